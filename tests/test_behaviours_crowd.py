@@ -361,11 +361,15 @@ def test_whoever_sweeps_sees_everything_once_per_round_wherever_he_began() -> No
         (Explore(weight=1, low=(0, 0), high=(9, 2), speed=1, track=1), None, "must be at least 3 tracks = 3 m"),
         (Forage(weight=1, food=2, speed=1), None, "food = 2: there are 1 groups, counted from 0"),
         (Queue(weight=1, target=(0, 0, 0), speed=1), None, "target = (0.0, 0.0, 0.0): dimension = 2"),
-        (Queue(weight=1, target=(0, 0)), None, "speed = None: groups[0].max_speed is none too"),
-        (Forage(weight=1, food=0), None, "speed = None: groups[0].max_speed is none too"),
-        (Explore(weight=1, low=(0, 0), high=(9, 9), track=1), None, "speed = None: groups[0].max_speed is none too"),
-        (Orca(weight=1, target=(0, 0)), None, "speed = None: groups[0].max_speed is none too"),
-        (StayOnPath(weight=1, points=((0, 0), (1, 0)), radius=1), None, "speed = None: groups[0].max_speed is none"),
+        (Queue(weight=1, target=(0, 0)), None, "speed = None: groups[0].max_speed is not given"),
+        (Forage(weight=1, food=0), None, "speed = None: groups[0].max_speed is not given"),
+        (Explore(weight=1, low=(0, 0), high=(9, 9), track=1), None, "speed = None: groups[0].max_speed is not given"),
+        (Orca(weight=1, target=(0, 0)), None, "speed = None: groups[0].max_speed is not given"),
+        (
+            StayOnPath(weight=1, points=((0, 0), (1, 0)), radius=1),
+            None,
+            "speed = None: groups[0].max_speed is not given",
+        ),
     ],
 )
 def test_what_does_not_suit_a_scene_is_refused_in_one_line(effect: Any, space: Any, said: str) -> None:

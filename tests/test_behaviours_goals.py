@@ -504,10 +504,10 @@ def test_nothing_is_divided_by_zero(row: Any, speed: float) -> None:
     [
         ((Pursue(weight=1, group=3, radius=5),), "effects[0].group = 3: there are 2 groups"),
         ((Interpose(weight=1, group=0, other=2, radius=5, slow_radius=1),), "effects[0].other = 2: there are 2 groups"),
-        ((Seek(weight=1, target=(0, 0)),), "effects[0].speed = None: groups[1].max_speed is none too"),
+        ((Seek(weight=1, target=(0, 0)),), "effects[0].speed = None: groups[1].max_speed is not given either"),
         (
             (Steer(group=1, behaviours=(Wander(weight=1),)),),
-            "effects[0].behaviours[0].speed = None: groups[1].max_speed is none too",
+            "effects[0].behaviours[0].speed = None: groups[1].max_speed is not given either",
         ),
         ((Seek(weight=1, target=(0, 0, 0), speed=1),), "effects[0].target = (0.0, 0.0, 0.0): dimension = 2"),
     ],

@@ -306,7 +306,7 @@ def test_it_looks_at_the_nearest_obstacles_in_whatever_order_they_are_listed() -
 
 
 def test_other_obstacles_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"sees round obstacles alone, obstacles\[0\].kind = wall"):
+    with pytest.raises(ValueError, match=r"sees round obstacles only, obstacles\[0\].kind = wall"):
         walkers(obstacles=({"kind": "wall", "vertices": ((0.0, 0.0), (1.0, 0.0))},))
 
 

@@ -1,9 +1,9 @@
-"""What an agent wants: Reynolds' behaviours, a family per file.
+"""Steering behaviours: Reynolds' and others, a family per file.
 
 To add one: write its file here, and a row in tests/catalogue.py.
 
 A behaviour is an effect (see physics/effects/effect.py for the forms of its laws) with `steering = True`: its laws
-return a steering force, in newtons. Several in a scene's list of effects are summed, and the sum is cut to max_force;
+return a steering force, in newtons. Those in a scene's list of effects are summed, and the sum is cut to max_force;
 under a `Steer` effect an arbitration combines them.
 """
 
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from flockenv.jit.startup import import_all
 
-import_all(__name__, __path__, but="steer")  # which is made of all the others
+import_all(__name__, __path__, but="steer")  # which needs all the others
 
 from flockenv.behaviours.avoid import AvoidObstacles, ForceField, Whiskers  # noqa: E402
 from flockenv.behaviours.crowd import Explore, Forage, Queue, UnalignedAvoidance  # noqa: E402

@@ -1,7 +1,7 @@
-"""Steering around obstacles of any shape: to avoid (Reynolds 1999), by whiskers, and by a force field, for contrast.
+"""Steering around obstacles of any shape: avoidance (Reynolds 1999), whiskers, and a force field for comparison.
 
-To avoid is zero unless something is really in the way; a force field also pushes those who fly past, and stops those
-who come head-on (Reynolds 1988, "Not Bumping Into Things").
+Avoidance is zero unless an obstacle blocks the path; a force field also pushes agents that fly past, and stops those
+that come head-on (Reynolds 1988, "Not Bumping Into Things").
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ effects:
 
 @law
 def nothing(p: Any, me: Me) -> Vec:
-    """No threat yet: at infinity; no side."""
+    """Return the initial value: a threat at infinity, and no side."""
     o, far = like(me.who, 0.0), like(me.who, np.inf)
     return (far, o) + zero(me.pos) + zero(me.pos)  # noqa: RUF005  # numba joins tuples, but does not unpack them
 
 
 @law
 def _kept(acc: Vec) -> Vec:
-    """Return all but the side, which is found when the obstacle is."""
+    """Return all but the side, which is found after the obstacle."""
     if len(acc) == 6:
         return (acc[0], acc[1], acc[2], acc[3])
     else:
@@ -52,7 +52,7 @@ def _kept(acc: Vec) -> Vec:
 
 @law
 def straight_on(p: Any, me: Me, k: int) -> tuple[Vec, float]:
-    """Where it is heading."""
+    """Return its heading, and the margin."""
     return me.heading, p.margin
 
 
@@ -61,14 +61,14 @@ def nearest_threat(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
     """Keep the obstacle that the straight path touches first: (distance, clearance, offset, no side yet)."""
     far = like(me.who, np.inf)
     distance = other.hit if other.hit <= norm(me.vel) * p.horizon else far
-    # who overlaps it already wants out, however the sum of the radii is rounded
+    # an agent that overlaps already must turn away, however the sum of the radii is rounded
     clearance = me.radius + other.radius + p.margin if other.hit > like(me.who, 0.0) else far
     return select(distance < acc[0], (distance, clearance) + other.offset, _kept(acc)) + zero(me.pos)  # noqa: RUF005
 
 
 @law
 def in_time(p: Any, me: Me) -> float:
-    """As far as it comes within the horizon, and its size."""
+    """Return the distance travelled within the horizon, plus radius and margin."""
     return norm(me.vel) * p.horizon + me.radius + p.margin  # type: ignore[no-any-return]
 
 
@@ -83,10 +83,10 @@ def _sides(acc: Vec) -> tuple[Vec, Vec]:
 
 @law
 def _turns_in_time(p: Any, me: Me, normal: Vec, aside: Vec, hit: float) -> bool:
-    """Return whether it can turn aside before it comes to the surface, at the radius m v^2 / F of its turns.
+    """Return True if it can turn to that side before it reaches the surface, with a turning radius R = m v^2 / F.
 
-    Along the normal's side it always tries; to the other it first turns towards the surface, which takes a depth of
-    R (1 + sin a), where a is the angle between its heading and the normal.
+    Towards the normal's side the result is always True. To the other side the agent first turns towards the surface,
+    which takes a depth of R (1 + sin a), a the angle between heading and normal.
     """
     o, e = like(hit, 0.0), like(hit, 1.0)
     force = p.weight if p.weight < me.max_force else me.max_force
@@ -99,13 +99,13 @@ def _turns_in_time(p: Any, me: Me, normal: Vec, aside: Vec, hit: float) -> bool:
 
 @law
 def around(p: Any, me: Me, acc: Vec) -> Vec:
-    """F = w (1 m/s) sideways, to the nearest edge; without one, or too near to turn there, along the normal's side."""
+    """Return F = w (1 m/s) sideways to the nearest edge; without one, or too near to turn, to the normal's side."""
     e = like(me.who, 1.0)
     offset, aside = _sides(acc)
     away = steering.avoid(me.heading, offset, acc[1], e)
     some = dot(aside, aside) > like(e, 0.0)
     normal = scale(sub(scale(me.heading, acc[0] if some else like(e, 0.0)), offset), e / acc[1])
-    # away from a circle's centre is to its nearest edge: where both are one but for rounding it stays what it was
+    # away from a circle's centre is towards its nearest edge: if the two differ by rounding only, `away` is kept
     other = some & (dot(aside, away) < like(e, 1 - 1e-5)) & _turns_in_time(p, me, normal, aside, acc[0])
     wish = select(other, aside, away)
     return scale(select(acc[0] < like(me.who, np.inf), wish, zero(me.pos)), p.weight)
@@ -118,14 +118,14 @@ class AvoidObstacles(Effect):
     1988): away from a circle's centre; dead ahead of its middle, to the right. An edge is where the body passes with a
     radius to spare: walls that are joined, or leave a gap that is too narrow, are one obstacle. An obstacle that has no
     edge (a half-space, a room), or is too near for a turn to that edge at a radius of m v^2 / F, is avoided along the
-    side of its normal. In space the edges on five sides are compared: the side of the normal, and both directions along
+    side of its normal. In 3-D the edges on five sides are compared: the side of the normal, and both directions along
     and across the obstacle's own axis. A sphere has no axis; for it, they lie away from what blocks the side of the
-    normal, and across that. An obstacle that moves is avoided where it is, as if it stood still.
+    normal, and across that. An obstacle that moves is treated as if it stood still at its current place.
     """
 
     kind: Literal["avoid_obstacles"] = "avoid_obstacles"
-    weight: float = Field(ge=0, description="N, the force of an evasion")
-    horizon: float = Field(default=2.0, gt=0, description="s, how far ahead it looks at the present speed")
+    weight: float = Field(ge=0, description="N, steering force of an evasion")
+    horizon: float = Field(default=2.0, gt=0, description="s, look-ahead time, at the present speed")
     margin: float = Field(default=0.0, ge=0, description="m, clearance beyond both radii")
     steering: ClassVar[bool] = True
     obstacle_start: ClassVar[Law | None] = nothing
@@ -137,11 +137,11 @@ class AvoidObstacles(Effect):
     demo: ClassVar[str | None] = AVOIDING
 
     def lookahead(self, speed: float) -> float:
-        """As far as it comes within the horizon."""
+        """Return the distance travelled within the horizon, m."""
         return speed * self.horizon
 
     def folded(self, dimension: int) -> int:
-        """Distance, clearance and offset of the nearest threat, and the side of its nearest edge."""
+        """Return the size of distance, clearance and offset of the nearest threat, and the side of its nearest edge."""
         return 2 + 2 * dimension
 
 
@@ -150,7 +150,7 @@ class AvoidObstacles(Effect):
 
 @law
 def whisker(p: Any, me: Me, k: int) -> tuple[Vec, float]:
-    """One straight ahead, then left and right, then (in 3-D) up and down."""
+    """Return the direction of whisker k: straight ahead, then left and right, then (in 3-D) up and down."""
     o, e = like(me.who, 0.0), like(me.who, 1.0)
     right = perpendicular(me.heading)
     turn = p.angle * like(me.who, np.pi / 180)
@@ -169,16 +169,16 @@ def _across(heading: Vec, right: Vec, k: int) -> Vec:
 
 @law
 def no_whisker(p: Any, me: Me) -> Vec:
-    """Nothing touched."""
+    """Return the initial value: nothing touched."""
     o, far = like(me.who, 0.0), like(me.who, np.inf)
     return (far, o) + zero(me.pos) + zero(me.pos)  # noqa: RUF005
 
 
 @law
 def deepest_whisker(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
-    """Keep what a whisker reaches into deepest.
+    """Keep the obstacle that a whisker reaches into deepest.
 
-    (How far ahead it is if that is the middle one, the share that is inside, the normal where it enters, no side yet.)
+    (Distance if that is the middle whisker, else inf; share inside; normal at the point of entry; no side yet.)
     """
     o, e = like(me.who, 0.0), like(me.who, 1.0)
     length = norm(me.vel) * p.horizon
@@ -190,15 +190,15 @@ def deepest_whisker(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
 
 @law
 def whiskers_end(p: Any, me: Me) -> float:
-    """The length of a whisker, and its size."""
+    """Return the length of a whisker plus the radius."""
     return norm(me.vel) * p.horizon + me.radius  # type: ignore[no-any-return]
 
 
 @law
 def along_normal(p: Any, me: Me, acc: Vec) -> Vec:
-    """F = w (share inside) (n + side): n alone would mostly brake.
+    """Return F = w (share inside) (n + side): n alone would mostly brake.
 
-    The side is that of the nearest edge of what is ahead; without one unit(lateral n), and head-on the right.
+    The side is that of the nearest edge of the obstacle ahead; without one unit(lateral n), and head-on the right.
     """
     normal, edge = _sides(acc)
     aside = lateral(normal, me.heading)
@@ -209,17 +209,17 @@ def along_normal(p: Any, me: Me, acc: Vec) -> Vec:
 
 
 class Whiskers(Effect):
-    """Feel ahead and to the sides; turn away from, and brake before, what a whisker reaches into, by how deep it does.
+    """Turn away from, and brake before, the obstacle that a whisker reaches into, in proportion to the depth.
 
-    If the middle one reaches in deepest, turn towards the nearest edge of the silhouette, as `avoid_obstacles` does.
+    If the middle whisker reaches in deepest, turn towards the nearest edge of the silhouette, as in `avoid_obstacles`.
 
-    Three whiskers in the plane, five in space, `horizon` times the speed long. Buckland 2005, "wall avoidance": there a
-    whisker has the length of a line and the body no size; here it is what the body would touch.
+    Three whiskers in 2-D, five in 3-D, of length `horizon` times the speed. In Buckland 2005, "wall avoidance",
+    whiskers have a fixed length and the body no size; here a whisker is swept by the whole body.
     """
 
     kind: Literal["whiskers"] = "whiskers"
-    weight: float = Field(ge=0, description="N, where a whisker is inside whole")
-    horizon: float = Field(default=1.5, gt=0, description="s, how far ahead it feels at the present speed")
+    weight: float = Field(ge=0, description="N, steering force if a whisker is wholly inside")
+    horizon: float = Field(default=1.5, gt=0, description="s, length of a whisker at the present speed")
     angle: float = Field(default=35.0, gt=0, lt=90, description="degrees between the middle and the other whiskers")
     steering: ClassVar[bool] = True
     obstacle_start: ClassVar[Law | None] = no_whisker
@@ -231,11 +231,11 @@ class Whiskers(Effect):
     demo: ClassVar[str | None] = AVOIDING.replace("avoid_obstacles, weight: 8", "whiskers, weight: 20")
 
     def rays(self, dimension: int) -> int:
-        """Ahead, and two for each other axis."""
+        """Return the number of whiskers: one ahead, and two for each other axis."""
         return 2 * dimension - 1
 
     def folded(self, dimension: int) -> int:
-        """How far ahead, a share, a normal and a side."""
+        """Return the size of a distance, a share, a normal and a side."""
         return 2 + 2 * dimension
 
 
@@ -244,13 +244,13 @@ class Whiskers(Effect):
 
 @law
 def no_push(p: Any, me: Me) -> Vec:
-    """Nothing pushes yet."""
+    """Return the initial force, zero."""
     return zero(me.pos)
 
 
 @law
 def field_push(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
-    """n / d^p, within range."""
+    """Add n / d^p, within range."""
     room = other.gap - me.radius
     near = room if room > p.nearest else p.nearest
     size = like(me.who, 1.0) / near**p.power
@@ -259,28 +259,28 @@ def field_push(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
 
 @law
 def field_end(p: Any, me: Me) -> float:
-    """Its range, and its size."""
+    """Return its range plus the radius."""
     return p.range + me.radius  # type: ignore[no-any-return]
 
 
 @law
 def field_force(p: Any, me: Me, acc: Vec) -> Vec:
-    """F = w sum n / d^p."""
+    """Return F = w sum n / d^p."""
     return scale(acc, p.weight)
 
 
 class ForceField(Effect):
-    """Pushed away from every surface within range, whether it is in the way or not: F = w sum n / d^p.
+    """Repulsion from every surface within range, in the path or not: F = w sum n / d^p. Included for comparison.
 
-    What Reynolds (1988) holds against it: head-on it only brakes; it is too strong near and too weak far away; and it
-    pushes those who fly past. Here for contrast.
+    The drawbacks named by Reynolds (1988): head-on it only brakes; it is too strong near and too weak far away; and it
+    pushes agents that fly past.
     """
 
     kind: Literal["force_field"] = "force_field"
     weight: float = Field(ge=0, description="N m^p, the force at 1 m")
-    power: float = Field(default=2.0, ge=0, le=6, description="p, how steeply it falls")
+    power: float = Field(default=2.0, ge=0, le=6, description="p, exponent of its decay")
     range: float = Field(default=3.0, gt=0, description="m between the surfaces, beyond which there is no force")
-    nearest: float = Field(default=0.05, gt=0, description="m, nearer counts as this near")
+    nearest: float = Field(default=0.05, gt=0, description="m, smaller distances count as this one")
     steering: ClassVar[bool] = True
     obstacle_start: ClassVar[Law | None] = no_push
     obstacle_law: ClassVar[Law | None] = field_push
@@ -289,5 +289,5 @@ class ForceField(Effect):
     demo: ClassVar[str | None] = AVOIDING.replace("avoid_obstacles, weight: 8", "force_field, weight: 3")
 
     def folded(self, dimension: int) -> int:
-        """A vector."""
+        """Return the size of a vector."""
         return dimension

@@ -1,4 +1,4 @@
-"""What behaviours share: how fast they go, whom they are about, and the nearest one of those as laws see him."""
+"""Base classes of behaviours: top speed, target group, and the nearest member of that group."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ __all__ = [
 
 @law
 def top_speed(p: Any, me: Me) -> float:
-    """Return how fast a behaviour goes at most, m/s.
+    """Return the top speed of a behaviour, m/s.
 
-    1 for those without any limit: they are not steered (see Moving), but their wish must be a number.
+    1 for agents without any limit: they are not steered (see Moving), but their force must be finite.
     """
     top = p.speed if p.speed < me.max_speed else me.max_speed
     return top if top < like(top, np.inf) else like(top, 1.0)
@@ -40,13 +40,13 @@ def top_speed(p: Any, me: Me) -> float:
 
 @law
 def nearest_one(p: Any, me: Me, other: Other) -> Vec:
-    """Where, how fast, and that it is one: of the nearest alone, or of some that are as near."""
+    """Return offset, velocity and the count 1, to be summed over the nearest neighbour, or several equally near."""
     return other.offset + other.vel + (like(other.square, 1.0),)
 
 
 @law
 def seen_one(sums: Vec) -> tuple[Vec, Vec, bool]:
-    """Return offset and velocity of the nearest one, and whether there is one at all."""
+    """Return the mean offset and velocity of the nearest neighbour, and True if there is one."""
     o, e = like(sums[0], 0.0), like(sums[0], 1.0)
     count = sums[len(sums) - 1]
     share = e / count if count > o else o
@@ -58,7 +58,7 @@ def seen_one(sums: Vec) -> tuple[Vec, Vec, bool]:
 
 
 def steered_groups(effect: Effect, scene: SceneView) -> list[int]:
-    """Return the numbers of the groups that a behaviour of a scene steers."""
+    """Return the indices of the groups that a behaviour of a scene steers."""
     found: set[int] = set()
     for each in scene.effects:
         if each == effect or effect in each.wishes:
@@ -69,63 +69,63 @@ def steered_groups(effect: Effect, scene: SceneView) -> list[int]:
 
 
 def gains(weight: float, groups: Sequence[Any], dimension: int) -> NDArray[np.float64]:
-    """Return weight / mass of every agent, (N,); 0 where one is held in place, or its max_force is 0."""
+    """Return weight / mass of every agent, (N,); 0 if it is held in place, or its max_force is 0."""
     free = np.repeat([group.max_force != 0 for group in groups], [group.size for group in groups])
     return np.where(free, weight / all_masses(groups, dimension), 0.0)
 
 
 class Behaviour(Effect):
-    """What an agent wants, F = weight x S: S is the change of velocity that a law of `flockenv.steering` asks for.
+    """A steering force F = weight x S: S is desired velocity less velocity, by a law of `flockenv.steering`.
 
-    S contains -v, so weight / m is a damping: beyond 2 m / weight (of the Eulers) a step turns the velocity over. That
-    is about forces below max_force; a large weight under a small max_force is bang-bang control, whose velocity
+    S contains -v, so weight / m is a damping rate: with a step above 2 m / weight, the Euler methods are unstable.
+    That holds for forces below max_force; a large weight under a small max_force is bang-bang control, whose velocity
     chatters by max_force dt / m.
     """
 
-    weight: float = Field(ge=0, description="kg/s, force per change of velocity that is asked for")
+    weight: float = Field(ge=0, description="kg/s, force per change of velocity")
     steering: ClassVar[bool] = True
     always: ClassVar[bool] = False
     copies: ClassVar[bool] = False
-    """True if it takes on the velocity of an agent that may take on its own: together twice as fast."""
+    """True if it copies the velocity of an agent that may copy its own: together twice as fast."""
     unlimited: ClassVar[tuple[str, ...]] = ()
-    """Names of the fields of which none means without limit."""
+    """Names of the fields whose None means no limit."""
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Return its numbers; what has no limit is infinite."""
+        """Return its numbers; missing limits are infinite."""
         return {**dict.fromkeys(self.unlimited, math.inf), **super().parameters()}
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """No oscillation, and damping of weight / m."""
+        """Return no oscillation, and a damping of weight / m, or twice that if it copies a velocity."""
         damping = gains(self.weight * (2.0 if self.copies else 1.0), groups, dimension)
         return np.zeros(len(damping)), damping
 
     def check(self, scene: SceneView) -> None:
-        """Refuse a group that is not there, by the name under which it was given."""
+        """Raise ValueError if a group does not exist, naming the field."""
         for name in ("group", "other", "food"):
             demand_group(name, getattr(self, name, None), scene.groups)
         super().check(scene)
 
 
 class Moving(Behaviour):
-    """A behaviour that heads somewhere, as fast as it may."""
+    """A behaviour with a desired velocity up to a top speed."""
 
-    speed: float | None = Field(default=None, gt=0, description="m/s, how fast at most; none = its max_speed")
+    speed: float | None = Field(default=None, gt=0, description="m/s, top speed (default: max_speed)")
     unlimited: ClassVar[tuple[str, ...]] = ("speed",)
     steepness: ClassVar[float] = 1.0
-    """By how much steeper than V / slow_radius the speed that it asks for changes across its way."""
+    """Largest gradient of the desired velocity, in units of V / slow_radius."""
 
     @property
     def limit(self) -> float:
-        """How fast it goes at most, m/s, of its own accord; infinite without a limit."""
+        """Its own top speed, m/s; infinite without a limit."""
         return math.inf if self.speed is None else self.speed
 
     @property
     def ramp(self) -> float | None:
-        """Over how many metres it slows down to stop; none if it does not."""
+        """The distance over which it slows down to stop, m; None if it does not."""
         return getattr(self, "slow_radius", None)
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Damping of weight / m; where it slows down, at V over slow_radius, w^2 = weight V / (m slow_radius)."""
+        """Return damping weight / m, and w^2 = weight V / (m slow_radius) if it slows down, times `steepness`."""
         found = super().rates(groups, dimension)
         if found is None or not self.ramp:
             return found
@@ -134,21 +134,21 @@ class Moving(Behaviour):
         return found[0] + gains(self.weight, groups, dimension) * slope, found[1]
 
     def check(self, scene: SceneView) -> None:
-        """Refuse those who may be infinitely fast; warn of a ramp that is too short to stop on."""
+        """Raise ValueError if a group has no speed limit; warn if the ramp is too short to stop on."""
         super().check(scene)
         for k in steered_groups(self, scene):
             group = scene.groups[k]
             if group.max_force == 0:
-                continue  # it does nothing of what it is asked
+                continue  # it is not steered
             speeds = [speed for speed in (self.speed, group.fastest) if speed is not None]
             if not speeds:
-                raise ValueError(f"speed = None: groups[{k}].max_speed is none too; give either of them")
+                raise ValueError(f"speed = None: groups[{k}].max_speed is not given either; give one of them")
             if self.ramp is not None and group.max_force is not None:
                 _warn_of_overshoot(self.kind, self.ramp, min(speeds), group)
 
 
 def _warn_of_overshoot(kind: str, slow_radius: float, speed: float, group: Any) -> None:
-    """Say so if a ramp asks for a larger deceleration at its edge than the group's max_force allows: V^2 / d."""
+    """Warn if a ramp's deceleration at its edge, V^2 / d, is more than the group's max_force allows."""
     least = speed**2 * group.heaviest / group.max_force
     if slow_radius < least * (1 - 1e-9):
         text = (
@@ -158,19 +158,19 @@ def _warn_of_overshoot(kind: str, slow_radius: float, speed: float, group: Any) 
 
 
 class AboutNearest(Behaviour):
-    """A behaviour about the nearest of a group that it sees; it asks for nothing where it sees nobody."""
+    """A behaviour towards the nearest visible agent of a group; zero if none is visible."""
 
-    group: int | None = Field(default=None, ge=0, description="whom it is about: the nearest of it; none = of all")
-    radius: float = Field(gt=0, description="m, how far it sees")
+    group: int | None = Field(default=None, ge=0, description="group whose nearest agent counts (default: all)")
+    radius: float = Field(gt=0, description="m, range of sight")
     fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
-    occluded: bool = Field(default=False, description="whom an obstacle hides is not seen")
+    occluded: bool = Field(default=False, description="True if obstacles hide agents")
     pair_law: ClassVar[Law | None] = nearest_one
 
     @property
     def sight(self) -> Sight:
-        """The nearest one."""
+        """The nearest agent of the group."""
         return Sight(self.radius, self.fov, 1, self.group, self.occluded)
 
     def sums(self, dimension: int) -> int:
-        """Offset, velocity, count."""
+        """Return the size of offset, velocity and count."""
         return 2 * dimension + 1

@@ -1,4 +1,4 @@
-"""Among many who want to get somewhere: unaligned collision avoidance, a queue, foraging, sweeping a region."""
+"""Behaviours of crowds: unaligned collision avoidance, queueing, foraging, exploring a region."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ __all__ = ["Explore", "Forage", "Queue", "UnalignedAvoidance"]
 
 @law
 def no_meeting(p: Any, me: Me) -> Vec:
-    """Nobody is met yet, at any time."""
+    """Return the initial value: no collision, at time inf."""
     return (like(me.radius, np.inf),) + zero(me.pos)  # noqa: RUF005  # numba joins tuples, but does not unpack them
 
 
 @law
 def first_meeting(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
-    """Keep whom I meet first: (time, where to give way to)."""
+    """Keep the earliest predicted collision: (time, direction of evasion)."""
     clearance = me.radius + other.radius + p.margin
     time = steering.unaligned_threat(other.offset, me.vel, other.vel, clearance, p.horizon)
     away = steering.give_way(other.offset, me.vel, other.vel, time, like(clearance, 1.0))
@@ -40,7 +40,7 @@ def first_meeting(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
 
 @law
 def giving_way(p: Any, me: Me, acc: Vec) -> Vec:
-    """F = w (1 m/s) away from the meeting."""
+    """Return F = w (1 m/s) away from the predicted collision."""
     away: Vec
     if len(acc) == 3:
         away = (acc[1], acc[2])
@@ -50,15 +50,15 @@ def giving_way(p: Any, me: Me, acc: Vec) -> Vec:
 
 
 class UnalignedAvoidance(Behaviour):
-    """Give way to whom one would meet first within `horizon` seconds: aside, and braking or speeding up."""
+    """Avoid the earliest predicted collision within `horizon` seconds: turn aside, and brake or speed up."""
 
     kind: Literal["unaligned_avoidance"] = "unaligned_avoidance"
-    weight: float = Field(ge=0, description="N, the force with which it gives way")
-    radius: float = Field(default=10.0, gt=0, description="m, who is further away is not looked at")
+    weight: float = Field(ge=0, description="N, steering force of an evasion")
+    radius: float = Field(default=10.0, gt=0, description="m, range within which agents count")
     fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
-    horizon: float = Field(default=3.0, gt=0, description="s, how far ahead it looks")
+    horizon: float = Field(default=3.0, gt=0, description="s, look-ahead time")
     margin: float = Field(default=0.0, ge=0, description="m, clearance beyond both radii")
-    group: int | None = Field(default=None, ge=0, description="to whom it gives way; none = all")
+    group: int | None = Field(default=None, ge=0, description="group that it avoids (default: all)")
     pair_start: ClassVar[Law | None] = no_meeting
     pair_law: ClassVar[Law | None] = first_meeting
     finish_law: ClassVar[Law | None] = giving_way
@@ -83,22 +83,22 @@ effects:
 
     @property
     def sight(self) -> Sight:
-        """Radius, field of view, whom."""
+        """Radius, field of view and group."""
         return Sight(self.radius, self.fov, group=self.group)
 
     def parameters(self) -> dict[str, float | Vec]:
-        """How strongly, how far ahead, how wide: who is seen is the sweep's business."""
+        """Return weight, horizon and margin; the neighbour query uses the rest."""
         return {"weight": self.weight, "horizon": self.horizon, "margin": self.margin}
 
     def lookahead(self, speed: float) -> float:
-        """As far as it comes within the horizon, and as it sees."""
+        """Return the distance travelled within the horizon, m, at most the range of sight."""
         return min(speed * self.horizon, self.radius)
 
     def rates(self, groups: Sequence[Any], dimension: int) -> None:
-        """None: it pushes aside with one and the same force."""
+        """Return None: its force is constant in size."""
 
     def sums(self, dimension: int) -> int:
-        """A time and a direction."""
+        """Return the size of a time and a direction."""
         return 1 + dimension
 
 
@@ -107,7 +107,7 @@ effects:
 
 @law
 def free_way(p: Any, me: Me) -> Vec:
-    """The way to the door, and nobody on it."""
+    """Return the initial value: the direction to the door, and an infinite gap."""
     return unit(sub(p.target, me.pos)) + (like(me.radius, np.inf),)  # noqa: RUF005
 
 
@@ -127,7 +127,7 @@ def held_up(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
 
 @law
 def queueing(p: Any, me: Me, acc: Vec) -> Vec:
-    """F = w (v_queue - v)."""
+    """Return F = w (v_queue - v)."""
     way: Vec
     if len(acc) == 3:
         way = (acc[0], acc[1])
@@ -137,15 +137,15 @@ def queueing(p: Any, me: Me, acc: Vec) -> Vec:
 
 
 class Queue(Moving):
-    """Seek a door, and slow down behind whoever is near, ahead on the way there, and slower: no pushing."""
+    """Seek a door, and slow down behind slower agents ahead, without pushing."""
 
     kind: Literal["queue"] = "queue"
-    weight: float = Field(ge=0, description="kg/s, gain; 4 m / headway or more overshoots nothing")
+    weight: float = Field(ge=0, description="kg/s, gain; at 4 m / headway or more it does not overshoot")
     target: Vector = Field(description="m, the door")
     headway: float = Field(default=0.8, gt=0, description="s, a gap is closed as exp(-t / headway)")
-    margin: float = Field(default=0.0, ge=0, description="m, left between bodies that stand in the queue")
-    radius: float = Field(default=5.0, gt=0, description="m, who is further away holds up nobody")
-    group: int | None = Field(default=None, ge=0, description="behind whom it queues; none = all")
+    margin: float = Field(default=0.0, ge=0, description="m, gap between bodies that stand in the queue")
+    radius: float = Field(default=5.0, gt=0, description="m, range within which agents ahead block")
+    group: int | None = Field(default=None, ge=0, description="group that it queues behind (default: all)")
     places: ClassVar[tuple[str, ...]] = ("target",)
     pair_start: ClassVar[Law | None] = free_way
     pair_law: ClassVar[Law | None] = held_up
@@ -164,21 +164,21 @@ effects:
 
     @property
     def sight(self) -> Sight:
-        """Radius, whom; what is ahead is ahead on the way to the door."""
+        """Radius and group, in all directions: ahead is relative to the door."""
         return Sight(self.radius, group=self.group)
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Where to, how fast, how close: who is seen is the sweep's business."""
+        """Return target, speed, weight, headway and margin; the neighbour query uses the rest."""
         names = ("weight", "headway", "margin")
         return {"target": self.target, "speed": self.limit, **{name: float(getattr(self, name)) for name in names}}
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Damping of weight / m; while a gap closes, w^2 = weight / (m headway)."""
+        """Return w^2 = weight / (m headway), while a gap closes, and a damping of weight / m."""
         gain = gains(self.weight, groups, dimension)
         return gain / self.headway, gain
 
     def sums(self, dimension: int) -> int:
-        """The way and the gap."""
+        """Return the size of a direction and a gap."""
         return dimension + 1
 
 
@@ -187,21 +187,21 @@ effects:
 
 @law
 def no_food(p: Any, me: Me) -> Vec:
-    """Nothing found yet."""
+    """Return the initial value: no food found."""
     far = like(me.radius, np.inf)
     return (far, far) + zero(me.pos)  # noqa: RUF005
 
 
 @law
 def nearest_food(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
-    """Keep the nearest, of two the one with the lower number: (square, who, offset)."""
+    """Keep the nearest food, of two equally near that of lower index: (squared distance, index, offset)."""
     nearer = (other.square < acc[0]) | ((other.square == acc[0]) & (other.who < acc[1]))
     return select(nearer, (other.square, other.who) + other.offset, acc)  # noqa: RUF005
 
 
 @law
 def foraging(p: Any, me: Me, acc: Vec) -> Vec:
-    """F = w (v_arrive - v) if there is food in sight, else F = w (v_wander - v)."""
+    """Return F = w (v_arrive - v) if there is food in sight, else F = w (v_wander - v)."""
     o = like(me.radius, 0.0)
     offset: Vec
     if len(acc) == 4:
@@ -214,15 +214,15 @@ def foraging(p: Any, me: Me, acc: Vec) -> Vec:
 
 
 class Forage(Moving):
-    """Arrive at the nearest food in sight, and wander as long as there is none (Reynolds 1999 names it)."""
+    """Arrive at the nearest food in sight, and wander while there is none (named in Reynolds 1999)."""
 
     kind: Literal["forage"] = "forage"
-    food: int = Field(ge=0, strict=True, description="the group whose agents are food")
-    radius: float = Field(default=3.0, gt=0, description="m, food is seen within this")
+    food: int = Field(ge=0, strict=True, description="group whose agents are food")
+    radius: float = Field(default=3.0, gt=0, description="m, range within which food is seen")
     fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
-    slow_radius: float = Field(default=0.5, gt=0, description="m, it slows down within this of its food")
-    period: float = Field(default=2.0, gt=0, description="s, how long it remembers to which side it turned")
-    strength: float = Field(default=1.0, ge=0, description="m aside per m ahead: how far it turns while it wanders")
+    slow_radius: float = Field(default=0.5, gt=0, description="m, distance from food within which it slows down")
+    period: float = Field(default=2.0, gt=0, description="s, correlation time of its turns while it wanders")
+    strength: float = Field(default=1.0, ge=0, description="m sideways per m ahead while it wanders")
     pair_start: ClassVar[Law | None] = no_food
     pair_law: ClassVar[Law | None] = nearest_food
     finish_law: ClassVar[Law | None] = foraging
@@ -239,16 +239,16 @@ effects:
 
     @property
     def sight(self) -> Sight:
-        """Radius, field of view, food."""
+        """Radius, field of view and group of food."""
         return Sight(self.radius, self.fov, group=self.food)
 
     def parameters(self) -> dict[str, float | Vec]:
-        """How fast, and how it wanders: who is seen is the sweep's business."""
+        """Return speed, weight and the numbers of wandering; the neighbour query uses the rest."""
         names = ("weight", "slow_radius", "period", "strength")
         return {"speed": self.limit, **{name: float(getattr(self, name)) for name in names}}
 
     def sums(self, dimension: int) -> int:
-        """Square of the distance, who, and where the nearest is."""
+        """Return the size of squared distance, index and offset of the nearest."""
         return 2 + dimension
 
 
@@ -257,21 +257,23 @@ effects:
 
 @law
 def sweeping(p: Any, me: Me) -> Vec:
-    """F = w (v_track - v)."""
+    """Return F = w (v_track - v)."""
     to_low, to_high = sub(me.pos, p.low), sub(p.high, me.pos)
     return scale(steering.explore(to_low, to_high, me.vel, top_speed(p, me), p.track), p.weight)
 
 
 class Explore(Moving):
-    """Sweep a region for ever along a closed comb of tracks, so that everything comes into sight once per round.
+    """Sweep a region for ever along a closed comb of tracks, so that all of it comes into sight once per round.
 
-    What was seen already is no state: where one is says where to go (steering.explore).
+    There is no memory of what was seen: the position determines the direction (steering.explore).
     """
 
     kind: Literal["explore"] = "explore"
     low: Vector = Field(description="m, lower corner of the region")
     high: Vector = Field(description="m, upper corner of the region")
-    track: float = Field(gt=0, description="m, tracks lie at most so far apart; sight of 1.25 tracks misses nothing")
+    track: float = Field(
+        gt=0, description="m, largest distance of tracks; a range of sight of 1.25 tracks misses nothing"
+    )
     places: ClassVar[tuple[str, ...]] = ("low", "high")
     own_law: ClassVar[Law | None] = sweeping
     demo_time: ClassVar[float] = 60.0
@@ -283,7 +285,7 @@ effects:
 """
 
     def check(self, scene: SceneView) -> None:
-        """Refuse a region that has no edges or no area, and tracks that are too narrow to turn."""
+        """Raise ValueError if the space is periodic, or the region is less than 3 tracks wide."""
         super().check(scene)
         if scene.space.periodic:
             raise ValueError(f"low = {self.low}: a region has edges; space.kind = {scene.space.kind!r} has none")

@@ -1,4 +1,4 @@
-"""The driving force of social-force models: as fast as one would like to, where one wants to go; and in line."""
+"""The driving force of social-force models, towards the aim at desired speed; and lining up behind others."""
 
 from __future__ import annotations
 
@@ -20,14 +20,15 @@ __all__ = ["Driving", "LineUp"]
 
 @law
 def driving(p: Any, me: Me) -> Vec:
-    """F = m (v0 e - v) / tau, e = me.aim."""
+    """Return F = m (v0 e - v) / tau, e = me.aim."""
     return scale(sub(scale(me.aim, me.desired_speed), me.vel), me.mass / p.tau)
 
 
 class Driving(Behaviour):
-    """Walk at one's desired speed where one wants to go, F = m (v0 e - v) / tau (Helbing and Molnar 1995, eq. 2).
+    """Walk at the desired speed towards the aim, F = m (v0 e - v) / tau (Helbing and Molnar 1995, eq. 2).
 
-    v0 is the group's `desired_speed`, e what goals, courses and journeys of the scene say: who has no aim stops.
+    v0 is the group's `desired_speed`, e the direction from goals, courses and journeys of the scene; an agent without
+    an aim stops.
     """
 
     kind: Literal["driving"] = "driving"
@@ -51,22 +52,22 @@ effects:
 """
 
     def parameters(self) -> dict[str, float | Vec]:
-        """The time it takes."""
+        """Return the relaxation time, divided by the weight."""
         return {"tau": self.tau / self.weight if self.weight else np.inf}
 
     def check(self, scene: SceneView) -> None:
-        """Refuse those who do not say how fast they would like to go."""
+        """Raise ValueError if a steered group has no desired speed."""
         super().check(scene)
         _demand_speeds(self, scene)
 
     def rates(self, groups: Any, dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """No oscillation, and damping of 1 / tau."""
+        """Return no oscillation, and a damping of weight / tau."""
         n = len(all_masses(groups, dimension))
         return np.zeros(n), np.full(n, self.weight / self.tau)
 
 
 def _demand_speeds(effect: Behaviour, scene: SceneView) -> None:
-    """Refuse groups that an effect steers and that do not say how fast they would like to go."""
+    """Raise ValueError if a group that an effect steers has no desired speed."""
     for k in steered_groups(effect, scene):
         if scene.groups[k].desired_speed is None and scene.groups[k].max_force != 0:
             raise ValueError(f"kind = {effect.kind}: groups[{k}].desired_speed = None: give m/s")
@@ -74,15 +75,15 @@ def _demand_speeds(effect: Behaviour, scene: SceneView) -> None:
 
 @law
 def nobody_ahead(p: Any, me: Me) -> Vec:
-    """A free way."""
+    """Return the initial gap, inf: no agent ahead."""
     return (like(me.radius, np.inf),)
 
 
 @law
 def next_ahead(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
-    """Keep the shortest gap to who is ahead where one wants to go, and slower.
+    """Keep the shortest gap to a slower agent ahead in the direction of the aim.
 
-    Ahead is within 45 degrees: two whose ways meet at less than a right angle never wait for each other.
+    Ahead is within 45 degrees: two agents whose directions differ by less than 90 degrees never wait for each other.
     """
     way, o = unit(me.aim), like(me.radius, 0.0)
     along = dot(other.offset, way)
@@ -95,26 +96,26 @@ def next_ahead(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
 
 @law
 def lining_up(p: Any, me: Me, acc: Vec) -> Vec:
-    """F = m (e min(v0, gap / T) - v) / tau."""
+    """Return F = m (e min(v0, gap / T) - v) / tau."""
     top = me.desired_speed * norm(me.aim)
     return scale(steering.queue(unit(me.aim), me.vel, acc[0], top, p.headway), me.mass / p.tau)
 
 
 class LineUp(Behaviour):
-    """Driving without pushing: walk where one wants to go, no faster than the gap to who is ahead there allows.
+    """Driving without pushing: walk towards the aim, no faster than the gap to the agent ahead allows.
 
-    F = m (e min(v0, gap / T) - v) / tau: instead of `driving`, with the same aims. With T of 4 tau or more a gap closes
-    as exp(-t / T) and nobody overshoots (see `queue`). Ahead is within 45 degrees of one's way; who is beside is kept
-    apart by separation or contact, if at all. Who comes the other way holds up too: bodies that meet need to give way.
+    F = m (e min(v0, gap / T) - v) / tau, instead of `driving`, with the same aims. If T >= 4 tau a gap closes as
+    exp(-t / T) without overshoot (see `queue`). Ahead is within 45 degrees of the aim; agents beside are kept apart by
+    separation or contact only. Oncoming agents also block: such scenes need a behaviour that gives way.
     """
 
     kind: Literal["line_up"] = "line_up"
     weight: float = Field(default=1.0, ge=0, description="a factor")
     tau: float = Field(default=0.2, gt=0, description="s, relaxation time")
     headway: float = Field(default=0.8, gt=0, description="s, T")
-    margin: float = Field(default=0.0, ge=0, description="m, left between bodies that stand in line")
-    radius: float = Field(default=3.0, gt=0, description="m, who is further away holds up nobody")
-    group: int | None = Field(default=None, ge=0, description="behind whom it waits; none = all")
+    margin: float = Field(default=0.0, ge=0, description="m, gap between bodies that stand in line")
+    radius: float = Field(default=3.0, gt=0, description="m, range within which agents ahead block")
+    group: int | None = Field(default=None, ge=0, description="group that it waits behind (default: all)")
     pair_start: ClassVar[Law | None] = nobody_ahead
     pair_law: ClassVar[Law | None] = next_ahead
     finish_law: ClassVar[Law | None] = lining_up
@@ -132,24 +133,24 @@ effects:
 
     @property
     def sight(self) -> Sight:
-        """Radius, whom; ahead is where one wants to go."""
+        """Radius and group, in all directions: ahead is relative to the aim."""
         return Sight(self.radius, group=self.group)
 
     def parameters(self) -> dict[str, float | Vec]:
-        """How fast it adapts, how close it comes."""
+        """Return the relaxation time, the headway and the margin."""
         tau = self.tau / self.weight if self.weight else np.inf
         return {"tau": tau, "headway": self.headway, "margin": self.margin}
 
     def rates(self, groups: Any, dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Damping of 1 / tau; while a gap closes, w^2 = 1 / (tau headway)."""
+        """Return w^2 = weight / (tau headway), while a gap closes, and a damping of weight / tau."""
         damping = np.full(len(all_masses(groups, dimension)), self.weight / self.tau)
         return damping / self.headway, damping
 
     def sums(self, dimension: int) -> int:
-        """The gap."""
+        """Return 1: the gap."""
         return 1
 
     def check(self, scene: SceneView) -> None:
-        """Refuse those who do not say how fast they would like to go."""
+        """Raise ValueError if a steered group has no desired speed."""
         super().check(scene)
         _demand_speeds(self, scene)

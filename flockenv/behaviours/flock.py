@@ -1,8 +1,8 @@
-"""The three rules of a flock (Reynolds 1987), each an effect of its own; together they share one sweep.
+"""The three rules of a flock (Reynolds 1987), each an effect of its own; together they share one neighbour query.
 
-Each looks within its own radius and field of view, at everybody there (metric) or at the nearest few (topological;
-Ballerini et al. 2008, doi 10.1073/pnas.0711437105: starlings heed six or seven). Someone at standstill has no heading
-and sees all around.
+Each has its own radius and field of view, and uses all neighbours there (metric) or the nearest few (topological;
+Ballerini et al. 2008, doi 10.1073/pnas.0711437105: starlings interact with six or seven). An agent at rest has no
+heading and sees in all directions.
 """
 
 from __future__ import annotations
@@ -26,31 +26,31 @@ __all__ = ["Alignment", "Cohesion", "Separation"]
 
 @law
 def separation_pair(p: Any, me: Me, other: Other) -> Vec:
-    """One push."""
+    """Return the repulsion from one neighbour."""
     return others.part(other.offset, other.square, sub(me.tie, other.tie))
 
 
 @law
 def separation_apart(p: Any, me: Me, other: Other) -> Vec:
-    """The same where the two are not in one place."""
+    """Return the same for two agents that do not coincide."""
     return others.push_off(other.offset, other.square)
 
 
 @law
 def separation(p: Any, me: Me, sums: Vec) -> Vec:
-    """F = w sum of pushes."""
+    """Return F = w times the sum of repulsions."""
     return scale(sums, p.weight)
 
 
 @law
 def alignment_pair(p: Any, me: Me, other: Other) -> Vec:
-    """One velocity."""
+    """Return the velocity of one neighbour."""
     return other.vel
 
 
 @law
 def _mean(sums: Vec) -> tuple[Vec, bool]:
-    """Divide the vector part of the sums by their count, the last."""
+    """Return the vector part of the sums divided by their count, the last entry, and True if the count is positive."""
     e = like(sums[0], 1.0)
     count = sums[len(sums) - 1]
     some = count > like(e, 0.0)
@@ -63,46 +63,46 @@ def _mean(sums: Vec) -> tuple[Vec, bool]:
 
 @law
 def alignment(p: Any, me: Me, sums: Vec) -> Vec:
-    """F = w (mean v_j - v), 0 without neighbours."""
+    """Return F = w (mean v_j - v), 0 without neighbours."""
     mean, some = _mean(sums)
     return select(some, scale(steering.align(me.vel, mean), p.weight), zero(mean))
 
 
 @law
 def cohesion_pair(p: Any, me: Me, other: Other) -> Vec:
-    """One offset."""
+    """Return the offset of one neighbour."""
     return other.offset
 
 
 @law
 def cohesion(p: Any, me: Me, sums: Vec) -> Vec:
-    """F = w (mean x_j - x)."""
+    """Return F = w (mean x_j - x)."""
     mean, _ = _mean(sums)
     return scale(mean, p.weight)
 
 
 class _FlockRule(Effect):
-    """What the three rules have in common."""
+    """Base of the three rules."""
 
     steering: ClassVar[bool] = True
     always: ClassVar[bool] = False
 
     weight: float
-    radius: float = Field(gt=0, description="m, neighbours are nearer than this")
+    radius: float = Field(gt=0, description="m, range within which neighbours count")
     fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
     nearest: int | None = Field(
-        default=None, ge=1, le=32, description="topological: only so many nearest ones of those count; none = all"
+        default=None, ge=1, le=32, description="topological: number of nearest neighbours that count (default: all)"
     )
-    group: int | None = Field(default=None, ge=0, description="who counts as a neighbour: this group; none = all")
-    occluded: bool = Field(default=False, description="whom an obstacle hides is not seen")
+    group: int | None = Field(default=None, ge=0, description="group whose agents count (default: all)")
+    occluded: bool = Field(default=False, description="True if obstacles hide agents")
 
     @property
     def sight(self) -> Sight:
-        """Radius, field of view, how many, who."""
+        """Radius, field of view, number, group and occlusion."""
         return Sight(self.radius, self.fov, self.nearest, self.group, self.occluded)
 
     def parameters(self) -> dict[str, float | Vec]:
-        """The weight: who is seen is the sweep's business."""
+        """Return the weight; the neighbour query uses the rest."""
         return {"weight": self.weight}
 
 
@@ -125,18 +125,16 @@ dt: 0.02
 
     @property
     def conserves_momentum(self) -> bool:  # type: ignore[override]  # a rule with a view cone is not mutual
-        """True with eyes all around and for everybody near: then everybody pushes back as he is pushed."""
-        return (
-            self.fov >= 360.0 and self.nearest is None and self.group is None
-        )  # who is hidden from me does not see me either
+        """True if it has a full field of view and uses all neighbours: then the forces of a pair are opposite."""
+        return self.fov >= 360.0 and self.nearest is None and self.group is None  # occlusion is mutual
 
     def sums(self, dimension: int) -> int:
-        """A vector."""
+        """Return the size of a vector."""
         return dimension
 
 
 class Alignment(_FlockRule):
-    """Fly as the neighbours do: F = w (mean v_j - v)."""
+    """Match the mean velocity of the neighbours: F = w (mean v_j - v)."""
 
     kind: Literal["alignment"] = "alignment"
     weight: float = Field(ge=0, description="kg/s")
@@ -150,12 +148,12 @@ dt: 0.02
     averages: ClassVar[bool] = True
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """No oscillation; two that see each other alone take on each other's velocity at 2 w / m."""
+        """Return no oscillation, and a damping of 2 w / m, that of two agents that see only each other."""
         damping = gains(2 * self.weight, groups, dimension)
         return np.zeros(len(damping)), damping
 
     def sums(self, dimension: int) -> int:
-        """A vector."""
+        """Return the size of a vector."""
         return dimension
 
 
@@ -176,10 +174,10 @@ dt: 0.02
     averages: ClassVar[bool] = True
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """w^2 = 2 w / m of two that see each other alone; nothing damps it."""
+        """Return w^2 = 2 w / m, that of two agents that see only each other, and no damping."""
         square = gains(2 * self.weight, groups, dimension)
         return square, np.zeros(len(square))
 
     def sums(self, dimension: int) -> int:
-        """A vector."""
+        """Return the size of a vector."""
         return dimension

@@ -1,4 +1,4 @@
-"""The way to a goal around all obstacles: a global controller that agents follow while local steering does the rest."""
+"""The shortest path to a goal around all obstacles: global navigation, to be combined with local steering."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["FollowWay"]
 
 @law
 def follow_way(p: Any, me: Me) -> Vec:
-    """F = w (V e - v), e downhill the length of the way; slower over the last `slow_radius`."""
+    """Return F = w (V e - v), e the descent direction of the path length; slower over the last `slow_radius`."""
     straight = sub(p.target, me.pos)
     length, direction = way_ahead(p.table, me.pos, straight)
     near = norm(straight)
@@ -32,18 +32,18 @@ def follow_way(p: Any, me: Me) -> Vec:
 
 
 class FollowWay(Moving):
-    """Go to a point by the shortest way around all obstacles: S = V e - v, e = -grad u, |grad u| = 1 (eikonal).
+    """Go to a point by the shortest path around all obstacles: S = V e - v, e = -grad u, |grad u| = 1 (eikonal).
 
-    The way is found once, on a grid, when the scene is built; between its points it is interpolated. It keeps
-    `clearance` from every obstacle. Outside the grid it leads straight to the point.
+    The floor field u is computed once on a grid, when the scene is built, and interpolated between grid points. Paths
+    keep `clearance` from every obstacle. Outside the grid the direction is straight to the point.
     """
 
     kind: Literal["follow_way"] = "follow_way"
-    target: Vector = Field(description="m, where to")
-    clearance: float = Field(default=0.3, ge=0, description="m, from its way to every obstacle: its radius and more")
+    target: Vector = Field(description="m, the goal")
+    clearance: float = Field(default=0.3, ge=0, description="m, from its path to every obstacle: at least its radius")
     spacing: float = Field(default=0.2, gt=0, description="m, between points of the grid")
     slow_radius: float = Field(default=1.0, gt=0, description="m before the target, over which it slows down to stop")
-    margin: float = Field(default=3.0, gt=0, description="m of grid around obstacles, target and where agents begin")
+    margin: float = Field(default=3.0, gt=0, description="m of grid around obstacles, target and initial positions")
     tabled: ClassVar[bool] = True
     own_law: ClassVar[Law | None] = follow_way
     places: ClassVar[tuple[str, ...]] = ("target",)
@@ -60,31 +60,31 @@ effects:
 """
 
     def parameters(self) -> dict[str, float | Vec]:
-        """What the law reads beside the grid."""
+        """Return all parameters but the grid, which is in the table."""
         return {
             "speed": self.limit, "weight": self.weight, "target": self.target, "slow_radius": self.slow_radius,
         }  # fmt: skip
 
     @property
     def _given(self) -> tuple[tuple[Target], tuple[str]]:
-        """Where to, and by which name that was given."""
+        """The target, and the name of its field."""
         return (Target(at=self.target),), ("target",)
 
     def table(self, scene: SceneView) -> NDArray[np.float64]:
-        """The grid of ways."""
+        """Return the floor field."""
         corners = region(scene, self._given[0], self.margin)
         starts = [start for k in steered_groups(self, scene) for start in starts_of(scene, k)]
         return ways_to(scene, *self._given, corners, self.spacing, self.clearance, starts)
 
     def check_start(self, scene: SceneView, state: Any) -> None:
-        """Warn of agents that begin where no way leads to the target."""
+        """Warn of agents whose initial position has no path to the target."""
         lost = np.isinf(lengths_on(scene.table_of(self), state.pos))
         for k in set(range(len(scene.groups))) - set(steered_groups(self, scene)):
             lost[:, scene.starts[k] : scene.starts[k + 1]] = False
         warn_cut_off(self._given[1][0], lost, state)
 
     def check(self, scene: SceneView) -> None:
-        """Refuse a torus, obstacles that move, a grid too large, and a target that is in an obstacle."""
+        """Raise ValueError for a torus, moving obstacles, too large a grid, or a target in an obstacle."""
         super().check(scene)
         check_ways(scene, self.kind, *self._given, self.margin, self.spacing, self.clearance)
         scene.table_of(self)

@@ -1,4 +1,4 @@
-"""Behaviours about company: a formation, a leader to follow, two others to stand between (Reynolds 1999)."""
+"""Behaviours relative to others: formation, leader following, interposing between two (Reynolds 1999)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["FollowLeader", "Formation", "Interpose"]
 
 @law
 def _station(p: Any, offset: Vec) -> Vec:
-    """Return the place in the leader's frame."""
+    """Return the station in the leader's frame."""
     if len(offset) == 2:
         return (p.ahead, p.left)
     else:
@@ -28,7 +28,7 @@ def _station(p: Any, offset: Vec) -> Vec:
 
 @law
 def in_formation(p: Any, me: Me, sums: Vec) -> Vec:
-    """F = w (v_L + V min(1, d / d_slow) unit(d) - v)."""
+    """Return F = w (v_L + V min(1, d / d_slow) unit(d) - v)."""
     offset, velocity, some = seen_one(sums)
     place, top = _station(p, offset), top_speed(p, me)
     wish = steering.keep_station(offset, me.vel, velocity, place, top, p.slow_radius)
@@ -37,7 +37,7 @@ def in_formation(p: Any, me: Me, sums: Vec) -> Vec:
 
 @law
 def following(p: Any, me: Me, sums: Vec) -> Vec:
-    """Behind the leader, and out of its way."""
+    """Return F = w S: stay behind the leader, and out of its path."""
     offset, velocity, some = seen_one(sums)
     behind = p.distance + p.headway * norm(velocity)
     wish = steering.follow_leader(offset, me.vel, velocity, behind, p.ahead, p.aside, top_speed(p, me), p.slow_radius)
@@ -46,7 +46,7 @@ def following(p: Any, me: Me, sums: Vec) -> Vec:
 
 @law
 def _halves(acc: Vec) -> tuple[Vec, Vec]:
-    """Return square, offset and velocity of the one and the other."""
+    """Return (squared distance, offset, velocity) of the first and of the second agent."""
     if len(acc) == 10:
         return acc[:5], acc[5:]
     else:
@@ -64,7 +64,7 @@ def _either(condition: bool, a: Vec, b: Vec) -> Vec:
 
 @law
 def _parts(one: Vec) -> tuple[Vec, Vec]:
-    """Return offset and velocity, 0 of nobody."""
+    """Return offset and velocity, 0 if there is no agent."""
     if len(one) == 5:
         return (one[1], one[2]), (one[3], one[4])
     else:
@@ -73,7 +73,7 @@ def _parts(one: Vec) -> tuple[Vec, Vec]:
 
 @law
 def nobody_yet(p: Any, me: Me) -> Vec:
-    """Both infinitely far."""
+    """Return the initial value: both infinitely far."""
     o = zero(me.pos)
     none = (like(me.radius, np.inf),) + o + o  # noqa: RUF005
     return none + none
@@ -81,19 +81,19 @@ def nobody_yet(p: Any, me: Me) -> Vec:
 
 @law
 def nearest_two(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
-    """Keep the nearest of either group; of one group that is both, the two nearest."""
+    """Keep the nearest of each group; if both are the same group, its two nearest."""
     a, b = _halves(acc)
     it = (other.square,) + other.offset + other.vel  # noqa: RUF005
     in_a = (other.who >= p.first) & (other.who < p.end)
     in_b = (other.who >= p.other_first) & (other.who < p.other_end)
     nearer = in_a & (other.square < a[0])
-    left = _either(nearer, a, it)  # whom there is no place for as a: if both are one group, it is the next for b
+    left = _either(nearer, a, it)  # the one that is not kept as a: if both are one group, it is the candidate for b
     return _either(nearer, it, a) + _either(in_b & (left[0] < b[0]), left, b)
 
 
 @law
 def between(p: Any, me: Me, acc: Vec) -> Vec:
-    """F = w S, 0 unless it sees both."""
+    """Return F = w S, 0 unless both are visible."""
     a, b = _halves(acc)
     far = like(me.max_speed, np.inf)
     both = (a[0] < far) & (b[0] < far)
@@ -105,17 +105,17 @@ def between(p: Any, me: Me, acc: Vec) -> Vec:
 
 
 class Formation(AboutNearest, Moving):
-    """Keep a place in the frame of the nearest of a group: S = v_L + V min(1, d / d_slow) unit(d) - v.
+    """Keep a station in the frame of the nearest of a group: S = v_L + V min(1, d / d_slow) unit(d) - v.
 
-    The formation variant of offset pursuit (Reynolds 1999). Arriving where the place will be, as in yuka, would lag
-    behind: at the place itself it asks for standing still. A leader at standstill faces along the x axis.
+    The formation variant of offset pursuit (Reynolds 1999). Arriving at the predicted station, as in yuka, would lag
+    behind: at the station itself its desired velocity is zero. A leader at rest faces along the x axis.
     """
 
     kind: Literal["formation"] = "formation"
-    ahead: float = Field(description="m, where its place is: ahead of the leader; negative = behind")
+    ahead: float = Field(description="m, station ahead of the leader; negative = behind")
     left: float = Field(default=0.0, description="m, to its left; negative = to its right")
     up: float = Field(default=0.0, description="m, above it, in 3-D")
-    slow_radius: float = Field(gt=0, description="d_slow, m, from the place, within which it slows down")
+    slow_radius: float = Field(gt=0, description="d_slow, m, distance within which it slows down")
     finish_law: ClassVar[Law | None] = in_formation
     demo: ClassVar[str | None] = """
 groups:
@@ -139,17 +139,17 @@ effects:
 
 
 class FollowLeader(AboutNearest, Moving):
-    """Stay behind the nearest of a group, and out of its way: who is in the box in front of it moves out sideways.
+    """Stay behind the nearest of a group, and out of its path: agents in the box in front of it move out sideways.
 
-    The place is D = distance + headway x its speed behind it (Reynolds 1999). Separation keeps followers apart.
+    The target is D = distance + headway x leader's speed behind it (Reynolds 1999). Separation keeps followers apart.
     """
 
     kind: Literal["follow_leader"] = "follow_leader"
     distance: float = Field(gt=0, description="m, behind the leader")
-    headway: float = Field(default=0.0, ge=0, description="s, so much further behind per m/s of the leader")
+    headway: float = Field(default=0.0, ge=0, description="s, added distance per m/s of the leader's speed")
     ahead: float = Field(default=2.0, ge=0, description="m, length of the box in front of the leader")
-    aside: float = Field(default=0.5, ge=0, description="m, from the leader's way to a side of the box")
-    slow_radius: float = Field(gt=0, description="m, from the place, within which it slows down")
+    aside: float = Field(default=0.5, ge=0, description="m, half the width of the box")
+    slow_radius: float = Field(gt=0, description="m, distance within which it slows down")
     finish_law: ClassVar[Law | None] = following
     demo: ClassVar[str | None] = """
 groups:
@@ -167,19 +167,18 @@ effects:
 
 
 class Interpose(Moving):
-    """Arrive between the nearest of one group and the nearest of another, where that will be when it gets there.
+    """Arrive between the nearest of one group and the nearest of another, at the predicted time of arrival.
 
-    With one group that is both, between the two nearest of it (Reynolds 1999; T = d / V). It asks for nothing unless it
-    sees both.
+    If both are the same group, between its two nearest (Reynolds 1999; T = d / V). Zero unless both are visible.
     """
 
     kind: Literal["interpose"] = "interpose"
-    group: int = Field(ge=0, description="the one group")
+    group: int = Field(ge=0, description="the first group")
     other: int = Field(ge=0, description="the other group, or the same")
-    radius: float = Field(gt=0, description="m, how far it sees")
+    radius: float = Field(gt=0, description="m, range of sight")
     fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
-    share: float = Field(default=0.5, ge=0, le=1, description="of the way from the one to the other")
-    slow_radius: float = Field(gt=0, description="m, within which it slows down")
+    share: float = Field(default=0.5, ge=0, le=1, description="share of the path from the first to the other")
+    slow_radius: float = Field(gt=0, description="m, distance within which it slows down")
     pair_start: ClassVar[Law | None] = nobody_yet
     pair_law: ClassVar[Law | None] = nearest_two
     finish_law: ClassVar[Law | None] = between
@@ -194,15 +193,15 @@ effects:
 
     @property
     def sight(self) -> Sight:
-        """Everybody: its law knows who is in which group."""
+        """All agents: its law tests the groups."""
         return Sight(self.radius, self.fov)
 
     def sums(self, dimension: int) -> int:
-        """Square, offset, velocity, of two."""
+        """Return the size of squared distance, offset and velocity, of two agents."""
         return 2 * (1 + 2 * dimension)
 
     def members(self, starts: Sequence[int]) -> dict[str, float]:
-        """Who is in either group."""
+        """Return the first agent of each group, and one past its last."""
         names = ("first", "end", "other_first", "other_end")
         ends = (starts[self.group], starts[self.group + 1], starts[self.other], starts[self.other + 1])
         return dict(zip(names, map(float, ends), strict=True))

@@ -1,4 +1,4 @@
-"""Behaviours about a place, a direction or a speed: seek, flee, arrive, dock, face, target_speed (Reynolds 1999)."""
+"""Behaviours with a target place, direction or speed: seek, flee, arrive, dock, face, target_speed (Reynolds 1999)."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ __all__ = ["Arrive", "Dock", "Face", "Flee", "Seek", "TargetSpeed"]
 
 @law
 def sought(p: Any, me: Me) -> Vec:
-    """F = w (V unit(T - x) - v)."""
+    """Return F = w (V unit(T - x) - v)."""
     return scale(steering.seek(sub(p.target, me.pos), me.vel, top_speed(p, me)), p.weight)
 
 
 @law
 def fled(p: Any, me: Me) -> Vec:
-    """F = w (V unit(x - T) - v), 0 beyond the radius."""
+    """Return F = w (V unit(x - T) - v), 0 beyond the radius."""
     offset = sub(p.target, me.pos)
     away = scale(steering.flee(offset, me.vel, top_speed(p, me)), p.weight)
     return select(dot(offset, offset) < p.radius * p.radius, away, zero(offset))
@@ -32,13 +32,13 @@ def fled(p: Any, me: Me) -> Vec:
 
 @law
 def arrived(p: Any, me: Me) -> Vec:
-    """F = w (V min(1, d / d_slow) unit(T - x) - v)."""
+    """Return F = w (V min(1, d / d_slow) unit(T - x) - v)."""
     return scale(steering.arrive(sub(p.target, me.pos), me.vel, top_speed(p, me), p.slow_radius), p.weight)
 
 
 @law
 def docked(p: Any, me: Me) -> Vec:
-    """Through the gate, then along the axis."""
+    """Return F = w S: through the gate, then along the axis."""
     offset = sub(p.target, me.pos)
     wish = steering.dock(offset, me.vel, p.direction, top_speed(p, me), p.gate, p.width, p.slow_radius)
     return scale(wish, p.weight)
@@ -46,24 +46,24 @@ def docked(p: Any, me: Me) -> Vec:
 
 @law
 def faced(p: Any, me: Me) -> Vec:
-    """Across the way alone."""
+    """Return F = w S, perpendicular to the velocity."""
     return scale(steering.face(me.vel, p.heading), p.weight)
 
 
 @law
 def at_speed(p: Any, me: Me) -> Vec:
-    """Along the way alone."""
+    """Return F = w S, along the velocity."""
     return scale(steering.target_speed(me.vel, p.speed), p.weight)
 
 
 def _demand_direction(name: str, value: tuple[float, ...]) -> None:
-    """Refuse what points nowhere; the squares of others are no numbers of float32."""
+    """Raise ValueError if a direction is zero, or so long or short that its square is out of range in float32."""
     if not 1e-15 <= math.hypot(*value) <= 1e15:
         raise ValueError(f"{name} = {value}: a direction, not all 0 (from 1e-15 to 1e+15 long)")
 
 
 class _ToTarget(Moving):
-    """What behaviours about a place have in common; on a torus its nearest image counts."""
+    """Base of behaviours with a target place; on a torus its nearest image counts."""
 
     target: Vector = Field(description="m, the place")
     places: ClassVar[tuple[str, ...]] = ("target",)
@@ -86,7 +86,7 @@ class Flee(_ToTarget):
     """Head away from a place at full speed, if it is within a panic radius: S = V unit(x - T) - v (Reynolds 1999)."""
 
     kind: Literal["flee"] = "flee"
-    radius: float | None = Field(default=None, gt=0, description="m, beyond it asks for nothing; none = everywhere")
+    radius: float | None = Field(default=None, gt=0, description="m, beyond it the force is 0 (default: unlimited)")
     own_law: ClassVar[Law | None] = fled
     unlimited: ClassVar[tuple[str, ...]] = ("speed", "radius")
     demo: ClassVar[str | None] = """
@@ -100,11 +100,11 @@ effects:
 class Arrive(_ToTarget):
     """Seek a place and stand still there: S = V min(1, d / d_slow) unit(T - x) - v (Reynolds 1999).
 
-    It does not overshoot if d_slow >= V^2 m / max_force, of which LookaheadWarning tells, and weight >= 4 m V / d_slow.
+    It does not overshoot if d_slow >= V^2 m / max_force (else a LookaheadWarning) and weight >= 4 m V / d_slow.
     """
 
     kind: Literal["arrive"] = "arrive"
-    slow_radius: float = Field(gt=0, description="d_slow, m, within which it slows down")
+    slow_radius: float = Field(gt=0, description="d_slow, m, distance within which it slows down")
     own_law: ClassVar[Law | None] = arrived
     demo: ClassVar[str | None] = """
 groups:
@@ -116,19 +116,19 @@ effects:
 
 
 class Dock(_ToTarget):
-    """Arrive at a place while flying in a given direction, through a gate in front of it (Reynolds 1999, in words).
+    """Arrive at a place in a given direction, through a gate in front of it (described in Reynolds 1999).
 
-    It stands still at the place in the end, its last heading that direction: the distance from the axis falls as the
-    square of the distance to go.
+    It stops at the place, its last heading along that direction: the distance from the axis falls as the square of the
+    remaining distance.
     """
 
     kind: Literal["dock"] = "dock"
-    direction: Vector = Field(description="in which it flies when it docks, of any length")
-    gate: float = Field(gt=0, description="m, how far before the place the gate is")
-    width: float = Field(gt=0, description="m, within which of the axis it flies on along it")
-    slow_radius: float = Field(gt=0, description="m, within which it slows down")
+    direction: Vector = Field(description="direction of docking, of any length")
+    gate: float = Field(gt=0, description="m, distance of the gate before the place")
+    width: float = Field(gt=0, description="m, distance from the axis within which it goes along it")
+    slow_radius: float = Field(gt=0, description="m, distance within which it slows down")
     own_law: ClassVar[Law | None] = docked
-    steepness: ClassVar[float] = 4.0  # it aims at the axis half-way to the place, and where it turns in 3.2 were found
+    steepness: ClassVar[float] = 4.0  # it aims at the axis half-way to the place; up to 3.2 was measured
     demo: ClassVar[str | None] = """
 groups:
   - {count: 5, max_speed: 2, max_force: 6, spawn: {low: [-6, -5], high: [-2, 5], speed: [0, 1]}}
@@ -144,7 +144,7 @@ effects:
 
 
 class Face(Behaviour):
-    """Turn the velocity toward a heading and leave the speed as it is; it never brakes, S is across the way.
+    """Turn the velocity toward a heading at unchanged speed: S is perpendicular to the velocity.
 
     tan(a/2) of the angle a between the two falls as exp(-weight t / m). The construction is ours.
     """
@@ -166,7 +166,7 @@ effects:
 
 
 class TargetSpeed(Behaviour):
-    """Take on a speed on the way that one is on: S = (v_t - |v|) unit(v); at standstill it asks for nothing."""
+    """Reach a speed in the current direction of motion: S = (v_t - |v|) unit(v); zero at rest."""
 
     kind: Literal["target_speed"] = "target_speed"
     speed: float = Field(ge=0, description="v_t, m/s")

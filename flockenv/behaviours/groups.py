@@ -1,4 +1,4 @@
-"""People who belong together, and what draws them: walking groups, friends, windows and performers."""
+"""Social groups and attractions of pedestrians: walking groups, friends, windows and performers."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from flockenv.steering.others import ONE_PLACE
 __all__ = ["Friends", "Interest", "WalkingGroup"]
 
 
-# --- what draws -------------------------------------------------------------------------------------------------------
+# --- attraction -------------------------------------------------------------------------------------------------------
 
 
 @law
 def faded(p: Any, time: float) -> float:
-    """What is left of an interest that began at `since`: exp(-(t - t0) / T), 0 before."""
+    """Return the remaining share of an interest that began at `since`: exp(-(t - t0) / T), 0 before."""
     o = like(time, 0.0)
     age = time - p.since
     return exp(-age * p.fading) if age >= o else o
@@ -34,27 +34,27 @@ def faded(p: Any, time: float) -> float:
 
 @law
 def drawn_there(p: Any, me: Me) -> Vec:
-    """A exp(-d / B) exp(-(t - t0) / T) towards the place."""
+    """Return A exp(-d / B) exp(-(t - t0) / T) towards the place."""
     pull = scale(steering.draw(sub(p.target, me.pos), p.decay), size_of(p, me) * faded(p, me.time))
     near = norm(sub(p.target, me.pos)) < p.radius
     return select(near, pull, zero(me.pos))
 
 
 class Interest(Effect):
-    """Drawn to a place, as to a window or a performer, less and less: F = A exp(-d / B) exp(-(t - t0) / T) n.
+    """Attraction to a place, as to a window or a performer, that fades: F = A exp(-d / B) exp(-(t - t0) / T) n.
 
-    -grad W of a potential that grows with the distance and fades with time, as Helbing and Molnar 1995 ask for
-    (equation 7); the form is ours, they give none, and no numbers.
+    It is -grad W of a potential that grows with the distance and fades with time, as required by Helbing and Molnar
+    1995 (equation 7). They give neither form nor numbers: both are ours.
     """
 
     kind: Literal["interest"] = "interest"
-    target: Vector = Field(description="m, what is interesting")
+    target: Vector = Field(description="m, place of attraction")
     strength: float = Field(default=0.0, ge=0, description="A, N")
     acceleration: float = Field(default=0.0, ge=0, description="A, m/s^2: the force is that times its own mass")
     decay: float = Field(gt=0, description="B, m, over which the pull falls to 1/e")
-    fades: float | None = Field(default=None, gt=0, description="T, s, in which interest falls to 1/e; none = it stays")
+    fades: float | None = Field(default=None, gt=0, description="T, s, in which interest falls to 1/e (default: never)")
     since: float = Field(default=0.0, ge=0, description="t0, s, when it begins")
-    radius: float = Field(default=20.0, gt=0, description="m, from further away it does not draw")
+    radius: float = Field(default=20.0, gt=0, description="m, range of the attraction")
     steering: ClassVar[bool] = True
     strengths: ClassVar[tuple[str, ...]] = ("strength", "acceleration")
     places: ClassVar[tuple[str, ...]] = ("target",)
@@ -70,7 +70,7 @@ effects:
 """
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Where, how strong, how far, how long."""
+        """Return place, strength, range and fading."""
         fading = 0.0 if self.fades is None else 1 / self.fades
         numbers = {
             name: float(getattr(self, name)) for name in ("strength", "acceleration", "decay", "since", "radius")
@@ -80,25 +80,25 @@ effects:
 
 @law
 def drawn_together(p: Any, me: Me, other: Other) -> Vec:
-    """exp(-d / B) towards him, and A times that no more than the bound."""
+    """Return exp(-d / B) towards the neighbour, cut so that A times it is at most the bound."""
     return limit(steering.draw(other.offset, p.decay), p.bound / size_of(p, me))
 
 
 @law
 def as_friends(p: Any, me: Me, sums: Vec) -> Vec:
-    """A exp(-(t - t0) / T) times the sum."""
+    """Return A exp(-(t - t0) / T) times the sum."""
     return scale(sums, size_of(p, me) * faded(p, me.time))
 
 
 class Friends(Social):
-    """Drawn to those of a group, less and less: F = A exp(-(t - t0) / T) sum exp(-d / B) n.
+    """Attraction to the agents of a group, that fades: F = A exp(-(t - t0) / T) sum exp(-d / B) n.
 
     The attraction of Helbing and Molnar 1995 (equation 7) to friends; form and numbers are ours, see `interest`.
     """
 
     kind: Literal["friends"] = "friends"
     decay: float = Field(gt=0, description="B, m, over which the pull falls to 1/e")
-    fades: float | None = Field(default=None, gt=0, description="T, s, in which interest falls to 1/e; none = it stays")
+    fades: float | None = Field(default=None, gt=0, description="T, s, in which interest falls to 1/e (default: never)")
     since: float = Field(default=0.0, ge=0, description="t0, s, when it begins")
     pair_law: ClassVar[Law | None] = drawn_together
     finish_law: ClassVar[Law | None] = as_friends
@@ -120,7 +120,7 @@ effects:
 """
 
     def parameters(self) -> dict[str, float | Vec]:
-        """How strong, how far, how long."""
+        """Return strength, range and fading."""
         fading = 0.0 if self.fades is None else 1 / self.fades
         return {**super().parameters(), "decay": self.decay, "since": self.since, "fading": fading}
 
@@ -130,13 +130,13 @@ effects:
 
 @law
 def _party(p: Any, who: float) -> float:
-    """Which of the parties somebody of the group belongs to."""
+    """Return the index of the party of an agent."""
     return np.floor((who - p.first) / p.party)  # type: ignore[no-any-return]
 
 
 @law
 def of_the_party(p: Any, me: Me, other: Other) -> Vec:
-    """Where he is, that he is one, and which way is away from him if he is too near; 0 of who is of another party."""
+    """Return count 1, offset, and repulsion direction if too near, of a neighbour; 0 if it is of another party."""
     o, e = like(other.square, 0.0), like(other.square, 1.0)
     mine = _party(p, me.who) == _party(p, other.who)
     near = mine & (other.square < p.distance * p.distance)
@@ -148,7 +148,7 @@ def of_the_party(p: Any, me: Me, other: Other) -> Vec:
 
 @law
 def as_a_party(p: Any, me: Me, sums: Vec) -> Vec:
-    """m (-beta1 alpha v + beta2 q_A U + beta3 sum q_R W)."""
+    """Return m (-beta1 alpha v + beta2 q_A U + beta3 sum q_R W)."""
     o, e = like(me.mass, 0.0), like(me.mass, 1.0)
     others = sums[0]
     to: Vec
@@ -157,7 +157,7 @@ def as_a_party(p: Any, me: Me, sums: Vec) -> Vec:
         to, away = (sums[1], sums[2]), (sums[3], sums[4])
     else:
         to, away = (sums[1], sums[2], sums[3]), (sums[4], sums[5], sums[6])
-    centre = scale(to, e / (others + e))  # of all of the party, itself too
+    centre = scale(to, e / (others + e))  # of the party, including itself
     alpha = steering.gaze_turn(me.heading, to, p.edge)
     far = norm(centre) > others * like(me.mass, 0.5)  # (N - 1) / 2 m
     wish = add(scale(me.vel, -p.gaze * alpha), scale(unit(centre), p.cohesion if far else o))
@@ -166,24 +166,25 @@ def as_a_party(p: Any, me: Me, sums: Vec) -> Vec:
 
 
 class WalkingGroup(Effect):
-    """Walk in small parties of a group: those of numbers 0 to `party` - 1 are one, the next are another, and so on.
+    """Walk in small parties of a group: its agents 0 to `party` - 1 are one party, the next are another, and so on.
 
-    Moussaid et al. 2010: F = m (-beta1 alpha v + beta2 q_A U + beta3 sum q_R W). alpha is by how much it must turn its
-    head to see the others' centre, U leads to the centre of the party, if that is further than (N - 1) / 2 m (N
-    members), and W away from each who is nearer than `distance`. It comes beside a repulsion from everybody.
+    Moussaid et al. 2010: F = m (-beta1 alpha v + beta2 q_A U + beta3 sum q_R W). alpha is the angle by which an agent
+    must turn its head to see the centre of the others. U points to the centre of the party, if that is further than
+    (N - 1) / 2 m (N members), and W away from each member nearer than `distance`. Combine it with a repulsion from all
+    agents.
     """
 
     kind: Literal["walking_group"] = "walking_group"
     group: int | None = Field(
-        default=None, ge=0, strict=True, description="whose agents walk in parties; none = all, counted through"
+        default=None, ge=0, strict=True, description="group that walks in parties (default: all, counted consecutively)"
     )
-    party: int = Field(ge=2, strict=True, description="N, how many are a party; the last may be smaller")
-    gaze: float = Field(default=4.0, ge=0, description="beta1, 1/(s rad), braking to see the others")
-    cohesion: float = Field(default=3.0, ge=0, description="beta2, m/s^2, to the centre")
-    repulsion: float = Field(default=1.0, ge=0, description="beta3, m/s^2, from each of the party who is too near")
-    distance: float = Field(default=0.8, gt=0, description="m between centres, nearer is too near")
-    fov: float = Field(default=180.0, gt=0, le=360, description="degrees, full angle that is seen without turning")
-    radius: float = Field(default=20.0, gt=0, description="m, whoever is further away is lost")
+    party: int = Field(ge=2, strict=True, description="N, size of a party; the last may be smaller")
+    gaze: float = Field(default=4.0, ge=0, description="beta1, 1/(s rad), braking by the angle of gaze")
+    cohesion: float = Field(default=3.0, ge=0, description="beta2, m/s^2, towards the centre")
+    repulsion: float = Field(default=1.0, ge=0, description="beta3, m/s^2, from each member that is too near")
+    distance: float = Field(default=0.8, gt=0, description="m between centres, below which members repel")
+    fov: float = Field(default=180.0, gt=0, le=360, description="degrees, full angle of view without turning")
+    radius: float = Field(default=20.0, gt=0, description="m, range within which members count")
     steering: ClassVar[bool] = True
     always: ClassVar[bool] = False
     strengths: ClassVar[tuple[str, ...]] = ("gaze", "cohesion", "repulsion")
@@ -201,25 +202,25 @@ effects:
 
     @property
     def sight(self) -> Sight:
-        """Those of the group, all around."""
+        """The agents of the group, in all directions."""
         return Sight(self.radius, group=self.group)
 
     def parameters(self) -> dict[str, float | Vec]:
-        """beta1 to beta3, and who belongs together."""
+        """Return beta1 to beta3, the size of a party and its distance."""
         names = ("party", "gaze", "cohesion", "repulsion", "distance")
         return {"edge": math.radians(self.fov) / 2, **{name: float(getattr(self, name)) for name in names}}
 
     def members(self, starts: Sequence[int]) -> dict[str, float]:
-        """The first agent of the group, and the first after it."""
+        """Return the first agent of the group, and one past its last."""
         first, end = (0, starts[-1]) if self.group is None else starts[self.group : self.group + 2]
         return {"first": float(first), "end": float(end)}
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """No oscillation, and damping of beta1 times the largest turn of a head, pi less half of the field of view."""
+        """Return no oscillation, and damping beta1 times the largest turn of a head, pi less half the field of view."""
         most = self.gaze * (math.pi - math.radians(self.fov) / 2)
         damping = np.where(np.isfinite(all_masses(groups, dimension)), most, 0.0)
         return np.zeros(len(damping)), damping
 
     def sums(self, dimension: int) -> int:
-        """How many others, where, and away from those who are too near."""
+        """Return the size of count, summed offset and summed repulsion."""
         return 1 + 2 * dimension

@@ -1,4 +1,4 @@
-"""Two rules instead of forces: look where the way is free, and go no faster than is safe: Moussaid et al. 2011."""
+"""Two rules instead of forces: select a free direction, and go no faster than is safe: Moussaid et al. 2011."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ __all__ = ["DIRECTIONS", "Heuristics"]
 Floats = NDArray[np.float64]
 
 DIRECTIONS = 31
-"""Directions that are looked at within the field of view, from the rightmost to the leftmost; the aim is one more."""
+"""Number of directions tested within the field of view, from the rightmost to the leftmost; the aim is one more."""
 
 SIDES = ("wall", "capsule", "polygon", "block", "half_space")
-"""Kinds of obstacles whose sides are straight."""
+"""Kinds of obstacles with straight sides."""
 
 ENDLESS = 1e4
 """m, half the length of the line that stands for the surface of a half-space."""
@@ -36,7 +36,7 @@ ENDLESS = 1e4
 
 @law
 def turned_by(way: Vec, cosine: float, sine: float) -> Vec:
-    """Return the vector, turned to the left."""
+    """Return the vector turned to the left."""
     return (way[0] * cosine - way[1] * sine, way[0] * sine + way[1] * cosine)
 
 
@@ -44,7 +44,7 @@ def nearer(
     found: Vec, way: Vec, aim: Vec, cosine: float, sine: float, offset: Vec, velocity: Vec, clearance: float,
     speed: float,
 ) -> Vec:  # fmt: skip
-    """Return, of all directions, how far one may go: on to meet who goes on, and to where he is now; the less of both.
+    """Return the free distances `found`, reduced by one more neighbour: at constant velocity, then as if at rest.
 
     found: DIRECTIONS distances, that along the aim, and as many again. way: the rightmost direction.
     """
@@ -59,7 +59,7 @@ def nearer(
 
 @overload(nearer, jit_options=OPTIONS)
 def _nearer(found, way, aim, cosine, sine, offset, velocity, clearance, speed):  # type: ignore[no-untyped-def]
-    """Written out, so that lanes lie side by side."""
+    """Return the function with its loop unrolled, for use of SIMD lanes."""
     count = DIRECTIONS + 1
     lines = [
         "def all_ways(found, way, aim, cosine, sine, offset, velocity, clearance, speed):",
@@ -79,12 +79,12 @@ def _nearer(found, way, aim, cosine, sine, offset, velocity, clearance, speed): 
     made: dict[str, Any] = {
         "zero": zero, "like": like, "turned_by": turned_by, "distance": steering.collision_distance
     }  # fmt: skip
-    exec("\n".join(lines), made)  # noqa: S102  # how many directions there are is a constant
+    exec("\n".join(lines), made)  # noqa: S102  # the number of directions is a constant
     return made["all_ways"]
 
 
 def unseen(far: float) -> Vec:
-    """Return as many infinite distances as there are."""
+    """Return the initial distances, all infinite."""
     return (far,) * (2 * DIRECTIONS + 2)
 
 
@@ -97,13 +97,13 @@ def _unseen(far):  # type: ignore[no-untyped-def]
 
 @law
 def all_free(p: Any, me: Me) -> Vec:
-    """Nobody in the way yet."""
+    """Return the initial distances: all directions are free."""
     return unseen(like(me.radius, np.inf))
 
 
 @law
 def _view(p: Any, me: Me) -> tuple[Vec, Vec]:
-    """Return the rightmost direction that it sees, and where it wants to go; who stands looks where he wants to go."""
+    """Return the rightmost direction of its field of view, and its aim; an agent at rest faces its aim."""
     aim = unit(me.aim)
     moves = dot(me.heading, me.heading) > like(me.radius, 0.0)
     return turned_by(select(moves, me.heading, aim), p.edge_cosine, -p.edge_sine), aim
@@ -111,7 +111,7 @@ def _view(p: Any, me: Me) -> tuple[Vec, Vec]:
 
 @law
 def in_the_way(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
-    """How far each way is free of one more."""
+    """Reduce the free distances by one more agent."""
     way, aim = _view(p, me)
     room = me.radius + other.radius
     return nearer(acc, way, aim, p.cosine, p.sine, other.offset, other.vel, room, me.desired_speed)
@@ -119,7 +119,7 @@ def in_the_way(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
 
 @law
 def round_in_the_way(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
-    """How far each way is free of a round obstacle, which stands."""
+    """Reduce the free distances by a round obstacle, which is at rest."""
     way, aim = _view(p, me)
     room = me.radius + other.radius
     return nearer(acc, way, aim, p.cosine, p.sine, other.offset, zero(me.vel), room, me.desired_speed)
@@ -129,9 +129,9 @@ def round_in_the_way(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
 def until_a_wall(p: Any, me: Me, way: Vec, reach: float) -> float:
     """Return how far its body goes until it touches a straight side, m; inf if that is further than `reach`.
 
-    A side that it touches already is in no way that leads off it.
+    A side that it touches already does not block directions that lead off it.
 
-    The table: the edges of a torus, 0 without one, then of each side its ends (4) and half its thickness, m.
+    The table: the edges of a torus, 0 without one, then for each side its ends (4) and half its thickness, m.
     """
     o, half = like(reach, 0.0), like(reach, 0.5)
     best = like(reach, np.inf)
@@ -152,7 +152,7 @@ def until_a_wall(p: Any, me: Me, way: Vec, reach: float) -> float:
 
 @law
 def chosen_way(p: Any, me: Me, acc: Vec) -> Vec:
-    """F = m (v_des e(alpha) - v) / tau, alpha where d(alpha) is least; of two ways as good, the right one."""
+    """Return F = m (v_des e(alpha) - v) / tau, alpha that of least d(alpha); of two equal ones, the right one."""
     free = stacked(acc)
     count = DIRECTIONS + 1
     e, o = like(me.radius, 1.0), like(me.radius, 0.0)
@@ -162,13 +162,13 @@ def chosen_way(p: Any, me: Me, acc: Vec) -> Vec:
     sees = (dot(me.heading, aim) >= p.edge_cosine) | (not moves)
     best, chosen, ahead = like(me.radius, np.inf), zero(me.vel), o
     for j in range(count):
-        k = DIRECTIONS if j == 0 else j - 1  # the aim first: of what is as good, what it wants
+        k = DIRECTIONS if j == 0 else j - 1  # the aim first: it wins against equal directions
         u = aim if j == 0 else way
         if (k < DIRECTIONS) | sees:
             wall = until_a_wall(p, me, u, p.radius)
             f = min(min(free[k], wall), p.radius)
             d = p.radius * p.radius + f * f - (f + f) * p.radius * dot(aim, u)
-            better = d < best - like(d, 1e-6) * p.radius * p.radius  # what rounding tells apart is as good
+            better = d < best - like(d, 1e-6) * p.radius * p.radius  # a difference by rounding is a tie
             best, chosen = d if better else best, select(better, u, chosen)
             ahead = min(free[count + k], wall) if better else ahead
         if j > 0:
@@ -178,23 +178,24 @@ def chosen_way(p: Any, me: Me, acc: Vec) -> Vec:
 
 
 class Heuristics(Effect):
-    """Take the most direct way that is free, as fast as is safe: F = m (v_des e(alpha) - v) / tau, and no other force.
+    """Take the most direct free direction, as fast as is safe: F = m (v_des e(alpha) - v) / tau, and no other force.
 
-    Moussaid, Helbing and Theraulaz 2011. alpha lies within `view` to either side of where it goes, and is where
-    d^2 = d_max^2 + f^2 - 2 d_max f cos(alpha_0 - alpha) is least: f(alpha) is how far it comes at its desired speed
-    until it touches somebody who goes on, or a wall; at most d_max. v_des = min(v0, d_h / tau), d_h how far whoever or
-    whatever is first in that direction is now. Bodies that touch are `contact` (k = 5e3 kg/s^2) and `obstacle_contact`.
+    Moussaid, Helbing and Theraulaz 2011. alpha lies within `view` to either side of the heading, and minimises
+    d^2 = d_max^2 + f^2 - 2 d_max f cos(alpha_0 - alpha). f(alpha) is the distance travelled at desired speed until it
+    touches an agent that keeps its velocity, or a wall; at most d_max. v_des = min(v0, d_h / tau), d_h the present
+    distance to the first agent or obstacle in that direction. Contact forces are those of `contact` (k = 5e3 kg/s^2)
+    and `obstacle_contact`.
 
-    31 directions are looked at, and that of the aim (me.aim): the paper's alpha is continuous, ours is within 2.5
-    degrees at 75. It stands for `driving`: give one or the other. In a plane, among walls that stand still.
+    31 directions are tested, and that of the aim (me.aim): the paper's alpha is continuous, ours is within 2.5 degrees
+    at 75. It replaces `driving`: use one or the other. In 2-D only, among walls that stand still.
     """
 
     kind: Literal["heuristics"] = "heuristics"
     weight: float = Field(default=1.0, ge=0, description="a factor, 1 as published")
-    tau: float = Field(default=0.5, gt=0, description="s, relaxation time, and the time that it keeps to what is ahead")
-    radius: float = Field(default=10.0, gt=0, description="d_max, m, how far it sees")
+    tau: float = Field(default=0.5, gt=0, description="s, relaxation time, and least time to collision")
+    radius: float = Field(default=10.0, gt=0, description="d_max, m, range of sight")
     view: float = Field(default=75.0, gt=0, le=180, description="phi, degrees to either side")
-    group: int | None = Field(default=None, ge=0, description="whom it sees; none = all")
+    group: int | None = Field(default=None, ge=0, description="group that it sees (default: all)")
     steering: ClassVar[bool] = True
     tabled: ClassVar[bool] = True
     pair_start: ClassVar[Law | None] = all_free
@@ -220,11 +221,11 @@ effects:
 
     @property
     def sight(self) -> Sight:
-        """As far as it sees, all around: who comes from behind may be met too."""
+        """Its range, in all directions: agents from behind may also collide."""
         return Sight(self.radius, group=self.group)
 
     def parameters(self) -> dict[str, float | Vec]:
-        """How fast, how far, and by how much one direction is turned from the next."""
+        """Return weight, tau, range, half angle of view, and the angle between directions."""
         edge = math.radians(self.view)
         step = 2 * edge / (DIRECTIONS - 1)
         return {
@@ -234,13 +235,13 @@ effects:
         }  # fmt: skip
 
     def table(self, scene: SceneView) -> Floats:
-        """The edges of a torus, and every straight side that stands."""
+        """Return the edges of a torus, and every straight side."""
         size = scene.space.extent(2) if scene.space.periodic else (0.0, 0.0)
         sides = [side for shape in scene.shapes for side in _sides(shape)]
         return np.array([*size, *(number for side in sides for number in side)])
 
     def check(self, scene: SceneView) -> None:
-        """Refuse space, obstacles whose sides are not straight or that move, and those without a desired speed."""
+        """Raise ValueError in 3-D, or if an obstacle moves or has sides that are not straight."""
         if scene.dimension != 2:
             raise ValueError(f"kind = heuristics: dimension = {scene.dimension}, must be 2")
         demand_group("group", self.group, scene.groups)
@@ -256,15 +257,15 @@ effects:
         super().check(scene)
 
     def lookahead(self, speed: float) -> float:
-        """As far as it sees."""
+        """Return the range of sight, m."""
         return self.radius
 
     def sums(self, dimension: int) -> int:
-        """How far every direction, and the aim, are free: of those who go on, and as they are now."""
+        """Return the number of free distances: of every direction and the aim, for moving and for resting agents."""
         return 2 * DIRECTIONS + 2
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:
-        """No oscillation, and damping of 1 / tau."""
+        """Return no oscillation, and a damping of weight / tau."""
         n = len(all_masses(groups, dimension))
         return np.zeros(n), np.full(n, self.weight / self.tau)
 

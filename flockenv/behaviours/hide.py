@@ -1,4 +1,4 @@
-"""Hide: put an obstacle between oneself and who seeks (Reynolds 1999)."""
+"""Hide: keep an obstacle between the agent and a seeker (Reynolds 1999)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["Hide"]
 
 @law
 def seeker(p: Any, me: Me, sums: Vec) -> Vec:
-    """Return where who seeks will be, an offset in m; 0 if there is nobody."""
+    """Return the offset of the seeker's predicted position, m; 0 if there is no seeker."""
     offset, velocity, some = seen_one(sums)
     time = steering.approach_time(offset, norm(velocity), p.longest)
     return select(some, add(offset, scale(velocity, time)), zero(offset))
@@ -26,13 +26,13 @@ def seeker(p: Any, me: Me, sums: Vec) -> Vec:
 
 @law
 def no_place(p: Any, me: Me, threat: Vec) -> Vec:
-    """No hiding place yet: infinitely far; and the one to hide from."""
+    """Return the initial value: no hiding place, infinitely far; and the offset of the seeker."""
     return (like(me.radius, np.inf),) + zero(threat) + threat  # noqa: RUF005  # numba joins tuples, does not unpack them
 
 
 @law
 def _places(acc: Vec) -> tuple[Vec, Vec]:
-    """Return the offsets of the nearest hiding place and of the one to hide from."""
+    """Return the offsets of the nearest hiding place and of the seeker."""
     if len(acc) == 5:
         return (acc[1], acc[2]), (acc[3], acc[4])
     else:
@@ -41,17 +41,17 @@ def _places(acc: Vec) -> tuple[Vec, Vec]:
 
 @law
 def nearest_place(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
-    """Keep the nearest place behind an obstacle."""
+    """Keep the nearest hiding place behind an obstacle."""
     goal, threat = _places(acc)
     place = steering.hiding_place(other.offset, other.radius, me.radius + p.margin, threat)
     square = dot(place, place)
-    nearer = (square < acc[0]) & (other.radius > like(square, 0.0))  # behind round ones alone
+    nearer = (square < acc[0]) & (other.radius > like(square, 0.0))  # round obstacles only
     return (square if nearer else acc[0],) + select(nearer, place, goal) + threat  # noqa: RUF005
 
 
 @law
 def hidden(p: Any, me: Me, acc: Vec) -> Vec:
-    """F = w S: arrive there; without a place flee; without anybody nothing."""
+    """Return F = w S: arrive at the place; flee if there is none; 0 without a seeker."""
     goal, threat = _places(acc)
     top, o = top_speed(p, me), like(me.radius, 0.0)
     there = steering.arrive(goal, me.vel, top, p.slow_radius)
@@ -62,14 +62,14 @@ def hidden(p: Any, me: Me, acc: Vec) -> Vec:
 class Hide(AboutNearest, Moving):
     """Arrive at the nearest place behind a round obstacle, seen from the nearest of a group; evade if there is none.
 
-    The place is c + (radius + own radius + margin) unit(c - x_s) (Reynolds 1999; yuka), x_s where who seeks will be in
-    min(longest, d / |v_s|). What lies in between is for avoid_obstacles.
+    The place is c + (radius + own radius + margin) unit(c - x_s) (Reynolds 1999; yuka), x_s the seeker's position after
+    min(longest, d / |v_s|). Combine it with avoid_obstacles for obstacles on the path.
     """
 
     kind: Literal["hide"] = "hide"
-    margin: float = Field(default=0.5, ge=0, description="m, between an obstacle and who hides behind it")
-    slow_radius: float = Field(gt=0, description="m, from the place, within which it slows down")
-    longest: float = Field(default=0.5, ge=0, description="s, it foresees who seeks no further")
+    margin: float = Field(default=0.5, ge=0, description="m, gap between an obstacle and the hidden agent")
+    slow_radius: float = Field(gt=0, description="m, distance from the place within which it slows down")
+    longest: float = Field(default=0.5, ge=0, description="s, longest prediction of the seeker")
     finish_law: ClassVar[Law | None] = seeker
     obstacle_start: ClassVar[Law | None] = no_place
     obstacle_law: ClassVar[Law | None] = nearest_place
@@ -89,5 +89,5 @@ effects:
 """
 
     def folded(self, dimension: int) -> int:
-        """Square of the distance, and offsets of the nearest place and of the one to hide from."""
+        """Return the size of squared distance, and offsets of the nearest place and of the seeker."""
         return 1 + 2 * dimension

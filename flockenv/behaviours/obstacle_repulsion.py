@@ -1,4 +1,4 @@
-"""Keep off walls: a repulsion that falls exponentially with the distance, summed over all sides around."""
+"""Repulsion from walls that falls exponentially with the distance, summed over all sides within range."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ __all__ = ["ObstacleRepulsion"]
 
 @law
 def nowhere(p: Any, me: Me) -> Vec:
-    """No force yet."""
+    """Return the initial force, zero."""
     return zero(me.pos)
 
 
 @law
 def pushed_off(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
-    """A exp((r_i - d) / B) n, within reach."""
+    """Add A exp((r_i - d) / B) n, within range."""
     force = (p.strength + me.mass * p.acceleration) * exp((p.bodies * me.radius - other.gap) / p.decay)
     force = force if force < p.bound else p.bound
     return select(other.gap < p.radius, add(acc, scale(other.normal, force)), acc)
@@ -34,13 +34,13 @@ def pushed_off(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
 
 @law
 def within(p: Any, me: Me) -> float:
-    """The distance up to which it looks."""
+    """Return its range, m."""
     return p.radius  # type: ignore[no-any-return]
 
 
 @law
 def all_sides(p: Any, me: Me, acc: Vec) -> Vec:
-    """The sum."""
+    """Return the sum."""
     return acc
 
 
@@ -48,19 +48,19 @@ class ObstacleRepulsion(Push):
     """Keep off every wall: F = A exp((r_i - d) / B) n, d from the body's centre; r_i its radius, or 0.
 
     Helbing and Molnar 1995: -grad U0 exp(-d / R), so A = U0 / R in m/s^2, B = R, `bodies: false`. Helbing, Farkas and
-    Vicsek 2000: A in N, with bodies. Summed over sides: of walls, polygons and rooms every straight side acts by the
-    foot of the perpendicular on it, and a corner where it is nearest to all sides that meet there, once; so a wall is
-    the same however it is cut, and where walls that stand still are joined. If two obstacles lie on each other (a
-    wall given twice, rooms with a common side), both act. What is round, thick or a grid acts by its nearest point.
-    With `occluded`, nothing acts through a wall. If a body is inside something solid, the force points out through the
-    nearest point, and goes on growing.
+    Vicsek 2000: A in N, with bodies. Summed over sides: every straight side of walls, polygons and rooms acts by the
+    foot of the perpendicular on it; a corner acts once, if it is the nearest point of all sides that meet there. So
+    the force does not depend on how a wall is divided, also where walls that stand still are joined. If two obstacles
+    coincide (a wall given twice, rooms with a common side), both act. Round and thick shapes and grids act by their
+    nearest point. With `occluded`, no side acts through another obstacle. If a body is inside a solid obstacle, the
+    force points out through the nearest point, and grows with depth.
     """
 
     kind: Literal["obstacle_repulsion"] = "obstacle_repulsion"
     decay: float = Field(gt=0, description="B, m, over which the force falls to 1/e")
-    bodies: bool = Field(default=True, description="is the distance that from the body's surface, not its centre?")
-    radius: float = Field(default=3.0, gt=0, description="m from its centre, beyond which walls do nothing")
-    occluded: bool = Field(default=False, description="do only sides push that no other obstacle hides?")
+    bodies: bool = Field(default=True, description="True: distance from the body's surface; False: from its centre")
+    radius: float = Field(default=3.0, gt=0, description="m from its centre, range within which walls act")
+    occluded: bool = Field(default=False, description="True if obstacles hide the sides of others")
     obstacle_pieces: ClassVar[bool] = True
     obstacle_start: ClassVar[Law | None] = nowhere
     obstacle_law: ClassVar[Law | None] = pushed_off
@@ -81,20 +81,20 @@ effects:
 
     @property
     def occluded_obstacles(self) -> bool:
-        """Whether walls hide walls."""
+        """True if walls hide walls."""
         return self.occluded
 
     def parameters(self) -> dict[str, float | Vec]:
-        """A, B, whose surface, and how far it looks."""
+        """Return A, B, `bodies` and the range."""
         about = {"decay": self.decay, "bodies": float(self.bodies), "radius": self.radius}
         return {**super().parameters(), **about}
 
     def folded(self, dimension: int) -> int:
-        """The force so far."""
+        """Return the size of a force."""
         return dimension
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """w^2 = A / (m B) where a body touches a wall (of distances alone, its centre does); deeper it is steeper."""
+        """Return w^2 = A / (m B) for a body that touches a wall, no damping; it is steeper for deeper overlap."""
         mass = all_masses(groups, dimension)
         square = (self.strength / mass + np.where(np.isfinite(mass), self.acceleration, 0.0)) / self.decay
         return square, np.zeros(len(mass))

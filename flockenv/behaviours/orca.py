@@ -1,4 +1,4 @@
-"""Reciprocal collision avoidance among agents and round obstacles, in a plane: ORCA as a behaviour."""
+"""Reciprocal collision avoidance among agents and round obstacles in 2-D: ORCA as a behaviour."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["Orca"]
 
 
 def kept(slots: Vec, new: Vec) -> Vec:
-    """Return the slots with a new one sorted in by its power distance, |offset|^2 - radius^2; the last drops out."""
+    """Return the slots with a new one inserted by its power distance, |offset|^2 - radius^2; the last is dropped."""
     size = len(new)
     listed: Vec = ()
     for k in range(0, len(slots), size):
@@ -36,7 +36,7 @@ def _power(slot: Vec) -> float:
 
 @overload(kept, jit_options=OPTIONS)
 def _kept(slots, new):  # type: ignore[no-untyped-def]  # numba compares signatures, annotations included
-    """Written out for as many slots as there are, as choices without branches, so that lanes sort side by side."""
+    """Return the function unrolled for the number of slots, with selects instead of branches, for SIMD lanes."""
     size, lines = len(new), ["def sort_in(slots, new):"]
     held = [f"c{j}" for j in range(size)]
     lines.append(f"    {', '.join(held)} = new")
@@ -51,13 +51,13 @@ def _kept(slots, new):  # type: ignore[no-untyped-def]  # numba compares signatu
             kept_.append(f"k{k + j}")
     lines.append(f"    return ({', '.join(kept_)},)")
     made: dict[str, Any] = {}
-    exec("\n".join(lines), made)  # noqa: S102  # how many there are is a type's
+    exec("\n".join(lines), made)  # noqa: S102  # their number is part of the type
     return made["sort_in"]
 
 
 @law
 def nobody(p: Any, me: Me) -> Vec:
-    """Six places without anybody."""
+    """Return six empty slots."""
     far, o, e = like(me.radius, np.inf), like(me.radius, 0.0), like(me.radius, 1.0)
     empty = (far, far, o, o, -e, o)
     return empty + empty + empty + empty + empty + empty
@@ -65,7 +65,7 @@ def nobody(p: Any, me: Me) -> Vec:
 
 @law
 def near_agent(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
-    """Keep an agent if he is among the nearest; who is in the same place is taken to be a little to one side."""
+    """Keep an agent if it is among the nearest; one in the same place is moved a little to one side."""
     one_place = other.square <= like(other.square, 1e-12)
     to = select(one_place, scale(sub(me.tie, other.tie), like(other.square, -1e-6)), other.offset)
     return kept(acc, (to[0], to[1], other.vel[0], other.vel[1], other.radius, like(other.square, 0.5)))
@@ -80,7 +80,7 @@ def near_obstacle(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
 
 @law
 def reciprocal(p: Any, me: Me, acc: Vec) -> Vec:
-    """F = w (v_orca - v), the wish being to arrive."""
+    """Return F = w (v_orca - v), with arrival as the preferred velocity."""
     speed = top_speed(p, me)
     wish = steering.arrive(sub(p.target, me.pos), zero(me.vel), speed, p.slow_radius)
     top = min(p.hurry * speed, me.max_speed)
@@ -88,25 +88,28 @@ def reciprocal(p: Any, me: Me, acc: Vec) -> Vec:
 
 
 class Orca(Moving):
-    """Arrive at a point with the velocity nearest to the wished one that touches nobody within `horizon` seconds.
+    """Arrive at a point with the velocity nearest to the preferred one that is collision-free for `horizon` seconds.
 
     Optimal reciprocal collision avoidance (van den Berg et al. 2011) among the six nearest agents and obstacles.
-    It chooses a velocity: without inertia (weight = m / dt, no max_force) those who all do so never touch.
+    It selects a velocity: without inertia (weight = m / dt, no max_force) agents that all use it never touch.
     """
 
     kind: Literal["orca"] = "orca"
-    weight: float = Field(ge=0, description="kg/s, gain; m / dt takes on the velocity at once")
-    target: Vector = Field(description="m, where to arrive; in a plane")
-    hurry: float = Field(default=1.2, ge=1, description="top speed of an evasion, in `speed`s; at most max_speed")
-    slow_radius: float = Field(default=0.5, gt=0, description="m, it slows down within this of its target")
-    radius: float = Field(default=8.0, gt=0, description="m, agents further away are not looked at")
-    horizon: float = Field(default=3.0, gt=0, description="s, for so long the velocity must be free")
-    step: float = Field(default=0.1, gt=0, description="s, who overlaps parts within this")
+    weight: float = Field(ge=0, description="kg/s, gain; m / dt reaches the velocity in one step")
+    target: Vector = Field(description="m, the goal, in 2-D")
+    hurry: float = Field(default=1.2, ge=1, description="top speed of an evasion, times `speed`; at most max_speed")
+    slow_radius: float = Field(default=0.5, gt=0, description="m, distance within which it slows down")
+    radius: float = Field(default=8.0, gt=0, description="m, range within which agents count")
+    horizon: float = Field(default=3.0, gt=0, description="s, time for which the velocity is collision-free")
+    step: float = Field(default=0.1, gt=0, description="s, time within which overlaps are resolved")
     margin: float = Field(default=0.0, ge=0, description="m, clearance beyond both radii")
     turn: float = Field(
-        default=0.05, ge=0, le=1.5, description="rad, a wish that is not free is turned right by this: no standstill"
+        default=0.05,
+        ge=0,
+        le=1.5,
+        description="rad, turn to the right of a blocked preferred velocity, against deadlock",
     )
-    group: int | None = Field(default=None, ge=0, description="whom it avoids; none = all")
+    group: int | None = Field(default=None, ge=0, description="group that it avoids (default: all)")
     places: ClassVar[tuple[str, ...]] = ("target",)
     pair_start: ClassVar[Law | None] = nobody
     pair_law: ClassVar[Law | None] = near_agent
@@ -125,30 +128,28 @@ effects:
 
     @property
     def sight(self) -> Sight:
-        """Radius, whom."""
+        """Radius and group."""
         return Sight(self.radius, group=self.group)
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Where to, how fast, how far ahead: who is seen is the sweep's business."""
+        """Return target, speed and the numbers of ORCA; the neighbour query uses the rest."""
         names = ("weight", "hurry", "slow_radius", "horizon", "step", "margin", "turn")
         return {"target": self.target, "speed": self.limit, **{name: float(getattr(self, name)) for name in names}}
 
     def lookahead(self, speed: float) -> float:
-        """As far as it comes within the horizon, and as it sees."""
+        """Return the distance travelled within the horizon, m, at most the range of sight."""
         return min(speed * self.horizon, self.radius)
 
     def check(self, scene: SceneView) -> None:
-        """Refuse space."""
+        """Raise ValueError in 3-D, or if an obstacle is not a round, solid one that stands still."""
         if scene.dimension != 2:
             raise ValueError(f"kind = orca: dimension = {scene.dimension}, must be 2")
         for k, obstacle in enumerate(scene.obstacles):
             if not obstacle.in_state:
                 what = ", which moves or is hollow" if obstacle.kind == "circle" else ""
-                raise ValueError(
-                    f"kind = orca: sees round obstacles alone, obstacles[{k}].kind = {obstacle.kind}{what}"
-                )
+                raise ValueError(f"kind = orca: sees round obstacles only, obstacles[{k}].kind = {obstacle.kind}{what}")
         super().check(scene)
 
     def sums(self, dimension: int) -> int:
-        """Six neighbours."""
+        """Return the size of six slots."""
         return 6 * orca.SLOT

@@ -1,6 +1,7 @@
-"""Along paths and fields (Reynolds 1999): follow a path, stay on it, follow a field of velocities on a grid.
+"""Paths and flow fields (Reynolds 1999): follow a path, stay on it, follow a field of velocities on a grid.
 
-A path is a tube: straight pieces, its spine, and a radius. Who will still be in it in `time` seconds is let alone.
+A path is a tube: straight pieces, its spine, and a radius. An agent that will still be inside in `time` seconds is not
+steered.
 """
 
 from __future__ import annotations
@@ -25,16 +26,16 @@ from flockenv.physics.effects.effect import Me, Vector
 __all__ = ["FollowFlow", "FollowPath", "StayOnPath"]
 
 SLOWEST = 0.25
-"""Share of the wanted speed at which it looks ahead at least: who stands still must be sent somewhere."""
+"""Smallest speed for the look-ahead, as a share of top speed: an agent at rest also needs a target ahead."""
 
 
 MOST_PLACES = 500
-"""Of a path, in pictures."""
+"""Most points of a path in pictures."""
 
 
 @law
 def _offset(found: Vec) -> Vec:
-    """Return the offset of what `polyline.nearest` found."""
+    """Return the offset part of a result of `polyline.nearest`."""
     if len(found) == 3:
         return (found[1], found[2])
     else:
@@ -43,7 +44,7 @@ def _offset(found: Vec) -> Vec:
 
 @law
 def path_followed(p: Any, me: Me) -> Vec:
-    """F = w S."""
+    """Return F = w S of following the path."""
     top = top_speed(p, me)
     o, way = like(top, 0.0), like(top, p.way)
     now = polyline.nearest(p.table, me.pos)
@@ -60,7 +61,7 @@ def path_followed(p: Any, me: Me) -> Vec:
 
 @law
 def path_kept(p: Any, me: Me) -> Vec:
-    """F = w S."""
+    """Return F = w S of staying on the path."""
     step = scale(me.vel, p.time)
     to_spine = _offset(polyline.nearest(p.table, add(me.pos, step)))
     beyond = norm(to_spine) - p.radius
@@ -70,7 +71,7 @@ def path_kept(p: Any, me: Me) -> Vec:
 
 @law
 def _middle(table: Any, x: Vec) -> Vec:
-    """Return the middle of a grid."""
+    """Return the centre of a grid."""
     d = len(x)
     half = like(x[0], 0.5) * table[d]
     e = like(x[0], 1.0)
@@ -83,30 +84,30 @@ def _middle(table: Any, x: Vec) -> Vec:
 
 @law
 def flow_followed(p: Any, me: Me) -> Vec:
-    """F = w S, 0 outside the grid."""
+    """Return F = w (u - v), 0 outside the grid."""
     there = add(me.pos, scale(me.vel, p.time))
-    at = add(sub(there, p.centre), _middle(p.table, there))  # on a torus p.centre is the image that is nearest
+    at = add(sub(there, p.centre), _middle(p.table, there))  # on a torus p.centre is the nearest image
     wish = steering.follow_flow(grid.sample_vector(p.table, at, 0), me.vel)
     return scale(select(grid.covers(p.table, at), wish, zero(me.vel)), p.weight)
 
 
 class _OnPath(Moving):
-    """What both have in common: a tube, and how far ahead they look."""
+    """Base of the behaviours on a path: a tube, and a look-ahead time."""
 
     tabled: ClassVar[bool] = True
     places: ClassVar[tuple[str, ...]] = ("points",)
     heads_for: ClassVar[bool] = False
 
     points: Annotated[tuple[Vector, ...], Field(min_length=2, max_length=1024)] = Field(
-        description="m, the corners of its spine; on a torus each piece between two goes the shortest way"
+        description="m, corners of its spine; on a torus each piece takes the shortest path"
     )
-    closed: bool = Field(default=False, description="does the last point lead back to the first?")
-    radius: float = Field(gt=0, description="m, of the tube")
-    time: float = Field(default=0.5, ge=0, description="s, how far ahead it looks")
+    closed: bool = Field(default=False, description="True if the last point is joined to the first")
+    radius: float = Field(gt=0, description="m, radius of the tube")
+    time: float = Field(default=0.5, ge=0, description="s, look-ahead time")
 
     @model_validator(mode="after")
     def _is_a_path(self) -> _OnPath:
-        """Refuse points of different dimensions, and two in one place."""
+        """Raise ValueError if points differ in dimension, or two coincide."""
         for k, point in enumerate(self.points):
             if len(point) != len(self.points[0]):
                 raise ValueError(f"points[{k}] = {point}: the first point has {len(self.points[0])} coordinates")
@@ -114,22 +115,22 @@ class _OnPath(Moving):
         return self
 
     def parameters(self) -> dict[str, float | Vec]:
-        """All but the path itself, which is in the table."""
+        """Return all parameters but the path itself, which is in the table."""
         return {"speed": self.limit, "weight": self.weight, "radius": self.radius, "time": self.time}
 
     def table(self, scene: SceneView) -> NDArray[np.float64]:
-        """The path."""
+        """Return the pieces of the path."""
         return polyline.pieces(self.points, self.closed, scene.space)
 
     def way_shown(self, scene: SceneView) -> tuple[tuple[Vec, ...], float] | None:
-        """Its tube: places half a radius apart, at most MOST_PLACES."""
+        """Return its tube for pictures: points half a radius apart, at most MOST_PLACES pieces, and the radius."""
         path = scene.table_of(self)
         count = min(math.ceil(path[1] / (0.5 * self.radius)), MOST_PLACES)
         along = polyline.on_spine(path, np.linspace(0.0, path[1], count + 1), scene.dimension)
         return tuple(map(tuple, scene.space.wrap(along).tolist())), self.radius
 
     def check(self, scene: SceneView) -> None:
-        """Refuse a path of another dimension, or one that a torus makes a point of."""
+        """Raise ValueError if the path has another dimension, or a piece has no length on a torus."""
         if len(self.points[0]) != scene.dimension:
             raise ValueError(f"points[0] = {self.points[0]}: dimension = {scene.dimension}")
         super().check(scene)
@@ -137,20 +138,22 @@ class _OnPath(Moving):
 
 
 class FollowPath(_OnPath):
-    """Follow a path in one of its directions: nothing while on its way in the tube, else seek the spine further along.
+    """Follow a path in one direction: zero while the agent makes progress inside the tube, else seek the spine ahead.
 
-    Reynolds lets alone whoever gains anything on its way, so that it coasts for ever at whatever speed it has: here it
-    must gain `keep` times its speed. Two groups with opposite ways are traffic. The end of an open path is sought, or
-    arrived at within `slow_radius`.
+    In Reynolds' version any progress is enough, so an agent coasts for ever at whatever speed it has; here it must
+    progress at `keep` times top speed. Two groups with opposite directions are traffic. At the end of an open path the
+    agent seeks the end, or arrives at it within `slow_radius`.
     """
 
     kind: Literal["follow_path"] = "follow_path"
-    time: float = Field(default=0.5, gt=0, description="s, how far ahead it looks")
-    way: Literal[1, -1] = Field(default=1, description="1: as the points are listed; -1: the other way")
+    time: float = Field(default=0.5, gt=0, description="s, look-ahead time")
+    way: Literal[1, -1] = Field(default=1, description="1: in the order of the points; -1: reversed")
     keep: float = Field(
-        default=0.5, ge=0, lt=1, description="share of its speed: who is slower on its way is sent on; 0 = nobody is"
+        default=0.5, ge=0, lt=1, description="share of top speed below which an agent is steered on; 0 = never"
     )
-    slow_radius: float = Field(default=0.0, ge=0, description="m, it brakes so far from the end of an open path")
+    slow_radius: float = Field(
+        default=0.0, ge=0, description="m, distance from the end of an open path at which it brakes"
+    )
     own_law: ClassVar[Law | None] = path_followed
     demo: ClassVar[str | None] = """
 groups:
@@ -173,17 +176,17 @@ effects:
 
     @property
     def ramp(self) -> float | None:
-        """Of an open path alone, and 0 is none."""
+        """The slow radius of an open path; None if the path is closed or the radius is 0."""
         return None if self.closed or self.slow_radius == 0 else self.slow_radius
 
     def parameters(self) -> dict[str, float | Vec]:
-        """And what is about its way along it."""
+        """Return its parameters, with direction, progress and slow radius."""
         own = {"way": float(self.way), "keep": float(self.keep), "slow_radius": float(self.slow_radius)}
         return super().parameters() | own
 
 
 class StayOnPath(_OnPath):
-    """Stay in a path's tube, whichever way: if the place after `time` s is outside, seek the spine beside it."""
+    """Stay in a path's tube, in either direction: seek the nearest spine if the position after `time` s is outside."""
 
     kind: Literal["stay_on_path"] = "stay_on_path"
     own_law: ClassVar[Law | None] = path_kept
@@ -201,13 +204,13 @@ class FollowFlow(Behaviour):
     """Follow a field of velocities on a grid, linear in between: F = w (u - v), 0 outside the grid."""
 
     kind: Literal["follow_flow"] = "follow_flow"
-    centre: Vector = Field(description="m, the middle of the grid")
-    spacing: float = Field(gt=0, description="m, from one point of the grid to the next")
+    centre: Vector = Field(description="m, centre of the grid")
+    spacing: float = Field(gt=0, description="m, between points of the grid")
     counts: tuple[Annotated[int, Field(ge=2, le=1024)], ...] = Field(
         min_length=2, max_length=3, description="points along each axis"
     )
-    velocities: tuple[Vector, ...] = Field(description="m/s, at all points; the last axis runs fastest")
-    time: float = Field(default=0.2, ge=0, description="s, how far ahead it looks")
+    velocities: tuple[Vector, ...] = Field(description="m/s, at all points; the last axis varies fastest")
+    time: float = Field(default=0.2, ge=0, description="s, look-ahead time")
     tabled: ClassVar[bool] = True
     places: ClassVar[tuple[str, ...]] = ("centre",)
     heads_for: ClassVar[bool] = False
@@ -223,7 +226,7 @@ effects:
 
     @model_validator(mode="after")
     def _fills_the_grid(self) -> FollowFlow:
-        """Refuse another number of velocities than of points, and vectors of different dimensions."""
+        """Raise ValueError if the number of velocities is not that of points, or dimensions differ."""
         d = len(self.centre)
         if len(self.counts) != d:
             raise ValueError(f"counts = {self.counts}: the centre has {d} coordinates")
@@ -235,17 +238,17 @@ effects:
         return self
 
     def parameters(self) -> dict[str, float | Vec]:
-        """All but the grid, which is in the table."""
+        """Return all parameters but the grid, which is in the table."""
         return {"weight": self.weight, "centre": tuple(map(float, self.centre)), "time": self.time}
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Of a field whose slopes add up to at most s: w^2 = weight s / m, damping of weight (1 + s time) / m."""
+        """Return w^2 = weight s / m and damping weight (1 + s time) / m, s the sum of the largest slopes per axis."""
         field = np.reshape(self.velocities, (*self.counts, -1))
         slope = sum(np.linalg.norm(np.diff(field, axis=k), axis=-1).max() for k in range(len(self.counts)))
         gain, slope = gains(self.weight, groups, dimension), slope / self.spacing
         return gain * slope, gain * (1 + slope * self.time)
 
     def table(self, scene: SceneView) -> NDArray[np.float64]:
-        """The grid."""
+        """Return the grid."""
         low = np.array(self.centre) - self.spacing * (np.array(self.counts) - 1) / 2
         return grid.packed(np.reshape(self.velocities, (*self.counts, -1)), low.tolist(), self.spacing)

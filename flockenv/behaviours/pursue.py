@@ -1,4 +1,4 @@
-"""Behaviours about the nearest of a group: pursue, evade, offset_pursue, shadow, match_velocity (Reynolds 1999)."""
+"""Behaviours towards the nearest of a group: pursue, evade, offset_pursue, shadow, match_velocity (Reynolds 1999)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PREDICTORS = ("distance", "opensteer", "exact")
 
 @law
 def chosen(p: Any, distance: float, table: float, exact: float) -> float:
-    """Return what the predictor says, s, at most p.longest."""
+    """Return the prediction time of the selected predictor, s, at most p.longest."""
     e = like(distance, 1.0)
     time = distance if p.method < e else (table if p.method < e + e else exact)
     return time if time < p.longest else p.longest
@@ -27,7 +27,7 @@ def chosen(p: Any, distance: float, table: float, exact: float) -> float:
 
 @law
 def to_meet(p: Any, me: Me, offset: Vec, velocity: Vec) -> float:
-    """Return for how long ahead a pursuer predicts, s."""
+    """Return the prediction time of a pursuer, s."""
     top = top_speed(p, me)
     distance = steering.distance_time(offset, top, p.factor)
     table = steering.opensteer_time(offset, me.vel, velocity, p.longest)
@@ -36,18 +36,18 @@ def to_meet(p: Any, me: Me, offset: Vec, velocity: Vec) -> float:
 
 @law
 def until_met(p: Any, me: Me, offset: Vec, velocity: Vec) -> float:
-    """Return for how long ahead an evader predicts, s: exact is when the pursuer at its speed can meet it."""
+    """Return the prediction time of an evader, s: "exact" is when the pursuer at its speed can intercept it."""
     top, theirs = top_speed(p, me), norm(velocity)
     distance = steering.distance_time(offset, top, p.factor)
     table = steering.approach_time(offset, theirs, p.longest)
-    least = like(top, 1e-6) * top  # of somebody at rest there is no such time
+    least = like(top, 1e-6) * top  # a pursuer at rest has no such time
     back = scale(offset, like(top, -1.0))
     return chosen(p, distance, table, steering.interception_time(back, me.vel, theirs if theirs > least else least))
 
 
 @law
 def pursued(p: Any, me: Me, sums: Vec) -> Vec:
-    """F = w (V unit(x_q + v_q T - x) - v)."""
+    """Return F = w (V unit(x_q + v_q T - x) - v)."""
     offset, velocity, some = seen_one(sums)
     time = to_meet(p, me, offset, velocity)
     wish = steering.pursue(offset, me.vel, velocity, top_speed(p, me), time)
@@ -56,7 +56,7 @@ def pursued(p: Any, me: Me, sums: Vec) -> Vec:
 
 @law
 def evaded(p: Any, me: Me, sums: Vec) -> Vec:
-    """F = w (V unit(x - x_p - v_p T) - v)."""
+    """Return F = w (V unit(x - x_p - v_p T) - v)."""
     offset, velocity, some = seen_one(sums)
     time = until_met(p, me, offset, velocity)
     wish = steering.evade(offset, me.vel, velocity, top_speed(p, me), time)
@@ -65,7 +65,7 @@ def evaded(p: Any, me: Me, sums: Vec) -> Vec:
 
 @law
 def passed(p: Any, me: Me, sums: Vec) -> Vec:
-    """Pursue a point beside the quarry."""
+    """Return F = w S: pursue a point beside the quarry."""
     offset, velocity, some = seen_one(sums)
     time = to_meet(p, me, steering.passing_point(offset, me.vel, p.distance), velocity)
     wish = steering.offset_pursue(offset, me.vel, velocity, top_speed(p, me), p.distance, time)
@@ -74,7 +74,7 @@ def passed(p: Any, me: Me, sums: Vec) -> Vec:
 
 @law
 def shadowed(p: Any, me: Me, sums: Vec) -> Vec:
-    """Pursue from afar, match near by."""
+    """Return F = w S: pursue from afar, match velocity near by."""
     offset, velocity, some = seen_one(sums)
     time = to_meet(p, me, offset, velocity)
     wish = steering.shadow(offset, me.vel, velocity, top_speed(p, me), p.distance, p.band, time)
@@ -83,20 +83,20 @@ def shadowed(p: Any, me: Me, sums: Vec) -> Vec:
 
 @law
 def matched(p: Any, me: Me, sums: Vec) -> Vec:
-    """F = w (v_j - v)."""
+    """Return F = w (v_j - v)."""
     _, velocity, some = seen_one(sums)
     return select(some, scale(steering.match_velocity(me.vel, velocity), p.weight), zero(velocity))
 
 
 class Predicting(AboutNearest, Moving):
-    """What behaviours that foresee somebody's way have in common."""
+    """Base of behaviours that predict the path of another agent."""
 
     predictor: Literal["distance", "opensteer", "exact"] = Field(
         default="exact",
-        description="how far ahead it foresees: factor d / V, OpenSteer's table, or until they can meet",
+        description="prediction time: factor d / V, OpenSteer's table, or time to interception",
     )
     factor: float = Field(default=1.0, ge=0, description="of the predictor by distance, T = factor d / V")
-    longest: float = Field(default=10.0, ge=0, description="s, it foresees no further")
+    longest: float = Field(default=10.0, ge=0, description="s, longest prediction")
 
     def parameters(self) -> dict[str, float | Vec]:
         """Return its numbers; the predictor is one of them."""
@@ -104,10 +104,10 @@ class Predicting(AboutNearest, Moving):
 
 
 class Pursue(Predicting):
-    """Seek where the nearest of a group will be: S = V unit(x_q + v_q T - x) - v (Reynolds 1999).
+    """Seek the predicted position of the nearest of a group: S = V unit(x_q + v_q T - x) - v (Reynolds 1999).
 
-    T is factor d / V (distance), OpenSteer's k d / |v| with k by where the quarry is and heads (opensteer), or the
-    first time at which the two can meet while the quarry goes straight on (exact).
+    T is factor d / V (distance), OpenSteer's k d / |v| with k by position and heading of the quarry (opensteer), or the
+    earliest interception time if the quarry goes straight on (exact).
     """
 
     kind: Literal["pursue"] = "pursue"
@@ -123,14 +123,15 @@ effects:
 
 
 class Evade(Predicting):
-    """Flee from where the nearest of a group will be: S = V unit(x - x_p - v_p T) - v (Reynolds 1999).
+    """Flee from the predicted position of the nearest of a group: S = V unit(x - x_p - v_p T) - v (Reynolds 1999).
 
-    T is factor d / V (distance), d / |v_p| (opensteer), or when the pursuer at its speed can meet it (exact).
+    T is factor d / V (distance), d / |v_p| (opensteer), or the time at which the pursuer at its speed can intercept it
+    (exact).
     """
 
     kind: Literal["evade"] = "evade"
     predictor: Literal["distance", "opensteer", "exact"] = Field(
-        default="opensteer", description="how far ahead it foresees: factor d / V, d / |v_p|, or until they can meet"
+        default="opensteer", description="prediction time: factor d / V, d / |v_p|, or time to interception"
     )
     finish_law: ClassVar[Law | None] = evaded
     demo: ClassVar[str | None] = """
@@ -144,7 +145,7 @@ effects:
 
 
 class OffsetPursue(Predicting):
-    """Pass the nearest of a group at a distance: seek a point so far beside where it will be (Reynolds 1999)."""
+    """Pass the nearest of a group at a distance: seek a point beside its predicted position (Reynolds 1999)."""
 
     kind: Literal["offset_pursue"] = "offset_pursue"
     distance: float = Field(ge=0, description="m, at which it passes")
@@ -164,15 +165,15 @@ effects:
 
 
 class Shadow(Predicting):
-    """Approach the nearest of a group, then fly as it does: pursue from afar, match its velocity near by.
+    """Approach the nearest of a group, then move along with it: pursue from afar, match its velocity near by.
 
-    Pursuit fades linearly from distance + band to distance, where it is all matching, so that nothing chatters.
-    Reynolds 1999 in words; there the two alternate, and to do that with hysteresis takes a memory.
+    Pursuit fades linearly from distance + band to distance, within which it only matches, so that it does not chatter.
+    Described in Reynolds 1999, where the two alternate; to do that with hysteresis would need a memory.
     """
 
     kind: Literal["shadow"] = "shadow"
     distance: float = Field(ge=0, description="m, within which it only matches speed and heading")
-    band: float = Field(default=1.0, gt=0, description="m, from there on it pursues more and more")
+    band: float = Field(default=1.0, gt=0, description="m, width beyond `distance` over which pursuit grows")
     finish_law: ClassVar[Law | None] = shadowed
     copies: ClassVar[bool] = True
     demo: ClassVar[str | None] = """
@@ -191,7 +192,7 @@ effects:
 
 
 class MatchVelocity(AboutNearest):
-    """Take on the velocity of the nearest of a group: S = v_j - v (Reynolds 1987)."""
+    """Match the velocity of the nearest of a group: S = v_j - v (Reynolds 1987)."""
 
     kind: Literal["match_velocity"] = "match_velocity"
     finish_law: ClassVar[Law | None] = matched

@@ -1,4 +1,4 @@
-"""An arbitration over rows: what it makes of steering forces that are given as arrays."""
+"""An arbitration over rows of arrays: combines steering forces that are passed as arrays."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def reconcile(
     who: ArrayLike = 0, heading: ArrayLike | None = None, dtype: Any = np.float64,
     inner: Mapping[str, ArrayLike] | None = None,
 ) -> tuple[Reals, Reals]:  # fmt: skip
-    """Return the force, (R, D) N, and the share of each wish, (R, K), that an arbitration makes of wishes (R, K, D) N.
+    """Return the force, (R, D) N, and the share of each behaviour, (R, K), from steering forces `wishes` (R, K, D) N.
 
-    The other arguments are (R,), or one number for all: N, s, the key of the world, which agent; heading (R, D); what
-    goes on inside by name, each (R,), if the arbitration asks for it.
+    The other arguments are (R,), or one number for all: max_force, N; time, s; key of the world; agent `who`; heading
+    (R, D); `inner` numbers by name, each (R,), if the arbitration recalls them.
     """
     asked = np.ascontiguousarray(wishes, dtype)
     if asked.ndim != 3 or asked.shape[1] < 1 or asked.shape[2] not in (2, 3):
@@ -56,7 +56,7 @@ def _number(numbers: Any, k: int) -> float:
 
 @entry_of
 def _over_rows(law: Law, count: int, dimension: int, recalled: tuple[str, ...]) -> Callable[..., None]:
-    """Make the loop of one arbitration over rows."""
+    """Return the loop of one arbitration over rows."""
     direction, wish = vector(dimension), kernel(lambda wishes, k: direction(wishes[k], 0))
     wishes_of, kept_of = several(count, wish), several(max(len(recalled), 1), _number)
     inner_of, recalls = record(recalled), bool(recalled)

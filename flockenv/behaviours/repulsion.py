@@ -1,4 +1,4 @@
-"""What forces that keep apart have in common: how strong they are, and what is most."""
+"""Base of repulsive forces: strength and upper bound."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ __all__ = ["Push"]
 
 
 class Push(Effect):
-    """A force of strength A: in newtons, or in m/s^2 for everybody's own mass; or both."""
+    """A force of strength A: in newtons, or in m/s^2 times the agent's mass; or the sum of both."""
 
     strength: float = Field(default=0.0, ge=0, description="A, N")
     acceleration: float = Field(default=0.0, ge=0, description="A, m/s^2: the force is that times its own mass")
     most: float | None = Field(
-        default=None, gt=0, description="N, that one of those it is about does at most, before it is weighed"
+        default=None, gt=0, description="N, largest force from one neighbour or wall, before weighting"
     )
     steering: ClassVar[bool] = True
     strengths: ClassVar[tuple[str, ...]] = ("strength", "acceleration")
 
     @model_validator(mode="after")
     def _does_something(self) -> Self:
-        """Refuse one whose strength was forgotten; 0 is allowed where it is said."""
+        """Raise ValueError if no strength is given; an explicit 0 is allowed."""
         if not {"strength", "acceleration"} & self.model_fields_set:
             raise ValueError("strength: missing; give strength, N, or acceleration, m/s^2")
         return self
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Its strength, and its bound."""
+        """Return its strength and its bound."""
         most = math.inf if self.most is None else self.most
         return {"strength": self.strength, "acceleration": self.acceleration, "bound": most}

@@ -1,4 +1,4 @@
-"""Shepherding: drive a group to a place, from behind (Strombom et al. 2014)."""
+"""Shepherding: drive a group to a place from behind (Strombom et al. 2014)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["Shepherd"]
 
 @law
 def shepherded(p: Any, me: Me, flock: Members) -> Vec:
-    """Arrive behind the member that strays, or else behind all of them."""
+    """Return F = w S: arrive behind the stray member, or else behind the whole group; 0 without members."""
     n, o = flock.size, like(flock.size, 0.0)
     together, driving = p.spacing * np.cbrt(n * n), p.spacing * np.sqrt(n)
     place = steering.herd_from(flock.centre, flock.farthest, sub(p.goal, me.pos), together, p.spacing, driving)
@@ -28,19 +28,19 @@ def shepherded(p: Any, me: Me, flock: Members) -> Vec:
 
 
 class Shepherd(Moving):
-    """Drive a group to a place: arrive behind its stray, else behind all of it, as seen from the place.
+    """Drive a group to a place: arrive behind its stray, else behind the whole group, as seen from the place.
 
-    If the member farthest from the centre of the N living ones is more than r_a N^(2/3) m from it, r_a behind that one,
-    seen from the centre; else r_a sqrt(N) behind the centre, seen from the goal (Strombom et al. 2014). What the paper
-    adds, that a shepherd slows down near a sheep and moves with noise, is left to other behaviours (`separation` keeps
-    a shepherd off). Without living members it asks for nothing.
+    If the member farthest from the centre of the N living ones is more than r_a N^(2/3) m from it, the target is r_a
+    behind that member, seen from the centre; else r_a sqrt(N) behind the centre, seen from the goal (Strombom et al.
+    2014). In the paper a shepherd also slows down near a sheep and moves with noise; that is left to other behaviours
+    (`separation` keeps a shepherd off). Without living members the force is zero.
     """
 
     kind: Literal["shepherd"] = "shepherd"
-    group: int = Field(ge=0, description="which group it drives")
-    goal: Vector = Field(description="m, where to")
-    spacing: float = Field(gt=0, description="r_a, m, how far apart the members keep")
-    slow_radius: float = Field(gt=0, description="m, within which of its place it slows down")
+    group: int = Field(ge=0, description="group that it drives")
+    goal: Vector = Field(description="m, place to which it drives the group")
+    spacing: float = Field(gt=0, description="r_a, m, spacing of the members")
+    slow_radius: float = Field(gt=0, description="m, distance from its target within which it slows down")
     group_law: ClassVar[Law | None] = shepherded
     places: ClassVar[tuple[str, ...]] = ("goal",)
     demo: ClassVar[str | None] = """
@@ -63,5 +63,5 @@ effects:
     demo_time: ClassVar[float] = 35.0
 
     def members(self, starts: Sequence[int]) -> dict[str, float]:
-        """The first agent of the group, and the first after it."""
+        """Return the first agent of the group, and one past its last."""
         return {"first": float(starts[self.group]), "end": float(starts[self.group + 1])}

@@ -1,6 +1,6 @@
-"""Social forces between pedestrians: repulsion by distance, by ellipses, and by where both are going.
+"""Social forces between pedestrians: repulsion by distance, by ellipses, and by both velocities.
 
-They are wishes: `Steer` says whose. Two who overlap as bodies are `Contact`'s business. See docs/social_forces.md.
+They are steering forces; `Steer` selects the group. `Contact` handles bodies that overlap. See docs/social_forces.md.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ effects:
 
 @law
 def as_felt(p: Any, me: Me, sums: Vec) -> Vec:
-    """The sum over all who are seen."""
+    """Return the sum over all visible neighbours."""
     return sums
 
 
@@ -52,29 +52,29 @@ def size_of(p: Any, me: Me) -> float:
 
 
 class Social(Push):
-    """What forces between pedestrians have in common: how strong they are, whom they are about, who is seen."""
+    """Base of forces between pedestrians: strength, range, group and visibility."""
 
-    radius: float = Field(gt=0, description="m, who is further away is not looked at")
-    group: int | None = Field(default=None, ge=0, description="whom it is about; none = all")
-    occluded: bool = Field(default=False, description="whom an obstacle hides does nothing")
+    radius: float = Field(gt=0, description="m, range within which neighbours count")
+    group: int | None = Field(default=None, ge=0, description="group that it interacts with (default: all)")
+    occluded: bool = Field(default=False, description="True if obstacles hide neighbours")
     finish_law: ClassVar[Law | None] = as_felt
 
     @property
     def sight(self) -> Sight:
-        """Radius, whom, and whether walls hide them."""
+        """Radius, group and occlusion."""
         return Sight(self.radius, group=self.group, occluded=self.occluded)
 
     def sums(self, dimension: int) -> int:
-        """The force so far."""
+        """Return the size of a force."""
         return dimension
 
     def check(self, scene: SceneView) -> None:
-        """Refuse a group that is not there."""
+        """Raise ValueError if the group does not exist."""
         demand_group("group", self.group, scene.groups)
         super().check(scene)
 
     def _steepest(self, decay: float, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:
-        """Return w^2 = A (1 / m + 1 / m_other) / B of two who touch, (N,), the other the lightest, and no damping."""
+        """Return w^2 = A (1 / m + 1 / m_other) / B of a pair in touch, (N,), the other the lightest; and no damping."""
         mass = all_masses(groups, dimension)
         none = np.zeros(len(mass))
         if len(mass) == 1:
@@ -90,7 +90,7 @@ class Social(Push):
 
 @law
 def pushed_by_distance(p: Any, me: Me, other: Other) -> Vec:
-    """f n, and f n n^T by its different numbers: f = A exp((r_ij - d) / B), n away from him."""
+    """Return f n and the distinct entries of f n n^T: f = A exp((r_ij - d) / B), n away from the neighbour."""
     n, distance = social.apart(other.offset, sub(me.tie, other.tie))
     force = size_of(p, me) * exp((p.bodies * (me.radius + other.radius) - distance) * p.slope)
     force = force if force < p.bound else p.bound
@@ -108,7 +108,7 @@ def _products(n: Vec, force: float) -> Vec:
 
 @law
 def weighed_by_view(p: Any, me: Me, sums: Vec) -> Vec:
-    """Sum of w f n: w = lambda + (1 - lambda)(1 - n . e) / 2 is linear in n, so all are weighed at once."""
+    """Return the sum of w f n; w = lambda + (1 - lambda)(1 - n . e) / 2 is linear in n, so it follows from the sums."""
     e, half = like(me.mass, 1.0), like(me.mass, 0.5)
     way = unit(steering.looking(me.aim, me.heading))
     push: Vec
@@ -132,14 +132,14 @@ class CircularRepulsion(Social):
     """Keep away from others: F = A w(phi) exp((r_ij - d) / B) n, with r_ij both radii, or 0 (`bodies: false`).
 
     Helbing, Farkas and Vicsek 2000 (A in N, with bodies, lambda = 1); the circular specification of Johansson, Helbing
-    and Shukla 2007 (A in m/s^2, distances between centres, w = lambda + (1 - lambda)(1 + cos phi) / 2, phi from the way
-    that it wants to go, or goes, to the other). It is not the opposite of what it does to the other: w differs.
+    and Shukla 2007 (A in m/s^2, distances between centres, w = lambda + (1 - lambda)(1 + cos phi) / 2, phi the angle
+    from its aim, or else its heading, to the other). The forces of a pair are not opposite: w differs.
     """
 
     kind: Literal["circular_repulsion"] = "circular_repulsion"
     decay: float = Field(gt=0, description="B, m, over which the force falls to 1/e")
-    bodies: bool = Field(default=True, description="is the distance that between the surfaces, not the centres?")
-    anisotropy: float = Field(default=1.0, ge=0, le=1, description="lambda, how much who is straight behind counts")
+    bodies: bool = Field(default=True, description="True: distance between surfaces; False: between centres")
+    anisotropy: float = Field(default=1.0, ge=0, le=1, description="lambda, weight of neighbours straight behind")
     pair_law: ClassVar[Law | None] = pushed_by_distance
     finish_law: ClassVar[Law | None] = weighed_by_view
     demo: ClassVar[str | None] = HEAD_ON.replace(
@@ -147,18 +147,18 @@ class CircularRepulsion(Social):
     )
 
     def parameters(self) -> dict[str, float | Vec]:
-        """A, B, lambda."""
+        """Return A, B and lambda."""
         shape = {"slope": 1 / self.decay, "bodies": float(self.bodies), "anisotropy": self.anisotropy}
         return {**super().parameters(), **shape}
 
     def sums(self, dimension: int) -> int:
-        """A vector, and a symmetric matrix."""
+        """Return the size of a vector and a symmetric matrix."""
         return dimension + dimension * (dimension + 1) // 2
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:
-        """A / B over the reduced mass, where two bodies touch (or, of distances alone, are in one place).
+        """Return w^2 = A / B over the reduced mass, for two bodies in touch (in one place if `bodies` is False).
 
-        Where bodies overlap it is steeper, exp(overlap / B) times: that depends on the state.
+        If bodies overlap it is steeper, exp(overlap / B) times: that depends on the state.
         """
         return self._steepest(self.decay, groups, dimension)
 
@@ -168,7 +168,7 @@ class CircularRepulsion(Social):
 
 @law
 def pushed_by_ellipse(p: Any, me: Me, other: Other) -> Vec:
-    """A w (-B grad exp(-b / B))."""
+    """Return A w (-B grad exp(-b / B))."""
     step = scale(sub(other.vel, scale(me.vel, p.relative)), p.step)
     out, size = social.off_ellipse(other.offset, step, sub(me.tie, other.tie), p.decay)
     way = steering.looking(me.aim, me.heading)
@@ -178,28 +178,29 @@ def pushed_by_ellipse(p: Any, me: Me, other: Other) -> Vec:
 
 
 class EllipticalRepulsion(Social):
-    """Keep away from others and from where they step next: F = A w (-B grad exp(-b / B)).
+    """Keep away from others and from the ends of their next steps: F = A w (-B grad exp(-b / B)).
 
-    b is the smaller half axis of the ellipse through me with foci at the other and at the end of his step
-    y = v_j dt (Helbing and Molnar 1995: A = V0 / sigma, B = sigma, and w = 1 in a field of view, `outside` out of it;
-    elliptical I of Johansson, Helbing and Shukla 2007), or y = (v_j - v_i) dt (`relative`: elliptical II), with their
-    w(phi) = lambda + (1 - lambda)(1 + cos phi) / 2. His step is what he does, not what he would like to.
+    b is the semi-minor axis of the ellipse through the agent with foci at the neighbour and at the end of the
+    neighbour's step y = v_j dt (Helbing and Molnar 1995: A = V0 / sigma, B = sigma, and w = 1 in a field of view,
+    `outside` out of it; elliptical I of Johansson, Helbing and Shukla 2007), or y = (v_j - v_i) dt (`relative`:
+    elliptical II), with their w(phi) = lambda + (1 - lambda)(1 + cos phi) / 2. The step uses the actual velocity, not
+    the desired one.
     """
 
     kind: Literal["elliptical_repulsion"] = "elliptical_repulsion"
     decay: float = Field(gt=0, description="B, m, over which the force falls to 1/e")
-    step: float = Field(ge=0, description="dt, s, how far ahead the step leads")
-    relative: bool = Field(default=False, description="is the step that of the other relative to me?")
-    anisotropy: float = Field(default=1.0, ge=0, le=1, description="lambda, how much who is straight behind counts")
+    step: float = Field(ge=0, description="dt, s, duration of the step")
+    relative: bool = Field(default=False, description="True: step by relative velocity")
+    anisotropy: float = Field(default=1.0, ge=0, le=1, description="lambda, weight of neighbours straight behind")
     fov: float = Field(default=360.0, gt=0, le=360, description="degrees, 2 phi, full angle of the field of view")
-    outside: float = Field(default=1.0, ge=0, le=1, description="c, how much what pushes from out of view counts")
+    outside: float = Field(default=1.0, ge=0, le=1, description="c, weight of forces from outside the field of view")
     pair_law: ClassVar[Law | None] = pushed_by_ellipse
     demo: ClassVar[str | None] = HEAD_ON.replace(
         "FORCE", "{kind: elliptical_repulsion, acceleration: 7, decay: 0.3, step: 2, fov: 200, outside: 0.5, radius: 5}"
     )
 
     def parameters(self) -> dict[str, float | Vec]:
-        """A, B, the step, and how much who is where counts."""
+        """Return A, B, the step and the weights by direction."""
         shape = {
             "decay": self.decay, "step": self.step, "relative": float(self.relative), "anisotropy": self.anisotropy,
             "edge": math.cos(math.radians(self.fov) / 2) if self.fov < 360 else -2.0, "outside": self.outside,
@@ -207,16 +208,16 @@ class EllipticalRepulsion(Social):
         return {**super().parameters(), **shape}
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:
-        """A / B over the reduced mass, as of somebody who stands; near the end of a step it may be steeper."""
+        """Return w^2 = A / B over the reduced mass, for a neighbour at rest; near a step's end it may be steeper."""
         return self._steepest(self.decay, groups, dimension)
 
 
-# --- by where both go -------------------------------------------------------------------------------------------------
+# --- by both velocities -----------------------------------------------------------------------------------------------
 
 
 @law
 def stepped_aside(p: Any, me: Me, other: Other) -> Vec:
-    """A (f_t t + f_n n)."""
+    """Return A (f_t t + f_n n)."""
     wish = steering.sidestep(
         other.offset, me.vel, other.vel, sub(other.tie, me.tie), p.importance, p.gamma, p.angular, p.forward, p.bias
     )
@@ -224,15 +225,15 @@ def stepped_aside(p: Any, me: Me, other: Other) -> Vec:
 
 
 class Sidestep(Social):
-    """Slow down before others and pass them on one side, as was measured (Moussaid et al. 2009, equations 4 to 7).
+    """Slow down before others and pass them on one side, as fitted to experiments (Moussaid et al. 2009, eq. 4 to 7).
 
     D = lambda (v_i - v_j) + e_ij, t = unit(D), B = gamma |D|, theta the angle from t to e_ij in (-pi, pi], with B eps
-    added: -A exp(-d / B - (n' B theta)^2) along t, and A exp(-d / B - (n B theta)^2) to the side where he is not.
-    eps > 0 keeps right where he is dead ahead. In space it turns in the plane of t and e_ij: that is ours.
+    added: -A exp(-d / B - (n' B theta)^2) along t, and A exp(-d / B - (n B theta)^2) to the side away from the
+    neighbour. If that is dead ahead, eps > 0 keeps right. In 3-D the agent turns in the plane of t and e_ij (ours).
     """
 
     kind: Literal["sidestep"] = "sidestep"
-    importance: float = Field(default=2.0, ge=0, description="lambda, s/m, of velocities against positions")
+    importance: float = Field(default=2.0, ge=0, description="lambda, s/m, weight of relative velocity")
     gamma: float = Field(default=0.35, gt=0, description="s, B = gamma |D| m")
     angular: float = Field(default=2.0, ge=0, description="n, 1/m, of turning")
     forward: float = Field(default=3.0, ge=0, description="n', 1/m, of slowing down")
@@ -241,6 +242,6 @@ class Sidestep(Social):
     demo: ClassVar[str | None] = HEAD_ON.replace("FORCE", "{kind: sidestep, acceleration: 4.5, radius: 8}")
 
     def parameters(self) -> dict[str, float | Vec]:
-        """A, and the numbers of the fit."""
+        """Return A, and the numbers of the fit."""
         names = ("importance", "gamma", "angular", "forward", "bias")
         return {**super().parameters(), **{name: float(getattr(self, name)) for name in names}}

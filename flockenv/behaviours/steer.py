@@ -1,4 +1,4 @@
-"""Steer: the behaviours of a group, in order of priority, and how their wishes are reconciled.
+"""Steer: the behaviours of a group, in order of priority, and the arbitration of their steering forces.
 
 Steer(group=0, arbitration=Allocation(), behaviours=(AvoidObstacles(weight=8), Wander(weight=2)))
 """
@@ -36,17 +36,17 @@ else:
 
 
 class Steer(Effect):
-    """What a group wants: its behaviours in order of priority, and the arbitration that makes one force of them."""
+    """The behaviours of a group in order of priority, and the arbitration that combines them into one force."""
 
     kind: Literal["steer"] = "steer"
-    behaviours: tuple[AnyBehaviour, ...] = Field(min_length=1, description="the most pressing one first")
-    arbitration: AnyReconciling = Field(default_factory=Allocation, description="how their wishes are reconciled")
-    group: int | None = Field(default=None, ge=0, description="whom it steers; none = everybody")
+    behaviours: tuple[AnyBehaviour, ...] = Field(min_length=1, description="in order of priority, the highest first")
+    arbitration: AnyReconciling = Field(default_factory=Allocation, description="how their forces are combined")
+    group: int | None = Field(default=None, ge=0, description="group that it steers (default: all)")
     steering: ClassVar[bool] = True
 
     @model_validator(mode="after")
     def _wishes_alone(self) -> Steer:
-        """Refuse what is no behaviour, and numbers that do not go with so many of them."""
+        """Raise ValueError if an entry is no behaviour, or the arbitration's numbers do not fit their count."""
         for k, behaviour in enumerate(self.behaviours):
             if not behaviour.steering or behaviour.wishes:
                 raise ValueError(f"behaviours[{k}].kind = {behaviour.kind}: is no behaviour; {', '.join(BEHAVIOURS)}")
@@ -65,27 +65,27 @@ class Steer(Effect):
 
     @property
     def recalled(self) -> tuple[str, ...]:
-        """What the arbitration recalls."""
+        """The inner numbers that the arbitration recalls."""
         return self.arbitration.recalls
 
     @property
     def reach(self) -> float:
-        """How far any of its behaviours looks, m."""
+        """The largest reach of its behaviours, m."""
         return max(behaviour.reach for behaviour in self.behaviours)
 
     def parameters(self) -> dict[str, float | Vec]:
-        """The numbers of the arbitration: behaviours have their own."""
+        """Return the numbers of the arbitration: behaviours have their own."""
         return self.arbitration.parameters(len(self.behaviours))
 
     def members(self, starts: Sequence[int]) -> dict[str, float]:
-        """Whom it steers: [first, end)."""
+        """Return the agents that it steers: [first, end)."""
         first, end = (0, starts[-1]) if self.group is None else starts[self.group : self.group + 2]
         return {"first": float(first), "end": float(end)}
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """The sum of those of its behaviours that know theirs, of the agents that it steers: each has all it asks.
+        """Return the sum of the rates of its behaviours, as if each acted in full; 0 for agents that it does not steer.
 
-        Of an arbitration that grants one behaviour at a time the largest of them.
+        For an arbitration that selects one behaviour at a time, the largest of them. None if no behaviour has rates.
         """
         found = [each for behaviour in self.behaviours if (each := behaviour.rates(groups, dimension)) is not None]
         if not found:
@@ -104,16 +104,16 @@ class Steer(Effect):
         return all(behaviour.always for behaviour in self.behaviours)
 
     def in_the_open(self) -> Effect | None:
-        """Return it with those of its behaviours that act where there are no obstacles."""
+        """Return a copy with those of its behaviours that act without obstacles, or None."""
         left = tuple(behaviour for behaviour in self.behaviours if behaviour.in_the_open() is not None)
         return self.model_copy(update={"behaviours": left}) if left else None
 
     def idle(self) -> Effect:
-        """Return the same behaviours, all of them idle."""
+        """Return a copy whose behaviours are all idle."""
         return self.model_copy(update={"behaviours": tuple(behaviour.idle() for behaviour in self.behaviours)})
 
     def check(self, scene: SceneView) -> None:
-        """Refuse a group that is not there, and behaviours that do not suit the scene."""
+        """Raise ValueError if the group does not exist, or a behaviour does not suit the scene."""
         demand_group("group", self.group, scene.groups)
         for k, behaviour in enumerate(self.behaviours):
             try:
@@ -122,14 +122,14 @@ class Steer(Effect):
                 raise ValueError(f"behaviours[{k}].{error}") from None
 
     def check_start(self, scene: SceneView, state: Any) -> None:
-        """Let each of its behaviours warn of what the first instant shows."""
+        """Run the checks of the initial state of its behaviours, which may warn."""
         for behaviour in self.behaviours:
             behaviour.check_start(scene, state)
 
     def calls_for(self) -> tuple[str, ...]:
-        """What any of its behaviours calls for."""
+        """Return what its behaviours call for."""
         return tuple(dict.fromkeys(what for behaviour in self.behaviours for what in behaviour.calls_for()))
 
 
 EVERY_EFFECT: tuple[type[Effect], ...] = tuple(EFFECTS.values())
-"""What a scene's file may list: all effects, all behaviours, and what reconciles them."""
+"""All that a scene's file may list: effects, behaviours, and Steer."""

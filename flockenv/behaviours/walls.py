@@ -1,4 +1,4 @@
-"""Walls to keep to: following them at a distance, and staying within them (Reynolds 1999)."""
+"""Wall following at a distance, and containment within walls (Reynolds 1999)."""
 
 from __future__ import annotations
 
@@ -24,31 +24,31 @@ __all__ = ["Contain", "FollowWall"]
 
 @law
 def soon(p: Any, me: Me) -> Vec:
-    """Where it will be, at its present velocity."""
+    """Return the displacement after `time` s at the present velocity."""
     return scale(me.vel, p.time)
 
 
 @law
 def no_wall(p: Any, me: Me) -> Vec:
-    """No wall yet: at infinity."""
+    """Return the initial value: a wall at infinity."""
     return (like(me.who, np.inf),) + zero(me.pos)  # noqa: RUF005  # numba joins tuples, but does not unpack them
 
 
 @law
 def nearest_wall(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
-    """Keep the nearest surface: (how far it is from there, its normal)."""
+    """Keep the nearest surface: (its distance from the predicted position, its normal)."""
     return select(abs(other.gap) < abs(acc[0]), (other.gap,) + other.normal, acc)  # noqa: RUF005
 
 
 @law
 def walls_seen(p: Any, me: Me) -> float:
-    """Its range, from where it will be."""
+    """Return its range around the predicted position, m."""
     return p.range + norm(me.vel) * p.time  # type: ignore[no-any-return]
 
 
 @law
 def along_wall(p: Any, me: Me, acc: Vec) -> Vec:
-    """F = w (seek of w + D n, the point off the wall, nearest to where it will be)."""
+    """Return F = w S, which seeks q + D n, with q the point of the wall nearest to the predicted position."""
     o, e = like(me.who, 0.0), like(me.who, 1.0)
     normal: Vec
     if len(acc) == 3:
@@ -58,7 +58,7 @@ def along_wall(p: Any, me: Me, acc: Vec) -> Vec:
     near = abs(acc[0]) < p.range
     step = scale(me.vel, p.time)
     gap = acc[0] if near else o
-    crossed = gap - dot(step, normal) < o  # it will be through a thin wall: its own side counts
+    crossed = gap - dot(step, normal) < o  # the prediction is behind a thin wall: its own side counts
     normal, gap = scale(normal, -e if crossed else e), -gap if crossed else gap
     still = dot(step, step) <= o
     onward = select(still, scale(perpendicular(normal), p.time * top_speed(p, me)), step)
@@ -68,16 +68,16 @@ def along_wall(p: Any, me: Me, acc: Vec) -> Vec:
 
 
 class FollowWall(Moving):
-    """Keep `distance` to the nearest surface and go on along it: seek the point off the wall beside the place ahead.
+    """Follow the nearest surface at `distance`: seek the point off the wall beside the predicted position.
 
-    On whichever side it comes by; at rest it sets out with the wall on its right. Around a corner it turns as sharply
-    as its force allows: `time` of about 2 m / w cuts no corner.
+    It keeps to the side on which it arrives; at rest it starts with the wall on its right. Around a corner it turns as
+    sharply as its force allows: with `time` of about 2 m / w it does not cut corners.
     """
 
     kind: Literal["follow_wall"] = "follow_wall"
-    distance: float = Field(gt=0, description="m, of its centre from the wall")
-    time: float = Field(default=0.5, gt=0, description="s, how far ahead it looks")
-    range: float = Field(default=5.0, gt=0, description="m, walls further away than this are not seen")
+    distance: float = Field(gt=0, description="m, from the wall to its centre")
+    time: float = Field(default=0.5, gt=0, description="s, look-ahead time")
+    range: float = Field(default=5.0, gt=0, description="m, range within which walls are seen")
     obstacle_from: ClassVar[Law | None] = soon
     obstacle_start: ClassVar[Law | None] = no_wall
     obstacle_law: ClassVar[Law | None] = nearest_wall
@@ -97,7 +97,7 @@ effects:
 """
 
     def folded(self, dimension: int) -> int:
-        """A distance and a normal."""
+        """Return the size of a distance and a normal."""
         return 1 + dimension
 
 
@@ -106,7 +106,7 @@ effects:
 
 @law
 def back_inside(p: Any, me: Me, now: float, gap: float, out: Vec) -> Vec:
-    """Turn along the wall that it will come through, braking as it comes head-on; from outside, straight back."""
+    """Return F = w S: turn along the wall that it would cross, brake if head-on; from outside, go straight back."""
     o, e = like(me.who, 0.0), like(me.who, 1.0)
     aside = scale(lateral(out, me.heading), -e)
     straight = dot(aside, aside) < like(me.who, 1e-6)
@@ -121,7 +121,7 @@ def back_inside(p: Any, me: Me, now: float, gap: float, out: Vec) -> Vec:
 
 @law
 def contain_chain(p: Any, me: Me) -> Vec:
-    """Within a circle, a polygon or whatever else is a chain."""
+    """Return the force for a circle, a polygon or another chain."""
     x = _relative(p.table, me.pos)
     now, away = nearest_chain(p.table, 0, x)
     gap, out = nearest_chain(p.table, 0, add(x, scale(me.vel, p.time)))
@@ -131,7 +131,7 @@ def contain_chain(p: Any, me: Me) -> Vec:
 
 @law
 def contain_block(p: Any, me: Me) -> Vec:
-    """Within a box."""
+    """Return the force for a block."""
     x = _relative(p.table, me.pos)
     now, away = nearest_block(p.table, 0, x)
     gap, out = nearest_block(p.table, 0, add(x, scale(me.vel, p.time)))
@@ -148,19 +148,19 @@ def _relative(table: Any, x: Vec) -> Vec:
 
 
 class Contain(Moving):
-    """Stay within a shape: zero while the place `time` seconds ahead is inside it, else along the wall met there.
+    """Stay within a shape: zero while the position `time` seconds ahead is inside, else steer along the wall there.
 
     The inward normal's part across the heading steers; head-on there is none, so the agent brakes and keeps right. From
     outside, an agent heads straight back in. Reynolds 1999, containment.
 
-    A steering force is no wall. Where agents turn along the surface, their bodies cross it by about half the length of
-    a step, max_speed dt / 2, and by a little at corners; they cross it further if `weight` or max_force is too small to
-    turn within `time`, or if others push. Agents that must never leave need a hollow obstacle and `collisions`.
+    A steering force is no wall. Agents that turn along the surface cross it by about half the length of a step,
+    max_speed dt / 2, and by a little at corners. They cross it further if `weight` or max_force is too small to turn
+    within `time`, or if others push. Agents that must never leave need a hollow obstacle and `collisions`.
     """
 
     kind: Literal["contain"] = "contain"
     within: AnyShape = Field(description="a circle (or sphere), a block, a polygon; the whole body is kept inside")
-    time: float = Field(default=1.0, gt=0, description="s, how far ahead it looks")
+    time: float = Field(default=1.0, gt=0, description="s, look-ahead time")
     tabled: ClassVar[bool] = True
     demo: ClassVar[str | None] = """
 groups:
@@ -178,7 +178,7 @@ effects:
         if self.within.kind not in ("circle", "block", "polygon"):
             raise ValueError(f"within.kind = {self.within.kind}: must be one of circle, block, polygon")
         if self.within.moves or self.within.form.startswith("hollow"):
-            raise ValueError("within: must stand still and be solid; what it encloses is where the body stays")
+            raise ValueError("within: must stand still and be solid; the body stays inside it")
         return self
 
     @property
@@ -187,17 +187,17 @@ effects:
         return contain_block if self.within.form == "block" else contain_chain
 
     def parameters(self) -> dict[str, float | Vec]:
-        """The shape is a table."""
+        """Return all parameters but the shape, which is in the table."""
         return {"speed": self.limit, "weight": self.weight, "time": self.time}
 
     def table(self, scene: SceneView) -> NDArray[np.float64]:
-        """The row of the shape."""
+        """Return the row of the shape."""
         return packed([self.within], scene.dimension)[0]
 
     def check(self, scene: SceneView) -> None:
-        """Refuse a torus, where there is no outside, and another dimension."""
+        """Raise ValueError if the space is a torus, which has no outside, or the dimension differs."""
         super().check(scene)
         if isinstance(scene.space, Torus):
-            raise ValueError("kind = contain: on a torus everybody is inside; only a plane or a box is allowed")
+            raise ValueError("kind = contain: a torus has no outside; only a plane or a box is allowed")
         if self.within.dimension != scene.dimension:
             raise ValueError(f"within: lies in {self.within.dimension} dimensions, but dimension = {scene.dimension}")

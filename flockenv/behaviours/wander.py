@@ -1,4 +1,4 @@
-"""Wander: a way that turns now here, now there, and does not depend on the step size."""
+"""Wander: a random walk of smoothly varying direction, independent of the step size."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ GOLDEN = 0.6180339887498949
 
 @law
 def _aside(way: Vec, left: float, up: float) -> Vec:
-    """Return a point beside the way in the agent's own frame."""
+    """Return a sideways offset in the agent's own frame."""
     o = like(left, 0.0)
     if len(way) == 2:
         return (o, left)
@@ -31,12 +31,12 @@ def _aside(way: Vec, left: float, up: float) -> Vec:
 
 @law
 def wandered(p: Any, me: Any) -> Vec:
-    """F = w (V unit(forward + strength (n1 left + n2 up)) - v) with n1, n2 smooth in time."""
+    """Return F = w (V unit(forward + strength (n1 left + n2 up)) - v) with n1, n2 smooth in time."""
     o, e = like(p.strength, 0.0), like(p.strength, 1.0)
     who = int(me.who)
-    when = np.float64(me.time) / np.float64(p.period) + GOLDEN * who  # not everybody turns to a new side at once
+    when = np.float64(me.time) / np.float64(p.period) + GOLDEN * who  # phases differ between agents
     left, up = like(e, smooth(me.key, when, who, CHANNEL)), like(e, smooth(me.key, when, who, CHANNEL + 1))
-    # whoever stands still sets off in a direction of his own
+    # each agent at rest starts in a random direction
     begin = 2.0 * np.pi * uniform(me.key, 0, who, CHANNEL + 2)
     way = select(dot(me.vel, me.vel) > o, me.vel, planar(me.vel, like(e, np.cos(begin)), like(e, np.sin(begin))))
     target = _aside(way, left * p.strength, up * p.strength)
@@ -45,15 +45,15 @@ def wandered(p: Any, me: Any) -> Vec:
 
 
 class Wander(Moving):
-    """Roam: seek a point in front that moves to and fro across the way: S = V unit(f + strength n) - v.
+    """Wander: seek a point ahead that moves to and fro sideways: S = V unit(f + strength n) - v.
 
-    n is coherent noise (Perlin 1985) of each agent in [-1, 1] per axis across its way, a function of time: the same
-    walk for every dt. Reynolds 1999 displaces the point a little in each step; here too it stays near where it was.
+    n is coherent noise (Perlin 1985) of each agent, in [-1, 1] per axis across its heading, as a function of time: the
+    same walk for every dt. Reynolds 1999 displaces the point a little in each step; here it also moves continuously.
     """
 
     kind: Literal["wander"] = "wander"
-    strength: float = Field(default=1.0, ge=0, description="m aside per m ahead of the point: 1 = up to 45 degrees")
-    period: float = Field(default=1.0, gt=0, description="s, how long it remembers to which side it turned")
+    strength: float = Field(default=1.0, ge=0, description="m sideways per m ahead: 1 = up to 45 degrees")
+    period: float = Field(default=1.0, gt=0, description="s, correlation time of its turns")
     own_law: ClassVar[Law | None] = wandered
     demo: ClassVar[str | None] = """
 groups:

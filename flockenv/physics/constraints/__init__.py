@@ -1,4 +1,4 @@
-"""What a step must end with, whichever method made it. To add one: write its file, and a row in tests/catalogue.py."""
+"""Conditions on the end of every step, for any method. To add one: write its file, and a row in tests/catalogue.py."""
 
 from __future__ import annotations
 

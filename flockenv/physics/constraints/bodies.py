@@ -1,4 +1,4 @@
-"""The bodies of one world on their way through a step, what they may meet, and where each is at any time of it."""
+"""The bodies of one world during a step, what they may touch, and the position of each at any time of the step."""
 
 from __future__ import annotations
 
@@ -33,48 +33,48 @@ STOPPED = 2
 
 
 class Bodies(NamedTuple):
-    """The bodies of one world on their way through a step; arrays of N rows."""
+    """The bodies of one world during a step; arrays of N rows."""
 
-    start: Any  # (N, D) m, at the beginning of the step
-    at: Any  # (N, D) m, at time `since`
-    vel: Any  # (N, D) m/s, then
-    acc: Any  # (N, D) m/s^2, from then on
-    free: Any  # (N, D) m/s^2, where nothing carries it
-    excess: Any  # (N, D) m/s, what the method calls velocity beyond that of the parabola; if stopped, the velocity
+    start: Any  # (N, D) m, position at the beginning of the step
+    at: Any  # (N, D) m, position at time `since`
+    vel: Any  # (N, D) m/s, velocity at time `since`
+    acc: Any  # (N, D) m/s^2, acceleration from `since` on
+    free: Any  # (N, D) m/s^2, acceleration without contacts
+    excess: Any  # (N, D) m/s, the method's velocity less that of the parabola; if stopped, the stored velocity
     since: Any  # (N,) s, from the beginning of the step
-    reach: Any  # (N,) m, how far from the start it may come
+    reach: Any  # (N,) m, bound of the distance from the start
     radius: Any  # (N,) m
     light: Any  # (N,) 1/kg, 0 = held in place
     living: Any  # (N,) 1 or 0
     moved: Any  # (N,) 1 if something has happened to it, STOPPED
     leans: Any  # (N,) 1 if it has come to rest on another body in this step
-    first: Any  # (N,) its last meeting, 2 c + side; -1 = none
+    first: Any  # (N,) its last meeting, 2 c + side; -1 if it has none
 
 
 class Meetings(NamedTuple):
-    """Who may meet what; arrays of as many places as there is room for."""
+    """Pairs of bodies, or of a body and an obstacle, that may touch; the length of the arrays is the capacity."""
 
     who: Any  # a body
     other: Any  # another body, or -1 - m for obstacle m
-    time: Any  # s, when; inf = never
-    hits: Any  # how often they have
+    time: Any  # s, time of the impact; inf = never
+    hits: Any  # number of impacts so far
     closed: Any  # within this step: 0, RESTS or GIVEN_UP
     deep: Any  # m, how far the two may overlap before they stop
     following: Any  # (2, places) the next meeting of the same body, as in Bodies.first
     listed: Any  # 1 = among the active
-    active: Any  # meetings that have a time, and some that have none any more
-    todo: Any  # (2 places,) meetings whose time is to be found
+    active: Any  # meetings with a time, and some that have lost theirs
+    todo: Any  # (2 places,) meetings whose time is to be computed
 
 
 class Things(NamedTuple):
     """The obstacles of one world; arrays of M rows."""
 
-    table: Any  # their numbers, see flockenv/geometry/shapes/table.py
-    row: Any  # (M,) where in the table; impact.POINT = it is round, and `size` says how large
-    anchor: Any  # (M, D) m, what its row is relative to, before it has moved
-    place: Any  # (M, D) m, where that is at the beginning of the step
-    drift: Any  # (M, D) m/s, how fast it moves in this step
-    size: Any  # (M,) m, the radius of what is round, 0 of others; negative = it is not there
+    table: Any  # the table of shapes, see flockenv/geometry/shapes/table.py
+    row: Any  # (M,) its row in the table; impact.POINT = a disc or ball of radius `size`
+    anchor: Any  # (M, D) m, origin of its row, before it has moved
+    place: Any  # (M, D) m, that origin at the beginning of the step
+    drift: Any  # (M, D) m/s, its velocity in this step
+    size: Any  # (M,) m, radius of a disc or ball, 0 for other shapes; negative = absent
     restitution: Any  # (M,) of its surface
 
 
@@ -87,20 +87,20 @@ class Rules(NamedTuple):
     sticky: bool
     most: int  # impacts of a body and an obstacle in one step
     again: int  # impacts of the same two bodies in one step
-    touch: float  # m, two that are this near touch
+    touch: float  # m, gap at and below which two touch
     pairs: bool  # True if bodies collide with each other
-    stops: bool  # True if there are no impacts, and bodies stop where they meet something
+    stops: bool  # True if there are no impacts, and bodies stop where they hit something
 
 
 @kernel
 def width(bodies: Bodies, i: int, j: int) -> float:
-    """Return the smaller radius of two bodies, or that of a body that meets an obstacle, m."""
+    """Return the smaller radius of two bodies, or that of the body if j is an obstacle, m."""
     return float(bodies.radius[i] if j < 0 else min(bodies.radius[i], bodies.radius[j]))
 
 
 @kernel
 def position(period: Vec, bodies: Bodies, i: int, t: float) -> Vec:
-    """Return where body i is at time t of the step, m."""
+    """Return the position of body i at time t of the step, m."""
     s = t - bodies.since[i]
     return along(vector(period, bodies.at, i), vector(period, bodies.vel, i), vector(period, bodies.acc, i), s)
 
@@ -113,7 +113,7 @@ def velocity(period: Vec, bodies: Bodies, i: int, t: float) -> Vec:
 
 @kernel
 def take_off(period: Vec, bodies: Bodies, i: int, seconds: float, moved: Vec, before: Vec, after: Vec) -> None:
-    """Begin the way of body i through a step that led it `moved` m further and from one velocity to another."""
+    """Set up the parabola of body i for a step that moved it by `moved` m and changed its velocity."""
     v, a, excess = flight(seconds, moved, before, after)
     write(bodies.vel, i, v)
     write(bodies.acc, i, a)
@@ -126,7 +126,7 @@ def take_off(period: Vec, bodies: Bodies, i: int, seconds: float, moved: Vec, be
 
 @kernel
 def link(bodies: Bodies, meetings: Meetings, c: int) -> None:
-    """Make a new meeting known to those who are part of it."""
+    """Initialise a new meeting, and add it to the lists of its bodies."""
     i, j = meetings.who[c], meetings.other[c]
     meetings.hits[c], meetings.closed[c], meetings.listed[c], meetings.time[c] = 0, 0, 0, np.inf
     meetings.deep[c] = 0.0
@@ -139,7 +139,7 @@ def link(bodies: Bodies, meetings: Meetings, c: int) -> None:
 
 @kernel
 def relative(period: Vec, bodies: Bodies, things: Things, i: int, j: int, t: float) -> tuple[Vec, Vec, Vec]:
-    """Return place, velocity and acceleration of body i as seen from body j or obstacle -1 - j, at time t."""
+    """Return position, velocity and acceleration of body i relative to body j or obstacle -1 - j, at time t."""
     x, v, a = position(period, bodies, i, t), velocity(period, bodies, i, t), vector(period, bodies.acc, i)
     if j >= 0:
         x, v = sub(x, position(period, bodies, j, t)), sub(v, velocity(period, bodies, j, t))
@@ -152,7 +152,7 @@ def relative(period: Vec, bodies: Bodies, things: Things, i: int, j: int, t: flo
 
 @kernel
 def met(bodies: Bodies, things: Things, i: int, j: int) -> tuple[int, float]:
-    """Return the row of what body i meets, and how near to it its centre comes."""
+    """Return the row of the shape that body i may touch, and the distance of its centre at contact, m."""
     if j >= 0:
         return POINT, bodies.radius[i] + bodies.radius[j]
     return things.row[-1 - j], bodies.radius[i] + things.size[-1 - j]
@@ -160,7 +160,7 @@ def met(bodies: Bodies, things: Things, i: int, j: int) -> tuple[int, float]:
 
 @kernel
 def gained(period: Vec, bodies: Bodies, i: int, j: int) -> float:
-    """Return the larger acceleration of two bodies, or of a body that meets an obstacle, m/s^2."""
+    """Return the larger free acceleration of two bodies, or that of the body if j is an obstacle, m/s^2."""
     hard = norm(vector(period, bodies.free, i))
     return float(max(hard, norm(vector(period, bodies.free, j))) if j >= 0 else hard)
 
@@ -169,7 +169,7 @@ def gained(period: Vec, bodies: Bodies, i: int, j: int) -> float:
 def widened(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, i: int, t: float, count: int
 ) -> int:
-    """Add meetings of a body that may now come further than was thought; return how many there are."""
+    """Enlarge the reach of body i if it may now exceed it, and add its new meetings; return the number of meetings."""
     d = image(period, sub(position(period, bodies, i, t), vector(period, bodies.start, i)))
     left = rules.seconds - t
     v, a = vector(period, bodies.vel, i), vector(period, bodies.acc, i)
@@ -189,7 +189,7 @@ def widened(
 
 @kernel
 def _joined(bodies: Bodies, meetings: Meetings, i: int, j: int, count: int) -> int:
-    """Add the meeting of body i with body j, or obstacle -1 - j, if it is not there yet."""
+    """Add the meeting of body i with body j, or obstacle -1 - j, if it is not listed; return the number of meetings."""
     who, other = (i, j) if j < 0 else (min(i, j), max(i, j))
     place = bodies.first[i]
     while place >= 0:

@@ -1,7 +1,7 @@
-"""Who may touch whom within a step: pairs whose bounding balls overlap, found by the common neighbour query.
+"""Pairs that may touch within a step: their bounding balls overlap, found by the common neighbour query.
 
-A ball is around where a body is at the beginning, as wide as the body and as the way that it may go. The grid is as
-coarse as the balls of most bodies; the few that go much further than they are wide are compared with everybody.
+A ball is centred at the start of the step; its radius is that of the body plus the distance that it may go. The cell
+size is that of the balls of most bodies; the few with much larger balls are compared with all bodies.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["image", "led", "loaded", "near", "nearby", "vector", "write"]
 
 @law
 def vector(size: Vec, array: Any, i: int) -> Vec:
-    """Return row i of an array (N, D); `size` says what D is."""
+    """Return row i of an array (N, D); D is the length of `size`."""
     if len(size) == 2:
         return (array[i, 0], array[i, 1])
     else:
@@ -36,7 +36,7 @@ def write(array: Any, i: int, x: Vec) -> None:
 
 @kernel
 def loaded(size: Vec, array: Any, b: int, i: int) -> Vec:
-    """Return a vector of agent i of world b of an array (D, B, N), in double precision; `size` says what D is."""
+    """Return the vector of agent i of world b in an array (D, B, N), in double precision; D is the length of `size`."""
     if len(size) == 2:
         return (np.float64(array[0, b, i]), np.float64(array[1, b, i]))
     else:
@@ -50,7 +50,7 @@ def _shift(d: float, period: float) -> float:
 
 @law
 def image(period: Vec, d: Vec) -> Vec:
-    """Return the shortest of an offset and its images; a period of 0 has none."""
+    """Return the shortest periodic image of an offset; a period of 0 has no images."""
     if len(d) == 2:
         return (_shift(d[0], period[0]), _shift(d[1], period[1]))
     else:
@@ -59,14 +59,14 @@ def image(period: Vec, d: Vec) -> Vec:
 
 @law
 def led(period: Vec, apart: Vec, guess: Vec) -> Vec:
-    """Return how far a step has led a body to a place `apart` from where it was: the image nearest to a guess."""
+    """Return the displacement of a step whose ends are `apart`: the periodic image nearest to a guess."""
     off = sub(apart, guess)
     return sub(apart, sub(off, image(period, off)))
 
 
 @kernel
 def near(period: Vec, at: Any, radius: Any, reach: Any, i: int, j: int) -> bool:
-    """Do the balls of two bodies overlap?"""
+    """Return True if the balls of two bodies overlap."""
     d = image(period, sub(vector(period, at, j), vector(period, at, i)))
     room = radius[i] + radius[j] + reach[i] + reach[j]
     return bool(dot(d, d) <= room * room)
@@ -74,7 +74,7 @@ def near(period: Vec, at: Any, radius: Any, reach: Any, i: int, j: int) -> bool:
 
 @kernel
 def _common_reach(living: Any, radius: Any, reach: Any, n: int, many: Any) -> float:
-    """Return how far balls reach of those that are no exception, m: four times as far as half of all at most.
+    """Return the largest ball radius but for outliers, m: the largest within the power of two that covers 98 %.
 
     many: scratch (>= 64,), a histogram over powers of two.
     """
@@ -94,7 +94,7 @@ def _common_reach(living: Any, radius: Any, reach: Any, n: int, many: Any) -> fl
     for i in range(n):
         ball = radius[i] + reach[i]
         widest = max(widest, ball if living[i] > 0 and ball <= limit else 0.0)
-    return 1.000001 * widest if widest > 0.0 else limit  # cells no larger than they must be
+    return 1.000001 * widest if widest > 0.0 else limit  # cells as small as possible
 
 
 @kernel
@@ -104,8 +104,8 @@ def nearby(
 ) -> int:  # fmt: skip
     """Write the pairs (first, second) whose balls overlap, the lower number first; return how many there are.
 
-    at (N, D) m; living, radius, reach (N,); `first` and `second` are written as far as they go: more pairs than that
-    are counted only. The rest is scratch of the query.
+    at (N, D) m; living, radius, reach (N,). Pairs beyond the capacity of `first` and `second` are counted but not
+    written. The other arrays are scratch memory of the query.
     """
     periodic = period[0] > 0.0
     common = _common_reach(living, radius, reach, n, grid)
@@ -137,7 +137,7 @@ def nearby(
 
 @kernel
 def _mark(living: Any, radius: Any, reach: Any, n: int, common: float, grid: Any) -> int:
-    """Mark those who are met by cells; the others are compared with everybody. Return how many are marked."""
+    """Mark the bodies that the cell list finds; the others are compared with all bodies. Return the number marked."""
     present = 0
     for i in range(n):
         grid[i] = 1 if living[i] > 0 and radius[i] + reach[i] <= common else 0
@@ -147,7 +147,7 @@ def _mark(living: Any, radius: Any, reach: Any, n: int, common: float, grid: Any
 
 @kernel
 def _arrange(grid: Any, cell: Any, offset: Any, n: int, cells: int, order: Any) -> None:
-    """List the marked in the order of their cells; as they come if there are none."""
+    """List the marked bodies in the order of their cells; by number if there are no cells."""
     at = 0
     for i in range(n):
         if grid[i] > 0:
@@ -161,7 +161,7 @@ def _arrange(grid: Any, cell: Any, offset: Any, n: int, cells: int, order: Any) 
 
 @kernel
 def _kept(period: Vec, at: Any, radius: Any, reach: Any, i: int, j: int, found: int, first: Any, second: Any) -> int:
-    """Add a pair if its balls overlap, and there is room; return how many there are."""
+    """Count a pair if its balls overlap, and write it if there is room; return the number of pairs."""
     if not near(period, at, radius, reach, i, j):
         return found
     if found < first.shape[0]:

@@ -20,9 +20,10 @@ def list_meetings(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, reach: Any,
     ahead: bool, nearly: bool, scratch: Any,
 ) -> int:  # fmt: skip
-    """Find what may meet within the step (ahead), or touches at its end; return how many, room for them or not.
+    """List the pairs that may touch within the step (ahead), or at its end; return their number.
 
-    nearly: True if two count that are a tenth of their radii apart.
+    The number may exceed the capacity of `meetings`; then some pairs are not written.
+    nearly: True if pairs with a gap of up to a tenth of their radii also count.
     """
     grid, order, cell, start, offset, bounds, sync, ranges = scratch
     n, count = bodies.living.shape[0], 0
@@ -46,7 +47,7 @@ def list_meetings(
 
 @kernel
 def _reach_further(bodies: Bodies) -> None:
-    """Let all bodies reach further than they go, so that few that are hit come where they were not expected."""
+    """Enlarge the reach of all bodies, so that few that are hit leave it."""
     total, present = 0.0, 0
     for i in range(bodies.living.shape[0]):
         if bodies.living[i] > 0:
@@ -60,7 +61,7 @@ def _with_obstacles(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, at: Any, reach: Any, seconds: float, touch: float,
     ahead: bool, count: int,
 ) -> int:  # fmt: skip
-    """Add who may touch which obstacle: within the step, or at its end; return how many there are."""
+    """Add pairs of a body and an obstacle that may touch, within the step or at its end; return the number of pairs."""
     capacity = meetings.who.shape[0]
     for m in range(things.row.shape[0]):
         if things.size[m] < 0.0:
@@ -77,7 +78,7 @@ def _with_obstacles(
                 room = bodies.radius[i] + touch + way + reach[i]
                 off, far = sub(y, middle), radius + room
                 if bounded and not dot(off, off) <= far * far:
-                    continue  # it is not even near the circle or sphere around it
+                    continue  # outside the bounding circle or sphere
                 gap, _ = surface(things.table, things.row[m], y)
                 if gap - things.size[m] <= room:
                     if count < capacity:

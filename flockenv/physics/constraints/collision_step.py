@@ -1,4 +1,4 @@
-"""One step of many worlds, mended: who may meet whom, impacts in the order of time or all at once, overlaps parted."""
+"""Collisions in one step of many worlds: broad phase, impacts in the order of time or all at once, overlaps."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from flockenv.physics.constraints.step_end import RAISED, settle_ends
 __all__ = ["COUNTED", "LOST", "collide"]
 
 COUNTED = 5
-"""Numbers that a call reports: world, agent, meetings in all, impacts, what was left unsolved."""
+"""Length of the report of a call: world, agent, number of meetings, of impacts, and of unsolved ones."""
 
 LOST = 7
-"""Numbers in `lost`: what `events.play` adds to, and those that `ends` names."""
+"""Length of `lost`: the numbers that event_driven.play adds to, and those that step_end.py names."""
 
 EXACT = 8 * 2.0**-52
-"""Rounding of a coordinate, times how large it is."""
+"""Rounding error of a coordinate, relative to its size."""
 
 
 @kernel
@@ -35,7 +35,7 @@ def _board(
     period: Vec, x0: Any, v0: Any, x: Any, v: Any, alive: Any, b: int, bodies: Bodies, ends: Ends, before: Any,
     seconds: float,
 ) -> tuple[float, float, float, Vec]:  # fmt: skip
-    """Take all bodies of world b aboard; return their largest coordinate, speed, acceleration, and the mean of that."""
+    """Load all bodies of world b; return their largest coordinate, speed and acceleration, and summed acceleration."""
     far, fast, hard, mean = 0.0, 0.0, 0.0, zero(period)
     for i in range(x.shape[2]):
         bodies.living[i] = 1 if alive[b, i] else 0
@@ -60,7 +60,7 @@ def _board(
 def _obstacles(
     period: Vec, things: Things, obstacle_x: Any, obstacle_radius: Any, b: int, begun: float, ended: float
 ) -> None:
-    """Find where the obstacles of world b are, and how they move in this step; its own round ones come first."""
+    """Compute positions and velocities of the obstacles of world b in this step; its own round ones come first."""
     for m in range(things.row.shape[0]):
         if m < obstacle_radius.shape[1]:
             radius = np.float64(obstacle_radius[b, m])
@@ -81,11 +81,12 @@ def collide(
     in_time: bool, once: bool, rounds: int, spread: float, first: int, end: int, work: Any, at_work: int, report: Any,
     lost: Any,
 ) -> int:  # fmt: skip
-    """Mend the steps of worlds [first, end) that led from x0, v0 to x, v (D, B, N), in place.
+    """Correct the steps of worlds [first, end) that led from x0, v0 to x, v (D, B, N), in place.
 
-    period: where a periodic box ends, zeros = nowhere; in_time: impacts within the step, one after another; once: one
-    pass over contacts, and places are not advanced anew; spread: m, how far two are parted at most. Returns the world
-    that there was no room for, with the number of its meetings in report[2]: nothing of it is written; else -1.
+    period: edges of a periodic box, m, zeros if it is not periodic; in_time: impacts within the step, one after
+    another; once: one pass over contacts, and positions are not advanced anew; spread: m, by how much a pair is
+    separated at most. Returns -1, or the first world with more meetings than capacity: report[2] is their number, and
+    that world is left unchanged.
     """
     scratch = (grid, order, cell, start, offset, bounds, sync, ranges)
     report[0], report[1], report[3], report[4] = -1, -1, 0, 0
@@ -136,7 +137,7 @@ def _fly(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, before: Any, count: int,
     report: Any, lost: Any,
 ) -> int:  # fmt: skip
-    """Move all bodies through the step; return how many meetings there are, room for them or not."""
+    """Move all bodies through the step; return the number of meetings, even if it exceeds their capacity."""
     together(period, bodies, meetings, things, rules, count, before)
     some, cut, count = play(period, bodies, meetings, things, rules, count, lost)
     if count <= meetings.who.shape[0]:
@@ -150,7 +151,7 @@ def _fly(
 
 @kernel
 def _land(period: Vec, bodies: Bodies, ends: Ends, i: int, seconds: float) -> None:
-    """Write where and how fast the way of body i ends."""
+    """Write the position and velocity at which the path of body i ends."""
     left = seconds - bodies.since[i]
     v, a = vector(period, bodies.vel, i), vector(period, bodies.acc, i)
     write(ends.pos, i, along(vector(period, bodies.at, i), v, a, left))
@@ -160,7 +161,7 @@ def _land(period: Vec, bodies: Bodies, ends: Ends, i: int, seconds: float) -> No
 
 @kernel
 def _leave(period: Vec, x: Any, v: Any, b: int, ends: Ends, bodies: Bodies) -> int:
-    """Write everybody back into the batch; return the first who is nowhere, or -1."""
+    """Write all living bodies back into the batch; return the first whose state is not finite, or -1."""
     bad = -1
     for i in range(x.shape[2]):
         if bodies.living[i] == 0:

@@ -32,21 +32,22 @@ __all__ = [
 class Collisions(Constraint):
     """Bodies are solid: discs or balls that do not go through obstacles, the walls of a box, or each other.
 
-    Within a step, the moment of an impact is found on the parabola that the method has made of the step, exactly under
+    The time of an impact within a step is found on the parabola that the method has made of the step, exactly under
     constant forces, for bodies of any speed. The responses:
 
     - "earliest": the earliest impact of all happens, both bodies go on from there, their further paths are searched
       anew, and so on; nothing is missed, and an elastic ball keeps its energy.
     - "back_up": the same with at most 30 impacts of the same two bodies in a step, whatever `most` is.
-    - "impulses": at the end of a step all bodies in touch exchange impulses, in passes, until none goes into another.
-      For heaps and crowds. A body whose path leads into something stops there, and has its impact in the next step.
-    - "project": one such pass, and a body inside something is put on the surface. The cheapest; it loses energy at
-      every impact, friction holds no body in place, and those that overlap are moved apart even against their weight.
+    - "impulses": at the end of a step all bodies in touch exchange impulses, in passes, until none approach each other.
+      For heaps and crowds. A body whose path is blocked stops there, and has its impact in the next step.
+    - "project": one such pass, and a body inside another or an obstacle is put on the surface. The cheapest; it loses
+      energy at every impact, friction holds no body in place, and bodies that overlap are moved apart even against
+      their weight.
 
-    No body passes another. Where the impacts of a step run out, the two bodies stop: they keep
-    their velocities and do not move for the rest of the step, and what runs into them stops, too. So time is lost, and
-    neither energy nor momentum; "stopped" counts such bodies, and a warning says how much time. Two that meet slower
-    than a step's acceleration changes velocity come to rest instead; the warning says how much energy that took.
+    No body passes another. Beyond the limit of impacts in a step, the two bodies stop: they keep their velocities and
+    do not move for the rest of the step, and bodies that run into them also stop. So time is lost, but neither energy
+    nor momentum; "stopped" counts such bodies, and a warning gives the time. Two that approach slower than a step's
+    acceleration changes velocity come to rest instead; the warning gives the energy lost.
 
     All responses end with passes over bodies that are near, so that none overlap. Restitution e is speed after over
     speed before, across the surface; friction is Coulomb's. A ball dropped from h bounces to e^2 h, and is at rest
@@ -57,15 +58,15 @@ class Collisions(Constraint):
     response: Literal["earliest", "back_up", "impulses", "project"] = Field(
         default="earliest", description="what happens at an impact, and when"
     )
-    agents: bool = Field(default=True, description="do bodies meet each other?")
-    obstacles: bool = Field(default=True, description="do they meet obstacles, and the walls of a box?")
+    agents: bool = Field(default=True, description="True if bodies hit each other")
+    obstacles: bool = Field(default=True, description="True if they hit obstacles, and the walls of a box")
     restitution: float = Field(default=0.5, ge=0, le=1, description="e: 0 = soft, 1 = elastic")
     friction: float = Field(default=0.0, ge=0, description="Coulomb's coefficient, along surfaces")
-    sticky: bool = Field(default=False, description="do those stay together who touch (glue)?")
-    most: int = Field(default=100, ge=1, description="impacts of the same two in one step; then they stop")
+    sticky: bool = Field(default=False, description="True if bodies that touch stay together (glue)")
+    most: int = Field(default=100, ge=1, description="impacts of the same pair in one step; then both stop")
     passes: int = Field(default=200, ge=1, description="passes over all contacts at the end of a step")
     part_speed: float | None = Field(
-        default=None, gt=0, description="m/s, how fast those who overlap are moved apart; none = at once"
+        default=None, gt=0, description="m/s, speed at which overlapping bodies are moved apart (default: at once)"
     )
     capacity: ClassVar[int] = 4
     """Meetings per agent that there is room for at first."""
@@ -73,9 +74,9 @@ class Collisions(Constraint):
     """Impacts of the same two bodies in one step under `back_up`."""
 
     def check(self, scene: SceneView) -> None:
-        """Refuse what cannot be right: twice the same constraint, and bodies as wide as a periodic box."""
+        """Raise ValueError if the scene has two such constraints, or bodies too wide for a periodic box."""
         if sum(isinstance(other, Collisions) for other in scene.constraints) > 1:
-            raise ValueError("kind = collisions: there is another; a scene has its collisions once")
+            raise ValueError("kind = collisions: there is another; a scene has at most one")
         widest = max(group.widest for group in scene.groups)
         if isinstance(scene.space, Torus) and 4 * widest > min(scene.space.extent(scene.dimension)):
             raise ValueError(
@@ -84,21 +85,21 @@ class Collisions(Constraint):
             )
 
     def calls_for(self) -> tuple[str, ...]:
-        """Who is near whom, and obstacles, if they are met."""
+        """Return the neighbour query, and obstacles, if they are used."""
         asked = ("neighbour query", self.agents), ("obstacles", self.obstacles)
         return tuple(what for what, is_met in asked if is_met)
 
     def numbers(self, scene: SceneView) -> int:
-        """Bodies, ends, and room for meetings."""
+        """Return the size of bodies, ends and meetings, per agent."""
         return int(8 * scene.dimension + 12 + self.capacity * (12 + 4 * scene.dimension))
 
     def settler(self, scene: SceneView) -> Settler:
-        """Return what mends a step."""
+        """Return a function that corrects a step."""
         return _Settler(self, scene)
 
 
 class _Settler:
-    """Mends steps of one scene, with scratch of its own."""
+    """Corrects steps of one scene, with scratch memory of its own."""
 
     def __init__(self, record: Collisions, scene: SceneView) -> None:
         n, d = scene.agents, scene.dimension
@@ -125,7 +126,7 @@ class _Settler:
         self._make_room(record.capacity * n + 64)
 
     def _make_room(self, places: int) -> None:
-        """Allocate for so many meetings."""
+        """Allocate room for `places` meetings."""
         d = self.scene.dimension
 
         def whole(*shape: int) -> NDArray[np.int64]:
@@ -143,7 +144,7 @@ class _Settler:
         )  # fmt: skip
 
     def _things(self) -> Things:
-        """Return the obstacles: round ones, whose places are those of a world, then others, then walls of a box."""
+        """Return the obstacles: round ones, with positions of each world, then other shapes, then walls of a box."""
         scene, d = self.scene, self.scene.dimension
         shapes, given = list(scene.shapes), self.record.restitution
         restitution = [given] * (len(scene.circles) + len(shapes))
@@ -175,7 +176,7 @@ class _Settler:
         )  # fmt: skip
 
     def __call__(self, x0: Floats, v0: Floats, state: State, first: int, end: int) -> tuple[int, int]:
-        """Mend the steps of some worlds."""
+        """Correct the steps of worlds [first, end); return the first (world, agent) that is not finite, or (-1, -1)."""
         r = self.record
         rules = Rules(
             self.scene.dt, r.restitution, r.friction, r.sticky, r.most,
@@ -207,7 +208,7 @@ class _Settler:
         return bad
 
     def _unsolved(self, unsolved: int, lost: NDArray[np.float64]) -> str:
-        """Return what a warning says of a step: see events.play and ends for what is lost."""
+        """Return the warning about a step: see event_driven.play and step_end.py for the numbers in `lost`."""
         r, seconds, joules, stopped = self.record, float(lost[0]), float(lost[1]), float(lost[2])
         said = (
             f"constraints: collisions: in a step {unsolved} impacts or worlds with contacts were not solved within "

@@ -1,9 +1,9 @@
-"""Constraint: what a step must end with, whichever method made it; applied after the method, in the scene's order.
+"""Constraint: a condition on the end of every step, for any method; applied after the method, in the scene's order.
 
-A force says how motion changes; a constraint says what motion may not do, and mends the end of a step: nobody is in a
-wall, a rod keeps its length. It is given where everybody was before the step and how fast, and may change where they
-are and how fast. It works on all worlds of a batch in one compiled call that is the same for all scenes of a dimension
-and a precision: nothing is compiled per scene, and a scene without constraints does not know of them.
+A force changes motion; a constraint restricts it by correcting the end of a step: no agent is in a wall, a rod keeps
+its length. A constraint is passed positions and velocities before the step, and may change those after it. It works on
+all worlds of a batch in one compiled call that is the same for all scenes of a dimension and a precision: nothing is
+compiled per scene, and a scene without constraints has no overhead.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ CONSTRAINTS: dict[str, type[Constraint]] = {}
 """Every constraint by its kind; a class registers itself when it is defined."""
 
 Settler = Callable[[Floats, Floats, State, int, int], tuple[int, int]]
-"""settle(x0, v0, state, first, end): mend the step of worlds [first, end) that began at x0, v0 (D, B, N), in place.
+"""settle(x0, v0, state, first, end): correct the step of worlds [first, end) that began at x0, v0 (D, B, N), in place.
 
-state.tick has been counted on already. Returns the first (world, agent) whose place or velocity is no number, or
-(-1, -1). It has scratch of its own, and so belongs to one thread.
+state.tick has been incremented already. Returns the first (world, agent) whose position or velocity is not finite, or
+(-1, -1). It owns its scratch memory, so it must be used by one thread only.
 """
 
 
 class Constraint(Record):
-    """What every step of a scene must end with."""
+    """A condition that every step of a scene ends with."""
 
     kind: str
 
@@ -41,16 +41,16 @@ class Constraint(Record):
             CONSTRAINTS[cls.model_fields["kind"].default] = cls
 
     def check(self, scene: SceneView) -> None:
-        """Refuse a scene that this cannot be demanded of: ValueError that begins with the field's name."""
+        """Raise ValueError, beginning with the field's name, if the scene does not suit this constraint."""
 
     def calls_for(self) -> tuple[str, ...]:
-        """What it makes a scene compute beside itself, in words, as effects say it."""
+        """Return what else the scene must compute for it, in words, as for effects."""
         return ()
 
     def numbers(self, scene: SceneView) -> int:
-        """How many numbers of scratch it takes per agent."""
+        """Return how many numbers of scratch memory it takes per agent."""
         return 0
 
     @abstractmethod
     def settler(self, scene: SceneView) -> Settler:
-        """Return what mends a step, with scratch of its own."""
+        """Return a function that corrects a step, with scratch memory of its own."""

@@ -1,11 +1,11 @@
-"""Contacts of one world at the end of a step, all at once: impulses until nobody goes into anybody, then places.
+"""Contacts of one world at the end of a step, all at once: impulses until no body approaches another, then positions.
 
 Sequential impulses: contact after contact, up and down along the mean acceleration, each as if it were the only one,
-until none is left to do anything. First impacts, with the velocities of before the step, which keep the share e of
-their approach (Guendelman, Bridson and Fedkiw 2003: so what a step's own acceleration adds never bounces, and what lies
-is still); then what the step has added, without any bounce, with impulses that are summed, never pull, and give
-friction its bound. Overlaps that are left are parted, the lighter one further; velocities do not hear of that, so
-nobody is shot away from where he overlapped.
+until none changes. First impacts, with the velocities before the step and restitution e (Guendelman, Bridson and
+Fedkiw 2003: the velocity that the step's own acceleration adds never bounces, and a resting body stays still). Then the
+velocity that the step has added, without a bounce: the impulses of each contact are summed, never pull, and bound its
+friction. Remaining overlaps are resolved by moving bodies apart, the lighter one further; velocities do not change by
+that, so no overlap accelerates a body.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ __all__ = ["NEARLY", "Contacts", "Ends", "deepest", "gather", "impacts", "part",
 
 
 NEARLY = 0.1
-"""Radii by which two are apart at most that may be pushed into each other by others."""
+"""Largest gap, in radii, of two bodies that others may push into each other."""
 
 
 class Contacts(NamedTuple):
-    """What touches at the end of a step; arrays of as many places as there is room for."""
+    """Contacts at the end of a step; the length of the arrays is the capacity."""
 
     who: Any  # a body
     other: Any  # another, or -1 - m
     normal: Any  # (places, D), to the first from the other
-    allowed: Any  # m/s, how fast they may go into each other: until they touch at the end of the step
-    open: Any  # 1 = who go into each other in the next step: nothing to press here
-    push: Any  # kg m/s, given across so far
-    rub: Any  # (places, D) kg m/s, given along so far
-    was: Any  # (places, D + 1) kg m/s, along and across, before a pass
-    way: Any  # (places, D + 1) kg m/s, the direction in which passes go on
-    rank: Any  # m, how far up along the mean acceleration
-    order: Any  # the contacts from below
+    allowed: Any  # m/s, allowed approach speed: that at which they touch at the end of the step
+    open: Any  # 1 = their impact is in the next step, and no impulse acts here
+    push: Any  # kg m/s, normal impulse so far
+    rub: Any  # (places, D) kg m/s, tangential impulse so far
+    was: Any  # (places, D + 1) kg m/s, tangential and normal impulse before a pass
+    way: Any  # (places, D + 1) kg m/s, search direction of the passes
+    rank: Any  # m, height against the mean acceleration
+    order: Any  # the contacts, lowest first
 
 
 class Ends(NamedTuple):
-    """Where and how fast the bodies of one world are at the end of a step; (N, D) m and m/s."""
+    """Positions and velocities of the bodies of one world at the end of a step; (N, D) m and m/s."""
 
     pos: Any
     vel: Any
-    tie: Any  # unit vectors: two bodies in one place part along the difference of theirs
+    tie: Any  # unit vectors: two bodies in one place separate along the difference of theirs
 
 
 @kernel
@@ -82,12 +82,12 @@ def gather(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, contacts: Contacts, seconds: float,
     up: Vec, touch: float, slow: float, restitution: float, in_time: bool, passing: bool, count: int,
 ) -> int:  # fmt: skip
-    """Find which meetings touch at the end, or nearly do; return how many, in the order of their height.
+    """Find the meetings that touch at the end of the step, or nearly do, sorted by height; return their number.
 
-    in_time: True if impacts of the step are done. Two that are still to meet have their impact in the next step, but
-    for bodies in a heap: those that are nearly in touch, and approach slower than the step's acceleration has made
-    them, rest. For others it is `slow` m/s.
-    passing: True if bodies may pass what they touch at the beginning; then that is where they touch.
+    in_time: True if impacts of the step are done. Pairs that still approach have their impact in the next step. Bodies
+    in a heap are the exception: those that are nearly in touch rest if their approach speed is at most what the step's
+    acceleration has added. For others the limit is `slow` m/s.
+    passing: True if bodies may pass what they touch at the beginning; then the contact is taken from there.
     """
     found = 0
     for c in range(count):
@@ -101,7 +101,7 @@ def gather(
             begun, first = _normal(period, bodies, things, bodies.start, ends, 0.0, i, j)
             passed = begun <= margin and (gap < -margin or dot(n, first) < 0.5)
             n = select(passed, first, n)
-        if (gap <= margin and not (passing and gap < -margin)) or passed:  # what came from afar stops on the way
+        if (gap <= margin and not (passing and gap < -margin)) or passed:  # a body from afar stops on its path
             contacts.who[found], contacts.other[found] = i, j
             w = -dot(_seen(period, things, ends.vel, i, j), n)
             heap = restitution < 1.0 if j >= 0 else bodies.leans[i] > 0
@@ -124,7 +124,7 @@ def gather(
 
 @kernel
 def _far_apart(period: Vec, bodies: Bodies, ends: Ends, i: int, j: int, margin: float) -> bool:
-    """True if two bodies are further apart than a margin at the end of a step, m: without a square root."""
+    """Return True if two bodies are further apart than a margin, m, at the end of a step; without a square root."""
     d = image(period, sub(vector(period, ends.pos, i), vector(period, ends.pos, j)))
     room = 1.000001 * (bodies.radius[i] + bodies.radius[j] + margin)
     return bool(dot(d, d) > room * room)
@@ -132,19 +132,19 @@ def _far_apart(period: Vec, bodies: Bodies, ends: Ends, i: int, j: int, margin: 
 
 @kernel
 def _moved(period: Vec, bodies: Bodies, ends: Ends, i: int) -> Vec:
-    """Return how far a step has led a body, m."""
+    """Return the displacement of a body in the step, m."""
     return image(period, sub(vector(period, ends.pos, i), vector(period, bodies.start, i)))
 
 
 @kernel
 def _drifted(period: Vec, things: Things, j: int, seconds: float) -> Vec:
-    """Return how far obstacle -1 - j moves in a step, m."""
+    """Return the displacement of obstacle -1 - j in the step, m."""
     return scale(vector(period, things.drift, -1 - j), seconds)
 
 
 @kernel
 def _sort(rank: Any, order: Any, count: int) -> None:
-    """Put [0, count) in the order of their rank: heapsort."""
+    """Sort the first `count` entries of `order` by rank: heapsort."""
     end = count
     start = count // 2
     while end > 1:
@@ -166,7 +166,7 @@ def _sort(rank: Any, order: Any, count: int) -> None:
 
 @kernel
 def _give(period: Vec, bodies: Bodies, vel: Any, i: int, j: int, impulse: Vec) -> None:
-    """Give an impulse to a body, and its opposite to the other."""
+    """Apply an impulse to a body, and the opposite to the other."""
     write(vel, i, add(vector(period, vel, i), scale(impulse, bodies.light[i])))
     if j >= 0:
         write(vel, j, sub(vector(period, vel, j), scale(impulse, bodies.light[j])))
@@ -174,7 +174,7 @@ def _give(period: Vec, bodies: Bodies, vel: Any, i: int, j: int, impulse: Vec) -
 
 @kernel
 def _ease(bodies: Bodies, i: int, j: int) -> float:
-    """Return by how much an impulse of 1 kg m/s changes the velocity between two, 1/kg."""
+    """Return the inverse reduced mass of a pair, 1/kg: the change of relative velocity per impulse."""
     return float(bodies.light[i] + (bodies.light[j] if j >= 0 else 0.0))
 
 
@@ -183,10 +183,10 @@ def impacts(
     period: Vec, bodies: Bodies, things: Things, contacts: Contacts, vel: Any, restitution: float, friction: float,
     sticky: bool, rounds: int, slow: float, count: int,
 ) -> tuple[int, int]:  # fmt: skip
-    """Let those that go into each other at velocities (N, D) bounce, until none does; return impacts, and those left.
+    """Let bodies that approach each other, at velocities (N, D), bounce until none do; return impacts, and those left.
 
-    slow: m/s, approach that is none. Impacts that are left after `rounds` > 1 passes are those of the next step: their
-    contacts are open, so that nothing takes their energy.
+    slow: m/s, approach speed that is ignored. Impacts that are left after `rounds` > 1 passes are left to the next
+    step: their contacts are marked open, so that no energy is lost.
     """
     done, left = 0, 0
     for turn in range(rounds):
@@ -218,7 +218,7 @@ def _press_once(
     period: Vec, bodies: Bodies, things: Things, contacts: Contacts, vel: Any, friction: float, sticky: bool, up: bool,
     count: int,
 ) -> tuple[float, float]:  # fmt: skip
-    """Pass once over all contacts; return the fastest change of velocity, and the sum of the squares of impulses."""
+    """Pass once over all contacts; return the largest change of velocity, and the sum of the squares of impulses."""
     worst, square = 0.0, 0.0
     for k in range(count):
         c = contacts.order[k if up else count - 1 - k]
@@ -257,12 +257,12 @@ def press(
     period: Vec, bodies: Bodies, things: Things, contacts: Contacts, vel: Any, friction: float, sticky: bool,
     rounds: int, slow: float, count: int,
 ) -> float:  # fmt: skip
-    """Stop those who go into each other at velocities (N, D), without a bounce; return the last pass's fastest change.
+    """Stop the approach of bodies, velocities (N, D), without a bounce; return the last pass's largest change, m/s.
 
-    The impulse of each contact is summed and never pulls; friction is bounded by what was given across, friction times
-    as much (Coulomb), and stops what it can. Sticky contacts pull as well as push, in every direction. Passes go on
-    along the direction of those before, as conjugate gradients do (Silcowitz, Niebe and Erleben 2010): the weight of a
-    heap is known at its foot after about as many passes as it is high, and not after their square.
+    The summed normal impulse of each contact never pulls. The summed friction impulse is at most `friction` times as
+    large (Coulomb), and opposes sliding. Sticky contacts pull and push in every direction. Passes are accelerated by
+    nonsmooth nonlinear conjugate gradients (Silcowitz, Niebe and Erleben 2010): the weight of a heap reaches its foot
+    after about as many passes as it has layers, not after their square.
     """
     for c in range(count):
         contacts.push[c] = 0.0
@@ -303,10 +303,10 @@ def part(
     period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: float, rounds: int, touch: float, most: float,
     contacts: Contacts, count: int,
 ) -> float:  # fmt: skip
-    """Move apart those that overlap at the end, each two by at most `most` m; return the last pass's farthest move.
+    """Move bodies that overlap at the end apart, each pair by at most `most` m; return the last pass's largest move, m.
 
-    The lighter of two moves further. Between a heavy body and a wall that would take as many passes as the masses'
-    ratio is large: in the second half of the passes all masses count the same.
+    The lighter of two moves further. A light body between a heavy one and a wall would need a number of passes
+    proportional to the mass ratio, so the second half of the passes treats all masses as equal.
     """
     for c in range(count):
         contacts.push[c] = 0.0
@@ -334,9 +334,9 @@ def part(
 def deepest(
     period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: float, who: Any, other: Any, count: int
 ) -> float:
-    """Return how far any two of these pairs overlap at the end of a step, as a part of the smaller radius.
+    """Return the deepest overlap of these pairs at the end of a step, as a part of the smaller radius.
 
-    who, other: (places,) as in Meetings and Contacts.
+    `who`, `other`: (places,) as in Meetings and Contacts.
     """
     deep = 0.0
     for c in range(count):
@@ -349,7 +349,7 @@ def deepest(
 
 @kernel
 def _share(bodies: Bodies, i: int, j: int, alike: bool) -> float:
-    """Return the part of a move that body i makes, of both; alike: True if masses do not count."""
+    """Return the part of a move that body i makes, the other makes the rest; alike: True if masses are ignored."""
     one, two = bodies.light[i], bodies.light[j] if j >= 0 else 0.0
     if alike and one > 0.0 and two > 0.0:
         return 0.5

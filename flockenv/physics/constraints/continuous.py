@@ -1,7 +1,7 @@
-"""What responses do that look at the end of a step alone, so that no body goes through another, however fast it is.
+"""Straight paths of responses that use the end of a step only, so that no body tunnels through another at any speed.
 
 Impacts and contacts have changed velocities; now each body goes in a straight line to its place at the end of the step.
-Where it would go into something on that path it stops, in touch with it, and their impact is that of the next step.
+If it would go into another body or an obstacle on that path, it stops in touch, and has its impact in the next step.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from flockenv.physics.constraints.impact import surface
 __all__ = ["goes_round", "may_pass", "stop_on_the_way", "take_aim"]
 
 SLOW = 0.75
-"""Part of its radius that a body may move in a step without ever being beyond what it touches."""
+"""Part of its radius that a body may move in a step without passing what it touches."""
 
 LOST = 0.5
-"""Part of the smaller radius by which two overlap that are in each other: which is on which side means nothing."""
+"""Overlap, as a part of the smaller radius, from which on the order of two bodies is undefined."""
 
 
 @kernel
 def goes_round(period: Vec, path: float) -> bool:
-    """True if two whose paths are so long, m, may meet where one is not the nearest image of the other."""
+    """Return True if two bodies whose paths are `path` m long may meet where they are not nearest images."""
     least = np.inf
     for k in range(len(period)):
         least = min(least, period[k])
@@ -51,9 +51,9 @@ def goes_round(period: Vec, path: float) -> bool:
 
 @kernel
 def may_pass(period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: float, turned: bool) -> bool:
-    """True if a body, or an obstacle relative to it, moves so far in the step that one may pass the other.
+    """Return True if a body, or an obstacle relative to it, moves so far in the step that one may pass the other.
 
-    turned: True if impacts have changed where bodies go.
+    turned: True if impacts have changed the paths of bodies.
     """
     drift = 0.0
     for m in range(things.row.shape[0]):
@@ -68,14 +68,14 @@ def may_pass(period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: f
 
 @kernel
 def take_aim(period: Vec, bodies: Bodies, ends: Ends, seconds: float) -> None:
-    """Let each body reach as far as the end of its step is from the beginning."""
+    """Set the reach of each body to the distance from the beginning to the end of its step."""
     for i in range(bodies.living.shape[0]):
         bodies.reach[i] = norm(_path(period, bodies, ends, i, seconds))
 
 
 @kernel
 def _path(period: Vec, bodies: Bodies, ends: Ends, i: int, seconds: float) -> Vec:
-    """Return the vector from where body i begins the step to where it ends it, m."""
+    """Return the vector from the beginning to the end of the step of body i, m."""
     apart = sub(vector(period, ends.pos, i), vector(period, bodies.start, i))
     return led(period, apart, scale(vector(period, ends.vel, i), seconds))
 
@@ -85,12 +85,11 @@ def stop_on_the_way(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, strict: bool, count: int,
     lost: Any,
 ) -> int:  # fmt: skip
-    """Stop bodies where their paths lead into something; return how many meetings there are, room for them or not.
+    """Stop bodies where their paths hit something; return the number of meetings, even if it exceeds their capacity.
 
-    rules.stops must be set. strict: True if no two may come to overlap further than they did when the step began, but
-    for DEEP; two of which one began in the other by half of its radius have no order to keep. A body that stops keeps
-    the velocity that impacts left it with, less what the step's acceleration would have added on the part of the path
-    that it does not go.
+    rules.stops must be set. strict: True if no two bodies may come to overlap by more than when the step began, or than
+    DEEP; two that began with an overlap of more than LOST have no order to keep. A body that stops keeps the velocity
+    that impacts left it with, less what the step's acceleration would have added on the rest of the path.
     """
     n, seconds, known = bodies.living.shape[0], rules.seconds, count
     for i in range(n):
@@ -119,8 +118,8 @@ def stop_on_the_way(
             meetings.deep[c] = max(DEEP * wide, -begun) + 10.0 * rules.touch
             meetings.closed[c] = GIVEN_UP if -begun > LOST * wide else 0
             continue
-        # two that begin near each other rest, and are parted by little; what comes from afar stops at the surface, or
-        # it would be lifted out of it
+        # two bodies that begin near each other rest, and are separated by little; a body that comes from afar stops at
+        # the surface, or separation would lift it out
         near = max(DEEP * width(bodies, i, j) - max(begun, 0.0), 0.0)
         meetings.deep[c] = near + 10.0 * rules.touch + max(-begun, 0.0)
     _, _, count = play(period, bodies, meetings, things, rules, count, lost)
@@ -133,7 +132,7 @@ def stop_on_the_way(
 
 @kernel
 def _end(period: Vec, bodies: Bodies, ends: Ends, i: int, seconds: float) -> None:
-    """Write where body i stopped, or where an obstacle pushed it, and its velocity."""
+    """Write the place where body i stopped, or to which an obstacle pushed it, and its velocity."""
     left = seconds - bodies.since[i]
     for k in range(len(period)):
         ends.pos[i, k] = bodies.at[i, k] + bodies.vel[i, k] * left

@@ -1,12 +1,12 @@
 """Impacts of one world within one step, one after another in the order of time.
 
 Each body flies along the parabola that the method has made of the step. The earliest impact of all is found, both
-bodies respond, and their further paths are searched anew. A ball whose hops get smaller and smaller is at rest at the
-end of the series, if that lies within the step; from then on the surface carries it: what pushes it into the surface
-is cancelled, and friction acts along it.
+bodies respond, and their further paths are searched anew. If the infinite series of hops of a bouncing ball ends within
+the step, the ball rests; from then on the surface carries it: the acceleration into the surface is cancelled, and
+friction acts along it.
 
-The number of impacts of one pair in one step is limited. Beyond the limit the two bodies stop (stops.py): they keep
-their velocities and do not move for the rest of the step. So time is lost, and neither energy nor order.
+The number of impacts of one pair in one step is limited. Beyond the limit the two bodies stop (stalls.py): they keep
+their velocities and do not move for the rest of the step. So time is lost, but neither energy nor order.
 """
 
 from __future__ import annotations
@@ -42,27 +42,27 @@ from flockenv.physics.constraints.stalls import halt
 __all__ = ["play", "together"]
 
 OBLIQUE = 0.6180339887498949
-"""An axis in no special direction: coordinates weigh 1, this, and its square."""
+"""Weight of an axis in a generic direction: coordinates are weighted by 1, this, and its square."""
 
 CALM = 0.01
-"""Part of a radius that what rests falls in a step that is short for it."""
+"""A step is short for a body at rest if it would fall by less than this part of its radius."""
 
 JOLTED = 3
-"""Place in `lost` of the flag that the last impact changed velocities by more than the step does; see `play`."""
+"""Index in `lost` of the flag that the last impact changed velocities by more than the step does; see `play`."""
 
 
 @kernel
 def together(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, count: int, before: Any
 ) -> None:
-    """Let bodies that begin in touch begin with their velocities as they are, before (N, D) m/s, for the whole step."""
+    """Start bodies that touch at the beginning with their velocities before the step, `before` (N, D) m/s."""
     for c in range(count):
         _together(period, bodies, things, meetings.who[c], meetings.other[c], rules.touch, before)
 
 
 @kernel
 def _together(period: Vec, bodies: Bodies, things: Things, i: int, j: int, touch: float, before: Any) -> None:
-    """Drop the half step by which a method of first order is ahead: it would lead into what is touched, or away."""
+    """Drop the half step by which a first-order method is ahead: it would lead into the surface, or away from it."""
     y, _, _ = relative(period, bodies, things, i, j, 0.0)
     row, room = met(bodies, things, i, j)
     if surface(things.table, row, y)[0] - room <= touch:
@@ -82,11 +82,11 @@ def _as_it_is(period: Vec, bodies: Bodies, i: int, before: Any) -> None:
 def play(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, count: int, lost: Any
 ) -> tuple[int, int, int]:
-    """Move all bodies of one world through the step; return impacts, how many were cut short, and meetings in all.
+    """Move all bodies of one world through the step; return numbers of impacts, of those cut short, and of meetings.
 
-    lost: s that stopped bodies did not move for, J that bodies lost that came to rest at the limit, and how many bodies
-    stopped, added to; and 1 if the last impact changed velocities by more than the step does, else 0. More meetings
-    than there is room for: the work is to be done anew.
+    lost: added to are the s that stopped bodies did not move for, the J lost by bodies that came to rest at the limit,
+    and the number of bodies that stopped. Entry JOLTED is 1 if the last impact changed velocities by more than the step
+    does, else 0. If there are more meetings than capacity, the caller must repeat the work with more room.
     """
     todo, active, impacts, cut = count, 0, 0, 0
     for c in range(count):
@@ -116,7 +116,7 @@ def play(
 
 @kernel
 def _stops_both(bodies: Bodies, meetings: Meetings, rules: Rules, c: int) -> bool:
-    """True if a meeting is no impact: one of the two has stopped already, or they rest and would overlap too far."""
+    """Return True if a meeting is no impact: no impacts are allowed, one body has stopped, or the two are at rest."""
     j = meetings.other[c]
     stopped = bodies.moved[meetings.who[c]] == STOPPED or (j >= 0 and bodies.moved[j] == STOPPED)
     return bool(rules.stops or stopped or meetings.closed[c] == RESTS)
@@ -124,7 +124,7 @@ def _stops_both(bodies: Bodies, meetings: Meetings, rules: Rules, c: int) -> boo
 
 @kernel
 def _earliest(period: Vec, bodies: Bodies, meetings: Meetings, active: int) -> tuple[int, int]:
-    """Return the earliest meeting, -1 if there is none, and how many are active; those without a time are let go of."""
+    """Return the earliest meeting, or -1, and the number of active ones; drop those without a time from the list."""
     best, k = -1, 0
     while k < active:
         c = meetings.active[k]
@@ -144,7 +144,7 @@ def _earliest(period: Vec, bodies: Bodies, meetings: Meetings, active: int) -> t
 
 @kernel
 def _height(period: Vec, bodies: Bodies, meetings: Meetings, c: int) -> float:
-    """Return a number by which meetings at the very same time are told apart, whatever the numbers of the bodies."""
+    """Return a tie-breaker of simultaneous meetings that depends on positions, not on the indices of the bodies."""
     i, j = meetings.who[c], meetings.other[c]
     place, out = vector(period, bodies.start, i), 0.0
     if j >= 0:
@@ -156,7 +156,7 @@ def _height(period: Vec, bodies: Bodies, meetings: Meetings, c: int) -> float:
 
 @kernel
 def _search(period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, c: int, active: int) -> int:
-    """Find when a meeting takes place; return how many have a time."""
+    """Compute the time of a meeting; return the number of active meetings."""
     if meetings.closed[c] == GIVEN_UP:
         return active
     i, j = meetings.who[c], meetings.other[c]
@@ -179,7 +179,7 @@ def _again(
 ) -> int:  # fmt: skip
     """List the meetings of body i to be searched anew; return how many are listed.
 
-    Two that rest need no search if nothing has jolted them, and the step is too short for them to overlap much.
+    Two bodies at rest need no search if no impact has jolted them and the step is too short for them to overlap much.
     """
     calm = not jolted and gained(period, bodies, i, -1) * rules.seconds**2 < CALM * bodies.radius[i]
     place = bodies.first[i]
@@ -196,9 +196,9 @@ def _again(
 
 @kernel
 def _hit_anew(period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, c: int, t: float) -> bool:
-    """True if a third body has driven two that rest into each other, faster than the step's acceleration does.
+    """Return True if a third body has driven two at rest into each other, faster than the step's acceleration does.
 
-    At most so often that a step has an end.
+    It returns False after a bounded number of hits, so that the step ends.
     """
     i, j = meetings.who[c], meetings.other[c]
     if meetings.hits[c] >= ANEW * (rules.most + 1):
@@ -213,10 +213,10 @@ def _hit_anew(period: Vec, bodies: Bodies, meetings: Meetings, things: Things, r
 def _impact(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, c: int, t: float, lost: Any
 ) -> int:
-    """Change the velocities of those that meet; return 1 if it is one impact too many, else 0.
+    """Change the velocities of the two bodies of an impact; return 1 if it exceeds the limit of impacts, else 0.
 
-    One too many: two that approach slower than the step's acceleration changes velocity are at rest from now on; faster
-    ones respond, and stop.
+    Beyond the limit, two that approach slower than the step's acceleration changes velocity are at rest from now on;
+    faster ones respond, and stop.
     """
     i, j = meetings.who[c], meetings.other[c]
     y, v, a = relative(period, bodies, things, i, j, t)
@@ -227,7 +227,7 @@ def _impact(
     over = meetings.hits[c] % ((rules.most if j < 0 else rules.again) + 1) == 0
     slow = w <= gained(period, bodies, i, j) * rules.seconds
     rests = rules.sticky or ends_here(max(w, 0.0), push, restitution, left) or hops_in_touch(w, push, rules.touch)
-    if j >= 0 and restitution < 1.0:  # in a heap no body is accelerated into another, and all are pressed together
+    if j >= 0 and restitution < 1.0:  # in a heap each contact comes to rest, and all are solved together
         rests = rests or slow
     cut = over and not rests
     rests = rests or (over and slow)
@@ -268,7 +268,7 @@ def _go_on(period: Vec, bodies: Bodies, i: int, t: float, change: Vec) -> None:
 def _lie(
     period: Vec, bodies: Bodies, things: Things, rules: Rules, i: int, m: int, n: Vec, push: float, left: float
 ) -> None:
-    """Let obstacle m carry body i for the rest of the step: what pushes it in is cancelled, friction acts along it."""
+    """Let obstacle m carry body i for the rest of the step: no acceleration into it, friction along it."""
     drift, a = vector(period, things.drift, m), vector(period, bodies.acc, i)
     side = sub(vector(period, bodies.vel, i), drift)
     if rules.sticky:
@@ -281,7 +281,7 @@ def _lie(
     after = rubbed(add(side, scale(a, left)), most) if most > 0.0 else add(side, scale(a, left))
     excess = vector(period, bodies.excess, i)
     excess = sub(excess, scale(n, dot(excess, n)))
-    if most > 0.0:  # friction holds the velocity that the method speaks of, too
+    if most > 0.0:  # friction also acts on the method's excess of velocity
         excess = sub(rubbed(add(add(side, scale(a, left)), excess), most), after)
     write(bodies.excess, i, excess)
     write(bodies.acc, i, scale(sub(after, side), 1.0 / left) if left > 0.0 else scale(a, 0.0))

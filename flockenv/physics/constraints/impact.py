@@ -1,8 +1,8 @@
-"""When a body that flies along a parabola first touches something, and what that does to its velocity.
+"""The time at which a body on a parabola first touches a surface, and its velocity after the impact.
 
-Laws for one body, relative to what it may touch; lengths in m, times in s. What it may touch is a row of a table of
-shapes (flockenv/geometry/shapes/table.py), or a point: two round bodies touch when the centre of one is as far from
-that of the other as both radii together, their `room`.
+Laws for one body, relative to what it may touch; lengths in m, times in s. That is a row of a table of shapes
+(flockenv/geometry/shapes/table.py), or a point: two round bodies touch when the distance of their centres is the sum
+of their radii, their `room`.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ __all__ = [
 ]  # fmt: skip
 
 POINT = -1
-"""The row of what is a point."""
+"""The row number that stands for a point."""
 
 CHORDS = 8
-"""Pieces that a path is cut into at most."""
+"""Most pieces that a path is cut into."""
 
 POLISH = 40
-"""Steps of Newton's method after a chord has hit; two or three are usual."""
+"""Most steps of Newton's method after a chord has hit; two or three are usual."""
 
 
 @routine
 def surface(table: Any, at: int, y: Vec) -> tuple[float, Vec]:
-    """Return how far the surface is, m, and the unit normal there, of a shape or a point, from y relative to it."""
+    """Return the distance to the surface of a shape or a point, m, and the unit normal there, from y relative to it."""
     if at >= 0:
         return nearest_shape(table, at, y)
     far = norm(y)
@@ -42,7 +42,7 @@ def surface(table: Any, at: int, y: Vec) -> tuple[float, Vec]:
 
 @routine
 def _hit(table: Any, at: int, y: Vec, way: Vec, room: float) -> float:
-    """Return how far along a unit vector a body of this radius touches, m."""
+    """Return the distance along the unit vector `way` after which a body of radius `room` touches, m."""
     if at >= 0:
         return hit_shape(table, at, y, way, room)
     return ray_hit(scale(y, -1.0), way, room)
@@ -69,10 +69,10 @@ def flight(dt: float, moved: Vec, before: Vec, after: Vec) -> tuple[Vec, Vec, Ve
 
 @law
 def _starts(w: float, a: float, far: float, touch: float) -> float:
-    """Return from when on a body that touches already may touch anew: 0 = now, inf = never.
+    """Return the time from which a body that touches already may touch anew: 0 = now, inf = never.
 
-    w, a: how fast it leaves, and is accelerated, along the normal. What takes it in by less than half of `touch` until
-    `far` is rounding: no impact, however often a body that slides would be said to hop.
+    w, a: velocity and acceleration along the outward normal. A motion that goes in by less than half of `touch` until
+    `far` is rounding, and no impact; otherwise a sliding body would hop over and over.
     """
     fall = -a if a < 0.0 else 0.0
     if not (0.5 * fall * far - w) * far > 0.5 * touch:
@@ -82,11 +82,11 @@ def _starts(w: float, a: float, far: float, touch: float) -> float:
 
 @routine
 def first_impact(table: Any, at: int, y: Vec, v: Vec, a: Vec, far: float, room: float, touch: float) -> float:
-    """Return when a body at y, at v, accelerated by a, first comes to touch within `far` s; inf if it does not.
+    """Return when a body at y, with velocity v and acceleration a, first touches within `far` s; inf if it does not.
 
-    It touches where its gap is at most `touch`, m. A path is cut into chords so short that it bends by no more than a
-    hundredth of the room, each chord is followed exactly, and where one hits the moment is polished on the parabola.
-    Who overlaps already and goes in deeper touches now; who leaves, only where he comes back.
+    It touches where its gap is at most `touch`, m. The path is cut into chords so short that it bends by at most a
+    hundredth of the room. Each chord is followed exactly; where one hits, the time is refined on the parabola. A body
+    that overlaps already and goes in deeper touches now; one that leaves touches only where it comes back.
     """
     gap, n = surface(table, at, y)
     if gap - room > touch:
@@ -96,7 +96,7 @@ def first_impact(table: Any, at: int, y: Vec, v: Vec, a: Vec, far: float, room: 
     top = _starts(dot(v, n), dot(a, n), far, touch)
     if top <= 0.0:
         return 0.0
-    away = min(top, far)  # until then it leaves what it touches; of the same shape it may meet something else
+    away = min(top, far)  # until then it leaves the surface that it touches, but may hit another part of the same shape
     t = _followed(table, at, y, v, a, 0.0, away, room, gap - 1e-9 * room - touch, touch)
     if t < np.inf or top >= far:
         return t
@@ -110,7 +110,7 @@ def _followed(
     table: Any, at: int, y: Vec, v: Vec, a: Vec, begin: float, far: float, room: float, seen: float,
     touch: float,
 ) -> float:  # fmt: skip
-    """Return when within [begin, far] its surface is met, whose chords are followed as if the room was `seen`."""
+    """Return when the path reaches the surface within [begin, far], else inf; chords are followed with room `seen`."""
     bend = norm(a) * (far - begin) * (far - begin) / 8.0
     chords = int(min(1.0 + np.sqrt(bend / (0.01 * room + 1e-12)), CHORDS * 1.0))
     each = (far - begin) / chords
@@ -132,10 +132,10 @@ def _followed(
 def _polished(
     table: Any, at: int, y: Vec, v: Vec, a: Vec, early: float, late: float, room: float, t: float
 ) -> float:  # fmt: skip
-    """Return the moment near t, from `early` to `late`, at which the surface is reached: Newton's method, kept between.
+    """Return the time near t, within [early, late], at which the surface is reached, by a safeguarded Newton's method.
 
-    Where it is beyond the surface in the end, halves of the time in between take over wherever Newton's step leads out
-    of them: a chord may hit while the body still rises.
+    If the body is beyond the surface at `late`, bisection replaces each Newton step that leaves the bracket: a chord
+    may hit while the body still rises.
     """
     through = surface(table, at, along(y, v, a, late))[0] < room
     for _ in range(POLISH):
@@ -159,10 +159,10 @@ def _polished(
 
 @law
 def bounced(c: Vec, n: Vec, restitution: float, friction: float) -> Vec:
-    """Return the velocity after an impact at velocity c relative to a surface of normal n, if it goes into it.
+    """Return the velocity after an impact at velocity c relative to a surface of normal n; c if it does not approach.
 
-    The normal part turns around and keeps the share `restitution`. Coulomb's friction takes at most friction times as
-    much from the part along the surface as the impact gave across it, and never turns that part around.
+    The normal part is reversed and multiplied by `restitution`. Coulomb friction reduces the tangential part by at most
+    `friction` times the change of the normal part, and never reverses it.
     """
     w = -dot(c, n)
     if w <= 0.0:
@@ -173,20 +173,20 @@ def bounced(c: Vec, n: Vec, restitution: float, friction: float) -> Vec:
 
 @law
 def rubbed(side: Vec, most: float) -> Vec:
-    """Return a velocity along a surface, less `most` m/s; nothing if that is more than there is."""
+    """Return a velocity along a surface, reduced by `most` m/s, and zero if it is slower than that."""
     speed = norm(side)
     return scale(side, 1.0 - most / speed if speed > most else 0.0)
 
 
 @law
 def hops_in_touch(w: float, push: float, touch: float) -> bool:
-    """True if a body that comes at w, m/s, would hop no higher than `touch`, m, under an acceleration `push` < 0."""
+    """Return True if a body that comes at w, m/s, hops at most `touch`, m, high under an acceleration `push` < 0."""
     return push < 0.0 and w * w <= -2.0 * push * touch
 
 
 @law
 def ends_here(w: float, push: float, restitution: float, left: float) -> bool:
-    """Do all further bounces on a plane, each of `restitution` times the speed, end within so many seconds?
+    """Return True if all further bounces on a plane end within `left` s, each at `restitution` = e times the speed.
 
     A body that comes at w > 0 and is accelerated by `push` < 0 into the plane bounces 2 e w / (-push (1 - e)) s long.
     """

@@ -1,4 +1,4 @@
-"""Rods and ropes: pairs of agents whose distance is given, or at most given, at the end of every step."""
+"""Rods and ropes: pairs of agents whose distance is fixed, or has an upper limit, at the end of every step."""
 
 from __future__ import annotations
 
@@ -26,46 +26,46 @@ Pair = tuple[Number, Number]
 Length = Annotated[float, Field(gt=0, strict=True)]
 
 KNOWN, UNKNOWN = 0.9999, 0.99
-"""By which factor at most Jacobi's iteration is taken to shrink errors: where directions at rest are known, or not."""
+"""Upper limits of the assumed convergence factor of Jacobi's iteration: if directions at rest are known, or not."""
 
 POWERS, LEAST = 50, 1e-9
-"""Steps in which that is found, and what rods are taken to resist at least: there may be one too many."""
+"""Steps of inverse iteration that estimate it, and a shift of the matrix, which redundant rods make singular."""
 
 
 class Ties(NamedTuple):
-    """Who is held to whom, R pairs, in layers of which each has nobody twice."""
+    """R pairs of agents that are held together, in layers; each agent is at most once in a layer."""
 
     i: NDArray[np.int32]  # (R,)
     j: NDArray[np.int32]  # (R,)
     length: NDArray[np.float64]  # (R,) m
-    way: NDArray[np.float64]  # (R, D) from i to j when nothing is strained; 0 = nobody knows
+    way: NDArray[np.float64]  # (R, D) from i to j at rest; 0 = unknown
 
 
 class Hold(NamedTuple):
-    """What a kernel is given of R rods: who, how, and scratch."""
+    """Arguments of a kernel for R rods: agents, parameters, and scratch memory."""
 
-    weight: Any  # (N,) 1/kg; 0 of who is held in place
+    weight: Any  # (N,) 1/kg; 0 for agents that are held in place
     i: Any  # (R,)
     j: Any  # (R,)
     length: Any  # (R,) m
-    period: Any  # (D,) m, around a torus; 0 = it has none
+    period: Any  # (D,) m, edges of a torus; 0 = not periodic
     per_dt: float  # 1/s
     slack: bool
     tolerance: float
     most: int
     rho: float  # see _slowness
-    allowed: Any  # (R,) m, by which a length may be off
+    allowed: Any  # (R,) m, allowed error of a length
     old: Any  # (R, D) m, from i to j before the step
-    before: Any  # (R,) m, how long that was
-    pull: Any  # (R,) what each rod has done in these sweeps
+    before: Any  # (R,) m, length before the step
+    pull: Any  # (R,) summed correction of each rod in these sweeps
     way: Any  # (D,) m, from i to j now
     along: Any  # (D,) the direction in which it acts, of any length
-    kept: Any  # (2, D, N) where everybody came by the method, and how fast
+    kept: Any  # (2, D, N) positions and velocities after the method
 
 
 @kernel
 def _to(x: Any, b: int, i: int, j: int, period: Any, way: Any) -> float:
-    """Write the way from agent i to agent j, the shortest around a torus; return how long it is."""
+    """Write the offset from agent i to agent j, the shortest one on a torus; return its length."""
     square = like(way[0], 0.0)
     for k in range(x.shape[0]):
         d = x[k, b, j] - x[k, b, i]
@@ -87,7 +87,7 @@ def _sum(a: Any, b: Any) -> float:
 
 @kernel
 def _push(x: Any, b: int, rods: Any, r: int, by: float) -> None:
-    """Move both ends of a rod along it, each by its weight: x of one end grows as that of the other falls."""
+    """Add `by` times weight times direction to x of one end of a rod, and subtract it from x of the other."""
     i, j = rods.i[r], rods.j[r]
     for k in range(x.shape[0]):
         x[k, b, i] += by * rods.weight[i] * rods.along[k]
@@ -96,7 +96,7 @@ def _push(x: Any, b: int, rods: Any, r: int, by: float) -> None:
 
 @kernel
 def _begin(x0: Any, x: Any, b: int, rods: Any) -> None:
-    """Write how every rod was before the step, and how far off it may be: no length is known better than a place is."""
+    """Write each rod's offset before the step, and its allowed error: at least the rounding error of positions."""
     for r in range(rods.i.shape[0]):
         i, j = rods.i[r], rods.j[r]
         rods.before[r] = _to(x0, b, i, j, rods.period, rods.old[r])
@@ -108,16 +108,16 @@ def _begin(x0: Any, x: Any, b: int, rods: Any) -> None:
 
 @kernel
 def _moves(alive: Any, b: int, rods: Any, r: int) -> bool:
-    """Are both ends alive, and can one of them move?"""
+    """Return True if both ends of a rod are alive, and at least one of them can move."""
     i, j = rods.i[r], rods.j[r]
     return alive[b, i] and alive[b, j] and rods.weight[i] + rods.weight[j] > 0  # type: ignore[no-any-return]
 
 
 @kernel
 def _sooner(over: float, rho: float, sweep: int) -> float:
-    """Return by how much the next sweep is over-relaxed: Chebyshev's way from 1 to Young's 2 / (1 + sqrt(1 - rho^2)).
+    """Return the over-relaxation of the next sweep: Chebyshev's sequence from 1 to Young's 2 / (1 + sqrt(1 - rho^2)).
 
-    (Golub and Varga 1961.) Errors do not grow on the way, as they do if one begins with the last.
+    (Golub and Varga 1961.) Errors do not grow meanwhile, as they do if the first sweep uses the final value.
     """
     e = like(rho, 1.0)
     return e / (e - rho * rho * over * like(rho, 0.5 if sweep == 0 else 0.25))
@@ -125,7 +125,7 @@ def _sooner(over: float, rho: float, sweep: int) -> float:
 
 @kernel
 def _aim(rods: Any, r: int) -> float:
-    """Return how long a rod shall be while velocities come to fit: as it was, if that was wrong already."""
+    """Return the target length of a rod in the stage that also changes velocities: its old length if that was wrong."""
     aim, before, allowed = rods.length[r], rods.before[r], rods.allowed[r]
     if before > aim + allowed or (before < aim - allowed and not rods.slack):
         aim = before
@@ -134,9 +134,9 @@ def _aim(rods: Any, r: int) -> float:
 
 @kernel
 def _turned(rods: Any, r: int, now: float, carry: bool) -> float:
-    """Write along which way a rod acts, and return way . along, > 0.
+    """Write the direction in which a rod acts, and return way . along, > 0.
 
-    The one before the step, if it carries; if it turned too far since, or was in one place, the one it has now.
+    With `carry` it is that before the step. Without, or if the rod has turned too far since, it is the current one.
     """
     o = like(now, 0.0)
     if carry:
@@ -149,15 +149,15 @@ def _turned(rods: Any, r: int, now: float, carry: bool) -> float:
         rods.along[k] = rods.way[k]
     if now > o:
         return now * now
-    rods.along[0] = rods.length[r]  # both are in one place: any way will do
+    rods.along[0] = rods.length[r]  # both are in one place: any direction will do
     return rods.length[r] * rods.length[r]  # type: ignore[no-any-return]
 
 
 @kernel
 def _longer(x: Any, v: Any, b: int, rods: Any, r: int, over: float, carry: bool) -> tuple[float, bool]:
-    """Move the ends of a rod so that it is as long as it shall be; return by which share it was not, and if it counts.
+    """Move the ends of a rod to its target length; return its relative error, and whether that exceeds the tolerance.
 
-    With `carry` velocities change by as much as positions did in the step.
+    With `carry` velocities change by the change of positions per time step.
     """
     o, aim = like(over, 0.0), _aim(rods, r) if carry else rods.length[r]
     now = _to(x, b, rods.i[r], rods.j[r], rods.period, rods.way)
@@ -176,7 +176,10 @@ def _longer(x: Any, v: Any, b: int, rods: Any, r: int, over: float, carry: bool)
 
 @kernel
 def _stiller(x: Any, v: Any, b: int, rods: Any, r: int, over: float) -> tuple[float, bool]:
-    """Take the velocity along a rod, or what would stretch a taut rope; return its share, and if it counts."""
+    """Remove the velocity along a rod, or that which stretches a taut rope; return its relative size, and if it counts.
+
+    The size is relative to one length per time step.
+    """
     o, allowed = like(over, 0.0), rods.allowed[r]
     now = _to(x, b, rods.i[r], rods.j[r], rods.period, rods.way)
     if not now > o or (rods.slack and now < rods.length[r] - like(o, 2.0) * allowed):
@@ -197,9 +200,10 @@ def _stiller(x: Any, v: Any, b: int, rods: Any, r: int, over: float) -> tuple[fl
 
 @kernel
 def _swept(x: Any, v: Any, alive: Any, b: int, rods: Any, stage: int) -> tuple[int, float]:
-    """Sweep over all rods until they are right, over-relaxed; return the worst one if they are not, and its share.
+    """Sweep over all rods with over-relaxation until they are within tolerance.
 
-    Stage 0: lengths, velocities with them; 1: lengths that were wrong before; 2: velocities.
+    Returns the worst rod if they are not, else -1, and its relative error.
+    Stage 0: lengths, with velocities; 1: lengths that were wrong before the step; 2: velocities.
     """
     count, o = rods.i.shape[0], like(rods.per_dt, 0.0)
     for r in range(count):
@@ -223,7 +227,7 @@ def _swept(x: Any, v: Any, alive: Any, b: int, rods: Any, stage: int) -> tuple[i
 
 @kernel
 def _copy(x: Any, v: Any, kept: Any, b: int, keep: bool) -> None:
-    """Keep positions and velocities of world b, or put back what was kept."""
+    """Save positions and velocities of world b (keep), or restore them."""
     for k in range(x.shape[0]):
         for i in range(x.shape[2]):
             if keep:
@@ -234,7 +238,7 @@ def _copy(x: Any, v: Any, kept: Any, b: int, keep: bool) -> None:
 
 @kernel
 def _inside(x: Any, v: Any, b: int, i: int, period: Any) -> bool:
-    """Bring an agent back into a torus; is it where there are numbers?"""
+    """Wrap the position of an agent on a torus; return True if its state is finite."""
     sound = True
     for k in range(x.shape[0]):
         p = period[k]
@@ -248,11 +252,12 @@ def _inside(x: Any, v: Any, b: int, i: int, period: Any) -> bool:
 
 @kernel
 def hold(x0: Any, x: Any, v: Any, alive: Any, rods: Any, first: int, end: int) -> tuple[int, int, int, float]:
-    """Hold the agents of worlds [first, end) together.
+    """Apply the rods of worlds [first, end), in place.
 
-    Where velocities do not come to fit, as they may not in far too long a step, they are left as they were: those that
-    come of sweeps without end would be anything, and so energy is lost and never won.
-    Returns the first (world, agent) not finite, or -1s, and the last rod that is not right, or -1, and by which share.
+    If the first stage does not converge, as in far too long a step, its changes are undone: unconverged velocities
+    could have any value. So energy is lost and never gained.
+    Returns the first (world, agent) that is not finite, or -1s, the last rod out of tolerance, or -1, and its relative
+    error.
     """
     world, agent, rod, off = -1, -1, -1, like(rods.per_dt, 0.0)
     for b in range(first, end):
@@ -274,29 +279,31 @@ def hold(x0: Any, x: Any, v: Any, alive: Any, rods: Any, first: int, end: int) -
 class Rods(Constraint):
     """Agents keep their distances, as if there were rods without mass between them; or ropes, which may hang slack.
 
-    Each step ends with positions moved along the directions that the rods had before it, velocities with them, and
-    then without any speed along the rods (Ryckaert, Ciccotti and Berendsen 1977; Andersen 1983, RATTLE): momentum is
-    kept, and in gravity no energy is pumped. A rope that is drawn tight loses the speed that would stretch it. Who is
-    held in place is not moved. Distances that are wrong to begin with are mended in the first step, without a speed.
-    A chain of n links takes some 6 n sweeps in a step, and so does a cloth of n x n cells.
-    Rods have the last word: a limit of speed, and the walls of a box, were before them.
+    Each step ends with a correction of positions, and with them velocities, along the directions that the rods had
+    before it; then the velocity along the rods is removed (Ryckaert, Ciccotti and Berendsen 1977; Andersen 1983,
+    RATTLE). Momentum is conserved, and in gravity no energy is gained. A rope that becomes taut loses the speed that
+    would stretch it. Agents that are held in place are not moved. Distances that are wrong at the start are corrected
+    in the first step, without a change of velocity. A chain of n links takes some 6 n sweeps in a step, and so does a
+    cloth of n x n cells. Rods are applied last, after the speed limit and the walls of a box.
     """
 
     kind: Literal["rods"] = "rods"
-    group: int | None = Field(default=None, ge=0, description="number of the group along the edges of whose network")
-    pairs: tuple[Pair, ...] = Field(default=(), description="or who to whom, by numbers of agents")
-    lengths: tuple[Length, ...] = Field(default=(), description="m, of the pairs; one for all, or one for each")
-    slack: bool = Field(default=False, description="ropes, not rods: they may come nearer")
-    tolerance: float = Field(default=1e-10, ge=1e-14, le=0.1, description="of a length, or what numbers can tell")
-    most: int = Field(default=5000, ge=1, le=1_000_000, description="sweeps over all in one step; then it warns")
+    group: int | None = Field(default=None, ge=0, description="index of a group: rods along the edges of its network")
+    pairs: tuple[Pair, ...] = Field(default=(), description="or pairs of agents, by index")
+    lengths: tuple[Length, ...] = Field(default=(), description="m, lengths of the pairs; one for all, or one for each")
+    slack: bool = Field(default=False, description="True: ropes, whose ends may come nearer")
+    tolerance: float = Field(
+        default=1e-10, ge=1e-14, le=0.1, description="relative error of a length, at least rounding"
+    )
+    most: int = Field(default=5000, ge=1, le=1_000_000, description="sweeps over all rods in one step; then it warns")
 
     @model_validator(mode="after")
     def _one_or_the_other(self) -> Self:
-        """Refuse what is about nobody, or about two things; who is tied to himself; lengths that are too few."""
+        """Raise ValueError unless there is a group or there are pairs, of different agents, each once, with lengths."""
         if (self.group is None) == (not self.pairs):
             raise ValueError("group: give either a group with a network or pairs")
         if len(self.lengths) not in ((1, len(self.pairs)) if self.pairs else (0,)):
-            allowed = f"1 or {len(self.pairs)}" if self.pairs else "none beside a group"
+            allowed = f"1 or {len(self.pairs)}" if self.pairs else "none with a group"
             raise ValueError(f"lengths: {len(self.lengths)} of them; {allowed} is allowed")
         seen: dict[frozenset[int], int] = {}
         for k, pair in enumerate(self.pairs):
@@ -307,7 +314,7 @@ class Rods(Constraint):
         return self
 
     def ties(self, scene: SceneView) -> Ties:
-        """Return who is held to whom in a scene; ValueError if it has no such network or agents."""
+        """Return the pairs that are held together in a scene; raise ValueError if it has no such group or network."""
         d = scene.dimension
         if self.group is None:
             i, j = np.array(self.pairs, np.int32).T
@@ -323,7 +330,7 @@ class Rods(Constraint):
         return _layered(Ties(i + np.int32(first), j + np.int32(first), springs.rest[edges], points[j] - points[i]))
 
     def check(self, scene: SceneView) -> None:
-        """Refuse agents and networks that are not there, newborn ends, and lengths that reach around a torus."""
+        """Raise ValueError if an agent or network is missing, an end can be newborn, or a rod wraps around a torus."""
         ties = self.ties(scene)
         most = int(max(ties.i.max(initial=0), ties.j.max(initial=0)))
         if most >= scene.agents:
@@ -341,14 +348,14 @@ class Rods(Constraint):
             )
 
     def numbers(self, scene: SceneView) -> int:
-        """Of each pair what `Hold` lists; and a copy of where everybody is, and how fast."""
+        """Return the size of the arrays of `Hold`, and of a copy of positions and velocities, per agent."""
         d = int(scene.dimension)
         return 2 * d - (-(6 + d) * len(self.ties(scene).i) // int(scene.agents))
 
     def settler(self, scene: SceneView) -> Settler:
-        """Return what mends a step, with scratch of its own; it warns once if lengths are not met."""
+        """Return a function that corrects a step, with scratch memory of its own; it warns once if lengths are off."""
         ties, real, d = self.ties(scene), np.dtype(scene.dtype).type, scene.dimension
-        weight = (1 / scene.body.mass).astype(real)  # who is held in place has an infinite mass
+        weight = (1 / scene.body.mass).astype(real)  # agents held in place have an infinite mass
         period = np.array(scene.space.extent(d) if scene.space.periodic else (0.0,) * d, real)
         length = ties.length.astype(real)
         rods = Hold(
@@ -377,9 +384,9 @@ class Rods(Constraint):
 
 
 def _layered(ties: Ties) -> Ties:
-    """Return the same in ascending order, layer after layer: the order in which they were given makes no difference.
+    """Return the same pairs sorted layer by layer: the order in which they were given makes no difference.
 
-    In each layer nobody is twice, so that those of a chain, every other one, are Young's ordering.
+    Each agent is at most once in a layer. The layers of a chain are every other link, which is Young's ordering.
     """
     swap = ties.i > ties.j
     i, j = np.where(swap, ties.j, ties.i), np.where(swap, ties.i, ties.j)
@@ -396,12 +403,12 @@ def _layered(ties: Ties) -> Ties:
 
 
 def _slowness(ties: Ties, weight: Floats) -> float:
-    """Return rho, by which Jacobi's iteration shrinks what shrinks the least, of everybody at rest.
+    """Return rho, the spectral radius of Jacobi's iteration for the network at rest.
 
-    1 less the least eigenvalue of what rods do to each other, by inverse iteration. Rods of unknown directions count as
-    if all were in line. A wrong rho makes more sweeps, and no other result.
+    It is 1 less the smallest eigenvalue of the matrix that couples the rods, by inverse iteration. Rods of unknown
+    directions count as if all were in line. A wrong rho costs more sweeps, and does not change the result.
     """
-    from scipy import sparse  # here: who simulates without rods need not wait for it
+    from scipy import sparse  # imported here: scenes without rods need not load it
     from scipy.sparse.linalg import splu
 
     weight = weight.astype(np.float64)
@@ -410,7 +417,7 @@ def _slowness(ties: Ties, weight: Floats) -> float:
     long = np.linalg.norm(way, axis=1)
     known = bool(long.all())
     ways = way / long[:, None] if known else np.eye(1, d).repeat(len(way), axis=0)
-    speeds: Any = 0  # along each rod, of what each of its ends does, (R, N D)
+    speeds: Any = 0  # velocity along each rod per velocity of its ends, (R, N D)
     for ends, sign in ((ties.i[moves], -1.0 if known else 1.0), (ties.j[moves], 1.0)):
         share = np.sqrt(weight[ends] / (weight[ties.i] + weight[ties.j])[moves])
         column = ends[:, None] * d + np.arange(d)

@@ -1,8 +1,8 @@
-"""Bodies that stop within a step: where impacts run out, and where a response searches no impacts within a step.
+"""Bodies that stop within a step: when the impact limit is reached, or the response has no impacts within a step.
 
 A body that stops keeps its place for the rest of the step, and its velocity for the next one. The time that it does not
-move is lost; energy, momentum and the order of bodies are not. What runs into a stopped body stops, too. An obstacle
-that moves into a stopped body pushes it, and the body pushes others.
+move is lost; energy, momentum and the order of bodies are not. A body that runs into a stopped body also stops. An
+obstacle that moves into a stopped body pushes it, and the body pushes others.
 """
 
 from __future__ import annotations
@@ -34,7 +34,10 @@ __all__ = ["halt"]
 def halt(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, c: int, t: float, lost: Any
 ) -> None:
-    """Stop those of meeting c at time t; what is pushed already pushes on. At most so often that a step has an end."""
+    """Stop the bodies of meeting c at time t; a body that is pushed already pushes the other.
+
+    A meeting is given up after a bounded number of hits, so that the step ends.
+    """
     i, j = meetings.who[c], meetings.other[c]
     y, _, _ = relative(period, bodies, things, i, j, t)
     row, _ = met(bodies, things, i, j)
@@ -51,7 +54,7 @@ def halt(
 
 @kernel
 def _stop(period: Vec, bodies: Bodies, rules: Rules, i: int, t: float, lost: Any) -> None:
-    """Stop body i at time t: its velocity is kept as `excess`, and `vel` is that by which an obstacle pushes it."""
+    """Stop body i at time t: `excess` stores its velocity, and `vel` that by which an obstacle pushes it."""
     write(bodies.at, i, position(period, bodies, i, t))
     if bodies.moved[i] != STOPPED:
         write(bodies.excess, i, add(vector(period, bodies.excess, i), velocity(period, bodies, i, t)))
@@ -65,7 +68,7 @@ def _stop(period: Vec, bodies: Bodies, rules: Rules, i: int, t: float, lost: Any
 
 @kernel
 def _push(period: Vec, bodies: Bodies, things: Things, rules: Rules, i: int, m: int, n: Vec) -> None:
-    """Move a stopped body out of the way of obstacle m, which comes along n, and let its velocity bounce, or stick."""
+    """Let obstacle m, moving along n, push a stopped body; the stored velocity bounces, or sticks."""
     drift, pushed = vector(period, things.drift, m), vector(period, bodies.vel, i)
     into = dot(sub(drift, pushed), n)
     if into <= 0.0 or bodies.light[i] == 0.0:
@@ -78,7 +81,7 @@ def _push(period: Vec, bodies: Bodies, things: Things, rules: Rules, i: int, m: 
 
 @kernel
 def _push_on(period: Vec, bodies: Bodies, i: int, j: int, n: Vec) -> None:
-    """Let one of two stopped bodies, that something pushes into the other, push it along n; n leads to i from j."""
+    """Let one of two stopped bodies that is pushed into the other push it along n; n leads to i from j."""
     one, two = vector(period, bodies.vel, i), vector(period, bodies.vel, j)
     into = dot(sub(two, one), n)
     if into <= 0.0:

@@ -1,4 +1,4 @@
-"""The end of a step of one world: impulses of all contacts at once, blocked paths, overlaps that are parted."""
+"""The end of a step of one world: impulses of all contacts at once, blocked paths, resolution of overlaps."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from flockenv.physics.constraints.continuous import may_pass, stop_on_the_way, t
 __all__ = ["settle_ends"]
 
 UNSOLVED = 0.1
-"""Part of the velocity that a step adds with which a body may still go into another."""
+"""Approach speed that counts as unsolved, as a part of the velocity that a step adds."""
 
 ROUNDS = 8
-"""How often those that touch are gathered anew, where moving bodies apart has led them into others."""
+"""Most times that contacts are gathered, if moving bodies apart leads them into others."""
 
 CROWDED = 0.5
-"""Part of its radius by which a body is moved so far by the single pass of `project` that it makes more of them."""
+"""Move of a body in the single pass of `project`, as a part of its radius, beyond which more passes are made."""
 
 DEEPEST = 0.25
-"""Part of the smaller radius by which two may overlap after the passes that part them; then bodies are held back."""
+"""Largest overlap after the passes that separate bodies, as a part of the smaller radius; beyond it, bodies stop."""
 
 RAISED = 4
-"""Place in `lost` of the energy, J, of bodies that were moved apart against the step's acceleration."""
+"""Index in `lost` of the energy, J, of bodies that were moved apart against the step's acceleration."""
 
 LEFT, SUNK = 5, 6
-"""Places in `lost` of how much is left unsolved in a step, the most of all: the fastest change of velocity of the last
-pass, m/s, and the deepest overlap, as a part of the smaller radius."""
+"""Indices in `lost` of the largest residuals of a step: the largest change of velocity of the last pass, m/s, and the
+deepest overlap, as a part of the smaller radius."""
 
 
 @kernel
@@ -42,9 +42,10 @@ def settle_ends(
     reach: Any, rules: Rules, in_time: bool, once: bool, passing: bool, rounds: int, fast: float, hard: float, up: Vec,
     spread: float, round_about: bool, count: int, scratch: Any, lost: Any, report: Any,
 ) -> int:  # fmt: skip
-    """Solve all contacts of the step's end, velocities, then places; return how many meetings there are.
+    """Solve all contacts of the step's end, velocities, then positions; return the number of meetings.
 
-    up: against the mean acceleration; round_about: True if paths on a torus are too long to tell the order of bodies.
+    up: unit vector against the mean acceleration; round_about: True if paths on a torus are so long that the order of
+    bodies is undefined.
     """
     least = 1e-12 * fast
     slow, gain = 1e-3 * hard * rules.seconds + least, 1e-6 * hard * rules.seconds + least
@@ -66,7 +67,7 @@ def settle_ends(
         count = _wider(period, bodies, meetings, things, ends, rules, count)
     held = False
     if (touching > 0 or again) and count <= meetings.who.shape[0]:
-        for i in range(bodies.living.shape[0]):  # velocities before the step are used no more
+        for i in range(bodies.living.shape[0]):  # velocities before the step are not used any more
             write(before, i, vector(period, ends.pos, i))
         count, deep, stuck = _places(
             period, bodies, meetings, things, contacts, ends, reach, rules, once, again or turned, rounds, up, spread,
@@ -95,11 +96,11 @@ def _hold_back(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, before: Any, reach: Any, rules: Rules,
     once: bool, stuck: bool, spread: float, count: int, scratch: Any, lost: Any,
 ) -> int:  # fmt: skip
-    """Stop bodies where the straight paths to their parted places lead into something; return how many meetings are.
+    """Stop bodies where the straight paths to their separated places are blocked; return the number of meetings.
 
-    before (N, D) m: where they were before they were parted; stuck: True if passes ran out. Passes may throw a light
-    body past a heavy one, or leave it in one where others block it. Bodies begin the step in order, so that what goes
-    no further than the first contact keeps it.
+    before (N, D) m: positions before separation; stuck: True if passes ran out. Passes may throw a light body past a
+    heavy one, or leave it inside if others block it. Bodies begin the step in order, and stopping at the first contact
+    keeps that order.
     """
     if not stuck and not (once and _moved_far(period, bodies, ends, before, NEARLY)):
         return count
@@ -116,10 +117,10 @@ def _hold_back(
 
 @kernel
 def _raised(period: Vec, bodies: Bodies, ends: Ends, before: Any) -> float:
-    """Return the energy, J, that bodies have gained where they were moved from `before` (N, D) m against the step.
+    """Return the energy, J, of bodies that were moved from `before` (N, D) m against the step's acceleration.
 
-    Against its acceleration, that is: times mass, times the move. Bodies that were moved along it do not make up for
-    others, so that this is a bound.
+    It is mass times acceleration times move. Moves along the acceleration are not subtracted, so this is an upper
+    bound.
     """
     joules = 0.0
     for i in range(bodies.living.shape[0]):
@@ -134,10 +135,10 @@ def _velocities(
     period: Vec, bodies: Bodies, things: Things, contacts: Contacts, ends: Ends, before: Any, rules: Rules,
     in_time: bool, once: bool, rounds: int, hard: float, least: float, gain: float, count: int, report: Any,
 ) -> float:  # fmt: skip
-    """Change velocities until no body goes into another; return the last pass's fastest change, m/s."""
+    """Change velocities until no body approaches another; return the last pass's largest change, m/s."""
     passes, seconds, n = 1 if once else rounds, rules.seconds, bodies.living.shape[0]
     if not in_time:
-        for i in range(n):  # what the step has added comes after the impacts; what is slower than it does not bounce
+        for i in range(n):  # the velocity that the step adds follows after the impacts; slower approaches do not bounce
             write(bodies.vel, i, vector(period, ends.vel, i))
             write(bodies.acc, i, sub(vector(period, ends.vel, i), vector(period, before, i)))
         done, left = impacts(
@@ -152,7 +153,7 @@ def _velocities(
     if not in_time and not once:
         for i in range(n):
             write(bodies.at, i, vector(period, ends.pos, i))
-        for i in range(n):  # what contacts have changed goes from its start as fast as it is now, under every method
+        for i in range(n):  # changed bodies go from their start at their final velocity, under every method
             now = vector(period, ends.vel, i)
             more = sub(now, vector(period, bodies.vel, i))
             if dot(more, more) > 0.0:
@@ -165,12 +166,12 @@ def _places(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, contacts: Contacts, ends: Ends, reach: Any,
     rules: Rules, once: bool, anew: bool, rounds: int, up: Vec, spread: float, touching: int, count: int, scratch: Any,
 ) -> tuple[int, float, bool]:  # fmt: skip
-    """Move apart those that overlap; return how many meetings there are, the last pass's farthest move, m, and stuck.
+    """Move overlapping bodies apart; return the number of meetings, the last pass's largest move, m, and stuck.
 
-    stuck: True if two still overlap by DEEPEST, or bodies were still moved when rounds ran out; not if `spread`, m, is
-    what they part by at most.
-    anew: True if bodies have moved since those that touch were gathered. That is done again, too, where bodies are
-    moved so far that they may overlap others; two that part slowly on purpose are moved once.
+    stuck: True if two still overlap by DEEPEST, or bodies were still moved when rounds ran out; always False if
+    `spread`, m, limits the separation.
+    anew: True if bodies have moved since contacts were gathered. Contacts are gathered again if bodies are moved so far
+    that they may overlap others; with a finite `spread`, bodies are moved once.
     """
     deep, elsewhere, settled, done = 0.0, False, False, False
     for turn in range(ROUNDS):
@@ -205,7 +206,7 @@ def _places(
 
 @kernel
 def _beyond(period: Vec, bodies: Bodies, ends: Ends, reach: Any) -> bool:
-    """True if a body is further from where it began than meetings were listed for."""
+    """Return True if a body is further from its start than the reach for which meetings were listed."""
     for i in range(bodies.living.shape[0]):
         moved = image(period, sub(vector(period, ends.pos, i), vector(period, bodies.start, i)))
         if bodies.living[i] > 0 and norm(moved) > max(reach[i], bodies.reach[i]):
@@ -217,7 +218,7 @@ def _beyond(period: Vec, bodies: Bodies, ends: Ends, reach: Any) -> bool:
 def _wider(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, count: int
 ) -> int:
-    """Add meetings of bodies that impacts made so fast that they end in what they were not near; return how many."""
+    """Add meetings of bodies that impacts made so fast that they leave their reach; return the number of meetings."""
     for i in range(bodies.living.shape[0]):
         moved = sub(vector(period, ends.pos, i), vector(period, bodies.start, i))
         moved = led(period, moved, scale(vector(period, ends.vel, i), rules.seconds))
@@ -242,7 +243,7 @@ def _widest(bodies: Bodies) -> float:
 
 @kernel
 def _moved_far(period: Vec, bodies: Bodies, ends: Ends, since: Any, share: float) -> bool:
-    """True if a body was moved from its place `since` (N, D) m by more than this part of its radius."""
+    """Return True if a body was moved from its place `since` (N, D) m by more than `share` of its radius."""
     for i in range(bodies.living.shape[0]):
         d = image(period, sub(vector(period, ends.pos, i), vector(period, since, i)))
         if bodies.living[i] > 0 and norm(d) > share * bodies.radius[i]:

@@ -1,7 +1,7 @@
 """Populations: births and deaths of agents in a fixed table of slots, some of which hold a living agent.
 
-A group has as many slots as its count says. An emitter brings the dead ones of a group to life, and a sink lets the
-living die; a slot that is used again holds another agent, with an identity and a time of birth of its own.
+A group has `count` slots. An emitter fills its free slots with new agents, and a sink removes living ones; a slot that
+is used again holds another agent, with an identity and a time of birth of its own.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Births of all worlds in one call: which are due, in which slot, where, how fast and for how long.
+"""Births of all worlds in one call: those that are due, with slot, place, velocity and lifetime.
 
-A row of `streams` is an emitter's rate, or one of its bursts: the first slot, and the one after the last; from when and
-until when, s; rate, 1/s; how many at once; speed from, to, m/s; spread, rad; 1 if along the normal; direction (3);
-lifetime from, to, s; 1 if born in one place; the kind of its place, and the numbers of that.
-Number k of stream e is a new agent, of identity N + k E + e in a scene of N slots and E streams.
+A row of `streams` is an emitter's rate, or one of its bursts: first slot, one past the last slot; start and end, s;
+rate, 1/s; size of the burst; speed from, to, m/s; spread, rad; 1 if along the normal; direction (3); lifetime from, to,
+s; 1 if a burst is born in one place; the kind of its place, and the parameters of that.
+Birth k of stream e is a new agent, of identity N + k E + e in a scene of N slots and E streams.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ __all__ = ["births", "due"]
 BIRTHS, DEATHS, REFUSED = (WORK.index(name) for name in ("births", "deaths", "births_refused"))
 
 CHANNEL = 3_000_000
-"""First of the channels of a newborn's draws: of speed, lifetime, place and direction, 16 for each try."""
+"""First RNG channel of a newborn: speed, lifetime, place and direction, 16 for each try."""
 
 TOGETHER = CHANNEL + 100_000
-"""First of the channels of what all of a burst share."""
+"""First RNG channel of draws that all agents of a burst share."""
 
 TRIES = 64
-"""How often a place of a surface is drawn anew that lies within another part of it."""
+"""Most draws of a point on a surface, if it lies within another part of the shape."""
 
 PLACE = 17
-"""Where the numbers of a place begin in a row."""
+"""Index in a row of the first parameter of the place."""
 
 
 @kernel
 def due(row: Any, time: float, dt: float) -> int:
-    """Return how many of a stream are born until `time`, s; one that is due at that instant, but for rounding, is."""
+    """Return the number of births of a stream until `time`, s; one that is due then, within rounding, counts."""
     if row[4] == 0.0:
         return int(row[5]) if time + 1e-9 * dt >= row[2] else 0
     expected = row[4] * (min(time, row[3]) - row[2])
@@ -52,26 +52,26 @@ def _draw(key: Any, who: int, channel: int) -> Vec:
 
 @law
 def _three(row: Any, at: int) -> Vec:
-    """Return three numbers of a row as a vector."""
+    """Return three numbers of a row, from index `at`, as a vector."""
     return row[at], row[at + 1], row[at + 2]
 
 
 @law
 def _across(axis: Vec) -> Vec:
-    """Return a unit vector across a unit vector; within the plane z = 0 if the axis is."""
+    """Return a unit vector perpendicular to a unit vector; in the plane z = 0 if the axis is."""
     return unit(select(abs(axis[2]) < 0.9, (-axis[1], axis[0], 0.0), (0.0, -axis[2], axis[1])))
 
 
 @law
 def _around(axis: Vec, turn: float) -> Vec:
-    """Return the unit vector across an axis that is turned so far about it, rad."""
+    """Return the unit vector perpendicular to an axis, turned about it by `turn`, rad."""
     u = _across(axis)
     return add(scale(u, math.cos(turn)), scale(cross(axis, u), math.sin(turn)))
 
 
 @law
 def _cone(flat: bool, axis: Vec, spread: float, s: float, t: float) -> Vec:
-    """Return a unit vector within `spread` [rad] of an axis, as often any as any other; s, t uniform in [0, 1)."""
+    """Return a uniformly distributed unit vector within `spread` [rad] of an axis; s, t uniform in [0, 1)."""
     angle = spread * (2.0 * s - 1.0)
     along = math.cos(angle) if flat else 1.0 - s * (1.0 - math.cos(spread))
     aside = math.sin(angle) if flat else math.sqrt(max(0.0, 1.0 - along * along))
@@ -80,7 +80,7 @@ def _cone(flat: bool, axis: Vec, spread: float, s: float, t: float) -> Vec:
 
 @law
 def _on_flat(piece: Any, flat: bool, s: float, t: float) -> tuple[Vec, Vec]:
-    """Return a place of an edge or a face, and the outward normal."""
+    """Return a point on an edge or a face, and the outward normal."""
     u, v = _three(piece, 5), _three(piece, 8)
     right = (u[1], -u[0], 0.0)
     normal = unit(select(flat, right, cross(u, v)))
@@ -89,7 +89,7 @@ def _on_flat(piece: Any, flat: bool, s: float, t: float) -> tuple[Vec, Vec]:
 
 @law
 def _on_round(piece: Any, flat: bool, s: float, t: float) -> tuple[Vec, Vec]:
-    """Return a place of the side of a tube, or of its ends, and the outward normal there."""
+    """Return a point on the side of a tube, or on its ends, and the outward normal there."""
     a, b = _three(piece, 2), _three(piece, 5)
     line = sub(b, a)
     axis = select(dot(line, line) > 0.0, unit(line), (1.0, 0.0, 0.0))
@@ -102,7 +102,7 @@ def _on_round(piece: Any, flat: bool, s: float, t: float) -> tuple[Vec, Vec]:
 
 @law
 def _within(piece: Any, spot: Vec) -> bool:
-    """True if a place lies within a part of a line with a thickness, and not at its surface."""
+    """Return True if a point lies inside a segment of a thick line, not on its surface."""
     line, way = sub(_three(piece, 5), _three(piece, 2)), sub(spot, _three(piece, 2))
     square = dot(line, line)
     share = min(max(dot(line, way) / square, 0.0), 1.0) if square > 0.0 else 0.0
@@ -112,7 +112,7 @@ def _within(piece: Any, spot: Vec) -> bool:
 
 @kernel
 def _on_surface(flat: bool, row: Any, pieces: Any, key: Any, who: int, channel: int) -> tuple[Vec, Vec]:
-    """Return a place of a surface, and the outward normal there."""
+    """Return a random point on a surface, and the outward normal there."""
     first, end = int(row[PLACE]), int(row[PLACE + 1])
     spot: Vec = (0.0, 0.0, 0.0)
     normal: Vec = spot
@@ -138,7 +138,7 @@ def _on_surface(flat: bool, row: Any, pieces: Any, key: Any, who: int, channel: 
 
 @law
 def _in_disc(row: Any, flat: bool, draws: Vec) -> Vec:
-    """Return a place of a disc, of a ball, or of a flat disc in space."""
+    """Return a point in a disc, a ball, or a flat disc in 3-D."""
     axis = _three(row, PLACE + 4)
     across = dot(axis, axis) > 0.0
     out = _cone(flat, (1.0, 0.0, 0.0), math.pi, draws[1], draws[2])
@@ -149,7 +149,7 @@ def _in_disc(row: Any, flat: bool, draws: Vec) -> Vec:
 
 @law
 def _in_box(row: Any, draws: Vec) -> Vec:
-    """Return a place between two corners; with the same share of all three, of a line."""
+    """Return a point between two corners; on the line between them if all three draws are equal."""
     low, high = _three(row, PLACE), _three(row, PLACE + 3)
     return (
         low[0] + draws[0] * (high[0] - low[0]),
@@ -163,7 +163,7 @@ def _in_clearing(
     x: Any, b: int, row: Any, key: Any, who: int, channel: int, period: Any, grid: Any, start: Any, order: Any,
     born: Any, identity: Any,
 ) -> Vec:  # fmt: skip
-    """Return, of some places drawn in a box, the one with the fewest living agents around it; of equals the first."""
+    """Return, of points drawn in a box, the one with the fewest living agents around it; the first of equals."""
     best: Vec = (0.0, 0.0, 0.0)
     fewest = 2**62
     for attempt in range(int(row[PLACE + 7])):
@@ -176,7 +176,7 @@ def _in_clearing(
 
 @kernel
 def _into_space(walls: bool, period: Any, size: float, radius: float, p: float) -> float:
-    """Return a coordinate within a periodic axis, or between walls."""
+    """Return a coordinate wrapped to a periodic axis, or clamped between walls."""
     if period > 0.0:
         inside = p - period * math.floor(p / period)
         return 0.0 if inside >= period else inside
@@ -188,7 +188,7 @@ def _spot(
     d: int, row: Any, pieces: Any, x: Any, b: int, key: Any, who: int, channel: int, period: Any, grid: Any, start: Any,
     order: Any, born: Any, identity: Any,
 ) -> tuple[Vec, Vec]:  # fmt: skip
-    """Return the place of a birth, and the direction: the row's, or the outward normal of a surface."""
+    """Return the place of a birth, and its direction: that of the row, or the outward normal of a surface."""
     draws, aim = _draw(key, who, channel), _three(row, 10)
     if row[16] <= 1.0:
         return _in_box(row, (draws[0], draws[0], draws[0])), aim
@@ -198,7 +198,7 @@ def _spot(
         spot, normal = _on_surface(d == 2, row, pieces, key, who, channel)
         return spot, select(row[9] == 1.0, normal, aim)
     spot = _in_box(row, draws)
-    if order is not None:  # noqa: SIM102  # alone, numba leaves the rest away
+    if order is not None:  # noqa: SIM102  # numba prunes only a test that is alone
         if row[16] == 5.0:
             spot = _in_clearing(x, b, row, key, who, channel, period, grid, start, order, born, identity)
     return spot, aim
@@ -210,11 +210,11 @@ def births(
     dies: Any, tick: Any, key: Any, work: Any, radius: Any, dt: float, walls: bool, size: Any, period: Any, first: int,
     end: int, grid: Any, cell: Any, start: Any, order: Any,
 ) -> None:  # fmt: skip
-    """Bring to life the agents that are due in the step that ends now, in worlds [first, end); at the start, at once.
+    """Create the agents that are due in the step that ends now, or at the start, in worlds [first, end).
 
     clearing: m, the largest radius within which neighbours are counted; if no place counts any, grid, cell, start and
-    order are None, and nothing of it is compiled. walls: True if the space is a box of `size` (3,) m. period (3,) m: 0
-    where an axis does not repeat.
+    order are None, and no code for it is compiled. walls: True if the space is a box of `size` (3,) m. period (3,) m: 0
+    for axes that are not periodic.
     """
     n, kinds = x.shape[2], streams.shape[0]
     for b in range(first, end):
@@ -223,11 +223,12 @@ def births(
             row = streams[e]
             before = due(row, (tick[b] - 1) * dt, dt) if tick[b] > 0 else 0
             after = due(row, tick[b] * dt, dt)
-            if order is not None:  # noqa: SIM102  # alone, numba leaves the rest away
+            if order is not None:  # noqa: SIM102  # numba prunes only a test that is alone
                 if after > before and not sorted_:
                     sort_living(x, alive, b, 0, n, clearing, period, grid, cell, start, order)
                     sorted_ = True
-            if until != int(row[1]):  # streams of a group come one after another, and go on where the last one ended
+            # streams of a group are consecutive, and each continues at the slot where the last one ended
+            if until != int(row[1]):
                 slot, until = int(row[0]), int(row[1])
             slot = _bear(
                 before, after, e, kinds, slot, until, row, pieces, x, v, frame, alive, identity, born, dies,
@@ -241,7 +242,7 @@ def _bear(
     frame: Any, alive: Any, identity: Any, born: Any, dies: Any, now: float, key: Any, work: Any, radius: Any,
     dt: float, walls: bool, size: Any, period: Any, b: int, grid: Any, start: Any, order: Any,
 ) -> int:  # fmt: skip
-    """Bring births `before` to `after` of a stream to life, in free slots from `slot` on; return where that ends."""
+    """Create births `before` to `after` of a stream in free slots from `slot` on; return the slot reached."""
     d, n = x.shape[0], x.shape[2]
     for k in range(before, after):
         who = n + k * kinds + stream

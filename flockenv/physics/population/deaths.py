@@ -1,7 +1,7 @@
 """Deaths of all worlds in one call for each sink: by age, on leaving a region, by chance, in a drain, in a crowd.
 
-Each sink selects among all agents that live when its turn comes, before any of them dies: the result does not depend
-on the order of agents.
+Each sink selects among all agents that are alive when its turn comes, before it removes any: the result does not
+depend on the order of agents.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from flockenv.physics.population.occupancy import count_near, sort_living
 __all__ = ["crowding", "drain", "passing", "reaching"]
 
 DECAY = 2_000_000
-"""Channel of the draws of the first sink; the next has the next."""
+"""RNG channel of the first sink; each further sink has the next one."""
 
 
 @kernel
 def _die(b: int, i: int, v: Any, alive: Any, work: Any) -> None:
-    """Let an agent die: its slot is free, and keeps the place of death and the identity."""
+    """Remove an agent: its slot becomes free, and keeps the place of death and the identity."""
     alive[b, i] = False
     for k in range(v.shape[0]):
         v[k, b, i] = 0
@@ -39,7 +39,7 @@ def _die(b: int, i: int, v: Any, alive: Any, work: Any) -> None:
 def _chance(rate: float, usual: float, born: float, now: float, dt: float) -> float:
     """Return the probability that an agent died since the sinks last acted; `usual`: in a step, 1 - exp(-rate dt).
 
-    An agent that was born within the step before was not yet drawn for: it has been alive for longer than a step.
+    For an agent that was born within the previous step this is the first draw: it covers its time since birth.
     """
     late = born > now - (2.0 - 1e-6) * dt and born < now - dt
     return 1.0 - math.exp(-rate * (now - born)) if late else usual
@@ -50,9 +50,9 @@ def passing(
     sinks: Any, x: Any, v: Any, alive: Any, identity: Any, born: Any, dies: Any, tick: Any, key: Any, work: Any,
     dt: float, first: int, end: int, channel: int,
 ) -> None:  # fmt: skip
-    """Let agents die at the end of their own lifetime, then by sinks of age, region and chance; worlds [first, end).
+    """Remove agents at the end of their own lifetime, then by sinks of age, region and chance; worlds [first, end).
 
-    sinks: a row each: kind (0 age, 1 region, 2 chance), first slot, the one after the last, numbers.
+    sinks: a row each: kind (0 age, 1 region, 2 chance), first slot, one past the last slot, parameters.
     """
     for b in range(first, end):
         now = tick[b] * dt
@@ -83,10 +83,10 @@ def drain(
     table: Any, margin: float, slots: Any, anchor: Vec, period: Vec, x0: Any, x: Any, v: Any, alive: Any, tick: Any,
     work: Any, dt: float, first: int, end: int,
 ) -> None:  # fmt: skip
-    """Let agents die that are in a shape, or went through it in the step that began at x0; slots (first, end).
+    """Remove agents inside a shape, and those that crossed it during the step that began at x0.
 
-    table: the shape's row (see shapes/table.py); anchor, period: (D,) m, the latter 0 where an axis does not repeat.
-    If the shape moves, paths are relative to it.
+    table: the shape's row (see shapes/table.py); slots: (first, end); anchor, period: (D,) m, the latter 0 for axes
+    that are not periodic. If the shape moves, paths are relative to it.
     """
     for b in range(first, end):
         shift = shift_of(table, 0, tick[b] * dt, anchor)
@@ -107,9 +107,9 @@ def crowding(
     row: Any, channel: int, x: Any, v: Any, alive: Any, identity: Any, born: Any, tick: Any, key: Any, work: Any,
     dt: float, period: Any, first: int, end: int, grid: Any, cell: Any, start: Any, order: Any, doomed: Any,
 ) -> None:  # fmt: skip
-    """Let agents die that have too many elders around them.
+    """Remove agents that have more than a given number of elders within a radius.
 
-    row: kind, first slot, the one after the last, radius [m], how many, rate [1/s]. doomed (N,): scratch.
+    row: kind, first slot, one past the last slot, radius [m], number, rate [1/s]. doomed (N,): scratch memory.
     """
     low, high = int(row[1]), int(row[2])
     for b in range(first, end):
@@ -134,7 +134,7 @@ def crowding(
 
 @kernel
 def reaching(numbers: Any, level: float, slots: Any, v: Any, alive: Any, work: Any, first: int, end: int) -> None:
-    """Let agents die whose number, of numbers (B, N), has come to a level; slots (first, end)."""
+    """Remove agents whose value in `numbers` (B, N) is at least `level`; slots (first, end)."""
     for b in range(first, end):
         for i in range(slots[0], slots[1]):
             if alive[b, i] and numbers[b, i] >= level:

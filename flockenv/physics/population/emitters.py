@@ -1,6 +1,6 @@
-"""Emitters: the places, times and velocities at which agents come to life.
+"""Emitters: the places, times and velocities at which agents are created.
 
-The time of a birth is independent of dt: number k of an emitter with a rate is born at start + (k + 1) / rate. Its
+The time of a birth is independent of dt: agent k of an emitter with a rate is born at start + (k + 1) / rate. Its
 place, velocity and lifetime are functions of the world's key and its identity. So another dt, another order or another
 number of threads gives the same births.
 """
@@ -21,7 +21,7 @@ from flockenv.physics.population.regions import AnyPlace, Clearing, Surface, Vec
 __all__ = ["MOST_RATE", "Burst", "Emitter"]
 
 MOST_RATE = 1e9
-"""1/s, births of one emitter: their number stays exact for weeks."""
+"""1/s, largest rate of one emitter: the number of births stays exact for weeks."""
 
 Range = tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]]
 
@@ -30,36 +30,36 @@ class Burst(Record):
     """A number of births at one time."""
 
     time: float = Field(ge=0, description="s since the start")
-    count: int = Field(ge=1, le=2**24, description="how many")
+    count: int = Field(ge=1, le=2**24, description="number of births")
 
 
 class Emitter(Member):
-    """Brings the dead of a group to life: at a rate, in bursts, or both; of T seconds at a rate, floor(rate T) agents.
+    """Creates agents in free slots of a group, at a rate, in bursts, or both; a rate gives floor(rate T) in T seconds.
 
     An agent born within a step moves with its velocity for the rest of it; forces act from the next step on. If no
-    slot is free a birth is left out, and counted as refused. Slots begin dead, but for `alive` of the group.
+    slot is free, a birth is skipped and counted as refused. All slots but the first `alive` of the group start free.
     """
 
     kind: Literal["emitter"] = "emitter"
-    group: int = Field(default=0, ge=0, description="number of the group whose slots it fills")
-    place: AnyPlace = Field(description="where they are born")
+    group: int = Field(default=0, ge=0, description="index of the group whose slots it fills")
+    place: AnyPlace = Field(description="place of births")
     rate: float = Field(default=0.0, ge=0, le=MOST_RATE, description="1/s")
-    start: float = Field(default=0.0, ge=0, description="s, from when on there is a rate")
-    end: float | None = Field(default=None, gt=0, description="s, until when; none = for ever")
+    start: float = Field(default=0.0, ge=0, description="s, time at which the rate begins")
+    end: float | None = Field(default=None, gt=0, description="s, time at which the rate ends (default: never)")
     bursts: tuple[Burst, ...] = Field(default=(), description="numbers of births at given times")
-    together: bool = Field(default=False, description="does each burst begin in one place, drawn for all of it?")
+    together: bool = Field(default=False, description="True if all agents of a burst are born at one point")
     speed: Range = Field(default=(0.0, 0.0), description="m/s, least and most")
     direction: Vector | None = Field(
-        default=None, description="of the velocity; none = any, or of a surface the outward normal"
+        default=None, description="of the velocity (default: any, or the outward normal of a surface)"
     )
     spread: float | None = Field(
-        default=None, ge=0, le=180, description="degrees to any side of the direction; none = 0 if there is one"
+        default=None, ge=0, le=180, description="degrees to any side of the direction (default: 0 if there is one)"
     )
-    lifetime: Range | None = Field(default=None, description="s, least and most; none = no limit")
+    lifetime: Range | None = Field(default=None, description="s, least and most (default: no limit)")
 
     @model_validator(mode="after")
     def _consistent(self) -> Emitter:
-        """Refuse ranges that run backwards, and an emitter that never does anything."""
+        """Raise ValueError if a range is reversed, or the emitter has no births."""
         for name in ("speed", "lifetime"):
             value = getattr(self, name)
             if value is not None and value[0] > value[1]:
@@ -67,7 +67,7 @@ class Emitter(Member):
         if self.lifetime is not None and not self.lifetime[0] > 0:
             raise ValueError(f"lifetime = {self.lifetime}: must be more than 0 s")
         if self.rate == 0 and not self.bursts:
-            raise ValueError("rate = 0: give a rate or bursts, or nobody is ever born")
+            raise ValueError("rate = 0: give a rate or bursts, or no agent is ever born")
         if self.end is not None and self.end <= self.start:
             raise ValueError(f"end = {self.end:g}: must be after start = {self.start:g} s")
         if self.direction is not None and not math.hypot(*self.direction) > 0:
@@ -77,11 +77,11 @@ class Emitter(Member):
         return self
 
     def feeds(self, group: int) -> bool:
-        """True if it brings agents of this group to life."""
+        """Return True if it creates agents of this group."""
         return group == self.group
 
     def check(self, scene: SceneView) -> None:
-        """Refuse a group that does not exist, other dimensions, and speeds beyond the group's limit."""
+        """Raise ValueError if the group or the place does not suit, or a speed exceeds the group's limit."""
         demand_group(scene, self.group)
         group = scene.groups[self.group]
         if group.network is not None:
@@ -97,7 +97,7 @@ class Emitter(Member):
         self._check_space(scene, group)
 
     def _check_space(self, scene: SceneView, group: Any) -> None:
-        """Refuse births beyond the walls of a box, and neighbours around a torus."""
+        """Raise ValueError if births lie beyond the walls of a box, or a radius wraps around a torus."""
         if isinstance(scene.space, Box):
             ends = self.place.extremes
             if len(ends) and ((ends < 0).any() or (ends > scene.space.size).any()):

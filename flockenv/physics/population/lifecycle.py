@@ -1,4 +1,4 @@
-"""A scene's population as numbers, and what settles it at the end of every step: first deaths, then births."""
+"""A scene's population as arrays, and its update at the end of every step: first deaths, then births."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from flockenv.physics.population.sinks import Crowding, Drain, Sink, Threshold
 __all__ = ["NUMBERS", "beget", "settler"]
 
 NUMBERS = 4
-"""Numbers of scratch per agent: cells, the agents in them, the agents that are to die."""
+"""Numbers of scratch memory per agent: cells, the agents in them, the agents that are to die."""
 
 WIDTH = PLACE + 8
-"""Numbers of a row of streams."""
+"""Length of a row of streams."""
 
 Part = Callable[[Floats, State, int, int], None]
 """part(x0, state, first, end): one sink, or all births, over worlds [first, end)."""
@@ -33,7 +33,7 @@ Part = Callable[[Floats, State, int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class _Scratch:
-    """Scratch of one thread, which nothing reads afterwards."""
+    """Scratch memory of one thread, which is not read afterwards."""
 
     grid: NDArray[np.float64]  # (4, 3) corner, edges, cells, cells per metre
     cell: NDArray[np.int32]  # (N,)
@@ -49,7 +49,7 @@ class _Scratch:
 
 
 def _sized(scene: SceneView, there: bool) -> NDArray[np.float64]:
-    """Return the size of the space, (3,) m; zeros if it has none of this kind."""
+    """Return the size of the space, (3,) m; zeros unless `there`."""
     size = np.zeros(3)
     if there:
         size[: scene.dimension] = scene.space.extent(scene.dimension)
@@ -61,7 +61,7 @@ def _period(scene: SceneView) -> NDArray[np.float64]:
 
 
 def _streams(scene: SceneView) -> tuple[Floats, Floats, float]:
-    """Return a row per rate and burst, group after group; surfaces' pieces; the largest radius of clearings, m."""
+    """Return a row per rate and burst, by group; the pieces of surfaces; and the largest radius of clearings, m."""
     emitters = sorted((m for m in scene.population if isinstance(m, Emitter)), key=lambda m: m.group)
     found: list[list[float]] = []
     pieces: list[Floats] = [np.zeros((0, 14))]
@@ -153,13 +153,13 @@ def _reaching(scene: SceneView, sink: Threshold) -> Part:
 
 
 def _asks(scene: SceneView) -> bool:
-    """True if a member of the population counts agents near a place."""
+    """Return True if a member of the population counts agents near a place."""
     places = [member.place for member in scene.population if isinstance(member, Emitter)]
     return any(isinstance(m, (Crowding, Clearing)) for m in (*scene.population, *places))
 
 
 def _parts(scene: SceneView) -> list[Part]:
-    """Return what is done at the end of a step: lifetimes, then sinks in the scene's order, then births."""
+    """Return the functions of the end of a step: lifetimes, then sinks in the scene's order, then births."""
     scratch = _Scratch.of(scene.agents, _asks(scene))
     emits = any(isinstance(member, Emitter) for member in scene.population)
     mortal = any(isinstance(m, Emitter) and m.lifetime is not None for m in scene.population)
@@ -183,13 +183,13 @@ def _parts(scene: SceneView) -> list[Part]:
 
 
 def beget(scene: SceneView, state: State) -> None:
-    """Bring to life the agents that are born at time 0, in place."""
+    """Create the agents that are born at time 0, in place."""
     if any(isinstance(member, Emitter) for member in scene.population):
         _births(scene, _Scratch.of(scene.agents, _asks(scene)))(state.x, state, 0, state.shape[0])
 
 
 def settler(scene: SceneView) -> Callable[[Floats, Floats, State, int, int], tuple[int, int]]:
-    """Return what settles the population of a scene at the end of a step, with scratch of its own."""
+    """Return a function that updates the population at the end of a step, with scratch memory of its own."""
     parts = _parts(scene)
 
     def settle(x0: Floats, v0: Floats, state: State, first: int, end: int) -> tuple[int, int]:

@@ -14,7 +14,7 @@ POPULATION: dict[str, type[Member]] = {}
 
 
 class Member(Record):
-    """What brings agents to life, or lets them die, at the end of a step."""
+    """An emitter, which creates agents, or a sink, which removes them, at the end of a step."""
 
     kind: str
     looks_back: ClassVar[bool] = False
@@ -27,15 +27,15 @@ class Member(Record):
             POPULATION[cls.model_fields["kind"].default] = cls
 
     def check(self, scene: SceneView) -> None:
-        """Refuse a scene that this does not suit: a ValueError that begins with the field's name."""
+        """Raise ValueError, beginning with the field's name, if the scene does not suit this member."""
 
     def feeds(self, group: int) -> bool:
-        """True if it brings agents of this group to life."""
+        """Return True if it creates agents of this group."""
         return False
 
 
 def demand_group(scene: SceneView, which: int | None) -> None:
-    """Refuse a group that does not exist."""
+    """Raise ValueError if the group does not exist."""
     count = len(scene.groups)
     if which is not None and which >= count:
         known = f"the scene has {count}, counted from 0" if count > 1 else "the scene has one, group 0"
@@ -43,7 +43,7 @@ def demand_group(scene: SceneView, which: int | None) -> None:
 
 
 def dimensions(scene: SceneView, **given: tuple[float, ...] | None) -> None:
-    """Refuse a vector whose length is not the scene's number of dimensions."""
+    """Raise ValueError if the length of a vector is not the scene's dimension."""
     for name, value in given.items():
         if value is not None and len(value) != scene.dimension:
             raise ValueError(f"{name} = {value}: has {len(value)} numbers, but dimension = {scene.dimension}")

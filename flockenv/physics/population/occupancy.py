@@ -1,7 +1,7 @@
-"""Counts of living agents near a place: a cell list of the agents of one world, for sinks and clearings alone.
+"""Counts of living agents near a place: a cell list of the agents of one world, for sinks and clearings only.
 
-Effects have a query of their own, over blocks of lanes, before a step. This one runs at the end of a step, its places
-need not be agents, and most scenes never use it.
+Effects have a query of their own, over blocks of SIMD lanes, before a step. This one runs at the end of a step, its
+places need not be agents, and most scenes never use it.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ __all__ = ["count_near", "sort_living"]
 
 @kernel
 def _inside(p: float, size: float) -> float:
-    """Return a coordinate in [0, size), of a periodic axis; as it is where size is 0."""
+    """Return a coordinate of a periodic axis wrapped to [0, size); unchanged if size is 0."""
     return p - size * math.floor(p / size) if size > 0.0 else p
 
 
 @kernel
 def _bounds(x: Any, alive: Any, b: int, first: int, end: int, period: Any, grid: Any) -> None:
-    """Write the lower corner of the living of slots [first, end), grid[0], and their extent, grid[1]; (4, 3)."""
+    """Write the lower corner of living agents of slots [first, end), grid[0], and their extent, grid[1]; (4, 3)."""
     for k in range(x.shape[0]):
         low, high = math.inf, -math.inf
         for i in range(first, end):
@@ -37,7 +37,7 @@ def _bounds(x: Any, alive: Any, b: int, first: int, end: int, period: Any, grid:
 
 @kernel
 def _divide(d: int, reach: float, most: int, grid: Any) -> int:
-    """Write cells per axis, grid[2], none narrower than `reach` and at most `most` in all; return how many."""
+    """Write cells per axis, grid[2], each at least `reach` wide, and at most `most` in all; return their number."""
     for k in range(3):
         grid[2, k] = 1.0
     for k in range(d):
@@ -54,7 +54,7 @@ def _divide(d: int, reach: float, most: int, grid: Any) -> int:
 
 @kernel
 def _cell_along(p: float, k: int, grid: Any) -> int:
-    """Return the cell along an axis in which an agent counts."""
+    """Return the index of the cell along an axis that holds coordinate p."""
     c: int = math.floor((p - grid[0, k]) * grid[3, k])
     return min(max(c, 0), int(grid[2, k]) - 1)
 
@@ -64,10 +64,10 @@ def sort_living(
     x: Any, alive: Any, b: int, first: int, end: int, reach: float, period: Any, grid: Any, cell: Any, start: Any,
     order: Any,
 ) -> None:  # fmt: skip
-    """List the living of slots [first, end) by cell, at least `reach` [m] wide.
+    """List living agents of slots [first, end) by cell; cells are at least `reach` [m] wide.
 
-    period (3,): m, 0 where an axis does not repeat. Writes grid (4, 3): corner, edges, cells, cells per metre; order
-    (N,): their slots; start (N + 1,): the first of each cell. cell (N,) is scratch.
+    period (3,): m, 0 for axes that are not periodic. Writes grid (4, 3): corner, edges, cells, cells per metre; order
+    (N,): their slots; start (N + 1,): the first of each cell. cell (N,) is scratch memory.
     """
     d = x.shape[0]
     _bounds(x, alive, b, first, end, period, grid)
@@ -85,12 +85,12 @@ def sort_living(
             start[c + 1] += 1
     for c in range(cells):
         start[c + 1] += start[c]
-    for j in range(end - first):  # backwards, so that each cell begins where it should when it is full
+    for j in range(end - first):  # backwards: `start` of each cell is decremented to its beginning
         i = end - 1 - j
         if cell[i] >= 0:
             start[cell[i] + 1] -= 1
             order[start[cell[i] + 1]] = i
-    # start[c + 1] is now the first of cell c: it begins where the one before ends
+    # start[c + 1] is now the first of cell c
     for c in range(cells):
         start[c] = start[c + 1]
     total = 0
@@ -103,7 +103,7 @@ def sort_living(
 def _neighbouring(c: int, turn: int, count: int, periodic: bool) -> int:
     """Return one of up to three cells along an axis, c - 1 to c + 1 by `turn` 0 to 2; -1 if there is none."""
     if periodic:
-        if turn >= count:  # an axis of one or two cells is walked through once
+        if turn >= count:  # each of one or two cells is visited once
             return -1
         return (c + turn - (1 if count > 2 else 0)) % count
     c += turn - 1
@@ -115,10 +115,10 @@ def count_near(
     x: Any, b: int, place: Any, reach: float, most: int, period: Any, grid: Any, start: Any, order: Any, born: Any,
     identity: Any, elder_than: int,
 ) -> int:  # fmt: skip
-    """Return how many of the listed agents are within `reach` of a place (3,), m; it stops counting beyond `most`.
+    """Return how many of the listed agents are within `reach` of a place (3,), m; counting stops at `most` + 1.
 
-    elder_than: a slot, if only agents born before its agent count (of two born at once, the one of lower identity is
-    the elder); -1 = all.
+    elder_than: a slot, if only agents born before its agent count (of two born at the same time, the one of lower
+    identity is the elder); -1 = all.
     """
     d, found = x.shape[0], 0
     nx, ny, nz = int(grid[2, 0]), int(grid[2, 1]), int(grid[2, 2])

@@ -26,7 +26,7 @@ Vector = Annotated[tuple[float, ...], Field(min_length=2, max_length=3)]
 
 
 def in_space(vector: Sequence[float]) -> list[float]:
-    """Return a vector with three numbers: 0 is the third of the plane."""
+    """Return a vector with three numbers: the third is 0 in 2-D."""
     return [*vector, *[0.0] * (3 - len(vector))]
 
 
@@ -44,18 +44,18 @@ class Place(Record):
     @property
     @abstractmethod
     def extremes(self) -> Floats:
-        """Return points that bound it, (n, D) m."""
+        """Points whose bounding box contains it, (n, D) m."""
 
     def pieces(self) -> Floats:
         """Return the pieces of a surface, (n, 14); see surface.py."""
         return np.zeros((0, 14))
 
     def check(self, scene: SceneView) -> None:
-        """Refuse a scene that this does not suit: a ValueError that begins with the field's name."""
+        """Raise ValueError, beginning with the field's name, if the scene does not suit this place."""
 
 
 class Point(Place):
-    """One place."""
+    """A point."""
 
     kind: Literal["point"] = "point"
     code: ClassVar[int] = 0
@@ -67,11 +67,11 @@ class Point(Place):
 
     @property
     def extremes(self) -> Floats:
-        """Itself."""
+        """The point itself."""
         return np.array([self.at])
 
     def check(self, scene: SceneView) -> None:
-        """Refuse other dimensions."""
+        """Raise ValueError if its dimension is not the scene's."""
         dimensions(scene, at=self.at)
 
 
@@ -84,7 +84,7 @@ class Segment(Place):
     end: Vector = Field(description="m")
 
     def row(self) -> list[float]:
-        """Its ends."""
+        """Return its ends."""
         return in_space(self.start) + in_space(self.end)
 
     @property
@@ -93,7 +93,7 @@ class Segment(Place):
         return np.array([self.start, self.end])
 
     def check(self, scene: SceneView) -> None:
-        """Refuse other dimensions."""
+        """Raise ValueError if its dimension is not the scene's."""
         dimensions(scene, start=self.start, end=self.end)
 
 
@@ -104,7 +104,7 @@ class Disc(Place):
     code: ClassVar[int] = 2
     centre: Vector = Field(description="m")
     radius: float = Field(gt=0, description="m")
-    axis: Vector | None = Field(default=None, description="in 3-D: what the disc lies across; none = a ball")
+    axis: Vector | None = Field(default=None, description="in 3-D: normal of the flat disc (default: a ball)")
 
     @model_validator(mode="after")
     def _points_somewhere(self) -> Disc:
@@ -113,36 +113,36 @@ class Disc(Place):
         return self
 
     def row(self) -> list[float]:
-        """Centre, radius, axis."""
+        """Return centre, radius and axis."""
         length = math.hypot(*self.axis) if self.axis is not None else 1.0
         return [*in_space(self.centre), self.radius, *(x / length for x in self.axis or (0.0, 0.0, 0.0))]
 
     @property
     def extremes(self) -> Floats:
-        """The corners of the box around it."""
+        """The corners of its bounding box."""
         return np.array(self.centre) + self.radius * np.array([[-1.0], [1.0]])
 
     def check(self, scene: SceneView) -> None:
-        """Refuse other dimensions."""
+        """Raise ValueError if its dimension is not the scene's."""
         dimensions(scene, centre=self.centre, axis=self.axis)
         if self.axis is not None and scene.dimension == 2:
-            raise ValueError(f"axis = {self.axis}: only in 3-D does a disc lie across something")
+            raise ValueError(f"axis = {self.axis}: only a disc in 3-D has an axis")
 
 
 class _Corners(Place):
-    """The region between two corners."""
+    """The box between two corners."""
 
     low: Vector = Field(description="m, lower corner")
     high: Vector = Field(description="m, upper corner")
 
     @model_validator(mode="after")
     def _ordered(self) -> _Corners:
-        """Refuse corners that are none."""
+        """Raise ValueError if the corners are not in order."""
         ordered(self.low, self.high)
         return self
 
     def row(self) -> list[float]:
-        """Its corners."""
+        """Return its corners."""
         return in_space(self.low) + in_space(self.high)
 
     @property
@@ -151,7 +151,7 @@ class _Corners(Place):
         return np.array([self.low, self.high])
 
     def check(self, scene: SceneView) -> None:
-        """Refuse other dimensions."""
+        """Raise ValueError if its dimension is not the scene's."""
         dimensions(scene, low=self.low, high=self.high)
 
 
@@ -167,15 +167,15 @@ class Surface(Place):
 
     kind: Literal["surface"] = "surface"
     code: ClassVar[int] = 4
-    shape: AnyShape = Field(description="as obstacles are; it need not be one")
+    shape: AnyShape = Field(description="a shape, as of an obstacle; it need not be one")
 
     def row(self) -> list[float]:
-        """Nothing: it is made of pieces."""
+        """Return an empty list: its pieces describe it."""
         return []
 
     @property
     def extremes(self) -> Floats:
-        """Those of the shape."""
+        """The extremes of the shape."""
         return np.asarray(self.shape.extremes)
 
     def pieces(self) -> Floats:
@@ -183,32 +183,32 @@ class Surface(Place):
         return pieces(self.shape)
 
     def check(self, scene: SceneView) -> None:
-        """Refuse other dimensions, and shapes that move, are hollow, or have no end."""
+        """Raise ValueError if its dimension is not the scene's, or the shape moves, is hollow or is unbounded."""
         if self.shape.dimension != scene.dimension:
             raise ValueError(
                 f"shape.kind = {self.shape.kind}: lies in {self.shape.dimension} dimensions, "
                 f"but dimension = {scene.dimension}"
             )
         if self.shape.moves:
-            raise ValueError(f"shape.kind = {self.shape.kind}: moves, and births come of what stays where it is")
+            raise ValueError(f"shape.kind = {self.shape.kind}: moves, but a place of births must be fixed")
         self.pieces()
 
 
 class Clearing(_Corners):
-    """A clearing in a box: of some places drawn at random, the one with the fewest living agents around it."""
+    """A clearing in a box: of some points drawn at random, the one with the fewest living agents around it."""
 
     kind: Literal["clearing"] = "clearing"
     code: ClassVar[int] = 5
-    radius: float = Field(gt=0, description="m, within which neighbours count")
-    candidates: int = Field(default=8, ge=1, le=64, description="places that are drawn for each birth")
+    radius: float = Field(gt=0, description="m, radius within which neighbours count")
+    candidates: int = Field(default=8, ge=1, le=64, description="points that are drawn for each birth")
 
     def row(self) -> list[float]:
-        """Its corners, the radius of its count, the number of draws."""
+        """Return its corners, the radius of its count and the number of draws."""
         return [*super().row(), self.radius, float(self.candidates)]
 
 
 def ordered(low: Sequence[float], high: Sequence[float]) -> None:
-    """Refuse corners that are none."""
+    """Raise ValueError if the lower corner is not below the upper one, or their lengths differ."""
     if len(low) != len(high) or any(a > b for a, b in zip(low, high, strict=True)):
         raise ValueError(f"low = {low}, high = {high}: the lower corner comes first, with as many numbers")
 

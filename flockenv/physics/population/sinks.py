@@ -1,4 +1,4 @@
-"""Sinks: conditions under which agents die. Each selects among all living agents at once when its turn comes."""
+"""Sinks: conditions under which agents die. Each selects among all agents that are alive when its turn comes."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ __all__ = ["Ageing", "Crowding", "Decay", "Drain", "Leaving", "Sink", "Threshold
 
 
 class Sink(Member):
-    """A condition under which agents of one group, or of all, die."""
+    """A condition under which agents of one group, or of all groups, die."""
 
     code: ClassVar[int]
     """Number of this kind in kernels."""
 
-    group: int | None = Field(default=None, ge=0, description="number of the group whose agents die; none = of all")
+    group: int | None = Field(default=None, ge=0, description="index of the group whose agents die (default: all)")
 
     def row(self) -> list[float]:
         """Return its numbers, as deaths.py reads them."""
         return []
 
     def check(self, scene: SceneView) -> None:
-        """Refuse a group that does not exist, or one whose agents are bound to each other."""
+        """Raise ValueError if the group does not exist, or is a network."""
         demand_group(scene, self.group)
         for k, group in enumerate(scene.groups):
             if self.group in (None, k) and group.network is not None:
@@ -43,7 +43,7 @@ class Ageing(Sink):
     lifetime: float = Field(gt=0, description="s")
 
     def row(self) -> list[float]:
-        """The lifetime."""
+        """Return the lifetime."""
         return [self.lifetime]
 
 
@@ -61,11 +61,11 @@ class Leaving(Sink):
         return self
 
     def row(self) -> list[float]:
-        """The corners."""
+        """Return the corners."""
         return in_space(self.low) + in_space(self.high)
 
     def check(self, scene: SceneView) -> None:
-        """Refuse other dimensions."""
+        """Raise ValueError if its dimension is not the scene's."""
         super().check(scene)
         dimensions(scene, low=self.low, high=self.high)
 
@@ -73,7 +73,7 @@ class Leaving(Sink):
 class Decay(Sink):
     """Agents die at random, each with a probability of 1 - exp(-rate t) within any time t, independent of dt.
 
-    Half of them are left after ln 2 / rate. Draws are of (world, step, identity).
+    Half of them are left after ln 2 / rate. Draws depend on world, step and identity.
     """
 
     kind: Literal["decay"] = "decay"
@@ -81,28 +81,28 @@ class Decay(Sink):
     rate: float = Field(gt=0, description="1/s")
 
     def row(self) -> list[float]:
-        """The rate."""
+        """Return the rate."""
         return [self.rate]
 
 
 class Drain(Sink):
-    """Agents die that are in a shape, or that went through it in the step: of a region, or at a surface.
+    """Removes agents inside a shape, and those that crossed it during the step.
 
-    The centre counts; `margin` is how far from the surface is near enough.
+    The centre of an agent counts; it dies at a distance of at most `margin` from the shape.
     """
 
     kind: Literal["drain"] = "drain"
     code: ClassVar[int] = 3
     looks_back: ClassVar[bool] = True
-    shape: AnyShape = Field(description="as obstacles are; it need not be one")
+    shape: AnyShape = Field(description="a shape, as of an obstacle; it need not be one")
     margin: float = Field(default=0.0, ge=0, description="m")
 
     def row(self) -> list[float]:
-        """The margin."""
+        """Return the margin."""
         return [self.margin]
 
     def check(self, scene: SceneView) -> None:
-        """Refuse other dimensions."""
+        """Raise ValueError if its dimension is not the scene's."""
         super().check(scene)
         if self.shape.dimension != scene.dimension:
             raise ValueError(
@@ -114,24 +114,24 @@ class Drain(Sink):
 
 
 class Crowding(Sink):
-    """In a dense crowd the youngest die: agents that have more than `most` elders within a radius.
+    """Removes the youngest agents of a dense crowd: those that have more than `most` elders within a radius.
 
-    Elders are agents of the same group (or of all) that were born earlier. With a rate, each of the youngest dies at
-    random; without, at once.
+    Elders are agents of the same group (or of all) that were born earlier. With a rate, such agents die at random;
+    without, at once.
     """
 
     kind: Literal["crowding"] = "crowding"
     code: ClassVar[int] = 4
     radius: float = Field(gt=0, description="m")
-    most: int = Field(ge=0, description="elders that one bears within the radius")
-    rate: float | None = Field(default=None, gt=0, description="1/s; none = at once")
+    most: int = Field(ge=0, description="number of elders that are allowed within the radius")
+    rate: float | None = Field(default=None, gt=0, description="1/s (default: at once)")
 
     def row(self) -> list[float]:
-        """Radius, how many, rate."""
+        """Return radius, number and rate."""
         return [self.radius, float(self.most), float("inf") if self.rate is None else self.rate]
 
     def check(self, scene: SceneView) -> None:
-        """Refuse a radius around the torus."""
+        """Raise ValueError if the radius wraps around the torus."""
         super().check(scene)
         if isinstance(scene.space, Torus) and self.radius > min(scene.space.size) / 2:
             raise ValueError(
@@ -141,19 +141,19 @@ class Crowding(Sink):
 
 
 class Threshold(Sink):
-    """Agents die whose inner number has come to a level: starved at a hunger of 1, caught."""
+    """Removes agents whose inner number is at least a level: starved at a hunger of 1, caught."""
 
     kind: Literal["threshold"] = "threshold"
     code: ClassVar[int] = 5
-    of: str = Field(min_length=1, description="name of the number, which some effect keeps")
-    level: float = Field(default=1.0, description="at which, or above which, the agent dies")
+    of: str = Field(min_length=1, description="name of the inner number, which an effect keeps")
+    level: float = Field(default=1.0, description="the agent dies at this value and above")
 
     def row(self) -> list[float]:
-        """The level."""
+        """Return the level."""
         return [self.level]
 
     def check(self, scene: SceneView) -> None:
-        """Refuse a number that no effect keeps."""
+        """Raise ValueError if no effect keeps the number."""
         super().check(scene)
         if self.of not in scene.parts.inner:
             kept = ", ".join(scene.parts.inner) or "nothing"

@@ -1,9 +1,9 @@
-"""Surfaces as pieces that places can be drawn from, each as large as the share of births that it gets.
+"""Surfaces as pieces from which points can be drawn, with a probability proportional to their size.
 
-A piece is 14 numbers: the measure of it and all before it (m in the plane, m^2 in space); 0 if it is flat, 1 if it is
-the side of a tube, 2 if it is the two ends of a tube or a ball; then three vectors. Flat: a corner, and the two edges
-from there (one in the plane); behind the last a sign, on which side of the edges is outside. Round: both ends of the
-tube's line, and its radius.
+A piece is 14 numbers: the cumulative size of it and all before it (m in 2-D, m^2 in 3-D); 0 if it is flat, 1 if it is
+the side of a tube, 2 if it is the two ends of a tube or a ball; then the geometry. Flat: a corner, the two edges from
+there (one in 2-D), and a sign: the side of the edges that is outside. Round: both ends of the tube's line, and its
+radius.
 """
 
 from __future__ import annotations
@@ -25,7 +25,10 @@ FLAT, SIDE, ENDS = 0.0, 1.0, 2.0
 
 
 def pieces(shape: Any) -> Floats:
-    """Return the pieces of a shape's surface, (n, 14); ValueError of one that has no end, or is only numbers."""
+    """Return the pieces of a shape's surface, (n, 14).
+
+    Raise ValueError if the shape is unbounded, hollow, or a grid of distances.
+    """
     if shape.form == "block":
         found = _block(shape)
     elif shape.kind == "polygon":
@@ -54,7 +57,7 @@ def _flat(corner: Any, u: Any, v: Any, size: float, sign: float = 1.0) -> list[f
 
 
 def _polygon(shape: Any) -> list[list[float]]:
-    """Return its edges, counter-clockwise: the right of an edge is outside."""
+    """Return the edges of a polygon, counter-clockwise: the right of an edge is outside."""
     corners = np.array(shape.vertices)
     corners = corners if area(corners) > 0 else corners[::-1]
     edges = np.roll(corners, -1, axis=0) - corners
@@ -78,7 +81,7 @@ def _block(shape: Any) -> list[list[float]]:
 
 
 def _chain(shape: Any) -> list[list[float]]:
-    """Return the sides and the ends of each part of a line with a thickness; of a circle or sphere the ends alone."""
+    """Return the sides and the ends of each segment of a thick line; the ends only for a circle or sphere."""
     if shape.kind == "circle":
         line, radius = [shape.centre, shape.centre], shape.radius
     else:
@@ -89,7 +92,7 @@ def _chain(shape: Any) -> list[list[float]]:
     found = []
     for a, b in itertools.pairwise(line):
         length = math.dist(a, b)
-        # a line without thickness in space has no surface: its length counts
+        # a line without thickness has no area in 3-D: its length is used
         size = length * (around if around > 0 else 1.0)
         for kind, measure in ((SIDE, size), (ENDS, ends)):
             if measure > 0:
