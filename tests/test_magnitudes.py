@@ -82,7 +82,7 @@ def test_with_motion_refuses_what_cannot_be_squared(number: float, which: int) -
     state = scene().start(0)
     motion = [np.zeros((1, 3, 2)), np.zeros((1, 3, 2))]
     motion[which][0, 2, 1] = number
-    with pytest.raises(ValueError, match=rf"{('pos', 'vel')[which]} holds .* at \(world, agent, axis\) \(0, 2, 1\)"):
+    with pytest.raises(ValueError, match=rf"{('pos', 'vel')[which]} contains .* at \(world, agent, axis\) \(0, 2, 1\)"):
         state.with_motion(*motion)
 
 
