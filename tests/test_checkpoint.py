@@ -304,7 +304,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "steps -5": (noted(steps=-5), "notes: steps = -5: must be an integer >= 0"),
     "steps in words": (noted(steps="many"), "notes: steps = 'many': must be an integer >= 0"),
     "a key more": (noted(lucky=7), "notes: lucky = 7: unknown key"),
-    "a key less": (noted(curve="gone"), "notes: curve: missing; needed is a list"),
+    "a key less": (noted(curve="gone"), "notes: curve: missing; must be a list"),
     "fewer steps": (noted(steps=256), "notes: curve goes to 512 steps"),
     "another best": (noted(best=1e6), "notes: best = 1000000.0 is not the best of the curve"),
     "notes are a list": (changed(lambda parts: parts.update(notes=as_bytes("[1, 2]"))), "notes: "),

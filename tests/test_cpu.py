@@ -117,7 +117,7 @@ def test_another_size_is_refused_by_one_line() -> None:
         [sys.executable, "-c", "import flockenv.scene"], env=environment, capture_output=True, text=True
     )
     assert done.stderr.rstrip().endswith(
-        "ValueError: FLOCKENV_REGISTER = '16': must be 32 or 64 (bytes side by side), or nothing"
+        "ValueError: FLOCKENV_REGISTER = '16': must be 32 or 64 (bytes of a register), or empty"
     )
 
 

@@ -135,7 +135,7 @@ def test_scenes_are_written_with_their_model_by_name_and_never_over_others(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["validate", "juelich", "--preset", "moussaid_2009", "--scenes", "mine"]) == 0
-    assert "mine holds 3 scenes" in capsys.readouterr().out
+    assert "mine contains 3 scenes" in capsys.readouterr().out
     text = Path("mine/juelich_2_turned.yaml").read_text()
     assert "- {preset: moussaid_2009}" in text and "sidestep" not in text
     Path("mine/juelich_6.yaml").write_text("precious")

@@ -76,7 +76,7 @@ def test_a_damaged_file_costs_one_line_and_one_compilation(
     path.write_bytes(DAMAGE[how](before))
     first, second = run(folder), run(folder)
     assert (first.returncode, first.stdout) == (0, whole[1])
-    assert first.stderr == f"flockenv: {path}: damaged; made anew\n"
+    assert first.stderr == f"flockenv: {path}: damaged; rebuilt\n"
     assert (second.returncode, second.stdout, second.stderr) == (0, whole[1], "")
     assert len(path.read_bytes()) > len(before) / 2
 
@@ -90,7 +90,7 @@ def test_a_scene_goes_on_where_every_file_is_damaged(tmp_path: Path) -> None:
         path.write_bytes(flipped(k / len(files))(path.read_bytes()))
     first, second = run(folder), run(folder)
     assert (first.returncode, first.stdout) == (0, before.stdout)
-    assert sorted(first.stderr.splitlines()) == sorted(f"flockenv: {path}: damaged; made anew" for path in files)
+    assert sorted(first.stderr.splitlines()) == sorted(f"flockenv: {path}: damaged; rebuilt" for path in files)
     assert (second.returncode, second.stdout, second.stderr) == (0, before.stdout, "")
 
 
@@ -108,7 +108,7 @@ def test_damaged_data_is_never_returned(
     path = store.folder / "name"
     path.write_bytes(damage(path.read_bytes()))
     assert store.read("name") is None and store.read("name") is None
-    assert capsys.readouterr().err == f"flockenv: {path}: damaged; made anew\n"
+    assert capsys.readouterr().err == f"flockenv: {path}: damaged; rebuilt\n"
     store.write("name", b"new")
     assert store.read("name") == b"new"
 

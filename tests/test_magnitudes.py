@@ -82,12 +82,12 @@ def test_with_motion_refuses_what_cannot_be_squared(number: float, which: int) -
     state = scene().start(0)
     motion = [np.zeros((1, 3, 2)), np.zeros((1, 3, 2))]
     motion[which][0, 2, 1] = number
-    with pytest.raises(ValueError, match=rf"{('pos', 'vel')[which]} holds .* at \(world, agent, axis\) \(0, 2, 1\)"):
+    with pytest.raises(ValueError, match=rf"{('pos', 'vel')[which]} contains .* at \(world, agent, axis\) \(0, 2, 1\)"):
         state.with_motion(*motion)
 
 
 def test_with_motion_knows_the_precision() -> None:
     far = np.full((1, 3, 2), 1e20)
     assert scene().start(0).with_motion(far, far).pos[0, 0, 0] == 1e20
-    with pytest.raises(ValueError, match=r"pos holds 1e\+20 .*float32 computes with at most 1e\+19"):
+    with pytest.raises(ValueError, match=r"pos contains 1e\+20 .*float32 computes with at most 1e\+19"):
         scene(dtype="float32").start(0).with_motion(far, far)

@@ -100,7 +100,7 @@ def test_folders_above_it_may_be_shared_if_they_are_sticky(mode: int, allowed: b
     if allowed:
         assert stat.S_IMODE(prepared(above / "cache").stat().st_mode) == 0o700
     else:
-        with pytest.raises(NotPrivateError, match=r"above: other users can exchange.*0777"):
+        with pytest.raises(NotPrivateError, match=r"above: other users can replace.*0777"):
             prepared(above / "cache")
 
 
@@ -115,7 +115,7 @@ def test_folders_behind_a_link_on_the_way_are_looked_at_too(tmp_path: Path) -> N
     world_writable(tmp_path / "open")
     (tmp_path / "open" / "home").mkdir(mode=0o700)
     (tmp_path / "way").symlink_to(tmp_path / "open" / "home")
-    with pytest.raises(NotPrivateError, match="open: other users can exchange"):
+    with pytest.raises(NotPrivateError, match="open: other users can replace"):
         prepared(tmp_path / "way" / "cache")
     (tmp_path / "open").chmod(0o755)
     assert prepared(tmp_path / "way" / "cache").is_dir()
@@ -201,6 +201,6 @@ def test_a_user_is_not_given_the_folders_of_another(request: pytest.FixtureReque
 
 def test_without_any_private_folder_one_line_says_why(tmp_path: Path) -> None:
     tmp_path.chmod(0o777)
-    with pytest.raises(OSError, match=r"\Ano folder for compiled kernels .*other users can exchange[^\n]*\Z"):
+    with pytest.raises(OSError, match=r"\Ano folder for compiled kernels .*other users can replace[^\n]*\Z"):
         first_private(tmp_path / "home" / "flockenv", tmp_path, "flockenv-1")
     assert not list(tmp_path.glob("flockenv-1-*"))

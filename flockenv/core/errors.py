@@ -188,7 +188,7 @@ def _reason(path: KeyPath, detail: ErrorDetails, schema: Schema, data: object) -
     node = _schema_at(path, schema, data)
     allowed, about = _range(node), _one_line(node.get("description", ""))
     if kind in _MISSING:
-        reason = f"missing; needed is {allowed or 'a value'}"
+        reason = f"missing; must be {allowed or 'a value'}"
     else:
         reason = (f"must be {allowed}" if allowed else message) + _hint(detail["input"], kind)
     return f"{reason} ({about})" if about else reason

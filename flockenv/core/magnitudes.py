@@ -69,5 +69,5 @@ def check_array(name: str, array: NDArray[np.float64], precision: str) -> None:
         found = array[at]
         what = f"{found:g}" if np.isfinite(found) else "NaN or infinity"
         raise ValueError(
-            f"{name} holds {what} at (world, agent, axis) {at}; {precision} computes with at most {most:g}"
+            f"{name} contains {what} at (world, agent, axis) {at}; {precision} computes with at most {most:g}"
         )

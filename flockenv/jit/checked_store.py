@@ -62,11 +62,11 @@ class Store:
         except FileNotFoundError:
             return None
         except OSError as error:
-            say_once(f"{error if error.strerror is None else f'{path}: {error.strerror}'}; made anew")
+            say_once(f"{error if error.strerror is None else f'{path}: {error.strerror}'}; rebuilt")
             return None
 
     def _say_damaged(self, name: str) -> None:
-        say_once(f"{self.folder / name}: damaged; made anew")
+        say_once(f"{self.folder / name}: damaged; rebuilt")
 
     def _keep(self, name: str, data: bytes) -> None:
         """Write a file, or report why it could not be written: only the next process's startup time depends on it."""

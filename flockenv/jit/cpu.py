@@ -31,7 +31,7 @@ def _register() -> int:
     """Return the register width in bytes; ValueError if FLOCKENV_REGISTER is neither 32 nor 64 nor empty."""
     told = os.environ.get("FLOCKENV_REGISTER", "")
     if told not in ("", "32", "64"):
-        raise ValueError(f"FLOCKENV_REGISTER = {told!r}: must be 32 or 64 (bytes side by side), or nothing")
+        raise ValueError(f"FLOCKENV_REGISTER = {told!r}: must be 32 or 64 (bytes of a register), or empty")
     return int(told) if told else 64 if "avx512f" in FEATURES else 32
 
 

@@ -148,7 +148,7 @@ def _check_above(place: Path) -> None:
     if found.st_uid not in trusted:
         raise NotPrivateError(f"{place}: belongs to user {found.st_uid}, which could replace its content")
     if not stat.S_ISLNK(found.st_mode) and _others_write(found) and not found.st_mode & stat.S_ISVTX:
-        raise NotPrivateError(f"{place}: other users can exchange what lies in it (mode {_mode(found)}); chmod go-w it")
+        raise NotPrivateError(f"{place}: other users can replace its content (mode {_mode(found)}); chmod go-w it")
 
 
 def _check(found: os.stat_result, path: Path, is_kind: Callable[[int], bool], kind: str) -> None:

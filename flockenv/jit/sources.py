@@ -43,7 +43,7 @@ def sources_of_code() -> Iterator[tuple[Path, bytes]]:
 
 @functools.cache
 def laws_digest() -> str:
-    """Digest `sources_of_code`.
+    """Return a digest of `sources_of_code` and of the versions of numba and Python.
 
     An edit to a source gives new files, never stale machine code. The digest does not depend on the machine.
     """
