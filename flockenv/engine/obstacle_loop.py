@@ -91,7 +91,7 @@ def _world_of(plan: Obstacles) -> Callable[..., Any]:
 
 @section
 def _starts(plan: Obstacles) -> Callable[..., None]:
-    """Make the start of all folds of a block; it also notes how far they reach."""
+    """Make `starts(context, pos, vel, time, place)`: begin all folds of a block, and note how far they reach."""
     width, agent, begin = plan.agent.width, _agent_of(plan.agent), in_turn(*(_start(plan, f) for f in plan.folds))
     reach, limited = np.uint64(max(plan.reach, 0)), plan.reach >= 0
     furthest: Any = _furthest(plan.folds) if limited else None
@@ -142,7 +142,7 @@ def _furthest(folds: tuple[Fold, ...]) -> Callable[..., float]:
 
 @section
 def _circles(plan: Obstacles) -> Callable[..., None]:
-    """Make the loop of all agents of a block, side by side, over every circle of the state."""
+    """Make `circles(context, pos, vel, time, place)`: update all folds of a block by every circle of the state."""
     width, agent, circle = plan.agent.width, _agent_of(plan.agent), vector_of(plan.agent.dimension)
     offset_to, meet, world_of = plan.around.offset_to, meet_circle(plan.folds), _world_of(plan)
 
@@ -209,7 +209,7 @@ def _row(plan: Obstacles, form: str) -> Callable[..., None]:
 
 @section
 def _in_turn(plan: Obstacles, j: int) -> Callable[..., None]:
-    """Make the loop of all agents of a block, side by side, over every shape of form j."""
+    """Make `shapes(context, pos, vel, time, place)`: update all folds of a block by every shape of form j."""
     width, agent, world_of = plan.agent.width, _agent_of(plan.agent), _world_of(plan)
     placed, meet = _placed(plan.agent.dimension, plan.around.moving), _row(plan, plan.around.forms[j].name)
 
@@ -231,7 +231,10 @@ def _in_turn(plan: Obstacles, j: int) -> Callable[..., None]:
 
 @section
 def _looked_up(plan: Obstacles, j: int) -> Callable[..., None]:
-    """Make the loop of each agent of a block over the shapes of form j that may lie within reach, in order."""
+    """Make `shapes(context, pos, vel, time, place)`: update each agent's folds by shapes of form j, found by a grid.
+
+    Only those that may lie within reach, in order.
+    """
     width, agent, world_of = plan.agent.width, _agent_of(plan.agent), _world_of(plan)
     placed, meet = _placed(plan.agent.dimension, plan.around.moving), _row(plan, plan.around.forms[j].name)
     near, box = near_rows(plan.around.offset_to, plan.agent.dimension), _box(plan.folds, plan.only_rays)
@@ -342,7 +345,10 @@ def _span(folds: tuple[Fold, ...]) -> Callable[..., tuple[Vec, Vec, float]]:
 
 @section
 def _asides(plan: Obstacles, fold: Fold) -> Callable[..., None]:
-    """Make the side on which each agent passes the obstacle ahead, for a law that reads it: see steering/around.py."""
+    """Make `asides(context, pos, vel, time, place)`: write on which side each agent passes the obstacle ahead.
+
+    For a law that reads it, see steering/around.py.
+    """
     k, ray_of, slots, ahead, width = fold.k, fold.ray, fold.slots, fold.ahead, plan.agent.width
     agent, aside, sides = _agent_of(plan.agent), aside_of(plan.around), fold.slots[-plan.agent.dimension :]
     first, which, place_at = np.uint64(slots[0]), np.uint64(ahead[0]), np.uint64(ahead[1])
