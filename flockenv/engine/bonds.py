@@ -126,7 +126,7 @@ def bonds_of(plan: BondPlan) -> Callable[..., None]:
         scratch, numbers, key, n = context.scratch, context.numbers, context.key[context.b], context.n
         sync, team, lanes, pulled = scratch.sync, context.team, scratch.lanes, scratch.pulled
         if waits:
-            wait_for_team(sync, team)  # the positions are those of all threads
+            wait_for_team(sync, team)  # all threads have written their positions now
         for block in range(np.uint64(context.first), np.uint64(context.end)):
             base = block * np.uint64(count)
             for place in range(np.uint64(count)):

@@ -55,7 +55,7 @@ def find_groups_of(plan: GroupPlan) -> Callable[..., None]:
 
     def find_groups(context: Any, pos: Any, vel: Any) -> None:
         sync, team = context.scratch.sync, context.team
-        wait_for_team(sync, team)  # the positions are those of all threads
+        wait_for_team(sync, team)  # all threads have written their positions now
         find(context, pos, vel)
         wait_for_team(sync, team)  # no agent moves before all threads have read positions
 

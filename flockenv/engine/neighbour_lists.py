@@ -139,7 +139,7 @@ def list_living(plan: Listing) -> Callable[..., Any]:
 
     def list_all(context: Any, pos: Any, vel: Any) -> Any:
         scratch, team, rank = context.scratch, context.team, context.rank
-        wait_for_team(scratch.sync, team)  # the positions are those of all threads
+        wait_for_team(scratch.sync, team)  # all threads have written their positions now
         shape = (0, 0, 0, 0, 0)
         if sorts:
             size, reach = context.numbers.size, context.numbers.reach

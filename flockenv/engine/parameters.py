@@ -105,7 +105,7 @@ class Numbered(Protocol):
 
     @property
     def dimension(self) -> int:
-        """D."""
+        """Number of axes, D."""
 
     @property
     def dtype(self) -> str:
@@ -121,7 +121,7 @@ class Numbered(Protocol):
 
     @property
     def integrator(self) -> Integrator:
-        """The method."""
+        """The integrator."""
 
     @property
     def shaped(self) -> tuple[Any, dict[Any, tuple[int, int]]]:

@@ -58,7 +58,7 @@ def number_of(form: str) -> int:
 
 @section
 def by_form(laws: tuple[tuple[str, Law], ...], otherwise: Law) -> Callable[..., Any]:
-    """Make `of(params, form, row, given)`: what the law of a shape's form returns for (params, row, *given).
+    """Make `of(params, form, row, given)`: return law(params, row, *given) with the law of the shape's form.
 
     laws: (form, its law); otherwise: that of a shape of any other form.
     """
@@ -78,7 +78,10 @@ def by_form(laws: tuple[tuple[str, Law], ...], otherwise: Law) -> Callable[..., 
 
 @section
 def seen_from(offset_to: Law, moving: bool) -> Callable[..., Vec]:
-    """Make `seen(params, size, at, time, x)`: the offset of x from the anchor of the shape at `at`, at `time` (s), m."""
+    """Make `seen(params, size, at, time, x)`: the offset of x from the anchor of the shape at `at`, m.
+
+    time: s.
+    """
 
     def seen(params: Any, size: Any, at: Any, time: Any, x: Any) -> Any:
         place = vector_at(params, at + 2, x)

@@ -38,7 +38,7 @@ ALL_AROUND = 6.0
 """rad: an obstacle that needs a larger turn to pass has no edge on that side."""
 
 JUST = 1 - 1e-3
-"""Share of its clearance that a body keeps in the test whether it passes an edge, so that it does not touch that edge."""
+"""Share of its clearance that a body keeps in the test whether it passes an edge: so it does not touch that edge."""
 
 NEARER = 1 - 1e-5
 """Share of the best distance within which another edge must lie to be preferred: so rounding selects no side."""
@@ -55,19 +55,19 @@ def _laws(verb: str, forms: tuple[FormPlan, ...]) -> tuple[tuple[str, Law], ...]
 
 @law
 def _no_edge(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
-    """Return that there is no edge, for what is no shape."""
+    """Return an infinite angle and distance: there is no edge, because there is no shape."""
     return like(room, np.inf), like(room, np.inf)
 
 
 @law
 def _nowhere(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
-    """Return that what is no shape is infinitely far, and has no normal."""
+    """Return an infinite distance and no normal: there is no shape."""
     return like(x[0], np.inf), zero(x)
 
 
 @law
 def _no_spine(table: Any, at: int, x: Vec, ray: Vec) -> Vec:
-    """Return that a shape has no axis of its own: 0."""
+    """Return 0: the shape has no axis of its own."""
     return zero(x)
 
 
@@ -102,7 +102,7 @@ def first_hit(around: Surroundings) -> Callable[..., tuple[float, int, int]]:
 
 @section
 def _first_row(around: Surroundings) -> Callable[..., tuple[float, int, int]]:
-    """Make `first(params, size, given, state)`: `state` after all shapes; given: (time, x, ray, room)."""
+    """Make `first(params, size, given, state)`: return `state` after all shapes; given: (time, x, ray, room)."""
     first, form = len(around.forms) == 1, around.forms[-1]
     before: Any = None if first else _first_row(around._replace(forms=around.forms[:-1]))
     each = each_row(around, form, _touches(around, form), _box_of_way, _never)
