@@ -62,7 +62,7 @@ def _in_sight(around: Surroundings | None) -> Callable[..., bool]:
 def _keeps(fold: Fold) -> Callable[..., None]:
     """Make `keep(p, world, me, it, form, place, lanes, lane)`: update a fold by an obstacle, as its law sees it.
 
-    If the number for what is ahead changes, it also notes the form and place of the obstacle.
+    For a fold with `ahead`, if its first number changes, it also notes the form and place of the obstacle.
     """
     law, slots, ahead, notes = fold.law, fold.slots, fold.ahead, bool(fold.ahead)
     occluded, in_sight = fold.hidden is not None, _in_sight(fold.hidden)

@@ -24,7 +24,7 @@ class Fold(NamedTuple):
     origin: Any  # returns the point from which it sees obstacles, if not the agent's position
     reach: Any
     rays: int
-    pieces: bool  # True if walls, polygons and rooms are handled side by side
+    pieces: bool  # True if walls, polygons and rooms are handled one side at a time
     hidden: Surroundings | None  # the obstacles that may hide others; None: occlusion does not matter
     slots: tuple[int, ...]  # where its running numbers lie
     ahead: tuple[int, ...]  # where form and place of the obstacle ahead are noted; empty if no law reads them

@@ -70,7 +70,7 @@ class MetObstacles:
 
     @functools.cached_property
     def cells(self) -> dict[str, NDArray[np.float64]]:
-        """Grids over the shapes of each bounded form that has many of them: see shapes/cells.py."""
+        """Grids over the shapes of each form of finite extent that has many of them: see shapes/cells.py."""
         table, forms = self.shaped
         period = np.array(self.space.extent(self.dimension)) if self.space.periodic else None
         found = {}

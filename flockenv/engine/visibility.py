@@ -57,7 +57,7 @@ def _hidden(around: Surroundings) -> Callable[..., bool]:
 
 @section
 def _hides(around: Surroundings, form: FormPlan) -> Callable[..., bool]:
-    """Make the function for each row: return True if a shape so far intersects the line."""
+    """Make the function for each row: return True if it or an earlier one intersects the line."""
     seen, hit = seen_from(around.offset_to, around.moving), law_of("hit", form.name)
 
     def hides(params: Any, size: Any, at: Any, given: Any, found: Any) -> Any:
