@@ -1,18 +1,19 @@
-"""The sweep: composes the laws of a scene into one kernel of Python functions, which numba compiles once and keeps.
+"""The kernel engine: composes the laws of a scene into one kernel, which numba compiles once and caches.
 
-What is compiled depends only on which laws there are, in which space, dimension and integrator, and which of them see
-the same neighbours; numbers are arguments. A law that is not listed leaves no trace: no branch, no buffer, no query.
+What is compiled depends only on which laws there are, on the space, the dimension and the integrator, and on which laws
+share a sight; numbers are arguments. A law that the scene does not have costs nothing: no branch, no buffer, no query.
 
-Agents go side by side in blocks, as many as a vector register holds (16 with AVX-512, 8 without, in float64 half of
-that), and every array of a world lies in blocks: the first coordinates of one, its second ones, and so on. So a loop
-over the lanes has a constant length and constant offsets, and the compiler makes it straight vector code; running sums
-lie in one small scratch array and stay in vector registers.
+Agents lie side by side in blocks, as many as a vector register holds (16 with AVX-512, 8 without, in float64 half of
+that). Every array of a world consists of blocks: the first coordinates of a block's agents, then their second ones, and
+so on. So a loop over the lanes has a constant length and constant offsets, and compiles to straight vector code;
+running sums lie in one small scratch array and stay in vector registers.
 
-The files, from the whole to its parts: `entries` are what Python calls; `step` advances a world, by `respond` (what all
-laws say), the integrator's `method` and `move`; `listing` sorts the agents and walks their blocks, `meeting` lets a
-block meet its candidates, `far` all agents, `bonds` its partners, `obstacles` what stands around; `look` is what tasks
-add. `parts` says what follows from which laws there are. Each file holds sections (see `flockenv.jit.section`): a
-function `thing_of(plan)` makes the function `thing`, of as little as it depends on.
+The files, from the whole to its parts: `entry_points` has what Python calls; `step` advances a world, by `respond` in
+`accelerations` (the sum of all laws), the integrator's `method` and `move`. `neighbour_lists` sorts the agents and
+walks through their blocks; a block interacts with its candidates in `pair_loop`, with all agents in `far_field`, with
+its partners in `bonds`, and with obstacles in `obstacle_loop`. `observation_query` is what tasks add. `kernel_plan`
+derives the plans from the laws of a scene. Each file holds sections (see `flockenv.jit.section`): a function
+`thing_of(plan)` makes the function `thing`, and depends on as little as possible.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
-"""The acceleration of every agent of a world: what all laws say, summed and divided by mass.
+"""The acceleration of every agent of a world: the forces of all laws, summed and divided by mass.
 
-Pair laws come first, in one sweep (`sense`), and leave what they came to in `felt`, by agent; laws about all agents,
-and bonds, in `pulled`. Then each block adds what its agents want or feel by themselves, and the folds over the
-obstacles (`respond`); what an agent wants is bounded by max_force. By a method of one stage the step goes on from
-there, part after part; `accelerate` is for all others, and where accelerations alone are asked for.
+Pair laws come first, in one pass over the candidates (`sense`), and leave their sums in `felt`, by agent; laws about
+all agents, and bonds, leave theirs in `pulled`. Then each block adds the steering and external forces of its agents,
+and the folds over the obstacles (`respond`); the steering force is limited to max_force. With a method of one stage the
+step continues from there, a few blocks at a time; `accelerate` serves all other methods, and calls for accelerations
+alone.
 """
 
 from __future__ import annotations
@@ -34,15 +35,15 @@ __all__ = ["accelerate_of", "felt_of", "respond_of", "response_plan", "sense_of"
 
 
 class Added(NamedTuple):
-    """Something that is added to what an agent wants, to what acts on it, or to one of its wishes."""
+    """A vector that is added to an agent's steering force, to its external force, or to the force of one behaviour."""
 
     kind: str  # "own" law, "still": an own law without its drag, "group", "fold" over obstacles, "felt", "pulled"
-    law: OneLaw | None = None  # of a fold: what ends it
-    places: tuple[int, ...] = ()  # of a fold: its numbers among the lanes; of what is felt: where it lies in a block
+    law: OneLaw | None = None  # of a fold: its finish law
+    places: tuple[int, ...] = ()  # of a fold: its numbers among the lanes; of "felt": where it lies in a block
 
 
 class Reconciled(NamedTuple):
-    """An effect that makes one of several wishes."""
+    """An effect that combines the steering forces of several behaviours into one."""
 
     k: int
     law: Law
@@ -50,17 +51,17 @@ class Reconciled(NamedTuple):
 
 
 class ResponsePlan(NamedTuple):
-    """What the acceleration of an agent depends on, once all is sensed."""
+    """What the acceleration of an agent depends on, once `sense` is done."""
 
     agent: AgentPlan
-    masked: bool  # may what is the same for all agents lie where the first block has it?
+    masked: bool  # True if numbers that all agents share may be read from the first block
     media: tuple[OneLaw, ...]
     flows: tuple[OneLaw, ...]
     added: tuple[Added, ...]
-    totals: tuple[tuple[int, ...], ...]  # which of them come to: what an agent wants, what acts on it, each wish
+    totals: tuple[tuple[int, ...], ...]  # indices into `added`: of steering, external and behaviour forces
     reconciled: tuple[Reconciled, ...]
-    steered: tuple[tuple[int, ...], tuple[int, ...]]  # which of those come to: what it wants, what acts on it
-    felt: int  # numbers of a block in `felt`
+    steered: tuple[tuple[int, ...], tuple[int, ...]]  # indices into `reconciled`: of steering, external forces
+    felt: int  # count of numbers of a block in `felt`
     obstacles: Obstacles | None
     groups: GroupPlan | None
 
@@ -77,7 +78,7 @@ def response_plan(parts: Parts) -> ResponsePlan:
             added.append((parts.target(k), Added("group", OneLaw.of(parts, k, "group_law"))))
         if effect.obstacle_start is not None and effect.obstacle_finish is not None:
             slots = tuple(place * parts.width for name, place in parts.slots.items() if name.startswith(f"o{k}_"))
-            # a fold sees no images: its law met obstacles by the shortest way
+            # A fold is passed no image points: its law already gets the shortest offset to each obstacle.
             added.append((parts.target(k), Added("fold", OneLaw(k, effect.obstacle_finish), slots)))
     added += [(name, Added("felt", None, (parts.felt_at(name),))) for name in parts.targets if name[0] != "n"]
     added += [("f", Added("pulled"))] * parts.pulls
@@ -97,11 +98,11 @@ def response_plan(parts: Parts) -> ResponsePlan:
     )  # fmt: skip
 
 
-# --- what is felt from others -----------------------------------------------------------------------------------------
+# --- what comes from other agents -------------------------------------------------------------------------------------
 
 
 class SensePlan(NamedTuple):
-    """What agents feel from others: what there is of it; None where there is none."""
+    """What agents sense of other agents; None where the scene has no such law."""
 
     agent: AgentPlan
     aims: tuple[OneLaw, ...]
@@ -125,7 +126,7 @@ def sense_plan(parts: Parts) -> SensePlan:
 
 @section
 def sense_of(plan: SensePlan) -> Callable[..., None]:
-    """Make `sense(context, pos, vel, time)`: write what this thread's agents of one world feel from others."""
+    """Make `sense(context, pos, vel, time)`: write the effect of other agents on this thread's agents of one world."""
     aim = _aim(plan.agent, plan.aims) if plan.aims else None
     meet = meet_neighbours(plan.pairs) if plan.pairs is not None else None
     far = far_of(plan.far) if plan.far is not None else None
@@ -151,7 +152,7 @@ def sense_of(plan: SensePlan) -> Callable[..., None]:
 
 @section
 def _aim(agent: AgentPlan, laws: tuple[OneLaw, ...]) -> Callable[..., None]:
-    """Make `aim(context, pos, vel, time)`: write in which direction this thread's agents want to go."""
+    """Make `aim(context, pos, vel, time)`: write the desired direction of each of this thread's agents."""
     d, width = agent.dimension, agent.width
     size, vector, put = np.uint64(d * width), vector_of_lane(d, width), put_vector_of(d, width)
     alone, ways, total = alone_of(agent._replace(aims=False)), tuple_from(*map(says_of, laws)), _sum_all(laws)
@@ -174,12 +175,12 @@ def _sum_all(laws: tuple[Any, ...]) -> Callable[[Vec, Any], Vec]:
     return sum_of(tuple(range(len(laws))))
 
 
-# --- what agents do about it ------------------------------------------------------------------------------------------
+# --- how agents respond -----------------------------------------------------------------------------------------------
 
 
 @functools.cache
 def felt_of(dimension: int, width: int, each: int, place: int) -> Callable[..., Vec]:
-    """Return `felt(scratch, row, lane)`: what pair laws have left an agent in a lane of the block at `row`."""
+    """Return `felt(scratch, row, lane)`: the sum of pair laws for the agent in a lane of the block at `row`."""
     vector, first, rows = vector_of_lane(dimension, width), np.uint64(place), np.uint64(each // width)
     return kernel(lambda scratch, row, lane: vector(scratch.felt, row * rows + first + lane))
 
@@ -217,7 +218,11 @@ def _adding(plan: ResponsePlan, added: Added) -> Callable[..., Vec]:
 
 @section
 def _totals(plan: ResponsePlan) -> Callable[..., Any]:
-    """Make `totals(numbers, scratch, me, wanted, row, at, lane)`: what an agent wants, what acts on it, its wishes."""
+    """Make `totals(numbers, scratch, me, wanted, row, at, lane)`: sum the forces of an agent.
+
+    `wanted` is the commanded steering force. Returns the steering force, the external force, and the tuple of the
+    forces of those behaviours that an effect combines.
+    """
     adding = tuple_from(*(_adding(plan, one) for one in plan.added)) if plan.added else None
     want, force, *wishes = map(sum_of, plan.totals)
     wishing: Any = tuple_from(*wishes) if wishes else kernel(lambda start, vectors: ())
@@ -234,7 +239,7 @@ def _totals(plan: ResponsePlan) -> Callable[..., Any]:
 
 @functools.cache
 def _steering(one: Reconciled) -> Callable[..., Vec]:
-    """Return `steers(numbers, me, wishes)`: what an effect makes of its wishes, if it is about this agent."""
+    """Return `steers(numbers, me, wishes)`: an effect's combined behaviours; 0 for an agent of another group."""
     k, law, places = one
 
     def steers(numbers: Any, me: Any, wishes: Any) -> Any:
@@ -249,7 +254,7 @@ def _steering(one: Reconciled) -> Callable[..., Vec]:
 def respond_of(plan: ResponsePlan) -> Callable[..., None]:
     """Make `respond(context, pos, vel, time, block, out, to)`: write the accelerations of a block, m/s^2.
 
-    They lie at `to` in an array of vectors; with what velocity the medium carries each agent, if it does, in
+    They are written at `to` in the array of vectors `out`. If a medium carries the agents, its velocity goes to
     `carrying`.
     """
     agent, d, width = plan.agent, plan.agent.dimension, plan.agent.width
@@ -281,8 +286,8 @@ def respond_of(plan: ResponsePlan) -> Callable[..., None]:
                 steered = steering(numbers, me, wishes)
                 wants, acts = to_want(wants, steered), to_force(acts, steered)
             wants = limit(wants, scratch.max_force[one + lane])
-            # a choice, not a factor of 0: a law may be infinite where the dead, what is held in place (by an infinite
-            # mass) and the lanes beyond the last agent lie
+            # Select, do not multiply by 0: a law may be infinite for dead agents, for agents of infinite mass (held in
+            # place) and in the lanes beyond the last agent.
             here = (scratch.living[live + lane] > o[0]) & (scratch.mass[one + lane] < like(o[0], np.inf))
             share = like(o[0], 1.0) / scratch.mass[one + lane]
             put(out, to + lane, select(here, scale(add(wants, acts), share), o))

@@ -1,4 +1,4 @@
-"""Agents as the laws of one agent see them: records put together from the scratch of a world."""
+"""Agents as the laws of one agent see them: records assembled from the scratch of a world."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ __all__ = ["AgentPlan", "agent_plan", "alone_of", "inner_of", "still"]
 
 
 class AgentPlan(NamedTuple):
-    """What of an agent there is to be known."""
+    """Which fields of an agent the laws of a scene need."""
 
     dimension: int
     width: int
-    oriented: bool = False  # does it keep a heading of its own?
-    aims: bool = False  # does any effect say where it wants to go?
-    paced: bool = False  # does any law ask how fast it would like to go?
-    inner: tuple[str, ...] = ()  # names of what goes on inside it
+    oriented: bool = False  # True if it keeps a heading of its own
+    aims: bool = False  # True if any effect has an aim law: a desired direction
+    paced: bool = False  # True if any law reads the desired speed
+    inner: tuple[str, ...] = ()  # names of its inner states
 
 
 def agent_plan(parts: Parts) -> AgentPlan:
@@ -39,7 +39,7 @@ def agent_plan(parts: Parts) -> AgentPlan:
 def alone_of(plan: AgentPlan) -> Callable[..., Me]:
     """Make `alone(scratch, drawn, time, place, i, one, x, v, medium)`: agent i as the laws of one agent see it.
 
-    It lies at `place` in arrays of vectors, its body at `one`. It has no tie: that is for pairs in one place.
+    Its vectors lie at `place`, its body at `one`. Its tie is 0: only pairs in the same position need one.
     """
     vector, inner = vector_of_lane(plan.dimension, plan.width), inner_of(plan.inner)
     oriented, aims, paced = plan.oriented, plan.aims, plan.paced
@@ -71,7 +71,7 @@ def alone_of(plan: AgentPlan) -> Callable[..., Me]:
 
 @law
 def still(me: Me) -> Me:
-    """Return an agent as it is at rest: what of a drag is left for a method that treats the rest of it by itself."""
+    """Return an agent at rest: what its law gives then is left for a method that integrates linear drag by itself."""
     o = zero(me.pos)
     mass, radius, max_speed, max_force = me.mass, me.radius, me.max_speed, me.max_force
     return Me(
@@ -82,7 +82,7 @@ def still(me: Me) -> Me:
 
 @section
 def inner_of(names: tuple[str, ...]) -> Callable[..., Any]:
-    """Make `inner(scratch, i)`: what goes on inside agent i, by name."""
+    """Make `inner(scratch, i)`: the inner states of agent i, by name."""
     if not names:
         return lambda scratch, i: ()
     kind, values = record(names), tuple_from(*map(_inner_number, range(len(names))))

@@ -1,9 +1,8 @@
 """Blocks: agents side by side, as many as a vector register holds.
 
-An array of vectors has, one after the other, the first coordinates of the agents of a block, their second ones, their
-third ones, and then the next block; an array of numbers has those of one block after those of another. Indices are
-counted without a sign: of a signed one numba asks whether it counts from the end, and the loop over the lanes would
-stay scalar.
+An array of vectors holds the first coordinates of the agents of a block, then their second ones, then their third ones,
+and then the next block; an array of numbers holds one block after another. Indices are unsigned: for a signed index
+numba checks whether it counts from the end, and the loop over the lanes would stay scalar.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ __all__ = [
 
 @section
 def vector_of_lane(dimension: int, width: int) -> Callable[..., Vec]:
-    """Make `vector(blocks, place)`: the vector whose first coordinate lies at `place` of an array of blocks."""
+    """Make `vector(blocks, place)`: return the vector whose first coordinate lies at `place` of an array of blocks."""
     one, two = np.uint64(width), np.uint64(2 * width)
 
     def vector(blocks: Any, place: Any) -> Any:
@@ -52,9 +51,10 @@ def put_vector_of(dimension: int, width: int) -> Callable[..., None]:
 
 @section
 def common_places(dimension: int, width: int, masked: bool) -> Callable[..., tuple[Any, Any, Any]]:
-    """Make `common(scratch, n, present, block)`: where a block has its bodies, lives and wants.
+    """Make `common(scratch, n, present, block)`: return where the bodies, `living` and `want` of a block begin.
 
-    In a large world what all agents have in common is read where the first block has it: large worlds wait for memory.
+    In a large world numbers that all agents share are read from the first block, because large worlds are limited by
+    memory bandwidth.
     """
     size, lanes = np.uint64(dimension * width), np.uint64(width)
 
@@ -70,7 +70,7 @@ def common_places(dimension: int, width: int, masked: bool) -> Callable[..., tup
 
 @section
 def vector_of(dimension: int) -> Callable[..., Vec]:
-    """Make `vector(array, b, m)`: the vector at [:, b, m] of an array, as the centre of circle m of world b."""
+    """Make `vector(array, b, m)`: return the vector at [:, b, m] of an array, as the centre of circle m of world b."""
 
     def vector(array: Any, b: Any, m: Any) -> Any:
         if dimension == 2:
@@ -82,7 +82,7 @@ def vector_of(dimension: int) -> Callable[..., Vec]:
 
 @section
 def place_of(rows: int, width: int) -> Callable[[Any], Any]:
-    """Make `place(i)`: where the first of `rows` numbers of agent i lies in an array of blocks."""
+    """Make `place(i)`: return where the first of `rows` numbers of agent i lies in an array of blocks."""
     whole, lanes = np.uint64(rows * width), np.uint64(width)
 
     def place(i: Any) -> Any:
@@ -114,7 +114,7 @@ def into_blocks(dimension: int, width: int) -> Callable[..., None]:
 
 @section
 def out_of_blocks(dimension: int, width: int) -> Callable[..., None]:
-    """Make `out_of_blocks(blocks, array, b, n, first, end)`: array[:, b] = blocks, the other way round."""
+    """Make `out_of_blocks(blocks, array, b, n, first, end)`: array[:, b] = blocks, the inverse of `into_blocks`."""
     size = dimension * width
 
     def out(blocks: Any, array: Any, b: Any, n: Any, first: Any, end: Any) -> None:
@@ -134,7 +134,7 @@ def out_of_blocks(dimension: int, width: int) -> Callable[..., None]:
 def handed_of(inner: bool) -> Callable[..., Any]:
     """Make `handed(scratch, pos, vel)`: a tuple of arrays, positions, velocities and, if any, inner states.
 
-    Behind them the arrays of scratch are counted on, see `gather.picked`.
+    The indices of the arrays of scratch follow on from theirs, see `lane_access.picked`.
     """
     if inner:
         return lambda scratch, pos, vel: (pos, vel) + scratch.inner  # noqa: RUF005  # numba adds tuples, and unpacks none

@@ -1,8 +1,8 @@
-"""Bonds: each agent gathers what acts on it through the bonds that it is in, block after block, lane beside lane.
+"""Bonds: each agent gathers the forces of its own bonds, block by block, lane beside lane.
 
-A table has, for each block of agents, as many slots as its most bonded agent has bonds; in a slot each lane has the
-places of its partners and the numbers of its bond, or its own place and zeros (`pack`). So no thread writes what is
-another's, and sums are the same for any number of threads.
+A table has, for each block of agents, as many slots as the agent with the most bonds has. In a slot each lane has the
+places of its partners and the numbers of its bond, or its own place and zeros (`pack`). So no thread writes to the
+agent of another, and sums are the same for any number of threads.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Table(NamedTuple):
 
 
 def pack(parts: Parts, agents: int, groups: Sequence[object]) -> Table:
-    """Return the table of a scene of so many agents; ValueError, naming the effect, if bonds do not suit it."""
+    """Return the table of a scene of `agents` agents; raise ValueError, naming the effect, if its bonds are invalid."""
     w, d = parts.width, parts.dimension
     blocks = -(-agents // w)
     places, numbers, starts, bases = [], [], [], []
@@ -46,7 +46,7 @@ def pack(parts: Parts, agents: int, groups: Sequence[object]) -> Table:
         try:
             found = effect.bonds(groups, d)
         except ValueError as error:
-            listed = k - sum(wish < k for wish in parts.wishes)  # those lie before the effect that reconciles them
+            listed = k - sum(wish < k for wish in parts.wishes)  # the effects listed before the one that combines them
             raise ValueError(f"effects[{listed}].{error}") from None
         start, place, number = _packed(found, agents, blocks, w, d)
         starts.append(start)
@@ -84,13 +84,13 @@ def _packed(
     return start.astype(np.int64), places, numbers
 
 
-# --- met by a kernel --------------------------------------------------------------------------------------------------
+# --- in a kernel ------------------------------------------------------------------------------------------------------
 
 
 class BondLaw(NamedTuple):
     """A law of bonds."""
 
-    k: int  # which effect it is of
+    k: int  # index of its effect
     law: Law
     partners: int
     numbers: int
@@ -102,9 +102,9 @@ class BondPlan(NamedTuple):
     agent: AgentPlan
     offset_to: Law
     laws: tuple[BondLaw, ...]  # in the order of the table
-    sums: int  # where in the scratch of lanes the sums of a block begin
-    waits: bool  # has nothing waited yet until all threads have written their positions?
-    adds: bool  # is something in `pulled` already?
+    sums: int  # where the sums of a block begin in the scratch of lanes
+    waits: bool  # True if no earlier phase has waited until all threads have written their positions
+    adds: bool  # True if `pulled` already holds forces of far laws
 
 
 def bond_plan(parts: Parts, agent: AgentPlan) -> BondPlan:
@@ -117,7 +117,7 @@ def bond_plan(parts: Parts, agent: AgentPlan) -> BondPlan:
 
 @section
 def bonds_of(plan: BondPlan) -> Callable[..., None]:
-    """Make `bonds(context, pos, vel, time)`: write what bonds do to this thread's agents, N, into `pulled`."""
+    """Make `bonds(context, pos, vel, time)`: write the forces of bonds on this thread's agents, N, into `pulled`."""
     add = _add_bonds(plan, len(plan.laws) - 1)
     waits, adds = plan.waits, plan.adds
     count, sums = plan.agent.dimension * plan.agent.width, np.uint64(plan.sums)
@@ -126,7 +126,7 @@ def bonds_of(plan: BondPlan) -> Callable[..., None]:
         scratch, numbers, key, n = context.scratch, context.numbers, context.key[context.b], context.n
         sync, team, lanes, pulled = scratch.sync, context.team, scratch.lanes, scratch.pulled
         if waits:
-            wait_for_team(sync, team)  # the positions are those of all threads
+            wait_for_team(sync, team)  # all threads have written their positions now
         for block in range(np.uint64(context.first), np.uint64(context.end)):
             base = block * np.uint64(count)
             for place in range(np.uint64(count)):
@@ -134,16 +134,16 @@ def bonds_of(plan: BondPlan) -> Callable[..., None]:
             add(scratch, numbers.effects, numbers.size, pos, vel, time, key, n, block)
             for place in range(np.uint64(count)):
                 pulled[base + place] = lanes[sums + place]
-        wait_for_team(sync, team)  # no agent moves before all have looked
+        wait_for_team(sync, team)  # no agent moves before all threads have read positions
 
     return bonds
 
 
 @section
 def _add_bonds(plan: BondPlan, place: int) -> Callable[..., None]:
-    """Make `add(scratch, effects, size, pos, vel, time, key, n, block)`: add what bonds say to a block's sums.
+    """Make `add(scratch, effects, size, pos, vel, time, key, n, block)`: add bond forces to the sums of a block.
 
-    Those of an effect, by its place in the table, and of all before it.
+    Those of the effect at `place` in the table, and of all effects before it.
     """
     before = _add_bonds(plan, place - 1) if place else None
     k, law, partners, numbers = plan.laws[place]
@@ -171,8 +171,9 @@ def _add_bonds(plan: BondPlan, place: int) -> Callable[..., None]:
                 me = alone(scratch, key, time, at, i, i, x, v, zero(x))
                 others = partners_of(kept, placed, pos, vel, scratch.radius, scratch.mass, size, x, places + lane)
                 says = law(effects[k], me, others, gather(numbered, first + lane, of_bond))
-                whole = are_alive(placed, living, places + lane)  # the dead hold no agent
-                # of a sum of products each form of the loop would fuse another one, and bits depend on the processor
+                whole = are_alive(placed, living, places + lane)  # a bond with a dead partner exerts no force
+                # exact_sum: each form of the loop would fuse the products differently, and bits would depend on the
+                # processor
                 lanes[sum_x + lane] = exact_sum(lanes[sum_x + lane], says[0] if whole else like(x[0], -0.0))
                 lanes[sum_y + lane] = exact_sum(lanes[sum_y + lane], says[1] if whole else like(x[0], -0.0))
                 if dimension == 3:
@@ -183,9 +184,9 @@ def _add_bonds(plan: BondPlan, place: int) -> Callable[..., None]:
 
 @section
 def _partners(plan: BondPlan, count: int) -> Callable[..., tuple[Other, ...]]:
-    """Make `partners(kept, placed, pos, vel, radius, mass, size, x, place)`: those in a bond with an agent at x.
+    """Make `partners(kept, placed, pos, vel, radius, mass, size, x, place)`: the partners in a bond of an agent at x.
 
-    place: where `placed` holds the place of the first. kept: scratch, if agents keep numbers inside; else nothing.
+    place: where `placed` holds the place of the first. kept: scratch if agents have inner states, else an empty tuple.
     """
     before, behind = _partners(plan, count - 1) if count > 1 else None, np.uint64((count - 1) * plan.agent.width)
     vector, inner, offset_to = vector_of_lane(*plan.agent[:2]), inner_of(plan.agent.inner), plan.offset_to
@@ -207,7 +208,7 @@ def _partners(plan: BondPlan, count: int) -> Callable[..., tuple[Other, ...]]:
 
 @section
 def _are_alive(dimension: int, width: int, count: int) -> Callable[..., bool]:
-    """Make `are_alive(places, living, place)`: are all partners of a bond alive?"""
+    """Make `are_alive(places, living, place)`: return True if all partners of a bond are alive."""
     before, behind = _are_alive(dimension, width, count - 1) if count > 1 else None, np.uint64((count - 1) * width)
     lanes, size = np.uint64(width), np.uint64(dimension * width)
 

@@ -1,4 +1,4 @@
-"""What kernels are handed: the worlds of a state, and one world in progress as a step sees it."""
+"""What kernels are passed: the worlds of a state, and one world in progress as a step sees it."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ __all__ = ["Context", "Worlds", "worlds_of"]
 
 
 class Worlds(NamedTuple):
-    """The arrays of a state. B worlds, N agents, D axes, M obstacles; those of a task have more behind these."""
+    """The arrays of a state. B worlds, N agents, D axes, M obstacles; worlds of a task have more fields."""
 
     x: Any  # (D, B, N) m
     v: Any  # (D, B, N) m/s
-    carried: Any  # a tuple of arrays: frames and inner states, if there are some
+    carried: Any  # a tuple of arrays: frames and inner states, if there are any
     alive: Any  # (B, N)
     tick: Any  # (B,) steps since the start
-    key: Any  # (B,) of random numbers
+    key: Any  # (B,) key of random numbers
     obstacle_x: Any  # (D, B, M) m
     obstacle_radius: Any  # (B, M) m
     work: Any  # (B, W) counters
@@ -37,15 +37,15 @@ class Context(NamedTuple):
     obstacle_x: Any  # (D, B, M) m
     obstacle_radius: Any  # (B, M) m
     work: Any  # (B, W) counters
-    params: Any  # the numbers of the scene in one row, with its tables behind them
-    numbers: Any  # the same by name: numbers.Numbers
-    key: Any  # (B,) of random numbers
-    b: Any  # which world
-    n: Any  # how many agents
-    present: Any  # how many of them are alive
-    arranged: Any  # do they lie by tiles, and not by number?
+    params: Any  # the numbers of the scene in one row, followed by its tables
+    numbers: Any  # the same by name: parameters.Numbers
+    key: Any  # (B,) key of random numbers
+    b: Any  # index of the world
+    n: Any  # number of agents
+    present: Any  # number of agents alive
+    arranged: Any  # True if agents lie by tile, not by number
     first: Any  # this thread's blocks: [first, end)
     end: Any
-    rank: Any  # which thread of the team that steps this world
-    team: Any  # how many those are
+    rank: Any  # index of this thread in the team that steps this world
+    team: Any  # number of threads in the team
     scratch: Any  # a record of arrays, see scratch.py

@@ -1,6 +1,6 @@
-"""The entry points of a scene: `step` its worlds, `begin` what goes on inside its agents, and its `field`.
+"""The entry points of a scene: `step` its worlds, `begin` the inner states of its agents, compute its `field`.
 
-Each is a function of what the scene is made of (`Parts`); its machine code is kept, see `section.entry_of`.
+Each is a function of the scene's `Parts`; its machine code is cached, see `section.entry_of`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def step_of(parts: Parts) -> Callable[..., tuple[int, int]]:
 
 
 def _title(parts: Parts) -> str:
-    """Return what a kernel is of: this is shown while it is compiled."""
+    """Return a description of a kernel, which is shown while it is compiled."""
     effects = ", ".join(type(e).__name__ for e in parts.effects) or "no effects"
     return f"{parts.dimension}-D {parts.space.kind}; {effects}"
 
@@ -43,8 +43,8 @@ def _title(parts: Parts) -> str:
 def _scene_step(plan: StepPlan) -> Callable[..., tuple[int, int]]:
     """Make `scene_step`: advance worlds [from_world, to_world) by `count` steps.
 
-    It returns (world, agent) not finite first, or -1s. drive (D, B, N), or (D, 0, N) for none. A team of several
-    threads calls this with the same worlds, each with its rank.
+    It returns the first (world, agent) that is not finite, or (-1, -1). drive is (D, B, N), or (D, 0, N) if there is
+    none. A team of several threads calls this with the same worlds, each thread with its rank.
     """
     step_world = step_world_of(plan)
 
@@ -54,7 +54,7 @@ def _scene_step(plan: StepPlan) -> Callable[..., tuple[int, int]]:
     ) -> tuple[int, int]:  # fmt: skip
         unaliased()
         broken, agent = -1, -1
-        for b in range(from_world, to_world):  # no choice in here: LLVM would copy the step for each of its outcomes
+        for b in range(from_world, to_world):  # no branch in here: LLVM would copy the step for each of its outcomes
             bad = step_world(worlds, drive, b, params, dt, count, b, rank, team, scratch)
             if bad >= 0 and broken < 0:
                 broken, agent = b, bad
@@ -64,23 +64,23 @@ def _scene_step(plan: StepPlan) -> Callable[..., tuple[int, int]]:
 
 
 class BeginPlan(NamedTuple):
-    """What beginning what goes on inside agents depends on."""
+    """What initialising the inner states of agents depends on."""
 
     inner: InnerPlan
     numbers: NumberPlan
 
 
 def begin_plan(parts: Parts) -> BeginPlan | None:
-    """Return the plan of a scene; None if nothing goes on inside its agents."""
+    """Return the plan of a scene; None if its agents have no inner states."""
     inner = inner_plan(parts)
     return BeginPlan(inner, parts.number_plan) if inner is not None else None
 
 
 @section
 def begin_inner_of(plan: BeginPlan) -> Callable[..., None]:
-    """Make `begin_inner(worlds, params, dt, fresh, b, scratch)`: write what goes on inside the agents that are `fresh`.
+    """Make `begin_inner(worlds, params, dt, fresh, b, scratch)`: write the initial inner states of `fresh` agents.
 
-    Those of world b, at the instant of the world; fresh (B, N).
+    Those of world b, at its current time; fresh (B, N).
     """
     agent, d, width = plan.inner.agent, plan.inner.agent.dimension, plan.inner.agent.width
     alone, vector, read = alone_of(agent._replace(aims=False)), vector_of_lane(d, width), numbers_of(plan.numbers)
@@ -129,7 +129,7 @@ def begin_of(parts: Parts) -> Callable[..., None]:
 
 @entry_of
 def _scene_begin(plan: BeginPlan) -> Callable[..., None]:
-    """Make `scene_begin`: write what goes on inside the agents of all worlds that are `fresh`, (B, N)."""
+    """Make `scene_begin`: write the initial inner states of the agents of all worlds that are `fresh`, (B, N)."""
     begin_inner = begin_inner_of(plan)
 
     def scene_begin(worlds: Any, params: Any, dt: float, fresh: Any, scratch: Any) -> None:
@@ -148,7 +148,7 @@ def field_of(parts: Parts) -> Callable[..., None]:
 
 @entry_of
 def _scene_field(plan: ResponsePlan, sensed: SensePlan, number_plan: NumberPlan) -> Callable[..., None]:
-    """Make `scene_field`: write accelerations at given instants, and the flow that carries agents if there is one.
+    """Make `scene_field`: write accelerations at given times, and the flow that carries agents if there is one.
 
     Of all worlds, (D, B, N); nothing moves.
     """

@@ -1,8 +1,8 @@
-"""Laws about all agents, however far: each agent meets all others, or groups of them where these are far away.
+"""Laws about all agents, however far: each agent interacts with all others, distant groups counting as one.
 
-Few agents, and many where an effect asks for exactness, are met one by one, lane beside lane (`_direct`); many others
-by blocks that walk through a tree (`_walk`, see flockenv.geometry.barnes_hut). Which of the two depends on the number
-of agents and the effect's opening alone. What it comes to is left in `pulled`, by agent, where bonds add to it.
+Where agents are few, or an effect requires exact sums, each agent interacts with each other one, lane beside lane
+(`_direct`); else blocks walk through a tree (`_walk`, see flockenv.geometry.barnes_hut). The choice depends only on the
+number of agents and the effect's opening. The sums are left in `pulled`, by agent, and bonds add to them.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ __all__ = ["FarPlan", "far_of", "far_plan"]
 class FarLaw(NamedTuple):
     """A law about all agents."""
 
-    k: int  # which effect it is of
+    k: int  # index of its effect
     law: Law
-    by_mass: bool  # does it count kilograms, not heads?
+    by_mass: bool  # True if it weighs by mass, kg, not by the number of agents
 
 
 class FarPlan(NamedTuple):
-    """What meeting all agents depends on."""
+    """What interacting with all agents depends on."""
 
     dimension: int
     width: int
-    sums: int  # where in the scratch of lanes the sums of a block begin
-    direct: tuple[FarLaw, ...]  # of these all agents are met one by one
-    treed: tuple[FarLaw, ...]  # of these groups of them as one
+    sums: int  # where the sums of a block begin in the scratch of lanes
+    direct: tuple[FarLaw, ...]  # laws that are evaluated for each agent
+    treed: tuple[FarLaw, ...]  # laws that are evaluated for nodes of a tree
 
 
 def far_plan(parts: Parts) -> FarPlan:
@@ -53,10 +53,10 @@ def far_plan(parts: Parts) -> FarPlan:
 
 @section
 def far_of(plan: FarPlan) -> Callable[..., None]:
-    """Make `far(context, pos, time)`: write what all others do to this thread's agents, N, into `pulled`.
+    """Make `far(context, pos, time)`: write the forces of all other agents on this thread's agents, N, into `pulled`.
 
-    It begins with a wait even where pairs have been met: the positions are those of all threads, and counts have been
-    read then.
+    It begins with a barrier even after pair laws: by then all threads have written their positions, and have read the
+    counts.
     """
     direct, walk = _direct(plan) if plan.direct else None, _walk(plan, plan.treed) if plan.treed else None
     width = plan.width
@@ -80,22 +80,22 @@ def far_of(plan: FarPlan) -> Callable[..., None]:
             share = present, rank, team
             met += walk(numbers.effects, numbers.size, tree, lanes, pulled, sync, scratch.tally, share, time, key)
         else:
-            wait_for_team(sync, team)  # no agent moves before all have looked
+            wait_for_team(sync, team)  # no agent moves before all threads have read positions
         if rank == 0:
             context.work[context.b, 2] += met
 
     return far
 
 
-# --- what is met ------------------------------------------------------------------------------------------------------
+# --- one interaction --------------------------------------------------------------------------------------------------
 
 
 @section
 def _meet(plan: FarPlan, laws: tuple[FarLaw, ...], in_tree: bool) -> Callable[..., None]:
-    """Make `meet(effects, lanes, lane, x, m, xj, heavy, time, key)`: add what is at xj to the sums of a lane.
+    """Make `meet(effects, lanes, lane, x, m, xj, heavy, time, key)`: add the effect of a mass at xj to a lane's sums.
 
-    The lane is that of an agent at x of mass m. `heavy` is the mass that is met, or in a tree the weight of a node.
-    Nothing is added by what is in the very same place, the agent itself above all: there is no direction.
+    The lane is that of an agent at x of mass m. `heavy` is the mass at xj, or in a tree the weight of a node. A mass at
+    exactly x adds nothing, because it has no direction: the agent itself above all.
     """
     before = _meet(plan, laws[:-1], in_tree) if laws[1:] else None
     k, law, by_mass = laws[-1]
@@ -110,7 +110,7 @@ def _meet(plan: FarPlan, laws: tuple[FarLaw, ...], in_tree: bool) -> Callable[..
         there = square > o
         me = Me(m, x, z, z, m, m, m, m, z, time, z, key, z, m, ())
         says = law(effects[k], me, Far(to, square, heavy if weighs else like(m, 1.0)))
-        lanes[first + lane] += says[0] if there else o  # a sum of a choice, see pairs
+        lanes[first + lane] += says[0] if there else o  # add a selected value, see lane_access.add_where
         lanes[second + lane] += says[1] if there else o
         if dimension == 3:
             lanes[third + lane] += says[2] if there else o
@@ -123,9 +123,9 @@ def _meet(plan: FarPlan, laws: tuple[FarLaw, ...], in_tree: bool) -> Callable[..
 
 @section
 def _direct(plan: FarPlan) -> Callable[..., None]:
-    """Make `direct(effects, pos, living, mass, lanes, pulled, blocks, n, time, key)`: blocks meet all agents alive.
+    """Make `direct(effects, pos, living, mass, lanes, pulled, blocks, n, time, key)`: sum over all living agents.
 
-    All laws at once; blocks: the first, and the end.
+    For all laws at once; blocks: the first, and the end.
     """
     dimension, width, sums = plan.dimension, plan.width, np.uint64(plan.sums)
     meet, vector, place = _meet(plan, plan.direct, False), vector_of_lane(dimension, width), place_of(dimension, width)
@@ -157,8 +157,8 @@ def _direct(plan: FarPlan) -> Callable[..., None]:
 def _walk(plan: FarPlan, laws: tuple[FarLaw, ...]) -> Callable[..., int]:
     """Make `walk(effects, size, tree, lanes, pulled, sync, tally, share, time, key)`: sorted blocks walk through trees.
 
-    There is a tree for each of some laws, one after the other: nodes weigh kilograms or heads. share: (agents alive,
-    rank, team), this thread's part of them. Returns, to rank 0, what all threads have met.
+    There is one tree for each of `laws`, one after another: nodes weigh kilograms or count agents. share: (agents
+    alive, rank, team), which gives this thread's blocks. Returns, on rank 0, the number of interactions of all threads.
     """
     before, adds = _walk(plan, laws[:-1]) if laws[1:] else None, bool(plan.direct or laws[1:])
     dimension, width, sums, (k, _, by_mass) = plan.dimension, plan.width, np.uint64(plan.sums), laws[-1]
@@ -176,7 +176,7 @@ def _walk(plan: FarPlan, laws: tuple[FarLaw, ...]) -> Callable[..., int]:
         (leaves, nodes, digits, near, places), (present, rank, team) = tree, share
         if rank == 0:
             weigh(leaves, present, width, size, by_mass, digits, nodes)
-        wait_for_team(sync, team)  # the tree is that of all threads
+        wait_for_team(sync, team)  # the tree is shared by all threads
         met, blocks, begin = 0, (present + width - 1) // width, rank * room
         for block in range(np.uint64(blocks * rank // team), np.uint64(blocks * (rank + 1) // team)):
             own: Any = np.int64(block)
@@ -197,7 +197,7 @@ def _walk(plan: FarPlan, laws: tuple[FarLaw, ...]) -> Callable[..., int]:
                         meet(effects, lanes, lane, x, m, xj, heavy, time, key)
             put(pulled, lanes, places, block * np.uint64(width), held)
         tally[rank] = met
-        wait_for_team(sync, team)  # what is pulled was written by other threads
+        wait_for_team(sync, team)  # `pulled` was written by other threads
         for r in range(team if rank == 0 else 0):
             total += tally[r]
         return total

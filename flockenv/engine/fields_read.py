@@ -13,7 +13,7 @@ from flockenv.physics.effects.effect import LAWS, Effect
 __all__ = ["OF_PAIRS", "names_read"]
 
 OF_PAIRS = ("pair_start", "pair_law", "apart_law", "finish_law")
-"""Those that are about a neighbour."""
+"""The slots of laws about a neighbour."""
 
 
 def names_read(effect: Effect, slots: Sequence[str]) -> set[str]:

@@ -1,6 +1,6 @@
-"""Laws about a group as one: its centre, its mean velocity and its farthest member are found once, for all agents.
+"""Laws about a group as one: its centre, mean velocity and farthest member are computed once, for all agents.
 
-Each thread finds them for itself: agents are met in the order of their numbers, so that they are the same bits for all.
+Each thread computes them for itself, over agents in the order of their numbers, so that all threads get the same bits.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ __all__ = ["GroupLaw", "GroupPlan", "find_groups_of", "group_plan", "members_of"
 
 
 class GroupLaw(NamedTuple):
-    """Where what is found for the law of an effect lies in the scratch of lanes."""
+    """Where the results for the law of an effect lie in the scratch of lanes."""
 
-    k: int  # which effect it is of
+    k: int  # index of its effect
     places: tuple[int, ...]  # of the count, the centre, the mean velocity, the farthest member
 
 
@@ -50,23 +50,23 @@ def group_plan(parts: Parts) -> GroupPlan:
 
 @section
 def find_groups_of(plan: GroupPlan) -> Callable[..., None]:
-    """Make `find_groups(context, pos, vel)`: find the groups that laws are about, at this instant."""
+    """Make `find_groups(context, pos, vel)`: compute the groups that laws are about, at this time."""
     find = in_turn(*(_find(plan, law) for law in plan.laws))
 
     def find_groups(context: Any, pos: Any, vel: Any) -> None:
         sync, team = context.scratch.sync, context.team
-        wait_for_team(sync, team)  # the positions are those of all threads
+        wait_for_team(sync, team)  # all threads have written their positions now
         find(context, pos, vel)
-        wait_for_team(sync, team)  # no agent moves before all threads have looked
+        wait_for_team(sync, team)  # no agent moves before all threads have read positions
 
     return find_groups
 
 
 @section
 def _find(plan: GroupPlan, law: GroupLaw) -> Callable[..., None]:
-    """Make `find(context, pos, vel)`: find the members of one group; an agent at no finite place is none of them.
+    """Make `find(context, pos, vel)`: compute one group from its living members whose position is finite.
 
-    Offsets are from the first member: on a torus, to the nearest image of each other.
+    Offsets are from the first member; on a torus each is that to the nearest image.
     """
     vector, place_in, offset_to = (
         vector_of_lane(plan.dimension, plan.width),

@@ -1,4 +1,4 @@
-"""Steps of a scene by a method that solves equations: who depends on whom, and how the kernel takes over what is found.
+"""Steps of a scene by an implicit method: which agents depend on which, and how the kernel takes over the solution.
 
 The method itself, and Newton's method, know nothing of scenes (flockenv.physics.integrators.implicit and newton).
 """
@@ -19,7 +19,7 @@ from flockenv.physics.integrators.newton import Coupling, Evaluate, NotSolvedErr
 __all__ = ["coupling_of", "solve_steps"]
 
 MOST_NUMBERS = 2**22
-"""Coordinates that are evaluated together; columns of a large matrix are taken in portions."""
+"""Coordinates that are evaluated together; the columns of a large matrix are evaluated in portions."""
 
 
 MOST_DENSE = 512
@@ -27,7 +27,7 @@ MOST_DENSE = 512
 
 
 def coupling_of(scene: SceneView) -> Coupling | None:
-    """Return who depends on whom; none if agents look around, and are too many for everybody to depend on everybody."""
+    """Return which agents depend on which; None if neighbours interact and a dense matrix would be too large."""
     if any(e.pair_law or e.far_law for e in scene.parts.effects):
         if scene.agents * scene.dimension > MOST_DENSE:
             return None
@@ -49,10 +49,10 @@ def solve_steps(
     steps: int,
     step: Callable[[State, int, Floats, Floats], tuple[int, int]],
 ) -> tuple[int, int, str]:
-    """Advance every world of a state in place; return the first (world, agent) not finite or not found, and why.
+    """Advance every world of a state in place; return the first (world, agent) that failed, and why.
 
-    `step(state, world, x, v)` lets the kernel take over positions and velocities (D, N): limits, the space, time. A
-    world that fails stays as it was.
+    A world fails if an agent is not finite or the equations are not solved; it then stays as it was. `step(state,
+    world, x, v)` passes positions and velocities (D, N) to the kernel, which applies limits, the space and the time.
     """
     method = scene.integrator
     assert isinstance(method, Implicit)
@@ -78,7 +78,7 @@ def _solved(
     scene: SceneView, method: Implicit, alone: State, evaluate: Evaluate,
     step: Callable[[State, int, Floats, Floats], tuple[int, int]],
 ) -> tuple[int, str]:  # fmt: skip
-    """Advance one world by one step; return the agent that is not finite or was not found, or -1, and what happened."""
+    """Advance one world by one step; return the agent that is not finite or was not solved, or -1, and the reason."""
     x, v = alone.x[:, 0].ravel(), alone.v[:, 0].ravel()
     try:
         found = method.solve(evaluate, x, v, float(alone.time[0]), scene.dt, scene.dimension, scene.coupling)
@@ -90,7 +90,7 @@ def _solved(
     alone.work[0, WORK.index("rejected_steps")] += found.rejected
     was = alone.x[:, 0], alone.v[:, 0]
     pos, vel = found.x.reshape(was[0].shape), found.v.reshape(was[0].shape)
-    held = np.isinf(scene.body.mass)  # who is held is that exactly, and not but for the rounding of a factorisation
+    held = np.isinf(scene.body.mass)  # held agents stay exactly, not but for the rounding of a factorisation
     vel[:, held] = was[1][:, held]
     if not scene.parts.flows:
         pos[:, held] = was[0][:, held] + scene.dt * vel[:, held]
@@ -106,7 +106,7 @@ def _put(state: State, b: int, alone: State) -> None:
 
 
 def _evaluation(scene: SceneView, alone: State, drive: Floats) -> Evaluate:
-    """Return the scene's law as Newton's method asks for it: many instants of one world are so many worlds."""
+    """Return the scene's law as Newton's method calls it: many points of one world become a batch of worlds."""
     d, n = scene.dimension, scene.agents
     portion = max(1, MOST_NUMBERS // (d * n))
 

@@ -1,8 +1,8 @@
 """Parts: which laws make up a scene, and what follows from that for its kernel.
 
-Which effects meet neighbours, in how many different ways they look around (`sights`), what is sorted of each agent
-(`fields`: only what some law reads), where each running number lies in the scratch of lanes (`slots`), and the numbers
-that the kernel is given (`parameters`). Plans of sections are made from parts, and scratch is allocated for them.
+Which effects interact with neighbours, through how many different `sights`, what is sorted of each agent (`fields`:
+only what some law reads), where each running number lies in the scratch of lanes (`slots`), and the numbers that the
+kernel is passed (`parameters`). Plans of sections are made from parts, and scratch is allocated for them.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ __all__ = ["Look", "Parts", "flattened"]
 
 
 class Look(NamedTuple):
-    """What is near every agent, for observations and rewards: the nearest few, all around."""
+    """The query for what is near every agent, for observations and rewards: the nearest few, in all directions."""
 
     radius: float  # m
-    agents: int = 0  # so many of the nearest agents
-    obstacles: int = 0  # so many of the obstacles whose surface is nearest
+    agents: int = 0  # number of nearest agents
+    obstacles: int = 0  # number of obstacles with the nearest surfaces
 
 
 @dataclass(frozen=True)
@@ -45,15 +45,15 @@ class Parts(MetObstacles):
     dimension: int
     space: Space
     effects: tuple[Effect, ...]
-    """As `flattened` lists them: behaviours whose wishes are reconciled lie before the effect that does it."""
+    """In the order of `flattened`: behaviours lie before the effect that combines their forces."""
     integrator: Integrator
     dtype: str = "float64"
     sorts: bool = True
     """True if there are enough agents to sort them by cell; a smaller scene has no code for it."""
     look: Look | None = None
-    """What a task shows its agents, found by the same query."""
+    """What a task's query finds for its agents, with the same cell list."""
     crowded: bool = False
-    """True if there are enough agents for groups of them to be met as one, where they are far away."""
+    """True if there are enough agents for distant groups of them to be treated as one."""
     oriented: bool = False
     """True if agents keep a heading (and an up vector) of their own."""
     turns: bool = False
@@ -61,34 +61,34 @@ class Parts(MetObstacles):
     leans: bool = False
     """True if some agents lean into their turns."""
     starts: tuple[int, ...] = ()
-    """The first agent of each group, and one more: numbers alone, code does not depend on them."""
+    """The first agent of each group, and N: values only, code does not depend on them."""
     shapes: tuple[Any, ...] = field(default=(), compare=False)
     """Obstacles that are not in the state: code depends on their forms, and on whether any of them moves."""
     circles: int = 0
-    """How many obstacles come before them."""
+    """Number of obstacles that come before them: circles of the state."""
     stepped: bool = True
-    """True if steps are made; else accelerations are asked for, also of agents at no finite place."""
+    """True if steps are made; else accelerations are computed, also of agents whose position is not finite."""
     touching: float = field(default=math.inf, compare=False)
-    """m, the radii of the two that are widest, and a little more: agents further apart than that do not touch."""
+    """m, slightly more than the sum of the two largest radii: agents further apart do not touch."""
     tables: tuple[NDArray[np.float64], ...] = field(default=(), compare=False)
-    """What the laws of each tabled effect look up, in order: numbers alone, too."""
+    """The lookup table of each tabled effect, in order: also values only."""
 
     @functools.cached_property
     def width(self) -> int:
         """Lanes of a block: agents that one vector register holds.
 
-        Where laws meet all agents, sixteen on any processor: a tree is made of blocks, so results follow from it.
+        With far laws it is 16 on any processor: a tree is made of blocks, so results depend on the width.
         """
         return 16 if self.far else cpu.REGISTER // self.itemsize
 
     @property
     def masks(self) -> bool:
-        """True if what was compared is kept in masks, beside the registers: it costs nothing to compare once more."""
+        """True if comparisons yield mask registers (AVX-512): repeating a comparison then costs nothing."""
         return cpu.REGISTER == LINE
 
     @property
     def keyed(self) -> bool:
-        """True if lists of the nearest are kept as keys; see sweep/look."""
+        """True if lists of the nearest agents are kept as keys; see query_keys."""
         return self.look is not None and self.look.agents > 1 and not self.sorts and self.itemsize == 4
 
     @property
@@ -98,27 +98,27 @@ class Parts(MetObstacles):
 
     @functools.cached_property
     def pairs(self) -> list[tuple[int, Effect]]:
-        """The effects with a pair law, and their numbers."""
+        """The effects with a pair law, and their indices."""
         return [(k, e) for k, e in enumerate(self.effects) if e.pair_law is not None]
 
     @functools.cached_property
     def bonded(self) -> list[tuple[int, Effect]]:
-        """The effects with a law of bonds, and their numbers."""
+        """The effects with a law of bonds, and their indices."""
         return [(k, e) for k, e in enumerate(self.effects) if e.bond_law is not None]
 
     @functools.cached_property
     def grouped(self) -> list[tuple[int, Effect]]:
-        """The effects with a law about a group as one, and their numbers."""
+        """The effects with a law about a group as one, and their indices."""
         return [(k, e) for k, e in enumerate(self.effects) if e.group_law is not None]
 
     @functools.cached_property
     def far(self) -> list[tuple[int, Effect]]:
-        """The effects with a law about all agents, and their numbers."""
+        """The effects with a law about all agents, and their indices."""
         return [(k, e) for k, e in enumerate(self.effects) if e.far_law is not None]
 
     @functools.cached_property
     def treed(self) -> list[tuple[int, Effect]]:
-        """Those of them that meet groups as one."""
+        """Those of `far` that treat distant groups as one."""
         return [(k, e) for k, e in self.far if self.crowded and e.parameters()["opening"] != 0]
 
     @property
@@ -133,20 +133,21 @@ class Parts(MetObstacles):
 
     @functools.cached_property
     def sights(self) -> list[Sight]:
-        """The different ways in which pair laws look around; laws that see the same share the test."""
+        """The different sights of pair laws; laws with the same sight share the test."""
         return list(dict.fromkeys(self.sight_of(e) for _, e in self.pairs))
 
     def sight_of(self, effect: Effect) -> Sight:
-        """Return which agents the pair law of an effect sees: of contacts, those that can touch."""
+        """Return which agents the pair law of an effect sees: a contact law, only those that can touch."""
         sight = effect.sight
         assert sight is not None, f"{type(effect).__name__} has a pair law and no sight"
         return sight._replace(radius=min(sight.radius, self.touching)) if effect.contact else sight
 
     @functools.cached_property
     def parting(self) -> bool:
-        """True if agents in one place are met by themselves, if there are any, and all others without looking at ties.
+        """True if agents in the same position are handled in a pass of their own, and all others without reading ties.
 
-        Where every law that reads ties has another for those elsewhere, and all that is told is added up.
+        This requires that every law that reads ties has an `apart_law` for agents elsewhere, and that all pair laws are
+        sums.
         """
         readers = [e for _, e in self.pairs if "tie" in names_read(e, OF_PAIRS)]
         sums = not any(e.pair_start or e.contact for _, e in self.pairs)
@@ -155,37 +156,38 @@ class Parts(MetObstacles):
 
     @property
     def looks_ahead(self) -> bool:
-        """True if it is worked out how far the next candidate is while one is met, so that more is under way at a time.
+        """True if the distance of the next candidate is computed early, so that more operations are in flight.
 
-        In small scenes, where a block meets all candidates in a row, of several laws, where there are registers enough.
+        In small scenes, where a block visits all candidates in a row, with several pair laws, and with registers
+        enough.
         """
         return self.parting and self.masks and not self.sorts and self.dimension == 2 and len(self.pairs) > 1
 
     @property
     def trusts(self) -> bool:
-        """True if every agent is at a finite place whenever forces are asked for, unless a step has failed already.
+        """True if every agent has a finite position whenever forces are computed, unless a step has failed already.
 
-        Where steps ask once each. Then laws that vanish are not asked whom they are about. 0 times a way that is NaN is
-        NaN, so an agent that meets one at NaN is at NaN after that step, too: which was the first is looked for step by
-        step (`step_world`).
+        This holds if a step computes forces once. Then a law that vanishes at a distance needs no mask. 0 times a NaN
+        offset is NaN, so a neighbour at NaN sends an agent to NaN in that step; `step_world` records step by step which
+        agent was first.
         """
         return self.stepped and self.one_stage
 
     @property
     def spreads(self) -> bool:
-        """True if NaN spreads at once to all agents that meet the one that has it."""
+        """True if a NaN position reaches every neighbour within one step."""
         return self.trusts and (bool(self.grouped) or any(effect.vanishes for effect in self.effects))
 
     @functools.cached_property
     def averaged(self) -> list[int]:
-        """The sights of which agents in sight are counted (not of contacts: few candidates are asked for those)."""
+        """The sights whose agents are counted (not of contact laws: these are evaluated for few candidates)."""
         if any(effect.averages and effect.contact for effect in self.effects):
             raise TypeError("an effect with `contact` counts no agents: it cannot have `averages`")
         return sorted({self.sights.index(self.sight_of(e)) for _, e in self.pairs if e.averages})
 
     @property
     def reach(self) -> float:
-        """The largest distance at which any law looks for neighbours, m."""
+        """The largest radius within which any law looks for neighbours, m."""
         return max((sight.radius for sight in self.sights), default=0.0)
 
     @functools.cached_property
@@ -193,7 +195,7 @@ class Parts(MetObstacles):
         return pack_numbers(self)
 
     def parameters(self) -> list[float]:
-        """Every number that the kernel is given; tables come behind."""
+        """Every number that the kernel is passed; tables follow."""
         return self._numbers[0]
 
     @property
@@ -203,58 +205,58 @@ class Parts(MetObstacles):
 
     @property
     def count(self) -> int:
-        """How many numbers the kernel is handed."""
+        """How many numbers the kernel is passed."""
         return len(self.parameters()) + sum(map(len, self.tables))
 
     def given(self) -> NDArray[Any]:
-        """Return `parameters()` and the tables behind them, in the scene's precision: what the kernel is handed."""
+        """Return `parameters()` and the tables behind them, in the scene's precision, as the kernel is passed them."""
         every: list[Any] = [self.parameters(), self.shaped[0], *self.cells.values(), *self.tables]
         return np.concatenate(every).astype(self.dtype)
 
     def numbers_of(self, effect: Effect) -> dict[str, Any]:
-        """Return the numbers and vectors that the laws of an effect are given, by name."""
+        """Return the numbers and vectors that the laws of an effect are passed, by name."""
         return {**effect.parameters(), **effect.members(self.starts)}
 
     def names_of(self, effect: Effect) -> list[str]:
-        """Return the names under which the laws of an effect find what they are given."""
+        """Return the field names of the record that the laws of an effect are passed."""
         more = ["table"] * effect.tabled + ["counted"] * (effect.count_law is not None)
         return [*self.numbers_of(effect), *more]
 
     @functools.cached_property
     def wishes(self) -> dict[int, int]:
-        """Which effects only wish, and the number of the one that reconciles their wishes."""
+        """The behaviours whose forces another effect combines, each with the index of that effect."""
         found: dict[int, int] = {}
         for k, effect in enumerate(self.effects):
             found |= dict.fromkeys(range(k - len(effect.wishes), k), k)
         return found
 
     def target(self, k: int) -> str:
-        """Return what effect k adds to: a wish of its own, what agents want, or what acts on them."""
+        """Return what effect k adds to: a behaviour's own force, the steering force, or the external force."""
         return f"w{k}_" if k in self.wishes else "s" if self.effects[k].steering else "f"
 
     def pair_target(self, k: int) -> str:
-        """Return what the pair law of effect k adds to: the same, or what its fold over the obstacles is told."""
+        """Return what the pair law of effect k adds to: as `target`, or an input of its obstacle fold or keep law."""
         effect = self.effects[k]
         return f"n{k}_" if effect.obstacle_start is not None or effect.keep_law is not None else self.target(k)
 
     @functools.cached_property
     def inner(self) -> tuple[str, ...]:
-        """Names of what goes on inside every agent: all that some effect keeps."""
+        """Names of the inner states of every agent: all that some effect keeps."""
         return tuple(dict.fromkeys(name for effect in self.effects for name in effect.keeps))
 
     @property
     def keeping(self) -> list[tuple[int, Effect]]:
-        """The effects that keep some of it, and their numbers."""
+        """The effects that keep inner states, and their indices."""
         return [(k, e) for k, e in enumerate(self.effects) if e.keeps]
 
     @property
     def counters(self) -> int:
-        """How many counters all effects have; they lie in the scratch `counters`."""
+        """How many counters all effects have; they lie in the scratch array `counters`."""
         return sum(effect.counters for effect in self.effects if effect.count_law)
 
     @property
     def aims(self) -> bool:
-        """True if some effect says where agents want to go."""
+        """True if some effect has an aim law: a desired direction."""
         return any(e.aim_law is not None for e in self.effects)
 
     @functools.cached_property
@@ -269,12 +271,12 @@ class Parts(MetObstacles):
 
     @property
     def sweeps(self) -> bool:
-        """True if neighbours are looked for."""
+        """True if any law or query looks for neighbours."""
         return bool(self.pairs) or (self.look is not None and self.look.agents > 0)
 
     @functools.cached_property
     def targets(self) -> list[str]:
-        """What pair laws add to: what agents want, what acts on them, wishes, what folds over obstacles are told."""
+        """What pair laws add to: steering force, external force, behaviour forces, inputs of folds and keep laws."""
         found = {self.pair_target(k) for k, _ in self.pairs}
         names = ("s", "f", *(f"w{k}_" for k in self.wishes), *(f"n{k}_" for k, _ in self.pairs))
         return [name for name in names if name in found]
@@ -285,17 +287,20 @@ class Parts(MetObstacles):
         return self.dimension * len(self.targets) * self.width
 
     def felt_at(self, target: str) -> int:
-        """Return where among those what the pair laws came to for a target lies."""
+        """Return where in a block of `felt` the sum of pair laws for a target lies."""
         return self.targets.index(target) * self.dimension * self.width
 
     @property
     def one_stage(self) -> bool:
-        """True if the method asks once, and then moves every coordinate by itself."""
+        """True if the method evaluates accelerations once, and then advances every coordinate independently."""
         return isinstance(self.integrator, OneStage)
 
     @property
     def aside(self) -> int:
-        """Numbers of every agent that are put aside: accelerations, or where it was, and how fast if bodies bounce."""
+        """Numbers of every agent that are saved in `aside`.
+
+        For a method of one stage its acceleration; else its old position, and its old velocity if bodies bounce.
+        """
         return self.dimension * (2 if self.bounces and not self.one_stage else 1)
 
     @functools.cached_property
@@ -315,7 +320,7 @@ class Parts(MetObstacles):
 
     @functools.cached_property
     def sorted_fields(self) -> list[str]:
-        """Those of them that lie side by side in scratch, or in records: ties that are seldom looked at do not."""
+        """Those that lie side by side in scratch, or in records: rarely read ties do not."""
         seldom = self.sorts and self.parting
         return [name for name in self.fields if not (seldom and name[0] == "t")]
 
@@ -326,7 +331,7 @@ class Parts(MetObstacles):
 
     @property
     def rows(self) -> int:
-        """Rows of numbers of agents that are listed, or are the block's own, that scratch must have."""
+        """Rows that scratch needs for the numbers of listed agents, or of a block's own agents."""
         return max(len(self.sorted_fields) if self.pairs else 0, self.dimension if self.look else 0, 1)
 
     @property
@@ -337,44 +342,44 @@ class Parts(MetObstacles):
 
     @property
     def confines(self) -> bool:
-        """True if all agents are brought into a periodic box when a call begins, so that no query has to look after it.
+        """True if all agents are moved into a periodic box when a call begins, so that no query has to wrap them.
 
-        Only where accelerations are asked for at the frozen present: a stage of a method may lie outside.
+        Only if accelerations are evaluated once per step: a stage of a method may lie outside.
         """
         return self.space.periodic and self.arranges and self.one_stage
 
     @property
     def arranges(self) -> bool:
-        """True if agents of a large world may be put in order for a while.
+        """True if agents of a large world may be reordered by tile during a call.
 
-        Not where places matter: bonds know their partners by them, far laws and groups meet agents in their order.
+        Not if places matter: bonds refer to partners by place, and far laws and groups visit agents in their order.
         """
         return self.sorts and bool(self.pairs) and not self.pulls and not self.grouped
 
     @property
     def homely(self) -> bool:
-        """True if it is noted then which agents have left their tiles: where cells are the same in every step."""
+        """True if reordered agents that have left their tiles are tracked: if the grid is the same in every step."""
         return self.arranges and self.space.periodic
 
     @property
     def frame_vectors(self) -> list[str]:
-        """The vectors of an agent's frame: where it faces, and in space which way is up."""
+        """The vectors of an agent's frame: its heading, and in 3-D its up vector."""
         return ["facing", "above"][: self.dimension - 1] if self.oriented else []
 
     @property
     def frame_numbers(self) -> list[str]:
-        """More numbers of an agent's body, by `Body`'s names, which not every scene needs."""
+        """Further numbers of an agent's body, by `Body`'s names, which not every scene needs."""
         paced = "desired_speed" in self.read
         return ["max_turn_rate"] * self.turns + ["banking"] * self.leans + ["desired_speed"] * paced
 
     @property
     def frame_rows(self) -> int:
-        """Coordinates of the vectors of a frame: what a state keeps of each agent."""
+        """Coordinates of the vectors of a frame, which a state holds for each agent."""
         return self.dimension * len(self.frame_vectors)
 
     @property
     def luggage(self) -> list[str]:
-        """What of an agent is carried along then: an array, and the axis of a vector."""
+        """What of an agent moves when agents are reordered: an array, and the axis of a vector."""
         vectors = ["pos", "vel", "want", *self.frame_vectors, *(["tie"] if "t0" in self.sorted_fields else [])]
         vector = [f"{name} {k}" for name in vectors for k in range(self.dimension)]
         inner = (f"inner{k}" for k in range(len(self.inner)))
@@ -388,7 +393,7 @@ class Parts(MetObstacles):
 
     @functools.cached_property
     def slots(self) -> dict[str, int]:
-        """Where in the scratch of lanes each running number lies."""
+        """Where each running number lies in the scratch of lanes."""
         d, look = self.dimension, self.look or Look(0.0)
         runs = [(f"c{k}_", e.sums(d)) for k, e in self.pairs]
         runs += [(f"near{q}_", sight.nearest or 0) for q, sight in enumerate(self.sights)]
@@ -411,5 +416,5 @@ class Parts(MetObstacles):
 
 
 def flattened(effects: Sequence[Effect]) -> tuple[Effect, ...]:
-    """Return effects with their behaviours, if they have some, before them: each has laws and numbers of its own."""
+    """Return effects with the behaviours that each combines before it: each has laws and numbers of its own."""
     return tuple(each for effect in effects for each in (*effect.wishes, effect))

@@ -1,7 +1,8 @@
 """Reading and writing several numbers at once, at places that are constants of a plan.
 
 A section knows where the numbers of an agent lie: side by side in a record, or each in a row of its own. It holds those
-places as tuples of integers, and each function below becomes as many loads or stores, without a loop or a call.
+places as tuples of integers, and each function below compiles to one load or store per number, without a loop or a
+call.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ _WORD = ir.IntType(64)
 
 
 def _constants(numbers: Any, name: str) -> list[int]:
-    """Return the integers of a tuple that a function holds; numba tries again with them if it did not tell them."""
+    """Return the integers of a tuple that a function holds; numba retries with literals if they are not known yet."""
     if not all(isinstance(number, types.IntegerLiteral) for number in numbers):
         raise numba.TypingError(f"{name}: {numbers}, must be a tuple of integers that the function holds")
     return [int(number.literal_value) for number in numbers]
@@ -47,7 +48,7 @@ def _pointers(context: Any, builder: Any, kind: Any, array: Any, at: Any, places
 
 
 def _gather(typing_context: Any, array: Any, at: Any, places: Any) -> Any:
-    """Return the numbers of an array at some places behind `at`, a tuple; 0 where a place is less than 0."""
+    """Return the numbers of an array at some places behind `at`, as a tuple; 0 for a negative place."""
     wanted = _constants(places, "places")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -117,8 +118,8 @@ fill: Any = intrinsic_or_python(_fill, _fill_in_python)
 def _add_where(typing_context: Any, some: Any, array: Any, at: Any, places: Any, numbers: Any, nothing: Any) -> Any:
     """Add the numbers of a tuple to those of an array at some places behind `at` if `some`, else `nothing`, -0.
 
-    A sum of a choice: of a choice between sums LLVM makes a masked store, and the sum stays in memory. x + -0 is x for
-    every x, so this becomes one masked addition.
+    The sum takes a selected summand: from a selection between sums LLVM makes a masked store, and the sum stays in
+    memory. x + -0 is x for every x, so this becomes one masked addition.
     """
     wanted = _constants(places, "places")
 
@@ -158,7 +159,7 @@ chosen: Any = intrinsic_or_python(_chosen, lambda condition, numbers, others: nu
 
 
 def _picked(typing_context: Any, given: Any, more: Any, indices: Any) -> Any:
-    """Return some items of two tuples or records, counted through both, as a tuple."""
+    """Return a tuple of some items of two tuples or records; indices count through the first, then the second."""
     wanted, many = _constants(indices, "indices"), len(given)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -175,7 +176,7 @@ picked: Any = intrinsic_or_python(_picked, lambda given, more, indices: tuple((*
 
 
 def _places_each(typing_context: Any, starts: Any, which: Any, further: Any) -> Any:
-    """Return places, a tuple: `starts[which[k]] + further[k]`."""
+    """Return a tuple of places: `starts[which[k]] + further[k]`."""
     chosen_starts, offsets = _constants(which, "which"), _constants(further, "further")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -195,7 +196,7 @@ places_each: Any = intrinsic_or_python(_places_each, _places_in_python)
 
 
 def _gather_each(typing_context: Any, arrays: Any, starts: Any, which: Any, further: Any) -> Any:
-    """Return a number of each array, a tuple: that at `starts[which[k]] + further[k]` of array k."""
+    """Return a tuple with one number of each array: that at `starts[which[k]] + further[k]` of array k."""
     chosen_starts, offsets = _constants(which, "which"), _constants(further, "further")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -219,7 +220,7 @@ gather_each: Any = intrinsic_or_python(_gather_each, _gather_each_in_python)
 
 
 def _scatter_each(typing_context: Any, arrays: Any, starts: Any, which: Any, further: Any, numbers: Any) -> Any:
-    """Write a number of a tuple to each array: to `starts[which[k]] + further[k]` of array k."""
+    """Write one number of a tuple to each array: to `starts[which[k]] + further[k]` of array k."""
     chosen_starts, offsets = _constants(which, "which"), _constants(further, "further")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Laws of one agent, as kernels call them: with the numbers of their effects, and sums of what they say."""
+"""Laws of one agent, as kernels call them: with the numbers of their effects, and sums of their results."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["OneLaw", "given_of", "laws_of", "says_of", "sum_of"]
 class OneLaw(NamedTuple):
     """A law of one agent."""
 
-    k: int  # which effect it is of
+    k: int  # index of its effect
     law: Law
     images: Images | None = None
 
@@ -37,7 +37,10 @@ def laws_of(parts: Parts, slot: str) -> tuple[OneLaw, ...]:
 
 @functools.cache
 def given_of(k: int, images: Images | None) -> Callable[[Any, Any], Any]:
-    """Return a function `given(numbers, me)`: what the laws of effect k are given, with images nearest to the agent."""
+    """Return a function `given(numbers, me)`: what the laws of effect k are passed.
+
+    Points are replaced by their images nearest to the agent.
+    """
     if images is None:
         return kernel(lambda numbers, me: numbers.effects[k])
     nearest = images_of(images)
@@ -46,14 +49,14 @@ def given_of(k: int, images: Images | None) -> Callable[[Any, Any], Any]:
 
 @functools.cache
 def says_of(one: OneLaw) -> Callable[[Any, Any], Any]:
-    """Return a function `says(numbers, me)`: what a law says about an agent."""
+    """Return a function `says(numbers, me)`: the value of a law for an agent."""
     given, law = given_of(one.k, one.images), one.law
     return kernel(lambda numbers, me: law(given(numbers, me), me))
 
 
 @functools.cache
 def sum_of(indices: tuple[int, ...]) -> Callable[[Vec, Any], Vec]:
-    """Return a function `total(start, vectors)`: start plus some vectors of a tuple, one after the other."""
+    """Return a function `total(start, vectors)`: start plus some vectors of a tuple, added in order."""
     if not indices:
         return kernel(lambda start, vectors: start)
     before, last = sum_of(indices[:-1]), indices[-1]

@@ -1,4 +1,4 @@
-"""What the agents of a world carry comes into blocks when a call begins, and goes back when it ends."""
+"""Copying the data of a world's agents into blocks when a call begins, and back when it ends."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _write_number(number: int) -> Callable[..., None]:
 
 @section
 def _between(agent: AgentPlan, inwards: bool) -> Callable[..., None]:
-    """Make `bring(worlds, scratch, b, first, end)`: copy what these blocks of world b carry into scratch, or back."""
+    """Make `bring(worlds, scratch, b, first, end)`: copy these blocks of world b into scratch, or back."""
     d, width, oriented, inner = agent.dimension, agent.width, agent.oriented, len(agent.inner)
     copy, place = (into_blocks if inwards else out_of_blocks)(d, width), int(oriented)
     copy_numbers = in_turn(*map(_read_number if inwards else _write_number, range(inner)))
@@ -55,18 +55,18 @@ def _between(agent: AgentPlan, inwards: bool) -> Callable[..., None]:
 
 
 def bring_in_of(agent: AgentPlan) -> Callable[..., None]:
-    """Return `bring_in(worlds, scratch, b, first, end)`: what these blocks of world b carry comes into scratch."""
+    """Return `bring_in(worlds, scratch, b, first, end)`: copy these blocks of world b into scratch."""
     return _between(agent, True)
 
 
 def bring_out_of(agent: AgentPlan) -> Callable[..., None]:
-    """Return `bring_out(worlds, scratch, b, first, end)`: what has become of these blocks of world b goes back."""
+    """Return `bring_out(worlds, scratch, b, first, end)`: copy these blocks of scratch back to world b."""
     return _between(agent, False)
 
 
 @section
 def take_drive_of(dimension: int, width: int, masked: bool) -> Callable[..., None]:
-    """Make `take_drive(scratch, drive, asked, n, first, end)`: what is asked of agents, drive[:, asked], or 0."""
+    """Make `take_drive(scratch, drive, asked, n, first, end)`: want = drive[:, asked], the commanded forces, or 0."""
     into, size = into_blocks(dimension, width), dimension * width
 
     def take_drive(scratch: Any, drive: Any, asked: Any, n: Any, first: Any, end: Any) -> None:
@@ -86,7 +86,7 @@ def take_drive_of(dimension: int, width: int, masked: bool) -> Callable[..., Non
 
 @section
 def bring_inside_of(agent: AgentPlan, confine: Law) -> Callable[..., None]:
-    """Make `bring_inside(scratch, size, first, end)`: bring agents into a periodic box, where steps rely on it."""
+    """Make `bring_inside(scratch, size, first, end)`: move agents into a periodic box, if steps rely on it."""
     width, count = agent.width, np.uint64(agent.dimension * agent.width)
     vector, put = vector_of_lane(agent.dimension, width), put_vector_of(agent.dimension, width)
 

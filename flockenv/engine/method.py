@@ -1,4 +1,4 @@
-"""The integrator's method as a section of a scene: its `advance`, with functions that know how agents lie in memory."""
+"""The integrator's method as a section of a scene: its `advance`, with functions that know the memory layout."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ __all__ = ["MethodPlan", "advance_of", "method_plan"]
 
 
 class MethodPlan(NamedTuple):
-    """What the functions that a method is provided with depend on."""
+    """What the functions that a method is passed depend on."""
 
     dimension: int
     width: int
-    drags: tuple[tuple[int, int], ...]  # linear drags, kg/s: (effect, which of its numbers)
+    drags: tuple[tuple[int, int], ...]  # linear drags, kg/s: (effect, index among its numbers)
 
 
 def method_plan(parts: Parts) -> MethodPlan:
@@ -32,9 +32,9 @@ def method_plan(parts: Parts) -> MethodPlan:
 
 @functools.cache
 def advance_of(method: Callable[[Provided], Method], plan: MethodPlan) -> Callable[[Any], Method]:
-    """Make `advance_of(accelerate)`: the compiled `advance` of a method, of a scene with this `accelerate`.
+    """Make `advance_of(accelerate)`: the compiled `advance` of a method, for a scene with this `accelerate`.
 
-    numba caches no function that is passed a compiled one, so `advance` holds it.
+    numba caches no function that takes a compiled one as an argument, so `advance` holds it.
     """
     damping, largest = _damping(plan), _largest(plan.dimension, plan.width)
 
@@ -53,14 +53,14 @@ def _settings(context: Any) -> Any:
 
 @kernel
 def _counted(context: Any, accepted: Any, rejected: Any) -> None:
-    """Count steps of the method's own."""
+    """Count the accepted and rejected substeps of the method."""
     context.work[context.b, SUBSTEPS] += accepted
     context.work[context.b, SUBSTEPS + 1] += rejected
 
 
 @section
 def _damping(plan: MethodPlan) -> Callable[..., None]:
-    """Make `damping(context, rate, first, end)`: write the sum of all linear drags of every coordinate, 1/s."""
+    """Make `damping(context, rate, first, end)`: write the total linear drag by mass of every coordinate, 1/s."""
     total, dimension, width = _drag(plan.drags), plan.dimension, plan.width
     lanes, size = np.uint64(width), dimension * width
 
@@ -97,9 +97,9 @@ def _drag(drags: tuple[tuple[int, int], ...]) -> Callable[[Any, Any], float]:
 
 @section
 def _largest(dimension: int, width: int) -> Callable[..., tuple[float, Any]]:
-    """Make `largest(context, squares, first, end)`: the largest sum of an agent's coordinates, and where it lies.
+    """Make `largest(context, squares, first, end)`: the largest sum of an agent's coordinates, and its place.
 
-    NaN if one is; the place is that of the agent's first coordinate.
+    The sum is NaN if any is; the place is that of the agent's first coordinate.
     """
     lanes, size = np.uint64(width), dimension * width
 
@@ -107,7 +107,7 @@ def _largest(dimension: int, width: int) -> Callable[..., tuple[float, Any]]:
         worst, where = like(squares[0], -1.0), np.uint64(first)
         for block in range(np.uint64(first // size), np.uint64(end // size)):
             base = block * np.uint64(size)
-            for one in range(width):  # one after the other: no loop over lanes
+            for one in range(width):  # one after another: no loop over lanes
                 place = base + np.uint64(one)
                 found = squares[place] + squares[place + lanes]
                 if dimension == 3:

@@ -1,6 +1,6 @@
-"""How the agents of a block move once the method has said where to: limits, the space, headings, inner states.
+"""How the agents of a block move to where the method leads: limits, the space, headings, inner states.
 
-A method of one stage is applied here, too, coordinate by coordinate.
+A method of one stage is applied here as well, coordinate by coordinate.
 """
 
 from __future__ import annotations
@@ -31,40 +31,40 @@ CHANNELS = 8
 
 
 class Kept(NamedTuple):
-    """A law of what goes on inside agents."""
+    """The laws of an effect that keeps inner states."""
 
     begin: OneLaw
     keep: OneLaw
-    felt: int  # where what its pair law has found out lies, see Parts.felt_at; -1: it has none
+    felt: int  # where the sum of its pair law lies, see Parts.felt_at; -1: it has none
 
 
 class InnerPlan(NamedTuple):
-    """What changes inside agents depends on."""
+    """What changing the inner states of agents depends on."""
 
     agent: AgentPlan
     laws: tuple[Kept, ...]
-    numbers: tuple[tuple[tuple[int, int], ...], ...]  # of each number: which laws say it, and as which of theirs
-    felt: int  # numbers of a block in `felt`
+    numbers: tuple[tuple[tuple[int, int], ...], ...]  # per number: (law, index in its result) of each law that sets it
+    felt: int  # count of numbers of a block in `felt`
 
 
 class MovePlan(NamedTuple):
     """What moving the agents of a block depends on."""
 
     agent: AgentPlan
-    masked: bool  # may what is the same for all agents lie where the first block has it?
+    masked: bool  # True if numbers that all agents share may be read from the first block
     confine: Law
     bounce: Law | None
     turns: bool
     leans: bool
     flows: bool
-    method: Law | None  # of one stage: where a coordinate and its velocity are a step later
+    method: Law | None  # of one stage: returns a coordinate and its velocity one step later
     kicks: tuple[tuple[int, Law], ...]
     inner: InnerPlan | None
-    bad: int  # where among the lanes it is noted which agent is not finite
+    bad: int  # where among the lanes the agent that is not finite is noted
 
 
 def inner_plan(parts: Parts) -> InnerPlan | None:
-    """Return the plan of what goes on inside the agents of a scene, if anything does."""
+    """Return the plan of the inner states of a scene; None if its agents have none."""
     if not parts.inner:
         return None
     laws = [
@@ -97,10 +97,10 @@ def move_plan(parts: Parts) -> MovePlan:
 
 @section
 def _moved(plan: MovePlan) -> Callable[..., Any]:
-    """Make `moved(scratch, pos, vel, at, past, dt)`: where an agent was, its velocity, and both as the method has them.
+    """Make `moved(scratch, pos, vel, at, past, dt)`: return old position and velocity, then new ones by the method.
 
-    It lies at `at`; what the method put aside of it, at `past` of `aside`. By a method of one stage that is its
-    acceleration; by any other where it was, and how fast if bodies bounce.
+    The agent lies at `at`; what the method saved of it at `past` of `aside`. For a method of one stage that is its
+    acceleration; for any other its old position, and its old velocity if bodies bounce.
     """
     dimension, vector, bounces = plan.agent.dimension, vector_of_lane(*plan.agent[:2]), plan.bounce is not None
     method, flows = plan.method, plan.flows
@@ -129,13 +129,13 @@ def _moved(plan: MovePlan) -> Callable[..., Any]:
 
 @functools.cache
 def _draws(channel: int) -> Callable[..., float]:
-    """Return `draws(drawn, instant, i, dt)`: a number of (world, step, agent, channel), as precise as dt."""
+    """Return `draws(drawn, instant, i, dt)`: a normal number of (world, step, agent, channel), in dt's precision."""
     return kernel(lambda drawn, instant, i, dt: like(dt, normal(drawn, instant, np.int64(i), channel)))  # type: ignore[arg-type]
 
 
 @functools.cache
 def _kicked(kicks: tuple[tuple[int, Law], ...], dimension: int) -> Callable[..., tuple[Vec, Vec]]:
-    """Return `kicked(numbers, me, free, drawn, instant, dt, x, v)`: x and v with what is added once per step."""
+    """Return `kicked(numbers, me, free, drawn, instant, dt, x, v)`: x and v after the step's velocity kicks."""
     before, (k, law) = _kicked(kicks[:-1], dimension) if kicks[1:] else None, kicks[-1]
     draws = tuple_from(*(_draws(CHANNELS * k + j) for j in range(dimension)))
 
@@ -154,9 +154,9 @@ def _kicked(kicks: tuple[tuple[int, Law], ...], dimension: int) -> Callable[...,
 
 @section
 def _turned(plan: MovePlan) -> Callable[..., Any]:
-    """Make `turn(scratch, i, at, dt, was, x, v)`: x, v and heading of an agent that turns by max_turn_rate dt at most.
+    """Make `turn(scratch, i, at, dt, was, x, v)`: x, v, heading of an agent that turns by at most max_turn_rate dt.
 
-    Neither its velocity nor its way in this step does; what a medium adds to its way is none of its doing.
+    Both its velocity and its displacement in this step are limited so; the displacement by a medium is left out.
     """
     vector, flows = vector_of_lane(*plan.agent[:2]), plan.flows
 
@@ -175,9 +175,9 @@ def _turned(plan: MovePlan) -> Callable[..., Any]:
 
 @section
 def _facing(plan: MovePlan) -> Callable[..., None]:
-    """Make `face(scratch, i, at, dt, v, ahead)`: write where agent i faces after the step, and which way is up.
+    """Make `face(scratch, i, at, dt, v, ahead)`: write the heading of agent i after the step, and its up vector.
 
-    An agent whose turn rate is limited turns while it stands still, too: `ahead` is as far as it has come.
+    An agent whose turn rate is limited also turns while it stands still: `ahead` is the heading that it has reached.
     """
     dimension, vector, put = plan.agent.dimension, vector_of_lane(*plan.agent[:2]), put_vector_of(*plan.agent[:2])
     turns, leans = plan.turns, plan.leans
@@ -200,7 +200,7 @@ def _facing(plan: MovePlan) -> Callable[..., None]:
 
 @functools.cache
 def _becomes(number: int, said: tuple[tuple[int, int], ...]) -> Callable[[Any, Any], float]:
-    """Return `becomes(was, says)`: a number as its only law says, or what it was and what several laws change."""
+    """Return `becomes(was, says)`: a number as its only law sets it, or changed by several laws."""
     if said[1:]:
         return _changed(number, said)
     ((law, place),) = said
@@ -209,7 +209,7 @@ def _becomes(number: int, said: tuple[tuple[int, int], ...]) -> Callable[[Any, A
 
 @functools.cache
 def _changed(number: int, said: tuple[tuple[int, int], ...]) -> Callable[[Any, Any], float]:
-    """Return `changed(was, says)`: what a number was, and the changes to it by several laws."""
+    """Return `changed(was, says)`: the old number, plus the changes to it by several laws."""
     before, (law, place) = _changed(number, said[:-1]) if said[1:] else None, said[-1]
     if before is None:
         return kernel(lambda was, says: was[number] + (says[law][place] - was[number]))
@@ -222,7 +222,7 @@ def _all_become(plan: InnerPlan) -> Callable[..., tuple[float, ...]]:
 
 @functools.cache
 def _keeps(plan: InnerPlan, kept: Kept) -> Callable[..., Any]:
-    """Return `keeps(numbers, scratch, me, row, lane, dt)`: what a law says of the numbers that it keeps."""
+    """Return `keeps(numbers, scratch, me, row, lane, dt)`: the new values of the numbers that a law keeps."""
     given, law, agent = given_of(kept.keep.k, kept.keep.images), kept.keep.law, plan.agent
     felt = felt_of(agent.dimension, agent.width, plan.felt, kept.felt) if kept.felt >= 0 else None
 
@@ -236,7 +236,7 @@ def _keeps(plan: InnerPlan, kept: Kept) -> Callable[..., Any]:
 
 @functools.cache
 def _put_number(number: int) -> Callable[..., None]:
-    """Return `put(inner, i, was, now, alive)`: write a number of agent i, of which that of a dead one stays."""
+    """Return `put(inner, i, was, now, alive)`: write a number of agent i; that of a dead agent stays."""
 
     def put(inner: Any, i: Any, was: Any, now: Any, alive: Any) -> None:
         inner[number][i] = now[number] if alive else was[number]
@@ -246,7 +246,7 @@ def _put_number(number: int) -> Callable[..., None]:
 
 @functools.cache
 def _all_finite(count: int) -> Callable[[Any], bool]:
-    """Return `sound(now)`: are all numbers finite?"""
+    """Return `sound(now)`: True if all numbers are finite."""
     total = _total(count)
     return kernel(lambda now: finite(total(now)))
 
@@ -261,7 +261,10 @@ def _total(count: int) -> Callable[[Any], float]:
 
 @section
 def _keep(plan: InnerPlan) -> Callable[..., bool]:
-    """Make `keep(scratch, numbers, me, i, row, lane, dt)`: write what goes on inside agent i; is that a number?"""
+    """Make `keep(scratch, numbers, me, i, row, lane, dt)`: write agent i's inner states.
+
+    It returns True if they are finite.
+    """
     says, become = tuple_from(*(_keeps(plan, kept) for kept in plan.laws)), _all_become(plan)
     put, sound = in_turn(*map(_put_number, range(len(plan.numbers)))), _all_finite(len(plan.numbers))
 
@@ -275,7 +278,7 @@ def _keep(plan: InnerPlan) -> Callable[..., bool]:
 
 @section
 def begin_agent_of(plan: InnerPlan) -> Callable[..., tuple[float, ...]]:
-    """Make `begin(numbers, me)`: what goes on inside an agent that comes into being."""
+    """Make `begin(numbers, me)`: return the initial inner states of an agent."""
     says, become = tuple_from(*(says_of(kept.begin) for kept in plan.laws)), _all_become(plan)
 
     def begin(numbers: Any, me: Any) -> Any:
@@ -291,9 +294,9 @@ def begin_agent_of(plan: InnerPlan) -> Callable[..., tuple[float, ...]]:
 def move_of(plan: MovePlan) -> Callable[..., None]:
     """Make `move(context, pos, vel, time, dt, instant, block, past)`: move the agents of a block.
 
-    past: where what was put aside of them begins, see `_moved`; instant: how many steps the world has made. No agent
-    moves faster than max_speed, whatever a method makes of its velocity within the step. Which one is not finite, the
-    lowest in each lane, is noted.
+    past: where the values saved for the block begin, see `_moved`; instant: number of steps that the world has made. No
+    agent moves faster than max_speed, whatever a method does to its velocity within the step. The lowest number of an
+    agent that is not finite is noted in each lane.
     """
     agent, d, width = plan.agent, plan.agent.dimension, plan.agent.width
     size, bad, put = np.uint64(d * width), np.uint64(plan.bad), put_vector_of(d, width)

@@ -1,7 +1,7 @@
-"""Lists of the nearest, kept in order while candidates come: as squares and places, or as keys that hold both.
+"""Sorted lists of the nearest, updated as candidates come: as squares and places, or as keys that hold both.
 
-A list is a tuple of numbers, which lie lane beside lane in scratch; each function below becomes as many comparisons and
-choices, without a loop or a branch, so that lists stay in vector registers.
+A list is a tuple of numbers, which lie lane beside lane in scratch; each function below compiles to comparisons and
+selections, without a loop or a branch, so that lists stay in vector registers.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from flockenv.jit.intrinsics import intrinsic_or_python
 __all__ = ["AT_ONCE", "exchanges", "inserted", "kept", "merged"]
 
 AT_ONCE = 4
-"""The number of keys that are put into a list at once."""
+"""The number of keys that are inserted into a list at once."""
 
 _tuple_of: Callable[..., Any] = types.BaseTuple.from_types
 
 
 def _inserted(typing_context: Any, numbers: Any, far: Any, place: Any) -> Any:
-    """Return a list, distances in order and then as many places, into which a distance and its place were put."""
+    """Return a list, sorted distances and then their places, with a distance and its place inserted."""
     many = len(numbers) // 2
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -54,7 +54,7 @@ inserted: Any = intrinsic_or_python(_inserted, _inserted_in_python)
 
 
 def _kept(typing_context: Any, numbers: Any, far: Any) -> Any:
-    """Return a list of distances in order into which a distance was put; the farthest falls out."""
+    """Return a list of sorted distances with one inserted; the largest drops out."""
     many = len(numbers)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -79,20 +79,20 @@ kept: Any = intrinsic_or_python(_kept, _kept_in_python)
 
 
 def exchanges(many: int, come: int) -> Iterator[tuple[int, int]]:
-    """Yield the exchanges that put `come` numbers, AT_ONCE at most, into a list of `many` in order, which they follow.
+    """Yield the exchanges that insert `come` numbers, at most AT_ONCE, into a sorted list of `many` before them.
 
-    Two places each: they change unless the first has the lesser. Then the first `many` are the least of all, in order.
-    One after the other, into a list of seven, that takes 13 instructions a key, and this 8: those that come are sorted,
-    the lesser of the list's last and the first of them, and so on, are the nearest, and a row that rises and then falls
-    is in order after as many rounds as its length has bits (Batcher, "Sorting networks and their applications", AFIPS
-    1968).
+    Each is two places, which are swapped unless the first holds the lesser number. Then the first `many` are the least
+    of all, in order. Inserting one by one into a list of seven takes 13 instructions a key, and this 8. The new numbers
+    are sorted; the lesser of the list's last and the first new one, and so on, are the nearest; and this bitonic
+    sequence is sorted in as many rounds as its length has bits (Batcher, "Sorting networks and their applications",
+    AFIPS 1968).
     """
     for a, b in ((0, 1), (2, 3), (0, 2), (1, 3), (1, 2)):
         if b < come:
             yield many + a, many + b
     for c in range(min(come, many)):
         yield many - 1 - c, many + c
-    length = 1 << (many - 1).bit_length()  # as if those that are missing of that were nearer than all
+    length = 1 << (many - 1).bit_length()  # as if the numbers that are missing of that length were the least
     half, missing = length // 2, length - many
     while half:
         for k in range(missing, length):
@@ -102,7 +102,7 @@ def exchanges(many: int, come: int) -> Iterator[tuple[int, int]]:
 
 
 def _merged(typing_context: Any, numbers: Any, come: Any) -> Any:
-    """Return a list of keys, as they lie where float32 may, with those that come put into it; it stays as long."""
+    """Return a list of keys (stored as float32) with new keys inserted; its length stays the same."""
     many = len(numbers)
     if len(come) != AT_ONCE or set(come) != {types.uint32} or set(numbers) != {types.float32}:
         raise numba.TypingError(f"merged: {come} into {numbers}, must be AT_ONCE keys and float32 numbers")

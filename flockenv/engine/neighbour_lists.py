@@ -1,11 +1,11 @@
-"""The listing: how the living agents are listed, once per instant, so that neighbours are found side by side.
+"""The listing: how the living agents are listed, each time forces are computed, so that neighbours lie side by side.
 
-In a small world, and where a grid would have too few cells, they are listed by number and each agent is a candidate;
-else they are sorted by cell. What is listed of each agent are its `fields`: in a small world a row for each (`x0`,
-`x1`, `v0`, ...), else a record for each agent. A team of threads lists together, each its own agents, and each then
-walks through its own share of the blocks of listed agents.
+In a small world, or if a grid would have too few cells, they are listed by number and each agent is a candidate; else
+they are sorted by cell. What is listed of each agent are its `fields`: in a small world a row for each field (`x0`,
+`x1`, `v0`, ...), else a record for each agent. A team of threads makes the list together, each thread for its own
+agents; each then walks through its own share of the blocks of listed agents.
 
-A field is a letter and an axis, of a vector (x position, v velocity, t tie, h heading that follows from v, d heading of
+A field is a letter and an axis of a vector (x position, v velocity, t tie, h heading that follows from v, d heading of
 its own, a aim), or the name of a number (`who`, `radius`, `inner0`, ...).
 """
 
@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 __all__ = ["Listing", "list_living", "listing_of", "walk_blocks"]
 
 AHEAD = np.uint64(8)
-"""The places of records are prefetched this many blocks ahead."""
+"""How many blocks ahead the places of records are prefetched."""
 
 _ARRAYS = {"x": "pos", "v": "vel", "t": "tie", "d": "facing", "a": "aiming", "who": "ident"}
-"""The arrays in which fields lie whose names differ."""
+"""The array of each field whose name differs from its array's."""
 
 
 class Listing(NamedTuple):
@@ -44,15 +44,15 @@ class Listing(NamedTuple):
 
     dimension: int
     width: int
-    sorts: bool  # by cell, where the space has enough of them
+    sorts: bool  # by cell, if the space has enough of them
     periodic: bool
     fields: tuple[str, ...]
-    inside: bool  # are all agents inside a periodic box already?
-    tiled: bool  # may agents lie in the order of tiles, and not by number?
-    homely: bool  # is it known then which agents have left their tiles?
+    inside: bool  # True if all agents are inside a periodic box already
+    tiled: bool  # True if agents may lie in the order of tiles, not by number
+    homely: bool  # True if the agents that have left their tiles are tracked
     confine: Law
     slots: tuple[tuple[str, int], ...]  # where running numbers of a block lie in the scratch `lanes`, by name
-    arrays: tuple[str, ...]  # what there is: `pos` and `vel`, which are handed over; inner states; scratch
+    arrays: tuple[str, ...]  # the names of `pos`, `vel` and inner states, which are passed separately, then of scratch
 
     def slot(self, name: str) -> np.uint64:
         """Return where the lanes of a running number begin."""
@@ -60,7 +60,7 @@ class Listing(NamedTuple):
 
     @property
     def record(self) -> tuple[str, ...]:
-        """What is written of an agent that is put into its cell, behind its place; headings follow from velocities."""
+        """What is written of an agent into its record, after its place; headings follow from velocities."""
         return tuple(field for field in self.fields if field[0] != "h")
 
     @property
@@ -70,18 +70,18 @@ class Listing(NamedTuple):
 
     @property
     def headed(self) -> bool:
-        """Are headings worked out from velocities?"""
+        """True if headings are computed from velocities."""
         return "h0" in self.fields
 
     @property
     def wraps(self) -> bool:
-        """Are positions brought into a periodic box first?"""
+        """True if positions are wrapped into a periodic box first."""
         return self.periodic and not self.inside
 
     def sources(self) -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
-        """Return, of each field of a record, which array it lies in, behind what, and how much further.
+        """Return, for each field of a record, the array in which it lies, the start to count from, and the offset.
 
-        Behind the number of an agent (0), or where its vectors begin (1); see `gather_each`.
+        The start is the number of an agent (0), or where its vectors begin (1); see `gather_each`.
         """
         found = []
         for field in self.record:
@@ -101,7 +101,7 @@ class Listing(NamedTuple):
         return int(self.slot(f"mine{k}")) if self.sorts else k * SMALL_STRIDE
 
     def listed(self, fields: Sequence[str]) -> tuple[int, ...]:
-        """Return where fields of a candidate lie: in its record, or in the rows that blocks read, too; -1: nowhere.
+        """Return where fields of a candidate lie: in its record, or in the rows of a small world; -1: nowhere.
 
         Headings are in no record: no law reads that of a candidate.
         """
@@ -131,7 +131,7 @@ def listing_of(parts: Parts, fields: list[str], inside: bool = False, tiled: boo
 def list_living(plan: Listing) -> Callable[..., Any]:
     """Make `list_living(context, pos, vel)`: list the living of a world; return the shape of its grid of cells.
 
-    That is (nx, ny, nz, fine, fold), or zeros where they are listed by number.
+    That is (nx, ny, nz, fine, fold), or zeros if they are listed by number.
     """
     sorts, periodic, wraps, width, homely = plan.sorts, plan.periodic, plan.wraps, plan.width, plan.homely
     by_number = (_enter if sorts else _fill)(plan)
@@ -139,7 +139,7 @@ def list_living(plan: Listing) -> Callable[..., Any]:
 
     def list_all(context: Any, pos: Any, vel: Any) -> Any:
         scratch, team, rank = context.scratch, context.team, context.rank
-        wait_for_team(scratch.sync, team)  # the positions are those of all threads
+        wait_for_team(scratch.sync, team)  # all threads have written their positions now
         shape = (0, 0, 0, 0, 0)
         if sorts:
             size, reach = context.numbers.size, context.numbers.reach
@@ -238,13 +238,13 @@ def _enter(plan: Listing) -> Callable[..., None]:
 def _sort(plan: Listing) -> Callable[..., None]:
     """Make `sort(context, pos, vel, shape)`: put agents into their cells, as whole records.
 
-    So each is one distant place in memory, which is asked for in good time.
+    So each agent takes one access to distant memory, which is prefetched.
     """
     d, width, wraps, confine = plan.dimension, plan.width, plan.wraps, plan.confine
     length, handed = np.uint64(plan.length), handed_of("inner0" in plan.arrays)
     arrays, which, further = plan.sources()
     inside = tuple(int(plan.slot("inside0")) + k * width for k in range(d))
-    if wraps:  # of these, positions are read where they are written first: in the lanes of this thread
+    if wraps:  # read wrapped positions from where they are written first: the lanes of this thread
         moved = [field[0] == "x" for field in plan.record]
         arrays = tuple(plan.arrays.index("lanes") if m else k for m, k in zip(moved, arrays, strict=True))
         which = tuple(2 if m else k for m, k in zip(moved, which, strict=True))
@@ -264,7 +264,7 @@ def _sort(plan: Listing) -> Callable[..., None]:
                 for lane in range(np.uint64(width)):
                     there = np.uint64(offset[rank, np.uint64(max(cell[later + lane], np.int32(0)))])
                     ask_for(records, there * length)
-            if wraps:  # a stage of a method may have brought agents out of the box
+            if wraps:  # a stage of a method may have moved agents out of the box
                 for lane in range(np.uint64(width)):
                     x = gather(pos, base + lane, vector)
                     within, _ = confine(context.numbers.size, scratch.radius[row + lane], x, x)
@@ -281,7 +281,7 @@ def _sort(plan: Listing) -> Callable[..., None]:
 
 @section
 def _in_order(plan: Listing) -> Callable[..., None]:
-    """Make `order(context, shape)`: put records in the order of numbers within each cell, where agents lie by tiles."""
+    """Make `order(context, shape)`: sort records by number within each cell, if agents lie by tiles."""
     homely, length, width = plan.homely, plan.length, plan.width
 
     def order(context: Any, shape: Any) -> None:
@@ -294,7 +294,7 @@ def _in_order(plan: Listing) -> Callable[..., None]:
                 away += scratch.tally[team + r]
             everything = away * FAR_FROM_HOME > context.n
         if everything:
-            for line in range(rows * rank // team, rows * (rank + 1) // team):  # a row at a time stays in the cache
+            for line in range(rows * rank // team, rows * (rank + 1) // team):  # one row at a time stays in the cache
                 mine: Any = np.int64(start[line * nx])
                 beyond: Any = np.int64(start[(line + 1) * nx])
                 order_records(records, scratch.cell, ident, length, mine, beyond, offset[rank])
@@ -315,7 +315,7 @@ def _in_order(plan: Listing) -> Callable[..., None]:
 
 @section
 def _take(plan: Listing) -> Callable[..., None]:
-    """Make `take(lanes, records, block)`: the records of a block become lanes, which its laws then read."""
+    """Make `take(lanes, records, block)`: copy the records of a block to lanes, which its laws then read."""
     width, headed = plan.width, plan.headed
     to = (int(plan.slot("home0")), *plan.lanes_of(plan.record))
     first = (0,) * len(to)
@@ -332,10 +332,10 @@ def _take(plan: Listing) -> Callable[..., None]:
 
 @section
 def walk_blocks(plan: Listing, meet: Callable[..., int]) -> Callable[..., int]:
-    """Make `walk(context, shape, time)`: call `meet` for each of this thread's blocks; add up its answers.
+    """Make `walk(context, shape, time)`: call `meet` for each of this thread's blocks; return the sum of its results.
 
-    It is handed context, shape, block, at, upto, found, time: the block is [at, upto), and `found` ranges of
-    listed agents may be near it: `scratch.ranges`.
+    `meet` is passed context, shape, block, at, upto, found, time: the block is [at, upto), and its candidates are the
+    first `found` ranges of listed agents in `scratch.ranges`.
     """
     width, sorts, periodic = plan.width, plan.sorts, plan.periodic
     take: Any = _take(plan) if sorts else None

@@ -1,4 +1,4 @@
-"""Agents as pair laws see them: in a lane of a block, or as a candidate whom the block meets."""
+"""Agents as pair laws see them: in a lane of a block, or as a candidate."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["Besides", "Block", "Candidate", "agent_listed", "candidate_listed", 
 
 
 class Candidate(NamedTuple):
-    """An agent that is listed, as pair laws see it; what no law reads is 0."""
+    """A listed agent, as pair laws see it; what no law reads is 0."""
 
     pos: Any
     vel: Any
@@ -31,15 +31,15 @@ class Candidate(NamedTuple):
 
 
 class Besides(NamedTuple):
-    """What only some scenes look at while agents meet: empty tuples in all others."""
+    """Data that pair laws need in some scenes only: empty tuples in all others."""
 
-    scenery: Any  # obstacle_x, obstacle_radius, params, world: of sights that obstacles hide
-    ties: Any  # tie, ident, order: of ties that are not listed
+    scenery: Any  # obstacle_x, obstacle_radius, params, world: for sights that obstacles block
+    ties: Any  # tie, ident, order: for ties that are not listed
 
 
 @section
 def agent_listed(listing: Listing, inner: tuple[str, ...], oriented: bool) -> Callable[..., Me]:
-    """Make `agent(array, at, time, drawn)`: the agent in a lane of a block, as pair laws see it."""
+    """Make `agent(array, at, time, drawn)`: return the agent in a lane of a block, as pair laws see it."""
     pos, vel, tie, aim, heading = (
         listing.lanes_of(listing.axes(x)) for x in ("x", "v", "t", "a", "d" if oriented else "h")
     )
@@ -60,13 +60,13 @@ def agent_listed(listing: Listing, inner: tuple[str, ...], oriented: bool) -> Ca
 
 
 def _inner_fields(inner: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the fields of what goes on inside an agent."""
+    """Return the fields of the inner states of an agent."""
     return tuple(f"inner{k}" for k in range(len(inner)))
 
 
 @section
 def candidate_listed(listing: Listing, inner: tuple[str, ...]) -> Callable[..., Candidate]:
-    """Make `candidate(array, at)`: the agent whose record, or place in rows, begins at `at`."""
+    """Make `candidate(array, at)`: return the agent whose record, or place in rows, begins at `at`."""
     pos, vel, tie = (listing.listed(listing.axes(letter)) for letter in "xvt")
     numbers, within = listing.listed(("who", "radius", "mass")), listing.listed(_inner_fields(inner))
     kind, feels = record(inner), bool(inner)
@@ -83,7 +83,7 @@ def candidate_listed(listing: Listing, inner: tuple[str, ...]) -> Callable[..., 
 
 @kernel
 def with_tie(me: Me, tie: Any) -> Me:
-    """Return an agent with its tie, where that was not listed."""
+    """Return an agent with its tie, which was not listed."""
     return Me(
         me.who, me.pos, me.vel, me.heading, me.mass, me.radius, me.max_speed, me.max_force, tie, me.time, me.medium,
         me.key, me.aim, me.desired_speed, me.inner,
@@ -92,21 +92,21 @@ def with_tie(me: Me, tie: Any) -> Me:
 
 @section
 def tie_of(dimension: int, width: int) -> Callable[..., Any]:
-    """Make `tie(ties, i)`: the tie of agent i."""
+    """Make `tie(ties, i)`: return the tie of agent i."""
     vector, place = tuple(k * width for k in range(dimension)), place_of(dimension, width)
     return lambda ties, i: gather(ties[0], place(np.uint64(ties[1][i])), vector)
 
 
 class Block(NamedTuple):
-    """A block of listed agents, for whom candidates are met."""
+    """A block of listed agents, which interact with their candidates."""
 
     mine: Any  # what its agents are read from: lanes, or rows
-    first: Any  # where the first lies there
+    first: Any  # where the first agent lies there
     theirs: Any  # what candidates are read from: records, or rows
     lanes: Any  # running numbers
-    number: Any  # (W,) which lane is which
+    number: Any  # (W,) index of each lane
     at: Any  # the first of its agents, and
     upto: Any  # one past the last, as they are listed
     ranges: Any  # (found, 3) its candidates
     time: Any  # s
-    drawn: Any  # the key of what is drawn at random
+    drawn: Any  # the key of random numbers

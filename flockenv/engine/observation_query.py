@@ -27,9 +27,9 @@ __all__ = ["look_of"]
 def look_of(plan: LookPlan) -> Callable[..., bool]:
     """Make `look(x, alive, obstacle_x, obstacle_radius, b, params, near_square, ..., near_pos, scratch)`.
 
-    It writes, for every agent of world b, the nearest agents (K, N) and obstacles (J, N), and how many (N,). Where
-    there is none, it is infinitely far, and some number stands there: of agents, one that exists. It returns whether
-    it has written where these are, too (D, K, N).
+    It writes, for every agent of world b, the nearest agents (K, N) and obstacles (J, N), and how many (N,). A missing
+    one is infinitely far, with an arbitrary number: for agents, one that exists. It returns True if it has also written
+    the positions of the agents (D, K, N).
     """
     width, at, agents, obstacles = plan.listing.width, plan.at, plan.agents > 0, plan.obstacles > 0
     axes, into = tuple(range(plan.listing.dimension)), into_blocks(plan.listing.dimension, plan.listing.width)
@@ -45,7 +45,7 @@ def look_of(plan: LookPlan) -> Callable[..., bool]:
         for i in range(n):
             present += alive[b, i]
             scratch.living[i] = alive[b, i]
-        for i in range(n if present < n else 0):  # dead agents are not looked for; obstacles are told to all
+        for i in range(n if present < n else 0):  # dead agents are not searched for; obstacles are found for all
             near_count[i] = 0
             for k in range(near_square.shape[0]):
                 near_square[k, i] = np.inf
@@ -69,7 +69,7 @@ def look_of(plan: LookPlan) -> Callable[..., bool]:
 
 @section
 def _among_agents(plan: LookPlan) -> Callable[[Any], bool]:
-    """Make `among(looking)`: write the nearest agents of each agent, block by block; it returns as `look` does."""
+    """Make `among(looking)`: write the nearest agents of each agent, block by block; return as `look` does."""
     list_all, walk, keyed = list_living(plan.listing), walk_blocks(plan.listing, _block(plan)), plan.keyed
     x_at = np.uint64(max(plan.place[0], 0))
 
@@ -87,7 +87,7 @@ def _among_agents(plan: LookPlan) -> Callable[[Any], bool]:
 
 @section
 def _block(plan: LookPlan) -> Callable[..., int]:
-    """Make what one block does, as `walk_blocks` calls it; it returns how many blocks were not told by keys: 0 or 1."""
+    """Make the function of one block for `walk_blocks`; it returns 1 if keys were not used for the block, else 0."""
     sorts, keyed = plan.listing.sorts, plan.keyed
     by_keys, by_squares, tell = by_keys_of(plan) if keyed else None, _by_squares(plan), _tell(plan)
 
@@ -119,7 +119,7 @@ def _block(plan: LookPlan) -> Callable[..., int]:
 def _by_squares(plan: LookPlan) -> Callable[..., None]:
     """Make `by_squares(mine, first, theirs, number, lanes, span, block, ranges, found)`: keep lists of squares.
 
-    Only around the edge of a periodic box are images sought.
+    Images are considered only around the edge of a periodic box.
     """
     listing, width = plan.listing, plan.listing.width
     squares, places = plan.slots("square", plan.agents), plan.slots("place", plan.agents)
@@ -147,7 +147,7 @@ def _by_squares(plan: LookPlan) -> Callable[..., None]:
 
 @section
 def _meet(plan: LookPlan, wrapped: bool) -> Callable[..., None]:
-    """Make `meet(mine, first, theirs, number, lanes, span, block, j, last)`: a block meets candidates [j, last)."""
+    """Make `meet(mine, first, theirs, number, lanes, span, block, j, last)`: insert candidates [j, last)."""
     listing, width, exact, offset_to = plan.listing, plan.listing.width, plan.exact, plan.offset_to
     length = np.uint64(listing.length if listing.sorts else 1)
     place, there = plan.place, listing.listed(listing.axes("x"))
@@ -172,9 +172,9 @@ def _meet(plan: LookPlan, wrapped: bool) -> Callable[..., None]:
 
 @section
 def _tell(plan: LookPlan) -> Callable[..., None]:
-    """Make `tell(listed, lanes, near, block, upto, by_number)`: write the lists of a block to where its agents look.
+    """Make `tell(listed, lanes, near, block, upto, by_number)`: write the lists of a block to the output arrays.
 
-    listed: which agent is at a place: records, or their order. by_number: the lists lie as the lanes do.
+    listed: the agent at each place: records, or their order. by_number: True if the lists lie as the lanes do.
     """
     listing, width, many = plan.listing, plan.listing.width, plan.agents
     squares, places, home = listing.slot("square0"), listing.slot("place0"), listing.slot("home0")
@@ -212,7 +212,8 @@ def _tell(plan: LookPlan) -> Callable[..., None]:
 def _among_obstacles(plan: LookPlan) -> Callable[..., None]:
     """Make `around(obstacle_x, obstacle_radius, b, span, pos, lanes, end, gap, who, count)`: write the nearest.
 
-    Of each agent those whose surfaces are nearest: how far these are (J, N), m, which they are (J, N), how many (N,).
+    For each agent the obstacles whose surfaces are nearest: their distances (J, N), m, their numbers (J, N), how many
+    (N,).
     """
     d, width, many, offset_to = plan.listing.dimension, plan.listing.width, plan.obstacles, plan.offset_to
     vector, circle, size = vector_of_lane(d, width), vector_of(d), d * width

@@ -1,7 +1,7 @@
 """What a fold does with one obstacle: how its law sees it, and what it keeps.
 
-A law meets circles as they are, and of any other shape one point (`effects.base.Obstacle`): the nearest of its surface,
-or, where the law casts a ray, the one that it touches first.
+A law is passed circles as they are, and of any other shape one point (`physics.effects.effect.Obstacle`): the nearest
+of its surface, or, if the law casts a ray, the first point that the ray touches.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from flockenv.steering.around import threat
 __all__ = ["meet_circle", "meet_shape"]
 
 CIRCLE = -1
-"""What is noted as the form of a circle of the state."""
+"""The form that is noted for a circle of the state."""
 
 PIECED = ("chain", "hollow_chain", "hollow_block")
-"""Forms that a law may meet piece by piece: side after side."""
+"""Forms whose sides a law may handle one by one."""
 
 SIDE_BY_SIDE = ("block", "half_space")
-"""Forms whose laws have no branches: lanes are one vector there, and a choice costs less than a branch."""
+"""Forms whose laws have no branches: lanes are vectorised there, and a selection costs less than a branch."""
 
 SHORT = 1 - 1e-6
-"""Share of the way to a surface on which nothing may stand, if it is to be seen: not the surface itself."""
+"""Share of the distance to a surface that must be free for it to be visible: the surface itself is left out."""
 
 
 # --- what is kept -----------------------------------------------------------------------------------------------------
@@ -45,7 +45,7 @@ SHORT = 1 - 1e-6
 
 @functools.cache
 def _in_sight(around: Surroundings | None) -> Callable[..., bool]:
-    """Make `in_sight(world, me, gap, out)`: does nothing stand in the way to the nearest place of a surface?"""
+    """Make `in_sight(world, me, gap, out)`: return True if the line to a nearest point is free."""
     if around is None:
         return kernel(lambda world, me, gap, out: True)
     hidden = blocked(around)
@@ -60,9 +60,9 @@ def _in_sight(around: Surroundings | None) -> Callable[..., bool]:
 
 @section
 def _keeps(fold: Fold) -> Callable[..., None]:
-    """Make `keep(p, world, me, it, form, place, lanes, lane)`: how a fold goes on with an obstacle, as it sees it.
+    """Make `keep(p, world, me, it, form, place, lanes, lane)`: update a fold by an obstacle, as its law sees it.
 
-    Where it keeps another number of what is ahead than before, it notes by form and place what that is.
+    For a fold with `ahead`, if its first number changes, it also notes the form and place of the obstacle.
     """
     law, slots, ahead, notes = fold.law, fold.slots, fold.ahead, bool(fold.ahead)
     occluded, in_sight = fold.hidden is not None, _in_sight(fold.hidden)
@@ -85,16 +85,16 @@ def _keeps(fold: Fold) -> Callable[..., None]:
 
 
 def meet_circle(folds: tuple[Fold, ...]) -> Callable[..., None]:
-    """Return `meet(numbers, world, me, to, rho, m, lanes, lane)`: all folds meet circle m of the state.
+    """Return `meet(numbers, world, me, to, rho, m, lanes, lane)`: update all folds by circle m of the state.
 
-    to: the way to its centre; rho: its radius, m.
+    to: the offset to its centre; rho: its radius, m.
     """
     return in_turn(*(_circle(fold, j) for fold in folds for j in range(fold.rays)))
 
 
 @section
 def _circle(fold: Fold, j: int) -> Callable[..., None]:
-    """Make the same of one fold, and ray j if it casts rays."""
+    """Make the same for one fold, and for ray j if it casts rays."""
     k, ray_of, origin, keep = fold.k, fold.ray, fold.origin, _keeps(fold)
     cast, elsewhere = fold.ray is not None, fold.origin is not None
 
@@ -117,7 +117,7 @@ def _circle(fold: Fold, j: int) -> Callable[..., None]:
 
 
 def meet_shape(folds: tuple[Fold, ...], form: str) -> Callable[..., None]:
-    """Return `meet(numbers, world, params, me, shape, lanes, lane)`: all folds meet a shape of a form."""
+    """Return `meet(numbers, world, params, me, shape, lanes, lane)`: update all folds by a shape of a form."""
     pieced = {fold for fold in folds if fold.pieces and form in PIECED}
     return in_turn(
         *(
@@ -130,7 +130,7 @@ def meet_shape(folds: tuple[Fold, ...], form: str) -> Callable[..., None]:
 
 @section
 def _near(fold: Fold, form: str) -> Callable[..., None]:
-    """Make what one fold that casts no rays does."""
+    """Make `meet` for one fold that casts no rays."""
     k, origin, keep, number = fold.k, fold.origin, _keeps(fold), number_of(form)
     elsewhere, nearest = fold.origin is not None, law_of("nearest", form)
 
@@ -150,9 +150,9 @@ def _near(fold: Fold, form: str) -> Callable[..., None]:
 
 @section
 def _touched(fold: Fold, form: str, j: int) -> Callable[..., None]:
-    """Make what one fold does that casts rays, with ray j.
+    """Make `meet` for ray j of one fold that casts rays.
 
-    Where the ray touches nothing the normal is that of the nearest place, which is known.
+    If the ray touches nothing, the normal is that of the nearest point, which is known.
     """
     k, ray_of, keep, number = fold.k, fold.ray, _keeps(fold), number_of(form)
     nearest, hit_of, chooses = law_of("nearest", form), law_of("hit", form), form in SIDE_BY_SIDE
@@ -176,9 +176,9 @@ def _touched(fold: Fold, form: str, j: int) -> Callable[..., None]:
 
 @section
 def _pieces(fold: Fold, form: str) -> Callable[..., None]:
-    """Make what one fold does that meets a shape side after side: the nearest place of each that acts by itself.
+    """Make `meet` for one fold that handles the sides of a shape one by one: the nearest point of each that acts.
 
-    Where nothing is near enough its sides are not either.
+    If the nearest point of the shape is out of reach, so are all its sides.
     """
     k, reach, keep, number = fold.k, fold.reach, _keeps(fold._replace(hidden=None, ahead=())), number_of(form)
     pieces_of, piece_of, reaches = law_of("pieces", form), law_of("piece", form), fold.reach is not None

@@ -1,9 +1,11 @@
-"""Folds over the obstacles, all of them in one pass: circles of the state, which may differ from world to world, then
-the other shapes: what is not round, moves, or is hollow. These are met where they are at the time of the stage.
+"""Folds over the obstacles, all in one pass: circles of the state, then all other shapes.
 
-Where there are many shapes of a form, each agent meets those that may lie within reach by a grid (shapes/cells.py), in
-the order in which they are listed; that is where the others, which a law leaves alone, would have been met too: so
-results are the same bits.
+The circles may differ from world to world; the other shapes are those that are not round, that move, or that are
+hollow. They are placed where they are at the time of the stage.
+
+If there are many shapes of a form, each agent looks up those that may lie within reach in a grid (shapes/cells.py), in
+the order in which they are listed. That is the order of a loop over all shapes, and a law ignores shapes out of reach:
+so results are the same bits.
 """
 
 from __future__ import annotations
@@ -31,14 +33,14 @@ from flockenv.maths.vectors import add, dot, scale, sub, zero
 __all__ = ["obstacles_of"]
 
 LOOSE = 1 + 1e-6
-"""Factor of a reach, so that single precision loses nothing that a law would have met."""
+"""Factor of a reach, so that single precision loses nothing that a law would have used."""
 
 
 @section
 def obstacles_of(plan: Obstacles) -> Callable[..., None]:
-    """Make `meet_obstacles(context, pos, vel, time, block)`: what one block's folds over the obstacles come to.
+    """Make `meet_obstacles(context, pos, vel, time, block)`: compute the folds of a block over the obstacles.
 
-    It is written into `lanes`, where the plan says; time, s.
+    The results are written into `lanes`, where the plan says; time, s.
     """
     d, width, arranges = plan.agent.dimension, plan.agent.width, plan.arranges
     size, wide = np.uint64(d * width), np.uint64(width)
@@ -59,7 +61,7 @@ def obstacles_of(plan: Obstacles) -> Callable[..., None]:
 
 @section
 def _agent_of(plan: AgentPlan) -> Callable[..., Any]:
-    """Make `agent(scratch, drawn, pos, vel, time, place, lane)`: an agent of a block, as its laws see it."""
+    """Make `agent(scratch, drawn, pos, vel, time, place, lane)`: return an agent of a block, as its laws see it."""
     vector_at, alone = vector_of_lane(plan.dimension, plan.width), alone_of(plan)
 
     def agent(scratch: Any, drawn: Any, pos: Any, vel: Any, time: Any, place: Any, lane: Any) -> Any:
@@ -72,7 +74,7 @@ def _agent_of(plan: AgentPlan) -> Callable[..., Any]:
 
 @functools.cache
 def _world_of(plan: Obstacles) -> Callable[..., Any]:
-    """Make `world(context)`: what is asked of the world in order to know what obstacles hide; nothing if none asks."""
+    """Make `world(context)`: return what occlusion by obstacles depends on; an empty tuple if no fold needs it."""
     if all(fold.hidden is None for fold in plan.folds):
         return kernel(lambda context: ())
 
@@ -89,7 +91,7 @@ def _world_of(plan: Obstacles) -> Callable[..., Any]:
 
 @section
 def _starts(plan: Obstacles) -> Callable[..., None]:
-    """Make how all folds of a block begin, and note how far they look."""
+    """Make `starts(context, pos, vel, time, place)`: begin all folds of a block, and note how far they reach."""
     width, agent, begin = plan.agent.width, _agent_of(plan.agent), in_turn(*(_start(plan, f) for f in plan.folds))
     reach, limited = np.uint64(max(plan.reach, 0)), plan.reach >= 0
     furthest: Any = _furthest(plan.folds) if limited else None
@@ -108,7 +110,7 @@ def _starts(plan: Obstacles) -> Callable[..., None]:
 
 @section
 def _start(plan: Obstacles, fold: Fold) -> Callable[..., None]:
-    """Make `start(scratch, numbers, me, row, lanes, lane)`: how one of them begins."""
+    """Make `start(scratch, numbers, me, row, lanes, lane)`: write the initial numbers of one fold."""
     k, start, slots, told = fold.k, fold.start, fold.slots, fold.told >= 0
     each, place = np.uint64(plan.felt // plan.agent.width), np.uint64(max(fold.told, 0))
     vector_at = vector_of_lane(plan.agent.dimension, plan.agent.width)
@@ -125,7 +127,7 @@ def _start(plan: Obstacles, fold: Fold) -> Callable[..., None]:
 
 @functools.cache
 def _furthest(folds: tuple[Fold, ...]) -> Callable[..., float]:
-    """Make `furthest(numbers, me)`: how far the fold looks that looks furthest, m."""
+    """Make `furthest(numbers, me)`: return the largest reach of all folds, m."""
     before, k, reach = _furthest(folds[:-1]) if folds[1:] else None, folds[-1].k, folds[-1].reach
 
     def furthest(numbers: Any, me: Any) -> Any:
@@ -135,12 +137,12 @@ def _furthest(folds: tuple[Fold, ...]) -> Callable[..., float]:
     return kernel(furthest)
 
 
-# --- what they meet ---------------------------------------------------------------------------------------------------
+# --- what they interact with ------------------------------------------------------------------------------------------
 
 
 @section
 def _circles(plan: Obstacles) -> Callable[..., None]:
-    """Make how all agents of a block, side by side, meet every circle of the state."""
+    """Make `circles(context, pos, vel, time, place)`: update all folds of a block by every circle of the state."""
     width, agent, circle = plan.agent.width, _agent_of(plan.agent), vector_of(plan.agent.dimension)
     offset_to, meet, world_of = plan.around.offset_to, meet_circle(plan.folds), _world_of(plan)
 
@@ -162,7 +164,7 @@ def _circles(plan: Obstacles) -> Callable[..., None]:
 
 @section
 def _placed(dimension: int, moving: bool) -> Callable[..., tuple[Vec, Vec]]:
-    """Make `placed(params, at, time)`: where the shape at `at` is at a time (s), m, and how fast it moves, m/s."""
+    """Make `placed(params, at, time)`: position (m) and velocity (m/s) of the shape at `at` at a time (s)."""
     vector_at = vector(dimension)
 
     def placed(params: Any, at: Any, time: Any) -> Any:
@@ -176,9 +178,9 @@ def _placed(dimension: int, moving: bool) -> Callable[..., tuple[Vec, Vec]]:
 
 @section
 def _row(plan: Obstacles, form: str) -> Callable[..., None]:
-    """Make `meet(numbers, world, params, me, at, place, where, vel, lanes, lane)`: one agent meets a shape.
+    """Make `meet(numbers, world, params, me, at, place, where, vel, lanes, lane)`: update an agent's folds by a shape.
 
-    It is left alone where it does not come within reach. where: its anchor, m; vel: m/s.
+    It is skipped if it is not within reach. where: its anchor, m; vel: m/s.
     """
     offset_to, nearest, meet = plan.around.offset_to, law_of("nearest", form), meet_shape(plan.folds, form)
     bounded, picks, reach = (
@@ -207,7 +209,7 @@ def _row(plan: Obstacles, form: str) -> Callable[..., None]:
 
 @section
 def _in_turn(plan: Obstacles, j: int) -> Callable[..., None]:
-    """Make how all agents of a block, side by side, meet every shape of form j."""
+    """Make `shapes(context, pos, vel, time, place)`: update all folds of a block by every shape of form j."""
     width, agent, world_of = plan.agent.width, _agent_of(plan.agent), _world_of(plan)
     placed, meet = _placed(plan.agent.dimension, plan.around.moving), _row(plan, plan.around.forms[j].name)
 
@@ -229,7 +231,10 @@ def _in_turn(plan: Obstacles, j: int) -> Callable[..., None]:
 
 @section
 def _looked_up(plan: Obstacles, j: int) -> Callable[..., None]:
-    """Make how each agent of a block meets the shapes of form j that may lie within reach, in order."""
+    """Make `shapes(context, pos, vel, time, place)`: update each agent's folds by shapes of form j, found by a grid.
+
+    Only those that may lie within reach, in order.
+    """
     width, agent, world_of = plan.agent.width, _agent_of(plan.agent), _world_of(plan)
     placed, meet = _placed(plan.agent.dimension, plan.around.moving), _row(plan, plan.around.forms[j].name)
     near, box = near_rows(plan.around.offset_to, plan.agent.dimension), _box(plan.folds, plan.only_rays)
@@ -259,9 +264,9 @@ def _looked_up(plan: Obstacles, j: int) -> Callable[..., None]:
 
 @functools.cache
 def _near_a_ray(folds: tuple[Fold, ...]) -> Callable[..., bool]:
-    """Make `near(numbers, params, at, y, me, seen)`: does a ray, up to `seen` m, come into the circle around a shape?
+    """Make `near(numbers, params, at, y, me, seen)`: return True if a ray comes near a shape.
 
-    Or the sphere.
+    That is, if a ray, up to `seen` m long, enters the bounding circle or sphere of the shape.
     """
     before, k, ray_of, rays = _near_a_ray(folds[:-1]) if folds[1:] else None, folds[-1].k, folds[-1].ray, folds[-1].rays
 
@@ -286,7 +291,7 @@ def _alike(x: Vec, length: float) -> Vec:
 
 @law
 def _grown(low: Vec, high: Vec, spot: Vec) -> tuple[Vec, Vec]:
-    """Return the corners of a box that has grown to hold a place."""
+    """Return the corners of a box, grown to hold a point."""
     a, b = (min(low[0], spot[0]), min(low[1], spot[1])), (max(high[0], spot[0]), max(high[1], spot[1]))
     if len(low) == 2:
         return a, b
@@ -296,9 +301,9 @@ def _grown(low: Vec, high: Vec, spot: Vec) -> tuple[Vec, Vec]:
 
 @section
 def _box(folds: tuple[Fold, ...], only_rays: bool) -> Callable[..., tuple[Vec, Vec]]:
-    """Make `box(numbers, me, seen)`: in which something may matter to an agent that looks `seen` m far.
+    """Make `box(numbers, me, seen)`: return the box that an agent's folds reach, its middle and half its edges, m.
 
-    Around all rays, if laws cast them, or around it: the middle, and half the edges, m.
+    It holds all rays if all folds cast rays, else all within `seen` m.
     """
     span: Any = _span(folds) if only_rays else None
 
@@ -316,9 +321,10 @@ def _box(folds: tuple[Fold, ...], only_rays: bool) -> Callable[..., tuple[Vec, V
 
 @functools.cache
 def _span(folds: tuple[Fold, ...]) -> Callable[..., tuple[Vec, Vec, float]]:
-    """Make `span(numbers, me, seen)`: the corners of the box around all rays, from the agent, m, and the widest body.
+    """Make `span(numbers, me, seen)`: return the corners of the box around all rays, and the widest body.
 
-    That is the radius of what goes along a ray, and what it keeps clear, m.
+    The corners are relative to the agent, m; the width is the radius of the body that moves along a ray plus its
+    margin, m.
     """
     before, k, ray_of, rays = _span(folds[:-1]) if folds[1:] else None, folds[-1].k, folds[-1].ray, folds[-1].rays
 
@@ -334,12 +340,15 @@ def _span(folds: tuple[Fold, ...]) -> Callable[..., tuple[Vec, Vec, float]]:
     return kernel(span)
 
 
-# --- the way around ---------------------------------------------------------------------------------------------------
+# --- the side to pass on ----------------------------------------------------------------------------------------------
 
 
 @section
 def _asides(plan: Obstacles, fold: Fold) -> Callable[..., None]:
-    """Make on which side each agent goes around what is in its way, for a law that asks: see around.py."""
+    """Make `asides(context, pos, vel, time, place)`: write on which side each agent passes the obstacle ahead.
+
+    For a law that reads it, see steering/around.py.
+    """
     k, ray_of, slots, ahead, width = fold.k, fold.ray, fold.slots, fold.ahead, plan.agent.width
     agent, aside, sides = _agent_of(plan.agent), aside_of(plan.around), fold.slots[-plan.agent.dimension :]
     first, which, place_at = np.uint64(slots[0]), np.uint64(ahead[0]), np.uint64(ahead[1])

@@ -1,4 +1,4 @@
-"""What folds over the obstacles depend on: which laws ask, where their numbers lie, which shapes they may skip."""
+"""What folds over the obstacles depend on: the laws, where their numbers lie, which shapes they may skip."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ __all__ = ["Fold", "Obstacles", "Place", "Shape", "obstacle_plan"]
 class Fold(NamedTuple):
     """An effect with a fold over the obstacles."""
 
-    k: int  # its number among all effects
-    start: Law  # its laws, or None where it has none
+    k: int  # its index among all effects
+    start: Law  # its laws; None if it has none
     law: Law
     ray: Any
-    origin: Any  # from where it sees obstacles, if not from where the agent is
+    origin: Any  # returns the point from which it sees obstacles, if not the agent's position
     reach: Any
     rays: int
-    pieces: bool  # are walls, polygons and rooms met side after side?
-    hidden: Surroundings | None  # by which obstacles others may be hidden from it; None: that does not matter
+    pieces: bool  # True if walls, polygons and rooms are handled one side at a time
+    hidden: Surroundings | None  # the obstacles that may hide others; None: occlusion does not matter
     slots: tuple[int, ...]  # where its running numbers lie
-    ahead: tuple[int, ...]  # where it is noted which obstacle is ahead, by form and place; nowhere if none asks
-    told: int  # where in a block of `felt` lies what its pair law has found out; -1: it has none
+    ahead: tuple[int, ...]  # where form and place of the obstacle ahead are noted; empty if no law reads them
+    told: int  # where the sum of its pair law lies in a block of `felt`; -1: it has none
 
 
 class Obstacles(NamedTuple):
@@ -37,13 +37,13 @@ class Obstacles(NamedTuple):
     agent: AgentPlan
     around: Surroundings
     folds: tuple[Fold, ...]
-    arranges: bool  # may what all agents have in common lie where the first block has it?
-    felt: int  # how many numbers of `felt` a block has
-    reach: int  # where it lies how far all folds look, m; -1: nowhere
-    found: int  # where rows lie that a grid lists; -1: nowhere
-    bounded: tuple[str, ...]  # forms of which a shape is met only if its box lies within reach
-    looked_up: tuple[str, ...]  # forms of which a grid lists the shapes that may lie within reach
-    only_rays: bool  # do all folds cast rays?
+    arranges: bool  # True if numbers that all agents share may be read from the first block
+    felt: int  # count of numbers of `felt` in a block
+    reach: int  # where the largest reach of all folds is noted, m; -1: nowhere
+    found: int  # where the rows that a grid lists are written; -1: nowhere
+    bounded: tuple[str, ...]  # forms whose shapes are skipped if their box is out of reach
+    looked_up: tuple[str, ...]  # forms whose shapes within reach are found by a grid
+    only_rays: bool  # True if all folds cast rays
 
 
 class Place(NamedTuple):
@@ -55,13 +55,13 @@ class Place(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """A shape as an agent meets it."""
+    """A shape as an agent sees it."""
 
     at: Any  # where its row begins
-    place: Any  # which of its form it is; of a form with a grid, how far its row lies behind the first
-    y: Any  # m, the agent from its anchor
+    place: Any  # index of it among its form; of a form with a grid, how far its row lies behind the first
+    y: Any  # m, the agent's offset from its anchor
     vel: Any  # m/s
-    gap: Any  # m, how far its surface is
+    gap: Any  # m, the distance of its surface
     out: Any  # the outward unit normal there
 
 

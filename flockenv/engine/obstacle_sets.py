@@ -1,4 +1,4 @@
-"""What follows from the parts of a scene for its obstacles: which forms there are, and which of them laws meet."""
+"""What follows from the parts of a scene for its obstacles: which forms there are, and which of them laws use."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from flockenv.physics.effects.effect import Effect, Sight
 __all__ = ["MetObstacles"]
 
 MOST_NUMBERS = 2**24
-"""Numbers of a form's rows, and of the grid over them, up to which single precision counts them exactly."""
+"""Numbers of a form's rows and of their grid, up to which single precision represents indices exactly."""
 
 
 class MetObstacles:
@@ -42,7 +42,7 @@ class MetObstacles:
 
     @functools.cached_property
     def shaped(self) -> tuple[NDArray[np.float64], dict[str, tuple[int, int]]]:
-        """The table of shapes that are not in the state, and the forms there are: where each begins, how many."""
+        """The table of shapes that are not in the state, and, by form, where the rows begin and how many there are."""
         if not self.meets_obstacles:
             return np.zeros(0), {}
         period = np.array(self.space.extent(self.dimension)) if self.space.periodic else None
@@ -55,22 +55,22 @@ class MetObstacles:
 
     @functools.cached_property
     def bounded(self) -> tuple[str, ...]:
-        """The forms of shapes that are only looked at where they lie within reach: none if some law asks for all.
+        """The forms of shapes that are skipped if out of reach; empty if some fold has no reach.
 
-        Those whose laws go from edge to edge, or from place to place. Blocks and half-spaces are met by lanes side by
-        side, which would go through all of the law anyhow: there it was no faster, with rays or without.
+        These are the forms whose laws loop over edges or cells. Laws of blocks and half-spaces are evaluated lane
+        beside lane, so some lane would need the whole law anyhow: there a test was no faster, with rays or without.
         """
         return tuple(form for form in ("chain", "distance_field") if form in self.shaped[1]) if self.reaches else ()
 
     @property
     def reaches(self) -> bool:
-        """True if all folds over obstacles say how far they reach."""
+        """True if all folds over obstacles have a reach."""
         folds = [e for e in self.effects if e.obstacle_start is not None]
         return bool(folds) and all(e.obstacle_reach is not None for e in folds)
 
     @functools.cached_property
     def cells(self) -> dict[str, NDArray[np.float64]]:
-        """Grids over the shapes of each form of which there are many, and which have an end: see shapes/cells.py."""
+        """Grids over the shapes of each form of finite extent that has many of them: see shapes/cells.py."""
         table, forms = self.shaped
         period = np.array(self.space.extent(self.dimension)) if self.space.periodic else None
         found = {}
@@ -88,7 +88,7 @@ class MetObstacles:
 
     @property
     def looked_up(self) -> tuple[str, ...]:
-        """The forms of which folds meet only the shapes that may lie within reach, found by a grid."""
+        """The forms for which folds use only the shapes that may lie within reach, found by a grid."""
         return tuple(self.cells) if self.reaches else ()
 
     @property
@@ -110,7 +110,7 @@ class MetObstacles:
 
     @property
     def meets_obstacles(self) -> bool:
-        """True if some law asks for obstacles, or for what is hidden by them."""
+        """True if some law depends on obstacles, or on what they hide."""
         return any(e.obstacle_law is not None for e in self.effects) or self.occludes
 
     @property

@@ -1,8 +1,8 @@
-"""The one sweep that all pair laws share: a block of listed agents meets its candidates, lane beside lane.
+"""The one loop over neighbours that all pair laws share: a block of listed agents and its candidates.
 
-Every pair law is evaluated for every candidate, and its sums keep what it says of those in sight; but contacts only of
-candidates whom some agent of the block may touch, for these are few. A topological sight needs a pass before that one,
-which finds how far its k nearest are.
+Every pair law is evaluated for every candidate, lane beside lane, and its sums keep the values for those in sight. Only
+contact laws are evaluated just for candidates that some agent of the block may touch, because these are few. A
+topological sight needs a pass before that one, which finds the distances of its k nearest neighbours.
 """
 
 from __future__ import annotations
@@ -37,14 +37,15 @@ __all__ = ["meet_neighbours"]
 
 APART, OTHER, TOGETHER = "in another place", "another agent", "another agent in the same place"
 NEAREST, CONTACTS = "another agent, to find the nearest", "another agent that may be touched"
-"""Which candidates a pass over them is about: ties are read of those in one place alone, where laws allow it."""
+"""Which candidates a pass is about: ties are read only of those in the same position, if laws allow it."""
 
 
 @section
 def _over_lanes(plan: Pairs, which: str, wrapped: bool, each: Callable[..., None]) -> Callable[..., bool]:
-    """Make what all lanes of a block do with a candidate; it returns whether some agent may touch it.
+    """Make `lanes_meet(numbers, besides, block, j, it)`: call `each` for all lanes of a block and candidate j.
 
-    wrapped: are images sought around the edge of a periodic box?
+    It returns True if some agent may touch the candidate. wrapped: True if the nearest image around the edge of a
+    periodic box is used.
     """
     width, parting, masks, sorts = plan.lanes, plan.parting, plan.masks, plan.listing.sorts
     agent, offset_to = agent_listed(plan.listing, plan.inner, plan.oriented), plan.offset_to
@@ -61,7 +62,7 @@ def _over_lanes(plan: Pairs, which: str, wrapped: bool, each: Callable[..., None
         own, o, touch = np.int32(j - block.at), like(numbers.reach, -0.0), False
         for lane in range(np.uint64(width)):
             me = agent(block.mine, block.first + lane, block.time, block.drawn)
-            if tied:  # lanes beyond the last agent hold what lay there
+            if tied:  # lanes beyond the last agent hold stale numbers
                 mine = np.uint64(lanes[home + lane]) if sorts else np.uint64(besides.ties[2][block.at + lane])
                 me = with_tie(me, tie(besides.ties, mine if block.at + lane < block.upto else np.uint64(0)))
             to = offset_to(size, me.pos, it.pos) if periodic else sub(it.pos, me.pos)
@@ -86,7 +87,7 @@ def _over_lanes(plan: Pairs, which: str, wrapped: bool, each: Callable[..., None
 
 @functools.cache
 def _within_any(sights: tuple[int, ...]) -> Callable[..., bool]:
-    """Make `within(views, other, square)`: may an agent touch a candidate?"""
+    """Make `within(views, other, square)`: return True if an agent may touch a candidate."""
     before, q = _within_any(sights[:-1]) if sights[1:] else None, sights[-1]
 
     def within(views: Any, other: Any, square: Any) -> Any:
@@ -98,7 +99,7 @@ def _within_any(sights: tuple[int, ...]) -> Callable[..., bool]:
 
 @section
 def _one_after_another(plan: Pairs, which: str, wrapped: bool, each: Callable[..., None]) -> Callable[..., None]:
-    """Make `meet(numbers, besides, block, r)`: a block meets the candidates of range r."""
+    """Make `meet(numbers, besides, block, r)`: apply `each` to a block and the candidates of range r."""
     candidate, sorts, length = (
         candidate_listed(plan.listing, plan.inner),
         plan.listing.sorts,
@@ -128,9 +129,9 @@ def _one_after_another(plan: Pairs, which: str, wrapped: bool, each: Callable[..
 
 @section
 def _looking_ahead(plan: Pairs, each: Callable[..., None]) -> Callable[..., None]:
-    """Make `meet(numbers, besides, block, r)` for a small world: the next candidate's distance is worked out early.
+    """Make `meet(numbers, besides, block, r)` for a small world: the next candidate's distance is computed early.
 
-    Behind the last one lies some other number: a row has room for more, and how far that is is never read.
+    The number behind the last candidate is arbitrary: a row has room for it, and its distance is never used.
     """
     listing, width, parting = plan.listing, plan.lanes, plan.parting
     agent, candidate = agent_listed(listing, plan.inner, plan.oriented), candidate_listed(listing, plan.inner)
@@ -171,10 +172,10 @@ def _looking_ahead(plan: Pairs, each: Callable[..., None]) -> Callable[..., None
 
 @section
 def _over_ranges(plan: Pairs, which: str, each: Callable[..., None]) -> Callable[..., None]:
-    """Make `meet(numbers, besides, block, found)`: a block meets the candidates of all its ranges.
+    """Make `meet(numbers, besides, block, found)`: apply `each` to a block and the candidates of all its ranges.
 
-    Only around the edge of a periodic box are images sought; what comes seldom has one form: the nearest image of an
-    agent that is near is the agent itself.
+    Images are considered only around the edge of a periodic box. The rare pass over agents in the same position is
+    compiled once, with images: the nearest image of a near agent is the agent itself.
     """
     listing = plan.listing
     ahead, both = plan.ahead and which == APART, listing.periodic and listing.sorts and which != TOGETHER
@@ -199,7 +200,7 @@ def _over_ranges(plan: Pairs, which: str, each: Callable[..., None]) -> Callable
 
 @section
 def _block(plan: Pairs) -> Callable[..., int]:
-    """Make what one block does: meet its candidates, and tell what comes of it; it returns how many pairs were met."""
+    """Make the function of one block for `walk_blocks`: evaluate pair laws, write sums; return the number of pairs."""
     begin, finish, tell = begin_sums(plan), finish_sums(plan), tell_sums(plan)
     meet = _over_ranges(plan, APART if plan.parting else OTHER, add_candidate(plan, False, plan.parting))
     nearest = any(view.near[1] for view in plan.views)
@@ -232,7 +233,7 @@ def _block(plan: Pairs) -> Callable[..., int]:
             met += (ranges[r, 1] - ranges[r, 0]) * (upto - at)
             others += ranges[r, 1] - ranges[r, 0]
         meet(numbers, besides, block, found)
-        if together is not None:  # seldom are two agents in one place
+        if together is not None:  # two agents rarely share a position
             crowded, all_of_them = False, like(numbers.reach, others)
             for lane in range(np.uint64(width)):
                 crowded |= tally_of(scratch.lanes[here + lane]) < all_of_them
@@ -251,9 +252,9 @@ def _block(plan: Pairs) -> Callable[..., int]:
 
 @section
 def meet_neighbours(plan: Pairs) -> Callable[..., None]:
-    """Make `meet(context, pos, vel, time)`: write to `felt` what agents feel from their neighbours at this instant.
+    """Make `meet(context, pos, vel, time)`: write the sums of pair laws for this thread's blocks to `felt`.
 
-    One listing per instant, one sweep for all pair laws. A team of threads shares both.
+    One listing per evaluation, one loop over candidates for all pair laws. A team of threads shares both.
     """
     list_all, walk = list_living(plan.listing), walk_blocks(plan.listing, _block(plan))
     folds = sum(law.joined is not None for law in plan.laws)
@@ -265,7 +266,7 @@ def meet_neighbours(plan: Pairs) -> Callable[..., None]:
             work[b, 3] += folds * context.n * context.obstacle_radius.shape[1]
         shape = list_all(context, pos, vel)
         scratch.tally[context.rank] = walk(context, shape, time)
-        wait_for_team(scratch.sync, context.team)  # what is felt was written by others
+        wait_for_team(scratch.sync, context.team)  # `felt` was written by other threads
         if context.rank == 0:
             for r in range(context.team):
                 work[b, 2] += scratch.tally[r]

@@ -1,4 +1,4 @@
-"""What the sweep over neighbours depends on: which pair laws there are, how they look around, where their sums lie."""
+"""What the loop over neighbours depends on: the pair laws, their sights, and where their sums lie."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ __all__ = ["PairLaw", "Pairs", "View", "pairs_of"]
 
 
 class View(NamedTuple):
-    """How some pair laws look around."""
+    """The sight that some pair laws share."""
 
-    fov: int  # the first sight with the same field of view; -1: all around
-    grouped: bool  # is one group alone seen?
-    occluded: bool  # are agents that an obstacle hides not seen?
-    near: tuple[int, int]  # where the squares of the nearest lie, and how many of them there are; (0, 0): all count
-    counted: int  # where the agents in sight are counted; -1: nowhere
+    fov: int  # the first sight with the same field of view; -1: in all directions
+    grouped: bool  # True if only one group is seen
+    occluded: bool  # True if agents that an obstacle hides are not seen
+    near: tuple[int, int]  # where the squares of the nearest lie, and their number; (0, 0): not topological
+    counted: int  # where agents in sight are counted; -1: nowhere
 
 
 class PairLaw(NamedTuple):
     """An effect with a pair law."""
 
-    k: int  # its number among all effects
-    start: Any  # its laws, or None where it has none
+    k: int  # its index among all effects
+    start: Any  # its laws; None if it has none
     pair: Any
     apart: Any
     finish: Any
-    joined: Any  # its law of obstacles, of a fold that meets these before neighbours
+    joined: Any  # its law of obstacles, if its fold takes these before neighbours
     first: int  # where its running numbers lie
     sums: int
     sight: int
@@ -41,24 +41,24 @@ class PairLaw(NamedTuple):
     vanishes: bool
     averages: bool
     images: Images | None
-    target: int  # what it adds to
+    target: int  # index of the target that it adds to
 
 
 class Pairs(NamedTuple):
-    """All that the sweep over neighbours depends on."""
+    """All that the loop over neighbours depends on."""
 
     listing: Listing
     views: tuple[View, ...]
     laws: tuple[PairLaw, ...]
-    targets: tuple[int, ...]  # where what each target comes to lies
+    targets: tuple[int, ...]  # where the sum of each target lies
     inner: tuple[str, ...]
     oriented: bool
-    parting: bool  # are those in one place met by themselves?
-    seldom: bool  # are ties not listed, because they are seldom looked at?
-    ahead: bool  # is it worked out how far the next candidate is while one is met?
-    masks: bool  # is what was compared kept in masks, so that it costs nothing to compare once more?
+    parting: bool  # True if agents in the same position are handled in a pass of their own
+    seldom: bool  # True if ties are not listed, because they are rarely read
+    ahead: bool  # True if the next candidate's distance is computed early
+    masks: bool  # True if comparisons yield mask registers, so that repeating one costs nothing
     offset_to: Law
-    hidden: Surroundings | None  # by which obstacles agents may be hidden, see visibility.py
+    hidden: Surroundings | None  # the obstacles that may hide agents, see visibility.py
 
     @property
     def lanes(self) -> int:
@@ -66,12 +66,12 @@ class Pairs(NamedTuple):
         return self.listing.width
 
     def slots(self, first: int, count: int) -> tuple[int, ...]:
-        """Return where running numbers lie that follow each other."""
+        """Return where consecutive running numbers lie."""
         return tuple(first + k * self.lanes for k in range(count))
 
 
 def pairs_of(parts: Parts) -> Pairs:
-    """Return what the sweep of a scene depends on."""
+    """Return what the loop over the neighbours of a scene depends on."""
     listing = listing_of(parts, parts.sorted_fields, parts.confines, parts.arranges)
     fovs = [sight.fov for sight in parts.sights]
     views = tuple(

@@ -1,4 +1,4 @@
-"""What pair laws add up for the agents of a block: how sums begin, what a candidate adds, and what they come to."""
+"""Sums of pair laws for the agents of a block: how they begin, what a candidate adds, and how they are finished."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ __all__ = ["add_candidate", "begin_sums", "finish_sums", "keep_nearest", "tell_s
 
 @section
 def _seen(plan: Pairs, q: int, cut: bool) -> Callable[..., bool]:
-    """Make `seen(numbers, besides, me, it, other, gap, lanes, lane)`: is a candidate in a sight?
+    """Make `seen(numbers, besides, me, it, other, gap, lanes, lane)`: return True if a candidate is in a sight.
 
-    cut: of a topological sight, is it known already how far its nearest are?
+    cut: for a topological sight, True if the distances of its nearest neighbours are known already.
     """
     view, masks = plan.views[q], plan.masks
     hidden: Any = blocked(plan.hidden) if plan.hidden is not None else None
@@ -48,7 +48,7 @@ def _seen(plan: Pairs, q: int, cut: bool) -> Callable[..., bool]:
             found = in_view(numbers.views[fov].cone, me.heading, it.offset, square) & found
         if grouped:
             found = found & (it.who >= mine.first) & (it.who < mine.end)
-        if occluded:  # an agent out of sight anyhow is not looked for behind obstacles
+        if occluded:  # an agent out of sight anyway needs no occlusion test
             obstacle_x, obstacle_radius, params, b = besides.scenery
             found = found and not hidden(
                 obstacle_x, obstacle_radius, params, numbers.size, b, me.time, me.pos, it.offset
@@ -65,9 +65,9 @@ def _seen(plan: Pairs, q: int, cut: bool) -> Callable[..., bool]:
 
 @section
 def _adds(plan: Pairs, law: PairLaw, q: int, apart: bool) -> Callable[..., None]:
-    """Make `adds(numbers, me, it, seen, o, lanes, lane)`: what one candidate adds to the running numbers of a law.
+    """Make `adds(numbers, me, it, seen, o, lanes, lane)`: add one candidate to the running numbers of a law.
 
-    seen: of each sight that is looked at, is it in there? The law has number q of those.
+    seen: for each sight that is tested, True if the candidate is in it; q: index of the law's sight in `seen`.
     """
     k, folds, vanishes, slots = law.k, law.start is not None, law.vanishes, plan.slots(law.first, law.sums)
     says_of = law.apart if apart and law.apart is not None else law.pair
@@ -88,12 +88,12 @@ def _adds(plan: Pairs, law: PairLaw, q: int, apart: bool) -> Callable[..., None]
 
 @section
 def add_candidate(plan: Pairs, touch: bool, apart: bool) -> Callable[..., None]:
-    """Make `meet(numbers, besides, me, it, other, gap, o, lanes, lane)`: what one candidate adds, by all laws.
+    """Make `meet(numbers, besides, me, it, other, gap, o, lanes, lane)`: add one candidate to the sums of all laws.
 
-    touch: by contacts, or by all others; apart: of the agents that it counts for, none is in one place with it.
+    touch: of contact laws, or of all others; apart: True if no agent that the candidate counts for shares its position.
     """
     laws = [law for law in plan.laws if law.contact == touch]
-    laws.sort(key=lambda law: law.vanishes)  # registers: others need one less while the first are worked out
+    laws.sort(key=lambda law: law.vanishes)  # others need one register less while the first are computed
     asked = sorted({law.sight for law in laws})
     see = tuple_from(*(_seen(plan, q, True) for q in asked))
     add_all = in_turn(*(_adds(plan, law, asked.index(law.sight), apart) for law in laws))
@@ -113,7 +113,7 @@ def add_candidate(plan: Pairs, touch: bool, apart: bool) -> Callable[..., None]:
 
 @functools.cache
 def _count_one(q: int, place: int) -> Callable[..., None]:
-    """Make `count(seen, lanes, lane)`: count the candidates in a sight, of which laws read the number."""
+    """Make `count(seen, lanes, lane)`: count the candidates in a sight whose count laws read."""
     at = np.uint64(place)
 
     def count(seen: Any, lanes: Any, lane: Any) -> None:
@@ -124,9 +124,9 @@ def _count_one(q: int, place: int) -> Callable[..., None]:
 
 @section
 def keep_nearest(plan: Pairs) -> Callable[..., None]:
-    """Make a pass that keeps, of each topological sight, the squares of its nearest, in order.
+    """Make a pass that keeps, for each topological sight, the squares of its nearest neighbours, in order.
 
-    It is called as `add_candidate`'s is.
+    It has the arguments of the function that `add_candidate` makes.
     """
     keep = in_turn(*(_keep_one(plan, q) for q, view in enumerate(plan.views) if view.near[1]))
 
@@ -148,12 +148,12 @@ def _keep_one(plan: Pairs, q: int) -> Callable[..., None]:
     return keep
 
 
-# --- how sums begin, and what they come to ----------------------------------------------------------------------------
+# --- how sums begin and end -------------------------------------------------------------------------------------------
 
 
 @section
 def begin_sums(plan: Pairs) -> Callable[..., None]:
-    """Make `begin(numbers, obstacles, block)`: how the running numbers of a block begin."""
+    """Make `begin(numbers, obstacles, block)`: initialise the running numbers of a block."""
     listing, width = plan.listing, plan.lanes
     sums = [slot for law in plan.laws if law.start is None for slot in plan.slots(law.first, law.sums)]
     sums += [int(listing.slot("here0"))] * plan.parting + [view.counted for view in plan.views if view.counted >= 0]
@@ -176,9 +176,9 @@ def begin_sums(plan: Pairs) -> Callable[..., None]:
 
 @section
 def _start(plan: Pairs, law: PairLaw) -> Callable[..., None]:
-    """Make `start(numbers, obstacles, me, lanes, lane)`: how a fold begins.
+    """Make `start(numbers, obstacles, me, lanes, lane)`: write the initial numbers of a fold.
 
-    With the obstacles, where it is one fold over these, too: (obstacle_x, obstacle_radius, b).
+    If the fold is also one over obstacles, they come first: (obstacle_x, obstacle_radius, b).
     """
     begin, joined, offset_to, given = law.start, law.joined, plan.offset_to, given_of(law.k, law.images)
     slots, centre = plan.slots(law.first, law.sums), vector_of(plan.listing.dimension)
@@ -201,7 +201,7 @@ def _start(plan: Pairs, law: PairLaw) -> Callable[..., None]:
 
 @section
 def finish_sums(plan: Pairs) -> Callable[..., None]:
-    """Make `finish(numbers, block)`: what the running numbers of a block come to, by target."""
+    """Make `finish(numbers, block)`: compute the sum of each target from the running numbers of a block."""
     agent, width = agent_listed(plan.listing, plan.inner, plan.oriented), plan.lanes
     ends = in_turn(*(_end(plan, t) for t in range(len(plan.targets))))
 
@@ -215,7 +215,7 @@ def finish_sums(plan: Pairs) -> Callable[..., None]:
 
 @section
 def _end(plan: Pairs, target: int) -> Callable[..., None]:
-    """Make `end(numbers, me, lanes, lane)`: add up what all laws with one target come to."""
+    """Make `end(numbers, me, lanes, lane)`: add up the results of all laws with one target."""
     total = _total(plan, tuple(law for law in plan.laws if law.target == target))
     slots = plan.slots(plan.targets[target], plan.listing.dimension)
     return lambda numbers, me, lanes, lane: scatter(lanes, lane, slots, total(numbers, me, lanes, lane))
@@ -241,7 +241,7 @@ def _total(plan: Pairs, laws: tuple[PairLaw, ...]) -> Callable[..., Any]:
 
 @section
 def tell_sums(plan: Pairs) -> Callable[..., None]:
-    """Make `tell(felt, order, block, by_number)`: write what a block feels to where its agents find it."""
+    """Make `tell(felt, order, block, by_number)`: write the sums of a block to `felt`, by agent."""
     width, sorts, home = plan.lanes, plan.listing.sorts, plan.listing.slot("home0")
     slots = tuple(slot for first in plan.targets for slot in plan.slots(first, plan.listing.dimension))
     rows, first = tuple(k * width for k in range(len(slots))), (0,) * len(slots)

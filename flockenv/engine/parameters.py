@@ -1,7 +1,7 @@
-"""The numbers of a scene: how they are packed into the one array that a kernel is handed, and read there by name.
+"""The numbers of a scene: how they are packed into the one array that a kernel is passed, and read there by name.
 
-`pack_numbers` says both at once, the values and where each lies (`NumberPlan`), so that packing and reading cannot
-disagree. Code depends on the plan; the values are arguments, and another value compiles nothing.
+`pack_numbers` returns both at once, the values and where each lies (`NumberPlan`), so that packing and reading cannot
+disagree. Code depends on the plan; the values are arguments, so a new value compiles nothing.
 """
 
 from __future__ import annotations
@@ -42,33 +42,33 @@ class Form(NamedTuple):
 
     at: Any
     many: Any
-    cells: Any  # 0 of a form without a grid
+    cells: Any  # 0 for a form without a grid
 
 
 class View(NamedTuple):
-    """How pair laws look around: see effects.base.Sight."""
+    """A sight as kernels read it: see flockenv.physics.effects.effect.Sight."""
 
     within: float  # m^2, radius squared
     cone: float  # what `in_view` compares
-    first: float  # the agents that are seen at all: those of a group, [first, end); 0 where all are
+    first: float  # the agents that can be seen: those of a group, [first, end); unused if all can
     end: float
 
 
 class Numbers(NamedTuple):
     """Every number of a scene, as its kernels read them."""
 
-    size: tuple[float, ...]  # m, of the space
-    reach: float  # m, the largest distance at which any law looks for neighbours
+    size: tuple[float, ...]  # m, size of the space
+    reach: float  # m, the largest radius within which any law looks for neighbours
     forms: tuple[Form, ...]
     views: tuple[View, ...]
-    effects: tuple[Any, ...]  # of each effect a record of what its laws are given, by name
+    effects: tuple[Any, ...]  # for each effect a record of what its laws are passed, by name
     space: tuple[float, ...]
     method: tuple[float, ...]
-    look: tuple[float, ...]  # the radius of what a task shows, m, and its square
+    look: tuple[float, ...]  # the radius of a task's query, m, and its square
 
 
 class EffectPlan(NamedTuple):
-    """Where the numbers of an effect lie: of each name whether it is a number, vector, table or counters, and where."""
+    """Where the numbers of an effect lie, and of what kind each is: a number, vector, table or counters."""
 
     names: tuple[str, ...]
     kinds: tuple[tuple[str, int, int], ...]  # (kind, place, how many numbers)
@@ -79,7 +79,7 @@ class NumberPlan(NamedTuple):
 
     dimension: int
     forms: tuple[tuple[int, bool], ...]  # (place, has a grid)
-    views: tuple[tuple[int, bool], ...]  # (place, sees one group alone)
+    views: tuple[tuple[int, bool], ...]  # (place, sees only one group)
     effects: tuple[EffectPlan, ...]
     space: tuple[int, int]  # (place, how many)
     method: tuple[int, int]
@@ -87,14 +87,14 @@ class NumberPlan(NamedTuple):
 
 
 EDGE = 8
-"""Rounding errors by which a field of view is wider: as many as a heading, an offset and their product have."""
+"""Rounding errors by which a field of view is wider: those of a heading, an offset and their product."""
 
 
 def view_of(fov: float, dtype: str) -> float:
     """Return c |c|, what `in_view` compares, with c = cos(fov / 2); fov in degrees.
 
-    The edge belongs to the field of view in either precision, since c is less by EDGE machine epsilons: with 180
-    degrees a neighbour exactly abeam is in view, whatever the heading is.
+    The edge belongs to the field of view in either precision, because c is decreased by EDGE machine epsilons: with 180
+    degrees a neighbour exactly abeam is in view, for every heading.
     """
     cosine = math.cos(math.radians(fov) / 2.0) - EDGE * float(np.finfo(dtype).eps)
     return cosine * abs(cosine)
@@ -105,7 +105,7 @@ class Numbered(Protocol):
 
     @property
     def dimension(self) -> int:
-        """D."""
+        """Number of axes, D."""
 
     @property
     def dtype(self) -> str:
@@ -113,15 +113,15 @@ class Numbered(Protocol):
 
     @property
     def space(self) -> Space:
-        """Where agents are."""
+        """The space in which agents move."""
 
     @property
     def effects(self) -> tuple[Effect, ...]:
-        """What acts on them."""
+        """The effects on agents."""
 
     @property
     def integrator(self) -> Integrator:
-        """The method."""
+        """The integrator."""
 
     @property
     def shaped(self) -> tuple[Any, dict[Any, tuple[int, int]]]:
@@ -133,15 +133,15 @@ class Numbered(Protocol):
 
     @property
     def tables(self) -> tuple[Any, ...]:
-        """What the laws of each tabled effect look up."""
+        """The lookup tables of tabled effects."""
 
     @property
     def reach(self) -> float:
-        """The largest reach of a pair law, m."""
+        """The largest radius of a sight, m."""
 
     @property
     def sights(self) -> Any:
-        """The fields of view of pair laws, each once."""
+        """The sights of pair laws, each once."""
 
     @property
     def starts(self) -> tuple[int, ...]:
@@ -149,11 +149,11 @@ class Numbered(Protocol):
 
     @property
     def counters(self) -> int:
-        """How many places count what laws report."""
+        """How many counters laws have."""
 
     @property
     def look(self) -> Any:
-        """What a task shows its agents, if it shows any."""
+        """The query of a task, if it has one."""
 
     def numbers_of(self, effect: Effect) -> dict[str, Any]:
         """Return the numbers of an effect by name."""
@@ -163,15 +163,15 @@ class Numbered(Protocol):
 
 
 def pack_numbers(parts: Numbered) -> tuple[list[float], NumberPlan]:
-    """Return every number that a kernel is given, and where each lies; tables come behind them.
+    """Return every number that a kernel is passed, and where each lies; tables follow behind them.
 
-    What lies behind (rows of shapes, grids, tables) is known by where it begins, and a table by where it ends, too.
+    What follows (rows of shapes, grids, tables) is addressed by where it begins, a table also by where it ends.
     """
     shapes, forms = parts.shaped
     ends = np.cumsum([len(shapes), *map(len, parts.cells.values())]).tolist()
     grids = dict(zip(parts.cells, ends, strict=False))
     tables = iter(np.cumsum([ends[-1], *map(len, parts.tables)]).tolist())
-    begin, behind = next(tables), []  # (place, how far behind all numbers what is meant lies)
+    begin, behind = next(tables), []  # (place, offset behind all numbers that goes there)
     values: list[float] = [*parts.space.extent(parts.dimension), parts.reach]
     planned_forms, views, effects = [], [], []
     for form, (where, count) in forms.items():
@@ -212,13 +212,13 @@ def pack_numbers(parts: Numbered) -> tuple[list[float], NumberPlan]:
 
 
 def _look_numbers(parts: Numbered) -> list[float]:
-    """Return how far a task looks around, m, and the square of that; nothing if it does not."""
+    """Return the radius of a task's query, m, and its square; an empty list if there is none."""
     return [parts.look.radius, parts.look.radius**2] if parts.look else []
 
 
 @section
 def numbers_of(plan: NumberPlan) -> Callable[[Any, Any], Numbers]:
-    """Make `numbers_of(params, counters)`: all numbers of a scene, read from the arrays that its kernel is handed."""
+    """Make `numbers_of(params, counters)`: read all numbers of a scene from the arrays that its kernel is passed."""
     d, size = plan.dimension, tuple(range(plan.dimension))
     forms, views, effects = _all(_form, plan.forms), _all(_view, plan.views), _all(_effect, plan.effects)
     space, method, look = (_places(*some) for some in (plan.space, plan.method, plan.look))
@@ -278,7 +278,7 @@ def _effect(plan: EffectPlan) -> Callable[..., Any]:
 
 
 def _runs(kinds: tuple[tuple[str, int, int], ...]) -> tuple[tuple[str, int, int], ...]:
-    """Return the same with numbers that follow each other read at once."""
+    """Return the same, with consecutive numbers read at once."""
     runs: list[tuple[str, int, int]] = []
     for kind, at, count in kinds:
         if kind == "number" and runs and runs[-1][0] == "number" and sum(runs[-1][1:]) == at:
@@ -307,7 +307,7 @@ def _run(run: tuple[str, int, int]) -> Callable[..., tuple[Any, ...]]:
 
 
 class Images(NamedTuple):
-    """Which numbers of an effect are points: on a torus these have images, and laws see the nearest."""
+    """Which numbers of an effect are points: on a torus these have images, and laws are passed the nearest."""
 
     names: tuple[str, ...]
     points: tuple[str, ...]
@@ -315,7 +315,7 @@ class Images(NamedTuple):
 
 
 def images_in(parts: Numbered, effect: Effect) -> Images | None:
-    """Return which numbers of an effect have images in the space of a scene; None if none has."""
+    """Return which numbers of an effect have images in the space of a scene; None if it has none."""
     if not (parts.space.periodic and effect.places):
         return None
     return Images(tuple(parts.names_of(effect)), tuple(effect.places), parts.space.offset_law)
@@ -323,7 +323,7 @@ def images_in(parts: Numbered, effect: Effect) -> Images | None:
 
 @section
 def images_of(plan: Images) -> Callable[..., Any]:
-    """Make `images_of(p, size, here)`: the record of an effect with its points where they are nearest to `here`."""
+    """Make `images_of(p, size, here)`: return an effect's record with the images of its points nearest to `here`."""
     kind = record(plan.names)
     values = _imaged(tuple(name in plan.points for name in plan.names), plan.offset_to)
 
@@ -335,7 +335,7 @@ def images_of(plan: Images) -> Callable[..., Any]:
 
 @functools.cache
 def _imaged(points: tuple[bool, ...], offset_to: Law) -> Callable[..., tuple[Any, ...]]:
-    """Make a function that returns the values of a record, those that are points as seen from somewhere."""
+    """Make a function that returns the values of a record, points as the images nearest to a position."""
     *earlier, point = points
     before, last = _imaged(tuple(earlier), offset_to) if earlier else None, len(earlier)
 

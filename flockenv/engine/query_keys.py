@@ -1,4 +1,4 @@
-"""How a block of a small world keeps lists of the nearest agents as keys: squares whose last bits are places.
+"""Lists of the nearest agents of a block of a small world as keys: squares whose last bits are places.
 
 Four candidates at once are sorted and merged with a list (`nearest.merged`).
 """
@@ -23,15 +23,15 @@ from flockenv.maths.vectors import exact_dot, sub
 __all__ = ["by_keys_of"]
 
 NOBODY = np.uint32(0xFFFFFFFF)
-"""A key that comes after those of all agents."""
+"""A key that sorts after those of all agents."""
 
 
 @section
 def by_keys_of(plan: LookPlan) -> Callable[..., bool]:
-    """Make `by_keys(rows, number, lanes, near, span, block, n)`: keep lists of keys, and tell them without a doubt.
+    """Make `by_keys(rows, number, lanes, near, span, block, n)`: keep lists of keys, and write them if certain.
 
-    They are one longer than asked for. Where two neighbours of a list, or one and the edge of sight, differ in less
-    than the bits that are left of a square, it returns False: all is to be found in the other way, once more.
+    The lists are one longer than needed. If two neighbours of a list, or one and the edge of sight, differ in less than
+    the bits that remain of a square, it returns False: then the lists must be computed again from squares.
     """
     width, lists, key = plan.listing.width, plan.slots("square", plan.agents + 1), _key(plan)
     tell, place, place_them = _tell_keys(plan), plan.place, _place_them(plan)
@@ -80,7 +80,7 @@ def _key(plan: LookPlan) -> Callable[..., Any]:
 def _tell_keys(plan: LookPlan) -> Callable[..., bool]:
     """Make `tell(lanes, near, block, tags, edge)`: write the lists of a block.
 
-    It returns True if rounding leaves no doubt of them.
+    It returns True if rounding leaves no doubt about them.
     """
     width, many, squares = plan.listing.width, plan.agents, plan.listing.slot("square0")
 
@@ -102,7 +102,7 @@ def _tell_keys(plan: LookPlan) -> Callable[..., bool]:
 
 @section
 def _place_them(plan: LookPlan) -> Callable[..., None]:
-    """Make `place_them(rows, lanes, near, span, block, n, edge)`: tell where the listed are, and squares, anew."""
+    """Make `place_them(rows, lanes, near, span, block, n, edge)`: write positions of the nearest, and exact squares."""
     width, many, d, squares = plan.listing.width, plan.agents, plan.listing.dimension, plan.listing.slot("square0")
     first = np.uint64(plan.place[0])
     place, offset_to, periodic, listed_at = plan.place, plan.offset_to, plan.listing.periodic, vector_of(d)

@@ -1,4 +1,4 @@
-"""What `look` depends on, and what its parts hand each other."""
+"""What `look` depends on, and what its functions pass each other."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ class LookPlan(NamedTuple):
     """All that `look` depends on."""
 
     listing: Listing
-    agents: int  # how many of the nearest agents are listed
-    obstacles: int  # and how many obstacles
-    keyed: bool  # are lists of agents kept as keys?
-    exact: bool  # is each operation of a square rounded, in every loop the same?
+    agents: int  # number of nearest agents in a list
+    obstacles: int  # number of nearest obstacles in a list
+    keyed: bool  # True if lists of agents are kept as keys
+    exact: bool  # True if each operation of a square is rounded, the same in every loop
     offset_to: Law
-    at: int  # where its numbers begin: how far it looks, m, and the square of that
+    at: int  # where its numbers begin: radius, m, and the square of that
 
     @property
     def place(self) -> tuple[int, ...]:
@@ -45,15 +45,15 @@ def plan_look(parts: Parts) -> LookPlan:
 
 
 class Span(NamedTuple):
-    """How far agents look."""
+    """The radius of the query."""
 
-    size: Any  # m, of the space
+    size: Any  # m, size of the space
     reach: Any  # m
     within: Any  # m^2, its square
 
 
 class Nearest(NamedTuple):
-    """Where the nearest agents are told."""
+    """Where the nearest agents are written."""
 
     square: Any  # (K, N) m^2
     who: Any  # (K, N)
@@ -62,15 +62,15 @@ class Nearest(NamedTuple):
 
 
 class Looking(NamedTuple):
-    """One world in which agents look around: the fields of a context that listing agents and walking blocks read."""
+    """One world in which neighbours are queried: the fields of a context that listing and walking blocks read."""
 
     numbers: Span
     near: Nearest
-    n: Any  # how many agents
-    present: Any  # how many of them are alive
-    arranged: Any  # never: agents lie by number
+    n: Any  # number of agents
+    present: Any  # number of agents alive
+    arranged: Any  # always False: agents lie by number
     first: Any  # blocks: [first, end)
     end: Any
-    rank: Any  # one thread alone
+    rank: Any  # a single thread
     team: Any
     scratch: Any

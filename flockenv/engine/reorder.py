@@ -1,10 +1,10 @@
-"""A large world is put in order for as long as a call of several steps lasts: near in space is near in memory.
+"""Reordering a large world for the duration of a call of several steps: near in space becomes near in memory.
 
-Agents are numbered as the scene lists them, and neighbours by number lie anywhere in space: sorting them by cell is one
-distant place in memory per agent and step. So at the beginning of a call all that is known of an agent moves to where
-its tile of cells comes, by number within (`flockenv.geometry.spatial_sort`). Each step then sorts what is nearly
-sorted; and at the end all agents go home. `ident` says which agent is where in between. Sums do not notice: within a
-cell agents are met in the order of their numbers all the same.
+Agents are numbered as the scene lists them, and consecutive agents lie anywhere in space: sorting them by cell takes an
+access to distant memory per agent and step. So at the beginning of a call all data of an agent moves to where its tile
+of cells lies, by number within (`flockenv.geometry.spatial_sort`). Each step then sorts what is nearly sorted, and at
+the end all agents move back. `ident` holds which agent lies where in between. Sums do not change: within a cell agents
+are still visited in the order of their numbers.
 """
 
 from __future__ import annotations
@@ -27,38 +27,38 @@ from flockenv.jit.transpose import put_lines
 __all__ = ["Luggage", "arrange_plan", "go_home_of", "move_in_of"]
 
 AHEAD = 64
-"""How many agents ahead it is asked for what has been packed."""
+"""How many agents ahead packed data is prefetched."""
 
 _COMMON = {**dict.fromkeys(("mass", "radius", "max_speed", "max_force"), 0), "want": 1}
-"""What all agents may have in common, and by which mask it is read then, see `blocks.common_places`."""
+"""What all agents may share, and by which mask it is read then, see `blocks.common_places`."""
 
 
 class Luggage(NamedTuple):
-    """What is packed of each agent: numbers of arrays, each at a place; see `gather.places_each`."""
+    """What is packed of each agent: numbers of arrays, each at a place; see `lane_access.places_each`."""
 
     arrays: tuple[int, ...]  # in which array each lies
-    which: tuple[int, ...]  # behind which start: of numbers, of vectors, and the same where all have them in common
+    which: tuple[int, ...]  # index of the start: of numbers, of vectors, and both again for what all agents may share
     further: tuple[int, ...]
     own: tuple[tuple[int, ...], ...]  # which of them each agent has for itself: always, by mask 0, by mask 1
 
 
 class ArrangePlan(NamedTuple):
-    """What putting agents in order depends on."""
+    """What reordering agents depends on."""
 
     dimension: int
     width: int
     periodic: bool
-    wraps: bool  # may agents lie outside a periodic box?
+    wraps: bool  # True if agents may lie outside a periodic box
     homely: bool
     inner: bool
     luggage: Luggage
-    size: int  # numbers of an agent that is packed, in whole cache lines
+    size: int  # numbers of a packed agent, in whole cache lines
 
 
 def arrange_plan(parts: Parts) -> ArrangePlan:
     """Return the plan of a scene."""
     names = array_names(parts)
-    packed = [field.partition(" ") for field in parts.luggage]  # an array, and of vectors which axis
+    packed = [field.partition(" ") for field in parts.luggage]  # an array, and for vectors the axis
     common = [_COMMON.get(name) for name, _, _ in packed]
     starts = [
         (2 if mask is not None else 0) + (1 if axis else 0) for mask, (_, _, axis) in zip(common, packed, strict=True)
@@ -78,10 +78,9 @@ def arrange_plan(parts: Parts) -> ArrangePlan:
 
 @section
 def move_in_of(plan: ArrangePlan) -> Callable[..., bool]:
-    """Make `move_in(scratch, numbers, count, share)`: move agents to where their tiles come, if that is worth it.
+    """Make `move_in(scratch, numbers, count, share)`: move agents to their tiles, if that pays; return True if so.
 
-    count: steps that are made before they go home. share: (n, present, first, end, rank, team). It returns whether
-    they have moved.
+    count: steps until they move back. share: (n, present, first, end, rank, team).
     """
     width, periodic, wraps, homely = plan.width, plan.periodic, plan.wraps, plan.homely
     carry = _carry(plan, True)
@@ -106,16 +105,16 @@ def move_in_of(plan: ArrangePlan) -> Callable[..., bool]:
 
 
 def go_home_of(plan: ArrangePlan) -> Callable[..., None]:
-    """Return `go_home(scratch, share)`: move agents back to where their numbers say."""
+    """Return `go_home(scratch, share)`: move agents back to the places of their numbers."""
     return _carry(plan, False)
 
 
 @section
 def _carry(plan: ArrangePlan, to_tiles: bool) -> Callable[..., None]:
-    """Make `carry(scratch, share)`: this thread's agents pack, all of them are carried, and its new ones unpack.
+    """Make `carry(scratch, share)`: pack this thread's agents, wait for all threads, and unpack the new ones.
 
-    What is packed goes to distant places, in no order: where its tile comes, or where its number says. `cell` says
-    where, in which -1 is nowhere.
+    Packed agents go to distant places, in no order: to their tile, or to the place of their number. `cell` holds where;
+    -1 is nowhere.
     """
     dimension, width, (arrays, which, further, _) = plan.dimension, plan.width, plan.luggage
     size, count, wide = np.uint64(dimension * width), plan.size, np.uint64(plan.size)
@@ -146,7 +145,7 @@ def _carry(plan: ArrangePlan, to_tiles: bool) -> Callable[..., None]:
 
 @section
 def _unpack(plan: ArrangePlan) -> Callable[..., None]:
-    """Make `unpack(scratch, sources, i, place)`: agent i unpacks all but what all have in common, which lies still."""
+    """Make `unpack(scratch, sources, i, place)`: unpack all data of agent i but what all agents share."""
     own = _put_back(plan.luggage, plan.luggage.own[0])
     bodies, wants = _put_back(plan.luggage, plan.luggage.own[1]), _put_back(plan.luggage, plan.luggage.own[2])
     wide = np.uint64(plan.size)

@@ -1,8 +1,8 @@
 """The scratch of one world in progress: every array by name, declared once.
 
-Which arrays there are follows from what a scene does; how large they are from how many agents it has. Kernels find them
-by name in one record; allocation and the count of bytes ask here, too. Arrays of vectors and of numbers lie in blocks
-(see blocks.py). Those of `OWN` belong to one thread each; all others to the team that steps a world together.
+Which arrays there are follows from the scene, and their sizes from its number of agents. Kernels find them by name in
+one record; allocation and the count of bytes use the same declaration. Arrays of vectors and of numbers lie in blocks
+(see blocks.py). Each thread has its own of those in `OWN`; all others belong to the team that steps a world together.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ if TYPE_CHECKING:
 __all__ = ["GIVEN", "OWN", "SMALL_STRIDE", "Array", "array_names", "scratch_bytes", "scratch_of", "scratch_record"]
 
 SMALL_STRIDE = 128
-"""Places in a row of sorted agents where there are too few to be sorted by cell: their blocks, and one more."""
+"""Length of a row of listed agents if these are too few to be sorted by cell: their blocks, and one more."""
 
 OWN = ("lanes", "ranges", "spread")
-"""What each thread has for itself: running numbers of a block, ranges of candidates, masks of what all share."""
+"""What each thread has for itself: running numbers of a block, ranges of candidates, masks of shared numbers."""
 
 GIVEN = ("bond_place", "bond_number", "bond_start")
-"""Tables of bonds, which a scene has made: handed over with scratch, and only read."""
+"""Tables of bonds, which a scene has made: passed along with scratch, and only read."""
 
 Array = tuple[tuple[int, ...], Any]
-"""Shape and kind of numbers."""
+"""Shape and dtype."""
 
 
 def scratch_of(parts: Parts, agents: int, team: int = 1) -> dict[str, Array]:
-    """Return the arrays that a team of threads takes to step one world, in order; those of `OWN` for one thread."""
+    """Return the arrays that a team of threads needs to step one world, in order; those of `OWN` for one thread."""
     real, d, width = np.dtype(parts.dtype), parts.dimension, parts.width
     padded = -(-agents // width) * width
 
@@ -69,7 +69,7 @@ def scratch_of(parts: Parts, agents: int, team: int = 1) -> dict[str, Array]:
 
 
 def _of_the_query(parts: Parts, agents: int, team: int) -> dict[str, Array]:
-    """Return what finding neighbours takes: small worlds are sorted into rows, others into cells, as records."""
+    """Return what finding neighbours needs: small worlds are listed in rows, others in cells, as records."""
     real, whole, width = np.dtype(parts.dtype), np.dtype(np.int32), parts.width
     padded = -(-agents // width) * width
     found: dict[str, Array] = {
@@ -89,7 +89,7 @@ def _of_the_query(parts: Parts, agents: int, team: int) -> dict[str, Array]:
 
 
 def _of_tiles(parts: Parts, agents: int) -> dict[str, Array]:
-    """Return what putting a large world in order takes."""
+    """Return what reordering a large world needs."""
     whole, width = np.dtype(np.int32), parts.width
     many = agents >= FEWEST_ARRANGED
     padded = -(-agents // width) * width if many else 0
@@ -103,7 +103,7 @@ def _of_tiles(parts: Parts, agents: int) -> dict[str, Array]:
 
 
 def _of_trees(parts: Parts, agents: int, team: int) -> dict[str, Array]:
-    """Return what a tree of agents takes, for laws about all agents."""
+    """Return what a tree of agents needs, for laws about all agents."""
     real, long, width = np.dtype(parts.dtype), np.dtype(np.int64), parts.width
     padded = -(-agents // width) * width
     found: dict[str, Array] = {
@@ -118,7 +118,7 @@ def _of_trees(parts: Parts, agents: int, team: int) -> dict[str, Array]:
 
 
 def scratch_record(parts: Parts) -> Any:
-    """Return the type of the record in which the kernels of a scene find them; `inner` is a tuple of several."""
+    """Return the type of the record of all arrays for the kernels of a scene; its `inner` is a tuple of arrays."""
     names = [name for name in scratch_of(parts, parts.width) if not name.startswith("inner")]
     return record((*names, *["inner"] * bool(parts.inner)))
 
@@ -129,5 +129,5 @@ def array_names(parts: Parts) -> tuple[str, ...]:
 
 
 def scratch_bytes(parts: Parts, agents: int) -> int:
-    """Return how many bytes they take for one thread."""
+    """Return how many bytes the arrays take for one thread."""
     return sum(math.prod(shape) * kind.itemsize for shape, kind in scratch_of(parts, agents).values())

@@ -1,7 +1,7 @@
-"""The rows of shapes that a scene's code meets, form by form: where they are, all of them or those that a grid lists.
+"""Loops over the rows of shapes of a scene, form by form: over all rows, or those that a grid lists.
 
-A row is one of shapes/table.py; `at` is where it begins in `params`. A loop over rows is made of what is done with
-each, and hands a state on from one to the next.
+A row is one of shapes/table.py; `at` is where it begins in `params`. A loop over rows is made from the function to be
+called for each, which returns a state that is passed on to the next call.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class FormPlan(NamedTuple):
 
     name: str
     place: int
-    """Where `params` says where its first row begins; behind that, how many rows it has, and where its grid begins."""
+    """Where `params` holds the start of its first row; behind that, the number of rows, and the start of its grid."""
     gridded: bool
     """True if a grid of cells lies over its rows, see shapes/cells.py."""
 
@@ -45,7 +45,7 @@ class Surroundings(NamedTuple):
 
     dimension: int
     offset_to: Law
-    """The shortest way from one place to another, of the space."""
+    """The law of the space that returns the shortest offset from one place to another."""
     moving: bool
     """True if any shape moves."""
     forms: tuple[FormPlan, ...]
@@ -58,7 +58,7 @@ def number_of(form: str) -> int:
 
 @section
 def by_form(laws: tuple[tuple[str, Law], ...], otherwise: Law) -> Callable[..., Any]:
-    """Make `of(params, form, row, given)`: what the law of a shape's form returns for (params, row, *given).
+    """Make `of(params, form, row, given)`: return law(params, row, *given) with the law of the shape's form.
 
     laws: (form, its law); otherwise: that of a shape of any other form.
     """
@@ -78,7 +78,10 @@ def by_form(laws: tuple[tuple[str, Law], ...], otherwise: Law) -> Callable[..., 
 
 @section
 def seen_from(offset_to: Law, moving: bool) -> Callable[..., Vec]:
-    """Make `seen(params, size, at, time, x)`: place x from the anchor of the shape at `at`, at this time (s), m."""
+    """Make `seen(params, size, at, time, x)`: the offset of x from the anchor of the shape at `at`, m.
+
+    time: s.
+    """
 
     def seen(params: Any, size: Any, at: Any, time: Any, x: Any) -> Any:
         place = vector_at(params, at + 2, x)
@@ -91,9 +94,9 @@ def seen_from(offset_to: Law, moving: bool) -> Callable[..., Vec]:
 
 @law
 def box_of_way(x: Vec, half: Vec, room: float) -> tuple[Vec, Vec]:
-    """Return the box around a body of radius `room` on its way from x: the middle, and half the edges, m.
+    """Return the box around the path of a body of radius `room` from x: the middle, and half the edges, m.
 
-    half: half of the way.
+    half: half of the displacement.
     """
     if len(half) == 2:
         return add(x, half), (abs(half[0]) + room, abs(half[1]) + room)
@@ -105,9 +108,9 @@ def box_of_way(x: Vec, half: Vec, room: float) -> tuple[Vec, Vec]:
 def each_row(around: Surroundings, form: FormPlan, meet: Law, box: Law, done: Law) -> Callable[..., Any]:
     """Make `each(params, size, given, state)`: `state = meet(params, size, at, given, state)` for the rows of a form.
 
-    All rows, in order; of a form with a grid those that it lists in the box `box(given, state)` (the middle, and half
-    the edges along each axis, m), which is worked out anew behind each, until `done(state)`. Some of these may be met
-    twice, and in no order that may be relied on.
+    All rows, in order. For a form with a grid, only those that it lists in the box `box(given, state)` (the middle, and
+    half the edges along each axis, m), which is updated after each row, until `done(state)`. Some of these may be
+    visited twice, and their order is not defined.
     """
     place, gridded, of_first = form.place, form.gridded, _of_first(meet)
     each_listed = _each_listed(around.offset_to, around.dimension, of_first, box, done)
@@ -126,7 +129,7 @@ def each_row(around: Surroundings, form: FormPlan, meet: Law, box: Law, done: La
 
 @section
 def _of_first(meet: Law) -> Callable[..., Any]:
-    """Make `meet` of a row that is known by how far it lies behind the first one."""
+    """Make `meet` for a row that is given by its offset behind the first one."""
 
     def meet_listed(params: Any, size: Any, at: Any, row: Any, given: Any, state: Any) -> Any:
         return meet(params, size, at + row, given, state)

@@ -1,12 +1,12 @@
-"""The way around what is in an agent's way: `aside_of`, the side of the nearest silhouette edge (Reynolds 1988).
+"""The side on which an agent passes what is ahead: `aside_of`, that of the nearest silhouette edge (Reynolds 1988).
 
-What is passed is an obstacle as the body sees it. Where another obstacle leaves no room beside an edge, a body's radius
-beyond it, the two are one, and the edge of the other is looked for on the same side: so joined walls, and gaps that are
-too narrow, have no edge in between.
+An obstacle is passed as grown by the body's radius. If another obstacle leaves no room beside an edge, the two count as
+one, and the edge of the other is searched for on the same side: so joined walls, and gaps that are too narrow, have no
+edge in between.
 
-All of it takes the `world`: the circles of the state (obstacle_x, obstacle_radius), params, the size of the space, the
-number of the world, and the time (s). What is touched is known by its form, and the row in `params` where it begins: of
-a circle of the state the form is -1 and the row its number; if nothing is touched the form is -2.
+All functions take the `world`: the circles of the state (obstacle_x, obstacle_radius), params, the size of the space,
+the index of the world, and the time (s). A touched obstacle is given by its form, and the row in `params` where it
+begins: for a circle of the state the form is -1 and the row its index; if nothing is touched the form is -2.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from flockenv.steering.around import threat
 __all__ = ["aside_of"]
 
 FOLLOWED = 8
-"""Obstacles in a row, edge to edge, that are taken for one; of more there is no edge on that side."""
+"""Obstacles in a row, edge to edge, that count as one; with more there is no edge on that side."""
 
 ALL_AROUND = 6.0
-"""rad: what must be turned by more to be passed is all around."""
+"""rad: an obstacle that needs a larger turn to pass has no edge on that side."""
 
 JUST = 1 - 1e-3
-"""Share of its clearance that a body keeps when it is tried whether it passes an edge: beside it touches nothing."""
+"""Share of its clearance that a body keeps in the test whether it passes an edge: so it does not touch that edge."""
 
 NEARER = 1 - 1e-5
-"""Share of its distance by which an edge must be nearer than another one to be preferred: so rounding picks no side."""
+"""Share of the best distance within which another edge must lie to be preferred: so rounding selects no side."""
 
 SPINES = ("chain", "block")
 """Forms that have an axis of their own: `spine_FORM` of shapes/edges.py."""
@@ -55,19 +55,19 @@ def _laws(verb: str, forms: tuple[FormPlan, ...]) -> tuple[tuple[str, Law], ...]
 
 @law
 def _no_edge(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
-    """Return that there is no edge: of what is no shape."""
+    """Return an infinite angle and distance: there is no edge, because there is no shape."""
     return like(room, np.inf), like(room, np.inf)
 
 
 @law
 def _nowhere(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
-    """Return that what is no shape is infinitely far, and has no normal."""
+    """Return an infinite distance and no normal: there is no shape."""
     return like(x[0], np.inf), zero(x)
 
 
 @law
 def _no_spine(table: Any, at: int, x: Vec, ray: Vec) -> Vec:
-    """Return that a shape has no axis of its own: 0."""
+    """Return 0: the shape has no axis of its own."""
     return zero(x)
 
 
@@ -76,9 +76,9 @@ def _no_spine(table: Any, at: int, x: Vec, ray: Vec) -> Vec:
 
 @functools.cache
 def first_hit(around: Surroundings) -> Callable[..., tuple[float, int, int]]:
-    """Make `first_hit(world, x, ray, room, most)`: how far a body of radius `room` comes along a ray, m; form and row.
+    """Make `first_hit(world, x, ray, room, most)`: how far a body of radius `room` moves along a ray, m; form and row.
 
-    At most `most`. Of what is touched at once, what is listed first.
+    At most `most`. If several are touched at once, it returns the first as they are listed.
     """
     offset_to, circle, shaped = around.offset_to, vector_of(around.dimension), bool(around.forms)
     first_row: Any = _first_row(around) if shaped else None
@@ -102,7 +102,7 @@ def first_hit(around: Surroundings) -> Callable[..., tuple[float, int, int]]:
 
 @section
 def _first_row(around: Surroundings) -> Callable[..., tuple[float, int, int]]:
-    """Make `first(params, size, given, state)`: `state` after all shapes; given: (time, x, ray, room)."""
+    """Make `first(params, size, given, state)`: return `state` after all shapes; given: (time, x, ray, room)."""
     first, form = len(around.forms) == 1, around.forms[-1]
     before: Any = None if first else _first_row(around._replace(forms=around.forms[:-1]))
     each = each_row(around, form, _touches(around, form), _box_of_way, _never)
@@ -117,7 +117,7 @@ def _first_row(around: Surroundings) -> Callable[..., tuple[float, int, int]]:
 
 @section
 def _touches(around: Surroundings, form: FormPlan) -> Callable[..., tuple[float, int, int]]:
-    """Make what a loop over rows does with each: keep (how far, form, row) of what is touched first."""
+    """Make the function for each row: keep (distance, form, row) of what is touched first."""
     seen, hit, number = seen_from(around.offset_to, around.moving), law_of("hit", form.name), number_of(form.name)
 
     def touches(params: Any, size: Any, at: Any, given: Any, state: Any) -> Any:
@@ -135,22 +135,22 @@ def _touches(around: Surroundings, form: FormPlan) -> Callable[..., tuple[float,
 
 @kernel
 def _box_of_way(given: Any, state: Any) -> Any:
-    """Return the box around a body on its way, as far as it is free: the middle, and half the edges."""
+    """Return the box around the free path of a body: the middle, and half the edges."""
     _, x, ray, room = given
     return box_of_way(x, scale(ray, state[0] * like(state[0], 0.5)), room)
 
 
 @kernel
 def _never(state: Any) -> Any:
-    """Return that another row may be nearer."""
+    """Return False: another row may be nearer."""
     return False
 
 
 @section
 def _row_ahead(forms: tuple[FormPlan, ...]) -> Callable[..., int]:
-    """Make `row(params, form, place)`: where the row of an obstacle begins, or the number of a circle of the state.
+    """Make `row(params, form, place)`: where the row of an obstacle begins, or the index of a circle of the state.
 
-    place: which of its form it is; of a form with a grid, how far its row lies behind the first.
+    place: index of it among its form; of a form with a grid, how far its row lies behind the first.
     """
     some = bool(forms)
     number, first, gridded = (number_of(forms[0].name), *forms[0][1:]) if forms else (0, 0, False)
@@ -176,9 +176,9 @@ def _row_ahead(forms: tuple[FormPlan, ...]) -> Callable[..., int]:
 
 @functools.cache
 def edge(around: Surroundings) -> Callable[..., tuple[float, float]]:
-    """Make `edge(world, form, row, x, ray, side, room)`: by what angle a ray must be turned to pass it, and how far.
+    """Make `edge(world, form, row, x, ray, side, room)`: the angle by which a ray must turn to pass, and the distance.
 
-    Towards `side`; rad, and m along the turned ray until the body is beside it.
+    Towards `side`; rad, and m along the turned ray until the body is beside the obstacle.
     """
     offset_to, circle, shaped = around.offset_to, vector_of(around.dimension), bool(around.forms)
     seen, edge_of = seen_from(around.offset_to, around.moving), by_form(_laws("edge", around.forms), _no_edge)
@@ -199,7 +199,7 @@ def edge(around: Surroundings) -> Callable[..., tuple[float, float]]:
 def normal_hit(around: Surroundings) -> Callable[..., Vec]:
     """Make `normal_hit(world, form, row, x, ray, hit, room)`: the outward unit normal where a body touches an obstacle.
 
-    hit: how far along the ray that is, m.
+    hit: distance along the ray, m.
     """
     offset_to, circle, shaped = around.offset_to, vector_of(around.dimension), bool(around.forms)
     laws = tuple((form.name, law_of("nearest", form.name)) for form in around.forms)
@@ -218,10 +218,10 @@ def normal_hit(around: Surroundings) -> Callable[..., Vec]:
 
 @functools.cache
 def edge_beyond(around: Surroundings) -> Callable[..., tuple[float, Vec]]:
-    """Make `edge_beyond(world, form, row, hit, x, ray, side, room, most)`: where a body passes on a side.
+    """Make `edge_beyond(world, form, row, hit, x, ray, side, room, most)`: the distance at which a body passes a side.
 
-    How far from the impact the nearest such place is, m; inf if beyond `most`. In space also the normal of the obstacle
-    that is first found in the way on that side; else 0.
+    From the impact to the nearest such place, m; inf if beyond `most`. In 3-D also the normal of the first other
+    obstacle that blocks that side; else 0.
     """
     touched, edge_at, space = first_hit(around), edge(around), around.dimension == 3
     normal_at: Any = normal_hit(around) if space else None
@@ -251,16 +251,16 @@ def edge_beyond(around: Surroundings) -> Callable[..., tuple[float, Vec]]:
     return routine(edge_beyond)
 
 
-# --- the nearest of them ----------------------------------------------------------------------------------------------
+# --- the nearest edge -------------------------------------------------------------------------------------------------
 
 
 @functools.cache
 def aside_of(around: Surroundings) -> Callable[..., Vec]:
     """Make `aside_of(world, x, ray, room, known)`: the unit vector across a ray to the side of the nearest edge.
 
-    Nearest to the impact; 0 if what is ahead has no edge where the body passes. known: how far ahead it is, m, its
-    form, and its place in that. In the plane both sides are compared, in space the normal's and those along and across
-    an axis.
+    Nearest to the impact; 0 if the obstacle ahead has no edge that the body can pass. known: its distance, m, form, and
+    place in that. In the plane both sides are compared; in 3-D the side of the normal and those along and across an
+    axis.
     """
     row_of, normal_at, beyond = _row_ahead(around.forms), normal_hit(around), edge_beyond(around)
     sides_of = _sides_in_space(around) if around.dimension == 3 else _both_sides
@@ -282,7 +282,7 @@ def aside_of(around: Surroundings) -> Callable[..., Vec]:
 
 @kernel
 def _both_sides(world: Any, form: Any, row: Any, x: Any, ray: Any, own: Any, off: Any) -> Any:
-    """Return the side that the normal's is not."""
+    """Return the other side: opposite to that of the normal."""
     return (scale(own, like(x[0], -1.0)),)
 
 
@@ -290,7 +290,7 @@ def _both_sides(world: Any, form: Any, row: Any, x: Any, ray: Any, own: Any, off
 def _sides_in_space(around: Surroundings) -> Callable[..., tuple[Vec, ...]]:
     """Make `sides(world, form, row, x, ray, own, off)`: both sides along and across an axis.
 
-    The axis is the obstacle's own, or else leads away from what blocked the side of the normal. So no axis of the
+    The axis is the obstacle's own; otherwise it points away from what blocked the side of the normal. So no axis of the
     coordinates is preferred, and agents of the mirrored scene take the mirrored path.
     """
     laws = _laws("spine", tuple(form for form in around.forms if form.name in SPINES))

@@ -1,4 +1,4 @@
-"""A step: worlds are brought into blocks, advanced by the integrator's method, bounded, and written back.
+"""A step: worlds are copied into blocks, advanced by the integrator's method, limited, and written back.
 
 `step_world` is called by scenes through `step`, and by tasks through their `play`. Several threads may advance one
 world together, each the agents of its own blocks.
@@ -45,7 +45,7 @@ PART = 8
 """Blocks that are advanced together."""
 
 AHEAD = 16
-"""How many blocks ahead it is asked for what agents are moved by, in large worlds: several arrays are read at once."""
+"""How many blocks ahead the forces and states of agents are prefetched in large worlds: from several arrays at once."""
 
 
 class StepPlan(NamedTuple):
@@ -53,7 +53,7 @@ class StepPlan(NamedTuple):
 
     agent: AgentPlan
     numbers: NumberPlan
-    confines: Law | None  # brings agents into a periodic box when a call begins
+    confines: Law | None  # moves agents into a periodic box when a call begins
     arrange: ArrangePlan | None
     counts: tuple[OneLaw, ...]  # laws that count agents
     sense: SensePlan
@@ -61,10 +61,10 @@ class StepPlan(NamedTuple):
     move: MovePlan
     method: Callable[[Provided], Method] | None  # of several stages
     method_plan: MethodPlan
-    tells: bool  # are inner states told what is sensed at the beginning of a step?
-    ahead: tuple[int, ...]  # numbers of a block in `pos`, `vel`, `felt` and `ident`, that are asked for ahead; or none
-    trusts: bool  # is every agent at a finite place until a step has failed? see Parts.trusts
-    spreads: bool  # does NaN spread at once to all agents that meet the one that has it?
+    tells: bool  # True if `sense` runs at the beginning of a step, for inner states
+    ahead: tuple[int, ...]  # numbers of a block in `pos`, `vel`, `felt` and `ident`, to be prefetched; or empty
+    trusts: bool  # True if every agent has a finite position until a step has failed, see Parts.trusts
+    spreads: bool  # True if a NaN position reaches every neighbour within one step
 
 
 def step_plan(parts: Parts) -> StepPlan:
@@ -86,7 +86,7 @@ def step_plan(parts: Parts) -> StepPlan:
 
 @functools.cache
 def _counting(law: OneLaw) -> Callable[..., None]:
-    """Return `counts(numbers, me, lives)`: count an agent as a law says."""
+    """Return `counts(numbers, me, lives)`: add a living agent to the counter that a law selects."""
     which_of, k = says_of(law), law.k
 
     def counts(numbers: Any, me: Any, lives: Any) -> None:
@@ -114,7 +114,7 @@ def _count(agent: AgentPlan, laws: tuple[OneLaw, ...]) -> Callable[..., None]:
 
     def count_agents(context: Any, pos: Any, vel: Any, time: Any) -> None:
         scratch, numbers, drawn = context.scratch, context.numbers, context.key[context.b]
-        wait_for_team(scratch.sync, context.team)  # what goes on inside agents was written by other threads
+        wait_for_team(scratch.sync, context.team)  # inner states were written by other threads
         if context.rank == 0:
             clear(numbers)
             for i in range(np.uint64(context.n)):
@@ -129,7 +129,7 @@ def _count(agent: AgentPlan, laws: tuple[OneLaw, ...]) -> Callable[..., None]:
 
 @functools.cache
 def _asking(many: int, width: int) -> Callable[[Any, Any], None]:
-    """Return `asks(array, block)`: ask for `many` numbers of a block of an array."""
+    """Return `asks(array, block)`: prefetch `many` numbers of a block of an array."""
     places = tuple(range(0, many, width))
     return kernel(lambda array, block: _ask_all(array, block * np.uint64(many), places))
 
@@ -142,7 +142,7 @@ def _ask_all(array: Any, at: Any, places: Any) -> None:
 
 @section
 def _ask_ahead(numbers: tuple[int, ...], width: int) -> Callable[..., None]:
-    """Make `ask_ahead(scratch, pos, vel, block)`: ask for what a later block will be moved by."""
+    """Make `ask_ahead(scratch, pos, vel, block)`: prefetch what moves a later block."""
     (of_pos, of_vel, of_felt, of_ident), felt = (_asking(many, width) for many in numbers), numbers[2] > 0
 
     def ask_ahead(scratch: Any, pos: Any, vel: Any, block: Any) -> None:
@@ -158,10 +158,10 @@ def _ask_ahead(numbers: tuple[int, ...], width: int) -> Callable[..., None]:
 
 @section
 def _in_two_loops(plan: StepPlan) -> Callable[..., None]:
-    """Make what moves agents by a method of one stage, once all is sensed: no agent reads what another writes.
+    """Make `advance` for a method of one stage: once `sense` is done, no agent reads what another writes.
 
-    A part after the other, which stays in the nearest cache, and of which accelerations are put aside. In one loop,
-    from what is felt to where that leads, too few agents would be under way at a time.
+    PART blocks at a time, which stay in the nearest cache; their accelerations are saved in `aside`. In a single loop,
+    from forces to new positions, too few agents would be in flight at a time.
     """
     size = np.uint64(plan.agent.dimension * plan.agent.width)
     respond, move = respond_of(plan.response), move_of(plan.move)
@@ -185,7 +185,7 @@ def _in_two_loops(plan: StepPlan) -> Callable[..., None]:
 
 @section
 def _by_method(plan: StepPlan) -> Callable[..., None]:
-    """Make what moves agents by a method of several stages, which asks for accelerations by itself."""
+    """Make `advance` for a method of several stages, which calls for accelerations by itself."""
     assert plan.method is not None
     size, move = plan.agent.dimension * plan.agent.width, move_of(plan.move)
     advance_by = advance_of(plan.method, plan.method_plan)(accelerate_of(plan.response, plan.sense))
@@ -214,12 +214,12 @@ def _by_method(plan: StepPlan) -> Callable[..., None]:
 
 @section
 def _first_bad(bad: int, width: int) -> Callable[..., Any]:
-    """Make `first_bad(lanes, well)`: the lowest number of an agent that is not finite, or `well`."""
+    """Make `first_bad(lanes, well)`: return the lowest number of an agent that is not finite, or `well`."""
     at = np.uint64(bad)
 
     def first_bad(lanes: Any, well: Any) -> Any:
         worst = well
-        for lane in range(width):  # one after the other: no loop over lanes
+        for lane in range(width):  # one after another: no loop over lanes
             worst = min(worst, lanes[at + np.uint64(lane)])
         return worst
 
@@ -228,9 +228,9 @@ def _first_bad(bad: int, width: int) -> Callable[..., Any]:
 
 @section
 def _failing(bad: int, width: int) -> Callable[..., Any]:
-    """Make `failing(lanes, well, step, n, failed, none_failed)`: which agent failed first, and in which step.
+    """Make `failing(lanes, well, step, n, failed, none_failed)`: return which agent failed first, and in which step.
 
-    As one number, step * n + agent; `none_failed`, n (count + 1), as long as none has.
+    As one number, step * n + agent; `none_failed`, n (count + 1), as long as no agent has.
     """
     at, lowest = np.uint64(bad), _first_bad(bad, width)
 
@@ -247,9 +247,9 @@ def _failing(bad: int, width: int) -> Callable[..., Any]:
 
 @section
 def _enter(plan: StepPlan) -> Callable[..., Context]:
-    """Make `enter(worlds, drive, asked, params, count, b, rank, team, scratch)`: bring this thread's part into blocks.
+    """Make `enter(worlds, drive, asked, params, count, b, rank, team, scratch)`: copy this thread's agents into blocks.
 
-    It returns the context of world b, in order for `count` steps if that is worth it.
+    It returns the context of world b, reordered for `count` steps if that pays.
     """
     agent, d, width, ordered = plan.agent, plan.agent.dimension, plan.agent.width, plan.arrange is not None
     read, bring_in, take_drive = numbers_of(plan.numbers), bring_in_of(agent), take_drive_of(d, width, ordered)
@@ -287,9 +287,9 @@ def step_world_of(plan: StepPlan) -> Callable[..., int]:
     """Make `step_world(worlds, drive, asked, params, dt, count, b, rank, team, scratch)`.
 
     It advances this thread's part of world b by `count` steps, and returns -1, or an agent that is not finite: the
-    lowest at the end of the call, or, where agents make others not finite (`spreads`), the lowest after the first step
-    that failed. Then nothing of the world is written. What is asked of its agents is drive[:, asked], N; nothing if
-    drive is empty.
+    lowest at the end of the call, or, if agents make others not finite (`spreads`), the lowest after the first step
+    that failed. Then nothing of the world is written. The commanded steering force is drive[:, asked], N; 0 if drive is
+    empty.
     """
     agent, width, bad = plan.agent, plan.agent.width, np.uint64(plan.move.bad)
     enter, bring_out, counted = _enter(plan), bring_out_of(agent), tuple(range(COUNTED_BY_KERNELS))
@@ -337,7 +337,7 @@ def step_world_of(plan: StepPlan) -> Callable[..., int]:
 def _verdict(trusts: bool, dimension: int) -> Callable[..., int]:
     """Make `verdict(context, worlds, before, failed, none_failed)`: which agent of a world is not finite, or -1.
 
-    What all threads of the team have found counts. Where one is, the counters of the world are what they were `before`.
+    It combines the results of all threads of the team. On failure the counters of the world are reset to `before`.
     """
 
     def verdict(context: Any, worlds: Any, before: Any, failed: Any, none_failed: Any) -> Any:
@@ -355,7 +355,7 @@ def _verdict(trusts: bool, dimension: int) -> Callable[..., int]:
         if rank == 0:
             for k in range(COUNTED_BY_KERNELS):
                 worlds.work[b, k] = before[k]
-        if trusts:  # an agent that was not finite before the call is the one to blame
+        if trusts:  # an agent that was not finite before the call is the cause
             for i in range(n):
                 for k in range(dimension):
                     if worlds.alive[b, i] and not finite(worlds.x[k, b, i]):

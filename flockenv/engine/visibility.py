@@ -1,4 +1,4 @@
-"""What obstacles hide: `blocked`, for laws that see, and meet, only what stands in no obstacle's shadow."""
+"""Occlusion by obstacles: `blocked`, for laws that ignore what an obstacle hides."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["blocked"]
 def blocked(around: Surroundings) -> Callable[..., bool]:
     """Make `blocked(obstacle_x, obstacle_radius, params, size, b, time, x, to)`.
 
-    It returns True if an obstacle stands in the straight way from place x to what is at the offset `to`, m.
+    It returns True if an obstacle intersects the straight line from place x to the offset `to`, m.
     """
     offset_to, circle, shaped = around.offset_to, vector_of(around.dimension), bool(around.forms)
     hidden: Any = _hidden(around) if shaped else None
@@ -42,7 +42,7 @@ def blocked(around: Surroundings) -> Callable[..., bool]:
 
 @section
 def _hidden(around: Surroundings) -> Callable[..., bool]:
-    """Make `hidden(params, size, time, x, to, found)`: `found`, or True if a shape stands in the way."""
+    """Make `hidden(params, size, time, x, to, found)`: return True if `found`, or if a shape intersects the line."""
     first, form = len(around.forms) == 1, around.forms[-1]
     before: Any = None if first else _hidden(around._replace(forms=around.forms[:-1]))
     each = each_row(around, form, _hides(around, form), _box_of_way, _found)
@@ -57,7 +57,7 @@ def _hidden(around: Surroundings) -> Callable[..., bool]:
 
 @section
 def _hides(around: Surroundings, form: FormPlan) -> Callable[..., bool]:
-    """Make what a loop over rows does with each: note if it stands in the way."""
+    """Make the function for each row: return True if it or an earlier one intersects the line."""
     seen, hit = seen_from(around.offset_to, around.moving), law_of("hit", form.name)
 
     def hides(params: Any, size: Any, at: Any, given: Any, found: Any) -> Any:
@@ -70,12 +70,12 @@ def _hides(around: Surroundings, form: FormPlan) -> Callable[..., bool]:
 
 @kernel
 def _box_of_way(given: Any, found: Any) -> Any:
-    """Return the box around the way: the middle, and half the edges."""
+    """Return the box around the line: the middle, and half the edges."""
     _, x, to = given
     return box_of_way(x, scale(to, like(to[0], 0.5)), like(to[0], 0.0))
 
 
 @kernel
 def _found(found: Any) -> Any:
-    """Return whether one is enough."""
+    """Return True if the search is done: one shape is enough."""
     return found

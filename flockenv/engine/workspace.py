@@ -1,4 +1,4 @@
-"""Workspace: scratch of those who step one world, counted and allocated before anything moves."""
+"""Workspace: the scratch of a team of threads that step one world, counted and allocated before anything moves."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ GAP = 5 * LINE
 
 @dataclass(frozen=True)
 class Workspace:
-    """Scratch of a team of threads that step one world: what a step writes and nobody reads afterwards."""
+    """Scratch of a team of threads that step one world: what a step writes, and nothing reads afterwards."""
 
     arrays: dict[str, NDArray[Any]]
     own: tuple[dict[str, NDArray[Any]], ...]  # lanes, ranges and spread of each thread
@@ -37,7 +37,7 @@ class Workspace:
 
     @classmethod
     def allocate(cls, parts: Parts, body: Body, table: Table, team: int = 1) -> Workspace:
-        """Return scratch for the sweep, the query and the integrator: the arrays of sweep.scratch_of."""
+        """Return scratch for neighbours, queries and the integrator: the arrays of engine.scratch.scratch_of."""
         agents, wanted = len(body.mass), scratch_of(parts, len(body.mass), team)
         made = _zeros({name: array for name, array in wanted.items() if name not in (*OWN, *GIVEN)})
         arrays = made | {name: getattr(table, name.removeprefix("bond_")) for name in GIVEN if name in wanted}
@@ -60,7 +60,7 @@ class Workspace:
         return cls(arrays, own)
 
     def of(self, rank: int, kind: Any) -> Any:
-        """Return what one of the team is given: a record of this kind, which names its arrays."""
+        """Return what one thread of the team is passed: a record of this kind, which names its arrays."""
         if (rank, kind) not in self._given:
             arrays: dict[str, Any] = self.arrays | self.own[rank]
             arrays["inner"] = tuple(array for name, array in arrays.items() if name.startswith("inner"))
@@ -69,9 +69,9 @@ class Workspace:
 
 
 def _spread(body: Body, width: int) -> NDArray[np.uint64]:
-    """Return what place of a body's numbers, and of what is asked of agents, is masked with: 0 if all have the same.
+    """Return the masks of the places of a body's numbers, and of steering forces: 0 if all agents have the same.
 
-    What all have in common is read where the first block has it.
+    Numbers that all agents share are read from the first block.
     """
     numbers = (body.mass, body.radius, body.max_speed, body.max_force)
     alike = len(body.mass) >= width and all((number == number[0]).all() for number in numbers)
@@ -79,9 +79,10 @@ def _spread(body: Body, width: int) -> NDArray[np.uint64]:
 
 
 def _zeros(wanted: Mapping[str, tuple[int | tuple[int, ...], np.dtype[Any]]]) -> dict[str, NDArray[Any]]:
-    """Return arrays of zeros in one piece of memory, each beginning on a cache line: no vector is loaded from two.
+    """Return arrays of zeros in one piece of memory, each beginning on a cache line: no vector spans two lines.
 
-    Between two there is a gap, or places that are used together would compete for the same few lines of the cache.
+    There is a gap between two arrays, because places that are used together would else compete for the same cache
+    lines.
     """
     sizes = {name: int(np.prod(shape)) * kind.itemsize for name, (shape, kind) in wanted.items()}
     raw = _memory(sum(sizes.values()) + (len(sizes) + 1) * (LINE + GAP))
@@ -93,7 +94,7 @@ def _zeros(wanted: Mapping[str, tuple[int | tuple[int, ...], np.dtype[Any]]]) ->
 
 
 def _memory(size: int) -> NDArray[np.uint8]:
-    """Return zeros; where there are many, and the system has them, on large pages: fewer addresses to look up."""
+    """Return zeros; a large array on large pages, if the system has them: fewer address translations."""
     if size < HUGE or not hasattr(mmap, "MADV_HUGEPAGE"):
         return np.zeros(size, np.uint8)
     memory = mmap.mmap(-1, size + HUGE, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
