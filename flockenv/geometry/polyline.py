@@ -28,7 +28,7 @@ Table = Any
 
 
 def pieces(points: Sequence[Sequence[float]], closed: bool, space: Space | None = None) -> Floats:
-    """Return the table of a path through `points` (P, D) m; raise ValueError, naming the point, if there is no such path."""
+    """Return the table of a path through `points` (P, D) m; raise ValueError, naming the point, if that is no path."""
     at = np.asarray(points, np.float64)
     least = 3 if closed else 2
     if at.ndim != 2 or len(at) < least:
@@ -112,7 +112,7 @@ def nearest(table: Table, x: Vec) -> Vec:
 
 @law
 def spine(table: Table, x: Vec, s: float) -> Vec:
-    """Return the offset from x to the point at arc length s, m; s is clamped on an open path, wrapped on a closed one."""
+    """Return the offset from x to the point at arc length s, m; s is clamped if the path is open, wrapped if closed."""
     d = len(x)
     head, size = 2 + d, 2 * d + 2
     o, length = like(table[0], 0.0), table[1]
@@ -173,7 +173,7 @@ def _point(table: Any, s: Any, origin: Any, out: Any) -> None:
 
 
 def projected(table: Floats, points: ArrayLike) -> tuple[Floats, Floats]:
-    """Return the arc lengths of the points nearest to places, (...) m, and offsets to them, (..., D) m; not for laws."""
+    """Return arc lengths (...) m of the path's nearest points, and offsets to them, (..., D) m; not for laws."""
     where = np.asarray(points, np.float64)
     flat = np.ascontiguousarray(where.reshape(-1, where.shape[-1]))
     out = np.empty((len(flat), where.shape[-1] + 1))

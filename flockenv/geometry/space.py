@@ -118,7 +118,7 @@ def _meets(gap: float, away: float, push: float) -> tuple[float, float]:
 
 @law
 def _flight(dt: float, was: float, before: float, x: float, v: float) -> tuple[float, float, float]:
-    """Return the initial velocity and acceleration of a step's parabola, and by how much the method's v exceeds its own.
+    """Return initial velocity and acceleration of a step's parabola, and by how much the method's v exceeds its own.
 
     The parabola goes from `was` to x in a step over which velocity changed from `before` to v. The velocity of a
     first-order method is half a step ahead or behind, but under a constant force its points do lie on a parabola.
@@ -136,7 +136,7 @@ def _flight(dt: float, was: float, before: float, x: float, v: float) -> tuple[f
 def _bounced(
     radius: float, length: float, restitution: float, dt: float, was: float, before: float, x: float, v: float
 ) -> tuple[float, float]:
-    """Return position and velocity along one axis after a step with impacts, each reflecting `restitution` of the speed.
+    """Return position and velocity along one axis after a step with impacts; each keeps `restitution` of the speed.
 
     If all further bounces (a geometric series) end within the step, the body is at rest at their end; so a body that
     rests at a wall costs one iteration instead of BOUNCES.

@@ -118,7 +118,7 @@ def count_from_home(
     reach: float, periodic: bool, wraps: bool, capacity: int, homes: Ints, strangers: Ints, tally: Any, cell: Ints,
     start: Ints, offset: Ints,
 ) -> tuple[int, int, int, int, int]:  # fmt: skip
-    """Do the same as `count_cells` if all `capacity` agents live and lie in tiles, and list those outside their home tile.
+    """Do the same as `count_cells` if all `capacity` agents live and lie in tiles; list those outside their home tile.
 
     The cells of such agents are written to `strangers` (agents, padded), from this thread's first agent on; their
     number to tally[team + rank].
@@ -181,8 +181,8 @@ def order_cells(
 ) -> None:
     """Sort the records of each cell of listed[begin:end] by agent number, if only this thread has filled the cell.
 
-    Records have `length` numbers and begin with their place; ident holds agent numbers by place; offset holds where each
-    thread stopped, and -1 for a cell once it is sorted, as a cell is listed once for each stranger in it.
+    Records have `length` numbers and begin with their place; ident holds agent numbers by place; offset holds where
+    each thread stopped, and -1 for a cell once it is sorted, as a cell is listed once for each stranger in it.
     """
     size, last, before = np.uint64(length), np.uint64(end), max(rank - 1, 0)
     mine = np.uint64(rank * offset.shape[1])

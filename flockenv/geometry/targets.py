@@ -19,7 +19,7 @@ Place = Annotated[tuple[Annotated[float, Field(strict=True)], ...], Field(min_le
 
 
 class Target(Record):
-    """A place to reach: a point `at`, a door between two `ends`, or a box `low` to `high`; each enlarged by `radius`."""
+    """A place to reach: a point `at`, a door between two `ends`, or a box `low` to `high`, enlarged by `radius`."""
 
     at: Place | None = Field(default=None, description="m, a point")
     ends: tuple[Place, Place] | None = Field(default=None, description="m, the two ends of a door")
@@ -175,7 +175,7 @@ def to_any(table: Any, at: Any, count: Any, x: Vec) -> Vec:
 
 @law
 def passed(table: Any, at: Any, was: Vec, now: Vec) -> bool:
-    """Return True if a move from `was` to `now` ends in the target whose row begins at `at`, or crosses its door; 2-D."""
+    """Return True if a move from `was` to `now` ends in the target whose row begins at `at`, or crosses a door; 2-D."""
     to = to_target(table, at, now)
     a, b, u, v = table[at], table[at + 1], table[at + 2], table[at + 3]
     o = like(now[0], 0.0)
