@@ -269,7 +269,7 @@ def _onward(level: int, node: int, top: int, digits: Any) -> tuple[int, int]:
 
 @kernel
 def _is_far(nodes: Any, own: int, at: int, slack: float, d: int) -> bool:
-    """Return True if no agent of a block is within edge / angle + shift of a node's centre (Barnes 1994).
+    """Return True if a block's box is further than edge / angle + shift from a node's centre (Barnes 1994).
 
     For angles up to 1 this is never true of a node that contains the block itself.
     """

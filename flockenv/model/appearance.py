@@ -53,9 +53,9 @@ class Appearance(Record):
         changes = len(self.colours) > 1 or self.opacity[0] != self.opacity[1]
         changes |= self.size is not None and self.size[0] != self.size[1]
         if changes and self.by is None:
-            raise ValueError("by: missing; colours, opacity or size change with age, speed, or what goes on inside")
+            raise ValueError("by: missing; colours, opacity or size depend on age, speed or an inner state")
         if (self.by == "inner") != (self.of is not None):
-            raise ValueError(f"of = {self.of}: goes with by = inner, and says which number")
+            raise ValueError(f"of = {self.of}: goes with by = inner, and names the inner state")
         return self
 
     def shade(

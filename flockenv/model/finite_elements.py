@@ -138,7 +138,7 @@ def rayleigh(M: Sparse, K: Sparse, alpha: float, beta: float) -> Sparse:
     """
     for name, value in (("alpha", alpha), ("beta", beta)):
         if not 0 <= value < math.inf:
-            raise ValueError(f"{name} = {value!r}: must be a number >= 0")
+            raise ValueError(f"{name} = {value!r}: must be a number >= 0; a negative one would add energy")
     return alpha * M + beta * K
 
 
@@ -277,7 +277,7 @@ def _assembled(parts: Floats, elements: NDArray[np.int64], count: int) -> Sparse
 
 
 def _free(count: int, fixed: ArrayLike) -> NDArray[np.intp]:
-    """Return the degrees of freedom that are not fixed; raise an error if `fixed` has others."""
+    """Return the degrees of freedom that are not fixed; raise TypeError or ValueError on invalid ones."""
     held = np.asarray(fixed)
     if held.size and not np.issubdtype(held.dtype, np.integer):
         raise TypeError(f"fixed of {held.dtype}: must be degrees of freedom, integers from 0 to {count - 1}")

@@ -477,7 +477,7 @@ class Mesh(Network):
         if self.rest is not None and self.stretch != 1:
             raise ValueError(f"stretch = {self.stretch:g}: rest gives the lengths of springs: give one of them")
         if self.lumping == "geometric":
-            self.masses(1.0, len(self.vertices[0]))  # raises if a particle is part of nothing
+            self.masses(1.0, len(self.vertices[0]))  # raises if a particle is part of no element
 
     def _joined(self) -> Ints:
         """Return its elements as given; an empty array of bars if there are none."""

@@ -117,7 +117,7 @@ class State:
 
     @property
     def up(self) -> Floats:
-        """Up vectors, unit vectors perpendicular to the heading, as a view, (B, N, 3); ValueError in 2-D."""
+        """Up vectors, unit vectors perpendicular to the heading, as a view, (B, N, 3); ValueError if not kept."""
         if not len(self.frame) or len(self.x) == 2:
             raise ValueError("up: only scenes in 3-D with an oriented group have up vectors")
         return self.frame[3:].transpose(1, 2, 0)
