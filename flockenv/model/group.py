@@ -37,7 +37,7 @@ class Group(Record):
     Mass, radius and desired_speed are a number, or a `Spread` of numbers that vary within the group.
     """
 
-    count: int | None = Field(default=None, ge=1, description="number of agents")
+    count: int | None = Field(default=None, ge=1, description="how many")
     network: AnyNetwork | None = Field(
         default=None, description="particles joined by springs or elements, and their positions"
     )
