@@ -240,7 +240,7 @@ def test_up_is_up_for_who_flies_level_and_survives_a_climb() -> None:
     state = scene.step(state)
     np.testing.assert_allclose(basis(state)[0], np.broadcast_to((0, -1, 0), state.shape), atol=1e-12)
     np.testing.assert_allclose(state.up, np.broadcast_to((-1, 0, 0), state.shape), atol=1e-12)
-    with pytest.raises(ValueError, match="up: only states of scenes in 3-D"):
+    with pytest.raises(ValueError, match="up: only scenes in 3-D"):
         vehicles(2, oriented=True).start(0).up  # noqa: B018  # a property that refuses
 
 

@@ -360,7 +360,7 @@ def test_springs_of_a_mesh_are_the_edges_of_its_elements_unless_pairs_are_given(
     (lambda: Mesh(vertices=SQUARE, triangles=((0, 1, 2),), bars=((0, 1),)), "bars and triangles: elements are of one"),
     (lambda: Mesh(vertices=SQUARE, tetrahedra=((0, 1, 2, 3),)), "tetrahedra: vertices have 2 coordinates"),
     (lambda: Mesh(vertices=SQUARE, angles=((0, 1, 2), (0, 2, 1), (2, 1, 0))), "angles[2] = (2, 1, 0): the same as"),
-    (lambda: Mesh(vertices=SQUARE, triangles=((0, 1, 2),), lumping="geometric"), "particle 3 is part of nothing"),
+    (lambda: Mesh(vertices=SQUARE, triangles=((0, 1, 2),), lumping="geometric"), "particle 3 is part of no element"),
     (lambda: Mesh(vertices=SQUARE, pinned=("left",)), "pinned[0] = 'left': unknown; allowed: numbers 0 to 3"),
 ])  # fmt: skip
 def test_a_refusal_is_one_line(call: Any, line: str) -> None:

@@ -103,7 +103,7 @@ def test_snapshot_survives_pickling() -> None:
         ({"bonds": [(0, 1)]}, r"Snapshot.bonds: must be agents from 0 to 0, got \[1\]"),
         ({"bonds": [(0, -1)]}, r"Snapshot.bonds: must be agents from 0 to 0, got \[-1\]"),
         ({"bonds": [0, 0]}, r"Snapshot.bonds: must have shape \(any, 2\), got shape \(2,\)"),
-        ({"bonds": [(0.0, 0.0)]}, "Snapshot.bonds: must be whole numbers, got float64"),
+        ({"bonds": [(0.0, 0.0)]}, "Snapshot.bonds: must be integers, got float64"),
         ({"marks": (Mark("goal", np.ones(3), np.ones(3), 0.0),)}, "Snapshot.marks: must have 2 coordinates, got 3"),
     ],
 )

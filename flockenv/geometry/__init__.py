@@ -1,1 +1,1 @@
-"""Space and what stands in it: shapes, targets, polylines, travel times; and how neighbours are found."""
+"""Space and its contents: shapes, targets, polylines, travel distances; and the neighbour search."""

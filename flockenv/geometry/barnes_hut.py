@@ -1,12 +1,12 @@
-"""A tree over the living agents of a world: whoever is far away is met as one (Barnes & Hut 1986, Nature 324:446).
+"""A tree over the living agents of a world: a distant group of agents acts as one (Barnes & Hut 1986, Nature 324:446).
 
 Agents are sorted along a Hilbert curve, on which neighbours in order are neighbours in space, and cut into blocks of
-lanes: the leaves. Node i of each level above holds the nodes 4 i to 4 i + 3 below it. So nothing is inserted, split or
-linked, the number of nodes is known beforehand, and agents in one place are a block like any other. A block walks
-through the tree as a whole, and lists what its lanes then meet side by side: a node where it is small for its distance
-(`gather`), agents one by one where it is not.
+one agent per SIMD lane: the leaves. Node i of each level above holds the nodes 4 i to 4 i + 3 below it. So nothing is
+inserted, split or linked, the number of nodes is known beforehand, and agents in one place are a block like any other.
+Each block traverses the tree as a whole (`gather`) and lists the sources that its lanes then interact with: a node if
+it is small for its distance, single agents otherwise.
 
-One thread grows the tree, which takes a few hundredths of the time of the walks; the walks are shared.
+One thread builds the tree, in a few hundredths of the time of the traversals; the traversals are shared by all threads.
 """
 
 from __future__ import annotations
@@ -21,37 +21,37 @@ from flockenv.jit.decorators import kernel
 __all__ = ["BUCKETS", "LEVELS", "LISTED", "MOST_DIRECT", "gather", "line_up", "tree_sizes", "weigh"]
 
 MOST_DIRECT = 2000
-"""Agents up to whom everybody is met one by one, exactly.
+"""Number of agents up to which all pairs are summed exactly.
 
-In space a tree is slower up to there; in a plane it would be 1.6 times faster from 1,000 on (benchmarks.gravitation),
-and the exact sum of 2,000 takes 1.7 ms.
+In 3-D a tree is slower up to there; in 2-D it would be 1.6 times faster from 1,000 on (benchmarks.gravitation), but the
+exact sum of 2,000 takes only 1.7 ms.
 """
 
 CHILDREN = 4
-"""Nodes that a node holds. In space too: with 8, levels are so far apart that many nodes are opened in vain."""
+"""Children per node, also in 3-D: with 8, levels are so far apart that many nodes are opened in vain."""
 
 LISTED = 256
-"""Nodes and agents that a block lists before its lanes meet them."""
+"""Capacity of a block's list of sources (nodes and agents); its lanes process the list when it is full."""
 
 DIGIT = 11
-"""Bits by which keys are sorted at a time."""
+"""Bits of a key per pass of the radix sort."""
 
 TURNS = 6
-"""Times that takes for 63 bits; even, so that keys end up where they began."""
+"""Passes for 63 bits; even, so that keys end up in the half of the array in which they began."""
 
 BUCKETS = 2**DIGIT
 
 TOGETHER = 512
-"""Cells that are found along the curve side by side."""
+"""Cells whose keys are computed together, so that the loop vectorizes."""
 
 LEVELS = 32
-"""More than any tree has."""
+"""Upper bound of the number of levels of a tree."""
 
 
 def tree_sizes(agents: int, lanes: int, dimension: int, team: int) -> dict[str, int]:
-    """Return how many numbers each array takes: leaves, nodes, and what the threads of a team list.
+    """Return the length of each array: leaves, nodes, and the source lists of a team of threads.
 
-    A node has its centre, its lowest and its highest corner; weight, edge, shift.
+    The record of a node: centre, lower corner, upper corner (D each); weight, edge, shift.
     """
     blocks = -(-agents // lanes)
     nodes = here = blocks
@@ -67,13 +67,13 @@ def tree_sizes(agents: int, lanes: int, dimension: int, team: int) -> dict[str, 
 
 @kernel
 def place_of(i: int, rows: int, lanes: int) -> int:
-    """Return where the first number of agent i lies, in blocks of lanes with so many rows."""
+    """Return the index of the first number of agent i, in blocks of (rows, lanes)."""
     return i // lanes * (rows * lanes) + i % lanes
 
 
 @kernel
 def _exchange(x: Any, other: Any, k: int) -> Any:
-    """Where bit k of the other axis is set, invert the bits of x below it; else exchange those of both."""
+    """Invert the bits of x below bit k if bit k of `other` is set; else exchange those bits of x and `other`."""
     below, here = (np.int64(1) << k) - 1, (other >> k) & 1
     swap = (x ^ other) & below & (here - 1)
     return x ^ (swap | (below & -here)), other ^ swap
@@ -81,9 +81,9 @@ def _exchange(x: Any, other: Any, k: int) -> Any:
 
 @kernel
 def _along_curve(cells: Any, flat: bool, bits: int) -> None:
-    """Turn cells into how far along a Hilbert curve they lie (Skilling 2004, AIP Conf. Proc. 707:381).
+    """Convert cells to their positions along a Hilbert curve (Skilling 2004, AIP Conf. Proc. 707:381).
 
-    cells: the x of TOGETHER of them, their y, their z; in the place of x comes what is asked for.
+    cells: the x of TOGETHER cells, then their y, then their z; the positions overwrite x.
     """
     one, two = np.uint64(TOGETHER), np.uint64(2 * TOGETHER)
     for k in range(bits - 1, 0, -1):
@@ -110,14 +110,14 @@ def _along_curve(cells: Any, flat: bool, bits: int) -> None:
 
 @kernel
 def _cell(x: float, low: float, pace: float, cells: Any) -> Any:
-    """Return which of so many cells of an axis x is in; a NaN in the first."""
+    """Return the index, of `cells` along an axis, of the cell that x is in; 0 for NaN."""
     at = (np.float64(x) - low) * pace
     return np.int64(min(at, np.float64(cells - 1)) if at > 0.0 else 0.0)
 
 
 @kernel
 def _place(keys: Any, first: int, end: int, cells: Any, flat: bool, bits: int) -> None:
-    """Write the keys of some agents, at most TOGETHER."""
+    """Write the keys of agents [first, end), at most TOGETHER."""
     _along_curve(cells, flat, bits)
     for i in range(first, end):
         keys[i] = cells[i - first]
@@ -125,7 +125,7 @@ def _place(keys: Any, first: int, end: int, cells: Any, flat: bool, bits: int) -
 
 @kernel
 def _sort(keys: Any, places: Any, digits: Any, count: int, room: int) -> None:
-    """Sort the first `count` keys, and places along with them; equal ones stay in order. Both arrays have 2 `room`."""
+    """Sort the first `count` keys, and places with them, by a stable radix sort. Both arrays have length 2 `room`."""
     for turn in range(TURNS):
         source = turn % 2 * room
         to, shift = room - source, turn * DIGIT
@@ -150,10 +150,10 @@ def line_up(
     pos: Any, living: Any, mass: Any, n: int, lanes: int, sync: Any, bounds: Any, size: Any, keys: Any, places: Any,
     digits: Any, leaves: Any,
 ) -> int:  # fmt: skip
-    """Sort the living along the curve, and write their blocks; return how many they are.
+    """Sort the living agents along the curve and write their blocks; return the number of living agents.
 
-    pos: blocks of (D, lanes) m; living, mass (agents, padded). Writes places, by order: which agent; leaves: blocks of
-    (D + 1, lanes), coordinates m and mass kg. Lanes beyond the last agent are as his.
+    pos: blocks of (D, lanes) m; living, mass (agents, padded). Writes places: the agent at each position of the order;
+    leaves: blocks of (D + 1, lanes), coordinates m and mass kg. Lanes beyond the last agent repeat it.
     """
     d = len(size)
     low, lengths = region(pos, living, 0, (n + lanes - 1) // lanes, lanes, 0, 1, sync, bounds, size, False)
@@ -184,7 +184,7 @@ def line_up(
 
 @kernel
 def _leaf(leaves: Any, block: int, held: int, lanes: int, by_mass: bool, nodes: Any, at: int, d: int) -> None:
-    """Write weight, centre and corners of a block of so many agents."""
+    """Write weight, centre and corners of a block of `held` agents."""
     first, total = block * (d + 1) * lanes, 0.0
     for l in range(held):  # noqa: E741  # a lane
         total += leaves[first + d * lanes + l] if by_mass else 1.0
@@ -201,7 +201,7 @@ def _leaf(leaves: Any, block: int, held: int, lanes: int, by_mass: bool, nodes: 
 
 @kernel
 def _join(nodes: Any, first: int, held: int, at: int, d: int) -> None:
-    """Write weight, centre and corners of a node that holds so many; their records lie one after another."""
+    """Write weight, centre and corners of a node with `held` children, whose records lie one after another."""
     size, total = 3 * d + 3, 0.0
     for c in range(held):
         total += nodes[first + c * size + 3 * d]
@@ -217,9 +217,9 @@ def _join(nodes: Any, first: int, held: int, at: int, d: int) -> None:
 
 @kernel
 def _measure(nodes: Any, at: int, d: int) -> None:
-    """Write the longest edge of a node, and how far its centre is shifted from the middle.
+    """Write the longest edge of a node, and the distance of its centre from the middle of its box.
 
-    Rounding does not carry a centre out of its corners: agents in one place have it there, and not beside it.
+    The centre is clamped to the box, so that rounding does not move it away from agents that are all in one place.
     """
     edge, square = 0.0, 0.0
     for k in range(d):
@@ -234,9 +234,9 @@ def _measure(nodes: Any, at: int, d: int) -> None:
 
 @kernel
 def weigh(leaves: Any, count: int, lanes: int, size: Any, by_mass: bool, digits: Any, nodes: Any) -> None:
-    """Grow the tree over the blocks of so many agents, whose weight is their mass or their number.
+    """Build the tree over the blocks of `count` agents; the weight of a node is their mass or their number.
 
-    Writes nodes, a record each (see record_size), level after level; digits[BUCKETS + k]: the first node of level k,
+    Writes nodes, a record each (see `tree_sizes`), level after level; digits[BUCKETS + k]: the first node of level k,
     digits[BUCKETS + LEVELS]: the highest level.
     """
     d = len(size)
@@ -259,7 +259,7 @@ def weigh(leaves: Any, count: int, lanes: int, size: Any, by_mass: bool, digits:
 
 @kernel
 def _onward(level: int, node: int, top: int, digits: Any) -> tuple[int, int]:
-    """Return the node after this one and all that it holds; on a level above the highest there is none."""
+    """Return the next node (level, node) after this one and its descendants; level top + 1 if there is none."""
     while level < top and (
         node % CHILDREN == CHILDREN - 1 or digits[BUCKETS + level] + node + 1 == digits[BUCKETS + level + 1]
     ):
@@ -269,9 +269,9 @@ def _onward(level: int, node: int, top: int, digits: Any) -> tuple[int, int]:
 
 @kernel
 def _is_far(nodes: Any, own: int, at: int, slack: float, d: int) -> bool:
-    """Is the nearest that an agent of a block can be to a node's centre beyond edge / angle + shift (Barnes 1994)?
+    """Return True if a block's box is further than edge / angle + shift from a node's centre (Barnes 1994).
 
-    For angles up to 1 that never holds of a node that the block itself is in.
+    For angles up to 1 this is never true of a node that contains the block itself.
     """
     square = 0.0
     for k in range(d):
@@ -287,9 +287,10 @@ def gather(
     leaves: Any, nodes: Any, digits: Any, count: int, lanes: int, size: Any, by_mass: bool, angle: float, block: int,
     level: int, node: int, listed: Any, first: int,
 ) -> tuple[int, int, int]:  # fmt: skip
-    """List what a block meets from a node on, until the list may not hold another leaf; return how many, and the next.
+    """List the sources of a block from a node on, until the list has no room for another leaf.
 
-    Writes from listed[first] on, for each, D coordinates of the centre m, and its weight.
+    Returns the number of sources, and the level and node to go on with. Writes, from listed[first] on, D coordinates
+    of each source's centre, m, and its weight.
     """
     d = len(size)
     record, top, many, slack = 3 * d + 3, digits[BUCKETS + LEVELS], 0, 1.0 / np.float64(angle)

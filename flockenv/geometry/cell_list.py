@@ -1,13 +1,13 @@
-"""Who is near whom: one query per instant, at the largest reach, shared by every law that asks.
+"""Cell list: one neighbour query per evaluation, at the largest interaction range, shared by all pair forces.
 
-A query sorts the living agents by cell where that pays, and answers with contiguous ranges of sorted candidates. No
-neighbour list is ever built: a sweep meets every candidate of a range, and keeps those in sight. Brute force is the
-query with one range. Several threads may share one query: each counts and places its own agents, and the order that
-results (by cell, then by number) does not depend on how many they are.
+A query sorts the living agents by cell if that pays, and returns contiguous ranges of sorted candidates. No neighbour
+list is built: the pair loop tests every candidate of a range against the interaction range. Brute force is the query
+with one range. Several threads may share one query: each counts and places its own agents, and the resulting order (by
+cell, then by agent number) does not depend on the number of threads.
 
-In a space that has no edges the cells divide the bounding box of the agents. One agent far away stretches them until
-all others share one. Where that has happened the cells are folded instead: they are as wide as the reach, there is no
-end to them, and they share a fixed number of places in memory, as the cells of a torus do (`_folded`).
+In an unbounded space the cells divide the bounding box of the agents. One agent far away stretches the cells until all
+others share one. If that has happened, the cells are folded instead: they are as wide as the reach, there are
+infinitely many, and they share a fixed number of slots in memory, like the cells of a torus (`_folded`).
 """
 
 from __future__ import annotations
@@ -29,36 +29,36 @@ __all__ = [
 ]  # fmt: skip
 
 MAX_RANGES = 27
-"""Ranges of one query: 9 rows of cells in 3-D, each in three pieces where it wraps around twice."""
+"""Most ranges of one query: 9 rows of cells in 3-D, each in three pieces if it wraps around twice."""
 
 FEWEST_AGENTS = 96
-"""Below this, sorting costs more than it saves."""
+"""With fewer agents, sorting costs more than it saves."""
 
 WORTH_ARRANGING = 2**14
-"""Agents from which on a call of several steps puts them in order first: fewer lie in the nearest caches anyway."""
+"""Number of agents from which a call of several steps sorts them in memory first; fewer fit into the L1/L2 cache."""
 
 FEWEST_ARRANGED = 2**12
-"""Agents from which on a team of threads does so: else threads write into the same lines of memory, in turns."""
+"""The same for a team of threads: with unsorted agents, threads write to the same cache lines (false sharing)."""
 
 STEPS_ARRANGED = 5
-"""Steps of a call that it takes for that."""
+"""Least number of steps of a call for which sorting agents in memory pays."""
 
 DISTANT = 2**13
-"""Agents from which on the places of records are asked for in good time: fewer lie in the nearest caches anyway."""
+"""Number of agents from which records are prefetched; fewer fit into the L1/L2 cache."""
 
 AHEAD = 48
-"""Records that are asked for before their turn comes; from 16 to 64 makes no difference."""
+"""Prefetch distance, in records; 16 to 64 make no difference."""
 
 FINEST = 3
-"""Cells along x that a reach spans at most: a row is cut finely, so that a block meets few agents out of its reach."""
+"""Most cells along x that a reach spans: rows are cut finely, so that few candidates are out of reach."""
 
 CROWDED = 8
-"""Stretched cells are folded if so many agents share one, in the mean over agents; 2 do if they are spread evenly."""
+"""Stretched cells are folded if more agents than this share one, in the mean over agents (2 if spread evenly)."""
 
 FOLDED_ROWS = 4
-"""Rows of folded cells along each further axis: at least 3, so that a row and its two neighbours are three."""
+"""Rows of folded cells along each further axis: at least 3, so that a row and its two neighbours are distinct."""
 
-_FARTHEST = 2.0**40  # cells from the origin: up to there rounding is less than the margin, and integers suffice
+_FARTHEST = 2.0**40  # cells from the origin: up to there rounding is less than the margin, and int64 suffices
 
 _MARGIN = 1.001  # cells are this much wider than the reach, so that rounding never hides a neighbour
 
@@ -67,14 +67,14 @@ Ints = NDArray[np.int32]
 
 @kernel
 def _fit(cells: Any, count: int) -> tuple[int, int, int]:
-    """Return cells per axis, at most `count` in all; wider cells are right too."""
+    """Return cells per axis, at most `count` in all; wider cells also give correct results."""
     nx, ny, nz = cells
     total = float(nx) * float(ny) * float(nz)
     if total > count:
         dimension = 1.0 + (1.0 if ny > 1 else 0.0) + (1.0 if nz > 1 else 0.0)
         shrink = (count / total) ** (1.0 / dimension)
         nx, ny, nz = max(1, int(nx * shrink)), max(1, int(ny * shrink)), max(1, int(nz * shrink))
-    while nx * ny * nz > count:  # an axis of one cell could not shrink (a queue of people): the longest gives way
+    while nx * ny * nz > count:  # an axis of one cell cannot shrink (e.g. agents in a line): shrink the longest
         if nx >= ny and nx >= nz:
             nx = max(1, count // (ny * nz))
         elif ny >= nz:
@@ -86,14 +86,14 @@ def _fit(cells: Any, count: int) -> tuple[int, int, int]:
 
 @kernel
 def _along(length: float, reach: float) -> int:
-    return int(min(max(1.0, length / (reach * _MARGIN)), 2.0**20))  # bounded first: 1e100 m are no integer of cells
+    return int(min(max(1.0, length / (reach * _MARGIN)), 2.0**20))  # bounded first: 1e100 m overflow an integer
 
 
 @kernel
 def grid_of(lengths: Any, count: int, reach: float, periodic: bool) -> tuple[int, int, int, int, int]:
-    """Choose how many cells each axis gets, at most `count` in all, and how many of them a reach spans along x.
+    """Return the number of cells per axis (nx, ny, nz), at most `count` in all, and how many a reach spans along x.
 
-    The last number is 0: these cells are not folded. All are zeros where brute force is as good.
+    The last number is 0: these cells are not folded. All are zeros if brute force is as fast.
     """
     fine, nx, ny, nz = FINEST, _along(lengths[0], reach / FINEST), _along(lengths[1], reach), 1
     if len(lengths) == 3:
@@ -125,7 +125,7 @@ def _spread(pos: Any, living: Any, first: int, end: int, lanes: int, d: int, k: 
 
 @kernel
 def _edge(k: int, team: int, bounds: Any) -> tuple[float, float]:
-    """Return where the agents of all threads begin on an axis, and how far they are spread; (0, 1) if nobody lives."""
+    """Return the least coordinate of all threads' agents along axis k, and their extent; (0, 1) if no agent lives."""
     low, high = np.inf, -np.inf
     for r in range(team):
         low, high = min(low, bounds[r, 2 * k]), max(high, bounds[r, 2 * k + 1])
@@ -137,9 +137,9 @@ def region(
     pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, bounds: Any, size: Any,
     periodic: bool,
 ) -> Any:  # fmt: skip
-    """Return the corner and the edges of the region to divide: the box, or where the living agents are.
+    """Return the corner and the edges of the region to divide: the periodic box, or the agents' bounding box.
 
-    Each of a team looks at its own blocks [first, end); bounds (team, 6) is how they tell each other.
+    Each thread of a team scans its own blocks [first, end); threads exchange their results through bounds (team, 6).
     """
     d = len(size)
     if not periodic:
@@ -160,7 +160,7 @@ def region(
 
 @kernel
 def _part(x: float, low: float, pace: float, count: int) -> Any:
-    """Return which of `count` cells along an axis x is in, a NaN in the first; cells per metre are its pace."""
+    """Return the index, of `count` cells along an axis, of the cell that x is in; 0 for NaN. pace: cells per metre."""
     return min(max(np.int64((np.float64(x) - low) * pace), np.int64(0)), np.int64(count - 1))
 
 
@@ -169,7 +169,7 @@ def divided(
     pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, bounds: Any, size: Any,
     reach: float, periodic: bool, capacity: int,
 ) -> tuple[tuple[int, int, int, int, int], Any, Any]:  # fmt: skip
-    """Return the cells as `grid_of` does, the corner of the region they divide, and cells per metre of each axis."""
+    """Return the cells as `grid_of` does, the corner of the region they divide, and cells per metre along each axis."""
     low, lengths = region(pos, living, first, end, lanes, rank, team, sync, bounds, size, periodic)
     shape = grid_of(lengths, capacity, reach, periodic)
     if len(size) == 2:
@@ -180,12 +180,12 @@ def divided(
 
 @kernel
 def cell_of(pos: Any, at: Any, lanes: Any, low: Any, pace: Any, size: Any, wraps: bool, shape: Any) -> tuple[Any, ...]:
-    """Return the cell along each of three axes of the agent whose coordinates lie from `at` on, so many lanes apart."""
+    """Return the cell along each of three axes of the agent whose coordinates begin at `at`, `lanes` apart."""
     if len(size) == 2:
         x: Any = (pos[at], pos[at + lanes])
     else:
         x = (pos[at], pos[at + lanes], pos[at + lanes + lanes])
-    if wraps:  # as it is sorted: -1e-17 is 0 there, and with a cell at the other end would miss neighbours
+    if wraps:  # the cell must be that of the confined position: -1e-17 becomes 0, not a place in the last cell
         x, _ = torus_confine(size, size[0], x, x)
     if len(size) == 2:
         third: Any = np.int64(0)
@@ -199,7 +199,7 @@ def _find_cells(
     pos: Any, living: Any, first: int, end: int, lanes: int, low: Any, pace: Any, size: Any, wraps: bool, shape: Any,
     cell: Ints,
 ) -> None:  # fmt: skip
-    """Write the cell of every agent of these blocks, lane beside lane; -1 for the dead."""
+    """Write the cell of every agent of these blocks, vectorized over lanes; -1 for the dead."""
     d, w = np.uint64(len(size)), np.uint64(lanes)
     for block in range(np.uint64(first), np.uint64(end)):
         for l in range(w):  # noqa: E741  # a lane
@@ -213,9 +213,9 @@ def count_cells(
     pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, bounds: Any, size: Any,
     reach: float, periodic: bool, wraps: bool, capacity: int, cell: Ints, start: Ints, offset: Ints,
 ) -> tuple[int, int, int, int, int]:  # fmt: skip
-    """Find the cell of every agent, and where in sorted order each cell begins; return the cells as grid_of does.
+    """Compute the cell of every agent, and where in sorted order each cell begins; return the cells as grid_of does.
 
-    pos: blocks of (D, lanes) m, to be brought into a periodic box first if it `wraps`; living (agents, padded) 0 or 1;
+    pos: blocks of (D, lanes) m, wrapped into the periodic box first if `wraps`; living (agents, padded) 0 or 1;
     [first, end): this thread's blocks; capacity: most cells.
     Writes cell (agents, padded), -1 for the dead; start (capacity + 1,): first sorted agent of each cell;
     offset (team, capacity): where this thread puts its next agent of each cell. Returns zeros for brute force.
@@ -236,7 +236,7 @@ def count_cells(
 
 @kernel
 def crowded(shape: Any, pace: Any, reach: float, start: Ints) -> bool:
-    """True if cells are much wider than the reach, and many agents share one; pace: cells per metre of each axis."""
+    """Return True if cells are much wider than the reach and many agents share one; pace: cells per metre per axis."""
     stretched = 1.0
     for k in range(len(pace)):
         stretched *= max(1.0, 1.0 / (pace[k] * reach))
@@ -255,9 +255,9 @@ def _folded(capacity: int, d: int) -> tuple[int, int, int, int, int]:
     """Return the shape of folded cells, at most `capacity` in all; its last number is more than 0.
 
     The cell (x, y, z) of an endless lattice lies in row (y mod ny, z mod nz), at x + fold (y div ny) + twist (z div nz)
-    modulo nx. So neighbours of a cell are found where they would be if every cell had a place of its own; what else
-    lies there is far away, and out of reach. The shifts are irrational parts of a row (the golden ratio; in space,
-    powers of the plastic number), so that a flock of whatever outline covers the places evenly.
+    modulo nx. So the neighbours of a cell are found as if every cell had a slot of its own; other agents in the same
+    slots are far away and out of reach. The shifts are irrational fractions of a row (the golden ratio; in 3-D, powers
+    of the plastic number), so that a flock of any outline covers the slots evenly.
     """
     nz = FOLDED_ROWS if d == 3 else 1
     nx = max(1, capacity // (FOLDED_ROWS * nz))
@@ -266,13 +266,13 @@ def _folded(capacity: int, d: int) -> tuple[int, int, int, int, int]:
 
 @kernel
 def _twist(shape: Any) -> Any:
-    """Return how far a row is shifted for every turn along the third axis."""
+    """Return the shift of a row, in cells, per turn along the third axis."""
     return np.int64(shape[0] * 0.7548776662466927)
 
 
 @kernel
 def _lattice(x: float, pace: float) -> Any:
-    """Return in which cell of an endless lattice a coordinate lies."""
+    """Return the cell of an endless lattice in which a coordinate lies."""
     return np.int64(math.floor(min(max(np.float64(x) * pace, -_FARTHEST), _FARTHEST)))
 
 
@@ -281,7 +281,7 @@ def count_folded(
     pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, size: Any, reach: float,
     capacity: int, cell: Ints, start: Ints, offset: Ints,
 ) -> tuple[int, int, int, int, int]:  # fmt: skip
-    """Do as `count_cells` does with folded cells."""
+    """Do the same as `count_cells`, with folded cells."""
     d, w, pace = np.uint64(len(size)), np.uint64(lanes), 1.0 / (reach * _MARGIN)
     shape = _folded(capacity, len(size))
     for block in range(np.uint64(first), np.uint64(end)):
@@ -306,7 +306,7 @@ def count_folded(
 
 @kernel
 def tally_cells(cell: Ints, first: int, end: int, rank: int, cells: int, offset: Ints) -> None:
-    """Write how many of the agents [first, end) are in each cell."""
+    """Write the number of agents of [first, end) in each cell."""
     for c in range(cells):
         offset[rank, c] = 0
     for i in range(first, end):
@@ -317,9 +317,9 @@ def tally_cells(cell: Ints, first: int, end: int, rank: int, cells: int, offset:
 
 @kernel
 def begin_cells(rank: int, team: int, sync: Any, cells: int, start: Ints, offset: Ints) -> None:
-    """Write where in sorted order each cell begins, and in `offset` each thread's part of it, of which it has the size.
+    """Write where in sorted order each cell begins, and in `offset`, which holds counts, where each thread's part does.
 
-    For all threads of a team at once: all have counted when it begins, and all are told when it ends.
+    A prefix sum, called by all threads of a team: barriers before and after it, one thread computes.
     """
     wait_for_team(sync, team)
     if rank == 0:
@@ -339,7 +339,7 @@ def begin_cells(rank: int, team: int, sync: Any, cells: int, start: Ints, offset
 
 @kernel
 def _key(records: Any, cell: Ints, ident: Any, at: Any) -> Any:
-    """Return cell and number of the agent whose record begins at `at`, in one whole number that is in their order."""
+    """Return one integer that orders records by cell, then by agent number; the record begins at `at`."""
     place = np.uint64(records[at])
     return np.int64(cell[place]) * np.int64(2**32) + np.int64(ident[place])
 
@@ -348,12 +348,11 @@ def _key(records: Any, cell: Ints, ident: Any, at: Any) -> Any:
 def order_records(
     records: Any, cell: Ints, ident: Any, length: int, first: int, end: int, late: Ints
 ) -> None:  # fmt: skip
-    """Put the records [first, end), so long and in the order of their cells, in the order of numbers within each.
+    """Sort the records [first, end), already in the order of their cells, by agent number within each cell.
 
-    Records begin with their place; cell and ident have cells and numbers by place. Most are where they belong: who
-    comes after somebody he should precede is listed first, without a branch, which would often be guessed wrong.
-    Records are asked for some way ahead: they are written, but they have left the nearest caches since. late: room for
-    that list.
+    Records have `length` numbers and begin with their place; cell and ident hold cells and agent numbers by place. Most
+    records are in order: those that are not are first collected in `late` (scratch), without a branch, as it would be
+    mispredicted often. Records are prefetched AHEAD of use: since they were written they have left the nearest caches.
     """
     if first >= end:
         return
@@ -371,7 +370,7 @@ def order_records(
 
 @kernel
 def _settle(records: Any, cell: Ints, ident: Any, size: Any, first: Any, end: Any, k: Any) -> None:
-    """Bring record k back to where it belongs, and those behind it, until one is there already."""
+    """Move record k back to where it belongs, then those after it, until one is in order."""
     later = _key(records, cell, ident, k * size - size) > _key(records, cell, ident, k * size)
     while later:
         at = k * size
@@ -387,7 +386,7 @@ def _settle(records: Any, cell: Ints, ident: Any, size: Any, first: Any, end: An
 
 @kernel
 def row_of(first: int, start: Ints, row: int, nx: int) -> int:
-    """Return the row of cells that holds sorted agent `first`, searching from `row` on."""
+    """Return the row of cells that holds sorted agent `first`; the search begins at `row`."""
     while start[(row + 1) * nx] <= first:
         row += 1
     return row
@@ -399,8 +398,8 @@ def candidates(
 ) -> tuple[int, int]:
     """Write the ranges (from, to, wrapped) of sorted agents that may be near the block [first, end) of one row.
 
-    `at` is a cell at or before that of `first`, from where the search begins. Returns how many ranges there are, and
-    the cell of `first`. A range is `wrapped` if it lies around the edge of a periodic box.
+    `at` is a cell at or before that of `first`; the search begins there. Returns the number of ranges and the cell of
+    `first`. A range is `wrapped` if it lies across the edge of a periodic box.
     """
     nx, ny, nz, fine, fold = shape
     while start[at + 1] <= first:
@@ -434,7 +433,7 @@ def candidates(
 def _row_ranges(
     base: int, west: int, east: int, nx: int, start: Ints, periodic: bool, around: bool, ranges: Any, found: int
 ) -> int:
-    """Add the pieces of one row of cells between west and east."""
+    """Add the ranges of one row of cells from `west` to `east`; return the new number of ranges."""
     if not periodic:
         return _add(start[base + max(west, 0)], start[base + min(east, nx - 1) + 1], False, ranges, found)
     if east - west + 1 >= nx:

@@ -1,9 +1,9 @@
-"""How far every place is from a goal around obstacles: |grad u| = 1 on a grid, second order in the spacing.
+"""Floor fields: the distance to a target around obstacles, |grad u| = 1 on a grid, second order in the spacing.
 
-A global controller: agents follow -grad u, local steering does the rest. Fast sweeping (Zhao, "A fast sweeping method
-for Eikonal equations", Math. Comp. 2005) finds the first-order solution, and with it the order in which a front reaches
-the points; one pass in that order takes one-sided differences of second order (Sethian, "Fast marching methods", SIAM
-Review 1999, section 3.1).
+Agents follow -grad u for global navigation; local steering does the rest. Fast sweeping (Zhao, "A fast sweeping method
+for Eikonal equations", Math. Comp. 2005) computes the first-order solution, and with it the order in which a front
+reaches the points; one pass in that order takes one-sided differences of second order (Sethian, "Fast marching
+methods", SIAM Review 1999, section 3.1).
 """
 
 from __future__ import annotations
@@ -27,14 +27,17 @@ __all__ = ["NO_WAY", "Start", "distances_around", "free_part", "way_table"]
 
 Floats = NDArray[np.float64]
 NEAR = 4.0
-"""Spacings from the goal within which distances are straight lines, where these are free."""
+"""Distance from the target, in spacings, within which distances are straight lines if these are free."""
 NO_WAY = 1e30
-"""m, the length that a table holds where no way leads: finite, so that it can be interpolated in float32 too."""
+"""m, the distance in a floor field where no path leads: finite, so that it can be interpolated, also in float32."""
 
 
 @kernel
 def _updated(a: float, b: float, c: float, h: float) -> float:
-    """Return u where sum of ((u - neighbour) / h)^2 over the axes that count is 1; of each the smaller neighbour."""
+    """Return u such that the sum of ((u - neighbour) / h)^2 is 1; a, b, c: the smaller neighbour along each axis.
+
+    Only neighbours smaller than u contribute.
+    """
     a, b = (a, b) if a < b else (b, a)
     b, c = (b, c) if b < c else (c, b)
     a, b = (a, b) if a < b else (b, a)
@@ -50,7 +53,7 @@ def _updated(a: float, b: float, c: float, h: float) -> float:
 
 @kernel
 def _sweep(u: Any, free: Any, h: float) -> float:
-    """Go through the grid (nx, ny, nz) once in each direction; return by how much anything became less."""
+    """Sweep the grid (nx, ny, nz) once in each direction; return the largest decrease of a value."""
     nx, ny, nz = u.shape
     changed = 0.0
     for way in range(8 if nz > 1 else 4):
@@ -78,7 +81,7 @@ def _upwind(u: Any, done: Any, at: int, stride: int, place: int, count: int) -> 
     """Return the smaller final neighbour of point `at` along one axis, and its one-sided difference as (t, w).
 
     The difference squared is w ((x - t) / h)^2: w = 9/4 where two points upwind are final and increase towards `at`,
-    else 1; w = 0 and t = inf where no neighbour is final. place: the index along this axis, of `count`.
+    else 1; w = 0 and t = inf if no neighbour is final. place: the index along this axis, of `count`.
     """
     near, side, beyond = np.inf, 0, False
     if place > 0 and done[at - stride]:
@@ -92,7 +95,7 @@ def _upwind(u: Any, done: Any, at: int, stride: int, place: int, count: int) -> 
 
 @kernel
 def _second_order(u: Any, done: Any, order: Any, shape: Any, h: float) -> None:
-    """Write the second-order distance of every point of `order` in turn; u, done: flat grids of this shape."""
+    """Write the second-order distance of each point, in the given order; u, done: flat grids of this shape."""
     _, ny, nz = shape
     for at in order:
         i, j, k = at // (ny * nz), at // nz % ny, at % nz
@@ -109,22 +112,22 @@ def _second_order(u: Any, done: Any, order: Any, shape: Any, h: float) -> None:
                 break
             w, wt, wtt = w + weight, wt + weight * t, wtt + weight * t * t
             root = wt * wt - w * wtt
-            if root < 0 or wt + math.sqrt(root) < w * near:  # upwind of this neighbour: it has no part in x
+            if root < 0 or wt + math.sqrt(root) < w * near:  # upwind of this neighbour, which does not contribute to x
                 break
             x = (wt + math.sqrt(root)) / w
         u[at], done[at] = x, True
 
 
 def distances_around(free: NDArray[np.bool_], spacing: float, begin: Floats) -> Floats:
-    """Return how far each point of a grid is from the goal through free ones, m; inf where no way leads.
+    """Return the distance of each point of a grid from the target through free points, m; inf where no path leads.
 
-    free (nx, ny[, nz]); begin: the same shape, distances of the points about the goal that are known, inf elsewhere.
+    free (nx, ny[, nz]); begin: the same shape, known distances of points near the target, inf elsewhere.
     """
     shape = (*free.shape, 1, 1)[:3]
     u = np.where(free, begin, np.inf).reshape(shape).astype(np.float64)
     open_ = np.ascontiguousarray((free & ~np.isfinite(begin)).reshape(shape))
     while entry(_sweep)(u, open_, spacing) > 1e-9 * spacing:
-        pass  # each round goes around one more corner than the one before, and no length grows
+        pass  # each round gets around one more corner than the one before, and no distance grows
     flat = u.reshape(-1)
     done = np.isfinite(flat) & ~open_.reshape(-1)
     order = np.flatnonzero(np.isfinite(flat) & ~done)
@@ -134,17 +137,17 @@ def distances_around(free: NDArray[np.bool_], spacing: float, begin: Floats) -> 
 
 
 class Ground(NamedTuple):
-    """A grid over a place with obstacles."""
+    """A grid over a region with obstacles."""
 
     low: tuple[float, ...]  # m, its lowest corner
     spacing: float  # m
     points: Floats  # (nx, ny[, nz], D) m
-    gap: Floats  # (nx, ny[, nz]) m, how far the nearest obstacle is
-    out: Floats  # (nx, ny[, nz], D) the way out of it
+    gap: Floats  # (nx, ny[, nz]) m, distance to the nearest obstacle
+    out: Floats  # (nx, ny[, nz], D) outward unit normal of its surface
 
 
 class Start(NamedTuple):
-    """Where somebody begins, who must get to a target."""
+    """A region in which agents begin and from which a path must lead to a target."""
 
     name: str
     low: Floats  # (D,) m
@@ -153,7 +156,7 @@ class Start(NamedTuple):
 
 @functools.lru_cache(maxsize=2)
 def ground(shapes: tuple[Shape, ...], low: tuple[float, ...], high: tuple[float, ...], spacing: float) -> Ground:
-    """Return the grid of a region, and how far its points are from obstacles: the same for every target."""
+    """Return the grid of a region and the distances of its points from obstacles: the same for every target."""
     counts = [1 + math.ceil((b - a) / spacing - 1e-9) for a, b in zip(low, high, strict=True)]
     points = points_of(low, spacing, counts)
     return Ground(low, spacing, points, *_nearest_surface(shapes, points))
@@ -163,15 +166,16 @@ def way_table(
     shapes: Sequence[Shape], targets: Sequence[Target], low: Sequence[float], high: Sequence[float], spacing: float,
     clearance: float, names: Sequence[str] = ("target",), starts: Sequence[Start] = (),
 ) -> Floats:  # fmt: skip
-    """Return the ways to the nearest of some targets as a grid (see grid.py): the length, m, and the first direction.
+    """Return a floor field as a grid (see flockenv/maths/grid.py): distance to the nearest target, m, and direction.
 
-    The way of a body's centre that keeps `clearance` from all shapes. Beside an obstacle and in it the direction is
-    away from the nearest surface, and the length that of the nearest clear point and the distance to it. Where no way
-    leads the length is NO_WAY; from a point that is clear of all obstacles the direction is zero then.
+    The shortest paths are those of a body's centre that keeps `clearance` from all shapes. Within `clearance` of an
+    obstacle, and inside it, the direction is away from the nearest surface, and the distance is that of the nearest
+    clear point plus the distance to that point. Where no path leads the distance is NO_WAY; the direction is then zero
+    at points that are clear of all obstacles.
 
     Raises:
-        ValueError: one line that begins with the target's name if a target is not free or is outside the grid; or if
-            no way leads to any target from one of `starts`.
+        ValueError: one line that begins with the target's name if a target is not free or is outside the grid, or if
+            no path leads to any target from one of `starts`.
     """
     found = ground(tuple(shapes), tuple(map(float, low)), tuple(map(float, high)), spacing)
     begin, towards = np.full(found.gap.shape, np.inf), np.zeros_like(found.points)
@@ -198,8 +202,8 @@ def way_table(
 def _lengths_beside(
     u: Floats, reached: NDArray[np.bool_], free: NDArray[np.bool_], spacing: float, clearance: float
 ) -> Floats:
-    """Return lengths everywhere, m: an agent that is pushed against a wall is about as near to its target as before."""
-    from scipy.ndimage import distance_transform_edt  # here: a scene without ways need not wait for it
+    """Return distances also beside obstacles, m, so that an agent pushed against a wall is about as far as before."""
+    from scipy.ndimage import distance_transform_edt  # here: a scene without floor fields need not wait for it
 
     far, place = distance_transform_edt(~reached, sampling=spacing, return_indices=True)
     beside = reached | (~free & (far <= clearance + 2 * spacing))
@@ -209,10 +213,10 @@ def _lengths_beside(
 def free_part(
     shapes: Sequence[Shape], target: Target, name: str, spacing: float, clearance: float
 ) -> tuple[Target, Floats, Floats]:
-    """Return a target without what of it is nearer than `clearance` to a shape, and places of it: where, how clear.
+    """Return the free part of a target, points of it (S, D) m, and their distances to the nearest shape (S,) m.
 
-    Of a door the part between the jambs, of a box all: who is not in the way there is seen at the places, (S, D) m and
-    (S,) m. ValueError, in one line, if nothing is left.
+    A door is cut to the part between its jambs; a box stays whole, but its points are only those at least `clearance`
+    from all shapes. Raises ValueError, in one line, if nothing is left.
     """
     samples = target.samples(spacing)
     gap = np.min([shape.gap(samples) for shape in shapes], axis=0) if shapes else np.full(len(samples), np.inf)
@@ -234,9 +238,9 @@ def _begin_at(
     found: Ground, shapes: Sequence[Shape], whole: Target, clearance: float, name: str, high: Sequence[float],
     begin: Floats, towards: Floats,
 ) -> None:  # fmt: skip
-    """Write the distances of the points about a target, and the straight way to it from those that are very near.
+    """Write the distances of points near a target, and the straight offset to it from those within two spacings.
 
-    Straight lines count where nothing can be between: nearer than the nearest obstacle.
+    A straight line is used only if no obstacle can be between: if it is shorter than the distance to the nearest one.
     """
     spacing, d = found.spacing, whole.dimension
     if (whole.extremes[0] < found.low).any() or (whole.extremes[1] > high).any():
@@ -247,7 +251,7 @@ def _begin_at(
     last = np.ceil((target.extremes[1] + sight - found.low) / spacing).astype(int) + 1
     here = tuple(slice(a, b) for a, b in zip(first, last, strict=True))
     points, free = found.points[here], found.gap[here] >= clearance
-    from scipy.spatial import cKDTree  # here: who looks for no way need not wait for it
+    from scipy.spatial import cKDTree  # here: a scene without floor fields need not wait for it
 
     nearby = cKDTree(places).query(points)[1]
     to = target.offset(points)
@@ -263,9 +267,9 @@ def _begin_at(
 
 
 def _nearest_surface(shapes: Sequence[Shape], points: Floats) -> tuple[Floats, Floats]:
-    """Return how far the nearest surface is from each point of a grid, and its normal.
+    """Return the distance of each point of a grid to the nearest surface, and its normal there.
 
-    A shape is asked only where the box around it is nearer than what was found before.
+    A shape is evaluated only at points whose distance to its bounding box is less than the best distance so far.
     """
     d = points.shape[-1]
     flat, lead = points.reshape(-1, d), points.shape[:-1]
@@ -284,7 +288,7 @@ def _nearest_surface(shapes: Sequence[Shape], points: Floats) -> tuple[Floats, F
 def _slopes(u: Floats, spacing: float) -> Floats:
     """Return the gradient, (..., D), by one-sided differences towards the smaller neighbour along each axis.
 
-    Second order where the next point on that side is no larger than the neighbour. No number crosses an obstacle.
+    Second order where the next point on that side is not larger than the neighbour. No difference crosses an obstacle.
     """
     found = []
     for axis in range(u.ndim):

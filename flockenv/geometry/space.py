@@ -1,8 +1,8 @@
-"""Space as two functions: offset(a, b), the way from a to b, and confine(x, v), where a body that left is put.
+"""Space as two functions: offset(a, b), the vector from a to b, and confine(x, v), which puts bodies back inside.
 
-Where bodies bounce, a third one: bounce(...), where a step really led that led beyond a wall.
+If bodies bounce, there is a third: bounce(...) returns where a step that led beyond a wall really ends.
 
-The shape of the world enters a simulation here and nowhere else; no other file takes a remainder.
+The topology of the world enters a simulation only here; no other file takes a remainder of positions.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 Size = Annotated[tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...], Field(min_length=2, max_length=3)]
 
 BOUNCES = 100
-"""Impacts on the walls across one axis that one step follows; a body that has more lies still at the wall."""
+"""Most impacts per step on the walls across one axis; a body with more stops at the wall."""
 
 
 @law
@@ -35,15 +35,15 @@ def plane_offset(size: Vec, a: Vec, b: Vec) -> Vec:
 
 @law
 def _shortest(d: float, length: float) -> float:
-    # times the reciprocal, which is the same for all pairs: a division each would double the cost of a sweep
+    # times the reciprocal, which is the same for all pairs: a division per pair would double the cost of the pair loop
     return d - length * nearest_whole(d * (like(d, 1.0) / length))
 
 
 @law
 def torus_offset(size: Vec, a: Vec, b: Vec) -> Vec:
-    """Return the shortest way from a to b (minimum image), from as many boxes away as numbers tell places apart.
+    """Return the shortest offset from a to b (minimum image), for points any number of boxes apart.
 
-    Two that are half a box apart are so in opposite directions, each seen from the other.
+    For two points exactly half a box apart, the offsets a to b and b to a are opposite.
     """
     if len(a) == 2:
         return (_shortest(b[0] - a[0], size[0]), _shortest(b[1] - a[1], size[1]))
@@ -57,7 +57,7 @@ def torus_offset(size: Vec, a: Vec, b: Vec) -> Vec:
 
 @law
 def plane_confine(size: Vec, radius: float, x: Vec, v: Vec) -> tuple[Vec, Vec]:
-    """Leave everybody where they are."""
+    """Return x and v unchanged."""
     return x, v
 
 
@@ -67,7 +67,7 @@ def _into(x: float, length: float) -> float:
     inside = x - length * np.floor(x * (like(x, 1.0) / length))
     # (-1e-17) wraps to exactly `length` in floating point: that is 0
     inside = o if inside >= length or inside < o else inside
-    # the last number below `length`, times 1 / length, may round to 1: who is inside stays where he is
+    # the last number below `length`, times 1 / length, may round to 1: a position inside is returned unchanged
     return x if (x >= o) & (x < length) else inside
 
 
@@ -103,9 +103,9 @@ def box_confine(size: Vec, radius: float, x: Vec, v: Vec) -> tuple[Vec, Vec]:
 
 @law
 def _meets(gap: float, away: float, push: float) -> tuple[float, float]:
-    """Return after what time a body comes to a wall (inf = never), and how fast it then is.
+    """Return the time at which a body reaches a wall, s (inf if never), and its speed then.
 
-    Its distance is gap + away t + push t^2 / 2. Of each root the form that does not cancel.
+    Its distance is gap + away t + push t^2 / 2. Each root is computed in the form without cancellation.
     """
     o, never = like(gap, 0.0), like(gap, np.inf)
     square = away * away - like(gap, 2.0) * push * gap
@@ -118,10 +118,10 @@ def _meets(gap: float, away: float, push: float) -> tuple[float, float]:
 
 @law
 def _flight(dt: float, was: float, before: float, x: float, v: float) -> tuple[float, float, float]:
-    """Return velocity at the beginning, acceleration, and what the method calls velocity beyond that of the parabola.
+    """Return initial velocity and acceleration of a step's parabola, and by how much the method's v exceeds its own.
 
-    The parabola goes from `was` to x in a step over which velocity changed from `before` to v. A method of first order
-    is half a step ahead or behind with its velocity: under a constant force its points lie on a parabola all the same.
+    The parabola goes from `was` to x in a step over which velocity changed from `before` to v. The velocity of a
+    first-order method is half a step ahead or behind, but under a constant force its points do lie on a parabola.
     """
     half = like(x, 0.5)
     a = (v - before) / dt
@@ -136,15 +136,15 @@ def _flight(dt: float, was: float, before: float, x: float, v: float) -> tuple[f
 def _bounced(
     radius: float, length: float, restitution: float, dt: float, was: float, before: float, x: float, v: float
 ) -> tuple[float, float]:
-    """Along one axis: fly, meet a wall, turn around with the restitution's share of the speed, fly on.
+    """Return position and velocity along one axis after a step with impacts; each keeps `restitution` of the speed.
 
-    Where all further bounces (a geometric series) end within the step, the body is at rest at their end; so who lies at
-    a wall costs one round, and not BOUNCES.
+    If all further bounces (a geometric series) end within the step, the body is at rest at their end; so a body that
+    rests at a wall costs one iteration instead of BOUNCES.
     """
     o, half = like(x, 0.0), like(x, 0.5)
     low, high = radius, length - radius
     speed, a, excess = _flight(dt, was, before, x, v)
-    # who lies at a wall begins at rest, whatever the velocity of a method of first order means
+    # a body resting at a wall starts at rest, although the velocity of a first-order method is off by half a step
     speed = o if (before == o) & ((was == low) | (was == high)) else speed
     at, left, hit = was, dt, False
     for bounce in range(BOUNCES):
@@ -163,7 +163,7 @@ def _bounced(
         speed = o if rests else (away if below else -away)
         a, excess = o if rests else a, o if rests else excess
     end = at + (speed + half * a * left) * left if hit else x
-    # not a number, where numbers are too large for their squares: at a wall, and still
+    # NaN, if squares overflow: at a wall, at rest
     inside = low if not end >= low else (high if end > high else end)
     then = speed + a * left + excess if hit else v
     return inside, then if finite(then) else o
@@ -173,7 +173,7 @@ def _bounced(
 def _hop(
     size: float, radius: float, restitution: float, dt: float, was: float, before: float, x: float, v: float
 ) -> tuple[float, float]:
-    """One axis of `box_bounce`."""
+    """Return position and velocity along one axis of `box_bounce`."""
     if was < radius or was > size - radius:
         return _wall(x, v, radius, size)
     else:
@@ -184,9 +184,9 @@ def _hop(
 def box_bounce(
     size: Vec, radius: float, restitution: float, dt: float, was: Vec, before: Vec, x: Vec, v: Vec
 ) -> tuple[Vec, Vec]:
-    """Return where a step from `was` to x really led, if velocity changed from `before` to v, and how fast.
+    """Return position and velocity after a step from `was` to x, over which velocity changed from `before` to v.
 
-    Exact under a constant force, axis by axis. Somebody who was outside is put at the wall.
+    Exact under a constant force, axis by axis. A body that was outside is put at the wall.
     """
     x0, v0 = _hop(size[0], radius, restitution, dt, was[0], before[0], x[0], v[0])
     x1, v1 = _hop(size[1], radius, restitution, dt, was[1], before[1], x[1], v[1])
@@ -198,7 +198,7 @@ def box_bounce(
 
 
 class Space(Record):
-    """Where agents live."""
+    """The space in which agents move."""
 
     kind: str
     offset_law: ClassVar[Law]
@@ -207,20 +207,20 @@ class Space(Record):
     periodic: ClassVar[bool] = False
 
     def extent(self, dimension: int) -> tuple[float, ...]:
-        """Return the size that the laws are given, m per axis; 1 where there is none."""
+        """Return the size passed to the laws, m per axis; 1 if the space has none."""
         size: tuple[float, ...] | None = getattr(self, "size", None)
         return size if size is not None else (1.0,) * dimension
 
     def numbers(self) -> tuple[float, ...]:
-        """Return what its bounce law is given beside the size."""
+        """Return the numbers passed to its bounce law besides the size."""
         return ()
 
     def displacement(self, a: ArrayLike, b: ArrayLike) -> Floats:
-        """Return the way from a to b, (..., D) m, over arrays: for code that is not in a kernel."""
+        """Return the offset from a to b, (..., D) m, for arrays: for code outside kernels."""
         return np.asarray(np.asarray(b, float) - np.asarray(a, float))
 
     def wrap(self, x: ArrayLike) -> Floats:
-        """Return positions (..., D) m brought back into the space: for code that is not in a kernel."""
+        """Return positions (..., D) m brought back into the space: for code outside kernels."""
         return np.asarray(x, np.float64)
 
 
@@ -233,7 +233,7 @@ class Plane(Space):
 
 
 class Torus(Space):
-    """A periodic box [0, size): who leaves on one side enters on the other."""
+    """A periodic box [0, size): an agent that leaves on one side enters on the other."""
 
     kind: Literal["torus"] = "torus"
     size: Size = Field(description="m per axis")
@@ -242,7 +242,7 @@ class Torus(Space):
     periodic: ClassVar[bool] = True
 
     def displacement(self, a: ArrayLike, b: ArrayLike) -> Floats:
-        """Return the shortest way from a to b, (..., D) m."""
+        """Return the shortest offset from a to b, (..., D) m."""
         d, size = super().displacement(a, b), np.asarray(self.size)
         return np.asarray(d - size * np.rint(d / size))
 
@@ -255,12 +255,12 @@ class Torus(Space):
 
 
 class Box(Space):
-    """A box [0, size] with walls, at which bodies stop, or which they bounce off.
+    """A box [0, size] with walls at which bodies stop or bounce.
 
-    Restitution e is speed after over speed before an impact, across the wall; along it nothing changes. Impacts are
-    found where they happen within a step: exactly under a constant force, for every method; otherwise as if the force
-    of a step were its mean. A ball dropped from height h rises to e^(2n) h after n bounces, and lies still after
-    sqrt(2 h / g) (1 + e) / (1 - e). Who would bounce more than 100 times in one step stops.
+    Restitution e is the normal speed after over that before an impact; the tangential velocity does not change. Impacts
+    are located within a step: exactly under a constant force, for every method; otherwise as if the force were constant
+    during the step. A ball dropped from height h rises to e^(2n) h after n bounces, and is at rest after
+    sqrt(2 h / g) (1 + e) / (1 - e). A body that would bounce more than 100 times in one step stops.
     """
 
     kind: Literal["box"] = "box"
@@ -272,12 +272,12 @@ class Box(Space):
     confine_law: ClassVar[Law] = box_confine
 
     @property
-    def bounce_law(self) -> Law | None:  # type: ignore[override]  # nothing of it is compiled where nobody bounces
-        """The law of walls that give something back."""
+    def bounce_law(self) -> Law | None:  # type: ignore[override]  # not compiled if bodies do not bounce
+        """The law of impacts; None if bodies stop at walls."""
         return box_bounce if self.restitution > 0 else None
 
     def numbers(self) -> tuple[float, ...]:
-        """The restitution, if there is one."""
+        """Return the restitution, if it is not 0."""
         return (self.restitution,) if self.bounce_law else ()
 
     def wrap(self, x: ArrayLike) -> Floats:

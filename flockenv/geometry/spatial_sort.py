@@ -1,8 +1,8 @@
-"""Tiles: where the agents of a large world lie in memory while it is in order, and who has left the one he began in.
+"""Tiles: the memory order of the agents of a large world, and the agents that have left their home tile since.
 
-A tile is a square (in 3-D a cube) of some 250 agents, made of whole cells. Within a tile agents lie by number. So of
-those who are still where they began all cells are in order as they are put there: what remains is to order the few
-cells that somebody from elsewhere came to, and those to which several threads put agents.
+A tile is a square (in 3-D a cube) of some 250 agents, made of whole cells. Within a tile agents lie in memory by agent
+number. So the cells of agents still in their home tile are in order as they are filled. Only the few cells that contain
+agents from another tile, and those filled by several threads, have to be sorted.
 """
 
 from __future__ import annotations
@@ -20,35 +20,35 @@ __all__ = [
 ]  # fmt: skip
 
 TILE = 256
-"""Agents of a tile in the mean."""
+"""Mean number of agents per tile."""
 
 HOME = 8
-"""Numbers that say of a block where its agents are at home, see `find_homes`; the last of them says nothing."""
+"""Numbers per block that describe the home tiles of its agents, see `find_homes`; the last is unused."""
 
 FAR_FROM_HOME = 4
-"""If more than one agent out of so many has left his tile, all records are looked through instead of their cells."""
+"""If more than 1 in 4 agents has left its home tile, all records are sorted instead of only those agents' cells."""
 
 PART = 64
-"""Blocks whose cells are found and counted together: they stay in the nearest cache in between."""
+"""Blocks whose cells are computed, then counted, together: they stay in the L1 cache in between."""
 
 BATCH = 64
-"""Cells that are asked together whether several threads have put agents there."""
+"""Cells that are tested together for agents of several threads."""
 
 AHEAD = (48, 24, 8)
-"""So many cells on it is asked where one begins, then for its first record, then for the numbers of its agents."""
+"""Prefetch distances, in cells: of a cell's beginning, its first record, and the numbers of its agents."""
 
 FEW = 8
-"""Agents of a cell whose numbers are asked for: a clump of thousands is listed once for each of them."""
+"""Most agents of a cell whose numbers are prefetched: a clump of thousands is listed once for each of them."""
 
 ASKED = 16
-"""So many blocks on it is asked for positions."""
+"""Prefetch distance of positions, in blocks."""
 
-_AWAY = 2**30  # more than any cell: added to that of who is not in his own tile, between two passes over a part
+_AWAY = 2**30  # more than any cell: added to the cell of an agent outside its home tile, between two passes over a part
 
 
 @kernel
 def _edge(shape: Any, capacity: int) -> int:
-    """Return how many rows of cells wide a tile is."""
+    """Return the width of a tile, in rows of cells."""
     cells = float(shape[0]) * float(shape[1]) * float(shape[2])
     volume = TILE * cells / capacity / shape[3]
     return max(1, int((np.sqrt(volume) if shape[2] == 1 else np.cbrt(volume)) + 0.5))
@@ -56,7 +56,7 @@ def _edge(shape: Any, capacity: int) -> int:
 
 @kernel
 def _tiles(shape: Any, edge: int) -> tuple[int, int, int]:
-    """Return how many tiles there are along each axis."""
+    """Return the number of tiles along each axis."""
     return (shape[0] - 1) // (edge * shape[3]) + 1, (shape[1] - 1) // edge + 1, (shape[2] - 1) // edge + 1
 
 
@@ -65,7 +65,7 @@ def count_tiles(
     pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, bounds: Any, size: Any,
     reach: float, periodic: bool, wraps: bool, capacity: int, cell: Ints, start: Ints, offset: Ints,
 ) -> tuple[int, int, int, int, int]:  # fmt: skip
-    """Do as `count_cells` does, with tiles in place of cells; return the cells of which they are made."""
+    """Do the same as `count_cells`, with tiles instead of cells; return the shape of the cells that make up tiles."""
     shape, low, pace = divided(
         pos, living, first, end, lanes, rank, team, sync, bounds, size, reach, periodic, capacity
     )
@@ -77,7 +77,7 @@ def count_tiles(
     for block in range(np.uint64(first), np.uint64(end)):
         for l in range(w):  # noqa: E741  # a lane
             x, y, z = cell_of(pos, block * d * w + l, w, low, pace, size, wraps, shape)
-            # a product, not a division, which would be one by one: half a cell on, it is never close to a whole number
+            # a product, as an integer division does not vectorize: with 0.5 added it is never close to an integer
             x, y, z = np.int64((x + 0.5) * row), np.int64((y + 0.5) * rows), np.int64((z + 0.5) * rows)
             index = (z * up + y) * along + x
             cell[block * w + l] = np.int32(index) if living[block * w + l] > 0 else np.int32(-1)
@@ -88,10 +88,10 @@ def count_tiles(
 
 @kernel
 def find_homes(first: int, end: int, lanes: int, n: int, shape: Any, start: Ints, homes: Ints) -> None:
-    """Write in which tile the agents of these blocks are at home, once all lie there; start: where each tile begins.
+    """Write the home tiles of the agents of these blocks, just after sorting; start: where each tile begins.
 
-    homes (blocks * HOME,): how many agents are at home in the first of two tiles, the lowest cell of that one along
-    each of three axes, and of the other. A block of more tiles has none: each of its agents counts as a stranger.
+    homes (blocks * HOME,): the number of agents in the first of two tiles, then the lowest cell along each of three
+    axes, of that tile and of the other. A block that spans more tiles has none: all its agents count as strangers.
     """
     edge = _edge(shape, n)
     along, up, _ = _tiles(shape, edge)
@@ -103,7 +103,7 @@ def find_homes(first: int, end: int, lanes: int, n: int, shape: Any, start: Ints
         other = tile
         while start[other + 1] <= last:
             other += 1
-        few = start[other] <= start[tile + 1]  # nobody in between
+        few = start[other] <= start[tile + 1]  # no agents in between
         homes[at] = start[tile + 1] - begin
         for k in range(2):
             t = other if k > 0 else tile
@@ -118,10 +118,10 @@ def count_from_home(
     reach: float, periodic: bool, wraps: bool, capacity: int, homes: Ints, strangers: Ints, tally: Any, cell: Ints,
     start: Ints, offset: Ints,
 ) -> tuple[int, int, int, int, int]:  # fmt: skip
-    """Do as `count_cells` does where all `capacity` agents live and lie in tiles, and list who is not in his own.
+    """Do the same as `count_cells` if all `capacity` agents live and lie in tiles; list those outside their home tile.
 
-    The cells such agents are in are written to `strangers` (agents, padded), from this thread's first agent on; how
-    many, to tally[team + rank].
+    The cells of such agents are written to `strangers` (agents, padded), from this thread's first agent on; their
+    number to tally[team + rank].
     """
     shape, low, pace = divided(
         pos, living, first, end, lanes, rank, team, sync, bounds, size, reach, periodic, capacity
@@ -165,7 +165,7 @@ def count_from_home(
     begin_cells(rank, team, sync, cells, start, offset)
     if periodic or not crowded(shape, pace, reach, start):
         return shape
-    tally[team + rank] = (end - first) * lanes  # folded cells are no parts of tiles
+    tally[team + rank] = (end - first) * lanes  # folded cells are not parts of tiles
     return count_folded(pos, living, first, end, lanes, rank, team, sync, size, reach, capacity, cell, start, offset)
 
 
@@ -179,10 +179,10 @@ def _corner(homes: Ints, at: Any) -> tuple[Any, Any, Any]:
 def order_cells(
     records: Any, length: int, ident: Any, start: Ints, offset: Ints, rank: int, listed: Ints, begin: int, end: int
 ) -> None:
-    """Put the records of the cells listed[begin:end] in the order of numbers, where only this thread has put some.
+    """Sort the records of each cell of listed[begin:end] by agent number, if only this thread has filled the cell.
 
-    Records are so long and begin with their place; ident has numbers by place; offset says where each thread stopped,
-    and afterwards -1 for a cell that is in order: it is listed once for each stranger in it.
+    Records have `length` numbers and begin with their place; ident holds agent numbers by place; offset holds where
+    each thread stopped, and -1 for a cell once it is sorted, as a cell is listed once for each stranger in it.
     """
     size, last, before = np.uint64(length), np.uint64(end), max(rank - 1, 0)
     mine = np.uint64(rank * offset.shape[1])
@@ -203,7 +203,7 @@ def order_cells(
 
 @kernel
 def _later(listed: Ints, m: Any, ahead: int, end: Any) -> Any:
-    """Return the cell whose turn comes so much later, or the last one."""
+    """Return the cell `ahead` entries later in the list, or the last one."""
     return np.uint64(listed[min(m + np.uint64(ahead), end - np.uint64(1))])
 
 
@@ -211,10 +211,10 @@ def _later(listed: Ints, m: Any, ahead: int, end: Any) -> Any:
 def order_shared(
     records: Any, length: int, ident: Any, start: Ints, offset: Ints, team: int, first: int, end: int
 ) -> None:
-    """Do so for those of the cells [first, end) to which several threads have put agents."""
+    """Sort the records of those cells of [first, end) that several threads have filled, by agent number."""
     size = np.uint64(length)
     for r in range(team - 1):
-        for begin in range(first, end, BATCH):  # seldom is one among so many: all are asked at once
+        for begin in range(first, end, BATCH):  # such cells are rare: a whole batch is tested at once
             until, shared = min(begin + BATCH, end), np.int32(0)
             for c in range(np.uint64(begin), np.uint64(until)):
                 shared |= np.int32((start[c] < offset[r, c]) & (offset[r, c] < start[c + np.uint64(1)]))
@@ -225,7 +225,7 @@ def order_shared(
 
 @kernel
 def _order(records: Any, size: Any, ident: Any, first: Any, end: Any) -> None:
-    """Put the records [first, end) in the order of numbers: most are where they belong."""
+    """Sort the records [first, end) by agent number (insertion sort: most are in order)."""
     for k in range(first + np.uint64(1), end):
         at, least = k * size, first * size
         who = ident[np.uint64(records[at])]

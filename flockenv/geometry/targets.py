@@ -1,4 +1,4 @@
-"""Places to go to: a point, a door (a segment) or a region (a box), as a record and as numbers that laws read."""
+"""Targets of agents: a point, a door (a segment) or a region (a box), as a record and as numbers that laws read."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ Place = Annotated[tuple[Annotated[float, Field(strict=True)], ...], Field(min_le
 
 
 class Target(Record):
-    """A place to go to: a point `at`, a door between two `ends`, or a box from `low` to `high`; all within `radius`."""
+    """A place to reach: a point `at`, a door between two `ends`, or a box `low` to `high`, enlarged by `radius`."""
 
     at: Place | None = Field(default=None, description="m, a point")
-    ends: tuple[Place, Place] | None = Field(default=None, description="m, where a door ends")
-    low: Place | None = Field(default=None, description="m, lower corner of a box along the axes")
-    high: Place | None = Field(default=None, description="m, its upper corner")
-    radius: float = Field(default=0.0, ge=0, description="m, whatever is this near belongs to it")
+    ends: tuple[Place, Place] | None = Field(default=None, description="m, the two ends of a door")
+    low: Place | None = Field(default=None, description="m, lower corner of an axis-aligned box")
+    high: Place | None = Field(default=None, description="m, upper corner of the box")
+    radius: float = Field(default=0.0, ge=0, description="m, points within this distance belong to the target")
 
     @model_validator(mode="after")
     def _one_of_three(self) -> Target:
-        """Refuse what is none, or more than one, of the three."""
+        """Raise ValueError if not exactly one of the three is given, or if the numbers do not fit together."""
         box = self.low is not None or self.high is not None
         if (self.at is not None) + (self.ends is not None) + box != 1 or (self.low is None) != (self.high is None):
             raise ValueError("at: give one of at, ends, or low and high")
@@ -43,44 +43,44 @@ class Target(Record):
 
     @property
     def _places(self) -> tuple[tuple[float, ...], ...]:
-        """The places that it was given by."""
+        """The points that define it."""
         found = (self.at, *(self.ends or ()), self.low, self.high)
         return tuple(place for place in found if place is not None)
 
     @property
     def _word(self) -> str:
-        """By which of its fields it was given."""
+        """The name of the field or fields that define it, for messages."""
         return "at" if self.at is not None else "ends" if self.ends is not None else "low, high"
 
     @property
     def shown(self) -> str:
-        """The places, as errors show them."""
+        """The points that define it, as messages show them."""
         return ", ".join(str(place) for place in self._places)
 
     @property
     def place(self) -> dict[str, Any]:
-        """The fields that say where it is, and nothing else of it."""
+        """The fields that define the place, without those of subclasses."""
         return {name: getattr(self, name) for name in Target.model_fields}
 
     @property
     def dimension(self) -> int:
-        """In how many dimensions it lies."""
+        """Number of dimensions."""
         return len(self._places[0])
 
     @property
     def length(self) -> float:
-        """From one end of a door to the other, m; 0 of what is none."""
+        """Length of a door, m; 0 for other targets."""
         return float(np.linalg.norm(np.subtract(*self.ends))) if self.ends else 0.0
 
     @property
     def extremes(self) -> Floats:
-        """Places that everything of it lies between, (2, D) m."""
+        """Lower and upper corner of its bounding box, (2, D) m."""
         places = np.array(self._places)
         return np.array([places.min(axis=0) - self.radius, places.max(axis=0) + self.radius])
 
     @property
     def row(self) -> list[float]:
-        """Its numbers, as laws read them: first end (D), the way to the other (D), half the edges (D), radius."""
+        """Its numbers, as laws read them: first end (D), vector to the other end (D), half the edges (D), radius."""
         places = np.array(self._places)
         box, d = self.low is not None, self.dimension
         begin = places.mean(axis=0) if box else places[0]
@@ -89,7 +89,7 @@ class Target(Record):
         return [*begin, *along, *half, self.radius]
 
     def offset(self, points: ArrayLike) -> Floats:
-        """Return the straight way from points (..., D) to its nearest one, (..., D) m; 0 within it."""
+        """Return the offset from points (..., D) to the nearest point of the target, (..., D) m; 0 inside."""
         x, d, row = np.asarray(points, np.float64), self.dimension, np.array(self.row)
         begin, along, half = row[:d], row[d : 2 * d], row[2 * d : 3 * d]
         to = begin - x
@@ -103,11 +103,11 @@ class Target(Record):
         return np.asarray(to * np.maximum(far - self.radius, 0) / np.where(far > 0, far, 1))
 
     def count(self, spacing: float) -> int:
-        """Return how many samples lie along it; the first ones."""
+        """Return how many samples lie along its core (a point or a door): the first ones of `samples`."""
         return 1 + int(np.ceil(4 * self.length / spacing - 1e-9))
 
     def samples(self, spacing: float) -> Floats:
-        """Return places of it, (S, D) m: nowhere in it is further from one than about half the spacing."""
+        """Return sample points (S, D) m: every point of the target is within about half the spacing of one."""
         d, row = self.dimension, np.array(self.row)
         core = row[:d] + np.linspace(0, 1, self.count(spacing))[:, None] * row[d : 2 * d]
         if self.low is None and not self.radius:
@@ -120,26 +120,26 @@ class Target(Record):
 
 
 def row_size(dimension: int) -> int:
-    """Return how many numbers a target's row has."""
+    """Return the length of a target's row."""
     return 3 * dimension + 1
 
 
 @law
 def _beyond(x: float, half: float) -> float:
-    """Return how far x is beyond [-half, half]."""
+    """Return the signed distance of x from [-half, half]; 0 inside."""
     return x - half if x > half else (x + half if x < -half else like(x, 0.0))
 
 
 @law
 def _within(offset: Vec, radius: float) -> Vec:
-    """Return an offset that ends a radius earlier; 0 if that is behind its beginning."""
+    """Return the offset shortened by `radius`; 0 if it is not longer than that."""
     length = norm(offset)
     return scale(offset, (length - radius) / length if length > radius else like(radius, 0.0))
 
 
 @law
 def _share(to_along: float, square: float) -> float:
-    """Return which part of the way along a door is nearest, 0 to 1."""
+    """Return the parameter, 0 to 1, of the nearest point along a door."""
     o, e = like(square, 0.0), like(square, 1.0)
     s = -to_along / square if square > o else o
     return o if s < o else (e if s > e else s)
@@ -147,7 +147,7 @@ def _share(to_along: float, square: float) -> float:
 
 @law
 def to_target(table: Any, at: Any, x: Vec) -> Vec:
-    """Return the straight way from x to the nearest point of the target whose row begins at `at`; 0 within it."""
+    """Return the offset from x to the nearest point of the target whose row begins at `at`; 0 inside."""
     if len(x) == 2:
         a, b, u, v = table[at] - x[0], table[at + 1] - x[1], table[at + 2], table[at + 3]
         s = _share(a * u + b * v, u * u + v * v)
@@ -164,7 +164,7 @@ def to_target(table: Any, at: Any, x: Vec) -> Vec:
 
 @law
 def to_any(table: Any, at: Any, count: Any, x: Vec) -> Vec:
-    """Return the straight way from x to the nearest of `count` targets whose rows begin at `at`."""
+    """Return the offset from x to the nearest of `count` targets whose rows begin at `at`."""
     best = to_target(table, at, x)
     size = 3 * len(x) + 1
     for k in range(1, count):
@@ -175,7 +175,7 @@ def to_any(table: Any, at: Any, count: Any, x: Vec) -> Vec:
 
 @law
 def passed(table: Any, at: Any, was: Vec, now: Vec) -> bool:
-    """Has who was here come into the target whose row begins at `at`, or across it if it is a door? In the plane."""
+    """Return True if a move from `was` to `now` ends in the target whose row begins at `at`, or crosses a door; 2-D."""
     to = to_target(table, at, now)
     a, b, u, v = table[at], table[at + 1], table[at + 2], table[at + 3]
     o = like(now[0], 0.0)

@@ -1,1 +1,1 @@
-"""What a world holds: its state, its groups of agents, where they begin, networks, and how they are drawn."""
+"""The contents of a world: state, groups of agents, initial positions, networks, appearance."""

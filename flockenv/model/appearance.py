@@ -1,4 +1,4 @@
-"""Appearance: how agents of a group are drawn, as data; pictures, GIFs and replays read it, and nothing else does."""
+"""Appearance: how agents of a group are drawn, as data; read only by pictures, GIFs and replays."""
 
 from __future__ import annotations
 
@@ -18,49 +18,50 @@ Size = Annotated[float, Field(ge=0)]
 
 
 class Appearance(Record):
-    """Points, discs or polygons, whose colour, opacity and size may change with age, speed or what goes on inside.
+    """Points, discs or polygons whose colour, opacity and size may depend on age, speed or an inner state.
 
-    `by` and `over` say when there is the first and when the last of colours, opacities and sizes; between, a mixture.
+    `by` names that quantity, and `over` its values for the first and the last colour, opacity and size; in between they
+    are interpolated.
     """
 
     form: Literal["point", "disc", "polygon"] = Field(
-        default="point", description="a dot, seen however small; a disc of its true size; a polygon that points ahead"
+        default="point", description="a dot, always visible; a disc of its true size; a polygon that points ahead"
     )
     vertices: tuple[tuple[float, float], ...] = Field(
         default=((1.0, 0.0), (-0.8, 0.6), (-0.8, -0.6)), min_length=3, max_length=64,
         description="corners of a polygon, x ahead, in units of its size",
     )  # fmt: skip
     by: Literal["age", "speed", "inner"] | None = Field(
-        default=None, description="with what it changes; none = not at all"
+        default=None, description="quantity that it depends on (default: none)"
     )
-    of: str | None = Field(default=None, description="name of what goes on inside, where it changes by inner")
+    of: str | None = Field(default=None, description="name of the inner state; only if by = inner")
     over: tuple[float, float] = Field(
-        default=(0.0, 1.0), description="s, m/s, or as that is counted: from where to where it changes"
+        default=(0.0, 1.0), description="s, m/s, or the unit of the inner state: range over which it changes"
     )
     colours: tuple[Colour, ...] = Field(
-        default=(), description="#rrggbb, from the first to the last, evenly; none = its role's"
+        default=(), description="#rrggbb, first to last, evenly spaced (default: the colour of its role)"
     )
-    opacity: tuple[Share, Share] = Field(default=(1.0, 1.0), description="from, to; 0 = nothing is seen")
-    size: tuple[Size, Size] | None = Field(default=None, description="m, from, to; none = the body's radius")
-    trail: float = Field(default=0.0, ge=0, description="s, how long a way behind it is drawn")
+    opacity: tuple[Share, Share] = Field(default=(1.0, 1.0), description="from, to; 0 = invisible")
+    size: tuple[Size, Size] | None = Field(default=None, description="m, from, to (default: the body's radius)")
+    trail: float = Field(default=0.0, ge=0, description="s, duration of the trail drawn behind it")
 
     @model_validator(mode="after")
     def _consistent(self) -> Appearance:
-        """Refuse a range that is none, and one that nothing changes over."""
+        """Raise ValueError if the range is empty, or `by` and what depends on it do not fit together."""
         if not self.over[0] < self.over[1]:
             raise ValueError(f"over = {self.over}: the least comes first, and they differ")
         changes = len(self.colours) > 1 or self.opacity[0] != self.opacity[1]
         changes |= self.size is not None and self.size[0] != self.size[1]
         if changes and self.by is None:
-            raise ValueError("by: missing; colours, opacity or size change with age, speed, or what goes on inside")
+            raise ValueError("by: missing; colours, opacity or size depend on age, speed or an inner state")
         if (self.by == "inner") != (self.of is not None):
-            raise ValueError(f"of = {self.of}: goes with by = inner, and says which number")
+            raise ValueError(f"of = {self.of}: goes with by = inner, and names the inner state")
         return self
 
     def shade(
         self, age: NDArray[np.float64], speed: NDArray[np.float64], inner: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Return how far along its range everybody is, (N,) from 0 to 1; `inner` is the number that it names."""
+        """Return the position of each agent in the range, (N,) from 0 to 1; inner: the inner state named by `of`."""
         value = {"age": age, "speed": speed, "inner": inner}.get(self.by or "")
         if value is None:
             return np.zeros(len(age))
@@ -68,7 +69,7 @@ class Appearance(Record):
         return np.asarray(np.clip((value - self.over[0]) / (self.over[1] - self.over[0]), 0.0, 1.0))
 
     def colour(self, shade: float, usual: str) -> tuple[int, int, int]:
-        """Return the colour at a shade, 0..255 each; `usual` is that of the role."""
+        """Return the colour at a shade, 0..255 each; usual: the colour of the role."""
         names = self.colours or (usual,)
         place = shade * (len(names) - 1)
         k = min(int(place), len(names) - 2) if len(names) > 1 else 0
@@ -81,5 +82,5 @@ class Appearance(Record):
         return self.opacity[0] + (self.opacity[1] - self.opacity[0]) * shade
 
     def sized(self, shade: float, radius: float) -> float:
-        """Return the size at a shade, m; `radius` is the body's."""
+        """Return the size at a shade, m; radius: the body's, m."""
         return radius if self.size is None else self.size[0] + (self.size[1] - self.size[0]) * shade

@@ -1,4 +1,4 @@
-"""Spread: a number that differs from one to the next of a group, uniform or normal; the same ones in every world."""
+"""Spread: a number that varies within a group, uniform or normal; the same values in every world."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from flockenv.core.record import Record
 __all__ = ["Spread", "drawn", "largest"]
 
 MOST = 10_000_000
-"""Of whom numbers are drawn to find the largest: more agents are refused anyhow."""
+"""Most agents for which numbers are drawn to find the largest: larger groups are rejected elsewhere."""
 
 
 class Spread(Record):
-    """Uniform from `low` to `high`; with `mean` and `sd` normal, and cut off at `low` and `high`."""
+    """Uniform from `low` to `high`, or, with `mean` and `sd`, normal and truncated to [low, high]."""
 
-    low: float | None = Field(default=None, description="least; none = 0, of a normal one")
-    high: float | None = Field(default=None, description="most; none = any, of a normal one")
-    mean: float | None = Field(default=None, description="of a normal one, before it is cut off")
+    low: float | None = Field(default=None, description="least (default for a normal one: 0)")
+    high: float | None = Field(default=None, description="greatest (default for a normal one: no limit)")
+    mean: float | None = Field(default=None, description="of a normal one, before truncation")
     sd: float | None = Field(default=None, ge=0, description="standard deviation of a normal one")
-    seed: int = Field(default=0, ge=0, description="another one draws other numbers")
+    seed: int = Field(default=0, ge=0, description="of the random numbers")
 
     @model_validator(mode="after")
     def _one_of_both(self) -> Spread:
-        """Refuse what is neither uniform nor normal, and what leaves nothing over."""
+        """Raise ValueError if it is neither uniform nor normal, or its range is not valid."""
         if (self.mean is None) != (self.sd is None):
             raise ValueError("mean and sd go together: give both or neither")
         if self.mean is None and (self.low is None or self.high is None):
@@ -42,21 +42,21 @@ class Spread(Record):
 
     @property
     def least(self) -> float:
-        """What nobody is below."""
+        """Lower bound of the numbers."""
         return 0.0 if self.low is None else self.low
 
     @property
     def most(self) -> float:
-        """What nobody is above; may be infinite."""
+        """Upper bound of the numbers; may be infinite."""
         return math.inf if self.high is None else self.high
 
     def at(self, share: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the numbers that such shares of all are below, each in [0, 1]."""
+        """Return the quantiles at `share`, each in [0, 1]."""
         if self.mean is None or self.sd is None:
             return self.least + (self.most - self.least) * share
         if self.sd == 0:
             return np.full(len(share), self.mean)
-        from scipy.special import ndtr, ndtri  # here: most numbers have no spread, and need not wait for it
+        from scipy.special import ndtr, ndtri  # here: most scenes have no normal spread, and need not wait for it
 
         low, high = (ndtr((bound - self.mean) / self.sd) for bound in (self.least, self.most))
         found = self.mean + self.sd * ndtri(low + (high - low) * share)
@@ -64,14 +64,14 @@ class Spread(Record):
 
 
 def drawn(value: float | Spread, count: int, channel: int) -> NDArray[np.float64]:
-    """Return a number for each of so many; spreads of one channel and seed have the same ranks (the heavy are wide)."""
+    """Return `count` numbers; spreads of one channel and seed have the same ranks (a heavy agent is wide)."""
     if not isinstance(value, Spread):
         return np.full(count, float(value))
     return value.at(np.random.default_rng([value.seed, channel]).random(count))
 
 
 def largest(value: float | Spread, count: int, channel: int) -> float:
-    """Return what none of these numbers is above; nothing is allocated for numbers that are all the same."""
+    """Return an upper bound of these numbers: that of the spread, or if it is infinite, the largest number drawn."""
     if not isinstance(value, Spread):
         return float(value)
     return value.most if math.isfinite(value.most) else float(drawn(value, min(count, MOST), channel).max())

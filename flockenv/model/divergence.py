@@ -1,4 +1,4 @@
-"""What a simulation says when it diverges: which world, whom, when, and which effect drove it there."""
+"""The error raised when a simulation diverges: world, agent, step, time and the effect that caused it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["SimulationDiverged"]
 class SimulationDiverged(FloatingPointError):  # noqa: N818  # the issue and its users call it so
     """A position or velocity is no longer finite; the worlds that stayed finite have made all their steps.
 
-    The world that did not is as it was before the call, and everything else is told here.
+    The diverged world is as it was before the call; the attributes hold the details.
     """
 
     state: Any = None
@@ -20,9 +20,9 @@ class SimulationDiverged(FloatingPointError):  # noqa: N818  # the issue and its
         self, world: int, agent: int, step: int, time: float, effect: str | None, dt: float, method: str,
         reason: str = "",
     ) -> None:  # fmt: skip
-        """world, agent, step (since the start): where; time: s; effect: what accelerated it most, none = not known.
+        """world, agent, step (since the start): where; time: s; effect: the largest acceleration's, None if unknown.
 
-        reason: what happened, if it is not that a number is no longer finite.
+        reason: what happened, if not that a number is no longer finite.
         """
         self.world, self.agent, self.step, self.time, self.effect = world, agent, step, time, effect
         self.dt, self.method, self.reason = dt, method, reason

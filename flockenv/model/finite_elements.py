@@ -1,8 +1,8 @@
-"""Linear finite elements: what a structure of bars, triangles or tetrahedra answers to small displacements.
+"""Linear finite elements: the response of structures of bars, triangles or tetrahedra to small displacements.
 
-M a = F - C v - K u, with M, C and K sparse, (n D, n D) for n particles in D dimensions. Degrees of freedom are counted
-particle by particle: x0, y0, x1, y1, ..., so particle i owns i D to i D + D - 1 (`freedoms`), and a displacement u,
-(n, D) as an array, is u.ravel() to a matrix. Shapes are linear, hence strain and stress constant in each element.
+M a = F - C v - K u, with M, C and K sparse, (n D, n D) for n particles in D dimensions. Degrees of freedom are numbered
+particle by particle: x0, y0, x1, y1, ..., so particle i has i D to i D + D - 1 (`freedoms`), and matrices act on
+u.ravel() of a displacement u (n, D). Shape functions are linear, so strain and stress are constant in each element.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ Sparse = Any
 """A scipy.sparse matrix: scipy is imported where it is used, and has no types."""
 
 SOFTEST = 1e-14
-"""Least eigenvalue of a stiffness whose diagonal is scaled to about one: below it rounding has eaten the answer."""
+"""Least eigenvalue of a stiffness whose diagonal is scaled to about 1: below it the solution is rounding error."""
 
 DENSE = 1000
-"""Freedoms up to which all frequencies are found at once, from full matrices."""
+"""Number of freedoms up to which all frequencies are computed, from full matrices."""
 
 STILL = 1e-13
-"""Square of a frequency, as a part of the greatest, below which it is rounding: a rigid motion."""
+"""Squared frequency, relative to the greatest, below which it is rounding error of 0: a rigid motion."""
 
 
 class Material(Record):
-    """What a structure is made of."""
+    """The material of a structure."""
 
     young: float = Field(gt=0, description="Pa, Young's modulus")
     poisson: float = Field(default=0.3, gt=-1, lt=0.5, description="Poisson's ratio; bars have none")
@@ -55,11 +55,11 @@ class Material(Record):
     thickness: float = Field(default=1.0, gt=0, description="m, of triangles")
 
     def section(self, corners: int) -> float:
-        """Return what turns an element's content into its volume: m^2 of a bar, m of a triangle, 1 of a tetrahedron."""
+        """Return the factor from an element's content to its volume: m^2 (bar), m (triangle), 1 (tetrahedron)."""
         return {2: self.area, 3: self.thickness}.get(corners, 1.0)
 
     def lame(self, corners: int) -> tuple[float, float]:
-        """Return Lame's moduli, Pa: of uniaxial stress (bar), plane stress (triangle), a solid (tetrahedron)."""
+        """Return Lame's moduli, Pa: for uniaxial stress (bar), plane stress (triangle), a solid (tetrahedron)."""
         E, v = self.young, self.poisson
         if corners == 2:
             return E, 0.0
@@ -80,7 +80,7 @@ def contents(points: ArrayLike, elements: ArrayLike) -> Floats:
 
 
 def flat(points: ArrayLike, elements: ArrayLike) -> NDArray[np.intp]:
-    """Return which elements have no content: corners in one place, on a line, in a plane, up to rounding."""
+    """Return the indices of degenerate elements: corners in one place, on a line or in a plane, up to rounding."""
     points, elements = np.asarray(points, float), np.asarray(elements)
     edges = _edges(points, elements)
     span = np.linalg.norm(edges, axis=2).max(axis=1, initial=0.0)
@@ -88,21 +88,21 @@ def flat(points: ArrayLike, elements: ArrayLike) -> NDArray[np.intp]:
 
 
 def freedoms(particles: ArrayLike, dimension: int) -> NDArray[np.int64]:
-    """Return the degrees of freedom of some particles, (P D,): what `fixed` takes for particles held altogether."""
+    """Return the degrees of freedom of some particles, (P D,): pass them as `fixed` to hold these particles."""
     held = np.asarray(particles, np.int64).reshape(-1, 1)
     return np.asarray((held * dimension + np.arange(dimension)).ravel())
 
 
 def stiffness(points: ArrayLike, elements: ArrayLike, material: Material) -> Sparse:
-    """Return K, csr (n D, n D) N/m: the forces that hold small displacements u are K u.
+    """Return K, csr (n D, n D) N/m: forces K u hold the structure at small displacements u.
 
     points: (n, D) m, undeformed; elements: (E, k): bars (k = 2, any D), triangles (k = 3, in the plane, plane stress)
     or tetrahedra (k = 4, in space). An isotropic element of volume V couples its corners a and b by
 
         K_ab = V (L g_a g_b' + G g_b g_a' + G (g_a . g_b) I)
 
-    with g the gradients of its shapes and L, G Lame's moduli; for a bar L = E, G = 0. Refuses what is no structure.
-    Source: Zienkiewicz, Taylor & Zhu, The Finite Element Method, 2.2 and 6.2.
+    with g the gradients of its shape functions and L, G Lame's moduli; for a bar L = E, G = 0. Raises ValueError if
+    points and elements are not a structure. Source: Zienkiewicz, Taylor & Zhu, The Finite Element Method, 2.2 and 6.2.
     """
     points, elements = _structure(points, elements)
     k, d = elements.shape[1], points.shape[1]
@@ -116,9 +116,10 @@ def stiffness(points: ArrayLike, elements: ArrayLike, material: Material) -> Spa
 
 
 def mass(points: ArrayLike, elements: ArrayLike, material: Material, lumped: bool = True) -> Sparse:
-    """Return M, csr (n D, n D) kg: each element's mass shared equally by its corners, or consistent with its shapes.
+    """Return the mass matrix M, csr (n D, n D) kg, lumped or consistent.
 
-    Lumped it is a diagonal. Consistent, corners a and b of k share m (1 + [a = b]) / (k (k + 1)).
+    Lumped, each element's mass m is shared equally by its corners, and M is diagonal. Consistent with linear shape
+    functions, the entry of corners a and b of k is m (1 + [a = b]) / (k (k + 1)).
     """
     points, elements = _structure(points, elements)
     k, d = elements.shape[1], points.shape[1]
@@ -132,20 +133,20 @@ def mass(points: ArrayLike, elements: ArrayLike, material: Material, lumped: boo
 def rayleigh(M: Sparse, K: Sparse, alpha: float, beta: float) -> Sparse:
     """Return C = alpha M + beta K, kg/s: a mode of frequency w is damped by the ratio alpha / (2 w) + beta w / 2.
 
-    alpha: 1/s, holds back slow modes and rigid motions; beta: s, fast modes. Refuses negative ones. Source: Rayleigh,
-    The Theory of Sound, 1877, 102.
+    alpha: 1/s, damps slow modes and rigid motions; beta: s, damps fast modes. Raises ValueError if one is negative.
+    Source: Rayleigh, The Theory of Sound, 1877, 102.
     """
     for name, value in (("alpha", alpha), ("beta", beta)):
         if not 0 <= value < math.inf:
-            raise ValueError(f"{name} = {value!r}: must be a number >= 0; less would feed motion")
+            raise ValueError(f"{name} = {value!r}: must be a number >= 0; a negative one would add energy")
     return alpha * M + beta * K
 
 
 def solve_static(K: Sparse, F: ArrayLike, fixed: ArrayLike) -> Floats:
-    """Return the displacements u, (n, D) m, at which K u = F, those of the fixed freedoms being 0.
+    """Return the displacements u, (n, D) m, with K u = F, and 0 at the fixed freedoms.
 
-    F: (n, D) N; fixed: degrees of freedom (see `freedoms`). Refuses a structure that can move without resistance, as
-    a whole or in a part, and says which particle moves most.
+    F: (n, D) N; fixed: degrees of freedom (see `freedoms`). Raises ValueError if the structure, or a part of it, can
+    move without resistance; the message names the particle that moves most.
     """
     force = np.asarray(F, float)
     if force.ndim != 2 or force.size != K.shape[0] or not np.isfinite(force).all():
@@ -162,14 +163,14 @@ def solve_static(K: Sparse, F: ArrayLike, fixed: ArrayLike) -> Floats:
 
 
 def frequencies(K: Sparse, M: Sparse, fixed: ArrayLike = (), count: int | None = None) -> Floats:
-    """Return the natural frequencies w, rad/s ascending: K u = w^2 M u; 0 for a rigid motion.
+    """Return the natural frequencies w, rad/s, ascending: K u = w^2 M u; 0 for a rigid motion.
 
-    fixed: degrees of freedom that are held; count: how many, the lowest; none = all, up to DENSE freedoms. Beyond that
-    the lowest are found by inverse iteration (ARPACK). Refuses freedoms without mass.
+    fixed: degrees of freedom that are held; count: number of lowest frequencies (default: all, up to DENSE freedoms).
+    Beyond that the lowest are computed by inverse iteration (ARPACK). Raises ValueError if a freedom has no mass.
     """
     free = _free(K.shape[0], fixed)
     if count is not None and not 1 <= count <= len(free):
-        raise ValueError(f"count = {count!r}: must be a whole number from 1 to {len(free)}, the free freedoms")
+        raise ValueError(f"count = {count!r}: must be an integer from 1 to {len(free)}, the free freedoms")
     if len(free) > DENSE and (count is None or count > DENSE):
         raise ValueError(f"count = {count}: {len(free):,} freedoms have too many frequencies; ask for up to {DENSE}")
     K, M = (matrix.tocsr()[free][:, free].tocsc() for matrix in (K, M))
@@ -182,9 +183,9 @@ def frequencies(K: Sparse, M: Sparse, fixed: ArrayLike = (), count: int | None =
 
 
 class Blocks(NamedTuple):
-    """What each particle is pulled by: those of particle i stand in start[i] to start[i + 1], its partners ascending.
+    """The stiffness blocks of each particle: those of particle i are start[i] to start[i + 1], partners ascending.
 
-    F_i = -sum_j K_ij ((x_j - x_i) - (X_j - X_i)): of x its neighbours' relative positions alone, at rest X.
+    F_i = -sum_j K_ij ((x_j - x_i) - (X_j - X_i)), which needs only relative positions of neighbours x; X is at rest.
     """
 
     start: NDArray[np.int64]  # (n + 1,)
@@ -194,9 +195,9 @@ class Blocks(NamedTuple):
 
 
 def blocks(K: Sparse, points: ArrayLike) -> Blocks:
-    """Return K as a gather over partners: it needs no diagonal, as a translation costs no force (rows sum to zero).
+    """Return K as blocks per pair of partners, without its diagonal: a translation costs no force (rows sum to 0).
 
-    points: (n, D) m, undeformed. Refuses a K whose rows do not sum to zero: something holds it to the ground.
+    points: (n, D) m, undeformed. Raises ValueError if rows of K do not sum to 0, as something holds it to the ground.
     """
     points = np.asarray(points, float)
     n, d = points.shape
@@ -221,13 +222,13 @@ def blocks(K: Sparse, points: ArrayLike) -> Blocks:
 
 
 def _edges(points: Floats, elements: NDArray[Any]) -> Floats:
-    """Return the ways from an element's first corner to its others, (E, k - 1, D) m."""
+    """Return the vectors from an element's first corner to its others, (E, k - 1, D) m."""
     corners = points[elements]
     return np.asarray(corners[:, 1:] - corners[:, :1])
 
 
 def _gradients(points: Floats, elements: NDArray[Any]) -> Floats:
-    """Return how an element's shapes grow in space, (E, k, D) 1/m; a bar's along itself only."""
+    """Return the gradients of each element's shape functions, (E, k, D) 1/m; those of a bar are along it."""
     edges = _edges(points, elements)
     if elements.shape[1] == 2:
         others = edges / np.square(edges).sum(axis=2, keepdims=True)
@@ -237,12 +238,12 @@ def _gradients(points: Floats, elements: NDArray[Any]) -> Floats:
 
 
 def _structure(points: ArrayLike, elements: ArrayLike) -> tuple[Floats, NDArray[np.int64]]:
-    """Return points and elements as arrays; refuse what is no structure, in one line."""
+    """Return points and elements as arrays; raise ValueError, in one line, if they are not a structure."""
     X, who = np.asarray(points, float), np.asarray(elements)
     if X.ndim != 2 or X.shape[1] not in (1, 2, 3) or not np.isfinite(X).all():
         raise ValueError(f"points of shape {X.shape}: must be finite numbers (n, D), D from 1 to 3")
     if who.ndim != 2 or not np.issubdtype(who.dtype, np.integer):
-        raise ValueError(f"elements of shape {who.shape}, {who.dtype}: must be whole numbers (E, k)")
+        raise ValueError(f"elements of shape {who.shape}, {who.dtype}: must be integers (E, k)")
     if who.shape[1] not in (2, X.shape[1] + 1):
         allowed = {1: "2 (bars)", 2: "2 (bars) or 3 (triangles)", 3: "2 (bars) or 4 (tetrahedra)"}[X.shape[1]]
         raise ValueError(f"elements of {who.shape[1]} corners: in {X.shape[1]} dimensions k must be {allowed}")
@@ -263,7 +264,7 @@ def _row(row: NDArray[Any]) -> tuple[int, ...]:
 
 def _assembled(parts: Floats, elements: NDArray[np.int64], count: int) -> Sparse:
     """Return the sum over elements of their matrices (E, k, D, k, D) as csr (n D, n D)."""
-    from scipy import sparse  # here: who simulates without finite elements need not wait for it
+    from scipy import sparse  # here: a scene without finite elements need not wait for it
 
     _, k, d, _, _ = parts.shape
     freedom = (elements[:, :, None] * d + np.arange(d)).reshape(-1, k * d)
@@ -276,10 +277,10 @@ def _assembled(parts: Floats, elements: NDArray[np.int64], count: int) -> Sparse
 
 
 def _free(count: int, fixed: ArrayLike) -> NDArray[np.intp]:
-    """Return the degrees of freedom that are not fixed; refuse what is none of them."""
+    """Return the degrees of freedom that are not fixed; raise TypeError or ValueError on invalid ones."""
     held = np.asarray(fixed)
     if held.size and not np.issubdtype(held.dtype, np.integer):
-        raise TypeError(f"fixed of {held.dtype}: must be degrees of freedom, whole numbers from 0 to {count - 1}")
+        raise TypeError(f"fixed of {held.dtype}: must be degrees of freedom, integers from 0 to {count - 1}")
     outside = held[(held < 0) | (held >= count)]
     if outside.size:
         raise ValueError(f"fixed: {outside[0]} is no degree of freedom; they are 0 to {count - 1}")
@@ -289,9 +290,9 @@ def _free(count: int, fixed: ArrayLike) -> NDArray[np.intp]:
 
 
 def _scaled(K: Sparse, free: NDArray[np.intp], dimension: int) -> tuple[Sparse, Floats]:
-    """Return K, csc, with the stiffest axis of each particle scaled to one, and the scale of each freedom.
+    """Return K, csc, with the stiffest axis of each particle scaled to 1, and the scale of each freedom.
 
-    Thick and thin parts can be compared then, and an axis that is stiff by rounding alone still shows.
+    Thick and thin parts are then comparable, and an axis that is stiff only by rounding is still detected.
     """
     from scipy import sparse
 
@@ -325,7 +326,7 @@ def _factor(K: Sparse) -> tuple[Any, Floats]:
 
 
 def _lu(A: Sparse) -> Any:
-    """Return the factors of a symmetric matrix, csc, that is not negative: it needs no pivoting, which fills it up."""
+    """Return the LU factors of a positive semidefinite matrix, csc, without pivoting, which would cause fill-in."""
     from scipy.sparse.linalg import splu
 
     return splu(A, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
@@ -348,7 +349,7 @@ def _all(K: Sparse, M: Sparse) -> Floats:
 
 
 def _lowest(K: Sparse, M: Sparse, count: int | None) -> Floats:
-    """Return the squares of the lowest frequencies, ascending; shifted to just below 0, as K may be singular."""
+    """Return the squares of the lowest frequencies, ascending; the shift is just below 0, as K may be singular."""
     from scipy.sparse.linalg import LinearOperator, eigsh
 
     shift = -1e-9 * float(K.diagonal().sum() / M.diagonal().sum())

@@ -1,4 +1,4 @@
-"""How far from the origin single precision tells places apart well enough to move."""
+"""The distance from the origin up to which single precision resolves positions well enough."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from flockenv.model.scene_view import SceneView
 __all__ = ["FARTHEST", "check_places"]
 
 FARTHEST = 10_000.0
-"""m from the origin, along any axis, within which a float32 scene must lie: beyond, places are 1 mm apart and more.
+"""m from the origin, along any axis, within which a float32 scene must lie: beyond, positions round to 1 mm or more.
 
-At 32,768 m somebody with 1 m/s does not move at all in steps of 1 ms (numerics.md P36).
+At 32,768 m an agent at 1 m/s does not move at all in steps of 1 ms.
 """
 
 
 def check_places(scene: SceneView) -> None:
-    """Refuse a float32 scene with a place beyond FARTHEST; what moves there later is not looked after."""
+    """Raise ValueError if a float32 scene has a place beyond FARTHEST; later motion is not checked."""
     if scene.dtype != "float32":
         return
     for name, value in _places(scene):
@@ -33,7 +33,7 @@ def check_places(scene: SceneView) -> None:
 
 
 def _places(scene: SceneView) -> Iterator[tuple[str, Any]]:
-    """Every place that a scene names, and its key."""
+    """Yield the key and value of every place in a scene."""
     yield "space.size", getattr(scene.space, "size", ())
     for k, group in enumerate(scene.groups):
         if group.network is not None:

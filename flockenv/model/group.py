@@ -1,4 +1,4 @@
-"""Group: some agents of a kind, how heavy, wide and fast they are, and where they begin."""
+"""Group: agents of one kind, with their masses, radii, speeds and initial positions."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from flockenv.model.spawn import Spawn
 __all__ = ["Group"]
 
 SIZE, PACE = 0, 1
-"""Channels of what differs within a group: whoever is heavy is wide, but not faster."""
+"""RNG channels of spreads: masses and radii share ranks (a heavy agent is wide); desired speeds are independent."""
 
 
 def _above_0(spread: Spread) -> Spread:
-    """Refuse numbers that are all 0."""
+    """Return the spread; raise ValueError if all of its numbers are 0."""
     if spread.most <= 0 or (spread.mean == 0 and spread.sd == 0):
         raise ValueError("all of them would be 0; must be above 0")
     return spread
@@ -32,46 +32,46 @@ PositiveSpread = Annotated[float, Field(gt=0)] | Annotated[Spread, AfterValidato
 
 
 class Group(Record):
-    """Some agents of a kind: so many that are on their own, or a network of them; there `mass` is the mean.
+    """Agents of one kind: `count` separate agents, or the particles of a network; there `mass` is the mean.
 
-    Mass, radius and desired_speed are a number, or a `Spread` of numbers that differ from one to the next.
+    Mass, radius and desired_speed are a number, or a `Spread` of numbers that vary within the group.
     """
 
     count: int | None = Field(default=None, ge=1, description="how many")
-    network: AnyNetwork | None = Field(default=None, description="particles that are tied to each other, and where")
+    network: AnyNetwork | None = Field(
+        default=None, description="particles joined by springs or elements, and their positions"
+    )
     mass: PositiveSpread = Field(default=1.0, description="kg")
     radius: Annotated[float, Field(ge=0)] | Spread = Field(default=0.1, description="m")
-    desired_speed: PositiveSpread | None = Field(
-        default=None, description="m/s, how fast it would like to go; see driving"
-    )
-    max_speed: float | None = Field(default=None, gt=0, description="m/s; none = no limit")
+    desired_speed: PositiveSpread | None = Field(default=None, description="m/s, target speed of the driving force")
+    max_speed: float | None = Field(default=None, gt=0, description="m/s (default: no limit)")
     haste: float | None = Field(
-        default=None, ge=1, description="max_speed of each as a multiple of its desired_speed, instead of one for all"
+        default=None, ge=1, description="max_speed of each agent as a multiple of its desired_speed; replaces max_speed"
     )
-    max_force: float | None = Field(default=None, ge=0, description="N, what it may ask for; none = no limit")
-    oriented: bool = Field(
-        default=False, description="does it keep its heading (in 3-D an up vector too) while it stands still?"
+    max_force: float | None = Field(
+        default=None, ge=0, description="N, limit of driving and steering forces (default: none)"
     )
+    oriented: bool = Field(default=False, description="keep a heading (in 3-D also an up vector) at standstill")
     max_turn_rate: float | None = Field(
-        default=None, gt=0, description="rad/s, how fast its heading turns; none = no limit; oriented if given"
+        default=None, gt=0, description="rad/s, limit of the turn rate of its heading (default: none); implies oriented"
     )
     banking: float | None = Field(
         default=None, gt=0,
-        description="s, in which it leans into its turns (3-D), as far as lateral acceleration against 9.81 m/s^2 "
-        "says; none = it does not; oriented if given",
+        description="s, time constant of banking in 3-D, towards the angle given by lateral acceleration and "
+        "9.81 m/s^2 (default: no banking); implies oriented",
     )  # fmt: skip
     spawn: Spawn = Field(default_factory=Spawn)
     alive: int | None = Field(
-        default=None, ge=0, description="how many live at the start; none = all, or nobody where an emitter feeds them"
+        default=None, ge=0, description="number alive at the start (default: all, or 0 if an emitter feeds the group)"
     )
     role: Literal["agent", "learner", "pursuer", "evader", "flockmate"] = Field(
-        default="agent", description="what it is in pictures"
+        default="agent", description="role in pictures"
     )
-    appearance: Appearance | None = Field(default=None, description="how it is drawn; none = as its role is")
+    appearance: Appearance | None = Field(default=None, description="how it is drawn (default: as its role)")
 
     @model_validator(mode="after")
     def _one_or_the_other(self) -> Group:
-        """Refuse a count beside a network, and neither; and a network that nobody knows how to place."""
+        """Raise ValueError unless either a count or a network is given, and the other fields fit it."""
         if (self.count is None) == (self.network is None):
             raise ValueError("count: give either a count or a network")
         if self.network is not None and (
@@ -79,7 +79,7 @@ class Group(Record):
             or self.spawn.spacing is not None
             or (any(self.spawn.speed) and not self.spawn.heading)
         ):
-            raise ValueError("spawn: a network is where it says; all it may be given is a speed, with a heading")
+            raise ValueError("spawn: a network defines its own positions; only speed, with a heading, may be given")
         if self.network is not None and (isinstance(self.mass, Spread) or isinstance(self.radius, Spread)):
             raise ValueError("mass: of a network it is the mean, and its radius is a number")
         if self.haste is not None and (self.max_speed is not None or self.desired_speed is None):
@@ -92,12 +92,12 @@ class Group(Record):
 
     @property
     def keeps_heading(self) -> bool:
-        """Has each of them a frame of its own?"""
+        """True if each agent keeps a heading frame."""
         return self.oriented or self.max_turn_rate is not None or self.banking is not None
 
     @property
     def size(self) -> int:
-        """How many agents it has."""
+        """Number of agents."""
         return self.network.size if self.network is not None else int(self.count or 0)
 
     @property
@@ -107,12 +107,12 @@ class Group(Record):
 
     @property
     def desired_speeds(self) -> NDArray[np.float64]:
-        """How fast each agent would like to go, (size,) m/s; 0 if nobody says."""
+        """The desired speed of each agent, (size,) m/s; 0 if not given."""
         return drawn(self.desired_speed or 0.0, self.size, PACE)
 
     @property
     def max_speeds(self) -> NDArray[np.float64]:
-        """How fast each agent goes at most, (size,) m/s; may be infinite."""
+        """The maximum speed of each agent, (size,) m/s; may be infinite."""
         if self.haste is not None:
             return self.haste * self.desired_speeds
         return np.full(self.size, math.inf if self.max_speed is None else self.max_speed)
@@ -124,16 +124,16 @@ class Group(Record):
 
     @property
     def heaviest(self) -> float:
-        """The largest mass, kg; of a network the mean."""
+        """The largest mass, kg; the mean if it is a network."""
         return largest(self.mass, self.size, SIZE)
 
     @property
     def fastest(self) -> float | None:
-        """The largest max_speed, m/s; none without a limit."""
+        """The largest max_speed, m/s; None without a limit."""
         return self.max_speed if self.haste is None else float(self.max_speeds.max())
 
     def masses(self, dimension: int) -> NDArray[np.float64]:
-        """Return the mass of each agent, (size,) kg; infinite where a network pins one."""
+        """Return the mass of each agent, (size,) kg; infinite for pinned particles of a network."""
         if self.network is None:
             return drawn(self.mass, self.size, SIZE)
         assert not isinstance(self.mass, Spread)

@@ -1,7 +1,7 @@
-"""Networks: particles tied to each other, a rope, a cloth, a jelly or a mesh by hand, as the arrays that tie them.
+"""Networks: particles joined to each other (a rope, a cloth, a jelly or a custom mesh), as arrays of their joints.
 
-Where particles begin, which springs, hinges and finite elements join them, who is pinned and what each weighs. What a
-spring does is somebody else's business.
+A network defines the initial positions of its particles, the springs, hinges and finite elements that join them, which
+particles are pinned, and their masses. The forces of springs are effects, defined elsewhere.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ Ints = NDArray[np.int32]
 
 
 MOST = 10_000_000
-"""Particles of one network."""
+"""Most particles of one network."""
 
 
 def _plain(value: object) -> object:
-    """Take numpy's whole numbers for whole numbers: they are what indices come as."""
+    """Return numpy integers as int, as indices often come as numpy integers; other values unchanged."""
     return int(value) if isinstance(value, np.integer) else value
 
 
-Coordinate = Annotated[float, Field(ge=-1e100, le=1e100)]  # a box of wider ones has no volume in floating point
+Coordinate = Annotated[float, Field(ge=-1e100, le=1e100)]  # the volume of a larger box overflows
 Length = Annotated[float, Field(gt=0, le=1e100)]
 Point = Annotated[tuple[Coordinate, ...], Field(min_length=2, max_length=3)]
 Count = Annotated[int, Field(ge=1, strict=True), BeforeValidator(_plain)]
-Particle = Annotated[int, Field(ge=0, lt=MOST, strict=True), BeforeValidator(_plain)]  # by its number; True is none
+Particle = Annotated[int, Field(ge=0, lt=MOST, strict=True), BeforeValidator(_plain)]  # its index; bool is rejected
 Name = Annotated[str, Field(strict=True)]
 
 EDGE, SHEAR, BEND = 0, 1, 2
-"""Roles of springs: along an edge, across a cell, over two edges."""
+"""Roles of springs: along an edge, across a cell, spanning two edges."""
 
 
 class Springs(NamedTuple):
@@ -56,22 +56,24 @@ class Springs(NamedTuple):
 
 
 class Network(Record):
-    """Particles tied to each other. A kind of network says where they are and what joins them.
+    """Particles joined to each other. Each kind of network defines their positions and what joins them.
 
-    Everything but `size`, `dimension` and `pins` is asked for with the dimension D of the world, and refused with a
-    ValueError if the network lies in another.
+    All methods but `size`, `dimension` and `pins` take the dimension D of the world, and raise ValueError if the
+    network has another.
     """
 
     kind: str
-    pinned: tuple[Particle | Name, ...] = Field(default=(), description="who is held: names of places, numbers")
-    stretch: float = Field(default=1.0, ge=1e-6, le=1e6, description="lengths at the beginning over lengths at rest")
+    pinned: tuple[Particle | Name, ...] = Field(
+        default=(), description="particles held in place: names of places, or indices"
+    )
+    stretch: float = Field(default=1.0, ge=1e-6, le=1e6, description="initial lengths over rest lengths")
     lumping: Literal["equal", "geometric"] = Field(
-        default="equal", description="shares of the mass: the same for all, or of the length, area or volume around it"
+        default="equal", description="mass of each particle: equal, or by the length, area or volume around it"
     )
 
     @model_validator(mode="after")
     def _sound(self) -> Self:
-        """Refuse too many particles, points of different dimensions, impossible shapes, pins that are nowhere."""
+        """Raise ValueError on too many particles, points of mixed dimensions, invalid shapes or unknown pins."""
         if self.size > MOST:
             raise ValueError(f"{self.size:,} particles: at most {MOST:,} are allowed")
         self._refuse_mixture()
@@ -95,10 +97,10 @@ class Network(Record):
                 )
 
     def _refuse_shape(self) -> None:
-        """Refuse fields that make no shape together."""
+        """Raise ValueError if the fields do not define a shape together."""
 
     def _given(self) -> Iterator[tuple[str, tuple[float, ...]]]:
-        """The points that somebody wrote down, by name."""
+        """Yield the names and points of the fields that were given."""
         return iter(())
 
     def _demand(self, dimension: int) -> None:
@@ -110,37 +112,37 @@ class Network(Record):
     @property
     @abstractmethod
     def size(self) -> int:
-        """How many particles, n."""
+        """Number of particles, n."""
 
     @property
     def dimension(self) -> int | None:
-        """2 or 3, whichever it was written down for; None if it fits into both."""
+        """Dimension of the given points, 2 or 3; None if it fits both."""
         return next((len(point) for _, point in self._given()), None)
 
     @property
     def places(self) -> tuple[str, ...]:
-        """The names that `pinned` knows."""
+        """Names of places that `pinned` accepts."""
         return ()
 
     def _place(self, name: str) -> NDArray[Any]:
-        """The particles of a place."""
+        """Return the particles of a place."""
         raise ValueError(f"pinned: a {self.kind} has no place {name!r}; give numbers of particles")
 
     @abstractmethod
     def points(self, dimension: int) -> Floats:
-        """Return where particles begin, (n, D) m."""
+        """Return the initial positions of particles, (n, D) m."""
 
     def rest_points(self, dimension: int) -> Floats:
-        """Return where particles are when nothing is strained, (n, D) m; the first one where it begins."""
+        """Return the unstrained positions of particles, (n, D) m; the first is at its initial position."""
         points = self.points(dimension)
         return np.asarray(points if self.stretch == 1 else points[0] + (points - points[0]) / self.stretch)
 
     @abstractmethod
     def springs(self, dimension: int) -> Springs:
-        """Return who is tied to whom, and how long each spring is at rest."""
+        """Return the springs: pairs of particles, rest lengths and roles."""
 
     def hinges(self, dimension: int) -> Ints:
-        """Return which angles resist bending, (H, 3): end, apex, end."""
+        """Return the angles that resist bending, (H, 3): end, apex, end."""
         self._demand(dimension)
         return np.zeros((0, 3), np.int32)
 
@@ -148,19 +150,19 @@ class Network(Record):
     def elements(self, dimension: int) -> Ints:
         """Return finite elements, (E, k): bars (k = 2), triangles (k = 3) or tetrahedra (k = 4).
 
-        Triangles in the plane and tetrahedra in space turn positively (det of the edges from the first corner > 0).
+        Triangles in 2-D and tetrahedra in 3-D are positively oriented (det of the edges from the first corner > 0).
         """
 
     def pins(self) -> Ints:
-        """Return who is held, (P,) ascending."""
+        """Return the pinned particles, (P,) ascending."""
         held = [self._place(pin) if isinstance(pin, str) else np.array([pin]) for pin in self.pinned]
         return np.unique(np.concatenate([np.zeros(0, np.int32), *held])).astype(np.int32)
 
     def masses(self, total: float, dimension: int) -> Floats:
-        """Return what each particle weighs, (n,) kg, `total` together: equal shares, or those of `lumping`.
+        """Return the mass of each particle, (n,) kg, `total` in sum, distributed according to `lumping`.
 
-        Geometric: each element, or spring where there are none, divides its length, area or volume among its corners.
-        Refuses particles left without mass.
+        Geometric: each element, or spring if there are no elements, divides its length, area or volume equally among
+        its corners. Raises ValueError if a particle has no mass.
         """
         self._demand(dimension)
         if not 0 < total < np.inf:
@@ -173,33 +175,37 @@ class Network(Record):
         share = np.repeat(contents(self.rest_points(dimension), joined), joined.shape[1])
         weight = np.bincount(joined.ravel(), share, minlength=self.size)
         if not weight.all():
-            raise ValueError(f"lumping = geometric: particle {np.argmin(weight)} is part of nothing and would weigh 0")
+            raise ValueError(
+                f"lumping = geometric: particle {np.argmin(weight)} is part of no element or spring and would weigh 0"
+            )
         return np.asarray(total * weight / weight.sum())
 
 
 class Rope(Network):
-    """Links in a row, from `start` to `end`, or in a direction.
+    """A chain of links from `start` to `end`, or in a direction.
 
-    With both ends and a length it hangs slack, in an arc of its rest lengths, or is drawn tight.
+    With both ends and a length it hangs slack, in an arc of its rest lengths, or is stretched.
     """
 
     kind: Literal["rope"] = "rope"
-    links: Count = Field(description="one less than its particles")
-    start: Point | None = Field(default=None, description="m; none = the origin")
-    end: Point | None = Field(default=None, description="m; none = where direction and length lead")
-    direction: Point | None = Field(default=None, description="from the start, of any length; none = along x")
-    length: Length | None = Field(default=None, description="m, at rest; none = from start to end over stretch")
-    sag: Point | None = Field(default=None, description="way in which slack hangs; none = down the last axis")
-    bend: bool = Field(default=False, description="springs over two links as well")
+    links: Count = Field(description="number of links; particles: one more")
+    start: Point | None = Field(default=None, description="m (default: the origin)")
+    end: Point | None = Field(default=None, description="m (default: given by direction and length)")
+    direction: Point | None = Field(default=None, description="from the start, of any length (default: along x)")
+    length: Length | None = Field(
+        default=None, description="m, at rest (default: distance of start and end over stretch)"
+    )
+    sag: Point | None = Field(default=None, description="direction in which slack hangs (default: down the last axis)")
+    bend: bool = Field(default=False, description="also springs that span two links")
 
     @property
     def size(self) -> int:
-        """Links and one."""
+        """Number of particles: links + 1."""
         return self.links + 1
 
     @property
     def places(self) -> tuple[str, ...]:
-        """One end, the other, both."""
+        """Each end, and both."""
         return ("start", "end", "ends")
 
     def _place(self, name: str) -> NDArray[Any]:
@@ -215,9 +221,9 @@ class Rope(Network):
         if self.end is None and self.length is None:
             raise ValueError("a rope needs an end or a length")
         if self.end is not None and self.direction is not None:
-            raise ValueError("end and direction say the same: give one of them")
+            raise ValueError("end and direction are redundant: give one of them")
         if self.end is not None and self.length is not None and self.stretch != 1:
-            raise ValueError(f"stretch = {self.stretch:g}: start, end and length say the same: give two of them")
+            raise ValueError(f"stretch = {self.stretch:g}: start, end and length are redundant: give two of them")
         for name in ("direction", "sag"):
             way = getattr(self, name)
             if way is not None and not np.linalg.norm(way) > 0:
@@ -226,7 +232,7 @@ class Rope(Network):
             raise ValueError(f"end = {self.end}: it is the start, so the rope needs a length")
 
     def _ends(self, dimension: int) -> tuple[Floats, Floats]:
-        """Where it starts and where it ends, (D,) m each."""
+        """Return its start and its end, (D,) m each."""
         start = np.array(self.start or (0.0,) * dimension, float)
         if self.end is not None:
             return start, np.array(self.end, float)
@@ -235,16 +241,16 @@ class Rope(Network):
         return start, start + way * (self.length * self.stretch / np.linalg.norm(way))
 
     def _reach(self) -> float:
-        """From its start to its end, m."""
+        """Return the distance from its start to its end, m."""
         start, end = self._ends(self.dimension or 2)
         return float(np.linalg.norm(end - start))
 
     def _link(self) -> float:
-        """A link at rest, m."""
+        """Return the rest length of a link, m."""
         return (self.length if self.length is not None else self._reach() / self.stretch) / self.links
 
     def points(self, dimension: int) -> Floats:
-        """Return its particles at equal distances on the way to its end, or on an arc where it is slack."""
+        """Return its particles, evenly spaced from start to end, or on an arc if it is slack."""
         self._demand(dimension)
         start, end = self._ends(dimension)
         slack = self.end is not None and self.length is not None and self._reach() < self.length
@@ -263,7 +269,7 @@ class Rope(Network):
         return np.asarray(np.linspace(start, start + along * (self._link() * self.links), self.size))
 
     def springs(self, dimension: int) -> Springs:
-        """Return a spring for each link, and with `bend` one over each two."""
+        """Return a spring for each link and, with `bend`, one spanning each two links in a row."""
         self._demand(dimension)
         ids = np.arange(self.size, dtype=np.int32)
         over = _runs(ids, 0, 3)[:, ::2] if self.bend else np.zeros((0, 2), np.int32)
@@ -271,7 +277,7 @@ class Rope(Network):
         return found._replace(rest=np.asarray(self._link() * (found.j - found.i)))
 
     def hinges(self, dimension: int) -> Ints:
-        """Return each three particles in a row."""
+        """Return all triples of consecutive particles."""
         self._demand(dimension)
         return _runs(np.arange(self.size, dtype=np.int32), 0, 3)
 
@@ -282,19 +288,19 @@ class Rope(Network):
 
 
 class _Lattice(Network):
-    """Cells in rows: what a cloth and a jelly have in common. Particles are counted along the first edge first."""
+    """A lattice of cells, common to cloth and jelly. Particles are numbered along the first edge first."""
 
     cells: tuple[int, ...]
-    origin: Point | None = Field(default=None, description="m, its first corner; none = the origin")
-    sides: tuple[Length, ...] | None = Field(default=None, description="m, of a box along the axes; or give edges")
-    edges: tuple[Point, ...] | None = Field(default=None, description="m, from the first corner; or give sides")
+    origin: Point | None = Field(default=None, description="m, its first corner (default: the origin)")
+    sides: tuple[Length, ...] | None = Field(default=None, description="m, of an axis-aligned box; or give edges")
+    edges: tuple[Point, ...] | None = Field(default=None, description="m, vectors from the first corner; or give sides")
     diagonals: Literal["alternating", "parallel"] = Field(
-        default="alternating", description="of elements: cells mirror each other, or are all alike"
+        default="alternating", description="cuts of cells into elements: mirrored from cell to cell, or all alike"
     )
 
     @property
     def size(self) -> int:
-        """One more than cells, along each edge."""
+        """Number of particles: one more than cells along each edge."""
         return math.prod(count + 1 for count in self.cells)
 
     def _given(self) -> Iterator[tuple[str, tuple[float, ...]]]:
@@ -313,7 +319,7 @@ class _Lattice(Network):
 
     @property
     def places(self) -> tuple[str, ...]:
-        """Its sides, in the plane of two edges its corners by name, all corners, all that lies outside."""
+        """Its sides; with two edges, each corner; all corners; the whole border."""
         if len(self.cells) == 3:
             return (*_SIDES, "corners", "border")
         corners = [f"{row}_{column}" for row in ("bottom", "top") for column in ("left", "right")]
@@ -334,12 +340,12 @@ class _Lattice(Network):
         return np.asarray(ids[tuple(here)]).ravel()
 
     def _ids(self) -> Ints:
-        """The number of the particle at each place of the lattice."""
+        """Return the index of the particle at each site of the lattice."""
         shape = tuple(count + 1 for count in self.cells)
         return np.arange(self.size, dtype=np.int32).reshape(shape, order="F")
 
     def points(self, dimension: int) -> Floats:
-        """Return corners of cells, the first edge's fastest."""
+        """Return the sites of the lattice; the index along the first edge varies fastest."""
         self._demand(dimension)
         points = np.tile(np.array(self.origin or (0.0,) * dimension, float), (self.size, 1))
         edges = self.edges if self.edges is not None else np.diag(self.sides or ()).tolist()
@@ -349,7 +355,7 @@ class _Lattice(Network):
         return points
 
     def _corners(self) -> tuple[Ints, NDArray[np.int64]]:
-        """The corners of each cell, (C, 2^d), bit k of a corner's place for edge k; and which cells are mirrored."""
+        """Return the corners of each cell, (C, 2^d), bit k of the column for edge k; and 1 for mirrored cells."""
         ids = self._ids()
         bits = itertools.product((0, 1), repeat=ids.ndim)  # the last edge's bit comes first
         shifted = [tuple(slice(b, b + n) for b, n in zip(bit[::-1], self.cells, strict=True)) for bit in bits]
@@ -358,7 +364,7 @@ class _Lattice(Network):
         return corners, np.asarray(mirrored, np.int64).ravel(order="F")
 
     def elements(self, dimension: int) -> Ints:
-        """Return its cells cut into triangles or tetrahedra that share whole faces."""
+        """Return its cells cut into triangles or tetrahedra with conforming faces."""
         self._demand(dimension)
         corners, mirrored = self._corners()
         cuts = _CUTS[len(self.cells), self.diagonals][mirrored]
@@ -367,7 +373,7 @@ class _Lattice(Network):
 
 
 class Cloth(_Lattice):
-    """A sheet of cells between two edges; in the plane or in space.
+    """A sheet of cells spanned by two edges; 2-D or 3-D.
 
     "left" is where the first edge begins, "bottom" where the second does.
     """
@@ -375,10 +381,10 @@ class Cloth(_Lattice):
     kind: Literal["cloth"] = "cloth"
     cells: tuple[Count, Count] = Field(description="along the first and the second edge")
     shear: bool = Field(default=True, description="springs across cells")
-    bend: bool = Field(default=True, description="springs over two edges in a row")
+    bend: bool = Field(default=True, description="springs that span two edges in a row")
 
     def springs(self, dimension: int) -> Springs:
-        """Return springs along the sides of cells, both diagonals of each, and over two sides in a row."""
+        """Return springs along the sides of cells, along both diagonals, and spanning two sides in a row."""
         self._demand(dimension)
         ids, (corners, _) = self._ids(), self._corners()
         groups = [(_runs(ids, axis, 2), EDGE) for axis in (0, 1)]
@@ -389,13 +395,13 @@ class Cloth(_Lattice):
         return _springs(groups, self.rest_points(dimension))
 
     def hinges(self, dimension: int) -> Ints:
-        """Return each three particles in a row, along both edges."""
+        """Return all triples of consecutive particles along both edges."""
         self._demand(dimension)
         return np.concatenate([_runs(self._ids(), axis, 3) for axis in (0, 1)])
 
 
 class Jelly(_Lattice):
-    """A box of tetrahedra, five per cell or (parallel) six; in the plane a sheet of triangles.
+    """A box of tetrahedra, five per cell or (parallel) six; in 2-D a sheet of triangles.
 
     "left" is where the first edge begins, "bottom" where the last does, "front" where the one between them does.
     """
@@ -405,7 +411,7 @@ class Jelly(_Lattice):
 
     @property
     def dimension(self) -> int:
-        """As many as it has edges."""
+        """Number of its edges."""
         return len(self.cells)
 
     def _refuse_shape(self) -> None:
@@ -424,26 +430,30 @@ class Jelly(_Lattice):
 
 
 class Mesh(Network):
-    """Points, and what joins them, by hand: elements of one kind; springs are their edges, or the pairs given."""
+    """Custom points and joints: elements of one kind; springs are their edges, or the given pairs."""
 
     kind: Literal["mesh"] = "mesh"
-    vertices: tuple[Point, ...] = Field(min_length=1, description="m, where particles begin")
+    vertices: tuple[Point, ...] = Field(min_length=1, description="m, initial positions of particles")
     pairs: tuple[tuple[Particle, Particle], ...] | None = Field(
-        default=None, description="springs; none = the edges of its elements"
+        default=None, description="springs (default: the edges of its elements)"
     )
     rest: tuple[Annotated[float, Field(ge=0, le=1e100)], ...] | None = Field(
-        default=None, description="m, of each pair; none = as far as its ends are, over stretch"
+        default=None, description="m, of each pair (default: distance of its ends, over stretch)"
     )
     bars: tuple[tuple[Particle, Particle], ...] = Field(default=(), description="elements of two corners")
-    triangles: tuple[tuple[Particle, Particle, Particle], ...] = Field(default=(), description="of three")
-    tetrahedra: tuple[tuple[Particle, Particle, Particle, Particle], ...] = Field(default=(), description="of four")
+    triangles: tuple[tuple[Particle, Particle, Particle], ...] = Field(
+        default=(), description="elements of three corners"
+    )
+    tetrahedra: tuple[tuple[Particle, Particle, Particle, Particle], ...] = Field(
+        default=(), description="elements of four corners"
+    )
     angles: tuple[tuple[Particle, Particle, Particle], ...] = Field(default=(), description="hinges: end, apex, end")
 
     _ELEMENTS: ClassVar[tuple[str, ...]] = ("bars", "triangles", "tetrahedra")
 
     @property
     def size(self) -> int:
-        """As many as vertices."""
+        """Number of vertices."""
         return len(self.vertices)
 
     def _given(self) -> Iterator[tuple[str, tuple[float, ...]]]:
@@ -465,12 +475,12 @@ class Mesh(Network):
                 f"rest: {len(self.rest)} lengths for {len(self.pairs or ())} pairs; one for each is needed"
             )
         if self.rest is not None and self.stretch != 1:
-            raise ValueError(f"stretch = {self.stretch:g}: rest says how long springs are: give one of them")
+            raise ValueError(f"stretch = {self.stretch:g}: rest gives the lengths of springs: give one of them")
         if self.lumping == "geometric":
-            self.masses(1.0, len(self.vertices[0]))  # refuses who is part of nothing
+            self.masses(1.0, len(self.vertices[0]))  # raises if a particle is part of no element
 
     def _joined(self) -> Ints:
-        """Its elements as they were given; bars, none of them, if there are none."""
+        """Return its elements as given; an empty array of bars if there are none."""
         given = next((rows for rows in (self.triangles, self.tetrahedra) if rows), self.bars)
         return np.array(given, np.int32) if given else np.zeros((0, 2), np.int32)
 
@@ -508,10 +518,10 @@ AnyNetwork = Annotated[Rope | Cloth | Jelly | Mesh, Field(discriminator="kind")]
 # --- lattices -------------------------------------------------------------------------------------------------------
 
 _SIDES = {"left": (0, 0), "right": (0, -1), "bottom": (-1, 0), "top": (-1, -1), "front": (1, 0), "back": (1, -1)}
-"""Which edge a side is at the beginning (0) or the end (-1) of."""
+"""The edge of each side, and the end of that edge it is at: first (0) or last (-1)."""
 
 _FIVE = [(0, 3, 5, 6), (1, 0, 3, 5), (2, 0, 3, 6), (4, 0, 5, 6), (7, 3, 5, 6)]
-"""A cell cut into one tetrahedron in the middle and four that are corners of the cell."""
+"""A cell cut into one tetrahedron in the middle and four at corners of the cell."""
 
 _SIX = [(0, 1 << a, (1 << a) | (1 << b), 7) for a, b in itertools.permutations(range(3), 2)]
 """A cell cut into six tetrahedra around its diagonal. Source: Kuhn 1960, IBM J. Res. Dev. 4, 518."""
@@ -522,11 +532,11 @@ _CUTS = {
     (3, "alternating"): np.array([_FIVE, [tuple(corner ^ 1 for corner in cut) for cut in _FIVE]]),
     (3, "parallel"): np.array([_SIX]),
 }
-"""Corners of the elements of a cell, and of its mirror image: bit k of a corner says on which side of edge k it is."""
+"""Corners of the elements of a cell, and of its mirror image: bit k of a corner is its end of edge k."""
 
 
 def _runs(ids: Ints, axis: int, length: int) -> Ints:
-    """Return each `length` particles in a row along an axis of a lattice, (R, length)."""
+    """Return all runs of `length` consecutive particles along an axis of a lattice, (R, length)."""
     count = max(ids.shape[axis] - length + 1, 0)
     rows = np.moveaxis(ids, axis, -1)
     parts = [np.moveaxis(rows[..., k : k + count], -1, axis) for k in range(length)]
@@ -534,7 +544,7 @@ def _runs(ids: Ints, axis: int, length: int) -> Ints:
 
 
 def _refuse_edges(edges: tuple[tuple[float, ...], ...]) -> None:
-    """Refuse an edge of no length, edges on a line, edges in a plane."""
+    """Raise ValueError if an edge has no length, or edges are parallel or in one plane."""
     lengths = np.linalg.norm(edges, axis=1)
     for k in np.flatnonzero(~(lengths > 0)):
         raise ValueError(f"edges[{k}] = {edges[k]}: it has no length")
@@ -546,28 +556,28 @@ def _refuse_edges(edges: tuple[tuple[float, ...], ...]) -> None:
 
 
 def _keys(pairs: NDArray[Any], size: int) -> NDArray[np.int64]:
-    """Return a number for each pair, whichever of the two comes first: smaller index times size, plus the greater."""
+    """Return a key for each pair, independent of its order: smaller index times size, plus the greater."""
     a, b = pairs[:, 0].astype(np.int64), pairs[:, 1]
     return np.asarray(np.minimum(a, b) * size + np.maximum(a, b))
 
 
 def _pairs(keys: NDArray[np.int64], size: int) -> Ints:
-    """Return the pairs that have these numbers, (E, 2), the smaller first."""
+    """Return the pairs with these keys, (E, 2), the smaller index first."""
     first = keys // size
     return np.stack([first, keys - first * size], axis=1).astype(np.int32)
 
 
 def _springs(groups: list[tuple[NDArray[Any], int]], rest_points: Floats) -> Springs:
-    """Return pairs and their roles as springs in order, as long at rest as their ends are apart."""
+    """Return pairs and their roles as sorted springs; rest lengths are the distances of their ends."""
     keys = np.concatenate([_keys(pairs, len(rest_points)) for pairs, _ in groups])
     role = np.repeat(np.array([role for _, role in groups], np.int8), [len(pairs) for pairs, _ in groups])
-    order = np.argsort(keys, kind="stable")  # quick where runs are in order already
+    order = np.argsort(keys, kind="stable")  # fast if runs are in order already
     i, j = np.ascontiguousarray(_pairs(keys[order], len(rest_points)).T)
     return Springs(i, j, np.linalg.norm(rest_points[j] - rest_points[i], axis=1), role[order])
 
 
 def _element_edges(elements: Ints, size: int) -> NDArray[np.int64]:
-    """Return the numbers of the pairs that are edges of elements, ascending, each once."""
+    """Return the keys of the pairs that are edges of elements, ascending, each once."""
     corners = itertools.combinations(range(elements.shape[1]), 2)
     keys = np.sort(np.concatenate([_keys(elements[:, pair], size) for pair in corners]))
     again = np.flatnonzero(keys[1:] == keys[:-1])
@@ -575,7 +585,7 @@ def _element_edges(elements: Ints, size: int) -> NDArray[np.int64]:
 
 
 def _turned(points: Floats, elements: Ints) -> Ints:
-    """Return elements that fill their space with a positive determinant: two corners of the others change places."""
+    """Return elements with positive determinant: two corners are swapped if it is negative (k = D + 1 only)."""
     elements = elements.astype(np.int32)
     if elements.shape[1] == points.shape[1] + 1:
         corners = points[elements]
@@ -585,7 +595,7 @@ def _turned(points: Floats, elements: Ints) -> Ints:
 
 
 def _refuse_rows(name: str, rows: tuple[tuple[int, ...], ...], size: int) -> None:
-    """Refuse rows that name a particle that is not there, or one twice, or the same particles as another row."""
+    """Raise ValueError if a row has an unknown particle, one twice, or the same particles as another row."""
     if not rows:
         return
     who = np.array(rows, np.int64)
@@ -594,7 +604,7 @@ def _refuse_rows(name: str, rows: tuple[tuple[int, ...], ...], size: int) -> Non
     ordered = np.sort(who, axis=1)
     for k in np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(axis=1)):
         raise ValueError(f"{name}[{k}] = {rows[k]}: the same particle twice")
-    if name == "angles":  # the same three may meet at another apex
+    if name == "angles":  # the same three may have another apex
         ordered = np.concatenate([ordered, who[:, 1:2]], axis=1)
     order = np.lexsort(ordered.T)
     for k in np.flatnonzero((ordered[order[1:]] == ordered[order[:-1]]).all(axis=1)):
@@ -606,7 +616,7 @@ def _refuse_rows(name: str, rows: tuple[tuple[int, ...], ...], size: int) -> Non
 
 
 def _frame(way: Floats, aside: Floats) -> tuple[Floats, Floats]:
-    """Return unit vectors along `way` and, at right angles to it, towards `aside`; if that is along it, some other."""
+    """Return unit vectors along `way` and perpendicular to it, towards `aside` unless that is parallel to `way`."""
     axes = np.eye(len(way))
     along = way / np.linalg.norm(way) if way.any() else axes[0]
     for towards in (aside / np.linalg.norm(aside) if aside.any() else aside, axes[np.argmin(np.abs(along))]):

@@ -1,4 +1,4 @@
-"""SceneView: what effects, constraints and populations read of the scene that they are part of."""
+"""SceneView: the attributes of a scene that effects, constraints and populations read."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ __all__ = ["SceneView"]
 
 
 class SceneView(Protocol):
-    """A scene as its parts see it: a record without the step. `flockenv.scene.Scene` is one.
+    """A scene as seen by its parts: a record without the step. `flockenv.scene.Scene` is one.
 
-    Members of packages above this one (effects, the method) are `Any` here: a part may ask them for their own names.
+    Members whose types are defined in packages above this one (effects, the method) are `Any` here.
     """
 
     @property
@@ -28,35 +28,35 @@ class SceneView(Protocol):
 
     @property
     def dtype(self) -> str:
-        """The precision of everything."""
+        """The precision of all numbers."""
 
     @property
     def dt(self) -> float:
-        """s, one physics step."""
+        """s, the length of a physics step."""
 
     @property
     def space(self) -> Space:
-        """Where agents are."""
+        """The space of the agents."""
 
     @property
     def groups(self) -> Sequence[Group]:
-        """Agents, group after group."""
+        """The groups of agents, in order."""
 
     @property
     def effects(self) -> Sequence[Any]:
-        """What acts on agents."""
+        """The effects that act on agents."""
 
     @property
     def obstacles(self) -> Sequence[Shape]:
-        """The same in every world."""
+        """Obstacles, the same in every world."""
 
     @property
     def integrator(self) -> Any:
-        """The method."""
+        """The integration method."""
 
     @property
     def constraints(self) -> Sequence[Any]:
-        """What every step must end with."""
+        """Constraints, applied at the end of every step."""
 
     @property
     def population(self) -> Sequence[Any]:
@@ -64,7 +64,7 @@ class SceneView(Protocol):
 
     @property
     def agents(self) -> int:
-        """N."""
+        """N, the number of agents."""
 
     @property
     def starts(self) -> tuple[int, ...]:
@@ -72,11 +72,11 @@ class SceneView(Protocol):
 
     @property
     def living(self) -> tuple[int, ...]:
-        """How many agents of each group live at the start."""
+        """Number of agents of each group that live at the start."""
 
     @property
     def circles(self) -> tuple[Circle, ...]:
-        """Round solid obstacles that stand still: part of the state."""
+        """Round solid obstacles that do not move: part of the state."""
 
     @property
     def shapes(self) -> tuple[Shape, ...]:
@@ -84,7 +84,7 @@ class SceneView(Protocol):
 
     @property
     def touching(self) -> float:
-        """The two largest radii, summed, m: agents further apart do not touch."""
+        """Sum of the two largest radii, m: agents further apart do not touch."""
 
     @property
     def body(self) -> Body:
@@ -92,21 +92,21 @@ class SceneView(Protocol):
 
     @property
     def parts(self) -> Any:
-        """What the kernel of this scene depends on."""
+        """The parts that the kernel of this scene depends on."""
 
     @property
     def coupling(self) -> Any:
-        """Which agents' accelerations depend on which, for methods that solve equations."""
+        """Which agents' accelerations depend on which others, for implicit methods."""
 
     @property
     def table(self) -> Any:
         """Bonds."""
 
     def table_of(self, effect: Any) -> NDArray[Any]:
-        """Return the numbers that the laws of a tabled effect look up."""
+        """Return the table that the laws of an effect read."""
 
     def inner(self, state: State, name: str) -> NDArray[Any]:
-        """Return a number that agents keep, by name, (B, N)."""
+        """Return an inner state of the agents, by name, (B, N)."""
 
     def rates(self, state: State, drive: ArrayLike | None = None, times: ArrayLike | None = None) -> Any:
         """Return accelerations and the velocity of the medium, (B, N, D)."""

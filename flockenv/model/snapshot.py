@@ -24,7 +24,7 @@ KINDS: Final = ("goal", "heading", "way")
 
 @dataclass(frozen=True, eq=False)
 class Mark:
-    """Something to draw that is no body: a goal, a desired heading, a piece of a way.
+    """Something to draw that is not a body: a goal, a desired heading, a piece of a path.
 
     kind: "goal" (a disc of `radius` around `at`; `vector` is not read) or "heading" (an arrow that starts at `at` and
     points along `vector`; only its direction counts, and a zero vector draws nothing; `radius` is not read) or "way" (a
@@ -226,7 +226,7 @@ def _switches(field: str, value: ArrayLike, count: int) -> NDArray[np.bool_]:
 def _whole(field: str, value: ArrayLike, count: int) -> NDArray[np.int64]:
     numbers = np.array(value)
     if numbers.size and numbers.dtype.kind not in "iu":
-        raise TypeError(f"{field}: must be whole numbers, got {numbers.dtype}")
+        raise TypeError(f"{field}: must be integers, got {numbers.dtype}")
     _demand(numbers.shape == (count,), field, f"must have shape ({count},)", f"shape {numbers.shape}")
     numbers = numbers.astype(np.int64)
     numbers.flags.writeable = False
@@ -236,7 +236,7 @@ def _whole(field: str, value: ArrayLike, count: int) -> NDArray[np.int64]:
 def _pairs(field: str, value: ArrayLike, count: int) -> NDArray[np.int32]:
     pairs = np.array(value)
     if pairs.size and pairs.dtype.kind not in "iu":
-        raise TypeError(f"{field}: must be whole numbers, got {pairs.dtype}")
+        raise TypeError(f"{field}: must be integers, got {pairs.dtype}")
     _demand(pairs.ndim == 2 and pairs.shape[1] == 2, field, "must have shape (any, 2)", f"shape {pairs.shape}")
     outside = pairs[(pairs < 0) | (pairs >= count)]
     _demand(not len(outside), field, f"must be agents from 0 to {count - 1}", outside[:1])

@@ -1,4 +1,4 @@
-"""Initial places of agents: drawn from the world's key, clear of obstacles, the same in every batch of worlds."""
+"""Initial positions of agents: drawn from the world's RNG key, clear of obstacles, independent of the batch size."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ __all__ = ["Spawn", "cells", "direction", "scatter"]
 Edge = Annotated[float, Field(gt=0)]
 
 TRIES = 64
-"""Places tried per agent before it is put where it overlaps least."""
+"""Positions tried per agent before it is put at the one with the least overlap."""
 
 MOST_CELLS = 10_000_000
-"""Cells of a grid that are looked through for free ones."""
+"""Most cells of a grid that are searched for free ones."""
 
 
 class Spawn(Record):
     """Uniform in a box (default: the whole space), at a speed drawn from a range, in a random or a given direction.
 
-    With `spacing` each agent has a cell of a grid; bodies do not overlap then, unless they are `wider` than cells.
+    With `spacing` each agent has its own cell of a grid; bodies then do not overlap, unless `wider` is set.
     """
 
     kind: Literal["uniform"] = "uniform"
@@ -38,23 +38,23 @@ class Spawn(Record):
     spacing: Edge | tuple[Edge, ...] | None = Field(
         default=None,
         description="m, edge of cells, or one edge per axis; from `low` on, along the first axis first; each agent is "
-        "in the middle of a cell that is clear of the obstacles; default: anywhere, also in one another",
+        "in the middle of a cell that is clear of obstacles (default: anywhere, bodies may overlap)",
     )  # fmt: skip
     jitter: float = Field(
-        default=0.0, ge=0, description="m, how far from the middle of its cell at most, along every axis"
+        default=0.0, ge=0, description="m, greatest distance from the middle of its cell along each axis"
     )
     wider: bool = Field(
         default=False,
-        description="may bodies be wider than their cells, and begin a little in their neighbours and in obstacles?",
+        description="allow bodies wider than their cells, which may overlap neighbours and obstacles at first",
     )
     speed: tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]] = Field(
         default=(0.0, 0.0), description="m/s, least and most"
     )
-    heading: tuple[float, ...] | None = Field(default=None, description="direction of the velocity; none = random")
+    heading: tuple[float, ...] | None = Field(default=None, description="direction of the velocity (default: random)")
 
     @model_validator(mode="after")
     def _ordered(self) -> Spawn:
-        """Refuse ranges that run backwards."""
+        """Raise ValueError if a range is reversed, or a field lacks the one it goes with."""
         if self.speed[0] > self.speed[1]:
             raise ValueError(f"speed = {self.speed}: the least comes first")
         if (self.low is None) != (self.high is None):
@@ -75,14 +75,15 @@ def cells(
 ) -> NDArray[np.float64]:  # fmt: skip
     """Return the middles of the first cells of a spawn's grid in [low, high) that are clear of shapes, (count, D) m.
 
-    ValueError that begins with the field's name if bodies of that radius, m, are wider than a cell, or have no room.
+    Raises ValueError, beginning with the field's name, if bodies of this radius, m, are wider than a cell, or if there
+    are too few free cells.
     """
     dimension, body = len(low), 0.0 if spawn.wider else radius
     spacing = _edges(spawn, dimension, radius)
     along = [math.floor((b - a) / edge + 1e-9) for a, b, edge in zip(low, high, spacing, strict=True)]
     total = math.prod(along)
     if total > MOST_CELLS:
-        raise ValueError(f"spacing = {_said(spacing)}: {total:,} cells; at most {MOST_CELLS:,} are looked through")
+        raise ValueError(f"spacing = {_said(spacing)}: {total:,} cells; at most {MOST_CELLS:,} are allowed")
     found = np.zeros((0, dimension))
     for first in range(0, total, 65_536):
         if len(found) >= count:
@@ -100,7 +101,7 @@ def cells(
 
 
 def _edges(spawn: Spawn, dimension: int, radius: float) -> tuple[float, ...]:
-    """Return the edges of a spawn's cells, (D,) m. ValueError if bodies of that radius, m, are wider than a cell."""
+    """Return the edges of a spawn's cells, (D,) m; raise ValueError if bodies of this radius, m, do not fit."""
     given = spawn.spacing if isinstance(spawn.spacing, tuple) else (spawn.spacing or 0.0,) * dimension
     if len(given) != dimension:
         raise ValueError(f"spacing = {given}: must be one edge, or one per axis ({dimension})")
@@ -114,7 +115,7 @@ def _edges(spawn: Spawn, dimension: int, radius: float) -> tuple[float, ...]:
 
 
 def _said(spacing: tuple[float, ...]) -> str:
-    """Return edges as a message has them: one, or all if they differ."""
+    """Return edges as text for messages: one number, or all if they differ."""
     return f"{spacing[0]:g}" if len(set(spacing)) == 1 else f"({', '.join(f'{edge:g}' for edge in spacing)})"
 
 
@@ -152,9 +153,8 @@ def scatter(
 ) -> None:  # fmt: skip
     """Place agents [first, end) of one world: uniform in [low, high), clear of obstacles if 64 tries find room.
 
-    pos, vel (D, N); low, high, heading, period, unit (D,); a heading of zeros means a random one; `period` is the
-    size of a periodic box, zeros for none; `unit` is scratch. `tried` (N,): number of tries already made, in; number of
-    the try that is kept, out.
+    pos, vel (D, N); low, high, heading, period, unit (D,); heading: zeros for a random one; period: size of a periodic
+    box, zeros for none; unit: scratch. tried (N,): in, number of tries already made; out, index of the try kept.
     """
     dimension = pos.shape[0]
     for i in range(first, end):

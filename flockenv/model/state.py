@@ -1,7 +1,7 @@
-"""State and Body: every array of a simulation, its shape and its unit, written here once.
+"""State and Body: every array of a simulation, with its shape and unit.
 
 B worlds, N agents, D = 2 or 3 dimensions, M obstacles. Memory is one contiguous array per coordinate, (D, B, N);
-people see (B, N, D) through a transposed view that costs nothing.
+users see (B, N, D) through transposed views, without a copy.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ WORK = (
     "evaluations", "neighbour_queries", "pairs", "obstacle_tests", "substeps", "rejected_steps", "newton_iterations",
     "linear_iterations", "impacts", "unsolved", "stopped", "births", "deaths", "births_refused",
 )  # fmt: skip
-"""What is counted in State.work: force evaluations, neighbour queries, candidate pairs met, agent-obstacle tests; and,
-by methods that choose their own steps, those accepted and rejected; by methods that solve, their iterations; by
-collisions, impacts, those that were cut short or left unsolved, and bodies that stopped within a step; of a population,
-births, deaths, and births for which there was no free slot."""
+"""Counters in State.work: force evaluations, neighbour queries, candidate pairs tested, agent-obstacle tests; of
+adaptive methods, steps accepted and rejected; of implicit methods, iterations; of collisions, impacts, those cut short
+or left unsolved, and bodies that stopped within a step; of a population, births, deaths, and births without a free
+slot."""
 
 COUNTED_BY_KERNELS = 8
-"""How many of these the kernel of a scene counts: the first."""
+"""Number of these counters, the first ones, that the kernel of a scene updates."""
 
 
 @dataclass(frozen=True, eq=False)
 class Obstacles:
-    """Round obstacles of every world, as views: they may differ from world to world, and stand still.
+    """Round obstacles of every world, as views: they may differ from world to world, and do not move.
 
-    Circles that move or are hollow are not among them: with the other shapes they are the scene's, `Scene.shapes`.
+    Circles that move or are hollow are not among them; like all other shapes they are in `Scene.shapes`.
     """
 
     centre: Floats  # (B, M, D) m
@@ -48,15 +48,15 @@ class Obstacles:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """What does not change about agents, the same in every world."""
+    """Constant properties of agents, the same in every world."""
 
     mass: Floats  # (N,) kg
     radius: Floats  # (N,) m
     max_speed: Floats  # (N,) m/s, may be inf
-    max_force: Floats  # (N,) N, bounds what an agent asks for (drive and steering), not what acts on it; may be inf
-    desired_speed: Floats  # (N,) m/s, how fast it would like to go; 0 if nobody says
-    max_turn_rate: Floats  # (N,) rad/s, may be inf; (0,) if nobody has a limit
-    banking: Floats  # (N,) s, in which it leans into its turns; inf = it does not, (0,) if nobody does
+    max_force: Floats  # (N,) N, limit of driving and steering forces only, not of other forces; may be inf
+    desired_speed: Floats  # (N,) m/s, target speed of the driving force; 0 if not given
+    max_turn_rate: Floats  # (N,) rad/s, may be inf; (0,) if no agent has a limit
+    banking: Floats  # (N,) s, time constant of banking; inf: no banking; (0,) if no agent banks
 
     def astype(self, dtype: Any) -> Body:
         """Return the same bodies in another precision."""
@@ -69,24 +69,24 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What changes: where everybody is, how fast, who is alive, and how many steps have passed.
+    """The variables of a simulation: positions, velocities, living agents, number of steps, and more.
 
-    The obstacles are here because a random field differs from world to world and from episode to episode.
+    Round obstacles are here because a random field of them differs from world to world and from episode to episode.
     """
 
     x: Floats  # (D, B, N) m, positions, per coordinate
     v: Floats  # (D, B, N) m/s, velocities, per coordinate
     alive: NDArray[np.bool_]  # (B, N)
     tick: NDArray[np.int64]  # (B,) physics steps since the start
-    key: NDArray[np.uint64]  # (B,) the world's random key, see noise.py
+    key: NDArray[np.uint64]  # (B,) the world's RNG key, see counter_rng.py
     obstacle_x: Floats  # (D, B, M) m
     obstacle_radius: Floats  # (B, M) m
     work: NDArray[np.int64]  # (B, len(WORK)) counters, see WORK
-    frame: Floats  # (F, B, N) unit vectors: where everybody faces, in space which way is up; F = 0 if nobody keeps that
-    inner: Floats  # (K, B, N) what goes on inside everybody: the numbers that effects keep, see Scene.inner
-    identity: NDArray[np.int64]  # (B, N) who is in this slot, or was last, -1 = nobody; (B, 0) without a population
-    born: NDArray[np.float64]  # (B, N) s, since when; (B, 0) without a population
-    dies: NDArray[np.float64]  # (B, N) s, when its own lifetime ends, inf = never; (B, 0) without a population
+    frame: Floats  # (F, B, N) unit vectors: heading and, in 3-D, up; F = 0 if no group keeps them
+    inner: Floats  # (K, B, N) inner states of agents, kept by effects, see Scene.inner
+    identity: NDArray[np.int64]  # (B, N) agent in this slot, or the last one, -1 if none; (B, 0) without a population
+    born: NDArray[np.float64]  # (B, N) s, time of birth; (B, 0) without a population
+    dies: NDArray[np.float64]  # (B, N) s, when its lifetime ends, inf if never; (B, 0) without a population
     dt: float  # s, one physics step: time = tick dt
 
     @property
@@ -101,14 +101,14 @@ class State:
 
     @property
     def carried(self) -> tuple[Floats, ...]:
-        """Frames and inner states, if this state has some: what kernels are given of it."""
+        """Frames and inner states, those that are not empty, as passed to kernels."""
         return tuple(array for array in (self.frame, self.inner) if len(array))
 
     @property
     def heading(self) -> Floats:
-        """Where everybody faces, unit vectors (B, N, D): a view if headings are kept.
+        """Headings, unit vectors (B, N, D): a view if they are kept.
 
-        If not, along the velocity, and 0 at standstill.
+        Otherwise the directions of velocities, 0 at standstill.
         """
         if len(self.frame):
             return self.frame[: len(self.x)].transpose(1, 2, 0)
@@ -117,19 +117,19 @@ class State:
 
     @property
     def up(self) -> Floats:
-        """Which way is up for everybody, unit vectors across the heading as a view, (B, N, 3); none in the plane."""
+        """Up vectors, unit vectors perpendicular to the heading, as a view, (B, N, 3); ValueError if not kept."""
         if not len(self.frame) or len(self.x) == 2:
-            raise ValueError("up: only states of scenes in 3-D have it in which a group is oriented")
+            raise ValueError("up: only scenes in 3-D with an oriented group have up vectors")
         return self.frame[3:].transpose(1, 2, 0)
 
     @property
     def time(self) -> NDArray[np.float64]:
-        """Time of each world, (B,) s: a whole number of steps times dt, so that it never drifts."""
+        """Time of each world, (B,) s: an integer number of steps times dt, so that it never drifts."""
         return np.asarray(self.tick * self.dt, np.float64)
 
     @property
     def age(self) -> NDArray[np.float64]:
-        """How long everybody has lived, (B, N) s, of the living; all as old as the world without a population."""
+        """Age of living agents, (B, N) s; the world's time for all agents without a population."""
         born = self.born if self.born.shape[1] else 0.0
         return np.asarray(np.broadcast_to(self.time[:, None], self.alive.shape) - born, np.float64)
 
@@ -145,7 +145,7 @@ class State:
         return b, n, d
 
     def counted(self, what: str) -> int:
-        """Return one work counter summed over the worlds; `what` is a name in WORK."""
+        """Return one work counter, summed over the worlds; what: a name in WORK."""
         return int(self.work[:, WORK.index(what)].sum())
 
     def copy(self) -> State:
@@ -153,7 +153,7 @@ class State:
         return replace(self, **{name: getattr(self, name).copy() for name in _ARRAYS})
 
     def copy_from(self, other: State) -> None:
-        """Overwrite the arrays of this state with another's; refuses one of another shape or precision."""
+        """Overwrite the arrays of this state with another's; raise ValueError if shape or precision differ."""
         for name in _ARRAYS:
             mine, theirs = getattr(self, name), getattr(other, name)
             if (mine.shape, mine.dtype) != (theirs.shape, theirs.dtype):
@@ -165,17 +165,16 @@ class State:
             getattr(self, name)[...] = getattr(other, name)
 
     def put(self, rows: NDArray[np.bool_], other: State) -> None:
-        """Overwrite some worlds, (B,), with the same of another state of this shape."""
+        """Overwrite the worlds selected by `rows`, (B,), with those of another state of the same shape."""
         for name in _ARRAYS:
             at = (slice(None), rows) if name in _PER_COORDINATE else rows
             getattr(self, name)[at] = getattr(other, name)[at]
 
     def with_motion(self, pos: ArrayLike, vel: ArrayLike) -> State:
-        """Return a copy with other positions and velocities, each (B, N, D); refuses other shapes, and NaN.
+        """Return a copy with other positions and velocities, each (B, N, D).
 
-        So it does numbers that are too large to be squared (flockenv.core.magnitudes).
-
-        Where headings are kept, who moves faces along his new velocity.
+        If headings are kept, moving agents face along their new velocity. Raises ValueError on other shapes, NaN, and
+        numbers too large to be squared (flockenv.core.magnitudes).
         """
         new = self.copy()
         for name, given, target in (("pos", pos, new.pos), ("vel", vel, new.vel)):
@@ -188,12 +187,12 @@ class State:
         return new
 
     def face(self) -> None:
-        """Where headings are kept, let everybody face along his velocity, or as before if there is none."""
+        """Turn the headings, if kept, along the velocities; an agent at standstill keeps its heading."""
         for b in range(self.shape[0] if len(self.frame) else 0):
             entry(face)(self.v, self.frame, b, False)
 
     def with_dt(self, dt: float) -> State:
-        """Return a copy whose clock counts steps of another length, s; refuses one that does not divide its time."""
+        """Return a copy with another step length, s; raise ValueError unless each world's time is a multiple of it."""
         if not (dt > 0 and np.isfinite(dt)):
             raise ValueError(f"dt is {dt}, must be a positive number of seconds")
         ticks = self.time / dt
@@ -226,7 +225,7 @@ def blank(
     worlds: int, agents: int, dimension: int, obstacles: int, dt: float, dtype: Any = np.float64, frame_rows: int = 0,
     population: bool = False, inner_rows: int = 0,
 ) -> State:  # fmt: skip
-    """Return a state of zeros, everybody alive: what a spawn writes into; identities are numbers of slots, if kept."""
+    """Return a state of zeros with all agents alive, for a spawn to fill; identities, if kept, are slot numbers."""
     slots = agents if population else 0
     return State(
         x=zeros((dimension, worlds, agents), dtype),

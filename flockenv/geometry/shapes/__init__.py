@@ -1,8 +1,9 @@
 """Obstacles: circles, capsules, walls, polygons, blocks, half-spaces, distance fields; in 2-D and (but polygons) 3-D.
 
-`round`, `chain`, `block`, `field` hold the laws of one agent and one shape, `hollow` those of shapes that bodies stay
-in; `head` what laws may ask whatever the form: bounds, and how it moves; `every` the laws of whatever form a row has;
-`table` how kernels are handed shapes; `records` what scenes list; `outlines` what pictures show.
+`round`, `chain`, `block`, `field` hold the laws of one agent and one shape, `inverted` those of shapes that bodies stay
+in, `edges` those of a silhouette; `row_header` reads what rows of every form share, bounds and motion; `dispatch` calls
+the law of a row's form at run time; `table` packs shapes for kernels, `cells` puts them on a grid, `joints` finds
+joined walls; `records` are what scenes list; `outlines` are for pictures.
 """
 
 from __future__ import annotations

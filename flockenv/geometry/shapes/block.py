@@ -1,8 +1,8 @@
-"""Boxes that may be turned, and half-spaces. See shapes/table.py for how they lie in a table.
+"""Boxes of any orientation, and half-spaces. See shapes/table.py for their layout in a table.
 
-A block is its half edges (D, m) and its axes (D unit vectors of D numbers); a half-space is the unit normal that points
-out of it; behind the head (see head.py). `x` is where the agent is, relative to the anchor: the centre, or a point of
-the surface.
+After the row header (see row_header.py), a block has its half edges (D, m) and its axes (D unit vectors of D numbers);
+a half-space has its outward unit normal. `x` is the position of the agent relative to the anchor: the centre of a
+block, or a point of the surface of a half-space.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def turned(table: Any, at: int, x: Vec) -> Vec:
 
 @law
 def turned_back(table: Any, at: int, y: Vec) -> Vec:
-    """Return y, which is in the frame of a block's axes, in that of the world."""
+    """Return a vector y, given in the frame of a block's axes, in the frame of the world."""
     out = add(scale(_axis(table, at, 0, y), y[0]), scale(_axis(table, at, 1, y), y[1]))
     if len(y) == 2:
         return out
@@ -55,7 +55,7 @@ def turned_back(table: Any, at: int, y: Vec) -> Vec:
 
 @law
 def _beyond(y: float, h: float) -> float:
-    """How far y lies outside [-h, h], with its sign."""
+    """Return the signed distance of y from [-h, h]; 0 inside."""
     return y - h if y > h else (y + h if y < -h else like(y, 0.0))
 
 
@@ -71,7 +71,7 @@ def _signed(y: float, k: int, x: Vec) -> Vec:
 
 @law
 def box_nearest(y: Vec, h: Vec) -> tuple[float, Vec]:
-    """Return the distance to a box around 0 along the axes, m (negative inside), and its outward unit normal."""
+    """Return the distance to an axis-aligned box around 0, m (negative inside), and its outward unit normal."""
     x_, y_ = _depth(y[0], h[0]), _depth(y[1], h[1])
     wide = x_ > y_
     deepest, face = x_ if wide else y_, select(wide, _signed(y[0], 0, y), _signed(y[1], 1, y))
@@ -89,7 +89,7 @@ def box_nearest(y: Vec, h: Vec) -> tuple[float, Vec]:
 
 @law
 def _slab(y: float, d: float, h: float) -> tuple[float, float]:
-    """Return where a line is between two faces: from, to."""
+    """Return the interval of a line between two opposite faces: (from, to), in units of its direction."""
     o, far = like(h, 0.0), like(h, np.inf)
     moves = d != o
     rate = d if moves else like(h, 1.0)
@@ -101,7 +101,7 @@ def _slab(y: float, d: float, h: float) -> tuple[float, float]:
 
 @law
 def box_hit(y: Vec, d: Vec, h: Vec) -> float:
-    """Return the distance along d to a box around 0 along the axes, m: 0 from inside, inf if missed."""
+    """Return the distance along d to an axis-aligned box around 0, m: 0 from inside, inf if missed."""
     a, b = _slab(y[0], d[0], h[0])
     c, e = _slab(y[1], d[1], h[1])
     first, last = c if c > a else a, e if e < b else b
@@ -114,7 +114,7 @@ def box_hit(y: Vec, d: Vec, h: Vec) -> float:
 
 @law
 def _rounded_square(y: Vec, d: Vec, h: Vec, r: float) -> float:
-    """Return where a ray meets what is within r of a rectangle: two rectangles and four circles."""
+    """Return the distance along a ray to a rectangle inflated by r: two rectangles and four circles."""
     a, b = box_hit(y, d, (h[0] + r, h[1])), box_hit(y, d, (h[0], h[1] + r))
     best = a if a < b else b
     for corner in range(4):
@@ -126,7 +126,7 @@ def _rounded_square(y: Vec, d: Vec, h: Vec, r: float) -> float:
 
 @law
 def _rounded_cube(y: Vec, d: Vec, h: Vec, r: float) -> float:
-    """Return where a ray meets what is within r of a box: three boxes, and a tube around each of twelve edges."""
+    """Return the distance along a ray to a box inflated by r: three boxes, and a tube around each of twelve edges."""
     a, b = box_hit(y, d, (h[0] + r, h[1], h[2])), box_hit(y, d, (h[0], h[1] + r, h[2]))
     c = box_hit(y, d, (h[0], h[1], h[2] + r))
     best = a if a < b else b
@@ -155,7 +155,7 @@ def nearest_block(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
 def hit_block(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
     """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
 
-    From where it overlaps already it is 0.
+    0 if the body already overlaps it.
     """
     y, d, h = turned(table, at, x), turned(table, at, direction), half_edges(table, at, x)
     if len(x) == 2:
@@ -175,7 +175,7 @@ def nearest_half_space(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
 def hit_half_space(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
     """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
 
-    From where it overlaps already it is 0.
+    0 if the body already overlaps it.
     """
     normal = vector_at(table, body_of(at, x), x)
     room, speed = dot(x, normal) - clearance, dot(direction, normal)

@@ -1,13 +1,13 @@
-"""A grid of cells over the rows of one form, so that a law meets only the shapes that may be near.
+"""A grid of cells over the rows of one form, so that a law is evaluated only for shapes that may be near.
 
-It is made once per scene and has about as many cells as there are shapes. A shape is listed in every cell that its box
-overlaps, so that the few cells around a place list all shapes near it, however many shapes there are. Shapes that move,
-and those that overlap more than MOST_CELLS cells, are in one more list, the last, which every search goes through.
+It is built once per scene and has about as many cells as there are shapes. A shape is listed in every cell that its box
+overlaps, so that the few cells around a place list all shapes near it. Shapes that move, and those that overlap more
+than MOST_CELLS cells, are in one more list, the last, which every search includes.
 
 The table holds, in order: the lower corner of the grid (D, m), cells per metre (D), the number of cells along each axis
 (D), 1 for a torus and 0 otherwise; the beginning of each list, cells in C order, then the last list, and its end; the
-lists. An entry holds the distance of the shape's row behind the first row of its form, the middle of the shape's box
-(D, m) and half the edges (D, m). See Ericson 2005, "Real-Time Collision Detection", 7.1.
+lists. An entry holds the offset of the shape's row from the first row of its form, the middle of the shape's box (D, m)
+and half its edges (D, m). See Ericson 2005, "Real-Time Collision Detection", 7.1.
 """
 
 from __future__ import annotations
@@ -30,30 +30,30 @@ __all__ = [
 Floats = NDArray[np.float64]
 
 FEWEST_ROWS = 16
-"""With fewer shapes of a form there is no grid: a loop over all of them, for many agents at a time, is faster."""
+"""With fewer shapes of a form there is no grid: a vectorized loop over all of them is faster."""
 
 MOST_FOUND = 64
-"""An agent that has more shapes near it than this interacts with all of the form, which needs no sorting."""
+"""An agent with more shapes near it than this interacts with all shapes of the form, which needs no sorting."""
 
 MOST_CELLS = 64
-"""A shape that overlaps more cells is in the last list."""
+"""A shape that overlaps more cells than this is in the last list."""
 
 LOOSE = 1e-6
-"""Boxes are larger by this share of their coordinates: single precision rounds by 6e-8."""
+"""Boxes are enlarged by this fraction of their coordinates: single precision rounds by 6e-8."""
 
 BESIDE = 1e-3
-"""Share of a cell by which a box beside it counts as in it: single precision rounds the place in a grid, too."""
+"""Fraction of a cell by which boxes are enlarged on the grid: single precision also rounds grid coordinates."""
 
 
 def entry_length(dimension: int) -> int:
-    """Return how many numbers a listed shape has."""
+    """Return the number of values in an entry of a list."""
     return 1 + 2 * dimension
 
 
 def cells_of(shapes: Sequence[Any], rows: Sequence[int], period: Floats | None = None) -> Floats:
-    """Return the cells of some shapes of one form, as a table.
+    """Return the table of cells for some shapes of one form.
 
-    rows: how far behind the first row the row of each begins, ascending. period: the edges of a torus, m.
+    rows: offset of each shape's row from the first row, ascending. period: the edges of a torus, m.
     """
     middle = np.array([shape.bound.centre for shape in shapes])
     half = np.array([np.full(len(m), np.inf) if s.moves else s.bound.half for s, m in zip(shapes, middle, strict=True)])
@@ -70,7 +70,7 @@ def cells_of(shapes: Sequence[Any], rows: Sequence[int], period: Floats | None =
 
 
 def _grid(middle: Floats, half: Floats, period: Floats | None) -> tuple[Floats, Floats, NDArray[np.int64]]:
-    """Return the lower corner of a grid, cells per metre and how many there are along each axis."""
+    """Return the lower corner of a grid, and cells per metre and the number of cells along each axis."""
     still, d = np.isfinite(half).all(axis=1), middle.shape[1]
     if period is not None:
         low, width = np.zeros(d), period
@@ -79,14 +79,14 @@ def _grid(middle: Floats, half: Floats, period: Floats | None) -> tuple[Floats, 
         width = (middle + half)[still].max(axis=0) - low
     else:
         low, width = np.zeros(d), np.ones(d)
-    width = np.maximum(width, max(float(width.max()), 1e-9) / len(middle))  # of what lies in a line, not too many cells
+    width = np.maximum(width, max(float(width.max()), 1e-9) / len(middle))  # bounds the cells of shapes in a line
     edge = (width.prod() / len(middle)) ** (1 / d)
     many = np.maximum(np.floor(width / edge), 1).astype(np.int64)
     return low, many / width, many
 
 
 def _cells(m: Floats, h: Floats, low: Floats, rate: Floats, many: NDArray[np.int64], closes: bool) -> list[int]:
-    """Return the numbers of the cells that a box overlaps; that of the last list if there are too many."""
+    """Return the indices of the cells that a box overlaps; the index of the last list if there are too many."""
     last = [int(many.prod())]
     if not np.isfinite(h).all():
         return last
@@ -104,9 +104,9 @@ def _cells(m: Floats, h: Floats, low: Floats, rate: Floats, many: NDArray[np.int
 
 @law
 def _span(table: Any, at: int, d: int, middle: float, reach: float, closes: bool) -> tuple[int, int]:
-    """Return the first cell that a box overlaps along an axis, whose numbers are at `at`, and how many it overlaps.
+    """Return the first cell that a box overlaps along the axis whose numbers begin at `at`, and how many it overlaps.
 
-    Only cells of the grid are returned, wherever the box is.
+    The cells are clipped to the grid.
     """
     low, rate, many = table[at], table[at + d], table[at + 2 * d]
     o, e = like(middle, 0.0), like(middle, 1.0)
@@ -119,7 +119,7 @@ def _span(table: Any, at: int, d: int, middle: float, reach: float, closes: bool
     most: Any = np.int64(many)
     first: Any = np.int64(begin)
     past: Any = np.int64(end)
-    first = first if first >= 0 else 0  # what is no number becomes the least of all
+    first = first if first >= 0 else 0  # NaN becomes the least integer
     last = first + most if closes else most
     past = past if past <= last else last
     return first, (past - first if past > first else 0)
@@ -127,7 +127,7 @@ def _span(table: Any, at: int, d: int, middle: float, reach: float, closes: bool
 
 @law
 def span_of(table: Any, at: int, middle: Vec, reach: Vec) -> tuple[tuple[int, int], ...]:
-    """Return the cells that a box overlaps, per axis: the first, and how many. middle, reach: of the box, m."""
+    """Return the cells that a box overlaps, per axis: (first, count). middle, reach: its centre and half edges, m."""
     d = len(middle)
     closes = table[at + 3 * d] > like(middle[0], 0.0)
     x = _span(table, at, d, middle[0], reach[0], closes)
@@ -149,7 +149,7 @@ def count_of(span: tuple[tuple[int, int], ...]) -> int:
 
 @law
 def list_of(table: Any, at: int, x: Vec, span: tuple[tuple[int, int], ...], k: int) -> tuple[int, int]:
-    """Return where the k-th of these lists begins and ends; k = 0 is the last list of the table."""
+    """Return where the k-th list of a span begins and ends; k = 0 is the last list of the table."""
     d = len(x)
     cell: Any = 0
     left: Any = k - 1
@@ -174,7 +174,7 @@ def list_of(table: Any, at: int, x: Vec, span: tuple[tuple[int, int], ...], k: i
 
 @law
 def meets_box(table: Any, entry: int, to: Vec, reach: Vec) -> bool:
-    """Return whether a box is within `reach` (m, per axis) of a place; `to` leads from there to its middle."""
+    """Return True if a box is within `reach` (m, per axis) of a point; `to`: offset from the point to its middle."""
     half = vector_at(table, entry + 1 + len(to), to)
     near = (abs(to[0]) <= half[0] + reach[0]) & (abs(to[1]) <= half[1] + reach[1])
     if len(to) == 3:
@@ -184,13 +184,13 @@ def meets_box(table: Any, entry: int, to: Vec, reach: Vec) -> bool:
 
 @law
 def row_listed(table: Any, entry: int) -> int:
-    """Return how far behind the first row its row lies."""
-    return np.int64(table[entry])  # type: ignore[return-value]  # a whole number, to numba an int
+    """Return the offset of a listed shape's row from the first row of its form."""
+    return np.int64(table[entry])  # type: ignore[return-value]  # an int to numba
 
 
 @kernel
 def keep_in_order(found: Any, first: int, count: int, row: int) -> int:
-    """Put a row among the `count` from `first` on, ascending, if it is new; return how many there are then."""
+    """Insert a row into the ascending `count` rows from `first` on, if it is new; return the new count."""
     place = first + count
     while place > first and found[place - 1] > row:
         place -= 1

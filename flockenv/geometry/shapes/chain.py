@@ -1,9 +1,9 @@
-"""Segments one after another: capsules, walls along a line, polygons (closed, and solid inside, in the plane).
+"""Chains of segments: capsules, walls along a polyline, polygons (closed, solid inside, 2-D).
 
-A chain is some numbers of a table: a head (see head.py), how many vertices there are, how far around the line
-it is thick (m), 1 if the last vertex is joined to the first and what lies within is solid; then the vertices, relative
-to the anchor; of a line that is not closed, two ends (see joints.py). A chain of one vertex is a circle or sphere. `x`
-is where the agent is, relative to the anchor.
+After the row header (see row_header.py), a chain has the number of its vertices; its radius, m (half its thickness); 1
+if it is closed (the last vertex is joined to the first, and the inside is solid), else 0; the vertices, relative to the
+anchor; and, if it is open, its two ends (see joints.py). A chain of one vertex is a circle or sphere. `x` is the
+position of the agent relative to the anchor.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = [
 
 @law
 def segment_share(x: Vec, a: Vec, b: Vec) -> float:
-    """Return how far from a to b the point of the segment lies that is nearest to x, from 0 to 1."""
+    """Return the parameter, 0 (at a) to 1 (at b), of the point of a segment that is nearest to x."""
     along = sub(b, a)
     o, e = like(x[0], 0.0), like(x[0], 1.0)
     square = dot(along, along)
@@ -35,7 +35,7 @@ def segment_share(x: Vec, a: Vec, b: Vec) -> float:
 
 @law
 def _side_hit(m: Vec, direction: Vec, along: Vec, radius: float) -> float:
-    """Return where a ray touches the sides of a tube around a line, inf if it does not; `m` leads from the line."""
+    """Return the distance along a ray to a tube around a line; inf if missed. m: offset of its origin from the line."""
     o, far = like(radius, 0.0), like(radius, np.inf)
     if len(m) == 2:
         across = perpendicular(along)
@@ -52,9 +52,9 @@ def _side_hit(m: Vec, direction: Vec, along: Vec, radius: float) -> float:
 
 @law
 def segment_hit(x: Vec, direction: Vec, a: Vec, b: Vec, radius: float) -> float:
-    """Return the distance along a unit `direction` to whatever is within `radius` of a segment, m; inf if missed.
+    """Return the distance along a unit `direction` to a segment inflated by `radius`, m: 0 from inside, inf if missed.
 
-    From inside it is 0. The sides of the tube, and a circle or sphere around each end.
+    Combines the sides of the tube and a circle or sphere around each end.
     """
     o, far = like(radius, 0.0), like(radius, np.inf)
     along, m = sub(b, a), sub(x, a)
@@ -71,13 +71,13 @@ def segment_hit(x: Vec, direction: Vec, a: Vec, b: Vec, radius: float) -> float:
 
 @law
 def vertex(table: Any, at: int, j: int, x: Vec) -> Vec:
-    """Return its vertex j, from the anchor."""
+    """Return vertex j, relative to the anchor."""
     return vector_at(table, body_of(at, x) + 3 + len(x) * j, x)
 
 
 @law
 def crosses(x: Vec, a: Vec, b: Vec) -> bool:
-    """Does the line from x to the right cross the segment?"""
+    """Return True if the ray from x in direction +x crosses the segment."""
     rise = b[1] - a[1]
     between = (a[1] > x[1]) != (b[1] > x[1])
     slope = rise if between else like(rise, 1.0)
@@ -88,7 +88,7 @@ def crosses(x: Vec, a: Vec, b: Vec) -> bool:
 def nearest_chain(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
     """Return the distance to the surface, m (negative inside), and the outward unit normal at its nearest point.
 
-    On the very line the normal is across it: to the right of a segment from a to b, which is out of a polygon.
+    If x is exactly on the line, the normal points to the right of the segment from a to b: out of a polygon.
     """
     body = body_of(at, x)
     count, radius = np.int64(table[body]), table[body + 1]
@@ -114,7 +114,7 @@ def nearest_chain(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
 def hit_chain(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
     """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
 
-    From where it overlaps already it is 0.
+    0 if the body already overlaps it.
     """
     body = body_of(at, x)
     count, room = np.int64(table[body]), table[body + 1] + clearance
@@ -139,17 +139,17 @@ def hit_chain(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> 
 
 @law
 def pieces_chain(table: Any, at: int, x: Vec, gap: float) -> int:
-    """Return how many pieces a chain is met in by one who is `gap` m from it: one where he is inside a solid one."""
+    """Return the number of pieces that act on an agent at distance `gap`, m; 1 inside a solid polygon."""
     body = body_of(at, x)
     count = np.int64(table[body])
     closed = table[body + 2] > like(gap, 0.0)
     edges = count if closed else max(count - 1, 1)
-    return 1 if closed & (gap < like(gap, 0.0)) else edges  # type: ignore[return-value]  # a whole number
+    return 1 if closed & (gap < like(gap, 0.0)) else edges  # type: ignore[return-value]  # an int to numba
 
 
 @law
 def _shares(table: Any, at: int, j: int, x: Vec) -> bool:
-    """Does the corner at the beginning of edge j, which is nearest to that edge, act: is it nearest to all there?"""
+    """Return True if the corner at the start of edge j acts: it is also the nearest point of the adjoining edge."""
     body = body_of(at, x)
     count: Any = np.int64(table[body])
     closed = table[body + 2] > like(x[0], 0.0)
@@ -162,7 +162,7 @@ def _shares(table: Any, at: int, j: int, x: Vec) -> bool:
 
 @law
 def end_acts(table: Any, at: int, which: int, x: Vec) -> bool:
-    """Does the first (0) or last (1) end of an open chain act on x, to which it is nearest of its own piece?"""
+    """Return True if the first (0) or last (1) end of an open chain acts on x, if it is its piece's nearest point."""
     body = body_of(at, x)
     count: Any = np.int64(table[body])
     place = body + 3 + len(x) * count + which * (1 + len(x))
@@ -175,17 +175,17 @@ def end_acts(table: Any, at: int, which: int, x: Vec) -> bool:
 
 @law
 def piece_chain(table: Any, at: int, j: int, x: Vec, gap: float, out: Vec) -> tuple[float, Vec, bool]:
-    """Return the distance to piece j, m, the unit normal there, and whether it acts by itself; see `piece_facing`."""
+    """Return the distance to piece j, m, the unit normal there, and whether the piece acts; see `piece_facing`."""
     return piece_facing(table, at, j, x, gap, out, like(gap, 1.0))
 
 
 @law
 def piece_facing(table: Any, at: int, j: int, x: Vec, gap: float, out: Vec, facing: float) -> tuple[float, Vec, bool]:
-    """Return the distance to piece j, m, the unit normal there, and whether it acts by itself.
+    """Return the distance to piece j, m, the unit normal there, and whether the piece acts.
 
-    A piece acts by the foot of the perpendicular on it; a corner, where it is nearest to all pieces that meet there,
-    once; of a polygon, the sides that face x. So a wall is the same however it is cut. gap, out: of the nearest place
-    of the whole chain, which is all that counts within a solid one. facing: 1 of solids, -1 of hollow ones.
+    A piece acts if the foot of the perpendicular lies on it; a corner acts once, if it is nearest to all pieces that
+    join there; of a polygon, only sides that face x act. So forces do not depend on how a wall is cut into pieces. gap,
+    out: distance and normal of the whole chain, used inside a solid polygon. facing: 1 if solid, -1 if hollow.
     """
     body = body_of(at, x)
     count: Any = np.int64(table[body])

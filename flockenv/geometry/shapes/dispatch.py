@@ -1,6 +1,6 @@
-"""The laws of whatever form a row has, for kernels that are compiled once and read it at run time.
+"""Dispatch to the laws of a row's form at run time, for kernels that are compiled once for all scenes.
 
-A scene's own kernel knows its forms when it is written, and calls their laws; this is for those that do not.
+The kernel of a scene knows its forms when it is generated, and calls their laws directly.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ __all__ = ["hit_shape", "nearest_shape"]
 
 @law
 def nearest_shape(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
-    """Return the distance to the surface, m (negative where it is solid), and the unit normal that leads out of it.
+    """Return the distance to the surface, m (negative in the solid), and the unit normal out of the solid.
 
-    x: relative to the anchor. Forms are counted as `table.FORMS` lists them.
+    x: relative to the anchor. Forms are numbered in the order of `table.FORMS`.
     """
     form = form_of(table, at, x)
     if form == 0:
@@ -51,7 +51,7 @@ def nearest_shape(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
 def hit_shape(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
     """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
 
-    From where it overlaps already it is 0.
+    0 if the body already overlaps it.
     """
     form = form_of(table, at, x)
     if form == 0:

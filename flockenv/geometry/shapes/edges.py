@@ -1,13 +1,13 @@
-"""How far a body must turn to pass a shape that is in its way: the edge of the silhouette, as it sees it.
+"""Silhouette edges: the angle by which a body must turn to pass a shape ahead of it.
 
-A law `edge_FORM(table, at, x, ray, side, room)` is about a ray that touches the shape: `x` is where the body is,
-relative to the anchor, `ray` where it goes and `side` across it, both unit vectors, `room` the body's radius and what
-it keeps clear. It returns by what angle (rad, 0 to 2 pi and more) the ray must be turned towards `side` until the body
-just passes the shape, and how far along the turned ray it is beside it then (m). Both are infinite if the shape has no
-edge there: a half-space is passed at infinity, a room never.
+A law `edge_FORM(table, at, x, ray, side, room)` applies to a ray that hits the shape: `x` is the position of the body
+relative to the anchor, `ray` its direction and `side` a direction across it, both unit vectors, `room` its radius plus
+clearance. It returns the angle (rad, 0 to 2 pi and more) by which the ray must turn towards `side` until the body just
+passes the shape, and the distance along the turned ray to the point of tangency (m). Both are infinite if the shape has
+no edge there: a half-space is passed at infinity, a room never.
 
-In space, turned rays lie in the plane of `ray` and `side`. Of a sphere the edge is exact; of a chain or block it is the
-shadow on that plane that is passed, which has no edge for a body that stands beside the shape and in its shadow.
+In 3-D, turned rays lie in the plane of `ray` and `side`. For a sphere the edge is exact; for a chain or block it is
+that of the projection onto that plane, which has no edge for a body beside the shape but inside its projection.
 Reynolds 1988, "Not Bumping Into Things".
 """
 
@@ -32,33 +32,33 @@ __all__ = [
 ]  # fmt: skip
 
 FAN = 24
-"""Rays to a side, over half a turn, by which the edge of a grid of distances is looked for."""
+"""Rays per side, over half a turn, that search for the edge of a distance field."""
 
 
 WIDER = 1 + 1e-5
-"""Factor of a circle that is only to rule out what is not near: single precision rounds."""
+"""Enlarges bounding circles used to reject distant shapes: a margin for rounding in single precision."""
 
 
 @law
 def _bearing(to: Vec, ray: Vec, side: Vec) -> float:
-    """Return by what angle `to` lies off the ray towards `side`, rad."""
+    """Return the angle from the ray to `to`, positive towards `side`, rad."""
     return atan2(dot(to, side), dot(to, ray))
 
 
 @law
 def _beside(to: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
-    """Return the angle between the middle of a disc of radius `room` and its tangent, rad, and how far that touches."""
+    """Return the angle between the centre of a disc of radius `room` and its tangent, rad, and the tangent's length."""
     along, across, o = dot(to, ray), dot(to, side), like(room, 0.0)
     square = along * along + across * across - room * room
     if len(to) == 3 and square <= o and dot(to, to) > room * room:
-        return like(room, np.inf), o  # in its shadow, but not in it
+        return like(room, np.inf), o  # inside its projection, but not inside the sphere
     reach = np.sqrt(square if square > o else o)
     return atan2(room, reach), reach
 
 
 @law
 def near_way(table: Any, at: int, x: Vec, ray: Vec, room: float, length: float) -> bool:
-    """Return whether a body on its way, `length` m along a ray, comes into the circle or sphere that a row lies in."""
+    """Return True if a body that moves `length` m along a ray intersects the bounding circle or sphere of a row."""
     middle, around = bound_of(table, at, x)
     to, o = sub(middle, x), like(room, 0.0)
     along = dot(to, ray)
@@ -70,16 +70,16 @@ def near_way(table: Any, at: int, x: Vec, ray: Vec, room: float, length: float) 
 
 @law
 def _disc_edge(to: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
-    """Return the edge of the shadow of a circle or sphere whose centre is at `to`, m; room: as of a sphere's edge."""
+    """Return the edge of the projection of a circle or sphere centred at `to`, m; room: as for `sphere_edge`."""
     half, reach = _beside(to, ray, side, room)
     return _bearing(to, ray, side) + half, reach
 
 
 @law
 def sphere_edge(to: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
-    """Return the edge of a circle or sphere whose centre is at `to`, m; room: both radii and what is kept clear.
+    """Return the edge of a circle or sphere centred at `to`, m; room: both radii plus clearance.
 
-    Of a sphere by the circle in which the plane of `ray` and `side` cuts it: tangents to both are equally long.
+    For a sphere, of the circle in which the plane of `ray` and `side` cuts it: tangents to both are equally long.
     """
     if len(to) == 2:
         return _disc_edge(to, ray, side, room)
@@ -91,9 +91,9 @@ def sphere_edge(to: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float
 
 @law
 def edge_chain(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
-    """Return the edge of a chain, followed from the piece that is touched; of a polygon, all around it.
+    """Return the edge of a chain, traced from the piece that is hit; all around a polygon.
 
-    Bearings are followed from vertex to vertex, so that they may go beyond half a turn: out of a pocket, too.
+    Bearings are accumulated from vertex to vertex, so that they may exceed half a turn, as out of a concave pocket.
     """
     body = body_of(at, x)
     count: Any = np.int64(table[body])
@@ -113,7 +113,7 @@ def edge_chain(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) ->
     for _ in range(left):
         k = (k + (1 if onward else count - 1)) % count
         to = sub(vertex(table, at, k, x), x)
-        # the angle between two vectors of the plane of `ray` and `side`, from their products in it
+        # the angle between two vectors projected onto the plane of `ray` and `side`
         p, q, r, s = dot(last, ray), dot(last, side), dot(to, ray), dot(to, side)
         bearing += atan2(p * s - q * r, p * r + q * s)
         half, far = _beside(to, ray, side, room)
@@ -124,7 +124,7 @@ def edge_chain(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) ->
 
 @law
 def _touched_piece(table: Any, at: int, x: Vec, ray: Vec, room: float) -> int:
-    """Return the piece of a chain that the ray touches first."""
+    """Return the piece of a chain that the ray hits first."""
     body = body_of(at, x)
     count: Any = np.int64(table[body])
     closed = table[body + 2] > like(room, 0.0)
@@ -138,7 +138,7 @@ def _touched_piece(table: Any, at: int, x: Vec, ray: Vec, room: float) -> int:
 
 @law
 def edge_block(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
-    """Return the edge of a block: of its corners the one that is farthest to that side."""
+    """Return the edge of a block: that of its corner farthest to the side."""
     y, h = turned(table, at, x), half_edges(table, at, x)
     ahead, across = turned(table, at, ray), turned(table, at, side)
     turn, reach = like(room, -np.inf), like(room, 0.0)
@@ -154,14 +154,14 @@ def edge_block(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) ->
 
 @law
 def edge_half_space(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
-    """Return the angle at which a ray is along the plane; it is passed at infinity."""
+    """Return the angle at which the ray is parallel to the plane, and inf: it is passed at infinity."""
     normal = vector_at(table, body_of(at, x), x)
     return atan2(-dot(normal, ray), dot(normal, side)), like(room, np.inf)
 
 
 @law
 def edge_hollow(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
-    """Return that a room has no edge: it is all around."""
+    """Return infinities: a room has no edge, as it is all around."""
     return like(room, np.inf), like(room, np.inf)
 
 
@@ -169,11 +169,11 @@ edge_hollow_chain = edge_hollow_block = edge_hollow
 
 
 def _edge_by_fan(hit: Any) -> Any:
-    """Return the law of an edge of what can only be asked how far a ray goes: `hit(table, at, x, ray, room)`."""
+    """Return the edge law of a form that has only a ray cast `hit(table, at, x, ray, room)`."""
 
     @law
     def edge(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
-        """Return the first of a fan of rays that goes twice as far as the one before it, or for ever."""
+        """Return the angle of the first ray of a fan that is twice as long as the last, and the length of the last."""
         turn, before = like(room, 0.0), hit(table, at, x, ray, room)
         step, two = like(room, np.pi / FAN), like(room, 2.0)
         for _ in range(FAN):
@@ -191,19 +191,19 @@ edge_distance_field = _edge_by_fan(hit_distance_field)
 edge_hollow_distance_field = _edge_by_fan(hit_hollow_distance_field)
 
 
-# --- in which directions edges are looked for in space ----------------------------------------------------------------
+# --- axes of shapes, which give the directions of edges in 3-D ------------------------------------------------------
 
 
 @law
 def spine_chain(table: Any, at: int, x: Vec, ray: Vec) -> Vec:
-    """Return the way from the first to the last vertex of a chain, m."""
+    """Return the vector from the first to the last vertex of a chain, m."""
     count: Any = np.int64(table[body_of(at, x)])
     return sub(vertex(table, at, count - 1, x), vertex(table, at, 0, x))
 
 
 @law
 def spine_block(table: Any, at: int, x: Vec, ray: Vec) -> Vec:
-    """Return the axis of a block that lies most across the ray."""
+    """Return the axis of a block that is most nearly perpendicular to the ray."""
     body, d = body_of(at, x), len(x)
     best, least = axis(x, 0), like(x[0], np.inf)
     for k in range(d):

@@ -1,7 +1,7 @@
-"""Any shape as distances on a grid (a signed distance field): between its points they are interpolated.
+"""Any shape as distances on a grid (a signed distance field), interpolated between its points.
 
 A field is a grid (see flockenv/maths/grid.py) relative to the anchor, whose points have 1 + D numbers: the distance to
-the surface (m, negative inside) and its direction, outward.
+the surface (m, negative inside) and its outward direction.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from flockenv.maths.vectors import add, axis, dot, norm, scale, select, sub, uni
 __all__ = ["STEPS", "hit_distance_field", "nearest_distance_field", "on_grid"]
 
 STEPS = 96
-"""Places that a ray is followed through before it counts as missed: it comes nearer by most of its distance each."""
+"""Most steps of ray marching before a ray counts as missed; each step covers most of the distance to the surface."""
 
 
 @law
 def _inside(grid: Any, x: float, d: int, k: int) -> float:
-    """Return x, or the edge of the grid that it is beyond, along axis k."""
+    """Return x clamped to the grid along axis k."""
     high = grid[k] + grid[d] * (grid[d + 1 + k] - like(x, 1.0))
     x = x if x > grid[k] else grid[k]
     return x if x < high else high
@@ -31,7 +31,7 @@ def _inside(grid: Any, x: float, d: int, k: int) -> float:
 
 @law
 def on_grid(grid: Any, x: Vec) -> Vec:
-    """Return the place of the grid that is nearest to x."""
+    """Return the point of the grid that is nearest to x."""
     if len(x) == 2:
         return (_inside(grid, x[0], 2, 0), _inside(grid, x[1], 2, 1))
     else:
@@ -42,7 +42,7 @@ def on_grid(grid: Any, x: Vec) -> Vec:
 def nearest_distance_field(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
     """Return the distance to the surface, m (negative inside), and the outward unit normal at its nearest point.
 
-    Outside the grid: the distance to the grid and the distance there, which is at least as far as it is.
+    Outside the grid: the distance to the grid plus the distance there, an upper bound.
     """
     grid = table[body_of(at, x) :]
     y = on_grid(grid, x)
@@ -56,8 +56,8 @@ def nearest_distance_field(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
 def hit_distance_field(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
     """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
 
-    From where it overlaps already it is 0. Followed step by step, each as long as the surface is far, to a hundredth of
-    the grid's spacing.
+    0 if the body already overlaps it. Ray marching: each step is 0.9 of the distance to the surface; accurate to a
+    hundredth of the grid's spacing.
     """
     grid = table[body_of(at, x) :]
     d = len(x)
@@ -70,7 +70,7 @@ def hit_distance_field(table: Any, at: int, x: Vec, direction: Vec, clearance: f
         y = on_grid(grid, spot)
         beyond = norm(sub(spot, y))
         here = sample(grid, y, 0)
-        # beyond the grid the surface is as far as the grid at least, and the body that comes nearer has a size
+        # outside the grid the surface is at least as far as the grid; clearance: the radius of the body
         here -= beyond
         room = (beyond if beyond > here else here) - clearance
         if (room < near) | (way > limit):

@@ -1,9 +1,9 @@
-"""Shapes turned inside out: free within, solid all around. Rooms, spheres and boxes that bodies stay in.
+"""Hollow shapes: free inside, solid outside. Rooms, spheres and boxes that bodies stay in.
 
-The rows are those of the solid shapes. Distances and normals are theirs with the other sign, and so as exact. A ray
-from within ends where a body of radius r touches the surface from inside: where its centre leaves all that is deeper
-than r within the solid. Of a circle, a sphere, a capsule or a block that is the same shape, smaller by r; of a polygon
-it is what is not within r of an edge: exact, all of them. A distance field is followed step by step.
+Rows are those of the solid shapes; distances and normals are theirs with the sign reversed. A ray from inside ends
+where a body of radius r touches the surface from inside: where its centre leaves the set of points deeper than r. For a
+circle, sphere, capsule or block that set is the same shape, smaller by r; for a polygon, the points inside not within r
+of an edge. All of these are exact; a distance field uses ray marching.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def nearest_hollow_distance_field(table: Any, at: int, x: Vec) -> tuple[float, V
 
 @law
 def _root(a: float, b: float, c: float) -> float:
-    """Return the larger t where a t^2 + 2 b t + c is 0, for a > 0; -inf if there is none. It does not cancel."""
+    """Return the larger root of a t^2 + 2 b t + c, for a > 0, without cancellation; -inf if there is none."""
     o = like(a, 0.0)
     square = b * b - a * c
     root = np.sqrt(square if square > o else o)
@@ -63,9 +63,9 @@ def _root(a: float, b: float, c: float) -> float:
 
 @law
 def _capsule_exit(x: Vec, direction: Vec, a: Vec, b: Vec, radius: float) -> float:
-    """Return where a ray from within leaves what is within `radius` of a segment.
+    """Return the distance at which a ray from inside leaves a segment inflated by `radius`.
 
-    The last place where it leaves the straight sides, or the circle or sphere around an end: all of these lie in it.
+    The largest of the distances at which it leaves the sides of the tube and the circle or sphere around each end.
     """
     o, e = like(radius, 0.0), like(radius, 1.0)
     along, m = sub(b, a), sub(x, a)
@@ -86,7 +86,7 @@ def _capsule_exit(x: Vec, direction: Vec, a: Vec, b: Vec, radius: float) -> floa
 def hit_hollow_chain(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
     """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
 
-    From where it overlaps already it is 0.
+    0 if the body already overlaps it.
     """
     body = body_of(at, x)
     count: Any = np.int64(table[body])
@@ -112,7 +112,7 @@ def hit_hollow_chain(table: Any, at: int, x: Vec, direction: Vec, clearance: flo
 
 @law
 def _leaves(y: float, d: float, h: float) -> float:
-    """Return where a ray leaves [-h, h] along one axis."""
+    """Return the distance at which a ray leaves [-h, h] along one axis."""
     o = like(h, 0.0)
     ends = h - y if d > o else -h - y
     return ends / d if d != o else like(h, np.inf)
@@ -122,7 +122,7 @@ def _leaves(y: float, d: float, h: float) -> float:
 def hit_hollow_block(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
     """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
 
-    From where it overlaps already it is 0.
+    0 if the body already overlaps it.
     """
     y, d, h = turned(table, at, x), turned(table, at, direction), half_edges(table, at, x)
     h0, h1 = h[0] - clearance, h[1] - clearance
@@ -141,7 +141,7 @@ def hit_hollow_block(table: Any, at: int, x: Vec, direction: Vec, clearance: flo
 def hit_hollow_distance_field(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
     """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
 
-    From where it overlaps already it is 0. Followed as the solid one is, to a hundredth of the grid's spacing.
+    0 if the body already overlaps it. Ray marching as for the solid one, accurate to a hundredth of the grid's spacing.
     """
     grid = table[body_of(at, x) :]
     d = len(x)
@@ -164,7 +164,7 @@ def hit_hollow_distance_field(table: Any, at: int, x: Vec, direction: Vec, clear
 
 @law
 def pieces_hollow_chain(table: Any, at: int, x: Vec, gap: float) -> int:
-    """Return how many pieces it is met in: the sides of a polygon from within, else one."""
+    """Return the number of pieces that act: the sides of a polygon from inside, else one."""
     body = body_of(at, x)
     o = like(gap, 0.0)
     return np.int64(table[body]) if (table[body + 2] > o) & (gap >= o) else 1  # type: ignore[return-value]
@@ -172,24 +172,24 @@ def pieces_hollow_chain(table: Any, at: int, x: Vec, gap: float) -> int:
 
 @law
 def piece_hollow_chain(table: Any, at: int, j: int, x: Vec, gap: float, out: Vec) -> tuple[float, Vec, bool]:
-    """Return the distance to side j of a room, m, the unit normal that leads into it, and whether it acts by itself."""
+    """Return the distance to side j of a room, m, the inward unit normal, and whether the side acts."""
     body = body_of(at, x)
     o = like(gap, 0.0)
     if (table[body + 2] > o) & (gap >= o):
-        # within it the chain's own distances are negative: 0 is not, and so all of its sides are met
+        # inside the room the chain's own distance is negative; passing 0 makes all of its sides act
         return piece_facing(table, at, j, x, o, out, like(gap, -1.0))
     return gap, out, True
 
 
 @law
 def pieces_hollow_block(table: Any, at: int, x: Vec, gap: float) -> int:
-    """Return how many faces it is met by: all from within, else one."""
+    """Return the number of faces that act: all from inside, else one."""
     return 2 * len(x) if gap >= like(gap, 0.0) else 1
 
 
 @law
 def piece_hollow_block(table: Any, at: int, j: int, x: Vec, gap: float, out: Vec) -> tuple[float, Vec, bool]:
-    """Return the distance to face j of a room, m, and the unit normal that leads into it; every face acts."""
+    """Return the distance to face j of a room, m, and the inward unit normal; every face acts."""
     o, e = like(gap, 0.0), like(gap, 1.0)
     y, h = turned(table, at, x), half_edges(table, at, x)
     k, sign = j // 2, e if j % 2 == 0 else -e

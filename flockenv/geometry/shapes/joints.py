@@ -1,7 +1,7 @@
-"""Where walls are joined: of an open chain, whether its ends are free, or lie on another wall.
+"""Joints of walls: whether the ends of an open chain are free, or lie on another wall.
 
-A law that meets walls piece by piece meets a corner once, however many pieces share it: it acts where it is nearest to
-all of them. Within a chain that follows from its vertices; ends that lie on other chains are found here.
+In a law that sums over the pieces of walls a corner acts once, however many pieces share it: where it is the nearest
+point of all of them. Within a chain this follows from its vertices; ends that lie on other chains are found here.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ __all__ = ["FREE", "NEVER", "SHARED", "joints"]
 Floats = NDArray[np.float64]
 
 FREE, SHARED, NEVER = 0.0, 1.0, 2.0
-"""Of an end: it acts where it is nearest; where it is nearest to another's piece too; another shape acts there."""
+"""Codes of an end. FREE: it acts if nearest; SHARED: if also nearest of the joined piece; NEVER: another shape acts."""
 
 NEAR = 1e-6
-"""m, that two walls may be apart and still be joined."""
+"""Largest distance, m, at which two walls count as joined."""
 
 
 def _lines(shape: Any) -> Floats | None:
-    """Return the pieces of a shape's outline, (M, 2, D) m, if it stands still and is made of straight ones."""
+    """Return the pieces of a shape's outline, (M, 2, D) m; None if it moves, is 3-D, or has no straight pieces."""
     if shape.moves or shape.laws not in ("chain", "block") or shape.dimension != 2:
         return None
     corners, around = shape.corners
@@ -39,15 +39,15 @@ def _lines(shape: Any) -> Floats | None:
 
 
 def _nearest(place: Floats, points: Floats, period: Floats | None) -> Floats:
-    """Return points less a place, by the shortest way."""
+    """Return the offsets from a place to points; period: minimum image."""
     way = points - place
     return way if period is None else way - period * np.round(way / period)
 
 
 def _touching(place: Floats, pieces: Floats, period: Floats | None) -> tuple[bool, Floats | None]:
-    """Return whether a place lies within one of the pieces, and the way along the one that it is an end of."""
+    """Return whether a place lies inside a piece, and the direction of the piece that it is an end of, if any."""
     along = pieces[:, 1] - pieces[:, 0]
-    first = _nearest(place, pieces.mean(axis=1), period) - along / 2  # of the image whose middle is nearest
+    first = _nearest(place, pieces.mean(axis=1), period) - along / 2  # offset to the image whose middle is nearest
     square = (along**2).sum(axis=1)
     share = np.clip(-(first * along).sum(axis=1) / np.where(square > 0, square, 1.0), 0.0, 1.0)
     off = np.linalg.norm(first + share[:, None] * along, axis=1)
@@ -63,7 +63,7 @@ def _touching(place: Floats, pieces: Floats, period: Floats | None) -> tuple[boo
 
 
 class _Outlines:
-    """The pieces of the outlines of all shapes, and the boxes that they lie in, so that few are looked at."""
+    """The pieces of the outlines of all shapes, and their bounding boxes, so that few have to be tested."""
 
     def __init__(self, shapes: Sequence[Any], period: Floats | None) -> None:
         self.period, self.pieces = period, [_lines(shape) for shape in shapes]
@@ -74,13 +74,13 @@ class _Outlines:
         self.middle, self.half = (low + high) / 2, (high - low) / 2 + 2 * NEAR
 
     def near(self, place: Floats) -> list[tuple[int, Floats]]:
-        """Return the shapes that a place may lie on, in order, and their pieces."""
+        """Return the shapes (index, pieces) whose box contains a place, in order."""
         within = (np.abs(_nearest(place, self.middle, self.period)) <= self.half).all(axis=1)
         found = [self.straight[k] for k in np.flatnonzero(within)]
         return [(k, pieces) for k in found if (pieces := self.pieces[k]) is not None]
 
     def end(self, place: Floats, own: int, skip: int) -> list[float]:
-        """Return what an end of chain `own` is, and the way along the piece that shares it; `skip`: its own piece."""
+        """Return the code of an end of chain `own`, and the direction of the piece sharing it; skip: its own piece."""
         code, way = FREE, np.zeros(len(place))
         for k, others in self.near(place):
             rest = np.delete(others, skip, axis=0) if k == own else others
@@ -93,9 +93,9 @@ class _Outlines:
 
 
 def joints(shapes: Sequence[Any], chains: Sequence[int], period: Floats | None = None) -> dict[int, list[float]]:
-    """Return what the first and the last end of the open `chains` among the shapes are: a code, and a way (D), each.
+    """Return, for each open chain of `chains` (indices), a code and a direction (D) for its first and its last end.
 
-    period: the edges of a torus, m. Of two chains that share an end the one that is listed first has it.
+    period: the edges of a torus, m. If two chains share an end, it belongs to the one that is listed first.
     """
     outlines, found = _Outlines(shapes, period), {}
     for k in chains:

@@ -1,4 +1,4 @@
-"""Shapes as polygons of the plane, for pictures, and what only needs their vertices. numpy, no laws."""
+"""Shapes as 2-D polygons, for pictures, and computations on their vertices. numpy, no laws."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ __all__ = ["area", "around", "band", "behind", "crossing", "distinct", "hull", "
 
 Floats = NDArray[np.float64]
 ROUND = 48
-"""Corners of a circle in a picture."""
+"""Corners of a circle in pictures."""
 
 SHORTEST = 1e-6
-"""Of a line's size: a piece that is shorter has no direction in single precision."""
+"""Fraction of a polyline's size: a shorter piece has no accurate direction in single precision."""
 
 
 def area(vertices: Floats) -> float:
@@ -27,7 +27,7 @@ def area(vertices: Floats) -> float:
 
 
 def distinct(vertices: Floats) -> Floats:
-    """Return the vertices (n, D) of a line without those that lie where the one before lies."""
+    """Return the vertices (n, D) of a polyline without those that coincide with the one before."""
     shortest = SHORTEST * float(np.linalg.norm(np.ptp(vertices, axis=0)))
     kept = [0]
     for k in range(1, len(vertices)):
@@ -37,7 +37,7 @@ def distinct(vertices: Floats) -> Floats:
 
 
 def crossing(vertices: Floats) -> tuple[int, int] | None:
-    """Return two edges of a closed polygon (n, 2) that cross, touch or overlap, each by its first vertex; or none."""
+    """Return two edges of a polygon (n, 2) that cross, touch or overlap, each by its first vertex; None if none do."""
     n = len(vertices)
     a, b = vertices, np.roll(vertices, -1, axis=0)
     for i in range(n):
@@ -59,7 +59,7 @@ def crossing(vertices: Floats) -> tuple[int, int] | None:
 
 
 def _turn(a: Floats, b: Floats, c: Floats) -> Floats:
-    """Return on which side of the lines from a to b points c lie."""
+    """Return on which side of the lines from a to b the points c lie: positive on the left."""
     return np.asarray(
         (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1]) - (b[..., 1] - a[..., 1]) * (c[..., 0] - a[..., 0])
     )
@@ -83,7 +83,7 @@ def hull(points: Floats) -> Floats:
 
 
 def width(polygon: Floats) -> float:
-    """Return the least distance of two parallel lines with a convex polygon (n, 2) between them, m; 0 of others."""
+    """Return the width of a convex polygon (n, 2), m: the least distance of parallel lines around it; 0 if concave."""
     edges = np.roll(polygon, -1, axis=0) - polygon
     after = np.roll(edges, -1, axis=0)
     turns = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
@@ -95,11 +95,11 @@ def width(polygon: Floats) -> float:
 
 
 def around(points: Floats, radius: float) -> Floats:
-    """Return all that is within `radius` of the convex hull of one or two points (n, 2), as a polygon."""
+    """Return the convex hull of one or two points (n, 2), inflated by `radius`, as a polygon."""
     return _around(tuple(map(tuple, points.tolist())), radius).copy()
 
 
-@functools.lru_cache(maxsize=1024)  # a film asks for the same walls in every picture
+@functools.lru_cache(maxsize=1024)  # an animation draws the same walls in every frame
 def _around(places: tuple[tuple[float, ...], ...], radius: float) -> Floats:
     points = np.array(places)
     turn = np.linspace(0, 2 * np.pi, ROUND, endpoint=False)
@@ -108,18 +108,18 @@ def _around(places: tuple[tuple[float, ...], ...], radius: float) -> Floats:
 
 
 def band(vertices: Floats, width: float) -> Floats:
-    """Return a strip along the outside of a closed polygon (n, 2), as one polygon: around it, and back."""
+    """Return a strip along the outside of a closed polygon (n, 2), as one polygon: around it and back."""
     inner = vertices if area(vertices) > 0 else vertices[::-1]
     along = np.roll(inner, -1, axis=0) - inner
     out = np.stack([along[:, 1], -along[:, 0]], axis=1) / np.hypot(*along.T)[:, None]
     both = out + np.roll(out, 1, axis=0)
-    # where two edges meet the strip is a mitre, but for corners so sharp that it would become a spike
+    # corners are mitred, with a limit, as sharp ones would become spikes
     outer = inner + width * both / np.maximum((both**2).sum(axis=1, keepdims=True) / 2, 0.5)
     return np.concatenate([outer, outer[:1], inner[:1], inner[::-1]])
 
 
 def behind(point: Floats, direction: Floats, low: Floats, high: Floats) -> list[Floats]:
-    """Return what of a region lies behind a line, as a polygon; nothing if the direction is 0 (a floor)."""
+    """Return the part of a region behind a line, as a polygon; nothing if the direction is 0 (a floor)."""
     if not direction.any():
         return []
     box = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
@@ -135,7 +135,7 @@ def behind(point: Floats, direction: Floats, low: Floats, high: Floats) -> list[
 
 
 def strips(distances: Floats, low: Sequence[float], spacing: float) -> list[Floats]:
-    """Return rectangles that cover where a grid of distances (nx, ny) is negative."""
+    """Return rectangles that cover the points of a grid of distances (nx, ny) that are negative."""
     found = []
     for i, column in enumerate(distances < 0):
         edges = np.flatnonzero(np.diff(np.concatenate([[False], column, [False]]).astype(int)))

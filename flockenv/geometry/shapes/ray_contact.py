@@ -1,4 +1,4 @@
-"""Where a body that goes along a ray touches a shape first, whatever shape it is."""
+"""The first contact of a body that moves along a ray with a shape of any form."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ __all__ = ["touched_offset", "touched_spot"]
 
 @law
 def touched_spot(y: Vec, ray: Vec, hit: float, room: float) -> Vec:
-    """Return the place of the body's centre where it touches; where it is if it never does.
+    """Return the position of the body's centre at contact; its current position if there is none.
 
-    A body without size is there just before: on the very surface a normal is a matter of rounding.
+    A point-like body stops just before contact: exactly on the surface the normal depends on rounding.
     """
     o = like(hit, 0.0)
     way = hit if hit < like(hit, np.inf) else o
@@ -24,10 +24,10 @@ def touched_spot(y: Vec, ray: Vec, hit: float, room: float) -> Vec:
 
 @law
 def touched_offset(ray: Vec, hit: float, normal: Vec, room: float, gap: float) -> Vec:
-    """Return the way to the point that is touched: where the body stops, and from there its own radius `room` inward.
+    """Return the offset to the point of contact: to where the body stops, and from there its radius `room` inward.
 
-    Of a body that overlaps already it is the nearest point of the surface; of one whose centre is inside, a point as
-    far inward: from there, too, the way out is away from it.
+    For a body that already overlaps it is the nearest point of the surface; for one whose centre is inside, a point
+    equally deep on the inner side, so that the direction away from it leads out.
     """
     o = like(hit, 0.0)
     depth = gap if gap > o else (-gap if gap < o else like(hit, 1e-6))

@@ -1,8 +1,8 @@
-"""Obstacles as records: each answers for itself how far its surface is, which way is out, where a ray hits.
+"""Obstacles as records, with methods for the distance to the surface, its normal, and ray casts.
 
 Polygon(vertices=((0, 0), (4, 0), (4, 3))).gap([5.0, 1.0])
 
-Where one moves, it answers for the place that its fields say; `shift` tells how far it is from there at a time.
+The methods of a moving obstacle apply to the position given by its fields; `shift` returns its displacement at a time.
 """
 
 from __future__ import annotations
@@ -32,33 +32,33 @@ Point = Annotated[tuple[float, ...], Field(min_length=2, max_length=3)]
 
 
 class Sway(Record):
-    """To and fro: amplitude sin(2 pi t / period + phase) beside whatever else moves it."""
+    """Oscillation: amplitude sin(2 pi t / period + phase), added to any other motion."""
 
-    amplitude: Point = Field(description="m, how far from the middle, and in which direction")
-    period: float = Field(gt=0, description="s, there and back")
-    phase: float = Field(default=0.0, description="rad, where it is at time 0")
+    amplitude: Point = Field(description="m, greatest displacement, a vector")
+    period: float = Field(gt=0, description="s, of one oscillation")
+    phase: float = Field(default=0.0, description="rad, at time 0")
 
 
 class Bound(NamedTuple):
-    """What a shape lies within where its fields say; all infinite but the centre if it has no end."""
+    """Bounds of a shape at the position given by its fields; all infinite but the centre if it is unbounded."""
 
-    centre: Floats  # (D,) m, the middle of the box
-    half: Floats  # (D,) m, half the edges of the box along the axes
-    radius: float  # m, of a circle or sphere around the centre
+    centre: Floats  # (D,) m, of the bounding box
+    half: Floats  # (D,) m, half the edges of the axis-aligned box
+    radius: float  # m, of the bounding circle or sphere around the centre
 
 
 class Shape(Record):
-    """Something solid: what every obstacle answers. Points are (..., D) arrays in m."""
+    """Base class of obstacles. Points are (..., D) arrays in m."""
 
     kind: str
-    velocity: Point | None = Field(default=None, description="m/s, how it moves from time 0 on; none = it does not")
-    sway: Sway | None = Field(default=None, description="how it goes to and fro; none = it does not")
+    velocity: Point | None = Field(default=None, description="m/s, constant from time 0 on (default: it does not move)")
+    sway: Sway | None = Field(default=None, description="oscillation (default: none)")
     laws: ClassVar[str] = "chain"
-    """By which laws it is met while it is solid; see shapes/table.py."""
+    """Name of its laws while it is solid; see shapes/table.py."""
 
     @model_validator(mode="after")
     def _moves_in_its_dimension(self) -> Self:
-        """Refuse a motion in another dimension."""
+        """Raise ValueError if a motion has another dimension."""
         swaying = self.sway.amplitude if self.sway else None
         for name, value in (("velocity", self.velocity), ("sway.amplitude", swaying)):
             if value is not None and len(value) != self.dimension:
@@ -67,12 +67,12 @@ class Shape(Record):
 
     @property
     def is_hollow(self) -> bool:
-        """Is it free within and solid all around?"""
+        """True if the shape is free inside and solid outside."""
         return False
 
     @property
     def thickness(self) -> float:
-        """How thick it is where it is thinnest, m, or less: 0 of a line, and where nobody knows."""
+        """Lower bound of its least thickness, m: 0 for a line or if unknown."""
         return math.inf if self.is_hollow else self._thickness
 
     @property
@@ -81,44 +81,44 @@ class Shape(Record):
 
     @property
     def form(self) -> str:
-        """By which laws it is met; see shapes/table.py."""
+        """Name of its laws; see shapes/table.py."""
         return f"hollow_{self.laws}" if self.is_hollow else self.laws
 
     @property
     def in_state(self) -> bool:
-        """Is it a circle or sphere that a state has a place for? Every other shape is the same in all worlds."""
+        """True if it is a circle or sphere kept in the state; every other shape is the same in all worlds."""
         return False
 
     @property
     def moves(self) -> bool:
-        """Is it ever somewhere else?"""
+        """True if it has a velocity or a sway."""
         return any(self.velocity or ()) or (self.sway is not None and any(self.sway.amplitude))
 
     @property
     def motion(self) -> list[float]:
-        """Its velocity (D), the amplitude of its sway (D), 2 pi / period and phase: what laws read of how it moves."""
+        """Its motion, as laws read it: velocity (D), amplitude of its sway (D), 2 pi / period, phase."""
         still = (0.0,) * self.dimension
         sway = (*self.sway.amplitude, math.tau / self.sway.period, self.sway.phase) if self.sway else (*still, 0.0, 0.0)
         return [*(self.velocity or still), *sway]
 
     def shift(self, time: float) -> Floats:
-        """Return how far it is at a time, s, from where its fields say, (D,) m: v t + a sin(2 pi t / T + phase)."""
+        """Return its displacement at a time, s, (D,) m: v t + a sin(2 pi t / T + phase)."""
         d, motion = self.dimension, np.array(self.motion)
         return np.asarray(motion[:d] * time + motion[d:-2] * math.sin(motion[-2] * time + motion[-1]))
 
     @property
     def dimension(self) -> int:
-        """In how many dimensions it lies."""
+        """Number of dimensions."""
         return len(self.anchor)
 
     @functools.cached_property
     def table(self) -> Floats:
-        """It alone, as laws read it."""
+        """A table of this shape alone, as laws read it."""
         return table.packed([self], self.dimension)[0]
 
     @functools.cached_property
     def bound(self) -> Bound:
-        """What it lies within; without an end if it is hollow: then all around is solid."""
+        """Its bounds; infinite if it is hollow, as the solid is outside."""
         extremes, (corners, around) = self.extremes, self.corners
         if self.is_hollow or not len(extremes):
             return Bound(np.array(self.anchor), np.full(self.dimension, np.inf), math.inf)
@@ -128,60 +128,61 @@ class Shape(Record):
 
     @property
     def corners(self) -> tuple[Floats, float]:
-        """Places (n, D) m, and how far around them it reaches, m: its hull is that of these circles; of some none."""
+        """Points (n, D) m and a radius, m: its hull is that of circles of this radius there; some shapes have none."""
         return np.zeros((0, self.dimension)), 0.0
 
     @property
     @abstractmethod
     def anchor(self) -> tuple[float, ...]:
-        """The place that the rest is relative to, m."""
+        """The point that laws take positions relative to, m."""
 
     @property
     @abstractmethod
     def extremes(self) -> Floats:
-        """Places that everything of it lies between, (n, D) m; none if it has no end."""
+        """Points (n, D) m whose bounding box contains it; none if it is unbounded."""
 
     @abstractmethod
     def row(self, dimension: int) -> Sequence[float] | Floats:
-        """Return the numbers that its laws read, behind the head."""
+        """Return the numbers that its laws read, after the row header."""
 
     @abstractmethod
     def polygons(self, low: Floats, high: Floats) -> list[Floats]:
-        """Return the polygons, each (n, 2) m, that show its solid from above in a region."""
+        """Return the polygons, each (n, 2) m, of its solid in a region, as seen from above."""
 
     def outline(self, low: Floats, high: Floats) -> list[Floats]:
-        """Return the polygons, each (n, 2) m, that show it from above in a region: of a hollow one, its edge alone."""
+        """Return the polygons, each (n, 2) m, that show it from above in a region; only its edge if it is hollow."""
         whole = self.polygons(low, high)
         return [outlines.band(each, 0.004 * float((high - low).max())) for each in whole] if self.is_hollow else whole
 
     def gap(self, points: ArrayLike) -> Floats:
-        """Return how far its surface is, (...) m; negative inside."""
+        """Return the distance to its surface, (...) m; negative inside."""
         return nearest(self, points)[0]
 
     def normal(self, points: ArrayLike) -> Floats:
-        """Return which way is out at the nearest place of its surface, (..., D) unit vectors."""
+        """Return the outward unit normal at the nearest point of its surface, (..., D)."""
         return nearest(self, points)[1]
 
     def nearest(self, points: ArrayLike) -> Floats:
-        """Return the nearest place of its surface, (..., D) m."""
+        """Return the nearest point of its surface, (..., D) m."""
         gap, normal = nearest(self, points)
         return np.asarray(points, float) - gap[..., None] * normal
 
     def inside(self, points: ArrayLike) -> np.ndarray[Any, np.dtype[np.bool_]]:
-        """Return whether points lie in it, (...)."""
+        """Return True for points inside it, (...)."""
         return np.asarray(self.gap(points) < 0)
 
     def hit(self, points: ArrayLike, directions: ArrayLike, clearance: ArrayLike = 0.0) -> Floats:
         """Return how far along unit directions a body of radius `clearance` touches it, (...) m; inf if it never does.
 
-        Exactly, whatever the angle: where a ray hits the shape that is inflated by the body's radius.
+        Exact at every angle: the ray is cast at the shape inflated by the body's radius.
         """
         return hits(self, points, directions, clearance)
 
     def silhouette(self, point: ArrayLike, clearance: float = 0.0) -> tuple[Floats, Floats]:
-        """Return the left and right ends of its outline as seen from a point of the plane outside, m.
+        """Return the left and right ends of its silhouette as seen from a point outside, m; 2-D only.
 
-        Of the shape inflated by `clearance`: whoever aims there passes (Reynolds 1987). ValueError where it has none.
+        Of the shape inflated by `clearance`: a body that aims there passes it (Reynolds 1987). Raises ValueError if
+        there are no ends.
         """
         return outlines.silhouette(self, np.asarray(point, float), clearance)
 
@@ -189,11 +190,11 @@ class Shape(Record):
 class Closed(Shape):
     """A shape with an inside, which may be solid or free."""
 
-    hollow: bool = Field(default=False, description="is it free within, and solid all around? Bodies stay inside")
+    hollow: bool = Field(default=False, description="free inside and solid outside; bodies stay inside")
 
     @property
     def is_hollow(self) -> bool:
-        """Is it free within and solid all around?"""
+        """True if the shape is free inside and solid outside."""
         return self.hollow
 
 
@@ -206,7 +207,7 @@ class Circle(Closed):
 
     @property
     def in_state(self) -> bool:
-        """If it stands still and is solid."""
+        """True if it is solid and does not move."""
         return not (self.moves or self.hollow)
 
     @property
@@ -225,20 +226,20 @@ class Circle(Closed):
 
     @property
     def extremes(self) -> Floats:
-        """Its corners, as a box."""
+        """Two opposite corners of its box."""
         return np.array(self.centre) + self.radius * np.array([[-1.0], [1.0]])
 
     def row(self, dimension: int) -> Sequence[float]:
-        """A chain of one vertex."""
+        """Return a chain of one vertex."""
         return [1.0, self.radius, 0.0] + [0.0] * dimension
 
     def polygons(self, low: Floats, high: Floats) -> list[Floats]:
-        """A circle."""
+        """Return a circle."""
         return [outlines.around(np.array([self.centre[:2]]), self.radius)]
 
 
 class Wall(Shape):
-    """A line through some points, `radius` thick on each side: walls, and in 3-D tubes.
+    """A polyline, `radius` thick on each side: walls, and in 3-D tubes.
 
     Pieces of length 0 (a vertex given twice) add nothing.
     """
@@ -254,7 +255,7 @@ class Wall(Shape):
 
     @property
     def dimension(self) -> int:
-        """As many as its first vertex has numbers."""
+        """Number of coordinates of its first vertex."""
         return len(self.vertices[0])
 
     @property
@@ -263,26 +264,26 @@ class Wall(Shape):
 
     @property
     def anchor(self) -> tuple[float, ...]:
-        """The middle of its box."""
+        """The centre of its box."""
         return _middle(self.vertices)
 
     @property
     def corners(self) -> tuple[Floats, float]:
-        """Its vertices, each once, and half its thickness."""
+        """Its vertices without repetitions, and half its thickness."""
         return outlines.distinct(np.array(self.vertices)), self.radius
 
     @property
     def extremes(self) -> Floats:
-        """Its vertices, with their thickness."""
+        """The corners of boxes around its vertices, of its thickness."""
         return _fattened(self.vertices, self.radius)
 
     def row(self, dimension: int) -> Sequence[float]:
-        """An open chain."""
+        """Return an open chain."""
         around = self.corners[0] - self.anchor
         return [float(len(around)), self.radius, 0.0, *around.ravel().tolist()]
 
     def polygons(self, low: Floats, high: Floats) -> list[Floats]:
-        """A capsule around each part."""
+        """Return a capsule around each piece."""
         flat = np.array(self.vertices)[:, :2]
         radius = max(self.radius, 0.002 * float((high - low).max()))
         return [outlines.around(flat[k : k + 2], radius) for k in range(len(flat) - 1)]
@@ -310,7 +311,7 @@ class Capsule(Closed):
 
     @property
     def dimension(self) -> int:
-        """As many as its start has numbers."""
+        """Number of coordinates of its start."""
         return len(self.start)
 
     @property
@@ -329,38 +330,38 @@ class Capsule(Closed):
 
     @property
     def extremes(self) -> Floats:
-        """Its ends, with their thickness."""
+        """The corners of boxes around its ends, of its thickness."""
         return self._wall.extremes
 
     def row(self, dimension: int) -> Sequence[float]:
-        """A chain of two vertices."""
+        """Return a chain of two vertices."""
         return self._wall.row(dimension)
 
     def polygons(self, low: Floats, high: Floats) -> list[Floats]:
-        """A capsule."""
+        """Return a capsule."""
         return self._wall.polygons(low, high)
 
 
 class Polygon(Closed):
-    """A solid of the plane, convex or concave; its edges do not cross.
+    """A 2-D polygon, convex or concave; its edges do not cross.
 
     A ring that repeats its first vertex at the end (GeoJSON, WKT, shapely's `exterior.coords`) is the same polygon.
     """
 
     kind: Literal["polygon"] = "polygon"
     vertices: tuple[Annotated[tuple[float, ...], Field(min_length=2, max_length=2)], ...] = Field(
-        min_length=3, max_length=1024, description="m, in either sense"
+        min_length=3, max_length=1024, description="m, in either orientation"
     )
 
     @field_validator("vertices")
     @classmethod
     def _opened(cls, vertices: tuple[Point, ...]) -> tuple[Point, ...]:
-        """Leave out the last vertex of a closed ring."""
+        """Return the vertices without the last one of a closed ring."""
         return vertices[:-1] if len(vertices) > 3 and vertices[0] == vertices[-1] else vertices
 
     @model_validator(mode="after")
     def _simple(self) -> Polygon:
-        """Refuse a vertex given twice, edges that cross or touch, and what has no area."""
+        """Raise ValueError if a vertex is given twice, edges cross or touch, or the area is 0."""
         first: dict[Point, int] = {}
         for k, vertex in enumerate(self.vertices):
             if first.setdefault(vertex, k) != k:
@@ -378,7 +379,7 @@ class Polygon(Closed):
 
     @property
     def anchor(self) -> tuple[float, ...]:
-        """The middle of its box."""
+        """The centre of its box."""
         return _middle(self.vertices)
 
     @property
@@ -392,18 +393,18 @@ class Polygon(Closed):
         return np.array(self.vertices)
 
     def row(self, dimension: int) -> Sequence[float]:
-        """A closed chain, counter-clockwise: the right of an edge is outside."""
+        """Return a closed chain, counter-clockwise: the right of an edge is outside."""
         around = np.array(self.vertices) - self.anchor
         around = around if outlines.area(around) > 0 else around[::-1]
         return [float(len(around)), 0.0, 1.0, *around.ravel().tolist()]
 
     def polygons(self, low: Floats, high: Floats) -> list[Floats]:
-        """Itself."""
+        """Return the polygon itself."""
         return [np.array(self.vertices)]
 
 
 class Block(Closed):
-    """A rectangle, or in 3-D a box, along the axes or turned."""
+    """A rectangle, or in 3-D a box, of any orientation."""
 
     kind: Literal["block"] = "block"
     laws: ClassVar[str] = "block"
@@ -413,7 +414,7 @@ class Block(Closed):
     )
     turn: float = Field(default=0.0, description="degrees, counter-clockwise; in 3-D about `axis`")
     axis: Annotated[tuple[float, ...], Field(min_length=3, max_length=3)] = Field(
-        default=(0.0, 0.0, 1.0), description="what a block in 3-D is turned about"
+        default=(0.0, 0.0, 1.0), description="axis of rotation of a block in 3-D"
     )
 
     @model_validator(mode="after")
@@ -437,7 +438,7 @@ class Block(Closed):
 
     @property
     def axes(self) -> Floats:
-        """Its own axes, (D, D) unit vectors, a row each (Rodrigues' rotation)."""
+        """Its axes as unit vectors, the rows of (D, D) (Rodrigues' rotation)."""
         x, y, z = np.array(self.axis) / math.hypot(*self.axis)
         angle, across = math.radians(self.turn), np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         full = np.eye(3) + math.sin(angle) * across + (1 - math.cos(angle)) * across @ across
@@ -446,7 +447,7 @@ class Block(Closed):
 
     @property
     def corners(self) -> tuple[Floats, float]:
-        """The same as its extremes."""
+        """Its corners, and 0."""
         return self.extremes, 0.0
 
     @property
@@ -457,21 +458,21 @@ class Block(Closed):
         return np.asarray(np.array(self.centre) + (signs * self.size) @ self.axes)
 
     def row(self, dimension: int) -> Sequence[float]:
-        """Half edges and axes."""
+        """Return half edges and axes."""
         return [*(0.5 * edge for edge in self.size), *self.axes.ravel().tolist()]
 
     def polygons(self, low: Floats, high: Floats) -> list[Floats]:
-        """Its corners as seen from above."""
+        """Return the convex hull of its corners as seen from above."""
         return [outlines.hull(self.extremes[:, :2])]
 
 
 class HalfSpace(Shape):
-    """All that lies behind a line, or in 3-D a plane."""
+    """The half-space behind a line, or in 3-D a plane."""
 
     kind: Literal["half_space"] = "half_space"
     laws: ClassVar[str] = "half_space"
-    point: Point = Field(description="m, any place of its surface")
-    direction: Point = Field(description="out of it, of any length")
+    point: Point = Field(description="m, any point of its surface")
+    direction: Point = Field(description="outward normal, of any length")
 
     @model_validator(mode="after")
     def _points_somewhere(self) -> HalfSpace:
@@ -492,33 +493,33 @@ class HalfSpace(Shape):
 
     @property
     def extremes(self) -> Floats:
-        """It has no end."""
+        """None: it is unbounded."""
         return np.zeros((0, len(self.point)))
 
     def row(self, dimension: int) -> Sequence[float]:
-        """The unit normal."""
+        """Return the unit normal."""
         return (np.array(self.direction) / math.hypot(*self.direction)).tolist()  # type: ignore[no-any-return]
 
     def polygons(self, low: Floats, high: Floats) -> list[Floats]:
-        """What of the region lies behind it; nothing of a floor."""
+        """Return the part of the region behind it; nothing if it is a floor."""
         return outlines.behind(np.array(self.point[:2]), np.array(self.direction[:2]), low, high)
 
 
 class DistanceField(Closed):
-    """Distances on a grid: of other shapes, or any that are given as an array (negative inside)."""
+    """Signed distances on a grid, of other shapes or given as an array (negative inside)."""
 
     kind: Literal["distance_field"] = "distance_field"
     laws: ClassVar[str] = "distance_field"
     low: Point = Field(description="m, the lowest corner of the grid")
-    high: Point | None = Field(default=None, description="m, its highest corner; goes with shapes")
-    spacing: float = Field(gt=0, description="m, between points of the grid")
-    shapes: tuple[Any, ...] = Field(default=(), description="what it is made of; together they are one")
+    high: Point | None = Field(default=None, description="m, the highest corner of the grid; only with shapes")
+    spacing: float = Field(gt=0, description="m, distance of grid points")
+    shapes: tuple[Any, ...] = Field(default=(), description="shapes whose union it is")
     values: tuple[Any, ...] | None = Field(default=None, description="m, nested lists (nx, ny[, nz]) of distances")
 
     @model_validator(mode="before")
     @classmethod
     def _read(cls, data: Any) -> Any:
-        """Read shapes as obstacles of a scene are read."""
+        """Return the data with its shapes read like obstacles of a scene."""
         if not isinstance(data, Mapping):
             return data
         made = dict(data)
@@ -552,7 +553,7 @@ class DistanceField(Closed):
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """How many points it has along each axis."""
+        """Number of grid points along each axis."""
         if self.values is not None:
             return np.shape(np.array(self.values, float))
         assert self.high is not None
@@ -561,7 +562,7 @@ class DistanceField(Closed):
 
     @functools.cached_property
     def distances(self) -> Floats:
-        """The distance at each point, (nx, ny[, nz]) m."""
+        """The distance at each grid point, (nx, ny[, nz]) m."""
         if self.values is not None:
             return np.array(self.values, float)
         points = points_of(self.low, self.spacing, self.counts)
@@ -574,12 +575,12 @@ class DistanceField(Closed):
 
     @property
     def extremes(self) -> Floats:
-        """The corners of its grid."""
+        """Lower and upper corner of its grid."""
         return np.array([self.low, np.array(self.low) + self.spacing * (np.array(self.counts) - 1)])
 
     @functools.cached_property
     def bound(self) -> Bound:
-        """The box of its grid, and as far around it as what is solid there may go on."""
+        """The box of its grid, enlarged by its greatest depth there, as the solid may extend beyond the grid."""
         if self.hollow:
             return super().bound
         low, high = self.extremes
@@ -595,15 +596,15 @@ class DistanceField(Closed):
         return packed(numbers, (0.0,) * len(self.low), self.spacing)
 
     def row(self, dimension: int) -> Floats:
-        """Its grid: distances and unit gradients."""
+        """Return its grid: distances and unit gradients."""
         return self._grid
 
     def polygons(self, low: Floats, high: Floats) -> list[Floats]:
-        """Strips of the grid that lie in it; in 3-D, of what lies below or above."""
+        """Return strips of grid cells inside it; in 3-D, of its projection from above."""
         return outlines.strips(self._from_above, self.low[:2], self.spacing)
 
     def outline(self, low: Floats, high: Floats) -> list[Floats]:
-        """The same, or of a hollow one what lies at its edge."""
+        """Return its polygons; if it is hollow, strips along its surface."""
         edge = np.abs(self._from_above) - self.spacing / 2
         return outlines.strips(edge, self.low[:2], self.spacing) if self.hollow else self.polygons(low, high)
 
@@ -636,11 +637,11 @@ SHAPES: dict[str, type[Shape]] = {
     str(shape.model_fields["kind"].default): shape
     for shape in (Circle, Capsule, Wall, Polygon, Block, HalfSpace, DistanceField)
 }
-"""Every shape by its kind."""
+"""Shape classes by kind."""
 
 
 def _round_by_default(value: Any, handler: Any) -> Any:
-    """Take a block without a kind for a circle."""
+    """Validate a shape; one without a kind is a circle."""
     if isinstance(value, Mapping) and "kind" not in value:
         value = {"kind": "circle", **value}
     return keep(Shape)(value, handler)
@@ -656,7 +657,7 @@ else:
 
 
 def shape_of(data: Any) -> Shape:
-    """Return a shape, given as itself or as a block of a file; ValueError if it is none."""
+    """Return a shape, given as a record or as a mapping read from a file; raise ValueError if it is neither."""
     if isinstance(data, Shape):
         return data
     kind = data.get("kind", "circle") if isinstance(data, Mapping) else None
@@ -667,9 +668,9 @@ def shape_of(data: Any) -> Shape:
 
 
 def clear_of(shapes: Sequence[Shape], points: Floats, period: Floats, time: float = 0.0) -> Floats:
-    """Return the distance of points (N, D) to the nearest of some shapes, (N,) m; inf if there is none.
+    """Return the distance of points (N, D) to the nearest of some shapes, (N,) m; inf if there are none.
 
-    period: of each axis, (D,) m; 0 where the world does not repeat. time: s, when.
+    period: of each axis, (D,) m; 0 if the axis is not periodic. time: s, of moving shapes.
     """
     best = np.full(len(points), np.inf)
     for shape in shapes:

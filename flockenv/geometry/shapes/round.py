@@ -1,6 +1,6 @@
-"""Circles and spheres as three questions: how far is the surface, which way is out, where does a ray hit.
+"""Circles and spheres: distance to the surface, outward normal, ray casts.
 
-Laws for one agent; `offset` leads from the agent to the centre, lengths in m.
+Laws for one agent; `offset`: from the agent to the centre; lengths in m.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def gap(offset: Vec, radius: float) -> float:
 
 @law
 def normal(offset: Vec) -> Vec:
-    """Return the outward unit normal at the nearest point of the surface; the x axis at the very centre."""
+    """Return the outward unit normal at the nearest point of the surface; the x axis exactly at the centre."""
     outside = dot(offset, offset) > like(offset[0], 0.0)
     return select(outside, scale(unit(offset), like(offset[0], -1.0)), axis(offset, 0))
 
@@ -43,7 +43,7 @@ def ray_hit(offset: Vec, direction: Vec, radius: float) -> float:
 
 @law
 def touched_normal(offset: Vec, direction: Vec, hit: float) -> Vec:
-    """Return the outward unit normal where a ray comes after `hit` m; of the nearest point if it never does."""
+    """Return the outward unit normal where a ray arrives after `hit` m; at the nearest point if it never does."""
     o = like(hit, 0.0)
     there = (hit > o) & (hit < like(hit, np.inf))
     return normal(sub(offset, scale(direction, hit if there else o)))
@@ -51,7 +51,7 @@ def touched_normal(offset: Vec, direction: Vec, hit: float) -> Vec:
 
 @law
 def blocks(offset: Vec, radius: float, to: Vec) -> bool:
-    """Does a circle or sphere stand in the straight way to `to`, an offset in m?"""
+    """Return True if a circle or sphere intersects the straight line to `to`, an offset in m."""
     o, e = like(radius, 0.0), like(radius, 1.0)
     length = dot(to, to)
     along = dot(offset, to)
@@ -63,10 +63,10 @@ def blocks(offset: Vec, radius: float, to: Vec) -> bool:
 
 @law
 def silhouette(offset: Vec, radius: float, toward: Vec) -> Vec:
-    """Return the point of the outline, as seen from the agent, that is nearest to the side `toward`; an offset in m.
+    """Return the point of the silhouette, as seen from the agent, on the side `toward`; an offset in m.
 
-    The outline of a circle or sphere at distance d is where lines from the agent touch it: at sqrt(d^2 - r^2) from the
-    agent. `toward` is any vector that is not along the offset; from inside there is no outline but the nearest point.
+    The silhouette of a circle or sphere at distance d is where lines from the agent touch it: at sqrt(d^2 - r^2) from
+    the agent. `toward` is any vector not parallel to the offset; from inside, the nearest surface point is returned.
     """
     square = dot(offset, offset)
     o = like(square, 0.0)

@@ -1,12 +1,12 @@
-"""What every row of a table of shapes begins with, whatever its form: who it is, what it lies within, how it moves.
+"""The header of a row in a table of shapes, common to all forms: number, bounds and motion of an obstacle.
 
-Of D dimensions, in order: its length; the number of the obstacle; the anchor (D, m); the number of its form (its place
-in `table.FORMS`); the middle of its box from the anchor (D, m), half the edges of that box (D, m), and the radius of a
-circle or sphere around the same middle (m), all infinite of what has no end; its velocity (D, m/s); the amplitude of
-its sway (D, m), 2 pi / period (1/s) and phase (rad). Behind that comes what its form calls for: see chain.py, block.py
-and field.py.
+In D dimensions, in order: length of the row; number of the obstacle; anchor (D, m); number of its form (index in
+`table.FORMS`); centre of its bounding box relative to the anchor (D, m), half the edges of that box (D, m), and radius
+of the bounding circle or sphere around the same centre (m), all infinite if the shape is unbounded; velocity (D, m/s);
+amplitude of its sway (D, m), 2 pi / period (1/s) and phase (rad). Then follow the numbers of its form: see chain.py,
+block.py and field.py.
 
-`at` is where a row begins; `x` is any vector of the scene: it tells the dimension.
+`at` is where a row begins; `x` is any vector of the scene, which gives the dimension.
 """
 
 from __future__ import annotations
@@ -32,25 +32,25 @@ def vector_at(table: Any, at: int, x: Vec) -> Vec:
 
 @law
 def form_of(table: Any, at: int, x: Vec) -> int:
-    """Return the number of its form."""
-    return np.int64(table[at + 2 + len(x)])  # type: ignore[return-value]  # a whole number, to numba an int
+    """Return the number of the row's form."""
+    return np.int64(table[at + 2 + len(x)])  # type: ignore[return-value]  # an int to numba
 
 
 @law
 def box_of(table: Any, at: int, x: Vec) -> tuple[Vec, Vec]:
-    """Return the box along the axes that it lies within: the middle, from the anchor, and half its edges, m."""
+    """Return the axis-aligned bounding box: its centre, relative to the anchor, and half its edges, m."""
     return vector_at(table, at + 3 + len(x), x), vector_at(table, at + 3 + 2 * len(x), x)
 
 
 @law
 def bound_of(table: Any, at: int, x: Vec) -> tuple[Vec, float]:
-    """Return the circle or sphere that it lies within: the centre, from the anchor, and the radius, m."""
+    """Return the bounding circle or sphere: its centre, relative to the anchor, and its radius, m."""
     return vector_at(table, at + 3 + len(x), x), table[at + 3 + 3 * len(x)]
 
 
 @law
 def outside_box(table: Any, at: int, x: Vec) -> Vec:
-    """Return how far x is from the box that it lies within, per axis, m: 0 inside. Of a long wall that is near."""
+    """Return the distance of x from the bounding box, per axis, m: 0 inside. A tighter bound than the circle's."""
     middle, half = box_of(table, at, x)
     if len(x) == 2:
         return (_beyond(x[0] - middle[0], half[0]), _beyond(x[1] - middle[1], half[1]))
@@ -67,7 +67,7 @@ def _beyond(x: float, half: float) -> float:
 
 @law
 def shift_of(table: Any, at: int, time: float, x: Vec) -> Vec:
-    """Return how far its anchor is at a time (s) from where the row says, m: v t + a sin(2 pi t / period + phase)."""
+    """Return the displacement of the anchor at a time (s), m: v t + a sin(2 pi t / period + phase)."""
     d = len(x)
     turn = table[at + 4 + 5 * d] * time + table[at + 5 + 5 * d]
     sway = scale(vector_at(table, at + 4 + 4 * d, x), np.sin(turn))
@@ -76,7 +76,7 @@ def shift_of(table: Any, at: int, time: float, x: Vec) -> Vec:
 
 @law
 def velocity_of(table: Any, at: int, time: float, x: Vec) -> Vec:
-    """Return how fast it moves at a time (s), m/s."""
+    """Return the velocity of the shape at a time (s), m/s."""
     d = len(x)
     rate = table[at + 4 + 5 * d]
     sway = scale(vector_at(table, at + 4 + 4 * d, x), rate * np.cos(rate * time + table[at + 5 + 5 * d]))
@@ -85,5 +85,5 @@ def velocity_of(table: Any, at: int, time: float, x: Vec) -> Vec:
 
 @law
 def body_of(at: int, x: Vec) -> int:
-    """Return where begins what its form calls for."""
+    """Return the index at which the numbers of its form begin."""
     return at + 6 + 5 * len(x)

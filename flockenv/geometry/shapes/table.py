@@ -1,8 +1,8 @@
 """Shapes as rows of one table that kernels read, and loops over points for Python.
 
-A row is a head, the same for every form (see head.py), then what its form calls for: see chain.py, block.py and
-field.py. Everything is relative to the anchor, so that on a torus the nearest image counts, and float32 loses nothing
-far from the origin. Rows of one form lie one after another.
+A row is a header, the same for every form (see row_header.py), then the numbers of its form: see chain.py, block.py and
+field.py. All positions are relative to the anchor, so that on a torus the nearest image is used, and float32 loses no
+accuracy far from the origin. Rows of one form lie one after another.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ FORMS = {
     "hollow_block": "flockenv.geometry.shapes.inverted",
     "hollow_distance_field": "flockenv.geometry.shapes.inverted",
 }
-"""The forms that rows have, and where their laws `nearest_FORM` and `hit_FORM` are."""
+"""The forms of rows, and the modules of their laws `nearest_FORM` and `hit_FORM`."""
 
 
 UP = 1 + 1e-6
-"""Bounds in a row are larger by this: whoever is beyond one is clear of the shape, however single precision rounds."""
+"""Factor that enlarges bounds: a point beyond them is clear of the shape, also with rounding in single precision."""
 
 
 def packed(
     shapes: Sequence[Any], dimension: int, first: int = 0, period: Floats | None = None
 ) -> tuple[Floats, dict[str, tuple[int, int]]]:
-    """Return the table of some shapes, numbered from `first`, and for each form there is: (where, how many).
+    """Return the table of some shapes, numbered from `first`, and for each form present (first index, number of rows).
 
-    period: the edges of a torus, m, around which walls may be joined.
+    period: the edges of a torus, m, across which walls may be joined.
     """
     rows: list[Floats] = []
     where: dict[str, tuple[int, int]] = {}
@@ -66,7 +66,7 @@ def packed(
 
 
 def _head(shape: Any, form: int) -> list[float]:
-    """Return what stands in a row before its body, after its length and number; see head.py."""
+    """Return the header of a row without its length and number; see row_header.py."""
     bound = shape.bound
     middle = bound.centre - np.array(shape.anchor)
     return [*shape.anchor, float(form), *middle, *(bound.half * UP), bound.radius * UP, *shape.motion]
@@ -74,7 +74,7 @@ def _head(shape: Any, form: int) -> list[float]:
 
 @functools.cache
 def law_of(verb: str, form: str) -> Law:
-    """Return a law of a form, by its verb: `nearest_FORM`, `hit_FORM`, or what else its module has."""
+    """Return the law `VERB_FORM` of a form, such as `nearest_chain` or `hit_chain`, from the form's module."""
     law: Law = getattr(importlib.import_module(FORMS[form]), f"{verb}_{form}")
     return law
 
@@ -118,7 +118,10 @@ def nearest(shape: Any, points: ArrayLike) -> tuple[Floats, Floats]:
 
 
 def hits(shape: Any, points: ArrayLike, directions: ArrayLike, clearance: ArrayLike) -> Floats:
-    """Return how far along unit directions (..., D) bodies of a radius touch it first, (...) m; inf if never."""
+    """Return the distances along unit directions (..., D) at which bodies touch it, (...) m; inf if never.
+
+    clearance: the radii of the bodies, m.
+    """
     flat, lead = _flat(np.broadcast_arrays(points, directions)[0])
     ways, _ = _flat(np.broadcast_arrays(points, directions)[1])
     room = np.ascontiguousarray(np.broadcast_to(np.asarray(clearance, np.float64), lead)).reshape(-1)
