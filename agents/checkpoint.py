@@ -29,7 +29,7 @@ from flockenv.core.errors import refusals, shown
 from flockenv.core.record import Record
 
 __all__ = [
-    "FILE", "TIMES", "CheckpointError", "Damaged", "InUse", "Parts", "as_json", "claimed", "digest", "from_json",
+    "FILE", "TIMES", "CheckpointError", "Damaged", "InUse", "KernelPlan", "as_json", "claimed", "digest", "from_json",
     "path_in", "read", "write",
 ]  # fmt: skip
 
@@ -39,7 +39,7 @@ BEFORE = ("run.json", "policy.pt", "optimizer.pt", "best.npz")
 """The files of the format before this one: four that could be of different moments."""
 
 Tensors = dict[str, NDArray[Any]]
-Parts = dict[str, Tensors]
+KernelPlan = dict[str, Tensors]
 R = TypeVar("R", bound=Record)
 
 
@@ -90,7 +90,7 @@ def as_json(content: Any) -> Tensors:
     return {JSON: np.frombuffer(json.dumps(content, allow_nan=False).encode(), np.uint8)}
 
 
-def write(folder: Path, parts: Parts) -> None:
+def write(folder: Path, parts: KernelPlan) -> None:
     """Write a checkpoint, which takes the place of the one before when all of it is on the disk."""
     digests = {part: _digest(tensors) for part, tensors in parts.items()}
     tensors = {f"{part}/{name}": np.asarray(t, order="C") for part, named in parts.items() for name, t in named.items()}
@@ -99,7 +99,7 @@ def write(folder: Path, parts: Parts) -> None:
         file.write(data)
 
 
-def digest(parts: Parts) -> str:
+def digest(parts: KernelPlan) -> str:
     """Return the SHA-256 of all that a checkpoint holds, but for the part `times`."""
     each = [f"{part} {_digest(tensors)}" for part, tensors in sorted(parts.items()) if part != TIMES]
     return hashlib.sha256("\n".join(each).encode()).hexdigest()
@@ -116,7 +116,7 @@ def _digest(tensors: Mapping[str, NDArray[Any]]) -> str:
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
-def read(folder: Path, largest: int) -> Parts | None:
+def read(folder: Path, largest: int) -> KernelPlan | None:
     """Return the parts of a folder's checkpoint, each with the digest that was recorded; None if there is none.
 
     largest: bytes; a larger file is not read.
@@ -156,8 +156,8 @@ def _recorded(metadata: Mapping[str, str], folder: Path) -> dict[str, str]:
     return digests
 
 
-def _parts(file: Any, folder: Path) -> Parts:
-    parts: Parts = {}
+def _parts(file: Any, folder: Path) -> KernelPlan:
+    parts: KernelPlan = {}
     for name in file.keys():  # noqa: SIM118  # not a dictionary
         part, slash, rest = name.partition("/")
         if not slash or not rest:
@@ -166,7 +166,7 @@ def _parts(file: Any, folder: Path) -> Parts:
     return parts
 
 
-def _compare(parts: Parts, recorded: Mapping[str, str], folder: Path) -> None:
+def _compare(parts: KernelPlan, recorded: Mapping[str, str], folder: Path) -> None:
     """Refuse a part that is missing, unknown, or not what its digest was taken of; one without tensors is there."""
     for part in sorted({*recorded, *parts}):
         if part not in recorded:
@@ -175,7 +175,7 @@ def _compare(parts: Parts, recorded: Mapping[str, str], folder: Path) -> None:
             raise Damaged(folder, f"{part}: its SHA-256 is not the recorded one")
 
 
-def from_json(kind: type[R], parts: Parts, part: str, folder: Path) -> R:
+def from_json(kind: type[R], parts: KernelPlan, part: str, folder: Path) -> R:
     """Return the record that a part holds in JSON, read strictly; Damaged, with the key, if it is not of that kind."""
     tensors = parts.get(part, {})
     if tensors.keys() != {JSON} or tensors[JSON].dtype != np.uint8:

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from agents import checkpoint as files
-from agents.checkpoint import CheckpointError, Parts
+from agents.checkpoint import CheckpointError, KernelPlan
 from agents.experiment import Experiment
 from flockenv.core.errors import KeyPath, key_path, shown
 from flockenv.core.record import ResultRecord
@@ -52,7 +52,7 @@ class Run:
     curve: list[dict[str, float]] = field(default_factory=list)
     best: float | None = None
     tensors: dict[str, np.ndarray] = field(default_factory=dict)
-    state: Parts = field(default_factory=dict)  # of the model, see agents.training_state
+    state: KernelPlan = field(default_factory=dict)  # of the model, see agents.training_state
 
 
 class Point(ResultRecord):

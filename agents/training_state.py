@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
 
-from agents.checkpoint import JSON, Damaged, Parts, Tensors, as_json
+from agents.checkpoint import JSON, Damaged, KernelPlan, Tensors, as_json
 from flockenv.envs.world import World
 from flockenv.studies.accuracy.benchmark import machine
 from flockenv.tasks import Task
@@ -36,7 +36,7 @@ POSITIONS = ("state.x", "state.v")
 """What must be finite of worlds: a lifetime, or a measure that does not apply yet, may be infinite or NaN."""
 
 
-def capture(model: PPO) -> Parts:
+def capture(model: PPO) -> KernelPlan:
     """Return copies of all that training goes on from, by part; to be called where a rollout begins."""
     assert isinstance(model._last_obs, np.ndarray) and model._last_episode_starts is not None
     return {
@@ -52,7 +52,7 @@ def capture(model: PPO) -> Parts:
     }
 
 
-def restore(model: PPO, parts: Parts, steps: int, folder: Path) -> None:
+def restore(model: PPO, parts: KernelPlan, steps: int, folder: Path) -> None:
     """Put a model, built by the same recipe, where another one was captured after so many steps of its rows.
 
     Raises:
@@ -107,7 +107,7 @@ def _fault(kept: Tensors, wanted: Tensors, finite: Sequence[str]) -> str:
     return ""
 
 
-def _put(model: PPO, parts: Parts) -> None:
+def _put(model: PPO, parts: KernelPlan) -> None:
     """Write what a checkpoint holds into a model that it fits; the generators last, since building draws numbers."""
     policy, optimizer, moments = model.policy, model.policy.optimizer, parts["optimizer"]
     policy.load_state_dict({name: torch.from_numpy(array) for name, array in parts["policy"].items()})

@@ -23,7 +23,7 @@ hypothesis.settings.load_profile("flockenv")
 
 
 # Where a test asks for threads all of them share all work, however little: how soon it is done is not what is tested.
-thread_pool.Choice.always, thread_pool._cores = True, 64
+thread_pool.AutoTuner.always, thread_pool._cores = True, 64
 
 # Tests compare all of stderr. On a busy machine a kernel compiles for longer than the 3 s after which a line about
 # progress is written; tests of that line set their own times.

@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 
 from agents import checkpoint as files
 from agents import ppo
-from agents.checkpoint import FILE, Damaged, InUse, Parts, claimed, digest
+from agents.checkpoint import FILE, Damaged, InUse, KernelPlan, claimed, digest
 from agents.divergence import LearningDiverged
 from agents.experiment import CONFIGS, Experiment
 from agents.run import checkpoint, checkpointed
@@ -38,7 +38,7 @@ LARGEST = 2**26
 TWO_THREADS = PURSUIT.model_copy(update={"ppo": PURSUIT.ppo.model_copy(update={"threads": 2})})
 
 
-def parts_in(folder: Path) -> Parts:
+def parts_in(folder: Path) -> KernelPlan:
     parts = files.read(folder, LARGEST)
     assert parts is not None
     return parts
@@ -227,7 +227,7 @@ def refused(folder: Path, said: str) -> None:
     assert {path.name for path in folder.iterdir()} == {"pursuit.yaml", "runs"}
 
 
-def changed(change: Callable[[Parts], Any]) -> Callable[[Path], None]:
+def changed(change: Callable[[KernelPlan], Any]) -> Callable[[Path], None]:
     """Return what writes a checkpoint anew, with true digests, after a change."""
 
     def write(folder: Path) -> None:
@@ -241,7 +241,7 @@ def changed(change: Callable[[Parts], Any]) -> Callable[[Path], None]:
 def noted(**changes: Any) -> Callable[[Path], None]:
     """Return what changes the notes of a checkpoint; None takes a key away."""
 
-    def change(parts: Parts) -> None:
+    def change(parts: KernelPlan) -> None:
         notes = {**json.loads(parts["notes"]["json"].tobytes()), **changes}
         text = json.dumps({key: value for key, value in notes.items() if value != "gone"})
         parts["notes"] = {"json": np.frombuffer(text.encode(), np.uint8)}
@@ -258,7 +258,7 @@ def as_bytes(text: str) -> dict[str, Any]:
 
 
 def tensor(part: str, name: str, value: Callable[[Any], Any]) -> Callable[[Path], None]:
-    def change(parts: Parts) -> None:
+    def change(parts: KernelPlan) -> None:
         parts[part][name] = value(parts[part][name].copy())
 
     return changed(change)

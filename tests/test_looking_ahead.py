@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from flockenv.behaviours import Alignment, Cohesion, Separation
-from flockenv.engine import Parts
+from flockenv.engine import KernelPlan
 from flockenv.geometry.space import Plane, Torus
 from flockenv.model.spawn import Spawn
 from flockenv.physics.integrators import SemiImplicitEuler
 from flockenv.scene import Group, Scene
 
 
-@pytest.mark.skipif(not Parts(2, Plane(), (), SemiImplicitEuler()).masks, reason="only with AVX-512")
+@pytest.mark.skipif(not KernelPlan(2, Plane(), (), SemiImplicitEuler()).masks, reason="only with AVX-512")
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("agents", [17, 95])  # from 96 on they are sorted by cell
 def test_working_out_the_next_candidate_early_moves_no_bit(
@@ -28,7 +28,7 @@ def test_working_out_the_next_candidate_early_moves_no_bit(
     def moved(ahead: bool) -> tuple[Any, Any, Any]:
         scene = Scene(groups=(group,), effects=rules, space=Torus(size=(6, 6)), dtype=dtype)
         if not ahead:
-            monkeypatch.setattr(Parts, "looks_ahead", False)
+            monkeypatch.setattr(KernelPlan, "looks_ahead", False)
         assert scene.parts.looks_ahead == ahead
         state = scene.start(0, worlds=2)
         state.alive[1, ::3] = False

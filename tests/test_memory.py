@@ -10,14 +10,14 @@ from numba import njit
 from numba.core.errors import TypingError
 
 from flockenv.jit.cpu import LINE
-from flockenv.jit.memory import fetch, pour, settle, zeros
+from flockenv.jit.memory import prefetch, store_fence, stream_store, zeros
 
 
 @njit(nogil=True)
 def poured(to: Any, at: int, source: Any) -> None:
     """Call it as a kernel does."""
-    pour(to, np.uint64(at), source)
-    settle()
+    stream_store(to, np.uint64(at), source)
+    store_fence()
 
 
 def aligned(count: int, kind: Any, past: int) -> Any:
@@ -78,7 +78,7 @@ def test_zeros_begin_where_a_line_does(kind: Any) -> None:
 @njit
 def fetched(array: Any, part: int, parts: int) -> None:
     """Call it as a kernel does."""
-    fetch(array, part, parts)
+    prefetch(array, part, parts)
 
 
 def test_memory_is_asked_for_without_being_touched() -> None:

@@ -340,9 +340,11 @@ class Clock:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 0.0
         monkeypatch.setattr(thread_pool, "perf_counter", lambda: self.now)
-        monkeypatch.setattr(thread_pool.Choice, "always", False)
+        monkeypatch.setattr(thread_pool.AutoTuner, "always", False)
 
-    def done(self, choice: thread_pool.Choice, alone: float, shared: float, pieces: int, surely: bool = False) -> str:
+    def done(
+        self, choice: thread_pool.AutoTuner, alone: float, shared: float, pieces: int, surely: bool = False
+    ) -> str:
         """By whom so many pieces are done, a letter each, if these are the seconds that they take."""
         by = []
 
@@ -360,15 +362,15 @@ class Clock:
 
 def test_both_ways_are_tried_and_the_sooner_one_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock(monkeypatch)
-    assert clock.done(thread_pool.Choice(), 1.0, 0.6, 10) == "aaasss" + 4 * "s"
-    assert clock.done(thread_pool.Choice(), 1.0, 1.2, 10) == "aaasss" + 4 * "a"
-    assert clock.done(thread_pool.Choice(), thread_pool.SHORTEST / 2, 0.0, 200) == 200 * "a"  # too short to share
-    assert clock.done(thread_pool.Choice(), 0.0, 9.0, 5, surely=True) == 5 * "s"  # too long to try
+    assert clock.done(thread_pool.AutoTuner(), 1.0, 0.6, 10) == "aaasss" + 4 * "s"
+    assert clock.done(thread_pool.AutoTuner(), 1.0, 1.2, 10) == "aaasss" + 4 * "a"
+    assert clock.done(thread_pool.AutoTuner(), thread_pool.SHORTEST / 2, 0.0, 200) == 200 * "a"  # too short to share
+    assert clock.done(thread_pool.AutoTuner(), 0.0, 9.0, 5, surely=True) == 5 * "s"  # too long to try
 
 
 def test_what_was_slower_is_tried_again_ever_more_seldom(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock(monkeypatch)
-    by = clock.done(thread_pool.Choice(), 1.0, 1.2, 20_000)[2 * thread_pool.TRIAL :]
+    by = clock.done(thread_pool.AutoTuner(), 1.0, 1.2, 20_000)[2 * thread_pool.TRIAL :]
     waits = [len(part) for part in by.split(thread_pool.TRIAL * "s")]
     assert waits[:3] == [2 * thread_pool.AGAIN, 4 * thread_pool.AGAIN, 8 * thread_pool.AGAIN]
     assert set(waits[6:-1]) == {thread_pool.SELDOM}
@@ -377,7 +379,7 @@ def test_what_was_slower_is_tried_again_ever_more_seldom(monkeypatch: pytest.Mon
 @pytest.mark.parametrize("sooner", [0, 1])
 def test_nothing_that_happens_once_decides_for_ever(sooner: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Somebody is held up, or what is sooner done changes."""
-    clock, choice, wanted = Clock(monkeypatch), thread_pool.Choice(), "as"[sooner]
+    clock, choice, wanted = Clock(monkeypatch), thread_pool.AutoTuner(), "as"[sooner]
     usual, late = (0.5, 1.0) if sooner == 0 else (1.0, 0.5), 100.0
     clock.done(choice, *usual, 100)
     for held_up in ((late, usual[1]), (usual[0], late)):
@@ -389,14 +391,14 @@ def test_nothing_that_happens_once_decides_for_ever(sooner: int, monkeypatch: py
     clock.done(choice, *usual[::-1], 2 * thread_pool.SELDOM)
     assert clock.done(choice, *usual[::-1], 100).count(wanted) <= thread_pool.TRIAL
     for held_up in range(2 * thread_pool.TRIAL):  # while it is tried for the first time
-        begun = thread_pool.Choice()
+        begun = thread_pool.AutoTuner()
         for k in range(2 * thread_pool.TRIAL):
             clock.done(begun, *((late, late) if k == held_up else usual), 1)
         assert clock.done(begun, *usual, thread_pool.AGAIN) == thread_pool.AGAIN * wanted
 
 
 def test_a_piece_that_failed_is_nothing_to_go_by(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock, choice = Clock(monkeypatch), thread_pool.Choice()
+    clock, choice = Clock(monkeypatch), thread_pool.AutoTuner()
     clock.done(choice, 1.0, 0.6, 10)
     before = list(choice.took)
 
@@ -410,13 +412,13 @@ def test_a_piece_that_failed_is_nothing_to_go_by(monkeypatch: pytest.MonkeyPatch
 
 
 def test_scenes_and_worlds_keep_to_what_is_sooner_done(shared: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(thread_pool.Choice, "always", False)
+    monkeypatch.setattr(thread_pool.AutoTuner, "always", False)
     use_threads(2)
     scene = NAMED["torus"].make(640, 60.0)
     start = scene.start(0)
     expected = scene.run(start, 1)
     assert shared == []
-    choice = scene._choices.of("together", 640, 2)
+    choice = scene._tuners.of("together", 640, 2)
     for took, by in (([1.0, 0.5], [2]), ([0.5, 1.0], [])):
         choice._left, choice._wait, choice.took = 0, 100, took
         shared.clear()
@@ -425,7 +427,7 @@ def test_scenes_and_worlds_keep_to_what_is_sooner_done(shared: list[int], monkey
     world = World(Flock(), 200)
     world.reset(0)
     world.step(np.zeros((200, 24, 2)))
-    assert [kind for kind, *_ in world._choices] == ["beginning", "deciding"]
+    assert [kind for kind, *_ in world._tuners] == ["beginning", "deciding"]
 
 
 @pytest.mark.parametrize(("count", "worlds", "surely"), [(640, 1, False), (640, 2, True), (4096, 1, True)])
@@ -433,7 +435,7 @@ def test_long_calls_are_shared_at_once_where_threads_seldom_wait_for_each_other(
     count: int, worlds: int, surely: bool, shared: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Worlds apart, or one of many agents; whether a team on few is sooner done must have been seen."""
-    monkeypatch.setattr(thread_pool.Choice, "always", False)
+    monkeypatch.setattr(thread_pool.AutoTuner, "always", False)
     use_threads(2)
     scene = NAMED["torus"].make(count, 60.0)
     start, steps = scene.start(0, worlds=worlds), 1 + scenes.LARGEST // (count * worlds)
@@ -523,7 +525,7 @@ def test_two_callers_may_step_one_scene_with_two_threads_each(
 def test_callers_whose_jobs_wait_for_each_other_never_wait_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nine at once hire a crew, which takes a while: none is left with fewer threads than it has jobs."""
 
-    class Slow(thread_pool._Crew):
+    class Slow(thread_pool._ThreadPool):
         def __init__(self, count: int) -> None:
             super().__init__(count)
             time.sleep(0.02 * (6 - count))  # the smallest comes last, and stays

@@ -14,7 +14,7 @@ import pytest
 
 from flockenv.envs.world import AT_HAND, PAST, Step, World, _portions
 from flockenv.jit.decorators import python_of
-from flockenv.jit.section import settled
+from flockenv.jit.section import without_dispatch
 from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.maths.counter_rng import key_of, keys_of
 from flockenv.tasks import Crossing, Flock, Obstacles, Pursuit
@@ -142,7 +142,7 @@ def test_what_goes_past_the_caches_is_the_same(row: TaskRow, monkeypatch: pytest
 def test_other_threads_see_what_went_past_the_caches() -> None:
     """By a fence at the end; without it results are nearly always the same."""
     source = inspect.getsource(python_of(play_of(Flock())))
-    assert source.index("show(p") < source.index("        if past:\n            settle()\n        return")
+    assert source.index("show(p") < source.index("        if past:\n            store_fence()\n        return")
 
 
 def test_only_what_is_large_goes_past_the_caches() -> None:
@@ -277,21 +277,21 @@ def test_a_masked_reset_touches_the_masked_worlds_only(row: TaskRow) -> None:
 @pytest.fixture
 def looking(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let numba look at the types of every call, so that it would compile for other ones."""
-    monkeypatch.setattr("flockenv.envs.world.settled", lambda function: function)
+    monkeypatch.setattr("flockenv.envs.world.without_dispatch", lambda function: function)
 
 
 def test_a_world_that_was_reset_calls_its_kernel_without_a_look_at_types() -> None:
     world = World(Pursuit(), 2)
     world.reset(1)
     play = world._entries[0]
-    assert world._enter is settled(play) is not play
+    assert world._enter is without_dispatch(play) is not play
     again = copy.deepcopy(world)
     assert again._enter is play
     for a in actions_for(world, 3):
         np.testing.assert_array_equal(world.step(a).observation, again.step(a).observation)
     for several in (0, 2):
         function = SimpleNamespace(overloads=dict.fromkeys(range(several)))
-        assert settled(function) is function
+        assert without_dispatch(function) is function
 
 
 @pytest.mark.usefixtures("looking")

@@ -448,8 +448,11 @@ def _episodes(task: Task, players: Sequence[str], seed: int, trust_pickle: bool)
     panels = []
     with progress_bar("playing", len(players) * task.horizon, "decisions") as progress:
         for k, (player, policy) in enumerate(zip(players, policies, strict=True)):
-            before = k * task.horizon
-            episode = rollout(task, policy, 1, seed, record=0, progress=lambda done, most, n=before: progress(n + done))
+
+            def show(done: int, most: int, before: int = k * task.horizon) -> None:
+                progress(before + done)
+
+            episode = rollout(task, policy, 1, seed, record=0, progress=show)
             assert episode.recording is not None  # requested with record=0
             outcome, film = "success" if episode.success[0] else "no success", episode.recording
             title = Path(player).stem if len(players) > 1 else film.snapshots[0].title

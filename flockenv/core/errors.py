@@ -179,7 +179,7 @@ def _reason(path: KeyPath, detail: ErrorDetails, schema: Schema, data: object) -
     if kind == "extra_forbidden":
         keys = _keys(path, schema, data)
         return f"unknown key{nearest(str(path[-1]), keys) or ';'} allowed here: {', '.join(keys) or 'no key'}"
-    choices = _choices(path, detail, schema, data)
+    choices = _tuners(path, detail, schema, data)
     if choices:
         close = "" if kind in _MISSING else nearest(str(_value(detail)), choices)
         start = "missing;" if kind in _MISSING else f"unknown{close or ';'}"
@@ -212,7 +212,7 @@ def _keys(path: KeyPath, schema: Schema, data: object) -> list[str]:
     return list(_schema_at(path[:-1], schema, data).get("properties", {}))
 
 
-def _choices(path: KeyPath, detail: ErrorDetails, schema: Schema, data: object) -> list[str]:
+def _tuners(path: KeyPath, detail: ErrorDetails, schema: Schema, data: object) -> list[str]:
     """Return the words that are allowed at `path`; [] if it does not take one of a set of words."""
     if detail["type"].startswith("union_tag_"):
         union = _follow(_step_down(path[:-1], schema, data), schema)

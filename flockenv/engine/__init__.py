@@ -21,7 +21,7 @@ from __future__ import annotations
 from flockenv.engine.bonds import Table, pack
 from flockenv.engine.context import Worlds, worlds_of
 from flockenv.engine.entry_points import BeginPlan, begin_inner_of, begin_of, begin_plan, field_of, step_of
-from flockenv.engine.kernel_plan import Look, Parts, flattened
+from flockenv.engine.kernel_plan import KernelPlan, Look, flattened
 from flockenv.engine.observation_query import look_of
 from flockenv.engine.query_plan import LookPlan, plan_look
 from flockenv.engine.scratch import GIVEN, OWN, scratch_bytes, scratch_of, scratch_record
@@ -31,9 +31,9 @@ __all__ = [
     "GIVEN",
     "OWN",
     "BeginPlan",
+    "KernelPlan",
     "Look",
     "LookPlan",
-    "Parts",
     "StepPlan",
     "Table",
     "Worlds",

@@ -20,7 +20,7 @@ from flockenv.engine.blocks import common_places, put_vector_of, vector_of_lane
 from flockenv.engine.bonds import BondPlan, bond_plan, bonds_of
 from flockenv.engine.far_field import FarPlan, far_of, far_plan
 from flockenv.engine.group_laws import GroupPlan, find_groups_of, group_plan, members_of
-from flockenv.engine.kernel_plan import Parts
+from flockenv.engine.kernel_plan import KernelPlan
 from flockenv.engine.lane_access import gather, picked
 from flockenv.engine.law_calls import OneLaw, given_of, laws_of, says_of, sum_of
 from flockenv.engine.obstacle_loop import obstacles_of
@@ -66,7 +66,7 @@ class ResponsePlan(NamedTuple):
     groups: GroupPlan | None
 
 
-def response_plan(parts: Parts) -> ResponsePlan:
+def response_plan(parts: KernelPlan) -> ResponsePlan:
     """Return the plan of a scene."""
     targets, wishes = ["s", "f", *(f"w{k}_" for k in parts.wishes)], list(parts.wishes)
     added: list[tuple[str, Added]] = []
@@ -112,7 +112,7 @@ class SensePlan(NamedTuple):
     groups: GroupPlan | None
 
 
-def sense_plan(parts: Parts) -> SensePlan:
+def sense_plan(parts: KernelPlan) -> SensePlan:
     """Return the plan of a scene."""
     agent = agent_plan(parts)
     return SensePlan(

@@ -13,7 +13,7 @@ from flockenv.maths.vectors import unit, zero
 from flockenv.physics.effects.effect import Me
 
 if TYPE_CHECKING:
-    from flockenv.engine.kernel_plan import Parts
+    from flockenv.engine.kernel_plan import KernelPlan
 
 __all__ = ["AgentPlan", "agent_plan", "alone_of", "inner_of", "still"]
 
@@ -29,7 +29,7 @@ class AgentPlan(NamedTuple):
     inner: tuple[str, ...] = ()  # names of its inner states
 
 
-def agent_plan(parts: Parts) -> AgentPlan:
+def agent_plan(parts: KernelPlan) -> AgentPlan:
     """Return the plan of a scene."""
     paced = "desired_speed" in parts.frame_numbers
     return AgentPlan(parts.dimension, parts.width, parts.oriented, parts.aims, paced, parts.inner)

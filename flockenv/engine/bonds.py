@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from flockenv.engine.agent_records import AgentPlan, alone_of, inner_of
 from flockenv.engine.blocks import vector_of_lane
-from flockenv.engine.kernel_plan import Parts
+from flockenv.engine.kernel_plan import KernelPlan
 from flockenv.engine.lane_access import gather
 from flockenv.jit.decorators import Law, like
 from flockenv.jit.intrinsics import wait_for_team
@@ -36,7 +36,7 @@ class Table(NamedTuple):
     ]  # per effect: the first slot of each block, and one more; then where its part begins, twice
 
 
-def pack(parts: Parts, agents: int, groups: Sequence[object]) -> Table:
+def pack(parts: KernelPlan, agents: int, groups: Sequence[object]) -> Table:
     """Return the table of a scene of `agents` agents; raise ValueError, naming the effect, if its bonds are invalid."""
     w, d = parts.width, parts.dimension
     blocks = -(-agents // w)
@@ -107,7 +107,7 @@ class BondPlan(NamedTuple):
     adds: bool  # True if `pulled` already holds forces of far laws
 
 
-def bond_plan(parts: Parts, agent: AgentPlan) -> BondPlan:
+def bond_plan(parts: KernelPlan, agent: AgentPlan) -> BondPlan:
     """Return the plan of a scene."""
     d = parts.dimension
     laws = tuple(BondLaw(k, e.bond_law, e.partners, e.numbers(d)) for k, e in parts.bonded if e.bond_law is not None)

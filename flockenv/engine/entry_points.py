@@ -1,6 +1,6 @@
 """The entry points of a scene: `step` its worlds, `begin` the inner states of its agents, compute its `field`.
 
-Each is a function of the scene's `Parts`; its machine code is cached, see `section.entry_of`.
+Each is a function of the scene's `KernelPlan`; its machine code is cached, see `section.entry_of`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from flockenv.engine.accelerations import ResponsePlan, SensePlan, accelerate_of
 from flockenv.engine.agent_records import alone_of
 from flockenv.engine.blocks import out_of_blocks, place_of, vector_of_lane
 from flockenv.engine.context import Context
-from flockenv.engine.kernel_plan import Parts
+from flockenv.engine.kernel_plan import KernelPlan
 from flockenv.engine.load_store import bring_in_of, take_drive_of
 from flockenv.engine.move import InnerPlan, begin_agent_of, inner_plan
 from flockenv.engine.parameters import NumberPlan, numbers_of
@@ -28,12 +28,12 @@ from flockenv.maths.vectors import zero
 __all__ = ["BeginPlan", "begin_inner_of", "begin_of", "begin_plan", "field_of", "step_of"]
 
 
-def step_of(parts: Parts) -> Callable[..., tuple[int, int]]:
+def step_of(parts: KernelPlan) -> Callable[..., tuple[int, int]]:
     """Return the entry point `step` of a scene: see `_scene_step`."""
     return titled(_scene_step(step_plan(parts)), f"{_title(parts)}, {parts.integrator.kind}")
 
 
-def _title(parts: Parts) -> str:
+def _title(parts: KernelPlan) -> str:
     """Return a description of a kernel, which is shown while it is compiled."""
     effects = ", ".join(type(e).__name__ for e in parts.effects) or "no effects"
     return f"{parts.dimension}-D {parts.space.kind}; {effects}"
@@ -70,7 +70,7 @@ class BeginPlan(NamedTuple):
     numbers: NumberPlan
 
 
-def begin_plan(parts: Parts) -> BeginPlan | None:
+def begin_plan(parts: KernelPlan) -> BeginPlan | None:
     """Return the plan of a scene; None if its agents have no inner states."""
     inner = inner_plan(parts)
     return BeginPlan(inner, parts.number_plan) if inner is not None else None
@@ -120,7 +120,7 @@ def _begin_number(number: int) -> Callable[..., None]:
     return kernel(begin)
 
 
-def begin_of(parts: Parts) -> Callable[..., None]:
+def begin_of(parts: KernelPlan) -> Callable[..., None]:
     """Return the entry point `begin` of a scene with inner states: see `_scene_begin`."""
     plan = begin_plan(parts)
     assert plan is not None, "a scene in which agents keep nothing"
@@ -140,7 +140,7 @@ def _scene_begin(plan: BeginPlan) -> Callable[..., None]:
     return scene_begin
 
 
-def field_of(parts: Parts) -> Callable[..., None]:
+def field_of(parts: KernelPlan) -> Callable[..., None]:
     """Return the entry point `field` of parts that are not `stepped`: see `_scene_field`."""
     made = _scene_field(response_plan(parts), sense_plan(parts), parts.number_plan)
     return titled(made, f"{_title(parts)}, accelerations")

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flockenv.engine.blocks import place_of, vector_of_lane
-from flockenv.engine.kernel_plan import Parts
+from flockenv.engine.kernel_plan import KernelPlan
 from flockenv.geometry.barnes_hut import BUCKETS, LEVELS, LISTED, gather, line_up, weigh
 from flockenv.jit.decorators import Law, like
 from flockenv.jit.intrinsics import wait_for_team
@@ -42,7 +42,7 @@ class FarPlan(NamedTuple):
     treed: tuple[FarLaw, ...]  # laws that are evaluated for nodes of a tree
 
 
-def far_plan(parts: Parts) -> FarPlan:
+def far_plan(parts: KernelPlan) -> FarPlan:
     """Return the plan of a scene."""
     laws = {k: FarLaw(k, effect.far_law, effect.weighs_mass) for k, effect in parts.far if effect.far_law is not None}
     treed = [k for k, _ in parts.treed]

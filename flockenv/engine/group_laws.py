@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flockenv.engine.blocks import place_of, vector_of_lane
-from flockenv.engine.kernel_plan import Parts
+from flockenv.engine.kernel_plan import KernelPlan
 from flockenv.engine.lane_access import gather, scatter
 from flockenv.jit.decorators import Law, finite, kernel, like
 from flockenv.jit.intrinsics import wait_for_team
@@ -39,7 +39,7 @@ class GroupPlan(NamedTuple):
     laws: tuple[GroupLaw, ...]
 
 
-def group_plan(parts: Parts) -> GroupPlan:
+def group_plan(parts: KernelPlan) -> GroupPlan:
     """Return the plan of a scene."""
     laws = [
         GroupLaw(k, tuple(at * parts.width for name, at in parts.slots.items() if name.startswith(f"group{k}_")))

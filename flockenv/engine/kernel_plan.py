@@ -1,4 +1,4 @@
-"""Parts: which laws make up a scene, and what follows from that for its kernel.
+"""KernelPlan: which laws make up a scene, and what follows from that for its kernel.
 
 Which effects interact with neighbours, through how many different `sights`, what is sorted of each agent (`fields`:
 only what some law reads), where each running number lies in the scratch of lanes (`slots`), and the numbers that the
@@ -27,7 +27,7 @@ from flockenv.physics.effects.effect import LAWS, Effect, Sight
 from flockenv.physics.integrators.integrator import Integrator
 from flockenv.physics.integrators.single_stage import OneStage
 
-__all__ = ["Look", "Parts", "flattened"]
+__all__ = ["KernelPlan", "Look", "flattened"]
 
 
 class Look(NamedTuple):
@@ -39,7 +39,7 @@ class Look(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Parts(MetObstacles):
+class KernelPlan(MetObstacles):
     """Which laws make up a scene: all that its kernel depends on."""
 
     dimension: int

@@ -11,7 +11,7 @@ from flockenv.jit.decorators import Law, Vec, kernel
 from flockenv.maths.vectors import add
 
 if TYPE_CHECKING:
-    from flockenv.engine.kernel_plan import Parts
+    from flockenv.engine.kernel_plan import KernelPlan
 
 __all__ = ["OneLaw", "given_of", "laws_of", "says_of", "sum_of"]
 
@@ -24,13 +24,13 @@ class OneLaw(NamedTuple):
     images: Images | None = None
 
     @classmethod
-    def of(cls, parts: Parts, k: int, slot: str) -> OneLaw:
+    def of(cls, parts: KernelPlan, k: int, slot: str) -> OneLaw:
         """Return the law that effect k has in a slot."""
         effect = parts.effects[k]
         return cls(k, getattr(effect, slot), images_in(parts, effect))
 
 
-def laws_of(parts: Parts, slot: str) -> tuple[OneLaw, ...]:
+def laws_of(parts: KernelPlan, slot: str) -> tuple[OneLaw, ...]:
     """Return the laws of all effects that have one in a slot, in order."""
     return tuple(OneLaw.of(parts, k, slot) for k, e in enumerate(parts.effects) if getattr(e, slot) is not None)
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flockenv.engine.kernel_plan import Parts
+from flockenv.engine.kernel_plan import KernelPlan
 from flockenv.jit.decorators import kernel, like
 from flockenv.jit.section import section
 from flockenv.physics.integrators.integrator import SUBSTEPS, Method, Provided
@@ -24,7 +24,7 @@ class MethodPlan(NamedTuple):
     drags: tuple[tuple[int, int], ...]  # linear drags, kg/s: (effect, index among its numbers)
 
 
-def method_plan(parts: Parts) -> MethodPlan:
+def method_plan(parts: KernelPlan) -> MethodPlan:
     """Return the plan of a scene."""
     drags = tuple((k, parts.names_of(e).index(e.linear_drag)) for k, e in enumerate(parts.effects) if e.linear_drag)
     return MethodPlan(parts.dimension, parts.width, drags)

@@ -14,7 +14,7 @@ import numpy as np
 from flockenv.engine.accelerations import felt_of
 from flockenv.engine.agent_records import AgentPlan, agent_plan, alone_of
 from flockenv.engine.blocks import common_places, put_vector_of, vector_of_lane
-from flockenv.engine.kernel_plan import Parts
+from flockenv.engine.kernel_plan import KernelPlan
 from flockenv.engine.law_calls import OneLaw, given_of, says_of
 from flockenv.jit.decorators import Law, Vec, finite, kernel, like
 from flockenv.jit.section import in_turn, section, tuple_from
@@ -35,7 +35,7 @@ class Kept(NamedTuple):
 
     begin: OneLaw
     keep: OneLaw
-    felt: int  # where the sum of its pair law lies, see Parts.felt_at; -1: it has none
+    felt: int  # where the sum of its pair law lies, see KernelPlan.felt_at; -1: it has none
 
 
 class InnerPlan(NamedTuple):
@@ -63,7 +63,7 @@ class MovePlan(NamedTuple):
     bad: int  # where among the lanes the agent that is not finite is noted
 
 
-def inner_plan(parts: Parts) -> InnerPlan | None:
+def inner_plan(parts: KernelPlan) -> InnerPlan | None:
     """Return the plan of the inner states of a scene; None if its agents have none."""
     if not parts.inner:
         return None
@@ -81,7 +81,7 @@ def inner_plan(parts: Parts) -> InnerPlan | None:
     return InnerPlan(agent_plan(parts), tuple(laws), numbers, parts.felt_size)
 
 
-def move_plan(parts: Parts) -> MovePlan:
+def move_plan(parts: KernelPlan) -> MovePlan:
     """Return the plan of a scene."""
     kicks = tuple((k, e.kick_law) for k, e in enumerate(parts.effects) if e.kick_law is not None)
     method = parts.integrator.move() if isinstance(parts.integrator, OneStage) else None

@@ -22,13 +22,13 @@ from flockenv.engine.scratch import SMALL_STRIDE, array_names
 from flockenv.geometry.cell_list import DISTANT, candidates, count_cells, order_records, row_of
 from flockenv.geometry.spatial_sort import FAR_FROM_HOME, count_from_home, order_cells, order_shared
 from flockenv.jit.decorators import Law
-from flockenv.jit.intrinsics import ask_for, wait_for_team
+from flockenv.jit.intrinsics import prefetch_for_write, wait_for_team
 from flockenv.jit.section import section
 from flockenv.jit.transpose import out_of_records, put_records
 from flockenv.maths.vectors import unit
 
 if TYPE_CHECKING:
-    from flockenv.engine.kernel_plan import Parts
+    from flockenv.engine.kernel_plan import KernelPlan
 
 __all__ = ["Listing", "list_living", "listing_of", "walk_blocks"]
 
@@ -114,7 +114,7 @@ class Listing(NamedTuple):
         return tuple(f"{letter}{k}" for k in range(self.dimension))
 
 
-def listing_of(parts: Parts, fields: list[str], inside: bool = False, tiled: bool = False) -> Listing:
+def listing_of(parts: KernelPlan, fields: list[str], inside: bool = False, tiled: bool = False) -> Listing:
     """Return how the agents of a scene are listed, with these fields of each."""
     slots = tuple((name, place * parts.width) for name, place in parts.slots.items())
     return Listing(
@@ -263,7 +263,7 @@ def _sort(plan: Listing) -> Callable[..., None]:
                 later = np.uint64(min(block + AHEAD, np.uint64(context.end - 1)) * np.uint64(width))
                 for lane in range(np.uint64(width)):
                     there = np.uint64(offset[rank, np.uint64(max(cell[later + lane], np.int32(0)))])
-                    ask_for(records, there * length)
+                    prefetch_for_write(records, there * length)
             if wraps:  # a stage of a method may have moved agents out of the box
                 for lane in range(np.uint64(width)):
                     x = gather(pos, base + lane, vector)

@@ -9,7 +9,7 @@ from flockenv.engine.shape_rows import Surroundings
 from flockenv.jit.decorators import Law
 
 if TYPE_CHECKING:
-    from flockenv.engine.kernel_plan import Parts
+    from flockenv.engine.kernel_plan import KernelPlan
 
 __all__ = ["Fold", "Obstacles", "Place", "Shape", "obstacle_plan"]
 
@@ -65,7 +65,7 @@ class Shape(NamedTuple):
     out: Any  # the outward unit normal there
 
 
-def obstacle_plan(parts: Parts, agent: AgentPlan) -> Obstacles:
+def obstacle_plan(parts: KernelPlan, agent: AgentPlan) -> Obstacles:
     """Return the plan of a scene."""
     d, width, slots, around = parts.dimension, parts.width, parts.slots, parts.surroundings
 

@@ -22,7 +22,7 @@ MOST_NUMBERS = 2**24
 
 
 class MetObstacles:
-    """The part of `Parts` that is about obstacles."""
+    """The part of `KernelPlan` that is about obstacles."""
 
     dimension: int
     space: Space
@@ -34,11 +34,11 @@ class MetObstacles:
 
         @functools.cached_property
         def sights(self) -> list[Sight]:
-            """See Parts."""
+            """See KernelPlan."""
 
         @property
         def number_plan(self) -> NumberPlan:
-            """See Parts."""
+            """See KernelPlan."""
 
     @functools.cached_property
     def shaped(self) -> tuple[NDArray[np.float64], dict[str, tuple[int, int]]]:

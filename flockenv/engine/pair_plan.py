@@ -10,7 +10,7 @@ from flockenv.engine.shape_rows import Surroundings
 from flockenv.jit.decorators import Law
 
 if TYPE_CHECKING:
-    from flockenv.engine.kernel_plan import Parts
+    from flockenv.engine.kernel_plan import KernelPlan
 
 __all__ = ["PairLaw", "Pairs", "View", "pairs_of"]
 
@@ -70,7 +70,7 @@ class Pairs(NamedTuple):
         return tuple(first + k * self.lanes for k in range(count))
 
 
-def pairs_of(parts: Parts) -> Pairs:
+def pairs_of(parts: KernelPlan) -> Pairs:
     """Return what the loop over the neighbours of a scene depends on."""
     listing = listing_of(parts, parts.sorted_fields, parts.confines, parts.arranges)
     fovs = [sight.fov for sight in parts.sights]

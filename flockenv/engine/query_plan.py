@@ -8,7 +8,7 @@ from flockenv.engine.neighbour_lists import Listing, listing_of
 from flockenv.jit.decorators import Law
 
 if TYPE_CHECKING:
-    from flockenv.engine.kernel_plan import Parts
+    from flockenv.engine.kernel_plan import KernelPlan
 
 __all__ = ["LookPlan", "Looking", "Nearest", "Span", "plan_look"]
 
@@ -34,7 +34,7 @@ class LookPlan(NamedTuple):
         return tuple(int(self.listing.slot(f"{name}{k}")) for k in range(count))
 
 
-def plan_look(parts: Parts) -> LookPlan:
+def plan_look(parts: KernelPlan) -> LookPlan:
     """Return what `look` depends on for a task whose parts have a look."""
     look, exact = parts.look, parts.keyed or any(sight.nearest for sight in parts.sights)
     assert look is not None

@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flockenv.engine.blocks import handed_of, place_of
-from flockenv.engine.kernel_plan import Parts
+from flockenv.engine.kernel_plan import KernelPlan
 from flockenv.engine.lane_access import gather, picked, places_each, scatter_each
 from flockenv.engine.scratch import array_names
 from flockenv.geometry.cell_list import FEWEST_ARRANGED, STEPS_ARRANGED, WORTH_ARRANGING
 from flockenv.geometry.spatial_sort import count_tiles, find_homes
-from flockenv.jit.intrinsics import ask_for, wait_for_team
+from flockenv.jit.intrinsics import prefetch_for_write, wait_for_team
 from flockenv.jit.section import section
 from flockenv.jit.transpose import put_lines
 
@@ -55,7 +55,7 @@ class ArrangePlan(NamedTuple):
     size: int  # numbers of a packed agent, in whole cache lines
 
 
-def arrange_plan(parts: Parts) -> ArrangePlan:
+def arrange_plan(parts: KernelPlan) -> ArrangePlan:
     """Return the plan of a scene."""
     names = array_names(parts)
     packed = [field.partition(" ") for field in parts.luggage]  # an array, and for vectors the axis
@@ -137,7 +137,7 @@ def _carry(plan: ArrangePlan, to_tiles: bool) -> Callable[..., None]:
             put_lines(luggage, sources, places_each(starts, which, further), width, cell, row, count, np.uint64(n))
         wait_for_team(scratch.sync, team)
         for i in range(np.uint64(first * width), np.uint64(min(end * width, n))):
-            ask_for(luggage, (i + np.uint64(AHEAD)) * wide)
+            prefetch_for_write(luggage, (i + np.uint64(AHEAD)) * wide)
             unpack(scratch, sources, i, place_in(i))
 
     return carry

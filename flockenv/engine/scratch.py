@@ -18,7 +18,7 @@ from flockenv.geometry.spatial_sort import HOME
 from flockenv.jit.section import record
 
 if TYPE_CHECKING:
-    from flockenv.engine.kernel_plan import Parts
+    from flockenv.engine.kernel_plan import KernelPlan
 
 __all__ = ["GIVEN", "OWN", "SMALL_STRIDE", "Array", "array_names", "scratch_bytes", "scratch_of", "scratch_record"]
 
@@ -35,7 +35,7 @@ Array = tuple[tuple[int, ...], Any]
 """Shape and dtype."""
 
 
-def scratch_of(parts: Parts, agents: int, team: int = 1) -> dict[str, Array]:
+def scratch_of(parts: KernelPlan, agents: int, team: int = 1) -> dict[str, Array]:
     """Return the arrays that a team of threads needs to step one world, in order; those of `OWN` for one thread."""
     real, d, width = np.dtype(parts.dtype), parts.dimension, parts.width
     padded = -(-agents // width) * width
@@ -68,7 +68,7 @@ def scratch_of(parts: Parts, agents: int, team: int = 1) -> dict[str, Array]:
     return found | {"lanes": ((len(parts.slots) * width,), real)}
 
 
-def _of_the_query(parts: Parts, agents: int, team: int) -> dict[str, Array]:
+def _of_the_query(parts: KernelPlan, agents: int, team: int) -> dict[str, Array]:
     """Return what finding neighbours needs: small worlds are listed in rows, others in cells, as records."""
     real, whole, width = np.dtype(parts.dtype), np.dtype(np.int32), parts.width
     padded = -(-agents // width) * width
@@ -88,7 +88,7 @@ def _of_the_query(parts: Parts, agents: int, team: int) -> dict[str, Array]:
     }
 
 
-def _of_tiles(parts: Parts, agents: int) -> dict[str, Array]:
+def _of_tiles(parts: KernelPlan, agents: int) -> dict[str, Array]:
     """Return what reordering a large world needs."""
     whole, width = np.dtype(np.int32), parts.width
     many = agents >= FEWEST_ARRANGED
@@ -102,7 +102,7 @@ def _of_tiles(parts: Parts, agents: int) -> dict[str, Array]:
     return found
 
 
-def _of_trees(parts: Parts, agents: int, team: int) -> dict[str, Array]:
+def _of_trees(parts: KernelPlan, agents: int, team: int) -> dict[str, Array]:
     """Return what a tree of agents needs, for laws about all agents."""
     real, long, width = np.dtype(parts.dtype), np.dtype(np.int64), parts.width
     padded = -(-agents // width) * width
@@ -117,17 +117,17 @@ def _of_trees(parts: Parts, agents: int, team: int) -> dict[str, Array]:
     }
 
 
-def scratch_record(parts: Parts) -> Any:
+def scratch_record(parts: KernelPlan) -> Any:
     """Return the type of the record of all arrays for the kernels of a scene; its `inner` is a tuple of arrays."""
     names = [name for name in scratch_of(parts, parts.width) if not name.startswith("inner")]
     return record((*names, *["inner"] * bool(parts.inner)))
 
 
-def array_names(parts: Parts) -> tuple[str, ...]:
+def array_names(parts: KernelPlan) -> tuple[str, ...]:
     """Return the names of all arrays of a world in progress, in the order of `blocks.handed_of` and of scratch."""
     return ("pos", "vel", *(f"inner{k}" for k in range(len(parts.inner))), *scratch_record(parts)._fields)
 
 
-def scratch_bytes(parts: Parts, agents: int) -> int:
+def scratch_bytes(parts: KernelPlan, agents: int) -> int:
     """Return how many bytes the arrays take for one thread."""
     return sum(math.prod(shape) * kind.itemsize for shape, kind in scratch_of(parts, agents).values())

@@ -24,7 +24,7 @@ from flockenv.engine.accelerations import (
 from flockenv.engine.agent_records import AgentPlan, agent_plan, alone_of
 from flockenv.engine.blocks import place_of, vector_of_lane
 from flockenv.engine.context import Context
-from flockenv.engine.kernel_plan import Parts
+from flockenv.engine.kernel_plan import KernelPlan
 from flockenv.engine.lane_access import gather
 from flockenv.engine.law_calls import OneLaw, laws_of, says_of
 from flockenv.engine.load_store import bring_in_of, bring_inside_of, bring_out_of, take_drive_of
@@ -33,7 +33,7 @@ from flockenv.engine.move import MovePlan, move_of, move_plan
 from flockenv.engine.parameters import NumberPlan, numbers_of
 from flockenv.engine.reorder import ArrangePlan, arrange_plan, go_home_of, move_in_of
 from flockenv.jit.decorators import Law, finite, kernel, like
-from flockenv.jit.intrinsics import ask_for, wait_for_team
+from flockenv.jit.intrinsics import prefetch_for_write, wait_for_team
 from flockenv.jit.section import in_turn, section
 from flockenv.maths.vectors import zero
 from flockenv.model.state import COUNTED_BY_KERNELS
@@ -63,11 +63,11 @@ class StepPlan(NamedTuple):
     method_plan: MethodPlan
     tells: bool  # True if `sense` runs at the beginning of a step, for inner states
     ahead: tuple[int, ...]  # numbers of a block in `pos`, `vel`, `felt` and `ident`, to be prefetched; or empty
-    trusts: bool  # True if every agent has a finite position until a step has failed, see Parts.trusts
+    trusts: bool  # True if every agent has a finite position until a step has failed, see KernelPlan.trusts
     spreads: bool  # True if a NaN position reaches every neighbour within one step
 
 
-def step_plan(parts: Parts) -> StepPlan:
+def step_plan(parts: KernelPlan) -> StepPlan:
     """Return the plan of a scene."""
     d, w = parts.dimension, parts.width
     method = None if parts.one_stage else parts.integrator.advance()
@@ -137,7 +137,7 @@ def _asking(many: int, width: int) -> Callable[[Any, Any], None]:
 @kernel
 def _ask_all(array: Any, at: Any, places: Any) -> None:
     for place in places:
-        ask_for(array, at + np.uint64(place))
+        prefetch_for_write(array, at + np.uint64(place))
 
 
 @section

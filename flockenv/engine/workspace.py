@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.engine import GIVEN, OWN, Parts, Table, scratch_of
+from flockenv.engine import GIVEN, OWN, KernelPlan, Table, scratch_of
 from flockenv.jit.cpu import LINE
 from flockenv.model.state import Body
 from flockenv.physics.effects.effect import ties
@@ -36,7 +36,7 @@ class Workspace:
     _given: dict[tuple[int, Any], Any] = field(default_factory=dict)
 
     @classmethod
-    def allocate(cls, parts: Parts, body: Body, table: Table, team: int = 1) -> Workspace:
+    def allocate(cls, parts: KernelPlan, body: Body, table: Table, team: int = 1) -> Workspace:
         """Return scratch for neighbours, queries and the integrator: the arrays of engine.scratch.scratch_of."""
         agents, wanted = len(body.mass), scratch_of(parts, len(body.mass), team)
         made = _zeros({name: array for name, array in wanted.items() if name not in (*OWN, *GIVEN)})

@@ -19,9 +19,9 @@ from flockenv.engine.workspace import Workspace
 from flockenv.jit.buffer_pool import Recycler
 from flockenv.jit.cpu import LINE
 from flockenv.jit.memory import zeros
-from flockenv.jit.section import settled
+from flockenv.jit.section import without_dispatch
 from flockenv.jit.simd_rows import PAIR, apart
-from flockenv.jit.thread_pool import LARGEST, Choices, at_work, share
+from flockenv.jit.thread_pool import LARGEST, AutoTuners, at_work, share
 from flockenv.maths.counter_rng import MASK, keys_of
 from flockenv.model import state as states
 from flockenv.model.snapshot import Snapshot
@@ -137,7 +137,7 @@ class World:
         )  # fmt: skip
         self._counted = (self.steps, np.array(numbers[1], float), self._last, self._sums)
         self._alone = np.empty((len(task.metric_names), 1))  # metrics of one world
-        self._scratch, self._choices = [self._allocate()], Choices()
+        self._scratch, self._tuners = [self._allocate()], AutoTuners()
         self._hire()
 
     def _hire(self) -> None:
@@ -217,7 +217,7 @@ class World:
         begun = self.worlds if into is None else int(np.count_nonzero(rows))
         self._play(False, rows, into is None, begun, 0, Results(observation, *self._untold), self._actions)
         if self._enter is self._entries[0]:
-            self._enter = settled(self._enter)  # types stay what they were in this call
+            self._enter = without_dispatch(self._enter)  # types stay what they were in this call
             self._hire()
         for numbers in (self._sums, self._last, self.paid):
             numbers[rows] = 0
@@ -328,7 +328,7 @@ class World:
         def shared() -> tuple[int, int]:
             return self._shared(crew, acting, mask, everyone, limit, told, actions)
 
-        choice = self._choices.of("deciding" if acting else "beginning", work, crew)
+        choice = self._tuners.of("deciding" if acting else "beginning", work, crew)
         return choice.made(functools.partial(self._calls[0], *whole), shared, work >= LARGEST)
 
     def _shared(
@@ -403,7 +403,7 @@ class World:
         """Write the metrics of as many worlds as there is room for, (K, B)."""
         self._tell(*self._counted, first, told)
         if self._tell is self._entries[1]:
-            self._tell = settled(self._tell)
+            self._tell = without_dispatch(self._tell)
 
     def snapshot(self, world: int = 0) -> Snapshot:
         """Return one world at this instant, for pictures."""

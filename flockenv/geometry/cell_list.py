@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from flockenv.geometry.space import torus_confine
 from flockenv.jit.decorators import kernel
-from flockenv.jit.intrinsics import ask_for, wait_for_team
+from flockenv.jit.intrinsics import prefetch_for_write, wait_for_team
 
 __all__ = [
     "AHEAD", "DISTANT", "FEWEST_AGENTS", "FEWEST_ARRANGED", "FINEST", "MAX_RANGES", "STEPS_ARRANGED",
@@ -359,7 +359,7 @@ def order_records(
     size, count, last = np.uint64(length), np.uint64(0), np.uint64(end)
     before = _key(records, cell, ident, np.uint64(first) * size)
     for k in range(np.uint64(first) + np.uint64(1), last):
-        ask_for(records, (k + np.uint64(AHEAD)) * size)
+        prefetch_for_write(records, (k + np.uint64(AHEAD)) * size)
         key = _key(records, cell, ident, k * size)
         late[count] = np.int32(k)
         count += np.uint64(1) if key < before else np.uint64(0)

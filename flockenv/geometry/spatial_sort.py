@@ -13,7 +13,7 @@ import numpy as np
 
 from flockenv.geometry.cell_list import Ints, begin_cells, cell_of, count_folded, crowded, divided, tally_cells
 from flockenv.jit.decorators import kernel
-from flockenv.jit.intrinsics import ask_for
+from flockenv.jit.intrinsics import prefetch_for_write
 
 __all__ = [
     "FAR_FROM_HOME", "HOME", "TILE", "count_from_home", "count_tiles", "find_homes", "order_cells", "order_shared",
@@ -139,8 +139,8 @@ def count_from_home(
         for block in range(np.uint64(begin), np.uint64(until)):
             at, later = block * np.uint64(HOME), block + np.uint64(ASKED)
             for k in range(d):
-                ask_for(pos, (later * d + k) * w)
-            ask_for(cell, later * w)
+                prefetch_for_write(pos, (later * d + k) * w)
+            prefetch_for_write(cell, later * w)
             first_of_two = np.uint64(homes[at])
             x0, y0, z0 = _corner(homes, at + np.uint64(1))
             x1, y1, z1 = _corner(homes, at + np.uint64(4))
@@ -188,12 +188,12 @@ def order_cells(
     mine = np.uint64(rank * offset.shape[1])
     for m in range(np.uint64(begin), last):
         c = _later(listed, m, AHEAD[0], last)
-        ask_for(start, c)
-        ask_for(offset, mine + c)
-        ask_for(records, np.uint64(start[_later(listed, m, AHEAD[1], last)]) * size)
+        prefetch_for_write(start, c)
+        prefetch_for_write(offset, mine + c)
+        prefetch_for_write(records, np.uint64(start[_later(listed, m, AHEAD[1], last)]) * size)
         c = _later(listed, m, AHEAD[2], last)
         for k in range(np.uint64(start[c]), np.uint64(min(start[c + np.uint64(1)], start[c] + FEW))):
-            ask_for(ident, np.uint64(records[k * size]))
+            prefetch_for_write(ident, np.uint64(records[k * size]))
         c = np.uint64(listed[m])
         first, beyond = start[c], start[c + np.uint64(1)]
         alone = (offset[rank, c] == beyond) & ((rank == 0) | (offset[before, c] == first))

@@ -21,10 +21,10 @@ from flockenv.jit.cpu import LINE
 from flockenv.jit.decorators import IN_PYTHON, kernel
 
 __all__ = [
-    "ask_for",
     "asked",
     "copy_lanes",
     "intrinsic_or_python",
+    "prefetch_for_write",
     "stacked",
     "tallied",
     "tally_of",
@@ -114,7 +114,7 @@ def asked(builder: Any, address: Any) -> None:
     builder.call(prefetch, [builder.bitcast(address, byte), flag(1), flag(3), flag(1)])  # to write; near; data
 
 
-def _ask_for(typing_context: Any, array: Any, place: Any) -> Any:
+def _prefetch_for_write(typing_context: Any, array: Any, place: Any) -> Any:
     """Prefetch the cache line of array[place], with a flat index, which is written soon.
 
     Accesses in random order wait for one line after another; prefetched early, the lines are loaded in parallel.
@@ -129,7 +129,7 @@ def _ask_for(typing_context: Any, array: Any, place: Any) -> Any:
     return types.void(array, types.uint64), generate
 
 
-ask_for: Any = intrinsic_or_python(_ask_for, lambda array, place: None)
+prefetch_for_write: Any = intrinsic_or_python(_prefetch_for_write, lambda array, place: None)
 
 
 def _stacked(typing_context: Any, numbers: Any) -> Any:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from flockenv.jit.cpu import LINE
 from flockenv.jit.intrinsics import asked, intrinsic_or_python
 
-__all__ = ["array_of", "fetch", "in_one_piece", "pour", "put_past", "settle", "zeros"]
+__all__ = ["array_of", "in_one_piece", "prefetch", "put_past", "store_fence", "stream_store", "zeros"]
 
 
 def zeros(shape: int | tuple[int, ...], dtype: Any = np.float64) -> NDArray[Any]:
@@ -43,7 +43,7 @@ def array_of(context: Any, builder: Any, kind: Any, value: Any = None) -> Any:
     return make(kind)(context, builder, value) if value is not None else make(kind)(context, builder)
 
 
-def _fetch(typing_context: Any, array: Any, part: Any, parts: Any) -> Any:
+def _prefetch(typing_context: Any, array: Any, part: Any, parts: Any) -> Any:
     """Prefetch part number `part` of `parts` of a contiguous array that is written soon.
 
     Rows are written in one go, and a store waits for a line that is not in a cache. Prefetching all lines at once would
@@ -70,7 +70,7 @@ def _fetch(typing_context: Any, array: Any, part: Any, parts: Any) -> Any:
     return types.void(array, part, parts), generate
 
 
-fetch: Any = intrinsic_or_python(_fetch, lambda array, part, parts: None)
+prefetch: Any = intrinsic_or_python(_prefetch, lambda array, part, parts: None)
 
 
 def put_past(builder: Any, vector: Any, place: Any, size: int) -> None:
@@ -82,10 +82,11 @@ def put_past(builder: Any, vector: Any, place: Any, size: int) -> None:
     stored.set_metadata("nontemporal", builder.module.add_metadata([ir.IntType(32)(1)]))
 
 
-def _poured(typing_context: Any, to: Any, at: Any, source: Any) -> Any:
+def _stream_store(typing_context: Any, to: Any, at: Any, source: Any) -> Any:
     """Copy an array into `to`, from flat index `at` on, by streaming stores; both are contiguous.
 
-    Whole cache lines bypass the caches; a partial line at either end does not. Other threads see all after `settle`.
+    Whole cache lines bypass the caches; a partial line at either end does not. Other threads see all after
+    `store_fence`.
     """
     in_one_piece(to)
     in_one_piece(source)
@@ -116,14 +117,14 @@ def _poured(typing_context: Any, to: Any, at: Any, source: Any) -> Any:
     return types.void(to, types.uint64, source), generate
 
 
-def _poured_in_python(to: Any, at: Any, source: Any) -> None:
+def _stream_store_in_python(to: Any, at: Any, source: Any) -> None:
     to.reshape(-1)[int(at) : int(at) + source.size] = source.reshape(-1)
 
 
-pour: Any = intrinsic_or_python(_poured, _poured_in_python)
+stream_store: Any = intrinsic_or_python(_stream_store, _stream_store_in_python)
 
 
-def _settled(typing_context: Any) -> Any:
+def _store_fence(typing_context: Any) -> Any:
     """Wait until all stores, streaming stores included, are visible to other threads."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -133,4 +134,4 @@ def _settled(typing_context: Any) -> Any:
     return types.void(), generate
 
 
-settle: Any = intrinsic_or_python(_settled, lambda: None)
+store_fence: Any = intrinsic_or_python(_store_fence, lambda: None)

@@ -41,11 +41,11 @@ __all__ = [
     "joined_from",
     "record",
     "section",
-    "settled",
     "several",
     "titled",
     "tuple_from",
     "vector",
+    "without_dispatch",
 ]
 
 _njit: Any = numba.njit  # numba's stubs do not know `_nrt`
@@ -77,7 +77,7 @@ def entry_of(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[
     return made
 
 
-def settled(function: Any) -> Callable[..., Any]:
+def without_dispatch(function: Any) -> Callable[..., Any]:
     """Return a compiled entry point without numba's type dispatch, which takes half of the time of a short call.
 
     The caller must pass the same argument types each time, with contiguous arrays: types are not checked any more. A

@@ -37,7 +37,7 @@ def sources_of_code() -> Iterator[tuple[Path, bytes]]:
     """Yield path and content of every source of the package that defines laws or their records, or compiles them."""
     for path in sorted(PACKAGE.rglob("*.py")):
         text = path.read_bytes()
-        if b"flockenv.jit" in text or path.relative_to(PACKAGE).parts[0] in ("jit", "engine", "sweep", "tasks"):
+        if b"flockenv.jit" in text or path.relative_to(PACKAGE).parts[0] in ("jit", "engine", "tasks"):
             yield path, text
 
 

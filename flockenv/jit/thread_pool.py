@@ -2,7 +2,7 @@
 
 The default is one thread: waiting threads spin, which costs more than it gains if another process uses the second core.
 Set it by `use_threads(2)`, or FLOCKENV_THREADS=2 in the environment. Results do not depend on the number. Work is
-distributed if that is faster (`Choice`): handing it over takes 20 microseconds, or 100 on a virtual machine. More
+distributed if that is faster (`AutoTuner`): handing it over takes 20 microseconds, or 100 on a virtual machine. More
 threads than cores would only wait for each other, so there are never more at work.
 
 On Linux the pool's threads avoid the core of the calling thread: woken after a pause, they are often scheduled there,
@@ -21,7 +21,7 @@ from collections.abc import Callable, Sequence
 from time import perf_counter
 from typing import Any, TypeVar
 
-__all__ = ["Choice", "Choices", "at_work", "share", "threads", "use_threads"]
+__all__ = ["AutoTuner", "AutoTuners", "at_work", "share", "threads", "use_threads"]
 
 T = TypeVar("T")
 
@@ -43,7 +43,7 @@ RISE = 1.25
 """Largest factor by which one measurement raises a time, so that a single disturbance counts little."""
 
 
-class _Crew:
+class _ThreadPool:
     """Pool of threads that wait for work; created when first needed, and again in a forked process, which has none."""
 
     def __init__(self, count: int) -> None:
@@ -105,7 +105,7 @@ def _work(desk: queue.SimpleQueue[Any]) -> None:
 
 _count = 1
 _cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-_crew: _Crew | None = None
+_crew: _ThreadPool | None = None
 _in_python = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")  # numba itself takes long to import
 
 
@@ -130,12 +130,12 @@ def use_threads(count: int) -> None:
     _count = count
 
 
-def _crew_of(count: int) -> _Crew:
+def _crew_of(count: int) -> _ThreadPool:
     """Return a pool for `count` threads; two callers at once may create two, and each uses its own."""
     global _crew
     crew = _crew
     if crew is None or crew.pid != os.getpid() or len(crew.desks) < count - 1:
-        crew = _crew = _Crew(max(count, _count))
+        crew = _crew = _ThreadPool(max(count, _count))
     return crew
 
 
@@ -159,7 +159,7 @@ def share(jobs: Sequence[Callable[[], Any]]) -> list[Any]:
     return [first, *(result for result, _ in rest)]
 
 
-class Choice:
+class AutoTuner:
     """Choice between one thread and several for work of one kind and size; both are timed, and rarely timed again.
 
     Which is faster depends on how the system wakes threads and on the load of its cores, so it is measured. The first
@@ -224,13 +224,13 @@ class Choice:
             self._wait = self._pause
 
 
-class Choices(dict[tuple[Any, ...], Choice]):
-    """A `Choice` for each kind and size of work, with sizes in powers of two, and number of threads."""
+class AutoTuners(dict[tuple[Any, ...], AutoTuner]):
+    """A `AutoTuner` for each kind and size of work, with sizes in powers of two, and number of threads."""
 
-    def of(self, kind: str, work: int, count: int) -> Choice:
+    def of(self, kind: str, work: int, count: int) -> AutoTuner:
         """Return the choice for `work` agent steps and `count` threads."""
         key = kind, work.bit_length(), count
-        return self.get(key) or self.setdefault(key, Choice())
+        return self.get(key) or self.setdefault(key, AutoTuner())
 
 
 def _from_environment() -> None:

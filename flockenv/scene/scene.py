@@ -24,7 +24,7 @@ from flockenv.behaviours.steer import EVERY_EFFECT
 from flockenv.core.magnitudes import check_numbers
 from flockenv.core.record import Record, keep
 from flockenv.engine import (
-    Parts,
+    KernelPlan,
     Table,
     begin_of,
     field_of,
@@ -41,7 +41,7 @@ from flockenv.geometry.barnes_hut import MOST_DIRECT
 from flockenv.geometry.cell_list import FEWEST_AGENTS
 from flockenv.geometry.shapes import AnyShape, Circle, HalfSpace, Shape
 from flockenv.geometry.space import AnySpace, Box, Plane, Torus
-from flockenv.jit.thread_pool import LARGEST, Choices, at_work, share
+from flockenv.jit.thread_pool import LARGEST, AutoTuners, at_work, share
 from flockenv.maths.counter_rng import MASK, key_of
 from flockenv.model import state as states
 from flockenv.model.appearance import Appearance
@@ -325,14 +325,14 @@ class Scene(Record):
         return Body(mass, radius, fastest, per_agent("max_force"), pace, *turning)
 
     @functools.cached_property
-    def parts(self) -> Parts:
+    def parts(self) -> KernelPlan:
         """The kernel plan: all that the kernel is compiled from."""
         sorts = self.agents >= FEWEST_AGENTS
         crowded = self.agents > MOST_DIRECT
         effects = flattened(self.effects)
         walled = any(isinstance(constraint, Collisions) and constraint.obstacles for constraint in self.constraints)
         space = Plane() if walled and isinstance(self.space, Box) else self.space  # its walls are then obstacles
-        return Parts(
+        return KernelPlan(
             self.dimension, space, effects, self.integrator, self.dtype, sorts, crowded=crowded,
             oriented=any(group.keeps_heading for group in self.groups),
             turns=any(group.max_turn_rate is not None for group in self.groups),
@@ -588,7 +588,7 @@ class Scene(Record):
             parts = zip(self._settlers(crew), bounds[:-1], bounds[1:], strict=False)
             return [bad for found in share([functools.partial(settle, *part) for part in parts]) for bad in found]
 
-        return alone() if crew <= 1 else self._choices.of("mending", work, crew).made(alone, shared, work >= LARGEST)
+        return alone() if crew <= 1 else self._tuners.of("mending", work, crew).made(alone, shared, work >= LARGEST)
 
     def _settlers(self, count: int) -> list[list[Settler]]:
         """Return the constraints and population of `count` threads, each with scratch memory of its own."""
@@ -626,7 +626,7 @@ class Scene(Record):
 
         work = worlds * agents * steps
         surely = work >= LARGEST and (team == 1 or agents >= SURELY_TOGETHER)
-        return self._choices.of("together" if team > 1 else "apart", work, crew).made(alone, shared, surely)
+        return self._tuners.of("together" if team > 1 else "apart", work, crew).made(alone, shared, surely)
 
     def _divided(self, worlds: int, agents: int) -> tuple[int, int]:
         """Return the number of threads that may step these worlds, and the number that share each world.
@@ -681,7 +681,7 @@ class Scene(Record):
         return np.dtype(self.dtype).type(self.dt)
 
     @functools.cached_property
-    def _plain_parts(self) -> Parts:
+    def _plain_parts(self) -> KernelPlan:
         """The kernel plan for accelerations alone: independent of the integrator, and agents may be at NaN."""
         return dataclasses.replace(self.parts, integrator=SemiImplicitEuler(), stepped=False)
 
@@ -710,9 +710,9 @@ class Scene(Record):
         return found
 
     @property
-    def _choices(self) -> Choices:
+    def _tuners(self) -> AutoTuners:
         """Measurements, by the calling thread, of whether work is faster on one thread or on several."""
-        found: Choices = vars(self._threads).setdefault("choices", Choices())
+        found: AutoTuners = vars(self._threads).setdefault("choices", AutoTuners())
         return found
 
     @functools.cached_property

@@ -11,7 +11,7 @@ import numpy as np
 from flockenv.engine import begin_inner_of, look_of, step_world_of
 from flockenv.engine.lane_access import gather
 from flockenv.jit.decorators import kernel, like, replaced
-from flockenv.jit.memory import fetch, pour
+from flockenv.jit.memory import prefetch, stream_store
 from flockenv.jit.section import record, section
 from flockenv.jit.simd_rows import columns, into_rows, packed, take
 from flockenv.maths.heading import face
@@ -224,9 +224,9 @@ def _ask_ahead(dimension: int) -> Callable[..., None]:
 
     def ask_ahead(w: Any, actions: Any, following: int) -> None:
         for k in range(dimension):
-            fetch(w.x[k, following], 0, 1)
-            fetch(w.v[k, following], 0, 1)
-        fetch(actions[following], 0, 1)
+            prefetch(w.x[k, following], 0, 1)
+            prefetch(w.v[k, following], 0, 1)
+        prefetch(actions[following], 0, 1)
 
     return ask_ahead
 
@@ -237,10 +237,10 @@ def _ask_for_sums(terms: int) -> Callable[..., None]:
 
     def ask_for_sums(totals: Any, results: Any, everyone: bool, b: int) -> None:
         for k in range(terms):
-            fetch(totals.paid[k, b], 0, 1)
+            prefetch(totals.paid[k, b], 0, 1)
         for k in range(terms if everyone else 0):
-            fetch(results.terms[k, b], 0, 1)
-        fetch(results.payment[b], 0, 1)
+            prefetch(results.terms[k, b], 0, 1)
+        prefetch(results.payment[b], 0, 1)
 
     return ask_for_sums
 
@@ -257,12 +257,12 @@ def act_of(plan: Plan) -> Callable[..., Any]:
     ) -> Any:  # fmt: skip
         decide(p, w, made, now, listed, action, results.over, b)
         if shows and not past:  # here and there, for it is written at the end
-            fetch(results.rows[b], 0, 4)
+            prefetch(results.rows[b], 0, 4)
         bad = step_world(w, made.force, 0, given.params, dt, count, b, 0, 1, scratch)
         w.steps[b] += 1
         if shows:
             if not past:
-                fetch(results.rows[b], 1, 4)
+                prefetch(results.rows[b], 1, 4)
             ask_for_sums(totals, results, everyone, b)
         return bad
 
@@ -297,10 +297,10 @@ def answer_of(plan: Plan) -> Callable[..., None]:
         mortal: bool, everyone: bool, past: bool, limit: int, following: int, b: int,
     ) -> None:  # fmt: skip
         if shows and not past:
-            fetch(results.rows[b], 2, 4)
+            prefetch(results.rows[b], 2, 4)
         reward(p, before, wide, action, earns)
         if shows and not past:
-            fetch(results.rows[b], 3, 4)
+            prefetch(results.rows[b], 3, 4)
         ask_ahead(w, actions, following)
         judge(p, w, before, wide, totals, results, mortal, limit, b)
         pay(earns, totals, results, everyone, b)
@@ -322,7 +322,7 @@ def show_of(plan: Plan) -> Callable[..., None]:
             into_rows(seen, beside, many, far)
         observe(p, now, seen)
         if past:
-            pour(rows, np.uint64(b) * np.uint64(seen.size), seen)
+            stream_store(rows, np.uint64(b) * np.uint64(seen.size), seen)
 
     return show
 

@@ -16,7 +16,7 @@ import numpy as np
 from flockenv.engine import begin_plan, plan_look, step_plan
 from flockenv.jit.decorators import Law, finite, kernel
 from flockenv.jit.intrinsics import unaliased
-from flockenv.jit.memory import settle
+from flockenv.jit.memory import store_fence
 from flockenv.jit.section import digest_of, entry_of
 from flockenv.jit.simd_rows import apart, columns, in_one_row, packed
 from flockenv.tasks.decision import (
@@ -190,7 +190,7 @@ def _play(plan: Plan) -> Callable[..., tuple[int, int]]:
                 )  # fmt: skip
             show(p, now, wide, made, rounded, results.rows, past, b)
         if past:
-            settle()
+            store_fence()
         return broken, who
 
     return play

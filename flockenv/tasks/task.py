@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv.core.record import Record
-from flockenv.engine import Look, Parts
+from flockenv.engine import KernelPlan, Look
 from flockenv.model.snapshot import Mark
 from flockenv.model.state import State
 from flockenv.physics.integrators import INTEGRATORS, SemiImplicitEuler
@@ -190,7 +190,7 @@ class Task(Record):
         return ()
 
     @functools.cached_property
-    def parts(self) -> Parts:
+    def parts(self) -> KernelPlan:
         """What its kernel is made of: the scene's parts, and the look."""
         if self.scene.constraints:
             kinds = ", ".join(constraint.kind for constraint in self.scene.constraints)
