@@ -41,7 +41,7 @@ def _rewards(task: Task) -> str:
 def _infos(task: Task) -> str:
     rows = [
         (_quoted(reward_keys(task)), "each term of the reward of this step"),
-        ("`is_success`", "True if the task counts as a success so far"),
+        ("`is_success`", "True if the episode so far is a success"),
         (_quoted(task.metric_names), "metrics of the episode so far, if they have a value"),
         ("`seed`", "the seed of the world, only in the info of a reset"),
     ]

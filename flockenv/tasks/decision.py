@@ -173,7 +173,7 @@ def _widened(plan: Plan) -> Callable[..., Any]:
 
 @section
 def _judge(plan: Plan) -> Callable[..., None]:
-    """Return a function that finds ends and success of world b, and adds its measures; if `mortal`, ended agents die."""
+    """Return a function that finds ends and success of world b, and sums measures; if `mortal`, ended agents die."""
     ended, measure, lasting, by_name = plan.kernels.ended, plan.kernels.measure, plan.lasting, by_name_of(plan.measures)
 
     def judge(

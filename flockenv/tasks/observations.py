@@ -95,7 +95,7 @@ def put_crowding(
 
 
 def neighbour_slots(count: int, sight: float, most_relative: float, who: str, crowding: bool) -> tuple[Slot, ...]:
-    """Return the slots of a row for the nearest agents; `most_relative` m/s is the scale of their relative velocities.
+    """Return the slots of the nearest agents in a row; `most_relative`, m/s, scales relative velocities.
 
     crowding: add unit vectors towards them, scaled by closeness.
     """
@@ -116,7 +116,7 @@ def compass(rays: int) -> tuple[float, ...]:
 
 @kernel
 def block_ways(row: Any, at: int, rays: int, table: Any, to: Any, ahead: Any, clearance: float, sight: float) -> None:
-    """Shorten the free paths in row[at : at + rays], in units of `sight` m, by an obstacle at `to` m, if it is in sight.
+    """Shorten the free paths in row[at : at + rays], in units of `sight` m, by an obstacle at `to` m, if in sight.
 
     Paths lead in the directions of `compass`, passed as `table`, rotated so that the first is `ahead`, a unit vector.
     """

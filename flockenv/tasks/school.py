@@ -381,12 +381,11 @@ def _show(p: Any, frame: Frame, i: int, first: int, end: int, slots: int, row: A
 class School(Task):
     """Fish with one shared policy (or one among scripted fish) live in a tank with patches of food and hunters.
 
-    Hunger grows with time and effort. A fish within `reach` of a patch eats of it; the patch regrows logistically. A fish
-    sees within a view angle of `fov`, 300 degrees by default. A hungry hunter pursues the nearest fish; it is faster
-    than a fish, but turns more slowly. A fed hunter does not pursue until it is hungry again. A fish that is caught or
-    starves terminates; the others go on. Success: at least half of the learners live. Hunger and fear follow Tu and
-    Terzopoulos (1994; see flockenv.steering.motivation); scripted fish are their state machine: flee, school, forage,
-    wander.
+    Hunger grows with time and effort. A fish within `reach` of a patch eats of it; the patch regrows logistically. The
+    view angle of a fish is `fov`, 300 degrees by default. A hungry hunter pursues the nearest fish; it is faster than a
+    fish, but turns more slowly. A fed hunter does not pursue until it is hungry again. A fish that is caught or starves
+    terminates; the others go on. Success: at least half of the learners live. Hunger and fear follow Tu and Terzopoulos
+    (1994; see flockenv.steering.motivation); scripted fish are their state machine: flee, school, forage, wander.
     """
 
     name: ClassVar[str] = "school"

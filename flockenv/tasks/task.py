@@ -25,8 +25,8 @@ world:
   the memory;
 * `observe(p, frame, rows)` writes the observation rows (L, O), or what `abreast` left of them.
 
-`p` holds the task's `parameters()` by name. Learners are the first L agents of a world. If the task has a `look`, the
-neighbours of all learners are searched once, by the same query as for a scene's effects.
+`p` holds the task's `parameters()` by name. Learners are the first L agents of a world. If the task has a `look`,
+neighbours are searched once for all kernels, by the same query as for a scene's effects.
 """
 
 from __future__ import annotations
