@@ -168,7 +168,7 @@ def checked_seed(seed: Any) -> int | None:
     except TypeError:
         number = None
     if number is None or isinstance(seed, bool | np.bool_):
-        raise TypeError(f"seed: {seed!r} is no whole number; allowed: 0 to 2**63 - 1, or None for a random one")
+        raise TypeError(f"seed: {seed!r} is not an integer; allowed: 0 to 2**63 - 1, or None for a random one")
     if not 0 <= number < SEEDS:
         raise ValueError(f"seed: {number} is out of range; allowed: 0 to 2**63 - 1, or None for a random one")
     return number

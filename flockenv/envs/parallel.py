@@ -115,7 +115,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Named, dict[str, Named]]:
         """Begin an episode; return observations, (O,) float32 each, and infos, which are empty, by agent.
 
-        The seed is `world.seeds[0]`. It is not in the infos, because TorchRL takes the keys of these as all keys there are.
+        The seed is `world.seeds[0]`. It is not in the infos, because TorchRL takes their keys as all keys of infos.
         """
         seed = checked_seed(seed)
         # PettingZoo's own test suite resets every environment with {"options": 1}; all other options are rejected.
@@ -160,10 +160,10 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         return outcome  # type: ignore[return-value]  # five dictionaries
 
     def _step(self, actions: Mapping[str, Rows]) -> Step:
-        """Let the world act; ValueError names the agent at fault, found one by one only if the block is refused."""
+        """Step the world; ValueError, with the agent at fault, which is searched only if the actions are rejected."""
         if not isinstance(actions, Mapping):
             raise TypeError(f"actions: {type(actions).__name__}, must be a dictionary from agent to action")
-        if [*actions] == [*self._live]:  # in our order, as most callers pass them
+        if [*actions] == [*self._live]:  # in the order of `_live`, as most callers pass them
             given = [*actions.values()]
         elif self._live.keys() <= actions.keys() <= self.action_spaces.keys():
             given = [actions[name] for name in self._live]

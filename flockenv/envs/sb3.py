@@ -285,7 +285,7 @@ def load_sb3_zip(
     file = Path(path)
     if trust_pickle is not True:
         raise ValueError(
-            f"{file}: a Stable-Baselines3 zip runs code when it is read; if you made it, say trust_pickle=True"
+            f"{file}: a Stable-Baselines3 zip runs code when it is read; if you trust it, pass trust_pickle=True"
         )
     if not file.is_file():
         raise ValueError(f"{file}: no such file")

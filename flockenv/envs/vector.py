@@ -311,7 +311,7 @@ def _autoreset(mode: str | AutoresetMode) -> AutoresetMode:
 
 
 def _worlds(rows: Any, learners: int) -> int:
-    """Return the number of worlds with this many rows; ValueError unless `learners` divides the number of rows."""
+    """Return the number of worlds with this many rows; ValueError unless `learners` divides it."""
     if learners == 1 or not isinstance(rows, int | np.integer):
         return rows  # type: ignore[no-any-return]  # World checks the number of worlds
     worlds, over = divmod(int(rows), learners)
@@ -324,8 +324,8 @@ def _worlds(rows: Any, learners: int) -> int:
     return worlds
 
 
-# Infos are columns over rows, as in gymnasium's vector envs, with 0, and False in `_name`, if there is no value. Columns
-# of a result are the step's own arrays, so that they need no copy.
+# Infos are columns over rows, as in gymnasium's vector envs, with 0, and False in `_name`, if there is no value.
+# Columns of a result are the step's own arrays, so that they need no copy.
 
 
 def _put(info: Info, columns: Mapping[str, Any], mask: Mask, lacks: Mapping[str, Mask] = MappingProxyType({})) -> None:

@@ -238,12 +238,12 @@ class Bottleneck(Task):
     memory: ClassVar[int] = 4
     keeps: ClassVar[bool] = True
 
-    dt: float = Field(default=0.01, gt=0, description="s, one physics step: bodies are stiff")
+    dt: float = Field(default=0.01, gt=0, description="s, one physics step; small, because bodies are stiff")
     horizon: int = Field(default=300, ge=1, description="decisions until the time limit (truncation)")
     people: int = Field(default=20, ge=1, le=400, description="number of people in the room")
     learners: int = Field(
         default_factory=lambda given: given.get("people", 20), ge=1,
-        description="how many of them are learners (default: all); the others are scripted",
+        description="number of learners (default of the task: all); the others are scripted",
     )  # fmt: skip
     together: bool = Field(default=False, description="True if learners that are out wait until all are")
     room: float = Field(default=6.0, gt=1, description="m, edge of the room")

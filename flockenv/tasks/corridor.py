@@ -233,7 +233,7 @@ class Corridor(LastingTask):
     people: int = Field(default=24, ge=2, le=1000, description="number of people, half of them in each direction")
     learners: int = Field(
         default_factory=lambda given: given.get("people", 24), ge=1,
-        description="how many of them are learners (default: all); the others are scripted",
+        description="number of learners (default of the task: all); the others are scripted",
     )  # fmt: skip
     horizon: int = Field(default=300, ge=1, description="decisions until the time limit (truncation)")
     length: float = Field(default=12.0, gt=1, description="m, period of the corridor")

@@ -212,7 +212,7 @@ class Crossing(Task):
     agents: int = Field(default=12, ge=1, le=1000, description="number of walkers")
     learners: int = Field(
         default_factory=lambda given: given.get("agents", 12), ge=1,
-        description="how many of them are learners (default: all); the others are scripted",
+        description="number of learners (default of the task: all); the others are scripted",
     )  # fmt: skip
     horizon: int = Field(default=200, ge=1, description="decisions until the time limit (truncation)")
     circle: float = Field(default=6.0, gt=0, description="m, radius of the circle")

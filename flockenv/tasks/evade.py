@@ -317,8 +317,8 @@ class Evade(Task):
         widest = 2 * (self.greatest_radius + self.min_gap)
         if self.least_radius > self.greatest_radius or widest > self.size:
             raise ValueError(
-                f"least_radius = {self.least_radius:g}, greatest_radius = {self.greatest_radius:g}: the least comes "
-                f"first, and with min_gap on each side it must fit into a field of {self.size:g} m"
+                f"least_radius = {self.least_radius:g}, greatest_radius = {self.greatest_radius:g}: must be in "
+                f"this order, and fit, with min_gap on each side, into a field of {self.size:g} m"
             )
         if self.start_distance > self.size / 2:
             raise ValueError(f"start_distance = {self.start_distance:g}: at most size / 2 = {self.size / 2:g} m")

@@ -426,7 +426,7 @@ class Flock(LastingTask):
     agents: int = Field(default=24, ge=1, le=100_000, description="number of agents")
     learners: int = Field(
         default_factory=lambda given: given.get("agents", 24), ge=1,
-        description="how many of them are learners (default: all); the others are scripted",
+        description="number of learners (default of the task: all); the others are scripted",
     )  # fmt: skip
     horizon: int = Field(default=300, ge=1, description="decisions until the time limit (truncation)")
     size: float = Field(default=40.0, gt=14, description="m, edge of the periodic field")

@@ -328,9 +328,7 @@ class Herd(Task):
     def _room(self) -> Herd:
         """Raise ValueError if `away` is more than a third of the field."""
         if self.away > self.size / 3:
-            raise ValueError(
-                f"away = {self.away:g} m: in a field of {self.size:g} m at most {self.size / 3:g} m is sure to be found"
-            )
+            raise ValueError(f"away = {self.away:g} m: must be at most size / 3 = {self.size / 3:g} m")
         return self
 
     @property

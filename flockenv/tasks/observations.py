@@ -30,9 +30,7 @@ def offset(a: float, b: float, size: float) -> float:
     """Return b - a, the shortest offset on a periodic axis of this size (0: not periodic)."""
     d = b - a
     o, one = like(d, 0.0), like(d, 1.0)
-    around = (
-        one / like(d, size) if size > o else o
-    )  # the same for all pairs, so that the division is hoisted out of the loop
+    around = one / like(d, size) if size > o else o  # equal for all pairs, so that it is hoisted out of the loop
     return d - like(d, size) * nearest_whole(d * around)
 
 
@@ -79,7 +77,7 @@ def put_neighbour(
 ) -> None:
     """Write offset and relative velocity of the s-th nearest agent, times `near_by`, 1/m, and `pace`, s/m.
 
-    The blocks of `neighbour_slots` begin at `at`; vectors are rotated so that `ahead`, a unit vector, is the first axis.
+    The blocks of `neighbour_slots` begin at `at`; vectors are rotated so that the unit vector `ahead` is the x axis.
     """
     put(row, at + 2 * s, turned(to, ahead, near_by))
     put(row, at + 2 * slots + 2 * s, turned(relative, ahead, pace))

@@ -183,7 +183,7 @@ class Obstacles(Task):
         if not self.least_radius <= self.greatest_radius <= 2.0:
             raise ValueError(
                 f"least_radius = {self.least_radius:g}, greatest_radius = {self.greatest_radius:g}: "
-                "the least comes first, and above 2 m an obstacle could cover the start"
+                "must be in this order, and at most 2 m, as a larger obstacle could cover the start"
             )
         return self
 

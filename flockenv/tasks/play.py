@@ -93,7 +93,7 @@ def _check(task: Task) -> None:
         raise TypeError(f"{kind}.terms is empty: a reward is the sum of at least one term")
     for name in task.measures:
         if not name.isidentifier() or keyword.iskeyword(name) or name[0] == "_" or task.measures.count(name) > 1:
-            raise TypeError(f"{kind}.measures: {name!r} must be a name, as of a field, and there once")
+            raise TypeError(f"{kind}.measures: {name!r} must be a valid field name, and unique")
 
 
 # --- tell -------------------------------------------------------------------------------------------------------------

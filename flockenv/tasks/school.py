@@ -398,7 +398,7 @@ class School(Task):
     fish: int = Field(default=8, ge=1, le=64, description="number of fish")
     learners: int = Field(
         default_factory=lambda given: given.get("fish", 8), ge=1,
-        description="how many of them are learners (default: all); the others are scripted",
+        description="number of learners (default of the task: all); the others are scripted",
     )  # fmt: skip
     hunters: int = Field(default=1, ge=1, le=8, description="number of hunters")
     patches: int = Field(default=4, ge=1, le=16, description="number of food patches")

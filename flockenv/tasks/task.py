@@ -103,9 +103,7 @@ class Task(Record):
 
     control_dt: float = Field(default=0.1, gt=0, description="s, one decision; an integer multiple of dt")
     dt: float = Field(default=0.05, gt=0, description="s, one physics step")
-    integrator: AnyIntegrator = Field(
-        default_factory=SemiImplicitEuler, description="integration method of a physics step"
-    )
+    integrator: AnyIntegrator = Field(default_factory=SemiImplicitEuler, description="method of a physics step")
     horizon: int = Field(default=300, ge=1, description="decisions until the time limit (truncation)")
     dtype: Literal["float64", "float32"] = Field(default="float64", description="precision of the simulation")
 
@@ -196,9 +194,13 @@ class Task(Record):
         """The parts of its kernel: those of the scene, and the look."""
         if self.scene.constraints:
             kinds = ", ".join(constraint.kind for constraint in self.scene.constraints)
-            raise ValueError(f"scene.constraints: {kinds}: a task plays in one kernel, which knows of none yet")
+            raise ValueError(
+                f"scene.constraints: {kinds}: a task runs as one kernel, which supports no constraints yet"
+            )
         if self.scene.population:
-            raise ValueError("scene.population: a task plays in one kernel, which knows of no births; it has `ended`")
+            raise ValueError(
+                "scene.population: a task runs as one kernel, which supports no births; agents leave by `ended`"
+            )
         return replace(self.scene.parts, look=self.look)
 
     def parameters(self) -> dict[str, float]:
