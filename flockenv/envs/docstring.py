@@ -98,11 +98,7 @@ def _arguments(task: Task) -> str:
         if name != "horizon"  # each API has its own name for the time limit
     ]
     rows.append(
-        (
-            "`render_mode`",
-            "`None`",
-            "`rgb_array` (headless picture), `human` (window, needs the extra `render`) or None",
-        )
+        ("`render_mode`", "`None`", "`rgb_array` (headless), `human` (window, needs the extra `render`) or None")
     )
     return _table(("argument", "default", "meaning"), rows)
 

@@ -84,7 +84,7 @@ def _fits(p: Any, frame: Frame, m: int, x: float, y: float, rho: float) -> bool:
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
     """Write each learner's action as a force in the frame of the heading; flockmates follow `_flockmate`."""
-    for i in range(np.uint64(action.shape[0])):  # no branches, so that agents share SIMD registers
+    for i in range(np.uint64(action.shape[0])):  # no branches, so that SIMD is used
         hx, hy = frame.memory[0, i], frame.memory[1, i]
         along, left = action[i, 0] * frame.max_force[i], action[i, 1] * frame.max_force[i]
         force[0, i] = along * hx - left * hy
@@ -168,7 +168,7 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
     """Write the terms progress, alignment, spacing, together, touch, obstacle; all of the state after the step."""
     one, o = like(p.sight, 1.0), like(p.sight, 0.0)
     per_cruise, per_spacing, per_slot = one / p.cruise, one / p.spacing, one / p.neighbours
-    for i in range(np.uint64(terms.shape[0])):  # no branches, so that agents share SIMD registers
+    for i in range(np.uint64(terms.shape[0])):  # no branches, so that SIMD is used
         v = (after.vel[0, i], after.vel[1, i])
         along = v[0] * like(one, after.memory[0, i]) + v[1] * like(one, after.memory[1, i])
         found = after.near_count[i]
@@ -267,9 +267,7 @@ def _nearest(p: Any, frame: Frame) -> float:
         for k in range(lanes):
             i = np.uint64(first + k)
             root = np.sqrt(frame.near_square[0, i])
-            distance = (
-                root if frame.near_count[i] > 0 else like(root, p.sight)
-            )  # no branch, so that agents share SIMD registers
+            distance = root if frame.near_count[i] > 0 else like(root, p.sight)  # no branch, so that SIMD is used
             sums[k] += distance if i < n else like(distance, 0.0)
     mean = 0.0
     for k in range(lanes):
