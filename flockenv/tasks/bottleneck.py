@@ -247,7 +247,7 @@ class Bottleneck(Task):
     )  # fmt: skip
     together: bool = Field(default=False, description="True if learners that are out wait until all are")
     room: float = Field(default=6.0, gt=1, description="m, edge of the room")
-    width: float = Field(default=1.0, gt=0.5, description="m, of the door; bodies are 0.5 m wide")
+    width: float = Field(default=1.0, gt=0.5, description="m, width of the door; bodies are 0.5 m wide")
     clear: float = Field(default=1.5, ge=0, description="m before the wall with the door, in which no agent starts")
     max_speed: float = Field(default=1.5, gt=0, description="m/s")
     max_force: float = Field(default=600.0, gt=0, description="N; the mass is 80 kg")

@@ -215,9 +215,9 @@ class Corridor(LastingTask):
     """Two opposite streams of people walk in one corridor, which is periodic along its length.
 
     Each agent has its own desired speed, drawn from N(1.34, 0.26) m/s, and its reward is largest at that speed. A
-    contact stops no agent; it costs as long as it lasts. Walls are solid. By default all agents are learners with one
-    policy; scripted agents walk by the forces of Moussaid et al. 2009. Each agent observes everything in the frame of
-    its own walking direction, so that lanes, or keeping to one side, emerge from the policy. No agent terminates.
+    contact stops no agent; it costs as long as it lasts. Walls are solid. All learners share one policy; scripted
+    agents walk by the forces of Moussaid et al. 2009. Observations are in the frame of the agent's own walking
+    direction, so that lanes, or keeping to one side, emerge from the policy. No agent terminates.
 
     The aim holds while the mean over learners of 1 - |speed along the walking direction / desired speed - 1| is above
     `aim`, and no learner touches another agent. Success: it holds in the share `lasting` of the decisions after

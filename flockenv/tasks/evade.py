@@ -286,8 +286,8 @@ class Evade(Task):
     pursuers: int = Field(default=3, ge=1, le=16, description="number of pursuers")
     size: float = Field(default=28.0, gt=10, description="m, edge of the field")
     cover: int = Field(default=10, ge=0, le=100, description="number of obstacles; those that do not fit are left out")
-    least_radius: float = Field(default=0.8, gt=0, description="m")
-    greatest_radius: float = Field(default=1.8, gt=0, description="m")
+    least_radius: float = Field(default=0.8, gt=0, description="m, least radius of an obstacle")
+    greatest_radius: float = Field(default=1.8, gt=0, description="m, greatest radius of an obstacle")
     min_gap: float = Field(default=1.5, ge=0, description="m between obstacles, and to walls; bodies are 0.6 m wide")
     start_distance: float = Field(
         default=8.0, ge=0, description="m, least distance between the evader and pursuers at the start"

@@ -431,8 +431,8 @@ class Flock(LastingTask):
     obstacle_count: int = Field(
         default=6, ge=0, le=200, description="number of obstacles; those that do not fit are left out"
     )
-    least_radius: float = Field(default=0.8, gt=0, description="m")
-    greatest_radius: float = Field(default=2.0, gt=0, description="m")
+    least_radius: float = Field(default=0.8, gt=0, description="m, least radius of an obstacle")
+    greatest_radius: float = Field(default=2.0, gt=0, description="m, greatest radius of an obstacle")
     cruise: float = Field(default=2.0, gt=0, description="m/s, desired speed along the heading")
     max_speed: float = Field(default=3.0, gt=0, description="m/s")
     max_force: float = Field(default=4.0, gt=0, description="N; the mass is 1 kg")

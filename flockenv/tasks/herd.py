@@ -295,7 +295,7 @@ class Herd(Task):
         gt=0,
         description="m, edge of the field in pictures; the pen and the dogs start in its middle half",
     )
-    pen_radius: float = Field(default=4.0, gt=0, description="m")
+    pen_radius: float = Field(default=4.0, gt=0, description="m, radius of the pen")
     away: float = Field(
         default=15.0, ge=0, description="m, least distance between the pen and the middle of the sheep at the start"
     )

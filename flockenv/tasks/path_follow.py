@@ -260,7 +260,7 @@ class PathFollow(Task):
     winding: float = Field(
         default=0.55, ge=0, le=0.8, description="bound of the sum of all waves, as a share of the radius"
     )
-    half_width: float = Field(default=0.7, gt=0, description="m, of the track")
+    half_width: float = Field(default=0.7, gt=0, description="m, half the width of the track")
     lost_distance: float = Field(
         default=2.5, gt=0, description="m from the middle line, beyond which the learner is lost"
     )
