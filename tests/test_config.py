@@ -433,10 +433,10 @@ def test_a_value_that_fits_no_member_of_a_union_is_one_mistake() -> None:
         kind: Literal["wave"] = "wave"
         height: float
 
-    class AutoTuner(BaseModel):
+    class Choice(BaseModel):
         value: int | Wave | tuple[float, float]
 
-    assert len(refusal("value: word\n", AutoTuner).splitlines()) == 1
+    assert len(refusal("value: word\n", Choice).splitlines()) == 1
 
 
 # --- the schema -------------------------------------------------------------------------------------------------------

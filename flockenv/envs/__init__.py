@@ -1,7 +1,7 @@
-"""Faces of one World: gymnasium (single.py, vector.py), pettingzoo (parallel.py, aec.py); SB3's is flockenv.envs.sb3.
+"""APIs of one World: gymnasium (single.py, vector.py), pettingzoo (parallel.py, aec.py), Stable-Baselines3 (sb3.py).
 
-They hold no physics and no rules: they translate shapes, names and conventions, so that one action sequence through
-any of them gives the same numbers.
+They hold no physics and no rules: they only translate shapes, names and conventions, so that an action sequence gives
+the same numbers through each of them.
 """
 
 from __future__ import annotations

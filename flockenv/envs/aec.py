@@ -17,10 +17,10 @@ __all__ = ["by_turns"]
 
 
 class _Checked(BaseWrapper):  # type: ignore[misc]  # pettingzoo ships no types
-    """Refuses a bad action on its agent's turn, and not when the last agent of the round moves.
+    """Rejects a bad action on its agent's turn, not later, when the last agent of the round acts.
 
-    It also shows what PettingZoo's conversion hides behind a deprecation warning (the dictionaries of spaces) or does
-    not pass on (`np_random`).
+    It also gives access to what PettingZoo's conversion hides behind a deprecation warning (the dictionaries of spaces)
+    or omits (`np_random`).
     """
 
     @property
@@ -35,7 +35,7 @@ class _Checked(BaseWrapper):  # type: ignore[misc]  # pettingzoo ships no types
 
     @property
     def np_random(self) -> np.random.Generator:
-        """The random numbers of wrappers, seeded by `reset(seed=s)`."""
+        """The random number generator for wrappers, seeded by `reset(seed=s)`."""
         return self.unwrapped.np_random  # type: ignore[no-any-return]
 
     def observe(self, agent: str) -> Rows:
@@ -51,7 +51,7 @@ class _Checked(BaseWrapper):  # type: ignore[misc]  # pettingzoo ships no types
 
     def step(self, action: Rows | None) -> None:
         """Pass the action of the agent whose turn it is: (A,), or None from an agent that has ended."""
-        turns = self.env  # its plain attributes: the properties of this wrapper would make each turn slower
+        turns = self.env  # plain attributes: the properties of this wrapper would slow down each turn
         agent = turns.agent_selection
         if not (turns.terminations[agent] or turns.truncations[agent]):
             turns.unwrapped.checked_action(agent, action)
@@ -66,6 +66,6 @@ class _Checked(BaseWrapper):  # type: ignore[misc]  # pettingzoo ships no types
 def by_turns(env: WorldParallelEnv) -> AECEnv[str, Any, Any]:
     """Return the AEC form, with order enforced (no step before reset, one per turn) and actions checked.
 
-    Actions out of [-1, 1] are clipped by the world, as in every other face, and not by a wrapper that warns.
+    Actions out of [-1, 1] are clipped by the world, as in all other APIs, and not by a wrapper that warns.
     """
     return OrderEnforcingWrapper(_Checked(parallel_to_aec_wrapper(env)))

@@ -1,4 +1,4 @@
-"""What every face shares: its spaces, its seeds, its options and its pictures."""
+"""What all environment APIs share: spaces, seeds, options and pictures."""
 
 from __future__ import annotations
 
@@ -39,18 +39,18 @@ __all__ = [
 Rows = NDArray[Any]
 RENDER_MODES = ("human", "rgb_array")
 DISPLAYED = 256
-"""Agents up to which dictionaries by agent are written out: compiling that takes a millisecond for every dozen."""
+"""Number of agents up to which code is generated for dictionaries by agent; compiling takes 1 ms per 12 agents."""
 SEEDS = 2**63
 """Seeds are 0 ... 2**63 - 1, so that they fit the int64 arrays of a vector env's infos."""
 
 
 def build(task_type: type[Task], parameters: Mapping[str, Any], limit: str, own: Sequence[str] = ()) -> Task:
-    """Make a task from the keyword arguments of a face.
+    """Make a task from the keyword arguments of an environment.
 
-    limit: the face's name for its time limit. The task's own `horizon` is refused: two limits could disagree.
-    own: the other arguments of the face, which a misspelt name may have meant.
+    limit: the environment's name for its time limit. The task's `horizon` is rejected, as two limits could disagree.
+    own: the environment's other arguments, candidates for a misspelt name.
 
-    Raises TypeError for an unknown name, with Python's own words: TorchRL and others look for them.
+    Raises TypeError for an unknown name, with Python's own message, which TorchRL and others match.
     """
     allowed = [*(name for name in task_type.model_fields if name != "horizon"), *own]
     unknown = next((name for name in parameters if name not in allowed), None)
@@ -64,7 +64,7 @@ def build(task_type: type[Task], parameters: Mapping[str, Any], limit: str, own:
 
 
 def together(task: Task) -> Task:
-    """Return the task; ValueError if its learners end one by one, for which a row has no meaning after its end."""
+    """Return the task; ValueError if its learners end one by one, as a row would have no meaning after its end."""
     if not task.ends_together:
         raise ValueError(
             f"{task.name}: its learners leave one by one, and a row of a vector env cannot; "
@@ -84,7 +84,7 @@ def action_space(task: Task) -> Box:
 
 
 def reward_keys(task: Task) -> tuple[str, ...]:
-    """Return the key of each reward term in an info: `reward/` and its name.
+    """Return the key of each reward term in an info: `reward/` plus its name.
 
     Infos are flat: many clients turn each value into a tensor, and loggers group by the part before the slash.
     """
@@ -92,35 +92,35 @@ def reward_keys(task: Task) -> tuple[str, ...]:
 
 
 def named(names: Sequence[str], rows: Rows) -> Iterator[dict[str, float]]:
-    """Make a dictionary of each row of numbers, (R, K), by name.
+    """Return an iterator over dictionaries, by name, of the rows of numbers (R, K).
 
-    Column by column, and one row at a time: a list for every row would wake the garbage collector.
+    Columns become lists, and rows are made one at a time: a list for each row would trigger the garbage collector.
     """
     return map(_named(*names), *rows.T.tolist())
 
 
 @functools.cache
 def _named(*names: str) -> Callable[..., dict[str, float]]:
-    """Return a function of as many numbers as names: a display, written out, takes half as long as dict(zip(...))."""
+    """Return a function of K numbers that makes a dictionary; a dict display takes half the time of dict(zip(...))."""
     numbers = [f"n{k}" for k in range(len(names))]
     made: Callable[..., dict[str, float]] = eval(f"lambda {', '.join(numbers)}: {_display(names, numbers)}")  # noqa: S307  # reprs alone
     return made
 
 
 def _display(names: Iterable[str], values: Iterable[str]) -> str:
-    """Write a dictionary of what is written for each name."""
+    """Return the source of a dict display with the source of a value for each name."""
     return f"{{{', '.join(f'{str.__str__(name)!r}: {value}' for name, value in zip(names, values, strict=True))}}}"
 
 
 class ByAgent:
-    """Makes the dictionaries of a step, in which every agent has a name; `of` does it.
+    """Makes the dictionaries of a step, keyed by agent name, in its method `of`.
 
     `keys` are those of the reward terms in an info. `of(seen, paid, over, late, terms, success)` takes observations
-    (L, O), rewards and terminations as lists of L, the truncation of all, each of the K reward terms as a list of L,
-    and whether it is a success. It returns observations, rewards, terminations, truncations and infos by agent.
+    (L, O), rewards and terminations as lists of L, one truncation for all, each of the K reward terms as a list of L,
+    and the success. It returns observations, rewards, terminations, truncations and infos by agent.
 
-    Of up to DISPLAYED agents it is written out, a display for each dictionary: those are made in one piece, and take
-    three quarters of the time.
+    For up to DISPLAYED agents its code is generated, with a dict display for each dictionary: this takes three quarters
+    of the time.
     """
 
     def __init__(self, keys: Sequence[str], agents: Sequence[str]) -> None:
@@ -160,7 +160,7 @@ def render_fps(task: Task) -> int:
 
 
 def checked_seed(seed: Any) -> int | None:
-    """Return the seed as an int, or None; TypeError if it is no integer, ValueError outside 0 ... 2**63 - 1."""
+    """Return the seed as an int, or None; TypeError if it is not an integer, ValueError outside 0 ... 2**63 - 1."""
     if seed is None:
         return None
     try:
@@ -168,14 +168,14 @@ def checked_seed(seed: Any) -> int | None:
     except TypeError:
         number = None
     if number is None or isinstance(seed, bool | np.bool_):
-        raise TypeError(f"seed: {seed!r} is no whole number; allowed: 0 to 2**63 - 1, or None for a random one")
+        raise TypeError(f"seed: {seed!r} is not an integer; allowed: 0 to 2**63 - 1, or None for a random one")
     if not 0 <= number < SEEDS:
         raise ValueError(f"seed: {number} is out of range; allowed: 0 to 2**63 - 1, or None for a random one")
     return number
 
 
 def checked_options(options: Mapping[str, Any] | None, known: Iterable[str] = ()) -> Mapping[str, Any]:
-    """Return the options of a reset; ValueError for a name not in `known`, with what may have been meant."""
+    """Return the options of a reset; ValueError for a name not in `known`, with the nearest known name."""
     if options is None:
         return {}
     if not isinstance(options, Mapping):
@@ -189,18 +189,18 @@ def checked_options(options: Mapping[str, Any] | None, known: Iterable[str] = ()
 
 
 def begun(running: bool, call: str) -> None:
-    """Refuse a step or a picture of a face that was not reset, or was closed; ResetNeeded."""
+    """Raise ResetNeeded for a step or a picture of an environment that was not reset, or was closed."""
     if not running:
         raise ResetNeeded(f"{call}: there is no episode; call reset() first")
 
 
 class Screen:
-    """Shows a world in one render mode; a window opens with the first frame and not before.
+    """Shows a world in one render mode; a window opens with the first frame.
 
     Args:
         mode: "human" (a window), "rgb_array" ((H, W, 3) uint8, headless) or None.
         fps: frames per second of the window.
-        modes: the modes of this face.
+        modes: the modes of this environment.
     """
 
     def __init__(self, mode: str | None, fps: int, modes: tuple[str, ...] = RENDER_MODES) -> None:
@@ -212,7 +212,7 @@ class Screen:
         self._window: Window | None = None
 
     def show(self, snapshot: Snapshot, mode: str | None = None) -> NDArray[np.uint8] | None:
-        """Draw one instant, in `mode` if given: return the picture, or show it and return None."""
+        """Draw one instant, in `mode` if given; return the picture, or show it in the window and return None."""
         from flockenv.render import Window, draw
 
         mode = mode or self.mode

@@ -1,4 +1,4 @@
-"""Corridor for PettingZoo, module style: env() by turns, parallel_env() all at once, raw_env the class behind both."""
+"""Corridor for PettingZoo, as a module: env() (AEC), parallel_env(), and raw_env, the class of both."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The documentation page of an environment, written from its task, so that text and code cannot drift apart."""
+"""The documentation page of an environment, generated from its task so that text and code agree."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ def _rewards(task: Task) -> str:
 def _infos(task: Task) -> str:
     rows = [
         (_quoted(reward_keys(task)), "each term of the reward of this step"),
-        ("`is_success`", "True if the aim is reached so far"),
-        (_quoted(task.metric_names), "metrics of the episode so far, where they have a value"),
-        ("`seed`", "the seed of the world, in the info of a reset and nowhere else"),
+        ("`is_success`", "True if the episode so far is a success"),
+        (_quoted(task.metric_names), "metrics of the episode so far, if they have a value"),
+        ("`seed`", "the seed of the world, only in the info of a reset"),
     ]
-    return "Infos are flat: each value is one number or truth value.\n\n" + _table(("key", "value"), rows)
+    return "Infos are flat: each value is one number or bool.\n\n" + _table(("key", "value"), rows)
 
 
 def _quoted(names: Sequence[str]) -> str:
@@ -55,10 +55,10 @@ def _quoted(names: Sequence[str]) -> str:
 def _end(task: Task) -> str:
     return (
         f"Termination: see the description. Truncation: after {task.horizon} decisions "
-        f"({task.horizon * task.control_dt:g} s), unless `max_episode_steps` says otherwise.\n\n"
-        "`gymnasium.make_vec` begins a world anew in the step after its end, as gymnasium does by default "
-        "(`AutoresetMode.NEXT_STEP`): that step does not read the action, and returns the first observation, reward 0 "
-        'and no end. `autoreset_mode="SameStep"` begins it in the step that ends it, `"Disabled"` never.'
+        f"({task.horizon * task.control_dt:g} s), unless `max_episode_steps` is given.\n\n"
+        "`gymnasium.make_vec` resets a world in the step after its end, as gymnasium does by default "
+        "(`AutoresetMode.NEXT_STEP`): that step ignores the action, and returns the first observation, reward 0 "
+        'and no end. `autoreset_mode="SameStep"` resets it in the step that ends it, `"Disabled"` never.'
     )
 
 
@@ -79,7 +79,7 @@ def _range(layout: Layout) -> str:
 
 
 def _layout(layout: Layout) -> str:
-    """Return the table of a row of numbers: place, meaning, unit and bounds of each quantity."""
+    """Return the table of a row of numbers: index, meaning, unit and bounds of each quantity."""
     rows, start = [], 0
     slots = (slot for slot in layout.slots if slot.size)
     for (index, name, unit, meaning), slot in zip(layout.table(), slots, strict=True):
@@ -95,9 +95,11 @@ def _arguments(task: Task) -> str:
     rows = [
         (f"`{name}`", f"`{getattr(task, name)!r}`", field.description or "")
         for name, field in fields
-        if name != "horizon"  # the time limit has another name in every face
+        if name != "horizon"  # each API has its own name for the time limit
     ]
-    rows.append(("`render_mode`", "`None`", "`rgb_array` (headless picture), `human` (window, extra `render`) or None"))
+    rows.append(
+        ("`render_mode`", "`None`", "`rgb_array` (headless), `human` (window, needs the extra `render`) or None")
+    )
     return _table(("argument", "default", "meaning"), rows)
 
 

@@ -1,4 +1,4 @@
-"""PettingZoo's parallel environments: every learner of one world is an agent with a name."""
+"""PettingZoo parallel environments: each learner of one world is an agent with a name."""
 
 from __future__ import annotations
 
@@ -41,26 +41,26 @@ Named = dict[str, Any]
 
 
 class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # pettingzoo ships no types
-    """One world whose learners are PettingZoo agents; `task` and `world` give access to the arrays inside.
+    """One world whose learners are PettingZoo agents; `task` and `world` give access to its arrays.
 
-    An agent that ends (captured, say) appears in the dictionaries of that step and then leaves `agents`. At the time
-    limit all agents that are left are truncated, also those that terminate in the same step. When none is left,
-    `step({})` returns five empty dictionaries. Seeds are as in SingleEnv.
+    An agent that terminates (captured, for example) appears in the dictionaries of that step and then leaves `agents`.
+    At the time limit all remaining agents are truncated, also those that terminate in the same step. When no agent is
+    left, `step({})` returns five empty dictionaries. Seeds are as in SingleEnv.
 
     Infos are flat: `reward/NAME` (each term of the reward of this step), `is_success`, and metrics in the step that
     ends the episode.
 
-    `reset(seed=s)` also seeds `np_random`, from which wrappers draw; the world itself draws nothing from it.
+    `reset(seed=s)` also seeds `np_random`, for wrappers; the world itself draws nothing from it.
 
     Args:
-        max_cycles: steps after which the world is truncated; None = the task's own horizon.
+        max_cycles: steps after which the world is truncated (default: the task's horizon).
         render_mode: "rgb_array", "human" or None.
         parameters: those of the task.
     """
 
     task_type: ClassVar[type[Task]]
     fixed: ClassVar[dict[str, Any]] = {}
-    """Parameters with another default than the task's own."""
+    """Parameters whose default differs from the task's."""
 
     def __init__(self, max_cycles: int | None = None, render_mode: str | None = None, **parameters: Any) -> None:
         self.task = build(
@@ -85,7 +85,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
 
     @property
     def max_cycles(self) -> int:
-        """Steps after which the world is truncated; PettingZoo's tests set it on an environment that exists."""
+        """Steps after which the world is truncated; PettingZoo's tests set it on an existing environment."""
         return self.world.time_limit or self.task.horizon
 
     @max_cycles.setter
@@ -96,7 +96,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
 
     @property
     def agents(self) -> list[str]:
-        """The agents that still act, as a list of the caller's own."""
+        """The agents that still act; a new list for each caller."""
         return list(self._live)
 
     def observation_space(self, agent: str) -> Box:
@@ -115,10 +115,10 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Named, dict[str, Named]]:
         """Begin an episode; return observations, (O,) float32 each, and infos, which are empty, by agent.
 
-        The seed is `world.seeds[0]`. It is not in the infos, because TorchRL takes the keys of these for all there are.
+        The seed is `world.seeds[0]`. It is not in the infos, because TorchRL takes their keys as all keys of infos.
         """
         seed = checked_seed(seed)
-        # PettingZoo's own test suite resets every environment with {"options": 1}; nothing else is let through.
+        # PettingZoo's own test suite resets every environment with {"options": 1}; all other options are rejected.
         checked_options(options, ("options",))
         observation = self.world.reset(seeds=seed)[0]
         if seed is not None:
@@ -131,12 +131,12 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
     def step(
         self, actions: Mapping[str, Rows]
     ) -> tuple[Named, dict[str, float], dict[str, bool], dict[str, bool], dict[str, Named]]:
-        """Act for one control_dt; needs an action, (A,), clipped to [-1, 1], from every agent in `agents`.
+        """Take one decision; needs an action, (A,), clipped to [-1, 1], from each agent in `agents`.
 
-        Actions of agents that have left are ignored, as PettingZoo's conversion to this form does: TorchRL and AgileRL
-        pass them. When no agent is left, an empty dictionary is needed, and five empty ones are returned.
+        Actions of agents that have left are ignored, as in PettingZoo's conversion from AEC: TorchRL and AgileRL pass
+        them. When no agent is left, an empty dictionary is needed, and five empty ones are returned.
 
-        Raises ValueError, before anything moves, that names the agent that is unknown or whose action is missing, has
+        Raises ValueError, before any state changes, with the agent that is unknown or whose action is missing, has
         another shape or holds NaN; ResetNeeded before the first reset, or for actions when no agent is left.
         """
         if self._running and not self._live and isinstance(actions, dict) and not actions:
@@ -160,10 +160,10 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         return outcome  # type: ignore[return-value]  # five dictionaries
 
     def _step(self, actions: Mapping[str, Rows]) -> Step:
-        """Let the world act; ValueError names the agent at fault, found one by one only if the block is refused."""
+        """Step the world; ValueError, with the agent at fault, which is searched only if the actions are rejected."""
         if not isinstance(actions, Mapping):
             raise TypeError(f"actions: {type(actions).__name__}, must be a dictionary from agent to action")
-        if [*actions] == [*self._live]:  # in our order, as most callers pass them
+        if [*actions] == [*self._live]:  # in the order of `_live`, as most callers pass them
             given = [*actions.values()]
         elif self._live.keys() <= actions.keys() <= self.action_spaces.keys():
             given = [actions[name] for name in self._live]
@@ -193,13 +193,13 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         raise ValueError(f"actions: agent {lacking!r} has none")
 
     def checked_action(self, agent: str, action: Rows | None) -> Rows:
-        """Return an action as an array, (A,); ValueError that names the agent on NaN, infinity or another shape."""
+        """Return an action as an array, (A,); ValueError, with the agent, on NaN, infinity or another shape."""
         size = self.task.action_layout.size
         try:
             row = np.asarray(action, np.float64)
         except (TypeError, ValueError):
             row = None
-        if row is None or action is None:  # numpy makes NaN of None
+        if row is None or action is None:  # numpy converts None to NaN
             raise ValueError(f"actions: agent {agent!r} has {action!r}, must be {size} numbers")
         if row.shape != (size,):
             raise ValueError(f"actions: agent {agent!r} has shape {row.shape}, must be ({size},)")
@@ -215,7 +215,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         return Box(-1.0, 1.0, _everything(begun_elsewhere, 1).shape, np.float32)
 
     def state(self) -> NDArray[np.float32]:
-        """Return the whole world as one row, for critics that see everything; (S,) float32 in [-1, 1].
+        """Return the state of the world as one row, for centralised critics; (S,) float32 in [-1, 1].
 
         Positions (N, D) in the region shown, velocities (N, D) over the largest speed, alive (N,), obstacles
         (M, D + 1), goals and headings (K, 2 D), and the share of the time limit that has passed; all clipped.
@@ -228,7 +228,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
             self._screen.show(self.world.snapshot())
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return the present picture, (H, W, 3) uint8, or show it in the window and return None."""
+        """Return the current picture, (H, W, 3) uint8, or show it in the window and return None."""
         if self.render_mode is None:
             warnings.warn(
                 "render() shows nothing without a render mode: make(..., render_mode='rgb_array')", stacklevel=2
@@ -238,7 +238,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         return self._screen.show(self.world.snapshot())
 
     def close(self) -> None:
-        """Close the window and end the episode; may be called twice, and reset() begins anew."""
+        """Close the window and end the episode; may be called twice, and reset() begins a new episode."""
         self._running, self._live = False, {}
         self._screen.close()
 
@@ -262,20 +262,20 @@ def _everything(world: World, limit: int) -> NDArray[np.float32]:
 
 
 class FlockParallelEnv(WorldParallelEnv):
-    """A flock in which every boid is an agent (learners=k: only the first k are, the rest are scripted)."""
+    """A flock in which each boid is an agent (learners=k: only the first k; the rest are scripted)."""
 
     task_type = Flock
 
 
 class PursuitParallelEnv(WorldParallelEnv):
-    """Pursuit as a game of two sides: three pursuers and two evaders, all of them agents; captured ones leave."""
+    """Pursuit as a two-team game: three pursuers and two evaders, all of them agents; captured evaders leave."""
 
     task_type = Pursuit
     fixed: ClassVar[dict[str, Any]] = {"pursuers": 3, "evaders": 2, "sides": "both"}
 
 
 class CrossingParallelEnv(WorldParallelEnv):
-    """Walkers swap places across a circle, all of them agents (learners=k: only the first k are)."""
+    """Walkers swap places across a circle, all of them agents (learners=k: only the first k)."""
 
     task_type = Crossing
 
@@ -288,18 +288,18 @@ class HerdParallelEnv(WorldParallelEnv):
 
 
 class SchoolParallelEnv(WorldParallelEnv):
-    """A school in which every fish is an agent, and leaves when caught or starved (learners=k: the first k are)."""
+    """A school in which each fish is an agent, and leaves when caught or starved (learners=k: only the first k)."""
 
     task_type = School
 
 
 class CorridorParallelEnv(WorldParallelEnv):
-    """Two streams in one corridor, all of them agents (learners=k: only the first k are)."""
+    """Two opposite streams in one corridor, all of them agents (learners=k: only the first k)."""
 
     task_type = Corridor
 
 
 class BottleneckParallelEnv(WorldParallelEnv):
-    """A crowd leaves a room by one door; all are agents, each until it is out (learners=k: only the first k are)."""
+    """A crowd leaves a room through one door; all are agents until they are out (learners=k: only the first k)."""
 
     task_type = Bottleneck

@@ -1,4 +1,4 @@
-"""Ids, and the module that builds each: strings and numbers only, so that importing flockenv imports no simulator."""
+"""Environment ids, and the module that builds each; only strings and numbers, so that no simulator is imported."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ HORIZONS = {
     "Corridor": 300,
     "Bottleneck": 300,
 }
-"""Time limit of an episode in control steps, by name: `Task.horizon`, repeated here so that no task is imported."""
+"""Time limit of an episode in decisions, by name: `Task.horizon`, repeated here so that no task is imported."""
 
 VERSIONS = {"Corridor": 1, "Evade": 1, "Flock": 1}
 """Versions of environments whose results have changed, by name; all others are 0. Reasons: each class's `history`."""
@@ -34,7 +34,7 @@ def id_of(name: str) -> str:
 
 
 SINGLE = tuple(id_of(name) for name in HORIZONS)
-"""Ids for gymnasium.make and gymnasium.make_vec: one learner, all other agents are scripted."""
+"""Ids for gymnasium.make and gymnasium.make_vec: by default one learner, all other agents scripted."""
 
 PARALLEL = {
     id_of(name): f"{name.lower()}_v{VERSIONS.get(name, 0)}"

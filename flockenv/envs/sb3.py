@@ -1,7 +1,7 @@
-"""Stable-Baselines3's face: every learner of every world is one row of a VecEnv, without subprocesses or SuperSuit.
+"""Stable-Baselines3 VecEnv: each learner of each world is one row, without subprocesses or SuperSuit.
 
-Worlds on several threads and torch share the cores: on few of them, GOMP_SPINCOUNT=10000 in the environment keeps
-torch's threads from spinning where the worlds' would run (docs/performance.md, Training).
+The thread pool of worlds and torch share the cores. On few cores, GOMP_SPINCOUNT=10000 in the environment keeps torch's
+threads from spinning on cores that the thread pool needs (docs/performance.md, Training).
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ Info = dict[str, Any]
 
 
 class _Nothing(Info):
-    """The info of a row of which there is nothing to tell: one for all of them, so it cannot be written.
+    """The empty info of a row whose episode goes on: one object for all rows, so that it is read-only.
 
-    `info.copy()` gives a dictionary of one's own; pickled or deeply copied it is still this one.
+    `info.copy()` returns a writable dictionary; pickled or deeply copied it is still this object.
     """
 
     def _refuse(self, *args: Any, **kwargs: Any) -> NoReturn:
@@ -70,28 +70,28 @@ NOTHING = _Nothing()
 class WorldVecEnv(VecEnv):
     """B worlds with L learners each as B * L rows of one shared policy; row i is learner i % L of world i // L.
 
-    A world that ended begins anew in the same step. The infos of its rows then hold `terminal_observation`,
-    `TimeLimit.truncated` (so that PPO bootstraps time limits and not deaths), `is_success`, `reward/NAME` (each reward
-    term, summed over the episode), and the metrics of the world; all other infos are one empty dictionary that refuses
-    to be written.
+    A world that ends is reset in the same step. The infos of its rows then hold `terminal_observation`,
+    `TimeLimit.truncated` (so that PPO bootstraps at time limits and not at deaths), `is_success`, `reward/NAME` (each
+    reward term, summed over the episode), and the metrics of the world; all other infos are one empty, read-only
+    dictionary.
 
-    Seeds: `seed(s)` gives world k the seed s + k at the next reset; a world goes on with the next episodes of its seed.
-    The next reset also seeds `np_random` by s, from which wrappers draw; worlds draw nothing from it.
+    Seeds: `seed(s)` gives world k the seed s + k at the next reset; later episodes of a world continue its seed. The
+    next reset also seeds `np_random` with s, for wrappers; worlds draw nothing from it.
 
-    Stable-Baselines3's `EvalCallback` and `evaluate_policy` ask for a monitor: wrap this in `WorldMonitor`.
+    Stable-Baselines3's `EvalCallback` and `evaluate_policy` need a monitor: wrap this in `WorldMonitor`.
 
     Args:
-        task: of which all learners of a world end together, unless `leaving`.
+        task: its learners must end together, unless `leaving`.
         worlds: B.
-        time_limit: decisions after which a world is truncated; None = the task's own horizon.
+        time_limit: decisions after which a world is truncated (default: the task's horizon).
         render_mode: "rgb_array" (world 0) or None.
-        leaving: let learners end one by one. A row is done once, when its learner leaves, and the info of that step
-            holds its `terminal_observation` and reward terms; what is of the world stands in the infos of the rows
-            that end with it. Until the world begins anew, `present` is False for the row, its reward is 0 and its
-            actions are not read. It is not done again when the world begins anew: `present` is True from then on.
+        leaving: allow learners that end one by one. A row is done once, when its learner leaves, and the info of that
+            step holds its `terminal_observation` and reward terms; metrics and success of the world are in the infos of
+            the rows that end with it. Until the world is reset, `present` is False for the row, its reward is 0 and its
+            actions are ignored. The row is not done again at the reset; `present` is True from then on.
 
     Raises:
-        ValueError: the task's learners end one by one, for which a row has no meaning after its end, and not `leaving`.
+        ValueError: the task's learners end one by one, and `leaving` is False.
     """
 
     metadata: dict[str, Any]
@@ -126,7 +126,7 @@ class WorldVecEnv(VecEnv):
         return self._seeds
 
     def reset(self) -> NDArray[np.float32]:
-        """Begin an episode in every world; return (B L, O) float32. `reset_infos` says which seed each row has."""
+        """Begin an episode in every world; return (B L, O) float32. `reset_infos` holds the seed of each row."""
         for options in self._options:
             checked_options(options)
         seeds = [seed for seed in self._seeds[:: self.task.learners] if seed is not None]
@@ -142,7 +142,7 @@ class WorldVecEnv(VecEnv):
         return self._rows(observation)
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Take the actions of all rows, (B L, A), clipped to [-1, 1]; ValueError on another shape."""
+        """Store the actions of all rows, (B L, A), clipped to [-1, 1]; ValueError on another shape."""
         begun(self._running, "step")
         rows = np.asarray(actions)
         expected = (self.num_envs, self.task.action_layout.size)
@@ -151,9 +151,9 @@ class WorldVecEnv(VecEnv):
         self._actions = rows.reshape(self.world.worlds, self.task.learners, -1)
 
     def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], list[Info]]:
-        """Act for one control_dt; return observations (B L, O), rewards (B L,), dones (B L,) and an info per row.
+        """Take one decision; return observations (B L, O), rewards (B L,), dones (B L,) and an info per row.
 
-        Raises ValueError that names world and agent on NaN.
+        Raises ValueError, with world and agent, on NaN.
         """
         actions, self._actions = self._actions, None
         if actions is None:
@@ -170,7 +170,7 @@ class WorldVecEnv(VecEnv):
         return self._rows(result.observation), result.reward.reshape(-1), done.reshape(-1), infos
 
     def _tell(self, infos: list[Info], result: Step, done: NDArray[np.bool_]) -> None:
-        """Write how the episodes of the rows that are done ended, done (B, L); the only loop over rows."""
+        """Write the infos of the rows that are done, done (B, L); the only loop over rows."""
         worlds, each = np.flatnonzero(done.any(axis=1)), self.task.learners
         of_world = self._ends(result, np.flatnonzero(result.ended))
         picked = done[worlds].reshape(-1)
@@ -180,11 +180,11 @@ class WorldVecEnv(VecEnv):
         for row, info, last, terminated in zip(rows, paid, seen, over, strict=True):
             infos[row] = info
             info["terminal_observation"] = last
-            info["TimeLimit.truncated"] = not terminated  # what else ends an episode is the time limit
+            info["TimeLimit.truncated"] = not terminated  # an episode ends by termination or by the time limit
             info |= of_world.get(row // each, {})
 
     def _ends(self, result: Step, worlds: NDArray[np.intp]) -> dict[int, Info]:
-        """Return what the infos of all rows of a world say of its end, by world."""
+        """Return the metrics and success of each world that ended, for the infos of its rows, by world."""
         columns = {name: column[worlds].tolist() for name, column in self.world.measure().items()}
         columns["is_success"] = result.success[worlds].tolist()
         ends = (dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True))
@@ -192,30 +192,30 @@ class WorldVecEnv(VecEnv):
         return dict(zip(worlds.tolist(), known, strict=True))
 
     def _rows(self, observation: NDArray[np.float32], worlds: Any = slice(None)) -> NDArray[np.float32]:
-        """Return a row for each learner of these worlds, (B, L, O); one who shows more than that does it here."""
+        """Return a row for each learner of these worlds, (B, L, O); a subclass may extend rows here."""
         return observation.reshape(-1, self.task.layout.size)
 
     def close(self) -> None:
-        """End the episodes and close the window; may be called twice, and reset() begins anew."""
+        """End the episodes and close the window; may be called twice, and reset() begins new episodes."""
         self._running, self._actions = False, None
         self._screen.close()
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        """Return the picture of world 0: a picture per row would show every world as often as it has learners."""
+        """Return the picture of world 0 only: one per row would repeat each world for each of its learners."""
         begun(self._running, "render")
         return [self._screen.show(self.world.snapshot(), "rgb_array")]
 
     def render(self, mode: str | None = None) -> NDArray[np.uint8] | None:
-        """Return the picture of world 0, (H, W, 3) uint8, or show it ("human") in our window, which needs no OpenCV."""
+        """Return the picture of world 0, (H, W, 3) uint8, or show it ("human") in flockenv's window, without OpenCV."""
         begun(self._running, "render")
         return self._screen.show(self.world.snapshot(), mode)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute of this face (`task`, `world`, ...) for each of the rows."""
+        """Return an attribute of this object (`task`, `world`, ...) for each of the rows."""
         return [getattr(self, attr_name)] * len(self._picked(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of this face; ValueError for some rows only, since all rows share one simulator."""
+        """Set an attribute of this object; ValueError for a subset of rows, since all rows share one simulator."""
         if len(self._picked(indices)) != self.num_envs:
             raise ValueError(f"set_attr({attr_name!r}): the rows share one simulator; leave out indices")
         setattr(self, attr_name, value)
@@ -223,14 +223,14 @@ class WorldVecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of this face once, and return its result for each of the rows."""
+        """Call a method of this object once, and return its result for each of the rows."""
         picked = self._picked(indices)
         return [getattr(self, method_name)(*method_args, **method_kwargs)] * len(picked)
 
     def env_is_wrapped(
         self, wrapper_class: type[Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """Return False for each of the rows: there is no gymnasium environment inside that could be wrapped."""
+        """Return False for each of the rows: they contain no gymnasium environment that could be wrapped."""
         return [False] * len(self._picked(indices))
 
     def _picked(self, indices: VecEnvIndices) -> list[int]:
@@ -238,7 +238,7 @@ class WorldVecEnv(VecEnv):
 
 
 def _spec(task: Task, time_limit: int | None) -> EnvSpec | None:
-    """Return the spec with which `gymnasium.make_vec` makes the same worlds; None for a task without an id."""
+    """Return the spec from which `gymnasium.make_vec` makes the same worlds; None for a task without an id."""
     name = type(task).__name__
     if name not in HORIZONS:
         return None
@@ -247,15 +247,15 @@ def _spec(task: Task, time_limit: int | None) -> EnvSpec | None:
     for name, field in type(task).model_fields.items():
         value = getattr(task, name)
         if name != "horizon" and (name == "learners" or value != field.get_default(call_default_factory=True)):
-            spec.kwargs[name] = value  # learners always: the default of an id is 1, that of a task is all
+            spec.kwargs[name] = value  # always learners: the default of an id is 1, that of a task is all
     return spec
 
 
 class WorldMonitor(VecMonitor):
     """VecMonitor over a WorldVecEnv: the length of an episode is the number of steps in which its learner acted.
 
-    VecMonitor alone counts also the steps for which the row of a learner that has left waits for its world to end.
-    Where all learners of a world end together, both count the same.
+    VecMonitor alone also counts the steps in which the row of a learner that has left waits for its world to end. Both
+    agree if all learners of a world end together.
 
     Args:
         venv: a WorldVecEnv.
@@ -265,7 +265,7 @@ class WorldMonitor(VecMonitor):
     venv: WorldVecEnv
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Act; the infos of rows that are done hold `episode`: return `r`, length `l` and time `t` in s."""
+        """Take one decision; infos of rows that are done hold `episode`: return `r`, length `l` and time `t` in s."""
         waiting = ~self.venv.present
         outcome = super().step_wait()
         self.episode_lengths[waiting] = 0
@@ -275,9 +275,9 @@ class WorldMonitor(VecMonitor):
 def load_sb3_zip(
     path: str | os.PathLike[str], trust_pickle: bool = False, algorithm: type[BaseAlgorithm] = PPO
 ) -> BaseAlgorithm:
-    """Read a model that Stable-Baselines3 saved, which RUNS CODE from the file (cloudpickle, SB3 #2281).
+    """Load a model that Stable-Baselines3 saved; this RUNS CODE from the file (cloudpickle, SB3 #2281).
 
-    Our own policies are safetensors and need none of this: flockenv.players.policy.MlpPolicy.load.
+    Policies of flockenv are safetensors, which run no code: flockenv.players.policy.MlpPolicy.load.
 
     Raises:
         ValueError: trust_pickle is not True, or there is no such file.
@@ -285,7 +285,7 @@ def load_sb3_zip(
     file = Path(path)
     if trust_pickle is not True:
         raise ValueError(
-            f"{file}: a Stable-Baselines3 zip runs code when it is read; if you made it, say trust_pickle=True"
+            f"{file}: a Stable-Baselines3 zip runs code when it is read; if you trust it, pass trust_pickle=True"
         )
     if not file.is_file():
         raise ValueError(f"{file}: no such file")

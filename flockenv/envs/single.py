@@ -1,4 +1,4 @@
-"""Gymnasium environments: one learner in one world; the page of each is its docstring."""
+"""Gymnasium environments: one learner in one world; the docstring of each is its documentation page."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ __all__ = [
 
 
 def one_learner(task_type: type[Task], parameters: dict[str, Any]) -> Task:
-    """Make the task of a face that has one action per world; ValueError if several agents would learn."""
+    """Make the task of an environment with one learner; ValueError if the task has several."""
     task = build(task_type, parameters, limit="max_episode_steps", own=("render_mode",))
     if task.learners != 1:
         raise ValueError(
@@ -69,7 +69,7 @@ def one_learner(task_type: type[Task], parameters: dict[str, Any]) -> Task:
 
 
 class SingleEnv(gymnasium.Env[Rows, Rows]):
-    """One world with one learner, as Gymnasium wants it; `task` and `world` give access to the arrays inside.
+    """One world with one learner, as a Gymnasium environment; `task` and `world` give access to its arrays.
 
     Seeds: `reset(seed=s)` begins episode 0 of seed s; each later `reset()` begins the next episode of that seed, and a
     first `reset()` without a seed draws one. `info["seed"]` of a reset is the seed used.
@@ -77,7 +77,7 @@ class SingleEnv(gymnasium.Env[Rows, Rows]):
 
     task_type: ClassVar[type[Task]]
     fixed: ClassVar[dict[str, Any]] = {}
-    """Parameters with another default than the task's own."""
+    """Parameters whose default differs from the task's."""
     history: ClassVar[str]
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -101,7 +101,7 @@ class SingleEnv(gymnasium.Env[Rows, Rows]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begin an episode; return (O,) float32 and info with the seed. Takes no options: any is refused by name."""
+        """Begin an episode; return (O,) float32 and info with the seed. Raises ValueError for any option."""
         seed = checked_seed(seed)
         checked_options(options)
         super().reset(seed=seed)
@@ -113,9 +113,9 @@ class SingleEnv(gymnasium.Env[Rows, Rows]):
         return observation, {"seed": self.world.seeds[0]}
 
     def step(self, action: Rows) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Act for one control_dt; the action is (A,), clipped to [-1, 1]. Raises ValueError on NaN or another shape.
+        """Take one decision; the action is (A,), clipped to [-1, 1]. Raises ValueError on NaN or another shape.
 
-        `truncated` is always False here: the time limit is the wrapper that gymnasium.make puts around.
+        `truncated` is always False here: the wrapper that gymnasium.make adds applies the time limit.
         """
         begun(self._running, "step")
         result = self.world.step(self._row(action))
@@ -139,7 +139,7 @@ class SingleEnv(gymnasium.Env[Rows, Rows]):
             self._screen.show(self.world.snapshot())
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return the present picture, (H, W, 3) uint8, or show it in the window and return None."""
+        """Return the current picture, (H, W, 3) uint8, or show it in the window and return None."""
         if self.render_mode is None:
             logger.warn("render() shows nothing without a render mode: gymnasium.make(..., render_mode='rgb_array')")
             return None
@@ -147,7 +147,7 @@ class SingleEnv(gymnasium.Env[Rows, Rows]):
         return self._screen.show(self.world.snapshot())
 
     def close(self) -> None:
-        """Close the window and end the episode; may be called twice, and reset() begins anew."""
+        """Close the window and end the episode; may be called twice, and reset() begins a new episode."""
         self._running = False
         self._screen.close()
 
@@ -160,21 +160,21 @@ class PursuitEnv(SingleEnv):
 
 
 class ObstaclesEnv(SingleEnv):
-    """A walker goes to its goal through a random field of obstacles."""
+    """A walker crosses a random field of obstacles to its goal."""
 
     task_type = Obstacles
     history = "v0: first version (flockenv 0.1.0)."
 
 
 class PathFollowEnv(SingleEnv):
-    """A runner follows a narrow winding track, as far as it gets."""
+    """A runner follows a narrow winding track as far as possible."""
 
     task_type = PathFollow
     history = "v0: first version (flockenv 0.1.0)."
 
 
 class FlockEnv(SingleEnv):
-    """A learner flies in a flock of scripted flockmates."""
+    """A learner travels in a flock of scripted flockmates."""
 
     task_type = Flock
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}
@@ -185,7 +185,7 @@ class FlockEnv(SingleEnv):
 
 
 class CrossingEnv(SingleEnv):
-    """A learner crosses a circle among scripted walkers that keep clear of it and of each other by ORCA."""
+    """A learner crosses a circle among scripted walkers that avoid it and each other by ORCA."""
 
     task_type = Crossing
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}
@@ -200,7 +200,7 @@ class HerdEnv(SingleEnv):
 
 
 class EvadeEnv(SingleEnv):
-    """An evader stays out of the hands of three scripted pursuers among cover."""
+    """An evader escapes three scripted pursuers among cover."""
 
     task_type = Evade
     history = (
@@ -209,7 +209,7 @@ class EvadeEnv(SingleEnv):
 
 
 class SchoolEnv(SingleEnv):
-    """A fish lives among scripted fish, food that grows, and a scripted hunter."""
+    """A fish lives among scripted fish, patches of food that regrow, and a scripted hunter."""
 
     task_type = School
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}
@@ -224,7 +224,7 @@ class CrowdNavEnv(SingleEnv):
 
 
 class CorridorEnv(SingleEnv):
-    """One walker in a corridor among two streams of scripted ones."""
+    """A learner walks in a corridor among two opposite streams of scripted walkers."""
 
     task_type = Corridor
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}
@@ -235,7 +235,7 @@ class CorridorEnv(SingleEnv):
 
 
 class BottleneckEnv(SingleEnv):
-    """One person leaves a room through a door that scripted others also leave by."""
+    """A person leaves a crowded room through one door, among scripted people."""
 
     task_type = Bottleneck
     fixed: ClassVar[dict[str, Any]] = {"learners": 1}

@@ -1,7 +1,7 @@
-"""Gymnasium's vector environments: many worlds in one array program, without subprocesses or a loop over worlds.
+"""Gymnasium vector environments: many worlds in one array program, without subprocesses or a Python loop over worlds.
 
-They behave as gymnasium's SyncVectorEnv over the single environments does, number for number and info for info (a test
-compares the two), in each of the three autoreset modes; `infos="ends"` reports ends and begins alone.
+Numbers and infos equal those of gymnasium's SyncVectorEnv over the single environments (a test compares the two), in
+each of the three autoreset modes; `infos="ends"` reports only ends and starts of episodes.
 """
 
 from __future__ import annotations
@@ -69,25 +69,25 @@ OWN: Final = ("num_envs", "max_episode_steps", "autoreset_mode", "render_mode", 
 """Arguments of WorldsEnv that are not the task's."""
 INFOS = ("steps", "ends")
 NONE = -1
-"""Stands for "no seed" in a column of seeds."""
+"""Marks "no seed" in a column of seeds."""
 
 
 class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
     """B independent worlds with L learners each as B L rows; row i is learner i % L of world i // L.
 
-    With one learner a world, row k of seed s is the single environment of seed s + k. With several, which must all end
-    together, rows of one world share its seed, metrics and success; they end together and begin anew together.
+    With one learner per world, row k of seed s equals the single environment of seed s + k. With several, which must
+    all end together, the rows of one world share its seed, metrics and success, and are reset together.
 
     Args:
-        num_envs: B L, how many rows; a whole number of worlds.
-        max_episode_steps: decisions after which a world is truncated; None = never (make_vec passes the id's own).
-        autoreset_mode: when a world that ended begins anew. "NextStep" (default, as gymnasium's own): the next step
-            is its reset: it does not read the actions of the world's rows, and returns their first observations,
-            reward 0 and no end. "SameStep": in the step that ends it; `info["final_obs"]` and `info["final_info"]`
-            hold the end. "Disabled": only by `reset(options={"reset_mask": mask})`.
+        num_envs: B L, the number of rows; a multiple of L.
+        max_episode_steps: decisions after which a world is truncated; None: never (make_vec passes that of the id).
+        autoreset_mode: when a world that ended is reset. "NextStep" (default, as in gymnasium): in the next step, which
+            ignores the actions of the world's rows, and returns their first observations, reward 0 and no end.
+            "SameStep": in the step that ends it; `info["final_obs"]` and `info["final_info"]` hold the end. "Disabled":
+            only by `reset(options={"reset_mask": mask})`.
         render_mode: "rgb_array" or None.
-        infos: "steps" reports every row after every step, as single environments do; "ends" only the metrics of
-            episodes that end and the seeds of episodes that begin: faster with many rows.
+        infos: "steps" reports every row after every step, as single environments do; "ends" reports only the
+            metrics of episodes that end and the seeds of episodes that begin: faster with many rows.
         parameters: those of the task.
     """
 
@@ -135,7 +135,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
     ) -> tuple[NDArray[np.float32], Info]:
         """Begin an episode in every world, or in those of options["reset_mask"], (B L,) bool; return (B L, O) float32.
 
-        seed: s for worlds s, s + 1, ...; or one per row, None meaning the next episode of the seed that its world has.
+        seed: s for worlds s, s + 1, ...; or one per row, None for the next episode of its world's seed.
         """
         seeds = self._seed_column(seed)
         mask = self._reset_mask(checked_options(options, ("reset_mask",)))
@@ -152,7 +152,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         return np.repeat(column, self.task.learners, axis=0)
 
     def _seed_column(self, seed: int | Sequence[int | None] | None) -> NDArray[np.int64]:
-        """Return a seed per world, (B,); refuses one seed too many, and rows of one world that disagree."""
+        """Return a seed per world, (B,); ValueError for a wrong number of seeds, or rows of one world that disagree."""
         worlds = self.world.worlds
         if seed is None:
             return np.full(worlds, NONE, np.int64)
@@ -166,7 +166,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         return self._one_per_world("seed", np.array([NONE if s is None else s for s in given], np.int64))
 
     def _reset_mask(self, options: Mapping[str, Any]) -> Mask:
-        """Return the worlds to begin, (B,) bool."""
+        """Return the worlds to reset, (B,) bool."""
         if "reset_mask" not in options:
             return np.ones(self.world.worlds, np.bool_)
         mask = options["reset_mask"]
@@ -180,7 +180,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         return self._one_per_world("options['reset_mask']", mask)
 
     def _one_per_world(self, what: str, column: NDArray[Any]) -> NDArray[Any]:
-        """Return the first of each world's rows; ValueError if another row of that world differs."""
+        """Return the value of each world's first row; ValueError if another row of that world differs."""
         several = column.reshape(self.world.worlds, self.task.learners)
         differ = several != several[:, :1]
         if differ.any():
@@ -192,7 +192,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
     def _begin(
         self, mask: Mask, seeds: NDArray[np.int64] | None = None, into: NDArray[np.float32] | None = None
     ) -> NDArray[np.float32]:
-        """Begin the masked worlds, with a new seed where there is one, else with the next episode of their seed."""
+        """Reset the masked worlds, each with its new seed if there is one, else to the next episode of its seed."""
         self._ended = self._ended & ~mask
         if seeds is None:
             return self.world.reset(mask=mask, into=into)
@@ -205,9 +205,9 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         return observation
 
     def step(self, actions: Rows) -> tuple[NDArray[np.float32], Rows, Mask, Mask, Info]:
-        """Act for one control_dt in every world; actions are (B L, A), clipped to [-1, 1].
+        """Take one decision in each world; actions are (B L, A), clipped to [-1, 1].
 
-        Raises ValueError that names the world on NaN or another shape; ResetNeeded for a world that ended, if
+        Raises ValueError on NaN (with the world) or another shape; ResetNeeded for a world that ended, if
         `autoreset_mode` is "Disabled".
         """
         begun(self._running, "step")
@@ -224,9 +224,9 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         return observation, reward, terminated.reshape(-1), late, info
 
     def _infos(self, result: Step, anew: Mask | None, final: bool) -> Info:
-        """Return infos of every row, or of those that ended; begin worlds anew, in the result's observations.
+        """Return infos of all rows, or of those that ended; reset the worlds `anew`, in the result's observations.
 
-        final: the worlds have just ended, so that their last observations and infos are entered first.
+        final: these worlds have just ended, so that their last observations and infos are entered first.
         """
         info: Info = {}
         told, anew = self._told(), self._nobody if anew is None else anew
@@ -250,14 +250,14 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         return self._ended if self.infos == "ends" else np.ones(self.world.worlds, np.bool_)
 
     def _begun(self, worlds: Mask) -> Info:
-        """Return the seeds of the worlds that have begun."""
+        """Return the infos of reset worlds: their seeds."""
         info: Info = {}
         mask = self._rows(worlds)
         _put(info, _only({"seed": self._rows(self._seeds)}, np.flatnonzero(mask)), mask)
         return info
 
     def _resting(self) -> Mask | None:
-        """Return the worlds for which this step is their reset, if any; refuse to step one that ended and stays so."""
+        """Return the worlds that this step resets, if any; ResetNeeded if one has ended and autoreset is disabled."""
         if self.autoreset_mode is AutoresetMode.NEXT_STEP and self._ended.any():
             return self._ended
         if self.autoreset_mode is AutoresetMode.DISABLED and self._ended.any():
@@ -267,7 +267,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         return None
 
     def _blocks(self, actions: Rows, resting: Mask | None) -> Rows:
-        """Return the actions by world and learner, (B, L, A), with zeros for resting worlds."""
+        """Return the actions by world and learner, (B, L, A), with zeros for worlds that this step resets."""
         given = np.asarray(actions)
         if given.shape != self.action_space.shape:
             raise ValueError(f"actions: shape {given.shape}, must be {self.action_space.shape}, a row per learner")
@@ -275,7 +275,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         return blocks if resting is None else np.where(resting[:, None, None], 0.0, blocks)
 
     def _columns(self, result: Step) -> tuple[Info, dict[str, Mask]]:
-        """Return infos as columns over rows, and by column the rows that have no value yet (zero in its place)."""
+        """Return infos as columns over rows, and by column the rows that have no value yet (0 instead)."""
         columns: Info = {key: result.terms[..., k].reshape(-1) for k, key in enumerate(self._reward_keys)}
         columns["is_success"] = self._rows(result.success)
         lacks = {}
@@ -296,7 +296,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         return tuple(frame for frame in frames if frame is not None)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Forget the episodes; a step then needs a reset."""
+        """End the episodes; the next step then needs a reset."""
         self._running = False
 
 
@@ -311,21 +311,21 @@ def _autoreset(mode: str | AutoresetMode) -> AutoresetMode:
 
 
 def _worlds(rows: Any, learners: int) -> int:
-    """Return the number of worlds that these rows make; ValueError if their learners do not fill whole worlds."""
+    """Return the number of worlds with this many rows; ValueError unless `learners` divides it."""
     if learners == 1 or not isinstance(rows, int | np.integer):
-        return rows  # type: ignore[no-any-return]  # World refuses what is no number of worlds
+        return rows  # type: ignore[no-any-return]  # World checks the number of worlds
     worlds, over = divmod(int(rows), learners)
     if over:
         near = sorted({max(k, 1) * learners for k in (worlds, worlds + 1)})
         raise ValueError(
-            f"num_envs: {rows} rows are no whole number of worlds with {learners} learners each; "
+            f"num_envs: {rows} rows are not a multiple of the {learners} learners per world; "
             f"the nearest: {' or '.join(map(str, near))}"
         )
     return worlds
 
 
-# Infos are columns over rows, as gymnasium's vector envs make them: zeros, and a False in `_name`, where there is no
-# value. Those that come from a result are the step's own arrays, so they are handed on and not copied.
+# Infos are columns over rows, as in gymnasium's vector envs, with 0, and False in `_name`, if there is no value.
+# Columns of a result are the step's own arrays, so that they need no copy.
 
 
 def _put(info: Info, columns: Mapping[str, Any], mask: Mask, lacks: Mapping[str, Mask] = MappingProxyType({})) -> None:
@@ -348,7 +348,7 @@ def _put_final(info: Info, seen: NDArray[np.float32], columns: Info, mask: Mask,
 
 
 def _only(columns: Mapping[str, Any], rows: NDArray[np.intp]) -> Info:
-    """Return new columns: zeros but in these rows."""
+    """Return new columns that are zero except in these rows."""
     new = {name: np.zeros_like(column) for name, column in columns.items()}
     for name, column in new.items():
         column[rows] = columns[name][rows]

@@ -1,4 +1,4 @@
-"""World: B independent worlds of one task, stepped together. Every face is a thin view of this."""
+"""World: B independent worlds of one task, stepped together. Each environment API is a thin layer over it."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ __all__ = ["Step", "World"]
 Rows = NDArray[np.float32]
 
 LEAST = 24
-"""A portion of worlds that is handed out to a thread is at least one in so many of its share of them."""
+"""The smallest chunk of worlds for a thread is 1 / LEAST of its equal share."""
 
 RECYCLE = 2**18
-"""Bytes of observations from which on the memory of results is used again; below, new memory costs less."""
+"""Bytes of observations from which results come from a buffer pool; below, new memory costs less."""
 
 PAST = 2**22
-"""Bytes of observations from which on they are written past the caches, which have no room for them in any case."""
+"""Bytes of observations from which they are written with streaming stores, as they do not fit into the caches."""
 
 AT_HAND = 2**17
-"""Bytes of observations of a world up to which that is so: they are made in scratch that stays in a core's cache."""
+"""Largest bytes of observations per world for streaming stores: they are made in scratch in a core's cache."""
 
 TERMS = ("steps", "ends")
 _NEVER = 2**63 - 1
@@ -53,35 +53,35 @@ _SINGLE = np.dtype(np.float32)
 
 
 class Step(NamedTuple):
-    """What one decision brought; every array is fresh, nobody else holds it. B worlds, L learners."""
+    """Results of one decision, in arrays that nothing else references. B worlds, L learners."""
 
     observation: Rows  # (B, L, O)
     reward: NDArray[np.float64]  # (B, L)
-    terms: NDArray[np.float64]  # (B, L, K), reward = sum over K where told; each term in one piece
+    terms: NDArray[np.float64]  # (B, L, K), reward = sum over K, if written; each term contiguous
     terminated: NDArray[np.bool_]  # (B, L)
-    truncated: NDArray[np.bool_]  # (B,) the time limit, nothing else
+    truncated: NDArray[np.bool_]  # (B,) by the time limit
     success: NDArray[np.bool_]  # (B,)
     alive: NDArray[np.bool_]  # (B, L) after the step
 
     @property
     def ended(self) -> NDArray[np.bool_]:
-        """(B,): the episode is over, one way or the other."""
+        """(B,): True if the episode is over, truncated or with all learners terminated."""
         return np.asarray(self.truncated | self.terminated.all(axis=1))
 
 
 class World:
-    """B worlds of one task. World k of seed s is the same world as the only one of seed s + k, bit for bit.
+    """B worlds of one task. World k of seed s equals a single world of seed s + k, bit for bit.
 
-    It never resets by itself: a face decides when. Raises ValueError on actions of a wrong shape or that are not
-    finite, naming world and agent, before anything has moved; RuntimeError on a step before the first reset.
+    It never resets by itself. Raises ValueError on actions of a wrong shape, and on actions that are not finite, with
+    world and agent, before any state changes; RuntimeError on a step before the first reset.
     """
 
     def __init__(self, task: Task, worlds: int = 1, time_limit: int | None = None) -> None:
-        """worlds: B >= 1. time_limit: decisions until truncation, none = never."""
+        """worlds: B >= 1. time_limit: decisions until truncation; None: no limit."""
         if not _whole(worlds) or worlds < 1:
-            raise ValueError(f"worlds is {worlds!r}, must be a whole number of at least 1")
+            raise ValueError(f"worlds is {worlds!r}, must be an integer >= 1")
         if time_limit is not None and (not _whole(time_limit) or time_limit < 1):
-            raise ValueError(f"time_limit is {time_limit}, must be a whole number of decisions, at least 1, or None")
+            raise ValueError(f"time_limit is {time_limit}, must be an integer >= 1 (decisions), or None")
         scene = task.scene
         bytes_ = worlds * (scene.bytes_per_world() + task.learners * 8 * task.layout.size)
         if bytes_ > MEMORY_LIMIT:
@@ -90,7 +90,7 @@ class World:
         self.task, self.worlds, self.time_limit = task, int(worlds), time_limit
         self.learners, self.agents = task.learners, scene.agents
         self.observation_size, self.action_size = task.layout.size, task.action_layout.size
-        # The kernel is handed these arrays once and for all: write into them, never put others in their place.
+        # These arrays are bound to the kernel once: write into them, never replace them.
         self.state: Final = states.blank(
             self.worlds, self.agents, scene.dimension, task.obstacle_slots, scene.dt, scene.dtype,
             scene.parts.frame_rows, inner_rows=len(scene.parts.inner),
@@ -105,7 +105,7 @@ class World:
         self._prepare()
 
     def _prepare(self) -> None:
-        """Make what follows from the task: kernel, scratch, and what every step is given."""
+        """Make what follows from the task: kernel, scratch, and the constant arguments of each step."""
         scene, task, s = self.task.scene, self.task, self.state
         self._entries = play_of(task), tell_of(task)
         self._enter, self._tell = self._entries
@@ -116,10 +116,10 @@ class World:
             ((b, i, self.observation_size), np.float32), ((b, i), float), ((len(task.terms), b, i), float),
             ((b, i), bool), ((b,), bool), ((b,), bool), ((b, i), bool),
         )  # fmt: skip
-        self._shapes = tuple(shape for shape, _ in fields)  # of a Step, whose terms lie one after the other
+        self._shapes = tuple(shape for shape, _ in fields)  # of a Step, with terms as the first axis
         self._dtypes = tuple(np.dtype(kind) for _, kind in fields)
         self._everywhere = np.ones(b, np.bool_)
-        self._untold = tuple(np.empty(shape, kind) for shape, kind in fields[1:])  # what a reset says nothing of
+        self._untold = tuple(np.empty(shape, kind) for shape, kind in fields[1:])  # results that a reset does not write
         row, size = 4 * math.prod(self._shapes[0][1:]), 4 * math.prod(self._shapes[0])
         self._past = size >= PAST and row <= AT_HAND
         kinds, maker = zip(self._shapes, self._dtypes, strict=True), Recycler(line=LINE).maker
@@ -141,13 +141,13 @@ class World:
         self._hire()
 
     def _hire(self) -> None:
-        """Bind the entry point to what it is given in every call, once for each thread: the scratch is its own."""
+        """Bind the entry point to its constant arguments, once for each thread, which has its own scratch."""
         self._calls: list[Callable[..., tuple[int, int]]] = [
             functools.partial(self._enter, *self._always, *scratch) for scratch in self._scratch
         ]
 
     def _allocate(self) -> tuple[Decision, Near, Any]:
-        """Return the scratch of one thread: of a decision, of looking, of stepping."""
+        """Return the scratch of one thread: of a decision, of the neighbour query, of a physics step."""
         task, scene, n = self.task, self.task.scene, self.agents
         d, real, look = scene.dimension, scene.dtype, task.look or Look(0.0)
         lanes = PAIR if task.abreast else task.parts.width
@@ -157,7 +157,7 @@ class World:
             beside = zeros(task.abreast * apart(self.learners), np.float32)
             own, vel = (2 * d + 1 + task.memory, padded), (d, look.agents, padded)
             wide = (zeros(own, real), zeros(vel, real), zeros((1, look.agents, padded), real), beside)
-            wide[2][:] = scene.body.radius[0]  # all have it, or it is taken
+            wide[2][:] = scene.body.radius[0]  # all agents have it, or it is gathered
         decision = Decision(
             zeros(self._shapes[0][1:] if self._past else (0, 0), np.float32),
             zeros((d, 1, n), real), zeros((d, n), real), zeros((d, n), real), zeros(n, np.bool_),
@@ -174,7 +174,7 @@ class World:
         return decision, Near(*[*near, places]), space.of(0, scratch_record(task.parts))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Pickle what cannot be made anew."""
+        """Return the attributes that `_prepare` cannot make again."""
         made = (
             "_entries", "_enter", "_tell", "_actions", "_always", "_scratch", "_choices", "_calls", "_counted",
             "_alone", "_shapes", "_dtypes", "_everywhere", "_untold", "_fresh", "_past",
@@ -182,12 +182,12 @@ class World:
         return {name: value for name, value in vars(self).items() if name not in made}
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
-        """Go on where the pickled world was."""
+        """Continue from a pickled world."""
         vars(self).update(kept)
         self._prepare()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> World:
-        """Return a world that goes on by itself from here."""
+        """Return an independent world that continues from here."""
         new = object.__new__(World)
         new.__setstate__({name: copy.deepcopy(value, memo) for name, value in self.__getstate__().items()})
         return new
@@ -199,9 +199,9 @@ class World:
     ) -> Rows:
         """Begin episodes and return observations (B, L, O).
 
-        seeds: an int s gives world k the seed s + k; a sequence gives each its own; none begins the next episode of the
-        same seeds (a first one without seeds draws them from the system). mask (B,): only these worlds begin anew.
-        into: the observations of the step before, in which the worlds that begin are to be written; none = a new array.
+        seeds: an int s gives world k the seed s + k; a sequence gives each its own; None begins the next episode of the
+        same seeds (a first reset without seeds draws one from the system). mask (B,): only these worlds are reset.
+        into: observations of the last step, into which those of reset worlds are written; None: a new array.
         """
         rows = np.ones(self.worlds, np.bool_) if mask is None else np.array(mask)
         if rows.shape != (self.worlds,) or rows.dtype != np.bool_:
@@ -211,13 +211,13 @@ class World:
         if into is not None and (into.shape, into.dtype) != (self._shapes[0], self._dtypes[0]):
             raise ValueError(f"into has shape {into.shape} and type {into.dtype}, expected {self._shapes[0]} float32")
         if into is not None and not into.flags.carray:
-            raise ValueError("into must be writable and in one piece: the observations of a step, no part of them")
+            raise ValueError("into must be writable and contiguous: the observations of a step, no part of them")
         self._seed(seeds, rows)
         observation: Rows = self._fresh[0]() if into is None else into
         begun = self.worlds if into is None else int(np.count_nonzero(rows))
         self._play(False, rows, into is None, begun, 0, Results(observation, *self._untold), self._actions)
         if self._enter is self._entries[0]:
-            self._enter = without_dispatch(self._enter)  # types stay what they were in this call
+            self._enter = without_dispatch(self._enter)  # argument types do not change after this call
             self._hire()
         for numbers in (self._sums, self._last, self.paid):
             numbers[rows] = 0
@@ -236,15 +236,15 @@ class World:
         self.state.key[rows] = keys_of(self._seeds[rows], self._episodes[rows])
 
     def _checked(self, seeds: int | Sequence[int]) -> list[int]:
-        """Return one seed per world, or refuse."""
+        """Return one seed per world; ValueError for another number of seeds, or no integers in 0 ... 2^64 - 1."""
         if not (_whole(seeds) or (isinstance(seeds, (Sequence, np.ndarray)) and not isinstance(seeds, (str, bytes)))):
-            raise ValueError(f"seeds is {seeds!r}, must be a whole number, or a sequence of them, one for each world")
+            raise ValueError(f"seeds is {seeds!r}, must be an integer, or a sequence of integers, one for each world")
         several = [seeds + k for k in range(self.worlds)] if isinstance(seeds, (int, np.integer)) else list(seeds)
         if len(several) != self.worlds:
             raise ValueError(f"{len(several)} seeds for {self.worlds} worlds")
         for k, seed in enumerate(several):
             if not _whole(seed) or not 0 <= seed <= MASK:
-                raise ValueError(f"seed of world {k} is {seed!r}, must be a whole number from 0 to 2^64 - 1")
+                raise ValueError(f"seed of world {k} is {seed!r}, must be an integer from 0 to 2^64 - 1")
         return [int(seed) for seed in several]
 
     @property
@@ -253,9 +253,9 @@ class World:
         return () if self._seeds is None else tuple(self._seeds.tolist())
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return everything that changes while worlds go on, by name, as views; RuntimeError before the first reset.
+        """Return all arrays that change during episodes, by name, as views; RuntimeError before the first reset.
 
-        Copies of them and the task are enough to go on from here: see `restore`.
+        Copies of them and the task are enough to continue from here: see `restore`.
         """
         if self._seeds is None:
             raise RuntimeError("arrays before the first reset: call reset() first")
@@ -267,10 +267,10 @@ class World:
         return {**{f"state.{name}": array for name, array in state.items()}, **mine}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Go on from what `arrays` returned of worlds of the same task, as many; the next step is theirs, bit for bit.
+        """Continue from what `arrays` returned for as many worlds of the same task; the next step is equal bit for bit.
 
-        Raises ValueError that names the array which is missing, unknown, or of another shape or type, before any is
-        written; RuntimeError before the first reset.
+        Raises ValueError, with the array that is missing, unknown, or of another shape or type, before any is written;
+        RuntimeError before the first reset.
         """
         mine = self.arrays()
         if odd := sorted(mine.keys() ^ arrays.keys()):
@@ -284,19 +284,19 @@ class World:
 
     @property
     def memory(self) -> NDArray[Any]:
-        """(B, M, N): what the task keeps of everybody beside the state, such as hunger; a view of what is kept."""
+        """(B, M, N): the task's memory of each agent, such as hunger; a view."""
         return self._memory.transpose(1, 0, 2)
 
     @property
     def paid(self) -> NDArray[np.float64]:
-        """(B, L, K): terms, summed over the episode; a view of what is counted."""
+        """(B, L, K): reward terms, summed over the episode; a view."""
         return self._paid.transpose(1, 2, 0)
 
     def step(self, actions: ArrayLike, terms: Literal["steps", "ends"] = "steps") -> Step:
-        """Let everybody act for control_dt; actions (B, L, A), clipped to [-1, 1].
+        """Take one decision, of control_dt s, in each world; actions (B, L, A), clipped to [-1, 1].
 
-        terms: told after all "steps", or (faster with many worlds) only of worlds in which somebody ends or whose time
-        is over; for others anything stands there.
+        terms: written after all "steps", or (faster with many worlds) only for worlds in which a learner ends or the
+        time limit is reached ("ends"); those of other worlds are undefined.
         """
         if self._seeds is None:
             raise RuntimeError("step before the first reset: call reset() first")
@@ -316,9 +316,10 @@ class World:
         self, acting: bool, mask: NDArray[np.bool_], everyone: bool, busy: int, limit: int,
         told: Results, actions: NDArray[Any],
     ) -> tuple[int, int]:  # fmt: skip
-        """Let worlds decide, or begin where the mask says so, by several threads if so many `busy` worlds are worth it.
+        """Take a decision in all worlds, or begin those in the mask, by a thread pool if `busy` worlds are enough.
 
-        everyone: are all observed where only some begin, and told their terms? Return who is not finite, or (-1, -1).
+        everyone: observe all worlds in a reset, and write the terms of all in a decision. Returns (world, agent) of the
+        first agent that is not finite, or (-1, -1).
         """
         crew, work = min(at_work(), busy), busy * self.agents * self.task.substeps
         whole = acting, mask, everyone, acting, 0, self.worlds, actions, limit, told
@@ -335,13 +336,13 @@ class World:
         self, crew: int, acting: bool, mask: NDArray[np.bool_], everyone: bool, limit: int,
         told: Results, actions: NDArray[Any],
     ) -> tuple[int, int]:  # fmt: skip
-        """Do what `_play` does by so many threads."""
+        """Do what `_play` does, with `crew` threads."""
         if crew > len(self._scratch):
             self._scratch += [self._allocate() for _ in range(crew - len(self._scratch))]
             self._hire()
         if acting and self._calls[0](True, mask, everyone, True, 0, 0, actions, limit, told)[0] == REFUSED:
-            return REFUSED, 0  # nobody moves before all were looked at
-        portions = iter(_portions(self.worlds, crew))  # whoever is done takes the next
+            return REFUSED, 0  # no world moves before all actions are checked
+        portions = iter(_portions(self.worlds, crew))  # a thread that is done takes the next chunk
 
         def several(k: int) -> tuple[int, int]:
             found, call = [], self._calls[k]
@@ -353,22 +354,19 @@ class World:
         return min(bad, default=(-1, -1))
 
     def _taken(self, actions: ArrayLike) -> NDArray[Any]:
-        """Return the actions as the kernel reads them, in the precision of the scene: one type, one compilation.
-
-        Those that are so already are not copied.
-        """
+        """Return the actions in the precision of the scene, the kernel's only type; copied only if necessary."""
         given, kept = np.asarray(actions), self._actions
         if given.shape != kept.shape:
             raise ValueError(f"actions have shape {given.shape}, expected (worlds, learners, numbers) = {kept.shape}")
         if given.dtype == kept.dtype and given.flags.carray:
             return given
-        if given.dtype == _SINGLE:  # as spaces sample them, into doubles: each has its number there
+        if given.dtype == _SINGLE:  # as spaces sample them; exact in doubles
             kept[...] = given
             return kept
         try:
             with np.errstate(over="ignore"):
                 kept[...] = given
-            if kept.dtype == _SINGLE and np.isinf(kept).any():  # what it has no number for is beyond 1, not infinite
+            if kept.dtype == _SINGLE and np.isinf(kept).any():  # float32 overflow: the number is beyond 1, not infinite
                 exact = given.astype(float)
                 kept[...] = np.where(np.isfinite(exact), np.clip(exact, -1, 1), exact)
         except (TypeError, ValueError):
@@ -376,31 +374,31 @@ class World:
         return kept
 
     def _refuse(self, actions: NDArray[Any]) -> NoReturn:
-        """Say which of the actions is no number."""
+        """Raise ValueError with the first action that is not finite."""
         b, i, k = np.argwhere(~np.isfinite(actions))[0]
         raise ValueError(
             f"action {k} of {self.task.agent_names[i]} in world {b} is {actions[b, i, k]}, must be a number in [-1, 1]"
         )
 
-    # --- looking at it ----------------------------------------------------------------------------------------------
+    # --- metrics and pictures ---------------------------------------------------------------------------------------
 
     def measure(self) -> dict[str, NDArray[np.float64]]:
-        """Domain metrics of the episodes so far, each (B,), by name."""
+        """Return the domain metrics of the episodes so far, each (B,), by name; NaN: no value yet."""
         told = np.empty((len(self.task.metric_names), self.worlds))
         self._tell_of(0, told)
         return dict(zip(self.task.metric_names, told, strict=True))
 
     def metrics(self, world: int = 0) -> dict[str, float]:
-        """Domain metrics of one world's episode so far, by name; what has no value yet is left out.
+        """Return the domain metrics of one world's episode so far, by name, without those that have no value yet.
 
-        NaN would not do: two equal infos would then differ.
+        NaN is not used, since two equal infos would then differ.
         """
         self._tell_of(range(self.worlds)[world], self._alone)
         values = self._alone.ravel().tolist()
         return {name: value for name, value in zip(self.task.metric_names, values, strict=True) if value == value}
 
     def _tell_of(self, first: int, told: NDArray[np.float64]) -> None:
-        """Write the metrics of as many worlds as there is room for, (K, B)."""
+        """Write the metrics of the worlds from `first` on into `told`, (K, B)."""
         self._tell(*self._counted, first, told)
         if self._tell is self._entries[1]:
             self._tell = without_dispatch(self._tell)
@@ -423,9 +421,9 @@ class World:
 
 @functools.cache
 def _portions(worlds: int, crew: int) -> tuple[tuple[int, int], ...]:
-    """Return the portions in which worlds are handed out to a crew: the first and the one after the last of each.
+    """Return the chunks of worlds for `crew` threads: the first world and the one after the last of each chunk.
 
-    Each is a thread's share of half of what is left, so that all are done at the same time whoever begins late.
+    Each is a thread's share of half of the rest, so that all threads end at the same time even if some start late.
     """
     least, at, portions = -(-worlds // (LEAST * crew)), 0, []
     while at < worlds:
@@ -436,5 +434,5 @@ def _portions(worlds: int, crew: int) -> tuple[tuple[int, int], ...]:
 
 
 def _whole(value: object) -> bool:
-    """Is it a whole number (True and False are none)?"""
+    """Return True if it is an integer; False for a bool."""
     return isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.bool_))

@@ -1,4 +1,4 @@
-"""Tasks, one file each: the scene, what is seen, what is paid, when it ends."""
+"""Tasks, one file each: scene, observations, rewards and episode ends."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bottleneck: everybody wants to leave a room through one door, soon, and nobody is to be crushed."""
+"""Bottleneck: people leave a room through one door, quickly and without being crushed."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ from flockenv.tasks.task import Frame, Task
 
 __all__ = ["Bottleneck"]
 
-_RADIUS = 0.25  # m, of everybody
+_RADIUS = 0.25  # m, of every body
 _MODEL = PRESETS["helbing_farkas_vicsek_2000"]
-_MASS, _STIFFNESS, _FRICTION = 80.0, 1.2e5, 2.4e5  # kg; k, N/m, and kappa, kg/(m s), of bodies: those of the model
-_RATIO = 0.3  # damping as a share of what is critical: ours, people do not bounce
+_MASS, _STIFFNESS, _FRICTION = 80.0, 1.2e5, 2.4e5  # kg; k, N/m, and kappa, kg/(m s), of the model
+_RATIO = 0.3  # share of critical damping; not in the model: people do not bounce
 _BEYOND = 1.5  # m of floor beyond the door
 
 
 @kernel
 def spawn(p: Any, frame: Frame) -> None:
-    """At rest, each somewhere in a cell of his own, in the part of the room that is away from the door."""
+    """Place people at rest, each at random in a cell of its own, at least `clear` m from the wall with the door."""
     columns, rows = int(p.columns), int(p.rows)
     wide, high = (p.room - p.clear) / columns, p.room / rows
     for i in range(frame.pos.shape[1]):
@@ -53,9 +53,9 @@ def spawn(p: Any, frame: Frame) -> None:
 
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
-    """Learners push where their action says, along the walls' axes; the others follow `_walker`.
+    """Write each learner's action as a force along the room's axes; the others follow `_walker`.
 
-    Who has left in the decision before is taken out of the world now: what was seen then is what there was.
+    An agent that left in the decision before is removed now, so that the last observation still holds it.
     """
     for i in range(frame.pos.shape[1]):
         frame.alive[i] = frame.alive[i] and frame.memory[2, i] < 1.0
@@ -68,7 +68,7 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
 
 @kernel
 def _walker(p: Any, frame: Frame, i: int, force: Any) -> None:
-    """A scripted person: to the door at 1.34 m/s or less, and off others, as in Helbing, Farkas and Vicsek 2000."""
+    """Write the force of a scripted person: to the door at up to 1.34 m/s, off others, as in Helbing et al. 2000."""
     velocity, top = velocity_of(frame, i), min(1.34, p.max_speed)
     y, fits = 0.5 * p.room - np.float64(frame.pos[1, i]), max(0.5 * p.width - 1.2 * _RADIUS, 0.0)
     aside = y - min(max(y, -fits), fits)
@@ -85,15 +85,15 @@ def _walker(p: Any, frame: Frame, i: int, force: Any) -> None:
 
 @kernel
 def _wall_gap(p: Any, frame: Frame, i: int) -> float:
-    """Return how far the centre of agent i is from the wall with the door, m."""
+    """Return the distance from the centre of agent i to the wall with the door, m."""
     x, y = p.room - np.float64(frame.pos[0, i]), abs(np.float64(frame.pos[1, i]) - 0.5 * p.room)
-    beside = 0.5 * p.width - y  # of the door: how far the nearer post is
+    beside = 0.5 * p.width - y  # distance to the nearer door post along y
     return math.hypot(x, beside) if beside > 0.0 else abs(x)
 
 
 @kernel
 def _pressure(p: Any, frame: Frame, i: int) -> float:
-    """Return what presses on agent i, N/m: elastic forces of bodies and of the door's wall over his circumference."""
+    """Return the pressure on agent i, N/m: elastic forces of bodies and of the door's wall over its circumference."""
     overlap = max(_RADIUS - _wall_gap(p, frame, i), 0.0)
     for j in range(frame.pos.shape[1]):
         if j != i and frame.alive[j]:
@@ -104,7 +104,7 @@ def _pressure(p: Any, frame: Frame, i: int) -> float:
 
 @kernel
 def keep(p: Any, before: Frame, after: Frame) -> None:
-    """Remember what presses now, the most so far, N/m; who left now (1), or before (2), and when, s."""
+    """Store the pressure now and its maximum so far, N/m; whether an agent left now (1) or before (2), and when, s."""
     for i in range(after.pos.shape[1]):
         inside = after.memory[2, i] < 1.0
         now = _pressure(p, after, i) if inside else 0.0
@@ -118,14 +118,14 @@ def keep(p: Any, before: Frame, after: Frame) -> None:
 
 @kernel
 def _left(p: Any, frame: Frame, i: int) -> float:
-    """Return how far it is from agent i to the middle of the door's far side, m."""
+    """Return the distance from agent i to the middle of the door's far side, m."""
     x, y = p.room + _RADIUS - np.float64(frame.pos[0, i]), 0.5 * p.room - np.float64(frame.pos[1, i])
     return math.hypot(max(x, 0.0), y)
 
 
 @kernel
 def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
-    """Terms: progress, out, pressed, hurt, time; nothing for who has left before."""
+    """Write the terms progress, out, pressed, hurt, time; all 0 for an agent that left in an earlier decision."""
     for i in range(terms.shape[0]):
         for k in range(5):
             terms[i, k] = 0.0
@@ -140,7 +140,7 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 
 @kernel
 def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
-    """Who is through the door is out; all learners out, and none of them ever hurt: success."""
+    """End the learners that are through the door; return True if all are out and none of them was ever hurt."""
     everybody, unhurt = True, True
     for i in range(over.shape[0]):
         out = bool(after.memory[2, i] > 0.0)
@@ -155,9 +155,10 @@ def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
 
 @kernel
 def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
-    """Learners out; when the first and the last of them left, s; most pressure so far, N/m; in touch, and hurt, s.
+    """Write learners out; times of the first and last exit, s; peak pressure so far, N/m; contact and hurt time, s.
 
-    The last two: the time, on average over them, in which somebody or the wall was touched, and in which it hurt.
+    Contact and hurt time are what this decision adds to the mean over learners: time in contact with a body or the
+    door's wall, and time above the pressure limit.
     """
     n = int(p.learners)
     out, first, latest, most, touched, hurt = 0.0, np.inf, 0.0, 0.0, 0.0, 0.0
@@ -174,8 +175,8 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 @kernel
 def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
-    """Share that is out; s until the last was, if all are; persons per s and m of door between the first and the last,
-    once two are out; s in touch, each, on average; most pressure on anybody, N/m; s in which it hurt, each, on average.
+    """Write the share out; evacuation time, s, if all are out; specific flow, persons/(s m) of door from the first to
+    the last exit, if two are out; mean contact time, s; peak pressure on a learner, N/m; mean hurt time, s.
     """  # fmt: skip
     span = last.latest - last.first
     numbers[0] = last.out / p.learners
@@ -188,7 +189,7 @@ def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
 
 @kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
-    """Own velocity, the way to the door on two scales, walls, what presses, the nearest others."""
+    """Write own velocity, offset of the door on two scales, wall distances, pressure, the nearest others."""
     slots, one = int(p.neighbours), like(p.sight, 1.0)
     half, axis = 0.5 * p.room, (one, like(one, 0.0))
     for i in range(rows.shape[0]):
@@ -214,17 +215,18 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
 
 
 class Bottleneck(Task):
-    """N people leave a room through one door; who is through is out, and the others go on. One policy for all.
+    """N people leave a room through one door. All learners share one policy.
 
-    Who is out leaves the game. With `together` he stays in it, out of the world, paid nothing and shown zeros, until
-    all are out: vector environments want learners that end together, and learn from the same returns.
+    A learner terminates once it is through the door, and the others go on. With `together`, a learner that is out
+    waits, outside the world, with reward 0 and an observation of zeros, until all learners are out: vector environments
+    need learners that end together.
 
     Bodies and walls are those of Helbing, Farkas and Vicsek 2000 (Nature 407:487): k = 1.2e5 kg/s^2, sliding friction
-    kappa = 2.4e5 kg/(m s), 80 kg; damped (ours), because people do not bounce. Somebody is hurt, as there, where the
-    forces that press on him are more than 1600 N for each metre of his circumference: 2.5 kN in all. Elastic forces of
-    other bodies and of the wall with the door count; the other walls are hard and press on nobody. Everybody is paid
-    for himself. All out, and none of them ever hurt, is success. Who does not learn walks by the forces of 2000 between
-    people; walls stop him as bodies do.
+    kappa = 2.4e5 kg/(m s), 80 kg. Contacts are also damped, which is not in the paper, because people do not bounce. As
+    in the paper, an agent is hurt while the pressing forces exceed 1600 N per metre of its circumference, 2.5 kN in
+    all. Elastic forces of other bodies and of the wall with the door count; the other walls are hard and exert no
+    pressure. Rewards are individual. Success: all learners are out, and none of them was ever hurt. Scripted agents
+    walk by the paper's forces between people; walls stop them as bodies do.
     """
 
     name: ClassVar[str] = "bottleneck"
@@ -236,33 +238,35 @@ class Bottleneck(Task):
     memory: ClassVar[int] = 4
     keeps: ClassVar[bool] = True
 
-    dt: float = Field(default=0.01, gt=0, description="s, one physics step: bodies are stiff")
+    dt: float = Field(default=0.01, gt=0, description="s, one physics step; small, because bodies are stiff")
     horizon: int = Field(default=300, ge=1, description="decisions until the time limit (truncation)")
-    people: int = Field(default=20, ge=1, le=400, description="how many want to leave")
+    people: int = Field(default=20, ge=1, le=400, description="number of people in the room")
     learners: int = Field(
         default_factory=lambda given: given.get("people", 20), ge=1,
-        description="how many of them learn (default: all); the others follow a script",
+        description="number of learners (default of the task: all); the others are scripted",
     )  # fmt: skip
-    together: bool = Field(default=False, description="do learners who are out wait until all are?")
+    together: bool = Field(default=False, description="True if learners that are out wait until all are")
     room: float = Field(default=6.0, gt=1, description="m, edge of the room")
-    width: float = Field(default=1.0, gt=0.5, description="m, of the door; bodies are 0.5 m wide")
-    clear: float = Field(default=1.5, ge=0, description="m before the door, in which nobody begins")
+    width: float = Field(default=1.0, gt=0.5, description="m, width of the door; bodies are 0.5 m wide")
+    clear: float = Field(default=1.5, ge=0, description="m before the wall with the door, in which no agent starts")
     max_speed: float = Field(default=1.5, gt=0, description="m/s")
     max_force: float = Field(default=600.0, gt=0, description="N; the mass is 80 kg")
-    sight: float = Field(default=2.0, gt=0, description="m, others are seen within this")
-    neighbours: int = Field(default=6, ge=1, le=32, description="how many others are seen, nearest first")
-    near: float = Field(default=0.5, gt=0, description="m between bodies, within which closeness is seen")
-    close: float = Field(default=1.5, gt=0, description="m, the fine scale on which the door is seen")
-    limit: float = Field(default=1600.0, gt=0, description="N/m, force on a body over its circumference that hurts")
+    sight: float = Field(default=2.0, gt=0, description="m, range within which others are seen")
+    neighbours: int = Field(default=6, ge=1, le=32, description="number of others seen, nearest first")
+    near: float = Field(default=0.5, gt=0, description="m between bodies, below which `crowding` is not 0")
+    close: float = Field(default=1.5, gt=0, description="m, fine scale on which the door is seen")
+    limit: float = Field(
+        default=1600.0, gt=0, description="N/m, pressure (force over circumference) above which an agent is hurt"
+    )
     progress_reward: float = Field(default=0.5, ge=0, description="per m nearer to the door")
     out_reward: float = Field(default=5.0, ge=0, description="for getting out")
-    press_cost: float = Field(default=2.0, ge=0, description="per s at the limit of pressure, less in proportion")
-    hurt_cost: float = Field(default=50.0, ge=0, description="per s above the limit")
+    press_cost: float = Field(default=2.0, ge=0, description="per s at the pressure limit; in proportion below it")
+    hurt_cost: float = Field(default=50.0, ge=0, description="per s above the pressure limit")
     time_cost: float = Field(default=0.5, ge=0, description="per s in the room")
 
     @model_validator(mode="after")
     def _room_for_all(self) -> Bottleneck:
-        """Refuse more learners than people, a door that is wider than its wall, and more people than have room."""
+        """Raise ValueError for more learners than people, a door wider than its wall, or more people than fit."""
         if self.learners > self.people:
             raise ValueError(f"learners = {self.learners}: there are only {self.people} people")
         if self.width >= self.room:
@@ -276,24 +280,24 @@ class Bottleneck(Task):
 
     @property
     def cells(self) -> tuple[int, int]:
-        """In how many columns and rows they begin."""
+        """Columns and rows of the grid of starting cells."""
         columns = max(1, round(math.sqrt(self.people * (self.room - self.clear) / self.room)))
         return columns, -(-self.people // columns)
 
     def parameters(self) -> dict[str, float]:
-        """The fields, where people begin, and how those walk who do not learn."""
+        """Return the fields, the grid of starting cells, and the parameters of scripted people."""
         columns, rows = self.cells
         begin = {"columns": float(columns), "rows": float(rows)}
         return super().parameters() | begin | _MODEL.numbers
 
     @property
     def agents(self) -> int:
-        """Everybody."""
+        """N: all people."""
         return self.people
 
     @property
     def ends_together(self) -> bool:
-        """Who is out is out, unless he waits, or is the only one."""
+        """True with `together`, or with one learner."""
         return self.together or self.learners == 1
 
     @property
@@ -343,14 +347,14 @@ class Bottleneck(Task):
 
     @functools.cached_property
     def action_layout(self) -> Layout:
-        """A force, in the room's axes."""
+        """A force along the room's axes."""
         meaning = "force (x, y) / max_force, shortened to length 1"
         return Layout((Slot("force", (2,), self.max_force, "N", meaning),))
 
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
-        """The door."""
+        """Return a mark at the door."""
         return (Mark("goal", np.array([self.room, self.room / 2]), np.zeros(2), self.width / 2),)
 
     def view(self, state: State, world: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """The room, and what is beyond the door."""
+        """Return the room and the floor beyond the door, m."""
         return (0.0, 0.0), (self.room + _BEYOND, self.room)

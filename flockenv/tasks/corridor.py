@@ -1,4 +1,4 @@
-"""Corridor: two streams of people in one corridor, each against the other; who keeps lanes gets along."""
+"""Corridor: two opposite streams of people in one corridor, which move faster in lanes."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ from flockenv.tasks.task import Frame
 
 __all__ = ["Corridor"]
 
-_RADIUS = 0.25  # m, of everybody
+_RADIUS = 0.25  # m, of every body
 _WALL = 1.0  # m, where the lower wall is
 
 
 @kernel
 def spawn(p: Any, frame: Frame) -> None:
-    """At rest, everybody in a cell of his own, drawn at random; the first half wants to the right, the others left.
+    """Place people at rest, each in a random cell of its own; the first half walks to the right, the others left.
 
-    Memory: the way to go (+-1), the desired speed, m/s.
+    Memory: walking direction (+-1), desired speed, m/s.
     """
     n, columns, rows = frame.pos.shape[1], int(p.columns), int(p.rows)
     for i in range(n):
@@ -59,7 +59,7 @@ def spawn(p: Any, frame: Frame) -> None:
 
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
-    """Learners push where their action says: (along their way, to its left); the others follow `_walker`."""
+    """Write each learner's action as a force (along its walking direction, to the left); others follow `_walker`."""
     for i in range(frame.pos.shape[1]):
         way = np.float64(frame.memory[0, i])
         if i < action.shape[0]:
@@ -70,7 +70,7 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
 
 @kernel
 def _walker(p: Any, frame: Frame, i: int, force: Any) -> None:
-    """A scripted walker: at his desired speed, aside of others and off walls, as in Moussaid et al. 2009."""
+    """Write the force of a scripted walker: the social force of Moussaid et al. 2009, with repulsion from walls."""
     velocity, y = velocity_of(frame, i), np.float64(frame.pos[1, i]) - _WALL
     wanted = (np.float64(frame.memory[0, i] * frame.memory[1, i]), 0.0)
     decay = p.obstacle_repulsion_decay
@@ -93,19 +93,19 @@ def _walker(p: Any, frame: Frame, i: int, force: Any) -> None:
 
 @kernel
 def _share(frame: Frame, i: int) -> float:
-    """Return how fast agent i gets along, as a share of his desired speed."""
+    """Return the speed of agent i along its walking direction over its desired speed."""
     return np.float64(frame.vel[0, i]) * np.float64(frame.memory[0, i]) / np.float64(frame.memory[1, i])
 
 
 @kernel
 def _suited(frame: Frame, i: int) -> float:
-    """Return 1 at one's desired speed; less, by the share that it is missed by, both below and above."""
+    """Return 1 - |speed along the walking direction / desired speed - 1|."""
     return 1.0 - abs(_share(frame, i) - 1.0)
 
 
 @kernel
 def _touches(frame: Frame, i: int) -> float:
-    """Return how many agent i touches."""
+    """Return the number of agents that agent i touches."""
     touches = 0.0
     for s in range(frame.near_count[i]):
         touches += 1.0 if frame.near_square[s, i] < 4.0 * _RADIUS * _RADIUS else 0.0
@@ -114,7 +114,7 @@ def _touches(frame: Frame, i: int) -> float:
 
 @kernel
 def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
-    """Terms: along (as fast as one would like, no faster), touch, effort."""
+    """Write the terms along (largest at the desired speed), touch, effort."""
     for i in range(terms.shape[0]):
         push = action[i, 0] * action[i, 0] + action[i, 1] * action[i, 1]
         terms[i, 0] = p.along_reward * _suited(after, i) * p.control_dt
@@ -124,10 +124,11 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 
 @kernel
 def _order(p: Any, frame: Frame) -> float:
-    """Return the lane order: in rows along the corridor, of pairs in one row, same ways minus opposite ways.
+    """Return the lane order: the share of pairs in a row with the same direction minus that with opposite directions.
 
-    Of n people in a row with a sum of ways D that is (D^2 - n) / (n^2 - n), both summed over rows: the order of
-    Feliciani and Nishinari 2016, mean (D / n)^2, less what it is by chance, 1 / n. Without pairs it is 0.
+    Rows run along the corridor. For n people in a row whose directions (+-1) sum to D it is (D^2 - n) / (n^2 - n),
+    numerator and denominator summed over rows: the order of Feliciani and Nishinari 2016, mean (D / n)^2, less its
+    expectation by chance, 1 / n. Without pairs it is 0.
     """
     rows = int(p.lane_rows)
     same, pairs = 0.0, 0.0
@@ -145,7 +146,7 @@ def _order(p: Any, frame: Frame) -> float:
 
 @kernel
 def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
-    """Never over before the time limit. The aim holds now if learners keep to their speeds, and do not touch."""
+    """End no learner; return whether the aim holds now: learners keep to their desired speeds and touch no agent."""
     n = over.shape[0]
     share, touches = 0.0, 0.0
     for i in range(n):
@@ -158,7 +159,7 @@ def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
 
 @kernel
 def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
-    """Of learners: speed along the way over the desired one; touches that began. Lane order in the second half."""
+    """Write the learners' mean speed over the desired one, contacts that began, and lane order in the second half."""
     n, length = int(p.learners), p.length
     share, began = 0.0, 0.0
     for i in range(n):
@@ -169,7 +170,7 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
             j = after.near_who[s, i]
             x = offset(np.float64(before.pos[0, i]), np.float64(before.pos[0, j]), length)
             y = np.float64(before.pos[1, j] - before.pos[1, i])
-            both = 0.5 if j < n else 1.0  # of a pair of learners each counts a half
+            both = 0.5 if j < n else 1.0  # a pair of learners is counted from both sides
             began += both if x * x + y * y >= 4.0 * _RADIUS * _RADIUS else 0.0
     late = 2 * after.step > p.horizon
     numbers[0], numbers[1] = share, began
@@ -178,7 +179,7 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 @kernel
 def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
-    """Speed along the way over the desired one; touches that began; lane order in the second half only; the aim."""
+    """Write mean speed over the desired one; contacts that began; lane order in the second half; those of the aim."""
     tell_lasting(sums, last, steps, numbers, 3)
     numbers[0] = sums.share / max(steps, 1)
     numbers[1] = sums.touches
@@ -188,7 +189,7 @@ def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
 
 @kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
-    """All as (along one's way, to its left): own velocity, desired speed, walls, the nearest others."""
+    """Write own velocity, desired speed, walls, nearest others; vectors are (along the walking direction, left)."""
     slots, one = int(p.neighbours), like(p.sight, 1.0)
     for i in range(rows.shape[0]):
         row = rows[i]
@@ -211,15 +212,16 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
 
 
 class Corridor(LastingTask):
-    """Two streams of people walk in one corridor, against each other, for ever: along it, the world is a ring.
+    """Two opposite streams of people walk in one corridor, which is periodic along its length.
 
-    Everybody has a desired speed of his own, N(1.34, 0.26) m/s, and is paid for getting along so fast, no faster.
-    Nobody is stopped by a touch; it costs as long as it lasts. Walls are solid. All learn, with one policy (those who
-    do not walk by the forces of Moussaid et al. 2009), and see everything in the frame of their own way; so what looks
-    like keeping right, or lanes, is their doing. No agent terminates.
+    Each agent has its own desired speed, drawn from N(1.34, 0.26) m/s, and its reward is largest at that speed. A
+    contact stops no agent; it costs as long as it lasts. Walls are solid. All learners share one policy; scripted
+    agents walk by the forces of Moussaid et al. 2009. Observations are in the frame of the agent's own walking
+    direction, so that lanes, or keeping to one side, emerge from the policy. No agent terminates.
 
-    The aim holds while the mean over learners of 1 - |speed along one's way / desired speed - 1| is above `aim`, and no
-    learner touches another. Success: it holds in the share `lasting` of the decisions after `settling` s.
+    The aim holds while the mean over learners of 1 - |speed along the walking direction / desired speed - 1| is above
+    `aim`, and no learner touches another agent. Success: it holds in the share `lasting` of the decisions after
+    `settling` s.
     """
 
     name: ClassVar[str] = "corridor"
@@ -228,30 +230,34 @@ class Corridor(LastingTask):
     measures: ClassVar[tuple[str, ...]] = ("share", "touches", "order", "late", *MEASURES)
     memory: ClassVar[int] = 2
 
-    people: int = Field(default=24, ge=2, le=1000, description="how many walk, half of them each way")
+    people: int = Field(default=24, ge=2, le=1000, description="number of people, half of them in each direction")
     learners: int = Field(
         default_factory=lambda given: given.get("people", 24), ge=1,
-        description="how many of them learn (default: all); the others follow a script",
+        description="number of learners (default of the task: all); the others are scripted",
     )  # fmt: skip
     horizon: int = Field(default=300, ge=1, description="decisions until the time limit (truncation)")
-    length: float = Field(default=12.0, gt=1, description="m, after which the corridor begins anew")
+    length: float = Field(default=12.0, gt=1, description="m, period of the corridor")
     width: float = Field(default=3.0, gt=0.6, description="m, between the walls")
-    lane_rows: int = Field(default=6, ge=1, description="into how many rows the width is cut to measure lane order")
+    lane_rows: int = Field(default=6, ge=1, description="rows into which the width is cut to measure lane order")
     desired_speed: float = Field(default=1.34, gt=0, description="m/s, mean")
     spread: float = Field(default=0.26, ge=0, description="m/s, standard deviation of desired speeds")
     max_speed: float = Field(default=2.0, gt=0, description="m/s")
     max_force: float = Field(default=5.0, gt=0, description="N; the mass is 1 kg")
-    sight: float = Field(default=4.0, gt=0, description="m, others are seen within this")
-    neighbours: int = Field(default=8, ge=1, le=32, description="how many others are seen, nearest first")
-    near: float = Field(default=0.75, gt=0, description="m between bodies, within which closeness is seen")
-    aim: float = Field(default=0.9, ge=0, le=1, description="how near the desired speeds the aim is: 1 = at them")
-    along_reward: float = Field(default=1.0, ge=0, description="per s at the desired speed; less by what is missed")
-    touch_cost: float = Field(default=5.0, ge=0, description="per s and person touched")
+    sight: float = Field(default=4.0, gt=0, description="m, range within which others are seen")
+    neighbours: int = Field(default=8, ge=1, le=32, description="number of others seen, nearest first")
+    near: float = Field(default=0.75, gt=0, description="m between bodies, below which `crowding` is not 0")
+    aim: float = Field(
+        default=0.9, ge=0, le=1, description="closeness to the desired speeds that the aim needs; 1: exactly at them"
+    )
+    along_reward: float = Field(
+        default=1.0, ge=0, description="per s at the desired speed; less in proportion to the deviation from it"
+    )
+    touch_cost: float = Field(default=5.0, ge=0, description="per s and agent touched")
     effort_cost: float = Field(default=0.1, ge=0, description="per s at full force")
 
     @model_validator(mode="after")
     def _room(self) -> Corridor:
-        """Refuse more learners than people, more people than have room, and a sight that reaches around the ring."""
+        """Raise ValueError for more learners than people, more people than fit, or a sight beyond half the length."""
         if self.learners > self.people:
             raise ValueError(f"learners = {self.learners}: there are only {self.people} people")
         columns, rows = self.cells
@@ -263,19 +269,19 @@ class Corridor(LastingTask):
 
     @property
     def cells(self) -> tuple[int, int]:
-        """In how many columns and rows they begin."""
+        """Columns and rows of the grid of starting cells."""
         rows = max(1, round(math.sqrt(self.people * self.width / self.length)))
         return -(-self.people // rows), rows
 
     def parameters(self) -> dict[str, float]:
-        """The fields, where people begin, and how those walk who do not learn."""
+        """Return the fields, the grid of starting cells, and the parameters of scripted walkers."""
         columns, rows = self.cells
         begin = {"columns": float(columns), "rows": float(rows)}
         return super().parameters() | begin | PRESETS["moussaid_2009"].numbers
 
     @property
     def agents(self) -> int:
-        """Everybody."""
+        """N: all people."""
         return self.people
 
     @property
@@ -285,7 +291,7 @@ class Corridor(LastingTask):
 
     @functools.cached_property
     def scene(self) -> Scene:
-        """A ring with two walls along it; nothing acts on people but walls and what they want."""
+        """A periodic corridor between two walls; only contact with walls acts on people beside their own forces."""
         high, half = _WALL + self.width, self.length / 2
         limits: dict[str, Any] = {"max_speed": self.max_speed, "max_force": self.max_force, "radius": _RADIUS}
         limits["spawn"] = Spawn(low=(0.0, _WALL), high=(self.length, high))
@@ -295,7 +301,7 @@ class Corridor(LastingTask):
         return Scene(
             space=Torus(size=(self.length, max(high + _WALL, 2.0 * self.sight))),
             groups=tuple(groups),
-            obstacles=tuple(  # no piece is longer than half of the ring
+            obstacles=tuple(  # no wall segment is longer than half of the period
                 Wall(vertices=((x, y), (x + half, y))) for y in (_WALL, high) for x in (0.0, half)
             ),
             effects=(ObstacleContact(stiffness=200.0, ratio=0.5),),
@@ -311,7 +317,7 @@ class Corridor(LastingTask):
 
     @functools.cached_property
     def layout(self) -> Layout:
-        """Every vector is (along one's way, to its left)."""
+        """The observation; every vector is (along the walking direction, to its left)."""
         return Layout((
             Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (along one's way, to its left)"),
             Slot("desired_speed", (), self.max_speed, "m/s", "how fast one would like to go", low=0.0),
@@ -321,15 +327,15 @@ class Corridor(LastingTask):
 
     @functools.cached_property
     def action_layout(self) -> Layout:
-        """A force in the frame of one's way."""
+        """A force in the frame of the walking direction."""
         meaning = "force (along one's way, to its left) / max_force, shortened to length 1"
         return Layout((Slot("force", (2,), self.max_force, "N", meaning),))
 
     def roles(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[str, ...]:
-        """Walkers of the two directions have two names, and colours."""
+        """Return two names, and so two colours, for the two walking directions."""
         names = zip(self.scene.roles, memory[0, world] < 0, strict=True)
         return tuple(f"{role} 2" if back else role for role, back in names)
 
     def view(self, state: State, world: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """The corridor."""
+        """Return the corridor and a margin beyond its walls, m."""
         return (0.0, 0.0), (self.length, self.width + 2 * _WALL)

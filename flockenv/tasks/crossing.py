@@ -1,4 +1,4 @@
-"""Crossing: everybody starts on a circle and walks to the opposite point; all ways meet in the middle."""
+"""Crossing: agents start on a circle and walk to the opposite points; all paths meet in the middle."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from flockenv.tasks.task import Frame, Task
 
 __all__ = ["Crossing"]
 
-_HEEDED = 6  # how many neighbours a scripted walker heeds
+_HEEDED = 6  # neighbours that a scripted walker avoids
 _NOBODY = (0.0,) * (_HEEDED * orca.SLOT)
 
 
 @kernel
 def spawn(p: Any, frame: Frame) -> None:
-    """Evenly around a circle, each a little off his place and at rest; his goal is the opposite point."""
+    """Place agents at rest, evenly around a circle with some jitter; the goal of each is the opposite point."""
     n = frame.pos.shape[1]
     first = 2.0 * math.pi * uniform(frame.key, 0, 9999, 0)
     for i in range(n):
@@ -48,7 +48,7 @@ def spawn(p: Any, frame: Frame) -> None:
 
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
-    """Learners push where their action says, in the frame of their course; the others keep clear by ORCA."""
+    """Write each learner's action as a force in the frame of its course; the others avoid neighbours by ORCA."""
     for i in range(frame.pos.shape[1]):
         if i < action.shape[0]:
             hx, hy = frame.memory[2, i], frame.memory[3, i]
@@ -61,7 +61,7 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
 
 @kernel
 def _walker(p: Any, frame: Frame, i: int, force: Any) -> None:
-    """A scripted walker: the velocity nearest to the way to his goal that is free of the nearest few for 2 s."""
+    """Write the force of a scripted walker by ORCA: the collision-free velocity (2 s) nearest to that to its goal."""
     given, lines, relaxed = stacked(_NOBODY), stacked(_NOBODY), stacked(_NOBODY)
     v = (np.float64(frame.vel[0, i]), np.float64(frame.vel[1, i]))
     found, last, last_square = 0, -1, -1.0
@@ -88,7 +88,7 @@ def _walker(p: Any, frame: Frame, i: int, force: Any) -> None:
 
 @kernel
 def _next_nearest(p: Any, frame: Frame, i: int, last: int, last_square: float) -> tuple[int, float]:
-    """Return who is nearest to agent i within sight after `last`, equal distances by number, and the square; or -1."""
+    """Return the next nearest agent to i after `last`, within sight, ties by index, and its squared distance; or -1."""
     best, who = np.float64(p.sight * p.sight), -1
     for j in range(frame.pos.shape[1]):
         dx, dy = frame.pos[0, j] - frame.pos[0, i], frame.pos[1, j] - frame.pos[1, i]
@@ -101,20 +101,20 @@ def _next_nearest(p: Any, frame: Frame, i: int, last: int, last_square: float) -
 
 @kernel
 def _to_goal(frame: Frame, i: int) -> tuple[float, float]:
-    """Return the way to the goal of agent i, m."""
+    """Return the offset from agent i to its goal, m."""
     return frame.memory[0, i] - np.float64(frame.pos[0, i]), frame.memory[1, i] - np.float64(frame.pos[1, i])
 
 
 @kernel
 def _left(frame: Frame, i: int) -> float:
-    """Return how far it is to the goal of agent i, m."""
+    """Return the distance from agent i to its goal, m."""
     x, y = _to_goal(frame, i)
     return math.sqrt(x * x + y * y)
 
 
 @kernel
 def _touches(frame: Frame, i: int) -> float:
-    """Return how many agent i touches."""
+    """Return the number of agents that agent i touches."""
     touches = 0.0
     for s in range(frame.near_count[i]):
         contact = frame.radius[i] + frame.radius[frame.near_who[s, i]]
@@ -124,7 +124,7 @@ def _touches(frame: Frame, i: int) -> float:
 
 @kernel
 def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
-    """Terms: progress, arrival (given back by who leaves again), touch, time (until there), effort."""
+    """Write the terms progress, arrival (taken back on leaving), touch, time (while away from the goal), effort."""
     for i in range(terms.shape[0]):
         was, left = _left(before, i), _left(after, i)
         came = (1.0 if left <= p.goal_radius else 0.0) - (1.0 if was <= p.goal_radius else 0.0)
@@ -138,7 +138,7 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 
 @kernel
 def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
-    """Over for all when every learner is at his goal: that is success."""
+    """End all learners once every one is at its goal, which is success."""
     there = True
     for i in range(over.shape[0]):
         there &= _left(after, i) <= p.goal_radius
@@ -149,7 +149,7 @@ def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
 
 @kernel
 def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
-    """Of the learners: touches that began just now; share at the goal; metres gained, and walked, on average."""
+    """Write the learners' contacts that began; share at the goal; mean metres gained, and walked."""
     learners = int(p.learners)
     began, there, gained, walked = 0.0, 0.0, 0.0, 0.0
     for i in range(learners):
@@ -163,14 +163,14 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
             if after.near_square[s, i] >= contact * contact:
                 break
             x, y = before.pos[0, j] - before.pos[0, i], before.pos[1, j] - before.pos[1, i]
-            both = 0.5 if j < learners else 1.0  # of a pair of learners each counts a half
+            both = 0.5 if j < learners else 1.0  # a pair of learners is counted from both sides
             began += both if x * x + y * y >= contact * contact else 0.0
     numbers[0], numbers[1], numbers[2], numbers[3] = began, there / learners, gained / learners, walked / learners
 
 
 @kernel
 def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
-    """Touches that began; mean time away from the goal, s; share there at the end; straight way / way walked."""
+    """Write contacts that began; mean time away from the goal, s; last share at the goal; metres gained / walked."""
     numbers[0] = sums.touches
     numbers[1] = (steps - sums.there) * p.control_dt
     numbers[2] = last.there
@@ -179,7 +179,7 @@ def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
 
 @kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
-    """All in the frame of the course: (along, left). Own velocity, the way to the goal, the nearest neighbours."""
+    """Write own velocity, offset of the goal, nearest neighbours, in the frame of the course: (along, left)."""
     slots, one = int(p.neighbours), like(p.sight, 1.0)
     for i in range(rows.shape[0]):
         row, course = rows[i], (frame.memory[2, i], frame.memory[3, i])
@@ -196,10 +196,11 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
 
 
 class Crossing(Task):
-    """N walkers on a circle swap to the opposite points, all at once, without touching; one policy for all learners.
+    """N walkers start on a circle and swap to the opposite points, all at once, without touching.
 
-    Everything a walker sees is relative to himself and turned into the frame of his course, from his start to his goal.
-    Nobody dies and nobody is stopped by a touch; it costs as long as it lasts. The episode ends when all are there.
+    All learners share one policy. Observations are relative to the walker, in the frame of its course, from its start
+    to its goal. A contact removes and stops no agent; it costs as long as it lasts. The episode ends, with success,
+    once every learner is at its goal.
     """
 
     name: ClassVar[str] = "crossing"
@@ -208,28 +209,32 @@ class Crossing(Task):
     measures: ClassVar[tuple[str, ...]] = ("touches", "there", "gained", "walked")
     memory: ClassVar[int] = 4
 
-    agents: int = Field(default=12, ge=1, le=1000, description="how many walk")
+    agents: int = Field(default=12, ge=1, le=1000, description="number of walkers")
     learners: int = Field(
         default_factory=lambda given: given.get("agents", 12), ge=1,
-        description="how many of them learn (default: all); the others follow a script",
+        description="number of learners (default of the task: all); the others are scripted",
     )  # fmt: skip
     horizon: int = Field(default=200, ge=1, description="decisions until the time limit (truncation)")
     circle: float = Field(default=6.0, gt=0, description="m, radius of the circle")
-    jitter: float = Field(default=0.1, ge=0, le=0.5, description="how far off his place one starts, in gaps")
+    jitter: float = Field(
+        default=0.1, ge=0, le=0.5, description="largest offset of a start, as a share of the gap between starts"
+    )
     max_speed: float = Field(default=2.0, gt=0, description="m/s")
     max_force: float = Field(default=5.0, gt=0, description="N; the mass is 1 kg")
-    goal_radius: float = Field(default=0.4, gt=0, description="m, who is nearer to his goal than this is there")
-    sight: float = Field(default=6.0, gt=0, description="m, neighbours are seen within this")
-    neighbours: int = Field(default=6, ge=1, le=32, description="how many neighbours are seen, nearest first")
+    goal_radius: float = Field(
+        default=0.4, gt=0, description="m, a walker within this distance of its goal has arrived"
+    )
+    sight: float = Field(default=6.0, gt=0, description="m, range within which neighbours are seen")
+    neighbours: int = Field(default=6, ge=1, le=32, description="number of neighbours seen, nearest first")
     progress_reward: float = Field(default=0.5, ge=0, description="per m nearer to the goal")
-    arrival_reward: float = Field(default=5.0, ge=0, description="at the goal; given back by who leaves it")
+    arrival_reward: float = Field(default=5.0, ge=0, description="on arrival at the goal; taken back on leaving it")
     touch_cost: float = Field(default=10.0, ge=0, description="per s and agent touched")
     time_cost: float = Field(default=0.5, ge=0, description="per s away from the goal")
     effort_cost: float = Field(default=0.1, ge=0, description="per s at full force")
 
     @model_validator(mode="after")
     def _enough(self) -> Crossing:
-        """Refuse more learners than agents, and more agents than have room on the circle."""
+        """Raise ValueError for more learners than agents, or more agents than fit on the circle."""
         if self.learners > self.agents:
             raise ValueError(f"learners = {self.learners}: there are only {self.agents} agents")
         room = 2 * math.pi * self.circle * (1 - 2 * self.jitter) / self.agents
@@ -245,7 +250,7 @@ class Crossing(Task):
 
     @functools.cached_property
     def scene(self) -> Scene:
-        """A plane; nothing acts but what walkers want."""
+        """A plane, in which only the walkers' own forces act."""
         around = Spawn(low=(-self.circle, -self.circle), high=(self.circle, self.circle))
         limits: dict[str, Any] = {"radius": 0.3, "max_speed": self.max_speed, "max_force": self.max_force}
         limits["spawn"] = around  # before an episode begins
@@ -261,7 +266,7 @@ class Crossing(Task):
 
     @functools.cached_property
     def layout(self) -> Layout:
-        """Every vector is (along the course, to its left)."""
+        """The observation; every vector is (along the course, to its left)."""
         return Layout((
             Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (along the course, to its left)"),
             Slot("goal", (2,), 3 * self.circle, "m", "the way to the goal"),
@@ -275,10 +280,10 @@ class Crossing(Task):
         return Layout((Slot("force", (2,), self.max_force, "N", meaning),))
 
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
-        """The goals."""
+        """Return a mark at each goal."""
         return tuple(Mark("goal", memory[:2, world, i], np.zeros(2), self.goal_radius) for i in range(self.agents))
 
     def view(self, state: State, world: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """The circle, and some room around it."""
+        """Return the circle and a margin around it, m."""
         edge = 1.3 * self.circle
         return (-edge, -edge), (edge, edge)

@@ -1,4 +1,4 @@
-"""CrowdNav: one robot through a crowd of pedestrians who swap places across a circle under social forces."""
+"""CrowdNav: one robot crosses a crowd of pedestrians that swap places on a circle under social forces."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ Crowd = Literal[
     "moussaid_2009", "helbing_molnar_1995", "johansson_2007_circular", "johansson_2007_elliptical_1",
     "johansson_2007_elliptical_2",
 ]  # fmt: skip
-"""Those of `flockenv.scene.presets` that need no stiff bodies."""
+"""The models of `flockenv.scene.presets` without stiff bodies."""
 
 _RADIUS = 0.3  # m, of the robot, as in CrowdNav
-_NOBODY = 1e3  # m, to the nearest where there is nobody
+_NOBODY = 1e3  # m, gap to the nearest pedestrian if there is none
 
 
 @kernel
 def spawn(p: Any, frame: Frame) -> None:
-    """Evenly around a circle, each a little off his place and at rest; the robot's goal is the opposite point."""
+    """Place agents at rest, evenly around a circle with some jitter; the robot's goal is the opposite point."""
     n = frame.pos.shape[1]
     first = 2.0 * math.pi * uniform(frame.key, 0, 9999, 0)
     for i in range(n):
@@ -58,7 +58,7 @@ def spawn(p: Any, frame: Frame) -> None:
 
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
-    """The robot pushes where its action says, in the frame of its course; what pedestrians want is the scene's."""
+    """Write the robot's action as a force in the frame of its course; the scene steers the pedestrians."""
     hx, hy = frame.memory[2, 0], frame.memory[3, 0]
     along, left = action[0, 0] * frame.max_force[0], action[0, 1] * frame.max_force[0]
     force[0, 0], force[1, 0] = along * hx - left * hy, along * hy + left * hx
@@ -68,7 +68,7 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
 
 @kernel
 def keep(p: Any, before: Frame, after: Frame) -> None:
-    """Remember how near a pedestrian came in this decision, between surfaces along the way, and so far in all, m."""
+    """Store the least gap between surfaces along the path of this decision, and so far in the episode, m."""
     least = np.float64(_NOBODY)
     for j in range(1, after.pos.shape[1]):
         x, y = np.float64(before.pos[0, j] - before.pos[0, 0]), np.float64(before.pos[1, j] - before.pos[1, 0])
@@ -84,32 +84,32 @@ def keep(p: Any, before: Frame, after: Frame) -> None:
 
 @kernel
 def _to_goal(frame: Frame) -> tuple[float, float]:
-    """Return the robot's way to its goal, m."""
+    """Return the offset from the robot to its goal, m."""
     return frame.memory[0, 0] - np.float64(frame.pos[0, 0]), frame.memory[1, 0] - np.float64(frame.pos[1, 0])
 
 
 @kernel
 def _left(frame: Frame) -> float:
-    """Return how far it is to the goal, m."""
+    """Return the distance from the robot to its goal, m."""
     x, y = _to_goal(frame)
     return math.sqrt(x * x + y * y)
 
 
 @kernel
 def _collides(after: Frame) -> bool:
-    """Has it touched somebody in this decision?"""
+    """Return True if the robot touched a pedestrian in this decision."""
     return bool(after.memory[4, 0] < 0.0)
 
 
 @kernel
 def _arrives(p: Any, after: Frame) -> bool:
-    """Is it at its goal, without having touched somebody in this decision?"""
+    """Return True if the robot is at its goal and touched no pedestrian in this decision."""
     return bool(_left(after) <= p.goal_radius) and not _collides(after)
 
 
 @kernel
 def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
-    """Terms: progress, success, collision, discomfort, time."""
+    """Write the terms progress, success, collision, discomfort, time."""
     gap = np.float64(after.memory[4, 0])
     terms[0, 0] = p.progress_reward * (_left(before) - _left(after))
     terms[0, 1] = p.success_reward if _arrives(p, after) else 0.0
@@ -121,7 +121,7 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 
 @kernel
 def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
-    """A touch ends it, and so does the goal: that is success."""
+    """End the episode at a collision, or at the goal, which is success."""
     success = _arrives(p, after)
     over[0] = success or _collides(after)
     return success
@@ -129,7 +129,7 @@ def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
 
 @kernel
 def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
-    """Does it touch now; is it there; path, m; least gap so far, m; too near, without a touch, s."""
+    """Write collision (0 or 1); arrival (0 or 1); path, m; least gap so far, m; discomfort without collision, s."""
     gap = np.float64(after.memory[4, 0])
     numbers[0] = 1.0 if gap < 0.0 else 0.0
     numbers[1] = 1.0 if _arrives(p, after) else 0.0
@@ -140,8 +140,8 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 @kernel
 def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
-    """Did it touch somebody; neither that nor there; s to the goal, if it is there; path, m; least gap, m; share of the
-    time nearer than is comfortable.
+    """Write whether it collided; whether it did neither that nor arrive; time to the goal, s, if it arrived; path, m;
+    least gap, m; share of the time below the comfort distance.
     """  # fmt: skip
     time = steps * p.control_dt
     numbers[0] = last.touch
@@ -156,7 +156,7 @@ def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
 
 @kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
-    """All in the frame of the course: (along, left). Own velocity, the way to the goal, the nearest pedestrians."""
+    """Write own velocity, offset of the goal, nearest pedestrians, in the frame of the course: (along, left)."""
     slots, one = int(p.neighbours), like(p.sight, 1.0)
     row, course = rows[0], (frame.memory[2, 0], frame.memory[3, 0])
     put(row, 0, turned((frame.vel[0, 0], frame.vel[1, 0]), course, one / p.max_speed))
@@ -175,16 +175,19 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
 
 
 class CrowdNav(Task):
-    """One robot crosses a circle on which pedestrians swap places, under a social force; it must not touch anybody.
+    """One robot crosses a circle on which pedestrians swap places under a social force, and must touch none of them.
 
-    The crowd is that of Moussaid et al. 2009, desired speeds N(1.29, 0.19) m/s, or another of `flockenv.scene.presets`
-    as published: who has bodies of 0.5 m keeps 0.4 m between centres there in the middle of a circle of 12, while those
-    of 1995 and 2007 walk into each other, with 0.1 m and less. By default it does not see the robot (`visible`), as in
-    the tests of CrowdNav (Chen et al. 2019, arXiv 1809.08835), so that nobody makes way and the robot cannot count on
-    it. Everything it sees is relative to itself and turned into the frame of its course, from start to goal. Rewards
-    are those of Chen et al. times 20: success 1, collision -0.25, and -0.5 per s and metre that the nearest is nearer
-    than 0.2 m; a reward of progress and a cost of time, ours, stand for their imitation and their discount. A touch
-    ends it: distances are those between bodies along the way of a decision, not only at its end.
+    The crowd follows Moussaid et al. 2009, with desired speeds N(1.29, 0.19) m/s, or another model of
+    `flockenv.scene.presets`, as published. Pedestrians of the 2009 model, with bodies of 0.5 m, keep 0.4 m between
+    centres in the middle of a circle of 12; those of the models of 1995 and 2007 walk into each other, with 0.1 m and
+    less. By default the crowd does not see the robot (`visible`), as in the tests of CrowdNav (Chen et al. 2019,
+    arXiv 1809.08835), so that the robot cannot rely on pedestrians to give way. Observations are relative to the robot,
+    in the frame of its course, from start to goal.
+
+    Rewards are those of Chen et al. times 20: success 1, collision -0.25, and -0.5 per s and per metre by which the
+    nearest pedestrian is closer than 0.2 m. A progress reward and a time cost, which are not in the paper, replace its
+    imitation learning and its discount. A collision ends the episode. Gaps are the least along the path of a decision,
+    not only at its end.
     """
 
     name: ClassVar[str] = "crowd_nav"
@@ -197,27 +200,35 @@ class CrowdNav(Task):
     keeps: ClassVar[bool] = True
 
     horizon: int = Field(default=250, ge=1, description="decisions until the time limit (truncation)")
-    people: int = Field(default=10, ge=1, le=200, description="how many pedestrians")
-    visible: bool = Field(default=False, description="does the crowd see the robot?")
+    people: int = Field(default=10, ge=1, le=200, description="number of pedestrians")
+    visible: bool = Field(default=False, description="True if the crowd sees the robot")
     crowd: Crowd = Field(default="moussaid_2009", description="the social force of the crowd, as published")
     circle: float = Field(default=6.0, gt=0, description="m, radius of the circle")
-    jitter: float = Field(default=0.35, ge=0, lt=0.5, description="how far off his place one starts, in gaps")
+    jitter: float = Field(
+        default=0.35, ge=0, lt=0.5, description="largest offset of a start, as a share of the gap between starts"
+    )
     max_speed: float = Field(default=1.34, gt=0, description="m/s, of the robot")
     max_force: float = Field(default=5.0, gt=0, description="N, of the robot; its mass is 1 kg")
-    goal_radius: float = Field(default=0.3, gt=0, description="m, nearer to its goal than this it is there")
-    sight: float = Field(default=5.0, gt=0, description="m, pedestrians are seen within this, by each other too")
-    neighbours: int = Field(default=6, ge=1, le=32, description="how many are seen, nearest first")
-    near: float = Field(default=1.5, gt=0, description="m between bodies, within which closeness is seen")
-    comfort_distance: float = Field(default=0.2, gt=0, description="m between bodies, below which it is discomfort")
+    goal_radius: float = Field(
+        default=0.3, gt=0, description="m, the robot has arrived within this distance of its goal"
+    )
+    sight: float = Field(
+        default=5.0, gt=0, description="m, range within which pedestrians are seen, also by each other"
+    )
+    neighbours: int = Field(default=6, ge=1, le=32, description="number of pedestrians seen, nearest first")
+    near: float = Field(default=1.5, gt=0, description="m between bodies, below which `crowding` is not 0")
+    comfort_distance: float = Field(
+        default=0.2, gt=0, description="m between bodies, below which the discomfort cost applies"
+    )
     progress_reward: float = Field(default=0.5, ge=0, description="per m nearer to the goal")
-    success_reward: float = Field(default=20.0, ge=0, description="at the goal")
-    collision_cost: float = Field(default=5.0, ge=0, description="for a touch")
+    success_reward: float = Field(default=20.0, ge=0, description="on arrival at the goal")
+    collision_cost: float = Field(default=5.0, ge=0, description="for a collision")
     discomfort_cost: float = Field(default=10.0, ge=0, description="per s and m below the comfort distance")
     time_cost: float = Field(default=0.2, ge=0, description="per s")
 
     @model_validator(mode="after")
     def _enough(self) -> CrowdNav:
-        """Refuse more people than have room on the circle."""
+        """Raise ValueError for more people than fit on the circle."""
         n = self.people + 1
         room = 2 * math.pi * self.circle * (1 - 2 * self.jitter) / n
         if room < 0.8:
@@ -227,12 +238,12 @@ class CrowdNav(Task):
 
     @property
     def learners(self) -> int:
-        """One."""
+        """L: 1, the robot."""
         return 1
 
     @property
     def agents(self) -> int:
-        """The robot and the crowd."""
+        """N: the robot and the crowd."""
         return 1 + self.people
 
     @property
@@ -242,7 +253,7 @@ class CrowdNav(Task):
 
     @functools.cached_property
     def scene(self) -> Scene:
-        """A plane; the crowd wants to get across the circle, off each other, and off the robot if it sees it."""
+        """A plane; pedestrians cross the circle and avoid each other, and also the robot if it is visible."""
         around = Spawn(low=(-self.circle, -self.circle), high=(self.circle, self.circle))  # before an episode begins
         robot = {"radius": _RADIUS, "max_speed": self.max_speed, "max_force": self.max_force, "role": "learner"}
         seen = {"radius": self.sight, "group": None if self.visible else 1}
@@ -273,7 +284,7 @@ class CrowdNav(Task):
 
     @functools.cached_property
     def layout(self) -> Layout:
-        """Every vector is (along the course, to its left)."""
+        """The observation; every vector is (along the course, to its left)."""
         return Layout((
             Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (along the course, to its left)"),
             Slot("goal", (2,), 3 * self.circle, "m", "the way to the goal"),
@@ -287,10 +298,10 @@ class CrowdNav(Task):
         return Layout((Slot("force", (2,), self.max_force, "N", meaning),))
 
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
-        """The robot's goal."""
+        """Return a mark at the robot's goal."""
         return (Mark("goal", memory[:2, world, 0], np.zeros(2), self.goal_radius),)
 
     def view(self, state: State, world: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """The circle, and some room around it."""
+        """Return the circle and a margin around it, m."""
         edge = 1.3 * self.circle
         return (-edge, -edge), (edge, edge)

@@ -1,4 +1,4 @@
-"""A decision in one world, part by part: it begins or acts, looks around, is paid and judged, and shows itself."""
+"""The parts of a decision in one world: begin or act, search neighbours, compute rewards and ends, observe."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ __all__ = [
 
 @functools.cache
 def _fixed(counts: tuple[tuple[int, float], ...]) -> Callable[[Any], Any]:
-    """Return a function that puts constants into their places of a tuple."""
+    """Return a function that replaces elements of a tuple by constants."""
     k, value = counts[-1]
     before = _fixed(counts[:-1]) if counts[1:] else None
 
@@ -44,7 +44,7 @@ def _fixed(counts: tuple[tuple[int, float], ...]) -> Callable[[Any], Any]:
 
 @section
 def parameters_of(names: tuple[str, ...], counts: tuple[tuple[int, float], ...]) -> Callable[[Any], Any]:
-    """Make what reads the parameters of a task out of a row, by name; some are constants."""
+    """Return a function that reads a task's parameters from a row, by name; `counts` are constants."""
     kind, places, fixes = record(names), tuple(range(len(names))), bool(counts)
     fixed: Any = _fixed(counts) if counts else None
 
@@ -58,7 +58,7 @@ def parameters_of(names: tuple[str, ...], counts: tuple[tuple[int, float], ...])
 
 @section
 def by_name_of(names: tuple[str, ...]) -> Callable[[Any], Any]:
-    """Make what reads measures out of a row, by name."""
+    """Return a function that reads measures from a row, by name."""
     kind, places, some = record(names), tuple(range(len(names))), bool(names)
 
     def by_name(row: Any) -> Any:
@@ -85,7 +85,7 @@ def frame_of(w: Any, scratch: Any, near: Any, table: Any, b: int) -> Any:
 
 @kernel
 def frame_before(w: Any, scratch: Any, made: Any, near: Any, table: Any, b: int) -> Any:
-    """Return the frame of world b before the decision: nobody is near."""
+    """Return the frame of world b before the decision, without neighbours."""
     none = near.square[:0]
     return Frame(
         made.x0, made.v0, made.alive0, w.obstacle_x[:, b], w.obstacle_radius[b], w.memory[:, b], w.key[b],
@@ -96,7 +96,7 @@ def frame_before(w: Any, scratch: Any, made: Any, near: Any, table: Any, b: int)
 
 @section
 def begin_of(plan: Plan) -> Callable[..., None]:
-    """Make what begins an episode in world b."""
+    """Return a function that begins an episode in world b."""
     spawn, inner, oriented = plan.kernels.spawn, plan.kernels.begin, plan.oriented
     begin_inner = begin_inner_of(inner) if inner is not None else None
 
@@ -116,7 +116,7 @@ def begin_of(plan: Plan) -> Callable[..., None]:
 
 @section
 def _decide(plan: Plan) -> Callable[..., None]:
-    """Make what remembers the present of world b, takes its actions, clipped, and asks what forces they are."""
+    """Return a function that stores the state of world b, clips its actions, and computes the steering forces."""
     drive, d, size, shows = plan.kernels.drive, plan.dimension, plan.action, plan.abreast > 0
 
     def decide(p: Any, w: Any, made: Any, now: Any, given: Any, action: Any, over: Any, b: int) -> None:
@@ -141,9 +141,9 @@ def _decide(plan: Plan) -> Callable[..., None]:
 
 @section
 def _widened(plan: Plan) -> Callable[..., Any]:
-    """Make the frame of a task that shows agents side by side.
+    """Return a function that makes the frame of a task with a kernel `abreast`.
 
-    It goes on beyond the last agent, up to whole registers: loops over agents have no rest that goes one by one.
+    Its arrays are padded beyond the last agent to whole registers, so that loops over agents need no scalar remainder.
     """
     d, kept, alike = plan.dimension, plan.memory, plan.alike
     radius, memory = 2 * d, 2 * d + 1
@@ -173,7 +173,7 @@ def _widened(plan: Plan) -> Callable[..., Any]:
 
 @section
 def _judge(plan: Plan) -> Callable[..., None]:
-    """Make what says how world b ended, and counts the measures; who is over dies if he is `mortal`."""
+    """Return a function that finds ends and success of world b, and sums measures; if `mortal`, ended agents die."""
     ended, measure, lasting, by_name = plan.kernels.ended, plan.kernels.measure, plan.lasting, by_name_of(plan.measures)
 
     def judge(
@@ -197,7 +197,7 @@ def _judge(plan: Plan) -> Callable[..., None]:
 
 @section
 def _pay(terms: int) -> Callable[..., None]:
-    """Make what adds up the terms of world b, and tells them where that is asked for."""
+    """Return a function that sums the reward terms of world b, and writes them out if an agent ends or `everyone`."""
 
     def pay(earns: Any, totals: Any, results: Any, everyone: bool, b: int) -> None:
         over = results.over
@@ -220,7 +220,7 @@ def _pay(terms: int) -> Callable[..., None]:
 
 @section
 def _ask_ahead(dimension: int) -> Callable[..., None]:
-    """Make what asks in good time for the world that comes next."""
+    """Return a function that prefetches the next world."""
 
     def ask_ahead(w: Any, actions: Any, following: int) -> None:
         for k in range(dimension):
@@ -233,7 +233,7 @@ def _ask_ahead(dimension: int) -> Callable[..., None]:
 
 @section
 def _ask_for_sums(terms: int) -> Callable[..., None]:
-    """Make what asks in good time for what is paid in world b."""
+    """Return a function that prefetches the reward sums of world b."""
 
     def ask_for_sums(totals: Any, results: Any, everyone: bool, b: int) -> None:
         for k in range(terms):
@@ -247,7 +247,7 @@ def _ask_for_sums(terms: int) -> Callable[..., None]:
 
 @section
 def act_of(plan: Plan) -> Callable[..., Any]:
-    """Make what lets world b take a decision and go on; returns who is not finite, or -1."""
+    """Return a function that takes a decision in world b; it returns the first agent that is not finite, or -1."""
     decide, ask_for_sums, shows = _decide(plan), _ask_for_sums(plan.terms), plan.abreast > 0
     step_world = step_world_of(plan.kernels.step)
 
@@ -256,8 +256,8 @@ def act_of(plan: Plan) -> Callable[..., Any]:
         totals: Any, results: Any, everyone: bool, past: bool, b: int,
     ) -> Any:  # fmt: skip
         decide(p, w, made, now, listed, action, results.over, b)
-        if shows and not past:  # here and there, for it is written at the end
-            prefetch(results.rows[b], 0, 4)
+        if shows and not past:  # spread over the decision, as rows are written at its end
+            fetch(results.rows[b], 0, 4)
         bad = step_world(w, made.force, 0, given.params, dt, count, b, 0, 1, scratch)
         w.steps[b] += 1
         if shows:
@@ -271,7 +271,7 @@ def act_of(plan: Plan) -> Callable[..., Any]:
 
 @section
 def look_in(plan: Plan) -> Callable[..., bool]:
-    """Make what looks around in world b, if the task does; returns whether it has written where the nearest are."""
+    """Return a function that searches neighbours in world b, if the task has a `look`; True if it wrote positions."""
     look = look_of(plan.kernels.look) if plan.kernels.look is not None else None
     looks = look is not None
 
@@ -288,7 +288,7 @@ def look_in(plan: Plan) -> Callable[..., bool]:
 
 @section
 def answer_of(plan: Plan) -> Callable[..., None]:
-    """Make what pays the agents of world b, and says who is over."""
+    """Return a function that computes rewards and ends of world b."""
     reward, terms, shows = plan.kernels.reward, plan.terms, plan.abreast > 0
     judge, pay, ask_ahead = _judge(plan), _pay(terms), _ask_ahead(plan.dimension)
 
@@ -310,7 +310,7 @@ def answer_of(plan: Plan) -> Callable[..., None]:
 
 @section
 def show_of(plan: Plan) -> Callable[..., None]:
-    """Make what writes the observations of world b: on the canvas first, where they go past the caches."""
+    """Return a function that writes the observations of world b, via the canvas if streaming stores are used."""
     abreast, observe, many, far = plan.kernels.abreast, plan.kernels.observe, plan.abreast, plan.apart
     shows = abreast is not None
 
@@ -329,7 +329,7 @@ def show_of(plan: Plan) -> Callable[..., None]:
 
 @section
 def wide_of(plan: Plan) -> Callable[..., Any]:
-    """Make what returns how many learners are worked out in world b, and the frame in which they are."""
+    """Return a function that returns the padded number of learners of world b, and their frame."""
     widened, shows, width = _widened(plan), plan.abreast > 0, plan.width
 
     def widen(

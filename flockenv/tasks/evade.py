@@ -1,4 +1,4 @@
-"""Evade: stay out of the hands of a team of pursuers among cover, behind which they lose sight of you."""
+"""Evade: an evader escapes a team of pursuers among cover, behind which they lose sight of it."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from flockenv.tasks.task import Frame, Task
 __all__ = ["Evade"]
 
 _TRIES = 64
-_GAIN = 5.0  # kg/s: a pursuer has the velocity that it wants within 0.2 s, if it is strong enough
-_SEARCH = 4.0  # s, after which a pursuer that sees nobody looks behind another cover
+_GAIN = 5.0  # kg/s: a pursuer reaches its desired velocity within 0.2 s, if its force limit allows
+_SEARCH = 4.0  # s, after which a searching pursuer looks behind another cover
 
 
 @kernel
 def spawn(p: Any, frame: Frame) -> None:
-    """Cover with gaps between; an evader in the open, pursuers `start_distance` m or more from it; all at rest."""
+    """Place cover with gaps, the evader in the open, pursuers at least `start_distance` m from it; all at rest."""
     frame.vel[:, :] = 0.0
     for m in range(frame.rho.shape[0]):
         frame.rho[m] = 0.0
@@ -50,12 +50,12 @@ def spawn(p: Any, frame: Frame) -> None:
             if _clear(p, frame, i):
                 break
         frame.memory[:, i] = 0.0
-        frame.memory[2, i] = p.patience  # it has seen nobody yet
+        frame.memory[2, i] = p.patience  # it has not seen the evader yet
 
 
 @kernel
 def _clear(p: Any, frame: Frame, i: int) -> bool:
-    """Is agent i in no cover, and far enough from the evader, and from the pursuers before it?"""
+    """Return True if agent i is clear of cover, and far enough from the evader and from the pursuers before it."""
     for m in range(frame.rho.shape[0]):
         if frame.rho[m] > 0.0 and norm(_to_cover(frame, i, m)) < frame.rho[m] + 2.0 * frame.radius[i]:
             return False
@@ -67,7 +67,7 @@ def _clear(p: Any, frame: Frame, i: int) -> bool:
 
 @kernel
 def _to(frame: Frame, i: int, j: int) -> Vec:
-    """Return the offset of agent j from agent i, m; taken in the precision of the scene, in which policies learned."""
+    """Return the offset of agent j from agent i, m; subtracted in the precision of the scene, as in training."""
     return (np.float64(frame.pos[0, j] - frame.pos[0, i]), np.float64(frame.pos[1, j] - frame.pos[1, i]))
 
 
@@ -79,7 +79,7 @@ def _to_cover(frame: Frame, i: int, m: int) -> Vec:
 
 @kernel
 def _sees(p: Any, frame: Frame, i: int) -> bool:
-    """Does pursuer i see the evader: is it within sight, and no cover in the straight way between them?"""
+    """Return True if pursuer i sees the evader: it is within sight, and no cover blocks the straight line to it."""
     to = _to(frame, i, 0)
     distance, way = norm(to), unit(to)
     if distance > p.sight:
@@ -92,7 +92,7 @@ def _sees(p: Any, frame: Frame, i: int) -> bool:
 
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
-    """The learner pushes where its action says; pursuers follow `_hunt`."""
+    """Write the learner's action as a force along the field's axes; pursuers follow `_hunt`."""
     for k in range(2):
         force[k, 0] = action[0, k] * frame.max_force[0]
     for i in range(1, frame.pos.shape[1]):
@@ -101,7 +101,7 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
 
 @kernel
 def _hunt(p: Any, frame: Frame, i: int, force: Any) -> None:
-    """A scripted pursuer: around cover, off its mates, inside the field, after the evader; allocation in that order."""
+    """Write a pursuer's force; priorities: avoid cover, separate from mates, stay in the field, chase the evader."""
     velocity, top = velocity_of(frame, i), np.float64(frame.max_speed[i])
     margin = 0.5
     low = (frame.pos[0, i] - margin, frame.pos[1, i] - margin)
@@ -119,9 +119,10 @@ def _hunt(p: Any, frame: Frame, i: int, force: Any) -> None:
 
 @kernel
 def _after(p: Any, frame: Frame, i: int, velocity: Vec, top: float) -> Vec:
-    """Pursue who is seen; else go where it was seen last; there, or after `patience` s, look behind some cover.
+    """Return the steering vector of the chase: pursue the evader if it is seen, else seek its last seen position.
 
-    Memory: the place where the evader was seen last, m, and how long ago that is, s.
+    Once there, or after `patience` s, look behind random cover. Memory: where the evader was last seen, m, and how long
+    ago, s.
     """
     if _sees(p, frame, i):
         to, theirs = _to(frame, i, 0), velocity_of(frame, 0)
@@ -145,7 +146,7 @@ def _after(p: Any, frame: Frame, i: int, velocity: Vec, top: float) -> Vec:
 
 @kernel
 def _around(frame: Frame, i: int, velocity: Vec, top: float) -> Vec:
-    """Steer around the cover that is touched first within 1 s."""
+    """Return the steering vector around the cover that would be hit first within 1 s."""
     forward = unit(velocity)
     where: Vec = (0.0, 0.0)
     nearest, room = np.inf, 0.0
@@ -163,7 +164,7 @@ def _around(frame: Frame, i: int, velocity: Vec, top: float) -> Vec:
 
 @kernel
 def _apart(frame: Frame, i: int) -> Vec:
-    """Keep 2 m from other pursuers, so that they come from several sides."""
+    """Return the separation from pursuers within 2 m, so that they come from several sides."""
     push: Vec = (0.0, 0.0)
     for j in range(1, frame.pos.shape[1]):
         to = _to(frame, i, j)
@@ -183,7 +184,7 @@ def _nearest(frame: Frame) -> float:
 
 @kernel
 def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
-    """Terms: alive, caught, effort."""
+    """Write the terms alive, caught, effort."""
     caught = _nearest(after) <= p.capture_distance
     square = min(action[0, 0] * action[0, 0] + action[0, 1] * action[0, 1], 1.0)
     terms[0, 0] = 0.0 if caught else p.alive_reward * p.control_dt
@@ -193,14 +194,14 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 
 @kernel
 def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
-    """To be caught ends it; as long as nobody has caught the evader, the aim holds."""
+    """End the episode at a capture; return True as long as the evader is not caught."""
     over[0] = _nearest(after) <= p.capture_distance
     return not over[0]
 
 
 @kernel
 def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
-    """Time, s; time in which nobody sees the evader, s; is it caught now; distance of the nearest pursuer, m."""
+    """Write time, s; time unseen by all pursuers, s; caught (0 or 1); distance of the nearest pursuer, m."""
     seen = False
     for i in range(1, after.pos.shape[1]):
         seen = seen or _sees(p, after, i)
@@ -212,13 +213,13 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 @kernel
 def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
-    """Seconds until it was caught, or now; is it free; seconds in which nobody saw it; nearest pursuer now, m."""
+    """Write survival time, s; survived (0 or 1); time unseen, s; distance of the nearest pursuer now, m."""
     numbers[0], numbers[1], numbers[2], numbers[3] = sums.time, 1.0 - last.caught, sums.hidden, last.distance
 
 
 @kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
-    """Own velocity, walls, pursuers nearest first and whether they see it, the nearest cover, free ways all around."""
+    """Write own velocity, walls, pursuers nearest first, whether they see it, nearest cover, free path lengths."""
     row = rows[0]
     for c in range(row.shape[0]):
         row[c] = 0.0
@@ -245,7 +246,7 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
 
 @kernel
 def _show_pursuers(p: Any, frame: Frame, row: Any) -> int:
-    """Write the pursuers, nearest first; return the place after them."""
+    """Write the pursuers, nearest first; return the index after them."""
     count = frame.pos.shape[1] - 1
     last, chosen = -1.0, 0
     for s in range(count):
@@ -267,11 +268,12 @@ def _show_pursuers(p: Any, frame: Frame, row: Any) -> int:
 
 
 class Evade(Task):
-    """One learner stays out of the hands of a team of scripted pursuers among round cover, in a walled field.
+    """One learner escapes a team of scripted pursuers among round cover, in a walled field.
 
-    Pursuers are slower and turn more slowly. They see the evader within `sight`, unless cover is in the straight way,
-    and head for where it will be; who has lost sight of it goes where it was last, then looks behind one cover after
-    another. Each sees for itself alone. Cover and walls are solid. To be caught ends it.
+    Pursuers are slower and turn more slowly. They see the evader within `sight`, unless cover blocks the straight line
+    to it, and head for its predicted position. A pursuer that has lost sight of the evader goes to where it last saw
+    it, then looks behind one cover after another. Pursuers do not share what they see. Cover and walls are solid. A
+    capture ends the episode. Success: the evader is not caught.
     """
 
     name: ClassVar[str] = "evade"
@@ -281,38 +283,42 @@ class Evade(Task):
     memory: ClassVar[int] = 3
 
     horizon: int = Field(default=300, ge=1, description="decisions until the time limit (truncation)")
-    pursuers: int = Field(default=3, ge=1, le=16, description="how many chase")
+    pursuers: int = Field(default=3, ge=1, le=16, description="number of pursuers")
     size: float = Field(default=28.0, gt=10, description="m, edge of the field")
-    cover: int = Field(default=10, ge=0, le=100, description="obstacles drawn; those that find no room are left out")
-    least_radius: float = Field(default=0.8, gt=0, description="m")
-    greatest_radius: float = Field(default=1.8, gt=0, description="m")
+    cover: int = Field(default=10, ge=0, le=100, description="number of obstacles; those that do not fit are left out")
+    least_radius: float = Field(default=0.8, gt=0, description="m, least radius of an obstacle")
+    greatest_radius: float = Field(default=1.8, gt=0, description="m, greatest radius of an obstacle")
     min_gap: float = Field(default=1.5, ge=0, description="m between obstacles, and to walls; bodies are 0.6 m wide")
-    start_distance: float = Field(default=8.0, ge=0, description="m, between the evader and pursuers at the start")
+    start_distance: float = Field(
+        default=8.0, ge=0, description="m, least distance between the evader and pursuers at the start"
+    )
     evader_speed: float = Field(default=3.0, gt=0, description="m/s")
     evader_force: float = Field(default=8.0, gt=0, description="N; the mass is 1 kg")
     pursuer_speed: float = Field(default=2.2, gt=0, description="m/s")
     pursuer_force: float = Field(default=4.0, gt=0, description="N; the mass is 1 kg")
     sight: float = Field(
-        default=10.0, gt=0, description="m, within which pursuers see the evader if nothing is between"
+        default=10.0, gt=0, description="m, range within which pursuers see the evader unless cover is between"
     )
-    patience: float = Field(default=4.0, ge=0, description="s, how long they go to where it was seen last")
-    capture_distance: float = Field(default=0.7, gt=0, description="m between centres")
-    near: float = Field(default=6.0, gt=0, description="m, within which the closeness of pursuers is seen")
-    slots: int = Field(default=6, ge=1, le=32, description="how many obstacles are seen, nearest surface first")
-    rays: int = Field(default=16, ge=1, le=128, description="directions in which the free way is seen")
-    way_sight: float = Field(default=8.0, gt=0, description="m, up to which it is")
+    patience: float = Field(default=4.0, ge=0, description="s, longest search at the evader's last seen position")
+    capture_distance: float = Field(default=0.7, gt=0, description="m between centres, for a capture")
+    near: float = Field(default=6.0, gt=0, description="m, range within which `closeness` is not 0")
+    slots: int = Field(default=6, ge=1, le=32, description="number of obstacles seen, nearest surface first")
+    rays: int = Field(default=16, ge=1, le=128, description="number of directions in which the free path is seen")
+    way_sight: float = Field(default=8.0, gt=0, description="m, greatest free path that is seen")
     alive_reward: float = Field(default=1.0, ge=0, description="per s")
-    caught_cost: float = Field(default=10.0, ge=0, description="once")
-    effort_cost: float = Field(default=0.1, ge=0, description="per s of full force; goes with its square")
+    caught_cost: float = Field(default=10.0, ge=0, description="once, when caught")
+    effort_cost: float = Field(
+        default=0.1, ge=0, description="per s at full force; proportional to the square of the force"
+    )
 
     @model_validator(mode="after")
     def _fitting(self) -> Evade:
-        """Refuse radii that run backwards, or for which the field has no room, and a start that is out of reach."""
+        """Raise ValueError for radii in the wrong order or too large, or a start distance above half the field."""
         widest = 2 * (self.greatest_radius + self.min_gap)
         if self.least_radius > self.greatest_radius or widest > self.size:
             raise ValueError(
-                f"least_radius = {self.least_radius:g}, greatest_radius = {self.greatest_radius:g}: the least comes "
-                f"first, and with min_gap on each side it must fit into a field of {self.size:g} m"
+                f"least_radius = {self.least_radius:g}, greatest_radius = {self.greatest_radius:g}: must be in "
+                f"this order, and fit, with min_gap on each side, into a field of {self.size:g} m"
             )
         if self.start_distance > self.size / 2:
             raise ValueError(f"start_distance = {self.start_distance:g}: at most size / 2 = {self.size / 2:g} m")
@@ -320,12 +326,12 @@ class Evade(Task):
 
     @property
     def learners(self) -> int:
-        """One."""
+        """L: 1, the evader."""
         return 1
 
     @property
     def agents(self) -> int:
-        """The evader and its pursuers."""
+        """N: the evader and its pursuers."""
         return 1 + self.pursuers
 
     @property
@@ -335,7 +341,7 @@ class Evade(Task):
 
     @property
     def obstacle_slots(self) -> int:
-        """As many as are drawn."""
+        """M: the number of obstacles."""
         return self.cover
 
     @functools.cached_property
@@ -356,16 +362,16 @@ class Evade(Task):
 
     @property
     def look(self) -> Look:
-        """The nearest cover."""
+        """The nearest cover, in the whole field."""
         return Look(self.size, obstacles=self.slots)
 
     def table(self) -> tuple[float, ...]:
-        """The directions of the rays."""
+        """Return the directions of the rays."""
         return compass(self.rays)
 
     @functools.cached_property
     def layout(self) -> Layout:
-        """Axes are the field's; offsets are relative to the agent."""
+        """The observation; axes are the field's, and offsets are relative to the agent."""
         n, m = self.pursuers, self.slots
         ways = "how far the body can go before it touches cover, anticlockwise from the x axis"
         seen = "offsets of the centres of the nearest obstacles, nearest surface first; zeros = none"
@@ -385,6 +391,6 @@ class Evade(Task):
 
     @functools.cached_property
     def action_layout(self) -> Layout:
-        """A force, in the field's axes."""
+        """A force along the field's axes."""
         meaning = "force (x, y) / max_force, shortened to length 1"
         return Layout((Slot("force", (2,), self.evader_force, "N", meaning),))

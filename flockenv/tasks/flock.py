@@ -32,7 +32,7 @@ __all__ = ["Flock"]
 
 @kernel
 def spawn(p: Any, frame: Frame) -> None:
-    """A loose crowd in the middle, moving anyhow; a heading; obstacles elsewhere, with gaps between them."""
+    """Place agents loosely in the middle with random velocities; draw a heading, and obstacles elsewhere, with gaps."""
     turn = 2.0 * math.pi * uniform(frame.key, 0, 9999, 0)
     frame.memory[0, :], frame.memory[1, :] = math.cos(turn), math.sin(turn)
     n = frame.pos.shape[1]
@@ -62,7 +62,7 @@ def spawn(p: Any, frame: Frame) -> None:
 
 @kernel
 def _clear(frame: Frame, i: int, distance: float) -> bool:
-    """Is agent i at least this far from those placed before it?"""
+    """Return True if agent i is at least `distance` m from those placed before it."""
     for j in range(i):
         dx, dy = frame.pos[0, j] - frame.pos[0, i], frame.pos[1, j] - frame.pos[1, i]
         if math.sqrt(dx * dx + dy * dy) < distance:
@@ -72,7 +72,7 @@ def _clear(frame: Frame, i: int, distance: float) -> bool:
 
 @kernel
 def _fits(p: Any, frame: Frame, m: int, x: float, y: float, rho: float) -> bool:
-    """Does an obstacle here leave a gap of 3 m to those before it?"""
+    """Return True if an obstacle at (x, y) leaves a gap of 3 m to those before it."""
     for k in range(m):
         if frame.rho[k] > 0.0:
             dx, dy = offset(frame.centre[0, k], x, p.size), offset(frame.centre[1, k], y, p.size)
@@ -83,8 +83,8 @@ def _fits(p: Any, frame: Frame, m: int, x: float, y: float, rho: float) -> bool:
 
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
-    """Learners push where their action says, in the frame of the heading; flockmates follow `_flockmate`."""
-    for i in range(np.uint64(action.shape[0])):  # no branch in it: agents side by side
+    """Write each learner's action as a force in the frame of the heading; flockmates follow `_flockmate`."""
+    for i in range(np.uint64(action.shape[0])):  # no branches, so that SIMD is used
         hx, hy = frame.memory[0, i], frame.memory[1, i]
         along, left = action[i, 0] * frame.max_force[i], action[i, 1] * frame.max_force[i]
         force[0, i] = along * hx - left * hy
@@ -93,15 +93,15 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
         _flockmate(p, frame, i, force)
 
 
-_MOST = 32  # neighbours that are heeded at most
+_MOST = 32  # limit of `neighbours`
 _FAR, _NOBODY = (math.inf,) * _MOST, (np.uint64(0),) * _MOST
 
 
 @kernel
 def _flockmate(p: Any, frame: Frame, i: int, force: Any) -> None:
-    """A scripted member: avoid obstacles, separate, align, cohere, follow the heading, by prioritised allocation.
+    """Write a flockmate's force; priorities: avoid obstacles, separate, align, cohere, follow the heading.
 
-    It heeds the `neighbours` nearest within sight.
+    It reacts to the `neighbours` nearest within sight.
     """
     x, y = frame.pos[0, i], frame.pos[1, i]
     v = (np.float64(frame.vel[0, i]), np.float64(frame.vel[1, i]))
@@ -127,7 +127,7 @@ def _flockmate(p: Any, frame: Frame, i: int, force: Any) -> None:
 
 @kernel
 def _list_nearest(p: Any, frame: Frame, i: int, squares: Any, who: Any) -> Any:
-    """List the nearest within sight of agent i, equal distances by number, and their squares; return how many."""
+    """List the nearest within sight of agent i, ties by index, and squared distances; return their number."""
     one, found, last = np.uint64(1), np.uint64(0), np.uint64(p.neighbours) - np.uint64(1)
     for j in range(np.uint64(frame.pos.shape[1])):
         dx = offset(frame.pos[0, i], frame.pos[0, j], p.size)
@@ -145,7 +145,7 @@ def _list_nearest(p: Any, frame: Frame, i: int, squares: Any, who: Any) -> Any:
 
 @kernel
 def _around(p: Any, frame: Frame, i: int, v: Any) -> Any:
-    """Steer around the obstacle that is touched first within 2 s, with all the force there is."""
+    """Return the force around the obstacle that would be hit first within 2 s, at the force limit."""
     forward = unit(v)
     nearest, where, room = np.inf, (0.0, 0.0), 0.0
     for m in range(frame.rho.shape[0]):
@@ -165,10 +165,10 @@ def _around(p: Any, frame: Frame, i: int, v: Any) -> Any:
 
 @kernel
 def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
-    """Terms: progress, alignment, spacing, together, touch, obstacle; each judged of the world after the step."""
+    """Write the terms progress, alignment, spacing, together, touch, obstacle; all of the state after the step."""
     one, o = like(p.sight, 1.0), like(p.sight, 0.0)
     per_cruise, per_spacing, per_slot = one / p.cruise, one / p.spacing, one / p.neighbours
-    for i in range(np.uint64(terms.shape[0])):  # no branch in it: agents side by side
+    for i in range(np.uint64(terms.shape[0])):  # no branches, so that SIMD is used
         v = (after.vel[0, i], after.vel[1, i])
         along = v[0] * like(one, after.memory[0, i]) + v[1] * like(one, after.memory[1, i])
         found = after.near_count[i]
@@ -195,7 +195,7 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 
 @kernel
 def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
-    """Never over before the time limit. The aim holds now if the flock is aligned, under way, and no agent touches."""
+    """End no learner; return whether the aim holds now: aligned, moving along the heading, no contact."""
     polarisation, along = numbers[0], numbers[3] = _order(after)
     holds = polarisation > 0.9 and along > 0.8 * p.cruise and not _anybody_touches(after)
     judge(p, after.step, holds, numbers, 4)
@@ -203,7 +203,7 @@ def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
 
 
 _ZEROS = (0.0,) * SIDE
-"""A sum for each lane, so that agents are added side by side; the order is the same on every machine."""
+"""A partial sum for each SIMD lane, so that the order of summation is the same on every machine."""
 
 
 @kernel
@@ -229,8 +229,8 @@ def _order(frame: Frame) -> tuple[float, float]:
 
 @kernel
 def _anybody_touches(frame: Frame) -> bool:
-    """Is anybody's nearest neighbour, or nearest obstacle, so near that they touch?"""
-    touching = np.int32(0)  # counted: of a question whether there is one LLVM makes a search, agent by agent
+    """Return True if an agent touches its nearest neighbour or its nearest obstacle."""
+    touching = np.int32(0)  # a count vectorises; of an early exit LLVM makes a scalar search
     for i in range(np.uint64(frame.alive.shape[0])):
         touching += np.int32(1) if _touches(frame, i) else np.int32(0)
     return bool(touching > np.int32(0))
@@ -238,21 +238,21 @@ def _anybody_touches(frame: Frame) -> bool:
 
 @kernel
 def _touches(frame: Frame, i: int) -> Any:
-    """Does agent i touch its nearest neighbour, or the nearest obstacle? Where there is none, it is infinitely far."""
+    """Return True if agent i touches its nearest neighbour or obstacle; a missing one is infinitely far."""
     contact = frame.radius[i] + frame.near_radius[0, i]
     return (frame.near_square[0, i] < contact * contact) | (frame.obstacle_gap[0, i] < frame.radius[i])
 
 
 @kernel
 def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
-    """Mean distance of the nearest in sight, m; touches that began just now; `ended` writes what order there is."""
+    """Write the mean nearest distance in sight, m, and contacts that began; `ended` writes the order measures."""
     numbers[1] = _nearest(p, after)
     numbers[2] = _began(p, before, after) if _anybody_touches(after) else 0.0
 
 
 @kernel
 def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
-    """Means over the episode: polarisation, nearest neighbour [m], speed along [m/s]; touches that began; the aim."""
+    """Write polarisation, nearest distance, m, and speed along, m/s (means); contacts that began; those of the aim."""
     n = max(steps, 1)
     tell_lasting(sums, last, steps, numbers, 4)
     numbers[0], numbers[1] = sums.polarisation / n, sums.nearest / n
@@ -261,13 +261,13 @@ def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
 
 @kernel
 def _nearest(p: Any, frame: Frame) -> float:
-    """Return the mean distance of the nearest neighbour, m; the sight where there is none."""
+    """Return the mean distance of the nearest neighbour, m; `sight` counts for an agent that sees none."""
     n, lanes, sums = np.uint64(frame.alive.shape[0]), np.uint64(SIDE), stacked(_ZEROS)
     for first in range(np.uint64(0), n, lanes):
         for k in range(lanes):
             i = np.uint64(first + k)
             root = np.sqrt(frame.near_square[0, i])
-            distance = root if frame.near_count[i] > 0 else like(root, p.sight)  # no branch: agents side by side
+            distance = root if frame.near_count[i] > 0 else like(root, p.sight)  # no branch, so that SIMD is used
             sums[k] += distance if i < n else like(distance, 0.0)
     mean = 0.0
     for k in range(lanes):
@@ -277,7 +277,7 @@ def _nearest(p: Any, frame: Frame) -> float:
 
 @kernel
 def _began(p: Any, before: Frame, after: Frame) -> float:
-    """Return how many touches began just now, of two agents, or of one and an obstacle."""
+    """Return the number of contacts that began in this step, of two agents, or of an agent and an obstacle."""
     began = 0.0
     for i in range(after.alive.shape[0]):
         if not _touches(after, i):
@@ -298,14 +298,14 @@ def _began(p: Any, before: Frame, after: Frame) -> float:
 
 @kernel
 def _touched(p: Any, frame: Frame, i: int, x: float, y: float, contact: float) -> bool:
-    """Was agent i nearer than `contact` m to a place?"""
+    """Return True if agent i was nearer than `contact` m to the point (x, y)."""
     dx, dy = offset(frame.pos[0, i], x, p.size), offset(frame.pos[1, i], y, p.size)
     return dx * dx + dy * dy < contact * contact
 
 
 @kernel
 def abreast(p: Any, frame: Frame, columns: Any) -> None:
-    """All in the frame of the heading: (along, left). Own velocity, nearest neighbours, nearest obstacles."""
+    """Write own velocity, nearest neighbours and obstacles, in the frame of the heading: (along, left)."""
     n, one = np.uint64(columns.shape[0]), like(p.sight, 1.0)
     slots, listed, seen = np.uint64(p.neighbours), np.uint64(p.listed), np.uint64(p.obstacles_seen)
     two, seven = np.uint64(2), np.uint64(7)
@@ -332,9 +332,9 @@ def _heading(p: Any, frame: Frame, i: int) -> Any:
 
 @kernel
 def _show_neighbour(p: Any, frame: Frame, i: int, s: int, slots: Any, scales: Any, columns: Any) -> None:
-    """Write what agent i sees of its s-th nearest neighbour: offset, relative velocity, presence, crowding.
+    """Write the offset, relative velocity, presence and crowding of agent i's s-th nearest neighbour.
 
-    Zeros if there is none. All is worked out for whoever stands in the list; that is somebody's number in any case.
+    Zeros if there is none. The values are computed in any case: an empty entry of the list holds a valid index.
     """
     o, one, two, heading = like(p.sight, 0.0), like(p.sight, 1.0), np.uint64(2), _heading(p, frame, i)
     there = np.int32(s) < frame.near_count[i]
@@ -353,9 +353,9 @@ def _show_neighbour(p: Any, frame: Frame, i: int, s: int, slots: Any, scales: An
 
 @kernel
 def _show_obstacle(p: Any, frame: Frame, i: int, s: int, at: Any, seen: Any, columns: Any) -> None:
-    """Write what agent i sees of the s-th nearest obstacle, from column `at` on: offset, radius; or zeros.
+    """Write the offset and radius of agent i's s-th nearest obstacle, from column `at` on, or zeros.
 
-    As with neighbours, there is somebody's number in the list in any case, where there are obstacles at all.
+    As with neighbours, an empty entry of the list holds a valid index if there are obstacles at all.
     """
     there = np.int32(s) < frame.obstacle_count[i]
     centre, rho = _obstacle(frame, i, s)
@@ -383,7 +383,7 @@ def _put_if(there: Any, columns: Any, i: int, at: Any, vector: Any) -> None:
 
 @kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
-    """Free ways, anticlockwise from the heading, after what stands abreast; and zeros where nobody can be listed."""
+    """Write the free path lengths, anticlockwise from the heading, and zeros in slots beyond the neighbour list."""
     slots, listed, ways = int(p.neighbours), int(p.listed), rows.shape[1] - int(p.rays)
     for i in range(rows.shape[0]):
         row, heading = rows[i], _heading(p, frame, i)
@@ -401,8 +401,8 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
 class Flock(LastingTask):
     """N learners with one shared policy (or one among scripted flockmates) travel along a heading as a flock.
 
-    They start as a loose crowd moving anyhow in a periodic field with round obstacles. Everything an agent sees is
-    relative to itself and turned into the frame of the heading. No agent dies; what is bad costs as long as it lasts.
+    Agents start as a loose crowd with random velocities, in a periodic field with round obstacles. Observations are
+    relative to the agent, in the frame of the heading. No agent is removed; contacts cost as long as they last.
 
     The aim holds while the polarisation is above 0.9, the mean speed along the heading above 0.8 `cruise`, and no agent
     touches another or an obstacle. Success: it holds in the share `lasting` of the decisions after `settling` s.
@@ -421,38 +421,40 @@ class Flock(LastingTask):
     counts: ClassVar[tuple[str, ...]] = ("neighbours", "listed", "obstacles_seen", "rays")
     memory: ClassVar[int] = 2
 
-    agents: int = Field(default=24, ge=1, le=100_000, description="how many fly")
+    agents: int = Field(default=24, ge=1, le=100_000, description="number of agents")
     learners: int = Field(
         default_factory=lambda given: given.get("agents", 24), ge=1,
-        description="how many of them learn (default: all); the others follow a script",
+        description="number of learners (default of the task: all); the others are scripted",
     )  # fmt: skip
     horizon: int = Field(default=300, ge=1, description="decisions until the time limit (truncation)")
     size: float = Field(default=40.0, gt=14, description="m, edge of the periodic field")
-    obstacle_count: int = Field(default=6, ge=0, le=200, description="obstacles drawn")
-    least_radius: float = Field(default=0.8, gt=0, description="m")
-    greatest_radius: float = Field(default=2.0, gt=0, description="m")
-    cruise: float = Field(default=2.0, gt=0, description="m/s, wanted along the heading")
+    obstacle_count: int = Field(
+        default=6, ge=0, le=200, description="number of obstacles; those that do not fit are left out"
+    )
+    least_radius: float = Field(default=0.8, gt=0, description="m, least radius of an obstacle")
+    greatest_radius: float = Field(default=2.0, gt=0, description="m, greatest radius of an obstacle")
+    cruise: float = Field(default=2.0, gt=0, description="m/s, desired speed along the heading")
     max_speed: float = Field(default=3.0, gt=0, description="m/s")
     max_force: float = Field(default=4.0, gt=0, description="N; the mass is 1 kg")
-    spacing: float = Field(default=1.5, gt=0, description="m, wanted distance of the nearest neighbour")
-    sight: float = Field(default=6.0, gt=0, description="m, neighbours and obstacles are seen within this")
-    neighbours: int = Field(default=6, ge=1, le=_MOST, description="how many neighbours are seen, nearest first")
-    obstacles_seen: int = Field(default=2, ge=1, le=32, description="how many are seen, nearest surface first")
-    rays: int = Field(default=16, ge=1, le=128, description="directions in which the way clear of obstacles is seen")
+    spacing: float = Field(default=1.5, gt=0, description="m, desired distance of the nearest neighbour")
+    sight: float = Field(default=6.0, gt=0, description="m, range within which neighbours and obstacles are seen")
+    neighbours: int = Field(default=6, ge=1, le=_MOST, description="number of neighbours seen, nearest first")
+    obstacles_seen: int = Field(default=2, ge=1, le=32, description="number of obstacles seen, nearest surface first")
+    rays: int = Field(default=16, ge=1, le=128, description="number of directions in which the free path is seen")
     progress_reward: float = Field(default=1.0, ge=0, description="per s at cruising speed along the heading")
     alignment_cost: float = Field(
-        default=0.5, ge=0, description="per s at a velocity off the neighbours' mean by cruise"
+        default=0.5, ge=0, description="per s at a velocity that differs from the neighbours' mean by `cruise`"
     )
     spacing_cost: float = Field(
-        default=0.5, ge=0, description="per s with the nearest neighbour off its place by 100 %"
+        default=0.5, ge=0, description="per s at a nearest distance that differs from `spacing` by 100 %"
     )
     loneliness_cost: float = Field(default=0.5, ge=0, description="per s without any neighbour in sight")
     touch_cost: float = Field(default=10.0, ge=0, description="per s and agent touched")
-    obstacle_cost: float = Field(default=10.0, ge=0, description="per s in an obstacle")
+    obstacle_cost: float = Field(default=10.0, ge=0, description="per s and obstacle touched")
 
     @model_validator(mode="after")
     def _enough(self) -> Flock:
-        """Refuse more learners than agents."""
+        """Raise ValueError for more learners than agents, radii in the wrong order, or sight above half the field."""
         if self.learners > self.agents:
             raise ValueError(f"learners = {self.learners}: there are only {self.agents} agents")
         if self.least_radius > self.greatest_radius:
@@ -470,17 +472,17 @@ class Flock(LastingTask):
 
     @property
     def abreast(self) -> int:
-        """All but the free ways."""
+        """How many numbers the kernel `abreast` writes: all but the free path lengths."""
         return self.layout.size - self.rays
 
     @property
     def obstacle_slots(self) -> int:
-        """As many as are drawn."""
+        """M: the number of obstacles."""
         return self.obstacle_count
 
     @functools.cached_property
     def scene(self) -> Scene:
-        """A periodic square; nothing acts but what agents want."""
+        """A periodic square, in which only the agents' own forces act."""
         limits: dict[str, Any] = {"radius": 0.3, "max_speed": self.max_speed, "max_force": self.max_force}
         groups = [Group(count=self.learners, role="learner", **limits)]
         if self.agents > self.learners:
@@ -495,11 +497,11 @@ class Flock(LastingTask):
 
     @property
     def _listed(self) -> int:
-        """How many neighbours there can be at most; a list of one is kept for a boid alone, too."""
+        """Length of the neighbour lists; at least 1, also for a single agent."""
         return min(self.neighbours, max(self.agents - 1, 1))
 
     def parameters(self) -> dict[str, float]:
-        """The fields, and how long lists of neighbours are."""
+        """Return the fields, and the length of neighbour lists."""
         return {**super().parameters(), "listed": float(self._listed)}
 
     @property
@@ -508,12 +510,12 @@ class Flock(LastingTask):
         return Look(self.sight, self._listed, self.obstacles_seen)
 
     def table(self) -> tuple[float, ...]:
-        """The directions of the rays."""
+        """Return the directions of the rays."""
         return compass(self.rays)
 
     @functools.cached_property
     def layout(self) -> Layout:
-        """Every vector is (along the heading, to its left)."""
+        """The observation; every vector is (along the heading, to its left)."""
         n, m = self.neighbours, self.obstacles_seen
         ways = "how far the body can go before it touches one of them, anticlockwise from the heading"
         crowding = "their directions times 1 - distance / spacing; 0 beyond the spacing"
@@ -536,6 +538,6 @@ class Flock(LastingTask):
         return Layout((Slot("force", (2,), self.max_force, "N", meaning),))
 
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
-        """The heading."""
+        """Return a mark that shows the heading."""
         at = np.array([0.13, 0.82]) * self.size
         return (Mark("heading", at, memory[:2, world, 0], 0.0),)

@@ -26,12 +26,12 @@ from flockenv.tasks.task import Frame, Task
 __all__ = ["Herd"]
 
 _TRIES = 64
-_GAIN = 5.0  # kg/s: a sheep has the velocity that it wants within 0.2 s
+_GAIN = 5.0  # kg/s: a sheep reaches its desired velocity within 0.2 s
 
 
 @kernel
 def spawn(p: Any, frame: Frame) -> None:
-    """A pen, sheep about a place at least `away` m from it, dogs out of the sheep's sight; everybody at rest."""
+    """Place the pen, sheep around a point at least `away` m from it, dogs beyond `fear_distance`; all at rest."""
     frame.vel[:, :] = 0.0
     middle: Vec = (0.0, 0.0)
     for t in range(_TRIES):
@@ -57,14 +57,14 @@ def spawn(p: Any, frame: Frame) -> None:
 
 @kernel
 def _somewhere(p: Any, frame: Frame, t: int, channel: int) -> Vec:
-    """Return a random place in the middle of the field, a quarter of its edge or more from that."""
+    """Return a random point of the middle half of the field, at least a quarter of the edge from its border."""
     x = p.size * (0.25 + 0.5 * uniform(frame.key, t, 500 + channel, 5))
     return (np.float64(x), np.float64(p.size * (0.25 + 0.5 * uniform(frame.key, t, 500 + channel, 6))))
 
 
 @kernel
 def _clear(frame: Frame, i: int, first: int, end: int, distance: float) -> bool:
-    """Is agent i at least this far from those of [first, end)?"""
+    """Return True if agent i is at least `distance` m from the agents [first, end)."""
     for j in range(first, end):  # noqa: SIM110  # there are no generators in compiled code
         if norm(_to(frame, i, j)) < distance:
             return False
@@ -101,7 +101,7 @@ def _course(p: Any, frame: Frame) -> Vec:
 
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
-    """Dogs push where their action says, in the frame of the course; sheep follow `_sheep`."""
+    """Write each dog's action as a force in the frame of the course; sheep follow `_sheep`."""
     course, dogs = _course(p, frame), int(p.dogs)
     for i in range(dogs):
         along, left = action[i, 0] * frame.max_force[i], action[i, 1] * frame.max_force[i]
@@ -113,7 +113,7 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
 
 @kernel
 def _sheep(p: Any, frame: Frame, i: int, force: Any) -> None:
-    """Heed dogs within `fear_distance` as in Strombom et al. 2014; graze otherwise, slowly, and not too near others."""
+    """Write a sheep's force: flee dogs within `fear_distance` as in Strombom et al. 2014, else graze slowly, apart."""
     velocity, dogs = velocity_of(frame, i), int(p.dogs)
     crowd: Vec = (0.0, 0.0)
     centre: Vec = (0.0, 0.0)
@@ -144,7 +144,7 @@ def _sheep(p: Any, frame: Frame, i: int, force: Any) -> None:
 
 @kernel
 def _farthest(p: Any, frame: Frame, centre: Vec) -> tuple[int, float]:
-    """Return the sheep that is farthest from the centre, and the mean distance of all of them, m."""
+    """Return the sheep that is farthest from the centre, and the mean distance of all sheep from it, m."""
     who, most, total, dogs, n = 0, -1.0, 0.0, int(p.dogs), frame.pos.shape[1]
     for j in range(dogs, n):
         distance = norm(sub(place_of(frame, j), centre))
@@ -156,7 +156,7 @@ def _farthest(p: Any, frame: Frame, centre: Vec) -> tuple[int, float]:
 
 @kernel
 def _penned(p: Any, frame: Frame) -> int:
-    """Return how many sheep are in the pen."""
+    """Return the number of sheep in the pen."""
     count, pen = 0, _pen(frame)
     for j in range(int(p.dogs), frame.pos.shape[1]):
         count += 1 if norm(sub(place_of(frame, j), pen)) <= p.pen_radius else 0
@@ -170,7 +170,7 @@ def _all_in(p: Any, frame: Frame) -> bool:
 
 @kernel
 def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
-    """Terms: progress, gathering, success, time; the same for every dog."""
+    """Write the terms progress, gathering, success, time; the same for every dog."""
     here, there = _centre(p, before), _centre(p, after)
     nearer = norm(sub(_pen(before), here)) - norm(sub(_pen(after), there))
     _, wide = _farthest(p, before, here)
@@ -185,7 +185,7 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 
 @kernel
 def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
-    """All sheep in the pen end it: success."""
+    """End the episode when all sheep are in the pen, which is success."""
     done = _all_in(p, after)
     for i in range(over.shape[0]):
         over[i] = done
@@ -194,7 +194,7 @@ def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
 
 @kernel
 def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
-    """Share of the sheep in the pen; time, s; mean distance of the sheep from their centre, m; path of the dogs, m."""
+    """Write the share of sheep penned; time, s; mean distance of sheep from their centre, m; mean path of a dog, m."""
     n, dogs = after.pos.shape[1], int(p.dogs)
     numbers[0] = _penned(p, after) / (n - dogs)
     numbers[1] = p.control_dt
@@ -207,7 +207,7 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 @kernel
 def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
-    """Share of the sheep in the pen; s until all were, if they are; spread now, m; path of a dog, m."""
+    """Write the share of sheep penned; time until all were, s, if they are; spread now, m; mean path of a dog, m."""
     numbers[0] = last.penned
     if last.penned >= 1.0 and steps > 0:
         numbers[1] = sums.time
@@ -216,7 +216,7 @@ def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
 
 @kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
-    """In the frame of the course, (along, left): own velocity, pen, flock, who strays, nearest sheep, other dogs."""
+    """Write own velocity, pen, flock, farthest and nearest sheep, other dogs, in the frame of the course."""
     centre, course, pen = _centre(p, frame), _course(p, frame), _pen(frame)
     far, spread = _farthest(p, frame, centre)
     slots, dogs = int(p.sheep_seen), int(p.dogs)
@@ -243,7 +243,7 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
 
 @kernel
 def _show_sheep(p: Any, frame: Frame, i: int, slots: int, course: Vec, row: Any) -> None:
-    """Write the nearest sheep of dog i, nearest first, and the direction and closeness of the very nearest."""
+    """Write the nearest sheep of dog i, nearest first, and the direction and closeness of the first."""
     last, chosen = -1.0, -1
     for s in range(slots):
         best, who = np.inf, -1
@@ -267,7 +267,7 @@ def _show_sheep(p: Any, frame: Frame, i: int, slots: int, course: Vec, row: Any)
 
 @kernel
 def _put(row: Any, at: int, vector: Vec, course: Vec) -> None:
-    """Write a vector's parts along the course and to its left, clipped."""
+    """Write a vector's components along the course and to its left, clipped to [-1, 1]."""
     row[at] = clip(vector[0] * course[0] + vector[1] * course[1])
     row[at + 1] = clip(vector[1] * course[0] - vector[0] * course[1])
 
@@ -275,10 +275,10 @@ def _put(row: Any, at: int, vector: Vec, course: Vec) -> None:
 class Herd(Task):
     """Dogs with one shared policy gather sheep and drive them into a round pen, in an open field.
 
-    Sheep graze until a dog comes near. Then they go, at full speed, as in Strombom et al. 2014 (doi
-    10.1098/rsif.2014.0719): away from dogs, to the centre of the sheep around them, away from who is too near, on as
-    before, and a little anyhow. Everything a dog sees is relative to itself and turned into the frame of the course,
-    which leads from the flock's centre to the pen. All sheep in the pen at once end it.
+    Sheep graze until a dog comes near. Then they move at full speed, in the direction of Strombom et al. 2014 (doi
+    10.1098/rsif.2014.0719), a weighted sum: away from dogs, to the centre of the sheep around, away from sheep that are
+    too near, inertia, and noise. Observations are relative to the dog, in the frame of the course, which leads from the
+    flock's centre to the pen. The episode ends, with success, when all sheep are in the pen at once.
     """
 
     name: ClassVar[str] = "herd"
@@ -287,54 +287,58 @@ class Herd(Task):
     measures: ClassVar[tuple[str, ...]] = ("penned", "time", "spread", "path")
     memory: ClassVar[int] = 2
 
-    dogs: int = Field(default=1, ge=1, le=3, description="how many learn")
-    sheep: int = Field(default=12, ge=2, le=200, description="how many are driven")
+    dogs: int = Field(default=1, ge=1, le=3, description="number of dogs, the learners")
+    sheep: int = Field(default=12, ge=2, le=200, description="number of sheep")
     horizon: int = Field(default=600, ge=1, description="decisions until the time limit (truncation)")
     size: float = Field(
-        default=60.0, gt=0, description="m, edge of the part that is shown; all begin in its middle half"
+        default=60.0,
+        gt=0,
+        description="m, edge of the field in pictures; the pen and the dogs start in its middle half",
     )
-    pen_radius: float = Field(default=4.0, gt=0, description="m")
-    away: float = Field(default=15.0, ge=0, description="m, between the pen and the middle of the sheep, at least")
-    scatter: float = Field(default=6.0, gt=0, description="m about that middle within which sheep begin")
+    pen_radius: float = Field(default=4.0, gt=0, description="m, radius of the pen")
+    away: float = Field(
+        default=15.0, ge=0, description="m, least distance between the pen and the middle of the sheep at the start"
+    )
+    scatter: float = Field(default=6.0, gt=0, description="m, radius about that middle within which sheep start")
     dog_speed: float = Field(default=3.0, gt=0, description="m/s")
     dog_force: float = Field(default=9.0, gt=0, description="N; the mass is 1 kg")
-    sheep_speed: float = Field(default=2.0, gt=0, description="m/s, of a sheep that flees")
+    sheep_speed: float = Field(default=2.0, gt=0, description="m/s, of a fleeing sheep")
     sheep_force: float = Field(default=6.0, gt=0, description="N; the mass is 1 kg")
-    graze_speed: float = Field(default=0.2, ge=0, description="m/s, of a sheep that grazes")
-    fear_distance: float = Field(default=8.0, gt=0, description="r_s, m, within which a dog is heeded")
-    apart_distance: float = Field(default=1.0, gt=0, description="r_a, m, that sheep keep from each other")
-    flock_sight: float = Field(default=12.0, gt=0, description="m, within which sheep go to the centre of the others")
-    inertia: float = Field(default=0.5, ge=0, description="h, weight of going on as before")
-    attraction: float = Field(default=1.05, ge=0, description="c, weight of going to the centre of the others")
-    apart: float = Field(default=2.0, ge=0, description="rho_a, weight of going away from who is too near")
-    fear: float = Field(default=1.0, ge=0, description="rho_s, weight of going away from dogs")
-    error: float = Field(default=0.3, ge=0, description="e, weight of going anyhow")
-    sight: float = Field(default=40.0, gt=0, description="m, a dog sees offsets up to this per axis")
-    sheep_seen: int = Field(default=6, ge=1, le=32, description="how many sheep a dog tells apart, nearest first")
-    progress_reward: float = Field(default=0.5, ge=0, description="per m that the flock's centre came nearer the pen")
-    gathering_reward: float = Field(
-        default=0.5, ge=0, description="per m that sheep came nearer their centre, on average"
+    graze_speed: float = Field(default=0.2, ge=0, description="m/s, of a grazing sheep")
+    fear_distance: float = Field(default=8.0, gt=0, description="r_s, m, within which a sheep flees a dog")
+    apart_distance: float = Field(default=1.0, gt=0, description="r_a, m, within which sheep repel each other")
+    flock_sight: float = Field(default=12.0, gt=0, description="m, range within which sheep attract each other")
+    inertia: float = Field(default=0.5, ge=0, description="h, weight of the present direction")
+    attraction: float = Field(default=1.05, ge=0, description="c, weight of the direction to the centre of the others")
+    apart: float = Field(default=2.0, ge=0, description="rho_a, weight of the repulsion from sheep that are too near")
+    fear: float = Field(default=1.0, ge=0, description="rho_s, weight of the repulsion from dogs")
+    error: float = Field(default=0.3, ge=0, description="e, weight of the noise")
+    sight: float = Field(default=40.0, gt=0, description="m, offsets are seen up to this along each axis")
+    sheep_seen: int = Field(default=6, ge=1, le=32, description="number of sheep seen one by one, nearest first")
+    progress_reward: float = Field(
+        default=0.5, ge=0, description="per m by which the flock's centre came nearer to the pen"
     )
-    success_reward: float = Field(default=10.0, ge=0, description="once, when all are in the pen")
+    gathering_reward: float = Field(
+        default=0.5, ge=0, description="per m by which the mean distance of sheep from their centre fell"
+    )
+    success_reward: float = Field(default=10.0, ge=0, description="once, when all sheep are in the pen")
     time_cost: float = Field(default=0.2, ge=0, description="per s")
 
     @model_validator(mode="after")
     def _room(self) -> Herd:
-        """Refuse a start that the field has no room for."""
+        """Raise ValueError if `away` is more than a third of the field."""
         if self.away > self.size / 3:
-            raise ValueError(
-                f"away = {self.away:g} m: in a field of {self.size:g} m at most {self.size / 3:g} m is sure to be found"
-            )
+            raise ValueError(f"away = {self.away:g} m: must be at most size / 3 = {self.size / 3:g} m")
         return self
 
     @property
     def learners(self) -> int:
-        """The dogs."""
+        """L: the dogs."""
         return self.dogs
 
     @property
     def agents(self) -> int:
-        """Dogs and sheep."""
+        """N: dogs and sheep."""
         return self.dogs + self.sheep
 
     @property
@@ -344,7 +348,7 @@ class Herd(Task):
 
     @functools.cached_property
     def scene(self) -> Scene:
-        """An open plane; nothing acts but what agents want."""
+        """An open plane, in which only the agents' own forces act."""
         begin: dict[str, Any] = {"radius": 0.3, "spawn": Spawn(low=(0.0, 0.0), high=(self.size, self.size))}
         dogs = Group(
             count=self.dogs, max_speed=self.dog_speed, max_force=self.dog_force, role="learner", **begin
@@ -362,16 +366,16 @@ class Herd(Task):
 
     @property
     def spread_scale(self) -> float:
-        """Distances from the flock's centre are seen up to this, m."""
+        """Greatest distance from the flock's centre that is seen, m."""
         return 2.0 * self.scatter
 
     def parameters(self) -> dict[str, float]:
-        """The fields, and what follows from them."""
+        """Return the fields, and the numbers derived from them."""
         return super().parameters() | {"spread_scale": self.spread_scale}
 
     @functools.cached_property
     def layout(self) -> Layout:
-        """Every vector is (along the course, to its left); the course leads from the flock's centre to the pen."""
+        """The observation; every vector is (along the course from the flock's centre to the pen, to its left)."""
         k, mates, far = self.sheep_seen, self.dogs - 1, self.sight
         near = "1 - distance / fear_distance of the nearest sheep; 0 beyond"
         return Layout((
@@ -397,9 +401,9 @@ class Herd(Task):
         return Layout((Slot("force", (2,), self.dog_force, "N", meaning),))
 
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
-        """The pen."""
+        """Return a mark at the pen."""
         return (Mark("goal", memory[:2, world, 0], np.zeros(2), self.pen_radius),)
 
     def view(self, state: State, world: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Return the middle of the field."""
+        """Return the field in which agents start, m."""
         return (0.0, 0.0), (self.size, self.size)

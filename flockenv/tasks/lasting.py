@@ -1,7 +1,7 @@
-"""Success over a whole episode, for tasks that nothing but the time limit ends: the aim has to last.
+"""Success over a whole episode, for tasks that only the time limit ends: the aim has to hold most of the time.
 
-Such a task's `ended` returns whether the aim holds at this instant, which `judge` writes among the measures; success is
-what `lasts` returns of their sums. A task of this kind has MEASURES and METRICS last.
+Such a task's `ended` returns whether the aim holds at this instant, which `judge` writes into the measures; `lasts`
+computes success from their sums. MEASURES and METRICS are the last measures and metrics of such a task.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from flockenv.tasks.task import Task
 __all__ = ["MEASURES", "METRICS", "LastingTask", "judge", "lasts", "tell_lasting"]
 
 MEASURES = ("holds", "judged", "held")
-"""Of one decision, 1 or 0: the aim holds; it is judged, for the agents have had time to settle; both."""
+"""Of one decision, 1 or 0: the aim holds; the decision is judged, as it is after the settling time; both."""
 
 METRICS = ("held", "success_at_end")
 """Share of the judged decisions in which the aim holds; whether it holds at the last one."""
@@ -34,7 +34,7 @@ def judge(p: Any, step: int, holds: bool, numbers: Any, first: int) -> None:
 
 @kernel
 def lasts(p: Any, sums: Any) -> bool:
-    """Return True if the aim has held in the share `lasting` of the judged decisions, and there is one."""
+    """Return True if the aim has held in at least the share `lasting` of the judged decisions, and there is one."""
     return bool(sums.judged > 0.0 and sums.held >= p.lasting * sums.judged - 1e-4)
 
 
@@ -52,11 +52,14 @@ class LastingTask(Task):
 
     lasting_aim: ClassVar[bool] = True
 
-    settling: float = Field(default=5.0, ge=0, description="s, after which it is judged whether the aim holds")
+    settling: float = Field(default=5.0, ge=0, description="s, settling time, before which the aim is not judged")
     lasting: float = Field(
-        default=0.9, gt=0, le=1, description="share of the decisions after that in which the aim must hold: success"
+        default=0.9,
+        gt=0,
+        le=1,
+        description="least share of the decisions after `settling` in which the aim must hold, for success",
     )
 
     def parameters(self) -> dict[str, float]:
-        """The fields, and after how many decisions the aim is judged."""
+        """Return the fields, and the number of decisions in the settling time."""
         return {**super().parameters(), "settled": float(math.ceil(self.settling / self.control_dt - 1e-6))}

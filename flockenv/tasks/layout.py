@@ -1,4 +1,4 @@
-"""Layout: what each number of an observation or action row is, by name, so that nobody ever reads one by index."""
+"""Layout: names, units and scales of the numbers of an observation or action row, to read them by name."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Layout", "Slot"]
 
 @dataclass(frozen=True)
 class Slot:
-    """Some neighbouring numbers of a row: `shape` of them, each the quantity divided by `scale`."""
+    """Consecutive numbers of a row, in this shape, each the quantity divided by `scale`."""
 
     name: str
     shape: tuple[int, ...]  # (2,) a vector, (6, 2) six vectors, () a number
@@ -28,7 +28,7 @@ class Slot:
 
     @property
     def size(self) -> int:
-        """How many numbers it takes."""
+        """Numbers in the slot."""
         return math.prod(self.shape)
 
 
@@ -40,7 +40,7 @@ class Layout:
 
     @functools.cached_property
     def size(self) -> int:
-        """Length of a row."""
+        """Numbers in a row."""
         return sum(slot.size for slot in self.slots)
 
     @property
@@ -78,5 +78,5 @@ class Layout:
 
     @property
     def digest(self) -> str:
-        """A short name of this layout: two rows of the same digest mean the same."""
+        """A short digest of this layout: rows with the same digest have the same meaning."""
         return hashlib.sha256(repr(self.slots).encode()).hexdigest()[:16]

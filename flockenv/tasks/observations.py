@@ -1,4 +1,4 @@
-"""What several tasks share: what they write into observation rows, and what they ask of a frame."""
+"""Kernels that several tasks share: writing observation rows, and reading frames."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ __all__ = [
 
 @kernel
 def clip(x: float) -> float:
-    """Bound to [-1, 1]."""
+    """Clip a number to [-1, 1]."""
     return min(max(x, like(x, -1.0)), like(x, 1.0))
 
 
 @kernel
 def offset(a: float, b: float, size: float) -> float:
-    """Return b - a, the shortest way around a periodic axis of this size (0 = not periodic)."""
+    """Return b - a, the shortest offset on a periodic axis of this size (0: not periodic)."""
     d = b - a
     o, one = like(d, 0.0), like(d, 1.0)
-    around = one / like(d, size) if size > o else o  # the same for all pairs: the division leaves the loop
+    around = one / like(d, size) if size > o else o  # equal for all pairs, so that it is hoisted out of the loop
     return d - like(d, size) * nearest_whole(d * around)
 
 
 @kernel
 def turned(vector: Any, heading: Any, factor: float) -> Any:
-    """Return a vector's parts along the heading and to its left, scaled and clipped."""
+    """Return a vector's components along the heading and to its left, scaled, then clipped to [-1, 1]."""
     along, left = vector[0] * heading[0] + vector[1] * heading[1], vector[1] * heading[0] - vector[0] * heading[1]
     return clip(along * factor), clip(left * factor)
 
 
 @kernel
 def place_of(frame: Any, i: int) -> Vec:
-    """Return where agent i is, m."""
+    """Return the position of agent i, m."""
     return (np.float64(frame.pos[0, i]), np.float64(frame.pos[1, i]))
 
 
@@ -55,7 +55,7 @@ def velocity_of(frame: Any, i: int) -> Vec:
 
 @kernel
 def leaves_gap(p: Any, frame: Any, m: int, x: float, y: float, rho: float) -> bool:
-    """Does obstacle m, a circle of radius rho here, leave a gap of `min_gap` to those before it?"""
+    """Return True if obstacle m, of radius rho at (x, y), leaves a gap of `min_gap` to those before it."""
     for k in range(m):
         dx, dy = frame.centre[0, k] - x, frame.centre[1, k] - y
         distance = math.sqrt(dx * dx + dy * dy)
@@ -66,7 +66,7 @@ def leaves_gap(p: Any, frame: Any, m: int, x: float, y: float, rho: float) -> bo
 
 @kernel
 def put(row: Any, at: int, vector: Any) -> None:
-    """Write two numbers into a row from place `at` on (counted without a sign, see block_ways)."""
+    """Write two numbers into a row from index `at` on (unsigned, see block_ways)."""
     row[np.uint64(at)] = vector[0]
     row[np.uint64(at + 1)] = vector[1]
 
@@ -75,9 +75,9 @@ def put(row: Any, at: int, vector: Any) -> None:
 def put_neighbour(
     row: Any, at: int, slots: int, s: int, to: Any, relative: Any, ahead: Any, near_by: float, pace: float
 ) -> None:
-    """Write where the s-th nearest is and how fast it moves against oneself, x near_by, 1/m, and pace, s/m.
+    """Write offset and relative velocity of the s-th nearest agent, times `near_by`, 1/m, and `pace`, s/m.
 
-    The blocks of `neighbour_slots` begin at `at`; vectors are turned so that `ahead`, a unit vector, is the first axis.
+    The blocks of `neighbour_slots` begin at `at`; vectors are rotated so that the unit vector `ahead` is the x axis.
     """
     put(row, at + 2 * s, turned(to, ahead, near_by))
     put(row, at + 2 * slots + 2 * s, turned(relative, ahead, pace))
@@ -87,15 +87,15 @@ def put_neighbour(
 def put_crowding(
     row: Any, at: int, slots: int, s: int, to: Any, ahead: Any, distance: float, gap: float, near: float
 ) -> None:
-    """Write the way to the s-th nearest, the longer the smaller the gap between bodies is, m; 0 from `near` on."""
+    """Write the direction of the s-th nearest agent times 1 - gap / near, 0 for a gap of `near` m or more."""
     share = min(max(1.0 - gap / near, 0.0), 1.0) / distance
     put(row, at + 4 * slots + 2 * s, turned(to, ahead, share))
 
 
 def neighbour_slots(count: int, sight: float, most_relative: float, who: str, crowding: bool) -> tuple[Slot, ...]:
-    """Return what a row says of the nearest few: `most_relative` m/s is the unit of their velocities against one's own.
+    """Return the slots of the nearest agents in a row; `most_relative`, m/s, scales relative velocities.
 
-    crowding: are there unit vectors that grow where bodies are near, too?
+    crowding: add unit vectors towards them, scaled by closeness.
     """
     close = "unit vectors towards them x (1 - gap between bodies / near), 0 beyond"
     return (
@@ -107,25 +107,25 @@ def neighbour_slots(count: int, sight: float, most_relative: float, who: str, cr
 
 
 def compass(rays: int) -> tuple[float, ...]:
-    """Return the cosines, then the sines, of so many directions, anticlockwise from the first axis."""
+    """Return the cosines, then the sines, of `rays` directions, anticlockwise from the first axis."""
     angles = [2.0 * math.pi * r / rays for r in range(rays)]
     return (*map(math.cos, angles), *map(math.sin, angles))
 
 
 @kernel
 def block_ways(row: Any, at: int, rays: int, table: Any, to: Any, ahead: Any, clearance: float, sight: float) -> None:
-    """Shorten the free ways in row[at : at + rays], in units of `sight` m, by an obstacle at `to` m, if it is in sight.
+    """Shorten the free paths in row[at : at + rays], in units of `sight` m, by an obstacle at `to` m, if in sight.
 
-    Ways lead in the directions of `compass`, turned so that the first is `ahead`, a unit vector; `table` is it.
+    Paths lead in the directions of `compass`, passed as `table`, rotated so that the first is `ahead`, a unit vector.
     """
     if dot(to, to) >= (sight + clearance) * (sight + clearance):
         return
     here = (to[0] * ahead[0] + to[1] * ahead[1], to[1] * ahead[0] - to[0] * ahead[1])
     share = like(sight, 1.0) / sight
     sines, row_at = np.uint64(rays), np.uint64(at)
-    # Counted without a sign: of a signed index numba asks whether it counts from the end, and the loop stays scalar.
+    # Unsigned: numba checks whether a signed index counts from the end, and the loop would stay scalar.
     for r in range(np.uint64(rays)):
         hit = np.float32(ray_hit(here, (table[r], table[sines + r]), clearance) * share)
-        # No way is longer than 1. Of the lesser of two, one of which is there already, LLVM would make a store under a
-        # mask, which takes some processors without AVX-512 forty instructions.
+        # The third argument changes no value, as no path is longer than 1. Of min(row[k], hit) alone LLVM would make a
+        # masked store, which takes some processors without AVX-512 forty instructions.
         row[row_at + r] = min(row[row_at + r], hit, np.float32(1.0))

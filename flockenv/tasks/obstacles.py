@@ -26,7 +26,7 @@ __all__ = ["Obstacles"]
 
 @kernel
 def spawn(p: Any, frame: Frame) -> None:
-    """Start on the left, goal on the right; obstacles between, with a way of at least `min_gap` around each."""
+    """Draw a start on the left, a goal on the right, and obstacles with gaps of at least `min_gap` between them."""
     frame.pos[0, 0] = 1.5
     frame.pos[1, 0] = 2.0 + (p.size - 4.0) * uniform(frame.key, 0, 0, 0)
     frame.vel[:, 0] = 0.0
@@ -47,7 +47,7 @@ def spawn(p: Any, frame: Frame) -> None:
 
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
-    """The learner pushes where its action says."""
+    """Write the learner's action as a force along the field's axes."""
     for k in range(2):
         force[k, 0] = action[0, k] * frame.max_force[0]
 
@@ -59,7 +59,7 @@ def _to_goal(frame: Frame) -> float:
 
 @kernel
 def _touches(before: Frame, after: Frame) -> bool:
-    """Did the agent touch an obstacle on its way, taken as straight from one decision to the next?"""
+    """Return True if the straight path of the decision comes nearer to an obstacle than the sum of radii."""
     x, y = before.pos[0, 0], before.pos[1, 0]
     dx, dy = after.pos[0, 0] - x, after.pos[1, 0] - y
     way = dx * dx + dy * dy
@@ -75,13 +75,13 @@ def _touches(before: Frame, after: Frame) -> bool:
 
 @kernel
 def keep(p: Any, before: Frame, after: Frame) -> None:
-    """Remember whether an obstacle was touched in this decision: looked for once, asked for by three."""
+    """Store whether the agent touched an obstacle in this decision; `reward`, `ended` and `measure` read it."""
     after.memory[3, 0] = 1.0 if _touches(before, after) else 0.0
 
 
 @kernel
 def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
-    """Terms: progress, goal, touch, time."""
+    """Write the terms progress, goal, touch, time."""
     touch = after.memory[3, 0] > 0.0
     there = not touch and _to_goal(after) <= p.goal_radius
     terms[0, 0] = p.progress_reward * (_to_goal(before) - _to_goal(after))
@@ -92,7 +92,7 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 
 @kernel
 def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
-    """A touch ends it, and so does the goal, which is success."""
+    """End the episode at a contact, or at the goal, which is success."""
     touch = after.memory[3, 0] > 0.0
     there = not touch and _to_goal(after) <= p.goal_radius
     over[0] = touch or there
@@ -101,7 +101,7 @@ def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
 
 @kernel
 def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
-    """Path, m; touches; distance left, m; straight distance at the start, m."""
+    """Write path, m; contacts (0 or 1); distance to the goal, m, now and at the start."""
     numbers[0] = math.hypot(after.pos[0, 0] - before.pos[0, 0], after.pos[1, 0] - before.pos[1, 0])
     numbers[1] = after.memory[3, 0]
     numbers[2] = _to_goal(after)
@@ -110,7 +110,7 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 @kernel
 def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
-    """Seconds to the goal, if it is reached; touches; and metres gained towards the goal per metre run."""
+    """Write time to the goal, s, if it is reached; contacts; metres gained towards the goal per metre of path."""
     if last.left <= p.goal_radius and sums.touch == 0 and steps > 0:
         numbers[0] = steps * p.control_dt
     numbers[1] = sums.touch
@@ -119,7 +119,7 @@ def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
 
 @kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
-    """Own velocity, goal, walls, the nearest obstacles, free ways all around."""
+    """Write own velocity, goal, walls, nearest obstacles, free path lengths."""
     row = rows[0]
     for k in range(2):
         row[k] = clip(frame.vel[k, 0] / p.max_speed)
@@ -146,10 +146,11 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
 
 
 class Obstacles(Task):
-    """One learner crosses a walled square full of round obstacles to a goal; to touch an obstacle ends it.
+    """One learner crosses a walled square full of round obstacles to a goal, without touching an obstacle.
 
-    Start and goal are drawn on opposite sides, obstacles between them with gaps that the agent fits through. The walls
-    of the square stop the agent and do not count as a touch.
+    Start and goal are drawn on opposite sides, obstacles between them with gaps of at least `min_gap`. The episode ends
+    at a contact with an obstacle, or at the goal, which is success. The walls of the square stop the agent and do not
+    count as a contact.
     """
 
     name: ClassVar[str] = "obstacles"
@@ -161,39 +162,39 @@ class Obstacles(Task):
 
     horizon: int = Field(default=250, ge=1, description="decisions until the time limit (truncation)")
     size: float = Field(default=24.0, gt=10, description="m, edge of the square")
-    count: int = Field(default=26, ge=0, le=200, description="obstacles drawn; those that find no room are left out")
-    least_radius: float = Field(default=0.6, gt=0, description="m")
-    greatest_radius: float = Field(default=2.0, gt=0, description="m")
+    count: int = Field(default=26, ge=0, le=200, description="number of obstacles; those that do not fit are left out")
+    least_radius: float = Field(default=0.6, gt=0, description="m, least radius of an obstacle")
+    greatest_radius: float = Field(default=2.0, gt=0, description="m, greatest radius of an obstacle")
     min_gap: float = Field(default=1.0, ge=0, description="m between obstacles; the agent's diameter is 0.6 m")
     max_speed: float = Field(default=3.0, gt=0, description="m/s")
     max_force: float = Field(default=5.0, gt=0, description="N; the mass is 1 kg")
-    goal_radius: float = Field(default=0.8, gt=0, description="m, the goal is reached within this")
-    sight: float = Field(default=8.0, gt=0, description="m, obstacles are seen whose surface is nearer than this")
-    slots: int = Field(default=6, ge=1, le=32, description="how many obstacles are seen, nearest first")
-    rays: int = Field(default=16, ge=1, le=128, description="directions in which the free way is seen")
+    goal_radius: float = Field(default=0.8, gt=0, description="m, the goal is reached within this distance")
+    sight: float = Field(default=8.0, gt=0, description="m, range within which the surfaces of obstacles are seen")
+    slots: int = Field(default=6, ge=1, le=32, description="number of obstacles seen, nearest first")
+    rays: int = Field(default=16, ge=1, le=128, description="number of directions in which the free path is seen")
     progress_reward: float = Field(default=0.5, ge=0, description="per m nearer to the goal")
-    goal_reward: float = Field(default=10.0, ge=0, description="once")
-    touch_cost: float = Field(default=10.0, ge=0, description="once")
+    goal_reward: float = Field(default=10.0, ge=0, description="once, at the goal")
+    touch_cost: float = Field(default=10.0, ge=0, description="once, at a contact")
     time_cost: float = Field(default=0.5, ge=0, description="per s")
 
     @model_validator(mode="after")
     def _fitting(self) -> Obstacles:
-        """Refuse radii that run backwards or reach the start and the goal."""
+        """Raise ValueError for radii in the wrong order, or large enough to cover the start or the goal."""
         if not self.least_radius <= self.greatest_radius <= 2.0:
             raise ValueError(
                 f"least_radius = {self.least_radius:g}, greatest_radius = {self.greatest_radius:g}: "
-                "the least comes first, and above 2 m an obstacle could cover the start"
+                "must be in this order, and at most 2 m, as a larger obstacle could cover the start"
             )
         return self
 
     @property
     def learners(self) -> int:
-        """One."""
+        """L: 1, the walker."""
         return 1
 
     @property
     def agents(self) -> int:
-        """One."""
+        """N: 1."""
         return 1
 
     @property
@@ -203,12 +204,12 @@ class Obstacles(Task):
 
     @property
     def obstacle_slots(self) -> int:
-        """As many as are drawn."""
+        """M: the number of obstacles."""
         return self.count
 
     @functools.cached_property
     def scene(self) -> Scene:
-        """A walled square; nothing acts but what the agent wants."""
+        """A walled square, in which only the agent's own force acts."""
         walker = Group(count=1, radius=0.3, max_speed=self.max_speed, max_force=self.max_force, role="learner")
         return Scene(
             space=Box(size=(self.size, self.size)),
@@ -224,12 +225,12 @@ class Obstacles(Task):
         return Look(self.sight, obstacles=self.slots)
 
     def table(self) -> tuple[float, ...]:
-        """The directions of the rays."""
+        """Return the directions of the rays."""
         return compass(self.rays)
 
     @functools.cached_property
     def layout(self) -> Layout:
-        """Axes are the field's; offsets are relative to the agent."""
+        """The observation; axes are the field's, and offsets are relative to the agent."""
         ways = "how far the body can go before it touches an obstacle, anticlockwise from the x axis"
         seen = "offsets of the centres of the nearest obstacles, nearest surface first; zeros = none"
         return Layout((
@@ -245,9 +246,9 @@ class Obstacles(Task):
 
     @functools.cached_property
     def action_layout(self) -> Layout:
-        """A force, in the field's axes."""
+        """A force along the field's axes."""
         return Layout((Slot("force", (2,), self.max_force, "N", "force (x, y) / max_force, shortened to length 1"),))
 
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
-        """The goal."""
+        """Return a mark at the goal."""
         return (Mark("goal", memory[:2, world, 0], np.zeros(2), self.goal_radius),)

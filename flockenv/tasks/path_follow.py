@@ -1,4 +1,4 @@
-"""PathFollow: a narrow winding track, as far along it as one gets."""
+"""PathFollow: run as far as possible along a narrow winding track."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ POINTS = 128
 """Corners of a track, evenly spread in angle about the middle of the field."""
 
 HARMONICS = 7
-"""Waves around a track; the first of them has two."""
+"""Number of waves that make up a track; the first has two periods per lap."""
 
 WINDOW = 16
-"""Pieces on either side of one's own angle among which the nearest point of the spine is."""
+"""Pieces on either side of the agent's angle among which the nearest point of the middle line is searched."""
 
-# what is kept of a world: x and y of every corner, how far along the track it is, the whole length, what was gained
+# memory of a world: x and y of every corner, its arc length, the length of the track, metres gained, running direction
 _Y, _S, _LENGTH, _GAINED, _TURN = POINTS, 2 * POINTS, 3 * POINTS, 3 * POINTS + 1, 3 * POINTS + 2
-# where one is, x and y, and the place there: which piece, and how far along it; and the place before this step
+# position of the agent (x, y); its place on the track (piece, metres along it), now and before this step
 _HERE, _NOW, _THEN = 3 * POINTS + 3, 3 * POINTS + 5, 3 * POINTS + 7
 
 
 @kernel
 def spawn(p: Any, frame: Frame) -> None:
-    """A closed track, r(a) = R (1 + sum of waves), run counterclockwise or clockwise; somewhere on it, at rest."""
+    """Draw a closed track, r(a) = R (1 + sum of waves), run either way round; place the agent on it, at rest."""
     m, turn = frame.memory, 1.0 if uniform(frame.key, 0, 0, 0) < 0.5 else -1.0
     for i in range(POINTS):
         m[i, 0] = 0.0
@@ -70,7 +70,7 @@ def _corner(frame: Frame, i: int) -> Vec:
 
 @kernel
 def _line(frame: Frame, i: int) -> tuple[Vec, Vec, float]:
-    """Return where piece i begins, the way from there to its end, and its length, m."""
+    """Return the start of piece i, the offset to its end, and its length, m."""
     a = _corner(frame, i)
     u = sub(_corner(frame, i + 1), a)
     return a, u, norm(u)
@@ -78,7 +78,7 @@ def _line(frame: Frame, i: int) -> tuple[Vec, Vec, float]:
 
 @kernel
 def _piece(frame: Frame, i: int) -> tuple[Vec, Vec, float]:
-    """Return where piece i begins, its direction, and its length, m."""
+    """Return the start of piece i, its direction, and its length, m."""
     a, u, size = _line(frame, i)
     return a, (u[0] / size, u[1] / size), size
 
@@ -91,9 +91,10 @@ def _way(frame: Frame, i: int) -> Vec:
 
 @kernel
 def _nearest(p: Any, frame: Frame) -> tuple[int, float]:
-    """Return the piece whose point is nearest, and how far along it that is, m.
+    """Return the piece with the point nearest to the agent, and how far along the piece that point is, m.
 
-    Only pieces at about one's own angle are asked: a track that comes near another part of itself is not confused.
+    Only pieces near the agent's own angle are searched, so that another part of the track nearby is not mistaken for
+    this one.
     """
     x, y = frame.pos[0, 0], frame.pos[1, 0]
     angle = math.atan2(frame.memory[_TURN, 0] * (y - p.middle), x - p.middle) / (2.0 * math.pi)
@@ -113,7 +114,7 @@ def _nearest(p: Any, frame: Frame) -> tuple[int, float]:
 
 @kernel
 def _remember(p: Any, frame: Frame) -> None:
-    """Keep where one is, and the place on the track there."""
+    """Store the agent's position, and its place on the track."""
     i, s = _nearest(p, frame)
     m = frame.memory
     m[_HERE, 0], m[_HERE + 1, 0], m[_NOW, 0], m[_NOW + 1, 0] = frame.pos[0, 0], frame.pos[1, 0], i, s
@@ -121,7 +122,7 @@ def _remember(p: Any, frame: Frame) -> None:
 
 @kernel
 def _place(p: Any, frame: Frame) -> tuple[int, float]:
-    """Return what `_nearest` does: what is kept, unless somebody has put the runner elsewhere since."""
+    """Return what `_nearest` does: the stored place, unless the agent was moved since it was stored."""
     m = frame.memory
     if frame.pos[0, 0] == m[_HERE, 0] and frame.pos[1, 0] == m[_HERE + 1, 0]:
         return int(m[_NOW, 0]), np.float64(m[_NOW + 1, 0])
@@ -130,7 +131,7 @@ def _place(p: Any, frame: Frame) -> tuple[int, float]:
 
 @kernel
 def _left(p: Any, frame: Frame) -> float:
-    """Return how far to the left of the track one is, m."""
+    """Return the agent's signed distance from the middle line, m; positive to the left."""
     i, s = _place(p, frame)
     a, u, _ = _piece(frame, i)
     to = (frame.pos[0, 0] - a[0], frame.pos[1, 0] - a[1])
@@ -141,7 +142,7 @@ def _left(p: Any, frame: Frame) -> float:
 
 @kernel
 def _gain(after: Frame) -> float:
-    """How far one came along the track in this step, m."""
+    """Return the progress along the track in this step, m."""
     m = after.memory
     i, a = int(m[_THEN, 0]), np.float64(m[_THEN + 1, 0])
     j, b = int(m[_NOW, 0]), np.float64(m[_NOW + 1, 0])
@@ -151,7 +152,7 @@ def _gain(after: Frame) -> float:
 
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
-    """The learner pushes along the track and to its left, as it is where it is."""
+    """Write the learner's action as a force in the frame of the track beside it: (along, left)."""
     i, _ = _place(p, frame)
     way, f = _way(frame, i), frame.max_force[0]
     force[0, 0] = f * (action[0, 0] * way[0] - action[0, 1] * way[1])
@@ -160,7 +161,7 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
 
 @kernel
 def keep(p: Any, before: Frame, after: Frame) -> None:
-    """The place on the track before and after the step, the only search for it; what was gained since the start."""
+    """Store the place on the track before and after the step, searched only here, and the progress since the start."""
     i, s = _place(p, before)
     after.memory[_THEN, 0], after.memory[_THEN + 1, 0] = i, s
     _remember(p, after)
@@ -169,7 +170,7 @@ def keep(p: Any, before: Frame, after: Frame) -> None:
 
 @kernel
 def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
-    """Terms: progress, off_track, lost."""
+    """Write the terms progress, off_track, lost."""
     left = _left(p, after)
     terms[0, 0] = p.progress_reward * _gain(after)
     terms[0, 1] = -p.off_cost * p.control_dt if abs(left) > p.half_width else 0.0
@@ -178,14 +179,14 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 
 @kernel
 def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
-    """Who is lost is out; a whole lap, without that, is success."""
+    """End the episode if the agent is lost; return True once it has run a whole lap."""
     over[0] = abs(_left(p, after)) > p.lost_distance
     return not over[0] and after.memory[_GAINED, 0] >= after.memory[_LENGTH, 0]
 
 
 @kernel
 def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
-    """Progress, m; off the track; path, m."""
+    """Write progress, m; off the track (0 or 1); path, m."""
     numbers[0] = _gain(after)
     numbers[1] = 1.0 if abs(_left(p, after)) > p.half_width else 0.0
     numbers[2] = math.hypot(after.pos[0, 0] - before.pos[0, 0], after.pos[1, 0] - before.pos[1, 0])
@@ -193,7 +194,7 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 @kernel
 def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
-    """Metres along the track, share of the time off it, metres run per second."""
+    """Write progress along the track, m; share of the time off it; mean speed, m/s."""
     made = max(steps, 1)
     numbers[0], numbers[1] = sums.gained, sums.off / made
     numbers[2] = sums.path / (made * p.control_dt)
@@ -201,7 +202,7 @@ def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
 
 @kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
-    """All in the frame of the track here: own velocity, how far to the left, the spine ahead and how it bends."""
+    """Write own velocity, offset to the left, middle line ahead and its curvature, in the frame of the track here."""
     i, along = _place(p, frame)
     left, way = _left(p, frame), _way(frame, i)
     row, count = rows[0], int(p.ahead)
@@ -227,23 +228,24 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
 
 @kernel
 def _bend(frame: Frame, i: int, share: float) -> float:
-    """Return the curvature at a share of piece i, 1/m, left positive: between those of its two corners."""
+    """Return the curvature at a share of piece i, 1/m, left positive, interpolated between its two corners."""
     return (1.0 - share) * _corner_bend(frame, i) + share * _corner_bend(frame, i + 1)
 
 
 @kernel
 def _corner_bend(frame: Frame, i: int) -> float:
-    """Return one over the radius of the circle through a corner and its two neighbours."""
+    """Return the curvature of the circle through a corner and its two neighbours, 1/m."""
     a, b, c = _corner(frame, i + POINTS - 1), _corner(frame, i), _corner(frame, i + 1)
     u, v, w = sub(b, a), sub(c, b), sub(c, a)
     return 2.0 * (u[0] * v[1] - u[1] * v[0]) / (norm(u) * norm(v) * norm(w))
 
 
 class PathFollow(Task):
-    """One learner on a narrow winding closed track, another one in each episode: as far as possible, and not off it.
+    """One learner runs as far as possible along a narrow winding closed track, a new one in each episode.
 
-    The track is a circle with waves, run either way. Everything is seen and done in the frame of the track beside the
-    learner: along it, and to its left. Whoever is `lost_distance` from its middle is lost, which ends it.
+    The track is a circle with waves, run clockwise or anticlockwise. Observations and actions are in the frame of the
+    track beside the learner: along it, and to its left. The episode ends if the learner is more than `lost_distance`
+    from the middle line. Success: a whole lap.
     """
 
     name: ClassVar[str] = "path_follow"
@@ -255,20 +257,24 @@ class PathFollow(Task):
 
     horizon: int = Field(default=300, ge=1, description="decisions until the time limit (truncation)")
     ring: float = Field(default=12.0, ge=5, le=50, description="m, mean radius of the track")
-    winding: float = Field(default=0.55, ge=0, le=0.8, description="bound of all its waves together, of the radius")
-    half_width: float = Field(default=0.7, gt=0, description="m, of the track")
-    lost_distance: float = Field(default=2.5, gt=0, description="m from its middle, from which on one is lost")
+    winding: float = Field(
+        default=0.55, ge=0, le=0.8, description="bound of the sum of all waves, as a share of the radius"
+    )
+    half_width: float = Field(default=0.7, gt=0, description="m, half the width of the track")
+    lost_distance: float = Field(
+        default=2.5, gt=0, description="m from the middle line, beyond which the learner is lost"
+    )
     max_speed: float = Field(default=8.0, gt=0, description="m/s")
     max_force: float = Field(default=8.0, gt=0, description="N; the mass is 1 kg")
-    ahead: int = Field(default=8, ge=1, le=64, description="how many points of the track are seen")
-    spacing: float = Field(default=1.2, gt=0, description="m along the track from one to the next")
+    ahead: int = Field(default=8, ge=1, le=64, description="number of points of the track seen")
+    spacing: float = Field(default=1.2, gt=0, description="m along the track between these points")
     progress_reward: float = Field(default=0.2, ge=0, description="per m along the track")
     off_cost: float = Field(default=3.0, ge=0, description="per s off the track")
-    lost_cost: float = Field(default=10.0, ge=0, description="once")
+    lost_cost: float = Field(default=10.0, ge=0, description="once, when lost")
 
     @model_validator(mode="after")
     def _widths(self) -> PathFollow:
-        """Refuse a track that is wider than where one is lost, or sees more than half of itself."""
+        """Raise ValueError unless half_width < lost_distance <= 0.3 ring and the points span at most half a ring."""
         if self.half_width >= self.lost_distance:
             raise ValueError(
                 f"lost_distance = {self.lost_distance:g}: must be more than half_width = {self.half_width:g}"
@@ -284,21 +290,21 @@ class PathFollow(Task):
 
     @property
     def size(self) -> float:
-        """Edge of the field, m: nobody who is not lost comes to its walls."""
+        """Edge of the field, m; a learner is lost before it reaches the walls."""
         return 2 * (self.ring * (1 + self.winding) + self.lost_distance + 1)
 
     def parameters(self) -> dict[str, float]:
-        """And the middle of the field."""
+        """Return the fields, and the middle of the field, m."""
         return super().parameters() | {"middle": self.size / 2}
 
     @property
     def learners(self) -> int:
-        """One."""
+        """L: 1, the runner."""
         return 1
 
     @property
     def agents(self) -> int:
-        """One."""
+        """N: 1."""
         return 1
 
     @property
@@ -308,7 +314,7 @@ class PathFollow(Task):
 
     @functools.cached_property
     def scene(self) -> Scene:
-        """A walled square that is large enough; nothing acts but what the agent wants."""
+        """A walled square around the track, in which only the agent's own force acts."""
         runner = Group(count=1, radius=0.2, max_speed=self.max_speed, max_force=self.max_force, role="learner")
         return Scene(
             space=Box(size=(self.size, self.size)),
@@ -320,7 +326,7 @@ class PathFollow(Task):
 
     @functools.cached_property
     def layout(self) -> Layout:
-        """All in the frame of the track beside the learner: (along, to its left)."""
+        """The observation; every vector is (along the track beside the learner, to its left)."""
         far = self.spacing * self.ahead + self.lost_distance
         points = f"offsets of {self.ahead} points of its middle line, {self.spacing:g} m apart, the first so far ahead"
         return Layout((
@@ -337,11 +343,11 @@ class PathFollow(Task):
         return Layout((Slot("force", (2,), self.max_force, "N", said),))
 
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
-        """The track: a disc of its width at every corner."""
+        """Return the track as marks: a disc of its width at every corner."""
         return _discs(np.asarray(memory[: 2 * POINTS, world, 0], np.float64).tobytes(), self.half_width)
 
 
 @functools.lru_cache(maxsize=64)
 def _discs(corners: bytes, radius: float) -> tuple[Mark, ...]:
-    """Return the discs of a track, the same ones while it is the same: a picture asks for them at every instant."""
+    """Return the discs of a track, cached, since every picture of an episode needs the same ones."""
     return tuple(Mark("way", corner, np.zeros(2), radius) for corner in np.frombuffer(corners).reshape(2, -1).T)

@@ -1,7 +1,7 @@
-"""The entry points of a task, `play` and `tell`: sections over its kernels and over its scene's step.
+"""The compiled entry points of a task, `play` and `tell`, made of its kernels and its scene's step.
 
-`play` begins episodes or takes decisions: looking around is the larger part of it, and is compiled once. `tell`
-works out metrics from what `play` has counted. Parameters to which loops count (`Task.counts`) are constants of both.
+`play` begins episodes or takes decisions; most of it is the neighbour search, which is compiled once. `tell` computes
+metrics from the sums that `play` has kept. Parameters that are loop bounds (`Task.counts`) are constants in both.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ __all__ = ["name_of", "plan_of", "play_of", "tell_of"]
 
 
 def play_of(task: Task) -> Callable[..., tuple[int, int]]:
-    """Return a task's entry point that begins episodes and takes decisions."""
+    """Return the entry point of a task that begins episodes and takes decisions."""
     return _play(plan_of(task))
 
 
 def plan_of(task: Task) -> Plan:
-    """Return all that `play` of a task depends on; TypeError for a task of which no kernel can be made."""
+    """Return all that `play` of a task depends on; TypeError for a task that cannot be compiled."""
     _check(task)
     parts = task.parts
     own = {name: _kernel_of(task, name) for name in ("spawn", "drive", "reward", "ended", "measure", "observe")}
@@ -60,12 +60,12 @@ def plan_of(task: Task) -> Plan:
 
 
 def name_of(task: Task) -> str:
-    """Return a name of a task's kernel, which holds a digest of every law in it."""
+    """Return the name of a task's kernel, with a digest of every law in it."""
     return f"task_{task.name}_{digest_of(plan_of(task))}"
 
 
 def tell_of(task: Task) -> Callable[..., None]:
-    """Return a task's entry point that works out metrics."""
+    """Return the entry point of a task that computes metrics."""
     return _tell(_kernel_of(task, "metrics"), tuple(task.parameters()), _counts(task), task.measures)
 
 
@@ -79,12 +79,12 @@ def _kernel_of(task: Task, name: str) -> Law:
 
 
 def _counts(task: Task) -> tuple[tuple[int, float], ...]:
-    """Return the places and values of the parameters to which loops of a task's kernels count."""
+    """Return the indices and values of the parameters in `Task.counts`."""
     return tuple((k, v) for k, (name, v) in enumerate(task.parameters().items()) if name in task.counts)
 
 
 def _check(task: Task) -> None:
-    """Refuse a task of which no kernel can be made; TypeError."""
+    """Raise TypeError for a task that cannot be compiled: unknown counts, no terms, or bad names of measures."""
     kind, names = type(task).__name__, task.parameters()
     unknown = [name for name in task.counts if name not in names]
     if unknown:
@@ -93,7 +93,7 @@ def _check(task: Task) -> None:
         raise TypeError(f"{kind}.terms is empty: a reward is the sum of at least one term")
     for name in task.measures:
         if not name.isidentifier() or keyword.iskeyword(name) or name[0] == "_" or task.measures.count(name) > 1:
-            raise TypeError(f"{kind}.measures: {name!r} must be a name, as of a field, and there once")
+            raise TypeError(f"{kind}.measures: {name!r} must be a valid field name, and unique")
 
 
 # --- tell -------------------------------------------------------------------------------------------------------------
@@ -103,7 +103,7 @@ def _check(task: Task) -> None:
 def _tell(
     metrics: Law, names: tuple[str, ...], counts: tuple[tuple[int, float], ...], measures: tuple[str, ...]
 ) -> Callable[..., None]:
-    """Make `tell`: write the metrics of worlds from `first` on, (K, B), as many as `told` has; NaN: no value."""
+    """Return `tell`, which writes the metrics (K, B) of the B worlds from `first` on into `told`; NaN: no value."""
     parameters, by_name = parameters_of(names, counts), by_name_of(measures)
 
     def tell(steps: Any, numbers: Any, last: Any, sums: Any, first: int, told: Any) -> None:
@@ -122,7 +122,7 @@ def _tell(
 
 @kernel
 def _refuses(given: Any, check: bool) -> bool:
-    """Return True if an action is no number."""
+    """Return True if `check` and an action is not finite."""
     refused = np.int32(0)
     for k in range(np.uint64(given.shape[0] if check else 0)):
         refused += np.int32(0) if finite(given[k]) else np.int32(1)
@@ -131,7 +131,7 @@ def _refuses(given: Any, check: bool) -> bool:
 
 @kernel
 def _packed(worlds: Any) -> Any:
-    """Return the arrays of worlds so that agents are known to lie side by side."""
+    """Return the arrays of worlds, marked as contiguous over agents for the compiler."""
     return Worlds(
         packed(worlds.x), packed(worlds.v), worlds.alive, worlds.tick, packed(worlds.obstacle_x),
         worlds.obstacle_radius, worlds.work, worlds.key, packed(worlds.memory), worlds.steps, worlds.carried,
@@ -140,12 +140,12 @@ def _packed(worlds: Any) -> Any:
 
 @entry_of
 def _play(plan: Plan) -> Callable[..., tuple[int, int]]:
-    """Make what lets worlds [from_world, to_world) take a decision, or begin an episode, and observes them.
+    """Return `play`, which takes a decision or begins an episode in worlds [from_world, to_world), and observes them.
 
-    Acting, it returns the (world, agent) that is not finite first, or -1s; the world is REFUSED, and nothing moves, if
-    `check` is asked for and an action is no number. Beginning where `mask` says so, it observes the worlds that begin,
-    or all; acting, it observes all, and writes the terms of worlds in which an agent ends, or of all (`everyone`).
-    Rows that are to go `past` the caches are made on the canvas.
+    If `acting`, it returns the first (world, agent) that is not finite, or -1s, observes all worlds, and writes the
+    terms of worlds in which an agent ends, or of all (`everyone`). With `check`, it returns REFUSED as the world, and
+    changes nothing, if an action is not finite. If not `acting`, it begins the worlds in `mask`, and observes these, or
+    all (`everyone`). With `past`, rows are made on the canvas and written with streaming stores.
     """
     keep, keeps, parameters = plan.kernels.keep, plan.kernels.keep is not None, parameters_of(plan.names, plan.counts)
     begin, act, look, answer, show = (part(plan) for part in (begin_of, act_of, look_in, answer_of, show_of))

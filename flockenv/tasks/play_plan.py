@@ -1,4 +1,4 @@
-"""What `play` of a task depends on, and the records in which arrays are handed to it."""
+"""What `play` of a task depends on, and the records of arrays that are passed to it."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from flockenv.jit.decorators import Law
 __all__ = ["REFUSED", "Decision", "Given", "Kernels", "Near", "Plan", "Results", "Totals", "Worlds"]
 
 REFUSED = -2
-"""The world that `play` names if an action is no number."""
+"""The world that `play` returns if an action is not finite."""
 
 
 class Worlds(NamedTuple):
-    """What changes while worlds go on. B worlds, N agents, D axes, M obstacles."""
+    """Arrays that change during episodes. B worlds, N agents, D axes, M obstacles."""
 
     x: Any  # (D, B, N) m
     v: Any  # (D, B, N) m/s
@@ -26,11 +26,11 @@ class Worlds(NamedTuple):
     key: Any  # (B,)
     memory: Any  # (K, B, N)
     steps: Any  # (B,) decisions since the start
-    carried: Any  # a tuple of arrays: frames and inner states, if there are some
+    carried: Any  # a tuple of arrays: frames and inner states, if any
 
 
 class Given(NamedTuple):
-    """Numbers that stay."""
+    """Constant numbers."""
 
     params: Any  # of the scene
     numbers: Any  # of the task: its parameters()
@@ -38,28 +38,28 @@ class Given(NamedTuple):
 
 
 class Totals(NamedTuple):
-    """What is counted over an episode."""
+    """Sums over an episode."""
 
     last: Any  # (B, Q) the measures of the last decision
-    sums: Any  # (B, Q) and their sums
+    sums: Any  # (B, Q) sums of the measures
     paid: Any  # (K, B, L) sums of the reward terms
 
 
 class Decision(NamedTuple):
-    """Scratch of a decision in one world; `own` and what follows it of tasks with numbers `abreast` alone."""
+    """Scratch arrays of a decision in one world."""
 
-    canvas: Any  # (L, O), or (0, 0) where rows do not go past the caches
+    canvas: Any  # (L, O), or (0, 0) without streaming stores
     force: Any  # (D, 1, N) N
-    x0: Any  # (D, N) m, positions before it
+    x0: Any  # (D, N) m, positions before the decision
     v0: Any  # (D, N) m/s
     alive0: Any  # (N,)
     decided: Any  # actions in columns
     earned: Any  # terms in columns
-    wide: Any  # a tuple: own, near_vel, near_radius, beside; or nothing
+    wide: Any  # (own, near_vel, near_radius, beside) for a task with `abreast`, else empty
 
 
 class Near(NamedTuple):
-    """What `look` writes; see Frame."""
+    """Results of `look`; see Frame."""
 
     square: Any
     who: Any
@@ -71,7 +71,7 @@ class Near(NamedTuple):
 
 
 class Results(NamedTuple):
-    """What a decision brought; see world.Step."""
+    """Results of a decision; see world.Step."""
 
     rows: Any
     payment: Any
@@ -83,7 +83,7 @@ class Results(NamedTuple):
 
 
 class Kernels(NamedTuple):
-    """The kernels of a task, and the plans of those of its scene; None where there is none."""
+    """The kernels of a task, and the kernel plans of its scene; None if there is none."""
 
     spawn: Law
     drive: Law
@@ -102,8 +102,8 @@ class Plan(NamedTuple):
     """All that `play` of a task depends on."""
 
     kernels: Kernels
-    names: tuple[str, ...]  # of its parameters
-    counts: tuple[tuple[int, float], ...]  # which of them are constants, and their values
+    names: tuple[str, ...]  # of the parameters
+    counts: tuple[tuple[int, float], ...]  # indices and values of the constant parameters
     measures: tuple[str, ...]
     lasting: bool
     oriented: bool
@@ -113,5 +113,5 @@ class Plan(NamedTuple):
     terms: int
     action: int  # numbers of an action
     memory: int
-    abreast: int  # numbers of a row that are written abreast
-    apart: int  # how far columns lie apart; 0 without them
+    abreast: int  # numbers of a row that the kernel `abreast` writes
+    apart: int  # distance between columns; 0 without `abreast`

@@ -1,4 +1,4 @@
-"""Pursuit: catch somebody who is slower but turns faster, in a walled field."""
+"""Pursuit: catch an evader that is slower but turns faster, in a walled field."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _FAR = 1e30
 
 @kernel
 def spawn(p: Any, frame: Frame) -> None:
-    """Everybody somewhere in the field, at rest; nobody begins within 4 m of an opponent (64 tries)."""
+    """Place all agents at random, at rest, no evader within 4 m of a pursuer (64 tries)."""
     pursuers, n = int(p.pursuers), frame.pos.shape[1]
     for i in range(n):
         for t in range(64):
@@ -49,7 +49,7 @@ def _distance(frame: Frame, i: int, j: int) -> float:
 
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
-    """Learners push where their action says; scripted evaders follow `_escape`."""
+    """Write each learner's action as a force along the field's axes; scripted evaders follow `_escape`."""
     for i in range(frame.pos.shape[1]):
         if i < action.shape[0]:
             for k in range(2):
@@ -60,7 +60,7 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
 
 @kernel
 def _escape(p: Any, frame: Frame, i: int, force: Any) -> None:
-    """The scripted evader: contain, then evade the nearest pursuer, then wander, by prioritised allocation."""
+    """Write a scripted evader's force; priorities: contain, evade the nearest pursuer, wander."""
     velocity, top = (frame.vel[0, i], frame.vel[1, i]), frame.max_speed[i]
     noise = (2.0 * uniform(frame.key, frame.step, i, 11) - 1.0, 2.0 * uniform(frame.key, frame.step, i, 12) - 1.0)
     target = steering.wander_turn((frame.memory[0, i], frame.memory[1, i]), noise, 2.0, p.control_dt)
@@ -76,7 +76,7 @@ def _escape(p: Any, frame: Frame, i: int, force: Any) -> None:
     low = (frame.pos[0, i] - margin, frame.pos[1, i] - margin)
     high = (p.size - margin - frame.pos[0, i], p.size - margin - frame.pos[1, i])
     inside = steering.contain(low, high, velocity, top, 0.5)
-    gain = 1.0 / 0.2  # kg/s: a wish is granted within 0.2 s
+    gain = 1.0 / 0.2  # kg/s: the desired velocity is reached within 0.2 s
     wishes = (scale(inside, gain), scale(away, gain), scale(roam, gain))
     wish = arbitration.allocate(wishes, frame.max_force[i])
     force[0, i], force[1, i] = wish[0], wish[1]
@@ -106,14 +106,14 @@ def _sides(p: Any, frame: Frame, i: int) -> tuple[int, int, int, int, float]:
 
 @kernel
 def _caught(p: Any, before: Frame, after: Frame, j: int) -> bool:
-    """Was evader j alive before, and is a pursuer within reach of it now?"""
+    """Return True if evader j was alive before and a pursuer is within the capture distance now."""
     _, distance = _nearest(after, j, 0, int(p.pursuers))
     return bool(before.alive[j]) and distance <= p.capture_distance
 
 
 @kernel
 def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
-    """Terms: closing, capture, time; evaders are paid the opposite."""
+    """Write the terms closing, capture, time; evaders get them with the opposite sign."""
     caught = 0
     for j in range(int(p.pursuers), after.pos.shape[1]):
         caught += 1 if _caught(p, before, after, j) else 0
@@ -133,7 +133,7 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 
 @kernel
 def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
-    """A caught evader is out; when none is left, everything ends: that is success."""
+    """Remove caught evaders; end all learners when no evader is left, which is success."""
     pursuers, n = int(p.pursuers), after.pos.shape[1]
     left = 0
     for j in range(pursuers, n):
@@ -149,7 +149,7 @@ def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
 
 @kernel
 def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
-    """Path of the first pursuer, m; nearest distance between the sides, m; evaders caught; time until the last, s."""
+    """Write the path of pursuer 0, m; least distance between the sides, m; evaders caught; time until the last, s."""
     numbers[0] = math.hypot(after.pos[0, 0] - before.pos[0, 0], after.pos[1, 0] - before.pos[1, 0])
     n, pursuers = after.pos.shape[1], int(p.pursuers)
     best, caught, free = _FAR, 0, 0
@@ -165,7 +165,7 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 @kernel
 def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
-    """Time of the last capture, s, if nobody is free; path of pursuer 0, m; distance now, m; caught."""
+    """Write time of the last capture, s, if all are caught; path of pursuer 0, m; distance now, m; evaders caught."""
     if last.captured >= p.evaders:
         numbers[0] = sums.time
     numbers[1], numbers[2], numbers[3] = sums.path, last.distance, last.captured
@@ -173,7 +173,7 @@ def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
 
 @kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
-    """Own velocity, walls, the nearest opponents and team mates, nearest first."""
+    """Write own velocity, walls, and the nearest opponents and team mates, nearest first."""
     for i in range(rows.shape[0]):
         row = rows[i]
         for c in range(row.shape[0]):
@@ -222,11 +222,12 @@ def _clip(x: float) -> float:
 
 
 class Pursuit(Task):
-    """One learner chases a scripted evader that is slower, turns faster, knows the walls and wanders when left alone.
+    """Pursuers, by default one, chase evaders that are slower but turn faster, in a walled field.
 
-    The evader evades the nearest pursuer within `alarm_distance`, stays in the field, and wanders otherwise, by
-    prioritised acceleration allocation in the order contain, evade, wander. With sides="both" the evaders are agents
-    too, paid the opposite of the pursuers; who is caught is out, and the game ends with the last evader.
+    A scripted evader evades the nearest pursuer within `alarm_distance`, stays in the field, and wanders otherwise, by
+    prioritised acceleration allocation in the order contain, evade, wander. With sides="both" the evaders are learners
+    also, with rewards of the opposite sign. A caught evader terminates; the episode ends, with success, once all
+    evaders are caught.
     """
 
     name: ClassVar[str] = "pursuit"
@@ -235,29 +236,31 @@ class Pursuit(Task):
     measures: ClassVar[tuple[str, ...]] = ("path", "distance", "captured", "time")
     memory: ClassVar[int] = 2
 
-    pursuers: int = Field(default=1, ge=1, le=64, description="how many chase")
-    evaders: int = Field(default=1, ge=1, le=64, description="how many are chased")
-    sides: Literal["pursuers", "both"] = Field(default="pursuers", description="who learns")
+    pursuers: int = Field(default=1, ge=1, le=64, description="number of pursuers")
+    evaders: int = Field(default=1, ge=1, le=64, description="number of evaders")
+    sides: Literal["pursuers", "both"] = Field(
+        default="pursuers", description="the learners: pursuers only, or both sides"
+    )
     size: float = Field(default=20.0, gt=6, description="m, edge of the field")
     pursuer_speed: float = Field(default=3.0, gt=0, description="m/s")
     pursuer_force: float = Field(default=5.0, gt=0, description="N; the mass is 1 kg")
     evader_speed: float = Field(default=2.4, gt=0, description="m/s")
     evader_force: float = Field(default=12.0, gt=0, description="N; the mass is 1 kg")
     alarm_distance: float = Field(default=8.0, ge=0, description="m, within which a scripted evader flees")
-    near: float = Field(default=4.0, gt=0, description="m, within which the closeness of opponents is seen")
-    capture_distance: float = Field(default=0.6, gt=0, description="m between centres")
-    closing_reward: float = Field(default=0.1, ge=0, description="per m that the nearest evader came nearer")
+    near: float = Field(default=4.0, gt=0, description="m, range within which `closeness` is not 0")
+    capture_distance: float = Field(default=0.6, gt=0, description="m between centres, for a capture")
+    closing_reward: float = Field(default=0.1, ge=0, description="per m by which the nearest evader came nearer")
     capture_reward: float = Field(default=10.0, ge=0, description="for each capture, to every pursuer")
     time_cost: float = Field(default=0.5, ge=0, description="per s")
 
     @property
     def learners(self) -> int:
-        """The pursuers, or everybody."""
+        """L: the pursuers, or all agents."""
         return self.pursuers + (self.evaders if self.sides == "both" else 0)
 
     @property
     def agents(self) -> int:
-        """Both sides."""
+        """N: pursuers and evaders."""
         return self.pursuers + self.evaders
 
     @property
@@ -268,12 +271,12 @@ class Pursuit(Task):
 
     @property
     def ends_together(self) -> bool:
-        """In the game of both sides, caught evaders leave before the others."""
+        """True unless evaders are learners: these leave when they are caught."""
         return self.sides == "pursuers"
 
     @functools.cached_property
     def scene(self) -> Scene:
-        """A walled square; nothing acts but what agents want."""
+        """A walled square, in which only the agents' own forces act."""
         return Scene(
             space=Box(size=(self.size, self.size)),
             groups=(
@@ -299,20 +302,20 @@ class Pursuit(Task):
 
     @property
     def _slots(self) -> tuple[int, int]:
-        """How many opponents and team mates an observation shows: rows of both sides have one length."""
+        """Number of opponents and of team mates in an observation, the same for both sides."""
         teams = (self.pursuers, self.evaders) if self.sides == "both" else (self.pursuers,)
         opponents = max(self.pursuers, self.evaders) if self.sides == "both" else self.evaders
         return min(opponents, 3), min(max(teams) - 1, 2)
 
     def parameters(self) -> dict[str, float]:
-        """The fields, and what follows from them."""
+        """Return the fields, and the numbers derived from them."""
         opponents, mates = self._slots
         fastest = max(self.pursuer_speed, self.evader_speed)
         return super().parameters() | {"opponent_slots": opponents, "mate_slots": mates, "speed_scale": fastest}
 
     @functools.cached_property
     def layout(self) -> Layout:
-        """Axes are the field's; offsets are relative to the agent."""
+        """The observation; axes are the field's, and offsets are relative to the agent."""
         opponents, mates = self._slots
         fastest = max(self.pursuer_speed, self.evader_speed)
         there = "1 where there is one, else 0 (and zeros before)"
@@ -332,6 +335,6 @@ class Pursuit(Task):
 
     @functools.cached_property
     def action_layout(self) -> Layout:
-        """A force, in the field's axes."""
+        """A force along the field's axes."""
         meaning = "force (x, y) / own max_force, shortened to length 1"
         return Layout((Slot("force", (2,), self.pursuer_force, "N", meaning),))

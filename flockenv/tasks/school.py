@@ -1,4 +1,4 @@
-"""School: live long and well fed, as a fish among fish, food that grows, and a hunter that must eat, too."""
+"""School: fish survive and feed among other fish, patches of food that regrow, and hunters."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ from flockenv.tasks.task import Frame, Task
 __all__ = ["School"]
 
 _TRIES = 64
-_GAIN = 5.0  # kg/s: a scripted fish has the velocity that it wants within 0.2 s
-_MARGIN = 0.5  # m, that the scripted keep to walls
-_ESCAPE, _SCHOOL, _NEED = 0.4, 0.15, 0.5  # fear above which they flee, and join the others; hunger above which they eat
-_CALM, _CONTENT = 0.1, 0.3  # how much less fear, or hunger, ends it
+_GAIN = 5.0  # kg/s: a scripted fish reaches its desired velocity within 0.2 s
+_MARGIN = 0.5  # m, distance that scripted agents keep from walls
+_ESCAPE, _SCHOOL, _NEED = 0.4, 0.15, 0.5  # fear above which they flee, and school; hunger above which they eat
+_CALM, _CONTENT = 0.1, 0.3  # the intention ends when fear, or hunger, falls by this below its threshold
 HUNGER, FEAR, FOOD, EATEN, INTENT, FATE = range(6)
-"""Rows of the memory: 0 to 1; 0 to 1; units of food, of patches; units of food in this step; a number of INTENTIONS;
-what became of a fish in this step, see below."""
+"""Rows of the memory: hunger, 0 to 1; fear, 0 to 1; food of a patch; food eaten in this step; index of INTENTIONS; fate
+of a fish in this step: 0, CAUGHT or STARVED. Food is in the unit of `capacity`."""
 
 CAUGHT, STARVED = 1, 2
 
 
 @kernel
 def spawn(p: Any, frame: Frame) -> None:
-    """Fish anywhere, patches of food apart from each other, hunters `start_distance` from all fish; all at rest."""
+    """Place fish at random, food patches apart from each other, hunters `start_distance` m from all fish; at rest."""
     frame.vel[:, :] = 0.0
     frame.memory[:, :] = 0.0
     fish, foes, n = int(p.fish), int(p.fish + p.hunters), frame.pos.shape[1]
@@ -65,7 +65,7 @@ def spawn(p: Any, frame: Frame) -> None:
 
 @kernel
 def _clear(frame: Frame, i: int, first: int, end: int, distance: float) -> bool:
-    """Is agent i at least this far from those of [first, end)?"""
+    """Return True if agent i is at least `distance` m from the agents [first, end)."""
     for j in range(first, end):  # noqa: SIM110  # there are no generators in compiled code
         if norm(_to(frame, i, j)) < distance:
             return False
@@ -80,7 +80,7 @@ def _to(frame: Frame, i: int, j: int) -> Vec:
 
 @kernel
 def _sees(p: Any, frame: Frame, i: int, j: int) -> bool:
-    """Does fish i see agent j: within sight, and not in the blind angle behind it?"""
+    """Return True if fish i sees agent j: within sight, and not in the blind angle behind it."""
     to = _to(frame, i, j)
     square = dot(to, to)
     inside: bool = square < p.sight * p.sight and in_view(p.cone, unit(velocity_of(frame, i)), to, square)
@@ -89,7 +89,7 @@ def _sees(p: Any, frame: Frame, i: int, j: int) -> bool:
 
 @kernel
 def _next_seen(p: Any, frame: Frame, i: int, first: int, end: int, last: int, past: float) -> tuple[int, float]:
-    """Return whom of [first, end) fish i sees nearest after `last`, equal distances by number, and how far; or -1."""
+    """Return the next nearest agent of [first, end) after `last` seen by fish i, ties by index, and distance; or -1."""
     best, who = np.inf, -1
     for j in range(first, end):
         distance = norm(_to(frame, i, j))
@@ -99,12 +99,12 @@ def _next_seen(p: Any, frame: Frame, i: int, first: int, end: int, last: int, pa
     return who, best
 
 
-# --- who is scripted --------------------------------------------------------------------------------------------------
+# --- scripted agents --------------------------------------------------------------------------------------------------
 
 
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
-    """Learners push where their action says; other fish follow `_fish`, hunters `_hunter`."""
+    """Write each learner's action as a force along the tank's axes; other fish follow `_fish`, hunters `_hunter`."""
     fish, foes = int(p.fish), int(p.fish + p.hunters)
     for i in range(frame.pos.shape[1]):
         if not frame.alive[i] or i >= foes:
@@ -124,7 +124,7 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
 
 @kernel
 def _apart(frame: Frame, i: int) -> Vec:
-    """Keep clear of others of one's kind who are nearer than three radii."""
+    """Return the separation from agents of the same radius that are nearer than three radii."""
     push: Vec = (0.0, 0.0)
     for j in range(frame.pos.shape[1]):
         to, mine = _to(frame, i, j), frame.radius[i]
@@ -135,7 +135,7 @@ def _apart(frame: Frame, i: int) -> Vec:
 
 @kernel
 def _roam(frame: Frame, i: int, time: float, speed: float) -> Vec:
-    """Wander (Reynolds 1999), at this speed."""
+    """Return the force of wandering (Reynolds 1999) at this speed, m/s."""
     velocity = velocity_of(frame, i)
     begin = 2.0 * math.pi * uniform(frame.key, 0, i, 3)
     way: Vec = (math.cos(begin), math.sin(begin))
@@ -148,7 +148,7 @@ def _roam(frame: Frame, i: int, time: float, speed: float) -> Vec:
 
 @kernel
 def _fish(p: Any, frame: Frame, i: int) -> Vec:
-    """What a scripted fish wants in its state: evade, forage, keep to the school, or wander."""
+    """Return the force of a scripted fish by its intention: evade, forage, school, or wander."""
     velocity, top = velocity_of(frame, i), np.float64(frame.max_speed[i])
     fish, foes, intent = int(p.fish), int(p.fish + p.hunters), frame.memory[INTENT, i]
     if intent == motivation.ESCAPE:
@@ -176,7 +176,7 @@ def _fish(p: Any, frame: Frame, i: int) -> Vec:
 
 @kernel
 def _hunter(p: Any, frame: Frame, i: int) -> Vec:
-    """A hungry hunter pursues the nearest fish in its sight, which is all around; else it wanders, slowly."""
+    """Return a hunter's force: if hungry, pursue the nearest fish within `hunter_sight`, else wander slowly."""
     best, who = p.hunter_sight, -1
     for j in range(int(p.fish)):
         distance = norm(_to(frame, i, j))
@@ -190,14 +190,14 @@ def _hunter(p: Any, frame: Frame, i: int) -> Vec:
     return _roam(frame, i, 0.5 * frame.step * p.control_dt, 0.4 * top)
 
 
-# --- what goes on inside ----------------------------------------------------------------------------------------------
+# --- hunger, fear and food --------------------------------------------------------------------------------------------
 
 
 @kernel
 def keep(p: Any, before: Frame, after: Frame) -> None:
-    """Food grows and is eaten, fish are caught, everybody gets hungrier, afraid or calm, and knows what it wants.
+    """Update food, captures, hunger, fear and intentions.
 
-    Whatever passes between two is found from both sides, from the same instant, before anything changes.
+    Interactions between two agents are computed for both from the same instant, before any state changes.
     """
     foes, n = int(p.fish + p.hunters), after.pos.shape[1]
     for i in range(n):
@@ -219,7 +219,7 @@ def keep(p: Any, before: Frame, after: Frame) -> None:
 
 @kernel
 def _graze(p: Any, frame: Frame, i: int) -> None:
-    """Count what fish i eats of each patch that it is at: to it, and to the patch."""
+    """Add what fish i eats of each patch within reach to the counts of the fish and of the patch."""
     hunger = np.float64(frame.memory[HUNGER, i])
     for j in range(int(p.fish + p.hunters), frame.pos.shape[1]):
         if norm(_to(frame, i, j)) < p.reach:
@@ -230,13 +230,13 @@ def _graze(p: Any, frame: Frame, i: int) -> None:
 
 @kernel
 def _has(p: Any, frame: Frame, j: int, i: int) -> bool:
-    """Has hunter j, which hunts, got fish i?"""
+    """Return True if hunter j is hunting and fish i is within its capture distance."""
     return bool(frame.memory[INTENT, j] == motivation.EAT and norm(_to(frame, j, i)) <= p.capture_distance)
 
 
 @kernel
 def _face_hunters(p: Any, frame: Frame, i: int) -> None:
-    """Fear of the hunters that fish i sees, and what is left of before; is it caught?"""
+    """Update the fear of fish i from the hunters that it sees and its previous fear, and whether it is caught."""
     felt = 0.0
     for j in range(int(p.fish), int(p.fish + p.hunters)):
         if _sees(p, frame, i, j):
@@ -250,7 +250,7 @@ def _face_hunters(p: Any, frame: Frame, i: int) -> None:
 
 @kernel
 def _intend(frame: Frame, i: int) -> None:
-    """What fish or hunter i is up to now."""
+    """Update the intention of fish or hunter i."""
     now, hunger = np.float64(frame.memory[INTENT, i]), np.float64(frame.memory[HUNGER, i])
     fear = np.float64(frame.memory[FEAR, i])
     frame.memory[INTENT, i] = motivation.intention(now, hunger, 0.0, fear, _ESCAPE, _SCHOOL, _NEED, _CALM, _CONTENT)
@@ -258,7 +258,7 @@ def _intend(frame: Frame, i: int) -> None:
 
 @kernel
 def _digest(p: Any, frame: Frame, i: int) -> None:
-    """Hunger of fish or hunter i after this step: of time and effort, less what it has eaten."""
+    """Update the hunger of fish or hunter i: time and effort raise it, food lowers it."""
     hunts = i >= int(p.fish)
     pace = norm(velocity_of(frame, i)) / np.float64(frame.max_speed[i])
     rate = p.hunter_metabolism if hunts else p.metabolism
@@ -273,12 +273,12 @@ def _digest(p: Any, frame: Frame, i: int) -> None:
         frame.memory[FATE, i] = STARVED
 
 
-# --- what is paid, and what ends --------------------------------------------------------------------------------------
+# --- reward and end ---------------------------------------------------------------------------------------------------
 
 
 @kernel
 def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
-    """Terms: alive, fed, dead; who is out is paid nothing."""
+    """Write the terms alive, fed, dead; all 0 for a fish that died before this step."""
     for i in range(terms.shape[0]):
         lives = before.alive[i] and after.memory[FATE, i] == 0.0
         terms[i, 0] = p.alive_reward * p.control_dt if lives else 0.0
@@ -288,7 +288,7 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
 
 @kernel
 def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
-    """Who is caught or starved is out. As long as half of the learners live, the aim holds."""
+    """End the learners that are caught or starved; return True while at least half of the learners live."""
     left = 0
     for i in range(int(p.fish)):
         out = not before.alive[i] or after.memory[FATE, i] != 0.0
@@ -301,7 +301,10 @@ def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
 
 @kernel
 def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
-    """Of the learners: share alive; hunger of those, summed; food eaten; shares that were caught, and starved, now."""
+    """Write the learners' share alive; summed hunger of those; food eaten; shares caught and starved in this step.
+
+    Hunger and food are divided by the number of learners.
+    """
     learners = int(p.learners)
     for k in range(5):
         numbers[k] = 0.0
@@ -317,9 +320,8 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 @kernel
 def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
-    """Share of the learners alive; s that they lived, on average; mean hunger while they did; food eaten by each.
-
-    And which share was caught, and which starved.
+    """Write the share of learners alive; mean lifetime, s; mean hunger while alive; mean food eaten; shares caught,
+    and starved.
     """
     numbers[0], numbers[1] = last.alive, sums.alive * p.control_dt
     if sums.alive > 0:
@@ -327,14 +329,14 @@ def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
     numbers[3], numbers[4], numbers[5] = sums.eaten, sums.caught, sums.starved
 
 
-# --- what is seen -----------------------------------------------------------------------------------------------------
+# --- observation ------------------------------------------------------------------------------------------------------
 
 
 @kernel
 def observe(p: Any, frame: Frame, rows: Any) -> None:
-    """Own velocity, walls, hunger, fear; hunters, food and fish in sight, nearest first.
+    """Write own velocity, walls, hunger, fear; hunters, food and fish in sight, nearest first.
 
-    Who is out sees nothing but a hunger of 1, at no distance from any wall: no row of a living fish is like it.
+    The row of a dead fish is 0 but for a hunger of 1; its wall distances of 0 set it apart from any living fish.
     """
     fish, foes, n = int(p.fish), int(p.fish + p.hunters), frame.pos.shape[1]
     for i in range(rows.shape[0]):
@@ -356,9 +358,9 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
 
 @kernel
 def _show(p: Any, frame: Frame, i: int, first: int, end: int, slots: int, row: Any, at: int) -> int:
-    """Write whom of [first, end) fish i sees: offset, bearing, closeness, velocity, and presence or amount.
+    """Write the agents of [first, end) that fish i sees: offset, bearing, velocity, closeness, presence or amount.
 
-    Returns the place after them.
+    Returns the index after them.
     """
     last, past = -1, -1.0
     for s in range(slots):
@@ -377,13 +379,13 @@ def _show(p: Any, frame: Frame, i: int, first: int, end: int, slots: int, row: A
 
 
 class School(Task):
-    """Fish with one shared policy (or one among scripted fish) live in a tank with patches of food and a hunter.
+    """Fish with one shared policy (or one among scripted fish) live in a tank with patches of food and hunters.
 
-    Hunger grows with time and effort; who swims at a patch eats of it, and it grows again, the faster the less is
-    missing. A fish sees 300 degrees. A hunter that is hungry pursues the nearest fish, faster than that, but it turns
-    more slowly; fed, it leaves them alone for a while. To be caught or starved ends it for that fish; the others go on.
-    What goes on inside follows Tu and Terzopoulos (1994; see flockenv.steering.motivation), and the scripted fish are
-    their state machine: flee, keep to the school, forage, wander.
+    Hunger grows with time and effort. A fish within `reach` of a patch eats of it; the patch regrows logistically. The
+    view angle of a fish is `fov`, 300 degrees by default. A hungry hunter pursues the nearest fish; it is faster than a
+    fish, but turns more slowly. A fed hunter does not pursue until it is hungry again. A fish that is caught or starves
+    terminates; the others go on. Success: at least half of the learners live. Hunger and fear follow Tu and Terzopoulos
+    (1994; see flockenv.steering.motivation); scripted fish are their state machine: flee, school, forage, wander.
     """
 
     name: ClassVar[str] = "school"
@@ -393,45 +395,55 @@ class School(Task):
     memory: ClassVar[int] = 6
     keeps: ClassVar[bool] = True
 
-    fish: int = Field(default=8, ge=1, le=64, description="how many fish there are")
+    fish: int = Field(default=8, ge=1, le=64, description="number of fish")
     learners: int = Field(
         default_factory=lambda given: given.get("fish", 8), ge=1,
-        description="how many of them learn (default: all); the others follow a script",
+        description="number of learners (default of the task: all); the others are scripted",
     )  # fmt: skip
-    hunters: int = Field(default=1, ge=1, le=8, description="how many hunt them")
-    patches: int = Field(default=4, ge=1, le=16, description="of food")
+    hunters: int = Field(default=1, ge=1, le=8, description="number of hunters")
+    patches: int = Field(default=4, ge=1, le=16, description="number of food patches")
     horizon: int = Field(default=400, ge=1, description="decisions until the time limit (truncation)")
     size: float = Field(default=24.0, gt=10, description="m, edge of the tank")
-    start_distance: float = Field(default=6.0, ge=0, description="m, between hunters and fish at the start")
+    start_distance: float = Field(
+        default=6.0, ge=0, description="m, least distance between hunters and fish at the start"
+    )
     fish_speed: float = Field(default=2.0, gt=0, description="m/s")
     fish_force: float = Field(default=8.0, gt=0, description="N; the mass is 1 kg")
     hunter_speed: float = Field(default=2.4, gt=0, description="m/s")
     hunter_force: float = Field(default=2.5, gt=0, description="N; the mass is 1 kg")
-    hunter_sight: float = Field(default=12.0, gt=0, description="m, all around")
-    hunter_metabolism: float = Field(default=0.04, ge=0, description="1/s, hunger of a hunter at rest; hunts above 0.5")
-    meal: float = Field(default=0.8, ge=0, le=1, description="hunger that a fish takes off a hunter")
-    capture_distance: float = Field(default=0.5, gt=0, description="m between centres")
-    sight: float = Field(default=10.0, gt=0, description="m, a fish sees others and food within this")
-    fov: float = Field(default=300.0, gt=0, le=360, description="degrees, full angle of what a fish sees")
-    near: float = Field(default=5.0, gt=0, description="m, within which closeness is seen")
-    food_seen: int = Field(default=3, ge=1, le=16, description="how many patches a fish tells apart, nearest first")
-    fish_seen: int = Field(default=3, ge=0, le=16, description="how many others")
-    start_hunger: float = Field(default=0.4, gt=0, le=0.6, description="0 full, 1 starved; up to half more or less")
-    metabolism: float = Field(default=0.02, ge=0, description="1/s, hunger of a fish at rest")
-    effort: float = Field(default=0.02, ge=0, description="1/s more at top speed; goes with its square")
-    reach: float = Field(default=1.0, gt=0, description="m, who is nearer to a patch's centre eats")
-    grazing: float = Field(default=0.5, ge=0, description="1/s, share of a patch that one eats who is starved")
-    growth: float = Field(default=0.25, ge=0, description="1/s, of food")
-    capacity: float = Field(default=1.5, gt=0, description="fish from starved to full, that a patch feeds")
-    fear_distance: float = Field(default=1.0, gt=0, description="m, within which fear of a hunter is 1")
-    fear_memory: float = Field(default=2.0, gt=0, description="s, over which fear falls to 1/e")
+    hunter_sight: float = Field(
+        default=12.0, gt=0, description="m, range within which a hunter sees fish, in all directions"
+    )
+    hunter_metabolism: float = Field(
+        default=0.04, ge=0, description="1/s, rate of hunger of a hunter at rest; it hunts above 0.5"
+    )
+    meal: float = Field(default=0.8, ge=0, le=1, description="by how much a caught fish lowers a hunter's hunger")
+    capture_distance: float = Field(default=0.5, gt=0, description="m between centres, for a capture")
+    sight: float = Field(default=10.0, gt=0, description="m, range within which a fish sees others and food")
+    fov: float = Field(default=300.0, gt=0, le=360, description="degrees, full view angle of a fish")
+    near: float = Field(default=5.0, gt=0, description="m, range within which closeness is not 0")
+    food_seen: int = Field(default=3, ge=1, le=16, description="number of patches seen, nearest first")
+    fish_seen: int = Field(default=3, ge=0, le=16, description="number of other fish seen, nearest first")
+    start_hunger: float = Field(
+        default=0.4, gt=0, le=0.6, description="mean hunger at the start, drawn within +-50 %; 0 full, 1 starved"
+    )
+    metabolism: float = Field(default=0.02, ge=0, description="1/s, rate of hunger of a fish at rest")
+    effort: float = Field(
+        default=0.02, ge=0, description="1/s, extra rate of hunger at top speed; proportional to speed squared"
+    )
+    reach: float = Field(default=1.0, gt=0, description="m, a fish eats within this distance of a patch's centre")
+    grazing: float = Field(default=0.5, ge=0, description="1/s, share of a patch that a fish with hunger 1 eats")
+    growth: float = Field(default=0.25, ge=0, description="1/s, growth rate of food")
+    capacity: float = Field(default=1.5, gt=0, description="food of a full patch; 1 feeds a fish from starved to full")
+    fear_distance: float = Field(default=1.0, gt=0, description="m, distance within which the fear of a hunter is 1")
+    fear_memory: float = Field(default=2.0, gt=0, description="s, time constant with which fear decays")
     alive_reward: float = Field(default=0.5, ge=0, description="per s")
-    fed_reward: float = Field(default=0.5, ge=0, description="per s with no hunger at all")
-    death_cost: float = Field(default=10.0, ge=0, description="once")
+    fed_reward: float = Field(default=0.5, ge=0, description="per s at hunger 0; falls linearly to 0 at hunger 1")
+    death_cost: float = Field(default=10.0, ge=0, description="once, when caught or starved")
 
     @model_validator(mode="after")
     def _fitting(self) -> School:
-        """Refuse more learners than fish, a start that is out of reach, and meals that are larger than the patch."""
+        """Raise ValueError for more learners than fish, a start distance above half the tank, or too much grazing."""
         if self.learners > self.fish:
             raise ValueError(f"learners = {self.learners}: there are only {self.fish} fish")
         if self.start_distance > self.size / 2:
@@ -445,7 +457,7 @@ class School(Task):
 
     @property
     def agents(self) -> int:
-        """Fish, hunters and patches."""
+        """N: fish, hunters and food patches."""
         return self.fish + self.hunters + self.patches
 
     @property
@@ -455,12 +467,12 @@ class School(Task):
 
     @property
     def ends_together(self) -> bool:
-        """Several leave one by one."""
+        """True for one learner: several leave one by one."""
         return self.learners == 1
 
     @functools.cached_property
     def scene(self) -> Scene:
-        """A walled square; nothing acts but what fish and hunters want."""
+        """A walled square, in which only the agents' own forces act."""
         fish: dict[str, Any] = {"radius": 0.2, "max_speed": self.fish_speed, "max_force": self.fish_force}
         groups = [Group(count=self.learners, role="learner", **fish)]
         if self.fish > self.learners:
@@ -480,13 +492,13 @@ class School(Task):
         )
 
     def parameters(self) -> dict[str, float]:
-        """The fields, and what follows from them."""
+        """Return the fields, and the numbers derived from them."""
         ahead = math.cos(math.radians(self.fov / 2))
         return super().parameters() | {"cone": ahead * abs(ahead)}
 
     @functools.cached_property
     def layout(self) -> Layout:
-        """Axes are the tank's; offsets are relative to the fish; zeros where nobody is seen."""
+        """The observation; axes are the tank's, offsets relative to the fish; zeros for empty slots."""
         slots = [
             Slot("velocity", (2,), self.fish_speed, "m/s", "own velocity (x, y)"),
             Slot("to_low", (2,), self.size, "m", "distance to the walls at x = 0 and y = 0", low=0.0),
@@ -513,12 +525,12 @@ class School(Task):
 
     @functools.cached_property
     def action_layout(self) -> Layout:
-        """A force, in the tank's axes."""
+        """A force along the tank's axes."""
         meaning = "force (x, y) / max_force, shortened to length 1"
         return Layout((Slot("force", (2,), self.fish_force, "N", meaning),))
 
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
-        """The patches; their area is what is left."""
+        """Return a mark at each patch, with an area proportional to its food."""
         first = self.fish + self.hunters
         return tuple(
             Mark("goal", state.pos[world, j], np.zeros(2), self._shown(float(memory[FOOD, world, j])))

@@ -1,32 +1,32 @@
-"""Task: what is seen, what is paid, when it ends; functions of frames, over a scene that knows nothing of them.
+"""Task: observations, rewards and episode ends, as functions of frames, over a scene that does not depend on them.
 
-A task is one file: a frozen record whose fields are the keyword arguments of `make`, and seven kernels, or up to nine,
-over one world:
+A task is one file: a frozen record whose fields are the keyword arguments of `make`, and seven to nine kernels over one
+world:
 
-* `spawn(p, frame)` writes the first positions, velocities, obstacles and memory from the world's key;
-* `drive(p, frame, action, force)` turns actions (L, A) into forces asked for (D, N) N, of scripted agents too;
-* `keep(p, before, after)`, of a task that `keeps` alone, writes into the memory what the others read of this step;
-* `reward(p, before, after, action, terms)` writes the named terms (L, K), each of which lies in one piece, and nothing
-  else, as a test checks;
-* `ended(p, before, after, numbers, over) -> success` writes which learners are over (L,), may take agents out of
-  `after.alive`, and returns whether the aim is reached; of the `measures` (Q,) it may write those that it needs itself;
-  of a task with a `lasting_aim`, it returns whether the aim holds now, and success is what `lasts` in tasks/lasting.py
-  returns of the sums of the measures;
-* `measure(p, before, after, numbers)` comes next and writes the others: what this step adds to the `measures`;
+* `spawn(p, frame)` writes the initial positions, velocities, obstacles and memory, drawn from the world's key;
+* `drive(p, frame, action, force)` turns actions (L, A) into steering forces (D, N) N, also of scripted agents;
+* `keep(p, before, after)`, only if the task `keeps`, writes into the memory what the other kernels read of this step;
+* `reward(p, before, after, action, terms)` writes the named terms (L, K), each contiguous, and nothing else, as a test
+  checks;
+* `ended(p, before, after, numbers, over) -> success` writes which learners are over (L,), may clear `after.alive` of
+  agents, and returns whether the aim is reached; it may also write those of the `measures` (Q,) that it needs itself.
+  If the task has a `lasting_aim`, it returns whether the aim holds now, and success is what `lasts` in tasks/lasting.py
+  returns for the sums of the measures;
+* `measure(p, before, after, numbers)` runs next and writes the other measures: what this step adds to each;
 * `metrics(p, sums, last, steps, numbers)` writes the domain metrics of an episode so far, in the order of
-  `metric_names`, from the sums of the measures over its steps and from their last values, by name (sums.path, say), and
-  the number of steps; a metric has no value where none is written. All of it is double precision, `p` too;
-* `abreast(p, frame, columns)`, of a task with numbers `abreast` alone, writes the first so many numbers of all rows,
-  (L, abreast), of which the same number of all agents lies together: loops over agents become vector code. So that
-  none is left over, L is rounded up there and in that task's `reward`, and in what it and that task's `reward`, `ended`
-  and `measure` see, `pos`, `vel`, `memory`, `radius` and what is near go on beyond the last agent, up to a multiple of
-  `abreast.PAIR`, and hold anything there: nobody may look at what follows from it. `alive`, the limits, `before` and
-  `action` end with the last agent. The frame is a copy: such a task's `ended` writes `over` and `after.alive` alone;
-  what is to be remembered is for `keep`;
-* `observe(p, frame, rows)` writes the observation rows (L, O), or what of them `abreast` left.
+  `metric_names`, from the sums of the measures over its steps and from their last values, by name (e.g. sums.path), and
+  the number of steps. A metric that is not written has no value. All numbers are double precision, also `p`;
+* `abreast(p, frame, columns)`, only if the task's `abreast` is not 0, writes the first `abreast` numbers of all rows,
+  (L, abreast), with each number of all agents contiguous, so that loops over agents become vector code. L is rounded up
+  to whole registers there and in that task's `reward`. In the frames of `abreast`, `reward`, `ended` and `measure` of
+  such a task, `pos`, `vel`, `memory`, `radius` and the near arrays extend beyond the last agent, up to a multiple of
+  `simd_rows.PAIR`, with arbitrary values: no result may depend on these. `alive`, the limits, `before` and `action` end
+  with the last agent. The frame is a copy: such a task's `ended` may write only `over` and `after.alive`; `keep` writes
+  the memory;
+* `observe(p, frame, rows)` writes the observation rows (L, O), or what `abreast` left of them.
 
-`p` holds the task's `parameters()` by name. Learners are the first L agents of a world. Who is near whom is found once
-for all of them, by the same query as a scene's effects, if the task says what it wants to know: its `look`.
+`p` holds the task's `parameters()` by name. Learners are the first L agents of a world. If the task has a `look`,
+neighbours are searched once for all kernels, by the same query as for a scene's effects.
 """
 
 from __future__ import annotations
@@ -54,28 +54,28 @@ TASKS: dict[str, type[Task]] = {}
 
 
 class Frame(NamedTuple):
-    """One world at one instant, as kernels see it."""
+    """State of one world at one instant, as passed to kernels."""
 
     pos: Any  # (D, N) m
     vel: Any  # (D, N) m/s
     alive: Any  # (N,)
     centre: Any  # (D, M) m, obstacles
-    rho: Any  # (M,) m, their radii; 0 = empty slot
-    memory: Any  # (K, N) what a task keeps between steps: wander targets, goals
+    rho: Any  # (M,) m, obstacle radii; 0: empty slot
+    memory: Any  # (K, N) kept between steps by the task: wander targets, goals
     key: Any  # random key of the world
-    step: Any  # control steps since the start
+    step: Any  # decisions since the start
     radius: Any  # (N,) m
     max_speed: Any  # (N,) m/s
     max_force: Any  # (N,) N
-    # What is near, as the task's `look` asks for it; not in the frame of `before`, whose arrays are empty.
-    near_square: Any  # (K, N) m^2, distances to the nearest agents squared, nearest first; inf: none
-    near_who: Any  # (K, N) which they are; where there is none, somebody
-    near_count: Any  # (N,) how many there are within sight
+    # Neighbours and obstacles, as the task's `look` defines them; empty in the frame `before`.
+    near_square: Any  # (K, N) m^2, squared distances to the nearest agents, nearest first; inf: none
+    near_who: Any  # (K, N) their indices; a valid index also where there is none
+    near_count: Any  # (N,) number of agents within sight, at most K
     obstacle_gap: Any  # (J, N) m, distances to the surfaces of the nearest obstacles; inf: none
     obstacle_who: Any  # (J, N)
     obstacle_count: Any  # (N,)
-    # Where the nearest agents are, how they move, how large they are: in tasks with numbers `abreast`, for what writes
-    # these and for `reward`, `ended` and `measure`; else empty.
+    # Positions, velocities and radii of the nearest agents: only in tasks with `abreast`, for the kernels `abreast`,
+    # `reward`, `ended` and `measure`; else empty.
     near_pos: Any  # (D, K, N) m
     near_vel: Any  # (D, K, N) m/s
     near_radius: Any  # (K, N) m
@@ -83,7 +83,7 @@ class Frame(NamedTuple):
 
 
 class Task(Record):
-    """What is seen, what is paid, when it ends. See the module for what a subclass must offer."""
+    """Observations, rewards and episode ends; the module's docstring lists what a subclass must define."""
 
     name: ClassVar[str]
     terms: ClassVar[tuple[str, ...]]
@@ -93,17 +93,17 @@ class Task(Record):
     measures: ClassVar[tuple[str, ...]]
     """Names of the numbers that `measure` writes each step."""
     counts: ClassVar[tuple[str, ...]] = ()
-    """Parameters to which loops of its kernels count, written into them: faster; another value is another kernel."""
+    """Parameters that are loop bounds of its kernels; compiled in as constants, so each value has its own kernel."""
     memory: ClassVar[int] = 0
-    """Numbers kept per agent between steps."""
+    """Numbers stored per agent between steps."""
     keeps: ClassVar[bool] = False
-    """Has it a kernel `keep`?"""
+    """True if it has a kernel `keep`."""
     lasting_aim: ClassVar[bool] = False
     """True if success is judged over the episode, by tasks/lasting.py, and not at one instant."""
 
-    control_dt: float = Field(default=0.1, gt=0, description="s, one decision; a whole multiple of dt")
+    control_dt: float = Field(default=0.1, gt=0, description="s, one decision; an integer multiple of dt")
     dt: float = Field(default=0.05, gt=0, description="s, one physics step")
-    integrator: AnyIntegrator = Field(default_factory=SemiImplicitEuler, description="how a physics step is taken")
+    integrator: AnyIntegrator = Field(default_factory=SemiImplicitEuler, description="method of a physics step")
     horizon: int = Field(default=300, ge=1, description="decisions until the time limit (truncation)")
     dtype: Literal["float64", "float32"] = Field(default="float64", description="precision of the simulation")
 
@@ -114,7 +114,7 @@ class Task(Record):
             TASKS[cls.name] = cls
 
     def model_post_init(self, context: Any) -> None:
-        """Refuse clocks that do not fit, and methods that leave the kernel."""
+        """Raise ValueError if control_dt is no integer multiple of dt, or the integrator solves equations in Python."""
         if self.integrator.solves:
             allowed = ", ".join(kind for kind, method in INTEGRATORS.items() if not method.solves)
             solves = "solves equations in Python, while a task plays in one kernel"
@@ -128,7 +128,7 @@ class Task(Record):
         """Physics steps per decision."""
         return round(self.control_dt / self.dt)
 
-    # --- what a task says of itself ---------------------------------------------------------------------------------
+    # --- properties of a task ---------------------------------------------------------------------------------------
 
     if TYPE_CHECKING:  # a field in one task, a property in another
 
@@ -138,7 +138,7 @@ class Task(Record):
 
         @property
         def agents(self) -> int:
-            """N."""
+            """N: all agents of a world."""
 
     @property
     def agent_names(self) -> tuple[str, ...]:
@@ -147,32 +147,32 @@ class Task(Record):
 
     @functools.cached_property
     def scene(self) -> Scene:
-        """The scene it plays in."""
+        """The scene of the task."""
         raise TypeError(f"{type(self).__name__} must have a scene")
 
     @functools.cached_property
     def layout(self) -> Layout:
-        """What an observation row holds."""
+        """The layout of an observation row."""
         raise TypeError(f"{type(self).__name__} must lay out its observation")
 
     @functools.cached_property
     def action_layout(self) -> Layout:
-        """What an action row holds."""
+        """The layout of an action row."""
         raise TypeError(f"{type(self).__name__} must lay out its action")
 
     @property
     def alike(self) -> bool:
-        """Are all agents as large as each other?"""
+        """True if all agents have the same radius."""
         return bool(np.ptp(self.scene.body.radius) == 0)
 
     @property
     def abreast(self) -> int:
-        """How many of a row's first numbers its kernel `abreast` writes; 0 = it has none."""
+        """How many of a row's first numbers its kernel `abreast` writes; 0: it has no such kernel."""
         return 0
 
     @property
     def obstacle_slots(self) -> int:
-        """M: obstacles a world may have."""
+        """M: largest number of obstacles in a world."""
         return 0
 
     @property
@@ -182,34 +182,38 @@ class Task(Record):
 
     @property
     def look(self) -> Look | None:
-        """What its frames say of who is near, if its observations and rewards need it."""
+        """The neighbour query whose results are in its frames; None if its kernels need none."""
         return None
 
     def table(self) -> tuple[float, ...]:
-        """Numbers that its kernels look up: directions of rays, say."""
+        """Return the numbers that its kernels look up, such as directions of rays."""
         return ()
 
     @functools.cached_property
     def parts(self) -> KernelPlan:
-        """What its kernel is made of: the scene's parts, and the look."""
+        """The parts of its kernel: those of the scene, and the look."""
         if self.scene.constraints:
             kinds = ", ".join(constraint.kind for constraint in self.scene.constraints)
-            raise ValueError(f"scene.constraints: {kinds}: a task plays in one kernel, which knows of none yet")
+            raise ValueError(
+                f"scene.constraints: {kinds}: a task runs as one kernel, which supports no constraints yet"
+            )
         if self.scene.population:
-            raise ValueError("scene.population: a task plays in one kernel, which knows of no births; it has `ended`")
+            raise ValueError(
+                "scene.population: a task runs as one kernel, which supports no births; agents leave by `ended`"
+            )
         return replace(self.scene.parts, look=self.look)
 
     def parameters(self) -> dict[str, float]:
-        """The numbers that its kernels are given, by name."""
+        """Return the numbers that are passed to its kernels, by name."""
         numbers = {n: getattr(self, n) for n in type(self).model_fields}
         return {n: float(v) for n, v in numbers.items() if isinstance(v, (int, float))}
 
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
-        """Return what a picture should point out."""
+        """Return the marks of a picture, such as goals."""
         return ()
 
     def roles(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[str, ...]:
-        """Return what each agent of a world is called in pictures, (N,) of snapshot.ROLES; the same all episode."""
+        """Return the role of each agent of a world in pictures, (N,) of snapshot.ROLES; constant over an episode."""
         return self.scene.roles
 
     def view(self, state: State, world: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
