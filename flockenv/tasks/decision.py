@@ -257,7 +257,7 @@ def act_of(plan: Plan) -> Callable[..., Any]:
     ) -> Any:  # fmt: skip
         decide(p, w, made, now, listed, action, results.over, b)
         if shows and not past:  # spread over the decision, as rows are written at its end
-            fetch(results.rows[b], 0, 4)
+            prefetch(results.rows[b], 0, 4)
         bad = step_world(w, made.force, 0, given.params, dt, count, b, 0, 1, scratch)
         w.steps[b] += 1
         if shows:
