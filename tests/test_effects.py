@@ -551,7 +551,7 @@ for row in EFFECTS:
         scene = scene_under(row, dimension)
         end = scene.run(scene.start(3), 5)
         found[f"{row.name} {dimension}"] = end.x.tobytes().hex()
-        assert sum(scene._move.stats.cache_misses.values()) == 0, f"{row.name} was compiled again"
+        assert sum(scene.stepper.move.stats.cache_misses.values()) == 0, f"{row.name} was compiled again"
 json.dump(found, sys.stdout)
 """
 

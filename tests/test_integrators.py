@@ -279,7 +279,7 @@ def test_one_stage_needs_no_row_of_scratch(row: IntegratorRow) -> None:
     scene = Scene(groups=(group,), effects=(Separation(weight=1, radius=1),), integrator=row.method)
     once = row.method.evaluations == 1
     assert scene.parts.one_stage == once
-    assert ("stages" not in scene._workspaces(1, 1)[0].arrays) == once
+    assert ("stages" not in scene.stepper.workspaces(1, 1)[0].arrays) == once
 
 
 @IN_ROWS

@@ -362,7 +362,7 @@ def test_energy_that_moving_bodies_apart_adds_is_counted(response: str, pull: fl
         for _ in range(200):
             fast, state = np.linalg.norm(state.vel[0], axis=1), of.step(state)
             now = kinetic(of, state) + float((mass * pull * state.pos[0, :, 1]).sum())
-            (settler,) = cast(Any, of._settlers(1)[0])
+            (settler,) = cast(Any, of.stepper._settlers(1)[0])
             falling = float((mass * pull * of.dt * fast).sum())
             assert now <= last * (1 + 1e-9) + settler.lost[RAISED] + falling
             last = now

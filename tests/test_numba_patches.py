@@ -190,7 +190,7 @@ def dispatchers(part):
 
 scene = scene_under(next(row for row in EFFECTS if row.effect.kind == "drag"), 2)
 scene.step(scene.start(seed=1))
-counts = {python_of(part).__name__: len(part.signatures) for part in set(dispatchers(scene._move))}
+counts = {python_of(part).__name__: len(part.signatures) for part in set(dispatchers(scene.stepper.move))}
 print(counts["respond"], [name for name, count in counts.items() if count > 1])
 """
 

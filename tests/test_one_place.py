@@ -145,7 +145,7 @@ def test_what_lies_in_records_beyond_the_last_agent_is_nobodys_business() -> Non
     state.x[:, 0, [50, 51]] = SIZE - 1e-3  # in the last cell of all
     state.alive[0, 600:] = False
     expected_ = scene.acceleration(state)
-    scene._workspaces(1, 1)[0].arrays["records"][:] = 1e12
+    scene.stepper.workspaces(1, 1)[0].arrays["records"][:] = 1e12
     np.testing.assert_array_equal(scene.acceleration(state), expected_)
 
 
@@ -311,7 +311,7 @@ def test_who_falls_in_a_call_of_many_steps_is_named_though_others_follow() -> No
     assert scene.parts.spreads
     state.v[1, 0, 7] = np.nan
     for steps in (1, 2, 5):
-        assert scene._advance(state.copy(), np.zeros((2, 0, 0)), steps)[:2] == (0, 7)
+        assert scene.stepper.advance(state.copy(), np.zeros((2, 0, 0)), steps)[:2] == (0, 7)
 
 
 def test_equal_sights_are_counted_once() -> None:

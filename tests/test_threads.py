@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 import flockenv
-import flockenv.scene.scene as scenes
+import flockenv.engine.stepper as steppers
 from flockenv.behaviours import Alignment, Separation
 from flockenv.envs.world import World
 from flockenv.geometry.cell_list import FEWEST_ARRANGED, STEPS_ARRANGED, WORTH_ARRANGING
@@ -60,7 +60,7 @@ def shared(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         seen.append(len(jobs))
         return share(jobs)
 
-    monkeypatch.setattr(scenes, "share", spy)
+    monkeypatch.setattr(steppers, "share", spy)
     return seen
 
 
@@ -169,7 +169,7 @@ def test_a_team_goes_through_the_worlds_of_a_small_batch_of_large_ones(shared: l
 
 
 @pytest.mark.parametrize("name", ["torus", "box"])
-@pytest.mark.parametrize("count", [scenes.FEWEST_TOGETHER, 333])
+@pytest.mark.parametrize("count", [steppers.FEWEST_TOGETHER, 333])
 def test_a_team_of_many_takes_the_step_of_few_agents(name: str, count: int, shared: list[int]) -> None:
     """Some of them have no block, or no row of cells, of their own."""
     scene = NAMED[name].make(count, 20.0)
@@ -213,10 +213,10 @@ def test_a_team_puts_fewer_agents_in_order_than_one_thread() -> None:
     for team, count in ((2, STEPS_ARRANGED - 1), (2, STEPS_ARRANGED), (3, STEPS_ARRANGED)):
         use_threads(team)
         found = scene.step(start, steps=count)
-        luggage = scene._workspaces(1, team)[0].arrays["luggage"]
+        luggage = scene.stepper.workspaces(1, team)[0].arrays["luggage"]
         assert luggage.any() == (count == STEPS_ARRANGED)
         assert_same(scene.step(found, steps=STEPS_ARRANGED - count), expected)
-    assert not scene._workspaces(1, 1)[0].arrays["luggage"].any()
+    assert not scene.stepper.workspaces(1, 1)[0].arrays["luggage"].any()
 
 
 def scene_is_flat(name: str) -> bool:
@@ -273,7 +273,7 @@ def test_a_body_of_another_kind_counts_in_a_large_world() -> None:
 def test_nan_in_a_world_that_was_put_in_order_names_the_agent_by_its_number() -> None:
     scene, start = crowded(NAMED["torus_single"].make(WORTH_ARRANGING, 140.0))
     start.v[1, 0, 12_345] = np.inf
-    world, agent, _ = scene._advance(start.copy(), np.zeros((2, 0, 0), np.float32), 3)
+    world, agent, _ = scene.stepper.advance(start.copy(), np.zeros((2, 0, 0), np.float32), 3)
     apart = scene.space.displacement(start.pos[0, agent], start.pos[0, 12_345])
     assert world == 0 and agent < 12_345  # its neighbours caught it, and theirs
     assert np.linalg.norm(apart) < 3 * 3.0
@@ -312,7 +312,7 @@ def test_worlds_divided_among_threads_are_the_same_worlds(variant: Variant, coun
     for threads_used in (2, 3, 7, 8):
         use_threads(threads_used)
         assert_same(scene.run(start, 4), expected)
-    assert shared == [2, 3, 7, 8 if count >= scenes.FEWEST_TOGETHER else 7]  # worlds apart, or a team of 8
+    assert shared == [2, 3, 7, 8 if count >= steppers.FEWEST_TOGETHER else 7]  # worlds apart, or a team of 8
 
 
 @pytest.mark.parametrize("used", [1, 3])
@@ -418,7 +418,7 @@ def test_scenes_and_worlds_keep_to_what_is_sooner_done(shared: list[int], monkey
     start = scene.start(0)
     expected = scene.run(start, 1)
     assert shared == []
-    choice = scene._tuners.of("together", 640, 2)
+    choice = scene.stepper.tuners.of("together", 640, 2)
     for took, by in (([1.0, 0.5], [2]), ([0.5, 1.0], [])):
         choice._left, choice._wait, choice.took = 0, 100, took
         shared.clear()
@@ -438,7 +438,7 @@ def test_long_calls_are_shared_at_once_where_threads_seldom_wait_for_each_other(
     monkeypatch.setattr(thread_pool.AutoTuner, "always", False)
     use_threads(2)
     scene = NAMED["torus"].make(count, 60.0)
-    start, steps = scene.start(0, worlds=worlds), 1 + scenes.LARGEST // (count * worlds)
+    start, steps = scene.start(0, worlds=worlds), 1 + steppers.LARGEST // (count * worlds)
     scene.run(start, steps - 2)
     assert shared == []
     scene.run(start, steps)

@@ -415,7 +415,7 @@ class World:
             marks=self.task.marks(s, self._memory, world),
             low=np.array(low, np.float64), high=np.array(high, np.float64),
             periodic=self.task.scene.space.periodic, title=type(self.task).__name__,
-            outlines=self.task.scene.outlines(low, high, float(s.time[world])),
+            outlines=self.task.scene.view.outlines(low, high, float(s.time[world])),
         )  # fmt: skip
 
 

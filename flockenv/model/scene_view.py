@@ -71,6 +71,14 @@ class SceneView(Protocol):
         """The first agent of each group, and N."""
 
     @property
+    def roles(self) -> tuple[str, ...]:
+        """The role of each agent, (N,)."""
+
+    @property
+    def edges(self) -> NDArray[Any]:
+        """Pairs of agents along the edges of networks, (E, 2)."""
+
+    @property
     def living(self) -> tuple[int, ...]:
         """Number of agents of each group that live at the start."""
 

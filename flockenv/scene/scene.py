@@ -12,9 +12,7 @@ import functools
 import itertools
 import math
 import operator
-import threading
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,46 +24,39 @@ from flockenv.core.record import Record, keep
 from flockenv.engine import (
     KernelPlan,
     Table,
-    begin_of,
-    field_of,
     flattened,
     pack,
     scratch_bytes,
     scratch_record,
-    step_of,
     worlds_of,
 )
-from flockenv.engine.implicit_step import coupling_of, solve_steps
-from flockenv.engine.workspace import Workspace
+from flockenv.engine.implicit_step import coupling_of
+from flockenv.engine.stepper import Stepper
 from flockenv.geometry.barnes_hut import MOST_DIRECT
 from flockenv.geometry.cell_list import FEWEST_AGENTS
 from flockenv.geometry.shapes import AnyShape, Circle, HalfSpace, Shape
 from flockenv.geometry.space import AnySpace, Box, Plane, Torus
-from flockenv.jit.thread_pool import LARGEST, AutoTuners, at_work, share
 from flockenv.maths.counter_rng import MASK, key_of
 from flockenv.model import state as states
-from flockenv.model.appearance import Appearance
 from flockenv.model.divergence import SimulationDiverged
 from flockenv.model.float_range import check_places
 from flockenv.model.group import Group
 from flockenv.model.networks import EDGE
-from flockenv.model.snapshot import Mark, Snapshot
+from flockenv.model.snapshot import Snapshot
 from flockenv.model.state import Body, Floats, State
-from flockenv.physics.constraints import CONSTRAINTS, Collisions, Constraint, Settler
+from flockenv.physics.constraints import CONSTRAINTS, Collisions, Constraint
 from flockenv.physics.effects import EFFECTS, Effect
 from flockenv.physics.effects.effect import all_masses
 from flockenv.physics.integrators import INTEGRATORS, Adaptive, ImplicitEuler, Integrator, SemiImplicitEuler
 from flockenv.physics.integrators.newton import Coupling
-from flockenv.physics.population import POPULATION, Emitter, Member, beget
-from flockenv.physics.population import settler as population_settler
+from flockenv.physics.population import POPULATION, Member, beget
 from flockenv.physics.population.lifecycle import NUMBERS as POPULATION_NUMBERS
 from flockenv.scene.placement import cells_of, place_groups
 from flockenv.scene.stability import check_contact, check_dt, check_lookahead
+from flockenv.scene.view import View
 
 __all__ = ["Group", "Scene"]
 
-FEWEST_TOGETHER, SURELY_TOGETHER = 128, 4096
-"""Least agents of a world for threads to be allowed to share it (at least 8 blocks), and always in long calls."""
 
 EXACT = 2**24
 """Largest integer, and so number of agents, up to which float32 is exact."""
@@ -378,13 +369,19 @@ class Scene(Record):
         return coupling_of(self)
 
     @functools.cached_property
-    def _params(self) -> Floats:
-        return self.parts.given()
-
-    @functools.cached_property
     def _cells(self) -> tuple[Floats | None, ...]:
         """Centres of the initial cells of each group with a cell per agent, (size, D) m; None for others."""
         return cells_of(self)
+
+    @functools.cached_property
+    def stepper(self) -> Stepper:
+        """The kernels of this scene, and their scratch."""
+        return Stepper(self)
+
+    @functools.cached_property
+    def view(self) -> View:
+        """The scene as pictures show it."""
+        return View(self)
 
     # --- running ----------------------------------------------------------------------------------------------------
 
@@ -406,16 +403,10 @@ class Scene(Record):
             state.obstacle_radius[:, m] = obstacle.radius
         place_groups(self, state, self._cells)
         beget(self, state)
-        self._begin(state, np.ones_like(state.alive))
+        self.stepper.begin(state, np.ones_like(state.alive))
         for effect in self.effects:
             effect.check_start(self, state)
         return state
-
-    def _begin(self, state: State, fresh: NDArray[np.bool_]) -> None:
-        """Write the initial inner numbers of the agents in `fresh`, (B, N)."""
-        if self.parts.inner and fresh.any():
-            scratch = self._workspaces(1, 1)[0].of(0, self._scratch_kind)
-            self._fill_inner(worlds_of(state), self._params, self._dt, fresh, scratch)
 
     def inner(self, state: State, name: str) -> Floats:
         """Return an inner number of every agent by name, as a view, (B, N); see `Effect.keeps`."""
@@ -440,7 +431,7 @@ class Scene(Record):
             _demand_one_piece(out)
             if out is not state:
                 out.copy_from(state)
-        world, agent, reason = self._advance(out, forces, steps)
+        world, agent, reason = self.stepper.advance(out, forces, steps)
         if world >= 0:
             raise self._diverged(out, forces, world, agent, steps, reason)
         return out
@@ -452,7 +443,7 @@ class Scene(Record):
         alone = state.worlds([world])
         push = drive[:, world : world + 1].copy() if drive.shape[1] else drive
         done = 0
-        while done < steps and (bad := self._advance(alone, push, 1))[0] < 0:
+        while done < steps and (bad := self.stepper.advance(alone, push, 1))[0] < 0:
             done += 1
         agent = bad[1] if done < steps else agent
         last, effect = int(alone.tick[0]) + 1, self._blamed(alone, agent)
@@ -504,138 +495,11 @@ class Scene(Record):
         if self.parts.confines:  # as at the start of a step; a given state may be outside the box
             with np.errstate(invalid="ignore"):  # an infinite position has no image, and is no neighbour
                 x = np.ascontiguousarray(self.space.wrap(state.pos).transpose(2, 0, 1), self.dtype)
-        self._accelerate(
-            worlds_of(state)._replace(x=x), self._drive(drive, state), self._params, when, acc, flow,
-            self._workspaces(1, 1)[0].of(0, scratch_record(self._plain_parts)),
+        self.stepper.accelerate(
+            worlds_of(state)._replace(x=x), self._drive(drive, state), self.stepper.params, when, acc, flow,
+            self.stepper.workspaces(1, 1)[0].of(0, scratch_record(self.stepper.plain_parts)),
         )  # fmt: skip
         return acc.transpose(1, 2, 0), flow.transpose(1, 2, 0) if self.parts.flows else None
-
-    def _advance(self, state: State, drive: Floats, steps: int) -> tuple[int, int, str]:
-        """Step in place; return the first (world, agent) that failed, or (-1, -1), and why if numbers are finite."""
-        if steps == 0:
-            return -1, -1, ""
-        if self.integrator.solves:
-            return solve_steps(self, state, drive, steps, self._take_over)
-        return *self._stepped(state, drive, steps), ""
-
-    def _take_over(self, state: State, world: int, x: Floats, v: Floats) -> tuple[int, int]:
-        """Let the kernel finish a step with the solved positions and velocities, (D, N): limits, space, time."""
-        width, (_, n) = self.parts.width, x.shape
-        stages = self._workspaces(1, 1)[0].arrays["stages"]
-        for row, solved in zip(stages, (x, v), strict=True):
-            padded = np.zeros((self.dimension, -(-n // width) * width), self.dtype)
-            padded[:, :n] = solved
-            row[:] = padded.reshape(self.dimension, -1, width).transpose(1, 0, 2).ravel()
-        return self._stepped(state, np.zeros((self.dimension, 0, 0), self.dtype), 1)
-
-    def _stepped(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
-        """Step in place with the kernel: all steps in one call, or one by one with constraints and population."""
-        ends = self.constraints or self.population
-        return self._settled(state, drive, steps) if ends else self._moved(state, drive, steps)
-
-    def _settled(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
-        """Step in place, with constraints and population after each step; a world that fails stays as it was."""
-        kept, x0, v0 = self._remembered(state)
-        begun, failed = state.tick.copy(), np.zeros(len(state.tick), np.bool_)
-        found, births = (-1, -1), bool(self.population and self.parts.inner)
-        for step in range(steps):
-            if self._looks_back:
-                x0[...], v0[...] = state.x, state.v
-            moved = self._moved(state, drive, 1)
-            who = state.identity.copy() if births else None
-            mended = self._mended(x0, v0, state)
-            if who is not None:
-                self._begin(state, state.identity != who)
-            failed |= state.tick != begun + step + 1
-            failed[[world for world, _ in mended]] = True
-            found = min([f for f in (moved, *mended) if f[0] >= 0], default=found) if found[0] < 0 else found
-            if failed.any():
-                state.put(failed, kept)
-                state.tick[failed] += step + 1  # they go on from the kept state
-        if failed.any():
-            state.put(failed, kept)
-        return found
-
-    @functools.cached_property
-    def _looks_back(self) -> bool:
-        """True if constraints or population depend on the start of the step."""
-        return bool(self.constraints) or any(member.looks_back for member in self.population)
-
-    def _remembered(self, state: State) -> tuple[State, Floats, Floats]:
-        """Return a copy of a state, and buffers for positions and velocities: memory of this thread, reused."""
-        memory = vars(self._threads)
-        sizes = state.shape, state.obstacle_radius.shape
-        if memory.get("remembered_sizes") != sizes:
-            memory["remembered"] = state.copy(), np.empty_like(state.x), np.empty_like(state.v)
-            memory["remembered_sizes"] = sizes
-        kept, x0, v0 = memory["remembered"]
-        kept.copy_from(state)
-        return kept, x0, v0
-
-    def _mended(self, x0: Floats, v0: Floats, state: State) -> list[tuple[int, int]]:
-        """Apply all constraints to a step that began at x0, v0; return every (world, agent) that is not finite."""
-        worlds, agents, _ = state.shape
-        crew, work = min(at_work(), worlds), worlds * agents
-
-        def settle(settlers: list[Settler], first: int, end: int) -> list[tuple[int, int]]:
-            return [bad for each in settlers if (bad := each(x0, v0, state, first, end))[0] >= 0]
-
-        def alone() -> list[tuple[int, int]]:
-            return settle(self._settlers(1)[0], 0, worlds)
-
-        def shared() -> list[tuple[int, int]]:
-            bounds = [worlds * k // crew for k in range(crew + 1)]
-            parts = zip(self._settlers(crew), bounds[:-1], bounds[1:], strict=False)
-            return [bad for found in share([functools.partial(settle, *part) for part in parts]) for bad in found]
-
-        return alone() if crew <= 1 else self._tuners.of("mending", work, crew).made(alone, shared, work >= LARGEST)
-
-    def _settlers(self, count: int) -> list[list[Settler]]:
-        """Return the constraints and population of `count` threads, each with scratch memory of its own."""
-        kept: list[list[Settler]] = vars(self._threads).setdefault("settlers", [])
-        while len(kept) < count:
-            last = [population_settler(self)] if self.population else []
-            kept.append([constraint.settler(self) for constraint in self.constraints] + last)
-        return kept
-
-    def _moved(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
-        """Step in place by the kernel alone, on all threads in use.
-
-        Threads divide the worlds, or the agents of a large world.
-        """
-        worlds, agents, _ = state.shape
-        move, kind = self._move, self._scratch_kind
-        arrays = worlds_of(state), drive, self._params, self._dt, steps
-        crew, team = self._divided(worlds, agents)
-
-        def alone() -> tuple[int, int]:
-            return move(*arrays, 0, worlds, 0, 1, self._workspaces(1, 1)[0].of(0, kind))
-
-        if crew <= 1:
-            return alone()
-
-        def shared() -> tuple[int, int]:
-            spaces = self._workspaces(crew // team, team)
-            spaces[0].arrays["sync"][:] = 0
-            parts = [(0, worlds) if team > 1 else (worlds * k // crew, worlds * (k + 1) // crew) for k in range(crew)]
-            found = share([
-                functools.partial(move, *arrays, *parts[k], k % team, team, spaces[k // team].of(k % team, kind))
-                for k in range(crew)
-            ])  # fmt: skip
-            return min([bad for bad in found if bad[0] >= 0], default=(-1, -1))
-
-        work = worlds * agents * steps
-        surely = work >= LARGEST and (team == 1 or agents >= SURELY_TOGETHER)
-        return self._tuners.of("together" if team > 1 else "apart", work, crew).made(alone, shared, surely)
-
-    def _divided(self, worlds: int, agents: int) -> tuple[int, int]:
-        """Return the number of threads that may step these worlds, and the number that share each world.
-
-        With an implicit method the solution is in one thread's scratch memory.
-        """
-        crew, solves = at_work(), self.integrator.adaptive or self.integrator.solves
-        together = worlds < crew and agents >= FEWEST_TOGETHER and not solves
-        return (crew, crew) if together else (min(crew, worlds), 1)
 
     def _check(self, state: State, steps: int) -> None:
         """Raise ValueError if the state does not fit the scene: kernels trust the sizes of their arrays."""
@@ -676,142 +540,11 @@ class Scene(Record):
             raise ValueError(f"drive of world {world}, agent {agent}, axis {axis} is {given[world, agent, axis]}")
         return np.ascontiguousarray(given.transpose(2, 0, 1))
 
-    @property
-    def _dt(self) -> Any:
-        return np.dtype(self.dtype).type(self.dt)
-
-    @functools.cached_property
-    def _plain_parts(self) -> KernelPlan:
-        """The kernel plan for accelerations alone: independent of the integrator, and agents may be at NaN."""
-        return dataclasses.replace(self.parts, integrator=SemiImplicitEuler(), stepped=False)
-
-    @functools.cached_property
-    def _scratch_kind(self) -> Any:
-        return scratch_record(self.parts)
-
-    @functools.cached_property
-    def _accelerate(self) -> Callable[..., None]:
-        return field_of(self._plain_parts)
-
-    @functools.cached_property
-    def _fill_inner(self) -> Callable[..., None]:
-        return begin_of(self.parts)
-
-    @functools.cached_property
-    def _move(self) -> Callable[..., tuple[int, int]]:
-        return step_of(self.parts)
-
-    def _workspaces(self, count: int, team: int) -> list[Workspace]:
-        """Return scratch memory of this thread: two threads may step one scene at the same time."""
-        kept: dict[int, list[Workspace]] = vars(self._threads).setdefault("workspaces", {})
-        found = kept.setdefault(team, [])
-        while len(found) < count:
-            found.append(Workspace.allocate(self.parts, self.body, self.table, team))
-        return found
-
-    @property
-    def _tuners(self) -> AutoTuners:
-        """Measurements, by the calling thread, of whether work is faster on one thread or on several."""
-        found: AutoTuners = vars(self._threads).setdefault("choices", AutoTuners())
-        return found
-
-    @functools.cached_property
-    def _threads(self) -> threading.local:
-        return threading.local()
-
     # --- looking at it ----------------------------------------------------------------------------------------------
 
     def snapshot(self, state: State, world: int = 0, title: str = "") -> Snapshot:
         """Return one world at one instant, for pictures."""
-        low, high = self._view(state, world)
-        return Snapshot(
-            time=float(state.time[world]), pos=state.pos[world], vel=state.vel[world], alive=state.alive[world],
-            heading=state.heading[world] if len(state.frame) else None,
-            radius=np.asarray(self.body.radius, np.float64), roles=self.roles,
-            obstacle_centre=state.obstacles.centre[world], obstacle_radius=state.obstacle_radius[world],
-            marks=self.marks,
-            low=np.array(low, np.float64), high=np.array(high, np.float64),
-            periodic=self.space.periodic, title=title, bonds=self.edges,
-            outlines=self.outlines(low, high, float(state.time[world])),
-            looks=self.looks, look=self.look if self.looks else None,
-            age=state.age[world] if self.population else None,
-            identity=state.identity[world] if self.population else None, inner=self.shown(state, world),
-        )  # fmt: skip
-
-    def shown(self, state: State, world: int = 0) -> NDArray[np.float64] | None:
-        """Return the inner number of every agent that pictures show, (N,), set by its appearance; None without one."""
-        if not any(look.by == "inner" for look in self.looks):
-            return None
-        shown = np.zeros(self.agents)
-        for k, group in enumerate(self.groups):
-            if group.appearance is not None and group.appearance.of is not None:
-                mine = slice(self.starts[k], self.starts[k + 1])
-                shown[mine] = self.inner(state, group.appearance.of)[world, mine]
-        return shown
-
-    @property
-    def looks(self) -> tuple[Appearance, ...]:
-        """Appearances of the groups that have one."""
-        return tuple(group.appearance for group in self.groups if group.appearance is not None)
-
-    @property
-    def look(self) -> NDArray[np.int32]:
-        """Index into `looks` of every agent, (N,); -1: no appearance."""
-        dressed = [group.appearance is not None for group in self.groups]
-        number = np.where(dressed, np.cumsum(dressed) - 1, -1)
-        return np.repeat(number, [group.size for group in self.groups]).astype(np.int32)
-
-    def outlines(
-        self, low: Sequence[float] | NDArray[np.float64], high: Sequence[float] | NDArray[np.float64], time: float = 0.0
-    ) -> tuple[NDArray[np.float64], ...]:
-        """Return the obstacles of `shapes` as polygons, each (n, 2) m, seen from above in a region at a time, s."""
-        region, found = np.array([low, high], np.float64), []
-        for shape in self.shapes:
-            shift = self._shift(shape, time)
-            found += [polygon + shift[:2] for polygon in shape.outline(*(region - shift))]
-        return tuple(found)
-
-    def _shift(self, shape: Shape, time: float) -> Floats:
-        """Return the displacement of a shape at a time, m; on a torus, to its image in the box."""
-        shift = shape.shift(time)
-        if not (shape.moves and self.space.periodic):
-            return shift
-        return np.asarray(self.space.wrap(np.array(shape.anchor) + shift)) - shape.anchor
-
-    def _view(self, state: State, world: int) -> tuple[Sequence[float], Sequence[float]]:
-        """Return the region to show: the space, or the bounds of all agents and obstacles."""
-        if not isinstance(self.space, Plane):
-            return (0.0,) * self.dimension, self.space.extent(self.dimension)
-        pos, living = state.pos[world], state.alive[world]
-        pos = pos[living] if self.population and living.any() else pos  # empty slots have no position
-        margin = 1.0 + 0.05 * float(np.ptp(pos, axis=0).max())
-        low, high = pos.min(axis=0) - margin, pos.max(axis=0) + margin
-        every = np.concatenate([low[None], high[None], *self.extremes(float(state.time[world]))])
-        return tuple(every.min(axis=0)), tuple(every.max(axis=0))
-
-    def extremes(self, *times: float) -> list[Floats]:
-        """Return points that pictures at some times, s, must show: of shapes, emitters, and paths of behaviours."""
-        tracks = [np.asarray(track) + side for track, radius in self._tracks for side in (-radius, radius)]
-        shown = [shape.extremes + shape.shift(time) for shape in self.shapes for time in times]
-        places = [member.place.extremes for member in self.population if isinstance(member, Emitter)]
-        return [*shown, *places, *tracks]
-
-    @functools.cached_property
-    def _tracks(self) -> tuple[tuple[tuple[tuple[float, ...], ...], float], ...]:
-        """The paths of steering behaviours, each once."""
-        ways = dict.fromkeys(effect.way_shown(self) for effect in self.parts.effects if effect.steering)
-        return tuple(way for way in ways if way is not None)
-
-    @property
-    def marks(self) -> tuple[Mark, ...]:
-        """The paths and targets of steering behaviours."""
-        still, size = np.zeros(self.dimension), 2 * max(group.widest for group in self.groups)
-        wishes = [effect for effect in self.parts.effects if effect.steering]
-        places = [getattr(wish, name) for wish in wishes if wish.heads_for for name in wish.places]
-        return (
-            *(Mark("way", np.array(at), still, radius) for track, radius in self._tracks for at in track),
-            *(Mark("goal", np.array(place), still, size) for place in places if place is not None),
-        )
+        return self.view.snapshot(state, world, title)
 
     def with_effects(self, *effects: Effect) -> Scene:
         """Return the same scene with other effects."""

@@ -75,9 +75,11 @@ class Trajectory:
         """Return every instant, ready to be drawn, all in one frame: the space, or the box of all positions."""
         times = (self.step * self.scene.dt).tolist()
         low, high = _region(self.scene, self.pos, self.alive, times)
-        start = replace(self.scene.snapshot(self.first, title=title), outlines=self.scene.outlines(low, high, times[0]))
+        start = replace(
+            self.scene.snapshot(self.first, title=title), outlines=self.scene.view.outlines(low, high, times[0])
+        )
         for k, time in enumerate(times):
-            walls = self.scene.outlines(low, high, time) if self.scene.parts.moving else start.outlines
+            walls = self.scene.view.outlines(low, high, time) if self.scene.parts.moving else start.outlines
             yield replace(
                 start, time=time, pos=self.pos[k], vel=self.vel[k], alive=self.alive[k], low=low, high=high,
                 heading=None if self.heading is None else self.heading[k], outlines=walls,
@@ -190,7 +192,7 @@ class _Film:
         pos, vel, heading = (np.empty(shape, scene.dtype) for _ in range(3))
         who, since = (np.empty(shape[:2], np.int64), np.empty(shape[:2])) if scene.population else (None, None)
         faced = heading if scene.parts.oriented else None
-        shown = np.empty(shape[:2]) if any(look.by == "inner" for look in scene.looks) else None
+        shown = np.empty(shape[:2]) if any(look.by == "inner" for look in scene.view.looks) else None
         return cls(pos, vel, np.empty(shape[:2], np.bool_), faced, who, since, shown, scene, [])
 
     def keep(self, state: State) -> None:
@@ -203,7 +205,7 @@ class _Film:
             if self.identity is not None and self.born is not None:
                 self.identity[k], self.born[k] = state.identity[0], state.born[0]
             if self.shown is not None:
-                self.shown[k] = self.scene.shown(state)
+                self.shown[k] = self.scene.view.shown(state)
             self.step.append(step)
 
 
@@ -212,7 +214,7 @@ def _checked_instants(scene: Scene, steps: int, every: int) -> int:
         raise ValueError(f"steps = {steps} must be at least 0 and every = {every} at least 1")
     instants = 1 + -(-steps // every)
     each = scene.agents * ((2 + scene.parts.oriented) * scene.dimension * np.dtype(scene.dtype).itemsize + 1)
-    each += (16 * bool(scene.population) + 8 * any(look.by == "inner" for look in scene.looks)) * scene.agents
+    each += (16 * bool(scene.population) + 8 * any(look.by == "inner" for look in scene.view.looks)) * scene.agents
     needed = instants * (each + 40)  # the step is a Python number in a list
     if needed > MEMORY_LIMIT:
         rarer = every * math.ceil(needed / MEMORY_LIMIT) * scene.dt
@@ -246,7 +248,7 @@ def _region(
     ends = ((np.min, np.inf), (np.max, -np.inf))
     low, high = (np.asarray(end(pos, axis=(0, 1), where=living, initial=far), np.float64) for end, far in ends)
     margin = 1.0 + 0.05 * float((high - low).max())
-    shown = scene.extremes(*(times if scene.parts.moving else times[:1]))
+    shown = scene.view.extremes(*(times if scene.parts.moving else times[:1]))
     every = np.concatenate([[low - margin], [high + margin], *shown])
     return every.min(axis=0), every.max(axis=0)
 

@@ -85,7 +85,7 @@ def _draw_trial(axes: Axes, trial: Trial) -> None:
     low, high = _region([trial])
     for circle in trial.scene.circles:
         axes.add_patch(Circle((circle.centre[0], circle.centre[1]), circle.radius, color=GRID, ec=FAINT, lw=0.5))
-    for outline in trial.scene.outlines(tuple(low), tuple(high)):
+    for outline in trial.scene.view.outlines(tuple(low), tuple(high)):
         axes.add_patch(Polygon(outline, closed=True, color=GRID, ec=FAINT, lw=0.5))
     colour = COLOURS[1]
     for k in range(trial.path.shape[1]):

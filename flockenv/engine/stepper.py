@@ -1,0 +1,224 @@
+"""Stepper: advances the worlds of a scene in place, on one thread or several, with scratch of its own per thread."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.engine.context import worlds_of
+from flockenv.engine.entry_points import begin_of, field_of, step_of
+from flockenv.engine.implicit_step import solve_steps
+from flockenv.engine.kernel_plan import KernelPlan
+from flockenv.engine.scratch import scratch_record
+from flockenv.engine.workspace import Workspace
+from flockenv.jit.thread_pool import LARGEST, AutoTuners, at_work, share
+from flockenv.model.scene_view import SceneView
+from flockenv.model.state import Floats, State
+from flockenv.physics.constraints import Settler
+from flockenv.physics.integrators import SemiImplicitEuler
+from flockenv.physics.population import settler as population_settler
+
+__all__ = ["FEWEST_TOGETHER", "Stepper"]
+
+FEWEST_TOGETHER, SURELY_TOGETHER = 128, 4096
+"""Least agents of a world for threads to be allowed to share it (at least 8 blocks), and always in long calls."""
+
+
+class Stepper:
+    """The kernels of a scene and what they are passed; each thread that calls it has its own scratch."""
+
+    def __init__(self, scene: SceneView) -> None:
+        """Compile nothing yet: kernels are compiled by their first call."""
+        self.scene = scene
+
+    @functools.cached_property
+    def params(self) -> Floats:
+        """Every number that the kernel is passed."""
+        given: Floats = self.scene.parts.given()
+        return given
+
+    @property
+    def dt(self) -> Any:
+        """The step, s, in the precision of the scene."""
+        return np.dtype(self.scene.dtype).type(self.scene.dt)
+
+    def begin(self, state: State, fresh: NDArray[np.bool_]) -> None:
+        """Write the initial inner numbers of the agents in `fresh`, (B, N)."""
+        if self.scene.parts.inner and fresh.any():
+            scratch = self.workspaces(1, 1)[0].of(0, self._scratch_kind)
+            self._fill_inner(worlds_of(state), self.params, self.dt, fresh, scratch)
+
+    def advance(self, state: State, drive: Floats, steps: int) -> tuple[int, int, str]:
+        """Step in place; return the first (world, agent) that failed, or (-1, -1), and why if numbers are finite."""
+        if steps == 0:
+            return -1, -1, ""
+        if self.scene.integrator.solves:
+            return solve_steps(self.scene, state, drive, steps, self._take_over)
+        return *self._stepped(state, drive, steps), ""
+
+    def _take_over(self, state: State, world: int, x: Floats, v: Floats) -> tuple[int, int]:
+        """Let the kernel finish a step with the solved positions and velocities, (D, N): limits, space, time."""
+        width, (_, n) = self.scene.parts.width, x.shape
+        stages = self.workspaces(1, 1)[0].arrays["stages"]
+        for row, solved in zip(stages, (x, v), strict=True):
+            padded = np.zeros((self.scene.dimension, -(-n // width) * width), self.scene.dtype)
+            padded[:, :n] = solved
+            row[:] = padded.reshape(self.scene.dimension, -1, width).transpose(1, 0, 2).ravel()
+        return self._stepped(state, np.zeros((self.scene.dimension, 0, 0), self.scene.dtype), 1)
+
+    def _stepped(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
+        """Step in place with the kernel: all steps in one call, or one by one with constraints and population."""
+        ends = self.scene.constraints or self.scene.population
+        return self._settled(state, drive, steps) if ends else self._moved(state, drive, steps)
+
+    def _settled(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
+        """Step in place, with constraints and population after each step; a world that fails stays as it was."""
+        kept, x0, v0 = self._remembered(state)
+        begun, failed = state.tick.copy(), np.zeros(len(state.tick), np.bool_)
+        found, births = (-1, -1), bool(self.scene.population and self.scene.parts.inner)
+        for step in range(steps):
+            if self._looks_back:
+                x0[...], v0[...] = state.x, state.v
+            moved = self._moved(state, drive, 1)
+            who = state.identity.copy() if births else None
+            mended = self._mended(x0, v0, state)
+            if who is not None:
+                self.begin(state, state.identity != who)
+            failed |= state.tick != begun + step + 1
+            failed[[world for world, _ in mended]] = True
+            found = min([f for f in (moved, *mended) if f[0] >= 0], default=found) if found[0] < 0 else found
+            if failed.any():
+                state.put(failed, kept)
+                state.tick[failed] += step + 1  # they go on from the kept state
+        if failed.any():
+            state.put(failed, kept)
+        return found
+
+    @functools.cached_property
+    def _looks_back(self) -> bool:
+        """True if constraints or population depend on the start of the step."""
+        return bool(self.scene.constraints) or any(member.looks_back for member in self.scene.population)
+
+    def _remembered(self, state: State) -> tuple[State, Floats, Floats]:
+        """Return a copy of a state, and buffers for positions and velocities: memory of this thread, reused."""
+        memory = vars(self._threads)
+        sizes = state.shape, state.obstacle_radius.shape
+        if memory.get("remembered_sizes") != sizes:
+            memory["remembered"] = state.copy(), np.empty_like(state.x), np.empty_like(state.v)
+            memory["remembered_sizes"] = sizes
+        kept, x0, v0 = memory["remembered"]
+        kept.copy_from(state)
+        return kept, x0, v0
+
+    def _mended(self, x0: Floats, v0: Floats, state: State) -> list[tuple[int, int]]:
+        """Apply all constraints to a step that began at x0, v0; return every (world, agent) that is not finite."""
+        worlds, agents, _ = state.shape
+        crew, work = min(at_work(), worlds), worlds * agents
+
+        def settle(settlers: list[Settler], first: int, end: int) -> list[tuple[int, int]]:
+            return [bad for each in settlers if (bad := each(x0, v0, state, first, end))[0] >= 0]
+
+        def alone() -> list[tuple[int, int]]:
+            return settle(self._settlers(1)[0], 0, worlds)
+
+        def shared() -> list[tuple[int, int]]:
+            bounds = [worlds * k // crew for k in range(crew + 1)]
+            parts = zip(self._settlers(crew), bounds[:-1], bounds[1:], strict=False)
+            return [bad for found in share([functools.partial(settle, *part) for part in parts]) for bad in found]
+
+        return alone() if crew <= 1 else self.tuners.of("mending", work, crew).made(alone, shared, work >= LARGEST)
+
+    def _settlers(self, count: int) -> list[list[Settler]]:
+        """Return the constraints and population of `count` threads, each with scratch memory of its own."""
+        kept: list[list[Settler]] = vars(self._threads).setdefault("settlers", [])
+        while len(kept) < count:
+            last = [population_settler(self.scene)] if self.scene.population else []
+            kept.append([constraint.settler(self.scene) for constraint in self.scene.constraints] + last)
+        return kept
+
+    def _moved(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
+        """Step in place by the kernel alone, on all threads in use.
+
+        Threads divide the worlds, or the agents of a large world.
+        """
+        worlds, agents, _ = state.shape
+        move, kind = self.move, self._scratch_kind
+        arrays = worlds_of(state), drive, self.params, self.dt, steps
+        crew, team = self._divided(worlds, agents)
+
+        def alone() -> tuple[int, int]:
+            return move(*arrays, 0, worlds, 0, 1, self.workspaces(1, 1)[0].of(0, kind))
+
+        if crew <= 1:
+            return alone()
+
+        def shared() -> tuple[int, int]:
+            spaces = self.workspaces(crew // team, team)
+            spaces[0].arrays["sync"][:] = 0
+            parts = [(0, worlds) if team > 1 else (worlds * k // crew, worlds * (k + 1) // crew) for k in range(crew)]
+            found = share([
+                functools.partial(move, *arrays, *parts[k], k % team, team, spaces[k // team].of(k % team, kind))
+                for k in range(crew)
+            ])  # fmt: skip
+            return min([bad for bad in found if bad[0] >= 0], default=(-1, -1))
+
+        work = worlds * agents * steps
+        surely = work >= LARGEST and (team == 1 or agents >= SURELY_TOGETHER)
+        return self.tuners.of("together" if team > 1 else "apart", work, crew).made(alone, shared, surely)
+
+    def _divided(self, worlds: int, agents: int) -> tuple[int, int]:
+        """Return the number of threads that may step these worlds, and the number that share each world.
+
+        With an implicit method the solution is in one thread's scratch memory.
+        """
+        crew, solves = at_work(), self.scene.integrator.adaptive or self.scene.integrator.solves
+        together = worlds < crew and agents >= FEWEST_TOGETHER and not solves
+        return (crew, crew) if together else (min(crew, worlds), 1)
+
+    @functools.cached_property
+    def plain_parts(self) -> KernelPlan:
+        """The kernel plan for accelerations alone: independent of the integrator, and agents may be at NaN."""
+        plan: KernelPlan = self.scene.parts
+        return dataclasses.replace(plan, integrator=SemiImplicitEuler(), stepped=False)
+
+    @functools.cached_property
+    def _scratch_kind(self) -> Any:
+        return scratch_record(self.scene.parts)
+
+    @functools.cached_property
+    def accelerate(self) -> Callable[..., None]:
+        """The kernel that computes accelerations alone."""
+        return field_of(self.plain_parts)
+
+    @functools.cached_property
+    def _fill_inner(self) -> Callable[..., None]:
+        return begin_of(self.scene.parts)
+
+    @functools.cached_property
+    def move(self) -> Callable[..., tuple[int, int]]:
+        """The kernel that steps worlds."""
+        return step_of(self.scene.parts)
+
+    def workspaces(self, count: int, team: int) -> list[Workspace]:
+        """Return scratch memory of this thread: two threads may step one scene at the same time."""
+        kept: dict[int, list[Workspace]] = vars(self._threads).setdefault("workspaces", {})
+        found = kept.setdefault(team, [])
+        while len(found) < count:
+            found.append(Workspace.allocate(self.scene.parts, self.scene.body, self.scene.table, team))
+        return found
+
+    @property
+    def tuners(self) -> AutoTuners:
+        """Measurements, by the calling thread, of whether work is faster on one thread or on several."""
+        found: AutoTuners = vars(self._threads).setdefault("choices", AutoTuners())
+        return found
+
+    @functools.cached_property
+    def _threads(self) -> threading.local:
+        return threading.local()

@@ -1,0 +1,119 @@
+"""View: a scene as pictures show it: a snapshot of a state, outlines of obstacles, the region to show, marks."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.geometry.shapes import Shape
+from flockenv.geometry.space import Plane
+from flockenv.model.appearance import Appearance
+from flockenv.model.scene_view import SceneView
+from flockenv.model.snapshot import Mark, Snapshot
+from flockenv.model.state import Floats, State
+from flockenv.physics.population import Emitter
+
+__all__ = ["View"]
+
+
+class View:
+    """What pictures show of a scene."""
+
+    def __init__(self, scene: SceneView) -> None:
+        """Compute nothing yet."""
+        self.scene = scene
+
+    def snapshot(self, state: State, world: int = 0, title: str = "") -> Snapshot:
+        """Return one world at one instant, for pictures."""
+        low, high = self._view(state, world)
+        return Snapshot(
+            time=float(state.time[world]), pos=state.pos[world], vel=state.vel[world], alive=state.alive[world],
+            heading=state.heading[world] if len(state.frame) else None,
+            radius=np.asarray(self.scene.body.radius, np.float64), roles=self.scene.roles,
+            obstacle_centre=state.obstacles.centre[world], obstacle_radius=state.obstacle_radius[world],
+            marks=self.marks,
+            low=np.array(low, np.float64), high=np.array(high, np.float64),
+            periodic=self.scene.space.periodic, title=title, bonds=self.scene.edges,
+            outlines=self.outlines(low, high, float(state.time[world])),
+            looks=self.looks, look=self.look if self.looks else None,
+            age=state.age[world] if self.scene.population else None,
+            identity=state.identity[world] if self.scene.population else None, inner=self.shown(state, world),
+        )  # fmt: skip
+
+    def shown(self, state: State, world: int = 0) -> NDArray[np.float64] | None:
+        """Return the inner number of every agent that pictures show, (N,), set by its appearance; None without one."""
+        if not any(look.by == "inner" for look in self.looks):
+            return None
+        shown = np.zeros(self.scene.agents)
+        for k, group in enumerate(self.scene.groups):
+            if group.appearance is not None and group.appearance.of is not None:
+                mine = slice(self.scene.starts[k], self.scene.starts[k + 1])
+                shown[mine] = self.scene.inner(state, group.appearance.of)[world, mine]
+        return shown
+
+    @property
+    def looks(self) -> tuple[Appearance, ...]:
+        """Appearances of the groups that have one."""
+        return tuple(group.appearance for group in self.scene.groups if group.appearance is not None)
+
+    @property
+    def look(self) -> NDArray[np.int32]:
+        """Index into `looks` of every agent, (N,); -1: no appearance."""
+        dressed = [group.appearance is not None for group in self.scene.groups]
+        number = np.where(dressed, np.cumsum(dressed) - 1, -1)
+        return np.repeat(number, [group.size for group in self.scene.groups]).astype(np.int32)
+
+    def outlines(
+        self, low: Sequence[float] | NDArray[np.float64], high: Sequence[float] | NDArray[np.float64], time: float = 0.0
+    ) -> tuple[NDArray[np.float64], ...]:
+        """Return the obstacles of `shapes` as polygons, each (n, 2) m, seen from above in a region at a time, s."""
+        region, found = np.array([low, high], np.float64), []
+        for shape in self.scene.shapes:
+            shift = self._shift(shape, time)
+            found += [polygon + shift[:2] for polygon in shape.outline(*(region - shift))]
+        return tuple(found)
+
+    def _shift(self, shape: Shape, time: float) -> Floats:
+        """Return the displacement of a shape at a time, m; on a torus, to its image in the box."""
+        shift = shape.shift(time)
+        if not (shape.moves and self.scene.space.periodic):
+            return shift
+        return np.asarray(self.scene.space.wrap(np.array(shape.anchor) + shift)) - shape.anchor
+
+    def _view(self, state: State, world: int) -> tuple[Sequence[float], Sequence[float]]:
+        """Return the region to show: the space, or the bounds of all agents and obstacles."""
+        if not isinstance(self.scene.space, Plane):
+            return (0.0,) * self.scene.dimension, self.scene.space.extent(self.scene.dimension)
+        pos, living = state.pos[world], state.alive[world]
+        pos = pos[living] if self.scene.population and living.any() else pos  # empty slots have no position
+        margin = 1.0 + 0.05 * float(np.ptp(pos, axis=0).max())
+        low, high = pos.min(axis=0) - margin, pos.max(axis=0) + margin
+        every = np.concatenate([low[None], high[None], *self.extremes(float(state.time[world]))])
+        return tuple(every.min(axis=0)), tuple(every.max(axis=0))
+
+    def extremes(self, *times: float) -> list[Floats]:
+        """Return points that pictures at some times, s, must show: of shapes, emitters, and paths of behaviours."""
+        tracks = [np.asarray(track) + side for track, radius in self._tracks for side in (-radius, radius)]
+        shown = [shape.extremes + shape.shift(time) for shape in self.scene.shapes for time in times]
+        places = [member.place.extremes for member in self.scene.population if isinstance(member, Emitter)]
+        return [*shown, *places, *tracks]
+
+    @functools.cached_property
+    def _tracks(self) -> tuple[tuple[tuple[tuple[float, ...], ...], float], ...]:
+        """The paths of steering behaviours, each once."""
+        ways = dict.fromkeys(effect.way_shown(self.scene) for effect in self.scene.parts.effects if effect.steering)
+        return tuple(way for way in ways if way is not None)
+
+    @property
+    def marks(self) -> tuple[Mark, ...]:
+        """The paths and targets of steering behaviours."""
+        still, size = np.zeros(self.scene.dimension), 2 * max(group.widest for group in self.scene.groups)
+        wishes = [effect for effect in self.scene.parts.effects if effect.steering]
+        places = [getattr(wish, name) for wish in wishes if wish.heads_for for name in wish.places]
+        return (
+            *(Mark("way", np.array(at), still, radius) for track, radius in self._tracks for at in track),
+            *(Mark("goal", np.array(place), still, size) for place in places if place is not None),
+        )
