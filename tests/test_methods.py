@@ -126,7 +126,7 @@ def test_a_medium_carries_to_the_order_of_the_method(row: IntegratorRow) -> None
     assert measured == pytest.approx(row.method.order, abs=0.2)
 
 
-# --- stability ---------------------------------------------------------------------------------------------------------
+# --- stability ------------------------------------------------------------------------------------------------------
 
 
 def growth(method: Integrator, law: Callable[[Array, Array, float], Array]) -> float:

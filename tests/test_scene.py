@@ -384,7 +384,7 @@ def test_with_motion_refuses_what_is_no_motion() -> None:
         assert said in str(caught.value)
 
 
-# --- what is refused when a scene is made --------------------------------------------------------------------------------
+# --- what is refused when a scene is made ----------------------------------------------------------------------------
 
 GROUPS = (Group(count=3, spawn=SPAWN),)
 BAD_SCENES = [
