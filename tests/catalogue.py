@@ -520,12 +520,12 @@ EFFECTS = (
 
 @dataclass(frozen=True)
 class IntegratorRow:
-    """A method, and what numerics.md says of it."""
+    """A method, and its closed forms."""
 
     method: Integrator
-    grown: float  # what 100 grows to with x' = v, v' = v / 10 in ten steps of 1 s (E16)
-    real: float  # largest h |lambda| at which v' = lambda v, lambda < 0, does not grow (3.1)
-    imaginary: float  # largest h omega at which x'' = -omega^2 x does not grow (3.1)
+    grown: float  # what 100 grows to with x' = v, v' = v / 10 in ten steps of 1 s
+    real: float  # largest h |lambda| at which v' = lambda v, lambda < 0, does not grow
+    imaginary: float  # largest h omega at which x'' = -omega^2 x does not grow
 
     @property
     def name(self) -> str:

@@ -97,7 +97,7 @@ METHODS = methods_named(["semi_implicit_euler", "velocity_verlet", "rk4"])
 
 @pytest.mark.slow
 def test_a_speed_limit_makes_every_method_one_of_order_1() -> None:
-    """numerics.md, P09: what a scene does after each step, no method knows of.
+    """What a scene does after each step, no method knows of.
 
     In two dimensions: along a line the speed is just held, and who is held a step too late is O(h^2) off.
     """
@@ -213,7 +213,7 @@ def test_no_tolerance_is_asked_for_that_costs_more_than_the_finest_fixed_steps()
 
 
 def test_energy_is_off_by_the_book() -> None:
-    """numerics.md 3.1: RK4 keeps 1 - y^6/72 + y^8/576 of it per step, y = h w; half of it at most is kinetic."""
+    """RK4 keeps 1 - y^6/72 + y^8/576 of it per step, y = h w; half of it at most is kinetic."""
     oscillator = one("oscillator")
     report = measure(oscillator, methods_named(["rk4"]), repetitions=0)
     assert report.energy == "kinetic and potential (tether)"
@@ -292,7 +292,7 @@ def test_nothing_is_said_below_the_floor(damped: Report) -> None:
     assert rows(damped, [1e-14])[0][3:5] == ["-", "-"]
 
 
-NUMERICS_3_4: dict[str, dict[float, tuple[int | None, ...]]] = {
+EVALUATIONS: dict[str, dict[float, tuple[int | None, ...]]] = {
     "oscillator": {
         1e-1: (8192, 512, 512, 2048, 512),
         1e-3: (None, 32768, 4096, 16384, 2048),
@@ -301,20 +301,20 @@ NUMERICS_3_4: dict[str, dict[float, tuple[int | None, ...]]] = {
     "pendulum": {1e-2: (None, 2048, 256, 1024, 512), 1e-6: (None, None, 32768, 65536, 2048)},
     "kepler": {1e-2: (None, 8192, 2048, 4096, 1024), 1e-6: (None, None, 262144, 262144, 8192)},
 }
-"""numerics.md 3.4 as printed, but for one number: of the Kepler orbit's 1e-6 m by velocity Verlet it says "> 4e5",
-while 262144 steps, 4.5e-7 m, are enough. None = not with 2^18 = 262144; the next power is more than 4e5."""
+"""Evaluations, in powers of two, that reach an error in m. Velocity Verlet's 1e-6 m on the Kepler orbit take 262144
+steps (4.5e-7 m). None: not with 2^18 = 262144; the next power is more than 4e5."""
 
-OF_3_4 = ("explicit_euler", "semi_implicit_euler", "velocity_verlet", "midpoint", "rk4")
+TABULATED = ("explicit_euler", "semi_implicit_euler", "velocity_verlet", "midpoint", "rk4")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NUMERICS_3_4)
+@pytest.mark.parametrize("name", EVALUATIONS)
 def test_accuracy_costs_what_the_table_says(name: str) -> None:
     """Velocity Verlet asks twice per step here, so that drag does not make it order 1; the table counts once."""
     problem = replace(one(name), steps=tuple(2**k for k in range(2, 19)))
-    report = measure(problem, methods_named(OF_3_4), repetitions=0)
-    for tolerance, expected in NUMERICS_3_4[name].items():
-        for kind, evaluations in zip(OF_3_4, expected, strict=True):
+    report = measure(problem, methods_named(TABULATED), repetitions=0)
+    for tolerance, expected in EVALUATIONS[name].items():
+        for kind, evaluations in zip(TABULATED, expected, strict=True):
             twice = 2 if kind == "velocity_verlet" else 1
             points = [p for p in report.curve(kind).points if p.evaluations <= twice * 2**18]
             good = [p.evaluations for p in points if p.error is not None and p.error < tolerance]

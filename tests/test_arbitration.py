@@ -120,7 +120,7 @@ CONFLICT = np.array([[(8.0, 0.0), (-8.0, 0.0), (0.0, 5.0)]])
 
 
 def test_reynolds_budget_and_the_running_sum_differ_on_opposite_wishes() -> None:
-    """(8, 0), (-8, 0), (0, 5) within 10: scalars add up, or the sum gives room back (formulas.md 1.3)."""
+    """(8, 0), (-8, 0), (0, 5) within 10: scalars add up, or the sum gives room back."""
     force, share = reconciled(Allocation(), CONFLICT)
     np.testing.assert_allclose(force, [(6, 0)])
     np.testing.assert_allclose(share, [(1, 0.25, 0)])

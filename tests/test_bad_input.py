@@ -1,4 +1,4 @@
-"""Bad input and odd requests, a row per number of numerics.md 6.1 that concerns scenes and environments.
+"""Bad input and odd requests, a function for each that concerns scenes and environments.
 
 What is refused is refused in one line that names the key, what was given and what is allowed, and leaves everything as
 it was; what is not refused does what is documented. More of each is in the file of whatever refuses it.
@@ -452,7 +452,7 @@ ROWS = (
     b29_closing, b30_copies, b32_side_by_side, b33_states, b34_another_method, b35_toggled, b36_all_at_once,
     b38_observations,
 )  # fmt: skip
-"""A row per number of numerics.md 6.1."""
+"""A function for each request."""
 
 
 SLOW = (b34_another_method,)

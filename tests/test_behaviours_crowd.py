@@ -56,7 +56,7 @@ def test_a_threat_is_the_closest_approach(offset: Any, other: Any, clearance: fl
 
 
 def test_a_threat_is_found_by_the_sum_of_both_radii() -> None:
-    """formulas.md 1.4: twice the own radius lets the small one run into the large one."""
+    """Twice the own radius lets the small one run into the large one."""
     for mine, his in ((0.1, 0.9), (0.9, 0.1)):
         assert np.isfinite(threat((6.0, 0.95), (1.0, 0.0), (-1.0, 0.0), mine + his, 5.0))
     assert threat((6.0, 0.95), (1.0, 0.0), (-1.0, 0.0), 2 * 0.1, 5.0) == np.inf
@@ -253,7 +253,7 @@ def test_a_queue_stops_behind_who_stops_and_closes_up_exponentially() -> None:
 
 @pytest.mark.slow
 def test_a_gap_in_a_queue_is_between_bodies_of_either_size() -> None:
-    """A small one stops the margin short of a large one that stands, not of one of its own size (formulas.md 1.4)."""
+    """A small one stops the margin short of a large one that stands, not of one of its own size."""
     small, large = bodies(1, radius=0.1), bodies(1, radius=0.9)
     scene = crowd((small, large), ((160.0, 100.0), (160.0, 100.0)), behind=(1, 1), queue=4.0)
     state = placed(scene, [(100.0, 100.0), (106.0, 100.0)], [(0.0, 0.0), (0.0, 0.0)])

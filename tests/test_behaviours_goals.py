@@ -139,7 +139,7 @@ def test_arrive_stops_within_a_centimetre_and_does_not_overshoot() -> None:
 
 
 def test_arrive_warns_of_a_ramp_on_which_nobody_can_stop_and_they_do_overshoot() -> None:
-    """The error of several libraries: a look-ahead shorter than the stopping distance (formulas.md 1.4)."""
+    """The error of several libraries: a look-ahead shorter than the stopping distance."""
     arrive = Arrive(weight=50, target=(0, 0), slow_radius=0.2)
     with pytest.warns(LookaheadWarning, match=r"slow_radius = 0.2 m: overshoots.* = 1 m") as told:
         scene = trio(arrive, max_force=4.0)
@@ -478,7 +478,7 @@ ABOUT_OTHERS = tuple(row for row in EFFECTS if row.family == "others")
 
 @pytest.mark.parametrize("row", ABOUT_OTHERS, ids=lambda row: row.name)
 def test_who_is_alone_feels_nothing(row: Any) -> None:
-    """A mean that includes oneself, or a wrong count, would show (formulas.md 1.4)."""
+    """A mean that includes oneself, or a wrong count, would show."""
     scene = scene_of(*row.company(2), groups=(Group(count=1, max_speed=2, spawn=ANYWHERE),))
     state = scene.start(0)
     state.vel[...] = (0.3, -0.4)

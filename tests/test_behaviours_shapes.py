@@ -103,7 +103,7 @@ def test_it_passes_whatever_shape_is_in_the_way(kind: str) -> None:
     "shape", [WALL, Block(centre=(0, -1.6), size=(90, 2)), Capsule(start=(-50, -0.8), end=(50, -0.8), radius=0.2)]
 )
 def test_along_a_wall_to_avoid_is_exactly_zero_and_the_force_field_is_not(shape: Shape) -> None:
-    """numerics.md section 0: the second of the two hard cases. The wall is 0.4 m beside the body."""
+    """The second of two hard cases. The wall is 0.4 m beside the body."""
     np.testing.assert_array_equal(wish(AVOID, obstacles=(shape,)), 0)
     push = wish(FIELD, obstacles=(shape,))
     np.testing.assert_allclose(push, [0, 2 / 0.4**2], atol=1e-9)
@@ -208,7 +208,7 @@ def test_in_space_whiskers_feel_above_and_below_too() -> None:
 
 
 def test_in_a_corridor_the_force_field_of_both_walls_leads_to_the_middle_without_chatter() -> None:
-    """formulas.md 1.4: the nearest wall alone pushes to and fro."""
+    """The nearest wall alone pushes to and fro."""
     walls = (HalfSpace(point=(0, -0.9), direction=(0, 1)), HalfSpace(point=(0, 0.9), direction=(0, -1)))
     np.testing.assert_allclose(wish(FIELD, obstacles=walls), 0, atol=1e-12)
     x, v = path(scene(FIELD, SEEK, obstacles=walls, at=(0.0, 0.3)), 6)
@@ -451,7 +451,7 @@ def test_a_way_that_cannot_be_is_refused(change: Any, text: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["circle", "block", "wall"])
 def test_nobody_is_drawn_to_whom_an_obstacle_hides(kind: str) -> None:
-    """formulas.md: forces are not applied if there are obstacles in the way."""
+    """Forces are not applied if there are obstacles in the way."""
     spots = ((0.0, 0.0), (2.0, 0.0), (0.0, 2.0))
     groups = tuple(Group(count=1, radius=0.05, spawn=Spawn(low=spot, high=spot)) for spot in spots)
     effects = (Cohesion(weight=1, radius=5, occluded=True),)

@@ -1,4 +1,4 @@
-"""Walls that bodies bounce off: numerics.md N05, N06, P19, P20, P22 and 3.3, for every method."""
+"""Walls that bodies bounce off: N05, N06, P19 and closed forms, for every method."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def test_who_rests_stays_until_something_lifts_him(row: IntegratorRow) -> None:
 @pytest.mark.parametrize("dt", [0.01, 0.1, 2.5])
 @METHODS
 def test_billiards_by_unfolding(row: IntegratorRow, dt: float) -> None:
-    """numerics.md 3.3: x0 = 0.37, v = 3.3, L = 1, 10 s: 0.63 after 33 bounces."""
+    """x0 = 0.37, v = 3.3, L = 1, 10 s: 0.63 after 33 bounces."""
     scene = hall((0.0, 0.0), size=1.0, dt=dt, integrator=row.method)
     end = scene.run(at(scene, (0.37, 0.2), (3.3, -0.7)), round(10 / dt))
     np.testing.assert_allclose(end.pos[0, 0], (0.63, 0.8), atol=1e-11)

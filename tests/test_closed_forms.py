@@ -1,4 +1,4 @@
-"""What the textbook says in a formula: drag, gravity, central fields, vortices, Kepler's orbits (numerics.md 3.3, 6.2).
+"""What the textbook says in a formula: drag, gravity, central fields, vortices, Kepler's orbits.
 
 Several effects share one kernel per method: those that a test does not speak of are there and idle.
 """
@@ -107,7 +107,7 @@ def test_quadratic_drag_is_along_the_velocity_and_not_per_axis() -> None:
 
 
 def test_semi_implicit_euler_keeps_its_own_energy_in_a_fall() -> None:
-    """numerics.md 3.2: v^2 / 2 + g y - h v g / 2 is what it conserves, to rounding; the plain energy drifts."""
+    """v^2 / 2 + g y - h v g / 2 is what it conserves, to rounding; the plain energy drifts."""
     scene = falling(SemiImplicitEuler(), 0.01)
     x, v = path(scene, begin(scene, (0, 0), (1, 2)), 100, 10)
     plain = (v**2).sum(axis=1) / 2 + G * x[:, 1]
@@ -206,7 +206,7 @@ def test_forces_are_the_slopes_of_the_potentials_that_effects_state(dimension: i
     assert [effect.potential(scene.groups, start, scene.space.displacement) for effect in silent] == [None] * 3
 
 
-KEPLER = {  # numerics.md, N04: 1000 steps a turn, 100 turns; energy and angular momentum to within so much
+KEPLER = {  # N04: 1000 steps a turn, 100 turns; energy and angular momentum to within so much
     "velocity_verlet": (VelocityVerlet(), 4e-4, 1e-12, -1.466),
     "rk4": (RK4(), 3e-7, 5e-8, 0.0),
     "semi_implicit_euler": (SemiImplicitEuler(), 2e-2, 1e-12, None),
@@ -269,7 +269,7 @@ def tracer(method: Integrator, dt: float, **fields: Any) -> Scene:
 
 @pytest.mark.slow
 def test_a_tracer_goes_around_a_vortex_in_the_time_of_the_formula() -> None:
-    """numerics.md, N16: RK4, ten turns of 200 steps, |dr / r| <= 1e-6; a turn takes 6.936637 s."""
+    """N16: RK4, ten turns of 200 steps, |dr / r| <= 1e-6; a turn takes 6.936637 s."""
     assert pytest.approx(6.936637, abs=5e-7) == TURN
     scene = tracer(RK4(), TURN / 200)
     x, v = path(scene, begin(scene, (0.5 + R, -0.3), (0, 0)), 2000, 1)
@@ -305,7 +305,7 @@ def test_in_space_a_vortex_turns_about_its_axis() -> None:
 
 
 def test_a_tether_damps_what_it_holds() -> None:
-    """numerics.md E2: F = -k u - c v; with the other sign of v it would pump."""
+    """F = -k u - c v; with the other sign of v it would pump."""
     held = Scene(
         groups=(Group(count=1, mass=2, spawn=Spawn(low=(1, 0), high=(1, 0), speed=(3, 3), heading=(0, 1))),),
         effects=(Tether(centre=(0, 0), stiffness=8, damping=0.5),),

@@ -131,7 +131,7 @@ def momentum(of: Scene, state: State) -> Array:
 def test_a_damped_hit_gives_back_what_the_formula_says(
     ratio: float, released: float, kept: float, adhesive: bool
 ) -> None:
-    """numerics.md P18, to 2 %, whatever the masses; the formula to four digits."""
+    """To 2 %, whatever the masses; the formula to four digits."""
     expected = kept if adhesive else released
     assert restitution(ratio, adhesive) == pytest.approx(expected, abs=6e-5)
     for masses in ((2.0, 0.5), (0.3, 0.3)):
@@ -194,7 +194,7 @@ def test_friction_below_coulomb_s_bound_is_helbing_s_and_above_it_mu_times_the_n
 
 
 def test_two_who_touch_feel_helbing_s_contact() -> None:
-    """k g n + kappa g dv.t t with dv = v_j - v_i, t = (-n_y, n_x): formulas.md 2.1."""
+    """k g n + kappa g dv.t t with dv = v_j - v_i, t = (-n_y, n_x)."""
     pair = bodies(friction=700.0)
     pos, vel = np.array([(0.1, 0.2), (0.45, 0.5)]), np.array([(0.3, -0.8), (-1.1, 0.4)])
     force = forces(pair, begun(pair, pos, vel))
@@ -246,7 +246,7 @@ def warned(of: Scene) -> list[str]:
     (ImplicitEuler(), 105.3),
 ])  # fmt: skip
 def test_how_many_steps_a_contact_wants(method: Integrator, steps: float) -> None:
-    """Explicit Euler: (1 + y^2)^(pi / 2y) = 1.05 (numerics.md P17), and .002 to spare."""
+    """Explicit Euler: (1 + y^2)^(pi / 2y) = 1.05, and .002 to spare."""
     y = contact_limit(method)
     assert math.pi / y == pytest.approx(steps, abs=0.5)
     if method.kind in ("explicit_euler", "implicit_euler"):

@@ -299,7 +299,7 @@ def test_it_is_finite_where_everybody_is_in_one_place_at_rest(row: EffectRow, di
 
 @DIMENSIONS
 def test_whoever_is_in_one_place_separates_in_different_directions(dimension: int) -> None:
-    """numerics.md, P28: finite, momentum unchanged, apart after 1 s, and not all to the same side."""
+    """P28: finite, momentum unchanged, apart after 1 s, and not all to the same side."""
     scene = scene_of(Separation(weight=1, radius=2), dimension=dimension, groups=(
         Group(count=50, max_speed=3, spawn=Spawn(low=(0,) * dimension, high=(1,) * dimension)),))  # fmt: skip
     state = scene.start(0)
@@ -579,7 +579,7 @@ def test_a_second_process_compiles_nothing_and_finds_the_same() -> None:
 
 
 def test_drag_slows_down_exponentially() -> None:
-    """v = v0 exp(-c t / m), x = x0 + v0 (1 - exp(-c t / m)) m / c (numerics.md 3.3), for each body's own mass."""
+    """v = v0 exp(-c t / m), x = x0 + v0 (1 - exp(-c t / m)) m / c, for each body's own mass."""
     scene = scene_of(Drag(rate=0.4), integrator=RK4(), dt=0.02)
     start = scene.start(1)
     end = scene.run(start, 150)

@@ -130,7 +130,7 @@ def test_on_a_torus_the_nearest_image_of_a_centre_acts(dimension: int) -> None:
 
 @pytest.mark.slow
 def test_fluctuations_do_not_depend_on_the_step() -> None:
-    """numerics.md, P15: var x after T within 5 % for three steps, and (s/m)^2 T^3 / 3; var v = (s/m)^2 T."""
+    """var x after T within 5 % for three steps, and (s/m)^2 T^3 / 3; var v = (s/m)^2 T."""
     seconds, s, m = 2.0, 0.6, 1.5
     for dt in (0.1, 0.05, 0.025):
         scene = scene_of(Fluctuation(strength=s), Drag(rate=0), count=10_000, mass=m, dt=dt)

@@ -287,13 +287,13 @@ def scaled(A: Any, M: Any) -> Floats:
 
 
 def chain(free: int) -> Floats:
-    """sin((2 k - 1) pi / (2 (2 N + 1))): N equal masses in a row, the first tied to a wall (numerics.md 3.3)."""
+    """sin((2 k - 1) pi / (2 (2 N + 1))): N equal masses in a row, the first tied to a wall."""
     k = np.arange(1, free + 1)
     return np.asarray(np.sin((2 * k - 1) * np.pi / (2 * (2 * free + 1))))
 
 
 def test_a_rope_of_equal_masses_sounds_like_a_chain() -> None:
-    """numerics.md 3.3: N = 20, k = 400, m = 0.1; fixed-free, fixed-fixed and free-free."""
+    """N = 20, k = 400, m = 0.1; fixed-free, fixed-fixed and free-free."""
     rope = Rope(links=20, length=2, pinned=("start",))
     K = stiffness(rope.points(2), rope.elements(2), Material(young=400 * 0.1, area=1))
     M = sparse.diags_array(np.repeat(rope.masses(2.1, 2), 2))

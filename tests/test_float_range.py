@@ -1,4 +1,4 @@
-"""Far from the origin: the same motion in double precision, one clear line in single (numerics.md P36, N17)."""
+"""Far from the origin: the same motion in double precision, one clear line in single (N17)."""
 
 from __future__ import annotations
 

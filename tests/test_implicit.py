@@ -239,7 +239,7 @@ def test_free_springs_keep_momentum() -> None:
 
 
 def test_implicit_midpoint_keeps_the_energy_of_a_linear_network() -> None:
-    """Without rest lengths springs are linear; numerics.md 3.1: exactly, here 1e-12 over 1,000 steps."""
+    """Without rest lengths springs are linear: exactly, here 1e-12 over 1,000 steps."""
     sheet = Group(network=Cloth(cells=(2, 2), sides=(1.0, 0.8), pinned=("corners",)), mass=0.05)
     effects = Springs(stiffness=40.0, rest=0.0), Gravity(acceleration=(0.0, 0.0))
     scene = Scene(groups=(sheet,), effects=effects, integrator=ImplicitMidpoint(), dt=0.05)

@@ -54,7 +54,7 @@ def alone(row: IntegratorRow) -> Alone:
 
 
 def exact(t: float) -> tuple[float, float]:
-    """The damped oscillator at time t (numerics.md 3.3)."""
+    """The damped oscillator at time t."""
     decay, wd = math.exp(-ZETA * W * t), W * math.sqrt(1 - ZETA**2)
     a, b = X0, (V0 + ZETA * W * X0) / wd
     x = decay * (a * math.cos(wd * t) + b * math.sin(wd * t))
@@ -96,7 +96,7 @@ def test_the_orders_are_those_of_the_table() -> None:
 
 @pytest.mark.slow
 def test_a_speed_limit_takes_the_order_away(tether: Any) -> None:
-    """numerics.md, P09: nobody may read "order 4" off a scene with a clamp after each step."""
+    """Nobody may read "order 4" off a scene with a clamp after each step."""
     end = oscillator(tether, "compiled", max_speed=0.9)
     seconds = 0.7 * PERIOD
     measured = order(end, RK4(), motion(end(RK4(), seconds / 2**17, 2**17)), seconds, first=40)
@@ -112,7 +112,7 @@ def test_both_ways_take_the_same_steps(row: IntegratorRow, tether: Any) -> None:
 
 @METHODS
 def test_growth_is_the_worked_example_s(row: IntegratorRow) -> None:
-    """numerics.md, E16: x = 100 exp(t / 10) as x'' = x' / 10, ten steps of 1 s."""
+    """x = 100 exp(t / 10) as x'' = x' / 10, ten steps of 1 s."""
     state = blank(1, 1, 2, 0, 1.0)
     state.x[...], state.v[...] = 100.0, 10.0
     for _ in range(10):
@@ -130,7 +130,7 @@ def energies(end: Advance, method: Integrator, w: float, dt: float, counts: Any)
 
 @WAYS
 def test_explicit_euler_pumps_energy_by_the_book(way: str, tether: Any) -> None:
-    """numerics.md, P01: E_n = (1 + h^2 w^2)^n E_0. An Euler that moves with the new velocity is found out here."""
+    """E_n = (1 + h^2 w^2)^n E_0. An Euler that moves with the new velocity is found out here."""
     w, h, counts = 2 * math.pi, 0.01, (1, 10, 1000)
     found = energies(oscillator(tether, way, w, zeta=0), ExplicitEuler(), w, h, counts)
     expected = (V0**2 + w * w * X0**2) * (1 + h * h * w * w) ** np.array(counts)
@@ -139,7 +139,7 @@ def test_explicit_euler_pumps_energy_by_the_book(way: str, tether: Any) -> None:
 
 @WAYS
 def test_rk4_loses_energy_by_the_book(way: str, tether: Any) -> None:
-    """Per step 1 - y^6/72 + y^8/576 with y = h w (numerics.md 3.1)."""
+    """Per step 1 - y^6/72 + y^8/576 with y = h w."""
     w, h, counts = 2 * math.pi, 0.05, (1, 10, 1000)
     found = energies(oscillator(tether, way, w, zeta=0), RK4(), w, h, counts)
     y = h * w
@@ -149,7 +149,7 @@ def test_rk4_loses_energy_by_the_book(way: str, tether: Any) -> None:
 
 @pytest.mark.parametrize(("way", "steps"), [("python", 3000), ("compiled", 100_000)])
 def test_semi_implicit_euler_keeps_its_invariant(way: str, steps: int, tether: Any) -> None:
-    """v^2 + w^2 x^2 - h w^2 x v does not change at all (numerics.md 3.2)."""
+    """v^2 + w^2 x^2 - h w^2 x v does not change at all."""
     w, h = 2 * math.pi, 0.01
     end = oscillator(tether, way, w, zeta=0)
     start = V0**2 + w * w * X0**2 - h * w * w * X0 * V0
@@ -161,7 +161,7 @@ def test_semi_implicit_euler_keeps_its_invariant(way: str, steps: int, tether: A
 @pytest.mark.slow
 @pytest.mark.parametrize(("way", "steps"), [("python", 3000), ("compiled", 100_000)])
 def test_velocity_verlet_keeps_its_invariant(way: str, steps: int, tether: Any) -> None:
-    """v^2 + w^2 x^2 (1 - h^2 w^2 / 4) does not change at all (numerics.md 3.2)."""
+    """v^2 + w^2 x^2 (1 - h^2 w^2 / 4) does not change at all."""
     w, h = 2 * math.pi, 0.01
     end, share = oscillator(tether, way, w, zeta=0), 1 - h * h * w * w / 4
     start = V0**2 + w * w * X0**2 * share
@@ -173,7 +173,7 @@ def test_velocity_verlet_keeps_its_invariant(way: str, steps: int, tether: Any) 
 @WAYS
 @pytest.mark.parametrize("method", [Midpoint(), Heun()], ids=lambda method: method.kind)
 def test_methods_of_order_2_pump_energy_by_the_book(method: Integrator, way: str, tether: Any) -> None:
-    """Per step 1 + y^4/4 with y = h w (numerics.md 3.1)."""
+    """Per step 1 + y^4/4 with y = h w."""
     w, h, counts = 2 * math.pi, 0.05, (1, 10, 1000)
     found = energies(oscillator(tether, way, w, zeta=0), method, w, h, counts)
     expected = (V0**2 + w * w * X0**2) * (1 + (h * w) ** 4 / 4) ** np.array(counts)
@@ -194,7 +194,7 @@ def test_a_constant_force_leads_along_a_parabola(row: IntegratorRow) -> None:
 
 @pytest.mark.slow
 def test_energy_after_a_hundred_periods_is_the_table_s(tether: Any) -> None:
-    """100 steps per period (numerics.md 3.1): 1.29272e17 explicit, 0.9999915 RK4, within 3.3 % semi-implicit."""
+    """100 steps per period: 1.29272e17 explicit, 0.9999915 RK4, within 3.3 % semi-implicit."""
     w = 2 * math.pi
     end = oscillator(tether, "compiled", w, zeta=0)
     start = V0**2 + w * w * X0**2

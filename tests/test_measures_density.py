@@ -200,7 +200,7 @@ def test_a_crowd_that_walks_as_juelichs_is_in_all_bins_and_below_weidmann() -> N
     assert in_juelich(rho, v + 0.3) == 0
     off = from_weidmann(rho, v)
     assert off.samples == 2500
-    assert -0.25 < off.mean < -0.1  # numerics.md A3: real corridors lie below it
+    assert -0.25 < off.mean < -0.1  # real corridors lie below it
     assert from_weidmann(rho, weidmann_speed(rho))[1:3] == pytest.approx((0, 0), abs=1e-12)
     assert from_weidmann(rho, weidmann_speed(rho) + 0.2).worst == pytest.approx(0.2, abs=0.01)
     assert math.isnan(in_juelich([0.1], [1.0]))

@@ -1,4 +1,4 @@
-"""Methods on the problems of numerics.md: orders where time enters, stability limits, orbits, drag, steps of their own.
+"""Methods on hard problems: orders where time enters, stability limits, orbits, drag, steps of their own.
 
 What holds for every method is in test_integrators.py; here are the harder problems, and what is particular to some.
 """
@@ -100,7 +100,7 @@ def test_the_exact_solutions_solve_their_equations() -> None:
 
 
 def test_heun_and_midpoint_differ_where_time_enters(tether: Any) -> None:
-    """numerics.md, P06: on linear problems without time they are the same method."""
+    """On linear problems without time they are the same method."""
     end = tethered(tether, "python", stiffness=1, push=1)
     errors = [math.dist(motion(end(method, 0.01, 200)), forced(2.0)) for method in (Heun(), Midpoint())]
     assert errors[1] > 1.5 * errors[0]
@@ -126,7 +126,7 @@ def test_a_medium_carries_to_the_order_of_the_method(row: IntegratorRow) -> None
     assert measured == pytest.approx(row.method.order, abs=0.2)
 
 
-# --- stability (numerics.md 3.1) --------------------------------------------------------------------------------------
+# --- stability ------------------------------------------------------------------------------------------------------
 
 
 def growth(method: Integrator, law: Callable[[Array, Array, float], Array]) -> float:
@@ -166,7 +166,7 @@ def test_oscillations_are_stable_up_to_the_limit_of_the_table(row: IntegratorRow
 
 @pytest.mark.parametrize("zeta", [0.5, 1.0, 2.0])
 def test_damped_semi_implicit_euler_is_stable_up_to_its_limit(zeta: float) -> None:
-    """numerics.md, P02: h omega < 2 (sqrt(1 + zeta^2) - zeta); damping makes it smaller."""
+    """h omega < 2 (sqrt(1 + zeta^2) - zeta); damping makes it smaller."""
     limit = 2 * (math.sqrt(1 + zeta**2) - zeta)
     for share, grows in ((0.99, False), (1.01, True)):
         w = share * limit
@@ -176,7 +176,7 @@ def test_damped_semi_implicit_euler_is_stable_up_to_its_limit(zeta: float) -> No
 
 @pytest.mark.parametrize(("kind", "grown"), [(AdaptiveRK4, False), (DormandPrince, False)], ids=["rk4", "dormand"])
 def test_no_oscillation_grows_by_extrapolation(kind: type[Integrator], grown: bool) -> None:
-    """numerics.md, P04: with the two results of step doubling extrapolated it would, at any step."""
+    """With the two results of step doubling extrapolated it would, at any step."""
     for y in (0.05, 0.1, 0.2):
         found = growth(kind(tolerance=1e30), lambda x, v, t, y=y: -y * y * x)
         assert found**10_000 <= 1 + 1e-9
@@ -214,7 +214,7 @@ def off(state: State, given: dict[str, Any]) -> float:
 def test_a_narrow_orbit_costs_what_the_table_says(
     method: Integrator, evaluations: int, error: float, way: str, tether: Any
 ) -> None:
-    """Kepler e = 0.9, one period (numerics.md, E4 and 3.4); fixed RK4 takes 40,000 evaluations for 1.1e-6."""
+    """Kepler e = 0.9, one period; fixed RK4 takes 40,000 evaluations for 1.1e-6."""
     given = orbit(0.9)
     after = tethered(tether, way, **given)(method, 2 * math.pi, 1)
     steps = after.counted("substeps") + after.counted("rejected_steps")
@@ -251,7 +251,7 @@ def test_a_tolerance_a_thousand_times_smaller_pays(kind: type[Integrator], tethe
     ids=lambda value: getattr(value, "kind", None),
 )
 def test_a_hundred_orbits_keep_what_they_keep(method: Integrator, energy: float, spin: float, tether: Any) -> None:
-    """numerics.md, N04: e = 0.6, 1000 steps per period."""
+    """N04: e = 0.6, 1000 steps per period."""
     given = orbit(0.6)
     end, worst = tethered(tether, "compiled", **given), 0.0
     for k in range(1, 5):
@@ -288,7 +288,7 @@ def test_phi_functions_of_single_precision_are_of_single_precision() -> None:
 @WAYS
 @pytest.mark.parametrize("steps", [1, 3, 50])
 def test_a_projectile_with_drag_lands_where_the_book_says(steps: int, way: str, tether: Any) -> None:
-    """numerics.md 3.3: v = (10, 15), kappa = 0.2: 2.798418 s and 21.43051 m, at every step."""
+    """v = (10, 15), kappa = 0.2: 2.798418 s and 21.43051 m, at every step."""
     seconds = 2.798418
     end = tethered(tether, way, pos=0.0, vel=(10.0, 15.0), drag=0.2)
     assert end(ExponentialDrag(), seconds / steps, steps).pos[0, 0, 0] == pytest.approx(21.43051, abs=5e-6)
@@ -299,7 +299,7 @@ def test_a_projectile_with_drag_lands_where_the_book_says(steps: int, way: str, 
 @WAYS
 @pytest.mark.parametrize("stiff", [1.9, 2.1, 10.0, 1e6])
 def test_stiff_drag_is_monotone_and_never_reverses(stiff: float, way: str, tether: Any) -> None:
-    """numerics.md, N20: dt = 0.5 and h kappa from 1.9 on; the exact motion at every step."""
+    """N20: dt = 0.5 and h kappa from 1.9 on; the exact motion at every step."""
     drag, weight, dt = stiff / 0.5, -9.81, 0.5
     end = tethered(tether, way, pos=0.0, vel=0.3, drag=drag, weight=weight)
     speeds = [0.3]
@@ -425,7 +425,7 @@ def test_the_clock_runs_through_every_stage(kind: type[Integrator]) -> None:
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-6, 1e-9])
 @pytest.mark.parametrize("jump", [1.0, 10.0])
 def test_a_force_that_jumps_is_crossed(kind: type[Integrator], tolerance: float, jump: float) -> None:
-    """numerics.md, P10: less than 20 steps are rejected per crossing, and it ends; x'' = -J sign x from x = 0.3."""
+    """Less than 20 steps are rejected per crossing, and it ends; x'' = -J sign x from x = 0.3."""
     dt, seconds = 0.05, 20 / math.sqrt(jump)
     state, method, crossings = at_start(blank(1, 1, 2, 0, dt), 0.3, 0.0), kind(tolerance=tolerance), 0
     for _ in range(int(seconds / dt)):

@@ -71,7 +71,7 @@ def total(values: Array, i: Array, count: int) -> Array:
 
 
 def expected(effect: Any, x: Array, v: Array, space: Space) -> Array:
-    """The forces (N, D) of one of the three rules, written from formulas.md 1.2."""
+    """The forces (N, D) of one of the three rules, written from their formulas."""
     n = len(x)
     if effect.weight == 0:
         return np.zeros_like(x)
@@ -321,7 +321,7 @@ def on_edges(space: Torus, reach: float) -> Array:
 
 @pytest.mark.parametrize("size", [(5.005, 6.0), (8.009, 9.0), (3.1, 20.0)])
 def test_agents_on_the_edges_of_cells(size: Any) -> None:
-    """numerics.md, P34. They are ulps apart: cohesion and alignment, because pushes of 1e15 N would hide the others."""
+    """They are ulps apart: cohesion and alignment, because pushes of 1e15 N would hide the others."""
     space = Torus(size=size)
     x = on_edges(space, 1.0)
     assert len(x) > 96

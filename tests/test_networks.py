@@ -173,7 +173,7 @@ def test_a_cloth_has_the_springs_it_should(cells: tuple[int, int]) -> None:
     ("shear", "bend", "printed"), [(False, False, "3.93"), (True, False, "7.80"), (True, True, "9.75")]
 )
 def test_the_stiffest_motion_of_a_cloth_is_that_of_the_table(shear: bool, bend: bool, printed: str) -> None:
-    """numerics.md 3.3: 12 x 12 nodes of mass m, all springs of stiffness k: omega^2 m / k."""
+    """12 x 12 nodes of mass m, all springs of stiffness k: omega^2 m / k."""
     cloth = Cloth(cells=(11, 11), sides=(11, 11), shear=shear, bend=bend)
     points, (i, j, _, _) = cloth.points(2), cloth.springs(2)
     way = points[j] - points[i]

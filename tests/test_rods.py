@@ -94,7 +94,7 @@ def test_a_pendulum_keeps_its_length_its_energy_and_its_period() -> None:
 
 
 def test_a_hanging_chain_is_the_catenary_of_its_links() -> None:
-    """tan theta_i = (m g / H)(i - (n + 1) / 2), H so that sum l cos theta_i = span (numerics.md 3.3)."""
+    """tan theta_i = (m g / H)(i - (n + 1) / 2), H so that sum l cos theta_i = span."""
     links, long, span = 8, 2.0, 1.3
     rope = Rope(links=links, start=(0, 0), end=(span, 0), length=long, pinned=("ends",))
     scene = hanging(rope, 0.01, drag=1.5, mass=0.2)

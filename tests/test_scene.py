@@ -262,7 +262,7 @@ def test_a_number_of_steps_that_is_none_is_refused(steps: Any) -> None:
 
 
 def test_the_clock_does_not_drift() -> None:
-    """numerics.md, P13: a million times 0.1 s is 100000 s, not 100000.00000133."""
+    """A million times 0.1 s is 100000 s, not 100000.00000133."""
     scene = scene_of(dt=0.1, groups=(Group(count=1, spawn=SPAWN),))
     assert scene.run(scene.start(0), 1_000_000).time[0] == 1_000_000 * 0.1
 
@@ -276,7 +276,7 @@ def test_a_drive_is_a_force_and_lasts_for_the_whole_step() -> None:
 
 @pytest.mark.parametrize("far", [0.0, 1e4, 1e7])
 def test_motion_far_from_the_origin_is_the_same_motion(far: float) -> None:
-    """numerics.md, P36: relative trajectories agree to 1e-6 in float64."""
+    """Relative trajectories agree to 1e-6 in float64."""
     scene = scene_of(Separation(weight=1.3, radius=2.5))
     start = scene.start(2)
     away = start.with_motion(start.pos + far, start.vel)
@@ -384,7 +384,7 @@ def test_with_motion_refuses_what_is_no_motion() -> None:
         assert said in str(caught.value)
 
 
-# --- what is refused when a scene is made (numerics.md 6.1) -----------------------------------------------------------
+# --- what is refused when a scene is made ----------------------------------------------------------------------------
 
 GROUPS = (Group(count=3, spawn=SPAWN),)
 BAD_SCENES = [

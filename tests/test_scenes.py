@@ -66,7 +66,7 @@ def energy(state: State, mass: Array) -> float:
 @FAST
 @pytest.mark.filterwarnings(UNSOLVED)
 def test_in_no_scene_does_anybody_overlap_or_get_out(name: str) -> None:
-    """Less than 5 % of the radius, which is what numerics.md N23 allows."""
+    """Less than 5 % of the radius, which is what case N23 allows."""
     scene = scene_of(name)
     state, worst = scene.start(0), 0.0
     every = max(1, round(0.05 / scene.dt))

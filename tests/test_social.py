@@ -453,7 +453,7 @@ def approach(v0: float, tau: float, decay: float, acceleration: float) -> tuple[
 def test_who_walks_against_a_wall_oscillates_if_and_only_if_kretz_says(
     v0: float, tau: float, decay: float, acceleration: float
 ) -> None:
-    """v0 tau / B <= 1/4 excludes it (arXiv 1507.02566), and the gap is B ln(A tau / v0) (numerics.md N13)."""
+    """v0 tau / B <= 1/4 excludes it (arXiv 1507.02566), and the gap is B ln(A tau / v0) (N13)."""
     speeds, gap = approach(v0, tau, decay, acceleration)
     turns = np.abs(np.diff(np.sign(speeds[np.abs(speeds) > 1e-6]))) > 0
     ratio = v0 * tau / decay
@@ -502,7 +502,7 @@ def test_head_on_a_side_bias_breaks_the_deadlock_to_the_right() -> None:
 
 
 def test_presets_have_the_published_values() -> None:
-    """formulas.md 2.2."""
+    """Values as published: docs/social_forces.md lists them."""
     wanted = {
         "helbing_molnar_1995": {"acceleration": 2.1 / 0.3, "decay": 0.3, "step": 2, "fov": 200, "outside": 0.5},
         "helbing_farkas_vicsek_2000": {"strength": 2000, "decay": 0.08, "anisotropy": 1, "bodies": True},
@@ -603,7 +603,7 @@ def test_explicit_euler_at_10_ms_is_told_its_real_limit_and_what_comes_of_it() -
     w2, sinks = 1.2e5 / 80, 2000 / 0.08 / 80
     assert suggest_dt_of(1) == pytest.approx(2 / (w2 + sinks), rel=0.01)  # (1 / tau) / w^2, with the repulsion
     coarse = kinds[CoarseContactWarning]
-    assert f"do not come to rest above {2 / w2:.3g} s" in coarse  # 1.33 ms: the contact alone, formulas.md 2.3
+    assert f"do not come to rest above {2 / w2:.3g} s" in coarse  # 1.33 ms: the contact alone
     y = 0.01 * math.sqrt(w2)
     back = (1 + y * y) ** (math.pi / (2 * y))
     assert f"at this dt {back:.3g} times as fast as they went in" in coarse

@@ -40,7 +40,7 @@ def torus(request: pytest.FixtureRequest) -> Scene:
 @example(9.0, 7.0)
 @example(np.nextafter(9.0, 0), np.nextafter(7.0, 8))
 def test_a_torus_keeps_everybody_in_its_half_open_box(torus: Scene, x: float, y: float) -> None:
-    """numerics.md, P32: (-1e-17) % 10 is 10, an index beyond the last cell."""
+    """(-1e-17) % 10 is 10, an index beyond the last cell."""
     state = torus.start(0)
     state.pos[0, 0], state.vel[...] = (x, y), 0.0
     found = torus.step(state).pos[0, 0]
@@ -64,7 +64,7 @@ def test_wrap_over_arrays_does_the_same(x: float, y: float) -> None:
 
 @pytest.mark.parametrize("times", [0.3, 0.7, 1.6, 2.4, 7.7, -1.7, 1000.2])
 def test_the_shortest_way_is_shortest_from_any_distance(times: float) -> None:
-    """numerics.md, P33: adding or subtracting one box is not enough beyond 1.5 boxes."""
+    """Adding or subtracting one box is not enough beyond 1.5 boxes."""
     space = Torus(size=(10.0, 4.0))
     a, b = np.array([9.0, 3.5]), np.array([9.0, 3.5]) + times * np.array([10.0, 4.0])
     images = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2) * [10.0, 4.0]

@@ -98,7 +98,7 @@ def test_springs_and_hinges_turn_and_move_nothing_as_a_whole(dimension: int) -> 
 @pytest.mark.slow
 @DIMENSIONS
 def test_damping_only_ever_takes_energy(dimension: int) -> None:
-    """E1 of numerics.md: with the printed sign it pumps."""
+    """With the printed sign it pumps."""
     effects = Springs(stiffness=300, damping=0.5), AngularSprings(stiffness=0.5, damping=0.05)
     world = scene(cloth(dimension), *effects, dimension=dimension, integrator=RK4())
     state, found = shaken(world, 0.05), []
@@ -111,7 +111,7 @@ def test_damping_only_ever_takes_energy(dimension: int) -> None:
 
 
 def test_one_damped_spring_is_the_worked_example() -> None:
-    """numerics.md E1: k = 50, k_d = 1, stretch .3: the energy falls from 2.25 to 0.0056 J within 3 s."""
+    """k = 50, k_d = 1, stretch .3: the energy falls from 2.25 to 0.0056 J within 3 s."""
     rope = Rope(links=1, length=1.0, stretch=1.3)
     world = scene(rope, Springs(stiffness=50, damping=1), each=1.0, integrator=RK4())
     start = world.start(0)
@@ -122,7 +122,7 @@ def test_one_damped_spring_is_the_worked_example() -> None:
 
 
 def test_a_ratio_of_one_is_critical_for_a_spring_between_two() -> None:
-    """numerics.md E14: c = 2 sqrt(k mu) with the reduced mass; nothing swings through, and nothing is slower.
+    """c = 2 sqrt(k mu) with the reduced mass; nothing swings through, and nothing is slower.
 
     With the mass of one end it would be sqrt(2) times too much: the stretch falls as (1 + w t) exp(-w t) of both alone.
     """
@@ -145,7 +145,7 @@ def test_a_ratio_of_one_is_critical_for_a_spring_between_two() -> None:
 
 @DIMENSIONS
 def test_two_ends_in_one_place_part(dimension: int) -> None:
-    """numerics.md P39: no NaN, and opposite ways."""
+    """No NaN, and opposite ways."""
     world = scene(Rope(links=1, length=1.0), Springs(stiffness=40, damping=1), dimension=dimension, integrator=RK4())
     state = world.start(0)
     state.pos[...] = 0.3
@@ -204,7 +204,7 @@ def test_what_is_pinned_stays_where_it_is() -> None:
 
 @pytest.mark.slow
 def test_a_hanging_chain_is_as_long_as_it_should_be() -> None:
-    """numerics.md 3.3, N15: N L + (m g / k) N (N + 1) / 2 = 1.1348875 m for ten links of .1 m."""
+    """N15: N L + (m g / k) N (N + 1) / 2 = 1.1348875 m for ten links of .1 m."""
     rope = Rope(links=10, length=1.0, direction=(0, -1), pinned=("start",))
     effects = Springs(stiffness=400, damping=2), Gravity(acceleration=(0, -9.81))
     world = scene(rope, *effects, each=0.1, integrator=ImplicitEuler(), dt=0.02)
@@ -214,7 +214,7 @@ def test_a_hanging_chain_is_as_long_as_it_should_be() -> None:
 
 @pytest.mark.parametrize("ends", ["fixed", "free", "both"])
 def test_a_chain_swings_at_its_eigenfrequencies(ends: str) -> None:
-    """numerics.md 3.3: sin(k pi / 2(N+1)), sin((2k-1) pi / 2(2N+1)), sin(k pi / 2N), times 2 sqrt(k/m).
+    """sin(k pi / 2(N+1)), sin((2k-1) pi / 2(2N+1)), sin(k pi / 2N), times 2 sqrt(k/m).
 
     Each mode is set going along the chain, and the acceleration is -w^2 times it.
     """

@@ -40,7 +40,7 @@ from tests.catalogue import INTEGRATORS, Array
 
 CHAIN = Rope(links=21, length=2.1, pinned=("ends",))  # 20 free masses
 TRUE = 2 / (2 * math.sqrt(400 / 0.1) * math.sin(20 * math.pi / 42))
-"""s, of numerics.md 3.3: .0158557."""
+"""s: .0158557."""
 
 HERE = Spawn(low=(0, 0), high=(1, 1))
 O2 = (0.0, 0.0)
@@ -112,7 +112,7 @@ def test_the_limit_is_where_the_map_begins_to_grow(kind: str) -> None:
 
 @pytest.mark.parametrize("zeta", ZETAS[1:])
 def test_limits_are_those_of_the_table(zeta: float) -> None:
-    """numerics.md P02, 3.1."""
+    """Explicit Euler: h w <= 2 zeta up to critical damping, 2 / (zeta + sqrt(zeta^2 - 1)) beyond."""
     root = math.sqrt(max(zeta * zeta - 1, 0.0))
     euler = 2 * zeta if zeta <= 1 else 2 / (zeta + root)
     assert limit(ExplicitEuler(), zeta) == pytest.approx(euler, rel=1e-4)
@@ -271,7 +271,7 @@ def test_the_suggested_step_is_at_most_the_true_limit_and_not_far_below(name: st
 
 @pytest.mark.parametrize(("shear", "bend", "printed"), [(0.0, 0.0, 3.93), (1000.0, 0.0, 7.80), (1000.0, 1000.0, 9.75)])
 def test_a_cloth_is_as_stiff_as_the_table_says(shear: float, bend: float, printed: float) -> None:
-    """12 x 12, numerics.md 3.3: the greatest w^2 m / k, and a suggestion within .5 to 1 of 2 / w."""
+    """12 x 12: the greatest w^2 m / k, and a suggestion within .5 to 1 of 2 / w."""
     sheet = Cloth(cells=(11, 11), sides=(1.1, 1.1))
     bonds = Springs(stiffness=1000, shear=shear, bend=bend).bonds((Group(network=sheet, mass=0.1),), 2)
     matrix, points = np.zeros((288, 288)), sheet.rest_points(2)

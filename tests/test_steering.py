@@ -163,7 +163,7 @@ def test_flee_is_the_opposite_of_seek_and_goes_on_where_there_is_no_away() -> No
 @DIMENSIONS
 @pytest.mark.parametrize("dt", [0.1, 0.05, 0.01])
 def test_arrive_stops_on_the_point_without_chatter(dt: float, dimension: int) -> None:
-    """numerics.md, P07: below 0.01 m/s and 0.02 m after 20 s, at every step size up to 0.1 s."""
+    """Below 0.01 m/s and 0.02 m after 20 s, at every step size up to 0.1 s."""
     x, v = crowd(dimension)
     *_, (_, x, v) = steer(lambda t, x, v: rows(steering.arrive)(-x, v, 2.0, 1.5), x, v, dt=dt, seconds=20)
     assert np.linalg.norm(v, axis=1).max() < 0.01
@@ -333,7 +333,7 @@ def test_align_takes_the_mean_and_cohere_seeks_the_centre() -> None:
 
 @DIMENSIONS
 def test_nothing_is_in_the_way_of_who_passes_by(dimension: int) -> None:
-    """A force field would push here; steer-to-avoid must ask for exactly nothing (numerics.md, section 0)."""
+    """A force field would push here; steer-to-avoid must ask for exactly nothing."""
     ahead, side = np.eye(dimension)[0], np.eye(dimension)[1]
     far = rows(steering.threat)(ahead, [3 * ahead + 1.001 * side, 3 * ahead + side, -3 * ahead], 1.0, 10.0)
     np.testing.assert_array_equal(far, np.inf)
@@ -350,7 +350,7 @@ def test_a_threat_is_where_the_straight_path_first_touches(dimension: int) -> No
 
 @DIMENSIONS
 def test_avoid_is_sideways_away_from_the_centre(dimension: int) -> None:
-    """S = -V unit(lateral offset), formulas.md 1.2: no part along the way, whatever the distance."""
+    """S = -V unit(lateral offset): no part along the way, whatever the distance."""
     x, heading = crowd(dimension)
     heading /= np.linalg.norm(heading, axis=1, keepdims=True)
     lateral = x - (x * heading).sum(axis=1, keepdims=True) * heading
@@ -404,7 +404,7 @@ REYNOLDS = [(8.0, 0.0), (-8.0, 0.0), (0.0, 5.0)]
 
 
 def test_allocate_serves_the_most_pressing_and_drops_the_rest() -> None:
-    """formulas.md 1.3: lengths add up as scalars; (6, 4) would be Buckland's running sum."""
+    """Lengths add up as scalars; (6, 4) would be Buckland's running sum."""
     np.testing.assert_allclose(rows(arbitration.allocate)(REYNOLDS, 10.0), [6, 0])
     np.testing.assert_allclose(rows(arbitration.allocate)(REYNOLDS, 21.0), [0, 5])
     np.testing.assert_allclose(rows(arbitration.allocate)(REYNOLDS, 0.0), [0, 0])

@@ -268,6 +268,6 @@ def test_implicit_midpoint_does_what_it_is_known_for(name: str, verdicts: set[st
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["N01", "N04"])
 def test_explicit_euler_does_what_it_is_known_for(name: str) -> None:
-    """Its energy is that of its formula, and its orbit fails (numerics.md 3.1, N04)."""
+    """Its energy is that of its formula, and its orbit fails (N04)."""
     (finding,) = run((named(name),), (ExplicitEuler(),)).findings
     assert finding.verdict == ("fails" if name == "N04" else "warned")

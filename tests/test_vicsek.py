@@ -1,4 +1,4 @@
-"""Vicsek's flock: the map of one step to the last digit, and its curve of order over noise (numerics.md A14)."""
+"""Vicsek's flock: the map of one step to the last digit, and its curve of order over noise."""
 
 from __future__ import annotations
 

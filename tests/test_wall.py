@@ -1,4 +1,4 @@
-"""A wall that pushes: closed forms of numerics.md 2.1 (Kretz), and what it refuses; symmetries: test_effects.py."""
+"""A wall that pushes: closed forms (Kretz), and what it refuses; symmetries: test_effects.py."""
 
 from __future__ import annotations
 

@@ -1,0 +1,71 @@
+"""docs/extending.md: every Python block of the page runs as a script of its section, and prints what the page says."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGE = (ROOT / "docs/extending.md").read_text(encoding="utf-8")
+NUMBER = r"-?\d+\.?\d*(?:e-?\d+)?"
+TUTORIALS = ("Your own effect", "Your own behaviour", "Your own task", "Your own player")
+
+
+def script_of(section: str) -> str:
+    """Return the Python blocks of a section, one after another."""
+    (text,) = re.findall(rf"^## {section}\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.MULTILINE)
+    return "\n".join(re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE))
+
+
+def printed(section: str, folder: Path) -> list[str]:
+    """Run a tutorial as a script in an empty folder, warnings of flockenv as errors; return the lines it prints."""
+    (folder / "tutorial.py").write_text(script_of(section), encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-W", "error::UserWarning", "tutorial.py"], cwd=folder, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)}, check=False, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def numbers(text: str) -> list[float]:
+    return [float(number) for number in re.findall(NUMBER, text)]
+
+
+def test_every_python_block_of_the_page_is_run() -> None:
+    blocks = re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+    assert len(blocks) >= 2 * len(TUTORIALS)
+    scripts = [script_of(section) for section in TUTORIALS]
+    assert all(sum(block in script for script in scripts) == 1 for block in blocks)
+
+
+def test_the_wind_moves_agents_by_its_mean_force(tmp_path: Path) -> None:
+    """Two whole periods: v = push / 2 / m = 0.75 m/s along x."""
+    assert numbers(" ".join(printed(TUTORIALS[0], tmp_path))) == pytest.approx([0.75, 0] * 2, abs=1e-5)
+
+
+def test_agents_settle_on_the_orbit_that_the_page_computes(tmp_path: Path) -> None:
+    """d = R + m V / weight = 5.2 m."""
+    assert numbers(" ".join(printed(TUTORIALS[1], tmp_path))) == pytest.approx([5.2] * 8, abs=0.1)
+
+
+def test_the_task_is_solved_in_every_world_and_is_an_environment(tmp_path: Path) -> None:
+    rollout, environment = printed(TUTORIALS[2], tmp_path)
+    success, longest = numbers(rollout)
+    assert success == 1
+    assert 10 < longest < 150
+    assert environment.startswith("Box(-1.0, 1.0, (4,), float32)")
+    assert environment.endswith("False)")
+
+
+def test_the_player_from_a_file_catches_more_than_chance(tmp_path: Path) -> None:
+    scores, comparison = printed(TUTORIALS[3], tmp_path)
+    mine, chance, success = numbers(scores)
+    assert success == 1
+    assert mine > 5 > 0 > chance
+    assert "worlds=16" in comparison
