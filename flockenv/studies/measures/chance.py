@@ -38,7 +38,7 @@ class Above(NamedTuple):
 
 
 def mean_of_runs(values: ArrayLike, seed: int = 0) -> Mean:
-    """Return the mean of one number per run, (R,), with its 95 % bootstrap interval; runs that are not finite are left out."""
+    """Return the mean of one number per run, (R,), with its 95 % bootstrap interval; only finite values count."""
     given = np.asarray(values, np.float64)
     x = given[np.isfinite(given)]
     if len(x) < 2:
@@ -46,7 +46,7 @@ def mean_of_runs(values: ArrayLike, seed: int = 0) -> Mean:
     rng = np.random.default_rng(seed)
     drawn = [
         x[rng.integers(len(x), size=len(x))].mean() for _ in range(RESAMPLES)
-    ]  # one by one, as there may be many runs
+    ]  # one by one: there may be many runs
     low, high = np.quantile(drawn, (0.025, 0.975))
     return Mean(len(x), float(x.mean()), float(low), float(high))
 

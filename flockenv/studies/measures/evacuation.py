@@ -34,9 +34,7 @@ def leaving_times(time: ArrayLike, inside: ArrayLike) -> Floats:
 def last_crossing(found: Crossings, agents: int) -> Floats:
     """Return the time of each agent's last crossing of a line, (N,) s, if that is forward; else NaN."""
     out = np.full(agents, np.nan)
-    out[found.agent] = np.where(
-        found.sign > 0, found.time, np.nan
-    )  # crossings are in the order of time: the last one remains
+    out[found.agent] = np.where(found.sign > 0, found.time, np.nan)  # in the order of time: the last one remains
     return out
 
 

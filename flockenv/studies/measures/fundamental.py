@@ -98,7 +98,7 @@ def single_file_density(place: ArrayLike, length: float) -> Floats:
 def diagram(density: ArrayLike, speed: ArrayLike, edges: ArrayLike | None = None) -> list[Bin]:
     """Return speeds (S,), m/s, over densities (S,), 1/m^2, in bins between edges.
 
-    Default edges: those of `JUELICH`, with one more bin below. Samples that are not finite (an empty area) are left out.
+    Default edges: those of `JUELICH`, and one more bin below. Samples that are not finite (an empty area) are left out.
     Raises ValueError if the lengths differ.
     """
     rho, v = (np.asarray(each, np.float64).ravel() for each in (density, speed))

@@ -113,7 +113,7 @@ def nearest_distances(
         progress(first)
         rows = np.asarray(tree.indices[first : first + AT_A_TIME])
         found, which = tree.query(inside[rows], k=2)
-        # Of two points at the same place either may be found first: the neighbour is the one that is not the point itself.
+        # Of two points at the same place either may be found first: the neighbour is the one that is not the point.
         column = np.where(which[:, 0] == rows, 1, 0)
         k = np.arange(len(rows))
         distance[here[rows]], nearest[here[rows]] = found[k, column], here[which[k, column]]
