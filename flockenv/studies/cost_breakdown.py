@@ -153,7 +153,7 @@ def _work(scene: Scene, state: State) -> dict[str, float]:
 
 
 def _shares(scene: Scene, state: State) -> tuple[tuple[str, str, float], ...]:
-    """Return the mean share granted to each behaviour while its force is not 0, over INSTANTS of a run from a state on."""
+    """Return the mean share granted to each behaviour while its force is not 0, over INSTANTS of a run from `state`."""
     if not any(effect.wishes for effect in scene.effects):
         return ()
     grants, found = Grants(scene), []
