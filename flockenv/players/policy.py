@@ -52,7 +52,7 @@ LARGEST_CARD, LARGEST_WEIGHTS = 8 << 20, 256 << 20
 
 @runtime_checkable
 class Policy(Protocol):
-    """Exact signature of Stable-Baselines3's predict(), so that hand-written rules and PPO models are interchangeable."""
+    """Signature of Stable-Baselines3's predict(), so that hand-written rules and PPO models are interchangeable."""
 
     def predict(
         self,

@@ -44,9 +44,8 @@ def mean_of_runs(values: ArrayLike, seed: int = 0) -> Mean:
     if len(x) < 2:
         return Mean(len(x), float(x.mean()) if len(x) else np.nan, np.nan, np.nan)
     rng = np.random.default_rng(seed)
-    drawn = [
-        x[rng.integers(len(x), size=len(x))].mean() for _ in range(RESAMPLES)
-    ]  # one by one: there may be many runs
+    # one by one: there may be many runs
+    drawn = [x[rng.integers(len(x), size=len(x))].mean() for _ in range(RESAMPLES)]
     low, high = np.quantile(drawn, (0.025, 0.975))
     return Mean(len(x), float(x.mean()), float(low), float(high))
 
