@@ -288,7 +288,7 @@ def test_a_coarse_point_that_is_right_by_chance_is_not_taken() -> None:
 def test_nothing_is_said_below_the_floor(damped: Report) -> None:
     with pytest.raises(ValueError, match="tolerance = 1e-14 m: must be finite and >="):
         damped.cheapest(1e-14)
-    assert best(damped, [1e-14])[0].startswith("to 1e-14 m: below")
+    assert best(damped, [1e-14])[0].startswith("to 1e-14 m: errors below")
     assert rows(damped, [1e-14])[0][3:5] == ["-", "-"]
 
 

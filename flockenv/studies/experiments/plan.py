@@ -1,6 +1,6 @@
 """A plan: an experiment as data, with cases, variants of each, and the numbers that are measured.
 
-See configs/experiments/; `flockenv experiment FILE.yaml` runs one. A `SteerPlan` varies the behaviours of a steer.
+See configs/experiments/; `flockenv experiment FILE.yaml` runs one. A `SteerPlan` varies the behaviours of a `steer`.
 """
 
 from __future__ import annotations

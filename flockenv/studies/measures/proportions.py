@@ -23,7 +23,7 @@ class Proportion(NamedTuple):
     """Mean size of a fault where it occurs, and how often it occurs."""
 
     mean: float  # over the cases where it is not 0; 0 if there are none
-    share: float  # of the cases where it is not 0 in all cases; NaN without cases
+    share: float  # of the cases, those in which it is not 0; NaN without cases
 
 
 def overlap_area(distance: ArrayLike, first: ArrayLike, second: ArrayLike) -> Floats:
