@@ -469,8 +469,8 @@ def test_explain_says_what_is_called_for_and_what_was_left_out(capsys: pytest.Ca
     unasked = capsys.readouterr().out
     assert re.search(rf"^drag\(rate=0.5\) +nothing +{COST}$", unasked, re.MULTILINE)
     assert "1 evaluations, 0 neighbour queries, 0 pairs, 0 obstacle tests" in unasked
-    assert "neighbour query: no effect asks who is near whom" in unasked
-    assert "pass over obstacles (0): no effect asks for them" in unasked
+    assert "neighbour query: no effect needs neighbours" in unasked
+    assert "pass over obstacles (0): no effect needs them" in unasked
     assert f"effects that are not listed: {', '.join(sorted(EFFECTS.keys() - {'drag'}))}" in " ".join(unasked.split())
     assert "Largest stable step: 4 s (drag, agent 0), dt = 0.01 s" in unasked  # |1 - h c / m| = 1
     assert "Largest stable step: nothing in it sets a limit, unless agents that meet do; dt = 0.01 s" in asked

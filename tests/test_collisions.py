@@ -438,7 +438,7 @@ def test_an_explanation_says_who_asks_for_what() -> None:
     assert found.remains == "semi_implicit_euler, limits, box, collisions"
     alone = explain(scene([1, 1], agents=False, space=Box(size=(4, 4))))
     assert alone.work["neighbour_queries"] == 0
-    assert "neighbour query: no effect asks who is near whom" in alone.left_out
+    assert "neighbour query: no effect needs neighbours" in alone.left_out
 
 
 def test_who_meets_nobody_flies_as_if_nothing_was() -> None:

@@ -61,7 +61,7 @@ def test_of_two_streams_everything_is_known(capsys: pytest.CaptureFixture[str]) 
     )
     said = capsys.readouterr().out
     assert "positions every 0.4 s, seed 0" in said
-    assert "Phi, 1 = nobody shares a row" in said
+    assert "Phi, 1 = no row holds agents" in said
     scene = load_scene(Path("streams.yaml"))
     x = scene.start(0).pos[0, :, 0]
     turns = np.where(

@@ -90,7 +90,7 @@ def test_who_is_not_there_does_not_count() -> None:
     assert lanes(spoilt, ways, 0, 3, deals=20).order < 0.95
     present[:, 40:] = False
     assert lanes(spoilt, ways, 0, 3, present, deals=20).order == 1
-    with pytest.raises(ValueError, match="way: lanes are of people who go both ways"):
+    with pytest.raises(ValueError, match="way: lanes need agents in both directions"):
         lanes(y, np.ones(40), 0, 3)
     with pytest.raises(ValueError, match="rows from 3 to 0 m"):
         lanes(y, way, 3, 0)

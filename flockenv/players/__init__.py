@@ -1,14 +1,14 @@
-"""The players that ship with flockenv, by name, and players of one's own, from files.
+"""Players: those that ship with flockenv, by name, and users' own, from files.
 
     from flockenv.players import load_player
     from flockenv.tasks import Pursuit
 
     action, state = load_player("rules", Pursuit()).predict(observation)
 
-* `random`: actions uniform in [-1, 1], the floor of every table;
+* `random`: actions uniform in [-1, 1], the lower baseline of every table;
 * `textbook`: the hand-written player of a task, with published parameters;
 * `orca`, `heuristics`, `queueing`: other hand-written players, of some tasks each;
-* `rules`: the hand-written player of a task, with the parameters that a search found;
+* `rules`: the hand-written player of a task, with parameters found by a search;
 * `ppo`: trained weights.
 """
 
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     from flockenv.players.policy import Policy
     from flockenv.tasks import Task
 
-# Neither the laws nor numba are imported up here: `flockenv render --help` names the players in a fifth of a second.
+# Neither the laws nor numba are imported here: `flockenv render --help` lists the players in a fifth of a second.
 
 __all__ = ["NAMES", "WEIGHTS", "load_player", "named_player", "other_tasks"]
 
 NAMES = ("random", "textbook", "orca", "heuristics", "queueing", "rules", "ppo")
-"""From the least to the most that is claimed; tables and pictures keep this order."""
+"""Roughly from the weakest to the strongest; tables and pictures keep this order."""
 
 FORMER = {"reynolds": "rules"}
 """Names that players had, and their names now."""
@@ -39,18 +39,18 @@ WEIGHTS = Path(__file__).resolve().parent / "weights"
 
 
 def load_player(spec: str | os.PathLike[str], task: Task, seed: int = 0, trust_pickle: bool = False) -> Policy:
-    """Return the policy that a name or a file stands for, ready to play a task.
+    """Return the policy of a name or a file, ready to play a task.
 
     Args:
         spec: one of NAMES; or a `.safetensors` file with its card; or a `.py` file, which is executed (see
             `flockenv.players.files`); or, with `trust_pickle`, a Stable-Baselines3 `.zip`.
         task: the task that it will play.
         seed: of the random numbers of `random` and of a sampling `ppo`.
-        trust_pickle: read zips too. Loading one executes whatever code is stored in it.
+        trust_pickle: also read zips. Loading one executes the code stored in it.
 
     Raises:
-        ValueError: one line: no such player (with the nearest name), none of that name for the task, a file that cannot
-            be used, or one not trusted.
+        ValueError: no such player (with the nearest name), none of that name for the task, a file that cannot be used,
+            or one that is not trusted; one line.
     """
     from flockenv.players.files import SUFFIXES, load_file
 
@@ -65,7 +65,7 @@ def load_player(spec: str | os.PathLike[str], task: Task, seed: int = 0, trust_p
 
 
 def named_player(name: str, task: Task, seed: int = 0) -> Policy:
-    """Return one of NAMES, ready to play a task; ValueError if there is none of that name for it."""
+    """Return one of NAMES, ready to play a task; raise ValueError if that task has none of that name."""
     from flockenv.players.policy import RandomPolicy
     from flockenv.players.rules import player
 
@@ -85,7 +85,7 @@ def _trained(task: Task, seed: int) -> Policy:
 
 
 def other_tasks(name: str, task: str) -> tuple[str, ...]:
-    """Return the tasks that a player is written for if `task` is none of them; () if it plays `task`."""
+    """Return the tasks that a player is written for if `task` is not among them; () if it plays `task`."""
     from flockenv.players.rules import PLAYERS
 
     known = PLAYERS.get(name, {task: None})

@@ -43,11 +43,11 @@ WANTED = (
 
 
 class PlayerError(ValueError):
-    """A player's own code failed, or is no player; one line that names its file."""
+    """Error in the code of a player file, or a file without a player; one line with the name of the file."""
 
 
 def load_file(name: str, task: Task, seed: int = 0, trust_pickle: bool = False) -> Policy:
-    """Return the player of a file whose name ends with one of SUFFIXES; ValueError in one line if there is none."""
+    """Return the player of a file whose name ends with one of SUFFIXES; raise ValueError if there is none."""
     suffix = Path(name).suffix.lower()
     if suffix == ".zip" and not trust_pickle:
         raise ValueError(
@@ -62,13 +62,13 @@ def load_file(name: str, task: Task, seed: int = 0, trust_pickle: bool = False) 
 
 
 def _load_zip(path: Path) -> Policy:
-    # by name: stable-baselines3 and torch are looked for only here, and sb3.py is a layer above this file
+    # imported by name: only zips need stable-baselines3 and torch, and sb3.py is a layer above this file
     policy: Policy = importlib.import_module("flockenv.envs.sb3").load_sb3_zip(path, trust_pickle=True)
     return policy
 
 
 def _load_python(path: Path, task: Task) -> FilePlayer:
-    """Execute a player file and return the player that it offers."""
+    """Execute a player file and return its player."""
     module = _guarded(path, "while loading it", _execute, path)
     kinds = [name for name in ("player", "Player", "predict") if hasattr(module, name)]
     if not kinds:
@@ -154,14 +154,14 @@ def _guarded(path: Path, where: str, function: Callable[..., Any], *arguments: A
 
 
 def _line_in(path: Path, error: BaseException) -> str:
-    """Return ", line N" of the file where an error came from, if it came from there."""
+    """Return ", line N" with the last line of the file in an error's traceback; "" if there is none."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame.lineno for frame in frames if os.path.abspath(frame.filename) == os.path.abspath(path)]
     return f", line {own[-1]}" if own else ""
 
 
 def _takes(function: Callable[..., Any], count: int) -> bool:
-    """True if a function can be called with `count` arguments; true of built-in ones, which have no signature."""
+    """Return True if a function accepts `count` arguments; also for built-in ones without a signature."""
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):

@@ -1,11 +1,12 @@
-"""Policies: whatever turns rows of observations into rows of actions, hand-written or learned, behind SB3's predict().
+"""Policies: map rows of observations to rows of actions, hand-written or learned, with SB3's predict().
 
 A learned policy is two files that hold no code: `X.safetensors` (the actor's weights) and `X.json` beside it (the card:
-activation, sizes, the task, its arguments, the slots of its rows, SHA-256 of the weights, and how they came about).
+activation, sizes, the task, its arguments, the slots of its rows, SHA-256 of the weights, and how they were trained).
 It runs in numpy alone.
 
 A policy plays any task whose rows have the slots of its card: the same names, shapes and units in the same order. Other
-arguments (more agents, say) and other scales, by which a number means another quantity, are allowed and said.
+arguments (such as more agents) and other scales, which change the quantity that a number stands for, are allowed with
+a warning.
 """
 
 from __future__ import annotations
@@ -42,16 +43,16 @@ MOST_SAID = 6
 ONE_THREAD = 2**18
 """Multiplications per matrix product up to which OpenBLAS stays on one thread (its interface/gemm.c).
 
-Rows are taken in blocks of that size: a product this small gains nothing from threads, and where other work shares the
-cores their waiting for each other was measured to cost two hundred times the product itself."""
+Rows are processed in blocks of that size: so small a product gains nothing from threads, and if other work shares the
+cores, waiting threads were measured to cost two hundred times the product itself."""
 
 LARGEST_CARD, LARGEST_WEIGHTS = 8 << 20, 256 << 20
-"""Bytes: what is bigger is no policy of ours, and is not read."""
+"""Bytes: larger files are not read."""
 
 
 @runtime_checkable
 class Policy(Protocol):
-    """Letter for letter Stable-Baselines3's predict(), so that hand-written rules and a PPO model are used alike."""
+    """Signature of Stable-Baselines3's predict(), so that hand-written rules and PPO models are interchangeable."""
 
     def predict(
         self,
@@ -65,11 +66,11 @@ class Policy(Protocol):
 
 
 class RandomPolicy:
-    """Actions uniform in [-1, 1]: the floor of every table.
+    """Actions uniform in [-1, 1]: the lower baseline of every table.
 
     Args:
         action_size: A, how many numbers an action has.
-        seed: of its own generator; None draws one. `seed` records which it was.
+        seed: of its own generator; None draws one. The attribute `seed` records it.
     """
 
     def __init__(self, action_size: int, seed: int | None = None) -> None:
@@ -88,7 +89,7 @@ class RandomPolicy:
         episode_start: NDArray[Any] | None = None,
         deterministic: bool = False,
     ) -> tuple[Floats, State | None]:
-        """Return a fresh draw per row; `deterministic` changes nothing, for the mean of it would be to do nothing."""
+        """Return a new draw per row; `deterministic` is ignored, as the mean action would be zero."""
         shape = (*np.asarray(observation).shape[:-1], self.action_size)
         return self._generator.uniform(-1.0, 1.0, shape).astype(np.float32), state
 
@@ -105,11 +106,11 @@ class MlpPolicy:
     Args:
         tensors: `policy.0.weight`, `policy.0.bias`, `policy.1.weight`, ... (hidden layers), `action.weight`,
             `action.bias`, `log_std`; weights are (out, in) as in torch.
-        card: needs `activation`, "tanh" or "relu"; the rest is for people.
+        card: needs `activation`, "tanh" or "relu"; the rest is information.
         seed: of the generator that samples when not deterministic; None draws one.
 
     Raises:
-        ValueError: a tensor is missing, unknown, of another shape or type than its neighbours call for, or not finite.
+        ValueError: a tensor is missing, unknown, not finite, or its shape or type does not match the other layers.
     """
 
     def __init__(self, tensors: Mapping[str, NDArray[Any]], card: Mapping[str, Any], seed: int | None = 0) -> None:
@@ -122,7 +123,7 @@ class MlpPolicy:
         self.action_size = int(self._head[1].shape[0])
         self.seed, self._generator = _seeded(seed)
         self.differences: tuple[str, ...] = ()
-        """What differs between the task that it plays and the one that it was trained on, a phrase each."""
+        """Differences between the task that it plays and the one that it was trained on, a phrase each."""
 
     def __repr__(self) -> str:
         sizes = [self.observation_size, *(len(bias) for _, bias in self._hidden), self.action_size]
@@ -130,13 +131,13 @@ class MlpPolicy:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], task: Task | None = None, seed: int | None = 0) -> MlpPolicy:
-        """Read `X.safetensors` and the card beside it; with a task, check that the policy sees what the task shows.
+        """Read `X.safetensors` and the card beside it; with a task, check that its observations match the card.
 
-        Warns with OtherTaskWarning, in one line, where the task has other arguments or scales than the card's;
+        Warns with OtherTaskWarning, in one line, if the task has other arguments or scales than the card's;
         `differences` lists them all.
 
         Raises:
-            ValueError: one line, for a missing, truncated, altered or foreign file or one made for other slots.
+            ValueError: the file is missing, truncated, altered, foreign or made for other slots; one line.
         """
         path = Path(path)
         try:
@@ -182,17 +183,17 @@ class MlpPolicy:
 
 
 def save_policy(path: str | os.PathLike[str], tensors: Mapping[str, NDArray[Any]], card: Mapping[str, Any]) -> None:
-    """Write the weights and the card beside them, both or neither; the card receives what can be derived.
+    """Write the weights and the card beside them, both or neither; entries of the card that can be derived are added.
 
     Args:
         path: ends in .safetensors; the card gets the same name ending in .json.
         tensors: as MlpPolicy takes them, float32.
-        card: `activation` is needed; what `describe` returns of the task is what a later load checks against the task;
-            `steps`, `wall_time_s` and all else is for people. `version`, `sha256`, `observation_size` and
+        card: `activation` is needed; a later load checks the result of `describe` in it against its task; `steps`,
+            `wall_time_s` and all else are information. `version`, `sha256`, `observation_size` and
             `action_size` are filled in.
 
     Raises:
-        ValueError: for anything that MlpPolicy.load would refuse; nothing is written then.
+        ValueError: anything for which MlpPolicy.load raises it; nothing is written then.
     """
     from safetensors.numpy import save
 
@@ -221,7 +222,7 @@ def save_policy(path: str | os.PathLike[str], tensors: Mapping[str, NDArray[Any]
 
 
 def _read_card(path: Path) -> dict[str, Any]:
-    """Read a card strictly: no duplicate keys, no NaN, of a version we know."""
+    """Read a card strictly: no duplicate keys, no NaN, and of the supported version."""
     try:
         card = json.loads(_read(path, LARGEST_CARD), object_pairs_hook=_unique, parse_constant=_no_constant)
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
@@ -259,14 +260,14 @@ def _read(path: Path, largest: int) -> bytes:
 
 
 def _check_sizes(policy: MlpPolicy) -> None:
-    """Compare what the weights are with what the card says."""
+    """Raise ValueError if the sizes of the weights differ from those in the card."""
     for key, size in {"observation_size": policy.observation_size, "action_size": policy.action_size}.items():
         if policy.card[key] != size:
             raise ValueError(f"the card says {key} = {policy.card[key]!r}, the weights are for {size}")
 
 
 def describe(task: Task) -> dict[str, Any]:
-    """Return what a card says of the task that a policy is trained on: name, arguments, and the slots of its rows."""
+    """Return a card's entries on the task that a policy is trained on: name, arguments, and the slots of its rows."""
     return {
         "task": task.name,
         "arguments": task.model_dump(mode="json"),
@@ -284,7 +285,7 @@ def _slots(layout: Layout) -> list[dict[str, Any]]:
 
 
 def _differences(card: Mapping[str, Any], task: Task) -> tuple[str, ...]:
-    """Return what differs between a card and a task, a phrase each; ValueError where the slots do not fit."""
+    """Return the differences of a card and a task, a phrase each; raise ValueError if the slots do not match."""
     if "observation" not in card:
         return _differences_of_digest(card, task)
     found = []
@@ -308,7 +309,7 @@ def _differences(card: Mapping[str, Any], task: Task) -> tuple[str, ...]:
 
 
 def _differences_of_digest(card: Mapping[str, Any], task: Task) -> tuple[str, ...]:
-    """Return what differs between a card that lists no slots, but has a digest of them, and a task."""
+    """Return the differences of a task and a card that has a digest of its slots instead of a list."""
     sizes = {"observation_size": task.layout.size, "action_size": task.action_layout.size}
     for key, size in sizes.items():
         if card[key] != size:

@@ -1,1 +1,1 @@
-"""What is found out about simulations: measures, accuracy, hard cases, validation, experiments; and how it is kept."""
+"""Studies of simulations: measures, accuracy, hard cases, validation, experiments, and records of their results."""

@@ -1,10 +1,10 @@
-"""What arbitration granted: for every `Steer` of a scene, what each behaviour wished for, and what it was given.
+"""Trace of arbitration: for every `Steer` of a scene, the force of each behaviour and the share granted to it.
 
 found = granted(scene, state)[0]
 found.mean_share()  # {"avoid_obstacles": 1.0, "wander": 0.27}
 
-Wishes come from the scene's own kernel, in which one behaviour after another is heard alone; shares from the very law
-by which the scene reconciles them, in a loop over agents.
+The steering force of each behaviour comes from the scene's own kernel, run with one behaviour at a time; shares come
+from the law by which the scene reconciles them, in a loop over agents.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ Reals = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True, eq=False)
 class Granted:
-    """What one `Steer` effect granted at one instant. B worlds, N agents, K behaviours in order of priority."""
+    """Shares that one `Steer` effect granted at one instant. B worlds, N agents, K behaviours in order of priority."""
 
     steer: Steer
-    effect: int  # its place in scene.effects
-    wish: Reals  # (B, N, K, D) N; 0 for whom it does not steer, and for the dead
-    share: Reals  # (B, N, K) of each wish, 0 to 1; 0 where nothing was wished for
-    force: Reals  # (B, N, D) N, what came of them, before it is bounded together with a drive
+    effect: int  # its index in scene.effects
+    wish: Reals  # (B, N, K, D) N, steering forces; 0 for agents that are dead or not steered
+    share: Reals  # (B, N, K) of each steering force, 0 to 1; 0 if that force is 0
+    force: Reals  # (B, N, D) N, their combination, before it is bounded together with a drive
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What the behaviours are called, (K,): their kinds, numbered where there are several of one."""
+        """Names of the behaviours, (K,): their kinds, numbered if there are several of one kind."""
         kinds = [behaviour.kind for behaviour in self.steer.behaviours]
         return tuple(
             kind if kinds.count(kind) == 1 else f"{kind} {kinds[: k + 1].count(kind)}" for k, kind in enumerate(kinds)
@@ -48,16 +48,16 @@ class Granted:
 
     @property
     def asked(self) -> NDArray[np.bool_]:
-        """Who wished for something, (B, N, K)."""
+        """True where a behaviour's steering force is not 0, (B, N, K)."""
         return np.asarray((self.wish != 0).any(axis=-1))
 
     @property
     def cut(self) -> NDArray[np.bool_]:
-        """Whose wish was not granted in full, (B, N, K)."""
+        """True where a steering force was not granted in full, (B, N, K)."""
         return self.asked & (self.share < 1)
 
     def mean_share(self) -> dict[str, float]:
-        """Return the mean share of each behaviour among those agents in whom it wished for something; NaN if nobody."""
+        """Return the mean share of each behaviour over agents in which its force is not 0; NaN without such agents."""
         asked = self.asked
         return {
             name: float(self.share[..., k][asked[..., k]].mean()) if asked[..., k].any() else float("nan")
@@ -66,7 +66,7 @@ class Granted:
 
 
 class _Heard(Steer):
-    """The same behaviours, of whom one is heard; what it wishes for is not bounded by max_force."""
+    """The same behaviours with only one of them active; its force is not bounded by max_force."""
 
     kind: str  # type: ignore[assignment]  # without a default it is not registered: no scene in YAML has it
     which: int
@@ -74,17 +74,17 @@ class _Heard(Steer):
 
     @property
     def steer_law(self) -> Law:
-        """One of them."""
+        """Law that returns the force of one behaviour."""
         return heard
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Whom to hear."""
+        """Index of the active behaviour."""
         return {"which": float(self.which)}
 
 
 @law
 def heard(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
-    """One wish and no other."""
+    """Return the force of behaviour `which`, and no other."""
     total = zero(wishes[0])
     for k in range(len(wishes)):
         if like(p.which, k) == p.which:
@@ -93,12 +93,12 @@ def heard(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
 
 
 class Grants:
-    """Asks a scene again and again what its `Steer` effects grant; what that takes is made once."""
+    """Shares granted by the `Steer` effects of a scene, at any number of states; its kernels are built once."""
 
     def __init__(self, scene: Scene) -> None:
         """scene: with any number of Steer effects."""
         self.scene = scene
-        # a behaviour may read the medium; one that pushes, too, is no behaviour's business
+        # behaviours may read a medium, an aim or kept state; effects with a force of their own are left out
         media = tuple(e for e in scene.effects if e.own_law is None and (e.medium_law or e.aim_law or e.keeps))
         self._heard = {
             k: [scene.with_effects(*media, _heard_alone(effect, j)) for j in range(len(effect.behaviours))]
@@ -107,14 +107,14 @@ class Grants:
         }
 
     def at(self, state: State) -> tuple[Granted, ...]:
-        """Return what each of them grants at this instant, in the order of the effects; nothing moves."""
+        """Return what each `Steer` grants in this state, in the order of the effects; the state stays as it is."""
         return tuple(self._one(state, k) for k in self._heard)
 
     def _one(self, state: State, which: int) -> Granted:
-        """Return what one of them grants."""
+        """Return what the effect with index `which` grants."""
         steer, body = self.scene.effects[which], self.scene.body
         assert isinstance(steer, Steer)
-        counted = state.copy()  # what is counted is the scene's
+        counted = state.copy()  # a copy, as acceleration() changes work counters
         mass = np.where(np.isfinite(body.mass), body.mass, 0)[:, None]
         wish = np.stack([scene.acceleration(counted) * mass for scene in self._heard[which]], axis=2)
         b, n, d = state.shape
@@ -129,16 +129,15 @@ class Grants:
 
 
 def _heard_alone(steer: Steer, which: int) -> _Heard:
-    """Return an effect that hears one of the behaviours."""
+    """Return an effect in which one of the behaviours is active."""
     return _Heard(
         kind="heard", behaviours=steer.behaviours, arbitration=steer.arbitration, group=steer.group, which=which
     )
 
 
 def granted(scene: Scene, state: State) -> tuple[Granted, ...]:
-    """Return what each `Steer` of a scene grants at this instant, in the order of its effects; nothing moves.
+    """Return what each `Steer` of a scene grants in this state, in the order of its effects; the state stays as it is.
 
-    The budget is max_force, whatever else the agents are driven to do. `Grants(scene).at(state)` is the same for who
-    asks more than once.
+    The budget is max_force, whatever else drives the agents. `Grants(scene).at(state)` is faster for repeated calls.
     """
     return Grants(scene).at(state)

@@ -1,4 +1,4 @@
-"""What a scene computes, for whom, at what cost, and what it does not compute because nobody asked for it."""
+"""Cost of a scene: the time of each effect, what it needs computed, and what no effect needs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from flockenv.studies.arbitration_trace import Grants
 __all__ = ["Cost", "Explanation", "Row", "explain"]
 
 ROUNDS = 15
-INSTANTS, BETWEEN = 20, 10  # at which shares are looked at, and the steps between two
+INSTANTS, BETWEEN = 20, 10  # at which shares are measured, and the steps between two of them
 TIMED = 0.01  # s per measurement: long against the clock, short against a change of the processor's speed
 
 
@@ -34,7 +34,7 @@ class Cost(NamedTuple):
     @classmethod
     def of(cls, differences: NDArray[np.float64]) -> Cost:
         """Return the median of the differences of each round, with the exact interval of order statistics."""
-        from scipy.stats import quantile_test  # here: a command that times nothing need not wait for it
+        from scipy.stats import quantile_test  # imported here: commands that time nothing do not need it
 
         interval = quantile_test(differences, p=0.5).confidence_interval(0.95)
         return cls(float(np.median(differences)), float(interval.low), float(interval.high))
@@ -49,12 +49,12 @@ class Row:
     """One effect of a scene."""
 
     effect: Effect
-    calls_for: tuple[str, ...]  # in words; empty = nothing but the agent itself
-    cost: Cost  # that the scene would save without it; what it shares with others is not in it
+    calls_for: tuple[str, ...]  # what it needs computed, in words; empty = only the agent itself
+    cost: Cost  # that the scene would save without it; excludes work shared with other effects
 
     @property
     def name(self) -> str:
-        """Its kind, and the fields that are not at their defaults."""
+        """Kind of the effect, and its fields that differ from their defaults."""
         usual = {name: f.get_default(call_default_factory=True) for name, f in type(self.effect).model_fields.items()}
         given = {name: getattr(self.effect, name) for name in usual if name != "kind"}
         return f"{self.effect.kind}({', '.join(f'{k}={v}' for k, v in given.items() if v != usual[k])})"
@@ -62,28 +62,28 @@ class Row:
 
 @dataclass(frozen=True)
 class Explanation:
-    """What one step of one world does."""
+    """Cost of one step of one world, by effect."""
 
     scene: Scene
     rows: tuple[Row, ...]
     step: float  # us, a whole step
     rest: float  # us, a step without any effect: integrator, limits, confinement, constraints, population
-    shared: Cost  # that no single effect could save: the query and the sweep that several share
+    shared: Cost  # not saved by removing any single effect: the neighbour query and the pass that several share
     work: dict[str, float]  # per step, see state.WORK
-    left_out: tuple[str, ...]  # one line each
+    left_out: tuple[str, ...]  # what is not computed, one line each
     stable: Suggestion  # the largest stable step
     shares: tuple[tuple[str, str, float], ...] = ()  # of each Steer's behaviours: which, and the mean share granted
 
     @property
     def remains(self) -> str:
-        """What is left of a step without any effect, in words."""
+        """Parts of a step that remain without any effect, in words."""
         scene = self.scene
         parts = [scene.integrator.kind, "limits", scene.space.kind, *(each.kind for each in scene.constraints)]
         return ", ".join(parts + ["births and deaths"] * bool(scene.population))
 
     @property
     def largest_step(self) -> str:
-        """The largest stable step in words, beside the step that is made."""
+        """The largest stable step, in words, next to the step of the scene."""
         found, made = self.stable, f"dt = {self.scene.dt:g} s"
         if found.dt == 0:
             return f"none is stable with {self.scene.integrator.kind} ({found.effect} at agent {found.agent}), {made}"
@@ -97,11 +97,11 @@ class Explanation:
 def explain(
     scene: Scene, state: State | None = None, progress: Callable[[int], None] = lambda done: None
 ) -> Explanation:
-    """Measure a scene from a state on (default: its start with seed 0), one effect left out at a time.
+    """Measure the cost of each effect, from a state on (default: the start with seed 0), leaving out one at a time.
 
     All variants are timed in turn, ROUNDS times. A cost is the median over the rounds of the difference within a round,
-    with its 95 % interval: a disturbance that lasts hits both sides. `progress` is called with the number of variants
-    that are ready; each may have to be compiled.
+    with its 95 % interval: a disturbance that lasts affects both variants. `progress` is called with the number of
+    variants that are ready; each may have to be compiled.
     """
     state = scene.start(0) if state is None else state
     effects = scene.effects
@@ -122,7 +122,7 @@ def explain(
 
 
 class _Timer:
-    """Times the steps of a scene from one state on, so many at a time that the clock is no matter."""
+    """Timer of a scene's steps from one state on, enough at a time that the clock's resolution does not matter."""
 
     def __init__(self, scene: Scene, state: State) -> None:
         self._scene, self._state, self._scratch = scene, state, state.copy()
@@ -153,7 +153,7 @@ def _work(scene: Scene, state: State) -> dict[str, float]:
 
 
 def _shares(scene: Scene, state: State) -> tuple[tuple[str, str, float], ...]:
-    """Return the mean share of each wish, while it is one, over INSTANTS of a run from a state on."""
+    """Return the mean share granted to each behaviour while its force is not 0, over INSTANTS of a run from `state`."""
     if not any(effect.wishes for effect in scene.effects):
         return ()
     grants, found = Grants(scene), []
@@ -175,13 +175,13 @@ def _left_out(scene: Scene) -> tuple[str, ...]:
     others = sorted(EFFECTS.keys() - {effect.kind for effect in scene.parts.effects})
     lines = []
     if "neighbour query" not in asked:
-        lines.append("neighbour query: no effect asks who is near whom")
+        lines.append("neighbour query: no effect needs neighbours")
     if "obstacles" not in asked:
-        lines.append(f"pass over obstacles ({len(scene.obstacles)}): no effect asks for them")
+        lines.append(f"pass over obstacles ({len(scene.obstacles)}): no effect needs them")
     if not scene.constraints:
         lines.append("collisions, rods: no constraint is listed; bodies pass through each other and through obstacles")
     if not scene.population:
-        lines.append("births and deaths: nothing in its population")
+        lines.append("births and deaths: the population is empty")
     if others:
         lines.append(f"effects that are not listed: {', '.join(others)}")
     return tuple(lines)

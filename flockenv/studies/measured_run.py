@@ -1,4 +1,4 @@
-"""A run that is measured: which measures make sense for it, their values, and what pictures of it are drawn from."""
+"""Measures of a run: those that make sense for its scene, their values, and the data for its pictures."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ __all__ = ["UNITS", "Asked", "Survey", "combined", "survey"]
 Floats = NDArray[np.float64]
 
 INSTANTS, FEWEST, MOST_CELLS = 200, 10, 400_000
-"""At so many instants of a run, evenly, cells, lanes and order are looked at; at fewer if that is more cells in all."""
+"""Evenly spaced instants at which cells, lanes and order are measured; fewer if that is more than MOST_CELLS cells."""
 
 MOST_DEALT = 20_000_000
-"""Directions that are dealt out anew, in all, for the null of lanes."""
+"""Most permuted directions, in all, for the null of lanes."""
 
 SAMPLES = 100
-"""So many samples of a power law are drawn, to see whether gaps are of one."""
+"""Samples of a power law that are drawn to test whether gaps follow one."""
 
 UNITS = {
     "agents": "alive, mean",
@@ -39,7 +39,7 @@ UNITS = {
     "specific flow": "1/(m s), the same per width of the line",
     "both ways": "1/(m s), forward and backward added",
     "passing": "1/s, forward, from the first to the last: J",
-    "time gap": "s, mean between two who go forward",
+    "time gap": "s, mean between two agents that go forward",
     "tail exponent": "alpha of p(gap) ~ gap^-alpha; > 2 flows, <= 2 clogs",
     "tail error": "its standard error",
     "tail start": "s, where the power law begins",
@@ -48,7 +48,7 @@ UNITS = {
     "burst length": "crossings in a burst, mean",
     "burst length by chance": "the same of a coin",
     "bursts p": "that chance makes so few bursts, or fewer",
-    "out": "of those who began before the line",
+    "out": "of the agents that began before the line",
     "95 % out": "s, when 95 % of them were beyond it for good",
     "all out": "s, when all were",
     "density counted": "1/m^2 in the area, mean",
@@ -58,47 +58,47 @@ UNITS = {
     "off Weidmann": "m/s, mean, over .5 to 3 per m^2",
     "off Weidmann, worst": "m/s, of means over .5 per m^2",
     "in Juelich bins": "share of ug-180's bins that were met within a deviation",
-    "lanes": "Phi, 1 = nobody shares a row with who goes the other way",
-    "lanes by chance": "Phi with directions dealt out anew",
+    "lanes": "Phi, 1 = no row holds agents of both directions",
+    "lanes by chance": "Phi with permuted directions",
     "lanes p": "that chance makes as much order",
     "band index": "Y, the same over wider bands, not squared",
     "polarisation": "0 to 1: length of the mean heading",
     "milling": "0 to 1: how far all circle one way",
     "group momentum": "kg m/s",
     "nearest neighbour": "m, mean distance of centres",
-    "groups": "of whom each is within reach of another",
+    "groups": "of agents, each within reach of another",
     "overlap": "share of the smaller body, mean over pairs that overlap",
     "overlapping": "share of agents that overlap another",
     "collisions": "1/s, how often an agent begins to touch another",
     "oscillation": "speed backward over desired speed, mean where it is so",
     "oscillating": "share of agents that move backward",
 }
-"""Every measure, in the order of the table: what its number is."""
+"""Every measure, in the order of the table: unit and meaning of its number."""
 
 
 @dataclass(frozen=True)
 class Asked:
-    """Where and when is measured."""
+    """Where and when a run is measured."""
 
     line: Floats | None = None  # (2, 2) m
-    area: Floats | None = None  # (n, 2) m; none = the whole space, if it has a size
-    walkable: Floats | None = None  # (n, 2) m; none = found out
-    skip: float = 0.0  # s, of the beginning
+    area: Floats | None = None  # (n, 2) m; default: the whole space, if it has a size
+    walkable: Floats | None = None  # (n, 2) m; default: derived from the scene
+    skip: float = 0.0  # s, left out at the beginning
 
     def check(self, scene: Scene) -> None:
-        """Refuse a line or an area of a scene in space: ValueError, of one line."""
+        """Raise ValueError if a line or an area is given for a 3-D scene."""
         if scene.dimension == 3 and (self.line is not None or self.area is not None or self.walkable is not None):
             raise ValueError("dimension = 3: lines and areas are of the plane")
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What was measured of a run."""
+    """The measures of a run."""
 
-    values: dict[str, float]  # by names of UNITS; NaN where one has no meaning
-    axis: Floats  # (2,) the way of walking
+    values: dict[str, float]  # by names of UNITS; NaN if a measure has no meaning
+    axis: Floats  # (2,) the walking direction
     way: NDArray[np.int64]  # (N,) 1 = along it, -1 = against it, 0 = neither
-    stopped: str = ""  # why it ended before its time
+    stopped: str = ""  # why it ended early
     density: Floats = field(default_factory=lambda: np.zeros(0))  # (S,) 1/m^2, by cells
     speed: Floats = field(default_factory=lambda: np.zeros(0))  # (S,) m/s
     gaps: Floats = field(default_factory=lambda: np.zeros(0))  # (G,) s
@@ -107,9 +107,9 @@ class Survey:
 def survey(
     trajectory: Trajectory, asked: Asked, progress: Callable[[int], None] = lambda done: None
 ) -> Survey:  # fmt: skip
-    """Return what was measured of a run, as far as it makes sense for it.
+    """Return the measures of a run that make sense for its scene.
 
-    A KeyboardInterrupt ends it early: what was measured until then is returned, and `stopped` says so.
+    A KeyboardInterrupt ends it early: the measures so far are returned, with `stopped` = "interrupted".
     """
     run = _Run.of(trajectory, asked)
     found: dict[str, Any] = {}
@@ -131,7 +131,7 @@ Part = tuple[dict[str, float], dict[str, Floats]]
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """A run as the measures take it: after the skipped time, with a way of walking."""
+    """A run as the measures need it: with a first instant after the skipped time, and a walking direction."""
 
     scene: Scene
     asked: Asked
@@ -140,7 +140,7 @@ class _Run:
     vel: NDArray[np.floating[Any]]
     alive: NDArray[np.bool_]
     identity: NDArray[np.int64] | None
-    first: int  # the first instant that counts
+    first: int  # the first instant that is measured
     axis: Floats
     way: NDArray[np.int64]
     low: Floats  # corners of the region
@@ -148,7 +148,7 @@ class _Run:
 
     @classmethod
     def of(cls, run: Trajectory, asked: Asked) -> _Run:
-        """Return it; ValueError, of one line, for a line or area that is none, or that is asked for in space."""
+        """Return a trajectory with its walking direction; raise ValueError if a line or area is given in 3-D."""
         scene, time = run.scene, np.asarray(run.step * run.scene.dt, np.float64)
         asked.check(scene)
         alive = run.alive & np.isfinite(run.pos).all(axis=2)
@@ -163,19 +163,19 @@ class _Run:
 
     @property
     def period(self) -> tuple[float, float]:
-        """After how much the world goes on with itself, m."""
+        """Period of a periodic world, m; 0 if it is not periodic."""
         size = self.scene.space.extent(self.scene.dimension) if self.scene.space.periodic else (0.0, 0.0)
         return size[0], size[1]
 
     @property
     def area(self) -> Floats | None:
-        """What is measured: what was asked for, or a whole space that has a size; none of others."""
+        """The measured area: the given one, else the whole space if it has a size, else None."""
         if self.asked.area is not None or self.scene.dimension == 3:
             return self.asked.area
         return None if isinstance(self.scene.space, Plane) else rectangle(self.low, self.high)
 
     def ground(self) -> m.Ground:
-        """Return where people walk, less obstacles that stand still, and where they are measured."""
+        """Return the walkable area, less static obstacles, and the measured area."""
         hollow = [s for s in self.scene.shapes if s.is_hollow and not s.moves]
         if self.asked.walkable is not None:
             walk = checked("walkable", self.asked.walkable)
@@ -188,19 +188,19 @@ class _Run:
         return m.Ground.of(walk, self.area, holes, self.period)
 
     def instants(self) -> list[int]:
-        """Return so many instants that count, evenly."""
+        """Return the indices of evenly spaced instants after the skipped time."""
         most = min(INSTANTS, max(FEWEST, MOST_CELLS // self.scene.agents), len(self.time) - self.first)
         return sorted({round(float(k)) for k in np.linspace(self.first, len(self.time) - 1, most)})
 
     def worlds(self) -> Iterator[tuple[Floats, Floats, NDArray[np.bool_]]]:
-        """Return positions and velocities of the living at those instants, and who they are."""
+        """Yield positions and velocities of living agents at those instants, and the mask of living agents."""
         for k in self.instants():
             here = self.alive[k]
             yield np.asarray(self.pos[k, here], float), np.asarray(self.vel[k, here], float), here
 
 
 def _axis(run: Trajectory, alive: NDArray[np.bool_], line: Floats | None) -> Floats:
-    """Return the way of walking, (2,): across the line, or the direction that most of all movement is along."""
+    """Return the walking direction, (2,): across the line, or the principal axis of all velocities."""
     if line is not None:
         along = line[1] - line[0]
         return np.asarray(np.array([along[1], -along[0]]) / np.hypot(*along))
@@ -213,7 +213,7 @@ def _axis(run: Trajectory, alive: NDArray[np.bool_], line: Floats | None) -> Flo
 
 
 def _mean(values: Sequence[float]) -> float:
-    """Return the mean of those that are numbers; NaN of none."""
+    """Return the mean of the finite values; NaN if there are none."""
     some = [x for x in values if math.isfinite(x)]
     return float(np.mean(some)) if some else np.nan
 
@@ -224,7 +224,7 @@ def _motion(run: _Run) -> Part:
 
 
 def _flow(run: _Run) -> Part:
-    """Measure at the line."""
+    """Measure flow, gaps, bursts and evacuation at the line."""
     if run.asked.line is None:
         return {}, {}
     line = run.asked.line
@@ -254,7 +254,7 @@ def _flow(run: _Run) -> Part:
 
 
 def _evacuation(run: _Run, every: m.Crossings, line: Floats) -> dict[str, float]:
-    """Measure when those are out who began before the line; nothing where people are born, or come around again."""
+    """Measure when the agents that began before the line left; {} with emitters or in a periodic world."""
     if run.scene.space.periodic or any(isinstance(member, Emitter) for member in run.scene.population):
         return {}
     along, to = line[1] - line[0], run.pos[0] - line[0]
@@ -291,7 +291,7 @@ def _room(run: _Run) -> Part:
 
 
 def _lanes(run: _Run) -> Part:
-    """Measure lanes, where people go both ways along the axis on the whole."""
+    """Measure lanes, if agents go in both directions and mostly along the axis."""
     if run.scene.dimension == 3:
         return {}, {}
     at, across = run.instants(), np.array([-run.axis[1], run.axis[0]])
@@ -309,7 +309,7 @@ def _lanes(run: _Run) -> Part:
 
 
 def _straight(run: _Run) -> bool:
-    """Do most go along the axis, one way or the other?"""
+    """Return True if more than half of all movement is along the axis, in either direction."""
     v = np.where(run.alive[..., None], run.vel[..., :2], 0.0)[run.first :]
     along, whole = np.abs((v @ run.axis).sum(axis=0)).sum(), np.linalg.norm(v, axis=2).sum()
     return bool(along > 0.5 * whole)
@@ -330,7 +330,7 @@ def _order(run: _Run) -> Part:
 
 
 def _bodies(run: _Run) -> Part:
-    """Measure what models of people should not do."""
+    """Measure overlaps, collisions and backward motion."""
     radius, space = np.asarray(run.scene.body.radius, float), run.scene.space
     at = slice(run.first, None)
     values: dict[str, float] = {}
@@ -340,7 +340,7 @@ def _bodies(run: _Run) -> Part:
             found = m.overlap_proportion(pos, radius, space, alive)
             values |= {"overlap": found.mean, "overlapping": found.share}
         values["collisions"] = m.collision_rate(run.time[at], run.pos[at], radius, space, run.alive[at])
-    body = run.scene.body  # who does not say how fast he would like to go goes as fast as he may
+    body = run.scene.body  # without a desired speed it is max_speed
     wished = np.asarray(np.where(body.desired_speed > 0, body.desired_speed, body.max_speed), float)
     if run.scene.dimension == 2 and np.isfinite(wished).all() and _straight(run):
         desired = (run.way * wished)[:, None] * run.axis
@@ -350,6 +350,6 @@ def _bodies(run: _Run) -> Part:
 
 
 def combined(found: Sequence[Survey]) -> dict[str, m.Mean]:
-    """Return every measure's mean over runs, with its 95 % interval."""
+    """Return the mean of every measure over runs, with its 95 % interval."""
     names = [name for name in UNITS if any(name in each.values for each in found)]
     return {name: m.mean_of_runs([each.values.get(name, np.nan) for each in found]) for name in names}

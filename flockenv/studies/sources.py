@@ -1,4 +1,4 @@
-"""What stored findings depend on: the code of the simulator and of a study, without comments and docstrings."""
+"""Fingerprint of the code that stored findings depend on: simulator and study, without comments and docstrings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A scene run and kept: instants of one world in memory, and on disk as plain arrays with a summary beside them."""
+"""Recorded runs: instants of one world in memory, and on disk as plain arrays with a summary in JSON."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MEMORY_LIMIT = 2 * 2**30
 """Bytes of instants that are kept before a run is refused."""
 
 PATIENCE = 1_000_000
-"""Agent-steps between two looks at the clock and the keyboard: some hundredths of a second."""
+"""Agent-steps between two calls of `progress` and checks for KeyboardInterrupt: some hundredths of a second."""
 
 FORMAT = 1
 
@@ -48,7 +48,7 @@ class Trajectory:
     first: State
     last: State
     wall: float  # s, without compiling
-    stopped: str  # why it ended before its time; "" if it did not
+    stopped: str  # reason if it ended early, else ""
     heading: Floats | None = None  # (T, N, D) directions that agents face, of scenes that keep headings
     identity: NDArray[np.int64] | None = None  # (T, N) the agent in each slot, of scenes with a population
     born: NDArray[np.float64] | None = None  # (T, N) s, times of birth
@@ -196,7 +196,7 @@ class _Film:
         return cls(pos, vel, np.empty(shape[:2], np.bool_), faced, who, since, shown, scene, [])
 
     def keep(self, state: State) -> None:
-        """Add an instant, unless it is there already."""
+        """Add an instant, unless it has been kept already."""
         k, step = len(self.step), int(state.tick[0])
         if not k or step > self.step[-1]:
             self.pos[k], self.vel[k], self.alive[k] = state.pos[0], state.vel[0], state.alive[0]
@@ -226,7 +226,7 @@ def _checked_instants(scene: Scene, steps: int, every: int) -> int:
 
 
 def whole_steps(name: str, seconds: float, dt: float, least: int = 0) -> int:
-    """Return how many steps of dt a time takes; raises ValueError, with the nearest, if that is no integer."""
+    """Return the number of steps of dt in a time; raise ValueError, with the nearest times, if it is not an integer."""
     if not (math.isfinite(seconds) and seconds >= 0):
         raise ValueError(f"{name} = {seconds:g}: must be a finite number of seconds >= {least * dt:g}")
     if seconds / dt > 2**53:
@@ -244,7 +244,7 @@ def _region(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     if not isinstance(scene.space, Plane):
         return np.zeros(scene.dimension), np.array(scene.space.extent(scene.dimension))
-    living = alive[..., None] if scene.population and alive.any() else True  # empty slots have no place
+    living = alive[..., None] if scene.population and alive.any() else True  # empty slots have no position
     ends = ((np.min, np.inf), (np.max, -np.inf))
     low, high = (np.asarray(end(pos, axis=(0, 1), where=living, initial=far), np.float64) for end, far in ends)
     margin = 1.0 + 0.05 * float((high - low).max())

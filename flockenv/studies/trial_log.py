@@ -1,7 +1,7 @@
-"""Findings: what cases came to under methods or models, tried one after another, and gone on with where it stopped.
+"""Findings: results of cases under methods or models, run one after another; an interrupted run can be resumed.
 
 Hard cases of the simulator (`flockenv.studies.stress`) and crowds against guidelines (`flockenv.studies.validation`)
-are tried so. What a case raises is its verdict: a scene that is refused, a simulation that diverges and says so.
+are run this way. An error that a case raises is its verdict: a scene that is refused, a simulation that diverges.
 """
 
 from __future__ import annotations
@@ -31,47 +31,47 @@ VERDICTS: dict[Verdict, str] = {
     "fails": "beyond the bound: the number is what came of it",
     "diverges": "no longer finite, and reported: world, agent, step, effect",
 }
-"""What each verdict means."""
+"""Meaning of each verdict."""
 
 MARKS: dict[Verdict, str] = {"pass": "ok", "reported": "", "fails": "FAILS"}
-"""What they are in a table, where it is not their name."""
+"""Text of a verdict in a table, if it is not its name."""
 
 
 @dataclass(frozen=True)
 class Value:
-    """What a case came to, and whether that is within its bound; none where there is none: it is reported."""
+    """Result of a case, and whether it is within its bound; `holds` is None without a bound: it is only reported."""
 
     number: float
     holds: bool | None
     note: str = ""
     series: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    """What pictures are drawn from."""
+    """Data for pictures."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """Something that is tried: its name, what happens in it, what is demanded, and how it is tried under something."""
+    """A test case: its name, what happens in it, its bound, and a function that runs it under a method or model."""
 
     name: str
     title: str
     bound: str
     trial: Callable[[Any], Value]
     only: tuple[str, ...] = ()
-    """Names of those that it is tried under; none = all."""
+    """Names of the methods or models that it is run under (default: all)."""
 
     def under(self, name: str) -> bool:
-        """Is it tried under this?"""
+        """Return True if the case is run under this method or model."""
         return not self.only or name in self.only
 
 
 class Finding(ResultRecord):
-    """What one case came to under one method or model."""
+    """Result of one case under one method or model."""
 
     case: str
     title: str
     under: str = Field(description="the method, or the model")
     bound: str
-    value: float | None = Field(description="what is bounded; none if it came to no number")
+    value: float | None = Field(description="the bounded quantity; null if it is not finite")
     verdict: Verdict
     note: str = ""
     seconds: float = Field(ge=0, description="s, wall time, compiling included")
@@ -84,14 +84,14 @@ class Finding(ResultRecord):
 
 
 class Results(ResultRecord):
-    """All that was found, and by which sources."""
+    """All findings, and a fingerprint of the sources that they depend on."""
 
     findings: tuple[Finding, ...]
-    sources: str = Field(default="", description="fingerprint of the sources that it hangs by")
+    sources: str = Field(default="", description="fingerprint of the sources that the findings depend on")
 
     @property
     def unders(self) -> list[str]:
-        """Names of methods or models, in the order in which they were tried."""
+        """Names of methods or models, in the order in which they were run."""
         return list(dict.fromkeys(f.under for f in self.findings))
 
     @property
@@ -100,12 +100,12 @@ class Results(ResultRecord):
         return list(dict.fromkeys(f.case for f in self.findings))
 
     def only(self, cases: Collection[str], unders: Collection[str]) -> Results:
-        """Return what was found in some cases under some methods or models."""
+        """Return the findings of some cases under some methods or models."""
         found = tuple(f for f in self.findings if f.case in cases and f.under in unders)
         return self.model_copy(update={"findings": found})
 
     def at(self, case: str, under: str) -> Finding | None:
-        """Return one finding; none if that was not tried."""
+        """Return one finding; None if that case was not run."""
         return next((f for f in self.findings if (f.case, f.under) == (case, under)), None)
 
     def rows(self, digits: int = 2) -> list[list[str]]:
@@ -118,13 +118,13 @@ class Results(ResultRecord):
         return out
 
     def legend(self) -> list[tuple[str, str]]:
-        """Return what the verdicts mean that there are."""
+        """Return the verdicts that occur, each with its meaning."""
         there = {f.verdict for f in self.findings}
         return [(verdict, text) for verdict, text in VERDICTS.items() if verdict in there]
 
 
 def cases_named(cases: Sequence[Case], names: Sequence[str]) -> tuple[Case, ...]:
-    """Return the cases of some names, all for none; a name's first word is enough; ValueError for an unknown one."""
+    """Return cases by name or first word of a name (no names: all); raise ValueError for an unknown one."""
     known = {case.name for case in cases} | {case.name.split()[0] for case in cases}
     for name in names:
         if name not in known:
@@ -133,7 +133,7 @@ def cases_named(cases: Sequence[Case], names: Sequence[str]) -> tuple[Case, ...]
 
 
 def trials(cases: Sequence[Case], unders: Collection[str]) -> int:
-    """Return how many trials there are of these cases under these methods or models."""
+    """Return the number of trials of these cases under these methods or models."""
     return sum(case.under(name) for case in cases for name in unders)
 
 
@@ -146,11 +146,11 @@ def run(
     keep: Callable[[Results], None] = lambda results: None,
     told: tuple[type[Warning], ...] = (),
 ) -> Results:
-    """Try every case under everything by name, and return that beside what is known.
+    """Run every case under every method or model in `unders`, by name; return these findings with the known ones.
 
-    A case that says what it is tried under is tried under nothing else. `told` are warnings that make a verdict.
-    What is known from the same sources is not tried again, and not lost; of other sources nothing is taken over.
-    `progress` is called with how many are done, `keep` with all there is after each: whoever is interrupted has that.
+    A case with names in `only` is run under no others. `told` are warnings that lead to the verdict "warned".
+    Known findings from the same sources are kept and not run again; those from other sources are dropped. `progress`
+    is called with the number done, `keep` with all findings after each trial, so an interrupted run loses nothing.
     """
     found = {(f.case, f.under): f for f in known.findings} if known and known.sources == sources else {}
     place = {case.name: k for k, case in enumerate(cases)}
@@ -169,7 +169,7 @@ def run(
 
 
 def _tried(case: Case, name: str, argument: Any, told: tuple[type[Warning], ...]) -> Finding:
-    """Return what one case came to under something."""
+    """Return the finding of one case under one method or model."""
     began, value = perf_counter(), Value(math.nan, False)
     verdict: Verdict
     with warnings.catch_warnings(record=bool(told)) as caught:
@@ -193,19 +193,19 @@ def _tried(case: Case, name: str, argument: Any, told: tuple[type[Warning], ...]
 
 
 def _judged(value: Value) -> Verdict:
-    """Return the verdict on what a case came to; what is no number is within no bound, whichever way that is asked."""
+    """Return the verdict on a result; NaN is within no bound."""
     if value.holds is None:
         return "reported"
     return "pass" if value.holds and not math.isnan(value.number) else "fails"
 
 
 def _known(number: float) -> float | None:
-    """Return a number; none for what is no number."""
+    """Return a finite number; None for any other."""
     return float(number) if math.isfinite(number) else None
 
 
 def _rounded(series: Mapping[str, Sequence[float]]) -> dict[str, tuple[float | None, ...]]:
-    """Return numbers as they are written: six digits are enough for a picture."""
+    """Return numbers rounded to six digits, enough for a picture; None if not finite."""
     return {
         name: tuple(None if (x := _known(v)) is None else float(f"{x:.6g}") for v in values)
         for name, values in series.items()

@@ -1,6 +1,6 @@
-"""The hand-written players: a file per task, made of the laws that the simulator itself steers by.
+"""The hand-written players: a file per task, built from the simulator's own steering laws.
 
-Each sees the learner's observation and nothing else, and its force has the same limits. Three kinds of names:
+Each receives the learner's observation and nothing else, and its force has the same limits. Three kinds of names:
 
 * `textbook`: published parameters, the defaults in the files;
 * `rules`: the same functions with the parameters that a search found (`python -m agents.tune`), in ../tuned/TASK.json;
@@ -39,7 +39,7 @@ from flockenv.tasks import Task
 __all__ = ["PLAYERS", "RULES", "TUNED", "RulesPlayer", "Tuned", "as_dict", "player", "tuned"]
 
 TUNED = Path(__file__).resolve().parent.parent / "tuned"
-"""Folder of what the search found, a file per task."""
+"""Folder of parameters found by the search, a file per task."""
 
 RULES: dict[str, tuple[Callable[..., Any], type]] = {
     "pursuit": (pursuit.pursuit, pursuit.PursuitRules),
@@ -54,7 +54,7 @@ RULES: dict[str, tuple[Callable[..., Any], type]] = {
     "bottleneck": (bottleneck.bottleneck, bottleneck.BottleneckRules),
     "corridor": (corridor.corridor, corridor.CorridorRules),
 }
-"""What `textbook` and `rules` do in each task, and the record of their parameters."""
+"""Function of `textbook` and `rules` for each task, and the class of its parameters."""
 
 PLAYERS: dict[str, dict[str, tuple[Callable[..., Any], type]]] = {
     "textbook": RULES,
@@ -67,10 +67,10 @@ PLAYERS: dict[str, dict[str, tuple[Callable[..., Any], type]]] = {
     "queueing": {"bottleneck": (bottleneck.queueing, bottleneck.QueueingRules)},
     "rules": RULES,
 }
-"""What each hand-written player does, by its name and the task's."""
+"""Function and parameter class of each hand-written player, by its name and the task's."""
 
 REMEMBERING = (school.school,)
-"""Functions that keep a number per row from one decision to the next."""
+"""Functions with a state per row that is kept between decisions."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Tuned:
 
 
 def tuned(name: str) -> Tuned:
-    """Return what the search found for a task; an empty record if there was no search yet."""
+    """Return the parameters that the search found for a task; an empty record if there was no search yet."""
     path = TUNED / f"{name}.json"
     if not path.is_file():
         return Tuned()
@@ -122,7 +122,7 @@ def tuned(name: str) -> Tuned:
 
 
 def player(task: Task, name: str = "rules") -> RulesPlayer:
-    """Return a hand-written player of a task by name; ValueError if there is none of that name for it."""
+    """Return a hand-written player of a task by name; raise ValueError if the task has none of that name."""
     known = PLAYERS[name]
     if task.name not in known:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Bottleneck: push, as in 2000; or queue."""
+"""Bottleneck: push (Helbing, Farkas and Vicsek 2000), or queue."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class BottleneckRules:
 
 
 def bottleneck(see: Any, task: Bottleneck, p: BottleneckRules) -> NDArray[np.float64]:
-    """Drive to the door, repelled by others and by walls, exponentially."""
+    """Drive to the door, with exponential repulsion from other agents and from walls."""
     drive = 80.0 * (p.speed * task.max_speed * _to_opening(see, task) - see.velocity) / p.tau
     tie = np.array([1.0, 0.0])
     push = p.strength * repulsion(see.neighbours, tie, 2 * _PERSON, p.decay) * see.neighbour_present[..., None]
@@ -67,7 +67,7 @@ class QueueingRules:
 
 
 def queueing(see: Any, task: Bottleneck, p: QueueingRules) -> NDArray[np.float64]:
-    """Go to the door as fast as the gap ahead allows, and keep a little apart."""
+    """Go to the door as fast as the gap ahead allows, with a small separation force."""
     way, present = _to_opening(see, task), see.neighbour_present > 0
     others = see.velocity[:, None] + see.neighbour_velocity
     gap = queue_gap(way[:, None], see.neighbours, others, 2 * _PERSON + p.margin, task.max_speed)

@@ -1,4 +1,4 @@
-"""The law that players by ORCA share: the velocity nearest to the desired one that is free of all agents in sight."""
+"""Law that ORCA players share: the velocity nearest to the desired one that avoids all agents in sight."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ class CorridorRules:
     tau: float = 0.54  # s, relaxation time
     strength: float = 4.5  # A, m/s^2
     importance: float = 2.0  # lambda, s/m, of velocities against positions
-    gamma: float = 0.35  # s, the range of the force per m/s of what closes in
+    gamma: float = 0.35  # s, range of the force per m/s of closing speed
     angular: float = 2.0  # n, 1/m, of turning
     forward: float = 3.0  # n', 1/m, of slowing down
     bias: float = 0.005  # eps, 1/m, to the right
@@ -61,7 +61,7 @@ def _off_walls(see: Any, strength: float, decay: float) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class CorridorOrcaRules:
-    """As published, both take half; a desired velocity that is not free is turned right."""
+    """As published, each agent makes half of the change; a desired velocity that is not free is turned right."""
 
     horizon: float = 2.0  # s, for which the velocity must be free of collisions
     margin: float = 0.05  # m, clearance for what inertia delays

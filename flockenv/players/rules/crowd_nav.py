@@ -28,7 +28,7 @@ class CrowdNavRules:
     speed: float = 1.0  # desired speed as a share of the top speed
     strength: float = 4.5  # A, m/s^2
     importance: float = 2.0  # lambda, s/m, of velocities against positions
-    gamma: float = 0.35  # s, the range of the force per m/s of what closes in
+    gamma: float = 0.35  # s, range of the force per m/s of closing speed
     angular: float = 2.0  # n, 1/m, of turning
     forward: float = 3.0  # n', 1/m, of slowing down
     bias: float = 0.005  # eps, 1/m, to the right

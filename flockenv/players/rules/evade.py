@@ -1,4 +1,4 @@
-"""Evade: around what is in the way, off the walls, away from pursuers, into cover."""
+"""Evade: around obstacles, off the walls, away from pursuers, into cover."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ threat = rows(steering.threat)
 class EvadeRules:
     """Textbook: evade pursuers that are near, else hide from the nearest (Reynolds 1999), in order of priority."""
 
-    horizon: float = 1.0  # s, how far ahead cover counts that is in the way
+    horizon: float = 1.0  # s, look-ahead for cover on the path
     avoid: float = 5.0  # kg/s, strength of steering around it
     wall: float = 0.5  # s, how far ahead walls count
     alarm: float = 10.0  # m, within which a pursuer is evaded: as far as it sees

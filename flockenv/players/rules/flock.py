@@ -1,4 +1,4 @@
-"""Flock: avoid, keep apart, fly as the others do, stay with them, and on course."""
+"""Flock: avoid obstacles, separate, align, cohere, and keep course."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Obstacles: arrive at the goal, around what is in the way."""
+"""Obstacles: seek the goal around obstacles."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class ObstaclesRules:
 
 
 def obstacles(see: Any, task: Obstacles, p: ObstaclesRules) -> NDArray[np.float64]:
-    """Steer to avoid what the straight path touches first (Reynolds 1999), then seek; allocation as in 1987."""
+    """Avoid the obstacle that the straight path touches first (Reynolds 1999), then seek; allocation as in 1987."""
     speed = np.linalg.norm(see.velocity, axis=-1)
     goal_way = see.goal / np.maximum(np.linalg.norm(see.goal, axis=-1), 1e-9)[:, None]
     forward = np.where(speed[:, None] > 0.05, see.velocity / np.maximum(speed, 1e-9)[:, None], goal_way)

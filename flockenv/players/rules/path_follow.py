@@ -22,8 +22,8 @@ class PathFollowRules:
     """Textbook: half a second ahead, the whole track is the tube, full speed in every bend."""
 
     time: float = 0.5  # s, how far ahead it predicts itself
-    lead: float = 0.5  # s, how far ahead at its present speed the point lies that is sought
-    tube: float = 1.0  # share of the track's width that is left alone
+    lead: float = 0.5  # s, look-ahead at the present speed to the point that is sought
+    tube: float = 1.0  # share of the track's width within which there is no correction
     keep: float = 0.5  # share of the desired speed, below which it speeds up
     speed: float = 1.0  # desired speed as a share of the top speed
     grip: float = 100.0  # share of the largest force that a bend may need; a large one = never slows down
@@ -56,4 +56,4 @@ def path_follow(see: Any, task: PathFollow, p: PathFollowRules) -> NDArray[np.fl
 
 
 _FINE = 5
-"""Places between two points of the track that are seen, among which the nearest is."""
+"""Interpolated places per piece between two observed points of the track, among which the nearest is taken."""

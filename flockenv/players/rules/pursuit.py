@@ -1,4 +1,4 @@
-"""Pursuit: seek where the quarry will be, but never beyond the walls it cannot pass."""
+"""Pursuit: seek the predicted place of the quarry, clipped to the walls that it cannot pass."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ interception_time = rows(steering.interception_time)
 class PursuitRules:
     """Textbook: exact interception, full force."""
 
-    factor: float = 1.0  # share of the interception time that is looked ahead
+    factor: float = 1.0  # look-ahead as a share of the interception time
     horizon: float = 10.0  # s, never look further ahead than this
     margin: float = 0.3  # m, the quarry will not be nearer to a wall than this
     gain: float = 5.0  # kg/s, force per m/s of the desired change

@@ -1,4 +1,4 @@
-"""School: a state machine: flee, join the others, eat, or wander; keep off walls and each other always."""
+"""School: a state machine: flee, join the others, eat, or wander; always keep off walls and each other."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class SchoolRules:
     escape: float = 0.4  # fear above which it flees
     school: float = 0.15  # fear above which it joins the others
     need: float = 0.5  # hunger above which it eats
-    calm: float = 0.1  # how much less fear ends either
-    content: float = 0.3  # how much less hunger ends it
+    calm: float = 0.1  # hysteresis: how much less fear ends either
+    content: float = 0.3  # hysteresis: how much less hunger ends it
     wall: float = 0.3  # s, how far ahead walls count
     apart: float = 1.0  # N m, separation from agents that it nearly touches
     predict: float = 0.5  # s, how far ahead a hunter is predicted at most

@@ -1,4 +1,4 @@
-"""What accuracy costs: how far each method ends from the truth in steps of each length, beside time and evaluations.
+"""Cost of accuracy: the error of each method in steps of each length, with time and evaluations.
 
 from flockenv.studies.accuracy import Problem, measure
 report = measure(Problem.of(scene, seconds=1.0, steps=[16, 32, 64, 128, 256, 512]))

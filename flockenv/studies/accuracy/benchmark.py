@@ -1,4 +1,4 @@
-"""Every method in every setting on one problem: errors first, then wall times, in rounds over all of them."""
+"""Benchmark of every method in every setting on one problem: first errors, then wall times, in rounds over all."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ __all__ = ["REPETITIONS", "TOLERANCES", "machine", "measure", "usual_methods"]
 
 REPETITIONS = 20
 TOLERANCES = tuple(10.0**-k for k in range(3, 13))
-"""What an adaptive method is asked for: it chooses its steps itself."""
+"""Tolerances of adaptive methods, which choose their steps themselves."""
 
 DEAREST = 4
-"""Evaluations per step of the dearest method with fixed steps."""
+"""Evaluations per step of the most expensive method with fixed steps."""
 
 TRUSTED = 4.0
-"""Errors of fewer times the reference's own are not trusted."""
+"""Errors below this multiple of the reference's own error are not trusted."""
 
 TOLERANCE_WITHIN = 1e-8
-"""What an adaptive method is asked for where something acts after each step: its steps are then given, like others'."""
+"""Tolerance of an adaptive method if something acts after each step; its steps are then given, as for others."""
 
 
 @dataclass(eq=False)
 class _Trial:
-    """A method in a setting: a scene to run, and what came of it."""
+    """A method in one setting: a scene to run, and its results."""
 
     problem: Problem
     method: Integrator
@@ -52,10 +52,10 @@ class _Trial:
     point: Point | None = None
 
     def compare(self, reference: Reference) -> None:
-        """Run from instant to instant, and measure how far from the reference."""
+        """Run from instant to instant, and measure the distance from the reference."""
         try:
             path = self.problem.path(self.method, self.steps)
-        except ArithmeticError:  # it diverges, or equations were not solved
+        except ArithmeticError:  # divergence, or equations that were not solved
             self.point = self._point(self.steps * self.method.evaluations, {})
             return
         off = self.problem.apart(path, reference.path)
@@ -80,7 +80,7 @@ class _Trial:
         )  # fmt: skip
 
     def clock(self) -> None:
-        """Run as one call, and keep how long it took; one step before it brings the code back into the caches."""
+        """Time one call for the whole run; a step before it brings the code back into the caches."""
         scene, start, out = self._ready
         scene.step(start, out=out)
         began = perf_counter()
@@ -94,7 +94,7 @@ class _Trial:
 
     @property
     def good(self) -> bool:
-        """Did it arrive?"""
+        """True if the run reached the end and has an error."""
         return self.point is not None and self.point.error is not None
 
     @property
@@ -111,14 +111,14 @@ def measure(
     finer: int | None = None,
     progress: Callable[[int], None] = lambda percent: None,
 ) -> Report:
-    """Return how far off each method ends in each number of steps, and what it costs.
+    """Return the error at the end and the cost of each method in each number of steps.
 
-    methods: instances, none = all that `usual_methods` names. repetitions: how often the wall time of each point is
-    taken, all of them in turn; compiling is over by then; 0 = not at all. finer: how much finer than the finest steps
-    a reference of own steps is (see reference.own_steps). progress is called with percents. A KeyboardInterrupt ends
-    it early: what was done is returned, and `stopped` says so; it is raised on if no run has arrived by then.
-    Raises ValueError, in one line, where there is no reference: a scene that is chaotic over its horizon (see
-    chaos.find_sensitivity), or that does not settle on one path (see reference.own_steps).
+    methods: instances (default: those of `usual_methods`). repetitions: number of wall times per point, taken in turns
+    after compiling; 0 = none. finer: ratio of steps for a reference by own steps (see reference.own_steps). progress is
+    called with percents. A KeyboardInterrupt ends it early: the report has what was done, with `stopped` =
+    "interrupted"; it is raised again if no run has reached the end by then.
+    Raises ValueError if there is no reference: the scene is chaotic over its horizon (see chaos.find_sensitivity), or
+    does not converge to one path (see reference.own_steps).
     """
     chosen = usual_methods() if methods is None else tuple(methods)
     if repetitions < 0 or (finer is not None and (finer < LEAST_FINER or finer % LEAST_FINER)):
@@ -147,7 +147,7 @@ def measure(
 
 
 def _settings(problem: Problem, method: Integrator) -> list[tuple[Integrator, int, float | None]]:
-    """Return the settings of a method: numbers of steps, or tolerances of one that chooses its steps itself."""
+    """Return the settings of a method: numbers of steps, or tolerances if it chooses its steps itself."""
     if method.adaptive and problem.after_steps:
         method = method.model_copy(update={"tolerance": TOLERANCE_WITHIN})
     if not method.adaptive or problem.after_steps:
@@ -157,9 +157,9 @@ def _settings(problem: Problem, method: Integrator) -> list[tuple[Integrator, in
 
 
 def _worse_than_dear(before: _Trial, trial: _Trial) -> bool:
-    """Would a tolerance ask for still more than the one before it, which took more evaluations than any fixed steps?
+    """Return True if the previous, looser tolerance of this method took more evaluations than any fixed steps.
 
-    Where forces jump to and fro, a method with steps of its own may need as many as one over its tolerance.
+    If forces jump back and forth, an adaptive method may need as many steps as 1 / tolerance.
     """
     if trial.tolerance is None or before.method.kind != trial.method.kind:
         return False
@@ -167,7 +167,7 @@ def _worse_than_dear(before: _Trial, trial: _Trial) -> bool:
 
 
 def _clock(trials: Sequence[_Trial], repetitions: int, progress: Callable[[int], None]) -> None:
-    """Take the time of every trial, round after round: a disturbance of the machine hits all of them."""
+    """Time every trial, in rounds, so that a disturbance of the machine affects all of them."""
     collecting = gc.isenabled()
     gc.disable()
     try:
@@ -196,7 +196,7 @@ def _curves(trials: Sequence[_Trial], least: float, most: float) -> list[Curve]:
 
 
 def _energy_off(problem: Problem, path: Path, reference: Path) -> float:
-    """Return by how much the energy is off at worst, in parts of the largest kinetic energy of the reference."""
+    """Return the largest error of the energy, as a share of the largest kinetic energy of the reference."""
     if path.who is not None:
         return float("nan")
     off = largest(np.abs(problem.energy(path.pos, path.vel) - problem.energy(reference.pos, reference.vel)))
@@ -205,7 +205,7 @@ def _energy_off(problem: Problem, path: Path, reference: Path) -> float:
 
 
 def _momentum_off(problem: Problem, path: Path, reference: Path) -> float:
-    """Return by how much a momentum that is kept has changed at worst, in parts of the sum of its sizes."""
+    """Return the largest change of a conserved momentum, as a share of the summed magnitudes of all momenta."""
     if not problem.conserves_momentum:
         return float("nan")
     before = problem.momentum(problem.start.vel[0].astype(np.float64))
@@ -215,13 +215,13 @@ def _momentum_off(problem: Problem, path: Path, reference: Path) -> float:
 
 
 def usual_methods() -> tuple[Integrator, ...]:
-    """Return every method that takes explicit steps, in its usual setting, those of low order first."""
+    """Return every explicit method with its default fields, low orders first."""
     kinds = [kind for kind in INTEGRATORS.values() if not kind.solves]
     return tuple(kind() for kind in sorted(kinds, key=lambda kind: (kind.order, kind.evaluations)))
 
 
 def machine() -> Machine:
-    """Return what times depend on."""
+    """Return the machine that times depend on: CPU, cores and load."""
     cpu = platform.processor()
     with suppress(OSError):
         lines = File("/proc/cpuinfo").read_text().splitlines()

@@ -1,4 +1,4 @@
-"""Sensitivity: how fast two nearly equal starts part, and over which time a scene can be compared at all."""
+"""Sensitivity: how fast two nearly equal starts diverge, and the longest time over which runs can be compared."""
 
 from __future__ import annotations
 
@@ -15,26 +15,25 @@ from flockenv.studies.accuracy.problem import FINER, Problem
 __all__ = ["PERTURBATION", "Sensitivity", "find_sensitivity"]
 
 PERTURBATION = 1e-12
-"""m and m/s, or parts of the largest coordinate: how much a start is changed, to see what becomes of it."""
+"""m and m/s, or share of the largest coordinate: perturbation of the start."""
 
 MOST_GROWTH = 1e8
-"""How often larger it may become before the horizon is refused: 1e-12 m are 0.1 mm then."""
+"""Largest growth of a perturbation before the horizon is refused: 1e-12 m have become 0.1 mm then."""
 
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """What becomes of a change of the start."""
+    """Growth of a perturbation of the start."""
 
-    growth: float  # how often larger the change is where it is largest
-    error: float  # m, what it has become then
-    rate: float  # 1/s, at which it grew on average, ln(growth) / time; 0 if it did not
+    growth: float  # largest factor by which the perturbation grows
+    error: float  # m, its size then
+    rate: float  # 1/s, average growth rate ln(growth) / time; 0 if it did not grow
 
 
 def find_sensitivity(problem: Problem) -> Sensitivity:
-    """Return what becomes of a tiny change of the start until the end.
+    """Return the growth of a tiny perturbation of the start until the end.
 
-    Raises ValueError if it grows so much that no two computers could agree where any agent is; the line names a
-    horizon.
+    Raises ValueError, with a horizon to try, if it grows so much that no two computers could agree on any position.
     """
     start = problem.start
     shift = PERTURBATION * max(1.0, float(np.abs(start.pos).max()))
@@ -42,9 +41,7 @@ def find_sensitivity(problem: Problem) -> Sensitivity:
     try:
         paths = [problem.path(RK4(), steps, begin) for begin in (start, _shifted(start, shift))]
     except FloatingPointError as error:
-        raise ValueError(
-            f"the finest steps that were asked for, {problem.seconds / steps:g} s, are too long: {error}"
-        ) from None
+        raise ValueError(f"the finest steps given, {problem.seconds / steps:g} s, are too long: {error}") from None
     off = np.nan_to_num(problem.apart(*paths))
     growth = np.maximum.accumulate(off.max(axis=1)) / shift
     if not growth[-1] <= MOST_GROWTH:
@@ -62,9 +59,9 @@ def find_sensitivity(problem: Problem) -> Sensitivity:
 
 
 def _shifted(start: State, shift: float) -> State:
-    """Return a start with every position changed by `shift` m, and every velocity by as many m/s, at random.
+    """Return a start with positions changed by `shift` m and velocities by `shift` m/s, at random.
 
-    An agent at rest stays at rest: which way it looks is no small change.
+    An agent at rest stays at rest, as its heading could change by any angle.
     """
     change = np.random.default_rng(0).choice([-shift, shift], size=(2, *start.x.shape)) / math.sqrt(len(start.x))
     moves = (start.v != 0).any(axis=0)

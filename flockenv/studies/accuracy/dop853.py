@@ -1,8 +1,8 @@
-"""The path of a scene by scipy's DOP853 on its compiled laws.
+"""Path of a scene by scipy's DOP853 on its compiled laws.
 
-DOP853 (Hairer, Norsett, Wanner: Solving Ordinary Differential Equations I, II.10) has order 8, and gets over jumps of a
-force in steps of nearly nothing. It is run at two tolerances: by how much the two differ is how wrong it is taken to
-be. What acts between the steps of a scene it cannot see, and says so.
+DOP853 (Hairer, Norsett, Wanner: Solving Ordinary Differential Equations I, II.10) has order 8, and crosses jumps of a
+force in very short steps. It is run at two tolerances; the difference of the two runs is the estimate of its error. It
+does not include what acts between the steps of a scene, and raises NotSmoothError then.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ TIGHT, LOOSE = 1e-13, 1e-12
 """rtol = atol of the two runs of DOP853."""
 
 AGREED = 1e-8
-"""As a share of how far agents go: DOP853's two runs must not differ by more."""
+"""Largest difference of DOP853's two runs, as a share of the distance that agents go."""
 
 MOST_EVALUATIONS, AT_ONCE = 50_000, 0.1
-"""Of DOP853, before it is said not to converge: of the share at once, and of the rest as it gets on."""
+"""Most evaluations of DOP853; this share is allowed at once, the rest in proportion to the time reached."""
 
 
 class NotSmoothError(Exception):
-    """DOP853 cannot follow this scene; the text says why."""
+    """DOP853 cannot follow this scene; the message has the reason."""
 
 
 def integrated_twice(problem: Problem) -> tuple[Path, float, str]:
-    """Return the path, its error in m, and how it was found; raises NotSmoothError where DOP853 cannot follow."""
+    """Return the path, its error in m, and a note; raise NotSmoothError if DOP853 cannot follow the scene."""
     if problem.after_steps:
-        raise NotSmoothError(f"DOP853 knows nothing of what acts after each step ({problem.after_steps})")
+        raise NotSmoothError(f"DOP853 does not include what acts after each step ({problem.after_steps})")
     (tight, evaluations), (loose, _) = _integrated(problem, TIGHT), _integrated(problem, LOOSE)
     apart = largest(problem.apart(tight, loose))
     gone = largest(problem.apart(tight, Path(problem.start.pos[0], problem.start.vel[0])))
@@ -43,7 +43,7 @@ def integrated_twice(problem: Problem) -> tuple[Path, float, str]:
 
 
 def _integrated(problem: Problem, tolerance: float) -> tuple[Path, int]:
-    """Integrate x' = v + flow, v' = a from instant to instant; return the path, and how often laws were evaluated."""
+    """Integrate x' = v + flow, v' = a from instant to instant; return the path, and the number of evaluations."""
     from scipy.integrate import solve_ivp
 
     laws = _Laws(problem)
@@ -64,7 +64,7 @@ def _integrated(problem: Problem, tolerance: float) -> tuple[Path, int]:
 
 
 class _Laws:
-    """y = (positions, velocities) in one row -> its derivative, by the compiled laws of a scene."""
+    """Right-hand side y -> dy/dt for y = (positions, velocities) in one row, by the compiled laws of a scene."""
 
     def __init__(self, problem: Problem) -> None:
         self._scene, self._state, self._seconds = problem.scene, problem.start.copy(), problem.seconds
@@ -86,7 +86,7 @@ class _Laws:
         return both[0], both[1]
 
     def refuse_limits(self, times: Floats, rows: Floats) -> None:
-        """Raise if a limit that a scene keeps after each step would have acted: DOP853 knows nothing of them."""
+        """Raise NotSmoothError if a wall or speed limit would have acted after a step: DOP853 does not include them."""
         body, space = self._scene.body, self._scene.space
         limited = bool(np.isfinite(body.max_speed).any())
         if not limited and space.kind != "box":
@@ -96,9 +96,9 @@ class _Laws:
             if space.kind == "box":
                 extent, radius = np.array(space.extent(pos.shape[1])), body.radius[:, None]
                 if ((pos < radius) | (pos > extent - radius)).any():
-                    raise NotSmoothError(f"a wall is met at t = {t:.3g} s, and is kept to after each step")
+                    raise NotSmoothError(f"an agent reaches a wall at t = {t:.3g} s, which acts after each step")
             if limited:
                 derivative = self(t, row)
                 speeds = (np.linalg.norm(self._split(part)[k], axis=-1) for part, k in ((row, 1), (derivative, 0)))
                 if any((speed > body.max_speed * (1 + 1e-9)).any() for speed in speeds):
-                    raise NotSmoothError(f"the speed limit is reached at t = {t:.3g} s, and is kept to after each step")
+                    raise NotSmoothError(f"the speed limit is reached at t = {t:.3g} s, which acts after each step")

@@ -1,4 +1,4 @@
-"""Paths: where a run was at some instants, and how far two of them are apart, agent by agent."""
+"""Paths: positions of a run at some instants, and the distances between two paths, agent by agent."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """Where a run was at some instants."""
+    """Positions and velocities of a run at some instants."""
 
     pos: Floats  # (K, N, D) m
     vel: Floats  # (K, N, D) m/s
-    who: NDArray[np.int64] | None = None  # (K, N) identity of the agent in each slot, -1 = none lives there
-    work: NDArray[np.int64] | None = None  # (len(WORK),) what was counted, see State.work
+    who: NDArray[np.int64] | None = None  # (K, N) identity of the agent in each slot, -1 = empty slot
+    work: NDArray[np.int64] | None = None  # (len(WORK),) work counters, see State.work
 
     def counted(self, what: str) -> int:
         """Return one work counter; `what` is a name in WORK."""
@@ -31,9 +31,9 @@ class Path:
 
 
 def apart(path: Path, other: Path, displacement: Callable[[Floats, Floats], Floats]) -> Floats:
-    """Return how far every agent of a path is from where another has it, (K, N) m, the shortest way.
+    """Return the distance of every agent between two paths, (K, N) m, along the shortest path.
 
-    Where agents are born and die they are compared by identity: what lives in one path alone is NaN.
+    If agents are born and die, they are compared by identity: NaN for agents that live in only one path.
     """
     if path.who is None or other.who is None:
         return np.asarray(np.linalg.norm(displacement(path.pos, other.pos), axis=-1))
@@ -47,7 +47,7 @@ def apart(path: Path, other: Path, displacement: Callable[[Floats, Floats], Floa
 
 
 def unmatched(path: Path, other: Path) -> int:
-    """Return how many agents live in one of two paths alone, at the instant at which they are most."""
+    """Return the number of agents that live in only one of two paths, at the instant with most of them."""
     if path.who is None or other.who is None:
         return 0
     return max(
@@ -56,7 +56,7 @@ def unmatched(path: Path, other: Path) -> int:
 
 
 def reach(path: Path, start: Floats, displacement: Callable[[Floats, Floats], Floats]) -> float:
-    """Return how far the farthest agent goes from `start`, (N, D), or from where it is first seen after birth, m."""
+    """Return the largest distance of an agent from `start`, (N, D), or from its first position after birth, m."""
     if path.who is None:
         return largest(np.linalg.norm(displacement(path.pos, start), axis=-1))
     most, first = 0.0, {int(who): start[who] for who in range(len(start))}
@@ -73,5 +73,5 @@ def largest(values: Floats) -> float:
 
 
 def farthest(off: Floats) -> float:
-    """Return the largest distance of agents that live in both paths, m; NaN if none does."""
+    """Return the largest distance of agents that live in both paths, m; NaN if there are none."""
     return largest(off[~np.isnan(off)])

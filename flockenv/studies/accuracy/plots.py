@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["draw_precision", "write_precision"]
 
 COLUMNS = 4
-"""Problems side by side, before another band begins."""
+"""Problems side by side in one band."""
 
 MARKERS = "osD^vPX<>*hp"
 LINES = ("-", "--")
@@ -44,7 +44,7 @@ def write_precision(path: str | Path, reports: Sequence[Report]) -> None:
 def draw_precision(reports: Sequence[Report]) -> Figure:
     """Return the picture: per problem errors at the end against wall time, below them against force evaluations.
 
-    The number at the end of a line is the order that was measured; grey slopes show what orders 1, 2 and 4 would look
+    The number at the end of a line is the measured order; grey slopes show what orders 1, 2 and 4 would look
     like. Hollow points are not clearly above the reference's own error, whose size is below the title; the grey band
     begins where errors are not trusted. The legend of a single problem also has the orders.
 

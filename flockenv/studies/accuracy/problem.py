@@ -1,4 +1,4 @@
-"""Problem: a scene with a start and an end, taken there by any method in any number of steps."""
+"""Problem: a scene from a start to an end, which any method can run in any number of steps."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ Exact = Callable[[float], tuple[ArrayLike, ArrayLike]]
 """t, s -> positions (N, D) m and velocities (N, D) m/s, in closed form."""
 
 INSTANTS = 16
-"""At most so many instants, equally apart and the last at the end, at which a run is compared with its reference."""
+"""Most instants at which a run is compared with its reference, evenly spaced, the last at the end."""
 
 
 FINER = 64
-"""The finest steps of a reference of own steps, in parts of the finest that are measured."""
+"""Ratio of the finest measured step to the finest step of a reference by own steps."""
 
 BY_DT = (UnstableStepWarning, CoarseContactWarning, UnsolvedContactsWarning, UnmetWarning)
 """Warnings about steps that are too long: a measurement takes such steps on purpose."""
@@ -39,7 +39,7 @@ BY_DT = (UnstableStepWarning, CoarseContactWarning, UnsolvedContactsWarning, Unm
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A scene, where it starts, for how long it runs, and in which numbers of steps methods are to take it there."""
+    """A scene, its start, its duration, and the numbers of steps in which methods run it."""
 
     name: str
     title: str
@@ -63,15 +63,15 @@ class Problem:
     ) -> Problem:
         """Return the problem of a scene from its start with a seed, or from positions and velocities, (N, D) each.
 
-        Raises ValueError, in one line, for what no method can be measured on: seconds or steps that lead nowhere,
-        float32 (its rounding hides what a method does), draws of every step (runs in steps of two lengths have no
-        path in common), and laws that are maps of one step.
+        Raises ValueError if no method can be measured on it: invalid seconds or steps, float32 (rounding hides the
+        errors of methods), random draws in every step (runs with different steps have no path in common), and laws
+        that are maps of one step.
         """
         if not (math.isfinite(seconds) and seconds > 0):
             raise ValueError(f"seconds = {seconds!r}: must be a finite number of seconds > 0")
         wrong = [n for n in steps if not isinstance(n, int) or isinstance(n, bool) or n < 1]
         if wrong or not steps:
-            raise ValueError(f"steps = {tuple(steps)}: must be whole numbers of at least 1, and one at least")
+            raise ValueError(f"steps = {tuple(steps)}: must be integers >= 1, at least one")
         if scene.dtype != "float64":
             raise ValueError(f"dtype = {scene.dtype}: its rounding would hide what a method does; use float64")
         _refuse_draws(scene)
@@ -84,20 +84,20 @@ class Problem:
 
     @property
     def times(self) -> Floats:
-        """The instants, (K,) s: as many as every number of steps can be divided into."""
+        """The instants, (K,) s: the most, up to INSTANTS, that divide every number of steps."""
         common = math.gcd(*self.steps)
         many = max(k for k in range(1, INSTANTS + 1) if common % k == 0)
         return self.seconds * np.arange(1, many + 1) / many
 
     @property
     def _moving(self) -> Floats:
-        """The masses of those who are not held in place, (N,) kg; 0 for them."""
+        """The masses of agents, (N,) kg; 0 for those held in place."""
         mass = self.scene.body.mass.astype(np.float64)
         return np.where(np.isfinite(mass), mass, 0.0)
 
     @property
     def after_steps(self) -> str:
-        """What acts between steps, so that no method knows of it, in words; "" if nothing does."""
+        """What acts between steps, outside the integration method, in words; "" if nothing does."""
         scene, parts = self.scene, self.scene.parts
         found = [constraint.kind for constraint in scene.constraints]
         found += ["births and deaths"] if scene.population else []
@@ -107,7 +107,7 @@ class Problem:
 
     @property
     def by_events(self) -> Problem:
-        """The same problem with every impact found in the order of time, where its own response comes to that."""
+        """The same problem with impacts found in the order of time, if its own response converges to that."""
         constraints = tuple(
             each.model_copy(update={"response": "earliest"})
             if isinstance(each, Collisions) and each.response in ("back_up", "project")
@@ -117,9 +117,9 @@ class Problem:
         return replace(self, scene=self.scene.model_copy(update={"constraints": constraints}))
 
     def ready(self, method: Integrator, steps: int) -> tuple[Scene, State]:
-        """Return the scene advanced by a method in so many steps, and its start.
+        """Return the scene with a method and the step of `steps` steps, and its start.
 
-        Raises ValueError where the scene refuses such steps because they blow up; of less it does not warn.
+        Raises ValueError if the scene refuses such steps as unstable; warnings about long steps are ignored.
         """
         dt = self.seconds / steps
         with warnings.catch_warnings():
@@ -128,9 +128,9 @@ class Problem:
             return self.scene.model_copy(update={"integrator": method, "dt": dt}), replace(self.start, dt=dt)
 
     def stable(self, method: Integrator, most: int) -> int:
-        """Return the least power of 2 by which the finest steps must be divided for a method to be stable.
+        """Return the smallest power of 2 by which the finest steps must be divided for a method to be stable.
 
-        Raises ValueError, in one line, if that is more than `most`.
+        Raises ValueError if that is more than `most`.
         """
         limit = suggest_dt(self.ready(method, most * self.steps[-1])[0]).dt
         finest, times = self.seconds / self.steps[-1], 1
@@ -138,16 +138,16 @@ class Problem:
             times *= 2
             if times > most:
                 raise ValueError(
-                    f"the finest steps that were asked for, {finest:.3g} s, are too long: {method.kind}, which finds "
+                    f"the finest steps given, {finest:.3g} s, are too long: {method.kind}, which finds "
                     f"the reference, is stable up to {limit:.3g} s in this scene"
                 )
         return times
 
     def path(self, method: Integrator, steps: int, start: State | None = None) -> Path:
-        """Run, and return where every agent was at the instants; raises FloatingPointError where it diverges."""
+        """Run, and return the path of all agents at the instants; raise FloatingPointError if it diverges."""
         try:
             scene, state = self.ready(method, steps)
-        except ValueError as error:  # it would
+        except ValueError as error:  # the steps are unstable
             raise FloatingPointError(str(error)) from None
         state = replace(start, dt=scene.dt) if start is not None else state
         before, each = state.work.sum(axis=0), steps // len(self.times)
@@ -166,11 +166,11 @@ class Problem:
         )  # fmt: skip
 
     def apart(self, path: Path, other: Path) -> Floats:
-        """Return how far every agent is from where another path has it, (K, N) m; see `paths.apart`."""
+        """Return the distance of every agent between two paths, (K, N) m; see `paths.apart`."""
         return apart(path, other, self.scene.space.displacement)
 
     def energy(self, pos: Floats, vel: Floats) -> Floats:
-        """Return kinetic energy, and what potential energy the effects know of, at instants (K, N, D), (K,) J."""
+        """Return kinetic energy plus the potential energies that effects have, at instants (K, N, D), (K,) J."""
         instants, agents, dimension = pos.shape  # a world for every instant
         state = blank(instants, agents, dimension, 0, self.start.dt).with_motion(pos, vel)
         total = self.kinetic(vel)
@@ -188,12 +188,12 @@ class Problem:
 
     @property
     def _with_potential(self) -> list[Effect]:
-        """The effects that know their potential energy; none on a torus, where it jumps from image to image."""
+        """The effects with a potential energy; empty on a torus, where it jumps between images."""
         known = [] if self.scene.space.periodic else self.scene.effects
         return [effect for effect in known if self._potential(effect, self.start) is not None]
 
     def impulse(self, vel: Floats) -> Floats:
-        """Return the sum of the sizes of all momenta, (...) kg m/s."""
+        """Return the sum of the magnitudes of all momenta, (...) kg m/s."""
         return np.asarray((self._moving * np.linalg.norm(vel, axis=-1)).sum(axis=-1))
 
     def kinetic(self, vel: Floats) -> Floats:
@@ -202,7 +202,7 @@ class Problem:
 
     @property
     def energies(self) -> str:
-        """What `energy` sums up, in words."""
+        """The energies that `energy` sums up, in words."""
         if self.scene.population:
             return "not compared: agents are born and die"
         kinds = [effect.kind for effect in self._with_potential]
@@ -210,7 +210,7 @@ class Problem:
 
     @property
     def conserves_momentum(self) -> bool:
-        """True if momentum is kept, but for errors: by all effects, and no wall, limit, birth or death changes it."""
+        """True if momentum is conserved up to errors: by all effects, and no wall, limit, birth or death changes it."""
         body = self.scene.body
         walled = any(isinstance(each, Collisions) and each.obstacles for each in self.scene.constraints)
         if self.scene.population or (walled and self.scene.obstacles):
@@ -223,7 +223,7 @@ class Problem:
 
 
 def _refuse_draws(scene: Scene) -> None:
-    """Refuse what is drawn anew in every step: two lengths of a step draw different numbers."""
+    """Raise ValueError for random draws in every step: other step lengths draw other numbers."""
     for k, effect in enumerate(scene.effects):
         if any(each.kick_law is not None for each in (effect, *effect.wishes)):
             raise ValueError(

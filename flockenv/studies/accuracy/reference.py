@@ -1,9 +1,9 @@
-"""Where a scene truly goes: the best reference that obeys all of the scene, and how wrong it may be.
+"""Reference solution of a scene: the best one that respects all of the scene, with an estimate of its error.
 
-In this order: a closed form, where the problem has one; scipy's DOP853 on the scene's laws, where nothing acts between
-its steps; else the scene's own steps, with its constraints, births and deaths, much finer than anything that is
-measured. Impacts are found in the order of time then (`response: earliest`). How wrong own steps are is estimated after
-Richardson: three runs, each in twice as many steps as the one before, give the order in which they close in on a limit.
+In this order: a closed form, if the problem has one; scipy's DOP853 on the scene's laws, if nothing acts between
+its steps; else the scene's own steps, with its constraints, births and deaths, much finer than any that is measured,
+with impacts found in the order of time (`response: earliest`). The error of own steps is estimated by Richardson
+extrapolation: three runs, each in twice as many steps as the one before, give the order of convergence to a limit.
 Source: Roache 1998, Verification and Validation in Computational Science and Engineering, ch. 5 (grid convergence).
 """
 
@@ -24,40 +24,40 @@ from flockenv.studies.accuracy.problem import FINER, Problem
 __all__ = ["COARSE", "LEAST_FINER", "Reference", "find_reference", "own_steps"]
 
 LEAST_FINER = 4
-"""The finest steps of a reference of own steps, in parts of the finest that are measured, at least."""
+"""Least ratio of the finest measured step to the step of a reference by own steps."""
 
 MOST_WORK = 100_000_000
-"""Steps of agents in the finest run of such a reference: of more, it is less fine."""
+"""Most agent-steps in the finest run of such a reference; its steps are coarser if they would be more."""
 
 BETWEEN_STEPS = 500
-"""Agents whose step takes about as long as what a scene does between two steps, if something acts there."""
+"""Cost of what acts between two steps of a scene, as a number of agents whose step takes as long."""
 
 COARSE = 0.1
-"""Errors of more than this share of how far agents go are no approximation."""
+"""Errors above this share of the distance that agents go are no approximation."""
 
 ROUNDING, ROUNDING_STEP = 1e-12, 1e-16
-"""m, or parts of how far agents go: runs that part by less, or by less for each of their steps, differ by rounding."""
+"""m, or share of the distance that agents go: smaller differences of runs, in all or per step, are rounding."""
 
 SETTLED = 0.5
-"""The order from which on three runs are taken to close in on a limit."""
+"""Least order at which three runs are taken to converge to a limit."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Where every agent is at the instants of a problem."""
+    """Reference position of every agent at the instants of a problem."""
 
     kind: str  # "closed form", "DOP853", "event-exact steps" or "own steps"
     path: Path
-    error: float  # m, how wrong it may be at any instant
-    reach: float  # m, how far the farthest agent goes
-    note: str = ""  # how it was found, and why it is no better one
+    error: float  # m, estimated error at any instant
+    reach: float  # m, the distance that the farthest agent goes
+    note: str = ""  # how it was found, and why no better reference was possible
 
 
 def find_reference(problem: Problem, finer: int | None = None) -> Reference:
     """Return the best reference there is.
 
-    finer: see `own_steps`. Raises ValueError, in one line, where there is none: the scene diverges even in the finest
-    steps, or does not settle on one path.
+    finer: see `own_steps`. Raises ValueError if there is none: the scene diverges even in the finest steps, or does not
+    converge to one path.
     """
     if problem.exact is not None:
         pos, vel = zip(*(problem.exact(t) for t in problem.times), strict=True)
@@ -71,10 +71,10 @@ def find_reference(problem: Problem, finer: int | None = None) -> Reference:
 
 
 def own_steps(problem: Problem, finer: int | None = None, reason: str = "") -> Reference:
-    """Return the reference of the whole scene in steps of its own with RK4.
+    """Return the reference of the whole scene by its own steps with RK4.
 
-    finer: how much finer than the finest steps that are measured, a multiple of 4; none = 64, or as much as keeps to
-    MOST_WORK. Raises ValueError, in one line, where it diverges, or no longer knows where agents are.
+    finer: ratio of the finest measured step to that of the reference, a multiple of 4 (default: 64, or the largest
+    within MOST_WORK). Raises ValueError if the scene diverges or does not converge to one path.
     """
     fine = problem.by_events
     many = max(affordable(problem) if finer is None else finer, LEAST_FINER * problem.stable(RK4(), FINER))
@@ -96,7 +96,7 @@ def own_steps(problem: Problem, finer: int | None = None, reason: str = "") -> R
 
 
 def _left_over(path: Path) -> list[str]:
-    """Say what a run did not do as its scene asks: contacts left unsolved, births without a free slot."""
+    """Return notes on deviations of a run from its scene: contacts left unsolved, births without a free slot."""
     unsolved, refused = path.counted("unsolved"), path.counted("births_refused")
     found = [f"{unsolved:,} contacts unsolved"] if unsolved else []
     slots = f"{refused:,} births found no free slot, so which agents are born depends on the step"
@@ -104,7 +104,7 @@ def _left_over(path: Path) -> list[str]:
 
 
 def affordable(problem: Problem) -> int:
-    """Return how much finer than the finest measured steps a reference is that keeps to MOST_WORK."""
+    """Return the largest ratio of the finest measured step to that of a reference within MOST_WORK."""
     ends = problem.scene.constraints or problem.scene.population
     work = (problem.scene.agents + (BETWEEN_STEPS if ends else 0)) * problem.steps[-1]
     finer = FINER
@@ -114,10 +114,10 @@ def affordable(problem: Problem) -> int:
 
 
 def _closing_in(before: float, last: float, rounding: float) -> tuple[float | None, float]:
-    """Return the order in which three runs close in on a limit, and how wrong the finest is, m, by how far they part.
+    """Return the order of convergence of three runs, and the error of the finest, m, from their differences.
 
-    Richardson: with order q the finest is last / (2^q - 1) off. An order above 1 is not relied upon, where forces jump
-    and bodies hit; without an order the larger distance is the best that can be said.
+    Richardson: with order q the error of the finest is last / (2^q - 1). Orders above 1 are not relied upon, as forces
+    may jump and bodies may hit; without an order the larger difference is returned.
     """
     if not last > rounding:
         return None, max(before, last)
@@ -126,7 +126,7 @@ def _closing_in(before: float, last: float, rounding: float) -> tuple[float | No
 
 
 def _told(order: float | None, last: float) -> str:
-    """Say how a reference closes in on a limit."""
+    """Return a note on the convergence of a reference."""
     if order is None:
         return f"{last:.1e} m from half as many, which is rounding"
     settles = f"order {order:.1f}" if order >= SETTLED else f"no order ({order:.1f}): a path that jumps"
@@ -134,7 +134,7 @@ def _told(order: float | None, last: float) -> str:
 
 
 def _refuse_unsettled(problem: Problem, steps: int, off: Floats, error: float, gone: float) -> None:
-    """Refuse a scene that ends somewhere else in other steps, however short; the line names a horizon."""
+    """Raise ValueError, with a horizon to try, if a scene does not converge with shorter steps."""
     if math.isnan(error):
         raise ValueError(f"seconds = {problem.seconds:g}: no agent lives at any instant at which runs are compared")
     if error <= COARSE * gone or error == 0:
@@ -144,8 +144,8 @@ def _refuse_unsettled(problem: Problem, steps: int, off: Floats, error: float, g
     advice = f"try --seconds {kept[-1]:.3g}" if len(kept) else "try a shorter horizon, or shorter steps"
     raise ValueError(
         f"no reference over {problem.seconds:g} s: RK4 in {steps:,} steps and in half as many end "
-        f"{by_instant[-1]:.1e} m apart, of {gone:.1e} m that the farthest agent goes (a jump is met on one path and "
-        f"missed on the other, and what follows differs); {advice}"
+        f"{by_instant[-1]:.1e} m apart, of {gone:.1e} m that the farthest agent goes (a jump occurs on one path and "
+        f"not on the other, and what follows differs); {advice}"
     )
 
 

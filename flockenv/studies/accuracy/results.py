@@ -1,4 +1,4 @@
-"""What was measured: points, a curve of them per method, a report per problem; and which of them is the cheapest."""
+"""Results of a benchmark: points, a curve of points per method, a report per problem; and the cheapest of them."""
 
 from __future__ import annotations
 
@@ -20,89 +20,89 @@ Cost = Literal["seconds", "evaluations"]
 COSTS: dict[Cost, str] = {"seconds": "wall time, s", "evaluations": "force evaluations"}
 
 HALVINGS = 5
-"""An order is measured over the finest so many halvings that are neither coarse nor drowned in rounding."""
+"""Halvings over which an order is measured: the finest whose errors are neither too coarse nor rounding."""
 
 SENSITIVE = 100.0
 """Growth of a tiny difference at the start beyond which a report counts as sensitive."""
 
 FEWEST = 4
-"""Points of which an order is told at all."""
+"""Fewest points over which an order is measured."""
 
 
 class Machine(ResultRecord):
-    """Where it was measured."""
+    """The machine of a measurement."""
 
     cpu: str
     cores: int
     load: float | None
-    """Processes that wanted to run meanwhile, on average over a minute; none where the system does not count."""
+    """Runnable processes, on average over the last minute; None if the system does not count them."""
 
 
 class Point(ResultRecord):
-    """One method in one setting, taken from the start to the end; what has no number is none."""
+    """One run of a method in one setting, from start to end; values that do not exist are None."""
 
     steps: int
     """Calls of the method."""
     dt: float
     """s; an adaptive method chooses shorter ones."""
     tolerance: float | None
-    """Of an adaptive method."""
+    """Tolerance of an adaptive method."""
     evaluations: int
-    """Of the force."""
+    """Evaluations of the force."""
     error: float | None
-    """m, of the agent that is farthest off at the end; none = it diverged."""
+    """m, of the agent with the largest error at the end; None if the run diverged."""
     rms: float | None
     """m, root of the mean square over the agents at the end."""
     along: float | None
-    """m, of the agent that is farthest off at any instant."""
+    """m, the largest error of any agent at any instant."""
     energy: float | None
-    """By how much the energy is off at worst, in parts of the largest kinetic energy."""
+    """Largest error of the energy, as a share of the largest kinetic energy."""
     momentum: float | None
-    """By how much the momentum has changed at worst, in parts of the sum of its sizes; none where it is not kept."""
+    """Largest change of the momentum, as a share of the summed magnitudes; None if momentum is not conserved."""
     seconds: float | None
-    """Wall time of the whole run, the median of several; none = not measured."""
+    """s, wall time of the whole run, the median of several; None if not measured."""
     unmatched: int = 0
-    """Agents that live in this run or in the reference alone, at the instant at which they are most."""
+    """Agents that live in only one of this run and the reference, at the instant with most of them."""
     unsolved: int = 0
     """Contacts that collisions left unsolved, see State.work."""
 
     def cost(self, by: Cost) -> float | None:
-        """Return what it costs."""
+        """Return the cost of this point, in seconds or evaluations."""
         return self.seconds if by == "seconds" else float(self.evaluations)
 
 
 class Choice(ResultRecord):
-    """A setting that keeps to a tolerance, and what it costs."""
+    """A setting that reaches a tolerance, and its cost."""
 
     method: str
     dt: float
     tolerance: float | None
-    """Of an adaptive method."""
+    """Tolerance of an adaptive method."""
     cost: float
     error: float
     """m"""
     interpolated: bool
-    """Does it lie between two measured points?"""
+    """True if it lies between two measured points."""
 
 
 class Curve(ResultRecord):
-    """A method, from its cheapest point to its dearest."""
+    """The points of a method, from the cheapest to the most expensive."""
 
     method: str
     declared: int
-    """The order it has where forces are smooth."""
+    """The order of the method if forces are smooth."""
     points: tuple[Point, ...]
     order: float | None
-    """The measured one; none where too few points are left, and of adaptive methods: what they halve is no step."""
+    """The measured order; None with too few points, and for adaptive methods, whose steps are not halved."""
     used: int
     """Points that the order was measured over."""
 
     def needed(self, tolerance: float, by: Cost = "evaluations", interpolate: bool = True) -> Choice | None:
-        """Return the cheapest way of this method to an error of at most `tolerance`, m; none if no point is so good.
+        """Return the cheapest setting of this method with an error of at most `tolerance`, m; None if there is none.
 
-        All points that are finer must be as good: a coarse one that is right by chance is not taken. Between the last
-        one that is too coarse and the first that is not, errors and costs are taken for straight lines over their
-        logarithms, unless `interpolate` is False. Times are noisy: a finer point may be the cheaper one.
+        All finer points must also be within the tolerance, so a coarse point that is accurate by chance is not taken.
+        Between the last point that is too coarse and the first that is not, the logarithms of error and cost are
+        interpolated linearly, unless `interpolate` is False. Times are noisy: a finer point may be cheaper.
         """
         known = [p for p in self.points if p.cost(by) is not None]
         good = list(takewhile(lambda p: p.error is not None and p.error <= tolerance, reversed(known)))
@@ -121,7 +121,7 @@ class Curve(ResultRecord):
         )
 
     def _between(self, worse: Point, better: Point, error: float, by: Cost) -> Choice:
-        """Return the choice of a certain error between two points of larger and of smaller error."""
+        """Return the interpolated choice with a given error, between a point of larger and one of smaller error."""
         a, b = self._at(worse, by), self._at(better, by)
         share = math.log(a.error / error) / math.log(a.error / b.error)
         tolerances = None
@@ -142,25 +142,25 @@ class Report(ResultRecord):
     seconds: float
     dtype: str
     reference: str
-    """What errors are measured against."""
+    """The reference that errors are measured against."""
     reference_error: float
-    """m, how wrong that may be."""
+    """m, estimated error of the reference."""
     note: str
     growth: float
-    """How often larger a tiny difference at the start has become by the end."""
+    """Factor by which a tiny difference at the start has grown by the end."""
     rate: float = 0.0
-    """1/s, at which it grew on average: of a chaotic scene its largest Lyapunov exponent, over this horizon."""
+    """1/s, its average growth rate: for a chaotic scene the largest Lyapunov exponent, over this horizon."""
     floor: float
-    """m, errors below are rounding or the reference's own."""
+    """m, errors below this are rounding or the reference's own."""
     reach: float
-    """m, how far the farthest agent goes: an error of a tenth of it and more is no approximation."""
+    """m, the distance that the farthest agent goes: an error of a tenth of it or more is no approximation."""
     energy: str
-    """Which energy is compared."""
+    """The kinds of energy that are compared."""
     repetitions: int
     machine: Machine
     curves: tuple[Curve, ...]
     stopped: str = ""
-    """Why it ended before its time."""
+    """Reason if it ended early, else empty."""
 
     @property
     def sensitive(self) -> bool:
@@ -168,11 +168,11 @@ class Report(ResultRecord):
         return self.growth > SENSITIVE
 
     def trusts(self, point: Point) -> bool:
-        """True if an error is clearly above what the reference itself may be wrong by."""
+        """Return True if the error is clearly above that of the reference itself."""
         return point.error is not None and point.error > self.floor
 
     def curve(self, method: str) -> Curve:
-        """Return the curve of a method; raises ValueError, with the nearest name, if it was not measured."""
+        """Return the curve of a method; raise ValueError, with the nearest name, if it was not measured."""
         for curve in self.curves:
             if curve.method == method:
                 return curve
@@ -180,31 +180,31 @@ class Report(ResultRecord):
         raise ValueError(f"method = {shown(method)}: was not measured{nearest(method, names)} ({', '.join(names)})")
 
     def cheapest(self, tolerance: float, by: Cost = "evaluations", interpolate: bool = True) -> Choice | None:
-        """Return the cheapest measured way to an error of at most `tolerance`, m; none if nothing measured is so good.
+        """Return the cheapest choice with an error of at most `tolerance`, m; None if no method reaches it.
 
-        Raises ValueError for a tolerance below what this report can tell, its floor.
+        Raises ValueError for a tolerance below the floor of this report.
         """
         if not (math.isfinite(tolerance) and tolerance >= self.floor):
             raise ValueError(
-                f"tolerance = {tolerance:g} m: must be a finite number of at least {self.floor:.1e} m, below which "
-                f"{self.name} is rounding"
+                f"tolerance = {tolerance:g} m: must be finite and >= {self.floor:.1e} m, below which "
+                f"errors of {self.name} are not trusted"
             )
         found = [c for curve in self.curves if (c := curve.needed(tolerance, by, interpolate)) is not None]
         return min(found, key=lambda choice: choice.cost, default=None)
 
 
 class Results(ResultRecord):
-    """Reports as they lie in a file."""
+    """Reports as stored in a file."""
 
     format: Literal[1] = FORMAT  # type: ignore[assignment]
     reports: tuple[Report, ...]
 
 
 def measured_order(points: Iterable[Point], least: float, most: float) -> tuple[float | None, int]:
-    """Return the slope of the logarithm of the error over that of the evaluations, and how many points it is of.
+    """Return the slope of the logarithm of the error over that of the evaluations, and the number of points used.
 
-    Of the finest HALVINGS + 1 points whose errors lie between `least` (rounding) and `most` (no approximation) m; none
-    of fewer than FEWEST. Of the error at any instant: at one of them alone it may pass through zero.
+    Uses the finest HALVINGS + 1 points whose errors lie between `least` (rounding) and `most` (no approximation), m;
+    the order is None for fewer than FEWEST. The error is the largest over all instants, as at one it may pass zero.
     """
     usable = [p for p in points if p.along is not None and least < p.along < most]
     kept = usable[-HALVINGS - 1 :]
@@ -215,5 +215,5 @@ def measured_order(points: Iterable[Point], least: float, most: float) -> tuple[
 
 
 def _between(a: float, b: float, share: float) -> float:
-    """Return what lies between two positive numbers, on a straight line over logarithms."""
+    """Return the logarithmic interpolation between two positive numbers."""
     return math.exp((1 - share) * math.log(a) + share * math.log(b))

@@ -1,6 +1,6 @@
-"""The suite: problems with closed forms, and flocks, that show what methods cost where forces are smooth and where not.
+"""The suite: problems with closed forms, and flocks, for the cost of methods with smooth and non-smooth forces.
 
-Horizons are no whole numbers of periods: there semi-implicit Euler would pass for a method of order 2.
+Horizons are not whole numbers of periods, at which semi-implicit Euler would seem to have order 2.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ __all__ = ["SUITE", "problems_named"]
 
 ORIGIN = (0.0, 0.0)
 BIRDS, EDGE, REACH = 24, 40.0, 20.0
-"""Of the flocks: how many, on a torus of which edge, m, who see how far, m: everybody, as long as they are together."""
+"""Flocks: number of agents, edge of the torus, m, and radius of sight, m, larger than a flock that is together."""
 
 
 def powers(first: int, last: int) -> tuple[int, ...]:
@@ -49,7 +49,7 @@ def _one_body(
     name: str, title: str, effects: Sequence[Effect], seconds: float, steps: Sequence[int], exact: Exact | None,
     start: tuple[Floats, Floats] | None = None,
 ) -> Problem:  # fmt: skip
-    """Return the problem of one body of 1 kg that begins where its closed form says, or at `start`."""
+    """Return the problem of one body of 1 kg that begins at its closed form for t = 0, or at `start`."""
     group = Group(count=1, spawn=Spawn(low=ORIGIN, high=ORIGIN))
     scene = Scene(groups=(group,), effects=tuple(effects))
     motion = exact(0.0) if start is None and exact is not None else start
@@ -96,7 +96,7 @@ def pendulum() -> Problem:
 
 
 def forced_oscillator() -> Problem:
-    """x'' = -x + cos 2t from rest at 0: forces are asked for in the middle of a step too."""
+    """x'' = -x + cos 2t from rest at 0: forces are also evaluated within a step."""
 
     def exact(t: float) -> tuple[Floats, Floats]:
         x, v = (math.cos(t) - math.cos(2 * t)) / 3, (2 * math.sin(2 * t) - math.sin(t)) / 3
@@ -110,7 +110,7 @@ def forced_oscillator() -> Problem:
 
 
 def _kepler(name: str, eccentricity: float, periods: float, steps: Sequence[int]) -> Problem:
-    """Return a body about a fixed sun, mu = 1 and a = 1, from where it is nearest."""
+    """Return a body in orbit about a fixed sun, mu = 1 and a = 1, from its pericentre."""
 
     def exact(t: float) -> tuple[Floats, Floats]:
         angle, e = t, eccentricity  # the eccentric anomaly solves t = E - e sin E
@@ -126,12 +126,12 @@ def _kepler(name: str, eccentricity: float, periods: float, steps: Sequence[int]
 
 
 def kepler() -> Problem:
-    """An orbit that is not far from round."""
+    """An orbit of moderate eccentricity."""
     return _kepler("kepler", 0.5, 3.3, powers(7, 17))
 
 
 def kepler_close() -> Problem:
-    """An orbit that passes close to the sun, where short steps are needed and nowhere else."""
+    """An orbit that passes close to the sun; short steps are needed only there."""
     return _kepler("kepler_close", 0.9, 1.3, powers(8, 18))
 
 
@@ -224,7 +224,7 @@ def rod() -> Problem:
 
 
 def _flock(name: str, title: str, fov: float = 360.0, max_speed: float | None = None) -> Problem:
-    """Return the problem of a flock in the middle of a torus, which stays together."""
+    """Return the problem of a flock that stays together in the middle of a torus."""
     low, high = (0.4 * EDGE,) * 2, (0.6 * EDGE,) * 2
     group = Group(count=BIRDS, max_speed=max_speed, spawn=Spawn(low=low, high=high, speed=(0.5, 1.5)))
     rules = (
@@ -237,17 +237,17 @@ def _flock(name: str, title: str, fov: float = 360.0, max_speed: float | None = 
 
 
 def boids() -> Problem:
-    """Three rules, eyes all around: a smooth force as long as everybody sees everybody."""
+    """Three rules with a view of 360 degrees: forces are smooth as long as each agent sees all others."""
     return _flock("boids", f"{BIRDS} boids that see all around")
 
 
 def boids_cone() -> Problem:
-    """The same with a view cone: forces jump whenever somebody enters or leaves it."""
+    """The same with a view cone: forces jump if a neighbour enters or leaves it."""
     return _flock("boids_cone", f"{BIRDS} boids that see 270\u00b0", fov=270.0)
 
 
 def boids_limit() -> Problem:
-    """The same with a speed limit, which is kept to after each step."""
+    """The same with a speed limit, which is enforced after each step."""
     return _flock("boids_limit", f"{BIRDS} boids with a speed limit", max_speed=1.5)
 
 
@@ -271,7 +271,7 @@ SUITE: dict[str, Callable[[], Problem]] = {
 
 
 def problems_named(names: Sequence[str] = ()) -> list[Problem]:
-    """Return problems by name, none = all; raises ValueError, with the nearest, for a name that is not there."""
+    """Return problems by name (no names: all); raise ValueError, with the nearest name, for an unknown one."""
     for name in names:
         if name not in SUITE:
             raise ValueError(f"problems: {shown(name)} is none{nearest(name, SUITE)} ({', '.join(SUITE)})")

@@ -13,7 +13,7 @@ DRIFTS = ("energy off", "momentum off")
 
 
 def headlines(report: Report) -> list[str]:
-    """Return what a reader must know before the table, a line each."""
+    """Return the lines above the table: agents, reference, sensitivity, energy, machine."""
     times = f"median of {report.repetitions} runs" if report.repetitions else "not taken"
     load = "" if report.machine.load is None else f", load {report.machine.load:.1f}"
     lines = [
@@ -33,20 +33,19 @@ def headlines(report: Report) -> list[str]:
 
 
 def _wrong(report: Report) -> str:
-    """Return how wrong the reference may be, in words."""
+    """Return the error of the reference, in words."""
     return f"about {report.reference_error:.1e} m" if report.reference_error > 0 else "nothing"
 
 
 def _rate(report: Report) -> str:
-    """Say how fast a difference grows, where that is fast enough to matter."""
+    """Return the growth rate of a difference as text, if it is fast enough to matter."""
     return f" (e-fold in {1 / report.rate:.2g} s)" if report.sensitive and report.rate > 0 else ""
 
 
 def errors(report: Report) -> tuple[tuple[str, ...], list[list[str]]]:
-    """Return heads and rows of the errors at the end, m, of every method in every number of steps.
+    """Return header and rows of the errors at the end, m, of every method in every number of steps.
 
-    ? = not clearly above what the reference itself may be off by. Methods that
-    choose their steps by tolerance are left out.
+    ? = not clearly above the error of the reference itself. Methods that choose their steps by tolerance are left out.
     """
     steps = sorted({p.steps for c in report.curves for p in c.points if p.tolerance is None})
     found = []
@@ -58,7 +57,7 @@ def errors(report: Report) -> tuple[tuple[str, ...], list[list[str]]]:
 
 
 def _error(point: Point | None, report: Report) -> str:
-    """Return one error as text, and whether it can be trusted."""
+    """Return one error as text, with ? if it cannot be trusted."""
     if point is None:
         return ""
     if point.error is None:
@@ -67,12 +66,12 @@ def _error(point: Point | None, report: Report) -> str:
 
 
 def columns(tolerances: Sequence[float]) -> tuple[str, ...]:
-    """Return the heads of the table."""
+    """Return the header of the table."""
     return (*COLUMNS, *(f"{what} to {t:g} m" for t in tolerances for what in ("evals", "ms")), *DRIFTS)
 
 
 def rows(report: Report, tolerances: Sequence[float]) -> list[list[str]]:
-    """Return a row per method: its order, what each tolerance costs with it, and what it does to energy and momentum.
+    """Return a row per method: its order, its cost for each tolerance, and its errors of energy and momentum.
 
     ~ before a number: it lies between two measured points. Energy and momentum are those of the finest steps.
     """
@@ -93,7 +92,7 @@ def _row(curve: Curve, report: Report, tolerances: Sequence[float]) -> list[str]
 
 
 def _order(curve: Curve, floor: float) -> str:
-    """Return the measured order, and of how many points if those are fewer than it should be."""
+    """Return the measured order, with the number of points if there are fewer than usual."""
     if curve.order is not None:
         return f"{curve.order:.2f}" + (f" ({curve.used} points)" if curve.used <= HALVINGS else "")
     errors = [p.along for p in curve.points]
@@ -113,11 +112,11 @@ def _amount(choice: Choice, by: Cost) -> str:
 
 
 def best(report: Report, tolerances: Sequence[float]) -> list[str]:
-    """Return, a line per tolerance, which method is the cheapest by time and by evaluations."""
+    """Return, a line per tolerance, the cheapest method by time and by evaluations."""
     lines = []
     for tolerance in tolerances:
         if tolerance < report.floor:
-            lines.append(f"to {tolerance:g} m: below {report.floor:.1e} m nothing can be told")
+            lines.append(f"to {tolerance:g} m: errors below {report.floor:.1e} m are not trusted")
             continue
         parts = []
         for by, unit in (("seconds", "ms"), ("evaluations", "evaluations")):
@@ -127,5 +126,5 @@ def best(report: Report, tolerances: Sequence[float]) -> list[str]:
                     f"dt = {choice.dt:.3g} s" if choice.tolerance is None else f"tolerance = {choice.tolerance:.1e}"
                 )
                 parts.append(f"{choice.method} at {setting}, {_amount(choice, by)} {unit}")  # type: ignore[arg-type]
-        lines.append(f"to {tolerance:g} m: " + ("; ".join(parts) if parts else "nothing that was measured is so good"))
+        lines.append(f"to {tolerance:g} m: " + ("; ".join(parts) if parts else "no measured setting reaches it"))
     return lines

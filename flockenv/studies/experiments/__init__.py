@@ -1,7 +1,7 @@
-"""Experiments: questions about steering, each a file of cases and variants, of which a table and a picture are made.
+"""Experiments on steering, each a file of cases and variants that gives a table and a picture.
 
-To ask another one, write a plan (configs/experiments/). To measure something else: a file here with what is measured,
-and its plan's class in PLANS.
+For a new experiment, write a plan (configs/experiments/). For a new measure, add a module here that computes it, and
+the class of its plan to PLANS.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ __all__ = [
 ]
 
 PLANS: dict[str, type[Plan]] = {"avoidance": SteerPlan, "arbitration": SteerPlan, "vicsek": NoisePlan}
-"""The kinds of plans, by what is measured."""
+"""Classes of plans, by their `measure`."""
 
 
 class _Named(BaseModel):
-    """Any plan: what it measures says which."""
+    """Any plan: `measure` selects its class."""
 
     model_config = ConfigDict(extra="allow")
     measure: str
 
 
 def load_plan(source: str | Path) -> Plan:
-    """Return the plan that a YAML file or text describes; see `config.load`."""
+    """Return the plan that a YAML file or text describes; see `yaml_io.load`."""
     measure = load(source, _Named).measure
     if measure not in PLANS:
         raise ConfigError(

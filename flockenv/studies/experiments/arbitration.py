@@ -1,7 +1,7 @@
-"""How wishes that contradict each other are reconciled: what is run into, and who is heard.
+"""Arbitration of behaviours that contradict each other: collisions, and the share granted to each behaviour.
 
-Reynolds 1987: the sum of "left, around the obstacle" and "right, to where the flock is" is straight into it; and in an
-emergency the most pressing wish must not share a bounded force with all others.
+Reynolds 1987: the sum of "left, around the obstacle" and "right, to where the flock is" leads straight into it; and in
+an emergency the most pressing behaviour must not share a bounded force with all others.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ SHOWN = ("collisions", "switches")
 
 
 def more_columns(plan: SteerPlan) -> dict[str, str]:
-    """Return a column for every behaviour that the cases have."""
+    """Return a column for every behaviour of the cases."""
     scenes = (plan.scene_of(case, variant) for case in plan.cases for variant in plan.variants)
     names = dict.fromkeys(wish.kind for scene in scenes for wish in scene.effects[0].wishes)
     return {f"share {name}": f"of what {name} wishes for, granted on average while it wishes" for name in names}
 
 
 def trial(plan: SteerPlan, case: str, variant: str) -> Trial:
-    """Run one case under one variant, in so many worlds."""
+    """Run one case under one variant, in all worlds of the plan."""
     scene, target = plan.scene_of(case, variant), np.array(plan.cases[case].target)
     grants, steps = Grants(scene), round(plan.cases[case].seconds / scene.dt)
     state = scene.start(plan.seed, worlds=plan.worlds)
@@ -49,14 +49,14 @@ def trial(plan: SteerPlan, case: str, variant: str) -> Trial:
 
 
 def _contacts(depth: Floats) -> dict[str, float]:
-    """Return numbers about obstacles that were run into; depth (T, B, N) m."""
+    """Return the collisions with obstacles and the greatest depth in one; depth (T, B, N) m."""
     inside = depth > 0
     entered = inside[0].sum() + (inside[1:] & ~inside[:-1]).sum()
     return {"collisions": float(entered / inside[0].size), "deepest": float(max(depth.max(), 0.0))}
 
 
 def _grants(granted: list[Granted], dt: float) -> dict[str, float]:
-    """Return numbers about who was heard: whose part of the force is the largest, and with which share."""
+    """Return how often the behaviour with the largest part of the force changes, and the mean share of each."""
     share = np.stack([each.share for each in granted])  # (T, B, N, K)
     wish = np.stack([np.linalg.norm(each.wish, axis=-1) for each in granted])
     part = share * wish

@@ -1,7 +1,7 @@
-"""How obstacles are avoided: who arrives, how soon, by how long a way, and what is run into.
+"""Obstacle avoidance: share of agents that arrive, their time and path length, and collisions.
 
-Reynolds 1988, "Not Bumping Into Things": a force field only brakes who comes head-on, and pushes who flies past.
-Steering to avoid does neither, and like everything local is caught in a dead end; there the global way is what helps.
+Reynolds 1988, "Not Bumping Into Things": a force field only brakes an agent that comes head-on, and pushes one that
+flies past. Steering to avoid does neither, but like any local method it is caught in a dead end; a global path is not.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from flockenv.studies.experiments.plan import SteerPlan
 __all__ = ["ARRIVED", "COLUMNS", "SHOWN", "trial"]
 
 ARRIVED = 0.4
-"""m from the target, where an agent has arrived."""
+"""m, distance from the target within which an agent has arrived."""
 
 COLUMNS = {
     "arrived": f"share that came within {ARRIVED:g} m of the target in time",
@@ -28,9 +28,9 @@ SHOWN = ("arrived", "time", "collisions")
 
 
 def trial(plan: SteerPlan, case: str, variant: str) -> Trial:
-    """Run one case under one variant, in so many worlds, until everybody is there or time is over; of the first agent.
+    """Run one case under one variant, in all worlds of the plan, to the end of its time; measure the first agent.
 
-    ValueError if nothing limits how fast it is.
+    Raises ValueError if that agent has no max_speed.
     """
     scene, target = plan.scene_of(case, variant), np.array(plan.cases[case].target)
     fastest = float(scene.body.max_speed[0])

@@ -18,7 +18,7 @@ __all__ = ["write_order"]
 
 
 def write_order(path: str | Path, experiment: Experiment, trials: Mapping[tuple[str, str], Trial]) -> None:
-    """Draw the first column with its deviation, the second; the bound, the third; and values of other sources."""
+    """Draw the first column with the second as its deviation, the third as a bound, the fourth as reference values."""
     assert experiment.curve is not None
     value, spread, bound, seen = list(experiment.columns)[:4]
     figure = new_figure(6.0, 4.4, experiment.title)

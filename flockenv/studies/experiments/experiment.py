@@ -1,4 +1,4 @@
-"""An experiment: some cases, each under some variants, and the numbers that come of it, as table, JSON and picture."""
+"""An experiment: cases, each under several variants, and its numbers as table, JSON and picture."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ __all__ = ["Cell", "Experiment", "Results", "Trial", "depth", "run"]
 
 
 class Trial(NamedTuple):
-    """What came of one case under one variant."""
+    """Result of one case under one variant."""
 
-    numbers: Mapping[str, float]  # by the names of the experiment's columns; NaN has no value
+    numbers: Mapping[str, float]  # by the names of the experiment's columns; NaN = no value
     scene: Scene
     path: Floats  # (T, N, D) m, of the first world, for pictures
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """What is tried, and what is measured of it."""
+    """Cases, variants and the numbers measured on them."""
 
     name: str
     title: str
     cases: Mapping[str, str]  # what happens in each
     variants: tuple[str, ...]
     columns: Mapping[str, str]  # what each number is, with its unit
-    shown: tuple[str, ...]  # those of them that stand below a picture
-    trial: Callable[[str, str], Trial]  # of a case and a variant
-    curve: tuple[str, str] | None = None  # names of axes: cases are numbers, and the first column is drawn over them
+    shown: tuple[str, ...]  # the columns that are shown below a picture
+    trial: Callable[[str, str], Trial]  # runs a case under a variant
+    curve: tuple[str, str] | None = None  # labels of axes, if cases are numbers: the first column is drawn over them
 
 
 class Cell(ResultRecord):
@@ -45,11 +45,11 @@ class Cell(ResultRecord):
 
     case: str
     variant: str
-    numbers: dict[str, float | None] = Field(description="by column; none has no value")
+    numbers: dict[str, float | None] = Field(description="by column; null = no value")
 
 
 class Results(ResultRecord):
-    """All that was measured, and by which sources."""
+    """All numbers of an experiment, and a fingerprint of the sources that they depend on."""
 
     experiment: str
     title: str
@@ -59,7 +59,7 @@ class Results(ResultRecord):
     sources: str = Field(default="", description="fingerprint of the laws")
 
     def at(self, case: str, variant: str) -> dict[str, float | None]:
-        """Return the numbers of one of them."""
+        """Return the numbers of one case under one variant."""
         return next(c.numbers for c in self.cells if (c.case, c.variant) == (case, variant))
 
     def rows(self) -> list[list[str]]:
@@ -71,7 +71,7 @@ class Results(ResultRecord):
 
 
 def depth(scene: Scene, state: State) -> Floats:
-    """Return how deep everybody is in an obstacle, (B, N) m; negative outside of all."""
+    """Return the depth of each agent in an obstacle, (B, N) m; negative outside all obstacles."""
     gap = np.min([shape.gap(state.pos) for shape in scene.obstacles], axis=0)
     return np.asarray(scene.body.radius - gap)
 
@@ -79,7 +79,7 @@ def depth(scene: Scene, state: State) -> Floats:
 def run(
     experiment: Experiment, progress: Callable[[int], None] = lambda done: None
 ) -> tuple[Results, dict[tuple[str, str], Trial]]:
-    """Try every case under every variant; return the numbers, and the trials for whoever draws them."""
+    """Run every case under every variant; return the numbers, and the trials for pictures."""
     trials: dict[tuple[str, str], Trial] = {}
     for case in experiment.cases:
         for variant in experiment.variants:
@@ -98,6 +98,6 @@ def run(
 
 
 def _known(numbers: Mapping[str, float], columns: Sequence[str]) -> dict[str, float | None]:
-    """Return the numbers in the order of the columns; none for what is no number."""
+    """Return the numbers in the order of the columns; None for those that are not finite."""
     found = {name: numbers.get(name, math.nan) for name in columns}
     return {name: float(x) if math.isfinite(x) else None for name, x in found.items()}

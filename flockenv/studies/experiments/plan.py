@@ -1,6 +1,6 @@
-"""A plan: an experiment as data. Some cases, what is varied in each, and which numbers are measured.
+"""A plan: an experiment as data, with cases, variants of each, and the numbers that are measured.
 
-configs/experiments/ holds some; `flockenv experiment FILE.yaml` runs one. A `SteerPlan` varies what is in a steer.
+See configs/experiments/; `flockenv experiment FILE.yaml` runs one. A `SteerPlan` varies the behaviours of a `steer`.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ __all__ = ["Case", "GlobalWay", "Plan", "SteerPlan", "Variant"]
 
 
 class Plan(Record):
-    """An experiment as data: what all of them say."""
+    """An experiment as data: fields that all plans have."""
 
     measure: str = Field(description="which numbers are measured")
     title: str
-    worlds: int = Field(ge=1, description="how many worlds each case is tried in")
+    worlds: int = Field(ge=1, description="number of worlds that each case is run in")
     seed: int = Field(default=0, ge=0)
 
     def experiment(self) -> Experiment:
-        """Return what is to be run; ValueError, of one line, if one of its scenes cannot be built."""
+        """Return the experiment; raise ValueError if one of its scenes cannot be built."""
         raise TypeError(f"{type(self).__name__} must say what is run")
 
 
 class Case(Record):
-    """Something that happens: a scene whose first effect is the `steer` that is varied."""
+    """A case: a scene whose first effect is the `steer` that is varied."""
 
     what: str = Field(description="what happens, in a sentence")
     seconds: float = Field(gt=0, description="s, for how long at most")
@@ -43,51 +43,51 @@ class Case(Record):
 
     @model_validator(mode="after")
     def _seeks(self) -> Case:
-        """Refuse a scene in which nothing could be varied, or nobody wants to get anywhere."""
+        """Raise ValueError if the first effect is not a steer with a seek, or if there are no obstacles."""
         steer = self.scene.effects[0] if self.scene.effects else None
         if not isinstance(steer, Steer) or not any(isinstance(wish, Seek) for wish in steer.behaviours):
             raise ValueError("scene.effects[0]: must be a steer, and seek among its behaviours")
         if not self.scene.obstacles:
-            raise ValueError("scene.obstacles: must not be empty; it is about them")
+            raise ValueError("scene.obstacles: must not be empty")
         return self
 
     @property
     def steer(self) -> Steer:
-        """What is varied."""
+        """The effect that is varied."""
         steer = self.scene.effects[0]
         assert isinstance(steer, Steer)
         return steer
 
     @property
     def target(self) -> tuple[float, ...]:
-        """Where everybody wants to get to, m."""
+        """Target of the seek behaviour, m."""
         return next(wish.target for wish in self.steer.behaviours if isinstance(wish, Seek))
 
 
 class GlobalWay(Record):
-    """The way around all obstacles to what would be sought straight ahead, see `follow_way`."""
+    """The floor field around all obstacles to the target that would be sought straight ahead, see `follow_way`."""
 
-    clearance: float = Field(ge=0, description="m, from the way to every obstacle")
+    clearance: float = Field(ge=0, description="m, from the path to every obstacle")
     spacing: float = Field(gt=0, description="m, between points of its grid")
-    slow_radius: float = Field(gt=0, description="m before the target, over which it slows down")
+    slow_radius: float = Field(gt=0, description="m before the target, over which the agent slows down")
 
     def instead_of(self, wish: Effect) -> Effect:
-        """Return the way to the same target, if a behaviour seeks one."""
+        """Return a FollowWay to the same target for a Seek; return other behaviours unchanged."""
         if not isinstance(wish, Seek):
             return wish
         return FollowWay(speed=wish.speed, weight=wish.weight, target=wish.target, **self.model_dump())
 
 
 class Variant(Record):
-    """What is put into the steer of every case."""
+    """Changes to the steer of every case."""
 
     first: tuple[AnyBehaviour, ...] = Field(default=(), description="more pressing behaviours than those of the case")
-    arbitration: AnyReconciling | None = Field(default=None, description="none = the case's own")
-    way: GlobalWay | None = Field(default=None, description="instead of seeking straight ahead; none = straight ahead")
+    arbitration: AnyReconciling | None = Field(default=None, description="default: the case's own")
+    way: GlobalWay | None = Field(default=None, description="replaces seeking straight ahead (default: straight ahead)")
 
 
 class SteerPlan(Plan):
-    """Scenes in which somebody steers, each under several ways to do so."""
+    """Scenes with a steer, each under several variants of it."""
 
     measure: Literal["avoidance", "arbitration"] = Field(description="which numbers are measured")
     cases: dict[str, Case] = Field(min_length=1)
@@ -107,7 +107,7 @@ class SteerPlan(Plan):
         return Scene(**fields | {"effects": (steer, *given.scene.effects[1:])})
 
     def experiment(self) -> Experiment:
-        """Return what is to be run."""
+        """Return the experiment."""
         measure = importlib.import_module(f"flockenv.studies.experiments.{self.measure}")
         for case in self.cases:
             for variant in self.variants:

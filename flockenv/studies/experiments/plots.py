@@ -21,7 +21,7 @@ __all__ = ["draw_trials", "write_trials"]
 
 
 WIDE, GAP = 1.9, 0.35
-"""Inches: the width of a picture, and the height of what stands below it."""
+"""Inches: the width of a picture, and the height of the text below it."""
 
 
 def write_trials(path: str | Path, experiment: Experiment, trials: Mapping[tuple[str, str], Trial]) -> None:
@@ -99,6 +99,6 @@ def _draw_trial(axes: Axes, trial: Trial) -> None:
 
 
 def _caption(experiment: Experiment, trial: Trial) -> str:
-    """Return the numbers that go below a picture."""
+    """Return the numbers below a picture, as text."""
     numbers = {name: trial.numbers[name] for name in experiment.shown}
     return ", ".join(f"{name} {x:.2g}" if x == x else f"{name} -" for name, x in numbers.items())

@@ -1,10 +1,10 @@
-"""Order against noise in Vicsek's flock: the curve of 1995, beside its bound and an independent run.
+"""Order over noise in Vicsek's flock: the curve of 1995, with its bound and an independent run.
 
 configs/scenes/vicsek.yaml under more and more noise: the order v_a is the length of the mean heading, over time and
-worlds after the flock has settled. Its transition sharpens with the number of agents; at no size is it above sin(eta/2)
-/ (eta/2), what errors alone leave of directions that agree, by more than what chance leaves of none. Whether positions
-move with the new velocity (semi_implicit_euler) or, as the paper writes it, with the old one (explicit_euler), makes a
-difference near the transition, though a step is .03 of the reach.
+worlds after the flock has settled. Its transition sharpens with the number of agents. At no size does v_a exceed
+sin(eta/2) / (eta/2), the order of equal directions with angular noise, by more than the order of N random directions.
+Whether positions move with the new velocity (semi_implicit_euler) or, as in the paper, with the old one
+(explicit_euler), makes a difference near the transition, though a step is only .03 of the radius.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from flockenv.studies.measures import polarisation
 __all__ = ["SEEN", "Flock", "NoisePlan", "bound", "order", "scene_of"]
 
 EVERY = 10
-"""Steps between two looks at the order."""
+"""Steps between two measurements of the order."""
 
 SPEED, DENSITY = 0.03, 4.0
-"""m/s, of all; agents per m^2. Vicsek's text says .4, but his sizes (N = 400, L = 10) are 4."""
+"""m/s, of all agents; agents per m^2. Vicsek et al. write .4, but their sizes (N = 400, L = 10) give 4."""
 
 SEEN = {0.1: 0.9994, 1.0: 0.945, 2.0: 0.779, 4.0: 0.199, 6.28: 0.044}
-"""v_a of an independent run of 400 at this density, moved with the new velocity."""
+"""v_a by eta, of an independent run of 400 agents at this density, moved with the new velocity."""
 
 
 def scene_of(noise: float, count: int = 400, method: Integrator | None = None) -> Scene:
-    """Return Vicsek's flock of so many at his density, under some noise, rad."""
+    """Return Vicsek's flock of `count` agents at density DENSITY, under some noise, rad."""
     edge = math.sqrt(count / DENSITY)
     group = Group(count=count, radius=0.05, spawn=Spawn(speed=(SPEED, SPEED)))
     return Scene(
@@ -48,12 +48,12 @@ def scene_of(noise: float, count: int = 400, method: Integrator | None = None) -
 
 
 def bound(noise: float, count: int) -> float:
-    """Return what order cannot exceed: of directions that agree but for errors, and of none, by chance."""
+    """Return the bound of the order: that of equal directions with noise, plus that of random directions."""
     return math.sin(noise / 2) / (noise / 2) + math.sqrt(math.pi) / (2 * math.sqrt(count))
 
 
 def order(scene: Scene, settle: int, steps: int, worlds: int = 4, seed: int = 0) -> np.ndarray:
-    """Return v_a of worlds that settled for so many steps, at every tenth of the next, (steps / 10, worlds)."""
+    """Return v_a after `settle` steps, at every tenth of the next `steps`, (steps / 10, worlds)."""
     state = scene.run(scene.start(seed, worlds=worlds), settle)
     found = np.empty((steps // EVERY, worlds))
     for k in range(len(found)):
@@ -63,7 +63,7 @@ def order(scene: Scene, settle: int, steps: int, worlds: int = 4, seed: int = 0)
 
 
 class Flock(Record):
-    """How many fly, and under which method."""
+    """Number of agents, and the integrator."""
 
     count: int = Field(ge=2, description="N, at Vicsek's density")
     integrator: AnyIntegrator = Field(
@@ -72,16 +72,16 @@ class Flock(Record):
 
 
 class NoisePlan(Plan):
-    """Flocks under more and more noise."""
+    """Flocks under increasing noise."""
 
     measure: Literal["vicsek"] = Field(description="the order of Vicsek's flock")
-    settle: int = Field(ge=0, description="steps before the order is looked at")
-    steps: int = Field(ge=EVERY, description="steps over which it is")
+    settle: int = Field(ge=0, description="steps before the order is measured")
+    steps: int = Field(ge=EVERY, description="steps over which it is measured")
     noises: tuple[Annotated[float, Field(gt=0, lt=6.3)], ...] = Field(min_length=1, description="eta, rad")
     variants: dict[str, Flock] = Field(min_length=1)
 
     def experiment(self) -> Experiment:
-        """Return what is to be run."""
+        """Return the experiment."""
         return Experiment(
             name=self.measure, title=self.title,
             cases={f"{x:.3g}": f"errors of up to {x / 2:.3g} rad to either side" for x in self.noises},

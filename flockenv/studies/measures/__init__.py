@@ -1,7 +1,7 @@
-"""What people who study flocks and crowds measure, a family per file: functions of arrays, or of one world.
+"""Measures from research on flocks and crowds, a family per file: functions of arrays, or of one world.
 
-`flockenv measure SCENE.yaml` runs a scene and shows those that make sense for it; docs/measures.md says what each
-means.
+`flockenv measure SCENE.yaml` runs a scene and shows the measures that make sense for it; docs/measures.md describes
+each.
 """
 
 from __future__ import annotations

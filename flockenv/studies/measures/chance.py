@@ -1,4 +1,4 @@
-"""Many runs of one scene: a mean with its interval, and whether order is above its null."""
+"""Statistics over many runs of one scene: a mean with its interval, and whether order is above its null."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ class Mean(NamedTuple):
 
     runs: int
     mean: float
-    low: float  # NaN of one run
+    low: float  # NaN for fewer than two runs
     high: float
 
 
 class Above(NamedTuple):
-    """How far runs are above their own nulls."""
+    """Excess of runs over their own nulls."""
 
     runs: int
     excess: float  # mean of value - null
@@ -33,29 +33,30 @@ class Above(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Is the whole interval above 0?"""
+        """True if the whole interval is above 0."""
         return self.low > 0
 
 
 def mean_of_runs(values: ArrayLike, seed: int = 0) -> Mean:
-    """Return the mean of one number per run, (R,), with its 95 % bootstrap interval; runs of NaN are left out."""
+    """Return the mean of one number per run, (R,), with its 95 % bootstrap interval; only finite values count."""
     given = np.asarray(values, np.float64)
     x = given[np.isfinite(given)]
     if len(x) < 2:
         return Mean(len(x), float(x.mean()) if len(x) else np.nan, np.nan, np.nan)
     rng = np.random.default_rng(seed)
-    drawn = [x[rng.integers(len(x), size=len(x))].mean() for _ in range(RESAMPLES)]  # one by one: runs may be many
+    # one by one: there may be many runs
+    drawn = [x[rng.integers(len(x), size=len(x))].mean() for _ in range(RESAMPLES)]
     low, high = np.quantile(drawn, (0.025, 0.975))
     return Mean(len(x), float(x.mean()), float(low), float(high))
 
 
 def above_null(values: ArrayLike, nulls: ArrayLike, seed: int = 0) -> Above:
-    """Return how far an order, one number per run (R,), is above what chance makes of the same run, (R,).
+    """Return the excess of an order, one number per run (R,), over its value by chance in the same run, (R,).
 
-    For lanes `Lanes.order` against `Lanes.null`, for a door `Bursts.length` against `Bursts.null_length`: pairs, so
-    what differs from run to run (how many, where) is in neither. A run without a null (NaN) is left out. It holds, with
-    95 % confidence, if the interval lies above 0. Raises ValueError, of one line, if both are not as many, or fewer
-    than 5 have a null: an interval of four runs is none.
+    For lanes `Lanes.order` against `Lanes.null`, for a door `Bursts.length` against `Bursts.null_length`: values are
+    paired, so differences between runs (number of agents, positions) cancel. Runs without a null (NaN) are left out.
+    The order is above chance, with 95 % confidence, if the interval lies above 0. Raises ValueError if the shapes
+    differ, or fewer than 5 runs have a null, too few for an interval.
     """
     order, null = np.asarray(values, np.float64), np.asarray(nulls, np.float64)
     if order.shape != null.shape or order.ndim != 1:

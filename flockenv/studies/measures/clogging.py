@@ -1,4 +1,4 @@
-"""Arching and clogging: how long the gaps between passages become, and whether their mean exists at all."""
+"""Arching and clogging: the tail of the time gaps between passages, and whether their mean exists."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ __all__ = ["Tail", "goodness", "survival", "tail"]
 Floats = NDArray[np.float64]
 
 LEAST = 10
-"""Fewer gaps than this have no tail to speak of."""
+"""Fewer gaps than this have no meaningful tail."""
 
 MOST_STARTS = 500
 
 
 class Tail(NamedTuple):
-    """A power law p(t) ~ t^-alpha fitted to all gaps from `start` on; NaN where there are too few."""
+    """A power law p(t) ~ t^-alpha fitted to all gaps >= `start`; NaN if there are too few."""
 
     alpha: float
     error: float  # standard error of alpha
     start: float  # s
     gaps: int  # in the tail
-    distance: float  # of Kolmogorov and Smirnov, between the tail and the fit
+    distance: float  # Kolmogorov-Smirnov distance of the tail and the fit
 
     @property
     def flows(self) -> bool:
-        """Is alpha > 2, so that the mean gap exists?"""
+        """True if alpha > 2, so that the mean gap exists."""
         return self.alpha > 2
 
     @property
     def verdict(self) -> str:
-        """'flows' or 'clogs' if alpha is 1.96 errors from 2, else 'undecided'; 'no tail' of too few gaps."""
+        """'flows' or 'clogs' if alpha is 1.96 errors from 2, else 'undecided'; 'no tail' for too few gaps."""
         if not np.isfinite(self.alpha):
             return "no tail"
         if abs(self.alpha - 2) <= 1.96 * self.error:
@@ -42,7 +42,7 @@ class Tail(NamedTuple):
 
 
 def survival(gaps: ArrayLike) -> tuple[Floats, Floats]:
-    """Return gaps in growing order, (n,) s, and the share of gaps that are at least as long as each."""
+    """Return gaps in ascending order, (n,) s, and the share of gaps that are at least as long as each."""
     ordered = np.sort(_checked(gaps))
     return ordered, 1.0 - np.arange(len(ordered)) / max(1, len(ordered))
 
@@ -50,12 +50,11 @@ def survival(gaps: ArrayLike) -> tuple[Floats, Floats]:
 def tail(gaps: ArrayLike, start: float | None = None) -> Tail:
     """Return the power law p(t) ~ t^-alpha that fits the long gaps (n,), s, best; the survival falls as t^-(alpha - 1).
 
-    alpha = 1 + n / sum ln(t / start), with error (alpha - 1) / sqrt(n), over gaps >= start; the start, unless given, is
-    that at which fit and gaps are nearest (Kolmogorov and Smirnov), with 10 or more gaps left.
-    alpha <= 2 is a clogged door: the mean gap, the integral of t p(t), does not exist. That is so for the exponent of
-    the density; of the survival alone the same limit is 1.
-    Raises ValueError, of one line, for gaps that are negative or not finite, or a start that is not above 0; gaps of 0
-    are in no tail.
+    alpha = 1 + n / sum ln(t / start), with error (alpha - 1) / sqrt(n), over gaps >= start; the start, unless given,
+    minimises the Kolmogorov-Smirnov distance of fit and gaps, with at least 10 gaps left.
+    alpha <= 2 is a clogged door: the mean gap, the integral of t p(t), does not exist. This limit is for the exponent
+    of the density; for that of the survival it is 1.
+    Raises ValueError if gaps are negative or not finite, or if start is not > 0; gaps of 0 are in no tail.
     Source: Clauset, Shalizi, Newman 2009, SIAM Review 51, 661, eqs. 3.1, 3.2, 3.9; the transition: Zuriguel et al.
     2014, Sci. Rep. 4, 7324.
     """
@@ -74,10 +73,10 @@ def tail(gaps: ArrayLike, start: float | None = None) -> Tail:
 
 
 def goodness(gaps: ArrayLike, fit: Tail, samples: int = 200, seed: int = 0) -> float:
-    """Return the share of samples of the fit that are further from their own fits than the gaps (n,) from theirs.
+    """Return the share of samples of the fit that are at least as far from their own fits as the gaps (n,) from `fit`.
 
-    Below .1 a power law is not believed (Clauset, Shalizi, Newman 2009, 4.1): each sample has as many gaps, in the tail
-    drawn from the fit and before it from the gaps. NaN where there is no tail.
+    Below .1 a power law is rejected (Clauset, Shalizi, Newman 2009, 4.1): each sample has as many gaps as given; its
+    tail is drawn from the fit, the rest from the gaps before `fit.start`. NaN without a tail.
     """
     given = _checked(gaps)
     given = given[given > 0]
@@ -94,7 +93,7 @@ def goodness(gaps: ArrayLike, fit: Tail, samples: int = 200, seed: int = 0) -> f
 
 
 def _fitted(long: Floats, start: float) -> Tail | None:
-    """Return the fit to gaps in growing order, all >= start; none if they are too few, or all the same."""
+    """Return the fit to gaps in ascending order, all >= start; None if they are too few or all equal to start."""
     logs = float(np.log(long / start).sum()) if len(long) >= LEAST else 0.0
     if not logs > 0:
         return None

@@ -1,4 +1,4 @@
-"""Density and speed in an area: counted, and by the room that everybody has (Voronoi), which scatters far less."""
+"""Density and speed in an area: by counting, and by Voronoi cells, which scatters far less."""
 
 from __future__ import annotations
 
@@ -20,23 +20,22 @@ __all__ = ["Ground", "Room", "classical_density", "speed_in_area", "voronoi", "v
 Floats = NDArray[np.float64]
 
 EDGE = 8.0
-"""How wide an edge of images is tried first, in mean distances of people."""
+"""Width of the border of periodic images that is tried first, in mean distances of agents."""
 
 
 class Room(NamedTuple):
-    """How much room everybody has."""
+    """Area of the Voronoi cell of each agent."""
 
-    cell: Floats  # (N,) m^2, the area of his Voronoi cell; NaN for who is not on the walkable area
-    inside: Floats  # (N,) m^2, what of it lies in the area that is measured; 0 for those
-    area: float  # m^2 of what is measured, as far as it is walkable
+    cell: Floats  # (N,) m^2, the area of the Voronoi cell; NaN for agents outside the walkable area
+    inside: Floats  # (N,) m^2, the part of it in the measured area; 0 for agents outside the walkable area
+    area: float  # m^2, the walkable part of the measured area
 
 
 def classical_density(pos: ArrayLike, area: ArrayLike, alive: ArrayLike | None = None) -> Floats:
-    """Return agents per m^2 in a polygon, at each instant, (T,): so many inside / its area.
+    """Return agents per m^2 in a polygon, at each instant, (T,): the number inside / its area.
 
-    pos (T, N, 2) m; area (n, 2) m, its corners; alive (T, N), all by default. With few agents it takes few values.
-    Raises ValueError, of one line, for an area that is none. Source: Steffen & Seyfried 2010, Physica A 389, 1902, eq.
-    1.
+    pos (T, N, 2) m; area (n, 2) m, its corners; alive (T, N), default: all. With few agents it takes few values.
+    Raises ValueError if the polygon is invalid. Source: Steffen & Seyfried 2010, Physica A 389, 1902, eq. 1.
     """
     corners = checked("area", area)
     inside = contains(corners, _flat(pos))
@@ -48,10 +47,10 @@ def classical_density(pos: ArrayLike, area: ArrayLike, alive: ArrayLike | None =
 def speed_in_area(
     pos: ArrayLike, vel: ArrayLike, area: ArrayLike, alive: ArrayLike | None = None, along: ArrayLike | None = None
 ) -> Floats:
-    """Return the mean speed of those in a polygon at each instant, (T,) m/s; NaN where nobody is there.
+    """Return the mean speed of agents in a polygon at each instant, (T,) m/s; NaN if it is empty.
 
-    pos, vel (T, N, 2) m, m/s; along: a direction (2,), and then it is the component of velocity along it instead of
-    |v|. Raises ValueError, of one line, for an area that is none, or a direction of no length.
+    pos, vel (T, N, 2) m, m/s; along: a direction (2,); if given, the component of velocity along it replaces |v|.
+    Raises ValueError if the polygon is invalid or the direction has length 0.
     """
     inside = contains(checked("area", area), _flat(pos))
     if alive is not None:
@@ -69,34 +68,34 @@ def voronoi(
     holes: Sequence[ArrayLike] = (),
     period: tuple[float, float] = (0.0, 0.0),
 ) -> Room:
-    """Return the Voronoi cell of everybody at one instant: all that is nearer to him than to anybody else.
+    """Return the Voronoi cell of each agent at one instant: all points nearer to it than to any other agent.
 
     pos (N, 2) m. Cells are cut to the polygon `walkable` (n, 2) m, which need not be convex, less the polygons `holes`:
-    obstacles, wherever they lie and however they overlap. What of a cell lies behind a wall counts too, so a walkable
-    area must end at walls. area: a convex polygon that is measured, all of the walkable area by default. period:
-    (Lx, Ly) m, 0 = none: the world goes on with itself after so much, and `walkable` is one period of it. Who is
-    outside of `walkable` has no cell and takes no room. Those in one place share a cell.
-    Raises ValueError, of one line, for polygons that are none, for an area that is not convex, or not walkable.
+    obstacles, which may lie anywhere and overlap. Parts of a cell behind a wall count as well, so a walkable area must
+    end at walls. area: the convex polygon that is measured (default: all of the walkable area). period: (Lx, Ly) m of
+    a periodic world, 0 along an axis that is not periodic; `walkable` is one period of it. An agent outside `walkable`
+    has no cell and takes no room. Agents at the same position share a cell.
+    Raises ValueError if a polygon is invalid, or if the area is not convex or nothing of it is walkable.
     Source: Steffen & Seyfried 2010, Physica A 389, 1902. Cells by scipy's Qhull, areas by shapely's GEOS.
     """
     return Ground.of(walkable, area, holes, period).room(pos)
 
 
 class Ground(NamedTuple):
-    """Where people walk and where they are measured, checked once for many instants."""
+    """The walkable area and the measured area, checked once for many instants."""
 
     walk: Floats
-    free: BaseGeometry  # what of it is walkable
-    target: BaseGeometry  # what of that is measured
+    free: BaseGeometry  # the part of it that is walkable
+    target: BaseGeometry  # the part of that which is measured
     period: tuple[float, float]
-    area: float  # m^2 of what is measured
+    area: float  # m^2, of the measured area
 
     @classmethod
     def of(
         cls, walkable: ArrayLike, area: ArrayLike | None = None, holes: Sequence[ArrayLike] = (),
         period: tuple[float, float] = (0.0, 0.0),
     ) -> Ground:  # fmt: skip
-        """Return it; see `voronoi`, for what is what, and for what is refused."""
+        """Return the ground of these polygons; see `voronoi` for the arguments and errors."""
         walk = checked("walkable", walkable)
         polygon = None if area is None else checked("area", area, is_convex=True)
         solid = [checked(f"holes[{k}]", hole) for k, hole in enumerate(holes)]
@@ -107,7 +106,7 @@ class Ground(NamedTuple):
         return cls(walk, free, target, period, float(target.area))
 
     def room(self, pos: ArrayLike) -> Room:
-        """Return the cells of people at (N, 2), m."""
+        """Return the cells of agents at positions (N, 2), m."""
         points = _flat(pos)
         here = np.flatnonzero(contains(self.walk, points)) if len(points) else np.zeros(0, np.int64)
         cell, inside = np.full(len(points), np.nan), np.zeros(len(points))
@@ -120,13 +119,13 @@ class Ground(NamedTuple):
 
 
 def _everywhere(polygons: Sequence[Floats], period: tuple[float, float]) -> BaseGeometry:
-    """Return what polygons cover together, images of a world that goes on with itself included."""
+    """Return the union of polygons, including their images in a periodic world."""
     steps = np.array(_shifts(period)) * period
     return shapely.union_all([Polygon(polygon + step) for polygon in polygons for step in steps])
 
 
 def _shared(cells: Sequence[Corners], ground: BaseGeometry, period: tuple[float, float]) -> Floats:
-    """Return how much of each convex cell, or of its images, lies on some ground, (N,) m^2."""
+    """Return the area of the intersection of each convex cell, or of its images, with the ground, (N,) m^2."""
     places = np.concatenate([np.array(cell).reshape(-1, 2) for cell in cells])
     which = np.repeat(np.arange(len(cells)), [len(cell) for cell in cells])
     found = np.zeros(len(cells))
@@ -137,25 +136,25 @@ def _shared(cells: Sequence[Corners], ground: BaseGeometry, period: tuple[float,
 
 
 def voronoi_density(room: Room) -> float:
-    """Return agents per m^2: the mean over the area of 1 / (the area of the cell that a place belongs to)."""
+    """Return agents per m^2: the mean over the area of 1 / (the area of the cell that contains the point)."""
     some = room.inside > 0
     return float((room.inside[some] / room.cell[some]).sum() / room.area)
 
 
 def voronoi_speed(room: Room, speed: ArrayLike) -> float:
-    """Return the mean over the area of the speed, m/s, of whom a place belongs to; NaN where it belongs to nobody.
+    """Return the mean over the area of the speed, m/s, of the agent whose cell contains the point; NaN without cells.
 
-    speed: (N,) m/s, or any other number of each.
+    speed: (N,) m/s, or any other number per agent.
     """
     total = float(room.inside.sum())
     return float(room.inside @ np.asarray(speed, np.float64)) / total if total > 0 else np.nan
 
 
 def _cells(places: Floats, walk: Floats, period: tuple[float, float]) -> list[Corners]:
-    """Return the cells of different places, cut to a box around the walkable area, or to a period around each.
+    """Return the cells of distinct points, cut to a box around the walkable area, or to a period around each.
 
-    Of a world that goes on with itself images near its edge are enough where cells are small: who is missing is further
-    from a corner of a cell than the cell's own place.
+    In a periodic world images near the edge suffice if cells are small: any other image is further from a corner of a
+    cell than the cell's own point.
     """
     low, high = walk.min(axis=0), walk.max(axis=0)
     images = [places + np.multiply(shift, period) for shift in _shifts(period)]
@@ -173,9 +172,9 @@ def _cells(places: Floats, walk: Floats, period: tuple[float, float]) -> list[Co
 
 
 def _cut(places: Floats, every: Floats, low: Floats, high: Floats, period: tuple[float, float]) -> list[Corners]:
-    """Return the cells of places, the first of every place that there is."""
+    """Return the cells of `places`, which are the first points in `every`."""
     middle, far = (low + high) / 2, 20 * float(max(np.ptp(every - every.mean(axis=0)), *(high - low), *period))
-    # four more far outside: every cell ends, and they are too far away to take anything of the walkable area
+    # four more points far outside bound every cell, and are too far away to take any of the walkable area
     ring = middle + far * np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
     pairs = Voronoi(np.concatenate([every, ring])).ridge_points
     pairs = pairs[(pairs < len(every)).all(axis=1)]
@@ -191,14 +190,14 @@ def _cut(places: Floats, every: Floats, low: Floats, high: Floats, period: tuple
 
 
 def _box(place: Sequence[float], low: Floats, high: Floats, period: tuple[float, float]) -> Corners:
-    """Return a box that the cell of a place lies in."""
+    """Return a box that contains the cell of a point."""
     first = [x - length / 2 if length else a for x, length, a in zip(place, period, low.tolist(), strict=True)]
     last = [x + length / 2 if length else b for x, length, b in zip(place, period, high.tolist(), strict=True)]
     return _corners(rectangle(first, last))
 
 
 def _shifts(period: tuple[float, float]) -> list[tuple[int, int]]:
-    """Return by how many periods a world is repeated around itself; not at all comes first."""
+    """Return the shifts to the neighbouring images of a periodic world, in periods; (0, 0) comes first."""
     steps = [(0, -1, 1) if length else (0,) for length in period]
     return [(i, j) for i, j in product(*steps)]
 

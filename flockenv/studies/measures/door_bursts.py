@@ -1,4 +1,4 @@
-"""Bursts at a door: whether several go through one way before one comes the other way, beside chance."""
+"""Bursts at a door: runs of passages in one direction before one in the other, compared with chance."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ Floats = NDArray[np.float64]
 
 
 class Bursts(NamedTuple):
-    """Runs of equal direction, and what chance makes of as many each way."""
+    """Runs of equal direction, and the same by chance with as many crossings in each direction."""
 
     crossings: int
     bursts: int
     length: float  # mean, crossings per burst
-    null_bursts: float  # expected of chance
+    null_bursts: float  # expected by chance
     null_length: float  # crossings / null_bursts
-    p: float  # that chance makes as few bursts, or fewer
+    p: float  # probability that chance makes as few bursts or fewer
 
 
 def runs(signs: ArrayLike) -> NDArray[np.int64]:
-    """Return the lengths of runs of equal signs, in their order: of + + - + it is 2, 1, 1."""
+    """Return the lengths of runs of equal signs, in their order: 2, 1, 1 for + + - +."""
     given = np.asarray(signs)
     if not len(given):
         return np.zeros(0, np.int64)
@@ -36,10 +36,9 @@ def runs(signs: ArrayLike) -> NDArray[np.int64]:
 def bursts(signs: ArrayLike) -> Bursts:
     """Return the bursts among crossings in the order of time, (C,), each 1 or -1.
 
-    The null is a coin that is tossed anew for each, given as many heads as there were: every order of n1 and n2 signs
-    is as likely as every other. Then 1 + 2 n1 n2 / n bursts are expected, and P(bursts <= r) is exact. Doors have fewer
-    and longer ones: one-sided. NaN where all go one way, for then chance cannot do otherwise, and of nobody.
-    Raises ValueError, of one line, for anything but 1 and -1.
+    The null hypothesis is that all orders of the n1 and n2 signs are equally likely. Then 1 + 2 n1 n2 / n bursts are
+    expected, and P(bursts <= r) is exact. The test is one-sided, as doors have fewer and longer bursts. The null is NaN
+    if all go in one direction, or without crossings. Raises ValueError for signs other than 1 and -1.
     Source of the null: Wald & Wolfowitz 1940, Ann. Math. Statist. 11, 147; of the bursts: Helbing & Molnar 1995.
     """
     given = np.asarray(signs)
@@ -55,7 +54,7 @@ def bursts(signs: ArrayLike) -> Bursts:
 
 
 def runs_probability(many: int, first: int, second: int) -> float:
-    """Return how likely so many runs are in a random order of `first` of one kind and `second` of another."""
+    """Return the probability of `many` runs in a random order of `first` items of one kind and `second` of another."""
     k, odd = divmod(many, 2)
     a, b = first - 1, second - 1
     ways = [(k, k - 1), (k - 1, k)] if odd else [(k - 1, k - 1), (k - 1, k - 1)]

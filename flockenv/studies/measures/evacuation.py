@@ -1,4 +1,4 @@
-"""How long it takes until people are out."""
+"""Evacuation times."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ Floats = NDArray[np.float64]
 
 
 def leaving_times(time: ArrayLike, inside: ArrayLike) -> Floats:
-    """Return the first instant after which nobody of (N,) is seen inside again, s; NaN of who still is, or never was.
+    """Return the first instant of each agent (N,) after its last one inside, s; NaN if it never was or still is inside.
 
-    time (T,) s; inside (T, N): who is where he is to leave, and alive.
+    time (T,) s; inside (T, N): True for agents that are alive and inside the region that they leave.
     """
     when, here = np.asarray(time, np.float64), np.asarray(inside, np.bool_)
     if here.ndim != 2 or when.shape != here.shape[:1]:
@@ -32,21 +32,21 @@ def leaving_times(time: ArrayLike, inside: ArrayLike) -> Floats:
 
 
 def last_crossing(found: Crossings, agents: int) -> Floats:
-    """Return when each of so many crossed a line for good, (N,) s: his last crossing, if that is forward; else NaN."""
+    """Return the time of each agent's last crossing of a line, (N,) s, if that is forward; else NaN."""
     out = np.full(agents, np.nan)
-    out[found.agent] = np.where(found.sign > 0, found.time, np.nan)  # in the order of time: the last one stays
+    out[found.agent] = np.where(found.sign > 0, found.time, np.nan)  # in the order of time: the last one remains
     return out
 
 
 def evacuation_time(left: ArrayLike, share: float = 1.0) -> float:
-    """Return when so large a share of all is out, s; NaN if at the end of the run it is not.
+    """Return when a share of all agents is out, s; NaN if that share is not reached by the end of the run.
 
-    left (N,) s, when each left, NaN = not yet. share in (0, 1]: 1 = all, .95 = all but the last twentieth, which
-    depends less on a single straggler. Raises ValueError, of one line, for another share, or nobody.
+    left (N,) s, when each agent left, NaN = not yet. share in (0, 1]: 1 = all, .95 = all but the last twentieth, which
+    depends less on a single straggler. Raises ValueError for any other share, or without agents.
     """
     times = np.asarray(left, np.float64)
     if not 0 < share <= 1 or not len(times):
-        raise ValueError(f"share = {share:g} of {len(times)}: must be in (0, 1], of somebody")
+        raise ValueError(f"share = {share:g} of {len(times)}: must be in (0, 1], of at least one agent")
     needed = math.ceil(share * len(times) - 1e-9)
     out = np.sort(times[np.isfinite(times)])
     return float(out[needed - 1]) if len(out) >= needed else np.nan

@@ -1,4 +1,4 @@
-"""The fundamental diagram: how speed and flow fall with density, beside what was measured on people."""
+"""The fundamental diagram: speed and flow over density, compared with measurements of pedestrians."""
 
 from __future__ import annotations
 
@@ -15,43 +15,43 @@ __all__ = [
 Floats = NDArray[np.float64]
 
 FREE, GAMMA, JAM = 1.34, 1.913, 5.4
-"""Weidmann's free speed, m/s, his gamma, 1/m^2, and the density at which nobody walks, 1/m^2."""
+"""Weidmann's free speed, m/s, gamma, 1/m^2, and jam density, 1/m^2, at which the speed is 0."""
 
 JUELICH = (
     (0.5, 1.0, 0.94, 0.12), (1.0, 1.5, 0.70, 0.12), (1.5, 2.0, 0.56, 0.08), (2.0, 2.5, 0.42, 0.11),
     (2.5, 3.0, 0.35, 0.06), (3.0, 3.5, 0.23, 0.04), (3.5, 4.0, 0.17, 0.05),
 )  # fmt: skip
-"""From, to, 1/m^2; mean and deviation of speed, m/s: one-way in a corridor 1.8 m wide, ug-180, n = 434."""
+"""From, to, 1/m^2; mean and standard deviation of speed, m/s: one-way corridor, 1.8 m wide, ug-180, n = 434."""
 
 AT_REST, PER_SPEED = 0.36, 1.06
-"""m, and s: the length that who walks in single file needs (Seyfried 2005)."""
+"""m, and s: length that a pedestrian in single file needs at rest, and its growth per m/s (Seyfried 2005)."""
 
 
 class Bin(NamedTuple):
-    """What was measured between two densities."""
+    """Samples between two densities."""
 
     low: float  # 1/m^2
     high: float
     samples: int
-    density: float  # 1/m^2, mean; NaN of an empty bin, as all that follows
+    density: float  # 1/m^2, mean; NaN in an empty bin, like all fields below
     speed: float  # m/s, mean
     spread: float  # m/s, standard deviation
     flow: float  # 1/(m s), mean of density times speed
 
 
 class Deviation(NamedTuple):
-    """How far speeds are from a reference."""
+    """Deviation of speeds from a reference."""
 
     samples: int
-    mean: float  # m/s, over - under
+    mean: float  # m/s, signed
     rms: float  # m/s
-    worst: float  # m/s, of the means of bins: the largest, by amount
+    worst: float  # m/s, signed: the largest absolute deviation of a bin's mean
 
 
 def weidmann_speed(density: ArrayLike) -> Floats:
     """Return v = 1.34 (1 - exp(-1.913 (1/rho - 1/5.4))), m/s, at densities in 1/m^2; 1.34 at 0, 0 from 5.4 on.
 
-    Raises ValueError, of one line, for a negative density. Source: Weidmann 1993, Transporttechnik der Fussgaenger,
+    Raises ValueError if a density is negative. Source: Weidmann 1993, Transporttechnik der Fussgaenger,
     with Kladek's formula. Real corridors lie below it: `JUELICH`.
     """
     rho = np.asarray(density, np.float64)
@@ -68,7 +68,7 @@ def weidmann_flow(density: ArrayLike) -> Floats:
 
 
 def required_length(speed: ArrayLike) -> Floats:
-    """Return the length of path d = .36 + 1.06 v that somebody needs in single file, m, at speeds in m/s.
+    """Return the length of path d = .36 + 1.06 v, m, that a pedestrian in single file needs at speed v, m/s.
 
     Source: Seyfried, Steffen, Klingsch, Boltes 2005, J. Stat. Mech. P10002 (arXiv physics/0506170), .1 < v < 1 m/s.
     """
@@ -82,9 +82,9 @@ def single_file_speed(density: ArrayLike) -> Floats:
 
 
 def single_file_density(place: ArrayLike, length: float) -> Floats:
-    """Return 1 / (the way to the next ahead), per m, of everybody on a closed path of some length, m.
+    """Return 1 / (the distance to the next agent ahead), per m, of each agent on a closed path of some length, m.
 
-    place (N,) m along the path; a lone walker has all of it for himself; inf where two are in one place.
+    place (N,) m along the path; a single agent has distance `length`; inf for two agents at the same place.
     """
     s = np.asarray(place, np.float64) % length
     order = np.argsort(s, kind="stable")
@@ -96,11 +96,10 @@ def single_file_density(place: ArrayLike, length: float) -> Floats:
 
 
 def diagram(density: ArrayLike, speed: ArrayLike, edges: ArrayLike | None = None) -> list[Bin]:
-    """Return what speeds (S,), m/s, were measured at which densities (S,), 1/m^2, in bins between edges.
+    """Return speeds (S,), m/s, over densities (S,), 1/m^2, in bins between edges.
 
-    By default edges are those of `JUELICH`, with one more below. A sample whose speed is NaN (nobody was there) is
-    none.
-    Raises ValueError, of one line, if there are not as many of both.
+    Default edges: those of `JUELICH`, and one more bin below. Samples that are not finite (an empty area) are left out.
+    Raises ValueError if the lengths differ.
     """
     rho, v = (np.asarray(each, np.float64).ravel() for each in (density, speed))
     if len(rho) != len(v):
@@ -118,11 +117,11 @@ def diagram(density: ArrayLike, speed: ArrayLike, edges: ArrayLike | None = None
 
 
 def from_weidmann(density: ArrayLike, speed: ArrayLike, low: float = 0.5, high: float = 3.0) -> Deviation:
-    """Return how far speeds (S,) are from Weidmann's at densities (S,) between low and high, 1/m^2; NaN of no sample.
+    """Return the deviation of speeds (S,) from Weidmann's at densities (S,) in [low, high), 1/m^2; NaN without samples.
 
-    `worst` is over means of bins half a person per m^2 wide, the last as wide as is left. A model is near enough if it
-    stays below .25 m/s: real corridors are .15 m/s below the curve (JuPedSim's validation of ug-180). Raises
-    ValueError, of one line, for bounds that leave nothing between them.
+    `worst` is over the means of bins .5 per m^2 wide; the last may be narrower. A model is close enough if it stays
+    below .25 m/s: real corridors are .15 m/s below the curve (JuPedSim's validation of ug-180).
+    Raises ValueError unless 0 <= low < high.
     """
     if not 0 <= low < high:
         raise ValueError(f"low = {low:g}: must be at least 0 and below high = {high:g}")
@@ -137,7 +136,7 @@ def from_weidmann(density: ArrayLike, speed: ArrayLike, low: float = 0.5, high: 
 
 
 def in_juelich(density: ArrayLike, speed: ArrayLike) -> float:
-    """Return the share of bins of `JUELICH` with samples whose mean lies within one deviation; NaN if none has any."""
+    """Return the share of sampled bins of `JUELICH` whose mean lies within one deviation; NaN without samples."""
     found = diagram(density, speed)[1:]
     inside = [
         abs(b.speed - mean) <= spread for b, (_, _, mean, spread) in zip(found, JUELICH, strict=True) if b.samples

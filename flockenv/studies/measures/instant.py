@@ -1,4 +1,4 @@
-"""What people who study flocks and crowds measure on one world at one instant: order, spacing, speed, contact."""
+"""Measures of one world at one instant: order, spacing, speed, contacts."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ MEASURES = {
 def measure(
     scene: Scene, state: State, world: int = 0, progress: Callable[[int], None] = lambda done: None
 ) -> dict[str, float]:
-    """Return the measures of one world by name; NaN where one has no meaning (spacing of a single agent).
+    """Return the measures of one world by name; NaN if one has no meaning (spacing of a single agent).
 
     progress: called with the number of agents whose nearest neighbour has been found.
     """
-    with np.errstate(over="ignore", invalid="ignore"):  # a run that is about to diverge may be looked at, too
+    with np.errstate(over="ignore", invalid="ignore"):  # a run that is about to diverge may also be measured
         return _measure(scene, state, world, progress)
 
 

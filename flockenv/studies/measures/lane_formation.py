@@ -1,4 +1,4 @@
-"""Lanes: whether those who walk one way keep together, beside what chance makes of the same people."""
+"""Lane formation: whether agents that walk in the same direction keep together, compared with chance."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ __all__ = ["Lanes", "band_index", "lane_order", "lanes", "rows_of"]
 Floats = NDArray[np.float64]
 
 BAND, ROW = 0.3, 0.2
-"""m: the width of a band of Y, and of a row of Phi."""
+"""m: the width of a band of Y and of a row of Phi."""
 
 MOST_ROWS = 10_000
 
 
 class Lanes(NamedTuple):
-    """Order over a run, and what the same run has if directions are dealt out anew."""
+    """Order over a run, and the order of the same run with permuted directions."""
 
     order: float  # Phi, mean over the instants
     bands: float  # Y, mean over the instants
-    null: float  # Phi, mean over the deals
-    null_high: float  # Phi, which 95 % of the deals do not exceed
-    p: float  # share of deals with at least the order that was found, itself among them
-    beyond: float  # (Phi - null) / (1 - null): 0 = as by chance, 1 = lanes alone; NaN where chance makes perfect lanes
+    null: float  # Phi, mean over the permutations
+    null_high: float  # Phi, which 95 % of the permutations do not exceed
+    p: float  # share of permutations with at least the order that was found, the run itself included
+    beyond: float  # (Phi - null) / (1 - null): 0 = as by chance, 1 = lanes alone; NaN if chance makes perfect lanes
 
 
 def rows_of(across: ArrayLike, low: float, high: float, width: float) -> NDArray[np.int64]:
-    """Return which row of some width, m, everybody is in who is `across`, m, from low on; -1 outside of [low, high).
+    """Return the row of width `width`, m, counted from low, of each coordinate `across`, m; -1 outside [low, high).
 
-    Raises ValueError, of one line, for an empty range, a width that is not positive, or too many rows.
+    Raises ValueError if the range is empty, the width is not positive, or there are more than MOST_ROWS rows.
     """
     if not (np.isfinite([low, high, width]).all() and low < high and width > 0):
         raise ValueError(f"rows from {low:g} to {high:g} m, {width:g} m wide: must be finite, low < high and width > 0")
@@ -45,10 +45,10 @@ def rows_of(across: ArrayLike, low: float, high: float, width: float) -> NDArray
 
 
 def lane_order(across: ArrayLike, way: ArrayLike, low: float, high: float, width: float = ROW) -> float:
-    """Return Phi, the mean over rows with somebody in it of ((n+ - n-) / (n+ + n-))^2; NaN if there is nobody.
+    """Return Phi, the mean over occupied rows of ((n+ - n-) / (n+ + n-))^2; NaN without agents.
 
-    across (N,) m, across the way of walking; way (N,) > 0 or < 0, who goes which way. 1 = nobody shares a row with
-    somebody who goes the other way; by chance it is not 0 but about 1/n in rows of n. Source: Feliciani & Nishinari
+    across (N,) m, perpendicular to the walking direction; way (N,), > 0 or < 0: the direction of each agent. 1 = no row
+    holds agents of both directions; by chance it is not 0 but about 1/n in rows of n. Source: Feliciani & Nishinari
     2016, Phys. Rev. E 94, 032304, rows .2 m wide; after Rex & Loewen 2007, Phys. Rev. E 75, 051402.
     """
     forward, many = _counted(across, way, low, high, width)
@@ -56,16 +56,16 @@ def lane_order(across: ArrayLike, way: ArrayLike, low: float, high: float, width
 
 
 def band_index(across: ArrayLike, way: ArrayLike, low: float, high: float, width: float = BAND) -> float:
-    """Return Y, the mean over bands with somebody in it of |n+ - n-| / (n+ + n-); NaN if there is nobody.
+    """Return Y, the mean over occupied bands of |n+ - n-| / (n+ + n-); NaN without agents.
 
-    As `lane_order`, but for the square, and for bands .3 m wide. Source: Yamori 1998, Psychol. Rev. 105, 530.
+    Like `lane_order`, but without the square and with bands .3 m wide. Source: Yamori 1998, Psychol. Rev. 105, 530.
     """
     forward, many = _counted(across, way, low, high, width)
     return float((np.abs(2 * forward - many) / many).mean()) if len(many) else np.nan
 
 
 def _counted(across: ArrayLike, way: ArrayLike, low: float, high: float, width: float) -> tuple[Floats, Floats]:
-    """Return how many go forward, and how many there are, in each row with somebody in it."""
+    """Return the number of agents that go forward, and of all agents, in each occupied row."""
     row, sign = rows_of(across, low, high, width), np.asarray(way, np.float64)
     here = (row >= 0) & (sign != 0)
     many = np.bincount(row[here], np.ones(int(here.sum())))
@@ -83,12 +83,12 @@ def lanes(
     deals: int = 400,
     seed: int = 0,
 ) -> Lanes:
-    """Return the order of lanes over a run, and of `deals` runs in which directions are dealt out anew.
+    """Return the order of lanes over a run, and over `deals` permutations of its directions.
 
-    across (T, N) m; way (N,): who goes which way all the time, > 0 or < 0, or 0: is not counted; present (T, N): who is
-    in the region that is measured, all by default. The deals are a permutation test: positions stay as they are, each
-    person keeps a direction all the time, and as many go each way as before.
-    Raises ValueError, of one line, for shapes that do not fit, and where not both ways are gone by somebody.
+    across (T, N) m; way (N,): the direction of each agent over the whole run, > 0 or < 0; agents with 0 are not
+    counted; present (T, N): True for agents in the measured region (default: all). This is a permutation test:
+    positions stay as they are, each agent keeps one direction, and as many go in each direction as before.
+    Raises ValueError if shapes do not match, or if all agents go in one direction.
     """
     y, sign = np.asarray(across, np.float64), np.sign(np.asarray(way, np.float64))
     if y.ndim != 2 or sign.shape != y.shape[1:]:
@@ -99,7 +99,7 @@ def lanes(
     row = np.where(sign != 0, row, -1)
     seen = np.flatnonzero((row >= 0).any(axis=0))
     if not ((sign[seen] > 0).any() and (sign[seen] < 0).any()):
-        raise ValueError("way: lanes are of people who go both ways, here all go one")
+        raise ValueError("way: lanes need agents in both directions, here all go in one")
     row, forward = row[:, seen], (sign[seen] > 0).astype(np.float64)
     rng = np.random.default_rng(seed)
     dealt = np.stack([forward, *(rng.permutation(forward) for _ in range(deals))], axis=1)
@@ -115,7 +115,7 @@ def lanes(
 
 
 def _orders(row: NDArray[np.int64], dealt: Floats) -> Floats:
-    """Return Phi, mean over the instants, of rows (T, N) under each of many deals (N, R), (R,)."""
+    """Return Phi, mean over the instants, of rows (T, N) under each permutation of directions (N, R), (R,)."""
     total, instants = np.zeros(dealt.shape[1]), 0
     for now in row:
         here = np.flatnonzero(now >= 0)

@@ -1,4 +1,4 @@
-"""Order of a flock at one instant: does it fly one way, turn around its middle, keep together, and how near."""
+"""Order of a flock at one instant: polarisation, milling, momentum, cohesion and spacing."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ __all__ = [
 Floats = NDArray[np.float64]
 
 AT_A_TIME = 2**18
-"""Points that are looked for between two calls of `progress`."""
+"""Points that are queried between two calls of `progress`."""
 
 FARTHEST = 1e150
-"""m: the square of a longer way is no number any more."""
+"""m: the square of a larger distance overflows."""
 
 
 def polarisation(vel: Floats) -> float:
-    """Return |mean of v_i / |v_i|| over velocities (N, D): 1 if all head the same way; NaN if nobody moves.
+    """Return |mean of v_i / |v_i|| over velocities (N, D): 1 if all have the same heading; NaN if no agent moves.
 
     Source: Vicsek et al. 1995, Phys. Rev. Lett. 75, 1226.
     """
@@ -38,10 +38,10 @@ def polarisation(vel: Floats) -> float:
 
 
 def milling(pos: Floats, vel: Floats, space: Space) -> float:
-    """Return |mean of unit(x_i - centre) x unit(v_i)|, positions and velocities (N, D): 1 if all circle one way.
+    """Return |mean of unit(x_i - centre) x unit(v_i)|, positions and velocities (N, D): 1 if all circle in one sense.
 
-    NaN if nobody moves off the centre. Source: Couzin et al. 2002, J. theor. Biol. 218, 1, who call it the angular
-    momentum of the group.
+    NaN if no agent moves away from the centre. Source: Couzin et al. 2002, J. theor. Biol. 218, 1, there called group
+    angular momentum.
     """
     out = space.displacement(centre(pos, space), pos) if len(pos) else pos
     far, speed = np.linalg.norm(out, axis=1), np.linalg.norm(vel, axis=1)
@@ -54,14 +54,14 @@ def milling(pos: Floats, vel: Floats, space: Space) -> float:
 
 
 def group_momentum(vel: Floats, mass: ArrayLike) -> float:
-    """Return |sum of m_i v_i|, kg m/s, of velocities (N, D), m/s, and masses (N,), kg; infinite ones have none."""
+    """Return |sum of m_i v_i|, kg m/s, of velocities (N, D), m/s, and masses (N,), kg; infinite masses are left out."""
     weight = np.asarray(mass, np.float64)
     free = np.isfinite(weight)
     return float(np.linalg.norm((vel[free] * weight[free, None]).sum(axis=0)))
 
 
 def centre(pos: Floats, space: Space) -> Floats:
-    """Return the middle of positions (N, D), m, (D,); on a torus by the directions in which they lie on its circles.
+    """Return the centre of positions (N, D), m, (D,): the mean, on a torus the circular mean along each axis.
 
     Source of the latter: Bai & Breen 2008, J. Graph. Tools 13, 53.
     """
@@ -73,16 +73,16 @@ def centre(pos: Floats, space: Space) -> Floats:
 
 
 def cohesion_radius(pos: Floats, space: Space) -> float:
-    """Return the mean distance of positions (N, D) from their centre, m; NaN of nobody."""
+    """Return the mean distance of positions (N, D) from their centre, m; NaN without agents."""
     if not len(pos):
         return np.nan
     return float(np.linalg.norm(space.displacement(centre(pos, space), pos), axis=1).mean())
 
 
 def components(pos: Floats, reach: float, space: Space) -> int:
-    """Return how many groups there are of whom each is within `reach`, m, of another of his group; positions (N, D), m.
+    """Return the number of connected components of positions (N, D), m, if points within `reach`, m, are linked.
 
-    Raises ValueError, of one line, for a reach that is not positive, or, on a torus, goes around it.
+    Raises ValueError if the reach is not positive or, on a torus, more than half of its shortest side.
     """
     longest = min(space.size) / 2 if isinstance(space, Torus) else np.inf
     if not 0 < reach <= longest:
@@ -99,7 +99,7 @@ def nearest_distances(
 ) -> tuple[Floats, NDArray[np.intp]]:
     """Return for each of (N, D) points, m, the distance to its nearest neighbour, m, and which point that is.
 
-    A lone point, or one further out than squares can be taken, is infinitely far from its nearest neighbour, itself.
+    A single point, or one beyond FARTHEST along an axis, has itself as nearest neighbour, at distance inf.
     progress: called with the number of points done.
     """
     distance, nearest = np.full(len(pos), np.inf), np.arange(len(pos))
@@ -108,12 +108,12 @@ def nearest_distances(
         return distance, nearest
     inside = space.wrap(pos[here])
     tree = cKDTree(inside, boxsize=space.size if isinstance(space, Torus) else None)
-    # In the order of the tree's leaves, successive points need the same nodes, which are in the caches then.
+    # In the order of the tree's leaves, successive points need the same nodes, which are then in the caches.
     for first in range(0, len(here), AT_A_TIME):
         progress(first)
         rows = np.asarray(tree.indices[first : first + AT_A_TIME])
         found, which = tree.query(inside[rows], k=2)
-        # Of two points in one place each may be found first: the neighbour is the one that is not the point itself.
+        # Of two points at the same place either may be found first: the neighbour is the one that is not the point.
         column = np.where(which[:, 0] == rows, 1, 0)
         k = np.arange(len(rows))
         distance[here[rows]], nearest[here[rows]] = found[k, column], here[which[k, column]]

@@ -1,4 +1,4 @@
-"""Pictures of measurements: flow over density, paths in the colours of their lanes, tail of gaps, density in time."""
+"""Pictures of measurements: flow over density, paths coloured by direction, tail of gaps, density over time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Polygons of the plane that areas are measured with: refused if they are none, cut by lines, and what lies in them."""
+"""Polygons of measured areas: validation, clipping by half-planes, and containment of points."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ __all__ = ["Corners", "checked", "contains", "convex", "cut", "rectangle"]
 
 Floats = NDArray[np.float64]
 Corners = list[tuple[float, float]]
-"""A polygon while it is cut: plain numbers, for there are few of them and many polygons."""
+"""A polygon while it is clipped: plain numbers, as there are many polygons of few corners."""
 
 
 def checked(name: str, polygon: ArrayLike, is_convex: bool = False) -> Floats:
-    """Return a polygon (n, 2), m, counter-clockwise; ValueError, of one line, for what encloses no area, or crosses."""
+    """Return a polygon (n, 2), m, counter-clockwise; raise ValueError if it has no area or crosses itself."""
     vertices = np.asarray(polygon, np.float64)
     if vertices.ndim != 2 or vertices.shape[1:] != (2,) or len(vertices) < 3 or not np.isfinite(vertices).all():
         raise ValueError(f"{name} = {shown(vertices.tolist())}: must be at least three corners (x, y), all finite")
@@ -36,7 +36,7 @@ def rectangle(low: Sequence[float] | Floats, high: Sequence[float] | Floats) -> 
 
 
 def convex(polygon: Floats) -> bool:
-    """Is a counter-clockwise polygon (n, 2) convex?"""
+    """Return True if a counter-clockwise polygon (n, 2) is convex."""
     edges = np.roll(polygon, -1, axis=0) - polygon
     after = np.roll(edges, -1, axis=0)
     turns = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
@@ -44,9 +44,9 @@ def convex(polygon: Floats) -> bool:
 
 
 def contains(polygon: Floats, points: Floats) -> NDArray[np.bool_]:
-    """Return which of some points (..., 2) lie in a polygon (n, 2), by how often a ray from each crosses its edges.
+    """Return which points (..., 2) lie in a polygon (n, 2), by the parity of the edges that a ray from each crosses.
 
-    Of two polygons that share an edge one contains a point on it.
+    A point on an edge that two polygons share lies in exactly one of them.
     """
     x, y = points[..., 0], points[..., 1]
     inside = np.zeros(points.shape[:-1], np.bool_)
@@ -57,7 +57,7 @@ def contains(polygon: Floats, points: Floats) -> NDArray[np.bool_]:
 
 
 def cut(corners: Corners, nx: float, ny: float, bound: float) -> Corners:
-    """Return what of a convex polygon lies where nx x + ny y <= bound.
+    """Return the part of a convex polygon in the half-plane nx x + ny y <= bound.
 
     Source: Sutherland & Hodgman 1974, Comm. ACM 17, 32.
     """

@@ -1,4 +1,4 @@
-"""What a model of people should not do: bodies in one another, going backward; and how often they collide."""
+"""Faults of pedestrian models: overlapping bodies, walking backward, and the collision rate."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ __all__ = ["Proportion", "collision_rate", "oscillation_proportion", "overlap_ar
 Floats = NDArray[np.float64]
 
 ROUNDING = 1e-6
-"""Of the distance of two who touch: hard bodies lie so near to each other that rounding would decide who overlaps."""
+"""Share of the contact distance that is tolerated: whether hard bodies in contact overlap is a matter of rounding."""
 
 
 class Proportion(NamedTuple):
-    """How much, where it happens; and how often it does."""
+    """Mean size of a fault where it occurs, and how often it occurs."""
 
-    mean: float  # over those cases where it is not 0; 0 if there is none
-    share: float  # of the cases, where it is not 0; NaN if nobody was looked at
+    mean: float  # over the cases where it is not 0; 0 if there are none
+    share: float  # of the cases, those in which it is not 0; NaN without cases
 
 
 def overlap_area(distance: ArrayLike, first: ArrayLike, second: ArrayLike) -> Floats:
-    """Return the area that two discs share, m^2, whose centres are so far apart, of these radii, m."""
+    """Return the area, m^2, that two discs share; `distance` of their centres and radii `first` and `second` in m."""
     d, a, b = np.broadcast_arrays(*(np.asarray(each, np.float64) for each in (distance, first, second)))
     small, large = np.minimum(a, b), np.maximum(a, b)
     # half angles of the two segments, from sides of the triangle between the centres and where the circles cross
@@ -39,9 +39,9 @@ def overlap_area(distance: ArrayLike, first: ArrayLike, second: ArrayLike) -> Fl
 
 
 def touching(pos: Floats, radius: Floats, space: Space, margin: float = 0.0) -> tuple[NDArray[np.int64], Floats]:
-    """Return the pairs of discs (N, D), m, that overlap, (P, 2), the lesser number first, and how far apart, (P,) m.
+    """Return the pairs of discs (N, D), m, that overlap, (P, 2), the smaller index first, and their distances, (P,) m.
 
-    Radii, (N,) m, are larger by a share `margin`, at most .001.
+    Radii, (N,) m, are enlarged by a share `margin`, at most .001.
     """
     if len(pos) < 2 or not radius.max() > 0:
         return np.zeros((0, 2), np.int64), np.zeros(0)
@@ -53,10 +53,10 @@ def touching(pos: Floats, radius: Floats, space: Space, margin: float = 0.0) -> 
 
 
 def overlap_proportion(pos: ArrayLike, radius: ArrayLike, space: Space, alive: ArrayLike | None = None) -> Proportion:
-    """Return how much bodies lie in one another: the mean of A_ij / min(A_i, A_j) over all pairs that overlap.
+    """Return how much bodies overlap: the mean of A_ij / min(A_i, A_j) over all pairs that overlap.
 
-    pos (T, N, 2) m; radius (N,) m; alive (T, N). `mean` is 0 where no two ever overlap, 1 where one always lies in the
-    other; `share` is how many of all agent-instants are in a pair that overlaps.
+    pos (T, N, 2) m; radius (N,) m; alive (T, N). `mean` is 0 if no two agents ever overlap, 1 if one always lies in the
+    other; `share` is the share of agent-instants in a pair that overlaps.
     Source: Chraibi, Seyfried, Schadschneider 2010, Phys. Rev. E 82, 046111 (arXiv 1008.4297), there of ellipses.
     """
     total, many, seen, people = 0.0, 0, 0, 0
@@ -64,7 +64,7 @@ def overlap_proportion(pos: ArrayLike, radius: ArrayLike, space: Space, alive: A
         pairs, far = touching(where, size, space, -ROUNDING)
         a, b = size[pairs[:, 0]], size[pairs[:, 1]]
         least = np.pi * np.minimum(a, b) ** 2
-        # a point in a body lies in it whole
+        # a point inside a body overlaps it entirely
         total += float(np.where(least > 0, overlap_area(far, a, b) / np.where(least > 0, least, 1), 1.0).sum())
         many += len(pairs)
         seen += len(np.unique(pairs))
@@ -73,11 +73,11 @@ def overlap_proportion(pos: ArrayLike, radius: ArrayLike, space: Space, alive: A
 
 
 def oscillation_proportion(vel: ArrayLike, desired: ArrayLike, alive: ArrayLike | None = None) -> Proportion:
-    """Return how strongly people move backward: the mean of S = -v . v0 / |v0|^2 where that is > 0.
+    """Return how strongly agents move backward: the mean of S = -v . v0 / |v0|^2 where that is > 0.
 
-    vel (T, N, D) and desired (N, D) or (T, N, D), m/s: v0 with its speed; who wants to go nowhere is not looked at.
-    alive (T, N). `mean` is 0 where nobody ever moves backward, 1 where he does so as fast as he would walk; `share` is
-    how many of all agent-instants it happens in. Forces that oscillate do it again and again (Kretz, arXiv 1507.02566).
+    vel (T, N, D) and desired (N, D) or (T, N, D), m/s: the desired velocity v0; agents with v0 = 0 are left out.
+    alive (T, N). `mean` is 0 if no agent ever moves backward, 1 if agents do so at their desired speed; `share` is the
+    share of agent-instants with S > 0. Forces that oscillate cause it repeatedly (Kretz, arXiv 1507.02566).
     Source: Chraibi, Seyfried, Schadschneider 2010, Phys. Rev. E 82, 046111, S = (|s| - s) / 2 with s = v . v0 / |v0|^2.
     """
     v = np.asarray(vel, np.float64)
@@ -94,10 +94,10 @@ def oscillation_proportion(vel: ArrayLike, desired: ArrayLike, alive: ArrayLike 
 def collision_rate(
     time: ArrayLike, pos: ArrayLike, radius: ArrayLike, space: Space, alive: ArrayLike | None = None
 ) -> float:
-    """Return how often two begin to touch, per agent and second: 2 pairs that did not at the instant before / (N T).
+    """Return the rate at which agents begin to touch, 1/s per agent: 2 (pairs that newly touch) / (N T).
 
-    time (T,) s; pos (T, N, D) m; radius (N,) m; alive (T, N). Who touched at the first instant has not begun to; what
-    begins and ends between two instants is not seen. NaN of fewer than two instants, or of nobody.
+    time (T,) s; pos (T, N, D) m; radius (N,) m; alive (T, N). Pairs that touch at the first instant are not counted;
+    contacts that begin and end between two instants are missed. NaN for fewer than two instants, or no agents.
     """
     when = np.asarray(time, np.float64)
     before: set[int] | None = None
@@ -115,7 +115,7 @@ def collision_rate(
 def _instants(
     pos: ArrayLike, radius: ArrayLike, alive: ArrayLike | None
 ) -> Iterator[tuple[Floats, Floats, NDArray[np.intp]]]:
-    """Return positions, radii and numbers of those who are there, at instant after instant."""
+    """Yield positions, radii and indices of the agents that are alive and finite, instant by instant."""
     where, size = np.asarray(pos), np.asarray(radius, np.float64)
     if where.ndim != 3 or size.shape != where.shape[1:2]:
         raise ValueError(f"pos: of shape {where.shape}, radius of {size.shape}: must be (T, N, D) and (N,)")

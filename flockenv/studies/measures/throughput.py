@@ -1,4 +1,4 @@
-"""Flow through a line: who crosses it, when and which way; how many per second and metre; the gaps between them."""
+"""Flow through a line: its crossings by agent, time and direction; the flow, 1/(m s); the time gaps."""
 
 from __future__ import annotations
 
@@ -13,27 +13,25 @@ __all__ = ["Crossings", "Flow", "crossings", "cumulative", "flow", "time_gaps"]
 Floats = NDArray[np.float64]
 
 PIECE = 2_000_000
-"""Agent-instants that are looked at together."""
+"""Agent-instants that are processed together."""
 
 
 class Crossings(NamedTuple):
-    """Every crossing of a line, in the order of time."""
+    """All crossings of a line, in the order of time."""
 
     time: Floats  # (C,) s
     agent: NDArray[np.int64]  # (C,)
-    sign: NDArray[
-        np.int64
-    ]  # (C,) 1: to the right of who looks from the line's first end to its second; -1: to the left
+    sign: NDArray[np.int64]  # (C,) 1: to the right, seen from the line's first end towards its second; -1: to the left
 
 
 class Flow(NamedTuple):
-    """What went through a line in a time; `forward` is to its right."""
+    """Flow through a line over some time; `forward` is to its right."""
 
     forward: int
     backward: int
-    rate: float  # 1/s, forward less backward, by all of the time
-    specific: float  # 1/(m s), the same by the width
-    passing: float  # 1/s, (n - 1) / (t_n - t_1) of those forward: while it flows; NaN of fewer than two
+    rate: float  # 1/s, (forward - backward) / the whole time
+    specific: float  # 1/(m s), rate / width
+    passing: float  # 1/s, (n - 1) / (t_n - t_1) of forward crossings: while it flows; NaN for fewer than two
 
 
 def crossings(
@@ -44,13 +42,14 @@ def crossings(
     identity: ArrayLike | None = None,
     period: ArrayLike = (0.0, 0.0),
 ) -> Crossings:
-    """Return who crossed a line between two instants; ways between instants are straight.
+    """Return the crossings of a line; paths between two instants are straight.
 
     time (T,) s, increasing; pos (T, N, 2) m; line (2, 2) m, from its first end to its second; alive (T, N) and identity
-    (T, N): who is not there at both instants, or is not the same, made no way; period (2,) m, 0 = none: the world goes
-    on with itself, and the shortest way is the one that was made. Who comes to lie on the line has crossed it from the
-    right and has not from the left; where two lines make one, each crossing is of one of them, but for rounding.
-    Raises ValueError, of one line, for shapes that do not fit, a line of no length, and times that do not grow.
+    (T, N): a slot whose agent is dead at one of two instants, or another agent at the second, has no path between them;
+    period (2,) m of a periodic world, in which the shortest path is taken; 0 = not periodic. An agent that ends exactly
+    on the line has crossed it if it came from the right, not from the left; so where two lines join end to end, each
+    crossing belongs to one of them, up to rounding.
+    Raises ValueError if shapes do not match, the line has length 0, or times do not increase.
     """
     when, where = np.asarray(time, np.float64), np.asarray(pos, np.float64)
     ends = _checked_line(line)
@@ -79,7 +78,7 @@ _NOBODY = (np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.int64))
 def _crossed(
     time: Floats, pos: Floats, line: Floats, moved: NDArray[np.bool_], period: Floats
 ) -> list[tuple[Floats, NDArray[np.int64], NDArray[np.int64]]]:
-    """Return times, agents and signs of some instants: of the line, and of its images."""
+    """Return times, agents and signs of crossings of the line and of its images, over some instants."""
     way = pos[1:] - pos[:-1]
     way -= period * np.round(way / np.where(period > 0, period, np.inf))
     begin, along = pos[:-1], line[1] - line[0]
@@ -110,8 +109,8 @@ def flow(found: Crossings, width: float, seconds: float) -> Flow:
     """Return the flow through a line of some width, m, over a time, s.
 
     rate = N / seconds and specific = rate / width, with N = forward less backward; `passing` is what experiments at
-    bottlenecks call J (Seyfried et al. 2009, Transp. Sci. 43, 395): it knows nothing of the time before the first and
-    after the last. Raises ValueError, of one line, for a width or time that is not positive.
+    bottlenecks call J (Seyfried et al. 2009, Transp. Sci. 43, 395): it leaves out the time before the first crossing
+    and after the last. Raises ValueError if width or time is not positive.
     """
     for name, value in (("width", width), ("seconds", seconds)):
         if not (np.isfinite(value) and value > 0):
@@ -124,12 +123,12 @@ def flow(found: Crossings, width: float, seconds: float) -> Flow:
 
 
 def cumulative(found: Crossings) -> tuple[Floats, NDArray[np.int64]]:
-    """Return N(t): times (C,), s, and how many are beyond the line just after each, (C,), forward less backward."""
+    """Return N(t): times (C,), s, and forward less backward crossings just after each, (C,)."""
     return found.time, np.cumsum(found.sign)
 
 
 def time_gaps(found: Crossings, sign: int = 1) -> Floats:
-    """Return the times between one crossing and the next of the same sign, s, in their order; of C crossings C - 1.
+    """Return the times between successive crossings of one sign, s, in their order: C - 1 for C such crossings.
 
     Source: Kretz, Gruenebohm, Schreckenberg 2006, J. Stat. Mech. P10014 (arXiv physics/0610077).
     """

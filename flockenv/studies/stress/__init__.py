@@ -26,4 +26,4 @@ __all__ = [
 ]  # fmt: skip
 
 CASES: tuple[Case, ...] = (*BODIES, *BONDED, *CROWDS, *CONTACTS, *IMPACTS, *HEAPS, *GATHERINGS)
-"""Every hard case, in the order of shared/reference/numerics.md, section 6.2, within each kind of scene."""
+"""Every hard case, by kind of scene."""

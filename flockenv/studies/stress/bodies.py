@@ -1,6 +1,6 @@
-"""Hard cases of one body: oscillators, orbits, tracers, stiff drag. One set of laws for all of them: one kernel each.
+"""Hard cases of one body: oscillators, orbits, tracers, stiff drag.
 
-Names, scenes and bounds are those of shared/reference/numerics.md, sections 3 and 6.2.
+All share one set of laws, so that each method compiles one kernel.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ PRINTED: dict[str, Callable[[float, int], tuple[float, float]]] = {
     "velocity_verlet": lambda y, n: (1 - y * y / 4, 1.0),
     "implicit_midpoint": lambda y, n: (1.0, 1.0),
 }
-"""E_n / E_0 of an oscillator begun at rest, at least and at most, for y = h w (numerics.md 3.1)."""
+"""Lower and upper bound of E_n / E_0 of an oscillator that begins at rest, for y = h w after n steps, by method."""
 
 
 def oscillator(method: Integrator) -> Value:
@@ -148,7 +148,7 @@ def _pendulum(seconds: float) -> Floats:
 
 
 def _projectile(t: float, k: float) -> Floats:
-    """Return position and velocity under linear drag (numerics.md 3.3)."""
+    """Return position and velocity under linear drag, closed form."""
     left = math.exp(-k * t)
     return np.array([
         10 * (1 - left) / k, (15 + 9.81 / k) * (1 - left) / k - 9.81 * t / k,
@@ -193,7 +193,7 @@ ORBIT = {
     "velocity_verlet": 4e-4, "rk4": 3e-7, "semi_implicit_euler": 2e-2, "midpoint": 3e-3, "dormand_prince": 1e-4,
     "adaptive_rk4": 1e-3,
 }  # fmt: skip
-"""Of |dE/E| over 100 periods at 1,000 steps (numerics.md 3.3, N04); 1e-2 for others."""
+"""Bounds of |dE/E| over 100 periods at 1,000 steps each; 1e-2 for other methods."""
 
 
 def orbit(method: Integrator) -> Value:
@@ -286,7 +286,7 @@ def in_the_centre(method: Integrator) -> Value:
 def approach(speed: float, tau: float, decay: float) -> Callable[[Integrator], Value]:
     """Return the trial of Kretz: an agent of 1 kg with desired speed `speed` comes to rest before a wall, A = 100 N.
 
-    It oscillates if and only if v0 tau / B > 1/4, at any step (numerics.md 2.1, P11).
+    It oscillates if and only if v0 tau / B > 1/4, at any step (Kretz, arXiv 1507.02566).
     """
 
     def trial(method: Integrator) -> Value:

@@ -1,7 +1,4 @@
-"""Hard cases of springs: a cloth that grows stiffer, a hanging chain, and a swinging chain far from the origin.
-
-Names, scenes and bounds are those of shared/reference/numerics.md, section 6.2.
-"""
+"""Hard cases of springs: a cloth that grows stiffer, a hanging chain, and a swinging chain far from the origin."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Hard cases of soft contact: restitution of a spring that acts for a few steps, and bodies that begin inside others.
-
-Names, scenes and bounds are those of shared/reference/numerics.md, sections 2.2 (P17, P27) and 6.2.
-"""
+"""Hard cases of soft contact: restitution of a spring over few steps, and bodies that begin inside others."""
 
 from __future__ import annotations
 
@@ -54,7 +51,7 @@ class Hit(NamedTuple):
 
 
 def hits(method: Integrator, dt: float, wall: bool) -> Hit:
-    """Let a pair meet head-on, or one a wall, at PHASES phases of the step."""
+    """Return the restitution of a head-on hit of two bodies, or of one and a wall, at PHASES phases of the step."""
     with warnings.catch_warnings(record=True) as caught:
         for kind in TOO_LONG:
             warnings.simplefilter("always", kind)
@@ -70,7 +67,7 @@ def hits(method: Integrator, dt: float, wall: bool) -> Hit:
 
 
 def _given_back(scene: Scene, dt: float, wall: bool) -> Floats:
-    """Return the speed of parting over that of meeting, (PHASES,): a world for each phase."""
+    """Return the speed after the hit over that before it, (PHASES,): a world for each phase."""
     gap = SPEED * dt * (np.arange(PHASES) + 0.5) / PHASES
     start = scene.start(0, worlds=PHASES)
     pos, vel = np.zeros((PHASES, 2, 2)), np.zeros((PHASES, 2, 2))
@@ -84,7 +81,7 @@ def _given_back(scene: Scene, dt: float, wall: bool) -> Floats:
 
 
 def gives_back(wall: bool) -> Callable[[Integrator], Value]:
-    """Return the trial: a hit without a warning gives back 95 to 105 % of its speed."""
+    """Return the trial that a hit without a warning has a restitution of .95 to 1.05."""
 
     def trial(method: Integrator) -> Value:
         edge = 0.999 * contact_limit(method) / math.sqrt(2 * STIFFNESS / MASS)  # the longest step without a warning
@@ -95,7 +92,7 @@ def gives_back(wall: bool) -> Callable[[Integrator], Value]:
             f"{h.dt:.3g} s: " + (f"{h.least:.3f} to {h.largest:.3f}" if h.least == h.least else "")
             + (f" ({h.told})" if h.told else "") for h in found
         )  # fmt: skip
-        return Value(off, off <= 0.05 and bool(silent), note)  # somewhere it must be silent
+        return Value(off, off <= 0.05 and bool(silent), note)  # some step must give no warning
 
     return trial
 
@@ -104,7 +101,7 @@ MOST = 2.0  # m/s
 
 
 def inside_each_other(method: Integrator) -> Value:
-    """Two deep inside each other, and 30 in a disc of two bodies' size: each pair parts no faster than `most`.
+    """Two bodies deep inside each other, and 30 in a disc of twice their radius: no pair parts faster than `most`.
 
     In steps of 1.5 ms; a contact of a pair lasts 38 of them.
     """

@@ -1,7 +1,4 @@
-"""Hard cases of several agents: all in one place, around the edge of a torus.
-
-Names, scenes and bounds are those of shared/reference/numerics.md, section 6.2.
-"""
+"""Hard cases of several agents: all at one place, opposite headings, around the edge of a torus."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Hard cases of solid agents that steer to goals: head-on, at a crossing, across a circle; stalls; chaos repeated.
-
-Names, scenes and bounds are those of shared/reference/numerics.md, sections 2.2 and 6.2.
-"""
+"""Hard cases of solid agents that steer to goals: head-on, at a crossing, across a circle; stalls; chaos repeated."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Hard cases of discs that lie: an incline, a stack of ten, a thousand in a funnel.
-
-Names, scenes and bounds are those of shared/reference/numerics.md, sections 2.2 and 6.2.
-"""
+"""Hard cases of discs at rest: an incline, a stack of ten, a thousand in a funnel."""
 
 from __future__ import annotations
 
@@ -65,7 +62,7 @@ def funnel(method: Integrator, response: Response, seconds: float = 60.0, count:
 
 
 def _lattice(count: int) -> Floats:
-    """Return starting positions, (count, 2) m: rows of 44 above the funnel, every other one shifted, a little off."""
+    """Return starting positions, (count, 2) m: rows of 44 above the funnel, every other one shifted, with jitter."""
     k = np.arange(count)
     row, column = k // 44, k % 44
     off = np.random.default_rng(0).uniform(-0.1, 0.1, (count, 2)) * GRAIN
@@ -74,7 +71,7 @@ def _lattice(count: int) -> Floats:
 
 
 def _left(before: Floats, after: Floats) -> bool:
-    """True if a disc has crossed the middle of a wall, or a plane, between two instants."""
+    """Return True if a disc has crossed the middle of a wall, or a plane, between two instants."""
     out = (np.abs(after[:, 0]) > 2.5) | (after[:, 1] < 0)
     for shape in SIDES:
         corners = np.array(shape.vertices)
@@ -86,7 +83,7 @@ def _left(before: Floats, after: Floats) -> bool:
 
 
 def _turn(a: Floats, b: Floats) -> Floats:
-    """Return a x b, of vectors of the plane."""
+    """Return the cross product a x b of vectors of the plane."""
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 

@@ -1,7 +1,4 @@
-"""Hard cases of discs that hit: bouncing balls, bullets, a cradle, mass ratios, a gas far away, fifty in one place.
-
-Names, scenes and bounds are those of shared/reference/numerics.md, sections 2.2, 3.3 and 6.2.
-"""
+"""Hard cases of discs that hit: bouncing balls, bullets, a cradle, mass ratios, a gas far away, fifty in one place."""
 
 from __future__ import annotations
 
@@ -175,7 +172,7 @@ CHAINS: tuple[tuple[Sequence[float], Sequence[float], Sequence[float]], ...] = (
     ((1, 1, 1, 1, 1), (1, 1, 0, 0, 0), (0, 0, 0, 1, 1)),
     ((1, 2, 1), (1, 0, 0), (-1 / 3, 2 / 9, 8 / 9)),
 )
-"""Masses in kg, velocities before and after in m/s (numerics.md P23)."""
+"""Masses in kg, velocities before and after in m/s."""
 
 
 def cradle(method: Integrator, response: Response) -> Value:

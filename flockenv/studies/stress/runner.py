@@ -34,5 +34,5 @@ def run(
     progress: Callable[[int], None] = lambda done: None,
     keep: Callable[[Results], None] = lambda results: None,
 ) -> Results:
-    """Run every case under every method, and return the findings with the known ones; see `findings.run`."""
+    """Run every case under every method, and return the findings with the known ones; see `trial_log.run`."""
     return trial_log.run(cases, {m.kind: m for m in methods}, fingerprint(), known, progress, keep, TOLD)

@@ -3,8 +3,8 @@
 from flockenv.studies.validation import CASES, run
 results = run(CASES, ("helbing_farkas_vicsek_2000",))
 
-Names and bounds are those of RiMEA, NIST TN 1822 and JuPedSim's tests, as shared/reference/numerics.md has them; values
-of presets are the published ones. A miss is a verdict and not an error.
+Names and bounds are those of RiMEA, NIST TN 1822 and JuPedSim's tests; values of presets are the published ones. A
+missed bound is a verdict and not an error.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ CASES: tuple[Case, ...] = (*ALONE, *CORRIDORS, *DOORS)
 """Every case."""
 
 VALIDATED = tuple(name for name in PRESETS if name != "moussaid_2010_groups")
-"""Every preset of a whole model: that of groups, 2010, is the one of 2009 and forces that keep parties together."""
+"""Every preset of a whole model: the omitted one is moussaid_2009 plus forces that keep groups together."""
 
 
 def presets_named(names: list[str]) -> tuple[str, ...]:
-    """Return the presets of some names, all for none; ValueError with the nearest name for an unknown one."""
+    """Return presets by name or alias (no names: all); raise ValueError with the nearest name for an unknown one."""
     from flockenv.scene.presets import ALIASES
 
     for name in names:

@@ -1,6 +1,6 @@
 """Cases of people that walk alone: speed in a corridor, the same one turned, speeds of people of all ages.
 
-Names and bounds: shared/reference/numerics.md, sections 1.1 to 1.3 (RiMEA, NIST TN 1822, JuPedSim's tests of Juelich).
+Names and bounds are those of RiMEA, NIST TN 1822 and JuPedSim's tests (Juelich).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ TABLE = ((0.58, 1.61), (1.41, 1.54), (0.68, 1.41), (0.46, 0.76))
 """m/s, from and to: below 30 years, 30 to 50, above, and the handicapped (RiMEA 7, by Weidmann's table)."""
 
 AGES = (13, 13, 12, 12)
-"""Number of people of each."""
+"""Number of people in each age group."""
 
 
 def corridor(name: str, speed: float, *, length: float, degrees: float = 0.0, moving: bool = False) -> Scene:
@@ -138,7 +138,7 @@ def rimea_7(name: str) -> Value:
 
 def nist_2_4(name: str) -> Value:
     """100 people with normal desired speeds, 1.2 +- .2 m/s: a test that their walking speeds are normal."""
-    from scipy.stats import kstest  # it looks for torch, and takes half a second
+    from scipy.stats import kstest  # imported here: it looks for torch, and takes half a second
 
     speeds = np.concatenate([_free_speeds(built(name)) for built in SCENES["nist 2.4"].values()])
     p = float(kstest(speeds, "norm", args=(1.2, 0.2)).pvalue)

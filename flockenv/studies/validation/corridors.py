@@ -43,18 +43,18 @@ from flockenv.studies.validation.walk import (
 __all__ = ["CORRIDORS", "SCENES", "endless", "lined_up"]
 
 EDGE = 32.0
-"""m, of the torus across the corridor, and its least length: the widest sight of a preset is 15 m."""
+"""m, size of the torus across the corridor, and least length of one: the largest radius of a preset is 15 m."""
 
 WIDTH = 4.0
 ROOMY = 0.8
-"""m^2 per agent; where each has less, cells fill a corridor from wall to wall."""
+"""m^2 per agent; if each has less, cells fill the corridor from wall to wall."""
 
 DENSITIES = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
 ALONG = (0.5, 0.75, 1.0, 1.25, 1.5, 1.75)
 """1/m^2, and 1/m in single file."""
 
 DENSE = {"helbing_farkas_vicsek_2000": 0.001}
-"""s, one step where bodies lie in each other from the start: those of 2000 are .6 m across, and 3 per m^2 fill .85."""
+"""s, one step if bodies overlap from the start: those of 2000 are .6 m across, so that 3 per m^2 cover .85 of it."""
 
 SECONDS, DROPPED = 30.0, 12.0
 LANE_SEEDS, LANE_SECONDS, LANE_LAST = 20, 60.0, 20.0
@@ -82,7 +82,7 @@ def endless(
         elif not roomy:
             begin = {"spawn": filled(count, low, high, people(name, count, low, high).widest)}
         groups.append(people(name, count, low, high, **begin))
-    if sum(counts) < FEWEST_AGENTS:  # so few and many share a kernel
+    if sum(counts) < FEWEST_AGENTS:  # so that small and large crowds share a kernel
         groups.append(nobody(name, (half, middle), FEWEST_AGENTS - sum(counts)))
     aims = [Course(group=k, direction=(way, 0)) for k, way in enumerate(ways)]
     return scene_of(

@@ -1,6 +1,6 @@
 """Cases of doors, bottlenecks and rooms: times of evacuation, and flows.
 
-Names and bounds: shared/reference/numerics.md, sections 1.1, 1.2 and 4 (RiMEA, NIST TN 1822, measured bottlenecks).
+Names and bounds are those of RiMEA, NIST TN 1822 and JuPedSim's tests, with flows of measured bottlenecks.
 """
 
 from __future__ import annotations

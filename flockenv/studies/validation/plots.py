@@ -1,4 +1,4 @@
-"""Pictures of a validation: the table, flow and speed over density, flow over width, lanes, time over haste."""
+"""Pictures of a validation: speed over density, flow over width, lanes, evacuation time over desired speed."""
 
 from __future__ import annotations
 

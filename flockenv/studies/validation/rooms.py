@@ -76,7 +76,7 @@ def gated(x: float, low: float, high: float, *doors: tuple[float, float]) -> tup
 def room(name: str, count: int, size: Point, door: float, speed: Any = None, seed: int = 0, **fields: Any) -> Scene:
     """Return people in a room whose right wall, at x = 0, has a door in its middle; people 2 m outside are removed.
 
-    A door of 0 m is shut: they press against its place.
+    A door of 0 m is shut: people press against its place.
     """
     wide, high = size[0], size[1] / 2
     walls = (
@@ -115,7 +115,7 @@ def corner(name: str, count: int, width: float, arm: float, begin: float) -> Sce
 
 
 def straight(name: str, count: int, width: float, length: float, begin: float) -> Scene:
-    """Return the same people in a corridor that does not turn, of some length in all."""
+    """Return people in the first metres of a straight corridor along x; people at its end are removed."""
     walls = (wall((length, 0.0), (0.0, 0.0), (0.0, width), (length, width)),)
     group = people(name, count, (0.1, 0.1), (begin, width - 0.1))
     out = Leaving(low=(-1.0, -1.0), high=(length, width + 1))

@@ -24,6 +24,6 @@ def run(
     progress: Callable[[int], None] = lambda done: None,
     keep: Callable[[Results], None] = lambda results: None,
 ) -> Results:
-    """Run every case with every preset, and return the findings with the known ones; see `findings.run`."""
+    """Run every case with every preset, and return the findings with the known ones; see `trial_log.run`."""
     with quietly():
         return trial_log.run(cases, {name: name for name in presets}, fingerprint(), known, progress, keep)

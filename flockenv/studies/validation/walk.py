@@ -25,10 +25,10 @@ WEIDMANN = Spread(mean=1.34, sd=0.26, low=0.3)
 """m/s, desired speeds of pedestrians (Weidmann 1993), the default of all cases."""
 
 STEPS = {"helbing_farkas_vicsek_2000": 0.005, "moussaid_2011": 0.05}
-"""s, one step. Of bodies that rub: 6 cm of two bodies' overlap, kappa d 2 / m < 2 / dt; of all others .02."""
+"""s, one step (default: .02). With friction of bodies, kappa d 2 / m < 2 / dt at 6 cm overlap d of two bodies."""
 
 SOLID = ObstacleContact(stiffness=1.2e5)
-"""Of walls in models that have no bodies, as Helbing, Farkas and Vicsek 2000 have it: or a crowd is pushed through."""
+"""Elastic walls (Helbing, Farkas and Vicsek 2000) of models without bodies, whose crowds are else pushed through."""
 
 SHAKEN = 0.01
 """m, largest initial distance from a cell's middle, along each axis, of bodies that are wider than their cells."""
@@ -48,7 +48,7 @@ class Walk(NamedTuple):
     last: State
 
     def gone(self, world: int = 0) -> Floats:
-        """Return the time at which each was last there, (N,) s; NaN if it still is at the end."""
+        """Return the first instant at which each agent is gone, (N,) s; NaN if it is still there at the end."""
         here = self.alive[:, world]
         last = len(here) - 1 - here[::-1].argmax(axis=0)
         return np.where(here[-1] | ~here.any(axis=0), np.nan, self.time[np.minimum(last + 1, len(here) - 1)])
@@ -83,7 +83,7 @@ def _apart(count: int, low: Sequence[float], high: Sequence[float], widest: floa
 def filled(count: int, low: Sequence[float], high: Sequence[float], widest: float) -> Spawn:
     """Return a grid of `count` cells that fills a box, with the longest shorter edge.
 
-    Bodies are apart if the cells are as wide as they; else they are up to SHAKEN from the middles of their cells.
+    Bodies are apart if they fit in the cells; else they are up to SHAKEN from the middles of their cells.
     """
     wide, deep = (b - a for a, b in zip(low, high, strict=True))
     fitting = [(wide / -(-count // rows), deep / rows) for rows in range(1, count + 1)]
@@ -120,7 +120,7 @@ def walked(
     scene: Scene, seconds: float, *, seed: int = 0, worlds: int = 1, every: float = 0.1,
     until: Callable[[State], bool] | None = None, begin: State | None = None,
 ) -> Walk:  # fmt: skip
-    """Run a scene for `seconds` s, with an instant every `every` s; end at `until`, or if all are stuck."""
+    """Run a scene for `seconds` s, with an instant every `every` s; end early at `until`, or if all are stuck."""
     state = scene.start(seed, worlds) if begin is None else begin
     stride = max(1, round(every / scene.dt))
     kept, living, since = [state], int(state.alive.sum()), 0.0
