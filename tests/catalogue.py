@@ -645,7 +645,7 @@ def everything(dimension: int, *chosen: Effect, **fields: Any) -> Scene:
     """Return effects of all forms at once (AMONG_ALL), on a torus unless another space is given.
 
     With some chosen, the others are there and idle: one kernel serves for tests of each of them, as long as they look
-    around in the same ways (sweep.KernelPlan.sights: who shares a radius, and who has a view cone at all).
+    around in the same ways (KernelPlan.sights: who shares a radius, and who has a view cone at all).
     """
     own = {effect.kind: effect for effect in chosen}
     others = [row.effect for row in FIRST if row.effect.kind in AMONG_ALL]

@@ -220,9 +220,9 @@ def test_in_a_corridor_the_force_field_of_both_walls_leads_to_the_middle_without
 # --- wall following ---------------------------------------------------------------------------------------------------
 
 
-def along(made: Scene, shape: Shape, seconds: float, without_dispatch: float) -> tuple[Any, Any]:
+def along(made: Scene, shape: Shape, seconds: float, settled: float) -> tuple[Any, Any]:
     x, v = path(made, seconds)
-    keep = np.arange(len(x)) * 5 * made.dt > without_dispatch
+    keep = np.arange(len(x)) * 5 * made.dt > settled
     return shape.gap(x[keep]), np.linalg.norm(v[keep], axis=1)
 
 

@@ -26,7 +26,7 @@ METRICS = ("held", "success_at_end")
 @kernel
 def judge(p: Any, step: int, holds: bool, numbers: Any, first: int) -> None:
     """Write the measures of a lasting aim from number `first` on, `step` decisions after the start."""
-    judged = step > p.without_dispatch
+    judged = step > p.settled
     numbers[first] = 1.0 if holds else 0.0
     numbers[first + 1] = 1.0 if judged else 0.0
     numbers[first + 2] = 1.0 if holds and judged else 0.0

@@ -173,7 +173,7 @@ def _places(
     anew: True if bodies have moved since contacts were gathered. Contacts are gathered again if bodies are moved so far
     that they may overlap others; with a finite `spread`, bodies are moved once.
     """
-    deep, elsewhere, without_dispatch, done = 0.0, False, False, False
+    deep, elsewhere, settled, done = 0.0, False, False, False
     for turn in range(ROUNDS):
         if turn > 0 and (elsewhere or _beyond(period, bodies, ends, reach)):
             elsewhere = True
@@ -197,11 +197,11 @@ def _places(
         if crowded:
             deep = part(period, bodies, things, ends, rules.seconds, rounds, rules.touch, spread, contacts, touching)
         done = (once and not crowded) or spread < np.inf
-        without_dispatch = not _moved_far(period, bodies, ends, bodies.at, NEARLY if once else 0.5 * DEEP)
-        if done or without_dispatch:
+        settled = not _moved_far(period, bodies, ends, bodies.at, NEARLY if once else 0.5 * DEEP)
+        if done or settled:
             break
     left = deepest(period, bodies, things, ends, rules.seconds, contacts.who, contacts.other, touching)
-    return count, deep, spread == np.inf and (left > DEEPEST or not (done or without_dispatch))
+    return count, deep, spread == np.inf and (left > DEEPEST or not (done or settled))
 
 
 @kernel

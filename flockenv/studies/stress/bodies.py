@@ -286,7 +286,8 @@ def in_the_centre(method: Integrator) -> Value:
 def approach(speed: float, tau: float, decay: float) -> Callable[[Integrator], Value]:
     """Return the trial of Kretz: an agent of 1 kg with desired speed `speed` comes to rest before a wall, A = 100 N.
 
-    It oscillates if and only if v0 tau / B > 1/4, at any step (Kretz, arXiv 1507.02566).
+    Near the wall the force of length B has the stiffness v0 / (tau B) for a mass of 1 kg, with a damping of 1 / tau. So
+    the agent oscillates if and only if v0 tau / B > 1/4, at any step.
     """
 
     def trial(method: Integrator) -> Value:
