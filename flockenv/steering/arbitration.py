@@ -1,9 +1,9 @@
-"""Many wishes, one wish: how behaviours that want different things are reconciled.
+"""Arbitration: one steering force from several behaviours that disagree.
 
-`wishes` is a tuple of vectors in order of priority, all in one unit; a wish of zero asks for nothing. `budget` bounds
-the result, in the same unit. The first laws are for whoever has wishes and no scene (players); each record below is
-one that a `Steer` effect may be given, with a law (p, me, wishes) -> (force, shares) in newtons: what is done, and what
-share of each wish was granted.
+`wishes` is a tuple of steering forces in order of priority, all in one unit; a zero vector is an idle behaviour.
+`budget` bounds the result, in the same unit. The first laws need no scene, so players call them too. Each record below
+can be the arbitration of a `Steer` effect: its law (p, me, wishes) -> (force, shares) returns the resulting force, N,
+and the share of each steering force that is in it.
 
 Sources: Reynolds 1987 (prioritised acceleration allocation) and 1999 (blending, priority, dithering); Buckland,
 "Programming Game AI by Example" (2004; the running sum); Fray, "Context Steering" (Game AI Pro 2, 2015).
@@ -233,9 +233,9 @@ def dithered(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
 
 
 class Dithering(Arbitration):
-    """Prioritised dithering: each behaviour in order is heard with a probability, the first that asks has it all.
+    """Prioritised dithering: each behaviour in order is drawn with a probability; the first active one gets everything.
 
-    Who is drawn is a function of (world, time, agent) and lasts for `period`: it does not depend on dt.
+    The draw is a function of (world, time, agent) and lasts for `period`: it does not depend on dt.
     """
 
     kind: Literal["dithering"] = "dithering"
@@ -396,14 +396,14 @@ def by_intention(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
 
 
 class Intentions(Arbitration):
-    """A finite state machine's: each behaviour is heard in one state alone, or always (avoid); the others get nothing.
+    """A finite state machine: each behaviour is active in one state, or always (avoid); the others get nothing.
 
-    Which state it is an effect `intention` keeps. Those that are heard share max_force as in allocation, in order.
+    An `intention` effect keeps the state. The active behaviours share max_force in order, as in allocation.
     """
 
     kind: Literal["intentions"] = "intentions"
     when: tuple[Literal["avoid", "escape", "eat", "mate", "school", "wander"], ...] = Field(
-        min_length=1, description="when each behaviour is heard; avoid = always"
+        min_length=1, description="state in which each behaviour is active; avoid = always"
     )
     law: ClassVar[Law] = by_intention
     recalls: ClassVar[tuple[str, ...]] = ("intention",)

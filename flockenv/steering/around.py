@@ -33,7 +33,7 @@ def threat(forward: Vec, offset: Vec, clearance: float, lookahead: float) -> flo
 def avoid(forward: Vec, offset: Vec, clearance: float, max_speed: float) -> Vec:
     """Steer around the circle or sphere that `threat` found: sideways, away from its centre, at V m/s (Reynolds 1999).
 
-    Dead ahead everybody keeps right; inside, the way is straight out. It never brakes.
+    An obstacle dead ahead is passed on the right; an agent inside is steered straight out. It never brakes.
     """
     o = like(max_speed, 0.0)
     inside = dot(offset, offset) < clearance * clearance

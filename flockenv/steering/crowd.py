@@ -1,4 +1,4 @@
-"""Among many who want to get somewhere: not into each other's way, in a queue, and everywhere once."""
+"""Laws among many agents with goals: unaligned collision avoidance, queues, and coverage of a region."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ __all__ = ["explore", "give_way", "queue", "queue_gap", "unaligned_threat"]
 
 @law
 def unaligned_threat(offset: Vec, velocity: Vec, other_velocity: Vec, clearance: float, horizon: float) -> float:
-    """Return when somebody comes nearest if both go on, s; inf if that is behind us, too late, or not near enough.
+    """Return the time of closest approach to a neighbour, s; inf if it is past, too late, or not near enough.
 
     t* = -dx . dv / |dv|^2, kept if 0 <= t* <= horizon and |dx + dv t*| < clearance, the sum of both radii and a margin
-    (Reynolds 1999, unaligned collision avoidance; not twice the own radius).
+    (Reynolds 1999, unaligned collision avoidance; not twice the own radius). Both keep their velocities.
     """
     apart = sub(other_velocity, velocity)
     square, closing = dot(apart, apart), -dot(offset, apart)
@@ -29,11 +29,11 @@ def unaligned_threat(offset: Vec, velocity: Vec, other_velocity: Vec, clearance:
 
 @law
 def give_way(offset: Vec, velocity: Vec, other_velocity: Vec, time: float, max_speed: float) -> Vec:
-    """Steer away from where somebody will be, as seen from where I shall be, when we are nearest: S = -V unit(p), m/s.
+    """Steer away from the predicted offset p of a neighbour at the closest approach: S = -V unit(p), m/s.
 
-    p lies across the motion relative to him. So who meets head-on steers aside, who crosses behind steers aside and
-    brakes, who crosses in front steers aside and speeds up; the two always do opposite things. If p = 0, both keep
-    right of that relative motion: of two who cross, the one on the other's right goes first (formulas.md 1.2).
+    p lies across the relative motion. So an agent that meets another head-on steers aside, one that crosses behind
+    steers aside and brakes, one that crosses in front steers aside and speeds up; the two always do opposite things.
+    If p = 0, both keep right of the relative motion: of two that cross, the one on the other's right goes first.
     """
     meeting = add(offset, scale(sub(other_velocity, velocity), time))
     noise = like(time, 1e-10) * dot(offset, offset)  # a rest of rounding has no side
@@ -44,9 +44,10 @@ def give_way(offset: Vec, velocity: Vec, other_velocity: Vec, time: float, max_s
 
 @law
 def queue_gap(way: Vec, offset: Vec, other_velocity: Vec, clearance: float, max_speed: float) -> float:
-    """Return how far I can go on my `way` (a unit vector) until I touch somebody slower than I want to be, m; or inf.
+    """Return the gap along `way` (a unit vector) to a neighbour slower than the desired speed, m; inf if there is none.
 
-    Who is behind, beside the way, or as fast as I want to be, holds up nobody (Reynolds 1999: near, ahead and slower).
+    A neighbour behind, beside the way, or as fast as the desired speed does not count (Reynolds 1999: near, ahead and
+    slower).
     """
     far = like(clearance, np.inf)
     holds_up = (dot(offset, way) > like(clearance, 0.0)) & (dot(other_velocity, way) < max_speed)
@@ -56,11 +57,11 @@ def queue_gap(way: Vec, offset: Vec, other_velocity: Vec, clearance: float, max_
 
 @law
 def queue(way: Vec, velocity: Vec, gap: float, max_speed: float, headway: float) -> Vec:
-    """Go on one's way as fast as the gap allows: S = way min(V, gap / T) - v, m/s; T = headway [s].
+    """Follow `way` as fast as the gap allows: S = way min(V, gap / T) - v, m/s; T = headway [s].
 
     The brake of Reynolds 1999 in the form of Tordeux, Chraibi, Seyfried 2016 (doi 10.1007/978-3-319-33482-0_29): a gap
     closes as exp(-t / T) and never to less than nothing, and 1 / (T + l / V) agents of length l pass in a second. With
-    a gain of k = 4 m / T or more nobody overshoots.
+    a gain of k = 4 m / T or more no agent overshoots.
     """
     held = gap / headway
     return sub(scale(way, held if held < max_speed else max_speed), velocity)
@@ -70,10 +71,10 @@ def queue(way: Vec, velocity: Vec, gap: float, max_speed: float, headway: float)
 def explore(to_low: Vec, to_high: Vec, velocity: Vec, max_speed: float, track: float) -> Vec:
     """Sweep a rectangle for ever along a closed comb of tracks, at most `track` [m] apart: S, m/s.
 
-    To and fro along an even number of rows from the lower wall to the upper, and back down beside the left wall. Where
-    one is says where to go, so nothing is remembered: who is pushed away goes on from there, and everybody sweeps the
-    same loop. In space, on one's own level. `to_low` and `to_high` are distances to the walls per axis, m. It takes
-    track > V^2 m / F_max not to fly past a turn. (Ours: the textbook's boustrophedon, made a field.)
+    To and fro along an even number of rows from the lower wall to the upper, and back down beside the left wall. The
+    position alone determines the direction, so nothing is remembered: a displaced agent goes on from there, and all
+    agents sweep the same loop. In space, each at its own height. `to_low` and `to_high` are distances to the walls per
+    axis, m. It takes track > V^2 m / F_max not to fly past a turn. (Ours: the textbook's boustrophedon, made a field.)
     """
     e, half = like(track, 1.0), like(track, 0.5)
     x, y = to_low[0], to_low[1]

@@ -58,9 +58,9 @@ def wander_turn(target: Vec, noise: Vec, rate: float, dt: float) -> Vec:
 
 @law
 def in_frame(own: Vec, velocity: Vec) -> Vec:
-    """Return in the world's axes what is (forward, left) or (forward, left, up) of somebody at this velocity.
+    """Return in world axes a vector given as (forward, left) or (forward, left, up) of an agent at this velocity.
 
-    Left is level unless he flies straight up; at standstill forward is the x axis.
+    Left is level unless the agent flies straight up; at standstill forward is the x axis.
     """
     moving = unit(velocity)
     forward = select(dot(moving, moving) > like(own[0], 0.0), moving, axis(moving, 0))

@@ -37,7 +37,7 @@ def behind(offset: Vec, goal: Vec, distance: float) -> Vec:
 def herd_from(
     centre: Vec, farthest: Vec, goal: Vec, together: float, collecting: float, driving: float
 ) -> Vec:  # fmt: skip
-    """Return the offset of where a dog should be: to collect who strays, else to drive all of them to the goal.
+    """Return the offset of the place for a dog: behind a stray, to collect it; else behind the flock, to drive it.
 
     If the sheep farthest from the centre is more than `together` m from it, `collecting` m behind that sheep, seen from
     the centre; else `driving` m behind the centre, seen from the goal (Strombom et al. 2014: r_a N^(2/3), r_a and

@@ -1,12 +1,12 @@
-"""Hunger, libido, fear, and what they make an animal intend: laws for scenes, tasks and players alike.
+"""Hunger, libido, fear, and the intention that follows from them: laws for scenes, tasks and players.
 
 After Tu and Terzopoulos, "Artificial Fishes" (SIGGRAPH 1994). Theirs are: hunger H = 1 - n / a, of which the food n in
 the stomach is digested at a constant rate (`hungrier`, as a rate of change); libido L = s(t) (1 - H) with s growing
 evenly since the last mating (`desire`); fear of one predator min(D0 / d, 1), of all of them the sum, at most 1
 (`fright`); and the order in which intentions are looked for: collision, then fear (above one level flee, above a lower
 one school), then the larger of hunger and libido above a level, then wander (`intention`). Ours are: effort makes
-hungry, fear fades instead of ending at once, who eats takes his share by mass action and food grows logistically
-(Verhulst 1838), and levels are lower for who is already at it, where they keep their intention by a memory of the last.
+hungry, fear fades instead of ending at once, eaters share food by mass action, food grows logistically (Verhulst
+1838), and levels are lower for the present intention, where theirs is kept by a memory of the last one.
 """
 
 from __future__ import annotations
@@ -76,10 +76,11 @@ def intention(
     now: float, hunger: float, libido: float, fear: float, escape: float, school: float, need: float, calm: float,
     content: float,
 ) -> float:  # fmt: skip
-    """Return the number of what one intends, of INTENTIONS: fear first, then the larger of two needs, else wander.
+    """Return the index of the intention in INTENTIONS: fear first, then the larger of two needs, else wander.
 
-    `escape` and `school`: levels of fear; `need`: of hunger and libido. Who is at it goes on until it is `calm` less
-    (fear) or `content` less (needs); so, too, one need takes over from another only if it is larger by `content`.
+    `escape` and `school`: levels of fear; `need`: of hunger and libido. An intention ends when its
+    cause is `calm` (fear) or `content` (needs) below its level, and one need replaces another only if it is larger by
+    `content`.
     """
     o, e = like(fear, 0.0), like(fear, 1.0)
     eat, mate = like(fear, EAT), like(fear, MATE)

@@ -1,8 +1,8 @@
-"""Optimal reciprocal collision avoidance: the velocity nearest to the wished one that leads into nobody, in a plane.
+"""Optimal reciprocal collision avoidance (ORCA) in a plane: the collision-free velocity nearest to the desired one.
 
-Each neighbour forbids a half-plane of velocities, of which both take their share: if everybody keeps to his own, nobody
-touches within the horizon. What is nearest to the wish in all half-planes and within the speed limit is a linear
-programme with a round bound, solved line by line; where nothing is allowed, what is forbidden least is taken.
+Each neighbour forbids a half-plane of velocities, and both agents take their share of the change: if both keep to it,
+they do not touch within the horizon. The velocity nearest to the desired one within all half-planes and the speed limit
+is a linear programme with a round bound, solved line by line. If no velocity is allowed, the least forbidden is taken.
 
 Source: van den Berg, Guy, Lin, Manocha, "Reciprocal n-Body Collision Avoidance" (ISRR 2009, Springer 2011,
 doi 10.1007/978-3-642-19457-3_1), sections 4 and 5. A half-plane is (normal, bound) here: normal . v >= bound.
@@ -21,7 +21,7 @@ from flockenv.maths.vectors import add, axis, dot, limit, norm, scale, select, s
 __all__ = ["SLOT", "clear", "half_plane", "orca"]
 
 SLOT = 6
-"""Numbers of one neighbour in `orca`: offset (2) m, velocity (2) m/s, radius m (< 0: nobody), share."""
+"""Numbers of one neighbour in `orca`: offset (2) m, velocity (2) m/s, radius m (< 0: empty slot), share."""
 
 _PARALLEL = 1e-6  # sine below which two lines do not meet
 _SLACK = 1e-5  # m/s by which parallel lines may contradict each other, from rounding
@@ -33,8 +33,9 @@ def half_plane(
 ) -> Vec:
     """Return (n_x, n_y, bound): velocities with n . v >= bound do not lead to a touch within `horizon` [s].
 
-    `clearance` [m] is the sum of both radii, `share` the part of the change that is mine: 1/2 of somebody who does the
-    same, 1 of what does not give way. Who overlaps parts within `step` [s]. Straight at each other, both keep right.
+    `clearance` [m] is the sum of both radii, `share` this agent's part of the change: 1/2 for a neighbour
+    that does the same, 1 for one that does not give way. Agents that overlap part within `step` [s]. Head-on, both
+    keep right.
     """
     o, e = like(clearance, 0.0), like(clearance, 1.0)
     relative, square, contact = sub(velocity, other_velocity), dot(offset, offset), clearance * clearance
@@ -129,11 +130,11 @@ def orca(
     velocity: Vec, wish: Vec, radius: float, max_speed: float, horizon: float, step: float, turn: float,
     neighbours: Numbers,
 ) -> Vec:  # fmt: skip
-    """Change to the velocity nearest to the wished one that keeps clear of the neighbours for `horizon` s: S, m/s.
+    """Change to the velocity nearest to the desired one that keeps clear of the neighbours for `horizon` s: S, m/s.
 
-    `neighbours` holds SLOT numbers of each. Half-planes of those whose share is 1 (obstacles, whoever does not give
-    way) are never given up for others. If the wish is not free it is turned right by `turn` [rad], so that what is
-    symmetric does not come to a halt; else it is granted as it is, up to `max_speed`.
+    `neighbours` holds SLOT numbers of each. Half-planes of neighbours with share 1 (obstacles, agents that do not
+    give way) are never given up for others. A desired velocity that is not free is turned right by `turn` [rad], so
+    that symmetric encounters do not stop; a free one is returned as it is, up to `max_speed`.
     """
     given, lines, relaxed = stacked(neighbours), stacked(neighbours), stacked(neighbours)
     asked = (wish, max_speed, turn)

@@ -72,7 +72,7 @@ def interception_time(offset: Vec, quarry_velocity: Vec, max_speed: float) -> fl
 
 @law
 def approach_time(offset: Vec, speed: float, longest: float) -> float:
-    """Return |offset| / speed, s: how long somebody at this speed needs to come here; at most `longest` [s].
+    """Return |offset| / speed, s: how long an agent at this speed takes to arrive here; at most `longest` [s].
 
     The predictor of evasion (OpenSteer), which divides unguarded there.
     """
@@ -119,7 +119,7 @@ def evade(offset: Vec, velocity: Vec, pursuer_velocity: Vec, max_speed: float, t
 @law
 def push_off(offset: Vec, square: float) -> Vec:
     """One neighbour's push where the two are not in one place, 1/m: see `separate`. Their distance squared is known."""
-    return opposite(scale(offset, like(square, 1.0) / square))  # of who is infinitely far 0: a mask, and no choice
+    return opposite(scale(offset, like(square, 1.0) / square))  # 0 for an infinite distance: a mask, not a branch
 
 
 @law
@@ -133,7 +133,7 @@ def separate(offset: Vec, tie: Vec) -> Vec:
 
 @law
 def part(offset: Vec, square: float, tie: Vec) -> Vec:
-    """The same of somebody whose distance squared is told, m^2: where it is infinite, nothing."""
+    """The same with the squared distance given, m^2; zero if it is infinite."""
     return select(square > like(square, ONE_PLACE), push_off(offset, square), tie)
 
 
@@ -152,9 +152,9 @@ def cohere(mean_offset: Vec, velocity: Vec, max_speed: float) -> Vec:
 
 @law
 def passing_point(offset: Vec, velocity: Vec, distance: float) -> Vec:
-    """Return the offset of the point beside somebody, `distance` [m] from him towards one's own way, to pass him by.
+    """Return the offset of the point beside a neighbour, `distance` [m] from it towards this agent's path, to pass it.
 
-    Across the way; dead ahead he is passed on the right.
+    It lies across the path; a neighbour dead ahead is passed on the right.
     """
     forward = unit(velocity)
     aside = lateral(offset, forward)
@@ -179,10 +179,10 @@ def offset_pursue(
 def keep_station(
     offset: Vec, velocity: Vec, leader_velocity: Vec, place: Vec, max_speed: float, slow_radius: float
 ) -> Vec:
-    """Arrive at a place in a leader's frame, (forward, left[, up]) of it [m], and fly with it: a formation.
+    """Arrive at a place in a leader's frame, (forward, left[, up]) of it [m], and keep it: a formation.
 
-    v_d = v_L + V min(1, d / slow_radius) towards the place, at most V. Whoever arrives at where the place will be, as
-    in offset pursuit (Reynolds 1999), has v_d = 0 there and lags behind a leader that moves.
+    v_d = v_L + V min(1, d / slow_radius) towards the place, at most V. An agent that arrives at the predicted place,
+    as in offset pursuit (Reynolds 1999), has v_d = 0 there and lags behind a moving leader.
     """
     station = add(offset, in_frame(place, leader_velocity))
     towards = arrive(station, zero(velocity), max_speed, slow_radius)
@@ -200,10 +200,10 @@ def follow_leader(
     max_speed: float,
     slow_radius: float,
 ) -> Vec:
-    """Keep station `behind` a leader [m], and make way for it: who is in the box in front of it moves out sideways.
+    """Keep station `behind` a leader [m]; an agent in the box in front of the leader moves out sideways.
 
-    The box is `ahead` long and `aside` to each side [m]; in its axis everybody makes way to the leader's right
-    (Reynolds 1999). Neighbours are kept off by separation.
+    The box is `ahead` long and `aside` to each side [m]; on its axis agents move to the leader's right
+    (Reynolds 1999). Separation keeps neighbours apart.
     """
     o = like(behind, 0.0)
     forward = unit(leader_velocity)
@@ -256,6 +256,6 @@ def shadow(
 def hiding_place(offset: Vec, radius: float, margin: float, threat: Vec) -> Vec:
     """Return the offset [m] of the place behind a round obstacle, `margin` [m] from it, that `threat` cannot see.
 
-    h = c + (radius + margin) unit(c - x_threat); `offset` leads to the obstacle's centre c, `threat` to who seeks.
+    h = c + (radius + margin) unit(c - x_threat); `offset` leads to the obstacle's centre c, `threat` to the seeker.
     """
     return add(offset, scale(unit(sub(offset, threat)), radius + margin))

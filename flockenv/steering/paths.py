@@ -24,9 +24,9 @@ def stay_on_path(beyond: float, to_spine: Vec, velocity: Vec, max_speed: float) 
 
 @law
 def follow_path(beyond: float, gained: float, target: Vec, velocity: Vec, max_speed: float) -> Vec:
-    """Ask for nothing on the way in the tube, else seek a point of the spine further along it (Reynolds 1999).
+    """Return zero while the agent makes progress in the tube, else seek a point further along it (Reynolds 1999).
 
-    `gained` is how much further along its way the predicted place is, m, less what it must gain: who does not has
+    `gained` is the progress of the predicted place along the path, m, less the required one: without it the agent has
     turned round, or is too slow, and is sent on. `beyond` is how far it lies outside the tube, m, negative inside.
     """
     o = like(beyond, 0.0)

@@ -1,11 +1,11 @@
-"""Social forces: what pedestrians do about each other and about walls, one law each, as accelerations or as shares.
+"""Social forces between pedestrians, and between pedestrians and walls, as accelerations or as shares.
 
 Sources: Helbing and Molnar 1995 (Phys. Rev. E 51:4282); Helbing, Farkas and Vicsek 2000 (Nature 407:487); Johansson,
 Helbing and Shukla 2007 (arXiv 0810.4587); Moussaid et al. 2009 (Proc. R. Soc. B 276:2755), 2010 (PLoS ONE 5:e10047) and
 2011 (PNAS 108:6884). docs/social_forces.md has their values, and where they disagree.
 
-`offset` is other minus self, everywhere: who is repelled goes against it. `aim` is the unit vector of where one wants
-to go. `tie` is a unit vector, opposite for the other one, by which two who are in one place part.
+`offset` is other minus self, everywhere: repulsion acts along -offset. `aim` is the unit vector of the desired
+direction. `tie` is a unit vector, opposite for the other agent, along which two agents in one place part.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ NO_SIDE = 1e-14
 
 @law
 def looking(aim: Vec, heading: Vec) -> Vec:
-    """Return where somebody looks: where he wants to go, or if he says nothing where he goes; 0 if he does neither.
+    """Return the direction in which an agent looks: its aim, else its velocity; 0 if it has neither.
 
-    A way, of any length: laws that take one look at its direction alone.
+    The length is arbitrary: laws use the direction alone.
     """
     return select(dot(aim, aim) > like(aim[0], 0.0), aim, heading)
 
 
 @law
 def view_weight(way: Vec, offset: Vec, least: float) -> float:
-    """Return lambda + (1 - lambda)(1 + cos phi) / 2: 1 for who is straight ahead on the `way`, lambda behind.
+    """Return lambda + (1 - lambda)(1 + cos phi) / 2: 1 straight ahead on the `way`, lambda behind.
 
     phi lies between the way and `offset`, which leads to the other (Johansson, Helbing and Shukla 2007, where cos phi
-    is -n . e with n from the other to me). Without a way, and in one place, it is 1: he is seen as well as anybody.
+    is -n . e with n from the other to me). Without a way, and in one place, it is 1.
     """
     e, half = like(least, 1.0), like(least, 0.5)
     long = dot(offset, offset) * dot(way, way)
@@ -93,15 +93,15 @@ def repulsion(offset: Vec, tie: Vec, size: float, decay: float) -> Vec:
 
 @law
 def elliptical_repulsion(offset: Vec, step: Vec, tie: Vec, decay: float) -> Vec:
-    """-B grad exp(-b / B): away from the other and from where his `step` y leads; times A it is an acceleration.
+    """-B grad exp(-b / B): away from the other and from the end of its `step` y; times A it is an acceleration.
 
-    b = sqrt((|d| + |d - y|)^2 - |y|^2) / 2 is the smaller half axis of the ellipse through me with foci where he is and
-    where his step leads, d from him to me. y is his own step, v_j dt (Helbing and Molnar 1995; elliptical I of
-    Johansson et al. 2007), or that relative to me, (v_j - v_i) dt (elliptical II). In the form that does not cancel:
-    b = sqrt(p q) |u + w| / 2 and grad b = (p + q) / (2 sqrt(p q)) unit(u + w), with p u = d and q w = d - y.
+    b = sqrt((|d| + |d - y|)^2 - |y|^2) / 2 is the smaller half axis of the ellipse through this agent i with foci at
+    the other agent j and at the end of its step, d from j to i. y is the step of j, v_j dt (Helbing and Molnar 1995;
+    elliptical I of Johansson et al. 2007), or relative to i, (v_j - v_i) dt (elliptical II). In the form that does not
+    cancel: b = sqrt(p q) |u + w| / 2 and grad b = (p + q) / (2 sqrt(p q)) unit(u + w), with p u = d and q w = d - y.
 
-    It has no side where I stand in the way of his step, and grows as 1 / sqrt(q) at its end: there a tie says where to,
-    and (p + q) / (2 sqrt(p q)) is at most 500.
+    It has no direction if i stands on the step of j, and grows as 1 / sqrt(q) at its end: there a tie gives the
+    direction, and (p + q) / (2 sqrt(p q)) is at most 500.
     """
     out, size = off_ellipse(offset, step, tie, decay)
     return scale(out, size)
@@ -123,7 +123,7 @@ def off_ellipse(offset: Vec, step: Vec, tie: Vec, decay: float) -> tuple[Vec, fl
     across = lateral(tie, unit(step))
     there = p * p > like(decay, ONE_PLACE)
     out = select(square > like(decay, NO_SIDE), unit(sides), unit(across))
-    # in one place he is all around: as strong as with no step at all
+    # in one place there is no direction: as strong as without a step
     return select(there, out, unit(tie)), (ratio if there else e) * exp(-(b if there else o) / decay)
 
 
@@ -132,11 +132,11 @@ def sidestep(
     offset: Vec, velocity: Vec, other_velocity: Vec, tie: Vec,
     importance: float, gamma: float, angular: float, forward: float, bias: float,
 ) -> Vec:  # fmt: skip
-    """Slow down before somebody, and turn to one side of him; times A it is an acceleration.
+    """Slow down before a neighbour, and turn to one side of it; times A it is an acceleration.
 
-    D = lambda (v_i - v_j) + e, with e from me to him, t = unit(D), B = gamma |D|; theta is the angle from t to e in
-    (-pi, pi], positive if he is to the left of t; -exp(-d / B - (n' B theta)^2) along t, and away from his side,
-    exp(-d / B - (n B theta)^2) across it. The side bias theta + B eps, wrapped again, decides for the right where he is
+    D = lambda (v_i - v_j) + e, with e from i to j, t = unit(D), B = gamma |D|; theta is the angle from t to e in
+    (-pi, pi], positive if j is to the left of t; -exp(-d / B - (n' B theta)^2) along t, and away from the side of j,
+    exp(-d / B - (n B theta)^2) across it. The side bias theta + B eps, wrapped again, decides for the right if j is
     dead ahead (Moussaid et al. 2009, equations 4 to 7). In space it turns in the plane of t and e: ours.
 
     importance: lambda, s/m; gamma: s (B = gamma |D| m); angular: n; forward: n'; bias: eps.
@@ -163,9 +163,9 @@ def sidestep(
 
 @law
 def _side_of(towards: Vec, t: Vec) -> tuple[Vec, float]:
-    """Return a unit vector across t, and the angle from t towards it: its left in a plane, his side in space.
+    """Return a unit vector across t, and the angle from t towards it: its left in a plane, the other's side in space.
 
-    In space who is dead ahead is to the left, so that he is passed on the right; and so is anybody if t is 0.
+    In space a neighbour dead ahead counts as left, so that it is passed on the right; so does any if t is 0.
     """
     if len(t) == 2:
         left: Vec = (-t[1], t[0])
@@ -204,10 +204,10 @@ def gaze_turn(heading: Vec, offset: Vec, half: float) -> float:
 
 @law
 def collision_distance(way: Vec, offset: Vec, other_velocity: Vec, clearance: float, speed: float) -> float:
-    """Return how far somebody walks on the unit vector `way` at `speed` until he touches another who goes on; or inf.
+    """Return the free distance along the unit vector `way` at `speed` until contact with a moving neighbour, m; or inf.
 
     The smallest t >= 0 with |x_j + v_j t - v t way| = clearance, times v (f(alpha) of Moussaid, Helbing and Theraulaz
-    2011); 0 for two who overlap and come nearer.
+    2011); 0 for two that overlap and approach.
     """
     o, far = like(speed, 0.0), like(speed, np.inf)
     closing = sub(scale(way, speed), other_velocity)
