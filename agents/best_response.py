@@ -1,9 +1,8 @@
-"""Who gains by playing otherwise than all others? `python -m agents.best_response configs/training/school.yaml`.
+"""Best response: one agent deviates from the policy of all others. `python -m agents.best_response configs/...yaml`.
 
-The comparison lets everybody in a world play alike. Here one agent of each world plays one policy, and all others
-another: where a policy does best among those who do not have it, and all are worse off when all have it, no learner
-that is paid for itself stays with the better one (a prisoner's dilemma; who invades whom: Maynard Smith and Price 1973,
-Nature 246, 15).
+In the comparison all agents of a world play one policy. Here one agent of each world plays one policy, and all others
+another. If a policy scores best among agents without it, and all score worse when all have it, selfish learners leave
+the better policy: a prisoner's dilemma (evolutionary stability: Maynard Smith and Price 1973, Nature 246, 15).
 """
 
 from __future__ import annotations

@@ -191,7 +191,7 @@ def _cheapest(settings: Results, error_mm: float) -> str:
 
 
 def verdict(task: str, results: Results) -> str:
-    """Return a sentence about the last player: does it survive, and what does accuracy cost?"""
+    """Return a sentence about the last player: whether it keeps its success rate, and what accuracy costs."""
     settings, trained = results["settings"], results["settings"][results["trained"]]
     pilot = list(trained["players"])[-1]
     best, cheap = finest(results), frugal(results)

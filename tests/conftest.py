@@ -71,7 +71,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _of_a_rare_method(given: dict[str, Any]) -> bool:
-    """Does it compile one, or solve an implicit one's equations in Python?"""
+    """True if it compiles a rare method, or solves the equations of an implicit one in Python."""
     kind, way = getattr(getattr(given.get("row"), "method", None), "kind", ""), given.get("way")
     return kind in RARE_METHODS and way is None if way != "python" else kind.startswith("implicit")
 
