@@ -228,10 +228,12 @@ def publish_a_comparison(folder: Path, number: int) -> None:
     results = json.loads((ROOT / "docs" / "results.json").read_text(encoding="utf-8"))
     for name in ("results", "root/docs"):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    (folder / "results" / "results.json").write_text(json.dumps({**results, "seed": number}))
+    results["tasks"]["pursuit"]["players"]["rules"]["iqm"] -= number  # another table, and another picture
+    (folder / "results" / "results.json").write_text(json.dumps(results))
     (folder / "results" / "comparison.png").write_bytes(b"%d" % number)
-    marks = f"<!-- python -m agents.publish -->\n{number}<!-- end -->"
-    (folder / "root" / "README.md").write_text(marks)
+    for page in ("README.md", "docs/results.md"):
+        if not (folder / "root" / page).exists():
+            (folder / "root" / page).write_text("<!-- python -m agents.publish -->\n<!-- end -->")
     publish.main(folder / "results", folder / "root")
 
 

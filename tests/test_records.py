@@ -41,8 +41,8 @@ def test_pickles_hold_fields_alone_and_compare_equal() -> None:
     again = pickle.loads(pickle.dumps(SCENE))
     assert again == SCENE
     assert hash(again) == hash(SCENE)
-    assert "_move" in vars(SCENE)
-    assert not {"_move", "_threads"} & vars(again).keys()
+    assert "stepper" in vars(SCENE)
+    assert not {"stepper", "view"} & vars(again).keys()
 
 
 @pytest.mark.parametrize(("call", "line"), [

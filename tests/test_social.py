@@ -566,7 +566,7 @@ def test_in_a_file_a_preset_stands_for_its_effects(name: str) -> None:
         (["{preset: helbing_2000, group: 2}"], "text:7: effects[0].group = 2: there are 2 groups, counted from 0"),
         (
             ["{preset: helbing_2000}", "{preset: moussaid_2011}"],
-            "text:8: effects[1].preset = moussaid_2011: its bodies",
+            "text:8: effects[1].preset = moussaid_2011: its contacts",
         ),
         (["{kind: circular_repulsion, decay: 1, radius: 2}"], "text:7: effects[0]: strength: missing"),
     ],

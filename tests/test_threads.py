@@ -530,7 +530,7 @@ def test_callers_whose_jobs_wait_for_each_other_never_wait_for_ever(monkeypatch:
             super().__init__(count)
             time.sleep(0.02 * (6 - count))  # the smallest comes last, and stays
 
-    monkeypatch.setattr(thread_pool, "_Crew", Slow)
+    monkeypatch.setattr(thread_pool, "_ThreadPool", Slow)
     monkeypatch.setattr(thread_pool, "_crew", None)
 
     def call(size: int) -> list[int]:

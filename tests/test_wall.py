@@ -77,7 +77,7 @@ def test_the_force_is_the_formula_on_both_sides_and_the_gradient_of_its_potentia
 @pytest.mark.parametrize(
     ("fields", "said"),
     [
-        ({"normal": (0, 0)}, "normal = (0.0, 0.0): a direction"),
+        ({"normal": (0, 0)}, "normal = (0.0, 0.0): must be a direction"),
         ({"normal": (1e-200, 0)}, "normal[0] = 1e-200"),
         ({"normal": (0, 1e200)}, "normal[1] = 1e+200"),
         ({"decay": 0}, "decay = 0"),
