@@ -1,4 +1,4 @@
-"""Best response: one agent deviates from the policy of all others. `python -m agents.best_response configs/...yaml`.
+"""Best response: one agent deviates from all others. `python -m agents.best_response configs/training/school.yaml`.
 
 In the comparison all agents of a world play one policy. Here one agent of each world plays one policy, and all others
 another. If a policy scores best among agents without it, and all score worse when all have it, selfish learners leave

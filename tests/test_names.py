@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import re
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -37,3 +39,38 @@ def test_a_function_by_the_name_of_its_module_is_found(tmp_path: Path, monkeypat
     (package / "open.py").write_text("")
     monkeypatch.syspath_prepend(tmp_path)
     assert hidden(importlib.import_module("hiding")) == ["edge"]
+
+
+PATH = re.compile(
+    r"(?<![\w/.])((?:flockenv|agents|benchmarks|configs|docs|tests)(?:/\w+)+\.(?:py|md|yaml|json|png|html))\b"
+)
+MODULE = re.compile(r"`flockenv((?:\.[a-z_]\w*)+)")
+MADE_UP = {"configs/no.yaml", "flockenv/helpers.py"}
+"""Paths that tests need not to exist."""
+
+
+def texts() -> Iterator[Path]:
+    for folder, suffixes in (("flockenv", ".py"), ("agents", ".py"), ("benchmarks", ".py"), ("tests", ".py")):
+        yield from sorted((ROOT / folder).rglob(f"*{suffixes}"))
+    yield from [
+        ROOT / "README.md",
+        ROOT / "CONTRIBUTING.md",
+        *(ROOT / "docs").glob("*.md"),
+        *(ROOT / "configs").rglob("*.yaml"),
+    ]
+
+
+def test_files_and_modules_that_texts_name_exist() -> None:
+    missing = []
+    for path in texts():
+        text = path.read_text(encoding="utf-8")
+        named = {name for name in PATH.findall(text) if not re.search(r"/[A-Z]+\.", name)} - MADE_UP
+        missing += [f"{path.relative_to(ROOT)}: {name}" for name in named if not (ROOT / name).exists()]
+        for name in MODULE.findall(text):
+            package, *rest = name.strip(".").split(".")
+            folder = ROOT / "flockenv" / package
+            known = folder.is_dir() and (not rest or (folder / rest[0]).is_dir() or (folder / f"{rest[0]}.py").exists())
+            exported = folder.is_dir() and rest and rest[0] in (folder / "__init__.py").read_text(encoding="utf-8")
+            if not (known or exported):
+                missing.append(f"{path.relative_to(ROOT)}: flockenv{name}")
+    assert missing == []
