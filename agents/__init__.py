@@ -5,7 +5,7 @@ import flockenv  # noqa: F401  # first of all: handles signals from here on, if 
 import os  # isort: skip
 
 # Torch's threads spin for some milliseconds before they sleep: on two cores, where the worlds' second thread would run.
-# So many rounds are a quarter of a millisecond, and after a forward pass a step of Flock takes 1 / 1.7 of the time.
-# OpenMP reads it when torch is imported; who has said how threads wait is heard.
+# This is a quarter of a millisecond, and after a forward pass a step of Flock takes 1 / 1.7 of the time.
+# OpenMP reads it when torch is imported; a value that is already set stays.
 if "OMP_WAIT_POLICY" not in os.environ:
     os.environ.setdefault("GOMP_SPINCOUNT", "10000")

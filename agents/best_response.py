@@ -59,7 +59,7 @@ class Among:
         return self._seen[self._mine][:, None]
 
     def step(self, actions: NDArray[Any]) -> Step:
-        """Let everybody act, the one by `actions` (B, 1, A); return what it sees and is paid."""
+        """Step all agents, the one by `actions` (B, 1, A); return its observation and reward."""
         rows = self._seen[~self._mine]
         theirs, self._state = self._others.predict(rows, self._state, np.full(len(rows), self._begins), True)
         if np.shape(theirs) != (len(rows), actions.shape[-1]):
@@ -93,11 +93,11 @@ class Payoffs:
         return bootstrap(self.of[one, others].returns, "mean")
 
     def gain(self, one: str, others: str) -> Interval:
-        """Return what one has more who plays `one` among `others` than who plays as they do, in the same worlds."""
+        """Return the gain of one agent that plays `one` among `others`, over playing as they do, in the same worlds."""
         return compare(self.of[one, others], self.of[others, others]).difference
 
     def verdict(self, a: str, b: str) -> str:
-        """Say in a line what changing sides brings whoever does it alone, and what it comes to when all do."""
+        """Return a line: the gain of one agent that changes the policy, and of all agents that do."""
         a, b = sorted((a, b), key=lambda name: self.mean(name, name).value)
         into, back = self.gain(a, b), self.gain(b, a)
         whole = compare(self.of[a, a], self.of[b, b]).difference
@@ -128,17 +128,17 @@ def invade(
     seed: int = 0,
     advance: Callable[[], None] = lambda: None,
 ) -> Payoffs:
-    """Let one agent of each world play every policy, among others of every policy, in the same evaluation worlds.
+    """Play every policy with one agent of each world, among others of every policy, in the same evaluation worlds.
 
     Args:
         task: with at least two learners in a world.
-        players: name -> makes that policy; each rollout has one of its own, since a policy may remember.
-        worlds: in how many.
-        seed: which of them, as in the comparison.
+        players: name -> factory of that policy; each rollout has a new one, since a policy may have memory.
+        worlds: number of worlds.
+        seed: of the first, as in the comparison.
         advance: called after each rollout.
 
     Raises:
-        ValueError: one line: nobody to be among, or a player that fails.
+        ValueError: one line: a world has one learner, or a player fails.
     """
     if task.learners < 2:
         raise ValueError(f"task {task.name!r}: one learner alone in each world, with nobody to play otherwise than")
@@ -156,7 +156,7 @@ def invade(
 
 
 def table_of(payoffs: Payoffs) -> Table:
-    """Return the payoffs: a row for who is alone, a column for all others."""
+    """Return the payoffs: a row per policy of the one agent, a column per policy of all others."""
     table = Table("", *payoffs.players)
     for one in payoffs.players:
         table.add_row(one, *(str(payoffs.mean(one, others)) for others in payoffs.players))

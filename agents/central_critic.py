@@ -1,7 +1,7 @@
 """A critic that sees more than its actor: trained together, played alone (Lowe et al. 2017; Yu et al. 2022, MAPPO).
 
-What becomes of a learner depends on what it does not see: how hungry the hunter is, how many are left. An actor must do
-without; a critic, which nobody needs afterwards, need not, and what it explains is noise no longer.
+The return of a learner depends on what it does not observe: how hungry the hunter is, how many agents are left. The
+actor must do without; the critic is needed in training alone, so it may see that, and its estimates have less noise.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ Rows = NDArray[np.float32]
 
 
 class CentralVecEnv(WorldVecEnv):
-    """Rows of what a learner sees, and behind it what its critic is shown besides; see WorldVecEnv.
+    """Rows of a learner's observation, followed by the additional inputs of its critic; see WorldVecEnv.
 
-    That is what those learners who are still there see on average, which share of them is, what share of its time the
-    world has behind it, and the memory that the task keeps of everybody who is no learner.
+    These are the mean observation of the learners still present, their share, the share of the episode that is over,
+    and the task's memory of all agents that are no learners.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:

@@ -47,7 +47,7 @@ ROOT = Path(__file__).resolve().parent.parent
 WORLDS, SMOKE_WORLDS = 256, 16
 RESAMPLES, SMOKE_RESAMPLES = 10_000, 1_000
 TOLD_EVERY = 0.1  # s, between news of one player's progress from another process
-RECORDED = 0  # the world in the replay: the first, not one that somebody picked
+RECORDED = 0  # the world in the replay: the first, not a selected one
 PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "pettingzoo")
 FILES = ("results.json", "table.md", "comparison.png", "replay.html")
 ROOM = 2**24
@@ -63,7 +63,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions
 
 @dataclass(frozen=True)
 class Player:
-    """Who plays: what was asked for (a known name or a file), and the name in the tables."""
+    """A player: as given (a known name or a file), and its name in the tables."""
 
     spec: str
     name: str
@@ -150,7 +150,7 @@ def _sits_out(player: Player, task: Task, tasks: Sequence[Task]) -> bool:
 
 @dataclass(frozen=True)
 class _Job:
-    """One task: who plays it, in how many worlds, and what is asked of the scores."""
+    """One task: its players, the number of worlds, and the settings of the statistics."""
 
     task: Task
     players: Sequence[Player]
@@ -186,7 +186,7 @@ def _work(job: _Job, tell: Tell) -> Played:
             last[0] = perf_counter()
             tell(*news)
 
-    tell(job.task.name, job.players[0].name, 0, job.task.horizon)  # somebody is at it, though he may compile first
+    tell(job.task.name, job.players[0].name, 0, job.task.horizon)  # a process works on it; it may compile first
     policies = {player.name: player.policy(job.task, job.seed, job.trust_pickle) for player in job.players}
     return _play(job, policies, advance)
 
@@ -241,7 +241,7 @@ def experiment_of(name: str) -> Experiment:
 
 
 def provenance() -> report.Results:
-    """Return what somebody needs who wants the same numbers again."""
+    """Return what is needed to reproduce the numbers."""
     changes = _git("status", "--porcelain")
     versions = {"flockenv": flockenv.__version__, "python": platform.python_version()}
     return {
@@ -283,7 +283,7 @@ def main(
     ] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show where an error came from.")] = False,
 ) -> None:
-    """Play all tasks with all players in the same worlds, and say who won by what."""
+    """Play all tasks with all players in the same worlds, and compare their scores."""
     with one_line("compare", "interrupted, nothing written", debug):
         folder = folder_of(out, FILES)
         chosen = [experiment_of(name).build() for name in pick("--tasks", split(tasks) or list(TASKS), TASKS)]
@@ -360,7 +360,7 @@ def _bars(tasks: Sequence[Task], players: int) -> Iterator[Advance]:
 def _files(
     results: report.Results, episodes: Mapping[str, Mapping[str, Episodes]]
 ) -> dict[str, Callable[[Path], None]]:
-    """Return who writes which file."""
+    """Return the writer of each file."""
     writers: tuple[Callable[[Path], None], ...] = (
         lambda path: write_text(path, report.json_text(results)),
         lambda path: write_text(path, report.markdown(results)),

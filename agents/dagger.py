@@ -25,9 +25,9 @@ WORLDS, ROUNDS = 96, 4
 def shown(
     task: Task, rules: RulesPlayer, worlds: int, who: Answers | None = None, first: int = 0
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return what was seen in one episode of each of so many training worlds, (rows, size), and what rules answer.
+    """Return the observations of one episode in each of some training worlds, (rows, size), and the rules' actions.
 
-    who: what acts; the rules themselves if it is nothing. first: how many training worlds come before these.
+    who: the acting policy; None: the rules. first: the number of training worlds before these.
     """
     world, state = World(task, worlds, task.horizon), None
     seen = world.reset(worlds_for("training", 0, first + worlds) + first)
@@ -51,11 +51,11 @@ def teach(
     model: PPO, task: Task, rules: RulesPlayer, updates: int, worlds: int = WORLDS,
     advance: Callable[[int], None] = lambda n: None,
 ) -> tuple[int, float]:  # fmt: skip
-    """Teach PPO's actor what rules answer, by so many gradient steps of 2,048 rows in four rounds.
+    """Train PPO's actor to imitate the rules (DAgger), by some gradient steps of 2,048 rows in four rounds.
 
-    First of what rules meet in so many training worlds, then, round by round, of what the actor meets in as many more.
-    Returns how many rows there were, and what is missed in the end: mean square of its answers' errors, over the
-    variance of the rules' answers. advance: called with 1 after every gradient step.
+    The first round uses observations that the rules meet in training worlds, each later one those that the actor meets
+    in as many more. Returns the number of rows, and the remaining error: the mean square error of the actions over the
+    variance of the rules' actions. advance: called with 1 after every gradient step.
 
     Raises:
         FloatingPointError: learning or a world diverged; LearningDiverged names the gradient step and the loss.

@@ -47,10 +47,10 @@ class PpoSettings(Record):
     log_std: float = Field(default=-0.5, description="logarithm of the first standard deviation of actions")
     reward_scale: float = Field(default=0.1, gt=0, description="rewards are multiplied by this while learning")
     hold: int = Field(default=1, ge=1, le=100, description="decisions of the world for which it keeps to an action")
-    care: float = Field(default=0.0, ge=0, le=1, description="what others of his world count for a learner; he is 1")
+    care: float = Field(default=0.0, ge=0, le=1, description="weight of the others' advantages, beside 1 for its own")
     central_critic: bool = Field(
         default=False,
-        description="the critic is shown what all of its world see on average, and memories of who does not learn",
+        description="the critic also sees its world's mean observation and the memory of non-learners",
     )
     taught: int = Field(
         default=0, ge=0, description="gradient steps in which it first learns what the tuned rules answer"

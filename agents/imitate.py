@@ -42,7 +42,7 @@ class Imitation:
 def imitate(
     experiment: Experiment, worlds: int = WORLDS, updates: int = 6000, advance: Callable[[int], None] = lambda n: None
 ) -> Imitation:
-    """Teach PPO's actor what tuned rules answer, in so many training worlds a round; let both play tuning worlds.
+    """Train PPO's actor to imitate the tuned rules in training worlds; evaluate both in tuning worlds.
 
     Raises:
         FloatingPointError: learning or a world diverged.

@@ -15,13 +15,13 @@ __all__ = ["ForLearning"]
 
 
 class ForLearning(VecEnvWrapper):
-    """What learning likes: small rewards, actions that tell, and worlds in different phases of their episodes.
+    """A vector environment for learning: scaled rewards, held actions, worlds in different phases of their episodes.
 
-    Rewards times a constant keep the value loss near 1, so that clipping gradients does not starve the policy. And
-    where only the time limit ends an episode, worlds that began together would show every update one phase alone;
-    staggered, their first episodes end one after another. What one noisy decision in ten per second changes is lost
-    among the others; `hold` keeps to each for so many, and pays what they are paid together (Mnih et al. 2015). Where
-    an episode ends among them, what the next one is paid until there is another decision is left out.
+    Scaled rewards keep the value loss near 1, so that gradient clipping does not starve the policy. If only the time
+    limit ends episodes, worlds that begin together would show each update a single phase; staggered, their first
+    episodes end one after another. The effect of one noisy decision in ten per second is small; `hold` repeats each
+    action for a number of decisions and sums their rewards (Mnih et al. 2015). If an episode ends among them, rewards
+    of the next one before the next decision are left out.
     """
 
     def __init__(self, venv: WorldVecEnv, scale: float, stagger: bool, hold: int = 1) -> None:

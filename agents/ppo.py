@@ -71,7 +71,7 @@ def tensors_of(model: PPO) -> dict[str, np.ndarray]:
 
 @contextmanager
 def on_threads(count: int) -> Iterator[None]:
-    """Let torch and the worlds use so many threads; afterwards each uses as many as before."""
+    """Set the number of threads of torch and of the worlds for a block; restore both afterwards."""
     before = torch.get_num_threads(), threads()
     torch.set_num_threads(count)
     use_threads(count)

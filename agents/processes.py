@@ -25,13 +25,13 @@ Tell = Callable[..., None]
 
 
 def side_by_side(work: Callable[[Job, Tell], Done], jobs: Sequence[Job], processes: int, tell: Tell) -> Iterator[Done]:
-    """Yield what comes of every job, in their order, worked off by so many processes.
+    """Yield the result of every job, in their order, computed by a number of processes.
 
     Args:
-        work: a function of a module (it is found by name there), called with a job and with whom to tell news.
-        jobs: what it is called with; they and what comes of them travel between processes.
-        processes: how many; each is started anew, so a script needs `if __name__ == "__main__":`.
-        tell: called with the news of all of them, by another thread; no more once it has raised something.
+        work: a function of a module (it is found by name there), called with a job and a function that takes news.
+        jobs: its arguments; they and the results are pickled between processes.
+        processes: their number; each is started anew, so a script needs `if __name__ == "__main__":`.
+        tell: called with the news of all of them, by another thread; never again once it has raised.
 
     Raises:
         OSError: a process was ended from outside.
@@ -78,7 +78,7 @@ def _heard(context: Any, tell: Tell) -> Iterator[tuple[Connection, Any, Future[N
         while True:
             try:
                 news = ear.recv()
-            except Exception:  # nobody is left who could say a word, or finish one
+            except Exception:  # no process is left to report or to finish
                 return
             if news is None:
                 return
@@ -93,7 +93,7 @@ def _heard(context: Any, tell: Tell) -> Iterator[tuple[Connection, Any, Future[N
     try:
         yield mouth, context.Lock(), trouble
     finally:
-        mouth.send(None)  # closing tells him too, but where a process never took its end of the pipe
+        mouth.send(None)  # closing the pipe ends it as well, unless a process never took its end
         mouth.close()
         listener.join()
         ear.close()

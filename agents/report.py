@@ -96,7 +96,7 @@ def _number(value: float) -> float | None:
 
 
 def verdict(task: str, results: Results) -> str:
-    """Return a sentence: who is ahead by how much in the same worlds, and what each of the two cost.
+    """Return a sentence: which player is ahead by how much in the same worlds, and the cost of both.
 
     It is about ppo and rules where both played, else about the two players with the best means.
     """
@@ -199,7 +199,7 @@ def pair_cells(results: Results) -> tuple[list[str], list[list[str]]]:
 
 
 def column(task: str, results: Results, episodes: Mapping[str, Episodes]) -> Column:
-    """Return what the picture shows of one task: all players, and the pairs of those who steer at all."""
+    """Return the column of one task in the picture: all players, and the pairs without random actions."""
 
     def interval(about: Results, name: str, prefix: str) -> Interval:
         return Interval(about[name], about[f"{prefix}_low"], about[f"{prefix}_high"])

@@ -36,7 +36,7 @@ def recipe_of(experiment: Experiment) -> dict[str, Any]:
     """Return all that training depends on: with another value anywhere it is another training."""
     task, told = experiment.build(), experiment.model_dump(mode="json", include={"task", "arguments", "ppo"})
     if experiment.ppo.taught:
-        told["rules"] = as_dict(player(task).rules)  # who taught it
+        told["rules"] = as_dict(player(task).rules)  # the policy that it imitated first
     return {**told, "layout": task.layout.digest}
 
 

@@ -1,9 +1,9 @@
-"""Who gets the credit for what becomes of the others of a world: prosocial learners (Peysakhovich and Lerer 2018).
+"""Team credit: learners that share their advantages with the other learners of a world (Peysakhovich and Lerer 2018).
 
-Everybody is paid for himself and has a critic of his own pay; what is shared is the advantage. A critic of what all are
-paid would have to find what one's own hunger changes in the sum of eight: it is lost in what it explains worst, and who
-learns from it goes hungry (docs/players.md). The sum of what eight critics find is a critic of the sum (value
-decomposition, Sunehag et al. 2018), and finds it.
+Each learner has its own reward and a critic of its own return; the advantages are shared. A critic of the team's return
+would have to find the effect of one's own hunger in a sum of eight returns, where it is lost in the unexplained part,
+and such learners starve (docs/players.md). The sum of eight critics is a critic of the sum (value decomposition,
+Sunehag et al. 2018), and finds it.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ __all__ = ["CaringBuffer"]
 
 
 class CaringBuffer(RolloutBuffer):
-    """SB3's rollouts, in which a learner's advantage is his own and that of the others of his world, times `care`.
+    """SB3's rollout buffer; a learner's advantage is its own plus `care` times those of the others in its world.
 
-    What an action does to others when its own learner is out counts too. Who is out does nothing: his rows have no
-    advantage, before SB3 takes away the mean of a minibatch.
+    An action's effect on others counts also after its own learner has left. A learner that has left does nothing: its
+    rows have advantage 0, before SB3 subtracts the mean of a minibatch.
 
     Args:
-        worlds: whose rows these are; `worlds.acted`, (rows,) bool, True for a row whose learner acted in the last step.
+        worlds: of these rows; `worlds.acted`, (rows,) bool, is True for a row whose learner acted in the last step.
         learners: rows of a world, which lie side by side.
-        care: 0: he is himself alone; 1: all of a world are worth the same to him.
+        care: 0: its own advantage alone; 1: all learners of a world count the same.
     """
 
     def __init__(self, *args: Any, worlds: VecEnvWrapper, learners: int, care: float, **kwargs: Any) -> None:

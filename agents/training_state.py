@@ -53,7 +53,7 @@ def capture(model: PPO) -> KernelPlan:
 
 
 def restore(model: PPO, parts: KernelPlan, steps: int, folder: Path) -> None:
-    """Put a model, built by the same recipe, where another one was captured after so many steps of its rows.
+    """Restore the captured state of a training into a model built by the same recipe.
 
     Raises:
         Damaged: it names the part that does not fit this model, and says why.

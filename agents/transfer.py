@@ -153,7 +153,7 @@ def _measured(plans: Sequence[Plan], workers: int) -> report.Results:
     began = perf_counter()
     for plan in plans:
         for player in plan.players:
-            plan.policy(player, plan.task)  # whoever cannot be had is refused before anybody plays
+            plan.policy(player, plan.task)  # players that cannot be loaded are rejected before any plays
     missing, rounds = [job for plan in plans for job in jobs(plan)], rounds_missing(plans)
     steps = sum(len(settings) * len(plan.players) for plan, settings in missing) + len(rounds) * len(plans)
     with _bar(steps) as advance:
@@ -182,7 +182,7 @@ def _measured(plans: Sequence[Plan], workers: int) -> report.Results:
 
 @contextmanager
 def _crew(processes: int, work: Sequence[Any]) -> Iterator[Callable[[Any, Iterable[Any]], Iterable[Any]]]:
-    """Offer a map over some work: by so many processes, which end with this one; by none, in this one.
+    """Yield a map over some work: by a number of processes, which end with this one; by none, in this one.
 
     A single process does one piece of work and makes room for a fresh one.
     """

@@ -33,9 +33,9 @@ __all__ = [
 ]  # fmt: skip
 
 DECISIONS = 30
-"""So many are replayed by the clock, from the start of the episodes."""
+"""Decisions that are replayed for timing, from the start of the episodes."""
 REFERENCE = 64
-"""RK4 with so many steps per decision says where everybody should be."""
+"""RK4 with this number of steps per decision is the reference for positions."""
 KEPT = Path("runs/transfer")
 
 Actions = list[NDArray[Any]]
@@ -44,7 +44,7 @@ Kept = TypeVar("Kept", Cell, Clock)
 
 @dataclass(frozen=True)
 class Plan:
-    """What is asked of one task: which players meet which worlds under which settings, the trained one first."""
+    """The plan of one task: players, worlds and settings, the trained one first."""
 
     task: Task
     settings: tuple[Setting, ...]
@@ -66,7 +66,7 @@ class Plan:
 
     @property
     def pilot(self) -> Player:
-        """Whose actions the clock replays, and whom the sentence is about: the player that claims most."""
+        """The player whose actions are replayed for timing, and that the sentence is about."""
         return self.players[-1]
 
     def policy(self, player: Player, task: Task) -> Policy:
