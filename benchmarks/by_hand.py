@@ -2,7 +2,7 @@
 
 2-D, torus, semi-implicit Euler, brute force; the arguments, the checks and the limits are those of a scene. They have
 the form that is fast (agents side by side in the lanes of a vector register, sums in a small scratch array, unsigned
-indices, no aliasing; -0 added for who is not seen, which is an addition under a mask; neighbours counted by such
+indices, no aliasing; -0 added for an unseen neighbour, which is an addition under a mask; neighbours counted by such
 additions too, with AVX2 in whole numbers; those in one place by a branch), and each knows nothing but its own mix.
 """
 
@@ -31,7 +31,7 @@ __all__ = ["MIXES", "by_hand"]
 FAST: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy", "nogil": True, "_nrt": False}
 PARTS: dict[str, Any] = {"forceinline": True, "pipeline_class": Inlined, **FAST}  # loops made vectors where they run
 WIDTH = REGISTER // 4  # lanes, of doubles two registers: with AVX-512 one takes 1.4 times as long, with AVX2 as long
-ROWS = 9  # of scratch: x, y, vx, vy, the wish, who lives, and where to from somebody in the same place
+ROWS = 9  # of scratch: x, y, vx, vy, the steering force, alive flags, and directions of parting
 
 
 @njit(**PARTS)
@@ -100,7 +100,7 @@ def _rows(width):
 
 
 def _together(width):
-    """Whoever is in one place with somebody: seldom anybody but each himself, so that he is met by a branch."""
+    """Neighbours in the same place: nearly always the agent itself, so a branch handles them."""
     at = _rows(width)
 
     @njit(**PARTS)
@@ -220,7 +220,7 @@ def _two(width):
 
 
 def _seeing(width):
-    """Separation, alignment and cohesion, of whom is within a field of view."""
+    """Separation, alignment and cohesion of neighbours in a field of view."""
     at, together = _rows(width), _together(width)
 
     @njit(**PARTS)
@@ -309,7 +309,7 @@ def _kernel(mix: str, width: int) -> Any:
 
 
 def by_hand(mix: str, scene: Scene, state: State, steps: int) -> Callable[[], object]:
-    """Return a call that advances the arrays of `state` by so many steps; the scene must be of that mix.
+    """Return a call that advances the arrays of `state` by a number of steps; the scene must be of that mix.
 
     Its parameters: size, the squares of the radii, the weights, and cos(fov / 2) |cos(fov / 2)|.
     """

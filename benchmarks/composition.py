@@ -30,7 +30,7 @@ __all__ = ["mix_scene"]
 WORLDS, STEPS, CROWD = 1024, 10, 10_000
 NAMES = ("separation", "alignment", "cohesion")
 FOV = 270.0  # degrees
-CLOSE = {"float64": 1e-9, "float32": 1e-2}  # m, everybody, after STEPS steps; in float32 a neighbour may be lost
+CLOSE = {"float64": 1e-9, "float32": 1e-2}  # m, all agents, after STEPS steps; in float32 a neighbour may be lost
 SAMPLE, QUICK_SAMPLE = 0.1, 0.05  # s, of a process beside this one
 
 

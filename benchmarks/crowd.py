@@ -52,7 +52,7 @@ def _models(bench: Bench, dtype: str, most: Machine | None) -> None:
     for name in PRESETS:
         try:
             scene = crowd(name, dtype=dtype)
-        except ValueError as error:  # who looks too far for so small a torus
+        except ValueError as error:  # a reach too large for the torus
             bench.note(f"{name} is not raced: {error}")
             continue
         start = scene.run(scene.start(0), 100)

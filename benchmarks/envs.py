@@ -39,7 +39,7 @@ Step = Callable[[], object]
 
 
 def _draws(*shape: int) -> Iterator[Any]:
-    """Yield random actions in [-1, 1], so many sets in turn, float32 as agents act."""
+    """Yield random actions in [-1, 1], a number of sets in turn, float32."""
     return cycle(np.random.default_rng(0).uniform(-1, 1, (DRAWS, *shape)).astype(np.float32))
 
 
@@ -100,7 +100,7 @@ def _parallel(env: Any) -> Step:
 
 
 def _by_turns(env: Any) -> Step:
-    """Step everybody once, one after another, as PettingZoo's own example does."""
+    """Step all agents once, one after another, as PettingZoo's own example does."""
     actions = _named_draws(env)
     env.reset(seed=0)
 
@@ -239,7 +239,7 @@ def _floor(task: Task, worlds: int, most: Machine | None, threads: int = 1) -> F
 
 
 def _on(threads: int, step: Step) -> Step:
-    """Return a step on so many threads."""
+    """Return a step on a number of threads."""
 
     def call() -> None:
         use_threads(threads)

@@ -1,10 +1,10 @@
 """Floors: what no program on this machine beats, from operations and bytes that are counted.
 
-Counted is what a task cannot be done without, however it is written: every pair that is met is measured once, every
+Counted is what a task cannot be done without, however it is written: every pair is measured once, every
 number that is shown is made and written once, every weight of a network is multiplied once. Operations are done at the
 pace of independent ones (pace.c, compiled here by gcc), bytes go at the bandwidth to memory, both measured just before;
-the slower of the two is the floor. What is done with so little that nobody counts it (choosing the nearest, random
-numbers, sorting, calls) is not in it: a program at its floor does not exist.
+the slower of the two is the floor. Small work (choosing the nearest, random numbers,
+sorting, calls) is not counted: no program reaches its floor.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Work:
 
 @dataclass(frozen=True)
 class Machine:
-    """What this machine does at most, on so many cores at once."""
+    """The limits of this machine, on a number of cores at once."""
 
     pace: dict[tuple[str, int], float]  # operations/s by dtype and threads
     bandwidth: dict[int, float]  # bytes/s to and from memory, by threads
@@ -74,7 +74,7 @@ class Machine:
         )
 
     def floor(self, work: Work, threads: int = 1) -> Floor:
-        """Return the floor of something on so many threads."""
+        """Return the floor of some work on a number of threads."""
         pace, bandwidth = self.pace[work.dtype, threads], self.bandwidth[threads]
         why = (
             f"{work.why}: {number(work.operations)} operations at {pace / 1e9:.0f} G/s, "
@@ -160,7 +160,7 @@ def of_scene(scene: Scene, start: State, steps: int = 1) -> Work:
 
 
 def of_decisions(task: Task, worlds: int = 1) -> Work:
-    """Count a decision of a learner: everybody and every obstacle is looked at once, moved, and shown."""
+    """Count a decision of a learner: each agent and obstacle is read once, moved, and observed."""
     scene = task.scene
     d, on_torus, each = scene.dimension, isinstance(scene.space, Torus), task.agents / task.learners
     others, obstacles = _pair(d, on_torus), _pair(d, on_torus) + 1  # from its surface
@@ -191,7 +191,7 @@ def of_learning(policy: Any, epochs: int, decision: Work) -> Work:
 
 
 def _pair(d: int, images: bool) -> float:
-    """Measure somebody: the offset, its square, is that somebody else? And the nearest image on a torus."""
+    """Operations for one neighbour: offset, square, test for itself; nearest image on a torus."""
     return 2 * d + 1 + 3 * d * images
 
 

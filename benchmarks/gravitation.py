@@ -1,4 +1,4 @@
-"""Everybody meets everybody, or groups that are far away: `python -m benchmarks.gravitation`.
+"""All pairs, or groups that are far away: `python -m benchmarks.gravitation`.
 
 The exact sum over all pairs against the tree, at an opening of 0.5, over the number of agents, in flat space and in
 three dimensions. Both run in turns. From the crossover follows flockenv.geometry.barnes_hut.MOST_DIRECT, up to which a

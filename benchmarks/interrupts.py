@@ -76,7 +76,7 @@ class Outcome:
 def interrupted(
     command: str, at: float, number: signal.Signals, group: bool, twice: bool, cache: Path, folder: Path
 ) -> Outcome | None:
-    """Run a command in a folder, send it a signal after so many seconds and look at what is left.
+    """Run a command in a folder, send it a signal after a number of seconds, and look at what is left.
 
     None if it had ended before, or was just ending. The folder is empty; group: the signal goes to all its processes.
     """
@@ -118,7 +118,7 @@ def interrupted(
 
 
 def _hear() -> None:
-    for number in (signal.SIGINT, signal.SIGTERM):  # whoever runs this in the background ignores them, for all below
+    for number in (signal.SIGINT, signal.SIGTERM):  # a shell in the background ignores them, for all below
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
 
 

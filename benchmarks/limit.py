@@ -28,7 +28,7 @@ __all__ = ["ROWS", "Reference", "Row", "disagreement"]
 
 FEW = 5  # steps after which both sides are compared
 CLOSE = {"float64": 1e-9, "float32": 1e-4}  # m, nearly all agents; a single neighbour more or less moves one by 1e-3
-FAR = {"float64": 1e-9, "float32": 2e-2}  # m, everybody
+FAR = {"float64": 1e-9, "float32": 2e-2}  # m, all agents
 NEARLY_ALL = 0.99
 
 
@@ -66,7 +66,7 @@ class Reference:
         self.form: str = limit.form().decode()  # which intrinsics it is written in here
 
     def stepper(self, scene: Scene, state: State, steps: int) -> Callable[[], object]:
-        """Return a call that advances the arrays of `state` by so many steps, in place."""
+        """Return a call that advances the arrays of `state` by a number of steps, in place."""
         kind = "worlds" if state.shape[0] > 1 else "crowd"
         step = getattr(self.limit, f"{kind}_{'f32' if scene.dtype == 'float32' else 'f64'}_{scene.dimension}d")
         numbers = np.array(_numbers(scene), scene.dtype)

@@ -105,7 +105,7 @@ class Sample:
 
     items: float  # work done
     seconds: float  # s, wall clock
-    cpu_seconds: float | None = None  # s, of all threads of this process; none = not known
+    cpu_seconds: float | None = None  # s, of all threads of this process; None: not known
 
     @property
     def rate(self) -> float:
@@ -135,7 +135,7 @@ class Contestant:
         return max(1, round(calls * seconds / max(took, 1e-9)))
 
     def sample(self, calls: int) -> Sample:
-        """Run it so many times."""
+        """Run it a number of times."""
         cpu, began = process_time(), perf_counter()
         for _ in repeat(None, calls):
             self.call()
@@ -170,7 +170,7 @@ class Result:
 
 
 def _quiet(what: str, done: int, most: int) -> None:
-    """Tell nobody."""
+    """Report nothing."""
 
 
 def race(
@@ -182,8 +182,8 @@ def race(
 ) -> tuple[list[Result], bool]:
     """Measure contestants in turns; return their results, and whether Ctrl-C cut it short (what was done is kept).
 
-    Every round runs each contestant once; the next round begins with the next one, so that nobody is always first.
-    Raises ValueError if two have one name or nobody is called `baseline`.
+    Every round runs each contestant once; the next round begins with the next one, so that none is always first.
+    Raises ValueError if two have one name, or none is called `baseline`.
     """
     plan = plan or Plan()
     names = [c.name for c in contestants]
@@ -206,7 +206,7 @@ def race(
 
 
 def _turns(count: int, rounds: int) -> Iterator[int]:
-    """Yield who runs next: everybody once a round, the first of a round moving on by one."""
+    """Yield the next contestant: each once a round; the first of a round moves on by one."""
     for r in range(rounds):
         yield from ((r + k) % count for k in range(count))
 
@@ -423,7 +423,7 @@ def _bar(title: str) -> Iterator[Advance]:
 
 
 def machine() -> Numbers:
-    """Return what somebody needs who wonders about the numbers: processor, cores, load, versions, commit, date."""
+    """Return what is needed to judge the numbers: processor, cores, load, versions, commit, date."""
     return {
         "cpu": _cpu("model name") or platform.processor() or None,
         "simd": [flag for flag in ("sse4_2", "avx2", "fma", "avx512f") if flag in (_cpu("flags") or "").split()],

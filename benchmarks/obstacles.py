@@ -28,7 +28,7 @@ FEWEST = 10  # obstacles that the plane has room for: with fewer, the same agent
 
 
 def among(count: int, kind: str = "block", dtype: str = "float64") -> Scene:
-    """Return agents among so many obstacles, in the plane, that lie near the points of a square lattice."""
+    """Return agents among a number of obstacles, in the plane, that lie near the points of a square lattice."""
     side, rows = APART * math.sqrt(max(count, FEWEST)), math.ceil(math.sqrt(count))
     rng = np.random.default_rng(1)
     obstacles: list[Shape] = []

@@ -6,7 +6,8 @@ Every package lives in a virtual environment of its own below ~/.cache/flockenv-
 (`--install vmas,mesa`, or `--install all`: about 5 GB), and is run by a script of benchmarks/peers_scripts in a process
 of its own; so is flockenv. The two processes of a pair live side by side and work in turns, never at the same time.
 
-Nobody else computes just what flockenv computes. What each side does is said beside its rate; read it before the ratio.
+No other package computes exactly what flockenv computes. What each side does is said beside its rate; read it before
+the ratio.
 """
 
 from __future__ import annotations
@@ -87,7 +88,7 @@ PAIRS = (
         )
     ),
 )
-"""The last are what somebody meets who changes to flockenv for its speed: ours in many worlds, theirs as they come."""
+"""The last compare flockenv in many worlds with others as they come."""
 
 
 class PeerError(Exception):
@@ -99,7 +100,7 @@ class PeerError(Exception):
 
 @dataclass(frozen=True)
 class Turns(Contestant):
-    """A script that takes a sample whenever it is told to."""
+    """A script that takes a sample at each request."""
 
     script: subprocess.Popen[str] | None = None
     seconds: float = SAMPLE
@@ -220,8 +221,8 @@ def _run(peer: str, command: Sequence[str]) -> None:
 
 
 def main(
-    peers: Annotated[str, typer.Option(help=f"Whom to run, by comma: {', '.join(PEERS)}. [those installed]")] = "",
-    to_install: Annotated[str, typer.Option("--install", help="Whom to install first, by comma, or `all`.")] = "",
+    peers: Annotated[str, typer.Option(help=f"Packages to run: {', '.join(PEERS)}. [those installed]")] = "",
+    to_install: Annotated[str, typer.Option("--install", help="Packages to install first, or `all`.")] = "",
     cache: Annotated[Path, typer.Option(help="Where the virtual environments live.")] = CACHE,
     threads: Annotated[int, typer.Option(min=1, help="Cores for each side.")] = 1,
     quick: Quick = False,
@@ -278,7 +279,7 @@ def _race(bench: Bench, pair: Pair, cache: Path, threads: int, most: Machine | N
 
 
 def _remarks(bench: Bench, threads: int) -> None:
-    """Add what a reader should know: how the sides were kept apart, who was disturbed, and all ratios in one line."""
+    """Add what a reader should know: how the sides were kept apart, disturbances, and all ratios in one line."""
     if not bench.results:
         return
     cores = "1 core" if threads == 1 else f"{threads} cores"

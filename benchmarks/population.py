@@ -27,7 +27,7 @@ LIFETIME = 4.0  # s, on average
 
 
 def fountain(alive: int, dtype: str, dimension: int, mortal: bool) -> Scene:
-    """So many particles alive on average: born at a nozzle, and gone after 3 to 5 s; or the same that live for ever."""
+    """A number of particles, alive on average: born at a nozzle, gone after 3 to 5 s; or the same that never die."""
     up = (0.0,) * (dimension - 1)
     nozzle = Disc(centre=(0.0,) * dimension, radius=0.5)
     emitter = Emitter(place=nozzle, rate=alive / LIFETIME, speed=(15.0, 20.0), direction=(*up, 1.0), spread=15.0,

@@ -37,7 +37,7 @@ def _steps(agents: int) -> int:
 
 
 def _on(threads: int, scene: Scene, worlds: int, name: str, most: Machine | None) -> Contestant:
-    """Return a scene stepped by so many threads."""
+    """Return a scene stepped by a number of threads."""
     agents = worlds * scene.agents
     steps, start = _steps(agents), scene.start(0, worlds=worlds)
     step = stepping(scene, start, steps)
@@ -143,7 +143,7 @@ def main(
             _memory(bench, dtype)
         bench.note(
             f"Every call begins in the same state and does 10 steps, up to 100 where those are below {ENOUGH:,} "
-            "agent-steps. Two threads need two cores that nobody else uses: see the column `cores`."
+            "agent-steps. Two threads need two cores without other work: see the column `cores`."
         )
 
 

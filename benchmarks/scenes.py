@@ -1,4 +1,4 @@
-"""Boids on a torus, as several benchmarks step them: so many agents, so many neighbours, the three rules of a flock."""
+"""Boids on a torus, as several benchmarks step them: a number of agents and neighbours, the three rules of a flock."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["boids", "crowd", "edge_for", "restarting", "rules", "stepping", "wor
 
 REACH = 2.0  # m, how far agents of a crowd look
 NEIGHBOURS = 15.0  # within that, on average
-WORLD_RADII = {2: (2.0, 4.0, 5.0), 3: (2.0, 4.0, 4.5)}  # m, of a small world by dimension: almost everybody is near
+WORLD_RADII = {2: (2.0, 4.0, 5.0), 3: (2.0, 4.0, 4.5)}  # m, of a small world by dimension: almost all agents are near
 EDGES = {2: 12.0, 3: 10.0}  # m, of a small world
 
 
@@ -39,7 +39,7 @@ def boids(agents: int, edge: float, effects: tuple[Effect, ...], dtype: str, dim
 
 
 def world(dtype: str, dimension: int = 2, agents: int = 32) -> Scene:
-    """A small world, where everybody meets everybody."""
+    """A small world, where each agent interacts with all others."""
     return boids(agents, EDGES[dimension], rules(WORLD_RADII[dimension]), dtype, dimension)
 
 
@@ -66,6 +66,6 @@ def restarting(start: State, state: State, step: Callable[[], object]) -> Callab
 
 
 def stepping(scene: Scene, start: State, steps: int) -> Callable[[], object]:
-    """Return a call that does so many steps of a scene, from the same state each time."""
+    """Return a call that makes a number of steps of a scene, from the same state each time."""
     state = start.copy()
     return restarting(start, state, lambda: scene.step(state, out=state, steps=steps))

@@ -51,7 +51,7 @@ class Process(Contestant):
         return 1
 
     def sample(self, calls: int) -> Sample:
-        """Start it so many times; the time that it takes to end is not counted."""
+        """Start it a number of times; the time that it takes to end is not counted."""
         took = 0.0
         for _ in range(calls):
             began = time()

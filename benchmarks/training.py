@@ -34,7 +34,7 @@ SECONDS, QUICK_SECONDS = 4.0, 1.0  # s, a turn lasts at least
 ROUNDS, QUICK_ROUNDS = 3, 1
 SPINS = ("300000", "10000", "0")  # rounds: libgomp's own, what agents asks for, none
 MOST_THREADS = 2  # that floors are measured for
-SB3_ROWS = 8  # environments that somebody with the defaults may have
+SB3_ROWS = 8  # environments, a usual number
 
 
 def settings(p: PpoSettings, learners: int) -> Iterator[tuple[str, PpoSettings]]:

@@ -1,7 +1,7 @@
-"""What ways cost, and a picture of who chooses which door: `python -m benchmarks.ways --picture docs/ways.png`.
+"""The cost of floor fields, and a picture of the choice of doors: `python -m benchmarks.ways --picture docs/ways.png`.
 
 Measured: building a scene of 1,000 people in a building of 60 x 60 m with 120 walls on grids of 0.2 and 0.1 m; and
-what a step of these people costs who walk to the nearest of two doors, and who choose the quickest.
+the cost of a step if they walk to the nearest of two doors, and if they choose the quickest.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def room() -> Scene:
 
 
 def picture(path: Path, seconds: float = 3.0) -> None:
-    """Draw the room, everybody in the colour of the door that he heads for."""
+    """Draw the room, each agent in the colour of the door that it walks to."""
     scene = room()
     state = scene.run(scene.start(1), round(seconds / scene.dt))
     door = np.array(scene.inner(state, "door")[0]).astype(np.int32)

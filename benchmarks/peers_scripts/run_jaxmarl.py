@@ -47,7 +47,7 @@ def spread(threads: int, agents: int) -> Case:
     """Agents share as many landmarks."""
     does = (
         f"MPE_simple_spread_v3, {WORLDS} worlds x {agents} agents, float32: drag and contact forces of all pairs; "
-        "observations of everybody, rewards"
+        "observations of all agents, rewards"
     )
     return environment("MPE_simple_spread_v3", agents, does, 100 // agents, num_agents=agents, num_landmarks=agents)
 
@@ -56,7 +56,7 @@ def tag(threads: int) -> Case:
     """Three chase one."""
     does = (
         f"MPE_simple_tag_v3, {WORLDS} worlds x 4 agents, 2 obstacles, float32: drag and contact forces; "
-        "observations of everybody, rewards"
+        "observations of all agents, rewards"
     )
     return environment("MPE_simple_tag_v3", 4, does)
 

@@ -27,7 +27,7 @@ def spread(threads: int) -> Case:
     from mpe2 import simple_spread_v3
 
     env = simple_spread_v3.parallel_env(max_cycles=CYCLES, continuous_actions=True)
-    does = "simple_spread_v3, one world x 3 agents: drag and contact forces; observations of everybody, rewards"
+    does = "simple_spread_v3, one world x 3 agents: drag and contact forces; observations of all agents, rewards"
     return parallel(env, 3, does)
 
 

@@ -162,7 +162,7 @@ def boids(agents: int, edge: float, reach: float, apart: float, about: str) -> C
     state = scene.start(seed=0)
     does = (
         f"boids, one world x {agents} on a torus {edge:.3g} m wide, {scene.dtype}: separation (radius {apart:g}), "
-        f"alignment and cohesion (radius {reach:.3g}), everybody at once; no observations, no rewards{about}"
+        f"alignment and cohesion (radius {reach:.3g}), all at once; no observations, no rewards{about}"
     )
     return Case(lambda: scene.step(state, out=state), agents, does, of_scene(scene, state))
 

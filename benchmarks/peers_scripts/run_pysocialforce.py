@@ -6,7 +6,7 @@ from turns import Case, run
 
 
 def crowd(people: int) -> Case:
-    """A crowd, one person per square metre, everybody on the way to the right; no groups, no obstacles."""
+    """A crowd, one person per square metre, all walking to the right; no groups, no obstacles."""
     import numpy as np
     import pysocialforce
 

@@ -8,7 +8,7 @@ PURSUERS, EVADERS = 8, 30
 
 
 def pursuit(threads: int) -> Case:
-    """Eight pursuers look for thirty evaders, who walk at random; resets are timed too."""
+    """Eight pursuers look for thirty evaders that walk at random; resets are timed as well."""
     from pettingzoo.sisl import pursuit_v5
 
     env = pursuit_v5.parallel_env(n_pursuers=PURSUERS, n_evaders=EVADERS, max_cycles=300)

@@ -38,7 +38,7 @@ def tag(threads: int) -> Case:
     torch.set_num_threads(threads)
     does = (
         f"simple_tag, {WORLDS} worlds x 4 agents, 2 obstacles, float32: drag and contact forces in 10 substeps; "
-        "observations of everybody, rewards"
+        "observations of all agents, rewards"
     )
     return scenario("simple_tag", 4, does)
 

@@ -17,7 +17,7 @@ from time import perf_counter, process_time
 from typing import Any, NamedTuple
 
 DRAWS = 16
-"""Random actions are drawn before, so many sets, and used in turn: drawing them is nobody's simulation."""
+"""Random actions are drawn before, a number of sets, and used in turn: drawing them is no part of a simulation."""
 
 
 class Case(NamedTuple):
@@ -59,7 +59,7 @@ def run(cases: Mapping[str, Callable[[int], Case]], *packages: str) -> None:
 
 
 def limit(threads: int) -> None:
-    """Keep this process to so many cores and every thread pool to so many threads; before anything is imported."""
+    """Limit the cores of this process and the threads of every thread pool; before anything is imported."""
     if hasattr(os, "sched_setaffinity"):  # the only limit that JAX keeps to
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[-threads:])
     for name in ("OMP", "MKL", "OPENBLAS", "NUMBA"):
