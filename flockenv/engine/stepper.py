@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import threading
+import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -35,7 +36,14 @@ class Stepper:
 
     def __init__(self, scene: SceneView) -> None:
         """Compile nothing yet: kernels are compiled by their first call."""
-        self.scene = scene
+        self._scene = weakref.ref(scene)  # the scene holds this object: its scratch is freed with its last reference
+
+    @property
+    def scene(self) -> SceneView:
+        """The scene, which must be alive."""
+        scene = self._scene()
+        assert scene is not None
+        return scene
 
     @functools.cached_property
     def params(self) -> Floats:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import weakref
 from collections.abc import Sequence
 
 import numpy as np
@@ -24,7 +25,14 @@ class View:
 
     def __init__(self, scene: SceneView) -> None:
         """Compute nothing yet."""
-        self.scene = scene
+        self._scene = weakref.ref(scene)  # the scene holds this object: its scratch is freed with its last reference
+
+    @property
+    def scene(self) -> SceneView:
+        """The scene, which must be alive."""
+        scene = self._scene()
+        assert scene is not None
+        return scene
 
     def snapshot(self, state: State, world: int = 0, title: str = "") -> Snapshot:
         """Return one world at one instant, for pictures."""
