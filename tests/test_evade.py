@@ -1,4 +1,4 @@
-"""Evade keeps its promises: who sees whom, where pursuers go who see nobody, what is solid, what ends and what pays."""
+"""The task Evade: sight past cover, pursuit and search, contact with cover, rewards and the end of an episode."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FAR = (27.0, 27.0)
 
 
 def scene(evader: Any, *pursuers: Any, cover: Any = (), **fields: Any) -> World:
-    """One world, everybody at rest where they are told; cover is (x, y, radius)."""
+    """Return a world with all agents at rest at the given positions; cover is (x, y, radius)."""
     world = World(Evade(pursuers=len(pursuers), **fields))
     world.reset(3)
     world.state.pos[0], world.state.vel[0] = [evader, *pursuers], 0.0
@@ -29,7 +29,7 @@ def act(world: World, action: Any = (0.0, 0.0)) -> Step:
 
 
 def seen(world: World) -> Any:
-    """What the evader sees now, by name."""
+    """Return the current observation of the evader by slot name."""
     rows = world.reset(mask=np.zeros(1, bool))
     return world.task.layout.unpack(rows[0, 0])
 
@@ -43,29 +43,29 @@ def paid(world: World, step: Step) -> dict[str, float]:
     [
         ((), True),
         (((10.0, 14.0, 1.0),), False),
-        (((10.0, 15.01, 1.0),), True),  # the line of sight grazes by
+        (((10.0, 15.01, 1.0),), True),  # the line of sight just misses it
         (((10.0, 14.99, 1.0),), False),
         (((4.5, 14.0, 1.0),), True),  # behind the evader
         (((15.5, 14.0, 1.0),), True),  # behind the pursuer
         (((5.5, 14.0, 1.0), (20.0, 5.0, 1.5)), True),
     ],
 )
-def test_cover_in_the_straight_way_takes_sight_and_nothing_else_does(cover: Any, visible: bool) -> None:
+def test_only_cover_on_the_straight_line_blocks_sight(cover: Any, visible: bool) -> None:
     world = scene((6.6, 14.0), (13.4, 14.0), FAR, FAR, cover=cover)
     assert bool(seen(world).seen[0]) == visible
 
 
-def test_nobody_sees_farther_than_their_sight() -> None:
+def test_a_pursuer_sees_the_evader_only_within_its_sight() -> None:
     assert seen(scene((2.0, 14.0), (11.99, 14.0), FAR, FAR)).seen[0] == 1
     assert seen(scene((2.0, 14.0), (12.01, 14.0), FAR, FAR)).seen[0] == 0
 
 
-def test_a_pursuer_that_sees_nobody_goes_where_it_saw_the_evader_last_and_not_where_it_is() -> None:
+def test_a_pursuer_without_sight_of_the_evader_goes_to_the_last_seen_position() -> None:
     world = scene((10.0, 4.0), (10.0, 12.0), FAR, FAR)
     act(world)
     last = world.state.pos[0, 0].copy()
     world.state.obstacles.centre[0, 0], world.state.obstacle_radius[0, 0] = (15.0, 8.0), 1.8
-    world.state.pos[0, 0] = (20.0, 4.0)  # far to the side, behind cover that has grown there
+    world.state.pos[0, 0] = (20.0, 4.0)  # far to the side, behind the new cover
     world.state.pos[0, 2:] = FAR
     for _ in range(12):
         world.state.pos[0, 0], world.state.vel[0, 0] = (20.0, 4.0), 0.0
@@ -76,8 +76,8 @@ def test_a_pursuer_that_sees_nobody_goes_where_it_saw_the_evader_last_and_not_wh
     assert heading @ (way / np.linalg.norm(way)) > 0.99
 
 
-def test_a_pursuer_that_has_lost_the_evader_looks_behind_cover() -> None:
-    """It has never seen anybody, and there is one obstacle: 8 s later it has been on the far side of that."""
+def test_a_searching_pursuer_looks_behind_cover() -> None:
+    """It has never seen the evader; within 8 s it reaches the far side of the only obstacle."""
     world = scene((1.0, 27.0), (14.0, 8.0), FAR, FAR, cover=((14.0, 14.0, 1.5),), sight=3.0)
     world.state.pos[0, 2:] = (27.0, 1.0)
     highest = 0.0
@@ -87,8 +87,8 @@ def test_a_pursuer_that_has_lost_the_evader_looks_behind_cover() -> None:
     assert highest > 15.5
 
 
-def test_pursuers_head_for_where_the_evader_will_be() -> None:
-    """Exact interception, at most 1 s ahead: seen from the side, the quarry running along x at 2 m/s is led by 2 m."""
+def test_pursuers_head_for_the_predicted_position_of_the_evader() -> None:
+    """Interception looks at most 1 s ahead: an evader that runs along x at 2 m/s is led by 2 m."""
     world = scene((8.0, 4.0), (8.0, 12.0), FAR, FAR)
     world.state.vel[0, 0] = (2.0, 0.0)
     act(world)
@@ -96,7 +96,7 @@ def test_pursuers_head_for_where_the_evader_will_be() -> None:
     assert way[0] / -way[1] == pytest.approx(2.0 / 8.0, rel=1e-6)
 
 
-def test_to_be_caught_costs_once_and_ends_it_and_being_free_pays_by_the_second() -> None:
+def test_a_capture_costs_once_and_ends_the_episode_and_free_time_is_rewarded() -> None:
     world = scene((10.0, 10.0), (11.5, 10.0), FAR, FAR)
     step = act(world, (0.6, 0.8))
     terms = paid(world, step)
@@ -113,7 +113,7 @@ def test_to_be_caught_costs_once_and_ends_it_and_being_free_pays_by_the_second()
     assert measured["survival_time"] == pytest.approx(0.2)
 
 
-def test_time_hidden_is_the_time_in_which_nobody_sees_it() -> None:
+def test_time_hidden_is_the_time_in_which_no_pursuer_sees_the_evader() -> None:
     cover = ((10.0, 14.0, 1.5),)
     world = scene((6.0, 14.0), (14.0, 14.0), FAR, FAR, cover=cover)
     for k in range(5):
@@ -126,7 +126,7 @@ def test_time_hidden_is_the_time_in_which_nobody_sees_it() -> None:
     assert world.measure()["time_hidden"] == pytest.approx(0.5)
 
 
-def test_cover_is_solid_for_whoever_runs_into_it() -> None:
+def test_cover_stops_an_evader_that_runs_into_it() -> None:
     world = scene((5.0, 14.0), FAR, FAR, FAR, cover=((10.0, 14.0, 1.5),))
     deepest = 0.0
     for _ in range(60):
@@ -137,7 +137,7 @@ def test_cover_is_solid_for_whoever_runs_into_it() -> None:
     assert world.state.pos[0, 0, 0] == pytest.approx(8.2 + 8.0 / 400.0, abs=0.02)  # pressed by 8 N
 
 
-def test_pursuers_stay_out_of_cover_and_within_their_speed() -> None:
+def test_pursuers_stay_out_of_cover_and_below_their_maximum_speed() -> None:
     world = World(Evade(), 32)
     world.reset(5)
     rng, s, deepest, fastest = np.random.default_rng(1), world.state, [], 0.0
@@ -152,7 +152,7 @@ def test_pursuers_stay_out_of_cover_and_within_their_speed() -> None:
     assert 2.1 < fastest <= 2.2 * (1 + 1e-9)
 
 
-def test_everybody_begins_clear_of_cover_and_of_each_other() -> None:
+def test_agents_start_clear_of_cover_and_of_each_other() -> None:
     world = World(Evade(), 100)
     world.reset(3)
     s = world.state
@@ -164,7 +164,7 @@ def test_everybody_begins_clear_of_cover_and_of_each_other() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fields", "said"),
+    ("fields", "message"),
     [
         ({"least_radius": 3.0}, "least_radius = 3"),
         ({"greatest_radius": 13.0}, "field of 28 m"),
@@ -172,8 +172,8 @@ def test_everybody_begins_clear_of_cover_and_of_each_other() -> None:
         ({"pursuers": 0}, "pursuers = 0"),
     ],
 )
-def test_what_it_cannot_be_is_refused_in_one_line(fields: dict[str, Any], said: str) -> None:
+def test_invalid_fields_are_refused_in_one_line(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=r".") as caught:
         Evade(**fields)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -1,4 +1,4 @@
-"""Far from the origin: the same motion in double precision, one clear line in single (N17)."""
+"""Scenes far from the origin: the same motion in double precision, an error of one line in single (N17)."""
 
 from __future__ import annotations
 
@@ -32,25 +32,25 @@ FAR_AWAY = [
 ]
 
 
-@pytest.mark.parametrize(("fields", "said"), FAR_AWAY, ids=lambda value: str(value)[:40])
-def test_single_precision_is_refused_in_one_line_far_from_the_origin(fields: Any, said: str) -> None:
+@pytest.mark.parametrize(("fields", "message"), FAR_AWAY, ids=lambda value: str(value)[:40])
+def test_single_precision_is_refused_in_one_line_far_from_the_origin(fields: Any, message: str) -> None:
     given = {"groups": HERE, **fields}
     with pytest.raises(ValueError, match="use dtype = float64") as caught:
         Scene(dtype="float32", **given)
     line = str(caught.value)
-    assert said in line
+    assert message in line
     assert f"{FARTHEST:,.0f} m" in line
     assert "\n" not in line
     Scene(dtype="float64", **given)
 
 
-def test_up_to_the_limit_single_precision_is_taken() -> None:
+def test_single_precision_is_accepted_up_to_the_limit() -> None:
     scene = Scene(groups=HERE, space=Box(size=(FARTHEST, 5)), dtype="float32")
     assert scene.dtype == "float32"
 
 
-def test_at_the_limit_somebody_still_gets_where_he_walks() -> None:
-    """1 m/s for 1 s in steps of 20 ms; at 30 km he would be 2 % off, at 300 km stand still."""
+def test_an_agent_at_the_limit_still_walks_the_right_distance() -> None:
+    """It walks at 1 m/s for 1 s in steps of 20 ms; at 30 km it would be 2 % off, at 300 km it would not move."""
     scene = Scene(groups=(Group(count=1, spawn=HERE[0].spawn),), dtype="float32")
     end = scene.run(scene.start(0).with_motion([[(FARTHEST - 2, 0)]], [[(1.0, 0)]]), 50)
     assert end.pos[0, 0, 0] - (FARTHEST - 2) == pytest.approx(1, rel=0.03)
@@ -74,8 +74,8 @@ def moved(state: State, offset: float) -> State:
 @pytest.mark.slow
 @pytest.mark.parametrize("offset", [1e4, 1e7])
 @pytest.mark.parametrize("scene", [flock, chain])
-def test_a_scene_far_from_the_origin_does_the_same_in_double_precision(scene: Any, offset: float) -> None:
-    """N17: within 1e-6 of its own size after 100 steps."""
+def test_a_scene_far_from_the_origin_moves_the_same_in_double_precision(scene: Any, offset: float) -> None:
+    """N17: after 100 steps the difference is at most 1e-6 of the size of the scene."""
     start = scene(0.0).start(3)
     if scene is chain:
         start.vel[0, 1:, 1] = np.sin(np.arange(1, start.shape[1]))

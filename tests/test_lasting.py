@@ -1,4 +1,4 @@
-"""Success in tasks that only the time limit ends: the aim must last, and the last instant decides nothing by itself."""
+"""Success in tasks that only the time limit ends: the aim must hold for a share of the settled decisions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Played = dict[str, Any]
 def play(
     task: Task, skilled: Callable[[int], bool] = lambda k: True, each: Callable[[World], Any] | None = None
 ) -> Played:
-    """Play one episode, skilled in some decisions and at random in the others; return what was told when."""
+    """Play one episode, skilled in some decisions and random in the others; return the measures of every decision."""
     players = {True: load_player(SKILLED[task.name], task), False: load_player("random", task)}
     world = World(task, WORLDS, task.horizon)
     seen = world.reset(5)
@@ -34,16 +34,16 @@ def play(
         rows = seen.reshape(-1, seen.shape[-1])
         action, _ = players[skilled(k)].predict(rows, None, np.full(len(rows), k == 0), True)
         step = world.step(action.reshape(WORLDS, task.learners, -1))
-        seen, told = step.observation.copy(), world.measure()
+        seen, found = step.observation.copy(), world.measure()
         success.append(step.success.copy())
-        now.append(told["success_at_end"])
-        held.append(told["held"])
+        now.append(found["success_at_end"])
+        held.append(found["held"])
         seen_of.append(each(world) if each is not None else None)
     return {"success": np.array(success), "now": np.array(now) == 1, "held": np.array(held), "each": seen_of}
 
 
 def polarised(world: World) -> np.ndarray:
-    """Return whether every flock is aligned and under way: the aim of Flock, but for touches."""
+    """Return by world whether the flock is aligned and moves: the aim of Flock without the condition on contacts."""
     v = world.state.vel  # (B, N, 2) m/s
     course = v / np.linalg.norm(v, axis=-1, keepdims=True)
     order = np.linalg.norm(course.mean(axis=1), axis=-1)
@@ -51,39 +51,39 @@ def polarised(world: World) -> np.ndarray:
     return np.asarray((order > 0.9) & (along > 0.8 * world.task.cruise))
 
 
-def test_the_tasks_without_an_end_of_their_own_are_these() -> None:
+def test_corridor_and_flock_are_the_tasks_that_only_the_time_limit_ends() -> None:
     assert set(LASTING) == {Corridor, Flock}
 
 
 @pytest.mark.parametrize("kind", LASTING)
 @pytest.mark.parametrize(("settling", "lasting"), [(5.0, 0.9), (0.0, 0.5), (2.0, 1.0), (0.25, 0.96)])
-def test_success_is_the_share_of_the_settled_decisions_in_which_the_aim_holds(
+def test_success_depends_on_the_share_of_settled_decisions_in_which_the_aim_holds(
     kind: type[LastingTask], settling: float, lasting: float
 ) -> None:
     task = kind(horizon=80, settling=settling, lasting=lasting)
-    told = play(task)
+    found = play(task)
     first = int(np.ceil(settling / task.control_dt - 1e-9))
-    share = np.cumsum(told["now"][first:], axis=0) / np.arange(1, 81 - first)[:, None]
-    np.testing.assert_allclose(told["held"][first:], share, atol=1e-12)
-    assert np.isnan(told["held"][:first]).all()
-    np.testing.assert_array_equal(told["success"][first:], share >= lasting - 1e-9)
-    assert not told["success"][:first].any()
+    share = np.cumsum(found["now"][first:], axis=0) / np.arange(1, 81 - first)[:, None]
+    np.testing.assert_allclose(found["held"][first:], share, atol=1e-12)
+    assert np.isnan(found["held"][:first]).all()
+    np.testing.assert_array_equal(found["success"][first:], share >= lasting - 1e-9)
+    assert not found["success"][:first].any()
 
 
-def test_the_aim_of_a_flock_is_alignment_under_way_without_a_touch() -> None:
-    told = play(Flock(agents=8, obstacle_count=0, horizon=60), each=polarised)
-    missing = np.array(told["each"]) & ~told["now"]
-    assert not (told["now"] & ~np.array(told["each"])).any()
-    assert missing.mean() < 0.02, "touches alone make the difference, and rules hardly touch"
-    assert told["now"].any() and not told["now"].all()
+def test_the_aim_of_a_flock_is_aligned_motion_without_contacts() -> None:
+    found = play(Flock(agents=8, obstacle_count=0, horizon=60), each=polarised)
+    missing = np.array(found["each"]) & ~found["now"]
+    assert not (found["now"] & ~np.array(found["each"])).any()
+    assert missing.mean() < 0.02, "only contacts make the difference, and the rules have few"
+    assert found["now"].any() and not found["now"].all()
 
 
 @pytest.mark.parametrize("kind", LASTING)
-def test_the_last_instant_decides_nothing_by_itself(kind: type[LastingTask]) -> None:
-    """Skilled until the last moment, and then lost; lost for most of the time, and then skilled."""
+def test_the_last_decision_alone_does_not_determine_success(kind: type[LastingTask]) -> None:
+    """A player is skilled until shortly before the end and then random; another is random and skilled at the end."""
     task = kind(horizon=150)
     lost = play(task, lambda k: k < 146)
-    assert not lost["now"][-1].any() or kind is Flock, "four random decisions break the desired speeds"
+    assert not lost["now"][-1].any() or kind is Flock, "four random decisions take agents off their desired speeds"
     assert lost["success"][-1].mean() > 0.7
     late = play(task, lambda k: k >= 120)
     assert late["now"][-1].mean() > 0.7
@@ -93,9 +93,9 @@ def test_the_last_instant_decides_nothing_by_itself(kind: type[LastingTask]) -> 
 @pytest.mark.parametrize("kind", LASTING)
 def test_an_episode_that_ends_before_agents_settle_is_no_success(kind: type[LastingTask]) -> None:
     task = kind(horizon=20, settling=2.0)
-    told = play(task)
-    assert not told["success"].any() and np.isnan(told["held"]).all()
-    assert told["now"][-1].any()
+    found = play(task)
+    assert not found["success"].any() and np.isnan(found["held"]).all()
+    assert found["now"][-1].any()
 
 
 @pytest.mark.parametrize("kind", LASTING)
@@ -108,7 +108,7 @@ def test_a_share_or_time_out_of_range_is_refused(kind: type[LastingTask], field:
 
 
 @pytest.mark.parametrize("kind", LASTING)
-def test_both_precisions_judge_the_same_decisions(kind: type[LastingTask]) -> None:
+def test_both_precisions_count_from_the_same_decision(kind: type[LastingTask]) -> None:
     counted = []
     for dtype in ("float64", "float32"):
         world = World(kind(dtype=dtype, settling=0.7, horizon=30), 1, 30)

@@ -1,4 +1,4 @@
-"""Who may import whom: data flows one way through the house, and heavy packages stay behind their doors."""
+"""The order of imports: a package imports only those below it, and heavy packages stay in a few places."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ ONLY_IN = {
     "matplotlib": ("flockenv/render", "flockenv/evaluation", "flockenv/studies", "agents", "tests"),
     "pygame": ("flockenv/render", "tests"),
 }
-"""Libraries that only these files and folders may import at all."""
+"""Libraries that only the given files and folders may import."""
 
 INSIDE_FUNCTIONS = {"matplotlib", "pygame"}
-"""Packages whose import costs so much that it waits until somebody calls."""
+"""Packages that only functions import, because loading them is slow."""
 
 
 class Import(NamedTuple):
@@ -42,7 +42,7 @@ class Import(NamedTuple):
 
 
 def imports(root: Path) -> Iterator[Import]:
-    """Every import statement of flockenv/, agents/ and tests/."""
+    """Yield every import of flockenv/, agents/ and tests/."""
     for folder in ("flockenv", "agents", "tests"):
         for path in sorted((root / folder).rglob("*.py")):
             yield from _imports_of(path.read_text(), path.relative_to(root).as_posix())
@@ -50,14 +50,14 @@ def imports(root: Path) -> Iterator[Import]:
 
 @functools.lru_cache(maxsize=2048)
 def _imports_of(text: str, file: str) -> tuple[Import, ...]:
-    """Those of one file: a planted fault changes one file of hundreds."""
+    """Return the imports of one file; cached by its text, because a planted fault changes one file of hundreds."""
     return tuple(_walk(ast.parse(text), file, False, False))
 
 
 def _walk(node: ast.AST, file: str, lazy: bool, typing: bool) -> Iterator[Import]:
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.expr):
-            continue  # nothing is imported there
+            continue  # expressions contain no imports
         if isinstance(child, ast.Import):
             yield from (Import(file, child.lineno, alias.name, lazy, typing) for alias in child.names)
         elif isinstance(child, ast.ImportFrom) and child.module:
@@ -72,7 +72,10 @@ def _walk(node: ast.AST, file: str, lazy: bool, typing: bool) -> Iterator[Import
 
 
 def part(module: str) -> str:
-    """flockenv.physics.effects.drag -> effects; flockenv/physics/effects/drag.py -> effects; agents.ppo -> agents."""
+    """Return the package of a module or file.
+
+    flockenv.physics.effects.drag -> physics; flockenv/physics/effects/drag.py -> physics; agents.ppo -> agents.
+    """
     steps = module.removesuffix(".py").replace("/", ".").split(".")
     return steps[1] if steps[0] == "flockenv" and len(steps) > 1 else steps[0]
 
@@ -82,7 +85,7 @@ def rank(name: str) -> int:
 
 
 def faults(root: Path) -> list[str]:
-    """What breaks the order of the house, one line each."""
+    """Return the breaches of the order of imports, one line each."""
     allowed = {"__init__.py", "py.typed", "__pycache__", *LAYERS}
     found = [f"flockenv/{each.name}: is no package of LAYERS" for each in (root / "flockenv").iterdir()
              if each.name not in allowed]  # fmt: skip
@@ -112,7 +115,7 @@ def _misplaced(entry: Import) -> str:
 
 
 def circles(root: Path) -> list[list[str]]:
-    """Circles among imports, those for types alone included; imports inside functions are left out."""
+    """Return a circle among imports, if there is one; imports for types count, imports inside functions do not."""
     modules = {
         path.relative_to(root).with_suffix("").as_posix().replace("/", ".").removesuffix(".__init__")
         for path in (root / "flockenv").rglob("*.py")
@@ -123,7 +126,7 @@ def circles(root: Path) -> list[list[str]]:
         there = entry.module if entry.module in modules else entry.module.rpartition(".")[0]
         if here in modules and there in modules - {here} and not entry.lazy:
             edges[here].add(there)
-    while free := {module for module in edges if not edges[module]}:  # what imports nothing is in no circle
+    while free := {module for module in edges if not edges[module]}:  # a module that imports nothing is in no circle
         edges = {module: targets - free for module, targets in edges.items() if module not in free}
     return [_follow(edges, min(edges))] if edges else []
 
@@ -135,7 +138,7 @@ def _follow(edges: dict[str, set[str]], module: str) -> list[str]:
     return [*way[way.index(min(edges[way[-1]])) :], min(edges[way[-1]])]
 
 
-def test_nothing_imports_upwards_and_heavy_packages_stay_in_their_place() -> None:
+def test_no_module_imports_upwards_and_heavy_packages_stay_in_place() -> None:
     assert faults(ROOT) == []
 
 
@@ -183,15 +186,15 @@ def test_a_planted_fault_is_found(tmp_path: Path, file: str, planted: str, fault
         "from flockenv.cli.main import main; assert main(['run', '--help']) == 0",
     ],
 )
-def test_a_glance_at_the_library_loads_nothing_heavy(statement: str) -> None:
+def test_importing_the_library_and_its_help_load_no_heavy_package(statement: str) -> None:
     heavy = ["torch", "stable_baselines3", "matplotlib", "numba", "scipy", "shapely", "pygame"]
     code = f"{statement}\nimport sys; print(sorted(set({heavy}) & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
 
 
-def test_the_simulator_needs_no_torch() -> None:
-    """With torch and stable-baselines3 made impossible to import, everything but sb3.py still loads."""
+def test_the_library_loads_without_torch() -> None:
+    """With torch and stable-baselines3 blocked, every module but sb3.py can be imported."""
     modules = [
         path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".")
         for path in sorted((ROOT / "flockenv").rglob("*.py"))
@@ -218,7 +221,7 @@ for name in sys.argv[1:]:
 
 
 @pytest.mark.slow
-def test_every_module_can_be_the_first_to_be_imported() -> None:
+def test_every_module_can_be_imported_first() -> None:
     files = [path.relative_to(ROOT).with_suffix("") for path in sorted((ROOT / "flockenv").rglob("*.py"))]
     names = [".".join(path.parts).removesuffix(".__init__") for path in files if path.name != "__main__"]
     run = subprocess.run([sys.executable, "-c", FIRST, *names], cwd=ROOT, text=True, stdout=subprocess.PIPE, check=True)
