@@ -1,4 +1,4 @@
-"""Ways to go: around obstacles, to the nearest of several doors, from place to place, by the quickest door; in line."""
+"""Floor fields, journeys, choice of doors, queues and unaligned avoidance."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ ROOM = (
 LEFT, RIGHT = ((0.0, 2.5), (0.0, 3.5)), ((10.0, 2.0), (10.0, 4.0))
 
 
-# --- the way itself ---------------------------------------------------------------------------------------------------
+# --- floor fields -----------------------------------------------------------------------------------------------------
 
 
-def test_the_way_around_a_disc_is_as_long_as_tangents_and_an_arc() -> None:
-    """Closed form, to a few hundredths of a metre, for a body that keeps 0.3 m from a disc of 0.7 m."""
+def test_the_path_around_a_disc_is_as_long_as_tangents_and_an_arc() -> None:
+    """The body keeps 0.3 m from a disc of radius 0.7 m; the mean error is below 0.05 m."""
     way = Way(targets=(Target(at=(3, 0)),), clearance=0.3, spacing=0.05, margin=4)
     scene = Scene(
         groups=(walkers(1, (-4, 0), (-4, 0)),), obstacles=(Circle(centre=(0, 0), radius=0.7),), effects=(way,)
@@ -60,8 +60,8 @@ def test_the_way_around_a_disc_is_as_long_as_tangents_and_an_arc() -> None:
     assert np.abs(wrong).max() < 0.2
 
 
-def test_the_nearest_door_is_nearest_by_way_and_not_by_air() -> None:
-    """A wall lies before one of two points: by air it is 3 m away, by way 13 m, and the other is 6 m away."""
+def test_the_nearest_target_is_the_one_with_the_shortest_path() -> None:
+    """One target, behind a wall, is 3 m away in a straight line but 13 m by the path; the other is 6 m away."""
     wall = (Wall(vertices=((2, -6), (2, 20)), radius=0.1),)
     way = Way(targets=(Target(at=(3, 0)), Target(at=(-6, 0))), spacing=0.1, margin=1)
     scene = Scene(groups=(walkers(1, (0, 0), (0, 0)),), obstacles=wall, effects=(way,))
@@ -77,16 +77,16 @@ def test_the_nearest_door_is_nearest_by_way_and_not_by_air() -> None:
     assert one.lengths(scene.with_effects(one), [0.0, 0.0]) == pytest.approx(around, rel=0.04)
 
 
-def test_who_is_pushed_against_a_wall_is_as_near_as_he_is() -> None:
-    """Nearer to a jamb than the clearance no way is searched; lengths go on there, or people would turn away."""
+def test_path_lengths_continue_into_the_clearance_of_walls() -> None:
+    """Floor fields end at the clearance of a jamb; without continued lengths agents nearer to it would turn away."""
     way = Way(targets=(Target(ends=LEFT),), spacing=0.1)
     scene = Scene(groups=(walkers(1, (5, 3), (5, 3)),), obstacles=ROOM, effects=(way,))
     assert way.lengths(scene, [0.2, 3.2]) == pytest.approx(0.25, abs=0.15)
     assert way.lengths(scene, [5.0, 0.3]) == pytest.approx(math.hypot(5, 2.6), abs=0.5)
 
 
-def test_a_thousand_places_of_a_plan_are_asked_for_once() -> None:
-    """What is near obstacles does not depend on targets: several share it."""
+def test_floor_fields_of_several_targets_share_the_distances_to_obstacles() -> None:
+    """Distances to obstacles do not depend on targets."""
     ground.cache_clear()
     targets = tuple(Target(at=(x, 3.0)) for x in (2, 4, 6))
     stages = tuple(Stage(at=target.at, radius=0.3) for target in targets)
@@ -94,7 +94,7 @@ def test_a_thousand_places_of_a_plan_are_asked_for_once() -> None:
     assert ground.cache_info().misses == 1
 
 
-def test_an_agent_that_no_way_leads_from_is_warned_of_and_stands_still() -> None:
+def test_an_agent_without_a_path_causes_a_warning_and_stands_still() -> None:
     """A wall across the box, an agent on each side of it, the target on the right."""
     wall = Wall(vertices=((6, 0), (6, 8)), radius=0.1)
     way = Way(targets=(Target(at=(11, 4)),), spacing=0.1)
@@ -102,9 +102,9 @@ def test_an_agent_that_no_way_leads_from_is_warned_of_and_stands_still() -> None
         space=Box(size=(12, 8)), groups=(walkers(2, (0.5, 0.5), (11, 7)),), obstacles=(wall,),
         effects=(way, Driving(tau=0.5)), dt=0.01,
     )  # fmt: skip
-    with pytest.warns(NoWayWarning, match=r"targets\[0\]: no way leads there from where \d+ of 8 agents") as told:
+    with pytest.warns(NoWayWarning, match=r"targets\[0\]: no way leads there from where \d+ of 8 agents") as caught:
         state = scene.start(0, 4)
-    assert f"where {(state.pos[..., 0] < 6).sum()} of 8" in str(told[0].message)
+    assert f"where {(state.pos[..., 0] < 6).sum()} of 8" in str(caught[0].message)
     np.testing.assert_array_equal(way.lengths(scene, [(3.0, 4.0), (9.0, 4.0), (5.6, 1)]) == np.inf, [True, False, True])
     assert way.lengths(scene, [9.0, 4.0]) == pytest.approx(2, abs=0.01)
     state = state.worlds([0]).with_motion([[[3.0, 4.0], [9.0, 4.0]]], np.zeros((1, 2, 2)))
@@ -114,7 +114,7 @@ def test_an_agent_that_no_way_leads_from_is_warned_of_and_stands_still() -> None
 
 
 def cut_off(effect: Any, count: int = 4, **more: Any) -> Scene:
-    """A scene with a closed cell of 3 x 6 m on the left, in which some of the agents begin."""
+    """Return a scene with a closed cell of 3 x 6 m on the left, in which some of the agents begin."""
     wall = Wall(vertices=((3, 0), (3, 6)), radius=0.1)
     return Scene(
         space=Box(size=(10, 6)), groups=(walkers(count, (1, 1), (9, 5)),), obstacles=(wall,),
@@ -131,14 +131,14 @@ def cut_off(effect: Any, count: int = 4, **more: Any) -> Scene:
         (Steer(behaviours=(FollowWay(weight=50, target=(9, 3), speed=1.0),)), "target"),
     ],
 )
-def test_every_effect_with_ways_counts_the_agents_that_are_cut_off(effect: Any, name: str) -> None:
-    with pytest.warns(NoWayWarning, match=rf"{name}: no way leads there from where \d+ of 40 agents begin") as told:
+def test_every_effect_with_floor_fields_counts_the_agents_that_are_cut_off(effect: Any, name: str) -> None:
+    with pytest.warns(NoWayWarning, match=rf"{name}: no way leads there from where \d+ of 40 agents begin") as caught:
         state = cut_off(effect).start(0, 10)
     count = (state.pos[..., 0] < 3).sum()
-    assert f"where {count} of 40" in str(told[0].message)
+    assert f"where {count} of 40" in str(caught[0].message)
 
 
-def test_one_door_that_can_be_reached_is_enough_and_each_stage_of_a_journey_is_needed() -> None:
+def test_one_reachable_door_is_enough_but_every_stage_of_a_journey_is_needed() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         cut_off(Way(targets=(Target(at=(1, 3)), Target(at=(9, 3))))).start(0, 10)
@@ -148,7 +148,7 @@ def test_one_door_that_can_be_reached_is_enough_and_each_stage_of_a_journey_is_n
         cut_off(Journey(stages=stages)).start(0, 10)
 
 
-def test_an_emitter_that_no_way_leads_from_is_refused() -> None:
+def test_emitters_and_spawns_without_a_path_are_refused() -> None:
     born = (Emitter(group=0, place=Point(at=(1.5, 3.0)), rate=1.0),)
     with pytest.raises(ValueError, match=r"targets\[0\] = \(9.0, 3.0\): no way leads there from population\[0\]"):
         cut_off(Way(targets=(Target(at=(9, 3)),)), population=born)
@@ -180,7 +180,7 @@ def travellers(dt: float = 0.02, **more: Any) -> Scene:
 
 
 def history(scene: Scene, seconds: float, name: str = "stage") -> tuple[Array, Array]:
-    """When, and what goes on inside everybody then, from the start to the end."""
+    """Return the times of all steps, and an inner number of every agent at each of them."""
     state, times, found = scene.start(0), [0.0], []
     found.append(np.array(scene.inner(state, name)[0]))
     for _ in range(round(seconds / scene.dt)):
@@ -191,7 +191,7 @@ def history(scene: Scene, seconds: float, name: str = "stage") -> tuple[Array, A
 
 
 @pytest.mark.parametrize("dt", [0.01, 0.02, 0.05, 0.07])
-def test_places_come_in_order_and_waits_are_exact_for_every_dt(dt: float) -> None:
+def test_stages_come_in_order_and_waits_are_exact_for_every_dt(dt: float) -> None:
     scene = travellers(dt)
     times, stage = history(scene, 14)
     table = scene.table_of(THERE)
@@ -202,13 +202,13 @@ def test_places_come_in_order_and_waits_are_exact_for_every_dt(dt: float) -> Non
         order = [stage[0, i], *stage[1:, i][np.diff(stage[:, i]) != 0]]
         assert order == [-0.5, 0, 1, 1.5, 2, 3]
         first = {value: times[np.argmax(stage[:, i] == value)] for value in order}
-        assert 0 <= first[0.0] - drawn[i, 0] < dt * 1.02  # it sets out with the first step after its time
+        assert 0 <= first[0.0] - drawn[i, 0] < dt * 1.02  # it sets out in the first step after its time
         assert 0 <= first[2.0] - first[1.5] - drawn[i, 2] < dt * 1.02
     assert (stage[-1, 5:] <= 1).all()
-    assert (np.abs(np.diff(stage[:, 5:], axis=0)).sum(axis=0) >= 3).all()  # round and round
+    assert (np.abs(np.diff(stage[:, 5:], axis=0)).sum(axis=0) >= 3).all()  # the loop repeats
 
 
-def test_nobody_moves_before_he_sets_out_and_who_has_left_goes_straight_on() -> None:
+def test_agents_rest_until_they_set_out_and_go_straight_on_after_they_left() -> None:
     scene = travellers()
     start = scene.start(0)
     early = scene.run(start, 24)
@@ -220,7 +220,7 @@ def test_nobody_moves_before_he_sets_out_and_who_has_left_goes_straight_on() -> 
     np.testing.assert_allclose(np.linalg.norm(end.vel[0, :5], axis=1), 1, atol=1e-3)
 
 
-def test_nobody_goes_through_a_wall() -> None:
+def test_no_agent_goes_through_a_wall() -> None:
     scene = travellers()
     state, clear = scene.start(3, 4), np.inf
     for _ in range(140):
@@ -243,7 +243,7 @@ def test_journeys_do_not_depend_on_threads_batches_or_calls() -> None:
     np.testing.assert_array_equal(alone.inner[:, 0], end.inner[:, 1])
 
 
-def test_who_is_born_begins_his_journey_and_leaves_through_a_sink() -> None:
+def test_born_agents_begin_a_journey_of_their_own_and_leave_through_a_drain() -> None:
     scene = travellers(population=(
         Emitter(group=0, place=Point(at=(1.0, 3.0)), rate=1.0),
         Drain(group=0, shape=Wall(vertices=((11, 0), (11, 6)), radius=0.1)),
@@ -266,13 +266,13 @@ def test_who_is_born_begins_his_journey_and_leaves_through_a_sink() -> None:
 
 
 def two_groups(groups: Any, routes: Any) -> Scene:
-    """Everybody in the room lines up behind his own group; one kernel for all tests."""
+    """Return a room in which agents line up behind agents of their own group; one kernel for all tests."""
     lines = tuple(Steer(group=k, behaviours=(LineUp(margin=0.1, group=k),)) for k in range(2))
     return Scene(groups=groups, obstacles=ROOM, effects=(*routes, *lines), dt=0.02)
 
 
 def waiting(count: int, doors: tuple[Door, ...], at: Any, **more: Any) -> Array:
-    """Which door everybody heads for who thinks about it for 20 s, and does not walk."""
+    """Return the doors that agents choose within 20 s if they do not walk."""
     routes = tuple(Routes(group=k, doors=doors, spacing=0.1, share=0.0, period=0.5, **more) for k in range(2))
     scene = two_groups((walkers(count, at, at), walkers(1, (5, 5), (5, 5))), routes)
     return np.array(scene.inner(scene.run(scene.start(1), 1000), "door")[0, :count])
@@ -282,8 +282,8 @@ EQUAL = (Door(ends=LEFT, width=1.0), Door(ends=RIGHT, width=1.0))
 
 
 @pytest.mark.slow
-def test_of_two_equal_doors_half_take_each_and_of_unequal_ones_as_computed() -> None:
-    """All stand in one place, so that half of those of a door are ahead: L1 + n1 / (2 J w1) = L2 + n2 / (2 J w2)."""
+def test_agents_divide_between_two_doors_as_computed() -> None:
+    """All stand in one place, so half of a door's agents count as ahead: L1 + n1 / (2 J w1) = L2 + n2 / (2 J w2)."""
     more = {"flow": 1.9, "hysteresis": 0.0}
     assert abs((waiting(60, EQUAL, (5, 3), **more) == 0).sum() - 30) <= 3
     assert abs((waiting(60, EQUAL, (3, 3), **more) == 0).sum() - (30 + 1.9 * 4)) <= 3
@@ -292,14 +292,14 @@ def test_of_two_equal_doors_half_take_each_and_of_unequal_ones_as_computed() -> 
 
 
 @pytest.mark.slow
-def test_who_has_decided_stays_with_it_unless_another_door_is_quicker_by_the_hysteresis() -> None:
-    """Nine people 4.4 m from one door, 5.6 m from the other: 4.4 + 4 / 1.9 s against 5.6 s is 14 % more."""
+def test_agents_change_their_door_only_if_it_saves_more_than_the_hysteresis() -> None:
+    """Nine agents, 4.4 m from one door and 5.6 m from the other: 4.4 + 4 / 1.9 s is 14 % more than 5.6 s."""
     assert (waiting(9, EQUAL, (4.4, 3), hysteresis=0.3) == 0).all()
     assert 0 < (waiting(9, EQUAL, (4.4, 3), hysteresis=0.0) == 1).sum() < 5
 
 
 @pytest.mark.slow
-def test_an_assigned_door_is_used_by_everybody_and_all_get_out_for_any_threads() -> None:
+def test_all_agents_leave_by_their_assigned_door_for_any_number_of_threads() -> None:
     groups = (walkers(20, (1, 1), (9, 5)), walkers(20, (1, 1), (9, 5)))
     doors = (Door(ends=LEFT),), (Door(ends=RIGHT),)
     scene = two_groups(groups, tuple(Routes(group=k, doors=doors[k], spacing=0.1) for k in range(2)))
@@ -318,8 +318,8 @@ def test_an_assigned_door_is_used_by_everybody_and_all_get_out_for_any_threads()
 
 
 @pytest.mark.slow
-def test_a_group_in_another_order_goes_the_same_ways() -> None:
-    """Who is where decides, not his number: but of the times at which decisions fall, which are each one's own."""
+def test_door_choices_do_not_depend_on_the_order_of_agents() -> None:
+    """The period is one step, since the time of a decision within a period depends on the index of an agent."""
     routes = tuple(Routes(group=k, doors=EQUAL, spacing=0.1, period=0.02) for k in range(2))
     scene = two_groups((walkers(20, (1, 1), (4, 5)), walkers(1, (5, 5), (5, 5))), routes)
     start, order = scene.start(4), [*np.random.default_rng(0).permutation(20), 20]
@@ -334,7 +334,7 @@ def test_a_group_in_another_order_goes_the_same_ways() -> None:
 
 @pytest.mark.slow
 def test_routes_of_a_large_crowd_do_not_depend_on_threads_or_calls() -> None:
-    """A large crowd is advanced by two threads together, and put in order where many steps are one call."""
+    """Two threads share a large crowd, and a call of many steps sorts its agents."""
     routes = Routes(doors=EQUAL, spacing=0.1, period=0.2)
     groups = (walkers(4200, (1, 1), (4, 5)),)
     scene = Scene(groups=groups, obstacles=ROOM, effects=(routes, Steer(behaviours=(LineUp(margin=0.05),))), dt=0.02)
@@ -352,12 +352,12 @@ def test_routes_of_a_large_crowd_do_not_depend_on_threads_or_calls() -> None:
     np.testing.assert_array_equal(again.pos, end.pos)
 
 
-# --- in line, and past each other -------------------------------------------------------------------------------------
+# --- queues and avoidance ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-def test_who_lines_up_stops_behind_whoever_is_ahead() -> None:
-    """The first does not walk, and the others come to rest a margin behind each other."""
+def test_an_agent_that_lines_up_stops_a_margin_behind_the_agent_ahead() -> None:
+    """Agents of the second group do not walk; the gap of the first to the one ahead never falls below the margin."""
     groups = (walkers(1, (1, 3), (1, 3)), walkers(2, (4, 3), (6, 3)))
     routes = tuple(Routes(group=k, doors=(Door(ends=RIGHT),), spacing=0.1) for k in range(2))
     routes = (routes[0], routes[1].model_copy(update={"share": 0.0}))
@@ -374,7 +374,7 @@ def test_who_lines_up_stops_behind_whoever_is_ahead() -> None:
 
 
 def passing(second: Group, both: bool) -> Array:
-    """The paths of somebody who walks from -4 to 4 m, and of another; all but a bystander give way."""
+    """Return the paths of an agent that walks from -4 to 4 m and of a second agent; both avoid each other if `both`."""
     give = UnalignedAvoidance(weight=120.0, radius=4.0, horizon=2.0, margin=0.1)
     ways = (
         Way(group=0, targets=(Target(at=(-30, 0)), Target(at=(4, 0))), slow_radius=0.5),
@@ -390,8 +390,8 @@ def passing(second: Group, both: bool) -> Array:
 
 
 @pytest.mark.slow
-def test_somebody_who_stands_is_passed_and_two_who_meet_head_on_both_keep_right() -> None:
-    """JuPedSim's T4 and T12: no overlap; who stands and does not care stays; two are each other's mirror image."""
+def test_a_standing_agent_is_passed_and_two_agents_head_on_both_keep_right() -> None:
+    """JuPedSim's T4 and T12: no overlap; the standing agent stays; the two paths head-on are mirror images."""
     path = passing(walkers(1, (0, 0), (0, 0), max_force=0), both=False)
     assert np.linalg.norm(path[:, 0] - path[:, 1], axis=1).min() > 0.4
     np.testing.assert_array_equal(path[:, 1], 0)
@@ -401,10 +401,10 @@ def test_somebody_who_stands_is_passed_and_two_who_meet_head_on_both_keep_right(
     assert np.abs(path.sum(axis=1)).max() < 0.005
     np.testing.assert_allclose(path[-1], ((4, 0), (-4, 0)), atol=0.01)
     middle = np.argmin(np.abs(path[:, 0, 0]))
-    assert path[middle, 0, 1] < -0.1  # to the right of who comes from the left
+    assert path[middle, 0, 1] < -0.1  # the agent from the left passes on its right
 
 
-# --- what cannot be ---------------------------------------------------------------------------------------------------
+# --- refusals ---------------------------------------------------------------------------------------------------------
 
 DOOR = Door(ends=LEFT)
 
@@ -441,13 +441,13 @@ DOOR = Door(ends=LEFT)
         (lambda: Routes(doors=(DOOR, Door(ends=((0, 0), (0, 1))))), r"doors\[1\] = .*: is at most -0.1 m"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(make: Any, text: str) -> None:
+def test_invalid_targets_and_floor_fields_are_refused_in_one_line(make: Any, text: str) -> None:
     with pytest.raises(ValueError, match=text) as error:
         Scene(groups=(walkers(2, (2, 2), (3, 3)),), obstacles=ROOM, effects=(make(),))
     assert "\n" not in str(error.value)
 
 
-def test_two_journeys_of_one_group_are_refused_and_so_is_a_choice_without_a_speed() -> None:
+def test_two_aims_of_one_group_and_door_choice_without_a_speed_are_refused() -> None:
     groups = (walkers(2, (2, 2), (3, 3)), walkers(2, (2, 2), (3, 3)))
     with pytest.raises(ValueError, match=r"effects\[0\].group = 0: effects\[1\], a routes, also steers some"):
         Scene(groups=groups, obstacles=ROOM, effects=(THERE, Routes(doors=(DOOR,))))
@@ -461,7 +461,7 @@ def thin(x: float = 5.0, wide: float = 0.05) -> Polygon:
 
 
 @pytest.mark.parametrize(
-    ("shapes", "clearance", "said"),
+    ("shapes", "clearance", "part"),
     [
         ((thin(),), 0.0, r"obstacles\[0\], 0.05 m thick, unless a clearance of more than 0.075 m or a spacing of less"),
         ((thin(),), 0.01, "unless a clearance of more than 0.075 m"),
@@ -470,9 +470,9 @@ def thin(x: float = 5.0, wide: float = 0.05) -> Polygon:
         ((Block(centre=(5, 2.5), size=(0.1, 5)),), 0.04, "0.1 m thick"),
     ],
 )
-def test_no_way_leads_through_what_a_grid_may_miss(shapes: Any, clearance: float, said: str) -> None:
+def test_obstacles_thinner_than_the_grid_resolves_are_refused(shapes: Any, clearance: float, part: str) -> None:
     people = walkers(1, (1, 1), (1, 1))
-    with pytest.raises(ValueError, match=said) as error:
+    with pytest.raises(ValueError, match=part) as error:
         Scene(
             space=Box(size=(10, 6)), groups=(people,), obstacles=shapes,
             effects=(Way(targets=(Target(at=(9, 1)),), clearance=clearance),),
@@ -489,5 +489,5 @@ def test_no_way_leads_through_what_a_grid_may_miss(shapes: Any, clearance: float
         (Wall(vertices=((0, 0), (1, 0)), radius=0.1), 0.2),
     ],
 )  # fmt: skip
-def test_how_thick_shapes_are_where_they_are_thinnest(shape: Any, thick: float) -> None:
+def test_the_thickness_of_a_shape_is_that_of_its_thinnest_place(shape: Any, thick: float) -> None:
     assert shape.thickness == pytest.approx(thick)

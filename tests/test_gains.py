@@ -1,4 +1,4 @@
-"""Behaviours know how stiff they are: just beyond the linear limit a scene warns, just below it does not."""
+"""Stability limits of behaviours: a scene warns just beyond the linear limit and not just below it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ UNBOUNDED = {
     "avoid_obstacles", "circular_repulsion", "elliptical_repulsion", "force_field", "friends", "interest",
     "obstacle_repulsion", "separation", "sidestep", "unaligned_avoidance", "whiskers",
 }  # fmt: skip
-"""Behaviours whose force is no gain times a velocity or a place: always as strong, or as steep as agents are near."""
+"""Behaviours whose force is no gain times a velocity or an offset: of constant size, or steeper for nearer agents."""
 
 
 def scene(*effects: Effect, dt: float = 1e-3, count: int = 1, speed: float = 1.0, **group: Any) -> Scene:
@@ -38,7 +38,7 @@ def scene(*effects: Effect, dt: float = 1e-3, count: int = 1, speed: float = 1.0
 
 
 def semi_implicit(square: float, damping: float) -> float:
-    """The largest stable step of semi-implicit Euler: h^2 k + 2 h c = 4."""
+    """Return the largest stable step of semi-implicit Euler: h^2 k + 2 h c = 4."""
     if square == 0:
         return 2 / damping
     return (math.sqrt(damping**2 + 4 * square) - damping) / square
@@ -48,7 +48,7 @@ BEHAVIOURS = sorted(k for k, e in EFFECTS.items() if e.steering and "weight" in 
 
 
 def alone(kind: str) -> Scene:
-    """The scene of a behaviour's demo without other behaviours, and without bounds of force."""
+    """Return the scene of a behaviour's demo without other behaviours and without force limits."""
     shown, effects = load_scene(str(EFFECTS[kind].demo)), []
     for effect in shown.effects:
         left = tuple(each for each in effect.wishes if each.kind == kind)
@@ -61,7 +61,7 @@ def alone(kind: str) -> Scene:
 
 
 def derivative(of: Scene, state: State, agent: int, name: str) -> Array:
-    """- d a / d x or - d a / d v of one agent by itself, (D, D), by differences."""
+    """Return - d a / d x or - d a / d v of one agent with respect to its own x or v, (D, D), by differences."""
     columns = []
     for k in range(of.dimension):
         ends = []
@@ -75,11 +75,11 @@ def derivative(of: Scene, state: State, agent: int, name: str) -> Array:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [kind for kind in BEHAVIOURS if kind not in UNBOUNDED])
-def test_damping_is_never_more_than_its_bound_and_somewhere_at_least_half_of_it(kind: str) -> None:
-    """By differences of the compiled law itself, along a run of the demo.
+def test_damping_stays_below_its_bound_and_reaches_about_half_of_it(kind: str) -> None:
+    """Damping is measured by differences of the compiled law along a run of the demo.
 
-    5 %: the place that follow_path heads for moves along its path with its speed. Cohesion has no damping, a walking
-    group turns its heads less far than it could, and without its pursuer nothing comes near who evades.
+    The margin of 5 % is for follow_path, whose target moves with the agent's speed. Cohesion has no damping, heads in a
+    walking group turn less far than they could, and agents that evade have no pursuer near in this scene.
     """
     only, shares = alone(kind), []
     state = only.start(0)
@@ -95,8 +95,8 @@ def test_damping_is_never_more_than_its_bound_and_somewhere_at_least_half_of_it(
 
 
 @pytest.mark.parametrize("kind", [kind for kind in BEHAVIOURS if kind not in UNBOUNDED])
-def test_every_behaviour_with_a_gain_warns_just_beyond_its_limit_and_not_below(kind: str) -> None:
-    """In the scene of its own demo, by itself."""
+def test_every_behaviour_with_a_gain_warns_only_beyond_its_limit(kind: str) -> None:
+    """The behaviour is alone in the scene of its demo."""
     only = alone(kind)
     found = suggest_dt(only)
     assert found.effect in (kind, "steer")
@@ -109,7 +109,7 @@ def test_every_behaviour_with_a_gain_warns_just_beyond_its_limit_and_not_below(k
         only.model_copy(update={"dt": 0.99 * found.dt})
 
 
-def test_behaviours_that_say_nothing_are_those_that_have_no_gain() -> None:
+def test_only_behaviours_without_a_gain_return_no_rates() -> None:
     for kind in BEHAVIOURS:
         shown = load_scene(str(EFFECTS[kind].demo))
         behaviour = next(b for effect in shown.effects for b in (*effect.wishes, effect) if b.kind == kind)
@@ -140,7 +140,7 @@ def test_limits_are_those_of_the_linear_law(behaviour: Effect, square: float, da
     assert 0 < suggest_dt(verlet).dt < math.inf
 
 
-def test_arrive_shakes_at_its_target_beyond_the_limit_alone() -> None:
+def test_arrive_oscillates_at_its_target_only_beyond_the_limit() -> None:
     """w = 10 kg/s, m = 1 kg, V = 3 m/s, slow_radius 2 m: .1766 s."""
     limit = semi_implicit(15.0, 10.0)
     assert limit == pytest.approx(0.1766, abs=1e-4)
@@ -154,8 +154,8 @@ def test_arrive_shakes_at_its_target_beyond_the_limit_alone() -> None:
     assert np.abs(end.vel).max() > 0.1
 
 
-def test_aligned_agents_turn_round_in_every_step_beyond_the_limit_alone() -> None:
-    """100 agents in sight of some others: limits lie between m / w, of two alone, and 2 m / w, of very many."""
+def test_aligned_velocities_flip_in_every_step_only_beyond_the_limit() -> None:
+    """Each of 100 agents sees some others: limits lie between m / w for two agents and 2 m / w for very many."""
     rule = Alignment(weight=10.0, radius=5.0)
     spawn = Spawn(speed=(1.0, 2.0))
     group = Group(count=100, radius=0.1, max_speed=3.0, spawn=spawn)
@@ -169,7 +169,7 @@ def test_aligned_agents_turn_round_in_every_step_beyond_the_limit_alone() -> Non
     assert np.abs(wild.step(before).vel - before.vel).max() > 3.0
 
 
-def test_two_that_see_each_other_alone_set_the_limit_of_alignment() -> None:
+def test_two_agents_that_see_only_each_other_set_the_limit_of_alignment() -> None:
     rule = Alignment(weight=10.0, radius=50.0)
     for dt, grows in ((0.098, False), (0.102, True)):
         with warnings.catch_warnings():
@@ -180,7 +180,7 @@ def test_two_that_see_each_other_alone_set_the_limit_of_alignment() -> None:
         assert (apart[1] > apart[0]) == grows
 
 
-def test_a_steer_adds_up_what_it_grants_and_what_it_grants_one_at_a_time_counts_once() -> None:
+def test_blend_sums_the_gains_of_behaviours_and_priority_takes_the_largest() -> None:
     behaviours = Seek(weight=6.0, target=O2), Arrive(weight=4.0, target=O2, slow_radius=SLOW)
     blended = suggest_dt(scene(Steer(behaviours=behaviours, arbitration={"kind": "blend"})))
     assert blended.dt == pytest.approx(semi_implicit(4 * TOP / SLOW, 10.0), rel=1e-3)
@@ -188,8 +188,8 @@ def test_a_steer_adds_up_what_it_grants_and_what_it_grants_one_at_a_time_counts_
     assert first.dt == pytest.approx(semi_implicit(4 * TOP / SLOW, 6.0), rel=1e-3)
 
 
-def test_a_behaviour_is_warned_of_and_never_refused() -> None:
-    """It may be cut to max_force, or ask for nothing where it is; who has no force has no limit."""
+def test_an_unstable_behaviour_causes_a_warning_and_is_never_refused() -> None:
+    """Its force may be limited by max_force, or be 0 in places; without force there is no limit."""
     with pytest.warns(UnstableStepWarning, match="at most 0.002 s is stable"):
         scene(Seek(weight=1000.0, target=O2), dt=0.05, max_force=4.0)
     assert suggest_dt(scene(Seek(weight=1000.0, target=O2), max_force=0.0)).dt == math.inf

@@ -1,4 +1,4 @@
-"""Forces between all agents: exact for few, and for many to the accuracy that the opening of the tree says."""
+"""Forces between all agents: exact for few agents, and for many within the error that the tree's opening allows."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from flockenv.studies.cost_breakdown import explain
 from tests.catalogue import Array, scene_of, users_module
 
 pytestmark = pytest.mark.slow
-"""Many kernels: where slow tests run."""
+"""Slow, because the tests compile many kernels."""
 
 DIMENSIONS = pytest.mark.parametrize("dimension", [2, 3])
 KINDS = pytest.mark.parametrize("kind", ["gravitation", "inverse_square"])
 MANY = 4200
-"""Enough for a tree, and for a team of threads."""
+"""Enough agents for a tree, and for several threads in one world."""
 
 
 def acting(kind: str, opening: float = 0.5, **fields: float) -> Effect:
@@ -40,20 +40,20 @@ def acting(kind: str, opening: float = 0.5, **fields: float) -> Effect:
 
 
 def cloud(effect: Effect, dimension: int, count: int = MANY, **fields: Any) -> Scene:
-    """Agents of two masses in a square or a cube."""
+    """Return a scene with agents of two masses in a square or a cube."""
     spawn = Spawn(low=(0,) * dimension, high=(3,) * dimension)
     groups = (Group(count=count - count // 3, mass=0.7, spawn=spawn), Group(count=count // 3, mass=2, spawn=spawn))
     return scene_of(effect, dimension=dimension, **{"groups": groups} | fields)
 
 
 def forces(scene: Scene, state: State) -> Array:
-    """Of the first world, (N, D) N."""
+    """Return the forces in the first world, (N, D) N."""
     change = scene.step(state).vel[0].astype(float) - state.vel[0]
     return np.asarray(change / scene.dt * scene.body.mass[:, None])
 
 
 def expected(effect: Any, scene: Scene, state: State) -> Array:
-    """The sum as the textbook writes it, over everybody alive, (N, D) N."""
+    """Return the textbook sum over all living agents, (N, D) N."""
     pos, mass, alive = state.pos[0].astype(float), scene.body.mass.astype(float), state.alive[0]
     found = np.zeros_like(pos)
     for i in np.flatnonzero(alive):
@@ -66,18 +66,20 @@ def expected(effect: Any, scene: Scene, state: State) -> Array:
 
 
 def errors(found: Array, exact: Array) -> Array:
-    """Of each agent, relative to the force on a typical one: in the middle forces cancel."""
+    """Return the error of each agent relative to the root mean square force, since forces cancel in the middle."""
     size = np.linalg.norm(exact, axis=1)
     return np.asarray(np.linalg.norm(found - exact, axis=1) / np.sqrt((size**2).mean()))
 
 
-# --- how exact --------------------------------------------------------------------------------------------------------
+# --- accuracy ---------------------------------------------------------------------------------------------------------
 
 
 @DIMENSIONS
 @KINDS
 @pytest.mark.parametrize(("count", "opening"), [(203, 0.5), (MOST_DIRECT, 0.5), (MANY, 0.0)])
-def test_few_or_unopened_it_is_the_sum_over_all_pairs(kind: str, dimension: int, count: int, opening: float) -> None:
+def test_forces_are_the_sum_over_all_pairs_for_few_agents_or_an_opening_of_0(
+    kind: str, dimension: int, count: int, opening: float
+) -> None:
     effect = acting(kind, opening)
     scene = cloud(effect, dimension, count)
     state = scene.start(1)
@@ -85,17 +87,17 @@ def test_few_or_unopened_it_is_the_sum_over_all_pairs(kind: str, dimension: int,
     assert scene.step(state).counted("pairs") == count**2
 
 
-BOUNDS = {  # opening -> error of the median and of all but a hundredth, share of all pairs that are met
+BOUNDS = {  # opening -> median and 99 % quantile of the error, share of all pairs that are computed
     2: {1.0: (0.04, 0.13, 0.08), 0.5: (0.0085, 0.023, 0.18), 0.2: (8e-4, 2e-3, 0.56)},
     3: {1.0: (0.011, 0.047, 0.21), 0.5: (0.0012, 0.004, 0.57), 0.2: (1.6e-5, 9e-5, 1.0)},
 }
-"""Four thirds of what was measured."""
+"""4/3 of the measured values."""
 
 
 @DIMENSIONS
 @KINDS
-def test_many_are_summed_as_exactly_as_the_opening_says(kind: str, dimension: int) -> None:
-    """Errors shrink with the opening, and so does what is spared."""
+def test_errors_of_the_tree_stay_below_bounds_that_shrink_with_the_opening(kind: str, dimension: int) -> None:
+    """From each opening to the next smaller one, errors shrink by a factor of at least 4."""
     before = (np.inf, np.inf)
     for opening in (1.0, 0.5, 0.2):
         effect = acting(kind, opening)
@@ -103,14 +105,14 @@ def test_many_are_summed_as_exactly_as_the_opening_says(kind: str, dimension: in
         state = scene.start(2)
         error = errors(forces(scene, state), expected(effect, scene, state))
         found = float(np.median(error)), float(np.quantile(error, 0.99))
-        met = scene.step(state).counted("pairs") / MANY**2
+        computed = scene.step(state).counted("pairs") / MANY**2
         median, most, share = BOUNDS[dimension][opening]
-        assert found[0] < median and found[1] < most and met < share
+        assert found[0] < median and found[1] < most and computed < share
         assert found[0] < 0.25 * before[0] and found[1] < 0.25 * before[1]
         before = found
 
 
-def test_in_single_precision_a_tree_is_as_exact_as_its_opening() -> None:
+def test_the_tree_gives_the_same_forces_in_single_precision() -> None:
     effect = acting("gravitation")
     double, single = (cloud(effect, 2, dtype=dtype) for dtype in ("float64", "float32"))
     state = double.start(2)
@@ -118,8 +120,8 @@ def test_in_single_precision_a_tree_is_as_exact_as_its_opening() -> None:
 
 
 @DIMENSIONS
-def test_agents_of_very_different_distances_are_summed_as_exactly(dimension: int) -> None:
-    """A dense core, and some who have escaped to a thousand times its size: a tree has as many levels as it needs."""
+def test_the_tree_is_as_accurate_for_agents_at_very_different_distances(dimension: int) -> None:
+    """A dense core, and some agents a thousand times its size away; the tree has as many levels as it needs."""
     effect = acting("gravitation")
     scene = cloud(effect, dimension)
     state = scene.start(3)
@@ -131,7 +133,7 @@ def test_agents_of_very_different_distances_are_summed_as_exactly(dimension: int
 
 
 @DIMENSIONS
-def test_momentum_is_kept_exactly_by_few_and_to_the_accuracy_of_the_tree_by_many(dimension: int) -> None:
+def test_momentum_is_conserved_exactly_by_pairs_and_approximately_by_the_tree(dimension: int) -> None:
     for opening, least, most in ((0.0, 0.0, 1e-15), (0.5, 1e-9, 1e-3)):
         scene = cloud(acting("gravitation", opening), dimension)
         found = forces(scene, scene.start(4))
@@ -141,7 +143,7 @@ def test_momentum_is_kept_exactly_by_few_and_to_the_accuracy_of_the_tree_by_many
 
 @DIMENSIONS
 @KINDS
-def test_the_force_is_the_slope_of_the_potential(kind: str, dimension: int) -> None:
+def test_the_force_is_the_negative_gradient_of_the_potential(kind: str, dimension: int) -> None:
     effect = acting(kind)
     scene = cloud(effect, dimension, 40)
     state = scene.start(9)
@@ -160,14 +162,14 @@ def test_the_force_is_the_slope_of_the_potential(kind: str, dimension: int) -> N
 # --- orbits -----------------------------------------------------------------------------------------------------------
 
 
-def test_the_orbit_of_two_closes_after_the_period_that_kepler_says() -> None:
+def test_the_orbit_of_two_bodies_closes_after_keplers_period() -> None:
     """Masses 3 and 1, semi-major axis 1, eccentricity 0.6: P = 2 pi sqrt(a^3 / (G (m + M))) = pi with G = 1."""
     spawn = Spawn(low=(0, 0), high=(1, 1))
     steps, groups = 2000, (Group(count=1, mass=3, spawn=spawn), Group(count=1, mass=1, spawn=spawn))
     effect = Gravitation(constant=1, softening=0)
     scene = Scene(groups=groups, effects=(effect,), integrator=RK4(), dt=np.pi / steps)
     start = scene.start(0)
-    near, fast = 1 - 0.6, np.sqrt(4 * (1 + 0.6) / (1 - 0.6))  # at the nearest point
+    near, fast = 1 - 0.6, np.sqrt(4 * (1 + 0.6) / (1 - 0.6))  # at periapsis
     start.pos[0] = [[-near / 4, 0], [near * 3 / 4, 0]]
     start.vel[0] = [[0, -fast / 4], [0, fast * 3 / 4]]
     half, end = scene.run(start, steps // 2), scene.run(start, steps)
@@ -176,13 +178,13 @@ def test_the_orbit_of_two_closes_after_the_period_that_kepler_says() -> None:
     np.testing.assert_allclose(end.vel, start.vel, atol=1e-5)
 
 
-# --- who is there -----------------------------------------------------------------------------------------------------
+# --- coincident and dead agents ---------------------------------------------------------------------------------------
 
 
 @DIMENSIONS
 @pytest.mark.parametrize("softening", [0.0, 0.05])
-def test_many_in_one_place_do_not_pull_each_other(dimension: int, softening: float) -> None:
-    """Nor does a tree over them split for ever; and whoever is elsewhere feels all of them."""
+def test_coincident_agents_do_not_attract_each_other(dimension: int, softening: float) -> None:
+    """A tree over coincident agents does not split forever, and agents elsewhere are attracted by all of them."""
     effect = acting("gravitation", softening=softening)
     scene = cloud(effect, dimension)
     state = scene.start(0)
@@ -194,8 +196,8 @@ def test_many_in_one_place_do_not_pull_each_other(dimension: int, softening: flo
 
 
 @pytest.mark.parametrize("alive", [0, 1, 16, 17, 3000])
-def test_the_dead_neither_pull_nor_are_pulled(alive: int) -> None:
-    """With the very bits of a world that they are not in, if that has a tree too."""
+def test_no_force_acts_on_or_from_dead_agents(alive: int) -> None:
+    """If there is a tree, the bits are those of a world without the dead agents."""
     effect = acting("gravitation")
     scene = cloud(effect, 3)
     state = scene.start(5)
@@ -214,7 +216,7 @@ def test_the_dead_neither_pull_nor_are_pulled(alive: int) -> None:
         np.testing.assert_array_equal(fewer.step(other).v, scene.step(state).v[:, :, :alive])
 
 
-# --- the same whoever else computes -----------------------------------------------------------------------------------
+# --- threads, batches and other laws ----------------------------------------------------------------------------------
 
 
 @pytest.fixture(autouse=True)
@@ -225,7 +227,7 @@ def one_thread_afterwards() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("opening", [0.0, 0.5])
-def test_threads_leave_no_trace(opening: float) -> None:
+def test_results_do_not_depend_on_the_number_of_threads(opening: float) -> None:
     scene = cloud(acting("gravitation", opening), 3)
     start = scene.start(6)
     start.alive[0, ::9] = False
@@ -237,7 +239,7 @@ def test_threads_leave_no_trace(opening: float) -> None:
             np.testing.assert_array_equal(getattr(found, name), getattr(end, name))
 
 
-def test_other_worlds_leave_no_trace() -> None:
+def test_results_do_not_depend_on_the_other_worlds_of_a_batch() -> None:
     scene = cloud(acting("gravitation"), 3)
     batch = scene.run(scene.start(7, worlds=3), 2)
     for k in range(3):
@@ -278,8 +280,8 @@ class Leash(Effect):
 """
 
 
-def test_every_form_of_law_at_once_is_the_sum_of_each(tmp_path: Path) -> None:
-    """Trees by mass and by number, an exact sum, bonds, a pair law; of many, by any number of threads and calls."""
+def test_laws_of_all_forms_in_one_scene_add_up(tmp_path: Path) -> None:
+    """Trees by mass and by number, an exact sum, bonds and a pair law, for any number of threads and calls."""
     far = acting("gravitation"), acting("inverse_square"), acting("gravitation", 0.0)
     scene = cloud(far[0], 2, WORTH_ARRANGING)
     start = scene.start(8)
@@ -301,15 +303,15 @@ def test_every_form_of_law_at_once_is_the_sum_of_each(tmp_path: Path) -> None:
             np.testing.assert_array_equal(getattr(again, name), getattr(end, name))
 
 
-# --- what is said of it -----------------------------------------------------------------------------------------------
+# --- explanation, refusals, memory ------------------------------------------------------------------------------------
 
 
-def test_a_scene_explains_whether_it_grows_a_tree() -> None:
-    said = {
+def test_the_explanation_of_a_scene_names_direct_sums_and_trees() -> None:
+    explained = {
         (count, opening): explain(cloud(acting("gravitation", opening), 2, count)).rows[0].calls_for
         for count, opening in ((50, 0.5), (MANY, 0.0), (MANY, 0.5))
     }
-    assert said == {
+    assert explained == {
         (50, 0.5): ("all others (direct)",),
         (MANY, 0.0): ("all others (direct)",),
         (MANY, 0.5): ("all others (tree)",),
@@ -317,7 +319,7 @@ def test_a_scene_explains_whether_it_grows_a_tree() -> None:
 
 
 @KINDS
-def test_what_does_not_suit_it_is_refused_in_one_line(kind: str) -> None:
+def test_a_torus_and_an_invalid_opening_are_refused_in_one_line(kind: str) -> None:
     with pytest.raises(ValueError, match=rf"effects\[0\].kind = {kind} reaches all agents, .* only a plane or a box"):
         scene_of(acting(kind), space=Torus(size=(9, 9)))
     for opening in (-0.1, 1.5, float("nan")):
@@ -326,7 +328,7 @@ def test_what_does_not_suit_it_is_refused_in_one_line(kind: str) -> None:
         assert "\n" not in str(caught.value)
 
 
-def test_who_is_pinned_would_pull_infinitely() -> None:
+def test_gravitation_of_pinned_particles_is_refused_since_their_mass_is_infinite() -> None:
     free = Group(count=3, spawn=Spawn(low=(0, 0), high=(1, 1)))
     pinned = Group(network=Rope(links=3, length=3, pinned=(0,)))
     assert scene_of(acting("inverse_square"), groups=(free, pinned)).agents == 7
@@ -334,6 +336,6 @@ def test_who_is_pinned_would_pull_infinitely() -> None:
         scene_of(acting("gravitation"), groups=(free, pinned))
 
 
-def test_memory_of_a_tree_is_counted_before_it_is_taken() -> None:
+def test_the_memory_of_a_tree_is_counted_before_it_is_allocated() -> None:
     few, many = (cloud(acting("gravitation", opening), 3, 40_000).bytes_per_world() / 40_000 for opening in (0.0, 0.5))
     assert 50 < many - few < 100

@@ -1,4 +1,4 @@
-"""Herd keeps its promises: when sheep heed a dog and when they graze, what is paid, what ends it, what a dog sees."""
+"""The task Herd: sheep that flee or graze, rewards, the end of an episode, and observations of dogs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PEN = np.array([30.0, 30.0])
 
 
 def scene(dogs: Any, sheep: Any, **fields: Any) -> World:
-    """One world, everybody at rest where they are told, the pen in the middle."""
+    """Return a world with all agents at rest at the given positions and the pen in the middle."""
     dogs, sheep = np.atleast_2d(dogs), np.atleast_2d(sheep)
     world = World(Herd(dogs=len(dogs), sheep=len(sheep), **fields))
     world.reset(3)
@@ -32,12 +32,12 @@ def paid(world: World, step: Step, dog: int = 0) -> dict[str, float]:
 
 
 def flock(middle: Any, count: int = 12, spacing: float = 1.5) -> Any:
-    """Sheep on a square lattice about a place."""
+    """Return positions of sheep on a square lattice around a point."""
     k = np.arange(count)
     return np.asarray(middle) + spacing * np.stack([k % 4 - 1.5, k // 4 - (count // 4 - 1) / 2], axis=1)
 
 
-def test_sheep_flee_from_a_dog_within_their_fear_and_graze_otherwise() -> None:
+def test_sheep_flee_from_a_dog_within_the_fear_distance_and_graze_otherwise() -> None:
     for distance, scared in ((5.0, True), (12.0, False)):
         world = scene((10.0 - distance, 10.0), flock((10.0, 10.0), spacing=1.2), error=0.0, attraction=0.0)
         for _ in range(10):
@@ -50,8 +50,8 @@ def test_sheep_flee_from_a_dog_within_their_fear_and_graze_otherwise() -> None:
             assert world.state.vel[0, 1:, 0].mean() > 1.0  # away from the dog
 
 
-def test_a_scared_flock_draws_together_and_one_that_grazes_keeps_apart() -> None:
-    """The selfish herd: a dog comes, and the mean distance from the centre shrinks; left alone it stays."""
+def test_a_scared_flock_contracts_and_a_grazing_flock_keeps_its_spread() -> None:
+    """The mean distance from the centre shrinks as a dog comes (the selfish herd), and stays about the same without."""
     spreads = {}
     for dog in ((4.0, 20.0), (-50.0, 20.0)):
         world = scene(dog, flock((10.0, 20.0), spacing=3.0))
@@ -73,7 +73,7 @@ def test_sheep_keep_their_distance_from_each_other() -> None:
     assert np.median(gaps.min(axis=1)) > 0.6
 
 
-def test_progress_and_gathering_are_paid_by_the_metre_and_time_by_the_second() -> None:
+def test_progress_and_gathering_are_rewarded_per_metre_and_time_costs_per_second() -> None:
     world = scene((15.0, 30.0), flock((20.0, 30.0)))
     here = world.state.pos[0, 1:].copy()
     step = act(world)
@@ -88,7 +88,7 @@ def test_progress_and_gathering_are_paid_by_the_metre_and_time_by_the_second() -
     assert nearer > 0
 
 
-def test_all_sheep_in_the_pen_end_it_and_one_outside_does_not() -> None:
+def test_the_episode_ends_only_with_all_sheep_in_the_pen() -> None:
     inside = flock(PEN, spacing=1.1)
     world = scene((50.0, 50.0), inside)
     step = act(world)
@@ -106,7 +106,7 @@ def test_all_sheep_in_the_pen_end_it_and_one_outside_does_not() -> None:
     assert np.isnan(world.measure()["time_to_pen"])
 
 
-def test_dogs_are_paid_the_same_and_end_together() -> None:
+def test_all_dogs_get_the_same_reward() -> None:
     world = scene([(15.0, 30.0), (15.0, 32.0), (15.0, 28.0)], flock((20.0, 30.0)))
     for _ in range(20):
         step = act(world, (1.0, 0.3))
@@ -114,7 +114,7 @@ def test_dogs_are_paid_the_same_and_end_together() -> None:
         np.testing.assert_array_equal(step.terms[0, 0], step.terms[0, 2])
 
 
-def test_a_dog_sees_what_is_there_in_the_frame_of_the_course() -> None:
+def test_a_dog_observes_offsets_in_the_frame_of_the_flocks_course() -> None:
     dogs = np.array([(12.0, 20.0), (25.0, 12.0)])
     world = scene(dogs, flock((18.0, 24.0)))
     for _ in range(5):
@@ -139,8 +139,8 @@ def test_a_dog_sees_what_is_there_in_the_frame_of_the_course() -> None:
     np.testing.assert_allclose(see.stray, far.max(), atol=1e-5)
 
 
-def test_a_field_turned_by_a_quarter_is_seen_and_paid_the_same() -> None:
-    """Nothing in a row may say where north is; without the sheep's whims, which do not turn with the field."""
+def test_observations_and_rewards_do_not_change_if_the_field_is_rotated() -> None:
+    """The field turns by 90 degrees; noise and grazing are off, since they do not turn with it."""
     quarter = np.array([[0.0, -1.0], [1.0, 0.0]])
     dog, sheep = np.array([16.0, 27.0]), flock((21.0, 33.0))
     world = scene(dog, sheep, error=0.0, graze_speed=0.0)
@@ -152,7 +152,7 @@ def test_a_field_turned_by_a_quarter_is_seen_and_paid_the_same() -> None:
         np.testing.assert_allclose(ours.terms, theirs.terms, atol=1e-8)
 
 
-def test_it_begins_with_the_flock_away_from_the_pen_and_dogs_out_of_sight() -> None:
+def test_the_flock_starts_away_from_the_pen_and_dogs_beyond_the_fear_distance() -> None:
     world = World(Herd(dogs=3), 100)
     world.reset(3)
     s = world.state
@@ -163,10 +163,10 @@ def test_it_begins_with_the_flock_away_from_the_pen_and_dogs_out_of_sight() -> N
 
 
 @pytest.mark.parametrize(
-    ("fields", "said"), [({"away": 25.0}, "away = 25"), ({"dogs": 4}, "dogs = 4"), ({"sheep": 1}, "sheep = 1")]
+    ("fields", "message"), [({"away": 25.0}, "away = 25"), ({"dogs": 4}, "dogs = 4"), ({"sheep": 1}, "sheep = 1")]
 )
-def test_what_it_cannot_be_is_refused_in_one_line(fields: dict[str, Any], said: str) -> None:
+def test_invalid_fields_are_refused_in_one_line(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=r".") as caught:
         Herd(**fields)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
