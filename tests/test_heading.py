@@ -1,4 +1,4 @@
-"""The vehicle: headings that outlive standstill, turns that take their time, banking; and nothing of it for others."""
+"""Oriented agents: headings kept at rest, limited turn rates, banking; no cost for agents without headings."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ RATE = 0.8  # rad/s
 
 
 def vehicles(dimension: int = 2, effects: tuple[Effect, ...] = (), count: int = 6, **group: Any) -> Scene:
-    """Some agents about the origin, who fly along the x axis at 1 m/s."""
+    """Return a scene with agents around the origin that fly along the x axis at 1 m/s."""
     corner, ahead = (5.0,) * dimension, (1.0,) + (0.0,) * (dimension - 1)
     spawn = Spawn(low=tuple(-x for x in corner), high=corner, speed=(1, 1), heading=ahead)
     change = {name: group.pop(name) for name in ("dt", "dtype", "space", "integrator", "obstacles") if name in group}
@@ -42,14 +42,14 @@ def vehicles(dimension: int = 2, effects: tuple[Effect, ...] = (), count: int = 
 
 
 def leftward(state: State, strength: float) -> Array:
-    """A force to everybody's left, in the horizontal plane."""
+    """Return a force to the left of every agent, in the horizontal plane."""
     out = np.zeros(state.shape)
     out[..., 0], out[..., 1] = -strength * state.heading[..., 1], strength * state.heading[..., 0]
     return out
 
 
 def angle(a: Array, b: Array) -> Array:
-    """Between vectors, rad, exact for small ones."""
+    """Return the angles between vectors, rad; exact for small angles."""
     a, b = (np.asarray(x, float) / np.linalg.norm(x, axis=-1, keepdims=True) for x in (a, b))
     return np.asarray(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
 
@@ -59,7 +59,7 @@ def angle(a: Array, b: Array) -> Array:
 
 @DIMENSIONS
 def test_a_heading_is_kept_at_rest(dimension: int) -> None:
-    """While it moves it is unit(v); brought to a stop it stays; a scene that keeps none has none."""
+    """A moving agent's heading is unit(v), and stays when the agent stops; other scenes keep no heading."""
     scene = vehicles(dimension, (Drag(rate=0.5),), oriented=True, max_force=3.0)
     state = scene.start(1)
     assert np.allclose(state.heading[..., 0], 1)
@@ -77,25 +77,27 @@ def test_a_heading_is_kept_at_rest(dimension: int) -> None:
 
 @pytest.mark.slow
 @DIMENSIONS
-def test_who_stands_looks_where_it_last_went(dimension: int) -> None:
-    """The field of view of laws about neighbours is that of the kept heading: what is behind is not seen."""
+def test_the_field_of_view_of_a_standing_agent_is_around_its_kept_heading(dimension: int) -> None:
+    """A neighbour behind the kept heading is not seen."""
     scene = vehicles(dimension, (Separation(weight=1, radius=3, fov=180),), count=2, oriented=True)
     state = scene.start(0)
     state.pos[0, 0], state.pos[0, 1] = 0, 0
     state.pos[0, 1, 0] = 1
     state.vel[...] = 0
     acceleration = scene.acceleration(state)
-    np.testing.assert_allclose(acceleration[0, 0, 0], -1)  # the other is ahead of it, at a distance of 1 m
+    np.testing.assert_allclose(acceleration[0, 0, 0], -1)  # the neighbour is 1 m ahead
     np.testing.assert_array_equal(acceleration[0, 1], 0)
     state.heading[0] *= -1
     np.testing.assert_array_equal(scene.acceleration(state)[0, 0], 0)
     np.testing.assert_allclose(scene.acceleration(state)[0, 1, 0], 1)
     plain = vehicles(dimension, (Separation(weight=1, radius=3, fov=180),), count=2)
     other = plain.start(0).with_motion(state.pos, state.vel)
-    assert (np.abs(plain.acceleration(other)[0, :, 0]) == 1).all()  # at standstill, without a heading, all around
+    assert (
+        np.abs(plain.acceleration(other)[0, :, 0]) == 1
+    ).all()  # without a heading, an agent at rest sees all around
 
 
-def test_headings_begin_where_the_spawn_says_and_follow_what_is_written() -> None:
+def test_headings_start_as_spawned_and_follow_velocities_that_are_written() -> None:
     spawn = Spawn(low=(0, 0), high=(1, 1), heading=(0, -2))
     state = Scene(groups=(Group(count=3, spawn=spawn, oriented=True),)).start(0)
     np.testing.assert_array_equal(state.vel, 0)
@@ -114,8 +116,8 @@ def test_headings_begin_where_the_spawn_says_and_follow_what_is_written() -> Non
 
 @DIMENSIONS
 @pytest.mark.parametrize("method", [None, pytest.param(RK4(), marks=pytest.mark.slow)])
-def test_a_vehicle_that_turns_as_fast_as_it_can_flies_a_circle(dimension: int, method: Any) -> None:
-    """In steps of s dt, each turned by rate dt: on a circle of radius s dt/(2 sin(rate dt/2)), s/rate for small dt."""
+def test_an_agent_at_its_turn_rate_limit_flies_a_circle(dimension: int, method: Any) -> None:
+    """Steps of s dt, each turned by rate dt, lie on a circle of radius s dt/(2 sin(rate dt/2)); s/rate for small dt."""
     fields = {} if method is None else {"integrator": method}
     scene = vehicles(dimension, (Drag(rate=0.0),), max_turn_rate=RATE, max_speed=1.0, **fields)
     state = scene.step(scene.start(2), leftward(scene.start(2), 8.0))
@@ -137,7 +139,7 @@ def test_a_vehicle_that_turns_as_fast_as_it_can_flies_a_circle(dimension: int, m
 @DIMENSIONS
 @pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_no_step_turns_by_more_than_the_rate(dimension: int, dtype: str) -> None:
-    """Whatever is asked for, at rest and head-on backwards too; and who wants to turn less turns as he wants."""
+    """This holds for any drive, also at rest and straight backwards; turns below the limit are not changed."""
     scene = vehicles(dimension, (Drag(rate=0.0),), max_turn_rate=RATE, max_speed=1.0, dtype=dtype)
     state, rng = scene.start(3), np.random.default_rng(0)
     most = RATE * scene.dt
@@ -147,19 +149,19 @@ def test_no_step_turns_by_more_than_the_rate(dimension: int, dtype: str) -> None
         if k % 10 == 5:
             drive = -120 * state.heading.astype(float)
         before, place = state.heading.copy(), state.pos.copy()
-        wanted = state.vel + drive * scene.dt
+        unlimited = state.vel + drive * scene.dt
         state = scene.step(state, drive)
         turn = angle(state.heading, before)
         assert (turn <= most + 8 * eps).all()
-        less = angle(wanted, before) < 0.9 * most
-        np.testing.assert_allclose(turn[less], angle(wanted, before)[less], atol=16 * eps)
+        less = angle(unlimited, before) < 0.9 * most
+        np.testing.assert_allclose(turn[less], angle(unlimited, before)[less], atol=16 * eps)
         went = state.pos - place
         moved = np.linalg.norm(went, axis=-1) > 1e-4
         assert (angle(went[moved], before[moved]) <= most + (1e-9 if dtype == "float64" else 2e-2)).all()
 
 
-def test_from_standstill_it_turns_on_the_spot() -> None:
-    """Pushed backwards it stays where it is until the way ahead lies within a right angle: pi/2 / rate seconds."""
+def test_an_agent_at_rest_turns_on_the_spot() -> None:
+    """Pushed backwards, it does not move until its heading is within 90 degrees of the push: pi/2 / rate seconds."""
     scene = vehicles(2, (Drag(rate=0.0),), max_turn_rate=RATE, max_speed=1.0)
     state = scene.start(0)
     state.vel[...] = 0
@@ -169,14 +171,14 @@ def test_from_standstill_it_turns_on_the_spot() -> None:
     state = scene.step(state, push, steps=half - 1)
     np.testing.assert_array_equal(state.pos, begin)
     np.testing.assert_allclose(angle(state.heading, scene.start(0).heading), (half - 1) * RATE * scene.dt)
-    np.testing.assert_array_less(state.heading[..., 1], 0)  # over its right hand, as everybody
+    np.testing.assert_array_less(state.heading[..., 1], 0)  # all turn to the right
     state = scene.step(state, push, steps=2 * half)
     np.testing.assert_allclose(state.heading[..., 0], -1, atol=1e-3)
     assert (state.pos[..., 0] < begin[..., 0] - 0.1).all()
 
 
-def test_a_wide_limit_changes_nothing() -> None:
-    """A turn that is allowed leaves velocity and place as they are, to the last bit; so do frames that nobody reads."""
+def test_a_limit_that_is_never_reached_changes_nothing() -> None:
+    """Positions and velocities have the same bits without headings, with them, and with a wide limit."""
     drive = np.random.default_rng(1).normal(size=(1, 6, 2))
     ends = []
     for group in ({}, {"oriented": True}, {"max_turn_rate": 400.0}):
@@ -188,8 +190,8 @@ def test_a_wide_limit_changes_nothing() -> None:
 
 
 @pytest.mark.slow
-def test_each_group_has_its_own_rate_and_a_wall_turns_anybody() -> None:
-    """A bounce is no turn of one's own: the heading follows it at once."""
+def test_each_group_has_its_own_turn_rate_and_a_bounce_turns_at_once() -> None:
+    """The turn rate does not limit a bounce off a wall."""
     still = Spawn(low=(4, 4), high=(6, 6), speed=(1, 1), heading=(1, 0))
     groups = tuple(Group(count=3, spawn=still, max_turn_rate=rate) for rate in (0.5, 2.0, None))
     scene = Scene(space=Box(size=(10, 10), restitution=1.0), groups=groups, effects=(Drag(rate=0),), dt=0.01)
@@ -204,15 +206,15 @@ def test_each_group_has_its_own_rate_and_a_wall_turns_anybody() -> None:
 
 
 def basis(state: State) -> tuple[Array, Array, Array]:
-    """Side (the right hand), forward and up."""
+    """Return side (to the right), forward and up."""
     side = np.cross(state.heading, state.up)
     return side, state.heading, state.up
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_the_basis_stays_right_handed(dtype: str) -> None:
-    """After 10,000 steps in all directions det (side, forward, up) = +1; up = f x side of 1999 would make it -1."""
+def test_side_forward_and_up_stay_a_right_handed_basis(dtype: str) -> None:
+    """After 10,000 steps in all directions det (side, forward, up) = +1; with up = f x side (1999) it would be -1."""
     scene = vehicles(3, (Drag(rate=0.3),), oriented=True, dtype=dtype, dt=0.02)
     state, rng = scene.start(5), np.random.default_rng(2)
     np.testing.assert_allclose(np.linalg.det(np.stack(basis(state), axis=-1)), 1, rtol=1e-6)
@@ -231,12 +233,12 @@ def test_the_basis_stays_right_handed(dtype: str) -> None:
 
 
 @pytest.mark.slow
-def test_up_is_up_for_who_flies_level_and_survives_a_climb() -> None:
+def test_up_is_vertical_in_level_flight_and_leans_back_in_a_climb() -> None:
     scene = vehicles(3, (Drag(rate=0.0),), oriented=True)
     state = scene.start(0)
     np.testing.assert_array_equal(state.up, np.broadcast_to((0, 0, 1), state.shape))
-    np.testing.assert_array_equal(basis(state)[0], np.broadcast_to((0, -1, 0), state.shape))  # the right hand
-    state.vel[...] = (0, 0, 1)  # straight up at once: side stays as it was, up leans back
+    np.testing.assert_array_equal(basis(state)[0], np.broadcast_to((0, -1, 0), state.shape))  # to the right
+    state.vel[...] = (0, 0, 1)  # straight up at once: side does not change, up leans back
     state = scene.step(state)
     np.testing.assert_allclose(basis(state)[0], np.broadcast_to((0, -1, 0), state.shape), atol=1e-12)
     np.testing.assert_allclose(state.up, np.broadcast_to((-1, 0, 0), state.shape), atol=1e-12)
@@ -245,8 +247,8 @@ def test_up_is_up_for_who_flies_level_and_survives_a_climb() -> None:
 
 
 @pytest.mark.slow
-def test_it_leans_into_a_turn_as_far_as_its_acceleration_says() -> None:
-    """In a steady turn tan(bank) = s omega/g, to the side it turns to; level flight brings it back upright."""
+def test_the_bank_angle_of_a_steady_turn_follows_from_its_acceleration() -> None:
+    """In a steady turn tan(bank) = s omega/g, towards the inside; in level flight the agent returns upright."""
     scene = vehicles(3, (Drag(rate=0.0),), max_turn_rate=2.0, max_speed=6.0, banking=0.3)
     state = scene.start(0)
     state.vel[..., 0] = 6.0
@@ -262,7 +264,7 @@ def test_it_leans_into_a_turn_as_far_as_its_acceleration_says() -> None:
     half = scene.model_copy(update={"dt": 0.005})
     other = half.start(0)
     other.vel[..., 0] = 6.0
-    for _ in range(60):  # on the way there, too, it is no matter of dt
+    for _ in range(60):  # the transient does not depend on dt either
         other = half.step(other, leftward(other, 20.0))
     once = scene.start(0)
     once.vel[..., 0] = 6.0
@@ -271,11 +273,11 @@ def test_it_leans_into_a_turn_as_far_as_its_acceleration_says() -> None:
     np.testing.assert_allclose(np.arccos(other.up[..., 2]), np.arccos(once.up[..., 2]), rtol=0.05)
 
 
-# --- all other promises -----------------------------------------------------------------------------------------------
+# --- batches, cost, records, refusals ---------------------------------------------------------------------------------
 
 
 def crowded(count: int, **group: Any) -> Scene:
-    """A flock with a view cone on a torus: many enough agents are sorted by cell, and put in order."""
+    """Return a flock with a field of view on a torus; a large one is sorted by cell and rearranged in memory."""
     edge = math.sqrt(count) * 0.7
     effects = (Alignment(weight=2, radius=1.5, fov=200), Separation(weight=1, radius=1, fov=250))
     spawn = Spawn(speed=(0.0, 1.5))
@@ -285,7 +287,7 @@ def crowded(count: int, **group: Any) -> Scene:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [40, pytest.param(9000, marks=pytest.mark.slow)])
-def test_worlds_of_a_batch_calls_of_one_step_and_threads_give_the_same_bits(count: int) -> None:
+def test_headings_do_not_depend_on_batches_steps_per_call_or_threads(count: int) -> None:
     scene = crowded(count, max_turn_rate=1.0)
     batch = scene.run(scene.start(7, worlds=3), 12)
     alone = scene.run(scene.start(9), 12)
@@ -295,10 +297,10 @@ def test_worlds_of_a_batch_calls_of_one_step_and_threads_give_the_same_bits(coun
     had = threads()
     try:
         use_threads(2)
-        crew = scene.run(scene.start(9), 12)
+        threaded = scene.run(scene.start(9), 12)
     finally:
         use_threads(had)
-    for other in (alone, single, crew):
+    for other in (alone, single, threaded):
         np.testing.assert_array_equal(batch.x[:, 2], other.x[:, 0])
         np.testing.assert_array_equal(batch.frame[:, 2], other.frame[:, 0])
     assert angle(batch.heading, scene.start(7, worlds=3).heading).max() <= 12 * 0.05 * 1.0 + 1e-9
@@ -307,7 +309,7 @@ def test_worlds_of_a_batch_calls_of_one_step_and_threads_give_the_same_bits(coun
 
 
 @pytest.mark.slow
-def test_the_dead_and_worlds_that_diverge_keep_their_heading() -> None:
+def test_dead_agents_and_diverged_worlds_keep_their_headings() -> None:
     scene = vehicles(2, (Drag(rate=0.0),), max_turn_rate=1.0)
     state = scene.start(1, worlds=2)
     state.alive[0, 2] = False
@@ -321,7 +323,7 @@ def test_the_dead_and_worlds_that_diverge_keep_their_heading() -> None:
     assert angle(end.heading[0, 0], before[0, 0]) == pytest.approx(0.01)
 
 
-def test_who_keeps_no_heading_pays_nothing() -> None:
+def test_scenes_without_headings_need_no_memory_or_code_for_them() -> None:
     plain, kept = vehicles(), vehicles(oriented=True)
     assert plain.start(0).frame.shape == (0, 1, 6)
     assert kept.start(0).frame.shape == (2, 1, 6)
@@ -335,7 +337,7 @@ def test_who_keeps_no_heading_pays_nothing() -> None:
     )
 
 
-def test_pictures_and_records_show_the_heading(tmp_path: Path) -> None:
+def test_snapshots_and_records_contain_the_heading(tmp_path: Path) -> None:
     scene = vehicles(2, (Drag(rate=0.0),), oriented=True)
     state = scene.start(0)
     state.vel[...] = 0
@@ -361,12 +363,12 @@ def test_pictures_and_records_show_the_heading(tmp_path: Path) -> None:
         ({"banking": 0.3}, r"groups\[0\].banking = 0.3: only in 3-D"),
     ],
 )
-def test_what_does_not_fit_is_refused(group: dict[str, Any], message: str) -> None:
+def test_invalid_turn_rates_and_banking_in_2d_are_refused(group: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         vehicles(2, **group)
 
 
-def test_a_state_without_headings_is_refused_by_a_scene_that_keeps_them() -> None:
+def test_states_and_scenes_must_agree_on_headings() -> None:
     with pytest.raises(ValueError, match="the state keeps no headings, but this scene keeps headings"):
         vehicles(oriented=True).step(vehicles().start(0))
     with pytest.raises(ValueError, match="the state keeps headings, but this scene keeps no headings"):
@@ -377,20 +379,20 @@ def test_a_state_without_headings_is_refused_by_a_scene_that_keeps_them() -> Non
 
 
 def runners(horizon: float, **group: Any) -> Scene:
-    """V = 2 m/s, m = 1 kg, F = 4 N, r = 0.1 m: the stopping distance is 0.5 m, and 0.6 m with its radius."""
+    """Return agents with V = 2 m/s, m = 1 kg, F = 4 N, r = 0.1 m: the stopping distance is 0.5 m, 0.6 m with r."""
     given: dict[str, Any] = {"max_speed": 2.0, "max_force": 4.0} | group
     return vehicles(2, (AvoidObstacles(weight=4, horizon=horizon),), **given)
 
 
-def test_a_lookahead_shorter_than_the_stopping_distance_is_warned_of() -> None:
+def test_a_lookahead_shorter_than_the_stopping_distance_causes_a_warning() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         runners(0.31)
-        runners(0.01, max_force=None)  # nobody knows how fast it stops, or goes
+        runners(0.01, max_force=None)  # without both limits no stopping distance is known
         runners(0.01, max_speed=None)
-    with pytest.warns(LookaheadWarning, match=r"effects\[0\].horizon = 0.29: .* 0.58 m .* 0.6 m .* 0.3 s") as told:
+    with pytest.warns(LookaheadWarning, match=r"effects\[0\].horizon = 0.29: .* 0.58 m .* 0.6 m .* 0.3 s") as caught:
         runners(0.29)
-    assert "\n" not in str(told[0].message)
+    assert "\n" not in str(caught[0].message)
     steer = Steer(group=0, behaviours=(Separation(weight=1, radius=1), AvoidObstacles(weight=4, horizon=0.29)))
     with pytest.warns(LookaheadWarning, match=r"effects\[0\].behaviours\[1\].horizon = 0.29"):
         vehicles(2, (steer,), max_speed=2.0, max_force=4.0)
@@ -398,20 +400,22 @@ def test_a_lookahead_shorter_than_the_stopping_distance_is_warned_of() -> None:
         warnings.simplefilter("error")
         other = Group(count=1, spawn=Spawn(low=(0, 0), high=(1, 1)), max_speed=2.0, max_force=40.0)
         slow = vehicles(2, (Drag(rate=0.0),), max_speed=2.0, max_force=4.0)
-        slow.model_copy(update={"groups": (other, *slow.groups), "effects": (steer,)})  # it is about others
+        slow.model_copy(
+            update={"groups": (other, *slow.groups), "effects": (steer,)}
+        )  # the steer acts on the other group
 
 
 # --- tasks ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-def test_a_task_whose_agents_keep_headings_plays_on() -> None:
-    """An episode begins with headings along the velocities; turns are limited; a world of a batch is itself alone."""
+def test_a_task_can_have_agents_with_limited_turn_rates() -> None:
+    """Episodes start with headings along velocities, turns are limited, and worlds do not depend on their batch."""
 
     def world(count: int) -> World:
         task = Obstacles()
         groups = tuple(group.model_copy(update={"max_turn_rate": RATE}) for group in task.scene.groups)
-        vars(task)["scene"] = task.scene.model_copy(update={"groups": groups})  # before anything follows from it
+        vars(task)["scene"] = task.scene.model_copy(update={"groups": groups})  # before anything is derived from it
         return World(task, worlds=count)
 
     batch, alone = world(3), world(1)

@@ -1,4 +1,4 @@
-"""Methods that solve equations: against dense references, in scenes, and what they say when there is no solution."""
+"""Implicit methods: against dense references, in scenes, and their errors if there is no solution."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from flockenv.physics.integrators.newton import Coupling, NotSolvedError, couple
 from flockenv.scene import Group, Scene
 from tests.catalogue import Array
 
-SOLVERS = pytest.mark.parametrize("way", ["sparse", "free"])
+SOLVERS = pytest.mark.parametrize("solver", ["sparse", "free"])
 
 
 # --- one stage, without a scene ---------------------------------------------------------------------------------------
 
 
 def linear(rng: Any, agents: int, dimension: int, stiff: float) -> tuple[Any, Array, Array, Array, Array, Coupling]:
-    """A chain of agents: a = -K x - C v + f, carried by u = U x; and who depends on whom."""
+    """Return a chain of agents, a = -K x - C v + f t, carried by u = U x, and which agents depend on each other."""
     n = agents * dimension
     near = np.abs(np.subtract.outer(np.arange(agents), np.arange(agents))) <= 1
     mask = np.tile(near, (dimension, dimension))
@@ -44,7 +44,7 @@ def linear(rng: Any, agents: int, dimension: int, stiff: float) -> tuple[Any, Ar
 
 @SOLVERS
 @pytest.mark.parametrize(("dimension", "stiff"), [(2, 1.0), (3, 30.0)])
-def test_a_linear_stage_is_the_dense_solution(way: str, dimension: int, stiff: float) -> None:
+def test_a_linear_stage_is_the_dense_solution(solver: str, dimension: int, stiff: float) -> None:
     """x = x0 + h (v + U x), v = v0 + h (-K x - C v + f t): two blocks of linear equations."""
     rng = np.random.default_rng(dimension)
     evaluate, stiffness, damping, flow, force, coupling = linear(rng, 6, dimension, stiff)
@@ -53,14 +53,14 @@ def test_a_linear_stage_is_the_dense_solution(way: str, dimension: int, stiff: f
     one = np.eye(n)
     whole = np.block([[one - h * flow, -h * one], [h * stiffness, one + h * damping]])
     expected = np.linalg.solve(whole, np.concatenate([x0, v0 + h * force * time]))
-    found = solve_stage(evaluate, x0, v0, time, h, dimension, coupling if way == "sparse" else None)
+    found = solve_stage(evaluate, x0, v0, time, h, dimension, coupling if solver == "sparse" else None)
     np.testing.assert_allclose(np.concatenate([found.x, found.v]), expected, rtol=1e-9, atol=1e-10)
     assert 1 <= found.newton <= 6
     assert found.linear >= found.newton - 1
 
 
-def test_nobody_meets_two_of_one_colour() -> None:
-    """And as few colours as a chain, a ring, a star and nobody need."""
+def test_no_agent_depends_on_two_agents_of_one_colour() -> None:
+    """The number of colours is at most 3 for a chain, 1 for unconnected agents, and 8 for a star of 8."""
     rng = np.random.default_rng(0)
     for agents, first, second, most in (
         (30, np.arange(29), np.arange(1, 30), 3), (1, [], [], 1), (5, [], [], 1), (8, [0] * 7, np.arange(1, 8), 8),
@@ -69,28 +69,30 @@ def test_nobody_meets_two_of_one_colour() -> None:
         pairs = np.asarray(first, int), np.asarray(second, int)
         found = coupled(agents, *pairs)
         seen = set(zip(found.row.tolist(), found.column.tolist(), strict=True))
-        wanted = {(i, i) for i in range(agents)} | set(zip(*(p.tolist() for p in pairs), strict=True))
-        assert seen == wanted
+        expected_pairs = {(i, i) for i in range(agents)} | set(zip(*(p.tolist() for p in pairs), strict=True))
+        assert seen == expected_pairs
         assert found.colours <= most
         for i in range(agents):
             colours = found.colour[[column for row, column in seen if row == i]]
             assert len(set(colours.tolist())) == len(colours)
 
 
-def test_what_has_no_solution_says_so() -> None:
+def test_a_stage_without_a_solution_raises_an_error() -> None:
     x0, v0 = np.zeros(2), np.ones(2)
-    for law, said in (
+    for law, message in (
         (lambda x, v, t: (np.full_like(x, np.nan), None), "not finite"),
         (lambda x, v, t: (np.where(v > 0, -10.0, 10.0) * np.ones_like(x), None), "converged|derivative"),
     ):
         for coupling in (None, coupled(1, np.zeros(0, int), np.zeros(0, int))):
-            with pytest.raises(NotSolvedError, match=said):
+            with pytest.raises(NotSolvedError, match=message):
                 solve_stage(law, x0, v0, 0.0, 1.0, 2, coupling)
 
 
-def test_a_step_that_is_not_solved_is_made_in_halves(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a force that no number is given for beyond x = 1 per step, shorter steps find one."""
-    monkeypatch.setitem(INTEGRATORS, "implicit_euler", ImplicitEuler)  # a class registers itself: not beyond this test
+def test_a_step_without_a_solution_is_halved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """This method finds no solution for dt > 0.3, so a step of 1 s is solved in four of 0.25 s."""
+    monkeypatch.setitem(
+        INTEGRATORS, "implicit_euler", ImplicitEuler
+    )  # the class below registers itself; undone after this test
     calls: list[float] = []
 
     class Picky(ImplicitEuler):
@@ -124,7 +126,7 @@ WEIGHT = Gravity(acceleration=(0.0, -9.81))
 
 
 def hanging(*, method: Any = None, stiffness: float = 400.0, damping: float = 0.1, **fields: Any) -> Scene:
-    """A sheet held at two corners, and five agents beside it: the one set of laws of most tests here."""
+    """Return a sheet pinned at two corners and five agents beside it; most tests here share its laws."""
     groups = fields.pop("groups", (Group(network=SHEET, mass=0.05), LOOSE))
     effects: tuple[Effect, ...] = (Springs(stiffness=stiffness, damping=damping), fields.pop("weight", WEIGHT))
     given: dict[str, Any] = {"integrator": method or ImplicitEuler(), "dt": 0.02} | fields
@@ -145,8 +147,8 @@ def same(a: State, b: State) -> None:
 
 
 @pytest.mark.parametrize("method", [ImplicitEuler(), ImplicitMidpoint()], ids=lambda method: method.kind)
-def test_a_step_solves_its_equations(method: Any) -> None:
-    """Against scipy's hybrid method on the scene's own acceleration, with a drive."""
+def test_a_step_solves_the_equations_of_its_method(method: Any) -> None:
+    """The reference is scipy's hybrid method on the scene's acceleration, with a drive."""
     scene = hanging(method=method)
     state = shaken(scene)
     drive = np.random.default_rng(2).normal(size=state.shape)
@@ -163,16 +165,16 @@ def test_a_step_solves_its_equations(method: Any) -> None:
     assert found.time[0] == scene.dt
 
 
-def test_all_solvers_find_the_same() -> None:
-    """Sparse factors, differences along directions, a full matrix."""
+def test_all_solvers_find_the_same_solution() -> None:
+    """The solvers use sparse factors, differences along directions, or a full matrix."""
     found = []
-    for way in ("sparse", "free", "dense"):
+    for solver in ("sparse", "free", "dense"):
         scene = hanging()
-        everybody = np.indices((scene.agents, scene.agents)).reshape(2, -1)
+        all_pairs = np.indices((scene.agents, scene.agents)).reshape(2, -1)
         assert scene.coupling is not None
         assert scene.coupling.colours < 15
-        if way != "sparse":
-            scene.__dict__["coupling"] = None if way == "free" else coupled(scene.agents, *everybody)
+        if solver != "sparse":
+            scene.__dict__["coupling"] = None if solver == "free" else coupled(scene.agents, *all_pairs)
         found.append(scene.run(shaken(scene), 5))
     for other in found[1:]:
         np.testing.assert_allclose(other.pos, found[0].pos, atol=1e-9)
@@ -180,7 +182,7 @@ def test_all_solvers_find_the_same() -> None:
     assert found[1].counted("linear_iterations") > found[0].counted("linear_iterations")
 
 
-def test_worlds_of_a_batch_and_steps_of_a_call_do_not_know_of_each_other() -> None:
+def test_results_do_not_depend_on_batches_or_steps_per_call() -> None:
     scene = hanging()
     start = shaken(scene, worlds=3)
     whole = scene.step(start, steps=3)
@@ -202,12 +204,12 @@ def test_worlds_of_a_batch_and_steps_of_a_call_do_not_know_of_each_other() -> No
     assert whole.counted("evaluations") > whole.counted("newton_iterations")
 
 
-def test_the_dead_and_the_held_stay_and_limits_hold() -> None:
+def test_dead_and_pinned_agents_stay_and_limits_of_speed_and_force_hold() -> None:
     scene = hanging()
     start = shaken(scene)
     dead, held = [6, 21], np.flatnonzero(np.isinf(scene.body.mass))
     start.alive[0, dead] = False
-    drive = np.full(start.shape, 100.0)  # far more than anybody may ask for
+    drive = np.full(start.shape, 100.0)  # far more than any agent's max_force
     end = scene.step(start, drive=drive, steps=10)
     np.testing.assert_array_equal(end.pos[0, dead], start.pos[0, dead])
     np.testing.assert_array_equal(end.pos[0, held], start.pos[0, held])
@@ -219,18 +221,18 @@ def test_the_dead_and_the_held_stay_and_limits_hold() -> None:
     assert np.linalg.norm(push) == pytest.approx(3.0 / 0.4, rel=1e-6)
 
 
-def test_coincident_agents_part() -> None:
-    """P39: where Newton's method begins forces may have no derivative."""
+def test_coincident_agents_of_a_rope_part() -> None:
+    """P39: forces have no derivative at the start of Newton's method."""
     rope = Group(network=Rope(links=3, length=0.3), mass=0.1)
     scene = hanging(groups=(rope,), weight=Gravity(acceleration=(0.0, 0.0)))
     state = scene.start(0)
     state.pos[...] = 1.0
     end = scene.run(state, 20)
-    assert np.linalg.norm(np.diff(end.pos[0], axis=0), axis=1).min() > 0.05  # who is tied; others may lie over him
+    assert np.linalg.norm(np.diff(end.pos[0], axis=0), axis=1).min() > 0.05  # only bonded neighbours must part
     np.testing.assert_allclose(end.vel[0].sum(axis=0), 0, atol=1e-10)
 
 
-def test_free_springs_keep_momentum() -> None:
+def test_momentum_is_conserved_by_free_springs() -> None:
     sheet = Group(network=Cloth(cells=(4, 3), sides=(1.0, 0.8), stretch=1.1), mass=0.05)
     scene = hanging(groups=(sheet,), stiffness=1e4, weight=Gravity(acceleration=(0.0, 0.0)))
     start = shaken(scene)
@@ -238,8 +240,8 @@ def test_free_springs_keep_momentum() -> None:
     np.testing.assert_allclose((end.vel - start.vel)[0].sum(axis=0) * 0.05, 0, atol=1e-10)
 
 
-def test_implicit_midpoint_keeps_the_energy_of_a_linear_network() -> None:
-    """Without rest lengths springs are linear: exactly, here 1e-12 over 1,000 steps."""
+def test_implicit_midpoint_conserves_the_energy_of_a_linear_network() -> None:
+    """Springs without rest lengths are linear; the relative error stays below 1e-12 over 1,000 steps."""
     sheet = Group(network=Cloth(cells=(2, 2), sides=(1.0, 0.8), pinned=("corners",)), mass=0.05)
     effects = Springs(stiffness=40.0, rest=0.0), Gravity(acceleration=(0.0, 0.0))
     scene = Scene(groups=(sheet,), effects=effects, integrator=ImplicitMidpoint(), dt=0.05)
@@ -260,7 +262,7 @@ def test_implicit_midpoint_keeps_the_energy_of_a_linear_network() -> None:
 
 @pytest.mark.parametrize("stiffness", [1e3, 1e8])
 def test_a_cloth_gains_no_energy(stiffness: float) -> None:
-    """P40, N14: kinetic and elastic energy stay below 1.05 of what gravity did, at 60 frames a second."""
+    """P40, N14: at 60 steps per second, kinetic and elastic energy stay below 1.05 times the work of gravity."""
     sheet = Cloth(cells=(9, 9), sides=(1.0, 1.0), pinned=("top_left", "top_right"))
     scene = hanging(groups=(Group(network=sheet, mass=0.01),), stiffness=stiffness, damping=0.0, dt=1 / 60)
     state = scene.start(0)
@@ -274,13 +276,13 @@ def test_a_cloth_gains_no_energy(stiffness: float) -> None:
         assert total <= 1.05 * 9.81 * (height - (mass * state.pos[0, :, 1]).sum()) + 1e-9
 
 
-# --- what cannot be solved --------------------------------------------------------------------------------------------
+# --- divergence -------------------------------------------------------------------------------------------------------
 
 
-def test_a_world_without_a_solution_is_named_and_the_others_go_on() -> None:
+def test_an_error_names_the_world_without_a_solution_and_the_others_go_on() -> None:
     scene = hanging()
     start = shaken(scene, worlds=3)
-    start.pos[1, 7] = 1e200  # springs of no finite length
+    start.pos[1, 7] = 1e200  # the lengths of its springs are not finite
     with pytest.raises(SimulationDiverged, match="world 1, agent") as caught:
         scene.step(start, steps=2)
     error = caught.value
@@ -297,8 +299,8 @@ def test_a_world_without_a_solution_is_named_and_the_others_go_on() -> None:
 
 
 @pytest.mark.slow
-def test_in_single_precision_around_a_torus() -> None:
-    """Float32 stays float32, and everybody in the box; the same motion to its rounding."""
+def test_single_precision_on_a_torus_follows_double_precision() -> None:
+    """Arrays stay float32, agents stay in the box, and the motion agrees to the rounding of float32."""
     groups = (Group(network=Rope(links=4, length=0.4, start=(3.8, 2.0), stretch=1.2), mass=0.1), LOOSE)
     scene = hanging(groups=groups, space=Torus(size=(4.0, 4.0)), dtype="float32")
     end = scene.run(scene.start(0), 5)
@@ -312,8 +314,8 @@ def test_in_single_precision_around_a_torus() -> None:
 
 
 @pytest.mark.slow
-def test_a_medium_carries_and_agents_that_look_around_are_coupled() -> None:
-    """x' = v + u(x): against scipy on the scene's own rates; few agents by a full matrix, many without one."""
+def test_a_medium_and_forces_between_neighbours_are_solved() -> None:
+    """x' = v + u(x), against scipy on the scene's rates; few agents are solved by a full matrix, many without one."""
     group = Group(count=6, spawn=Spawn(low=(0, 0), high=(2, 2), speed=(0.2, 1.0)))
     effects = (
         Vortex(strength=2.0, centre=(1.0, 1.0), maximum=3.0, acts="medium"), Carried(), Drag(rate=0.7),

@@ -1,4 +1,4 @@
-"""Loops over lanes stay loops until LLVM comes to make vectors of them; no other loop is touched."""
+"""Loops over lanes are not unrolled before LLVM vectorizes them; other loops are not touched."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from flockenv.jit.pipeline import Whole
 LANES = 8
 
 
-def written_down(x: Any, y: Any, n: int) -> None:
-    for l in range(np.uint64(8)):  # noqa: E741  # as in the files that are generated
-        y[l + np.uint64(1)] = y[l] * x[l]  # one after the other: it stays a loop to the end
+def literal_count(x: Any, y: Any, n: int) -> None:
+    for l in range(np.uint64(8)):  # noqa: E741  # as in generated files
+        y[l + np.uint64(1)] = y[l] * x[l]  # each element needs the one before: LLVM cannot vectorize it
 
 
-def of_the_module(x: Any, y: Any, n: int) -> None:
+def module_constant(x: Any, y: Any, n: int) -> None:
     lanes = np.uint64(LANES)
     for lane in range(lanes):
         y[lane + np.uint64(1)] = y[lane] * x[lane]
 
 
-def within_another(x: Any, y: Any, n: int) -> None:
+def nested(x: Any, y: Any, n: int) -> None:
     k = 0
     while k < n:
         for lane in range(np.uint64(LANES)):
@@ -38,7 +38,7 @@ def within_another(x: Any, y: Any, n: int) -> None:
         k += 1
 
 
-def with_two_ways_back(x: Any, y: Any, n: int) -> None:
+def with_continue(x: Any, y: Any, n: int) -> None:
     for lane in range(np.uint64(LANES)):
         if x[lane] > 0.0:
             continue
@@ -50,7 +50,7 @@ def signed(x: Any, y: Any, n: int) -> None:
         y[lane + 1] = y[lane] * x[lane]
 
 
-def as_many_as_it_says(x: Any, y: Any, n: int) -> None:
+def variable_count(x: Any, y: Any, n: int) -> None:
     for lane in range(np.uint64(n)):
         y[lane + np.uint64(1)] = y[lane] * x[lane]
 
@@ -60,32 +60,32 @@ def too_few(x: Any, y: Any, n: int) -> None:
         y[lane + np.uint64(1)] = y[lane] * x[lane]
 
 
-def from_one_on(x: Any, y: Any, n: int) -> None:
+def starting_at_one(x: Any, y: Any, n: int) -> None:
     for lane in range(np.uint64(1), np.uint64(LANES)):
         y[lane + np.uint64(1)] = y[lane] * x[lane]
 
 
-def over_what_is_given(x: Any, y: Any, n: int) -> None:
+def over_an_array(x: Any, y: Any, n: int) -> None:
     for number in x:
         y[0] = y[1] * number
 
 
 def compiled(part: Callable[..., None]) -> Any:
-    """Return an entry point that is made of one part."""
+    """Return an entry point that calls one kernel."""
     inner: Any = kernel(part)
 
     def entry(x: Any, y: Any, n: int) -> None:
         unaliased()
         inner(x, y, n)
 
-    made: Any = numba.njit(entry, pipeline_class=Whole, error_model="numpy", fastmath={"contract"}, _nrt=False)
-    made.compile((numba.float64[::1], numba.float64[::1], numba.int64))
-    return made
+    entry_point: Any = numba.njit(entry, pipeline_class=Whole, error_model="numpy", fastmath={"contract"}, _nrt=False)
+    entry_point.compile((numba.float64[::1], numba.float64[::1], numba.int64))
+    return entry_point
 
 
 @pytest.fixture
 def kept(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What LLVM was told to keep, as it reads then."""
+    """Return a list that collects the LLVM text of the back edges of every loop that is kept."""
     seen: list[str] = []
     keep = pipeline._LanesStay._keep
 
@@ -97,25 +97,25 @@ def kept(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return seen
 
 
-@pytest.mark.parametrize("part", [written_down, of_the_module, within_another, with_two_ways_back])
-def test_a_loop_over_lanes_is_kept(part: Callable[..., None], kept: list[str]) -> None:
-    made = compiled(part)
+@pytest.mark.parametrize("part", [literal_count, module_constant, nested, with_continue])
+def test_a_loop_over_lanes_is_marked_to_be_kept(part: Callable[..., None], kept: list[str]) -> None:
+    entry_point = compiled(part)
     assert len(kept) == 1
     assert "br label" in kept[0]
     assert "!llvm.loop" in kept[0]
-    text = next(iter(made.inspect_llvm().values()))
-    assert "llvm.loop.unroll.disable" in text  # one agent after the other cannot be made a vector: it is there still
+    text = next(iter(entry_point.inspect_llvm().values()))
+    assert "llvm.loop.unroll.disable" in text  # still there, as the loop is not vectorized
 
 
-@pytest.mark.parametrize("part", [signed, as_many_as_it_says, too_few, from_one_on, over_what_is_given])
-def test_no_other_loop_is(part: Callable[..., None], kept: list[str]) -> None:
+@pytest.mark.parametrize("part", [signed, variable_count, too_few, starting_at_one, over_an_array])
+def test_other_loops_are_not_marked(part: Callable[..., None], kept: list[str]) -> None:
     compiled(part)
     assert kept == []
     assert pipeline.FEWEST_LANES <= LANES
 
 
-@pytest.mark.parametrize("part", [written_down, within_another, with_two_ways_back, signed])
-def test_the_loop_does_what_it_says(part: Callable[..., None]) -> None:
+@pytest.mark.parametrize("part", [literal_count, nested, with_continue, signed])
+def test_a_compiled_loop_gives_the_results_of_python(part: Callable[..., None]) -> None:
     x, y = np.linspace(-0.5, 1.5, 10), np.linspace(1, 2, 10)
     expected = y.copy()
     part(x, expected, 2)
@@ -124,13 +124,13 @@ def test_the_loop_does_what_it_says(part: Callable[..., None]) -> None:
 
 
 def in_lanes(x: Any, y: Any, n: int) -> None:
-    """As short as a law that LLVM would unroll first: a guarded division."""
+    """Divide with a guard; LLVM would unroll a loop as short as this before it vectorizes."""
     for lane in range(np.uint64(LANES)):
         square = x[lane] * x[lane]
         y[lane] = 1.0 / np.sqrt(square) if square > 0.0 else 0.0
 
 
-def test_what_is_made_of_it_is_vectors() -> None:
+def test_a_loop_over_lanes_becomes_vector_instructions() -> None:
     text = next(iter(compiled(in_lanes).inspect_llvm().values()))
     assert re.search(r"fdiv (contract )?<\d+ x double>", text)
     assert not re.search(r"fdiv (contract )?double", text)
@@ -140,7 +140,7 @@ def test_what_is_made_of_it_is_vectors() -> None:
 
 
 def chain(length: int) -> Callable[[float], float]:
-    """Return a kernel that calls a kernel, and so on, as what a scene's effects come to is added up."""
+    """Return a kernel that calls a kernel, and so on, like the sum over the effects of a scene."""
     before: Any = chain(length - 1) if length > 1 else None
 
     def add_one(x: float) -> float:
@@ -149,7 +149,7 @@ def chain(length: int) -> Callable[[float], float]:
     return kernel(add_one)
 
 
-def test_calls_within_calls_compile_however_deep() -> None:
+def test_deeply_nested_kernels_compile() -> None:
     add_all: Any = chain(60)
     compiled: Any = numba.njit(lambda x: add_all(x), pipeline_class=Whole)
     assert compiled(0.5) == 60.5

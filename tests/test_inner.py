@@ -1,4 +1,4 @@
-"""What goes on inside agents, where they want to go, and how a group's numbers are spread."""
+"""Inner states of agents, goals and courses, and spreads of a group's numbers."""
 
 from __future__ import annotations
 
@@ -22,50 +22,50 @@ from flockenv.scene import Group, Scene
 
 @law
 def numbered(p: Any, me: Any) -> Any:
-    """Everybody begins as warm as his number, and has not lived yet."""
+    """Return the agent's index as its initial warmth, and a lifetime of 0."""
     return me.who, me.who - me.who
 
 
 @law
 def warmer(p: Any, me: Any, other: Any) -> Any:
-    """How much warmer a neighbour is."""
+    """Return the difference in warmth of a neighbour."""
     return (other.inner.warmth - me.inner.warmth,)
 
 
 @law
-def all_of_them(p: Any, me: Any, sums: Any) -> Any:
-    """As a vector, which is told."""
+def as_vector(p: Any, me: Any, sums: Any) -> Any:
+    """Return the sum as a vector, which is passed to the keep law."""
     return sums[0], sums[0] - sums[0]
 
 
 @law
-def warmed(p: Any, me: Any, told: Any, seconds: float) -> Any:
-    """Heat flows from neighbours, and time goes by."""
-    return me.inner.warmth + p.rate * seconds * told[0], me.inner.lived + seconds
+def warmed(p: Any, me: Any, received: Any, seconds: float) -> Any:
+    """Add the heat from neighbours, and the time step."""
+    return me.inner.warmth + p.rate * seconds * received[0], me.inner.lived + seconds
 
 
 class Warmth(Effect):
-    """A toy that keeps two numbers, one of them about neighbours."""
+    """A toy effect that keeps two numbers; one of them depends on neighbours."""
 
     kind: str
     rate: float = 0.5
     pair_law: ClassVar[Law | None] = warmer
-    finish_law: ClassVar[Law | None] = all_of_them
+    finish_law: ClassVar[Law | None] = as_vector
     begin_law: ClassVar[Law | None] = numbered
     keep_law: ClassVar[Law | None] = warmed
     keeps: ClassVar[tuple[str, ...]] = ("warmth", "lived")
 
     @property
     def sight(self) -> Sight:
-        """All around."""
+        """Neighbours within 1 m in all directions."""
         return Sight(1.0)
 
     def sums(self, dimension: int) -> int:
-        """One."""
+        """Return 1: the heat."""
         return 1
 
     def parameters(self) -> dict[str, Any]:
-        """How fast."""
+        """Return the rate."""
         return {"rate": self.rate}
 
 
@@ -76,7 +76,7 @@ def warm(count: int, size: float) -> Scene:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("count", "size"), [(30, 5.0), pytest.param(2**14, 90.0, marks=pytest.mark.slow)])
-def test_what_is_kept_follows_neighbours_and_not_the_order_threads_or_calls(count: int, size: float) -> None:
+def test_inner_numbers_do_not_depend_on_threads_calls_or_batches(count: int, size: float) -> None:
     scene = warm(count, size)
     start = scene.start(3, 2)
     warmth = np.array(scene.inner(start, "warmth"))
@@ -85,16 +85,16 @@ def test_what_is_kept_follows_neighbours_and_not_the_order_threads_or_calls(coun
     for _ in range(5):
         for b in range(2):
             near = cKDTree(state.pos[b], boxsize=size).query_pairs(1.0, output_type="ndarray")
-            told = np.zeros(count)
+            received = np.zeros(count)
             for i, j in ((0, 1), (1, 0)):
-                np.add.at(told, near[:, i], warmth[b, near[:, j]] - warmth[b, near[:, i]])
-            warmth[b] += 0.5 * 0.01 * told
+                np.add.at(received, near[:, i], warmth[b, near[:, j]] - warmth[b, near[:, i]])
+            warmth[b] += 0.5 * 0.01 * received
         state = scene.step(state)
         np.testing.assert_allclose(scene.inner(state, "warmth"), warmth, rtol=1e-12)
     np.testing.assert_allclose(scene.inner(state, "lived"), 0.05, rtol=1e-12)
     use_threads(2)
     try:
-        again = scene.step(start, steps=5)  # in one call agents of a large world are put in order
+        again = scene.step(start, steps=5)  # one call of many steps sorts the agents of a large world
     finally:
         use_threads(1)
     np.testing.assert_array_equal(again.inner, state.inner)
@@ -106,7 +106,7 @@ WALKERS = Group(count=6, radius=0.2, mass=70, desired_speed=1.3, spawn=Spawn(low
 
 
 @pytest.mark.slow
-def test_an_antipode_is_kept_from_the_start_and_reached() -> None:
+def test_the_antipode_of_the_start_is_kept_and_reached() -> None:
     scene = Scene(groups=(WALKERS,), effects=(Antipode(centre=(2, 2)), Driving()), dt=0.02)
     start = scene.start(0)
     end = scene.run(start, 600)
@@ -115,18 +115,18 @@ def test_an_antipode_is_kept_from_the_start_and_reached() -> None:
 
 
 @pytest.mark.slow
-def test_driving_relaxes_to_the_desired_speed_of_each() -> None:
+def test_driving_relaxes_to_the_desired_speed_of_each_agent() -> None:
     group = WALKERS.model_copy(update={"desired_speed": Spread(mean=1.34, sd=0.26, low=0.5)})
     scene = Scene(groups=(group, WALKERS), effects=(Course(group=0, direction=(3, 4)), Driving(tau=0.5)), dt=1e-3)
     state = scene.run(scene.start(1), 500)
-    wanted = scene.body.desired_speed[:6]
-    assert np.ptp(wanted) > 0.1
-    np.testing.assert_allclose(state.vel[0, :6], wanted[:, None] * (0.6, 0.8) * (1 - np.exp(-1)), rtol=2e-3)
-    np.testing.assert_array_equal(state.vel[0, 6:], 0)  # nobody told them where to go
+    desired = scene.body.desired_speed[:6]
+    assert np.ptp(desired) > 0.1
+    np.testing.assert_allclose(state.vel[0, :6], desired[:, None] * (0.6, 0.8) * (1 - np.exp(-1)), rtol=2e-3)
+    np.testing.assert_array_equal(state.vel[0, 6:], 0)  # no effect gives them an aim
 
 
 @pytest.mark.slow
-def test_a_goal_is_reached_at_rest_and_on_a_torus_the_short_way() -> None:
+def test_a_goal_on_a_torus_is_reached_at_rest_by_the_shorter_path() -> None:
     walkers = WALKERS.model_copy(update={"count": 1, "spawn": Spawn(low=(9, 5), high=(9.01, 5))})
     scene = Scene(space=Torus(size=(10, 10)), groups=(walkers,), effects=(Goal(target=(1, 5)), Driving()), dt=0.02)
     state = scene.step(scene.start(0), steps=20)
@@ -136,7 +136,7 @@ def test_a_goal_is_reached_at_rest_and_on_a_torus_the_short_way() -> None:
     np.testing.assert_allclose(state.vel[0, 0], 0, atol=1e-3)
 
 
-def test_who_is_born_begins_anew() -> None:
+def test_a_born_agent_starts_with_its_own_inner_numbers() -> None:
     group = WALKERS.model_copy(update={"count": 4, "desired_speed": 0.1})
     born = Emitter(group=0, place=Point(at=(1.0, 3.0)), rate=10.0)
     scene = Scene(groups=(group,), effects=(Antipode(centre=(2, 2)), Driving()), population=(born,), dt=0.05)
@@ -156,7 +156,7 @@ def test_a_scene_without_inner_states_has_none() -> None:
         kept.step(scene.start(0))
 
 
-def test_spreads_are_what_they_say() -> None:
+def test_spreads_have_the_given_moments_and_bounds() -> None:
     share = (np.arange(10_000) + 0.5) / 10_000
     normal = Spread(mean=1.34, sd=0.26).at(share)
     assert abs(normal.mean() - 1.34) < 1e-3
@@ -165,11 +165,11 @@ def test_spreads_are_what_they_say() -> None:
     assert cut.min() >= 1.2
     assert cut.max() <= 1.4
     group = Group(count=500, mass=Spread(low=60, high=100), radius=Spread(low=0.1875, high=0.3125))
-    np.testing.assert_allclose(group.radii * 320, group.masses(2))  # the heavy are wide
-    for none in (Spread(low=0, high=0), Spread(mean=0, sd=0)):
+    np.testing.assert_allclose(group.radii * 320, group.masses(2))  # mass and radius use the same draw
+    for zero in (Spread(low=0, high=0), Spread(mean=0, sd=0)):
         for name in ("mass", "desired_speed"):
             with pytest.raises(ValueError, match=r"must be a number > 0|must be above 0"):
-                Group(count=2, **{name: none})
+                Group(count=2, **{name: zero})
     haste = Group(count=5, desired_speed=Spread(low=1, high=2), haste=1.3)
     np.testing.assert_allclose(haste.max_speeds, 1.3 * haste.desired_speeds)
 
@@ -184,12 +184,12 @@ def test_spreads_are_what_they_say() -> None:
         ({"mean": 3.0, "sd": 1.0, "high": 2.0}, "mean = 3: must lie between low and high"),
     ],
 )
-def test_spreads_that_make_no_sense_are_refused(given: dict[str, float], message: str) -> None:
+def test_invalid_spreads_are_refused(given: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Spread(**given)
 
 
-def test_driving_wants_to_know_how_fast() -> None:
+def test_missing_speeds_and_zero_directions_are_refused() -> None:
     with pytest.raises(ValueError, match=r"groups\[0\].desired_speed = None: give m/s"):
         Scene(groups=(Group(count=1, spawn=Spawn(low=(0, 0), high=(1, 1))),), effects=(Driving(),))
     with pytest.raises(ValueError, match=r"direction = \(0.0, 0.0\): leads nowhere"):
