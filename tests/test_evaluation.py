@@ -1,4 +1,4 @@
-"""Evaluation: accounts that can be done on paper, statistics against closed forms and scipy, worlds that never mix."""
+"""Evaluation: rollouts with known scores, statistics against closed forms and scipy, independence of worlds."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from flockenv.tasks import TASKS
 
 
 class Toy(BaseModel):
-    """World of seed s ends after 2 + s % 3 steps. Learner l earns (l + 1) * its action, and s in the first step."""
+    """World of seed s ends after 2 + s % 3 steps. Learner l gets (l + 1) * its action, and s in the first step."""
 
     name: str = "toy"
     horizon: int = 4
@@ -61,11 +61,11 @@ class ToyStep:
 
 
 class ToyWorld:
-    """Steps Toy; a world that has ended goes mad, so that whoever still counts it is found out."""
+    """Steps Toy; a world that has ended returns wrong numbers, so that a rollout that still counts it fails."""
 
     def __init__(self, task: Toy, worlds: int, time_limit: int) -> None:
         self.task, self.worlds, self.time_limit = task, worlds, time_limit
-        self.asked: list[np.ndarray] = []
+        self.received: list[np.ndarray] = []
 
     def reset(self, seeds: int) -> Any:
         self.seeds, self.steps = seeds + np.arange(self.worlds), 0
@@ -76,13 +76,13 @@ class ToyWorld:
         return np.stack([column, np.full_like(column, self.steps)], axis=-1).astype(np.float32)
 
     def step(self, actions: Any) -> Any:
-        self.asked.append(actions.copy())
+        self.received.append(actions.copy())
         self.steps += 1
         over = self.steps > 2 + self.seeds % 3
         effort = actions[..., 0] * np.arange(1, self.task.learners + 1)
         gift = np.where(self.steps == 1, self.seeds, 0)[:, None] * np.ones(self.task.learners)
-        mad = np.where(self.seeds % 2 == 0, np.nan, 1e6)[:, None, None]
-        terms = np.where(over[:, None, None], mad, np.stack([effort, gift], axis=-1))
+        wrong = np.where(self.seeds % 2 == 0, np.nan, 1e6)[:, None, None]
+        terms = np.where(over[:, None, None], wrong, np.stack([effort, gift], axis=-1))
         ended = self.steps >= np.minimum(2 + self.seeds % 3, self.time_limit)
         return ToyStep(self.observe(), terms.sum(axis=-1), terms, (self.seeds % 2 == 0) ^ over, ended)
 
@@ -95,7 +95,7 @@ class ToyWorld:
 
 
 class Constant:
-    """Always acts `value`; keeps what it was asked."""
+    """A policy that always returns `value` and keeps the arguments of its calls."""
 
     def __init__(self, value: float = 0.5) -> None:
         self.value = value
@@ -115,7 +115,7 @@ def play(worlds: int = 6, seed: int = 10, value: float = 0.5, task: Any = None, 
 # --- rollout
 
 
-def test_returns_lengths_success_terms_and_metrics_are_those_on_paper() -> None:
+def test_returns_lengths_success_terms_and_metrics_have_the_computed_values() -> None:
     episodes = play(worlds=6, seed=10)
     seeds = np.arange(10, 16)
     lengths = 2 + seeds % 3
@@ -129,11 +129,11 @@ def test_returns_lengths_success_terms_and_metrics_are_those_on_paper() -> None:
     assert (episodes.task, episodes.seed, episodes.horizon, episodes.worlds) == ("toy", 10, 4, 6)
 
 
-def test_a_world_ends_at_the_tasks_horizon() -> None:
+def test_a_world_ends_at_the_horizon_of_the_task() -> None:
     np.testing.assert_array_equal(play(seed=0, task=Toy(horizon=3)).lengths, [2, 3, 3, 2, 3, 3])
 
 
-def test_the_policy_sees_all_rows_its_own_state_and_true_starts() -> None:
+def test_a_policy_is_passed_all_rows_its_own_state_and_episode_starts() -> None:
     policy = Constant()
     rollout(Toy(), policy, 6, 10, make_world=ToyWorld, deterministic=False)  # type: ignore[arg-type]
     calls = policy.calls[module.LATENCY_CALLS :]
@@ -142,14 +142,14 @@ def test_the_policy_sees_all_rows_its_own_state_and_true_starts() -> None:
         assert rows.shape == (12, 2)
         assert rows.dtype == np.float32
         np.testing.assert_array_equal(rows[:, 0], np.repeat(np.arange(10, 16), 2))  # a world's learners side by side
-        np.testing.assert_array_equal(rows[:, 1], k)  # what is so after the last step, not before
+        np.testing.assert_array_equal(rows[:, 1], k)  # observed after the last step, not before it
         assert state == (None if k == 0 else (k,))
         assert starts.shape == (12,)
         assert (starts == (k == 0)).all()
         assert deterministic is False
 
 
-def test_actions_reach_the_learner_they_are_for() -> None:
+def test_actions_reach_their_learners_in_order() -> None:
     worlds: list[ToyWorld] = []
 
     def make(*arguments: Any) -> ToyWorld:
@@ -161,10 +161,10 @@ def test_actions_reach_the_learner_they_are_for() -> None:
             return np.arange(len(observation), dtype=np.float32)[:, None], None
 
     rollout(Toy(learners=3), Echo(), 2, 0, make_world=make)  # type: ignore[arg-type]
-    np.testing.assert_array_equal(worlds[0].asked[0][..., 0], [[0, 1, 2], [3, 4, 5]])
+    np.testing.assert_array_equal(worlds[0].received[0][..., 0], [[0, 1, 2], [3, 4, 5]])
 
 
-def test_the_recorded_world_is_filmed_from_start_to_its_own_end() -> None:
+def test_a_world_is_recorded_from_its_start_to_its_own_end() -> None:
     episodes = play(worlds=6, seed=10, record=2)  # seed 12: two steps
     recording = episodes.recording
     assert recording is not None
@@ -174,20 +174,20 @@ def test_the_recorded_world_is_filmed_from_start_to_its_own_end() -> None:
     assert play().recording is None
 
 
-def test_progress_is_told_after_every_step() -> None:
-    told: list[tuple[int, int]] = []
-    play(progress=lambda done, most: told.append((done, most)))
-    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+def test_progress_is_reported_after_every_step() -> None:
+    reported: list[tuple[int, int]] = []
+    play(progress=lambda done, most: reported.append((done, most)))
+    assert reported == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
-def test_time_is_taken_inside_predict_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_the_time_inside_predict_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
     monkeypatch.setattr(module, "perf_counter", lambda: now[0])
 
     class Slow(Constant):
         def predict(self, observation: Any, *rest: Any) -> Any:
             now[0] += 3e-6 if len(observation) == 1 else 24e-6
-            now[0] += 1.0 if len(self.calls) in (7, module.LATENCY_CALLS + 1) else 0.0  # the machine was elsewhere
+            now[0] += 1.0 if len(self.calls) in (7, module.LATENCY_CALLS + 1) else 0.0  # an interruption of the process
             return super().predict(observation, *rest)
 
     class SlowWorld(ToyWorld):
@@ -213,15 +213,15 @@ def test_time_is_taken_inside_predict_alone(monkeypatch: pytest.MonkeyPatch) -> 
         ({"record": -1}, "record: -1, must"),
     ],
 )
-def test_bad_requests_are_refused_before_a_world_is_made(change: dict[str, Any], message: str) -> None:
+def test_invalid_arguments_are_refused_before_a_world_is_created(change: dict[str, Any], message: str) -> None:
     def make(*_: Any) -> Any:
-        raise AssertionError("a world was made")
+        raise AssertionError("a world was created")
 
     with pytest.raises(ValueError, match=message):
         rollout(Toy(), Constant(), **{"worlds": 6, "seed": 0, **change}, make_world=make)  # type: ignore[arg-type]
 
 
-def test_wrong_shapes_are_named() -> None:
+def test_actions_of_a_wrong_shape_are_refused() -> None:
     class Wide(Constant):
         def predict(self, observation: Any, *rest: Any) -> Any:
             return np.zeros((len(observation), 2)), None
@@ -230,7 +230,7 @@ def test_wrong_shapes_are_named() -> None:
         rollout(Toy(), Wide(), 2, 0, make_world=ToyWorld)  # type: ignore[arg-type]
 
 
-def test_a_reward_that_is_not_finite_is_named_with_its_world() -> None:
+def test_an_infinite_reward_is_refused_and_its_world_named() -> None:
     class Broken(ToyWorld):
         def step(self, actions: Any) -> Any:
             step = super().step(actions)
@@ -241,7 +241,7 @@ def test_a_reward_that_is_not_finite_is_named_with_its_world() -> None:
         rollout(Toy(), Constant(), 6, 10, make_world=Broken)  # type: ignore[arg-type]
 
 
-def test_a_world_that_never_ends_is_not_waited_for() -> None:
+def test_a_world_that_continues_after_its_time_limit_raises_an_error() -> None:
     class Endless(ToyWorld):
         def step(self, actions: Any) -> Any:
             step = super().step(actions)
@@ -256,7 +256,7 @@ def test_a_world_that_never_ends_is_not_waited_for() -> None:
 # --- seeds
 
 
-def test_the_blocks_of_seeds_do_not_meet() -> None:
+def test_blocks_of_seeds_do_not_overlap() -> None:
     spans = []
     for purpose in ("training", "tuning", "evaluation"):
         for seed in (0, 1, 999):
@@ -265,7 +265,7 @@ def test_the_blocks_of_seeds_do_not_meet() -> None:
     assert sorted(spans) == spans
     assert all(end <= start for (_, end), (start, _) in pairwise(spans))
     assert (worlds_for("training"), worlds_for("tuning"), worlds_for("evaluation")) == (TRAINING, TUNING, EVALUATION)
-    assert spans[-1][1] < 2**32  # numpy's legacy seeding, which SB3 calls, takes no more
+    assert spans[-1][1] < 2**32  # the limit of numpy's legacy seeding, which SB3 uses
 
 
 @pytest.mark.parametrize(
@@ -292,7 +292,7 @@ def test_iqm_is_the_mean_of_the_middle_half() -> None:
 
 
 @pytest.mark.parametrize("name", ["iqm", "mean"])
-def test_bootstrap_agrees_with_scipys(name: Any) -> None:
+def test_bootstrap_agrees_with_that_of_scipy(name: Any) -> None:
     x = np.random.default_rng(1).exponential(size=200)
     statistic = {"iqm": lambda v, axis: stats.trim_mean(v, 0.25, axis=axis), "mean": np.mean}[name]
     theirs = stats.bootstrap((x,), statistic, n_resamples=20_000, method="percentile", rng=np.random.default_rng(5))
@@ -303,7 +303,7 @@ def test_bootstrap_agrees_with_scipys(name: Any) -> None:
     assert ours.high == pytest.approx(theirs.confidence_interval.high, abs=0.03 * width)
 
 
-def test_bootstrap_repeats_with_its_seed_and_not_otherwise() -> None:
+def test_bootstrap_is_reproducible_and_depends_on_its_seed() -> None:
     x = np.random.default_rng(2).normal(size=50)
     assert bootstrap(x) == bootstrap(x)
     assert bootstrap(x, seed=1) != bootstrap(x)
@@ -311,13 +311,13 @@ def test_bootstrap_repeats_with_its_seed_and_not_otherwise() -> None:
         bootstrap(x, resamples=0)
 
 
-def test_bootstrap_in_chunks_is_a_bootstrap() -> None:
+def test_bootstrap_in_chunks_has_the_expected_width() -> None:
     x = np.random.default_rng(3).normal(size=30_000)  # 133 resamples to a chunk
     interval = bootstrap(x, "mean", resamples=400)
     assert (interval.high - interval.low) == pytest.approx(2 * 1.96 / math.sqrt(30_000), rel=0.15)
 
 
-def test_the_interval_holds_the_truth_as_often_as_it_says() -> None:
+def test_intervals_contain_the_true_value_at_the_nominal_rate() -> None:
     """Exponential scores, 128 worlds: the IQM of the distribution is 1 + 1.5 ln(4/3) - 0.5 ln 4."""
     truth = {"iqm": 1 + 1.5 * math.log(4 / 3) - 0.5 * math.log(4), "mean": 1.0}
     rng, tries = np.random.default_rng(4), 400
@@ -327,7 +327,7 @@ def test_the_interval_holds_the_truth_as_often_as_it_says() -> None:
         for name, value in truth.items():
             interval = bootstrap(x, name, resamples=400, seed=k)  # type: ignore[arg-type]
             held[name] += interval.low <= value <= interval.high
-    # 0.95 less what a percentile interval lacks at 128 worlds; two standard errors of 400 tries are 0.022
+    # Percentile intervals cover slightly less than 0.95 at 128 worlds; two standard errors of 400 tries are 0.022.
     assert 0.915 <= held["iqm"] / tries <= 0.975
     assert 0.915 <= held["mean"] / tries <= 0.975
 
@@ -339,20 +339,20 @@ def test_equal_scores_have_an_interval_without_width_or_warning() -> None:
 
 
 @pytest.mark.parametrize("values", [[], [1.0], [1.0, np.nan], [1.0, np.inf], [[1.0, 2.0]]])
-def test_what_has_no_interval_is_refused(values: Any) -> None:
+def test_scores_without_an_interval_are_refused(values: Any) -> None:
     with pytest.raises(ValueError, match="at least two worlds and finite scores"):
         bootstrap(values)
 
 
 @pytest.mark.parametrize(("wins", "worlds"), [(0, 10), (3, 10), (10, 10), (128, 256), (256, 256), (1, 1)])
-def test_proportion_is_wilsons_interval(wins: int, worlds: int) -> None:
+def test_proportion_returns_wilsons_interval(wins: int, worlds: int) -> None:
     ours = proportion(np.arange(worlds) < wins)
     theirs = stats.binomtest(wins, worlds).proportion_ci(method="wilson")
     assert (ours.low, ours.value, ours.high) == pytest.approx((theirs.low, wins / worlds, theirs.high), abs=1e-12)
     assert 0 <= ours.low <= ours.value <= ours.high <= 1
 
 
-def test_summary_averages_metrics_where_they_apply() -> None:
+def test_a_summary_averages_metrics_over_worlds_that_have_them() -> None:
     summary = summarise(play(worlds=6, seed=10), resamples=100)
     assert summary.metrics == {"finish": (pytest.approx((30 + 20 + 40) / 3), 3)}  # seeds 10, 12, 14
     assert summary.success == proportion([1, 0, 1, 0, 1, 0])
@@ -366,10 +366,10 @@ def test_summary_averages_metrics_where_they_apply() -> None:
 # --- pairs
 
 
-def test_pairs_are_taken_world_by_world() -> None:
+def test_players_are_compared_world_by_world() -> None:
     weak, strong = play(value=0.2), play(value=0.6)
     pair = compare(strong, weak, resamples=500)
-    gains = 0.4 * 1.5 * weak.lengths  # the luck of the worlds (10 to 15) is gone
+    gains = 0.4 * 1.5 * weak.lengths  # the scores of the worlds themselves (10 to 15) cancel
     assert pair.difference.value == pytest.approx(gains.mean())
     assert pair.iqm_difference.value == pytest.approx(iqm(gains))
     assert pair.difference.low >= gains.min() - 1e-6
@@ -383,14 +383,14 @@ def test_pairs_are_taken_world_by_world() -> None:
     assert back.separated
 
 
-def test_ties_count_half_and_equals_are_level() -> None:
+def test_ties_count_half_and_equal_players_are_not_separated() -> None:
     pair = compare(play(), play(), resamples=100)
     assert pair.better.value == 0.5
     assert pair.difference.value == 0
     assert not pair.separated
 
 
-def test_a_rare_disaster_counts_in_the_difference() -> None:
+def test_rare_low_scores_count_in_the_mean_difference_but_not_in_the_iqm() -> None:
     one = play(worlds=20)
     gain = np.full(20, 1.0)
     gain[:4] = -100
@@ -422,17 +422,17 @@ def test_probability_of_improvement_is_that_of_correlated_normals() -> None:
         ({"worlds": 5}, "worlds 6 and 5"),
     ],
 )
-def test_scores_of_other_worlds_are_not_paired(other: dict[str, Any], message: str) -> None:
+def test_scores_of_other_tasks_seeds_or_worlds_cannot_be_paired(other: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=f"scores cannot be paired: {message}"):
         compare(play(), play(**other))
 
 
-def test_scores_of_another_time_limit_are_not_paired() -> None:
+def test_scores_of_another_time_limit_cannot_be_paired() -> None:
     with pytest.raises(ValueError, match="horizon 4 and 3"):
         compare(play(), replace(play(), horizon=3))
 
 
-def test_the_digest_knows_every_setting() -> None:
+def test_the_digest_of_a_task_depends_on_its_class_and_settings() -> None:
     class Other(Toy):
         pass
 
@@ -445,14 +445,14 @@ def test_the_digest_knows_every_setting() -> None:
 
 
 class Forward:
-    """Asks for full force along the first axis: stateless, so that a world does not care who plays beside it."""
+    """A policy of full force along the first axis; it has no state, so worlds cannot influence each other."""
 
     def predict(self, observation: Any, state: Any = None, *_: Any) -> Any:
         return np.broadcast_to(np.float32([1, 0]), (len(observation), 2)), state
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_a_world_scores_the_same_in_company_and_alone(name: str) -> None:
+def test_scores_of_a_world_do_not_depend_on_its_batch(name: str) -> None:
     task, first = TASKS[name](horizon=40), worlds_for("evaluation", 3, 4)
     together = rollout(task, Forward(), 4, first)  # type: ignore[arg-type]
     for k in range(4):
@@ -466,7 +466,7 @@ def test_a_world_scores_the_same_in_company_and_alone(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_every_player_begins_in_the_same_world(name: str) -> None:
+def test_every_player_starts_in_the_same_world(name: str) -> None:
     task = TASKS[name](horizon=20)
     players: list[Any] = [Forward(), RandomPolicy(task.action_layout.size, 0)]
     films = [rollout(task, player, 3, 77, record=1).recording for player in players]

@@ -1,4 +1,4 @@
-"""Linear finite elements against what is known exactly: bars, constant strain, beams, chains, rigid motions."""
+"""Linear finite elements against exact solutions: bars, constant strain, beams, chains, rigid motions."""
 
 from __future__ import annotations
 
@@ -40,19 +40,19 @@ STRUCTURES = pytest.mark.parametrize(
 
 
 def structure(network: Network, dimension: int, material: Material = SOFT) -> tuple[Floats, Any, Any]:
-    """Points, K and lumped M of a network."""
+    """Return the points, K and lumped M of a network."""
     points, elements = network.rest_points(dimension), network.elements(dimension)
     return points, stiffness(points, elements, material), mass(points, elements, material)
 
 
 def along(points: int, length: float) -> tuple[Floats, NDArray[Any]]:
-    """A row of bars on a line: points (n, 1), elements (n - 1, 2)."""
-    who = np.arange(points - 1)
-    return np.linspace(0, length, points)[:, None], np.stack([who, who + 1], axis=1)
+    """Return a row of bars on a line: points (n, 1), elements (n - 1, 2)."""
+    index = np.arange(points - 1)
+    return np.linspace(0, length, points)[:, None], np.stack([index, index + 1], axis=1)
 
 
 def jiggled(network: Network, dimension: int, inside: NDArray[Any]) -> Floats:
-    """Its points, those inside moved a little: no element is like another."""
+    """Return the points of a network, the inner ones moved a little, so that all elements differ."""
     points = network.points(dimension)
     points[inside] += np.random.default_rng(4).uniform(-0.05, 0.05, (len(inside), dimension))
     return points
@@ -62,7 +62,7 @@ def jiggled(network: Network, dimension: int, inside: NDArray[Any]) -> Floats:
 
 
 @pytest.mark.parametrize("links", [1, 2, 50])
-def test_a_bar_in_tension_grows_by_what_the_book_says(links: int) -> None:
+def test_the_elongation_of_a_bar_in_tension_is_exact(links: int) -> None:
     """u(x) = F x / (E A), at every particle."""
     points, elements = along(links + 1, 3.0)
     force = np.zeros_like(points)
@@ -72,15 +72,15 @@ def test_a_bar_in_tension_grows_by_what_the_book_says(links: int) -> None:
     assert u[-1, 0] == pytest.approx(1000.0 * 3.0 / (2e11 * 1e-4), rel=1e-12)
 
 
-def test_a_bar_pulls_along_itself_wherever_it_points() -> None:
+def test_a_bar_in_space_is_stiff_only_along_itself() -> None:
     points = np.array([(0.0, 0.0, 0.0), (1.0, 2.0, 2.0)])
     K = stiffness(points, [(0, 1)], SOFT).toarray()
-    way = np.array([1, 2, 2]) / 3
-    np.testing.assert_allclose(K[:3, :3], SOFT.young * SOFT.area / 3 * np.outer(way, way), rtol=1e-14)
+    unit = np.array([1, 2, 2]) / 3
+    np.testing.assert_allclose(K[:3, :3], SOFT.young * SOFT.area / 3 * np.outer(unit, unit), rtol=1e-14)
     np.testing.assert_allclose(K[:3, 3:], -K[:3, :3])
 
 
-def test_one_triangle_is_that_of_the_book() -> None:
+def test_the_stiffness_of_one_triangle_is_the_textbook_matrix() -> None:
     """K = t A B' D B, plane stress, with strain (xx, yy, 2 xy)."""
     points = np.array([(0.0, 0.0), (2.0, 0.5), (0.5, 1.5)])
     (x0, y0), (x1, y1), (x2, y2) = points
@@ -91,7 +91,7 @@ def test_one_triangle_is_that_of_the_book() -> None:
     B /= 2 * area
     v = SOFT.poisson
     D = SOFT.young / (1 - v**2) * np.array([(1, v, 0), (v, 1, 0), (0, 0, (1 - v) / 2)])
-    for order in ([0, 1, 2], [2, 1, 0]):  # whichever way it turns
+    for order in ([0, 1, 2], [2, 1, 0]):  # both orientations
         K = stiffness(points, [order], SOFT).toarray()
         np.testing.assert_allclose(K, SOFT.thickness * area * B.T @ D @ B, atol=1e-14)
 
@@ -99,7 +99,7 @@ def test_one_triangle_is_that_of_the_book() -> None:
 @pytest.mark.parametrize("diagonals", ["alternating", "parallel"])
 @pytest.mark.parametrize("cells", [(5, 4), (3, 3, 4)])
 def test_constant_strain_is_reproduced_on_any_mesh(cells: tuple[int, ...], diagonals: Any) -> None:
-    """The patch test: particles on the border moved as u = A x + c, those inside follow, no force on them."""
+    """The patch test: with u = A x + c on the border, inner particles follow, and no force acts on them."""
     dimension = len(cells)
     jelly = Jelly(cells=cells, sides=(1,) * dimension, diagonals=diagonals, pinned=("border",))
     border = jelly.pins()
@@ -117,7 +117,7 @@ def test_constant_strain_is_reproduced_on_any_mesh(cells: tuple[int, ...], diago
     np.testing.assert_allclose((K @ exact.ravel()).reshape(exact.shape)[inside], 0, atol=1e-12)
 
 
-def test_a_block_in_tension_narrows_by_poissons_ratio() -> None:
+def test_a_block_in_tension_contracts_by_poissons_ratio() -> None:
     """Uniaxial stress s = F / A: strain s / E along, -v s / E across, in the plane and in space."""
     for cells in ((3, 2), (3, 2, 2)):
         d = len(cells)
@@ -133,7 +133,7 @@ def test_a_block_in_tension_narrows_by_poissons_ratio() -> None:
 
 
 def deflection(refined: int) -> float:
-    """How far 1 N, spread over the tip of a cantilever of 10 m by 1 m, bends it down, m (E = 1000 Pa, v = 0)."""
+    """Return the deflection, m, of a cantilever of 10 m by 1 m under 1 N at its tip (E = 1000 Pa, v = 0)."""
     beam = Jelly(cells=(10 * refined, 2 * refined), sides=(10, 1), pinned=("left",))
     points, elements = beam.points(2), beam.elements(2)
     tip = np.flatnonzero(points[:, 0] > 9.999)
@@ -147,7 +147,7 @@ def deflection(refined: int) -> float:
 
 
 def test_a_cantilever_converges_to_beam_theory_at_second_order() -> None:
-    """Timoshenko: F L^3 / (3 E I) + F L / (5/6 G A); linear triangles are too stiff, by something like h^2."""
+    """Timoshenko: F L^3 / (3 E I) + F L / (5/6 G A); linear triangles are too stiff by an error of order h^2."""
     beam = 10**3 / (3 * 1000 / 12) + 10 / (5 / 6 * 500)
     error = np.array([1 - deflection(refined) / beam for refined in (4, 8, 16)])
     assert (error > 0).all()
@@ -167,7 +167,7 @@ def test_a_structure_that_can_move_is_refused(network: Network, dimension: int) 
             solve_static(K, force, fixed)
 
 
-def test_a_mechanism_is_refused_and_the_particle_named() -> None:
+def test_a_mechanism_is_refused_and_its_particle_named() -> None:
     square = Mesh(vertices=((0, 0), (1, 0), (1, 1), (0, 1)), bars=((0, 1), (1, 2), (2, 3), (3, 0)))
     points, K, _ = structure(square, 2)
     with pytest.raises(ValueError, match=r"particle [23] along x"):
@@ -178,7 +178,7 @@ def test_a_mechanism_is_refused_and_the_particle_named() -> None:
         solve_static(K, np.ones_like(points), freedoms([0, 2], 2))
 
 
-def test_what_rounding_alone_holds_is_not_held() -> None:
+def test_stiffness_from_rounding_errors_does_not_hold_a_particle() -> None:
     points = np.array([(0.0, 0.0), (1e-15, 1.0), (0.0, 2.0)])
     K = stiffness(points, [(0, 1), (1, 2)], SOFT)
     assert K[2, 2] > 0
@@ -186,7 +186,7 @@ def test_what_rounding_alone_holds_is_not_held() -> None:
         solve_static(K, np.ones_like(points), freedoms([0, 2], 2))
 
 
-def test_thick_and_thin_parts_are_no_mechanism() -> None:
+def test_very_different_stiffnesses_are_not_taken_for_a_mechanism() -> None:
     points, elements = along(3, 2.0)
     stiff, soft = (stiffness(points, [row], SOFT.model_copy(update={"area": area}))
                    for row, area in zip(elements, (1e9, 1e-9), strict=True))  # fmt: skip
@@ -194,7 +194,7 @@ def test_thick_and_thin_parts_are_no_mechanism() -> None:
     assert u[2, 0] == pytest.approx(1.0)
 
 
-def test_a_structure_held_altogether_stays_where_it_is() -> None:
+def test_a_structure_with_all_freedoms_fixed_does_not_move() -> None:
     points, K, M = structure(SHEET, 2)
     everything = freedoms(np.arange(SHEET.size), 2)
     assert not solve_static(K, np.ones_like(points), everything).any()
@@ -205,7 +205,7 @@ def test_a_structure_held_altogether_stays_where_it_is() -> None:
 
 
 @STRUCTURES
-def test_rigid_motions_cost_nothing(network: Network, dimension: int) -> None:
+def test_rigid_motions_need_no_force(network: Network, dimension: int) -> None:
     points, K, _ = structure(network, dimension)
     scale = abs(K).max()
     for axis in np.eye(dimension):
@@ -217,7 +217,7 @@ def test_rigid_motions_cost_nothing(network: Network, dimension: int) -> None:
 
 
 @STRUCTURES
-def test_stiffness_is_symmetric_and_never_negative(network: Network, dimension: int) -> None:
+def test_stiffness_is_symmetric_and_positive_semidefinite(network: Network, dimension: int) -> None:
     _, K, _ = structure(network, dimension)
     assert K.format == "csr"
     dense = K.toarray()
@@ -229,23 +229,23 @@ def test_stiffness_is_symmetric_and_never_negative(network: Network, dimension: 
 
 
 @STRUCTURES
-def test_partners_alone_give_the_force(network: Network, dimension: int) -> None:
+def test_blocks_of_partners_give_the_force(network: Network, dimension: int) -> None:
     """F_i = -sum_j K_ij ((x_j - x_i) - (X_j - X_i)) is -K u: rows of K sum to zero."""
     X, K, _ = structure(network, dimension)
-    start, partner, block, way = blocks(K, X)
+    start, partner, block, offset = blocks(K, X)
     u = np.random.default_rng(2).normal(size=X.shape)
     x = X + u
     force = np.zeros_like(X)
     for i in range(len(X)):
         for e in range(start[i], start[i + 1]):
-            force[i] -= block[e] @ ((x[partner[e]] - x[i]) - way[e])
+            force[i] -= block[e] @ ((x[partner[e]] - x[i]) - offset[e])
     np.testing.assert_allclose(force.ravel(), -(K @ u.ravel()), atol=1e-13 * abs(K).max())
-    assert start.shape == (len(X) + 1,) and start[-1] == len(partner) == len(block) == len(way)
-    who = np.repeat(np.arange(len(X)), np.diff(start))
-    assert (who != partner).all()
+    assert start.shape == (len(X) + 1,) and start[-1] == len(partner) == len(block) == len(offset)
+    index = np.repeat(np.arange(len(X)), np.diff(start))
+    assert (index != partner).all()
     springs = network.springs(dimension)
     expected = {*zip(springs.i, springs.j, strict=True), *zip(springs.j, springs.i, strict=True)}
-    assert {*zip(who, partner, strict=True)} <= expected  # a diagonal of a right-angled cell may carry nothing
+    assert {*zip(index, partner, strict=True)} <= expected  # a diagonal of a right-angled cell may have no stiffness
     assert all((np.diff(partner[a:b]) > 0).all() for a, b in itertools.pairwise(start))
 
 
@@ -263,22 +263,22 @@ def test_masses_add_up_to_density_times_volume(network: Network, dimension: int,
     assert (M.nnz == M.shape[0]) == lumped
 
 
-def test_consistent_mass_of_a_bar_is_that_of_the_book() -> None:
+def test_the_consistent_mass_of_a_bar_is_the_textbook_matrix() -> None:
     M = mass([[0.0], [3.0]], [(0, 1)], SOFT, lumped=False).toarray()
     np.testing.assert_allclose(M, 2 * 0.5 * 3 / 6 * np.array([(2, 1), (1, 2)]))
 
 
-def test_damping_damps_each_mode_by_its_ratio() -> None:
+def test_rayleigh_damping_gives_each_mode_its_damping_ratio() -> None:
     _, K, M = structure(SHEET, 2)
     w = frequencies(K, M)[3:]
     ratio = 0.4 / (2 * w) + 0.02 * w / 2
     damped = np.linalg.eigvalsh(scaled(rayleigh(M, K, 0.4, 0.02), M))
-    np.testing.assert_allclose(damped[:3], 0.4, rtol=1e-9)  # rigid motions: by alpha alone
+    np.testing.assert_allclose(damped[:3], 0.4, rtol=1e-9)  # rigid motions are damped by alpha only
     np.testing.assert_allclose(damped[3:], 2 * ratio * w, rtol=1e-9)
 
 
 def scaled(A: Any, M: Any) -> Floats:
-    """M^-1/2 A M^-1/2 of a diagonal M."""
+    """Return M^-1/2 A M^-1/2 for a diagonal M."""
     root = np.sqrt(M.diagonal())
     return np.asarray(A.toarray() / root / root[:, None])
 
@@ -287,12 +287,12 @@ def scaled(A: Any, M: Any) -> Floats:
 
 
 def chain(free: int) -> Floats:
-    """sin((2 k - 1) pi / (2 (2 N + 1))): N equal masses in a row, the first tied to a wall."""
+    """Return sin((2 k - 1) pi / (2 (2 N + 1))), for N equal masses in a row, the first tied to a wall."""
     k = np.arange(1, free + 1)
     return np.asarray(np.sin((2 * k - 1) * np.pi / (2 * (2 * free + 1))))
 
 
-def test_a_rope_of_equal_masses_sounds_like_a_chain() -> None:
+def test_frequencies_of_a_rope_are_those_of_a_chain_of_masses() -> None:
     """N = 20, k = 400, m = 0.1; fixed-free, fixed-fixed and free-free."""
     rope = Rope(links=20, length=2, pinned=("start",))
     K = stiffness(rope.points(2), rope.elements(2), Material(young=400 * 0.1, area=1))
@@ -311,7 +311,7 @@ def test_a_rope_of_equal_masses_sounds_like_a_chain() -> None:
     assert frequencies(K, M, across)[[0, -1]] == pytest.approx([9.4527, 126.137], rel=1e-5)
 
 
-def test_a_bar_sounds_lower_lumped_and_higher_consistent_than_it_is() -> None:
+def test_lumped_mass_lowers_and_consistent_mass_raises_the_frequency_of_a_bar() -> None:
     """Fixed-free, c = sqrt(E / rho): w_1 = pi c / (2 L); lumped N links have 2 c N / L sin(pi / (4 N))."""
     N, L = 40, 2.0
     c = np.sqrt(SOFT.young / SOFT.density)
@@ -326,8 +326,8 @@ def test_a_bar_sounds_lower_lumped_and_higher_consistent_than_it_is() -> None:
     assert consistent[0] == pytest.approx(exact, rel=1e-4)
 
 
-def test_the_lowest_of_many_are_those_of_all() -> None:
-    """Inverse iteration, above DENSE freedoms, against the closed forms of a fixed and of a free bar."""
+def test_the_lowest_frequencies_of_a_large_structure_are_exact() -> None:
+    """Inverse iteration, used above DENSE freedoms, against closed forms of a fixed and of a free bar."""
     N = DENSE + 200
     points, elements = along(N + 1, 1.0)
     K, M = stiffness(points, elements, SOFT), mass(points, elements, SOFT)
@@ -337,7 +337,7 @@ def test_the_lowest_of_many_are_those_of_all() -> None:
     np.testing.assert_allclose(frequencies(K, M, (), 6), 2 * c * N * np.sin((k - 1) * np.pi / (2 * N)), rtol=1e-7)
 
 
-def test_the_lowest_are_found_though_the_structure_can_move(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_lowest_frequencies_of_a_free_structure_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
     for network, dimension in ((SHEET, 2), (BLOCK, 3)):
         _, K, M = structure(network, dimension)
         still = dimension * (dimension + 1) // 2
@@ -350,7 +350,7 @@ def test_the_lowest_are_found_though_the_structure_can_move(monkeypatch: pytest.
 
 
 @STRUCTURES
-def test_all_frequencies_are_those_of_a_full_matrix(network: Network, dimension: int) -> None:
+def test_frequencies_agree_with_eigenvalues_of_the_full_matrix(network: Network, dimension: int) -> None:
     _, K, M = structure(network, dimension)
     held = freedoms([0], dimension)
     free = np.setdiff1d(np.arange(K.shape[0]), held)
@@ -393,18 +393,18 @@ BAR = stiffness([[0.0], [1.0]], [(0, 1)], SOFT)
     (lambda: blocks(BAR + sparse.eye_array(2), [[0.0], [1.0]]), "the rows of particle 0 do not sum to zero"),
     (lambda: blocks(BAR, POINTS), "K of shape (2, 2): 4 points in 2 dimensions need (8, 8)"),
 ])  # fmt: skip
-def test_a_refusal_is_one_line(call: Any, line: str) -> None:
+def test_invalid_input_is_refused_in_one_line(call: Any, line: str) -> None:
     with pytest.raises(ValueError, match=r".") as caught:
         call()
     assert line in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_freedoms_are_numbers_not_marks() -> None:
+def test_a_mask_of_fixed_freedoms_is_refused() -> None:
     with pytest.raises(TypeError, match="fixed of bool: must be degrees of freedom"):
         solve_static(BAR, [[0.0], [1.0]], [True, False])
 
 
-def test_a_cloth_in_space_has_areas_though_no_stiffness() -> None:
+def test_a_cloth_in_space_has_areas() -> None:
     cloth = Cloth(cells=(3, 2), edges=((1, 0, 1), (0, 2, 0)))
     assert contents(cloth.points(3), cloth.elements(3)).sum() == pytest.approx(2 * 2**0.5)

@@ -1,4 +1,4 @@
-"""The single-agent face: Gymnasium's own checks, then what they leave out."""
+"""The Gymnasium face: Gymnasium's own checks, and properties that they do not test."""
 
 import copy
 import hashlib
@@ -31,7 +31,7 @@ MODES = (None, "rgb_array", "human")
 
 @pytest.fixture(autouse=True)
 def no_display(monkeypatch):
-    """SDL draws nowhere, and a window's clock does not wait."""
+    """Let SDL draw without a display, and replace the clock of windows by one that does not wait."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     monkeypatch.setattr("pygame.time.Clock", Clock)
 
@@ -47,7 +47,7 @@ def actions(env, steps, seed=7):
 
 
 def play(env, rows, seed=None):
-    """Step through the rows, resetting at every end; return everything that came back, as bytes."""
+    """Step through the rows, resetting at every end; return everything that step and reset return, as bytes."""
     log = [] if seed is None else [env.reset(seed=seed)[0].tobytes()]
     for row in rows:
         observation, reward, terminated, truncated, info = env.step(row)
@@ -72,7 +72,7 @@ def digest(env_id, steps=1000):
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("env_id", SINGLE)
-def test_gymnasium_check_env_has_nothing_to_say(env_id, mode):
+def test_check_env_of_gymnasium_passes(env_id, mode):
     env = gymnasium.make(env_id, render_mode=mode)
     check_env(env.unwrapped)
     env.close()
@@ -92,14 +92,14 @@ def test_an_episode_passes_the_passive_checker_of_make(env_id):
 
 
 @pytest.mark.parametrize("env_id", SINGLE)
-def test_registered_time_limit_is_the_task_s_own(env_id):
+def test_the_registered_time_limit_is_the_horizon_of_the_task(env_id):
     spec = gymnasium.spec(env_id)
     assert spec.max_episode_steps == gymnasium.make(env_id).unwrapped.task.horizon
 
 
 @pytest.mark.parametrize("kind", ["parallel", "aec"])
 @pytest.mark.parametrize("env_id", PARALLEL)
-def test_registered_cycles_are_the_task_s_own(env_id, kind):
+def test_the_registered_max_cycles_is_the_horizon_of_the_task(env_id, kind):
     assert pettingzoo.spec(kind, env_id).max_cycles == pettingzoo.make(kind, env_id).unwrapped.task.horizon
 
 
@@ -107,7 +107,7 @@ def test_every_task_has_an_id():
     assert sorted(re.sub(r"(?<!^)([A-Z])", r"_\1", name).lower() for name in HORIZONS) == sorted(TASKS)
 
 
-def test_a_task_knows_its_id_if_it_has_one():
+def test_every_task_maps_to_a_registered_id():
     assert sorted(id_of(task.__name__) for task in TASKS.values()) == sorted(SINGLE)
 
 
@@ -118,7 +118,7 @@ def test_importing_twice_registers_once():
 
 
 @pytest.mark.parametrize("env_id", SINGLE)
-def test_a_spec_travels_as_json(env_id):
+def test_a_spec_survives_a_round_trip_through_json(env_id):
     env = gymnasium.make(env_id, render_mode="rgb_array")
     spec = EnvSpec.from_json(env.spec.to_json())
     json.loads(env.spec.to_json())
@@ -134,7 +134,7 @@ def test_the_package_can_be_named_in_the_id():
     assert json.loads(done.stdout) == gymnasium.make("flockenv/Pursuit-v0").reset(seed=3)[0].tolist()
 
 
-def test_import_is_light():
+def test_importing_flockenv_loads_no_heavy_package():
     heavy = ["torch", "stable_baselines3", "matplotlib", "numba", "pygame", "PIL", "pydantic", "scipy"]
     code = f"import sys, flockenv; print([name for name in {heavy} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True)
@@ -149,11 +149,11 @@ def test_public_names_load_on_demand():
         _ = flockenv.Wrold
 
 
-# --- the page ------------------------------------------------------------------------------------------------------
+# --- docstrings ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("env_id", SINGLE)
-def test_the_docstring_is_the_page_of_the_environment(env_id):
+def test_the_docstring_of_an_environment_is_complete(env_id):
     env = gymnasium.make(env_id).unwrapped
     page = type(env).__doc__
     for section in ("Description", "Action space", "Observation space", "Rewards", "Infos", "Episode end", "Arguments"):
@@ -173,7 +173,7 @@ def test_the_docstring_is_the_page_of_the_environment(env_id):
     assert f"{env.task.horizon} decisions" in page
 
 
-# --- what comes back -----------------------------------------------------------------------------------------------
+# --- returned values -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("env_id", SINGLE)
@@ -184,7 +184,7 @@ def test_types_and_spaces_hold_at_every_step(env_id):
     assert observation in env.observation_space
     assert info == {"seed": 0}
     for t in range(1000):
-        # Corners of the action box drive everything to its limits.
+        # Actions at corners of the box bring observations to their limits.
         action = (
             rng.choice([-1.0, 1.0], env.action_space.shape).astype(np.float32)
             if t % 50 < 40
@@ -205,14 +205,14 @@ def test_types_and_spaces_hold_at_every_step(env_id):
 
 
 @pytest.mark.parametrize("env_id", SINGLE)
-def test_nothing_that_came_back_is_written_again(env_id):
+def test_returned_observations_are_never_overwritten(env_id):
     env = gymnasium.make(env_id).unwrapped
     kept = [env.reset(seed=1)[0]]
     copies = [kept[0].copy()]
     for row in actions(env, 20):
         kept.append(env.step(row)[0])
         copies.append(kept[-1].copy())
-        kept[-2][:] = 9.0  # and what a user writes into an old one changes nothing
+        kept[-2][:] = 9.0  # writing into an old observation must not change later ones
     assert not any(np.shares_memory(a, b) for a, b in itertools.pairwise(kept))
     np.testing.assert_array_equal(kept[-1], copies[-1])
     replay = [env.reset(seed=1)[0], *(env.step(row)[0] for row in actions(env, 20))]
@@ -220,7 +220,7 @@ def test_nothing_that_came_back_is_written_again(env_id):
 
 
 @pytest.mark.parametrize("env_id", SINGLE)
-def test_an_episode_ends_by_the_clock_with_metrics(env_id):
+def test_an_episode_is_truncated_at_the_time_limit_with_metrics(env_id):
     env = gymnasium.make(env_id, max_episode_steps=5)
     env.reset(seed=0)
     for t in range(5):
@@ -243,7 +243,7 @@ def test_a_thousand_steps_replay_bit_for_bit(env_id):
 
 @pytest.mark.slow
 def test_a_thousand_steps_replay_in_another_process():
-    # Another hash seed and a fresh interpreter: nothing may depend on either.
+    # Results must not depend on the hash seed or on the interpreter's history.
     code = (
         "import importlib.util, sys\n"
         f"spec = importlib.util.spec_from_file_location('replayed', {__file__!r})\n"
@@ -261,7 +261,7 @@ def test_a_thousand_steps_replay_in_another_process():
     assert done.stdout.strip() == str([digest(env_id) for env_id in SINGLE])
 
 
-def test_another_seed_or_action_is_another_episode():
+def test_another_seed_or_other_actions_give_another_episode():
     env = gymnasium.make("flockenv/Flock-v1")
     rows = actions(env, 10)
     assert play(env, rows, seed=1) != play(env, rows, seed=2)
@@ -269,7 +269,7 @@ def test_another_seed_or_action_is_another_episode():
 
 
 @pytest.mark.parametrize("env_id", SINGLE)
-def test_seeds(env_id):
+def test_a_reset_with_the_seed_of_an_episode_repeats_it(env_id):
     env = gymnasium.make(env_id).unwrapped
     first, info = env.reset()
     drawn = info["seed"]
@@ -286,7 +286,7 @@ def test_seeds(env_id):
 
 @pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
 @pytest.mark.parametrize("mode", MODES)
-def test_a_copy_goes_on_as_the_original_would(clone, mode):
+def test_a_copy_continues_as_the_original_does(clone, mode):
     env = gymnasium.make("flockenv/Pursuit-v0", render_mode=mode, max_episode_steps=60)
     rows = actions(env, 100)
     play(env, rows[:40], seed=3)
@@ -300,7 +300,7 @@ def test_a_copy_goes_on_as_the_original_would(clone, mode):
 
 
 def test_random_numbers_of_wrappers_follow_the_seed():
-    """In every form; and a reset without a seed goes on with them."""
+    """This holds for all kinds of environments; a reset without a seed continues the sequence."""
     forms = {
         "single": gymnasium.make("flockenv/Pursuit-v0").unwrapped,
         "vector": gymnasium.make_vec("flockenv/Pursuit-v0", num_envs=2),
@@ -418,7 +418,7 @@ def test_bad_actions_are_refused_and_change_nothing(action):
     np.testing.assert_array_equal(env.step(row)[0], twin.step(row)[0])
 
 
-def test_good_actions_come_in_many_types():
+def test_actions_of_many_types_are_accepted():
     env = gymnasium.make("flockenv/Pursuit-v0").unwrapped
     backwards = np.array([0.0, 9.0, 1.0], np.float32)[::-2]
     forms = [[1.0, 0.0], (1, 0), np.array([1, 0]), np.array([1, 0], np.float16), np.array([1.0, 0.0]), backwards]
@@ -453,9 +453,9 @@ def test_an_unknown_id_and_an_unknown_parameter_are_named():
     [("frameskip", ""), ("rendermode", ", did you mean `render_mode`"), ("max_forc", ", did you mean")],
 )
 @pytest.mark.parametrize("form", ["single", "native", "sync", "parallel", "aec"])
-def test_an_unknown_argument_is_a_type_error_in_python_s_own_words(form, name, meant):
-    """TorchRL's GymEnv passes `frameskip`, and goes on without it if it reads these words."""
-    made = {
+def test_an_unknown_argument_raises_a_type_error_with_the_words_of_python(form, name, meant):
+    """TorchRL's GymEnv passes `frameskip`, and retries without it if the error has these words."""
+    make_env = {
         "single": lambda **given: gymnasium.make("flockenv/Pursuit-v0", **given),
         "native": lambda **given: gymnasium.make_vec("flockenv/Pursuit-v0", num_envs=2, **given),
         "sync": lambda **given: gymnasium.make_vec("flockenv/Pursuit-v0", 2, vectorization_mode="sync", **given),
@@ -463,8 +463,8 @@ def test_an_unknown_argument_is_a_type_error_in_python_s_own_words(form, name, m
         "aec": lambda **given: pettingzoo.make("aec", "flockenv/Pursuit-v0", **given),
     }[form]
     with pytest.raises(TypeError, match=f"got an unexpected keyword argument '{name}'{meant}") as error:
-        made(**{name: 1})
-    assert "evaders" in one_line(error)  # among what is allowed
+        make_env(**{name: 1})
+    assert "evaders" in one_line(error)  # one of the allowed arguments
 
 
 def test_a_bad_value_and_a_bad_mode_are_named():
@@ -480,12 +480,12 @@ def test_there_is_one_name_for_the_time_limit():
         gymnasium.make("flockenv/Pursuit-v0", horizon=9)
 
 
-def test_several_learners_are_sent_to_the_faces_that_can():
+def test_the_error_for_several_learners_names_the_faces_that_support_them():
     with pytest.raises(ValueError, match=r"make_vec.*pettingzoo\.make.*WorldVecEnv"):
         gymnasium.make("flockenv/Flock-v1", learners=3)
 
 
-def test_step_and_render_want_an_episode():
+def test_step_and_render_need_a_reset_first():
     env = gymnasium.make("flockenv/Obstacles-v0", render_mode="rgb_array").unwrapped
     row = np.zeros(env.action_space.shape, np.float32)
     for call in (lambda: env.step(row), env.render):
@@ -501,7 +501,7 @@ def test_step_and_render_want_an_episode():
     env.step(row)
 
 
-def test_no_step_after_the_end():
+def test_a_step_after_the_end_is_refused():
     env = gymnasium.make("flockenv/Obstacles-v0", goal_radius=100.0).unwrapped
     env.reset(seed=0)
     _, _, terminated, _, info = env.step(np.zeros(env.action_space.shape))
@@ -514,7 +514,7 @@ def test_no_step_after_the_end():
 # --- pictures ------------------------------------------------------------------------------------------------------
 
 
-def test_pictures_are_fresh_and_without_a_window():
+def test_every_rendered_picture_is_a_new_array():
     env = gymnasium.make("flockenv/Flock-v1", render_mode="rgb_array")
     env.reset(seed=0)
     first = env.render()
@@ -535,7 +535,7 @@ def test_rendering_without_a_mode_warns_as_gymnasium_does():
 
 
 @pytest.mark.parametrize("env_id", SINGLE)
-def test_frames_per_second_play_in_real_time(env_id):
+def test_render_fps_is_the_number_of_decisions_per_second(env_id):
     env = gymnasium.make(env_id)
     assert env.metadata["render_fps"] == round(1 / env.unwrapped.task.control_dt)
     assert set(env.metadata["render_modes"]) == {"rgb_array", "human"}
@@ -543,16 +543,16 @@ def test_frames_per_second_play_in_real_time(env_id):
 
 @pytest.mark.filterwarnings("ignore:.*out of date:DeprecationWarning")
 @pytest.mark.parametrize("name", sorted(VERSIONS))
-def test_a_former_version_is_refused_by_the_name_of_the_new_one(name: str) -> None:
+def test_the_error_for_a_former_version_names_the_new_one(name: str) -> None:
     for make in (gymnasium.make, gymnasium.make_vec):
         with pytest.raises(gymnasium.error.DeprecatedEnv, match=rf"Please use `flockenv/{name}-v{VERSIONS[name]}`"):
             make(f"flockenv/{name}-v{VERSIONS[name] - 1}")
 
 
 @pytest.mark.parametrize("env_id", SINGLE)
-def test_an_environment_says_what_every_version_changed(env_id: str) -> None:
+def test_docstrings_list_the_changes_of_every_version(env_id: str) -> None:
     name, _, version = env_id.removeprefix("flockenv/").partition("-v")
     page = getattr(single, f"{name}Env").__doc__
-    told = re.findall(r"^v(\d+): ", page.partition("## Version history")[2], re.MULTILINE)
-    assert told == [str(v) for v in range(int(version), -1, -1)]
+    listed = re.findall(r"^v(\d+): ", page.partition("## Version history")[2], re.MULTILINE)
+    assert listed == [str(v) for v in range(int(version), -1, -1)]
     assert f'`gymnasium.make("{env_id}")`' in page

@@ -1,7 +1,7 @@
-"""How a law is advanced in time: measured orders, exact discrete invariants, and what each method says of itself.
+"""Integrators: measured orders, exact discrete invariants, and the declarations of each method.
 
-Every law here is taken through both ways that a method can be used: `Integrator.__call__` with an acceleration in
-Python, and the compiled step of a scene.
+Laws are integrated both by `Integrator.__call__` with an acceleration in Python ("python") and by the compiled step of
+a scene ("compiled").
 """
 
 from __future__ import annotations
@@ -39,22 +39,22 @@ PERIOD = 2 * math.pi / W
 
 
 def oscillator(tether: Any, way: str, w: float = W, zeta: float = ZETA, **limits: Any) -> Advance:
-    """x'' = -w^2 x - 2 zeta w x', from (X0, V0), one way or the other."""
+    """Return x'' = -w^2 x - 2 zeta w x' from (X0, V0), advanced in Python or by a compiled scene."""
     return tethered(tether, way, stiffness=w * w, damping=2 * zeta * w, **limits)
 
 
 def spring(context: Any, pos: Array, vel: Array, time: float, out: Array) -> None:
-    """An acceleration as `advance` calls it, over flat rows."""
+    """Write an acceleration over flat rows, with the signature that `advance` calls."""
     out[...] = -pos
 
 
 def alone(row: IntegratorRow) -> Alone:
-    """The context of a world whose laws are Python functions."""
+    """Return the context of a world whose laws are Python functions."""
     return Alone(settings=row.fixed.settings())
 
 
 def exact(t: float) -> tuple[float, float]:
-    """The damped oscillator at time t."""
+    """Return position and velocity of the damped oscillator at time t."""
     decay, wd = math.exp(-ZETA * W * t), W * math.sqrt(1 - ZETA**2)
     a, b = X0, (V0 + ZETA * W * X0) / wd
     x = decay * (a * math.cos(wd * t) + b * math.sin(wd * t))
@@ -68,7 +68,7 @@ def exact(t: float) -> tuple[float, float]:
 @WAYS
 @METHODS
 def test_the_order_is_the_declared_one(row: IntegratorRow, way: str, tether: Any) -> None:
-    """On a damped oscillator, over 0.7 periods: over a whole one semi-implicit Euler would pass for order 2 (P06)."""
+    """Over 0.7 periods of a damped oscillator; over a whole period semi-implicit Euler would seem of order 2 (P06)."""
     seconds = 0.7 * PERIOD
     measured = order(oscillator(tether, way), row.fixed, exact(seconds), seconds, first_of(row.method))
     assert measured == pytest.approx(row.method.order_with_drag, abs=0.2)
@@ -85,7 +85,7 @@ def test_the_order_without_damping_is_the_declared_one(row: IntegratorRow, tethe
 
 
 def test_the_orders_are_those_of_the_table() -> None:
-    """What the issue promises, so that a method cannot declare its way out."""
+    """The orders are written here again, so that a wrong declaration fails."""
     orders = {row.name: (row.method.order, row.method.order_with_drag) for row in INTEGRATORS}
     promised = {"explicit_euler": (1, 1), "semi_implicit_euler": (1, 1), "averaged_velocity": (1, 1), "rk4": (4, 4)}
     promised |= {"midpoint": (2, 2), "heun": (2, 2), "velocity_verlet": (2, 2), "exponential_drag": (2, 2)}
@@ -95,8 +95,8 @@ def test_the_orders_are_those_of_the_table() -> None:
 
 
 @pytest.mark.slow
-def test_a_speed_limit_takes_the_order_away(tether: Any) -> None:
-    """Nobody may read "order 4" off a scene with a clamp after each step."""
+def test_a_speed_limit_reduces_the_order(tether: Any) -> None:
+    """RK4 is no longer of order 4 if speeds are clamped after each step."""
     end = oscillator(tether, "compiled", max_speed=0.9)
     seconds = 0.7 * PERIOD
     measured = order(end, RK4(), motion(end(RK4(), seconds / 2**17, 2**17)), seconds, first=40)
@@ -105,14 +105,14 @@ def test_a_speed_limit_takes_the_order_away(tether: Any) -> None:
 
 @pytest.mark.slow
 @METHODS
-def test_both_ways_take_the_same_steps(row: IntegratorRow, tether: Any) -> None:
+def test_python_and_compiled_steps_agree(row: IntegratorRow, tether: Any) -> None:
     ends = [motion(oscillator(tether, way)(row.method, 0.05, 100)) for way in ("python", "compiled")]
     np.testing.assert_allclose(ends[0], ends[1], rtol=1e-12)
 
 
 @METHODS
-def test_growth_is_the_worked_example_s(row: IntegratorRow) -> None:
-    """x = 100 exp(t / 10) as x'' = x' / 10, ten steps of 1 s."""
+def test_exponential_growth_has_the_published_values(row: IntegratorRow) -> None:
+    """x = 100 exp(t / 10) as x'' = x' / 10 in ten steps of 1 s."""
     state = blank(1, 1, 2, 0, 1.0)
     state.x[...], state.v[...] = 100.0, 10.0
     for _ in range(10):
@@ -124,13 +124,13 @@ def test_growth_is_the_worked_example_s(row: IntegratorRow) -> None:
 
 
 def energies(end: Advance, method: Integrator, w: float, dt: float, counts: Any) -> Array:
-    """v^2 + w^2 x^2 after some numbers of steps."""
+    """Return v^2 + w^2 x^2 after each of the given numbers of steps."""
     return np.array([v * v + w * w * x * x for x, v in (motion(end(method, dt, n)) for n in counts)])
 
 
 @WAYS
-def test_explicit_euler_pumps_energy_by_the_book(way: str, tether: Any) -> None:
-    """E_n = (1 + h^2 w^2)^n E_0. An Euler that moves with the new velocity is found out here."""
+def test_energy_under_explicit_euler_grows_by_the_exact_factor(way: str, tether: Any) -> None:
+    """E_n = (1 + h^2 w^2)^n E_0. An Euler method that moves with the new velocity would fail."""
     w, h, counts = 2 * math.pi, 0.01, (1, 10, 1000)
     found = energies(oscillator(tether, way, w, zeta=0), ExplicitEuler(), w, h, counts)
     expected = (V0**2 + w * w * X0**2) * (1 + h * h * w * w) ** np.array(counts)
@@ -138,7 +138,7 @@ def test_explicit_euler_pumps_energy_by_the_book(way: str, tether: Any) -> None:
 
 
 @WAYS
-def test_rk4_loses_energy_by_the_book(way: str, tether: Any) -> None:
+def test_energy_under_rk4_falls_by_the_exact_factor(way: str, tether: Any) -> None:
     """Per step 1 - y^6/72 + y^8/576 with y = h w."""
     w, h, counts = 2 * math.pi, 0.05, (1, 10, 1000)
     found = energies(oscillator(tether, way, w, zeta=0), RK4(), w, h, counts)
@@ -148,7 +148,7 @@ def test_rk4_loses_energy_by_the_book(way: str, tether: Any) -> None:
 
 
 @pytest.mark.parametrize(("way", "steps"), [("python", 3000), ("compiled", 100_000)])
-def test_semi_implicit_euler_keeps_its_invariant(way: str, steps: int, tether: Any) -> None:
+def test_semi_implicit_euler_conserves_its_invariant(way: str, steps: int, tether: Any) -> None:
     """v^2 + w^2 x^2 - h w^2 x v does not change at all."""
     w, h = 2 * math.pi, 0.01
     end = oscillator(tether, way, w, zeta=0)
@@ -160,7 +160,7 @@ def test_semi_implicit_euler_keeps_its_invariant(way: str, steps: int, tether: A
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("way", "steps"), [("python", 3000), ("compiled", 100_000)])
-def test_velocity_verlet_keeps_its_invariant(way: str, steps: int, tether: Any) -> None:
+def test_velocity_verlet_conserves_its_invariant(way: str, steps: int, tether: Any) -> None:
     """v^2 + w^2 x^2 (1 - h^2 w^2 / 4) does not change at all."""
     w, h = 2 * math.pi, 0.01
     end, share = oscillator(tether, way, w, zeta=0), 1 - h * h * w * w / 4
@@ -172,7 +172,7 @@ def test_velocity_verlet_keeps_its_invariant(way: str, steps: int, tether: Any) 
 
 @WAYS
 @pytest.mark.parametrize("method", [Midpoint(), Heun()], ids=lambda method: method.kind)
-def test_methods_of_order_2_pump_energy_by_the_book(method: Integrator, way: str, tether: Any) -> None:
+def test_energy_under_methods_of_order_2_grows_by_the_exact_factor(method: Integrator, way: str, tether: Any) -> None:
     """Per step 1 + y^4/4 with y = h w."""
     w, h, counts = 2 * math.pi, 0.05, (1, 10, 1000)
     found = energies(oscillator(tether, way, w, zeta=0), method, w, h, counts)
@@ -181,8 +181,8 @@ def test_methods_of_order_2_pump_energy_by_the_book(method: Integrator, way: str
 
 
 @METHODS
-def test_a_constant_force_leads_along_a_parabola(row: IntegratorRow) -> None:
-    """Exactly, but for the Eulers, which lag or lead by h g t / 2."""
+def test_a_constant_force_gives_a_parabola(row: IntegratorRow) -> None:
+    """It is exact for all methods but the Euler methods, which lag or lead by h g t / 2."""
     state, g = at_start(blank(1, 1, 2, 0, 0.25)), -9.81
     for _ in range(8):
         state = row.method(lambda x, v, t: g + 0 * x, state, 0.25)
@@ -193,7 +193,7 @@ def test_a_constant_force_leads_along_a_parabola(row: IntegratorRow) -> None:
 
 
 @pytest.mark.slow
-def test_energy_after_a_hundred_periods_is_the_table_s(tether: Any) -> None:
+def test_energy_after_a_hundred_periods_has_the_documented_values(tether: Any) -> None:
     """100 steps per period: 1.29272e17 explicit, 0.9999915 RK4, within 3.3 % semi-implicit."""
     w = 2 * math.pi
     end = oscillator(tether, "compiled", w, zeta=0)
@@ -202,17 +202,17 @@ def test_energy_after_a_hundred_periods_is_the_table_s(tether: Any) -> None:
     assert energies(end, RK4(), w, 0.01, [10_000])[0] / start == pytest.approx(0.9999915, abs=1e-7)
     for method in (Midpoint(), Heun()):
         assert energies(end, method, w, 0.01, [10_000])[0] / start == pytest.approx(1.039733, abs=1e-6)
-    kept = start - 0.01 * w * w * X0 * V0  # its own invariant, around which the energy swings
+    kept = start - 0.01 * w * w * X0 * V0  # its invariant; the energy oscillates around it
     swing = energies(end, SemiImplicitEuler(), w, 0.01, range(9_900, 10_000)) / kept
     assert swing.min() == pytest.approx(1 / (1 + 0.01 * w / 2), abs=1e-4)  # 0.969541
     assert swing.max() == pytest.approx(1 / (1 - 0.01 * w / 2), abs=1e-4)  # 1.032435
 
 
-# --- what a method says of itself -------------------------------------------------------------------------------------
+# --- declarations and rows of a method --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("row", [row for row in INTEGRATORS if not row.method.solves], ids=lambda row: row.name)
-def test_it_evaluates_the_force_as_often_as_it_says(row: IntegratorRow, tether: Any) -> None:
+def test_a_method_evaluates_the_force_as_often_as_declared(row: IntegratorRow, tether: Any) -> None:
     calls = []
     row.method(lambda x, v, t: calls.append(1) or -x, blank(1, 3, 2, 0, 0.1), 0.1)
     assert len(calls) == row.method.evaluations
@@ -223,7 +223,7 @@ def test_it_evaluates_the_force_as_often_as_it_says(row: IntegratorRow, tether: 
 
 @METHODS
 @pytest.mark.parametrize("dt", [0.0, -0.1, math.nan, math.inf])
-def test_a_step_that_leads_nowhere_is_refused(row: IntegratorRow, dt: float) -> None:
+def test_a_time_step_that_is_not_positive_and_finite_is_refused(row: IntegratorRow, dt: float) -> None:
     state = blank(1, 1, 2, 0, 0.1)
     with pytest.raises(ValueError, match="dt is") as caught:
         row.method(lambda x, v, t: -x, state, dt)
@@ -232,7 +232,7 @@ def test_a_step_that_leads_nowhere_is_refused(row: IntegratorRow, dt: float) -> 
 
 
 @METHODS
-def test_a_step_leaves_its_state_alone_and_agents_apart(row: IntegratorRow) -> None:
+def test_a_step_does_not_change_its_state_and_agents_are_independent(row: IntegratorRow) -> None:
     rng = np.random.default_rng(0)
     state = blank(2, 5, 3, 0, 0.1)
     state.x[...], state.v[...] = rng.normal(size=(3, 2, 5)), rng.normal(size=(3, 2, 5))
@@ -250,8 +250,8 @@ def test_a_step_leaves_its_state_alone_and_agents_apart(row: IntegratorRow) -> N
 
 
 @METHODS
-def test_a_law_never_knows_which_method_integrates_it(row: IntegratorRow) -> None:
-    """A force of nothing is a straight line for all of them; a constant one is a parabola, to their order."""
+def test_without_a_force_every_method_moves_in_a_straight_line(row: IntegratorRow) -> None:
+
     state = at_start(blank(1, 1, 2, 0, 0.25))
     for _ in range(8):
         state = row.method(lambda x, v, t: 0 * x, state, 0.25)
@@ -262,19 +262,19 @@ def test_a_law_never_knows_which_method_integrates_it(row: IntegratorRow) -> Non
 IN_ROWS = pytest.mark.parametrize(
     "row", [row for row in INTEGRATORS if not isinstance(row.method, OneStage)], ids=lambda row: row.name
 )
-"""Methods that work over rows of coordinates, with rows of their own."""
+"""Methods that work on rows of coordinates and have stage rows of their own."""
 
 
 @IN_ROWS
-def test_stage_arrays_are_as_many_as_are_used(row: IntegratorRow) -> None:
-    """With fewer than it declares a method would write into another's scratch: a guard behind them stays untouched."""
+def test_a_method_writes_no_more_stage_rows_than_it_declares(row: IntegratorRow) -> None:
+    """Guard rows behind the declared ones must stay unchanged; writes there would overwrite other scratch."""
     stages = np.full((row.method.stages + 2, 6), 7.0)
     row.method.advance()(Provided(spring))(alone(row), np.ones(6), np.ones(6), (), 0.0, 0.1, stages, 0, 6)
     assert (stages[row.method.stages :] == 7).all()
 
 
 @pytest.mark.parametrize("row", INTEGRATORS, ids=lambda row: row.name)
-def test_one_stage_needs_no_row_of_scratch(row: IntegratorRow) -> None:
+def test_methods_of_one_evaluation_need_no_stage_rows(row: IntegratorRow) -> None:
     group = Group(count=3, spawn=Spawn(low=(0, 0), high=(1, 1)))
     scene = Scene(groups=(group,), effects=(Separation(weight=1, radius=1),), integrator=row.method)
     once = row.method.evaluations == 1
@@ -283,15 +283,15 @@ def test_one_stage_needs_no_row_of_scratch(row: IntegratorRow) -> None:
 
 
 @IN_ROWS
-def test_of_a_team_each_writes_his_own_part_alone(row: IntegratorRow) -> None:
-    """Threads that share a world share its rows: what one leaves of [first, end) or writes beyond it is a race."""
+def test_each_thread_of_a_shared_world_writes_only_its_own_part(row: IntegratorRow) -> None:
+    """Threads that share a world share its rows, so each must write all of [first, end) and nothing beyond."""
     rng = np.random.default_rng(0)
     start = (*rng.normal(size=(2, 12)), np.full((row.method.stages, 12), 7.0))
     together, apart = [array.copy() for array in start], [array.copy() for array in start]
     row.method.advance()(Provided(spring))(alone(row), *together[:2], (), 0.0, 0.1, together[2], 0, 12)
     for first, end in ((0, 5), (5, 5), (5, 12)):
         if first == end and row.method.adaptive:
-            continue  # nobody helps with a world of its: there is no empty part
+            continue  # threads never share a world of an adaptive method: no empty parts
 
         def law(context: Any, pos: Array, vel: Array, time: float, out: Array, mine: slice = slice(first, end)) -> None:
             out[mine] = -pos[mine]
@@ -307,8 +307,8 @@ def test_of_a_team_each_writes_his_own_part_alone(row: IntegratorRow) -> None:
         np.testing.assert_array_equal(whole, once)
 
 
-def test_linear_drags_of_several_effects_are_treated_as_their_sum() -> None:
-    """Exactly, and in every dimension: v = v0 exp(-(c + c') dt / m)."""
+def test_linear_drags_of_several_effects_are_summed() -> None:
+    """v = v0 exp(-(c + c') dt / m) exactly, in both dimensions."""
     for dimension in (2, 3):
         group = Group(count=20, mass=2.0, spawn=Spawn(low=(0,) * dimension, high=(9,) * dimension, speed=(1, 2)))
         drags = Drag(rate=3.0), Drag(rate=1.5)
@@ -331,10 +331,10 @@ def advance(provided):
 """
 
 
-def test_a_method_that_is_typed_into_a_notebook_runs_in_a_scene_and_in_python(tether: Any) -> None:
-    """It has no file: its code is compiled, not its text. This one is semi-implicit Euler, written over a row."""
+def test_a_method_without_a_source_file_runs_in_a_scene_and_in_python(tether: Any) -> None:
+    """Its code object is compiled, not its source, as in a notebook. It is semi-implicit Euler over a row."""
     typed: dict[str, Any] = {"np": np, "__name__": __name__}
-    exec(TYPED, typed)  # noqa: S102  # the lines above
+    exec(TYPED, typed)  # noqa: S102  # the text above
 
     class Typed(Integrator):
         kind: Literal["typed"] = "typed"
@@ -354,7 +354,7 @@ def test_a_method_that_is_typed_into_a_notebook_runs_in_a_scene_and_in_python(te
 
 
 @pytest.mark.slow
-def test_halving_the_step_brings_the_methods_together(tether: Any) -> None:
+def test_differences_between_methods_halve_with_the_step(tether: Any) -> None:
     seconds = 0.7 * PERIOD
     end, gaps = oscillator(tether, "compiled"), []
     for n in (100, 200, 400):
