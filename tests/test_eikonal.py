@@ -14,19 +14,22 @@ Array = NDArray[np.float64]
 
 
 def plane(spacing: float, size: float = 20.0) -> tuple[Array, Array]:
-    """The coordinates of a square grid, m."""
+    """Return the coordinates of a square grid, m."""
     axis = np.arange(round(size / spacing) + 1) * spacing
     x, y = np.meshgrid(axis, axis, indexing="ij")
     return x, y
 
 
 def about(distance: Array, radius: float) -> Array:
-    """Distances that are known: those up to `radius`, m."""
+    """Return the known distances, those up to `radius`, m; inf elsewhere."""
     return np.where(distance <= radius + 1e-9, distance, np.inf)
 
 
 def behind_a_wall(spacing: float) -> tuple[NDArray[np.bool_], Array, Array]:
-    """Free points of a plane with a wall at x = 10 from 0 to 12 m, distances from (5, 5) by air, and around the tip."""
+    """Return the free points of a plane with a wall, straight distances from (5, 5), and those around the wall.
+
+    The wall is at x = 10 m, from y = 0 to 12 m.
+    """
     x, y = plane(spacing)
     free = ~((abs(x - 10) < 1.5 * spacing) & (y < 12 + spacing / 2))
     by_air, left, right = np.hypot(x - 5, y - 5), 10 - spacing, 10 + spacing  # the tip has two corners
@@ -37,8 +40,8 @@ def behind_a_wall(spacing: float) -> tuple[NDArray[np.bool_], Array, Array]:
     return free, by_air, np.where(shadow, to_left + 2 * spacing + np.hypot(x - right, y - 12), around)
 
 
-def test_distances_in_the_open_are_second_order() -> None:
-    """Half the spacing, a quarter of the error, from a goal that is the same disc of 0.8 m on each grid."""
+def test_errors_in_the_open_plane_are_of_second_order() -> None:
+    """Half the spacing gives about a quarter of the error; the goal is the same disc of 0.8 m on each grid."""
     errors = []
     for spacing in (0.2, 0.1, 0.05):
         x, y = plane(spacing)
@@ -50,7 +53,7 @@ def test_distances_in_the_open_are_second_order() -> None:
 
 
 @pytest.mark.parametrize("goal", [(10.0, 10.0), (3.0, 7.0)])
-def test_distances_in_the_open_are_as_good_as_those_of_scikit_fmm(goal: tuple[float, float]) -> None:
+def test_errors_in_the_open_plane_do_not_exceed_those_of_scikit_fmm(goal: tuple[float, float]) -> None:
     x, y = plane(0.05)
     exact, known = np.hypot(x - goal[0], y - goal[1]), 0.2
     found = distances_around(np.ones(x.shape, bool), 0.05, about(exact, known))
@@ -59,7 +62,7 @@ def test_distances_in_the_open_are_as_good_as_those_of_scikit_fmm(goal: tuple[fl
     assert abs(found - exact).max() < 0.01  # first order: 0.07
 
 
-def test_distances_behind_a_wall_are_as_good_as_those_of_scikit_fmm() -> None:
+def test_errors_behind_a_wall_are_about_those_of_scikit_fmm() -> None:
     free, by_air, exact = behind_a_wall(0.05)
     found = distances_around(free, 0.05, about(by_air, 0.2))
     theirs = np.asarray(skfmm.distance(np.ma.MaskedArray(by_air - 0.2, ~free), dx=0.05, order=2)) + 0.2
@@ -69,7 +72,7 @@ def test_distances_behind_a_wall_are_as_good_as_those_of_scikit_fmm() -> None:
     assert errors.max() < 0.16  # first order: 0.27
 
 
-def test_distances_in_space_are_second_order() -> None:
+def test_errors_in_open_space_are_of_second_order() -> None:
     errors = []
     for spacing in (0.4, 0.2):
         axis = np.arange(round(8 / spacing) + 1) * spacing
@@ -80,7 +83,7 @@ def test_distances_in_space_are_second_order() -> None:
     assert errors[0] / errors[1] > 3
 
 
-def test_points_that_no_way_leads_to_are_infinitely_far_and_walls_are_not_crossed() -> None:
+def test_unreachable_points_are_infinitely_far_and_walls_are_not_crossed() -> None:
     x, y = plane(0.1, 4.0)
     free = abs(x - 2) > 0.05
     found = distances_around(free, 0.1, about(np.hypot(x - 1, y - 2), 0.3))
@@ -88,8 +91,8 @@ def test_points_that_no_way_leads_to_are_infinitely_far_and_walls_are_not_crosse
     assert np.isfinite(found[x < 1.95]).all()
 
 
-def test_all_connected_points_are_reached_and_no_distance_takes_a_short_cut() -> None:
-    """Among random discs: a stencil that reached across one would be shorter than by air by its width, 0.4 m."""
+def test_all_connected_points_are_reached_and_no_path_cuts_an_obstacle() -> None:
+    """Obstacles are random discs; a stencil across one would give less than the straight distance, by up to 0.4 m."""
     rng = np.random.default_rng(3)
     x, y = plane(0.1, 12.0)
     by_air = np.hypot(x - 6.05, y - 6.05)
@@ -104,8 +107,8 @@ def test_all_connected_points_are_reached_and_no_distance_takes_a_short_cut() ->
     assert (found - by_air)[there].min() > -0.05
 
 
-def test_a_maze_of_many_turns_is_followed_to_its_end() -> None:
-    """1,000 corridors one point wide: a round of sweeps goes around two corners of it."""
+def test_distances_are_found_to_the_end_of_a_long_maze() -> None:
+    """The maze has 1,000 corridors, one point wide; a round of sweeps passes two corners."""
     corridors = 1000
     free = np.zeros((2 * corridors + 1, 5), bool)
     free[1::2, 1:4] = True

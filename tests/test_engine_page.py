@@ -1,4 +1,4 @@
-"""docs/engine.md: what it says of the files holds, and its example of a law runs."""
+"""docs/engine.md: the files and functions that it names exist, and its example of a law runs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGE = (ROOT / "docs/engine.md").read_text(encoding="utf-8")
 
 
-def test_every_file_of_the_page_is_there_and_holds_what_the_page_names() -> None:
+def test_files_and_functions_named_by_the_page_exist() -> None:
     named = re.findall(r"`(flockenv/[\w/]+\.py)`(?:, `(\w+)`)?", PAGE)
     assert len(named) > 8
     for path, function in named:

@@ -1,4 +1,4 @@
-"""Experiments: what they find, and the command that shows it."""
+"""Experiments: plans, results, and the command that runs them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PLANS = Path(__file__).parent.parent / "configs" / "experiments"
 
 
 @pytest.mark.parametrize("path", sorted(PLANS.glob("*.yaml")), ids=lambda path: path.stem)
-def test_every_plan_can_be_run_and_is_named_as_what_it_measures(path: Path) -> None:
+def test_every_plan_builds_its_scenes_and_has_the_name_of_its_file(path: Path) -> None:
     experiment = load_plan(path).experiment()  # builds every scene
     assert experiment.name == path.stem
     assert experiment.cases
@@ -31,7 +31,7 @@ def steer_plan(name: str) -> SteerPlan:
     return plan
 
 
-def test_every_arbitration_is_tried_in_every_conflict() -> None:
+def test_every_arbitration_is_a_variant_of_every_case() -> None:
     plan = steer_plan("arbitration")
     assert list(plan.variants) == [a.kind for a in catalogue.ARBITRATIONS]
     for case in plan.cases:
@@ -39,22 +39,23 @@ def test_every_arbitration_is_tried_in_every_conflict() -> None:
             assert plan.scene_of(case, variant).effects[0].arbitration.kind == variant  # type: ignore[attr-defined]
 
 
-def test_the_global_way_leads_to_what_was_sought() -> None:
+def test_follow_way_has_the_target_of_the_seek_behaviour_it_replaces() -> None:
     plan = steer_plan("avoidance")
     avoid, way = plan.scene_of("U trap", "to avoid, global way").effects[0].wishes
     assert (avoid.kind, way.kind, way.target) == ("avoid_obstacles", "follow_way", (12, 0))  # type: ignore[attr-defined]
-    assert [wish.kind for wish in plan.scene_of("U trap", "whiskers").effects[0].wishes] == ["whiskers", "seek"]
+    assert [each.kind for each in plan.scene_of("U trap", "whiskers").effects[0].wishes] == ["whiskers", "seek"]
 
 
-def test_numbers_about_contacts_and_grants() -> None:
-    depth = np.array([[[-1.0, 0.1]], [[0.2, -0.1]], [[-0.1, 0.3]]])  # one inside from the start, out, in again
+def test_collisions_and_depths_are_counted_per_agent() -> None:
+    # One agent enters once; the other starts inside, leaves and enters again.
+    depth = np.array([[[-1.0, 0.1]], [[0.2, -0.1]], [[-0.1, 0.3]]])
     assert arbitration._contacts(depth) == {"collisions": 1.5, "deepest": 0.3}
     assert arbitration._contacts(-np.ones((3, 1, 2))) == {"collisions": 0.0, "deepest": 0.0}
 
 
 @pytest.mark.slow
-def test_what_the_experiment_shows() -> None:
-    """A blend runs into what it is warned of, where wishes cancel and in an emergency; an ordered budget does not."""
+def test_blending_collides_in_conflicts_and_ordered_arbitrations_do_not() -> None:
+    """A blend collides if forces cancel, and in an emergency."""
     plan = steer_plan("arbitration")
     results, trials = run(plan.experiment())
     assert len(trials) == len(plan.cases) * len(plan.variants)
@@ -90,13 +91,13 @@ variants:
 
 
 @pytest.mark.slow
-def test_the_command_writes_table_numbers_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_writes_a_table_numbers_and_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plan = tmp_path / "small.yaml"
     plan.write_text(SMALL)
     out = tmp_path / "x.png"
     assert main(["experiment", str(plan), "--out", str(out)]) == 0
-    said = capsys.readouterr().out
-    assert "A small one" in said
+    printed = capsys.readouterr().out
+    assert "A small one" in printed
     found: dict[str, Any] = json.loads(out.with_suffix(".json").read_text())
     assert [cell["numbers"]["arrived"] for cell in found["cells"]] == [0.0]
     assert [cell["numbers"]["time"] for cell in found["cells"]] == [None]
@@ -117,12 +118,12 @@ def test_the_command_writes_table_numbers_and_picture(tmp_path: Path, capsys: py
         ("straight: {}", "straight: {furst: []}", "first"),
     ],
 )
-def test_a_plan_that_makes_no_sense_is_refused(old: str, new: str, message: str) -> None:
+def test_an_invalid_plan_is_refused(old: str, new: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         load_plan(SMALL.replace(old, new))
 
 
-def test_who_is_fast_without_limit_loses_no_share_of_it() -> None:
+def test_a_group_without_a_maximum_speed_is_refused() -> None:
     limitless = SMALL.replace("max_speed: 2, ", "").replace("weight: 4,", "weight: 4, speed: 2,")
     with pytest.raises(ValueError, match=r"cases.ahead.scene.groups\[0\].max_speed = None: give m/s"):
         run(load_plan(limitless).experiment())

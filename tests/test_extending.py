@@ -1,4 +1,4 @@
-"""docs/extending.md: every Python block of the page runs as a script of its section, and prints what the page says."""
+"""docs/extending.md: the Python blocks of each section run as a script, and print the numbers of the page."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def numbers(text: str) -> list[float]:
     return [float(number) for number in re.findall(NUMBER, text)]
 
 
-def test_every_python_block_of_the_page_is_run() -> None:
+def test_every_python_block_of_the_page_is_part_of_a_tutorial() -> None:
     blocks = re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
     assert len(blocks) >= 2 * len(TUTORIALS)
     scripts = [script_of(section) for section in TUTORIALS]
     assert all(sum(block in script for script in scripts) == 1 for block in blocks)
 
 
-def test_the_wind_moves_agents_by_its_mean_force(tmp_path: Path) -> None:
+def test_the_wind_of_the_page_moves_agents_by_its_mean_force(tmp_path: Path) -> None:
     """Two whole periods: v = push / 2 / m = 0.75 m/s along x."""
     assert numbers(" ".join(printed(TUTORIALS[0], tmp_path))) == pytest.approx([0.75, 0] * 2, abs=1e-5)
 
@@ -54,7 +54,7 @@ def test_agents_settle_on_the_orbit_that_the_page_computes(tmp_path: Path) -> No
     assert numbers(" ".join(printed(TUTORIALS[1], tmp_path))) == pytest.approx([5.2] * 8, abs=0.1)
 
 
-def test_the_task_is_solved_in_every_world_and_is_an_environment(tmp_path: Path) -> None:
+def test_the_task_of_the_page_is_solved_in_every_world_and_is_an_environment(tmp_path: Path) -> None:
     rollout, environment = printed(TUTORIALS[2], tmp_path)
     success, longest = numbers(rollout)
     assert success == 1
@@ -63,7 +63,7 @@ def test_the_task_is_solved_in_every_world_and_is_an_environment(tmp_path: Path)
     assert environment.endswith("False)")
 
 
-def test_the_player_from_a_file_catches_more_than_chance(tmp_path: Path) -> None:
+def test_the_player_of_the_page_scores_more_than_a_random_player(tmp_path: Path) -> None:
     scores, comparison = printed(TUTORIALS[3], tmp_path)
     mine, chance, success = numbers(scores)
     assert success == 1

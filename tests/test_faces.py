@@ -39,8 +39,8 @@ def record(observation, reward, terminated, truncated):
     return observation.tobytes(), np.float64(reward).tobytes(), bool(terminated), bool(truncated)
 
 
-# Each of these plays the sequence in one face, beginning anew at every end, and returns one list per learner: the
-# first observation, then records, and after each end the first observation of the next episode.
+# Each of these functions plays the sequence in one face, with a reset at every end. It returns one list per learner:
+# the first observation, then records, and after each end the first observation of the next episode.
 
 
 def through_world(task, actions):
@@ -137,7 +137,7 @@ def through_turns(env_id, parameters, actions):
 
 
 @pytest.mark.parametrize("name", ALONE)
-def test_one_learner_through_every_face(name):
+def test_one_learner_gets_the_same_numbers_in_every_face(name):
     task, parameters = ALONE[name]
     env_id, actions = id_of(name), sequence(task)
     expected = through_world(task, actions)
@@ -154,7 +154,7 @@ def test_one_learner_through_every_face(name):
         assert through_turns(env_id, alone[name], actions) == expected
 
 
-def test_many_learners_through_every_face_that_takes_them():
+def test_many_learners_get_the_same_numbers_in_every_face_for_several():
     task = Flock(agents=7, learners=5)
     parameters, actions = {"agents": 7, "learners": 5}, sequence(task)
     expected = through_world(task, actions)
@@ -169,12 +169,12 @@ def test_many_learners_through_every_face_that_takes_them():
     [(Pursuit(pursuers=3, evaders=2, sides="both"), {}), (School(metabolism=0.4), {"metabolism": 0.4})],
     ids=["pursuit", "school"],
 )
-def test_a_game_in_which_agents_leave(task, parameters):
+def test_faces_agree_in_a_game_in_which_agents_leave(task, parameters):
     actions, env_id = sequence(task), id_of(type(task).__name__)
     parallel = through_parallel(env_id, parameters, actions)
     assert parallel == through_turns(env_id, parameters, actions)
     for log, whole in zip(parallel, through_world(task, actions), strict=True):
-        # The World goes on to write about an agent that left; the others say nothing about it.
+        # The World continues to return rows for an agent that left; the other faces do not.
         assert [e for e in whole if e in log] == log
 
 
@@ -184,7 +184,7 @@ class Odd(enum.StrEnum):
 
 
 @pytest.mark.parametrize("names", [["a", "b"], (Odd.QUOTED, Odd.PLAIN), (np.str_("a"), "class"), ("n1", "agents")])
-def test_numbers_are_told_by_whatever_names_they_have(names):
+def test_numbers_keep_their_names_of_any_string_type(names):
     rows = np.arange(6.0).reshape(3, 2)
     expected = [dict(zip(map(str, names), row, strict=True)) for row in rows.tolist()]
     assert list(named(names, rows)) == expected

@@ -1,4 +1,4 @@
-"""Fields, media, fluctuations and pressure: what they promise beside their closed forms, and what they refuse."""
+"""Fields, media, fluctuations and pressure: closed forms, statistics and refusals."""
 
 from __future__ import annotations
 
@@ -39,20 +39,20 @@ def scene_of(*effects: Effect, count: int = 1, dimension: int = 2, mass: float =
     )  # fmt: skip
 
 
-# --- in time ----------------------------------------------------------------------------------------------------------
+# --- time dependence --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-def test_a_field_may_swing_in_time() -> None:
-    """m v' = F cos(w t + phase): v and x are its integrals; stages of a method ask at their own instants."""
+def test_a_uniform_field_can_oscillate_in_time() -> None:
+    """m v' = F cos(w t + phase): v and x are its integrals; stages of a method evaluate it at their own times."""
     scene = scene_of(Uniform(strength=(3, -1), period=0.7, phase=0.4), mass=1.5)
     start = scene.start(0)
     end = scene.run(start, 230)
     w, t, a = 2 * math.pi / 0.7, 2.3, np.array([2, -2 / 3])
     speed = (math.sin(w * t + 0.4) - math.sin(0.4)) / w
-    way = (math.cos(0.4) - math.cos(w * t + 0.4)) / w**2 - math.sin(0.4) / w * t
+    shift = (math.cos(0.4) - math.cos(w * t + 0.4)) / w**2 - math.sin(0.4) / w * t
     np.testing.assert_allclose(end.vel[0, 0], a * speed, atol=1e-8)
-    np.testing.assert_allclose((end.pos - start.pos)[0, 0], a * way, atol=1e-8)
+    np.testing.assert_allclose((end.pos - start.pos)[0, 0], a * shift, atol=1e-8)
 
 
 def test_gusts_rise_and_fall_within_a_period() -> None:
@@ -64,7 +64,7 @@ def test_gusts_rise_and_fall_within_a_period() -> None:
     np.testing.assert_allclose((end.pos - start.pos)[0, 0], (2 + grown, 3 * grown), atol=1e-8)
 
 
-def test_what_is_steady_knows_no_time() -> None:
+def test_steady_effects_have_no_numbers_for_time() -> None:
     steady = scene_of(Source(strength=1, centre=(0, 0), maximum=1), Wind(velocity=(1, 0)))
     swinging = scene_of(Source(strength=1, centre=(0, 0), maximum=1, period=2), Wind(velocity=(1, 0)))
     (source, wind), (swung, _) = steady.parts.number_plan.effects, swinging.parts.number_plan.effects
@@ -77,7 +77,7 @@ def test_what_is_steady_knows_no_time() -> None:
 
 
 @pytest.mark.slow
-def test_to_be_dragged_and_to_be_carried_are_two_models() -> None:
+def test_dragged_and_carried_agents_follow_different_closed_forms() -> None:
     """Dragged from rest v = u (1 - exp(-c t / m)), and x lags behind u t by u m / c; carried x = u t, and v stays 0."""
     medium, u = Uniform(strength=(2, 1), acts="medium"), np.array([2, 1])
     ends = []
@@ -101,8 +101,8 @@ def test_media_are_summed() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_on_a_torus_the_nearest_image_of_a_centre_acts(dimension: int) -> None:
-    """As in a plane with the centre there, whichever way around is shorter."""
+def test_the_nearest_image_of_a_centre_acts_on_a_torus(dimension: int) -> None:
+    """The forces are those in a plane with the centre at that image."""
     size, place = (9.0, 7.0, 8.0)[:dimension], (8.5, 6.8, 0.1)[:dimension]
     given = {"strength": 2, "maximum": 3}
     turning = {"axis": (0.6, 0, 0.8)} if dimension == 3 else {}
@@ -129,7 +129,7 @@ def test_on_a_torus_the_nearest_image_of_a_centre_acts(dimension: int) -> None:
 
 
 @pytest.mark.slow
-def test_fluctuations_do_not_depend_on_the_step() -> None:
+def test_variances_under_fluctuations_do_not_depend_on_dt() -> None:
     """var x after T within 5 % for three steps, and (s/m)^2 T^3 / 3; var v = (s/m)^2 T."""
     seconds, s, m = 2.0, 0.6, 1.5
     for dt in (0.1, 0.05, 0.025):
@@ -142,11 +142,11 @@ def test_fluctuations_do_not_depend_on_the_step() -> None:
 
 
 @pytest.mark.slow
-def test_with_drag_fluctuations_come_to_an_equilibrium() -> None:
+def test_fluctuations_and_drag_reach_the_equilibrium_variance() -> None:
     """var v = s^2 / (2 c m) per direction, and in the long run x diffuses: var x = 2 D t + ..., D = s^2 / (2 c^2).
 
-    v is seen just after a kick, before drag has had its share of it: that is too much by c dt / m, and the reason why
-    the two steps here are short.
+    v is measured just after a kick, before drag acts on it, and is too large by a factor of about 1 + c dt / m; the two
+    steps are therefore short.
     """
     s, m, c = 0.6, 0.25, 0.5
     for dt in (0.02, 0.01):
@@ -182,7 +182,7 @@ DIMENSIONS = pytest.mark.parametrize("dimension", [2, 3])
 
 
 def pushed(x: Array, dimension: int) -> Array:
-    """The formula, over all pairs, (N, D)."""
+    """Return the formula summed over all pairs, (N, D)."""
     a2, offset = PRESSURE.distance(dimension) ** 2, x[:, None] - x[None]
     square = (offset**2).sum(axis=2) + np.eye(len(x)) * 1e9
     force = 1.5 * (a2 - square) / (square + a2 / 64) * np.maximum(1 - square / 1.35**2, 0) ** 2
@@ -190,7 +190,7 @@ def pushed(x: Array, dimension: int) -> Array:
 
 
 @DIMENSIONS
-def test_pressure_is_its_formula_smooth_and_nothing_beyond_its_radius(dimension: int) -> None:
+def test_pressure_follows_its_formula_and_goes_smoothly_to_0_at_its_radius(dimension: int) -> None:
     scene = scene_of(PRESSURE, Drag(rate=0), count=40, dimension=dimension, mass=0.5)
     start = scene.start(0)
     start.pos[0] *= 3
@@ -200,7 +200,7 @@ def test_pressure_is_its_formula_smooth_and_nothing_beyond_its_radius(dimension:
     state = pair.start(0)
 
     def force(r: float) -> float:
-        """On the second of two, away from the first."""
+        """Return the force on the second of two agents, away from the first."""
         state.pos[0], state.pos[0, 1, 0] = 0, r
         found = pair.acceleration(state)[0]
         np.testing.assert_array_equal(found[0], -found[1])
@@ -209,15 +209,15 @@ def test_pressure_is_its_formula_smooth_and_nothing_beyond_its_radius(dimension:
     assert force(0.5 * a) > 0 > force(1.1 * a)
     assert force(a) == pytest.approx(0, abs=1e-12)
     assert force(1.35) == force(5) == 0
-    assert abs(force(1.35 - 1e-5)) < 1e-8  # with its slope
+    assert abs(force(1.35 - 1e-5)) < 1e-8  # the slope is also 0
     assert force(1e-9) == pytest.approx(1.5 * 64, rel=1e-6)
 
 
 @pytest.mark.slow
 @DIMENSIONS
 @pytest.mark.parametrize("crowding", [1.5, 2.0])
-def test_a_crowded_gas_relaxes_to_the_density(dimension: int, crowding: float) -> None:
-    """Within 10 %, agents counted in the inner half of the radius; momentum is that of the start."""
+def test_a_crowded_gas_relaxes_to_the_given_density(dimension: int, crowding: float) -> None:
+    """The density within half the radius is right to 10 %; the centre of mass does not move."""
     count = 400
     edge = (count / crowding) ** (1 / dimension)
     scene = scene_of(PRESSURE, Drag(rate=1), count=count, dimension=dimension, dt=0.02, integrator=SemiImplicitEuler())
@@ -269,7 +269,7 @@ GROUPS = (Group(count=1, spawn=Spawn(low=(0, 0), high=(1, 1))),)
         (lambda: Gravity(acceleration=(0,)), "Gravity: acceleration: must be a list of 2 to 3, each a number"),
     ],
 )  # fmt: skip
-def test_what_does_not_fit_is_refused_in_one_line(make: Any, line: str) -> None:
+def test_invalid_fields_are_refused_in_one_line(make: Any, line: str) -> None:
     with pytest.raises(ValueError, match="^" + re.escape(line)) as caught:
         make()
     assert "\n" not in str(caught.value)

@@ -1,4 +1,4 @@
-"""The gallery: every behaviour shows itself, and the page says what the behaviours say."""
+"""The gallery: every behaviour has a demo, and the page in docs agrees with the behaviours."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
 
 
 @pytest.mark.parametrize("kind", BEHAVIOURS)
-def test_every_behaviour_has_a_scene_that_lists_it(kind: str) -> None:
+def test_the_demo_of_every_behaviour_contains_it(kind: str) -> None:
     demo = BEHAVIOURS[kind].demo
     assert demo is not None, f"{kind} needs a demo, the YAML text of a small scene"
     scene = load_scene(demo)
@@ -27,21 +27,21 @@ def test_every_behaviour_has_a_scene_that_lists_it(kind: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", BEHAVIOURS)
-def test_somebody_moves_otherwise_than_without_it(kind: str) -> None:
+def test_every_behaviour_changes_the_motion_in_its_demo(kind: str) -> None:
     run = shown(BEHAVIOURS[kind])
     others = tuple(effect.idle() if effect.kind in (kind, "steer") else effect for effect in run.scene.effects)
     without = run.scene.with_effects(*others).run(run.first, int(run.step[-1]))
     assert np.abs(run.last.pos - without.pos).max() > 0.1
 
 
-def test_the_page_in_docs_is_the_one_of_the_behaviours() -> None:
-    """If this fails: flockenv gallery --out docs/behaviours.md --force."""
+def test_the_page_in_docs_is_up_to_date() -> None:
+    """If this fails, run `flockenv gallery --out docs/behaviours.md --force`."""
     assert (DOCS / "behaviours.md").read_text(encoding="utf-8") == page(BEHAVIOURS, "behaviours")
     assert {path.stem for path in (DOCS / "behaviours").glob("*.png")} == set(BEHAVIOURS)
 
 
 @pytest.mark.slow
-def test_a_gallery_is_a_page_and_its_pictures(
+def test_the_command_writes_a_page_and_its_pictures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -57,7 +57,7 @@ def test_a_gallery_is_a_page_and_its_pictures(
     assert main(["gallery", "--out", "page.md"]) == 2
 
 
-def test_a_behaviour_without_a_scene_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_behaviour_without_a_demo_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Separation, "demo", None)
     with pytest.raises(ValueError, match=r"^separation: has no demo"):
         shown(Separation)

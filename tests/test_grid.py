@@ -1,4 +1,4 @@
-"""Numbers on a grid: what is linear is exact everywhere in between."""
+"""Interpolation on a grid: exact for functions that are linear along each axis."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ def table(dimension: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_in_between_it_is_linear_along_each_axis(dimension: int) -> None:
+def test_interpolation_is_linear_along_each_axis(dimension: int) -> None:
     low = np.array(LOW[:dimension])
     high = low + SPACING * (np.array(COUNTS[:dimension]) - 1)
     where = np.random.default_rng(1).uniform(low, high, (400, dimension))
     found = sampled(table(dimension), where)
     np.testing.assert_allclose(found[:, 0], where @ np.array([2.0, -3.0, 0.5])[:dimension] + 1, atol=1e-12)
-    # x y is linear along each axis: what a bilinear sample gets right, and one that takes the nearest point does not
+    # x y is linear along each axis: bilinear interpolation is exact, the nearest point is not.
     np.testing.assert_allclose(found[:, 1], where[:, 0] * where[:, 1], atol=1e-12)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_outside_it_is_as_on_the_edge_and_never_reads_beyond(dimension: int) -> None:
+def test_points_outside_get_the_value_of_the_nearest_edge(dimension: int) -> None:
     low = np.array(LOW[:dimension])
     high = low + SPACING * (np.array(COUNTS[:dimension]) - 1)
     where = np.random.default_rng(2).uniform(-1e3, 1e3, (400, dimension))
@@ -47,6 +47,6 @@ def test_outside_it_is_as_on_the_edge_and_never_reads_beyond(dimension: int) -> 
         (np.full((3, 3, 1), np.nan), 1.0, "must be finite"),
     ],
 )
-def test_what_is_no_grid_is_refused(values: np.ndarray, spacing: float, text: str) -> None:
+def test_invalid_grids_are_refused(values: np.ndarray, spacing: float, text: str) -> None:
     with pytest.raises(ValueError, match=text):
         packed(values, (0.0, 0.0), spacing)

@@ -111,7 +111,7 @@ def test_python_and_compiled_steps_agree(row: IntegratorRow, tether: Any) -> Non
 
 
 @METHODS
-def test_exponential_growth_has_the_published_values(row: IntegratorRow) -> None:
+def test_exponential_growth_has_the_values_of_the_catalogue(row: IntegratorRow) -> None:
     """x = 100 exp(t / 10) as x'' = x' / 10 in ten steps of 1 s."""
     state = blank(1, 1, 2, 0, 1.0)
     state.x[...], state.v[...] = 100.0, 10.0
@@ -251,7 +251,6 @@ def test_a_step_does_not_change_its_state_and_agents_are_independent(row: Integr
 
 @METHODS
 def test_without_a_force_every_method_moves_in_a_straight_line(row: IntegratorRow) -> None:
-
     state = at_start(blank(1, 1, 2, 0, 0.25))
     for _ in range(8):
         state = row.method(lambda x, v, t: 0 * x, state, 0.25)

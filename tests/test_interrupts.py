@@ -1,4 +1,4 @@
-"""Signals: a command ends in one line, its processes end with it, and nothing half-written is left behind."""
+"""Signals: a command ends with one line, its processes end with it, and no partly written file is left."""
 
 from __future__ import annotations
 
@@ -42,20 +42,20 @@ def say(word):
 
 
 def start(*command: str, folder: Path) -> subprocess.Popen[str]:
-    """Start a process that has a group of its own and hears of signals, however the tests were started."""
+    """Start a process with a group of its own and default signal handlers, however the tests were started."""
 
-    def hear() -> None:
+    def reset_handlers() -> None:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
 
     return subprocess.Popen(
         [sys.executable, *command], cwd=folder, env=ENVIRONMENT, text=True, stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE, start_new_session=True, preexec_fn=hear,
+        stderr=subprocess.PIPE, start_new_session=True, preexec_fn=reset_handlers,
     )  # fmt: skip
 
 
 def toy(body: str, folder: Path, word: str = "ready") -> subprocess.Popen[str]:
-    """Start a command of a few lines, and wait until it says a word."""
+    """Start a command of a few lines, and wait until it prints a word."""
     process = start("-c", COMMAND.format(body=body), folder=folder)
     wait_for(process, word)
     return process
@@ -66,7 +66,7 @@ def wait_for(process: subprocess.Popen[str], word: str) -> None:
 
 
 def guards_signals(process: subprocess.Popen[str]) -> bool:
-    """True if a process blocks SIGTERM or handles it: Python itself does not."""
+    """Return True if a process blocks or handles SIGTERM; Python itself does neither."""
     status = Path(f"/proc/{process.pid}/status").read_text()
     masks = re.findall(r"^Sig(?:Blk|Cgt):\s*(\w+)", status, re.MULTILINE)
     return any(int(mask, 16) >> (signal.SIGTERM - 1) & 1 for mask in masks)
@@ -79,7 +79,7 @@ def lives(pid: int) -> bool:
         return False
 
 
-# --- one line, at every moment
+# --- one line, at any time
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
@@ -92,7 +92,7 @@ def lives(pid: int) -> bool:
     ],
     ids=["flockenv", "compare", "tune"],
 )
-def test_a_command_that_is_still_importing_ends_in_one_line(
+def test_a_signal_during_imports_ends_a_command_with_one_line(
     command: tuple[str, ...], number: signal.Signals, tmp_path: Path
 ) -> None:
     process = start(*command, folder=tmp_path)
@@ -100,15 +100,15 @@ def test_a_command_that_is_still_importing_ends_in_one_line(
         assert process.poll() is None
         time.sleep(0.0005)
     os.killpg(process.pid, number)
-    out, said = process.communicate(timeout=60)
-    assert process.returncode == 128 + number, said
-    assert re.fullmatch(r"\w+: (interrupted|terminated).*\n", said)
+    out, message = process.communicate(timeout=60)
+    assert process.returncode == 128 + number, message
+    assert re.fullmatch(r"\w+: (interrupted|terminated).*\n", message)
     assert (out, list(tmp_path.iterdir())) == ("", [])
 
 
 PLACES = {
-    "a line of ours": "with signals.running('toy'):\n    say('ready')\n    time.sleep(60)",
-    "a package that is not to be left": """\
+    "a line of the command": "with signals.running('toy'):\n    say('ready')\n    time.sleep(60)",
+    "inside pickle": """\
 import pickle
 class Slow:
     def __reduce__(self):
@@ -124,23 +124,23 @@ with signals.running('toy'):
     say('ready')
     count(10**13)""",
 }
-"""Where the main thread is when a signal arrives, or soon after."""
+"""The code that the main thread executes when a signal arrives, or soon after."""
 
 
 @pytest.mark.parametrize("body", PLACES.values(), ids=PLACES)
-def test_a_command_ends_wherever_it_is(body: str, tmp_path: Path) -> None:
+def test_an_interrupt_ends_a_command_in_any_code(body: str, tmp_path: Path) -> None:
     process = toy(body, tmp_path)
-    time.sleep(0.2)  # from the line that says so into the next: on a slow machine another place is tried
+    time.sleep(0.2)  # until the line after the output; a slow machine may still be before it
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=60)
+    _, message = process.communicate(timeout=60)
     if process.returncode == 130:
-        assert said == "toy: interrupted\n"
-    else:  # a line of its own was interrupted, and it says what it makes of that: here, nothing
-        assert said.splitlines()[-1] == "KeyboardInterrupt" and "pickle" not in body
+        assert message == "toy: interrupted\n"
+    else:  # raised in the command's own code, which does not handle it
+        assert message.splitlines()[-1] == "KeyboardInterrupt" and "pickle" not in body
 
 
 @pytest.mark.parametrize(
-    ("number", "said"),
+    ("number", "message"),
     [
         (signal.SIGINT, "interrupted, nothing kept"),
         (signal.SIGTERM, "terminated, nothing kept"),
@@ -148,8 +148,8 @@ def test_a_command_ends_wherever_it_is(body: str, tmp_path: Path) -> None:
     ],
     ids=lambda value: getattr(value, "name", ""),
 )
-def test_what_is_said_of_a_command_begins_with_the_signal_that_ended_it(
-    number: signal.Signals, said: str, tmp_path: Path
+def test_the_last_line_of_a_command_begins_with_the_signal_that_ended_it(
+    number: signal.Signals, message: str, tmp_path: Path
 ) -> None:
     body = """\
 import typer
@@ -165,11 +165,11 @@ sys.argv = ['toy']
 program('toy', app)"""
     process = toy(body, tmp_path)
     process.send_signal(number)
-    assert process.communicate(timeout=60)[1] == f"toy: {said}\n"
+    assert process.communicate(timeout=60)[1] == f"toy: {message}\n"
     assert process.returncode == 128 + number
 
 
-def test_a_second_interrupt_ends_what_the_first_one_began(tmp_path: Path) -> None:
+def test_a_second_interrupt_ends_the_cleanup_that_the_first_one_began(tmp_path: Path) -> None:
     slow = """\
 with signals.running('toy'):
     try:
@@ -183,11 +183,11 @@ with signals.running('toy'):
     wait_for(process, "first")
     time.sleep(2 * ONE_PRESS)
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=60)
-    assert (process.returncode, said) == (130, "toy: interrupted\n")
+    _, message = process.communicate(timeout=60)
+    assert (process.returncode, message) == (130, "toy: interrupted\n")
 
 
-def test_two_signals_of_one_press_are_one(tmp_path: Path) -> None:
+def test_two_signals_of_one_key_press_count_as_one(tmp_path: Path) -> None:
     """A terminal and a wrapper such as `uv run` both pass Ctrl-C on."""
     keeps = """\
 with signals.running('toy'):
@@ -199,11 +199,11 @@ with signals.running('toy'):
         time.sleep(0.6)
         say('kept')"""
     process = toy(keeps, tmp_path, "kept")
-    out, said = process.communicate(timeout=60)
-    assert (process.returncode, out, said) == (0, "", "")
+    out, message = process.communicate(timeout=60)
+    assert (process.returncode, out, message) == (0, "", "")
 
 
-def test_a_command_under_nohup_goes_on_without_a_terminal(tmp_path: Path) -> None:
+def test_a_command_under_nohup_ignores_a_closed_terminal(tmp_path: Path) -> None:
     ignoring = "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
     process = start("-c", ignoring + COMMAND.format(body="say('ready')\ntime.sleep(1)"), folder=tmp_path)
     wait_for(process, "ready")
@@ -211,7 +211,7 @@ def test_a_command_under_nohup_goes_on_without_a_terminal(tmp_path: Path) -> Non
     assert process.communicate(timeout=60)[1] == "" and process.returncode == 0
 
 
-def test_importing_flockenv_leaves_a_users_signals_alone() -> None:
+def test_importing_flockenv_does_not_change_signal_handlers() -> None:
     code = "import signal, flockenv, agents; assert signal.getsignal(signal.SIGINT) is signal.default_int_handler"
     process = start("-c", code, folder=ROOT)
     assert process.communicate(timeout=60)[1] == ""
@@ -227,14 +227,14 @@ atexit.register(print, 'done', flush=True)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
-def test_a_signal_after_the_work_changes_neither_exit_code_nor_words(number: signal.Signals, tmp_path: Path) -> None:
+def test_a_signal_after_the_work_changes_neither_exit_code_nor_output(number: signal.Signals, tmp_path: Path) -> None:
     process = toy(END, tmp_path, "done")
     process.send_signal(number)
     assert (process.communicate(timeout=60)[1], process.returncode) == ("", 0)
 
 
-def test_a_signal_that_a_command_outruns_is_forgotten(tmp_path: Path) -> None:
-    """The signal arrives where nothing may be raised; the work is done before the process would be ended."""
+def test_a_signal_is_dropped_if_the_work_ends_before_it_takes_effect(tmp_path: Path) -> None:
+    """The signal arrives inside pickle, where no exception may be raised; the work is done within PATIENCE."""
     outruns = """\
 import atexit, pickle
 signals.PATIENCE = 1.5
@@ -251,11 +251,11 @@ say('worked')"""
     assert (process.communicate(timeout=60)[1], process.returncode) == ("", 0)
 
 
-# --- nothing half-written
+# --- partly written files
 
 
 @pytest.mark.parametrize("running", [True, False], ids=["running", "before it runs"])
-def test_what_is_half_written_is_removed(running: bool, tmp_path: Path) -> None:
+def test_partly_written_files_are_removed(running: bool, tmp_path: Path) -> None:
     (tmp_path / "old.json").write_text("old")
     write = (
         "with made(Path('new/deep')), replacing('new/deep/x.json') as one, replacing('old.json') as two:\n"
@@ -270,7 +270,7 @@ def test_what_is_half_written_is_removed(running: bool, tmp_path: Path) -> None:
     assert (tmp_path / "old.json").read_text() == "old"
 
 
-def test_a_held_section_happens_whole(tmp_path: Path) -> None:
+def test_a_held_section_is_completed_in_spite_of_a_signal(tmp_path: Path) -> None:
     body = """\
 with signals.running('toy'):
     with signals.held():
@@ -304,10 +304,10 @@ if __name__ == "__main__":
 
 @pytest.mark.parametrize("before", [None, "17"])
 @pytest.mark.parametrize("error", [None, ValueError("a player fails")])
-def test_processes_started_later_are_no_workers(
+def test_the_mark_of_worker_processes_is_removed_after_they_are_started(
     before: str | None, error: Exception | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One that imports flockenv would ignore Ctrl-C, and end with this process."""
+    """A later process with the mark that imports flockenv would ignore Ctrl-C, and end with this process."""
     monkeypatch.delenv(signals.PARENT, raising=False)
     if before is not None:
         monkeypatch.setenv(signals.PARENT, before)
@@ -322,7 +322,7 @@ def test_processes_started_later_are_no_workers(
 @pytest.mark.parametrize(
     "doing", ["time.sleep(60)", "sum(k for k in range(10**12))"], ids=["waiting", "working"]
 )  # fmt: skip
-def test_processes_end_with_their_parent_however_it_ends(number: signal.Signals, doing: str, tmp_path: Path) -> None:
+def test_worker_processes_end_with_their_parent(number: signal.Signals, doing: str, tmp_path: Path) -> None:
     (tmp_path / "parent.py").write_text(WORK.format(doing=doing))
     process = start("parent.py", folder=tmp_path)
     assert process.stdout is not None
@@ -334,11 +334,11 @@ def test_processes_end_with_their_parent_however_it_ends(number: signal.Signals,
     while any(lives(pid) for pid in workers):
         assert time.monotonic() < until, "a worker lives on"
         time.sleep(0.05)
-    _, said = process.communicate(timeout=60)
-    assert "Traceback" not in said and "leaked" not in said
+    _, message = process.communicate(timeout=60)
+    assert "Traceback" not in message and "leaked" not in message
 
 
-def test_a_package_called_agents_of_another_program_keeps_its_own_handlers(tmp_path: Path) -> None:
+def test_a_package_of_another_program_named_agents_keeps_its_signal_handlers(tmp_path: Path) -> None:
     package = tmp_path / "agents"
     package.mkdir()
     (package / "__init__.py").write_text("import flockenv\n")
