@@ -134,7 +134,7 @@ def test_cover_stops_an_evader_that_runs_into_it() -> None:
         act(world, (1.0, 0.0))
         deepest = max(deepest, float(world.state.pos[0, 0, 0]))
     assert 10.0 - 1.8 < deepest < 10.0 - 1.8 + 0.25
-    assert world.state.pos[0, 0, 0] == pytest.approx(8.2 + 8.0 / 400.0, abs=0.02)  # pressed by 8 N
+    assert world.state.pos[0, 0, 0] == pytest.approx(8.2 + 8.0 / 400.0, abs=0.02)  # pressed in by 8 N
 
 
 def test_pursuers_stay_out_of_cover_and_below_their_maximum_speed() -> None:

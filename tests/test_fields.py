@@ -64,7 +64,7 @@ def test_gusts_rise_and_fall_within_a_period() -> None:
     np.testing.assert_allclose((end.pos - start.pos)[0, 0], (2 + grown, 3 * grown), atol=1e-8)
 
 
-def test_steady_effects_have_no_numbers_for_time() -> None:
+def test_steady_effects_have_no_parameters_of_time() -> None:
     steady = scene_of(Source(strength=1, centre=(0, 0), maximum=1), Wind(velocity=(1, 0)))
     swinging = scene_of(Source(strength=1, centre=(0, 0), maximum=1, period=2), Wind(velocity=(1, 0)))
     (source, wind), (swung, _) = steady.parts.number_plan.effects, swinging.parts.number_plan.effects
@@ -130,7 +130,7 @@ def test_the_nearest_image_of_a_centre_acts_on_a_torus(dimension: int) -> None:
 
 @pytest.mark.slow
 def test_variances_under_fluctuations_do_not_depend_on_dt() -> None:
-    """var x after T within 5 % for three steps, and (s/m)^2 T^3 / 3; var v = (s/m)^2 T."""
+    """For three values of dt, var x after T is (s/m)^2 T^3 / 3 and var v is (s/m)^2 T, within 5 %."""
     seconds, s, m = 2.0, 0.6, 1.5
     for dt in (0.1, 0.05, 0.025):
         scene = scene_of(Fluctuation(strength=s), Drag(rate=0), count=10_000, mass=m, dt=dt)

@@ -374,7 +374,7 @@ def test_an_agent_that_lines_up_stops_a_margin_behind_the_agent_ahead() -> None:
 
 
 def passing(second: Group, both: bool) -> Array:
-    """Return the paths of an agent that walks from -4 to 4 m and of a second agent; both avoid each other if `both`."""
+    """Return the paths of an agent that walks from -4 to 4 m and of a second one, which walks back if `both`."""
     give = UnalignedAvoidance(weight=120.0, radius=4.0, horizon=2.0, margin=0.1)
     ways = (
         Way(group=0, targets=(Target(at=(-30, 0)), Target(at=(4, 0))), slow_radius=0.5),

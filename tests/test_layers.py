@@ -225,4 +225,4 @@ def test_every_module_can_be_imported_first() -> None:
     files = [path.relative_to(ROOT).with_suffix("") for path in sorted((ROOT / "flockenv").rglob("*.py"))]
     names = [".".join(path.parts).removesuffix(".__init__") for path in files if path.name != "__main__"]
     run = subprocess.run([sys.executable, "-c", FIRST, *names], cwd=ROOT, text=True, stdout=subprocess.PIPE, check=True)
-    assert run.stdout == "", "these can't"
+    assert run.stdout == "", "modules that cannot be imported first"
