@@ -72,8 +72,8 @@ def test_a_pursuer_without_sight_of_the_evader_goes_to_the_last_seen_position() 
         act(world)
         assert seen(world).seen.sum() == 0
     heading = world.state.vel[0, 1] / np.linalg.norm(world.state.vel[0, 1])
-    way = last - world.state.pos[0, 1]
-    assert heading @ (way / np.linalg.norm(way)) > 0.99
+    offset = last - world.state.pos[0, 1]
+    assert heading @ (offset / np.linalg.norm(offset)) > 0.99
 
 
 def test_a_searching_pursuer_looks_behind_cover() -> None:
@@ -92,8 +92,8 @@ def test_pursuers_head_for_the_predicted_position_of_the_evader() -> None:
     world = scene((8.0, 4.0), (8.0, 12.0), FAR, FAR)
     world.state.vel[0, 0] = (2.0, 0.0)
     act(world)
-    way = world.state.vel[0, 1]
-    assert way[0] / -way[1] == pytest.approx(2.0 / 8.0, rel=1e-6)
+    velocity = world.state.vel[0, 1]
+    assert velocity[0] / -velocity[1] == pytest.approx(2.0 / 8.0, rel=1e-6)
 
 
 def test_a_capture_costs_once_and_ends_the_episode_and_free_time_is_rewarded() -> None:

@@ -132,10 +132,10 @@ def circles(root: Path) -> list[list[str]]:
 
 
 def _follow(edges: dict[str, set[str]], module: str) -> list[str]:
-    way = [module]
-    while min(edges[way[-1]]) not in way:
-        way.append(min(edges[way[-1]]))
-    return [*way[way.index(min(edges[way[-1]])) :], min(edges[way[-1]])]
+    path = [module]
+    while min(edges[path[-1]]) not in path:
+        path.append(min(edges[path[-1]]))
+    return [*path[path.index(min(edges[path[-1]])) :], min(edges[path[-1]])]
 
 
 def test_no_module_imports_upwards_and_heavy_packages_stay_in_place() -> None:
