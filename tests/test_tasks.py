@@ -1,4 +1,4 @@
-"""What the tasks see and pay: exact questions to hand-made states, and what holds for every task of the catalogue."""
+"""Observations and rewards of the tasks: exact values in hand-made states, and properties of every task."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def place(world: World, pos: Any, vel: Any = 0.0) -> None:
 
 
 def act(world: World, action: Any = 0.0) -> Step:
-    """One step of the only world, the same action for all."""
+    """Step the only world, with the same action for all learners."""
     return world.step(np.broadcast_to(np.asarray(action, float), (1, world.learners, world.action_size)))
 
 
@@ -47,7 +47,7 @@ def paid(world: World, step: Step, learner: int = 0) -> dict[str, float]:
 def random_actions(world: World, steps: int, seed: int = 0) -> Any:
     rng = np.random.default_rng(seed)
     wanted = rng.uniform(-1, 1, (steps // 10 + 1, world.worlds, world.learners, world.action_size))
-    return np.repeat(wanted, 10, axis=0)[:steps]  # the same for a while, so that everybody gets somewhere
+    return np.repeat(wanted, 10, axis=0)[:steps]  # each held for 10 steps, so that agents cover some distance
 
 
 # --- what holds for every task ----------------------------------------------------------------------------------------
@@ -72,7 +72,7 @@ def test_an_observation_stays_in_its_space(row: TaskRow) -> None:
     low, high = row.task.layout.low, row.task.layout.high
     assert low.shape == high.shape == (world.observation_size,)
     for actions in random_actions(world, 1000):
-        step = world.step(2 * actions)  # beyond the bounds, so that corners are asked for too
+        step = world.step(2 * actions)  # beyond the bounds, so that corners of the action space occur
         assert step.observation.dtype == np.float32
         assert step.observation.shape == (4, row.task.learners, world.observation_size)
         assert np.isfinite(step.observation).all()
@@ -83,7 +83,7 @@ def test_an_observation_stays_in_its_space(row: TaskRow) -> None:
 
 
 @EVERY
-def test_a_task_is_a_value_and_names_what_it_has(row: TaskRow) -> None:
+def test_a_task_is_a_value_with_distinct_names(row: TaskRow) -> None:
     task = row.task
     assert pickle.loads(pickle.dumps(task)) == task
     assert type(task).model_validate(task.model_dump()) == task
@@ -102,19 +102,19 @@ def test_a_task_is_a_value_and_names_what_it_has(row: TaskRow) -> None:
     assert set(row.task.counts) <= row.task.parameters().keys()
 
 
-def test_a_kernel_knows_what_its_loops_count_to_and_no_other_number() -> None:
-    made = name_of(Flock())
+def test_kernels_are_compiled_for_their_loop_bounds_and_no_other_number() -> None:
+    default = name_of(Flock())
     for name in ("neighbours", "obstacles_seen", "rays"):
-        assert name_of(Flock(**{name: 5})) != made
-    assert name_of(Flock(agents=5)) != made == name_of(Flock(agents=40))  # 4 others at most are listed
-    assert name_of(Flock(touch_cost=3.0, sight=7.0, obstacle_count=2)) == made
+        assert name_of(Flock(**{name: 5})) != default
+    assert name_of(Flock(agents=5)) != default == name_of(Flock(agents=40))  # 5 agents: at most 4 neighbours
+    assert name_of(Flock(touch_cost=3.0, sight=7.0, obstacle_count=2)) == default
 
 
 @pytest.mark.slow
-def test_what_is_counted_to_is_the_same_written_out_or_given(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In single precision, in which policies learn: a number of the wrong kind would promote what it meets.
+def test_loop_bounds_give_the_same_results_as_constants_and_as_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In single precision, as policies learn in it: a number of the wrong type would promote its operands.
 
-    The norm in `alignment` is fused one way or the other, so its last bit may differ.
+    Whether the norm in `alignment` is a fused operation varies, so its last bit may differ.
     """
     task = Flock(agents=5, neighbours=3, obstacles_seen=1, rays=8, dtype="float32")
     ends = []
@@ -123,11 +123,11 @@ def test_what_is_counted_to_is_the_same_written_out_or_given(monkeypatch: pytest
         world = world_of(task, worlds=3)
         steps = [world.step(actions) for actions in random_actions(world, 40)]
         ends.append((np.array([s.observation for s in steps]), np.array([s.terms for s in steps])))
-    (seen, terms), (seen_too, terms_too) = ends
-    np.testing.assert_array_equal(seen, seen_too)
+    (seen, terms), (seen_given, terms_given) = ends
+    np.testing.assert_array_equal(seen, seen_given)
     fused = Flock.terms.index("alignment")
-    np.testing.assert_array_equal(np.delete(terms, fused, -1), np.delete(terms_too, fused, -1))
-    np.testing.assert_allclose(terms[..., fused], terms_too[..., fused], rtol=2e-7, atol=1e-9)
+    np.testing.assert_array_equal(np.delete(terms, fused, -1), np.delete(terms_given, fused, -1))
+    np.testing.assert_allclose(terms[..., fused], terms_given[..., fused], rtol=2e-7, atol=1e-9)
 
 
 def test_a_task_without_terms_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,7 +136,7 @@ def test_a_task_without_terms_is_refused(monkeypatch: pytest.MonkeyPatch) -> Non
         name_of(Pursuit())
 
 
-def test_a_kernel_without_lanes_is_the_same_for_any_number_of_learners() -> None:
+def test_a_kernel_without_lanes_is_shared_by_all_numbers_of_learners() -> None:
     assert name_of(Crossing(agents=70, circle=20)) == name_of(Crossing(agents=60, circle=20))
 
 
@@ -147,7 +147,7 @@ def test_a_count_that_is_no_parameter_is_refused(monkeypatch: pytest.MonkeyPatch
 
 
 @EVERY
-def test_a_task_plays_with_the_method_it_is_given_and_shows_the_same_to_policies(row: TaskRow) -> None:
+def test_the_integrator_of_a_task_does_not_change_its_layouts_and_parameters(row: TaskRow) -> None:
     task = row.task.model_copy(update={"integrator": {"kind": "midpoint"}})
     assert task.integrator == task.scene.integrator == Midpoint()
     assert row.task.integrator == row.task.scene.integrator == SemiImplicitEuler()
@@ -158,14 +158,16 @@ def test_a_task_plays_with_the_method_it_is_given_and_shows_the_same_to_policies
 
 
 @pytest.mark.parametrize("names", [("path", "class"), ("_x",), ("pa th",), ("path", "path")])
-def test_measures_that_cannot_be_fields_are_refused(names: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_measures_that_are_no_valid_field_names_are_refused(
+    names: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(Pursuit, "measures", names)
     with pytest.raises(TypeError, match=rf"Pursuit.measures: '{names[-1]}'"):
         name_of(Pursuit())
 
 
 @pytest.mark.slow
-def test_a_method_of_second_order_takes_a_constant_force_exactly_and_the_default_one_does_not() -> None:
+def test_a_method_of_second_order_is_exact_for_a_constant_force() -> None:
     moved = {}
     for task in (Pursuit(), Pursuit(integrator=Midpoint())):
         world = world_of(task)
@@ -178,22 +180,24 @@ def test_a_method_of_second_order_takes_a_constant_force_exactly_and_the_default
 
 
 @EVERY
-def test_methods_that_leave_the_kernel_are_refused_in_one_line(row: TaskRow, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_methods_that_solve_equations_in_python_are_refused_in_one_line(
+    row: TaskRow, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(RK4, "solves", True)
     with pytest.raises(ValueError, match=r".") as caught:
         type(row.task)(integrator=RK4())
-    said = str(caught.value)
-    assert "integrator.kind = 'rk4': solves equations in Python" in said
-    allowed = said.split("allowed: ")[1].split(", ")
+    message = str(caught.value)
+    assert "integrator.kind = 'rk4': solves equations in Python" in message
+    allowed = message.split("allowed: ")[1].split(", ")
     assert "midpoint" in allowed
     assert "rk4" not in allowed
-    assert "\n" not in said
+    assert "\n" not in message
 
 
 @EVERY
 @pytest.mark.parametrize("kind", ["typo", "clock", "backwards", "method"])
 def test_bad_arguments_of_a_task_are_refused_in_one_line(row: TaskRow, kind: str) -> None:
-    given, said = {
+    given, message = {
         "typo": ({"horizn": 5}, "did you mean `horizon`"),
         "clock": ({"control_dt": 0.1, "dt": 0.03}, "control_dt = 0.1 s is not a whole multiple of dt = 0.03 s"),
         "backwards": ({"dt": 0.2}, "whole multiple"),
@@ -201,19 +205,19 @@ def test_bad_arguments_of_a_task_are_refused_in_one_line(row: TaskRow, kind: str
     }[kind]
     with pytest.raises(ValueError, match=r".") as caught:
         type(row.task)(**given)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (lambda: Pursuit(pursuer_sped=2), "did you mean `pursuer_speed`"),
         (lambda: Pursuit(pursuers=0), "pursuers = 0"),
         (lambda: Pursuit(sides="neither"), "sides = 'neither'"),
         (lambda: Obstacles(size=5), "size = 5"),
         (lambda: Obstacles(least_radius=2, greatest_radius=1), "least_radius = 2"),
-        (lambda: Obstacles(greatest_radius=4), "greatest_radius = 4"),  # it could cover the start
+        (lambda: Obstacles(greatest_radius=4), "greatest_radius = 4"),  # an obstacle could cover the start
         (lambda: Flock(least_radius=3, greatest_radius=1), "least_radius = 3"),
         (lambda: Flock(agents=0), "agents = 0"),
         (lambda: Flock(agents=10**9), "agents = 1000000000"),
@@ -223,10 +227,10 @@ def test_bad_arguments_of_a_task_are_refused_in_one_line(row: TaskRow, kind: str
         (lambda: Flock(dt=0), "dt = 0"),
     ],
 )
-def test_what_a_task_cannot_be_is_refused_in_one_line(make: Any, said: str) -> None:
+def test_invalid_parameters_of_a_task_are_refused_in_one_line(make: Any, message: str) -> None:
     with pytest.raises(ValueError, match=r".") as caught:
         make()
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -236,9 +240,9 @@ from collections import namedtuple
 import numpy as np
 from flockenv.tasks.task import Frame
 
-for name, task, before, after, action, terms, observation, counted, told in pickle.load(open(sys.argv[1], "rb")):
+for name, task, before, after, action, terms, observation, counted, measured in pickle.load(open(sys.argv[1], "rb")):
     module = importlib.import_module(type(task).__module__)
-    assert not hasattr(module.reward, "py_func"), "the point is to run the laws in Python"
+    assert not hasattr(module.reward, "py_func"), "the laws must run in Python here"
     numbers = task.parameters()
     p = namedtuple("P", numbers)(**numbers)
     for array in (*before, *after, action):
@@ -254,7 +258,7 @@ for name, task, before, after, action, terms, observation, counted, told in pick
     for array in counted[:2]:
         array.flags.writeable = False
     module.metrics(p, Measures(*counted[0]), Measures(*counted[1]), counted[2], metrics)
-    np.testing.assert_allclose(metrics, told, rtol=1e-12, err_msg=name)
+    np.testing.assert_allclose(metrics, measured, rtol=1e-12, err_msg=name)
     if task.abreast:
         module.abreast(p, after, rows[:, : task.abreast])
     module.observe(p, after, rows)
@@ -265,11 +269,11 @@ print("untouched")
 
 
 def frame(world: World) -> list[Any]:
-    """World 0 as its kernels see it; arrays copied."""
+    """Return the numbers of a Frame of world 0, as its kernels see it, with copies of the arrays."""
     s, scene = world.state, world.task.scene
     arrays = [s.x[:, 0], s.v[:, 0], s.alive[0], s.obstacle_x[:, 0], s.obstacle_radius[0], world._memory[:, 0]]
     body = [scene.body.radius, scene.body.max_speed, scene.body.max_force]
-    decision, found, _ = world._scratch[0]  # of the last world looked at
+    decision, found, _ = world._scratch[0]  # those of the last world that was observed
     near, d = [*found[:-1], *[np.zeros(0)] * 3], scene.dimension
     if world.task.abreast:
         own, near_vel, near_radius = decision.wide[:3]
@@ -279,24 +283,23 @@ def frame(world: World) -> list[Any]:
     return [*(a.copy() for a in arrays), int(s.key[0]), int(world.steps[0]), *body, *(a.copy() for a in near), table]
 
 
-def test_reward_and_observation_touch_nothing(tmp_path: Path) -> None:
-    """They run in plain Python, every array of both frames locked against writing, and find what was compiled.
+def test_kernels_of_a_task_do_not_write_to_frames(tmp_path: Path) -> None:
+    """In plain Python, with all arrays of both frames read-only, they return what the compiled kernels return.
 
-    So do `measure` and `ended`, which may say of who is in the world, and of nothing else; and `metrics`, where numpy
-    sees to it that nothing is written beyond their number.
+    `ended` may write `alive`, and nothing else of a frame. Numpy refuses to write metrics beyond their number.
     """
-    questions = []
+    cases = []
     for row in ROWS:
         world = world_of(row.task)
         for actions in random_actions(world, 30):
             before = frame(world)
             step = world.step(actions)
             counted = world._sums[0].copy(), world._last[0].copy(), int(world.steps[0])
-            told = [float(column[0]) for column in world.measure().values()]
+            measured = [float(column[0]) for column in world.measure().values()]
             seen = (actions[0], step.terms[0], step.observation[0])
-            question = (row.name, row.task, before, frame(world), *seen, counted, told)
-        questions.append(question)
-    (tmp_path / "frames").write_bytes(pickle.dumps(questions))
+            case = (row.name, row.task, before, frame(world), *seen, counted, measured)
+        cases.append(case)
+    (tmp_path / "frames").write_bytes(pickle.dumps(cases))
     source = str(Path(flockenv.__file__).parent.parent)
     done = subprocess.run(
         [sys.executable, "-c", FROZEN, str(tmp_path / "frames")],
@@ -309,12 +312,12 @@ def test_reward_and_observation_touch_nothing(tmp_path: Path) -> None:
 
 
 @EVERY
-def test_looking_changes_nothing(row: TaskRow) -> None:
+def test_observing_changes_nothing(row: TaskRow) -> None:
     world = world_of(row.task, worlds=3)
     for actions in random_actions(world, 20):
         step = world.step(actions)
     kept, memory = world.state.copy(), world._memory.copy()
-    again = world.reset(mask=np.zeros(3, bool))  # nobody begins anew: everybody is only looked at
+    again = world.reset(mask=np.zeros(3, bool))  # no world is reset: all are only observed
     world.measure()
     world.snapshot(1)
     np.testing.assert_array_equal(again, step.observation)
@@ -326,7 +329,7 @@ def test_looking_changes_nothing(row: TaskRow) -> None:
 # --- Pursuit ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_capture_pays_once_and_ends_it() -> None:
+def test_a_capture_pays_once_and_ends_the_episode() -> None:
     world = world_of(Pursuit())
     place(world, [[10, 10], [10.4, 10]])
     step = act(world)
@@ -350,14 +353,14 @@ def test_no_capture_beyond_the_capture_distance() -> None:
     assert not step.success.any()
 
 
-def test_coming_nearer_pays_by_the_metre_and_time_costs() -> None:
+def test_approaching_pays_per_metre_and_time_costs() -> None:
     world = world_of(Pursuit())
     place(world, [[10, 10], [13, 10]], [[3, 0], [0, 0]])
     step = act(world, [1, 0])
     distance = np.linalg.norm(world.state.pos[0, 1] - world.state.pos[0, 0])
     terms = paid(world, step)
     assert terms["closing"] == pytest.approx(0.1 * (3 - distance), rel=1e-9)
-    assert terms["closing"] > 0.015  # 0.3 m at full speed, less what the evader made
+    assert terms["closing"] > 0.015  # 0.3 m at full speed, less the distance that the evader moves
     assert terms["time"] == pytest.approx(-0.5 * 0.1)
     assert terms["capture"] == 0
 
@@ -387,7 +390,7 @@ def test_the_scripted_evader_flees_within_its_alarm_distance() -> None:
             assert world.state.vel[0, 1] @ ahead > 0.8  # it can reach 2.4 m/s in 0.2 s, and may swerve
 
 
-def test_the_scripted_evader_wanders_when_it_is_left_alone() -> None:
+def test_the_scripted_evader_wanders_beyond_its_alarm_distance() -> None:
     world = world_of(Pursuit(size=60, alarm_distance=5))
     place(world, [[5, 5], [40, 40]])
     courses = []
@@ -420,7 +423,7 @@ def both(**more: Any) -> World:
     return world_of(Pursuit(pursuers=3, evaders=2, sides="both", **more))
 
 
-def test_in_the_game_of_two_sides_who_is_caught_is_out() -> None:
+def test_with_two_sides_a_captured_evader_is_removed() -> None:
     world = both()
     place(world, [[3, 3], [3, 10], [3, 17], [17, 3], [17, 17]])
     act(world)
@@ -434,7 +437,7 @@ def test_in_the_game_of_two_sides_who_is_caught_is_out() -> None:
     later = act(world)
     np.testing.assert_array_equal(later.terminated[0], [False, False, False, True, False])
     np.testing.assert_array_equal(later.terms[0, :, 1], 0)
-    np.testing.assert_array_equal(later.terms[0, 3], 0)  # who is out is paid nothing
+    np.testing.assert_array_equal(later.terms[0, 3], 0)  # a captured evader gets no reward
     assert world.measure()["captured"] == 1
     place(world, [[3, 3], [3, 10], [3, 17], [3.2, 3], [3.2, 17]])
     last = act(world)
@@ -462,7 +465,7 @@ def test_a_dead_evader_is_not_seen() -> None:
     np.testing.assert_allclose(seen.opponents[0, 0, 0], offset, atol=1e-5)
 
 
-def test_a_pursuer_sees_what_is_there() -> None:
+def test_pursuit_observations_are_the_offsets_and_velocities_of_others() -> None:
     world = both()
     for actions in random_actions(world, 25):
         step = world.step(actions)
@@ -497,7 +500,7 @@ def goal_of(world: World) -> Any:
     return mark.at
 
 
-def test_a_touch_costs_and_ends_it() -> None:
+def test_a_touch_costs_and_ends_the_episode() -> None:
     world = world_of(Obstacles())
     s = world.state
     centre, radius = s.obstacles.centre[0, 0], s.obstacle_radius[0, 0]
@@ -510,7 +513,7 @@ def test_a_touch_costs_and_ends_it() -> None:
     assert world.measure()["collisions"] == 1
 
 
-def test_just_beside_is_no_touch() -> None:
+def test_a_small_gap_to_an_obstacle_is_no_touch() -> None:
     world = world_of(Obstacles(count=1))
     s = world.state
     place(world, s.obstacles.centre[0, 0] + [s.obstacle_radius[0, 0] + 0.31, 0])
@@ -519,7 +522,7 @@ def test_just_beside_is_no_touch() -> None:
     assert not step.terminated.any()
 
 
-def test_the_goal_pays_and_ends_it() -> None:
+def test_the_goal_pays_and_ends_the_episode() -> None:
     world = world_of(Obstacles())
     place(world, goal_of(world) + np.array([-0.9, 0]), [2.0, 0])
     step = act(world)
@@ -531,7 +534,7 @@ def test_the_goal_pays_and_ends_it() -> None:
     assert step.success.all()
 
 
-def test_progress_is_the_way_gained_and_adds_up() -> None:
+def test_progress_adds_up_to_the_distance_gained() -> None:
     world = world_of(Obstacles(count=0))
     goal, start = goal_of(world), world.state.pos[0, 0].copy()
     total = sum(paid(world, act(world, actions[0]))["progress"] for actions in random_actions(world, 50))
@@ -549,7 +552,7 @@ def test_a_goal_in_an_obstacle_is_a_touch() -> None:
     assert not step.success.any()
 
 
-def test_a_wall_is_no_touch_and_stops() -> None:
+def test_a_wall_stops_the_agent_and_is_no_touch() -> None:
     world = world_of(Obstacles(count=0))
     for _ in range(60):
         step = act(world, [-1, 0])
@@ -558,7 +561,7 @@ def test_a_wall_is_no_touch_and_stops() -> None:
     assert world.state.vel[0, 0, 0] == 0
 
 
-def test_a_straight_way_is_fully_efficient() -> None:
+def test_a_straight_path_is_fully_efficient() -> None:
     world = world_of(Obstacles(count=0))
     place(world, [1.5, goal_of(world)[1]])
     world._memory[2, 0, 0] = goal_of(world)[0] - 1.5
@@ -569,7 +572,7 @@ def test_a_straight_way_is_fully_efficient() -> None:
     assert measured["time_to_goal"] == pytest.approx(world.steps[0] * 0.1)
 
 
-def test_a_walker_sees_what_is_there() -> None:
+def test_obstacle_observations_are_goal_velocity_obstacles_and_free_distances() -> None:
     world = world_of(Obstacles())
     for actions in random_actions(world, 12):
         step = world.step(actions)
@@ -588,14 +591,14 @@ def test_a_walker_sees_what_is_there() -> None:
     np.testing.assert_array_equal(seen.obstacle_radius[n:], 0)
     turns = 2 * np.pi * np.arange(len(seen.free_way)) / len(seen.free_way)
     steps = np.arange(0, task.sight, 0.01)  # type: ignore[attr-defined]
-    ways = x + steps[:, None, None] * np.stack([np.cos(turns), np.sin(turns)], axis=1)
-    blocked = (np.linalg.norm(ways[:, :, None] - centres, axis=3) < radii + 0.3 * (radii > 0)).any(axis=2)
+    points = x + steps[:, None, None] * np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    blocked = (np.linalg.norm(points[:, :, None] - centres, axis=3) < radii + 0.3 * (radii > 0)).any(axis=2)
     expected = np.where(blocked.any(axis=0), steps[blocked.argmax(axis=0)], task.sight)  # type: ignore[attr-defined]
     assert blocked.any()
     np.testing.assert_allclose(seen.free_way, expected, atol=0.011)
 
 
-def test_a_field_can_be_crossed_from_where_it_begins() -> None:
+def test_obstacles_leave_gaps_and_do_not_cover_start_and_goal() -> None:
     world = world_of(Obstacles(), worlds=100)
     s = world.state
     assert (s.obstacle_radius > 0).sum(axis=1).min() > 10
@@ -612,7 +615,10 @@ def test_a_field_can_be_crossed_from_where_it_begins() -> None:
 
 
 def pair(gap: float, first: Any, second: Any, **more: Any) -> tuple[World, dict[str, float], dict[str, float]]:
-    """Two boids `gap` m apart along the heading after one step of 0.1 s; velocities (along, left), no action."""
+    """Step two boids once, 0.1 s, without action, to `gap` m apart along the heading; return world and reward terms.
+
+    first, second: velocities (along the heading, to its left), m/s.
+    """
     world = world_of(Flock(agents=2, obstacle_count=0, **more))
     (mark,) = world.snapshot().marks
     along = mark.vector / np.linalg.norm(mark.vector)
@@ -624,8 +630,8 @@ def pair(gap: float, first: Any, second: Any, **more: Any) -> tuple[World, dict[
     return world, paid(world, step, 0), paid(world, step, 1)
 
 
-def test_two_boids_in_step_are_paid_as_on_paper() -> None:
-    """Both at cruising speed along the heading, 1.5 m apart: nothing to complain of but four empty places."""
+def test_rewards_of_two_aligned_boids_match_the_formulas() -> None:
+    """At cruising speed along the heading, 1.5 m apart: they lose reward only for four missing neighbours."""
     world, a, b = pair(1.5, (2, 0), (2, 0))
     for terms in (a, b):
         expected = [0.1, 0, 0, -0.5 * (1 - 1 / 6) * 0.1, 0, 0]
@@ -637,8 +643,8 @@ def test_two_boids_in_step_are_paid_as_on_paper() -> None:
     assert measured["collisions"] == 0
 
 
-def test_two_boids_out_of_step_are_paid_as_on_paper() -> None:
-    """One stands, one flies across at 1 m/s, 2 m apart."""
+def test_rewards_of_two_unaligned_boids_match_the_formulas() -> None:
+    """One is at rest, the other, 2 m away, flies across at 1 m/s."""
     world, a, b = pair(2.0, (0, 0), (0, 1))
     assert a["progress"] == b["progress"] == pytest.approx(0)  # 2 m/s short of 2 m/s
     assert a["alignment"] == b["alignment"] == pytest.approx(-0.5 * (1 / 2) * 0.1)
@@ -647,14 +653,14 @@ def test_two_boids_out_of_step_are_paid_as_on_paper() -> None:
     assert world.measure()["speed_along"] == pytest.approx(0)
 
 
-def test_two_boids_that_touch_pay_as_long_as_it_lasts_and_count_once() -> None:
+def test_a_touch_costs_as_long_as_it_lasts_and_counts_once() -> None:
     world, a, b = pair(0.5, (1, 0), (1, 0))
     assert a["touch"] == b["touch"] == pytest.approx(-10 * 0.1)
     assert a["spacing"] == pytest.approx(-0.5 * (1.0 / 1.5) * 0.1)
     assert a["progress"] == pytest.approx(0.5 * 0.1)
     touching = world.measure()["collisions"]
     assert paid(world, act(world))["touch"] == pytest.approx(-10 * 0.1)
-    assert world.measure()["collisions"] == touching  # it is still the same touch
+    assert world.measure()["collisions"] == touching  # the same touch goes on
 
 
 def test_polarisation_is_the_length_of_the_mean_heading() -> None:
@@ -662,14 +668,14 @@ def test_polarisation_is_the_length_of_the_mean_heading() -> None:
     assert world.measure()["polarisation"] == pytest.approx(np.sqrt(0.5))
 
 
-def test_a_boid_alone_pays_for_it() -> None:
+def test_an_isolated_boid_pays_for_missing_neighbours() -> None:
     _, a, _ = pair(15.0, (2, 0), (2, 0))
     assert a["together"] == pytest.approx(-0.5 * 0.1)
     assert a["alignment"] == pytest.approx(-0.5 * 0.1)
 
 
-def test_a_boid_that_is_absent_is_neither_seen_nor_paid_for_touching() -> None:
-    """The lists of the decision before, when it touched, are not read again."""
+def test_an_absent_boid_is_not_seen_and_its_touch_costs_nothing() -> None:
+    """The neighbour lists of the decision before, in which it touched, are not used again."""
     world, a, b = pair(0.5, (1, 0), (1, 0))
     assert a["touch"] == b["touch"] < 0
     world.state.alive[0, 1] = False
@@ -680,8 +686,8 @@ def test_a_boid_that_is_absent_is_neither_seen_nor_paid_for_touching() -> None:
     assert not world.task.layout.unpack(step.observation).neighbour_present.any()
 
 
-def test_few_learners_see_what_many_see() -> None:
-    """Of a square of sixteen rows only those are written that there are agents for."""
+def test_observations_do_not_depend_on_the_number_of_learners() -> None:
+    """Rows are computed in squares of sixteen; only those of existing learners are written."""
     whole = World(Flock(agents=24), 2).reset(5)
     for learners in (1, 15, 16, 17, 23):
         part = World(Flock(agents=24, learners=learners), 2).reset(5)
@@ -707,7 +713,7 @@ def test_neighbours_are_found_across_the_edge() -> None:
     assert np.linalg.norm(seen.neighbours[0, 0, 0]) == pytest.approx(1.0, rel=1e-5)
 
 
-def test_a_boid_sees_what_is_there_in_the_frame_of_the_heading() -> None:
+def test_flock_observations_are_in_the_frame_of_the_heading() -> None:
     world = world_of(Flock())
     for actions in random_actions(world, 15):
         step = world.step(actions)
@@ -729,8 +735,8 @@ def test_a_boid_sees_what_is_there_in_the_frame_of_the_heading() -> None:
         np.testing.assert_array_equal(seen.neighbour_present[i], [1] * n + [0] * (task.neighbours - n))  # type: ignore[attr-defined]
 
 
-def test_a_flock_turned_by_a_quarter_sees_and_is_paid_the_same() -> None:
-    """Field, obstacles and heading turned about the middle: nothing in a row may say where north is."""
+def test_observations_and_rewards_of_a_flock_do_not_change_by_a_quarter_turn() -> None:
+    """Field, obstacles and heading are turned about the middle: no number may depend on absolute directions."""
     world = world_of(Flock(), worlds=2)
     for actions in random_actions(world, 10):
         world.step(actions)
@@ -741,8 +747,8 @@ def test_a_flock_turned_by_a_quarter_sees_and_is_paid_the_same() -> None:
         ours[...] = (theirs - middle) @ quarter.T + middle
     t.vel[...], t.obstacle_radius[...] = s.vel @ quarter.T, s.obstacle_radius
     turned._memory[...] = np.einsum("ij,jbn->ibn", quarter, world._memory)
-    nobody = np.zeros(2, bool)
-    np.testing.assert_allclose(turned.reset(mask=nobody), world.reset(mask=nobody), atol=1e-6)
+    nothing = np.zeros(2, bool)
+    np.testing.assert_allclose(turned.reset(mask=nothing), world.reset(mask=nothing), atol=1e-6)
     for actions in random_actions(world, 20, seed=1):
         ours, theirs = turned.step(actions), world.step(actions)
         np.testing.assert_allclose(ours.observation, theirs.observation, atol=1e-5)
@@ -750,7 +756,7 @@ def test_a_flock_turned_by_a_quarter_sees_and_is_paid_the_same() -> None:
 
 
 def test_scripted_flockmates_flock() -> None:
-    """The learner among them does nothing; the others find together and fly as they should."""
+    """The learner does nothing; the others form a flock and fly along the heading."""
     world = world_of(Flock(learners=1), worlds=4)
     for _ in range(250):
         world.step(np.zeros((4, 1, 2)))
@@ -764,35 +770,35 @@ def test_scripted_flockmates_flock() -> None:
 
 @pytest.mark.parametrize("dtype", [pytest.param("float32", marks=pytest.mark.slow), "float64"])
 @pytest.mark.parametrize("agents", [pytest.param(1, marks=pytest.mark.slow), 17, 33])
-def test_what_lies_beyond_the_last_agent_is_nobodys_business(agents: int, dtype: str) -> None:
-    """Where flocks are shown side by side arrays go on; what is there makes no difference."""
-    told = []
+def test_numbers_beyond_the_last_agent_make_no_difference(agents: int, dtype: str) -> None:
+    """Arrays are padded to whole blocks of agents; numbers in the padding make no difference."""
+    results = []
     for beyond in (0.0, np.nan):
         world = world_of(Flock(agents=agents, dtype=dtype, settling=0.0), worlds=3)
         own, *near = world._scratch[0][0].wide[:3]
         near.append(world._scratch[0][1].pos)
-        said = []
+        found = []
         for actions in random_actions(world, 5):
             for numbers in (own, *near):
                 numbers[..., agents:] = beyond
             step = world.step(actions)
-            said += [step.observation, step.terms, step.success, *(world.measure().values())]
+            found += [step.observation, step.terms, step.success, *(world.measure().values())]
         assert np.isnan(own[:, agents:]).all() == np.isnan(beyond) or agents % PAIR == 0
-        told.append(said)
-    for one, other in zip(*told, strict=True):
+        results.append(found)
+    for one, other in zip(*results, strict=True):
         np.testing.assert_array_equal(one, other)
         assert np.isfinite(one).all()
 
 
 class Seen(NamedTuple):
-    """What of a frame a scripted flockmate looks at for its neighbours."""
+    """The part of a frame that a scripted flockmate reads to find its neighbours."""
 
     pos: Any
     alive: Any
 
 
-class Wanted(NamedTuple):
-    """And of what a task gives."""
+class Numbers(NamedTuple):
+    """The part of a task's parameters that it reads."""
 
     neighbours: float
     sight: float
@@ -800,15 +806,15 @@ class Wanted(NamedTuple):
 
 
 @njit
-def heeded(p: Wanted, frame: Seen, i: int, squares: Any, who: Any) -> Any:
-    """Call it as a kernel does."""
-    return flock._list_nearest(p, frame, i, squares, who)
+def listed(p: Numbers, frame: Seen, i: int, squares: Any, indices: Any) -> Any:
+    """Call `_list_nearest` as a kernel does."""
+    return flock._list_nearest(p, frame, i, squares, indices)
 
 
 @pytest.mark.parametrize("neighbours", [1, 2, 6, 32])
 @pytest.mark.parametrize("agents", [1, 2, 7, 60])
-def test_a_scripted_flockmate_heeds_the_nearest(agents: int, neighbours: int) -> None:
-    """On a lattice, so that many are equally far: those come by number. Around the edge, too."""
+def test_a_scripted_flockmate_lists_its_nearest_neighbours(agents: int, neighbours: int) -> None:
+    """On a lattice, where many are equally far: these come in the order of their numbers. Also across the edge."""
     rng = np.random.default_rng(agents)
     frame = Seen(rng.integers(0, 8, (2, agents)) * 1.0, rng.random(agents) < 0.8)
     for i in range(agents):
@@ -816,13 +822,13 @@ def test_a_scripted_flockmate_heeds_the_nearest(agents: int, neighbours: int) ->
         square = (offset**2).sum(axis=0)
         square[~frame.alive | (np.arange(agents) == i) | (square >= 9.0)] = np.inf
         expected = [j for j in np.argsort(square, kind="stable") if square[j] < np.inf][:neighbours]
-        squares, who = np.full(32, np.inf), np.zeros(32, np.uint64)
-        found = int(heeded(Wanted(float(neighbours), 3.0, 8.0), frame, i, squares, who))
-        assert who[:found].tolist() == expected
+        squares, indices = np.full(32, np.inf), np.zeros(32, np.uint64)
+        found = int(listed(Numbers(float(neighbours), 3.0, 8.0), frame, i, squares, indices))
+        assert indices[:found].tolist() == expected
         assert squares[:found].tolist() == square[expected].tolist()
 
 
-def test_a_flock_begins_untouched() -> None:
+def test_a_flock_begins_without_touches() -> None:
     world = world_of(Flock(), worlds=50)
     s, space = world.state, world.task.scene.space
     for b in range(50):

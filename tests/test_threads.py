@@ -1,7 +1,7 @@
-"""Threads: results and counters to the last bit the same for any number of them, and nobody waits for ever.
+"""Threads: results and counters are the same bits for any number of threads, and no thread waits for ever.
 
-Worlds are divided among threads, or, of a large world, its agents: a team that waits for each other several times in
-every evaluation of the forces.
+Worlds are divided among threads. A large world is shared by a team of threads, which divide its agents and wait for
+each other several times in every evaluation of the forces.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ ROOT = Path(__file__).resolve().parent.parent
 NAMED = {variant.name: variant for variant in VARIANTS}
 ARRAYS = ("x", "v", "alive", "tick", "work")
 PATIENCE = 120.0
-"""s: far more than anything here takes; whoever waits longer waits for ever."""
+"""s: far longer than any test here takes; a longer wait counts as a deadlock."""
 
 
 @pytest.fixture(autouse=True)
@@ -53,7 +53,7 @@ def one_thread_afterwards() -> Iterator[None]:
 
 @pytest.fixture
 def shared(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Among how many threads each step was shared."""
+    """List of the number of threads that shared each step."""
     seen: list[int] = []
 
     def spy(jobs: Any) -> list[Any]:
@@ -70,7 +70,7 @@ def assert_same(a: State, b: State) -> None:
 
 
 def started(scene: Scene, worlds: int = 1, dead: float = 0.1) -> State:
-    """A start of which some are dead, and of the first quarter almost all: the parts of a team are not alike."""
+    """Return a start with some dead agents, most of them in the first quarter: the threads' parts differ in work."""
     state = scene.start(7, worlds)
     chance = np.random.default_rng(0).random((worlds, scene.agents))
     quarter = scene.agents // 4
@@ -91,7 +91,7 @@ class Large:
 
     @property
     def name(self) -> str:
-        """By which tests/conftest.py knows kernels that only slow tests compile."""
+        """Name by which tests/conftest.py finds kernels that only slow tests compile."""
         return self.variant
 
     def __str__(self) -> str:
@@ -122,14 +122,14 @@ LARGE = [
 
 @pytest.mark.parametrize("large", LARGE, ids=str)
 @pytest.mark.parametrize("dead", [0.0, 0.1])
-def test_a_team_takes_the_very_step_that_one_thread_takes(large: Large, dead: float, shared: list[int]) -> None:
+def test_a_team_of_threads_gives_the_same_bits_as_one_thread(large: Large, dead: float, shared: list[int]) -> None:
     scene = large.scene
     start = started(scene, dead=dead)
     expected = scene.run(start, 2)
     assert shared == []
-    met, alive = int(expected.work[0, 2]), int(start.alive.sum())
-    everybody = int(expected.work[0, 1]) * alive**2
-    assert met < 0.5 * everybody if large.sorts else met == everybody
+    tested, alive = int(expected.work[0, 2]), int(start.alive.sum())
+    all_pairs = int(expected.work[0, 1]) * alive**2
+    assert tested < 0.5 * all_pairs if large.sorts else tested == all_pairs
     for count in (2, 3):
         use_threads(count)
         for _ in range(3):  # a race need not show every time
@@ -139,7 +139,7 @@ def test_a_team_takes_the_very_step_that_one_thread_takes(large: Large, dead: fl
 
 
 @pytest.mark.slow
-def test_an_implicit_step_of_a_large_world_is_the_same_for_any_number_of_threads() -> None:
+def test_implicit_steps_of_a_large_world_do_not_depend_on_the_number_of_threads() -> None:
     scene = Scene(
         space=Box(size=(60.0, 60.0)),
         effects=(Drag(rate=0.4),),
@@ -156,12 +156,12 @@ def test_an_implicit_step_of_a_large_world_is_the_same_for_any_number_of_threads
 
 
 @pytest.mark.slow
-def test_a_team_goes_through_the_worlds_of_a_small_batch_of_large_ones(shared: list[int]) -> None:
+def test_a_small_batch_of_large_worlds_is_stepped_by_a_team(shared: list[int]) -> None:
     scene = NAMED["torus_single"].make(4200, 60.0)
     start = started(scene, worlds=2)
     drive = np.random.default_rng(0).normal(size=start.shape)
     expected = scene.step(start, drive=drive, steps=3)
-    for count, parts in ((2, 2), (3, 3)):  # two worlds apart, or a team of three for one after the other
+    for count, parts in ((2, 2), (3, 3)):  # a world per thread, or a team of three for each world in turn
         use_threads(count)
         shared.clear()
         assert_same(scene.step(start, drive=drive, steps=3), expected)
@@ -170,8 +170,8 @@ def test_a_team_goes_through_the_worlds_of_a_small_batch_of_large_ones(shared: l
 
 @pytest.mark.parametrize("name", ["torus", "box"])
 @pytest.mark.parametrize("count", [steppers.FEWEST_TOGETHER, 333])
-def test_a_team_of_many_takes_the_step_of_few_agents(name: str, count: int, shared: list[int]) -> None:
-    """Some of them have no block, or no row of cells, of their own."""
+def test_a_team_gives_the_same_bits_for_few_agents(name: str, count: int, shared: list[int]) -> None:
+    """Some threads get no block of agents, or no row of cells."""
     scene = NAMED[name].make(count, 20.0)
     start = started(scene)
     expected = scene.run(start, 5)
@@ -182,7 +182,7 @@ def test_a_team_of_many_takes_the_step_of_few_agents(name: str, count: int, shar
 
 
 def crowded(scene: Scene) -> tuple[Scene, State]:
-    """The same with bodies of two kinds, mixed up in space, large enough to be put in order during a call."""
+    """Return a scene with two kinds of bodies, mixed in space, and enough agents to be reordered during a call."""
     half = scene.groups[0].model_copy(update={"count": WORTH_ARRANGING // 2 + 3})
     heavy = half.model_copy(update={"mass": 3.0, "max_speed": 1.0, "max_force": 2.0, "radius": 0.05})
     scene = scene.model_copy(update={"groups": (half, heavy)})
@@ -192,8 +192,8 @@ def crowded(scene: Scene) -> tuple[Scene, State]:
 
 
 @pytest.mark.parametrize("name", ["torus_single", "torus_3", "box", "nearest_torus_single", "torus_single_rk4"])
-def test_a_call_of_many_steps_is_many_calls_of_one(name: str) -> None:
-    """Only in a call of several steps agents of a large world are put in order; nobody can tell from the bits."""
+def test_one_call_of_many_steps_equals_many_calls_of_one_step(name: str) -> None:
+    """Agents of a large world are reordered in memory only in calls of several steps."""
     scene, start = crowded(NAMED[name].make(WORTH_ARRANGING, 140.0 if scene_is_flat(name) else 40.0))
     drive = np.random.default_rng(2).normal(size=start.shape)
     expected = start
@@ -205,7 +205,7 @@ def test_a_call_of_many_steps_is_many_calls_of_one(name: str) -> None:
     assert not np.array_equal(np.argsort(start.x[0, 0]), np.argsort(expected.x[0, 0]))  # they changed places
 
 
-def test_a_team_puts_fewer_agents_in_order_than_one_thread() -> None:
+def test_a_team_reorders_smaller_worlds_than_one_thread_does() -> None:
     scene = NAMED["torus_single"].make(FEWEST_ARRANGED, 70.0)
     start = scene.start(3)
     start.x[...] = np.random.default_rng(1).permuted(start.x, axis=2)
@@ -223,8 +223,8 @@ def scene_is_flat(name: str) -> bool:
     return NAMED[name].dimension == 2
 
 
-def test_a_world_that_was_put_in_order_may_shrink_until_there_is_no_grid() -> None:
-    """From then on everybody is met in the order of numbers, not of places."""
+def test_a_reordered_world_may_shrink_until_it_has_no_grid() -> None:
+    """Without a grid, neighbours are visited in the order of their numbers, not by cell."""
     spawn = Spawn(low=(0, 0), high=(6.1, 6.1))
     scene = Scene(
         groups=(Group(count=WORTH_ARRANGING, spawn=spawn),), effects=(Separation(weight=1e-3, radius=1.0),), dt=0.02
@@ -235,22 +235,22 @@ def test_a_world_that_was_put_in_order_may_shrink_until_there_is_no_grid() -> No
 
 
 @pytest.mark.parametrize("absent", [(), (5_000,), (0, WORTH_ARRANGING)])
-def test_what_all_have_in_common_is_nobodys_own(absent: tuple[int, ...]) -> None:
-    """A large world reads bodies that are alike, who lives, and that nothing is asked, where its first block has it."""
-    most = WORTH_ARRANGING + 2  # and one more: the last block is not full
+def test_values_shared_by_all_agents_give_the_same_bits_as_values_of_each(absent: tuple[int, ...]) -> None:
+    """A large world reads what all agents share (body, alive, no drive) from its first block only."""
+    most = WORTH_ARRANGING + 2  # one more agent follows: the last block is not full
     group = Group(count=most, max_speed=1e3, max_force=1e6, spawn=Spawn(low=(0, 0), high=(130.0, 130.0)))
     laws = {"effects": (Separation(weight=1e-3, radius=1.0),), "dt": 0.02}
     rng, ends = np.random.default_rng(4), []
     places, drive = rng.uniform(0, 130, (2, 1, most + 1)), rng.normal(size=(1, most + 1, 2))
-    for strength in (1e6, 2e6):  # nobody reaches either: the other body makes no difference
+    for strength in (1e6, 2e6):  # no agent reaches either limit: the results must be equal
         scene = Scene(groups=(group, group.model_copy(update={"count": 1, "max_force": strength})), **laws)
         state = scene.start(1)
         state.x[...] = places
         state.alive[0, list(absent)] = False
-        for asked in (None, drive, None):  # what was asked for is forgotten
-            state = scene.step(state, drive=asked, steps=2)
-            once = scene.step(scene.step(state, drive=asked), drive=asked)
-            assert_same(scene.step(state, drive=asked, steps=2), once)
+        for given in (None, drive, None):  # the drive of the call before must not be used again
+            state = scene.step(state, drive=given, steps=2)
+            once = scene.step(scene.step(state, drive=given), drive=given)
+            assert_same(scene.step(state, drive=given, steps=2), once)
         ends.append(state)
         driven, alone = scene.step(state, drive=drive, steps=2), scene.step(state, steps=2)
         assert_same(alone, scene.step(state, drive=np.zeros_like(drive), steps=2))
@@ -258,7 +258,7 @@ def test_what_all_have_in_common_is_nobodys_own(absent: tuple[int, ...]) -> None
     assert_same(*ends)
 
 
-def test_a_body_of_another_kind_counts_in_a_large_world() -> None:
+def test_a_single_heavy_agent_of_a_large_world_keeps_its_own_mass() -> None:
     group = Group(count=WORTH_ARRANGING, max_force=1e6, spawn=Spawn(low=(0, 0), high=(130.0, 130.0)))
     heavy = Group(count=1, max_force=1e6, mass=4.0, spawn=Spawn(low=(500, 0), high=(501, 1)))
     scene = Scene(groups=(group, heavy), effects=(Separation(weight=1e-3, radius=1.0),), dt=0.02)
@@ -270,12 +270,12 @@ def test_a_body_of_another_kind_counts_in_a_large_world() -> None:
 
 
 @pytest.mark.slow
-def test_nan_in_a_world_that_was_put_in_order_names_the_agent_by_its_number() -> None:
+def test_nan_in_a_reordered_world_names_the_agent_by_its_number() -> None:
     scene, start = crowded(NAMED["torus_single"].make(WORTH_ARRANGING, 140.0))
     start.v[1, 0, 12_345] = np.inf
     world, agent, _ = scene.stepper.advance(start.copy(), np.zeros((2, 0, 0), np.float32), 3)
     apart = scene.space.displacement(start.pos[0, agent], start.pos[0, 12_345])
-    assert world == 0 and agent < 12_345  # its neighbours caught it, and theirs
+    assert world == 0 and agent < 12_345  # it spread to neighbours, and to theirs
     assert np.linalg.norm(apart) < 3 * 3.0
     kept = start.copy()
     with pytest.raises(FloatingPointError, match="world 0, agent "):
@@ -283,8 +283,8 @@ def test_nan_in_a_world_that_was_put_in_order_names_the_agent_by_its_number() ->
     assert_same(start, kept)
 
 
-def test_more_threads_than_there_is_work_for_do_no_harm() -> None:
-    """Five of them, some without a row of cells of their own, on fewer cores."""
+def test_surplus_threads_do_not_change_results() -> None:
+    """Five threads, some without a row of cells, on fewer cores."""
     scene = NAMED["box"].make(4500, 45.0)
     start = scene.start(1)
     start.pos[0, :4400] = np.random.default_rng(0).uniform(20.0, 21.0, (4400, 2))  # nearly all in one row of cells
@@ -305,19 +305,19 @@ def test_more_threads_than_there_is_work_for_do_no_harm() -> None:
 
 @pytest.mark.parametrize("variant", VARIANTS, ids=lambda variant: variant.name)
 @pytest.mark.parametrize("count", [33, 300])
-def test_worlds_divided_among_threads_are_the_same_worlds(variant: Variant, count: int, shared: list[int]) -> None:
+def test_worlds_divided_among_threads_keep_their_bits(variant: Variant, count: int, shared: list[int]) -> None:
     scene = variant.make(count, 20.0)
     start = started(scene, worlds=7)
     expected = scene.run(start, 4)
     for threads_used in (2, 3, 7, 8):
         use_threads(threads_used)
         assert_same(scene.run(start, 4), expected)
-    assert shared == [2, 3, 7, 8 if count >= steppers.FEWEST_TOGETHER else 7]  # worlds apart, or a team of 8
+    assert shared == [2, 3, 7, 8 if count >= steppers.FEWEST_TOGETHER else 7]  # a world per job, or a team of 8
 
 
 @pytest.mark.parametrize("used", [1, 3])
-def test_a_long_call_gives_the_bits_of_short_ones_however_many_have_left_their_tiles(used: int) -> None:
-    """3 m/s for 2 s, in tiles of 14 m: few have left at the beginning, more than a quarter at the end."""
+def test_long_calls_equal_short_ones_however_many_agents_leave_their_tiles(used: int) -> None:
+    """3 m/s for 2 s, in tiles of 14 m: few agents have left their tile at first, over a quarter at the end."""
     use_threads(used)
     scene = Scene(
         dimension=2, space=Torus(size=(117.0, 117.0)), dt=0.05, dtype="float32",
@@ -327,15 +327,15 @@ def test_a_long_call_gives_the_bits_of_short_ones_however_many_have_left_their_t
     one_by_one = start = scene.start(5)
     for _ in range(40):
         one_by_one = scene.step(one_by_one)
-    way = np.abs((one_by_one.x - start.x + 58.5) % 117 - 58.5)
-    assert (way / 14).sum(axis=0).mean() > 0.3  # the chance that an edge of his tile was in the way
+    moved = np.abs((one_by_one.x - start.x + 58.5) % 117 - 58.5)
+    assert (moved / 14).sum(axis=0).mean() > 0.3  # probability that an agent crossed an edge of its tile
     at_once = scene.step(start, steps=40)
     np.testing.assert_array_equal(at_once.x, one_by_one.x)
     np.testing.assert_array_equal(at_once.v, one_by_one.v)
 
 
 class Clock:
-    """Says how late it is, which is as late as is told."""
+    """Clock that stands still but for the durations that jobs add to it."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 0.0
@@ -345,10 +345,10 @@ class Clock:
     def done(
         self, choice: thread_pool.AutoTuner, alone: float, shared: float, pieces: int, surely: bool = False
     ) -> str:
-        """By whom so many pieces are done, a letter each, if these are the seconds that they take."""
+        """Do `pieces` jobs of these durations, s; return a letter per piece: a (alone) or s (shared)."""
         by = []
 
-        def way(letter: str, seconds: float) -> Callable[[], None]:
+        def job_of(letter: str, seconds: float) -> Callable[[], None]:
             def job() -> None:
                 by.append(letter)
                 self.now += seconds
@@ -356,11 +356,11 @@ class Clock:
             return job
 
         for _ in range(pieces):
-            choice.made(way("a", alone), way("s", shared), surely)
+            choice.made(job_of("a", alone), job_of("s", shared), surely)
         return "".join(by)
 
 
-def test_both_ways_are_tried_and_the_sooner_one_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_both_alternatives_are_tried_and_the_faster_one_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock(monkeypatch)
     assert clock.done(thread_pool.AutoTuner(), 1.0, 0.6, 10) == "aaasss" + 4 * "s"
     assert clock.done(thread_pool.AutoTuner(), 1.0, 1.2, 10) == "aaasss" + 4 * "a"
@@ -368,7 +368,7 @@ def test_both_ways_are_tried_and_the_sooner_one_is_kept(monkeypatch: pytest.Monk
     assert clock.done(thread_pool.AutoTuner(), 0.0, 9.0, 5, surely=True) == 5 * "s"  # too long to try
 
 
-def test_what_was_slower_is_tried_again_ever_more_seldom(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_slower_alternative_is_retried_ever_more_seldom(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock(monkeypatch)
     by = clock.done(thread_pool.AutoTuner(), 1.0, 1.2, 20_000)[2 * thread_pool.TRIAL :]
     waits = [len(part) for part in by.split(thread_pool.TRIAL * "s")]
@@ -376,11 +376,11 @@ def test_what_was_slower_is_tried_again_ever_more_seldom(monkeypatch: pytest.Mon
     assert set(waits[6:-1]) == {thread_pool.SELDOM}
 
 
-@pytest.mark.parametrize("sooner", [0, 1])
-def test_nothing_that_happens_once_decides_for_ever(sooner: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Somebody is held up, or what is sooner done changes."""
-    clock, choice, wanted = Clock(monkeypatch), thread_pool.AutoTuner(), "as"[sooner]
-    usual, late = (0.5, 1.0) if sooner == 0 else (1.0, 0.5), 100.0
+@pytest.mark.parametrize("faster", [0, 1])
+def test_a_single_measurement_does_not_decide_for_ever(faster: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A single slow run, or a change of which alternative is faster."""
+    clock, choice, wanted = Clock(monkeypatch), thread_pool.AutoTuner(), "as"[faster]
+    usual, late = (0.5, 1.0) if faster == 0 else (1.0, 0.5), 100.0
     clock.done(choice, *usual, 100)
     for held_up in ((late, usual[1]), (usual[0], late)):
         clock.done(choice, *held_up, 1)
@@ -390,14 +390,14 @@ def test_nothing_that_happens_once_decides_for_ever(sooner: int, monkeypatch: py
         )
     clock.done(choice, *usual[::-1], 2 * thread_pool.SELDOM)
     assert clock.done(choice, *usual[::-1], 100).count(wanted) <= thread_pool.TRIAL
-    for held_up in range(2 * thread_pool.TRIAL):  # while it is tried for the first time
+    for held_up in range(2 * thread_pool.TRIAL):  # during the first trials
         begun = thread_pool.AutoTuner()
         for k in range(2 * thread_pool.TRIAL):
             clock.done(begun, *((late, late) if k == held_up else usual), 1)
         assert clock.done(begun, *usual, thread_pool.AGAIN) == thread_pool.AGAIN * wanted
 
 
-def test_a_piece_that_failed_is_nothing_to_go_by(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_time_of_failed_work_is_not_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     clock, choice = Clock(monkeypatch), thread_pool.AutoTuner()
     clock.done(choice, 1.0, 0.6, 10)
     before = list(choice.took)
@@ -411,7 +411,7 @@ def test_a_piece_that_failed_is_nothing_to_go_by(monkeypatch: pytest.MonkeyPatch
     assert choice.took == before
 
 
-def test_scenes_and_worlds_keep_to_what_is_sooner_done(shared: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scenes_and_worlds_use_the_faster_number_of_threads(shared: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(thread_pool.AutoTuner, "always", False)
     use_threads(2)
     scene = NAMED["torus"].make(640, 60.0)
@@ -431,10 +431,10 @@ def test_scenes_and_worlds_keep_to_what_is_sooner_done(shared: list[int], monkey
 
 
 @pytest.mark.parametrize(("count", "worlds", "surely"), [(640, 1, False), (640, 2, True), (4096, 1, True)])
-def test_long_calls_are_shared_at_once_where_threads_seldom_wait_for_each_other(
+def test_long_calls_are_shared_at_once_if_threads_seldom_wait_for_each_other(
     count: int, worlds: int, surely: bool, shared: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Worlds apart, or one of many agents; whether a team on few is sooner done must have been seen."""
+    """Without a trial if each thread has its own world, or a world has many agents; a team for few agents is timed."""
     monkeypatch.setattr(thread_pool.AutoTuner, "always", False)
     use_threads(2)
     scene = NAMED["torus"].make(count, 60.0)
@@ -445,24 +445,24 @@ def test_long_calls_are_shared_at_once_where_threads_seldom_wait_for_each_other(
     assert shared == [2] * surely
 
 
-def test_there_are_never_more_at_work_than_there_are_cores(shared: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_there_are_never_more_threads_at_work_than_cores(shared: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(thread_pool, "_cores", 3)
     scene = NAMED["torus"].make(33, 20.0)
     start = scene.start(0, worlds=7)
-    for asked, work in ((2, [2]), (8, [3]), (1, [])):
+    for requested, work in ((2, [2]), (8, [3]), (1, [])):
         shared.clear()
-        use_threads(asked)
+        use_threads(requested)
         scene.run(start, 1)
         assert shared == work
-        assert threads() == asked
+        assert threads() == requested
 
 
-# --- a number that is none, found by any thread -----------------------------------------------------------------------
+# --- NaN, found by any thread -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 @pytest.mark.parametrize("agent", [0, 1, 1700, 3333, 4998])
-def test_whichever_thread_meets_nan_names_the_agent(agent: int, count: int) -> None:
+def test_nan_found_by_any_thread_names_the_first_agent(agent: int, count: int) -> None:
     scene = NAMED["torus"].make(4999, 60.0)
     start = scene.start(0)
     start.pos[0, agent, 1] = np.nan
@@ -471,7 +471,7 @@ def test_whichever_thread_meets_nan_names_the_agent(agent: int, count: int) -> N
     with pytest.raises(FloatingPointError, match=f"world 0, agent {agent}:"):
         scene.step(start)
     start.pos[0, 4998, 0] = np.inf
-    with pytest.raises(FloatingPointError, match=f"world 0, agent {agent}:"):  # the first of two
+    with pytest.raises(FloatingPointError, match=f"world 0, agent {agent}:"):  # the first of the two
         scene.step(start)
     np.testing.assert_array_equal(kept.tick, start.tick)
 
@@ -488,11 +488,11 @@ def test_nan_in_a_batch_is_found_in_its_first_world(count: int) -> None:
         scene.run(start, 5)
 
 
-# --- threads of the caller's own --------------------------------------------------------------------------------------
+# --- calls from several threads ---------------------------------------------------------------------------------------
 
 
 def at_the_same_time(calls: list[Callable[[], Any]]) -> list[Any]:
-    """Call all of them, each in a thread; fail, instead of waiting for ever, if one does not come back."""
+    """Call each in a thread of its own and return the results; fail if one takes longer than PATIENCE."""
     pool = ThreadPoolExecutor(len(calls))
     try:
         return [future.result(PATIENCE) for future in [pool.submit(call) for call in calls]]
@@ -504,7 +504,7 @@ def at_the_same_time(calls: list[Callable[[], Any]]) -> list[Any]:
     ("name", "count", "edge", "worlds", "steps"),
     [("torus_single", 5000, 70.0, 1, 3), ("torus_single", 150, 20.0, 7, 10), ("nearest_plane", 4111, 60.0, 1, 2)],
 )
-def test_two_callers_may_step_one_scene_with_two_threads_each(
+def test_two_callers_can_step_one_scene_with_two_threads_each(
     name: str, count: int, edge: float, worlds: int, steps: int
 ) -> None:
     scene = NAMED[name].make(count, edge)
@@ -522,13 +522,13 @@ def test_two_callers_may_step_one_scene_with_two_threads_each(
         assert_same(a, b)
 
 
-def test_callers_whose_jobs_wait_for_each_other_never_wait_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nine at once hire a crew, which takes a while: none is left with fewer threads than it has jobs."""
+def test_simultaneous_callers_with_waiting_jobs_do_not_deadlock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nine callers create pools at once, slowly: each gets as many threads as it has jobs."""
 
     class Slow(thread_pool._ThreadPool):
         def __init__(self, count: int) -> None:
             super().__init__(count)
-            time.sleep(0.02 * (6 - count))  # the smallest comes last, and stays
+            time.sleep(0.02 * (6 - count))  # the smallest pool is ready last, and stays
 
     monkeypatch.setattr(thread_pool, "_ThreadPool", Slow)
     monkeypatch.setattr(thread_pool, "_crew", None)
@@ -555,7 +555,7 @@ def test_callers_whose_jobs_wait_for_each_other_never_wait_for_ever(monkeypatch:
     assert answers == {n: [size * (size - 1) // 2] * 20 for n, size in enumerate(sizes)}
 
 
-def test_a_job_that_fails_fails_the_call_when_all_have_ended() -> None:
+def test_the_error_of_a_job_is_raised_after_all_jobs_have_ended() -> None:
     ended = []
 
     def good() -> None:
@@ -570,7 +570,7 @@ def test_a_job_that_fails_fails_the_call_when_all_have_ended() -> None:
         with pytest.raises(OverflowError, match="too much"):
             share(jobs)
         assert ended == [1, 1]
-    assert share([lambda: 1, lambda: 2, lambda: 3]) == [1, 2, 3]  # the crew is as good as before
+    assert share([lambda: 1, lambda: 2, lambda: 3]) == [1, 2, 3]  # the pool still works
 
 
 # --- a process that forks ---------------------------------------------------------------------------------------------
@@ -612,18 +612,18 @@ def in_another_process(code: str, **environment: str) -> subprocess.CompletedPro
     )
 
 
-LINUX = pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no thread can be kept off a core here")
+LINUX = pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="thread affinity cannot be set here")
 
 
 @pytest.fixture
 def new_crew(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody has worked yet, and where it may run nobody has said."""
+    """Start without a thread pool, so that no thread has an affinity yet."""
     monkeypatch.setattr(thread_pool, "_crew", None)
 
 
 @pytest.fixture
 def cores(new_crew: None) -> set[int]:
-    """Cores that this thread may run on, two at least."""
+    """Return the cores that this thread may run on; skip if there is only one."""
     given = os.sched_getaffinity(0)
     if len(given) < 2:
         pytest.skip("one core")
@@ -631,25 +631,25 @@ def cores(new_crew: None) -> set[int]:
 
 
 @LINUX
-def test_others_keep_off_the_core_of_who_shares_its_work(cores: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pool_threads_avoid_the_core_of_the_calling_thread(cores: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
     assert thread_pool._here()[0] in cores
     for core in (*cores, *cores):
-        monkeypatch.setattr(thread_pool, "_asked", lambda core=core: core)  # the caller's own is another one any time
+        monkeypatch.setattr(thread_pool, "_asked", lambda core=core: core)  # the caller may be on any core
         assert share([lambda: None, lambda: os.sched_getaffinity(0)])[1] == cores - {core}
-    assert os.sched_getaffinity(0) == cores  # the caller's own thread is left alone
+    assert os.sched_getaffinity(0) == cores  # the caller's own affinity is unchanged
 
 
 @LINUX
 @pytest.mark.usefixtures("new_crew")
-def test_threads_run_anywhere_where_there_are_more_of_them_than_cores() -> None:
+def test_threads_run_on_any_core_if_there_are_more_threads_than_cores() -> None:
     cores = os.sched_getaffinity(0)
     found = share([lambda: os.sched_getaffinity(0)] * (len(cores) + 1))
     assert found == [cores] * (len(cores) + 1)
 
 
 @LINUX
-def test_who_is_pinned_keeps_its_helpers_there(cores: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever the helpers were kept to before; and a core of their own is theirs again when the caller has several."""
+def test_pool_threads_stay_on_the_cores_of_a_pinned_caller(cores: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever their affinity was before; they avoid its core again once the caller may use several."""
 
     def calls() -> list[set[int]]:
         seen = []
@@ -666,7 +666,9 @@ def test_who_is_pinned_keeps_its_helpers_there(cores: set[int], monkeypatch: pyt
 
 
 @LINUX
-def test_fewer_threads_than_before_are_kept_off_again(cores: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_after_a_call_with_surplus_threads_they_avoid_the_callers_core_again(
+    cores: set[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     core = min(cores)
     monkeypatch.setattr(thread_pool, "_asked", lambda: core)
     share([lambda: None] * (len(cores) + 2))
@@ -674,14 +676,12 @@ def test_fewer_threads_than_before_are_kept_off_again(cores: set[int], monkeypat
 
 
 @pytest.mark.usefixtures("new_crew")
-@pytest.mark.parametrize("forbidden", ["sched_setaffinity", "sched_getaffinity", "to ask"])
-def test_a_system_that_keeps_no_thread_off_a_core_is_served_all_the_same(
-    forbidden: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("forbidden", ["sched_setaffinity", "sched_getaffinity", "sched_getcpu"])
+def test_work_is_shared_even_if_thread_affinity_is_unavailable(forbidden: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: Any) -> None:
         raise PermissionError
 
-    monkeypatch.setattr(thread_pool, "_asked", None if forbidden == "to ask" else lambda: 0)
+    monkeypatch.setattr(thread_pool, "_asked", None if forbidden == "sched_getcpu" else lambda: 0)
     for name in ("sched_setaffinity", "sched_getaffinity"):
         monkeypatch.setattr(os, name, refuse if forbidden == name else lambda *_: {0, 1}, raising=False)
     assert share([lambda: 1, lambda: 2]) == [1, 2]
@@ -689,16 +689,16 @@ def test_a_system_that_keeps_no_thread_off_a_core_is_served_all_the_same(
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
-def test_a_forked_child_steps_with_threads_of_its_own() -> None:
+def test_a_forked_child_steps_with_its_own_threads() -> None:
     done = in_another_process(FORK)
     assert done.stdout == "[7, 7]\n", done.stderr
 
 
-# --- how many ---------------------------------------------------------------------------------------------------------
+# --- number of threads ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("count", [0, -1, 257, 2.0, True, "2", None, float("nan")])
-def test_a_number_of_threads_that_is_none_is_refused(count: Any) -> None:
+def test_an_invalid_number_of_threads_is_refused(count: Any) -> None:
     with pytest.raises(ValueError, match="threads is") as caught:
         use_threads(count)
     assert repr(count) in str(caught.value)
@@ -707,9 +707,7 @@ def test_a_number_of_threads_that_is_none_is_refused(count: Any) -> None:
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "257", "2.0", "two", "", " ", "1e3", "²", "99999999999999999999"])
-def test_an_environment_that_asks_for_no_number_of_threads_is_refused(
-    text: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_invalid_number_of_threads_in_the_environment_is_refused(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FLOCKENV_THREADS", text)
     with pytest.raises(ValueError, match="FLOCKENV_THREADS is") as caught:
         thread_pool._from_environment()
@@ -718,7 +716,7 @@ def test_an_environment_that_asks_for_no_number_of_threads_is_refused(
     assert threads() == 1
 
 
-def test_the_environment_says_how_many_threads() -> None:
+def test_the_environment_sets_the_number_of_threads() -> None:
     code = "import flockenv.jit.thread_pool as c; print(c.threads())"
     assert in_another_process(code).stdout == "1\n"
     assert in_another_process(code, FLOCKENV_THREADS="3").stdout == "3\n"
@@ -729,8 +727,8 @@ def test_the_environment_says_how_many_threads() -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="torch has another OpenMP there")
 @pytest.mark.parametrize(
-    ("given", "heard"), [({}, "10000"), ({"GOMP_SPINCOUNT": "77"}, "77"), ({"OMP_WAIT_POLICY": "passive"}, "0")]
+    ("given", "spins"), [({}, "10000"), ({"GOMP_SPINCOUNT": "77"}, "77"), ({"OMP_WAIT_POLICY": "passive"}, "0")]
 )
-def test_torch_spins_briefly_unless_somebody_has_said_how_threads_wait(given: dict[str, str], heard: str) -> None:
-    told = in_another_process("import agents, torch", OMP_DISPLAY_ENV="verbose", **given)
-    assert f"GOMP_SPINCOUNT = '{heard}'" in told.stderr
+def test_torch_spins_briefly_unless_the_environment_sets_how_threads_wait(given: dict[str, str], spins: str) -> None:
+    done = in_another_process("import agents, torch", OMP_DISPLAY_ENV="verbose", **given)
+    assert f"GOMP_SPINCOUNT = '{spins}'" in done.stderr
