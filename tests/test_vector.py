@@ -1,4 +1,4 @@
-"""The native vector face: number for number and info for info what gymnasium makes of many single environments."""
+"""The native vector environment: numbers and infos equal those of gymnasium's vector of single environments."""
 
 import copy
 import itertools
@@ -37,11 +37,11 @@ EASY = {
     "flockenv/PathFollow-v0": {"lost_distance": 1.5, "max_force": 2.5},
     "flockenv/School-v0": {"start_hunger": 0.6, "metabolism": 0.15},
     "flockenv/Bottleneck-v0": {"people": 4, "room": 2.0, "clear": 0.0, "width": 1.8},
-    "flockenv/Corridor-v1": {},  # nor there
+    "flockenv/Corridor-v1": {},  # never terminates
     "flockenv/CrowdNav-v0": {"goal_radius": 11.8},
-    "flockenv/Flock-v1": {},  # nobody ever terminates there
+    "flockenv/Flock-v1": {},  # never terminates
 }
-"""Parameters under which random actions sometimes end an episode, and the clock ends the others."""
+"""Parameters with which random actions sometimes end an episode; the time limit ends the others."""
 
 
 def rows(envs, steps, seed=0):
@@ -54,8 +54,8 @@ def masked(ended, mode):
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("env_id", SINGLE)
-def test_it_is_gymnasium_s_own_vector_of_singles(env_id, mode):
-    """Observations, rewards, ends, every info and its mask, over episodes that end by the clock and by themselves."""
+def test_it_equals_the_vector_of_single_environments_of_gymnasium(env_id, mode):
+    """Observations, rewards, ends, every info and its mask, over episodes that terminate or are truncated."""
     options = {"max_episode_steps": 40, **EASY[env_id]}
     native = gymnasium.make_vec(env_id, 4, autoreset_mode=mode, **options)
     loop = gymnasium.make_vec(env_id, 4, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, **options)
@@ -77,8 +77,8 @@ def test_it_is_gymnasium_s_own_vector_of_singles(env_id, mode):
 
 
 @pytest.mark.parametrize("env_id", SINGLE)
-def test_the_default_begins_anew_when_gymnasium_s_does(env_id):
-    """In the step after the end, which ignores the actions, pays nothing and ends nothing."""
+def test_the_default_autoreset_mode_is_that_of_gymnasium(env_id):
+    """In the step after an end: it ignores the actions, has no reward and ends no episode."""
     native = gymnasium.make_vec(env_id, 2, max_episode_steps=3)
     loop = gymnasium.make_vec(env_id, 2, max_episode_steps=3, vectorization_mode="sync")
     assert native.metadata["autoreset_mode"] is loop.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
@@ -108,7 +108,7 @@ WRAPPERS = {
 
 @pytest.mark.filterwarnings("ignore:.*overflow encountered in cast", "ignore:.*precision lowered")  # gymnasium's own
 @pytest.mark.parametrize("name", WRAPPERS)
-def test_a_wrapper_sees_in_it_what_it_sees_in_gymnasium_s_own(name):
+def test_wrappers_give_the_same_results_as_on_the_vector_of_gymnasium(name):
     options = {"max_episode_steps": 7, "capture_distance": 6.0}
     native = WRAPPERS[name](gymnasium.make_vec("flockenv/Pursuit-v0", num_envs=4, **options))
     loop = WRAPPERS[name](gymnasium.make_vec("flockenv/Pursuit-v0", 4, vectorization_mode="sync", **options))
@@ -127,23 +127,23 @@ def test_a_wrapper_sees_in_it_what_it_sees_in_gymnasium_s_own(name):
 
 @pytest.mark.filterwarnings("ignore:.*overflow encountered in cast", "ignore:.*precision lowered")  # gymnasium's own
 @pytest.mark.parametrize("name", WRAPPERS)
-def test_a_wrapper_takes_several_learners_in_each_world(name):
+def test_wrappers_work_with_several_learners_in_each_world(name):
     envs = WRAPPERS[name](crowd(max_episode_steps=5))
     assert envs.reset(seed=3)[0].shape == (12, *envs.single_observation_space.shape)
     for t, row in enumerate(rows(envs, 13)):
         observation, _, terminated, truncated, _ = envs.step(row)
         assert np.isfinite(observation).all()
-        np.testing.assert_array_equal(terminated | truncated, np.full(12, t % 6 == 4))  # 5 steps, then one to begin
+        np.testing.assert_array_equal(terminated | truncated, np.full(12, t % 6 == 4))  # 5 steps, then a reset
 
 
 @pytest.mark.parametrize("mode", MODES)
 def test_a_metric_without_a_value_is_left_out(monkeypatch, mode):
-    """NaN would make equal infos unequal; in a batch its mask says which worlds have none."""
-    tell_of, k = World._tell_of, Pursuit.metric_names.index("least_distance")
+    """NaN would make equal infos unequal; in a batch the mask marks the worlds that have a value."""
+    write_metrics, k = World._tell_of, Pursuit.metric_names.index("least_distance")
 
-    def sometimes(self, first, told):
-        tell_of(self, first, told)
-        told[k, told[k] >= 8.0] = np.nan
+    def sometimes(self, first, metrics):
+        write_metrics(self, first, metrics)
+        metrics[k, metrics[k] >= 8.0] = np.nan
 
     monkeypatch.setattr(World, "_tell_of", sometimes)
     native = gymnasium.make_vec("flockenv/Pursuit-v0", 4, autoreset_mode=mode, max_episode_steps=30)
@@ -164,7 +164,7 @@ def test_a_metric_without_a_value_is_left_out(monkeypatch, mode):
 
 
 @pytest.mark.parametrize("env_id", SINGLE)
-def test_a_row_of_sixteen_is_that_world_alone(env_id):
+def test_a_row_of_sixteen_worlds_equals_that_world_alone(env_id):
     many = gymnasium.make_vec(env_id, 16, max_episode_steps=150)
     actions = rows(many, 400)
     picked = (0, 5, 15)
@@ -191,7 +191,7 @@ def test_observations_stay_inside_their_space(env_id):
         assert terminated.dtype == truncated.dtype == np.bool_
 
 
-def test_time_limit_is_the_id_s_unless_said_otherwise():
+def test_the_default_time_limit_is_that_of_the_id():
     assert gymnasium.make_vec("flockenv/Pursuit-v0", 2).spec.max_episode_steps == HORIZONS["Pursuit"]
     envs = gymnasium.make_vec("flockenv/Pursuit-v0", 2, max_episode_steps=3)
     envs.reset(seed=0)
@@ -213,7 +213,7 @@ def test_the_end_of_an_episode_is_in_the_infos():
 
 
 def of(info, rows):
-    """What infos say of these rows: zeros elsewhere, and nothing of which they say nothing."""
+    """Return the infos of these rows: other rows are zero, and columns without any of these rows are left out."""
     kept = {}
     for name, mask in info.items():
         if name.startswith("_") and (mask & rows).any():
@@ -226,20 +226,20 @@ def of(info, rows):
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("learners", [1, 3])
-def test_who_asks_for_ends_is_told_of_ends_alone(mode, learners):
-    """Of those that end in other steps than others: what is told of a row is what is told of it otherwise."""
+def test_infos_can_be_limited_to_rows_that_end(mode, learners):
+    """Worlds end in different steps; a row that ends has the same infos as with infos="steps"."""
     options = {"autoreset_mode": mode, "max_episode_steps": 9, "agents": 7, "learners": learners}
     envs, twin = (gymnasium.make_vec("flockenv/Flock-v1", 4 * learners, infos=i, **options) for i in ("ends", "steps"))
     for each in (envs, twin):
         each.reset(seed=2)
-        each.world.steps[1:3] = 4  # some are ahead
-    silent, told = 0, 0
+        each.world.steps[1:3] = 4  # these worlds end earlier
+    silent, reported = 0, 0
     for row in rows(envs, 40):
         ours, theirs = envs.step(row), twin.step(row)
         for a, b in zip(ours[:4], theirs[:4], strict=True):
             np.testing.assert_array_equal(a, b)
         info, ended = theirs[4], ours[2] | ours[3]
-        silent, told = silent + (not ours[4]), told + ended.any()
+        silent, reported = silent + (not ours[4]), reported + ended.any()
         begun = {name: info[name] for name in ("seed", "_seed") if name in info}
         last = {name: info[name] for name in info if "final" in name}
         rest = {name: info[name] for name in info if name not in begun | last}
@@ -248,7 +248,7 @@ def test_who_asks_for_ends_is_told_of_ends_alone(mode, learners):
         if masked(ended, mode):
             for each in (envs, twin):
                 each.reset(options=masked(ended, mode))
-    assert told >= 6
+    assert reported >= 6
     assert silent >= 20
 
 
@@ -262,7 +262,7 @@ SAME_STEP = pytest.param(
 
 
 @pytest.mark.parametrize("mode", [SAME_STEP, AutoresetMode.NEXT_STEP])
-def test_gymnasium_s_wrappers_work_on_it(mode):
+def test_statistics_of_gymnasium_are_those_of_the_episodes(mode):
     envs = gymnasium.make_vec("flockenv/Flock-v1", 3, max_episode_steps=10, autoreset_mode=mode)
     envs = DictInfoToList(RecordEpisodeStatistics(envs))
     envs.reset(seed=0)
@@ -298,7 +298,7 @@ def test_no_buffer_is_shared(monkeypatch, recycle):
 
 
 @pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-def test_a_copy_goes_on_as_the_original_would(clone):
+def test_a_copy_continues_like_the_original(clone):
     envs = gymnasium.make_vec("flockenv/Pursuit-v0", 3, max_episode_steps=9)
     envs.reset(seed=1)
     actions = rows(envs, 40)
@@ -318,20 +318,19 @@ def crowd(worlds=3, learners=4, **options):
 
 @pytest.mark.parametrize("mode", MODES)
 def test_rows_are_learners_of_worlds(mode):
-    """Everything that is told of row i is what a World says of learner i % L of world i // L, over several episodes."""
+    """Row i is learner i % L of world i // L, with the numbers and infos of a World, over several episodes."""
     envs, world = crowd(max_episode_steps=12, autoreset_mode=mode), World(Flock(agents=7, learners=4), 3, time_limit=12)
     assert envs.num_envs == 12
     np.testing.assert_array_equal(envs.reset(seed=9)[0], world.reset(9).reshape(12, -1))
-    # Worlds that end one after another.
-    world.steps[:] = envs.world.steps[:] = [0, 5, 9]
+    world.steps[:] = envs.world.steps[:] = [0, 5, 9]  # worlds end one after another
     resting, ends = np.zeros(3, bool), 0
     for row in rows(envs, 40):
         observation, reward, terminated, truncated, info = envs.step(row)
         step = world.step(np.where(np.repeat(resting, 4)[:, None], 0, row).reshape(3, 4, -1))
         ended = step.truncated & ~resting
         rewards = [f"reward/{name}" for name in Flock.terms]
-        told = world.measure()
-        valued = [name for name in world.task.metric_names if not np.isnan(told[name]).any()]
+        metrics = world.measure()
+        valued = [name for name in world.task.metric_names if not np.isnan(metrics[name]).any()]
         keys = (*rewards, "is_success", *valued)
         last = step.observation.copy()
         ends += ended.sum()
@@ -343,14 +342,14 @@ def test_rows_are_learners_of_worlds(mode):
         np.testing.assert_array_equal(truncated, np.repeat(ended, 4))
         assert not terminated.any()
         if mode is AutoresetMode.SAME_STEP and ended.any():
-            check_rows(info["final_info"], keys, step, told, ended)
+            check_rows(info["final_info"], keys, step, metrics, ended)
             np.testing.assert_array_equal(info["_final_obs"], np.repeat(ended, 4))
             for k in range(12):
                 if ended[k // 4]:
                     np.testing.assert_array_equal(info["final_obs"][k], last[k // 4, k % 4])
                 else:
                     assert info["final_obs"][k] is None
-        check_rows(info, keys, step, told, ~anew)
+        check_rows(info, keys, step, metrics, ~anew)
         np.testing.assert_array_equal(info.get("_seed", np.zeros(12)), np.repeat(anew, 4))
         if anew.any():
             np.testing.assert_array_equal(info["seed"], np.repeat(np.where(anew, [9, 10, 11], 0), 4))
@@ -362,8 +361,8 @@ def test_rows_are_learners_of_worlds(mode):
     assert ends >= 8
 
 
-def check_rows(info, keys, step, told, worlds):
-    """These worlds are told of as the step and the metrics have it, and the others with zeros."""
+def check_rows(info, keys, step, metrics, worlds):
+    """Check that infos of these worlds equal those of the step and the metrics, and that others are zero."""
     here = np.repeat(worlds, 4)
     assert [key for key in keys if key in info] == (list(keys) if worlds.any() else [])
     for key in keys if worlds.any() else ():
@@ -371,7 +370,7 @@ def check_rows(info, keys, step, told, worlds):
         if key.startswith("reward/"):
             column = step.terms[..., Flock.terms.index(key.removeprefix("reward/"))].reshape(12)
         else:
-            column = np.repeat(step.success if key == "is_success" else told[key], 4)
+            column = np.repeat(step.success if key == "is_success" else metrics[key], 4)
         np.testing.assert_array_equal(info[key], np.where(here, column, 0))
 
 
@@ -390,9 +389,9 @@ def test_a_capture_ends_all_rows_of_its_world():
     assert ends
 
 
-def test_numbers_of_rows_that_do_not_fill_worlds_are_refused():
-    for count, said in ((100, "96 or 128"), (5, "the nearest: 32$"), (33, "32 or 64"), (-5, "the nearest: 32$")):
-        with pytest.raises(ValueError, match=rf"^num_envs: {count} rows [^\n]*{said}"):
+def test_a_number_of_rows_that_does_not_fill_worlds_is_refused():
+    for count, message in ((100, "96 or 128"), (5, "the nearest: 32$"), (33, "32 or 64"), (-5, "the nearest: 32$")):
+        with pytest.raises(ValueError, match=rf"^num_envs: {count} rows [^\n]*{message}"):
             gymnasium.make_vec("flockenv/Flock-v1", count, agents=32, learners=32)
     for count in (0, -32, 2.5, "many"):
         with pytest.raises(ValueError, match=r"^worlds is [^\n]*$"):
@@ -400,7 +399,7 @@ def test_numbers_of_rows_that_do_not_fill_worlds_are_refused():
     assert gymnasium.make_vec("flockenv/Flock-v1", 64, agents=32, learners=32).world.worlds == 2
 
 
-def test_learners_that_leave_one_by_one_are_sent_elsewhere():
+def test_tasks_whose_learners_end_one_by_one_are_refused_with_a_hint():
     with pytest.raises(ValueError, match=r"^[^\n]*pettingzoo[^\n]*$"):
         gymnasium.make_vec("flockenv/Pursuit-v0", 5, pursuers=3, evaders=2, sides="both")
 
@@ -423,7 +422,7 @@ def test_rows_of_one_world_share_its_seed():
         envs.reset(seed=[5, 6, 7])
 
 
-def test_rows_of_one_world_begin_together_or_not_at_all():
+def test_rows_of_one_world_are_reset_together():
     envs = crowd(autoreset_mode=AutoresetMode.DISABLED)
     envs.reset(seed=5)
     kept = envs.step(rows(envs, 1)[0])[0]
@@ -449,7 +448,7 @@ def test_a_bad_action_of_one_of_several_is_named():
         envs.step(bad.reshape(3, 4, 2))
 
 
-def test_gymnasium_s_wrappers_work_on_several_learners():
+def test_statistics_of_gymnasium_work_with_several_learners():
     envs = DictInfoToList(RecordEpisodeStatistics(crowd(max_episode_steps=10, autoreset_mode=AutoresetMode.NEXT_STEP)))
     envs.reset(seed=0)
     total = np.zeros(12)
@@ -460,10 +459,10 @@ def test_gymnasium_s_wrappers_work_on_several_learners():
     np.testing.assert_allclose([info["episode"]["r"] for info in infos], total)
 
 
-# --- resets --------------------------------------------------------------------------------------------------------
+# --- resets -----------------------------------------------------------------------------------------------------------
 
 
-def test_seeds_may_be_a_number_or_one_per_world_or_nothing():
+def test_seeds_can_be_a_number_a_list_or_none():
     envs = gymnasium.make_vec("flockenv/Flock-v1", 3)
     by_number = envs.reset(seed=5)
     by_list = envs.reset(seed=[5, 6, 7])
@@ -479,7 +478,7 @@ def test_seeds_may_be_a_number_or_one_per_world_or_nothing():
     assert len(set(info["seed"].tolist())) == 3
 
 
-def test_a_masked_reset_leaves_the_others_alone():
+def test_a_masked_reset_does_not_change_other_worlds():
     options = {"autoreset_mode": AutoresetMode.DISABLED}
     envs, twin = (gymnasium.make_vec("flockenv/Flock-v1", 3, **options) for _ in range(2))
     actions = rows(envs, 10)
@@ -499,7 +498,7 @@ def test_a_masked_reset_leaves_the_others_alone():
     np.testing.assert_array_equal(seeded[mask], twin.reset(seed=0)[0][mask])
 
 
-def test_worlds_that_ended_want_a_reset_when_nobody_resets_them():
+def test_without_autoreset_ended_worlds_need_a_reset():
     envs = gymnasium.make_vec("flockenv/Flock-v1", 2, max_episode_steps=2, autoreset_mode=AutoresetMode.DISABLED)
     envs.reset(seed=0)
     row = np.zeros(envs.action_space.shape)
@@ -511,7 +510,7 @@ def test_worlds_that_ended_want_a_reset_when_nobody_resets_them():
     envs.step(row)
 
 
-def test_actions_of_worlds_that_rest_are_not_read():
+def test_actions_in_the_step_of_an_autoreset_are_ignored():
     envs = gymnasium.make_vec("flockenv/Flock-v1", 2, max_episode_steps=2, autoreset_mode=AutoresetMode.NEXT_STEP)
     envs.reset(seed=0)
     row = np.zeros(envs.action_space.shape)
@@ -524,7 +523,7 @@ def test_actions_of_worlds_that_rest_are_not_read():
         envs.step(row * np.nan)
 
 
-# --- bad input -----------------------------------------------------------------------------------------------------
+# --- bad input --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -539,7 +538,7 @@ def test_bad_masks_are_refused(mask):
         envs.reset(options={"reset_mask": mask})
 
 
-def test_the_first_reset_begins_every_world():
+def test_the_first_reset_must_reset_all_worlds():
     envs = gymnasium.make_vec("flockenv/Flock-v1", 2)
     with pytest.raises(ValueError, match="first reset"):
         envs.reset(options={"reset_mask": np.array([True, False])})
@@ -578,7 +577,7 @@ def test_bad_options_actions_and_modes_are_refused():
     envs.close()
 
 
-def test_one_picture_per_world():
+def test_render_returns_one_picture_per_world():
     envs = gymnasium.make_vec("flockenv/Flock-v1", 2, render_mode="rgb_array")
     envs.reset(seed=0)
     first, second = envs.render()

@@ -1,4 +1,4 @@
-"""World: batches, seeds, episodes, copies, threads, and what it refuses; for every task of the catalogue."""
+"""World: batches, seeds, episodes, copies, threads and refused arguments, for every task of the catalogue."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from flockenv.tasks.play import _play
 from tests.catalogue import TASKS, TaskRow
 
 EVERY = pytest.mark.parametrize("row", TASKS[::-1], ids=lambda row: row.name)
-"""The last one first: test_tasks.py may run beside it, from the first on, and neither waits for the other's kernels."""
+"""In reverse order: test_tasks.py, which may run in parallel, compiles the kernels of the first tasks first."""
 
 ARRAYS = ("x", "v", "alive", "tick", "key", "obstacle_x", "obstacle_radius", "work")
 
@@ -33,7 +33,7 @@ def actions_for(world: World, steps: int, seed: int = 0) -> Any:
 
 
 def everything(world: World) -> dict[str, Any]:
-    """All that a world holds, as copies."""
+    """Return copies of all arrays of a world, and its metrics."""
     kept = {name: getattr(world.state, name).copy() for name in ARRAYS}
     return kept | {"memory": world._memory.copy(), "steps": world.steps.copy(), **world.measure()}
 
@@ -51,7 +51,7 @@ def fields(step: Step) -> dict[str, Any]:
 
 @pytest.fixture(params=[False, True], ids=["fresh", "recycled"])
 def recycled(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
-    """Small worlds hand out new memory, large ones use it again; here every size does what the parameter says."""
+    """Return new memory for each result, or memory from a buffer pool, for worlds of any size."""
     monkeypatch.setattr("flockenv.envs.world.RECYCLE", 0 if request.param else 2**62)
     return bool(request.param)
 
@@ -60,7 +60,7 @@ def recycled(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
 
 
 @EVERY
-def test_a_row_of_a_batch_is_that_world_alone_bit_for_bit(row: TaskRow) -> None:
+def test_a_world_of_a_batch_equals_that_world_alone_bit_for_bit(row: TaskRow) -> None:
     batch = World(row.task, 16, time_limit=250)
     first = batch.reset(100)
     actions = actions_for(batch, 300)
@@ -70,7 +70,7 @@ def test_a_row_of_a_batch_is_that_world_alone_bit_for_bit(row: TaskRow) -> None:
         alone = World(row.task, time_limit=250)
         np.testing.assert_array_equal(alone.reset(100 + k)[0], first[k])
         found = [fields(alone.step(actions[t, k : k + 1])) for t in range(300)]
-        for name in found[0]:  # over time; one comparison for each moment took most of the time
+        for name in found[0]:  # all steps in one comparison, which is much faster than one each
             ours, theirs = (np.array(each) for each in ([s[name][0] for s in found], [s[name][k] for s in steps]))
             np.testing.assert_array_equal(ours, theirs, err_msg=f"{name}, world {k}, step by step")
         for name, value in alone.measure().items():
@@ -78,11 +78,11 @@ def test_a_row_of_a_batch_is_that_world_alone_bit_for_bit(row: TaskRow) -> None:
 
 
 @EVERY
-def test_two_worlds_in_one_process_and_in_threads_do_not_mix(row: TaskRow, recycled: bool) -> None:
+def test_worlds_in_one_process_and_in_threads_do_not_interact(row: TaskRow, recycled: bool) -> None:
     def run(seed: int) -> list[Any]:
         world = World(row.task, 2)
         world.reset(seed)
-        # what is kept, and what is let go of at once, so that its memory is used again
+        # every other result is dropped at once, so that its memory is reused
         return [world.step(a).observation.copy() if t % 2 else world.step(a).observation for t, a in plan(world, seed)]
 
     def plan(world: World, seed: int) -> Any:
@@ -96,13 +96,13 @@ def test_two_worlds_in_one_process_and_in_threads_do_not_mix(row: TaskRow, recyc
     for seed, world in enumerate(worlds):
         world.reset(seed)
     plans = [actions_for(world, 60, seed) for seed, world in enumerate(worlds)]
-    for t in range(60):  # in turn
+    for t in range(60):  # alternately
         for seed, world in enumerate(worlds):
             np.testing.assert_array_equal(world.step(plans[seed][t]).observation, serial[seed][t])
 
 
 @EVERY
-def test_nothing_handed_out_is_shared(row: TaskRow, recycled: bool) -> None:
+def test_results_and_arguments_share_no_memory_with_the_world(row: TaskRow, recycled: bool) -> None:
     world, other = World(row.task, 2), World(row.task, 2)
     held = [world.reset(5)]
     other.reset(5)
@@ -112,7 +112,7 @@ def test_nothing_handed_out_is_shared(row: TaskRow, recycled: bool) -> None:
         step = world.step(given[t])
         held += [step.observation, step.reward, step.terms, step.terminated, step.success, step.alive, step.truncated]
         for array in held:
-            array[...] = 1  # a stranger scribbles over it
+            array[...] = 1  # must not change the world
         for array in world.measure().values():
             array[...] = 77
         reference = other.step(actions[t])
@@ -123,7 +123,7 @@ def test_nothing_handed_out_is_shared(row: TaskRow, recycled: bool) -> None:
 
 @EVERY
 @pytest.mark.usefixtures("recycled")
-def test_what_goes_past_the_caches_is_the_same(row: TaskRow, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_streaming_stores_give_the_same_results(row: TaskRow, monkeypatch: pytest.MonkeyPatch) -> None:
     direct = World(row.task, 5, time_limit=7)
     monkeypatch.setattr("flockenv.envs.world.PAST", 0)
     past = World(row.task, 5, time_limit=7)
@@ -140,14 +140,14 @@ def test_what_goes_past_the_caches_is_the_same(row: TaskRow, monkeypatch: pytest
 
 
 def test_a_fence_follows_all_streaming_stores() -> None:
-    """Without it, other threads nearly always see the same results. The source is read: `play` may be in the cache."""
+    """Without it other threads nearly always see the same results. The source is checked, as `play` may be cached."""
     (play,) = (node for node in ast.walk(ast.parse(inspect.getsource(_play))) if getattr(node, "name", "") == "play")
     *_, fence, last = play.body
     assert ast.unparse(fence) == "if past:\n    store_fence()" and isinstance(last, ast.Return)
 
 
-def test_only_what_is_large_goes_past_the_caches() -> None:
-    """Nor does what is larger than a core's cache: it would go to memory twice."""
+def test_streaming_stores_are_used_for_large_results_only() -> None:
+    """Not if one world's observations exceed a core's cache: they would go to memory twice."""
     size = 4 * Obstacles().layout.size
     few, many = World(Obstacles(), (PAST - 1) // size), World(Obstacles(), -(-PAST // size))
     assert (few._past, many._past) == (False, True)
@@ -157,24 +157,24 @@ def test_only_what_is_large_goes_past_the_caches() -> None:
 
 @EVERY
 @pytest.mark.usefixtures("recycled")
-def test_terms_may_be_told_of_ends_alone(row: TaskRow) -> None:
+def test_terms_can_be_limited_to_worlds_that_end(row: TaskRow) -> None:
     every, ends = World(row.task, 4, time_limit=9), World(row.task, 4, time_limit=9)
     every.reset(5)
     ends.reset(5)
-    told = 0
+    written = 0
     for actions in actions_for(every, 30):
         one, other = every.step(actions), ends.step(actions, terms="ends")
-        tells = one.truncated | one.terminated.any(axis=1)
-        told += int(tells.sum())
-        np.testing.assert_array_equal(other.terms[tells], one.terms[tells])
+        over = one.truncated | one.terminated.any(axis=1)
+        written += int(over.sum())
+        np.testing.assert_array_equal(other.terms[over], one.terms[over])
         assert_same(fields(one), fields(other), but=("terms",))
         if one.ended.any():
             np.testing.assert_array_equal(every.reset(mask=one.ended), ends.reset(mask=one.ended))
-    assert told >= 8
+    assert written >= 8
     assert_same(everything(every), everything(ends))
 
 
-def test_terms_are_told_of_steps_or_ends() -> None:
+def test_an_unknown_choice_of_terms_is_refused() -> None:
     world = World(Pursuit())
     world.reset(0)
     kept = everything(world)
@@ -184,8 +184,8 @@ def test_terms_are_told_of_steps_or_ends() -> None:
 
 
 @EVERY
-def test_what_is_held_stays_as_it_was(row: TaskRow, recycled: bool) -> None:
-    """Whole results, single arrays and views of them, some let go of at once and some later."""
+def test_results_that_are_kept_do_not_change(row: TaskRow, recycled: bool) -> None:
+    """Whole results, single arrays and views of them, some released at once and some later."""
     world, held, was = World(row.task, 3, time_limit=20), [], []
     held.append(world.reset(5))
     was.append(held[-1].copy())
@@ -196,18 +196,18 @@ def test_what_is_held_stays_as_it_was(row: TaskRow, recycled: bool) -> None:
         if step.ended.any():
             held.append(world.reset(mask=step.ended))
             was.append(held[-1].copy())
-        if t % 9 == 8:  # somebody tidies up
+        if t % 9 == 8:  # release every other one
             del held[::2], was[::2]
     for array, copied in zip(held, was, strict=True):
         np.testing.assert_array_equal(array, copied)
 
 
-def test_a_large_world_uses_its_memory_again() -> None:
+def test_a_large_world_reuses_its_memory() -> None:
     world = World(Flock(agents=32), 64)
     world.reset(0)
     actions = actions_for(world, 12)
     blocks = {id(step.observation.base) for step in map(world.step, actions)}
-    assert len(blocks) == 2  # the one in hand, and the one being written
+    assert len(blocks) == 2  # one that the caller holds, and one being written
     assert id(None) not in blocks
 
 
@@ -215,7 +215,7 @@ def test_a_large_world_uses_its_memory_again() -> None:
 
 
 @EVERY
-def test_episodes_differ_and_the_same_seed_gives_the_same_ones(row: TaskRow) -> None:
+def test_episodes_differ_and_depend_on_the_seed_alone(row: TaskRow) -> None:
     world, other = World(row.task, 3), World(row.task, 3)
     ours = [world.reset(7), world.reset(), world.reset()]
     theirs = [other.reset([7, 8, 9]), other.reset(), other.reset()]
@@ -227,7 +227,7 @@ def test_episodes_differ_and_the_same_seed_gives_the_same_ones(row: TaskRow) -> 
     assert world.seeds == (7, 8, 9)
 
 
-def test_a_world_without_a_seed_draws_one_and_says_which() -> None:
+def test_a_world_without_a_seed_draws_one_and_reports_it() -> None:
     world, other = World(Pursuit()), World(Pursuit())
     first = world.reset()
     assert not np.array_equal(first, other.reset())
@@ -236,8 +236,8 @@ def test_a_world_without_a_seed_draws_one_and_says_which() -> None:
 
 
 @EVERY
-def test_scripted_agents_do_not_depend_on_when_they_are_looked_at(row: TaskRow) -> None:
-    """Two resets to one seed in a row, and observations in between, change nothing that follows."""
+def test_scripted_agents_do_not_depend_on_observations_and_snapshots(row: TaskRow) -> None:
+    """Another reset to the same seed, and observations in between, do not change what follows."""
     world, other = World(row.task, 2), World(row.task, 2)
     world.reset(1)
     other.reset(9)
@@ -251,7 +251,7 @@ def test_scripted_agents_do_not_depend_on_when_they_are_looked_at(row: TaskRow) 
 
 
 @EVERY
-def test_a_masked_reset_touches_the_masked_worlds_only(row: TaskRow) -> None:
+def test_a_masked_reset_changes_the_masked_worlds_only(row: TaskRow) -> None:
     world = World(row.task, 4)
     world.reset(20)
     for a in actions_for(world, 15):
@@ -276,12 +276,12 @@ def test_a_masked_reset_touches_the_masked_worlds_only(row: TaskRow) -> None:
 
 
 @pytest.fixture
-def looking(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let numba look at the types of every call, so that it would compile for other ones."""
+def checking_types(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let numba check the types of every call, so that it would compile for new ones."""
     monkeypatch.setattr("flockenv.envs.world.without_dispatch", lambda function: function)
 
 
-def test_a_world_that_was_reset_calls_its_kernel_without_a_look_at_types() -> None:
+def test_after_a_reset_the_kernel_is_called_without_type_checks() -> None:
     world = World(Pursuit(), 2)
     world.reset(1)
     play = world._entries[0]
@@ -295,9 +295,9 @@ def test_a_world_that_was_reset_calls_its_kernel_without_a_look_at_types() -> No
         assert without_dispatch(function) is function
 
 
-@pytest.mark.usefixtures("looking")
+@pytest.mark.usefixtures("checking_types")
 @pytest.mark.parametrize("first", [False, True])
-def test_a_mask_may_lie_in_memory_as_it_likes_and_nothing_compiles_anew(first: bool) -> None:
+def test_masks_of_any_memory_layout_compile_nothing(first: bool) -> None:
     task = TASKS[0].task
     world, other = World(task, 4), World(task, 4)
     for w in (world, other):
@@ -337,7 +337,7 @@ def test_a_reset_into_given_observations_writes_the_masked_worlds_only(row: Task
 
 
 @EVERY
-def test_what_was_paid_is_the_sum_of_the_terms(row: TaskRow) -> None:
+def test_paid_is_the_sum_of_the_terms_so_far(row: TaskRow) -> None:
     world = World(row.task, 3)
     world.reset(6)
     steps = [world.step(a) for a in actions_for(world, 15)]
@@ -362,16 +362,16 @@ def test_metrics_of_one_world_are_those_of_all(row: TaskRow) -> None:
         assert found == {name: column[k] for name, column in columns.items() if not np.isnan(column[k])}
         assert all(type(value) is float for value in found.values())
     assert world.metrics(-1) == world.metrics(2)
-    for nobody in (3, -4):
+    for missing in (3, -4):
         with pytest.raises(IndexError):
-            world.metrics(nobody)
+            world.metrics(missing)
 
 
 @pytest.mark.slow
 def test_metrics_are_doubles_in_a_world_of_single_precision() -> None:
     world = World(Crossing(dtype="float32"))
     world.steps[:] = 7
-    assert world.metrics()["time_to_goal"] == 7 * 0.1  # and not 7 times the float32 nearest to it
+    assert world.metrics()["time_to_goal"] == 7 * 0.1  # not 7 times the nearest float32
 
 
 def test_keys_of_many_worlds_are_the_keys_of_each() -> None:
@@ -383,7 +383,7 @@ def test_keys_of_many_worlds_are_the_keys_of_each() -> None:
 
 
 @EVERY
-@pytest.mark.usefixtures("looking")
+@pytest.mark.usefixtures("checking_types")
 def test_time_limits_truncate_and_never_terminate(row: TaskRow) -> None:
     world = World(row.task, 2, time_limit=5)
     world.reset(3)
@@ -396,7 +396,7 @@ def test_time_limits_truncate_and_never_terminate(row: TaskRow) -> None:
     endless.reset(3)
     assert not any(endless.step(a).truncated.any() for a in actions_for(endless, 50))
     compiled = len(endless._entries[0].overloads)
-    for limit in (np.int32(51), 2**70):  # neither compiles anew
+    for limit in (np.int32(51), 2**70):  # neither type is compiled for
         endless.time_limit = limit
         np.testing.assert_array_equal(endless.step(actions_for(endless, 1)[0]).truncated, limit == 51)
     assert len(endless._entries[0].overloads) == compiled
@@ -409,14 +409,14 @@ def test_time_limits_truncate_and_never_terminate(row: TaskRow) -> None:
 @pytest.mark.parametrize(
     "copied", [copy.deepcopy, lambda world: pickle.loads(pickle.dumps(world))], ids=["deep", "pickle"]
 )
-def test_a_copy_goes_on_as_the_original_would(row: TaskRow, copied: Any) -> None:
+def test_a_copy_continues_like_the_original(row: TaskRow, copied: Any) -> None:
     world = World(row.task, 3, time_limit=90)
     world.reset(11)
     actions = actions_for(world, 120)
     for a in actions[:40]:
         world.step(a)
     other = copied(world)
-    ours = [fields(world.step(a)) for a in actions[40:]] + [{"reset": world.reset()}]  # moved on first
+    ours = [fields(world.step(a)) for a in actions[40:]] + [{"reset": world.reset()}]  # the original goes first
     theirs = [fields(other.step(a)) for a in actions[40:]] + [{"reset": other.reset()}]
     for a, b in zip(ours, theirs, strict=True):
         assert_same(a, b)
@@ -427,7 +427,7 @@ def test_a_copy_goes_on_as_the_original_would(row: TaskRow, copied: Any) -> None
 @pytest.mark.parametrize(
     "copied", [copy.deepcopy, lambda world: pickle.loads(pickle.dumps(world))], ids=["deep", "pickle"]
 )
-def test_a_copy_has_memory_of_its_own(copied: Any) -> None:
+def test_a_copy_has_its_own_memory(copied: Any) -> None:
     world = World(Flock(agents=32), 64)
     world.reset(0)
     a, b = actions_for(world, 2)
@@ -435,29 +435,31 @@ def test_a_copy_has_memory_of_its_own(copied: Any) -> None:
     held = [world.step(b).observation]
     other = copied(world)
     assert other._fresh[0] is not world._fresh[0]
-    assert len(pickle.dumps(world)) < 2 * len(pickle.dumps(World(Flock(agents=32), 64)))  # no results in it
+    assert len(pickle.dumps(world)) < 2 * len(pickle.dumps(World(Flock(agents=32), 64)))  # without results
     held += [other.step(a).observation, world.step(a).observation]
     assert not any(np.shares_memory(held[i], held[k]) for i, k in ((0, 1), (0, 2), (1, 2)))
     np.testing.assert_array_equal(held[1], held[2])
 
 
-def test_a_copy_of_a_world_that_was_never_reset_is_one_too() -> None:
+def test_a_copy_of_a_world_that_was_never_reset_needs_a_reset() -> None:
     other = copy.deepcopy(World(Pursuit(), 2))
     with pytest.raises(RuntimeError, match="reset"):
         other.step(np.zeros((2, 1, 2)))
     other.reset(1)
 
 
-@pytest.mark.parametrize("crew", [1, 2, 3, 16])
+@pytest.mark.parametrize("team", [1, 2, 3, 16])
 @pytest.mark.parametrize("worlds", [1, 2, 3, 31, 1024, 4097])
-def test_portions_are_all_worlds_and_grow_smaller(worlds: int, crew: int) -> None:
-    portions = np.array(_portions(worlds, crew))
+def test_portions_cover_all_worlds_and_never_grow(worlds: int, team: int) -> None:
+    portions = np.array(_portions(worlds, team))
     first, end = portions.T
     assert first[0] == 0 and end[-1] == worlds and (first[1:] == end[:-1]).all()
     size = end - first
     assert (size > 0).all() and (np.diff(size) <= 0).all()
-    assert len(size) <= 8 * crew + 8
-    assert size[-min(crew, len(size)) :].sum() <= max(worlds / 8, crew)  # nobody waits long for who took the last ones
+    assert len(size) <= 8 * team + 8
+    assert size[-min(team, len(size)) :].sum() <= max(
+        worlds / 8, team
+    )  # the last ones are small: threads end at about the same time
 
 
 # --- actions ----------------------------------------------------------------------------------------------------------
@@ -466,9 +468,7 @@ def test_portions_are_all_worlds_and_grow_smaller(worlds: int, crew: int) -> Non
 @EVERY
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_an_action_that_is_no_number_is_refused_by_name_and_moves_nobody(
-    row: TaskRow, value: float, dtype: Any
-) -> None:
+def test_an_action_that_is_not_finite_is_named_and_changes_nothing(row: TaskRow, value: float, dtype: Any) -> None:
     world, other = World(row.task, 3), World(row.task, 3)
     world.reset(2)
     other.reset(2)
@@ -484,14 +484,16 @@ def test_an_action_that_is_no_number_is_refused_by_name_and_moves_nobody(
     assert "world 1" in line
     assert "\n" not in line
     assert_same(everything(world), kept)
-    for a in actions[1:]:  # and it goes on as if nothing had been asked
+    for a in actions[1:]:  # the refused step leaves no trace
         np.testing.assert_array_equal(world.step(a).observation, other.step(a).observation)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("place", [(0, 0, 0), (199, 23, 1)])
-def test_so_it_is_where_threads_share_the_worlds(value: float, place: tuple[int, int, int]) -> None:
-    """All actions are looked at before any thread moves anybody."""
+def test_an_action_that_is_not_finite_is_refused_before_any_thread_moves_a_world(
+    value: float, place: tuple[int, int, int]
+) -> None:
+    """All actions are checked before any thread changes a world."""
     world, before = World(Flock(), 200), threads()
     world.reset(2)
     actions, kept = np.zeros((200, 24, 2)), everything(world)
@@ -502,7 +504,7 @@ def test_so_it_is_where_threads_share_the_worlds(value: float, place: tuple[int,
             world.step(actions)
     finally:
         use_threads(before)
-    assert len(world._scratch) == 2  # they did share them
+    assert len(world._scratch) == 2  # two threads did share the worlds
     assert_same(everything(world), kept)
 
 
@@ -531,7 +533,7 @@ def test_actions_that_are_no_numbers_are_refused(actions: Any) -> None:
 
 
 @EVERY
-def test_actions_beyond_the_bounds_are_the_bounds(row: TaskRow) -> None:
+def test_actions_are_clipped_to_the_bounds(row: TaskRow) -> None:
     signs = np.sign(actions_for(World(row.task, 2), 30))
     ends = []
     for factor in (1.0, np.nextafter(np.float32(1), np.float32(2)), 1.7, 1e30, 1e300):
@@ -545,8 +547,8 @@ def test_actions_beyond_the_bounds_are_the_bounds(row: TaskRow) -> None:
 
 
 @pytest.mark.slow
-def test_single_precision_takes_actions_as_they_are_or_rounded() -> None:
-    """Of doubles beyond its range, too, which are beyond the bounds, not infinite; what is infinite is refused."""
+def test_single_precision_takes_doubles_and_rounded_actions_alike() -> None:
+    """Doubles beyond the range of float32 are clipped to the bounds; only infinite ones are refused."""
     task = Pursuit(dtype="float32")
     actions = np.random.default_rng(0).uniform(-1.5, 1.5, (20, 1, 1, 2))
     actions[3], actions[7, 0, 0, 1] = 1e300, -1e300
@@ -571,8 +573,8 @@ def test_single_precision_takes_actions_as_they_are_or_rounded() -> None:
     assert_same(everything(world), kept)
 
 
-@pytest.mark.usefixtures("looking")
-def test_whatever_holds_the_numbers_they_are_the_same_numbers() -> None:
+@pytest.mark.usefixtures("checking_types")
+def test_actions_of_any_type_and_layout_give_the_same_results() -> None:
     values = np.array([[[0.5, -0.25]], [[-1.0, 1.0]]])
     wide = np.zeros((2, 1, 4))
     wide[..., ::2] = values
@@ -588,11 +590,11 @@ def test_whatever_holds_the_numbers_they_are_the_same_numbers() -> None:
         assert_same(end, ends[0])
     world.step(np.ones((2, 1, 2), np.int64))
     world.step(np.ones((2, 1, 2), bool))
-    world.step(np.broadcast_to(0.5, (2, 1, 2)))  # cannot be written
-    assert len(world._entries[0].overloads) == 1  # and none of them was compiled for
+    world.step(np.broadcast_to(0.5, (2, 1, 2)))  # read-only
+    assert len(world._entries[0].overloads) == 1  # none of these types was compiled for
 
 
-# --- what a world cannot be -------------------------------------------------------------------------------------------
+# --- refused arguments ------------------------------------------------------------------------------------------------
 
 
 def test_a_step_before_the_first_reset_is_refused() -> None:
@@ -604,7 +606,7 @@ def test_a_step_before_the_first_reset_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (lambda: World(Pursuit(), 0), "worlds is 0"),
         (lambda: World(Pursuit(), -3), "worlds is -3"),
@@ -618,15 +620,15 @@ def test_a_step_before_the_first_reset_is_refused() -> None:
         (lambda: World(Pursuit(), time_limit=True), "time_limit is True"),
     ],
 )
-def test_a_bad_world_is_refused_in_one_line(make: Any, said: str) -> None:
+def test_a_bad_world_is_refused_in_one_line(make: Any, message: str) -> None:
     with pytest.raises((ValueError, TypeError)) as caught:
         make()
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("seeds", "said"),
+    ("seeds", "message"),
     [
         (-1, "-1"),
         (2**64, "18446744073709551616"),
@@ -638,13 +640,13 @@ def test_a_bad_world_is_refused_in_one_line(make: Any, said: str) -> None:
         (True, "True"),
     ],
 )
-def test_bad_seeds_are_refused_in_one_line_and_change_nothing(seeds: Any, said: str) -> None:
+def test_bad_seeds_are_refused_in_one_line_and_change_nothing(seeds: Any, message: str) -> None:
     world = World(Obstacles(), 2)
     world.reset(3)
     kept = everything(world)
     with pytest.raises((ValueError, TypeError)) as caught:
         world.reset(seeds)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
     assert_same(everything(world), kept)
     assert world.seeds == (3, 4)
@@ -662,7 +664,7 @@ def test_a_bad_mask_is_refused(mask: Any) -> None:
 
 
 @EVERY
-def test_a_world_that_diverged_says_which(row: TaskRow) -> None:
+def test_divergence_names_the_world_and_the_agent(row: TaskRow) -> None:
     world = World(row.task, 3)
     world.reset(2)
     world.state.vel[1, 0] = np.nan
@@ -672,7 +674,7 @@ def test_a_world_that_diverged_says_which(row: TaskRow) -> None:
 
 
 @EVERY
-def test_a_snapshot_is_a_picture_of_one_world(row: TaskRow) -> None:
+def test_a_snapshot_is_a_copy_of_one_world(row: TaskRow) -> None:
     world = World(row.task, 3)
     world.reset(2)
     for a in actions_for(world, 7):
@@ -688,8 +690,8 @@ def test_a_snapshot_is_a_picture_of_one_world(row: TaskRow) -> None:
 
 
 @pytest.mark.slow
-def test_a_large_flock_looks_around_through_cells() -> None:
-    """Its nearest are those that everybody against everybody finds."""
+def test_neighbours_in_a_large_flock_are_those_of_brute_force() -> None:
+    """Its nearest neighbours are those of brute force."""
     task = Flock(agents=130, learners=130, size=60.0)
     world = World(task, 2)
     world.reset(0)
