@@ -1,4 +1,4 @@
-"""Springs, hinges and finite elements as effects: forces are gradients, modes have their frequencies."""
+"""Springs, hinges and finite elements as effects: forces are gradients of the energy, modes have known frequencies."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def shaken(world: Scene, far: float, seed: int = 0) -> State:
 
 
 def energy(world: Scene, state: State) -> float:
-    """Potential of all effects that have one, J."""
+    """Return the total potential energy of all effects that have one, J."""
     found = [effect.potential(world.groups, state, world.space.displacement) for effect in world.effects]
     return float(sum(part[0] for part in found if part is not None))
 
@@ -79,8 +79,8 @@ def test_the_force_is_the_gradient_of_the_energy(name: str, dimension: int) -> N
 
 @pytest.mark.slow
 @DIMENSIONS
-def test_springs_and_hinges_turn_and_move_nothing_as_a_whole(dimension: int) -> None:
-    """Momentum and angular momentum, under damping too."""
+def test_momentum_and_angular_momentum_are_conserved_by_springs_and_hinges(dimension: int) -> None:
+    """With damping as well."""
     effects = Springs(stiffness=300, ratio=0.3), AngularSprings(stiffness=0.5, damping=0.1)
     world = scene(cloth(dimension), *effects, dimension=dimension)
     state = shaken(world, 0.05)
@@ -97,8 +97,8 @@ def test_springs_and_hinges_turn_and_move_nothing_as_a_whole(dimension: int) -> 
 
 @pytest.mark.slow
 @DIMENSIONS
-def test_damping_only_ever_takes_energy(dimension: int) -> None:
-    """With the printed sign it pumps."""
+def test_damping_never_adds_energy(dimension: int) -> None:
+    """With the opposite sign, as printed in the source, damping would add energy."""
     effects = Springs(stiffness=300, damping=0.5), AngularSprings(stiffness=0.5, damping=0.05)
     world = scene(cloth(dimension), *effects, dimension=dimension, integrator=RK4())
     state, found = shaken(world, 0.05), []
@@ -110,7 +110,7 @@ def test_damping_only_ever_takes_energy(dimension: int) -> None:
     assert found[-1] < 0.7 * found[0]
 
 
-def test_one_damped_spring_is_the_worked_example() -> None:
+def test_one_damped_spring_loses_energy_as_in_the_worked_example() -> None:
     """k = 50, k_d = 1, stretch .3: the energy falls from 2.25 to 0.0056 J within 3 s."""
     rope = Rope(links=1, length=1.0, stretch=1.3)
     world = scene(rope, Springs(stiffness=50, damping=1), each=1.0, integrator=RK4())
@@ -121,10 +121,10 @@ def test_one_damped_spring_is_the_worked_example() -> None:
     assert kinetic + energy(world, end) == pytest.approx(0.0056, abs=1e-4)
 
 
-def test_a_ratio_of_one_is_critical_for_a_spring_between_two() -> None:
-    """c = 2 sqrt(k mu) with the reduced mass; nothing swings through, and nothing is slower.
+def test_a_ratio_of_one_is_critical_damping_of_two_masses() -> None:
+    """c = 2 sqrt(k mu) with the reduced mass mu: the stretch falls as (1 + w t) exp(-w t) and does not overshoot.
 
-    With the mass of one end it would be sqrt(2) times too much: the stretch falls as (1 + w t) exp(-w t) of both alone.
+    With the mass of one end, c would be sqrt(2) times too large.
     """
     world = scene(Rope(links=1, length=1.0, stretch=1.5), Springs(stiffness=40, ratio=1), integrator=RK4())
     w = math.sqrt(40 * (1 / world.body.mass).sum())
@@ -144,8 +144,8 @@ def test_a_ratio_of_one_is_critical_for_a_spring_between_two() -> None:
 
 
 @DIMENSIONS
-def test_two_ends_in_one_place_part(dimension: int) -> None:
-    """No NaN, and opposite ways."""
+def test_two_ends_in_the_same_place_part(dimension: int) -> None:
+    """Without NaN, by opposite forces."""
     world = scene(Rope(links=1, length=1.0), Springs(stiffness=40, damping=1), dimension=dimension, integrator=RK4())
     state = world.start(0)
     state.pos[...] = 0.3
@@ -156,7 +156,7 @@ def test_two_ends_in_one_place_part(dimension: int) -> None:
 
 
 @DIMENSIONS
-def test_a_hinge_whose_arms_have_no_length_says_nothing(dimension: int) -> None:
+def test_a_hinge_with_arms_of_no_length_has_no_force(dimension: int) -> None:
     world = scene(Rope(links=2, length=1.0), AngularSprings(stiffness=4, damping=1), dimension=dimension)
     state = world.start(0)
     state.pos[...] = 0.3
@@ -165,7 +165,7 @@ def test_a_hinge_whose_arms_have_no_length_says_nothing(dimension: int) -> None:
 
 @pytest.mark.slow
 def test_a_hinge_finds_its_rest_angle_from_both_sides() -> None:
-    """In the plane an angle has a sign: a corner that is pushed through straight comes back to its own side."""
+    """In 2-D an angle has a sign: a corner that is bent through to the other side returns to its own."""
     corner = Mesh(vertices=((1, 0), (0, 0), (0, 1)), pairs=((0, 1), (1, 2)), angles=((0, 1, 2),))
     effects = Springs(stiffness=400, ratio=0.5), AngularSprings(stiffness=5, damping=0.5)
     world = scene(corner, *effects, integrator=RK4())
@@ -178,7 +178,7 @@ def test_a_hinge_finds_its_rest_angle_from_both_sides() -> None:
 
 
 @DIMENSIONS
-def test_the_dead_hold_nobody(dimension: int) -> None:
+def test_springs_of_dead_particles_have_no_force(dimension: int) -> None:
     world = scene(Rope(links=3, length=3.0, stretch=1.2), Springs(stiffness=40), dimension=dimension)
     state = world.start(0)
     state.alive[0, 1] = False
@@ -189,7 +189,7 @@ def test_the_dead_hold_nobody(dimension: int) -> None:
 
 
 @pytest.mark.slow
-def test_what_is_pinned_stays_where_it_is() -> None:
+def test_pinned_particles_do_not_move() -> None:
     world = scene(cloth(3, pinned=("top",)), Springs(stiffness=300), Gravity(acceleration=(0, 0, -9.81)), dimension=3)
     start = world.start(0)
     end = world.run(start, 500)
@@ -203,7 +203,7 @@ def test_what_is_pinned_stays_where_it_is() -> None:
 
 
 @pytest.mark.slow
-def test_a_hanging_chain_is_as_long_as_it_should_be() -> None:
+def test_the_length_of_a_hanging_chain_is_the_closed_form() -> None:
     """N15: N L + (m g / k) N (N + 1) / 2 = 1.1348875 m for ten links of .1 m."""
     rope = Rope(links=10, length=1.0, direction=(0, -1), pinned=("start",))
     effects = Springs(stiffness=400, damping=2), Gravity(acceleration=(0, -9.81))
@@ -213,10 +213,10 @@ def test_a_hanging_chain_is_as_long_as_it_should_be() -> None:
 
 
 @pytest.mark.parametrize("ends", ["fixed", "free", "both"])
-def test_a_chain_swings_at_its_eigenfrequencies(ends: str) -> None:
+def test_eigenfrequencies_of_a_chain_are_the_closed_forms(ends: str) -> None:
     """sin(k pi / 2(N+1)), sin((2k-1) pi / 2(2N+1)), sin(k pi / 2N), times 2 sqrt(k/m).
 
-    Each mode is set going along the chain, and the acceleration is -w^2 times it.
+    The squares are the eigenvalues of the matrix that gives accelerations along the chain, times -1.
     """
     n, k, m = 8, 400.0, 0.1
     pinned = {"fixed": ("ends",), "free": ("start",), "both": ()}[ends]
@@ -241,7 +241,7 @@ def test_a_chain_swings_at_its_eigenfrequencies(ends: str) -> None:
 
 
 @pytest.mark.slow
-def test_finite_elements_in_motion_come_to_rest_where_statics_says() -> None:
+def test_finite_elements_come_to_rest_at_the_static_solution() -> None:
     """M a + D v + K u = F: a bar of ten elements and a plate of triangles under their weight."""
     rope = Rope(links=10, length=1.0, direction=(0, -1), pinned=("start",))
     plate = Cloth(cells=(4, 2), edges=((1, 0), (0, 0.5)), pinned=("left",))
@@ -255,7 +255,7 @@ def test_finite_elements_in_motion_come_to_rest_where_statics_says() -> None:
         weight[:, 1] = -9.81 * each
         held = freedoms(np.flatnonzero(np.isinf(masses)), 2)
         if network is rope:
-            held = np.union1d(held, freedoms(np.arange(world.agents), 2)[::2])  # a rope of bars does not resist aside
+            held = np.union1d(held, freedoms(np.arange(world.agents), 2)[::2])  # bars in a row: no sideways stiffness
         u = solve_static(body.matrix(network, 2), weight, held)
         np.testing.assert_allclose(end.pos[0] - network.points(2), u.reshape(-1, 2), atol=1e-8)
 
@@ -263,7 +263,7 @@ def test_finite_elements_in_motion_come_to_rest_where_statics_says() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("method", [RK4(), ImplicitMidpoint()], ids=lambda method: method.kind)
 def test_a_plate_swings_at_the_frequency_of_its_first_mode(method: Any) -> None:
-    """Explicit and implicit: after one period of the first mode everybody is back."""
+    """After one period all particles are back, with an explicit and an implicit method."""
     plate = Cloth(cells=(5, 2), edges=((1, 0), (0, 0.3)), pinned=("left",))
     body = Elastic(young=5e3, thickness=0.1)
     k = body.matrix(plate, 2)
@@ -283,8 +283,8 @@ def test_a_plate_swings_at_the_frequency_of_its_first_mode(method: Any) -> None:
     np.testing.assert_allclose(whole.pos[0] - points, u.reshape(-1, 2), atol=1e-6)
 
 
-def test_lumped_frequencies_are_those_of_the_effect() -> None:
-    """elements.frequencies and the scene mean the same K and M."""
+def test_frequencies_of_lumped_elements_are_those_of_a_scene() -> None:
+    """`finite_elements.frequencies` and a scene use the same K and M."""
     plate = Cloth(cells=(3, 2), edges=((1, 0), (0, 0.5)), pinned=("left",))
     body, material = Elastic(young=5e3, thickness=0.1), Material(young=5e3, thickness=0.1, density=200)
     points, triangles = plate.rest_points(2), plate.elements(2)
@@ -303,13 +303,13 @@ def test_lumped_frequencies_are_those_of_the_effect() -> None:
     np.testing.assert_allclose(other, found, rtol=1e-6)
 
 
-# --- the same whoever steps -------------------------------------------------------------------------------------------
+# --- threads, spaces, groups, refused arguments -----------------------------------------------------------------------
 
 
 @pytest.mark.slow
 @DIMENSIONS
-def test_threads_and_batches_make_no_difference(dimension: int) -> None:
-    """A large world is shared, a batch is handed out: bits are the same."""
+def test_results_do_not_depend_on_the_number_of_threads(dimension: int) -> None:
+    """A large world that threads share gives the same bits, and so do several calls."""
     size = (90, 80)
     edges = ((9.0, 0.0, 0.0), (0.0, 8.0, 0.0)) if dimension == 3 else ((9.0, 0.0), (0.0, 8.0))
     net = Cloth(cells=size, edges=edges, pinned=("corners",), stretch=1.05)
@@ -337,7 +337,7 @@ def test_bonds_act_around_the_edge_of_a_torus() -> None:
     assert (b.pos[0, :, 0] < 5).any()
 
 
-def test_other_groups_are_not_touched() -> None:
+def test_springs_do_not_act_on_other_groups() -> None:
     spawn = Spawn(low=(3, 3), high=(4, 4), speed=(1, 1))
     net = Group(network=Rope(links=9, length=1.0, stretch=1.3), mass=0.1)
     world = Scene(groups=(Group(count=7, spawn=spawn), net), effects=(Springs(group=1, stiffness=50),), dt=0.01)
@@ -348,7 +348,7 @@ def test_other_groups_are_not_touched() -> None:
 
 
 class Limp(Springs):
-    """Springs that do not know how stiff they are: nobody asks for their bonds before they are laid out."""
+    """Springs without rates: their bonds are first needed when the table of the kernel is made."""
 
     kind: str  # type: ignore[assignment]  # without a default it is not registered
 
@@ -360,13 +360,13 @@ def free(count: int, *effects: Any) -> Scene:
     return Scene(groups=(Group(count=count, spawn=Spawn(low=(0, 0), high=(1, 1))),), effects=effects)
 
 
-WISHES = Steer(behaviours=(Separation(weight=1, radius=1), Cohesion(weight=1, radius=1)))
+STEERING = Steer(behaviours=(Separation(weight=1, radius=1), Cohesion(weight=1, radius=1)))
 REFUSED = [
     (lambda: scene(Rope(links=2, length=1.0), Springs(group=1, stiffness=1)), "group = 1: there are 1 groups"),
     (lambda: free(3, Springs(stiffness=1)), "effects[0].group = 0: has no network"),
     (
-        lambda: free(2, WISHES, Limp(kind="limp", stiffness=1)).table,
-        "effects[1].group = 0: has no network",  # counted as the scene lists them, not as the kernel does
+        lambda: free(2, STEERING, Limp(kind="limp", stiffness=1)).table,
+        "effects[1].group = 0: has no network",  # index in the list of the scene, not of the kernel
     ),
     (lambda: scene(cloth(3), Elastic(young=1), dimension=3), "effects[0]"),
     (lambda: scene(cloth(3), Springs(stiffness=1)), "groups[0].network"),
@@ -378,9 +378,9 @@ REFUSED = [
 
 
 @pytest.mark.parametrize("number", range(len(REFUSED)))
-def test_what_does_not_suit_is_refused_in_one_line(number: int) -> None:
+def test_invalid_springs_and_networks_are_refused_in_one_line(number: int) -> None:
     make, text = REFUSED[number]
-    with pytest.raises(ValueError) as caught:  # noqa: PT011  # the text is looked at
+    with pytest.raises(ValueError) as caught:  # noqa: PT011  # the text is checked below
         make()
     assert text in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -388,7 +388,7 @@ def test_what_does_not_suit_is_refused_in_one_line(number: int) -> None:
 
 @pytest.mark.slow
 def test_a_free_body_slows_down_by_alpha() -> None:
-    """Rayleigh's alpha is a drag of each particle's own mass: a free body under it slows down by exp(-alpha t)."""
+    """Rayleigh's alpha is a drag in proportion to each mass: v falls as exp(-alpha t)."""
     world = scene(Rope(links=2, length=1.0), Elastic(young=1e3, alpha=0.5), integrator=RK4())
     state = world.start(0)
     state.vel[..., 0] = 2.0

@@ -1,4 +1,4 @@
-"""The largest stable step: of methods against their formulas, of scenes against their own linearised equations."""
+"""The largest stable step: of methods against formulas, of scenes against their linearised equations."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def body(*effects: Effect, method: Integrator | None = None, dt: float = 1e-6, *
 
 
 def powers(*coefficients: float) -> Any:
-    """R(A) = sum of c_k A^k, A = [[0, 1], [-y^2, -z]]: what a method of Runge and Kutta makes of (x, v)."""
+    """Return R(A) = sum of c_k A^k, A = [[0, 1], [-y^2, -z]]: the map of (x, v) in a Runge-Kutta method."""
 
     def matrix(y: float, z: float) -> Array:
         a = np.array([[0.0, 1.0], [-y * y, -z]])
@@ -82,14 +82,14 @@ MAPS: dict[str, Any] = {
         [-y * y / 2 * (2 - z - y * y / 2), (1 - y * y / 2) * (1 - z / 2) - z / 2 * (1 - z)],
     ]),
 }  # fmt: skip
-"""What one step makes of (x, v) with x'' = -y^2 x - z v, h = 1."""
+"""Map of (x, v) in one step, h = 1, with x'' = -y^2 x - z v."""
 
 FIXED = tuple(row.method for row in INTEGRATORS if not row.method.adaptive and not row.method.solves)
 ZETAS = (0.0, 0.1, 0.5, 1.0, 2.0, 20.0)
 
 
 @pytest.mark.parametrize("kind", MAPS)
-def test_one_step_of_an_oscillator_is_the_map_of_the_book(kind: str) -> None:
+def test_one_step_of_an_oscillator_is_the_map_of_the_textbook(kind: str) -> None:
     method = next(method for method in FIXED if method.kind == kind)
     for y, zeta in ((0.3, 0.0), (1.7, 0.4), (2.5, 3.0)):
         found = amplification(method, np.array([9.0, y]), zeta)[1]
@@ -97,7 +97,7 @@ def test_one_step_of_an_oscillator_is_the_map_of_the_book(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", MAPS)
-def test_the_limit_is_where_the_map_begins_to_grow(kind: str) -> None:
+def test_at_the_limit_the_map_begins_to_amplify(kind: str) -> None:
     method = next(method for method in FIXED if method.kind == kind)
     for zeta in ZETAS:
         most = limit(method, zeta)
@@ -111,7 +111,7 @@ def test_the_limit_is_where_the_map_begins_to_grow(kind: str) -> None:
 
 
 @pytest.mark.parametrize("zeta", ZETAS[1:])
-def test_limits_are_those_of_the_table(zeta: float) -> None:
+def test_limits_of_damped_oscillators_match_the_formulas(zeta: float) -> None:
     """Explicit Euler: h w <= 2 zeta up to critical damping, 2 / (zeta + sqrt(zeta^2 - 1)) beyond."""
     root = math.sqrt(max(zeta * zeta - 1, 0.0))
     euler = 2 * zeta if zeta <= 1 else 2 / (zeta + root)
@@ -122,7 +122,7 @@ def test_limits_are_those_of_the_table(zeta: float) -> None:
         assert limit(Heun(), zeta) == pytest.approx(2 / (zeta + root), rel=1e-5)
 
 
-def test_without_damping_limits_are_those_of_the_table() -> None:
+def test_limits_of_undamped_oscillators_match_the_table_of_integrators() -> None:
     for row in INTEGRATORS:
         if row.method.adaptive or row.method.solves:
             assert limit(row.method, 0.0) == limit(row.method, 3.0) == drag_limit(row.method) == math.inf
@@ -139,7 +139,7 @@ GROWING = (ExplicitEuler(), AveragedVelocity(), Midpoint(), Heun())
 
 
 def test_methods_that_touch_the_axis_at_0_alone_have_no_stable_step_without_damping() -> None:
-    """As (h w)^2 or (h w)^4 they grow at every step; the slightest damping gives an honest, small limit."""
+    """The amplitude grows as (h w)^2 or (h w)^4 in every step; slight damping gives a small limit."""
     for row in INTEGRATORS:
         assert (limit(row.method, 0.0) == 0.0) == (row.method in GROWING), row.method.kind
     for zeta in (1e-4, 1e-3):
@@ -149,8 +149,8 @@ def test_methods_that_touch_the_axis_at_0_alone_have_no_stable_step_without_damp
 
 
 @pytest.mark.parametrize("method", GROWING, ids=lambda method: method.kind)
-def test_an_undamped_spring_is_told_of_no_stable_step_and_how_fast_it_grows(method: Integrator) -> None:
-    """k = 18, m = 2: w = 3. The warning's e-fold time is that of the amplitude in a run."""
+def test_the_warning_of_an_undamped_spring_gives_the_growth_of_its_amplitude(method: Integrator) -> None:
+    """k = 18, m = 2, w = 3. The e-fold time in the warning is that of the amplitude in a run."""
     tether = Tether(centre=O2, stiffness=18.0)
     for dt in (0.00047, 0.02, 0.1):
         with pytest.warns(UnstableStepWarning, match="no step is stable, for nothing damps it") as caught:
@@ -166,7 +166,7 @@ def test_an_undamped_spring_is_told_of_no_stable_step_and_how_fast_it_grows(meth
     assert math.log(amplitude) == pytest.approx(steps * scene.dt / seconds, rel=0.2)
 
 
-def test_explain_says_that_no_step_is_stable() -> None:
+def test_explain_reports_that_no_step_is_stable() -> None:
     tether = Tether(centre=O2, stiffness=18.0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnstableStepWarning)
@@ -174,20 +174,20 @@ def test_explain_says_that_no_step_is_stable() -> None:
         assert found.largest_step == "none is stable with explicit_euler (tether at agent 0), dt = 0.01 s"
 
 
-def test_methods_with_an_interval_are_told_it_as_before() -> None:
+def test_the_suggested_step_of_an_undamped_spring_is_the_limit_of_the_method() -> None:
     for method, most in ((SemiImplicitEuler(), 2 / 3), (VelocityVerlet(), 2 / 3), (RK4(), 2.828427 / 3)):
         assert suggest_dt(body(Tether(centre=O2, stiffness=18.0), mass=2.0, method=method)).dt == pytest.approx(
             most, rel=1e-5
         )
 
 
-def test_drag_that_a_method_treats_itself_sets_no_limit() -> None:
-    """And drag that it is not told of does."""
+def test_drag_that_a_method_integrates_exactly_sets_no_limit() -> None:
+    """Drag inside the acceleration sets one."""
     method = ExponentialDrag()
-    for told in (0.1, 1.0, 10.0):
-        assert limit(method, 0.0, told) > 2.0
-        assert limit(method, told) < 2.0
-        assert limit(SemiImplicitEuler(), 0.0, told) == limit(SemiImplicitEuler(), told)
+    for drag in (0.1, 1.0, 10.0):
+        assert limit(method, 0.0, drag) > 2.0
+        assert limit(method, drag) < 2.0
+        assert limit(SemiImplicitEuler(), 0.0, drag) == limit(SemiImplicitEuler(), drag)
     assert suggest_dt(body(Drag(rate=100), method=method)).dt == math.inf
     tether = Tether(centre=O2, stiffness=0.0, damping=100)
     assert suggest_dt(body(tether, Drag(rate=100), method=method)).dt == pytest.approx(0.02, rel=1e-4)
@@ -197,7 +197,7 @@ def test_drag_that_a_method_treats_itself_sets_no_limit() -> None:
 
 
 def derivatives(scene: Scene) -> tuple[Array, Array]:
-    """K and C of the free agents, linearised where they begin: a = -K x - C v."""
+    """Return K and C of the free agents, linearised at the start: a = -K x - C v."""
     state, free, step = scene.start(0), np.flatnonzero(np.isfinite(scene.body.mass)), 1e-6
     stiffness, damping = [], []
     for i in free:
@@ -214,9 +214,9 @@ def derivatives(scene: Scene) -> tuple[Array, Array]:
 
 
 def linear_limit(method: Integrator, stiffness: Array, damping: Array, drag: float) -> float:
-    """The first h at which one step of the whole linear system grows, from the step itself."""
+    """Return the smallest h, s, at which one step amplifies the whole linear system; found by taking steps."""
     n = len(stiffness)
-    state = blank(1, n, 2 * n, 0, 1.0)  # as many beginnings as there are numbers, side by side
+    state = blank(1, n, 2 * n, 0, 1.0)  # one initial state per position and velocity, side by side
     state.x[:n, 0], state.v[n:, 0] = np.eye(n), np.eye(n)
     own = drag if method.splits_drag else 0.0
     weight = np.concatenate([np.full(n, math.sqrt(np.abs(stiffness).sum(axis=1).max())), np.ones(n)])
@@ -251,14 +251,14 @@ LINEAR: dict[str, tuple[Network, tuple[Effect, ...], float]] = {
         ), 0.5,
     ),
 }  # fmt: skip
-"""A network of .1 kg each, effects, and which share of the true limit is suggested at least."""
+"""Network of .1 kg per mass, effects, and the least share of the true limit that must be suggested."""
 
 
 @pytest.mark.parametrize(
     "name", [n if n in ("chain", "triangles") else pytest.param(n, marks=pytest.mark.slow) for n in LINEAR]
 )
 def test_the_suggested_step_is_at_most_the_true_limit_and_not_far_below(name: str) -> None:
-    """P02: at most the limit, at least half of it; where damping is bounded as well, about a third."""
+    """P02: at least half of the limit; at least about a third if damping is bounded as well."""
     net, effects, least = LINEAR[name]
     stiffness, damping = derivatives(network(net, *effects))
     drag = sum(effect.rate for effect in effects if isinstance(effect, Drag)) / 0.1
@@ -270,14 +270,14 @@ def test_the_suggested_step_is_at_most_the_true_limit_and_not_far_below(name: st
 
 
 @pytest.mark.parametrize(("shear", "bend", "printed"), [(0.0, 0.0, 3.93), (1000.0, 0.0, 7.80), (1000.0, 1000.0, 9.75)])
-def test_a_cloth_is_as_stiff_as_the_table_says(shear: float, bend: float, printed: float) -> None:
-    """12 x 12: the greatest w^2 m / k, and a suggestion within .5 to 1 of 2 / w."""
+def test_the_stiffness_of_a_cloth_matches_the_published_table(shear: float, bend: float, printed: float) -> None:
+    """12 x 12 masses: the greatest w^2 m / k is the printed one; the suggestion is .5 to 1 times 2 / w."""
     sheet = Cloth(cells=(11, 11), sides=(1.1, 1.1))
     bonds = Springs(stiffness=1000, shear=shear, bend=bend).bonds((Group(network=sheet, mass=0.1),), 2)
     matrix, points = np.zeros((288, 288)), sheet.rest_points(2)
     for i, (j,), (k, _, _) in zip(bonds.agent, bonds.partner, bonds.number, strict=True):
-        way = points[j] - points[i]
-        block = k * np.outer(way, way) / (way @ way) / 0.1
+        offset = points[j] - points[i]
+        block = k * np.outer(offset, offset) / (offset @ offset) / 0.1
         matrix[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] += block
         matrix[2 * i : 2 * i + 2, 2 * j : 2 * j + 2] -= block
     square = float(np.linalg.eigvalsh(matrix)[-1])
@@ -291,7 +291,7 @@ def test_a_cloth_is_as_stiff_as_the_table_says(shear: float, bend: float, printe
 def test_a_chain_is_bounded_just_below_its_limit_and_diverges_just_above(method: Integrator) -> None:
     """P02, N03: k = 400 N/m, m = .1 kg, 20 masses between fixed ends."""
     assert pytest.approx(0.0158557, abs=1e-7) == TRUE
-    springs = Springs(stiffness=400, rest=0)  # linear: with rest lengths other modes take up what grows
+    springs = Springs(stiffness=400, rest=0)  # linear: with rest lengths, energy would go over to other modes
     most = TRUE * limit(method, 0.0) / 2
     suggested = suggest_dt(network(CHAIN, springs, method=method)).dt
     assert 0.5 * most <= suggested <= most
@@ -310,15 +310,15 @@ def test_a_chain_is_bounded_just_below_its_limit_and_diverges_just_above(method:
         scenes[1].run(ends[1], 100_000)
 
 
-def test_agents_have_limits_of_their_own() -> None:
-    """By mass, by group, by effect: the tightest sets the step, and its own stiffest effect is named."""
+def test_each_agent_has_its_own_limit() -> None:
+    """The agent with the smallest limit sets the step; the effect that is stiffest for this agent is named."""
     light, heavy = Group(count=3, mass=0.1, spawn=HERE), Group(count=4, mass=5.0, spawn=HERE)
     ropes = tuple(Group(network=Rope(links=4, length=0.4), mass=0.1) for _ in range(2))
     masses = Scene(groups=(heavy, light), effects=(Tether(centre=O2, stiffness=40.0),), dt=1e-6)
     found = suggest_dt(masses)
     assert found.dt == pytest.approx(2 / math.sqrt(40 / 0.1), rel=1e-6)
     assert (found.agent, found.frequency, found.effect) == (4, pytest.approx(20.0), "tether")
-    # the springs of the first group are the stiffest effect; both of the second group's are stiffer together
+    # springs of the first group are the stiffest single effect, but both effects of the second add up to more
     effects = Springs(stiffness=100, group=0), Springs(stiffness=90, group=1), AngularSprings(stiffness=0.05, group=1)
     both = suggest_dt(Scene(groups=ropes, effects=effects, dt=1e-6))
     alone = suggest_dt(Scene(groups=ropes, effects=effects[:1], dt=1e-6))
@@ -332,8 +332,8 @@ def test_agents_have_limits_of_their_own() -> None:
     assert mixed.effect in ("springs", "angular_springs")
 
 
-def test_of_very_many_the_fastest_are_looked_at() -> None:
-    """Everybody's mass is another one."""
+def test_the_fastest_of_many_different_agents_sets_the_limit() -> None:
+    """All masses differ; only the fastest oscillators are tested."""
     groups = tuple(Group(count=1, mass=10.0 ** (-k / 100), spawn=HERE) for k in range(300))
     scene = Scene(groups=groups, effects=(Tether(centre=O2, stiffness=40.0, damping=2.0),), dt=1e-6)
     mass = 10.0 ** (-299 / 100)
@@ -342,8 +342,8 @@ def test_of_very_many_the_fastest_are_looked_at() -> None:
     assert suggest_dt(scene).dt == pytest.approx(expected, rel=1e-3)
 
 
-def test_who_is_held_has_no_limit() -> None:
-    """Infinite masses: no NaN, no warning, nobody who is held is named."""
+def test_held_agents_have_no_limit() -> None:
+    """Infinite masses give no NaN and no warning, and are never the named agent."""
     all_held = Cloth(cells=(1, 1), sides=(1.0, 1.0), pinned=("corners",))
     for effect in (
         Springs(stiffness=1e6, damping=1, ratio=0.5), AngularSprings(stiffness=1e3, damping=1),
@@ -355,7 +355,7 @@ def test_who_is_held_has_no_limit() -> None:
     assert 0 < found.dt < math.inf
 
 
-# --- when a scene is made ---------------------------------------------------------------------------------------------
+# --- checks of a new scene --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.filterwarnings("ignore::flockenv.core.warnings.UnstableStepWarning")
@@ -367,13 +367,13 @@ def test_scenes_without_stiff_effects_have_no_limit() -> None:
 
 
 @pytest.mark.parametrize("path", sorted(Path("configs/scenes").glob("*.yaml")), ids=lambda path: path.stem)
-def test_scenes_that_are_shipped_are_neither_refused_nor_warned_of(path: Path) -> None:
+def test_shipped_scenes_are_neither_refused_nor_warned_of(path: Path) -> None:
     if path.read_text().startswith("# yaml-language-server") and "groups:" in path.read_text():
         scene = load_scene(path)  # a warning is an error here
         assert scene.dt <= suggest_dt(scene).dt
 
 
-def test_a_warning_names_step_method_effect_agent_and_limit() -> None:
+def test_a_warning_names_the_step_method_effect_agent_and_limit() -> None:
     effects = Gravity(acceleration=(0, -9.81)), Tether(centre=O2, stiffness=100.0), Drag(rate=0.1)
     with pytest.warns(UnstableStepWarning) as caught:
         body(*effects, dt=0.21)
@@ -387,21 +387,21 @@ def test_a_warning_names_step_method_effect_agent_and_limit() -> None:
 
 
 @pytest.mark.parametrize("method", [ExplicitEuler(), AveragedVelocity(), Midpoint(), Heun()], ids=lambda m: m.kind)
-def test_who_grows_at_every_step_is_told_to_take_another(method: Integrator) -> None:
+def test_without_a_stable_step_another_integrator_is_recommended(method: Integrator) -> None:
     tether = Tether(centre=O2, stiffness=1.0)
     with pytest.warns(UnstableStepWarning, match=r"no step is stable.*so take another integrator"):
         body(tether, method=method, dt=0.1)
     with pytest.raises(ValueError, match=r"no step is stable.*so take another integrator"):
         body(tether, method=method, dt=3.0)
-    with pytest.warns(UnstableStepWarning) as caught:  # enough damping, and there is an honest limit
+    with pytest.warns(UnstableStepWarning) as caught:  # with enough damping there is a limit
         body(Tether(centre=O2, stiffness=1.0, damping=1.0), method=method, dt=1.01 * limit(method, 0.5))
     assert "another integrator" not in str(caught[0].message)
     assert "no step is stable" not in str(caught[0].message)
 
 
 @pytest.mark.parametrize("method", FIXED, ids=lambda method: method.kind)
-def test_a_step_that_must_blow_up_is_refused(method: Integrator) -> None:
-    """And one that a bound is enough to explain is not: 2.5 times the limit."""
+def test_a_step_that_must_diverge_is_refused(method: Integrator) -> None:
+    """Up to 2.5 times the limit it is only warned of: the bound of frequency may be that far off."""
     tether = Tether(centre=O2, stiffness=100.0)
     with pytest.raises(ValueError, match=f"dt = 1 s: {method.kind} with tether") as caught:
         body(tether, method=method, dt=1.0)
@@ -419,14 +419,14 @@ def test_a_step_that_must_blow_up_is_refused(method: Integrator) -> None:
 
 
 @pytest.mark.parametrize("method", [ImplicitEuler(), ImplicitMidpoint(), AdaptiveRK4(), DormandPrince()])
-def test_methods_without_a_limit_are_left_alone(method: Integrator) -> None:
+def test_methods_without_a_limit_are_not_warned_of(method: Integrator) -> None:
     scene = body(Tether(centre=O2, stiffness=1e8), Drag(rate=1e4), method=method, dt=1.0)
     assert suggest_dt(scene).dt == math.inf
 
 
 @pytest.mark.parametrize("spokes", [6, 20])
-def test_what_is_stable_is_never_refused(spokes: int) -> None:
-    """Springs in all directions do not add up as their bound does: by sqrt(2 D) at most, in no scene by more."""
+def test_a_stable_step_is_never_refused(spokes: int) -> None:
+    """The bound of frequency adds up springs of all directions; it is at most sqrt(2 D) times too large."""
     directions = np.random.default_rng(0).normal(size=(spokes, 3))
     ends = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     star = Mesh(
@@ -438,5 +438,5 @@ def test_what_is_stable_is_never_refused(spokes: int) -> None:
         true = 2 / math.sqrt(float(np.linalg.eigvals(stiffness).real.max()))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UnstableStepWarning)
-            make(0.999 * true)  # warned of, maybe
+            make(0.999 * true)  # may be warned of
             assert suggest_dt(make(1e-6)).dt <= true

@@ -1,4 +1,4 @@
-"""Reynolds' behaviours: what holds for every one of them, and what each must do when it steers somebody."""
+"""Reynolds' behaviours: properties of all steering laws, and what each of them makes agents do."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TURNED = ("vector", "heading", "noise")
 
 
 def arguments(row: Law, dimension: int, count: int, seed: int = 1) -> list[Array]:
-    """Random arguments of a law, `count` rows."""
+    """Return random arguments of a law, `count` rows."""
     rng = np.random.default_rng(seed)
 
     def unit() -> Array:
@@ -49,12 +49,12 @@ def turned(row: Law, given_: list[Array], matrix: Array) -> list[Array]:
     return [a @ matrix.T if kind in TURNED else a for kind, a in zip(row.takes, given_, strict=True)]
 
 
-# --- what holds for all -----------------------------------------------------------------------------------------------
+# --- properties of all laws -------------------------------------------------------------------------------------------
 
 
 @DIMENSIONS
 @laws(*(row for row in STEERING if row.turns != "none"))
-def test_it_turns_with_the_world(row: Law, dimension: int) -> None:
+def test_steering_turns_with_its_arguments(row: Law, dimension: int) -> None:
     given_ = arguments(row, dimension, 200)
     answer = rows(row.law)(*given_)
     for seed in range(3):
@@ -65,7 +65,7 @@ def test_it_turns_with_the_world(row: Law, dimension: int) -> None:
 
 @DIMENSIONS
 @laws(*(row for row in STEERING if row.mirrors))
-def test_its_mirror_image_does_the_mirrored_thing(row: Law, dimension: int) -> None:
+def test_mirrored_arguments_give_mirrored_steering(row: Law, dimension: int) -> None:
     given_ = arguments(row, dimension, 200)
     answer = rows(row.law)(*given_)
     expected = answer @ mirror(dimension) if row.gives == "vector" else answer
@@ -73,10 +73,10 @@ def test_its_mirror_image_does_the_mirrored_thing(row: Law, dimension: int) -> N
 
 
 def extremes(row: Law, dimension: int) -> list[Array]:
-    """Every combination of vanishing, tiny, common and huge vectors that the law can meet."""
+    """Return all combinations of vanishing, tiny, common and huge vectors that the law accepts."""
     rng = np.random.default_rng(3)
     sizes = {"vector": (0.0, 1e-12, 1.0, 1e6), "walls": (-1e6, 0.0, 1e6), "noise": (0.0, 1.0)}
-    headings = (0.0, 1.0) if row.law is not steering.separate else (1.0,)  # at standstill there is no heading
+    headings = (0.0, 1.0) if row.law is not steering.separate else (1.0,)  # 0: an agent at rest has no heading
     choices = [sizes.get(kind, headings if kind == "heading" else (1.0,)) for kind in row.takes]
     grid = np.stack([g.ravel() for g in np.meshgrid(*choices, indexing="ij")], axis=1)
     grid = np.repeat(grid, 8, axis=0)
@@ -92,19 +92,19 @@ def extremes(row: Law, dimension: int) -> list[Array]:
 
 @DIMENSIONS
 @laws(*STEERING)
-def test_it_is_finite_wherever_it_may_be_asked(row: Law, dimension: int) -> None:
+def test_steering_is_bounded_for_vanishing_and_huge_arguments(row: Law, dimension: int) -> None:
     answer = rows(row.law)(*extremes(row, dimension))
     assert not np.isnan(answer).any()
     endless = (steering.threat, steering.unaligned_threat, steering.queue_gap, steering.collision_distance)
-    if row.law not in endless:  # infinity: nothing in the way
+    if row.law not in endless:  # infinite if nothing is ahead
         assert np.isfinite(answer).all()
-    if row.law is not steering.interception_time:  # equally fast, straight away: 1e22 s is the answer to the rounding
-        assert np.abs(answer[np.isfinite(answer)]).max() <= 1e13  # a distance of 1e-12 m is never divided by twice
+    if row.law is not steering.interception_time:  # up to 1e22 s, by rounding, for a quarry as fast that flees
+        assert np.abs(answer[np.isfinite(answer)]).max() <= 1e13  # no law divides twice by a distance of 1e-12 m
 
 
 @pytest.mark.slow
 @DIMENSIONS
-def test_in_single_precision_they_stay_there_and_stay_accurate(dimension: int) -> None:
+def test_laws_stay_in_single_precision_and_accurate(dimension: int) -> None:
     given_ = [[a.astype(np.float32) for a in arguments(row, dimension, 200)] for row in STEERING]
     exact = [rows(row.law)(*g) for row, g in zip(STEERING, given_, strict=True)]
     answers = [np.full_like(e, np.nan) for e in exact]
@@ -123,7 +123,7 @@ def test_in_single_precision_they_stay_there_and_stay_accurate(dimension: int) -
 
 
 def steer(behaviour: Any, x: Array, v: Array, *, dt: float, seconds: float, top: float = 2.0, strength: float = 8.0):
-    """Move agents of 1 kg as Reynolds 1999 does: force cut to strength [N], speed to top [m/s], velocity first."""
+    """Move agents of 1 kg as in Reynolds 1999: force up to strength [N], speed up to top [m/s], velocity first."""
     x, v = x.copy(), v.copy()
     for step in range(round(seconds / dt)):
         force = 5.0 * behaviour(step * dt, x, v)
@@ -142,7 +142,7 @@ def crowd(dimension: int, count: int = 40) -> tuple[Array, Array]:
 
 
 @DIMENSIONS
-def test_seek_comes_nearer_and_flee_gets_away(dimension: int) -> None:
+def test_seek_approaches_the_point_and_flee_moves_away(dimension: int) -> None:
     x, v = crowd(dimension)
     start = np.linalg.norm(x, axis=1)
     *_, (_, near, _) = steer(lambda t, x, v: rows(steering.seek)(-x, v, 2.0), x, v, dt=0.05, seconds=1.5)
@@ -151,18 +151,18 @@ def test_seek_comes_nearer_and_flee_gets_away(dimension: int) -> None:
     assert (np.linalg.norm(far, axis=1) > start + 1).all()
 
 
-def test_seek_asks_for_full_speed_towards_the_point() -> None:
+def test_seek_steers_to_full_speed_towards_the_point() -> None:
     np.testing.assert_allclose(rows(steering.seek)([3.0, 4.0], [0.5, 0.25], 2.0), [1.2 - 0.5, 1.6 - 0.25])
 
 
-def test_flee_is_the_opposite_of_seek_and_goes_on_where_there_is_no_away() -> None:
+def test_flee_is_away_from_the_point_and_straight_on_at_the_point_itself() -> None:
     np.testing.assert_allclose(rows(steering.flee)([3.0, 4.0], [0.5, 0.25], 2.0), [-1.2 - 0.5, -1.6 - 0.25])
     np.testing.assert_allclose(rows(steering.flee)([0.0, 0.0], [0.0, 0.5], 2.0), [0.0, 1.5])
 
 
 @DIMENSIONS
 @pytest.mark.parametrize("dt", [0.1, 0.05, 0.01])
-def test_arrive_stops_on_the_point_without_chatter(dt: float, dimension: int) -> None:
+def test_arrive_stops_at_the_point_without_chatter(dt: float, dimension: int) -> None:
     """Below 0.01 m/s and 0.02 m after 20 s, at every step size up to 0.1 s."""
     x, v = crowd(dimension)
     *_, (_, x, v) = steer(lambda t, x, v: rows(steering.arrive)(-x, v, 2.0, 1.5), x, v, dt=dt, seconds=20)
@@ -170,7 +170,7 @@ def test_arrive_stops_on_the_point_without_chatter(dt: float, dimension: int) ->
     assert np.linalg.norm(x, axis=1).max() < 0.02
 
 
-def test_arrive_is_seek_outside_and_a_ramp_inside() -> None:
+def test_arrive_is_seek_outside_the_radius_and_a_ramp_inside() -> None:
     arrive = rows(steering.arrive)
     np.testing.assert_allclose(arrive([5.0, 0.0], [1.0, 0.0], 2.0, 4.0), [1.0, 0.0])
     np.testing.assert_allclose(arrive([1.0, 0.0], [1.0, 0.0], 2.0, 4.0), [-0.5, 0.0])
@@ -186,14 +186,14 @@ def test_arrive_is_seek_outside_and_a_ramp_inside() -> None:
         ((10, 0), (0, 0), 2, 5),
         ((10, 0), (0, 1), 2, 10 / math.sqrt(3)),  # crossing
         ((10, 0), (-1, 0), 2, 10 / 3),  # head-on
-        ((10, 0), (1, 0), 2, 10),  # running away, slower
+        ((10, 0), (1, 0), 2, 10),  # fleeing, slower
         ((10, 0), (-1, 0), 1, 5),  # as fast: the quadratic term vanishes
-        ((10, 0), (-3, 0), 2, 2),  # faster, but it comes
+        ((10, 0), (-3, 0), 2, 2),  # faster, approaching
         ((10, 0), (-3, 1), 2, 2.0),  # faster, two meetings: the first, (9 + 1 - 4) t^2 - 60 t + 100 = 0 ...
-        ((10, 0), (3, 0), 2, 5),  # faster and away: never; |p| / V instead
+        ((10, 0), (3, 0), 2, 5),  # faster and fleeing: never; |p| / V instead
         ((10, 0), (0, 3), 2, 5),  # faster and across: never
         ((10, 0), (0, 2), 2, 5),  # as fast and across: never, at the edge of the formula
-        ((0, 0), (1, 0), 2, 0),  # there already
+        ((0, 0), (1, 0), 2, 0),  # at the same place
     ],
 )
 def test_interception_time_is_the_closed_form(offset: Any, quarry: Any, speed: float, seconds: float) -> None:
@@ -202,14 +202,14 @@ def test_interception_time_is_the_closed_form(offset: Any, quarry: Any, speed: f
     assert rows(steering.interception_time)(offset, quarry, speed) == pytest.approx(seconds, rel=1e-12)
 
 
-def test_interception_time_does_not_cancel() -> None:
-    """Far away and almost as fast, the textbook form loses all digits of the small root."""
+def test_interception_time_is_accurate_despite_cancellation() -> None:
+    """Far away and almost as fast: the textbook form of the small root loses all digits."""
     time = float(rows(steering.interception_time)([1e4, 0.0], [-1.0, 0.0], 1.0 + 1e-9))
     assert time == pytest.approx(1e4 / (2 + 1e-9), rel=1e-12)
 
 
 @DIMENSIONS
-def test_pursue_with_the_exact_predictor_meets_its_quarry_on_a_straight_way(dimension: int) -> None:
+def test_pursue_with_the_exact_predictor_intercepts_on_a_straight_path(dimension: int) -> None:
     x, _ = crowd(dimension)
     w = np.random.default_rng(8).normal(size=x.shape)
     w *= 1.5 / np.linalg.norm(w, axis=1, keepdims=True)  # the quarry is slower
@@ -231,7 +231,7 @@ def test_pursue_with_the_exact_predictor_meets_its_quarry_on_a_straight_way(dime
 
 
 @DIMENSIONS
-def test_pursue_looks_ahead_by_the_distance_predictor(dimension: int) -> None:
+def test_pursue_with_the_distance_predictor_seeks_the_predicted_point(dimension: int) -> None:
     x, v = crowd(dimension)
     time = rows(steering.distance_time)(x, 2.0, 0.5)
     np.testing.assert_allclose(time, 0.25 * np.linalg.norm(x, axis=1))
@@ -240,8 +240,8 @@ def test_pursue_looks_ahead_by_the_distance_predictor(dimension: int) -> None:
 
 
 @DIMENSIONS
-def test_evade_keeps_a_pursuer_off_longer_than_standing_still(dimension: int) -> None:
-    """A pursuer that is faster and heads straight for its victim; the time until it is within 0.5 m."""
+def test_evade_delays_capture_compared_to_standing_still(dimension: int) -> None:
+    """Time until a faster pursuer, which heads straight for the agent, is within 0.5 m."""
     start, _ = crowd(dimension)
     hunter = np.zeros_like(start)
     held = []
@@ -264,7 +264,7 @@ def test_evade_keeps_a_pursuer_off_longer_than_standing_still(dimension: int) ->
 
 
 def headings_after(seconds: float, dt: float, count: int = 20_000) -> Array:
-    """How far wanderers have turned, rad, each from its own way straight ahead."""
+    """Return the angles, rad, by which wandering agents have turned from their initial directions."""
     rng = np.random.default_rng(round(1000 * dt))
     target, v = np.tile([1.0, 0.0], (count, 1)), np.tile([1.0, 0.0], (count, 1))
     turned_by = np.zeros(count)
@@ -282,7 +282,7 @@ def test_wander_does_not_depend_on_the_step_size() -> None:
     assert min(variances) > 0.02  # it does turn
 
 
-def test_wander_keeps_its_target_on_the_sphere_and_goes_straight_without_noise() -> None:
+def test_wander_targets_stay_on_the_sphere_and_wander_ahead_is_straight() -> None:
     rng = np.random.default_rng(2)
     for dimension in (2, 3):
         target = np.tile(np.eye(dimension)[0], (500, 1))
@@ -291,16 +291,16 @@ def test_wander_keeps_its_target_on_the_sphere_and_goes_straight_without_noise()
             np.testing.assert_allclose(np.linalg.norm(target, axis=1), 1, rtol=1e-12)
         v = rng.normal(size=(500, dimension))
         ahead = np.tile(np.eye(dimension)[0], (500, 1))
-        wish = rows(steering.wander)(ahead, v, 2.0, 1.5) + v
-        np.testing.assert_allclose(wish, 2 * v / np.linalg.norm(v, axis=1, keepdims=True), atol=1e-12)
-        assert abs(target.mean(axis=0)).max() < 0.15  # by now anywhere
+        desired = rows(steering.wander)(ahead, v, 2.0, 1.5) + v
+        np.testing.assert_allclose(desired, 2 * v / np.linalg.norm(v, axis=1, keepdims=True), atol=1e-12)
+        assert abs(target.mean(axis=0)).max() < 0.15  # by now the targets are spread over the sphere
 
 
-def test_a_wander_target_survives_a_step_that_lands_on_the_centre() -> None:
+def test_a_wander_target_that_would_move_to_the_centre_stays() -> None:
     np.testing.assert_array_equal(rows(steering.wander_turn)([1.0, 0.0], [-1.0, 0.0], 1.0, 1.0), [1.0, 0.0])
 
 
-def test_wander_s_own_frame_is_forward_left_up() -> None:
+def test_the_frame_of_wander_is_forward_left_up() -> None:
     wander = rows(steering.wander)
     v = np.array([3.0, 0.0])
     np.testing.assert_allclose(wander([0.0, 1.0], v, 1.0, 0.0) + v, [0, 1], atol=1e-12)
@@ -313,7 +313,7 @@ def test_wander_s_own_frame_is_forward_left_up() -> None:
 
 
 @DIMENSIONS
-def test_a_push_weighs_one_over_the_distance_and_is_mutual(dimension: int) -> None:
+def test_separation_is_one_over_the_distance_and_mutual(dimension: int) -> None:
     x, tie = crowd(dimension)
     tie /= np.linalg.norm(tie, axis=1, keepdims=True)
     square = (x**2).sum(axis=1, keepdims=True)
@@ -322,7 +322,7 @@ def test_a_push_weighs_one_over_the_distance_and_is_mutual(dimension: int) -> No
     np.testing.assert_array_equal(rows(steering.separate)(0 * x, tie), tie)
 
 
-def test_align_takes_the_mean_and_cohere_seeks_the_centre() -> None:
+def test_align_takes_on_the_mean_velocity_and_cohere_seeks_the_centre() -> None:
     np.testing.assert_allclose(rows(steering.align)([1.0, 2.0], [0.5, 4.0]), [-0.5, 2.0])
     np.testing.assert_allclose(rows(steering.cohere)([3.0, 4.0], [0.5, 0.25], 2.0), [0.7, 1.35])
     np.testing.assert_array_equal(rows(steering.cohere)([0.0, 0.0], [0.5, 0.25], 2.0), [0.0, 0.0])
@@ -332,25 +332,25 @@ def test_align_takes_the_mean_and_cohere_seeks_the_centre() -> None:
 
 
 @DIMENSIONS
-def test_nothing_is_in_the_way_of_who_passes_by(dimension: int) -> None:
-    """A force field would push here; steer-to-avoid must ask for exactly nothing."""
+def test_obstacles_beside_the_path_are_no_threat(dimension: int) -> None:
+    """Obstacles beside the path: a force field would push here."""
     ahead, side = np.eye(dimension)[0], np.eye(dimension)[1]
     far = rows(steering.threat)(ahead, [3 * ahead + 1.001 * side, 3 * ahead + side, -3 * ahead], 1.0, 10.0)
     np.testing.assert_array_equal(far, np.inf)
 
 
 @DIMENSIONS
-def test_a_threat_is_where_the_straight_path_first_touches(dimension: int) -> None:
+def test_a_threat_is_the_distance_to_the_first_touch_on_the_straight_path(dimension: int) -> None:
     ahead, side = np.eye(dimension)[0], np.eye(dimension)[1]
     offsets = [5 * ahead, 5 * ahead + 0.6 * side, 5 * ahead, 0.3 * ahead, -0.3 * ahead, 5 * ahead]
-    reach = [10, 10, 3.9, 10, 10, 4.0]  # the last one touches just at the end of what is looked at
+    reach = [10, 10, 3.9, 10, 10, 4.0]  # the last obstacle is touched exactly at the end of the reach
     expected = [4, 5 - 0.8, np.inf, 0, 0, 4]
     np.testing.assert_allclose(rows(steering.threat)(ahead, offsets, 1.0, reach), expected)
 
 
 @DIMENSIONS
-def test_avoid_is_sideways_away_from_the_centre(dimension: int) -> None:
-    """S = -V unit(lateral offset): no part along the way, whatever the distance."""
+def test_avoid_steers_sideways_away_from_the_centre(dimension: int) -> None:
+    """S = -V unit(lateral offset): no part along the heading, at any distance."""
     x, heading = crowd(dimension)
     heading /= np.linalg.norm(heading, axis=1, keepdims=True)
     lateral = x - (x * heading).sum(axis=1, keepdims=True) * heading
@@ -358,7 +358,7 @@ def test_avoid_is_sideways_away_from_the_centre(dimension: int) -> None:
     np.testing.assert_allclose(rows(steering.avoid)(heading, x, 0.5, 3.0), expected, atol=1e-12)
 
 
-def test_dead_ahead_everybody_keeps_right() -> None:
+def test_avoid_steers_right_of_an_obstacle_dead_ahead() -> None:
     avoid = rows(steering.avoid)
     np.testing.assert_allclose(avoid([1.0, 0.0], [5.0, 0.0], 1.0, 3.0), [0, -3])
     np.testing.assert_allclose(avoid([0.0, 1.0], [0.0, 5.0], 1.0, 3.0), [3, 0])
@@ -370,7 +370,7 @@ def test_dead_ahead_everybody_keeps_right() -> None:
 
 
 @DIMENSIONS
-def test_inside_an_obstacle_the_way_is_straight_out(dimension: int) -> None:
+def test_avoid_steers_straight_out_of_an_obstacle(dimension: int) -> None:
     x, heading = crowd(dimension)
     heading /= np.linalg.norm(heading, axis=1, keepdims=True)
     out = -3 * x / np.linalg.norm(x, axis=1, keepdims=True)
@@ -382,20 +382,20 @@ def test_inside_an_obstacle_the_way_is_straight_out(dimension: int) -> None:
 
 
 @DIMENSIONS
-def test_contain_asks_for_nothing_inside_and_for_the_way_in_outside(dimension: int) -> None:
+def test_contain_is_zero_inside_and_steers_inwards_outside(dimension: int) -> None:
     rng = np.random.default_rng(4)
     x, v = rng.uniform(-3, 13, (500, dimension)), rng.normal(size=(500, dimension))
-    wish = rows(steering.contain)(x, 10 - x, v, 2.0, 1.5)
+    change = rows(steering.contain)(x, 10 - x, v, 2.0, 1.5)
     soon = x + 1.5 * v
     inside = ((soon >= 0) & (soon <= 10)).all(axis=1)
     assert 50 < inside.sum() < 450
-    np.testing.assert_array_equal(wish[inside], 0)
+    np.testing.assert_array_equal(change[inside], 0)
     goal = np.clip(soon, 0, 10) - x
     expected = 2 * goal / np.linalg.norm(goal, axis=1, keepdims=True) - v
-    np.testing.assert_allclose(wish[~inside], expected[~inside], atol=1e-9)
+    np.testing.assert_allclose(change[~inside], expected[~inside], atol=1e-9)
     outside = ((x < 0) | (x > 10)).any(axis=1) & ~inside
     nearest = np.clip(x, 0, 10) - x
-    assert (((wish + v) * nearest).sum(axis=1)[outside] > 0).all()
+    assert (((change + v) * nearest).sum(axis=1)[outside] > 0).all()
 
 
 # --- arbitration ------------------------------------------------------------------------------------------------------
@@ -403,8 +403,8 @@ def test_contain_asks_for_nothing_inside_and_for_the_way_in_outside(dimension: i
 REYNOLDS = [(8.0, 0.0), (-8.0, 0.0), (0.0, 5.0)]
 
 
-def test_allocate_serves_the_most_pressing_and_drops_the_rest() -> None:
-    """Lengths add up as scalars; (6, 4) would be Buckland's running sum."""
+def test_allocate_takes_forces_in_order_until_the_budget_is_used_up() -> None:
+    """Lengths are added as scalars; Buckland's running sum would be (6, 4)."""
     np.testing.assert_allclose(rows(arbitration.allocate)(REYNOLDS, 10.0), [6, 0])
     np.testing.assert_allclose(rows(arbitration.allocate)(REYNOLDS, 21.0), [0, 5])
     np.testing.assert_allclose(rows(arbitration.allocate)(REYNOLDS, 0.0), [0, 0])
@@ -417,7 +417,7 @@ def test_blend_can_cancel() -> None:
     np.testing.assert_allclose(rows(arbitration.blend)(REYNOLDS, [1.0, 0.5, 0.6], 2.5), [2, 1.5])
 
 
-def test_prioritise_takes_the_first_that_matters() -> None:
+def test_prioritise_takes_the_first_force_above_the_threshold() -> None:
     prioritise = rows(arbitration.prioritise)
     np.testing.assert_allclose(prioritise(REYNOLDS, 0.1, 10.0), [8, 0])
     np.testing.assert_allclose(prioritise([(0.05, 0.0), (0.0, 3.0), (9.0, 9.0)], 0.1, 2.0), [0, 2])
@@ -428,20 +428,20 @@ NUMBERS = st.one_of(st.just(0.0), st.floats(-1e6, 1e6), st.floats(-1e-9, 1e-9))
 
 
 @given(st.lists(st.tuples(NUMBERS, NUMBERS), min_size=3, max_size=3), st.floats(0, 1e6))
-def test_allocate_never_exceeds_the_budget_and_is_the_sum_if_that_fits(wishes: Any, budget: float) -> None:
-    granted = rows(arbitration.allocate)(wishes, budget)
-    lengths = np.linalg.norm(wishes, axis=1)
+def test_allocate_never_exceeds_the_budget_and_is_the_sum_if_that_fits(forces: Any, budget: float) -> None:
+    granted = rows(arbitration.allocate)(forces, budget)
+    lengths = np.linalg.norm(forces, axis=1)
     assert np.isfinite(granted).all()
     assert np.linalg.norm(granted) <= budget * (1 + 1e-12) + 1e-300
     if lengths.sum() <= budget * (1 - 1e-12):
-        np.testing.assert_allclose(granted, np.sum(wishes, axis=0), rtol=1e-12, atol=1e-9 * max(1.0, lengths.max()))
+        np.testing.assert_allclose(granted, np.sum(forces, axis=0), rtol=1e-12, atol=1e-9 * max(1.0, lengths.max()))
 
 
 @given(st.lists(st.tuples(NUMBERS, NUMBERS), min_size=3, max_size=3), st.floats(0, 1e6))
-def test_no_arbiter_exceeds_the_budget(wishes: Any, budget: float) -> None:
+def test_no_arbiter_exceeds_the_budget(forces: Any, budget: float) -> None:
     for answer in (
-        rows(arbitration.blend)(wishes, [1.0, 2.0, 0.5], budget),
-        rows(arbitration.prioritise)(wishes, 0.0, budget),
+        rows(arbitration.blend)(forces, [1.0, 2.0, 0.5], budget),
+        rows(arbitration.prioritise)(forces, 0.0, budget),
     ):
         assert np.linalg.norm(answer) <= budget * (1 + 1e-12) + 1e-300
 
@@ -459,21 +459,21 @@ def test_rows_broadcast_and_keep_the_leading_shape() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given_", "said"),
+    ("given_", "message"),
     [
         (([1.0, 2.0], [0.0, 0.0]), "seek takes 3 arguments (offset, velocity, max_speed)"),
         (([1.0, 2.0, 3.0, 4.0], [0.0, 0.0], 1.0), "offset has shape (4,)"),
         ((1.0, [0.0, 0.0], 1.0), "offset has shape ()"),
     ],
 )
-def test_rows_say_which_argument_does_not_fit(given_: Any, said: str) -> None:
+def test_rows_name_the_argument_that_does_not_fit(given_: Any, message: str) -> None:
     with pytest.raises((TypeError, ValueError)) as caught:
         rows(steering.seek)(*given_)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_rows_refuse_a_mixture_of_dimensions() -> None:
+def test_rows_refuse_mixed_dimensions() -> None:
     for offset, velocity in (([1.0, 2.0, 3.0], [0.0, 0.0]), ([1.0, 2.0], [0.0, 0.0, 5.0])):
         with pytest.raises(ValueError, match=r"seek: .*\b2\b.*\b3\b"):
             rows(steering.seek)(offset, velocity, 1.0)
