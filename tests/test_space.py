@@ -1,4 +1,4 @@
-"""Where agents live: wrapping, minimum images and walls, as arrays see them and as compiled steps see them."""
+"""Spaces: wrapping, minimum images and walls, in array methods and in compiled steps."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ def alone(scene: Scene) -> Scene:
 
 @pytest.fixture(scope="module", params=["float64", "float32"])
 def torus(request: pytest.FixtureRequest) -> Scene:
-    return alone(everything(2, Drag(rate=0), dtype=request.param))  # all effects, and nothing acts
+    return alone(everything(2, Drag(rate=0), dtype=request.param))  # the kernel of all effects, but without forces
 
 
 @given(ANYWHERE, ANYWHERE)
 @example(-1e-17, -1e-9)
 @example(9.0, 7.0)
 @example(np.nextafter(9.0, 0), np.nextafter(7.0, 8))
-def test_a_torus_keeps_everybody_in_its_half_open_box(torus: Scene, x: float, y: float) -> None:
-    """(-1e-17) % 10 is 10, an index beyond the last cell."""
+def test_a_torus_keeps_agents_in_its_half_open_box(torus: Scene, x: float, y: float) -> None:
+    """In floating point, (-1e-17) % 10 is 10: an index beyond the last cell."""
     state = torus.start(0)
     state.pos[0, 0], state.vel[...] = (x, y), 0.0
     found = torus.step(state).pos[0, 0]
@@ -54,7 +54,7 @@ def test_a_torus_keeps_everybody_in_its_half_open_box(torus: Scene, x: float, y:
 
 @given(ANYWHERE, ANYWHERE)
 @example(-1e-17, -1e-9)
-def test_wrap_over_arrays_does_the_same(x: float, y: float) -> None:
+def test_wrap_puts_arrays_into_the_half_open_box(x: float, y: float) -> None:
     space = SPACES["torus"][2]
     found = space.wrap([[x, y]])
     assert (found >= 0).all()
@@ -63,8 +63,8 @@ def test_wrap_over_arrays_does_the_same(x: float, y: float) -> None:
 
 
 @pytest.mark.parametrize("times", [0.3, 0.7, 1.6, 2.4, 7.7, -1.7, 1000.2])
-def test_the_shortest_way_is_shortest_from_any_distance(times: float) -> None:
-    """Adding or subtracting one box is not enough beyond 1.5 boxes."""
+def test_the_displacement_on_a_torus_is_the_shortest_for_any_distance(times: float) -> None:
+    """Beyond 1.5 boxes it is not enough to add or subtract one box."""
     space = Torus(size=(10.0, 4.0))
     a, b = np.array([9.0, 3.5]), np.array([9.0, 3.5]) + times * np.array([10.0, 4.0])
     images = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2) * [10.0, 4.0]
@@ -75,20 +75,20 @@ def test_the_shortest_way_is_shortest_from_any_distance(times: float) -> None:
 
 
 @DIMENSIONS
-def test_who_is_half_a_box_away_is_so_in_opposite_directions(dimension: int) -> None:
-    """Else two that push each other off would push the same way."""
+def test_displacements_by_half_a_box_are_opposite_for_the_two_agents(dimension: int) -> None:
+    """Otherwise two agents that repel each other would be pushed in the same direction."""
     space = SPACES["torus"][dimension]
     half = np.asarray(space.size) / 2  # type: ignore[attr-defined]
-    for ways in (space.displacement, functools.partial(rows(space_module.torus_offset), space.extent(dimension))):
+    for offset in (space.displacement, functools.partial(rows(space_module.torus_offset), space.extent(dimension))):
         for times in (-5, -3, -1, 1, 3, 5):
-            way, back = (np.asarray(ways(times * a, times * b)) for a, b in ((0 * half, half), (half, 0 * half)))
-            np.testing.assert_array_equal(way, -back)
-            np.testing.assert_array_equal(np.abs(way), half)
+            there, back = (np.asarray(offset(times * a, times * b)) for a, b in ((0 * half, half), (half, 0 * half)))
+            np.testing.assert_array_equal(there, -back)
+            np.testing.assert_array_equal(np.abs(there), half)
 
 
 @DIMENSIONS
 @ROWS
-def test_the_law_and_the_method_agree_on_the_way(kind: str, dimension: int) -> None:
+def test_the_offset_law_and_the_displacement_method_agree(kind: str, dimension: int) -> None:
     space: Space = SPACES[kind][dimension]
     rng = np.random.default_rng(0)
     a, b = rng.uniform(-30, 30, (500, dimension)), rng.uniform(-30, 30, (500, dimension))
@@ -99,7 +99,7 @@ def test_the_law_and_the_method_agree_on_the_way(kind: str, dimension: int) -> N
     assert space.periodic == (np.linalg.norm(found, axis=1).max() < 10)
 
 
-def test_the_edge_of_the_box_is_on_one_side_only() -> None:
+def test_displacements_jump_at_half_a_box() -> None:
     space = Torus(size=(10.0, 10.0))
     np.testing.assert_allclose(np.abs(space.displacement([0, 0], [[5, 5], [-5, 15]])), 5)
     np.testing.assert_allclose(space.displacement([0, 0], [[4.999, 5.001]]), [[4.999, -4.999]])
@@ -110,32 +110,32 @@ def test_the_edge_of_the_box_is_on_one_side_only() -> None:
 
 @pytest.fixture(scope="module")
 def box() -> Scene:
-    """One agent of radius 0.5 m in a box of 9 m by 7 m; the kernel is test_neighbours.py's."""
+    """Return one agent of radius 0.5 m in a box of 9 m by 7 m, with the kernel that test_neighbours.py uses."""
     return alone(scene_of(Separation(weight=0, radius=1), space=Box(size=(9.0, 7.0)), dt=0.1))
 
 
 @pytest.mark.parametrize(
     ("at", "velocity", "then", "left"),
     [
-        ((8.45, 3.0), (2.0, 1.0), (8.5, 3.1), (0.0, 1.0)),  # into the wall: the part along it stays
+        ((8.45, 3.0), (2.0, 1.0), (8.5, 3.1), (0.0, 1.0)),  # into the wall: the component along it stays
         ((0.55, 3.0), (-2.0, 1.0), (0.5, 3.1), (0.0, 1.0)),
         ((4.0, 6.45), (1.0, 2.0), (4.1, 6.5), (1.0, 0.0)),
         ((8.45, 6.45), (2.0, 2.0), (8.5, 6.5), (0.0, 0.0)),  # a corner stops both
         ((8.5, 3.0), (-2.0, 1.0), (8.3, 3.1), (-2.0, 1.0)),  # away from the wall: nothing happens
         ((8.5, 3.0), (0.0, 1.0), (8.5, 3.1), (0.0, 1.0)),  # along the wall
-        ((12.0, 3.0), (-2.0, 1.0), (8.5, 3.1), (-2.0, 1.0)),  # put outside, on its way in: only put back
+        ((12.0, 3.0), (-2.0, 1.0), (8.5, 3.1), (-2.0, 1.0)),  # outside but moving inwards: only the position changes
         ((-1.0, -1.0), (3.0, -3.0), (0.5, 0.5), (3.0, 0.0)),
         ((4.0, 3.0), (1.0, -1.0), (4.1, 2.9), (1.0, -1.0)),
     ],
 )
-def test_walls_stop_the_outward_part_only(box: Scene, at: Any, velocity: Any, then: Any, left: Any) -> None:
+def test_walls_stop_the_outward_component_only(box: Scene, at: Any, velocity: Any, then: Any, left: Any) -> None:
     state = box.start(0).with_motion([[at]], [[velocity]])
     after = box.step(state)
     np.testing.assert_allclose(after.pos[0, 0], then, atol=1e-12)
     np.testing.assert_allclose(after.vel[0, 0], left, atol=1e-12)
 
 
-def test_nobody_leaves_a_box(box: Scene) -> None:
+def test_agents_do_not_leave_a_box(box: Scene) -> None:
     state = box.start(3, worlds=50)
     rng = np.random.default_rng(0)
     for _ in range(300):
@@ -155,7 +155,7 @@ def test_a_plane_has_no_walls() -> None:
     "size", [(0.0, 1.0), (-1.0, 1.0), (1.0,), (1.0,) * 4, (float("nan"), 1.0), (1.0, float("inf"))]
 )
 @pytest.mark.parametrize("kind", [Torus, Box])
-def test_a_size_that_is_none_is_refused_in_one_line(kind: Any, size: Any) -> None:
+def test_an_invalid_size_is_refused_in_one_line(kind: Any, size: Any) -> None:
     with pytest.raises(ValueError, match="size") as caught:
         kind(size=size)
     assert "\n" not in str(caught.value)

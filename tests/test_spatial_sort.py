@@ -1,4 +1,4 @@
-"""Tiles: who has left the one he began in is listed, and the cells such agents came to are put in order."""
+"""Tiles: agents that have left their home tile are listed, and the cells that they are in now are sorted."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ LANES, AGENTS = 16, 5003
 
 
 def in_blocks(x: Any) -> Any:
-    """Positions (N, D) as kernels have them: blocks of (D, LANES)."""
+    """Return positions (N, D) in the layout of kernels: blocks of (D, LANES)."""
     n, d = x.shape
     padded = np.zeros((-(-n // LANES) * LANES, d), x.dtype)
     padded[:n] = x
     return padded.reshape(-1, LANES, d).transpose(0, 2, 1).reshape(-1).copy()
 
 
-@pytest.mark.parametrize("stride", [0.0, 0.2, 3.0, 100.0])  # m, at most, that agents have moved since
-@pytest.mark.parametrize("empty", [0.0, 0.8])  # of the box: blocks of many tiles lie there
+@pytest.mark.parametrize("stride", [0.0, 0.2, 3.0, 100.0])  # m, largest distance along an axis since agents were sorted
+@pytest.mark.parametrize("empty", [0.0, 0.8])  # share of the box with few agents: there a block has many tiles
 @pytest.mark.parametrize("size", [(70.0, 50.0), (17.0, 15.0, 16.0)])
-def test_cells_to_which_strangers_came_are_put_in_order(size: Any, empty: float, stride: float) -> None:
+def test_cells_with_agents_from_other_tiles_are_sorted_by_agent_number(size: Any, empty: float, stride: float) -> None:
     rng = np.random.default_rng(7)
     n, d, blocks = AGENTS, len(size), -(-AGENTS // LANES)
     x = rng.uniform(0, size, (n, d)).astype(np.float32)
@@ -60,12 +60,12 @@ def test_cells_to_which_strangers_came_are_put_in_order(size: Any, empty: float,
     assert shape == again == plain
     np.testing.assert_array_equal(cell, expected)
     np.testing.assert_array_equal(start, begins)
-    many = [len(set(home[k : k + LANES])) > 2 for k in range(0, n, LANES)]  # such a block is nobody's home
+    many = [len(set(home[k : k + LANES])) > 2 for k in range(0, n, LANES)]  # such a block has no home tile
     away = (counted(count_tiles, moved)[1] != home) | np.repeat(many, LANES)[:n]
     assert any(many) == (empty > 0)
     np.testing.assert_array_equal(strangers[: tally[1]], cell[away])
 
-    place = np.argsort(cell, kind="stable")  # as agents are put into their cells
+    place = np.argsort(cell, kind="stable")  # the order in which agents are put into cells
     numbers = ident.astype(np.float32)
     records = np.column_stack([place, place + 0.5, -place]).astype(np.float32)
     ends = start[1:][None].copy()
@@ -73,4 +73,4 @@ def test_cells_to_which_strangers_came_are_put_in_order(size: Any, empty: float,
     entry(order_cells)(flat, 3, numbers, start, ends, 0, strangers, 0, int(tally[1]))
     np.testing.assert_array_equal(flat.reshape(n, 3), records[np.lexsort((ident[place], cell[place]))])
     assert (flat != records.reshape(-1)).any() == (stride > 0)
-    assert (ends[0, strangers[: tally[1]]] == -1).all()  # each once, however many strangers are in it
+    assert (ends[0, strangers[: tally[1]]] == -1).all()  # each cell is sorted once, for any number of strangers

@@ -1,4 +1,4 @@
-"""A smooth speed limit: its formula, that the length of a step does not show, and that methods keep their order."""
+"""A smooth speed limit: its formula, stable steps, and the order of methods under it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PUSH = (2.0, 1.5)  # N, 2.5 together
 
 
 def scene(push: float = 1.0, dt: float = 0.01, hard: float | None = None, strength: float = B) -> Scene:
-    """Somebody who is pushed, along and against a slow swing, up to a limit of speed: this one, or the hard one."""
+    """Return an agent under a constant and a slowly oscillating force, with a smooth or a hard speed limit."""
     group = Group(count=1, mass=MASS, max_speed=hard, spawn=Spawn(low=(0, 0), high=(0, 0)))
     effects = (
         SpeedLimit(speed=V, strength=strength),
@@ -43,8 +43,8 @@ def curve(hard: float | None) -> Curve:
 
 
 @pytest.mark.slow
-def test_rk4_keeps_its_order_and_under_the_hard_limit_it_is_of_order_one() -> None:
-    """P09, P14: halving the step divides errors by 16, and by 2."""
+def test_rk4_has_order_4_with_the_smooth_limit_and_order_1_with_the_hard_one() -> None:
+    """P09, P14: half the step divides errors by 16, and by 2 with the hard limit."""
     smooth, clamped = curve(None), curve(V)
     assert smooth.order is not None
     assert smooth.order >= 3.8
@@ -53,8 +53,8 @@ def test_rk4_keeps_its_order_and_under_the_hard_limit_it_is_of_order_one() -> No
 
 
 @pytest.mark.parametrize("times", [1.0, 2.0, 4.0, 8.0])
-def test_who_is_driven_by_so_much_ends_so_fast(times: float) -> None:
-    """B 16 s^9 / (15 + s^8) = F: V itself for F = B, 1.087, 1.189 and 1.319 V for two, four and eight times that."""
+def test_the_final_speed_under_a_constant_force_is_the_closed_form(times: float) -> None:
+    """16 B s^9 / (15 + s^8) = F: the speed is V for F = B, and 1.087, 1.189 and 1.319 V for 2, 4 and 8 B."""
     share = brentq(lambda s: 16 * s**9 / (15 + s**8) - times, 0.1, 3.0)
     assert share == pytest.approx({1.0: 1.0, 2.0: 1.087, 4.0: 1.189, 8.0: 1.319}[times], abs=5e-4)
     driven = scene(push=times * B / np.hypot(*PUSH))
@@ -67,8 +67,8 @@ def test_who_is_driven_by_so_much_ends_so_fast(times: float) -> None:
     assert fastest <= share * V * (1 + 1e-9)
 
 
-def test_far_above_the_limit_it_is_a_drag_that_no_step_below_its_bound_runs_away_from() -> None:
-    """m V / (8 B) for explicit Euler, more for RK4; the bound is what the scene's dt is judged by."""
+def test_speeds_far_above_the_limit_decay_stably_and_like_the_exact_solution() -> None:
+    """The bound, m V / (8 B) for explicit Euler and more for RK4, is what a scene compares dt to."""
     fast = scene(push=0.0, dt=0.9 * MASS * V / (8 * B))
     state = moving(fast, 300.0, -400.0)
     speeds = [500.0]

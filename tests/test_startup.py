@@ -1,4 +1,4 @@
-"""What a process does once: folders are imported, kernels are read, and Python looks for no garbage meanwhile."""
+"""Start of a process: folders are imported and kernels are loaded with garbage collection disabled."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def collecting() -> Iterator[None]:
     gc.enable()
 
 
-def test_garbage_is_looked_for_afterwards_again() -> None:
+def test_garbage_collection_is_enabled_again_afterwards() -> None:
     with nothing_to_collect(), nothing_to_collect():
         assert not gc.isenabled()
     assert gc.isenabled()
@@ -32,14 +32,14 @@ def test_garbage_is_looked_for_afterwards_again() -> None:
     assert gc.isenabled()
 
 
-def test_who_looks_for_no_garbage_does_not_afterwards_either() -> None:
+def test_disabled_garbage_collection_stays_disabled() -> None:
     gc.disable()
     with nothing_to_collect():
         pass
     assert not gc.isenabled()
 
 
-def test_a_folder_is_imported_without_looking_for_garbage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_is_imported_without_garbage_collection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "some_folder"
     folder.mkdir()
     (folder / "__init__.py").write_text("")
@@ -51,26 +51,26 @@ def test_a_folder_is_imported_without_looking_for_garbage(tmp_path: Path, monkey
     assert gc.isenabled()
 
 
-def test_a_kernel_is_read_without_looking_for_garbage_and_waited_for_with(tmp_path: Path) -> None:
+def test_a_kernel_is_loaded_without_garbage_collection(tmp_path: Path) -> None:
     class Disk:
         def load_overload(self, *_: Any) -> None:
             seen.append(gc.isenabled())
 
     seen: list[bool] = []
     cache = OneAtATime(Disk(), tmp_path / "lock")
-    cache.load_overload(None, None)  # once before it is this process's turn to compile, and once in its turn
+    cache.load_overload(None, None)  # loads twice: before and after it acquires the compile lock
     cache._lock.release()
     assert seen == [False, False]
     assert gc.isenabled()
 
 
 @pytest.mark.parametrize("module", ["flockenv.tasks", "flockenv.scene", "flockenv.envs.single", "flockenv.envs.sb3"])
-def test_whatever_is_imported_first_python_collects_afterwards(module: str) -> None:
+def test_garbage_collection_is_enabled_after_the_first_import_of_any_module(module: str) -> None:
     code = f"import gc, {module}; assert gc.isenabled(); assert 'pursuit' in __import__('flockenv').TASKS"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_kernels_are_read_without_linear_algebra_and_whoever_needs_it_has_it() -> None:
+def test_linear_algebra_is_imported_only_when_a_kernel_needs_it() -> None:
     code = """
 import sys, threading
 import numba, numpy as np
@@ -93,7 +93,7 @@ assert "scipy.linalg" in sys.modules
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_class_variables_are_evaluated_once_and_stay_class_variables() -> None:
+def test_class_variables_of_records_are_evaluated_once_and_are_no_fields() -> None:
     class Base(Record):
         shade: ClassVar[str] = "grey"
         size: float = 1.0

@@ -1,4 +1,4 @@
-"""Hard cases: what they come to under three methods, and how findings are kept and told."""
+"""Stress cases: their verdicts under several methods, and how findings are kept and reported."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from flockenv.studies.stress.heaps import HEAPS
 from flockenv.studies.stress.impacts import IMPACTS
 
 pytestmark = pytest.mark.slow
-"""Many kernels: where slow tests run."""
+"""Many kernels are compiled: only slow runs include these tests."""
 
 NAMES = tuple(case.name for case in CASES)
 
@@ -65,7 +65,7 @@ def raised(error: Exception) -> Any:
     return trial
 
 
-def test_what_a_trial_returns_or_raises_is_its_verdict() -> None:
+def test_the_verdict_is_what_a_trial_returns_warns_or_raises() -> None:
     diverged = SimulationDiverged(0, 3, 17, 0.34, "springs", 0.02, "rk4")
     for trial, verdict, value, note in (
         (lambda method: Value(0.5, True, "fine"), "pass", 0.5, "fine"),
@@ -87,7 +87,7 @@ def test_what_a_trial_returns_or_raises_is_its_verdict() -> None:
         assert finding.seconds >= 0
 
 
-def test_other_errors_and_warnings_are_not_verdicts() -> None:
+def test_other_errors_and_warnings_are_raised() -> None:
     def deprecated(method: Integrator) -> Value:
         warnings.warn("old", DeprecationWarning, stacklevel=1)
         return Value(0.0, True)
@@ -98,16 +98,16 @@ def test_other_errors_and_warnings_are_not_verdicts() -> None:
         tried(deprecated)
 
 
-def test_a_number_that_is_not_one_is_no_pass() -> None:
-    """nan <= bound is False, and a bound that is asked the other way round must not let it through."""
+def test_nan_never_passes() -> None:
+    """nan <= bound is False; a bound in the form `not value > bound` must not let it pass."""
     assert tried(lambda method: Value(math.nan, math.nan <= 1.0)).verdict == "fails"
     assert tried(lambda method: Value(math.nan, True)).verdict == "fails"
 
 
-# --- what is kept -----------------------------------------------------------------------------------------------------
+# --- kept results -----------------------------------------------------------------------------------------------------
 
 
-def test_findings_that_are_known_are_not_tried_again() -> None:
+def test_known_findings_are_not_tried_again() -> None:
     calls: list[tuple[str, str]] = []
 
     def trial(name: str) -> Any:
@@ -115,10 +115,10 @@ def test_findings_that_are_known_are_not_tried_again() -> None:
 
     cases, methods = tuple(case(trial(name), name) for name in ("A", "B")), (SemiImplicitEuler(), RK4())
     kept: list[Results] = []
-    told: list[int] = []
-    whole = run(cases, methods, progress=told.append, keep=kept.append)
+    counts: list[int] = []
+    whole = run(cases, methods, progress=counts.append, keep=kept.append)
     assert calls == [("A", "semi_implicit_euler"), ("B", "semi_implicit_euler"), ("A", "rk4"), ("B", "rk4")]
-    assert told == [0, 1, 2, 3]
+    assert counts == [0, 1, 2, 3]
     assert [len(results.findings) for results in kept] == [1, 2, 3, 4]
     assert kept[-1] == whole
     assert [(f.case, f.under) for f in whole.findings] == [
@@ -131,7 +131,7 @@ def test_findings_that_are_known_are_not_tried_again() -> None:
     assert run(cases, methods, known=whole) == whole
 
 
-def test_what_is_known_of_other_cases_stays_and_of_other_sources_goes() -> None:
+def test_known_findings_of_other_cases_stay_and_of_other_sources_are_dropped() -> None:
     calls: list[str] = []
 
     def trial(name: str) -> Case:
@@ -149,7 +149,7 @@ def test_what_is_known_of_other_cases_stays_and_of_other_sources_goes() -> None:
     assert calls == ["A"]
 
 
-def test_results_are_a_table_and_json() -> None:
+def test_results_become_a_table_and_json() -> None:
     results = Results(
         findings=(
             tried(lambda method: Value(0.123456, True, "so")), tried(raised(ValueError("no")), RK4()),
@@ -170,7 +170,7 @@ def test_results_are_a_table_and_json() -> None:
     assert gap.rows() == [["X01", "made up", "none", "0.12 ok", ""], ["X02", "made up", "none", "", "refused"]]
 
 
-def test_names_are_known_and_unknown_ones_get_a_suggestion() -> None:
+def test_cases_and_methods_are_found_by_name_and_unknown_names_are_refused() -> None:
     assert len(set(NAMES)) == len(NAMES)
     assert cases_named(CASES, ()) == CASES
     assert [case.name for case in cases_named(CASES, ("N14",))] == [f"N14 {power}" for power in range(3, 9)]
@@ -189,7 +189,7 @@ def test_names_are_known_and_unknown_ones_get_a_suggestion() -> None:
 
 # --- the cases --------------------------------------------------------------------------------------------------------
 
-SOLID = {case.name for case in (*IMPACTS, *HEAPS, *GATHERINGS)}  # of these: tests/test_stress_solids.py
+SOLID = {case.name for case in (*IMPACTS, *HEAPS, *GATHERINGS)}  # tested in tests/test_stress_solids.py
 BOUNDED = tuple(name for name in NAMES if not name.startswith(("N14", "N20")) and name not in SOLID)
 HEAVY = ("N09 crowd", "N10", "N18", "N09 centre")  # a kernel each, of ten seconds
 LIGHT = tuple(name for name in BOUNDED if name not in HEAVY)
@@ -230,7 +230,7 @@ def test_a_stiff_cloth_is_refused_before_anything_runs(method: Integrator, name:
 
 @pytest.mark.parametrize(("name", "expected"), [("N20 1.9", "pass"), ("N20 2.1", "warned"), ("N20 10", "refused")])
 def test_stiff_drag_is_bounded_then_warned_of_then_refused(name: str, expected: str) -> None:
-    """`warned` is caught by the case itself, which passes for it; its note says so."""
+    """The case N20 2.1 catches the warning itself and passes; its note mentions it."""
     (finding,) = run((named(name),), (SemiImplicitEuler(),)).findings
     assert finding.verdict == ("pass" if expected == "warned" else expected)
     assert ("warned" in finding.note) == (expected == "warned")
@@ -239,7 +239,7 @@ def test_stiff_drag_is_bounded_then_warned_of_then_refused(name: str, expected: 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["N01", "N02", "N03", "N09 centre", "N16", "N20 1.9", "N20 2.1", "N20 10"])
 def test_exponential_drag_stays_within_the_bounds(name: str) -> None:
-    """Drag that it is told of has no limit, other damping has one."""
+    """Drag that it integrates exactly sets no limit; other damping does."""
     within(ExponentialDrag(), name)
 
 
@@ -254,12 +254,12 @@ def test_implicit_euler_stays_within_the_bounds(name: str) -> None:
     ("name", "verdicts"),
     [
         ("N03", {"pass"}), ("N14 3", {"pass"}),
-        # it is stable at any step, but what is far too fast for the step it turns around and hardly damps
+        # stable at any step, but motion that is too fast for the step changes sign in each step and is hardly damped
         ("N15", {"fails"}), ("N20 10", {"fails"}),
-        ("N14 8", {"pass", "diverges"}),  # and there may be no solution nearby; never more energy without a word
+        ("N14 8", {"pass", "diverges"}),  # there may be no solution nearby, but energy never grows unnoticed
     ],
 )  # fmt: skip
-def test_implicit_midpoint_does_what_it_is_known_for(name: str, verdicts: set[str]) -> None:
+def test_implicit_midpoint_has_its_known_verdicts(name: str, verdicts: set[str]) -> None:
     (finding,) = run((named(name),), (ImplicitMidpoint(),)).findings
     assert finding.verdict in verdicts, finding.note
     assert finding.verdict != "diverges" or "Newton's method" in finding.note or "not finite" in finding.note
@@ -267,7 +267,7 @@ def test_implicit_midpoint_does_what_it_is_known_for(name: str, verdicts: set[st
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["N01", "N04"])
-def test_explicit_euler_does_what_it_is_known_for(name: str) -> None:
-    """Its energy is that of its formula, and its orbit fails (N04)."""
+def test_explicit_euler_has_its_known_verdicts(name: str) -> None:
+    """Its energy grows as in the formula, with a warning; its orbit fails (N04)."""
     (finding,) = run((named(name),), (ExplicitEuler(),)).findings
     assert finding.verdict == ("fails" if name == "N04" else "warned")

@@ -1,4 +1,4 @@
-"""Hard cases of solid bodies: what each response comes to, and what is known to fail, says so."""
+"""Stress cases of solid bodies: each response to contacts stays within its bounds, or is known to fail."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ CASE = {case.name: case for case in CASES}
 ONCE = tuple(case.name for case in (*IMPACTS, *HEAPS) if not case.only)
 
 FAIL = {
-    "N05 impulses", "N05 project",  # an impact at the end of the step takes away what was fallen since
-    "N08 project", "N22 project", "P19 project",  # one pass
+    "N05 impulses", "N05 project",  # impacts at the end of a step also remove the speed gained since by falling
+    "N08 project", "N22 project", "P19 project",  # a single pass
 }  # fmt: skip
-"""What fails under every method, as docs/stress.md says."""
+"""Cases that fail under every method, see docs/stress.md."""
 
 
-WARNED = {"N27 project"}  # bodies that are held back leave contacts unsolved in some step
-"""What holds its bound, and warns, since bodies are held back that parting would put past others."""
+WARNED = {"N27 project"}  # bodies that are held back leave contacts unsolved in some steps
+"""Cases that hold their bounds but warn: bodies are held back that would be pushed past others."""
 
 
 def found(name: str, method: Integrator | None = None) -> Finding:
@@ -44,26 +44,26 @@ def as_known(name: str, method: Integrator | None = None) -> None:
         "N22 earliest", "N22 impulses", "P19 earliest", "P19 back_up", "P19 impulses", "P24 earliest", "P28 impulses",
     ],
 )  # fmt: skip
-def test_semi_implicit_euler_does_what_is_known(name: str) -> None:
+def test_semi_implicit_euler_has_the_known_verdicts(name: str) -> None:
     as_known(name)
 
 
-def test_a_hundred_discs_in_the_funnel_overlap_little_and_nobody_leaves() -> None:
-    """N23 at its beginning; all of it, 1,000 discs for 60 s, is in docs/stress.md."""
+def test_ninety_discs_in_the_funnel_overlap_little_and_do_not_leave() -> None:
+    """The first second of N23; all of it, 1,000 discs for 60 s, is in docs/stress.md."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnsolvedContactsWarning)
         value = funnel(SemiImplicitEuler(), "impulses", seconds=1.0, count=90)
     assert value.holds, value.note
 
 
-def test_a_case_may_say_under_which_methods_it_is_tried() -> None:
+def test_a_case_is_tried_only_under_its_own_methods() -> None:
     some = (Case("X01", "made up", "none", lambda method: Value(1.0, True), ("rk4",)),)
     methods = (SemiImplicitEuler(), RK4())
     assert trials(some, [method.kind for method in methods]) == 1
     assert [f.under for f in run(some, methods).findings] == ["rk4"]
 
 
-def test_a_warning_of_contacts_that_are_not_solved_is_part_of_a_verdict() -> None:
+def test_a_warning_of_unsolved_contacts_makes_the_verdict_warned() -> None:
     def trial(method: Integrator) -> Value:
         warnings.warn("not solved within passes = 1", UnsolvedContactsWarning, stacklevel=1)
         return Value(1.0, True)
@@ -75,7 +75,7 @@ def test_a_warning_of_contacts_that_are_not_solved_is_part_of_a_verdict() -> Non
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ONCE)
 @pytest.mark.parametrize("method", [SemiImplicitEuler(), VelocityVerlet(), RK4()], ids=lambda method: method.kind)
-def test_methods_do_what_is_known(method: Integrator, name: str) -> None:
+def test_other_methods_have_the_known_verdicts(method: Integrator, name: str) -> None:
     as_known(name, method)
 
 

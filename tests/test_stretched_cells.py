@@ -1,4 +1,4 @@
-"""Agents far away from all others: neighbour search meets about as many candidates as without, and finds the same."""
+"""Agents far away from all others do not change which neighbours are found, nor add many candidates."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def flock(dimension: int = 2, count: int = COUNT) -> Scene:
 
 
 def placed(scene: Scene, outline: tuple[float, ...]) -> State:
-    """Agents spread evenly over a box of these edges, m."""
+    """Return a start with agents spread evenly over a box of these edges, m."""
     rng = np.random.default_rng(0)
     shape = scene.start(0).shape
     return scene.start(0).with_motion(rng.uniform(0, outline, shape), rng.normal(size=shape))
@@ -41,7 +41,7 @@ def moved(state: State, change: Any) -> State:
 
 
 def candidates(scene: Scene, state: State, steps: int = 1) -> float:
-    """Candidates that a step meets."""
+    """Return the mean number of candidates that a step tests."""
     return (scene.run(state, steps).counted("pairs") - state.counted("pairs")) / steps
 
 
@@ -68,7 +68,7 @@ def test_agents_far_away_do_not_add_candidates(how: Any, outline: tuple[float, .
     assert candidates(scene, moved(state, how)) < 2.5 * candidates(scene, state)
 
 
-def test_agents_far_away_do_not_add_candidates_in_space() -> None:
+def test_agents_far_away_do_not_add_candidates_in_3d() -> None:
     scene = flock(dimension=3)
     state = placed(scene, (50, 50, 50))
     for how in (FAR["one far along each axis"], FAR["two clusters 1,000 km apart"]):
@@ -77,7 +77,7 @@ def test_agents_far_away_do_not_add_candidates_in_space() -> None:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("how", FAR.values(), ids=FAR.keys())
-def test_the_same_neighbours_are_found_as_without_agents_far_away(how: Any, dimension: int) -> None:
+def test_agents_far_away_do_not_change_the_neighbours_that_are_found(how: Any, dimension: int) -> None:
     """Positions are multiples of 2^-10 m, so that moving a cluster by kilometres changes no distance in it."""
     scene = flock(dimension)
     state = placed(scene, (200, 200) if dimension == 2 else (50, 50, 50))
@@ -99,7 +99,7 @@ def _neighbours(pos: NDArray[np.float64]) -> list[frozenset[int]]:
 
 
 @pytest.mark.parametrize("count", [5000, 20000])
-def test_results_do_not_depend_on_threads_calls_or_rows(count: int) -> None:
+def test_results_do_not_depend_on_threads_calls_or_batches(count: int) -> None:
     scene = flock(count=count)
     side = 200 * (count / 5000) ** 0.5
     state = moved(placed(scene, (side, side)), FAR["one far along each axis"])

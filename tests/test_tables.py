@@ -1,4 +1,4 @@
-"""Tables: numbers that an effect's laws look up, as many as a scene calls for; another table compiles nothing."""
+"""Tables: numbers that the laws of an effect look up; a table of another length compiles nothing."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def scene_with(*effects: Any, **fields: Any) -> Scene:
 
 
 def test_every_law_looks_up_its_own_table(lookup: Any) -> None:
-    """One effect beside two behaviours; tables are of different lengths, and in reverse order of their agents."""
+    """An effect and two behaviours, with tables of different lengths, each in reverse order of the agents."""
     first, second = lookup(values=(9.0, 3.0, 2.0, 1.0)), lookup(values=(30.0, 20.0, 10.0), along=1, weight=0.5)
     third = lookup(values=(7.0, 5.0, 4.0, 4.0), along=1)
     scene = scene_with(first, Steer(behaviours=(second, third), arbitration=Blend()))
@@ -80,14 +80,14 @@ def test_another_table_compiles_nothing(lookup: Any) -> None:
     np.testing.assert_allclose(moved, [[1.0, 0.5, 0.0], [249.5, 249.0, 248.5]])
 
 
-def test_float32_counts_so_far(lookup: Any, monkeypatch: Any) -> None:
+def test_tables_beyond_the_integers_of_float32_are_refused(lookup: Any, monkeypatch: Any) -> None:
     monkeypatch.setattr(scenes, "EXACT", 1000)
     assert scene_with(lookup(values=(1.0,) * 2000)).agents == 3
     with pytest.raises(ValueError, match=r"effects: 2,0\d\d numbers: float32 counts exactly"):
         scene_with(lookup(values=(1.0,) * 2000), dtype="float32")
 
 
-def test_an_effect_without_a_table_has_none(lookup: Any) -> None:
+def test_a_scene_without_tables_has_no_numbers_of_tables(lookup: Any) -> None:
     scene = scene_with()
     assert scene.parts.tables == ()
     assert len(scene.parts.given()) == len(scene.parts.parameters())

@@ -378,7 +378,7 @@ def test_the_slower_alternative_is_retried_ever_more_seldom(monkeypatch: pytest.
 
 @pytest.mark.parametrize("faster", [0, 1])
 def test_a_single_measurement_does_not_decide_for_ever(faster: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A single slow run, or a change of which alternative is faster."""
+    """Neither a single slow run, nor an old measurement after the other alternative has become faster."""
     clock, choice, wanted = Clock(monkeypatch), thread_pool.AutoTuner(), "as"[faster]
     usual, late = (0.5, 1.0) if faster == 0 else (1.0, 0.5), 100.0
     clock.done(choice, *usual, 100)

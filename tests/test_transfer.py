@@ -1,4 +1,4 @@
-"""What accuracy buys a policy: the settings, what is kept between runs, the sentences, and the command line."""
+"""How accuracy of the physics affects a policy: settings, kept results, the verdict in words, the command line."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def results(folder: str = "results") -> Any:
 
 
 class Counted:
-    """Stands for rollout, counts the calls, and may be interrupted at one of them."""
+    """Replacement of `rollout` that counts calls and raises KeyboardInterrupt in the call `stop_at`."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, stop_at: int = 0) -> None:
         self.calls, self.stop_at, self.real = 0, stop_at, transfer_cache.rollout
@@ -57,7 +57,7 @@ class Counted:
 # --- settings
 
 
-def test_the_trained_setting_is_the_task_itself_and_others_differ_in_what_they_say() -> None:
+def test_the_trained_setting_is_the_task_itself_and_others_change_what_they_name() -> None:
     task = Pursuit()
     trained = Setting.trained(task)
     assert trained == Setting("semi_implicit_euler", "float64", 2)
@@ -68,33 +68,33 @@ def test_the_trained_setting_is_the_task_itself_and_others_differ_in_what_they_s
 
 
 @pytest.mark.parametrize("control_dt", [0.1, 0.3, 0.7])
-def test_every_number_of_steps_fits_into_a_decision(control_dt: float) -> None:
+def test_a_setting_has_its_number_of_steps_per_decision(control_dt: float) -> None:
     for steps in (1, 2, 3, 7, 1000):
         task = Setting("midpoint", "float64", steps).of(Pursuit(control_dt=control_dt, dt=control_dt))
         assert task.substeps == steps
 
 
-# --- what is measured
+# --- measured numbers
 
 
 @pytest.mark.slow
-def test_the_trained_setting_scores_what_the_comparison_says_bit_for_bit_and_again_the_same() -> None:
+def test_the_trained_setting_scores_as_in_the_comparison_bit_for_bit() -> None:
     run(*TINY, *TRAINED, "--players", "random,rules,ppo")
     task = TASKS["pursuit"]()
     field = comparison.field_of(["random", "rules", "ppo"])
-    said, _ = comparison.compare([task], field, worlds=3, resamples=100)
+    report, _ = comparison.compare([task], field, worlds=3, resamples=100)
     plan = Plan(task, (Setting.trained(task),), tuple(field), 3, 0, 2)
     for (_, name), cell in transfer_cache.played(plan).items():
-        assert cell.returns.tolist() == said["tasks"]["pursuit"]["players"][name]["returns"]
+        assert cell.returns.tolist() == report["tasks"]["pursuit"]["players"][name]["returns"]
     about = results()["tasks"]["pursuit"]
     assert about["again"] == {"random": 0.0, "rules": 0.0, "ppo": 0.0}
     [setting] = about["settings"].values()
     assert [setting["players"]["ppo"][key] for key in ("difference", "ci_low", "ci_high")] == [0, 0, 0]
-    assert results()["world_seeds"]["first"] == said["world_seeds"]["first"]
+    assert results()["world_seeds"]["first"] == report["world_seeds"]["first"]
 
 
 @pytest.mark.slow
-def test_methods_of_second_order_err_less_and_the_costs_are_told() -> None:
+def test_methods_of_second_order_have_less_error_and_costs_are_reported() -> None:
     run(*TINY, "--players", "rules", "--methods", "semi_implicit_euler,midpoint", "--substeps", "1,4")
     found = results()["tasks"]["pursuit"]["settings"]
     assert next(iter(found)) == "semi_implicit_euler /2"
@@ -109,42 +109,42 @@ def test_methods_of_second_order_err_less_and_the_costs_are_told() -> None:
 
 
 @pytest.mark.slow
-def test_float32_plays_the_same_worlds() -> None:
+def test_float32_uses_the_same_worlds() -> None:
     run(*TINY, "--players", "rules", "--methods", "semi_implicit_euler:float32", "--substeps", "2")
     other = results()["tasks"]["pursuit"]["settings"]["semi_implicit_euler float32 /2"]
     assert other["dtype"] == "float32"
     assert 0 < abs(other["players"]["rules"]["difference"]) < 0.5
 
 
-# --- what is kept
+# --- kept results
 
 
 @pytest.mark.slow
-def test_the_same_command_goes_on_after_an_interruption_and_plays_nothing_twice(
+def test_an_interrupted_command_continues_and_plays_nothing_twice(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    asked = (*TINY, "--players", "random,rules", "--methods", "semi_implicit_euler", "--substeps", "1,2")
-    cells = 2 * 2 + 2  # settings times players, and the trained setting again
+    request = (*TINY, "--players", "random,rules", "--methods", "semi_implicit_euler", "--substeps", "1,2")
+    cells = 2 * 2 + 2  # settings times players, and the trained setting once more
     first = Counted(monkeypatch, stop_at=4)
-    result = run(*asked, code=130)
+    result = run(*request, code=130)
     assert "interrupted; what was played is in" in result.stderr
     assert len(list(KEPT.rglob("*.json"))) == 3
     assert not Path("results").exists()
     monkeypatch.setattr(transfer_cache, "rollout", first.real)
     second = Counted(monkeypatch)
-    run(*asked)
+    run(*request)
     assert second.calls == cells - 3
     kept = {path: path.read_bytes() for path in KEPT.rglob("*.json")}
     before = results()
-    run(*asked)
+    run(*request)
     assert second.calls == cells - 3
     assert {path: path.read_bytes() for path in KEPT.rglob("*.json")} == kept
     after = results()
-    assert after["tasks"] == before["tasks"]  # times too: no round is run twice
+    assert after["tasks"] == before["tasks"]  # also the times: no round is run twice
 
 
 @pytest.mark.slow
-def test_more_rounds_are_added_to_those_that_are_kept() -> None:
+def test_more_rounds_are_added_to_the_kept_ones() -> None:
     run(*TINY, *TRAINED, "--players", "random")
     [path] = KEPT.rglob("clock-*.json")
     before = json.loads(path.read_text())["rounds"]
@@ -167,52 +167,52 @@ DAMAGED = [
 ]
 
 
-def test_a_kept_file_that_is_damaged_is_named_in_one_line() -> None:
-    asked = (*TINY, *TRAINED, "--players", "rules")
-    run(*asked)
+def test_a_damaged_kept_file_is_named_in_one_line() -> None:
+    request = (*TINY, *TRAINED, "--players", "rules")
+    run(*request)
     for name, content in DAMAGED:
         [path] = KEPT.rglob(name)
         before = path.read_bytes()
         path.write_text(content, encoding="utf-8")
-        said = run(*asked, code=2).stderr
-        assert said.startswith(f"transfer: {path} is damaged: ") and said.count("\n") == 1, said
+        error = run(*request, code=2).stderr
+        assert error.startswith(f"transfer: {path} is damaged: ") and error.count("\n") == 1, error
         path.write_bytes(before)
     path.unlink()
-    run(*asked)
+    run(*request)
 
 
 @pytest.mark.slow
-def test_a_player_that_has_changed_plays_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_changed_player_is_played_again(monkeypatch: pytest.MonkeyPatch) -> None:
     counted = Counted(monkeypatch)
-    asked = (*TINY, *TRAINED, "--players", "mine.py")
+    request = (*TINY, *TRAINED, "--players", "mine.py")
     Path("mine.py").write_text(STILL)
-    run(*asked)
+    run(*request)
     assert counted.calls == 2
-    run(*asked)
+    run(*request)
     assert counted.calls == 2
     Path("mine.py").write_text(STILL.replace("0 *", "0.5 +  0 *"))
-    run(*asked)
+    run(*request)
     assert counted.calls == 4
 
 
 @pytest.mark.slow
-def test_two_processes_find_what_one_finds() -> None:
-    asked = ("--players", "random,rules", "--methods", "semi_implicit_euler,midpoint", "--substeps", "2")
-    run(*TINY, *asked)
+def test_results_do_not_depend_on_the_number_of_processes() -> None:
+    request = ("--players", "random,rules", "--methods", "semi_implicit_euler,midpoint", "--substeps", "2")
+    run(*TINY, *request)
     alone = {path.name: path.read_bytes() for path in KEPT.rglob("*.json") if "clock" not in path.name}
     for path in KEPT.rglob("*.json"):
         path.unlink()
-    run(*TINY, *asked, "--workers", "2")
+    run(*TINY, *request, "--workers", "2")
     assert {path.name: path.read_bytes() for path in KEPT.rglob("*.json") if "clock" not in path.name} == alone
 
 
-# --- what is said
+# --- verdicts, page and picture
 
 LUCK = np.random.default_rng(0).normal(size=60)
 
 
 def made_up(policy: Any, error_mm: tuple[float, float] = (80.0, 0.5), *rounds: tuple[float, float]) -> Any:
-    """Results of two settings: the trained one, in which the policy scores LUCK + 10, and RK4, in which it does so."""
+    """Return results of two settings: the policy scores LUCK + 10 in the trained one, and `policy` in RK4."""
     task = Pursuit()
     settings = (Setting.trained(task), Setting("rk4", "float64", 4))
     scores = {
@@ -231,17 +231,19 @@ def made_up(policy: Any, error_mm: tuple[float, float] = (80.0, 0.5), *rounds: t
     return transfer_report.task_results(task, settings, cells, clock, again, 500, 0)
 
 
-def test_the_sentence_says_what_survives_and_what_accuracy_costs() -> None:
+def test_the_verdict_reports_survival_and_the_cost_of_accuracy() -> None:
     noise = 0.01 * np.random.default_rng(1).normal(size=60)
-    said = made_up(LUCK + 9.8 + noise - noise.mean())["verdict"]
-    assert said.startswith("pursuit: ppo survives every setting: in its worst setting (rk4, dt 0.025 s) it loses 0.2")
-    assert "keeps 98 % of its lead over random" in said
-    assert "solved to 0.5 mm (rk4, dt 0.025 s; trained: 80 mm) it loses 0.2" in said
-    assert "and is ahead of rules (0.8" in said
-    assert said.endswith("(rk4, dt 0.025 s: 0.5 mm) costs 3.00 times the time; no other has less error.")
+    verdict = made_up(LUCK + 9.8 + noise - noise.mean())["verdict"]
+    assert verdict.startswith(
+        "pursuit: ppo survives every setting: in its worst setting (rk4, dt 0.025 s) it loses 0.2"
+    )
+    assert "keeps 98 % of its lead over random" in verdict
+    assert "solved to 0.5 mm (rk4, dt 0.025 s; trained: 80 mm) it loses 0.2" in verdict
+    assert "and is ahead of rules (0.8" in verdict
+    assert verdict.endswith("(rk4, dt 0.025 s: 0.5 mm) costs 3.00 times the time; no other has less error.")
 
 
-def test_the_sentence_does_not_hide_that_a_policy_fails_or_that_nothing_is_known() -> None:
+def test_the_verdict_reports_failures_and_uncertainty() -> None:
     lost = made_up(LUCK + 2)
     assert "ppo does not survive every setting: " in lost["verdict"]
     assert "it loses 8.000 [8.000, 8.000]" in lost["verdict"]
@@ -256,13 +258,13 @@ def test_the_sentence_does_not_hide_that_a_policy_fails_or_that_nothing_is_known
     assert "costs 1.05 times the time (rounds overlap); no other" in better
 
 
-def test_of_settings_without_error_the_cheapest_is_named() -> None:
+def test_the_cheapest_of_the_settings_without_error_is_named() -> None:
     about = made_up(LUCK + 10, error_mm=(1e-9, 1e-12))
     assert transfer_report.finest(about) == about["trained"]
     assert "solved to rounding (semi_implicit_euler, dt 0.05 s" in about["verdict"]
 
 
-def test_the_page_holds_a_row_per_setting_and_the_trained_one_again() -> None:
+def test_the_page_has_a_row_per_setting_and_repeats_the_trained_one() -> None:
     about = {"worlds": 60, "world_seeds": {"first": 1, "last": 60}, "versions": {"python": "3"}}
     page = transfer_report.markdown({
         "tasks": {"pursuit": made_up(LUCK + 9.8)}, **about, "machine": {"system": "here", "cores": 2},
@@ -285,12 +287,12 @@ def test_the_picture_is_centred_on_the_trained_setting() -> None:
     assert [text.get_text() for text in heat.texts] == ["trained", "+0.2"]
     assert [label.get_text() for label in heat.get_xticklabels()] == ["0.05", "0.025"]
     colours = shades.get_cmap()(shades.norm([-0.2, 0.0, 0.2]))
-    assert np.ptp(colours[1][:3]) < 0.05, "no difference has no colour"
-    assert colours[0][0] > colours[0][2], "losses are red"
-    assert colours[2][2] > colours[2][0], "gains are blue"
+    assert np.ptp(colours[1][:3]) < 0.05, "no difference must have no colour"
+    assert colours[0][0] > colours[0][2], "losses must be red"
+    assert colours[2][2] > colours[2][0], "gains must be blue"
 
 
-def test_players_of_one_task_alone_are_in_the_legend_in_a_colour_of_their_own() -> None:
+def test_players_of_a_single_task_have_their_own_colour_in_the_legend() -> None:
     tasks = {"pursuit": made_up(LUCK + 10.2)}
     for name in ("orca", "queueing"):
         tasks[name] = json.loads(json.dumps(tasks["pursuit"]).replace("rules", name))
@@ -304,26 +306,26 @@ def test_players_of_one_task_alone_are_in_the_legend_in_a_colour_of_their_own() 
 # --- the command line
 
 
-def test_the_usual_players_are_those_of_the_tasks_that_are_played(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_default_players_exist_for_the_tasks_that_are_played(monkeypatch: pytest.MonkeyPatch) -> None:
     Counted(monkeypatch, stop_at=1)
     assert transfer.STOPPED in run(*TINY, *TRAINED, code=130).stderr
 
 
 @pytest.mark.slow
-def test_a_hand_written_player_sits_out_the_tasks_that_it_is_not_written_for() -> None:
+def test_a_hand_written_player_plays_only_its_own_tasks() -> None:
     run("crossing", *TINY, *TRAINED, "--players", "random,orca")
     found = {task: list(about["again"]) for task, about in results()["tasks"].items()}
     assert found == {"crossing": ["random", "orca"], "pursuit": ["random"]}
 
 
-def test_a_folder_in_the_place_of_a_file_is_refused_before_anything_is_played(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_in_place_of_a_file_is_refused_before_anything_is_played(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(transfer_cache, "rollout", lambda *_, **__: pytest.fail("something was played"))
     Path("results/transfer.md").mkdir(parents=True)
     assert "transfer.md': is a folder" in run(*TINY, code=2).stderr
 
 
 @pytest.mark.slow
-def test_all_files_come_out_of_one_run() -> None:
+def test_one_run_writes_all_files() -> None:
     result = run(*TINY, *TRAINED, "--players", "random,rules", "--out", "here/out")
     assert sorted(path.name for path in Path("here/out").iterdir()) == FILES
     assert results("here/out")["tasks"]["pursuit"]["verdict"] in " ".join(result.stdout.split())
@@ -348,7 +350,7 @@ def test_all_files_come_out_of_one_run() -> None:
         (("--out", "../x"), "--out '../x': must not go up"),
     ],
 )
-def test_bad_requests_are_refused_in_one_line(
+def test_bad_arguments_are_refused_in_one_line(
     arguments: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(transfer_cache, "rollout", lambda *_, **__: pytest.fail("something was played"))
@@ -360,12 +362,12 @@ def test_bad_requests_are_refused_in_one_line(
     assert not list(Path.cwd().rglob("*"))
 
 
-def test_a_method_that_leaves_the_kernel_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_method_that_solves_equations_in_python_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(RK4, "solves", True)
     line = run("--methods", "rk4", code=2).stderr
     assert "--methods 'rk4': no method of a task" in line
     assert "midpoint" in line
 
 
-def test_the_usual_methods_exist() -> None:
+def test_the_default_methods_exist() -> None:
     assert {name.partition(":")[0] for name in transfer.METHODS} <= set(INTEGRATORS)

@@ -1,4 +1,4 @@
-"""Vicsek's flock: the map of one step to the last digit, and its curve of order over noise."""
+"""Vicsek's model: the map of one step to rounding, and the curve of order over noise."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def flock(noise: float, count: int = 400, **fields: object) -> Scene:
-    """So many at Vicsek's density."""
+    """Return the scene of the experiment with `count` agents, at Vicsek's density."""
     return scene_of(noise, count).model_copy(update=fields)
 
 
-def test_the_scene_of_configs_is_the_experiments() -> None:
+def test_the_scene_in_configs_is_that_of_the_experiment() -> None:
     assert load_scene(ROOT / "configs" / "scenes" / "vicsek.yaml") == scene_of(1.0)
 
 
 def drawn_for(key: int, step: int, agent: int) -> float:
-    """What `noise.uniform` draws, in Python's whole numbers."""
+    """Return what `noise.uniform` draws, computed with Python integers."""
     return float(_mix(_mix(_mix(key, step), agent), CHANNEL) >> 11) * 2.0**-53
 
 
 def mapped(scene: Scene, state: State) -> tuple[Array, Array]:
-    """Positions and velocities after one update of the paper, in numpy: everybody asks everybody."""
+    """Return positions and velocities after one update of the paper, in numpy, over all pairs."""
     effect = scene.effects[0]
     assert isinstance(effect, Vicsek)
     x, v = state.pos[0], state.vel[0]
@@ -53,8 +53,8 @@ def mapped(scene: Scene, state: State) -> tuple[Array, Array]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", [ExplicitEuler(), SemiImplicitEuler()], ids=lambda m: m.kind)
-def test_a_step_is_the_papers_map(method: ExplicitEuler | SemiImplicitEuler) -> None:
-    """Five steps, each from the one before: sums of the same velocities, the same errors, to rounding."""
+def test_a_step_is_the_map_of_the_paper(method: ExplicitEuler | SemiImplicitEuler) -> None:
+    """Five steps, each from the state before, with the same noise; equal to rounding."""
     scene = flock(2.0, integrator=method)
     state = scene.start(7)
     for _ in range(5):
@@ -66,7 +66,7 @@ def test_a_step_is_the_papers_map(method: ExplicitEuler | SemiImplicitEuler) -> 
 
 
 @pytest.mark.slow
-def test_without_noise_neighbours_agree_and_the_lone_fly_on() -> None:
+def test_without_noise_neighbours_align_and_isolated_agents_fly_straight_on() -> None:
     scene = flock(0.0, count=100)
     state = scene.start(0)
     x, v = np.array(state.pos), np.array(state.vel)
@@ -82,41 +82,43 @@ def test_without_noise_neighbours_agree_and_the_lone_fly_on() -> None:
     start = alone.start(1)
     np.testing.assert_allclose(alone.run(start, 10).vel, start.vel, rtol=1e-12)
     rest = alone.step(start.with_motion(start.pos, 0 * start.vel))
-    assert (rest.vel == 0).all()  # and is not torn anywhere
+    assert (rest.vel == 0).all()  # without a velocity it gets no direction
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"integrator": Heun()}, "kind = vicsek: is a map from step to step, integrator.kind = heun"),
         ({"dt": 0.5}, r"step = 1: dt = 0\.5 s, must be the same"),
         ({"dimension": 3, "space": Torus(size=(9.0, 9.0, 9.0))}, "kind = vicsek: dimension = 3, must be 2"),
     ],
 )
-def test_what_is_no_step_of_the_map_is_refused_in_one_line(change: dict[str, object], said: str) -> None:
+def test_scenes_that_are_not_the_map_of_the_paper_are_refused_in_one_line(
+    change: dict[str, object], message: str
+) -> None:
     given = {"space": Torus(size=(9.0, 9.0)), "integrator": ExplicitEuler(), "dt": 1.0, **change}
     effect = Vicsek(speed=0.03, radius=1, noise=1)
-    with pytest.raises(ValueError, match=rf"effects\[0\]\.{said}") as caught:
+    with pytest.raises(ValueError, match=rf"effects\[0\]\.{message}") as caught:
         Scene(groups=(Group(count=3, spawn=Spawn()),), effects=(effect,), **given)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.slow
-def test_noise_takes_order_away() -> None:
+def test_noise_lowers_order() -> None:
     found = [order(flock(noise), 1000, 300).mean() for noise in (0.1, 2.0, 2 * math.pi)]
     assert found == pytest.approx([0.9994, 0.779, 0.044], abs=0.1)
 
 
 @pytest.mark.slow
-def test_with_the_old_velocity_there_is_more_order_near_the_transition() -> None:
-    """.28 and not .20 at eta = 4: a separate loop with draws of its own found .29 (.32, .27) and .21 (.208, .209)."""
+def test_moving_with_the_old_velocity_raises_order_near_the_transition() -> None:
+    """.28 instead of .20 at eta = 4; an independent loop with other draws found .29 (.32, .27) and .21 (.208, .209)."""
     found = float(order(flock(4.0, integrator=ExplicitEuler()), 3000, 8000).mean())
     assert found == pytest.approx(0.282, abs=0.035)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", [*SEEN])
-def test_the_curve_is_vicseks(noise: float) -> None:
+def test_the_curve_of_order_is_vicseks(noise: float) -> None:
     found = float(order(flock(noise), 3000, 8000).mean())
     assert found == pytest.approx(SEEN[noise], abs=0.04)
-    assert found <= bound(noise, 400) + 0.001  # without order it is the bound, on average
+    assert found <= bound(noise, 400) + 0.001  # without order it equals the bound on average

@@ -1,4 +1,4 @@
-"""A wall that pushes: closed forms (Kretz), and what it refuses; symmetries: test_effects.py."""
+"""Wall repulsion: closed forms (Kretz), and refused arguments. Its symmetries are tested in test_effects.py."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MASS = 80.0
 
 
 def approach(speed: float, tau: float, decay: float, strength: float, normal: Any = (-2.0, 0.0)) -> Scene:
-    """Somebody walks along x towards a wall at x = 5 m: m x'' = m (v0 - x') / tau - A exp(-d / B)."""
+    """Return an agent that walks along x to a wall at x = 5 m: m x'' = m (v0 - x') / tau - A exp(-d / B)."""
     effects = (
         Drag(rate=MASS / tau),
         Uniform(strength=(MASS * speed / tau, 0.0)),
@@ -32,7 +32,7 @@ def approach(speed: float, tau: float, decay: float, strength: float, normal: An
     ("speed", "tau", "decay", "oscillates"),
     [(0.8, 0.5, 0.08, True), (1.34, 0.05, 0.5, False), (1.0, 0.05, 0.2, False), (1.0, 0.2, 0.1, True)],
 )
-def test_whether_somebody_swings_before_a_wall_is_a_matter_of_the_model(
+def test_an_agent_oscillates_in_front_of_a_wall_as_the_formula_predicts(
     speed: float, tau: float, decay: float, oscillates: bool
 ) -> None:
     """P11, N13: no sign change of velocity iff v0 tau / B <= 1/4; the gap is B ln(A tau / (m v0))."""
@@ -54,7 +54,7 @@ def test_whether_somebody_swings_before_a_wall_is_a_matter_of_the_model(
 
 
 @pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
-def test_the_force_is_the_formula_on_both_sides_and_the_gradient_of_its_potential(dtype: str) -> None:
+def test_the_force_is_the_formula_and_the_gradient_of_its_potential(dtype: str) -> None:
     wall = WallRepulsion(point=(5.0, -3.0), normal=(-3.0, 4.0), strength=70.0, decay=0.8)
     spawn = Spawn(low=(3, -4), high=(6, -2))
     scene = Scene(groups=(Group(count=50, mass=2, spawn=spawn),), effects=(wall,), dtype=dtype)
@@ -75,7 +75,7 @@ def test_the_force_is_the_formula_on_both_sides_and_the_gradient_of_its_potentia
 
 
 @pytest.mark.parametrize(
-    ("fields", "said"),
+    ("fields", "message"),
     [
         ({"normal": (0, 0)}, "normal = (0.0, 0.0): must be a direction"),
         ({"normal": (1e-200, 0)}, "normal[0] = 1e-200"),
@@ -84,15 +84,15 @@ def test_the_force_is_the_formula_on_both_sides_and_the_gradient_of_its_potentia
         ({"strength": -1}, "strength = -1"),
     ],
 )
-def test_what_is_no_wall_is_refused_in_one_line(fields: Any, said: str) -> None:
+def test_invalid_walls_are_refused_in_one_line(fields: Any, message: str) -> None:
     good = {"point": (0, 0), "normal": (0, 1), "strength": 1, "decay": 1}
     with pytest.raises(ValueError, match="WallRepulsion") as caught:
         WallRepulsion(**{**good, **fields})
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_a_torus_has_no_wall_and_a_box_may_have_one() -> None:
+def test_walls_are_refused_on_a_torus_and_allowed_in_a_box() -> None:
     wall = WallRepulsion(point=(0, 0), normal=(0, 1), strength=1, decay=1)
     scene = Scene(space=Box(size=(9, 9)), groups=(Group(count=1),), effects=(wall,))
     with pytest.raises(ValueError, match=r"effects\[0\].kind = wall_repulsion: on a torus") as caught:

@@ -457,9 +457,7 @@ def test_portions_cover_all_worlds_and_never_grow(worlds: int, team: int) -> Non
     size = end - first
     assert (size > 0).all() and (np.diff(size) <= 0).all()
     assert len(size) <= 8 * team + 8
-    assert size[-min(team, len(size)) :].sum() <= max(
-        worlds / 8, team
-    )  # the last ones are small: threads end at about the same time
+    assert size[-min(team, len(size)) :].sum() <= max(worlds / 8, team)  # small at last: threads end together
 
 
 # --- actions ----------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""What tests of training share."""
+"""Experiments and helpers that tests of training share."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ SCHOOL = Experiment(
         "central_critic": True, "care": 1.0, "taught": 3, "critic_first": 600, "stagger": True,
     },
 )  # fmt: skip
-"""Everything of training that has a memory of its own."""
+"""Experiment with every part of training that has state of its own, which an interrupted run must restore."""
 
 
 def interrupt(experiment: Experiment, folder: Path, points: int = 1) -> None:
-    """Train, and press Ctrl-C where the point of the curve after so many is to be measured."""
+    """Train until `points` points of the curve are measured, then raise KeyboardInterrupt as Ctrl-C would."""
     from agents import ppo  # with torch
 
     measure, measured = ppo.score, 0
