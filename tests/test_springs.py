@@ -309,7 +309,7 @@ def test_frequencies_of_lumped_elements_are_those_of_a_scene() -> None:
 @pytest.mark.slow
 @DIMENSIONS
 def test_results_do_not_depend_on_the_number_of_threads(dimension: int) -> None:
-    """A large world that threads share gives the same bits, and so do several calls."""
+    """Several calls also give the same bits as one."""
     size = (90, 80)
     edges = ((9.0, 0.0, 0.0), (0.0, 8.0, 0.0)) if dimension == 3 else ((9.0, 0.0), (0.0, 8.0))
     net = Cloth(cells=size, edges=edges, pinned=("corners",), stretch=1.05)
@@ -348,7 +348,7 @@ def test_springs_do_not_act_on_other_groups() -> None:
 
 
 class Limp(Springs):
-    """Springs without rates: their bonds are first needed when the table of the kernel is made."""
+    """Springs without rates: their bonds are first needed for the table of the kernel."""
 
     kind: str  # type: ignore[assignment]  # without a default it is not registered
 

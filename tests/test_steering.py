@@ -80,14 +80,14 @@ def extremes(row: Law, dimension: int) -> list[Array]:
     choices = [sizes.get(kind, headings if kind == "heading" else (1.0,)) for kind in row.takes]
     grid = np.stack([g.ravel() for g in np.meshgrid(*choices, indexing="ij")], axis=1)
     grid = np.repeat(grid, 8, axis=0)
-    made = []
+    arrays = []
     for k, kind in enumerate(row.takes):
         directions = rng.normal(size=(len(grid), dimension))
         directions[::4] = np.eye(dimension)[0]  # aligned with each other and with an axis
         directions[1::4] = np.eye(dimension)[-1]  # vertical in 3-D
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        made.append(grid[:, k, None] * directions if kind in VECTORS else grid[:, k])
-    return made
+        arrays.append(grid[:, k, None] * directions if kind in VECTORS else grid[:, k])
+    return arrays
 
 
 @DIMENSIONS
@@ -113,7 +113,7 @@ def test_laws_stay_in_single_precision_and_accurate(dimension: int) -> None:
             tuple(arrays), answer
         )
     for row, answer, expected in zip(STEERING, answers, exact, strict=True):
-        assert (answer.astype(np.float32) == answer).all(), f"a constant has made {row.name} float64"
+        assert (answer.astype(np.float32) == answer).all(), f"a constant promotes {row.name} to float64"
         here = np.isfinite(expected)
         assert (here == np.isfinite(answer)).all()
         np.testing.assert_allclose(answer[here], expected[here], rtol=2e-5, atol=2e-5, err_msg=row.name)
@@ -221,11 +221,11 @@ def test_pursue_with_the_exact_predictor_intercepts_on_a_straight_path(dimension
         p = w * t - x
         return rows(steering.pursue)(p, v, w, 2.0, rows(steering.interception_time)(p, w, 2.0))
 
-    met = np.full(len(x), np.inf)
+    reached = np.full(len(x), np.inf)
     for t, now, _ in steer(chase, x, 2 * aim / 2, dt=0.02, seconds=20, strength=1e9):
         near = np.linalg.norm(w * t - now, axis=1) < 0.1
-        met[near] = np.minimum(met[near], t)
-    early = meeting - met  # 0.1 m are closed at 0.5 to 3.5 m/s
+        reached[near] = np.minimum(reached[near], t)
+    early = meeting - reached  # 0.1 m are closed at 0.5 to 3.5 m/s
     assert early.min() > 0
     assert early.max() < 0.1 / 0.5 + 0.02
 

@@ -75,7 +75,7 @@ def test_a_warning_of_unsolved_contacts_makes_the_verdict_warned() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ONCE)
 @pytest.mark.parametrize("method", [SemiImplicitEuler(), VelocityVerlet(), RK4()], ids=lambda method: method.kind)
-def test_other_methods_have_the_known_verdicts(method: Integrator, name: str) -> None:
+def test_semi_implicit_euler_verlet_and_rk4_have_the_known_verdicts(method: Integrator, name: str) -> None:
     as_known(name, method)
 
 

@@ -202,7 +202,9 @@ def test_one_call_of_many_steps_equals_many_calls_of_one_step(name: str) -> None
     assert_same(scene.step(start, drive=drive, steps=4), expected)
     use_threads(2)
     assert_same(scene.step(start, drive=drive, steps=4), expected)
-    assert not np.array_equal(np.argsort(start.x[0, 0]), np.argsort(expected.x[0, 0]))  # they changed places
+    assert not np.array_equal(
+        np.argsort(start.x[0, 0]), np.argsort(expected.x[0, 0])
+    )  # their order in space has changed
 
 
 def test_a_team_reorders_smaller_worlds_than_one_thread_does() -> None:
@@ -378,7 +380,7 @@ def test_the_slower_alternative_is_retried_ever_more_seldom(monkeypatch: pytest.
 
 @pytest.mark.parametrize("faster", [0, 1])
 def test_a_single_measurement_does_not_decide_for_ever(faster: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neither a single slow run, nor an old measurement after the other alternative has become faster."""
+    """A single slow run is forgotten, and the choice changes when the other alternative becomes faster."""
     clock, choice, wanted = Clock(monkeypatch), thread_pool.AutoTuner(), "as"[faster]
     usual, late = (0.5, 1.0) if faster == 0 else (1.0, 0.5), 100.0
     clock.done(choice, *usual, 100)
@@ -492,7 +494,7 @@ def test_nan_in_a_batch_is_found_in_its_first_world(count: int) -> None:
 
 
 def at_the_same_time(calls: list[Callable[[], Any]]) -> list[Any]:
-    """Call each in a thread of its own and return the results; fail if one takes longer than PATIENCE."""
+    """Call each in its own thread and return the results; fail if one takes longer than PATIENCE."""
     pool = ThreadPoolExecutor(len(calls))
     try:
         return [future.result(PATIENCE) for future in [pool.submit(call) for call in calls]]
@@ -649,7 +651,7 @@ def test_threads_run_on_any_core_if_there_are_more_threads_than_cores() -> None:
 
 @LINUX
 def test_pool_threads_stay_on_the_cores_of_a_pinned_caller(cores: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever their affinity was before; they avoid its core again once the caller may use several."""
+    """With any affinity before. They avoid its core again once the caller may use several cores."""
 
     def calls() -> list[set[int]]:
         seen = []

@@ -57,7 +57,7 @@ class Counted:
 # --- settings
 
 
-def test_the_trained_setting_is_the_task_itself_and_others_change_what_they_name() -> None:
+def test_the_trained_setting_is_the_task_and_others_replace_method_dtype_and_step() -> None:
     task = Pursuit()
     trained = Setting.trained(task)
     assert trained == Setting("semi_implicit_euler", "float64", 2)

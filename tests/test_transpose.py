@@ -18,16 +18,16 @@ def compiled(length: int, width: int) -> Any:
     numbers = range(length - 1)
     sources, places = "lanes, " * len(numbers), "".join(f"np.uint64(at + {k * width}), " for k in numbers)
     taken = "".join(f"np.uint64(at + {k * width}), " for k in range(-1, length - 1))
-    made: dict[str, Any] = {"np": np, "put_records": put_records, "out_of_records": out_of_records}
+    namespace: dict[str, Any] = {"np": np, "put_records": put_records, "out_of_records": out_of_records}
     exec(  # noqa: S102  # the number of sources is part of a type
         "def put(records, lanes, at, cell, first, offset, spare):\n"
         f"    put_records(records, ({sources}), ({places}), {width}, cell, np.uint64(first), offset, np.uint64(spare)"
         ")\n"
         "def take(lanes, at, first, records):\n"
         f"    out_of_records(lanes, ({taken}), np.uint64(first), {width}, records)\n",
-        made,
+        namespace,
     )
-    return numba.njit(made["put"]), numba.njit(made["take"])
+    return numba.njit(namespace["put"]), numba.njit(namespace["take"])
 
 
 @pytest.mark.parametrize("length", LENGTHS)
@@ -63,11 +63,11 @@ def test_lines_are_transposed_lanes(dtype: str, width: int, count: int) -> None:
     side = LINE // np.dtype(dtype).itemsize
     length = max(-(-count // side) * side, side)
     sources, places = "lanes, " * count, "".join(f"np.uint64(at + {k * width}), " for k in range(count))
-    made: dict[str, Any] = {"np": np, "put_lines": put_lines}
+    namespace: dict[str, Any] = {"np": np, "put_lines": put_lines}
     exec(  # noqa: S102  # the number of sources is part of a type
         "def put(lines, lanes, at, to, first, spare):\n"
         f"    put_lines(lines, ({sources}), ({places}), {width}, to, np.uint64(first), {length}, np.uint64(spare))\n",
-        made,
+        namespace,
     )
     rng, n = np.random.default_rng(count), 3 * width
     raw = np.full((n + 2) * length + side, -7, dtype)
@@ -76,7 +76,7 @@ def test_lines_are_transposed_lanes(dtype: str, width: int, count: int) -> None:
     lanes = rng.random((count + 1) * width).astype(dtype)
     to = rng.permutation(n).astype(np.int32)
     to[width + 2] = -1  # its numbers go to the spare place
-    numba.njit(made["put"])(lines, lanes, width, to, width, n)
+    numba.njit(namespace["put"])(lines, lanes, width, to, width, n)
     found = lines.reshape(n + 1, length)
     here = to[width : 2 * width]
     np.testing.assert_array_equal(found[here, :count], lanes.reshape(count + 1, width)[1:].T)

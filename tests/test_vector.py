@@ -54,7 +54,7 @@ def masked(ended, mode):
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("env_id", SINGLE)
-def test_it_equals_the_vector_of_single_environments_of_gymnasium(env_id, mode):
+def test_results_equal_those_of_gymnasiums_vector_of_single_environments(env_id, mode):
     """Observations, rewards, ends, every info and its mask, over episodes that terminate or are truncated."""
     options = {"max_episode_steps": 40, **EASY[env_id]}
     native = gymnasium.make_vec(env_id, 4, autoreset_mode=mode, **options)

@@ -147,7 +147,7 @@ def test_a_fence_follows_all_streaming_stores() -> None:
 
 
 def test_streaming_stores_are_used_for_large_results_only() -> None:
-    """Not if one world's observations exceed a core's cache: they would go to memory twice."""
+    """Except if one world's observations exceed a core's cache: they would go to memory twice."""
     size = 4 * Obstacles().layout.size
     few, many = World(Obstacles(), (PAST - 1) // size), World(Obstacles(), -(-PAST // size))
     assert (few._past, many._past) == (False, True)
