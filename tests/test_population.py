@@ -1,4 +1,4 @@
-"""Who is born and who dies: exactly so many, whenever, whatever dt, order, batch or number of threads there is."""
+"""Births and deaths: exact numbers, independent of dt, order, batch and number of threads."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ G = 9.81
 
 
 def scene(*members: Any, count: int = 400, g: float = 0.0, **fields: Any) -> Scene:
-    """Particles that fall, or do not: one kernel for most of these tests."""
+    """Return a scene of particles under gravity g; one kernel serves most of these tests."""
     fields = {"groups": (Group(count=count, **fields.pop("group", {})),), "dt": 0.02, **fields}
     return Scene(effects=(Gravity(acceleration=(0.0, -g)),), population=members, **fields)
 
 
 def living(state: State, world: int = 0) -> dict[int, tuple[float, ...]]:
-    """Who lives: identity -> born, pos, vel."""
+    """Return the living agents: identity -> (born, pos, vel)."""
     here = np.flatnonzero(state.alive[world])
     return {
         int(state.identity[world, i]): (state.born[world, i], *state.pos[world, i], *state.vel[world, i]) for i in here
@@ -65,17 +65,17 @@ def living(state: State, world: int = 0) -> dict[int, tuple[float, ...]]:
 
 
 def same(one: State, other: State) -> None:
-    """Refuse two states that differ in a bit."""
+    """Assert that two states are equal to the last bit."""
     for name, value in vars(one).items():
         np.testing.assert_array_equal(value, getattr(other, name), err_msg=name)
 
 
-# --- when ------------------------------------------------------------------------------------------------------------
+# --- times of birth --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dt", DTS)
 @pytest.mark.parametrize("rate", [0.7, 10.0, 60.0, 234.5])
-def test_so_many_are_born_whatever_dt_is(dt: float, rate: float) -> None:
+def test_the_number_of_births_is_rate_times_duration_for_every_dt(dt: float, rate: float) -> None:
     start, end = 0.25, 2.0
     fountain = scene(
         Emitter(place=ORIGIN, rate=rate), Emitter(place=ORIGIN, rate=rate, start=start, end=end), count=8000, dt=dt
@@ -89,8 +89,8 @@ def test_so_many_are_born_whatever_dt_is(dt: float, rate: float) -> None:
         assert state.counted("births") == expected == state.alive.sum()
 
 
-def test_a_birth_is_the_same_for_every_dt() -> None:
-    """Without forces everybody is where his own time of birth says: no birth waits for the end of a step."""
+def test_births_do_not_depend_on_dt() -> None:
+    """No birth waits for the end of a step: without forces, positions follow from the times of birth."""
     emitters = (
         Emitter(
             place=Disc(centre=(1.0, 2.0), radius=0.5), rate=97.3, speed=(1.0, 3.0), direction=(1.0, 1.0), spread=40
@@ -106,15 +106,15 @@ def test_a_birth_is_the_same_for_every_dt() -> None:
             assert 0 <= born <= end
             assert len(motion) == 4
     assert seen[0].keys() == seen[1].keys() == seen[2].keys()
-    for who, numbers in seen[0].items():
-        np.testing.assert_allclose(numbers, seen[1][who], rtol=0, atol=1e-11)
-        np.testing.assert_allclose(numbers, seen[2][who], rtol=0, atol=1e-11)
-    k = [who for who, numbers in seen[0].items() if numbers[0] != 0.33]
-    times = sorted(seen[0][who][0] for who in k)
+    for identity, numbers in seen[0].items():
+        np.testing.assert_allclose(numbers, seen[1][identity], rtol=0, atol=1e-11)
+        np.testing.assert_allclose(numbers, seen[2][identity], rtol=0, atol=1e-11)
+    k = [identity for identity, numbers in seen[0].items() if numbers[0] != 0.33]
+    times = sorted(seen[0][identity][0] for identity in k)
     np.testing.assert_allclose(times, (1 + np.arange(len(times))) / 97.3, rtol=1e-12)
 
 
-def test_bursts_are_there_at_their_time() -> None:
+def test_bursts_are_born_in_the_step_that_reaches_their_time() -> None:
     fireworks = scene(
         Emitter(place=BoxPlace(low=(0, 0), high=(9, 9)), together=True, bursts=tuple(
             Burst(time=t, count=n) for t, n in ((0.0, 5), (0.05, 3), (0.11, 4))
@@ -127,39 +127,39 @@ def test_bursts_are_there_at_their_time() -> None:
         counts.append(int(state.alive.sum()))
     assert counts == [5, 5, 5, 8, 8, 8, 12, 12]
     places = np.unique(state.pos[0][state.alive[0]].round(12), axis=0)
-    assert len(places) == 3  # each burst in one place, and in another
+    assert len(places) == 3  # one place for each burst
 
 
 # --- slots and identities --------------------------------------------------------------------------------------------
 
 
-def test_slots_are_used_again_by_somebody_else() -> None:
+def test_slots_are_reused_under_new_identities() -> None:
     fountain = scene(Emitter(place=ORIGIN, rate=300.0, lifetime=(0.2, 0.4), speed=(1, 1)), count=100)
-    state, met = fountain.start(0), dict[int, tuple[int, float]]()
+    state, first_seen = fountain.start(0), dict[int, tuple[int, float]]()
     assert not state.alive.any()
     for _ in range(150):
         state = fountain.run(state, 1)
         for slot in np.flatnonzero(state.alive[0]):
-            who = int(state.identity[0, slot])
+            identity = int(state.identity[0, slot])
             here = (int(slot), float(state.born[0, slot]))
-            assert met.setdefault(who, here) == here  # nobody changes place, nobody comes back
+            assert first_seen.setdefault(identity, here) == here  # an identity keeps its slot and never returns
         assert len(set(state.identity[0][state.alive[0]])) == state.alive.sum()
         assert (state.age[0][state.alive[0]] <= 0.4).all()
         assert not state.vel[0][~state.alive[0]].any()
     births, deaths = state.counted("births"), state.counted("deaths")
     assert births == 900
     assert births - deaths == state.alive.sum()
-    assert len({slot for slot, _ in met.values()}) <= 100 < len(met) == births
+    assert len({slot for slot, _ in first_seen.values()}) <= 100 < len(first_seen) == births
     assert state.counted("births_refused") == 0
 
 
-def test_who_finds_no_slot_is_counted() -> None:
+def test_births_without_a_free_slot_are_refused_and_counted() -> None:
     full = scene(Emitter(place=ORIGIN, rate=100.0), count=30)
     state = full.run(full.start(0), 100)
     assert (state.counted("births"), state.counted("births_refused"), state.alive.sum()) == (30, 170, 30)
 
 
-def test_some_may_live_at_the_start() -> None:
+def test_a_group_may_start_with_some_agents_alive() -> None:
     begun = scene(Emitter(place=ORIGIN, rate=1.0), group={"alive": 3, "spawn": Spawn(low=(4, 4), high=(5, 5))}, count=9)
     state = begun.start(0)
     assert state.alive[0].tolist() == [True] * 3 + [False] * 6
@@ -171,8 +171,8 @@ def test_some_may_live_at_the_start() -> None:
 # --- laws with a closed form -----------------------------------------------------------------------------------------
 
 
-def test_as_many_live_as_are_born_within_a_lifetime() -> None:
-    for rate, life in ((200.0, 1.37), (4000.0, 0.005)):  # the latter within a step
+def test_the_number_alive_is_the_number_of_births_within_one_lifetime() -> None:
+    for rate, life in ((200.0, 1.37), (4000.0, 0.005)):  # the second lifetime is shorter than a step
         fountain = scene(Emitter(place=ORIGIN, rate=rate, lifetime=(life, life)))
         state = fountain.start(0)
         for _ in range(12):
@@ -183,11 +183,11 @@ def test_as_many_live_as_are_born_within_a_lifetime() -> None:
     rate = 200.0
     drawn = scene(Emitter(place=ORIGIN, rate=rate, lifetime=(0.5, 1.5)))
     state = drawn.run(drawn.start(0), 300)
-    assert abs(state.alive.sum() - rate) < 4 * math.sqrt(rate / 6)  # each of 200 a second lives 1 s on average
+    assert abs(state.alive.sum() - rate) < 4 * math.sqrt(rate / 6)  # 200 births a second, 1 s of life on average
 
 
-def test_a_fountain_is_as_high_as_ballistics_say() -> None:
-    """Forces act on the newborn from the next step on, which this method makes up for on average: see the docs."""
+def test_the_mean_height_of_a_fountain_is_that_of_ballistics() -> None:
+    """Forces act on newborn agents from the next step on; this method corrects for it on average (see the docs)."""
     rate, life, speed = 4000.0, 1.5, 9.0
     for dt in (0.02, 0.01):
         jet = scene(
@@ -200,7 +200,7 @@ def test_a_fountain_is_as_high_as_ballistics_say() -> None:
 
 
 @pytest.mark.parametrize("dt", [0.1, 0.02])
-def test_half_of_all_are_left_after_a_half_life(dt: float) -> None:
+def test_half_of_the_agents_are_alive_after_each_half_life(dt: float) -> None:
     half, n = 1.0, 4000
     sample = scene(Decay(rate=math.log(2) / half), count=n, group={"spawn": Spawn(low=(0, 0), high=(1, 1))}, dt=dt)
     state = sample.start(3)
@@ -210,8 +210,8 @@ def test_half_of_all_are_left_after_a_half_life(dt: float) -> None:
     assert state.counted("deaths") == n - state.alive.sum()
 
 
-def test_who_is_born_within_a_step_decays_for_as_long_as_he_lives() -> None:
-    """In steps as long as a life, at the end of which none of the newborn was asked yet."""
+def test_decay_acts_on_an_agent_from_its_birth_within_a_step() -> None:
+    """dt is the mean lifetime. Agents born in the last step are not counted: they have not decayed yet."""
     rate, decay, dt = 4000.0, 1.0, 1.0
     fountain = scene(Emitter(place=ORIGIN, rate=rate), Decay(rate=decay), count=12_000, dt=dt)
     state = fountain.run(fountain.start(1), 3)
@@ -220,11 +220,11 @@ def test_who_is_born_within_a_step_decays_for_as_long_as_he_lives() -> None:
     assert abs(old.sum() - expected) < 4 * math.sqrt(expected)
 
 
-# --- where and whither -----------------------------------------------------------------------------------------------
+# --- places and directions -------------------------------------------------------------------------------------------
 
 
 def newborn(place: Any, count: int = 4000, dimension: int = 2, space: Space | None = None, **how: Any) -> State:
-    """So many at once, before the first step: needs no kernel of a scene."""
+    """Return a state with `count` agents born before the first step, which needs no kernel of a scene."""
     emitter = Emitter(place=place, bursts=(Burst(time=0.0, count=count),), **how)
     born = Scene(dimension=dimension, groups=(Group(count=count),), population=(emitter,), space=space or Plane())
     state = born.start(2)
@@ -242,20 +242,20 @@ SURFACES: list[Shape] = [
 
 
 @pytest.mark.parametrize("shape", SURFACES, ids=lambda shape: f"{shape.kind}{shape.dimension}")
-def test_a_surface_is_drawn_from_evenly_and_left_along_its_normal(shape: Shape) -> None:
+def test_births_on_a_surface_are_uniform_and_move_along_its_normal(shape: Shape) -> None:
     state = newborn(Surface(shape=shape), dimension=shape.dimension, speed=(1, 1))
     pos, vel = state.pos[0], state.vel[0]
     np.testing.assert_allclose(shape.gap(pos), 0, atol=1e-12)
-    assert shape.gap(pos[:0]).shape == (0,)  # as of a world where nobody lives
+    assert shape.gap(pos[:0]).shape == (0,)  # as in a world without agents
     np.testing.assert_allclose(vel, shape.normal(pos + 1e-6 * vel), atol=1e-5)
-    # as many in a ball around any place as in one around another, as far as the surface there is flat
+    # balls around different places hold about as many agents, as far as the surface there is flat
     square = ((pos[:, None] - pos[None, :50]) ** 2).sum(axis=2)
     near = (square < 0.15**2).sum(axis=0)
     assert np.median(near) > 0.6 * near.max() - 12
     assert np.median(near) < 1.7 * near.min() + 12
 
 
-def test_places_are_drawn_from_evenly() -> None:
+def test_births_are_uniform_in_discs_balls_segments_and_boxes() -> None:
     disc = newborn(Disc(centre=(1.0, 2.0), radius=2.0)).pos[0] - (1.0, 2.0)
     ball = newborn(Disc(centre=(1.0, 2.0, 3.0), radius=2.0), dimension=3).pos[0] - (1.0, 2.0, 3.0)
     for offset, d in ((disc, 2), (ball, 3)):
@@ -275,7 +275,7 @@ def test_places_are_drawn_from_evenly() -> None:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_a_cone_is_filled_evenly(dimension: int) -> None:
+def test_directions_of_birth_are_uniform_in_a_cone(dimension: int) -> None:
     aim = np.array([1.0, 2.0, -2.0][:dimension])
     place = Point(at=(0.0,) * dimension)
     state = newborn(place, dimension=dimension, speed=(2, 4), direction=tuple(aim), spread=60)
@@ -284,7 +284,7 @@ def test_a_cone_is_filled_evenly(dimension: int) -> None:
     assert 2 <= speed.min() < 2.02 < 3.98 < speed.max() <= 4
     assert along.min() >= 0.5 - 1e-12
     inner = math.cos(math.pi / 6) if dimension == 2 else 0.75
-    assert abs((along > inner).mean() - 0.5) < 0.03  # half of the angle; half of the cap
+    assert abs((along > inner).mean() - 0.5) < 0.03  # half of the angle in 2D, half of the cap's area in 3D
     every = newborn(place, dimension=dimension, speed=(1, 1)).vel[0]
     assert np.abs(every.mean(axis=0)).max() < 0.05
 
@@ -297,8 +297,8 @@ def test_births_stay_in_the_space() -> None:
 
 
 @pytest.mark.slow
-def test_a_clearing_is_filled_first() -> None:
-    """Half of the box is full: hardly anybody is born there, while a box is filled alike."""
+def test_births_in_a_clearing_avoid_living_agents() -> None:
+    """Half of the region is crowded: a clearing has hardly any births there, a box about half of them."""
     low, high = (0.0, 0.0), (2.0, 1.0)
     for place, share in (
         (Clearing(low=low, high=high, radius=0.3), (0.0, 0.02)),
@@ -313,7 +313,7 @@ def test_a_clearing_is_filled_first() -> None:
         assert share[0] <= (pos[:, 0] < 1).mean() <= share[1]
 
 
-def test_who_is_born_faces_ahead() -> None:
+def test_newborn_agents_face_along_their_velocity() -> None:
     emitter = Emitter(place=ORIGIN, bursts=(Burst(time=0.0, count=3),), speed=(2, 2), direction=(3, 4))
     oriented = Scene(groups=(Group(count=5, oriented=True),), population=(emitter,))
     np.testing.assert_allclose(oriented.start(0).heading[0, :3], [(0.6, 0.8)] * 3, rtol=1e-12)
@@ -322,8 +322,8 @@ def test_who_is_born_faces_ahead() -> None:
 # --- sinks -----------------------------------------------------------------------------------------------------------
 
 
-def test_nobody_goes_through_a_drain() -> None:
-    """Bullets of 3 m per step, a wall of no thickness, at many phases and angles."""
+def test_no_agent_passes_through_a_thin_drain() -> None:
+    """The agents move 3 m per step and meet a wall without thickness at many phases and angles."""
     wall = Drain(shape=Wall(vertices=((0, -50), (0, 50))))
     gun = scene(wall, count=64, group={"spawn": Spawn(low=(-5, -1), high=(-2, 1), speed=(150, 150), heading=(1, 0))})
     start = gun.start(0)
@@ -337,8 +337,8 @@ def test_nobody_goes_through_a_drain() -> None:
     assert state.counted("deaths") == 64
 
 
-def test_a_drain_takes_whom_it_comes_upon_and_a_hollow_one_who_is_outside() -> None:
-    """A disc that moves .4 m a step along a row that stands; a ring's solid part is all around."""
+def test_a_drain_removes_agents_in_its_path_and_a_hollow_one_agents_outside() -> None:
+    """The disc moves 0.4 m a step along a resting row; a hollow shape is solid all around its inside."""
     row = np.stack([np.linspace(-4, 4, 17), np.zeros(17)], axis=1)[None]
     group = {"spawn": Spawn(low=(0, 0), high=(1, 1))}
     for shape, left, steps in (
@@ -355,7 +355,7 @@ def test_a_drain_takes_whom_it_comes_upon_and_a_hollow_one_who_is_outside() -> N
         np.testing.assert_array_equal(end.alive[0], left)
 
 
-def test_regions_take_who_is_in_them_and_who_leaves() -> None:
+def test_drain_leaving_and_ageing_remove_agents_by_place_and_age() -> None:
     group = {"spawn": Spawn(low=(-2, -2), high=(2, 2))}
     inside = scene(Drain(shape=Block(centre=(0, 0), size=(2, 2)), margin=0.25), count=500, group=group)
     before = inside.start(0)
@@ -378,21 +378,21 @@ def test_regions_take_who_is_in_them_and_who_leaves() -> None:
     ],
     ids=["plane", "torus", "thin", "single"],
 )  # fmt: skip
-def test_of_a_crowd_the_youngest_die(space: Space, dtype: str) -> None:
+def test_crowding_removes_the_youngest_agents(space: Space, dtype: str) -> None:
     radius, most, n = 0.45, 6, 400
     group = {"spawn": Spawn(low=(0, 0), high=(1.0, 3.9))}
     crowd = scene(Crowding(radius=radius, most=most), count=n, space=space, group=group, dtype=dtype)
     before = crowd.start(0)
     after = before.copy()
-    settler(crowd)(before.x, before.v, after, 0, 1)  # the end of a step in which nobody moved
-    way = np.asarray(space.displacement(before.pos[0][:, None], before.pos[0][None]))
-    near = (way**2).sum(axis=2) <= radius**2
-    elders = np.tril(near, -1).sum(axis=1)  # all as old: who has the smaller number
+    settler(crowd)(before.x, before.v, after, 0, 1)  # the end of a step without motion
+    offset = np.asarray(space.displacement(before.pos[0][:, None], before.pos[0][None]))
+    near = (offset**2).sum(axis=2) <= radius**2
+    elders = np.tril(near, -1).sum(axis=1)  # of equal age: those with smaller indices
     np.testing.assert_array_equal(after.alive[0], elders <= most)
     assert 0 < after.alive.sum() < n
 
 
-def test_a_crowd_thins_out_at_its_rate() -> None:
+def test_crowding_removes_agents_at_its_rate() -> None:
     thinning = scene(
         Crowding(radius=9.0, most=0, rate=math.log(2)), count=2000, group={"spawn": Spawn(low=(0, 0), high=(1, 1))}
     )
@@ -401,7 +401,7 @@ def test_a_crowd_thins_out_at_its_rate() -> None:
     assert state.alive[0, 0]  # the eldest
 
 
-# --- whatever batch, order, threads, calls ---------------------------------------------------------------------------
+# --- independence of batch, threads, calls ---------------------------------------------------------------------------
 
 
 EVERYTHING = (
@@ -414,7 +414,7 @@ EVERYTHING = (
 )  # fmt: skip
 
 
-def test_a_world_of_a_batch_is_that_world_alone() -> None:
+def test_a_world_of_a_batch_equals_the_world_alone() -> None:
     everything = scene(*EVERYTHING, g=G, count=1500)
     batch = everything.run(everything.start(7, worlds=3), 60)
     for k in range(3):
@@ -423,7 +423,7 @@ def test_a_world_of_a_batch_is_that_world_alone() -> None:
     assert len({int(n) for n in batch.alive.sum(axis=1)}) > 1
 
 
-def test_threads_and_calls_change_nothing() -> None:
+def test_results_do_not_depend_on_threads_or_on_how_steps_are_split_into_calls() -> None:
     everything = scene(*EVERYTHING, g=G, count=3000)
     whole = everything.run(everything.start(7, worlds=3), 40)
     try:
@@ -441,7 +441,7 @@ def test_threads_and_calls_change_nothing() -> None:
 
 
 @pytest.mark.slow
-def test_a_world_that_goes_wrong_stays_as_it_was() -> None:
+def test_a_diverged_world_keeps_its_state_and_the_others_are_stepped() -> None:
     jet = scene(Emitter(place=ORIGIN, rate=100.0, speed=(1, 1)), g=G)
     good = jet.run(jet.start(0, worlds=2), 20)
     bad = good.copy()
@@ -466,8 +466,8 @@ def test_single_precision_has_the_same_births() -> None:
 
 
 @pytest.mark.slow
-def test_nobody_alive_is_no_trouble_to_anybody() -> None:
-    """Effects that look around, and a method that solves: with nobody there, and with the first ones."""
+def test_scenes_without_living_agents_can_be_stepped() -> None:
+    """A pair law and an implicit method are tried, first without agents, then with the first births."""
     emitter = Emitter(place=Disc(centre=(5.0, 5.0), radius=1.0), rate=20.0, start=0.2, speed=(1, 1))
     for count, effects, method in (
         (300, (Separation(weight=1.0, radius=1.0),), SemiImplicitEuler()),
@@ -483,10 +483,10 @@ def test_nobody_alive_is_no_trouble_to_anybody() -> None:
         assert np.isfinite(state.pos).all()
 
 
-# --- who does not ask for it -----------------------------------------------------------------------------------------
+# --- no population, files, errors ------------------------------------------------------------------------------------
 
 
-def test_a_scene_without_a_population_knows_nothing_of_it() -> None:
+def test_a_scene_without_a_population_keeps_no_identities() -> None:
     fountain = scene(Emitter(place=ORIGIN, rate=1.0), count=5, group={"spawn": Spawn(low=(0, 0), high=(1, 1))})
     plain = fountain.model_copy(update={"population": ()})
     state = plain.start(0)
@@ -498,7 +498,7 @@ def test_a_scene_without_a_population_knows_nothing_of_it() -> None:
             one.step(other.start(0))
 
 
-def test_it_goes_into_a_file_and_back() -> None:
+def test_a_population_survives_yaml_and_pickle() -> None:
     everything = scene(*EVERYTHING, Emitter(place=Clearing(low=(0, 0), high=(1, 1), radius=0.1), rate=1.0), g=G)
     assert load_scene(dump_scene(everything)) == everything
     assert pickle.loads(pickle.dumps(everything)) == everything
@@ -507,12 +507,12 @@ def test_it_goes_into_a_file_and_back() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["fountain", "fireworks"])
-def test_scenes_are_what_they_say(name: str) -> None:
+def test_example_scenes_load_and_refuse_no_births(name: str) -> None:
     loaded = load_scene(Path(__file__).parent.parent / "configs" / "scenes" / f"{name}.yaml")
     assert load_scene(dump_scene(loaded)) == loaded
     state = loaded.run(loaded.start(0), round(4 / loaded.dt))
     assert state.counted("births") > 300
-    assert state.counted("births_refused") == 0  # slots are as many as are needed
+    assert state.counted("births_refused") == 0  # there are enough slots
 
 
 PLANE = {"kind": "half_space", "point": [0, 0], "direction": [0, 1]}
@@ -520,7 +520,7 @@ ONE = {"kind": "emitter", "place": {"kind": "point", "at": [0, 0]}, "rate": 1.0}
 
 
 @pytest.mark.parametrize(
-    ("member", "says"),
+    ("member", "message"),
     [
         ({**ONE, "rate": -1.0}, r"population\[0\].rate = -1.0: must be a number >= 0"),
         ({**ONE, "rate": "many"}, r"population\[0\].rate = 'many': must be a number"),
@@ -562,14 +562,14 @@ ONE = {"kind": "emitter", "place": {"kind": "point", "at": [0, 0]}, "rate": 1.0}
         ({"kind": "decay", "rate": 1, "group": 7}, "did you mean 1"),
     ],
 )  # fmt: skip
-def test_what_makes_no_sense_is_refused_in_one_line(member: dict[str, Any], says: str) -> None:
+def test_bad_members_of_a_population_raise_errors_of_one_line(member: dict[str, Any], message: str) -> None:
     data = {"groups": [{"count": 3, "max_speed": 5, "alive": 0}, {"count": 2, "alive": 0}], "population": [member]}
-    with pytest.raises(ValueError, match=says) as caught:
+    with pytest.raises(ValueError, match=message) as caught:
         load_scene(repr(data).replace("'", '"') + "\n")
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_records_refuse_what_files_do() -> None:
+def test_records_raise_the_same_errors_as_files() -> None:
     for bad in (math.nan, math.inf, -1.0, True):
         with pytest.raises(ValueError, match="rate"):
             Emitter(place=ORIGIN, rate=bad)
@@ -596,7 +596,7 @@ def looked_at(**look: Any) -> Scene:
     return Scene(effects=(Gravity(acceleration=(0.0, 0.0)),), groups=(group,), population=(emitter,), dt=0.02)
 
 
-def test_colours_tell_ages_and_trails_end_with_their_owner(tmp_path: Path) -> None:
+def test_colours_follow_age_in_pictures_replays_and_files(tmp_path: Path) -> None:
     jet = looked_at(by="age", over=(0.0, 0.5), colours=("#ff0000", "#0000ff"), size=(0.2, 0.1), trail=0.2)
     film = record(jet, 0, 100, 2)
     shots = list(film.snapshots())
@@ -606,7 +606,7 @@ def test_colours_tell_ages_and_trails_end_with_their_owner(tmp_path: Path) -> No
     np.testing.assert_allclose(now.shade[now.alive], np.asarray(now.age)[now.alive] / 0.5, atol=1e-12)
     picture = draw(now, 400)
     red, blue = (np.nonzero((picture[..., k] > 200) & (picture[..., 2 - k] < 60))[1] for k in (0, 2))
-    assert red.max() < blue.min()  # the young are red, and near where they are born
+    assert red.max() < blue.min()  # young agents are red and near the emitter
     page = tmp_path / "replay.html"
     write_replay(page, [ReplayGroup("jet", [Panel("", shots, None, "")])], "jet")
     text = page.read_text()
@@ -618,31 +618,31 @@ def test_colours_tell_ages_and_trails_end_with_their_owner(tmp_path: Path) -> No
         np.testing.assert_array_equal(kept["born"], film.born)
 
 
-def test_a_trail_ends_with_its_owner() -> None:
-    """A slot that holds somebody else since: no line leads from where the one died to where the other was born."""
+def test_a_trail_does_not_join_two_agents_of_one_slot() -> None:
+    """No line leads from the death of one agent to the birth of the next in its slot."""
     emitter = Emitter(place=ORIGIN, rate=10.0, speed=(6, 6), direction=(1, 0), lifetime=(0.1, 0.1))
     jet = looked_at(trail=0.5, colours=("#ff0000",)).model_copy(update={"population": (emitter,), "dt": 0.01})
     film = record(jet, 0, 21, 1)
     shots = list(film.snapshots())
     before, last, now = shots[17], shots[19], shots[21]
     assert not np.array_equal(last.identity, now.identity)
-    ways = [draw(shots[19], 400, trails=[before], all_trails=False), draw(shots[19], 400)]
-    assert (ways[0] != ways[1]).any()
+    pictures = [draw(shots[19], 400, trails=[before], all_trails=False), draw(shots[19], 400)]
+    assert (pictures[0] != pictures[1]).any()
     np.testing.assert_array_equal(draw(now, 400, trails=[last], all_trails=False), draw(now, 400))
     nameless = [replace(shot, identity=None) for shot in (last, now)]
     assert (draw(nameless[1], 400, trails=nameless[:1], all_trails=False) != draw(now, 400)).any()
 
 
-def test_forms_differ_and_looks_are_checked() -> None:
+def test_forms_look_different_and_bad_appearances_are_refused() -> None:
     pictures = []
     for form in ("point", "disc", "polygon"):
         jet = looked_at(form=form, opacity=(1.0, 1.0))
         pictures.append(draw(jet.snapshot(jet.run(jet.start(0), 20)), 300))
     assert (pictures[1] != pictures[2]).any()
-    for wrong, says in (
+    for wrong, message in (
         ({"colours": ("red",)}, "colours"), ({"colours": ("#ff0000", "#00ff00")}, "by: missing"),
         ({"over": (1.0, 1.0)}, "over"), ({"form": "star"}, "form"), ({"opacity": (1.0, 2.0)}, "opacity"),
         ({"trail": -1.0}, "trail"), ({"vertices": ((0.0, 0.0), (1.0, 0.0))}, "vertices"),
     ):  # fmt: skip
-        with pytest.raises(ValueError, match=says):
+        with pytest.raises(ValueError, match=message):
             Appearance(**wrong)

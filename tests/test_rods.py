@@ -1,4 +1,4 @@
-"""Rods and ropes: closed forms of pendulums and chains, what is kept, and what is refused."""
+"""Rods and ropes: closed forms of pendulums and chains, conserved quantities, and refused input."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def hanging(
     network: Any, dt: float, *, drag: float = 0.0, gravity: float = G, mass: float = 1.0,
     method: Integrator | None = None, **rods: Any,
 ) -> Scene:  # fmt: skip
-    """Return a network of rods under gravity: one set of laws for all tests with the same method."""
+    """Return a network of rods under gravity and drag; tests with the same method share one kernel."""
     return Scene(
         groups=(Group(network=network, mass=mass),), effects=(Gravity(acceleration=(0, -gravity)), Drag(rate=drag)),
         constraints=(Rods(**({"group": 0} | rods)),), integrator=method or VelocityVerlet(), dt=dt,
@@ -48,7 +48,7 @@ def hanging(
 
 
 def pendulum(dt: float, *angles: float, method: Integrator | None = None, **rods: Any) -> tuple[Scene, State]:
-    """Return a metre long pendulum, at rest at each of these angles from its lowest point, a world each."""
+    """Return pendulums of 1 m at rest at these angles from the lowest point, one world for each angle."""
     scene = hanging(Rope(links=1, length=1.0, direction=(0, -1), pinned=("start",)), dt, method=method, **rods)
     start = scene.start(0, worlds=len(angles))
     pos = np.array(start.pos)
@@ -57,7 +57,7 @@ def pendulum(dt: float, *angles: float, method: Integrator | None = None, **rods
 
 
 def energy(state: State) -> Array:
-    """Return the energy of free particles of 1 kg, (B,) J; who is held stays at height 0 at rest."""
+    """Return the energy of free particles of 1 kg, (B,) J; pinned ones rest at height 0."""
     return np.asarray((0.5 * (state.vel**2).sum(axis=2) + G * state.pos[..., 1]).sum(axis=1))
 
 
@@ -70,7 +70,7 @@ def lengths(state: State) -> Array:
 
 @pytest.mark.slow
 def test_a_pendulum_keeps_its_length_its_energy_and_its_period() -> None:
-    """Of a small swing 2 pi sqrt(l / g), of a large one 4 sqrt(l / g) K(sin^2(a / 2)); over 100 periods and more."""
+    """The period is 4 sqrt(l / g) K(sin^2(a / 2)), for small swings 2 pi sqrt(l / g); over more than 100 periods."""
     angles, dt = np.array([0.02, 1.0, 2.5]), 0.01
     scene, state = pendulum(dt, *angles)
     before, worst, off, found = energy(state), 0.0, np.zeros(3), [np.sin(angles)]
@@ -112,7 +112,7 @@ def test_a_hanging_chain_is_the_catenary_of_its_links() -> None:
 
 
 def double(t: float, y: Array) -> list[float]:
-    """The double pendulum of equal masses and rods of 1 m, angles from the lowest point."""
+    """Return the derivatives of a double pendulum of equal masses and rods of 1 m, angles from the lowest point."""
     a, b, u, w = y
     d, k = a - b, 3 - math.cos(2 * (a - b))
     return [
@@ -122,7 +122,7 @@ def double(t: float, y: Array) -> list[float]:
     ]  # fmt: skip
 
 
-def test_a_double_pendulum_goes_where_its_equations_say_and_keeps_its_energy() -> None:
+def test_a_double_pendulum_follows_its_equations_and_keeps_its_energy() -> None:
     begin = (2.0, 1.0)
     angles = solve_ivp(double, (0, 1.5), [*begin, 0, 0], "DOP853", rtol=1e-12, atol=1e-12).y[:2, -1]
     exact = np.cumsum(np.stack([np.sin(angles), -np.cos(angles)], axis=1), axis=0)
@@ -143,7 +143,7 @@ def test_a_double_pendulum_goes_where_its_equations_say_and_keeps_its_energy() -
     assert off < 2e-3 * G
 
 
-@pytest.mark.slow  # a kernel each
+@pytest.mark.slow  # one kernel for each method
 @pytest.mark.parametrize(
     "method", [SemiImplicitEuler(), ExplicitEuler(), RK4(), ImplicitMidpoint()], ids=lambda m: m.kind
 )
@@ -158,7 +158,7 @@ def test_under_every_method_a_pendulum_keeps_length_and_energy(method: Integrato
     np.testing.assert_allclose(np.abs(energy(state) - before), 0, atol=0.06 * G)
 
 
-# --- what is kept, whatever the order -------------------------------------------------------------------------------
+# --- conserved quantities -------------------------------------------------------------------------------------------
 
 
 def free(space: Any = None, pairs: Any = None, **rods: Any) -> Scene:
@@ -178,12 +178,12 @@ def ring_state(scene: Scene, worlds: int = 1) -> State:
 
 
 def gaps(scene: Scene, state: State) -> Array:
-    way = scene.space.displacement(state.pos, np.roll(state.pos, -1, axis=1))
-    return np.asarray(np.linalg.norm(way, axis=2))
+    offset = scene.space.displacement(state.pos, np.roll(state.pos, -1, axis=1))
+    return np.asarray(np.linalg.norm(offset, axis=2))
 
 
-def test_free_bodies_keep_momentum_lengths_and_energy_across_the_seam_of_a_torus() -> None:
-    """Once their velocities suit their rods."""
+def test_a_free_ring_keeps_momentum_lengths_and_energy_across_the_seam_of_a_torus() -> None:
+    """The first step makes the velocities consistent with the rods."""
     scene = free()
     state = scene.step(ring_state(scene, worlds=3))
     mass = scene.body.mass[None, :, None]
@@ -196,7 +196,7 @@ def test_free_bodies_keep_momentum_lengths_and_energy_across_the_seam_of_a_torus
     np.testing.assert_allclose((mass * state.vel**2).sum(axis=(1, 2)), kinetic, rtol=1e-2)
 
 
-def test_a_world_of_a_batch_is_that_world_alone_and_the_order_of_the_rods_is_none() -> None:
+def test_results_do_not_depend_on_the_batch_or_on_the_order_of_rods() -> None:
     scene = free()
     start = ring_state(scene, worlds=3)
     batch = scene.run(start, 50)
@@ -211,8 +211,8 @@ def test_a_world_of_a_batch_is_that_world_alone_and_the_order_of_the_rods_is_non
     np.testing.assert_allclose(third.run(start, 50).pos, batch.pos, atol=1e-7)
 
 
-def test_the_dead_and_the_held_are_where_they_were() -> None:
-    """Who is dead pulls nobody; of two who are held nobody moves, and nobody is told."""
+def test_rods_do_not_move_dead_pinned_or_partnerless_agents() -> None:
+    """A dead agent exerts no force. A rod between two pinned agents moves neither, and there is no warning."""
     scene = free(pairs=((0, 1), (1, 2)))
     start = ring_state(scene)
     start.alive[0, 1] = False
@@ -225,7 +225,7 @@ def test_the_dead_and_the_held_are_where_they_were() -> None:
 
 
 @pytest.mark.slow  # two kernels
-def test_single_precision_holds_as_far_as_its_numbers_go() -> None:
+def test_single_precision_holds_rod_lengths_to_4e_5() -> None:
     scene = free().model_copy(update={"dtype": "float32"})
     end = scene.run(ring_state(scene), 200)
     np.testing.assert_allclose(gaps(scene, end), 1.0, rtol=4e-5)
@@ -234,8 +234,8 @@ def test_single_precision_holds_as_far_as_its_numbers_go() -> None:
 # --- ropes ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_slack_rope_lets_fly_and_a_taut_one_never_adds_energy() -> None:
-    """Thrown up inside its length it flies a parabola, is caught, and swings on with what is left."""
+def test_a_slack_rope_exerts_no_force_and_a_taut_one_never_adds_energy() -> None:
+    """The mass flies a parabola within the rope's length, is stopped by the rope, and swings with less energy."""
     scene, state = pendulum(0.002, 0.0, slack=True)
     pos, vel = np.array(state.pos), np.array(state.vel)
     pos[0, 1], vel[0, 1] = (0.3, -0.2), (1.5, 2.0)
@@ -247,15 +247,15 @@ def test_a_slack_rope_lets_fly_and_a_taut_one_never_adds_energy() -> None:
         state = scene.run(state, 5)
         now = energy(state)[0]
         assert lengths(state).max() <= 1 + 1e-9
-        assert now <= before + 1e-4 * G  # Verlet's own, while it swings
+        assert now <= before + 1e-4 * G  # the error of Verlet's method
         caught |= now < before - 0.01
         before = min(before, now)
     assert caught
     assert abs(state.pos[0, 1]).max() <= 1 + 1e-9
 
 
-def test_of_two_ropes_only_the_one_that_ends_taut_has_pulled() -> None:
-    """Agent 2 leaves the reach of both in one step; once 1 has pulled, the rope to 0 is slack: as if it were not."""
+def test_of_two_ropes_only_the_one_that_ends_taut_acts() -> None:
+    """Agent 2 exceeds the length of both ropes in one step; the rope to 1 pulls it back, and the rope to 0 is slack."""
     both, one = (
         free(pairs=((0, 2), (1, 2)), lengths=(0.83, 1.15), slack=True),
         free(pairs=((1, 2),), lengths=(1.15,), slack=True),
@@ -271,10 +271,10 @@ def test_of_two_ropes_only_the_one_that_ends_taut_has_pulled() -> None:
     np.testing.assert_allclose(first.vel, second.vel, atol=1e-7)
 
 
-# --- what cannot be met ---------------------------------------------------------------------------------------------
+# --- unmet and refused rods -----------------------------------------------------------------------------------------
 
 
-def test_what_is_wrong_to_begin_with_is_mended_without_a_speed() -> None:
+def test_wrong_initial_lengths_are_corrected_without_adding_velocity() -> None:
     stretched = Rope(links=4, length=1.0, direction=(1, 0), stretch=1.5)
     scene = hanging(stretched, 0.01, gravity=0.0)
     end = scene.step(scene.start(0))
@@ -287,18 +287,18 @@ def test_what_is_wrong_to_begin_with_is_mended_without_a_speed() -> None:
     np.testing.assert_allclose(gaps(together, together.step(start))[0, 0], 0.4, rtol=1e-9)
 
 
-def test_too_few_sweeps_are_told_once() -> None:
+def test_too_few_sweeps_warn_once() -> None:
     sheet = Cloth(cells=(9, 9), edges=((1, 0), (0, 1)), pinned=("top",))
     cloth = hanging(sheet, 0.02, gravity=0.0, most=3)
     start = cloth.start(0)
     start.vel[0, cloth.body.mass < 1e9] = np.random.default_rng(0).normal(size=(90, 2))
-    with pytest.warns(UnmetWarning, match=r"after most = 3 sweeps agents \d+ and \d+ were .* more sweeps") as told:
+    with pytest.warns(UnmetWarning, match=r"after most = 3 sweeps agents \d+ and \d+ were .* more sweeps") as caught:
         end = cloth.run(start, 50)
-    assert len(told) == 1
+    assert len(caught) == 1
     assert (end.vel**2).sum() <= (start.vel**2).sum()
     start.vel[...] *= 0.2
     enough = hanging(sheet, 0.005)
-    hung = enough.run(start.with_dt(0.005), 20)  # and here nobody is told
+    hung = enough.run(start.with_dt(0.005), 20)  # without a warning
     assert np.abs(np.linalg.norm(hung.pos[0, 1] - hung.pos[0, 0]) - 1 / 9) < 1e-9
 
 
@@ -317,7 +317,7 @@ def test_too_few_sweeps_are_told_once() -> None:
     ({"group": 0, "tolerance": 0.0}, "tolerance"),
     ({"group": 0, "most": 0}, "most"),
 ])  # fmt: skip
-def test_bad_rods_are_refused_in_one_line(fields: dict[str, Any], message: str) -> None:
+def test_bad_rods_raise_errors_of_one_line(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message) as caught:
         Rods(**fields)
     assert "\n" not in str(caught.value)
@@ -329,13 +329,13 @@ def test_bad_rods_are_refused_in_one_line(fields: dict[str, Any], message: str) 
     (Rods(group=1), r"constraints\[0\].group = 1: has no network"),
     (Rods(pairs=((0, 1),), lengths=(10.1,)), r"constraints\[0\].lengths: 10.1 m reaches around the torus"),
 ])  # fmt: skip
-def test_scenes_that_rods_do_not_suit_are_refused(rods: Rods, message: str) -> None:
+def test_rods_that_do_not_fit_the_scene_are_refused(rods: Rods, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         free().model_copy(update={"constraints": (rods,)})
 
 
-def test_nobody_is_born_into_a_rod() -> None:
-    """He would be drawn to where the dead one was, in one step; but those who are tied may die."""
+def test_births_into_the_ends_of_a_rod_are_refused() -> None:
+    """A newborn agent would be pulled to the place of the dead one in one step. Agents with rods may die, however."""
     rods, born = Rods(pairs=((0, 1),), lengths=(1.0,)), Emitter(place=Point(at=(0.0, 0.0)), rate=1.0)
     update = {"constraints": (rods,), "population": (Decay(rate=1.0), born)}
     with pytest.raises(ValueError, match=r"constraints\[0\].pairs: agent 0 is of a group that population\[1\] fills"):
@@ -343,7 +343,7 @@ def test_nobody_is_born_into_a_rod() -> None:
     free().model_copy(update=update | {"population": (Decay(rate=1.0), born.model_copy(update={"group": 1}))})
 
 
-def test_a_scene_with_rods_is_a_file_and_a_value(tmp_path: Path) -> None:
+def test_a_scene_with_rods_survives_yaml_and_pickle(tmp_path: Path) -> None:
     scene = free(tolerance=1e-8, slack=True)
     (tmp_path / "ring.yaml").write_text(dump_scene(scene))
     assert load_scene(tmp_path / "ring.yaml") == scene

@@ -1,4 +1,4 @@
-"""Scene: starts, steps, refusals, threads, and an effect that somebody else wrote."""
+"""Scene: starts, steps, refused input, memory, threads, and an effect from a user's module."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ ARRAYS = ("x", "v", "alive", "tick", "key", "obstacle_x", "obstacle_radius", "wo
 
 
 def crowd(count: int = 150, **fields: Any) -> Scene:
-    """Every effect at once, enough agents and space for a grid."""
+    """Return a scene with every effect, and with enough agents and space for a grid."""
     group = Group(count=count, max_speed=3, max_force=8, spawn=Spawn(speed=(0.5, 2)))
     return everything(2, groups=(group,), space=Torus(size=(24, 20)), **fields)
 
@@ -50,7 +50,7 @@ def assert_same(a: State, b: State) -> None:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_a_world_starts_the_same_in_every_batch(dimension: int) -> None:
+def test_the_start_of_a_world_does_not_depend_on_the_batch(dimension: int) -> None:
     scene = everything(dimension)
     batch = scene.start(40, worlds=6)
     for k in range(6):
@@ -60,7 +60,7 @@ def test_a_world_starts_the_same_in_every_batch(dimension: int) -> None:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_agents_start_where_and_as_fast_as_they_should(dimension: int) -> None:
+def test_agents_start_uniformly_with_the_given_speeds_and_headings(dimension: int) -> None:
     low, high = (1.0, 2.0, 3.0)[:dimension], (4.0, 6.0, 8.0)[:dimension]
     spawn = Spawn(low=low, high=high, speed=(0.5, 1.5))
     led = Spawn(low=low, high=high, speed=(2, 2), heading=(3, 4, 0)[:dimension])
@@ -72,13 +72,13 @@ def test_agents_start_where_and_as_fast_as_they_should(dimension: int) -> None:
     speed = np.linalg.norm(state.vel[0], axis=1)
     assert 0.5 <= speed[:4000].min() < 0.52
     assert 1.48 < speed[:4000].max() <= 1.5
-    assert np.abs(state.vel[0, :4000].mean(axis=0)).max() < 0.05  # no favourite direction
+    assert np.abs(state.vel[0, :4000].mean(axis=0)).max() < 0.05  # no preferred direction
     np.testing.assert_allclose(state.vel[0, 4000:], np.tile((1.2, 1.6, 0)[:dimension], (50, 1)))
 
 
 @pytest.mark.parametrize("space", [Plane(), Torus(size=(10, 10))])
-def test_nobody_starts_in_an_obstacle(space: Space) -> None:
-    """Nor in the part of one that reaches across the edge of a torus."""
+def test_no_agent_starts_in_an_obstacle(space: Space) -> None:
+    """Obstacles also reach across the seam of a torus."""
     obstacles = (Circle(centre=(0.5, 3), radius=2), Circle(centre=(7, 7), radius=1.5))
     scene = scene_of(obstacles=obstacles, space=space, groups=(Group(count=500, radius=0.2, spawn=SPAWN),))
     state = scene.start(0, worlds=3)
@@ -88,8 +88,8 @@ def test_nobody_starts_in_an_obstacle(space: Space) -> None:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_with_a_spacing_nobody_starts_in_anybody_or_in_an_obstacle(dimension: int) -> None:
-    """Cells that an obstacle reaches into are left out, of whatever shape it is; worlds differ by the jitter alone."""
+def test_agents_with_a_spacing_do_not_start_in_each_other_or_in_obstacles(dimension: int) -> None:
+    """Cells that an obstacle of any shape reaches into stay empty; worlds differ only by the jitter."""
     obstacles = (Circle(centre=(2,) * dimension, radius=0.8), Block(centre=(0,) * dimension, size=(1,) * dimension))
     spawn = Spawn(low=(0,) * dimension, high=(5,) * dimension, spacing=0.6, jitter=0.1)
     groups = (
@@ -109,7 +109,7 @@ def test_with_a_spacing_nobody_starts_in_anybody_or_in_an_obstacle(dimension: in
 
 
 @pytest.mark.parametrize("edges", [0.6, (0.6, 0.5), (0.3, 0.9)])
-def test_bodies_wider_than_their_cells_overlap_by_no_more_than_that(edges: Any) -> None:
+def test_bodies_wider_than_their_cells_need_wider_and_stay_near_the_cell_centres(edges: Any) -> None:
     each = (edges, edges) if isinstance(edges, float) else edges
     spawn = Spawn(low=(0, 0), high=(6, 3), spacing=edges, jitter=0.01, wider=True)
     scene = scene_of(groups=(Group(count=20, radius=0.35, spawn=spawn),))
@@ -132,7 +132,7 @@ def test_bodies_wider_than_their_cells_overlap_by_no_more_than_that(edges: Any) 
         pytest.param(scene_of(Drag(rate=0.4), integrator=RK4(), dt=0.02), id="rk4"),
     ],
 )
-def test_a_run_split_in_two_is_the_same_run(scene: Scene) -> None:
+def test_a_run_equals_a_run_split_in_two_and_single_steps(scene: Scene) -> None:
     start = scene.start(1, worlds=2)
     together = scene.run(start, 30)
     split = scene.run(pickle.loads(pickle.dumps(scene.run(start, 11))), 19)
@@ -145,7 +145,7 @@ def test_a_run_split_in_two_is_the_same_run(scene: Scene) -> None:
 
 
 FEW = (Separation(weight=1.3, radius=2.5), Alignment(weight=0.7, radius=3, fov=270), Drag(rate=0.4))
-"""A sweep, a view cone and a law of one agent: what a method may go wrong with, in a third of the time to compile."""
+"""A pair law, a view cone and a law of one agent; they compile in a third of the time of every effect."""
 
 QUICK = {"torus", "torus_3", "torus_single", "box"}
 
@@ -169,11 +169,11 @@ ALL = [
         if not row.method.solves  # see test_implicit.py
     ),
 ]
-"""Every space, dimension, precision and method; where slow tests run, every method in the plane."""
+"""Every space, dimension, precision and method; most of them are slow tests."""
 
 
 def tried(counts: Sequence[int]) -> Any:
-    """Try all of them with so many agents each; with enough for cells, of each kind of method one."""
+    """Parametrize over ALL and these numbers of agents; with enough agents for cells, over three methods only."""
     kinds = (SemiImplicitEuler(), RK4(), AdaptiveRK4())
     rows = [(row if isinstance(row, Variant) else row.values[0], getattr(row, "marks", ())) for row in ALL]
     return pytest.mark.parametrize(
@@ -188,23 +188,23 @@ def tried(counts: Sequence[int]) -> Any:
 
 
 def roomy(variant: Variant, count: int) -> Scene:
-    """Room for a grid as soon as there are agents for one."""
+    """Return a scene with room for a grid."""
     return variant.make(count, 24.0 if variant.dimension == 2 else 18.0)
 
 
 @tried([1, 7, 16, 17, 32, 95, 96, 97, 300])
-def test_a_world_of_a_batch_is_that_world_alone_to_the_last_bit(variant: Variant, count: int) -> None:
+def test_a_world_of_a_batch_equals_the_world_alone_to_the_last_bit(variant: Variant, count: int) -> None:
     scene = roomy(variant, count)
     start = scene.start(20, worlds=3)
     start.alive[1, count // 2 :] = False
     batch = scene.run(start, 4)
-    assert count < 300 or batch.work[0, 2] < 0.7 * batch.work[0, 1] * count**2  # through sorted cells
+    assert count < 300 or batch.work[0, 2] < 0.7 * batch.work[0, 1] * count**2  # by sorted cells
     for k in range(3):
         assert_same(scene.run(start.worlds([k]), 4), batch.worlds([k]))
 
 
 @tried([17, 150])
-def test_ten_steps_at_once_are_ten_steps(variant: Variant, count: int) -> None:
+def test_ten_steps_in_one_call_equal_ten_calls(variant: Variant, count: int) -> None:
     scene = roomy(variant, count)
     start = scene.start(5, worlds=2)
     drive = np.random.default_rng(0).normal(size=start.shape)
@@ -215,8 +215,8 @@ def test_ten_steps_at_once_are_ten_steps(variant: Variant, count: int) -> None:
     assert not np.array_equal(one_by_one.x, start.x)
 
 
-def test_what_is_left_of_one_world_does_not_reach_the_next() -> None:
-    """Scratch is kept: a scene that has just stepped a crowd steps two survivors as a fresh one does."""
+def test_reused_scratch_does_not_affect_later_results() -> None:
+    """A scene that has just stepped many agents steps two living agents like a new scene."""
     scene, fresh = crowd(), crowd()
     for seed in range(3):
         full = scene.start(seed)
@@ -235,11 +235,11 @@ def test_a_drive_may_be_a_view_of_the_state_it_drives() -> None:
     assert_same(start, expected)
 
 
-def test_a_step_into_a_given_state_is_the_same_step_without_a_copy() -> None:
+def test_a_step_into_a_given_state_equals_a_step_into_a_new_one() -> None:
     scene = crowd()
     start = scene.start(1, worlds=2)
     kept, fresh = start.copy(), scene.run(start, 5)
-    assert_same(start, kept)  # the present is not touched
+    assert_same(start, kept)  # the input is unchanged
     other = scene.start(9, worlds=2)
     assert scene.step(start, out=other, steps=5) is other
     assert_same(other, fresh)
@@ -247,14 +247,14 @@ def test_a_step_into_a_given_state_is_the_same_step_without_a_copy() -> None:
     assert_same(start, fresh)
 
 
-def test_no_steps_lead_nowhere() -> None:
+def test_zero_steps_leave_a_state_unchanged() -> None:
     scene = crowd()
     start = scene.start(1)
     assert_same(scene.run(start, 0), start)
 
 
 @pytest.mark.parametrize("steps", [-1, 1.5, True, "3", None])
-def test_a_number_of_steps_that_is_none_is_refused(steps: Any) -> None:
+def test_an_invalid_number_of_steps_is_refused(steps: Any) -> None:
     scene = crowd()
     start = scene.start(1)
     kept = start.copy()
@@ -263,7 +263,7 @@ def test_a_number_of_steps_that_is_none_is_refused(steps: Any) -> None:
     assert_same(start, kept)
 
 
-def test_the_clock_does_not_drift() -> None:
+def test_time_does_not_drift_by_rounding() -> None:
     """A million times 0.1 s is 100000 s, not 100000.00000133."""
     scene = scene_of(dt=0.1, groups=(Group(count=1, spawn=SPAWN),))
     assert scene.run(scene.start(0), 1_000_000).time[0] == 1_000_000 * 0.1
@@ -277,7 +277,7 @@ def test_a_drive_is_a_force_and_lasts_for_the_whole_step() -> None:
 
 
 @pytest.mark.parametrize("far", [0.0, 1e4, 1e7])
-def test_motion_far_from_the_origin_is_the_same_motion(far: float) -> None:
+def test_motion_does_not_depend_on_the_distance_from_the_origin(far: float) -> None:
     """Relative trajectories agree to 1e-6 in float64."""
     scene = scene_of(Separation(weight=1.3, radius=2.5))
     start = scene.start(2)
@@ -286,7 +286,7 @@ def test_motion_far_from_the_origin_is_the_same_motion(far: float) -> None:
 
 
 @pytest.mark.slow
-def test_single_precision_is_the_same_scene_in_single_precision() -> None:
+def test_single_precision_agrees_with_double_precision() -> None:
     single, double = everything(2, dtype="float32"), everything(2)
     start = single.start(3, worlds=2)
     assert start.x.dtype == start.v.dtype == np.float32
@@ -314,11 +314,11 @@ def test_a_toggled_effect_acts_from_the_next_step_on() -> None:
     assert_same(bare.with_effects(Drag(rate=0.4)).run(under_way, 5), scene.run(under_way, 5))
 
 
-# --- what goes wrong during a run -------------------------------------------------------------------------------------
+# --- errors during a run ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_drive_that_is_no_number_is_refused_by_name(value: float) -> None:
+def test_a_drive_that_is_not_finite_is_refused_with_its_world_and_agent(value: float) -> None:
     scene = crowd(20)
     start = scene.start(0, worlds=2)
     kept, drive = start.copy(), np.zeros(start.shape)
@@ -342,7 +342,7 @@ def test_a_drive_of_another_shape_is_refused(shape: Any) -> None:
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e200])
 @pytest.mark.parametrize("array", ["x", "v"])
-def test_a_run_that_diverged_is_stopped_by_name(array: str, value: float) -> None:
+def test_a_diverged_run_raises_an_error_with_world_and_agent(array: str, value: float) -> None:
     scene = scene_of(Drag(rate=0.4))
     start = scene.start(0, worlds=3)
     getattr(start, array)[0, 1, 5] = value
@@ -353,7 +353,7 @@ def test_a_run_that_diverged_is_stopped_by_name(array: str, value: float) -> Non
     assert_same(start, kept)
 
 
-def test_a_step_far_too_large_does_not_end_in_silence() -> None:
+def test_a_step_that_is_far_too_large_raises_an_error_with_effect_and_dt() -> None:
     scene = scene_of(QuadraticDrag(rate=1e6), dt=0.01)
     with pytest.raises(FloatingPointError, match=r"accelerated by quadratic_drag; dt = 0\.01 s"):
         scene.run(scene.start(0), 1000)
@@ -361,7 +361,7 @@ def test_a_step_far_too_large_does_not_end_in_silence() -> None:
 
 @pytest.mark.parametrize("other", [crowd(21), crowd(19), everything(3), crowd(20, dtype="float32")])
 def test_the_state_of_another_scene_is_refused(other: Scene) -> None:
-    """A kernel trusts its arrays: it would read and write beyond them."""
+    """A kernel does not check its arrays: it would read and write beyond their ends."""
     scene = crowd(20)
     state, theirs = scene.start(0), other.start(0)
     for call in (lambda: scene.step(theirs), lambda: scene.step(state, out=theirs)):
@@ -376,17 +376,21 @@ def test_a_result_for_another_number_of_worlds_is_refused() -> None:
         scene.step(scene.start(0), out=scene.start(0, worlds=3))
 
 
-def test_with_motion_refuses_what_is_no_motion() -> None:
+def test_with_motion_refuses_wrong_shapes_and_numbers_that_are_not_finite() -> None:
     state = crowd(20).start(0)
     bad = np.zeros(state.shape)
     bad[0, 3, 1] = np.nan
-    for pos, said in ((bad, "(0, 3, 1)"), (np.zeros((1, 19, 2)), "(1, 19, 2)"), (np.zeros((1, 20, 3)), "(1, 20, 3)")):
+    for pos, message in (
+        (bad, "(0, 3, 1)"),
+        (np.zeros((1, 19, 2)), "(1, 19, 2)"),
+        (np.zeros((1, 20, 3)), "(1, 20, 3)"),
+    ):
         with pytest.raises(ValueError, match="pos") as caught:
             state.with_motion(pos, np.zeros(state.shape))
-        assert said in str(caught.value)
+        assert message in str(caught.value)
 
 
-# --- what is refused when a scene is made ----------------------------------------------------------------------------
+# --- errors when a scene is built -------------------------------------------------------------------------------------
 
 GROUPS = (Group(count=3, spawn=SPAWN),)
 BAD_SCENES = [
@@ -427,8 +431,8 @@ BAD_SCENES = [
 ]
 
 
-@pytest.mark.parametrize(("fields", "said"), BAD_SCENES, ids=lambda value: str(value)[:40])
-def test_a_bad_scene_is_refused_in_one_line_before_anything_is_allocated(fields: Any, said: list[str]) -> None:
+@pytest.mark.parametrize(("fields", "parts"), BAD_SCENES, ids=lambda value: str(value)[:40])
+def test_a_bad_scene_raises_an_error_of_one_line_before_allocating(fields: Any, parts: list[str]) -> None:
     tracemalloc.start()
     try:
         with pytest.raises((ValueError, TypeError)) as caught:
@@ -438,13 +442,13 @@ def test_a_bad_scene_is_refused_in_one_line_before_anything_is_allocated(fields:
         tracemalloc.stop()
     line = str(caught.value)
     assert "\n" not in line
-    for part in said:
+    for part in parts:
         assert part in line, line
     assert peak < 20e6
 
 
 @pytest.mark.parametrize(
-    ("fields", "said"),
+    ("fields", "message"),
     [
         ({"count": 0}, "count = 0"),
         ({"count": -1}, "count = -1"),
@@ -469,15 +473,15 @@ def test_a_bad_scene_is_refused_in_one_line_before_anything_is_allocated(fields:
     ],
     ids=str,
 )
-def test_a_bad_group_is_refused_in_one_line(fields: Any, said: str) -> None:
+def test_a_bad_group_raises_an_error_of_one_line(fields: Any, message: str) -> None:
     with pytest.raises(ValueError, match=r".") as caught:
         Group(**{"count": 3, **fields})
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("call", "said"),
+    ("call", "message"),
     [
         (lambda scene: scene.start(0, worlds=0), "worlds is 0"),
         (lambda scene: scene.start(0, worlds=10**9), "GiB"),
@@ -488,10 +492,10 @@ def test_a_bad_group_is_refused_in_one_line(fields: Any, said: str) -> None:
         (lambda scene: scene.start("abc"), "seed"),
     ],
 )
-def test_a_bad_start_is_refused_in_one_line(call: Any, said: str) -> None:
+def test_a_bad_start_raises_an_error_of_one_line(call: Any, message: str) -> None:
     with pytest.raises((ValueError, TypeError)) as caught:
         call(crowd(20))
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -499,7 +503,7 @@ def test_a_bad_start_is_refused_in_one_line(call: Any, said: str) -> None:
 
 
 def taken(scene: Scene) -> int:
-    """Bytes of a state of one world, the bodies, and the scratch of one thread."""
+    """Return the bytes of a state of one world, of the bodies, and of the scratch of one thread."""
     state, scratch = scene.start(0), Workspace.allocate(scene.parts, scene.body, scene.table)
     own = [array for arrays in scratch.own for array in arrays.values()]
     arrays = [*(getattr(state, name) for name in ARRAYS), *scene.body.arrays(), *scratch.arrays.values(), *own]
@@ -508,16 +512,16 @@ def taken(scene: Scene) -> int:
 
 @pytest.mark.parametrize("variant", ALL[: len(VARIANTS)], ids=lambda variant: variant.name)
 @pytest.mark.parametrize("count", [1, 97, 3000])
-def test_memory_is_what_a_scene_says_before_it_takes_any(variant: Variant, count: int) -> None:
-    """But for a few tables that are the same for any number of agents, and lanes beyond the last one."""
+def test_allocated_memory_agrees_with_bytes_per_world(variant: Variant, count: int) -> None:
+    """Except for a few tables of constant size, and lanes beyond the last agent."""
     scene = variant.make(count, 9.0)
-    said, fixed = scene.bytes_per_world(), 24 * 1024
-    assert said <= 1.25 * taken(scene)
-    assert taken(scene) <= said + fixed
+    predicted, fixed = scene.bytes_per_world(), 24 * 1024
+    assert predicted <= 1.25 * taken(scene)
+    assert taken(scene) <= predicted + fixed
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize("space", [Plane(), Torus(size=(900, 900))])  # tiles are written down on a torus alone
+@pytest.mark.parametrize("space", [Plane(), Torus(size=(900, 900))])  # only a torus stores tiles
 def test_a_million_agents_fit_into_a_gigabyte(space: Space, dtype: str) -> None:
     rules = (Separation(weight=1, radius=1), Alignment(weight=1, radius=2), Cohesion(weight=1, radius=2))
 
@@ -528,13 +532,13 @@ def test_a_million_agents_fit_into_a_gigabyte(space: Space, dtype: str) -> None:
     assert of(1_000_000).bytes_per_world() < 1e9
     few, many = of(8192), of(16384)
     more = many.bytes_per_world() - few.bytes_per_world()
-    per_agent = more / 8192  # what holds for them holds for a million
+    per_agent = more / 8192  # bytes grow linearly
     assert of(1_000_000).bytes_per_world() == pytest.approx(per_agent * 1_000_000, rel=1e-3)
     assert more == taken(many) - taken(few)
 
 
-def test_a_scene_of_gravity_alone_takes_memory_for_nothing_else() -> None:
-    """No neighbours, bonds, tree, medium, walls: none of their arrays grows with the agents, and nothing is counted."""
+def test_a_scene_of_gravity_alone_allocates_nothing_for_other_laws() -> None:
+    """No array of neighbours, bonds, tree, medium or walls grows with the agents; only evaluations are counted."""
     gravity = Gravity(acceleration=(0, -9.81))
     scenes = [scene_of(gravity, groups=(Group(count=n, spawn=Spawn(low=(0, 0), high=(9, 9))),)) for n in (160, 1600)]
     few, many = (Workspace.allocate(s.parts, s.body, s.table).arrays for s in scenes)
@@ -542,7 +546,7 @@ def test_a_scene_of_gravity_alone_takes_memory_for_nothing_else() -> None:
     body = {"mass", "radius", "max_speed", "max_force", "living", "ident"}
     assert growing == {"pos", "vel", "aside", "want"} | body
     handed = set(scratch_of(scenes[0].parts, 160))
-    assert handed == growing | {"counters", "tally", "sync", "lanes"}  # of agents, threads, and who is not finite
+    assert handed == growing | {"counters", "tally", "sync", "lanes"}  # of agents, threads, and of divergence
     start = scenes[0].start(0)
     end = scenes[0].step(start, steps=3)
     assert end.counted("evaluations") == 3
@@ -553,10 +557,10 @@ def test_a_scene_of_gravity_alone_takes_memory_for_nothing_else() -> None:
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert peak < 8_000  # objects of Python, whatever the number of agents and steps: nothing per agent
+    assert peak < 8_000  # objects of Python, nothing per agent or step
 
 
-# --- who stands where ---------------------------------------------------------------------------------------------
+# --- positions --------------------------------------------------------------------------------------------------------
 
 
 def crowd_of(count: int, **fields: Any) -> Scene:
@@ -565,8 +569,8 @@ def crowd_of(count: int, **fields: Any) -> Scene:
 
 
 @pytest.mark.slow
-def test_who_is_inside_a_torus_stays_where_he_is() -> None:
-    """59.999996 / 60 rounds to 1 in single precision: an agent there must not be carried round at each call."""
+def test_resting_agents_near_the_edge_of_a_torus_are_not_wrapped() -> None:
+    """59.999996 / 60 rounds to 1 in single precision: an agent there must not be wrapped at each call."""
     scene = crowd_of(200, space=Torus(size=(60, 60)), dtype="float32")
     state = scene.start(0)
     state.v[...] = 0
@@ -576,21 +580,21 @@ def test_who_is_inside_a_torus_stays_where_he_is() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("axis", [0, 1])
-def test_agents_on_a_line_do_not_all_meet(axis: int) -> None:
+def test_agents_on_a_line_are_not_all_paired(axis: int) -> None:
     scene = crowd_of(2000, space=Plane())
     state = scene.start(0)
     state.x[axis], state.x[1 - axis] = np.linspace(0, 2000, 2000), 1.0
     assert scene.step(state).counted("pairs") < 100 * 2000
 
 
-def test_no_steps_move_nobody() -> None:
+def test_zero_steps_do_not_wrap_positions() -> None:
     scene = crowd_of(200, space=Torus(size=(60, 60)))
     state = scene.start(0)
     state.x[0, 0, 0] = -3.0
     np.testing.assert_array_equal(scene.step(state, steps=0).x, state.x)
 
 
-def test_a_state_in_pieces_is_refused_in_place_and_copied_otherwise() -> None:
+def test_a_noncontiguous_state_is_copied_as_input_and_refused_as_output() -> None:
     scene = crowd_of(64, space=Plane())
     state = scene.start(0)
     pieces = State(**{**vars(state), "x": np.asfortranarray(state.x)})
@@ -617,10 +621,10 @@ def test_a_refused_step_writes_nothing(fault: str, drive: Any, x: Callable[[Arra
     assert_same(out, before)
 
 
-# --- somebody else's effect -------------------------------------------------------------------------------------------
+# --- effects of users -------------------------------------------------------------------------------------------------
 
 
-def test_an_effect_of_a_user_s_own_works_like_ours(tmp_path: Path) -> None:
+def test_an_effect_of_a_user_s_module_works_like_a_built_in_one(tmp_path: Path) -> None:
     with users_module(tmp_path, TETHER) as laws:
         effect = laws.Tether(stiffness=4.0, damping=0.5)
         scene = scene_of(effect, Drag(rate=0.1))
@@ -647,8 +651,8 @@ print((scene.step(start).vel - start.vel)[0, 0, 0] / start.pos[0, 0, 0])
 
 
 @pytest.mark.slow
-def test_an_edited_law_is_compiled_anew_in_the_next_process(tmp_path: Path) -> None:
-    """numba alone would go on with the machine code of the old law: it watches the file that calls, not the law."""
+def test_an_edited_law_is_recompiled_in_the_next_process(tmp_path: Path) -> None:
+    """numba alone would reuse the machine code of the old law: it checks the file of the caller, not of the law."""
     found = []
     for text in (TETHER, TETHER.replace("-p.stiffness", "-3 * p.stiffness").replace("-p.damping", "-3 * p.damping")):
         (tmp_path / "users_laws.py").write_text(text)
@@ -665,7 +669,7 @@ def test_an_edited_law_is_compiled_anew_in_the_next_process(tmp_path: Path) -> N
     assert found[1] == pytest.approx(3 * found[0], rel=1e-12)
 
 
-def test_a_scene_written_by_hand_runs() -> None:
+def test_a_scene_built_in_python_runs() -> None:
     scene = Scene(
         space=Torus(size=(9, 7)),
         groups=(Group(count=30, max_speed=2, spawn=Spawn(speed=(1, 2))),),
@@ -682,7 +686,7 @@ def test_a_scene_written_by_hand_runs() -> None:
 
 
 def test_a_scene_is_freed_with_its_last_reference() -> None:
-    """Else its scratch, 200 bytes an agent, would wait for the garbage collector, which does not count bytes."""
+    """Otherwise its scratch, 200 bytes per agent, would wait for the garbage collector, which does not count bytes."""
     scene = Scene(space=Torus(size=(9.0, 9.0)), groups=(Group(count=4),), effects=(Drag(rate=1.0),), dt=0.01)
     state = scene.run(scene.start(0), 2)
     scene.snapshot(state)

@@ -1,4 +1,4 @@
-"""Scenes of configs/ in which bodies hit things: nobody overlaps or gets out, and each does what its name says."""
+"""Scenes of configs/ with collisions: no body overlaps another or escapes, and each shows what its file describes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SLOW = (
     "rope_on_ball",
     "cloth_on_ball",
     "funnel",
-)  # half a minute of compiling, or many bodies
+)  # they compile for half a minute or have many bodies
 FAST = pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in SECONDS]
 )
@@ -42,7 +42,7 @@ def scene_of(name: str) -> Scene:
 
 
 def overlap(scene: Scene, state: State) -> float:
-    """The deepest overlap of anybody with anybody or anything, in radii."""
+    """Return the deepest overlap of a body with another, an obstacle or the box, in radii."""
     pos, radius = np.asarray(state.pos[0], float), np.asarray(scene.body.radius, float)
     deep = [(radius - shape.gap(pos)) / radius for shape in scene.obstacles]
     if isinstance(scene.space, Box):
@@ -58,15 +58,15 @@ def overlap(scene: Scene, state: State) -> float:
 
 
 def energy(state: State, mass: Array) -> float:
-    """Kinetic, J."""
+    """Return the kinetic energy, J."""
     moving = np.where(np.isfinite(mass), mass, 0.0)
     return float((moving * (state.vel[0] ** 2).sum(axis=1)).sum() / 2)
 
 
 @FAST
 @pytest.mark.filterwarnings(UNSOLVED)
-def test_in_no_scene_does_anybody_overlap_or_get_out(name: str) -> None:
-    """Less than 5 % of the radius, which is what case N23 allows."""
+def test_no_body_overlaps_or_escapes_by_more_than_5_percent_of_its_radius(name: str) -> None:
+    """The bound is that of case N23."""
     scene = scene_of(name)
     state, worst = scene.start(0), 0.0
     every = max(1, round(0.05 / scene.dt))
@@ -75,7 +75,7 @@ def test_in_no_scene_does_anybody_overlap_or_get_out(name: str) -> None:
         worst = max(worst, overlap(scene, state))
     assert worst < 0.05
     assert state.counted("impacts") > 0
-    assert (state.counted("unsolved") > 0) == (name == "funnel"), "its file says so"
+    assert (state.counted("unsolved") > 0) == (name == "funnel"), "only funnel.yaml announces unsolved contacts"
 
 
 @pytest.mark.slow
@@ -89,11 +89,8 @@ def test_particles_in_a_sphere_keep_their_energy() -> None:
 
 @pytest.mark.filterwarnings(UNSOLVED)
 @pytest.mark.parametrize("apart", [0.201, 0.2])
-def test_newtons_cradle_passes_everything_on(apart: float) -> None:
-    """Also where balls touch: they tremble there until they rest, and what comes from outside goes through them.
-
-    One after another swings out as far as the first, and those between stay; before, the third impact took half of it.
-    """
+def test_newtons_cradle_passes_on_the_whole_impulse(apart: float) -> None:
+    """Impulses also pass through touching balls: the outer balls swing to the same height, and the inner ones rest."""
     scene = scene_of("newtons_cradle")
     k = np.arange(5) - 2
     state = scene.start(0)
@@ -101,23 +98,23 @@ def test_newtons_cradle_passes_everything_on(apart: float) -> None:
     pos[0, ::2, 0] += k * (apart - 0.201)
     pos[0, 1::2, 0] += k * (apart - 0.201)
     state = state.with_motion(pos, state.vel)
-    ways = []
+    offsets = []
     for _ in range(3300):
         state = scene.step(state)
-        ways.append(state.pos[0, 1::2, 0] - pos[0, ::2, 0])
-    way = np.array(ways)
-    assert way[:, 0].min() == pytest.approx(-np.sqrt(0.5), abs=1e-3)
-    assert way[:1500, 4].max() == pytest.approx(np.sqrt(0.5), abs=1e-3)
-    assert way[1500:2500, 0].min() == pytest.approx(-np.sqrt(0.5), abs=1e-3)
-    assert way[2500:, 4].max() == pytest.approx(np.sqrt(0.5), abs=1e-3)
-    assert np.abs(way[:, 1:4]).max() < 0.01
+        offsets.append(state.pos[0, 1::2, 0] - pos[0, ::2, 0])
+    offset = np.array(offsets)
+    assert offset[:, 0].min() == pytest.approx(-np.sqrt(0.5), abs=1e-3)
+    assert offset[:1500, 4].max() == pytest.approx(np.sqrt(0.5), abs=1e-3)
+    assert offset[1500:2500, 0].min() == pytest.approx(-np.sqrt(0.5), abs=1e-3)
+    assert offset[2500:, 4].max() == pytest.approx(np.sqrt(0.5), abs=1e-3)
+    assert np.abs(offset[:, 1:4]).max() < 0.01
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings(UNSOLVED)
 @pytest.mark.parametrize(("name", "seconds", "apart"), [("rope_on_ball", 4.0, 0.08), ("cloth_on_ball", 2.0, 0.04)])
-def test_where_it_folds_a_rope_or_a_cloth_keeps_off_itself(name: str, seconds: float, apart: float) -> None:
-    """Those whom no spring ties to each other; without the push between them they come as near as 2 mm and less."""
+def test_folds_of_a_rope_or_cloth_keep_their_distance(name: str, seconds: float, apart: float) -> None:
+    """Particles without a common spring are compared; without their repulsion they come as near as 2 mm or less."""
     scene = scene_of(name)
     network: Any = scene.groups[0].network
     springs = network.springs(scene.dimension)
@@ -132,7 +129,7 @@ def test_where_it_folds_a_rope_or_a_cloth_keeps_off_itself(name: str, seconds: f
     assert state.counted("unsolved") == 0
 
 
-def test_the_page_of_scenes_has_a_picture_and_a_command_for_each() -> None:
+def test_the_page_of_scenes_has_a_picture_and_a_command_for_each_scene() -> None:
     page = (ROOT / "docs" / "scenes.md").read_text()
     for name in (*SECONDS, "fountain", "fireworks"):
         assert re.search(rf"flockenv render configs/scenes/{name}\.yaml .*--out docs/scenes/{name}\.png", page)
@@ -141,8 +138,8 @@ def test_the_page_of_scenes_has_a_picture_and_a_command_for_each() -> None:
 
 
 @pytest.mark.slow
-def test_the_funnel_says_how_much_its_heap_leaves_unsolved() -> None:
-    """More than once in two steps, as its file says; but little: discs hardly overlap, nor go into each other."""
+def test_the_funnel_warns_of_unsolved_contacts_with_small_overlaps() -> None:
+    """More than half of the steps are unsolved, as its file announces."""
     scene = scene_of("funnel")
     state, deep, rows = scene.start(0), 0.0, round(1.5 / scene.dt) // 20
     with warnings.catch_warnings(record=True) as caught:
@@ -152,6 +149,6 @@ def test_the_funnel_says_how_much_its_heap_leaves_unsolved() -> None:
             deep = max(deep, overlap(scene, state))
     assert 20 * rows / 2 < state.counted("unsolved") < 20 * rows
     assert deep < 0.03
-    (told,) = (str(each.message) for each in caught)
-    said = re.search(r"; the deepest overlap is ([\d.e-]+) of a radius$", told)
-    assert said and float(said[1]) < 0.03
+    (message,) = (str(each.message) for each in caught)
+    found = re.search(r"; the deepest overlap is ([\d.e-]+) of a radius$", message)
+    assert found and float(found[1]) < 0.03

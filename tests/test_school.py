@@ -1,4 +1,4 @@
-"""What goes on inside fish, what they do for it, and the task that asks players to live by it."""
+"""Inner states of fish, the behaviour that follows from them, and the task `School`."""
 
 from __future__ import annotations
 
@@ -27,13 +27,11 @@ from flockenv.tasks import School
 from flockenv.tasks.school import CAUGHT, EATEN, FATE, FEAR, FOOD, HUNGER, INTENT
 
 FISH, HUNTERS, PATCHES = 6, 2, 3
-AWAY = 1e3  # m, where nobody sees anybody
+AWAY = 1e3  # m, more than any radius of an effect
 
 
 def tank(mortal: bool = True, **changes: Any) -> Scene:
-    """Fish, hunters and food under all that the scene of configs/scenes/fish.yaml knows; one kernel for this whole
-    file.
-    """
+    """Return fish, hunters and food under the effects of configs/scenes/fish.yaml; one kernel serves this file."""
     given: dict[str, Any] = {
         "hungry": {"rate": 0.02, "effort": 0.01, "start": 0.5, "spread": 0.4},
         "starving": {"rate": 0.0, "start": 0.8},
@@ -73,7 +71,7 @@ def tank(mortal: bool = True, **changes: Any) -> Scene:
 
 
 def placed(scene: Scene, *places: Any, worlds: int = 1, velocity: Any = 0.0) -> State:
-    """Everybody far from everybody, but for the first of each group that are told where; velocities of all."""
+    """Return a state with the first agents of each group at `places`, the others far apart, all at `velocity`."""
     state = scene.start(1, worlds)
     n = scene.agents
     state.pos[...] = np.stack([AWAY * np.arange(1, n + 1), np.zeros(n)], axis=1)
@@ -87,9 +85,9 @@ def placed(scene: Scene, *places: Any, worlds: int = 1, velocity: Any = 0.0) -> 
 # --- closed forms -----------------------------------------------------------------------------------------------------
 
 
-def test_hunger_grows_with_time_and_effort_and_stops_at_starved() -> None:
+def test_hunger_grows_with_time_and_effort_up_to_1() -> None:
     scene = tank(mortal=False, force=0.0)
-    state = placed(scene, velocity=(1.0, 0.0))  # half of max_speed, and nobody can change that
+    state = placed(scene, velocity=(1.0, 0.0))  # half of max_speed; no force changes it
     hunger = np.array(scene.inner(state, "hunger"))
     assert np.ptp(hunger[0, :FISH]) > 0.05
     state = scene.run(state, 100)
@@ -100,7 +98,7 @@ def test_hunger_grows_with_time_and_effort_and_stops_at_starved() -> None:
     np.testing.assert_array_equal(scene.inner(state, "hunger")[0, FISH + HUNTERS :], 0)
 
 
-def test_food_grows_as_verhulst_says_whatever_the_step() -> None:
+def test_food_grows_by_the_logistic_equation_of_verhulst() -> None:
     scene = tank(force=0.0)
     state = scene.run(placed(scene), 200)
     a0, t = 1.5, 10.0
@@ -109,9 +107,9 @@ def test_food_grows_as_verhulst_says_whatever_the_step() -> None:
     np.testing.assert_array_equal(scene.inner(state, "food")[0, :-PATCHES], 0)
 
 
-def test_what_fish_eat_is_what_food_loses_and_takes_their_hunger() -> None:
+def test_food_is_conserved_and_lowers_the_hunger_of_fish() -> None:
     scene = tank(mortal=False, force=0.0, grazing={"growth": 0.0}, hungry={"rate": 0.0, "effort": 0.0})
-    # two at the first patch, one between both, one beside; the first patch has most of it eaten
+    # two fish at the first patch, one between both, one out of reach
     state = placed(scene, [(0, 0), (0.3, 0), (0.8, 0), (0, 2.5)], (), [(0, 0), (1.6, 0)])
     food, hunger = (np.array(scene.inner(state, name)) for name in ("food", "hunger"))
     state = scene.run(state, 400)
@@ -123,7 +121,7 @@ def test_what_fish_eat_is_what_food_loses_and_takes_their_hunger() -> None:
     np.testing.assert_array_equal(eaten[0, 3:], 0)
 
 
-def test_fear_is_of_what_is_seen_and_fades() -> None:
+def test_fear_rises_with_hunters_in_sight_and_decays() -> None:
     scene = tank(mortal=False, force=0.0, predation={"meal": 0.0})
     hunters = [(0, 0), (0, 3)]
     ahead, behind, hurried = (4.0, 0.0), (-8.0, 0.0), (1.0, 0.5)  # the second swims away from both
@@ -139,7 +137,7 @@ def test_fear_is_of_what_is_seen_and_fades() -> None:
     np.testing.assert_allclose(scene.inner(state, "fear")[0, 0], 0.9 * np.exp(-2 / 3), rtol=1e-6)
 
 
-def test_two_who_would_mate_and_one_who_is_hungry_does_not() -> None:
+def test_two_ready_fish_mate_and_a_hungry_one_does_not() -> None:
     scene = tank(mortal=False, force=0.0, hungry={"rate": 0.0, "effort": 0.0, "start": 0.2, "spread": 0.0})
     state = placed(scene, [(0, 0), (0.5, 0), (0, 9), (0.5, 9)])
     scene.inner(state, "hunger")[0, 3] = 0.9
@@ -152,7 +150,7 @@ def test_two_who_would_mate_and_one_who_is_hungry_does_not() -> None:
     np.testing.assert_allclose(urge[2:], 0.05 * 202 * 0.05, rtol=1e-12)
 
 
-def test_who_is_caught_or_starved_dies_and_feeds_a_hunter_who_then_lets_go() -> None:
+def test_caught_and_starved_fish_die_and_a_fed_hunter_stops_hunting() -> None:
     hungry = {"rate": 0.02, "effort": 0.0, "start": 0.5, "spread": 0.0}
     scene = tank(force=0.0, hungry=hungry, predation={"meal": 0.6})
     state = placed(scene, [(0, 0.5), (0, 0.7), (9, 0)], [(0, 0), (9, 3)])
@@ -161,23 +159,23 @@ def test_who_is_caught_or_starved_dies_and_feeds_a_hunter_who_then_lets_go() -> 
     np.testing.assert_array_equal(state.alive[0, :FISH], [False, True, True, True, True, False])
     assert state.counted("deaths") == 2
     np.testing.assert_allclose(scene.inner(state, "hunger")[0, FISH : FISH + HUNTERS], [0.2, 0.8])
-    state.pos[0, 1] = (0, 0.1)  # he is not hungry now
+    state.pos[0, 1] = (0, 0.1)  # the hunter is not hungry now
     state = scene.run(state, 5)
     assert state.alive[0, 1]
 
 
-# --- what they are up to ----------------------------------------------------------------------------------------------
+# --- intentions -------------------------------------------------------------------------------------------------------
 
 
-def test_states_follow_fear_then_needs_and_change_with_hysteresis() -> None:
-    """Up and down through every level: a state begins above it, and ends so much below."""
+def test_intentions_follow_fear_before_needs_with_hysteresis() -> None:
+    """A state begins above its level and ends a margin below it; values rise and fall through every level."""
     law = rows(motivation.intention)
 
     def walk(name: str, values: Any, **rest: float) -> list[float]:
         now, found = 0.0, []
         for value in values:
-            felt = {"hunger": 0.0, "libido": 0.0, "fear": 0.0} | rest | {name: value}
-            now = float(law(now, felt["hunger"], felt["libido"], felt["fear"], 0.4, 0.15, 0.5, 0.1, 0.3))
+            needs = {"hunger": 0.0, "libido": 0.0, "fear": 0.0} | rest | {name: value}
+            now = float(law(now, needs["hunger"], needs["libido"], needs["fear"], 0.4, 0.15, 0.5, 0.1, 0.3))
             found.append(now)
         return found
 
@@ -189,25 +187,27 @@ def test_states_follow_fear_then_needs_and_change_with_hysteresis() -> None:
         names[n] for n in ("wander", *["eat"] * 3, *["wander"] * 2)
     ]
     assert walk("libido", [0.4, 0.51, 0.21, 0.19]) == [names[n] for n in ("wander", "mate", "mate", "wander")]
-    # the larger need wins, but takes over only if it is larger by so much; fear comes before either
+    # the larger need wins, but replaces the other only if larger by the margin; fear comes before both
     assert walk("libido", [0.7, 0.85, 0.95], hunger=0.6) == [names["mate"]] * 3
     assert walk("libido", [0.55, 0.85, 0.95], hunger=0.6) == [names[n] for n in ("eat", "eat", "mate")]
     assert walk("fear", [0.2, 0.5], hunger=0.9, libido=0.9) == [names[n] for n in ("school", "escape")]
 
 
-def test_only_what_is_always_heard_and_the_state_s_own_behaviours_are_granted() -> None:
+def test_only_permanent_behaviours_and_those_of_the_intention_are_granted() -> None:
     record = Intentions(when=("avoid", "escape", "eat", "eat"))
-    wishes = np.array([[[3, 0], [0, 9], [4, 0], [0, 4]]] * 3, float)
-    force, share = reconcile(record, wishes, 8.0, inner={"intention": [0.0, 3.0, 4.0]})
+    forces = np.array([[[3, 0], [0, 9], [4, 0], [0, 4]]] * 3, float)
+    force, share = reconcile(record, forces, 8.0, inner={"intention": [0.0, 3.0, 4.0]})
     np.testing.assert_allclose(share, [[1, 0, 0, 0], [1, 0, 1, 0.25], [1, 5 / 9, 0, 0]])
     np.testing.assert_allclose(force, [[3, 0], [7, 1], [3, 5]])
     with pytest.raises(ValueError, match=r"arbitration.when = \['eat'\]: must be one for each of 2 behaviours"):
         Steer(arbitration=Intentions(when=("eat",)), behaviours=(Wander(weight=1), Wander(weight=2)))
 
 
-def test_fish_flee_what_they_see_and_not_what_they_do_not() -> None:
+def test_fish_flee_hunters_in_sight_only() -> None:
     scene = tank(mortal=False, predation={"meal": 0.0}, hungry={"start": 0.2, "spread": 0.0})
-    state = placed(scene, [(3, 0), (-3, 0)], [(0, 0)], velocity=(-0.5, 0.0))  # one heads for it, one away from it
+    state = placed(
+        scene, [(3, 0), (-3, 0)], [(0, 0)], velocity=(-0.5, 0.0)
+    )  # the first swims towards the hunter, the second away
     state = scene.run(state, 10)
     intent = scene.inner(state, "intention")[0]
     assert intent[0] == motivation.ESCAPE
@@ -218,7 +218,7 @@ def test_fish_flee_what_they_see_and_not_what_they_do_not() -> None:
 
 
 @pytest.mark.slow  # a kernel for each behaviour
-def test_what_is_granted_is_told() -> None:
+def test_the_trace_of_arbitration_follows_the_intention() -> None:
     scene = tank(mortal=False, predation={"meal": 0.0}, hungry={"start": 0.2, "spread": 0.0})
     state = placed(scene, [(3, 0), (-3, 0)], [(0, 0)], velocity=(-0.5, 0.0))
     share = granted(scene, scene.run(state, 2))[0].share[0]
@@ -228,7 +228,7 @@ def test_what_is_granted_is_told() -> None:
     assert share[1, 5] > 0
 
 
-def test_the_hungry_eat_and_neither_order_batch_nor_threads_matter() -> None:
+def test_eating_does_not_depend_on_order_batch_or_threads() -> None:
     scene = tank()
     near = [(0.3 * k, 0.4 * (k % 2)) for k in range(FISH)]
     state = placed(scene, near, [(6, 6)], [(1, 0), (4, 4)], worlds=3)
@@ -245,7 +245,7 @@ def test_the_hungry_eat_and_neither_order_batch_nor_threads_matter() -> None:
         np.testing.assert_array_equal(getattr(end, name), getattr(again, name))
     alone = scene.run(placed(scene, near, [(6, 6)], [(1, 0), (4, 4)]), 100)
     np.testing.assert_array_equal(alone.inner[:, 0], end.inner[:, 0])
-    calm = tank(mortal=False, force=0.0)  # what is random is each one's own: without forces there is none of it
+    calm = tank(mortal=False, force=0.0)  # no forces: random numbers depend on the agent
     one = placed(calm, near, [(6, 6)], [(1, 0), (4, 4)])
     for name in ("hunger", "libido"):
         calm.inner(one, name)[0, :FISH] = np.linspace(0.2, 0.8, FISH)
@@ -257,7 +257,7 @@ def test_the_hungry_eat_and_neither_order_batch_nor_threads_matter() -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (lambda: tank(grazing={"rate": 4.0}), "effects[2].rate = 4: all 6 of groups[0] could eat more than there is"),
         (lambda: Metabolism(start=0.9, spread=0.4), "spread = 0.4: start = 0.9 leaves room for 0.2"),
@@ -274,10 +274,10 @@ def test_the_hungry_eat_and_neither_order_batch_nor_threads_matter() -> None:
         (lambda: School(start_distance=15), "start_distance = 15"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(make: Any, said: str) -> None:
+def test_bad_numbers_raise_errors_of_one_line(make: Any, message: str) -> None:
     with pytest.raises(ValueError, match=r".") as caught:
         make()
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -287,7 +287,7 @@ FAR = ((1.0, 23.0), (23.0, 23.0), (23.0, 1.0))
 
 
 def school(fish: Any, hunter: Any, patches: Any, hunger: float = 0.4, hunting: bool = True, worlds: int = 1) -> World:
-    """Eight fish, the first of them where they are told, the others in a corner; all at rest."""
+    """Return a world with the first fish at the places in `fish`, the rest in a corner, all at rest."""
     world = World(School(), worlds)
     world.reset(3)
     task = world.task
@@ -307,7 +307,7 @@ def still(world: World) -> Any:
     return world.step(np.zeros((world.worlds, world.learners, 2)))
 
 
-def test_in_the_task_food_is_conserved_too_and_being_fed_pays() -> None:
+def test_the_task_conserves_food_and_rewards_low_hunger() -> None:
     world = school([(12, 12), (12.5, 12)], (23, 12), [(12.2, 12), *FAR], hunting=False)
     step, task = still(world), world.task
     assert isinstance(task, School)
@@ -320,7 +320,7 @@ def test_in_the_task_food_is_conserved_too_and_being_fed_pays() -> None:
     np.testing.assert_allclose(step.terms[0, 0], [0.05, 0.05 * (1 - memory[HUNGER, 0]), 0.0], rtol=1e-12)
 
 
-def test_the_dead_leave_one_by_one_are_paid_once_and_are_seen_no_more() -> None:
+def test_dead_fish_terminate_are_penalised_once_and_are_no_longer_observed() -> None:
     world = school([(12, 12), (12, 14)], (12, 11.6), [(5, 12), *FAR])
     world._memory[HUNGER, 0, 3] = 0.9999
     first = still(world)
@@ -331,7 +331,7 @@ def test_the_dead_leave_one_by_one_are_paid_once_and_are_seen_no_more() -> None:
     np.testing.assert_array_equal(first.terms[0, 3], [0, 0, -10])
     assert not first.ended.any()
     assert first.success.all()
-    np.testing.assert_allclose(world._memory[HUNGER, 0, 8], 0.9 + 0.04 * 0.1 - 0.8, atol=2e-3)  # it has eaten
+    np.testing.assert_allclose(world._memory[HUNGER, 0, 8], 0.9 + 0.04 * 0.1 - 0.8, atol=2e-3)  # the hunter has eaten
     np.testing.assert_array_equal(np.flatnonzero(first.observation[0, 0]), [6])
     later = still(world)
     np.testing.assert_array_equal(later.terms[0, [0, 3]], 0)
@@ -344,9 +344,9 @@ def test_the_dead_leave_one_by_one_are_paid_once_and_are_seen_no_more() -> None:
     assert measured["caught"] == measured["starved"] == 0.125
 
 
-def test_a_fish_sees_what_is_there_but_not_behind_itself() -> None:
+def test_observations_of_fish_exclude_what_lies_behind() -> None:
     world = school([(12, 12), (14, 12), (10, 12.5)], (12, 16), [(16, 12), (8, 12), *FAR[:2]], hunting=False)
-    world.state.vel[0, 0] = (1.0, 0.0)  # towards the second; the third, and one patch, are behind
+    world.state.vel[0, 0] = (1.0, 0.0)  # towards the second fish; the third and one patch are behind
     world._memory[FOOD, 0, 9] = 0.75
     seen, s = world.task.layout.unpack(world.reset(mask=np.zeros(1, bool))[0]), world.state
     np.testing.assert_allclose(seen.mates[0, 0], (2, 0), atol=1e-6)
@@ -364,7 +364,7 @@ def test_a_fish_sees_what_is_there_but_not_behind_itself() -> None:
     np.testing.assert_allclose(world._memory[FEAR, 0, 1], 1 / np.hypot(2, 4), rtol=1e-2)
 
 
-def test_the_hand_written_player_flees_remembers_and_beats_random() -> None:
+def test_the_textbook_player_flees_keeps_its_state_and_beats_random() -> None:
     task = School()
     rules = player(task, name="textbook")
     empty = {slot.name: np.zeros((2, *slot.shape)) for slot in task.layout.slots}
@@ -386,17 +386,17 @@ def test_the_hand_written_player_flees_remembers_and_beats_random() -> None:
     np.testing.assert_array_equal(ask(state, hunger=0.3, **food)[1], motivation.EAT)
     np.testing.assert_array_equal(ask(None, hunger=0.3, **food)[1], motivation.WANDER)
 
-    class Anyhow:
+    class Random:
         def predict(self, seen: Any, state: Any = None, *_: Any) -> Any:
             return np.random.default_rng(7).uniform(-1, 1, (len(seen), 2)), state
 
     short, seed = School(horizon=200), worlds_for("tuning", 1, 16)
-    ours, theirs = (rollout(short, each, 16, seed) for each in (player(short, name="textbook"), Anyhow()))  # type: ignore[arg-type]
+    ours, theirs = (rollout(short, each, 16, seed) for each in (player(short, name="textbook"), Random()))  # type: ignore[arg-type]
     assert np.mean(ours.returns - theirs.returns) > 3
     assert ours.metrics["survived"].mean() > theirs.metrics["survived"].mean() + 0.2
 
 
-def test_scripted_fish_are_their_own_state_machine() -> None:
+def test_scripted_fish_use_all_states_but_mate_and_survive() -> None:
     world = World(School(learners=1), 32)
     world.reset(5)
     states = set()

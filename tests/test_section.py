@@ -1,4 +1,4 @@
-"""Sections: entry points made of Python functions are found again by what they depend on, and by nothing else."""
+"""Sections: the cache key of an entry point covers all that its machine code depends on, and nothing else."""
 
 from __future__ import annotations
 
@@ -65,48 +65,48 @@ print(count.compiled > 0)
 def run(folder: Path, laws: str = LAWS, **environment: str) -> str:
     """Return what the program prints: a number for each plan, and whether anything was compiled."""
     (folder / "users_laws.py").write_text(laws)
-    told = {**os.environ, "FLOCKENV_CACHE": str(folder / "cache"), "PYTHONPATH": f"{folder}:{ROOT}", **environment}
-    done = subprocess.run([sys.executable, "-c", PROGRAM], env=told, capture_output=True, text=True, check=True)
+    env = {**os.environ, "FLOCKENV_CACHE": str(folder / "cache"), "PYTHONPATH": f"{folder}:{ROOT}", **environment}
+    done = subprocess.run([sys.executable, "-c", PROGRAM], env=env, capture_output=True, text=True, check=True)
     return done.stdout.strip()
 
 
-def test_each_plan_has_code_of_its_own_that_the_next_process_finds(tmp_path: Path) -> None:
+def test_each_plan_has_its_own_code_which_the_next_process_reuses(tmp_path: Path) -> None:
     assert run(tmp_path) == "6.0 12.0 9.0 81.0 15.0 75.0 21.0 147.0 True"
     assert run(tmp_path) == "6.0 12.0 9.0 81.0 15.0 75.0 21.0 147.0 False"
 
 
-def test_an_edited_law_compiles_anew_and_undone_it_is_found_again(tmp_path: Path) -> None:
+def test_an_edited_law_is_recompiled_and_the_old_one_stays_cached(tmp_path: Path) -> None:
     run(tmp_path)
     assert run(tmp_path, LAWS.replace("2 * x", "5 * x")) == "15.0 75.0 9.0 81.0 15.0 75.0 21.0 147.0 True"
     assert run(tmp_path) == "6.0 12.0 9.0 81.0 15.0 75.0 21.0 147.0 False"
 
 
-def test_sections_run_in_plain_python_too(tmp_path: Path) -> None:
+def test_sections_also_run_in_plain_python(tmp_path: Path) -> None:
     assert run(tmp_path, NUMBA_DISABLE_JIT="1") == "6.0 12.0 9.0 81.0 15.0 75.0 21.0 147.0 False"
 
 
-def test_an_edited_law_without_a_file_compiles_anew(tmp_path: Path) -> None:
-    """As in a notebook: the module has no source, and the law keeps its name."""
+def test_an_edited_law_without_a_file_is_recompiled(tmp_path: Path) -> None:
+    """The module has no source file, as in a notebook, and the law keeps its name."""
     imports = "from flockenv.jit.section import entry\nfrom flockenv.jit.decorators import law\n"
     cell = imports + "@law\ndef f(x): return {} * x\nprint(entry(f)(3.0))"
-    told = {**os.environ, "FLOCKENV_CACHE": str(tmp_path)}
+    env = {**os.environ, "FLOCKENV_CACHE": str(tmp_path)}
     for factor in (2, 5, 2):
         done = subprocess.run(
-            [sys.executable, "-c", cell.format(factor)], cwd=ROOT, env=told, capture_output=True, text=True, check=True
+            [sys.executable, "-c", cell.format(factor)], cwd=ROOT, env=env, capture_output=True, text=True, check=True
         )
         assert done.stdout == f"{3.0 * factor}\n"
 
 
 def test_plain_python_uses_one_thread() -> None:
-    """Whatever is asked for: a team of threads counts in one indivisible operation, which Python has none of."""
-    told = {**os.environ, "NUMBA_DISABLE_JIT": "1", "FLOCKENV_THREADS": "2"}
+    """Although two are set: the barrier's counter is not atomic in plain Python."""
+    env = {**os.environ, "NUMBA_DISABLE_JIT": "1", "FLOCKENV_THREADS": "2"}
     code = "from flockenv.jit.thread_pool import at_work, threads; print(threads(), at_work())"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=told, capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=env, capture_output=True, text=True, check=True)
     assert done.stdout == "2 1\n"
 
 
 @pytest.mark.slow
-def test_damaged_code_is_compiled_anew(tmp_path: Path) -> None:
+def test_damaged_code_in_the_cache_is_recompiled(tmp_path: Path) -> None:
     run(tmp_path)
     for path in (tmp_path / "cache").glob("*.nbc"):
         path.write_bytes(path.read_bytes()[:-9])

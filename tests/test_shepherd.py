@@ -1,4 +1,4 @@
-"""Shepherd, and the form of its law: a group as one, its centre, its mean velocity and its farthest member."""
+"""Shepherd and group laws: laws of the centre, the mean velocity and the farthest member of a group."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SIDE = 20.0
 
 
 def herd(dimension: int = 2, sheep: int = 7, dogs: int = 2, space: Any = None, **fields: Any) -> Scene:
-    """Sheep that stand, dogs that drive them, and others of whom nothing is told."""
+    """Return a scene of three groups, all of which drive group 1, the sheep."""
     low, high = (0.0,) * dimension, (SIDE,) * dimension
     groups = tuple(
         Group(count=count, mass=1.5, max_speed=2, spawn=Spawn(low=low, high=high, speed=(0, 1)))
@@ -38,7 +38,7 @@ def herd(dimension: int = 2, sheep: int = 7, dogs: int = 2, space: Any = None, *
 
 
 def expected(scene: Scene, state: State) -> Array:
-    """The accelerations by the law over rows, m/s^2, of a state in which agents 3 to 9 are the sheep."""
+    """Return the accelerations by the vectorized law, m/s^2, if agents 3 to 9 are the sheep."""
     drive: Any = scene.effects[0]
     living = state.alive[0, 3:10]
     sheep, pos, vel = state.pos[0, 3:10][living], state.pos[0], state.vel[0]
@@ -47,21 +47,21 @@ def expected(scene: Scene, state: State) -> Array:
     n, r = len(sheep), drive.spacing
     goal = np.array(drive.goal)
     place = rows(steering.herd_from)(centre - pos, farthest - pos, goal - pos, r * n ** (2 / 3), r, r * n**0.5)
-    wish = rows(steering.arrive)(place, vel, 2.0, drive.slow_radius)
-    return np.where(state.alive[0][:, None], drive.weight * wish / 1.5, 0)
+    change = rows(steering.arrive)(place, vel, 2.0, drive.slow_radius)
+    return np.where(state.alive[0][:, None], drive.weight * change / 1.5, 0)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("dead", [(), (4, 5, 9)])
-def test_it_is_the_law_of_the_place_behind(dimension: int, dead: tuple[int, ...]) -> None:
+def test_accelerations_are_those_of_the_vectorized_law(dimension: int, dead: tuple[int, ...]) -> None:
     scene = herd(dimension)
     state = scene.start(0)
     state.alive[0, list(dead)] = False
     np.testing.assert_allclose(scene.acceleration(state)[0], expected(scene, state), atol=1e-12)
 
 
-def test_on_a_torus_the_edge_makes_no_difference() -> None:
-    """A flock of a few metres over the edge is one flock, wherever the edge is."""
+def test_forces_do_not_depend_on_the_seam_of_a_torus() -> None:
+    """A group of a few metres across the seam is one group."""
     scene = herd(space=Torus(size=(SIDE, SIDE)))
     state = scene.start(0)
     state.pos[0] = np.random.default_rng(0).uniform(7, 12, (12, 2))
@@ -75,14 +75,14 @@ def test_on_a_torus_the_edge_makes_no_difference() -> None:
     np.testing.assert_allclose(over.acceleration(state)[0], plain, atol=1e-12)
 
 
-def test_without_living_members_it_asks_for_nothing() -> None:
+def test_the_force_is_zero_without_living_members() -> None:
     scene = herd()
     state = scene.start(0)
     state.alive[0, 3:10] = False
     np.testing.assert_array_equal(scene.acceleration(state), 0)
 
 
-def test_a_member_at_no_place_is_none_where_accelerations_are_asked_for() -> None:
+def test_acceleration_ignores_a_member_whose_position_is_nan() -> None:
     scene = herd()
     state = scene.start(0)
     gone = state.copy()
@@ -92,7 +92,7 @@ def test_a_member_at_no_place_is_none_where_accelerations_are_asked_for() -> Non
     np.testing.assert_array_equal(scene.acceleration(state)[0, others], scene.acceleration(gone)[0, others])
 
 
-def test_one_that_leaves_all_bounds_is_named_though_all_hear_of_it_at_once() -> None:
+def test_a_diverged_member_is_named_although_it_enters_all_forces() -> None:
     scene = herd()
     state = scene.start(0)
     state.vel[0, 6] = np.inf
@@ -100,7 +100,7 @@ def test_one_that_leaves_all_bounds_is_named_though_all_hear_of_it_at_once() -> 
         scene.step(state, steps=3)
 
 
-@pytest.mark.parametrize("sheep", [20, 300])  # few, and many that are sorted by cell for another effect
+@pytest.mark.parametrize("sheep", [20, 300])  # with 300, another effect sorts them by cell
 def test_threads_calls_and_batches_give_the_same_bits(sheep: int) -> None:
     beside = (Cohesion(weight=1, radius=3),)
     scene = herd(sheep=sheep, dogs=5, beside=beside, space=Torus(size=(SIDE, SIDE)), dtype="float32")
@@ -112,17 +112,17 @@ def test_threads_calls_and_batches_give_the_same_bits(sheep: int) -> None:
     alone = scene.run(start.worlds([1]), 12)
     try:
         use_threads(2)
-        team = scene.run(start.worlds([1]), 12)
+        threaded = scene.run(start.worlds([1]), 12)
     finally:
         use_threads(1)
     np.testing.assert_array_equal(once.pos, one_by_one.pos)
     np.testing.assert_array_equal(once.pos[1], alone.pos[0])
-    np.testing.assert_array_equal(once.pos[1], team.pos[0])
+    np.testing.assert_array_equal(once.pos[1], threaded.pos[0])
 
 
 @law
 def drawn(p: Any, me: Me, flock: Members) -> Vec:
-    """The mean velocity of a group, as a force."""
+    """Return the mean velocity of a group as a force."""
     return flock.vel
 
 
@@ -133,14 +133,14 @@ class Drawn(Effect):
     group_law: ClassVar[Law | None] = drawn
 
     def members(self, starts: Any) -> dict[str, float]:
-        """The second group."""
+        """Return the range of the second group."""
         return {"first": float(starts[1]), "end": float(starts[2])}
 
 
 EFFECTS.pop("drawn_for_a_test")
 
 
-def test_the_mean_velocity_is_that_of_the_living() -> None:
+def test_the_mean_velocity_of_a_group_excludes_dead_members() -> None:
     scene = herd().model_copy(update={"effects": (Drawn(),)})
     state = scene.start(0)
     state.alive[0, 5] = False
@@ -148,8 +148,8 @@ def test_the_mean_velocity_is_that_of_the_living() -> None:
     np.testing.assert_allclose(scene.acceleration(state)[0, state.alive[0]], np.tile(mean / 1.5, (11, 1)), atol=1e-12)
 
 
-def test_the_dog_of_the_demo_drives_its_flock_to_the_place() -> None:
-    """From more than 8 m away to within 4 m in 35 s; without the dog the flock stays where it is."""
+def test_the_demo_s_shepherd_drives_its_group_to_the_goal() -> None:
+    """From more than 8 m away to within 4 m in 35 s; without the shepherd the group stays more than 8 m away."""
     assert Shepherd.demo is not None
     scene = Scene.model_validate(yaml.safe_load(Shepherd.demo))
     start = scene.start(0)
