@@ -1,4 +1,4 @@
-"""With NUMBA_DISABLE_JIT=1 everything runs in plain Python, for a debugger, and comes to the same but for rounding."""
+"""With NUMBA_DISABLE_JIT=1 everything runs in plain Python, for a debugger, with the same results up to rounding."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.plain_python import ROOT, TIES, cases, ended
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_every_effect_method_and_task_comes_to_the_same_in_plain_python(tmp_path: Path) -> None:
+def test_plain_python_gives_the_same_results_for_every_effect_method_and_task(tmp_path: Path) -> None:
     file = tmp_path / "ended.npz"
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
     subprocess.run([sys.executable, "-m", "tests.plain_python", str(file)], cwd=ROOT, env=environment, check=True)

@@ -1,4 +1,4 @@
-"""Players: by name as they ship, and from files; what is no player is refused in one line that names the file."""
+"""Players by name and from files; an invalid player is refused in one line that names the file."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ TASK: Any = SimpleNamespace(name="toy", layout=SimpleNamespace(size=5), action_l
 
 @pytest.mark.filterwarnings("ignore:.*together = False, trained with True")
 @pytest.mark.parametrize("name", sorted(TASKS))
-def test_every_name_plays_every_task_that_it_is_written_for(name: str) -> None:
+def test_every_named_player_returns_actions_in_every_task_it_supports(name: str) -> None:
     task = TASKS[name]()
     rows = np.zeros((3, task.layout.size), np.float32)
     playing = [player for player in NAMES if not other_tasks(player, name)]
@@ -39,11 +39,11 @@ def test_every_name_plays_every_task_that_it_is_written_for(name: str) -> None:
     assert {"random", "textbook", "rules", "ppo"} <= set(playing)
 
 
-def test_the_names_are_those_of_the_hand_written_players_and_two_more() -> None:
+def test_names_are_the_hand_written_players_random_and_ppo() -> None:
     assert set(NAMES) == {"random", "ppo", *PLAYERS}
 
 
-def test_a_seed_is_that_of_the_player() -> None:
+def test_the_seed_determines_the_random_player() -> None:
     rows = np.zeros((2, Pursuit().layout.size), np.float32)
     a, b, c = (load_player("random", Pursuit(), seed).predict(rows)[0] for seed in (1, 1, 2))
     np.testing.assert_array_equal(a, b)
@@ -51,7 +51,7 @@ def test_a_seed_is_that_of_the_player() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "task", "said"),
+    ("name", "task", "message"),
     [
         ("rule", Pursuit(), "player 'rule': unknown, did you mean `rules`?; allowed: random, textbook, orca, "),
         ("reynolds", Pursuit(), "player 'reynolds': is called 'rules'; allowed: "),
@@ -61,13 +61,13 @@ def test_a_seed_is_that_of_the_player() -> None:
         ("queueing", Crossing(), "no hand-written player 'queueing' for 'crossing'; there is one for: bottleneck"),
     ],
 )
-def test_a_name_that_does_not_play_is_refused_in_one_line(name: str, task: Task, said: str) -> None:
+def test_unknown_or_unsuitable_names_are_refused_in_one_line(name: str, task: Task, message: str) -> None:
     with pytest.raises(ValueError, match="player") as caught:
         load_player(name, task)
-    assert said in str(caught.value) and "\n" not in str(caught.value)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_glance_at_the_names_loads_no_simulator() -> None:
+def test_importing_the_names_of_players_imports_neither_numba_nor_scipy() -> None:
     code = "import flockenv.players, sys; print({'numba', 'scipy'} & set(sys.modules), flockenv.players.NAMES[0])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "set() random\n"
@@ -84,7 +84,7 @@ def test_hostile_names_are_refused_in_one_printable_line(name: str) -> None:
     assert len(str(caught.value)) < 500
 
 
-def test_weights_are_a_player() -> None:
+def test_a_weights_file_loads_as_an_mlp_policy() -> None:
     path = WEIGHTS / "pursuit.safetensors"
     assert isinstance(load_player(str(path), Pursuit()), MlpPolicy)
     assert isinstance(load_player(path, Pursuit()), MlpPolicy)
@@ -130,7 +130,7 @@ def player(task):
 
 
 @pytest.mark.parametrize("source", FILES.values(), ids=FILES)
-def test_a_python_file_is_a_player(tmp_path: Path, source: str) -> None:
+def test_python_files_of_every_form_load_as_players(tmp_path: Path, source: str) -> None:
     path = tmp_path / "half.py"
     path.write_text(source)
     action, state = load_player(str(path), TASK).predict(np.zeros((3, 5), np.float32), None, None, True)
@@ -167,7 +167,7 @@ NO_PLAYER = {
 
 
 @pytest.mark.parametrize("source", NO_PLAYER)
-def test_a_python_file_that_is_no_player_is_refused_when_it_is_loaded(tmp_path: Path, source: str) -> None:
+def test_python_files_without_a_player_are_refused_at_load(tmp_path: Path, source: str) -> None:
     path = tmp_path / "half.py"
     path.write_text(source)
     with pytest.raises(ValueError, match="player") as caught:
@@ -177,7 +177,7 @@ def test_a_python_file_that_is_no_player_is_refused_when_it_is_loaded(tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("body", "said"),
+    ("body", "message"),
     [
         ("return observation[0, 99]", "IndexError in predict, line 2: index 99 is out of bounds"),
         ("exit(3)", "SystemExit in predict, line 2: 3"),
@@ -189,25 +189,23 @@ def test_a_python_file_that_is_no_player_is_refused_when_it_is_loaded(tmp_path: 
         ("return 1, 2, 3", "TypeError in predict: returned 3 values, must be actions, or (actions, state)"),
     ],
 )
-def test_a_player_that_fails_while_it_plays_is_one_line_that_names_its_file(
-    tmp_path: Path, body: str, said: str
-) -> None:
+def test_a_failure_in_predict_raises_one_line_that_names_the_file(tmp_path: Path, body: str, message: str) -> None:
     path = tmp_path / "half.py"
     path.write_text(f"def predict(observation):\n    {body}")
     player = load_player(path, TASK)
     with pytest.raises(ValueError, match="player") as caught:
         player.predict(np.zeros((3, 5), np.float32))
-    assert str(caught.value).startswith(f"player {os.fspath(path)!r}: {said}") and "None" not in str(caught.value)
+    assert str(caught.value).startswith(f"player {os.fspath(path)!r}: {message}") and "None" not in str(caught.value)
 
 
-def test_ctrl_c_in_a_player_file_stays_ctrl_c(tmp_path: Path) -> None:
+def test_a_keyboard_interrupt_in_a_player_file_is_not_converted(tmp_path: Path) -> None:
     path = tmp_path / "half.py"
     path.write_text("def predict(observation):\n    raise KeyboardInterrupt")
     with pytest.raises(KeyboardInterrupt):
         load_player(path, TASK).predict(np.zeros((3, 5), np.float32))
 
 
-def test_two_files_of_one_name_stay_two_players(tmp_path: Path) -> None:
+def test_two_files_of_one_name_are_two_players(tmp_path: Path) -> None:
     for folder, value in (("a", 0.25), ("b", 0.75)):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "p.py").write_text(f"def predict(o):\n    return {value} + 0 * o[:, :2]")
@@ -217,7 +215,7 @@ def test_two_files_of_one_name_stay_two_players(tmp_path: Path) -> None:
     assert b.predict(rows)[0][0, 0] == 0.75
 
 
-def test_a_zip_is_opened_only_when_trusted(tmp_path: Path) -> None:
+def test_a_zip_is_loaded_only_with_trust_pickle(tmp_path: Path) -> None:
     stable_baselines3 = pytest.importorskip("stable_baselines3")
     from flockenv.envs.sb3 import WorldVecEnv
 
@@ -236,7 +234,7 @@ def test_a_zip_is_opened_only_when_trusted(tmp_path: Path) -> None:
     [main.app, compare.app, best_response.app, transfer.app],
     ids=["flockenv", "compare", "best_response", "transfer"],
 )
-def test_every_command_with_players_can_be_told_to_trust_their_zips(app: typer.Typer) -> None:
+def test_every_command_with_players_has_the_option_trust_pickle(app: typer.Typer) -> None:
     commands = getattr(get_command(app), "commands", {"": get_command(app)})
     options = [{option for p in command.params for option in p.opts} for command in commands.values()]
     playing = [each for each in options if each & {"--player", "--players"}]

@@ -1,4 +1,4 @@
-"""Policies: SB3's actor in numpy, files refused when anything about them is wrong, players from names and files."""
+"""Policies: the actor of SB3 in numpy, the checks of policy files, and the task that a policy's card names."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def rewrite(path: Path, **changes: Any) -> None:
 
 
 def replace_weights(path: Path, data: bytes) -> None:
-    """Swap the weights for others that the card vouches for."""
+    """Replace the weights, and update their digest in the card."""
     path.write_bytes(data)
     rewrite(path, sha256=hashlib.sha256(data).hexdigest())
 
@@ -77,7 +77,7 @@ def test_random_player_is_uniform_reproducible_and_records_its_seed() -> None:
 # --- the actor in numpy
 
 
-def test_actor_is_the_formula_on_paper() -> None:
+def test_actor_equals_a_network_computed_by_hand() -> None:
     t = {
         "policy.0.weight": np.array([[1, -2], [0.5, 0]], np.float32),
         "policy.0.bias": np.array([0.1, -1], np.float32),
@@ -93,7 +93,7 @@ def test_actor_is_the_formula_on_paper() -> None:
     assert MlpPolicy(t, {"activation": "relu"}).predict(x, deterministic=True)[0] == pytest.approx(relu, rel=1e-6)
 
 
-def test_actor_takes_one_row_or_many_clips_and_leaves_its_input_alone() -> None:
+def test_actor_takes_one_or_many_rows_clips_and_does_not_change_its_input() -> None:
     policy = MlpPolicy(tensors(), CARD)
     rows = np.random.default_rng(1).normal(size=(50, 5)).astype(np.float32)
     before = rows.copy()
@@ -104,7 +104,7 @@ def test_actor_takes_one_row_or_many_clips_and_leaves_its_input_alone() -> None:
     assert state == ("kept",)
     np.testing.assert_array_equal(rows, before)
     np.testing.assert_allclose(policy.predict(rows[3], deterministic=True)[0], actions[3], atol=1e-6)
-    assert actions.max() == 1  # some are beyond
+    assert actions.max() == 1  # some outputs are clipped
     assert actions.min() == -1
     with pytest.raises(ValueError, match=r"observation: shape \(50, 4\), must be \(5,\) or \(rows, 5\)"):
         policy.predict(rows[:, :4])
@@ -155,7 +155,7 @@ def test_actor_equals_stable_baselines3(activation: str) -> None:
     }
     t = {f"{a}.{part}": given[f"{b}.{part}"].numpy() for a, b in names.items() for part in ("weight", "bias")}
     ours = MlpPolicy({**t, "log_std": given["log_std"].numpy()}, {"activation": activation})
-    rows = np.random.default_rng(0).uniform(-1, 1, (501, 11)).astype(np.float32)  # several blocks and a bit
+    rows = np.random.default_rng(0).uniform(-1, 1, (501, 11)).astype(np.float32)  # full blocks and a partial one
     expected, _ = theirs.predict(rows, deterministic=True)
     np.testing.assert_allclose(ours.predict(rows, deterministic=True)[0], expected, atol=1e-6)
     np.testing.assert_allclose(ours.predict(rows[0], deterministic=True)[0], expected[0], atol=1e-6)
@@ -174,7 +174,7 @@ def test_importing_and_using_a_policy_needs_no_torch() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*does not list the arguments")
-def test_what_was_saved_is_loaded(saved: Path) -> None:
+def test_a_saved_policy_is_loaded_unchanged(saved: Path) -> None:
     policy = MlpPolicy.load(saved, TASK)
     rows = np.random.default_rng(0).normal(size=(9, 5)).astype(np.float32)
     expected = MlpPolicy(tensors(), CARD).predict(rows, deterministic=True)[0]
@@ -189,7 +189,7 @@ def test_what_was_saved_is_loaded(saved: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*does not list the arguments")
-def test_a_network_without_hidden_layers_is_a_network(tmp_path: Path) -> None:
+def test_a_network_without_hidden_layers_is_allowed(tmp_path: Path) -> None:
     save_policy(tmp_path / "linear.safetensors", tensors((5, 2)), CARD)
     assert MlpPolicy.load(tmp_path / "linear.safetensors", TASK).predict(np.ones(5))[0].shape == (2,)
 
@@ -203,7 +203,7 @@ def test_truncated_weights_are_refused_in_one_line(saved: Path, kept: float) -> 
     refused(saved, "not a safetensors file")
 
 
-def test_one_flipped_bit_is_noticed(saved: Path) -> None:
+def test_one_flipped_bit_is_refused(saved: Path) -> None:
     data = bytearray(saved.read_bytes())
     data[len(data) // 2] ^= 1
     saved.write_bytes(data)
@@ -302,7 +302,7 @@ def refused(path: Path, message: str) -> None:
     assert len(str(caught.value)) < 600
 
 
-def test_a_card_may_not_contradict_its_weights(tmp_path: Path) -> None:
+def test_cards_that_contradict_their_weights_are_not_saved(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="card: observation_size = 6, the weights say 5"):
         save_policy(tmp_path / "x.safetensors", tensors(), {**CARD, "observation_size": 6})
     with pytest.raises(ValueError, match=r"must end in \.safetensors"):
@@ -328,7 +328,7 @@ def test_a_failed_save_leaves_the_old_policy(saved: Path, monkeypatch: pytest.Mo
 
 
 def kept(folder: Path, task: Task, **changes: Any) -> Path:
-    """Save a policy that answers with zeros, and is trained on `task` by its card."""
+    """Save a policy that returns zeros, with a card that describes `task`; return its path."""
     inputs, outputs = task.layout.size, task.action_layout.size
     zeros = {"action.weight": np.zeros((outputs, inputs), np.float32), "action.bias": np.zeros(outputs, np.float32)}
     path = folder / "own.safetensors"
@@ -338,12 +338,12 @@ def kept(folder: Path, task: Task, **changes: Any) -> Path:
 
 
 @pytest.mark.parametrize("kind", TASKS.values(), ids=TASKS)
-def test_a_policy_plays_the_task_of_its_card_without_a_word(tmp_path: Path, kind: type[Task]) -> None:
+def test_a_policy_loads_for_the_task_of_its_card_without_differences(tmp_path: Path, kind: type[Task]) -> None:
     assert MlpPolicy.load(kept(tmp_path, kind()), kind()).differences == ()
 
 
 @pytest.mark.parametrize(
-    ("trained", "played", "said"),
+    ("trained", "played", "expected"),
     [
         (Crossing(), Crossing(agents=24), ("agents = 24, trained with 12", "learners = 24, trained with 12")),
         (Corridor(people=12), Corridor(people=12, dt=0.025), ("dt = 0.025, trained with 0.05",)),
@@ -359,15 +359,15 @@ def test_a_policy_plays_the_task_of_its_card_without_a_word(tmp_path: Path, kind
         ),
     ],
 )
-def test_other_arguments_and_scales_are_allowed_and_said(
-    tmp_path: Path, trained: Task, played: Task, said: tuple[str, ...]
+def test_other_arguments_and_scales_are_allowed_with_a_warning(
+    tmp_path: Path, trained: Task, played: Task, expected: tuple[str, ...]
 ) -> None:
     path = kept(tmp_path, trained)
     with pytest.warns(OtherTaskWarning) as caught:
         policy = MlpPolicy.load(path, played)
     assert len(caught) == 1 and "\n" not in str(caught[0].message)
     assert str(caught[0].message).startswith(f"policy {str(path)!r}: ")
-    for phrase in said:
+    for phrase in expected:
         assert any(found.startswith(phrase) for found in policy.differences), policy.differences
         assert phrase in str(caught[0].message)
     action, _ = policy.predict(np.zeros((3, played.layout.size), np.float32))
@@ -375,7 +375,7 @@ def test_other_arguments_and_scales_are_allowed_and_said(
 
 
 @pytest.mark.parametrize(
-    ("trained", "played", "said"),
+    ("trained", "played", "expected"),
     [
         (
             Crossing(),
@@ -390,15 +390,15 @@ def test_other_arguments_and_scales_are_allowed_and_said(
         (Flock(rays=6), Flock(), r"of shape \(6,\) in '.*', task 'flock' has '.*' of shape \(16,\)"),
     ],
 )
-def test_other_slots_are_refused_by_the_first_that_differs(
-    tmp_path: Path, trained: Task, played: Task, said: str
+def test_other_slots_are_refused_with_the_first_that_differs(
+    tmp_path: Path, trained: Task, played: Task, expected: str
 ) -> None:
-    with pytest.raises(ValueError, match=said) as caught:
+    with pytest.raises(ValueError, match=expected) as caught:
         MlpPolicy.load(kept(tmp_path, trained), played)
     assert "\n" not in str(caught.value)
 
 
-def test_an_argument_that_a_card_lacks_was_its_default(tmp_path: Path) -> None:
+def test_an_argument_missing_from_a_card_has_its_default(tmp_path: Path) -> None:
     path = kept(tmp_path, Corridor())
     card = json.loads(path.with_suffix(".json").read_text())
     del card["arguments"]["settling"]
@@ -409,14 +409,14 @@ def test_an_argument_that_a_card_lacks_was_its_default(tmp_path: Path) -> None:
     assert policy.differences == (f"settling = 7.0, trained with {Corridor().settling}",)
 
 
-def test_many_differences_are_a_line_and_all_of_them_are_kept(tmp_path: Path) -> None:
+def test_many_differences_warn_in_one_line_and_are_all_stored(tmp_path: Path) -> None:
     changed = Pursuit(evader_force=4.0, capture_distance=0.7, horizon=200, size=25.0, dt=0.025, control_dt=0.05)
     with pytest.warns(OtherTaskWarning, match="; and .* more$"):
         policy = MlpPolicy.load(kept(tmp_path, Pursuit()), changed)
     assert len(policy.differences) > 6
 
 
-def test_a_card_without_slots_fits_its_own_digest_alone(tmp_path: Path) -> None:
+def test_a_card_without_slots_fits_only_its_own_digest(tmp_path: Path) -> None:
     path = kept(tmp_path, Pursuit())
     rewrite(path, observation=None, action=None)
     with pytest.warns(OtherTaskWarning, match="the card does not list the arguments of its task"):
@@ -426,7 +426,7 @@ def test_a_card_without_slots_fits_its_own_digest_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "expected"),
     [
         ({"observation": 3}, "the card's 'observation' is 3, must be a list of slots"),
         ({"observation": [3]}, r"the card's 'observation' is \[3\], must be a list of slots"),
@@ -436,8 +436,8 @@ def test_a_card_without_slots_fits_its_own_digest_alone(tmp_path: Path) -> None:
         ({"observation": []}, "made for observation nothing, task 'pursuit' has"),
     ],
 )
-def test_a_card_with_broken_slots_is_refused(tmp_path: Path, change: dict[str, Any], said: str) -> None:
+def test_a_card_with_broken_slots_is_refused(tmp_path: Path, change: dict[str, Any], expected: str) -> None:
     path = kept(tmp_path, Pursuit())
     rewrite(path, **change)
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=expected):
         MlpPolicy.load(path, Pursuit())

@@ -1,4 +1,4 @@
-"""Kernels are code: nothing is run from a folder or a file that another user can change."""
+"""Kernels are code: none is loaded from a folder or a file that another user can change."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="no owners an
 as_root = pytest.mark.skipif(getattr(os, "geteuid", lambda: 1)() != 0, reason="only root can act as two users")
 
 STRANGER, VICTIM = 54321, 54322
-"""Numbers of users that no system gives away."""
+"""User ids that no system assigns."""
 
 USE = '''
 from flockenv.scene.yaml_io import load_scene
@@ -83,7 +83,7 @@ def test_a_folder_that_others_can_change_is_refused_in_one_line(make: Callable[[
 
 
 @pytest.mark.parametrize("make", BAD)
-def test_one_that_is_named_is_refused_and_nothing_in_it_runs(make: Callable[[Path], None], tmp_path: Path) -> None:
+def test_a_bad_flockenv_cache_is_refused_and_nothing_in_it_runs(make: Callable[[Path], None], tmp_path: Path) -> None:
     folder = tmp_path / "cache"
     make(folder)
     done = run(USE, FLOCKENV_CACHE=str(folder))
@@ -93,7 +93,7 @@ def test_one_that_is_named_is_refused_and_nothing_in_it_runs(make: Callable[[Pat
 
 
 @pytest.mark.parametrize(("mode", "allowed"), [(0o777, False), (0o1777, True), (0o755, True)])
-def test_folders_above_it_may_be_shared_if_they_are_sticky(mode: int, allowed: bool, tmp_path: Path) -> None:
+def test_parent_folders_may_be_writable_by_others_if_they_are_sticky(mode: int, allowed: bool, tmp_path: Path) -> None:
     above = tmp_path / "above"
     above.mkdir()
     above.chmod(mode)
@@ -105,13 +105,13 @@ def test_folders_above_it_may_be_shared_if_they_are_sticky(mode: int, allowed: b
 
 
 @as_root
-def test_a_folder_above_it_that_belongs_to_another_user_is_refused(tmp_path: Path) -> None:
+def test_a_parent_folder_of_another_user_is_refused(tmp_path: Path) -> None:
     of_a_stranger(tmp_path / "above")
     with pytest.raises(NotPrivateError, match=f"above: belongs to user {STRANGER}"):
         prepared(tmp_path / "above" / "cache")
 
 
-def test_folders_behind_a_link_on_the_way_are_looked_at_too(tmp_path: Path) -> None:
+def test_parents_behind_a_symbolic_link_are_also_checked(tmp_path: Path) -> None:
     world_writable(tmp_path / "open")
     (tmp_path / "open" / "home").mkdir(mode=0o700)
     (tmp_path / "way").symlink_to(tmp_path / "open" / "home")
@@ -121,14 +121,14 @@ def test_folders_behind_a_link_on_the_way_are_looked_at_too(tmp_path: Path) -> N
     assert prepared(tmp_path / "way" / "cache").is_dir()
 
 
-def test_folders_that_are_made_are_private_under_any_umask(tmp_path: Path) -> None:
+def test_new_folders_are_private_under_any_umask(tmp_path: Path) -> None:
     before = os.umask(0)
     try:
-        made = prepared(tmp_path / "new" / "deeper" / "cache")
-        Store(made).write("a", b"data")
+        folder = prepared(tmp_path / "new" / "deeper" / "cache")
+        Store(folder).write("a", b"data")
     finally:
         os.umask(before)
-    modes = [stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "new", made, made / "a")]
+    modes = [stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "new", folder, folder / "a")]
     assert modes == [0o755, 0o700, 0o600]
 
 
@@ -159,7 +159,7 @@ def test_only_plain_files_of_this_user_are_read(make: Callable[[Path], None], tm
 
 
 def planted(tmp_path: Path, folder: Path) -> Path:
-    """Put what a process has compiled into a folder, with one line more in the source; return what that line writes."""
+    """Copy compiled sources into `folder`, each with a line that writes a marker file; return the marker's path."""
     own, marker = tmp_path / "own", tmp_path / "marker"
     assert run(USE, FLOCKENV_CACHE=str(own)).returncode == 0
     for source in own.glob("*.py"):
@@ -169,7 +169,7 @@ def planted(tmp_path: Path, folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("make", [world_writable, a_link, pytest.param(of_a_stranger, marks=as_root)])
-def test_what_was_planted_in_the_temporary_folder_does_not_run(make: Callable[[Path], None], tmp_path: Path) -> None:
+def test_code_planted_in_the_temporary_folder_does_not_run(make: Callable[[Path], None], tmp_path: Path) -> None:
     temporary = tmp_path / "tmp"
     temporary.mkdir()
     temporary.chmod(0o1777)
@@ -182,12 +182,12 @@ def test_what_was_planted_in_the_temporary_folder_does_not_run(make: Callable[[P
     for done in (first, second):
         assert len(done.stderr.splitlines()) == 1 and str(folder) in done.stderr
     fresh = [each for each in temporary.iterdir() if each.name.startswith(folder.name + "-")]
-    assert len(fresh) == 1 and stat.S_IMODE(fresh[0].lstat().st_mode) == 0o700  # the second process found the first's
+    assert len(fresh) == 1 and stat.S_IMODE(fresh[0].lstat().st_mode) == 0o700  # the second process reuses the first's
 
 
 @as_root
-def test_a_user_is_not_given_the_folders_of_another(request: pytest.FixtureRequest) -> None:
-    with_root = Path(tempfile.mkdtemp())  # that of pytest is closed to others
+def test_cache_folder_never_returns_the_folder_of_another_user(request: pytest.FixtureRequest) -> None:
+    with_root = Path(tempfile.mkdtemp())  # other users cannot enter that of pytest
     request.addfinalizer(lambda: shutil.rmtree(with_root))
     with_root.chmod(0o1777)
     for name in (f"flockenv-{VICTIM}", f"flockenv-{VICTIM}-0000"):
@@ -199,7 +199,7 @@ def test_a_user_is_not_given_the_folders_of_another(request: pytest.FixtureReque
     assert Path(found).parent == with_root and not found.endswith((f"-{VICTIM}", "-0000"))
 
 
-def test_without_any_private_folder_one_line_says_why(tmp_path: Path) -> None:
+def test_without_any_private_folder_the_error_is_one_line(tmp_path: Path) -> None:
     tmp_path.chmod(0o777)
     with pytest.raises(OSError, match=r"\Ano folder for compiled kernels .*other users can replace[^\n]*\Z"):
         first_private(tmp_path / "home" / "flockenv", tmp_path, "flockenv-1")

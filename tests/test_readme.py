@@ -1,4 +1,4 @@
-"""What the README tells people to type, typed."""
+"""The README: its example runs, its links exist, and its tables are those of docs/results.json."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 RESULTS = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
 
 
-def test_the_ten_lines_run_and_the_player_scores_what_a_player_scores(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_example_runs_and_the_hand_written_player_scores_well(capsys: pytest.CaptureFixture[str]) -> None:
     (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert len(code.strip().splitlines()) <= 12
-    exec(compile(code, "README.md", "exec"), {})  # noqa: S102  # that is the point
+    exec(compile(code, "README.md", "exec"), {})  # noqa: S102  # the example of the README
     mean, _ = (float(x) for x in re.findall(r"-?\d+\.\d+", capsys.readouterr().out)[:2])
     assert mean > 5, "the hand-written pursuer catches nearly all: 10 for a capture, minus half a point per second"
 
 
-def test_every_file_it_points_to_exists() -> None:
+def test_every_linked_file_exists() -> None:
     for target in re.findall(r"\]\(([^)#:]+)\)", README):
         assert (ROOT / target).exists(), target
 
 
-def test_its_tables_are_those_of_the_stored_run() -> None:
-    """If this fails: `python -m agents.compare && python -m agents.publish` makes both anew."""
+def test_the_tables_are_those_of_results_json() -> None:
+    """If this fails, run `python -m agents.compare && python -m agents.publish`."""
     results = json.loads((ROOT / "docs" / "results.json").read_text(encoding="utf-8"))
     assert publish.BLOCK.findall(README) == [publish.summary(results)]
     assert publish.BLOCK.findall(RESULTS) == [publish.tables(results)]
@@ -42,7 +42,7 @@ def test_its_tables_are_those_of_the_stored_run() -> None:
             assert f"{player['iqm']:.2f} [{player['ci_low']:.2f}, {player['ci_high']:.2f}]" in RESULTS
 
 
-def test_it_is_short_and_its_tables_are_narrow() -> None:
+def test_the_readme_is_short_and_its_tables_are_narrow() -> None:
     assert len(README.splitlines()) <= 150
     for table in re.findall(r"(?:^\|.*\n)+", README, re.MULTILINE):
         assert table.splitlines()[0].count("|") <= 7, "at most six columns"
@@ -51,7 +51,7 @@ def test_it_is_short_and_its_tables_are_narrow() -> None:
         assert len(sentence.split()) <= 30, sentence
 
 
-def test_a_comparison_is_published_as_it_is_and_a_quick_or_partial_one_never(tmp_path: Path) -> None:
+def test_a_full_comparison_is_published_and_a_quick_or_partial_one_is_refused(tmp_path: Path) -> None:
     results = json.loads((ROOT / "docs" / "results.json").read_text(encoding="utf-8"))
     folder, root = tmp_path / "results", tmp_path / "checkout"
     (root / "docs").mkdir(parents=True)
@@ -67,13 +67,13 @@ def test_a_comparison_is_published_as_it_is_and_a_quick_or_partial_one_never(tmp
         return CliRunner().invoke(publish.app, [str(folder), "--root", str(root)])
 
     without = {**results, "tasks": {name: task for name, task in results["tasks"].items() if name != "herd"}}
-    for given, said in (
+    for given, message in (
         (None, "no such file; `python -m agents.compare` writes it"),
         ({**results, "smoke": True}, "a quick look (--smoke) is not for the documents"),
         (without, "a part of a comparison, without herd, is not for the documents"),
     ):
         refused = published(given)
-        assert refused.exit_code == 2 and said in refused.stderr and refused.stderr.count("\n") == 1
+        assert refused.exit_code == 2 and message in refused.stderr and refused.stderr.count("\n") == 1
         assert (root / "README.md").read_text(encoding="utf-8") == readme
         assert [path.name for path in (root / "docs").iterdir()] == ["results.md"]
     done = published(results)

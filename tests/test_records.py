@@ -1,4 +1,4 @@
-"""Records are values: what is derived from them never outlives a change, and copying one is free."""
+"""Records are values: a changed copy is derived and checked again, and a plain copy is the record itself."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from flockenv.tasks import Pursuit
 SCENE = Scene(space=Box(size=(10, 10)), groups=(Group(count=3),), effects=(Drag(rate=0.5),))
 
 
-def test_a_changed_copy_derives_everything_anew() -> None:
+def test_a_changed_copy_recomputes_derived_values() -> None:
     assert len(SCENE.parts.effects) == 1  # cached on the original
     other = SCENE.with_effects(Drag(rate=0.5), Separation(weight=1, radius=1))
     assert len(other.parts.effects) == 2
@@ -30,13 +30,13 @@ def test_a_changed_copy_is_checked_like_a_new_one() -> None:
 
 
 @pytest.mark.slow
-def test_copies_are_the_record_itself_even_after_use() -> None:
+def test_copies_are_the_record_itself() -> None:
     SCENE.step(SCENE.start(0))
     assert copy.copy(SCENE) is SCENE
     assert copy.deepcopy(SCENE) is SCENE
 
 
-def test_pickles_hold_fields_alone_and_compare_equal() -> None:
+def test_pickles_hold_only_fields_and_compare_equal() -> None:
     SCENE.step(SCENE.start(0))
     again = pickle.loads(pickle.dumps(SCENE))
     assert again == SCENE
@@ -52,7 +52,7 @@ def test_pickles_hold_fields_alone_and_compare_equal() -> None:
     (lambda: Pursuit(control_dt=0.1, dt=0.03), "whole multiple"),
     (lambda: Scene(groups=(Group(count=10**9),), space=Box(size=(1, 1))), "GiB"),
 ])  # fmt: skip
-def test_a_refusal_is_one_line_that_says_what_and_what_else(call, line) -> None:  # type: ignore[no-untyped-def]
+def test_errors_are_one_line_with_the_field_or_a_suggestion(call, line) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ValueError, match=r".") as caught:
         call()
     assert line in str(caught.value)
@@ -60,7 +60,7 @@ def test_a_refusal_is_one_line_that_says_what_and_what_else(call, line) -> None:
 
 
 def test_scenes_that_have_run_can_be_compared() -> None:
-    """What follows from the fields is kept in the record, arrays too, and does not count."""
+    """Derived values, which include arrays, are cached in the record and do not affect equality."""
     group = Group(count=3, spawn=Spawn(low=(0, 0), high=(1, 1)))
     one, other = (Scene(groups=(group,), effects=(Drag(rate=0.5),), dt=0.1) for _ in range(2))
     for scene in (one, other):

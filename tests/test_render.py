@@ -52,7 +52,7 @@ def close_to(image: np.ndarray, colour: tuple[int, int, int], within: int = 12) 
 
 
 def blob(image: np.ndarray, role: str) -> tuple[float, float]:
-    # The caption, which shows the roles' colours too, lies above the world.
+    # The caption above the world also shows the colours of the roles.
     rows, columns = np.nonzero(close_to(image, rgb(ROLE_COLOURS[role][0])) & (np.arange(len(image)) > 50)[:, None])
     assert len(rows)
     return columns.mean(), rows.mean()
@@ -67,24 +67,24 @@ def difference(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 def test_snapshot_copies_and_is_read_only() -> None:
     vel = np.ones((1, 2))
-    made = shot(vel=vel)
+    snapshot = shot(vel=vel)
     vel[:] = 7.0
-    assert (made.vel == 1.0).all()
+    assert (snapshot.vel == 1.0).all()
     for name in ("pos", "vel", "alive", "radius", "obstacle_centre", "obstacle_radius", "low", "high", "bonds"):
         with pytest.raises(ValueError, match="read-only"):
-            getattr(made, name)[...] = 0
+            getattr(snapshot, name)[...] = 0
     with pytest.raises(AttributeError):
-        made.time = 1.0  # type: ignore[misc]
+        snapshot.time = 1.0  # type: ignore[misc]
 
 
 def test_snapshot_survives_pickling() -> None:
-    made = shot(marks=(Mark("goal", [1.0, 2.0], [0.0, 0.0], 1.0),))
-    again = pickle.loads(pickle.dumps(made))
-    assert (draw(again) == draw(made)).all()
+    snapshot = shot(marks=(Mark("goal", [1.0, 2.0], [0.0, 0.0], 1.0),))
+    again = pickle.loads(pickle.dumps(snapshot))
+    assert (draw(again) == draw(snapshot)).all()
 
 
 @pytest.mark.parametrize(
-    ("fields", "says"),
+    ("fields", "message"),
     [
         ({"pos": [[1.0, 2.0, 3.0, 4.0]]}, "Snapshot.pos: must have 2 or 3 coordinates, got 4"),
         ({"vel": np.zeros((2, 2))}, r"Snapshot.vel: must have shape \(1, 2\), got shape \(2, 2\)"),
@@ -107,8 +107,8 @@ def test_snapshot_survives_pickling() -> None:
         ({"marks": (Mark("goal", np.ones(3), np.ones(3), 0.0),)}, "Snapshot.marks: must have 2 coordinates, got 3"),
     ],
 )
-def test_snapshot_refuses_in_one_line(fields: dict[str, Any], says: str) -> None:
-    with pytest.raises((ValueError, TypeError), match=says) as caught:
+def test_a_bad_snapshot_raises_an_error_of_one_line(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises((ValueError, TypeError), match=message) as caught:
         shot(**fields)
     assert "\n" not in str(caught.value)
 
@@ -124,34 +124,34 @@ def test_mark_refuses_an_unknown_kind_and_a_negative_radius() -> None:
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_an_agent_shows_its_roles_colour_where_it_is(role: str) -> None:
+def test_an_agent_is_drawn_at_its_position_in_the_colour_of_its_role(role: str) -> None:
     x0, y0 = blob(draw(shot([(5.0, 5.0)], roles=(role,))), role)
     x1, y1 = blob(draw(shot([(7.0, 6.0)], roles=(role,))), role)
     metre = (x1 - x0) / 2.0
     assert 45.0 < metre < 60.0  # ten metres over the most of 600 px
     assert y0 - y1 == pytest.approx(metre, abs=0.6)  # y points up
-    assert x0 == pytest.approx(299.5, abs=0.6)  # the world's middle is the picture's
+    assert x0 == pytest.approx(299.5, abs=0.6)  # both middles coincide
 
 
 @pytest.mark.parametrize("degrees", range(0, 360, 30))
 def test_a_dart_points_along_the_velocity(degrees: int) -> None:
-    way = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
-    image = draw(shot(vel=[3.0 * way], radius=[1.0]))
+    direction = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
+    image = draw(shot(vel=[3.0 * direction], radius=[1.0]))
     x, y = blob(draw(shot(radius=[1.0])), "evader")
     solid = close_to(image, rgb(ROLE_COLOURS["evader"][0]), 30)
-    ahead, behind = (tuple(np.rint((y - r * way[1], x + r * way[0])).astype(int)) for r in (36.0, -36.0))
+    ahead, behind = (tuple(np.rint((y - r * direction[1], x + r * direction[0])).astype(int)) for r in (36.0, -36.0))
     assert solid[ahead]
     assert not solid[behind]
 
 
-def test_an_agent_shows_its_body_radius() -> None:
+def test_an_agent_is_drawn_with_its_radius() -> None:
     image = draw(shot([(5.0, 5.0)], [(1.0, 0.0)], radius=[1.5]))
     rows = np.flatnonzero(difference(image, draw(shot(np.empty((0, 2))))).max(axis=1)[60:])
     metre = np.diff([blob(draw(shot([(x, 5.0)])), "evader")[0] for x in (2.0, 8.0)])[0] / 6.0
     assert rows[-1] - rows[0] == pytest.approx(2.0 * 1.5 * metre, abs=2.5)
 
 
-def test_nobody_is_drawn_where_nobody_is() -> None:
+def test_dead_and_diverged_agents_are_not_drawn() -> None:
     empty = draw(shot(np.empty((0, 2))))
     assert (difference(draw(shot([(2.0, 2.0)])), empty)[60:].max()) > 100
     for hidden in (
@@ -163,7 +163,7 @@ def test_nobody_is_drawn_where_nobody_is() -> None:
         assert difference(draw(hidden), empty)[60:].max() == 0
 
 
-def test_who_was_caught_leaves_a_cross() -> None:
+def test_a_caught_agent_leaves_a_cross() -> None:
     image = draw(shot(alive=[False], radius=[1.0]))
     x, y = np.rint(blob(draw(shot(radius=[1.0])), "evader")).astype(int)
     marked = difference(image, draw(shot(np.empty((0, 2))))) > 60
@@ -172,7 +172,7 @@ def test_who_was_caught_leaves_a_cross() -> None:
     assert not marked[y, x + 25]
 
 
-def test_a_body_on_the_seam_is_seen_on_both_sides_and_only_inside() -> None:
+def test_a_body_on_the_seam_is_drawn_on_both_sides_inside_the_world() -> None:
     here = {"pos": [(0.1, 5.0)], "radius": [0.8]}
     box, torus = draw(shot(**here)), draw(shot(**here, periodic=True))
     empty = draw(shot(np.empty((0, 2)), periodic=True))
@@ -189,7 +189,7 @@ def test_no_body_covers_the_caption() -> None:
     assert (covered[:38, :100] == plain[:38, :100]).all()
 
 
-def test_obstacles_goals_and_headings_are_seen() -> None:
+def test_obstacles_goals_and_headings_are_drawn() -> None:
     empty = draw(shot(np.empty((0, 2))))
 
     def change(**fields: Any) -> np.ndarray:
@@ -200,7 +200,7 @@ def test_obstacles_goals_and_headings_are_seen() -> None:
     assert stone.sum() == pytest.approx(np.pi * (2.0 * 54.0) ** 2, rel=0.05)
     assert goal.sum() == pytest.approx(stone.sum(), rel=0.02)
     ring = close_to(draw(shot(np.empty((0, 2)), marks=(Mark("goal", [5.0, 5.0], [0.0, 0.0], 2.0),))), (0, 158, 115))
-    assert 0 < ring.sum() < 0.1 * goal.sum()  # a ring: one can see who is inside
+    assert 0 < ring.sum() < 0.1 * goal.sum()  # a ring: agents inside stay visible
     x, y = 300, np.nonzero(stone)[0].mean()
     east = change(marks=(Mark("heading", [5.0, 5.0], [9.0, 0.0], 0.0),))
     north = change(marks=(Mark("heading", [5.0, 5.0], [0.0, 0.01], 0.0),))
@@ -210,7 +210,7 @@ def test_obstacles_goals_and_headings_are_seen() -> None:
     assert not change(marks=(Mark("heading", [5.0, 5.0], [0.0, 0.0], 0.0),)).any()
 
 
-def test_what_is_nearer_in_three_dimensions_is_larger_and_on_top() -> None:
+def test_nearer_agents_in_3d_are_larger_and_on_top() -> None:
     empty = draw(shot(np.empty((0, 3))))
     area = [(difference(draw(shot([(5.0, 5.0, z)])), empty)[60:] > 8).sum() for z in (0.0, 5.0, 10.0)]
     assert area[0] < area[1] < area[2]
@@ -228,15 +228,15 @@ def test_bonds_are_lines_between_dots() -> None:
     )
     assert not free[60:, 200:400].any()
     assert tied[60:, 200:400].any(axis=0).all()
-    assert 1 <= tied[60:, 300].sum() <= 3  # a thin one
+    assert 1 <= tied[60:, 300].sum() <= 3  # a thin line
     dot = np.flatnonzero(tied[60:, :].any(axis=0))[0], np.flatnonzero(free[60:, :].any(axis=0))[0]
-    assert dot[0] > dot[1]  # no dart stands out behind it
+    assert dot[0] > dot[1]  # a dot instead of a dart
     for gone in ({"alive": [True, False], "roles": ("agent",) * 2}, {"vel": [(1.0, 0.0), (np.nan, 0.0)]}):
         alone = difference(draw(shot(**{**pair, **gone}, bonds=[(0, 1)])), empty) > 20
         assert not alone[60:, 200:400].any()
 
 
-def test_a_bond_across_the_seam_takes_the_shortest_way() -> None:
+def test_a_bond_across_the_seam_takes_the_shortest_path() -> None:
     pair = {"pos": [(1.0, 5.0), (9.0, 5.0)], "radius": [0.1, 0.1], "periodic": True}
     seen = difference(draw(shot(**pair, bonds=[(0, 1)])), draw(shot(np.empty((0, 2)), periodic=True))) > 20
     assert not seen[60:, 100:500].any()
@@ -244,24 +244,24 @@ def test_a_bond_across_the_seam_takes_the_shortest_way() -> None:
     assert seen[60:, 540:570].any(axis=0).all()
 
 
-def test_what_is_tied_leaves_no_trail() -> None:
-    way = [shot([(3.0 + k, 5.0), (3.0 + k, 6.0)], bonds=[(0, 1)]) for k in range(4)]
-    assert (draw(way[-1], trails=way[:-1]) == draw(way[-1])).all()
+def test_agents_with_bonds_leave_no_trail() -> None:
+    shots = [shot([(3.0 + k, 5.0), (3.0 + k, 6.0)], bonds=[(0, 1)]) for k in range(4)]
+    assert (draw(shots[-1], trails=shots[:-1]) == draw(shots[-1])).all()
 
 
-def test_trails_show_the_way_and_do_not_streak_across_the_seam() -> None:
-    way = [shot([((8.0 + 0.5 * k) % 10.0, 5.0)], [(1.0, 0.0)], radius=[0.2], periodic=True) for k in range(8)]
-    trail = difference(draw(way[-1], trails=way[:-1]), draw(way[-1])) > 8
+def test_trails_follow_the_path_and_are_cut_at_the_seam() -> None:
+    shots = [shot([((8.0 + 0.5 * k) % 10.0, 5.0)], [(1.0, 0.0)], radius=[0.2], periodic=True) for k in range(8)]
+    trail = difference(draw(shots[-1], trails=shots[:-1]), draw(shots[-1])) > 8
     columns = np.flatnonzero(trail.any(axis=0))
     assert columns[-1] > 520  # before the seam
     assert columns[0] < 40  # behind it
     assert not trail[:, 120:420].any()
     with pytest.raises(ValueError, match="trails: must have positions of shape"):
-        draw(way[0], trails=[shot(np.zeros((3, 2)))])
+        draw(shots[0], trails=[shot(np.zeros((3, 2)))])
 
 
 @pytest.mark.parametrize("high", [(10.0, 10.0), (40.0, 10.0), (3.0, 30.0), (1000.0, 1.0)])
-def test_pictures_are_even_and_fit(high: tuple[float, float]) -> None:
+def test_pictures_have_even_sides_that_fit_the_size(high: tuple[float, float]) -> None:
     image = draw(shot(np.empty((0, 2)), high=high), size=301)
     assert image.dtype == np.uint8
     assert image.shape[1:] == (300, 3)
@@ -269,7 +269,7 @@ def test_pictures_are_even_and_fit(high: tuple[float, float]) -> None:
     assert image.shape[0] <= 302
 
 
-def test_drawing_twice_gives_the_same_and_leaves_the_kept_backdrop_alone() -> None:
+def test_drawing_is_repeatable_and_does_not_change_the_cached_backdrop() -> None:
     one = shot(np.random.default_rng(0).uniform(0, 10, (9, 2)), title="same")
     first = draw(one)
     draw(shot(title="same"))
@@ -316,7 +316,7 @@ def test_importing_the_package_imports_no_backend_and_drawing_needs_no_display()
     assert done.returncode == 0, done.stderr
 
 
-def test_an_unknown_name_is_an_attribute_error_that_lists_the_known() -> None:
+def test_an_unknown_attribute_raises_an_error_that_lists_the_known_ones() -> None:
     import flockenv.render
 
     with pytest.raises(AttributeError, match="write_replay"):
@@ -324,14 +324,14 @@ def test_an_unknown_name_is_an_attribute_error_that_lists_the_known() -> None:
     assert "draw" in dir(flockenv.render)
 
 
-def test_window_shows_the_frame_and_closes_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_window_shows_the_frame_and_may_be_closed_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     pygame = pytest.importorskip("pygame")
     window = Window("test")
     frame = draw(shot(), size=100)
     window.show(frame, fps=1000.0)
     assert (pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1) == frame).all()
-    assert not pygame.mixer.get_init()  # display alone, not pygame.init()
+    assert not pygame.mixer.get_init()  # the display only, not pygame.init()
     assert not pygame.font.get_init()
     window.show(draw(shot(), size=80), fps=1000.0)
     assert pygame.display.get_surface().get_size() == (80, 80)
@@ -343,7 +343,7 @@ def test_window_shows_the_frame_and_closes_twice(monkeypatch: pytest.MonkeyPatch
     assert not pygame.display.get_init()
 
 
-def test_closing_the_window_by_hand_lets_the_run_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_continues_after_its_window_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     pygame = pytest.importorskip("pygame")
     window, frame = Window(), draw(shot(), size=64)
@@ -354,7 +354,7 @@ def test_closing_the_window_by_hand_lets_the_run_go_on(monkeypatch: pytest.Monke
     window.show(frame, fps=1000.0)
 
 
-def test_two_windows_outlive_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_closing_one_window_keeps_the_other_open(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     pytest.importorskip("pygame")
     one, two, frame = Window(), Window(), draw(shot(), size=64)
@@ -366,7 +366,7 @@ def test_two_windows_outlive_each_other(monkeypatch: pytest.MonkeyPatch) -> None
     two.close()
 
 
-def test_without_pygame_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pygame_the_error_names_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(ImportError, match=r"pip install 'flockenv\[render\]'") as caught:
         Window()
@@ -377,20 +377,20 @@ def test_without_pygame_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def noise(n: int, height: int = 40, width: int = 60) -> Iterator[np.ndarray]:
-    # Few colours a frame, other ones each time, black among them: palettes must change and stay right.
+    # Few colours per frame, new ones each time, and black: palettes must change and stay correct.
     draws = np.random.default_rng(0)
     for _ in range(n):
         colours = np.vstack([draws.integers(0, 256, (20, 3)), np.zeros((1, 3))]).astype(np.uint8)
         yield colours[draws.integers(0, 21, (height, width))]
 
 
-def test_a_gif_holds_every_frame_at_its_time(tmp_path: Path) -> None:
+def test_a_gif_holds_every_frame_and_the_whole_duration(tmp_path: Path) -> None:
     path = tmp_path / "run.gif"
     frames = list(noise(7))
-    frames[0] = np.full((40, 60, 3), 255, np.uint8)  # a palette of one colour, which lacks the next one's black
+    frames[0] = np.full((40, 60, 3), 255, np.uint8)  # its palette of one colour lacks the black of the next
     frames[1] = frames[0].copy()
     frames[1][:9] = 0
-    frames[3:5] = [frames[2], frames[2].copy()]  # nothing new is a frame too
+    frames[3:5] = [frames[2], frames[2].copy()]  # equal frames also count
     frames[4][5:9, 5:9] = 0
     assert write_gif(path, iter(frames), fps=30) == 7
     with Image.open(path) as gif:
@@ -436,18 +436,18 @@ def test_a_gif_refuses_a_bad_rate_before_it_writes(tmp_path: Path, fps: Any) -> 
     assert not list(tmp_path.iterdir())
 
 
-def test_a_gif_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
+def test_a_failed_gif_leaves_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "x.gif"
     with pytest.raises(ValueError, match="at least one"):
         write_gif(path, [], 10)
     assert not list(tmp_path.iterdir())
     path.write_bytes(b"old")
-    for frames, says in (
+    for frames, message in (
         ([np.zeros((4, 4, 3), np.uint8), np.zeros((4, 5, 3), np.uint8)], r"frame 1: must have the shape of frame 0"),
         ([np.zeros((4, 4, 3))], "frame 0: must be a uint8 array .* got float64 array"),
         ([np.zeros((4, 4), np.uint8)], r"frame 0: must have shape \(height, width, 3\)"),
     ):
-        with pytest.raises((ValueError, TypeError), match=says):
+        with pytest.raises((ValueError, TypeError), match=message):
             write_gif(path, frames, 10)
         assert path.read_bytes() == b"old"
         assert list(tmp_path.iterdir()) == [path]
@@ -468,14 +468,14 @@ def test_a_png_is_the_frame(tmp_path: Path) -> None:
         ("x" * 300 + ".png", OSError),
     ],
 )
-def test_a_path_that_cannot_be_is_one_clear_line(tmp_path: Path, name: str, error: type[Exception]) -> None:
+def test_an_impossible_path_raises_an_error_of_one_line(tmp_path: Path, name: str, error: type[Exception]) -> None:
     with pytest.raises(error) as caught:
         write_png(tmp_path / name, draw(shot(), size=64))
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_link_is_replaced_and_not_followed(tmp_path: Path) -> None:
+def test_a_symbolic_link_is_replaced_and_not_followed(tmp_path: Path) -> None:
     (tmp_path / "outside").write_bytes(b"old")
     (tmp_path / "x.png").symlink_to(tmp_path / "outside")
     write_png(tmp_path / "x.png", draw(shot(), size=64))
@@ -486,7 +486,7 @@ def test_a_link_is_replaced_and_not_followed(tmp_path: Path) -> None:
 
 
 class Page(HTMLParser):
-    """What a browser would make of the file: its tags, and the texts of title and scripts."""
+    """The tags of a file of HTML, and the texts inside them, for example of title and scripts."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -546,15 +546,15 @@ def test_a_replay_decodes_to_the_run(tmp_path: Path, dimension: int) -> None:
     assert packed["radius"] == [0.5] * 7
 
 
-def test_a_replay_tells_the_dead_the_resting_and_the_lost(tmp_path: Path) -> None:
+def test_a_replay_marks_dead_resting_and_diverged_agents(tmp_path: Path) -> None:
     pos = [(1.0, 1.0), (2.0, 2.0), (np.nan, 3.0), (1e300, -1e300)]
     one = shot(pos, [(1.0, 0.0), (0.0, 0.0), (1.0, 0.0), (0.0, 1.0)], alive=[False, True, True, True])
     (packed,) = written(tmp_path / "r.html", [Group("g", [panel([one])])]).data["groups"][0]["panels"]
     assert list(base64.b64decode(packed["heading"])) == [255, 254, 255, 64]
-    assert (decoded(packed)[0, 2:] == [(-5.0, -5.0), (15.0, -5.0)]).all()  # outside, where nobody looks
+    assert (decoded(packed)[0, 2:] == [(-5.0, -5.0), (15.0, -5.0)]).all()  # outside the view
 
 
-def test_a_replay_keeps_bonds_once(tmp_path: Path) -> None:
+def test_a_replay_stores_bonds_once(tmp_path: Path) -> None:
     (packed,) = written(tmp_path / "r.html", [Group("g", [panel(run(bonds=[(0, 2), (2, 1)]))])]).data["groups"][0][
         "panels"
     ]
@@ -563,7 +563,7 @@ def test_a_replay_keeps_bonds_once(tmp_path: Path) -> None:
         panel([run(2)[0], run(2, bonds=[(0, 1)])[1]])
 
 
-def test_a_scene_shows_the_edges_of_its_networks() -> None:
+def test_a_snapshot_of_a_scene_has_the_edges_of_its_networks() -> None:
     cloth = Cloth(cells=(2, 1), sides=(2, 1))
     scene = Scene(
         groups=(SceneGroup(count=3, spawn=Spawn(low=(0, 0), high=(1, 1))), SceneGroup(network=cloth)), effects=()
@@ -573,7 +573,7 @@ def test_a_scene_shows_the_edges_of_its_networks() -> None:
     assert seen.tied.tolist() == [False] * 3 + [True] * 6
 
 
-def test_groups_of_a_scene_are_told_apart() -> None:
+def test_groups_of_a_scene_have_different_roles() -> None:
     kinds = [{}, {"role": "pursuer"}, {}, {}, {}, {}]
     groups = tuple(SceneGroup(count=2, spawn=Spawn(low=(0, 0), high=(9, 9)), **kind) for kind in kinds)
     shown = Scene(groups=groups).snapshot(Scene(groups=groups).start(0)).roles
@@ -581,12 +581,12 @@ def test_groups_of_a_scene_are_told_apart() -> None:
     assert len({ROLE_COLOURS[role] for role in ROLES}) == len(ROLES)
 
 
-def test_a_replay_of_a_scene_shows_no_return(tmp_path: Path) -> None:
+def test_a_replay_of_a_scene_has_no_reward(tmp_path: Path) -> None:
     page = written(tmp_path / "r.html", [Group("boids", [Panel("", run(3), None, "")])])
     assert page.data["groups"][0]["panels"][0]["reward"] is None
 
 
-def test_a_replay_keeps_scenery_only_when_it_changes(tmp_path: Path) -> None:
+def test_a_replay_stores_scenery_only_when_it_changes(tmp_path: Path) -> None:
     there = (Mark("goal", [1.0, 2.0], [0.0, 0.0], 0.5),)
     here = (Mark("heading", [0.0, 0.0], [3.0, 4.0], 0.0),)
     stone = {"obstacle_centre": [(1.0, 1.0)], "obstacle_radius": [0.25]}
@@ -609,11 +609,11 @@ HOSTILE = [
 
 
 @pytest.mark.parametrize("name", [*HOSTILE, "\ud800", "=cmd()", '"&amp;', "🐟", "x" * 5000])
-def test_a_hostile_name_is_only_a_name(tmp_path: Path, name: str) -> None:
+def test_a_hostile_name_adds_no_tags_to_a_replay(tmp_path: Path, name: str) -> None:
     harmless = written(tmp_path / "a.html", [Group("g", [panel(run())])])
     hostile = written(tmp_path / "b.html", [Group(name, [panel(run(), name)])], title=name)
     assert hostile.tags == harmless.tags
-    # Browsers end a script at "</script" and a space too, which Python's parser lets pass.
+    # Browsers, unlike Python's parser, also end a script at "</script" and a space.
     assert (tmp_path / "b.html").read_text(encoding="utf-8").count("<") == (tmp_path / "a.html").read_text(
         encoding="utf-8"
     ).count("<")
@@ -639,7 +639,7 @@ def test_a_replay_of_three_tasks_stays_small(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "says"),
+    ("make", "message"),
     [
         (lambda: Panel("p", [], [], ""), "panel 'p': must have at least one snapshot"),
         (lambda: Panel("p", run(3), [0.0], ""), r"panel 'p': must have one reward per snapshot \(3\), got 1"),
@@ -651,8 +651,8 @@ def test_a_replay_of_three_tasks_stays_small(tmp_path: Path) -> None:
         (lambda: write_replay("never.html", [], "t"), "groups: there must be at least one"),
     ],
 )
-def test_a_replay_refuses_in_one_line(make: Any, says: str) -> None:
-    with pytest.raises((ValueError, TypeError), match=says) as caught:
+def test_a_bad_replay_raises_an_error_of_one_line(make: Any, message: str) -> None:
+    with pytest.raises((ValueError, TypeError), match=message) as caught:
         make()
     assert "\n" not in str(caught.value)
     assert not Path("never.html").exists()

@@ -1,4 +1,4 @@
-"""Laws over rows: whatever module or function a law was made in, and whatever shapes it is given."""
+"""Vectorized laws: defined in a module, a function or a notebook, with arguments of many shapes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ print(rows(stretched)([[1.0, 2.0], [3.0, 4.0]], 10.0).tolist())
 
 
 def stretching(factor: float) -> Law:
-    """Return a law that its module does not hold under its own name."""
+    """Return a law that is not an attribute of its module."""
 
     @law
     def stretched(x: Vec, by: float) -> Vec:
@@ -43,25 +43,25 @@ def stretching(factor: float) -> Law:
 
 @law
 def blended(a: float, weights: Numbers, b: Vec, c: float, d: Vec, e: float) -> float:
-    """Six arguments of every kind."""
+    """Return a sum over six arguments of every kind."""
     total = a + c * b[0] + e * d[1]
     for k in range(len(weights)):
         total += weights[k]
     return total
 
 
-def test_laws_made_by_one_function_are_two_laws() -> None:
+def test_laws_from_one_factory_are_distinct() -> None:
     np.testing.assert_array_equal(rows(stretching(2.0))([1.0, 2.0], 10.0), [20.0, 40.0])
     np.testing.assert_array_equal(rows(stretching(3.0))([1.0, 2.0, 4.0], 10.0), [30.0, 60.0, 120.0])
 
 
 @pytest.mark.parametrize("jit", ["0", "1"])
-def test_a_law_of_a_notebook_runs_and_edited_runs_anew(jit: str, tmp_path: Path) -> None:
-    """As there: its module has no source, and the law keeps its name."""
-    told = {**os.environ, "FLOCKENV_CACHE": str(tmp_path), "NUMBA_DISABLE_JIT": jit}
+def test_a_law_of_a_notebook_runs_and_is_recompiled_after_an_edit(jit: str, tmp_path: Path) -> None:
+    """The module has no source file, and the law keeps its name."""
+    env = {**os.environ, "FLOCKENV_CACHE": str(tmp_path), "NUMBA_DISABLE_JIT": jit}
     for factor in (2, 5, 2):
         program = [sys.executable, "-c", NOTEBOOK.format(factor=factor)]
-        done = subprocess.run(program, cwd=ROOT, env=told, capture_output=True, text=True, check=True)
+        done = subprocess.run(program, cwd=ROOT, env=env, capture_output=True, text=True, check=True)
         assert done.stdout == f"[[{10.0 * factor}, {20.0 * factor}], [{30.0 * factor}, {40.0 * factor}]]\n"
 
 
@@ -74,10 +74,10 @@ def test_a_law_takes_many_arguments_and_numbers_of_any_length(length: int) -> No
 
 
 def unannotated(x: Any, by: float) -> Vec:
-    """Say nothing of x that `rows` can use."""
+    """Annotate x with a type that `rows` cannot use."""
     return scale(x, by)
 
 
-def test_a_law_whose_annotations_say_nothing_is_refused_in_one_line() -> None:
+def test_a_law_without_usable_annotations_is_refused_in_one_line() -> None:
     with pytest.raises(TypeError, match=r"\Aunannotated: x must be annotated as one of Vec, .*got 'Any'\Z"):
         rows(law(unannotated))

@@ -1,4 +1,4 @@
-"""Stable-Baselines3: strangers' use unchanged, and our own VecEnv by the letter of its contract."""
+"""Stable-Baselines3: its tools on our environments, and our VecEnv against the contract of `VecEnv`."""
 
 import base64
 import copy
@@ -33,7 +33,7 @@ torch.set_num_threads(1)
 
 @pytest.fixture(autouse=True)
 def no_display(monkeypatch):
-    """SDL draws nowhere, and a window's clock does not wait."""
+    """Let SDL draw without a display, and let the clock of a window not wait."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     monkeypatch.setattr("pygame.time.Clock", Clock)
 
@@ -51,16 +51,16 @@ def rows(env, steps, seed=0):
     return np.random.default_rng(seed).uniform(-1, 1, (steps, env.num_envs, *env.action_space.shape)).astype(np.float32)
 
 
-# --- strangers' use ------------------------------------------------------------------------------------------------
+# --- tools of SB3 --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mode", [None, "rgb_array", "human"])
 @pytest.mark.parametrize("env_id", SINGLE)
-def test_sb3_check_env_has_nothing_to_say(env_id, mode):
+def test_check_env_accepts_every_environment_and_render_mode(env_id, mode):
     check_env(gymnasium.make(env_id, render_mode=mode), skip_render_check=False)
 
 
-def test_ppo_trains_on_the_id():
+def test_ppo_trains_on_a_registered_id():
     model = PPO("MlpPolicy", "flockenv/Pursuit-v0", n_steps=128, batch_size=64, n_epochs=2, seed=0)
     before = [p.detach().clone() for p in model.policy.parameters()]
     model.learn(384)
@@ -70,7 +70,7 @@ def test_ppo_trains_on_the_id():
 
 
 @pytest.mark.parametrize("env_id", SINGLE)
-def test_evaluate_policy_takes_the_reynolds_player(env_id):
+def test_evaluate_policy_gives_the_same_returns_on_our_vec_env(env_id):
     env = make_vec_env(env_id, 2, seed=1, env_kwargs={})
     task = env.get_attr("task")[0]
     returns, lengths = evaluate_policy(player(task), env, n_eval_episodes=4, return_episode_rewards=True)
@@ -90,8 +90,8 @@ def test_evaluate_policy_takes_the_reynolds_player(env_id):
 
 
 @pytest.mark.parametrize("name", sorted(TASKS))
-def test_it_is_sb3_s_own_vecenv_of_singles(name):
-    """Rows, dones and infos of DummyVecEnv over gymnasium.make, across ends, wherever both speak of the same thing."""
+def test_our_vec_env_equals_dummy_vec_env_of_single_environments(name):
+    """Observations, rewards, dones and common keys of infos are compared, also across ends of episodes."""
     env_id = next(i for i in SINGLE if name.replace("_", "") in i.lower())
     dummy = DummyVecEnv([lambda: gymnasium.make(env_id, max_episode_steps=25)] * 3)
     native = WorldVecEnv(dummy.get_attr("task")[0], 3, time_limit=25)
@@ -105,14 +105,14 @@ def test_it_is_sb3_s_own_vecenv_of_singles(name):
         for k in np.flatnonzero(ours[2]):
             mine, other = ours[3][k], theirs[3][k]
             np.testing.assert_array_equal(mine["terminal_observation"], other["terminal_observation"])
-            sums = {key for key in mine if key.startswith("reward/")}  # over the episode, where theirs are of the step
+            sums = {key for key in mine if key.startswith("reward/")}  # ours: of the episode; theirs: of the step
             assert sums <= set(other)
             for key in set(mine) & set(other) - sums - {"terminal_observation"}:
                 assert mine[key] == other[key], key
             assert {"TimeLimit.truncated", "is_success"} <= set(mine) & set(other)
 
 
-def test_rows_are_worlds_times_learners():
+def test_rows_are_the_learners_of_each_world_in_order():
     env = flock()
     world = World(env.task, 3, time_limit=10)
     env.seed(40)
@@ -126,7 +126,7 @@ def test_rows_are_worlds_times_learners():
         assert infos == [{}] * 12
 
 
-def test_the_end_of_an_episode():
+def test_infos_at_the_end_of_an_episode_have_observation_success_and_sums():
     env = flock()
     world = World(env.task, 3, time_limit=10)
     env.seed(40)
@@ -151,7 +151,7 @@ def check_end(infos, step, metrics, sums):
         assert all(info[name] == column[k // 4] for name, column in metrics.items() if not np.isnan(column[k // 4]))
 
 
-def test_an_end_at_the_time_limit_is_a_death_if_it_is_one():
+def test_termination_at_the_time_limit_is_not_truncation():
     env = WorldVecEnv(Pursuit(capture_distance=100.0), 2, time_limit=1)
     env.reset()
     _, _, done, infos = env.step(np.zeros((2, 2)))
@@ -160,7 +160,7 @@ def test_an_end_at_the_time_limit_is_a_death_if_it_is_one():
     assert [info["is_success"] for info in infos] == [True, True]
 
 
-def test_infos_that_tell_something_are_never_shared():
+def test_infos_with_content_are_never_shared():
     env = flock()
     env.seed(0)
     env.reset()
@@ -182,7 +182,7 @@ WRITES = {
 
 
 @pytest.mark.parametrize("write", WRITES.values(), ids=WRITES)
-def test_the_empty_info_is_one_and_cannot_be_written(write):
+def test_all_rows_share_one_empty_info_that_cannot_be_written(write):
     env = flock()
     env.reset()
     infos = env.step(rows(env, 1)[0])[3]
@@ -196,12 +196,12 @@ def test_the_empty_info_is_one_and_cannot_be_written(write):
     assert json.dumps(infos[3]) == "{}"
 
 
-def test_copies_of_the_empty_info():
+def test_explicit_copies_of_the_empty_info_are_writable():
     own = NOTHING.copy()
     assert type(own) is dict
     own["episode"] = 1
     assert type({**NOTHING}) is type(NOTHING | {}) is type(dict(NOTHING)) is dict
-    # A deep copy of a list of infos would otherwise be full of one dictionary that can be written.
+    # Otherwise a deep copy of a list of infos would hold one writable dictionary many times.
     assert copy.deepcopy([NOTHING] * 2)[1] is copy.copy(NOTHING) is pickle.loads(pickle.dumps(NOTHING)) is NOTHING
     assert NOTHING == {}
 
@@ -235,7 +235,7 @@ def test_seeds_belong_to_worlds():
         env.seed(-1)
 
 
-def test_ppo_trains_on_worlds_and_meets_monitor_and_nan_check():
+def test_ppo_training_is_reproducible_under_vec_monitor_and_vec_check_nan():
     def train():
         env = VecMonitor(VecCheckNan(flock(worlds=4), raise_exception=True), info_keywords=("is_success",))
         return PPO("MlpPolicy", env, n_steps=16, batch_size=64, n_epochs=2, seed=3).learn(512)
@@ -246,8 +246,8 @@ def test_ppo_trains_on_worlds_and_meets_monitor_and_nan_check():
         assert torch.equal(a, b)
 
 
-def test_time_limits_are_bootstrapped():
-    """PPO adds gamma V(terminal_observation) to the reward of a truncated row; it needs both keys for that."""
+def test_ppo_bootstraps_time_limits():
+    """PPO adds gamma V(terminal_observation) to the reward of a truncated row; that needs both keys of the info."""
     env = flock(worlds=1)
     model = PPO("MlpPolicy", env, n_steps=10, batch_size=40, n_epochs=1, gamma=0.5, seed=0)
     raised = []
@@ -257,12 +257,12 @@ def test_time_limits_are_bootstrapped():
     assert sum(obs.shape[0] == 1 for obs in raised) == 4
 
 
-def test_who_leaves_one_by_one_is_refused():
+def test_tasks_whose_learners_leave_one_by_one_are_refused_by_default():
     with pytest.raises(ValueError, match=r"^[^\n]*pettingzoo[^\n]*$"):
         WorldVecEnv(Pursuit(pursuers=3, evaders=2, sides="both"))
 
 
-def test_a_row_whose_learner_left_is_paid_nothing_until_the_world_begins_anew():
+def test_rows_of_absent_learners_have_no_reward_until_their_world_is_reset():
     task = School(metabolism=0.1, start_hunger=0.6)
     env, world = WorldVecEnv(task, 3, time_limit=60, leaving=True), World(task, 3, time_limit=60)
     env.seed(2)
@@ -286,7 +286,7 @@ ROOM = Bottleneck(people=8)
 
 
 def played(env, steps):
-    """Yield what comes back in each step of the tuned rules, and which rows had a learner before it."""
+    """Play the tuned rules; yield which rows had a learner before each step, and rewards, dones and infos."""
     rules, state, first = player(env.task), None, np.ones(env.num_envs, bool)
     seen = env.reset()
     for _ in range(steps):
@@ -296,8 +296,7 @@ def played(env, steps):
         yield before, reward, first, infos
 
 
-def test_a_row_is_done_once_and_tells_how_it_ended():
-    """Each learner ends once in each episode of its world, with its last observation and the sums of its terms."""
+def test_each_learner_is_done_once_per_episode_with_its_last_observation_and_sums():
     env = WorldVecEnv(ROOM, 2, leaving=True)
     env.seed(3)
     ends, sums, early = np.zeros(16, int), np.zeros(16), 0
@@ -314,36 +313,38 @@ def test_a_row_is_done_once_and_tells_how_it_ended():
         assert all(bool(info) == over for info, over in zip(infos, done.tolist(), strict=True))
         begun = np.repeat(env.world.steps == 0, 8)
         np.testing.assert_array_equal(env.present, present & ~done | begun)
-        assert np.ptp(ends.reshape(2, 8)[env.world.steps == 0], axis=-1).sum() == 0  # all of a world, equally often
+        assert (
+            np.ptp(ends.reshape(2, 8)[env.world.steps == 0], axis=-1).sum() == 0
+        )  # all learners of a world, equally often
     assert early > 10
     assert ends.min() >= 2
 
 
 def one_by_one(task, seed, episodes):
-    """Return what each agent of PettingZoo's form is paid by the tuned rules in an episode, and for how long."""
+    """Return the returns and episode lengths of the tuned rules, per agent, in the PettingZoo environment."""
     env = pettingzoo.make("parallel", "flockenv/Bottleneck-v0", people=task.people)
     rules, returns, lengths = player(task), [], []
     for episode in range(episodes):
         seen, state, first = env.reset(seed=None if episode else seed)[0], None, np.ones(task.learners, bool)
-        everyone, index = np.stack([*seen.values()]), {agent: i for i, agent in enumerate(env.possible_agents)}
-        paid, stayed = np.zeros(task.learners), np.zeros(task.learners, int)
+        latest, index = np.stack([*seen.values()]), {agent: i for i, agent in enumerate(env.possible_agents)}
+        paid, duration = np.zeros(task.learners), np.zeros(task.learners, int)
         while env.agents:
             for agent, row in seen.items():
-                everyone[index[agent]] = row
-            actions, state = rules.predict(everyone, state, first)
+                latest[index[agent]] = row
+            actions, state = rules.predict(latest, state, first)
             first = np.zeros(task.learners, bool)
             seen, reward, *_ = env.step({agent: actions[index[agent]] for agent in env.agents})
             for agent in reward:
                 paid[index[agent]] += reward[agent]
-                stayed[index[agent]] += 1
+                duration[index[agent]] += 1
         returns += paid.tolist()
-        lengths += stayed.tolist()
+        lengths += duration.tolist()
     return returns, lengths
 
 
 @pytest.mark.parametrize("monitor", [WorldMonitor, VecMonitor])
 def test_monitors_count_one_episode_for_each_learner(monitor):
-    """What it is paid, and (by our monitor) for how long it is there, as PettingZoo's form has it."""
+    """Returns, and with our monitor also lengths, are those of the PettingZoo environment."""
     worlds = WorldVecEnv(ROOM, 2, leaving=True)
     worlds.seed(3)
     counted = evaluate_policy(player(ROOM), monitor(worlds), 32, return_episode_rewards=True)
@@ -354,7 +355,7 @@ def test_monitors_count_one_episode_for_each_learner(monitor):
 
 
 @pytest.mark.parametrize("monitor", [WorldMonitor, lambda env: WorldMonitor(VecCheckNan(env))])
-def test_where_all_end_together_our_monitor_is_sb3_s(monitor):
+def test_our_monitor_equals_vec_monitor_if_all_learners_end_together(monitor):
     ours, theirs = monitor(flock(worlds=2)), VecMonitor(flock(worlds=2))
     for env in (ours, theirs):
         env.seed(5)
@@ -368,7 +369,7 @@ def test_where_all_end_together_our_monitor_is_sb3_s(monitor):
 
 
 @pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-def test_a_copy_goes_on_as_the_original_would(clone):
+def test_a_copy_continues_like_the_original(clone):
     env = flock()
     env.seed(1)
     env.reset()
@@ -381,7 +382,7 @@ def test_a_copy_goes_on_as_the_original_would(clone):
             np.testing.assert_array_equal(a, b)
 
 
-def test_attributes_and_methods():
+def test_attributes_and_methods_follow_the_contract_of_vec_env():
     env = flock()
     assert env.get_attr("task") == [env.task] * 12
     assert env.get_attr("task", indices=[1, 2]) == [env.task] * 2
@@ -398,13 +399,13 @@ def test_attributes_and_methods():
 
 
 @pytest.mark.parametrize("task", [Pursuit(control_dt=0.25), Flock(agents=7, learners=4)], ids=["pursuit", "flock"])
-def test_metadata_tells_how_fast_frames_play_in_real_time(task):
+def test_render_fps_is_the_rate_of_control_steps(task):
     assert WorldVecEnv(task, 2, render_mode="rgb_array").metadata["render_fps"] == round(1 / task.control_dt)
     assert WorldVecEnv(task, 2).metadata["render_fps"] == round(1 / task.control_dt)
 
 
 @pytest.mark.parametrize("task", [Pursuit(), Flock(agents=7, learners=4), Pursuit(pursuers=2, capture_distance=1.5)])
-def test_its_spec_makes_the_same_worlds(task):
+def test_make_vec_of_the_spec_makes_the_same_worlds(task):
     env = WorldVecEnv(task, 2, time_limit=9)
     spec = env.get_attr("spec")[0]
     again = gymnasium.make_vec(spec, num_envs=env.num_envs)
@@ -413,7 +414,7 @@ def test_its_spec_makes_the_same_worlds(task):
     assert VecMonitor(env).venv.spec.id == spec.id
 
 
-def test_random_numbers_of_wrappers_follow_the_seed():
+def test_np_random_follows_the_seed():
     env = flock()
     env.seed(5)
     env.reset()
@@ -425,7 +426,7 @@ def test_random_numbers_of_wrappers_follow_the_seed():
     assert env.np_random.integers(2**40, size=3).tolist() == first
 
 
-def test_bad_input():
+def test_bad_input_raises_errors():
     env = flock()
     with pytest.raises(ResetNeeded, match="reset"):
         env.step(np.zeros((12, 2)))
@@ -450,7 +451,7 @@ def test_bad_input():
         env.step(np.zeros((12, 2)))
 
 
-def test_pictures_and_the_window():
+def test_render_and_get_images_return_the_same_picture():
     env = flock(render_mode="rgb_array")
     env.reset()
     picture = env.render()
@@ -471,7 +472,7 @@ class Canary:
         return Path.touch, (self.path,)
 
 
-def test_a_zip_is_not_opened_on_trust(tmp_path):
+def test_code_in_a_zip_runs_only_with_trust_pickle(tmp_path):
     good, bad, marker = tmp_path / "good.zip", tmp_path / "bad.zip", tmp_path / "ran"
     model = PPO("MlpPolicy", "flockenv/Pursuit-v0", n_steps=64, batch_size=64, seed=0)
     model.save(good)

@@ -1,4 +1,4 @@
-"""Obstacles of every shape: how far, which way is out, where a ray hits, against independent answers."""
+"""Obstacles of every shape: distance, normal, hit of a ray, silhouette and bounds, by independent computations."""
 
 from __future__ import annotations
 
@@ -63,29 +63,29 @@ def places(shape: Shape, count: int = 300, seed: int = 1) -> Any:
 
 
 def directions(shape: Shape, count: int = 300) -> Any:
-    ways = np.random.default_rng(2).normal(size=(count, shape.dimension))
-    return ways / np.linalg.norm(ways, axis=1, keepdims=True)
+    vectors = np.random.default_rng(2).normal(size=(count, shape.dimension))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 @every
-def test_the_normal_is_the_slope_of_the_distance(name: str) -> None:
+def test_the_normal_is_the_gradient_of_the_distance(name: str) -> None:
     shape, h = SHAPES[name], 1e-6
     x = places(shape)
     steps = h * np.eye(shape.dimension)
     slope = np.stack([(shape.gap(x + s) - shape.gap(x - s)) / (2 * h) for s in steps], axis=1)
-    smooth = np.abs(np.linalg.norm(slope, axis=1) - 1) < 1e-6  # not where two places of the surface are equally near
+    smooth = np.abs(np.linalg.norm(slope, axis=1) - 1) < 1e-6  # excludes places with two nearest points
     assert smooth.mean() > 0.9
     np.testing.assert_allclose(shape.normal(x)[smooth], slope[smooth], atol=1e-5)
 
 
 @every
-def test_the_nearest_place_lies_on_the_surface_and_no_place_of_it_is_nearer(name: str) -> None:
+def test_the_nearest_point_lies_on_the_surface_and_no_point_of_it_is_nearer(name: str) -> None:
     shape = SHAPES[name]
     x = places(shape)
     nearest = shape.nearest(x)
     np.testing.assert_allclose(shape.gap(nearest), 0, atol=1e-9)
     np.testing.assert_allclose(np.linalg.norm(nearest - x, axis=1), np.abs(shape.gap(x)), rtol=1e-9)
-    # whatever lies within the distance of a place is on its side of the surface
+    # all points nearer to a place than its distance are on the same side of the surface
     inner = x + 0.999 * np.abs(shape.gap(x))[:, None] * directions(shape)
     assert (np.sign(shape.gap(inner)) == np.sign(shape.gap(x))).all()
 
@@ -93,26 +93,26 @@ def test_the_nearest_place_lies_on_the_surface_and_no_place_of_it_is_nearer(name
 @every
 @pytest.mark.parametrize("clearance", [0.0, 0.35])
 def test_a_ray_hits_where_the_body_touches_first(name: str, clearance: float) -> None:
-    """Oracle: a fine walk along the ray, which stops where the distance is the clearance for the first time."""
+    """The oracle steps finely along the ray: before a hit, the distance must exceed the clearance."""
     shape = SHAPES[name]
     x = places(shape, 200)
-    way = np.array(shape.anchor) + places(shape, 200, 3) / 3 - x  # somewhere towards it
-    way /= np.linalg.norm(way, axis=1, keepdims=True)
-    found = shape.hit(x, way, clearance)
-    room = lambda t: shape.gap(x + t[:, None] * way) - clearance  # noqa: E731
+    direction = np.array(shape.anchor) + places(shape, 200, 3) / 3 - x  # roughly towards the shape
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    found = shape.hit(x, direction, clearance)
+    room = lambda t: shape.gap(x + t[:, None] * direction) - clearance  # noqa: E731
     np.testing.assert_array_equal(found == 0, room(np.zeros(200)) < 0)
     hits = np.isfinite(found) & (found > 0)
     assert 10 < hits.sum() < 190
     np.testing.assert_allclose(room(np.where(hits, found, 0))[hits], 0, atol=1e-9)
     for share in np.linspace(0.01, 0.999, 120):
-        assert (room(share * np.where(hits, found, 0))[hits] > -1e-9).all(), "it was touched before"
+        assert (room(share * np.where(hits, found, 0))[hits] > -1e-9).all(), "an earlier point touches the shape"
     missed = np.isinf(found)
     for t in np.linspace(0, 20, 300):
-        assert (room(np.full(200, t))[missed] > -1e-9).all(), "it is touched, and missed"
+        assert (room(np.full(200, t))[missed] > -1e-9).all(), "a ray that misses touches the shape"
 
 
 @pytest.mark.parametrize("name", ["concave", "convex", "clockwise"])
-def test_inside_of_a_polygon_is_where_the_winding_number_says(name: str) -> None:
+def test_inside_of_a_polygon_agrees_with_the_winding_number(name: str) -> None:
     shape: Any = SHAPES[name]
     x = places(shape, 500)
     corners = np.array(shape.vertices)[None] - x[:, None]
@@ -122,42 +122,42 @@ def test_inside_of_a_polygon_is_where_the_winding_number_says(name: str) -> None
     np.testing.assert_array_equal(shape.inside(x), np.abs(winding) > 0.5)
 
 
-def test_a_polygon_does_not_care_in_which_sense_it_is_given() -> None:
-    x, way = places(L), directions(L)
+def test_the_orientation_of_a_polygon_does_not_matter() -> None:
+    x, direction = places(L), directions(L)
     a, b = SHAPES["convex"], SHAPES["clockwise"]
     np.testing.assert_allclose(a.gap(x), b.gap(x), atol=1e-12)
-    np.testing.assert_allclose(a.hit(x, way, 0.2), b.hit(x, way, 0.2), atol=1e-12)
+    np.testing.assert_allclose(a.hit(x, direction, 0.2), b.hit(x, direction, 0.2), atol=1e-12)
     on_edge = np.array([0.5, -0.75])
     np.testing.assert_allclose(a.normal(on_edge), b.normal(on_edge), atol=1e-9)
 
 
 @pytest.mark.parametrize("clearance", [0.0, 0.3])
 @pytest.mark.parametrize("name", ["circle", "capsule", "segment", "wall", "convex", "concave", "block", "turned_block"])
-def test_lines_to_the_ends_of_the_silhouette_just_touch(name: str, clearance: float) -> None:
+def test_lines_to_the_ends_of_the_silhouette_just_touch_the_shape(name: str, clearance: float) -> None:
     shape = SHAPES[name]
     point = np.array([-5.0, 3.0])
     for end, side in zip(shape.silhouette(point, clearance), (1, -1), strict=True):
-        way = (end - point) / np.linalg.norm(end - point)
-        assert shape.hit(point, way, clearance + 1e-6) < np.inf
+        direction = (end - point) / np.linalg.norm(end - point)
+        assert shape.hit(point, direction, clearance + 1e-6) < np.inf
         for turn in (1e-4, 0.1, 1.0):
             c, s = np.cos(side * turn), np.sin(side * turn)
-            outward = np.array([way[0] * c - way[1] * s, way[0] * s + way[1] * c])
+            outward = np.array([direction[0] * c - direction[1] * s, direction[0] * s + direction[1] * c])
             assert shape.hit(point, outward, clearance) == np.inf
         assert abs(float(shape.gap(end)) - clearance) < 1e-9
 
 
 @pytest.mark.parametrize("name", ["concave", "turned_box"])
-def test_a_distance_field_is_the_shape_to_the_spacing(name: str) -> None:
+def test_a_distance_field_agrees_with_its_shape_to_the_spacing(name: str) -> None:
     shape = SHAPES[name]
     d, spacing = shape.dimension, 0.05 if name == "concave" else 0.1
     field = DistanceField(low=(-3,) * d, high=(5,) * d, spacing=spacing, shapes=(shape,))
-    x, way = np.random.default_rng(1).uniform(-2.5, 4, (300, d)), directions(shape)
+    x, direction = np.random.default_rng(1).uniform(-2.5, 4, (300, d)), directions(shape)
     assert np.abs(field.gap(x) - shape.gap(x)).max() < spacing
     far = np.abs(shape.gap(x)) > 3 * spacing
     assert np.median((field.normal(x) * shape.normal(x)).sum(axis=1)[far]) > 0.999
-    found, exact = field.hit(x, way, 0.3), shape.hit(x, way, 0.3)
+    found, exact = field.hit(x, direction, 0.3), shape.hit(x, direction, 0.3)
     both = np.isfinite(found) & np.isfinite(exact)
-    assert (np.isfinite(found) == np.isfinite(exact)).mean() > 0.98  # but for grazing rays
+    assert (np.isfinite(found) == np.isfinite(exact)).mean() > 0.98  # except for grazing rays
     assert np.quantile(np.abs(found[both] - exact[both]), 0.95) < 1.5 * spacing
     again = DistanceField(low=field.low, spacing=spacing, values=tuple(field.distances.tolist()))
     np.testing.assert_array_equal(again.gap(x), field.gap(x))
@@ -166,21 +166,21 @@ def test_a_distance_field_is_the_shape_to_the_spacing(name: str) -> None:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_in_a_hollow_circle_or_sphere_everything_has_a_closed_form(dimension: int) -> None:
-    """R - |x|, inward, and t = -x.d + sqrt((x.d)^2 - |x|^2 + (R - r)^2)."""
+def test_queries_in_a_hollow_circle_or_sphere_agree_with_closed_forms(dimension: int) -> None:
+    """Distance R - |x|, normal -x / |x|, and hit at t = -x.d + sqrt((x.d)^2 - |x|^2 + (R - r)^2)."""
     ball = Circle(centre=(0,) * dimension, radius=2.0, hollow=True)
     x = np.random.default_rng(5).uniform(-0.9, 0.9, (200, dimension))
-    way, far = directions(ball, 200), np.linalg.norm(x, axis=1)
+    direction, far = directions(ball, 200), np.linalg.norm(x, axis=1)
     np.testing.assert_allclose(ball.gap(x), 2 - far, atol=1e-14)
     np.testing.assert_allclose(ball.normal(x), -x / far[:, None], atol=1e-14)
-    along = (x * way).sum(axis=1)
-    np.testing.assert_allclose(ball.hit(x, way, 0.3), np.sqrt(along**2 - far**2 + 1.7**2) - along, rtol=1e-14)
-    assert (ball.hit(x, way, 2.5) == 0).all()
+    along = (x * direction).sum(axis=1)
+    np.testing.assert_allclose(ball.hit(x, direction, 0.3), np.sqrt(along**2 - far**2 + 1.7**2) - along, rtol=1e-14)
+    assert (ball.hit(x, direction, 2.5) == 0).all()
     assert float(ball.gap(np.full(dimension, 5.0))) < 0
 
 
 @every
-def test_whatever_it_is_made_of_lies_within_its_bounds(name: str) -> None:
+def test_a_shape_lies_within_its_bounds_and_they_are_tight(name: str) -> None:
     shape = SHAPES[name]
     x = 3 * places(shape, 400)
     offset = x - shape.bound.centre
@@ -191,29 +191,29 @@ def test_whatever_it_is_made_of_lies_within_its_bounds(name: str) -> None:
     assert (shape.gap(x)[beyond > 0] >= beyond[beyond > 0] - 1e-12).all()
     assert (shape.gap(x) >= np.linalg.norm(offset, axis=1) - shape.bound.radius - 1e-12).all()
     surface = shape.nearest(x) - shape.bound.centre
-    assert (np.abs(surface).max(axis=0) > 0.9 * shape.bound.half).all(), "the box is too large"
-    assert shape.bound.radius < 1.01 * np.linalg.norm(shape.bound.half), "so is the circle"
+    assert (np.abs(surface).max(axis=0) > 0.9 * shape.bound.half).all(), "the bounding box is too large"
+    assert shape.bound.radius < 1.01 * np.linalg.norm(shape.bound.half), "the bounding circle is too large"
 
 
-def test_a_distance_field_that_is_solid_up_to_the_edge_of_its_grid_goes_on_within_its_bounds() -> None:
+def test_a_distance_field_solid_at_the_edge_of_its_grid_stays_within_its_bounds() -> None:
     field = DistanceField(low=(0, 0), high=(2, 1), spacing=0.25, shapes=(Circle(centre=(0.5, 0.5), radius=1.0),))
     x, bound = places(field, 1000), field.bound
     offset = x - bound.centre
     beyond = np.linalg.norm(np.maximum(np.abs(offset) - bound.half, 0), axis=1)
     assert (field.gap(x)[beyond > 0] >= beyond[beyond > 0] - 1e-12).all()
     assert (field.gap(x) >= np.linalg.norm(offset, axis=1) - bound.radius - 1e-12).all()
-    assert field.gap([0.5, 1.4]) < 0, "it does go on"
+    assert field.gap([0.5, 1.4]) < 0, "the solid must extend beyond the grid"
 
 
 @every
-def test_it_is_finite_everywhere_and_without_a_direction(name: str) -> None:
+def test_queries_are_finite_everywhere_and_for_a_zero_direction(name: str) -> None:
     shape = SHAPES[name]
     special = [np.array(shape.anchor), *shape.extremes, np.zeros(shape.dimension), np.full(shape.dimension, 1e9)]
     x = np.array(special)
     assert np.isfinite(shape.gap(x)).all()
     np.testing.assert_allclose(np.linalg.norm(shape.normal(x), axis=1), 1, rtol=1e-9)
-    for way in (np.zeros_like(x), np.eye(shape.dimension)[np.zeros(len(x), int)]):
-        assert not np.isnan(shape.hit(x, way, 0.1)).any()
+    for direction in (np.zeros_like(x), np.eye(shape.dimension)[np.zeros(len(x), int)]):
+        assert not np.isnan(shape.hit(x, direction, 0.1)).any()
 
 
 # --- as obstacles of a scene ------------------------------------------------------------------------------------------
@@ -221,7 +221,7 @@ def test_it_is_finite_everywhere_and_without_a_direction(name: str) -> None:
 GROUP = Group(count=200, radius=0.2, spawn=Spawn(low=(-3, -3), high=(4, 4)))
 
 
-def test_a_plain_centre_and_radius_goes_on_meaning_a_circle() -> None:
+def test_an_obstacle_with_centre_and_radius_but_no_kind_is_a_circle() -> None:
     scene = load_scene(
         "groups: [{count: 1, spawn: {low: [0, 0], high: [1, 1]}}]\nobstacles: [{centre: [3, 3], radius: 1}]"
     )
@@ -229,7 +229,7 @@ def test_a_plain_centre_and_radius_goes_on_meaning_a_circle() -> None:
     assert scene.start(0).obstacle_radius.shape == (1, 1)
 
 
-def test_every_shape_comes_back_from_its_file() -> None:
+def test_every_shape_survives_yaml() -> None:
     flat = tuple(shape for shape in SHAPES.values() if shape.dimension == 2)
     field = DistanceField(low=(0, 0), high=(1, 1), spacing=0.5, shapes=(Circle(centre=(0.5, 0.5), radius=0.2),))
     sway = Sway(amplitude=(0.5, 0), period=3, phase=1)
@@ -240,13 +240,13 @@ def test_every_shape_comes_back_from_its_file() -> None:
     assert scene.shapes != moving
 
 
-def test_nobody_begins_in_an_obstacle() -> None:
+def test_no_agent_starts_in_an_obstacle() -> None:
     obstacles = (L, SHAPES["wall"], Circle(centre=(-2, -2), radius=0.8), Block(centre=(3, 3), size=(1, 1), turn=45))
     scene = Scene(groups=(GROUP,), obstacles=obstacles)
     pos = scene.start(4, worlds=2).pos
     for shape in obstacles:
         assert (shape.gap(pos) >= 0.2 - 1e-9).all()
-    # who was clear anyhow begins where he did without them
+    # agents that are clear anyway start where they do without the other obstacles
     free = Scene(groups=(GROUP,), obstacles=obstacles[2:3]).start(4, worlds=2).pos
     clear = np.min([shape.gap(free) for shape in obstacles], axis=0) >= 0.2
     assert clear.sum() > 100
@@ -261,7 +261,7 @@ def test_a_ring_that_repeats_its_first_vertex_is_the_same_polygon(hollow: bool) 
     np.testing.assert_array_equal(ring.gap(x), Polygon(vertices=L.vertices, hollow=hollow).gap(x))
 
 
-def test_on_a_torus_the_nearest_image_counts() -> None:
+def test_on_a_torus_distances_are_to_the_nearest_image() -> None:
     x, period = np.array([[0.1, 5.0], [9.9, 5.0]]), np.array([10.0, 10.0])
     block = Block(centre=(0, 5), size=(1, 1))
     np.testing.assert_allclose(clear_of([block], x, period), [-0.4, -0.4], atol=1e-9)
@@ -313,13 +313,13 @@ def test_on_a_torus_the_nearest_image_counts() -> None:
         (lambda: Contain(weight=1, within=SHAPES["hollow_circle"]), "within: must stand still and be solid"),
     ],
 )  # fmt: skip
-def test_what_is_no_shape_is_refused_in_one_line(make: Any, text: str) -> None:
+def test_a_bad_shape_raises_an_error_of_one_line(make: Any, text: str) -> None:
     with pytest.raises(ValueError, match=text) as caught:
         make()
     assert "\n" not in str(caught.value)
 
 
-def test_an_unknown_kind_is_answered_with_those_there_are() -> None:
+def test_an_unknown_kind_of_obstacle_gets_a_suggestion() -> None:
     with pytest.raises(ValueError, match=r"polygn.*did you mean `polygon`"):
         load_scene(
             "groups: [{count: 1, spawn: {low: [0, 0], high: [1, 1]}}]\nobstacles: [{kind: polygn, vertices: []}]"

@@ -1,4 +1,4 @@
-"""Steering to avoid aims beyond the silhouette edge nearest to the impact: every shape, both sides, plane and space."""
+"""Steering to avoid aims beyond the silhouette edge nearest to the impact: every shape, both sides, 2D and 3D."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from flockenv.steering.arbitration import Priority
 
 BLOCK = Block(centre=(6, -4.75), size=(0.5, 10.5))
 
-# what ends at y = 0.5, and elsewhere 10 m away
+# obstacles whose near edge is at y = 0.5, and whose other edge is 10 m away
 LONG: dict[str, tuple[Shape, ...]] = {
     "block": (BLOCK,),
     "wall": (Wall(vertices=((6, -10), (6, -3), (6, 0.5))),),
@@ -45,7 +45,7 @@ LONG_3: dict[str, tuple[Shape, ...]] = {
 
 
 def trip(obstacles: tuple[Shape, ...], behaviour: Any = None, y: float = 0.0, d: int = 2) -> tuple[float, float, Any]:
-    """Return length (m) and time (s) of the way to a target 14 m ahead of (0, y), and where it passes x = 6 m."""
+    """Return length (m) and time (s) of the path from (0, y) to (14, 0), and its first point beyond x = 6 m."""
     start, heading, target = ((0.0, y, 0.0)[:d], (1.0, 0.0, 0.0)[:d], (14.0, 0.0, 0.0)[:d])
     spawn = Spawn(low=start, high=start, speed=(2, 2), heading=heading)
     steer = Steer(
@@ -59,13 +59,13 @@ def trip(obstacles: tuple[Shape, ...], behaviour: Any = None, y: float = 0.0, d:
     while len(places) < 600 and np.linalg.norm(places[-1] - target) > 0.4:
         state = scene.step(state)
         places.append(state.pos[0, 0].copy())
-    way = np.array(places)
-    length = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
-    return length, (len(way) - 1) * scene.dt, way[np.argmax(way[:, 0] > 6)]
+    path = np.array(places)
+    length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+    return length, (len(path) - 1) * scene.dt, path[np.argmax(path[:, 0] > 6)]
 
 
 def mirrored(shape: Shape) -> Shape:
-    """Return a shape with the sign of y turned."""
+    """Return a shape with the sign of y reversed."""
     changed: dict[str, Any] = {}
     for name in ("centre", "start", "end", "velocity", "point", "direction"):
         value = getattr(shape, name, None)
@@ -82,30 +82,30 @@ quick = ("block", "wall", "joined walls")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in quick else pytest.mark.slow) for n in LONG])
-def test_it_goes_over_the_near_edge_on_whichever_side_that_is(name: str) -> None:
+def test_the_path_passes_the_near_edge_on_either_side(name: str) -> None:
     length, time, there = trip(LONG[name])
     assert length < 14.2 and time < 7.5  # 25.7 m and 36.8 s by the far edge
     other, _, opposite = trip(tuple(map(mirrored, LONG[name])))
     assert there[1] > 0.5 and opposite[1] < -0.5
-    # head on neither side is favoured by the law; the seek and contacts that follow are the same but for rounding
+    # head on, the law favours neither side; later seeking and contacts differ only by rounding
     assert other == pytest.approx(length, abs=0.15)
     for y in (-0.2, 0.2):
         assert trip(LONG[name], y=y)[0] < 14.2
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n == "block" else pytest.mark.slow) for n in LONG_3])
-def test_in_space_it_goes_over_the_near_edge(name: str) -> None:
+def test_in_3d_the_path_passes_the_near_edge(name: str) -> None:
     length, time, _ = trip(LONG_3[name], d=3)
     assert length < 14.2 and time < 7.5
 
 
 @pytest.mark.slow
-def test_whiskers_go_over_the_near_edge() -> None:
+def test_whiskers_pass_the_near_edge() -> None:
     assert trip(LONG["block"], Whiskers(weight=8))[0] < 14.5
 
 
 def first_force(obstacles: tuple[Shape, ...], heading: tuple[float, ...], at: tuple[float, ...] = (0, 0)) -> Any:
-    """Return what an agent of 2 m/s is made to do by them, N."""
+    """Return the avoidance force on an agent of 1 kg at 2 m/s, N."""
     spawn = Spawn(low=at, high=at, speed=(2, 2), heading=heading)
     scene = Scene(
         dimension=len(at), groups=(Group(count=1, radius=0.2, spawn=spawn),),
@@ -115,13 +115,13 @@ def first_force(obstacles: tuple[Shape, ...], heading: tuple[float, ...], at: tu
 
 
 @pytest.mark.parametrize("turn", [0.0, 30.0, 133.0])
-def test_turning_the_world_turns_the_side(turn: float) -> None:
+def test_the_force_turns_with_the_scene(turn: float) -> None:
     c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
     block = Block(centre=(4 * c + 3 * s, 4 * s - 3 * c), size=(0.5, 7), turn=turn)  # its near edge is to the left
     np.testing.assert_allclose(first_force((block,), (c, s)), [-8 * s, 8 * c], atol=1e-9)
 
 
-def test_dead_ahead_of_a_middle_it_keeps_right_and_a_hair_beside_it_to_the_near_side() -> None:
+def test_head_on_the_force_is_to_the_right_and_off_centre_to_the_near_side() -> None:
     for block in (Block(centre=(4, 0), size=(0.5, 6)), Block(centre=(4, 0), size=(3, 0.5))):
         np.testing.assert_allclose(first_force((block,), (1, 0)), [0, -8], atol=1e-9)
         np.testing.assert_allclose(first_force((block,), (1, 0), (0, 0.01)), [0, 8], atol=1e-9)
@@ -129,16 +129,16 @@ def test_dead_ahead_of_a_middle_it_keeps_right_and_a_hair_beside_it_to_the_near_
 
 
 @pytest.mark.parametrize("distance", [1.4, 3.0])
-def test_in_space_it_turns_away_from_the_middle_of_a_sphere(distance: float) -> None:
-    """Near or far: to other sides the turn is longer, as long as nothing is in the way on this one."""
+def test_in_3d_the_force_points_away_from_the_centre_of_a_sphere(distance: float) -> None:
+    """That side needs the smallest turn, near or far, if no other obstacle blocks it."""
     for around in (0.3, 1.2, 2.9, 4.4):
         side = np.array([0, math.cos(around), math.sin(around)])
         ball = Circle(centre=(distance, *(-0.9 * side[1:])), radius=1.0)
         np.testing.assert_allclose(first_force((ball,), (1, 0, 0), (0, 0, 0)), 8 * side, atol=1e-9)
 
 
-def test_in_space_it_passes_a_sphere_on_the_side_away_from_what_blocks_the_nearest_one() -> None:
-    """The near side is up, where a ball blocks it, a little to the left; the same in the mirror, to the right."""
+def test_in_3d_the_force_avoids_a_second_sphere_that_blocks_the_near_side() -> None:
+    """The near side is up; the second sphere blocks it slightly to the left, or mirrored, to the right."""
     ball = Circle(centre=(3, 0, -0.1), radius=1.0)
     for left in (1, -1):
         force = first_force((ball, Circle(centre=(3.2, 0.3 * left, 2.0), radius=1.2)), (1, 0, 0), (0, 0, 0))
@@ -150,26 +150,26 @@ def edge_of_sphere(to: Any, ray: Any, side: Any, room: float) -> tuple[float, fl
     return sphere_edge(to, ray, side, room)
 
 
-def test_the_edge_of_a_sphere_is_where_a_turned_ray_touches_it() -> None:
+def test_the_edge_of_a_sphere_is_where_the_turned_ray_touches_it() -> None:
     rng = np.random.default_rng(0)
     for _ in range(50):
         ray, side = np.linalg.qr(rng.normal(size=(3, 2)))[0].T
         room, off, ahead = 1.3, rng.uniform(0, 1.2), rng.uniform(1.4, 6)
         to = ahead * ray + off * (u := np.cross(ray, side) * 0.6 + 0.8 * side) / np.linalg.norm(u)
         turn, reach = edge_of_sphere(tuple(to), tuple(ray), tuple(side), room)
-        way = np.cos(turn) * ray + np.sin(turn) * side
-        assert to @ way == pytest.approx(reach) and np.linalg.norm(to - reach * way) == pytest.approx(room)
+        turned = np.cos(turn) * ray + np.sin(turn) * side
+        assert to @ turned == pytest.approx(reach) and np.linalg.norm(to - reach * turned) == pytest.approx(room)
 
 
-def test_a_pocket_is_left_by_its_nearer_end() -> None:
-    """A U that opens to the left; its upper arm is 2 m long, its lower one 9 m."""
+def test_the_force_in_a_pocket_points_to_its_nearer_end() -> None:
+    """The pocket is a U that opens to the left, with an upper arm of 2 m and a lower arm of 9 m."""
     pocket = Wall(vertices=((2, 1.5), (4, 1.5), (4, -1.5), (-5, -1.5)))
     np.testing.assert_allclose(first_force((pocket,), (1, 0)), [0, 8], atol=1e-9)
     upside_down = Wall(vertices=tuple((x, -y) for x, y in pocket.vertices))
     np.testing.assert_allclose(first_force((upside_down,), (1, 0)), [0, -8], atol=1e-9)
 
 
-def test_without_an_edge_it_goes_along_the_side_of_the_normal() -> None:
+def test_without_an_edge_the_force_is_to_the_side_of_the_normal() -> None:
     slope = HalfSpace(point=(4, 0), direction=(-1, 0.1))
     room = Block(centre=(0, 0), size=(8, 8), turn=-5, hollow=True)
     for shape in (slope, room):
@@ -177,15 +177,15 @@ def test_without_an_edge_it_goes_along_the_side_of_the_normal() -> None:
     np.testing.assert_allclose(first_force((slope,), (1, 0)), [0, 8], atol=1e-9)
 
 
-def test_too_near_to_turn_to_the_edge_it_goes_along_the_side_of_the_normal() -> None:
-    """Its turns have a radius of m v^2 / F = 0.5 m; to come around to the near edge takes 0.85 m of depth."""
+def test_too_near_to_turn_to_the_edge_the_force_is_to_the_side_of_the_normal() -> None:
+    """The radius of its turns is m v^2 / F = 0.5 m; a turn to the near edge needs 0.85 m of depth."""
     wall, slanted, force = Wall(vertices=((2, -20), (2, 1))), (math.sqrt(0.5), -math.sqrt(0.5)), 8 * math.sqrt(0.5)
     np.testing.assert_allclose(first_force((wall,), slanted, (1.2, 0)), [-force, -force], atol=1e-9)
     np.testing.assert_allclose(first_force((wall,), slanted, (0, 2)), [force, force], atol=1e-9)
 
 
 @pytest.mark.slow
-def test_it_comes_through_a_door_and_not_through_one_that_is_too_narrow() -> None:
+def test_the_path_leads_through_a_wide_door_and_around_a_narrow_one() -> None:
     def wall(width: float) -> tuple[Shape, ...]:
         low = Wall(vertices=((6, -9), (6, 0.3)))
         return low, Wall(vertices=((6, 0.3 + width), (6, 4)))

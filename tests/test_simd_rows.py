@@ -1,4 +1,4 @@
-"""Agents abreast: columns of all agents' numbers become rows, of every size; views are what they say."""
+"""SIMD rows: columns of all sizes are transposed to rows, arrays viewed without copies, and table entries looked up."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from flockenv.jit.simd_rows import PAIR, SIDE, apart, columns, in_one_row, into_
 
 @njit
 def turned(rows: Any, flat: Any, many: int, distance: int) -> None:
-    """Number what agent i has in column k as 1000 k + i, and make rows of it."""
+    """Write 1000 k + i into column k of agent i, and transpose the columns to rows."""
     beside = columns(flat, rows.shape[0], many, distance)
     for k in range(many):
         for i in range(rows.shape[0]):
@@ -30,14 +30,14 @@ def turned(rows: Any, flat: Any, many: int, distance: int) -> None:
 
 @njit
 def strides(array: Any, world: int) -> tuple[Any, Any, Any]:
-    """Return strides of a packed view, and of one world in it, and what that holds."""
+    """Return the strides of a packed view and of one world in it, and a copy of that world."""
     view = packed(array)
     return view.strides, view[:, world].strides, view[:, world].copy()
 
 
 @pytest.mark.parametrize("agents", [1, 2, 15, 16, 17, 31, 32, 33, 64, 65, 100])
 @pytest.mark.parametrize("many", [1, 15, 16, 17, 32, 47, 50])
-def test_columns_become_rows_and_nothing_else_is_touched(agents: int, many: int) -> None:
+def test_into_rows_transposes_columns_and_writes_nothing_else(agents: int, many: int) -> None:
     distance = apart(agents)
     flat = np.full(many * distance + 7, -3, np.float32)
     room = np.full((3, agents, many + 5), -7, np.float32)
@@ -50,7 +50,7 @@ def test_columns_become_rows_and_nothing_else_is_touched(agents: int, many: int)
     assert (flat[~written] == -3).all()
 
 
-def test_columns_have_room_and_do_not_lie_a_power_of_two_apart() -> None:
+def test_columns_fit_all_agents_and_their_distance_is_no_power_of_two() -> None:
     for agents in (1, 24, 63, 64, 65, 1024, 1025, 100_000):
         distance = apart(agents)
         assert agents <= distance <= max(2 * agents, 64) + SIDE
@@ -58,14 +58,14 @@ def test_columns_have_room_and_do_not_lie_a_power_of_two_apart() -> None:
     assert apart(24) == apart(32) == apart(64)  # one kernel for all of them
 
 
-def test_an_array_with_gaps_is_not_compiled_for() -> None:
+def test_noncontiguous_arrays_are_refused_at_compile_time() -> None:
     with pytest.raises(TypingError, match="one piece"):
         turned(np.zeros((20, 40), np.float32)[:, :20], np.zeros(20 * apart(20), np.float32), 20, apart(20))
     with pytest.raises(TypingError, match="one piece"):
         strides(np.zeros((2, 5, 8))[:, :, ::2], 3)
 
 
-def test_a_packed_array_is_the_same_array() -> None:
+def test_a_packed_array_keeps_its_strides_and_numbers() -> None:
     array = np.random.default_rng(1).normal(size=(2, 5, 7))
     whole, one, held = strides(array, 3)
     assert whole == array.strides
@@ -75,13 +75,13 @@ def test_a_packed_array_is_the_same_array() -> None:
 
 @njit
 def row_of(array: Any) -> tuple[int, Any]:
-    """Return how long it is in one row, and a copy of that."""
+    """Return the length of the array in one row, and a copy of that row."""
     row = in_one_row(array)
     return row.shape[0], row.copy()
 
 
 @pytest.mark.parametrize("shape", [(7,), (2, 0, 3), (4, 1), (3, 5, 2)])
-def test_an_array_in_one_row_is_the_same_numbers(shape: tuple[int, ...]) -> None:
+def test_an_array_in_one_row_keeps_its_numbers_in_order(shape: tuple[int, ...]) -> None:
     array = np.random.default_rng(1).normal(size=shape)
     length, row = row_of(array)
     assert length == array.size
@@ -89,39 +89,39 @@ def test_an_array_in_one_row_is_the_same_numbers(shape: tuple[int, ...]) -> None
 
 
 @njit
-def taken(to: Any, table: Any, who: Any, count: int) -> None:
-    """Call it as a kernel does."""
-    take(to, table, who, count)
+def taken(to: Any, table: Any, indices: Any, count: int) -> None:
+    """Call `take` from compiled code."""
+    take(to, table, indices, count)
 
 
 @pytest.mark.parametrize("real", ["float32", "float64"])
 @pytest.mark.parametrize("count", [1, 2, 15, 16, 17, 31, 32, 33, 63, 64, 65, 100, 128, 129, 300])
-def test_what_is_taken_is_what_the_listed_say(count: int, real: str) -> None:
-    """Tables of one pair of registers, of several, and of more than are looked up."""
+def test_take_returns_the_entries_at_the_indices(count: int, real: str) -> None:
+    """Tables fill one pair of registers, several pairs, or more than the register form handles."""
     long, many, listed = -(-count // PAIR) * PAIR, 3, 2
     rng = np.random.default_rng(count)
     table = rng.normal(size=(many + 1, long)).astype(real)
     table[:, count:] = np.nan
-    who = rng.integers(0, count, (listed, long)).astype(np.int32)
-    who[0, 0], who[-1, -1] = count - 1, 0
+    indices = rng.integers(0, count, (listed, long)).astype(np.int32)
+    indices[0, 0], indices[-1, -1] = count - 1, 0
     room = np.full((3, many, listed, long), -7, real)
-    taken(room[1], table, who, count)
-    np.testing.assert_array_equal(room[1], table[:many][:, who])
+    taken(room[1], table, indices, count)
+    np.testing.assert_array_equal(room[1], table[:many][:, indices])
     assert (room[[0, 2]] == -7).all()
 
 
-def test_numbers_are_looked_up_in_registers_where_that_can_be() -> None:
-    """The register form would vanish unseen: results are the same."""
+def test_take_uses_permutations_of_registers_if_the_processor_has_them() -> None:
+    """No other test would notice its loss: results are the same."""
     if "avx2" not in cpu.FEATURES:
-        pytest.skip("machine code is made for a processor that looks nothing up in registers")
+        pytest.skip("the target processor has no AVX2")
     long = "avx512f" in cpu.FEATURES
-    kinds = (np.float32, np.float64) if long else (np.float32,)  # AVX2 looks up single precision alone
+    kinds = (np.float32, np.float64) if long else (np.float32,)  # AVX2: single precision only
     for real in kinds:
         room, table = np.zeros((3, 2, PAIR), real), np.zeros((3, PAIR), real)
         taken(room, table, np.zeros((2, PAIR), np.int32), PAIR)
-    made = [text for kind, text in taken.inspect_asm().items() if str(kind[0].dtype) in map(str, map(np.dtype, kinds))]
-    assert len(made) >= len(kinds)
-    assert all(re.search("vperm[it]2p" if long else "vperm(ps|d)", text) for text in made)
+    texts = [text for kind, text in taken.inspect_asm().items() if str(kind[0].dtype) in map(str, map(np.dtype, kinds))]
+    assert len(texts) >= len(kinds)
+    assert all(re.search("vperm[it]2p" if long else "vperm(ps|d)", text) for text in texts)
 
 
 ONE_BY_ONE = """
@@ -137,13 +137,13 @@ print(float(np.abs(step.observation).sum()), step.terms.sum().round(6), world.st
 
 
 @pytest.mark.slow
-def test_a_processor_that_looks_nothing_up_takes_them_one_by_one(tmp_path: Path) -> None:
-    """The same flock on this processor, and compiled for one that any x86-64 is."""
-    said, other = [], {"NUMBA_CPU_NAME": "x86-64-v2", "NUMBA_CPU_FEATURES": "", "FLOCKENV_CACHE": str(tmp_path)}
+def test_a_processor_without_permutations_gives_the_same_results(tmp_path: Path) -> None:
+    """The same flock runs compiled for this processor and for x86-64-v2."""
+    printed, other = [], {"NUMBA_CPU_NAME": "x86-64-v2", "NUMBA_CPU_FEATURES": "", "FLOCKENV_CACHE": str(tmp_path)}
     for chosen in ({}, other):
         done = subprocess.run(
             [sys.executable, "-c", ONE_BY_ONE], env={**os.environ, **chosen},
             capture_output=True, text=True, check=True,
         )  # fmt: skip
-        said.append([float(word) for word in done.stdout.split()])
-    assert said[0] == pytest.approx(said[1], rel=1e-5)
+        printed.append([float(word) for word in done.stdout.split()])
+    assert printed[0] == pytest.approx(printed[1], rel=1e-5)
