@@ -128,7 +128,7 @@ def test_an_agent_is_drawn_at_its_position_in_the_colour_of_its_role(role: str) 
     x0, y0 = blob(draw(shot([(5.0, 5.0)], roles=(role,))), role)
     x1, y1 = blob(draw(shot([(7.0, 6.0)], roles=(role,))), role)
     metre = (x1 - x0) / 2.0
-    assert 45.0 < metre < 60.0  # ten metres over the most of 600 px
+    assert 45.0 < metre < 60.0  # 10 m over most of the 600 px
     assert y0 - y1 == pytest.approx(metre, abs=0.6)  # y points up
     assert x0 == pytest.approx(299.5, abs=0.6)  # both middles coincide
 

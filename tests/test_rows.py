@@ -1,4 +1,4 @@
-"""Vectorized laws: defined in a module, a function or a notebook, with arguments of many shapes."""
+"""Vectorized laws, defined in a module, a function or a notebook, with arguments of many shapes."""
 
 from __future__ import annotations
 

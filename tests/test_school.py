@@ -214,7 +214,7 @@ def test_fish_flee_hunters_in_sight_only() -> None:
     assert intent[1] == motivation.WANDER
     away = state.vel[0, 0] / np.linalg.norm(state.vel[0, 0])
     assert away[0] > 0.9
-    assert np.linalg.norm(state.vel[0, 1]) < 1.05  # it wanders on
+    assert np.linalg.norm(state.vel[0, 1]) < 1.05  # it goes on wandering
 
 
 @pytest.mark.slow  # a kernel for each behaviour
@@ -370,21 +370,21 @@ def test_the_textbook_player_flees_keeps_its_state_and_beats_random() -> None:
     empty = {slot.name: np.zeros((2, *slot.shape)) for slot in task.layout.slots}
     empty |= {"to_low": np.full((2, 2), 12.0), "to_high": np.full((2, 2), 12.0), "velocity": np.full((2, 2), 0.1)}
 
-    def ask(state: Any, **given: Any) -> tuple[Any, Any]:
+    def act(state: Any, **given: Any) -> tuple[Any, Any]:
         quantities = empty | {name: np.broadcast_to(value, empty[name].shape) for name, value in given.items()}
         row = np.concatenate([(quantities[s.name] / s.scale).reshape(2, -1) for s in task.layout.slots], axis=1)
         return rules.predict(row.astype(np.float32), state)
 
     hunted = {"hunters": (3.0, 0.0), "hunter_bearing": (1.0, 0.0), "hunter_present": 1.0}
-    action, state = ask(None, fear=0.5, **hunted)
+    action, state = act(None, fear=0.5, **hunted)
     np.testing.assert_array_equal(state, motivation.ESCAPE)
     assert (action[:, 0] < -0.9).all()
     food = {"food": [(0, 4), (0, 0), (0, 0)], "food_bearing": [(0, 1), (0, 0), (0, 0)]}
-    action, state = ask(state, hunger=0.6, **food)
+    action, state = act(state, hunger=0.6, **food)
     np.testing.assert_array_equal(state, motivation.EAT)
     assert (action[:, 1] > 0.9).all()
-    np.testing.assert_array_equal(ask(state, hunger=0.3, **food)[1], motivation.EAT)
-    np.testing.assert_array_equal(ask(None, hunger=0.3, **food)[1], motivation.WANDER)
+    np.testing.assert_array_equal(act(state, hunger=0.3, **food)[1], motivation.EAT)
+    np.testing.assert_array_equal(act(None, hunger=0.3, **food)[1], motivation.WANDER)
 
     class Random:
         def predict(self, seen: Any, state: Any = None, *_: Any) -> Any:
@@ -396,7 +396,7 @@ def test_the_textbook_player_flees_keeps_its_state_and_beats_random() -> None:
     assert ours.metrics["survived"].mean() > theirs.metrics["survived"].mean() + 0.2
 
 
-def test_scripted_fish_use_all_states_but_mate_and_survive() -> None:
+def test_scripted_fish_survive_and_use_all_states_except_mate() -> None:
     world = World(School(learners=1), 32)
     world.reset(5)
     states = set()

@@ -127,7 +127,7 @@ def test_nearest_whole_rounds_ties_to_even(dtype: Any, digits: int) -> None:
     found = np.empty_like(x)
     _rounded(x, dtype(1), found)
     np.testing.assert_array_equal(found, np.rint(x))
-    np.testing.assert_array_equal([nearest_whole.py_func(number) for number in x], np.rint(x))  # in plain Python also
+    np.testing.assert_array_equal([nearest_whole.py_func(number) for number in x], np.rint(x))  # also in plain Python
     _rounded(x[: len(halves) - 3], dtype(2), found)  # the compiler may fuse the product with the rounding
     np.testing.assert_array_equal(found[: len(halves) - 3], 2 * x[: len(halves) - 3])
     _rounded(np.array([np.nan, np.inf, -np.inf], dtype), dtype(1), found)
@@ -226,7 +226,7 @@ def test_friction_against_a_wall_never_adds_kinetic_energy() -> None:
 
 
 def test_friction_between_agents_opposes_slip_at_every_contact_angle() -> None:
-    """kappa d (dv_ji . t) t on i; Menge's accelerates half of them (peers.md 2.6)."""
+    """kappa d (dv_ji . t) t on i; in Menge it adds to the slip in half of the cases (peers.md 2.6)."""
     scene = crowd(Contact(stiffness=0, friction=2.4e5, radius=20), count=1)
     rng = np.random.default_rng(4)
     for _ in range(40):
@@ -276,7 +276,7 @@ def test_walking_groups_have_the_published_cohesion_gaze_and_repulsion() -> None
     """Moussaid et al. 2010: beta1 = 4, beta2 = 3, beta3 = 1. Agents 0 and 1 are a party, 2 and 3 another."""
     scene = crowd(WalkingGroup(group=0, party=2, radius=20), count=4)
     alone = pushed(scene, [[0, 0], [90, 0], [0.5, 0]])
-    assert not alone.any()  # agents of other parties do not act
+    assert not alone.any()  # agents of another party do not act
     far = pushed(scene, [[0, 0], [0, 4]])
     assert np.allclose(far[0], [0, 3]) and np.allclose(far[1], [0, -3])
     near = pushed(scene, [[0, 0], [0, 0.5]])
@@ -305,7 +305,7 @@ def test_parties_end_at_the_group_and_the_last_party_may_be_smaller() -> None:
     assert far[0][2] == 0
 
 
-def test_the_attraction_of_friends_is_at_most_most() -> None:
+def test_the_field_most_bounds_the_attraction_of_friends() -> None:
     here = [[0.0, 0.0], [1.0, 0.0]]
     free, bounded = (
         pushed(crowd(Friends(group=0, strength=80, decay=1, radius=20, most=most)), here)[0, 0] for most in (None, 8)
@@ -454,7 +454,7 @@ def approach(v0: float, tau: float, decay: float, acceleration: float) -> tuple[
     [(0.8, 0.5, 0.08, 25), (1.34, 0.05, 0.5, 50), (1.0, 0.25, 1.0, 50), (1.0, 0.2, 1.0, 50), (1.0, 0.4, 1.0, 50),
      (1.34, 0.5, 0.2, 50)],
 )  # fmt: skip
-def test_a_walk_against_a_wall_oscillates_iff_the_criterion_of_kretz_says_so(
+def test_a_walk_against_a_wall_oscillates_if_and_only_if_kretz_predicts_it(
     v0: float, tau: float, decay: float, acceleration: float
 ) -> None:
     """No oscillation if v0 tau / B <= 1/4 (arXiv 1507.02566); the gap is B ln(A tau / v0) (N13)."""
