@@ -532,7 +532,7 @@ def test_presets_have_the_published_values() -> None:
     assert solid == {"contact": (1.2e5, 2.4e5), "obstacle_contact": (1.2e5, 2.4e5)}
     walls = {name: next((e for e in preset(name) if isinstance(e, ObstacleRepulsion)), None) for name in PRESETS}
     assert walls["helbing_molnar_1995"].acceleration * walls["helbing_molnar_1995"].decay == pytest.approx(10)  # U0
-    assert walls["moussaid_2009"].acceleration, walls["moussaid_2009"].decay == (3, 0.1)
+    assert (walls["moussaid_2009"].acceleration, walls["moussaid_2009"].decay) == (3, 0.1)
     group = preset("moussaid_2010", group=0)[0].behaviours[-1]
     assert (group.gaze, group.cohesion, group.repulsion) == (4, 3, 1)
     assert ALIASES.keys().isdisjoint(PRESETS)
