@@ -124,22 +124,22 @@ def _left(p: Any, frame: Frame, i: int) -> float:
 
 
 @kernel
-def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
+def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
     """Write the terms progress, out, pressed, hurt, time; all 0 for an agent that left in an earlier decision."""
     for i in range(terms.shape[0]):
-        for k in range(5):
+        for k in range(terms.shape[1]):
             terms[i, k] = 0.0
         if after.memory[2, i] < 2.0:
             pressure = np.float64(after.memory[0, i])
-            terms[i, 0] = p.progress_reward * (_left(p, before, i) - _left(p, after, i))
-            terms[i, 1] = p.out_reward if after.memory[2, i] > 0.0 else 0.0
-            terms[i, 2] = -p.press_cost * min(pressure / p.limit, 1.0) * p.control_dt
-            terms[i, 3] = -p.hurt_cost * p.control_dt if pressure > p.limit else 0.0
-            terms[i, 4] = -p.time_cost * p.control_dt
+            terms[i, at.progress] = p.progress_reward * (_left(p, before, i) - _left(p, after, i))
+            terms[i, at.out] = p.out_reward if after.memory[2, i] > 0.0 else 0.0
+            terms[i, at.pressed] = -p.press_cost * min(pressure / p.limit, 1.0) * p.control_dt
+            terms[i, at.hurt] = -p.hurt_cost * p.control_dt if pressure > p.limit else 0.0
+            terms[i, at.time] = -p.time_cost * p.control_dt
 
 
 @kernel
-def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
+def ended(p: Any, at: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """End the learners that are through the door; return True if all are out and none of them was ever hurt."""
     everybody, unhurt = True, True
     for i in range(over.shape[0]):
@@ -154,7 +154,7 @@ def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
 
 
 @kernel
-def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
+def measure(p: Any, at: Any, before: Frame, after: Frame, numbers: Any) -> None:
     """Write learners out; times of the first and last exit, s; peak pressure so far, N/m; contact and hurt time, s.
 
     Contact and hurt time are what this decision adds to the mean over learners: time in contact with a body or the
@@ -170,27 +170,28 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
         most = max(most, np.float64(after.memory[1, i]))
         touched += p.control_dt / n if after.memory[0, i] > 0.0 else 0.0
         hurt += p.control_dt / n if after.memory[0, i] > p.limit else 0.0
-    numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5] = out, first, latest, most, touched, hurt
+    numbers[at.out], numbers[at.first], numbers[at.latest] = out, first, latest
+    numbers[at.most], numbers[at.touched], numbers[at.hurt] = most, touched, hurt
 
 
 @kernel
-def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+def metrics(p: Any, at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
     """Write the share out; evacuation time, s, if all are out; specific flow, persons/(s m) of door from the first to
     the last exit, if two are out; mean contact time, s; peak pressure on a learner, N/m; mean hurt time, s.
     """  # fmt: skip
     span = last.latest - last.first
-    numbers[0] = last.out / p.learners
+    numbers[at.share_out] = last.out / p.learners
     if last.out >= p.learners:
-        numbers[1] = last.latest
+        numbers[at.evacuation_time] = last.latest
     if last.out >= 2 and span > 0:
-        numbers[2] = (last.out - 1) / span / p.width
-    numbers[3], numbers[4], numbers[5] = sums.touched, last.most, sums.hurt
+        numbers[at.specific_flow] = (last.out - 1) / span / p.width
+    numbers[at.contact_time], numbers[at.most_pressure], numbers[at.hurt_time] = sums.touched, last.most, sums.hurt
 
 
 @kernel
-def observe(p: Any, frame: Frame, rows: Any) -> None:
+def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
     """Write own velocity, offset of the door on two scales, wall distances, pressure, the nearest others."""
-    slots, one = int(p.neighbours), like(p.sight, 1.0)
+    one = like(p.sight, 1.0)
     half, axis = 0.5 * p.room, (one, like(one, 0.0))
     for i in range(rows.shape[0]):
         row = rows[i]
@@ -199,19 +200,18 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
         if frame.memory[2, i] > 0.0:
             continue
         x, y = p.room - frame.pos[0, i], half - frame.pos[1, i]
-        put(row, 0, (clip(frame.vel[0, i] / p.max_speed), clip(frame.vel[1, i] / p.max_speed)))
-        put(row, 2, (clip(x / p.room), clip(y / p.room)))
-        put(row, 4, (clip(x / p.close), clip(y / p.close)))
-        put(row, 6, (clip(frame.pos[1, i] / p.room), clip((p.room - frame.pos[1, i]) / p.room)))
-        row[np.uint64(8)] = min(np.float64(frame.memory[0, i]) / p.limit, 1.0)
+        put(row, at.velocity, (clip(frame.vel[0, i] / p.max_speed), clip(frame.vel[1, i] / p.max_speed)))
+        put(row, at.door, (clip(x / p.room), clip(y / p.room)))
+        put(row, at.door_near, (clip(x / p.close), clip(y / p.close)))
+        put(row, at.to_sides, (clip(frame.pos[1, i] / p.room), clip((p.room - frame.pos[1, i]) / p.room)))
+        row[np.uint64(at.pressure)] = min(np.float64(frame.memory[0, i]) / p.limit, 1.0)
         for s in range(frame.near_count[i]):
             j = np.uint64(frame.near_who[s, i])
             to = (frame.pos[0, j] - frame.pos[0, i], frame.pos[1, j] - frame.pos[1, i])
             relative = (frame.vel[0, j] - frame.vel[0, i], frame.vel[1, j] - frame.vel[1, i])
             distance = max(math.sqrt(to[0] * to[0] + to[1] * to[1]), 1e-9)
-            put_neighbour(row, 9, slots, s, to, relative, axis, one / p.sight, 0.5 * one / p.max_speed)
-            put_crowding(row, 9, slots, s, to, axis, distance, distance - 2.0 * _RADIUS, p.near)
-            row[np.uint64(9 + 6 * slots + s)] = 1.0
+            put_neighbour(row, at, s, to, relative, axis, one / p.sight, 0.5 * one / p.max_speed)
+            put_crowding(row, at, s, to, axis, distance, distance - 2.0 * _RADIUS, p.near)
 
 
 class Bottleneck(Task):

@@ -113,13 +113,13 @@ def _touches(frame: Frame, i: int) -> float:
 
 
 @kernel
-def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
+def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
     """Write the terms along (largest at the desired speed), touch, effort."""
     for i in range(terms.shape[0]):
         push = action[i, 0] * action[i, 0] + action[i, 1] * action[i, 1]
-        terms[i, 0] = p.along_reward * _suited(after, i) * p.control_dt
-        terms[i, 1] = -p.touch_cost * _touches(after, i) * p.control_dt
-        terms[i, 2] = -p.effort_cost * min(push, 1.0) * p.control_dt
+        terms[i, at.along] = p.along_reward * _suited(after, i) * p.control_dt
+        terms[i, at.touch] = -p.touch_cost * _touches(after, i) * p.control_dt
+        terms[i, at.effort] = -p.effort_cost * min(push, 1.0) * p.control_dt
 
 
 @kernel
@@ -145,7 +145,7 @@ def _order(p: Any, frame: Frame) -> float:
 
 
 @kernel
-def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
+def ended(p: Any, at: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """End no learner; return whether the aim holds now: learners keep to their desired speeds and touch no agent."""
     n = over.shape[0]
     share, touches = 0.0, 0.0
@@ -153,12 +153,12 @@ def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
         share += _suited(after, i)
         touches += _touches(after, i)
     holds = bool(share > p.aim * n and touches == 0.0)
-    judge(p, after.step, holds, numbers, 4)
+    judge(p, at, after.step, holds, numbers)
     return holds
 
 
 @kernel
-def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
+def measure(p: Any, at: Any, before: Frame, after: Frame, numbers: Any) -> None:
     """Write the learners' mean speed over the desired one, contacts that began, and lane order in the second half."""
     n, length = int(p.learners), p.length
     share, began = 0.0, 0.0
@@ -173,24 +173,24 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
             both = 0.5 if j < n else 1.0  # a pair of learners is counted from both sides
             began += both if x * x + y * y >= 4.0 * _RADIUS * _RADIUS else 0.0
     late = 2 * after.step > p.horizon
-    numbers[0], numbers[1] = share, began
-    numbers[2], numbers[3] = _order(p, after) if late else 0.0, 1.0 if late else 0.0
+    numbers[at.share], numbers[at.touches] = share, began
+    numbers[at.order], numbers[at.late] = _order(p, after) if late else 0.0, 1.0 if late else 0.0
 
 
 @kernel
-def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+def metrics(p: Any, at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
     """Write mean speed over the desired one; contacts that began; lane order in the second half; those of the aim."""
-    tell_lasting(sums, last, steps, numbers, 3)
-    numbers[0] = sums.share / max(steps, 1)
-    numbers[1] = sums.touches
+    tell_lasting(at, sums, last, steps, numbers)
+    numbers[at.speed] = sums.share / max(steps, 1)
+    numbers[at.collisions] = sums.touches
     if sums.late > 0:
-        numbers[2] = sums.order / sums.late
+        numbers[at.lane_order] = sums.order / sums.late
 
 
 @kernel
-def observe(p: Any, frame: Frame, rows: Any) -> None:
+def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
     """Write own velocity, desired speed, walls, nearest others; vectors are (along the walking direction, left)."""
-    slots, one = int(p.neighbours), like(p.sight, 1.0)
+    one = like(p.sight, 1.0)
     for i in range(rows.shape[0]):
         row = rows[i]
         for c in range(rows.shape[1]):
@@ -198,17 +198,16 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
         way = (frame.memory[0, i], like(frame.memory[0, i], 0.0))
         low, high = frame.pos[1, i] - _WALL, _WALL + p.width - frame.pos[1, i]
         left, right = (high, low) if frame.memory[0, i] > 0.0 else (low, high)
-        put(row, 0, turned((frame.vel[0, i], frame.vel[1, i]), way, one / p.max_speed))
-        row[np.uint64(2)] = min(frame.memory[1, i] / p.max_speed, one)
-        put(row, 3, (min(max(left / p.width, 0.0), 1.0), min(max(right / p.width, 0.0), 1.0)))
+        put(row, at.velocity, turned((frame.vel[0, i], frame.vel[1, i]), way, one / p.max_speed))
+        row[np.uint64(at.desired_speed)] = min(frame.memory[1, i] / p.max_speed, one)
+        put(row, at.walls, (min(max(left / p.width, 0.0), 1.0), min(max(right / p.width, 0.0), 1.0)))
         for s in range(frame.near_count[i]):
             j = np.uint64(frame.near_who[s, i])
             x, y = offset(frame.pos[0, i], frame.pos[0, j], p.length), frame.pos[1, j] - frame.pos[1, i]
             relative = (frame.vel[0, j] - frame.vel[0, i], frame.vel[1, j] - frame.vel[1, i])
             distance = max(math.sqrt(x * x + y * y), 1e-9)
-            put_neighbour(row, 5, slots, s, (x, y), relative, way, one / p.sight, 0.5 * one / p.max_speed)
-            put_crowding(row, 5, slots, s, (x, y), way, distance, distance - 2.0 * _RADIUS, p.near)
-            row[np.uint64(5 + 6 * slots + s)] = 1.0
+            put_neighbour(row, at, s, (x, y), relative, way, one / p.sight, 0.5 * one / p.max_speed)
+            put_crowding(row, at, s, (x, y), way, distance, distance - 2.0 * _RADIUS, p.near)
 
 
 class Corridor(LastingTask):

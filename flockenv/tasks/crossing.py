@@ -123,21 +123,21 @@ def _touches(frame: Frame, i: int) -> float:
 
 
 @kernel
-def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
+def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
     """Write the terms progress, arrival (taken back on leaving), touch, time (while away from the goal), effort."""
     for i in range(terms.shape[0]):
         was, left = _left(before, i), _left(after, i)
         came = (1.0 if left <= p.goal_radius else 0.0) - (1.0 if was <= p.goal_radius else 0.0)
         push = action[i, 0] * action[i, 0] + action[i, 1] * action[i, 1]
-        terms[i, 0] = p.progress_reward * (was - left)
-        terms[i, 1] = p.arrival_reward * came
-        terms[i, 2] = -p.touch_cost * _touches(after, i) * p.control_dt
-        terms[i, 3] = -p.time_cost * p.control_dt if left > p.goal_radius else 0.0
-        terms[i, 4] = -p.effort_cost * min(push, 1.0) * p.control_dt
+        terms[i, at.progress] = p.progress_reward * (was - left)
+        terms[i, at.arrival] = p.arrival_reward * came
+        terms[i, at.touch] = -p.touch_cost * _touches(after, i) * p.control_dt
+        terms[i, at.time] = -p.time_cost * p.control_dt if left > p.goal_radius else 0.0
+        terms[i, at.effort] = -p.effort_cost * min(push, 1.0) * p.control_dt
 
 
 @kernel
-def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
+def ended(p: Any, at: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """End all learners once every one is at its goal, which is success."""
     there = True
     for i in range(over.shape[0]):
@@ -148,7 +148,7 @@ def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
 
 
 @kernel
-def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
+def measure(p: Any, at: Any, before: Frame, after: Frame, numbers: Any) -> None:
     """Write the learners' contacts that began; share at the goal; mean metres gained, and walked."""
     learners = int(p.learners)
     began, there, gained, walked = 0.0, 0.0, 0.0, 0.0
@@ -165,34 +165,34 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
             x, y = before.pos[0, j] - before.pos[0, i], before.pos[1, j] - before.pos[1, i]
             both = 0.5 if j < learners else 1.0  # a pair of learners is counted from both sides
             began += both if x * x + y * y >= contact * contact else 0.0
-    numbers[0], numbers[1], numbers[2], numbers[3] = began, there / learners, gained / learners, walked / learners
+    numbers[at.touches], numbers[at.there] = began, there / learners
+    numbers[at.gained], numbers[at.walked] = gained / learners, walked / learners
 
 
 @kernel
-def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+def metrics(p: Any, at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
     """Write contacts that began; mean time away from the goal, s; last share at the goal; metres gained / walked."""
-    numbers[0] = sums.touches
-    numbers[1] = (steps - sums.there) * p.control_dt
-    numbers[2] = last.there
-    numbers[3] = sums.gained / max(sums.walked, 1e-9)
+    numbers[at.collisions] = sums.touches
+    numbers[at.time_to_goal] = (steps - sums.there) * p.control_dt
+    numbers[at.arrived] = last.there
+    numbers[at.path_efficiency] = sums.gained / max(sums.walked, 1e-9)
 
 
 @kernel
-def observe(p: Any, frame: Frame, rows: Any) -> None:
+def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
     """Write own velocity, offset of the goal, nearest neighbours, in the frame of the course: (along, left)."""
-    slots, one = int(p.neighbours), like(p.sight, 1.0)
+    one = like(p.sight, 1.0)
     for i in range(rows.shape[0]):
         row, course = rows[i], (frame.memory[2, i], frame.memory[3, i])
-        put(row, 0, turned((frame.vel[0, i], frame.vel[1, i]), course, one / p.max_speed))
-        put(row, 2, turned(_to_goal(frame, i), course, one / (3.0 * p.circle)))
-        for c in range(4, rows.shape[1]):
+        for c in range(rows.shape[1]):
             row[np.uint64(c)] = 0.0
+        put(row, at.velocity, turned((frame.vel[0, i], frame.vel[1, i]), course, one / p.max_speed))
+        put(row, at.goal, turned(_to_goal(frame, i), course, one / (3.0 * p.circle)))
         for s in range(frame.near_count[i]):
             j = np.uint64(frame.near_who[s, i])
             to = (frame.pos[0, j] - frame.pos[0, i], frame.pos[1, j] - frame.pos[1, i])
             relative = (frame.vel[0, j] - frame.vel[0, i], frame.vel[1, j] - frame.vel[1, i])
-            put_neighbour(row, 4, slots, s, to, relative, course, one / p.sight, 0.5 * one / p.max_speed)
-            row[np.uint64(4 + 4 * slots + s)] = 1.0
+            put_neighbour(row, at, s, to, relative, course, one / p.sight, 0.5 * one / p.max_speed)
 
 
 class Crossing(Task):

@@ -24,7 +24,7 @@ from flockenv.scene import Group, Scene
 from flockenv.scene.presets import PRESETS
 from flockenv.steering.arbitration import Blend
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.observations import clip, neighbour_slots, put, put_crowding, put_neighbour, turned
+from flockenv.tasks.observations import neighbour_slots, put, put_crowding, put_neighbour, turned
 from flockenv.tasks.task import Frame, Task
 
 __all__ = ["CrowdNav"]
@@ -108,19 +108,19 @@ def _arrives(p: Any, after: Frame) -> bool:
 
 
 @kernel
-def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
+def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
     """Write the terms progress, success, collision, discomfort, time."""
     gap = np.float64(after.memory[4, 0])
-    terms[0, 0] = p.progress_reward * (_left(before) - _left(after))
-    terms[0, 1] = p.success_reward if _arrives(p, after) else 0.0
-    terms[0, 2] = -p.collision_cost if gap < 0.0 else 0.0
+    terms[0, at.progress] = p.progress_reward * (_left(before) - _left(after))
+    terms[0, at.success] = p.success_reward if _arrives(p, after) else 0.0
+    terms[0, at.collision] = -p.collision_cost if gap < 0.0 else 0.0
     near = p.comfort_distance - gap if gap >= 0.0 else 0.0
-    terms[0, 3] = -p.discomfort_cost * max(near, 0.0) * p.control_dt
-    terms[0, 4] = -p.time_cost * p.control_dt
+    terms[0, at.discomfort] = -p.discomfort_cost * max(near, 0.0) * p.control_dt
+    terms[0, at.time] = -p.time_cost * p.control_dt
 
 
 @kernel
-def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
+def ended(p: Any, at: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """End the episode at a collision, or at the goal, which is success."""
     success = _arrives(p, after)
     over[0] = success or _collides(after)
@@ -128,50 +128,49 @@ def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
 
 
 @kernel
-def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
+def measure(p: Any, at: Any, before: Frame, after: Frame, numbers: Any) -> None:
     """Write collision (0 or 1); arrival (0 or 1); path, m; least gap so far, m; discomfort without collision, s."""
     gap = np.float64(after.memory[4, 0])
-    numbers[0] = 1.0 if gap < 0.0 else 0.0
-    numbers[1] = 1.0 if _arrives(p, after) else 0.0
-    numbers[2] = math.hypot(after.pos[0, 0] - before.pos[0, 0], after.pos[1, 0] - before.pos[1, 0])
-    numbers[3] = after.memory[5, 0]
-    numbers[4] = p.control_dt if 0.0 <= gap < p.comfort_distance else 0.0
+    numbers[at.touch] = 1.0 if gap < 0.0 else 0.0
+    numbers[at.there] = 1.0 if _arrives(p, after) else 0.0
+    numbers[at.walked] = math.hypot(after.pos[0, 0] - before.pos[0, 0], after.pos[1, 0] - before.pos[1, 0])
+    numbers[at.gap] = after.memory[5, 0]
+    numbers[at.near] = p.control_dt if 0.0 <= gap < p.comfort_distance else 0.0
 
 
 @kernel
-def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+def metrics(p: Any, at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
     """Write whether it collided; whether it did neither that nor arrive; time to the goal, s, if it arrived; path, m;
     least gap, m; share of the time below the comfort distance.
     """  # fmt: skip
     time = steps * p.control_dt
-    numbers[0] = last.touch
-    numbers[1] = 1.0 - last.touch - last.there if steps > 0 else 0.0
+    numbers[at.collided] = last.touch
+    numbers[at.timed_out] = 1.0 - last.touch - last.there if steps > 0 else 0.0
     if last.there > 0:
-        numbers[2] = time
-    numbers[3] = sums.walked
+        numbers[at.time_to_goal] = time
+    numbers[at.path_length] = sums.walked
     if steps > 0:
-        numbers[4] = last.gap
-    numbers[5] = sums.near / max(time, p.control_dt)
+        numbers[at.least_gap] = last.gap
+    numbers[at.discomfort] = sums.near / max(time, p.control_dt)
 
 
 @kernel
-def observe(p: Any, frame: Frame, rows: Any) -> None:
+def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
     """Write own velocity, offset of the goal, nearest pedestrians, in the frame of the course: (along, left)."""
-    slots, one = int(p.neighbours), like(p.sight, 1.0)
+    one = like(p.sight, 1.0)
     row, course = rows[0], (frame.memory[2, 0], frame.memory[3, 0])
-    put(row, 0, turned((frame.vel[0, 0], frame.vel[1, 0]), course, one / p.max_speed))
-    put(row, 2, turned(_to_goal(frame), course, one / (3.0 * p.circle)))
-    for c in range(4, rows.shape[1]):
+    for c in range(rows.shape[1]):
         row[np.uint64(c)] = 0.0
+    put(row, at.velocity, turned((frame.vel[0, 0], frame.vel[1, 0]), course, one / p.max_speed))
+    put(row, at.goal, turned(_to_goal(frame), course, one / (3.0 * p.circle)))
     for s in range(frame.near_count[0]):
         j = np.uint64(frame.near_who[s, 0])
         to = (frame.pos[0, j] - frame.pos[0, 0], frame.pos[1, j] - frame.pos[1, 0])
         relative = (frame.vel[0, j] - frame.vel[0, 0], frame.vel[1, j] - frame.vel[1, 0])
         distance = max(math.sqrt(to[0] * to[0] + to[1] * to[1]), 1e-9)
         gap = distance - frame.radius[0] - frame.radius[j]
-        put_neighbour(row, 4, slots, s, to, relative, course, one / p.sight, 0.25 * one / p.max_speed)
-        put_crowding(row, 4, slots, s, to, course, distance, gap, p.near)
-        row[np.uint64(4 + 6 * slots + s)] = clip(one)
+        put_neighbour(row, at, s, to, relative, course, one / p.sight, 0.25 * one / p.max_speed)
+        put_crowding(row, at, s, to, course, distance, gap, p.near)
 
 
 class CrowdNav(Task):

@@ -20,8 +20,8 @@ from flockenv.tasks.play_plan import Plan
 from flockenv.tasks.task import Frame
 
 __all__ = [
-    "act_of", "answer_of", "begin_of", "by_name_of", "frame_before", "frame_of", "look_in", "parameters_of", "show_of",
-    "wide_of",
+    "act_of", "answer_of", "begin_of", "by_name_of", "frame_before", "frame_of", "indices_of", "look_in",
+    "parameters_of", "show_of", "wide_of",
 ]  # fmt: skip
 
 
@@ -67,6 +67,11 @@ def by_name_of(names: tuple[str, ...]) -> Callable[[Any], Any]:
         return ()
 
     return by_name
+
+
+def indices_of(names: tuple[str, ...], places: tuple[int, ...] = ()) -> Any:
+    """Return the indices of numbers by name, constants for a kernel: their places, by default 0, 1, 2, ..."""
+    return record(names)(*(places or range(max(len(names), 1))))
 
 
 # --- the parts --------------------------------------------------------------------------------------------------------
@@ -175,13 +180,14 @@ def _widened(plan: Plan) -> Callable[..., Any]:
 def _judge(plan: Plan) -> Callable[..., None]:
     """Return a function that finds ends and success of world b, and sums measures; if `mortal`, ended agents die."""
     ended, measure, lasting, by_name = plan.kernels.ended, plan.kernels.measure, plan.lasting, by_name_of(plan.measures)
+    at = indices_of(plan.measures)
 
     def judge(
         p: Any, w: Any, before: Any, wide: Any, totals: Any, results: Any, mortal: bool, limit: int, b: int
     ) -> None:
         over, last, sums = results.over, totals.last, totals.sums
-        results.success[b] = ended(p, before, wide, last[b], over[b])
-        measure(p, before, wide, last[b])
+        results.success[b] = ended(p, at, before, wide, last[b], over[b])
+        measure(p, at, before, wide, last[b])
         results.late[b] = w.steps[b] >= limit
         for k in range(sums.shape[1]):
             sums[b, k] += last[b, k]
@@ -248,7 +254,7 @@ def _ask_for_sums(terms: int) -> Callable[..., None]:
 @section
 def act_of(plan: Plan) -> Callable[..., Any]:
     """Return a function that takes a decision in world b; it returns the first agent that is not finite, or -1."""
-    decide, ask_for_sums, shows = _decide(plan), _ask_for_sums(plan.terms), plan.abreast > 0
+    decide, ask_for_sums, shows = _decide(plan), _ask_for_sums(len(plan.terms)), plan.abreast > 0
     step_world = step_world_of(plan.kernels.step)
 
     def act(
@@ -289,8 +295,8 @@ def look_in(plan: Plan) -> Callable[..., bool]:
 @section
 def answer_of(plan: Plan) -> Callable[..., None]:
     """Return a function that computes rewards and ends of world b."""
-    reward, terms, shows = plan.kernels.reward, plan.terms, plan.abreast > 0
-    judge, pay, ask_ahead = _judge(plan), _pay(terms), _ask_ahead(plan.dimension)
+    reward, shows, at = plan.kernels.reward, plan.abreast > 0, indices_of(plan.terms)
+    judge, pay, ask_ahead = _judge(plan), _pay(len(plan.terms)), _ask_ahead(plan.dimension)
 
     def answer(
         p: Any, w: Any, before: Any, wide: Any, action: Any, actions: Any, earns: Any, totals: Any, results: Any,
@@ -298,7 +304,7 @@ def answer_of(plan: Plan) -> Callable[..., None]:
     ) -> None:  # fmt: skip
         if shows and not past:
             prefetch(results.rows[b], 2, 4)
-        reward(p, before, wide, action, earns)
+        reward(p, at, before, wide, action, earns)
         if shows and not past:
             prefetch(results.rows[b], 3, 4)
         ask_ahead(w, actions, following)
@@ -312,15 +318,15 @@ def answer_of(plan: Plan) -> Callable[..., None]:
 def show_of(plan: Plan) -> Callable[..., None]:
     """Return a function that writes the observations of world b, via the canvas if streaming stores are used."""
     abreast, observe, many, far = plan.kernels.abreast, plan.kernels.observe, plan.abreast, plan.apart
-    shows = abreast is not None
+    shows, at = abreast is not None, indices_of(*zip(*plan.slots, strict=True))
 
     def show(p: Any, now: Any, wide: Any, made: Any, rounded: int, rows: Any, past: bool, b: int) -> None:
         seen = made.canvas if past else rows[b]
         if shows:
             beside = made.wide[3]
-            abreast(p, wide, columns(beside, rounded, many, far))  # type: ignore[misc]
+            abreast(p, at, wide, columns(beside, rounded, many, far))  # type: ignore[misc]
             into_rows(seen, beside, many, far)
-        observe(p, now, seen)
+        observe(p, at, now, seen)
         if past:
             stream_store(rows, np.uint64(b) * np.uint64(seen.size), seen)
 

@@ -183,70 +183,70 @@ def _nearest(frame: Frame) -> float:
 
 
 @kernel
-def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
+def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
     """Write the terms alive, caught, effort."""
     caught = _nearest(after) <= p.capture_distance
     square = min(action[0, 0] * action[0, 0] + action[0, 1] * action[0, 1], 1.0)
-    terms[0, 0] = 0.0 if caught else p.alive_reward * p.control_dt
-    terms[0, 1] = -p.caught_cost if caught else 0.0
-    terms[0, 2] = -p.effort_cost * square * p.control_dt
+    terms[0, at.alive] = 0.0 if caught else p.alive_reward * p.control_dt
+    terms[0, at.caught] = -p.caught_cost if caught else 0.0
+    terms[0, at.effort] = -p.effort_cost * square * p.control_dt
 
 
 @kernel
-def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
+def ended(p: Any, at: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """End the episode at a capture; return True as long as the evader is not caught."""
     over[0] = _nearest(after) <= p.capture_distance
     return not over[0]
 
 
 @kernel
-def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
+def measure(p: Any, at: Any, before: Frame, after: Frame, numbers: Any) -> None:
     """Write time, s; time unseen by all pursuers, s; caught (0 or 1); distance of the nearest pursuer, m."""
     seen = False
     for i in range(1, after.pos.shape[1]):
         seen = seen or _sees(p, after, i)
-    numbers[0] = p.control_dt
-    numbers[1] = 0.0 if seen else p.control_dt
-    numbers[3] = _nearest(after)
-    numbers[2] = 1.0 if numbers[3] <= p.capture_distance else 0.0
+    numbers[at.time] = p.control_dt
+    numbers[at.hidden] = 0.0 if seen else p.control_dt
+    numbers[at.distance] = _nearest(after)
+    numbers[at.caught] = 1.0 if numbers[at.distance] <= p.capture_distance else 0.0
 
 
 @kernel
-def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+def metrics(p: Any, at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
     """Write survival time, s; survived (0 or 1); time unseen, s; distance of the nearest pursuer now, m."""
-    numbers[0], numbers[1], numbers[2], numbers[3] = sums.time, 1.0 - last.caught, sums.hidden, last.distance
+    numbers[at.survival_time], numbers[at.survived] = sums.time, 1.0 - last.caught
+    numbers[at.time_hidden], numbers[at.least_distance] = sums.hidden, last.distance
 
 
 @kernel
-def observe(p: Any, frame: Frame, rows: Any) -> None:
+def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
     """Write own velocity, walls, pursuers nearest first, whether they see it, nearest cover, free path lengths."""
     row = rows[0]
     for c in range(row.shape[0]):
         row[c] = 0.0
     for k in range(2):
-        row[k] = clip(frame.vel[k, 0] / p.evader_speed)
-        row[2 + k] = clip(frame.pos[k, 0] / p.size)
-        row[4 + k] = clip((p.size - frame.pos[k, 0]) / p.size)
-    at = _show_pursuers(p, frame, row)
-    slots, rays = int(p.slots), int(p.rays)
+        row[at.velocity + k] = clip(frame.vel[k, 0] / p.evader_speed)
+        row[at.to_low + k] = clip(frame.pos[k, 0] / p.size)
+        row[at.to_high + k] = clip((p.size - frame.pos[k, 0]) / p.size)
+    _show_pursuers(p, at, frame, row)
+    rays = int(p.rays)
     for s in range(frame.obstacle_count[0]):
         m = frame.obstacle_who[s, 0]
         for k in range(2):
-            row[at + 2 * s + k] = clip((frame.centre[k, m] - frame.pos[k, 0]) / p.size)
-        row[at + 2 * slots + s] = frame.rho[m] / p.greatest_radius
-    ways = at + 3 * slots
+            row[at.cover + 2 * s + k] = clip((frame.centre[k, m] - frame.pos[k, 0]) / p.size)
+        row[at.cover_radius + s] = frame.rho[m] / p.greatest_radius
     for r in range(rays):
-        row[ways + r] = 1.0
+        row[at.free_way + r] = 1.0
     for m in range(frame.rho.shape[0]):
         if frame.rho[m] > 0.0:
             to = (frame.centre[0, m] - frame.pos[0, 0], frame.centre[1, m] - frame.pos[1, 0])
             ahead = (like(to[0], 1.0), like(to[0], 0.0))
-            block_ways(row, ways, rays, frame.table, to, ahead, frame.rho[m] + frame.radius[0], p.way_sight)
+            block_ways(row, at.free_way, rays, frame.table, to, ahead, frame.rho[m] + frame.radius[0], p.way_sight)
 
 
 @kernel
-def _show_pursuers(p: Any, frame: Frame, row: Any) -> int:
-    """Write the pursuers, nearest first; return the index after them."""
+def _show_pursuers(p: Any, at: Any, frame: Frame, row: Any) -> None:
+    """Write the pursuers, nearest first."""
     count = frame.pos.shape[1] - 1
     last, chosen = -1.0, 0
     for s in range(count):
@@ -258,13 +258,12 @@ def _show_pursuers(p: Any, frame: Frame, row: Any) -> int:
                 best, who = distance, j
         to, way = _to(frame, 0, who), unit(_to(frame, 0, who))
         for k in range(2):
-            row[6 + 2 * s + k] = clip(to[k] / p.size)
-            row[6 + 2 * count + 2 * s + k] = clip(frame.vel[k, who] / p.pursuer_speed)
-            row[6 + 4 * count + 2 * s + k] = way[k]
-        row[6 + 6 * count + s] = max(1.0 - best / p.near, 0.0)
-        row[6 + 7 * count + s] = 1.0 if _sees(p, frame, who) else 0.0
+            row[at.pursuers + 2 * s + k] = clip(to[k] / p.size)
+            row[at.pursuer_velocity + 2 * s + k] = clip(frame.vel[k, who] / p.pursuer_speed)
+            row[at.bearing + 2 * s + k] = way[k]
+        row[at.closeness + s] = max(1.0 - best / p.near, 0.0)
+        row[at.seen + s] = 1.0 if _sees(p, frame, who) else 0.0
         last, chosen = best, who
-    return 6 + 8 * int(count)
 
 
 class Evade(Task):

@@ -164,7 +164,7 @@ def _around(p: Any, frame: Frame, i: int, v: Any) -> Any:
 
 
 @kernel
-def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
+def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
     """Write the terms progress, alignment, spacing, together, touch, obstacle; all of the state after the step."""
     one, o = like(p.sight, 1.0), like(p.sight, 0.0)
     per_cruise, per_spacing, per_slot = one / p.cruise, one / p.spacing, one / p.neighbours
@@ -185,20 +185,20 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
         disagree = norm(sub(v, scale(mean, one / max(seen, one)))) * per_cruise if found > 0 else one
         gap = np.sqrt(after.near_square[0, i]) if found > 0 else p.sight
         off_speed, off_place = abs(along - p.cruise) * per_cruise, abs(gap - p.spacing) * per_spacing
-        terms[i, 0] = p.progress_reward * (one - min(off_speed, one)) * p.control_dt
-        terms[i, 1] = -p.alignment_cost * min(disagree, one) * p.control_dt
-        terms[i, 2] = -p.spacing_cost * min(off_place, one) * p.control_dt
-        terms[i, 3] = -p.loneliness_cost * (one - seen * per_slot) * p.control_dt
-        terms[i, 4] = -p.touch_cost * touches * p.control_dt
-        terms[i, 5] = -p.obstacle_cost * inside * p.control_dt
+        terms[i, at.progress] = p.progress_reward * (one - min(off_speed, one)) * p.control_dt
+        terms[i, at.alignment] = -p.alignment_cost * min(disagree, one) * p.control_dt
+        terms[i, at.spacing] = -p.spacing_cost * min(off_place, one) * p.control_dt
+        terms[i, at.together] = -p.loneliness_cost * (one - seen * per_slot) * p.control_dt
+        terms[i, at.touch] = -p.touch_cost * touches * p.control_dt
+        terms[i, at.obstacle] = -p.obstacle_cost * inside * p.control_dt
 
 
 @kernel
-def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
+def ended(p: Any, at: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """End no learner; return whether the aim holds now: aligned, moving along the heading, no contact."""
-    polarisation, along = numbers[0], numbers[3] = _order(after)
+    polarisation, along = numbers[at.polarisation], numbers[at.along] = _order(after)
     holds = polarisation > 0.9 and along > 0.8 * p.cruise and not _anybody_touches(after)
-    judge(p, after.step, holds, numbers, 4)
+    judge(p, at, after.step, holds, numbers)
     return holds
 
 
@@ -244,19 +244,19 @@ def _touches(frame: Frame, i: int) -> Any:
 
 
 @kernel
-def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
+def measure(p: Any, at: Any, before: Frame, after: Frame, numbers: Any) -> None:
     """Write the mean nearest distance in sight, m, and contacts that began; `ended` writes the order measures."""
-    numbers[1] = _nearest(p, after)
-    numbers[2] = _began(p, before, after) if _anybody_touches(after) else 0.0
+    numbers[at.nearest] = _nearest(p, after)
+    numbers[at.touches] = _began(p, before, after) if _anybody_touches(after) else 0.0
 
 
 @kernel
-def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+def metrics(p: Any, at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
     """Write polarisation, nearest distance, m, and speed along, m/s (means); contacts that began; those of the aim."""
     n = max(steps, 1)
-    tell_lasting(sums, last, steps, numbers, 4)
-    numbers[0], numbers[1] = sums.polarisation / n, sums.nearest / n
-    numbers[2], numbers[3] = sums.touches, sums.along / n
+    tell_lasting(at, sums, last, steps, numbers)
+    numbers[at.polarisation], numbers[at.nearest_neighbour] = sums.polarisation / n, sums.nearest / n
+    numbers[at.collisions], numbers[at.speed_along] = sums.touches, sums.along / n
 
 
 @kernel
@@ -304,24 +304,24 @@ def _touched(p: Any, frame: Frame, i: int, x: float, y: float, contact: float) -
 
 
 @kernel
-def abreast(p: Any, frame: Frame, columns: Any) -> None:
+def abreast(p: Any, at: Any, frame: Frame, columns: Any) -> None:
     """Write own velocity, nearest neighbours and obstacles, in the frame of the heading: (along, left)."""
     n, one = np.uint64(columns.shape[0]), like(p.sight, 1.0)
-    slots, listed, seen = np.uint64(p.neighbours), np.uint64(p.listed), np.uint64(p.obstacles_seen)
-    two, seven = np.uint64(2), np.uint64(7)
+    listed, seen = np.uint64(p.listed), np.uint64(p.obstacles_seen)
     scales = (one / p.sight, like(one, 0.5) / p.max_speed, one / p.spacing)
     for i in range(n):
         own = turned((frame.vel[0, i], frame.vel[1, i]), _heading(p, frame, i), like(one, 2.0) * scales[1])
-        columns[i, 0], columns[i, 1] = own[0], own[1]
+        columns[i, at.velocity], columns[i, at.velocity + 1] = own[0], own[1]
     for s in range(listed):
         for i in range(n):
-            _show_neighbour(p, frame, i, s, slots, scales, columns)
+            _show_neighbour(p, at, frame, i, s, scales, columns)
     some = seen if frame.rho.shape[0] > 0 else np.uint64(0)
     for s in range(some):
         for i in range(n):
-            _show_obstacle(p, frame, i, s, two + seven * slots, seen, columns)
-    for c in range(two + seven * slots + np.uint64(3) * some, two + seven * slots + np.uint64(3) * seen):
-        columns[:, c] = like(p.sight, 0.0)
+            _show_obstacle(p, at, frame, i, s, columns)
+    for s in range(some, seen):
+        for c in (at.obstacles + 2 * s, at.obstacles + 2 * s + 1, at.obstacle_radius + s):
+            columns[:, c] = like(p.sight, 0.0)
 
 
 @kernel
@@ -331,7 +331,7 @@ def _heading(p: Any, frame: Frame, i: int) -> Any:
 
 
 @kernel
-def _show_neighbour(p: Any, frame: Frame, i: int, s: int, slots: Any, scales: Any, columns: Any) -> None:
+def _show_neighbour(p: Any, at: Any, frame: Frame, i: int, s: int, scales: Any, columns: Any) -> None:
     """Write the offset, relative velocity, presence and crowding of agent i's s-th nearest neighbour.
 
     Zeros if there is none. The values are computed in any case: an empty entry of the list holds a valid index.
@@ -344,16 +344,16 @@ def _show_neighbour(p: Any, frame: Frame, i: int, s: int, slots: Any, scales: An
     distance = np.sqrt(frame.near_square[s, i])
     closeness = one - distance * scales[2]
     crowded = (closeness > o) & (distance > o)
-    _put_if(there, columns, i, two + two * s, turned(to, heading, scales[0]))
-    _put_if(there, columns, i, two + two * slots + two * s, turned(relative, heading, scales[1]))
-    columns[i, two + np.uint64(4) * slots + s] = one if there else o
+    _put_if(there, columns, i, np.uint64(at.neighbours) + two * s, turned(to, heading, scales[0]))
+    _put_if(there, columns, i, np.uint64(at.neighbour_velocity) + two * s, turned(relative, heading, scales[1]))
+    columns[i, np.uint64(at.neighbour_present) + s] = one if there else o
     crowding = turned(to, heading, closeness / distance if crowded else o)
-    _put_if(there, columns, i, two + np.uint64(5) * slots + two * s, crowding)
+    _put_if(there, columns, i, np.uint64(at.crowding) + two * s, crowding)
 
 
 @kernel
-def _show_obstacle(p: Any, frame: Frame, i: int, s: int, at: Any, seen: Any, columns: Any) -> None:
-    """Write the offset and radius of agent i's s-th nearest obstacle, from column `at` on, or zeros.
+def _show_obstacle(p: Any, at: Any, frame: Frame, i: int, s: int, columns: Any) -> None:
+    """Write the offset and radius of agent i's s-th nearest obstacle, or zeros.
 
     As with neighbours, an empty entry of the list holds a valid index if there are obstacles at all.
     """
@@ -362,8 +362,8 @@ def _show_obstacle(p: Any, frame: Frame, i: int, s: int, at: Any, seen: Any, col
     o = like(rho, 0.0)
     to = (offset(frame.pos[0, i], centre[0], p.size), offset(frame.pos[1, i], centre[1], p.size))
     vector = turned(to, _heading(p, frame, i), like(o, 1.0) / (p.sight + p.greatest_radius))
-    _put_if(there, columns, i, at + np.uint64(2) * s, vector)
-    columns[i, at + np.uint64(2) * seen + s] = rho / p.greatest_radius if there else o
+    _put_if(there, columns, i, np.uint64(at.obstacles) + np.uint64(2) * s, vector)
+    columns[i, np.uint64(at.obstacle_radius) + s] = rho / p.greatest_radius if there else o
 
 
 @kernel
@@ -382,20 +382,22 @@ def _put_if(there: Any, columns: Any, i: int, at: Any, vector: Any) -> None:
 
 
 @kernel
-def observe(p: Any, frame: Frame, rows: Any) -> None:
+def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
     """Write the free path lengths, anticlockwise from the heading, and zeros in slots beyond the neighbour list."""
-    slots, listed, ways = int(p.neighbours), int(p.listed), rows.shape[1] - int(p.rays)
+    slots, listed, rays = int(p.neighbours), int(p.listed), int(p.rays)
     for i in range(rows.shape[0]):
         row, heading = rows[i], _heading(p, frame, i)
-        for c in range(np.uint64(p.rays)):
-            row[np.uint64(ways) + c] = 1.0
-        for first, width in ((2, 2), (2 + 2 * slots, 2), (2 + 4 * slots, 1), (2 + 5 * slots, 2)):
+        for r in range(np.uint64(rays)):
+            row[np.uint64(at.free_way) + r] = 1.0
+        for first, width in (
+            (at.neighbours, 2), (at.neighbour_velocity, 2), (at.neighbour_present, 1), (at.crowding, 2),
+        ):  # fmt: skip
             for c in range(first + width * listed, first + width * slots):
                 row[np.uint64(c)] = 0.0
         for s in range(frame.obstacle_count[i]):
             centre, rho = _obstacle(frame, i, s)
             to = (offset(frame.pos[0, i], centre[0], p.size), offset(frame.pos[1, i], centre[1], p.size))
-            block_ways(row, ways, int(p.rays), frame.table, to, heading, rho + frame.radius[i], p.sight)
+            block_ways(row, at.free_way, rays, frame.table, to, heading, rho + frame.radius[i], p.sight)
 
 
 class Flock(LastingTask):

@@ -169,7 +169,7 @@ def _all_in(p: Any, frame: Frame) -> bool:
 
 
 @kernel
-def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
+def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
     """Write the terms progress, gathering, success, time; the same for every dog."""
     here, there = _centre(p, before), _centre(p, after)
     nearer = norm(sub(_pen(before), here)) - norm(sub(_pen(after), there))
@@ -177,14 +177,14 @@ def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None
     _, now_wide = _farthest(p, after, there)
     success = p.success_reward if _all_in(p, after) else 0.0
     for i in range(terms.shape[0]):
-        terms[i, 0] = p.progress_reward * nearer
-        terms[i, 1] = p.gathering_reward * (wide - now_wide)
-        terms[i, 2] = success
-        terms[i, 3] = -p.time_cost * p.control_dt
+        terms[i, at.progress] = p.progress_reward * nearer
+        terms[i, at.gathering] = p.gathering_reward * (wide - now_wide)
+        terms[i, at.success] = success
+        terms[i, at.time] = -p.time_cost * p.control_dt
 
 
 @kernel
-def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
+def ended(p: Any, at: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """End the episode when all sheep are in the pen, which is success."""
     done = _all_in(p, after)
     for i in range(over.shape[0]):
@@ -193,59 +193,58 @@ def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
 
 
 @kernel
-def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
+def measure(p: Any, at: Any, before: Frame, after: Frame, numbers: Any) -> None:
     """Write the share of sheep penned; time, s; mean distance of sheep from their centre, m; mean path of a dog, m."""
     n, dogs = after.pos.shape[1], int(p.dogs)
-    numbers[0] = _penned(p, after) / (n - dogs)
-    numbers[1] = p.control_dt
-    _, numbers[2] = _farthest(p, after, _centre(p, after))
+    numbers[at.penned] = _penned(p, after) / (n - dogs)
+    numbers[at.time] = p.control_dt
+    _, numbers[at.spread] = _farthest(p, after, _centre(p, after))
     path = 0.0
     for i in range(dogs):
         path += norm(sub(place_of(after, i), place_of(before, i)))
-    numbers[3] = path / dogs
+    numbers[at.path] = path / dogs
 
 
 @kernel
-def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+def metrics(p: Any, at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
     """Write the share of sheep penned; time until all were, s, if they are; spread now, m; mean path of a dog, m."""
-    numbers[0] = last.penned
+    numbers[at.share_penned] = last.penned
     if last.penned >= 1.0 and steps > 0:
-        numbers[1] = sums.time
-    numbers[2], numbers[3] = last.spread, sums.path
+        numbers[at.time_to_pen] = sums.time
+    numbers[at.spread], numbers[at.path_length] = last.spread, sums.path
 
 
 @kernel
-def observe(p: Any, frame: Frame, rows: Any) -> None:
+def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
     """Write own velocity, pen, flock, farthest and nearest sheep, other dogs, in the frame of the course."""
     centre, course, pen = _centre(p, frame), _course(p, frame), _pen(frame)
     far, spread = _farthest(p, frame, centre)
-    slots, dogs = int(p.sheep_seen), int(p.dogs)
+    dogs = int(p.dogs)
     for i in range(rows.shape[0]):
         row = rows[i]
-        here = place_of(frame, i)
-        _put(row, 0, scale(velocity_of(frame, i), 1.0 / p.dog_speed), course)
-        _put(row, 2, scale(sub(pen, here), 1.0 / p.sight), course)
-        to_centre = sub(centre, here)
-        _put(row, 4, scale(to_centre, 1.0 / p.sight), course)
-        _put(row, 6, unit(to_centre), course)
-        _put(row, 8, scale(_to(frame, i, far), 1.0 / p.sight), course)
-        row[10] = min(spread / p.spread_scale, 1.0)
-        row[11] = min(norm(sub(place_of(frame, far), centre)) / p.spread_scale, 1.0)
-        for c in range(12, rows.shape[1]):
+        for c in range(rows.shape[1]):
             row[c] = 0.0
-        _show_sheep(p, frame, i, slots, course, row)
-        at = 12 + 5 * slots + 3
+        here = place_of(frame, i)
+        _put(row, at.velocity, scale(velocity_of(frame, i), 1.0 / p.dog_speed), course)
+        _put(row, at.goal, scale(sub(pen, here), 1.0 / p.sight), course)
+        to_centre = sub(centre, here)
+        _put(row, at.centre, scale(to_centre, 1.0 / p.sight), course)
+        _put(row, at.centre_bearing, unit(to_centre), course)
+        _put(row, at.farthest, scale(_to(frame, i, far), 1.0 / p.sight), course)
+        row[at.spread] = min(spread / p.spread_scale, 1.0)
+        row[at.stray] = min(norm(sub(place_of(frame, far), centre)) / p.spread_scale, 1.0)
+        _show_sheep(p, at, frame, i, course, row)
         for j in range(dogs):
             if j != i:
-                _put(row, at, scale(_to(frame, i, j), 1.0 / p.sight), course)
-                at += 2
+                mate = j if j < i else j - 1
+                _put(row, at.mates + 2 * mate, scale(_to(frame, i, j), 1.0 / p.sight), course)
 
 
 @kernel
-def _show_sheep(p: Any, frame: Frame, i: int, slots: int, course: Vec, row: Any) -> None:
+def _show_sheep(p: Any, at: Any, frame: Frame, i: int, course: Vec, row: Any) -> None:
     """Write the nearest sheep of dog i, nearest first, and the direction and closeness of the first."""
     last, chosen = -1.0, -1
-    for s in range(slots):
+    for s in range(int(p.sheep_seen)):
         best, who = np.inf, -1
         for j in range(int(p.dogs), frame.pos.shape[1]):
             to = _to(frame, i, j)
@@ -256,12 +255,12 @@ def _show_sheep(p: Any, frame: Frame, i: int, slots: int, course: Vec, row: Any)
         if who < 0:
             break
         to = _to(frame, i, who)
-        _put(row, 12 + 2 * s, scale(to, 1.0 / p.sight), course)
-        _put(row, 12 + 2 * slots + 2 * s, scale(velocity_of(frame, who), 1.0 / p.sheep_speed), course)
-        row[12 + 4 * slots + s] = 1.0
+        _put(row, at.sheep + 2 * s, scale(to, 1.0 / p.sight), course)
+        _put(row, at.sheep_velocity + 2 * s, scale(velocity_of(frame, who), 1.0 / p.sheep_speed), course)
+        row[at.sheep_present + s] = 1.0
         if s == 0:
-            _put(row, 12 + 5 * slots, unit(to), course)
-            row[12 + 5 * slots + 2] = max(1.0 - norm(to) / p.fear_distance, 0.0)
+            _put(row, at.bearing, unit(to), course)
+            row[at.closeness] = max(1.0 - norm(to) / p.fear_distance, 0.0)
         last, chosen = best, who
 
 

@@ -1,7 +1,7 @@
 """Success over a whole episode, for tasks that only the time limit ends: the aim has to hold most of the time.
 
 Such a task's `ended` returns whether the aim holds at this instant, which `judge` writes into the measures; `lasts`
-computes success from their sums. MEASURES and METRICS are the last measures and metrics of such a task.
+computes success from their sums. The measures of such a task include MEASURES, its metrics METRICS.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ METRICS = ("held", "success_at_end")
 
 
 @kernel
-def judge(p: Any, step: int, holds: bool, numbers: Any, first: int) -> None:
-    """Write the measures of a lasting aim from number `first` on, `step` decisions after the start."""
+def judge(p: Any, at: Any, step: int, holds: bool, numbers: Any) -> None:
+    """Write the measures of a lasting aim, `step` decisions after the start."""
     judged = step > p.settled
-    numbers[first] = 1.0 if holds else 0.0
-    numbers[first + 1] = 1.0 if judged else 0.0
-    numbers[first + 2] = 1.0 if holds and judged else 0.0
+    numbers[at.holds] = 1.0 if holds else 0.0
+    numbers[at.judged] = 1.0 if judged else 0.0
+    numbers[at.held] = 1.0 if holds and judged else 0.0
 
 
 @kernel
@@ -39,12 +39,12 @@ def lasts(p: Any, sums: Any) -> bool:
 
 
 @kernel
-def tell_lasting(sums: Any, last: Any, steps: int, numbers: Any, first: int) -> None:
-    """Write the metrics of a lasting aim from number `first` on; `held` has no value before a decision is judged."""
+def tell_lasting(at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+    """Write the metrics of a lasting aim; `held` has no value before a decision is judged."""
     if sums.judged > 0.0:
-        numbers[first] = sums.held / sums.judged
+        numbers[at.held] = sums.held / sums.judged
     if steps > 0:
-        numbers[first + 1] = last.holds
+        numbers[at.success_at_end] = last.holds
 
 
 class LastingTask(Task):

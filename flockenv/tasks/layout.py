@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import itertools
 import math
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -42,6 +43,12 @@ class Layout:
     def size(self) -> int:
         """Numbers in a row."""
         return sum(slot.size for slot in self.slots)
+
+    @functools.cached_property
+    def places(self) -> dict[str, int]:
+        """Index of the first number of each slot in a row, by the slot's name."""
+        starts = itertools.accumulate((slot.size for slot in self.slots), initial=0)
+        return dict(zip((slot.name for slot in self.slots), starts, strict=False))
 
     @property
     def low(self) -> NDArray[np.float32]:

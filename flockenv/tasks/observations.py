@@ -72,24 +72,21 @@ def put(row: Any, at: int, vector: Any) -> None:
 
 
 @kernel
-def put_neighbour(
-    row: Any, at: int, slots: int, s: int, to: Any, relative: Any, ahead: Any, near_by: float, pace: float
-) -> None:
-    """Write offset and relative velocity of the s-th nearest agent, times `near_by`, 1/m, and `pace`, s/m.
+def put_neighbour(row: Any, at: Any, s: int, to: Any, relative: Any, ahead: Any, near_by: float, pace: float) -> None:
+    """Write presence, offset and relative velocity of the s-th nearest agent, times `near_by`, 1/m, and `pace`, s/m.
 
-    The blocks of `neighbour_slots` begin at `at`; vectors are rotated so that the unit vector `ahead` is the x axis.
+    The slots are those of `neighbour_slots`; vectors are rotated so that the unit vector `ahead` is the x axis.
     """
-    put(row, at + 2 * s, turned(to, ahead, near_by))
-    put(row, at + 2 * slots + 2 * s, turned(relative, ahead, pace))
+    put(row, at.neighbours + 2 * s, turned(to, ahead, near_by))
+    put(row, at.neighbour_velocity + 2 * s, turned(relative, ahead, pace))
+    row[np.uint64(at.neighbour_present + s)] = 1.0
 
 
 @kernel
-def put_crowding(
-    row: Any, at: int, slots: int, s: int, to: Any, ahead: Any, distance: float, gap: float, near: float
-) -> None:
+def put_crowding(row: Any, at: Any, s: int, to: Any, ahead: Any, distance: float, gap: float, near: float) -> None:
     """Write the direction of the s-th nearest agent times 1 - gap / near, 0 for a gap of `near` m or more."""
     share = min(max(1.0 - gap / near, 0.0), 1.0) / distance
-    put(row, at + 4 * slots + 2 * s, turned(to, ahead, share))
+    put(row, at.crowding + 2 * s, turned(to, ahead, share))
 
 
 def neighbour_slots(count: int, sight: float, most_relative: float, who: str, crowding: bool) -> tuple[Slot, ...]:

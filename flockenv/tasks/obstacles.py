@@ -80,18 +80,18 @@ def keep(p: Any, before: Frame, after: Frame) -> None:
 
 
 @kernel
-def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
+def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
     """Write the terms progress, goal, touch, time."""
     touch = after.memory[3, 0] > 0.0
     there = not touch and _to_goal(after) <= p.goal_radius
-    terms[0, 0] = p.progress_reward * (_to_goal(before) - _to_goal(after))
-    terms[0, 1] = p.goal_reward if there else 0.0
-    terms[0, 2] = -p.touch_cost if touch else 0.0
-    terms[0, 3] = -p.time_cost * p.control_dt
+    terms[0, at.progress] = p.progress_reward * (_to_goal(before) - _to_goal(after))
+    terms[0, at.goal] = p.goal_reward if there else 0.0
+    terms[0, at.touch] = -p.touch_cost if touch else 0.0
+    terms[0, at.time] = -p.time_cost * p.control_dt
 
 
 @kernel
-def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
+def ended(p: Any, at: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """End the episode at a contact, or at the goal, which is success."""
     touch = after.memory[3, 0] > 0.0
     there = not touch and _to_goal(after) <= p.goal_radius
@@ -100,49 +100,48 @@ def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
 
 
 @kernel
-def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
+def measure(p: Any, at: Any, before: Frame, after: Frame, numbers: Any) -> None:
     """Write path, m; contacts (0 or 1); distance to the goal, m, now and at the start."""
-    numbers[0] = math.hypot(after.pos[0, 0] - before.pos[0, 0], after.pos[1, 0] - before.pos[1, 0])
-    numbers[1] = after.memory[3, 0]
-    numbers[2] = _to_goal(after)
-    numbers[3] = after.memory[2, 0]
+    numbers[at.path] = math.hypot(after.pos[0, 0] - before.pos[0, 0], after.pos[1, 0] - before.pos[1, 0])
+    numbers[at.touch] = after.memory[3, 0]
+    numbers[at.left] = _to_goal(after)
+    numbers[at.straight] = after.memory[2, 0]
 
 
 @kernel
-def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+def metrics(p: Any, at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
     """Write time to the goal, s, if it is reached; contacts; metres gained towards the goal per metre of path."""
     if last.left <= p.goal_radius and sums.touch == 0 and steps > 0:
-        numbers[0] = steps * p.control_dt
-    numbers[1] = sums.touch
-    numbers[2] = max(last.straight - last.left, 0.0) / max(sums.path, 1e-9)
+        numbers[at.time_to_goal] = steps * p.control_dt
+    numbers[at.collisions] = sums.touch
+    numbers[at.path_efficiency] = max(last.straight - last.left, 0.0) / max(sums.path, 1e-9)
 
 
 @kernel
-def observe(p: Any, frame: Frame, rows: Any) -> None:
+def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
     """Write own velocity, goal, walls, nearest obstacles, free path lengths."""
     row = rows[0]
-    for k in range(2):
-        row[k] = clip(frame.vel[k, 0] / p.max_speed)
-        row[2 + k] = clip((frame.memory[k, 0] - frame.pos[k, 0]) / p.size)
-        row[4 + k] = clip(frame.pos[k, 0] / p.size)
-        row[6 + k] = clip((p.size - frame.pos[k, 0]) / p.size)
-    slots, rays = int(p.slots), int(p.rays)
-    ways = 8 + 4 * slots
-    for c in range(8, ways):
+    for c in range(row.shape[0]):
         row[c] = 0.0
+    for k in range(2):
+        row[at.velocity + k] = clip(frame.vel[k, 0] / p.max_speed)
+        row[at.goal + k] = clip((frame.memory[k, 0] - frame.pos[k, 0]) / p.size)
+        row[at.to_low + k] = clip(frame.pos[k, 0] / p.size)
+        row[at.to_high + k] = clip((p.size - frame.pos[k, 0]) / p.size)
+    rays = int(p.rays)
     for s in range(frame.obstacle_count[0]):
         m, gap = frame.obstacle_who[s, 0], frame.obstacle_gap[s, 0] - frame.radius[0]
         for k in range(2):
-            row[8 + 2 * s + k] = clip((frame.centre[k, m] - frame.pos[k, 0]) / (p.sight + p.greatest_radius))
-        row[8 + 2 * slots + s] = frame.rho[m] / p.greatest_radius
-        row[8 + 3 * slots + s] = clip(gap) if gap < 1.0 else 1.0
+            row[at.obstacles + 2 * s + k] = clip((frame.centre[k, m] - frame.pos[k, 0]) / (p.sight + p.greatest_radius))
+        row[at.obstacle_radius + s] = frame.rho[m] / p.greatest_radius
+        row[at.clearance + s] = clip(gap) if gap < 1.0 else 1.0
     for r in range(rays):
-        row[ways + r] = 1.0
+        row[at.free_way + r] = 1.0
     for m in range(frame.rho.shape[0]):
         if frame.rho[m] > 0.0:
             to = (frame.centre[0, m] - frame.pos[0, 0], frame.centre[1, m] - frame.pos[1, 0])
             ahead = (like(to[0], 1.0), like(to[0], 0.0))
-            block_ways(row, ways, rays, frame.table, to, ahead, frame.rho[m] + frame.radius[0], p.sight)
+            block_ways(row, at.free_way, rays, frame.table, to, ahead, frame.rho[m] + frame.radius[0], p.sight)
 
 
 class Obstacles(Task):

@@ -169,47 +169,47 @@ def keep(p: Any, before: Frame, after: Frame) -> None:
 
 
 @kernel
-def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
+def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
     """Write the terms progress, off_track, lost."""
     left = _left(p, after)
-    terms[0, 0] = p.progress_reward * _gain(after)
-    terms[0, 1] = -p.off_cost * p.control_dt if abs(left) > p.half_width else 0.0
-    terms[0, 2] = -p.lost_cost if abs(left) > p.lost_distance else 0.0
+    terms[0, at.progress] = p.progress_reward * _gain(after)
+    terms[0, at.off_track] = -p.off_cost * p.control_dt if abs(left) > p.half_width else 0.0
+    terms[0, at.lost] = -p.lost_cost if abs(left) > p.lost_distance else 0.0
 
 
 @kernel
-def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
+def ended(p: Any, at: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """End the episode if the agent is lost; return True once it has run a whole lap."""
     over[0] = abs(_left(p, after)) > p.lost_distance
     return not over[0] and after.memory[_GAINED, 0] >= after.memory[_LENGTH, 0]
 
 
 @kernel
-def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
+def measure(p: Any, at: Any, before: Frame, after: Frame, numbers: Any) -> None:
     """Write progress, m; off the track (0 or 1); path, m."""
-    numbers[0] = _gain(after)
-    numbers[1] = 1.0 if abs(_left(p, after)) > p.half_width else 0.0
-    numbers[2] = math.hypot(after.pos[0, 0] - before.pos[0, 0], after.pos[1, 0] - before.pos[1, 0])
+    numbers[at.gained] = _gain(after)
+    numbers[at.off] = 1.0 if abs(_left(p, after)) > p.half_width else 0.0
+    numbers[at.path] = math.hypot(after.pos[0, 0] - before.pos[0, 0], after.pos[1, 0] - before.pos[1, 0])
 
 
 @kernel
-def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+def metrics(p: Any, at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
     """Write progress along the track, m; share of the time off it; mean speed, m/s."""
     made = max(steps, 1)
-    numbers[0], numbers[1] = sums.gained, sums.off / made
-    numbers[2] = sums.path / (made * p.control_dt)
+    numbers[at.progress], numbers[at.off_track] = sums.gained, sums.off / made
+    numbers[at.mean_speed] = sums.path / (made * p.control_dt)
 
 
 @kernel
-def observe(p: Any, frame: Frame, rows: Any) -> None:
+def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
     """Write own velocity, offset to the left, middle line ahead and its curvature, in the frame of the track here."""
     i, along = _place(p, frame)
     left, way = _left(p, frame), _way(frame, i)
     row, count = rows[0], int(p.ahead)
     vx, vy = frame.vel[0, 0], frame.vel[1, 0]
-    row[0] = clip((vx * way[0] + vy * way[1]) / p.max_speed)
-    row[1] = clip((vy * way[0] - vx * way[1]) / p.max_speed)
-    row[2] = clip(left / p.lost_distance)
+    row[at.velocity] = clip((vx * way[0] + vy * way[1]) / p.max_speed)
+    row[at.velocity + 1] = clip((vy * way[0] - vx * way[1]) / p.max_speed)
+    row[at.left] = clip(left / p.lost_distance)
     scale = p.spacing * p.ahead + p.lost_distance
     for k in range(count):
         along += p.spacing
@@ -221,9 +221,9 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
             i += 1
             a, u, size = _line(frame, i)
         to = (a[0] + along / size * u[0] - frame.pos[0, 0], a[1] + along / size * u[1] - frame.pos[1, 0])
-        row[3 + 2 * k] = clip((to[0] * way[0] + to[1] * way[1]) / scale)
-        row[4 + 2 * k] = clip((to[1] * way[0] - to[0] * way[1]) / scale)
-        row[3 + 2 * count + k] = clip(_bend(frame, i, along / size) * p.half_width)
+        row[at.points + 2 * k] = clip((to[0] * way[0] + to[1] * way[1]) / scale)
+        row[at.points + 2 * k + 1] = clip((to[1] * way[0] - to[0] * way[1]) / scale)
+        row[at.curvature + k] = clip(_bend(frame, i, along / size) * p.half_width)
 
 
 @kernel

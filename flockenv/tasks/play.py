@@ -26,6 +26,7 @@ from flockenv.tasks.decision import (
     by_name_of,
     frame_before,
     frame_of,
+    indices_of,
     look_in,
     parameters_of,
     show_of,
@@ -54,8 +55,8 @@ def plan_of(task: Task) -> Plan:
     )  # fmt: skip
     return Plan(
         kernels, tuple(task.parameters()), _counts(task), task.measures, task.lasting_aim, parts.oriented, task.alike,
-        parts.dimension, parts.width, len(task.terms), task.action_layout.size, task.memory, task.abreast,
-        apart(task.learners) if task.abreast else 0,
+        parts.dimension, parts.width, task.terms, tuple(task.layout.places.items()), task.action_layout.size,
+        task.memory, task.abreast, apart(task.learners) if task.abreast else 0,
     )  # fmt: skip
 
 
@@ -66,7 +67,8 @@ def name_of(task: Task) -> str:
 
 def tell_of(task: Task) -> Callable[..., None]:
     """Return the entry point of a task that computes metrics."""
-    return _tell(_kernel_of(task, "metrics"), tuple(task.parameters()), _counts(task), task.measures)
+    kernel = _kernel_of(task, "metrics")
+    return _tell(kernel, tuple(task.parameters()), _counts(task), task.measures, task.metric_names)
 
 
 def _kernel_of(task: Task, name: str) -> Law:
@@ -84,16 +86,21 @@ def _counts(task: Task) -> tuple[tuple[int, float], ...]:
 
 
 def _check(task: Task) -> None:
-    """Raise TypeError for a task that cannot be compiled: unknown counts, no terms, or bad names of measures."""
+    """Raise TypeError for a task that cannot be compiled: unknown counts, no terms, or bad names."""
     kind, names = type(task).__name__, task.parameters()
     unknown = [name for name in task.counts if name not in names]
     if unknown:
         raise TypeError(f"{kind}.counts: {unknown[0]!r} is none of its parameters: {', '.join(names)}")
     if not task.terms:
         raise TypeError(f"{kind}.terms is empty: a reward is the sum of at least one term")
-    for name in task.measures:
-        if not name.isidentifier() or keyword.iskeyword(name) or name[0] == "_" or task.measures.count(name) > 1:
-            raise TypeError(f"{kind}.measures: {name!r} must be a valid field name, and unique")
+    slots = tuple(slot.name for slot in task.layout.slots)
+    for what, named in (
+        ("terms", task.terms), ("measures", task.measures), ("metric_names", task.metric_names), ("layout", slots),
+    ):  # fmt: skip
+        for name in named:
+            plain = name.isidentifier() and not keyword.iskeyword(name) and name.strip("_") == name and "__" not in name
+            if not plain or named.count(name) > 1:
+                raise TypeError(f"{kind}.{what}: {name!r} must be a valid field name, and unique")
 
 
 # --- tell -------------------------------------------------------------------------------------------------------------
@@ -101,10 +108,14 @@ def _check(task: Task) -> None:
 
 @entry_of
 def _tell(
-    metrics: Law, names: tuple[str, ...], counts: tuple[tuple[int, float], ...], measures: tuple[str, ...]
+    metrics: Law,
+    names: tuple[str, ...],
+    counts: tuple[tuple[int, float], ...],
+    measures: tuple[str, ...],
+    metric_names: tuple[str, ...],
 ) -> Callable[..., None]:
     """Return `tell`, which writes the metrics (K, B) of the B worlds from `first` on into `told`; NaN: no value."""
-    parameters, by_name = parameters_of(names, counts), by_name_of(measures)
+    parameters, by_name, at = parameters_of(names, counts), by_name_of(measures), indices_of(metric_names)
 
     def tell(steps: Any, numbers: Any, last: Any, sums: Any, first: int, told: Any) -> None:
         unaliased()
@@ -112,7 +123,7 @@ def _tell(
         for k in range(told.shape[1]):
             b = first + k
             told[:, k] = np.nan
-            metrics(p, by_name(sums[b]), by_name(last[b]), steps[b], told[:, k])
+            metrics(p, at, by_name(sums[b]), by_name(last[b]), steps[b], told[:, k])
 
     return tell
 
@@ -150,7 +161,7 @@ def _play(plan: Plan) -> Callable[..., tuple[int, int]]:
     keep, keeps, parameters = plan.kernels.keep, plan.kernels.keep is not None, parameters_of(plan.names, plan.counts)
     begin, act, look, answer, show = (part(plan) for part in (begin_of, act_of, look_in, answer_of, show_of))
     widen = wide_of(plan)
-    terms, size, far = plan.terms, plan.action, plan.apart
+    terms, size, far = len(plan.terms), plan.action, plan.apart
 
     def play(
         worlds: Any, given: Any, dt: float, count: int, mortal: bool, past: bool, totals: Any, made: Any, near: Any,

@@ -110,7 +110,8 @@ class Plan(NamedTuple):
     alike: bool
     dimension: int
     width: int
-    terms: int
+    terms: tuple[str, ...]
+    slots: tuple[tuple[str, int], ...]  # of a row: names and first indices
     action: int  # numbers of an action
     memory: int
     abreast: int  # numbers of a row that the kernel `abreast` writes

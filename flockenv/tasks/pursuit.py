@@ -112,27 +112,27 @@ def _caught(p: Any, before: Frame, after: Frame, j: int) -> bool:
 
 
 @kernel
-def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
+def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
     """Write the terms closing, capture, time; evaders get them with the opposite sign."""
     caught = 0
     for j in range(int(p.pursuers), after.pos.shape[1]):
         caught += 1 if _caught(p, before, after, j) else 0
     for i in range(terms.shape[0]):
-        for k in range(3):
+        for k in range(terms.shape[1]):
             terms[i, k] = 0.0
         if not before.alive[i]:
             continue
         first, end, _, _, side = _sides(p, after, i)
         opponent, d0 = _nearest(before, i, first, end)
         if opponent >= 0:
-            terms[i, 0] = side * p.closing_reward * (d0 - _distance(after, i, opponent))
+            terms[i, at.closing] = side * p.closing_reward * (d0 - _distance(after, i, opponent))
         prey = caught if side > 0 else (1 if _caught(p, before, after, i) else 0)
-        terms[i, 1] = side * p.capture_reward * prey
-        terms[i, 2] = -side * p.time_cost * p.control_dt
+        terms[i, at.capture] = side * p.capture_reward * prey
+        terms[i, at.time] = -side * p.time_cost * p.control_dt
 
 
 @kernel
-def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
+def ended(p: Any, at: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """Remove caught evaders; end all learners when no evader is left, which is success."""
     pursuers, n = int(p.pursuers), after.pos.shape[1]
     left = 0
@@ -148,9 +148,9 @@ def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
 
 
 @kernel
-def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
+def measure(p: Any, at: Any, before: Frame, after: Frame, numbers: Any) -> None:
     """Write the path of pursuer 0, m; least distance between the sides, m; evaders caught; time until the last, s."""
-    numbers[0] = math.hypot(after.pos[0, 0] - before.pos[0, 0], after.pos[1, 0] - before.pos[1, 0])
+    numbers[at.path] = math.hypot(after.pos[0, 0] - before.pos[0, 0], after.pos[1, 0] - before.pos[1, 0])
     n, pursuers = after.pos.shape[1], int(p.pursuers)
     best, caught, free = _FAR, 0, 0
     for j in range(pursuers, n):
@@ -158,21 +158,22 @@ def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
         free += 1 if before.alive[j] else 0
         for i in range(pursuers if before.alive[j] else 0):
             best = min(best, _distance(after, i, j))
-    numbers[1] = best
-    numbers[2] = caught
-    numbers[3] = p.control_dt if free > 0 else 0.0
+    numbers[at.distance] = best
+    numbers[at.captured] = caught
+    numbers[at.time] = p.control_dt if free > 0 else 0.0
 
 
 @kernel
-def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+def metrics(p: Any, at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
     """Write time of the last capture, s, if all are caught; path of pursuer 0, m; distance now, m; evaders caught."""
     if last.captured >= p.evaders:
-        numbers[0] = sums.time
-    numbers[1], numbers[2], numbers[3] = sums.path, last.distance, last.captured
+        numbers[at.time_to_capture] = sums.time
+    numbers[at.path_length], numbers[at.least_distance] = sums.path, last.distance
+    numbers[at.captured] = last.captured
 
 
 @kernel
-def observe(p: Any, frame: Frame, rows: Any) -> None:
+def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
     """Write own velocity, walls, and the nearest opponents and team mates, nearest first."""
     for i in range(rows.shape[0]):
         row = rows[i]
@@ -180,23 +181,26 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
             row[c] = 0.0
         first, end, mate, mates_end, _ = _sides(p, frame, i)
         for k in range(2):
-            row[k] = _clip(frame.vel[k, i] / p.speed_scale)
-            row[2 + k] = _clip(frame.pos[k, i] / p.size)
-            row[4 + k] = _clip((p.size - frame.pos[k, i]) / p.size)
+            row[at.velocity + k] = _clip(frame.vel[k, i] / p.speed_scale)
+            row[at.to_low + k] = _clip(frame.pos[k, i] / p.size)
+            row[at.to_high + k] = _clip((p.size - frame.pos[k, i]) / p.size)
         slots = int(p.opponent_slots)
-        at = _others(p, frame, i, first, end, slots, row, 6)
-        at = _others(p, frame, i, mate, mates_end, int(p.mate_slots), row, at)
+        opponents = (at.opponents, at.opponent_velocity, at.opponent_present)
+        _show_nearest(p, frame, i, first, end, slots, row, opponents)
+        mates = (at.mates, at.mate_velocity, at.mate_present)
+        _show_nearest(p, frame, i, mate, mates_end, int(p.mate_slots), row, mates)
         for s in range(slots):
-            dx, dy = row[6 + 2 * s] * p.size, row[7 + 2 * s] * p.size
+            dx, dy = row[at.opponents + 2 * s] * p.size, row[at.opponents + 2 * s + 1] * p.size
             distance = math.sqrt(dx * dx + dy * dy)
             if distance > 0.0:
-                row[at + 2 * s], row[at + 2 * s + 1] = dx / distance, dy / distance
-            row[at + 2 * slots + s] = max(1.0 - distance / p.near, 0.0) * row[6 + 4 * slots + s]
+                row[at.bearing + 2 * s], row[at.bearing + 2 * s + 1] = dx / distance, dy / distance
+            row[at.closeness + s] = max(1.0 - distance / p.near, 0.0) * row[at.opponent_present + s]
 
 
 @kernel
-def _others(p: Any, frame: Frame, i: int, first: int, end: int, slots: int, row: Any, at: int) -> int:
-    """Write the nearest living agents of [first, end) into `slots` blocks of offsets, velocities, presence."""
+def _show_nearest(p: Any, frame: Frame, i: int, first: int, end: int, slots: int, row: Any, places: Any) -> None:
+    """Write the nearest `slots` living agents of [first, end): offsets, velocities, presence, from these indices on."""
+    offsets, velocities, presence = places
     closest = -1.0
     chosen = -1
     for s in range(slots):
@@ -209,11 +213,10 @@ def _others(p: Any, frame: Frame, i: int, first: int, end: int, slots: int, row:
         if who < 0:
             break
         for k in range(2):
-            row[at + 2 * s + k] = _clip((frame.pos[k, who] - frame.pos[k, i]) / p.size)
-            row[at + 2 * slots + 2 * s + k] = _clip(frame.vel[k, who] / p.speed_scale)
-        row[at + 4 * slots + s] = 1.0
+            row[offsets + 2 * s + k] = _clip((frame.pos[k, who] - frame.pos[k, i]) / p.size)
+            row[velocities + 2 * s + k] = _clip(frame.vel[k, who] / p.speed_scale)
+        row[presence + s] = 1.0
         closest, chosen = best, who
-    return at + 5 * slots
 
 
 @kernel

@@ -277,17 +277,17 @@ def _digest(p: Any, frame: Frame, i: int) -> None:
 
 
 @kernel
-def reward(p: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
+def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
     """Write the terms alive, fed, dead; all 0 for a fish that died before this step."""
     for i in range(terms.shape[0]):
         lives = before.alive[i] and after.memory[FATE, i] == 0.0
-        terms[i, 0] = p.alive_reward * p.control_dt if lives else 0.0
-        terms[i, 1] = p.fed_reward * (1.0 - after.memory[HUNGER, i]) * p.control_dt if lives else 0.0
-        terms[i, 2] = -p.death_cost if before.alive[i] and not lives else 0.0
+        terms[i, at.alive] = p.alive_reward * p.control_dt if lives else 0.0
+        terms[i, at.fed] = p.fed_reward * (1.0 - after.memory[HUNGER, i]) * p.control_dt if lives else 0.0
+        terms[i, at.dead] = -p.death_cost if before.alive[i] and not lives else 0.0
 
 
 @kernel
-def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
+def ended(p: Any, at: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """End the learners that are caught or starved; return True while at least half of the learners live."""
     left = 0
     for i in range(int(p.fish)):
@@ -300,40 +300,40 @@ def ended(p: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
 
 
 @kernel
-def measure(p: Any, before: Frame, after: Frame, numbers: Any) -> None:
+def measure(p: Any, at: Any, before: Frame, after: Frame, numbers: Any) -> None:
     """Write the learners' share alive; summed hunger of those; food eaten; shares caught and starved in this step.
 
     Hunger and food are divided by the number of learners.
     """
     learners = int(p.learners)
-    for k in range(5):
+    for k in range(numbers.shape[0]):
         numbers[k] = 0.0
     for i in range(learners):
         if after.alive[i]:
-            numbers[0] += 1.0 / learners
-            numbers[1] += after.memory[HUNGER, i] / learners
+            numbers[at.alive] += 1.0 / learners
+            numbers[at.hunger] += after.memory[HUNGER, i] / learners
         if before.alive[i]:
-            numbers[2] += after.memory[EATEN, i] / learners
-            numbers[3] += 1.0 / learners if after.memory[FATE, i] == CAUGHT else 0.0
-            numbers[4] += 1.0 / learners if after.memory[FATE, i] == STARVED else 0.0
+            numbers[at.eaten] += after.memory[EATEN, i] / learners
+            numbers[at.caught] += 1.0 / learners if after.memory[FATE, i] == CAUGHT else 0.0
+            numbers[at.starved] += 1.0 / learners if after.memory[FATE, i] == STARVED else 0.0
 
 
 @kernel
-def metrics(p: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+def metrics(p: Any, at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
     """Write the share of learners alive; mean lifetime, s; mean hunger while alive; mean food eaten; shares caught,
     and starved.
     """
-    numbers[0], numbers[1] = last.alive, sums.alive * p.control_dt
+    numbers[at.survived], numbers[at.lifetime] = last.alive, sums.alive * p.control_dt
     if sums.alive > 0:
-        numbers[2] = sums.hunger / sums.alive
-    numbers[3], numbers[4], numbers[5] = sums.eaten, sums.caught, sums.starved
+        numbers[at.hunger] = sums.hunger / sums.alive
+    numbers[at.eaten], numbers[at.caught], numbers[at.starved] = sums.eaten, sums.caught, sums.starved
 
 
 # --- observation ------------------------------------------------------------------------------------------------------
 
 
 @kernel
-def observe(p: Any, frame: Frame, rows: Any) -> None:
+def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
     """Write own velocity, walls, hunger, fear; hunters, food and fish in sight, nearest first.
 
     The row of a dead fish is 0 but for a hunger of 1; its wall distances of 0 set it apart from any living fish.
@@ -344,24 +344,28 @@ def observe(p: Any, frame: Frame, rows: Any) -> None:
         for c in range(row.shape[0]):
             row[c] = 0.0
         if not frame.alive[i]:
-            row[6] = 1.0
+            row[at.hunger] = 1.0
             continue
         for k in range(2):
-            row[k] = clip(frame.vel[k, i] / p.fish_speed)
-            row[2 + k] = clip(frame.pos[k, i] / p.size)
-            row[4 + k] = clip((p.size - frame.pos[k, i]) / p.size)
-        row[6], row[7] = frame.memory[HUNGER, i], frame.memory[FEAR, i]
-        at = _show(p, frame, i, fish, foes, int(p.hunters), row, 8)
-        at = _show(p, frame, i, foes, n, int(p.food_seen), row, at)
-        _show(p, frame, i, 0, fish, int(p.fish_seen), row, at)
+            row[at.velocity + k] = clip(frame.vel[k, i] / p.fish_speed)
+            row[at.to_low + k] = clip(frame.pos[k, i] / p.size)
+            row[at.to_high + k] = clip((p.size - frame.pos[k, i]) / p.size)
+        row[at.hunger], row[at.fear] = frame.memory[HUNGER, i], frame.memory[FEAR, i]
+        hunters = (at.hunters, at.hunter_bearing, at.hunter_velocity, at.hunter_closeness, at.hunter_present)
+        _show(p, frame, i, fish, foes, int(p.hunters), row, hunters)
+        food = (at.food, at.food_bearing, at.food_velocity, at.food_closeness, at.food_amount)
+        _show(p, frame, i, foes, n, int(p.food_seen), row, food)
+        mates = (at.mates, at.mate_bearing, at.mate_velocity, at.mate_closeness, at.mate_present)
+        _show(p, frame, i, 0, fish, int(p.fish_seen), row, mates)
 
 
 @kernel
-def _show(p: Any, frame: Frame, i: int, first: int, end: int, slots: int, row: Any, at: int) -> int:
+def _show(p: Any, frame: Frame, i: int, first: int, end: int, slots: int, row: Any, places: Any) -> None:
     """Write the agents of [first, end) that fish i sees: offset, bearing, velocity, closeness, presence or amount.
 
-    Returns the index after them.
+    Each of these begins at its index in `places`.
     """
+    offset, bearing, velocity, closeness, kept = places
     last, past = -1, -1.0
     for s in range(slots):
         who, distance = _next_seen(p, frame, i, first, end, last, past)
@@ -369,13 +373,12 @@ def _show(p: Any, frame: Frame, i: int, first: int, end: int, slots: int, row: A
             break
         to, way = _to(frame, i, who), unit(_to(frame, i, who))
         for k in range(2):
-            row[at + 2 * s + k] = clip(to[k] / p.sight)
-            row[at + 2 * slots + 2 * s + k] = way[k]
-            row[at + 4 * slots + 2 * s + k] = clip(frame.vel[k, who] / p.hunter_speed)
-        row[at + 6 * slots + s] = max(1.0 - distance / p.near, 0.0)
-        row[at + 7 * slots + s] = 1.0 if end < frame.pos.shape[1] else min(frame.memory[FOOD, who] / p.capacity, 1.0)
+            row[offset + 2 * s + k] = clip(to[k] / p.sight)
+            row[bearing + 2 * s + k] = way[k]
+            row[velocity + 2 * s + k] = clip(frame.vel[k, who] / p.hunter_speed)
+        row[closeness + s] = max(1.0 - distance / p.near, 0.0)
+        row[kept + s] = 1.0 if end < frame.pos.shape[1] else min(frame.memory[FOOD, who] / p.capacity, 1.0)
         last, past = who, distance
-    return at + 8 * slots
 
 
 class School(Task):

@@ -6,27 +6,31 @@ world:
 * `spawn(p, frame)` writes the initial positions, velocities, obstacles and memory, drawn from the world's key;
 * `drive(p, frame, action, force)` turns actions (L, A) into steering forces (D, N) N, also of scripted agents;
 * `keep(p, before, after)`, only if the task `keeps`, writes into the memory what the other kernels read of this step;
-* `reward(p, before, after, action, terms)` writes the named terms (L, K), each contiguous, and nothing else, as a test
-  checks;
-* `ended(p, before, after, numbers, over) -> success` writes which learners are over (L,), may clear `after.alive` of
-  agents, and returns whether the aim is reached; it may also write those of the `measures` (Q,) that it needs itself.
-  If the task has a `lasting_aim`, it returns whether the aim holds now, and success is what `lasts` in tasks/lasting.py
-  returns for the sums of the measures;
-* `measure(p, before, after, numbers)` runs next and writes the other measures: what this step adds to each;
-* `metrics(p, sums, last, steps, numbers)` writes the domain metrics of an episode so far, in the order of
+* `reward(p, at, before, after, action, terms)` writes the named terms (L, K), each contiguous, and nothing else, as a
+  test checks;
+* `ended(p, at, before, after, numbers, over) -> success` writes which learners are over (L,), may clear `after.alive`
+  of agents, and returns whether the aim is reached; it may also write those of the `measures` (Q,) that it needs
+  itself. If the task has a `lasting_aim`, it returns whether the aim holds now, and success is what `lasts` in
+  tasks/lasting.py returns for the sums of the measures;
+* `measure(p, at, before, after, numbers)` runs next and writes the other measures: what this step adds to each;
+* `metrics(p, at, sums, last, steps, numbers)` writes the domain metrics of an episode so far, in the order of
   `metric_names`, from the sums of the measures over its steps and from their last values, by name (e.g. sums.path), and
   the number of steps. A metric that is not written has no value. All numbers are double precision, also `p`;
-* `abreast(p, frame, columns)`, only if the task's `abreast` is not 0, writes the first `abreast` numbers of all rows,
-  (L, abreast), with each number of all agents contiguous, so that loops over agents become vector code. L is rounded up
-  to whole registers there and in that task's `reward`. In the frames of `abreast`, `reward`, `ended` and `measure` of
-  such a task, `pos`, `vel`, `memory`, `radius` and the near arrays extend beyond the last agent, up to a multiple of
+* `abreast(p, at, frame, columns)`, only if the task's `abreast` is not 0, writes the first `abreast` numbers of all
+  rows, (L, abreast), each number of all agents contiguous, so that loops over agents become vector code. L is rounded
+  up to whole registers there and in that task's `reward`. In the frames of `abreast`, `reward`, `ended` and `measure`
+  of such a task, `pos`, `vel`, `memory`, `radius` and the near arrays extend beyond the last agent, up to a multiple of
   `simd_rows.PAIR`, with arbitrary values: no result may depend on these. `alive`, the limits, `before` and `action` end
   with the last agent. The frame is a copy: such a task's `ended` may write only `over` and `after.alive`; `keep` writes
   the memory;
-* `observe(p, frame, rows)` writes the observation rows (L, O), or what `abreast` left of them.
+* `observe(p, at, frame, rows)` writes the observation rows (L, O), or what `abreast` left of them.
 
-`p` holds the task's `parameters()` by name. Learners are the first L agents of a world. If the task has a `look`,
-neighbours are searched once for all kernels, by the same query as for a scene's effects.
+`p` holds the task's `parameters()` by name, and `at` the indices of the numbers that a kernel writes: those of `terms`
+(reward), `measures` (ended, measure), `metric_names` (metrics), or of the first number of each slot of the layout
+(abreast, observe): `terms[i, at.progress] = ...`, `rows[i, at.velocity + k] = ...`. No order of names is written twice.
+
+Learners are the first L agents of a world. If the task has a `look`, neighbours are searched once for all kernels, by
+the same query as for a scene's effects.
 """
 
 from __future__ import annotations
