@@ -8,7 +8,6 @@ spent, go into flockenv/players/tuned/TASK.json; the default budget is of the or
 from __future__ import annotations
 
 import json
-from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,9 +22,10 @@ from flockenv.core.atomic_files import made, replacing
 from flockenv.core.output_paths import check_room, checked_file
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.players.rules import RULES, TUNED, RulesPlayer, as_dict
+from flockenv.players.rules.parameter import ranges_of
 from flockenv.tasks import Task
 
-__all__ = ["RANGES", "app", "search"]
+__all__ = ["app", "search"]
 
 ROOM = 2**16
 """Bytes, more than what was found takes."""
@@ -33,64 +33,13 @@ ROOM = 2**16
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 console = Console(stderr=True)
 
-RANGES: dict[str, dict[str, tuple[float, float]]] = {
-    "pursuit": {
-        "factor": (0.0, 1.5), "horizon": (0.2, 6.0), "margin": (0.0, 2.5), "gain": (1.0, 12.0),
-        "slow_radius": (0.01, 2.0),
-    },
-    "obstacles": {
-        "horizon": (0.4, 3.0), "margin": (0.0, 0.6), "evade": (0.5, 8.0), "urgency": (0.0, 1.0), "brake": (0.0, 3.0),
-        "gain": (0.5, 6.0), "speed": (0.6, 1.0), "push": (0.0, 2.0),
-    },
-    "crossing": {
-        "horizon": (0.5, 6.0), "margin": (0.0, 0.8), "evade": (0.5, 8.0), "urgency": (0.0, 1.0), "radius": (0.6, 2.0),
-        "apart": (0.0, 4.0), "gain": (0.5, 6.0), "speed": (0.5, 1.0), "slow_radius": (0.1, 2.0),
-    },
-    "flock": {
-        "horizon": (0.5, 4.0), "margin": (0.0, 1.0), "evade": (0.5, 8.0), "radius": (1.0, 3.0), "apart": (0.0, 8.0),
-        "match": (0.0, 5.0), "centre": (0.0, 2.0), "course": (0.2, 6.0), "blend": (0.0, 1.0),
-    },
-    "evade": {
-        "horizon": (0.2, 2.0), "avoid": (0.5, 8.0), "wall": (0.1, 1.5), "alarm": (2.0, 15.0), "predict": (0.0, 2.0),
-        "evade": (0.5, 8.0), "crowd": (0.0, 2.0), "middle": (0.0, 1.5), "margin": (0.4, 2.5), "danger": (0.0, 3.0),
-        "exposed": (0.0, 10.0), "hide": (0.0, 8.0),
-    },
-    "herd": {
-        "together": (0.3, 2.0), "collecting": (0.0, 4.0), "driving": (0.3, 2.5), "near": (0.0, 5.0), "slow": (0.0, 1.0),
-        "gain": (1.0, 12.0), "around": (0.0, 6.0), "width": (0.5, 2.0), "apart": (0.0, 10.0),
-    },
-    "path_follow": {
-        "time": (0.05, 0.8), "lead": (0.1, 0.8), "tube": (0.0, 1.0), "keep": (0.3, 0.99), "speed": (0.5, 1.0),
-        "grip": (0.3, 2.5), "early": (0.2, 1.5), "brake": (0.0, 12.0), "gain": (1.0, 12.0),
-    },
-    "school": {
-        "escape": (0.05, 1.0), "school": (0.05, 1.0), "need": (0.05, 0.8), "calm": (0.0, 0.2), "content": (0.0, 0.6),
-        "wall": (0.1, 1.5), "apart": (0.0, 4.0), "predict": (0.0, 2.0), "evade": (1.0, 8.0), "middle": (0.0, 1.5),
-        "forage": (1.0, 8.0), "rich": (0.0, 20.0), "match": (0.0, 5.0), "centre": (0.0, 3.0), "pace": (0.1, 1.0),
-        "turn": (0.0, 1.0),
-    },
-    "bottleneck": {
-        "tau": (0.1, 1.5), "speed": (0.2, 1.0), "strength": (0.0, 4000.0), "decay": (0.02, 0.5), "walls": (0.0, 4000.0),
-    },
-    "corridor": {
-        "tau": (0.1, 1.5), "strength": (0.0, 20.0), "importance": (0.0, 4.0), "gamma": (0.05, 1.5),
-        "angular": (0.0, 6.0), "forward": (0.0, 6.0), "bias": (0.0, 0.5), "walls": (0.0, 20.0),
-        "wall_decay": (0.02, 0.5),
-    },
-    "crowd_nav": {
-        "tau": (0.15, 1.0), "speed": (0.5, 1.0), "strength": (0.5, 20.0), "importance": (0.0, 4.0),
-        "gamma": (0.05, 1.5), "angular": (0.0, 6.0), "forward": (0.0, 6.0), "bias": (0.0, 0.5),
-    },
-}  # fmt: skip
-"""Where each parameter is looked for."""
-
 
 def search(experiment: Experiment, advance: Any = lambda steps: None) -> tuple[dict[str, float], dict[str, float]]:
     """Return the best parameters, and what was spent and scored."""
     task, s = experiment.build(), experiment.search
     rng = np.random.default_rng(s.seed)
-    ranges, textbook = RANGES[task.name], as_dict(RULES[task.name][1]())
-    assert set(ranges) == {f.name for f in fields(RULES[task.name][1])}, "every parameter has a range"
+    parameters = RULES[task.name][1]
+    ranges, textbook = ranges_of(parameters), as_dict(parameters())
     pool = [textbook, *({k: float(rng.uniform(*r)) for k, r in ranges.items()} for _ in range(s.candidates - 1))]
     worlds, spent, best_score = s.worlds, 0, -np.inf
     for round_ in range(s.rounds):

@@ -22,7 +22,7 @@ from gymnasium.envs.registration import EnvSpec
 import flockenv  # noqa: F401  # registers the environments
 from benchmarks.floors import Machine, machine, of_decisions
 from benchmarks.measure import Bench, Contestant, Floor, Out, Quick, Result, Rounds, command_line, number
-from flockenv.envs.registration import id_of
+from flockenv.envs.table import id_of
 from flockenv.envs.world import World
 from flockenv.jit.thread_pool import use_threads
 from flockenv.tasks import TASKS, Flock, Task

@@ -21,52 +21,19 @@ import importlib  # noqa: E402  # see above
 from typing import TYPE_CHECKING, Any  # noqa: E402  # see above
 
 from flockenv.envs.registration import register_all  # noqa: E402  # see above
+from flockenv.envs.table import ENVIRONMENTS  # noqa: E402  # see above
 
 if TYPE_CHECKING:
     from flockenv.envs.world import Step, World
     from flockenv.model.snapshot import Snapshot
     from flockenv.model.state import Body, State
     from flockenv.scene import Scene
-    from flockenv.tasks import (
-        TASKS,
-        Bottleneck,
-        Corridor,
-        Crossing,
-        CrowdNav,
-        Evade,
-        Flock,
-        Herd,
-        Obstacles,
-        PathFollow,
-        Pursuit,
-        School,
-        Task,
-    )
+    from flockenv.tasks import *  # noqa: F403  # the tasks, by the names of their classes
+    from flockenv.tasks import TASKS, Task
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "TASKS",
-    "Body",
-    "Bottleneck",
-    "Corridor",
-    "Crossing",
-    "CrowdNav",
-    "Evade",
-    "Flock",
-    "Herd",
-    "Obstacles",
-    "PathFollow",
-    "Pursuit",
-    "Scene",
-    "School",
-    "Snapshot",
-    "State",
-    "Step",
-    "Task",
-    "World",
-    "__version__",
-]
+__all__ = ["TASKS", "Body", "Scene", "Snapshot", "State", "Step", "Task", "World", "__version__", *ENVIRONMENTS]
 
 _HOME = {
     "Scene": "scene",
@@ -74,20 +41,10 @@ _HOME = {
     "Body": "model.state",
     "State": "model.state",
     "TASKS": "tasks",
-    "Corridor": "tasks",
-    "Bottleneck": "tasks",
-    "Crossing": "tasks",
-    "CrowdNav": "tasks",
-    "Evade": "tasks",
-    "Flock": "tasks",
-    "Herd": "tasks",
-    "Obstacles": "tasks",
-    "PathFollow": "tasks",
-    "Pursuit": "tasks",
-    "School": "tasks",
     "Task": "tasks",
     "Step": "envs.world",
     "World": "envs.world",
+    **dict.fromkeys(ENVIRONMENTS, "tasks"),
 }
 """Public name -> the module that defines it, imported on first use (PEP 562)."""
 

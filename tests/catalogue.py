@@ -67,6 +67,7 @@ from flockenv.behaviours import (
     Whiskers,
 )
 from flockenv.behaviours.steer import Steer
+from flockenv.envs.table import ENVIRONMENTS
 from flockenv.geometry.shapes import Circle
 from flockenv.geometry.space import Box, Plane, Space, Torus
 from flockenv.geometry.targets import Target
@@ -570,6 +571,13 @@ class TaskRow:
     def name(self) -> str:
         return self.task.name + self.variant
 
+
+SINGLE = tuple(info.id for info in ENVIRONMENTS.values())
+"""Ids of environments with one learner."""
+TEAMS = tuple(info.id for info in ENVIRONMENTS.values() if info.team)
+"""Ids of environments with several."""
+RAISED = {name: info.version for name, info in ENVIRONMENTS.items() if info.version}
+"""Versions of environments above 0."""
 
 TASKS = (
     TaskRow(Pursuit()),

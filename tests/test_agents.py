@@ -30,6 +30,7 @@ from flockenv.jit.thread_pool import threads
 from flockenv.players import WEIGHTS
 from flockenv.players.policy import MlpPolicy, RandomPolicy
 from flockenv.players.rules import RULES, Tuned, as_dict, player, tuned
+from flockenv.players.rules.parameter import ranges_of
 from flockenv.tasks import TASKS, School, Task
 from tests.training import PURSUIT, TINY, interrupt
 
@@ -97,7 +98,7 @@ def test_a_player_is_finite_where_there_is_nothing_to_see(name: str) -> None:
 
 def test_every_parameter_of_the_rules_has_a_range_around_its_textbook_value() -> None:
     for name, (_, rules) in RULES.items():
-        for parameter, (low, high) in tune.RANGES[name].items():
+        for parameter, (low, high) in ranges_of(rules).items():
             assert low <= getattr(rules(), parameter) <= high or parameter in ("horizon", "grip"), (
                 name,
                 parameter,

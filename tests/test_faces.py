@@ -9,8 +9,8 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from flockenv.envs.common import ByAgent, named
-from flockenv.envs.registration import id_of
 from flockenv.envs.sb3 import WorldVecEnv
+from flockenv.envs.table import id_of
 from flockenv.envs.world import World
 from flockenv.tasks import Bottleneck, Corridor, Crossing, CrowdNav, Evade, Flock, Herd, Obstacles, Pursuit, School
 

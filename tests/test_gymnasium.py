@@ -22,9 +22,10 @@ from gymnasium.utils.env_checker import check_env
 
 import flockenv
 from flockenv.envs import single
-from flockenv.envs.registration import HORIZONS, PARALLEL, SINGLE, VERSIONS, id_of
 from flockenv.envs.single import PursuitEnv
+from flockenv.envs.table import ENVIRONMENTS, id_of
 from flockenv.tasks import TASKS
+from tests.catalogue import RAISED, SINGLE, TEAMS
 
 MODES = (None, "rgb_array", "human")
 
@@ -98,13 +99,13 @@ def test_the_registered_time_limit_is_the_horizon_of_the_task(env_id):
 
 
 @pytest.mark.parametrize("kind", ["parallel", "aec"])
-@pytest.mark.parametrize("env_id", PARALLEL)
+@pytest.mark.parametrize("env_id", TEAMS)
 def test_the_registered_max_cycles_is_the_horizon_of_the_task(env_id, kind):
     assert pettingzoo.spec(kind, env_id).max_cycles == pettingzoo.make(kind, env_id).unwrapped.task.horizon
 
 
 def test_every_task_has_an_id():
-    assert sorted(re.sub(r"(?<!^)([A-Z])", r"_\1", name).lower() for name in HORIZONS) == sorted(TASKS)
+    assert sorted(re.sub(r"(?<!^)([A-Z])", r"_\1", name).lower() for name in ENVIRONMENTS) == sorted(TASKS)
 
 
 def test_every_task_maps_to_a_registered_id():
@@ -542,11 +543,11 @@ def test_render_fps_is_the_number_of_decisions_per_second(env_id):
 
 
 @pytest.mark.filterwarnings("ignore:.*out of date:DeprecationWarning")
-@pytest.mark.parametrize("name", sorted(VERSIONS))
+@pytest.mark.parametrize("name", sorted(RAISED))
 def test_the_error_for_a_former_version_names_the_new_one(name: str) -> None:
     for make in (gymnasium.make, gymnasium.make_vec):
-        with pytest.raises(gymnasium.error.DeprecatedEnv, match=rf"Please use `flockenv/{name}-v{VERSIONS[name]}`"):
-            make(f"flockenv/{name}-v{VERSIONS[name] - 1}")
+        with pytest.raises(gymnasium.error.DeprecatedEnv, match=rf"Please use `flockenv/{name}-v{RAISED[name]}`"):
+            make(f"flockenv/{name}-v{RAISED[name] - 1}")
 
 
 @pytest.mark.parametrize("env_id", SINGLE)

@@ -13,7 +13,8 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import data_equivalence
 
 from flockenv.envs import common, crossing_v0, flock_v1, pursuit_v0, school_v0
-from flockenv.envs.registration import PARALLEL, VERSIONS, id_of
+from flockenv.envs.table import id_of
+from tests.catalogue import RAISED, TEAMS
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)  # on import it loads its own example the deprecated way
@@ -170,7 +171,7 @@ def test_names_and_spaces_stay_the_same_objects(env_id):
 
 
 @pytest.mark.parametrize("kind", ["parallel", "aec"])
-@pytest.mark.parametrize("env_id", PARALLEL)
+@pytest.mark.parametrize("env_id", TEAMS)
 def test_spaces_of_all_agents_are_there_before_the_first_reset(env_id, kind):
     env = pettingzoo.make(kind, env_id)
     for several, one in (
@@ -180,7 +181,7 @@ def test_spaces_of_all_agents_are_there_before_the_first_reset(env_id, kind):
         assert all(several[agent] is one(agent) for agent in env.possible_agents)
 
 
-@pytest.mark.parametrize("env_id", PARALLEL)
+@pytest.mark.parametrize("env_id", TEAMS)
 def test_nobody_left_is_a_step_of_nobody(env_id):
     """PettingZoo's own loops and SuperSuit's black_death go on with {} when all agents have left."""
     env = pettingzoo.make("parallel", env_id, max_cycles=3)
@@ -557,8 +558,8 @@ def test_the_library_s_copies_warn_about_nothing():
 def test_a_former_version_is_refused_by_the_name_of_the_new_one() -> None:
     from flockenv import envs
 
-    for name, version in VERSIONS.items():
-        if id_of(name) not in PARALLEL:  # of one learner: Gymnasium's alone, see test_gymnasium.py
+    for name, version in RAISED.items():
+        if id_of(name) not in TEAMS:  # of one learner: Gymnasium's alone, see test_gymnasium.py
             continue
         for kind in ("parallel", "aec"):
             with pytest.raises(

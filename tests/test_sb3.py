@@ -22,11 +22,11 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecMonitor
 
-from flockenv.envs.registration import SINGLE
 from flockenv.envs.sb3 import NOTHING, WorldMonitor, WorldVecEnv, load_sb3_zip
 from flockenv.envs.world import World
 from flockenv.players.rules import player
 from flockenv.tasks import TASKS, Bottleneck, Flock, Pursuit, School
+from tests.catalogue import SINGLE
 
 torch.set_num_threads(1)
 

@@ -23,9 +23,10 @@ from gymnasium.wrappers.vector import (
     RescaleObservation,
 )
 
-from flockenv.envs.registration import HORIZONS, SINGLE
+from flockenv.envs.table import ENVIRONMENTS
 from flockenv.envs.world import World
 from flockenv.tasks import Flock, Pursuit
+from tests.catalogue import SINGLE
 
 MODES = list(AutoresetMode)
 EASY = {
@@ -192,7 +193,7 @@ def test_observations_stay_inside_their_space(env_id):
 
 
 def test_the_default_time_limit_is_that_of_the_id():
-    assert gymnasium.make_vec("flockenv/Pursuit-v0", 2).spec.max_episode_steps == HORIZONS["Pursuit"]
+    assert gymnasium.make_vec("flockenv/Pursuit-v0", 2).spec.max_episode_steps == ENVIRONMENTS["Pursuit"].horizon
     envs = gymnasium.make_vec("flockenv/Pursuit-v0", 2, max_episode_steps=3)
     envs.reset(seed=0)
     ends = [envs.step(row)[3].tolist() for row in np.zeros((4, *envs.action_space.shape))]

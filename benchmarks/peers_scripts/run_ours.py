@@ -101,9 +101,9 @@ def _batch(world: Any, rng: Any, does: str) -> Case:
 
 def flock_parallel(threads: int) -> Case:
     """The Flock task as a PettingZoo parallel environment."""
-    from flockenv.envs.flock_v1 import parallel_env
+    from flockenv.envs import flock_v1
 
-    env = parallel_env(max_cycles=HORIZON, agents=3, obstacle_count=3)
+    env = flock_v1.parallel_env(max_cycles=HORIZON, agents=3, obstacle_count=3)
     size = env.task.layout.size
     return _parallel(
         env, 3, f"Flock, one world x 3 agents, 3 obstacles: drives in {env.task.substeps} substeps; {size} "
@@ -113,9 +113,9 @@ def flock_parallel(threads: int) -> Case:
 
 def pursuit_parallel(pursuers: int, evaders: int) -> Case:
     """The Pursuit task as a PettingZoo parallel environment; both sides are agents."""
-    from flockenv.envs.pursuit_v0 import parallel_env
+    from flockenv.envs import pursuit_v0
 
-    env = parallel_env(max_cycles=HORIZON, pursuers=pursuers, evaders=evaders)
+    env = pursuit_v0.parallel_env(max_cycles=HORIZON, pursuers=pursuers, evaders=evaders)
     size = env.task.layout.size
     return _parallel(
         env, pursuers + evaders,

@@ -67,9 +67,9 @@ RECORDED_EVERY = 0.1  # s, rounded to whole steps
 
 def _task_or_file(incomplete: str) -> list[str]:
     """Return the tasks, scene files and folders that complete a word (shell completion)."""
-    from flockenv.envs.registration import HORIZONS
+    from flockenv.envs.table import ENVIRONMENTS
 
-    tasks = (re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower() for name in HORIZONS)
+    tasks = (re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower() for name in ENVIRONMENTS)
     here = Path(incomplete).parent if "/" in incomplete else Path()
     found = sorted(here.iterdir()) if here.is_dir() else []
     files = [f"{p}/" if p.is_dir() else str(p) for p in found if p.is_dir() or p.suffix in (".yaml", ".yml")]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,8 @@ from pettingzoo import AECEnv
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 from pettingzoo.utils.wrappers import BaseWrapper, OrderEnforcingWrapper
 
+from flockenv.envs import parallel
 from flockenv.envs.common import Rows
-from flockenv.envs.parallel import WorldParallelEnv
 
 __all__ = ["by_turns"]
 
@@ -63,9 +64,23 @@ class _Checked(BaseWrapper):  # type: ignore[misc]  # pettingzoo ships no types
         return str(self.env)
 
 
-def by_turns(env: WorldParallelEnv) -> AECEnv[str, Any, Any]:
+def by_turns(env: parallel.WorldParallelEnv) -> AECEnv[str, Any, Any]:
     """Return the AEC form, with order enforced (no step before reset, one per turn) and actions checked.
 
     Actions out of [-1, 1] are clipped by the world, as in all other APIs, and not by a wrapper that warns.
     """
     return OrderEnforcingWrapper(_Checked(parallel_to_aec_wrapper(env)))
+
+
+def __getattr__(name: str) -> Callable[..., AECEnv[str, Any, Any]]:
+    """Return the function that makes the AEC form of an environment in the table, such as PursuitAECEnv."""
+    several = name.removesuffix("AECEnv")
+    if several == name:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    made: type[parallel.WorldParallelEnv] = getattr(parallel, f"{several}ParallelEnv")
+
+    def env(max_cycles: int | None = None, render_mode: str | None = None, **parameters: Any) -> AECEnv[str, Any, Any]:
+        """Make the turn-based environment (AEC); the parameters are those of the task."""
+        return by_turns(made(max_cycles, render_mode, **parameters))
+
+    return env

@@ -8,20 +8,20 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from flockenv.envs.common import reward_keys
-from flockenv.envs.registration import id_of
+from flockenv.envs.table import EnvInfo
 from flockenv.tasks import Layout, Task
 
 __all__ = ["page"]
 
 
-def page(summary: str, task: Task, name: str, history: str) -> str:
+def page(info: EnvInfo, task: Task) -> str:
     """Return the page of an environment in Markdown: its summary, its tables, its arguments, its history.
 
     The description is the docstring of the task's class; everything else is read from the task.
     """
     parts = [
-        inspect.cleandoc(summary),
-        _facts(task, id_of(name)),
+        info.summary,
+        _facts(task, info.id),
         "## Description\n\n" + inspect.cleandoc(type(task).__doc__ or ""),
         "## Action space\n\n" + _layout(task.action_layout),
         "## Observation space\n\n" + _layout(task.layout),
@@ -29,7 +29,7 @@ def page(summary: str, task: Task, name: str, history: str) -> str:
         "## Infos\n\n" + _infos(task),
         "## Episode end\n\n" + _end(task),
         "## Arguments\n\n" + _arguments(task),
-        "## Version history\n\n" + history,
+        "## Version history\n\n" + info.history,
     ]
     return "\n\n".join(parts) + "\n"
 

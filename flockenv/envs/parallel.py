@@ -28,14 +28,11 @@ from flockenv.envs.common import (
     render_fps,
     reward_keys,
 )
-from flockenv.envs.registration import VERSIONS
+from flockenv.envs.table import EnvInfo, class_of
 from flockenv.envs.world import Step, World
-from flockenv.tasks import Bottleneck, Corridor, Crossing, Flock, Herd, Pursuit, School, Task
+from flockenv.tasks import Task
 
-__all__ = [
-    "BottleneckParallelEnv", "CorridorParallelEnv", "CrossingParallelEnv", "FlockParallelEnv", "HerdParallelEnv",
-    "PursuitParallelEnv", "SchoolParallelEnv", "WorldParallelEnv",
-]  # fmt: skip
+__all__ = ["WorldParallelEnv"]
 
 Named = dict[str, Any]
 
@@ -58,6 +55,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         parameters: those of the task.
     """
 
+    info: ClassVar[EnvInfo]
     task_type: ClassVar[type[Task]]
     fixed: ClassVar[dict[str, Any]] = {}
     """Parameters whose default differs from the task's."""
@@ -67,7 +65,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
             self.task_type, {**self.fixed, **parameters}, limit="max_cycles", own=("max_cycles", "render_mode")
         )
         self.metadata = {
-            "name": f"{self.task.name}_v{VERSIONS.get(type(self.task).__name__, 0)}",
+            "name": f"{self.task.name}_v{self.info.version}",
             "render_modes": list(RENDER_MODES),
             "render_fps": render_fps(self.task),
             "is_parallelizable": True,
@@ -261,45 +259,6 @@ def _everything(world: World, limit: int) -> NDArray[np.float32]:
     return np.asarray(np.clip(row, -1.0, 1.0), np.float32)
 
 
-class FlockParallelEnv(WorldParallelEnv):
-    """A flock in which each boid is an agent (learners=k: only the first k; the rest are scripted)."""
-
-    task_type = Flock
-
-
-class PursuitParallelEnv(WorldParallelEnv):
-    """Pursuit as a two-team game: three pursuers and two evaders, all of them agents; captured evaders leave."""
-
-    task_type = Pursuit
-    fixed: ClassVar[dict[str, Any]] = {"pursuers": 3, "evaders": 2, "sides": "both"}
-
-
-class CrossingParallelEnv(WorldParallelEnv):
-    """Walkers swap places across a circle, all of them agents (learners=k: only the first k)."""
-
-    task_type = Crossing
-
-
-class HerdParallelEnv(WorldParallelEnv):
-    """Herding as a team: two dogs, both of them agents, with the same reward."""
-
-    task_type = Herd
-    fixed: ClassVar[dict[str, Any]] = {"dogs": 2}
-
-
-class SchoolParallelEnv(WorldParallelEnv):
-    """A school in which each fish is an agent, and leaves when caught or starved (learners=k: only the first k)."""
-
-    task_type = School
-
-
-class CorridorParallelEnv(WorldParallelEnv):
-    """Two opposite streams in one corridor, all of them agents (learners=k: only the first k)."""
-
-    task_type = Corridor
-
-
-class BottleneckParallelEnv(WorldParallelEnv):
-    """A crowd leaves a room through one door; all are agents until they are out (learners=k: only the first k)."""
-
-    task_type = Bottleneck
+def __getattr__(name: str) -> type[WorldParallelEnv]:
+    """Build the class of an environment in the table, such as PursuitParallelEnv."""
+    return class_of(WorldParallelEnv, "ParallelEnv", name, team=True)

@@ -34,7 +34,7 @@ from flockenv.envs.common import (
     reward_keys,
     together,
 )
-from flockenv.envs.registration import HORIZONS, id_of
+from flockenv.envs.table import ENVIRONMENTS
 from flockenv.envs.world import Step, World
 
 if TYPE_CHECKING:
@@ -240,9 +240,9 @@ class WorldVecEnv(VecEnv):
 def _spec(task: Task, time_limit: int | None) -> EnvSpec | None:
     """Return the spec from which `gymnasium.make_vec` makes the same worlds; None for a task without an id."""
     name = type(task).__name__
-    if name not in HORIZONS:
+    if name not in ENVIRONMENTS:
         return None
-    spec = copy.deepcopy(gymnasium.spec(id_of(name)))
+    spec = copy.deepcopy(gymnasium.spec(ENVIRONMENTS[name].id))
     spec.max_episode_steps = time_limit
     for name, field in type(task).model_fields.items():
         value = getattr(task, name)

@@ -1,4 +1,7 @@
-"""Gymnasium environments: one learner in one world; the docstring of each is its documentation page."""
+"""Gymnasium environments: one learner in one world; the docstring of each class is its documentation page.
+
+The classes, such as PursuitEnv, come from the rows of table.py.
+"""
 
 from __future__ import annotations
 
@@ -24,37 +27,11 @@ from flockenv.envs.common import (
     reward_keys,
 )
 from flockenv.envs.docstring import page
+from flockenv.envs.table import EnvInfo, class_of
 from flockenv.envs.world import Step, World
-from flockenv.tasks import (
-    Bottleneck,
-    Corridor,
-    Crossing,
-    CrowdNav,
-    Evade,
-    Flock,
-    Herd,
-    Obstacles,
-    PathFollow,
-    Pursuit,
-    School,
-    Task,
-)
+from flockenv.tasks import Task
 
-__all__ = [
-    "BottleneckEnv",
-    "CorridorEnv",
-    "CrossingEnv",
-    "CrowdNavEnv",
-    "EvadeEnv",
-    "FlockEnv",
-    "HerdEnv",
-    "ObstaclesEnv",
-    "PathFollowEnv",
-    "PursuitEnv",
-    "SchoolEnv",
-    "SingleEnv",
-    "one_learner",
-]
+__all__ = ["SingleEnv", "one_learner"]
 
 
 def one_learner(task_type: type[Task], parameters: dict[str, Any]) -> Task:
@@ -75,17 +52,17 @@ class SingleEnv(gymnasium.Env[Rows, Rows]):
     first `reset()` without a seed draws one. `info["seed"]` of a reset is the seed used.
     """
 
+    info: ClassVar[EnvInfo]
     task_type: ClassVar[type[Task]]
     fixed: ClassVar[dict[str, Any]] = {}
     """Parameters whose default differs from the task's."""
-    history: ClassVar[str]
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         if "task_type" in vars(cls):
             task = cls.task_type(**cls.fixed)
             cls.metadata = {"render_modes": list(RENDER_MODES), "render_fps": render_fps(task)}
-            cls.__doc__ = page(cls.__doc__ or "", task, cls.__name__.removesuffix("Env"), cls.history)
+            cls.__doc__ = page(cls.info, task)
 
     def __init__(self, render_mode: str | None = None, **parameters: Any) -> None:
         self.task = one_learner(self.task_type, {**self.fixed, **parameters})
@@ -152,91 +129,6 @@ class SingleEnv(gymnasium.Env[Rows, Rows]):
         self._screen.close()
 
 
-class PursuitEnv(SingleEnv):
-    """A pursuer chases a scripted evader."""
-
-    task_type = Pursuit
-    history = "v0: first version (flockenv 0.1.0)."
-
-
-class ObstaclesEnv(SingleEnv):
-    """A walker crosses a random field of obstacles to its goal."""
-
-    task_type = Obstacles
-    history = "v0: first version (flockenv 0.1.0)."
-
-
-class PathFollowEnv(SingleEnv):
-    """A runner follows a narrow winding track as far as possible."""
-
-    task_type = PathFollow
-    history = "v0: first version (flockenv 0.1.0)."
-
-
-class FlockEnv(SingleEnv):
-    """A learner travels in a flock of scripted flockmates."""
-
-    task_type = Flock
-    fixed: ClassVar[dict[str, Any]] = {"learners": 1}
-    history = (
-        "v1: success is judged over the episode (`settling`, `lasting`), not at its last instant; metrics `held` and "
-        "`success_at_end`.\n\nv0: first version (flockenv 0.1.0)."
-    )
-
-
-class CrossingEnv(SingleEnv):
-    """A learner crosses a circle among scripted walkers that avoid it and each other by ORCA."""
-
-    task_type = Crossing
-    fixed: ClassVar[dict[str, Any]] = {"learners": 1}
-    history = "v0: first version (flockenv 0.1.0)."
-
-
-class HerdEnv(SingleEnv):
-    """A dog gathers scripted sheep and drives them into a pen."""
-
-    task_type = Herd
-    history = "v0: first version (flockenv 0.1.0)."
-
-
-class EvadeEnv(SingleEnv):
-    """An evader escapes three scripted pursuers among cover."""
-
-    task_type = Evade
-    history = (
-        "v1: the forces of the scripted pursuers differ in their last bits.\n\nv0: first version (flockenv 0.1.0)."
-    )
-
-
-class SchoolEnv(SingleEnv):
-    """A fish lives among scripted fish, patches of food that regrow, and a scripted hunter."""
-
-    task_type = School
-    fixed: ClassVar[dict[str, Any]] = {"learners": 1}
-    history = "v0: first version (flockenv 0.1.0)."
-
-
-class CrowdNavEnv(SingleEnv):
-    """A robot crosses a crowd of pedestrians that swap places under a social force, and must touch none of them."""
-
-    task_type = CrowdNav
-    history = "v0: first version (flockenv 0.1.0)."
-
-
-class CorridorEnv(SingleEnv):
-    """A learner walks in a corridor among two opposite streams of scripted walkers."""
-
-    task_type = Corridor
-    fixed: ClassVar[dict[str, Any]] = {"learners": 1}
-    history = (
-        "v1: success is judged over the episode (`settling`, `lasting`), not at its last instant; metrics `held` and "
-        "`success_at_end`.\n\nv0: first version (flockenv 0.1.0)."
-    )
-
-
-class BottleneckEnv(SingleEnv):
-    """A person leaves a crowded room through one door, among scripted people."""
-
-    task_type = Bottleneck
-    fixed: ClassVar[dict[str, Any]] = {"learners": 1}
-    history = "v0: first version (flockenv 0.1.0)."
+def __getattr__(name: str) -> type[SingleEnv]:
+    """Build the class of an environment in the table, such as PursuitEnv."""
+    return class_of(SingleEnv, "Env", name)

@@ -32,36 +32,11 @@ from flockenv.envs.common import (
     reward_keys,
     together,
 )
+from flockenv.envs.table import EnvInfo, class_of
 from flockenv.envs.world import Step, World
-from flockenv.tasks import (
-    Bottleneck,
-    Corridor,
-    Crossing,
-    CrowdNav,
-    Evade,
-    Flock,
-    Herd,
-    Obstacles,
-    PathFollow,
-    Pursuit,
-    School,
-    Task,
-)
+from flockenv.tasks import Task
 
-__all__ = [
-    "BottleneckVectorEnv",
-    "CorridorVectorEnv",
-    "CrossingVectorEnv",
-    "CrowdNavVectorEnv",
-    "EvadeVectorEnv",
-    "FlockVectorEnv",
-    "HerdVectorEnv",
-    "ObstaclesVectorEnv",
-    "PathFollowVectorEnv",
-    "PursuitVectorEnv",
-    "SchoolVectorEnv",
-    "WorldsEnv",
-]
+__all__ = ["WorldsEnv"]
 
 Mask = NDArray[np.bool_]
 Info = dict[str, Any]
@@ -91,6 +66,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         parameters: those of the task.
     """
 
+    info: ClassVar[EnvInfo]
     task_type: ClassVar[type[Task]]
     fixed: ClassVar[dict[str, Any]] = {}
 
@@ -361,72 +337,6 @@ def _blank(columns: Mapping[str, Any], rows: NDArray[np.intp]) -> None:
         column[rows] = 0
 
 
-class PursuitVectorEnv(WorldsEnv):
-    """Pursuers, one per world or `pursuers=` several; the page is that of flockenv.envs.single.PursuitEnv."""
-
-    task_type = Pursuit
-
-
-class ObstaclesVectorEnv(WorldsEnv):
-    """Walkers, one per world; the page is that of flockenv.envs.single.ObstaclesEnv."""
-
-    task_type = Obstacles
-
-
-class PathFollowVectorEnv(WorldsEnv):
-    """Runners, one per world; the page is that of flockenv.envs.single.PathFollowEnv."""
-
-    task_type = PathFollow
-
-
-class FlockVectorEnv(WorldsEnv):
-    """Learners in flocks, one per world or `learners=` several; the page is that of flockenv.envs.single.FlockEnv."""
-
-    task_type = Flock
-    fixed: ClassVar[dict[str, Any]] = {"learners": 1}
-
-
-class CrossingVectorEnv(WorldsEnv):
-    """Walkers, one per world or `learners=` several; the page is that of flockenv.envs.single.CrossingEnv."""
-
-    task_type = Crossing
-    fixed: ClassVar[dict[str, Any]] = {"learners": 1}
-
-
-class HerdVectorEnv(WorldsEnv):
-    """Dogs, one per world or `dogs=` several; the page is that of flockenv.envs.single.HerdEnv."""
-
-    task_type = Herd
-
-
-class EvadeVectorEnv(WorldsEnv):
-    """Evaders, one per world; the page is that of flockenv.envs.single.EvadeEnv."""
-
-    task_type = Evade
-
-
-class SchoolVectorEnv(WorldsEnv):
-    """Fish in schools, one learner per world; the page is that of flockenv.envs.single.SchoolEnv."""
-
-    task_type = School
-    fixed: ClassVar[dict[str, Any]] = {"learners": 1}
-
-
-class CrowdNavVectorEnv(WorldsEnv):
-    """Robots, one per world; the page is that of flockenv.envs.single.CrowdNavEnv."""
-
-    task_type = CrowdNav
-
-
-class CorridorVectorEnv(WorldsEnv):
-    """Walkers in corridors, one per world or `learners=` several; the page is that of single.CorridorEnv."""
-
-    task_type = Corridor
-    fixed: ClassVar[dict[str, Any]] = {"learners": 1}
-
-
-class BottleneckVectorEnv(WorldsEnv):
-    """People leaving rooms, one per world, or `learners=` several with `together=True`; see single.BottleneckEnv."""
-
-    task_type = Bottleneck
-    fixed: ClassVar[dict[str, Any]] = {"learners": 1}
+def __getattr__(name: str) -> type[WorldsEnv]:
+    """Build the class of an environment in the table, such as PursuitVectorEnv."""
+    return class_of(WorldsEnv, "VectorEnv", name)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import steering
+from flockenv.players.rules.parameter import parameter
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Bottleneck
 
@@ -24,11 +25,11 @@ separate = rows(steering.separate)
 class BottleneckRules:
     """Textbook: Helbing, Farkas and Vicsek 2000; the contact forces of bodies and walls are the scene's."""
 
-    tau: float = 0.5  # s, relaxation time
-    speed: float = 1.0  # desired speed as a share of the top speed
-    strength: float = 2000.0  # A, N
-    decay: float = 0.08  # B, m
-    walls: float = 2000.0  # A of walls, N
+    tau: float = parameter(0.5, 0.1, 1.5)  # s, relaxation time
+    speed: float = parameter(1.0, 0.2, 1.0)  # desired speed as a share of the top speed
+    strength: float = parameter(2000.0, 0.0, 4000.0)  # A, N
+    decay: float = parameter(0.08, 0.02, 0.5)  # B, m
+    walls: float = parameter(2000.0, 0.0, 4000.0)  # A of walls, N
 
 
 def bottleneck(see: Any, task: Bottleneck, p: BottleneckRules) -> NDArray[np.float64]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from flockenv import steering
 from flockenv.players.rules.clearance import keep_clear
+from flockenv.players.rules.parameter import parameter
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Corridor
 
@@ -25,15 +26,15 @@ _PERSON = 0.25
 class CorridorRules:
     """Textbook: Moussaid et al. 2009, with its bias to the right, and its walls."""
 
-    tau: float = 0.54  # s, relaxation time
-    strength: float = 4.5  # A, m/s^2
-    importance: float = 2.0  # lambda, s/m, of velocities against positions
-    gamma: float = 0.35  # s, range of the force per m/s of closing speed
-    angular: float = 2.0  # n, 1/m, of turning
-    forward: float = 3.0  # n', 1/m, of slowing down
-    bias: float = 0.005  # eps, 1/m, to the right
-    walls: float = 3.0  # a, m/s^2
-    wall_decay: float = 0.1  # b, m
+    tau: float = parameter(0.54, 0.1, 1.5)  # s, relaxation time
+    strength: float = parameter(4.5, 0.0, 20.0)  # A, m/s^2
+    importance: float = parameter(2.0, 0.0, 4.0)  # lambda, s/m, of velocities against positions
+    gamma: float = parameter(0.35, 0.05, 1.5)  # s, range of the force per m/s of closing speed
+    angular: float = parameter(2.0, 0.0, 6.0)  # n, 1/m, of turning
+    forward: float = parameter(3.0, 0.0, 6.0)  # n', 1/m, of slowing down
+    bias: float = parameter(0.005, 0.0, 0.5)  # eps, 1/m, to the right
+    walls: float = parameter(3.0, 0.0, 20.0)  # a, m/s^2
+    wall_decay: float = parameter(0.1, 0.02, 0.5)  # b, m
 
 
 def corridor(see: Any, task: Corridor, p: CorridorRules) -> NDArray[np.float64]:

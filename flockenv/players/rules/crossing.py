@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from flockenv import steering
 from flockenv.players.rules.clearance import keep_clear
+from flockenv.players.rules.parameter import parameter
 from flockenv.steering import arbitration
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Crossing
@@ -27,15 +28,15 @@ unaligned_threat = rows(steering.unaligned_threat)
 class CrossingRules:
     """Textbook: look three seconds ahead, give way with the whole force, arrive with the rest."""
 
-    horizon: float = 3.0  # s, how far ahead a meeting counts
-    margin: float = 0.2  # m, clearance beyond the touching distance
-    evade: float = 5.0  # N, strength of an evasion
-    urgency: float = 0.0  # 0: evade with full strength however far ahead; 1: in proportion to nearness in time
-    radius: float = 1.0  # m, neighbours nearer than this push
-    apart: float = 0.0  # N m, separation
-    gain: float = 2.0  # kg/s towards the goal
-    speed: float = 1.0  # desired speed as a share of the top speed
-    slow_radius: float = 0.8  # m, slow down within this of the goal
+    horizon: float = parameter(3.0, 0.5, 6.0)  # s, how far ahead a meeting counts
+    margin: float = parameter(0.2, 0.0, 0.8)  # m, clearance beyond the touching distance
+    evade: float = parameter(5.0, 0.5, 8.0)  # N, strength of an evasion
+    urgency: float = parameter(0.0, 0.0, 1.0)  # 0: always evade fully; 1: in proportion to nearness in time
+    radius: float = parameter(1.0, 0.6, 2.0)  # m, neighbours nearer than this push
+    apart: float = parameter(0.0, 0.0, 4.0)  # N m, separation
+    gain: float = parameter(2.0, 0.5, 6.0)  # kg/s towards the goal
+    speed: float = parameter(1.0, 0.5, 1.0)  # desired speed as a share of the top speed
+    slow_radius: float = parameter(0.8, 0.1, 2.0)  # m, slow down within this of the goal
 
 
 def crossing(see: Any, task: Crossing, p: CrossingRules) -> NDArray[np.float64]:

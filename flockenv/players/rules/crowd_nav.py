@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from flockenv import steering
 from flockenv.players.rules.clearance import keep_clear
+from flockenv.players.rules.parameter import parameter
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import CrowdNav
 
@@ -24,14 +25,14 @@ sidestep = rows(steering.sidestep)
 class CrowdNavRules:
     """Textbook: Moussaid et al. 2009, the model of the pedestrians themselves."""
 
-    tau: float = 0.54  # s, relaxation time
-    speed: float = 1.0  # desired speed as a share of the top speed
-    strength: float = 4.5  # A, m/s^2
-    importance: float = 2.0  # lambda, s/m, of velocities against positions
-    gamma: float = 0.35  # s, range of the force per m/s of closing speed
-    angular: float = 2.0  # n, 1/m, of turning
-    forward: float = 3.0  # n', 1/m, of slowing down
-    bias: float = 0.005  # eps, 1/m, to the right
+    tau: float = parameter(0.54, 0.15, 1.0)  # s, relaxation time
+    speed: float = parameter(1.0, 0.5, 1.0)  # desired speed as a share of the top speed
+    strength: float = parameter(4.5, 0.5, 20.0)  # A, m/s^2
+    importance: float = parameter(2.0, 0.0, 4.0)  # lambda, s/m, of velocities against positions
+    gamma: float = parameter(0.35, 0.05, 1.5)  # s, range of the force per m/s of closing speed
+    angular: float = parameter(2.0, 0.0, 6.0)  # n, 1/m, of turning
+    forward: float = parameter(3.0, 0.0, 6.0)  # n', 1/m, of slowing down
+    bias: float = parameter(0.005, 0.0, 0.5)  # eps, 1/m, to the right
 
 
 def crowd_nav(see: Any, task: CrowdNav, p: CrowdNavRules) -> NDArray[np.float64]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from flockenv import steering
 from flockenv.geometry import shapes
+from flockenv.players.rules.parameter import parameter
 from flockenv.steering import arbitration
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Evade
@@ -30,18 +31,18 @@ threat = rows(steering.threat)
 class EvadeRules:
     """Textbook: evade pursuers that are near, else hide from the nearest (Reynolds 1999), in order of priority."""
 
-    horizon: float = 1.0  # s, look-ahead for cover on the path
-    avoid: float = 5.0  # kg/s, strength of steering around it
-    wall: float = 0.5  # s, how far ahead walls count
-    alarm: float = 10.0  # m, within which a pursuer is evaded: as far as it sees
-    predict: float = 0.5  # s, how far ahead a pursuer is predicted at most
-    evade: float = 5.0  # kg/s, strength of an evasion
-    crowd: float = 1.0  # how much farther pursuers count beside the nearest; 0: the nearest alone
-    middle: float = 0.2  # N/m towards the middle of the field while evading
-    margin: float = 1.0  # m, behind cover
-    danger: float = 0.0  # m added to the distance of a hiding place per m that a pursuer is nearer to it than 10 m
-    exposed: float = 0.0  # m added to it for each pursuer that sees that place
-    hide: float = 3.0  # kg/s, towards the hiding place
+    horizon: float = parameter(1.0, 0.2, 2.0)  # s, look-ahead for cover on the path
+    avoid: float = parameter(5.0, 0.5, 8.0)  # kg/s, strength of steering around it
+    wall: float = parameter(0.5, 0.1, 1.5)  # s, how far ahead walls count
+    alarm: float = parameter(10.0, 2.0, 15.0)  # m, within which a pursuer is evaded: as far as it sees
+    predict: float = parameter(0.5, 0.0, 2.0)  # s, how far ahead a pursuer is predicted at most
+    evade: float = parameter(5.0, 0.5, 8.0)  # kg/s, strength of an evasion
+    crowd: float = parameter(1.0, 0.0, 2.0)  # how much farther pursuers count beside the nearest; 0: the nearest alone
+    middle: float = parameter(0.2, 0.0, 1.5)  # N/m towards the middle of the field while evading
+    margin: float = parameter(1.0, 0.4, 2.5)  # m, behind cover
+    danger: float = parameter(0.0, 0.0, 3.0)  # m added to a hiding place's distance, per m of a pursuer within 10 m
+    exposed: float = parameter(0.0, 0.0, 10.0)  # m added to it for each pursuer that sees that place
+    hide: float = parameter(3.0, 0.0, 8.0)  # kg/s, towards the hiding place
 
 
 def evade(see: Any, task: Evade, p: EvadeRules) -> NDArray[np.float64]:

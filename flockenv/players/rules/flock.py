@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import steering
+from flockenv.players.rules.parameter import parameter
 from flockenv.steering import arbitration
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Flock
@@ -26,15 +27,15 @@ threat = rows(steering.threat)
 class FlockRules:
     """Textbook: Reynolds' order of 1987, collision avoidance first, then matching velocity, then centring."""
 
-    horizon: float = 2.0  # s, look-ahead for obstacles
-    margin: float = 0.3  # m, clearance from obstacles
-    evade: float = 5.0  # kg/s, strength of an evasion
-    radius: float = 1.5  # m, neighbours nearer than this push
-    apart: float = 2.0  # N m, separation
-    match: float = 1.5  # kg/s, alignment
-    centre: float = 0.3  # N/m, cohesion
-    course: float = 2.0  # kg/s, towards the cruising velocity
-    blend: float = 0.0  # 0: allocate in order; 1: sum up
+    horizon: float = parameter(2.0, 0.5, 4.0)  # s, look-ahead for obstacles
+    margin: float = parameter(0.3, 0.0, 1.0)  # m, clearance from obstacles
+    evade: float = parameter(5.0, 0.5, 8.0)  # kg/s, strength of an evasion
+    radius: float = parameter(1.5, 1.0, 3.0)  # m, neighbours nearer than this push
+    apart: float = parameter(2.0, 0.0, 8.0)  # N m, separation
+    match: float = parameter(1.5, 0.0, 5.0)  # kg/s, alignment
+    centre: float = parameter(0.3, 0.0, 2.0)  # N/m, cohesion
+    course: float = parameter(2.0, 0.2, 6.0)  # kg/s, towards the cruising velocity
+    blend: float = parameter(0.0, 0.0, 1.0)  # 0: allocate in order; 1: sum up
 
 
 def flock(see: Any, task: Flock, p: FlockRules) -> NDArray[np.float64]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import steering
+from flockenv.players.rules.parameter import parameter
 from flockenv.steering import arbitration
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Herd
@@ -26,15 +27,15 @@ threat = rows(steering.threat)
 class HerdRules:
     """Textbook: Strombom et al. 2014; lengths in units of the distance r_a that sheep keep from each other."""
 
-    together: float = 1.0  # times r_a N^(2/3): a sheep farther from the centre is collected
-    collecting: float = 1.0  # r_a, behind the sheep that is collected
-    driving: float = 1.0  # times r_a sqrt(N), behind the centre
-    near: float = 3.0  # r_a, to the nearest sheep: slower within this
-    slow: float = 0.0  # share of the top speed within it
-    gain: float = 5.0  # kg/s, force per m/s of the desired change
-    around: float = 0.0  # kg/s: keep outside a circle about the flock on the path to the place behind it
-    width: float = 1.0  # of that circle, times the distance of the farthest sheep from the centre
-    apart: float = 4.0  # N, away from other dogs, in proportion to nearness within 10 m
+    together: float = parameter(1.0, 0.3, 2.0)  # times r_a N^(2/3): a sheep farther from the centre is collected
+    collecting: float = parameter(1.0, 0.0, 4.0)  # r_a, behind the sheep that is collected
+    driving: float = parameter(1.0, 0.3, 2.5)  # times r_a sqrt(N), behind the centre
+    near: float = parameter(3.0, 0.0, 5.0)  # r_a, to the nearest sheep: slower within this
+    slow: float = parameter(0.0, 0.0, 1.0)  # share of the top speed within it
+    gain: float = parameter(5.0, 1.0, 12.0)  # kg/s, force per m/s of the desired change
+    around: float = parameter(0.0, 0.0, 6.0)  # kg/s, off a circle about the flock, on the path to the place behind it
+    width: float = parameter(1.0, 0.5, 2.0)  # of that circle, times the distance of the farthest sheep from the centre
+    apart: float = parameter(4.0, 0.0, 10.0)  # N, away from other dogs, in proportion to nearness within 10 m
 
 
 def herd(see: Any, task: Herd, p: HerdRules) -> NDArray[np.float64]:

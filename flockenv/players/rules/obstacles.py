@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import steering
+from flockenv.players.rules.parameter import parameter
 from flockenv.steering import arbitration
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Obstacles
@@ -25,14 +26,14 @@ threat = rows(steering.threat)
 class ObstaclesRules:
     """Textbook: look two seconds ahead, evade with the whole force, seek with the rest."""
 
-    horizon: float = 2.0  # s, how far ahead a threat counts at the present speed
-    margin: float = 0.2  # m, clearance beyond the touching distance
-    evade: float = 5.0  # kg/s, strength of an evasion
-    urgency: float = 0.0  # 0: evade with full strength at any distance; 1: in proportion to nearness
-    brake: float = 0.0  # kg/s against the speed, in proportion to nearness
-    gain: float = 2.0  # kg/s towards the goal
-    speed: float = 1.0  # desired speed as a share of the top speed
-    push: float = 0.0  # N m, repulsion from the nearest surfaces (1/gap), a force field for close quarters
+    horizon: float = parameter(2.0, 0.4, 3.0)  # s, how far ahead a threat counts at the present speed
+    margin: float = parameter(0.2, 0.0, 0.6)  # m, clearance beyond the touching distance
+    evade: float = parameter(5.0, 0.5, 8.0)  # kg/s, strength of an evasion
+    urgency: float = parameter(0.0, 0.0, 1.0)  # 0: always evade with full strength; 1: in proportion to nearness
+    brake: float = parameter(0.0, 0.0, 3.0)  # kg/s against the speed, in proportion to nearness
+    gain: float = parameter(2.0, 0.5, 6.0)  # kg/s towards the goal
+    speed: float = parameter(1.0, 0.6, 1.0)  # desired speed as a share of the top speed
+    push: float = parameter(0.0, 0.0, 2.0)  # N m, repulsion from the nearest surfaces, push / gap
 
 
 def obstacles(see: Any, task: Obstacles, p: ObstaclesRules) -> NDArray[np.float64]:

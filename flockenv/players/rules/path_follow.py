@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import steering
+from flockenv.players.rules.parameter import parameter
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import PathFollow
 
@@ -21,15 +22,15 @@ follow_path = rows(steering.follow_path)
 class PathFollowRules:
     """Textbook: half a second ahead, the whole track is the tube, full speed in every bend."""
 
-    time: float = 0.5  # s, how far ahead it predicts itself
-    lead: float = 0.5  # s, look-ahead at the present speed to the point that is sought
-    tube: float = 1.0  # share of the track's width within which there is no correction
-    keep: float = 0.5  # share of the desired speed, below which it speeds up
-    speed: float = 1.0  # desired speed as a share of the top speed
-    grip: float = 100.0  # share of the largest force that a bend may need; a large one = never slows down
-    early: float = 1.0  # share of it that braking before a bend counts on
-    brake: float = 0.0  # kg/s against the excess of speed
-    gain: float = 5.0  # kg/s, force per m/s of the desired change
+    time: float = parameter(0.5, 0.05, 0.8)  # s, how far ahead it predicts itself
+    lead: float = parameter(0.5, 0.1, 0.8)  # s, look-ahead at the present speed to the point that is sought
+    tube: float = parameter(1.0, 0.0, 1.0)  # share of the track's width within which there is no correction
+    keep: float = parameter(0.5, 0.3, 0.99)  # share of the desired speed, below which it speeds up
+    speed: float = parameter(1.0, 0.5, 1.0)  # desired speed as a share of the top speed
+    grip: float = parameter(100.0, 0.3, 2.5)  # share of max_force that a bend may need; a large one: never slow down
+    early: float = parameter(1.0, 0.2, 1.5)  # share of it that braking before a bend counts on
+    brake: float = parameter(0.0, 0.0, 12.0)  # kg/s against the excess of speed
+    gain: float = parameter(5.0, 1.0, 12.0)  # kg/s, force per m/s of the desired change
 
 
 def path_follow(see: Any, task: PathFollow, p: PathFollowRules) -> NDArray[np.float64]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import steering
+from flockenv.players.rules.parameter import parameter
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Pursuit
 
@@ -22,11 +23,11 @@ interception_time = rows(steering.interception_time)
 class PursuitRules:
     """Textbook: exact interception, full force."""
 
-    factor: float = 1.0  # look-ahead as a share of the interception time
-    horizon: float = 10.0  # s, never look further ahead than this
-    margin: float = 0.3  # m, the quarry will not be nearer to a wall than this
-    gain: float = 5.0  # kg/s, force per m/s of the desired change
-    slow_radius: float = 0.01  # m, arrive instead of seek: brake within this distance of the predicted place
+    factor: float = parameter(1.0, 0.0, 1.5)  # look-ahead as a share of the interception time
+    horizon: float = parameter(10.0, 0.2, 6.0)  # s, never look further ahead than this
+    margin: float = parameter(0.3, 0.0, 2.5)  # m, the quarry will not be nearer to a wall than this
+    gain: float = parameter(5.0, 1.0, 12.0)  # kg/s, force per m/s of the desired change
+    slow_radius: float = parameter(0.01, 0.01, 2.0)  # m, brake within this distance of the predicted place (arrive)
 
 
 def pursuit(see: Any, task: Pursuit, p: PursuitRules) -> NDArray[np.float64]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from flockenv import steering
 from flockenv.behaviours.reconciliation import reconcile
+from flockenv.players.rules.parameter import parameter
 from flockenv.steering import arbitration, motivation
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import School
@@ -29,22 +30,22 @@ wander = rows(steering.wander)
 class SchoolRules:
     """Textbook: Tu and Terzopoulos 1994, the levels of the scene's own effect `intention`, the nearest food."""
 
-    escape: float = 0.4  # fear above which it flees
-    school: float = 0.15  # fear above which it joins the others
-    need: float = 0.5  # hunger above which it eats
-    calm: float = 0.1  # hysteresis: how much less fear ends either
-    content: float = 0.3  # hysteresis: how much less hunger ends it
-    wall: float = 0.3  # s, how far ahead walls count
-    apart: float = 1.0  # N m, separation from agents that it nearly touches
-    predict: float = 0.5  # s, how far ahead a hunter is predicted at most
-    evade: float = 5.0  # kg/s, strength of an evasion
-    middle: float = 0.0  # N/m towards the middle of the tank while it flees
-    forage: float = 5.0  # kg/s, towards food
-    rich: float = 0.0  # m of distance that a full patch is worth more than an empty one
-    match: float = 2.0  # kg/s, alignment
-    centre: float = 1.0  # N/m, cohesion
-    pace: float = 0.5  # share of the top speed that it wanders at
-    turn: float = 0.2  # m aside per m ahead, while it wanders
+    escape: float = parameter(0.4, 0.05, 1.0)  # fear above which it flees
+    school: float = parameter(0.15, 0.05, 1.0)  # fear above which it joins the others
+    need: float = parameter(0.5, 0.05, 0.8)  # hunger above which it eats
+    calm: float = parameter(0.1, 0.0, 0.2)  # hysteresis: how much less fear ends either
+    content: float = parameter(0.3, 0.0, 0.6)  # hysteresis: how much less hunger ends it
+    wall: float = parameter(0.3, 0.1, 1.5)  # s, how far ahead walls count
+    apart: float = parameter(1.0, 0.0, 4.0)  # N m, separation from agents that it nearly touches
+    predict: float = parameter(0.5, 0.0, 2.0)  # s, how far ahead a hunter is predicted at most
+    evade: float = parameter(5.0, 1.0, 8.0)  # kg/s, strength of an evasion
+    middle: float = parameter(0.0, 0.0, 1.5)  # N/m towards the middle of the tank while it flees
+    forage: float = parameter(5.0, 1.0, 8.0)  # kg/s, towards food
+    rich: float = parameter(0.0, 0.0, 20.0)  # m of distance that a full patch is worth more than an empty one
+    match: float = parameter(2.0, 0.0, 5.0)  # kg/s, alignment
+    centre: float = parameter(1.0, 0.0, 3.0)  # N/m, cohesion
+    pace: float = parameter(0.5, 0.1, 1.0)  # share of the top speed that it wanders at
+    turn: float = parameter(0.2, 0.0, 1.0)  # m aside per m ahead, while it wanders
 
 
 _WHEN = arbitration.Intentions(when=("avoid", "avoid", "escape", "school", "eat", "wander"))
