@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = (ROOT / "docs/extending.md").read_text(encoding="utf-8")
 NUMBER = r"-?\d+\.?\d*(?:e-?\d+)?"
-TUTORIALS = ("Your own effect", "Your own behaviour", "Your own task", "Your own player")
+TUTORIALS = ("Your own effect", "Your own behaviour", "Your own integrator", "Your own task", "Your own player")
 
 
 def script_of(section: str) -> str:
@@ -55,16 +55,21 @@ def test_agents_settle_on_the_orbit_that_the_page_computes(tmp_path: Path) -> No
 
 
 def test_the_task_of_the_page_is_solved_in_every_world_and_is_an_environment(tmp_path: Path) -> None:
-    rollout, environment = printed(TUTORIALS[2], tmp_path)
+    rollout, environment, vector = printed(TUTORIALS[3], tmp_path)
     success, longest = numbers(rollout)
     assert success == 1
     assert 10 < longest < 150
     assert environment.startswith("Box(-1.0, 1.0, (4,), float32)")
     assert environment.endswith("False)")
+    assert vector == "(3, 4)"
+
+
+def test_the_integrator_has_second_order(tmp_path: Path) -> None:
+    assert numbers(" ".join(printed(TUTORIALS[2], tmp_path))) == pytest.approx([2.0], abs=0.05)
 
 
 def test_the_player_of_the_page_scores_more_than_a_random_player(tmp_path: Path) -> None:
-    scores, comparison = printed(TUTORIALS[3], tmp_path)
+    scores, comparison = printed(TUTORIALS[4], tmp_path)
     mine, chance, success = numbers(scores)
     assert success == 1
     assert mine > 5 > 0 > chance
