@@ -1,4 +1,4 @@
-"""Soft contact: closed forms of springs that only push, of dampers and of friction; symmetries: test_effects.py."""
+"""Contact forces: closed forms of springs that only repel, of dampers and of friction. Symmetries: test_effects.py."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from tests.catalogue import Array
 STIFFNESS, MASS, SPEED = 50.0, 2.0, 1.5
 OMEGA = math.sqrt(STIFFNESS / MASS)
 FLOOR = Block(centre=(0.0, -30.0), size=(200.0, 20.0))
-"""Its top is at y = -20 m; it is in every scene here, which are one kernel."""
+"""The top is at y = -20 m. All scenes here contain it, so that they share one kernel."""
 
 
 def scene(damping: float = 0.0, at: float = 3.4, speed: float = SPEED) -> Scene:
-    """Somebody of radius 0.3 m flies along x from `at`; he touches an obstacle of radius 1 m at x = 3.7 m."""
+    """Return a body of radius 0.3 m that flies along x from `at`; it touches an obstacle of radius 1 m at x = 3.7 m."""
     place = Spawn(low=(at, 0), high=(at, 0), speed=(speed, speed), heading=(1, 0))
     return Scene(
         groups=(Group(count=1, mass=MASS, radius=0.3, spawn=place),),
@@ -48,7 +48,7 @@ def scene(damping: float = 0.0, at: float = 3.4, speed: float = SPEED) -> Scene:
     )
 
 
-def test_a_body_goes_in_as_far_as_its_energy_carries_it_and_comes_out_as_fast() -> None:
+def test_elastic_contact_converts_kinetic_energy_to_depth_and_back() -> None:
     elastic = scene()
     deepest = elastic.run(elastic.start(0), round(1000 * (0.2 + math.pi / 2 / OMEGA)))
     assert deepest.pos[0, 0, 0] == pytest.approx(3.7 + SPEED / OMEGA, abs=1e-5)
@@ -59,8 +59,8 @@ def test_a_body_goes_in_as_far_as_its_energy_carries_it_and_comes_out_as_fast() 
 
 
 @pytest.mark.parametrize("damping", [2.0, 20.0, 100.0])
-def test_damped_it_takes_speed_and_never_pulls(damping: float) -> None:
-    """A plain spring and damper would pull back who leaves: his speed would fall again on the way out."""
+def test_damped_contact_reduces_speed_and_never_attracts(damping: float) -> None:
+    """A plain spring and damper would attract a body that leaves: its speed would fall again."""
     damped, speeds = scene(damping), []
     state = damped.start(0)
     for _ in range(60):
@@ -70,34 +70,34 @@ def test_damped_it_takes_speed_and_never_pulls(damping: float) -> None:
     assert -SPEED < speeds[-1] <= 1e-3
 
 
-def test_at_the_very_centre_there_is_a_way_out() -> None:
+def test_body_at_the_centre_of_an_obstacle_is_pushed_out() -> None:
     inside = scene(at=5.0, speed=0.0)
     state = inside.run(inside.start(0), 100)
     assert np.isfinite(state.pos).all()
     assert abs(state.vel[0, 0, 0]) == pytest.approx(1.3 * OMEGA * math.sin(0.1 * OMEGA), rel=1e-5)
 
 
-def test_nobody_is_pushed_who_does_not_touch() -> None:
+def test_no_contact_force_acts_without_contact() -> None:
     apart = scene(at=3.7 - 1e-9, speed=0.0)
     state = apart.run(apart.start(0), 100)
     np.testing.assert_array_equal(state.vel, 0.0)
 
 
-def test_other_shapes_are_as_solid() -> None:
-    """A block whose side is where the circle's nearest point was: head-on there is no difference."""
+def test_block_repels_like_a_circle_in_a_head_on_contact() -> None:
+    """The side of the block is at the nearest point of the circle."""
     away = {"centre": (5.0, 90.0), "radius": 1.0}
     block = scene().model_copy(update={"obstacles": (away, Block(centre=(5.0, 0.0), size=(2.0, 6.0)))})
     steps = round(1000 * (0.2 + math.pi / 2 / OMEGA))
     assert block.run(block.start(0), steps).pos[0, 0, 0] == pytest.approx(3.7 + SPEED / OMEGA, abs=1e-5)
 
 
-# --- pairs, and a floor: one kernel for all that follows ------------------------------------------------------------
+# --- pairs and a floor: one kernel for all scenes below -------------------------------------------------------------
 
 K, RADIUS = 400.0, 0.3  # N/m, m
 
 
 def bodies(masses: tuple[float, ...] = (2.0, 0.5), dt: float = 2e-4, **law: Any) -> Scene:
-    """Return single bodies over a floor that touch each other, and it, by the same law."""
+    """Return bodies, one per group, over a floor; one contact law acts between bodies and with the floor."""
     groups = tuple(Group(count=1, mass=m, radius=RADIUS, spawn=Spawn(low=(0, 0), high=(1, 1))) for m in masses)
     given = {"stiffness": K} | law
     effects = (Contact(radius=2 * RADIUS, **given), ObstacleContact(**given))
@@ -114,7 +114,7 @@ def energy(of: Scene, state: State) -> float:
 
 
 def forces(of: Scene, state: State) -> Array:
-    """Return what acts on everybody, (N, D) N: what a very short step makes of the velocity."""
+    """Return the forces on all agents, (N, D) in N, from the change of velocity in a very short step."""
     short = of.model_copy(update={"dt": 1e-8})
     after = short.step(dataclasses.replace(state, dt=1e-8))
     return np.asarray((after.vel[0] - state.vel[0]) * 1e8 * of.body.mass[:, None])
@@ -128,10 +128,10 @@ def momentum(of: Scene, state: State) -> Array:
 @pytest.mark.parametrize(
     ("ratio", "released", "kept"), [(0.05, 0.8588, 0.8545), (0.2, 0.5717, 0.5266), (0.5, 0.2984, 0.163)]
 )
-def test_a_damped_hit_gives_back_what_the_formula_says(
+def test_coefficient_of_restitution_of_a_damped_hit_equals_the_formula(
     ratio: float, released: float, kept: float, adhesive: bool
 ) -> None:
-    """To 2 %, whatever the masses; the formula to four digits."""
+    """To 2 % for different masses; the formula itself to four digits."""
     expected = kept if adhesive else released
     assert restitution(ratio, adhesive) == pytest.approx(expected, abs=6e-5)
     for masses in ((2.0, 0.5), (0.3, 0.3)):
@@ -146,7 +146,7 @@ def test_a_damped_hit_gives_back_what_the_formula_says(
     assert end.vel[0, 0, 1] == pytest.approx(expected, rel=0.02)
 
 
-def test_overdamped_and_critical_contacts_have_a_formula_too() -> None:
+def test_restitution_of_critical_and_overdamped_contacts() -> None:
     assert restitution(1.0) == pytest.approx(math.exp(-2), rel=1e-9)
     assert restitution(1.0 + 1e-9) == pytest.approx(restitution(1.0 - 1e-9), rel=1e-5)
     assert restitution(2.0) == pytest.approx(0.0477687325)  # scipy's solve_ivp
@@ -158,8 +158,8 @@ def test_overdamped_and_critical_contacts_have_a_formula_too() -> None:
 @pytest.mark.parametrize("law", [
     {"friction": 300.0}, {"friction": 3000.0, "coulomb": 0.4}, {"friction": 300.0, "ratio": 0.2, "most": 1.0},
 ])  # fmt: skip
-def test_friction_takes_slip_keeps_momentum_and_never_adds_energy(law: dict[str, Any]) -> None:
-    """An oblique hit of two, and one on the floor: with its sign turned round friction drives both (peers.md)."""
+def test_friction_reduces_slip_conserves_momentum_and_never_adds_energy(law: dict[str, Any]) -> None:
+    """An oblique hit of two bodies, and one on the floor; with the wrong sign friction would accelerate both."""
     pair = bodies(**law)
     start = begun(pair, [(0, 0), (0.62, 0.1)], [(1.0, 0.5), (-1.0, -2.0)])
     end = pair.run(start, 2000)
@@ -183,8 +183,8 @@ def test_friction_takes_slip_keeps_momentum_and_never_adds_energy(law: dict[str,
     assert slip < 1.95
 
 
-def test_friction_below_coulomb_s_bound_is_helbing_s_and_above_it_mu_times_the_normal_force() -> None:
-    """On the floor, pressed by k d: kappa d v if that is less than mu k d."""
+def test_friction_is_helbing_s_up_to_coulomb_s_bound() -> None:
+    """On the floor with normal force k d: friction is the smaller of kappa d v and mu k d."""
     depth, slow, fast, mu = 0.01, 0.001, 2.0, 0.4
     floor = bodies(friction=3e4, coulomb=mu)
     for speed, friction in ((slow, 3e4 * depth * slow), (fast, mu * K * depth)):
@@ -193,7 +193,7 @@ def test_friction_below_coulomb_s_bound_is_helbing_s_and_above_it_mu_times_the_n
         np.testing.assert_allclose(force, [-friction, K * depth], rtol=1e-4)
 
 
-def test_two_who_touch_feel_helbing_s_contact() -> None:
+def test_contact_force_of_a_pair_is_helbing_s() -> None:
     """k g n + kappa g dv.t t with dv = v_j - v_i, t = (-n_y, n_x)."""
     pair = bodies(friction=700.0)
     pos, vel = np.array([(0.1, 0.2), (0.45, 0.5)]), np.array([(0.3, -0.8), (-1.1, 0.4)])
@@ -206,8 +206,8 @@ def test_two_who_touch_feel_helbing_s_contact() -> None:
 
 
 @pytest.mark.parametrize("depth", [0.05, 0.2, 0.59, 0.6])
-def test_whoever_begins_inside_another_leaves_no_faster_than_most(depth: float) -> None:
-    """P27. Of a spring that is not at its bound: -u/U - ln(1 - u/U) = w^2 d^2 / (2 U^2)."""
+def test_overlapping_bodies_separate_at_most_at_the_given_speed(depth: float) -> None:
+    """Stress case P27. While the spring is below its bound: -u/U - ln(1 - u/U) = w^2 d^2 / (2 U^2)."""
     most, masses = 1.2, (2.0, 0.5)
     omega = math.sqrt(K * (1 / masses[0] + 1 / masses[1]))
     pair = bodies(masses, most=most)
@@ -230,7 +230,7 @@ def test_whoever_begins_inside_another_leaves_no_faster_than_most(depth: float) 
         assert np.linalg.norm(end.vel[0, 1] - end.vel[0, 0]) == pytest.approx(omega * depth, rel=1e-2)
 
 
-# --- how long a step may be -----------------------------------------------------------------------------------------
+# --- the longest step -----------------------------------------------------------------------------------------------
 
 
 def warned(of: Scene) -> list[str]:
@@ -245,15 +245,15 @@ def warned(of: Scene) -> list[str]:
     (SemiImplicitEuler(), 30), (RK4(), 30), (AdaptiveRK4(), 4), (AveragedVelocity(), 52.5), (ExplicitEuler(), 105.3),
     (ImplicitEuler(), 105.3),
 ])  # fmt: skip
-def test_how_many_steps_a_contact_wants(method: Integrator, steps: float) -> None:
-    """Explicit Euler: (1 + y^2)^(pi / 2y) = 1.05, and .002 to spare."""
+def test_number_of_steps_that_a_contact_needs(method: Integrator, steps: float) -> None:
+    """Explicit Euler: (1 + y^2)^(pi / 2y) = 1.05, with a margin of 0.002."""
     y = contact_limit(method)
     assert math.pi / y == pytest.approx(steps, abs=0.5)
     if method.kind in ("explicit_euler", "implicit_euler"):
         assert (1 + y * y) ** (math.pi / 2 / y) == pytest.approx(1.048, rel=1e-3)
 
 
-def test_a_contact_of_too_few_steps_is_warned_of_and_the_limit_named() -> None:
+def test_contact_of_too_few_steps_raises_a_warning_with_the_limit() -> None:
     omega = math.sqrt(K * (1 / 2.0 + 1 / 0.5))
     most = math.pi / omega / 30
     silent = bodies(dt=0.99 * most)
@@ -261,12 +261,12 @@ def test_a_contact_of_too_few_steps_is_warned_of_and_the_limit_named() -> None:
     with pytest.warns(CoarseContactWarning, match=rf"effects\[0\].contact lasts .* dt is at most {most:.3g} s"):
         coarse = bodies(dt=1.01 * most)
     assert len(warned(coarse)) == 1  # the lighter body's contact with a wall is slower than the pair's
-    assert warned(bodies(dt=1.01 * most, ratio=0.3)) == []  # it is not there to bounce
+    assert warned(bodies(dt=1.01 * most, ratio=0.3)) == []  # a damped contact need not conserve energy
 
 
 @pytest.mark.slow
-def test_nobody_is_looked_at_further_away_than_the_widest_two_touch() -> None:
-    """Whatever radius is given: of 900 bodies, one in ten twice as wide, each meets as few, and forces are the same."""
+def test_neighbour_query_reaches_only_as_far_as_the_widest_two_touch() -> None:
+    """900 bodies, one in ten twice as wide: a larger radius changes neither the number of pairs nor the forces."""
     spawn = {"low": (0.0, 0.0), "high": (30.0, 30.0), "speed": (0.0, 1.0)}
     groups = [{"count": 810, "radius": 0.3, "spawn": spawn}, {"count": 90, "radius": 0.6, "spawn": spawn}]
     found = []
@@ -282,7 +282,7 @@ def test_nobody_is_looked_at_further_away_than_the_widest_two_touch() -> None:
     np.testing.assert_array_equal((found[0][1][0] != 0).any(axis=-1), (gap < 0).any(axis=1))
 
 
-def test_a_radius_at_which_bodies_overlap_already_is_refused() -> None:
+def test_radius_below_the_largest_sum_of_radii_is_refused() -> None:
     with pytest.raises(ValueError, match=r"effects\[0\].radius = 0.5: .* 0.6 m; at least that is allowed") as caught:
         bodies().with_effects(Contact(stiffness=1.0, radius=0.5))
     assert "\n" not in str(caught.value)

@@ -1,4 +1,4 @@
-"""The processor: results do not depend on how many numbers lie side by side, and code is made for what there is."""
+"""Processor: results do not depend on the register width, and machine code is made for the processor's features."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def flock(agents: int, dtype: str, **sight: Any) -> Scene:
 
 
 def heavy(agents: int, *more: Effect) -> Scene:
-    """Everybody pulls everybody, those far away as groups: what a group is must not follow from a register."""
+    """Return a scene of mutual gravitation; far agents act in groups, which must not depend on the register width."""
     return Scene(
         dimension=2, space=Plane(), effects=(Gravitation(constant=1, softening=0.1, opening=0.5), *more), dt=0.01,
         groups=(Group(count=agents, spawn=Spawn(low=(0, 0), high=(30, 30))),),
@@ -69,8 +69,8 @@ def played(task: Task, decisions: int = 12) -> dict[str, Any]:
 CASES: dict[str, Callable[[], dict[str, Any]]] = {
     "few": lambda: stepped(flock(37, "float32", fov=270), 7),
     "many": lambda: stepped(flock(900, "float32", nearest=4), 7),
-    "so many that they move house": lambda: stepped(flock(20_003, "float32"), 3),
-    "groups met as one, and neighbours": lambda: stepped(heavy(3000, Separation(weight=1, radius=0.5)), 2),
+    "many, reordered in memory": lambda: stepped(flock(20_003, "float32"), 3),
+    "far groups and neighbours": lambda: stepped(heavy(3000, Separation(weight=1, radius=0.5)), 2),
     "Flock": lambda: played(Flock(agents=24, dtype="float32")),
     **{
         f"all forms, {d}-D, {t}": lambda d=d, t=t: stepped(everything(d, dtype=t), 7)  # type: ignore[misc]
@@ -85,19 +85,19 @@ CASES: dict[str, Callable[[], dict[str, Any]]] = {
 
 
 def write(case: str, path: str) -> None:
-    """Do what a case is about, in a process of its own, and leave what came of it."""
+    """Run a case and save its results; called in a process of its own."""
     np.savez(path, **CASES[case](), register=cpu.REGISTER)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
-def test_results_are_the_same_in_long_registers_and_in_short_ones(case: str, tmp_path: Path) -> None:
+def test_results_are_equal_in_registers_of_64_and_32_bytes(case: str, tmp_path: Path) -> None:
     found = []
     for size in ("64", "32"):
-        ask = f"from tests.test_cpu import write; write({case!r}, {str(tmp_path / size)!r})"
+        program = f"from tests.test_cpu import write; write({case!r}, {str(tmp_path / size)!r})"
         environment = {**os.environ, "FLOCKENV_REGISTER": size}
         done = subprocess.run(
-            [sys.executable, "-W", "ignore", "-c", ask], env=environment, cwd=ROOT, capture_output=True, text=True
+            [sys.executable, "-W", "ignore", "-c", program], env=environment, cwd=ROOT, capture_output=True, text=True
         )
         assert done.returncode == 0, done.stderr
         with np.load(tmp_path / f"{size}.npz") as arrays:
@@ -108,10 +108,10 @@ def test_results_are_the_same_in_long_registers_and_in_short_ones(case: str, tmp
         np.testing.assert_array_equal(values, narrow[name], err_msg=name)
 
 
-# --- what it is found to be -----------------------------------------------------------------------------------------
+# --- detected features ----------------------------------------------------------------------------------------------
 
 
-def test_another_size_is_refused_by_one_line() -> None:
+def test_register_width_of_16_bytes_is_refused() -> None:
     environment = {**os.environ, "FLOCKENV_REGISTER": "16"}
     done = subprocess.run(
         [sys.executable, "-c", "import flockenv.scene"], env=environment, capture_output=True, text=True
@@ -122,22 +122,22 @@ def test_another_size_is_refused_by_one_line() -> None:
 
 
 @pytest.mark.parametrize(
-    ("told", "found"),
+    ("settings", "found"),
     [({"NUMBA_CPU_NAME": "generic"}, "32 False False"), ({"NUMBA_CPU_FEATURES": "+avx2,-avx512f"}, "32 True False"),
      ({"NUMBA_CPU_FEATURES": "+avx2,+avx512f"}, "64 True True")],
 )  # fmt: skip
-def test_what_numba_is_told_counts(told: dict[str, str], found: str) -> None:
-    ask = "from flockenv.jit.cpu import *; print(REGISTER, *(name in FEATURES for name in ('avx2', 'avx512f')))"
-    environment = {name: value for name, value in os.environ.items() if name != "FLOCKENV_REGISTER"} | told
-    done = subprocess.run([sys.executable, "-c", ask], env=environment, capture_output=True, text=True)
+def test_numba_s_settings_override_detected_features(settings: dict[str, str], found: str) -> None:
+    program = "from flockenv.jit.cpu import *; print(REGISTER, *(name in FEATURES for name in ('avx2', 'avx512f')))"
+    environment = {name: value for name, value in os.environ.items() if name != "FLOCKENV_REGISTER"} | settings
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
     assert done.stdout.strip() == found, done.stderr
 
 
-# --- what LLVM makes ------------------------------------------------------------------------------------------------
+# --- generated code -------------------------------------------------------------------------------------------------
 
 
 def code(part: Callable[..., None], *arguments: Any, apart: bool = True) -> tuple[str, str]:
-    """Return what LLVM is left with, and the machine code, of an entry point that calls a part of a kernel."""
+    """Return the optimised LLVM code and the machine code of an entry point that calls a part of a kernel."""
     inner: Any = kernel(part)
 
     def entry(x: Any, y: Any) -> None:
@@ -154,17 +154,17 @@ def code(part: Callable[..., None], *arguments: Any, apart: bool = True) -> tupl
 
 
 def many_sums() -> Callable[..., None]:
-    """Return a loop with more running sums than there are registers of any kind."""
+    """Return a loop with more running sums than any processor has registers."""
     made: dict[str, Any] = {"np": np}
     sums = "\n".join(f"            y[np.uint64({16 * k}) + l] += x[j] * y[np.uint64(640) + l]" for k in range(40))
     source = f"def run(x, y):\n    for j in range(len(x)):\n        for l in range(np.uint64(16)):\n{sums}"
-    exec(source, made)  # noqa: S102  # forty lines alike
+    exec(source, made)  # noqa: S102  # forty similar lines
     return made["run"]  # type: ignore[no-any-return]
 
 
 @pytest.mark.skipif("avx" not in cpu.FEATURES, reason="registers of 16 bytes always lie within a line")
-def test_the_stack_begins_where_a_register_may_lie() -> None:
-    """Else what is put there for a while lies across two lines, in one process and not in the next."""
+def test_stack_is_aligned_to_the_register_width() -> None:
+    """Otherwise spilled registers may straddle two cache lines, which depends on the process."""
     x, y = np.arange(5, dtype=np.float32), np.ones(656, np.float32)
     left, machine = code(many_sums(), x, y)
     np.testing.assert_array_equal(y, [*[11] * 640, *[1] * 16])
@@ -173,27 +173,29 @@ def test_the_stack_begins_where_a_register_may_lie() -> None:
 
 
 def short_loop(x: Any, y: Any) -> None:
-    """Eight numbers a row, where nobody knows that y is not x."""
+    """Square rows of eight numbers; the compiler cannot know that y and x do not overlap."""
     for k in range(x.shape[0]):
-        for l in range(np.uint64(8)):  # noqa: E741  # as in the files that are generated
+        for l in range(np.uint64(8)):  # noqa: E741  # the name of the lane in kernels
             y[k, l] = x[k, l] * x[k, l]
 
 
-@pytest.mark.skipif(binding.llvm_version_info[0] not in pipeline.LLVMS, reason="LLVM is not told: see pipeline.LLVMS")
-def test_vectors_are_made_of_short_loops(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What LLVM is told for that is told while our functions compile, parts within entry points, and taken back."""
-    told: list[str] = []
-    tell = pipeline.binding.set_option
-    monkeypatch.setattr(pipeline.binding, "set_option", lambda name, option: (told.append(option), tell(name, option)))
+@pytest.mark.skipif(binding.llvm_version_info[0] not in pipeline.LLVMS, reason="option not set: see pipeline.LLVMS")
+def test_short_loops_are_vectorised(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The LLVM option for it is set once while an entry point and its parts compile, and reset afterwards."""
+    options: list[str] = []
+    set_option = pipeline.binding.set_option
+    monkeypatch.setattr(
+        pipeline.binding, "set_option", lambda name, option: (options.append(option), set_option(name, option))
+    )
     x = np.full((5, 8), 3, np.float32)
     y = x.copy()
     left, _ = code(short_loop, x, y, apart=False)
     np.testing.assert_array_equal(y, 9)
     assert re.search(r"fmul [\w ]*<\d+ x float>", left)
-    assert told == [f"--vectorizer-min-trip-count={count}" for count in (4, 16)]
+    assert options == [f"--vectorizer-min-trip-count={count}" for count in (4, 16)]
 
 
-def test_free_ways_are_not_stored_under_a_mask() -> None:
+def test_block_ways_stores_without_a_mask() -> None:
     def shorten(row: Any, table: Any) -> None:
         block_ways(row, 0, 16, table, (np.float32(1.0), np.float32(0.5)), (np.float32(1), np.float32(0)), 0.4, 6.0)
 

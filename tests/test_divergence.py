@@ -1,4 +1,4 @@
-"""Rates, clocks, and what a simulation that diverges says: who, when, why, and what became of the others."""
+"""Divergence: which world, agent, step and effect the error names, and the other worlds; also rates and clocks."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from flockenv.physics.integrators import ExponentialDrag, ImplicitEuler, Integra
 from flockenv.scene import Group, Scene
 
 HERE = Spawn(low=(0, 0), high=(4, 4), speed=(0.2, 1.0))
-MOTION = ("x", "v", "tick")  # what was tried in vain is counted as work all the same
+MOTION = ("x", "v", "tick")  # without `work`, which also counts failed steps
 
 GROUPS = (Group(count=5, mass=0.5, max_force=2.0, spawn=HERE), Group(network=Rope(links=3, length=0.6), mass=0.2))
 
 
 def mixed(method: Integrator | None = None, rate: float = 0.1, stiffness: float = 50.0, **fields: Any) -> Scene:
-    """Five agents and a rope under six effects; every scene here has these laws, whatever its numbers."""
+    """Return five agents and a rope under six effects; all scenes here share these laws, and differ in numbers."""
     effects = (
         Gravity(acceleration=(0.0, -9.81)), Uniform(strength=(1.0, 0.0), period=2.0), Drag(rate=0.1),
         Springs(group=1, stiffness=stiffness), QuadraticDrag(rate=rate), Tether(centre=(0, 0), stiffness=1.0),
@@ -51,7 +51,7 @@ def diverged(call: Any) -> SimulationDiverged:
     return caught.value
 
 
-# --- who is named -----------------------------------------------------------------------------------------------------
+# --- which agent and effect the error names ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -59,27 +59,27 @@ def diverged(call: Any) -> SimulationDiverged:
     [SemiImplicitEuler(), pytest.param(ImplicitEuler(), marks=pytest.mark.slow)],
     ids=lambda method: method.kind,
 )
-def test_the_guilty_effect_is_named(method: Integrator) -> None:
-    """Of six: the one whose force on that agent is the largest, or no number."""
-    for who, far, fast, kind in (
+def test_error_names_the_effect_that_caused_the_divergence(method: Integrator) -> None:
+    """That is the effect whose force on that agent is the largest, or not finite."""
+    for agent, far, fast, kind in (
         (2, 1.0, 1e200, "quadratic_drag"), (6, 1e308, 0.0, "springs"), (3, 1e308, 0.0, "tether"),
     ):  # fmt: skip
         scene = mixed(method, rate=1.0)
         start = scene.start(0, worlds=3)
-        start.vel[1, who, 0] += fast
+        start.vel[1, agent, 0] += fast
         if far > 1:
-            start.pos[1, who] = far
+            start.pos[1, agent] = far
         kept = start.copy()
         error = diverged(lambda scene=scene, start=start: scene.step(start))
         assert (error.world, error.step, error.time, error.dt) == (1, 1, 0.01, 0.01)
         assert error.effect == kind, str(error)
         assert error.method == method.kind
-        assert error.agent in ((who,) if who < 5 else (5, 6, 7))  # whoever of those tied comes first
+        assert error.agent in ((agent,) if agent < 5 else (5, 6, 7))  # neighbours in the rope diverge in the same step
         same(start, kept)
 
 
-def test_the_step_is_found_within_a_call() -> None:
-    """Quadratic drag with too long a step: the agent, the step since the start, its time; the others go on."""
+def test_error_names_the_first_step_of_a_call_that_diverges() -> None:
+    """The step is too long for quadratic drag in one world; the other worlds make all their steps."""
     scene = mixed(rate=3.0)
     start = scene.run(scene.start(0, worlds=3), 7)
     start.vel[2, 4] = 300.0, 0.0
@@ -99,7 +99,7 @@ def test_the_step_is_found_within_a_call() -> None:
         same(error.state.worlds([b]), scene.run(start.worlds([b]), 40))
 
 
-def test_results_are_written_where_they_were_asked_for() -> None:
+def test_out_holds_the_results_of_a_call_that_diverges() -> None:
     scene = mixed(rate=3.0)
     start = scene.start(0, worlds=3)
     start.vel[0, 1] = 300.0, 0.0
@@ -114,7 +114,7 @@ def test_results_are_written_where_they_were_asked_for() -> None:
     same(start, out)
 
 
-def test_threads_tell_the_same() -> None:
+def test_error_does_not_depend_on_the_number_of_threads() -> None:
     scene = mixed(rate=3.0)
     start = scene.start(0, worlds=12)
     start.vel[7, 1] = 300.0, 0.0
@@ -130,12 +130,12 @@ def test_threads_tell_the_same() -> None:
     same(one.state, two.state)
 
 
-def test_it_can_be_sent_and_read() -> None:
+def test_error_can_be_pickled_and_its_message_has_all_attributes() -> None:
     scene = mixed(rate=3.0)
     start = scene.start(0)
     start.vel[0, 1] = 300.0, 0.0
     error = diverged(lambda: scene.step(start, steps=20))
-    again = pickle.loads(pickle.dumps(error))  # our own
+    again = pickle.loads(pickle.dumps(error))
     assert type(again) is SimulationDiverged
     assert str(again) == str(error)
     assert (again.world, again.agent, again.step, again.effect) == (0, 1, error.step, "quadratic_drag")
@@ -148,8 +148,8 @@ def test_it_can_be_sent_and_read() -> None:
     )
 
 
-def test_a_step_beyond_the_limit_ends_in_a_report_and_not_in_a_warning() -> None:
-    """Whom it blames is asked of scenes made for that: they are not warned of, or refused, in its place."""
+def test_unstable_springs_are_named_when_they_diverge() -> None:
+    """The warning about an unstable step is silenced, so the run goes on until it diverges."""
     scene = mixed(stiffness=4e3, rate=0.0, dt=0.012)
     start = scene.start(0)
     start.pos[0, 6, 0] += 0.05
@@ -158,7 +158,7 @@ def test_a_step_beyond_the_limit_ends_in_a_report_and_not_in_a_warning() -> None
     assert error.agent >= 5
 
 
-def test_what_a_drive_did_is_no_effect_s_doing() -> None:
+def test_no_effect_is_named_in_a_scene_without_effects() -> None:
     group = Group(count=2, spawn=HERE)
     scene = Scene(groups=(group,), effects=(), dt=0.5)
     start = scene.start(0)
@@ -170,10 +170,10 @@ def test_what_a_drive_did_is_no_effect_s_doing() -> None:
 # --- accelerations and rates ------------------------------------------------------------------------------------------
 
 
-def test_accelerations_are_the_sum_of_the_laws() -> None:
-    """By hand, for agents that are tied to nobody; a drive is bounded, drag is in it under every method."""
+def test_accelerations_are_the_sum_of_the_laws_and_the_bounded_drive() -> None:
+    """Calculated by hand for the agents outside the rope. Drag is included under every method."""
     drive = np.zeros((2, 9, 2))
-    drive[0, 1] = 30.0, 40.0  # 50 N of at most 2
+    drive[0, 1] = 30.0, 40.0  # 50 N, more than max_force = 2 N
     drive[1, 2] = 0.3, -0.4
     for method in (SemiImplicitEuler(), ExponentialDrag(), ImplicitEuler()):
         scene = mixed(method)
@@ -187,15 +187,15 @@ def test_accelerations_are_the_sum_of_the_laws() -> None:
         force = force + np.array(
             [[[1.0, 0.0]], [[1.0, 0.0]]]
         ) * np.cos(np.pi * np.array([0.3, 0.7]))[:, None, None]  # fmt: skip
-        asked = drive[:, :5].copy()
-        asked[0, 1] *= 2.0 / 50
-        np.testing.assert_allclose(found[:, :5], (force + asked) / mass + (0.0, -9.81), rtol=1e-12, atol=1e-12)
+        bounded = drive[:, :5].copy()
+        bounded[0, 1] *= 2.0 / 50
+        np.testing.assert_allclose(found[:, :5], (force + bounded) / mass + (0.0, -9.81), rtol=1e-12, atol=1e-12)
         same(state, kept, MOTION)
         assert state.counted("evaluations") > 0
         np.testing.assert_array_equal(scene.acceleration(state), scene.rates(state, times=state.time)[0])
 
 
-def test_bad_rates_are_refused() -> None:
+def test_invalid_arguments_of_rates_are_refused() -> None:
     scene = mixed()
     state = scene.start(0, worlds=2)
     with pytest.raises(ValueError, match="drive has shape"):
@@ -209,7 +209,7 @@ def test_bad_rates_are_refused() -> None:
 
 
 @pytest.mark.slow
-def test_a_medium_that_carries_is_in_the_rates() -> None:
+def test_rates_include_the_velocity_of_a_medium_that_carries_agents() -> None:
     effects = Vortex(strength=2.0, centre=(1.0, 1.0), maximum=3.0, acts="medium"), Wind(velocity=(1.0, 0.0)), Carried()
     scene = Scene(groups=(Group(count=3, spawn=HERE),), effects=effects, dt=0.01)
     state = scene.start(0, worlds=2)
@@ -226,7 +226,7 @@ def test_a_medium_that_carries_is_in_the_rates() -> None:
 # --- clocks -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_clock_is_changed_where_it_can_be() -> None:
+def test_with_dt_keeps_the_time_if_it_is_a_multiple_of_the_new_dt() -> None:
     coarse = mixed(dt=0.02)
     state = coarse.run(coarse.start(0, worlds=2), 6)
     for dt, ticks in ((0.02, 6), (0.01, 12), (0.04, 3), (0.03, 4), (0.12, 1)):
@@ -247,7 +247,7 @@ def test_a_clock_is_changed_where_it_can_be() -> None:
 
 
 @pytest.mark.parametrize("dt", [0.0, -0.02, np.nan, np.inf])
-def test_a_clock_that_leads_nowhere_is_refused(dt: float) -> None:
+def test_with_dt_refuses_steps_that_are_not_positive_and_finite(dt: float) -> None:
     state = mixed().start(0)
     with pytest.raises(ValueError, match="dt is"):
         state.with_dt(dt)

@@ -1,4 +1,4 @@
-"""What acts on a body: laws that hold for every effect of the catalogue, in 2-D and 3-D, and closed forms."""
+"""Effects: symmetries and limits that every effect of the catalogue obeys, in 2-D and 3-D, and closed forms."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from tests.catalogue import (
 )
 
 EVERY_ROW = pytest.mark.parametrize("row", EFFECTS, ids=lambda row: row.name)
-"""For tests that compile nothing."""
+"""All rows, for tests that compile nothing."""
 
 
 ELSEWHERE = {
@@ -53,11 +53,11 @@ ELSEWHERE = {
         "fields", "tether", "attraction", "motivation", "aims", "floor_field", "waypoints", "exit_choice", "vicsek",
     )
 }  # fmt: skip
-"""Effects whose quick tests lie in files of their own: test_fields.py, test_inner.py, test_floor_fields.py, ..."""
+"""Modules of effects whose quick tests are in separate files: test_fields.py, test_inner.py, ..."""
 
 
 def among(rows: Iterable[EffectRow]) -> pytest.MarkDecorator:
-    """Those rows; most behaviours and fields where slow tests run: quick tests of theirs are in files of their own."""
+    """Parametrize over rows; most behaviours and fields are marked slow, as separate files hold their quick tests."""
     given = [pytest.param(row, marks=pytest.mark.slow) if _slow(row) else row for row in rows]
     return pytest.mark.parametrize("row", given, ids=lambda row: row.name)
 
@@ -72,18 +72,18 @@ ROWS = among(EFFECTS)
 
 
 def obeying(symmetry: str) -> pytest.MarkDecorator:
-    """The rows that declare a symmetry."""
+    """Parametrize over the rows that declare a symmetry."""
     return among(row for row in EFFECTS if symmetry in row.obeys)
 
 
 DIMENSIONS = pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
-"""Each effect is a kernel in each dimension; laws are written once for both, and quick tests try the plane."""
+"""Each effect is compiled once per dimension from the same laws, so quick tests run only the plane."""
 
 STEPS = 12
 
 
 def moved(state: State, matrix: Array, shift: Array) -> State:
-    """The same state turned about the middle of the agents' region and shifted; obstacles too."""
+    """Return the state, obstacles included, rotated about the middle of the agents' region and shifted."""
     new, middle = state.copy(), EDGE / 2
     for points in (new.pos, new.obstacles.centre):
         points[...] = (points - middle) @ matrix.T + middle + shift
@@ -92,15 +92,15 @@ def moved(state: State, matrix: Array, shift: Array) -> State:
 
 
 def assert_moves_alike(scene: Scene, matrix: Array, shift: Array) -> None:
-    """Turned and shifted, the scene ends where the turned and shifted end is; directions and places turn with it.
+    """Assert that a transformed scene ends in the transformed end state; matrix and shift also apply to the effects.
 
-    In single precision to 40 roundings of the largest coordinate: a few in each of the steps, the first when agents are
-    turned. Five times what was measured.
+    Tolerance in single precision: 40 roundings of the largest coordinate, five times the measured error. Each step
+    rounds a few times, and so does the transformation of the start.
     """
     start = scene.start(3, worlds=2)
     end = scene.run(start, STEPS)
     assert not np.allclose(end.vel, start.vel)
-    idle = [effect == effect.idle() for effect in scene.effects]  # a region of theirs may be none when it is turned
+    idle = [effect == effect.idle() for effect in scene.effects]  # their regions may be invalid after a rotation
     other = scene.with_effects(
         *(effect if rests else turned(effect, matrix, shift) for effect, rests in zip(scene.effects, idle, strict=True))
     )
@@ -112,7 +112,7 @@ def assert_moves_alike(scene: Scene, matrix: Array, shift: Array) -> None:
 
 
 def relabelled(scene: Scene, start: State) -> tuple[State, list[int]]:
-    """The same agents in another order within their groups, and that order."""
+    """Return the state with the agents of each group shuffled, and the order."""
     rng, order, first = np.random.default_rng(0), [], 0
     for group in scene.groups:
         order += list(first + rng.permutation(group.count))
@@ -127,33 +127,33 @@ def relabelled(scene: Scene, start: State) -> tuple[State, list[int]]:
 
 @DIMENSIONS
 @obeying("rotation")
-def test_it_turns_with_the_world(row: EffectRow, dimension: int) -> None:
+def test_effect_is_equivariant_under_rotation(row: EffectRow, dimension: int) -> None:
     assert_moves_alike(scene_under(row, dimension), rotation(dimension, 7), np.zeros(dimension))
 
 
 @DIMENSIONS
 @obeying("mirror")
-def test_its_mirror_image_does_the_mirrored_thing(row: EffectRow, dimension: int) -> None:
+def test_effect_is_equivariant_under_reflection(row: EffectRow, dimension: int) -> None:
     assert_moves_alike(scene_under(row, dimension), mirror(dimension), np.zeros(dimension))
 
 
 @DIMENSIONS
 @obeying("translation")
-def test_it_does_not_know_where_it_is(row: EffectRow, dimension: int) -> None:
+def test_effect_is_equivariant_under_translation(row: EffectRow, dimension: int) -> None:
     assert_moves_alike(scene_under(row, dimension), np.eye(dimension), np.arange(1, dimension + 1) * 37.25)
 
 
 @DIMENSIONS
-def test_a_torus_has_no_origin(dimension: int) -> None:
-    """All effects at once; the shift carries agents and obstacles across every edge."""
+def test_all_effects_are_equivariant_under_translation_on_a_torus(dimension: int) -> None:
+    """The shift moves agents and obstacles across every edge."""
     shift = np.random.default_rng(2).uniform(5, 50, dimension)
     assert_moves_alike(everything(dimension), np.eye(dimension), shift)
 
 
 @DIMENSIONS
 @obeying("relabelling")
-def test_the_order_of_the_agents_does_not_matter(row: EffectRow, dimension: int) -> None:
-    """Agents are relabelled within their groups: a body that is looked up in another agent's place shows."""
+def test_effect_does_not_depend_on_the_order_of_agents(row: EffectRow, dimension: int) -> None:
+    """Detects a body that is read with the index of another agent."""
     scene = scene_under(row, dimension)
     start = scene.start(3)
     other, order = relabelled(scene, start)
@@ -164,7 +164,7 @@ def test_the_order_of_the_agents_does_not_matter(row: EffectRow, dimension: int)
 
 @DIMENSIONS
 @ROWS
-def test_a_world_of_a_batch_is_that_world_alone(row: EffectRow, dimension: int) -> None:
+def test_world_of_a_batch_equals_the_same_world_alone(row: EffectRow, dimension: int) -> None:
     scene = scene_under(row, dimension)
     batch = scene.run(scene.start(20, worlds=5), 30)
     for k in range(5):
@@ -176,9 +176,9 @@ def test_a_world_of_a_batch_is_that_world_alone(row: EffectRow, dimension: int) 
 
 @DIMENSIONS
 @ROWS
-def test_it_conserves_momentum_if_it_says_so(row: EffectRow, dimension: int) -> None:
+def test_momentum_is_conserved_exactly_by_effects_that_declare_it(row: EffectRow, dimension: int) -> None:
     scene = scene_under(row, dimension)
-    start = scene.start(3, worlds=8)  # in some of them everybody who could be in the way is
+    start = scene.start(3, worlds=8)  # in some of them agents are in the way of others
     end = scene.run(start, 50)
     mass = scene.body.mass[None, :, None]
     gained = np.abs(((end.vel - start.vel) * mass).sum(axis=1)).max()
@@ -187,7 +187,7 @@ def test_it_conserves_momentum_if_it_says_so(row: EffectRow, dimension: int) -> 
 
 @DIMENSIONS
 @ROWS
-def test_somebody_out_of_reach_changes_nothing(row: EffectRow, dimension: int) -> None:
+def test_agent_out_of_reach_changes_nothing(row: EffectRow, dimension: int) -> None:
     scene = scene_under(row, dimension)
     start = scene.start(3)
     last = scene.groups[-1]
@@ -195,14 +195,13 @@ def test_somebody_out_of_reach_changes_nothing(row: EffectRow, dimension: int) -
     other = more.start(3)
     other.pos[0, -1] = 1000.0
     end, found = scene.run(start, 20), more.run(other, 20)
-    assert np.array_equal(end.pos, found.pos[:, :-1]) == (row.effect.far_law is None)  # nobody is out of its reach
+    assert np.array_equal(end.pos, found.pos[:, :-1]) == (row.effect.far_law is None)  # a far law has unlimited reach
     np.testing.assert_allclose(end.pos, found.pos[:, :-1], atol=1e-5)
 
 
 @DIMENSIONS
 @ROWS
-def test_the_dead_are_not_there(row: EffectRow, dimension: int) -> None:
-    """They push nobody, nothing pushes them, and they stay where they are."""
+def test_dead_agents_exert_no_force_and_stay_in_place(row: EffectRow, dimension: int) -> None:
     scene = scene_under(row, dimension)
     start = scene.start(3)
     start.alive[:, 18:] = False
@@ -220,9 +219,10 @@ def test_the_dead_are_not_there(row: EffectRow, dimension: int) -> None:
 
 
 def singly(rows: Iterable[EffectRow], changes: tuple[str, ...] = ("",)) -> pytest.MarkDecorator:
-    """Rows, dimensions and what they obey, in single precision; in space, and quickly, those alone that share a kernel.
+    """Parametrize over rows, dimensions and declared symmetries for single precision.
 
-    What float32 can break is a constant that makes it float64, or a threshold: no other in space than in the plane.
+    Only rows that share a kernel run in 3-D or without the slow mark. float32 can break by a constant that promotes to
+    float64 or by a threshold; both are the same in 2-D and 3-D.
     """
     given = [
         pytest.param(row, d, *filter(None, [change]), marks=() if d == 2 and row.effect.kind in AMONG_ALL else SLOW)
@@ -239,21 +239,21 @@ KINDS = singly(FIRST)
 
 
 def single(row: EffectRow, dimension: int) -> Scene:
-    """One effect in float32, the others idle: one kernel for all of them, but for those that are never among others."""
+    """Return a float32 scene of one effect; the others are idle, so that most rows share one kernel."""
     if row.effect.kind not in AMONG_ALL:
         return scene_of(*row.company(dimension), dimension=dimension, dtype="float32")
     return everything(dimension, *row.at(dimension), space=Plane(), dtype="float32")
 
 
 @singly(FIRST, ("rotation", "mirror", "translation"))
-def test_in_single_precision_it_obeys_the_same_symmetries(row: EffectRow, dimension: int, change: str) -> None:
+def test_effect_obeys_its_symmetries_in_single_precision(row: EffectRow, dimension: int, change: str) -> None:
     matrix = {"rotation": rotation(dimension, 7), "mirror": mirror(dimension)}.get(change, np.eye(dimension))
     shift = np.arange(1, dimension + 1) * (37.25 if change == "translation" else 0.0)
     assert_moves_alike(single(row, dimension), matrix, shift)
 
 
 @singly(row for row in FIRST if "relabelling" in row.obeys)
-def test_in_single_precision_too_the_order_of_the_agents_does_not_matter(row: EffectRow, dimension: int) -> None:
+def test_effect_does_not_depend_on_the_order_of_agents_in_single_precision(row: EffectRow, dimension: int) -> None:
     scene = single(row, dimension)
     start = scene.start(3)
     other, order = relabelled(scene, start)
@@ -264,8 +264,8 @@ def test_in_single_precision_too_the_order_of_the_agents_does_not_matter(row: Ef
 
 
 @KINDS
-def test_in_single_precision_it_conserves_momentum_if_it_says_so(row: EffectRow, dimension: int) -> None:
-    """To the rounding of the momenta that were exchanged: 50 steps, each with a rounding of every velocity."""
+def test_momentum_is_conserved_in_single_precision_by_effects_that_declare_it(row: EffectRow, dimension: int) -> None:
+    """Tolerance: in each of 50 steps every velocity is rounded once."""
     scene = single(row, dimension)
     start = scene.start(3)
     end = scene.run(start, 50)
@@ -281,8 +281,8 @@ def test_in_single_precision_it_conserves_momentum_if_it_says_so(row: EffectRow,
 @DIMENSIONS
 @ROWS
 @pytest.mark.parametrize("count", [1, 50])
-def test_it_is_finite_where_everybody_is_in_one_place_at_rest(row: EffectRow, dimension: int, count: int) -> None:
-    """In an obstacle's very centre, if there are obstacles: nothing has a direction there."""
+def test_effect_is_finite_if_all_agents_rest_in_one_place(row: EffectRow, dimension: int, count: int) -> None:
+    """If the scene has obstacles, that place is the centre of one, where no direction is defined."""
     spawn = Spawn(low=(0,) * dimension, high=(1,) * dimension)
     group = Group(count=count, desired_speed=1.2, spawn=spawn)
     groups = (group, group) if row.family == "urges" else (group,)  # fish, and food or hunters
@@ -298,8 +298,8 @@ def test_it_is_finite_where_everybody_is_in_one_place_at_rest(row: EffectRow, di
 
 
 @DIMENSIONS
-def test_whoever_is_in_one_place_separates_in_different_directions(dimension: int) -> None:
-    """P28: finite, momentum unchanged, apart after 1 s, and not all to the same side."""
+def test_separation_from_one_place_has_distinct_directions(dimension: int) -> None:
+    """Stress case P28. Momentum is conserved, and agents are apart after 1 s."""
     scene = scene_of(Separation(weight=1, radius=2), dimension=dimension, groups=(
         Group(count=50, max_speed=3, spawn=Spawn(low=(0,) * dimension, high=(1,) * dimension)),))  # fmt: skip
     state = scene.start(0)
@@ -315,8 +315,8 @@ def test_whoever_is_in_one_place_separates_in_different_directions(dimension: in
 
 @DIMENSIONS
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_two_in_one_place_part_in_opposite_directions_every_pair_in_its_own(dimension: int, dtype: str) -> None:
-    """30 pairs far from each other: momentum is kept to the last bit, and no direction is preferred."""
+def test_pairs_in_one_place_separate_in_opposite_directions_unique_to_each_pair(dimension: int, dtype: str) -> None:
+    """30 pairs far apart: momentum is conserved bit for bit, and no direction is preferred."""
     given = {
         "dimension": dimension,
         "groups": (Group(count=60, desired_speed=1.2, spawn=Spawn(low=(0,) * dimension, high=(1,) * dimension)),),
@@ -363,8 +363,8 @@ class Well(Effect):
 
 
 @pytest.mark.slow
-def test_where_nobody_lives_a_law_may_be_infinite(tmp_path: Path) -> None:
-    """Lanes beyond the last agent lie in the origin, and so does somebody dead: neither is anybody's NaN."""
+def test_law_may_be_infinite_at_dead_agents_and_unused_lanes(tmp_path: Path) -> None:
+    """Unused lanes and a dead agent are at the origin, where the law divides by zero; no NaN spreads."""
     with users_module(tmp_path, WELL, "wells") as laws:
         groups = (Group(count=5, spawn=Spawn(low=(1, 1), high=(2, 2))),)
         scene = scene_of(laws.Well(), groups=groups)
@@ -430,8 +430,8 @@ def push(me: Any, other: Any) -> Vec:
 
 
 @pytest.mark.slow
-def test_a_pair_law_may_read_bodies_in_another_module_of_the_user_s(tmp_path: Path) -> None:
-    """What a law reads is what is sorted of each agent: it is found through every function that the law calls."""
+def test_pair_law_may_call_a_function_of_another_user_module_that_reads_bodies(tmp_path: Path) -> None:
+    """Only the attributes that a law reads are sorted; they are collected from every function that the law calls."""
     with users_module(tmp_path, SOFT, "soft"), users_module(tmp_path, REPULSION, "repulsions") as laws:
         scene = scene_of(laws.Repulsion(weight=0.5))
         start = scene.start(3)
@@ -443,15 +443,15 @@ def test_a_pair_law_may_read_bodies_in_another_module_of_the_user_s(tmp_path: Pa
         np.testing.assert_allclose(found, 0.5 * terms.sum(axis=1), atol=1e-9)
 
 
-# --- nothing is computed that nobody asks for -------------------------------------------------------------------------
+# --- nothing is computed that no effect needs -------------------------------------------------------------------------
 
 
 @DIMENSIONS
 @ROWS
-def test_an_idle_effect_is_an_absent_one(row: EffectRow, dimension: int) -> None:
+def test_idle_effect_changes_nothing(row: EffectRow, dimension: int) -> None:
     absent = () if row.family else row.at(dimension)[1:]
     idle, absent = (scene_of(*some, dimension=dimension) for some in (row.company(dimension, idle=True), absent))
-    start = idle.start(3)  # clear of the obstacles, if there are some; what it keeps inside only its own state holds
+    start = idle.start(3)  # clear of obstacles; a start with inner state fits only its own scene
     ends = [scene.run(scene.start(3) if row.effect.keeps else start, 20) for scene in (idle, absent)]
     np.testing.assert_array_equal(ends[0].x, ends[1].x)
     np.testing.assert_array_equal(ends[0].v, ends[1].v)
@@ -459,17 +459,17 @@ def test_an_idle_effect_is_an_absent_one(row: EffectRow, dimension: int) -> None
 
 @DIMENSIONS
 @ROWS
-def test_it_calls_for_what_it_says_and_for_nothing_else(row: EffectRow, dimension: int) -> None:
+def test_effect_computes_only_what_it_declares(row: EffectRow, dimension: int) -> None:
     scene = scene_under(row, dimension)
     end = scene.run(scene.start(3, worlds=2), 10)
-    agents, asks = scene.agents, {what for effect in scene.effects for what in effect.calls_for()}
+    agents, needs = scene.agents, {what for effect in scene.effects for what in effect.calls_for()}
     assert end.counted("evaluations") == 2 * 10
-    assert end.counted("neighbour_queries") == (2 * 10 if "neighbour query" in asks else 0)
-    assert end.counted("pairs") == (2 * 10 * agents * agents if {"neighbour query", "all others"} & {*asks} else 0)
-    assert end.counted("obstacle_tests") == (2 * 10 * agents * 2 if "obstacles" in asks else 0)
+    assert end.counted("neighbour_queries") == (2 * 10 if "neighbour query" in needs else 0)
+    assert end.counted("pairs") == (2 * 10 * agents * agents if {"neighbour query", "all others"} & {*needs} else 0)
+    assert end.counted("obstacle_tests") == (2 * 10 * agents * 2 if "obstacles" in needs else 0)
 
 
-def test_a_scene_without_effects_computes_nothing() -> None:
+def test_scene_without_effects_computes_nothing() -> None:
     scene = scene_of(obstacles=({"centre": (1, 1), "radius": 0.5},))
     end = scene.run(scene.start(3, worlds=2), 10)
     assert [end.counted(what) for what in ("neighbour_queries", "pairs", "obstacle_tests")] == [0, 0, 0]
@@ -487,19 +487,19 @@ def test_several_pair_effects_share_one_query() -> None:
 
 
 def names_of_effects() -> dict[str, Any]:
-    """What a printed effect or scene is read with: effects, behaviours, arbitrations."""
+    """Return the names that the repr of an effect or scene uses: effects, behaviours, arbitrations."""
     kinds = (*effects_module.EFFECTS.values(), *ARBITRATIONS.values())
     return {kind.__name__: kind for kind in kinds} | {"Circle": Circle, "Target": Target, "Stage": Stage, "Door": Door}
 
 
 @EVERY_ROW
-def test_it_prints_as_its_own_constructor(row: EffectRow) -> None:
-    assert eval(repr(row.effect), names_of_effects()) == row.effect  # noqa: S307  # that is what is promised
+def test_repr_of_an_effect_is_its_constructor(row: EffectRow) -> None:
+    assert eval(repr(row.effect), names_of_effects()) == row.effect  # noqa: S307  # as documented
     assert str(row.effect) == repr(row.effect)
 
 
 @EVERY_ROW
-def test_it_is_a_value(row: EffectRow) -> None:
+def test_effect_is_a_value(row: EffectRow) -> None:
     again = pickle.loads(pickle.dumps(row.effect))
     assert again == row.effect == copy.deepcopy(row.effect)
     assert hash(again) == hash(row.effect)
@@ -513,7 +513,7 @@ def test_it_is_a_value(row: EffectRow) -> None:
 
 @DIMENSIONS
 @ROWS
-def test_a_scene_under_it_is_a_value(row: EffectRow, dimension: int) -> None:
+def test_scene_with_the_effect_is_a_value(row: EffectRow, dimension: int) -> None:
     scene = scene_under(row, dimension)
     end = scene.run(scene.start(3), 5)
     again = pickle.loads(pickle.dumps(scene))
@@ -525,13 +525,13 @@ def test_a_scene_under_it_is_a_value(row: EffectRow, dimension: int) -> None:
     np.testing.assert_array_equal(again.run(again.start(3), 5).x, end.x)
 
 
-def test_bad_parameters_are_refused_in_one_line() -> None:
+def test_invalid_parameters_raise_one_line_messages() -> None:
     for row in EFFECTS:
         good = row.effect.model_dump()
         for name, field in type(row.effect).model_fields.items():
             if name == "kind":
                 continue
-            # of what may be left out none is a value: all of the nearest few, a field that is steady
+            # None is valid for optional fields: all neighbours, a steady field
             some = (None,) if field.default is not None else (0, 33, 2.5, True) if name == "nearest" else ()
             negative = () if name in row.signed else (-1.0,)
             for value in (*negative, float("nan"), float("inf"), "much", *some):
@@ -556,8 +556,8 @@ json.dump(found, sys.stdout)
 """
 
 
-@pytest.mark.slow  # the first process compiles all forms of laws
-def test_a_second_process_compiles_nothing_and_finds_the_same() -> None:
+@pytest.mark.slow  # the first process compiles all effects
+def test_second_process_compiles_nothing_and_gets_equal_results() -> None:
     here = {}
     for row in EFFECTS:
         for dimension in row.dimensions:
@@ -578,8 +578,8 @@ def test_a_second_process_compiles_nothing_and_finds_the_same() -> None:
 # --- closed forms and limits ------------------------------------------------------------------------------------------
 
 
-def test_drag_slows_down_exponentially() -> None:
-    """v = v0 exp(-c t / m), x = x0 + v0 (1 - exp(-c t / m)) m / c, for each body's own mass."""
+def test_velocity_decays_exponentially_under_drag() -> None:
+    """v = v0 exp(-c t / m), x = x0 + v0 (1 - exp(-c t / m)) m / c, with the mass m of each body."""
     scene = scene_of(Drag(rate=0.4), integrator=RK4(), dt=0.02)
     start = scene.start(1)
     end = scene.run(start, 150)
@@ -589,8 +589,8 @@ def test_drag_slows_down_exponentially() -> None:
 
 
 @DIMENSIONS
-def test_the_speed_limit_holds_along_the_diagonal(dimension: int) -> None:
-    """A clip per axis would let sqrt(D) times the limit through."""
+def test_speed_limit_holds_along_the_diagonal(dimension: int) -> None:
+    """A limit on each axis would allow sqrt(D) times the speed."""
     spawn = Spawn(low=(0,) * dimension, high=(1,) * dimension)
     scene = scene_of(dimension=dimension, groups=(Group(count=3, max_speed=2, spawn=spawn),))
     end = scene.step(scene.start(0), drive=np.full((1, 3, dimension), 50.0), steps=100)
@@ -603,17 +603,17 @@ def forces(scene: Scene, state: State, drive: Array) -> Array:
 
 
 @DIMENSIONS
-def test_max_force_bounds_what_agents_ask_for_and_not_what_acts_on_them(dimension: int) -> None:
+def test_max_force_bounds_steering_and_drive_but_not_external_forces(dimension: int) -> None:
     spawn = Spawn(low=(0,) * dimension, high=(0.5,) * dimension, speed=(1, 2))
     groups = (Group(count=9, mass=2, max_force=3, spawn=spawn),)
     drive = np.zeros((1, 9, dimension))
     drive[0, :, 0] = 100.0
     steered = scene_of(Separation(weight=1.3, radius=2.5), dimension=dimension, groups=groups)
     state = steered.start(1)
-    wanted, weak = forces(steered, state, drive), forces(steered, state, drive * 0)
-    np.testing.assert_allclose(np.linalg.norm(wanted, axis=2), 3, rtol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(weak, axis=2), 3, rtol=1e-12)  # nine in half a metre: it pushes hard
-    assert not np.allclose(wanted, weak)  # drive and steering are cut together
+    strong, weak = forces(steered, state, drive), forces(steered, state, drive * 0)
+    np.testing.assert_allclose(np.linalg.norm(strong, axis=2), 3, rtol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(weak, axis=2), 3, rtol=1e-12)  # separation is strong
+    assert not np.allclose(strong, weak)  # the sum of drive and steering is bounded
     pushed = scene_of(Drag(rate=5), dimension=dimension, groups=groups)
     expected = -5 * state.vel
     expected[..., 0] += 3
@@ -664,7 +664,7 @@ class More(Drag):
 """
 
 
-def test_a_law_may_be_given_without_an_annotation_and_stays_a_function(tmp_path: Path) -> None:
+def test_law_may_be_assigned_without_an_annotation_and_stays_a_function(tmp_path: Path) -> None:
     with users_module(tmp_path, HELD, "held_laws") as laws:
         assert laws.Pulled(rate=1).own_law is laws.pulled
         scene = scene_of(
@@ -674,7 +674,7 @@ def test_a_law_may_be_given_without_an_annotation_and_stays_a_function(tmp_path:
         np.testing.assert_allclose(scene.acceleration(start), -4 * start.pos, rtol=1e-12)
 
 
-def test_a_law_may_be_made_by_a_function_and_holds_what_that_was_given(tmp_path: Path) -> None:
+def test_law_made_by_a_function_keeps_its_closure(tmp_path: Path) -> None:
     with users_module(tmp_path, HELD, "held_laws") as laws:
         group = Group(count=3, spawn=Spawn(low=(1, 1), high=(2, 2), speed=(1, 2)))
         for kind, strength in ((laws.Made, 2), (laws.More, 3)):
