@@ -1,4 +1,4 @@
-"""Recycler: memory is used again when nobody can see it any more, and never before."""
+"""Buffer pool: memory is reused only when nothing refers to it any more."""
 
 import itertools
 import pickle
@@ -17,25 +17,25 @@ def address(array):
 
 
 def maker_of(recycler):
-    """Return what makes arrays of any shape and type."""
+    """Return a function that makes arrays of any shape and dtype."""
     return lambda shape, dtype: recycler.maker(shape, dtype)()
 
 
-def test_what_was_let_go_of_is_used_again():
+def test_memory_of_released_arrays_is_reused():
     make = maker_of(Recycler())
     first = make((3, 4), F4)
     second = make((3, 4), F4)
-    places = {address(first), address(second)}
-    assert len(places) == 2
+    addresses = {address(first), address(second)}
+    assert len(addresses) == 2
     del first
     for _ in range(10):
         first = None
         first = make((3, 4), F4)
-        assert {address(first), address(second)} == places
+        assert {address(first), address(second)} == addresses
 
 
 @pytest.mark.parametrize("line", [1, 16, 64, 4096])
-def test_arrays_begin_with_a_line(line):
+def test_arrays_are_aligned_to_lines(line):
     make = maker_of(Recycler(keep=2, line=line))
     for shape in ((0,), (1,), (3, 5), (1000,)):
         held = [make(shape, F4) for _ in range(4)]
@@ -62,7 +62,7 @@ HOLDERS = {
 
 
 @pytest.mark.parametrize("hold", HOLDERS.values(), ids=HOLDERS)
-def test_whoever_holds_any_of_it_keeps_it(hold):
+def test_memory_is_not_reused_while_anything_refers_to_it(hold):
     make = maker_of(Recycler(keep=2))
     array = make((3, 4), F4)
     place = address(array)
@@ -75,7 +75,7 @@ def test_whoever_holds_any_of_it_keeps_it(hold):
     assert place in [address(other) for other in [make((3, 4), F4)]]
 
 
-def test_only_so_many_are_kept():
+def test_pool_keeps_at_most_the_given_number_of_buffers():
     recycler = Recycler(keep=3)
     many = [recycler.maker((2,), F4)() for _ in range(8)]
     places = [address(array) for array in many]
@@ -86,7 +86,7 @@ def test_only_so_many_are_kept():
     assert {address(array) for array in again} == set(places[:3])
 
 
-def test_shapes_and_types_are_apart():
+def test_arrays_of_each_shape_and_dtype_are_pooled_separately():
     make = maker_of(Recycler())
     shapes = [((6,), F4), ((2, 3), F4), ((6,), np.dtype(np.int32)), ((6,), np.dtype(bool))]
     for shape, dtype in [*shapes, *shapes[::-1]]:
@@ -96,7 +96,7 @@ def test_shapes_and_types_are_apart():
         del array
 
 
-def test_what_a_user_makes_of_an_array_does_not_outlive_it():
+def test_flags_set_on_an_array_do_not_persist_in_reused_memory():
     make = maker_of(Recycler(keep=1))
     places = set()
     for _ in range(3):
@@ -108,7 +108,7 @@ def test_what_a_user_makes_of_an_array_does_not_outlive_it():
     assert len(places) == 1
 
 
-def test_an_array_pickles_as_any_other():
+def test_arrays_can_be_pickled():
     array = Recycler().maker((2, 3), F4)()
     array[:] = 4
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(array)), array)

@@ -1,4 +1,4 @@
-"""The command line: what it prints and writes, and that every mistake is one line on stderr with exit code 2."""
+"""Command line: what it prints and writes; user errors print one line to stderr and exit with code 2."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ FLOCK = TINY.replace("{kind: drag, rate: 0.5}", "{kind: separation, weight: 1, r
 
 
 @pytest.fixture(autouse=True)
-def in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def in_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "tiny.yaml").write_text(TINY)
 
@@ -65,7 +65,7 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
 # --- list, schema, help -----------------------------------------------------------------------------------------------
 
 
-def test_list_names_everything_there_is_with_its_sentence() -> None:
+def test_list_prints_all_tasks_effects_and_methods_with_a_description() -> None:
     done = CliRunner().invoke(app, ["list"])
     assert done.exit_code == 0
     names = [*TASKS, *EFFECTS, *INTEGRATORS, "plane", "torus", "box", "flockenv/Flock-v1", "flockenv/Pursuit-v0"]
@@ -74,7 +74,7 @@ def test_list_names_everything_there_is_with_its_sentence() -> None:
     assert "F = -c (v - u)" in done.stdout
 
 
-def test_schema_is_json_and_the_one_of_scenes(capsys: pytest.CaptureFixture[str]) -> None:
+def test_schema_prints_the_json_schema_of_scenes(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["schema"]) == 0
     assert json.loads(capsys.readouterr().out) == schema()
 
@@ -95,8 +95,8 @@ def test_schema_is_json_and_the_one_of_scenes(capsys: pytest.CaptureFixture[str]
         "schema",
     ],
 )
-def test_every_command_has_a_page_of_help_that_shows_every_word(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Defaults in words, brackets and all: what a style would swallow is missed here."""
+def test_help_of_every_command_shows_all_of_its_text(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Detects text in brackets, such as defaults, that rich drops as markup."""
     monkeypatch.setenv("TERMINAL_WIDTH", "500")
     monkeypatch.setattr("typer.rich_utils.MAX_WIDTH", 500)
     done = CliRunner().invoke(app, [command, "--help"])
@@ -109,8 +109,7 @@ def test_every_command_has_a_page_of_help_that_shows_every_word(command: str, mo
             assert f"[default: ({parameter.show_default})]" in shown
 
 
-def test_no_help_says_a_default_in_brackets_of_its_own() -> None:
-    """Those that typer shows are of one form."""
+def test_help_texts_leave_defaults_to_typer() -> None:
     for command in typer.main.get_command(app).commands.values():  # type: ignore[attr-defined]
         assert not [p.name for p in command.params if "[default" in (p.help or "")]
 
@@ -119,7 +118,7 @@ def test_no_help_says_a_default_in_brackets_of_its_own() -> None:
     ("words", "expected"),
     [("render pur", ["pursuit"]), ("warmup path", ["path_follow"]), ("render ti", ["tiny.yaml"]), ("render zz", [])],
 )
-def test_the_shell_completes_tasks_and_scene_files(words: str, expected: list[str]) -> None:
+def test_shell_completes_tasks_and_scene_files(words: str, expected: list[str]) -> None:
     Path("notes.txt").touch()
     done = subprocess.run(
         [sys.executable, "-c", "from flockenv.cli.main import app; app(prog_name='flockenv')"],
@@ -130,14 +129,14 @@ def test_the_shell_completes_tasks_and_scene_files(words: str, expected: list[st
 
 
 @pytest.mark.parametrize("command", ["stress --cases N999", "validate riema9"])
-def test_an_unknown_case_is_told_the_nearest_few(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_case_is_refused_with_the_nearest_names(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(command.split()) == 2
-    said = capsys.readouterr().err
-    assert re.search(r"unknown; the nearest of \d+: (.*, ){4}.*$", said)
-    assert len(said) < 200
+    printed = capsys.readouterr().err
+    assert re.search(r"unknown; the nearest of \d+: (.*, ){4}.*$", printed)
+    assert len(printed) < 200
 
 
-def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
+def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"{flockenv.__version__}\n"
 
@@ -145,7 +144,7 @@ def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
 # --- run --------------------------------------------------------------------------------------------------------------
 
 
-def test_run_shows_measures_and_writes_a_trajectory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_prints_measures_and_writes_a_trajectory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "tiny.yaml", "--seed", "7", "--duration", "1", "--out", "results/deep/t.npz"]) == 0
     out = capsys.readouterr().out
     assert "4 agents, 100 steps of 0.01 s, seed 7" in out
@@ -169,7 +168,7 @@ def test_run_shows_measures_and_writes_a_trajectory(tmp_path: Path, capsys: pyte
     assert summary["work"]["neighbour_queries"] == 0
 
 
-def test_the_same_seed_is_the_same_run(capsys: pytest.CaptureFixture[str]) -> None:
+def test_runs_with_equal_seeds_are_equal(capsys: pytest.CaptureFixture[str]) -> None:
     for name, seed in (("a", "1"), ("b", "1"), ("c", "2")):
         assert main(["run", "tiny.yaml", "--seed", seed, "--duration", "0.5", "--out", f"{name}.npz"]) == 0
     a, b, c = (np.load(f"{name}.npz")["pos"] for name in "abc")
@@ -177,37 +176,37 @@ def test_the_same_seed_is_the_same_run(capsys: pytest.CaptureFixture[str]) -> No
     assert not np.array_equal(a, c)
 
 
-def test_nothing_is_written_unless_asked_for(tmp_path: Path) -> None:
+def test_run_without_out_writes_nothing(tmp_path: Path) -> None:
     assert main(["run", "tiny.yaml", "--duration", "0.1"]) == 0
     assert [p.name for p in tmp_path.iterdir()] == ["tiny.yaml"]
 
 
-def test_no_time_is_a_run_of_no_steps(capsys: pytest.CaptureFixture[str]) -> None:
+def test_duration_zero_makes_no_steps(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "tiny.yaml", "--duration", "0", "--out", "t.npz"]) == 0
     assert np.load("t.npz")["pos"].shape == (1, 4, 2)
     assert json.loads(Path("t.json").read_text())["agent_steps_per_s"] is None  # no NaN in JSON
 
 
-def test_every_says_how_often_an_instant_is_kept_and_the_last_always_is() -> None:
+def test_every_sets_the_interval_of_recorded_instants_and_the_last_is_included() -> None:
     assert main(["run", "tiny.yaml", "--duration", "0.5", "--every", "0.2", "--out", "t.npz"]) == 0
     assert np.load("t.npz")["time"] == pytest.approx([0, 0.2, 0.4, 0.5])
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::flockenv.core.warnings.UnsolvedContactsWarning")
-def test_run_and_render_say_how_many_contacts_were_left_unsolved(capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_and_render_print_the_number_of_unsolved_contacts(capsys: pytest.CaptureFixture[str]) -> None:
     heap = "{count: 25, radius: 0.1, spawn: {low: [0, 0], high: [1.25, 1.25], spacing: 0.25}}"
     rules = "effects: [{kind: gravity}]\nconstraints: [{kind: collisions, response: impulses, passes: %d}]\ndt: 0.01\n"
     text = f"dimension: 2\nspace: {{kind: box, size: [1.25, 5]}}\ngroups: [{heap}]\n{rules}"
-    for passes, said in ((2, True), (200, False)):
+    for passes, unsolved in ((2, True), (200, False)):
         Path("heap.yaml").write_text(text % passes)
         for command in (["run"], ["render", "--size", "64", "--force", "--out", "h.png"]):
             assert main([command[0], "heap.yaml", "--duration", "1", *command[1:]]) == 0
-            assert bool(re.search(r", [\d,]+ times contacts left unsolved$", capsys.readouterr().out, re.M)) == said
+            assert bool(re.search(r", [\d,]+ times contacts left unsolved$", capsys.readouterr().out, re.M)) == unsolved
 
 
 @pytest.mark.slow
-def test_a_scene_without_neighbour_effects_makes_no_query_and_one_with_them_one_per_step(
+def test_neighbours_are_queried_once_per_step_only_if_an_effect_needs_them(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert main(["run", PARTICLES, "--duration", "0.2"]) == 0
@@ -219,7 +218,7 @@ def test_a_scene_without_neighbour_effects_makes_no_query_and_one_with_them_one_
 
 @pytest.mark.slow
 @pytest.mark.parametrize("more", ["", "constraints: [{kind: collisions}]\n"], ids=["plain", "collisions"])
-def test_the_clock_of_a_run_begins_when_everything_is_compiled(more: str, tmp_path: Path) -> None:
+def test_time_of_a_run_excludes_compilation(more: str, tmp_path: Path) -> None:
     """Otherwise the first run of a scene shows the speed of the compiler."""
     Path("new.yaml").write_text(TINY + more)
     code = (
@@ -233,7 +232,7 @@ def test_the_clock_of_a_run_begins_when_everything_is_compiled(more: str, tmp_pa
     subprocess.run([sys.executable, "-c", code], env=fresh, check=True)
 
 
-def test_a_run_that_diverges_says_so_and_keeps_what_was_done(capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_that_diverges_reports_it_and_writes_the_steps_before(capsys: pytest.CaptureFixture[str]) -> None:
     wild = TINY.replace("kind: drag, rate: 0.5", "kind: quadratic_drag, rate: 1e6")
     wild = wild.replace("torus, size: [9, 9]", "plane").replace("spawn: {", "spawn: {low: [0, 0], high: [9, 9], ")
     Path("wild.yaml").write_text(wild)
@@ -249,12 +248,12 @@ def test_a_run_that_diverges_says_so_and_keeps_what_was_done(capsys: pytest.Capt
 
 
 def interrupted(moment: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run a command in a process that gets a real SIGINT once the bar of that name has moved on a little."""
+    """Run a command in a process that sends itself SIGINT once the progress bar of that name has advanced."""
     code = f"""
 import contextlib, os, signal, sys
 from flockenv.cli import main
 
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a test run in the background ignores them, for all below
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a background test run ignores SIGINT, as do its children
 
 @contextlib.contextmanager
 def progress(title, total, unit, first=""):
@@ -276,7 +275,7 @@ sys.exit(main.main())
     )
 
 
-def test_an_interrupted_run_keeps_what_was_done_and_leaves_with_130(tmp_path: Path) -> None:
+def test_interrupted_run_writes_its_steps_and_exits_with_130(tmp_path: Path) -> None:
     done = interrupted("simulating", "run", "tiny.yaml", "--duration", "1e6", "--every", "1000", "--out", "t.npz")
     assert done.returncode == 130, done.stderr
     assert re.fullmatch(r"flockenv: interrupted; results until \S+ s are shown\n", done.stderr)
@@ -289,33 +288,33 @@ def test_an_interrupted_run_keeps_what_was_done_and_leaves_with_130(tmp_path: Pa
 
 @pytest.mark.slow
 @pytest.mark.parametrize("moment", ["simulating", "drawing"])
-def test_an_interrupted_picture_is_not_written(moment: str, tmp_path: Path) -> None:
+def test_interrupted_render_writes_no_file(moment: str, tmp_path: Path) -> None:
     done = interrupted(moment, "render", "tiny.yaml", "--duration", "10", "--out", "t.gif")
     assert (done.returncode, done.stderr) == (130, "flockenv: interrupted\n")
     assert [p.name for p in tmp_path.iterdir()] == ["tiny.yaml"]
 
 
-# --- how far it is ----------------------------------------------------------------------------------------------------
+# --- progress ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
-    """News about progress come every 20 ms."""
+    """Report progress every 20 ms."""
     monkeypatch.setattr(terminal, "FIRST", 0.02)
     monkeypatch.setattr(terminal, "OFTEN", 0.02)
 
 
 @pytest.mark.usefixtures("often")
-def test_a_pipe_is_told_how_far_a_command_is(capsys: pytest.CaptureFixture[str]) -> None:
-    said = ""
+def test_progress_is_written_as_lines_to_a_pipe(capsys: pytest.CaptureFixture[str]) -> None:
+    printed = ""
 
     def until(word: str) -> None:
-        nonlocal said
+        nonlocal printed
         last = time.monotonic() + 60
-        while word not in said:
-            assert time.monotonic() < last, said
+        while word not in printed:
+            assert time.monotonic() < last, printed
             time.sleep(0.01)
-            said += capsys.readouterr().err
+            printed += capsys.readouterr().err
 
     with terminal.progress_bar("working", 10**14, "steps", "placing agents") as progress:
         until("placing agents: (")
@@ -324,21 +323,21 @@ def test_a_pipe_is_told_how_far_a_command_is(capsys: pytest.CaptureFixture[str])
         progress(10)
         until("years left")
         progress(10**14)
-    said += capsys.readouterr().err
+    printed += capsys.readouterr().err
     waiting, working = (
         r"placing agents: \(\d+ s so far\)",
         r"working: 1e-11 % \(\d+ s so far, about [\d,]+ years left\)",
     )
-    assert re.fullmatch(rf"({waiting}\n)+(working: \(\d+ s so far\)\n)*({working}\n)+", said), said
+    assert re.fullmatch(rf"({waiting}\n)+(working: \(\d+ s so far\)\n)*({working}\n)+", printed), printed
 
 
-def test_a_quick_command_says_nothing_of_its_progress(capsys: pytest.CaptureFixture[str]) -> None:
+def test_quick_command_prints_no_progress(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "tiny.yaml", "--duration", "0.1"]) == 0
     assert capsys.readouterr().err == ""
 
 
-class News(io.StringIO):
-    """What is written to stderr; `arrived` is set once it says how far a command is."""
+class Stderr(io.StringIO):
+    """Replacement of stderr; the event `arrived` is set once a line of progress is written."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -353,19 +352,19 @@ class News(io.StringIO):
 
 @pytest.mark.usefixtures("often")
 @pytest.mark.parametrize("command", [["measure", "--time", "0.1"], ["run", "--duration", "0.1"]], ids=lambda c: c[0])
-def test_long_commands_say_how_far_they_are(command: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever the speed of the machine: the command waits in its first news of progress until a line is written."""
-    news, update = News(), Progress.update
+def test_long_commands_print_progress(command: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Independent of the machine's speed: the first update of progress waits until a line is written."""
+    stderr, update = Stderr(), Progress.update
 
     def wait(bars: Progress, *given: Any, **more: Any) -> None:
         update(bars, *given, **more)
-        assert news.arrived.wait(60)
+        assert stderr.arrived.wait(60)
 
-    monkeypatch.setattr(sys, "stderr", news)
+    monkeypatch.setattr(sys, "stderr", stderr)
     monkeypatch.setattr(Progress, "update", wait)
     name, *options = command
     assert main([name, "tiny.yaml", *options]) == 0
-    assert re.search(r"^\S.*: .*\(\d+ s so far.*\)$", news.getvalue(), re.MULTILINE)
+    assert re.search(r"^\S.*: .*\(\d+ s so far.*\)$", stderr.getvalue(), re.MULTILINE)
 
 
 @pytest.mark.parametrize(
@@ -373,14 +372,14 @@ def test_long_commands_say_how_far_they_are(command: list[str], monkeypatch: pyt
     [(0, "0 s"), (89, "89 s"), (91, "2 min"), (5399, "90 min"), (5401, "2 h"), (172799, "48 h"), (172801, "2 days"),
      (7e7, "2 years"), (1e12, "31,688 years")],
 )  # fmt: skip
-def test_a_length_of_time_in_words(seconds: float, words: str) -> None:
+def test_duration_in_words(seconds: float, words: str) -> None:
     assert terminal.in_words(seconds) == words
 
 
 # --- render -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_scene_as_gif_png_and_html(capsys: pytest.CaptureFixture[str]) -> None:
+def test_scene_is_rendered_as_gif_png_and_html(capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("s.gif", "s.PNG", "s.html"):
         assert main(["render", "tiny.yaml", "--duration", "0.4", "--size", "128", "--out", name]) == 0
     assert capsys.readouterr().out.startswith("s.gif: ")
@@ -392,14 +391,14 @@ def test_a_scene_as_gif_png_and_html(capsys: pytest.CaptureFixture[str]) -> None
     assert '"player":' in Path("s.html").read_text()
 
 
-def test_a_plane_is_shown_in_one_frame() -> None:
+def test_scene_in_a_plane_is_rendered() -> None:
     Path("plane.yaml").write_text(
         "groups: [{count: 3, spawn: {low: [0, 0], high: [1, 1], speed: [9, 9]}}]\neffects: [{kind: drag, rate: 0}]\n"
     )
     assert main(["render", "plane.yaml", "--duration", "1", "--size", "128", "--out", "p.html"]) == 0
 
 
-def test_a_task_under_a_player_of_ones_own() -> None:
+def test_task_is_rendered_with_a_player_from_a_file() -> None:
     Path("still.py").write_text(
         "import numpy as np\n\n\ndef player(task):\n    class Still:\n"
         "        def predict(self, observation, state=None, episode_start=None, deterministic=False):\n"
@@ -415,7 +414,7 @@ def test_a_task_under_a_player_of_ones_own() -> None:
         assert png.size[0] == 96
 
 
-def test_several_players_of_one_world_are_drawn_side_by_side() -> None:
+def test_several_players_are_drawn_side_by_side() -> None:
     command = ["render", "pursuit", "--player", "rules,textbook", "--size", "192", "--seed", "3"]
     for out in ("two.png", "two.gif", "two.html"):
         assert main([*command, "--out", out]) == 0
@@ -427,7 +426,7 @@ def test_several_players_of_one_world_are_drawn_side_by_side() -> None:
     assert '"player":"rules"' in text and '"player":"textbook"' in text
 
 
-def test_a_zip_is_a_player_only_where_it_is_trusted(
+def test_zip_is_loaded_as_a_player_only_if_trusted(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def load(path: Path, trust_pickle: bool) -> Policy:
@@ -436,62 +435,62 @@ def test_a_zip_is_a_player_only_where_it_is_trusted(
 
     monkeypatch.setitem(sys.modules, "flockenv.envs.sb3", SimpleNamespace(load_sb3_zip=load))  # without torch
     Path("mine.zip").write_bytes(b"")
-    asked = ["render", "pursuit", "--player", "mine.zip", "--out", "p.html"]
-    assert main(asked) == 2 and "pass --trust-pickle" in capsys.readouterr().err
-    assert main([*asked, "--trust-pickle"]) == 0 and Path("p.html").exists()
+    command = ["render", "pursuit", "--player", "mine.zip", "--out", "p.html"]
+    assert main(command) == 2 and "pass --trust-pickle" in capsys.readouterr().err
+    assert main([*command, "--trust-pickle"]) == 0 and Path("p.html").exists()
 
 
 # --- explain ----------------------------------------------------------------------------------------------------------
 
 COST = r"-?[\d.e+-]+ \[-?[\d.e+-]+, -?[\d.e+-]+\]( level)? *"
-"""A measured difference of times, with its interval."""
+"""Pattern of a measured difference of times with its interval."""
 
 
-def test_a_cost_is_a_median_with_its_interval_and_is_level_where_that_holds_zero() -> None:
+def test_cost_is_a_median_with_an_interval_and_level_if_that_contains_zero() -> None:
     clear, level = Cost.of(np.arange(1.0, 16.0)), Cost.of(np.arange(-7.0, 8.0))
     assert str(clear) == "8 [4, 12]"  # ranks 4 and 12 of 15: 96.5 % of all medians lie between (binomial)
     assert str(level) == "0 [-4, 4] level"
     disturbed = np.arange(1.0, 16.0)
-    disturbed[-1] = 1e6  # one round in which something else ran
+    disturbed[-1] = 1e6  # another process slowed one round
     assert Cost.of(disturbed) == clear
 
 
 @pytest.mark.slow
-def test_explain_says_what_is_called_for_and_what_was_left_out(capsys: pytest.CaptureFixture[str]) -> None:
+def test_explain_prints_what_effects_need_and_what_is_not_computed(capsys: pytest.CaptureFixture[str]) -> None:
     Path("flock.yaml").write_text(FLOCK)
     assert main(["explain", "flock.yaml"]) == 0
-    asked = capsys.readouterr().out
-    assert re.search(rf"^separation\(.*radius=2.0\) +neighbour query within 2 m +{COST}$", asked, re.MULTILINE)
-    assert "Per step: 1 evaluations, 1 neighbour queries" in asked
-    assert "neighbour query: no effect" not in asked
+    flock = capsys.readouterr().out
+    assert re.search(rf"^separation\(.*radius=2.0\) +neighbour query within 2 m +{COST}$", flock, re.MULTILINE)
+    assert "Per step: 1 evaluations, 1 neighbour queries" in flock
+    assert "neighbour query: no effect" not in flock
 
     assert main(["explain", "tiny.yaml"]) == 0
-    unasked = capsys.readouterr().out
-    assert re.search(rf"^drag\(rate=0.5\) +nothing +{COST}$", unasked, re.MULTILINE)
-    assert "1 evaluations, 0 neighbour queries, 0 pairs, 0 obstacle tests" in unasked
-    assert "neighbour query: no effect needs neighbours" in unasked
-    assert "pass over obstacles (0): no effect needs them" in unasked
-    assert f"effects that are not listed: {', '.join(sorted(EFFECTS.keys() - {'drag'}))}" in " ".join(unasked.split())
-    assert "Largest stable step: 4 s (drag, agent 0), dt = 0.01 s" in unasked  # |1 - h c / m| = 1
-    assert "Largest stable step: nothing in it sets a limit, unless agents that meet do; dt = 0.01 s" in asked
+    drag = capsys.readouterr().out
+    assert re.search(rf"^drag\(rate=0.5\) +nothing +{COST}$", drag, re.MULTILINE)
+    assert "1 evaluations, 0 neighbour queries, 0 pairs, 0 obstacle tests" in drag
+    assert "neighbour query: no effect needs neighbours" in drag
+    assert "pass over obstacles (0): no effect needs them" in drag
+    assert f"effects that are not listed: {', '.join(sorted(EFFECTS.keys() - {'drag'}))}" in " ".join(drag.split())
+    assert "Largest stable step: 4 s (drag, agent 0), dt = 0.01 s" in drag  # |1 - h c / m| = 1
+    assert "Largest stable step: nothing in it sets a limit, unless agents that meet do; dt = 0.01 s" in flock
 
 
-def test_explain_says_who_sets_the_largest_step() -> None:
-    def said(scene: Scene) -> str:
+def test_explain_names_the_effect_and_agent_that_limit_the_step() -> None:
+    def limit(scene: Scene) -> str:
         return Explanation(scene, (), 0.0, 0.0, Cost(0, 0, 0), {}, (), suggest_dt(scene)).largest_step
 
     rope = Rope(links=4, length=4, pinned=("start",))
     scene = Scene(groups=(Group(network=rope),), effects=(Springs(stiffness=100),), dt=0.02)
     # three free particles between two springs: w^2 <= 2 (100 + 100) N/m / kg, and h w = 2 at the most
-    assert said(scene) == "0.1 s (springs, agent 1), dt = 0.02 s"
-    assert said(scene.model_copy(update={"integrator": ImplicitEuler()})) == (
+    assert limit(scene) == "0.1 s (springs, agent 1), dt = 0.02 s"
+    assert limit(scene.model_copy(update={"integrator": ImplicitEuler()})) == (
         "any is stable with implicit_euler, dt = 0.02 s"
     )
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("default")
-def test_a_warning_is_one_line_without_a_place_in_our_sources(capsys: pytest.CaptureFixture[str]) -> None:
+def test_warning_is_one_line_without_a_source_location(capsys: pytest.CaptureFixture[str]) -> None:
     held = TINY.replace("{kind: drag, rate: 0.5}", "{kind: tether, centre: [0, 0], stiffness: 100}")
     Path("stiff.yaml").write_text(held.replace("dt: 0.01", "dt: 0.21"))
     assert main(["run", "stiff.yaml", "--duration", "0.21"]) == 0
@@ -503,7 +502,7 @@ def test_a_warning_is_one_line_without_a_place_in_our_sources(capsys: pytest.Cap
 
 @pytest.fixture
 def tried(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Two made-up hard cases instead of the real ones, and a list of what was tried."""
+    """Replace the stress cases by two artificial ones; return the list of trials."""
     calls: list[str] = []
 
     def case(name: str, within: bool) -> Case:
@@ -517,7 +516,7 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return calls
 
 
-def test_stress_shows_values_and_what_is_wrong(tried: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_stress_prints_values_and_failures(tried: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["stress", "--methods", "rk4,heun"]) == 0
     assert tried == ["X01 rk4", "X02 rk4", "X01 heun", "X02 heun"]
     shown = capsys.readouterr().out
@@ -526,7 +525,7 @@ def test_stress_shows_values_and_what_is_wrong(tried: list[str], capsys: pytest.
     assert not list(Path().glob("*.json"))
 
 
-def test_stress_goes_on_where_it_was_and_loses_nothing(tried: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_stress_continues_with_the_findings_of_its_file(tried: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["stress", "--methods", "rk4", "--out", "hard.png"]) == 0
     with Image.open("hard.png") as picture:
         assert picture.width > 100
@@ -547,7 +546,9 @@ def test_stress_goes_on_where_it_was_and_loses_nothing(tried: list[str], capsys:
     assert tried == ["X01 rk4"]
 
 
-def test_stress_does_not_take_another_file_for_its_own(tried: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_stress_does_not_overwrite_a_file_without_findings(
+    tried: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     Path("mine.json").write_text('{"life": "work"}')
     assert main(["stress", "--out", "mine.json"]) == 2
     assert capsys.readouterr().err == (
@@ -556,7 +557,7 @@ def test_stress_does_not_take_another_file_for_its_own(tried: list[str], capsys:
     assert not tried and Path("mine.json").read_text() == '{"life": "work"}'
 
 
-def test_an_interrupted_stress_keeps_what_was_found(
+def test_interrupted_stress_writes_its_findings(
     tried: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def interrupted(method: Integrator) -> Value:
@@ -569,11 +570,11 @@ def test_an_interrupted_stress_keeps_what_was_found(
     assert [f["case"] for f in json.loads(Path("hard.json").read_text())["findings"]] == ["X01"]
 
 
-# --- mistakes ---------------------------------------------------------------------------------------------------------
+# --- user errors ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         ("run", "Missing argument 'SCENE.yaml'"),
         ("rnu tiny.yaml", "No such command 'rnu'. Did you mean 'run'?"),
@@ -608,7 +609,7 @@ def test_an_interrupted_stress_keeps_what_was_found(
         ("render tiny.yaml --out x.mp4", "--out 'x.mp4': must end in .gif or .png or .html"),
         ("render tiny.yaml --out x.gfi", "--out 'x.gfi': must end in .gif or .png or .html, did you mean `.gif`?"),
         ("render pursiut --out x.gif", "'pursiut': no such task, did you mean `pursuit`? ("),
-        ("render pursuit --out x.gif --player nobody", "player 'nobody': unknown"),
+        ("render pursuit --out x.gif --player nosuch", "player 'nosuch': unknown"),
         ("render pursuit --out x.gif --player rule", "player 'rule': unknown, did you mean `rules`?"),
         ("render pursuit --out x.gif --player reynolds", "player 'reynolds': is called 'rules'"),
         ("render pursuit --out x.gif --player orca", "there is no hand-written player 'orca' for 'pursuit'"),
@@ -618,18 +619,18 @@ def test_an_interrupted_stress_keeps_what_was_found(
         ("explain nothing.yaml", "nothing.yaml: no such file"),
     ],
 )
-def test_a_mistake_is_one_line_with_exit_code_2_and_writes_nothing(
-    arguments: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_user_error_is_one_line_with_exit_code_2_and_writes_nothing(
+    arguments: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(arguments.split(" ")) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
-    assert captured.err.startswith(f"flockenv: {said}"), captured.err
+    assert captured.err.startswith(f"flockenv: {message}"), captured.err
     assert len(captured.err.splitlines()) == 1 and len(captured.err) < 600
     assert [p.name for p in tmp_path.iterdir()] == ["tiny.yaml"]
 
 
-def test_a_mistake_in_a_scene_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_error_in_a_scene_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     Path("bad.yaml").write_text(TINY.replace("rate: 0.5", "rte: 0.5"))
     assert main(["run", "bad.yaml", "--out", "x.npz"]) == 2
     assert capsys.readouterr().err == (
@@ -637,14 +638,14 @@ def test_a_mistake_in_a_scene_is_one_line(capsys: pytest.CaptureFixture[str]) ->
     )
 
 
-def test_names_do_not_drive_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+def test_control_characters_in_names_are_escaped(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "\x1b[2Jx.yaml"]) == 2
     assert main(["render", "\x1b[2Jx", "--out", "x.gif"]) == 2
     assert main(["\x1b[2J"]) == 2
     assert "\x1b" not in capsys.readouterr().err
 
 
-def test_a_file_is_overwritten_only_by_force(capsys: pytest.CaptureFixture[str]) -> None:
+def test_existing_file_is_overwritten_only_with_force(capsys: pytest.CaptureFixture[str]) -> None:
     Path("t.json").write_text("mine")
     assert main(["run", "tiny.yaml", "--duration", "0", "--out", "t.npz"]) == 2
     assert re.match(r"flockenv: --out '.*t\.json': exists already; --force overwrites it", capsys.readouterr().err)
@@ -654,20 +655,22 @@ def test_a_file_is_overwritten_only_by_force(capsys: pytest.CaptureFixture[str])
     assert json.loads(Path("t.json").read_text())["steps"] == 0
 
 
-def test_a_link_to_the_outside_is_not_followed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_symbolic_link_out_of_the_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "out").symlink_to("/usr/share")
     assert main(["run", "tiny.yaml", "--duration", "0", "--out", "out/x.npz"]) == 2
     assert "must lie below" in capsys.readouterr().err
 
 
-def test_debug_shows_the_traceback(capsys: pytest.CaptureFixture[str]) -> None:
+def test_debug_raises_the_exception(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ValueError, match="no such file"):
         main(["run", "nothing.yaml", "--debug"])
     with pytest.raises(ValueError, match="no such file"):
         main(["--debug", "run", "nothing.yaml"])
 
 
-def test_a_fault_of_ours_is_called_one(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unexpected_exception_is_reported_as_a_bug(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     def broken(source: object) -> None:
         raise KeyError("pos")
 
@@ -676,7 +679,7 @@ def test_a_fault_of_ours_is_called_one(monkeypatch: pytest.MonkeyPatch, capsys: 
     assert capsys.readouterr().err == "flockenv: KeyError: 'pos' (a bug in flockenv; --debug shows where)\n"
 
 
-def test_too_little_memory_is_no_fault_of_ours(
+def test_lack_of_memory_is_not_reported_as_a_bug(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def short(text: str) -> Any:
@@ -685,27 +688,27 @@ def test_too_little_memory_is_no_fault_of_ours(
 
         return load
 
-    for text, said in (
+    for text, message in (
         ("Unable to allocate 3. GiB for an array", "not enough memory: Unable to allocate 3. GiB for an array"),
         ("", "not enough memory: use fewer agents or worlds"),
     ):
         monkeypatch.setattr("flockenv.scene.yaml_io.load_scene", short(text))
         assert main(["run", "tiny.yaml"]) == 2
-        assert capsys.readouterr().err == f"flockenv: {said}\n"
+        assert capsys.readouterr().err == f"flockenv: {message}\n"
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
 @pytest.mark.parametrize(
     "command", [("list",), ("schema",), ("run", "tiny.yaml", "--duration", "0.1")], ids=lambda c: c[0]
 )
-def test_a_full_disk_behind_standard_output_is_named(command: tuple[str, ...]) -> None:
+def test_full_disk_at_standard_output_is_one_line(command: tuple[str, ...]) -> None:
     with open("/dev/full", "w") as full:
         done = subprocess.run(process(*command), env=ENVIRONMENT, stdout=full, stderr=subprocess.PIPE, text=True)
     assert (done.returncode, done.stderr) == (2, "flockenv: standard output: No space left on device\n")
 
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), OSError(5, "Input/output error", "x")])
-def test_an_error_of_the_system_leaves_standard_output_empty(
+def test_system_error_prints_nothing_to_standard_output(
     error: OSError, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fail(*_: Any, **__: Any) -> None:
@@ -718,8 +721,8 @@ def test_an_error_of_the_system_leaves_standard_output_empty(
 
 
 @pytest.mark.parametrize("name", ["t.npz", "t.gif", "t.png", "t.html"])
-def test_a_full_disk_is_one_line_that_names_the_file_and_leaves_nothing(name: str, tmp_path: Path) -> None:
-    """A limit on the size of files stands for the disk."""
+def test_full_disk_is_one_line_with_the_file_and_leaves_no_files(name: str, tmp_path: Path) -> None:
+    """A limit on file size replaces the full disk."""
     command = "run" if name.endswith("npz") else "render"
     code = (
         "import resource, sys; from flockenv.cli.main import main\n"
@@ -727,7 +730,7 @@ def test_a_full_disk_is_one_line_that_names_the_file_and_leaves_nothing(name: st
         "resource.setrlimit(resource.RLIMIT_FSIZE, (200, 200)); sys.exit(main())"
     )
     arguments = (command, "tiny.yaml", "--duration", "0.2", "--out", f"deep/{name}")
-    assert main([*arguments[:-1], name]) == 0  # compiles; a kernel is larger than the disk
+    assert main([*arguments[:-1], name]) == 0  # compiles first, as a kernel exceeds the limit
     os.remove(name)
     Path("t.json").unlink(missing_ok=True)
     done = subprocess.run([sys.executable, "-c", code, *arguments], env=ENVIRONMENT, capture_output=True, text=True)
@@ -736,15 +739,15 @@ def test_a_full_disk_is_one_line_that_names_the_file_and_leaves_nothing(name: st
     assert [path.name for path in tmp_path.iterdir()] == ["tiny.yaml"]
 
 
-def test_nothing_at_all_shows_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_arguments_show_the_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 2
     assert "Usage:" in capsys.readouterr().out
 
 
-# --- as a program -----------------------------------------------------------------------------------------------------
+# --- as a process -----------------------------------------------------------------------------------------------------
 
 
-def test_as_a_program_errors_go_to_stderr_and_the_exit_code_says_so() -> None:
+def test_process_prints_errors_to_stderr_and_exits_with_2() -> None:
     done = subprocess.run(
         process("run", "tiny.yaml", "--duration", "-1"), env=ENVIRONMENT, capture_output=True, text=True, check=False
     )
@@ -752,14 +755,14 @@ def test_as_a_program_errors_go_to_stderr_and_the_exit_code_says_so() -> None:
     assert done.stderr == "flockenv: --duration = -1: must be a finite number of seconds >= 0\n"
 
 
-def test_a_reader_that_goes_away_is_no_error() -> None:
+def test_closed_pipe_is_no_error() -> None:
     """`flockenv list | head -1`."""
     command = f"{sys.executable} -c 'import sys; from flockenv.cli.main import main; sys.exit(main())' list | head -1"
     done = subprocess.run(command, shell=True, env=ENVIRONMENT, capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("Tasks\n", "")
 
 
-def test_it_works_without_a_home_a_display_or_a_locale() -> None:
+def test_run_works_without_home_display_or_locale() -> None:
     bare = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "LANG": "C", "LC_ALL": "C", "TZ": "Mars/Phobos"}
     done = subprocess.run(
         process("run", "tiny.yaml", "--duration", "0.1"), env=bare, capture_output=True, text=True, check=False

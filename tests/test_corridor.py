@@ -1,4 +1,4 @@
-"""Corridor: what is paid and measured, by hand, and whether players keep lanes."""
+"""Corridor: rewards and measures calculated by hand, and whether players form lanes."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ HORIZON = 10
 
 
 def walk(places: Any, velocities: Any = 0.0, **more: Any) -> World:
-    """People at places (along the corridor, across it), the first half of them on their way to the right."""
+    """Return a world with people at places (along the corridor, across it); the first half walks to the right."""
     world = world_of(Corridor(people=len(places), horizon=HORIZON, **more))
     place(world, np.add(places, [0.0, 1.0]), velocities)
     return world
 
 
-def test_people_begin_in_the_corridor_half_of_them_each_way_and_not_in_each_other() -> None:
+def test_people_start_in_the_corridor_half_each_direction_without_overlap() -> None:
     world = World(Corridor(), 100)
     world.reset(3)
-    pos, way, pace = world.state.pos, world._memory[0], world._memory[1]
-    assert (way[:, :12] == 1).all()
-    assert (way[:, 12:] == -1).all()
+    pos, direction, pace = world.state.pos, world._memory[0], world._memory[1]
+    assert (direction[:, :12] == 1).all()
+    assert (direction[:, 12:] == -1).all()
     assert (pos[..., 1] >= 1.25).all()
     assert (pos[..., 1] <= 3.75).all()
     x = pos[:, :, None, 0] - pos[:, None, :, 0]
@@ -40,10 +40,10 @@ def test_people_begin_in_the_corridor_half_of_them_each_way_and_not_in_each_othe
     assert gaps.min() >= 0.5
     assert pace.mean() == pytest.approx(1.34, abs=0.02)
     assert pace.std() == pytest.approx(0.26, abs=0.02)
-    assert len(np.unique(pos[:, 0, 0].round(1))) > 40  # cells are drawn anew
+    assert len(np.unique(pos[:, 0, 0].round(1))) > 40  # positions differ between worlds
 
 
-def test_getting_along_pays_most_at_the_desired_speed_and_a_touch_costs_both() -> None:
+def test_reward_along_peaks_at_the_desired_speed_and_contact_costs_both() -> None:
     world = walk([(2, 1), (6, 1), (6.4, 1), (10, 2)], [(0.67, 0), (1.9, 0), (0.67, 0), (-0.67, 0)])
     pace = world._memory[1, 0].copy()
     step = act(world)
@@ -54,7 +54,7 @@ def test_getting_along_pays_most_at_the_desired_speed_and_a_touch_costs_both() -
     assert paid(world, act(world, (0.6, 0.8)))["effort"] == pytest.approx(-0.1 * 0.1)
 
 
-def test_a_touch_counts_once_also_around_the_ring() -> None:
+def test_contact_counts_once_also_across_the_periodic_edge() -> None:
     world = walk([(11.9, 1), (0.5, 1)], [(1.5, 0), (0, 0)])  # 0.6 m apart, 0.45 m after a decision
     act(world)
     assert world.measure()["collisions"] == 1
@@ -62,13 +62,13 @@ def test_a_touch_counts_once_also_around_the_ring() -> None:
     assert world.measure()["collisions"] == 1
 
 
-def order_of(rows: Any, ways: Any) -> float:
-    """Of all pairs in one row, same ways minus opposite ways, over all pairs: by counting."""
+def order_of(rows: Any, directions: Any) -> float:
+    """Return pairs with equal minus pairs with opposite direction, over all pairs in one row, by counting."""
     pairs = [(i, j) for i, j in itertools.combinations(range(len(rows)), 2) if rows[i] == rows[j]]
-    return sum(ways[i] * ways[j] for i, j in pairs) / len(pairs) if pairs else 0.0
+    return sum(directions[i] * directions[j] for i, j in pairs) / len(pairs) if pairs else 0.0
 
 
-def test_lane_order_is_that_of_pairs_in_a_row() -> None:
+def test_lane_order_equals_the_count_of_pairs_in_a_row() -> None:
     rng = np.random.default_rng(0)
     for _ in range(5):
         places = np.stack([rng.uniform(0, 12, 24), rng.uniform(0.3, 2.7, 24)], axis=1)
@@ -80,14 +80,14 @@ def test_lane_order_is_that_of_pairs_in_a_row() -> None:
     lanes = np.stack([np.tile(np.arange(12.0), 2), np.repeat([0.75, 2.25], 12)], axis=1)
     world = walk(lanes)
     act(world)
-    assert np.isnan(world.measure()["lane_order"])  # of the second half alone
+    assert np.isnan(world.measure()["lane_order"])  # it is measured only in the second half of an episode
     world.steps[:] = HORIZON - 1
     act(world)
     assert world.measure()["lane_order"] == 1
 
 
-def test_lane_order_of_people_at_random_is_nothing() -> None:
-    """Of 12 + 12 people, -1/23 in the mean: who is met is taken from the others."""
+def test_lane_order_of_random_positions_is_about_zero() -> None:
+    """The mean is -1/23 for 12 + 12 people: of 23 others, 11 walk in the same direction and 12 in the opposite one."""
     world = World(Corridor(), 400)
     world.reset(0)
     world.steps[:] = 299
@@ -101,14 +101,14 @@ def test_walls_are_solid() -> None:
     for _ in range(60):
         world.step(np.broadcast_to([0.0, 1.0], (8, 24, 2)))
     y = world.state.pos[..., 1] - 1.0
-    assert (y[:, :12] > 2.5).all()  # left of who goes right
+    assert (y[:, :12] > 2.5).all()  # those that walk to the right are at the wall on their left
     assert (y[:, 12:] < 0.5).all()
     assert y.min() > 0.15
     assert y.max() < 2.85
 
 
-def test_both_ways_see_and_are_paid_the_same() -> None:
-    """The corridor turned by half a turn: who is on the other way is shown what the first was."""
+def test_observations_and_rewards_are_equal_in_both_directions() -> None:
+    """Rotated by half a turn, each half of the people gets the observations of the other."""
     places = np.array([(2.0, 0.7), (5.0, 1.4), (3.1, 1.0), (6.4, 2.2)])
     turned = ([12.0, 3.0] - places)[[2, 3, 0, 1]]
     worlds = [walk(places), walk(turned)]
@@ -120,7 +120,7 @@ def test_both_ways_see_and_are_paid_the_same() -> None:
         np.testing.assert_allclose(one.terms[:, [2, 3, 0, 1]], other.terms, atol=1e-9)
 
 
-def test_rewards_do_not_touch_what_happens() -> None:
+def test_rewards_do_not_change_the_motion() -> None:
     worlds = world_of(Corridor()), world_of(Corridor(along_reward=0, touch_cost=0, effort_cost=0))
     for actions in random_actions(worlds[0], 40):
         for world in worlds:
@@ -129,7 +129,7 @@ def test_rewards_do_not_touch_what_happens() -> None:
     np.testing.assert_array_equal(worlds[0].state.pos, worlds[1].state.pos)
 
 
-def test_players_keep_lanes_and_random_ones_do_not() -> None:
+def test_players_form_lanes_and_a_random_player_does_not() -> None:
     task, first = Corridor(), worlds_for("tuning", 7, 12)
     players = {
         "random": RandomPolicy(2, 0),
@@ -147,7 +147,7 @@ def test_players_keep_lanes_and_random_ones_do_not() -> None:
         assert episodes[name].metrics["speed"].mean() > 0.8
 
 
-def test_scripted_walkers_get_along() -> None:
+def test_scripted_pedestrians_reach_80_percent_of_their_desired_speed() -> None:
     world = World(Corridor(learners=1), 8)
     world.reset(2)
     for _ in range(150):
@@ -157,18 +157,18 @@ def test_scripted_walkers_get_along() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fields", "said"),
+    ("fields", "message"),
     [({"people": 1}, "people = 1"), ({"people": 150}, "people = 150"), ({"sight": 7.0}, "sight = 7"),
      ({"people": 4, "learners": 5}, "learners = 5")],
 )  # fmt: skip
-def test_what_it_cannot_be_is_refused_in_one_line(fields: dict[str, Any], said: str) -> None:
+def test_invalid_fields_are_refused_in_one_line(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=r".") as caught:
         Corridor(**fields)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_pictures_tell_the_two_directions_apart() -> None:
+def test_snapshot_has_a_role_for_each_direction() -> None:
     world = world_of(Corridor(people=8, learners=6), seed=3)
     moved = world.snapshot()
     east = np.array(world.memory[0, 0] > 0)

@@ -1,4 +1,4 @@
-"""Crossing: exact questions to hand-made states, and what its walkers, scripted and hand-written, must do."""
+"""Crossing: rewards, measures and observations of hand-made states, and scripted and hand-written walkers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ from tests.test_tasks import act, paid, place, random_actions, world_of
 
 
 def walk(gap: float, first: Any, second: Any, **more: Any) -> tuple[World, dict[str, float], dict[str, float]]:
-    """Two walkers side by side in the middle, `gap` m apart, after one step; velocities (along, left) of each."""
+    """Return a world after one step of two walkers in the middle, `gap` m apart, and their rewards.
+
+    first, second: velocities (along, left).
+    """
     world = world_of(Crossing(agents=2, jitter=0.0, **more))
     course = world._memory[2:4, 0].T
     left = np.stack([-course[:, 1], course[:, 0]], axis=1)
@@ -27,7 +30,7 @@ def walk(gap: float, first: Any, second: Any, **more: Any) -> tuple[World, dict[
     return world, paid(world, step, 0), paid(world, step, 1)
 
 
-def test_walkers_begin_around_a_circle_opposite_their_goals() -> None:
+def test_walkers_start_on_a_circle_opposite_their_goals() -> None:
     world = world_of(Crossing(), worlds=20)
     pos, goal, course = world.state.pos, *(world._memory[k : k + 2].transpose(1, 2, 0) for k in (0, 2))
     np.testing.assert_allclose(goal, -pos)
@@ -38,8 +41,8 @@ def test_walkers_begin_around_a_circle_opposite_their_goals() -> None:
     assert np.unique(pos[:, 0], axis=0).shape == (20, 2)
 
 
-def test_walkers_are_paid_as_on_paper() -> None:
-    """One at 2 m/s towards its goal, 6 m away; one at 1 m/s away from it; 3 m apart."""
+def test_reward_terms_equal_values_calculated_by_hand() -> None:
+    """3 m apart: one walks at 2 m/s towards its goal 6 m away, one at 1 m/s away from its goal."""
     _, a, b = walk(3.0, (2, 0), (-1, 0))
     expected = [0.5 * 0.2, 0, 0, -0.05, 0]
     np.testing.assert_allclose([a[name] for name in Crossing.terms], expected, atol=1e-9)
@@ -48,17 +51,17 @@ def test_walkers_are_paid_as_on_paper() -> None:
     assert paid(world, act(world, [0.6, 0.8]))["effort"] == pytest.approx(-0.1 * 0.1)
 
 
-def test_walkers_that_touch_pay_as_long_as_it_lasts_and_count_once() -> None:
+def test_contact_costs_in_every_decision_and_counts_once() -> None:
     world, a, b = walk(0.5, (0, 0), (0, 0))
     assert a["touch"] == b["touch"] == pytest.approx(-10 * 0.1)
-    assert world.measure()["collisions"] == 0  # it was there before
-    world, _, _ = walk(0.55, (0, 0), (0, 1))  # the other comes from 0.65 m
+    assert world.measure()["collisions"] == 0  # in contact before the step
+    world, _, _ = walk(0.55, (0, 0), (0, 1))  # the other walker comes from 0.65 m
     assert world.measure()["collisions"] == 1
     act(world)
     assert world.measure()["collisions"] == 1
 
 
-def test_who_leaves_the_goal_gives_back_what_arriving_paid() -> None:
+def test_leaving_the_goal_costs_the_reward_for_arrival() -> None:
     world = world_of(Crossing(agents=2))
     goal, course = world._memory[:2, 0].T.copy(), world._memory[2:4, 0].T.copy()
     place(world, [goal[0] - 0.5 * course[0], [0, 0]], [2 * course[0], [0, 0]])
@@ -71,7 +74,7 @@ def test_who_leaves_the_goal_gives_back_what_arriving_paid() -> None:
     assert terms["time"] == pytest.approx(-0.05)
 
 
-def test_it_ends_for_all_when_all_are_there() -> None:
+def test_episode_ends_for_all_when_all_have_arrived() -> None:
     world = world_of(Crossing(agents=3))
     goal = world._memory[:2, 0].T.copy()
     place(world, [goal[0], goal[1], goal[2] * 0.9])
@@ -86,7 +89,7 @@ def test_it_ends_for_all_when_all_are_there() -> None:
     assert world.measure()["arrived"] == 1
 
 
-def test_path_efficiency_is_what_is_gained_of_what_is_walked() -> None:
+def test_path_efficiency_is_progress_over_path_length() -> None:
     world, _, _ = walk(0.0, (0.8, 0.6), (0.8, -0.6))  # both end in the middle
     assert world.measure()["path_efficiency"] == pytest.approx((math.hypot(6.08, 0.06) - 6) / 0.1)
     world = world_of(Crossing(agents=1))
@@ -95,7 +98,7 @@ def test_path_efficiency_is_what_is_gained_of_what_is_walked() -> None:
     assert world.measure()["path_efficiency"] == pytest.approx(1)
 
 
-def test_a_walker_sees_what_is_there_in_the_frame_of_its_course() -> None:
+def test_observation_is_in_the_frame_of_the_course() -> None:
     world = world_of(Crossing())
     for actions in random_actions(world, 15):
         step = world.step(actions)
@@ -117,8 +120,8 @@ def test_a_walker_sees_what_is_there_in_the_frame_of_its_course() -> None:
         np.testing.assert_array_equal(seen.neighbour_present[i], [1] * n + [0] * (task.neighbours - n))  # type: ignore[attr-defined]
 
 
-def test_scripted_walkers_cross_without_a_touch() -> None:
-    """The learner stays where he is; the others touch nobody, and get to their goals but for who finds him there."""
+def test_scripted_walkers_cross_without_contact() -> None:
+    """The learner rests. All others arrive, except agent 4, whose goal is there."""
     world = world_of(Crossing(agents=8, learners=1), worlds=4)
     least = np.inf
     for _ in range(150):
@@ -130,7 +133,7 @@ def test_scripted_walkers_cross_without_a_touch() -> None:
     assert np.delete(left, [0, 4], axis=1).max() < 0.1
 
 
-def test_hand_written_walkers_arrive_and_orca_touches_nobody() -> None:
+def test_hand_written_players_arrive_and_orca_has_no_collision() -> None:
     task = Crossing()
     orca = rollout(task, player(task, name="orca"), 16, worlds_for("tuning", 0, 16))
     rules = rollout(task, player(task, name="textbook"), 16, worlds_for("tuning", 0, 16))

@@ -1,4 +1,4 @@
-"""CrowdNav: who sees whom, what is paid and what ends it, and whether players get through."""
+"""CrowdNav: visibility, rewards, ends of episodes, and whether players reach the goal."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ from tests.test_tasks import act, paid, place, random_actions, world_of
 
 
 def meeting(offset: Any, velocity: Any = (0.0, 0.0), **more: Any) -> World:
-    """The robot 3 m before its goal, a pedestrian where he wants to be, and one far away; vectors are (along, left)."""
+    """Return a world: the robot 3 m before its goal, a pedestrian at its own goal, and one far away.
+
+    Vectors are (along, left).
+    """
     world = world_of(CrowdNav(people=2, **more))
     goal, course = world._memory[:2, 0, 0].copy(), world._memory[2:4, 0, 0].copy()
     axes = np.array([course, [-course[1], course[0]]])
@@ -28,7 +31,7 @@ def meeting(offset: Any, velocity: Any = (0.0, 0.0), **more: Any) -> World:
     return world
 
 
-def test_everybody_begins_around_a_circle_opposite_his_goal() -> None:
+def test_agents_start_on_a_circle_opposite_their_goals() -> None:
     world = world_of(CrowdNav(), worlds=20)
     pos, goal = world.state.pos, world._memory[:2].transpose(1, 2, 0)
     np.testing.assert_allclose(goal[:, 0], -pos[:, 0])
@@ -39,15 +42,15 @@ def test_everybody_begins_around_a_circle_opposite_his_goal() -> None:
     assert not world.state.vel.any()
 
 
-def test_getting_nearer_pays_and_time_costs() -> None:
+def test_progress_is_rewarded_and_time_costs() -> None:
     world = meeting((0, 30), (1, 0))
     terms = paid(world, act(world))
     expected = {"progress": 0.5 * 0.1, "success": 0, "collision": 0, "discomfort": 0, "time": -0.02}
     assert terms == pytest.approx(expected, abs=1e-9)
 
 
-def test_too_near_costs_by_how_much_and_how_long() -> None:
-    """Bodies of 0.3 m and 0.25 m, 0.65 m apart: 0.1 m less than is comfortable, for 0.1 s."""
+def test_discomfort_cost_is_proportional_to_its_depth_and_duration() -> None:
+    """Bodies of 0.3 m and 0.25 m, 0.65 m apart: the gap is 0.1 m too small for 0.1 s."""
     world = meeting((0, 0.65))
     step = act(world)
     assert paid(world, step)["discomfort"] == pytest.approx(-10 * 0.1 * 0.1)
@@ -61,7 +64,7 @@ def test_too_near_costs_by_how_much_and_how_long() -> None:
     assert world.measure()["discomfort"] == 0
 
 
-def test_a_touch_ends_it_also_between_the_ends_of_a_decision() -> None:
+def test_collision_within_a_decision_ends_the_episode() -> None:
     world = meeting((0.067, 0.549), (1.34, 0))  # 0.553 m apart before and after, 0.549 m between
     step = act(world)
     terms = paid(world, step)
@@ -76,7 +79,7 @@ def test_a_touch_ends_it_also_between_the_ends_of_a_decision() -> None:
     assert not act(world).terminated.any()
 
 
-def test_the_goal_ends_it_with_success_and_a_touch_there_does_not() -> None:
+def test_goal_ends_the_episode_with_success_unless_there_is_a_collision() -> None:
     for beside, success in ((5.0, True), (0.45, False)):
         world = meeting((0, 5.0), (1, 0))
         goal, course = world._memory[:2, 0, 0].copy(), world._memory[2:4, 0, 0].copy()
@@ -91,7 +94,7 @@ def test_the_goal_ends_it_with_success_and_a_touch_there_does_not() -> None:
         assert world.measure()["time_to_goal"] == pytest.approx(0.1) if success else world.measure()["collided"] == 1
 
 
-def test_who_neither_arrives_nor_touches_has_timed_out() -> None:
+def test_episode_without_arrival_or_collision_has_timed_out() -> None:
     world = meeting((0, 30), (0, 1))
     for _ in range(5):
         act(world)
@@ -101,7 +104,7 @@ def test_who_neither_arrives_nor_touches_has_timed_out() -> None:
 
 
 def crowds(**fields: Any) -> list[np.ndarray]:
-    """Where the crowd is after 8 s, of a robot that stays and of one that walks through it."""
+    """Return positions of the crowd after 8 s, with a robot at rest and with one that walks through it."""
     found = []
     for action in ((0.0, 0.0), (0.4, 0.1)):
         world = World(CrowdNav(**fields), 4)
@@ -113,14 +116,14 @@ def crowds(**fields: Any) -> list[np.ndarray]:
 
 
 @pytest.mark.slow
-def test_an_invisible_robot_does_not_change_the_crowd_and_a_visible_one_does() -> None:
+def test_crowd_reacts_to_a_visible_robot_only() -> None:
     still, through = crowds()
     np.testing.assert_array_equal(still, through)
     still, through = crowds(visible=True)
     assert np.abs(still - through).max() > 0.05
 
 
-def test_rewards_do_not_touch_what_happens() -> None:
+def test_rewards_do_not_change_the_motion() -> None:
     free = {name: 0.0 for name in CrowdNav.model_fields if name.endswith(("_reward", "_cost"))}
     assert len(free) == 5
     worlds = world_of(CrowdNav()), world_of(CrowdNav(**free))
@@ -131,7 +134,7 @@ def test_rewards_do_not_touch_what_happens() -> None:
     np.testing.assert_array_equal(worlds[0].state.pos, worlds[1].state.pos)
 
 
-def test_the_robot_sees_what_is_there_in_the_frame_of_its_course() -> None:
+def test_observation_is_in_the_frame_of_the_robot_s_course() -> None:
     world = world_of(CrowdNav())
     for _ in range(35):
         step = act(world, (0.3, 0.1))
@@ -154,12 +157,12 @@ def test_the_robot_sees_what_is_there_in_the_frame_of_its_course() -> None:
     np.testing.assert_array_equal(seen.neighbour_present[0], [1] * n + [0] * (task.neighbours - n))
 
 
-def test_the_crowd_gets_across_without_walking_into_each_other() -> None:
+def test_crowd_crosses_without_deep_overlap() -> None:
     world = World(CrowdNav(), 32)
     world.reset(1)
-    least, nobody = np.full(32, 9.0), np.zeros((32, 1, 2))
+    least, rest = np.full(32, 9.0), np.zeros((32, 1, 2))
     for _ in range(250):
-        world.step(nobody)
+        world.step(rest)
         pos = world.state.pos[:, 1:]
         gaps = np.linalg.norm(pos[:, :, None] - pos[:, None], axis=3) + 9 * np.eye(10)
         least = np.minimum(least, gaps.min(axis=(1, 2)))
@@ -168,8 +171,8 @@ def test_the_crowd_gets_across_without_walking_into_each_other() -> None:
     assert np.median(least) > 0.35  # bodies are 0.5 m wide: shoulders brush
 
 
-def test_orca_and_the_shipped_policy_get_through_and_social_force_does_not() -> None:
-    """The crowd makes no way: who counts on that, as a pedestrian does, is run into."""
+def test_orca_and_the_shipped_policy_reach_the_goal_and_social_force_does_not() -> None:
+    """The crowd does not see the robot, so the social force model, which relies on mutual avoidance, collides."""
     task, first = CrowdNav(), worlds_for("tuning", 7, 48)
     players = {
         "force": player(task, name="textbook"),
@@ -184,11 +187,11 @@ def test_orca_and_the_shipped_policy_get_through_and_social_force_does_not() -> 
 
 
 @pytest.mark.parametrize(
-    ("fields", "said"),
+    ("fields", "message"),
     [({"people": 0}, "people = 0"), ({"people": 60}, "circle = 6"), ({"crowd": "helbing"}, "crowd = 'helbing'")],
 )
-def test_what_it_cannot_be_is_refused_in_one_line(fields: dict[str, Any], said: str) -> None:
+def test_invalid_fields_are_refused_in_one_line(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=r".") as caught:
         CrowdNav(**fields)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
