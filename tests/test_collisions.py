@@ -1,4 +1,4 @@
-"""Hard collisions: closed forms, conservation, and what must not depend on numbering, batches, threads or place."""
+"""Collisions: closed forms, conservation, and independence of numbering, batches, threads and position."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def scene(
     obstacles: tuple[Any, ...] = (), space: Space | None = None, method: Integrator | None = None,
     dtype: str = "float64", **more: Any,
 ) -> Scene:  # fmt: skip
-    """Discs under gravity: one kernel for a method, a space and a precision."""
+    """Return discs under gravity; scenes of equal method, space and precision share one kernel."""
     spawn = Spawn(low=(0, 0), high=(1, 1))
     return Scene(
         groups=tuple(Group(count=1, mass=float(m), radius=radius, spawn=spawn) for m in masses),
@@ -59,7 +59,7 @@ def energy(of: Scene, state: State, g: float = 0.0) -> float:
 
 
 def gas(response: str, e: float, count: int = 40, order: Any = None, offset: float = 0.0, **more: Any) -> Any:
-    """Discs of different masses on a lattice, with random velocities; and their scene."""
+    """Return a scene and a state of discs of different masses on a lattice, with random velocities."""
     rng, edge = np.random.default_rng(3), 4.0
     side = math.ceil(math.sqrt(count))
     lattice = np.stack(np.meshgrid(np.arange(side), np.arange(side)), -1).reshape(-1, 2)[:count]
@@ -79,10 +79,10 @@ def walls(offset: float = 0.0) -> tuple[Wall, ...]:
 
 @pytest.mark.parametrize("response", IN_TIME)
 @pytest.mark.parametrize("method", [SemiImplicitEuler(), VelocityVerlet(), RK4()], ids=lambda m: m.kind)
-def test_an_elastic_ball_bounces_a_hundred_times_as_high(response: str, method: Integrator) -> None:
+def test_elastic_ball_keeps_its_height_over_a_hundred_bounces(response: str, method: Integrator) -> None:
     of = scene([1], response, g=G, dt=0.02, obstacles=FLOOR, method=method)
     state = begun(of, [(0, 1 + R)], [(1, 0)])
-    # velocity and place of a method of order 1 are half a step apart
+    # the velocity of a method of order 1 is half a step ahead of its position
     ahead = G * of.dt / 2 if method.order == 1 else 0.0
 
     def height() -> float:
@@ -99,13 +99,13 @@ def test_an_elastic_ball_bounces_a_hundred_times_as_high(response: str, method: 
 @pytest.mark.parametrize("response", IN_TIME)
 @pytest.mark.parametrize(("e", "seconds"), [(0.5, 1.354571), (0.8, 4.063713)])
 @pytest.mark.parametrize("phase", [0.0, 0.3, 0.77])
-def test_a_ball_comes_to_rest_when_the_series_of_its_hops_ends(
+def test_ball_comes_to_rest_when_the_series_of_bounces_converges(
     response: str, e: float, seconds: float, phase: float
 ) -> None:
     dt = 0.02
     of = scene([1], response, e=e, g=G, dt=dt, obstacles=FLOOR)
-    away = phase * dt  # it has been falling for so long
-    state = begun(of, [(0, 1 + R - G * away**2 / 2)], [(0, -G * away + G * dt / 2)])  # half a step apart
+    away = phase * dt  # time since the ball began to fall
+    state = begun(of, [(0, 1 + R - G * away**2 / 2)], [(0, -G * away + G * dt / 2)])  # velocity half a step ahead
     state = of.run(state, math.floor((seconds - away) / dt) - 1)
     assert state.vel[0, 0, 1] != 0
     state = of.run(state, 3)
@@ -137,7 +137,7 @@ def test_newton_s_cradle(response: str, gap: float, sign: int, masses: Any, befo
 
 @pytest.mark.parametrize("ratio", [1e3, 1e6, 1e12])
 @pytest.mark.parametrize("response", EXACT)
-def test_a_light_body_and_a_heavy_one_obey_the_closed_form(response: str, ratio: float) -> None:
+def test_collision_of_a_light_and_a_heavy_body_has_the_closed_form(response: str, ratio: float) -> None:
     of = scene([1, ratio], response)
     end = of.run(begun(of, [(0, 0), (1, 0)], [(3, 0), (0, 0)]), 40)
     v = end.vel[0, :, 0]
@@ -147,7 +147,7 @@ def test_a_light_body_and_a_heavy_one_obey_the_closed_form(response: str, ratio:
 
 
 @pytest.mark.parametrize("response", EXACT)
-def test_equal_balls_part_at_a_right_angle(response: str) -> None:
+def test_equal_balls_separate_at_a_right_angle(response: str) -> None:
     of = scene([1, 1], response)
     end = of.run(begun(of, [(0, 0), (1, 0.08)], [(2, 0), (0, 0)]), 80)
     a, b = end.vel[0]
@@ -155,7 +155,7 @@ def test_equal_balls_part_at_a_right_angle(response: str) -> None:
 
 
 @pytest.mark.parametrize("response", EXACT)
-def test_on_an_incline_it_sticks_up_to_the_angle_of_friction(response: str) -> None:
+def test_body_on_an_incline_rests_up_to_the_angle_of_friction(response: str) -> None:
     for degrees in (16.6, 16.8, 30.0):
         angle = math.radians(degrees)
         out = np.array([-math.sin(angle), math.cos(angle)])
@@ -168,13 +168,13 @@ def test_on_an_incline_it_sticks_up_to_the_angle_of_friction(response: str) -> N
             assert moved < 1e-9
         else:
             assert abs(np.linalg.norm(end.vel[0, 0]) / pull - 1) < 1e-9
-            assert abs(moved / (pull / 2) - 1) < (1e-9 if response in IN_TIME else 0.0101)  # half a step of Euler's
+            assert abs(moved / (pull / 2) - 1) < (1e-9 if response in IN_TIME else 0.0101)  # half a step, by Euler
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("response", EXACT)
 @pytest.mark.parametrize("method", [VelocityVerlet(), RK4()], ids=lambda m: m.kind)
-def test_what_rests_creeps_under_no_method(response: str, method: Integrator) -> None:
+def test_resting_body_does_not_creep(response: str, method: Integrator) -> None:
     out = np.array([-math.sin(0.2), math.cos(0.2)])
     plane = (HalfSpace(point=(0.0, 0.0), direction=tuple(out)),)
     of = scene([1], response, e=0.3, g=G, dt=0.02, obstacles=plane, friction=0.3, method=method)
@@ -183,7 +183,7 @@ def test_what_rests_creeps_under_no_method(response: str, method: Integrator) ->
 
 
 @pytest.mark.parametrize(("response", "dt"), [("earliest", 0.01), ("back_up", 0.01), ("impulses", 0.005)])
-def test_friction_stops_it_where_it_should_and_does_not_turn_it_round(response: str, dt: float) -> None:
+def test_friction_stops_a_body_at_the_calculated_place_without_reversal(response: str, dt: float) -> None:
     of = scene([1], response, e=0.0, g=G, dt=dt, obstacles=FLOOR, friction=0.4)
     end = of.run(begun(of, [(0, R)], [(3, 0)]), round(2 / dt))
     assert abs(end.pos[0, 0, 0] / 1.14679 - 1) < 0.01
@@ -192,7 +192,7 @@ def test_friction_stops_it_where_it_should_and_does_not_turn_it_round(response: 
 
 @pytest.mark.parametrize("response", ["earliest", "impulses"])
 @pytest.mark.parametrize("e", [0.0, 0.5])
-def test_a_stack_of_ten_lies_still(response: str, e: float) -> None:
+def test_stack_of_ten_rests(response: str, e: float) -> None:
     of = scene([1] * 10, response, e=e, g=G, dt=1 / 60, obstacles=FLOOR)
     state = begun(of, [(0, R + 2 * R * k) for k in range(10)], np.zeros((10, 2)))
     end = of.run(state, 1200)
@@ -200,13 +200,13 @@ def test_a_stack_of_ten_lies_still(response: str, e: float) -> None:
     assert np.abs(end.vel).max() <= G * of.dt
 
 
-def test_a_billiard_ball_is_where_unfolding_the_table_says() -> None:
+def test_position_of_a_billiard_ball_equals_the_unfolded_path() -> None:
     of = scene([1], radius=0.0, space=Box(size=(1, 1), restitution=1.0))
     end = of.run(begun(of, [(0.37, 0.2)], [(3.3, 0)]), 1000)
     assert abs(end.pos[0, 0, 0] - 0.63) < 1e-9 and end.counted("impacts") == 33
 
 
-# --- nothing is missed ------------------------------------------------------------------------------------------------
+# --- no impact is missed ----------------------------------------------------------------------------------------------
 
 AIMED = [(phase / 16, math.radians(-40 + 80 * k / 7)) for phase in range(16) for k in range(8)]
 
@@ -224,12 +224,14 @@ AIMED = [(phase / 16, math.radians(-40 + 80 * k / 7)) for phase in range(16) for
     ],
     ids=["wall", "moving wall", "block", "corner of walls", "corner of a polygon"],
 )  # fmt: skip
-def test_no_bullet_goes_through(response: str, obstacle: Any, turn: float, home: tuple[float, float]) -> None:
+def test_fast_body_does_not_tunnel_through_an_obstacle(
+    response: str, obstacle: Any, turn: float, home: tuple[float, float]
+) -> None:
     of = scene([1] * len(AIMED), response, e=0.5, dt=1 / 60, obstacles=(obstacle,), agents=False)
-    ways = np.array([(math.cos(a + math.radians(turn)), math.sin(a + math.radians(turn))) for _, a in AIMED])
-    ways = np.clip(ways, 0.05, None) if turn else ways
+    directions = np.array([(math.cos(a + math.radians(turn)), math.sin(a + math.radians(turn))) for _, a in AIMED])
+    directions = np.clip(directions, 0.05, None) if turn else directions
     back = np.array([2 + 200 / 60 * phase for phase, _ in AIMED])[:, None]
-    state = begun(of, np.array(home) - back * ways, 200 * ways)
+    state = begun(of, np.array(home) - back * directions, 200 * directions)
     end = of.run(state, 5)
     u = np.array(getattr(obstacle, "velocity", None) or (0.0, 0.0))
     here = end.pos[0] - u * end.time[0]
@@ -239,7 +241,7 @@ def test_no_bullet_goes_through(response: str, obstacle: Any, turn: float, home:
 
 
 @pytest.mark.parametrize("response", IN_TIME)
-def test_two_bullets_do_not_pass_each_other(response: str) -> None:
+def test_fast_bodies_do_not_pass_through_each_other(response: str) -> None:
     of = scene([1, 1], response, dt=1 / 60)
     for phase in range(16):
         end = of.run(begun(of, [(-5 - phase * 0.21, 0), (5, 0)], [(200, 0), (-200, 0)]), 6)
@@ -247,8 +249,8 @@ def test_two_bullets_do_not_pass_each_other(response: str) -> None:
         np.testing.assert_allclose(end.vel[0, :, 0], [-200, 200], rtol=1e-12)
 
 
-def test_who_goes_far_round_a_torus_in_a_step_gains_no_energy_and_is_told_of() -> None:
-    """Ways of more than half of its edge, 4 m: what is met is met on the way there, not on the shorter one back."""
+def test_step_over_a_quarter_of_the_torus_keeps_energy_and_raises_a_warning() -> None:
+    """Some steps exceed half the edge of 4 m; impacts are on the actual path, not on the shorter one across the edge."""
     post = (Circle(centre=(1.0, 2.0), radius=0.2),)
     of = scene([1, 1], dt=1 / 60, space=Torus(size=(4.0, 4.0)), obstacles=post)
     with warnings.catch_warnings(record=True) as caught:
@@ -257,14 +259,14 @@ def test_who_goes_far_round_a_torus_in_a_step_gains_no_energy_and_is_told_of() -
             state = begun(of, [(0.5, 2.0), (0.3, 2.0)], [(speed, 1.0), (0.0, 0.0)])
             end = of.run(state, 3)
             np.testing.assert_allclose(energy(of, end), energy(of, state), rtol=1e-12)
-            assert end.counted("unsolved") == 3, speed  # more than a quarter in each
+            assert end.counted("unsolved") == 3, speed  # each step exceeds a quarter
         slow = of.run(begun(of, [(0.5, 2.0), (0.3, 2.0)], [(50.0, 1.0), (0.0, 0.0)]), 3)
         assert slow.counted("unsolved") == 0
     assert ["further than a quarter of the torus" in str(w.message) for w in caught] == [True]
 
 
-def test_who_is_hit_meets_who_was_out_of_its_reach() -> None:
-    """One that lies still is sent through the whole row by one that comes fast, within one step."""
+def test_chain_of_impacts_within_one_step_includes_distant_bodies() -> None:
+    """A fast body hits a row at rest; the impact passes through all of it in one step."""
     of = scene([1] * 6, dt=0.1)
     end = of.run(begun(of, [(0.5 * k, 0) for k in range(6)], [(40, 0)] + [(0, 0)] * 5), 1)
     np.testing.assert_allclose(end.vel[0, :, 0], [0, 0, 0, 0, 0, 40], atol=1e-9)
@@ -272,24 +274,24 @@ def test_who_is_hit_meets_who_was_out_of_its_reach() -> None:
 
 @pytest.mark.parametrize("period", [0.0, 4.0])
 @pytest.mark.parametrize("count", [5, 60, 500])
-def test_pairs_that_may_meet_are_the_oracle_s(count: int, period: float) -> None:
+def test_candidate_pairs_equal_those_of_brute_force(count: int, period: float) -> None:
     rng = np.random.default_rng(count)
     at, radius, living = rng.uniform(0, 4, (count, 2)), rng.uniform(0.01, 0.06, count), rng.random(count) > 0.1
-    reach = np.where(rng.random(count) > 0.98, 1.0, 0.01)  # a few go far
-    places, who = 50_000, np.zeros(50_000, np.int64)
-    other, whole = np.zeros(places, np.int64), np.int32
+    reach = np.where(rng.random(count) > 0.98, 1.0, 0.01)  # a few move far
+    places, one = 50_000, np.zeros(50_000, np.int64)
+    other, int32 = np.zeros(places, np.int64), np.int32
     scratch = (
-        np.zeros(max(count, 64), np.int64), np.zeros(count, whole), np.zeros(count, whole), np.zeros(count + 1, whole),
-        np.zeros((1, count), whole), np.zeros((1, 6)), np.zeros(8, np.int64), np.zeros((27, 3), np.int64),
+        np.zeros(max(count, 64), np.int64), np.zeros(count, int32), np.zeros(count, int32), np.zeros(count + 1, int32),
+        np.zeros((1, count), int32), np.zeros((1, 6)), np.zeros(8, np.int64), np.zeros((27, 3), np.int64),
     )  # fmt: skip
-    found = entry(nearby)((period,) * 2, at, living.astype(np.int64), radius, reach, count, *scratch, who, other)
+    found = entry(nearby)((period,) * 2, at, living.astype(np.int64), radius, reach, count, *scratch, one, other)
     d = at[:, None] - at[None]
     d -= period * np.floor(d / period + 0.5) if period else 0.0
     room = radius[:, None] + radius[None] + reach[:, None] + reach[None]
     near = (np.linalg.norm(d, axis=-1) <= room) & living[:, None] & living[None]
     expected = {(i, j) for i, j in np.argwhere(near).tolist() if i < j}
     assert found == len(expected)
-    assert set(zip(who[:found].tolist(), other[:found].tolist(), strict=True)) == expected
+    assert set(zip(one[:found].tolist(), other[:found].tolist(), strict=True)) == expected
 
 
 # --- conservation and symmetry ----------------------------------------------------------------------------------------
@@ -297,7 +299,7 @@ def test_pairs_that_may_meet_are_the_oracle_s(count: int, period: float) -> None
 
 @pytest.mark.parametrize("response", ALL)
 @pytest.mark.parametrize("e", [1.0, 0.6])
-def test_a_gas_keeps_its_momentum_and_never_gains_energy(response: str, e: float) -> None:
+def test_gas_conserves_momentum_and_never_gains_energy(response: str, e: float) -> None:
     of, state = gas(response, e, space=Torus(size=(4, 4)))
     mass = of.body.mass[:, None]
     last, first = energy(of, state), energy(of, state)
@@ -316,7 +318,7 @@ def test_a_gas_keeps_its_momentum_and_never_gains_energy(response: str, e: float
 
 
 @pytest.mark.parametrize("response", EXACT)
-def test_numbers_of_bodies_mean_nothing(response: str) -> None:
+def test_collisions_do_not_depend_on_the_order_of_bodies(response: str) -> None:
     order = np.random.default_rng(1).permutation(40)
     (one, a), (other, b) = (gas(response, 0.9, order=o, space=Torus(size=(4, 4))) for o in (None, order))
     np.testing.assert_allclose(other.run(b, 100).pos[0], one.run(a, 100).pos[0][order], rtol=0, atol=1e-9)
@@ -324,15 +326,15 @@ def test_numbers_of_bodies_mean_nothing(response: str) -> None:
 
 @pytest.mark.parametrize("response", EXACT)
 @pytest.mark.parametrize("offset", [1e4, 1e7])
-def test_it_is_the_same_far_away(response: str, offset: float) -> None:
+def test_collisions_far_from_the_origin_equal_those_near_it(response: str, offset: float) -> None:
     (near, a), (far, b) = (gas(response, 0.9, offset=o, obstacles=walls(o)) for o in (0.0, offset))
-    steps = 20 if offset > 1e6 else 40  # a gas forgets a rounding of 1e-9 m no longer than that
+    steps = 20 if offset > 1e6 else 40  # chaos amplifies a rounding of 1e-9 m in more steps
     np.testing.assert_allclose(far.run(b, steps).pos - offset, near.run(a, steps).pos, rtol=0, atol=1e-6)
     assert near.run(a, steps).counted("impacts") > 10
 
 
 @pytest.mark.slow
-def test_worlds_and_threads_do_not_know_of_each_other() -> None:
+def test_worlds_and_threads_are_independent() -> None:
     of, state = gas("earliest", 0.8, obstacles=walls())
     batch = of.start(0, worlds=120)
     rng = np.random.default_rng(0)
@@ -356,19 +358,19 @@ def test_worlds_and_threads_do_not_know_of_each_other() -> None:
 
 @pytest.mark.filterwarnings("default::flockenv.core.warnings.UnsolvedContactsWarning")
 @pytest.mark.parametrize("response", EXACT)
-def test_fifty_in_one_place_part_in_no_preferred_direction(response: str) -> None:
+def test_fifty_bodies_in_one_place_separate_in_no_preferred_direction(response: str) -> None:
     of = scene([1] * 50, response, e=0.5)
     end = of.run(begun(of, np.zeros((50, 2)), np.zeros((50, 2))), 100)
     apart = np.linalg.norm(end.pos[0][:, None] - end.pos[0][None], axis=-1) + 9 * np.eye(50)
     assert apart.min() > 2 * R * (1 - 1e-9)
-    assert np.abs(end.vel).max() == 0  # nobody is shot away
+    assert np.abs(end.vel).max() == 0  # the separation adds no velocity
     assert np.linalg.norm(end.pos[0].mean(axis=0)) < 1e-12
     slow = scene([1] * 50, response, e=0.5, part_speed=1.0)
     after = slow.run(begun(slow, np.zeros((50, 2)), np.zeros((50, 2))), 1)
     assert 0 < np.abs(after.pos).max() <= 49 * 1.0 * slow.dt
 
 
-def test_who_is_held_or_dead_is_not_moved_and_dead_ones_meet_nobody() -> None:
+def test_dead_bodies_do_not_move_or_collide() -> None:
     of = scene([1, 1, 1])
     state = begun(of, [(0, 0), (0.5, 0), (1.0, 0)], [(5, 0), (0, 0), (0, 0)])
     state.alive[0, 1] = False
@@ -377,7 +379,7 @@ def test_who_is_held_or_dead_is_not_moved_and_dead_ones_meet_nobody() -> None:
     assert end.vel[0, 2, 0] == pytest.approx(5) and end.counted("impacts") == 1
 
 
-def test_what_is_sticky_stays_where_it_falls() -> None:
+def test_sticky_bodies_stay_at_the_point_of_impact() -> None:
     roof = (*FLOOR, Block(centre=(0.0, 1.0), size=(2.0, 0.2)))
     of = scene([1] * 3, e=1.0, g=G, obstacles=roof, sticky=True)
     end = of.run(begun(of, [(-0.5, 3), (0.5, 4), (4, 2)], [(0, -1), (0.5, 0), (1, 0)]), 200)
@@ -385,7 +387,7 @@ def test_what_is_sticky_stays_where_it_falls() -> None:
     np.testing.assert_array_equal(of.run(end, 100).pos, end.pos)
 
 
-def test_in_a_hollow_sphere_it_stays_and_keeps_its_energy() -> None:
+def test_gas_in_a_hollow_sphere_stays_inside_and_conserves_energy() -> None:
     shell = Circle(centre=(0.0, 0.0), radius=2.0, hollow=True)
     of, state = gas("earliest", 1.0, count=16, obstacles=(shell,))
     state = state.with_motion(0.5 * (state.pos - 2.0), state.vel)
@@ -395,7 +397,7 @@ def test_in_a_hollow_sphere_it_stays_and_keeps_its_energy() -> None:
 
 
 @pytest.mark.slow
-def test_in_space_it_is_the_same() -> None:
+def test_gas_in_3d_conserves_energy_and_stays_in_the_box() -> None:
     rng = np.random.default_rng(5)
     spawn = Spawn(low=(0, 0, 0), high=(1, 1, 1))
     of = Scene(
@@ -411,17 +413,17 @@ def test_in_space_it_is_the_same() -> None:
 
 
 @pytest.mark.slow
-def test_in_single_precision_it_does_the_same_for_a_while() -> None:
+def test_single_precision_follows_double_precision_for_30_steps() -> None:
     (double, a), (single, b) = (gas("earliest", 0.8, obstacles=walls(), dtype=t) for t in ("float64", "float32"))
     end = single.run(b, 30)
     assert end.x.dtype == np.float32
     np.testing.assert_allclose(end.pos, double.run(a, 30).pos, atol=2e-4)
 
 
-# --- what it costs, and what it says ----------------------------------------------------------------------------------
+# --- cost and messages ------------------------------------------------------------------------------------------------
 
 
-def test_collisions_ask_once_per_step_and_scenes_without_them_never() -> None:
+def test_collisions_make_one_neighbour_query_per_step() -> None:
     of, state = gas("earliest", 1.0, space=Torus(size=(4, 4)))
     assert of.run(state, 7).counted("neighbour_queries") == 7
     bare = of.model_copy(update={"constraints": ()})
@@ -431,7 +433,7 @@ def test_collisions_ask_once_per_step_and_scenes_without_them_never() -> None:
     assert walls_only.run(state, 7).counted("neighbour_queries") == 0
 
 
-def test_an_explanation_says_who_asks_for_what() -> None:
+def test_explain_lists_the_neighbour_query_of_collisions() -> None:
     found = explain(scene([1, 1], obstacles=FLOOR, space=Box(size=(4, 4))))
     assert found.work["neighbour_queries"] == 1
     assert not [line for line in found.left_out if line.startswith(("neighbour query", "pass over obstacles"))]
@@ -441,26 +443,26 @@ def test_an_explanation_says_who_asks_for_what() -> None:
     assert "neighbour query: no effect needs neighbours" in alone.left_out
 
 
-def test_who_meets_nobody_flies_as_if_nothing_was() -> None:
+def test_motion_without_impacts_is_unchanged_by_the_constraint() -> None:
     of, state = gas("earliest", 1.0, count=4, g=G)
     bare = of.model_copy(update={"constraints": ()})
     np.testing.assert_array_equal(of.run(state, 3).x, bare.run(state, 3).x)
     np.testing.assert_array_equal(of.run(state, 3).v, bare.run(state, 3).v)
 
 
-def test_a_cap_that_bites_is_reported_once() -> None:
+def test_unsolved_contacts_raise_one_warning() -> None:
     of = scene([1] * 12, g=G, e=0.9, obstacles=FLOOR, most=1, passes=1)
     state = begun(of, [(0, R + 2 * R * k) for k in range(12)], [(0, -3)] * 12)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         end = of.run(state, 20)
-    told = [str(w.message) for w in caught if issubclass(w.category, UnsolvedContactsWarning)]
-    assert len(told) == 1 and "most = 1 and passes = 1" in told[0]
+    messages = [str(w.message) for w in caught if issubclass(w.category, UnsolvedContactsWarning)]
+    assert len(messages) == 1 and "most = 1 and passes = 1" in messages[0]
     assert end.counted("unsolved") > 0
 
 
-def test_who_is_parted_slowly_is_not_unsolved() -> None:
-    """Two .15 m deep in each other, parted at .5 m/s: after .3 s, and no passes are missed on the way."""
+def test_slow_separation_does_not_count_as_unsolved() -> None:
+    """An overlap of 0.15 m is removed at 0.5 m/s in 0.3 s."""
     of = scene([1, 1], part_speed=0.5)
     state = begun(of, [(0, 0), (0.05, 0)], [(0, 0), (0, 0)])
     early, end = of.run(state, 20), of.run(state, 40)
@@ -469,7 +471,7 @@ def test_who_is_parted_slowly_is_not_unsolved() -> None:
     assert np.abs(end.vel).max() == 0.0 and end.counted("unsolved") == 0
 
 
-def test_a_scene_with_collisions_is_a_value(tmp_path: Path) -> None:
+def test_scene_with_collisions_is_a_value(tmp_path: Path) -> None:
     of = scene([1, 2], "impulses", e=0.3, friction=0.2, sticky=True, part_speed=2.0, obstacles=FLOOR)
     file = tmp_path / "scene.yaml"
     file.write_text(dump_scene(of))
@@ -477,7 +479,7 @@ def test_a_scene_with_collisions_is_a_value(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
         ({"restitution": -0.1}, "restitution = -0.1"),
         ({"restitution": 1.5}, "restitution = 1.5"),
@@ -489,13 +491,13 @@ def test_a_scene_with_collisions_is_a_value(tmp_path: Path) -> None:
         ({"restituton": 0.1}, "restitution"),
     ],
 )
-def test_bad_numbers_are_refused_in_one_line(given: dict[str, Any], told: str) -> None:
+def test_invalid_parameters_are_refused_in_one_line(given: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match="Collisions: ") as caught:
         Collisions(**given)
-    assert told in str(caught.value) and "\n" not in str(caught.value)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_scenes_that_cannot_have_them_are_refused() -> None:
+def test_invalid_scenes_with_collisions_are_refused() -> None:
     group = (Group(count=2, radius=0.3, spawn=Spawn(low=(0, 0), high=(1, 1))),)
     with pytest.raises(ValueError, match=r"constraints\[0\]\.kind = collisions: there is another"):
         Scene(groups=group, constraints=(Collisions(), Collisions()))
@@ -507,6 +509,6 @@ def heights(of: Scene, state: State, steps: int) -> Floats:
     return np.array([(state := of.step(state)).pos[0, 0, 1] for _ in range(steps)])
 
 
-def test_projection_is_crude_and_says_so_by_losing_energy() -> None:
+def test_projection_loses_energy() -> None:
     of = scene([1], "project", g=G, dt=0.02, obstacles=FLOOR)
     assert heights(of, begun(of, [(0, 1 + R)], [(0, 0)]), 400)[-50:].max() < 0.9
