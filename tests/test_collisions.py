@@ -250,7 +250,7 @@ def test_fast_bodies_do_not_pass_through_each_other(response: str) -> None:
 
 
 def test_step_over_a_quarter_of_the_torus_keeps_energy_and_raises_a_warning() -> None:
-    """Some steps exceed half the edge of 4 m; impacts are on the actual path, not on the shorter one across the edge."""
+    """Some steps exceed half the edge of 4 m; impacts are on the real path, not on the shorter one across the edge."""
     post = (Circle(centre=(1.0, 2.0), radius=0.2),)
     of = scene([1, 1], dt=1 / 60, space=Torus(size=(4.0, 4.0)), obstacles=post)
     with warnings.catch_warnings(record=True) as caught:

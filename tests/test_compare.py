@@ -1,4 +1,4 @@
-"""The comparison: command line, files and sentences, on real tasks and on scores made up for the case."""
+"""Comparison of players: command line, files and sentences, on real tasks and on artificial scores."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ STILL = "def predict(observation):\n    return 0 * observation[:, :2]\n"
 
 
 @pytest.fixture(autouse=True)
-def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def in_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -47,7 +47,7 @@ def run(*arguments: str, code: int = 0) -> Any:
 
 
 def refused(*arguments: str) -> str:
-    """Run what must be refused: one line, exit code 2, nothing written and nothing played."""
+    """Run a command that must fail with one line and exit code 2, and write nothing; return the line."""
     before = sorted(Path.cwd().rglob("*"))
     result = run(*arguments, code=2)
     assert result.stdout == ""
@@ -59,7 +59,7 @@ def refused(*arguments: str) -> str:
     return str(lines[0])
 
 
-def made_up(returns: Any, task: str = "toy", **change: Any) -> Episodes:
+def artificial(returns: Any, task: str = "toy", **change: Any) -> Episodes:
     returns = np.asarray(returns, np.float64)
     fields: dict[str, Any] = {
         "task": task,
@@ -77,16 +77,16 @@ def made_up(returns: Any, task: str = "toy", **change: Any) -> Episodes:
     return Episodes(**{**fields, **change})
 
 
-def made_up_results(scores: dict[str, Any], costs: dict[str, Any] | None = None) -> report.Results:
-    return report.task_results("d", {name: made_up(x) for name, x in scores.items()}, costs or {}, 300, 0)
+def artificial_results(scores: dict[str, Any], costs: dict[str, Any] | None = None) -> report.Results:
+    return report.task_results("d", {name: artificial(x) for name, x in scores.items()}, costs or {}, 300, 0)
 
 
-# --- what is said
+# --- sentences and tables
 
 
-def test_results_hold_what_the_issue_names() -> None:
+def test_results_have_scores_differences_and_intervals() -> None:
     luck = np.random.default_rng(0).normal(size=40)
-    results = made_up_results({"random": luck - 5, "rules": luck, "ppo": luck + 1})
+    results = artificial_results({"random": luck - 5, "rules": luck, "ppo": luck + 1})
     assert list(results["players"]) == ["random", "rules", "ppo"]
     assert list(results["pairs"]) == ["ppo - rules", "ppo - random", "rules - random"]
     assert {"iqm", "ci_low", "ci_high", "success_rate", "worlds"} <= results["players"]["ppo"].keys()
@@ -102,18 +102,18 @@ def test_results_hold_what_the_issue_names() -> None:
     assert results["players"]["rules"]["returns"] == pytest.approx(list(luck))
 
 
-def test_results_are_strict_json_with_a_line_per_list() -> None:
-    results = made_up_results({"a": [1.0, -2.5e-7, 3.0], "b": [0.0, 1e9, -1.0]})
+def test_results_are_strict_json_with_one_line_per_list() -> None:
+    results = artificial_results({"a": [1.0, -2.5e-7, 3.0], "b": [0.0, 1e9, -1.0]})
     text = report.json_text(results)
     assert json.loads(text, parse_constant=pytest.fail) == json.loads(json.dumps(results))
     assert '"returns": [1.0, -2.5e-07, 3.0]' in text
     assert "NaN" not in text
 
 
-def test_the_sentence_says_who_won_by_what_and_what_it_cost() -> None:
+def test_verdict_names_the_winner_the_difference_and_the_costs() -> None:
     luck = np.linspace(-1, 1, 101)
     costs = {"ppo": {"wall_time_s": 252, "steps": 1_000_000}, "rules": {"of": "tuning", "steps": 950}}
-    ahead = made_up_results({"random": luck - 9, "rules": luck, "ppo": luck + 0.5}, costs)["verdict"]
+    ahead = artificial_results({"random": luck - 9, "rules": luck, "ppo": luck + 0.5}, costs)["verdict"]
     assert ahead.startswith(
         "toy: ppo beats rules by 0.500 [0.500, 0.500] per world and scores higher in 100 % [96, 100]"
     )
@@ -122,10 +122,10 @@ def test_the_sentence_says_who_won_by_what_and_what_it_cost() -> None:
     assert "; rules cost 950 agent-steps of tuning, then 1.5 µs per decision." in ahead
 
 
-def test_the_sentence_does_not_hide_that_rules_win_or_that_nobody_does() -> None:
+def test_verdict_also_reports_a_loss_of_ppo_or_a_tie() -> None:
     rng = np.random.default_rng(0)
     luck, noise = np.linspace(-1, 1, 101), 0.1 * rng.normal(size=101)
-    behind = made_up_results({"rules": luck, "ppo": luck - 0.5 + noise})
+    behind = artificial_results({"rules": luck, "ppo": luck - 0.5 + noise})
     assert behind["pairs"]["ppo - rules"]["difference"] < 0
     found = re.match(r"toy: rules beats ppo by (\S+) \[(\S+), (\S+)\] per world", behind["verdict"])
     assert found
@@ -133,41 +133,41 @@ def test_the_sentence_does_not_hide_that_rules_win_or_that_nobody_does() -> None
     assert 0 < low < value < high
     assert value == pytest.approx(-behind["pairs"]["ppo - rules"]["difference"], abs=0.005)
     assert low == pytest.approx(-behind["pairs"]["ppo - rules"]["ci_high"], abs=0.005)
-    level = made_up_results({"rules": luck, "ppo": luck + noise - noise.mean() + 1e-4})["verdict"]
+    level = artificial_results({"rules": luck, "ppo": luck + noise - noise.mean() + 1e-4})["verdict"]
     assert level.startswith("toy: ppo and rules are level: difference 0.000")
 
 
 @pytest.fixture
 def side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two worlds are enough to be worth a process for each of two cores."""
+    """Play in two processes, each with at least two worlds."""
     monkeypatch.setattr(comparison, "WORLDS", 2)
     monkeypatch.setattr(comparison.os, "cpu_count", lambda: 2)
 
 
 @pytest.mark.slow
-def test_side_by_side_everything_is_the_same_and_progress_is_told(
+def test_results_in_parallel_equal_serial_ones_and_progress_is_reported(
     side_by_side: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tasks = [TASKS["pursuit"](), TASKS["obstacles"]()]
     field = comparison.field_of(["random", "rules"])
-    told: list[tuple[str, str, int, int]] = []
-    both, films = comparison.compare(tasks, field, 2, resamples=100, advance=lambda *news: told.append(news))
+    reports: list[tuple[str, str, int, int]] = []
+    both, films = comparison.compare(tasks, field, 2, resamples=100, advance=lambda *row: reports.append(row))
     monkeypatch.setattr(comparison.os, "cpu_count", lambda: 1)
     alone, _ = comparison.compare(tasks, field, 2, resamples=100)
     assert list(both["tasks"]) == ["pursuit", "obstacles"]
     for name, about in alone["tasks"].items():
         assert both["tasks"][name]["pairs"] == about["pairs"]
-        for who, numbers in about["players"].items():
-            other = both["tasks"][name]["players"][who]
+        for player, numbers in about["players"].items():
+            other = both["tasks"][name]["players"][player]
             same = {key for key in numbers if not key.startswith("microseconds")}
             assert {key: other[key] for key in same} == {key: numbers[key] for key in same}
-            assert films[name][who].recording is not None
-    assert {(task, player) for task, player, _, _ in told} == {
+            assert films[name][player].recording is not None
+    assert {(task, player) for task, player, _, _ in reports} == {
         (task, player) for task in ("pursuit", "obstacles") for player in ("random", "rules")
     }
 
 
-def test_side_by_side_a_player_that_fails_is_named(side_by_side: None) -> None:
+def test_failing_player_is_named_in_parallel(side_by_side: None) -> None:
     Path("odd.py").write_text("def predict(observation):\n    raise RuntimeError('no idea')\n")
     line = run("--tasks", "pursuit,obstacles", "--players", "odd.py", "--worlds", "2", code=2).stderr
     assert (
@@ -176,10 +176,8 @@ def test_side_by_side_a_player_that_fails_is_named(side_by_side: None) -> None:
     )
 
 
-def test_side_by_side_the_first_failure_ends_all_that_was_to_come(
-    side_by_side: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """More jobs than a pool hands out at once; none of its threads may die of what it then finds."""
+def test_first_failure_ends_all_parallel_jobs(side_by_side: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There are more jobs than processes; no thread of the pool may raise an exception."""
     died: list[Any] = []
     monkeypatch.setattr(threading, "excepthook", died.append)
     Path("odd.py").write_text("def predict(observation):\n    raise RuntimeError('no idea')\n")
@@ -190,32 +188,32 @@ def test_side_by_side_the_first_failure_ends_all_that_was_to_come(
 
 
 @pytest.mark.slow
-def test_side_by_side_an_error_in_what_shows_progress_is_raised(
+def test_error_in_the_progress_callback_is_raised_in_parallel(
     side_by_side: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     died: list[Any] = []
     monkeypatch.setattr(threading, "excepthook", died.append)
-    tasks, told = [task() for task in TASKS.values()], []
+    tasks, reports = [task() for task in TASKS.values()], []
 
-    def advance(*news: Any) -> None:
-        told.append(news)
+    def advance(*row: Any) -> None:
+        reports.append(row)
         raise RuntimeError("enough")
 
     with pytest.raises(RuntimeError, match="enough"):
         comparison.compare(tasks, comparison.field_of(["random"]), 2, resamples=100, advance=advance)
-    assert len(told) == 1 and not died
+    assert len(reports) == 1 and not died
     assert not multiprocessing.active_children()
 
 
 @pytest.mark.slow
-def test_a_process_that_ends_by_itself_is_told_and_nothing_hangs(side_by_side: None) -> None:
+def test_process_that_exits_is_reported_and_nothing_hangs(side_by_side: None) -> None:
     Path("gone.py").write_text("import os\n\ndef predict(observation):\n    os._exit(3)\n")
     line = run("--tasks", "pursuit,obstacles", "--players", "gone.py", "--worlds", "2", code=2).stderr
     assert "one of the processes was ended from outside" in line and not Path("results").exists()
 
 
-def _hears_interrupts() -> None:
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a test run in the background ignores them, for all below
+def _enable_interrupts() -> None:
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a background test run ignores SIGINT, as do its children
 
 
 def _has_members(group: int) -> bool:
@@ -227,34 +225,34 @@ def _has_members(group: int) -> bool:
 
 
 @pytest.mark.slow
-def test_ctrl_c_ends_every_process() -> None:
-    """The signal goes to the whole group, as from a terminal; those who play for others say nothing of it."""
+def test_interrupt_ends_every_process() -> None:
+    """The signal goes to the whole process group, as from a terminal; workers print nothing."""
     command = [sys.executable, "-m", "agents.compare", "--tasks", "pursuit,obstacles", "--players", "random,rules"]
     process = subprocess.Popen(
         [*command, "--out", str(Path.cwd() / "out")], cwd=ROOT, text=True, stderr=subprocess.PIPE,
-        stdout=subprocess.DEVNULL, start_new_session=True, preexec_fn=_hears_interrupts,
+        stdout=subprocess.DEVNULL, start_new_session=True, preexec_fn=_enable_interrupts,
     )  # fmt: skip
     assert process.stderr is not None
     assert "plays" in process.stderr.readline()
     os.killpg(process.pid, signal.SIGINT)
-    _, said = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert said.splitlines()[-1] == "compare: interrupted, nothing written" and "Traceback" not in said
+    assert errors.splitlines()[-1] == "compare: interrupted, nothing written" and "Traceback" not in errors
     assert not Path("out").exists()
     until = time.monotonic() + 10
     while _has_members(process.pid):
-        assert time.monotonic() < until, "somebody plays on"
+        assert time.monotonic() < until, "a process still runs"
         time.sleep(0.05)
 
 
-def test_without_ppo_the_two_best_are_compared_and_one_alone_is_not() -> None:
+def test_verdict_without_ppo_compares_the_two_best_players() -> None:
     luck = np.linspace(-1, 1, 101)
-    three = made_up_results({"random": luck, "textbook": luck + 3, "rules": luck + 2})["verdict"]
+    three = artificial_results({"random": luck, "textbook": luck + 3, "rules": luck + 2})["verdict"]
     assert three.startswith("toy: textbook beats rules by 1.000")
-    assert made_up_results({"ppo": luck})["verdict"] == "toy: one player alone, nobody to compare with."
+    assert artificial_results({"ppo": luck})["verdict"] == "toy: one player alone, nobody to compare with."
 
 
-def test_numbers_are_shown_to_the_accuracy_they_have() -> None:
+def test_numbers_are_rounded_by_their_intervals() -> None:
     def shown(value: float, low: float, high: float) -> str:
         return report.interval_text({"x": value, "ci_low": low, "ci_high": high}, "x", "ci")
 
@@ -267,9 +265,9 @@ def test_numbers_are_shown_to_the_accuracy_they_have() -> None:
     assert [report.duration_text(x) for x in (4.2, 252)] == ["4 s", "4.2 min"]
 
 
-def test_tables_fit_a_terminal_and_show_no_markup() -> None:
+def test_tables_fit_80_columns_and_escape_markup() -> None:
     luck = np.linspace(-1, 1, 101)
-    episodes = {name: made_up(x, metrics={"[b]_m": x}) for name, x in {"[red]": luck, "a|b": luck + 0.5}.items()}
+    episodes = {name: artificial(x, metrics={"[b]_m": x}) for name, x in {"[red]": luck, "a|b": luck + 0.5}.items()}
     results = report.task_results("d", episodes, {}, 100, 0)
     console = Console(width=80, file=StringIO(), force_terminal=False)
     console.print(*report.player_tables("toy [bold]", results))
@@ -285,17 +283,17 @@ def test_tables_fit_a_terminal_and_show_no_markup() -> None:
     assert {len(re.findall(r"(?<!\\)\|", row)) for row in rows} == {6 + 1, 4 + 1}
 
 
-# --- the picture
+# --- the chart
 
 
 def columns() -> list[Column]:
     luck = np.random.default_rng(0).normal(size=50)
     scores = {"random": luck - 5, "rules": luck, "$mine_": luck + 0.5}
-    episodes = {name: made_up(x) for name, x in scores.items()}
+    episodes = {name: artificial(x) for name, x in scores.items()}
     return [report.column("toy", report.task_results("d", episodes, {}, 200, 0), episodes)]
 
 
-def test_the_picture_shows_the_intervals_where_they_are() -> None:
+def test_chart_draws_the_intervals() -> None:
     [column] = columns()
     figure = draw_chart([column], "Title", "note")
     scores, success, pairs = figure.axes
@@ -312,9 +310,9 @@ def test_the_picture_shows_the_intervals_where_they_are() -> None:
     assert all(low < row.score.low <= row.score.high < high for row in column.rows)
 
 
-def test_the_picture_is_a_png_and_the_same_every_time(elsewhere: Path) -> None:
+def test_chart_is_a_reproducible_png(in_temporary_folder: Path) -> None:
     for name in ("a.png", "b.png"):
-        write_chart(elsewhere / name, columns(), "Title")
+        write_chart(in_temporary_folder / name, columns(), "Title")
     data = Path("a.png").read_bytes()
     assert data == Path("b.png").read_bytes()
     assert data[:8] == b"\x89PNG\r\n\x1a\n"
@@ -323,7 +321,7 @@ def test_the_picture_is_a_png_and_the_same_every_time(elsewhere: Path) -> None:
     assert (pixels < 128).mean() > 0.002
 
 
-def test_an_empty_picture_is_refused() -> None:
+def test_empty_chart_is_refused() -> None:
     with pytest.raises(ValueError, match="at least one task"):
         draw_chart([], "nothing")
     with pytest.raises(ValueError, match="at least one player"):
@@ -333,7 +331,7 @@ def test_an_empty_picture_is_refused() -> None:
 # --- the command line
 
 
-def test_all_four_files_come_out_of_one_run(elsewhere: Path) -> None:
+def test_one_run_writes_all_four_files(in_temporary_folder: Path) -> None:
     Path("still.py").write_text(STILL)
     result = run("--players", "still.py,random", "--worlds", "6", "--smoke", "--out", "here/results")
     assert sorted(path.name for path in Path("here/results").iterdir()) == FILES
@@ -357,23 +355,23 @@ def test_all_four_files_come_out_of_one_run(elsewhere: Path) -> None:
     assert all(name in page for name in ("still", "random", *TASKS))
 
 
-def test_the_same_seed_gives_the_same_scores_and_another_one_others() -> None:
+def test_equal_seeds_give_equal_scores_and_different_seeds_do_not() -> None:
     def scores(out: str, seed: str) -> Any:
         run("--tasks", "obstacles", "--players", "random", "--worlds", "4", "--seed", seed, "--out", out)
         return json.loads(Path(out, "results.json").read_text())["tasks"]["obstacles"]["players"]["random"]["returns"]
 
     first = scores("a", "0")
-    assert scores("a", "0") == first  # and an older result is replaced
+    assert scores("a", "0") == first  # this also replaces the older result
     assert scores("b", "1") != first
 
 
-def test_players_are_ordered_by_what_they_claim_however_they_are_given() -> None:
+def test_order_of_players_does_not_depend_on_the_arguments() -> None:
     Path("mine.py").write_text(STILL)
     field = comparison.field_of(["mine.py", "ppo", "random", "rules", "textbook", "ppo"])
     assert [player.name for player in field] == ["random", "textbook", "rules", "ppo", "mine"]
 
 
-def test_weights_of_ones_own_play_under_the_name_of_their_file() -> None:
+def test_user_s_weights_play_under_the_name_of_their_file() -> None:
     task = TASKS["obstacles"]()
     inputs, outputs = task.layout.size, task.action_layout.size
     tensors = {"action.weight": np.zeros((outputs, inputs), np.float32), "action.bias": np.zeros(outputs, np.float32)}
@@ -418,10 +416,10 @@ def test_weights_of_ones_own_play_under_the_name_of_their_file() -> None:
         (("--out", "taken"), "taken/table.md': is a folder"),
     ],
 )
-def test_bad_requests_are_refused_in_one_line(
+def test_invalid_arguments_are_refused_in_one_line(
     arguments: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(comparison, "rollout", lambda *_, **__: pytest.fail("something was played"))
+    monkeypatch.setattr(comparison, "rollout", lambda *_, **__: pytest.fail("rollout was called"))
     Path("sub").mkdir()
     late = "def player(task):\n    return {}['no']"
     files = {"still.py": STILL, "sub/still.py": STILL, "broken.py": "1 / 0", "late.py": late, "model.zip": "PK"}
@@ -433,21 +431,21 @@ def test_bad_requests_are_refused_in_one_line(
     assert message in refused(*arguments)
 
 
-def test_missing_weights_name_the_command_that_trains_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_about_missing_weights_has_the_command_that_trains_them(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("flockenv.players.WEIGHTS", Path("nowhere"))
     line = refused("--players", "random,ppo", "--tasks", "flock")
     assert "no weights for task 'flock'" in line
     assert line.endswith("python -m agents.ppo configs/training/flock.yaml")
 
 
-def test_a_player_that_ends_the_process_is_named_and_nothing_is_written() -> None:
+def test_player_that_raises_system_exit_is_named_and_nothing_is_written() -> None:
     Path("leaves.py").write_text("def predict(observation):\n    raise SystemExit(3)\n")
     line = run("--tasks", "pursuit", "--players", "random,leaves.py", "--worlds", "2", code=2).stderr
     assert "player 'leaves.py': SystemExit in predict, line 2: 3 (task 'pursuit')" in line.splitlines()[-1]
     assert not Path("results").exists()
 
 
-def test_a_player_that_fails_is_named_and_nothing_is_written() -> None:
+def test_failing_player_is_named_and_nothing_is_written() -> None:
     for name, source, message in (
         ("bad", "def predict(o):\n    return o[:, 10**6]", "IndexError in predict, line 2: "),
         ("wide", "def predict(o):\n    return o", "ValueError in predict: actions of shape"),
@@ -465,12 +463,12 @@ def test_a_player_that_fails_is_named_and_nothing_is_written() -> None:
         assert not Path("results").exists()
 
 
-def test_debug_shows_where_an_error_came_from() -> None:
+def test_debug_raises_the_exception() -> None:
     result = CliRunner().invoke(comparison.app, ["--tasks", "no", "--debug"])
     assert isinstance(result.exception, ValueError)
 
 
-def test_an_interrupt_leaves_nothing_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupt_is_reported_and_nothing_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: Any, **__: Any) -> Any:
         raise KeyboardInterrupt
 
@@ -480,8 +478,8 @@ def test_an_interrupt_leaves_nothing_and_says_so(monkeypatch: pytest.MonkeyPatch
     assert not Path("results").exists()
 
 
-def test_what_a_player_cost_comes_from_its_card_or_from_the_search_that_tuned_it(
-    elsewhere: Path, monkeypatch: pytest.MonkeyPatch
+def test_cost_of_a_player_comes_from_its_card_or_from_its_tuning(
+    in_temporary_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     task = TASKS["pursuit"]()
     policies: dict[str, Any] = {
@@ -489,7 +487,7 @@ def test_what_a_player_cost_comes_from_its_card_or_from_the_search_that_tuned_it
         "ppo": SimpleNamespace(card={"wall_time_s": 2.5, "steps": 3, "secret": 1}),
         "mine": SimpleNamespace(),
     }
-    monkeypatch.setattr("flockenv.players.rules.TUNED", elsewhere)
+    monkeypatch.setattr("flockenv.players.rules.TUNED", in_temporary_folder)
     ppo = {"wall_time_s": 2.5, "steps": 3}
     assert comparison._costs(task, policies) == {"rules": {}, "ppo": ppo, "mine": {}}
     Path("pursuit.json").write_text('{"task": "pursuit", "parameters": {}, "found": {"agent_steps": 1200.0}}')
@@ -497,8 +495,8 @@ def test_what_a_player_cost_comes_from_its_card_or_from_the_search_that_tuned_it
     assert comparison._costs(task, policies) == {"rules": spent, "ppo": ppo, "mine": {}}
 
 
-def test_the_task_is_the_one_that_its_config_describes(elsewhere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(comparison, "CONFIGS", elsewhere)
+def test_task_is_built_from_its_config(in_temporary_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(comparison, "CONFIGS", in_temporary_folder)
     Path("pursuit.yaml").write_text("task: pursuit\narguments: {horizon: 7}")
     run("--tasks", "pursuit", "--players", "random", "--worlds", "2", "--smoke")
     about = json.loads(Path("results/results.json").read_text())["tasks"]["pursuit"]
@@ -511,10 +509,10 @@ def test_the_task_is_the_one_that_its_config_describes(elsewhere: Path, monkeypa
 NO_TORCH = """
 import sys
 
-class Refuse:  # not sys.modules["torch"] = None, which scipy takes for a torch
+class Refuse:  # sys.modules["torch"] = None would not do: scipy reads attributes of that
     def find_spec(self, name, path=None, target=None):
         if name.split(".")[0] in ("torch", "stable_baselines3"):
-            raise ImportError(f"{name} is not for this")
+            raise ImportError(f"{name} is blocked")
 
 sys.meta_path.insert(0, Refuse())
 from typer.testing import CliRunner
@@ -525,12 +523,12 @@ assert result.exit_code == 0, result.output
 
 
 @pytest.mark.slow
-def test_comparing_needs_no_torch() -> None:
+def test_compare_needs_no_torch() -> None:
     arguments = ["--players", "random,textbook,rules", "--worlds", "2", "--smoke", "--out", str(Path.cwd() / "out")]
     subprocess.run([sys.executable, "-c", NO_TORCH, *arguments], check=True, cwd=ROOT)
 
 
-def test_a_hand_written_player_of_some_tasks_sits_out_the_others() -> None:
+def test_hand_written_player_plays_only_the_tasks_that_it_supports() -> None:
     crossing, flock = TASKS["crossing"](), TASKS["flock"]()
     assert comparison.usual_players([crossing]) == ["random", "textbook", "orca", "rules", "ppo"]
     assert comparison.usual_players([flock]) == ["random", "textbook", "rules", "ppo"]
@@ -543,16 +541,16 @@ def test_a_hand_written_player_of_some_tasks_sits_out_the_others() -> None:
         comparison.compare([crossing, flock], [orca], 2)
 
 
-def test_a_policy_that_plays_another_task_than_it_was_trained_on_is_told_of(
-    elsewhere: Path, monkeypatch: pytest.MonkeyPatch
+def test_policy_in_another_task_than_it_was_trained_on_is_reported(
+    in_temporary_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(comparison, "CONFIGS", elsewhere)
+    monkeypatch.setattr(comparison, "CONFIGS", in_temporary_folder)
     Path("crossing.yaml").write_text("task: crossing\narguments: {agents: 16, horizon: 5}")
-    said = run("--tasks", "crossing", "--players", "random,ppo", "--worlds", "2", "--smoke").stdout
+    printed = run("--tasks", "crossing", "--players", "random,ppo", "--worlds", "2", "--smoke").stdout
     line = (
         "crossing: ppo plays another task than it was trained on: horizon = 5, trained with 200; agents = 16, trained"
     )
-    assert line in " ".join(said.split())
+    assert line in " ".join(printed.split())
     players = json.loads(Path("results/results.json").read_text())["tasks"]["crossing"]["players"]
     assert players["random"]["differs"] == []
     assert "agents = 16, trained with 12" in players["ppo"]["differs"]
