@@ -1,4 +1,4 @@
-"""Checkpoints: a resumed training is the uninterrupted one, bit for bit; a damaged file is refused in one line."""
+"""Checkpoints: resumed trainings equal uninterrupted ones bit for bit; damaged files are refused in one line."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def parts_in(folder: Path) -> KernelPlan:
 
 
 def same_training(one: Path, other: Path) -> None:
-    """Compare all that two trainings left, but for what the clock showed."""
+    """Assert that two trainings left equal checkpoints, except for times."""
     mine, its = parts_in(one), parts_in(other)
     for part, name in [(p, name) for p, tensors in mine.items() if p != files.TIMES for name in tensors]:
         np.testing.assert_array_equal(mine[part][name], its[part][name], f"{part}/{name}")
@@ -57,7 +57,7 @@ def same_training(one: Path, other: Path) -> None:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Experiment], Path]:
-    """Return the folder of a training that nothing interrupted."""
+    """Return a function that returns the folder of an uninterrupted training."""
     trained: dict[str, Path] = {}
 
     def of(experiment: Experiment) -> Path:
@@ -78,7 +78,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Experiment], Pa
         pytest.param(TWO_THREADS, 1, id="two threads", marks=pytest.mark.slow),
     ],
 )
-def test_a_resumed_training_is_the_uninterrupted_one(
+def test_resumed_training_equals_the_uninterrupted_one(
     tmp_path: Path, whole: Callable[[Experiment], Path], experiment: Experiment, points: int
 ) -> None:
     interrupt(experiment, tmp_path, points)
@@ -94,7 +94,7 @@ def test_a_resumed_training_is_the_uninterrupted_one(
     [(torch.optim.Adam, "step", 9), (World, "step", 40), (WorldVecEnv, "step_wait", 17), (files, "write", 2)],
     ids=["in an update", "while a world acts", "in a rollout", "before a checkpoint is written"],
 )
-def test_ctrl_c_at_any_moment_goes_on_from_the_last_rollout(
+def test_interrupted_training_resumes_from_the_last_rollout(
     tmp_path: Path, whole: Callable[[Experiment], Path], owner: Any, name: str, call: int
 ) -> None:
     original, calls = getattr(owner, name), 0
@@ -114,7 +114,7 @@ def test_ctrl_c_at_any_moment_goes_on_from_the_last_rollout(
     same_training(tmp_path, whole(PURSUIT))
 
 
-def test_a_training_may_be_resumed_again_and_again(tmp_path: Path, whole: Callable[[Experiment], Path]) -> None:
+def test_training_can_be_resumed_many_times(tmp_path: Path, whole: Callable[[Experiment], Path]) -> None:
     measure, at = ppo.score, 0
 
     def interrupted(*given: Any) -> tuple[float, float]:
@@ -134,15 +134,15 @@ def test_a_training_may_be_resumed_again_and_again(tmp_path: Path, whole: Callab
 
 
 @pytest.mark.slow
-def test_killed_trainings_end_as_if_they_had_never_been_killed() -> None:
+def test_killed_trainings_end_equal_to_uninterrupted_ones() -> None:
     command = [sys.executable, "-m", "benchmarks.kills", "--times", "20"]
     done = subprocess.run(command, cwd=CONFIGS.parent.parent, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "20 kills" in done.stdout and "0 ended otherwise, 0 resumptions were refused" in done.stdout
 
 
-def test_kills_are_spread_over_trainings_that_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a busy machine a training may be killed each time before it has come any further: one took 151 of 200."""
+def test_kills_are_spread_over_several_trainings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a busy machine every kill may come before any progress: one training took 151 of 200 kills."""
 
     class Life:
         exitcode = 0
@@ -164,7 +164,7 @@ def test_kills_are_spread_over_trainings_that_end(tmp_path: Path, monkeypatch: p
     assert (count.kills, count.same, count.different, count.refused) == (20, 3, [], [])
 
 
-def test_worlds_go_on_from_their_arrays_bit_for_bit() -> None:
+def test_worlds_restored_from_arrays_continue_bit_for_bit() -> None:
     task = SCHOOL.build()
     one, other = World(task, 3, task.horizon), World(task, 3, task.horizon)
     with pytest.raises(RuntimeError, match="before the first reset"):
@@ -181,13 +181,13 @@ def test_worlds_go_on_from_their_arrays_bit_for_bit() -> None:
         for mine, its in zip(one.step(action), other.step(action), strict=True):
             np.testing.assert_array_equal(mine, its)
         np.testing.assert_array_equal(one.reset(), other.reset())
-    for wrong, said in (
+    for wrong, message in (
         ({**kept, "spin": kept["steps"]}, "'spin' is unknown"),
         ({k: v for k, v in kept.items() if k != "paid"}, "'paid' is missing"),
         ({**kept, "steps": kept["steps"][:2]}, r"'steps' is \(2,\) of int64, expected \(3,\) of int64"),
         ({**kept, "state.x": kept["state.x"].astype(np.float16)}, r"'state.x' is .* of float16, expected"),
     ):
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             other.restore(wrong)
 
 
@@ -196,7 +196,7 @@ def test_worlds_go_on_from_their_arrays_bit_for_bit() -> None:
 
 @pytest.fixture(scope="module")
 def begun(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a checkpoint, and a config of its training."""
+    """Return a folder with a checkpoint and the config of its training."""
     folder = tmp_path_factory.mktemp("begun")
     interrupt(PURSUIT, folder / "runs" / "pursuit", 2)
     settings = {"task": "pursuit", "ppo": {**TINY, "steps": 1024}}
@@ -215,20 +215,20 @@ def command(folder: Path, *more: str) -> Any:
     return CliRunner().invoke(ppo.app, [*given, *more])
 
 
-def refused(folder: Path, said: str) -> None:
-    """Resume what must be refused in one line that says so; nothing is made, and nothing changed."""
+def refused(folder: Path, message: str) -> None:
+    """Resume, and assert that it is refused in one line that contains the message, without a change of files."""
     path = folder / "runs" / "pursuit" / FILE
     before = path.read_bytes() if path.is_file() and path.stat().st_size < LARGEST else None
     result = command(folder, "--resume")
     assert result.exit_code == 2, (result.output, result.exception)
     assert result.stderr.startswith(f"error: the checkpoint in {path.parent} is damaged: "), result.stderr
-    assert said in result.stderr and result.stderr.count("\n") == 1 and len(result.stderr) < 600
+    assert message in result.stderr and result.stderr.count("\n") == 1 and len(result.stderr) < 600
     assert before is None or path.read_bytes() == before
     assert {path.name for path in folder.iterdir()} == {"pursuit.yaml", "runs"}
 
 
 def changed(change: Callable[[KernelPlan], Any]) -> Callable[[Path], None]:
-    """Return what writes a checkpoint anew, with true digests, after a change."""
+    """Return a function that changes a checkpoint and rewrites it with valid digests."""
 
     def write(folder: Path) -> None:
         parts = parts_in(folder)
@@ -239,7 +239,7 @@ def changed(change: Callable[[KernelPlan], Any]) -> Callable[[Path], None]:
 
 
 def noted(**changes: Any) -> Callable[[Path], None]:
-    """Return what changes the notes of a checkpoint; None takes a key away."""
+    """Return a function that changes the notes of a checkpoint; the value "gone" removes a key."""
 
     def change(parts: KernelPlan) -> None:
         notes = {**json.loads(parts["notes"]["json"].tobytes()), **changes}
@@ -329,14 +329,14 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
 
 
 @pytest.mark.parametrize("name", DAMAGES)
-def test_a_damaged_checkpoint_is_named_in_one_line(copied: Path, name: str) -> None:
-    damage, said = DAMAGES[name]
+def test_damaged_checkpoint_is_refused_in_one_line(copied: Path, name: str) -> None:
+    damage, message = DAMAGES[name]
     damage(copied / "runs" / "pursuit")
-    refused(copied, said)
+    refused(copied, message)
 
 
 @pytest.mark.parametrize("mean", [1e-160, -1e103, 5e-324, -1.7e308])
-def test_results_of_any_finite_size_are_kept(tmp_path: Path, mean: float) -> None:
+def test_results_of_any_finite_size_are_stored(tmp_path: Path, mean: float) -> None:
     run = ppo.train(PURSUIT, tmp_path)
     run.curve = [{**point, "mean": mean, "seconds": 1e-160} for point in run.curve]
     run.best, run.wall = mean, 1e-160
@@ -345,8 +345,8 @@ def test_results_of_any_finite_size_are_kept(tmp_path: Path, mean: float) -> Non
     assert again is not None and (again.best, again.wall, again.curve) == (mean, 1e-160, run.curve)
 
 
-def test_every_flipped_bit_is_found(copied: Path) -> None:
-    """Tried in every seventh byte of the header and in 300 bytes of tensors, whose part is named."""
+def test_flipped_bits_are_detected(copied: Path) -> None:
+    """One bit in every seventh byte of the header and in 300 bytes of tensors; the error names the damaged part."""
     folder = copied / "runs" / "pursuit"
     data = bytearray((folder / FILE).read_bytes())
     header = 8 + int.from_bytes(data[:8], "little")
@@ -369,22 +369,22 @@ def test_every_flipped_bit_is_found(copied: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["run.json", "policy.pt"])
-def test_a_checkpoint_of_the_format_before_is_refused_in_one_line(copied: Path, name: str) -> None:
+def test_checkpoint_of_an_older_format_is_refused_in_one_line(copied: Path, name: str) -> None:
     folder = copied / "runs" / "pursuit"
     (folder / FILE).unlink()
     (folder / name).write_bytes(b"{}")
     result = command(copied, "--resume")
-    said = f"error: the checkpoint in {folder} is in an older format: start anew without --resume\n"
-    assert (result.exit_code, result.stderr) == (2, said)
+    message = f"error: the checkpoint in {folder} is in an older format: start anew without --resume\n"
+    assert (result.exit_code, result.stderr) == (2, message)
 
 
-def test_to_resume_without_a_checkpoint_starts_anew_and_says_so(fresh: Path) -> None:
+def test_resume_without_a_checkpoint_starts_a_training_and_reports_it(fresh: Path) -> None:
     result = command(fresh, "--resume")
     assert result.stderr == f"no checkpoint in {fresh / 'runs' / 'pursuit'}: starts anew\n"
-    assert isinstance(result.exception, AssertionError)  # of the fixture: it was to be built
+    assert isinstance(result.exception, AssertionError)  # from the fixture's build
 
 
-def test_a_checkpoint_runs_no_code_and_is_no_pickle(copied: Path) -> None:
+def test_checkpoint_contains_only_numeric_tensors(copied: Path) -> None:
     data = (copied / "runs" / "pursuit" / FILE).read_bytes()
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
     kinds = {entry["dtype"] for name, entry in header.items() if name != "__metadata__"}
@@ -392,17 +392,17 @@ def test_a_checkpoint_runs_no_code_and_is_no_pickle(copied: Path) -> None:
     assert sorted(path.name for path in (copied / "runs" / "pursuit").iterdir()) == [FILE, "training.lock"]
 
 
-# --- one training a folder --------------------------------------------------------------------------------------------
+# --- one training per folder ------------------------------------------------------------------------------------------
 
 
-def test_a_second_training_in_a_folder_says_so_at_once(copied: Path) -> None:
+def test_second_training_in_a_folder_is_refused_at_once(copied: Path) -> None:
     folder = copied / "runs" / "pursuit"
     before = (folder / FILE).read_bytes()
     with claimed(folder):
         for more in ((), ("--resume",)):
             result = command(copied, *more)
-            said = f"error: {folder} is in use by another training: wait for its end, or choose another --runs\n"
-            assert (result.exit_code, result.stderr) == (2, said)
+            message = f"error: {folder} is in use by another training: wait for its end, or choose another --runs\n"
+            assert (result.exit_code, result.stderr) == (2, message)
         with pytest.raises(InUse):
             ppo.train(PURSUIT, folder)
     assert (folder / FILE).read_bytes() == before and not (copied / "p.safetensors").exists()
@@ -410,7 +410,7 @@ def test_a_second_training_in_a_folder_says_so_at_once(copied: Path) -> None:
         pass
 
 
-def test_a_lock_is_seen_from_another_process_and_freed_by_its_end(copied: Path) -> None:
+def test_lock_of_another_process_is_released_when_it_ends(copied: Path) -> None:
     folder = copied / "runs" / "pursuit"
     code = f"""
 from pathlib import Path
@@ -432,7 +432,7 @@ with claimed(Path({str(folder)!r})):
         pass
 
 
-def test_what_a_killed_training_left_half_written_is_removed(copied: Path) -> None:
+def test_partial_files_of_a_killed_training_are_removed(copied: Path) -> None:
     folder = copied / "runs" / "pursuit"
     half = folder / LEFTOVERS.replace("*", "4711")
     half.mkdir()
@@ -441,29 +441,29 @@ def test_what_a_killed_training_left_half_written_is_removed(copied: Path) -> No
         assert not half.exists() and (folder / FILE).exists()
 
 
-# --- what is written is tried before ----------------------------------------------------------------------------------
+# --- outputs are checked before training ------------------------------------------------------------------------------
 
 
-def untouched(folder: Path, result: Any, said: str) -> None:
+def untouched(folder: Path, result: Any, message: str) -> None:
     assert result.exit_code == 2, (result.output, result.exception)
-    assert result.stderr.startswith("error: ") and said in result.stderr and result.stderr.count("\n") == 1
+    assert result.stderr.startswith("error: ") and message in result.stderr and result.stderr.count("\n") == 1
     assert [path.name for path in folder.iterdir()] == ["pursuit.yaml"]
 
 
 @pytest.fixture
 def fresh(tmp_path: Path, begun: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a folder with a config alone; nothing is to be built."""
+    """Return a folder with only a config; a call of build fails the test."""
     shutil.copy(begun / "pursuit.yaml", tmp_path)
 
     def build(*_: Any) -> None:
-        raise AssertionError("nothing is to be built")
+        raise AssertionError("build was called")
 
     monkeypatch.setattr(ppo, "build", build)
     return tmp_path
 
 
 @pytest.mark.parametrize(
-    ("option", "value", "said"),
+    ("option", "value", "message"),
     [
         ("--out", "{}/w.bin", "w.bin': must end in .safetensors"),
         ("--out", "{}/w", "w': must end in .safetensors"),
@@ -476,18 +476,18 @@ def fresh(tmp_path: Path, begun: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("--tensorboard", "/proc/logs", "--tensorboard '/proc/logs': must lie below"),
     ],
 )
-def test_what_cannot_be_written_is_refused_before_training(fresh: Path, option: str, value: str, said: str) -> None:
-    untouched(fresh, command(fresh, option, value.format(fresh)), said)
+def test_invalid_output_path_is_refused_before_training(fresh: Path, option: str, value: str, message: str) -> None:
+    untouched(fresh, command(fresh, option, value.format(fresh)), message)
 
 
-def test_a_card_that_cannot_be_written_is_refused_before_training(fresh: Path) -> None:
+def test_card_that_cannot_be_written_is_refused_before_training(fresh: Path) -> None:
     (fresh / "p.json").mkdir()
     result = command(fresh)
     assert result.exit_code == 2 and "its card, 'p.json', is a folder" in result.stderr
 
 
 @pytest.mark.parametrize("place", ["w.safetensors", "runs"])
-def test_a_read_only_disk_is_refused_before_training(
+def test_read_only_folder_is_refused_before_training(
     fresh: Path, monkeypatch: pytest.MonkeyPatch, place: str
 ) -> None:  # fmt: skip
     closed = fresh / "closed"
@@ -500,8 +500,8 @@ def test_a_read_only_disk_is_refused_before_training(
     assert not any(closed.iterdir())
 
 
-def test_a_disk_without_room_is_refused_before_training(fresh: Path) -> None:
-    """Files may not be so long for a moment: what a full disk answers, too, is found by trying."""
+def test_full_disk_is_refused_before_training(fresh: Path) -> None:
+    """A limit on file size replaces the full disk; both are detected by a trial write."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (2**10, before[1]))
     try:
@@ -511,7 +511,7 @@ def test_a_disk_without_room_is_refused_before_training(fresh: Path) -> None:
     untouched(fresh, result, "cannot write")
 
 
-def test_room_is_tried_where_a_file_will_be_and_nothing_is_left(tmp_path: Path) -> None:
+def test_check_room_tries_the_final_path_and_leaves_no_files(tmp_path: Path) -> None:
     check_room(tmp_path / "deep" / "down" / "x", 2**20)
     with pytest.raises(OSError, match=r"cannot write '.*x' \([\d,]+ bytes\): ") as caught:
         check_room(tmp_path / "deep" / "x", 2**60)
@@ -522,7 +522,7 @@ def test_room_is_tried_where_a_file_will_be_and_nothing_is_left(tmp_path: Path) 
 
 
 def spoilt(monkeypatch: pytest.MonkeyPatch, call: int, quantity: str, row: int, column: int) -> None:
-    """Put a NaN into what a step of all worlds tells, once."""
+    """Put a NaN into the rewards, or inf into the observations, that one call of step_wait returns."""
     original, calls = WorldVecEnv.step_wait, 0
 
     def step_wait(self: WorldVecEnv) -> Any:
@@ -544,11 +544,11 @@ NAN = [
 ]
 
 
-@pytest.mark.parametrize(("quantity", "column", "said"), NAN)
-def test_a_number_that_is_not_finite_is_named_and_the_last_good_policy_kept(
-    copied: Path, monkeypatch: pytest.MonkeyPatch, quantity: str, column: int, said: str
+@pytest.mark.parametrize(("quantity", "column", "message"), NAN)
+def test_non_finite_number_is_named_and_the_last_good_policy_is_kept(
+    copied: Path, monkeypatch: pytest.MonkeyPatch, quantity: str, column: int, message: str
 ) -> None:
-    """In the third rollout: two points of the curve are measured, and the checkpoint is of where it began."""
+    """It is in the third rollout: the curve has two points, and the checkpoint is from the start of that rollout."""
     shutil.rmtree(copied / "runs")
     spoilt(monkeypatch, 2 * 16 + 9, quantity, 11, column)
     result = command(copied)
@@ -557,13 +557,13 @@ def test_a_number_that_is_not_finite_is_named_and_the_last_good_policy_kept(
     assert result.exit_code == 1, (result.output, result.exception)
     lines = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
     kept = f"kept: the checkpoint of 512 steps in {folder}, and the best policy so far (mean return "
-    assert len(lines) == 1 and said.format(slot=slot) in lines[0] and kept in lines[0]
+    assert len(lines) == 1 and message.format(slot=slot) in lines[0] and kept in lines[0]
     run = checkpointed(PURSUIT, folder)
     assert run is not None and run.steps == 512 and len(run.curve) == 2
     assert MlpPolicy.load(target, PURSUIT.build()).card["tuning_mean"] == run.best
 
 
-def test_a_nan_before_anything_was_learned_is_named(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nan_in_the_first_rollout_is_named(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.rmtree(copied / "runs")
     spoilt(monkeypatch, 1, "reward", 0, 0)
     result = command(copied)
@@ -576,13 +576,13 @@ OLDER = {"of the same recipe": 0, "of another recipe": 1, "damaged": 0}
 
 @pytest.mark.parametrize("older", OLDER)
 @pytest.mark.parametrize(
-    ("error", "code", "said"),
+    ("error", "code", "message"),
     [(LearningDiverged("too far"), 1, "error: too far; nothing was learnt before"),
      (KeyboardInterrupt(), 130, "interrupted; nothing was learnt yet")],
     ids=["divergence", "Ctrl-C"],
 )  # fmt: skip
-def test_a_run_that_saved_nothing_does_not_claim_the_checkpoint_of_an_older_one(
-    copied: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int, said: str, older: str
+def test_run_that_saved_nothing_does_not_report_an_older_checkpoint(
+    copied: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int, message: str, older: str
 ) -> None:
     def build(*_: Any) -> None:
         raise error
@@ -593,18 +593,18 @@ def test_a_run_that_saved_nothing_does_not_claim_the_checkpoint_of_an_older_one(
         path.write_bytes(path.read_bytes()[:-1])
     before = path.read_bytes()
     result = command(copied, "--seed", str(OLDER[older]))
-    assert result.exit_code == code and said in result.stderr, result.output
+    assert result.exit_code == code and message in result.stderr, result.output
     assert path.read_bytes() == before and not (copied / "p.safetensors").exists()
 
 
-def test_a_reward_that_is_not_finite_in_a_tuning_world_is_named(
+def test_non_finite_reward_in_a_tuning_world_is_named(
     copied: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:  # fmt: skip
     step = World.step
 
     def spoils(self: World, *given: Any, **named: Any) -> Any:
         result = step(self, *given, **named)
-        if self.worlds == 4:  # where the curve is measured
+        if self.worlds == 4:  # the tuning worlds, which measure the curve
             result.reward[2] = np.nan
         return result
 
@@ -615,7 +615,7 @@ def test_a_reward_that_is_not_finite_in_a_tuning_world_is_named(
 
 
 @pytest.mark.parametrize("experiment", [PURSUIT, SCHOOL], ids=["pursuit", "school"])
-def test_learning_that_diverges_is_named(tmp_path: Path, experiment: Experiment) -> None:
+def test_divergence_of_learning_is_reported(tmp_path: Path, experiment: Experiment) -> None:
     settings = experiment.ppo.model_copy(update={"learning_rate": 1e30, "taught": 0, "critic_first": 0})
     with pytest.raises(LearningDiverged, match=r"largest weight is \d.*e\+\d+|weights of the network") as caught:
         ppo.train(experiment.model_copy(update={"ppo": settings}), tmp_path)
@@ -624,26 +624,28 @@ def test_learning_that_diverges_is_named(tmp_path: Path, experiment: Experiment)
 
 @pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")
 @pytest.mark.parametrize(
-    ("scale", "said"),
+    ("scale", "message"),
     [(1e38, "weights of the network, .*; the largest return of the .*e\\+"), (1e39, "advantages of the .* hold -inf")],
 )
-def test_a_loss_that_is_not_finite_is_named(tmp_path: Path, scale: float, said: str) -> None:
+def test_non_finite_loss_is_reported(tmp_path: Path, scale: float, message: str) -> None:
     huge = PURSUIT.ppo.model_copy(update={"reward_scale": scale})
-    with pytest.raises(LearningDiverged, match=said):
+    with pytest.raises(LearningDiverged, match=message):
         ppo.train(PURSUIT.model_copy(update={"ppo": huge}), tmp_path)
 
 
 # --- versions ---------------------------------------------------------------------------------------------------------
 
 
-def test_other_versions_are_said_and_stand_in_the_card(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_different_versions_are_reported_and_listed_in_the_card(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     begun, real = checkpointed(PURSUIT, copied / "runs" / "pursuit"), ppo.surroundings
     monkeypatch.setattr(ppo, "surroundings", lambda task: {**real(task), "torch": "9.1.0", "numpy": "3.0.0"})
     result = command(copied, "--resume")
     assert result.exit_code == 0, result.output
     torch_now, numpy_now = torch.__version__, np.__version__
-    said = " ".join(result.stderr.split())
-    assert f"numpy 3.0.0 after {numpy_now}, torch 9.1.0 after {torch_now}: weights may differ from those of an" in said
+    message = " ".join(result.stderr.split())
+    assert (
+        f"numpy 3.0.0 after {numpy_now}, torch 9.1.0 after {torch_now}: weights may differ from those of an" in message
+    )
     card = json.loads((copied / "p.json").read_text(encoding="utf-8"))
     assert card["versions"]["torch"] == torch_now
     assert card["versions"].keys() >= {"flockenv", "python", "numpy", "stable-baselines3", "system", "processor"}
@@ -651,7 +653,7 @@ def test_other_versions_are_said_and_stand_in_the_card(copied: Path, monkeypatch
     assert begun is not None and card["resumed"] == [{"steps": begun.steps, "surroundings": others}]
 
 
-def test_the_same_versions_are_not_worth_a_word(copied: Path) -> None:
+def test_equal_versions_are_not_reported(copied: Path) -> None:
     result = command(copied, "--resume")
     assert result.exit_code == 0 and "resumed" not in result.stderr
     assert "resumed" not in json.loads((copied / "p.json").read_text(encoding="utf-8"))
