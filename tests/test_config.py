@@ -1,4 +1,4 @@
-"""YAML <-> Scene: what is read, what is refused and in which words, and that a scene written reads back the same."""
+"""YAML: reading and writing scenes, round trips, and the messages about invalid files."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ dt: 0.01
 
 
 class Anything(BaseModel):
-    """A record of plain values, for what a scene has no field for."""
+    """A record with fields of all plain types, some of which a scene does not have."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -65,7 +65,7 @@ def refusal(text: str | Path, model: type[BaseModel] = Scene) -> str:
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_scene_is_read() -> None:
+def test_scene_is_read() -> None:
     scene = load_scene(GOOD)
     assert scene == Scene(
         space=Torus(size=(10, 12.5)),
@@ -76,14 +76,14 @@ def test_a_scene_is_read() -> None:
 
 
 @pytest.mark.parametrize("path", SCENES, ids=lambda p: p.stem)
-def test_the_scenes_in_configs_are_read_and_written_the_same(path: Path) -> None:
+def test_scenes_in_configs_survive_a_round_trip(path: Path) -> None:
     scene = load_scene(path)
     assert load_scene(dump_scene(scene)) == scene
     assert path.read_text().startswith("# yaml-language-server: $schema=../schema.json\n")
 
 
 @pytest.mark.parametrize(
-    ("written", "meant"),
+    ("written", "value"),
     [
         *[(word, 0.001) for word in ("0.001", "1e-3", "1E-3", "1.0e-3", ".001", "+1e-3", "0.1e-2")],
         *[(word, 1000.0) for word in ("1000", "1e3", "1e+3", "1.e3", "1_000", "1_000.0", "+1000")],
@@ -92,34 +92,34 @@ def test_the_scenes_in_configs_are_read_and_written_the_same(path: Path) -> None
         ("1e-320", 1e-320),
     ],
 )
-def test_numbers_are_what_people_mean(written: str, meant: float) -> None:
-    assert load(f"number: {written}\n", Anything).number == meant
+def test_numbers_are_read_in_all_common_notations(written: str, value: float) -> None:
+    assert load(f"number: {written}\n", Anything).number == value
 
 
-@pytest.mark.parametrize(("written", "meant"), [("1e3", 1000), ("1_000", 1000), ("1e22", 10**22), ("-7", -7)])
-def test_whole_numbers_are_what_people_mean(written: str, meant: int) -> None:
-    assert load(f"count: {written}\n", Anything).count == meant
+@pytest.mark.parametrize(("written", "value"), [("1e3", 1000), ("1_000", 1000), ("1e22", 10**22), ("-7", -7)])
+def test_integers_are_read_in_all_common_notations(written: str, value: int) -> None:
+    assert load(f"count: {written}\n", Anything).count == value
 
 
 @pytest.mark.parametrize(
     "word", ["yes", "no", "on", "off", "y", "N", "NO", "1:30", "0x1F", "2024-01-01", "1.2.3", "e5"]
 )
-def test_words_stay_words(word: str) -> None:
-    """YAML 1.1 makes booleans, sexagesimals, hexadecimals and dates of these; nobody means them."""
+def test_words_are_read_as_text(word: str) -> None:
+    """YAML 1.1 reads these as booleans, sexagesimals, hexadecimals and dates."""
     assert load(f"text: {word}\n", Anything).text == word
 
 
-@pytest.mark.parametrize(("word", "meant"), [("true", True), ("True", True), ("false", False), ("FALSE", False)])
-def test_switches(word: str, meant: bool) -> None:
-    assert load(f"switch: {word}\n", Anything).switch is meant
+@pytest.mark.parametrize(("word", "value"), [("true", True), ("True", True), ("false", False), ("FALSE", False)])
+def test_booleans_are_read(word: str, value: bool) -> None:
+    assert load(f"switch: {word}\n", Anything).switch is value
 
 
 @pytest.mark.parametrize("word", ["", "~", "null", "Null"])
-def test_nothing(word: str) -> None:
+def test_null_is_read_as_none(word: str) -> None:
     assert load(f"maybe: {word}\nnumber: 1\n", Anything).maybe is None
 
 
-def test_line_ends_and_byte_order_marks_do_not_matter(tmp_path: Path) -> None:
+def test_line_ends_and_byte_order_marks_are_ignored(tmp_path: Path) -> None:
     path = tmp_path / "windows.yaml"
     path.write_bytes(b"\xef\xbb\xbf" + GOOD.replace("\n", "\r\n").encode())
     assert load_scene(path) == load_scene(GOOD) == load_scene(str(path))
@@ -146,12 +146,12 @@ def test_line_ends_and_byte_order_marks_do_not_matter(tmp_path: Path) -> None:
 )
 @example(record=Anything(number=5e-324, text="line\nbreak\ttab 'quote' \"quote\" ü 鳥"))
 @example(record=Anything(text="\x85\u2028 \ufeff"))
-def test_what_is_written_reads_back_exactly(record: Anything) -> None:
+def test_record_survives_a_round_trip(record: Anything) -> None:
     try:
         text = dump(record)
     except ConfigError as error:
         assert "cannot be written as YAML" in str(error)
-        assert not record.text.isprintable()  # control characters have no place in a file that people edit
+        assert not record.text.isprintable()  # only control characters cannot be written
     else:
         again = load(text, Anything)
         assert again == record
@@ -159,7 +159,7 @@ def test_what_is_written_reads_back_exactly(record: Anything) -> None:
 
 
 @pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
-def test_in_brief_a_scene_says_no_default_and_is_the_same(path: Path) -> None:
+def test_brief_scene_omits_defaults_and_survives_a_round_trip(path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         scene = load_scene(path)
@@ -169,7 +169,7 @@ def test_in_brief_a_scene_says_no_default_and_is_the_same(path: Path) -> None:
     assert "null" not in text
 
 
-def test_models_are_written_by_name_where_all_of_them_is_there() -> None:
+def test_complete_presets_are_written_by_name() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         people = Group(count=2, mass=80.0, radius=0.3, desired_speed=1.0, spawn=Spawn(low=(0, 0), high=(9, 9)))
@@ -187,13 +187,13 @@ def test_models_are_written_by_name_where_all_of_them_is_there() -> None:
 
 @given(
     dt=st.floats(1e-9, 10),
-    rates=st.lists(st.floats(0, 0.03), max_size=3),  # stable at every dt here, whatever the method
+    rates=st.lists(st.floats(0, 0.03), max_size=3),  # stable at every dt here under every method
     count=st.integers(1, 10**6),
     max_speed=st.none() | st.floats(1e-18, 1e12),
-    wall=st.floats(1, 1e4),  # float32 goes no further
+    wall=st.floats(1, 1e4),  # float32 allows no larger spaces
     method=st.sampled_from(sorted(INTEGRATORS)),
 )
-def test_a_scene_reads_back_exactly(
+def test_scene_survives_a_round_trip(
     dt: float, rates: list[float], count: int, max_speed: float | None, wall: float, method: str
 ) -> None:
     scene = Scene(
@@ -210,7 +210,7 @@ def test_a_scene_reads_back_exactly(
     assert repr(again) == repr(scene)
 
 
-def test_no_limit_is_written_as_nothing() -> None:
+def test_infinite_default_is_omitted_and_other_infinities_are_refused() -> None:
     assert "unlimited" not in dump(Anything())
     with pytest.raises(
         ConfigError, match=r"^Anything cannot be written as YAML: its text reads back as another record$"
@@ -218,17 +218,17 @@ def test_no_limit_is_written_as_nothing() -> None:
         dump(Anything(number=math.inf))
 
 
-def test_other_yaml_readers_read_the_same_numbers() -> None:
-    """PyYAML's own loader (YAML 1.1) agrees with ours about everything we write."""
+def test_other_yaml_readers_read_equal_numbers() -> None:
+    """PyYAML's own loader (YAML 1.1) also reads the files that we write."""
     scene = Scene(space=Torus(size=(1e22, 1e16)), groups=(Group(count=3, mass=1e-7),), integrator=RK4(), dt=1e-5)
     assert yaml.safe_load(dump_scene(scene)) == json.loads(scene.model_dump_json())
 
 
-# --- refusing: one line with place, value, what is allowed, nearest name ----------------------------------------------
+# --- errors: one line with place, value, allowed values, nearest name -------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "expected"),
     [
         (
             "radius: 3",
@@ -292,20 +292,20 @@ def test_other_yaml_readers_read_the_same_numbers() -> None:
         ("dimension: 2", "dimension: 3", "text:2: space.size = (10.0, 12.5)"),
     ],
 )
-def test_a_mistake_is_one_clear_line(old: str, new: str, said: str) -> None:
+def test_error_is_one_line_with_place_value_and_allowed_values(old: str, new: str, expected: str) -> None:
     message = refusal(GOOD.replace(old, new))
-    assert message.startswith(said)
+    assert message.startswith(expected)
     assert "\n" not in message
 
 
-def test_a_billion_agents_are_refused_with_an_estimate_before_anything_is_allocated() -> None:
+def test_billion_agents_are_refused_with_an_estimate_of_memory() -> None:
     for count in ("1e9", "1000000000", "1e30"):
         message = refusal(GOOD.replace("count: 5", f"count: {count}"))
         assert message.startswith("text:3: groups: 1,000,000,000")
         assert "GiB" in message and "\n" not in message
 
 
-def test_every_mistake_has_its_line_and_the_fifth_is_the_last() -> None:
+def test_up_to_five_errors_are_listed_one_per_line() -> None:
     bad = GOOD.replace("dt: 0.01", "dt: 0").replace("count: 5", "count: 0")
     assert [line.split(" ")[0] for line in refusal(bad).splitlines()] == ["text:4:", "text:10:"]
     flood = GOOD + "".join(f"key{k}: 1\n" for k in range(9))
@@ -316,7 +316,7 @@ def test_every_mistake_has_its_line_and_the_fifth_is_the_last() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected"),
     [
         ("\n", "text: empty"),
         ("# nothing\n", "text: empty"),
@@ -330,14 +330,14 @@ def test_every_mistake_has_its_line_and_the_fifth_is_the_last() -> None:
         ("a: \0", "text:1: not YAML text: "),
     ],
 )
-def test_what_is_no_configuration_is_refused(text: str, said: str) -> None:
+def test_text_without_keys_and_values_is_refused(text: str, expected: str) -> None:
     message = refusal(text)
-    assert message.startswith(said)
+    assert message.startswith(expected)
     assert "\n" not in message and len(message) < 300
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "expected"),
     [
         (b"", ": empty"),
         (GOOD.encode("utf-16"), ": UTF-16 text; save it as UTF-8"),
@@ -347,13 +347,13 @@ def test_what_is_no_configuration_is_refused(text: str, said: str) -> None:
         (b"#" * (MAX_BYTES + 1), f": larger than {MAX_BYTES} bytes, the most that is read"),
     ],
 )
-def test_a_file_that_is_no_text_is_refused(tmp_path: Path, content: bytes, said: str) -> None:
+def test_file_that_is_not_utf_8_text_is_refused(tmp_path: Path, content: bytes, expected: str) -> None:
     path = tmp_path / "scene.yaml"
     path.write_bytes(content)
-    assert refusal(path) == f"{path}{said}"
+    assert refusal(path) == f"{path}{expected}"
 
 
-def test_a_file_that_is_not_there_is_refused_with_the_nearest(tmp_path: Path) -> None:
+def test_missing_file_is_refused_with_the_nearest_name(tmp_path: Path) -> None:
     (tmp_path / "boids.yaml").write_text(GOOD)
     missing = tmp_path / "biods.yaml"
     assert refusal(missing) == f"{missing}: no such file, did you mean `boids.yaml`?"
@@ -364,7 +364,7 @@ def test_a_file_that_is_not_there_is_refused_with_the_nearest(tmp_path: Path) ->
     assert refusal("x" * 300).endswith("x: cannot be read: File name too long")
 
 
-def test_a_scene_may_come_from_a_pipe_or_from_standard_input(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scene_is_read_from_a_pipe_or_standard_input(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(GOOD.encode())))
     assert load_scene("-") == load_scene(GOOD)
     monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(b"dt: fast")))
@@ -388,14 +388,14 @@ def test_a_scene_may_come_from_a_pipe_or_from_standard_input(monkeypatch: pytest
     ],
 )
 @pytest.mark.parametrize("place", ["{}\n", "a: {}\n", "{}: 1\n", "a: [1, {}]\n"])
-def test_a_tag_builds_nothing(tmp_path: Path, tag: str, place: str) -> None:
+def test_yaml_tags_run_no_code(tmp_path: Path, tag: str, place: str) -> None:
     marker = tmp_path / "made"
     message = refusal(place.format(tag.format(marker)))
     assert "\n" not in message
     assert not marker.exists()
 
 
-def test_a_million_aliases_are_not_followed() -> None:
+def test_nested_aliases_are_refused() -> None:
     bomb = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True))
     assert refusal(bomb) == "text:1: a: anchors and aliases are not read: write the value out"
 
@@ -411,7 +411,7 @@ def test_a_million_aliases_are_not_followed() -> None:
     ],
     ids=["keys", "numbers", "blocks", "depth", "escapes"],
 )
-def test_a_large_bad_file_has_a_short_answer(text: str) -> None:
+def test_error_about_a_large_file_is_short(text: str) -> None:
     assert len(refusal(text)) < 2000
 
 
@@ -421,14 +421,14 @@ def test_a_large_bad_file_has_a_short_answer(text: str) -> None:
 @example("a: 1_")
 @example("a: _1")
 @example("\t: -")
-def test_whatever_is_written_it_is_read_or_refused(text: str) -> None:
+def test_any_text_is_read_or_refused_with_a_config_error(text: str) -> None:
     try:
         load(text + "\n", Anything)
     except ConfigError as error:
         assert all(line.isprintable() for line in str(error).splitlines())
 
 
-def test_a_value_that_fits_no_member_of_a_union_is_one_mistake() -> None:
+def test_value_that_fits_no_member_of_a_union_is_one_error() -> None:
     class Wave(BaseModel):
         kind: Literal["wave"] = "wave"
         height: float
@@ -442,12 +442,12 @@ def test_a_value_that_fits_no_member_of_a_union_is_one_mistake() -> None:
 # --- the schema -------------------------------------------------------------------------------------------------------
 
 
-def test_the_schema_in_configs_is_the_scenes() -> None:
-    """If this fails: flockenv schema > configs/schema.json."""
+def test_schema_in_configs_is_current() -> None:
+    """To update the file: flockenv schema > configs/schema.json."""
     assert json.loads((ROOT / "configs" / "schema.json").read_text()) == schema()
 
 
-def test_the_schema_names_every_effect_and_integrator() -> None:
+def test_schema_contains_every_effect_and_integrator() -> None:
     text = json.dumps(schema())
     kinds: list[Any] = [*EFFECTS, *INTEGRATORS]
     assert all(f'"{kind}"' in text for kind in kinds)
