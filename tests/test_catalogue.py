@@ -1,4 +1,4 @@
-"""The lists of tests/catalogue.py are complete: whoever adds a law and forgets its row is told so."""
+"""The lists of tests/catalogue.py are complete: a law without a row fails a test here."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def kinds_in(folder: str, attribute: str) -> set[str]:
-    """The kinds or names that the classes in a folder's files state in their own text."""
+    """Return the kinds or names that classes in the files of a folder assign in their source."""
     return {
         ast.literal_eval(node.value)
         for path in (ROOT / "flockenv" / folder).glob("*.py")
@@ -42,7 +42,7 @@ def test_every_effect_can_be_idle() -> None:
     assert [row.name for row in catalogue.EFFECTS if row.effect.idle() == row.effect] == []
 
 
-ABOUT_GROUPS = [
+WITH_GROUPS = [
     (row, name)
     for row in catalogue.FIRST
     for name in ("group", "other", "food")
@@ -50,16 +50,16 @@ ABOUT_GROUPS = [
 ]
 
 
-@pytest.mark.parametrize(("row", "name"), ABOUT_GROUPS, ids=lambda given: getattr(given, "name", given))
-def test_a_group_that_is_not_there_is_refused_by_its_name(row: catalogue.EffectRow, name: str) -> None:
-    """Its numbers would be read from where those of others are."""
-    assert len(ABOUT_GROUPS) >= 18
-    said = rf"{name} = 2: there are 2 groups, counted from 0$"
+@pytest.mark.parametrize(("row", "name"), WITH_GROUPS, ids=lambda given: getattr(given, "name", given))
+def test_missing_group_is_refused_with_the_name_of_the_field(row: catalogue.EffectRow, name: str) -> None:
+    """Otherwise the kernel would read numbers of other groups."""
+    assert len(WITH_GROUPS) >= 18
+    message = rf"{name} = 2: there are 2 groups, counted from 0$"
     beyond = row.at(2)[0].model_copy(update={name: 2})
-    with pytest.raises(ValueError, match=rf"effects\[0\]\.{said}"):
+    with pytest.raises(ValueError, match=rf"effects\[0\]\.{message}"):
         catalogue.scene_of(beyond).start(0)
     if beyond.steering and not beyond.wishes:
-        with pytest.raises(ValueError, match=rf"effects\[0\]\.behaviours\[0\]\.{said}"):
+        with pytest.raises(ValueError, match=rf"effects\[0\]\.behaviours\[0\]\.{message}"):
             catalogue.scene_of(Steer(group=0, behaviours=(beyond,)))
 
 
@@ -88,7 +88,7 @@ def test_every_space_has_a_row() -> None:
     assert all(spaces[d].kind == kind for kind, spaces in catalogue.SPACES.items() for d in (2, 3))
 
 
-def test_names_are_told_apart() -> None:
+def test_names_of_rows_are_unique() -> None:
     for rows in (catalogue.EFFECTS, catalogue.INTEGRATORS, catalogue.TASKS, catalogue.STEERING):
         names = [row.name for row in rows]
         assert len(set(names)) == len(names)
@@ -102,7 +102,7 @@ def compiled_functions() -> Iterator[tuple[str, ast.FunctionDef]]:
 
 
 def test_no_compiled_law_calls_itself() -> None:
-    """numba's disk cache keeps such a call without its target: the second process that runs it dies."""
+    """numba's disk cache stores such a call without its target; the second process that runs it crashes."""
     laws = dict(compiled_functions())
     assert len(laws) > 100
     calls = {

@@ -1,4 +1,4 @@
-"""A critic that sees more than its actor: what it is shown, and that the actor is shown none of it."""
+"""Central critic: what it observes, and that the actor observes none of that."""
 
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ def actions_for(task: Task, worlds: int, steps: int) -> list[np.ndarray[Any, np.
 
 
 def besides(world: World, seen: Any, b: int) -> list[float]:
-    """What the critics of world b are shown beside their rows, number by number."""
+    """Return the numbers that the critics of world b observe in addition to the rows of their learners."""
     first = world.learners
     here = [i for i in range(first) if world.state.alive[b, i]]
     shown = [sum(float(seen[b, i, k]) for i in here) / max(len(here), 1) for k in range(seen.shape[2])]
@@ -34,8 +34,8 @@ def besides(world: World, seen: Any, b: int) -> list[float]:
     return shown + [float(row[j]) for row in world.memory[b] for j in range(first, world.agents)]
 
 
-def test_behind_what_a_learner_sees_stands_what_only_its_critic_is_shown() -> None:
-    """As a lone world has it: of who goes on, as the next episode begins, and of who ended, as the last one did."""
+def test_rows_append_the_critic_s_observation_to_the_learner_s() -> None:
+    """Equal to a single world's: of the next episode's start in the rows, and of the last end in the infos."""
     plain, central = (kind(SCHOOL, 3, time_limit=6, leaving=True) for kind in (WorldVecEnv, CentralVecEnv))
     lone, size, shares, ends = World(SCHOOL, 3, time_limit=6), SCHOOL.layout.size, set(), []
     for env in (plain, central):
@@ -47,8 +47,8 @@ def test_behind_what_a_learner_sees_stands_what_only_its_critic_is_shown() -> No
         world.steps[:] = (0, 2, 3)
     for actions in actions_for(SCHOOL, 3, 14):
         rows, reward, done, infos = central.step(actions)
-        told, paid, over, others = plain.step(actions)
-        np.testing.assert_array_equal(rows[:, :size], told)
+        expected_rows, paid, over, others = plain.step(actions)
+        np.testing.assert_array_equal(rows[:, :size], expected_rows)
         np.testing.assert_array_equal(reward, paid)
         np.testing.assert_array_equal(done, over)
         step = lone.step(actions.reshape(3, 3, -1))
@@ -71,7 +71,7 @@ def test_behind_what_a_learner_sees_stands_what_only_its_critic_is_shown() -> No
 
 
 @pytest.mark.parametrize("task", [Flock(agents=7), Herd(sheep=5, dogs=2)], ids=lambda task: task.name)
-def test_whoever_learns_alone_or_with_others_has_a_critic(task: Task) -> None:
+def test_rows_have_the_observation_space_with_one_and_several_learners(task: Task) -> None:
     central = CentralVecEnv(task, 2)
     rows = central.reset()
     assert rows.shape == (2 * task.learners, *central.observation_space.shape) and rows.dtype == np.float32
@@ -85,7 +85,7 @@ def settings(**changes: Any) -> Experiment:
     return Experiment(task="school", arguments=arguments, ppo=PpoSettings(**{**few, **changes}))
 
 
-def test_an_actor_is_blind_to_what_its_critic_sees_and_is_what_is_exported() -> None:
+def test_actor_ignores_the_critic_s_observation_and_is_exported() -> None:
     experiment = settings()
     task = experiment.build()
     model = ppo.build(task, experiment.ppo, None)
@@ -104,8 +104,8 @@ def test_an_actor_is_blind_to_what_its_critic_sees_and_is_what_is_exported() -> 
     np.testing.assert_allclose(answers, np.clip(acts[0], -1, 1), rtol=1e-5, atol=1e-6)
 
 
-def test_what_a_central_critic_and_held_actions_came_to_goes_on_after_an_interruption(tmp_path: Path) -> None:
-    """Decisions are counted on, the networks are those of before, and it is still only the critic that learns."""
+def test_training_with_a_central_critic_and_held_actions_can_be_resumed(tmp_path: Path) -> None:
+    """The count of steps continues, networks are restored, and still only the critic learns."""
     update = 4 * 3 * 16 * 3
     changes = {"taught": 3, "critic_first": 4 * update, "hold": 3, "steps": 3 * update, "evaluate_every": update}
     experiment = settings(**changes)

@@ -1,6 +1,6 @@
-"""The scripts that other libraries play by, and the page about them: what can be checked without those libraries.
+"""Scripts for clients, other libraries that use the environments, and their page, as far as testable without them.
 
-`python -m tests.clients` plays; it needs the network and many minutes.
+`python -m tests.clients` runs the scripts; it needs the network and many minutes.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ BLOCKS = re.findall(r"^## ([^\n]*)\n[^#]*?```python\n(.*?)```", PAGE, re.DOTALL 
 
 
 @pytest.mark.parametrize("client", CLIENTS)
-def test_a_script_pins_what_it_needs(client: str) -> None:
+def test_script_pins_its_dependencies(client: str) -> None:
     needs = head(client)
     assert needs["dependencies"]
     assert all(re.fullmatch(r"[\w.-]+(\[\w+\])?==[\d.]+", one) for one in needs["dependencies"])
@@ -31,26 +31,26 @@ def test_a_script_pins_what_it_needs(client: str) -> None:
 
 
 @pytest.mark.parametrize("client", CLIENTS)
-def test_the_log_has_the_versions_that_the_scripts_pin(client: str) -> None:
-    """In the row of the client; torch comes with all of them, and what comes with a client is not named."""
+def test_page_lists_the_versions_that_scripts_pin(client: str) -> None:
+    """Only the client itself is listed, without torch and its other dependencies."""
     pinned = dict(one.split("==") for one in head(client)["dependencies"] if not one.startswith("torch=="))
     for name, version in list(pinned.items())[:1]:
         assert f"| {name.partition('[')[0]} {version} |" in PAGE
 
 
 @pytest.mark.parametrize(("title", "code"), BLOCKS, ids=[title for title, _ in BLOCKS])
-def test_the_code_on_the_page_runs_where_its_library_is_here(title: str, code: str) -> None:
+def test_code_on_the_page_runs_if_its_libraries_are_installed(title: str, code: str) -> None:
     program = compile(code, f"docs/clients.md, {title}", "exec")
     needed = {name.partition(".")[0] for name in re.findall(r"^\s*(?:import|from) ([\w.]+)", code, re.MULTILINE)}
     lacking = sorted(name for name in needed if find_spec(name) is None)
     if lacking:
         pytest.skip(f"not installed: {', '.join(lacking)}")
-    exec(program, {})  # noqa: S102  # that is the point
+    exec(program, {})  # noqa: S102  # the test runs the page's code
 
 
 PLAYED = """
 import json
-print("what a client prints")
+print("output of a client")
 for env, lines in (("A-v0", 0), ("B-v0", 0), ("B-v0", 2)):
     print(json.dumps({"client": "x 1.0", "what": "all", "env": env, "lines": lines, "steps": 1000, "seconds": 0.1}))
 """
@@ -63,10 +63,10 @@ TABLE = """\
 
 
 @pytest.mark.parametrize(("end", "code"), [("", 0), ("raise SystemExit(3)", 3), ("import a_package_not_here", 1)])
-def test_what_was_played_before_a_script_fails_is_in_the_log(
+def test_results_before_a_script_fails_are_in_the_table(
     end: str, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """With --python beside the folder that the command is run in, as it is typed."""
+    """--python is given relative to the working folder."""
     (tmp_path / "play_x.py").write_text(PLAYED + end, encoding="utf-8")
     (tmp_path / "python").symlink_to(sys.executable)
     monkeypatch.chdir(tmp_path)
@@ -81,13 +81,13 @@ def test_what_was_played_before_a_script_fails_is_in_the_log(
     assert capfd.readouterr().out == TABLE
 
 
-def test_what_is_built_for_a_client_is_the_package_and_nothing_is_left_here(tmp_path: Path) -> None:
+def test_source_for_a_client_is_the_package(tmp_path: Path) -> None:
     copy = runner.source(tmp_path / "source")
     packages = {path.relative_to(ROOT) for path in (ROOT / "flockenv").rglob("*.py")}
     assert packages == {path.relative_to(copy) for path in copy.rglob("*.py")}
     assert (copy / "pyproject.toml").read_bytes() == (ROOT / "pyproject.toml").read_bytes()
 
 
-def test_no_test_run_collects_the_scripts() -> None:
+def test_pytest_does_not_collect_the_scripts() -> None:
     assert not list(HERE.glob("test_*.py")) + list(HERE.glob("*_test.py"))
     assert importlib.import_module("tests.clients").__doc__

@@ -1,4 +1,4 @@
-"""One process compiles a kernel, the others wait for what it writes."""
+"""Lock of the disk cache: one process compiles a kernel, the others wait for its file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ print(sum(each.kernel == "scene_step" for each in compiled()))
 
 
 class Disk:
-    """What numba's cache of a function does, in a dictionary that several share."""
+    """A replacement for numba's cache of a function; several instances share one dictionary."""
 
     def __init__(self, kept: dict[str, str]) -> None:
         self.kept, self.asked, self.name = kept, 0, "a function"
@@ -47,9 +47,9 @@ def two(tmp_path: Path, patience: float = 60.0) -> tuple[OneAtATime, OneAtATime]
     return first, second
 
 
-def test_who_comes_second_waits_for_what_the_first_writes(tmp_path: Path) -> None:
+def test_second_process_waits_for_the_file_of_the_first(tmp_path: Path) -> None:
     first, second = two(tmp_path)
-    assert first.load_overload("f8", None) is None  # it is up to the first
+    assert first.load_overload("f8", None) is None  # so that the first compiles
     found: list[str | None] = []
     waiter = threading.Thread(target=lambda: found.append(second.load_overload("f8", None)))
     waiter.start()
@@ -58,11 +58,11 @@ def test_who_comes_second_waits_for_what_the_first_writes(tmp_path: Path) -> Non
     first.save_overload("f8", "code")
     waiter.join(10)
     assert found == ["code"]
-    assert second.load_overload("f4", None) is None  # and the lock is free again
+    assert second.load_overload("f4", None) is None  # the lock is free again
     assert first.name == "a function"
 
 
-def test_a_compilation_that_fails_in_another_thread_holds_nobody_up(tmp_path: Path) -> None:
+def test_failed_compilation_in_another_thread_does_not_block(tmp_path: Path) -> None:
     first, _ = two(tmp_path, patience=0.2)
     failed = threading.Thread(target=first.load_overload, args=("f8", None))
     failed.start()
@@ -73,21 +73,21 @@ def test_a_compilation_that_fails_in_another_thread_holds_nobody_up(tmp_path: Pa
 
 
 @pytest.mark.parametrize("how", ["the compiler raises", "the disk is full"])
-def test_a_compilation_that_fails_holds_nobody_up(tmp_path: Path, how: str) -> None:
+def test_failed_compilation_does_not_block(tmp_path: Path, how: str) -> None:
     first, second = two(tmp_path)
     assert first.load_overload("f8", None) is None
     if how == "the disk is full":
         with pytest.raises(OSError, match="disk full"):
             first.save_overload("f8", "no")
     else:
-        assert first.load_overload("f4", None) is None  # tried again, with other types
+        assert first.load_overload("f4", None) is None  # numba tries again with other types
         first.save_overload("f4", "code")
     assert second.load_overload("f8", None) is None
     second.save_overload("f8", "code")
     assert first.load_overload("f8", None) == "code"
 
 
-def test_nobody_is_waited_for_without_end(tmp_path: Path) -> None:
+def test_waiting_for_another_process_is_limited(tmp_path: Path) -> None:
     first, second = two(tmp_path, patience=0.1)
     assert first.load_overload("f8", None) is None
     assert second.load_overload("f8", None) is None
@@ -95,17 +95,17 @@ def test_nobody_is_waited_for_without_end(tmp_path: Path) -> None:
     assert first.load_overload("f8", None) == "code"
 
 
-def test_what_is_there_is_read_without_waiting(tmp_path: Path) -> None:
+def test_existing_entry_is_read_without_waiting(tmp_path: Path) -> None:
     first, second = two(tmp_path, patience=60.0)
     second.save_overload("f8", "code")
     assert first.load_overload("f4", None) is None
     assert second.load_overload("f8", None) == "code"
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="nobody forks here")
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 @pytest.mark.parametrize("busy", [False, True], ids=["idle", "compiling"])
-def test_a_forked_process_has_a_lock_of_its_own(tmp_path: Path, busy: bool) -> None:
-    """As gymnasium's AsyncVectorEnv forks, with what its parent has begun to use."""
+def test_forked_process_has_its_own_lock(tmp_path: Path, busy: bool) -> None:
+    """gymnasium's AsyncVectorEnv forks after its parent has used the lock."""
     first, _ = two(tmp_path, patience=0.2)
     if busy:
         assert first.load_overload("f8", None) is None
@@ -122,15 +122,15 @@ def test_a_forked_process_has_a_lock_of_its_own(tmp_path: Path, busy: bool) -> N
     if not busy:
         assert first.load_overload("f8", None) is None
     with pytest.raises(Timeout):
-        FileLock(tmp_path / "a.lock", timeout=0).acquire()  # the child's end has freed nothing of its parent's
+        FileLock(tmp_path / "a.lock", timeout=0).acquire()  # the exit of the child did not release the parent's lock
     first.save_overload("f8", "code")
     FileLock(tmp_path / "a.lock", timeout=0).acquire()
 
 
 @pytest.mark.slow
-def test_of_three_processes_that_begin_together_one_compiles(tmp_path: Path) -> None:
+def test_one_of_three_simultaneous_processes_compiles(tmp_path: Path) -> None:
     environment = {**os.environ, "FLOCKENV_CACHE": str(tmp_path), "FLOCKENV_QUIET": "1"}
     command = [sys.executable, "-c", MANY]
     processes = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(3)]
-    said = [process.communicate(timeout=300)[0] for process in processes]
-    assert sorted(said) == ["0\n", "0\n", "1\n"]
+    printed = [process.communicate(timeout=300)[0] for process in processes]
+    assert sorted(printed) == ["0\n", "0\n", "1\n"]

@@ -1,4 +1,4 @@
-"""Scenes of crowds: bounds of RiMEA and NIST that hold, verdicts, the page, and the scenes in configs/."""
+"""Crowds: cases of RiMEA and NIST that pass, verdicts, the page, and the scenes in configs/."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ def found(name: str, preset: str = NERVOUS) -> Finding:
     return run(cases_named(CASES, (name,)), (preset,)).findings[0]
 
 
-# --- people walk ------------------------------------------------------------------------------------------------------
+# --- motion -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", [pytest.param("rimea 1", marks=slow), "nist 2.1", "juelich 2", "rimea 7"])
-def test_who_walks_alone_walks_as_fast_as_guidelines_ask(name: str) -> None:
+def test_single_pedestrian_passes_the_guidelines(name: str) -> None:
     finding = found(name)
     assert finding.verdict == "pass", finding.note
 
 
-def test_who_wants_to_walk_slower_is_later_than_rimea_1_allows() -> None:
+def test_crossing_time_at_a_desired_speed_below_that_of_rimea_1() -> None:
     with quietly():
         run_ = walked(corridor(NERVOUS, 1.1, length=40), 60)
     assert crossing_time(run_.time, run_.pos[:, 0, 0, 0], 40.0) == pytest.approx(40 / 1.1 + 0.5, abs=0.02)
 
 
 @pytest.mark.slow
-def test_twenty_people_come_around_a_corner_and_through_no_wall() -> None:
+def test_twenty_people_turn_a_corner_and_do_not_cross_walls() -> None:
     finding = found("rimea 6")
     assert finding.verdict == "pass", finding.note
     assert finding.note == "0 times through a wall"
@@ -57,14 +57,14 @@ def test_twenty_people_come_around_a_corner_and_through_no_wall() -> None:
 
 @slow
 @pytest.mark.parametrize("name", ["lanes", "nist 5.1"])
-def test_what_the_preset_of_2000_holds(name: str) -> None:
+def test_cases_that_the_preset_of_2000_passes(name: str) -> None:
     finding = found(name)
     assert finding.verdict == "pass", finding.note
 
 
 @slow
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
-def test_scenes_of_crowds_run(path: Path) -> None:
+def test_crowds_in_configs_move(path: Path) -> None:
     with quietly():
         scene = load_scene(path)
         start = scene.start(0)
@@ -79,12 +79,12 @@ DENSE = sorted(p for p in (ROOT / "configs" / "crowds").glob("rimea_*") if p.ste
 
 
 @pytest.mark.parametrize("path", DENSE, ids=lambda path: path.stem)
-def test_crowds_in_corridors_begin_apart_and_walk_under_every_seed(path: Path) -> None:
-    """Scattered anywhere, they began up to .65 m in each other: contact threw them at 3,000 m/s, or diverged."""
+def test_dense_crowds_start_without_deep_overlap_and_stay_in_the_corridor(path: Path) -> None:
+    """With uniformly random positions, overlaps of up to 0.65 m caused speeds of 3,000 m/s, or divergence."""
     with quietly():
         scene = load_scene(path)
     here, radius = scene.start(0).alive[0], scene.body.radius
-    limit = 2 / scene.dt * 80 / (2 * 2.4e5)  # m: beyond, friction of two bodies, kappa d 2 / m, is unstable
+    limit = 2 / scene.dt * 80 / (2 * 2.4e5)  # m of overlap d; friction of two bodies, kappa d 2 / m, is unstable beyond
     for seed in range(10):
         with quietly():
             state = scene.start(seed)
@@ -97,7 +97,7 @@ def test_crowds_in_corridors_begin_apart_and_walk_under_every_seed(path: Path) -
         assert np.abs(state.pos[0, here, 1] - 16).max() < (2 if "rimea_4" in path.stem else 0.4)
 
 
-# --- configs say what cases say ---------------------------------------------------------------------------------------
+# --- configs agree with the cases -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -108,29 +108,29 @@ def test_crowds_in_corridors_begin_apart_and_walk_under_every_seed(path: Path) -
         ("crowd_room", lambda: room(NERVOUS, 200, (15.0, 15.0), 1.0, 1.5)),
     ],
 )
-def test_configs_are_the_scenes_of_the_cases(name: str, built: Any) -> None:
+def test_scenes_in_configs_equal_those_of_the_cases(name: str, built: Any) -> None:
     with quietly():
-        said, made = load_scene(ROOT / "configs" / "scenes" / f"{name}.yaml"), built()
-    assert _walls(said) == _walls(made)
-    assert said.groups[0].size == made.groups[0].size
-    assert [effect for effect in said.effects if effect.kind != "way"] == [e for e in made.effects if e.kind != "way"]
-    assert said.effects[0] == made.effects[0]
+        loaded, expected = load_scene(ROOT / "configs" / "scenes" / f"{name}.yaml"), built()
+    assert _walls(loaded) == _walls(expected)
+    assert loaded.groups[0].size == expected.groups[0].size
+    assert [e for e in loaded.effects if e.kind != "way"] == [e for e in expected.effects if e.kind != "way"]
+    assert loaded.effects[0] == expected.effects[0]
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_files_of_scenes_are_what_cases_try(case: Case) -> None:
-    """If this fails: flockenv validate --preset helbing_2000 --scenes configs/crowds --force."""
-    for which, built in SCENES[case.name].items():
-        file = ROOT / "configs" / "crowds" / f"{'_'.join([*case.name.split(), *which.split()])}.yaml"
+def test_scene_files_equal_the_scenes_of_the_cases(case: Case) -> None:
+    """To update the files: flockenv validate --preset helbing_2000 --scenes configs/crowds --force."""
+    for variant, built in SCENES[case.name].items():
+        file = ROOT / "configs" / "crowds" / f"{'_'.join([*case.name.split(), *variant.split()])}.yaml"
         with quietly():
             assert load_scene(file) == built(NERVOUS)
 
 
-def test_there_is_no_other_file_of_scenes() -> None:
+def test_there_is_one_scene_file_per_variant() -> None:
     assert len(list((ROOT / "configs" / "crowds").iterdir())) == sum(len(SCENES[case.name]) for case in CASES)
 
 
-def test_scenes_are_written_with_their_model_by_name_and_never_over_others(
+def test_scenes_are_written_with_the_preset_by_name_and_never_overwrite(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -154,14 +154,14 @@ def test_scenes_are_written_with_their_model_by_name_and_never_over_others(
 @pytest.mark.parametrize(
     "preset", [VALIDATED[0], *(pytest.param(name, marks=pytest.mark.slow) for name in VALIDATED[1:])]
 )
-def test_every_scene_can_be_built_with_every_preset(preset: str, case: Case) -> None:
+def test_every_case_can_be_built_with_every_preset(preset: str, case: Case) -> None:
     with quietly():
         for built in SCENES[case.name].values():
             assert sum(built(preset).living) > 0
 
 
 def _walls(scene: Scene) -> set[tuple[tuple[float, ...], tuple[float, ...]]]:
-    """Every straight side, its ends in order."""
+    """Return every straight side as a sorted pair of its ends."""
     sides = [(a, b) for shape in scene.shapes for a, b in zip(shape.vertices, shape.vertices[1:], strict=False)]  # type: ignore[attr-defined]
     return {tuple(sorted((tuple(map(float, a)), tuple(map(float, b))))) for a, b in sides}  # type: ignore[misc]
 
@@ -169,7 +169,7 @@ def _walls(scene: Scene) -> set[tuple[tuple[float, ...], tuple[float, ...]]]:
 # --- verdicts, names, the page ----------------------------------------------------------------------------------------
 
 
-def test_names_that_are_unknown_are_refused_with_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_names_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert [case.name for case in cases_named(CASES, ("juelich",))] == ["juelich 2", "juelich 6"]
     assert presets_named(["helbing_2000"]) == (NERVOUS,)
     assert presets_named([]) == VALIDATED
@@ -179,7 +179,7 @@ def test_names_that_are_unknown_are_refused_with_the_nearest(capsys: pytest.Capt
     assert "--preset = 'helbing_2001': unknown, did you mean" in capsys.readouterr().err
 
 
-def test_the_command_writes_a_page_and_goes_on_where_it_was(
+def test_validate_writes_a_page_and_continues_with_earlier_findings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     calls: list[str] = []
@@ -207,7 +207,7 @@ def test_the_command_writes_a_page_and_goes_on_where_it_was(
     assert "contains no findings of crowds" in capsys.readouterr().err
 
 
-def test_when_somebody_was_somewhere_and_when_he_left() -> None:
+def test_crossing_and_leaving_times() -> None:
     time = np.array([0.0, 1.0, 2.0])
     assert crossing_time(time, np.array([0.0, 1.0, 3.0]), 2.0) == 1.5
     assert math.isnan(crossing_time(time, np.array([0.0, 1.0, 3.0]), 4.0))
@@ -217,13 +217,13 @@ def test_when_somebody_was_somewhere_and_when_he_left() -> None:
     np.testing.assert_array_equal(gone, [2.0, np.nan, np.nan])
 
 
-def test_a_flow_is_off_by_what_it_is_outside_of_its_band() -> None:
+def test_deviation_of_a_flow_is_its_relative_distance_to_the_band() -> None:
     assert _off(1.8, DATA[1.0]) == 0
     assert _off(0.9 * 1.71, DATA[1.0]) == pytest.approx(-0.1)
     assert _off(1.2 * 2.02, DATA[1.0]) == pytest.approx(0.2)
 
 
-def made_up() -> Results:
+def artificial() -> Results:
     cloud = {"density": (0.5, 1.0), "speed": (1.2, None), "densities": DENSITIES, "speeds": (1.0,) * len(DENSITIES)}
     spots = tuple(float(k % 32) for k in range(5 * 2 * EACH_WAY))
     series: dict[str, Any] = {
@@ -240,8 +240,8 @@ def made_up() -> Results:
     )  # fmt: skip
 
 
-def test_the_page_shows_every_finding_and_every_picture(tmp_path: Path) -> None:
-    results = made_up()
+def test_page_has_every_finding_and_picture(tmp_path: Path) -> None:
+    results = artificial()
     drawn = write_pictures(tmp_path, results)
     assert [path.name for path in drawn] == [
         "fundamental_diagram.png", "bottleneck.png", "lanes.png", "faster_is_slower.png",
@@ -253,8 +253,8 @@ def test_the_page_shows_every_finding_and_every_picture(tmp_path: Path) -> None:
     assert "![bottleneck](crowds/bottleneck.png)" in text
 
 
-def test_the_page_in_docs_is_that_of_its_numbers() -> None:
-    """If this fails: flockenv validate --out docs/crowds.md."""
+def test_page_in_docs_matches_its_data() -> None:
+    """To update the page: flockenv validate --out docs/crowds.md."""
     results = Results.model_validate_json((ROOT / "docs" / "crowds.json").read_text())
     drawn = [
         name for name in ("fundamental_diagram", "bottleneck", "lanes", "faster_is_slower")

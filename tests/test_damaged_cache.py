@@ -1,4 +1,4 @@
-"""A kernel file that was emptied, cut, or in which a bit has changed is noticed, said once, and made anew."""
+"""Damaged kernel files in the cache are detected, reported once, and rebuilt."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def run(folder: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """A folder in which all is well, and what a process says that uses it."""
+    """Return an undamaged cache folder, and the output of a process that uses it."""
     folder = tmp_path_factory.mktemp("whole") / "cache"
     done = run(folder)
     assert (done.returncode, done.stderr) == (0, "")
@@ -42,7 +42,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 
 def flipped(at: float) -> Callable[[bytes], bytes]:
-    """Change the lowest bit of the byte that lies there, as a share of all."""
+    """Return a function that flips the lowest bit of one byte; `at` is its position as a fraction of the length."""
 
     def flip(data: bytes) -> bytes:
         changed = bytearray(data)
@@ -56,8 +56,8 @@ DAMAGE: dict[str, Callable[[bytes], bytes]] = {
     "emptied": lambda data: b"",
     "cut to one byte": lambda data: data[:1],
     "cut in the middle": lambda data: data[: len(data) // 2],
-    "its end is zeros": lambda data: data[: len(data) // 2] + bytes(len(data) - len(data) // 2),
-    "longer": lambda data: data + b"\0",
+    "second half zeroed": lambda data: data[: len(data) // 2] + bytes(len(data) - len(data) // 2),
+    "one byte longer": lambda data: data + b"\0",
     "a bit flipped at the beginning": flipped(0),
     "a bit flipped in the middle": flipped(0.5),
     "a bit flipped at the end": flipped(1),
@@ -66,11 +66,11 @@ DAMAGE: dict[str, Callable[[bytes], bytes]] = {
 
 @pytest.mark.parametrize("how", ["emptied", "cut in the middle", "a bit flipped in the middle"])
 @pytest.mark.parametrize("kind", ["nbc"])
-def test_a_damaged_file_costs_one_line_and_one_compilation(
+def test_damaged_file_causes_one_message_and_one_compilation(
     kind: str, how: str, whole: tuple[Path, str], tmp_path: Path
 ) -> None:
     folder = Path(shutil.copytree(whole[0], tmp_path / "cache"))
-    run(folder)  # bytecode knows where its source lies
+    run(folder)  # bytecode contains the path of its source
     (path,) = folder.glob(f"scene_*.{kind}")
     before = path.read_bytes()
     path.write_bytes(DAMAGE[how](before))
@@ -82,7 +82,7 @@ def test_a_damaged_file_costs_one_line_and_one_compilation(
 
 
 @pytest.mark.slow
-def test_a_scene_goes_on_where_every_file_is_damaged(tmp_path: Path) -> None:
+def test_scene_runs_if_every_file_is_damaged(tmp_path: Path) -> None:
     folder = tmp_path / "cache"
     before = run(folder)
     files = [path for path in folder.iterdir() if path.is_file()]
@@ -113,7 +113,7 @@ def test_damaged_data_is_never_returned(
     assert store.read("name") == b"new"
 
 
-def test_no_bit_and_no_cut_goes_unnoticed(store: Store) -> None:
+def test_flipped_bits_and_truncations_are_detected(store: Store) -> None:
     path = store.folder / "name"
     data = path.read_bytes()
     for at in range(len(data)):
@@ -128,13 +128,13 @@ def test_no_bit_and_no_cut_goes_unnoticed(store: Store) -> None:
     assert store.read("name") == bytes(range(256)) * 3
 
 
-def test_data_is_found_under_its_own_name_alone(store: Store) -> None:
+def test_data_is_read_only_under_its_own_name(store: Store) -> None:
     shutil.copy(store.folder / "name", store.folder / "other")
     assert store.read("other") is None
     assert store.read("missing") is None
 
 
-def test_a_full_disk_is_said_once_and_nothing_is_left(
+def test_full_disk_is_reported_once_and_leaves_no_files(
     store: Store, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def full(handle: int) -> None:
@@ -143,7 +143,7 @@ def test_a_full_disk_is_said_once_and_nothing_is_left(
     monkeypatch.setattr(os, "fsync", full)
     for name in ("name", "other"):
         store.write(name, b"new")
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and "No space left on device" in said and str(store.folder) in said
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1 and "No space left on device" in printed and str(store.folder) in printed
     assert [path.name for path in store.folder.iterdir()] == ["name"]
     assert store.read("name") == bytes(range(256)) * 3

@@ -1,4 +1,4 @@
-"""What machine code is known by: the sources of all functions that it is made of, and of records handed to them."""
+"""Digest of machine code: it covers the sources of all functions in a kernel, and of the records passed to them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.catalogue import everything
 
 
 @pytest.mark.skipif(IN_PYTHON, reason="nothing is compiled")
-def test_every_function_and_record_of_a_kernel_lies_in_a_source_of_its_digest() -> None:
+def test_digest_covers_the_source_of_every_function_and_record_of_a_kernel() -> None:
     covered = {path for path, _ in sources_of_code()}
     entries = [
         step_of(everything(2).parts),
