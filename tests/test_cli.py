@@ -157,7 +157,7 @@ def test_run_prints_measures_and_writes_a_trajectory(tmp_path: Path, capsys: pyt
         assert file["pos"].shape == file["vel"].shape == (11, 4, 2)
         assert file["time"] == pytest.approx(np.arange(11) * 0.1)
         assert int(file["seed"]) == 7
-        # F = -c v from rest mass 1: v(t) = v(0) exp(-c t), to the accuracy of the first-order method
+        # F = -c v and mass 1: v(t) = v(0) exp(-c t), to the accuracy of the first-order method
         assert file["vel"][-1] == pytest.approx(file["vel"][0] * np.exp(-0.5), rel=0.01)
         start = load_scene(TINY).start(7)
         assert np.array_equal(file["pos"][0], start.pos[0])

@@ -193,7 +193,7 @@ def test_complete_presets_are_written_by_name() -> None:
     wall=st.floats(1, 1e4),  # float32 allows no larger spaces
     method=st.sampled_from(sorted(INTEGRATORS)),
 )
-def test_scene_survives_a_round_trip(
+def test_a_scene_reads_back_exactly(
     dt: float, rates: list[float], count: int, max_speed: float | None, wall: float, method: str
 ) -> None:
     scene = Scene(
