@@ -238,6 +238,7 @@ FROZEN = """
 import importlib, pickle, sys
 from collections import namedtuple
 import numpy as np
+from flockenv.tasks.decision import indices_of
 from flockenv.tasks.task import Frame
 
 for name, task, before, after, action, terms, observation, counted, measured in pickle.load(open(sys.argv[1], "rb")):
@@ -250,18 +251,20 @@ for name, task, before, after, action, terms, observation, counted, measured in 
             array.flags.writeable = False
     before, after = Frame(*before), Frame(*after)
     found, rows = np.full(terms.shape, np.nan), np.full(observation.shape, np.nan, np.float32)
-    module.reward(p, before, after._replace(alive=before.alive), action, found)
+    at = indices_of(task.measures)
+    module.reward(p, indices_of(task.terms), before, after._replace(alive=before.alive), action, found)
     numbers = np.zeros(len(task.measures))
-    module.ended(p, before, after._replace(alive=after.alive.copy()), numbers, np.zeros(len(terms), bool))
-    module.measure(p, before, after, numbers)
+    module.ended(p, at, before, after._replace(alive=after.alive.copy()), numbers, np.zeros(len(terms), bool))
+    module.measure(p, at, before, after, numbers)
     Measures, metrics = namedtuple("Measures", task.measures), np.full(len(task.metric_names), np.nan)
     for array in counted[:2]:
         array.flags.writeable = False
-    module.metrics(p, Measures(*counted[0]), Measures(*counted[1]), counted[2], metrics)
+    module.metrics(p, indices_of(task.metric_names), Measures(*counted[0]), Measures(*counted[1]), counted[2], metrics)
     np.testing.assert_allclose(metrics, measured, rtol=1e-12, err_msg=name)
+    slots = indices_of(*zip(*task.layout.places.items()))
     if task.abreast:
-        module.abreast(p, after, rows[:, : task.abreast])
-    module.observe(p, after, rows)
+        module.abreast(p, slots, after, rows[:, : task.abreast])
+    module.observe(p, slots, after, rows)
     np.testing.assert_allclose(found, terms, rtol=1e-9, atol=1e-9, err_msg=name)
     np.testing.assert_allclose(rows, observation, atol=2e-6, err_msg=name)
 print("untouched")
