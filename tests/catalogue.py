@@ -1,4 +1,4 @@
-"""One list of everything that is a law here: a row added to it inherits every test that was ever written for its kind.
+"""Lists of all laws, effects, integrators, spaces and tasks: a new row inherits all tests of its kind.
 
 A new effect, integrator, behaviour, task or space is one row below; `test_catalogue.py` fails while a row is missing.
 """
@@ -165,10 +165,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Law:
-    """A steering law and what its arguments are, so that a test can make some and can turn them.
+    """A steering law and the kinds of its arguments, so that a test can generate and rotate them.
 
-    Kinds of vectors: "vector" (any), "heading" (unit), both turned with the world; "own" (unit, in the agent's frame,
-    not turned); "noise" (uniform in [-1, 1]); "walls" (distances to walls per axis, not turned).
+    Kinds of vectors: "vector" (any), "heading" (unit), both rotated with the world; "own" (unit, in the agent's frame,
+    not rotated); "noise" (uniform in [-1, 1]); "walls" (distances to walls per axis, not rotated).
     Numbers: "positive" (around 1), "length" (m, around 3).
     """
 
@@ -192,7 +192,7 @@ STEERING = (
     Law(steering.pursue, ("vector", "vector", "vector", "positive", "positive"), "vector"),
     Law(steering.evade, ("vector", "vector", "vector", "positive", "positive"), "vector"),
     Law(steering.wander_turn, ("vector", "noise", "positive", "positive"), "vector"),
-    # its left hand is the right hand of its mirror image
+    # left and right are exchanged in a mirror image
     Law(steering.wander, ("own", "vector", "positive", "positive"), "vector", turns="upright", mirrors=False),
     Law(steering.in_frame, ("own", "vector"), "vector", turns="upright", mirrors=False),
     Law(steering.match_velocity, ("vector", "vector"), "vector"),
@@ -240,7 +240,7 @@ STEERING = (
     Law(steering.in_cone, ("heading", "vector", "positive", "positive"), "positive"),
     Law(steering.repulsion, ("vector", "heading", "positive", "length"), "vector"),
     Law(steering.elliptical_repulsion, ("vector", "vector", "heading", "length"), "vector"),
-    # it passes everybody on the same side
+    # it passes every neighbour on the same side
     Law(
         steering.sidestep, ("vector", "vector", "vector", "heading", *("positive",) * 5), "vector", turns="upright",
         mirrors=False,
@@ -254,13 +254,13 @@ STEERING = (
 )  # fmt: skip
 
 ARBITRATION = (arbitration.blend, arbitration.prioritise, arbitration.allocate, arbitration.allocate_running)
-"""Those for whoever has wishes and no scene."""
+"""Laws that combine steering forces without a scene."""
 
 ARBITRATIONS = (Blend(), Priority(), Dithering(), Allocation(), RunningSum(), RoundRobin(), ContextSteering())
-"""Those that a `Steer` effect may be given; tests/test_arbitration.py tries all of them."""
+"""Arbitrations of a `Steer` effect that need no inner state; tests/test_arbitration.py tests all of them."""
 
 RECALLING = (Intentions(when=("avoid", "escape", "eat", "mate", "school", "wander")),)
-"""Those that ask what goes on inside agents, so that no scene may have them alone; see tests/test_school.py."""
+"""Arbitrations that read inner states, which other effects must keep; see tests/test_school.py."""
 
 
 # --- effects ----------------------------------------------------------------------------------------------------------
@@ -268,18 +268,18 @@ RECALLING = (Intentions(when=("avoid", "escape", "eat", "mate", "school", "wande
 
 @dataclass(frozen=True)
 class EffectRow:
-    """An effect with parameters under which it acts, and what it must obey.
+    """An effect with parameters under which it acts, and the symmetries it must obey.
 
-    Vectors are given in 3-D; in 2-D their first two numbers are taken, and an axis is left out.
+    Vectors are given in 3-D; in 2-D only their first two numbers are used, and `axis` is None.
     """
 
     effect: Effect
-    beside: tuple[Effect, ...] = ()  # without which it moves nobody: what a medium drags or carries
+    beside: tuple[Effect, ...] = ()  # effects without which it moves no agent, such as drag
     obeys: frozenset[str] = frozenset({"translation", "rotation", "mirror", "relabelling"})
     signed: tuple[str, ...] = ()  # parameters that may be negative
-    dimensions: tuple[int, ...] = (2, 3)  # where it is at home
-    family: str = ""  # rows of a family share a kernel: in its scene the others are there too, idle; see `company`
-    flat: Effect | None = None  # the effect in the plane, where it is not enough to leave an axis out
+    dimensions: tuple[int, ...] = (2, 3)  # in which it is defined
+    family: str = ""  # rows of a family share a kernel: their scenes contain all of them, the others idle
+    flat: Effect | None = None  # the effect in 2-D, if it is not enough to drop the third numbers
 
     @property
     def name(self) -> str:
@@ -289,14 +289,14 @@ class EffectRow:
         return "_".join([self.effect.kind, *words])
 
     def at(self, dimension: int) -> tuple[Effect, ...]:
-        """The effect in so many dimensions, and those beside it; a test of others is skipped."""
+        """Return the effect in `dimension` and those beside it; skip the test if it is not defined there."""
         if dimension not in self.dimensions:
             pytest.skip(f"{self.name}: not in {dimension}-D")
         effect = self.flat if self.flat is not None and dimension == 2 else self.effect
         return tuple(in_dimension(effect, dimension) for effect in (effect, *self.beside))
 
     def company(self, dimension: int, idle: bool = False) -> tuple[Effect, ...]:
-        """The same among those of its family, which are idle; idle, it is so too."""
+        """Return the effect among the idle effects of its family; with `idle` it is idle itself."""
         if not self.family:
             effect, *beside = self.at(dimension)
             return (effect.idle() if idle else effect, *beside)
@@ -306,13 +306,13 @@ class EffectRow:
 
 
 def vectors(effect: Effect) -> dict[str, tuple[Any, ...]]:
-    """What of an effect's parameters are directions and places, and lists of places."""
+    """Return the parameters of an effect that are directions, places or lists of places."""
     given = effect.parameters() | {name: getattr(effect, name) for name in effect.places}
     return {name: value for name, value in given.items() if isinstance(value, tuple)}
 
 
 def in_dimension(effect: Effect, dimension: int) -> Effect:
-    """The same effect with the first numbers of its vectors; in the plane nobody turns about an axis."""
+    """Return the effect with the first numbers of its vectors; in 2-D `axis` is None."""
     flat: dict[str, Any] = {
         name: None if name == "axis" and dimension == 2 else value[:dimension]
         for name, value in vectors(effect).items()
@@ -330,7 +330,7 @@ def in_dimension(effect: Effect, dimension: int) -> Effect:
 
 
 def turned(effect: Effect, matrix: Array, shift: Array) -> Effect:
-    """The same effect with its directions turned, and its places turned about the middle of EDGE and shifted."""
+    """Return the effect with directions rotated, and places rotated about the point EDGE / 2 and shifted."""
     middle = EDGE / 2
     change = {
         name: (np.array(value) - middle) @ matrix.T + middle + shift if name in effect.places else value @ matrix.T
@@ -340,7 +340,7 @@ def turned(effect: Effect, matrix: Array, shift: Array) -> Effect:
 
 
 def _tuples(value: Any) -> Any:
-    """Lists, and lists in them, as tuples."""
+    """Return nested lists as nested tuples."""
     return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
@@ -362,7 +362,7 @@ EFFECTS = (
     EffectRow(Sink(strength=2, centre=CENTRE, maximum=3, acts="medium"), beside=(DRAG,), signed=("phase",)),
     EffectRow(
         Vortex(strength=-2, centre=CENTRE, maximum=3, axis=(0.6, 0, 0.8), acts="medium", period=3), beside=(DRAG,),
-        obeys=frozenset({"translation", "rotation", "relabelling"}),  # its mirror image turns the other way
+        obeys=frozenset({"translation", "rotation", "relabelling"}),  # its mirror image turns in the opposite direction
         signed=("strength", "phase"),
     ),
     EffectRow(
@@ -378,7 +378,7 @@ EFFECTS = (
     ),
     EffectRow(Goal(target=CENTRE, slow_radius=2), beside=(DRIVING,)),
     EffectRow(Course(direction=(0.8, -0.5, 0.3), share=0.7), beside=(DRIVING,)),
-    EffectRow(  # it keeps where it began: whoever is moved afterwards goes there all the same
+    EffectRow(  # the target is fixed at the start: an agent that is shifted later still goes there
         Antipode(centre=CENTRE[:2]), beside=(DRIVING,), dimensions=(2,), obeys=frozenset()
     ),
     EffectRow(DRIVING, beside=(Goal(target=CENTRE, slow_radius=2),)),
@@ -386,16 +386,16 @@ EFFECTS = (
         Way(targets=(Target(at=(3.0, 5.5)),), clearance=0.1, spacing=0.3, margin=1), beside=(DRIVING,),
         dimensions=(2,), obeys=frozenset({"relabelling"}),
     ),
-    EffectRow(  # where somebody was is kept
+    EffectRow(  # it keeps the last positions of agents
         Journey(stages=(Stage(at=(3.0, 5.5), radius=0.3, wait=0.1),), premovement=0.05, clearance=0.1, margin=1),
         beside=(DRIVING,), dimensions=(2,), obeys=frozenset(),
     ),
-    EffectRow(  # so is the door, and everybody decides at times of his own
+    EffectRow(  # it keeps positions and doors, and each agent decides at times of its own
         Routes(doors=(Door(ends=((3.0, 5.5), (4.0, 5.5))), Door(at=(1.0, 1.0), width=1)), clearance=0.1, margin=1),
         beside=(DRIVING,), dimensions=(2,), obeys=frozenset(),
     ),
     EffectRow(LineUp(margin=0.1, radius=2.5), beside=(Goal(target=CENTRE, slow_radius=2),)),
-    # what goes on inside moves nobody; tests/test_school.py asks what it is
+    # inner states move no agent; tests/test_school.py tests their values
     EffectRow(Metabolism(rate=0.1, effort=0.1, spread=0.4), family="urges", obeys=frozenset()),
     EffectRow(Grazing(group=0, other=1, radius=1.0, rate=0.3, appetite=0.8), family="urges", obeys=frozenset()),
     EffectRow(Predation(group=1, other=0, radius=0.8, meal=0.2), family="urges", obeys=frozenset()),
@@ -406,9 +406,9 @@ EFFECTS = (
     EffectRow(ObstacleContact(stiffness=30, damping=4, friction=8, coulomb=0.6, most=5)),
     EffectRow(Contact(stiffness=20, ratio=0.3, damping=0.1, friction=6, coulomb=0.5, most=4, radius=0.5)),
     EffectRow(SpeedLimit(speed=1.2, strength=0.8)),
-    EffectRow(Fluctuation(strength=0.8), obeys=frozenset({"translation"})),  # to each his own, along the axes
+    EffectRow(Fluctuation(strength=0.8), obeys=frozenset({"translation"})),  # random per agent, drawn along the axes
     EffectRow(Pressure(strength=1.5, density=1, radius=1.35)),
-    EffectRow(  # to each his own error, to the same side in a mirror
+    EffectRow(  # random per agent, with the same sign in a mirror image
         Vicsek(speed=1.2, radius=2.5, noise=1, step=0.05), obeys=frozenset({"translation", "rotation"}), dimensions=(2,)
     ),
     EffectRow(Separation(weight=1.3, radius=2.5)),
@@ -418,7 +418,7 @@ EFFECTS = (
     EffectRow(AvoidObstacles(weight=5, horizon=3, margin=0.1)),
     EffectRow(UnalignedAvoidance(weight=3, radius=4, horizon=2, margin=0.2), family="crowd"),
     EffectRow(Queue(weight=2, target=CENTRE, speed=1.2, margin=0.1), family="crowd"),
-    # to each his own way to look for food
+    # each agent searches for food along a random path of its own
     EffectRow(Forage(weight=2, food=0, speed=1.2, radius=2.4), obeys=frozenset({"translation"}), family="crowd"),
     EffectRow(
         Explore(weight=2, low=(-1, -1, -1), high=(7, 8, 7), speed=1.2, track=1.5),
@@ -426,7 +426,7 @@ EFFECTS = (
     ),
     EffectRow(
         Orca(weight=5, target=CENTRE, speed=1.2), obeys=frozenset({"translation", "rotation", "relabelling"}),
-        dimensions=(2,),  # in its mirror image everybody keeps left
+        dimensions=(2,),  # agents keep left in a mirror image
     ),
     EffectRow(
         Steer(
@@ -444,7 +444,7 @@ EFFECTS = (
     ),
     EffectRow(Face(weight=2, heading=(1, 2, -0.5)), family="goals"),
     EffectRow(TargetSpeed(weight=2, speed=1.2), family="goals"),
-    EffectRow(  # to each his own, and his left is not his mirror image's
+    EffectRow(  # random per agent, and random turns are not mirrored
         Wander(weight=2, speed=1.5, strength=0.8), obeys=frozenset({"translation"}), family="goals"
     ),
     EffectRow(Pursue(weight=2, speed=1.5, group=0, radius=2.5), family="others"),
@@ -456,7 +456,7 @@ EFFECTS = (
     EffectRow(MatchVelocity(weight=2, radius=2.5), family="others"),
     EffectRow(
         Formation(weight=2, speed=1.5, group=0, radius=2.5, ahead=-0.5, left=0.7, up=0.2, slow_radius=1),
-        obeys=UPRIGHT, signed=("ahead", "left", "up"), family="others",  # left of it is right of its mirror image
+        obeys=UPRIGHT, signed=("ahead", "left", "up"), family="others",  # `left` is right in a mirror image
     ),
     EffectRow(
         FollowLeader(weight=2, speed=1.5, group=0, radius=2.5, distance=0.5, headway=0.3, slow_radius=1),
@@ -465,10 +465,10 @@ EFFECTS = (
     EffectRow(Shepherd(weight=2, speed=1.5, group=0, goal=CENTRE, spacing=0.4, slow_radius=2)),
     EffectRow(Interpose(weight=2, speed=1.5, group=0, other=0, radius=2.5, slow_radius=1), family="others"),
     EffectRow(Hide(weight=2, speed=1.5, group=0, radius=2.5, slow_radius=1)),
-    EffectRow(Whiskers(weight=5, horizon=3), obeys=UPRIGHT, family="around"),  # some are horizontal
+    EffectRow(Whiskers(weight=5, horizon=3), obeys=UPRIGHT, family="around"),  # some whiskers are horizontal
     EffectRow(ForceField(weight=0.5, range=2), family="around"),
     EffectRow(FollowWall(weight=2, speed=1.5, distance=0.7, range=4), family="around"),
-    EffectRow(  # its circle stays where it is
+    EffectRow(  # its circle is not moved with the scene
         Contain(weight=2, speed=1.5, within=Circle(centre=(3, 3), radius=2.5)), obeys=frozenset({"relabelling"})
     ),
     EffectRow(  # its grid lies along the axes
@@ -483,7 +483,7 @@ EFFECTS = (
                         velocities=tuple(flow[:2] for flow in FLOWS[:12])),
         obeys=frozenset({"translation", "relabelling"}),  # its grid lies along the axes
     ),
-    EffectRow(Gravitation(constant=0.3, softening=0.5)),  # of few the sum is exact; of many, see test_gravitation.py
+    EffectRow(Gravitation(constant=0.3, softening=0.5)),  # exact for few agents; for many, see test_gravitation.py
     EffectRow(InverseSquare(strength=-0.4, softening=0.3), signed=("strength",)),
     EffectRow(CircularRepulsion(strength=2, decay=0.8, anisotropy=0.3, radius=2.5), family="social"),
     EffectRow(
@@ -498,21 +498,21 @@ EFFECTS = (
     EffectRow(ObstacleRepulsion(strength=3, decay=0.9), family="around"),
     EffectRow(Interest(target=CENTRE, strength=1, decay=2, fades=5), family="goals"),
     EffectRow(Friends(group=0, strength=1, decay=2, fades=5, radius=2.5), family="social"),
-    EffectRow(  # who belongs together is a matter of numbers
+    EffectRow(  # members of a party have consecutive indices
         WalkingGroup(group=0, party=3, radius=2.5), obeys=frozenset({"translation", "rotation", "mirror"}),
         family="social",
     ),
-    EffectRow(  # of two ways as good it takes the right one
+    EffectRow(  # of two equally good directions it takes the one on the right
         Heuristics(radius=2.5), beside=(Goal(target=CENTRE, slow_radius=2),),
         obeys=frozenset({"translation", "rotation", "relabelling"}), dimensions=(2,),
     ),
-    # everybody is tied to somebody else; see `tied`
+    # agents of a network; see `tied`
     EffectRow(Springs(stiffness=3, damping=0.2), obeys=frozenset({"translation", "rotation", "mirror"})),
     EffectRow(
-        AngularSprings(stiffness=0.05, damping=0.005), beside=(Springs(stiffness=3),),  # stretched, angles are at rest
+        AngularSprings(stiffness=0.05, damping=0.005), beside=(Springs(stiffness=3),),  # a uniform stretch keeps angles
         obeys=frozenset({"translation", "rotation"}),  # in the plane an angle has a sign
     ),
-    EffectRow(Elastic(young=3, beta=0.1), obeys=frozenset({"translation"})),  # linear: it knows where it has turned to
+    EffectRow(Elastic(young=3, beta=0.1), obeys=frozenset({"translation"})),  # linear: rotations cause strain
 )  # fmt: skip
 
 
@@ -521,10 +521,10 @@ EFFECTS = (
 
 @dataclass(frozen=True)
 class IntegratorRow:
-    """A method, and its closed forms."""
+    """A method and its closed-form results."""
 
     method: Integrator
-    grown: float  # what 100 grows to with x' = v, v' = v / 10 in ten steps of 1 s
+    grown: float  # result for 100 with x' = v, v' = v / 10 after ten steps of 1 s
     real: float  # largest h |lambda| at which v' = lambda v, lambda < 0, does not grow
     imaginary: float  # largest h omega at which x'' = -omega^2 x does not grow
 
@@ -534,7 +534,7 @@ class IntegratorRow:
 
     @property
     def fixed(self) -> Integrator:
-        """The method at the steps that it is given: one that chooses its own takes them whole if any error will do."""
+        """The method at fixed steps: an adaptive one gets a tolerance so large that it never splits a step."""
         return self.method.model_copy(update={"tolerance": 1e30}) if self.method.adaptive else self.method
 
 
@@ -548,7 +548,7 @@ INTEGRATORS = (
     IntegratorRow(RK4(), 271.82797, 2.7853, 2.8284),
     IntegratorRow(AdaptiveRK4(), 271.828169, 5.5705, 5.657),
     IntegratorRow(DormandPrince(), 271.828183, 3.3065, 0.997),
-    IntegratorRow(ExponentialDrag(), 271.68016, 2, 2),  # of drag that it is not told of; of other there is no limit
+    IntegratorRow(ExponentialDrag(), 271.68016, 2, 2),  # for drag within the force; none for drag it is passed
     IntegratorRow(ImplicitEuler(), 286.79720, math.inf, math.inf),
     IntegratorRow(ImplicitMidpoint(), 272.055141, math.inf, math.inf),
 )
@@ -562,7 +562,7 @@ SPACES = {
 
 @dataclass(frozen=True)
 class TaskRow:
-    """A task as people use it; `variant` names the rows that share a task."""
+    """A task with common settings; `variant` distinguishes rows of the same task."""
 
     task: Task
     variant: str = ""
@@ -604,11 +604,11 @@ TASKS = (
 # --- scenes that many tests share: each set of laws, dimension, space, method and precision is compiled once ----------
 
 EDGE = 6.0
-"""m: agents of `scene_of` begin in a square or cube of this edge."""
+"""m, edge of the square or cube in which agents of `scene_of` begin."""
 
 
 def tied(group: Group, dimension: int) -> Group:
-    """Return the same group as a network: one after another, wherever they are, and stretched."""
+    """Return the group as a network: a stretched chain through random positions."""
     count = group.size
     vertices = np.random.default_rng(5).uniform(0.2 * EDGE, 0.8 * EDGE, (count, dimension))
     mesh = Mesh(
@@ -619,7 +619,7 @@ def tied(group: Group, dimension: int) -> Group:
 
 
 def scene_of(*effects: Effect, dimension: int = 2, space: Space | None = None, **fields: Any) -> Scene:
-    """Return two kinds of agents under some effects, among two obstacles if one of them asks for obstacles."""
+    """Return a scene of two groups under some effects, with two obstacles if an effect needs obstacles."""
     low, high = (0.0,) * dimension, (EDGE,) * dimension
     spawn = Spawn(low=low, high=high, speed=(0.2, 1.5))
     paced = {"desired_speed": 1.2, "spawn": spawn}
@@ -635,7 +635,7 @@ def scene_of(*effects: Effect, dimension: int = 2, space: Space | None = None, *
 
 
 def scene_under(row: EffectRow, dimension: int) -> Scene:
-    """Return the scene in which tests try a row."""
+    """Return the scene in which tests simulate a row."""
     return scene_of(*row.company(dimension), dimension=dimension)
 
 
@@ -646,14 +646,14 @@ FIRST = tuple({row.effect.kind: row for row in reversed(EFFECTS)}.values())[::-1
 AMONG_ALL = {
     "drag", "wind", "carried", "fluctuation", "separation", "alignment", "cohesion", "avoid_obstacles",
 }  # fmt: skip
-"""An effect or more of each form that a torus and large worlds know: what else there is would only compile longer."""
+"""At least one effect of each form that a torus and large worlds support; more would only compile longer."""
 
 
 def everything(dimension: int, *chosen: Effect, **fields: Any) -> Scene:
-    """Return effects of all forms at once (AMONG_ALL), on a torus unless another space is given.
+    """Return a scene with effects of all forms (AMONG_ALL), on a torus unless another space is given.
 
-    With some chosen, the others are there and idle: one kernel serves for tests of each of them, as long as they look
-    around in the same ways (KernelPlan.sights: who shares a radius, and who has a view cone at all).
+    If some effects are chosen, the others are idle. Tests of different effects then share one kernel, as long as their
+    sights are alike (KernelPlan.sights: which effects share a radius, and which have a view cone).
     """
     own = {effect.kind: effect for effect in chosen}
     others = [row.effect for row in FIRST if row.effect.kind in AMONG_ALL]
@@ -667,12 +667,11 @@ def everything(dimension: int, *chosen: Effect, **fields: Any) -> Scene:
 class Variant:
     """A kernel that tests of batches, steps and threads share: laws, space, dimension, method and precision.
 
-    `make(count, edge)` returns a scene of so many agents spread over a region of that edge, m; no number of it is
-    compiled in.
+    `make(count, edge)` returns a scene of `count` agents in a region of that edge, m. The kernel is the same for all.
     """
 
     name: str
-    effects: tuple[Effect, ...]  # none = all kinds
+    effects: tuple[Effect, ...]  # empty: all forms, AMONG_ALL
     space: str
     dimension: int
     dtype: str = "float64"
@@ -692,13 +691,13 @@ class Variant:
 
 
 NEAREST = (
-    # both sights of two laws are one here
+    # here alignment and cohesion share one sight
     Variant("nearest_plane", (
         Separation(weight=1.3, radius=2.5, nearest=1),
         Alignment(weight=0.7, radius=3, nearest=6),
         Cohesion(weight=0.9, radius=3, nearest=6),
     ), "plane", 2),
-    # and here one law sees everybody near
+    # here cohesion sees all neighbours within its radius
     Variant("nearest_plane_3", (
         Separation(weight=1.3, radius=2.5, fov=300, nearest=6),
         Alignment(weight=0.7, radius=3, nearest=32),
@@ -715,14 +714,14 @@ NEAREST = (
         Cohesion(weight=0.9, radius=2),
     ), "torus", 3, method=ExplicitEuler()),
 )  # fmt: skip
-"""Rules for the nearest few: 1, 6 and 32 of them, with and without a view cone, in planes and on toruses."""
+"""Behaviours with the nearest 1, 6, 7 or 32 neighbours, with and without a view cone, in planes and on toruses."""
 
 NEAREST_MANY = Variant("nearest_torus_many", (
     Separation(weight=1.3, radius=2.5),
-    Alignment(weight=0.7, radius=3, fov=270, nearest=30),  # at whole distances up to 2 there are 32
+    Alignment(weight=0.7, radius=3, fov=270, nearest=30),  # a unit lattice has 32 neighbours within 2
     Cohesion(weight=0.9, radius=2),
 ), "torus", 3)  # fmt: skip
-"""About the most that a rule may heed, in a view cone and around the edges of a torus; half a minute to compile."""
+"""Almost the largest `nearest` that is allowed, with a view cone on a torus; it compiles for half a minute."""
 
 VARIANTS = (
     Variant("torus", (), "torus", 2),
@@ -734,7 +733,7 @@ VARIANTS = (
     Variant("box", (Separation(weight=1.3, radius=1.0),), "box", 2),
     *NEAREST,
 )
-"""Every space, dimension, precision and method; their combinations are tried when slow tests run (test_scene.py)."""
+"""Every space, dimension and precision, three methods; slow tests try their combinations (test_scene.py)."""
 
 
 def rotation(dimension: int, seed: int, upright: bool = False) -> Array:
@@ -750,11 +749,11 @@ def rotation(dimension: int, seed: int, upright: bool = False) -> Array:
 
 
 def mirror(dimension: int) -> Array:
-    """Return the reflection that exchanges the two ends of the x axis."""
+    """Return the matrix of a reflection that reverses the x axis."""
     return np.diag([-1.0] + [1.0] * (dimension - 1))
 
 
-# --- a law of somebody else's -----------------------------------------------------------------------------------------
+# --- an effect outside the library ------------------------------------------------------------------------------------
 
 TETHER = """
 from __future__ import annotations
@@ -799,12 +798,12 @@ class Tether(Effect):
     weight: float = Field(default=0.0, description="N along each axis")
     own_law: ClassVar[Law | None] = tether
 """
-"""An effect as a user of the library would write it, in a file of their own."""
+"""An effect as a user of the library would write it, in a separate file."""
 
 
 @contextmanager
 def users_module(folder: Path, text: str, name: str = "users_laws") -> Iterator[ModuleType]:
-    """Import a module that lies outside the library, and forget it and its effects afterwards."""
+    """Import a module from outside the library; remove it and its effects afterwards."""
     (folder / f"{name}.py").write_text(text)
     sys.path.insert(0, str(folder))
     known = dict(EFFECT_KINDS)

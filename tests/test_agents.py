@@ -1,4 +1,4 @@
-"""The workbench: rules are far above random, training is repeatable and resumes, the search writes what it found."""
+"""The workbench: rules beat random players, training is reproducible and resumes, the search writes its result."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_both_hand_written_players_are_far_above_random(name: str) -> None:
     for textbook, margin in (
         (True, 1 if name == "crowd_nav" else 3),
         (False, 10),
-    ):  # the text goes too fast for a narrow track, and into a crowd that does not see it; whoever tunes it does not
+    ):  # the textbook is too fast for a narrow track and runs into a crowd that ignores it; tuned rules do not
         rules = rollout(task, player(task, "textbook" if textbook else "rules"), 12, first)
         assert compare(rules, random).difference.low > margin
 
@@ -59,15 +59,15 @@ def test_the_shipped_policy_is_far_above_random_and_its_card_is_complete(name: s
     assert compare(rollout(task, policy, 24, first), random).difference.low > 10
     card = json.loads((WEIGHTS / f"{name}.json").read_text(encoding="utf-8"))
     recipe = load_experiment(CONFIGS / f"{name}.yaml").ppo.model_dump(mode="json")
-    assert card["recipe"]["ppo"] == recipe, "the config beside the weights is the one that made them"
+    assert card["recipe"]["ppo"] == recipe, "the weights were trained with this config"
     assert card["recipe"]["command"] == f"python -m agents.ppo configs/training/{name}.yaml"
-    assert card["arguments"].items() <= task.model_dump(mode="json").items(), "it plays the task that it was trained on"
+    assert card["arguments"].items() <= task.model_dump(mode="json").items(), "the policy was trained on this task"
     assert card["wall_time_s"] < 600 and card["curve"][-1]["mean"] > card["curve"][0]["mean"]
 
 
 @pytest.mark.parametrize("name", sorted(TASKS))
-def test_the_page_says_when_the_rules_were_passed(name: str) -> None:
-    """In the words of the policy's card, and of what the search found."""
+def test_the_page_states_when_training_passed_the_rules(name: str) -> None:
+    """The numbers are those of the policy's card and of the search."""
     card = json.loads((WEIGHTS / f"{name}.json").read_text(encoding="utf-8"))
     rules = tuned(name).found["tuning_mean"]
     past = next((point for point in card["curve"] if point["mean"] > rules), None)
@@ -79,7 +79,7 @@ def test_the_page_says_when_the_rules_were_passed(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(TASKS))
-def test_a_player_answers_one_row_as_it_answers_many(name: str) -> None:
+def test_a_player_acts_on_one_row_as_on_a_batch(name: str) -> None:
     task = TASKS[name]()
     rows = np.random.default_rng(0).uniform(-1, 1, (5, task.layout.size)).astype(np.float32)
     rows = np.clip(rows, task.layout.low, task.layout.high)
@@ -90,7 +90,7 @@ def test_a_player_answers_one_row_as_it_answers_many(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(TASKS))
-def test_a_player_is_finite_where_there_is_nothing_to_see(name: str) -> None:
+def test_a_player_returns_finite_actions_for_an_observation_of_zeros(name: str) -> None:
     task = TASKS[name]()
     action, _ = player(task).predict(np.zeros((1, task.layout.size), np.float32))
     assert np.isfinite(action).all()
@@ -102,7 +102,7 @@ def test_every_parameter_of_the_rules_has_a_range_around_its_textbook_value() ->
             assert low <= getattr(rules(), parameter) <= high or parameter in ("horizon", "grip"), (
                 name,
                 parameter,
-            )  # the text has no such limit
+            )  # the textbook has no such limit
 
 
 def test_tuned_rules_have_every_parameter_and_beat_the_textbook_on_tuning_worlds() -> None:
@@ -112,7 +112,7 @@ def test_tuned_rules_have_every_parameter_and_beat_the_textbook_on_tuning_worlds
         assert record.found["tuning_mean"] > record.found["textbook_mean"]
 
 
-def test_what_the_search_found_is_what_rules_play_by(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_rules_use_the_parameters_that_the_search_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     search = {"candidates": 4, "worlds": 2, "rounds": 2}
     config = tmp_path / "pursuit.yaml"
     config.write_text(yaml.safe_dump({"task": "pursuit", "search": search}), encoding="utf-8")
@@ -122,7 +122,7 @@ def test_what_the_search_found_is_what_rules_play_by(tmp_path: Path, monkeypatch
     result = CliRunner().invoke(tune.app, [str(config)])
     assert result.exit_code == 0, result.output
     rules, found = tune.search(load_experiment(config))
-    assert tuned("pursuit") == Tuned(rules, found), "the same seed finds the same"
+    assert tuned("pursuit") == Tuned(rules, found), "the search is reproducible"
     assert as_dict(player(TASKS["pursuit"]()).rules) == rules
     assert found["agent_steps"] > 0 and found["tuning_mean"] >= found["textbook_mean"]
 
@@ -132,7 +132,7 @@ def test_what_the_search_found_is_what_rules_play_by(tmp_path: Path, monkeypatch
     [("/proc/none/x.json", "must lie below"), ("file/x.json", "is not a folder"), ("x.yaml", "must end in .json"),
      ("../x.json", "must not go up")],
 )  # fmt: skip
-def test_a_search_is_refused_where_its_findings_cannot_be_written(
+def test_a_search_is_refused_if_its_result_cannot_be_written(
     out: str, fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -143,7 +143,7 @@ def test_a_search_is_refused_where_its_findings_cannot_be_written(
     assert result.exit_code == 2 and result.output.count("\n") == 1 and fault in result.output
 
 
-def test_a_search_whose_findings_cannot_be_written_in_the_end_says_what_they_are(
+def test_a_search_prints_its_result_if_it_cannot_be_written_in_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: Any) -> None:
@@ -162,7 +162,7 @@ def test_a_search_whose_findings_cannot_be_written_in_the_end_says_what_they_are
 
 
 @pytest.mark.slow
-def test_training_is_repeatable_and_exports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_is_reproducible_and_exports_a_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from agents import ppo
 
     temporary = tmp_path / "temporary"
@@ -172,7 +172,7 @@ def test_training_is_repeatable_and_exports(tmp_path: Path, monkeypatch: pytest.
     assert once.tensors.keys() == twice.tensors.keys()
     for name, tensor in once.tensors.items():
         np.testing.assert_array_equal(tensor, twice.tensors[name])
-    assert not any(temporary.glob("SB3*")), "no folder of a logger that logs nothing"
+    assert not any(temporary.glob("SB3*")), "a logger without outputs leaves no folder"
     ppo.export(once, tmp_path / "p.safetensors")
     policy = MlpPolicy.load(tmp_path / "p.safetensors", PURSUIT.build())
     assert policy.observation_size == PURSUIT.build().layout.size
@@ -180,11 +180,11 @@ def test_training_is_repeatable_and_exports(tmp_path: Path, monkeypatch: pytest.
 
 
 def _fail(*_: object, **__: object) -> None:
-    raise AssertionError("nothing is to be trained")
+    raise AssertionError("unexpected training")
 
 
 @pytest.mark.slow
-def test_training_that_was_interrupted_goes_on_and_a_finished_one_is_left_alone(
+def test_interrupted_training_resumes_and_finished_training_is_not_repeated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from agents import ppo
@@ -199,14 +199,14 @@ def test_training_that_was_interrupted_goes_on_and_a_finished_one_is_left_alone(
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"ppo": {**TINY, "steps": 1024, "gamma": 0.9}}, "ppo.gamma = 0.9: {}, with 0.99"),
         ({"ppo": {**TINY, "steps": 2048}}, "ppo.steps = 2048: {}, with 1024"),
         ({"arguments": {"pursuer_speed": 2.5}}, "arguments.pursuer_speed = 2.5: {}, with nothing"),
     ],
 )
-def test_training_does_not_go_on_with_another_recipe(tmp_path: Path, change: dict[str, Any], said: str) -> None:
+def test_training_does_not_resume_with_another_recipe(tmp_path: Path, change: dict[str, Any], message: str) -> None:
     from agents import ppo
 
     folder = tmp_path / "runs" / "pursuit"
@@ -216,7 +216,7 @@ def test_training_does_not_go_on_with_another_recipe(tmp_path: Path, change: dic
     given = [str(config), "--runs", str(tmp_path / "runs"), "--resume", "--out", str(tmp_path / "p.safetensors")]
     result = CliRunner().invoke(ppo.app, given)
     assert result.exit_code == 2
-    assert result.stderr == f"error: {said.format(f'the checkpoint in {folder} is of another recipe')}\n"
+    assert result.stderr == f"error: {message.format(f'the checkpoint in {folder} is of another recipe')}\n"
     assert not (tmp_path / "p.safetensors").exists()
 
 
@@ -224,7 +224,7 @@ def test_training_does_not_go_on_with_another_recipe(tmp_path: Path, change: dic
 
 
 def _curves(folder: Path, code: int = 0, **changes: Any) -> str:
-    """Compare two settings of Pursuit from a config with some changes; return what the command said."""
+    """Compare two settings of Pursuit from a config with some changes; return the command's stderr."""
     from agents import curves
 
     settings = {
@@ -248,9 +248,9 @@ def test_curves_train_every_setting_once_and_draw_them(tmp_path: Path, monkeypat
     experiment = Experiment(task="pursuit", ppo={**TINY, "steps": 512}, curves={"two epochs": {"epochs": 2}})
     interrupt(experiment, tmp_path / "runs" / "pursuit" / AS_CONFIGURED)
     monkeypatch.setattr("agents.curves.tuned", lambda task: Tuned({}, {"tuning_mean": -100.0}))
-    said = _curves(tmp_path)
-    assert "pursuit, as configured: 1 epoch, minibatch 64, rate 0.002: goes on after 256 steps\n" in said
-    assert "pursuit, two epochs: 2 epochs, minibatch 64, rate 0.002: begins\n" in said
+    message = _curves(tmp_path)
+    assert "pursuit, as configured: 1 epoch, minibatch 64, rate 0.002: goes on after 256 steps\n" in message
+    assert "pursuit, two epochs: 2 epochs, minibatch 64, rate 0.002: begins\n" in message
     picture, file = tmp_path / "new" / "learning.png", tmp_path / "new" / "learning.json"
     numbers = json.loads(file.read_text(encoding="utf-8"))
     rows = numbers["pursuit"]["settings"]
@@ -264,15 +264,15 @@ def test_curves_train_every_setting_once_and_draw_them(tmp_path: Path, monkeypat
         patch.setattr(ppo, "train", _fail)
         assert ": begins" not in _curves(tmp_path)
         assert json.loads(file.read_text(encoding="utf-8")) == numbers
-    said = _curves(tmp_path, curves={"two epochs": {"epochs": 2, "gamma": 0.9}})
-    assert "two epochs: 2 epochs, minibatch 64, rate 0.002: begins anew (ppo.gamma = 0.9: " in said
-    assert "as configured: 1 epoch, minibatch 64" not in said
+    message = _curves(tmp_path, curves={"two epochs": {"epochs": 2, "gamma": 0.9}})
+    assert "two epochs: 2 epochs, minibatch 64, rate 0.002: begins anew (ppo.gamma = 0.9: " in message
+    assert "as configured: 1 epoch, minibatch 64" not in message
     again = json.loads(file.read_text(encoding="utf-8"))["pursuit"]["settings"]
     assert again[AS_CONFIGURED] == rows[AS_CONFIGURED] and again["two epochs"]["curve"] != rows["two epochs"]["curve"]
 
 
 @pytest.mark.parametrize(
-    ("curves", "said"),
+    ("curves", "message"),
     [
         ({"two epochs": {"epocs": 2}}, "curves.'two epochs'.epocs = 2: unknown key, did you mean `epochs`? allowed"),
         ({"none": {"epochs": 0}}, "curves.none.epochs = 0: must be an integer >= 1 (passes over a rollout)"),
@@ -281,10 +281,10 @@ def test_curves_train_every_setting_once_and_draw_them(tmp_path: Path, monkeypat
         ({AS_CONFIGURED: {"epochs": 2}}, "curves.'as configured': that is what the settings under ppo are called"),
     ],
 )
-def test_curves_that_cannot_be_trained_are_one_line(tmp_path: Path, curves: dict[str, Any], said: str) -> None:
+def test_invalid_curves_are_refused_in_one_line(tmp_path: Path, curves: dict[str, Any], message: str) -> None:
     error = _curves(tmp_path, code=2, curves=curves)
     assert error.startswith("error: ") and error.count("\n") == 1
-    assert f": {said}" in error
+    assert f": {message}" in error
     (name,) = curves
     lines = (tmp_path / "pursuit.yaml").read_text(encoding="utf-8").splitlines()
     at = int(error.split("pursuit.yaml:")[1].split(":")[0]) - 1
@@ -292,21 +292,21 @@ def test_curves_that_cannot_be_trained_are_one_line(tmp_path: Path, curves: dict
     assert not (tmp_path / "runs").exists() and not (tmp_path / "new").exists()
 
 
-def test_curves_are_of_one_config_a_task_and_a_picture_is_a_png(tmp_path: Path) -> None:
+def test_curves_take_one_config_per_task_and_write_a_png(tmp_path: Path) -> None:
     from agents import curves
 
     config = str(CONFIGS / "pursuit.yaml")
-    for given, said in (
+    for given, message in (
         ([config, config], "another config is of that task"),
         ([config, "--out", str(tmp_path / "x.json")], "must end in .png"),
         ([str(CONFIGS.parent / "scenes" / "boids.yaml")], "unknown key"),
     ):
         result = CliRunner().invoke(curves.app, given)
-        assert result.exit_code == 2 and said in result.stderr
+        assert result.exit_code == 2 and message in result.stderr
 
 
-def test_the_stored_curves_are_of_the_settings_in_the_configs() -> None:
-    """Threads aside, which change how long it took. If this fails: docs/players.md says how they are made."""
+def test_the_stored_curves_match_the_settings_in_the_configs() -> None:
+    """Except for threads, which change only the duration. If this fails: docs/players.md shows how to remake them."""
     files = [ROOT / "docs" / name for name in ("learning.json", "learning_school.json")]
     stored = {task: numbers for file in files for task, numbers in json.loads(file.read_text(encoding="utf-8")).items()}
     assert stored.keys() == {name for name in TASKS if load_experiment(CONFIGS / f"{name}.yaml").curves}
@@ -317,7 +317,7 @@ def test_the_stored_curves_are_of_the_settings_in_the_configs() -> None:
         assert kept == {setting: p.model_copy(update={"threads": 2}) for setting, p in experiment.settings().items()}
 
 
-def test_training_leaves_the_number_of_threads_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_restores_the_number_of_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import torch
 
     from agents import ppo
@@ -336,7 +336,7 @@ def test_training_leaves_the_number_of_threads_as_it_was(tmp_path: Path, monkeyp
     assert (torch.get_num_threads(), threads()) == before
 
 
-def test_bad_settings_are_one_line(tmp_path: Path) -> None:
+def test_invalid_settings_are_refused_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "x.yaml"
     path.write_text("task: pursuit\nppo: {stpes: 3}\n", encoding="utf-8")
     with pytest.raises(ValueError, match=r"ppo\.stpes.*did you mean `steps`") as caught:
@@ -352,17 +352,17 @@ def test_bad_settings_are_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_network_that_is_taught_longer_answers_more_as_the_rules_do() -> None:
+def test_longer_imitation_brings_a_network_closer_to_the_rules() -> None:
     experiment = Experiment(task="pursuit", ppo={**TINY, "evaluate_worlds": 16})
     little, more = (imitate(experiment, worlds=4, updates=updates) for updates in (1, 300))
-    assert little.rules == more.rules and more.rows > 4 * little.rows > 0  # of rounds in which the network acted
+    assert little.rules == more.rules and more.rows > 4 * little.rows > 0  # the network acted in later rounds
     assert more.missed < 0.5 * little.missed
     assert more.network > little.network
 
 
 @pytest.mark.parametrize("rate", [1e19, 1e30], ids=str)
 @pytest.mark.parametrize("updates", [1, 8], ids=str)
-def test_imitation_that_diverges_ends_in_one_line(
+def test_diverging_imitation_ends_with_one_error_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rate: float, updates: int
 ) -> None:
     monkeypatch.setattr(dagger, "RATE", rate)
@@ -374,7 +374,7 @@ def test_imitation_that_diverges_ends_in_one_line(
     assert "not finite" in lines[0] or "is nan" in lines[0]
 
 
-def test_a_training_that_diverges_while_it_is_taught_ends_in_one_line(
+def test_training_that_diverges_during_imitation_ends_with_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from agents import ppo
@@ -387,8 +387,8 @@ def test_a_training_that_diverges_while_it_is_taught_ends_in_one_line(
     assert not (tmp_path / "p.safetensors").exists()
 
 
-def test_rules_say_what_they_would_do_where_somebody_else_comes_to() -> None:
-    """Who stays where he is sees what a world shows of that, from the world that comes after so many others."""
+def test_rules_are_queried_on_the_observations_of_the_acting_policy() -> None:
+    """The acting policy does nothing; its worlds are those after the first five training worlds."""
     task = School(fish=3, horizon=20)
     rules = player(task)
     rows, answers = shown(task, rules, 2, lambda rows: torch.zeros(len(rows), 2), first=5)
@@ -400,7 +400,7 @@ def test_rules_say_what_they_would_do_where_somebody_else_comes_to() -> None:
         np.testing.assert_array_equal(rows[here].numpy(), seen.reshape(6, -1))
         np.testing.assert_array_equal(answers[here].numpy(), np.asarray(expected, np.float32))
         seen, first = world.step(np.zeros((2, 3, 2))).observation, False
-    assert len(rows) == len(answers) == 120  # nobody starves so soon
+    assert len(rows) == len(answers) == 120  # no fish starves in 20 steps
 
 
 HUNGRY = School(fish=3, horizon=40, start_hunger=0.6, metabolism=0.4)
@@ -415,35 +415,33 @@ def for_learning(task: Task, worlds: int, **changes: Any) -> ForLearning:
 
 
 @pytest.mark.parametrize(("task", "hold"), [(HUNGRY, 3), (School(fish=3, horizon=2), 5)], ids=["deaths", "short"])
-def test_an_action_that_is_held_is_paid_what_its_decisions_are_paid_until_an_episode_ends(
-    task: School, hold: int
-) -> None:
-    """Each row: the sum to its own end, what the first end of its world was, and what is seen in the end."""
+def test_a_held_action_collects_the_rewards_of_its_decisions_until_an_episode_ends(task: School, hold: int) -> None:
+    """Each row has the rewards until its own end, the infos of the first end of its world, and the last observation."""
     held, each = for_learning(task, 2, hold=hold), for_learning(task, 2).venv
     rng, ends, alone = np.random.default_rng(2), 0, 0
     for _ in range(30):
         actions = rng.uniform(-1, 1, (6, 2))
         seen, reward, done, infos = held.step(actions)
         sums, over = np.zeros(6), ~each.present
-        told: list[dict[str, Any]] = [{}] * 6
+        expected: list[dict[str, Any]] = [{}] * 6
         for _ in range(hold):
             last, paid, ended, news = each.step(actions)
             sums, over = sums + np.where(over, 0.0, paid), over | ended
-            told = [before or dict(new) for new, before in zip(news, told, strict=True)]
+            expected = [before or dict(new) for new, before in zip(news, expected, strict=True)]
         np.testing.assert_array_equal(seen, last)
         np.testing.assert_allclose(reward, sums, rtol=0, atol=1e-12)
         np.testing.assert_array_equal(done, over)
         for row in range(6):
-            assert infos[row].keys() == told[row].keys()
+            assert infos[row].keys() == expected[row].keys()
             for key in infos[row]:
-                np.testing.assert_array_equal(infos[row][key], told[row][key])
+                np.testing.assert_array_equal(infos[row][key], expected[row][key])
         ends += sum(bool(info) for info in infos)
         alone += sum(bool(out) and not info for out, info in zip(done, infos, strict=True))
-    assert ends >= 6 and (alone > 0) == (task is HUNGRY)  # worlds ended, and somebody was out before that
+    assert ends >= 6 and (alone > 0) == (task is HUNGRY)  # worlds ended, and some fish died before that
 
 
-def test_a_rollout_that_goes_beyond_the_budget_does_not_learn_backwards() -> None:
-    """SB3 says then that less than nothing is left."""
+def test_the_learning_rate_stays_positive_beyond_the_budget() -> None:
+    """SB3 then passes a negative rest of the budget."""
     from agents import ppo
 
     task = HUNGRY
@@ -453,8 +451,8 @@ def test_a_rollout_that_goes_beyond_the_budget_does_not_learn_backwards() -> Non
 
 
 @pytest.mark.parametrize("care", [0.25, 1.0])
-def test_who_cares_is_credited_with_what_becomes_of_the_others_of_his_world(care: float) -> None:
-    """Advantages by hand: of each row by SB3's plain buffer, then summed over each world's rows that were there."""
+def test_care_adds_the_advantages_of_the_other_agents_of_a_world(care: float) -> None:
+    """Advantages by hand: of each row by SB3's plain buffer, then summed over the rows of its world with an agent."""
     steps, rows = 40, 6
     worlds = for_learning(HUNGRY, 2)
     space = (worlds.observation_space, worlds.action_space, "cpu", 0.9, 0.95, rows)
@@ -472,7 +470,7 @@ def test_who_cares_is_credited_with_what_becomes_of_the_others_of_his_world(care
         start = done
     for buffer in (plain, caring):
         buffer.compute_returns_and_advantage(torch.zeros(rows), start)
-    np.testing.assert_array_equal(caring.returns, plain.returns)  # critics learn what becomes of oneself
+    np.testing.assert_array_equal(caring.returns, plain.returns)  # critics learn an agent's own return
     there = np.array(here)
     assert there.any(axis=1).all() and not there.all()
     for t in range(steps):
@@ -483,7 +481,7 @@ def test_who_cares_is_credited_with_what_becomes_of_the_others_of_his_world(care
             assert got == (pytest.approx(expected, rel=1e-5, abs=1e-6) if there[t, i] else 0.0)
 
 
-def test_held_actions_count_as_the_decisions_that_they_are(tmp_path: Path) -> None:
+def test_a_held_action_counts_as_several_decisions(tmp_path: Path) -> None:
     from agents import ppo
 
     settings = PpoSettings(**{**TINY, "steps": 1536, "evaluate_every": 768, "hold": 3})
@@ -493,8 +491,7 @@ def test_held_actions_count_as_the_decisions_that_they_are(tmp_path: Path) -> No
     assert whole.steps >= 1536 > whole.steps - rows
 
 
-def test_a_taught_actor_waits_for_its_critic(tmp_path: Path) -> None:
-    """What is exported is the network as it was taught, for as long as only the critic learns."""
+def test_a_taught_actor_keeps_its_weights_while_only_the_critic_learns(tmp_path: Path) -> None:
     from agents import ppo
 
     def weights(**changes: Any) -> Any:
@@ -514,16 +511,16 @@ def test_a_taught_actor_waits_for_its_critic(tmp_path: Path) -> None:
     assert not np.array_equal(waits["action_net.weight"], untaught["action_net.weight"])
 
 
-def test_a_run_that_is_taught_remembers_its_teacher_and_its_time(tmp_path: Path) -> None:
+def test_a_taught_run_stores_its_teacher_and_counts_the_time_of_teaching(tmp_path: Path) -> None:
     from agents import ppo
 
     taught = Experiment(task="pursuit", ppo=PpoSettings(**TINY, steps=1024, taught=5, critic_first=1024))
-    interrupt(taught, tmp_path)  # when it had been taught
+    interrupt(taught, tmp_path)  # after it was taught
     begun = checkpointed(taught, tmp_path)
     assert begun is not None and begun.recipe["rules"] == as_dict(player(taught.build()).rules)
     assert "rules" not in recipe_of(PURSUIT)
     kept = begun.state["policy"]
-    found = ppo.train(taught, tmp_path, go_on=True).state["policy"]  # not taught again, and still the critic's turn
+    found = ppo.train(taught, tmp_path, go_on=True).state["policy"]  # not taught again; only the critic learns
     for name in ("action_net.weight", "mlp_extractor.policy_net.0.weight", "log_std"):
         np.testing.assert_array_equal(found[name], kept[name])
     assert not np.array_equal(found["value_net.weight"], kept["value_net.weight"])
@@ -533,7 +530,7 @@ def test_a_run_that_is_taught_remembers_its_teacher_and_its_time(tmp_path: Path)
         assert ppo.train(taught, tmp_path / "timed").curve[0]["seconds"] >= 100
 
 
-def test_ctrl_c_while_it_is_taught_claims_no_checkpoint_and_loses_none(
+def test_ctrl_c_during_teaching_reports_no_checkpoint_and_deletes_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from agents import ppo
@@ -542,14 +539,14 @@ def test_ctrl_c_while_it_is_taught_claims_no_checkpoint_and_loses_none(
         raise KeyboardInterrupt
 
     (tmp_path / "p.yaml").write_text(f"task: pursuit\nppo: {json.dumps(TINY | {'taught': 5})}\n", encoding="utf-8")
-    interrupt(PURSUIT, tmp_path / "runs" / "pursuit")  # of another recipe
+    interrupt(PURSUIT, tmp_path / "runs" / "pursuit")  # a checkpoint of another recipe
     monkeypatch.setattr(ppo, "teach", interrupted)
     result = CliRunner().invoke(ppo.app, [str(tmp_path / "p.yaml"), "--runs", str(tmp_path / "runs")])
     assert result.exit_code == 130 and "nothing was learnt yet" in result.stderr
     assert checkpointed(PURSUIT, tmp_path / "runs" / "pursuit") is not None
 
 
-def test_rows_are_shown_until_an_episode_is_over() -> None:
+def test_observations_are_collected_until_each_episode_ends() -> None:
     task = load_experiment(CONFIGS / "pursuit.yaml").build()
     rules = player(task)
     rows, answers = shown(task, rules, 6)

@@ -1,4 +1,4 @@
-"""Many wishes, one force: what every arbitration must obey, what sets each apart, and what `Steer` makes of them."""
+"""Arbitration: what every kind must obey, how the kinds differ, and how `Steer` uses them in scenes."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ BUDGET = 10.0
 
 
 def requests(dimension: int, count: int = 3, many: int = 200) -> Array:
-    """Wishes of all sizes, some of them zero, (R, K, D) N."""
+    """Return steering forces of all magnitudes, some of them zero, (R, K, D) N."""
     rng = np.random.default_rng(3)
     wishes = rng.normal(size=(many, count, dimension)) * 10 ** rng.uniform(-3, 3, (many, count, 1))
     return np.asarray(wishes * (rng.random((many, count, 1)) < 0.8))
 
 
 def reconciled(arbitration: Arbitration, wishes: Array, **more: Any) -> tuple[Any, Any]:
-    """Force and shares, agent by agent at different times."""
+    """Return force and shares for different agents, each at another time."""
     r = len(wishes)
     given = {"max_force": BUDGET, "time": np.arange(r) * 0.05, "key": key_of(1, 0), "who": np.arange(r)} | more
     return reconcile(arbitration, wishes, **given)
@@ -66,8 +66,8 @@ def reconciled(arbitration: Arbitration, wishes: Array, **more: Any) -> tuple[An
 @DIMENSIONS
 @PRECISIONS
 @ALL
-def test_shares_are_from_none_to_all_and_sum_to_the_force(arbitration: Arbitration, dtype: str, dimension: int) -> None:
-    """Of blend before the sum is bounded, of context steering not: that goes where nobody asked to go."""
+def test_shares_are_between_0_and_1_and_sum_to_the_force(arbitration: Arbitration, dtype: str, dimension: int) -> None:
+    """For blend before the sum is bounded. Not for context steering: its force is no sum of the steering forces."""
     wishes = requests(dimension).astype(dtype)
     force, share = reconciled(arbitration, wishes, dtype=dtype)
     assert force.dtype == share.dtype == np.dtype(dtype)
@@ -85,10 +85,10 @@ def test_shares_are_from_none_to_all_and_sum_to_the_force(arbitration: Arbitrati
 @DIMENSIONS
 @PRECISIONS
 @ALL
-def test_it_is_finite_without_wishes_without_a_budget_and_without_a_bound(
+def test_the_force_is_finite_for_zero_forces_and_for_a_budget_of_0_or_infinity(
     arbitration: Arbitration, dtype: str, dimension: int
 ) -> None:
-    """Without a bound every wish that is heard is heard in full."""
+    """Without a bound each share is 0 or 1."""
     wishes = np.concatenate([requests(dimension), np.zeros((1, 3, dimension)), np.ones((1, 3, dimension))])
     for budget in (0.0, math.inf, BUDGET):
         force, share = reconciled(arbitration, wishes, max_force=budget, dtype=dtype)
@@ -102,8 +102,8 @@ def test_it_is_finite_without_wishes_without_a_budget_and_without_a_bound(
 
 
 @ALL
-def test_a_single_wish_within_the_budget_is_granted(arbitration: Arbitration) -> None:
-    """By all who hear everybody at all times; by context steering exactly, for one of its directions is that one."""
+def test_a_single_force_within_the_budget_is_granted_in_full(arbitration: Arbitration) -> None:
+    """By context steering exactly, because the direction of the force is one of those it scores."""
     wishes = np.array([[(3.0, 4.0)], [(-6.0, 8.0)], [(0.0, 0.5)]])
     arbitration = arbitration.model_copy(update={"dangers": 0}) if arbitration.kind == "context" else arbitration
     arbitration = (
@@ -114,13 +114,13 @@ def test_a_single_wish_within_the_budget_is_granted(arbitration: Arbitration) ->
     np.testing.assert_allclose(share, 1, rtol=1e-12)
 
 
-# --- what sets each apart ---------------------------------------------------------------------------------------------
+# --- how the kinds differ ---------------------------------------------------------------------------------------------
 
 CONFLICT = np.array([[(8.0, 0.0), (-8.0, 0.0), (0.0, 5.0)]])
 
 
-def test_reynolds_budget_and_the_running_sum_differ_on_opposite_wishes() -> None:
-    """(8, 0), (-8, 0), (0, 5) within 10: scalars add up, or the sum gives room back."""
+def test_allocation_and_running_sum_differ_for_opposite_forces() -> None:
+    """(8, 0), (-8, 0), (0, 5) within 10: either lengths use up the budget, or the length of the sum does."""
     force, share = reconciled(Allocation(), CONFLICT)
     np.testing.assert_allclose(force, [(6, 0)])
     np.testing.assert_allclose(share, [(1, 0.25, 0)])
@@ -131,20 +131,20 @@ def test_reynolds_budget_and_the_running_sum_differ_on_opposite_wishes() -> None
     np.testing.assert_allclose(rows(allocate_running)(CONFLICT, BUDGET), [(6, 4)])
 
 
-def test_any_number_of_wishes_is_reconciled() -> None:
-    """Each is a function that numba compiles: one within the other, it came to its end at some 30."""
+def test_41_forces_are_combined() -> None:
+    """One compiled function nested in another for each force failed at about 30."""
     force, share = reconciled(Blend(), np.ones((2, 41, 2)), max_force=1e3)
     np.testing.assert_array_equal(force, np.full((2, 2), 41.0))
     np.testing.assert_array_equal(share, np.ones((2, 41)))
 
 
-def test_a_blend_of_opposite_wishes_is_nothing() -> None:
+def test_opposite_forces_cancel_in_a_blend() -> None:
     force, share = reconciled(Blend(), CONFLICT[:, :2])
     np.testing.assert_array_equal(force, [(0, 0)])
     np.testing.assert_array_equal(share, [(1, 1)])
 
 
-def test_in_an_emergency_the_first_has_the_whole_budget() -> None:
+def test_a_first_force_above_the_budget_takes_all_of_it() -> None:
     emergency = np.array([[(0.0, 25.0), (4.0, 0.0), (1.0, 1.0)]])
     for arbitration in (Allocation(), RunningSum(), Priority()):
         force, share = reconciled(arbitration, emergency)
@@ -152,28 +152,28 @@ def test_in_an_emergency_the_first_has_the_whole_budget() -> None:
         np.testing.assert_allclose(share, [(0.4, 0, 0)], atol=1e-15)
 
 
-def test_priority_passes_on_what_is_not_longer_than_its_threshold() -> None:
+def test_priority_skips_forces_up_to_its_threshold() -> None:
     for first, expected in ((0.5, (0, 5)), (0.51, (0.51, 0))):
         force, _ = reconciled(Priority(threshold=0.5), np.array([[(first, 0.0), (0.0, 5.0)]]))
         np.testing.assert_allclose(force, [expected])
 
 
-def test_dithering_hears_each_as_often_as_its_probability_says() -> None:
-    """p, (1 - p) q, the rest nobody: within four standard deviations of 20,000 worlds; and of 20,000 draws of one."""
+def test_dithering_selects_each_force_with_its_probability() -> None:
+    """p, (1 - p) q and otherwise none, within four standard deviations of 20,000 worlds, times or agents."""
     many = 20_000
     wishes = np.tile(CONFLICT[:, :2], (many, 1, 1))
     keys = np.array([key_of(seed, 0) for seed in range(many)])
     dithering = Dithering(probability=(0.7, 0.5), period=0.1)
     for more in ({"key": keys, "time": 0.0, "who": 0}, {"time": 0.1 * np.arange(many), "who": 0}, {"time": 0.0}):
         _, share = reconciled(dithering, wishes, **more)
-        heard = [share[:, 0].mean(), share[:, 1].mean(), (share == 0).all(axis=1).mean()]
-        np.testing.assert_allclose(heard, [0.7, 0.15, 0.15], atol=4 * 0.5 / math.sqrt(many))
+        found = [share[:, 0].mean(), share[:, 1].mean(), (share == 0).all(axis=1).mean()]
+        np.testing.assert_allclose(found, [0.7, 0.15, 0.15], atol=4 * 0.5 / math.sqrt(many))
 
 
 @pytest.mark.parametrize("arbitration", [Dithering(probability=0.5, period=0.1), RoundRobin(period=0.1)])
 @PRECISIONS
-def test_who_is_heard_does_not_depend_on_how_time_is_cut(arbitration: Arbitration, dtype: str) -> None:
-    """At times that are multiples of the period too, where floor(0.3 / 0.1) is 2 or 3 by rounding."""
+def test_the_selected_force_does_not_depend_on_dt(arbitration: Arbitration, dtype: str) -> None:
+    """Not even at multiples of the period: floor(0.3 / 0.1) is 2 or 3 by rounding."""
     whole = np.arange(600)  # times of 0.1 s
     found = []
     for dt in (0.1, 0.05, 0.02, 0.01):
@@ -185,7 +185,7 @@ def test_who_is_heard_does_not_depend_on_how_time_is_cut(arbitration: Arbitratio
         np.testing.assert_array_equal(np.argmax(found[0] > 0, axis=1), whole % 3)
 
 
-def test_round_robin_gives_everybody_a_turn_of_a_period() -> None:
+def test_round_robin_selects_each_force_for_one_period() -> None:
     time = np.arange(60) * 0.01 + 0.005
     _, share = reconciled(RoundRobin(period=0.1), np.tile(CONFLICT, (60, 1, 1)), time=time)
     np.testing.assert_array_equal(np.argmax(share, axis=1), np.repeat([0, 1, 2, 0, 1, 2], 10))
@@ -193,8 +193,8 @@ def test_round_robin_gives_everybody_a_turn_of_a_period() -> None:
 
 
 @DIMENSIONS
-def test_context_steering_never_goes_where_it_is_more_dangerous(dimension: int) -> None:
-    """Of any direction, not only of those that are weighed, up to what lies between two of them."""
+def test_context_steering_selects_a_least_dangerous_direction(dimension: int) -> None:
+    """Least dangerous of all directions, not only of those that it scores, up to the angle between two of these."""
     context = ContextSteering(dangers=2, directions=256)
     wishes = requests(dimension, count=4)
     force, _ = reconciled(context, wishes, max_force=math.inf)
@@ -213,8 +213,8 @@ def test_context_steering_never_goes_where_it_is_more_dangerous(dimension: int) 
     assert some.mean() > 0.9
 
 
-def test_context_steering_goes_around_what_a_blend_runs_into() -> None:
-    """Danger ahead as strong as the goal behind it: the sum is nothing, the best of the safe directions is not."""
+def test_context_steering_goes_around_a_danger_that_stalls_a_blend() -> None:
+    """A danger ahead is as strong as the goal behind it: their sum almost vanishes, a safe force does not."""
     wishes = np.array([[(-8.0, 0.0), (8.0, 0.5)]])
     force, _ = reconciled(ContextSteering(), wishes)
     assert np.linalg.norm(force) > 0.4
@@ -229,7 +229,7 @@ AVOID = AvoidObstacles(weight=5.0, horizon=3.0, margin=0.1)
 
 
 def crowd(*effects: Effect, **more: Any) -> Scene:
-    """Two groups among two obstacles, who may ask for little."""
+    """Return a scene of two groups of small max_force among two obstacles."""
     spawn = Spawn(speed=(0.5, 1.5))
     groups = tuple(Group(count=n, max_force=4.0, max_speed=2.0, spawn=spawn) for n in (9, 7))
     given: dict[str, Any] = {
@@ -240,8 +240,8 @@ def crowd(*effects: Effect, **more: Any) -> Scene:
 
 
 @pytest.mark.slow
-def test_steer_of_one_behaviour_under_blend_is_the_behaviour() -> None:
-    """Bit for bit: neither the sum nor its bound is taken twice."""
+def test_a_blend_of_one_behaviour_equals_the_behaviour() -> None:
+    """Bit for bit: the sum is bounded only once."""
     alone, steered = crowd(SEPARATION), crowd(Steer(behaviours=(SEPARATION,), arbitration=Blend()))
     ends = [scene.run(scene.start(2, worlds=3), 60) for scene in (alone, steered)]
     np.testing.assert_array_equal(ends[0].x, ends[1].x)
@@ -249,7 +249,7 @@ def test_steer_of_one_behaviour_under_blend_is_the_behaviour() -> None:
 
 
 @pytest.mark.slow
-def test_steer_leaves_other_groups_alone_and_grants_what_it_says() -> None:
+def test_steer_acts_on_its_group_alone_and_its_trace_matches_the_force() -> None:
     steer = Steer(group=1, behaviours=(AVOID, SEPARATION), arbitration=Allocation())
     scene = crowd(steer)
     state = scene.start(2, worlds=3)
@@ -259,18 +259,18 @@ def test_steer_leaves_other_groups_alone_and_grants_what_it_says() -> None:
 
     before = end.work.copy()
     found = granted(scene, end)[0]
-    np.testing.assert_array_equal(end.work, before)  # looking costs the scene nothing
+    np.testing.assert_array_equal(end.work, before)  # the trace leaves the scene's counters alone
     assert (found.names, found.effect) == (("avoid_obstacles", "separation"), 0)
     np.testing.assert_array_equal(found.wish[:, :9], 0)
     np.testing.assert_array_equal(found.share[:, :9], 0)
     np.testing.assert_allclose(found.force, scene.acceleration(end), atol=1e-12)  # 1 kg
     np.testing.assert_allclose((found.share[..., None] * found.wish).sum(axis=2), found.force, atol=1e-12)
-    assert np.linalg.norm(found.wish, axis=-1).max() > 4.0  # wishes are not bounded
+    assert np.linalg.norm(found.wish, axis=-1).max() > 4.0  # a single behaviour's force is not bounded
     assert found.cut.any()
     assert set(found.mean_share()) == {"avoid_obstacles", "separation"}
     where = found.asked[..., 1]
     assert found.mean_share()["separation"] == pytest.approx(float(found.share[..., 1][where].mean()))
-    shares = _shares(scene, state)  # what `flockenv explain` shows: means over a run
+    shares = _shares(scene, state)  # as shown by `flockenv explain`: means over a run
     assert [(where, name) for where, name, _ in shares] == [("effects[0]", name) for name in found.names]
     assert all(0 < mean <= 1 for _, _, mean in shares)
     assert _shares(crowd(SEPARATION), state) == ()
@@ -278,8 +278,8 @@ def test_steer_leaves_other_groups_alone_and_grants_what_it_says() -> None:
     assert (found.share[order][:, 0] >= found.share[order][:, 1]).all()
 
 
-def test_what_no_behaviour_asks_for_costs_nothing() -> None:
-    """No query without a behaviour that looks around, and no line of Steer's in a scene without one."""
+def test_a_kernel_contains_only_what_its_behaviours_need() -> None:
+    """No neighbour query without a behaviour that sees neighbours, and no code of `Steer` without a `Steer`."""
     scene = crowd(Steer(behaviours=(AVOID,)))
     assert "lanes_meet" in functions_of(crowd(SEPARATION))
     assert "lanes_meet" not in functions_of(scene)
@@ -289,7 +289,7 @@ def test_what_no_behaviour_asks_for_costs_nothing() -> None:
 
 
 @ALL
-def test_steer_is_yaml_and_back(arbitration: Arbitration) -> None:
+def test_steer_survives_a_round_trip_through_yaml(arbitration: Arbitration) -> None:
     scene = crowd(Steer(group=1, behaviours=(AVOID, SEPARATION), arbitration=arbitration), Drag(rate=0.1))
     again = load_scene(dump_scene(scene))
     assert again == scene
@@ -299,11 +299,11 @@ def test_steer_is_yaml_and_back(arbitration: Arbitration) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("arbitration", "dtype", "dimension"),
-    [(a, *(("float32", 2), ("float64", 3))[k % 2]) for k, a in enumerate(catalogue.ARBITRATIONS)],  # laws: in both
+    [(a, *(("float32", 2), ("float64", 3))[k % 2]) for k, a in enumerate(catalogue.ARBITRATIONS)],  # their laws: both
     ids=lambda value: getattr(value, "kind", value),
 )
 def test_every_arbitration_steers_a_scene(arbitration: Arbitration, dtype: str, dimension: int) -> None:
-    """The kernel does what the law says, wherever agents are, on top of each other at rest too."""
+    """The kernel applies the law, and stays finite for agents at rest in one place."""
     change: dict[str, Any] = {"dtype": dtype, "dimension": dimension, "space": Torus(size=(9.0,) * dimension)}
     change["obstacles"] = tuple({"centre": (x,) * dimension, "radius": 0.7} for x in (3.0, 6.5))
     scene = crowd(Steer(behaviours=(AVOID, SEPARATION), arbitration=arbitration), **change)
@@ -339,7 +339,7 @@ def test_every_arbitration_steers_a_scene(arbitration: Arbitration, dtype: str, 
         (lambda: Steer(behaviours=(AVOID,), arbitration={"kind": "blnd"}), ("arbitration", "blend")),
     ],
 )
-def test_what_does_not_fit_is_refused_in_one_line(make: Any, words: tuple[str, ...]) -> None:
+def test_an_invalid_arbitration_is_refused_in_one_line(make: Any, words: tuple[str, ...]) -> None:
     with pytest.raises(ValueError, match=re.escape(words[0])) as refused:
         make()
     text = str(refused.value)
@@ -348,7 +348,7 @@ def test_what_does_not_fit_is_refused_in_one_line(make: Any, words: tuple[str, .
         assert word in text
 
 
-def test_wishes_of_a_wrong_shape_are_refused() -> None:
+def test_forces_of_a_wrong_shape_are_refused() -> None:
     with pytest.raises(ValueError, match=r"wishes has shape \(3, 2\), expected \(R, K, D\)"):
         reconcile(Blend(), np.zeros((3, 2)), BUDGET)
 

@@ -1,4 +1,4 @@
-"""Who gains by playing otherwise: one agent among others, its seat and its end, and what is said of the payoffs."""
+"""Best response: one agent of each world deviates from the others; its seat, its return, and the payoffs."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from flockenv.players.policy import RandomPolicy
 from flockenv.tasks import Flock, School
 
 FISH, WORLDS = 3, 7
-TASK = School(fish=FISH, horizon=60, start_hunger=0.6, metabolism=0.2)  # they starve in time
+TASK = School(fish=FISH, horizon=60, start_hunger=0.6, metabolism=0.2)  # some starve before the time limit
 
 
 class Steady:
-    """Pushes the same way for ever, and remembers how often it was asked."""
+    """A player with memory: it pushes along x by push cos(n) at decision n."""
 
     def __init__(self, push: float) -> None:
         self.push = push
@@ -28,14 +28,14 @@ class Steady:
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[Any, Any]:
-        asked = np.zeros(len(observation)) if state is None or episode_start.all() else state
+        n = np.zeros(len(observation)) if state is None or episode_start.all() else state
         action = np.zeros((len(observation), 2), np.float32)
-        action[:, 0] = self.push * np.cos(asked)
-        return action, asked + 1
+        action[:, 0] = self.push * np.cos(n)
+        return action, n + 1
 
 
 def returns_of_seats(actions: Any) -> Any:
-    """Return what learner k % L of world k is paid until it is out, where learner i pushes by `actions(t)[k, i]`."""
+    """Return the reward of learner k % L of world k until it is out, if learner i of it acts by `actions(t)[k, i]`."""
     world = World(TASK, WORLDS, TASK.horizon)
     world.reset(worlds_for("evaluation", 0, WORLDS))
     seats, paid, lives = np.arange(WORLDS) % FISH, np.zeros(WORLDS), np.ones(WORLDS, np.bool_)
@@ -47,7 +47,7 @@ def returns_of_seats(actions: Any) -> Any:
 
 
 @pytest.mark.parametrize("theirs", [0.2, -0.8])
-def test_one_plays_alone_in_its_seat_and_is_paid_until_it_is_out(theirs: float) -> None:
+def test_one_agent_per_world_deviates_and_is_rewarded_until_it_is_out(theirs: float) -> None:
     def actions(t: int) -> Any:
         push = np.full((WORLDS, FISH, 2), theirs * np.cos(t))
         push[np.arange(WORLDS), np.arange(WORLDS) % FISH] = 0.2 * np.cos(t)
@@ -58,15 +58,15 @@ def test_one_plays_alone_in_its_seat_and_is_paid_until_it_is_out(theirs: float) 
     made = lambda task, worlds, limit: best_response.Among(task, worlds, limit, Steady(theirs))  # noqa: E731
     alone = rollout(TASK, Steady(0.2), WORLDS, first, make_world=made)
     np.testing.assert_allclose(alone.returns, returns_of_seats(actions), rtol=0, atol=1e-12)
-    assert (alone.lengths < TASK.horizon).any()  # somebody was out before the others
+    assert (alone.lengths < TASK.horizon).any()  # some were out before the time limit
 
 
-def test_one_of_many_changes_what_the_others_meet() -> None:
+def test_payoffs_depend_on_both_players_and_are_reproducible() -> None:
     field = {"calm": lambda task: Steady(0.0), "wild": lambda task: RandomPolicy(2, 0)}
-    told: list[int] = []
+    calls: list[int] = []
     flock = Flock(agents=7, horizon=10)
-    payoffs = best_response.invade(flock, field, WORLDS, advance=lambda: told.append(1))  # type: ignore[arg-type]
-    assert len(told) == 4 and payoffs.players == ("calm", "wild")
+    payoffs = best_response.invade(flock, field, WORLDS, advance=lambda: calls.append(1))  # type: ignore[arg-type]
+    assert len(calls) == 4 and payoffs.players == ("calm", "wild")
     assert not np.array_equal(payoffs.of["calm", "calm"].returns, payoffs.of["calm", "wild"].returns)
     assert not np.array_equal(payoffs.of["calm", "calm"].returns, payoffs.of["wild", "calm"].returns)
     again = best_response.invade(flock, field, WORLDS)  # type: ignore[arg-type]
@@ -75,7 +75,7 @@ def test_one_of_many_changes_what_the_others_meet() -> None:
 
 
 def made_up(aa: float, ab: float, ba: float, bb: float, noise: float = 0.1) -> best_response.Payoffs:
-    """Payoffs of `a` among `a`, of `a` among `b`, and so on, with a little luck of worlds."""
+    """Return payoffs of `a` among `a`, of `a` among `b`, and so on, with noise between worlds."""
     values = {("a", "a"): aa, ("a", "b"): ab, ("b", "a"): ba, ("b", "b"): bb}
     luck = np.random.default_rng(0)
 
@@ -89,7 +89,7 @@ def made_up(aa: float, ab: float, ba: float, bb: float, noise: float = 0.1) -> b
 
 
 @pytest.mark.parametrize(
-    ("payoffs", "says"),
+    ("payoffs", "verdict"),
     [
         (made_up(1, 5, 0, 3), "a prisoner's dilemma, everybody does better with a and all together with b"),
         (made_up(3, 0, 5, 1), "a prisoner's dilemma, everybody does better with b and all together with a"),
@@ -100,8 +100,8 @@ def made_up(aa: float, ab: float, ba: float, bb: float, noise: float = 0.1) -> b
         (made_up(1, 1, 1, 1), "not decided in these worlds"),
     ],
 )
-def test_the_verdict_follows_from_the_payoffs(payoffs: best_response.Payoffs, says: str) -> None:
-    assert payoffs.verdict("a", "b").endswith(says)
+def test_the_verdict_follows_from_the_payoffs(payoffs: best_response.Payoffs, verdict: str) -> None:
+    assert payoffs.verdict("a", "b").endswith(verdict)
     assert payoffs.verdict("b", "a") == payoffs.verdict("a", "b")
     assert payoffs.mean("a", "b").low < payoffs.of["a", "b"].returns.mean() < payoffs.mean("a", "b").high
 
@@ -118,7 +118,7 @@ def test_the_verdict_follows_from_the_payoffs(payoffs: best_response.Payoffs, sa
         (["configs/no.yaml"], "configs/no.yaml"),
     ],
 )
-def test_what_cannot_be_played_is_refused_in_one_line(arguments: list[str], message: str) -> None:
+def test_an_invalid_command_is_refused_in_one_line(arguments: list[str], message: str) -> None:
     result = CliRunner().invoke(best_response.app, [*arguments, "--worlds", "2"])
     assert result.exit_code == 2
     assert message in result.stderr and len(result.stderr.strip().splitlines()) == 1
@@ -134,7 +134,7 @@ def test_what_cannot_be_played_is_refused_in_one_line(arguments: list[str], mess
         ("return observation[:, 10_000], None", "IndexError in predict, line 3: "),
     ],
 )
-def test_somebody_who_fails_among_others_is_named(tmp_path: Path, code: str, message: str) -> None:
+def test_a_player_that_fails_among_others_is_named(tmp_path: Path, code: str, message: str) -> None:
     lines = ("import numpy as np", "def predict(observation, state=None, episode_start=None, deterministic=True):")
     (tmp_path / "mine.py").write_text("\n".join((*lines, f"    {code}", "")), encoding="utf-8")
     arguments = ["configs/training/school.yaml", "--players", str(tmp_path / "mine.py"), "--worlds", "2"]
@@ -143,7 +143,7 @@ def test_somebody_who_fails_among_others_is_named(tmp_path: Path, code: str, mes
     assert message in result.stderr and "mine" in result.stderr and len(result.stderr.strip().splitlines()) == 1
 
 
-def test_it_prints_a_table_and_a_sentence_for_each_pair() -> None:
+def test_the_command_prints_a_table_and_a_verdict_for_each_pair() -> None:
     command = ["configs/training/school.yaml", "--players", "textbook,rules", "--worlds", "8"]
     result = CliRunner().invoke(best_response.app, command)
     assert result.exit_code == 0, result.output

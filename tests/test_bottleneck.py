@@ -1,4 +1,4 @@
-"""Bottleneck: what presses, what it costs, who is out and when, and whether players get everybody out unhurt."""
+"""Bottleneck: pressure, rewards, agents that leave, and whether players get all agents out unhurt."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def room(places: Any, velocities: Any = 0.0, **more: Any) -> World:
     return world
 
 
-def test_people_begin_away_from_the_door_and_not_in_each_other() -> None:
+def test_people_begin_away_from_the_door_without_overlap() -> None:
     world = World(Bottleneck(), 100)
     world.reset(3)
     pos = world.state.pos
@@ -36,7 +36,7 @@ def test_people_begin_away_from_the_door_and_not_in_each_other() -> None:
     assert gaps.min() >= 0.5
 
 
-def test_getting_nearer_pays_and_time_costs() -> None:
+def test_progress_is_rewarded_and_time_costs() -> None:
     world = room([(3.0, 3.0), (1.0, 1.0)], [(1.0, 0.0), (0.0, 0.0)])
     step = act(world)
     assert paid(world, step) == pytest.approx({"progress": 0.05, "out": 0, "pressed": 0, "hurt": 0, "time": -0.05})
@@ -44,7 +44,7 @@ def test_getting_nearer_pays_and_time_costs() -> None:
 
 
 def pressures(world: World) -> np.ndarray:
-    """By hand: elastic forces of everybody and of the wall with the door over the circumference, N/m."""
+    """Return the elastic forces of neighbours and of the wall with the door, over the circumference, N/m."""
     pos = world.state.pos[0]
     overlap = np.clip(0.5 - np.linalg.norm(pos[:, None] - pos, axis=2), 0, None) - 0.5 * np.eye(len(pos))
     wall = 6.0 - pos[:, 0]
@@ -53,8 +53,8 @@ def pressures(world: World) -> np.ndarray:
     return K * (overlap.sum(axis=1) + np.clip(0.25 - gap, 0, None)) / ROUND
 
 
-def test_what_presses_is_the_force_over_the_circumference_and_above_the_limit_it_hurts() -> None:
-    """Three in a row push each other into the wall, with 600 N each."""
+def test_pressure_is_force_over_circumference_and_hurts_above_a_limit() -> None:
+    """Three agents in a row push each other into the wall, with 600 N each."""
     world = room([(5.76, 1.0), (5.28, 1.0), (4.80, 1.0), (1.0, 5.0)])
     hurt = 0.0
     for _ in range(10):
@@ -65,14 +65,14 @@ def test_what_presses_is_the_force_over_the_circumference_and_above_the_limit_it
             assert terms["pressed"] == pytest.approx(-2 * 0.1 * min(expected[i] / 1600, 1), rel=1e-9)
             assert terms["hurt"] == (-5 if expected[i] > 1600 else 0)
         hurt += 0.1 * np.mean(expected > 1600)
-    assert expected[0] == pytest.approx((3 * 600 + 2 * 600) / ROUND, rel=0.05)  # the wall, and both behind him
+    assert expected[0] == pytest.approx((3 * 600 + 2 * 600) / ROUND, rel=0.05)  # the wall, and both agents behind
     assert expected[2] == pytest.approx(600 / ROUND, rel=0.05)
     assert world.measure()["hurt_time"] == pytest.approx(hurt)
     assert world.measure()["most_pressure"] >= expected.max()
     assert hurt > 0.1
 
 
-def test_a_post_of_the_door_presses_too() -> None:
+def test_a_door_post_exerts_pressure() -> None:
     world = room([(6.0, 2.72), (1.0, 5.0)])  # 0.22 m from the post at (6, 2.5)
     world.state.vel[...] = 0
     act(world)
@@ -80,11 +80,11 @@ def test_a_post_of_the_door_presses_too() -> None:
 
 
 def leaving(**more: Any) -> World:
-    """Two before the door, one behind the other, and one far away."""
+    """Return a world of two agents at the door, one behind the other, and one far away."""
     return room([(6.15, 3.0), (5.3, 3.0), (1.0, 1.0)], [(1.5, 0), (1.5, 0), (0, 0)], **more)
 
 
-def test_who_is_through_leaves_and_is_paid_no_more() -> None:
+def test_an_agent_through_the_door_leaves_and_gets_no_more_reward() -> None:
     world = leaving()
     step = act(world)
     assert paid(world, step)["out"] == 5
@@ -97,7 +97,7 @@ def test_who_is_through_leaves_and_is_paid_no_more() -> None:
     np.testing.assert_array_equal(step.terminated, [[True, True, False]])
     measured = world.measure()
     assert measured["share_out"] == pytest.approx(2 / 3)
-    assert measured["specific_flow"] == pytest.approx(1 / 0.6)  # the second 0.6 s after the first, a door of 1 m
+    assert measured["specific_flow"] == pytest.approx(1 / 0.6)  # 0.6 s between the two, a door of 1 m
     assert np.isnan(measured["evacuation_time"])
     world.state.pos[0, 2] = (6.2, 3.0)
     world.state.vel[0, 2] = (1.5, 0.0)
@@ -107,7 +107,7 @@ def test_who_is_through_leaves_and_is_paid_no_more() -> None:
     assert world.measure()["evacuation_time"] == pytest.approx(0.8)
 
 
-def test_who_waits_for_the_others_is_out_of_the_world_too() -> None:
+def test_together_only_delays_termination_until_all_agents_are_out() -> None:
     world, waiting = leaving(), leaving(together=True)
     for _ in range(5):
         one, other = act(world, (0.3, 0.1)), act(waiting, (0.3, 0.1))
@@ -122,7 +122,7 @@ def test_who_waits_for_the_others_is_out_of_the_world_too() -> None:
     assert step.success.all()
 
 
-def test_a_person_sees_what_is_there() -> None:
+def test_the_observation_matches_the_state() -> None:
     world = world_of(Bottleneck())
     for actions in random_actions(world, 25):
         step = world.step(actions)
@@ -146,7 +146,7 @@ def test_a_person_sees_what_is_there() -> None:
         np.testing.assert_array_equal(see.neighbour_present[i], [1] * n + [0] * (task.neighbours - n))
 
 
-def test_rewards_do_not_touch_what_happens() -> None:
+def test_rewards_do_not_change_the_motion() -> None:
     free = {name: 0.0 for name in Bottleneck.model_fields if name.endswith(("_reward", "_cost"))}
     assert len(free) == 5
     worlds = world_of(Bottleneck()), world_of(Bottleneck(**free))
@@ -157,7 +157,7 @@ def test_rewards_do_not_touch_what_happens() -> None:
     np.testing.assert_array_equal(worlds[0].state.pos, worlds[1].state.pos)
 
 
-def test_nobody_gets_through_the_wall() -> None:
+def test_no_agent_passes_through_the_wall() -> None:
     world = world_of(Bottleneck(), worlds=8)
     for k in range(60):
         world.step(np.broadcast_to([1.0, 1.0 if k % 20 < 10 else -1.0], (8, 20, 2)))
@@ -166,7 +166,7 @@ def test_nobody_gets_through_the_wall() -> None:
         assert (np.abs(pos[..., 1] - 3.0)[beyond] < 0.5).all()
 
 
-def test_who_queues_gets_everybody_out_unhurt_and_who_pushes_hurts() -> None:
+def test_queueing_gets_all_agents_out_and_hurts_less_than_pushing() -> None:
     task, first = Bottleneck(together=True), worlds_for("tuning", 7, 12)
     players = {
         "random": RandomPolicy(2, 0),
@@ -191,12 +191,12 @@ def test_scripted_people_get_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fields", "said"),
+    ("fields", "message"),
     [({"people": 0}, "people = 0"), ({"people": 200}, "people = 200"), ({"width": 6.0}, "width = 6"),
      ({"clear": 5.5}, "clear = 5.5"), ({"people": 4, "learners": 5}, "learners = 5")],
 )  # fmt: skip
-def test_what_it_cannot_be_is_refused_in_one_line(fields: dict[str, Any], said: str) -> None:
+def test_invalid_fields_are_refused_in_one_line(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=r".") as caught:
         Bottleneck(**fields)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
