@@ -1,4 +1,4 @@
-"""Path following, staying on a path, flow-field following: closed forms, and what others get wrong."""
+"""Path following, staying on a path, flow-field following: closed forms, and errors that other libraries have."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from flockenv.scene import Group, Scene
 from flockenv.scene.yaml_io import load_scene
 from tests.catalogue import Array
 
-NOBODY = Spawn(low=(0.0, 0.0), high=(1.0, 1.0))
+ANYWHERE = Spawn(low=(0.0, 0.0), high=(1.0, 1.0))
 RING_RADIUS = 10.0
 
 
 def ring(pieces: int = 240, radius: float = RING_RADIUS) -> tuple[tuple[float, float], ...]:
-    """A circle of many short pieces, counterclockwise."""
+    """Return a circle of many short pieces, counterclockwise."""
     angles = 2 * np.pi * np.arange(pieces) / pieces
     return tuple(zip((radius * np.cos(angles)).tolist(), (radius * np.sin(angles)).tolist(), strict=True))
 
 
 def traffic(*follow: FollowPath, apart: float = 0.0, counts: tuple[int, ...] = (1,), **fields: Any) -> Scene:
-    """A group for each way of a path, or one of them idle: one kernel for all tests of path following in the plane."""
+    """Return a scene of two groups with a path each; the second may be idle, so that tests in 2-D share a kernel."""
     both = follow if len(follow) == 2 else (follow[0], follow[0].idle())
     each = counts if len(counts) == 2 else (counts[0], 1)
     groups = tuple(
-        Group(count=n, mass=1.0, radius=0.2, max_speed=2.0, max_force=fields.pop("max_force", 20.0), spawn=NOBODY)
+        Group(count=n, mass=1.0, radius=0.2, max_speed=2.0, max_force=fields.pop("max_force", 20.0), spawn=ANYWHERE)
         for n in each
     )
     steer = tuple(
@@ -47,7 +47,7 @@ def traffic(*follow: FollowPath, apart: float = 0.0, counts: tuple[int, ...] = (
 
 
 def begun(scene: Scene, places: Any, velocities: Any) -> State:
-    """Everybody else far away and at rest."""
+    """Return a state of these first agents; all others are far away and at rest."""
     state = scene.start(0)
     state.pos[0], state.vel[0] = -500.0, 0.0
     state.pos[0, :, 0] -= 50.0 * np.arange(scene.agents)
@@ -56,7 +56,7 @@ def begun(scene: Scene, places: Any, velocities: Any) -> State:
 
 
 def push(scene: Scene, place: Any, velocity: Any) -> Array:
-    """What the first agent of a scene asks for, N."""
+    """Return the acceleration of the first agent, m/s^2."""
     return np.asarray(scene.acceleration(begun(scene, [place], [velocity]))[0, 0])
 
 
@@ -68,8 +68,7 @@ STRAIGHT = FollowPath(weight=4, points=((0, 0), (20, 0)), radius=1, speed=2, tim
 
 @pytest.mark.parametrize("closed", [False, True])
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_a_path_knows_its_nearest_point_and_every_length(closed: bool, dimension: int) -> None:
-    """Against ten thousand points along it."""
+def test_lengths_and_nearest_points_of_a_path_match_those_of_10_000_points(closed: bool, dimension: int) -> None:
     rng = np.random.default_rng(4)
     points = rng.uniform(0, 10, (7, dimension))
     path = polyline.pieces(points.tolist(), closed)
@@ -89,7 +88,7 @@ def test_a_path_knows_its_nearest_point_and_every_length(closed: bool, dimension
     np.testing.assert_allclose(polyline.on_spine(path, found, dimension), places + offset, atol=1e-12)
 
 
-def test_on_a_torus_a_path_goes_the_shortest_way_and_so_do_offsets() -> None:
+def test_on_a_torus_pieces_of_a_path_and_offsets_are_the_shortest() -> None:
     path = polyline.pieces([(2, 5), (9, 5), (16, 5)], True, Torus(size=(20, 12)))
     assert path[1] == pytest.approx(20)
     found, offset = polyline.projected(path, [(19, 6), (1, 11.5), (39.5, -7.5)])
@@ -108,13 +107,13 @@ def test_on_a_torus_a_path_goes_the_shortest_way_and_so_do_offsets() -> None:
         ({"time": 0.0}, "time"),
     ],
 )
-def test_what_is_no_path_is_refused_in_one_line(change: dict[str, Any], text: str) -> None:
+def test_an_invalid_path_is_refused_in_one_line(change: dict[str, Any], text: str) -> None:
     with pytest.raises(ValueError, match=text) as caught:
         FollowPath(**{**STRAIGHT.model_dump(), **change})
     assert "\n" not in str(caught.value)
 
 
-def test_a_path_has_the_dimension_of_its_scene() -> None:
+def test_a_path_of_another_dimension_than_its_scene_is_refused() -> None:
     flat = Group(count=1, spawn=Spawn(low=(0, 0, 0), high=(1, 1, 1)))
     with pytest.raises(ValueError, match=r"effects\[0\]\.points\[0\] = .*: dimension = 3"):
         Scene(dimension=3, groups=(flat,), effects=(STRAIGHT,))
@@ -124,8 +123,8 @@ def test_a_path_has_the_dimension_of_its_scene() -> None:
 
 
 @pytest.mark.slow
-def test_on_its_way_in_the_tube_it_is_let_alone() -> None:
-    """Exactly 0 where the predicted place is in the tube and further along; in the wrong direction it is not."""
+def test_the_force_is_zero_if_the_predicted_position_is_in_the_tube_and_ahead() -> None:
+    """In the wrong direction along the path it is not zero."""
     there, back = traffic(STRAIGHT), traffic(STRAIGHT.model_copy(update={"way": -1}))
     for place, velocity in [((5, 0.5), (1, 0.5)), ((3, -0.9), (0.1, 0)), ((0.2, 0), (2, 0))]:
         assert not push(there, place, velocity).any()
@@ -134,33 +133,34 @@ def test_on_its_way_in_the_tube_it_is_let_alone() -> None:
         np.testing.assert_allclose(push(back, place, -np.array(velocity)) == 0, True)
 
 
-def test_who_would_leave_the_tube_seeks_the_spine_ahead() -> None:
-    """The closed form: S = V unit(spine(s + T |v|) - x) - v, at the speed that it has."""
+def test_an_agent_that_would_leave_the_tube_seeks_the_spine_ahead() -> None:
+    """The closed form: S = V unit(spine(s + T |v|) - x) - v."""
     x, v = np.array([4.0, 0.8]), np.array([1.0, 1.0])
     target = np.array([4 + 0.5 * math.sqrt(2), 0.0])
-    wish = 2 * (target - x) / np.linalg.norm(target - x) - v
-    np.testing.assert_allclose(push(traffic(STRAIGHT), x, v), 4 * wish, rtol=1e-12)
+    steering = 2 * (target - x) / np.linalg.norm(target - x) - v
+    np.testing.assert_allclose(push(traffic(STRAIGHT), x, v), 4 * steering, rtol=1e-12)
 
 
-def test_who_stands_is_sent_on() -> None:
-    """At standstill a look ahead of T |v| is none: on the spine it would stand for ever."""
+def test_an_agent_at_rest_is_pushed_along_the_path() -> None:
+    """At rest the look-ahead T |v| is 0: without a push, an agent on the spine would stand for ever."""
     for place in ((5.0, 0.0), (5.0, 0.4), (0.0, 0.0)):
         assert push(traffic(STRAIGHT), place, (0, 0))[0] > 1.0
     assert push(traffic(STRAIGHT.model_copy(update={"way": -1})), (5.0, 0.0), (0, 0))[0] < -1.0
 
 
-def test_who_is_slower_than_it_should_be_is_sent_on() -> None:
-    """Reynolds' rule lets alone who has just begun to move: it would coast for ever at a hundredth of its speed."""
+def test_a_slow_agent_speeds_up_if_keep_is_positive() -> None:
+    """By Reynolds' rule (keep = 0) an agent that has just begun to move coasts for ever, at 1 % of its speed."""
     for keep, fast in ((0.0, 0.5), (0.8, 1.5)):
         scene = traffic(STRAIGHT.model_copy(update={"keep": keep}))
         end = scene.run(begun(scene, [(1, 0)], [(0, 0)]), 300)
         assert (end.vel[0, 0, 0] > fast) == (keep > 0)
 
 
-def test_on_a_circle_it_flies_on_the_orbit_of_the_closed_form() -> None:
-    """A tube of no width: always the point L = T |v| ahead on the ring is sought, and the orbit r is where
-    m v^2 / r = w V sin a and v = V cos a, with a the angle of that point to the tangent, below it.
-    """  # one formula
+def test_on_a_circular_path_the_orbit_has_the_radius_of_the_closed_form() -> None:
+    """In a tube of no width, an agent always seeks the point L = T |v| ahead on the ring.
+
+    The orbit r solves m v^2 / r = w V sin a and v = V cos a, with a the angle of that point below the tangent.
+    """
     weight, top, time = 6.0, 2.0, 0.8
     path = FollowPath(weight=weight, points=ring(), closed=True, radius=1e-9, speed=top, time=time)
     scene = traffic(path, max_force=None, dt=0.004)
@@ -175,12 +175,11 @@ def test_on_a_circle_it_flies_on_the_orbit_of_the_closed_form() -> None:
         return weight * top * math.sin(angle) - speed**2 / r
 
     orbit = brentq(excess, 0.8 * RING_RADIUS, 1.2 * RING_RADIUS)
-    assert abs(orbit - RING_RADIUS) > 0.001  # it is not the ring itself
+    assert abs(orbit - RING_RADIUS) > 0.001  # the orbit is not the ring itself
     assert np.linalg.norm(end.pos[0, 0]) - RING_RADIUS == pytest.approx(orbit - RING_RADIUS, abs=2e-3)
 
 
-def test_on_a_circle_it_stays_in_the_tube_and_goes_round_and_round() -> None:
-    """Two laps; across the seam nothing pushes, the tube is never left by more than the turn that brings it back."""
+def test_on_a_circular_path_an_agent_stays_in_the_tube_for_two_laps() -> None:
     path = FollowPath(weight=20, points=ring(), closed=True, radius=0.6, speed=2, time=0.4, keep=0.8)
     scene = traffic(path)
     state = begun(scene, [(RING_RADIUS, -1.0)], [(0, 2)])
@@ -190,15 +189,15 @@ def test_on_a_circle_it_stays_in_the_tube_and_goes_round_and_round() -> None:
         out.append(abs(np.linalg.norm(state.pos[0, 0]) - RING_RADIUS))
         angles.append(math.atan2(state.pos[0, 0, 1], state.pos[0, 0, 0]))
     assert max(out) < 0.6
-    assert max(out) > 0.3  # it does not cling to the spine: in the tube nothing holds it
+    assert max(out) > 0.3  # it leaves the spine: within the tube there is no force
     turned = np.unwrap(angles)
     assert (np.diff(turned) > 0).all()
     assert turned[-1] - turned[0] > 2 * 2 * np.pi
-    assert not push(scene, (RING_RADIUS, -0.3), (0, 2)).any()  # in half a second it is beyond the first point
+    assert not push(scene, (RING_RADIUS, -0.3), (0, 2)).any()  # nor if it will soon pass the first point
 
 
-def test_traffic_of_both_ways_passes() -> None:
-    """Eight against eight in a tube of two metres, in the way of each other: all come round, and nobody is touched."""
+def test_traffic_in_both_directions_passes_without_contact() -> None:
+    """Eight agents move against eight others in a tube of 2 m; all keep going round."""
     path = FollowPath(weight=5, points=ring(), closed=True, radius=1.0, speed=2, time=0.5, keep=0.9)
     scene = traffic(path, path.model_copy(update={"way": -1}), apart=10.0, counts=(8, 8))
     angle, away = 2 * np.pi * np.arange(16) / 16, RING_RADIUS + np.random.default_rng(0).uniform(-0.7, 0.7, 16)
@@ -214,12 +213,12 @@ def test_traffic_of_both_ways_passes() -> None:
         gap = min(gap, np.linalg.norm(x[:, None] - x, axis=2)[~np.eye(16, dtype=bool)].min())
     way = np.unwrap(np.array(turned), axis=0)
     gone = (way[-1] - way[0]) * RING_RADIUS * np.repeat([1, -1], 8)
-    assert gone.min() > 0.9 * 2.0 * 40.0 - 2.0  # they began at rest
+    assert gone.min() > 0.9 * 2.0 * 40.0 - 2.0  # 2 m less, for they began at rest
     assert gap > 0.4  # both radii
-    assert out < 1.2  # the tube, and what it takes to give way at its edge
+    assert out < 1.2  # the tube, and a little more to give way at its edge
 
 
-def test_an_open_path_s_end_is_arrived_at() -> None:
+def test_agents_stop_at_the_end_of_an_open_path() -> None:
     for way, goal, begin in ((1, (20.0, 0.0), (12.0, 0.3)), (-1, (0.0, 0.0), (8.0, -0.3))):
         path = STRAIGHT.model_copy(update={"way": way, "slow_radius": 3.0, "keep": 0.5})
         scene = traffic(path)
@@ -232,8 +231,8 @@ def test_an_open_path_s_end_is_arrived_at() -> None:
         assert beyond < 0.01
 
 
-def test_it_does_not_depend_on_the_step() -> None:
-    """The same way for dt and dt / 4, to the error of the method: to 2 cm after 24 m."""
+def test_path_following_does_not_depend_on_dt() -> None:
+    """Positions for dt and dt / 4 differ by the error of the method, 2 cm after 24 m."""
     ends = []
     for dt, steps in ((0.008, 1500), (0.002, 6000)):
         path = FollowPath(weight=6, points=ring(), closed=True, radius=1e-9, speed=2, time=0.5)
@@ -251,7 +250,7 @@ def on_torus(path: Any) -> Scene:
 
 
 @pytest.mark.slow
-def test_on_a_torus_a_path_may_go_round_it() -> None:
+def test_a_path_may_wrap_around_a_torus() -> None:
     path = FollowPath(weight=5, points=((2, 11.5), (9, 11.5), (16, 11.5)), closed=True, radius=0.3, speed=2, time=0.5)
     scene = on_torus(path)
     state = scene.start(0)
@@ -269,13 +268,13 @@ def test_on_a_torus_a_path_may_go_round_it() -> None:
 
 
 def kept(path: StayOnPath, count: int = 1, space: Space | None = None, **fields: Any) -> Scene:
-    groups = (Group(count=count, max_speed=2, max_force=20, spawn=NOBODY),)
+    groups = (Group(count=count, max_speed=2, max_force=20, spawn=ANYWHERE),)
     return Scene(space=space or Plane(), groups=groups, effects=(path,), dt=0.02, **fields)
 
 
 @pytest.mark.slow
-def test_it_stays_in_the_tube_whichever_way() -> None:
-    """Twenty from the spine in all directions; the closed form of a wish; nothing if the predicted place is inside."""
+def test_stay_on_path_keeps_agents_in_the_tube_in_both_directions() -> None:
+    """Twenty agents begin on the spine in all directions; the force is zero if the predicted position is inside."""
     path = StayOnPath(weight=6, points=((-100, 3), (100, 3)), radius=1, speed=2, time=0.5)
     scene = kept(path, 20)
     angle = 2 * np.pi * (np.arange(20) + 0.5) / 20
@@ -286,17 +285,17 @@ def test_it_stays_in_the_tube_whichever_way() -> None:
         state = scene.step(state, steps=10)
         out = max(out, np.abs(state.pos[0, :, 1] - 3).max())
     assert out < 1.0
-    assert (np.sign(state.pos[0, :, 0]) == ways).all()  # it does not turn anybody round
+    assert (np.sign(state.pos[0, :, 0]) == ways).all()  # no agent turns round
     assert not push(scene, (5, 3.9), (-2, 0.1)).any()
     v = np.array([1.0, 1.0])
-    wish = 2 * np.array([0.5, -0.9]) / math.hypot(0.5, 0.9) - v
-    np.testing.assert_allclose(push(scene, (5, 3.9), v), 6 * wish, rtol=1e-12)
+    steering = 2 * np.array([0.5, -0.9]) / math.hypot(0.5, 0.9) - v
+    np.testing.assert_allclose(push(scene, (5, 3.9), v), 6 * steering, rtol=1e-12)
 
 
 # --- flow-field following ---------------------------------------------------------------------------------------------
 
 TURN = np.array([[-0.12, -0.24], [0.24, -0.12]])
-"""A whirl: what is linear, a grid holds exactly."""
+"""Velocity gradient of a whirl, 1/s; a grid represents this linear field exactly."""
 
 
 def whirl(time: float = 0.0, **fields: Any) -> FollowFlow:
@@ -308,13 +307,13 @@ def whirl(time: float = 0.0, **fields: Any) -> FollowFlow:
 
 
 def flown(flow: FollowFlow, **fields: Any) -> Scene:
-    groups = (Group(count=1, mass=1.5, spawn=NOBODY),)
+    groups = (Group(count=1, mass=1.5, spawn=ANYWHERE),)
     return Scene(groups=groups, effects=(flow,), **({"dt": 0.002} | fields))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("time", [0.0, 0.5])
-def test_a_linear_field_is_followed_as_the_exact_solution_says(time: float) -> None:
+def test_motion_in_a_linear_field_matches_the_exact_solution(time: float) -> None:
     """m x'' = w (A (x + T v - c) - v), solved by a matrix exponential."""
     scene, centre = flown(whirl(time)), np.array([5.0, 4.0])
     x, v = np.array([9.0, 1.5]), np.array([0.5, -0.3])
@@ -327,8 +326,8 @@ def test_a_linear_field_is_followed_as_the_exact_solution_says(time: float) -> N
 
 
 @pytest.mark.slow
-def test_outside_the_grid_it_asks_for_nothing() -> None:
-    """The grid reaches from -5 to 15 and from -3.5 to 11.5; what counts is the predicted place."""
+def test_follow_flow_is_zero_outside_its_grid() -> None:
+    """The grid reaches from -5 to 15 and from -3.5 to 11.5; the predicted position counts."""
     scene = flown(whirl(time=0.5))
     assert not push(scene, (15.2, 4), (1, 1)).any()
     assert not push(scene, (14.8, 4), (1, 0)).any()
@@ -338,7 +337,7 @@ def test_outside_the_grid_it_asks_for_nothing() -> None:
 
 
 @pytest.mark.slow
-def test_on_a_torus_the_nearest_grid_is_followed() -> None:
+def test_on_a_torus_the_nearest_image_of_the_grid_counts() -> None:
     flow = FollowFlow(
         weight=2, centre=(0.5, 0.0), spacing=4, counts=(2, 2), velocities=((1, 0.5), (1, 0), (1, 0), (1, 0)), time=0
     )
@@ -362,18 +361,18 @@ def test_on_a_torus_the_nearest_grid_is_followed() -> None:
         ({"spacing": 0.0}, "spacing"),
     ],
 )
-def test_what_is_no_field_is_refused_in_one_line(change: dict[str, Any], text: str) -> None:
+def test_an_invalid_field_is_refused_in_one_line(change: dict[str, Any], text: str) -> None:
     with pytest.raises(ValueError, match=text) as caught:
         FollowFlow(**{**whirl().model_dump(), **change})
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("behaviour", [FollowPath, StayOnPath, FollowFlow])
-def test_its_demo_is_a_small_scene_and_shows_its_way(behaviour: Any) -> None:
+def test_the_demo_of_a_path_behaviour_is_small_and_marks_its_path(behaviour: Any) -> None:
     scene = load_scene(behaviour.demo)
     assert 0 < scene.agents <= 20
     assert behaviour.demo_time == 8
     marks = scene.snapshot(scene.start(0)).marks
     assert {mark.kind for mark in marks} == (set() if behaviour is FollowFlow else {"way"})
-    if behaviour is FollowPath:  # once for both ways
+    if behaviour is FollowPath:  # one path for both directions
         assert len(marks) == math.ceil(polyline.pieces(scene.parts.effects[1].points, True)[1] / 0.3) + 1
