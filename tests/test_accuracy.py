@@ -1,4 +1,4 @@
-"""What accuracy costs: measured orders, references, the cheapest way to a tolerance, and what is refused."""
+"""Accuracy against cost: measured orders, references, the cheapest method for a tolerance, and refusals."""
 
 from __future__ import annotations
 
@@ -44,24 +44,24 @@ def body(effect: Effect, **group: Any) -> Scene:
 def sprung(
     stiffness: float, seconds: float, steps: tuple[int, ...] = (512, 1024), across: float = 0.0, **group: Any
 ) -> Problem:
-    """A body of 1 kg on a spring, from 1 m."""
+    """Return the problem of a body of 1 kg on a spring, released at 1 m."""
     scene = body(Tether(centre=ORIGIN, stiffness=stiffness), **group)
     return Problem.of(scene, seconds, steps, motion=([[1.0, 0.0]], [[0.0, across]]))
 
 
 def swinging(angle: float, seconds: float, steps: tuple[int, ...] = (512, 1024)) -> Problem:
-    """A pendulum let go, whose small swings take 1 s."""
+    """Return the problem of a pendulum released at an angle; its period for small angles is 1 s."""
     scene = body(Swing(centre=ORIGIN, strength=4 * math.pi**2))
     return Problem.of(scene, seconds, steps, motion=([[angle, 0.0]], [[0.0, 0.0]]))
 
 
 FEW = methods_named(["semi_implicit_euler", "velocity_verlet", "rk4", "dormand_prince"])
-"""Of each order one: every method is a kernel of its own."""
+"""One method of each order, because each compiles a kernel."""
 
 
 @pytest.fixture(scope="module")
 def damped() -> Report:
-    """A few methods on a damped oscillator; timed once, so that there are times."""
+    """Return the report of a few methods on a damped oscillator, each timed once."""
     return measure(one("damped"), FEW, repetitions=1)
 
 
@@ -69,7 +69,7 @@ def damped() -> Report:
 
 
 @pytest.mark.slow
-def test_orders_and_evaluations_are_the_declared_ones_where_forces_are_smooth() -> None:
+def test_orders_and_evaluations_are_the_declared_ones_for_smooth_forces() -> None:
     damped = measure(one("damped"), repetitions=0)
     steady = {method.kind for method in usual_methods() if not method.adaptive}
     assert len(steady) >= 8
@@ -84,11 +84,11 @@ def test_orders_and_evaluations_are_the_declared_ones_where_forces_are_smooth() 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["forced", "kepler", "projectile", "quadratic_fall", "tracer", "boids"])
 def test_orders_are_the_declared_ones_on_every_smooth_problem(name: str) -> None:
-    """But for tracers: a medium that carries alone has no velocity that a method could be half-implicit about."""
+    """A curve that has no measured order is left out."""
     report = measure(one(name), [m for m in usual_methods() if not m.adaptive], repetitions=0)
-    told = [curve for curve in report.curves if curve.order is not None]
-    assert {curve.declared for curve in told} == {1, 2, 4}
-    for curve in told:
+    measured = [curve for curve in report.curves if curve.order is not None]
+    assert {curve.declared for curve in measured} == {1, 2, 4}
+    for curve in measured:
         assert curve.order == pytest.approx(curve.declared, abs=0.25), curve.method
 
 
@@ -96,10 +96,10 @@ METHODS = methods_named(["semi_implicit_euler", "velocity_verlet", "rk4"])
 
 
 @pytest.mark.slow
-def test_a_speed_limit_makes_every_method_one_of_order_1() -> None:
-    """What a scene does after each step, no method knows of.
+def test_a_speed_limit_reduces_every_method_to_order_1() -> None:
+    """The scene limits the speed after each step, outside the method.
 
-    In two dimensions: along a line the speed is just held, and who is held a step too late is O(h^2) off.
+    The motion has two dimensions: on a line the speed is just held, and a limit one step late is only O(h^2) off.
     """
     problem = sprung(40.0, 0.7, tuple(2**k for k in range(6, 13)), across=1.9, max_speed=2.0)
     report = measure(problem, METHODS, repetitions=0)
@@ -111,15 +111,15 @@ def test_a_speed_limit_makes_every_method_one_of_order_1() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["boids_cone", "boids_limit"])
-def test_view_cones_and_speed_limits_of_flocks_leave_order_1(name: str) -> None:
+def test_view_cones_and_speed_limits_reduce_flocks_to_order_1(name: str) -> None:
     report = measure(one(name), METHODS, repetitions=0)
     assert report.reference == "own steps"
     for curve in report.curves:
         assert curve.order == pytest.approx(1, abs=0.3), curve.method
 
 
-def test_the_order_is_of_the_finest_points_between_rounding_and_nonsense() -> None:
-    """Order 2 in the end: not yet in the coarse steps, no approximation in the first, no more than rounding last."""
+def test_the_order_is_measured_at_the_finest_points_above_rounding() -> None:
+    """Errors have order 2 in the middle: the first steps are too coarse, the last two errors are rounding."""
     errors = [5.0, 0.9, 0.7, 0.5, *(1e-1 * 0.25**k for k in range(6)), 1e-12, 3e-12]
     points = [_point(2**k, error) for k, error in enumerate(errors)]
     order, used = measured_order(points, 1e-9, 1.0)
@@ -139,7 +139,7 @@ def _point(evaluations: int, error: float | None, seconds: float | None = None) 
 
 
 def test_references_agree_with_each_other() -> None:
-    """A closed form, DOP853 on the compiled laws, and finer steps of the scene's own: three ways to one end."""
+    """A closed form, DOP853 on the compiled laws, and finer steps of the scene give the same path."""
     known = one("damped")
     exact = references.find_reference(known)
     scipy = references.find_reference(replace(known, exact=None))
@@ -152,7 +152,7 @@ def test_references_agree_with_each_other() -> None:
 
 
 @pytest.mark.slow
-def test_scipy_sees_the_time_and_the_flow() -> None:
+def test_the_reference_of_scipy_takes_time_and_medium_into_account() -> None:
     for name in ("forced", "tracer"):
         known = one(name)
         scipy = references.find_reference(replace(known, exact=None))
@@ -160,14 +160,14 @@ def test_scipy_sees_the_time_and_the_flow() -> None:
         assert np.abs(references.find_reference(known).path.pos - scipy.path.pos).max() < 1e-10
 
 
-def test_a_limit_that_does_not_act_leaves_the_better_reference() -> None:
+def test_a_speed_limit_that_never_acts_leaves_the_better_reference() -> None:
     assert references.find_reference(sprung(40.0, 0.7, max_speed=2.0)).kind == "own steps"
     assert references.find_reference(sprung(40.0, 0.7, max_speed=20.0)).kind == "DOP853"
 
 
 @pytest.mark.slow
-def test_growth_is_that_of_the_law() -> None:
-    """Near the top a pendulum falls as exp(2 pi t), and so does a difference."""
+def test_a_perturbation_grows_as_the_closed_form_of_a_pendulum() -> None:
+    """Near the top the angle of a pendulum, and so any difference of angles, grows as exp(2 pi t)."""
     found = chaos.find_sensitivity(swinging(math.pi, 1.5))
     half = math.exp(2 * math.pi * 1.5) / math.sqrt(8)  # of cosh, and of a change along one of two axes
     assert found.growth == pytest.approx(
@@ -177,7 +177,7 @@ def test_growth_is_that_of_the_law() -> None:
 
 
 @pytest.mark.slow
-def test_a_horizon_beyond_what_anybody_can_tell_is_refused() -> None:
+def test_a_horizon_that_is_too_long_for_a_chaotic_scene_is_refused() -> None:
     with pytest.raises(ValueError, match=r"seconds = 5: too long a horizon, .* try [\d.]+ s") as caught:
         measure(swinging(math.pi - 1e-9, 5.0), METHODS)
     assert "\n" not in str(caught.value)
@@ -185,7 +185,7 @@ def test_a_horizon_beyond_what_anybody_can_tell_is_refused() -> None:
     measure(swinging(math.pi - 1e-9, shorter), methods_named(["rk4"]), repetitions=0)
 
 
-# --- what is counted --------------------------------------------------------------------------------------------------
+# --- evaluations, energy, momentum ------------------------------------------------------------------------------------
 
 
 def test_evaluations_are_those_of_the_method(damped: Report) -> None:
@@ -203,8 +203,8 @@ def assert_evaluations(damped: Report, methods: Sequence[Integrator]) -> None:
 
 
 @pytest.mark.slow
-def test_no_tolerance_is_asked_for_that_costs_more_than_the_finest_fixed_steps() -> None:
-    """Where forces jump to and fro, a tenth of the tolerance is ten times the steps: there would be no end of it."""
+def test_tolerances_end_once_they_cost_more_than_the_finest_fixed_steps() -> None:
+    """If forces jump, a tenth of the tolerance takes ten times the steps, without end."""
     few = replace(one("damped"), steps=(8,))
     (curve,) = measure(few, methods_named(["dormand_prince"]), repetitions=0).curves
     costs = [point.evaluations for point in curve.points]
@@ -212,20 +212,20 @@ def test_no_tolerance_is_asked_for_that_costs_more_than_the_finest_fixed_steps()
     assert costs[-1] > 4 * 8 and all(cost <= 4 * 8 for cost in costs[:-1])
 
 
-def test_energy_is_off_by_the_book() -> None:
-    """RK4 keeps 1 - y^6/72 + y^8/576 of it per step, y = h w; half of it at most is kinetic."""
+def test_the_energy_error_of_rk4_has_its_closed_form() -> None:
+    """RK4 keeps 1 - y^6/72 + y^8/576 of the energy per step, y = h w."""
     oscillator = one("oscillator")
     report = measure(oscillator, methods_named(["rk4"]), repetitions=0)
     assert report.energy == "kinetic and potential (tether)"
     for point in report.curve("rk4").points[:6]:
         y = oscillator.seconds / point.steps
         assert point.energy == pytest.approx(1 - (1 - y**6 / 72 + y**8 / 576) ** point.steps, rel=1e-2)
-        assert point.momentum is None  # a spring to a fixed point takes it
+        assert point.momentum is None  # a spring to a fixed point does not conserve it
 
 
 @pytest.mark.slow
-def test_what_diverges_has_no_errors_and_spoils_nothing() -> None:
-    """Steps of h w = 15, which the scene itself refuses, beside good ones."""
+def test_a_diverged_run_has_no_error_and_does_not_affect_other_runs() -> None:
+    """The coarse steps of h w = 15 diverge, the fine ones do not."""
     problem = sprung(900.0, 20.0, (40, 20480))
     report = measure(problem, methods_named(["explicit_euler", "semi_implicit_euler"]), repetitions=1)
     coarse, fine = report.curve("semi_implicit_euler").points
@@ -235,7 +235,7 @@ def test_what_diverges_has_no_errors_and_spoils_nothing() -> None:
 
 
 @pytest.mark.slow
-def test_momentum_is_kept_where_everybody_pushes_back() -> None:
+def test_momentum_is_conserved_by_mutual_separation() -> None:
     spawn = Spawn(low=ORIGIN, high=(4.0, 4.0), speed=(0.5, 1.0))
     scene = Scene(groups=(Group(count=8, spawn=spawn),), effects=(Separation(weight=0.3, radius=50),))
     report = measure(Problem.of(scene, 1.0, (64, 128)), methods_named(["rk4"]), repetitions=0)
@@ -243,11 +243,11 @@ def test_momentum_is_kept_where_everybody_pushes_back() -> None:
     assert report.energy == "kinetic"
 
 
-# --- the cheapest -----------------------------------------------------------------------------------------------------
+# --- the cheapest method ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("tolerance", [1e-1, 1e-3, 1e-5, 1e-8])
-def test_the_cheapest_is_the_cheapest_of_the_table(damped: Report, tolerance: float) -> None:
+def test_the_cheapest_point_is_the_one_of_least_cost_in_the_table(damped: Report, tolerance: float) -> None:
     for by in ("evaluations", "seconds"):
         good = [
             getattr(point, by)
@@ -263,7 +263,7 @@ def test_the_cheapest_is_the_cheapest_of_the_table(damped: Report, tolerance: fl
     assert between.cost <= min(p.evaluations for c in damped.curves for p in c.points if (p.error or 1) <= tolerance)
 
 
-def test_what_lies_between_two_points_keeps_its_promise(damped: Report) -> None:
+def test_an_interpolated_point_reaches_its_error_at_its_cost(damped: Report) -> None:
     choice = damped.curve("rk4").needed(3e-5)
     assert choice is not None and choice.interpolated
     problem = one("damped")
@@ -282,10 +282,10 @@ def test_a_coarse_point_that_is_right_by_chance_is_not_taken() -> None:
     assert choice is not None and choice.cost == 8
     assert curve.needed(1e-5) is None
     unknown = curve.needed(1e-2)
-    assert unknown is not None and not unknown.interpolated  # what diverged is no end of a line
+    assert unknown is not None and not unknown.interpolated  # not from a diverged point
 
 
-def test_nothing_is_said_below_the_floor(damped: Report) -> None:
+def test_errors_below_the_floor_are_refused(damped: Report) -> None:
     with pytest.raises(ValueError, match="tolerance = 1e-14 m: must be finite and >="):
         damped.cheapest(1e-14)
     assert best(damped, [1e-14])[0].startswith("to 1e-14 m: errors below")
@@ -301,16 +301,16 @@ EVALUATIONS: dict[str, dict[float, tuple[int | None, ...]]] = {
     "pendulum": {1e-2: (None, 2048, 256, 1024, 512), 1e-6: (None, None, 32768, 65536, 2048)},
     "kepler": {1e-2: (None, 8192, 2048, 4096, 1024), 1e-6: (None, None, 262144, 262144, 8192)},
 }
-"""Evaluations, in powers of two, that reach an error in m. Velocity Verlet's 1e-6 m on the Kepler orbit take 262144
-steps (4.5e-7 m). None: not with 2^18 = 262144; the next power is more than 4e5."""
+"""Evaluations, in powers of two, that reach an error in m, by method. Velocity Verlet needs 262144 steps for 1e-6 m on
+the Kepler orbit (4.5e-7 m). None: more than 2^18 = 262144."""
 
 TABULATED = ("explicit_euler", "semi_implicit_euler", "velocity_verlet", "midpoint", "rk4")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EVALUATIONS)
-def test_accuracy_costs_what_the_table_says(name: str) -> None:
-    """Velocity Verlet asks twice per step here, so that drag does not make it order 1; the table counts once."""
+def test_errors_are_reached_with_the_evaluations_of_the_table(name: str) -> None:
+    """Velocity Verlet evaluates forces twice per step, so that drag leaves it order 2; the table counts once."""
     problem = replace(one(name), steps=tuple(2**k for k in range(2, 19)))
     report = measure(problem, methods_named(TABULATED), repetitions=0)
     for tolerance, expected in EVALUATIONS[name].items():
@@ -324,7 +324,7 @@ def test_accuracy_costs_what_the_table_says(name: str) -> None:
 # --- reports ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_report_is_the_same_after_json(damped: Report) -> None:
+def test_a_report_survives_a_round_trip_through_json(damped: Report) -> None:
     results = Results(reports=(damped,))
     text = results.model_dump_json()
     assert Results.model_validate_json(text) == results
@@ -333,7 +333,7 @@ def test_a_report_is_the_same_after_json(damped: Report) -> None:
         Results.model_validate_json(text.replace('"format":1', '"format":2'))
 
 
-def test_a_report_as_text(damped: Report) -> None:
+def test_a_report_becomes_headlines_and_a_table(damped: Report) -> None:
     lines = " ".join(headlines(damped))
     assert "closed form" in lines and "median of 1 runs" in lines and "kinetic and potential (tether)" in lines
     table = rows(damped, [1e-2, 1e-4])
@@ -345,7 +345,7 @@ def test_a_report_as_text(damped: Report) -> None:
 
 
 class _Stop:
-    """A progress bar under which somebody presses Ctrl-C."""
+    """A progress bar that raises KeyboardInterrupt at a percentage, as Ctrl-C would."""
 
     def __init__(self, at: int) -> None:
         self.at = at
@@ -356,7 +356,7 @@ class _Stop:
 
 
 @pytest.mark.slow
-def test_an_interrupted_run_keeps_what_was_done() -> None:
+def test_an_interrupted_measurement_keeps_its_points_so_far() -> None:
     whole = measure(one("damped"), METHODS, repetitions=0)
     early = measure(one("damped"), METHODS, repetitions=0, progress=_Stop(50))
     assert early.stopped == "interrupted"
@@ -369,7 +369,7 @@ def test_an_interrupted_run_keeps_what_was_done() -> None:
     assert any("interrupted" in line for line in headlines(late))
 
 
-def test_a_picture_has_both_costs_of_every_problem_and_the_same_bytes(damped: Report, tmp_path: Path) -> None:
+def test_a_picture_shows_both_costs_of_every_problem_and_is_reproducible(damped: Report, tmp_path: Path) -> None:
     reports = [damped, damped.model_copy(update={"title": "again", "reach": 0.0})]
     figure = draw_precision(reports)
     labels = [axes.get_xlabel() for axes in figure.axes]
@@ -397,7 +397,7 @@ def test_a_picture_has_both_costs_of_every_problem_and_the_same_bytes(damped: Re
         ({"effects": (Fluctuation(strength=1.0),)}, r"effects\[0\] fluctuation: kicks at random"),
     ],
 )
-def test_what_cannot_be_measured_is_refused(change: dict[str, Any], text: str) -> None:
+def test_an_invalid_problem_is_refused(change: dict[str, Any], text: str) -> None:
     scene = sprung(1.0, 1.0).scene
     fields = {name: change.pop(name) for name in ("dtype", "effects") if name in change}
     given: dict[str, Any] = {"seconds": 1.0, "steps": (8, 16)} | change
@@ -406,7 +406,7 @@ def test_what_cannot_be_measured_is_refused(change: dict[str, Any], text: str) -
     assert "\n" not in str(caught.value)
 
 
-def test_wrong_names_are_refused_with_the_nearest() -> None:
+def test_unknown_names_are_refused_with_the_nearest_one() -> None:
     with pytest.raises(ValueError, match="methods: 'rk44' is none, did you mean `rk4`"):
         methods_named(["rk44"])
     with pytest.raises(ValueError, match="problems: 'keppler' is none, did you mean `kepler`"):
@@ -415,14 +415,14 @@ def test_wrong_names_are_refused_with_the_nearest() -> None:
         measure(one("damped"), METHODS, repetitions=-1)
 
 
-def test_every_problem_of_the_suite_can_be_built_and_begins_where_its_closed_form_does() -> None:
+def test_every_problem_of_the_suite_agrees_with_its_closed_form_at_the_start() -> None:
     for name, problem in zip(SUITE, problems_named(), strict=True):
         assert problem.name == name
         assert problem.steps == tuple(sorted(problem.steps)) and len(problem.steps) >= 9
         assert len(problem.times) >= 8
         if problem.exact is not None:
             np.testing.assert_allclose(problem.start.pos[0], problem.exact(0.0)[0], atol=1e-15)
-            # and moves with the velocity that it says: by differences
+            # the velocity is the derivative of the position, by differences
             h = 1e-5
             moved = (np.subtract(problem.exact(1 + h)[0], problem.exact(1 - h)[0])) / (2 * h)
             drift = moved - problem.exact(1.0)[1]
@@ -442,8 +442,8 @@ def in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.slow
 def test_accuracy_of_a_scene_on_the_command_line(in_a_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    asked = ["accuracy", "tiny.yaml", "--methods", "rk4,heun", "--repetitions", "1", "--out", "deep/a.png"]
-    assert main(asked) == 0
+    command = ["accuracy", "tiny.yaml", "--methods", "rk4,heun", "--repetitions", "1", "--out", "deep/a.png"]
+    assert main(command) == 0
     out = capsys.readouterr().out
     assert "tiny.yaml" in out and "errors against: DOP853" in out and "to 0.0001 m: " in out
     results = Results.model_validate_json((in_a_folder / "deep" / "a.json").read_text())
@@ -451,8 +451,8 @@ def test_accuracy_of_a_scene_on_the_command_line(in_a_folder: Path, capsys: pyte
     assert [curve.method for curve in report.curves] == ["rk4", "heun"]
     assert [p.dt for p in report.curves[0].points] == pytest.approx([0.04 / 2**k for k in range(8)])  # 50 = 2 x 25
     assert (in_a_folder / "deep" / "a.png").read_bytes().startswith(b"\x89PNG")
-    assert main(asked) == 2  # they are there already
-    assert main([*asked, "--force", "--dts", "0.1,0.05,0.025,0.0125"]) == 0
+    assert main(command) == 2  # the files exist
+    assert main([*command, "--force", "--dts", "0.1,0.05,0.025,0.0125"]) == 0
     (report,) = Results.model_validate_json((in_a_folder / "deep" / "a.json").read_text()).reports
     assert [p.steps for p in report.curves[0].points] == [10, 20, 40, 80]
 
@@ -475,15 +475,15 @@ def test_accuracy_of_a_scene_on_the_command_line(in_a_folder: Path, capsys: pyte
         ("accuracy tiny.yaml --out a.gif", "must end in .json or .png"),
     ],
 )
-def test_mistakes_on_the_command_line_are_one_line(
+def test_invalid_commands_are_refused_in_one_line(
     in_a_folder: Path, capsys: pytest.CaptureFixture[str], arguments: str, text: str
 ) -> None:
     assert main(arguments.split()) == 2
-    complaint = capsys.readouterr().err
-    assert complaint.count("\n") == 1 and text in complaint
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1 and text in message
 
 
-def test_ctrl_c_on_the_command_line_keeps_the_problems_that_are_done(
+def test_ctrl_c_on_the_command_line_keeps_the_finished_problems(
     in_a_folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def impatient(problem: Problem, methods: Any, repetitions: int, **more: Any) -> Report:
@@ -492,30 +492,30 @@ def test_ctrl_c_on_the_command_line_keeps_the_problems_that_are_done(
         return measure(problem, methods, repetitions)
 
     monkeypatch.setattr("flockenv.studies.accuracy.measure", impatient)
-    asked = ["accuracy", "--suite", "--problems", "damped,oscillator", "--methods", "rk4", "--repetitions", "0"]
-    assert main([*asked, "--out", "a.json"]) == 130
+    command = ["accuracy", "--suite", "--problems", "damped,oscillator", "--methods", "rk4", "--repetitions", "0"]
+    assert main([*command, "--out", "a.json"]) == 130
     text = capsys.readouterr()
     assert "Damped oscillator" in text.out and "interrupted" in text.err
     (report,) = Results.model_validate_json(Path("a.json").read_text()).reports
     assert report.name == "damped"
 
 
-def test_ctrl_c_before_any_run_has_arrived_is_one_line(
+def test_ctrl_c_before_the_first_run_ends_writes_one_line_and_no_file(
     in_a_folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def impatient(problem: Problem, methods: Any, repetitions: int, **more: Any) -> Report:
         return measure(problem, methods, repetitions, progress=_Stop(0))
 
     monkeypatch.setattr("flockenv.studies.accuracy.measure", impatient)
-    asked = ["accuracy", "--suite", "--problems", "damped", "--methods", "rk4", "--repetitions", "0"]
-    assert main([*asked, "--out", "a.png"]) == 130
+    command = ["accuracy", "--suite", "--problems", "damped", "--methods", "rk4", "--repetitions", "0"]
+    assert main([*command, "--out", "a.png"]) == 130
     text = capsys.readouterr()
     assert text.out == "" and text.err.splitlines()[-1] == "flockenv: interrupted"
     assert not list(Path().glob("a.*"))
 
 
 @pytest.mark.parametrize("bad", ["damped", "oscillator", "kepler"])
-def test_a_problem_without_a_reference_costs_the_others_nothing(
+def test_a_problem_without_a_reference_does_not_stop_the_others(
     bad: str, in_a_folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def measured(problem: Problem, methods: Any, repetitions: int, **more: Any) -> Report:
@@ -524,20 +524,20 @@ def test_a_problem_without_a_reference_costs_the_others_nothing(
         return measure(problem, methods, repetitions)
 
     monkeypatch.setattr("flockenv.studies.accuracy.measure", measured)
-    asked = ["accuracy", "--suite", "--methods", "rk4", "--repetitions", "0", "--out", "a.json", "--problems"]
+    command = ["accuracy", "--suite", "--methods", "rk4", "--repetitions", "0", "--out", "a.json", "--problems"]
     names = ["damped", "oscillator", "kepler"]
-    assert main([*asked, ",".join(names)]) == 0
+    assert main([*command, ",".join(names)]) == 0
     assert f"{bad}: no reference (and 1 more)\n" in capsys.readouterr().out
     reports = Results.model_validate_json(Path("a.json").read_text()).reports
     assert [report.name for report in reports] == [name for name in names if name != bad]
-    assert main([*asked, bad, "--force"]) == 2, "the only one is an error"
+    assert main([*command, bad, "--force"]) == 2, "an error if it is the only problem"
     assert capsys.readouterr().err.startswith("flockenv: no reference")
 
 
-def test_problems_that_are_done_are_written_before_the_next_one_begins(
+def test_finished_problems_are_written_before_the_next_one_begins(
     in_a_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A signal during compilation ends the process: what is written only at the end would be lost."""
+    """A signal during compilation ends the process: reports written only at the end would be lost."""
     kept: list[list[str]] = []
 
     def watched(problem: Problem, methods: Any, repetitions: int, **more: Any) -> Report:
@@ -547,12 +547,12 @@ def test_problems_that_are_done_are_written_before_the_next_one_begins(
         return measure(problem, methods, repetitions)
 
     monkeypatch.setattr("flockenv.studies.accuracy.measure", watched)
-    asked = ["accuracy", "--suite", "--problems", "damped,oscillator", "--methods", "rk4", "--repetitions", "0"]
-    assert main([*asked, "--out", "new/a.json"]) == 0
+    command = ["accuracy", "--suite", "--problems", "damped,oscillator", "--methods", "rk4", "--repetitions", "0"]
+    assert main([*command, "--out", "new/a.json"]) == 0
     assert kept == [[], ["damped"]]
 
 
-def test_times_are_whole_parts_of_every_run() -> None:
+def test_times_of_comparison_are_steps_of_every_run() -> None:
     scene = sprung(1.0, 1.0).scene
     for steps, instants in (((8, 16), 8), ((10, 25), 5), ((7,), 7), ((34,), 2), ((256, 512), 16)):
         assert len(Problem.of(scene, 2.0, steps).times) == instants
@@ -561,7 +561,7 @@ def test_times_are_whole_parts_of_every_run() -> None:
 
 
 @pytest.mark.slow
-def test_methods_that_solve_equations_are_measured_when_asked_for() -> None:
+def test_implicit_methods_are_measured_only_if_named() -> None:
     usual: tuple[Integrator, ...] = usual_methods()
     assert not any(method.solves for method in usual) and RK4() in usual
     report = measure(

@@ -1,4 +1,4 @@
-"""What accuracy costs in whole scenes: references obey constraints, births and deaths, and know how wrong they are."""
+"""Accuracy of whole scenes: references include constraints, births and deaths, and estimate their own errors."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def of(text: str, seconds: float, steps: tuple[int, ...], **more: Any) -> Proble
 
 
 def bounced(t: float, height: float, e: float) -> float:
-    """How high above the floor a ball is that was dropped from a height."""
+    """Return the height at time t of a ball dropped from `height`, with restitution e."""
     g, up = 9.81, math.sqrt(2 * 9.81 * height)
     fall = math.sqrt(2 * height / g)
     if t < fall:
@@ -75,7 +75,7 @@ def bounced(t: float, height: float, e: float) -> float:
 # --- references -------------------------------------------------------------------------------------------------------
 
 
-def test_a_ball_bounces_off_the_floor_in_its_reference_too() -> None:
+def test_the_reference_of_a_bouncing_ball_includes_the_floor() -> None:
     """In free fall it would be 3.9 m below the floor after a second."""
     problem = of(BALL, 1.0, (50, 100, 200))
     found = find_reference(problem)
@@ -87,8 +87,8 @@ def test_a_ball_bounces_off_the_floor_in_its_reference_too() -> None:
 
 
 @pytest.mark.slow
-def test_order_1_and_rounding_are_told_apart_on_the_bouncing_ball() -> None:
-    """Under constant gravity an event is found exactly on the parabola: all but the Eulers are exact in any step."""
+def test_order_1_is_distinguished_from_rounding_on_the_bouncing_ball() -> None:
+    """Under constant gravity an impact is found exactly on the parabola: only the Euler methods have an error."""
     report = measure(of(BALL, 1.0, (50, 100, 200, 400)), FEW, repetitions=0)
     euler = report.curve("semi_implicit_euler")
     assert euler.order == pytest.approx(1, abs=0.05)
@@ -111,8 +111,8 @@ def test_closed_forms_agree_with_the_scenes_own_steps(name: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_pendulum_on_a_rod_swings_in_its_reference() -> None:
-    """By the closed form of the suite: released level it is back there after one period, K(1/2) sqrt(l/g) 4."""
+def test_the_reference_of_a_pendulum_includes_its_rod() -> None:
+    """By the suite's closed form, a pendulum released level returns after one period, 4 K(1/2) sqrt(l/g)."""
     report = measure(of(ROD, 0.8, (40, 80, 160, 320)), FEW, repetitions=0)
     assert report.reference == "own steps"
     assert "rods" in report.note
@@ -121,7 +121,7 @@ def test_a_pendulum_on_a_rod_swings_in_its_reference() -> None:
 
 
 @pytest.mark.slow
-def test_newtons_cradle_has_a_reference_of_the_whole_scene() -> None:
+def test_the_reference_of_newtons_cradle_includes_its_constraints() -> None:
     problem = Problem.of(load_scene(Path("configs/scenes/newtons_cradle.yaml")), 0.6, (600, 1200), name="cradle")
     report = measure(problem, methods_named(["velocity_verlet"]), repetitions=0, finer=8)
     assert report.reference == "event-exact steps"
@@ -131,13 +131,13 @@ def test_newtons_cradle_has_a_reference_of_the_whole_scene() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("text", [EMITTER, AGEING], ids=["emitter", "ageing"])
-def test_agents_are_compared_by_identity_where_they_are_born_and_die(text: str) -> None:
+def test_agents_that_are_born_and_die_are_compared_by_identity(text: str) -> None:
     report = measure(of(text, 1.0, (80, 160, 320, 640)), FEW, repetitions=0)
     assert report.reference == "own steps"
     assert "births and deaths" in report.note
     assert report.energy.startswith("not compared")
     for curve in report.curves:
-        assert curve.order == pytest.approx(1, abs=0.35), curve.method  # the step of a birth is no method's
+        assert curve.order == pytest.approx(1, abs=0.35), curve.method  # births happen outside the method
         assert all(point.error is not None and point.error < 0.3 for point in curve.points)
         assert all(point.unmatched <= 4 for point in curve.points)
 
@@ -152,7 +152,7 @@ def test_paths_are_matched_by_identity_and_not_by_slot() -> None:
     assert reach(later, np.zeros((3, 2)), minus) == pytest.approx(math.hypot(11, 11))
 
 
-def test_the_reference_says_by_richardson_how_wrong_it_is() -> None:
+def test_the_error_of_a_reference_is_estimated_by_richardson_extrapolation() -> None:
     for order in (1.0, 2.0, 4.0):
         ends = [0.3 * 0.5 ** (order * k) for k in range(4)]  # of steps h, h/2, h/4, h/8
         found, error = _closing_in(ends[0] - ends[1], ends[1] - ends[2], 1e-15)
@@ -160,9 +160,9 @@ def test_the_reference_says_by_richardson_how_wrong_it_is() -> None:
         assert error >= ends[2]
         if order == 1:
             assert error == pytest.approx(ends[2])
-    assert _closing_in(1e-3, 2e-3, 1e-12)[1] == 2e-3  # it does not close in: the larger of the two
+    assert _closing_in(1e-3, 2e-3, 1e-12)[1] == 2e-3  # no convergence: the larger of the two
     assert _closing_in(1e-14, 3e-14, 1e-12) == (None, 3e-14)  # rounding
-    assert _closing_in(0.0, 1e-3, 1e-12)[1] == 1e-3  # a jump that the finest run alone meets
+    assert _closing_in(0.0, 1e-3, 1e-12)[1] == 1e-3  # a jump in the finest run alone
     assert _closing_in(1e-3, 0.0, 1e-12) == (None, 1e-3)
 
 
@@ -170,8 +170,8 @@ def test_the_reference_says_by_richardson_how_wrong_it_is() -> None:
 
 
 @pytest.mark.slow
-def test_a_chaotic_scene_says_so_and_how_long_it_can_be_compared() -> None:
-    """Balls in a box that hit each other: every impact multiplies a difference by its way over the radius."""
+def test_a_chaotic_scene_is_refused_with_a_horizon_to_try() -> None:
+    """Balls collide in a box: every impact multiplies a difference by the free path over the radius."""
     balls = """\
 space: {kind: box, size: [3, 3], restitution: 1}
 groups: [{count: 20, radius: 0.15, spawn: {low: [0, 0], high: [3, 3], spacing: 0.6, jitter: 0.1, speed: [4, 4]}}]
@@ -199,19 +199,19 @@ dt: 0.02
         ),
     ],
 )
-def test_what_is_drawn_in_every_step_has_one_line_that_says_so(more: str, text: str) -> None:
+def test_random_draws_in_every_step_are_refused_in_one_line(more: str, text: str) -> None:
     with pytest.raises(ValueError, match=text) as caught:
         of(f"groups: [{{count: 3, spawn: {{low: [0, 0], high: [1, 1]}}}}]\n{more}\n", 1.0, (8, 16))
     assert "\n" not in str(caught.value)
 
 
-def test_a_map_of_one_step_has_one_line_that_says_so() -> None:
+def test_a_map_from_step_to_step_is_refused_in_one_line() -> None:
     with pytest.raises(ValueError, match="vicsek: is a map from step to step") as caught:
         Problem.of(load_scene(Path("configs/scenes/vicsek.yaml")), 4.0, (4, 8))
     assert "\n" not in str(caught.value)
 
 
-# --- what is shown ----------------------------------------------------------------------------------------------------
+# --- tables, pictures and commands ------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +219,7 @@ def ball() -> Report:
     return measure(of(BALL, 0.5, (25, 50, 100, 200)), methods_named(["semi_implicit_euler", "rk4"]), repetitions=0)
 
 
-def test_errors_that_cannot_be_trusted_are_marked(ball: Report) -> None:
+def test_errors_near_that_of_the_reference_are_marked(ball: Report) -> None:
     heads, rows = errors(ball)
     assert heads == ("method", "25 steps", "50 steps", "100 steps", "200 steps")
     euler, rk4 = rows
@@ -232,7 +232,7 @@ def test_errors_that_cannot_be_trusted_are_marked(ball: Report) -> None:
     assert any("(1.0)" in text.get_text() for text in figure.legends[0].get_texts())
 
 
-def test_a_picture_says_where_no_method_arrives(ball: Report) -> None:
+def test_a_picture_states_that_no_method_arrives(ball: Report) -> None:
     nowhere = [
         curve.model_copy(
             update={"points": tuple(p.model_copy(update={"error": None}) for p in curve.points), "order": None}
@@ -244,19 +244,19 @@ def test_a_picture_says_where_no_method_arrives(ball: Report) -> None:
 
 
 @pytest.mark.slow
-def test_several_scenes_on_the_command_line_are_a_report_or_a_line_each(
+def test_each_scene_on_the_command_line_gets_a_report_or_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("ball.yaml").write_text(BALL)
     Path("kicked.yaml").write_text(BALL.replace("{kind: gravity}", "{kind: fluctuation, strength: 1}"))
-    asked = "--seconds 0.4 --methods rk4 --steps 20,40 --repetitions 0 --out all.json".split()
-    assert main(["accuracy", "ball.yaml", "kicked.yaml", *asked]) == 0
+    options = "--seconds 0.4 --methods rk4 --steps 20,40 --repetitions 0 --out all.json".split()
+    assert main(["accuracy", "ball.yaml", "kicked.yaml", *options]) == 0
     out = capsys.readouterr().out
     assert "against: event-exact steps" in out
     assert out.count("kicked.yaml: effects[0] fluctuation: kicks at random") == 1
     assert [r.name for r in Results.model_validate_json(Path("all.json").read_text()).reports] == ["ball"]
-    assert main(["accuracy", "kicked.yaml", *asked[:-2]]) == 2
+    assert main(["accuracy", "kicked.yaml", *options[:-2]]) == 2
     assert capsys.readouterr().err.count("\n") == 1
 
 
@@ -275,8 +275,8 @@ SHIPPED = [
 )  # steps as published, in configs/crowds
 @pytest.mark.filterwarnings("ignore::flockenv.core.warnings.UnstableStepWarning")
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
-def test_every_scene_that_is_shipped_has_a_reference_or_a_line_that_says_why_not(path: Path) -> None:
-    """Over four of its own steps, which is no measurement: that all of them are gone through, and told, is."""
+def test_every_shipped_scene_has_a_reference_or_one_line_with_the_reason(path: Path) -> None:
+    """Four steps of a scene are too few for a measurement; the test checks that none of the scenes fails."""
     scene = load_scene(path)
     try:
         problem = Problem.of(scene, 4 * scene.dt, (4, 8), name=path.stem)

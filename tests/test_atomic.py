@@ -1,4 +1,4 @@
-"""Files appear whole or not at all, one alone or several together, whatever else goes on meanwhile."""
+"""Files appear whole or not at all, one alone or several together, despite failures, signals and other writers."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def writes(text: str) -> Callable[[Path], object]:
 
 
 def failing(monkeypatch: pytest.MonkeyPatch, error: BaseException, *calls: int) -> None:
-    """Let some of the renames that are to come fail: call k for every k of `calls`, counted from 1."""
+    """Make some of the following renames fail: call k for every k of `calls`, counted from 1."""
     replace, count = os.replace, [0]
 
     def replaced(source: Any, target: Any) -> None:
@@ -57,7 +57,7 @@ def failing(monkeypatch: pytest.MonkeyPatch, error: BaseException, *calls: int) 
 # --- one file
 
 
-def test_a_file_is_replaced_as_a_whole_or_stays(tmp_path: Path) -> None:
+def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path: Path) -> None:
     path = tmp_path / "file"
     with replacing(path) as file:
         file.write(b"old")
@@ -68,7 +68,7 @@ def test_a_file_is_replaced_as_a_whole_or_stays(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ends", [("1", "2"), ("", "")], ids=["long names", "one target"])
 def test_two_writers_at_once_do_not_write_into_each_others_file(ends: tuple[str, str], tmp_path: Path) -> None:
-    """Names that begin with the same hundred characters, or are the same."""
+    """Their names share the first hundred characters, or are equal."""
     one, other = (tmp_path / f"{'x' * 100}{end}" for end in ends)
     with replacing(one) as first:
         first.write(b"first, and longer")
@@ -79,7 +79,7 @@ def test_two_writers_at_once_do_not_write_into_each_others_file(ends: tuple[str,
     assert len(list(tmp_path.iterdir())) == len({one, other})
 
 
-def test_threads_that_write_one_target_leave_what_one_of_them_wrote(tmp_path: Path) -> None:
+def test_threads_that_write_one_file_leave_the_text_of_one_of_them(tmp_path: Path) -> None:
     target, errors = tmp_path / "file", []
 
     def write(letter: bytes) -> None:
@@ -110,7 +110,7 @@ def test_a_planted_link_is_not_followed(tmp_path: Path) -> None:
     assert foreign.read_text() == "theirs" and target.read_text() == "mine" and not target.is_symlink()
 
 
-@pytest.mark.skipif(os.name == "nt", reason="has no modes")
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no modes")
 @pytest.mark.parametrize(
     ("mode", "mask", "expected"), [(0o666, 0o022, 0o644), (0o666, 0o077, 0o600), (0o600, 0, 0o600)]
 )
@@ -125,9 +125,9 @@ def test_permissions_are_those_of_any_new_file(mode: int, mask: int, expected: i
 
 
 @pytest.mark.parametrize("name", ["", ".", "gone/file", "a\0b"])
-def test_what_cannot_be_a_file_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
+def test_an_invalid_file_name_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
     with pytest.raises((OSError, ValueError), match=r"cannot write|NUL") as caught, replacing(f"{tmp_path}/{name}"):
-        raise AssertionError("is not to be reached")
+        raise AssertionError("must not be reached")
     assert str(caught.value).isprintable() and list(tmp_path.iterdir()) == []
 
 
@@ -136,7 +136,7 @@ def test_what_cannot_be_a_file_is_refused_in_one_line(name: str, tmp_path: Path)
 
 @pytest.mark.parametrize("error", [OSError(5, "Input/output error"), KeyboardInterrupt()], ids=["disk", "Ctrl-C"])
 @pytest.mark.parametrize("call", [1, 2, 3, 4])
-def test_a_rename_that_fails_leaves_all_files_as_they_were(
+def test_a_failed_rename_leaves_all_files_unchanged(
     call: int, error: BaseException, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     deliver(tmp_path, {"a": writes("old a"), "c": writes("old c"), "deep/d": writes("old d")})
@@ -147,8 +147,8 @@ def test_a_rename_that_fails_leaves_all_files_as_they_were(
     assert files_in(tmp_path) == before and not any(tmp_path.rglob(LEFTOVERS))
 
 
-def test_what_could_not_be_put_back_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The third rename fails, and so does the putting back of the first file."""
+def test_a_file_that_cannot_be_restored_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The third rename fails, and so does the restoring of the first file."""
     deliver(tmp_path, {name: writes(f"old {name}") for name in "abc"})
     failing(monkeypatch, OSError(5, "Input/output error"), 3, 4)
     with pytest.raises(OSError, match=r"cannot write '.*/c': Input/output error; .* '.*/a' could not be put back"):
@@ -156,7 +156,7 @@ def test_what_could_not_be_put_back_is_named(tmp_path: Path, monkeypatch: pytest
     assert files_in(tmp_path) == {"a": "new a", "b": "old b", "c": "old c"}
 
 
-def test_a_disk_without_second_names_is_put_back_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_are_restored_on_a_disk_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def link(*_: Any, **__: Any) -> None:
         raise OSError(1, "Operation not permitted")
 
@@ -169,7 +169,7 @@ def test_a_disk_without_second_names_is_put_back_as_well(tmp_path: Path, monkeyp
     assert files_in(tmp_path) == {"a": "old a", "b": "old b", "c": "old a"} and (tmp_path / "c").is_symlink()
 
 
-def test_a_writer_that_fails_is_named_by_its_file_and_leaves_nothing(tmp_path: Path) -> None:
+def test_a_failed_writer_is_reported_and_leaves_nothing(tmp_path: Path) -> None:
     def full(path: Path) -> None:
         with replacing(path):
             raise OSError(28, "No space left on device")
@@ -177,8 +177,8 @@ def test_a_writer_that_fails_is_named_by_its_file_and_leaves_nothing(tmp_path: P
     def own(_: Path) -> None:
         raise ValueError("own words")
 
-    for fail, said in ((full, f"^cannot write '{tmp_path}/new/b': No space left on device$"), (own, "^own words$")):
-        with pytest.raises((OSError, ValueError), match=said):
+    for fail, message in ((full, f"^cannot write '{tmp_path}/new/b': No space left on device$"), (own, "^own words$")):
+        with pytest.raises((OSError, ValueError), match=message):
             deliver(tmp_path / "new", {"a": writes("a"), "b": fail})
         assert list(tmp_path.iterdir()) == []
 
@@ -186,7 +186,7 @@ def test_a_writer_that_fails_is_named_by_its_file_and_leaves_nothing(tmp_path: P
 def test_a_folder_in_the_place_of_a_file_is_refused_before_a_writer_runs(tmp_path: Path) -> None:
     (tmp_path / "b").mkdir()
     with pytest.raises(IsADirectoryError, match=r"cannot write '.*b': it is a folder"):
-        deliver(tmp_path, {"a": lambda path: pytest.fail("is not to be written"), "b": writes("b")})
+        deliver(tmp_path, {"a": lambda path: pytest.fail("must not be written"), "b": writes("b")})
 
 
 RENAMED = """
@@ -206,7 +206,7 @@ with signals.running("toy"):
 """
 
 
-@pytest.mark.skipif(os.name == "nt", reason="has no such signals")
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
 def test_a_signal_between_two_renames_waits_until_both_are_done(tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, "-c", RENAMED], cwd=tmp_path, capture_output=True, text=True, timeout=100)
     assert done.returncode != 0 and done.stdout == ""
@@ -242,7 +242,7 @@ WRITTEN_TOGETHER = {"policy": save_a_policy, "trajectory": save_a_trajectory, "c
 
 @pytest.mark.parametrize("error", [OSError(5, "Input/output error"), KeyboardInterrupt()], ids=["disk", "Ctrl-C"])
 @pytest.mark.parametrize("save", WRITTEN_TOGETHER.values(), ids=WRITTEN_TOGETHER)
-def test_files_that_belong_together_stay_of_one_moment(
+def test_files_that_belong_together_are_replaced_together(
     save: Callable[[Path, int], None], error: BaseException, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     written = tmp_path / "root" / "docs" if save is publish_a_comparison else tmp_path
@@ -257,7 +257,7 @@ def test_files_that_belong_together_stay_of_one_moment(
     assert all(path.read_bytes() != old for path, old in before.items())
 
 
-# --- what killed writers leave
+# --- leftovers of killed writers
 
 KILLED = """
 import os, signal, sys
@@ -270,14 +270,14 @@ with replacing(sys.argv[1]) as file:
 
 
 def killed(folder: Path) -> Path:
-    """Return what a process leaves in a folder that was killed while it wrote there."""
+    """Return the file that a process leaves in a folder if it is killed while it writes there."""
     subprocess.run([sys.executable, "-c", KILLED, str(folder / "file")], check=False, timeout=100)
     (left,) = folder.glob(LEFTOVERS)
     return left
 
 
-@pytest.mark.skipif(os.name == "nt", reason="has no SIGKILL")
-def test_a_store_removes_what_processes_left_that_were_killed_a_day_ago(tmp_path: Path) -> None:
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")
+def test_a_store_removes_leftovers_older_than_a_day(tmp_path: Path) -> None:
     folder = prepared(tmp_path / "store")
     Store(folder).write("name", b"kept")
     shutil.copytree(folder, other := prepared(tmp_path / "other"), dirs_exist_ok=True)
@@ -288,7 +288,7 @@ def test_a_store_removes_what_processes_left_that_were_killed_a_day_ago(tmp_path
     assert sorted(path.name for path in other.iterdir()) == [".abc.tmp", "name"]
 
 
-def test_leftovers_are_hidden_files_of_a_certain_age_alone(tmp_path: Path) -> None:
+def test_only_hidden_temporary_files_of_a_given_age_count_as_leftovers(tmp_path: Path) -> None:
     names = [".flockenv-abc.part", ".x.tmp", ".hidden", "x.tmp", "x.part"]
     for name in names:
         (tmp_path / name).write_text("x")
