@@ -1,4 +1,4 @@
-"""What every test runs under: no display, no randomness of the test runner's own."""
+"""Settings of all tests: no display, no randomness of the test runner."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from flockenv.cli import terminal
 from flockenv.jit import thread_pool
 from tests.catalogue import TETHER, users_module
 
-# Before anything imports pygame: a window is opened, but nowhere.
+# Before pygame is imported: windows open without a display.
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
 
-# Examples are the same in every run (a failure is nobody's bad luck), and a first call may compile for seconds.
+# Examples are the same in every run, so that failures can be repeated. A first call may compile for seconds.
 hypothesis.settings.register_profile("flockenv", derandomize=True, deadline=None, database=None, max_examples=60)
 hypothesis.settings.load_profile("flockenv")
 
 
-# Where a test asks for threads all of them share all work, however little: how soon it is done is not what is tested.
+# In tests with threads, all threads share all work, however little, because tests do not measure speed.
 thread_pool.AutoTuner.always, thread_pool._cores = True, 64
 
 # Tests compare all of stderr. On a busy machine a kernel compiles for longer than the 3 s after which a line about
@@ -46,21 +46,21 @@ RARE_EFFECTS = {
     "alignment_cone", "cohesion_cone", "angular_springs", "elastic", "quadratic_drag", "carried",
     "wind", "obstacle_contact", "gravity",
 }  # fmt: skip
-"""Effects whose symmetries only slow tests try: each is a kernel, and each has quick tests of its own elsewhere."""
+"""Effects whose symmetries only slow tests try: each compiles a kernel, and has quick tests elsewhere."""
 
 RARE_METHODS = {"averaged_velocity", "midpoint", "heun", "exponential_drag", "adaptive_rk4", "implicit_midpoint"}
-"""Methods whose kernels only slow tests compile; in Python they are quick, but for the implicit ones."""
+"""Methods whose kernels only slow tests compile; quick tests run those in Python that are not implicit."""
 
 IN_SPACE_SLOW = {
     "test_behaviours_crowd", "test_behaviours_goals", "test_behaviours_paths", "test_behaviours_shapes", "test_effects",
     "test_fields", "test_neighbours", "test_springs", "test_steering",
 }  # fmt: skip
-"""Where a law is written once for the plane and for space: quick tests try the plane."""
+"""Files that test laws written once for 2-D and 3-D: quick tests try 2-D."""
 
 
-@pytest.hookimpl(tryfirst=True)  # before -m chooses
+@pytest.hookimpl(tryfirst=True)  # before -m selects
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what compiles a kernel of its own for one more variant of what quick tests try already."""
+    """Mark tests as slow that compile a kernel for one more variant of a quick test."""
     for item in items:
         given = getattr(getattr(item, "callspec", None), "params", {})
         named = [getattr(value, "name", value) for value in given.values()]
@@ -71,13 +71,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _of_a_rare_method(given: dict[str, Any]) -> bool:
-    """True if it compiles a rare method, or solves the equations of an implicit one in Python."""
+    """Return True if a test compiles a rare method, or solves the equations of an implicit one in Python."""
     kind, way = getattr(getattr(given.get("row"), "method", None), "kind", ""), given.get("way")
     return kind in RARE_METHODS and way is None if way != "python" else kind.startswith("implicit")
 
 
-@pytest.fixture(scope="module")  # and forgotten afterwards: other files count the effects there are
+@pytest.fixture(scope="module")  # removed afterwards: other files count all known effects
 def tether(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """The effect of catalogue.TETHER."""
+    """Yield the class of the effect in catalogue.TETHER."""
     with users_module(tmp_path_factory.mktemp("laws"), TETHER, "tethers") as module:
         yield module.Tether

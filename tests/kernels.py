@@ -1,4 +1,4 @@
-"""What the kernels of a scene are made of, for tests that ask what is in them."""
+"""Contents of a scene's kernel, for tests."""
 
 from __future__ import annotations
 
@@ -10,6 +10,6 @@ __all__ = ["functions_of"]
 
 
 def functions_of(scene: Scene) -> set[str]:
-    """The names of all sections and laws that the step of a scene holds."""
+    """Return the names of all sections and laws in the step of a scene."""
     make, plan = step_of(scene.parts).made_of  # type: ignore[attr-defined]
     return {function.__name__ for function in functions_in(make(*plan))}

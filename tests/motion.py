@@ -1,4 +1,4 @@
-"""The two ways that a method can be used, taken alike: its `__call__` with forces in Python, and a scene's kernel."""
+"""Both uses of a method behind one signature: its `__call__` with forces in Python, and a scene's kernel."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def at_start(state: State, pos: Any = X0, vel: Any = V0) -> State:
 
 
 def tethered(tether: Any, way: str, pos: Any = X0, vel: Any = V0, drag: float = 0.0, **given: Any) -> Advance:
-    """A point of 1 kg under the forces of catalogue.TETHER, and a drag that methods may treat by themselves.
+    """Return the motion of a 1 kg point under the forces of catalogue.TETHER and a drag that methods may split off.
 
-    What is given and is no force is a field of the point's group.
+    Arguments that are not fields of the effect are fields of the point's group.
     """
     forces = {name: given.pop(name) for name in tuple(given) if name in tether.model_fields}
     it = tether(**forces)
@@ -58,14 +58,14 @@ def tethered(tether: Any, way: str, pos: Any = X0, vel: Any = V0, drag: float = 
 
 
 def motion(state: State) -> tuple[float, float]:
-    """Position and velocity along the first axis."""
+    """Return position and velocity along the first axis."""
     return float(state.pos[0, 0, 0]), float(state.vel[0, 0, 0])
 
 
 def order(end: Advance, method: Integrator, target: tuple[float, float], seconds: float, first: int) -> float:
-    """The measured order over five halvings of the step, the last ones above rounding.
+    """Return the order measured over five halvings of the step, the last ones above rounding.
 
-    Of the error of position and velocity together: either alone may vanish by chance at one instant.
+    The error is that of position and velocity together, because either alone may vanish by chance at one instant.
     """
     steps = [first * 2**k for k in range(8)]
     errors = np.array([math.dist(motion(end(method, seconds / n, n)), target) for n in steps])
@@ -76,5 +76,5 @@ def order(end: Advance, method: Integrator, target: tuple[float, float], seconds
 
 
 def first_of(method: Integrator) -> int:
-    """How many steps to begin with, so that five halvings lie between what is too coarse and rounding."""
+    """Return a first number of steps, so that five halvings lie between too coarse steps and rounding."""
     return 16 if not method.adaptive else 8 if method.order < 5 else 4

@@ -1,4 +1,4 @@
-"""Small scenes and tasks, run to their ends and written to a file: by machine code, or in plain Python.
+"""Run small scenes and tasks, by machine code or in plain Python, and write their results to a file.
 
 `NUMBA_DISABLE_JIT=1 python -m tests.plain_python ended.npz`; test_plain_python.py compares the two.
 """
@@ -23,15 +23,15 @@ from tests.catalogue import EFFECTS, scene_of, scene_under
 
 ROOT = Path(__file__).resolve().parent.parent
 TIES = {
-    "journey, 2-D": "waits end with a step, and points of a way's grid are equally far: the order is rounding's",
-    "path_follow": "begins on a vertex of the path: which piece it is on is rounding's",
+    "journey, 2-D": "waits end with a step, and grid points are equally far: rounding decides their order",
+    "path_follow": "it begins on a vertex of the path: rounding decides which piece is nearest",
 }
-"""Cases that run, and in which rounding decides more than last digits."""
+"""Cases in which rounding changes more than the last digits; they run, but are not compared."""
 STEPS, DECISIONS, MOST_AGENTS = 3, 4, 150
 
 
 def cases() -> Iterator[tuple[str, Any]]:
-    """Scenes under each effect and behaviour, by each method, shipped ones (constraints, populations), and tasks."""
+    """Yield scenes of each effect, behaviour and method, shipped scenes (constraints, populations), and tasks."""
     for row in EFFECTS:
         for dimension in sorted(row.dimensions):
             yield f"{row.name}, {dimension}-D", scene_under(row, dimension)
@@ -49,7 +49,7 @@ def cases() -> Iterator[tuple[str, Any]]:
 
 
 def ended(case: Any) -> NDArray[np.float64]:
-    """Return where a scene's agents are after a few steps, or all that a task showed after a few decisions."""
+    """Return a scene's motion after a few steps, or a task's observations and rewards of a few decisions."""
     if isinstance(case, Scene):
         state = case.run(case.start(3), STEPS)
         return np.concatenate([state.x.ravel(), state.v.ravel()]).astype(float)

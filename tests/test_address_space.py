@@ -1,4 +1,4 @@
-"""Too little memory for what a command loads is one line, whatever library would have failed."""
+"""A command with too little memory for its imports ends with one line, whichever library fails."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def limited(megabytes: int, *command: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.parametrize("megabytes", [100, 150, 250, 400, 500])
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_without_the_address_space_it_needs_names_memory(name: str, megabytes: int) -> None:
+def test_a_command_with_too_little_address_space_names_memory(name: str, megabytes: int) -> None:
     done = limited(megabytes, *COMMANDS[name])
     start = f"{name}: not enough memory: at least "
     end = f" GB of address space are needed beside Python's own, {megabytes / 1e3:.2g} GB are allowed (ulimit -v)\n"

@@ -1,7 +1,7 @@
-"""Bad input and odd requests, a function for each that concerns scenes and environments.
+"""Bad input and odd requests to scenes and environments, a function for each.
 
-What is refused is refused in one line that names the key, what was given and what is allowed, and leaves everything as
-it was; what is not refused does what is documented. More of each is in the file of whatever refuses it.
+A refusal is one line that names the key, the given value and the allowed ones, and it changes nothing. Other requests
+do what is documented. The file of tests of each module has more refusals.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from flockenv.tasks import Pursuit
 
 SPAWN = Spawn(low=(1, 1), high=(3, 3), speed=(1, 1))
 FLOCK = (Separation(weight=2, radius=2), Alignment(weight=0.1, radius=2))
-"""One kernel serves for all that flock here."""
+"""Effects of all flocks here, so that these share one kernel."""
 
 GOOD = """\
 space: {kind: torus, size: [8, 6]}
@@ -50,24 +50,24 @@ dt: 0.01
 PURSUIT = "flockenv/Pursuit-v0"
 
 
-# --- what rows are made of --------------------------------------------------------------------------------------------
+# --- helpers ----------------------------------------------------------------------------------------------------------
 
 
-def refused(make: Callable[[], Any], *said: str) -> None:
-    """It is a ValueError or TypeError of one line that says all of this."""
+def refused(make: Callable[[], Any], *parts: str) -> None:
+    """Assert that `make` raises a ValueError or TypeError of one line with all of these parts."""
     with pytest.raises((ValueError, TypeError)) as caught:
         make()
     line = str(caught.value)
     assert "\n" not in line
     assert len(line) < 500
-    for part in said:
+    for part in parts:
         assert part in line, line
 
 
-def written(old: str, new: str, *said: str) -> None:
-    """The same of a file in which something else is written."""
+def written(old: str, new: str, *parts: str) -> None:
+    """Assert the same of a file in which `old` is replaced by `new`."""
     assert old in GOOD
-    refused(lambda: load_scene(GOOD.replace(old, new)), *said)
+    refused(lambda: load_scene(GOOD.replace(old, new)), *parts)
 
 
 def scene(*effects: Any, **fields: Any) -> Scene:
@@ -132,10 +132,10 @@ def b03_time_is_no_multiple(tmp_path: Path) -> None:
     assert main(["run", str(path), "--duration", "1.0"]) == 2
     refused(lambda: Pursuit(control_dt=1.0, dt=0.3), "control_dt = 1 s", "a whole multiple of dt = 0.3 s")
     made = scene(dt=0.1)
-    assert made.run(made.start(0), 10).time[0] == 1.0  # counted, not summed up
+    assert made.run(made.start(0), 10).time[0] == 1.0  # steps are counted, not summed up
 
 
-def b04_nobody_and_one(tmp_path: Path) -> None:
+def b04_no_agent_and_one(tmp_path: Path) -> None:
     written("count: 3", "count: 0", "groups[0].count = 0", ">= 1")
     alone = scene(*FLOCK, groups=(Group(count=1, spawn=SPAWN),))
     begun = alone.start(0)
@@ -181,11 +181,11 @@ def b11_tags(tmp_path: Path) -> None:
 
 
 def b13_files(tmp_path: Path) -> None:
-    for content, said in (
+    for content, part in (
         (b"", "empty"), (bytes(range(256)), "binary data"), (GOOD.encode("utf-16"), "save it as UTF-8"),
         (b"a: 1\n" * 10**7, "larger than 1000000 bytes"),
     ):  # fmt: skip
-        refused(lambda content=content: load_scene(fresh(tmp_path, content)), "scene.yaml", said)
+        refused(lambda content=content: load_scene(fresh(tmp_path, content)), "scene.yaml", part)
     assert load_scene(fresh(tmp_path, b"\xef\xbb\xbf" + GOOD.encode())) == load_scene(GOOD)
 
 
@@ -197,10 +197,10 @@ def b14_no_numbers(tmp_path: Path) -> None:
 def b16_signs(tmp_path: Path) -> None:
     for value in (-0.1, 1.5):
         refused(lambda value=value: Box(size=(8, 6), restitution=value), f"restitution = {value}", "0", "1")
-    refused(lambda: Drag(rate=-1), "rate = -1", ">= 0")  # it would pump energy
+    refused(lambda: Drag(rate=-1), "rate = -1", ">= 0")  # a negative rate would add energy
     refused(lambda: Springs(stiffness=1, damping=-1), "damping = -1", ">= 0")
     refused(lambda: Queue(weight=1, target=(0, 0), headway=0), "headway = 0", "> 0")
-    # friction, and restitution between bodies: with the collisions that have them
+    # friction, and restitution between bodies: see the tests of collisions
 
 
 def b17_springs(tmp_path: Path) -> None:
@@ -231,16 +231,16 @@ def b20_polygons(tmp_path: Path) -> None:
         assert Polygon(vertices=corners[::-1]).gap(place) == pytest.approx(float(Polygon(vertices=corners).gap(place)))
 
 
-def b21_where_they_begin(tmp_path: Path) -> None:
+def b21_starting_positions(tmp_path: Path) -> None:
     half = scene(obstacles=(HalfSpace(point=(2, 2), direction=(1, 0)),)).start(0)
-    assert (half.pos[..., 0] >= 2.1).all()  # drawn anew until they are outside
+    assert (half.pos[..., 0] >= 2.1).all()  # drawn again until they are outside
     there = Group(count=3, spawn=Spawn(low=(1, 1), high=(1, 1)))
     heap = scene(*FLOCK, groups=(there,))
     end = heap.run(heap.start(0), 20)
     apart = np.linalg.norm(end.pos[0, :, None] - end.pos[0], axis=-1)[np.triu_indices(3, 1)]
     assert np.isfinite(end.pos).all()
     assert apart.min() > 0.1
-    # who finds no room outside an obstacle, bodies in one another, a door narrower than a body: with the collisions
+    # no room outside an obstacle, overlapping bodies, a door narrower than a body: see the tests of collisions
 
 
 # --- environments -----------------------------------------------------------------------------------------------------
@@ -264,7 +264,7 @@ def b23_out_of_turn(tmp_path: Path) -> None:
     env.reset(seed=0)
     env.step(still(env))
     assert env.agents == []
-    assert env.step({}) == ({}, {}, {}, {}, {})  # as PettingZoo's own
+    assert env.step({}) == ({}, {}, {}, {}, {})  # as in PettingZoo's own environments
     with pytest.raises(ResetNeeded, match="reset"):
         env.step({env.possible_agents[0]: np.zeros(2)})
     closed = single()
@@ -304,22 +304,22 @@ def b25_actions(tmp_path: Path) -> None:
     env.reset(seed=3)
     assert np.isfinite(env.step(np.array([1e300, -1e300]))[0]).all()
     env.reset(seed=3)
-    whole = env.step(np.array([1, -1]))[0]  # whole numbers
+    whole = env.step(np.array([1, -1]))[0]  # integers
     env.reset(seed=3)
     same(whole, env.step(np.array([1.0, -1.0]))[0])
 
 
 def b26_bounds(tmp_path: Path) -> None:
-    """Clipped alike by every face: to the bound from just beyond it, and from far beyond."""
+    """Every face clips to the bound, from just beyond it and from far beyond."""
     env, many, side = single(), gymnasium.make_vec(PURSUIT, 2), team()
     found = []
     for action in (1.0, np.nextafter(1.0, 2.0), 7.0):
-        asked = np.array([action, -action])
+        actions = np.array([action, -action])
         env.reset(seed=4)
         many.reset(seed=4)
         side.reset(seed=4)
-        found.append((env.step(asked)[0], side.step(dict.fromkeys(side.agents, asked))[0]))
-        same(many.step(np.tile(asked, (2, 1)))[0][0], found[-1][0])
+        found.append((env.step(actions)[0], side.step(dict.fromkeys(side.agents, actions))[0]))
+        same(many.step(np.tile(actions, (2, 1)))[0][0], found[-1][0])
     for other in found[1:]:
         same(other, found[0])
 
@@ -359,7 +359,7 @@ def b30_copies(tmp_path: Path) -> None:
 
 
 def played(seed: int, steps: int = 60) -> Any:
-    """Observations of a world of its own."""
+    """Return the observations of a new world under random actions."""
     world, rng = World(Pursuit(), 1), np.random.default_rng(seed)
     world.reset(seed)
     return np.array([world.step(rng.uniform(-1, 1, (1, 1, 2))).observation for _ in range(steps)])
@@ -396,13 +396,13 @@ def b33_states(tmp_path: Path) -> None:
 
 
 def b34_another_method(tmp_path: Path) -> None:
-    """A state holds no memory of the method: another one goes on as it would from the start. A new dt must be said."""
+    """A state keeps nothing of its method: another one continues as from the start. A new dt must be declared."""
     made = scene(Drag(rate=0.5))
     verlet = made.model_copy(update={"integrator": VelocityVerlet()})
     state = verlet.run(verlet.start(0), 5)
     anew = made.start(0).with_motion(state.pos, state.vel)
     same(made.step(state).pos, made.step(anew).pos)
-    moved = state.with_motion(state.pos + 1, -state.vel)  # no acceleration of another place is used again
+    moved = state.with_motion(state.pos + 1, -state.vel)  # no acceleration of the former positions is reused
     clean = verlet.start(0).with_motion(state.pos + 1, -state.vel)
     same(verlet.step(moved).vel, verlet.step(clean).vel)
     finer = made.model_copy(update={"dt": 0.05})
@@ -426,7 +426,7 @@ def b36_all_at_once(tmp_path: Path) -> None:
     assert env.agents == []
     env = team(max_cycles=1, capture_distance=1e-3)
     env.reset(seed=0)
-    env.agents.clear()  # what is handed out is a list of one's own
+    env.agents.clear()  # `agents` returns a new list each time
     assert env.agents == env.possible_agents
     _, _, terminated, truncated, _ = env.step(still(env))
     assert all(truncated.values())
@@ -446,17 +446,17 @@ def b38_observations(tmp_path: Path) -> None:
 
 
 ROWS = (
-    b01_dt, b02_no_time, b03_time_is_no_multiple, b04_nobody_and_one, b05_counts, b06_bodies, b08_unknown_names,
+    b01_dt, b02_no_time, b03_time_is_no_multiple, b04_no_agent_and_one, b05_counts, b06_bodies, b08_unknown_names,
     b09_given_twice, b10_exponents, b11_tags, b13_files, b14_no_numbers, b16_signs, b17_springs, b18_small_worlds,
-    b20_polygons, b21_where_they_begin, b22_seeds, b23_out_of_turn, b24_names, b25_actions, b26_bounds, b28_resets,
+    b20_polygons, b21_starting_positions, b22_seeds, b23_out_of_turn, b24_names, b25_actions, b26_bounds, b28_resets,
     b29_closing, b30_copies, b32_side_by_side, b33_states, b34_another_method, b35_toggled, b36_all_at_once,
     b38_observations,
 )  # fmt: skip
-"""A function for each request."""
+"""All functions of requests."""
 
 
 SLOW = (b34_another_method,)
-"""It compiles a method more."""
+"""Functions that compile another method."""
 
 
 @pytest.mark.parametrize(

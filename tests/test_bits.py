@@ -1,7 +1,7 @@
-"""Results stay the same bits: every shipped scene and task against hashes that were stored, on one thread and two.
+"""Results stay the same to the last bit: every shipped scene and task against stored hashes, on one and two threads.
 
-A change that moves bits on purpose writes them anew, `python -m tests.test_bits`, and says in its commit what moved and
-why. Hashes hold for the processor's instructions that they were made with; elsewhere the tests are skipped.
+After an intended change, `python -m tests.test_bits` stores the hashes again; the commit explains what changed and why.
+Hashes hold for the processor's instructions that they were made with; on other processors the tests are skipped.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from flockenv.model.divergence import SimulationDiverged
 from flockenv.scene.yaml_io import ConfigError, load_scene
 from flockenv.tasks import TASKS
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # what scenes warn of is not what is tested here
+pytestmark = pytest.mark.filterwarnings("ignore")  # warnings of scenes are not tested here
 ROOT = Path(__file__).resolve().parent.parent
 STORED = Path(__file__).with_name("bits.json")
 STEPS, SLOW_STEPS = 2000, {"configs/scenes/cloth.yaml": 300}
@@ -34,17 +34,17 @@ WORLDS, DECISIONS = 64, 500
 
 
 def scene_files() -> Iterator[str]:
-    """Every shipped scene, by its path from the root."""
+    """Yield every shipped scene, by its path from the root."""
     for path in sorted((ROOT / "configs").rglob("*.yaml")):
         try:
             load_scene(path)
         except ConfigError:
-            continue  # a training or an experiment
+            continue  # a config of training or of an experiment
         yield path.relative_to(ROOT).as_posix()
 
 
 def of_scene(name: str) -> str:
-    """Return the hash of a scene's last state; of one that diverges, of where it was before that call of 50 steps."""
+    """Return the hash of a scene's last state; if it diverges, of the state before that call of 50 steps."""
     scene = load_scene(ROOT / name)
     state = scene.start(0)
     with contextlib.suppress(SimulationDiverged):
@@ -73,7 +73,7 @@ def digest(*arrays: Any) -> str:
 
 
 def machine() -> str:
-    """Return what the bits may hang on beside the code: the processor's instructions and numba's version."""
+    """Return what bits depend on besides the code: the processor's instructions and numba's version."""
     return f"{digest(np.array(sorted(cpu.FEATURES)))}, numba {numba.__version__}"
 
 
@@ -92,12 +92,12 @@ def one_thread_afterwards() -> Iterator[None]:
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2])
 @pytest.mark.parametrize("name", sorted(stored()["bits"]))
-def test_bits_are_what_they_were(name: str, count: int) -> None:
+def test_bits_equal_the_stored_ones(name: str, count: int) -> None:
     if machine() != stored()["machine"]:
         pytest.skip(f"stored on {stored()['machine']}, this is {machine()}")
     use_threads(count)
     found = of_task(name) if name in TASKS else of_scene(name)
-    assert found == stored()["bits"][name], "moved on purpose? python -m tests.test_bits"
+    assert found == stored()["bits"][name], "if intended: python -m tests.test_bits"
 
 
 def test_every_shipped_scene_and_task_is_stored() -> None:
@@ -105,7 +105,7 @@ def test_every_shipped_scene_and_task_is_stored() -> None:
 
 
 def write() -> None:
-    """Store all hashes anew."""
+    """Compute and store all hashes."""
     use_threads(1)
     bits = {}
     for name in [*scene_files(), *TASKS]:

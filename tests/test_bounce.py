@@ -1,4 +1,4 @@
-"""Walls that bodies bounce off: N05, N06, P19 and closed forms, for every method."""
+"""Bodies bounce off walls: stress cases N05, N06, P19 and closed forms, for every method."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.catalogue import INTEGRATORS, Array, IntegratorRow
 from tests.kernels import functions_of
 
 pytestmark = pytest.mark.slow
-"""Many kernels: where slow tests run."""
+"""These tests compile many kernels."""
 
 G = 9.81
 METHODS = pytest.mark.parametrize("row", INTEGRATORS, ids=lambda row: row.name)
@@ -27,7 +27,7 @@ STEPS = pytest.mark.parametrize("dt", [0.001, 0.005, 0.02])
 
 
 def hall(pull: tuple[float, ...] = (0.0, -G), size: float = 3.0, e: float = 1.0, **given: Any) -> Scene:
-    """Bodies under a constant force in a square or cube with walls; all scenes here differ in numbers alone."""
+    """Return a scene of bodies under a constant force in a square or cube with walls; scenes differ in numbers only."""
     d = len(pull)
     group = {"count": 1, "radius": 0.0, "spawn": Spawn(low=(0,) * d, high=(size,) * d)}
     group |= {name: given.pop(name) for name in ("count", "radius", "max_speed") if name in given}
@@ -42,7 +42,7 @@ def at(scene: Scene, pos: Any, vel: Any) -> State:
 
 
 def heights(scene: Scene, state: State, seconds: float) -> tuple[Array, Array]:
-    """Height and velocity of everybody after each step, (K, N)."""
+    """Return height and velocity of all bodies after each step, (K, N)."""
     ends = []
     for _ in range(round(seconds / scene.dt)):
         state = scene.step(state)
@@ -52,13 +52,13 @@ def heights(scene: Scene, state: State, seconds: float) -> tuple[Array, Array]:
 
 
 def dropped(dt: float, **given: Any) -> tuple[Scene, Array]:
-    """Sixteen balls, let fall from about 1 m: one step's way apart, so that each hits the floor at another phase."""
+    """Return a scene of 16 balls and their heights, about 1 m: each hits the floor at another phase of a step."""
     scene = hall(dt=dt, count=16, **given)
     return scene, 1 + np.arange(16) / 16 * dt * np.sqrt(2 * G)
 
 
 def bounced(y: Array) -> list[float]:
-    """The largest heights between impacts, in order."""
+    """Return the largest heights between impacts, in order."""
     return [float(y[k]) for k in range(1, len(y) - 1) if y[k] >= y[k - 1] and y[k] > y[k + 1]]
 
 
@@ -67,7 +67,7 @@ def bounced(y: Array) -> list[float]:
 
 @STEPS
 @METHODS
-def test_a_ball_rises_to_e_squared_of_its_height_and_comes_to_rest_in_time(row: IntegratorRow, dt: float) -> None:
+def test_a_ball_rises_to_e_squared_of_its_height_and_rests_after_a_known_time(row: IntegratorRow, dt: float) -> None:
     """N05: apexes e^(2n) h, T = sqrt(2 h / g) (1 + e) / (1 - e), 4.064 s for e = 0.8 and 1 m."""
     scene, h = dropped(dt, e=0.8, integrator=row.method)
     y, v = heights(scene, at(scene, np.stack([np.full(16, 1.5), h], 1), 0), 4.6)
@@ -80,8 +80,8 @@ def test_a_ball_rises_to_e_squared_of_its_height_and_comes_to_rest_in_time(row: 
 
 
 @METHODS
-def test_a_ball_that_loses_nothing_rises_as_high_after_100_bounces(row: IntegratorRow) -> None:
-    """N06: at most 1.01 h for all methods, for 1 +- 1e-6 for those that fall exactly; P22: reflecting pumps to 29 m."""
+def test_an_elastic_ball_rises_as_high_after_100_bounces(row: IntegratorRow) -> None:
+    """N06: within 1 % of h for all methods, exactly from order 2 on. P22: plain reflection would pump it to 29 m."""
     scene, h = dropped(0.02, integrator=row.method)
     y, v = heights(scene, at(scene, np.stack([np.full(16, 1.5), h], 1), 0), 91)
     assert (y.max(axis=0) <= 1.01 * h).all()
@@ -91,7 +91,7 @@ def test_a_ball_that_loses_nothing_rises_as_high_after_100_bounces(row: Integrat
     assert (y >= 0).all()
 
 
-def test_in_single_precision_too() -> None:
+def test_balls_bounce_and_come_to_rest_in_single_precision() -> None:
     scene, h = dropped(0.02, dtype="float32", integrator=SemiImplicitEuler())
     y, _ = heights(scene, at(scene, np.stack([np.full(16, 1.5), h], 1), 0), 91)
     assert y.dtype == np.float32
@@ -104,7 +104,7 @@ def test_in_single_precision_too() -> None:
 
 
 def height_after(t: float, h: float) -> float:
-    """Where a ball is that was dropped from a height and loses nothing."""
+    """Return the height at time t of an elastic ball dropped from h."""
     fall = np.sqrt(2 * h / G)
     since = (t + fall) % (2 * fall)
     return float(G * fall * since - G * since**2 / 2)
@@ -112,7 +112,7 @@ def height_after(t: float, h: float) -> float:
 
 @pytest.mark.parametrize("dt", [0.4, 3.0, 10.0])
 @pytest.mark.parametrize("row", [row for row in INTEGRATORS if row.method.order > 1], ids=lambda row: row.name)
-def test_a_step_may_be_longer_than_twenty_bounces(row: IntegratorRow, dt: float) -> None:
+def test_a_step_with_up_to_20_bounces_ends_at_the_exact_height(row: IntegratorRow, dt: float) -> None:
     scene = hall(dt=dt, integrator=row.method)
     state = at(scene, (1.5, 0.3), 0)
     for k in range(1, 4):
@@ -120,14 +120,14 @@ def test_a_step_may_be_longer_than_twenty_bounces(row: IntegratorRow, dt: float)
         assert state.pos[0, 0, 1] == pytest.approx(height_after(k * dt, 0.3), abs=1e-8)
 
 
-def test_who_would_bounce_more_than_a_hundred_times_in_a_step_lies_still() -> None:
+def test_a_ball_that_would_bounce_more_than_100_times_in_a_step_rests() -> None:
     scene = hall(dt=1e6)
     end = scene.step(at(scene, (1.5, 0.3), 0))
     np.testing.assert_array_equal(end.pos[0, 0], (1.5, 0))
     np.testing.assert_array_equal(end.vel[0, 0], (0, 0))
 
 
-def test_a_series_of_bounces_that_ends_within_a_step_has_ended_after_it() -> None:
+def test_a_ball_whose_bounces_end_within_a_step_rests_after_it() -> None:
     """P20: for e = 0.99 thousands of impacts."""
     for e in (0.3, 0.8, 0.99):
         total = np.sqrt(2 * 1e-4 / G) * (1 + e) / (1 - e)
@@ -137,8 +137,8 @@ def test_a_series_of_bounces_that_ends_within_a_step_has_ended_after_it() -> Non
         np.testing.assert_array_equal(end.vel[0, 0], (0.25, 0))
 
 
-def test_a_visit_to_the_wall_between_two_steps_is_seen() -> None:
-    """Both ends of the step are inside: the force turns the body around, but later than the wall would."""
+def test_an_impact_is_found_even_if_both_ends_of_the_step_are_inside() -> None:
+    """The force would also turn the body around, but later than the wall does."""
     scene = hall((0.0, 50.0), e=0.5, dt=0.1)
     end = scene.step(at(scene, (1.5, 0.01), (0, -2.0)))
     impact = np.sqrt(2.0**2 - 2 * 50 * 0.01)
@@ -149,14 +149,14 @@ def test_a_visit_to_the_wall_between_two_steps_is_seen() -> None:
 
 
 @METHODS
-def test_who_rests_stays_until_something_lifts_him(row: IntegratorRow) -> None:
+def test_a_resting_ball_stays_on_the_floor_until_a_force_lifts_it(row: IntegratorRow) -> None:
     down, up = (hall((0.0, pull), e=0.9, integrator=row.method) for pull in (-G, 2.0))
     state = down.run(at(down, (1.5, 0.0), (0.5, 0)), 50)
     np.testing.assert_allclose(state.pos[0, 0], (1.75, 0), atol=1e-12)
     np.testing.assert_array_equal(state.vel[0, 0, 1], 0)
     lifted = up.run(state, 50)
     assert lifted.vel[0, 0, 1] == pytest.approx(1.0)
-    assert lifted.pos[0, 0, 1] == pytest.approx(0.25, abs=0.0101)  # a method of first order: half a step
+    assert lifted.pos[0, 0, 1] == pytest.approx(0.25, abs=0.0101)  # order 1 is off by half a step
 
 
 # --- walls all around -------------------------------------------------------------------------------------------------
@@ -164,7 +164,7 @@ def test_who_rests_stays_until_something_lifts_him(row: IntegratorRow) -> None:
 
 @pytest.mark.parametrize("dt", [0.01, 0.1, 2.5])
 @METHODS
-def test_billiards_by_unfolding(row: IntegratorRow, dt: float) -> None:
+def test_a_billiard_ball_ends_where_the_unfolded_path_does(row: IntegratorRow, dt: float) -> None:
     """x0 = 0.37, v = 3.3, L = 1, 10 s: 0.63 after 33 bounces."""
     scene = hall((0.0, 0.0), size=1.0, dt=dt, integrator=row.method)
     end = scene.run(at(scene, (0.37, 0.2), (3.3, -0.7)), round(10 / dt))
@@ -172,15 +172,15 @@ def test_billiards_by_unfolding(row: IntegratorRow, dt: float) -> None:
     np.testing.assert_allclose(end.vel[0, 0], (-3.3, 0.7), rtol=1e-11)
 
 
-def test_in_single_precision_nobody_gains_speed_by_rounding() -> None:
-    """Far from the origin a way is known less well than a velocity."""
+def test_rounding_in_single_precision_adds_no_speed() -> None:
+    """Far from the origin, differences of positions are less accurate than velocities."""
     scene = hall((0.0, 0.0), size=9000.0, dt=1e-3, dtype="float32", integrator=SemiImplicitEuler())
     for speed in np.linspace(100, 130, 20):
         end = scene.run(at(scene, (8999.5, 3.0), (speed, 0)), 10)
         assert end.vel[0, 0, 0] == -np.float32(speed)
 
 
-def test_a_corner_turns_around_and_a_radius_keeps_off() -> None:
+def test_a_corner_reverses_the_velocity_and_a_radius_keeps_its_distance() -> None:
     scene = hall((0.0, 0.0, 0.0), e=0.5, dt=1.0, radius=0.25)
     end = scene.step(at(scene, (0.75, 0.75, 0.75), (-1, -1, -1)))
     np.testing.assert_allclose(end.pos[0, 0], 0.5, rtol=1e-12)
@@ -190,7 +190,7 @@ def test_a_corner_turns_around_and_a_radius_keeps_off() -> None:
     np.testing.assert_allclose(end.vel[0, 0], (-0.5, -0.5, 0), rtol=1e-12)
 
 
-def test_along_a_wall_nothing_changes() -> None:
+def test_bounces_leave_the_motion_along_the_wall_unchanged() -> None:
     scene, _ = dropped(0.02, e=0.7)
     state = at(scene, (0.5, 0.3), (0.37, -2.0))
     free = at(scene, (0.5, 1.5), (0.37, 0.0))
@@ -201,7 +201,7 @@ def test_along_a_wall_nothing_changes() -> None:
 
 
 @pytest.mark.parametrize("turn", ["quarter", "mirror"])
-def test_all_walls_are_alike(turn: str) -> None:
+def test_bounces_are_the_same_at_every_wall(turn: str) -> None:
     matrix = np.array([[0.0, -1], [1, 0]]) if turn == "quarter" else np.diag([-1.0, 1.0])
     rng = np.random.default_rng(0)
     pos, vel, pull = rng.uniform(0, 3, (50, 2)), rng.normal(size=(50, 2)) * 5, np.array([1.5, -7.0])
@@ -213,7 +213,7 @@ def test_all_walls_are_alike(turn: str) -> None:
     np.testing.assert_allclose(other.vel, end.vel @ matrix.T, atol=1e-8)
 
 
-def test_a_world_of_a_batch_and_a_team_of_threads_give_the_same_bits() -> None:
+def test_bounces_in_a_batch_and_with_two_threads_give_the_same_bits() -> None:
     scene = hall(count=4500, e=0.9)
     batch = scene.run(scene.start(3, worlds=3), 60)
     assert (batch.x[1] > 0).any()
@@ -234,7 +234,7 @@ def test_a_world_of_a_batch_and_a_team_of_threads_give_the_same_bits() -> None:
 
 
 @pytest.mark.parametrize("method", [RK4(), SemiImplicitEuler()], ids=lambda method: method.kind)
-def test_many_bodies_bounce_as_few_of_them_do(method: Integrator) -> None:
+def test_bodies_bounce_equally_in_large_and_small_worlds(method: Integrator) -> None:
     many, few = (hall(count=count, e=0.9, integrator=method) for count in (2000, 50))
     rng = np.random.default_rng(2)
     pos, vel = rng.uniform(0, 3, (2000, 2)), rng.normal(size=(2000, 2)) * 5
@@ -248,7 +248,7 @@ def test_many_bodies_bounce_as_few_of_them_do(method: Integrator) -> None:
 
 @pytest.mark.parametrize(("dtype", "widest"), [("float64", 150), ("float32", 18)])
 @pytest.mark.parametrize("dt", [1e-9, 0.01, 1e6])
-def test_nobody_leaves_and_nothing_becomes_no_number(dtype: str, widest: int, dt: float) -> None:
+def test_bodies_stay_inside_and_finite_for_extreme_numbers(dtype: str, widest: int, dt: float) -> None:
     rng = np.random.default_rng(1)
     count = 2000
     scene = hall((3.0, -G), count=count, e=0.9, dt=dt, dtype=dtype, integrator=SemiImplicitEuler())
@@ -263,7 +263,7 @@ def test_nobody_leaves_and_nothing_becomes_no_number(dtype: str, widest: int, dt
         assert (state.pos <= 3).all()
 
 
-def test_who_comes_back_to_the_wall_at_the_end_of_a_step_is_not_rounded_out_of_the_box() -> None:
+def test_a_body_at_the_wall_at_the_end_of_a_step_is_not_rounded_out_of_the_box() -> None:
     rng = np.random.default_rng(2)
     scene = hall(count=2000)
     speed = G * scene.dt / 2 / rng.integers(1, 12, 2000) * (1 + rng.integers(-3, 4, 2000) * 2.2e-16)
@@ -274,14 +274,14 @@ def test_who_comes_back_to_the_wall_at_the_end_of_a_step_is_not_rounded_out_of_t
     np.testing.assert_allclose(np.hypot(state.vel[0, :, 1], np.sqrt(2 * G * state.pos[0, :, 1])), speed, rtol=1e-9)
 
 
-def test_who_is_outside_is_put_at_the_wall() -> None:
+def test_a_body_outside_is_put_at_the_wall() -> None:
     scene = hall((0.0, 0.0), dt=0.1, radius=0.5)
     end = scene.step(at(scene, (4.0, -1.0), (-2.0, -3.0)))
     np.testing.assert_array_equal(end.pos[0, 0], (2.5, 0.5))
     np.testing.assert_array_equal(end.vel[0, 0], (-2, 0))
 
 
-def test_the_speed_limit_holds_after_an_impact_too() -> None:
+def test_the_speed_limit_holds_after_an_impact() -> None:
     scene, h = dropped(0.02, max_speed=2, integrator=SemiImplicitEuler())
     state = at(scene, np.stack([np.full(16, 1.5), h], 1), 0)
     for _ in range(200):
@@ -290,7 +290,7 @@ def test_the_speed_limit_holds_after_an_impact_too() -> None:
         assert np.linalg.norm(state.pos - before.pos, axis=2).max() <= 2 * 0.02 * (1 + 1e-9)
 
 
-def test_the_dead_stay_where_they_are() -> None:
+def test_dead_agents_do_not_move() -> None:
     scene = hall(count=2)
     state = at(scene, (1.0, 0.003), (0, -5.0))
     state.alive[0, 1] = False
@@ -299,10 +299,10 @@ def test_the_dead_stay_where_they_are() -> None:
     assert end.pos[0, 0, 1] > 0.003
 
 
-# --- restitution is a number, and 0 is the wall that stops ------------------------------------------------------------
+# --- restitution, which is 0 for a wall that stops bodies -------------------------------------------------------------
 
 
-def test_walls_that_give_nothing_back_cost_nothing() -> None:
+def test_walls_of_restitution_0_stop_bodies_without_code_for_bounces() -> None:
     still, some, more = (hall(e=e) for e in (0.0, 0.5, 1.0))
     assert functions_of(some) - functions_of(still) == {some.space.bounce_law.__name__}  # type: ignore[union-attr]
     assert step_of(some.parts) is step_of(more.parts)
@@ -312,7 +312,7 @@ def test_walls_that_give_nothing_back_cost_nothing() -> None:
 
 
 @pytest.mark.parametrize("restitution", [-0.1, 1.1, float("nan"), "0.5", True])
-def test_a_restitution_that_is_none_is_refused_in_one_line(restitution: Any) -> None:
+def test_an_invalid_restitution_is_refused_in_one_line(restitution: Any) -> None:
     with pytest.raises(ValueError, match="restitution") as caught:
         Box(size=(1, 1), restitution=restitution)
     assert "\n" not in str(caught.value)
