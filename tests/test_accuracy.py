@@ -169,10 +169,10 @@ def test_a_speed_limit_that_never_acts_leaves_the_better_reference() -> None:
 def test_a_perturbation_grows_as_the_closed_form_of_a_pendulum() -> None:
     """Near the top the angle of a pendulum, and so any difference of angles, grows as exp(2 pi t)."""
     found = chaos.find_sensitivity(swinging(math.pi, 1.5))
-    half = math.exp(2 * math.pi * 1.5) / math.sqrt(8)  # of cosh, and of a change along one of two axes
+    half = math.exp(2 * math.pi * 1.5) / math.sqrt(8)  # / 2: cosh; / sqrt(2): a change along one of two axes
     assert found.growth == pytest.approx(
         half, rel=1.01 / (2 * math.pi)
-    )  # sinh / 2 pi of the velocity's, of either sign
+    )  # the change of velocity adds sinh / (2 pi), of either sign
     assert chaos.find_sensitivity(one("damped")).growth < 2
 
 

@@ -238,7 +238,7 @@ def test_a_queue_flows_at_its_headway_and_never_overlaps() -> None:
 
 
 def test_a_queue_stops_behind_a_stopped_agent_and_closes_up_to_the_margin() -> None:
-    """Second order, gain 4 m / T: critically damped, so a gap closes to the margin and never beyond it."""
+    """With a gain of 4 m / T the motion is critically damped, so a gap closes to the margin and never beyond it."""
     scene, start = file_of(4, queue=4.0)
     stone = np.array([110.0, 100.0])  # the first agent is held here
     start.pos[0, 0] = stone

@@ -275,7 +275,7 @@ def test_pursue_and_evade_use_the_time_of_their_predictor() -> None:
     """F = w (V unit(+-(p + u T)) - v), with T of each predictor written out here."""
     p, u, v, top = np.array([3.0, 4.0]), np.array([-0.5, 0.8]), np.array([1.0, 0.0]), 2.0
     theirs = math.hypot(*u)
-    times = {  # ahead within 45 degrees: no, aside (0.6); across (-0.53)
+    times = {  # cosines 0.6 and -0.53: beyond 45 degrees, so aside and across
         (Pursue, "distance"): 0.5 * 5 / top, (Pursue, "opensteer"): 0.8 * 5 / 1.0,
         (Pursue, "exact"): float(rows(steering.interception_time)(p, u, top)),
         (Evade, "distance"): 0.5 * 5 / top, (Evade, "opensteer"): 5 / theirs,

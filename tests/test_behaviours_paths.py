@@ -193,7 +193,7 @@ def test_on_a_circular_path_an_agent_stays_in_the_tube_for_two_laps() -> None:
     turned = np.unwrap(angles)
     assert (np.diff(turned) > 0).all()
     assert turned[-1] - turned[0] > 2 * 2 * np.pi
-    assert not push(scene, (RING_RADIUS, -0.3), (0, 2)).any()  # nor if it will soon pass the first point
+    assert not push(scene, (RING_RADIUS, -0.3), (0, 2)).any()  # no force across the seam
 
 
 def test_traffic_in_both_directions_passes_without_contact() -> None:
