@@ -339,10 +339,10 @@ class Bottleneck(Task):
         return Layout((
             Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (x, y)"),
             Slot("door", (2,), self.room, "m", "offset of the middle of the door"),
-            Slot("door_near", (2,), self.close, "m", "the same on a fine scale, cut off beyond it"),
+            Slot("door_near", (2,), self.close, "m", "the same offset on a finer scale, clipped"),
             Slot("to_sides", (2,), self.room, "m", "distance to the walls at y = 0 and y = room", low=0.0),
-            Slot("pressure", (), self.limit, "N/m", "what presses, over the circumference", low=0.0),
-            *neighbour_slots(self.neighbours, self.sight, 2 * self.max_speed, "others", crowding=True),
+            Slot("pressure", (), self.limit, "N/m", "sum of the contact forces / circumference of the body", low=0.0),
+            *neighbour_slots(self.neighbours, self.sight, 2 * self.max_speed, "people", crowding=True),
         ))  # fmt: skip
 
     @functools.cached_property

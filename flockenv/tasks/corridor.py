@@ -318,16 +318,16 @@ class Corridor(LastingTask):
     def layout(self) -> Layout:
         """The observation; every vector is (along the walking direction, to its left)."""
         return Layout((
-            Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (along one's way, to its left)"),
-            Slot("desired_speed", (), self.max_speed, "m/s", "how fast one would like to go", low=0.0),
+            Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (along the walking direction, to its left)"),
+            Slot("desired_speed", (), self.max_speed, "m/s", "own desired speed", low=0.0),
             Slot("walls", (2,), self.width, "m", "distance to the wall on the left, and on the right", low=0.0),
-            *neighbour_slots(self.neighbours, self.sight, 2 * self.max_speed, "others", crowding=True),
+            *neighbour_slots(self.neighbours, self.sight, 2 * self.max_speed, "people", crowding=True),
         ))  # fmt: skip
 
     @functools.cached_property
     def action_layout(self) -> Layout:
         """A force in the frame of the walking direction."""
-        meaning = "force (along one's way, to its left) / max_force, shortened to length 1"
+        meaning = "force (along the walking direction, to its left) / max_force, shortened to length 1"
         return Layout((Slot("force", (2,), self.max_force, "N", meaning),))
 
     def roles(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[str, ...]:

@@ -269,7 +269,7 @@ class Crossing(Task):
         """The observation; every vector is (along the course, to its left)."""
         return Layout((
             Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (along the course, to its left)"),
-            Slot("goal", (2,), 3 * self.circle, "m", "the way to the goal"),
+            Slot("goal", (2,), 3 * self.circle, "m", "offset of the goal"),
             *neighbour_slots(self.neighbours, self.sight, 2 * self.max_speed, "neighbours", crowding=False),
         ))  # fmt: skip
 

@@ -286,7 +286,7 @@ class CrowdNav(Task):
         """The observation; every vector is (along the course, to its left)."""
         return Layout((
             Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (along the course, to its left)"),
-            Slot("goal", (2,), 3 * self.circle, "m", "the way to the goal"),
+            Slot("goal", (2,), 3 * self.circle, "m", "offset of the goal"),
             *neighbour_slots(self.neighbours, self.sight, 4 * self.max_speed, "pedestrians", crowding=True),
         ))  # fmt: skip
 

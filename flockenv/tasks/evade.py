@@ -372,8 +372,8 @@ class Evade(Task):
     def layout(self) -> Layout:
         """The observation; axes are the field's, and offsets are relative to the agent."""
         n, m = self.pursuers, self.slots
-        ways = "how far the body can go before it touches cover, anticlockwise from the x axis"
-        seen = "offsets of the centres of the nearest obstacles, nearest surface first; zeros = none"
+        ways = "free path length of the body to the nearest cover in each direction, anticlockwise from the x axis"
+        seen = "offsets of the centres of the nearest obstacles, nearest surface first; zeros: empty slot"
         return Layout((
             Slot("velocity", (2,), self.evader_speed, "m/s", "own velocity (x, y)"),
             Slot("to_low", (2,), self.size, "m", "distance to the walls at x = 0 and y = 0", low=0.0),
@@ -381,10 +381,10 @@ class Evade(Task):
             Slot("pursuers", (n, 2), self.size, "m", "offsets of the pursuers, nearest first"),
             Slot("pursuer_velocity", (n, 2), self.pursuer_speed, "m/s", "their velocities"),
             Slot("bearing", (n, 2), 1.0, "1", "unit vectors towards them"),
-            Slot("closeness", (n,), 1.0, "1", "1 - distance / near; 0 beyond", low=0.0),
-            Slot("seen", (n,), 1.0, "1", "1 where that pursuer sees the evader, else 0", low=0.0),
+            Slot("closeness", (n,), 1.0, "1", "1 - distance / near; 0 for a distance above near", low=0.0),
+            Slot("seen", (n,), 1.0, "1", "1 if that pursuer sees the evader, else 0", low=0.0),
             Slot("cover", (m, 2), self.size, "m", seen),
-            Slot("cover_radius", (m,), self.greatest_radius, "m", "their radii; 0 = none", low=0.0),
+            Slot("cover_radius", (m,), self.greatest_radius, "m", "their radii; 0: empty slot", low=0.0),
             Slot("free_way", (self.rays,), self.way_sight, "m", ways, low=0.0),
         ))  # fmt: skip
 

@@ -519,17 +519,18 @@ class Flock(LastingTask):
     def layout(self) -> Layout:
         """The observation; every vector is (along the heading, to its left)."""
         n, m = self.neighbours, self.obstacles_seen
-        ways = "how far the body can go before it touches one of them, anticlockwise from the heading"
-        crowding = "their directions times 1 - distance / spacing; 0 beyond the spacing"
-        seen = "offsets of the centres of the nearest obstacles, nearest surface first; zeros = none"
+        ways = "free path length of the body to the nearest obstacle in each direction, anticlockwise from the heading"
+        here = "1 for each neighbour, 0 for an empty slot, whose other numbers are also 0"
+        crowding = "unit vectors towards them, times 1 - distance / spacing; 0 for a distance above the spacing"
+        seen = "offsets of the centres of the nearest obstacles, nearest surface first; zeros: empty slot"
         return Layout((
             Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (along the heading, to its left)"),
             Slot("neighbours", (n, 2), self.sight, "m", "offsets of the nearest neighbours, nearest first"),
-            Slot("neighbour_velocity", (n, 2), 2 * self.max_speed, "m/s", "their velocities minus one's own"),
-            Slot("neighbour_present", (n,), 1.0, "1", "1 where there is one, else 0 (and zeros elsewhere)", low=0.0),
+            Slot("neighbour_velocity", (n, 2), 2 * self.max_speed, "m/s", "their velocities minus the agent's own"),
+            Slot("neighbour_present", (n,), 1.0, "1", here, low=0.0),
             Slot("crowding", (n, 2), 1.0, "1", crowding),
             Slot("obstacles", (m, 2), self.sight + self.greatest_radius, "m", seen),
-            Slot("obstacle_radius", (m,), self.greatest_radius, "m", "their radii; 0 = none", low=0.0),
+            Slot("obstacle_radius", (m,), self.greatest_radius, "m", "their radii; 0: empty slot", low=0.0),
             Slot("free_way", (self.rays,), self.sight, "m", ways, low=0.0),
         ))  # fmt: skip
 

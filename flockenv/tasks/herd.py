@@ -376,18 +376,18 @@ class Herd(Task):
     def layout(self) -> Layout:
         """The observation; every vector is (along the course from the flock's centre to the pen, to its left)."""
         k, mates, far = self.sheep_seen, self.dogs - 1, self.sight
-        near = "1 - distance / fear_distance of the nearest sheep; 0 beyond"
+        near = "1 - distance / fear_distance of the nearest sheep; 0 for a distance above it"
         return Layout((
             Slot("velocity", (2,), self.dog_speed, "m/s", "own velocity (along the course, to its left)"),
             Slot("goal", (2,), far, "m", "offset of the pen's centre"),
             Slot("centre", (2,), far, "m", "offset of the flock's centre"),
-            Slot("centre_bearing", (2,), 1.0, "1", "unit vector towards it"),
-            Slot("farthest", (2,), far, "m", "offset of the sheep that is farthest from that centre"),
+            Slot("centre_bearing", (2,), 1.0, "1", "unit vector towards the flock's centre"),
+            Slot("farthest", (2,), far, "m", "offset of the sheep that is farthest from the flock's centre"),
             Slot("spread", (), self.spread_scale, "m", "mean distance of the sheep from their centre", low=0.0),
-            Slot("stray", (), self.spread_scale, "m", "distance of the farthest from it", low=0.0),
+            Slot("stray", (), self.spread_scale, "m", "distance of that sheep from the flock's centre", low=0.0),
             Slot("sheep", (k, 2), far, "m", "offsets of the nearest sheep, nearest first"),
             Slot("sheep_velocity", (k, 2), self.sheep_speed, "m/s", "their velocities"),
-            Slot("sheep_present", (k,), 1.0, "1", "1 where there is one, else 0 (and zeros before)", low=0.0),
+            Slot("sheep_present", (k,), 1.0, "1", "1 for each sheep, 0 for an empty slot", low=0.0),
             Slot("bearing", (2,), 1.0, "1", "unit vector towards the nearest sheep"),
             Slot("closeness", (), 1.0, "1", near, low=0.0),
             Slot("mates", (mates, 2), far, "m", "offsets of the other dogs"),

@@ -94,12 +94,13 @@ def neighbour_slots(count: int, sight: float, most_relative: float, who: str, cr
 
     crowding: add unit vectors towards them, scaled by closeness.
     """
-    close = "unit vectors towards them x (1 - gap between bodies / near), 0 beyond"
+    present = "1 for each neighbour, 0 for an empty slot, whose other numbers are also 0"
+    close = "unit vectors towards them, times 1 - gap between the bodies / near; 0 for a gap above near"
     return (
         Slot("neighbours", (count, 2), sight, "m", f"offsets of the nearest {who}, nearest first"),
-        Slot("neighbour_velocity", (count, 2), most_relative, "m/s", "their velocities minus one's own"),
+        Slot("neighbour_velocity", (count, 2), most_relative, "m/s", "their velocities minus the agent's own"),
         *((Slot("crowding", (count, 2), 1.0, "1", close),) if crowding else ()),
-        Slot("neighbour_present", (count,), 1.0, "1", "1 where there is one, else 0 (and zeros elsewhere)", low=0.0),
+        Slot("neighbour_present", (count,), 1.0, "1", present, low=0.0),
     )
 
 

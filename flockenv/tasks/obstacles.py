@@ -230,16 +230,16 @@ class Obstacles(Task):
     @functools.cached_property
     def layout(self) -> Layout:
         """The observation; axes are the field's, and offsets are relative to the agent."""
-        ways = "how far the body can go before it touches an obstacle, anticlockwise from the x axis"
-        seen = "offsets of the centres of the nearest obstacles, nearest surface first; zeros = none"
+        ways = "free path length of the body to the nearest obstacle in each direction, anticlockwise from the x axis"
+        seen = "offsets of the centres of the nearest obstacles, nearest surface first; zeros: empty slot"
         return Layout((
             Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (x, y)"),
             Slot("goal", (2,), self.size, "m", "offset of the goal"),
             Slot("to_low", (2,), self.size, "m", "distance to the walls at x = 0 and y = 0", low=0.0),
             Slot("to_high", (2,), self.size, "m", "distance to the walls at x = size and y = size", low=0.0),
             Slot("obstacles", (self.slots, 2), self.sight + self.greatest_radius, "m", seen),
-            Slot("obstacle_radius", (self.slots,), self.greatest_radius, "m", "their radii; 0 = none", low=0.0),
-            Slot("clearance", (self.slots,), 1.0, "m", "gap between own body and theirs, cut at 1 m; 0 = none"),
+            Slot("obstacle_radius", (self.slots,), self.greatest_radius, "m", "their radii; 0: empty slot", low=0.0),
+            Slot("clearance", (self.slots,), 1.0, "m", "gap between the bodies, at most 1 m; 0: empty slot"),
             Slot("free_way", (self.rays,), self.sight, "m", ways, low=0.0),
         ))  # fmt: skip
 

@@ -328,12 +328,12 @@ class PathFollow(Task):
     def layout(self) -> Layout:
         """The observation; every vector is (along the track beside the learner, to its left)."""
         far = self.spacing * self.ahead + self.lost_distance
-        points = f"offsets of {self.ahead} points of its middle line, {self.spacing:g} m apart, the first so far ahead"
+        points = f"offsets of {self.ahead} points of its middle line, every {self.spacing:g} m from that distance on"
         return Layout((
             Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (along the track, to its left)"),
-            Slot("left", (), self.lost_distance, "m", "how far to the left of its middle line"),
+            Slot("left", (), self.lost_distance, "m", "offset from the middle line, positive to the left"),
             Slot("points", (self.ahead, 2), far, "m", points),
-            Slot("curvature", (self.ahead,), 1.0 / self.half_width, "1/m", "how it bends there, to the left positive"),
+            Slot("curvature", (self.ahead,), 1.0 / self.half_width, "1/m", "curvature there, positive to the left"),
         ))  # fmt: skip
 
     @functools.cached_property

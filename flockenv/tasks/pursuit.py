@@ -321,7 +321,8 @@ class Pursuit(Task):
         """The observation; axes are the field's, and offsets are relative to the agent."""
         opponents, mates = self._slots
         fastest = max(self.pursuer_speed, self.evader_speed)
-        there = "1 where there is one, else 0 (and zeros before)"
+        near = "1 - distance / near; 0 for a distance above near, and for an empty slot"
+        there = "1 for each one, 0 for an empty slot, whose other numbers are also 0"
         return Layout((
             Slot("velocity", (2,), fastest, "m/s", "own velocity (x, y)"),
             Slot("to_low", (2,), self.size, "m", "distance to the walls at x = 0 and y = 0", low=0.0),
@@ -332,8 +333,8 @@ class Pursuit(Task):
             Slot("mates", (mates, 2), self.size, "m", "offsets of the nearest team mates, nearest first"),
             Slot("mate_velocity", (mates, 2), fastest, "m/s", "their velocities"),
             Slot("mate_present", (mates,), 1.0, "1", there, low=0.0),
-            Slot("bearing", (opponents, 2), 1.0, "1", "unit vectors towards the opponents; zeros = none"),
-            Slot("closeness", (opponents,), 1.0, "1", "1 - distance / near; 0 beyond near, or none", low=0.0),
+            Slot("bearing", (opponents, 2), 1.0, "1", "unit vectors towards the opponents; zeros: empty slot"),
+            Slot("closeness", (opponents,), 1.0, "1", near, low=0.0),
         ))  # fmt: skip
 
     @functools.cached_property

@@ -502,17 +502,18 @@ class School(Task):
     @functools.cached_property
     def layout(self) -> Layout:
         """The observation; axes are the tank's, offsets relative to the fish; zeros for empty slots."""
+        fear = "min(fear_distance / distance, 1) of the hunters in sight; it fades without them"
         slots = [
             Slot("velocity", (2,), self.fish_speed, "m/s", "own velocity (x, y)"),
             Slot("to_low", (2,), self.size, "m", "distance to the walls at x = 0 and y = 0", low=0.0),
             Slot("to_high", (2,), self.size, "m", "distance to the walls at x = size and y = size", low=0.0),
             Slot("hunger", (), 1.0, "1", "0 full, 1 starved", low=0.0),
-            Slot("fear", (), 1.0, "1", "min(fear_distance / distance, 1) of hunters in sight; fades", low=0.0),
+            Slot("fear", (), 1.0, "1", fear, low=0.0),
         ]
         last = {
-            "hunters": ("present", 1.0, "1", "1 where there is one, else 0"),
-            "food": ("amount", self.capacity, "fish", "what is left there"),
-            "mates": ("present", 1.0, "1", "1 where there is one, else 0"),
+            "hunters": ("present", 1.0, "1", "1 for each one, 0 for an empty slot"),
+            "food": ("amount", self.capacity, "fish", "food left in that patch"),
+            "mates": ("present", 1.0, "1", "1 for each one, 0 for an empty slot"),
         }
         counts = {"hunters": self.hunters, "food": self.food_seen, "mates": self.fish_seen}
         for name, (what, unit_, of, meaning) in last.items():
@@ -521,7 +522,7 @@ class School(Task):
                 Slot(name, (n, 2), self.sight, "m", f"offsets of the {name} in sight, nearest first"),
                 Slot(f"{one}_bearing", (n, 2), 1.0, "1", "unit vectors towards them"),
                 Slot(f"{one}_velocity", (n, 2), self.hunter_speed, "m/s", "their velocities"),
-                Slot(f"{one}_closeness", (n,), 1.0, "1", "1 - distance / near; 0 beyond", low=0.0),
+                Slot(f"{one}_closeness", (n,), 1.0, "1", "1 - distance / near; 0 for a distance above near", low=0.0),
                 Slot(f"{one}_{what}", (n,), unit_, of, meaning, low=0.0),
             ]
         return Layout(tuple(slots))
