@@ -1,4 +1,4 @@
-"""Who is near whom: the sweep through sorted cells against an independent search (scipy's k-d tree), term by term."""
+"""Neighbours: the sums over sorted cells equal those of an independent search, scipy's k-d tree."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ DT = 2.0**-10
 """s: one short step, whose change of velocity is the acceleration; a power of two divides exactly."""
 
 
-# --- the oracle -------------------------------------------------------------------------------------------------------
+# --- the reference ----------------------------------------------------------------------------------------------------
 
 
 def pairs(x: Array, radius: float, space: Space) -> tuple[Array, Array, Array]:
-    """Who (i) meets whom (j) and the offset between them, for all ordered pairs nearer than the radius.
+    """Return i, j and the offset from i to j, for all ordered pairs nearer than the radius.
 
-    In the precision of x, operation for operation: who is exactly as far as somebody else is so here too.
+    Operations and precision are those of the library, so that exactly equal distances are equal here also.
     """
     box = np.asarray(space.size, x.dtype) if isinstance(space, Torus) else None
     tree = cKDTree(np.asarray(x, float), boxsize=box)
@@ -43,16 +43,16 @@ def pairs(x: Array, radius: float, space: Space) -> tuple[Array, Array, Array]:
 
 
 def nearest_few(i: Array, square: Array, count: int) -> Array:
-    """Which of the pairs (i, .) are among the `count` with the smallest squares of their i, or as near as the last."""
+    """Return which pairs (i, .) are among the `count` nearest of their i; ties with the last are included."""
     order = np.lexsort((square, i))
-    who, first, how_many = np.unique(i[order], return_index=True, return_counts=True)
+    agents, first, how_many = np.unique(i[order], return_index=True, return_counts=True)
     farthest = np.zeros(i.max() + 1, square.dtype)
-    farthest[who] = square[order][first + np.minimum(how_many, count) - 1]
+    farthest[agents] = square[order][first + np.minimum(how_many, count) - 1]
     return square <= farthest[i]
 
 
 def in_sight(effect: Any, x: Array, v: Array, space: Space) -> tuple[Array, Array, Array]:
-    """Whom everybody heeds under a rule: who is near, ahead, and among the nearest of those."""
+    """Return i, j and offsets of the pairs that an effect sums over: within radius, field of view and nearest few."""
     i, j, offset = pairs(x, effect.radius, space)
     if effect.fov < 360:
         speed = np.linalg.norm(v, axis=1)
@@ -71,7 +71,7 @@ def total(values: Array, i: Array, count: int) -> Array:
 
 
 def expected(effect: Any, x: Array, v: Array, space: Space) -> Array:
-    """The forces (N, D) of one of the three rules, written from their formulas."""
+    """Return the forces (N, D) of one of the three rules, from their formulas."""
     n = len(x)
     if effect.weight == 0:
         return np.zeros_like(x)
@@ -85,11 +85,11 @@ def expected(effect: Any, x: Array, v: Array, space: Space) -> Array:
     return effect.weight * np.where(some, total(v[j], i, n) / count - v, 0)
 
 
-# --- the sweep --------------------------------------------------------------------------------------------------------
+# --- all neighbours within a radius -----------------------------------------------------------------------------------
 
 
 def rules(radius: float, fov: float = 270, chosen: int = -1) -> tuple[Separation, Alignment, Cohesion]:
-    """The three rules, each with a sight of its own; with one chosen the others weigh nothing."""
+    """Return the three rules, each with its own field of view; if one is chosen, the weights of the others are 0."""
     weights = [1.0 if chosen in (-1, k) else 0.0 for k in range(3)]
     return (
         Separation(weight=1.3 * weights[0], radius=radius),
@@ -99,7 +99,7 @@ def rules(radius: float, fov: float = 270, chosen: int = -1) -> tuple[Separation
 
 
 def scene_with(effects: Any, space: Space | None, dimension: int, count: int) -> Scene:
-    """A scene of the rules alone in a plane; on a torus (all three of them) of the kernel that other tests use too."""
+    """Return a scene with only these rules in a plane; on a torus, with the kernel that other tests share."""
     groups = (Group(count=count, spawn=Spawn(low=(0,) * dimension, high=(1,) * dimension)),)
     given = {"groups": groups, "obstacles": (), "dt": DT}
     if isinstance(space, Torus):
@@ -117,9 +117,9 @@ def forces(scene: Scene, state: State) -> Array:
 
 
 def assert_as_expected(effects: Any, x: Array, space: Space | None, wrapped: bool = False) -> State:
-    """Compare all forces of all agents; return the state after the step, for its counters.
+    """Compare all forces of all agents with the reference; return the state after the step, for its counters.
 
-    wrapped: some of them are outside of the box, which the oracle does not know how to search.
+    wrapped: some agents are outside of the periodic box, so the reference is given their images inside.
     """
     count, dimension = x.shape
     v = np.random.default_rng(1).normal(size=x.shape)
@@ -140,25 +140,25 @@ def uniform(count: int, size: Any, seed: int = 0) -> Array:
 @pytest.mark.parametrize("alone", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("rule", [0, 1, 2])
 @pytest.mark.parametrize("count", [50, 95, 96, 400, 3000])
-def test_in_a_plane_every_rule_meets_exactly_its_neighbours(rule: int, count: int, alone: bool) -> None:
-    """In a kernel of its own, or beside two that weigh nothing."""
+def test_in_a_plane_every_rule_acts_on_exactly_its_neighbours(rule: int, count: int, alone: bool) -> None:
+    """In its own kernel (alone), or beside two rules of weight 0."""
     edge = math.sqrt(count / 4)
     effects = (rules(1.0)[rule],) if alone else rules(1.0, chosen=rule)
     after = assert_as_expected(effects, uniform(count, (edge, edge)) - 3.0, None)
-    met = after.counted("pairs") / count**2
-    assert met == 1 if count < 96 else met < {96: 1.01, 400: 0.5, 3000: 0.06}[count]  # a grid was used at all
+    tested = after.counted("pairs") / count**2
+    assert tested == 1 if count < 96 else tested < {96: 1.01, 400: 0.5, 3000: 0.06}[count]  # a grid was used
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rule", [0, 1, 2])
-def test_in_space_too(rule: int) -> None:
+def test_in_three_dimensions_every_rule_acts_on_exactly_its_neighbours(rule: int) -> None:
     after = assert_as_expected((rules(1.0)[rule],), uniform(3000, (9.0, 9.0, 9.0)) - 3.0, None)
     assert after.counted("pairs") < 0.2 * 3000**2
 
 
 @pytest.mark.parametrize("count", [50, 400, 3000])
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_on_a_torus_all_rules_share_one_sweep(count: int, dimension: int) -> None:
+def test_on_a_torus_all_rules_share_one_neighbour_query(count: int, dimension: int) -> None:
     edge = (count / 4) ** (1 / dimension)
     size = np.array([1.0, 1.3, 0.9])[:dimension] * max(edge, 2.5)
     after = assert_as_expected(rules(1.0), uniform(count, size), Torus(size=tuple(size)))
@@ -170,7 +170,7 @@ MIXED = (
     Alignment(weight=1, radius=1.7, fov=120),
     Cohesion(weight=1, radius=1.1, fov=300),
 )
-"""Three rules that see differently."""
+"""Three rules with different radii and fields of view."""
 
 
 def test_rules_of_different_radii_share_the_widest_query() -> None:
@@ -180,12 +180,11 @@ def test_rules_of_different_radii_share_the_widest_query() -> None:
     _, widest, _ = MIXED
     narrow = [effect.model_copy(update={"radius": 1e-3}) for effect in MIXED]
     alone = assert_as_expected((narrow[0], widest, narrow[2]), uniform(700, space.size), space)
-    assert alone.counted("pairs") == after.counted("pairs")  # a law that looks less far adds nothing to the query
+    assert alone.counted("pairs") == after.counted("pairs")  # a smaller radius adds nothing to the query
 
 
 @pytest.mark.parametrize("count", [50, pytest.param(700, marks=pytest.mark.slow)])
-def test_an_effect_that_is_not_listed_changes_no_bits_and_no_counters(count: int) -> None:
-    """The three rules alone are what they are among others that weigh nothing."""
+def test_effects_of_weight_zero_change_no_bits_and_no_counters(count: int) -> None:
     space = Torus(size=(14.0, 11.0))
     among = scene_with(MIXED, space, 2, count)
     alone = among.with_effects(*MIXED)
@@ -197,10 +196,10 @@ def test_an_effect_that_is_not_listed_changes_no_bits_and_no_counters(count: int
     np.testing.assert_array_equal(ends[0].work, ends[1].work)
     listed = scene_of(*MIXED, space=space, obstacles=({"centre": (7, 5), "radius": 1},), groups=alone.groups, dt=DT)
     under = listed.run(listed.start(0), 3)
-    assert under.counted("obstacle_tests") == 0  # nobody asked for the obstacle
+    assert under.counted("obstacle_tests") == 0  # no effect of this scene needs the obstacle
 
 
-def test_in_a_box_too() -> None:
+def test_in_a_box_separation_acts_on_exactly_its_neighbours() -> None:
     space = Box(size=(20.0, 8.0))
     assert_as_expected((rules(1.0)[0],), uniform(800, (19.6, 7.6)) + 0.2, space)
 
@@ -208,11 +207,11 @@ def test_in_a_box_too() -> None:
 @pytest.mark.parametrize(
     "size",
     [
-        (2.0, 2.0),  # twice the reach: everybody within sight of his own image, almost
+        (2.0, 2.0),  # twice the reach: an agent almost reaches its own image
         (2.0, 30.0),
         (2.0001, 9.0),
         (3.0, 3.0),  # three cells are just too narrow
-        (3.0031, 3.0031),  # three cells just fit: a row's neighbours are all rows
+        (3.0031, 3.0031),  # three cells just fit: every row is a neighbour of every other
         (3.01, 40.0),
         (4.01, 4.01),
         (200.0, 3.1),  # elongated: cells in one row, and more cells than agents
@@ -220,21 +219,21 @@ def test_in_a_box_too() -> None:
         (1e4, 2.5),
     ],
 )
-def test_awkward_toruses(size: Any) -> None:
+def test_forces_are_right_on_awkward_toruses(size: Any) -> None:
     assert_as_expected(rules(1.0, fov=200), uniform(300, size), Torus(size=size))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [(2.0, 2.0, 2.0), (3.0031, 3.0031, 3.0031), (4.01, 3.01, 30.0), (60.0, 3.1, 3.1)])
-def test_awkward_toruses_in_space(size: Any) -> None:
+def test_forces_are_right_on_awkward_toruses_in_three_dimensions(size: Any) -> None:
     assert_as_expected(rules(1.0, fov=200), uniform(300, size), Torus(size=size))
 
 
 @pytest.mark.parametrize("absent", [0, 60])
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("size", [(1e3, 1e-3, 1e-3), (1e-3, 1e4, 1e-3), (1e6, 1e6, 1.0), (50.0, 50.0, 50.0), (1, 1, 1)])
-def test_a_query_writes_into_its_own_arrays_only(size: Any, dimension: int, absent: int) -> None:
-    """With guards behind every array: more cells than there is room for would show there."""
+def test_a_query_writes_only_into_its_own_arrays(size: Any, dimension: int, absent: int) -> None:
+    """Guards behind every array reveal a grid with more cells than the arrays have room for."""
     n, lanes, guard = 200, 16, 100_000
     blocks = -(-n // lanes)
     pos, living = np.zeros(blocks * lanes * dimension), np.r_[np.ones(n), np.zeros(blocks * lanes - n)]
@@ -283,7 +282,7 @@ def test_a_query_writes_into_its_own_arrays_only(size: Any, dimension: int, abse
 @pytest.mark.parametrize(
     "size",
     [
-        (1000.0, 1e-3),  # a queue of people: many times more cells than agents, all in one row
+        (1000.0, 1e-3),  # a queue: many more cells than agents, all in one row
         (1e-3, 1000.0),
         (1000.0, 0.0),
         (1e6, 1.0),
@@ -291,28 +290,28 @@ def test_a_query_writes_into_its_own_arrays_only(size: Any, dimension: int, abse
         (1e-9, 1e-9),
     ],
 )
-def test_elongated_crowds(size: Any) -> None:
+def test_forces_are_right_in_elongated_crowds(size: Any) -> None:
     assert_as_expected((rules(1.0)[0],), uniform(300, size), None)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [(1000.0, 1e-3, 1e-3), (1e-3, 300.0, 300.0), (1e-3, 1e-3, 1e5)])
-def test_elongated_crowds_in_space(size: Any) -> None:
+def test_forces_are_right_in_elongated_crowds_in_three_dimensions(size: Any) -> None:
     assert_as_expected((rules(1.0)[0],), uniform(300, size), None)
 
 
-def test_a_lone_runaway_does_not_spoil_the_grid() -> None:
+def test_one_agent_very_far_away_does_not_change_the_other_forces() -> None:
     x = uniform(500, (10.0, 10.0))
     x[7] = 1e12, -1e12
     assert_as_expected((rules(1.0)[0],), x, None)
 
 
 def on_edges(space: Torus, reach: float) -> Array:
-    """Agents on every corner of the cells, and one ulp to either side."""
+    """Return agents on every corner of the cells, and one ulp to either side."""
     axes = []
     for length in space.size:
         edges = np.arange(int(length / (reach * 1.001))) * (length / int(length / (reach * 1.001)))
-        after = np.maximum(np.nextafter(edges, 1e9), 1e-16)  # after 0 comes a number whose square is 0
+        after = np.maximum(np.nextafter(edges, 1e9), 1e-16)  # the float after 0 has the square 0
         edges = np.concatenate([edges, after, np.nextafter(edges, -1e9)])
         axes.append(edges[(edges >= 0) & (edges < length)])
     corners = np.stack([g.ravel() for g in np.meshgrid(*axes)], axis=1)
@@ -320,8 +319,8 @@ def on_edges(space: Torus, reach: float) -> Array:
 
 
 @pytest.mark.parametrize("size", [(5.005, 6.0), (8.009, 9.0), (3.1, 20.0)])
-def test_agents_on_the_edges_of_cells(size: Any) -> None:
-    """They are ulps apart: cohesion and alignment, because pushes of 1e15 N would hide the others."""
+def test_forces_are_right_for_agents_on_the_edges_of_cells(size: Any) -> None:
+    """The agents are ulps apart, so separation has weight 0: forces of 1e15 N would hide the others."""
     space = Torus(size=size)
     x = on_edges(space, 1.0)
     assert len(x) > 96
@@ -331,8 +330,8 @@ def test_agents_on_the_edges_of_cells(size: Any) -> None:
 
 @pytest.mark.parametrize("nudge", [-1e-17, 0.0, 5e-324, 1e-17])
 @pytest.mark.parametrize("axis", [0, 1])
-def test_agents_a_hair_beyond_the_edge_of_the_box(nudge: float, axis: int) -> None:
-    """-1e-17 is brought to 0: sorted into the last cell it would not be met by its neighbours beyond the edge."""
+def test_forces_are_right_for_agents_just_beyond_the_edge_of_the_box(nudge: float, axis: int) -> None:
+    """-1e-17 must be wrapped to 0: in the last cell the agent would miss its neighbours across the edge."""
     space = Torus(size=(10.0, 10.0))
     x = uniform(1500, space.size)
     x[:15, axis], x[15:30, axis] = nudge, 10.0 + nudge
@@ -340,7 +339,7 @@ def test_agents_a_hair_beyond_the_edge_of_the_box(nudge: float, axis: int) -> No
     assert after.counted("pairs") < 0.5 * 1500**2
 
 
-def test_exactly_at_the_radius_is_outside() -> None:
+def test_a_neighbour_exactly_at_the_radius_is_out_of_range() -> None:
     scene = scene_with((rules(1.0)[0],), None, 2, 2)
     for distance, push in ((1.0, 0.0), (np.nextafter(1.0, 0.0), -1.3)):
         found = forces(scene, placed(scene, np.array([[0.0, 0.0], [distance, 0.0]]), np.zeros((2, 2))))
@@ -349,18 +348,18 @@ def test_exactly_at_the_radius_is_outside() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [50, 200])
-def test_everybody_in_one_place(count: int) -> None:
-    """Two velocities, one place: everybody's neighbours are all the others."""
+def test_alignment_if_all_agents_are_in_one_place(count: int) -> None:
+    """Every agent has all others as neighbours, and they have two different velocities."""
     x, v = np.full((count, 2), 4.0), np.zeros((count, 2))
     v[: count // 2, 0] = 1.0
-    scene = scene_with((rules(1.0)[1],), None, 2, count)  # one place is in everybody's view
+    scene = scene_with((rules(1.0)[1],), None, 2, count)  # an agent in the same place is always in view
     found = forces(scene, placed(scene, x, v))
     mean = (v.sum(axis=0) - v) / (count - 1)
     np.testing.assert_allclose(found, 0.7 * (mean - v), atol=1e-12)
 
 
 @pytest.mark.parametrize("count", [60, 600])
-def test_the_dead_are_no_neighbours(count: int) -> None:
+def test_dead_agents_are_no_neighbours(count: int) -> None:
     x, v = uniform(count, (9.0, 9.0)), np.zeros((count, 2))
     living = np.random.default_rng(3).random(count) < 0.6
     scene = scene_with((rules(1.0)[0],), None, 2, count)
@@ -372,7 +371,7 @@ def test_the_dead_are_no_neighbours(count: int) -> None:
 
 
 @pytest.mark.parametrize("living", [0, 1, 2])
-def test_almost_nobody_left(living: int) -> None:
+def test_forces_are_finite_if_at_most_two_agents_are_alive(living: int) -> None:
     scene = scene_with((rules(1.0)[0],), None, 2, 120)
     state = placed(scene, uniform(120, (0.5, 0.5)), np.zeros((120, 2)))
     state.alive[0, living:] = False
@@ -383,23 +382,23 @@ def test_almost_nobody_left(living: int) -> None:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_the_grid_finds_what_brute_force_finds(dimension: int) -> None:
-    """A rule without weight that looks far makes the query too wide for a grid: the same forces, every pair met."""
+    """A rule of weight 0 with a large radius makes the query too wide for a grid; the forces must not change."""
     size = (8.0, 9.0, 10.0)[:dimension]
     x, v = uniform(1000, size), np.zeros((1000, dimension))
-    found, met = [], []
+    found, tested = [], []
     for far in (1e-3, 4.0):
         separation, alignment = Separation(weight=1, radius=1), Alignment(weight=1, radius=1, fov=270)
         effects = (separation, alignment, Cohesion(weight=0, radius=far, fov=240))
         scene = scene_with(effects, Torus(size=size), dimension, 1000)
         state = placed(scene, x, v)
         found.append(forces(scene, state))
-        met.append(scene.step(state).counted("pairs"))
+        tested.append(scene.step(state).counted("pairs"))
     np.testing.assert_allclose(found[0], found[1], atol=1e-9)
-    assert met[1] == 1000**2
-    assert met[0] < met[1] / (4 if dimension == 2 else 8)
+    assert tested[1] == 1000**2
+    assert tested[0] < tested[1] / (4 if dimension == 2 else 8)
 
 
-def test_worlds_of_a_batch_are_searched_apart() -> None:
+def test_agents_of_other_worlds_in_a_batch_are_no_neighbours() -> None:
     scene = scene_with((rules(1.0)[0],), None, 2, 200)
     state = scene.start(0, worlds=3)
     state.pos[...] = uniform(600, (20.0, 20.0)).reshape(3, 200, 2)
@@ -417,13 +416,13 @@ FEW = pytest.mark.parametrize(
 
 
 ONE_LONG_STEP = pytest.mark.filterwarnings("ignore::flockenv.core.warnings.UnstableStepWarning")
-"""A step of 1 s shows an acceleration; nothing goes on from there."""
+"""One step of 1 s shows the acceleration; its result is not used further."""
 
 
 def one_at_a_time(variant: Variant, count: int, edge: float) -> list[tuple[Any, Scene]]:
-    """Every rule of a variant, and a scene in which the others are there and weigh nothing; a step of 1 s, no limits.
+    """Return every rule of a variant with a scene in which the others have weight 0; one step of 1 s, no limits.
 
-    One step of any first-order method changes velocities by dt times the acceleration at the start.
+    One step of any first-order method changes a velocity by dt times the acceleration at the start.
     """
     scenes = []
     for rule in variant.effects:
@@ -435,7 +434,7 @@ def one_at_a_time(variant: Variant, count: int, edge: float) -> list[tuple[Any, 
 
 
 def doubtful(rule: Any, x: Array, v: Array, space: Space, hair: float) -> Array:
-    """Who has somebody within a hair of where sight ends, (N,): there the last bit of a distance decides."""
+    """Return which agents (N,) have a neighbour so near the limit of sight that rounding decides whether it is seen."""
     found = []
     for wide in (1 - hair, 1 + hair):
         changed = rule.model_copy(update={"radius": rule.radius * wide, "fov": min(rule.fov * wide, 360.0)})
@@ -445,7 +444,7 @@ def doubtful(rule: Any, x: Array, v: Array, space: Space, hair: float) -> Array:
 
 
 def assert_few_as_expected(variant: Variant, x: Array, edge: float, hair: float = 1e-6) -> State:
-    """Compare every rule of a variant by itself, at positions that are numbers of its precision; return the last."""
+    """Compare every rule of a variant by itself with the reference; return the state after the last step."""
     v = np.random.default_rng(1).normal(size=x.shape).astype(variant.dtype)
     x = x.astype(variant.dtype)
     for rule, scene in one_at_a_time(variant, len(x), edge):
@@ -464,8 +463,8 @@ def assert_few_as_expected(variant: Variant, x: Array, edge: float, hair: float 
 @ONE_LONG_STEP
 @pytest.mark.parametrize("count", [1, 2, 5, 40, 95, 96, 1500])
 @FEW
-def test_the_nearest_few_are_the_oracle_s(variant: Variant, count: int) -> None:
-    """From fewer than anybody asks for to far more; through sorted cells too."""
+def test_the_nearest_few_are_those_of_the_reference(variant: Variant, count: int) -> None:
+    """From fewer agents than the nearest few to far more, by brute force and by cell list."""
     edge = max(7.0, (count / 1.5) ** 0.5) if variant.dimension == 2 else max(7.0, (count / 0.3) ** (1 / 3))
     x = uniform(count, (edge,) * variant.dimension) * 0.999
     after = assert_few_as_expected(variant, x, edge)
@@ -476,8 +475,8 @@ def test_the_nearest_few_are_the_oracle_s(variant: Variant, count: int) -> None:
 @ONE_LONG_STEP
 @FEW
 @pytest.mark.parametrize("share", [0.4, 1.0])
-def test_whoever_is_exactly_as_far_as_the_last_counts_too(variant: Variant, share: float) -> None:
-    """On a grid of points, whole or with holes, all distances are exact and most of them tie."""
+def test_neighbours_exactly_as_far_as_the_last_are_included(variant: Variant, share: float) -> None:
+    """On a grid of points, complete or with holes, all distances are exact and most of them tie."""
     side = 16 if variant.dimension == 2 else 8
     points = np.stack(np.meshgrid(*[np.arange(side)] * variant.dimension, indexing="ij"), axis=-1)
     x = points.reshape(-1, variant.dimension) + 0.25
@@ -508,7 +507,7 @@ def test_the_nearest_few_are_found_among_the_living(variant: Variant) -> None:
 
 
 @pytest.mark.parametrize("nearest", [0, 33, -1, 2.5, True, "6"])
-def test_a_number_of_nearest_ones_that_is_none_is_refused(nearest: Any) -> None:
+def test_an_invalid_number_of_nearest_neighbours_is_refused(nearest: Any) -> None:
     with pytest.raises(ValueError, match="nearest") as caught:
         Cohesion(weight=1, radius=1, nearest=nearest)
     assert "\n" not in str(caught.value)
@@ -520,7 +519,7 @@ def test_a_number_of_nearest_ones_that_is_none_is_refused(nearest: Any) -> None:
 @pytest.mark.parametrize("count", [60, 1500])
 @pytest.mark.parametrize("name", ["torus_single", "plane_single", "plane_3_single"])
 @pytest.mark.parametrize("rule", [0, 1, 2])
-def test_single_precision_meets_exactly_its_neighbours_too(name: str, rule: int, count: int) -> None:
+def test_in_single_precision_every_rule_acts_on_exactly_its_neighbours(name: str, rule: int, count: int) -> None:
     variant = next(v for v in VARIANTS if v.name == name)
     d, eps = variant.dimension, np.finfo(np.float32).eps
     edge = max(7.0, (count / 2) ** (1 / d))
@@ -536,21 +535,21 @@ def test_single_precision_meets_exactly_its_neighbours_too(name: str, rule: int,
     exact = expected(chosen[rule], x.astype(float), v.astype(float), space)
     sure = ~doubtful(chosen[rule], x.astype(float), v.astype(float), space, 1e-6)
     assert sure.mean() > 0.98
-    # a force is a sum of terms, each right to some bits; a push by somebody at 1 mm is 1000 N, and its bits are coarse
+    # each term of the sum is right to some bits; a neighbour at 1 mm contributes 1000 N, whose last bits are coarse
     assert np.abs((after.vel - state.vel)[0] - exact)[sure].max() <= 50 * eps * max(
         np.abs(exact).max(), np.abs(v).max()
     )
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize("share", [0.0, 0.05, 0.3, 1.0])  # of agents that come out of turn
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.3, 1.0])  # of agents that are out of order
 @pytest.mark.parametrize("cells", [1, 30, 200, 1000])
-def test_records_come_in_the_order_of_numbers_within_each_cell(cells: int, share: float, dtype: str) -> None:
+def test_records_are_ordered_by_agent_number_within_each_cell(cells: int, share: float, dtype: str) -> None:
     rng, length, count = np.random.default_rng(cells), 4, 400
     cell, ident = np.sort(rng.integers(0, cells, count)), rng.permutation(count).astype(dtype)
     place = rng.permutation(count)
     place = place[np.lexsort((ident[place], cell))]
-    for k in rng.permutation(count)[: int(share * count)]:  # changes places with another one of his cell
+    for k in rng.permutation(count)[: int(share * count)]:  # swaps places with another agent of its cell
         other = rng.choice(np.flatnonzero(cell == cell[k]))
         place[[k, other]] = place[[other, k]]
     records = np.column_stack([place, place + 0.5, place + 0.25, -place]).astype(dtype)
@@ -560,9 +559,9 @@ def test_records_come_in_the_order_of_numbers_within_each_cell(cells: int, share
     expected = records.copy()
     turn = np.lexsort((ident[place[first:end]], cell[first:end]))
     expected[first:end] = records[first:end][turn]
-    flat, late = records.reshape(-1).copy(), np.full(end - first, -7, np.int32)  # one more than can be out of turn
+    flat, late = records.reshape(-1).copy(), np.full(end - first, -7, np.int32)  # one more than can be out of order
     order = entry(order_records)
-    order(flat, by_place, ident, length, first, first, late)  # nobody: nothing happens
+    order(flat, by_place, ident, length, first, first, late)  # no agents: nothing changes
     np.testing.assert_array_equal(flat, records.reshape(-1))
     order(flat, by_place, ident, length, first, end, late)
     np.testing.assert_array_equal(flat.reshape(count, length), expected)
@@ -571,8 +570,8 @@ def test_records_come_in_the_order_of_numbers_within_each_cell(cells: int, share
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("fov", [60, 180, 270, 350])
-def test_the_edge_of_a_field_of_view_is_in_it_in_every_direction(fov: float, dtype: str) -> None:
-    """Neighbours exactly on the edge are seen, those a little outside it are not, in both precisions."""
+def test_the_edge_of_a_field_of_view_belongs_to_it_in_every_direction(fov: float, dtype: str) -> None:
+    """In both precisions; neighbours slightly outside are not seen."""
     scene = scene_with((Alignment(weight=1, radius=3, fov=fov),), None, 2, 2).model_copy(update={"dtype": dtype})
     start, seen = scene.start(0), []
     for course in np.linspace(0, 2 * np.pi, 61):

@@ -1,4 +1,4 @@
-"""Agents in one place: they part along their ties and count as neighbours; whoever is elsewhere is met without ties."""
+"""Agents in one place: they part along their ties and count as neighbours; other pairs are computed without ties."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from tests.catalogue import EFFECTS, scene_under, users_module
 
 RULES = (Separation(weight=1.5, radius=1.5), Alignment(weight=0.6, radius=2), Cohesion(weight=0.2, radius=2.5))
 SIZE = 20.0
-STACKS = ((3, 5), (2, 8, 9), (0, 1, 4, 6))  # who is where somebody else is
+STACKS = ((3, 5), (2, 8, 9), (0, 1, 4, 6))  # numbers of the agents that share a place
 
 
 def crowd(
     count: int, dimension: int, dtype: str, torus: bool, *effects: Effect, drawn: float = 6.0
 ) -> tuple[Scene, State]:
-    """Return agents near a corner of the box, some of whom are in one place, and some at its edge."""
+    """Return agents near a corner of the box: some of them share a place, and some are at the edge of the box."""
     space = Torus(size=(SIZE,) * dimension) if torus else Plane()
     spawn = Spawn(low=(0.0,) * dimension, high=(drawn,) * dimension)
     group = Group(count=count, mass=1, max_speed=100, max_force=1e6, spawn=spawn)
@@ -43,14 +43,14 @@ def crowd(
     state.x[:, 0] = rng.uniform(0, drawn, (dimension, count))
     state.v[:, 0] = rng.uniform(-1, 1, (dimension, count))
     for stack in STACKS:
-        for who in stack:
-            state.x[:, 0, who] = state.x[:, 0, stack[0]]
+        for agent in stack:
+            state.x[:, 0, agent] = state.x[:, 0, stack[0]]
     state.x[:, 0, [0, 1, 4, 6]] = 0.0  # at the corner of the box
     return scene, state
 
 
 def expected(scene: Scene, state: State) -> Any:
-    """The three rules by the book, agent by agent, in double precision."""
+    """Return the acceleration from the formulas of the three rules, agent by agent, in double precision."""
     x, v, d = state.pos[0].astype(float), state.vel[0].astype(float), scene.dimension
     tie, out = ties(len(x), d), np.zeros((len(x), d))
     for i in range(len(x)):
@@ -75,7 +75,7 @@ def expected(scene: Scene, state: State) -> Any:
      pytest.param(700, 3, "float32", True, marks=pytest.mark.slow),
      pytest.param(33, 3, "float64", False, marks=pytest.mark.slow)],
 )  # fmt: skip
-def test_the_three_rules_are_what_they_are_by_the_book(count: int, dimension: int, dtype: str, torus: bool) -> None:
+def test_the_three_rules_follow_their_formulas(count: int, dimension: int, dtype: str, torus: bool) -> None:
     scene, state = crowd(count, dimension, dtype, torus, drawn=6.0 if count < 100 else SIZE)
     assert scene.parts.parting
     found, by_the_book = scene.acceleration(state)[0], expected(scene, state)
@@ -85,8 +85,8 @@ def test_the_three_rules_are_what_they_are_by_the_book(count: int, dimension: in
         assert len(np.unique(found[list(stack)].round(3), axis=0)) == len(stack)  # they part
 
 
-def test_all_in_one_place_part_with_no_force_left_over() -> None:
-    """More than fill a block."""
+def test_all_agents_in_one_place_part_with_zero_total_force() -> None:
+    """The 40 agents fill more than one block."""
     scene, state = crowd(40, 2, "float64", False, RULES[0])
     state.x[...] = 3.0
     found = scene.acceleration(state)[0]
@@ -96,7 +96,7 @@ def test_all_in_one_place_part_with_no_force_left_over() -> None:
 
 
 @pytest.mark.parametrize("nearest", [1, 2])
-def test_who_is_in_one_place_is_among_the_nearest(nearest: int) -> None:
+def test_agents_in_the_same_place_are_among_the_nearest(nearest: int) -> None:
     scene, state = crowd(
         10, 2, "float64", False, Cohesion(weight=1, radius=9), Separation(weight=1, radius=9, nearest=nearest)
     )
@@ -107,12 +107,12 @@ def test_who_is_in_one_place_is_among_the_nearest(nearest: int) -> None:
     pair = STACKS[0]
     if nearest == 1:
         np.testing.assert_allclose(push[pair[0]], tie[pair[0]] - tie[pair[1]], atol=1e-12)
-    else:  # of a stack of three, each sees both others and nobody else
-        for who in STACKS[1]:
-            np.testing.assert_allclose(push[who], sum(tie[who] - tie[k] for k in STACKS[1]), atol=1e-12)
+    else:  # each of a stack of three sees only the other two
+        for agent in STACKS[1]:
+            np.testing.assert_allclose(push[agent], sum(tie[agent] - tie[k] for k in STACKS[1]), atol=1e-12)
 
 
-def test_absent_agents_are_in_nobodys_place() -> None:
+def test_absent_agents_push_no_agent_in_the_same_place() -> None:
     scene, state = crowd(10, 2, "float64", False)
     whole = scene.acceleration(state)[0]
     state.alive[0, 5] = False
@@ -127,8 +127,8 @@ def test_absent_agents_are_in_nobodys_place() -> None:
 
 
 @pytest.mark.parametrize("count", [700, WORTH_ARRANGING + 3])
-def test_steps_in_one_call_are_calls_of_one_where_many_are_in_one_place(count: int) -> None:
-    """Even where agents lie in another order during the call: their ties are found by their numbers."""
+def test_one_call_of_four_steps_equals_four_calls_if_agents_share_a_place(count: int) -> None:
+    """A call may sort agents in memory: ties belong to agent numbers, not to places in memory."""
     scene, state = crowd(count, 2, "float64", True, drawn=SIZE)
     state.x[:, 0, 100:130] = state.x[:, 0, 100:101]
     one = scene.step(state, steps=4)
@@ -139,10 +139,10 @@ def test_steps_in_one_call_are_calls_of_one_where_many_are_in_one_place(count: i
     np.testing.assert_array_equal(one.v, state.v)
 
 
-def test_what_lies_in_records_beyond_the_last_agent_is_nobodys_business() -> None:
-    """Lanes of a block that is not full hold it: no place in memory is looked up by it."""
+def test_records_beyond_the_last_agent_change_no_result() -> None:
+    """The unused lanes of the last block hold such records; their values must not be used as indices."""
     scene, state = crowd(700, 2, "float64", True, drawn=SIZE)
-    state.x[:, 0, [50, 51]] = SIZE - 1e-3  # in the last cell of all
+    state.x[:, 0, [50, 51]] = SIZE - 1e-3  # in the very last cell
     state.alive[0, 600:] = False
     expected_ = scene.acceleration(state)
     scene.stepper.workspaces(1, 1)[0].arrays["records"][:] = 1e12
@@ -181,15 +181,15 @@ class Tied(Separation):
 """
 
 
-def test_who_reads_ties_of_others_than_those_in_one_place_has_them_at_hand(tmp_path: Path) -> None:
+def test_ties_are_sorted_with_the_agents_if_the_law_of_agents_elsewhere_reads_them(tmp_path: Path) -> None:
     with users_module(tmp_path, TIED, "tied_laws") as laws:
         scene, _ = crowd(700, 2, "float64", True, laws.Tied(weight=1.0, radius=1.0))
         assert not scene.parts.parting
         assert {"t0", "t1"} <= set(scene.parts.sorted_fields)
 
 
-def test_who_is_outside_of_the_box_is_where_his_image_is() -> None:
-    """Of accelerations that are asked for; a step begins by putting everybody into the box."""
+def test_an_agent_outside_of_the_box_counts_as_its_image_inside() -> None:
+    """This matters for `acceleration` only: a step first moves all agents into the box."""
     scene, state = crowd(700, 2, "float64", True, drawn=SIZE)
     rng = np.random.default_rng(5)
     state.x[...] = np.round(state.x * 2**20) / 2**20  # so that images are exact
@@ -201,7 +201,7 @@ def test_who_is_outside_of_the_box_is_where_his_image_is() -> None:
 
 
 @pytest.mark.parametrize("place", [np.nan, np.inf, -np.inf])
-def test_who_is_nowhere_is_asked_without_a_warning_and_is_nobodys_neighbour(place: float) -> None:
+def test_an_agent_that_is_not_finite_is_no_neighbour_and_raises_no_warning(place: float) -> None:
     scene, state = crowd(700, 2, "float64", True, drawn=SIZE)
     without = state.copy()
     without.alive[0, 5] = False
@@ -226,15 +226,15 @@ def test_two_threads_and_a_view_cone_change_nothing() -> None:
     assert np.unique(two.x[:, 0, 100:130], axis=1).shape[1] == 30
 
 
-def test_a_block_counts_anew_who_is_in_its_places() -> None:
-    """Else all blocks after the first would go through their candidates twice, and no result would tell."""
+def test_the_counts_of_agents_in_the_same_place_start_at_zero_for_each_block() -> None:
+    """Otherwise blocks after the first would visit their candidates twice, and no result would show it."""
     scene, _ = crowd(10, 2, "float64", False)
     plan = pairs_of(scene.parts)
     lanes, first = np.full(len(scene.parts.slots) * plan.lanes, 7.0), int(plan.listing.slot("here0"))
     begin, numbers, block = begin_sums(plan), namedtuple("N", "reach")(1.0), namedtuple("B", "lanes")(lanes)  # type: ignore[call-arg]
     njit(lambda numbers, block: begin(numbers, (), block))(numbers, block)
     assert (lanes[first : first + plan.lanes] == 0).all()
-    assert (lanes == 7).any()  # what is no running number of the sweep stays
+    assert (lanes == 7).any()  # all other numbers of the block stay
 
 
 WITH_BOTH = [row for row in EFFECTS if row.effect.apart_law is not None]
@@ -242,8 +242,8 @@ WITH_BOTH = [row for row in EFFECTS if row.effect.apart_law is not None]
 
 @pytest.mark.parametrize("row", WITH_BOTH, ids=lambda row: row.name)
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_a_law_of_those_elsewhere_is_the_law(row: Any, dimension: int) -> None:
-    """Whatever ties are."""
+def test_the_law_for_agents_elsewhere_equals_the_pair_law(row: Any, dimension: int) -> None:
+    """For arbitrary ties."""
     effect = next(e for e in scene_under(row, dimension).parts.effects if e.kind == row.effect.kind)
     whole, elsewhere = effect.pair_law, effect.apart_law
     numbers = effect.parameters()
@@ -257,7 +257,7 @@ def test_a_law_of_those_elsewhere_is_the_law(row: Any, dimension: int) -> None:
         return tuple(rng.normal(size=dimension).tolist())
 
     for k in range(20):
-        offset = tuple(x * (1.0, 3e-15)[k % 2] for x in drawn())  # some so near that they are hardly in two places
+        offset = tuple(x * (1.0, 3e-15)[k % 2] for x in drawn())  # half of the offsets are barely longer than zero
         square = sum(x * x for x in offset)
         assert square > ONE_PLACE
         me = Me(0.0, drawn(), drawn(), drawn(), 1.0, 0.3, 2.0, 4.0, drawn(), 0.0, drawn(), 0, drawn(), 1.3, ())
@@ -270,8 +270,8 @@ VANISHING = [row for row in EFFECTS if row.effect.vanishes]
 
 @pytest.mark.parametrize("row", VANISHING, ids=lambda row: row.name)
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_a_law_that_vanishes_says_nothing_of_who_is_infinitely_far(row: Any, dimension: int) -> None:
-    """Wherever he is: so is he told of whom nobody sees."""
+def test_a_law_that_vanishes_is_zero_at_an_infinite_distance(row: Any, dimension: int) -> None:
+    """For any offset: steps pass an infinite square for agents out of sight."""
     effect = next(e for e in scene_under(row, dimension).parts.effects if e.kind == row.effect.kind)
     whole, elsewhere = effect.pair_law, effect.apart_law or effect.pair_law
     numbers, rng = effect.parameters(), np.random.default_rng(0)
@@ -287,13 +287,13 @@ def test_a_law_that_vanishes_says_nothing_of_who_is_infinitely_far(row: Any, dim
     for scale in (0.0, 1e-20, 1.0, 1e20):
         offset = tuple(scale * x for x in drawn())
         me = Me(0.0, drawn(), drawn(), drawn(), 1.0, 0.3, 2.0, 4.0, drawn(), 0.0, drawn(), 0, drawn(), 1.3, ())
-        for said in both(p, me, Other(1.0, offset, np.inf, drawn(), 0.3, drawn(), 1.0, ())):
-            assert not any(said)
+        for result in both(p, me, Other(1.0, offset, np.inf, drawn(), 0.3, drawn(), 1.0, ())):
+            assert not any(result)
 
 
 @pytest.mark.slow
-def test_who_is_nowhere_is_named_though_others_see_him() -> None:
-    """Laws that vanish make no number of him; where a method asks several times they are told whom they are about."""
+def test_the_agent_at_nan_is_named_although_neighbours_see_it() -> None:
+    """Laws that vanish give NaN for it; methods of several stages mask it instead (`trusts` is False)."""
     scene, state = crowd(40, 2, "float64", False)
     state.x[0, 0, 7] = np.nan
     with pytest.raises(SimulationDiverged, match="agent 7"):
@@ -305,8 +305,8 @@ def test_who_is_nowhere_is_named_though_others_see_him() -> None:
         several.step(state)
 
 
-def test_who_falls_in_a_call_of_many_steps_is_named_though_others_follow() -> None:
-    """By the kernel itself: a task has nobody who makes the steps again, one by one."""
+def test_the_first_agent_that_diverges_is_named_in_a_call_of_many_steps() -> None:
+    """By the kernel itself: a task does not repeat the steps one by one."""
     scene, state = crowd(40, 2, "float64", False, RULES[0])
     assert scene.parts.spreads
     state.v[1, 0, 7] = np.nan
@@ -314,8 +314,8 @@ def test_who_falls_in_a_call_of_many_steps_is_named_though_others_follow() -> No
         assert scene.stepper.advance(state.copy(), np.zeros((2, 0, 0)), steps)[:2] == (0, 7)
 
 
-def test_equal_sights_are_counted_once() -> None:
-    """Alignment and cohesion within one radius; and each by itself within another."""
+def test_neighbours_of_equal_sights_are_counted_once() -> None:
+    """Alignment and cohesion share a count if their radii are equal."""
     far = Cohesion(weight=0.2, radius=2.5)
     for rules, many in (((RULES[1], RULES[2]), 2), ((RULES[1], far.model_copy(update={"radius": 2})), 1)):
         scene, state = crowd(10, 2, "float64", False, *rules)
@@ -324,8 +324,8 @@ def test_equal_sights_are_counted_once() -> None:
         np.testing.assert_allclose(scene.acceleration(state), sum(each), atol=1e-12)
 
 
-def test_laws_that_know_only_one_form_are_met_as_ever() -> None:
-    assert not crowd(10, 2, "float64", False, RULES[1])[0].parts.parting  # nobody reads ties
+def test_scenes_with_a_law_of_one_form_have_no_separate_pass_for_one_place() -> None:
+    assert not crowd(10, 2, "float64", False, RULES[1])[0].parts.parting  # no law reads ties
     kinds = {row.effect.kind: row.effect for row in EFFECTS}
     for kind in ("pressure", "contact"):
         assert not crowd(10, 2, "float64", False, RULES[0], kinds[kind])[0].parts.parting
