@@ -1,4 +1,4 @@
-"""What nobody may do, whatever method integrates him: move faster than max_speed, vanish, or act when dead."""
+"""Under every method, agents do not exceed max_speed, do not vanish, and do not act when dead."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ QUICK = ("semi_implicit_euler",)
 @pytest.mark.parametrize(
     "kind", [kind if kind in QUICK else pytest.param(kind, marks=pytest.mark.slow) for kind in sorted(INTEGRATORS)]
 )
-def test_nobody_moves_faster_than_max_speed_by_pushing_on(kind: str) -> None:
+def test_no_method_lets_an_agent_exceed_max_speed(kind: str) -> None:
     walker = Group(count=1, max_speed=2, max_force=10, spawn=HERE)
     scene = Scene(groups=(walker,), dt=0.1, integrator=INTEGRATORS[kind]())
     state, fastest = scene.start(0), 0.0
@@ -33,7 +33,7 @@ def test_nobody_moves_faster_than_max_speed_by_pushing_on(kind: str) -> None:
     assert fastest == pytest.approx(2.0, rel=1e-9)
 
 
-def test_a_learner_that_pushes_on_gains_nothing_over_its_speed() -> None:
+def test_a_learner_does_not_exceed_its_max_speed() -> None:
     task = Pursuit(size=200)
     world = World(task)
     world.reset(3)
@@ -43,13 +43,13 @@ def test_a_learner_that_pushes_on_gains_nothing_over_its_speed() -> None:
         assert np.linalg.norm(world.state.pos[0, 0] - before) <= task.pursuer_speed * task.control_dt * (1 + 1e-9)
 
 
-def test_walls_do_not_hide_a_divergence() -> None:
+def test_the_walls_of_a_box_do_not_hide_a_divergence() -> None:
     scene = Scene(space=Box(size=(20, 20)), groups=(Group(count=1, mass=1e-150, spawn=HERE),))
     with pytest.raises(FloatingPointError, match="world 0, agent 0"):
         scene.step(scene.start(0), drive=np.full((1, 1, 2), 1e200))
 
 
-def test_the_dead_stay_where_they_are() -> None:
+def test_dead_agents_do_not_move() -> None:
     scene = Scene(space=Box(size=(20, 20)), groups=(Group(count=2, spawn=Spawn(speed=(1, 1))),))
     state = scene.start(0)
     state.alive[0, 1] = False
@@ -58,7 +58,7 @@ def test_the_dead_stay_where_they_are() -> None:
     assert np.linalg.norm(after.pos[0, 0] - state.pos[0, 0]) > 0.1
 
 
-def test_nobody_begins_in_the_periodic_image_of_an_obstacle() -> None:
+def test_no_agent_starts_in_the_periodic_image_of_an_obstacle() -> None:
     scene = Scene(space=Torus(size=(20, 20)), groups=(Group(count=300),), obstacles=(Circle(centre=(0, 0), radius=4),))
     gaps = np.linalg.norm(scene.space.displacement(scene.start(1).pos[0], np.zeros(2)), axis=1)
     assert gaps.min() >= 4.1

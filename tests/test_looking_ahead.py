@@ -1,4 +1,4 @@
-"""Working out how far the next candidate is while one is met."""
+"""`looks_ahead`: the distance of the next candidate is computed before the present one is finished."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from flockenv.scene import Group, Scene
 @pytest.mark.skipif(not KernelPlan(2, Plane(), (), SemiImplicitEuler()).masks, reason="only with AVX-512")
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("agents", [17, 95])  # from 96 on they are sorted by cell
-def test_working_out_the_next_candidate_early_moves_no_bit(
+def test_computing_the_next_distance_early_changes_no_bits(
     agents: int, dtype: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What lies behind the last one of a row is read, and looked at by nobody; some are dead, two are in one place."""
+    """Numbers behind the last candidate of a row are read but not used; some agents are dead, two are in one place."""
     rules = (Separation(weight=1, radius=1, fov=270), Alignment(weight=1, radius=2), Cohesion(weight=1, radius=3))
     group = Group(count=agents, spawn=Spawn(low=(0, 0), high=(6, 6), speed=(1, 2)))
 

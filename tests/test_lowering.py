@@ -1,4 +1,4 @@
-"""Arrays, loops and calls, told to LLVM in fewer words: what comes out is what numba makes, and what numpy says."""
+"""Shorter LLVM code for arrays, loops and calls: results equal those of numba's own code and of numpy."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ PLACES = {
     ],
     3: ["i, u, i", ":, i", "i, j", ":, :, i", "i", "i, :, u", ":0", "1:, i, :2", ":, 0", "0, 1, 2", "0, 1", ":, 1:, i"],
 }  # fmt: skip
-"""Indices by the dimensions of the array; the last ones of a row are left to numba."""
+"""Indices by the dimensions of the array; for the last ones of a row, numba's own code is used."""
 
 ARRAYS = {
     "contiguous": np.arange(7.0),
     "strided": np.arange(14.0)[::2],
-    "of_whole_numbers": np.arange(6, dtype=np.int32),
+    "of_integers": np.arange(6, dtype=np.int32),
     "table": np.arange(12.0).reshape(3, 4),
     "every_second_column": np.arange(24.0).reshape(3, 8)[:, ::2],
     "of_single_precision": np.arange(12, dtype=np.float32).reshape(3, 4),
@@ -55,17 +55,17 @@ REPORTS = {
                 out[{n}, 4 + 81 * q + 9 * w + z] = r[q, w, z]
 """,
 }
-"""What is written down of a part of an array, by its dimensions."""
+"""Code that records a part of an array, by its dimensions."""
 
 
 def compiled_whole(function: Callable[..., Any]) -> Any:
-    """Return an entry point."""
+    """Return the function compiled as an entry point."""
     options: Any = {"pipeline_class": Whole, "error_model": "numpy", "_nrt": False}
     return numba.njit(**options)(function)
 
 
 def looking_at(array: Any) -> Callable[..., None]:
-    """Return a function that looks at all of those parts of an array, and writes down what it sees."""
+    """Return a function that reads all parts PLACES of an array and records them."""
     text = "def looking(a, i, j, k, u, out):\n"
     for n, places in enumerate(PLACES[array.ndim]):
         dimension = np.ndim(eval(f"a[{places}]", {"a": array, "i": 1, "j": 1, "k": np.int32(1), "u": np.uint64(1)}))  # noqa: S307
@@ -81,7 +81,7 @@ def looking_at(array: Any) -> Callable[..., None]:
 
 
 @pytest.mark.parametrize("array", ARRAYS.values(), ids=ARRAYS)
-def test_parts_of_arrays_are_where_numpy_says(array: Any) -> None:
+def test_parts_of_arrays_are_those_of_numpy(array: Any) -> None:
     looking = looking_at(array)
     compiled = compiled_whole(looking)
     for i, j in ((1, 1), (0, 2), (-1, 0)):
@@ -103,7 +103,7 @@ def writing(line: Any, table: Any, flags: Any, i: int, u: Any) -> None:
     flags[i - 1] = table[0, 0] > 100
 
 
-def test_numbers_are_written_where_numpy_writes_them() -> None:
+def test_numbers_are_written_to_the_same_places_as_by_numpy() -> None:
     compiled = compiled_whole(writing)
     for kind in (np.float32, np.float64):
         for step in (1, 2):
@@ -151,7 +151,7 @@ def looping(out: Any, low: int, high: int, u: Any) -> int:
 
 
 @pytest.mark.parametrize(("low", "high", "u"), [(0, 5, 6), (2, 2, 2), (-3, 3, 5), (4, 1, 0), (-5, -8, 1)])
-def test_loops_go_where_python_goes(low: int, high: int, u: int) -> None:
+def test_loops_run_as_in_python(low: int, high: int, u: int) -> None:
     compiled = compiled_whole(looping)
     expected, seen = np.full((2, 400), np.nan)
     assert compiled(seen, low, high, np.uint64(u)) == looping(expected, low, high, u)
@@ -169,7 +169,7 @@ class Crowd(NamedTuple):
 
 @kernel
 def shifted(crowd: Crowd, by: tuple[float, float], loud: bool) -> tuple[Crowd, float]:
-    """Give back what was taken, and a number."""
+    """Return the given crowd, and a number."""
     total = 0.0
     for i in range(crowd.many):
         if crowd.alive[i] and not loud:
@@ -180,7 +180,7 @@ def shifted(crowd: Crowd, by: tuple[float, float], loud: bool) -> tuple[Crowd, f
 
 @kernel
 def either(k: int, x: Any) -> float | None:
-    """Give back nothing, or a number."""
+    """Return None, or a number."""
     if k > 1:
         return float(x[0, k])
     return None
@@ -188,7 +188,7 @@ def either(k: int, x: Any) -> float | None:
 
 @kernel
 def refuses(k: int) -> int:
-    """Raise an error of some numbers."""
+    """Raise an error for some numbers."""
     if k > 2:
         raise ValueError("more than two")
     return k + 1
@@ -201,7 +201,7 @@ def calling(x: Any, alive: Any, heights: Any, k: int) -> tuple[float, float, int
     return total + other, -1.0 if found is None else found, refuses(k)
 
 
-def test_parts_take_namedtuples_and_give_them_back() -> None:
+def test_kernels_take_and_return_namedtuples() -> None:
     compiled = compiled_whole(calling)
     for k in (0, 1, 2):
         x, alive, heights = np.arange(8.0).reshape(2, 4), np.array([True, False, True, True]), np.array([5.0, 6, 7, 8])
@@ -209,13 +209,13 @@ def test_parts_take_namedtuples_and_give_them_back() -> None:
         np.testing.assert_array_equal(x[0], [0.5 + (k == 0) * 2, 1, 2.5, 3])
 
 
-def test_whoever_calls_a_part_that_raises_raises_what_it_does() -> None:
+def test_an_error_of_a_kernel_reaches_the_caller() -> None:
     compiled = compiled_whole(calling)
     with pytest.raises(ValueError, match="more than two"):
         compiled(np.zeros((2, 4)), np.ones(4, bool), np.ones(4), 3)
 
 
-def test_where_references_are_counted_numba_does_it_all() -> None:
+def test_with_reference_counts_results_are_those_of_numba() -> None:
     def tail(x: Any) -> Any:
         kept = x[1:]
         for k in range(2):
@@ -243,7 +243,7 @@ def first_two() -> slice:
     return slice(0, 2)
 
 
-def test_what_is_no_slice_of_whole_numbers_is_left_to_numba() -> None:
+def test_slices_without_integers_give_the_results_of_numba() -> None:
     compiled, seen = compiled_whole(sliced), np.zeros(5)
     compiled(np.arange(5.0), (1, 4), seen)
     np.testing.assert_array_equal(seen[:4], [2, 3, 4, 1])
@@ -254,7 +254,7 @@ def test_what_is_no_slice_of_whole_numbers_is_left_to_numba() -> None:
 
 @kernel
 def next_but(k: int, most: int = 9) -> int:
-    """Raise an error of some numbers; one argument may be left out."""
+    """Raise an error for some numbers; one argument is optional."""
     if k > most:
         raise ValueError("more")
     return k + 1
@@ -262,18 +262,18 @@ def next_but(k: int, most: int = 9) -> int:
 
 @kernel
 def soothed(k: int) -> int:
-    """Make a number of an error."""
+    """Return a number, also after an error."""
     r = 0
     try:
         r = next_but(k)
-    except Exception:  # numba knows no other
+    except Exception:  # numba supports no other
         r = -1000
     return r
 
 
 @kernel
 def troubled(k: int) -> int:
-    """Raise an error of one."""
+    """Raise an error for 1."""
     if k == 1:
         raise ValueError("one")
     return soothed(k)
@@ -289,7 +289,7 @@ def soothing(n: int) -> int:
     return s
 
 
-def test_an_error_that_was_caught_is_forgotten() -> None:
+def test_an_error_that_was_caught_is_not_raised_again() -> None:
     compiled = compiled_whole(soothing)
     assert compiled(5) == 1 + 100 + 3 + 4 + 5
     assert compiled(11) == 1 + 100 + sum(range(3, 11)) - 1000
@@ -303,7 +303,7 @@ def halved(x: Any, n: int, odd: bool) -> float:
     return float(x[n]) + halved(x, n - 1, not odd) / 2
 
 
-def test_a_part_that_calls_itself() -> None:
+def test_a_kernel_may_call_itself() -> None:
     def entry(x: Any, n: int, odd: bool) -> float:
         return float(halved(x, n, odd))
 
@@ -311,14 +311,14 @@ def test_a_part_that_calls_itself() -> None:
         assert compiled_whole(entry)(np.arange(5.0), 4, odd) == 4 + 3 / 2 + 2 / 4 + 1 / 8 + odd / 16
 
 
-def test_another_numba_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unknown_version_of_numba_is_not_patched(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(front_end, "digest", lambda owner, name: "")
     front_end.reads_as_known.cache_clear()
     lowering.is_brief.cache_clear()
     try:
         assert not lowering.is_brief()
-        test_parts_of_arrays_are_where_numpy_says(ARRAYS["table"])
-        part: Any = kernel(lambda crowd, by: (crowd.x[0, 1] + by[1], crowd.more[2]))  # compiled here for the first time
+        test_parts_of_arrays_are_those_of_numpy(ARRAYS["table"])
+        part: Any = kernel(lambda crowd, by: (crowd.x[0, 1] + by[1], crowd.more[2]))  # not compiled before
 
         def entry(x: Any, alive: Any) -> tuple[float, bool]:
             moved: tuple[float, bool] = part(Crowd(x, alive, 3, (x, 0.5, True)), (1.0, 9.0))

@@ -1,4 +1,4 @@
-"""`flockenv measure` on people whose ways are known, for nothing acts on them; and where things go wrong."""
+"""`flockenv measure` on agents that no force acts on, so that their paths are known; and its error messages."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ groups:
   - {count: 40, radius: 0.1, max_speed: 1.2, spawn: {low: [0, 2.1], high: [10, 4], speed: [1.2, 1.2], heading: [-1, 0]}}
 dt: 0.05
 """
-"""Two streams past each other."""
+"""Two streams in opposite directions."""
 
 ROOM = """\
 groups: [{count: 30, radius: 0, spawn: {low: [0, 0], high: [4, 4], speed: [1, 1], heading: [1, 0]}}]
 dt: 0.05
 """
-"""Thirty who walk to the right, in a plane."""
+"""Thirty agents that move to the right, in a plane."""
 
 LINE = ["--line", "5,0,5,4"]
 
@@ -53,15 +53,15 @@ def values(found: dict[str, Any]) -> dict[str, float]:
     return {name: math.nan if x["mean"] is None else x["mean"] for name, x in found["measures"].items()}
 
 
-def test_of_two_streams_everything_is_known(capsys: pytest.CaptureFixture[str]) -> None:
-    """24 m in 20 s: everybody comes through the line twice, and .4 of them three times, more or less."""
+def test_all_measures_of_two_streams_are_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:
+    """24 m in 20 s on a torus of 10 m: every agent crosses the line two or three times, 2.4 times in the mean."""
     assert (
         main(["measure", "streams.yaml", "--time", "20", "--every", "0.4", "--json", "x.json", "--out", "p", *LINE])
         == 0
     )
-    said = capsys.readouterr().out
-    assert "positions every 0.4 s, seed 0" in said
-    assert "Phi, 1 = no row holds agents" in said
+    shown = capsys.readouterr().out
+    assert "positions every 0.4 s, seed 0" in shown
+    assert "Phi, 1 = no row holds agents" in shown
     scene = load_scene(Path("streams.yaml"))
     x = scene.start(0).pos[0, :, 0]
     turns = np.where(
@@ -82,7 +82,7 @@ def test_of_two_streams_everything_is_known(capsys: pytest.CaptureFixture[str]) 
     assert (found["walking speed"], found["speed"]) == pytest.approx((1.2, 1.2))
     assert found["off Weidmann"] == pytest.approx(1.2 - 0.606, abs=1e-3)
     assert (found["oscillation"], found["oscillating"], found["polarisation"]) == pytest.approx((0, 0, 0), abs=1e-9)
-    assert "all out" not in found  # they come around again
+    assert "all out" not in found  # on a torus they come back
     assert set(found) <= set(UNITS)
     assert sorted(path.name for path in Path("p").iterdir()) == [
         "flow_density.png", "gaps.png", "lanes.png", "space_time.png",
@@ -93,23 +93,23 @@ def test_of_two_streams_everything_is_known(capsys: pytest.CaptureFixture[str]) 
             assert np.asarray(picture.convert("L")).std() > 5
 
 
-def test_a_room_empties_when_the_last_has_walked_out() -> None:
-    """The line is at x = 6, drawn upward; everybody walks 1 m/s."""
+def test_a_room_is_empty_when_the_last_agent_has_crossed_the_line() -> None:
+    """The line is at x = 6, drawn upward; all agents move at 1 m/s."""
     assert main(["measure", "room.yaml", "--time", "8", "--json", "x.json", "--line", "6,-1,6,5"]) == 0
     found = numbers()
     value = values(found)
-    way = np.sort(6 - load_scene(Path("room.yaml")).start(0).pos[0, :, 0])
+    distance = np.sort(6 - load_scene(Path("room.yaml")).start(0).pos[0, :, 0])
     assert value["out"] == 30
-    assert value["all out"] == pytest.approx(way[-1])
-    assert value["95 % out"] == pytest.approx(way[28])
-    assert value["passing"] == pytest.approx(29 / (way[-1] - way[0]))
-    assert sorted(found["samples"]["gaps_s"]) == pytest.approx(np.sort(np.diff(way)), abs=1e-9)
-    assert "density" not in value  # of a plane, unless an area is asked for
-    assert "lanes" not in value  # all walk one way
-    assert "overlap" not in value  # of points
+    assert value["all out"] == pytest.approx(distance[-1])
+    assert value["95 % out"] == pytest.approx(distance[28])
+    assert value["passing"] == pytest.approx(29 / (distance[-1] - distance[0]))
+    assert sorted(found["samples"]["gaps_s"]) == pytest.approx(np.sort(np.diff(distance)), abs=1e-9)
+    assert "density" not in value  # not for a plane without an --area
+    assert "lanes" not in value  # all walk in the same direction
+    assert "overlap" not in value  # these agents are points
     assert main(["measure", "room.yaml", "--time", "3", "--json", "x.json", "--force", "--line", "6,-1,6,5"]) == 0
     assert numbers()["measures"]["all out"]["mean"] is None  # not yet
-    # in an area in the way, cells end where walls would be: those who are in 4 m x 4 m share them, at the start
+    # with --walkable, Voronoi cells end at its edge: at the start 30 agents share 4 m x 4 m
     assert main([
         "measure", "room.yaml", "--time", "0.05", "--json", "x.json", "--force", "--walkable", "0,0,4,4", "--area",
         "0,0,4,4",
@@ -117,20 +117,20 @@ def test_a_room_empties_when_the_last_has_walked_out() -> None:
     assert values(numbers())["density"] == pytest.approx(30 / 16, rel=0.1)
 
 
-def test_of_the_beginning_as_much_is_skipped_as_asked_for() -> None:
+def test_skip_leaves_out_the_crossings_of_the_first_seconds() -> None:
     assert main(["measure", "room.yaml", "--time", "8", "--skip", "4", "--json", "x.json", "--line", "6,-1,6,5"]) == 0
-    way = 6 - load_scene(Path("room.yaml")).start(0).pos[0, :, 0]
-    assert values(numbers())["forward"] == (way >= 4).sum()
-    assert values(numbers())["flow"] == pytest.approx((way >= 4).sum() / 4)
+    distance = 6 - load_scene(Path("room.yaml")).start(0).pos[0, :, 0]
+    assert values(numbers())["forward"] == (distance >= 4).sum()
+    assert values(numbers())["flow"] == pytest.approx((distance >= 4).sum() / 4)
     assert values(numbers())["out"] == 30
 
 
 @pytest.mark.slow
-def test_many_seeds_have_intervals_and_are_held_against_chance(capsys: pytest.CaptureFixture[str]) -> None:
+def test_several_seeds_give_intervals_and_a_comparison_with_chance(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["measure", "streams.yaml", "--time", "1", "--seeds", "5", "--seed", "3", "--json", "x.json"]) == 0
-    said = capsys.readouterr().out
-    assert "seeds 3 to 7: means and 95 % intervals" in said
-    assert "Above chance?" in said
+    shown = capsys.readouterr().out
+    assert "seeds 3 to 7: means and 95 % intervals" in shown
+    assert "Above chance?" in shown
     found = numbers()
     assert found["seeds"] == [3, 4, 5, 6, 7]
     assert found["above_chance"]["lanes"]["holds"] is True
@@ -142,14 +142,14 @@ def test_many_seeds_have_intervals_and_are_held_against_chance(capsys: pytest.Ca
 
 
 @pytest.mark.slow
-def test_the_same_seed_is_the_same_picture() -> None:
+def test_the_same_seed_gives_the_same_pictures() -> None:
     for name in ("a", "b"):
         assert main(["measure", "streams.yaml", "--time", "1", "--out", name, *LINE]) == 0
     for path in Path("a").iterdir():
         assert path.read_bytes() == (Path("b") / path.name).read_bytes()
 
 
-def test_interrupted_it_shows_what_there_is(
+def test_after_an_interrupt_the_results_until_then_are_shown(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def interrupted(run: object) -> None:
@@ -177,8 +177,8 @@ def test_an_interrupt_before_the_first_picture_leaves_no_folder(monkeypatch: pyt
 
 
 @pytest.mark.slow
-def test_a_run_that_ends_early_is_measured_until_then(capsys: pytest.CaptureFixture[str]) -> None:
-    """Such a drag turns every velocity round, and makes it larger, until it is no number."""
+def test_a_run_that_diverges_is_measured_until_then(capsys: pytest.CaptureFixture[str]) -> None:
+    """Such a strong drag reverses and enlarges every velocity until it is no longer finite."""
     free = STREAMS.replace("max_speed: 1.2, ", "")
     Path("bad.yaml").write_text(free.replace("dt:", "effects: [{kind: quadratic_drag, rate: 1.0e+60}]\ndt:"))
     assert main(["measure", "bad.yaml", "--time", "2"]) == 1
@@ -188,7 +188,7 @@ def test_a_run_that_ends_early_is_measured_until_then(capsys: pytest.CaptureFixt
 
 
 @pytest.mark.slow
-def test_space_has_no_lines_but_has_order() -> None:
+def test_a_scene_in_three_dimensions_has_order_but_no_density() -> None:
     Path("space.yaml").write_text(
         "dimension: 3\nspace: {kind: torus, size: [9, 9, 9]}\n"
         "groups: [{count: 9, spawn: {speed: [1, 1], heading: [0, 0, 1]}}]\n"
@@ -198,14 +198,14 @@ def test_space_has_no_lines_but_has_order() -> None:
     assert "density" not in values(numbers())
 
 
-def test_an_obstacle_takes_room() -> None:
-    """Half a box is a block: who is in the other half has half the room."""
+def test_the_area_of_an_obstacle_does_not_count_for_the_density() -> None:
+    """A polygon fills half of the box, so the density in the rest is doubled."""
     Path("half.yaml").write_text(
         "space: {kind: box, size: [4, 4]}\ngroups: [{count: 8, radius: 0, spawn: {low: [0, 0], high: [1.9, 3.9]}}]\n"
         "obstacles: [{kind: polygon, vertices: [[2, 0], [4, 0], [4, 4], [2, 4]]}]\ndt: 0.05\n"
     )
     run = record(load_scene(Path("half.yaml")), 0, 2, 1)
-    assert survey(run, Asked()).values["density"] == pytest.approx(1)  # 8 in 8 m^2 that are walkable
+    assert survey(run, Asked()).values["density"] == pytest.approx(1)  # 8 agents in 8 m^2 of walkable area
     left = np.array([(0, 0), (2, 0), (2, 4), (0, 4)], float)
     assert survey(run, Asked(area=left)).values["density"] == pytest.approx(1)
 
@@ -232,7 +232,7 @@ def test_an_obstacle_takes_room() -> None:
         ("cube.yaml --time 1 --line 0,0,1,0", "dimension = 3: lines and areas are of the plane"),
     ],
 )
-def test_a_mistake_is_one_line_and_writes_nothing(
+def test_an_invalid_argument_gives_one_line_and_writes_no_file(
     arguments: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("cube.yaml").write_text(
@@ -248,7 +248,7 @@ def test_a_mistake_is_one_line_and_writes_nothing(
 
 
 @pytest.mark.parametrize("option", ["--line 0,0,1,0", "--area 0,0,1,1", "--walkable 0,0,1,1"])
-def test_lines_and_areas_in_space_are_refused_before_the_run(
+def test_lines_and_areas_in_three_dimensions_are_refused_before_the_run(
     option: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def started(*arguments: object) -> None:
@@ -260,15 +260,15 @@ def test_lines_and_areas_in_space_are_refused_before_the_run(
     assert capsys.readouterr().err == "flockenv: dimension = 3: lines and areas are of the plane\n"
 
 
-def test_what_is_there_is_overwritten_only_by_force() -> None:
+def test_existing_files_are_not_overwritten_without_force() -> None:
     Path("p").mkdir()
     (Path("p") / "lanes.png").write_text("mine")
     assert main(["measure", "room.yaml", "--time", "1", "--out", "p"]) == 2
     assert (Path("p") / "lanes.png").read_text() == "mine"
 
 
-def test_the_page_of_measures_shows_what_there_is() -> None:
-    """Its pictures are there and small, the commands it gives exist, and each scene in them is one."""
+def test_the_pictures_and_scenes_of_the_page_on_measures_exist() -> None:
+    """Its pictures are small, and each scene in its commands can be loaded."""
     root = Path(__file__).resolve().parent.parent
     page = (root / "docs" / "measures.md").read_text()
     pictures = re.findall(r"!\[[^\]]*\]\((measures/\w+\.png)\)", page)
@@ -280,7 +280,7 @@ def test_the_page_of_measures_shows_what_there_is() -> None:
         load_scene(root / scene)
 
 
-def test_a_run_of_one_instant_is_measured_as_far_as_it_goes() -> None:
+def test_a_run_of_one_instant_has_density_and_lanes_but_no_flow() -> None:
     run = record(load_scene(Path("streams.yaml")), 0, 0, 1)
     found = survey(run, Asked(line=np.array([(5.0, 0.0), (5.0, 4.0)]))).values
     assert found["density"] == pytest.approx(2)
@@ -289,6 +289,6 @@ def test_a_run_of_one_instant_is_measured_as_far_as_it_goes() -> None:
     assert math.isnan(found["collisions"])
 
 
-def test_a_run_in_which_nobody_lives_has_pictures_too() -> None:
+def test_pictures_of_a_run_without_living_agents_are_drawn() -> None:
     Path("empty.yaml").write_text(Path("streams.yaml").read_text().replace("{count:", "{alive: 0, count:"))
     assert main(["measure", "empty.yaml", "--time", "1", "--line", "5,0,5,4", "--out", "empty"]) == 0

@@ -1,4 +1,4 @@
-"""PathFollow: the track, what is seen and paid on it, and its hand-written player."""
+"""PathFollow: the track, the observation and the reward on it, and its hand-written player."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ CAREFUL = PathFollowRules(time=0.2, lead=0.3, tube=0.1, keep=0.95, grip=0.8, ear
 
 
 def corners(world: World, k: int = 0) -> Array:
-    """The track's corners, (P, 2) m, in the order of its way."""
+    """Return the track's corners, (P, 2) m, in the order in which they are passed."""
     return np.asarray(world._memory[: 2 * POINTS, k, 0].reshape(2, POINTS).T, float)
 
 
 def ways(track: Array) -> tuple[Array, Array]:
-    """Unit vectors and lengths of its pieces."""
+    """Return the unit vectors and lengths of its pieces."""
     along = np.roll(track, -1, axis=0) - track
     size = np.linalg.norm(along, axis=1)
     return along / size[:, None], size
@@ -39,7 +39,7 @@ def left_of(way: Array) -> Array:
 
 
 def crossed(a: Array, b: Array) -> Array:
-    """Sines of the angles from one to the other, for unit vectors."""
+    """Return the sines of the angles from a to b, which are unit vectors."""
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
@@ -58,14 +58,14 @@ def seen(step: Step) -> Any:
 
 
 def stay(world: World) -> Step:
-    """A decision without any force."""
+    """Make a decision without any force."""
     return world.step(np.zeros((world.worlds, 1, 2)))
 
 
 # --- the track --------------------------------------------------------------------------------------------------------
 
 
-def test_a_track_is_drawn_from_the_seed_alone_and_lies_in_the_field() -> None:
+def test_a_track_depends_on_the_seed_alone_and_lies_in_the_field() -> None:
     world, again = world_of(5, 64), world_of(5, 64)
     np.testing.assert_array_equal(world._memory, again._memory)
     tracks = np.stack([corners(world, k) for k in range(64)])
@@ -74,13 +74,12 @@ def test_a_track_is_drawn_from_the_seed_alone_and_lies_in_the_field() -> None:
     assert tracks.max() < TASK.size - TASK.lost_distance
     x, y = (tracks - TASK.size / 2).transpose(2, 0, 1)
     area = 0.5 * (x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1)
-    assert 20 < (area > 0).sum() < 44  # run either way
+    assert 20 < (area > 0).sum() < 44  # some tracks run clockwise, some do not
     began = np.linalg.norm(tracks - world.state.pos, axis=2).min(axis=1)
     np.testing.assert_allclose(began, 0, atol=1e-12)
 
 
-def test_beside_every_piece_it_knows_where_it_is() -> None:
-    """To the left and right of the middle of each piece, at a velocity: what is seen, in the frame of that piece."""
+def test_offset_and_velocity_are_observed_in_the_frame_of_the_nearest_piece() -> None:
     world = world_of()
     track = corners(world)
     way, size = ways(track)
@@ -93,11 +92,11 @@ def test_beside_every_piece_it_knows_where_it_is() -> None:
             np.testing.assert_allclose(found.velocity, (1.5, -0.5), atol=1e-5)
 
 
-def test_points_ahead_are_those_of_the_track_and_bend_as_it_does() -> None:
+def test_the_observed_points_ahead_and_curvatures_are_those_of_the_track() -> None:
     world = world_of()
     track = corners(world)
     way, size = ways(track)
-    k = 100  # on, across the seam
+    k = 100  # the points ahead lie across the seam
     at(world, track[k] + 0.5 * size[k] * way[k])
     found = seen(stay(world))
     order = (np.arange(POINTS) + k) % POINTS
@@ -115,11 +114,11 @@ def test_points_ahead_are_those_of_the_track_and_bend_as_it_does() -> None:
     assert np.abs(corner).max() > 0.1
 
 
-# --- what is paid -----------------------------------------------------------------------------------------------------
+# --- the reward -------------------------------------------------------------------------------------------------------
 
 
-def test_what_it_gains_is_how_far_it_came_along_the_track() -> None:
-    """A whole episode against the lengths that flockenv.geometry.polyline finds; a lap, and no less, is a success."""
+def test_the_progress_reward_is_the_distance_covered_along_the_track() -> None:
+    """The distance is that of flockenv.geometry.polyline, over a whole episode; success needs a full lap."""
     world = world_of()
     track = polyline.pieces(corners(world).tolist(), closed=True)
     length, player = track[1], RulesPlayer(TASK, CAREFUL)
@@ -137,15 +136,15 @@ def test_what_it_gains_is_how_far_it_came_along_the_track() -> None:
     assert world.measure()["progress"][0] == pytest.approx(gone)
 
 
-def test_who_is_put_elsewhere_is_found_there() -> None:
-    """The place on the track is kept from step to step: it is that of where he is, not of where he was left."""
+def test_an_agent_moved_to_another_piece_is_found_there() -> None:
+    """The piece is stored from step to step, but it must be that of the present position."""
     world = world_of()
     world.step(np.zeros((1, 1, 2)))
     track = corners(world)
     way, _ = ways(track)
     place, across = (track[40] + track[41]) / 2, 0.3 * left_of(way[40])
     at(world, place + across)
-    row = world.reset(mask=np.zeros(1, bool))[0, 0]  # nobody begins anew, he is only looked at
+    row = world.reset(mask=np.zeros(1, bool))[0, 0]  # restarts no episode, only observes
     assert row[2] == pytest.approx(0.3 / TASK.lost_distance, abs=1e-5)
     step = world.step(np.array([[[1.0, 0.0]]]))  # along the track there
     gone = world.state.pos[0, 0] - place - across
@@ -153,19 +152,19 @@ def test_who_is_put_elsewhere_is_found_there() -> None:
     assert step.terms[0, 0, 0] == pytest.approx(TASK.progress_reward * (gone @ way[40]), rel=1e-3)
 
 
-def test_success_is_a_lap() -> None:
+def test_a_full_lap_is_a_success_and_does_not_end_the_episode() -> None:
     world = world_of()
-    world._memory[3 * POINTS + 1, 0, 0] = world._memory[3 * POINTS, 0, 0] - 0.05  # nearly all of it was gained
+    world._memory[3 * POINTS + 1, 0, 0] = world._memory[3 * POINTS, 0, 0] - 0.05  # all but 0.05 m of the lap
     track = corners(world)
     way, _ = ways(track)
     at(world, track[7] + 0.01 * way[7])
     assert not stay(world).success[0]
     at(world, track[7] + 0.01 * way[7], 1.0 * way[7])
     assert stay(world).success[0]
-    assert world.state.alive[0, 0]  # and it goes on
+    assert world.state.alive[0, 0]
 
 
-def test_backwards_costs_as_much_as_forwards_brings() -> None:
+def test_moving_backwards_costs_as_much_as_moving_forwards_gains() -> None:
     world = world_of()
     track = corners(world)
     way, size = ways(track)
@@ -179,11 +178,11 @@ def test_backwards_costs_as_much_as_forwards_brings() -> None:
         assert there[1] == pytest.approx(-there[0])
 
 
-def test_off_the_track_costs_and_far_off_it_ends() -> None:
+def test_leaving_the_track_costs_and_going_far_off_ends_the_episode() -> None:
     world = world_of()
     track = corners(world)
     way, size = ways(track)
-    k = int(np.argmin(np.abs(crossed(way, np.roll(way, -3, axis=0)))))  # where it is straight
+    k = int(np.argmin(np.abs(crossed(way, np.roll(way, -3, axis=0)))))  # the straightest piece
     middle, left = track[k] + 0.5 * size[k] * way[k], left_of(way[k])
     for off, expected, over in (
         (TASK.half_width - 0.02, (0.0, 0.0), False),
@@ -198,7 +197,7 @@ def test_off_the_track_costs_and_far_off_it_ends() -> None:
         assert not step.success[0]
 
 
-def test_it_pushes_in_the_frame_of_the_track() -> None:
+def test_actions_are_forces_in_the_frame_of_the_track() -> None:
     world = world_of()
     track = corners(world)
     way, size = ways(track)
@@ -214,7 +213,7 @@ def test_a_picture_shows_the_track() -> None:
     shot = world.snapshot(0)
     assert [mark.kind for mark in shot.marks] == ["way"] * POINTS
     np.testing.assert_allclose([mark.at for mark in shot.marks], corners(world))
-    assert world.snapshot().marks is shot.marks  # made once while the track is the same
+    assert world.snapshot().marks is shot.marks  # made once per track
     single = World(PathFollow(dtype="float32"), 1)
     single.reset(3)
     np.testing.assert_allclose([mark.at for mark in single.snapshot().marks], corners(single), rtol=1e-6)
@@ -225,7 +224,7 @@ def test_a_picture_shows_the_track() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"half_width": 3.0}, "lost_distance = 2.5: must be more than half_width = 3"),
         ({"ring": 6.0}, "lost_distance = 2.5: at most 0.3 of ring = 6"),
@@ -233,17 +232,17 @@ def test_a_picture_shows_the_track() -> None:
         ({"winding": 0.9}, "winding = 0.9"),
     ],
 )
-def test_what_it_cannot_be_is_refused_in_one_line(change: dict[str, Any], said: str) -> None:
+def test_invalid_parameters_are_refused_in_one_line(change: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=r".") as caught:
         PathFollow(**change)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 # --- the hand-written player ------------------------------------------------------------------------------------------
 
 
-def test_who_brakes_before_bends_stays_on_the_track_and_the_textbook_flies_off() -> None:
+def test_a_player_that_brakes_before_bends_stays_on_the_track_unlike_the_textbook() -> None:
     found = {name: rollout(TASK, RulesPlayer(TASK, rules), 32, 7) for name, rules in (
         ("careful", CAREFUL), ("textbook", PathFollowRules()))}  # fmt: skip
     assert found["careful"].success.all()
