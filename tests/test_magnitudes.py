@@ -1,4 +1,4 @@
-"""Numbers so large or small that what laws make of them is none are refused, in one line, before anything is made."""
+"""Numbers are refused in one line if squares or products of three of them would overflow or vanish."""
 
 from __future__ import annotations
 
@@ -46,31 +46,31 @@ REFUSED = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("given", "said"), REFUSED)
-def test_what_is_out_of_range_is_refused_in_one_line(given: dict[str, str], said: str) -> None:
+@pytest.mark.parametrize(("given", "message"), REFUSED)
+def test_numbers_out_of_range_are_refused_in_one_line(given: dict[str, str], message: str) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises(ConfigError) as error:
             scene(**given)
-    assert said in str(error.value) and "computes with numbers from" in str(error.value)
+    assert message in str(error.value) and "computes with numbers from" in str(error.value)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("make", [lambda x: Group(count=1, mass=x), lambda x: Spread(low=0.0, high=x)])
 @pytest.mark.parametrize("number", [1e103, 1e-155, 5e-324, 1.7e308])
-def test_records_made_in_python_are_refused_too(make: Any, number: float) -> None:
+def test_records_made_in_python_are_refused_if_out_of_range(make: Any, number: float) -> None:
     with pytest.raises(ValueError, match="computes with numbers from 1e-154 to 1e\\+102"):
         make(number)
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
-def test_within_the_bounds_products_of_three_and_squares_below_one_are_numbers(precision: str) -> None:
+def test_products_of_three_and_squares_are_finite_and_not_zero_within_the_bounds(precision: str) -> None:
     least, most = (np.dtype(precision).type(bound) for bound in BOUNDS[precision])
     assert np.isfinite(most * most * most) and np.isfinite(1 / (least * least))
     assert 10 * float(most) > float(np.finfo(precision).max) ** (1 / 3) and float(least) ** 2 > 0
 
 
-def test_usual_and_unusual_numbers_are_taken() -> None:
+def test_large_and_small_numbers_within_the_bounds_are_accepted() -> None:
     Group(count=1, mass=1e-30, radius=0.0, max_speed=3e8)
     Spawn(low=(-1e12, 0.0), high=(1e25, 0.0))
     Spread(mean=0.0, sd=0.0)
@@ -78,7 +78,7 @@ def test_usual_and_unusual_numbers_are_taken() -> None:
 
 @pytest.mark.parametrize("which", [0, 1])
 @pytest.mark.parametrize("number", [1e300, -1e155, math.inf, math.nan])
-def test_with_motion_refuses_what_cannot_be_squared(number: float, which: int) -> None:
+def test_with_motion_refuses_numbers_that_cannot_be_squared(number: float, which: int) -> None:
     state = scene().start(0)
     motion = [np.zeros((1, 3, 2)), np.zeros((1, 3, 2))]
     motion[which][0, 2, 1] = number
@@ -86,7 +86,7 @@ def test_with_motion_refuses_what_cannot_be_squared(number: float, which: int) -
         state.with_motion(*motion)
 
 
-def test_with_motion_knows_the_precision() -> None:
+def test_with_motion_applies_the_bounds_of_the_precision() -> None:
     far = np.full((1, 3, 2), 1e20)
     assert scene().start(0).with_motion(far, far).pos[0, 0, 0] == 1e20
     with pytest.raises(ValueError, match=r"pos contains 1e\+20 .*float32 computes with at most 1e\+19"):

@@ -1,4 +1,4 @@
-"""Domain measures against arrangements whose answer is known."""
+"""Domain measures in cases with known results."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from flockenv.studies.trajectory import whole_steps
 @pytest.mark.parametrize(
     ("vel", "expected"),
     [
-        ([[1, 0], [3, 0], [0.1, 0]], 1.0),  # speed does not count
+        ([[1, 0], [3, 0], [0.1, 0]], 1.0),  # speeds do not matter
         ([[1, 0], [-2, 0]], 0.0),
         ([[1, 0], [0, 1]], math.sqrt(0.5)),
-        ([[1, 0], [0, 0]], 1.0),  # who stands still has no heading
+        ([[1, 0], [0, 0]], 1.0),  # an agent at rest has no heading
         ([[1, 0, 0], [0, 1, 0], [0, 0, 1]], 1 / math.sqrt(3)),
         ([[0, 0]], math.nan),
         (np.zeros((0, 2)), math.nan),
     ],
 )
-def test_polarisation(vel: list[list[float]], expected: float) -> None:
+def test_polarisation_is_the_length_of_the_mean_heading(vel: list[list[float]], expected: float) -> None:
     assert polarisation(np.array(vel, float)) == pytest.approx(expected, nan_ok=True)
 
 
@@ -40,17 +40,19 @@ SPACES: list[Space] = [Torus(size=(10, 12)), Box(size=(10, 12)), Plane()]
     points=st.lists(st.tuples(st.floats(0, 9.99), st.floats(0, 11.99)), min_size=2, max_size=12),
     space=st.sampled_from(SPACES),
 )
-def test_the_nearest_is_the_nearest_of_all_pairs(points: list[tuple[float, float]], space: Space) -> None:
+def test_nearest_distances_are_those_of_all_pairs(points: list[tuple[float, float]], space: Space) -> None:
     pos = np.array(points)
-    ways = np.linalg.norm(space.displacement(pos[:, None], pos[None]), axis=-1)
-    np.fill_diagonal(ways, np.inf)
-    distance, who = nearest_distances(pos, space)
-    assert distance == pytest.approx(ways.min(axis=1), abs=1e-12)
-    assert (who != np.arange(len(pos))).all()
-    assert ways[np.arange(len(pos)), who] == pytest.approx(distance, abs=1e-12)
+    distances = np.linalg.norm(space.displacement(pos[:, None], pos[None]), axis=-1)
+    np.fill_diagonal(distances, np.inf)
+    distance, nearest = nearest_distances(pos, space)
+    assert distance == pytest.approx(distances.min(axis=1), abs=1e-12)
+    assert (nearest != np.arange(len(pos))).all()
+    assert distances[np.arange(len(pos)), nearest] == pytest.approx(distance, abs=1e-12)
 
 
-def test_the_nearest_are_found_piece_by_piece_with_news_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nearest_distances_found_in_pieces_are_the_same_and_each_piece_is_reported(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     pos, space, news = np.random.default_rng(0).uniform(0, 10, (100, 2)), Torus(size=(10, 12)), list[int]()
     whole = nearest_distances(pos, space)
     monkeypatch.setattr(order, "AT_A_TIME", 30)
@@ -59,26 +61,26 @@ def test_the_nearest_are_found_piece_by_piece_with_news_of_each(monkeypatch: pyt
     assert news == [0, 30, 60, 90]
 
 
-def test_the_nearest_around_the_corner_of_a_torus() -> None:
+def test_nearest_distances_around_the_corner_of_a_torus() -> None:
     pos = np.array([[0.5, 0.5], [9.5, 11.5], [5.0, 6.0], [10.0, -1e-17]])
-    distance, who = nearest_distances(pos, Torus(size=(10, 12)))
+    distance, nearest = nearest_distances(pos, Torus(size=(10, 12)))
     assert distance[0] == pytest.approx(math.sqrt(0.5))
-    assert who[0] == 3  # at (10, -1e-17), which is the origin
+    assert nearest[0] == 3  # at (10, -1e-17), which is the origin
 
 
 @pytest.mark.parametrize("pos", [np.zeros((0, 2)), np.zeros((1, 2)), np.array([[0.0, 0.0], [1e200, 0.0]])])
-def test_without_a_neighbour_the_nearest_is_infinitely_far(pos: np.ndarray) -> None:
-    distance, who = nearest_distances(pos, Plane())
+def test_the_nearest_distance_is_infinite_without_a_neighbour(pos: np.ndarray) -> None:
+    distance, nearest = nearest_distances(pos, Plane())
     assert np.isinf(distance).all()
-    assert (who == np.arange(len(pos))).all()
+    assert (nearest == np.arange(len(pos))).all()
 
 
-def test_measure_of_a_world_laid_out_by_hand() -> None:
+def test_measures_of_agents_placed_by_hand() -> None:
     scene = Scene(
         groups=(Group(count=4, radius=0.5, spawn=Spawn(low=(0, 0), high=(1, 1))),),
         obstacles=(Circle(centre=(20, 0), radius=2),),
     )
-    pos = [[[0, 0], [0.9, 0], [10, 0], [17.6, 0]]]  # two overlap; the last is 0.1 m inside the obstacle's reach
+    pos = [[[0, 0], [0.9, 0], [10, 0], [17.6, 0]]]  # two agents overlap; the last overlaps the obstacle by 0.1 m
     vel = [[[3, 4], [3, 4], [3, 4], [3, 4]]]
     found = measure(scene, scene.start(0).with_motion(pos, vel))
     assert found == pytest.approx(
@@ -87,7 +89,7 @@ def test_measure_of_a_world_laid_out_by_hand() -> None:
     assert found.keys() == MEASURES.keys()
 
 
-def test_the_dead_are_not_measured() -> None:
+def test_dead_agents_are_not_measured() -> None:
     scene = Scene(space=Torus(size=(9, 9)), groups=(Group(count=3),))
     state = scene.start(0).with_motion([[[1, 1], [1, 1.01], [5, 5]]], [[[1, 0], [-1, 0], [1, 0]]])
     state.alive[0, 1] = False
@@ -100,12 +102,12 @@ def test_the_dead_are_not_measured() -> None:
 @pytest.mark.parametrize(
     ("seconds", "dt", "steps"), [(0, 0.1, 0), (1, 0.1, 10), (0.3, 0.1, 3), (1e6, 0.02, 50_000_000)]
 )
-def test_whole_steps(seconds: float, dt: float, steps: int) -> None:
+def test_whole_steps_divides_a_time_by_dt(seconds: float, dt: float, steps: int) -> None:
     assert whole_steps("t", seconds, dt) == steps
 
 
 @pytest.mark.parametrize(
-    ("seconds", "said"),
+    ("seconds", "message"),
     [
         (1.0, "t = 1 s: must be a whole multiple of dt = 0.3 s, say 0.9 or 1.2"),
         (0.1, "t = 0.1 s: must be a whole multiple of dt = 0.3 s, say 0 or 0.3"),
@@ -114,7 +116,7 @@ def test_whole_steps(seconds: float, dt: float, steps: int) -> None:
         (math.nan, "t = nan: must be a finite number of seconds >= 0"),
     ],
 )
-def test_time_that_is_no_whole_number_of_steps_is_refused_with_the_nearest(seconds: float, said: str) -> None:
+def test_a_time_that_is_no_multiple_of_dt_is_refused_with_the_nearest_multiples(seconds: float, message: str) -> None:
     with pytest.raises(ValueError) as caught:  # noqa: PT011  # the whole text is compared
         whole_steps("t", seconds, 0.3)
-    assert str(caught.value) == said
+    assert str(caught.value) == message

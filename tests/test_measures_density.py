@@ -38,7 +38,7 @@ def lattice(spacing: float, high: float = 10.0) -> np.ndarray:
 
 
 def hexagonal(spacing: float, high: float) -> np.ndarray:
-    """Rows in which everybody is between two of the next row."""
+    """Return points of a triangular lattice: each is midway between two of the next row."""
     rows = round(high / (spacing * math.sqrt(3) / 2) / 2) * 2
     step = high / rows
     x = np.arange(0, high, spacing) + spacing / 4
@@ -50,8 +50,8 @@ def hexagonal(spacing: float, high: float) -> np.ndarray:
 # --- areas ------------------------------------------------------------------------------------------------------------
 
 
-def test_a_square_lattice_has_the_density_of_its_cells() -> None:
-    """1 / a^2 for cells; counting gives it only where the area ends between two rows."""
+def test_the_voronoi_density_of_a_square_lattice_is_exact() -> None:
+    """It is 1 / a^2; counting gives this only if the area ends between two rows."""
     pos = lattice(0.5)
     room = voronoi(pos, SQUARE, rectangle((3.1, 3.3), (6.2, 6.9)))
     assert room.cell == pytest.approx(np.full(400, 0.25), rel=1e-12)
@@ -62,18 +62,18 @@ def test_a_square_lattice_has_the_density_of_its_cells() -> None:
     assert classical_density(pos[None], rectangle((3.2, 3.2), (6.3, 6.3)))[0] != pytest.approx(4.0)
 
 
-def test_a_triangular_lattice_on_a_torus_has_no_edge() -> None:
+def test_the_cells_of_a_triangular_lattice_on_a_torus_are_equal() -> None:
     pos = hexagonal(0.5, 4.0)
     room = voronoi(pos, rectangle((0, 0), (4, 4)), period=(4.0, 4.0))
     assert room.cell == pytest.approx(np.full(len(pos), 16 / len(pos)), rel=1e-9)
     cut = voronoi(pos, rectangle((0, 0), (4, 4)))
     assert cut.cell.sum() == pytest.approx(16)
-    assert cut.cell.std() > 0.01  # at the edge cells end
+    assert cut.cell.std() > 0.01  # without a period cells at the edge are cut
 
 
 @pytest.mark.parametrize(("walkable", "whole"), [(SQUARE, 100.0), (NOTCHED, 88.0), (NOTCHED[::-1], 88.0)])
 @pytest.mark.parametrize("many", [1, 2, 3, 40])
-def test_cells_share_all_that_is_walkable(walkable: np.ndarray, whole: float, many: int) -> None:
+def test_cells_divide_the_whole_walkable_area(walkable: np.ndarray, whole: float, many: int) -> None:
     pos = np.random.default_rng(many).uniform(0, 4, (many, 2))
     room = voronoi(pos, walkable)
     assert room.cell.sum() == pytest.approx(whole, rel=1e-12)
@@ -85,34 +85,34 @@ def test_cells_share_all_that_is_walkable(walkable: np.ndarray, whole: float, ma
 
 @settings(max_examples=15)
 @given(seed=st.integers(0, 1000), many=st.integers(1, 12))
-def test_a_cell_is_what_is_nearest_to_him(seed: int, many: int) -> None:
-    """Against counting: of 20,000 places in a notched square those that are nearest to each; on a torus too."""
+def test_a_cell_has_the_area_of_the_places_nearest_to_its_agent(seed: int, many: int) -> None:
+    """The areas are compared with counts of random places, in a notched square and on tori."""
     rng = np.random.default_rng(seed)
     pos = rng.uniform(0, 4, (many, 2))
     places = rng.uniform(0, 10, (10_000, 2))
     for walkable, period in ((NOTCHED, (0.0, 0.0)), (SQUARE, (10.0, 10.0)), (SQUARE, (10.0, 0.0))):
-        way = places[:, None] - pos
+        offset = places[:, None] - pos
         wide = np.where(np.array(period) > 0, period, np.inf)
-        way -= np.array(period) * np.round(way / wide)
-        nearest = np.argmin((way**2).sum(-1), axis=1)
+        offset -= np.array(period) * np.round(offset / wide)
+        nearest = np.argmin((offset**2).sum(-1), axis=1)
         on = contains(walkable, places)
         share = np.bincount(nearest[on], minlength=many) / 100
         room = voronoi(pos, walkable, period=period)
-        assert room.cell == pytest.approx(share, abs=5 * 0.5)  # five deviations of such a count
+        assert room.cell == pytest.approx(share, abs=5 * 0.5)  # five standard deviations of such a count
         assert room.cell.sum() == pytest.approx(area(walkable))
 
 
-def test_those_in_one_place_share_a_cell_and_those_outside_have_none() -> None:
+def test_agents_in_one_place_share_a_cell_and_agents_outside_have_none() -> None:
     room = voronoi([[2, 5], [2, 5], [7, 5], [20, 5]], SQUARE)
     assert room.cell == pytest.approx([22.5, 22.5, 55, math.nan], nan_ok=True)
     assert voronoi_density(room) == pytest.approx(0.03)
-    nobody = voronoi(np.zeros((0, 2)), SQUARE)
-    assert voronoi_density(nobody) == 0
-    assert math.isnan(voronoi_speed(nobody, np.zeros(0)))
+    empty = voronoi(np.zeros((0, 2)), SQUARE)
+    assert voronoi_density(empty) == 0
+    assert math.isnan(voronoi_speed(empty, np.zeros(0)))
 
 
-def test_speed_by_area_weighs_by_room() -> None:
-    """One has 3/4 of the square and walks 1 m/s, one has 1/4 and stands."""
+def test_the_voronoi_speed_is_weighted_by_area() -> None:
+    """One agent has 3/4 of the square and moves at 1 m/s, one has 1/4 and is at rest."""
     pos, vel = np.array([[5.0, 5.0], [10.0 - 1e-9, 5.0]]), np.array([[1.0, 0], [0, 0]])
     room = voronoi(pos, SQUARE)
     assert voronoi_speed(room, np.linalg.norm(vel, axis=1)) == pytest.approx(0.75)
@@ -122,7 +122,7 @@ def test_speed_by_area_weighs_by_room() -> None:
 
 
 @pytest.mark.parametrize(
-    ("polygon", "said"),
+    ("polygon", "message"),
     [
         ([(0, 0), (1, 1)], "at least three corners"),
         ([(0, 0), (1, 0), (math.nan, 1)], "all finite"),
@@ -130,9 +130,9 @@ def test_speed_by_area_weighs_by_room() -> None:
         ([(0, 0), (1, 1), (1, 0), (0, 1)], "must not cross"),
     ],
 )
-def test_what_is_no_area_is_refused_in_one_line(polygon: list[tuple[float, float]], said: str) -> None:
+def test_an_invalid_area_is_refused_in_one_line(polygon: list[tuple[float, float]], message: str) -> None:
     for call in (lambda: classical_density(np.zeros((1, 1, 2)), polygon), lambda: voronoi(np.zeros((1, 2)), polygon)):
-        with pytest.raises(ValueError, match=said) as caught:
+        with pytest.raises(ValueError, match=message) as caught:
             call()
         assert "\n" not in str(caught.value)
     with pytest.raises(ValueError, match=r"area = .*: must be convex"):
@@ -141,17 +141,17 @@ def test_what_is_no_area_is_refused_in_one_line(polygon: list[tuple[float, float
         classical_density(np.zeros((1, 1, 3)), SQUARE)
 
 
-def test_what_lies_outside_of_the_walkable_area_takes_nothing_of_it() -> None:
-    """A hole that touches a diamond from outside, and one that it only half holds."""
+def test_the_part_of_a_hole_outside_of_the_walkable_area_does_not_count() -> None:
+    """One hole touches a diamond from outside, one is partly inside."""
     diamond = [(5, 0), (10, 5), (5, 10), (0, 5)]
-    person = [[5.0, 5.0]]
-    assert voronoi(person, diamond, holes=[rectangle((0, 0), (2, 2))]).cell == pytest.approx([50])
-    half = rectangle((-1, 4), (2, 6))  # of it a triangle of 1 m and a strip of 1 m lie inside
-    room = voronoi(person, diamond, holes=[half])
+    agent = [[5.0, 5.0]]
+    assert voronoi(agent, diamond, holes=[rectangle((0, 0), (2, 2))]).cell == pytest.approx([50])
+    half = rectangle((-1, 4), (2, 6))  # inside: a triangle of height 1 m and a strip of 1 m by 2 m
+    room = voronoi(agent, diamond, holes=[half])
     assert room.cell == pytest.approx([50 - 1 - 2]) and room.area == pytest.approx(47)
 
 
-def test_holes_that_overlap_are_taken_away_once() -> None:
+def test_the_overlap_of_two_holes_is_subtracted_once() -> None:
     corner = [rectangle((0, 0), (6, 2)), rectangle((0, 0), (2, 6))]
     room = voronoi([[5.0, 5.0]], SQUARE, holes=corner)
     assert room.area == pytest.approx(100 - 12 - 12 + 4) and room.cell == pytest.approx([80])
@@ -159,7 +159,7 @@ def test_holes_that_overlap_are_taken_away_once() -> None:
     assert window.area == pytest.approx(0.25) and window.inside == pytest.approx([0.25])
 
 
-def test_on_a_torus_a_hole_is_as_large_wherever_it_is() -> None:
+def test_a_hole_on_a_torus_may_lie_across_the_seam() -> None:
     rng = np.random.default_rng(4)
     pos = rng.uniform(0, 10, (20, 2))
     found = []
@@ -175,7 +175,7 @@ def test_on_a_torus_a_hole_is_as_large_wherever_it_is() -> None:
 # --- the fundamental diagram ------------------------------------------------------------------------------------------
 
 
-def test_weidmanns_curve_is_that_of_the_table() -> None:
+def test_weidmann_speeds_are_those_of_the_table() -> None:
     assert weidmann_speed([0.5, 1, 2, 3, 4]) == pytest.approx([1.298, 1.058, 0.606, 0.331, 0.156], abs=5e-4)
     assert weidmann_speed([0, 5.4, 8]) == pytest.approx([1.34, 0, 0])
     rho = np.linspace(0, 5.4, 5401)
@@ -185,14 +185,14 @@ def test_weidmanns_curve_is_that_of_the_table() -> None:
         weidmann_speed(-1.0)
 
 
-def test_single_file_is_seyfrieds_line() -> None:
+def test_single_file_speeds_are_those_of_seyfried() -> None:
     assert single_file_speed([1, 1.5, 2, 5]) == pytest.approx([0.604, 0.289, 0.132, 0], abs=5e-4)
     assert required_length(single_file_speed(1.5)) == pytest.approx(1 / 1.5)
     assert single_file_density([0.5, 9.5, 4.5], 10) == pytest.approx([1 / 4, 1, 1 / 5])
     assert single_file_density([3], 10) == pytest.approx([0.1])
 
 
-def test_a_crowd_that_walks_as_juelichs_is_in_all_bins_and_below_weidmann() -> None:
+def test_a_crowd_drawn_from_the_juelich_data_fits_it_and_is_below_weidmann() -> None:
     rng = np.random.default_rng(0)
     low, high, mean, spread = (np.repeat(column, 500) for column in np.array(JUELICH).T)
     rho, v = rng.uniform(low, high), rng.normal(mean, 0.5 * spread)
@@ -200,14 +200,14 @@ def test_a_crowd_that_walks_as_juelichs_is_in_all_bins_and_below_weidmann() -> N
     assert in_juelich(rho, v + 0.3) == 0
     off = from_weidmann(rho, v)
     assert off.samples == 2500
-    assert -0.25 < off.mean < -0.1  # real corridors lie below it
+    assert -0.25 < off.mean < -0.1  # speeds measured in corridors lie below the curve
     assert from_weidmann(rho, weidmann_speed(rho))[1:3] == pytest.approx((0, 0), abs=1e-12)
     assert from_weidmann(rho, weidmann_speed(rho) + 0.2).worst == pytest.approx(0.2, abs=0.01)
     assert math.isnan(in_juelich([0.1], [1.0]))
     assert from_weidmann([0.1], [1.0])[0] == 0
 
 
-def test_whatever_the_bounds_are_nothing_beyond_them_counts() -> None:
+def test_samples_beyond_the_bounds_do_not_count() -> None:
     one = from_weidmann([0.55, 0.6], [1.0, 1.1], 0.5, 0.7)
     assert one.samples == 2 and one.worst == pytest.approx(1.05 - weidmann_speed([0.575])[0])
     far = from_weidmann([0.6, 0.95], [weidmann_speed([0.6])[0], 9.0], 0.5, 0.9)
@@ -216,7 +216,7 @@ def test_whatever_the_bounds_are_nothing_beyond_them_counts() -> None:
         from_weidmann([0.5], [1.0], 2.0, 1.0)
 
 
-def test_bins_hold_what_they_should() -> None:
+def test_bins_of_the_fundamental_diagram_hold_samples_means_and_spreads() -> None:
     found = diagram([0.2, 0.7, 0.8, 0.9, 9.0], [1.3, 1.0, 0.8, math.nan, 1.0])
     assert [b.samples for b in found] == [1, 2, 0, 0, 0, 0, 0, 0]
     assert found[1][3:] == pytest.approx((0.75, 0.9, 0.1, (0.7 + 0.64) / 2))

@@ -1,4 +1,4 @@
-"""Lanes and their null, order of flocks, and what models of people should not do."""
+"""Lanes and their null distribution, order of flocks, and artefacts of pedestrian models."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from flockenv.studies.measures import (
 
 
 def walkers(many: int, seed: int, laned: float, instants: int = 30) -> tuple[np.ndarray, np.ndarray]:
-    """Where people are across a corridor 3 m wide, and their ways; `laned` of them keep to a third of their own."""
+    """Return positions across a corridor 3 m wide, and directions; a share `laned` stays in its direction's third."""
     rng = np.random.default_rng(seed)
     way = np.where(np.arange(many) % 2, 1, -1)
     y = rng.uniform(0, 3, (instants, many))
@@ -40,19 +40,19 @@ def walkers(many: int, seed: int, laned: float, instants: int = 30) -> tuple[np.
     return y, way
 
 
-def test_perfect_lanes_are_1_and_even_mixing_is_0() -> None:
+def test_lane_order_is_1_for_perfect_lanes_and_0_for_even_mixing() -> None:
     y = np.array([0.1, 0.3, 0.5, 0.7])
     assert lane_order(y, [1, 1, -1, -1], 0, 1) == 1
     assert band_index(y, [1, 1, -1, -1], 0, 1, 0.4) == 1
     assert lane_order(y, [1, -1, 1, -1], 0, 1, 0.4) == 0
     assert band_index(y, [1, -1, 1, -1], 0, 1, 0.4) == 0
-    # rows of three, two of whom go one way: (1/3)^2 and 1/3
+    # a row of three agents, two in one direction: (1/3)^2 and 1/3
     assert lane_order([0.1, 0.1, 0.1], [1, 1, -1], 0, 1) == pytest.approx(1 / 9)
     assert band_index([0.1, 0.1, 0.1], [1, 1, -1], 0, 1) == pytest.approx(1 / 3)
     assert math.isnan(lane_order([5.0], [1], 0, 1))
 
 
-def test_lanes_are_above_their_null_and_a_random_crowd_is_at_it() -> None:
+def test_lanes_are_above_their_null_and_a_random_crowd_is_not() -> None:
     found = lanes(*walkers(54, 0, 1.0), 0, 3)
     assert found.order == 1
     assert found.beyond == 1
@@ -64,8 +64,8 @@ def test_lanes_are_above_their_null_and_a_random_crowd_is_at_it() -> None:
     assert p.mean() == pytest.approx(0.5, abs=0.15)
 
 
-def test_the_null_is_about_one_over_the_number_in_a_row() -> None:
-    """Rows of n out of many: E ((n+ - n-) / n)^2 = 1/n, less a little, for there are as many of both."""
+def test_the_null_of_lane_order_is_about_one_over_the_number_in_a_row() -> None:
+    """In rows of n, E ((n+ - n-) / n)^2 = 1/n, and a little less if there are equally many in both directions."""
     for each in (2, 5, 10):
         many = 20 * each
         y = np.repeat((np.arange(20) + 0.5) * 0.2, each)[None]
@@ -75,13 +75,13 @@ def test_the_null_is_about_one_over_the_number_in_a_row() -> None:
         assert found.null == pytest.approx(exact, rel=0.03)
 
 
-def test_lanes_of_some_are_between() -> None:
+def test_lane_order_grows_with_the_share_of_agents_in_lanes() -> None:
     orders = [lanes(*walkers(80, 3, share), 0, 3, deals=50).beyond for share in (0, 0.3, 0.6, 1)]
     assert orders == sorted(orders)
     assert orders[1] > 0.05
 
 
-def test_who_is_not_there_does_not_count() -> None:
+def test_agents_that_are_not_present_do_not_count_for_lanes() -> None:
     y, way = walkers(40, 1, 1.0)
     rng = np.random.default_rng(0)
     spoilt = np.concatenate([y, rng.uniform(0, 3, (30, 20))], axis=1)
@@ -98,7 +98,7 @@ def test_who_is_not_there_does_not_count() -> None:
         lanes(y, way[1:], 0, 3)
 
 
-def test_with_20_seeds_lanes_are_above_chance_and_chance_is_not() -> None:
+def test_over_20_seeds_lanes_are_above_chance_and_random_crowds_are_not() -> None:
     def over_seeds(laned: float) -> bool:
         runs = [lanes(*walkers(40, k, laned, 5), 0, 3, deals=40) for k in range(20)]
         return above_null([r.order for r in runs], [r.null for r in runs]).holds
@@ -108,14 +108,14 @@ def test_with_20_seeds_lanes_are_above_chance_and_chance_is_not() -> None:
 
 
 @pytest.mark.slow
-def test_an_interval_over_runs_holds_as_often_as_it_says() -> None:
-    """Of 200 times 20 runs without any excess, 2.5 % are above; of a bootstrap of 20 a little more."""
+def test_runs_without_excess_are_rarely_above_the_null() -> None:
+    """An exact 95 % interval would give 2.5 %; a bootstrap of 20 runs gives a little more."""
     rng = np.random.default_rng(5)
     holds = [above_null(rng.normal(1, 1, 20), np.ones(20)).holds for _ in range(200)]
     assert 0.005 < np.mean(holds) < 0.07
 
 
-def test_means_of_runs() -> None:
+def test_means_of_runs_leave_out_nan_and_have_intervals() -> None:
     found = mean_of_runs([1, 2, 3, math.nan])
     assert (found.runs, found.mean) == (3, 2)
     assert found.low < 2 < found.high
@@ -131,7 +131,7 @@ def test_means_of_runs() -> None:
 
 
 def ring(many: int, dimension: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """A rigid ring that turns about its middle, which is somewhere: positions and velocities."""
+    """Return positions and velocities of a rigid ring that rotates about its centre."""
     turn = 2 * np.pi * np.arange(many) / many
     out, round_ = np.stack([np.cos(turn), np.sin(turn)], -1), np.stack([-np.sin(turn), np.cos(turn)], -1)
     more = [np.zeros((many, 1))] * (dimension - 2)
@@ -139,7 +139,7 @@ def ring(many: int, dimension: int = 2) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_rigid_rotation_mills_and_is_not_polarised(dimension: int) -> None:
+def test_rigid_rotation_has_milling_1_and_polarisation_0(dimension: int) -> None:
     pos, vel = ring(36, dimension)
     assert milling(pos, vel, Plane()) == pytest.approx(1)
     assert milling(pos, -vel, Plane()) == pytest.approx(1)
@@ -148,7 +148,7 @@ def test_rigid_rotation_mills_and_is_not_polarised(dimension: int) -> None:
     assert cohesion_radius(pos, Plane()) == pytest.approx(3)
 
 
-def test_flying_together_does_not_mill() -> None:
+def test_agents_with_equal_velocities_have_milling_0() -> None:
     pos, _ = ring(36)
     vel = np.tile([0.6, 0.8], (36, 1))
     assert milling(pos, vel, Plane()) == pytest.approx(0, abs=1e-12)
@@ -160,17 +160,17 @@ def test_flying_together_does_not_mill() -> None:
     assert math.isnan(cohesion_radius(np.zeros((0, 2)), Plane()))
 
 
-def test_over_the_corner_of_a_torus_a_ring_is_a_ring() -> None:
+def test_milling_of_a_ring_across_the_corner_of_a_torus() -> None:
     pos, vel = ring(36)
     torus = Torus(size=(20.0, 30.0))
     shifted = torus.wrap(pos - 9.0)
     assert milling(shifted, vel, torus) == pytest.approx(1)
     assert cohesion_radius(shifted, torus) == pytest.approx(3)
-    assert milling(shifted, vel, Plane()) < 0.9  # seen in the plane it is in four pieces
+    assert milling(shifted, vel, Plane()) < 0.9  # in a plane the ring is in four pieces
 
 
 @given(st.lists(st.tuples(st.floats(0, 9.9), st.floats(0, 9.9)), min_size=1, max_size=15), st.floats(0.1, 4.9))
-def test_groups_are_those_that_a_search_finds(points: list[tuple[float, float]], reach: float) -> None:
+def test_connected_groups_are_those_that_a_search_finds(points: list[tuple[float, float]], reach: float) -> None:
     pos, torus = np.array(points), Torus(size=(10.0, 10.0))
     near = np.linalg.norm(torus.displacement(pos[:, None], pos[None]), axis=-1) <= reach
     todo, groups = set(range(len(pos))), 0
@@ -184,7 +184,7 @@ def test_groups_are_those_that_a_search_finds(points: list[tuple[float, float]],
     assert components(pos, reach, torus) == groups
 
 
-def test_groups_need_a_reach() -> None:
+def test_connected_groups_need_a_valid_reach() -> None:
     assert components(np.zeros((0, 2)), 1.0, Plane()) == 0
     with pytest.raises(ValueError, match="reach = 0 m: must be > 0"):
         components(np.zeros((2, 2)), 0.0, Plane())
@@ -192,11 +192,11 @@ def test_groups_need_a_reach() -> None:
         components(np.zeros((2, 2)), 6.0, Torus(size=(10.0, 20.0)))
 
 
-# --- what models should not do ----------------------------------------------------------------------------------------
+# --- artefacts of models ----------------------------------------------------------------------------------------------
 
 
-def test_the_area_that_discs_share() -> None:
-    """Apart, one in the other, half of each; and against counting."""
+def test_the_overlap_area_of_two_discs() -> None:
+    """Apart, one inside the other, and partly overlapping; also against counting random places."""
     assert overlap_area(2.0, 1, 1) == 0
     assert overlap_area(0.0, 1, 2) == pytest.approx(np.pi)
     assert overlap_area(0.9, 2, 1) == pytest.approx(np.pi)
@@ -206,8 +206,8 @@ def test_the_area_that_discs_share() -> None:
     assert overlap_area(1.2, 1, 0.7) == pytest.approx(4 * both.mean(), rel=0.02)
 
 
-def test_overlap_is_a_mean_over_those_that_overlap() -> None:
-    """Of three instants one has a pair that shares 2 pi/3 - sqrt(3)/2 of pi, one has a small body in a large one."""
+def test_the_mean_overlap_is_over_overlapping_pairs_only() -> None:
+    """At one instant a pair shares 2 pi/3 - sqrt(3)/2 of pi, at one no pair, at one a small disc is in a large one."""
     pos = np.array([[[0, 0], [1, 0], [9, 9]], [[0, 0], [3, 0], [9, 9]], [[0, 0], [3, 0], [0.1, 0]]], float)
     found = overlap_proportion(pos, [1, 1, 0.5], Plane())
     assert found.mean == pytest.approx(((2 / 3 - math.sqrt(3) / 2 / np.pi) + 1) / 2)
@@ -221,25 +221,25 @@ def test_overlap_is_a_mean_over_those_that_overlap() -> None:
     assert overlap_proportion(seam, [0.5, 0.5], Box(size=(10.0, 10.0))).mean == 0
 
 
-def test_oscillation_is_what_goes_backward() -> None:
-    """One walks, one goes back at half his speed for one of four instants, one wants nothing."""
+def test_oscillation_is_the_share_of_motion_against_the_desired_velocity() -> None:
+    """One agent goes ahead, one goes back at half speed at one of four instants, one has no desired velocity."""
     vel = np.zeros((4, 3, 2))
     vel[:, 0], vel[:, 1], vel[:, 2] = (1.3, 0), (0, 1.2), (-5, 0)
     vel[2, 1] = (0.9, -0.6)
-    wish = np.array([[1.3, 0], [0, 1.2], [0, 0]])
-    assert oscillation_proportion(vel, wish) == pytest.approx((0.5, 1 / 8))
-    assert oscillation_proportion(vel[:2], wish) == (0.0, 0.0)
+    desired = np.array([[1.3, 0], [0, 1.2], [0, 0]])
+    assert oscillation_proportion(vel, desired) == pytest.approx((0.5, 1 / 8))
+    assert oscillation_proportion(vel[:2], desired) == (0.0, 0.0)
     assert math.isnan(oscillation_proportion(vel, np.zeros((3, 2))).share)
 
 
-def test_collisions_are_counted_when_they_begin() -> None:
-    """Two touch at 1 s and 2 s, part, and touch again at 4 s: two collisions of each in 4 s."""
+def test_a_collision_is_counted_when_the_contact_begins() -> None:
+    """Two agents touch at 1 s and 2 s, part, and touch again at 4 s: each has two collisions in 4 s."""
     gap = np.array([3.0, 0.9, 0.9, 3.0, 0.9])
     pos = np.zeros((5, 3, 2))
     pos[:, 1, 0], pos[:, 2] = gap, (50, 50)
     assert collision_rate(np.arange(5.0), pos, [0.5, 0.5, 0.5], Plane()) == pytest.approx(2 * 2 / (3 * 4))
     assert collision_rate(np.arange(5.0), pos[:, ::-1], [0.5] * 3, Plane()) == pytest.approx(1 / 3)
-    assert collision_rate([0.0], pos[:1], [0.5] * 3, Plane()) != 0  # no time has gone by: no number
+    assert collision_rate([0.0], pos[:1], [0.5] * 3, Plane()) != 0  # NaN for a single instant
     alive = np.ones((5, 3), bool)
     alive[1:3, 1] = False
     assert collision_rate(np.arange(5.0), pos, [0.5] * 3, Plane(), alive) == pytest.approx(2 / (2 + 2 + 3 + 3))

@@ -1,6 +1,6 @@
-"""Methods on hard problems: orders where time enters, stability limits, orbits, drag, steps of their own.
+"""Methods on hard problems: order with forces of time, stability limits, orbits, drag, adaptive steps.
 
-What holds for every method is in test_integrators.py; here are the harder problems, and what is particular to some.
+Properties that all methods share are in test_integrators.py.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ PROBLEMS: dict[str, tuple[dict[str, float], Callable[[float], tuple[float, float
 @pytest.mark.parametrize(
     "problem", ["forced", *(pytest.param(name, marks=pytest.mark.slow) for name in ("pendulum", "projectile"))]
 )
-def test_the_order_is_the_declared_one_wherever_time_enters(
+def test_the_order_is_the_declared_one_on_harder_problems(
     problem: str, row: IntegratorRow, way: str, tether: Any
 ) -> None:
     given, exact, seconds = PROBLEMS[problem]
@@ -96,11 +96,11 @@ def test_the_exact_solutions_solve_their_equations() -> None:
         assert (after - before) / (2 * h) == pytest.approx(v, abs=1e-7)
         assert (after - 2 * x + before) / h**2 == pytest.approx(force, abs=1e-6)
         assert exact(0.0) == pytest.approx((law.get("pos", X0), law.get("vel", V0)))
-    assert PROBLEMS["pendulum"][2] / (4 * ellipk(0.25)) == pytest.approx(0.46, abs=0.01)  # periods, not a whole one
+    assert PROBLEMS["pendulum"][2] / (4 * ellipk(0.25)) == pytest.approx(0.46, abs=0.01)  # periods, no integer
 
 
-def test_heun_and_midpoint_differ_where_time_enters(tether: Any) -> None:
-    """On linear problems without time they are the same method."""
+def test_heun_and_midpoint_differ_only_if_forces_depend_on_time(tether: Any) -> None:
+    """On linear autonomous problems they are the same method."""
     end = tethered(tether, "python", stiffness=1, push=1)
     errors = [math.dist(motion(end(method, 0.01, 200)), forced(2.0)) for method in (Heun(), Midpoint())]
     assert errors[1] > 1.5 * errors[0]
@@ -111,8 +111,8 @@ def test_heun_and_midpoint_differ_where_time_enters(tether: Any) -> None:
 
 @pytest.mark.slow
 @METHODS
-def test_a_medium_carries_to_the_order_of_the_method(row: IntegratorRow) -> None:
-    """x' = v + u with u = -x / 2 + 5 cos 2t and v at rest: what a flow adds is as good as what velocities do."""
+def test_the_velocity_of_a_medium_is_integrated_to_the_order_of_the_method(row: IntegratorRow) -> None:
+    """x' = v + u with u = -x / 2 + 5 cos 2t and v = 0."""
 
     def end(method: Integrator, dt: float, steps: int) -> State:
         state = at_start(blank(1, 1, 2, 0, dt), vel=0.0)
@@ -126,13 +126,13 @@ def test_a_medium_carries_to_the_order_of_the_method(row: IntegratorRow) -> None
     assert measured == pytest.approx(row.method.order, abs=0.2)
 
 
-# --- stability ------------------------------------------------------------------------------------------------------
+# --- stability --------------------------------------------------------------------------------------------------------
 
 
 def growth(method: Integrator, law: Callable[[Array, Array, float], Array]) -> float:
-    """How much the fastest growing motion grows in one step of 1 s: the spectral radius of what one step does.
+    """Return the factor by which the fastest growing motion grows in one step of 1 s: the spectral radius of a step.
 
-    One agent begins with x = 1, another with v = 1: what becomes of them are the columns of a matrix.
+    One agent begins with x = 1, another with v = 1: their states after the step are the columns of a matrix.
     """
     state = blank(1, 2, 2, 0, 1.0)
     state.x[:, 0, 0], state.v[:, 0, 1] = 1.0, 1.0
@@ -142,7 +142,7 @@ def growth(method: Integrator, law: Callable[[Array, Array, float], Array]) -> f
 
 @METHODS
 def test_drag_is_stable_up_to_the_limit_of_the_table(row: IntegratorRow) -> None:
-    """Where there is no limit, at a thousand times what others take."""
+    """A method without a limit is tested at up to a thousand times 2, the limit of most others."""
     shares = ((0.5, False), (0.99, False), (1.01, True)) if math.isfinite(row.real) else ((1.0, False), (1e3, False))
     for share, grows in shares:
         state = blank(1, 1, 2, 0, 1.0)
@@ -166,7 +166,7 @@ def test_oscillations_are_stable_up_to_the_limit_of_the_table(row: IntegratorRow
 
 @pytest.mark.parametrize("zeta", [0.5, 1.0, 2.0])
 def test_damped_semi_implicit_euler_is_stable_up_to_its_limit(zeta: float) -> None:
-    """h omega < 2 (sqrt(1 + zeta^2) - zeta); damping makes it smaller."""
+    """h omega < 2 (sqrt(1 + zeta^2) - zeta): damping lowers the limit."""
     limit = 2 * (math.sqrt(1 + zeta**2) - zeta)
     for share, grows in ((0.99, False), (1.01, True)):
         w = share * limit
@@ -175,15 +175,15 @@ def test_damped_semi_implicit_euler_is_stable_up_to_its_limit(zeta: float) -> No
 
 
 @pytest.mark.parametrize(("kind", "grown"), [(AdaptiveRK4, False), (DormandPrince, False)], ids=["rk4", "dormand"])
-def test_no_oscillation_grows_by_extrapolation(kind: type[Integrator], grown: bool) -> None:
-    """With the two results of step doubling extrapolated it would, at any step."""
+def test_no_oscillation_grows_under_adaptive_methods(kind: type[Integrator], grown: bool) -> None:
+    """If the two results of step doubling were extrapolated, it would grow at every step size."""
     for y in (0.05, 0.1, 0.2):
         found = growth(kind(tolerance=1e30), lambda x, v, t, y=y: -y * y * x)
         assert found**10_000 <= 1 + 1e-9
 
 
-def test_exponential_drag_loses_energy_by_the_book() -> None:
-    """What one step does to x'' = -omega^2 x has the determinant 1 - y^4 / 12 with y = h omega."""
+def test_exponential_drag_damps_oscillations_as_predicted() -> None:
+    """The matrix of one step for x'' = -omega^2 x has the determinant 1 - y^4 / 12 with y = h omega."""
     for y in (0.1, 0.5, 1.5):
         assert growth(ExponentialDrag(), lambda x, v, t, y=y: -y * y * x) == pytest.approx(math.sqrt(1 - y**4 / 12))
 
@@ -192,7 +192,7 @@ def test_exponential_drag_loses_energy_by_the_book() -> None:
 
 
 def orbit(eccentricity: float, aphelion: bool = False) -> dict[str, Any]:
-    """Where an orbit with a = 1 and mu = 1, period 2 pi, begins: at its perihelion unless it is said otherwise."""
+    """Return the start of an orbit with a = 1, mu = 1 and period 2 pi, at its perihelion or aphelion."""
     e = -eccentricity if aphelion else eccentricity
     return {"sun": 1.0, "pos": (1 - e, 0.0), "vel": (0.0, math.sqrt((1 + e) / (1 - e)))}
 
@@ -211,18 +211,18 @@ def off(state: State, given: dict[str, Any]) -> float:
     ],
     ids=["rk4_1e-6", "rk4_1e-9", "dormand_prince_1e-9"],
 )
-def test_a_narrow_orbit_costs_what_the_table_says(
+def test_cost_and_error_of_a_narrow_orbit_are_those_of_the_table(
     method: Integrator, evaluations: int, error: float, way: str, tether: Any
 ) -> None:
     """Kepler e = 0.9, one period; fixed RK4 takes 40,000 evaluations for 1.1e-6."""
     given = orbit(0.9)
     after = tethered(tether, way, **given)(method, 2 * math.pi, 1)
     steps = after.counted("substeps") + after.counted("rejected_steps")
-    asked = 6 * steps + 1 if isinstance(method, DormandPrince) else 10 * steps + after.counted("substeps")
-    assert evaluations / 1.5 < asked < evaluations * 1.5
+    needed = 6 * steps + 1 if isinstance(method, DormandPrince) else 10 * steps + after.counted("substeps")
+    assert evaluations / 1.5 < needed < evaluations * 1.5
     assert error / 1.5 < off(after, given) < error * 1.5
     if way == "compiled":
-        assert after.counted("evaluations") == asked
+        assert after.counted("evaluations") == needed
     if method == AdaptiveRK4(tolerance=1e-6):
         assert (after.counted("substeps"), after.counted("rejected_steps")) == (
             pytest.approx(102, rel=0.05),
@@ -232,7 +232,7 @@ def test_a_narrow_orbit_costs_what_the_table_says(
 
 @pytest.mark.slow
 @ADAPTIVE
-def test_a_tolerance_a_thousand_times_smaller_pays(kind: type[Integrator], tether: Any) -> None:
+def test_a_smaller_tolerance_reduces_the_error_accordingly(kind: type[Integrator], tether: Any) -> None:
     for aphelion in (False, True):
         given = orbit(0.9, aphelion)
         ends = [tethered(tether, "compiled", **given)(kind(tolerance=10.0**-k), 2 * math.pi, 1) for k in (6, 9, 12)]
@@ -250,7 +250,9 @@ def test_a_tolerance_a_thousand_times_smaller_pays(kind: type[Integrator], tethe
     ],
     ids=lambda value: getattr(value, "kind", None),
 )
-def test_a_hundred_orbits_keep_what_they_keep(method: Integrator, energy: float, spin: float, tether: Any) -> None:
+def test_orbits_conserve_energy_and_angular_momentum(
+    method: Integrator, energy: float, spin: float, tether: Any
+) -> None:
     """N04: e = 0.6, 1000 steps per period."""
     given = orbit(0.6)
     end, worst = tethered(tether, "compiled", **given), 0.0
@@ -262,7 +264,7 @@ def test_a_hundred_orbits_keep_what_they_keep(method: Integrator, energy: float,
     assert worst < energy
 
 
-# --- drag, exactly ----------------------------------------------------------------------------------------------------
+# --- exact drag -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("z", [0.0, -1e-300, -1e-12, -1e-3, -0.5, -1.0, -1.0000001, -2.0, -10.0, -40.0, -800.0])
@@ -279,7 +281,7 @@ def test_phi_functions_are_right_to_the_last_digits(z: float) -> None:
         np.testing.assert_allclose(phi_functions(z), [float(value) for value in exact], rtol=2e-15)
 
 
-def test_phi_functions_of_single_precision_are_of_single_precision() -> None:
+def test_phi_functions_return_the_precision_of_their_argument() -> None:
     found = phi_functions(np.float32(-0.3))
     assert {type(value) for value in found} == {np.float32}
     np.testing.assert_allclose(found, phi_functions(-0.3), rtol=5e-7)
@@ -287,8 +289,8 @@ def test_phi_functions_of_single_precision_are_of_single_precision() -> None:
 
 @WAYS
 @pytest.mark.parametrize("steps", [1, 3, 50])
-def test_a_projectile_with_drag_lands_where_the_book_says(steps: int, way: str, tether: Any) -> None:
-    """v = (10, 15), kappa = 0.2: 2.798418 s and 21.43051 m, at every step."""
+def test_exponential_drag_is_exact_for_a_projectile(steps: int, way: str, tether: Any) -> None:
+    """v = (10, 15), kappa = 0.2: 2.798418 s and 21.43051 m, with any number of steps."""
     seconds = 2.798418
     end = tethered(tether, way, pos=0.0, vel=(10.0, 15.0), drag=0.2)
     assert end(ExponentialDrag(), seconds / steps, steps).pos[0, 0, 0] == pytest.approx(21.43051, abs=5e-6)
@@ -298,8 +300,8 @@ def test_a_projectile_with_drag_lands_where_the_book_says(steps: int, way: str, 
 
 @WAYS
 @pytest.mark.parametrize("stiff", [1.9, 2.1, 10.0, 1e6])
-def test_stiff_drag_is_monotone_and_never_reverses(stiff: float, way: str, tether: Any) -> None:
-    """N20: dt = 0.5 and h kappa from 1.9 on; the exact motion at every step."""
+def test_stiff_drag_is_exact_and_never_reverses_a_velocity(stiff: float, way: str, tether: Any) -> None:
+    """N20: dt = 0.5 and h kappa from 1.9 on."""
     drag, weight, dt = stiff / 0.5, -9.81, 0.5
     end = tethered(tether, way, pos=0.0, vel=0.3, drag=drag, weight=weight)
     speeds = [0.3]
@@ -314,8 +316,8 @@ def test_stiff_drag_is_monotone_and_never_reverses(stiff: float, way: str, tethe
 
 
 @WAYS
-def test_drag_beside_other_forces_keeps_the_order(way: str, tether: Any) -> None:
-    """The damped oscillator, its drag told to the method: of order 2, and better than without being told."""
+def test_exponential_drag_with_other_forces_is_of_order_2(way: str, tether: Any) -> None:
+    """On a damped oscillator whose drag the method treats exactly."""
     w, zeta, seconds = 2.0, 0.4, 2.2
     decay, wd = math.exp(-zeta * w * seconds), w * math.sqrt(1 - zeta**2)
     b = (V0 + zeta * w * X0) / wd
@@ -326,8 +328,8 @@ def test_drag_beside_other_forces_keeps_the_order(way: str, tether: Any) -> None
 
 
 @pytest.mark.slow
-def test_drag_is_shared_among_agents_by_their_mass(tether: Any) -> None:
-    """kappa = c / m of everybody: two drags, 20 agents of two masses."""
+def test_exponential_drag_uses_the_mass_of_each_agent(tether: Any) -> None:
+    """kappa = c / m of each agent, for 20 agents of two masses."""
     from flockenv.physics.effects import Drag
 
     groups = tuple(Group(count=10, mass=m, spawn=Spawn(low=(0, 0), high=(1, 1), speed=(1, 2))) for m in (0.5, 4.0))
@@ -337,7 +339,7 @@ def test_drag_is_shared_among_agents_by_their_mass(tether: Any) -> None:
     np.testing.assert_allclose(after.vel, start.vel * np.exp(-3.0 * 1.4 / scene.body.mass)[:, None], rtol=1e-12)
 
 
-# --- steps of their own -----------------------------------------------------------------------------------------------
+# --- adaptive steps ---------------------------------------------------------------------------------------------------
 
 
 def judge(
@@ -346,7 +348,7 @@ def judge(
     return judged(clock, error, (tolerance, least, most), dt, 4)
 
 
-def test_the_next_step_is_the_standard_controller_s() -> None:
+def test_the_next_step_is_that_of_the_standard_controller() -> None:
     clock = Clock(0.2, 0.01, 0.0, 0, 5, 1, False)
     assert judge(clock, 1e-6 / 2).step == pytest.approx(0.01 * 0.9 * 2**0.2)
     assert judge(clock, 1e-6 * 3).step == pytest.approx(0.01 * 0.9 * 3**-0.2)
@@ -360,11 +362,11 @@ def test_the_next_step_is_the_standard_controller_s() -> None:
     assert judge(clock, 1e-6)[3:6] == (0, 6, 1)
 
 
-def test_steps_after_a_rejected_one_stay_wary_until_they_are_past_it() -> None:
+def test_steps_do_not_grow_again_before_the_end_of_a_rejected_step() -> None:
     clock = judge(begun(1.0), 1.0)
     assert (clock.step, clock.wary) == (pytest.approx(0.2), 1.0)
     again = judge(clock, 2e-6)
-    assert (again.step, again.wary) == (pytest.approx(0.04), pytest.approx(0.2))  # a fifth, though 0.78 might do
+    assert (again.step, again.wary) == (pytest.approx(0.04), pytest.approx(0.2))  # a fifth, although 0.78 might suffice
     taken = judge(again, 0.0)
     assert (taken.done, taken.step) == (pytest.approx(0.04), pytest.approx(0.04))
     assert judge(taken._replace(wary=0.05), 0.0).step == pytest.approx(0.2)
@@ -372,7 +374,7 @@ def test_steps_after_a_rejected_one_stay_wary_until_they_are_past_it() -> None:
 
 @pytest.mark.parametrize("seed", range(20))
 @pytest.mark.parametrize("dt", [0.02, 1 / 3, 1e6, 1e-9])
-def test_the_last_step_ends_where_the_step_ends(seed: int, dt: float) -> None:
+def test_adaptive_steps_end_exactly_at_the_end_of_the_step(seed: int, dt: float) -> None:
     rng = np.random.default_rng(seed)
     clock, total = begun(dt), 0.0
     while clock.done < dt:
@@ -384,7 +386,7 @@ def test_the_last_step_ends_where_the_step_ends(seed: int, dt: float) -> None:
     assert total == pytest.approx(dt, rel=1e-12)
 
 
-def test_a_world_is_given_up_after_so_many_tries_and_where_steps_vanish() -> None:
+def test_a_world_is_given_up_after_too_many_tries_or_if_its_steps_vanish() -> None:
     clock, tries = begun(1.0), 0
     while not clock.lost:
         clock, tries = judge(clock, math.nan), tries + 1
@@ -395,11 +397,11 @@ def test_a_world_is_given_up_after_so_many_tries_and_where_steps_vanish() -> Non
     assert not judge(Clock(0.5, 1e-16, 0.0, 0, 3, 0, False), 0.0).lost
     assert not judge(Clock(0.5, 0.01, 0.0, 0, 3, 1, False), 0.0, most=6).lost
     assert judge(Clock(0.5, 0.01, 0.0, 0, 3, 2, False), 0.0, most=6).lost
-    assert not judge(Clock(0.5, 0.5, 0.0, 0, 3, 2, False), 0.0, most=6).lost  # it is there
+    assert not judge(Clock(0.5, 0.5, 0.0, 0, 3, 2, False), 0.0, most=6).lost  # the end is reached
 
 
-def test_rounding_is_no_error() -> None:
-    """In float32 the two results of a step differ by more than a tolerance of 1e-9, at every step."""
+def test_differences_within_rounding_count_as_no_error() -> None:
+    """In float32 rounding makes the two results of a step differ by more than a tolerance of 1e-9."""
     tiny = 8 * np.finfo(np.float32).eps
     assert excess(np.float32(9e-6), np.float32(10.0), tiny) == 0
     assert excess(np.float32(9e-6), np.float32(1.0), tiny) > 0
@@ -409,8 +411,8 @@ def test_rounding_is_no_error() -> None:
 
 
 @ADAPTIVE
-def test_the_clock_runs_through_every_stage(kind: type[Integrator]) -> None:
-    """A force of time alone: the integral to the tolerance, and no stage outside the step."""
+def test_stages_are_evaluated_at_times_within_the_step(kind: type[Integrator]) -> None:
+    """The force depends on time alone."""
     times: list[float] = []
     state = blank(1, 1, 2, 0, 2.0)
     state.tick[:] = 3
@@ -424,8 +426,8 @@ def test_the_clock_runs_through_every_stage(kind: type[Integrator]) -> None:
 @ADAPTIVE
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-6, 1e-9])
 @pytest.mark.parametrize("jump", [1.0, 10.0])
-def test_a_force_that_jumps_is_crossed(kind: type[Integrator], tolerance: float, jump: float) -> None:
-    """Less than 20 steps are rejected per crossing, and it ends; x'' = -J sign x from x = 0.3."""
+def test_steps_across_a_jump_of_the_force_are_few(kind: type[Integrator], tolerance: float, jump: float) -> None:
+    """x'' = -J sign x from x = 0.3: less than 20 rejected steps per crossing."""
     dt, seconds = 0.05, 20 / math.sqrt(jump)
     state, method, crossings = at_start(blank(1, 1, 2, 0, dt), 0.3, 0.0), kind(tolerance=tolerance), 0
     for _ in range(int(seconds / dt)):
@@ -442,8 +444,8 @@ def test_a_force_that_jumps_is_crossed(kind: type[Integrator], tolerance: float,
 
 @ADAPTIVE
 @pytest.mark.parametrize("jump", [1.0, 10.0])
-def test_the_worst_agent_of_a_world_sets_its_steps(kind: type[Integrator], jump: float, tether: Any) -> None:
-    """Twenty agents in one world, of two masses: both ways alike, as many steps as the stiffest alone, or more."""
+def test_the_agent_with_the_largest_error_sets_the_substeps(kind: type[Integrator], jump: float, tether: Any) -> None:
+    """Twenty agents of two masses: compiled and in Python alike; without the light ones less than half the steps."""
     groups = tuple(Group(count=10, mass=m, spawn=Spawn(low=(0, 0), high=(1, 1), speed=(1, 2))) for m in (0.01, 4.0))
     method = kind(tolerance=1e-8)
     scene = Scene(groups=groups, effects=(tether(stiffness=jump, damping=0.1),), integrator=method, dt=1.0)
@@ -459,7 +461,7 @@ def test_the_worst_agent_of_a_world_sets_its_steps(kind: type[Integrator], jump:
 
 
 @ADAPTIVE
-def test_who_has_no_finite_force_is_named_and_the_world_stays(kind: type[Integrator], tether: Any) -> None:
+def test_an_agent_with_an_infinite_force_is_named(kind: type[Integrator], tether: Any) -> None:
     scene = Scene(groups=(Group(count=20, spawn=HERE),), effects=(tether(stiffness=1e100),), integrator=kind(), dt=0.1)
     start = scene.start(0, worlds=2)
     start.x[...], start.v[...] = 0.0, 0.0
@@ -473,7 +475,7 @@ def test_who_has_no_finite_force_is_named_and_the_world_stays(kind: type[Integra
 
 
 @ADAPTIVE
-def test_a_step_below_the_least_is_refused(kind: type[Integrator], tether: Any) -> None:
+def test_a_world_diverges_if_steps_are_too_small_or_too_many(kind: type[Integrator], tether: Any) -> None:
     given = orbit(0.9)
     with pytest.raises(SimulationDiverged, match=kind.model_fields["kind"].default):
         tethered(tether, "compiled", **given)(kind(tolerance=1e-9, least=0.01), 2 * math.pi, 1)
@@ -486,8 +488,8 @@ def test_a_step_below_the_least_is_refused(kind: type[Integrator], tether: Any) 
 
 @pytest.mark.slow
 @ADAPTIVE
-def test_single_precision_does_not_ask_for_more_than_it_has(kind: type[Integrator], tether: Any) -> None:
-    """A tolerance below rounding: the steps are those of rounding, and nobody is given up."""
+def test_a_tolerance_below_rounding_works_in_single_precision(kind: type[Integrator], tether: Any) -> None:
+    """Rounding then limits the steps, and no world is given up."""
     scene = Scene(
         groups=(Group(count=20, spawn=Spawn(low=(50, 50), high=(60, 60), speed=(1, 2))),),
         effects=(tether(stiffness=4.0),), integrator=kind(tolerance=1e-9), dt=0.5, dtype="float32",
@@ -499,7 +501,7 @@ def test_single_precision_does_not_ask_for_more_than_it_has(kind: type[Integrato
 
 
 @ADAPTIVE
-def test_two_threads_leave_a_world_of_it_whole(kind: type[Integrator], tether: Any) -> None:
+def test_two_threads_change_no_bits_of_an_adaptive_method(kind: type[Integrator], tether: Any) -> None:
     scene = Scene(groups=(Group(count=8192, spawn=HERE),), effects=(tether(stiffness=9.0),), integrator=kind(), dt=0.3)
     ends = []
     for count in (2, 1):
@@ -510,7 +512,7 @@ def test_two_threads_leave_a_world_of_it_whole(kind: type[Integrator], tether: A
 
 
 @pytest.mark.slow
-def test_only_methods_with_steps_of_their_own_count_them(tether: Any) -> None:
+def test_only_adaptive_and_implicit_methods_count_substeps(tether: Any) -> None:
     for row in INTEGRATORS:
         scene = Scene(groups=(Group(count=1, spawn=HERE),), effects=(tether(stiffness=1),), integrator=row.method)
         after = scene.run(scene.start(0), 10)
