@@ -1,4 +1,4 @@
-"""Obstacles that move, or that bodies stay in: where each is at a time, how fast, and what laws make of it."""
+"""Shapes that move, and hollow shapes: their positions, their velocities, and the forces of laws on bodies."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ def moving(shape: Shape, **motion: Any) -> Any:
     return shape.model_copy(update=motion)
 
 
-# --- the same from a frame that moves ---------------------------------------------------------------------------------
+# --- moving frames of reference ---------------------------------------------------------------------------------------
 
 
 AWAY: tuple[Any, ...] = (
     moving(Circle(centre=(900, 0), radius=1), velocity=(0, 1)), Block(centre=(900, 9), size=(1, 1)),
     HalfSpace(point=(900, 0), direction=(-1, 0)), Circle(centre=(0, 0), radius=900, hollow=True),
 )  # fmt: skip
-"""One of each form, where nobody is: scenes with these have one kernel."""
+"""One shape of each form, far from all bodies, so that all these scenes share one kernel."""
 
 
 def bodies(*shapes: Shape, radius: float = 0.3, stiffness: float = 50, damping: float = 0, **spawn: Any) -> Scene:
@@ -58,8 +58,8 @@ def bodies(*shapes: Shape, radius: float = 0.3, stiffness: float = 50, damping: 
 
 
 @pytest.mark.slow
-def test_a_shape_that_moves_is_a_shape_at_rest_that_everybody_moves_against() -> None:
-    """Galilei: (shape at u, bodies at v) is (shape at rest, bodies at v - u), seen from a frame that moves with u."""
+def test_contacts_with_moving_shapes_are_galilean_invariant() -> None:
+    """A shape at velocity u and bodies at v; or a shape at rest and bodies at v - u, in a frame that moves with -u."""
     shapes = (
         Polygon(vertices=((1, 0), (2, 0), (1.5, 1))), Capsule(start=(0.2, 0.1), end=(0.2, 0.1), radius=1),
         Block(centre=(0, -2), size=(1, 2), turn=20), HalfSpace(point=(-2, 0), direction=(1, 0)), ROOM,
@@ -76,11 +76,11 @@ def test_a_shape_that_moves_is_a_shape_at_rest_that_everybody_moves_against() ->
         begin, end = still.run(begin, 600), gliding.run(end, 600)
         np.testing.assert_allclose(end.pos, begin.pos + 3 * U, atol=1e-12)
         np.testing.assert_allclose(end.vel, begin.vel + U, atol=1e-12)
-        assert np.abs(end.vel - first.vel).max() > 0.1, "nobody was touched"
+        assert np.abs(end.vel - first.vel).max() > 0.1, "no body touched the shape"
 
 
-def test_a_circle_that_moves_is_met_as_one_of_the_state_is_that_stands_still() -> None:
-    """One that only sways is where it stands for an instant: there no law tells it from one that does not."""
+def test_a_swaying_circle_acts_like_one_at_rest_while_its_displacement_is_zero() -> None:
+    """The circle at rest is part of the state, the other is a shape; without damping its velocity does not matter."""
     circle = Circle(centre=(0, 0), radius=1)
     swaying = moving(circle, sway=Sway(amplitude=(2, 0), period=4))
     scenes = [bodies(shape, low=(-2, -2), high=(2, 2)) for shape in (circle, swaying)]
@@ -93,7 +93,7 @@ def test_a_circle_that_moves_is_met_as_one_of_the_state_is_that_stands_still() -
     np.testing.assert_allclose(at_middle.vel, at_rest.vel, atol=1e-12)
 
 
-# --- where it is, and how fast ----------------------------------------------------------------------------------------
+# --- positions and velocities -----------------------------------------------------------------------------------------
 
 SHAPES: tuple[Any, ...] = (
     moving(Circle(centre=(9, 8), radius=0.8), velocity=(1.5, 0.25)),
@@ -106,8 +106,8 @@ TIMES = (0.0, 1.7, 40.2)
 
 
 @pytest.mark.slow
-def test_a_law_meets_it_where_it_is_at_the_time_of_its_world_and_feels_how_fast_it_comes() -> None:
-    """k d - c (v - u).n of every shape, displaced by v t + a sin(2 pi t / T + phase); on a torus its nearest image."""
+def test_contact_forces_use_position_and_velocity_of_shapes_at_the_time_of_a_world() -> None:
+    """k d - c (v - u).n for each shape, displaced by v t + a sin(2 pi t / T + phase); the nearest image on a torus."""
     scene = Scene(
         space=Torus(size=(12, 12)), groups=(Group(count=94, radius=0.25, spawn=Spawn(speed=(0.5, 1))),),
         obstacles=SHAPES, effects=(ObstacleContact(stiffness=40, damping=6),),
@@ -128,12 +128,12 @@ def test_a_law_meets_it_where_it_is_at_the_time_of_its_world_and_feels_how_fast_
             expected[b] += np.where(hits, force, 0)[:, None] * normal
     np.testing.assert_allclose(found, expected, atol=1e-7)
     assert (touched > 1).all()
-    assert state.counted("obstacle_tests") == 3 * 94 * len(SHAPES), "what is out of reach is counted, too"
+    assert state.counted("obstacle_tests") == 3 * 94 * len(SHAPES), "obstacles out of reach are counted also"
 
 
 @pytest.mark.slow
-def test_what_moves_between_two_hides_them_from_each_other_while_it_is_there() -> None:
-    """A wall goes by at 1 m/s; from 1.5 to 2.5 s it stands between them."""
+def test_a_moving_wall_hides_agents_from_each_other_while_it_is_between_them() -> None:
+    """A wall moves past at 1 m/s and is between the agents from 1.5 to 2.5 s."""
     wall = Block(centre=(-2, 0), size=(1, 0.2), velocity=(1, 0))
     place = Spawn(low=(0, -1), high=(0, 1))
     scene = Scene(
@@ -146,11 +146,11 @@ def test_what_moves_between_two_hides_them_from_each_other_while_it_is_there() -
     assert (np.abs(found).max(axis=(1, 2)) > 0).tolist() == [True, True, False, False, True]
 
 
-# --- rooms ------------------------------------------------------------------------------------------------------------
+# --- hollow shapes ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("room", [ROOM, Circle(centre=(2, 2), radius=1.9, hollow=True)], ids=["polygon", "circle"])
-def test_everybody_begins_inside_and_stays_there(room: Any) -> None:
+def test_bodies_in_a_hollow_shape_start_inside_and_stay_inside(room: Any) -> None:
     scene = bodies(room, radius=0.1, stiffness=800, low=(0, 0), high=(4, 4), speed=(1, 2))
     state = scene.start(1, worlds=2)
     assert (room.gap(state.pos) >= 0.1).all()
@@ -158,31 +158,31 @@ def test_everybody_begins_inside_and_stays_there(room: Any) -> None:
     state = scene.run(state, 2000)
     assert (room.gap(state.pos) > 0.1 - 2 / np.sqrt(400)).all()
     now = (state.vel**2).sum() + 400 * (np.maximum(0.1 - room.gap(state.pos), 0) ** 2).sum()
-    assert now == pytest.approx(energy, rel=0.02), "walls gain and lose nothing"
+    assert now == pytest.approx(energy, rel=0.02), "walls conserve energy"
     touching = measure(scene, state)["contacts"]
     assert touching >= (room.gap(state.pos[0]) < 0.1).sum()
 
 
-def test_from_where_a_ray_ends_inside_there_is_no_way_on() -> None:
-    """What is left of a room for a body: nowhere along its way it touches, and right behind the end it does."""
+def test_a_ray_in_a_hollow_shape_ends_where_the_body_touches_the_wall() -> None:
+    """The gap exceeds the radius up to the hit and equals it there; a distance field gives nearly the same hit."""
     rng = np.random.default_rng(7)
     field = DistanceField(low=(-1, -1), high=(5, 5), spacing=0.05, shapes=(moving(ROOM, hollow=False),), hollow=True)
     x, turn = rng.uniform(0, 4, (400, 2)), rng.uniform(0, 2 * np.pi, 400)
-    way = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    exact, near = ROOM.hit(x, way, 0.2), field.hit(x, way, 0.2)
+    direction = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    exact, near = ROOM.hit(x, direction, 0.2), field.hit(x, direction, 0.2)
     inside = ROOM.gap(x) > 0.25
     assert inside.sum() > 50
     assert np.quantile(np.abs(exact - near)[inside], 0.9) < 0.1
     for share in np.linspace(0, 0.999, 50):
-        assert (ROOM.gap(x + share * exact[:, None] * way)[inside] > 0.2 - 1e-9).all()
-    np.testing.assert_allclose(ROOM.gap(x + exact[:, None] * way)[inside], 0.2, atol=1e-9)
+        assert (ROOM.gap(x + share * exact[:, None] * direction)[inside] > 0.2 - 1e-9).all()
+    np.testing.assert_allclose(ROOM.gap(x + exact[:, None] * direction)[inside], 0.2, atol=1e-9)
 
 
-# --- for kernels that know no forms -----------------------------------------------------------------------------------
+# --- shapes whose form is known only at run time ----------------------------------------------------------------------
 
 
-def test_a_row_says_by_which_laws_it_is_met_what_it_lies_within_and_how_it_moves() -> None:
-    """Every form in one table, read from its first row on, against what each shape says for itself."""
+def test_packed_rows_give_the_gap_hit_bound_shift_and_velocity_of_their_shape() -> None:
+    """For shapes of all forms in one table."""
     field = DistanceField(low=(-1, -1), high=(1, 1), spacing=0.5, shapes=(Circle(centre=(0, 0), radius=0.6),))
     hollows = (moving(field, hollow=True), ROOM, Block(centre=(0, 0), size=(5, 4), hollow=True))
     every = (*SHAPES, HalfSpace(point=(0, 1), direction=(1, 2), velocity=(0, 1)), field, *hollows)
@@ -195,12 +195,12 @@ def test_a_row_says_by_which_laws_it_is_met_what_it_lies_within_and_how_it_moves
         at += int(table[at])
     assert at == len(table)
     found = np.empty((len(every), 11))
-    x, way = np.array([0.4, 0.3]), np.array([0.6, 0.8])
-    entry(ask)(table, np.array(rows), 1.3, x, way, found)
+    x, direction = np.array([0.4, 0.3]), np.array([0.6, 0.8])
+    entry(read_rows)(table, np.array(rows), 1.3, x, direction, found)
     for k, (gap, *normal, hit, bx, by, radius, dx, dy, vx, vy) in zip(order, found.tolist(), strict=True):
         shape, place = every[k], np.array(every[k].anchor) + x
         np.testing.assert_allclose((gap, *normal), (shape.gap(place), *shape.normal(place)), atol=1e-12)
-        np.testing.assert_allclose(hit, shape.hit(place, way, 0.1), atol=1e-12)
+        np.testing.assert_allclose(hit, shape.hit(place, direction, 0.1), atol=1e-12)
         np.testing.assert_allclose((bx, by), shape.bound.centre - shape.anchor, atol=1e-12)
         np.testing.assert_allclose(radius, shape.bound.radius, rtol=2e-6)
         np.testing.assert_allclose((dx, dy), shape.shift(1.3), atol=1e-12)
@@ -209,9 +209,9 @@ def test_a_row_says_by_which_laws_it_is_met_what_it_lies_within_and_how_it_moves
     assert body_of.py_func(0, (0.0, 0.0)) == 16
 
 
-def ask(table: Any, rows: Any, time: float, x: Any, way: Any, found: Any) -> None:
-    """What the functions that read forms at run time say of each row."""
-    y, d = (x[0], x[1]), (way[0], way[1])
+def read_rows(table: Any, rows: Any, time: float, x: Any, direction: Any, found: Any) -> None:
+    """Write the results of the functions that read forms at run time, for each row."""
+    y, d = (x[0], x[1]), (direction[0], direction[1])
     for k in range(len(rows)):
         at = rows[k]
         gap, normal = nearest_shape(table, at, y)
@@ -226,7 +226,7 @@ def ask(table: Any, rows: Any, time: float, x: Any, way: Any, found: Any) -> Non
 # --- pictures ---------------------------------------------------------------------------------------------------------
 
 
-def test_pictures_show_it_where_it_is_and_of_a_room_the_walls_alone() -> None:
+def test_pictures_show_moving_shapes_in_place_and_only_the_walls_of_hollow_ones() -> None:
     scene = Scene(
         space=Torus(size=(12, 12)), groups=(Group(count=1),), dt=0.1,
         obstacles=(*SHAPES[:2], moving(Circle(centre=(6, 6), radius=3), hollow=True)),

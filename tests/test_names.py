@@ -1,4 +1,4 @@
-"""A module of a package can be reached by its name: no function that the package exports hides it."""
+"""A module of a package is available under its name: no function that the package exports hides it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PACKAGES = sorted(
 
 
 def hidden(package: ModuleType) -> list[str]:
-    """Return the submodules whose name is something else in their package."""
+    """Return the submodules whose name refers to another object in their package."""
     (folder,) = package.__path__
     paths = (path for pattern in ("[!_]*.py", "[!_]*/__init__.py") for path in Path(folder).glob(pattern))
     inside = (path.parent.name if path.name == "__init__.py" else path.stem for path in paths)
@@ -27,11 +27,11 @@ def hidden(package: ModuleType) -> list[str]:
 
 
 @pytest.mark.parametrize("name", PACKAGES)
-def test_no_package_has_another_thing_by_the_name_of_a_submodule(name: str) -> None:
+def test_no_package_has_another_object_with_the_name_of_a_submodule(name: str) -> None:
     assert hidden(importlib.import_module(name)) == []
 
 
-def test_a_function_by_the_name_of_its_module_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_function_with_the_name_of_its_module_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     package = tmp_path / "hiding"
     package.mkdir()
     (package / "__init__.py").write_text("from hiding.edge import edge\nimport hiding.open\n")
@@ -46,7 +46,7 @@ PATH = re.compile(
 )
 MODULE = re.compile(r"`flockenv((?:\.[a-z_]\w*)+)")
 MADE_UP = {"configs/no.yaml", "flockenv/helpers.py"}
-"""Paths that tests need not to exist."""
+"""Paths of files that must not exist, for tests."""
 
 
 def texts() -> Iterator[Path]:
@@ -60,7 +60,7 @@ def texts() -> Iterator[Path]:
     ]
 
 
-def test_files_and_modules_that_texts_name_exist() -> None:
+def test_files_and_modules_named_in_texts_exist() -> None:
     missing = []
     for path in texts():
         text = path.read_text(encoding="utf-8")

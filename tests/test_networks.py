@@ -1,4 +1,4 @@
-"""Networks: who is tied to whom, how long springs are at rest, who is pinned, what each particle weighs."""
+"""Networks: which particles are tied, rest lengths, pins and masses."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from flockenv.model.networks import BEND, EDGE, SHEAR, AnyNetwork, Cloth, Jelly,
 
 Floats = NDArray[np.float64]
 
-TURNED = ((0.6, 0.8, 0.0), (-0.8, 0.6, 0.0), (0.0, 0.0, 2.0))  # right-handed edges that lie along no axis
+TURNED = ((0.6, 0.8, 0.0), (-0.8, 0.6, 0.0), (0.0, 0.0, 2.0))  # right-handed edges, not along the axes
 SQUARE = ((0, 0), (1, 0), (1, 1), (0, 1))
 
 NETWORKS: list[tuple[Network, int]] = [
@@ -39,11 +39,11 @@ NETWORKS: list[tuple[Network, int]] = [
 EVERY = pytest.mark.parametrize(("network", "dimension"), NETWORKS, ids=lambda value: getattr(value, "kind", value))
 
 
-# --- what holds of every network ------------------------------------------------------------------------------------
+# --- every network ----------------------------------------------------------------------------------------------------
 
 
 @EVERY
-def test_springs_are_unique_ordered_and_as_long_as_their_ends_are_apart(network: Network, dimension: int) -> None:
+def test_springs_are_unique_sorted_and_as_long_as_the_distance_of_their_ends(network: Network, dimension: int) -> None:
     i, j, rest, role = springs = network.springs(dimension)
     assert [array.dtype for array in springs] == [np.int32, np.int32, np.float64, np.int8]
     assert (i < j).all()
@@ -55,18 +55,18 @@ def test_springs_are_unique_ordered_and_as_long_as_their_ends_are_apart(network:
 
 
 @EVERY
-def test_points_are_as_many_as_particles_and_stretched_as_asked(network: Network, dimension: int) -> None:
+def test_there_is_one_point_per_particle_and_springs_are_stretched_as_given(network: Network, dimension: int) -> None:
     points, rest = network.points(dimension), network.rest_points(dimension)
     assert points.shape == rest.shape == (network.size, dimension)
     assert points.dtype == np.float64
     i, j, length, _ = network.springs(dimension)
-    if not (isinstance(network, Rope) and network.end and network.length):  # a slack rope is no stretched line
+    if not (isinstance(network, Rope) and network.end and network.length):  # a slack rope is not stretched
         ratio = np.linalg.norm(points[j] - points[i], axis=1) / length
         np.testing.assert_allclose(ratio, network.stretch, rtol=1e-14)
 
 
 @EVERY
-def test_elements_and_hinges_join_particles_that_differ(network: Network, dimension: int) -> None:
+def test_elements_and_hinges_join_different_particles(network: Network, dimension: int) -> None:
     for rows in (network.elements(dimension), network.hinges(dimension)):
         assert rows.dtype == np.int32
         assert ((rows >= 0) & (rows < network.size)).all()
@@ -78,7 +78,7 @@ def test_elements_and_hinges_join_particles_that_differ(network: Network, dimens
 
 @EVERY
 @pytest.mark.parametrize("lumping", ["equal", "geometric"])
-def test_masses_add_up(network: Network, dimension: int, lumping: str) -> None:
+def test_masses_add_up_to_the_total(network: Network, dimension: int, lumping: str) -> None:
     if network == NETWORKS[-1][0]:  # no springs
         return
     masses = network.model_copy(update={"lumping": lumping}).masses(7.0, dimension)
@@ -88,20 +88,20 @@ def test_masses_add_up(network: Network, dimension: int, lumping: str) -> None:
 
 
 @EVERY
-def test_a_network_is_a_value_that_reads_back_from_a_file(network: Network, dimension: int) -> None:
+def test_a_network_equals_its_copy_from_json_pickle_and_repr(network: Network, dimension: int) -> None:
     again: Any = TypeAdapter(AnyNetwork).validate_json(network.model_dump_json())
     assert again == network == pickle.loads(pickle.dumps(network)) == eval(repr(network))  # noqa: S307  # our own text
     assert hash(again) == hash(network)
 
 
 def volumes(points: Floats, elements: NDArray[Any]) -> Floats:
-    """What elements that fill their space hold, negative if they are turned inside out."""
+    """Return areas of triangles or volumes of tetrahedra, negative if they are inverted."""
     corners = points[elements]
     factor = {3: 2, 4: 6}[elements.shape[1]]
     return np.asarray(np.linalg.det(corners[:, 1:] - corners[:, :1]) / factor)
 
 
-# --- ropes ----------------------------------------------------------------------------------------------------------
+# --- ropes ------------------------------------------------------------------------------------------------------------
 
 
 def test_a_rope_lies_in_its_direction_or_between_its_ends() -> None:
@@ -110,7 +110,7 @@ def test_a_rope_lies_in_its_direction_or_between_its_ends() -> None:
     taut = Rope(links=2, start=(0, 0), end=(6, 8), length=5)
     np.testing.assert_array_equal(taut.points(2), [(0, 0), (3, 4), (6, 8)])
     far = Rope(links=3, start=(0.1, 0.1), end=(0.7, -0.3))
-    np.testing.assert_array_equal(far.points(2)[[0, -1]], [(0.1, 0.1), (0.7, -0.3)])  # to the last bit
+    np.testing.assert_array_equal(far.points(2)[[0, -1]], [(0.1, 0.1), (0.7, -0.3)])  # exactly
     np.testing.assert_allclose(taut.springs(2).rest, 2.5)
     np.testing.assert_allclose(Rope(links=2, length=1, stretch=1.5).points(3)[-1], (1.5, 0, 0))
     np.testing.assert_allclose(Rope(links=2, end=(3, 0), stretch=1.5).springs(2).rest, 1)
@@ -120,7 +120,7 @@ def test_a_rope_lies_in_its_direction_or_between_its_ends() -> None:
 
 @pytest.mark.parametrize("links", [2, 3, 10, 101])
 @pytest.mark.parametrize("distance", [0.0, 0.3, 1.0, 1.999999])
-def test_slack_hangs_in_links_of_their_rest_length(links: int, distance: float) -> None:
+def test_the_links_of_a_slack_rope_have_their_rest_length(links: int, distance: float) -> None:
     rope = Rope(links=links, start=(1, 1, 5), end=(1 + distance, 1, 5), length=2)
     points = rope.points(3)
     np.testing.assert_array_equal(points[[0, -1]], [(1, 1, 5), (1 + distance, 1, 5)])
@@ -129,7 +129,7 @@ def test_slack_hangs_in_links_of_their_rest_length(links: int, distance: float) 
     np.testing.assert_allclose(points[:, 1], 1)
 
 
-def test_slack_hangs_where_it_is_told_and_somewhere_if_that_is_along_the_rope() -> None:
+def test_a_slack_rope_sags_in_the_given_direction_unless_it_is_along_the_rope() -> None:
     aside = Rope(links=4, start=(0, 0), end=(1, 0), length=2, sag=(5, 1)).points(2)
     assert (aside[1:-1, 1] > 0).all()
     along = Rope(links=4, start=(0, 0), end=(0, -1), length=2).points(2)
@@ -139,7 +139,7 @@ def test_slack_hangs_where_it_is_told_and_somewhere_if_that_is_along_the_rope() 
     np.testing.assert_array_equal(single.springs(2).rest, [2])
 
 
-def test_a_rope_bends_at_every_particle_between_two() -> None:
+def test_a_rope_has_a_hinge_at_every_inner_particle() -> None:
     rope = Rope(links=4, length=1, bend=True)
     np.testing.assert_array_equal(rope.hinges(2), [(0, 1, 2), (1, 2, 3), (2, 3, 4)])
     np.testing.assert_array_equal(rope.elements(2), [(0, 1), (1, 2), (2, 3), (3, 4)])
@@ -151,11 +151,11 @@ def test_a_rope_bends_at_every_particle_between_two() -> None:
     np.testing.assert_allclose(Rope(links=4, length=1, lumping="geometric").masses(8, 2), [1, 2, 2, 2, 1])
 
 
-# --- cloths and jellies ---------------------------------------------------------------------------------------------
+# --- cloths and jellies -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("cells", [(1, 1), (1, 4), (7, 3)])
-def test_a_cloth_has_the_springs_it_should(cells: tuple[int, int]) -> None:
+def test_a_cloth_has_the_expected_number_of_springs(cells: tuple[int, int]) -> None:
     a, b = cells
     cloth = Cloth(cells=cells, sides=(1, 1))
     role = cloth.springs(3).role
@@ -172,14 +172,14 @@ def test_a_cloth_has_the_springs_it_should(cells: tuple[int, int]) -> None:
 @pytest.mark.parametrize(
     ("shear", "bend", "printed"), [(False, False, "3.93"), (True, False, "7.80"), (True, True, "9.75")]
 )
-def test_the_stiffest_motion_of_a_cloth_is_that_of_the_table(shear: bool, bend: bool, printed: str) -> None:
-    """12 x 12 nodes of mass m, all springs of stiffness k: omega^2 m / k."""
+def test_the_highest_frequency_of_a_cloth_is_that_of_the_table(shear: bool, bend: bool, printed: str) -> None:
+    """omega^2 m / k of 12 x 12 particles of mass m with springs of stiffness k."""
     cloth = Cloth(cells=(11, 11), sides=(11, 11), shear=shear, bend=bend)
     points, (i, j, _, _) = cloth.points(2), cloth.springs(2)
-    way = points[j] - points[i]
-    way /= np.linalg.norm(way, axis=1)[:, None]
+    direction = points[j] - points[i]
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
     K = np.zeros((cloth.size, 2, cloth.size, 2))
-    for a, b, d in zip(i, j, way, strict=True):
+    for a, b, d in zip(i, j, direction, strict=True):
         block = np.outer(d, d)
         K[a, :, a] += block
         K[b, :, b] += block
@@ -188,7 +188,7 @@ def test_the_stiffest_motion_of_a_cloth_is_that_of_the_table(shear: bool, bend: 
     assert f"{np.linalg.eigvalsh(K.reshape(2 * cloth.size, -1))[-1]:.2f}" == printed
 
 
-def test_hinges_of_a_cloth_follow_both_edges() -> None:
+def test_hinges_of_a_cloth_lie_along_both_edges() -> None:
     cloth = Cloth(cells=(2, 1), sides=(2, 1))
     np.testing.assert_array_equal(cloth.hinges(2), [(0, 1, 2), (3, 4, 5)])
     np.testing.assert_array_equal(Cloth(cells=(1, 2), sides=(1, 2)).hinges(2), [(0, 2, 4), (1, 3, 5)])
@@ -213,13 +213,13 @@ def test_tetrahedra_fill_a_jelly_and_share_whole_faces(
     times = np.unique(faces, axis=0, return_counts=True)[1]
     assert times.max() <= 2
     a, b, c = cells
-    assert (times == 1).sum() == 4 * (a * b + b * c + c * a)  # the skin: two triangles on each square
+    assert (times == 1).sum() == 4 * (a * b + b * c + c * a)  # the surface: two triangles per square
     assert len(jelly.hinges(3)) == 0
 
 
 @pytest.mark.parametrize("diagonals", ["alternating", "parallel"])
 @pytest.mark.parametrize("edges", [((2, 0), (0, 1)), ((0, 1), (2, 0)), ((1, 1), (-1, 2))])
-def test_triangles_fill_a_jelly_in_the_plane(edges: tuple[Any, ...], diagonals: Any) -> None:
+def test_triangles_fill_a_jelly_in_two_dimensions(edges: tuple[Any, ...], diagonals: Any) -> None:
     jelly = Jelly(cells=(3, 4), edges=edges, diagonals=diagonals)
     content = volumes(jelly.points(2), jelly.elements(2))
     assert (content > 0).all()
@@ -239,7 +239,7 @@ def test_springs_of_a_jelly_are_the_edges_of_its_tetrahedra(diagonals: Any, acro
     np.testing.assert_allclose(np.sort(rest[role == SHEAR]), [2**0.5] * faces + [3**0.5] * 24 * across)
 
 
-def test_a_cloth_without_written_points_lies_in_the_plane_and_in_space() -> None:
+def test_a_cloth_without_coordinates_fits_two_and_three_dimensions() -> None:
     cloth = Cloth(cells=(2, 1), sides=(4, 1))
     assert cloth.dimension is None
     np.testing.assert_allclose(cloth.points(2), [(0, 0), (2, 0), (4, 0), (0, 1), (2, 1), (4, 1)])
@@ -249,13 +249,13 @@ def test_a_cloth_without_written_points_lies_in_the_plane_and_in_space() -> None
     np.testing.assert_allclose(stretched.rest_points(2)[[0, -1]], [(1, 1), (3, 1.5)])
 
 
-def test_geometric_shares_follow_the_area_around_a_particle() -> None:
+def test_geometric_masses_follow_the_area_around_a_particle() -> None:
     cloth = Cloth(cells=(2, 2), sides=(2, 2), lumping="geometric", diagonals="parallel")
-    np.testing.assert_allclose(cloth.masses(24, 3), [2, 3, 1, 3, 6, 3, 1, 3, 2])  # triangles that meet there
+    np.testing.assert_allclose(cloth.masses(24, 3), [2, 3, 1, 3, 6, 3, 1, 3, 2])  # number of triangles at each particle
     np.testing.assert_allclose(cloth.model_copy(update={"lumping": "equal"}).masses(9, 3), 1)
 
 
-# --- pins -----------------------------------------------------------------------------------------------------------
+# --- pins -------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -280,16 +280,16 @@ def test_geometric_shares_follow_the_area_around_a_particle() -> None:
         (Mesh(vertices=SQUARE), (3, 1), [1, 3]),
     ],
 )
-def test_pins_are_places_and_numbers(network: Network, pinned: tuple[Any, ...], held: list[int]) -> None:
+def test_pins_are_given_by_place_or_number(network: Network, pinned: tuple[Any, ...], held: list[int]) -> None:
     pins = network.model_copy(update={"pinned": pinned}).pins()
     assert pins.dtype == np.int32
     assert pins.tolist() == held
 
 
-# --- meshes ---------------------------------------------------------------------------------------------------------
+# --- meshes -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_mesh_keeps_the_rest_lengths_it_is_given_with_their_pairs() -> None:
+def test_a_mesh_keeps_the_rest_lengths_given_with_its_pairs() -> None:
     mesh = Mesh(vertices=SQUARE, pairs=((3, 2), (2, 0), (1, 0)), rest=(3.0, 2.0, 0.0))
     i, j, rest, _ = mesh.springs(2)
     assert list(zip(i.tolist(), j.tolist(), rest.tolist(), strict=True)) == [(0, 1, 0.0), (0, 2, 2.0), (2, 3, 3.0)]
@@ -304,7 +304,7 @@ def test_springs_of_a_mesh_are_the_edges_of_its_elements_unless_pairs_are_given(
     np.testing.assert_array_equal(mesh.elements(2), [(0, 1, 2), (3, 0, 2)])
 
 
-# --- refusals -------------------------------------------------------------------------------------------------------
+# --- refusals ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("call", "line"), [
@@ -363,12 +363,12 @@ def test_springs_of_a_mesh_are_the_edges_of_its_elements_unless_pairs_are_given(
     (lambda: Mesh(vertices=SQUARE, triangles=((0, 1, 2),), lumping="geometric"), "particle 3 is part of no element"),
     (lambda: Mesh(vertices=SQUARE, pinned=("left",)), "pinned[0] = 'left': unknown; allowed: numbers 0 to 3"),
 ])  # fmt: skip
-def test_a_refusal_is_one_line(call: Any, line: str) -> None:
+def test_an_invalid_network_is_refused_in_one_line(call: Any, line: str) -> None:
     with pytest.raises(ValueError, match=r".") as caught:
         call()
     assert line in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_what_is_bent_twice_is_no_duplicate() -> None:
+def test_hinges_of_the_same_particles_may_differ_in_their_middle() -> None:
     assert len(Mesh(vertices=SQUARE, angles=((0, 1, 2), (0, 2, 1), (1, 0, 2))).hinges(2)) == 3

@@ -1,4 +1,4 @@
-"""Solid bodies never pass each other, in any response; and no energy appears or vanishes where impacts run out."""
+"""Solid bodies never pass each other in any response, and energy is conserved even if impacts reach their limit."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def scene(
     masses: Any, response: str, *, e: float = 1.0, dt: float = 0.001, pull: float = 0.0, dimension: int = 2,
     radius: float = R, obstacles: Any = (), space: Space | None = None, dtype: str = "float64", **rules: Any,
 ) -> Scene:  # fmt: skip
-    """Return balls of these masses, which are pulled down the second axis."""
+    """Return balls of these masses under gravity along the second axis."""
     spawn = Spawn(low=(0,) * dimension, high=(1,) * dimension)
     down = (0.0, -pull, 0.0)[:dimension]
     return Scene(
@@ -52,7 +52,7 @@ def line(of: Scene, x: Any, v: Any) -> State:
 
 
 def gaps(state: State, radius: float = R) -> Floats:
-    """Return what is free between neighbours on the first axis, in the order of their numbers, m."""
+    """Return the gaps between neighbours on the first axis, in the order of their numbers, m."""
     return np.diff(np.asarray(state.pos[0, :, 0], float)) - 2 * radius
 
 
@@ -61,7 +61,7 @@ def kinetic(of: Scene, state: State) -> float:
 
 
 def billiard(masses: Any, x: Any, v: Any, seconds: float) -> tuple[Floats, int]:
-    """Return velocities of two elastic balls before a wall at x = 0 after some time, and the impacts: by events."""
+    """Return velocities of two elastic balls in front of a wall at x = 0 after some time, and the number of impacts."""
     (m, n), (x, y), (v, w), done = masses, map(float, x), map(float, v), 0
     while True:
         wall = (x - R) / -v if v < 0 else math.inf
@@ -109,15 +109,15 @@ def test_a_body_between_another_and_a_wall_stays_there(
         assert state.counted("impacts") == impacts
 
 
-def test_a_million_times_the_mass_makes_3141_impacts() -> None:
-    """Digits of pi (Galperin 2003)."""
+def test_a_mass_ratio_of_a_million_gives_3141_impacts() -> None:
+    """The number has the digits of pi (Galperin 2003)."""
     assert billiard((1, 1e6), (1.1, 2.3), (0, -1), 12.0)[1] == 3141
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("response", EXACT)
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_five_in_a_row_between_walls_keep_their_order_and_energy(response: str, dimension: int, dtype: str) -> None:
+def test_five_bodies_between_walls_keep_their_order_and_energy(response: str, dimension: int, dtype: str) -> None:
     size = (2.0, 1.0, 1.0)[:dimension]
     of = scene(
         [1, 1e4, 0.1, 10, 1], response, dimension=dimension, dtype=dtype, space=Box(size=size, restitution=1.0), dt=0.01
@@ -134,7 +134,7 @@ def test_five_in_a_row_between_walls_keep_their_order_and_energy(response: str, 
 
 @pytest.mark.parametrize("most", [1, 3])
 @pytest.mark.parametrize("response", IN_TIME)
-def test_where_impacts_run_out_bodies_stop_and_keep_momentum_and_energy(response: str, most: int) -> None:
+def test_bodies_stopped_at_the_limit_of_impacts_keep_momentum_and_energy(response: str, most: int) -> None:
     masses = np.array([1000.0, 1, 1, 1, 1000])
     of = scene(masses, response, dt=0.05, most=most)
     state = line(of, (-0.5, -0.28, 0, 0.28, 0.5), (4, 0, 0, 0, -4))
@@ -147,12 +147,12 @@ def test_where_impacts_run_out_bodies_stop_and_keep_momentum_and_energy(response
             assert kinetic(of, state) == pytest.approx(first, rel=1e-11)
             assert masses @ state.vel[0, :, 0] == pytest.approx(momentum, abs=1e-8)
     assert state.counted("stopped") > 0
-    (told,) = [str(w.message) for w in caught]
-    assert "bodies stopped" in told and "keep their velocities" in told
+    (message,) = [str(w.message) for w in caught]
+    assert "bodies stopped" in message and "keep their velocities" in message
 
 
-def test_energy_that_is_lost_at_the_limit_is_told() -> None:
-    """One disc comes to lie on another, which lies on the floor, slower than gravity makes it within a step."""
+def test_energy_lost_at_the_limit_of_impacts_is_reported() -> None:
+    """A disc settles on another one on the floor, slower than the speed that gravity adds in a step."""
     floor = (HalfSpace(point=(0.0, 0.0), direction=(0.0, 1.0)),)
     of = scene([1, 1], "earliest", dt=0.005, pull=G, obstacles=floor, most=1)
     state = of.start(0).with_motion([[[0.0, R], [0.0, 3 * R]]], [[[0.0, 0.0], [0.0, -0.02]]])
@@ -160,13 +160,13 @@ def test_energy_that_is_lost_at_the_limit_is_told() -> None:
         of.run(state, 5)
 
 
-# --- whatever is fast or thin ---------------------------------------------------------------------------------------
+# --- fast or thin bodies ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("response", ALL)
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_what_moves_many_times_its_width_in_a_step_passes_nothing(response: str, dimension: int) -> None:
-    """Bullets of 3.3 m a step at a row of discs at rest, and at a wall as thin as they come."""
+def test_a_body_that_moves_many_times_its_width_in_a_step_passes_nothing(response: str, dimension: int) -> None:
+    """It moves 3.3 m per step, towards a row of discs at rest and a thin wall behind them."""
     thin = Capsule(start=(9.0, -5.0), end=(9.0, 5.0), radius=0.01)
     block = Block(centre=(9.05,) + (0.0,) * (dimension - 1), size=(0.1,) + (10.0,) * (dimension - 1))
     for phase in range(8):
@@ -187,8 +187,8 @@ def test_what_moves_many_times_its_width_in_a_step_passes_nothing(response: str,
 
 
 @pytest.mark.parametrize("response", ALL)
-def test_a_thin_wall_that_comes_fast_leaves_no_body_behind(response: str) -> None:
-    wall = Wall(vertices=((-1.0, -5.0), (-1.0, 5.0)), velocity=(50.0, 0.0))  # .83 m a step
+def test_no_body_is_left_behind_a_fast_thin_wall(response: str) -> None:
+    wall = Wall(vertices=((-1.0, -5.0), (-1.0, 5.0)), velocity=(50.0, 0.0))  # 0.83 m per step
     of = scene([1, 1], response, e=0.5, dt=1 / 60, obstacles=(wall,))
     for phase in range(8):
         state = line(of, (0.1 * phase, 0.1 * phase + 0.6), (0, 0))
@@ -200,9 +200,9 @@ def test_a_thin_wall_that_comes_fast_leaves_no_body_behind(response: str) -> Non
 
 
 @pytest.mark.parametrize("response", ALL)
-def test_a_body_sticks_to_a_wall_that_comes_fast(response: str) -> None:
-    """It goes on with the wall, whether the impact is found within the step or at its end."""
-    wall = Wall(vertices=((-1.0, -5.0), (-1.0, 5.0)), velocity=(30.0, 0.0))  # 1.5 m a step
+def test_a_body_sticks_to_a_fast_wall(response: str) -> None:
+    """It moves on with the wall, whether the impact is found within the step or at its end."""
+    wall = Wall(vertices=((-1.0, -5.0), (-1.0, 5.0)), velocity=(30.0, 0.0))  # 1.5 m per step
     of = scene([1], response, e=0.3, dt=0.05, obstacles=(wall,), sticky=True)
     state = of.run(line(of, (0.0,), (0,)), 10)
     assert state.vel[0, 0, 0] == pytest.approx(30)
@@ -211,8 +211,8 @@ def test_a_body_sticks_to_a_wall_that_comes_fast(response: str) -> None:
 
 @pytest.mark.parametrize("response", ALL)
 @pytest.mark.parametrize("mass", [1.0, 1e4])
-def test_what_a_wall_pushes_against_others_stays_between(response: str, mass: float) -> None:
-    """A row that begins in touch, and a wall that pushes it at 2 m/s."""
+def test_a_row_of_bodies_pushed_by_a_wall_keeps_its_order(response: str, mass: float) -> None:
+    """The bodies touch at the start; the wall moves at 2 m/s."""
     wall = Wall(vertices=((-R, -5.0), (-R, 5.0)), velocity=(2.0, 0.0))
     of = scene([1, mass, 1], response, e=0.0, dt=0.005, obstacles=(wall,))
     state = line(of, (0.0, 0.2, 0.4), (0, 0, 0))
@@ -223,8 +223,8 @@ def test_what_a_wall_pushes_against_others_stays_between(response: str, mass: fl
 
 
 @pytest.mark.parametrize("response", EXACT)
-def test_what_rests_on_another_is_not_driven_through_it(response: str) -> None:
-    """A ball lies on one that lies on the floor; a heavy one hits it from above, in steps that are long for that."""
+def test_a_body_at_rest_on_another_is_not_driven_through_it(response: str) -> None:
+    """A ball lies on another one on the floor; a heavy one hits it from above, with large steps."""
     floor = (HalfSpace(point=(0.0, 0.0), direction=(0.0, 1.0)),)
     for dt, speed in itertools.product((0.01, 0.05), (1.0, 40.0)):
         of = scene([1, 1, 1e4], response, e=0.3, dt=dt, pull=G, obstacles=floor)
@@ -244,11 +244,11 @@ def test_a_ball_slides_over_collinear_pieces_of_a_wall(response: str, speed: flo
     state = of.start(0).with_motion([[[-1.03, R]]], [[[speed, 0.0]]])
     end = of.run(state, 200)
     assert end.counted("unsolved") == 0 and end.counted("stopped") == 0
-    way = 2.0 * speed if not friction else speed**2 / (2 * friction * G)
-    np.testing.assert_allclose(end.pos[0, 0], [-1.03 + way, R], rtol=0, atol=1e-2 if friction else 1e-9)
+    distance = 2.0 * speed if not friction else speed**2 / (2 * friction * G)
+    np.testing.assert_allclose(end.pos[0, 0], [-1.03 + distance, R], rtol=0, atol=1e-2 if friction else 1e-9)
 
 
-# --- heaps ------------------------------------------------------------------------------------------------------------
+# --- piles ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("response", EXACT)
@@ -260,7 +260,7 @@ def test_a_ball_slides_over_collinear_pieces_of_a_wall(response: str, speed: flo
 def test_bodies_that_lean_on_each_other_come_to_rest(
     response: str, count: int, e: float, friction: float, dt: float
 ) -> None:
-    """Discs between two walls, each on the one below and on a wall: 7 s, in which speed g t would be 69 m/s."""
+    """Discs between two walls, each on the one below, for 7 s; free fall would reach g t = 69 m/s."""
     size = (0.5, 5.0)
     of = scene(
         [1] * count, response, e=e, dt=dt, pull=G, radius=0.15, friction=friction, space=Box(size=size, restitution=e)
@@ -273,34 +273,34 @@ def test_bodies_that_lean_on_each_other_come_to_rest(
         assert overlap(state.pos[0], 0.15, size) < 0.01 * 0.15
         if step * 10 * dt > 5:
             assert np.linalg.norm(state.vel[0], axis=1).max() <= G * dt
-    assert (np.diff(state.pos[0, :, 1]) > 0).all(), "they lie as they fell"
+    assert (np.diff(state.pos[0, :, 1]) > 0).all(), "they lie in their initial order"
 
 
 def overlap(pos: Floats, radius: float, size: Any) -> float:
-    """Return how far any two overlap at most, or one and a wall of a box, m."""
+    """Return the largest overlap of two bodies, or of a body and a wall of the box, m."""
     pos = np.asarray(pos, float)
     apart = np.linalg.norm(pos[:, None] - pos[None], axis=-1) + 9 * np.eye(len(pos))
     walls = min(pos.min(), (np.array(size) - pos).min())
     return float(max(2 * radius - apart.min(), radius - walls))
 
 
-# --- anything ---------------------------------------------------------------------------------------------------------
+# --- random scenes ----------------------------------------------------------------------------------------------------
 
 
 def passes(before: Floats, after: Floats, room: float) -> bool:
-    """True if a pair is on the other side of each other, having come nearer than half of what they need."""
+    """Return True if a pair has swapped sides and on its path came nearer than half of `room`."""
     a, b = (x[:, None] - x[None] for x in (np.asarray(before, float), np.asarray(after, float)))
-    way = b - a
-    share = np.clip(-(a * way).sum(-1) / np.maximum((way**2).sum(-1), 1e-300), 0, 1)
-    nearest = np.linalg.norm(a + share[..., None] * way, axis=-1) + 9 * np.eye(len(before))
+    path = b - a
+    share = np.clip(-(a * path).sum(-1) / np.maximum((path**2).sum(-1), 1e-300), 0, 1)
+    nearest = np.linalg.norm(a + share[..., None] * path, axis=-1) + 9 * np.eye(len(before))
     return bool(((nearest < room / 2) & ((a * b).sum(-1) < 0)).any())
 
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("response", ALL)
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_in_no_scene_do_bodies_overlap_pass_or_gain_energy(response: str, dimension: int, seed: int) -> None:
-    """Random masses, restitution, friction, pull, speed and step, in a box."""
+def test_bodies_in_random_scenes_do_not_overlap_pass_or_gain_energy(response: str, dimension: int, seed: int) -> None:
+    """Random masses, restitution, friction, gravity, speeds and steps, in a box."""
     rng = np.random.default_rng(100 * dimension + seed)
     count, e = 24, float(rng.choice([0.0, 0.4, 0.8, 1.0]))
     pull, dt = float(rng.choice([0.0, G])), float(rng.choice([0.002, 0.01]))
@@ -318,17 +318,17 @@ def test_in_no_scene_do_bodies_overlap_pass_or_gain_energy(response: str, dimens
     for _ in range(200):
         before, before_v, state = state.pos[0].copy(), state.vel[0].copy(), of.step(state)
         assert overlap(state.pos[0], R, size) < (0.06 if response in EXACT else 0.26) * R
-        slow = np.abs(np.concatenate([state.vel[0], before_v])).max() * dt < R  # others may go round within a step
+        slow = np.abs(np.concatenate([state.vel[0], before_v])).max() * dt < R  # faster ones may move around each other
         assert not slow or not passes(before, state.pos[0], 2 * R)
         now = kinetic(of, state) + float((mass * pull * state.pos[0, :, 1]).sum())
-        lift = float(mass.sum()) * pull * (0.01 if response in EXACT else 0.3) * R  # what is moved apart may rise
-        if response not in IN_TIME:  # an impact at the end of a step is up to a step of falling off
+        lift = float(mass.sum()) * pull * (0.01 if response in EXACT else 0.3) * R  # moving bodies apart may raise them
+        if response not in IN_TIME:  # impacts at the end of a step are up to one step of free fall late
             lift += float((mass * pull * dt * np.linalg.norm(before_v, axis=1)).sum())
         assert now <= last * (1 + 1e-9) + lift
         last = now
 
 
-# --- crowds of very uneven masses ------------------------------------------------------------------------------------
+# --- crowds of very uneven masses -------------------------------------------------------------------------------------
 
 
 def crowd(seed: int, response: str, pull: float = G) -> tuple[Scene, State]:
@@ -343,8 +343,8 @@ def crowd(seed: int, response: str, pull: float = G) -> tuple[Scene, State]:
 
 @pytest.mark.parametrize("response", ["impulses", "project"])
 @pytest.mark.parametrize("seed", range(12))
-def test_heavy_bodies_do_not_throw_light_ones_past_others(response: str, seed: int) -> None:
-    """Passes that part bodies did under `project`."""
+def test_heavy_bodies_do_not_push_light_ones_past_others(response: str, seed: int) -> None:
+    """`project` once did so when it moved bodies apart."""
     of, state = crowd(seed, response)
     for _ in range(200):
         before, state = state.pos[0].copy(), of.step(state)
@@ -354,8 +354,8 @@ def test_heavy_bodies_do_not_throw_light_ones_past_others(response: str, seed: i
 
 @pytest.mark.parametrize("pull", [0.0, G])
 @pytest.mark.parametrize("response", ["impulses", "project"])
-def test_energy_that_moving_bodies_apart_adds_is_counted(response: str, pull: float) -> None:
-    """Without a pull there is none; else no step gains more than is counted, and what a step's falling may be off."""
+def test_energy_added_by_moving_bodies_apart_is_counted(response: str, pull: float) -> None:
+    """No step gains more than that energy and an error of one step of free fall; both are 0 without gravity."""
     for seed in range(4):
         of, state = crowd(seed, response, pull)
         mass, last = of.body.mass, np.inf
@@ -368,7 +368,7 @@ def test_energy_that_moving_bodies_apart_adds_is_counted(response: str, pull: fl
             last = now
 
 
-def test_a_warning_says_how_much_energy_moving_bodies_apart_adds() -> None:
+def test_a_warning_names_the_energy_added_by_moving_bodies_apart() -> None:
     of, state = crowd(0, "project")
     with pytest.warns(UnsolvedContactsWarning, match=r"; up to [\d.e+-]+ J gained by bodies that were moved apart"):
         of.run(state, 200)

@@ -1,4 +1,4 @@
-"""What numba is spared while our kernels compile: the same machine code, and numba as it was before and after."""
+"""Patches of numba while kernels compile: the machine code stays the same, and numba is restored afterwards."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from flockenv.maths.vectors import add, dot, scale
 
 ROOT = Path(__file__).resolve().parent.parent
 TRIED = "0.68.1"
-"""The numba that replacements were tried with; configs/constraints.txt holds CI to it."""
+"""The version of numba that the patches were tested with; configs/constraints.txt pins it in CI."""
 
 
 def now() -> list[Any]:
     return [vars(trick.owner)[trick.name] for trick in front_end.TRICKS]
 
 
-@pytest.mark.skipif(numba.__version__ != TRIED, reason="replacements were tried with another numba")
-def test_every_replacement_applies_to_the_numba_it_was_tried_with() -> None:
+@pytest.mark.skipif(numba.__version__ != TRIED, reason="patches were tested with another version of numba")
+def test_every_patch_applies_to_the_tested_version_of_numba() -> None:
     front_end._replacements.cache_clear()
     assert len(front_end._replacements()) == len(front_end.TRICKS)
     assert len(front_end._places()) == len(front_end.SPARED)
@@ -47,17 +47,17 @@ def test_every_replacement_applies_to_the_numba_it_was_tried_with() -> None:
 
 
 @pytest.fixture
-def forgotten() -> Iterator[None]:
-    """What is remembered of which replacements apply is forgotten, before and after."""
-    remembered = (front_end.reads_as_known, front_end._replacements, front_end._places, lowering.is_brief)
-    for function in remembered:
+def cleared_caches() -> Iterator[None]:
+    """Clear the caches of the patches that apply, before and after a test."""
+    caches = (front_end.reads_as_known, front_end._replacements, front_end._places, lowering.is_brief)
+    for function in caches:
         function.cache_clear()
     yield
-    for function in remembered:
+    for function in caches:
         function.cache_clear()
 
 
-def test_a_numba_that_reads_otherwise_is_left_alone(monkeypatch: pytest.MonkeyPatch, forgotten: None) -> None:
+def test_a_numba_with_other_source_code_is_not_patched(monkeypatch: pytest.MonkeyPatch, cleared_caches: None) -> None:
     monkeypatch.setattr(front_end, "digest", lambda owner, name: "")
     before = now()
     with front_end.lighter():
@@ -67,7 +67,7 @@ def test_a_numba_that_reads_otherwise_is_left_alone(monkeypatch: pytest.MonkeyPa
     assert len(unmatched()) == len(front_end.TRICKS) + len(front_end.SPARED) + 1
 
 
-def test_one_that_reads_otherwise_is_named(monkeypatch: pytest.MonkeyPatch, forgotten: None) -> None:
+def test_a_patch_for_other_source_code_is_named(monkeypatch: pytest.MonkeyPatch, cleared_caches: None) -> None:
     trick, digest = front_end.TRICKS[0], front_end.digest
     monkeypatch.setattr(
         front_end, "digest", lambda owner, name: "" if (owner, name) == trick.reads[0][:2] else digest(owner, name)
@@ -75,8 +75,8 @@ def test_one_that_reads_otherwise_is_named(monkeypatch: pytest.MonkeyPatch, forg
     assert unmatched() == (trick.title,)
 
 
-def test_each_replacement_has_a_title_of_its_own_and_another_name_is_refused(
-    monkeypatch: pytest.MonkeyPatch, forgotten: None
+def test_each_patch_has_its_own_title_and_other_names_are_refused(
+    monkeypatch: pytest.MonkeyPatch, cleared_caches: None
 ) -> None:
     titles = [each.title for each in (*front_end.TRICKS, *front_end.SPARED)]
     assert len(set(titles)) == len(titles)
@@ -86,8 +86,8 @@ def test_each_replacement_has_a_title_of_its_own_and_another_name_is_refused(
 
 
 @pytest.mark.parametrize("left_out", ["all", "one"])
-def test_the_environment_leaves_replacements_out(
-    left_out: str, monkeypatch: pytest.MonkeyPatch, forgotten: None
+def test_an_environment_variable_leaves_patches_out(
+    left_out: str, monkeypatch: pytest.MonkeyPatch, cleared_caches: None
 ) -> None:
     first, *others = (each.title for each in (*front_end.TRICKS, *front_end.SPARED))
     monkeypatch.setenv(front_end.LEFT_OUT, "all" if left_out == "all" else f"{first},lowering")
@@ -97,7 +97,7 @@ def test_the_environment_leaves_replacements_out(
     assert machine_code(Whole) == machine_code(None)
 
 
-def test_afterwards_everything_is_as_it_was_whatever_happens() -> None:
+def test_numba_is_restored_after_compilation_and_after_an_error() -> None:
     before = now()
     compiled: Any = numba.njit(pipeline_class=Whole)
     assert compiled(lambda x: x + 1)(2) == 3
@@ -108,7 +108,7 @@ def test_afterwards_everything_is_as_it_was_whatever_happens() -> None:
     gc.disable()
     try:
         compiled(lambda x: x + 2)(2)
-        assert not gc.isenabled()  # who had switched it off finds it off
+        assert not gc.isenabled()  # it was off before
     finally:
         gc.enable()
 
@@ -116,8 +116,8 @@ def test_afterwards_everything_is_as_it_was_whatever_happens() -> None:
 @law
 def _pull(p: Any, x: tuple[float, float], k: int) -> tuple[float, float]:
     far = dot(x, x)
-    way = scale(x, p[0] if far > p[1] else -p[0])
-    return add(way, x) if k % 2 == 0 else way
+    force = scale(x, p[0] if far > p[1] else -p[0])
+    return add(force, x) if k % 2 == 0 else force
 
 
 def sample(x: Any, numbers: Any, count: int) -> float:
@@ -134,7 +134,7 @@ def sample(x: Any, numbers: Any, count: int) -> float:
 
 
 def machine_code(pipeline: Any) -> str:
-    """The assembly of `sample`, without the names that numba counts up."""
+    """Return the assembly of `sample`, without names that numba numbers."""
     given: Any = {} if pipeline is None else {"pipeline_class": pipeline}
     compiled: Any = numba.njit(error_model="numpy", fastmath={"contract"}, _nrt=False, **given)(sample)
     compiled.compile((numba.float64[::1], numba.float64[::1], numba.int64))
@@ -142,7 +142,7 @@ def machine_code(pipeline: Any) -> str:
     return re.sub(r"_ZN\w+|[.\w$]*_ZN[^\s,()]+|\.L\w+|\d{10,}|v\d+", "#", text)
 
 
-def test_the_machine_code_is_what_numba_makes_on_its_own() -> None:
+def test_the_machine_code_equals_that_of_numba_without_patches() -> None:
     assert machine_code(Whole) == machine_code(None)
     assert machine_code(Whole).count("\n") > 50
 
@@ -153,7 +153,7 @@ def doubled(x: Any) -> None:
         x[k] = x[k] + x[k]
 
 
-def test_an_entry_point_may_use_the_widest_registers_there_are() -> None:
+def test_an_entry_point_may_use_the_widest_registers() -> None:
     compiled: Any = numba.njit(pipeline_class=Whole, _nrt=False)(doubled)
     x = np.arange(100.0)
     compiled(x)
@@ -195,7 +195,7 @@ print(counts["respond"], [name for name, count in counts.items() if count > 1])
 """
 
 
-def test_no_part_of_a_kernel_is_compiled_twice(tmp_path: Path) -> None:
+def test_no_function_of_a_kernel_is_compiled_twice(tmp_path: Path) -> None:
     environment = {**os.environ, "FLOCKENV_CACHE": str(tmp_path)}
     run = subprocess.run([sys.executable, "-c", PARTS], capture_output=True, text=True, cwd=ROOT, env=environment)
     assert (run.returncode, run.stdout) == (0, "1 []\n"), run.stderr

@@ -1,4 +1,4 @@
-"""Many obstacles: those that a grid rules out change nothing, to the last bit."""
+"""Many obstacles: a grid that skips those out of reach changes no bits of the results."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ def crowded(dimension: int, moving: bool) -> tuple[Shape, ...]:
             size = tuple(rng.uniform(0.2, 1, dimension).tolist())
             made.append(Block(centre=at, size=size, turn=float(rng.uniform(0, 90)), **motion))
     far = (0.0,) * (dimension - 2)
-    for reach in (6.0, 12.0, 18.0):  # in a few cells, and in many
+    for reach in (6.0, 12.0, 18.0):  # from a few cells to many
         made.append(Capsule(start=(1.0, 2.0, *far), end=(1.0 + reach, 2.0 + reach / 2, *far), radius=0.1))
         made.append(Block(centre=(SIDE - 1, reach / 2, *far), size=(0.5, reach, *(1.0 for _ in far)), turn=10.0))
     return tuple(made)
 
 
 def ends(space: Any, effects: tuple[Effect, ...], dimension: int, dtype: str, moving: bool) -> Any:
-    """Return where 60 agents are in two worlds after 40 steps."""
+    """Return positions and velocities of 60 agents in two worlds after 40 steps."""
     spawn = Spawn(low=(0,) * dimension, high=(SIDE,) * dimension, speed=(1, 2))
     group = Group(count=60, radius=0.2, max_speed=2, max_force=10, desired_speed=1, spawn=spawn)
     scene = Scene(
@@ -75,11 +75,11 @@ def ends(space: Any, effects: tuple[Effect, ...], dimension: int, dtype: str, mo
         pytest.param("rays", Torus(size=(SIDE,) * 3), 3, "float32", False, marks=pytest.mark.slow),
     ],
 )
-def test_a_grid_moves_no_bit(
+def test_a_grid_of_obstacles_changes_no_bits(
     name: str, space: Any, dimension: int, dtype: str, moving: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = ends(space, EFFECTS[name], dimension, dtype, moving)
-    monkeypatch.setattr(obstacle_sets, "FEWEST_ROWS", 10**9)  # the loop over all of them, in order
+    monkeypatch.setattr(obstacle_sets, "FEWEST_ROWS", 10**9)  # no grid: loop over all obstacles
     expected = ends(space, EFFECTS[name], dimension, dtype, moving)
     np.testing.assert_array_equal(found[0], expected[0])
     np.testing.assert_array_equal(found[1], expected[1])

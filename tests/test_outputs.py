@@ -1,4 +1,4 @@
-"""Where files may be written, and every place where they may not."""
+"""Paths at which files may be written, and paths that are refused."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from flockenv.core.output_paths import checked_file, checked_path
 
 @pytest.fixture(autouse=True)
 def in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Work in one folder; the one for temporary files is elsewhere."""
+    """Work in one folder; the folder for temporary files is another one."""
     (tmp_path / "here").mkdir()
     (tmp_path / "temporary").mkdir()
     monkeypatch.chdir(tmp_path / "here")
@@ -23,18 +23,18 @@ def in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("name", ["x.gif", "a/b/c/x.gif", "./x.gif", "ü 鳥.gif", "..x.gif", "a..b/x.gif", "conx.gif"])
-def test_below_the_current_folder_is_fine_and_nothing_is_made(name: str) -> None:
+def test_a_path_below_the_current_folder_is_allowed_and_nothing_is_created(name: str) -> None:
     assert checked_file(name, [".gif"]) == (Path.cwd() / name).resolve()
     assert list(Path.cwd().iterdir()) == []
 
 
-def test_below_the_temporary_folder_is_fine() -> None:
+def test_a_path_below_the_temporary_folder_is_allowed() -> None:
     path = Path(tempfile.gettempdir()) / "deep" / "x.gif"
     assert checked_file(str(path), [".gif"]) == path
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [
         ("", "must be a name without control characters"),
         ("  ", "must be a name without control characters"),
@@ -52,14 +52,14 @@ def test_below_the_temporary_folder_is_fine() -> None:
         ("a/lpt1.txt/b", "'lpt1.txt' is a reserved name"),
     ],
 )
-def test_a_bad_name_is_refused_in_one_line(name: str, said: str) -> None:
+def test_an_invalid_path_is_refused_in_one_line(name: str, message: str) -> None:
     with pytest.raises(ValueError, match="--out") as caught:
         checked_path(name)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert str(caught.value).isprintable() and len(str(caught.value)) < 500
 
 
-def test_a_link_is_followed_before_it_is_judged(tmp_path: Path) -> None:
+def test_symbolic_links_are_resolved_before_the_check(tmp_path: Path) -> None:
     Path("outside").symlink_to("/usr")
     Path("inside").symlink_to(tmp_path / "here")
     with pytest.raises(ValueError, match="must lie below"):
@@ -67,26 +67,26 @@ def test_a_link_is_followed_before_it_is_judged(tmp_path: Path) -> None:
     assert checked_path("inside/x") == tmp_path / "here" / "x"
 
 
-def test_a_file_in_the_way_is_refused() -> None:
+def test_a_file_in_place_of_a_folder_is_refused() -> None:
     Path("file").write_text("")
     with pytest.raises(ValueError, match=r"--out 'file/x\.gif': '.*file' is not a folder"):
         checked_file("file/x.gif", [".gif"])
 
 
 @pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="root may write anywhere")
-def test_a_folder_that_cannot_be_written_is_refused() -> None:
+def test_a_folder_without_write_permission_is_refused() -> None:
     Path("closed").mkdir(mode=0o500)
     with pytest.raises(ValueError, match="cannot be written to"):
         checked_path("closed/x")
 
 
-def test_a_folder_that_cannot_be_written_is_refused_even_to_root(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_os_access_denies_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     with pytest.raises(ValueError, match="cannot be written to"):
         checked_path("x")
 
 
-def test_what_is_there_is_overwritten_only_by_force() -> None:
+def test_existing_files_are_overwritten_only_with_force() -> None:
     Path("x.gif").write_text("mine")
     Path("folder.gif").mkdir()
     with pytest.raises(ValueError, match=r"--out 'x\.gif': exists already; --force overwrites it"):
@@ -96,7 +96,7 @@ def test_what_is_there_is_overwritten_only_by_force() -> None:
         checked_file("folder.gif", [".gif"], force=True)
 
 
-def test_the_suffix_is_one_of_those_that_are_written() -> None:
+def test_the_suffix_must_be_an_allowed_one() -> None:
     assert checked_file("x.GIF", [".gif", ".png"]).name == "x.GIF"
     with pytest.raises(ValueError, match=r"--to 'x\.gfi': must end in \.gif or \.png, did you mean `\.gif`\?"):
         checked_file("x.gfi", [".gif", ".png"], option="--to")
@@ -104,7 +104,7 @@ def test_the_suffix_is_one_of_those_that_are_written() -> None:
         checked_file("x", [".gif"])
 
 
-def test_what_is_written_beside_a_file_is_refused_with_it() -> None:
+def test_an_existing_file_with_the_suffix_of_beside_is_refused() -> None:
     Path("numbers.json").write_text("mine")
     for name in ("numbers.png", "numbers.json"):
         with pytest.raises(ValueError, match=r"numbers\.json': exists already"):
@@ -115,7 +115,7 @@ def test_what_is_written_beside_a_file_is_refused_with_it() -> None:
         checked_file("folder.png", [".png"], force=True, beside=".json")
 
 
-def test_a_folder_of_pictures_beside_a_page_is_no_file() -> None:
+def test_a_folder_beside_a_page_may_exist_but_a_file_may_not() -> None:
     assert checked_file("page.md", [".md"], beside="").name == "page.md"
     Path("page").mkdir()
     assert checked_file("page.md", [".md"], beside="").name == "page.md"
@@ -144,18 +144,18 @@ WRITING = {
     ("folder", "fault"),
     [("/proc/none/", "must lie below"), ("tiny.yaml/", "is not a folder"), ("a/../", "must not go up")],
 )
-def test_a_place_that_cannot_be_written_is_refused_at_once(
+def test_an_output_path_that_is_not_allowed_is_refused_at_once(
     words: list[str], name: str, folder: str, fault: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("tiny.yaml").write_text("space: {kind: torus, size: [9, 9]}\ngroups: [{count: 2}]\ndt: 0.01\n")
     before = sorted(Path().iterdir())
     assert main([*words, folder + name]) == 2
-    said = capsys.readouterr()
-    assert said.out == "" and said.err.count("\n") == 1 and fault in said.err
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.count("\n") == 1 and fault in captured.err
     assert sorted(Path().iterdir()) == before
 
 
-def test_every_command_that_writes_is_tried_above() -> None:
+def test_every_command_with_an_output_path_is_tested_above() -> None:
     commands = getattr(get_command(app), "commands", {})
     writing = {name for name, command in commands.items() if any("--out" in p.opts for p in command.params)}
     assert writing == {words[0] for words, _ in WRITING.values()}

@@ -1,4 +1,4 @@
-"""What is shipped: the wheel holds flockenv and nothing else, and works without the repository around it."""
+"""Distributions: the wheel contains flockenv alone and works without the repository; the sdist is the repository."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ README_TEST = (
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel, built from a copy so that no build/ or egg-info is left in the repository; needs no network."""
+    """Return a wheel built from a copy, so that no build/ or egg-info is left in the repository; needs no network."""
     source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
@@ -46,12 +46,12 @@ FILES = (
     "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "MANIFEST.in", "README.md", "pyproject.toml",
     ".gitignore", ".pre-commit-config.yaml",
 )  # fmt: skip
-"""What the repository holds."""
+"""Folders and files of the repository."""
 
 
 @pytest.fixture(scope="module")
 def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The source distribution of a copy of the repository, unpacked."""
+    """Return the unpacked source distribution of a copy of the repository."""
     source, target = tmp_path_factory.mktemp("repository"), tmp_path_factory.mktemp("sdist")
     for name in FILES:
         shutil.copy(ROOT / name, source)
@@ -73,7 +73,7 @@ def metadata(wheel: Path) -> Message:
         return email.message_from_bytes(archive.read(name))
 
 
-def test_the_wheel_ships_flockenv_alone(wheel: Path) -> None:
+def test_the_wheel_contains_flockenv_alone(wheel: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
     tops = {name.split("/")[0] for name in names}
     assert tops == {"flockenv", f"flockenv-{PROJECT['version']}.dist-info"}
@@ -85,7 +85,7 @@ def test_the_wheel_ships_flockenv_alone(wheel: Path) -> None:
     assert any(name.endswith("licenses/LICENSE") for name in names)
 
 
-def test_the_sdist_is_the_repository(sdist: Path) -> None:
+def test_the_sdist_contains_all_files_of_the_repository(sdist: Path) -> None:
     made = {"PKG-INFO", "setup.cfg"}
     files = {path.relative_to(sdist).as_posix() for path in sdist.rglob("*") if path.is_file()}
     kept = {
@@ -101,8 +101,8 @@ def test_the_sdist_is_the_repository(sdist: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_tests_of_the_sdist_are_all_found_and_run(sdist: Path) -> None:
-    """Nothing that a test file imports or opens at its top is missing, with nothing of this checkout on the path."""
+def test_all_tests_of_the_sdist_are_collected_and_two_files_pass(sdist: Path) -> None:
+    """Test files import and open nothing that is missing from the sdist; the checkout is not on the path."""
 
     def tested(*options: str) -> str:
         command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", *options]
@@ -115,7 +115,7 @@ def test_the_tests_of_the_sdist_are_all_found_and_run(sdist: Path) -> None:
     assert " passed" in tested("tests/test_config.py", "tests/test_readme.py")
 
 
-def test_the_environment_needs_no_torch(metadata: Message) -> None:
+def test_the_base_dependencies_do_not_include_torch(metadata: Message) -> None:
     needed = metadata.get_all("Requires-Dist") or []
     base = {re.split(r"[\s<>=!~;\[]", line)[0].lower() for line in needed if "extra ==" not in line}
     assert base == {
@@ -126,8 +126,8 @@ def test_the_environment_needs_no_torch(metadata: Message) -> None:
     assert "gymnasium<2,>=1.2" in needed
 
 
-def test_the_wheel_works_alone(wheel: Path, tmp_path: Path) -> None:
-    """Unpacked elsewhere, with nothing of the checkout in sight: the pieces that are no Python code are found."""
+def test_the_wheel_works_without_the_checkout(wheel: Path, tmp_path: Path) -> None:
+    """Files that are not Python code are found in it."""
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path / "site")
     code = (
@@ -148,7 +148,7 @@ def test_the_wheel_works_alone(wheel: Path, tmp_path: Path) -> None:
     assert done.stdout.splitlines()[-1].startswith(str(tmp_path / "site"))
 
 
-def test_one_version_everywhere(metadata: Message) -> None:
+def test_the_version_is_the_same_in_all_files(metadata: Message) -> None:
     import flockenv
 
     citation = (ROOT / "CITATION.cff").read_text()
@@ -158,13 +158,13 @@ def test_one_version_everywhere(metadata: Message) -> None:
     assert "unreleased" in newest.lower() or flockenv.__version__ in newest
 
 
-def test_ci_runs_the_command_that_the_readme_gives() -> None:
+def test_ci_runs_the_command_of_the_readme() -> None:
     assert README_TEST in (ROOT / ".ci" / "run").read_text()
     assert README_TEST in (ROOT / "README.md").read_text()
 
 
-def test_what_is_installed_here_is_what_the_constraints_say() -> None:
-    """Otherwise the tests that pass here say nothing about a fresh clone."""
+def test_installed_versions_are_those_of_the_constraints() -> None:
+    """Otherwise tests that pass here may fail in a fresh clone."""
     from importlib.metadata import PackageNotFoundError, version
 
     pins = dict(line.split("==") for line in (ROOT / "configs" / "constraints.txt").read_text().split())
@@ -174,7 +174,7 @@ def test_what_is_installed_here_is_what_the_constraints_say() -> None:
             if version(name).split("+")[0] != pin:
                 wrong[name] = (version(name), pin)
         except PackageNotFoundError:
-            continue  # a pin of something that only another extra wants
+            continue  # only another extra needs it
     assert not wrong
 
 
@@ -185,11 +185,11 @@ def test_every_dependency_is_pinned() -> None:
     wanted = {
         re.split(r"[<>=]", line)[0].lower() for line in PROJECT["dependencies"] + extras["train"] + extras["test"]
     }
-    assert wanted - pins == {"pillow"}  # left free: other packages that people install beside it pin it
+    assert wanted - pins == {"pillow"}  # not pinned: other packages often pin it
 
 
-def test_the_top_level_is_what_contributors_are_told() -> None:
-    """A checkout's tracked files; skipped where there is no git."""
+def test_the_top_level_contains_only_allowed_files_and_folders() -> None:
+    """Tracked files are tested, so without git nothing is tested."""
     done = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False)
     tops = {line.split("/")[0] for line in done.stdout.splitlines()}
     allowed = {

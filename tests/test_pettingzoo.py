@@ -1,4 +1,4 @@
-"""The multi-agent faces, all at once and by turns: PettingZoo's own tests, then what they leave out."""
+"""The parallel and turn-based (AEC) environments: PettingZoo's own tests, and what these do not test."""
 
 import copy
 import functools
@@ -17,7 +17,7 @@ from flockenv.envs.table import id_of
 from tests.catalogue import RAISED, TEAMS
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore", DeprecationWarning)  # on import it loads its own example the deprecated way
+    warnings.simplefilter("ignore", DeprecationWarning)  # the import loads its own example, by a deprecated call
     from pettingzoo.test import (
         api_test,
         max_cycles_test,
@@ -37,7 +37,7 @@ SMALL = {CROSSING: {"agents": 5}, FLOCK: {"agents": 6}, PURSUIT: {}, SCHOOL: {"m
 
 @pytest.fixture(autouse=True)
 def no_display(monkeypatch):
-    """SDL draws nowhere, and a window's clock does not wait."""
+    """Let SDL draw to no display, and let a window's clock not wait."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     monkeypatch.setattr("pygame.time.Clock", Clock)
 
@@ -56,7 +56,7 @@ def some(env, rng):
 
 
 def play(env, steps, seed):
-    """Everything that comes back in `steps` steps of random actions, begun anew at every end."""
+    """Return the results of `steps` steps of random actions, with a reset at each end of an episode."""
     rng = np.random.default_rng(seed)
     log = [env.reset(seed=seed)]
     for _ in range(steps):
@@ -66,46 +66,46 @@ def play(env, steps, seed):
     return log
 
 
-# --- the library's own tests ---------------------------------------------------------------------------------------
+# --- the library's own tests ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("env_id", IDS)
-def test_parallel_api(env_id):
+def test_parallel_environments_pass_the_api_test_of_pettingzoo(env_id):
     parallel_api_test(make(env_id), num_cycles=300)
 
 
 @pytest.mark.parametrize("env_id", IDS)
-def test_aec_api(env_id):
+def test_turn_based_environments_pass_the_api_test_of_pettingzoo(env_id):
     api_test(make(env_id, "aec"), num_cycles=200)
 
 
 @pytest.mark.parametrize("env_id", IDS)
-def test_library_seed_tests(env_id):
+def test_environments_pass_the_seed_tests_of_pettingzoo(env_id):
     seed_test(functools.partial(make, env_id, "aec", max_cycles=40), num_cycles=60)
     parallel_seed_test(functools.partial(make, env_id))
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_max_cycles(module):
+def test_environments_pass_the_max_cycles_test_of_pettingzoo(module):
     max_cycles_test(module)
 
 
 @pytest.mark.parametrize("env_id", IDS)
-def test_render(env_id):
+def test_environments_pass_the_render_test_of_pettingzoo(env_id):
     render_test(functools.partial(make, env_id, "aec"))
 
 
 @pytest.mark.parametrize("env_id", IDS)
-def test_state(env_id):
+def test_environments_pass_the_state_test_of_pettingzoo(env_id):
     state_test(make(env_id, "aec"), make(env_id))
 
 
-# --- what they leave out -------------------------------------------------------------------------------------------
+# --- what they do not test --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("env_id", IDS)
 def test_whole_episodes_replay_bit_for_bit(env_id):
-    """The library's parallel_seed_test compares one step, since it asks whether any *name* is true."""
+    """The library's parallel_seed_test compares one step, since it tests whether any *name* is true."""
     one, other = (play(make(env_id, max_cycles=60), 150, seed=8) for _ in range(2))
     assert data_equivalence(one, other, exact=True)
     assert not data_equivalence(one, play(make(env_id, max_cycles=60), 150, seed=9))
@@ -136,7 +136,7 @@ def test_every_observation_and_every_state_is_in_its_space(env_id):
 
 
 @pytest.mark.parametrize("env_id", IDS)
-def test_nothing_that_came_back_is_written_again(env_id):
+def test_returned_arrays_and_dictionaries_are_not_changed_later(env_id):
     env, rng = make(env_id), np.random.default_rng(0)
     outcomes = [env.reset(seed=0)]
     copies = [copy.deepcopy(outcomes[0])]
@@ -147,7 +147,7 @@ def test_nothing_that_came_back_is_written_again(env_id):
     for before, after in itertools.pairwise(outcomes):
         assert not {id(d) for d in before} & {id(d) for d in after}
     for name in outcomes[-1][0]:
-        outcomes[-1][0][name][:] = 9.0  # and what a user writes into it changes nothing
+        outcomes[-1][0][name][:] = 9.0  # changes by a user have no effect
     outcomes[-1][3]["__all__"] = True  # as RLlib does
     actions = some(env, rng)
     twin, twin_rng = make(env_id), np.random.default_rng(0)
@@ -172,7 +172,7 @@ def test_names_and_spaces_stay_the_same_objects(env_id):
 
 @pytest.mark.parametrize("kind", ["parallel", "aec"])
 @pytest.mark.parametrize("env_id", TEAMS)
-def test_spaces_of_all_agents_are_there_before_the_first_reset(env_id, kind):
+def test_spaces_of_all_agents_exist_before_the_first_reset(env_id, kind):
     env = pettingzoo.make(kind, env_id)
     for several, one in (
         (env.observation_spaces, env.observation_space), (env.action_spaces, env.action_space)
@@ -182,8 +182,8 @@ def test_spaces_of_all_agents_are_there_before_the_first_reset(env_id, kind):
 
 
 @pytest.mark.parametrize("env_id", TEAMS)
-def test_nobody_left_is_a_step_of_nobody(env_id):
-    """PettingZoo's own loops and SuperSuit's black_death go on with {} when all agents have left."""
+def test_a_step_without_agents_takes_an_empty_dictionary(env_id):
+    """PettingZoo's own loops and SuperSuit's black_death pass {} after all agents have left."""
     env = pettingzoo.make("parallel", env_id, max_cycles=3)
     with pytest.raises(ResetNeeded, match="reset"):
         env.step({})
@@ -212,9 +212,9 @@ def still(env):
     return dict.fromkeys(env.agents, np.zeros(2))
 
 
-def test_who_is_captured_leaves_and_the_others_play_on():
+def test_a_captured_agent_leaves_and_the_others_continue():
     env = make(PURSUIT, capture_distance=6.0)
-    for seed in range(50):  # until in a first step just one of the two is within reach
+    for seed in range(50):  # until exactly one evader is within reach
         env.reset(seed=seed)
         outcome = env.step(still(env))
         gone = [name for name, over in outcome[2].items() if over]
@@ -230,7 +230,7 @@ def test_who_is_captured_leaves_and_the_others_play_on():
 
 
 def without_one(**options):
-    """Pursuit after a first step in which just one of the two evaders was captured, and its name."""
+    """Return Pursuit after a first step in which exactly one of the two evaders was captured, and its name."""
     env = make(PURSUIT, capture_distance=6.0, **options)
     for seed in range(50):
         env.reset(seed=seed)
@@ -244,7 +244,7 @@ def without_one(**options):
 @pytest.mark.parametrize("place", ["first", "last"])
 @pytest.mark.parametrize("ignored", [np.ones(2), np.full(2, np.nan), np.zeros(3), None, "left"])
 def test_actions_of_agents_that_have_left_are_ignored(place, ignored):
-    """As by PettingZoo's conversion; TorchRL passes them until the episode ends, AgileRL for one more step."""
+    """PettingZoo's conversion does so; TorchRL passes them until the episode ends, AgileRL for one more step."""
     env, gone = without_one()
     twin = copy.deepcopy(env)
     rng = np.random.default_rng(0)
@@ -255,7 +255,7 @@ def test_actions_of_agents_that_have_left_are_ignored(place, ignored):
         assert twin.agents == env.agents
 
 
-def test_actions_of_agents_that_have_left_stand_for_no_other():
+def test_actions_of_agents_that_have_left_do_not_replace_missing_ones():
     env, gone = without_one()
     for lacking in env.agents:
         refused(env, {**still(env), gone: np.zeros(2)} | {lacking: np.zeros(3)}, repr(lacking))
@@ -265,8 +265,8 @@ def test_actions_of_agents_that_have_left_stand_for_no_other():
     assert gone not in env.step({**still(env), gone: np.zeros(2)})[0]
 
 
-def test_everybody_ends_once_and_nobody_comes_back():
-    """Over whole episodes: who left is dead in the world, too, and asks for nothing; a reset brings everybody back."""
+def test_every_agent_ends_once_and_none_returns_before_the_reset():
+    """An agent that has left is dead in the world also, and needs no action; a reset brings all agents back."""
     env, rng = make(PURSUIT, capture_distance=2.5, max_cycles=40), np.random.default_rng(0)
     early = 0
     for seed in range(6):
@@ -287,10 +287,10 @@ def test_everybody_ends_once_and_nobody_comes_back():
                 living = dict(zip(env.possible_agents, env.world.state.alive[0].tolist(), strict=True))
                 assert [name for name, alive in living.items() if alive] == env.agents
         assert sorted(ended) == sorted(env.possible_agents)
-    assert early > 0  # somebody left before the others
+    assert early > 0  # an agent left before the others
 
 
-def test_everybody_may_end_in_the_same_step():
+def test_all_agents_may_end_in_the_same_step():
     env = make(PURSUIT, capture_distance=100.0)
     env.reset(seed=0)
     _, _, terminated, truncated, infos = env.step(still(env))
@@ -302,8 +302,8 @@ def test_everybody_may_end_in_the_same_step():
     assert env.agents == []
 
 
-def test_who_ends_at_the_time_limit_is_truncated_too():
-    """RLlib calls an episode over when all are terminated or all are truncated, never for a mixture."""
+def test_an_agent_that_ends_at_the_time_limit_is_truncated_also():
+    """For RLlib an episode is over if all agents are terminated or all are truncated, never for a mixture."""
     env = make(PURSUIT, capture_distance=100.0, max_cycles=1)
     env.reset(seed=0)
     _, _, terminated, truncated, _ = env.step(still(env))
@@ -311,7 +311,7 @@ def test_who_ends_at_the_time_limit_is_truncated_too():
     assert all(truncated.values())
 
 
-def test_at_the_time_limit_everybody_is_truncated():
+def test_at_the_time_limit_all_agents_are_truncated():
     env = make(FLOCK, max_cycles=1)
     env.reset(seed=0)
     _, _, terminated, truncated, infos = env.step(still(env))
@@ -324,23 +324,23 @@ def test_at_the_time_limit_everybody_is_truncated():
 
 
 @pytest.mark.parametrize("agents", [("a",), ("a", "'", '"]}', "\\"), tuple(f"walker_{k}" for k in range(300))])
-def test_dictionaries_by_agent_are_the_same_written_out_or_not(monkeypatch, agents):
+def test_dictionaries_by_agent_are_equal_with_generated_code_and_with_loops(monkeypatch, agents):
     terms, rng = ("effort", "it's"), np.random.default_rng(len(agents))
     seen, over = rng.random((len(agents), 3)), (rng.random(len(agents)) < 0.5).tolist()
     paid, earned = rng.random(len(agents)).tolist(), rng.random((2, len(agents))).tolist()
     for displayed in (0, 1000):
         monkeypatch.setattr(common, "DISPLAYED", displayed)
         common._by_agent.cache_clear()
-        told = common.ByAgent(terms, agents).of(seen, paid, over, True, earned, False)
-        assert [list(each) for each in told] == [list(agents)] * 5
+        found = common.ByAgent(terms, agents).of(seen, paid, over, True, earned, False)
+        assert [list(each) for each in found] == [list(agents)] * 5
         for i, agent in enumerate(agents):
             info = {**{term: earned[k][i] for k, term in enumerate(terms)}, "is_success": False}
-            np.testing.assert_array_equal(told[0][agent], seen[i])
-            assert [each[agent] for each in told[1:]] == [paid[i], over[i], True, info]
+            np.testing.assert_array_equal(found[0][agent], seen[i])
+            assert [each[agent] for each in found[1:]] == [paid[i], over[i], True, info]
     common._by_agent.cache_clear()
 
 
-def test_a_user_who_writes_into_agents_changes_nothing():
+def test_changes_of_the_list_of_agents_have_no_effect():
     env = make(FLOCK)
     env.reset(seed=0)
     env.agents.clear()
@@ -350,7 +350,7 @@ def test_a_user_who_writes_into_agents_changes_nothing():
 
 @pytest.mark.parametrize("kind", ["parallel", "aec"])
 @pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-def test_a_copy_goes_on_as_the_original_would(kind, clone):
+def test_a_copy_continues_exactly_like_the_original(kind, clone):
     env = make(PURSUIT, kind, max_cycles=30, render_mode="human")
     env.reset(seed=2)
     for _ in range(7):
@@ -367,7 +367,7 @@ def test_a_copy_goes_on_as_the_original_would(kind, clone):
     twin.close()
 
 
-def test_fewer_learners_than_boids_fly_among_scripted_ones():
+def test_boids_that_are_not_learners_are_scripted():
     env = make(FLOCK, learners=2)
     assert len(env.possible_agents) == 2
     assert env.task.agents == 6
@@ -375,11 +375,11 @@ def test_fewer_learners_than_boids_fly_among_scripted_ones():
     assert len(pettingzoo.make("parallel", PURSUIT).possible_agents) == 5
 
 
-# --- bad input -----------------------------------------------------------------------------------------------------
+# --- bad input --------------------------------------------------------------------------------------------------------
 
 
 def refused(env, actions, *words):
-    """The refusal is one line with these words, and nothing has moved."""
+    """Assert that a step raises an error of one line with these words, and that no agent has moved."""
     before = env.state()
     with pytest.raises(ValueError, match=r"^[^\n]*$") as error:
         env.step(actions)
@@ -401,7 +401,7 @@ def test_bad_action_dictionaries_are_refused_by_name():
     env.step(good)
 
 
-def test_by_turns_a_bad_action_is_refused_on_its_own_turn():
+def test_by_turns_a_bad_action_is_refused_at_the_turn_of_its_agent():
     env = make(FLOCK, "aec")
     env.reset(seed=0)
     env.step(np.zeros(2))
@@ -423,7 +423,7 @@ def test_by_turns_an_agent_that_acts_needs_an_action(bad):
 
 
 def after_an_end(env_id):
-    """The turn-based form at the turn of an agent that has ended; with the time limit, all of them have."""
+    """Return the turn-based environment at the turn of an agent that has ended; at the time limit all have."""
     env = make(env_id, "aec", max_cycles=3)
     env.reset(seed=0)
     while not (env.terminations[env.agent_selection] or env.truncations[env.agent_selection]):
@@ -433,7 +433,7 @@ def after_an_end(env_id):
 
 @pytest.mark.parametrize("env_id", IDS)
 @pytest.mark.parametrize("bad", [np.zeros(2), np.array([np.nan, 0.0]), 0.0, "left"])
-def test_by_turns_an_agent_that_has_ended_takes_none_and_nothing_else(env_id, bad):
+def test_by_turns_an_agent_that_has_ended_accepts_only_none(env_id, bad):
     env = after_an_end(env_id)
     agent, others = env.agent_selection, [*env.agents]
     refused(env, bad, repr(agent), "None")
@@ -452,16 +452,16 @@ def test_by_turns_an_unknown_agent_is_not_observed():
 
 
 def round_of_turns(env):
-    """Each agent's turn until the world has moved: None from those that have ended, no steering from the others."""
+    """Give each agent its turn until the world has moved: None for those that have ended, no force for the others."""
     steps = env.unwrapped.world.steps.copy()
     while env.agents and env.unwrapped.world.steps == steps:
         agent = env.agent_selection
         env.step(None if env.terminations[agent] or env.truncations[agent] else np.zeros(2))
 
 
-def test_by_turns_an_agent_that_has_left_is_not_observed_after_the_next_step_of_the_world():
+def test_by_turns_an_agent_that_left_is_not_observed_after_the_next_world_step():
     env, gone = make(PURSUIT, "aec", capture_distance=6.0), []
-    for seed in range(50):  # until in a first step just one of the two is within reach
+    for seed in range(50):  # until exactly one evader is within reach
         env.reset(seed=seed)
         round_of_turns(env)
         gone = [agent for agent, over in env.terminations.items() if over]
@@ -474,7 +474,7 @@ def test_by_turns_an_agent_that_has_left_is_not_observed_after_the_next_step_of_
         env.observe(gone[0])
 
 
-def test_actions_beyond_the_box_are_clipped_without_a_word():
+def test_actions_beyond_the_box_are_clipped_without_a_warning():
     observations = []
     for big in (1.0, 5.0, 1e300):
         env = make(FLOCK, "aec")
@@ -494,10 +494,10 @@ def test_bad_seeds_are_refused(seed, kind):
         env.reset(seed=seed)
 
 
-def test_the_world_tells_the_seed_of_an_unseeded_reset():
+def test_the_world_has_the_seed_of_a_reset_without_seed():
     env, other = make(FLOCK), make(FLOCK)
     observations, infos = env.reset()
-    assert infos == {agent: {} for agent in env.agents}  # TorchRL takes the keys of these for all there are
+    assert infos == {agent: {} for agent in env.agents}  # TorchRL expects all agents as keys
     again, _ = make(FLOCK).reset(seed=env.world.seeds[0])
     assert data_equivalence(observations, again, exact=True)
     other.reset()
@@ -519,7 +519,7 @@ def test_bad_options_parameters_and_limits_are_refused():
         make(FLOCK, render_mode="humann")
 
 
-def test_step_render_and_state_want_an_episode():
+def test_step_render_and_state_require_a_reset():
     env = make(FLOCK, render_mode="rgb_array")
     for call in (lambda: env.step({}), env.render, env.state):
         with pytest.raises(ResetNeeded, match="reset"):
@@ -539,8 +539,8 @@ def test_rendering_without_a_mode_warns():
         assert env.render() is None
 
 
-def test_the_library_s_copies_warn_about_nothing():
-    """Conversions there and back, as other libraries do them."""
+def test_conversions_of_pettingzoo_raise_no_warnings():
+    """From parallel to turn-based and back, as other libraries convert."""
     from pettingzoo.utils.conversions import aec_to_parallel
 
     with warnings.catch_warnings():
@@ -555,11 +555,11 @@ def test_the_library_s_copies_warn_about_nothing():
             assert ours[1] == dict(theirs[1])
 
 
-def test_a_former_version_is_refused_by_the_name_of_the_new_one() -> None:
+def test_a_former_version_is_refused_and_the_new_one_is_named() -> None:
     from flockenv import envs
 
     for name, version in RAISED.items():
-        if id_of(name) not in TEAMS:  # of one learner: Gymnasium's alone, see test_gymnasium.py
+        if id_of(name) not in TEAMS:  # tasks of one learner: see test_gymnasium.py
             continue
         for kind in ("parallel", "aec"):
             with pytest.raises(
