@@ -1,4 +1,4 @@
-"""Look: who is nearest, and how near, is what a sort of all squares says, whichever way the lists are kept."""
+"""The nearest neighbours and their distances equal those of a sort of all squares, however the lists are stored."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flockenv.jit.decorators import kernel
 from flockenv.jit.simd_rows import key_of, key_read, key_written, ordered, same_key, tag_of
 from flockenv.tasks import Bottleneck, Flock
 
-SIGHT, MIDDLE = 6.1, 20.0  # the last bits of its square are not zeros
+SIGHT, MIDDLE = 6.1, 20.0  # the last bits of the square of SIGHT are not zeros
 
 
 def flock(agents: int, neighbours: int, kind: str) -> World:
@@ -22,16 +22,16 @@ def flock(agents: int, neighbours: int, kind: str) -> World:
 
 
 def found(world: World, places: Any) -> tuple[Any, Any, Any]:
-    """Return the lists of a world whose agents are there (N, 2): squares and whom (K, N), how many (N,)."""
+    """Return the lists of a world with agents at these places (N, 2): squares and numbers (K, N), counts (N,)."""
     n = world.agents
     world.state.x[:, 0] = np.asarray(places).T
-    world.reset(mask=np.zeros(1, bool))  # nobody begins anew: everybody is looked at
-    square, who, count = world._scratch[0][1][:3]
-    return square[:, :n].copy(), who[:, :n].copy(), count[:n].copy()
+    world.reset(mask=np.zeros(1, bool))  # restarts no episode, only observes
+    square, numbers, count = world._scratch[0][1][:3]
+    return square[:, :n].copy(), numbers[:, :n].copy(), count[:n].copy()
 
 
 def expected(places: Any, neighbours: int, kind: str) -> tuple[Any, Any, Any]:
-    """All squares (N, N), each operation rounded, and sorted (K, N), how many; nobody is near the edge of the box."""
+    """Return all rounded squares (N, N), the sorted ones (K, N), and counts; no agent is near the edge of the box."""
     at = np.asarray(places).astype(kind)
     to = at[None, :, :] - at[:, None, :]
     square = to[..., 0] * to[..., 0] + to[..., 1] * to[..., 1]
@@ -52,7 +52,7 @@ def lattice(n: int, rng: np.random.Generator) -> Any:
 
 
 def ring(n: int, rng: np.random.Generator) -> Any:
-    """Everybody is as far from the middle as all others, but for the last bits."""
+    """Return agents on a circle around one in the middle: equal distances except for the last bits."""
     angle = rng.uniform(0, 2 * np.pi, n)
     places = MIDDLE + 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     places[n // 2] = MIDDLE
@@ -60,12 +60,12 @@ def ring(n: int, rng: np.random.Generator) -> Any:
 
 
 def heap(n: int, rng: np.random.Generator) -> Any:
-    """Everybody stands in one of two places."""
+    """Return agents that stand in one of two places."""
     return MIDDLE + rng.integers(0, 2, (n, 1)) * np.ones(2)
 
 
 def edge(n: int, rng: np.random.Generator) -> Any:
-    """All others stand around the first at the edge of his sight, a little nearer or farther in the last bits."""
+    """Return agents around the first one at the limit of its sight, a little nearer or farther in the last bits."""
     angle = rng.uniform(0, 2 * np.pi, n)
     radius = SIGHT * (1 + 1.2e-7 * rng.choice([-4, -3, -2, -1, 1, 2, 3, 4], n))
     places = MIDDLE + radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -73,13 +73,13 @@ def edge(n: int, rng: np.random.Generator) -> Any:
     return places
 
 
-def steppes(n: int, rng: np.random.Generator) -> Any:
-    """Nobody sees anybody, but for a pair."""
+def sparse(n: int, rng: np.random.Generator) -> Any:
+    """Return agents that do not see each other, except for one pair."""
     places = 7.0 * np.stack(np.divmod(np.arange(n), 5), axis=1)[:, ::-1] % 35 + 2
     return places if n > 25 else np.concatenate([places[:-1], places[:1] + 1])
 
 
-CROWDS = (crowd, lattice, ring, heap, edge, steppes)
+CROWDS = (crowd, lattice, ring, heap, edge, sparse)
 
 
 @pytest.mark.parametrize("kind", ["float32", "float64"])
@@ -88,29 +88,28 @@ CROWDS = (crowd, lattice, ring, heap, edge, steppes)
     ("agents", "neighbours"),
     [pytest.param(3, 2, marks=pytest.mark.slow), (7, 6), (16, 6), (17, 6), (25, 6), (33, 6), (64, 6)],
 )
-def test_the_nearest_are_those_that_a_sort_finds(agents: int, neighbours: int, make: Any, kind: str) -> None:
+def test_the_nearest_neighbours_are_those_of_a_sort(agents: int, neighbours: int, make: Any, kind: str) -> None:
     world = flock(agents, neighbours, kind)
     world.reset(0)
     rng = np.random.default_rng(agents)
     for _ in range(20):
         places = make(agents, rng).astype(kind)
-        squares, who, count = found(world, places)
-        every, wanted, many = expected(places, neighbours, kind)
+        squares, numbers, count = found(world, places)
+        every, nearest, many = expected(places, neighbours, kind)
         np.testing.assert_array_equal(count, many)
         if kind == "float32":
-            np.testing.assert_array_equal(squares, wanted)
+            np.testing.assert_array_equal(squares, nearest)
         else:  # operations may be fused
-            np.testing.assert_allclose(squares, wanted, rtol=1e-14)
-        assert (who >= 0).all() and (who < agents).all()
-        assert (places[who.T] == world._scratch[0][1][6][:, :, :agents].T).all()  # where they are is told, too
-        for i in range(agents):  # of those who are equally far, any is nearest, but each once
-            listed = who[: count[i], i]
-            np.testing.assert_allclose(every[i, listed], wanted[: count[i], i], rtol=0 if kind == "float32" else 1e-14)
+            np.testing.assert_allclose(squares, nearest, rtol=1e-14)
+        assert (numbers >= 0).all() and (numbers < agents).all()
+        assert (places[numbers.T] == world._scratch[0][1][6][:, :, :agents].T).all()  # positions are listed also
+        for i in range(agents):  # of equally far ones any may be listed, but each only once
+            listed = numbers[: count[i], i]
+            np.testing.assert_allclose(every[i, listed], nearest[: count[i], i], rtol=0 if kind == "float32" else 1e-14)
             assert len(set(listed.tolist())) == count[i]
 
 
-def test_around_the_edge_of_a_periodic_box_the_lists_are_the_same() -> None:
-    """Squares are worked out anew there, too: by the shortest way around."""
+def test_the_lists_are_the_same_across_the_edge_of_a_periodic_box() -> None:
     rng = np.random.default_rng(1)
     world, size = flock(25, 6, "float32"), 40.0
     world.reset(0)
@@ -123,36 +122,36 @@ def test_around_the_edge_of_a_periodic_box_the_lists_are_the_same() -> None:
 
 
 @pytest.mark.slow
-def test_the_absent_are_in_nobodys_list() -> None:
-    """In a kernel that keeps keys when everybody is there."""
+def test_absent_agents_are_in_no_list() -> None:
+    """In a kernel that uses keys as long as all agents are present."""
     world = World(Bottleneck(dtype="float32"))
     assert world.task.parts.keyed
     world.reset(0)
     gone = np.arange(0, world.agents, 3)
     world.state.alive[0, gone] = False
     world.reset(mask=np.zeros(1, bool))
-    who, count = world._scratch[0][1][1:3]
+    numbers, count = world._scratch[0][1][1:3]
     for i in np.setdiff1d(np.arange(world.agents), gone):
-        listed = who[: count[i], i]
+        listed = numbers[: count[i], i]
         assert i not in listed
         assert not np.isin(listed, gone).any()
     assert count[: world.agents].max() > 0
 
 
-def test_who_is_listed_by_keys() -> None:
-    """In single precision, in small worlds; a list of one needs none."""
+def test_keys_are_used_for_small_worlds_in_single_precision() -> None:
+    """Lists of one neighbour need no keys."""
     worlds = flock(24, 6, "float32"), flock(24, 1, "float32"), flock(24, 6, "float64"), flock(600, 6, "float32")
     assert [world.task.parts.keyed for world in worlds] == [True, False, False, False]
 
 
 @kernel
 def _round(square: Any, place: Any, tags: Any) -> Any:
-    """Return the key of a square at a place, what is read of it where it is written, and the place in it."""
+    """Return the key of a square and a place, its value after writing and reading it, and the place read from it."""
     key = key_of(square, place, tags)
     return key, key_read(key_written(key)), tag_of(key, tags)
 
 
-def test_keys_are_in_the_order_of_squares_and_know_their_places() -> None:
+def test_keys_are_ordered_like_squares_and_contain_their_places() -> None:
     call = njit(lambda square, place, tags: _round(square, np.int32(place), np.int32(tags)))
     doubt = njit(lambda one, other, tags: same_key(np.uint32(one), np.uint32(other), np.int32(tags)))
     order = njit(lambda one, other: ordered(np.uint32(one), np.uint32(other)))
@@ -169,15 +168,14 @@ def test_keys_are_in_the_order_of_squares_and_know_their_places() -> None:
         assert (np.diff(keys[:, 0].astype(int))[apart] > 0).all()
         for pair in zip(keys[:-1, 0], keys[1:, 0], strict=True):
             assert order(*pair) == order(*pair[::-1]) == tuple(sorted(pair))
-    nobody = 0xFFFFFFFF  # comes after all of them, and after NaN of either sign
+    empty = 0xFFFFFFFF  # larger than all keys, also than those of NaN of either sign
     for number in (np.inf, np.nan, -np.nan):
         key = call(np.float32(number), 0, 1)[0]
-        assert call(np.float32(3e38), 1, 1)[0] < key and order(key, nobody) == (key, nobody)
+        assert call(np.float32(3e38), 1, 1)[0] < key and order(key, empty) == (key, empty)
 
 
 @pytest.mark.parametrize("length", range(2, 34))
-def test_exchanges_keep_the_least_in_a_list_and_in_order(length: int) -> None:
-    """Whatever the list's length, and whichever numbers come."""
+def test_exchanges_keep_the_least_numbers_of_a_list_sorted(length: int) -> None:
     rng = np.random.default_rng(length)
     for most in (3, 1000):
         kept, every = [most] * length, [most] * length
@@ -191,8 +189,8 @@ def test_exchanges_keep_the_least_in_a_list_and_in_order(length: int) -> None:
 
 
 @pytest.mark.parametrize("length", [2, 7])
-def test_keys_are_merged_into_lists_that_lie_in_scratch(length: int) -> None:
-    """Where float32 may: so keys that are NaN or no normal numbers must come out with the same bits."""
+def test_keys_stored_as_float32_are_merged_into_lists_bit_for_bit(length: int) -> None:
+    """Keys may then be NaN or denormal numbers."""
     call = njit(lambda numbers, come: merged(numbers, come))
     rng = np.random.default_rng(length)
     kept = np.full(length, 0xFFFFFFFF, np.uint32)
@@ -205,8 +203,8 @@ def test_keys_are_merged_into_lists_that_lie_in_scratch(length: int) -> None:
 
 
 @pytest.mark.parametrize("kind", ["float32", "float64"])
-def test_distances_are_inserted_with_their_places(kind: str) -> None:
-    """NaN and infinitely far ones stay out of a list; of those who are equally far, each is in it once."""
+def test_distances_are_inserted_into_a_list_with_their_places(kind: str) -> None:
+    """NaN and infinity stay out of a list; each of several equal distances is in it once."""
     call, real = njit(lambda numbers, far, place: inserted(numbers, far, place)), np.dtype(kind).type
     rng, length = np.random.default_rng(3), 5
     kept: tuple[Any, ...] = tuple([real(np.inf)] * length + [real(0)] * length)
