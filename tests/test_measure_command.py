@@ -211,7 +211,7 @@ def test_the_area_of_an_obstacle_does_not_count_for_the_density() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         ("room.yaml --time 0", "--time = 0 s: must be a whole multiple of dt = 0.05 s, say 0.05 or 0.1"),
         ("room.yaml --time 1 --skip 1", "--skip = 1: must be >= 0 and less than --time = 1"),
@@ -233,7 +233,7 @@ def test_the_area_of_an_obstacle_does_not_count_for_the_density() -> None:
     ],
 )
 def test_an_invalid_argument_gives_one_line_and_writes_no_file(
-    arguments: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    arguments: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("cube.yaml").write_text(
         "dimension: 3\ngroups: [{count: 1, spawn: {low: [0, 0, 0], high: [1, 1, 1]}}]\ndt: 0.05\n"
@@ -241,7 +241,7 @@ def test_an_invalid_argument_gives_one_line_and_writes_no_file(
     before = sorted(path.name for path in tmp_path.iterdir())
     assert main(["measure", *arguments.split(" ")]) == 2
     captured = capsys.readouterr()
-    assert captured.err.startswith(f"flockenv: {said}"), captured.err
+    assert captured.err.startswith(f"flockenv: {message}"), captured.err
     assert len(captured.err.splitlines()) == 1
     assert captured.out == ""
     assert sorted(path.name for path in tmp_path.iterdir()) == before
