@@ -264,7 +264,7 @@ REASONS = ("at random", "map from step", "chaotic", "no reference", "too long", 
 
 SHIPPED = [
     path
-    for path in sorted([*Path("configs").glob("*.yaml"), *Path("configs/crowds").glob("*.yaml")])
+    for path in sorted([*Path("configs/scenes").glob("*.yaml"), *Path("configs/crowds").glob("*.yaml")])
     if "\ngroups:" in path.read_text()
 ]
 
