@@ -40,10 +40,10 @@ WORLDS = 256
 
 
 class Among:
-    """Worlds as one agent of each meets them, (B, 1, O): all others play `others`.
+    """Worlds in which one agent of each is played from outside, (B, 1, O); all other agents play `others`.
 
-    In world k it is learner k % L, so that every seat counts alike where L divides B, and nearly elsewhere. For it a
-    world is over when it is out.
+    In world k that agent is learner k % L, so every learner counts equally if L divides B, otherwise nearly. Its world
+    ends when it is out.
     """
 
     def __init__(self, task: Task, worlds: int, time_limit: int, others: Policy) -> None:
@@ -54,19 +54,19 @@ class Among:
         self._begins = True
 
     def reset(self, seeds: int) -> NDArray[np.float32]:
-        """Begin, and return what the one sees."""
+        """Begin; return the observation of the one agent."""
         self._seen, self._begins = self._world.reset(seeds), True
         return self._seen[self._mine][:, None]
 
     def step(self, actions: NDArray[Any]) -> Step:
-        """Step all agents, the one by `actions` (B, 1, A); return its observation and reward."""
+        """Step all agents, the one agent by `actions` (B, 1, A); return its observation and reward."""
         rows = self._seen[~self._mine]
         theirs, self._state = self._others.predict(rows, self._state, np.full(len(rows), self._begins), True)
         if np.shape(theirs) != (len(rows), actions.shape[-1]):
             raise ValueError(f"others' actions have shape {np.shape(theirs)}, must be {(len(rows), actions.shape[-1])}")
-        everybody = np.empty((*self._mine.shape, actions.shape[-1]))
-        everybody[self._mine], everybody[~self._mine] = actions[:, 0], theirs
-        step, self._begins = self._world.step(everybody), False
+        joint = np.empty((*self._mine.shape, actions.shape[-1]))
+        joint[self._mine], joint[~self._mine] = actions[:, 0], theirs
+        step, self._begins = self._world.step(joint), False
         self._seen = step.observation
         names = ("observation", "reward", "terms", "terminated", "alive")
         return step._replace(**{name: getattr(step, name)[self._mine][:, None] for name in names})
@@ -82,7 +82,7 @@ class Among:
 
 @dataclass(frozen=True)
 class Payoffs:
-    """What one agent comes to with each policy, among others of each: `of[one, others]`."""
+    """Episodes of one agent with each policy among others with each policy: `of[one, others]`."""
 
     task: str
     players: tuple[str, ...]
@@ -93,19 +93,19 @@ class Payoffs:
         return bootstrap(self.of[one, others].returns, "mean")
 
     def gain(self, one: str, others: str) -> Interval:
-        """Return the gain of one agent that plays `one` among `others`, over playing as they do, in the same worlds."""
+        """Return the gain of one agent by playing `one` among `others`, over playing `others`, in the same worlds."""
         return compare(self.of[one, others], self.of[others, others]).difference
 
     def verdict(self, a: str, b: str) -> str:
-        """Return a line: the gain of one agent that changes the policy, and of all agents that do."""
+        """Return a line: the gain of one agent that changes its policy, and the gain if all agents change it."""
         a, b = sorted((a, b), key=lambda name: self.mean(name, name).value)
         into, back = self.gain(a, b), self.gain(b, a)
         whole = compare(self.of[a, a], self.of[b, b]).difference
         said = (
-            f"{a} among {b}: {_signed(into)} for who changes; {b} among {a}: {_signed(back)}; all {a}: {_signed(whole)}"
+            f"{a} among {b}: {_signed(into)} for one agent; {b} among {a}: {_signed(back)}; all {a}: {_signed(whole)}"
         )
         if into.low > 0 and back.high < 0 and whole.high < 0:
-            return f"{said}: a prisoner's dilemma, everybody does better with {a} and all together with {b}"
+            return f"{said}: a prisoner's dilemma, each agent does better with {a} and all together with {b}"
         if into.high < 0 and back.low > 0:
             return f"{said}: {b} is the better answer to both"
         if into.high < 0 and back.high < 0:
@@ -141,7 +141,7 @@ def invade(
         ValueError: one line: a world has one learner, or a player fails.
     """
     if task.learners < 2:
-        raise ValueError(f"task {task.name!r}: one learner alone in each world, with nobody to play otherwise than")
+        raise ValueError(f"task {task.name!r}: each world has a single learner; this command needs at least two")
     first, of = worlds_for("evaluation", seed, worlds), {}
     for others, theirs in players.items():
         for one, mine in players.items():
@@ -175,7 +175,7 @@ def main(
         bool, typer.Option("--trust-pickle", help="load Stable-Baselines3 zips too: executes the code in them")
     ] = False,
 ) -> None:
-    """Say who gains by playing otherwise than all others of a world."""
+    """Measure whether one agent gains by a policy other than that of all others in its world."""
     with one_line_errors():
         tasks = [load_experiment(config).build() for config in configs]
         fields = [_makers(task, split(players), seed, trust_pickle) for task in tasks]
@@ -186,14 +186,14 @@ def main(
             with shown_progress(Progress(console=console, transient=True)) as progress:
                 bar = progress.add_task(task.name, total=len(field) ** 2)
                 found = invade(task, field, worlds, seed, lambda: progress.advance(bar))  # noqa: B023  # called at once
-            out.print(f"{task.name}: mean return of one who plays the row, among those who play the column")
+            out.print(f"{task.name}: mean return of one agent that plays the row, among others that play the column")
             out.print(table_of(found))
             for pair in combinations(found.players, 2):
                 out.print(found.verdict(*pair), markup=False)
 
 
 def _makers(task: Task, asked: Sequence[str], seed: int, trust_pickle: bool) -> dict[str, Callable[[Task], Policy]]:
-    """Return how each player of a task is made, by name; one that cannot be made is refused before any episode."""
+    """Return the factory of each player of a task, by name; bad ones raise before any episode."""
     specs = asked or [name for name in NAMES if name not in ("random", "textbook") and not other_tasks(name, task.name)]
     makers = {
         player.name: functools.partial(player.policy, seed=seed, trust_pickle=trust_pickle)

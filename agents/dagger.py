@@ -1,4 +1,4 @@
-"""Teach a network what the tuned rules of a task answer, where it comes to by itself: DAgger (Ross et al. 2011)."""
+"""Teach a network the actions of the tuned rules, in the states that it reaches itself: DAgger (Ross et al. 2011)."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ WORLDS, ROUNDS = 96, 4
 
 
 def shown(
-    task: Task, rules: RulesPlayer, worlds: int, who: Answers | None = None, first: int = 0
+    task: Task, rules: RulesPlayer, worlds: int, actor: Answers | None = None, first: int = 0
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the observations of one episode in each of some training worlds, (rows, size), and the rules' actions.
 
-    who: the acting policy; None: the rules. first: the number of training worlds before these.
+    actor: the acting policy (default: the rules). first: the number of training worlds before these.
     """
     world, state = World(task, worlds, task.horizon), None
     seen = world.reset(worlds_for("training", 0, first + worlds) + first)
@@ -38,9 +38,9 @@ def shown(
         actions, state = rules.predict(given, state, np.full(len(given), begins))
         rows.append(given[playing.ravel()])
         answers.append(np.asarray(actions, np.float32)[playing.ravel()])
-        if who is not None:
+        if actor is not None:
             with torch.no_grad():
-                actions = who(torch.from_numpy(given)).numpy()
+                actions = actor(torch.from_numpy(given)).numpy()
         step = world.step(actions.reshape(worlds, task.learners, -1))
         seen, begins = step.observation, False
         playing &= ~(step.terminated | step.truncated[:, None])
@@ -53,9 +53,9 @@ def teach(
 ) -> tuple[int, float]:  # fmt: skip
     """Train PPO's actor to imitate the rules (DAgger), by some gradient steps of 2,048 rows in four rounds.
 
-    The first round uses observations that the rules meet in training worlds, each later one those that the actor meets
-    in as many more. Returns the number of rows, and the remaining error: the mean square error of the actions over the
-    variance of the rules' actions. advance: called with 1 after every gradient step.
+    The first round uses observations of the rules in training worlds, each later round adds observations of the actor
+    in as many more worlds. Returns the number of rows, and the remaining error: the mean square error of the actions
+    over the variance of the rules' actions. advance: called with 1 after every gradient step.
 
     Raises:
         FloatingPointError: learning or a world diverged; LearningDiverged names the gradient step and the loss.
@@ -85,7 +85,7 @@ def teach(
 
 
 def _finite_answers(model: PPO, rows: torch.Tensor) -> torch.Tensor:
-    """Return what the actor answers to rows (R, O), (R, A); LearningDiverged if a number of it is not finite."""
+    """Return the actor's actions for rows (R, O), (R, A); raise LearningDiverged if a number is not finite."""
     try:
         answers = model.policy.get_distribution(rows).mode()
     except ValueError:  # torch makes no distribution of NaN

@@ -102,7 +102,7 @@ def verdict(task: str, results: Results) -> str:
     """
     players = results["players"]
     if len(players) < 2:
-        return f"{task}: one player alone, nobody to compare with."
+        return f"{task}: only one player, no comparison."
     names = ("ppo", "rules")
     if not players.keys() >= set(names):
         names = tuple(sorted(players, key=lambda name: -players[name]["mean"])[:2])

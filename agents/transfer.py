@@ -1,9 +1,9 @@
-"""What accuracy buys a policy: `python -m agents.transfer [TASK...]` has the same worlds solved better and worse.
+"""Accuracy and policies: `python -m agents.transfer [TASK...]` plays the same worlds with other methods and steps.
 
-Every player meets the same held-out worlds as in agents.compare, under each method of integration, step and precision,
-and decides as often as before: what differs is how motion is solved between two decisions. Then the same actions are
-replayed under each setting by the clock. Returns and times are kept in runs/transfer as they come, so that the same
-command goes on after an interruption and plays nothing twice. Writes transfer.json, transfer.md and transfer.png.
+Every player plays the held-out worlds of agents.compare under each integration method, step and precision. It decides
+as often as before; only the motion between two decisions is computed differently. Then the same actions are replayed
+and timed under each setting. Returns and times are stored in runs/transfer at once, so that after an interruption the
+same command continues and plays nothing twice. Writes transfer.json, transfer.md and transfer.png.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ FILES = ("transfer.json", "transfer.md", "transfer.png")
 STOPPED = f"interrupted; what was played is in {KEPT}, and the same command goes on"
 
 Advance = Callable[[str, int], None]
-"""Told what has been done, and how many cells or clocks that was."""
+"""Called with a text of what was done, and the number of cells or clocks."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -138,18 +138,18 @@ def _solvers(names: Sequence[str]) -> list[tuple[str, str]]:
 def _substeps(texts: Sequence[str], usual: Sequence[int]) -> list[int]:
     for text in texts:
         if not (text.isascii() and text.isdigit() and 1 <= int(text[:9]) <= MOST_SUBSTEPS):
-            raise ValueError(f"--substeps {shown(text)}: must be a whole number from 1 to {MOST_SUBSTEPS}")
+            raise ValueError(f"--substeps {shown(text)}: must be an integer from 1 to {MOST_SUBSTEPS}")
     return sorted({int(text) for text in texts} or usual)
 
 
 def _settings(task: Task, solvers: Sequence[tuple[str, str]], substeps: Sequence[int]) -> tuple[Setting, ...]:
-    """Return the settings to play, the one that players were made for first, whether it was asked for or not."""
+    """Return the settings to play, beginning with the one that players were made for, even if it is not selected."""
     asked = [Setting(method, dtype, steps) for method, dtype in solvers for steps in substeps]
     return tuple(dict.fromkeys([Setting.trained(task), *asked]))
 
 
 def _measured(plans: Sequence[Plan], workers: int) -> report.Results:
-    """Play what is missing, run the clock, and return everything as plain data."""
+    """Play the missing episodes, time the settings, and return everything as plain data."""
     began = perf_counter()
     for plan in plans:
         for player in plan.players:

@@ -18,41 +18,41 @@ from flockenv.tasks import Task
 __all__ = ["Cell", "Clock", "Setting", "finest", "frugal", "markdown", "show", "task_results", "verdict"]
 
 SURVIVES = 0.95
-"""Share of its lead over random that a policy must keep in its worst setting to be said to survive."""
+"""A policy survives if it keeps this share of its lead over random in its worst setting."""
 NOTHING = 1e-6
 """mm: an error below this is rounding."""
 
 ASKED = """\
-Policies were trained, and rules tuned, in worlds solved by one method with one step. Do they survive when the same
-worlds are solved better, or worse, and what does accuracy cost? Everybody decides as often as before: what differs is
-how motion is solved between two decisions."""
+Policies were trained, and rules tuned, with one integration method and one time step. This page shows whether their
+scores survive a more or less accurate solution of the same worlds, and what accuracy costs. Players decide as often as
+before; only the motion between two decisions is computed differently."""
 
 READING = """\
-Between two decisions nothing but the force that agents ask for acts in these tasks, and it is constant. So every method
-of second order solves a decision exactly, in one step, until a limit of speed or a wall is met: midpoint, velocity
-Verlet and RK4 play the same game to rounding, what is left of their error comes from the limit and falls with dt alone,
-and RK4's other evaluations buy nothing. The two Euler methods are off by half a step: after a decision of n steps under
-a constant force, a body that began at rest has gone (1 + 1/n) times as far as it should under semi-implicit Euler, as
-if it had been pushed earlier, and (1 - 1/n) times under explicit Euler, as if later. That is what players notice.
+In these tasks the only force between two decisions is the constant steering force. So every method of second order
+solves a decision exactly, in one step, up to a speed limit or a wall. Midpoint, velocity Verlet and RK4 therefore agree
+to rounding. Their remaining error comes from the speed limit and falls only with dt, so RK4's additional evaluations
+have no benefit. The two Euler methods are off by half a step. After a decision of n steps under a constant force, a
+body that began at rest has moved (1 + 1/n) times the exact distance under semi-implicit Euler, as if the force had
+acted earlier, and (1 - 1/n) times under explicit Euler, as if later. The scores of players change by this effect.
 
 "Trained" is the setting of the comparison, in float64. The shipped policies learned in float32 with the same method and
-step: their very own setting is the float32 row of that step, and it makes no difference worth the name."""
+step. Their own setting is thus the float32 row of that step, which makes no relevant difference."""
 
 NOTES = """\
 Return: the mean reward of a world's learners, summed over its episode. A difference is the mean over the same worlds
 against the same player under the setting that it was made for, with a 95 % percentile bootstrap interval over worlds;
-"(level)": the interval holds 0. Many intervals are shown, and one in twenty misses 0 by luck where nothing differs.
-Error: how far learners are, after one second of the same actions, from where RK4 with 64 steps per decision has them
-(median over worlds and learners). Evaluations: of the force, per simulated second. Time: physics, observations and
-rewards of one world for one simulated second, in a batch on one thread, without compiling and without the policy: the
-median of interleaved rounds, each the median of its steps in a process of its own, and (least-most) of them; rounds
-overlap where those do. The machine was shared with other work. A policy is said to survive if it keeps
-95 % of its lead over random in its worst setting."""
+"(level)": the interval contains 0. Of many intervals without a true difference, one in twenty misses 0 by chance.
+Error: the distance of learners, after one second of the same actions, from their positions under RK4 with 64 steps per
+decision (median over worlds and learners). Evaluations: of the force, per simulated second. Time: physics, observations
+and rewards of one world for one simulated second, in a batch on one thread, without compiling and without the policy.
+It is the median of interleaved rounds (least-most), each the median of its steps in a separate process; "rounds
+overlap" means that these ranges do. The machine was shared with other work. A policy survives if it keeps 95 % of its
+lead over random in its worst setting."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """How motion is solved: by which method, in which precision, in how many steps per decision."""
+    """How motion is computed: integration method, precision, and number of steps per decision."""
 
     method: str
     dtype: str
@@ -60,11 +60,11 @@ class Setting:
 
     @classmethod
     def trained(cls, task: Task) -> Setting:
-        """Return the setting of a task as its config has it, for which its players were made."""
+        """Return the setting in the config of a task, for which its players were made."""
         return cls(task.integrator.kind, task.dtype, task.substeps)
 
     def of(self, task: Task) -> Task:
-        """Return the task solved so: itself, to the last bit of dt, if it is."""
+        """Return the task with this setting; the same task, to the last bit of dt, if it has this setting."""
         changes: dict[str, Any] = {"dtype": self.dtype}
         if self.method != task.integrator.kind:
             changes["integrator"] = INTEGRATORS[self.method]()
@@ -74,7 +74,7 @@ class Setting:
 
     @property
     def solver(self) -> str:
-        """Method and precision: what is compiled."""
+        """Method and precision, which determine the compiled code."""
         return f"{self.method}{' float32' if self.dtype == 'float32' else ''}"
 
     @property
@@ -85,24 +85,24 @@ class Setting:
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """What one player scored under one setting, by world, (B,)."""
+    """Scores of one player under one setting, by world, (B,)."""
 
     returns: NDArray[np.float64]
     success: NDArray[np.bool_]
 
     def to_json(self) -> Results:
-        """Return lists, from which the same bits are read again."""
+        """Return lists that of_json reads to the same bits."""
         return {"returns": self.returns.tolist(), "success": self.success.tolist()}
 
     @classmethod
     def of_json(cls, content: Results) -> Cell:
-        """Return what to_json was given."""
+        """Return the cell that to_json wrote."""
         return cls(np.array(content["returns"], np.float64), np.array(content["success"], np.bool_))
 
 
 @dataclass
 class Clock:
-    """What replaying the same actions showed, by name of the setting."""
+    """Times and errors of the replayed actions, by name of the setting."""
 
     rounds: list[dict[str, float]] = field(default_factory=list)  # s per step of all worlds
     error_mm: dict[str, float] = field(default_factory=dict)
@@ -168,7 +168,7 @@ def _difference(first: Cell, second: Cell, resamples: int, seed: int) -> Results
     return {**interval_fields("difference", "ci", gain), "separated": gain.low > 0 or gain.high < 0}
 
 
-# --- what it comes to -------------------------------------------------------------------------------------------------
+# --- sentences --------------------------------------------------------------------------------------------------------
 
 
 def finest(results: Results) -> str:
@@ -191,7 +191,7 @@ def _cheapest(settings: Results, error_mm: float) -> str:
 
 
 def verdict(task: str, results: Results) -> str:
-    """Return a sentence about the last player: whether it keeps its success rate, and what accuracy costs."""
+    """Return a sentence on the last player: whether it keeps its scores, and what accuracy costs."""
     settings, trained = results["settings"], results["settings"][results["trained"]]
     pilot = list(trained["players"])[-1]
     best, cheap = finest(results), frugal(results)
@@ -210,7 +210,7 @@ def verdict(task: str, results: Results) -> str:
 
 
 def _survival(results: Results, pilot: str) -> str:
-    """Say what a policy keeps in its worst setting, measured by its lead over random where that played."""
+    """Return what a policy keeps in its worst setting, as a share of its lead over random if random played."""
     settings = results["settings"]
     name = min(settings, key=lambda s: settings[s]["players"][pilot]["difference"])
     worst, trained = settings[name]["players"], settings[results["trained"]]["players"]
@@ -235,9 +235,9 @@ def _change(player: Results) -> str:
 
 
 def _standing(about: Results, pilot: str) -> str:
-    """Say where the policy stands beside the player that claims most of the others."""
+    """Compare the policy with the last of the other players."""
     if not about["leads"]:
-        return "nobody else played"
+        return "no other player took part"
     pair, lead = list(about["leads"].items())[-1]
     place = "level with" if not lead["separated"] else "ahead of" if lead["difference"] > 0 else "behind"
     return f"is {place} {pair.removeprefix(f'{pilot} - ')} ({interval_text(lead, 'difference', 'ci')})"
@@ -299,7 +299,7 @@ def cells_of(results: Results, players: Sequence[str]) -> tuple[list[str], list[
 
 
 def show(results: Results) -> None:
-    """Print a table per task about the last player, and last, in full, what they come to."""
+    """Print a table per task on the last player, and then the sentence of each task."""
     console = Console(highlight=False)
     if not console.is_terminal:
         console = Console(highlight=False, width=160)
@@ -311,14 +311,14 @@ def show(results: Results) -> None:
 
 
 def markdown(results: Results) -> str:
-    """Return the whole as a Markdown page."""
+    """Return the page in Markdown."""
     seeds = f"{results['world_seeds']['first']} to {results['world_seeds']['last']}"
     held_out = f"{results['worlds']} worlds per task, seeds {seeds}: held out, those of the comparison."
-    about = [ASKED, f"{held_out} `python -m agents.transfer` makes this page anew."]
-    parts = ["# What accuracy buys a policy", *about, "![Differences and times](transfer.png)"]
+    about = [ASKED, f"{held_out} `python -m agents.transfer` makes this page."]
+    parts = ["# Policies under other integration methods and steps", *about, "![Differences and times](transfer.png)"]
     parts += [f"* **{task}**{about['verdict'].removeprefix(task)}" for task, about in results["tasks"].items()]
     for task, about in results["tasks"].items():
         parts += [f"## {task}", grid(*cells_of(about, list(about["again"])))]
     versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
     machine = f"{results['machine']['system']}, {results['machine']['cores']} cores"
-    return "\n\n".join([*parts, "## What it says", READING, "---", NOTES, f"Made with {versions} on {machine}.\n"])
+    return "\n\n".join([*parts, "## Conclusions", READING, "---", NOTES, f"Made with {versions} on {machine}.\n"])

@@ -91,8 +91,8 @@ def made_up(aa: float, ab: float, ba: float, bb: float, noise: float = 0.1) -> b
 @pytest.mark.parametrize(
     ("payoffs", "verdict"),
     [
-        (made_up(1, 5, 0, 3), "a prisoner's dilemma, everybody does better with a and all together with b"),
-        (made_up(3, 0, 5, 1), "a prisoner's dilemma, everybody does better with b and all together with a"),
+        (made_up(1, 5, 0, 3), "a prisoner's dilemma, each agent does better with a and all together with b"),
+        (made_up(3, 0, 5, 1), "a prisoner's dilemma, each agent does better with b and all together with a"),
         (made_up(1, 2, 4, 5), "b is the better answer to both"),
         (made_up(3, 0, 0, 5), "either is best among its own kind"),
         (made_up(1, 5, 5, 3), "either does better among the other kind"),
@@ -111,7 +111,7 @@ def test_the_verdict_follows_from_the_payoffs(payoffs: best_response.Payoffs, ve
     [
         (
             ["configs/training/pursuit.yaml"],
-            "task 'pursuit': one learner alone in each world, with nobody to play otherwise",
+            "task 'pursuit': each world has a single learner; this command needs at least two",
         ),
         (["configs/training/school.yaml", "--players", "ppo,nobody"], "player 'nobody': unknown"),
         (["configs/training/school.yaml", "--players", "orca"], "no hand-written player 'orca' for 'school'"),
@@ -147,5 +147,5 @@ def test_the_command_prints_a_table_and_a_verdict_for_each_pair() -> None:
     command = ["configs/training/school.yaml", "--players", "textbook,rules", "--worlds", "8"]
     result = CliRunner().invoke(best_response.app, command)
     assert result.exit_code == 0, result.output
-    assert "school: mean return of one who plays the row, among those who play the column" in result.stdout
+    assert "school: mean return of one agent that plays the row, among others that play the column" in result.stdout
     assert "rules among textbook: " in result.stdout and "textbook among rules: " in result.stdout

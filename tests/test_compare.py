@@ -249,7 +249,7 @@ def test_verdict_without_ppo_compares_the_two_best_players() -> None:
     luck = np.linspace(-1, 1, 101)
     three = artificial_results({"random": luck, "textbook": luck + 3, "rules": luck + 2})["verdict"]
     assert three.startswith("toy: textbook beats rules by 1.000")
-    assert artificial_results({"ppo": luck})["verdict"] == "toy: one player alone, nobody to compare with."
+    assert artificial_results({"ppo": luck})["verdict"] == "toy: only one player, no comparison."
 
 
 def test_numbers_are_rounded_by_their_intervals() -> None:

@@ -340,7 +340,7 @@ def test_one_run_writes_all_files() -> None:
         (("--players", "no.py"), "player 'no.py': no such file"),
         (("--methods", "rk44"), "--methods 'rk44': no method of a task, did you mean `rk4`?; allowed: "),
         (("--methods", "rk4:float16"), "--methods 'rk4:float16': the precision must be float64 or float32"),
-        (("--substeps", "0"), "--substeps '0': must be a whole number from 1 to 1000"),
+        (("--substeps", "0"), "--substeps '0': must be an integer from 1 to 1000"),
         (("--substeps", "2.5"), "--substeps '2.5': must be"),
         (("--substeps", "1,9999999999"), "--substeps '9999999999': must be"),
         (("--worlds", "1"), "--worlds 1: must be from 2 to 1000000"),

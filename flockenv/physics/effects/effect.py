@@ -158,8 +158,8 @@ class Sight(NamedTuple):
 
     radius: float  # m
     fov: float = 360.0  # degrees, full angle; an agent at standstill has no heading and sees all around
-    nearest: int | None = None  # at most this number (and any exactly as far as the last); None = all
-    group: int | None = None  # this group alone; None = all
+    nearest: int | None = None  # at most this number, and any exactly as far as the last (default: all)
+    group: int | None = None  # this group alone (default: all)
     occluded: bool = False  # True: not neighbours whose centre an obstacle hides on the straight line of sight
 
 

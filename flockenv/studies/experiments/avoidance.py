@@ -18,9 +18,9 @@ ARRIVED = 0.4
 
 COLUMNS = {
     "arrived": f"share that came within {ARRIVED:g} m of the target in time",
-    "time": "s until then, of those who did",
-    "path": "length of their way over the straight one",
-    "speed lost": "share of max_speed, on average until then",
+    "time": "s until arrival, mean over agents that arrived",
+    "path": "path length over the straight distance, of the same agents",
+    "speed lost": "share of max_speed, mean until arrival or the end",
     "collisions": "obstacles run into, per agent",
     "deepest": "m, the deepest that any agent was in an obstacle",
 }

@@ -139,7 +139,7 @@ def stack(method: Integrator, response: Response) -> Value:
 HEAPS = (
     *per_response("N22", "incline, friction .3; a stop", "stays at 16.6, slides at 16.8; 1.14679 m +- 1 %", incline),
     *per_response(
-        "N23", "1,000 discs in a funnel for 60 s", "overlap 5 % R, nobody out, no energy gained", funnel,
+        "N23", "1,000 discs in a funnel for 60 s", "overlap 5 % R, none out, no energy gained", funnel,
         ("impulses",), ("semi_implicit_euler",),
     ),
     *per_response("P19", "a stack of ten for 20 s", "drift 1 % R", stack),

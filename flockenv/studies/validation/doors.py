@@ -289,7 +289,7 @@ def faster_is_slower(name: str) -> Value:
         highs.append(float(np.quantile(times, 0.75)))
     best = FASTER[int(np.argmin(medians))]
     note = ", ".join(f"{v:g} m/s {t:.0f} s" for v, t in zip(FASTER, medians, strict=True))
-    note += f"; medians of {FASTER_SEEDS} seeds, {stuck} runs with somebody stuck"
+    note += f"; medians of {FASTER_SEEDS} seeds, {stuck} runs with stuck people"
     series = {"speed": list(FASTER), "time": medians, "low": lows, "high": highs}
     return Value(best, None, note, series)
 
@@ -326,7 +326,7 @@ DOORS = (
         rimea_12,
     ),
     Case("nist 2.8", "counterflow: of 100 against 100 through", "the fewer the more come against", nist_2_8),
-    Case("nist 3.1", "23 people, 12 rooms: by the exit they were told, %", "100 %", nist_3_1),
+    Case("nist 3.1", "23 people, 12 rooms: by the assigned exit, %", "100 %", nist_3_1),
     Case("nist 5.1", "density at a door against that beyond it", "> 1", nist_5_1),
     Case("nist 5.2", "flow by a door of 1 m, /(m s)", "against IMO's 1.33", nist_5_2),
     Case("bursts", "48 + 48 through a door: bursts above a coin's", "> 0 with 95 %, 20 seeds", door_bursts),
