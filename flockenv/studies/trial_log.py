@@ -28,7 +28,7 @@ VERDICTS: dict[Verdict, str] = {
     "warned": "within the bound, after a warning: of a step that is too long, of contacts that were not solved",
     "reported": "there is no bound, only a number",
     "refused": "the scene was refused, the message says why; of a step that must blow up, the largest that does not",
-    "fails": "beyond the bound: the number is what came of it",
+    "fails": "beyond the bound; the number is the result",
     "diverges": "no longer finite, and reported: world, agent, step, effect",
 }
 """Meaning of each verdict."""
