@@ -56,10 +56,10 @@ def page(behaviours: Mapping[str, type[Effect]], pictures: str) -> str:
     lines = [
         "# Behaviours",
         "",
-        "This page shows each behaviour in a small scene; paths fade towards the past. To use a behaviour, list it under",
-        "`effects` of a scene, or under `behaviours` of a `steer` effect, whose arbitration combines several. The texts",
-        "are the docstrings and fields of the classes. `flockenv gallery --out docs/behaviours.md --force` draws and",
-        "writes this page.",
+        "This page shows each behaviour in a small scene; paths fade towards the past. To use one, list it under",
+        "`effects` of a scene, or under `behaviours` of a `steer` effect, whose arbitration combines several.",
+        "The texts are the docstrings and fields of the classes. `flockenv gallery --out docs/behaviours.md --force`",
+        "draws and writes this page.",
         "",
     ]
     for title, members in families(behaviours).items():

@@ -25,8 +25,8 @@ These settings are ours, not the models':
 * Paths to goals are computed on a grid around all walls (`way`, with a clearance of .3 m).
 * Walls do not hide people (`occluded: false`, the presets' default; `true` takes 20 times as long).
 * Desired speeds are Weidmann's N(1.34, .26) m/s unless a case has others. Masses and radii are those of each preset.
-* The step is .02 s, for the preset of 2011 .05 s, for that of 2000 .005 s, because of its friction at an overlap of 6 cm.
-  It is .0025 s if people hurry, and .001 s if bodies overlap at the start.
+* The step is .02 s, for the preset of 2011 .05 s, for that of 2000 .005 s, because of its friction at an overlap of
+  6 cm. It is .0025 s if people hurry, and .001 s if bodies overlap at the start.
 * Walls are solid. Models without bodies get the elastic wall of 2000 (k = 1.2e5 kg/s^2); otherwise a crowd is pushed
   through the walls of 2009.
 * Steps, solid walls and the sizes of some rooms were chosen after a first look; no value of a preset was.
