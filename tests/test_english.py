@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import io
-import json
 import re
 import tokenize
 from collections.abc import Iterator
@@ -14,8 +13,6 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 FOLDERS = ("flockenv", "agents", "benchmarks", "tests")
-REST = Path(__file__).with_name("english.json")
-"""How many banned words are left, by file. A file that is not listed has none; counts only ever fall."""
 
 BANNED = (
     "who", "whoever", "whom", "whomever", "somebody", "nobody", "everybody", "anybody", "he", "him", "his", "himself",
@@ -23,7 +20,7 @@ BANNED = (
     "are heard", "is met", "are met", "a whole number", "of whom", "no less than", "wished for",
 )  # fmt: skip
 WORDS = sorted(BANNED, key=len, reverse=True)
-BAN = re.compile("|".join(["none =", *(rf"(?<![\w`'-]){word}(?![\w`'-])" for word in WORDS)]), re.I)
+BAN = re.compile("|".join(["none =", *(rf"(?<![\w`'.-]){word}(?![\w`'-])" for word in WORDS)]), re.I)
 QUOTED = re.compile(r"`[^`]*`|\"\"\"|https?://\S+")
 ITSELF = {"tests/test_english.py"}
 
@@ -60,12 +57,6 @@ def files() -> Iterator[Path]:
         yield from sorted(path for path in (ROOT / folder).glob(pattern) if "history" not in path.parts)
 
 
-def counts() -> dict[str, int]:
-    """Return how many banned words each file has, without those that have none."""
-    found = {path.relative_to(ROOT).as_posix(): len(banned(path)) for path in files()}
-    return {name: count for name, count in found.items() if count and name not in ITSELF}
-
-
 def questions(path: Path) -> Iterator[str]:
     """Yield the docstrings that are questions."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -75,10 +66,8 @@ def questions(path: Path) -> Iterator[str]:
                 yield f"{path.relative_to(ROOT)}: {first}"
 
 
-def test_no_file_has_more_banned_words_than_before() -> None:
-    allowed = json.loads(REST.read_text()) if REST.exists() else {}
-    more = {name: count for name, count in counts().items() if count > allowed.get(name, 0)}
-    assert more == {}, [line for name in more for line in banned(ROOT / name)][:40]
+def test_no_text_has_a_banned_word() -> None:
+    assert [line for path in files() if path.relative_to(ROOT).as_posix() not in ITSELF for line in banned(path)] == []
 
 
 def test_docstrings_are_no_questions() -> None:
@@ -90,6 +79,6 @@ def test_a_banned_word_is_found(text: str) -> None:
     assert BAN.search(text)
 
 
-@pytest.mark.parametrize("text", ["the others", "there", "`whom`", "a whole scene"])
+@pytest.mark.parametrize("text", ["the others", "there", "`whom`", "a whole scene", "me.who"])
 def test_other_words_are_not(text: str) -> None:
     assert not BAN.search(QUOTED.sub("", text))
