@@ -1,4 +1,4 @@
-"""Start of a process: folders are imported and kernels are loaded with garbage collection disabled."""
+"""Start of a process: garbage collection is enabled afterwards, and heavy modules are imported when they are needed."""
 
 from __future__ import annotations
 
@@ -6,14 +6,12 @@ import gc
 import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import pytest
 
 from flockenv.core.record import Record
-from flockenv.jit.lock import OneAtATime
-from flockenv.jit.startup import import_all, nothing_to_collect
+from flockenv.jit.startup import nothing_to_collect
 
 
 @pytest.fixture(autouse=True)
@@ -37,31 +35,6 @@ def test_disabled_garbage_collection_stays_disabled() -> None:
     with nothing_to_collect():
         pass
     assert not gc.isenabled()
-
-
-def test_a_folder_is_imported_without_garbage_collection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = tmp_path / "some_folder"
-    folder.mkdir()
-    (folder / "__init__.py").write_text("")
-    for name in ("one", "two"):
-        (folder / f"{name}.py").write_text("import gc\ncollects = gc.isenabled()\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    import_all("some_folder", [str(folder)])
-    assert [sys.modules.pop(f"some_folder.{name}").collects for name in ("one", "two")] == [False, False]
-    assert gc.isenabled()
-
-
-def test_a_kernel_is_loaded_without_garbage_collection(tmp_path: Path) -> None:
-    class Disk:
-        def load_overload(self, *_: Any) -> None:
-            seen.append(gc.isenabled())
-
-    seen: list[bool] = []
-    cache = OneAtATime(Disk(), tmp_path / "lock")
-    cache.load_overload(None, None)  # loads twice: before and after it acquires the compile lock
-    cache._lock.release()
-    assert seen == [False, False]
-    assert gc.isenabled()
 
 
 @pytest.mark.parametrize("module", ["flockenv.tasks", "flockenv.scene", "flockenv.envs.single", "flockenv.envs.sb3"])
