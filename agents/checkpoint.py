@@ -24,8 +24,8 @@ from pydantic import ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from flockenv.core.atomic_files import made, remove_leftovers, replacing
-from flockenv.core.errors import refusals, shown
+from flockenv.core.atomic_files import new_folder, remove_leftovers, replace_file
+from flockenv.core.errors import printable, refusals
 from flockenv.core.record import Record
 
 __all__ = [
@@ -69,7 +69,7 @@ def claimed(folder: Path) -> Iterator[None]:
 
     What a killed process left half-written is removed; the lock of a killed process is free.
     """
-    with made(folder):
+    with new_folder(folder):
         lock = FileLock(folder / "training.lock")
         try:
             lock.acquire(blocking=False)
@@ -95,7 +95,7 @@ def write(folder: Path, parts: KernelPlan) -> None:
     digests = {part: _digest(tensors) for part, tensors in parts.items()}
     tensors = {f"{part}/{name}": np.asarray(t, order="C") for part, named in parts.items() for name, t in named.items()}
     data = save(tensors, {"format": FORMAT, "sha256": json.dumps(digests)})
-    with replacing(path_in(folder)) as file:
+    with replace_file(path_in(folder)) as file:
         file.write(data)
 
 
@@ -146,7 +146,7 @@ def read(folder: Path, largest: int) -> KernelPlan | None:
 def _recorded(metadata: Mapping[str, str], folder: Path) -> dict[str, str]:
     """Return the digests that a header names."""
     if metadata.get("format") != FORMAT:
-        raise Damaged(folder, f"header: format = {shown(metadata.get('format'))}, must be {FORMAT!r}")
+        raise Damaged(folder, f"header: format = {printable(metadata.get('format'))}, must be {FORMAT!r}")
     try:
         digests = json.loads(metadata.get("sha256", ""))
     except (ValueError, RecursionError):
@@ -161,7 +161,7 @@ def _parts(file: Any, folder: Path) -> KernelPlan:
     for name in file.keys():  # noqa: SIM118  # not a dictionary
         part, slash, rest = name.partition("/")
         if not slash or not rest:
-            raise Damaged(folder, f"header: {shown(name)} is not the name of a tensor, PART/NAME")
+            raise Damaged(folder, f"header: {printable(name)} is not the name of a tensor, PART/NAME")
         parts.setdefault(part, {})[rest] = file.get_tensor(name)
     return parts
 

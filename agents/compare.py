@@ -27,9 +27,9 @@ from agents import report
 from agents.experiment import CONFIGS, Experiment, load_experiment
 from agents.processes import Tell, side_by_side
 from flockenv.cli.terminal import one_line, program, shown_progress
-from flockenv.core.atomic_files import deliver
-from flockenv.core.errors import nearest, shown
-from flockenv.core.output_paths import check_room, checked_file, checked_path
+from flockenv.core.atomic_files import write_all_or_none
+from flockenv.core.errors import nearest, printable
+from flockenv.core.output_paths import check_room, valid_file, valid_path
 from flockenv.core.warnings import OtherTaskWarning
 from flockenv.evaluation import WORLDS_PER_SEED, Episodes, rollout, task_digest, worlds_for
 from flockenv.players import NAMES, load_player, other_tasks
@@ -73,7 +73,7 @@ class Player:
         """Name a file by its stem; ValueError for a stem that is fit for no table."""
         name = Path(spec).stem if Path(spec).suffix.lower() in SUFFIXES else spec
         if not NAME.fullmatch(name):
-            raise ValueError(f"--players {shown(spec)}: a name is up to 40 letters, digits and _ . + -")
+            raise ValueError(f"--players {printable(spec)}: a name is up to 40 letters, digits and _ . + -")
         return cls(spec, name)
 
     def policy(self, task: Task, seed: int, trust_pickle: bool = False) -> Policy:
@@ -295,17 +295,17 @@ def main(
         with _bars(chosen, len(field)) as advance:
             results, episodes = compare(chosen, field, count, seed, resamples, trust_pickle, advance)
         results["smoke"] = smoke
-        deliver(folder, _files(results, episodes))
+        write_all_or_none(folder, _files(results, episodes))
     _show(results, folder)
 
 
 def folder_of(text: str, files: Sequence[str]) -> Path:
     """Return the folder that --out names; ValueError or OSError if these files cannot be written there."""
-    folder = checked_path(text)
+    folder = valid_path(text)
     if folder.exists() and not folder.is_dir():
-        raise ValueError(f"--out {shown(text)}: is a file, must be a folder")
+        raise ValueError(f"--out {printable(text)}: is a file, must be a folder")
     for name in files:
-        checked_file(str(folder / name), (Path(name).suffix,), force=True)
+        valid_file(str(folder / name), (Path(name).suffix,), force=True)
     check_room(folder / files[0], ROOM)
     return folder
 
@@ -320,7 +320,7 @@ def pick(option: str, names: Sequence[str], allowed: Mapping[str, object]) -> li
     for name in names:
         if name not in allowed:
             hint = nearest(name[:200], allowed)
-            raise ValueError(f"{option} {shown(name)}: unknown{hint}; allowed: {', '.join(allowed)}")
+            raise ValueError(f"{option} {printable(name)}: unknown{hint}; allowed: {', '.join(allowed)}")
     return list(dict.fromkeys(names))
 
 

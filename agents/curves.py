@@ -19,8 +19,8 @@ from rich.console import Console
 
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors
 from flockenv.cli.terminal import one_line, program
-from flockenv.core.atomic_files import deliver, replacing
-from flockenv.core.output_paths import check_room, checked_file, checked_path
+from flockenv.core.atomic_files import replace_file, write_all_or_none
+from flockenv.core.output_paths import check_room, valid_file, valid_path
 from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK
 from flockenv.players.rules import tuned
 
@@ -99,7 +99,7 @@ def draw(path: Path, tasks: Mapping[str, Numbers], note: str = "One seed each; p
         _curves(axes, task, numbers)
     figure.suptitle("Learning, by the clock", x=0.01, ha="left", fontsize=14, fontweight="bold", color=INK)
     figure.supxlabel(note, x=0.01, ha="left", fontsize=8, color=FAINT)
-    with replacing(path) as file:
+    with replace_file(path) as file:
         figure.savefig(file, format="png", dpi=150, metadata={"Software": "flockenv"})
 
 
@@ -137,14 +137,14 @@ def main(
 ) -> None:
     """Train several settings of each task, and draw their learning curves side by side."""
     with one_line_errors():
-        picture = checked_file(out, (".png",), force=True, beside=".json")
-        folder = checked_path(str(runs), "--runs")
+        picture = valid_file(out, (".png",), force=True, beside=".json")
+        folder = valid_path(str(runs), "--runs")
         experiments = experiments_of(configs)
         check_room(picture, ROOM)
     stays = f"interrupted; what is trained stays in {runs}, the same command goes on"
     with one_line("curves", stays), one_line_errors((FloatingPointError,)):
         tasks = {task: measured(experiment, folder) for task, experiment in experiments.items()}
-        deliver(picture.parent, {
+        write_all_or_none(picture.parent, {
             picture.name: lambda path: draw(path, tasks),
             picture.with_suffix(".json").name: lambda path: path.write_bytes(json.dumps(tasks).encode()),
         })  # fmt: skip

@@ -40,7 +40,7 @@ from agents.team_credit import CaringBuffer
 from agents.training_state import capture, restore, surroundings
 from flockenv.cli.terminal import DIVERGED, interruptible, program, shown_progress
 from flockenv.core import signals
-from flockenv.core.output_paths import check_room, checked_file, checked_path
+from flockenv.core.output_paths import check_room, valid_file, valid_path
 from flockenv.envs.sb3 import WorldVecEnv
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.jit.thread_pool import threads, use_threads
@@ -340,8 +340,8 @@ def main(
         changes = {k: v for k, v in (("steps", steps), ("seed", seed)) if v is not None}
         experiment = experiment.model_copy(update={"ppo": PpoSettings(**{**experiment.ppo.model_dump(), **changes})})
         name = experiment.build().name
-        target = WEIGHTS / f"{name}.safetensors" if out is None else checked_file(str(out), (".safetensors",), True)
-        folder = checked_path(str(runs / name), "--runs")
+        target = WEIGHTS / f"{name}.safetensors" if out is None else valid_file(str(out), (".safetensors",), True)
+        folder = valid_path(str(runs / name), "--runs")
         _check_outputs(experiment, target, folder, tensorboard)
     kept: deque[Run] = deque(maxlen=1)  # the last one alone: a run holds all arrays of the model
     with interruptible(), one_line_errors((CheckpointError, OSError, MemoryError)):
@@ -349,7 +349,7 @@ def main(
             run = train(experiment, folder, go_on, tensorboard, kept.append)
         except KeyboardInterrupt:
             stays = f"checkpoint in {runs / name}, go on with --resume" if kept else "nothing was learnt yet"
-            signals.say(f"interrupted; {stays}")
+            signals.set_message(f"interrupted; {stays}")
             raise
         except FloatingPointError as error:
             typer.echo(f"error: {error}; {_last_good(kept, folder, target)}", err=True)
@@ -366,7 +366,7 @@ def _check_outputs(experiment: Experiment, target: Path, folder: Path, tensorboa
     for path in (target, path_in(folder)):
         check_room(path, expected_bytes(experiment))
     if tensorboard is not None:
-        checked_path(tensorboard, "--tensorboard")
+        valid_path(tensorboard, "--tensorboard")
         if find_spec("tensorboard") is None:
             raise ValueError("--tensorboard: the package tensorboard is not installed")
 

@@ -158,7 +158,7 @@ def _begin(mouth: Connection, turn: Any) -> None:
 
 def serve() -> None:
     """Make this process one that works for its parent: Ctrl-C is the parent's to handle, and it ends when that ends."""
-    signals.serve()
+    signals.begin_worker()
     os.environ["FLOCKENV_QUIET"] = "1"
     parent = parent_process()
     if parent is not None:

@@ -20,7 +20,7 @@ from agents.experiment import one_line_errors
 from agents.report import Results, grid
 from agents.summary_chart import write_summary
 from flockenv.cli.terminal import program
-from flockenv.core.atomic_files import deliver
+from flockenv.core.atomic_files import write_all_or_none
 from flockenv.tasks import TASKS
 
 __all__ = ["BLOCK", "app", "summary", "tables"]
@@ -118,7 +118,7 @@ def main(
             contents[name] = _page(root / name, table).encode()
         writers = {name: functools.partial(_write, content) for name, content in contents.items()}
         writers["docs/summary.png"] = functools.partial(write_summary, results=results)
-        deliver(root, writers)
+        write_all_or_none(root, writers)
     for name in writers:
         typer.echo(f"{root / name}: written")
 

@@ -14,7 +14,7 @@ from pydantic import Field
 from agents import checkpoint as files
 from agents.checkpoint import CheckpointError, KernelPlan
 from agents.experiment import Experiment
-from flockenv.core.errors import KeyPath, key_path, shown
+from flockenv.core.errors import KeyPath, key_path, printable
 from flockenv.core.record import ResultRecord
 from flockenv.players.policy import MlpPolicy
 from flockenv.players.rules import as_dict, player
@@ -136,7 +136,7 @@ def _compare(kept: dict[str, Any], wanted: dict[str, Any], folder: Path) -> None
     of_kept, of_wanted = dict(_numbers(kept)), dict(_numbers(wanted))
     for key in {**of_wanted, **of_kept}:
         if of_kept.get(key) != of_wanted.get(key):
-            has, asked = (shown(of[key]) if key in of else "nothing" for of in (of_kept, of_wanted))
+            has, asked = (printable(of[key]) if key in of else "nothing" for of in (of_kept, of_wanted))
             raise OtherRecipe(f"{key} = {asked}: the checkpoint in {folder} is of another recipe, with {has}")
 
 

@@ -46,8 +46,8 @@ from agents.transfer_cache import (
 )
 from agents.transfer_report import Setting
 from flockenv.cli.terminal import one_line, program, shown_progress
-from flockenv.core.atomic_files import deliver
-from flockenv.core.errors import nearest, shown
+from flockenv.core.atomic_files import write_all_or_none
+from flockenv.core.errors import nearest, printable
 from flockenv.evaluation import WORLDS_PER_SEED, worlds_for
 from flockenv.physics.integrators import INTEGRATORS
 from flockenv.tasks import TASKS, Task
@@ -106,7 +106,7 @@ def main(
             for task in chosen
         ]
         results = _measured(plans, workers)
-        deliver(folder, {
+        write_all_or_none(folder, {
             "transfer.json": lambda path: write_text(path, report.json_text(results)),
             "transfer.md": lambda path: write_text(path, transfer_report.markdown(results)),
             "transfer.png": lambda path: _draw(path, results),
@@ -128,9 +128,9 @@ def _solvers(names: Sequence[str]) -> list[tuple[str, str]]:
         kind, _, dtype = name.partition(":")
         if kind not in allowed:
             hint = nearest(kind[:200], allowed)
-            raise ValueError(f"--methods {shown(name)}: no method of a task{hint}; allowed: {', '.join(allowed)}")
+            raise ValueError(f"--methods {printable(name)}: no method of a task{hint}; allowed: {', '.join(allowed)}")
         if dtype not in ("", "float64", "float32"):
-            raise ValueError(f"--methods {shown(name)}: the precision must be float64 or float32")
+            raise ValueError(f"--methods {printable(name)}: the precision must be float64 or float32")
         found.append((kind, dtype or "float64"))
     return list(dict.fromkeys(found))
 
@@ -138,7 +138,7 @@ def _solvers(names: Sequence[str]) -> list[tuple[str, str]]:
 def _substeps(texts: Sequence[str], usual: Sequence[int]) -> list[int]:
     for text in texts:
         if not (text.isascii() and text.isdigit() and 1 <= int(text[:9]) <= MOST_SUBSTEPS):
-            raise ValueError(f"--substeps {shown(text)}: must be an integer from 1 to {MOST_SUBSTEPS}")
+            raise ValueError(f"--substeps {printable(text)}: must be an integer from 1 to {MOST_SUBSTEPS}")
     return sorted({int(text) for text in texts} or usual)
 
 

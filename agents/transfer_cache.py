@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from agents.compare import Player, blaming
 from agents.transfer_report import Cell, Clock, Setting
-from flockenv.core.atomic_files import made, replacing
+from flockenv.core.atomic_files import new_folder, replace_file
 from flockenv.envs.world import World
 from flockenv.evaluation import rollout, task_digest, worlds_for
 from flockenv.physics.integrators import RK4
@@ -124,7 +124,7 @@ def _print_of_known(player: Player, plan: Plan) -> str:
 
 
 def _keep(path: Path, content: Any) -> None:
-    with made(path.parent), replacing(path) as file:
+    with new_folder(path.parent), replace_file(path) as file:
         file.write(json.dumps(content, allow_nan=False).encode())
 
 

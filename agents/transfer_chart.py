@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agents.report import Results
-from flockenv.core.atomic_files import replacing
+from flockenv.core.atomic_files import replace_file
 from flockenv.evaluation.plots import FAINT, FIXED, GRID, INK
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ OTHERS = ("#009E73", "#CC79A7", "#56B4E9")  # of Okabe and Ito's palette, for pl
 def write_chart(path: str | Path, results: Results) -> None:
     """Write the picture as a PNG file, whole or not at all."""
     figure = draw_chart(results)
-    with replacing(path) as file:
+    with replace_file(path) as file:
         figure.savefig(file, format="png", dpi=150, metadata={"Software": "flockenv"})
 
 

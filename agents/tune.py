@@ -18,8 +18,8 @@ from rich.progress import Progress
 
 from agents.experiment import Experiment, load_experiment, one_line_errors
 from flockenv.cli.terminal import program, shown_progress
-from flockenv.core.atomic_files import made, replacing
-from flockenv.core.output_paths import check_room, checked_file
+from flockenv.core.atomic_files import new_folder, replace_file
+from flockenv.core.output_paths import check_room, valid_file
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.players.rules import RULES, TUNED, RulesPlayer, as_dict
 from flockenv.players.rules.parameter import ranges_of
@@ -88,7 +88,7 @@ def _score(task: Task, values: dict[str, float], worlds: int, seed: int) -> tupl
 def write(path: Path, task: str, parameters: dict[str, float], found: dict[str, float]) -> None:
     """Write what the search found for a task, whole or not at all."""
     content = {"task": task, "parameters": parameters, "found": found}
-    with made(path.parent), replacing(path) as file:
+    with new_folder(path.parent), replace_file(path) as file:
         file.write((json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
 
 
@@ -101,7 +101,7 @@ def main(
     with one_line_errors():
         experiment = load_experiment(config)
         task = experiment.build()
-        target = TUNED / f"{task.name}.json" if out is None else checked_file(str(out), (".json",), force=True)
+        target = TUNED / f"{task.name}.json" if out is None else valid_file(str(out), (".json",), force=True)
         check_room(target, ROOM)
     s = experiment.search
     with shown_progress(Progress(console=console)) as progress:

@@ -21,7 +21,7 @@ from flockenv.jit.decorators import like
 from flockenv.jit.intrinsics import unaliased
 from flockenv.jit.memory import zeros
 from flockenv.jit.pipeline import Inlined, Whole
-from flockenv.maths.approximations import nearest_whole
+from flockenv.maths.approximations import round_half_even
 from flockenv.model.state import State
 from flockenv.physics.effects.effect import ties
 from flockenv.scene import Scene
@@ -36,7 +36,7 @@ ROWS = 9  # of scratch: x, y, vx, vy, the steering force, alive flags, and direc
 
 @njit(**PARTS)
 def _image(d, size, inverse):
-    return d - size * nearest_whole(d * inverse)
+    return d - size * round_half_even(d * inverse)
 
 
 @njit(**PARTS)

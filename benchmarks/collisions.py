@@ -75,7 +75,7 @@ def main(
             for response in RESPONSES:
                 kind = scene.model_copy(update={"constraints": (given.model_copy(update={"response": response}),)})
                 after = kind.run(state, 60)
-                hits = (after.counted("impacts") - state.counted("impacts")) / 60
+                hits = (after.count_of("impacts") - state.count_of("impacts")) / 60
                 step, note = stepping(kind, state, STEPS), f"{hits:.3g} impacts a step"
                 pack.append(Contestant(response, step, discs * STEPS, floor, note))
             for result in bench.race(f"{name} of {discs:,}", pack, baseline="none")[1:]:

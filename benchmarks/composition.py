@@ -103,7 +103,7 @@ def _by_hand(bench: Bench, mix: str, dtype: str, most: Machine | None) -> bool:
     step()
     apart = float(np.abs(scene.space.displacement(mine.pos, theirs.pos)).max())
     title = f"{', '.join(type(e).__name__ for e in scene.effects)}{', 270 degrees' * (mix == 'seeing')}, {dtype}"
-    same_pairs = mine.counted("pairs") == theirs.counted("pairs")
+    same_pairs = mine.count_of("pairs") == theirs.count_of("pairs")
     if apart > CLOSE[dtype] or not same_pairs:
         bench.note(
             f"{title}: NOT RACED. After {STEPS} steps both are {number(apart)} m apart; same pairs: {same_pairs}"

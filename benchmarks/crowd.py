@@ -56,7 +56,7 @@ def _models(bench: Bench, dtype: str, most: Machine | None) -> None:
             bench.note(f"{name} is not raced: {error}")
             continue
         start = scene.run(scene.start(0), 100)
-        met = scene.step(start).counted("pairs") - start.counted("pairs")
+        met = scene.step(start).count_of("pairs") - start.count_of("pairs")
         note = f"each looks at {number(met / PEOPLE)} others"
         floor = most.floor(of_scene(scene, start)) if most else None
         contestants.append(Contestant(name, stepping(scene, start, 1), PEOPLE, floor, note))

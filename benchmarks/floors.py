@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks.measure import Bench, Floor, number
 from flockenv.geometry.space import Torus
-from flockenv.jit.thread_pool import share
+from flockenv.jit.thread_pool import run_parallel
 from flockenv.model.state import State
 from flockenv.scene import Scene
 from flockenv.tasks import Task
@@ -96,7 +96,7 @@ def _at_once(jobs: Sequence[Callable[[], float]]) -> float:
     """Return how much is done per second by jobs that run at the same time and say how much they do."""
     rates, until = [0.0], perf_counter() + SECONDS
     while (began := perf_counter()) < until:
-        done = sum(share(jobs))
+        done = sum(run_parallel(jobs))
         rates.append(done / (perf_counter() - began))
     return max(rates)
 
@@ -145,7 +145,7 @@ def of_scene(scene: Scene, start: State, steps: int = 1) -> Work:
     after = scene.step(start)
     worlds, _, d = start.shape
     alive = int(start.alive.sum())
-    pairs = (after.counted("pairs") - start.counted("pairs")) / alive
+    pairs = (after.count_of("pairs") - start.count_of("pairs")) / alive
     on_torus = isinstance(scene.space, Torus)
     each, law = _pair(d, on_torus and pairs >= alive / worlds - 1), 0.0
     for _, effect in scene.parts.pairs:

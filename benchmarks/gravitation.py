@@ -41,7 +41,7 @@ def _contestant(agents: int, dimension: int, dtype: str, opening: float, most: M
     """Return a scene stepped once a call."""
     scene = cloud(agents, dimension, dtype, opening)
     start = scene.start(0)
-    met = scene.step(start).counted("pairs") / agents
+    met = scene.step(start).count_of("pairs") / agents
     note = f"each meets {number(met)} of {agents:,}"
     name = f"{agents:,}, {'tree' if opening else 'direct'}"
     floor = most.floor(of_scene(scene, start)) if most else None

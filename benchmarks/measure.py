@@ -36,8 +36,8 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from flockenv.core.atomic_files import replacing
-from flockenv.core.output_paths import checked_file
+from flockenv.core.atomic_files import replace_file
+from flockenv.core.output_paths import valid_file
 
 __all__ = [
     "Bench", "Contestant", "Floor", "Out", "Plan", "Quick", "Result", "Rounds", "Sample",
@@ -352,7 +352,7 @@ def report(
         **(extra or {}),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as file:
+    with replace_file(path) as file:
         file.write(json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False).encode() + b"\n")
     console.print(f"{'interrupted; what was measured is' if interrupted else 'written'} in {path}", highlight=False)
     return path
@@ -361,7 +361,7 @@ def report(
 def _place(name: str, out: str | None) -> Path:
     """Return the path to write to; a bad one is a usage error."""
     try:
-        return checked_file(out or str(FOLDER / f"{name}.json"), [".json"], force=True)
+        return valid_file(out or str(FOLDER / f"{name}.json"), [".json"], force=True)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
 

@@ -20,10 +20,10 @@ import typer
 
 from agents import checkpoint, publish
 from flockenv.cli import gallery, validate
-from flockenv.core.atomic_files import LEFTOVERS, deliver, remove_leftovers, replacing
+from flockenv.core.atomic_files import LEFTOVERS, remove_leftovers, replace_file, write_all_or_none
 from flockenv.geometry.space import Torus
 from flockenv.jit.checked_store import Store
-from flockenv.jit.private_folder import prepared
+from flockenv.jit.private_folder import ensure_private
 from flockenv.model.group import Group
 from flockenv.players.policy import save_policy
 from flockenv.scene import Scene
@@ -59,9 +59,9 @@ def failing(monkeypatch: pytest.MonkeyPatch, error: BaseException, *calls: int) 
 
 def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path: Path) -> None:
     path = tmp_path / "file"
-    with replacing(path) as file:
+    with replace_file(path) as file:
         file.write(b"old")
-    with pytest.raises(TypeError), replacing(path) as file:
+    with pytest.raises(TypeError), replace_file(path) as file:
         file.writelines((b"half", "text"))  # type: ignore[arg-type]
     assert files_in(tmp_path) == {"file": "old"} and list(tmp_path.iterdir()) == [path]
 
@@ -70,9 +70,9 @@ def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path: Path) -> None:
 def test_two_writers_at_once_do_not_write_into_each_others_file(ends: tuple[str, str], tmp_path: Path) -> None:
     """Their names share the first hundred characters, or are equal."""
     one, other = (tmp_path / f"{'x' * 100}{end}" for end in ends)
-    with replacing(one) as first:
+    with replace_file(one) as first:
         first.write(b"first, and longer")
-        with replacing(other) as second:
+        with replace_file(other) as second:
             second.write(b"second")
         assert other.read_text() == "second"
     assert one.read_text() == "first, and longer"
@@ -85,7 +85,7 @@ def test_threads_that_write_one_file_leave_the_text_of_one_of_them(tmp_path: Pat
     def write(letter: bytes) -> None:
         try:
             for _ in range(20):
-                with replacing(target) as file:
+                with replace_file(target) as file:
                     for _ in range(50):
                         file.write(letter * 1000)
         except OSError as error:
@@ -105,7 +105,7 @@ def test_a_planted_link_is_not_followed(tmp_path: Path) -> None:
     foreign.write_text("theirs")
     target.with_name(f".file.{os.getpid()}.part").symlink_to(foreign)
     target.symlink_to(foreign)
-    with replacing(target) as file:
+    with replace_file(target) as file:
         file.write(b"mine")
     assert foreign.read_text() == "theirs" and target.read_text() == "mine" and not target.is_symlink()
 
@@ -117,7 +117,7 @@ def test_a_planted_link_is_not_followed(tmp_path: Path) -> None:
 def test_permissions_are_those_of_any_new_file(mode: int, mask: int, expected: int, tmp_path: Path) -> None:
     before = os.umask(mask)
     try:
-        with replacing(tmp_path / "file", mode) as file:
+        with replace_file(tmp_path / "file", mode) as file:
             file.write(b"x")
     finally:
         os.umask(before)
@@ -126,7 +126,7 @@ def test_permissions_are_those_of_any_new_file(mode: int, mask: int, expected: i
 
 @pytest.mark.parametrize("name", ["", ".", "gone/file", "a\0b"])
 def test_an_invalid_file_name_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
-    with pytest.raises((OSError, ValueError), match=r"cannot write|NUL") as caught, replacing(f"{tmp_path}/{name}"):
+    with pytest.raises((OSError, ValueError), match=r"cannot write|NUL") as caught, replace_file(f"{tmp_path}/{name}"):
         raise AssertionError("must not be reached")
     assert str(caught.value).isprintable() and list(tmp_path.iterdir()) == []
 
@@ -139,20 +139,20 @@ def test_an_invalid_file_name_is_refused_in_one_line(name: str, tmp_path: Path) 
 def test_a_failed_rename_leaves_all_files_unchanged(
     call: int, error: BaseException, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    deliver(tmp_path, {"a": writes("old a"), "c": writes("old c"), "deep/d": writes("old d")})
+    write_all_or_none(tmp_path, {"a": writes("old a"), "c": writes("old c"), "deep/d": writes("old d")})
     before = files_in(tmp_path)
     failing(monkeypatch, error, call)
     with pytest.raises(type(error), match=f"cannot write '.*{['a', 'b', 'c', 'd'][call - 1]}'|^$"):
-        deliver(tmp_path, {name: writes(f"new {name}") for name in ("a", "b", "c", "deep/d")})
+        write_all_or_none(tmp_path, {name: writes(f"new {name}") for name in ("a", "b", "c", "deep/d")})
     assert files_in(tmp_path) == before and not any(tmp_path.rglob(LEFTOVERS))
 
 
 def test_a_file_that_cannot_be_restored_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The third rename fails, and so does the restoring of the first file."""
-    deliver(tmp_path, {name: writes(f"old {name}") for name in "abc"})
+    write_all_or_none(tmp_path, {name: writes(f"old {name}") for name in "abc"})
     failing(monkeypatch, OSError(5, "Input/output error"), 3, 4)
     with pytest.raises(OSError, match=r"cannot write '.*/c': Input/output error; .* '.*/a' could not be put back"):
-        deliver(tmp_path, {name: writes(f"new {name}") for name in "abc"})
+        write_all_or_none(tmp_path, {name: writes(f"new {name}") for name in "abc"})
     assert files_in(tmp_path) == {"a": "new a", "b": "old b", "c": "old c"}
 
 
@@ -160,18 +160,18 @@ def test_files_are_restored_on_a_disk_without_hard_links(tmp_path: Path, monkeyp
     def link(*_: Any, **__: Any) -> None:
         raise OSError(1, "Operation not permitted")
 
-    deliver(tmp_path, {"a": writes("old a"), "b": writes("old b")})
+    write_all_or_none(tmp_path, {"a": writes("old a"), "b": writes("old b")})
     (tmp_path / "c").symlink_to("a")
     monkeypatch.setattr(os, "link", link)
     failing(monkeypatch, OSError(5, "Input/output error"), 3)
     with pytest.raises(OSError, match="Input/output error"):
-        deliver(tmp_path, {name: writes(f"new {name}") for name in "cab"})
+        write_all_or_none(tmp_path, {name: writes(f"new {name}") for name in "cab"})
     assert files_in(tmp_path) == {"a": "old a", "b": "old b", "c": "old a"} and (tmp_path / "c").is_symlink()
 
 
 def test_a_failed_writer_is_reported_and_leaves_nothing(tmp_path: Path) -> None:
     def full(path: Path) -> None:
-        with replacing(path):
+        with replace_file(path):
             raise OSError(28, "No space left on device")
 
     def own(_: Path) -> None:
@@ -179,14 +179,14 @@ def test_a_failed_writer_is_reported_and_leaves_nothing(tmp_path: Path) -> None:
 
     for fail, message in ((full, f"^cannot write '{tmp_path}/new/b': No space left on device$"), (own, "^own words$")):
         with pytest.raises((OSError, ValueError), match=message):
-            deliver(tmp_path / "new", {"a": writes("a"), "b": fail})
+            write_all_or_none(tmp_path / "new", {"a": writes("a"), "b": fail})
         assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_in_the_place_of_a_file_is_refused_before_a_writer_runs(tmp_path: Path) -> None:
     (tmp_path / "b").mkdir()
     with pytest.raises(IsADirectoryError, match=r"cannot write '.*b': it is a folder"):
-        deliver(tmp_path, {"a": lambda path: pytest.fail("must not be written"), "b": writes("b")})
+        write_all_or_none(tmp_path, {"a": lambda path: pytest.fail("must not be written"), "b": writes("b")})
 
 
 RENAMED = """
@@ -199,9 +199,9 @@ def slow(source, target):
     os.kill(os.getpid(), signal.SIGINT)
 os.replace = slow
 from pathlib import Path
-from flockenv.core.atomic_files import deliver
-with signals.running("toy"):
-    deliver(Path("."), {"a": lambda path: path.write_text("new"), "b": lambda path: path.write_text("new")})
+from flockenv.core.atomic_files import write_all_or_none
+with signals.handle_signals("toy"):
+    write_all_or_none(Path("."), {"a": lambda path: path.write_text("new"), "b": lambda path: path.write_text("new")})
     print("unreached" * (__import__("time").sleep(60) is None))
 """
 
@@ -261,8 +261,8 @@ def test_files_that_belong_together_are_replaced_together(
 
 KILLED = """
 import os, signal, sys
-from flockenv.core.atomic_files import replacing
-with replacing(sys.argv[1]) as file:
+from flockenv.core.atomic_files import replace_file
+with replace_file(sys.argv[1]) as file:
     file.write(b"half")
     file.flush()
     os.kill(os.getpid(), signal.SIGKILL)
@@ -278,9 +278,9 @@ def killed(folder: Path) -> Path:
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")
 def test_a_store_removes_leftovers_older_than_a_day(tmp_path: Path) -> None:
-    folder = prepared(tmp_path / "store")
+    folder = ensure_private(tmp_path / "store")
     Store(folder).write("name", b"kept")
-    shutil.copytree(folder, other := prepared(tmp_path / "other"), dirs_exist_ok=True)
+    shutil.copytree(folder, other := ensure_private(tmp_path / "other"), dirs_exist_ok=True)
     old, new = killed(other), other / ".abc.tmp"
     new.write_bytes(b"of a process that writes now")
     os.utime(old, times=(time.time() - 2 * 86_400,) * 2)

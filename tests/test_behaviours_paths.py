@@ -77,21 +77,21 @@ def test_lengths_and_nearest_points_of_a_path_match_those_of_10_000_points(close
     assert path[1] == pytest.approx(lengths[-1])
     s = np.linspace(0, lengths[-1], 10_001)
     dense = np.stack([np.interp(s, lengths, corners[:, k]) for k in range(dimension)], axis=1)
-    np.testing.assert_allclose(polyline.on_spine(path, s, dimension), dense, atol=1e-12)
-    beyond = polyline.on_spine(path, [-1.0, lengths[-1] + 1], dimension)
-    expected = polyline.on_spine(path, [lengths[-1] - 1, 1.0], dimension) if closed else corners[[0, -1]]
+    np.testing.assert_allclose(polyline.spine_points(path, s, dimension), dense, atol=1e-12)
+    beyond = polyline.spine_points(path, [-1.0, lengths[-1] + 1], dimension)
+    expected = polyline.spine_points(path, [lengths[-1] - 1, 1.0], dimension) if closed else corners[[0, -1]]
     np.testing.assert_allclose(beyond, expected, atol=1e-12)
     places = rng.uniform(-3, 13, (200, dimension))
-    found, offset = polyline.projected(path, places)
+    found, offset = polyline.project(path, places)
     gaps = np.linalg.norm(places[:, None] - dense, axis=2)
     np.testing.assert_allclose(np.linalg.norm(offset, axis=1), gaps.min(axis=1), atol=3e-3)
-    np.testing.assert_allclose(polyline.on_spine(path, found, dimension), places + offset, atol=1e-12)
+    np.testing.assert_allclose(polyline.spine_points(path, found, dimension), places + offset, atol=1e-12)
 
 
 def test_on_a_torus_pieces_of_a_path_and_offsets_are_the_shortest() -> None:
     path = polyline.pieces([(2, 5), (9, 5), (16, 5)], True, Torus(size=(20, 12)))
     assert path[1] == pytest.approx(20)
-    found, offset = polyline.projected(path, [(19, 6), (1, 11.5), (39.5, -7.5)])
+    found, offset = polyline.project(path, [(19, 6), (1, 11.5), (39.5, -7.5)])
     np.testing.assert_allclose(found, [17, 19, 17.5])
     np.testing.assert_allclose(offset, [(0, -1), (0, 5.5), (0, 0.5)], atol=1e-12)
 

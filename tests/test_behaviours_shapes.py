@@ -20,10 +20,10 @@ from flockenv.behaviours import (
     Whiskers,
 )
 from flockenv.behaviours.steer import Steer
-from flockenv.geometry.eikonal import way_table
+from flockenv.geometry.eikonal import floor_field_table
 from flockenv.geometry.shapes import Block, Capsule, Circle, HalfSpace, Polygon, Shape, Wall
 from flockenv.geometry.targets import Target
-from flockenv.maths.grid import sampled
+from flockenv.maths.grid import sample_points
 from flockenv.model.spawn import Spawn
 from flockenv.physics import floor_fields as way_module
 from flockenv.physics.constraints import Collisions
@@ -359,17 +359,19 @@ def test_the_shortest_path_around_a_circle_is_two_tangents_and_an_arc() -> None:
     arc = np.arccos(np.clip(x @ goal / (d * 3), -1, 1)) - np.arccos(1 / d) - math.acos(1 / 3)
     exact = np.where(arc <= 0, np.linalg.norm(x - goal, axis=1), np.sqrt(d**2 - 1) + math.sqrt(8) + arc)
     for spacing in (0.2, 0.1, 0.05):
-        table = way_table([Circle(centre=(0, 0), radius=1.0)], [Target(at=goal)], (-5, -5), (5, 5), spacing, 0.0)
-        errors.append(np.abs(sampled(table, x)[:, 0] - exact).mean())
+        table = floor_field_table(
+            [Circle(centre=(0, 0), radius=1.0)], [Target(at=goal)], (-5, -5), (5, 5), spacing, 0.0
+        )
+        errors.append(np.abs(sample_points(table, x)[:, 0] - exact).mean())
     assert errors[2] < 0.05
     assert errors[0] > 1.4 * errors[1] > 1.4 * 1.4 * errors[2]
 
 
 def test_the_shortest_path_in_free_space_is_straight() -> None:
     goal = np.array([1.0, 2.0, 0.5])
-    table = way_table([], [Target(at=goal)], (-2, -2, -2), (3, 4, 3), 0.25, 0.0)
+    table = floor_field_table([], [Target(at=goal)], (-2, -2, -2), (3, 4, 3), 0.25, 0.0)
     x = np.random.default_rng(1).uniform(-1.5, 2.5, (200, 3))
-    found = sampled(table, x)
+    found = sample_points(table, x)
     straight = goal - x
     distance = np.linalg.norm(straight, axis=1)
     np.testing.assert_allclose(found[:, 0], distance, rtol=0.08)
@@ -420,7 +422,9 @@ def test_follow_way_stops_at_its_target_and_heads_straight_outside_its_grid() ->
 def test_a_floor_field_is_solved_once_per_scene(monkeypatch: pytest.MonkeyPatch) -> None:
     """Validation of the scene and its tables use the same grid."""
     solved: list[Any] = []
-    monkeypatch.setattr(way_module, "way_table", lambda *given: solved.append(given) or way_table(*given))
+    monkeypatch.setattr(
+        way_module, "floor_field_table", lambda *given: solved.append(given) or floor_field_table(*given)
+    )
     made = trapped(FollowWay(weight=4, target=(12, 0), clearance=0.4))
     assert made.parts.tables
     assert len(solved) == 1

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from flockenv.jit.buffer_pool import Recycler
+from flockenv.jit.buffer_pool import BufferPool
 
 F4 = np.dtype(np.float32)
 
@@ -22,7 +22,7 @@ def maker_of(recycler):
 
 
 def test_memory_of_released_arrays_is_reused():
-    make = maker_of(Recycler())
+    make = maker_of(BufferPool())
     first = make((3, 4), F4)
     second = make((3, 4), F4)
     addresses = {address(first), address(second)}
@@ -36,7 +36,7 @@ def test_memory_of_released_arrays_is_reused():
 
 @pytest.mark.parametrize("line", [1, 16, 64, 4096])
 def test_arrays_are_aligned_to_lines(line):
-    make = maker_of(Recycler(keep=2, line=line))
+    make = maker_of(BufferPool(keep=2, line=line))
     for shape in ((0,), (1,), (3, 5), (1000,)):
         held = [make(shape, F4) for _ in range(4)]
         again = {address(array) for array in held[:2]}
@@ -63,7 +63,7 @@ HOLDERS = {
 
 @pytest.mark.parametrize("hold", HOLDERS.values(), ids=HOLDERS)
 def test_memory_is_not_reused_while_anything_refers_to_it(hold):
-    make = maker_of(Recycler(keep=2))
+    make = maker_of(BufferPool(keep=2))
     array = make((3, 4), F4)
     place = address(array)
     held = hold(array)
@@ -76,7 +76,7 @@ def test_memory_is_not_reused_while_anything_refers_to_it(hold):
 
 
 def test_pool_keeps_at_most_the_given_number_of_buffers():
-    recycler = Recycler(keep=3)
+    recycler = BufferPool(keep=3)
     many = [recycler.maker((2,), F4)() for _ in range(8)]
     places = [address(array) for array in many]
     assert len(set(places)) == 8
@@ -87,7 +87,7 @@ def test_pool_keeps_at_most_the_given_number_of_buffers():
 
 
 def test_arrays_of_each_shape_and_dtype_are_pooled_separately():
-    make = maker_of(Recycler())
+    make = maker_of(BufferPool())
     shapes = [((6,), F4), ((2, 3), F4), ((6,), np.dtype(np.int32)), ((6,), np.dtype(bool))]
     for shape, dtype in [*shapes, *shapes[::-1]]:
         array = make(shape, dtype)
@@ -97,7 +97,7 @@ def test_arrays_of_each_shape_and_dtype_are_pooled_separately():
 
 
 def test_flags_set_on_an_array_do_not_persist_in_reused_memory():
-    make = maker_of(Recycler(keep=1))
+    make = maker_of(BufferPool(keep=1))
     places = set()
     for _ in range(3):
         array = make((6,), F4)
@@ -109,6 +109,6 @@ def test_flags_set_on_an_array_do_not_persist_in_reused_memory():
 
 
 def test_arrays_can_be_pickled():
-    array = Recycler().maker((2, 3), F4)()
+    array = BufferPool().maker((2, 3), F4)()
     array[:] = 4
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(array)), array)

@@ -222,11 +222,11 @@ def test_time_of_a_run_excludes_compilation(more: str, tmp_path: Path) -> None:
     """Otherwise the first run of a scene shows the speed of the compiler."""
     Path("new.yaml").write_text(TINY + more)
     code = (
-        "from pathlib import Path; from flockenv.jit.progress import compiled;"
+        "from pathlib import Path; from flockenv.jit.progress import compiled_kernels;"
         "from flockenv.scene.yaml_io import load_scene;"
         "from flockenv.studies.trajectory import record; seen = [];"
-        "record(load_scene(Path('new.yaml')), 0, 50, 10, lambda done: seen.append(len(compiled())));"
-        "assert seen[0] == seen[-1] == len(compiled()) > 0, seen"
+        "record(load_scene(Path('new.yaml')), 0, 50, 10, lambda done: seen.append(len(compiled_kernels())));"
+        "assert seen[0] == seen[-1] == len(compiled_kernels()) > 0, seen"
     )
     fresh = {**ENVIRONMENT, "FLOCKENV_CACHE": str(tmp_path / "cache")}
     subprocess.run([sys.executable, "-c", code], env=fresh, check=True)

@@ -93,7 +93,7 @@ def test_elastic_ball_keeps_its_height_over_a_hundred_bounces(response: str, met
         state = of.step(state)
         assert R <= state.pos[0, 0, 1] <= 1.01 + R
     assert abs(height() / first - 1) < 1e-9
-    assert state.counted("impacts") >= 99 and state.vel[0, 0, 0] == 1
+    assert state.count_of("impacts") >= 99 and state.vel[0, 0, 0] == 1
 
 
 @pytest.mark.parametrize("response", IN_TIME)
@@ -113,7 +113,7 @@ def test_ball_comes_to_rest_when_the_series_of_bounces_converges(
     assert abs(state.pos[0, 0, 1] - R) < 1e-12
     later = of.run(state, 500)
     np.testing.assert_allclose(later.pos, state.pos, rtol=0, atol=1e-12)
-    assert of.run(later, 1).counted("unsolved") == 0
+    assert of.run(later, 1).count_of("unsolved") == 0
 
 
 @pytest.mark.parametrize("response", EXACT)
@@ -203,7 +203,7 @@ def test_stack_of_ten_rests(response: str, e: float) -> None:
 def test_position_of_a_billiard_ball_equals_the_unfolded_path() -> None:
     of = scene([1], radius=0.0, space=Box(size=(1, 1), restitution=1.0))
     end = of.run(begun(of, [(0.37, 0.2)], [(3.3, 0)]), 1000)
-    assert abs(end.pos[0, 0, 0] - 0.63) < 1e-9 and end.counted("impacts") == 33
+    assert abs(end.pos[0, 0, 0] - 0.63) < 1e-9 and end.count_of("impacts") == 33
 
 
 # --- no impact is missed ----------------------------------------------------------------------------------------------
@@ -237,7 +237,7 @@ def test_fast_body_does_not_tunnel_through_an_obstacle(
     here = end.pos[0] - u * end.time[0]
     beyond = here[:, 0] if not turn else here.max(axis=1)
     assert beyond.max() <= -R + 1e-9
-    assert end.counted("impacts") >= 100
+    assert end.count_of("impacts") >= 100
 
 
 @pytest.mark.parametrize("response", IN_TIME)
@@ -259,9 +259,9 @@ def test_step_over_a_quarter_of_the_torus_keeps_energy_and_raises_a_warning() ->
             state = begun(of, [(0.5, 2.0), (0.3, 2.0)], [(speed, 1.0), (0.0, 0.0)])
             end = of.run(state, 3)
             np.testing.assert_allclose(energy(of, end), energy(of, state), rtol=1e-12)
-            assert end.counted("unsolved") == 3, speed  # each step exceeds a quarter
+            assert end.count_of("unsolved") == 3, speed  # each step exceeds a quarter
         slow = of.run(begun(of, [(0.5, 2.0), (0.3, 2.0)], [(50.0, 1.0), (0.0, 0.0)]), 3)
-        assert slow.counted("unsolved") == 0
+        assert slow.count_of("unsolved") == 0
     assert ["further than a quarter of the torus" in str(w.message) for w in caught] == [True]
 
 
@@ -311,10 +311,10 @@ def test_gas_conserves_momentum_and_never_gains_energy(response: str, e: float) 
         apart = np.linalg.norm(d, axis=-1) + 9 * np.eye(of.agents)
         assert apart.min() > 2 * R * (1 - 0.05)
         state, last = after, energy(of, after)
-    assert state.counted("impacts") > 100
+    assert state.count_of("impacts") > 100
     if response in EXACT:
         assert (abs(last / first - 1) < 1e-11) == (e == 1.0)
-        assert state.counted("unsolved") == 0
+        assert state.count_of("unsolved") == 0
 
 
 @pytest.mark.parametrize("response", EXACT)
@@ -330,7 +330,7 @@ def test_collisions_far_from_the_origin_equal_those_near_it(response: str, offse
     (near, a), (far, b) = (gas(response, 0.9, offset=o, obstacles=walls(o)) for o in (0.0, offset))
     steps = 20 if offset > 1e6 else 40  # chaos amplifies a rounding of 1e-9 m in more steps
     np.testing.assert_allclose(far.run(b, steps).pos - offset, near.run(a, steps).pos, rtol=0, atol=1e-6)
-    assert near.run(a, steps).counted("impacts") > 10
+    assert near.run(a, steps).count_of("impacts") > 10
 
 
 @pytest.mark.slow
@@ -376,7 +376,7 @@ def test_dead_bodies_do_not_move_or_collide() -> None:
     state.alive[0, 1] = False
     end = of.run(state, 30)
     np.testing.assert_array_equal(end.pos[0, 1], (0.5, 0))
-    assert end.vel[0, 2, 0] == pytest.approx(5) and end.counted("impacts") == 1
+    assert end.vel[0, 2, 0] == pytest.approx(5) and end.count_of("impacts") == 1
 
 
 def test_sticky_bodies_stay_at_the_point_of_impact() -> None:
@@ -409,7 +409,7 @@ def test_gas_in_3d_conserves_energy_and_stays_in_the_box() -> None:
     end = of.run(state, 500)
     mass = of.body.mass[:, None]
     assert (mass * end.vel[0] ** 2).sum() == pytest.approx((mass * state.vel[0] ** 2).sum(), rel=1e-11)
-    assert end.pos.min() >= R - 1e-9 and end.pos.max() <= 1.5 - R + 1e-9 and end.counted("impacts") > 500
+    assert end.pos.min() >= R - 1e-9 and end.pos.max() <= 1.5 - R + 1e-9 and end.count_of("impacts") > 500
 
 
 @pytest.mark.slow
@@ -425,12 +425,12 @@ def test_single_precision_follows_double_precision_for_30_steps() -> None:
 
 def test_collisions_make_one_neighbour_query_per_step() -> None:
     of, state = gas("earliest", 1.0, space=Torus(size=(4, 4)))
-    assert of.run(state, 7).counted("neighbour_queries") == 7
+    assert of.run(state, 7).count_of("neighbour_queries") == 7
     bare = of.model_copy(update={"constraints": ()})
     end = bare.run(state, 7)
-    assert [end.counted(what) for what in ("neighbour_queries", "impacts", "unsolved", "pairs")] == [0, 0, 0, 0]
+    assert [end.count_of(what) for what in ("neighbour_queries", "impacts", "unsolved", "pairs")] == [0, 0, 0, 0]
     walls_only = of.model_copy(update={"constraints": (Collisions(agents=False),)})
-    assert walls_only.run(state, 7).counted("neighbour_queries") == 0
+    assert walls_only.run(state, 7).count_of("neighbour_queries") == 0
 
 
 def test_explain_lists_the_neighbour_query_of_collisions() -> None:
@@ -458,7 +458,7 @@ def test_unsolved_contacts_raise_one_warning() -> None:
         end = of.run(state, 20)
     messages = [str(w.message) for w in caught if issubclass(w.category, UnsolvedContactsWarning)]
     assert len(messages) == 1 and "most = 1 and passes = 1" in messages[0]
-    assert end.counted("unsolved") > 0
+    assert end.count_of("unsolved") > 0
 
 
 def test_slow_separation_does_not_count_as_unsolved() -> None:
@@ -468,7 +468,7 @@ def test_slow_separation_does_not_count_as_unsolved() -> None:
     early, end = of.run(state, 20), of.run(state, 40)
     assert early.pos[0, 1, 0] - early.pos[0, 0, 0] == pytest.approx(0.05 + 0.5 * 0.2, abs=1e-12)
     assert end.pos[0, 1, 0] - end.pos[0, 0, 0] == pytest.approx(2 * R, abs=1e-9)
-    assert np.abs(end.vel).max() == 0.0 and end.counted("unsolved") == 0
+    assert np.abs(end.vel).max() == 0.0 and end.count_of("unsolved") == 0
 
 
 def test_scene_with_collisions_is_a_value(tmp_path: Path) -> None:

@@ -15,13 +15,13 @@ from filelock import FileLock, Timeout
 from flockenv.jit.lock import OneAtATime
 
 MANY = """
-from flockenv.jit.progress import compiled
+from flockenv.jit.progress import compiled_kernels
 from flockenv.physics.effects import Drag
 from flockenv.scene import Group, Scene
 from flockenv.geometry.space import Torus
 scene = Scene(space=Torus(size=(9, 9)), groups=(Group(count=3),), effects=(Drag(rate=0.5),))
 scene.step(scene.start(seed=0))
-print(sum(each.kernel == "scene_step" for each in compiled()))
+print(sum(each.kernel == "scene_step" for each in compiled_kernels()))
 """
 
 

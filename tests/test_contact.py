@@ -274,7 +274,7 @@ def test_neighbour_query_reaches_only_as_far_as_the_widest_two_touch() -> None:
         contact = {"kind": "contact", "stiffness": 10.0, "ratio": 0.3, "friction": 3.0, "radius": radius}
         scene = Scene.model_validate({"groups": groups, "effects": [contact]})
         state = scene.start(3)
-        found.append((scene.step(state).counted("pairs"), scene.acceleration(state)))
+        found.append((scene.step(state).count_of("pairs"), scene.acceleration(state)))
     assert found[0][0] == found[1][0] < 0.3 * 900**2
     np.testing.assert_array_equal(found[0][1], found[1][1])
     pos, radius = state.pos[0], scene.body.radius

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from flockenv.jit.checked_store import Store
-from flockenv.jit.private_folder import prepared
+from flockenv.jit.private_folder import ensure_private
 
 SCENE = '''
 from flockenv.scene.yaml_io import load_scene
@@ -96,7 +96,7 @@ def test_scene_runs_if_every_file_is_damaged(tmp_path: Path) -> None:
 
 @pytest.fixture
 def store(tmp_path: Path) -> Store:
-    store = Store(prepared(tmp_path / "store"))
+    store = Store(ensure_private(tmp_path / "store"))
     store.write("name", bytes(range(256)) * 3)
     return store
 

@@ -191,7 +191,7 @@ def test_accelerations_are_the_sum_of_the_laws_and_the_bounded_drive() -> None:
         bounded[0, 1] *= 2.0 / 50
         np.testing.assert_allclose(found[:, :5], (force + bounded) / mass + (0.0, -9.81), rtol=1e-12, atol=1e-12)
         same(state, kept, MOTION)
-        assert state.counted("evaluations") > 0
+        assert state.count_of("evaluations") > 0
         np.testing.assert_array_equal(scene.acceleration(state), scene.rates(state, times=state.time)[0])
 
 

@@ -464,24 +464,24 @@ def test_effect_computes_only_what_it_declares(row: EffectRow, dimension: int) -
     scene = scene_under(row, dimension)
     end = scene.run(scene.start(3, worlds=2), 10)
     agents, needs = scene.agents, {what for effect in scene.effects for what in effect.calls_for()}
-    assert end.counted("evaluations") == 2 * 10
-    assert end.counted("neighbour_queries") == (2 * 10 if "neighbour query" in needs else 0)
-    assert end.counted("pairs") == (2 * 10 * agents * agents if {"neighbour query", "all others"} & {*needs} else 0)
-    assert end.counted("obstacle_tests") == (2 * 10 * agents * 2 if "obstacles" in needs else 0)
+    assert end.count_of("evaluations") == 2 * 10
+    assert end.count_of("neighbour_queries") == (2 * 10 if "neighbour query" in needs else 0)
+    assert end.count_of("pairs") == (2 * 10 * agents * agents if {"neighbour query", "all others"} & {*needs} else 0)
+    assert end.count_of("obstacle_tests") == (2 * 10 * agents * 2 if "obstacles" in needs else 0)
 
 
 def test_scene_without_effects_computes_nothing() -> None:
     scene = scene_of(obstacles=({"centre": (1, 1), "radius": 0.5},))
     end = scene.run(scene.start(3, worlds=2), 10)
-    assert [end.counted(what) for what in ("neighbour_queries", "pairs", "obstacle_tests")] == [0, 0, 0]
+    assert [end.count_of(what) for what in ("neighbour_queries", "pairs", "obstacle_tests")] == [0, 0, 0]
 
 
 def test_several_pair_effects_share_one_query() -> None:
     scene = everything(2)
     assert sum(effect.pair_law is not None for effect in scene.effects) > 1
     end = scene.run(scene.start(3, worlds=2), 10)
-    assert end.counted("neighbour_queries") == end.counted("evaluations") == 2 * 10
-    assert end.counted("pairs") == 2 * 10 * scene.agents**2
+    assert end.count_of("neighbour_queries") == end.count_of("evaluations") == 2 * 10
+    assert end.count_of("pairs") == 2 * 10 * scene.agents**2
 
 
 # --- an effect is a value ---------------------------------------------------------------------------------------------

@@ -84,7 +84,7 @@ def test_forces_are_the_sum_over_all_pairs_for_few_agents_or_an_opening_of_0(
     scene = cloud(effect, dimension, count)
     state = scene.start(1)
     assert errors(forces(scene, state), expected(effect, scene, state)).max() < 1e-12
-    assert scene.step(state).counted("pairs") == count**2
+    assert scene.step(state).count_of("pairs") == count**2
 
 
 BOUNDS = {  # opening -> median and 99 % quantile of the error, share of all pairs that are computed
@@ -105,7 +105,7 @@ def test_errors_of_the_tree_stay_below_bounds_that_shrink_with_the_opening(kind:
         state = scene.start(2)
         error = errors(forces(scene, state), expected(effect, scene, state))
         found = float(np.median(error)), float(np.quantile(error, 0.99))
-        computed = scene.step(state).counted("pairs") / MANY**2
+        computed = scene.step(state).count_of("pairs") / MANY**2
         median, most, share = BOUNDS[dimension][opening]
         assert found[0] < median and found[1] < most and computed < share
         assert found[0] < 0.25 * before[0] and found[1] < 0.25 * before[1]
@@ -129,7 +129,7 @@ def test_the_tree_is_as_accurate_for_agents_at_very_different_distances(dimensio
     state.pos[0, :40] *= 3000.0
     error = errors(forces(scene, state), expected(effect, scene, state))
     assert np.quantile(error, 0.99) < 0.023
-    assert scene.step(state).counted("pairs") < 0.6 * MANY**2
+    assert scene.step(state).count_of("pairs") < 0.6 * MANY**2
 
 
 @DIMENSIONS

@@ -179,7 +179,7 @@ def test_all_solvers_find_the_same_solution() -> None:
     for other in found[1:]:
         np.testing.assert_allclose(other.pos, found[0].pos, atol=1e-9)
         np.testing.assert_allclose(other.vel, found[0].vel, atol=1e-9)
-    assert found[1].counted("linear_iterations") > found[0].counted("linear_iterations")
+    assert found[1].count_of("linear_iterations") > found[0].count_of("linear_iterations")
 
 
 def test_results_do_not_depend_on_batches_or_steps_per_call() -> None:
@@ -199,9 +199,9 @@ def test_results_do_not_depend_on_batches_or_steps_per_call() -> None:
     same(start, kept)
     assert scene.step(start, out=start, steps=3) is start
     same(start, whole)
-    assert whole.counted("substeps") == 9
-    assert whole.counted("newton_iterations") >= 9
-    assert whole.counted("evaluations") > whole.counted("newton_iterations")
+    assert whole.count_of("substeps") == 9
+    assert whole.count_of("newton_iterations") >= 9
+    assert whole.count_of("evaluations") > whole.count_of("newton_iterations")
 
 
 def test_dead_and_pinned_agents_stay_and_limits_of_speed_and_force_hold() -> None:

@@ -218,7 +218,7 @@ def test_a_method_evaluates_the_force_as_often_as_declared(row: IntegratorRow, t
     assert len(calls) == row.method.evaluations
     spawn = Spawn(low=(0, 0), high=(1, 1))
     scene = Scene(groups=(Group(count=1, spawn=spawn),), effects=(tether(stiffness=1),), integrator=row.method)
-    assert scene.run(scene.start(0), 10).counted("evaluations") == 10 * row.method.evaluations
+    assert scene.run(scene.start(0), 10).count_of("evaluations") == 10 * row.method.evaluations
 
 
 @METHODS

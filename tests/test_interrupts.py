@@ -32,7 +32,7 @@ dt: 0.01
 COMMAND = """\
 import os, sys, time
 from flockenv.core import signals
-from flockenv.core.atomic_files import made, replacing
+from flockenv.core.atomic_files import new_folder, replace_file
 from pathlib import Path
 signals.begin("toy")
 def say(word):
@@ -107,20 +107,20 @@ def test_a_signal_during_imports_ends_a_command_with_one_line(
 
 
 PLACES = {
-    "a line of the command": "with signals.running('toy'):\n    say('ready')\n    time.sleep(60)",
+    "a line of the command": "with signals.handle_signals('toy'):\n    say('ready')\n    time.sleep(60)",
     "inside pickle": """\
 import pickle
 class Slow:
     def __reduce__(self):
         say('ready')
         time.sleep(60)
-with signals.running('toy'):
+with signals.handle_signals('toy'):
     pickle._dumps(Slow())""",
     "machine code": """\
 import numba
 count = numba.njit(nogil=True)(lambda n: sum([k % 7 for k in range(n)]))
 count(1)
-with signals.running('toy'):
+with signals.handle_signals('toy'):
     say('ready')
     count(10**13)""",
 }
@@ -171,7 +171,7 @@ program('toy', app)"""
 
 def test_a_second_interrupt_ends_the_cleanup_that_the_first_one_began(tmp_path: Path) -> None:
     slow = """\
-with signals.running('toy'):
+with signals.handle_signals('toy'):
     try:
         say('ready')
         time.sleep(60)
@@ -190,7 +190,7 @@ with signals.running('toy'):
 def test_two_signals_of_one_key_press_count_as_one(tmp_path: Path) -> None:
     """A terminal and a wrapper such as `uv run` both pass Ctrl-C on."""
     keeps = """\
-with signals.running('toy'):
+with signals.handle_signals('toy'):
     try:
         os.kill(os.getpid(), 2)
         time.sleep(60)
@@ -219,7 +219,7 @@ def test_importing_flockenv_does_not_change_signal_handlers() -> None:
 
 END = """\
 import atexit
-with signals.running('toy'):
+with signals.handle_signals('toy'):
     pass
 atexit.register(time.sleep, 1.0)
 atexit.register(print, 'done', flush=True)
@@ -244,7 +244,7 @@ class Slow:
         os.kill(os.getpid(), 2)
         time.sleep(0.1)
         return (list, ())
-with signals.running('toy'):
+with signals.handle_signals('toy'):
     pickle._dumps(Slow())
 say('worked')"""
     process = toy(outruns, tmp_path, "worked")
@@ -258,11 +258,11 @@ say('worked')"""
 def test_partly_written_files_are_removed(running: bool, tmp_path: Path) -> None:
     (tmp_path / "old.json").write_text("old")
     write = (
-        "with made(Path('new/deep')), replacing('new/deep/x.json') as one, replacing('old.json') as two:\n"
+        "with new_folder(Path('new/deep')), replace_file('new/deep/x.json') as one, replace_file('old.json') as two:\n"
         "    one.write(b'{'), two.write(b'{'), one.flush(), two.flush()\n"
         "    say(len(list(Path('.').rglob('*.part'))))\n    time.sleep(60)"
     )
-    within = "with signals.running('toy'):\n    " + write.replace("\n", "\n    ")
+    within = "with signals.handle_signals('toy'):\n    " + write.replace("\n", "\n    ")
     process = toy(within if running else write, tmp_path, "2")
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=60)
@@ -272,8 +272,8 @@ def test_partly_written_files_are_removed(running: bool, tmp_path: Path) -> None
 
 def test_a_held_section_is_completed_in_spite_of_a_signal(tmp_path: Path) -> None:
     body = """\
-with signals.running('toy'):
-    with signals.held():
+with signals.handle_signals('toy'):
+    with signals.defer_signals():
         say('ready')
         time.sleep(1.5)
         Path('all').write_text('there')

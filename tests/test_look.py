@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numba import njit
 
-from flockenv.engine.nearest import AT_ONCE, exchanges, inserted, merged
+from flockenv.engine.nearest import AT_ONCE, exchanges, insert, merge
 from flockenv.envs.world import World
 from flockenv.jit.decorators import kernel
-from flockenv.jit.simd_rows import key_of, key_read, key_written, ordered, same_key, tag_of
+from flockenv.jit.simd_rows import float_as_key, key_as_float, key_of, order_keys, same_key, tag_of
 from flockenv.tasks import Bottleneck, Flock
 
 SIGHT, MIDDLE = 6.1, 20.0  # the last bits of the square of SIGHT are not zeros
@@ -148,13 +148,13 @@ def test_keys_are_used_for_small_worlds_in_single_precision() -> None:
 def _round(square: Any, place: Any, tags: Any) -> Any:
     """Return the key of a square and a place, its value after writing and reading it, and the place read from it."""
     key = key_of(square, place, tags)
-    return key, key_read(key_written(key)), tag_of(key, tags)
+    return key, float_as_key(key_as_float(key)), tag_of(key, tags)
 
 
 def test_keys_are_ordered_like_squares_and_contain_their_places() -> None:
     call = njit(lambda square, place, tags: _round(square, np.int32(place), np.int32(tags)))
     doubt = njit(lambda one, other, tags: same_key(np.uint32(one), np.uint32(other), np.int32(tags)))
-    order = njit(lambda one, other: ordered(np.uint32(one), np.uint32(other)))
+    order = njit(lambda one, other: order_keys(np.uint32(one), np.uint32(other)))
     rng = np.random.default_rng(0)
     squares = np.sort(np.concatenate([[0, 1e-45, 1e-38, 3e38, np.inf], 10.0 ** rng.uniform(-30, 30, 400)])).astype("f4")
     for tags in (1, 7, 31, 127):
@@ -191,7 +191,7 @@ def test_exchanges_keep_the_least_numbers_of_a_list_sorted(length: int) -> None:
 @pytest.mark.parametrize("length", [2, 7])
 def test_keys_stored_as_float32_are_merged_into_lists_bit_for_bit(length: int) -> None:
     """Keys may then be NaN or denormal numbers."""
-    call = njit(lambda numbers, come: merged(numbers, come))
+    call = njit(lambda numbers, come: merge(numbers, come))
     rng = np.random.default_rng(length)
     kept = np.full(length, 0xFFFFFFFF, np.uint32)
     every = kept.tolist()
@@ -205,7 +205,7 @@ def test_keys_stored_as_float32_are_merged_into_lists_bit_for_bit(length: int) -
 @pytest.mark.parametrize("kind", ["float32", "float64"])
 def test_distances_are_inserted_into_a_list_with_their_places(kind: str) -> None:
     """NaN and infinity stay out of a list; each of several equal distances is in it once."""
-    call, real = njit(lambda numbers, far, place: inserted(numbers, far, place)), np.dtype(kind).type
+    call, real = njit(lambda numbers, far, place: insert(numbers, far, place)), np.dtype(kind).type
     rng, length = np.random.default_rng(3), 5
     kept: tuple[Any, ...] = tuple([real(np.inf)] * length + [real(0)] * length)
     every: dict[int, Any] = {}

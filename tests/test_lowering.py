@@ -313,7 +313,7 @@ def test_a_kernel_may_call_itself() -> None:
 
 def test_an_unknown_version_of_numba_is_not_patched(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(front_end, "digest", lambda owner, name: "")
-    front_end.reads_as_known.cache_clear()
+    front_end.is_known_source.cache_clear()
     lowering.is_brief.cache_clear()
     try:
         assert not lowering.is_brief()
@@ -327,5 +327,5 @@ def test_an_unknown_version_of_numba_is_not_patched(monkeypatch: pytest.MonkeyPa
         assert compiled_whole(entry)(np.arange(8.0).reshape(2, 4), np.ones(4, bool)) == (10.0, True)
     finally:
         monkeypatch.undo()
-        front_end.reads_as_known.cache_clear()
+        front_end.is_known_source.cache_clear()
         lowering.is_brief.cache_clear()

@@ -217,14 +217,14 @@ def test_cost_and_error_of_a_narrow_orbit_are_those_of_the_table(
     """Kepler e = 0.9, one period; fixed RK4 takes 40,000 evaluations for 1.1e-6."""
     given = orbit(0.9)
     after = tethered(tether, way, **given)(method, 2 * math.pi, 1)
-    steps = after.counted("substeps") + after.counted("rejected_steps")
-    needed = 6 * steps + 1 if isinstance(method, DormandPrince) else 10 * steps + after.counted("substeps")
+    steps = after.count_of("substeps") + after.count_of("rejected_steps")
+    needed = 6 * steps + 1 if isinstance(method, DormandPrince) else 10 * steps + after.count_of("substeps")
     assert evaluations / 1.5 < needed < evaluations * 1.5
     assert error / 1.5 < off(after, given) < error * 1.5
     if way == "compiled":
-        assert after.counted("evaluations") == needed
+        assert after.count_of("evaluations") == needed
     if method == AdaptiveRK4(tolerance=1e-6):
-        assert (after.counted("substeps"), after.counted("rejected_steps")) == (
+        assert (after.count_of("substeps"), after.count_of("rejected_steps")) == (
             pytest.approx(102, rel=0.05),
             pytest.approx(33, rel=0.15),
         )
@@ -236,7 +236,7 @@ def test_a_smaller_tolerance_reduces_the_error_accordingly(kind: type[Integrator
     for aphelion in (False, True):
         given = orbit(0.9, aphelion)
         ends = [tethered(tether, "compiled", **given)(kind(tolerance=10.0**-k), 2 * math.pi, 1) for k in (6, 9, 12)]
-        errors, costs = [off(s, given) for s in ends], [s.counted("evaluations") for s in ends]
+        errors, costs = [off(s, given) for s in ends], [s.count_of("evaluations") for s in ends]
         assert all(100 < a / b < 6000 for a, b in pairwise(errors))
         assert all(2 < b / a < 5 for a, b in pairwise(costs))  # 1000^(1/5) is 4.0
 
@@ -420,7 +420,7 @@ def test_stages_are_evaluated_at_times_within_the_step(kind: type[Integrator]) -
     after = method(lambda x, v, t: times.append(t) or np.cos(9 * t) + 0 * x, state, 2.0)
     assert (min(times), max(times)) == (6.0, pytest.approx(8.0, abs=1e-14))
     np.testing.assert_allclose(after.vel, (math.sin(72) - math.sin(54)) / 9, atol=1e-8)
-    assert after.counted("substeps") > 5
+    assert after.count_of("substeps") > 5
 
 
 @ADAPTIVE
@@ -434,10 +434,10 @@ def test_steps_across_a_jump_of_the_force_are_few(kind: type[Integrator], tolera
         before = state
         state = method(lambda x, v, t: -jump * np.sign(x), state, dt)
         crossings += int(state.x[0, 0, 0] * before.x[0, 0, 0] < 0)
-        rejected = state.counted("rejected_steps") - before.counted("rejected_steps")
+        rejected = state.count_of("rejected_steps") - before.count_of("rejected_steps")
         assert rejected < 20 * (1 + (jump > 1))
     assert crossings >= 10
-    assert state.counted("rejected_steps") < 20 * crossings
+    assert state.count_of("rejected_steps") < 20 * crossings
     energy = state.v[0, 0, 0] ** 2 / 2 + jump * abs(state.x[0, 0, 0])
     assert energy == pytest.approx(0.3 * jump, abs=200 * crossings * tolerance)
 
@@ -457,7 +457,7 @@ def test_the_agent_with_the_largest_error_sets_the_substeps(kind: type[Integrato
     np.testing.assert_array_equal(after.work[:, 4:6], again.work[:, 4:6])
     np.testing.assert_allclose(after.pos, again.pos, atol=1e-10)
     quick = Scene(groups=groups[1:], effects=scene.effects, integrator=method, dt=1.0)
-    assert quick.run(quick.start(3), 2).counted("substeps") < after.worlds([0]).counted("substeps") / 2
+    assert quick.run(quick.start(3), 2).count_of("substeps") < after.worlds([0]).count_of("substeps") / 2
 
 
 @ADAPTIVE
@@ -497,7 +497,7 @@ def test_a_tolerance_below_rounding_works_in_single_precision(kind: type[Integra
     start = scene.start(0)
     after = scene.run(start, 4)
     np.testing.assert_allclose(after.pos, start.pos * math.cos(4) + start.vel / 2 * math.sin(4), rtol=0, atol=5e-3 * 60)
-    assert after.counted("substeps") < 2000
+    assert after.count_of("substeps") < 2000
 
 
 @ADAPTIVE
@@ -516,5 +516,5 @@ def test_only_adaptive_and_implicit_methods_count_substeps(tether: Any) -> None:
     for row in INTEGRATORS:
         scene = Scene(groups=(Group(count=1, spawn=HERE),), effects=(tether(stiffness=1),), integrator=row.method)
         after = scene.run(scene.start(0), 10)
-        assert after.counted("substeps") == (10 if row.method.adaptive or row.method.solves else 0)
-        assert after.counted("rejected_steps") == 0
+        assert after.count_of("substeps") == (10 if row.method.adaptive or row.method.solves else 0)
+        assert after.count_of("rejected_steps") == 0

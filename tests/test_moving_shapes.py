@@ -19,7 +19,7 @@ from flockenv.geometry.shapes import (
     Shape,
     Sway,
     Wall,
-    packed,
+    pack_shapes,
 )
 from flockenv.geometry.shapes.dispatch import hit_shape, nearest_shape
 from flockenv.geometry.shapes.row_header import body_of, bound_of, shift_of, velocity_of
@@ -128,7 +128,7 @@ def test_contact_forces_use_position_and_velocity_of_shapes_at_the_time_of_a_wor
             expected[b] += np.where(hits, force, 0)[:, None] * normal
     np.testing.assert_allclose(found, expected, atol=1e-7)
     assert (touched > 1).all()
-    assert state.counted("obstacle_tests") == 3 * 94 * len(SHAPES), "obstacles out of reach are counted also"
+    assert state.count_of("obstacle_tests") == 3 * 94 * len(SHAPES), "obstacles out of reach are counted also"
 
 
 @pytest.mark.slow
@@ -186,7 +186,7 @@ def test_packed_rows_give_the_gap_hit_bound_shift_and_velocity_of_their_shape() 
     field = DistanceField(low=(-1, -1), high=(1, 1), spacing=0.5, shapes=(Circle(centre=(0, 0), radius=0.6),))
     hollows = (moving(field, hollow=True), ROOM, Block(centre=(0, 0), size=(5, 4), hollow=True))
     every = (*SHAPES, HalfSpace(point=(0, 1), direction=(1, 2), velocity=(0, 1)), field, *hollows)
-    table, where = packed(every, 2, first=3)
+    table, where = pack_shapes(every, 2, first=3)
     assert set(where) == set(FORMS)
     at, rows, order = 0, [], sorted(range(len(every)), key=lambda k: list(FORMS).index(every[k].form))
     for k in order:

@@ -145,7 +145,7 @@ def test_in_a_plane_every_rule_acts_on_exactly_its_neighbours(rule: int, count: 
     edge = math.sqrt(count / 4)
     effects = (rules(1.0)[rule],) if alone else rules(1.0, chosen=rule)
     after = assert_as_expected(effects, uniform(count, (edge, edge)) - 3.0, None)
-    tested = after.counted("pairs") / count**2
+    tested = after.count_of("pairs") / count**2
     assert tested == 1 if count < 96 else tested < {96: 1.01, 400: 0.5, 3000: 0.06}[count]  # a grid was used
 
 
@@ -153,7 +153,7 @@ def test_in_a_plane_every_rule_acts_on_exactly_its_neighbours(rule: int, count: 
 @pytest.mark.parametrize("rule", [0, 1, 2])
 def test_in_three_dimensions_every_rule_acts_on_exactly_its_neighbours(rule: int) -> None:
     after = assert_as_expected((rules(1.0)[rule],), uniform(3000, (9.0, 9.0, 9.0)) - 3.0, None)
-    assert after.counted("pairs") < 0.2 * 3000**2
+    assert after.count_of("pairs") < 0.2 * 3000**2
 
 
 @pytest.mark.parametrize("count", [50, 400, 3000])
@@ -162,7 +162,7 @@ def test_on_a_torus_all_rules_share_one_neighbour_query(count: int, dimension: i
     edge = (count / 4) ** (1 / dimension)
     size = np.array([1.0, 1.3, 0.9])[:dimension] * max(edge, 2.5)
     after = assert_as_expected(rules(1.0), uniform(count, size), Torus(size=tuple(size)))
-    assert after.counted("neighbour_queries") == 1
+    assert after.count_of("neighbour_queries") == 1
 
 
 MIXED = (
@@ -176,11 +176,11 @@ MIXED = (
 def test_rules_of_different_radii_share_the_widest_query() -> None:
     space = Torus(size=(14.0, 11.0))
     after = assert_as_expected(MIXED, uniform(700, space.size), space)
-    assert after.counted("neighbour_queries") == 1
+    assert after.count_of("neighbour_queries") == 1
     _, widest, _ = MIXED
     narrow = [effect.model_copy(update={"radius": 1e-3}) for effect in MIXED]
     alone = assert_as_expected((narrow[0], widest, narrow[2]), uniform(700, space.size), space)
-    assert alone.counted("pairs") == after.counted("pairs")  # a smaller radius adds nothing to the query
+    assert alone.count_of("pairs") == after.count_of("pairs")  # a smaller radius adds nothing to the query
 
 
 @pytest.mark.parametrize("count", [50, pytest.param(700, marks=pytest.mark.slow)])
@@ -196,7 +196,7 @@ def test_effects_of_weight_zero_change_no_bits_and_no_counters(count: int) -> No
     np.testing.assert_array_equal(ends[0].work, ends[1].work)
     listed = scene_of(*MIXED, space=space, obstacles=({"centre": (7, 5), "radius": 1},), groups=alone.groups, dt=DT)
     under = listed.run(listed.start(0), 3)
-    assert under.counted("obstacle_tests") == 0  # no effect of this scene needs the obstacle
+    assert under.count_of("obstacle_tests") == 0  # no effect of this scene needs the obstacle
 
 
 def test_in_a_box_separation_acts_on_exactly_its_neighbours() -> None:
@@ -336,7 +336,7 @@ def test_forces_are_right_for_agents_just_beyond_the_edge_of_the_box(nudge: floa
     x = uniform(1500, space.size)
     x[:15, axis], x[15:30, axis] = nudge, 10.0 + nudge
     after = assert_as_expected(rules(1.0), x, space, wrapped=True)
-    assert after.counted("pairs") < 0.5 * 1500**2
+    assert after.count_of("pairs") < 0.5 * 1500**2
 
 
 def test_a_neighbour_exactly_at_the_radius_is_out_of_range() -> None:
@@ -392,7 +392,7 @@ def test_the_grid_finds_what_brute_force_finds(dimension: int) -> None:
         scene = scene_with(effects, Torus(size=size), dimension, 1000)
         state = placed(scene, x, v)
         found.append(forces(scene, state))
-        tested.append(scene.step(state).counted("pairs"))
+        tested.append(scene.step(state).count_of("pairs"))
     np.testing.assert_allclose(found[0], found[1], atol=1e-9)
     assert tested[1] == 1000**2
     assert tested[0] < tested[1] / (4 if dimension == 2 else 8)
@@ -456,7 +456,7 @@ def assert_few_as_expected(variant: Variant, x: Array, edge: float, hair: float 
         error = np.abs((after.vel - state.vel)[0] - exact)[sure].max(initial=0.0)
         terms = np.abs(exact).max() + np.abs(v).max()
         assert error <= 200 * np.finfo(variant.dtype).eps * terms, f"{rule.kind}: {error}"
-    assert after.counted("neighbour_queries") == 1
+    assert after.count_of("neighbour_queries") == 1
     return after
 
 
@@ -469,7 +469,7 @@ def test_the_nearest_few_are_those_of_the_reference(variant: Variant, count: int
     x = uniform(count, (edge,) * variant.dimension) * 0.999
     after = assert_few_as_expected(variant, x, edge)
     if count == 1500:
-        assert after.counted("pairs") < 0.8 * count**2
+        assert after.count_of("pairs") < 0.8 * count**2
 
 
 @ONE_LONG_STEP
@@ -531,7 +531,7 @@ def test_in_single_precision_every_rule_acts_on_exactly_its_neighbours(name: str
     scene = everything(d, *chosen, space=space, groups=groups, obstacles=(), dt=1.0, dtype="float32")
     state = placed(scene, x, v)
     after = scene.step(state)
-    assert after.counted("pairs") == count**2 if count < 96 else after.counted("pairs") < 0.8 * count**2
+    assert after.count_of("pairs") == count**2 if count < 96 else after.count_of("pairs") < 0.8 * count**2
     exact = expected(chosen[rule], x.astype(float), v.astype(float), space)
     sure = ~doubtful(chosen[rule], x.astype(float), v.astype(float), space, 1e-6)
     assert sure.mean() > 0.98

@@ -106,7 +106,7 @@ def test_a_body_between_another_and_a_wall_stays_there(
     if response in IN_TIME:
         velocities, impacts = billiard(masses, x, v, seconds)
         np.testing.assert_allclose(state.vel[0, :, 0], velocities, rtol=1e-9, atol=1e-6)
-        assert state.counted("impacts") == impacts
+        assert state.count_of("impacts") == impacts
 
 
 def test_a_mass_ratio_of_a_million_gives_3141_impacts() -> None:
@@ -146,7 +146,7 @@ def test_bodies_stopped_at_the_limit_of_impacts_keep_momentum_and_energy(respons
             assert gaps(state).min() > -1e-9
             assert kinetic(of, state) == pytest.approx(first, rel=1e-11)
             assert masses @ state.vel[0, :, 0] == pytest.approx(momentum, abs=1e-8)
-    assert state.counted("stopped") > 0
+    assert state.count_of("stopped") > 0
     (message,) = [str(w.message) for w in caught]
     assert "bodies stopped" in message and "keep their velocities" in message
 
@@ -183,7 +183,7 @@ def test_a_body_that_moves_many_times_its_width_in_a_step_passes_nothing(respons
             state = of.step(state)
             assert gaps(state).min() > -(0.06 if response in EXACT else 0.5) * R
             assert state.pos[0, 3, 0] < 9.0
-        assert np.isfinite(state.vel).all() and state.counted("impacts") > 0
+        assert np.isfinite(state.vel).all() and state.count_of("impacts") > 0
 
 
 @pytest.mark.parametrize("response", ALL)
@@ -243,7 +243,7 @@ def test_a_ball_slides_over_collinear_pieces_of_a_wall(response: str, speed: flo
     of = scene([1], response, e=e, dt=0.01, pull=G, friction=friction, obstacles=(wall,))
     state = of.start(0).with_motion([[[-1.03, R]]], [[[speed, 0.0]]])
     end = of.run(state, 200)
-    assert end.counted("unsolved") == 0 and end.counted("stopped") == 0
+    assert end.count_of("unsolved") == 0 and end.count_of("stopped") == 0
     distance = 2.0 * speed if not friction else speed**2 / (2 * friction * G)
     np.testing.assert_allclose(end.pos[0, 0], [-1.03 + distance, R], rtol=0, atol=1e-2 if friction else 1e-9)
 

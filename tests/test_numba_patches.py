@@ -22,7 +22,7 @@ from flockenv.jit.decorators import law
 from flockenv.jit.intrinsics import unaliased
 from flockenv.jit.numba_patches import front_end, lowering
 from flockenv.jit.pipeline import Whole
-from flockenv.jit.progress import unmatched
+from flockenv.jit.progress import unapplied_patches
 from flockenv.maths.vectors import add, dot, scale
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -31,25 +31,25 @@ TRIED = "0.68.1"
 
 
 def now() -> list[Any]:
-    return [vars(trick.owner)[trick.name] for trick in front_end.TRICKS]
+    return [vars(trick.owner)[trick.name] for trick in front_end.PATCHES]
 
 
 @pytest.mark.skipif(numba.__version__ != TRIED, reason="patches were tested with another version of numba")
 def test_every_patch_applies_to_the_tested_version_of_numba() -> None:
     front_end._replacements.cache_clear()
-    assert len(front_end._replacements()) == len(front_end.TRICKS)
-    assert len(front_end._places()) == len(front_end.SPARED)
+    assert len(front_end._replacements()) == len(front_end.PATCHES)
+    assert len(front_end._places()) == len(front_end.REPLACED_PASSES)
     lowering.is_brief.cache_clear()
     assert lowering.is_brief()
     before = now()
-    with front_end.lighter():
+    with front_end.apply_patches():
         assert all(new is not old for new, old in zip(now(), before, strict=True))
 
 
 @pytest.fixture
 def cleared_caches() -> Iterator[None]:
     """Clear the caches of the patches that apply, before and after a test."""
-    caches = (front_end.reads_as_known, front_end._replacements, front_end._places, lowering.is_brief)
+    caches = (front_end.is_known_source, front_end._replacements, front_end._places, lowering.is_brief)
     for function in caches:
         function.cache_clear()
     yield
@@ -60,25 +60,27 @@ def cleared_caches() -> Iterator[None]:
 def test_a_numba_with_other_source_code_is_not_patched(monkeypatch: pytest.MonkeyPatch, cleared_caches: None) -> None:
     monkeypatch.setattr(front_end, "digest", lambda owner, name: "")
     before = now()
-    with front_end.lighter():
+    with front_end.apply_patches():
         assert all(new is old for new, old in zip(now(), before, strict=True))
-    assert front_end.spared([(front_end.SPARED[0].numbas, "")]) == [(front_end.SPARED[0].numbas, "")]
+    assert front_end.replace_passes([(front_end.REPLACED_PASSES[0].numbas, "")]) == [
+        (front_end.REPLACED_PASSES[0].numbas, "")
+    ]
     assert machine_code(Whole) == machine_code(None)
-    assert len(unmatched()) == len(front_end.TRICKS) + len(front_end.SPARED) + 1
+    assert len(unapplied_patches()) == len(front_end.PATCHES) + len(front_end.REPLACED_PASSES) + 1
 
 
 def test_a_patch_for_other_source_code_is_named(monkeypatch: pytest.MonkeyPatch, cleared_caches: None) -> None:
-    trick, digest = front_end.TRICKS[0], front_end.digest
+    trick, digest = front_end.PATCHES[0], front_end.digest
     monkeypatch.setattr(
         front_end, "digest", lambda owner, name: "" if (owner, name) == trick.reads[0][:2] else digest(owner, name)
     )
-    assert unmatched() == (trick.title,)
+    assert unapplied_patches() == (trick.title,)
 
 
 def test_each_patch_has_its_own_title_and_other_names_are_refused(
     monkeypatch: pytest.MonkeyPatch, cleared_caches: None
 ) -> None:
-    titles = [each.title for each in (*front_end.TRICKS, *front_end.SPARED)]
+    titles = [each.title for each in (*front_end.PATCHES, *front_end.REPLACED_PASSES)]
     assert len(set(titles)) == len(titles)
     monkeypatch.setenv(front_end.LEFT_OUT, "lowring")
     with pytest.raises(ValueError, match=r"^FLOCKENV_NUMBA_ALONE: 'lowring' is none, did you mean `lowering`"):
@@ -89,7 +91,7 @@ def test_each_patch_has_its_own_title_and_other_names_are_refused(
 def test_an_environment_variable_leaves_patches_out(
     left_out: str, monkeypatch: pytest.MonkeyPatch, cleared_caches: None
 ) -> None:
-    first, *others = (each.title for each in (*front_end.TRICKS, *front_end.SPARED))
+    first, *others = (each.title for each in (*front_end.PATCHES, *front_end.REPLACED_PASSES))
     monkeypatch.setenv(front_end.LEFT_OUT, "all" if left_out == "all" else f"{first},lowering")
     replaced = len(front_end._replacements()) + len(front_end._places())
     assert replaced == (0 if left_out == "all" else len(others))
@@ -178,14 +180,14 @@ def test_closures_comprehensions_and_reductions_are_still_inlined() -> None:
 
 PARTS = """
 from types import FunctionType
-from flockenv.jit.sources import held; from flockenv.jit.decorators import python_of
+from flockenv.jit.sources import free_values; from flockenv.jit.decorators import python_of
 from tests.catalogue import EFFECTS, scene_under
 
 def dispatchers(part):
     if hasattr(part, "signatures"):
         yield part
     function = python_of(part)
-    for inner in part if isinstance(part, tuple) else held(function) if isinstance(function, FunctionType) else ():
+    for inner in part if isinstance(part, tuple) else free_values(function) if isinstance(function, FunctionType) else ():
         yield from dispatchers(inner)
 
 scene = scene_under(next(row for row in EFFECTS if row.effect.kind == "drag"), 2)

@@ -10,7 +10,7 @@ import pytest
 from typer.main import get_command
 
 from flockenv.cli.main import app, main
-from flockenv.core.output_paths import checked_file, checked_path
+from flockenv.core.output_paths import valid_file, valid_path
 
 
 @pytest.fixture(autouse=True)
@@ -24,13 +24,13 @@ def in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("name", ["x.gif", "a/b/c/x.gif", "./x.gif", "ü 鳥.gif", "..x.gif", "a..b/x.gif", "conx.gif"])
 def test_a_path_below_the_current_folder_is_allowed_and_nothing_is_created(name: str) -> None:
-    assert checked_file(name, [".gif"]) == (Path.cwd() / name).resolve()
+    assert valid_file(name, [".gif"]) == (Path.cwd() / name).resolve()
     assert list(Path.cwd().iterdir()) == []
 
 
 def test_a_path_below_the_temporary_folder_is_allowed() -> None:
     path = Path(tempfile.gettempdir()) / "deep" / "x.gif"
-    assert checked_file(str(path), [".gif"]) == path
+    assert valid_file(str(path), [".gif"]) == path
 
 
 @pytest.mark.parametrize(
@@ -54,7 +54,7 @@ def test_a_path_below_the_temporary_folder_is_allowed() -> None:
 )
 def test_an_invalid_path_is_refused_in_one_line(name: str, message: str) -> None:
     with pytest.raises(ValueError, match="--out") as caught:
-        checked_path(name)
+        valid_path(name)
     assert message in str(caught.value)
     assert str(caught.value).isprintable() and len(str(caught.value)) < 500
 
@@ -63,65 +63,65 @@ def test_symbolic_links_are_resolved_before_the_check(tmp_path: Path) -> None:
     Path("outside").symlink_to("/usr")
     Path("inside").symlink_to(tmp_path / "here")
     with pytest.raises(ValueError, match="must lie below"):
-        checked_path("outside/x")
-    assert checked_path("inside/x") == tmp_path / "here" / "x"
+        valid_path("outside/x")
+    assert valid_path("inside/x") == tmp_path / "here" / "x"
 
 
 def test_a_file_in_place_of_a_folder_is_refused() -> None:
     Path("file").write_text("")
     with pytest.raises(ValueError, match=r"--out 'file/x\.gif': '.*file' is not a folder"):
-        checked_file("file/x.gif", [".gif"])
+        valid_file("file/x.gif", [".gif"])
 
 
 @pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="root may write anywhere")
 def test_a_folder_without_write_permission_is_refused() -> None:
     Path("closed").mkdir(mode=0o500)
     with pytest.raises(ValueError, match="cannot be written to"):
-        checked_path("closed/x")
+        valid_path("closed/x")
 
 
 def test_a_folder_that_os_access_denies_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     with pytest.raises(ValueError, match="cannot be written to"):
-        checked_path("x")
+        valid_path("x")
 
 
 def test_existing_files_are_overwritten_only_with_force() -> None:
     Path("x.gif").write_text("mine")
     Path("folder.gif").mkdir()
     with pytest.raises(ValueError, match=r"--out 'x\.gif': exists already; --force overwrites it"):
-        checked_file("x.gif", [".gif"])
-    assert checked_file("x.gif", [".gif"], force=True).read_text() == "mine"
+        valid_file("x.gif", [".gif"])
+    assert valid_file("x.gif", [".gif"], force=True).read_text() == "mine"
     with pytest.raises(ValueError, match="is a folder"):
-        checked_file("folder.gif", [".gif"], force=True)
+        valid_file("folder.gif", [".gif"], force=True)
 
 
 def test_the_suffix_must_be_an_allowed_one() -> None:
-    assert checked_file("x.GIF", [".gif", ".png"]).name == "x.GIF"
+    assert valid_file("x.GIF", [".gif", ".png"]).name == "x.GIF"
     with pytest.raises(ValueError, match=r"--to 'x\.gfi': must end in \.gif or \.png, did you mean `\.gif`\?"):
-        checked_file("x.gfi", [".gif", ".png"], option="--to")
+        valid_file("x.gfi", [".gif", ".png"], option="--to")
     with pytest.raises(ValueError, match=r"--out 'x': must end in \.gif$"):
-        checked_file("x", [".gif"])
+        valid_file("x", [".gif"])
 
 
 def test_an_existing_file_with_the_suffix_of_beside_is_refused() -> None:
     Path("numbers.json").write_text("mine")
     for name in ("numbers.png", "numbers.json"):
         with pytest.raises(ValueError, match=r"numbers\.json': exists already"):
-            checked_file(name, [".png", ".json"], beside=".json")
-        assert checked_file(name, [".png", ".json"], force=True, beside=".json").name == name
+            valid_file(name, [".png", ".json"], beside=".json")
+        assert valid_file(name, [".png", ".json"], force=True, beside=".json").name == name
     Path("folder.json").mkdir()
     with pytest.raises(ValueError, match=r"folder\.json': is a folder"):
-        checked_file("folder.png", [".png"], force=True, beside=".json")
+        valid_file("folder.png", [".png"], force=True, beside=".json")
 
 
 def test_a_folder_beside_a_page_may_exist_but_a_file_may_not() -> None:
-    assert checked_file("page.md", [".md"], beside="").name == "page.md"
+    assert valid_file("page.md", [".md"], beside="").name == "page.md"
     Path("page").mkdir()
-    assert checked_file("page.md", [".md"], beside="").name == "page.md"
+    assert valid_file("page.md", [".md"], beside="").name == "page.md"
     Path("other").write_text("mine")
     with pytest.raises(ValueError, match=r"--out 'other\.md': 'other' beside it is a file, must be a folder"):
-        checked_file("other.md", [".md"], force=True, beside="")
+        valid_file("other.md", [".md"], force=True, beside="")
 
 
 WRITING = {

@@ -122,12 +122,12 @@ def test_the_progress_reward_is_the_distance_covered_along_the_track() -> None:
     world = world_of()
     track = polyline.pieces(corners(world).tolist(), closed=True)
     length, player = track[1], RulesPlayer(TASK, CAREFUL)
-    s, gone = polyline.projected(track, world.state.pos[0, 0])[0], 0.0
+    s, gone = polyline.project(track, world.state.pos[0, 0])[0], 0.0
     observation = world.reset(3)
     for _ in range(TASK.horizon):
         step = world.step(player.predict(observation[:, 0])[0][:, None])
         observation = step.observation
-        now = polyline.projected(track, world.state.pos[0, 0])[0]
+        now = polyline.project(track, world.state.pos[0, 0])[0]
         gained = (now - s + length / 2) % length - length / 2
         s, gone = now, gone + gained
         assert step.terms[0, 0, 0] == pytest.approx(TASK.progress_reward * gained, abs=1e-9)

@@ -86,7 +86,7 @@ def test_the_number_of_births_is_rate_times_duration_for_every_dt(dt: float, rat
         t = float(state.time[0])
         expected = math.floor(rate * t + 1e-9)
         expected += math.floor(rate * max(0.0, min(t, end) - start) + 1e-9)
-        assert state.counted("births") == expected == state.alive.sum()
+        assert state.count_of("births") == expected == state.alive.sum()
 
 
 def test_births_do_not_depend_on_dt() -> None:
@@ -146,17 +146,17 @@ def test_slots_are_reused_under_new_identities() -> None:
         assert len(set(state.identity[0][state.alive[0]])) == state.alive.sum()
         assert (state.age[0][state.alive[0]] <= 0.4).all()
         assert not state.vel[0][~state.alive[0]].any()
-    births, deaths = state.counted("births"), state.counted("deaths")
+    births, deaths = state.count_of("births"), state.count_of("deaths")
     assert births == 900
     assert births - deaths == state.alive.sum()
     assert len({slot for slot, _ in first_seen.values()}) <= 100 < len(first_seen) == births
-    assert state.counted("births_refused") == 0
+    assert state.count_of("births_refused") == 0
 
 
 def test_births_without_a_free_slot_are_refused_and_counted() -> None:
     full = scene(Emitter(place=ORIGIN, rate=100.0), count=30)
     state = full.run(full.start(0), 100)
-    assert (state.counted("births"), state.counted("births_refused"), state.alive.sum()) == (30, 170, 30)
+    assert (state.count_of("births"), state.count_of("births_refused"), state.alive.sum()) == (30, 170, 30)
 
 
 def test_a_group_may_start_with_some_agents_alive() -> None:
@@ -179,7 +179,7 @@ def test_the_number_alive_is_the_number_of_births_within_one_lifetime() -> None:
             state = fountain.run(state, 17)
             t = float(state.time[0])
             assert abs(state.alive.sum() - (math.floor(rate * t) - math.floor(rate * max(0.0, t - life)))) <= 1
-            assert state.counted("births") - state.counted("deaths") == state.alive.sum()
+            assert state.count_of("births") - state.count_of("deaths") == state.alive.sum()
     rate = 200.0
     drawn = scene(Emitter(place=ORIGIN, rate=rate, lifetime=(0.5, 1.5)))
     state = drawn.run(drawn.start(0), 300)
@@ -207,7 +207,7 @@ def test_half_of_the_agents_are_alive_after_each_half_life(dt: float) -> None:
     for left in (0.5, 0.25):
         state = sample.run(state, round(half / dt))
         assert abs(state.alive.sum() - left * n) < 4 * math.sqrt(n * left * (1 - left))
-    assert state.counted("deaths") == n - state.alive.sum()
+    assert state.count_of("deaths") == n - state.alive.sum()
 
 
 def test_decay_acts_on_an_agent_from_its_birth_within_a_step() -> None:
@@ -334,7 +334,7 @@ def test_no_agent_passes_through_a_thin_drain() -> None:
         state = gun.run(state, 1)
         assert not (state.alive[0] & (state.pos[0, :, 0] > 0)).any()
     assert not state.alive.any()
-    assert state.counted("deaths") == 64
+    assert state.count_of("deaths") == 64
 
 
 def test_a_drain_removes_agents_in_its_path_and_a_hollow_one_agents_outside() -> None:
@@ -419,7 +419,7 @@ def test_a_world_of_a_batch_equals_the_world_alone() -> None:
     batch = everything.run(everything.start(7, worlds=3), 60)
     for k in range(3):
         same(batch.worlds([k]), everything.run(everything.start(7 + k), 60))
-    assert batch.counted("births") > 3 * 900
+    assert batch.count_of("births") > 3 * 900
     assert len({int(n) for n in batch.alive.sum(axis=1)}) > 1
 
 
@@ -479,7 +479,7 @@ def test_scenes_without_living_agents_can_be_stepped() -> None:
         state = empty.run(empty.start(0, worlds=2), 3)
         assert not state.alive.any()
         state = empty.run(state, 7)
-        assert state.alive.sum() == state.counted("births") == 2 * 6
+        assert state.alive.sum() == state.count_of("births") == 2 * 6
         assert np.isfinite(state.pos).all()
 
 
@@ -511,8 +511,8 @@ def test_example_scenes_load_and_refuse_no_births(name: str) -> None:
     loaded = load_scene(Path(__file__).parent.parent / "configs" / "scenes" / f"{name}.yaml")
     assert load_scene(dump_scene(loaded)) == loaded
     state = loaded.run(loaded.start(0), round(4 / loaded.dt))
-    assert state.counted("births") > 300
-    assert state.counted("births_refused") == 0  # there are enough slots
+    assert state.count_of("births") > 300
+    assert state.count_of("births_refused") == 0  # there are enough slots
 
 
 PLANE = {"kind": "half_space", "point": [0, 0], "direction": [0, 1]}

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from flockenv.jit.checked_store import Store
-from flockenv.jit.private_folder import NotPrivateError, first_private, prepared, read_private
+from flockenv.jit.private_folder import NotPrivateError, ensure_private, first_private, read_private
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="no owners and modes here")
 as_root = pytest.mark.skipif(getattr(os, "geteuid", lambda: 1)() != 0, reason="only root can act as two users")
@@ -79,7 +79,7 @@ def test_a_folder_that_others_can_change_is_refused_in_one_line(make: Callable[[
     folder = tmp_path / "cache"
     make(folder)
     with pytest.raises(NotPrivateError, match=r"\A[^\n]*cache: .*\Z"):
-        prepared(folder)
+        ensure_private(folder)
 
 
 @pytest.mark.parametrize("make", BAD)
@@ -98,17 +98,17 @@ def test_parent_folders_may_be_writable_by_others_if_they_are_sticky(mode: int, 
     above.mkdir()
     above.chmod(mode)
     if allowed:
-        assert stat.S_IMODE(prepared(above / "cache").stat().st_mode) == 0o700
+        assert stat.S_IMODE(ensure_private(above / "cache").stat().st_mode) == 0o700
     else:
         with pytest.raises(NotPrivateError, match=r"above: other users can replace.*0777"):
-            prepared(above / "cache")
+            ensure_private(above / "cache")
 
 
 @as_root
 def test_a_parent_folder_of_another_user_is_refused(tmp_path: Path) -> None:
     of_a_stranger(tmp_path / "above")
     with pytest.raises(NotPrivateError, match=f"above: belongs to user {STRANGER}"):
-        prepared(tmp_path / "above" / "cache")
+        ensure_private(tmp_path / "above" / "cache")
 
 
 def test_parents_behind_a_symbolic_link_are_also_checked(tmp_path: Path) -> None:
@@ -116,15 +116,15 @@ def test_parents_behind_a_symbolic_link_are_also_checked(tmp_path: Path) -> None
     (tmp_path / "open" / "home").mkdir(mode=0o700)
     (tmp_path / "way").symlink_to(tmp_path / "open" / "home")
     with pytest.raises(NotPrivateError, match="open: other users can replace"):
-        prepared(tmp_path / "way" / "cache")
+        ensure_private(tmp_path / "way" / "cache")
     (tmp_path / "open").chmod(0o755)
-    assert prepared(tmp_path / "way" / "cache").is_dir()
+    assert ensure_private(tmp_path / "way" / "cache").is_dir()
 
 
 def test_new_folders_are_private_under_any_umask(tmp_path: Path) -> None:
     before = os.umask(0)
     try:
-        folder = prepared(tmp_path / "new" / "deeper" / "cache")
+        folder = ensure_private(tmp_path / "new" / "deeper" / "cache")
         Store(folder).write("a", b"data")
     finally:
         os.umask(before)

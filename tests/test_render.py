@@ -570,7 +570,7 @@ def test_a_snapshot_of_a_scene_has_the_edges_of_its_networks() -> None:
     )
     seen = scene.snapshot(scene.start(0))
     assert {tuple(bond) for bond in seen.bonds.tolist()} == {(3, 4), (4, 5), (6, 7), (7, 8), (3, 6), (4, 7), (5, 8)}
-    assert seen.tied.tolist() == [False] * 3 + [True] * 6
+    assert seen.has_bonds.tolist() == [False] * 3 + [True] * 6
 
 
 def test_groups_of_a_scene_have_different_roles() -> None:

@@ -549,7 +549,7 @@ def test_a_scene_of_gravity_alone_allocates_nothing_for_other_laws() -> None:
     assert handed == growing | {"counters", "tally", "sync", "lanes"}  # of agents, threads, and of divergence
     start = scenes[0].start(0)
     end = scenes[0].step(start, steps=3)
-    assert end.counted("evaluations") == 3
+    assert end.count_of("evaluations") == 3
     assert end.work.sum() == 3
     tracemalloc.start()
     try:
@@ -584,7 +584,7 @@ def test_agents_on_a_line_are_not_all_paired(axis: int) -> None:
     scene = crowd_of(2000, space=Plane())
     state = scene.start(0)
     state.x[axis], state.x[1 - axis] = np.linspace(0, 2000, 2000), 1.0
-    assert scene.step(state).counted("pairs") < 100 * 2000
+    assert scene.step(state).count_of("pairs") < 100 * 2000
 
 
 def test_zero_steps_do_not_wrap_positions() -> None:

@@ -74,8 +74,8 @@ def test_no_body_overlaps_or_escapes_by_more_than_5_percent_of_its_radius(name: 
         state = scene.step(state, steps=every)
         worst = max(worst, overlap(scene, state))
     assert worst < 0.05
-    assert state.counted("impacts") > 0
-    assert (state.counted("unsolved") > 0) == (name == "funnel"), "only funnel.yaml announces unsolved contacts"
+    assert state.count_of("impacts") > 0
+    assert (state.count_of("unsolved") > 0) == (name == "funnel"), "only funnel.yaml announces unsolved contacts"
 
 
 @pytest.mark.slow
@@ -83,7 +83,7 @@ def test_particles_in_a_sphere_keep_their_energy() -> None:
     scene = scene_of("sphere")
     start = scene.start(1)
     end = scene.run(start, 100)
-    assert end.counted("impacts") > 300
+    assert end.count_of("impacts") > 300
     assert energy(end, scene.body.mass) == pytest.approx(energy(start, scene.body.mass), rel=1e-12)
 
 
@@ -126,7 +126,7 @@ def test_folds_of_a_rope_or_cloth_keep_their_distance(name: str, seconds: float,
         for i, j in cKDTree(pos).query_pairs(0.1) - tied:
             nearest = min(nearest, float(np.linalg.norm(pos[i] - pos[j])))
     assert apart < nearest < 0.1
-    assert state.counted("unsolved") == 0
+    assert state.count_of("unsolved") == 0
 
 
 def test_the_page_of_scenes_has_a_picture_and_a_command_for_each_scene() -> None:
@@ -147,7 +147,7 @@ def test_the_funnel_warns_of_unsolved_contacts_with_small_overlaps() -> None:
         for _ in range(rows):
             state = scene.run(state, 20)
             deep = max(deep, overlap(scene, state))
-    assert 20 * rows / 2 < state.counted("unsolved") < 20 * rows
+    assert 20 * rows / 2 < state.count_of("unsolved") < 20 * rows
     assert deep < 0.03
     (message,) = (str(each.message) for each in caught)
     found = re.search(r"; the deepest overlap is ([\d.e-]+) of a radius$", message)

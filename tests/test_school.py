@@ -157,7 +157,7 @@ def test_caught_and_starved_fish_die_and_a_fed_hunter_stops_hunting() -> None:
     scene.inner(state, "hunger")[0, 5] = 0.9995
     state = scene.run(state, 1)
     np.testing.assert_array_equal(state.alive[0, :FISH], [False, True, True, True, True, False])
-    assert state.counted("deaths") == 2
+    assert state.count_of("deaths") == 2
     np.testing.assert_allclose(scene.inner(state, "hunger")[0, FISH : FISH + HUNTERS], [0.2, 0.8])
     state.pos[0, 1] = (0, 0.1)  # the hunter is not hungry now
     state = scene.run(state, 5)

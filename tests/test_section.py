@@ -100,7 +100,7 @@ def test_an_edited_law_without_a_file_is_recompiled(tmp_path: Path) -> None:
 def test_plain_python_uses_one_thread() -> None:
     """Although two are set: the barrier's counter is not atomic in plain Python."""
     env = {**os.environ, "NUMBA_DISABLE_JIT": "1", "FLOCKENV_THREADS": "2"}
-    code = "from flockenv.jit.thread_pool import at_work, threads; print(threads(), at_work())"
+    code = "from flockenv.jit.thread_pool import threads, usable_threads; print(threads(), usable_threads())"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=env, capture_output=True, text=True, check=True)
     assert done.stdout == "2 1\n"
 

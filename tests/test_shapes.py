@@ -21,7 +21,7 @@ from flockenv.geometry.shapes import (
     Shape,
     Sway,
     Wall,
-    clear_of,
+    distance_to_shapes,
 )
 from flockenv.geometry.space import Torus
 from flockenv.model.spawn import Spawn
@@ -263,7 +263,7 @@ def test_a_ring_that_repeats_its_first_vertex_is_the_same_polygon(hollow: bool) 
 def test_on_a_torus_distances_are_to_the_nearest_image() -> None:
     x, period = np.array([[0.1, 5.0], [9.9, 5.0]]), np.array([10.0, 10.0])
     block = Block(centre=(0, 5), size=(1, 1))
-    np.testing.assert_allclose(clear_of([block], x, period), [-0.4, -0.4], atol=1e-9)
+    np.testing.assert_allclose(distance_to_shapes([block], x, period), [-0.4, -0.4], atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from numba import njit
 from numba.core.errors import TypingError
 
 from flockenv.jit import cpu
-from flockenv.jit.simd_rows import PAIR, SIDE, apart, columns, in_one_row, into_rows, packed, take
+from flockenv.jit.simd_rows import PAIR, SIDE, as_contiguous, column_distance, columns, flatten, into_rows, take
 
 
 @njit
@@ -31,14 +31,14 @@ def turned(rows: Any, flat: Any, many: int, distance: int) -> None:
 @njit
 def strides(array: Any, world: int) -> tuple[Any, Any, Any]:
     """Return the strides of a packed view and of one world in it, and a copy of that world."""
-    view = packed(array)
+    view = as_contiguous(array)
     return view.strides, view[:, world].strides, view[:, world].copy()
 
 
 @pytest.mark.parametrize("agents", [1, 2, 15, 16, 17, 31, 32, 33, 64, 65, 100])
 @pytest.mark.parametrize("many", [1, 15, 16, 17, 32, 47, 50])
 def test_into_rows_transposes_columns_and_writes_nothing_else(agents: int, many: int) -> None:
-    distance = apart(agents)
+    distance = column_distance(agents)
     flat = np.full(many * distance + 7, -3, np.float32)
     room = np.full((3, agents, many + 5), -7, np.float32)
     turned(room[1], flat, many, distance)
@@ -52,15 +52,20 @@ def test_into_rows_transposes_columns_and_writes_nothing_else(agents: int, many:
 
 def test_columns_fit_all_agents_and_their_distance_is_no_power_of_two() -> None:
     for agents in (1, 24, 63, 64, 65, 1024, 1025, 100_000):
-        distance = apart(agents)
+        distance = column_distance(agents)
         assert agents <= distance <= max(2 * agents, 64) + SIDE
         assert distance & (distance - 1) and distance % SIDE == 0
-    assert apart(24) == apart(32) == apart(64)  # one kernel for all of them
+    assert column_distance(24) == column_distance(32) == column_distance(64)  # one kernel for all of them
 
 
 def test_noncontiguous_arrays_are_refused_at_compile_time() -> None:
     with pytest.raises(TypingError, match="one piece"):
-        turned(np.zeros((20, 40), np.float32)[:, :20], np.zeros(20 * apart(20), np.float32), 20, apart(20))
+        turned(
+            np.zeros((20, 40), np.float32)[:, :20],
+            np.zeros(20 * column_distance(20), np.float32),
+            20,
+            column_distance(20),
+        )
     with pytest.raises(TypingError, match="one piece"):
         strides(np.zeros((2, 5, 8))[:, :, ::2], 3)
 
@@ -76,7 +81,7 @@ def test_a_packed_array_keeps_its_strides_and_numbers() -> None:
 @njit
 def row_of(array: Any) -> tuple[int, Any]:
     """Return the length of the array in one row, and a copy of that row."""
-    row = in_one_row(array)
+    row = flatten(array)
     return row.shape[0], row.copy()
 
 

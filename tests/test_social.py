@@ -29,7 +29,7 @@ from flockenv.behaviours.steer import Steer
 from flockenv.core.warnings import CoarseContactWarning, UnstableStepWarning
 from flockenv.geometry.shapes import Block, Polygon, Shape, Wall
 from flockenv.geometry.space import Torus
-from flockenv.maths.approximations import atan2, exp, nearest_whole
+from flockenv.maths.approximations import atan2, exp, round_half_even
 from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import Contact, Course, Effect, Goal, ObstacleContact
 from flockenv.physics.integrators import ExplicitEuler, SemiImplicitEuler
@@ -115,7 +115,7 @@ def test_exp_and_atan2_have_the_documented_accuracy() -> None:
 @njit(error_model="numpy", fastmath={"contract"})
 def _rounded(x: Any, factor: Any, out: Any) -> None:
     for i in range(len(x)):
-        out[i] = nearest_whole(x[i] * factor)
+        out[i] = round_half_even(x[i] * factor)
 
 
 @pytest.mark.parametrize(("dtype", "digits"), [(np.float32, 22), (np.float64, 51)])
@@ -127,7 +127,7 @@ def test_nearest_whole_rounds_ties_to_even(dtype: Any, digits: int) -> None:
     found = np.empty_like(x)
     _rounded(x, dtype(1), found)
     np.testing.assert_array_equal(found, np.rint(x))
-    np.testing.assert_array_equal([nearest_whole.py_func(number) for number in x], np.rint(x))  # also in plain Python
+    np.testing.assert_array_equal([round_half_even.py_func(number) for number in x], np.rint(x))  # also in plain Python
     _rounded(x[: len(halves) - 3], dtype(2), found)  # the compiler may fuse the product with the rounding
     np.testing.assert_array_equal(found[: len(halves) - 3], 2 * x[: len(halves) - 3])
     _rounded(np.array([np.nan, np.inf, -np.inf], dtype), dtype(1), found)

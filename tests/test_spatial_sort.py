@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flockenv.geometry.cell_list import count_cells
-from flockenv.geometry.spatial_sort import HOME, TILE, count_from_home, count_tiles, find_homes, order_cells
+from flockenv.geometry.spatial_sort import HOME, TILE, count_from_home_tiles, count_tiles, find_home_tiles, order_cells
 from flockenv.jit.section import entry
 
 LANES, AGENTS = 16, 5003
@@ -52,10 +52,10 @@ def test_cells_with_agents_from_other_tiles_are_sorted_by_agent_number(size: Any
     ident = np.argsort(tile, kind="stable")
     home = tile[ident]
     homes, strangers = np.zeros(blocks * HOME, np.int32), np.full(n + 1, -7, np.int32)
-    entry(find_homes)(0, blocks, LANES, n, shape, start, homes)
+    entry(find_home_tiles)(0, blocks, LANES, n, shape, start, homes)
     moved = ((x[ident] + rng.uniform(-stride, stride, (n, d))) % size).astype(np.float32)
     tally = np.zeros(2, np.int64)
-    again, cell, start = counted(count_from_home, moved, homes, strangers, tally)
+    again, cell, start = counted(count_from_home_tiles, moved, homes, strangers, tally)
     plain, expected, begins = counted(count_cells, moved)
     assert shape == again == plain
     np.testing.assert_array_equal(cell, expected)

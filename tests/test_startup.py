@@ -11,7 +11,7 @@ from typing import ClassVar
 import pytest
 
 from flockenv.core.record import Record
-from flockenv.jit.startup import nothing_to_collect
+from flockenv.jit.startup import no_garbage_collection
 
 
 @pytest.fixture(autouse=True)
@@ -22,17 +22,17 @@ def collecting() -> Iterator[None]:
 
 
 def test_garbage_collection_is_enabled_again_afterwards() -> None:
-    with nothing_to_collect(), nothing_to_collect():
+    with no_garbage_collection(), no_garbage_collection():
         assert not gc.isenabled()
     assert gc.isenabled()
-    with pytest.raises(KeyError), nothing_to_collect():
+    with pytest.raises(KeyError), no_garbage_collection():
         raise KeyError
     assert gc.isenabled()
 
 
 def test_disabled_garbage_collection_stays_disabled() -> None:
     gc.disable()
-    with nothing_to_collect():
+    with no_garbage_collection():
         pass
     assert not gc.isenabled()
 
@@ -47,9 +47,9 @@ def test_linear_algebra_is_imported_only_when_a_kernel_needs_it() -> None:
     code = """
 import sys, threading
 import numba, numpy as np
-from flockenv.jit.startup import numba_before_scipy
+from flockenv.jit.startup import import_numba_before_scipy
 line = threading.Barrier(4)
-threads = [threading.Thread(target=lambda: (line.wait(), numba_before_scipy())) for _ in range(4)]
+threads = [threading.Thread(target=lambda: (line.wait(), import_numba_before_scipy())) for _ in range(4)]
 for thread in threads: thread.start()
 for thread in threads: thread.join()
 assert sys.modules["numba.np.linalg"].ensure_blas.__name__ == "ensure_blas"

@@ -42,7 +42,7 @@ def moved(state: State, change: Any) -> State:
 
 def candidates(scene: Scene, state: State, steps: int = 1) -> float:
     """Return the mean number of candidates that a step tests."""
-    return (scene.run(state, steps).counted("pairs") - state.counted("pairs")) / steps
+    return (scene.run(state, steps).count_of("pairs") - state.count_of("pairs")) / steps
 
 
 def far_along_x(pos: NDArray[Any], by: float) -> None:

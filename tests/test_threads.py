@@ -28,7 +28,7 @@ from flockenv.geometry.cell_list import FEWEST_ARRANGED, STEPS_ARRANGED, WORTH_A
 from flockenv.geometry.space import Box, Torus
 from flockenv.jit import thread_pool
 from flockenv.jit.cache_folder import cache_folder
-from flockenv.jit.thread_pool import share, threads, use_threads
+from flockenv.jit.thread_pool import run_parallel, threads, use_threads
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
 from flockenv.physics.effects import Drag
@@ -58,9 +58,9 @@ def shared(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
     def spy(jobs: Any) -> list[Any]:
         seen.append(len(jobs))
-        return share(jobs)
+        return run_parallel(jobs)
 
-    monkeypatch.setattr(steppers, "share", spy)
+    monkeypatch.setattr(steppers, "run_parallel", spy)
     return seen
 
 
@@ -358,7 +358,7 @@ class Clock:
             return job
 
         for _ in range(pieces):
-            choice.made(job_of("a", alone), job_of("s", shared), surely)
+            choice.run(job_of("a", alone), job_of("s", shared), surely)
         return "".join(by)
 
 
@@ -409,7 +409,7 @@ def test_the_time_of_failed_work_is_not_recorded(monkeypatch: pytest.MonkeyPatch
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        choice.made(interrupted, interrupted)
+        choice.run(interrupted, interrupted)
     assert choice.took == before
 
 
@@ -533,7 +533,7 @@ def test_simultaneous_callers_with_waiting_jobs_do_not_deadlock(monkeypatch: pyt
             time.sleep(0.02 * (6 - count))  # the smallest pool is ready last, and stays
 
     monkeypatch.setattr(thread_pool, "_ThreadPool", Slow)
-    monkeypatch.setattr(thread_pool, "_crew", None)
+    monkeypatch.setattr(thread_pool, "_pool", None)
 
     def call(size: int) -> list[int]:
         meeting = threading.Barrier(size)
@@ -542,7 +542,7 @@ def test_simultaneous_callers_with_waiting_jobs_do_not_deadlock(monkeypatch: pyt
             meeting.wait(20)
             return k
 
-        return [sum(share([lambda k=k: job(k) for k in range(size)])) for _ in range(20)]
+        return [sum(run_parallel([lambda k=k: job(k) for k in range(size)])) for _ in range(20)]
 
     sizes = (2, 5, 3) * 3
     answers: dict[int, list[int]] = {}
@@ -570,9 +570,9 @@ def test_the_error_of_a_job_is_raised_after_all_jobs_have_ended() -> None:
     for jobs in ([bad, good, good], [good, bad, good]):
         ended.clear()
         with pytest.raises(OverflowError, match="too much"):
-            share(jobs)
+            run_parallel(jobs)
         assert ended == [1, 1]
-    assert share([lambda: 1, lambda: 2, lambda: 3]) == [1, 2, 3]  # the pool still works
+    assert run_parallel([lambda: 1, lambda: 2, lambda: 3]) == [1, 2, 3]  # the pool still works
 
 
 # --- a process that forks ---------------------------------------------------------------------------------------------
@@ -620,7 +620,7 @@ LINUX = pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="thread 
 @pytest.fixture
 def new_crew(monkeypatch: pytest.MonkeyPatch) -> None:
     """Start without a thread pool, so that no thread has an affinity yet."""
-    monkeypatch.setattr(thread_pool, "_crew", None)
+    monkeypatch.setattr(thread_pool, "_pool", None)
 
 
 @pytest.fixture
@@ -634,10 +634,12 @@ def cores(new_crew: None) -> set[int]:
 
 @LINUX
 def test_pool_threads_avoid_the_core_of_the_calling_thread(cores: set[int], monkeypatch: pytest.MonkeyPatch) -> None:
-    assert thread_pool._here()[0] in cores
+    assert thread_pool._current_core()[0] in cores
     for core in (*cores, *cores):
-        monkeypatch.setattr(thread_pool, "_asked", lambda core=core: core)  # the caller may be on any core
-        assert share([lambda: None, lambda: os.sched_getaffinity(0)])[1] == cores - {core}
+        monkeypatch.setattr(
+            thread_pool, "_current_core_number", lambda core=core: core
+        )  # the caller may be on any core
+        assert run_parallel([lambda: None, lambda: os.sched_getaffinity(0)])[1] == cores - {core}
     assert os.sched_getaffinity(0) == cores  # the caller's own affinity is unchanged
 
 
@@ -645,7 +647,7 @@ def test_pool_threads_avoid_the_core_of_the_calling_thread(cores: set[int], monk
 @pytest.mark.usefixtures("new_crew")
 def test_threads_run_on_any_core_if_there_are_more_threads_than_cores() -> None:
     cores = os.sched_getaffinity(0)
-    found = share([lambda: os.sched_getaffinity(0)] * (len(cores) + 1))
+    found = run_parallel([lambda: os.sched_getaffinity(0)] * (len(cores) + 1))
     assert found == [cores] * (len(cores) + 1)
 
 
@@ -658,8 +660,8 @@ def test_pool_threads_stay_on_the_cores_of_a_pinned_caller(cores: set[int], monk
         for core in cores:
             for allowed in (cores, {core}, cores):
                 os.sched_setaffinity(0, allowed)
-                monkeypatch.setattr(thread_pool, "_asked", lambda core=core: core)
-                seen.append(share([lambda: None, lambda: os.sched_getaffinity(0)])[1])
+                monkeypatch.setattr(thread_pool, "_current_core_number", lambda core=core: core)
+                seen.append(run_parallel([lambda: None, lambda: os.sched_getaffinity(0)])[1])
         return seen
 
     with ThreadPoolExecutor(1) as pool:
@@ -672,9 +674,9 @@ def test_after_a_call_with_surplus_threads_they_avoid_the_callers_core_again(
     cores: set[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     core = min(cores)
-    monkeypatch.setattr(thread_pool, "_asked", lambda: core)
-    share([lambda: None] * (len(cores) + 2))
-    assert share([lambda: None, lambda: os.sched_getaffinity(0)])[1] == cores - {core}
+    monkeypatch.setattr(thread_pool, "_current_core_number", lambda: core)
+    run_parallel([lambda: None] * (len(cores) + 2))
+    assert run_parallel([lambda: None, lambda: os.sched_getaffinity(0)])[1] == cores - {core}
 
 
 @pytest.mark.usefixtures("new_crew")
@@ -683,10 +685,10 @@ def test_work_is_shared_even_if_thread_affinity_is_unavailable(forbidden: str, m
     def refuse(*_: Any) -> None:
         raise PermissionError
 
-    monkeypatch.setattr(thread_pool, "_asked", None if forbidden == "sched_getcpu" else lambda: 0)
+    monkeypatch.setattr(thread_pool, "_current_core_number", None if forbidden == "sched_getcpu" else lambda: 0)
     for name in ("sched_setaffinity", "sched_getaffinity"):
         monkeypatch.setattr(os, name, refuse if forbidden == name else lambda *_: {0, 1}, raising=False)
-    assert share([lambda: 1, lambda: 2]) == [1, 2]
+    assert run_parallel([lambda: 1, lambda: 2]) == [1, 2]
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ def plain(threads: int) -> Case:
     start = scene.start(0, worlds=1024)
     state = scene.step(start, steps=100)
     digest = hashlib.sha256(state.x.tobytes() + state.v.tobytes()).hexdigest()[:16]
-    counted = ", ".join(f"{state.counted(what)} {what}" for what in ("evaluations", "neighbour_queries", "pairs"))
+    counted = ", ".join(f"{state.count_of(what)} {what}" for what in ("evaluations", "neighbour_queries", "pairs"))
     does = f"100 steps: bits {digest}; {counted}"
     work = state.copy()
 

@@ -14,8 +14,8 @@ from pydantic import Field
 from flockenv import steering
 from flockenv.geometry.shapes.chain import segment_hit, segment_share
 from flockenv.jit.decorators import OPTIONS, Law, Vec, law, like
-from flockenv.jit.intrinsics import stacked
-from flockenv.maths.approximations import nearest_whole
+from flockenv.jit.intrinsics import tuple_as_array
+from flockenv.maths.approximations import round_half_even
 from flockenv.maths.vectors import add, dot, norm, scale, select, sub, unit, zero
 from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.effect import Effect, Me, Other, Sight, all_masses, demand_group
@@ -140,8 +140,8 @@ def until_a_wall(p: Any, me: Me, way: Vec, reach: float) -> float:
         a, b = (p.table[at], p.table[at + 1]), (p.table[at + 2], p.table[at + 3])
         wide, high = p.table[0], p.table[1]
         x, y = me.pos[0] - half * (a[0] + b[0]), me.pos[1] - half * (a[1] + b[1])
-        x = wide * nearest_whole(x / wide) if wide > o else o
-        y = high * nearest_whole(y / high) if high > o else o
+        x = wide * round_half_even(x / wide) if wide > o else o
+        y = high * round_half_even(y / high) if high > o else o
         spot, room = sub(me.pos, (x, y)), me.radius + p.table[at + 4]
         off = sub(spot, add(a, scale(sub(b, a), segment_share(spot, a, b))))
         leaves = (dot(off, off) < room * room) & (dot(off, way) >= o)
@@ -153,7 +153,7 @@ def until_a_wall(p: Any, me: Me, way: Vec, reach: float) -> float:
 @law
 def chosen_way(p: Any, me: Me, acc: Vec) -> Vec:
     """Return F = m (v_des e(alpha) - v) / tau, alpha that of least d(alpha); of two equal ones, the right one."""
-    free = stacked(acc)
+    free = tuple_as_array(acc)
     count = DIRECTIONS + 1
     e, o = like(me.radius, 1.0), like(me.radius, 0.0)
     way, aim = _view(p, me)

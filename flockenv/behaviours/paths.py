@@ -49,13 +49,13 @@ def path_followed(p: Any, me: Me) -> Vec:
     o, way = like(top, 0.0), like(top, p.way)
     now = polyline.nearest(p.table, me.pos)
     then = polyline.nearest(p.table, add(me.pos, scale(me.vel, p.time)))
-    gained = way * polyline.gained(p.table, now[0], then[0]) - p.keep * top * p.time
+    gained = way * polyline.arc_difference(p.table, now[0], then[0]) - p.keep * top * p.time
     ahead = p.time * max(norm(me.vel), like(top, SLOWEST) * top)
     target = polyline.spine(p.table, me.pos, now[0] + way * ahead)
     wish = steering.follow_path(norm(_offset(then)) - p.radius, gained, target, me.vel, top)
     slow = max(p.slow_radius, like(top, 1e-9))
     end = polyline.spine(p.table, me.pos, p.table[1] if way > o else o)
-    arriving = polyline.to_end(p.table, now[0], way) < p.slow_radius
+    arriving = polyline.distance_to_end(p.table, now[0], way) < p.slow_radius
     return scale(select(arriving, steering.arrive(end, me.vel, top, slow), wish), p.weight)
 
 
@@ -126,7 +126,7 @@ class _OnPath(Moving):
         """Return its tube for pictures: points half a radius apart, at most MOST_PLACES pieces, and the radius."""
         path = scene.table_of(self)
         count = min(math.ceil(path[1] / (0.5 * self.radius)), MOST_PLACES)
-        along = polyline.on_spine(path, np.linspace(0.0, path[1], count + 1), scene.dimension)
+        along = polyline.spine_points(path, np.linspace(0.0, path[1], count + 1), scene.dimension)
         return tuple(map(tuple, scene.space.wrap(along).tolist())), self.radius
 
     def check(self, scene: SceneView) -> None:
@@ -251,4 +251,4 @@ effects:
     def table(self, scene: SceneView) -> NDArray[np.float64]:
         """Return the grid."""
         low = np.array(self.centre) - self.spacing * (np.array(self.counts) - 1) / 2
-        return grid.packed(np.reshape(self.velocities, (*self.counts, -1)), low.tolist(), self.spacing)
+        return grid.pack_grid(np.reshape(self.velocities, (*self.counts, -1)), low.tolist(), self.spacing)

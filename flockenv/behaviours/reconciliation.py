@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flockenv.jit.decorators import Law, kernel
-from flockenv.jit.section import entry_of, record, several, vector
+from flockenv.jit.section import entry_of, read_several, record, vector
 from flockenv.physics.effects.effect import Me
 from flockenv.steering.arbitration import Arbitration
 
@@ -58,7 +58,7 @@ def _number(numbers: Any, k: int) -> float:
 def _over_rows(law: Law, count: int, dimension: int, recalled: tuple[str, ...]) -> Callable[..., None]:
     """Return the loop of one arbitration over rows."""
     direction, wish = vector(dimension), kernel(lambda wishes, k: direction(wishes[k], 0))
-    wishes_of, kept_of = several(count, wish), several(max(len(recalled), 1), _number)
+    wishes_of, kept_of = read_several(count, wish), read_several(max(len(recalled), 1), _number)
     inner_of, recalls = record(recalled), bool(recalled)
 
     def over_rows(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field, WrapValidator, model_validator
 
 from flockenv.behaviours import BEHAVIOURS
-from flockenv.core.record import keep
+from flockenv.core.record import instance_of
 from flockenv.jit.decorators import Law, Vec
 from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.effect import EFFECTS, Effect, demand_group
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 else:
     AnyBehaviour = Annotated[
         Annotated[functools.reduce(operator.or_, BEHAVIOURS.values()), Field(discriminator="kind")],
-        WrapValidator(keep(Effect)),
+        WrapValidator(instance_of(Effect)),
     ]
-    AnyReconciling = Annotated[AnyArbitration, WrapValidator(keep(Arbitration))]
+    AnyReconciling = Annotated[AnyArbitration, WrapValidator(instance_of(Arbitration))]
 
 
 class Steer(Effect):

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from flockenv import steering
 from flockenv.behaviours.behaviour import Moving, top_speed
-from flockenv.geometry.shapes import AnyShape, packed
+from flockenv.geometry.shapes import AnyShape, pack_shapes
 from flockenv.geometry.shapes.block import nearest_block
 from flockenv.geometry.shapes.chain import nearest_chain
 from flockenv.geometry.space import Torus
@@ -192,7 +192,7 @@ effects:
 
     def table(self, scene: SceneView) -> NDArray[np.float64]:
         """Return the row of the shape."""
-        return packed([self.within], scene.dimension)[0]
+        return pack_shapes([self.within], scene.dimension)[0]
 
     def check(self, scene: SceneView) -> None:
         """Raise ValueError if the space is a torus, which has no outside, or the dimension differs."""

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from flockenv.behaviours import BEHAVIOURS
-from flockenv.core.atomic_files import made, replacing
+from flockenv.core.atomic_files import new_folder, replace_file
 from flockenv.physics.effects.effect import Effect
 from flockenv.render.gif import write_png
 from flockenv.render.picture import draw
@@ -74,12 +74,12 @@ def write_gallery(
 ) -> int:
     """Write the page, and a picture of each behaviour into a folder beside it; return the number of behaviours."""
     folder = path.with_suffix("")
-    with made(folder):
+    with new_folder(folder):
         for done, (kind, behaviour) in enumerate(behaviours.items()):
             progress(done)
             snapshots = list(shown(behaviour).snapshots())
             write_png(folder / f"{kind}.png", draw(snapshots[-1], SIZE, 3, snapshots))
-    with replacing(path) as file:
+    with replace_file(path) as file:
         file.write(page(behaviours, folder.name).encode())
     return len(behaviours)
 

@@ -42,7 +42,7 @@ from flockenv.cli.terminal import (
 )
 from flockenv.cli.validate import validate
 from flockenv.core import signals
-from flockenv.core.errors import nearest, shown
+from flockenv.core.errors import nearest, printable
 from flockenv.players import NAMES
 
 if TYPE_CHECKING:
@@ -98,16 +98,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     if arguments is not None:
         return _run(list(arguments))
-    with signals.running("flockenv"):
+    with signals.handle_signals("flockenv"):
         code = _run(sys.argv[1:])
-    if code == signals.code():
-        signals.leave(code)
+    if code == signals.exit_code():
+        signals.exit_now(code)
     return code
 
 
 def _run(words: Sequence[str]) -> int:
     debug = "--debug" in words
-    signals.say("")  # discard the text of an earlier command of this process
+    signals.set_message("")  # discard the text of an earlier command of this process
     try:
         with warnings.catch_warnings(), naming_stdout():
             warnings.showwarning = _warn
@@ -128,10 +128,10 @@ def _run(words: Sequence[str]) -> int:
 def _interrupted(text: str = "") -> int:
     """Print the line about the signal that ended the command, `text` if given; return the exit code."""
     if text:
-        signals.say(text)
-    if line := signals.said():
+        signals.set_message(text)
+    if line := signals.take_message():
         print(line, file=sys.stderr)
-    return signals.code()
+    return signals.exit_code()
 
 
 def _warn(message: Warning | str, *place: object, **more: object) -> None:
@@ -205,12 +205,12 @@ def run(
     force: Force = False,
 ) -> None:
     """Run a scene, show measures such as speed and polarisation, and write the trajectory if --out is given."""
-    from flockenv.core.output_paths import checked_file
+    from flockenv.core.output_paths import valid_file
     from flockenv.scene.yaml_io import load_scene
     from flockenv.studies.trajectory import whole_steps
 
     loaded = load_scene(Path(scene))
-    path = checked_file(out, [".npz"], force, beside=".json") if out is not None else None
+    path = valid_file(out, [".npz"], force, beside=".json") if out is not None else None
     steps = whole_steps("--duration", duration, loaded.dt)
     usual = max(1, round(RECORDED_EVERY / loaded.dt))
     stride = usual if every is None else whole_steps("--every", every, loaded.dt, 1)
@@ -256,11 +256,11 @@ def render(
     force: Force = False,
 ) -> None:
     """Draw a scene, or an episode of a task with a player, as GIF, PNG or HTML replay."""
-    from flockenv.core.atomic_files import made
-    from flockenv.core.output_paths import checked_file
+    from flockenv.core.atomic_files import new_folder
+    from flockenv.core.output_paths import valid_file
     from flockenv.tasks import TASKS
 
-    path = checked_file(out, PICTURES, force)
+    path = valid_file(out, PICTURES, force)
     if what in TASKS:
         if duration is not None:
             raise ValueError(f"--duration = {duration:g}: only for scenes; an episode of a task ends by itself")
@@ -269,8 +269,10 @@ def render(
         panel, fps, left = _film(what, 10.0 if duration is None else duration, seed)
         panels = [panel]
     else:
-        raise ValueError(f"{shown(what)}: no such task{nearest(what, TASKS)} ({', '.join(TASKS)}), nor a .yaml file")
-    with made(path.parent):
+        raise ValueError(
+            f"{printable(what)}: no such task{nearest(what, TASKS)} ({', '.join(TASKS)}), nor a .yaml file"
+        )
+    with new_folder(path.parent):
         _write_picture(path, panels, what if what in TASKS else Path(what).stem, fps, size)
     end = max(panel.snapshots[-1].time for panel in panels)
     new_console().print(f"{relative(path)}: {path.stat().st_size:,} bytes, {end:g} s{left}")
@@ -324,13 +326,15 @@ def warmup(
     ] = None,
 ) -> None:
     """Compile the kernels of tasks and scenes in advance, so that the first step is fast; show how long each took."""
-    from flockenv.jit.progress import compiled, unmatched
+    from flockenv.jit.progress import compiled_kernels, unapplied_patches
     from flockenv.scene.yaml_io import load_scene
     from flockenv.tasks import TASKS
 
     names = what or sorted(TASKS)
     if dtype not in (None, "float32", "float64"):
-        raise ValueError(f"--dtype = {shown(dtype)}: allowed: float32, float64{nearest(dtype, ('float32', 'float64'))}")
+        raise ValueError(
+            f"--dtype = {printable(dtype)}: allowed: float32, float64{nearest(dtype, ('float32', 'float64'))}"
+        )
     change = {} if dtype is None else {"dtype": dtype}
     jobs: list[tuple[str, Callable[[], None]]] = []
     for name in names:
@@ -341,23 +345,23 @@ def warmup(
             jobs.append((name, functools.partial(_first_step_of_scene, scene)))
         else:
             tasks = f"{nearest(name, TASKS)} ({', '.join(TASKS)})"
-            raise ValueError(f"{shown(name)}: no such task{tasks}, nor a .yaml file")
+            raise ValueError(f"{printable(name)}: no such task{tasks}, nor a .yaml file")
     rows = []
     with progress_bar("compiling", len(jobs), "kernels") as progress:
         for done, (name, job) in enumerate(jobs):
             progress(done)
-            before, began = len(compiled()), perf_counter()
+            before, began = len(compiled_kernels()), perf_counter()
             job()
-            took, new = perf_counter() - began, compiled()[before:]
+            took, new = perf_counter() - began, compiled_kernels()[before:]
             note = f"compiled in {sum(k.seconds for k in new):.1f} s" if new else "was in the cache"
             rows.append((name, note, f"{took:.1f}"))
     show_table(new_console(), "First steps", rows, ("of", "", "s"))
-    if unmatched():
+    if unapplied_patches():
         import numba
 
         new_console().print(
             f"numba {numba.__version__}: compiling takes longer, as flockenv leaves out patches that were tested with "
-            f"another version: {', '.join(unmatched())}"
+            f"another version: {', '.join(unapplied_patches())}"
         )
 
 
@@ -411,14 +415,14 @@ def _show_measures(console: Console, trajectory: Trajectory) -> None:
     title = f"{scene.agents:,} agents, {int(trajectory.step[-1]):,} steps of {scene.dt:g} s, seed {trajectory.seed}"
     show_table(console, title, rows, ("measure", "t = 0 s", f"t = {time:g} s", "unit"))
     work = {"neighbour queries": "neighbour_queries", "candidate pairs": "pairs", "obstacle tests": "obstacle_tests"}
-    counted = ", ".join(f"{trajectory.last.counted(name):,} {words}" for words, name in work.items())
+    counted = ", ".join(f"{trajectory.last.count_of(name):,} {words}" for words, name in work.items())
     counted += _unsolved(trajectory.last)
     console.print(f"{text(trajectory.rate / 1e6)} million agent-steps/s ({trajectory.wall:.3g} s); {counted}")
 
 
 def _unsolved(state: State) -> str:
     """Return the number of contacts that a run left unsolved, to be appended to a line; "" if there are none."""
-    count = state.counted("unsolved")
+    count = state.count_of("unsolved")
     return f", {count:,} times contacts left unsolved" if count else ""
 
 

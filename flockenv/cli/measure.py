@@ -22,7 +22,7 @@ from flockenv.cli.terminal import (
     relative,
     show_table,
 )
-from flockenv.core.errors import shown
+from flockenv.core.errors import printable
 
 if TYPE_CHECKING:
     from flockenv.scene import Scene
@@ -76,14 +76,14 @@ def measure(
     force: Force = False,
 ) -> None:
     """Run a scene and measure its crowd: flow, density, lanes, bursts, clogging, order; table, JSON and pictures."""
-    from flockenv.core.atomic_files import made
-    from flockenv.core.output_paths import checked_file
+    from flockenv.core.atomic_files import new_folder
+    from flockenv.core.output_paths import valid_file
     from flockenv.scene.yaml_io import load_scene
     from flockenv.studies.measured_run import Asked, combined
     from flockenv.studies.trajectory import whole_steps
 
     loaded = load_scene(Path(scene))
-    numbers = checked_file(json_file, [".json"], force, "--json") if json_file is not None else None
+    numbers = valid_file(json_file, [".json"], force, "--json") if json_file is not None else None
     folder = _checked_folder(out, force) if out is not None else None
     steps = whole_steps("--time", time, loaded.dt, 1)
     if not (math.isfinite(skip) and 0 <= skip < time):
@@ -97,7 +97,7 @@ def measure(
     if numbers is not None:
         _write_numbers(numbers, _summary(loaded, asked, found, means, above, first, stride))
     if folder is not None:
-        with made(folder):
+        with new_folder(folder):
             drawn = _draw(folder, first, found, asked, Path(scene).stem)
         new_console().print(f"{', '.join(drawn) or 'no pictures'} in {relative(folder)}")
     stopped = found[-1].stopped or ("interrupted" if len(found) < seeds else "")
@@ -139,13 +139,13 @@ PICTURES = ("flow_density.png", "lanes.png", "gaps.png", "space_time.png")
 
 
 def _checked_folder(text: str, force: bool) -> Path:
-    from flockenv.core.output_paths import checked_file, checked_path
+    from flockenv.core.output_paths import valid_file, valid_path
 
-    folder = checked_path(text)
+    folder = valid_path(text)
     if folder.exists() and not folder.is_dir():
-        raise ValueError(f"--out {shown(text)}: is a file; pictures go into a folder")
+        raise ValueError(f"--out {printable(text)}: is a file; pictures go into a folder")
     for name in PICTURES:
-        checked_file(str(folder / name), [".png"], force)
+        valid_file(str(folder / name), [".png"], force)
     return folder
 
 
@@ -155,7 +155,7 @@ def _numbers(option: str, text: str) -> list[float]:
     except ValueError:
         numbers = []
     if len(numbers) < 4 or len(numbers) % 2 or not all(map(math.isfinite, numbers)):
-        raise ValueError(f"{option} = {shown(text)}: must be X0,Y0,X1,Y1 in metres, or more corners for an area")
+        raise ValueError(f"{option} = {printable(text)}: must be X0,Y0,X1,Y1 in metres, or more corners for an area")
     return numbers
 
 
@@ -166,7 +166,7 @@ def _line(text: str | None) -> Any:
         return None
     numbers = _numbers("--line", text)
     if len(numbers) != 4 or numbers[:2] == numbers[2:]:
-        raise ValueError(f"--line = {shown(text)}: must be the two ends of a line, X0,Y0,X1,Y1 in metres")
+        raise ValueError(f"--line = {printable(text)}: must be the two ends of a line, X0,Y0,X1,Y1 in metres")
     return np.array(numbers).reshape(2, 2)
 
 
@@ -266,9 +266,9 @@ def _summary(
 
 
 def _write_numbers(path: Path, summary: dict[str, Any]) -> None:
-    from flockenv.core.atomic_files import made, replacing
+    from flockenv.core.atomic_files import new_folder, replace_file
 
-    with made(path.parent), replacing(path) as file:
+    with new_folder(path.parent), replace_file(path) as file:
         file.write((json.dumps(summary, indent=1, allow_nan=False) + os.linesep).encode())
     new_console().print(f"numbers in {relative(path)}")
 

@@ -22,7 +22,7 @@ from flockenv.cli.terminal import (
     show_table,
 )
 from flockenv.core import signals
-from flockenv.core.errors import shown
+from flockenv.core.errors import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -77,13 +77,13 @@ def accuracy(
     force: Force = False,
 ) -> None:
     """Show the cost of accuracy: the final error of each integrator for each step length, and its time."""
-    from flockenv.core.output_paths import checked_file
+    from flockenv.core.output_paths import valid_file
     from flockenv.physics.integrators import methods_named
     from flockenv.studies.accuracy import usual_methods
 
     todo = _todo(scenes or (), suite, problems, seconds, steps, dts, seed)
     aimed = _numbers("--tolerance", tolerance)
-    path = checked_file(out, [".json", ".png"], force, beside=".json") if out is not None else None
+    path = valid_file(out, [".json", ".png"], force, beside=".json") if out is not None else None
     chosen = methods_named(_words(methods)) if methods else usual_methods()
     console = new_console()
 
@@ -150,7 +150,7 @@ def _measured(
             keep(reports)
             _show_accuracy(console, reports[-1], tolerances)
             flush_output()
-            signals.say(INTERRUPTED_LATER)
+            signals.set_message(INTERRUPTED_LATER)
             if reports[-1].stopped:
                 break
     except KeyboardInterrupt:
@@ -209,21 +209,21 @@ def _problem(file: str, seconds: float | None, steps: str, dts: str, seed: int) 
 
 def _write(path: Path, numbers: Record, draw: Callable[[Path], None]) -> None:
     """Write results as JSON and, if `path` is a picture, draw them there: both files or neither."""
-    from flockenv.core.atomic_files import deliver
+    from flockenv.core.atomic_files import write_all_or_none
 
     writers: dict[str, Callable[[Path], None]] = {
         path.with_suffix(".json").name: functools.partial(write_numbers, numbers=numbers)
     }
     if path.suffix.lower() == ".png":
         writers[path.name] = draw
-    deliver(path.parent, writers)
+    write_all_or_none(path.parent, writers)
 
 
 def write_numbers(path: Path, numbers: Record) -> None:
     """Write results as JSON, completely or not at all, with the suffix of `path` replaced by .json."""
-    from flockenv.core.atomic_files import made, replacing
+    from flockenv.core.atomic_files import new_folder, replace_file
 
-    with made(path.parent), replacing(path.with_suffix(".json")) as file:
+    with new_folder(path.parent), replace_file(path.with_suffix(".json")) as file:
         file.write((numbers.model_dump_json(indent=1) + "\n").encode())
 
 
@@ -289,7 +289,7 @@ def _numbers(option: str, text: str) -> list[float]:
     except ValueError:
         numbers = []
     if not numbers or not all(math.isfinite(x) and x > 0 for x in numbers):
-        raise ValueError(f"{option} = {shown(text)}: must be positive numbers, separated by commas")
+        raise ValueError(f"{option} = {printable(text)}: must be positive numbers, separated by commas")
     return numbers
 
 
@@ -306,11 +306,11 @@ def stress(
     force: Annotated[bool, typer.Option("--force", help="Start again, ignoring X.json.")] = False,
 ) -> None:
     """Run every hard case with every integrator, and show value, bound and verdict of each."""
-    from flockenv.core.output_paths import checked_file
+    from flockenv.core.output_paths import valid_file
     from flockenv.physics.integrators import methods_named
     from flockenv.studies.stress import CASES, cases_named, fingerprint, run, trials, usual_methods
 
-    path = checked_file(out, [".json", ".png"], True, beside=".json") if out is not None else None
+    path = valid_file(out, [".json", ".png"], True, beside=".json") if out is not None else None
     todo = cases_named(CASES, _words(cases))
     under = methods_named(_words(methods)) if methods else usual_methods()
     kinds = [method.kind for method in under]
@@ -338,12 +338,12 @@ def experiment(
     force: Force = False,
 ) -> None:
     """Run an experiment about steering; write a table of the measures and a picture of the trajectories."""
-    from flockenv.core.output_paths import checked_file
+    from flockenv.core.output_paths import valid_file
     from flockenv.studies.experiments import load_plan, run
     from flockenv.studies.experiments.curves import write_order
     from flockenv.studies.experiments.plots import write_trials
 
-    path = checked_file(out, [".json", ".png"], force, beside=".json") if out is not None else None
+    path = valid_file(out, [".json", ".png"], force, beside=".json") if out is not None else None
     chosen = load_plan(Path(plan)).experiment()
     with progress_bar(chosen.title, len(chosen.cases) * len(chosen.variants), "trials") as advance:
         results, trials = run(chosen, advance)
@@ -364,9 +364,9 @@ def gallery(
     """Draw every behaviour in its own small scene, and write a page about all of them."""
     from flockenv.behaviours import BEHAVIOURS
     from flockenv.cli.gallery import write_gallery
-    from flockenv.core.output_paths import checked_file
+    from flockenv.core.output_paths import valid_file
 
-    path = checked_file(out, [".md"], force, beside="")
+    path = valid_file(out, [".md"], force, beside="")
     with progress_bar("drawing", len(BEHAVIOURS), "behaviours") as advance:
         many = write_gallery(path, progress=advance)
     new_console().print(f"{many} behaviours in {relative(path)}")

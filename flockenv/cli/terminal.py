@@ -78,13 +78,13 @@ def interruptible(interrupted: str = "interrupted") -> Iterator[None]:
 
     interrupted: the line; a leading "interrupted" is replaced by the signal's own word.
     """
-    signals.say(interrupted)
+    signals.set_message(interrupted)
     try:
         yield
     except KeyboardInterrupt:
-        if line := signals.said():
+        if line := signals.take_message():
             print(printable(line), file=sys.stderr)
-        raise typer.Exit(signals.code()) from None
+        raise typer.Exit(signals.exit_code()) from None
 
 
 @contextmanager
@@ -109,16 +109,16 @@ def program(name: str, app: typer.Typer, interrupted: str = "interrupted") -> No
 
     interrupted: the line about an interrupt, unless the command itself sets another.
     """
-    signals.say(interrupted)
-    with signals.running(name):
+    signals.set_message(interrupted)
+    with signals.handle_signals(name):
         try:
             app()
         except SystemExit as end:
-            if end.code not in (INTERRUPTED, signals.code()):
+            if end.code not in (INTERRUPTED, signals.exit_code()):
                 raise
-            if line := signals.said():  # typer turns a KeyboardInterrupt into this code without a message
+            if line := signals.take_message():  # typer turns a KeyboardInterrupt into this code without a message
                 print(line, file=sys.stderr)
-            signals.leave(signals.code())
+            signals.exit_now(signals.exit_code())
 
 
 class _Output:

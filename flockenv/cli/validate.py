@@ -39,12 +39,12 @@ def validate(
     force: Force = False,
 ) -> None:
     """Run published models of pedestrians in the test scenes of RiMEA and NIST: value, bound and verdict of each."""
-    from flockenv.core.output_paths import checked_file
+    from flockenv.core.output_paths import valid_file
     from flockenv.studies.validation import CASES, cases_named, fingerprint, presets_named, run, trials
 
-    path = checked_file(out, [".json", ".md"], True, beside=".json") if out is not None else None
+    path = valid_file(out, [".json", ".md"], True, beside=".json") if out is not None else None
     if path is not None and path.suffix.lower() == ".md":
-        checked_file(str(path), [".md"], True, beside="")  # the folder of pictures
+        valid_file(str(path), [".md"], True, beside="")  # the folder of pictures
     todo, under = cases_named(CASES, cases or []), presets_named(preset or [])
     if scenes is not None:
         _write_scenes(scenes, force, todo, under)
@@ -69,10 +69,10 @@ def validate(
 
 def _write_scenes(folder: str, force: bool, cases: Sequence[Case], presets: Sequence[str]) -> None:
     """Write the scenes of some cases as YAML, and print their number."""
-    from flockenv.core.output_paths import checked_path
+    from flockenv.core.output_paths import valid_path
     from flockenv.studies.validation.scenes import write_scenes
 
-    path = checked_path(folder, "--scenes")
+    path = valid_path(folder, "--scenes")
     written = write_scenes(path, cases, presets, force)
     new_console().print(f"{relative(path)} contains {len(written)} scenes")
 
@@ -81,12 +81,12 @@ def _write(path: Path, results: Results) -> None:
     """Write the findings as JSON; if `path` is a page (.md), also the page and its pictures."""
     write_numbers(path, results)
     if path.suffix.lower() == ".md":
-        from flockenv.core.atomic_files import made, replacing
+        from flockenv.core.atomic_files import new_folder, replace_file
         from flockenv.studies.validation.page import page
         from flockenv.studies.validation.plots import write_pictures
 
         folder = path.with_suffix("")
-        with made(folder):
+        with new_folder(folder):
             drawn = [picture.stem for picture in write_pictures(folder, results)]
-        with replacing(path) as file:
+        with replace_file(path) as file:
             file.write(page(results, folder.name, drawn).encode())

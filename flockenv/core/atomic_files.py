@@ -17,7 +17,7 @@ from typing import BinaryIO
 
 from flockenv.core import signals
 
-__all__ = ["LEFTOVERS", "deliver", "made", "remove_leftovers", "replacing"]
+__all__ = ["LEFTOVERS", "new_folder", "remove_leftovers", "replace_file", "write_all_or_none"]
 
 _PREFIX, _SUFFIX = ".flockenv-", ".part"
 
@@ -26,15 +26,15 @@ LEFTOVERS = f"{_PREFIX}*{_SUFFIX}"
 
 
 @contextmanager
-def replacing(path: str | os.PathLike[str], mode: int = 0o666) -> Iterator[BinaryIO]:
+def replace_file(path: str | os.PathLike[str], mode: int = 0o666) -> Iterator[BinaryIO]:
     """Open a new file for writing and rename it to `path` at the end; on any error nothing is left behind.
 
     An existing file is replaced; a link is itself replaced, never followed. The folder must exist.
     mode: permissions of the file, restricted by the umask.
     Raises ValueError or OSError, in one line that names the path; before the first byte is written if possible.
     """
-    target = _checked(Path(path))
-    with _named(target), _beside(target.parent) as scratch:
+    target = _valid_target(Path(path))
+    with _name_in_errors(target), _temporary_folder(target.parent) as scratch:
         part = scratch / "new"
         with open(part, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
             yield file
@@ -43,7 +43,7 @@ def replacing(path: str | os.PathLike[str], mode: int = 0o666) -> Iterator[Binar
         _rename({target: part})
 
 
-def deliver(folder: Path, writers: Mapping[str, Callable[[Path], object]]) -> None:
+def write_all_or_none(folder: Path, writers: Mapping[str, Callable[[Path], object]]) -> None:
     """Write several files and, when all are complete, rename them to their targets: all of them or none.
 
     No signal is handled between two renames, and if one fails, the earlier ones are undone. A process that is killed
@@ -58,27 +58,27 @@ def deliver(folder: Path, writers: Mapping[str, Callable[[Path], object]]) -> No
             a file could not be restored, the message names those that are new.
     """
     with ExitStack() as stack:
-        targets = {name: _below(folder, name) for name in writers}
+        targets = {name: _path_below(folder, name) for name in writers}
         for place in dict.fromkeys(target.parent for target in targets.values()):
-            stack.enter_context(made(place))
-        with _named(folder):
-            scratch = stack.enter_context(_beside(folder))
+            stack.enter_context(new_folder(place))
+        with _name_in_errors(folder):
+            scratch = stack.enter_context(_temporary_folder(folder))
         parts = {target: scratch / name for name, target in targets.items()}
         for (target, part), write in zip(parts.items(), writers.values(), strict=True):
-            with _named(target, part):
+            with _name_in_errors(target, part):
                 part.parent.mkdir(parents=True, exist_ok=True)
                 write(part)
-                _force(part, os.O_RDWR)
+                _sync(part, os.O_RDWR)
         _rename(parts)
 
 
 @contextmanager
-def made(folder: Path) -> Iterator[None]:
+def new_folder(folder: Path) -> Iterator[None]:
     """Create a folder and its parents; if the block raises, the created folders that are empty are removed again."""
     new = [path for path in (folder, *folder.parents) if not path.exists()]
     with ExitStack() as stack:
         for path in reversed(new):
-            stack.enter_context(signals.unfinished(path, if_empty=True))
+            stack.enter_context(signals.remove_at_end(path, if_empty=True))
         folder.mkdir(parents=True, exist_ok=True)
         yield
 
@@ -101,13 +101,13 @@ def _remove(entry: os.DirEntry[str]) -> None:
         os.unlink(entry.path)
 
 
-def _below(folder: Path, name: str) -> Path:
+def _path_below(folder: Path, name: str) -> Path:
     """Return the path of a file that may be written below a folder, which may be missing."""
     target = folder / name
-    return _checked(target) if target.parent.exists() else target
+    return _valid_target(target) if target.parent.exists() else target
 
 
-def _checked(target: Path) -> Path:
+def _valid_target(target: Path) -> Path:
     """Return the path if a file may be renamed to it; otherwise raise ValueError or OSError."""
     if "\0" in str(target):
         raise ValueError(f"path: must hold no NUL character, got {str(target)!r}")
@@ -119,17 +119,17 @@ def _checked(target: Path) -> Path:
 
 
 @contextmanager
-def _beside(folder: Path) -> Iterator[Path]:
+def _temporary_folder(folder: Path) -> Iterator[Path]:
     """Create a temporary folder in `folder`; remove it with its contents at the end of the block."""
     with ExitStack() as stack:
-        with signals.held():
+        with signals.defer_signals():
             scratch = tempfile.mkdtemp(_SUFFIX, _PREFIX, folder)
-            stack.enter_context(signals.unfinished(scratch))
+            stack.enter_context(signals.remove_at_end(scratch))
         yield Path(scratch)
 
 
 @contextmanager
-def _named(target: Path, part: Path | None = None) -> Iterator[None]:
+def _name_in_errors(target: Path, part: Path | None = None) -> Iterator[None]:
     """Name the target in an OSError about a new file, which has no name or a temporary one."""
     try:
         yield
@@ -143,27 +143,27 @@ def _named(target: Path, part: Path | None = None) -> Iterator[None]:
 
 def _rename(parts: Mapping[Path, Path]) -> None:
     """Rename files to their targets (`parts`: target -> file); on any error restore the old files."""
-    with signals.held():
-        kept = {target: _kept(target, part) for target, part in parts.items()} if len(parts) > 1 else {}
+    with signals.defer_signals():
+        kept = {target: _back_up(target, part) for target, part in parts.items()} if len(parts) > 1 else {}
         try:
             for target, part in parts.items():
-                with _named(target):
+                with _name_in_errors(target):
                     os.replace(part, target)
         except BaseException as error:
             moved = [target for target in kept if not os.path.lexists(parts[target])]
-            new = [repr(str(target)) for target in moved if not _put_back(target, kept[target])]
+            new = [repr(str(target)) for target in moved if not _restore(target, kept[target])]
             if new:
                 raise OSError(f"{error}; of those written together {', '.join(new)} could not be put back") from error
             raise
-    _force_names({target.parent for target in parts})
+    _sync_folders({target.parent for target in parts})
 
 
-def _kept(target: Path, part: Path) -> Path | None:
+def _back_up(target: Path, part: Path) -> Path | None:
     """Hard-link, or copy, the file at a target to a name beside the new file; return it, None if there is no file."""
     if not os.path.lexists(target):
         return None
     old = part.with_name(f"{part.name}.old")
-    with _named(target):
+    with _name_in_errors(target):
         try:
             os.link(target, old, follow_symlinks=False)
         except (OSError, NotImplementedError):  # this file system has no hard links, or none to symbolic links
@@ -171,7 +171,7 @@ def _kept(target: Path, part: Path) -> Path | None:
     return old
 
 
-def _put_back(target: Path, old: Path | None) -> bool:
+def _restore(target: Path, old: Path | None) -> bool:
     """Restore what was at a target: the file `old`, or no file (None). Return True on success."""
     try:
         if old is None:
@@ -183,7 +183,7 @@ def _put_back(target: Path, old: Path | None) -> bool:
     return True
 
 
-def _force(path: Path, flags: int) -> None:
+def _sync(path: Path, flags: int) -> None:
     """Sync a file, or the entries of a folder, to the disk."""
     handle = os.open(path, flags | getattr(os, "O_BINARY", 0))
     try:
@@ -192,9 +192,9 @@ def _force(path: Path, flags: int) -> None:
         os.close(handle)
 
 
-def _force_names(folders: Iterable[Path]) -> None:
+def _sync_folders(folders: Iterable[Path]) -> None:
     """Sync the entries of folders to the disk, on systems that can do so."""
     if os.name == "posix":
         for folder in folders:
             with suppress(OSError):  # some network file systems cannot
-                _force(folder, os.O_RDONLY)
+                _sync(folder, os.O_RDONLY)

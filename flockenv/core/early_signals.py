@@ -18,12 +18,12 @@ def command() -> str:
     words, program = sys.orig_argv, sys.argv[:1]
     if program == ["-m"] and "-m" in words[:-1]:  # Python has not located the module to run yet
         package, _, module = words[words.index("-m") + 1].rpartition(".")
-        return module if package.split(".")[0] == "agents" and _beside("agents") else ""
+        return module if package.split(".")[0] == "agents" and _is_beside_flockenv("agents") else ""
     script = os.path.basename(program[0]).split(".")[0].removesuffix("-script") if program else ""
     return script if script == "flockenv" else ""
 
 
-def _beside(package: str) -> bool:
+def _is_beside_flockenv(package: str) -> bool:
     """Return True if a package that is being imported lies beside flockenv: other programs also have an `agents`."""
     file = getattr(sys.modules.get(package), "__file__", None) or ""
     theirs, ours = (os.path.dirname(os.path.dirname(os.path.realpath(path))) for path in (file, _PACKAGE))

@@ -16,7 +16,17 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-__all__ = ["KeyPath", "Refusal", "key_path", "nearest", "nearest_few", "refusals", "shown", "shown_path", "steps_of"]
+__all__ = [
+    "KeyPath",
+    "Refusal",
+    "key_path",
+    "nearest",
+    "nearest_few",
+    "parse_key_path",
+    "printable",
+    "printable_path",
+    "refusals",
+]
 
 KeyPath = tuple[str | int, ...]
 """Path to a value: ("effects", 1, "radius") is effects[1].radius."""
@@ -49,19 +59,19 @@ def refusals(error: ValidationError, model: type[BaseModel], data: object) -> li
     found: dict[KeyPath, ErrorDetails] = {}
     for detail in error.errors(include_url=False)[:MOST]:
         path = _path_in(data, detail)
-        if path not in found or (_other_member(found[path]) and not _other_member(detail)):
+        if path not in found or (_is_type_error(found[path]) and not _is_type_error(detail)):
             found[path] = detail
     blocks = {path[:k] for path in found for k in range(len(path))}
-    meant = {_meant(path, schema, data) for path, detail in found.items() if detail["type"] == "extra_forbidden"}
+    meant = {_nearest_path(path, schema, data) for path, detail in found.items() if detail["type"] == "extra_forbidden"}
     echoes = {"missing": meant, "too_short": blocks}
     return [
         Refusal(path, _line(path, detail, schema, data))
         for path, detail in found.items()
-        if path not in echoes.get(detail["type"], blocks if _other_member(detail) else ())
+        if path not in echoes.get(detail["type"], blocks if _is_type_error(detail) else ())
     ]
 
 
-def _other_member(detail: ErrorDetails) -> bool:
+def _is_type_error(detail: ErrorDetails) -> bool:
     """Return True for a type error, which pydantic also reports for each union member that does not fit."""
     return detail["type"] in ("float_type", "int_type", "string_type", "bool_type")
 
@@ -72,15 +82,15 @@ def _schema_of(model: type[BaseModel]) -> Schema:
     return model.model_json_schema()
 
 
-def _meant(path: KeyPath, schema: Schema, data: object) -> KeyPath:
+def _nearest_path(path: KeyPath, schema: Schema, data: object) -> KeyPath:
     """Return the path with its last, unknown key replaced by the nearest known one."""
-    close = _close(str(path[-1]), _keys(path, schema, data))
+    close = _close_matches(str(path[-1]), _keys(path, schema, data))
     return (*path[:-1], *close)
 
 
 def nearest(word: str, allowed: Iterable[str]) -> str:
     """Return ', did you mean `x`?' for the allowed name nearest to `word`, or '' if none is near."""
-    return "".join(f", did you mean `{name}`?" for name in _close(word, allowed))
+    return "".join(f", did you mean `{name}`?" for name in _close_matches(word, allowed))
 
 
 def nearest_few(word: str, allowed: Iterable[str]) -> str:
@@ -88,10 +98,10 @@ def nearest_few(word: str, allowed: Iterable[str]) -> str:
     names = sorted(allowed)
     if len(names) <= FEW:
         return f"; allowed: {', '.join(names)}"
-    return f"; the nearest of {len(names)}: {', '.join(_close(word, names, FEW // 2, 0.0))}"
+    return f"; the nearest of {len(names)}: {', '.join(_close_matches(word, names, FEW // 2, 0.0))}"
 
 
-def _close(word: str, allowed: Iterable[str], most: int = 1, least: float = 0.6) -> list[str]:
+def _close_matches(word: str, allowed: Iterable[str], most: int = 1, least: float = 0.6) -> list[str]:
     """Return at most `most` names, the most similar first, each with a similarity ratio of at least `least`."""
     names = {name.lower(): name for name in allowed}
     return [names[name] for name in difflib.get_close_matches(word[:200].lower(), names, n=most, cutoff=least)]
@@ -104,24 +114,24 @@ def key_path(path: KeyPath) -> str:
         if isinstance(step, int):
             text += f"[{step}]"
         else:
-            text += ("." if text else "") + (step if re.fullmatch(r"[\w-]{1,60}", step) else shown(step))
+            text += ("." if text else "") + (step if re.fullmatch(r"[\w-]{1,60}", step) else printable(step))
     return text
 
 
-def steps_of(text: str) -> KeyPath:
+def parse_key_path(text: str) -> KeyPath:
     """Return the key path that a message begins with, () if it begins with none: the inverse of `key_path`."""
     start = re.match(r"[A-Za-z_]\w*(\.[\w-]+|\.'[^']+'|\[\d+\])*", text)
     steps = re.findall(r"([\w-]+)|'([^']+)'|\[(\d+)\]", start[0]) if start else []
     return tuple(int(index) if index else name or quoted for name, quoted, index in steps)
 
 
-def shown(value: object) -> str:
+def printable(value: object) -> str:
     """Return a value as one short printable line."""
     text = repr(value)
     return text if len(text) <= 60 else text[:50] + f"... ({len(text)} characters)"
 
 
-def shown_path(path: str | os.PathLike[str]) -> str:
+def printable_path(path: str | os.PathLike[str]) -> str:
     """Return a path as one printable line of a bounded length: quoted, control characters escaped."""
     text = repr(os.fspath(path))
     return text if len(text) <= 300 else f"{text[:150]}...{text[-100:]}"
@@ -161,7 +171,7 @@ def _line(path: KeyPath, detail: ErrorDetails, schema: Schema, data: object) -> 
     block = isinstance(value, (Mapping, list, tuple)) and detail["type"] != "extra_forbidden"
     if block or detail["type"] in _MISSING:
         return f"{place}: {reason}" if place else reason
-    return f"{place} = {shown(value)}: {reason}" if place else f"{shown(value)}: {reason}"
+    return f"{place} = {printable(value)}: {reason}" if place else f"{printable(value)}: {reason}"
 
 
 _MISSING = ("missing", "union_tag_not_found")
@@ -179,7 +189,7 @@ def _reason(path: KeyPath, detail: ErrorDetails, schema: Schema, data: object) -
     if kind == "extra_forbidden":
         keys = _keys(path, schema, data)
         return f"unknown key{nearest(str(path[-1]), keys) or ';'} allowed here: {', '.join(keys) or 'no key'}"
-    choices = _tuners(path, detail, schema, data)
+    choices = _choices(path, detail, schema, data)
     if choices:
         close = "" if kind in _MISSING else nearest(str(_value(detail)), choices)
         start = "missing;" if kind in _MISSING else f"unknown{close or ';'}"
@@ -212,10 +222,10 @@ def _keys(path: KeyPath, schema: Schema, data: object) -> list[str]:
     return list(_schema_at(path[:-1], schema, data).get("properties", {}))
 
 
-def _tuners(path: KeyPath, detail: ErrorDetails, schema: Schema, data: object) -> list[str]:
+def _choices(path: KeyPath, detail: ErrorDetails, schema: Schema, data: object) -> list[str]:
     """Return the words that are allowed at `path`; [] if it does not take one of a set of words."""
     if detail["type"].startswith("union_tag_"):
-        union = _follow(_step_down(path[:-1], schema, data), schema)
+        union = _resolve_reference(_step_down(path[:-1], schema, data), schema)
         return list(union.get("discriminator", {}).get("mapping", {}))
     node = _schema_at(path, schema, data)
     words = node.get("enum", [node["const"]] if "const" in node else [])
@@ -251,15 +261,15 @@ def _schema_at(path: KeyPath, schema: Schema, data: object) -> Schema:
     place: Any = data
     for step in path:
         place = _child(place, step)
-    node = _follow(_step_down(path, schema, data), schema)
-    return node if "discriminator" in node and not isinstance(place, Mapping) else _pick(node, place, schema)
+    node = _resolve_reference(_step_down(path, schema, data), schema)
+    return node if "discriminator" in node and not isinstance(place, Mapping) else _select_member(node, place, schema)
 
 
 def _step_down(path: KeyPath, schema: Schema, data: object) -> Schema:
     node: Schema = schema
     place: Any = data
     for step in path:
-        node = _pick(node, place, schema)
+        node = _select_member(node, place, schema)
         node = _item(node, step) if isinstance(step, int) else _member(node, step)
         place = _child(place, step)
     return node
@@ -285,7 +295,7 @@ def _child(place: Any, step: str | int) -> object:
     return None
 
 
-def _follow(node: Schema, schema: Schema) -> Schema:
+def _resolve_reference(node: Schema, schema: Schema) -> Schema:
     """Return the node that a $ref points to; keys beside the $ref, such as the field's description, take precedence."""
     while "$ref" in node:
         rest = {key: value for key, value in node.items() if key != "$ref"}
@@ -293,8 +303,8 @@ def _follow(node: Schema, schema: Schema) -> Schema:
     return node
 
 
-def _pick(node: Schema, place: object, schema: Schema) -> Schema:
-    node = _follow(node, schema)
+def _select_member(node: Schema, place: object, schema: Schema) -> Schema:
+    node = _resolve_reference(node, schema)
     members = list(_members(node))
     if not members:
         return node
@@ -302,12 +312,12 @@ def _pick(node: Schema, place: object, schema: Schema) -> Schema:
     tagged = node.get("discriminator")
     if tagged and isinstance(place, Mapping):
         name = tagged["mapping"].get(str(place.get(tagged["propertyName"])))
-        if name or tagged["propertyName"] in place or not _fits(_follow(chosen, schema), place):
+        if name or tagged["propertyName"] in place or not _fits(_resolve_reference(chosen, schema), place):
             chosen = {"$ref": name} if name else {}  # else the first kind, the default of a block without one
     elif not tagged:
-        chosen = next((m for m in members if _fits(_follow(m, schema), place)), chosen)
+        chosen = next((m for m in members if _fits(_resolve_reference(m, schema), place)), chosen)
     own = {key: value for key, value in node.items() if key == "description"}
-    return {**_pick(chosen, place, schema), **own}
+    return {**_select_member(chosen, place, schema), **own}
 
 
 def _members(node: Schema) -> Iterator[Schema]:

@@ -30,7 +30,7 @@ def bounds(precision: str) -> tuple[float, float]:
 BOUNDS = {precision: bounds(precision) for precision in ("float64", "float32")}
 
 
-def said(precision: str) -> str:
+def allowed_range(precision: str) -> str:
     """Return the part of a message that states what is allowed."""
     least, most = BOUNDS[precision]
     more = "; use dtype = float64" if precision == "float32" else ""
@@ -57,7 +57,7 @@ def outliers(value: Any, precision: str, path: str = "", into_records: bool = Tr
 def check_numbers(value: Any, precision: str, path: str = "", into_records: bool = True) -> None:
     """Raise ValueError if a number in `value` is out of bounds; the message begins with its path; see `outliers`."""
     for place, number in outliers(value, precision, path, into_records):
-        raise ValueError(f"{place} = {number:g}: {said(precision)}")
+        raise ValueError(f"{place} = {number:g}: {allowed_range(precision)}")
 
 
 def check_array(name: str, array: NDArray[np.float64], precision: str) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from flockenv.core.errors import nearest
 
-__all__ = ["check_room", "checked_file", "checked_path"]
+__all__ = ["check_room", "valid_file", "valid_path"]
 
 LONGEST_NAME, LONGEST_PATH = 200, 1000
 
@@ -19,7 +19,7 @@ _RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 """Names that Windows reserves for devices: a file of such a name cannot be copied there."""
 
 
-def checked_path(text: str, option: str = "--out") -> Path:
+def valid_path(text: str, option: str = "--out") -> Path:
     """Return the absolute path of a file or folder that may be written; nothing is created or changed.
 
     With links resolved, it must lie below the current folder or the system's folder for temporary files, so that a
@@ -28,13 +28,13 @@ def checked_path(text: str, option: str = "--out") -> Path:
     Raises:
         ValueError: in one line: the option, the path, and what is wrong with it.
     """
-    fault = _fault(text) or _place(Path(text))
+    fault = _fault(text) or _fault_of_place(Path(text))
     if fault:
-        raise ValueError(f"{option} {_shown(text)}: {fault}")
+        raise ValueError(f"{option} {_printable(text)}: {fault}")
     return Path(text).resolve()
 
 
-def checked_file(
+def valid_file(
     text: str, suffixes: Sequence[str], force: bool = False, option: str = "--out", beside: str | None = None
 ) -> Path:
     """Return the absolute path of a file that may be written and has one of `suffixes`.
@@ -42,21 +42,21 @@ def checked_file(
     beside: the suffix of a second file that is written with it, checked in the same way; "" for a folder.
 
     Raises:
-        ValueError: as `checked_path`; for another suffix; if the file exists and `force` is not given.
+        ValueError: as `valid_path`; for another suffix; if the file exists and `force` is not given.
     """
-    path = checked_path(text, option)
+    path = valid_path(text, option)
     suffix = path.suffix.lower()
     if suffix not in suffixes:
-        raise ValueError(f"{option} {_shown(text)}: must end in {' or '.join(suffixes)}{nearest(suffix, suffixes)}")
+        raise ValueError(f"{option} {_printable(text)}: must end in {' or '.join(suffixes)}{nearest(suffix, suffixes)}")
     if path.is_dir():
-        raise ValueError(f"{option} {_shown(text)}: is a folder")
+        raise ValueError(f"{option} {_printable(text)}: is a folder")
     if path.exists() and not force:
-        raise ValueError(f"{option} {_shown(text)}: exists already; --force overwrites it")
+        raise ValueError(f"{option} {_printable(text)}: exists already; --force overwrites it")
     if beside == "":
         if path.with_suffix("").exists() and not path.with_suffix("").is_dir():
-            raise ValueError(f"{option} {_shown(text)}: {path.stem!r} beside it is a file, must be a folder")
+            raise ValueError(f"{option} {_printable(text)}: {path.stem!r} beside it is a file, must be a folder")
     elif beside is not None and beside != suffix:
-        checked_file(str(path.with_suffix(beside)), [beside], force, option)
+        valid_file(str(path.with_suffix(beside)), [beside], force, option)
     return path
 
 
@@ -73,7 +73,7 @@ def _fault(text: str) -> str:
     return f"{reserved[0]!r} is a reserved name" if reserved else ""
 
 
-def _place(path: Path) -> str:
+def _fault_of_place(path: Path) -> str:
     """Return the reason why nothing may be written at a path, '' if there is none."""
     target = path.resolve()
     allowed = [Path.cwd().resolve(), Path(tempfile.gettempdir()).resolve()]
@@ -82,11 +82,11 @@ def _place(path: Path) -> str:
     around = target.parents if target.is_file() else (target, *target.parents)
     folder = next(place for place in around if place.exists())
     if not folder.is_dir():
-        return f"{_shown(str(folder))} is not a folder"
-    return "" if os.access(folder, os.W_OK | os.X_OK) else f"{_shown(str(folder))} cannot be written to"
+        return f"{_printable(str(folder))} is not a folder"
+    return "" if os.access(folder, os.W_OK | os.X_OK) else f"{_printable(str(folder))} cannot be written to"
 
 
-def _shown(text: str) -> str:
+def _printable(text: str) -> str:
     return repr(text) if len(text) <= 200 else f"{text[:80]!r}... ({len(text)} characters)"
 
 

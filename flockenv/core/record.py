@@ -12,31 +12,31 @@ from pydantic_core import PydanticCustomError
 from flockenv.core.errors import refusals
 from flockenv.core.magnitudes import check_numbers
 
-__all__ = ["Record", "ResultRecord", "in_tuples", "keep"]
+__all__ = ["Record", "ResultRecord", "instance_of", "lists_to_tuples"]
 
 _NUMBERS = (float, int, float | None, int | None)
 
 
-def keep(*kinds: type) -> Callable[[Any, Any], Any]:
+def instance_of(*kinds: type) -> Callable[[Any, Any], Any]:
     """Return a validator that accepts any instance of `kinds` unchanged, also of a class defined outside flockenv.
 
     Other values, such as blocks of a file, go through pydantic's own validation with its list of known kinds.
     """
 
-    def kept(value: Any, handler: Any) -> Any:
-        return value if isinstance(value, kinds) else handler(in_tuples(value))
+    def validate(value: Any, handler: Any) -> Any:
+        return value if isinstance(value, kinds) else handler(lists_to_tuples(value))
 
-    return kept
+    return validate
 
 
-def in_tuples(value: Any) -> Any:
+def lists_to_tuples(value: Any) -> Any:
     """Return the content of a file with lists replaced by tuples at every depth; mappings become dicts.
 
-    Pydantic's strict mode accepts a list as a tuple only from JSON, and a function like `kept` receives Python values.
+    Pydantic's strict mode accepts a list as a tuple only from JSON, and a validator receives Python values.
     """
     if isinstance(value, Mapping):
-        return {key: in_tuples(inner) for key, inner in value.items()}
-    return tuple(map(in_tuples, value)) if isinstance(value, (list, tuple)) else value
+        return {key: lists_to_tuples(inner) for key, inner in value.items()}
+    return tuple(map(lists_to_tuples, value)) if isinstance(value, (list, tuple)) else value
 
 
 class _OneLine(ModelMetaclass):
@@ -88,7 +88,7 @@ class Record(BaseModel, metaclass=_OneLine):
         written.update(dict.fromkeys(written.keys() & cls.__class_vars__, ClassVar))
 
     @model_validator(mode="after")
-    def _representable(self) -> Self:
+    def _check_magnitudes(self) -> Self:
         """Raise ValueError for numbers so large or small that laws overflow; nested records were checked when made."""
         for name in type(self).model_fields:
             value = getattr(self, name)
@@ -129,6 +129,6 @@ class ResultRecord(Record):
     """A record of computed results: its numbers may have any finite size, as no law reads them."""
 
     @model_validator(mode="after")
-    def _representable(self) -> Self:
+    def _check_magnitudes(self) -> Self:
         """Accept every number: a speed may have decayed to 1e-217 m/s."""
         return self

@@ -23,7 +23,19 @@ from types import FrameType
 
 from flockenv.core import early_signals
 
-__all__ = ["begin", "begin_early", "clean", "code", "held", "leave", "running", "said", "say", "serve", "unfinished"]
+__all__ = [
+    "begin",
+    "begin_early",
+    "begin_worker",
+    "defer_signals",
+    "exit_code",
+    "exit_now",
+    "handle_signals",
+    "remove_at_end",
+    "remove_unfinished",
+    "set_message",
+    "take_message",
+]
 
 PATIENCE = 1.0
 """Seconds to wait for a line at which KeyboardInterrupt can be raised."""
@@ -50,12 +62,12 @@ WRITING = {"_write_atomic", "save_overload", "_save_overload", "_save_index", "_
 """Functions of Python and numba that write a temporary file and rename it: these are not interrupted."""
 
 
-class _Asked:
+class _Received:
     """State of the signal that this process is handling, if any."""
 
     name = "flockenv"
     text = ""  # the text of the line, instead of that of SIGNALS
-    said = False  # the line has been written
+    written = False  # the line has been written
     main = 0  # the thread that handles signals
     running = False  # the command itself has started: it may have results to save
     signal = 0
@@ -70,7 +82,7 @@ _ending = _thread.RLock()
 _unfinished: dict[str, bool] = {}
 """Files and folders that are not complete yet, in order of creation; True: removed only if empty."""
 
-_held: set[object] = set()
+_deferring: set[object] = set()
 """Sections, in any thread, that must not be interrupted."""
 
 
@@ -78,19 +90,19 @@ def begin_early() -> None:
     """Start to handle signals if this process is a command of flockenv or agents; otherwise do nothing."""
     if "--multiprocessing-fork" in sys.orig_argv:
         if os.environ.get(PARENT) == str(os.getppid()):
-            serve()
-            _thread.start_new_thread(_follow, (os.getppid(),))
+            begin_worker()
+            _thread.start_new_thread(_end_after, (os.getppid(),))
     elif name := early_signals.command():
         begin(name)
 
 
 def begin(name: str) -> None:
     """Start to handle signals; every line begins with `name`. Ignored signals, as under nohup, stay ignored."""
-    _Asked.name = name
+    _Received.name = name
     if os.name != "posix":  # only Python's own KeyboardInterrupt is available
         return
-    if not _Asked.main:
-        _Asked.main = _thread.get_ident()
+    if not _Received.main:
+        _Received.main = _thread.get_ident()
         arrived, written = os.pipe()
         os.set_blocking(written, False)
         signal.set_wakeup_fd(written, warn_on_full_buffer=False)
@@ -106,15 +118,15 @@ def _finish() -> None:
 
     While Python shuts down, a thread that ends the process would write its line but not set the exit code.
     """
-    if _Asked.main:
+    if _Received.main:
         for which in SIGNALS:
             signal.signal(getattr(signal, which), signal.SIG_IGN)
         _ending.acquire()  # never released
 
 
-def leave(code: int) -> None:
+def exit_now(code: int) -> None:
     """End an interrupted process at once: Python's own shutdown could be interrupted again."""
-    clean()
+    remove_unfinished()
     with suppress(OSError, ValueError):
         sys.stdout.flush()
     with suppress(OSError, ValueError):
@@ -122,16 +134,16 @@ def leave(code: int) -> None:
     os._exit(code)
 
 
-def serve() -> None:
+def begin_worker() -> None:
     """Make a worker process of a command end on SIGTERM only, without output; the command handles the other signals."""
-    begin(_Asked.name)
-    _Asked.said = True
+    begin(_Received.name)
+    _Received.written = True
     for which in ("SIGINT", "SIGHUP"):
         if hasattr(signal, which):
             signal.signal(getattr(signal, which), signal.SIG_IGN)
 
 
-def _follow(parent: int) -> None:
+def _end_after(parent: int) -> None:
     """End this process after its parent has ended, even by SIGKILL: its parent process id then changes."""
     while os.getppid() == parent:
         time.sleep(0.25)
@@ -139,31 +151,31 @@ def _follow(parent: int) -> None:
 
 
 @contextmanager
-def running(name: str) -> Iterator[None]:
+def handle_signals(name: str) -> Iterator[None]:
     """Handle signals while a command runs; at its end remove partly written files and ignore later signals."""
     begin(name)
-    _Asked.running = True
+    _Received.running = True
     try:
         yield
     finally:
-        clean()
-        _Asked.running = False
+        remove_unfinished()
+        _Received.running = False
         _finish()
 
 
 @contextmanager
-def held() -> Iterator[None]:
+def defer_signals() -> Iterator[None]:
     """Defer signals until the end of a short block that must not be interrupted, such as renaming several files."""
     section = object()
-    _held.add(section)  # a set, not a counter: `+= 1` from two threads may lose one
+    _deferring.add(section)  # a set, not a counter: `+= 1` from two threads may lose one
     try:
         yield
     finally:
-        _held.discard(section)
+        _deferring.discard(section)
 
 
 @contextmanager
-def unfinished(path: str | os.PathLike[str], if_empty: bool = False) -> Iterator[str]:
+def remove_at_end(path: str | os.PathLike[str], if_empty: bool = False) -> Iterator[str]:
     """Remove a file or folder at the end of the block or when a signal ends the process; yield its absolute path.
 
     Complete files have been renamed before. if_empty: a folder is removed only if it is empty.
@@ -177,32 +189,32 @@ def unfinished(path: str | os.PathLike[str], if_empty: bool = False) -> Iterator
         _unfinished.pop(name, None)
 
 
-def clean() -> None:
+def remove_unfinished() -> None:
     """Remove all files and folders that are not complete."""
     for name, if_empty in reversed(list(_unfinished.items())):
         _remove(name, if_empty)
         _unfinished.pop(name, None)
 
 
-def say(text: str) -> None:
+def set_message(text: str) -> None:
     """Set the text of the line about a signal. A leading "interrupted" is replaced by the signal's own word."""
-    _Asked.text, _Asked.said = text, False
+    _Received.text, _Received.written = text, False
 
 
-def said() -> str:
+def take_message() -> str:
     """Return the line about the signal and mark it as written; "" if it was written before."""
-    if _Asked.said:
+    if _Received.written:
         return ""
-    _Asked.said = True
-    number = _Asked.signal or signal.SIGINT
-    word, text = SIGNALS[signal.Signals(number).name], _Asked.text or SIGNALS["SIGINT"]
-    kept = text.removeprefix(SIGNALS["SIGINT"])
-    return f"{_Asked.name}: {text if kept == text else word + kept}"
+    _Received.written = True
+    number = _Received.signal or signal.SIGINT
+    word, text = SIGNALS[signal.Signals(number).name], _Received.text or SIGNALS["SIGINT"]
+    rest = text.removeprefix(SIGNALS["SIGINT"])
+    return f"{_Received.name}: {text if rest == text else word + rest}"
 
 
-def code() -> int:
+def exit_code() -> int:
     """Return the exit code of a command that was interrupted: 128 + the signal."""
-    return 128 + (_Asked.signal or signal.SIGINT)
+    return 128 + (_Received.signal or signal.SIGINT)
 
 
 def _remove(name: str, if_empty: bool = False) -> None:
@@ -217,19 +229,19 @@ def _remove(name: str, if_empty: bool = False) -> None:
 
 def _handle(number: int, frame: FrameType | None) -> None:
     """Raise KeyboardInterrupt if the current line allows it; otherwise return, and end the process after PATIENCE."""
-    own, now = _Asked.again, time.monotonic()
-    _Asked.again = False
-    if not _Asked.signal:
-        _Asked.signal, _Asked.since = number, now
-    elif not own and now - _Asked.since < ONE_PRESS:
+    own, now = _Received.again, time.monotonic()
+    _Received.again = False
+    if not _Received.signal:
+        _Received.signal, _Received.since = number, now
+    elif not own and now - _Received.since < ONE_PRESS:
         return
-    if _held or _is_writing(frame) or (own and _Asked.raised):
+    if _deferring or _is_writing(frame) or (own and _Received.raised):
         return
-    twice = not own and now - _Asked.since > ONE_PRESS
-    if not _Asked.running or _Asked.raised or twice or now - _Asked.since > PATIENCE:
+    twice = not own and now - _Received.since > ONE_PRESS
+    if not _Received.running or _Received.raised or twice or now - _Received.since > PATIENCE:
         _end(number)
     elif _can_raise(frame):
-        _Asked.raised = True
+        _Received.raised = True
         raise KeyboardInterrupt
 
 
@@ -265,14 +277,14 @@ def _watch(signals: int) -> None:
         number = signal.Signals(arrived[0])
         if number.name not in SIGNALS:  # a signal of another library
             continue
-        until = time.monotonic() + (2 * PATIENCE if _Asked.running and not known else PATIENCE / 2)
-        while known or not _Asked.raised:
-            if time.monotonic() > until and not _held:
-                _end(_Asked.signal or number)
+        until = time.monotonic() + (2 * PATIENCE if _Received.running and not known else PATIENCE / 2)
+        while known or not _Received.raised:
+            if time.monotonic() > until and not _deferring:
+                _end(_Received.signal or number)
             time.sleep(AGAIN)
-            if not _Asked.raised:
-                _Asked.again = True
-                signal.pthread_kill(_Asked.main, _Asked.signal or number)
+            if not _Received.raised:
+                _Received.again = True
+                signal.pthread_kill(_Received.main, _Received.signal or number)
         known = True
         time.sleep(ONE_PRESS)
         while select.select([signals], [], [], 0)[0]:  # signals sent above, or from the same key press
@@ -282,12 +294,12 @@ def _watch(signals: int) -> None:
 def _end(number: int) -> None:
     """Remove partly written files, write one line and end the process, without Python's own shutdown."""
     _ending.acquire()
-    clean()
-    if _thread.get_ident() == _Asked.main:
+    remove_unfinished()
+    if _thread.get_ident() == _Received.main:
         with suppress(BaseException):  # closed, full, or in the middle of being written to
             sys.stdout.flush()
-    _Asked.signal = number
-    line = said()
+    _Received.signal = number
+    line = take_message()
     cursor = "\r\x1b[2K\x1b[?25h" if os.isatty(2) else ""  # a progress bar hides the cursor
     try:
         os.write(2, f"{cursor}{line}\n".encode() if line else b"")

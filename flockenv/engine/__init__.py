@@ -21,10 +21,10 @@ from __future__ import annotations
 from flockenv.engine.bonds import Table, pack
 from flockenv.engine.context import Worlds, worlds_of
 from flockenv.engine.entry_points import BeginPlan, begin_inner_of, begin_of, begin_plan, field_of, step_of
-from flockenv.engine.kernel_plan import KernelPlan, Look, flattened
+from flockenv.engine.kernel_plan import KernelPlan, Look, flatten_effects
 from flockenv.engine.observation_query import look_of
 from flockenv.engine.query_plan import LookPlan, plan_look
-from flockenv.engine.scratch import GIVEN, OWN, scratch_bytes, scratch_of, scratch_record
+from flockenv.engine.scratch import OWN, TABLES, scratch_bytes, scratch_of, scratch_record
 from flockenv.engine.step import StepPlan, step_plan, step_world_of
 
 __all__ = [

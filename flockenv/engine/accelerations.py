@@ -15,14 +15,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flockenv.engine.agent_records import AgentPlan, agent_plan, alone_of, still
+from flockenv.engine.agent_records import AgentPlan, agent_of, agent_plan, at_rest
 from flockenv.engine.blocks import common_places, put_vector_of, vector_of_lane
 from flockenv.engine.bonds import BondPlan, bond_plan, bonds_of
 from flockenv.engine.far_field import FarPlan, far_of, far_plan
 from flockenv.engine.group_laws import GroupPlan, find_groups_of, group_plan, members_of
 from flockenv.engine.kernel_plan import KernelPlan
-from flockenv.engine.lane_access import gather, picked
-from flockenv.engine.law_calls import OneLaw, given_of, laws_of, says_of, sum_of
+from flockenv.engine.lane_access import gather, pick_items
+from flockenv.engine.law_calls import OneLaw, arguments_of, laws_of, sum_of, value_of
 from flockenv.engine.obstacle_loop import obstacles_of
 from flockenv.engine.obstacle_plan import Obstacles, obstacle_plan
 from flockenv.engine.pair_loop import meet_neighbours
@@ -31,7 +31,7 @@ from flockenv.jit.decorators import Law, Vec, kernel, like
 from flockenv.jit.section import section, tuple_from
 from flockenv.maths.vectors import add, limit, scale, select, zero
 
-__all__ = ["accelerate_of", "felt_of", "respond_of", "response_plan", "sense_of", "sense_plan"]
+__all__ = ["accelerate_of", "pair_force_of", "respond_of", "response_plan", "sense_of", "sense_plan"]
 
 
 class Added(NamedTuple):
@@ -42,7 +42,7 @@ class Added(NamedTuple):
     places: tuple[int, ...] = ()  # of a fold: its numbers among the lanes; of "felt": where it lies in a block
 
 
-class Reconciled(NamedTuple):
+class Combination(NamedTuple):
     """An effect that combines the steering forces of several behaviours into one."""
 
     k: int
@@ -59,7 +59,7 @@ class ResponsePlan(NamedTuple):
     flows: tuple[OneLaw, ...]
     added: tuple[Added, ...]
     totals: tuple[tuple[int, ...], ...]  # indices into `added`: of steering, external and behaviour forces
-    reconciled: tuple[Reconciled, ...]
+    reconciled: tuple[Combination, ...]
     steered: tuple[tuple[int, ...], tuple[int, ...]]  # indices into `reconciled`: of steering, external forces
     felt: int  # count of numbers of a block in `felt`
     obstacles: Obstacles | None
@@ -84,7 +84,7 @@ def response_plan(parts: KernelPlan) -> ResponsePlan:
     added += [("f", Added("pulled"))] * parts.pulls
     mine = [(k, e) for k, e in enumerate(parts.effects) if e.wishes]
     reconciled = tuple(
-        Reconciled(k, e.steer_law, tuple(j for j, wish in enumerate(wishes) if parts.wishes[wish] == k))
+        Combination(k, e.steer_law, tuple(j for j, wish in enumerate(wishes) if parts.wishes[wish] == k))
         for k, e in mine
     )
     steered = [tuple(j for j, (k, _) in enumerate(mine) if parts.target(k) == name) for name in ("s", "f")]
@@ -155,7 +155,7 @@ def _aim(agent: AgentPlan, laws: tuple[OneLaw, ...]) -> Callable[..., None]:
     """Make `aim(context, pos, vel, time)`: write the desired direction of each of this thread's agents."""
     d, width = agent.dimension, agent.width
     size, vector, put = np.uint64(d * width), vector_of_lane(d, width), put_vector_of(d, width)
-    alone, ways, total = alone_of(agent._replace(aims=False)), tuple_from(*map(says_of, laws)), _sum_all(laws)
+    alone, ways, total = agent_of(agent._replace(aims=False)), tuple_from(*map(value_of, laws)), _sum_all(laws)
 
     def aim(context: Any, pos: Any, vel: Any, time: Any) -> None:
         scratch, numbers, drawn = context.scratch, context.numbers, context.key[context.b]
@@ -179,21 +179,21 @@ def _sum_all(laws: tuple[Any, ...]) -> Callable[[Vec, Any], Vec]:
 
 
 @functools.cache
-def felt_of(dimension: int, width: int, each: int, place: int) -> Callable[..., Vec]:
+def pair_force_of(dimension: int, width: int, each: int, place: int) -> Callable[..., Vec]:
     """Return `felt(scratch, row, lane)`: the sum of pair laws for the agent in a lane of the block at `row`."""
     vector, first, rows = vector_of_lane(dimension, width), np.uint64(place), np.uint64(each // width)
     return kernel(lambda scratch, row, lane: vector(scratch.felt, row * rows + first + lane))
 
 
 @functools.cache
-def _adding(plan: ResponsePlan, added: Added) -> Callable[..., Vec]:
+def _added_vector(plan: ResponsePlan, added: Added) -> Callable[..., Vec]:
     """Return `adds(numbers, scratch, me, row, at, lane)`: a vector that is added for an agent."""
     kind, one, places = added
     vector = vector_of_lane(plan.agent.dimension, plan.agent.width)
     if kind == "pulled":
         return kernel(lambda numbers, scratch, me, row, at, lane: vector(scratch.pulled, at))
     if kind == "felt":
-        felt = felt_of(plan.agent.dimension, plan.agent.width, plan.felt, *places)
+        felt = pair_force_of(plan.agent.dimension, plan.agent.width, plan.felt, *places)
         return kernel(lambda numbers, scratch, me, row, at, lane: felt(scratch, row, lane))
     assert one is not None
     if kind == "fold":
@@ -202,7 +202,7 @@ def _adding(plan: ResponsePlan, added: Added) -> Callable[..., Vec]:
             lambda numbers, scratch, me, row, at, lane: law(numbers.effects[k], me, gather(scratch.lanes, lane, places))
         )
     if kind == "group":
-        given, law = given_of(one.k, one.images), one.law
+        given, law = arguments_of(one.k, one.images), one.law
         assert plan.groups is not None
         members = members_of(plan.groups, next(each for each in plan.groups.laws if each.k == one.k))
         return kernel(
@@ -210,9 +210,9 @@ def _adding(plan: ResponsePlan, added: Added) -> Callable[..., Vec]:
                 given(numbers, me), me, members(scratch.lanes, numbers.size, me.pos)
             )
         )
-    says = says_of(one)
+    says = value_of(one)
     if kind == "still":
-        return kernel(lambda numbers, scratch, me, row, at, lane: says(numbers, still(me)))
+        return kernel(lambda numbers, scratch, me, row, at, lane: says(numbers, at_rest(me)))
     return kernel(lambda numbers, scratch, me, row, at, lane: says(numbers, me))
 
 
@@ -223,7 +223,7 @@ def _totals(plan: ResponsePlan) -> Callable[..., Any]:
     `wanted` is the commanded steering force. Returns the steering force, the external force, and the tuple of the
     forces of those behaviours that an effect combines.
     """
-    adding = tuple_from(*(_adding(plan, one) for one in plan.added)) if plan.added else None
+    adding = tuple_from(*(_added_vector(plan, one) for one in plan.added)) if plan.added else None
     want, force, *wishes = map(sum_of, plan.totals)
     wishing: Any = tuple_from(*wishes) if wishes else kernel(lambda start, vectors: ())
 
@@ -238,14 +238,14 @@ def _totals(plan: ResponsePlan) -> Callable[..., Any]:
 
 
 @functools.cache
-def _steering(one: Reconciled) -> Callable[..., Vec]:
+def _combined_force(one: Combination) -> Callable[..., Vec]:
     """Return `steers(numbers, me, wishes)`: an effect's combined behaviours; 0 for an agent of another group."""
     k, law, places = one
 
     def steers(numbers: Any, me: Any, wishes: Any) -> Any:
         p = numbers.effects[k]
         member = (me.who >= p.first) & (me.who < p.end)
-        return select(member, law(p, me, picked(wishes, (), places))[0], zero(me.pos))
+        return select(member, law(p, me, pick_items(wishes, (), places))[0], zero(me.pos))
 
     return kernel(steers)
 
@@ -259,11 +259,11 @@ def respond_of(plan: ResponsePlan) -> Callable[..., None]:
     """
     agent, d, width = plan.agent, plan.agent.dimension, plan.agent.width
     size, vector, put = np.uint64(d * width), vector_of_lane(d, width), put_vector_of(d, width)
-    alone, totals, common = alone_of(agent), _totals(plan), common_places(d, width, plan.masked)
-    medium: Any = tuple_from(*map(says_of, plan.media)) if plan.media else None
+    alone, totals, common = agent_of(agent), _totals(plan), common_places(d, width, plan.masked)
+    medium: Any = tuple_from(*map(value_of, plan.media)) if plan.media else None
     of_medium, of_flow = _sum_all(plan.media), _sum_all(plan.flows)
-    flow: Any = tuple_from(*map(says_of, plan.flows)) if plan.flows else None
-    steering: Any = tuple_from(*map(_steering, plan.reconciled)) if plan.reconciled else None
+    flow: Any = tuple_from(*map(value_of, plan.flows)) if plan.flows else None
+    steering: Any = tuple_from(*map(_combined_force, plan.reconciled)) if plan.reconciled else None
     to_want, to_force = map(sum_of, plan.steered)
     meet_obstacles = obstacles_of(plan.obstacles) if plan.obstacles is not None else None
 

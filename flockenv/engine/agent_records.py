@@ -15,7 +15,7 @@ from flockenv.physics.effects.effect import Me
 if TYPE_CHECKING:
     from flockenv.engine.kernel_plan import KernelPlan
 
-__all__ = ["AgentPlan", "agent_plan", "alone_of", "inner_of", "still"]
+__all__ = ["AgentPlan", "agent_of", "agent_plan", "at_rest", "inner_of"]
 
 
 class AgentPlan(NamedTuple):
@@ -36,7 +36,7 @@ def agent_plan(parts: KernelPlan) -> AgentPlan:
 
 
 @section
-def alone_of(plan: AgentPlan) -> Callable[..., Me]:
+def agent_of(plan: AgentPlan) -> Callable[..., Me]:
     """Make `alone(scratch, drawn, time, place, i, one, x, v, medium)`: agent i as the laws of one agent see it.
 
     Its vectors lie at `place`, its body at `one`. Its tie is 0: only pairs in the same position need one.
@@ -70,7 +70,7 @@ def alone_of(plan: AgentPlan) -> Callable[..., Me]:
 
 
 @law
-def still(me: Me) -> Me:
+def at_rest(me: Me) -> Me:
     """Return an agent at rest: what its law gives then is left for a method that integrates linear drag by itself."""
     o = zero(me.pos)
     mass, radius, max_speed, max_force = me.mass, me.radius, me.max_speed, me.max_force

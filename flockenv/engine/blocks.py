@@ -17,7 +17,13 @@ from flockenv.jit.intrinsics import copy_lanes
 from flockenv.jit.section import section
 
 __all__ = [
-    "common_places", "handed_of", "into_blocks", "out_of_blocks", "place_of", "put_vector_of", "vector_of",
+    "arrays_of",
+    "common_places",
+    "into_blocks",
+    "out_of_blocks",
+    "place_of",
+    "put_vector_of",
+    "vector_of",
     "vector_of_lane",
 ]  # fmt: skip
 
@@ -131,7 +137,7 @@ def out_of_blocks(dimension: int, width: int) -> Callable[..., None]:
 
 
 @section
-def handed_of(inner: bool) -> Callable[..., Any]:
+def arrays_of(inner: bool) -> Callable[..., Any]:
     """Make `handed(scratch, pos, vel)`: a tuple of arrays, positions, velocities and, if any, inner states.
 
     The indices of the arrays of scratch follow on from theirs, see `lane_access.picked`.

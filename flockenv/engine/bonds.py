@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.engine.agent_records import AgentPlan, alone_of, inner_of
+from flockenv.engine.agent_records import AgentPlan, agent_of, inner_of
 from flockenv.engine.blocks import vector_of_lane
 from flockenv.engine.kernel_plan import KernelPlan
 from flockenv.engine.lane_access import gather
@@ -48,7 +48,7 @@ def pack(parts: KernelPlan, agents: int, groups: Sequence[object]) -> Table:
         except ValueError as error:
             listed = k - sum(wish < k for wish in parts.wishes)  # the effects listed before the one that combines them
             raise ValueError(f"effects[{listed}].{error}") from None
-        start, place, number = _packed(found, agents, blocks, w, d)
+        start, place, number = _pack_bonds(found, agents, blocks, w, d)
         starts.append(start)
         bases += [first_place, first_number]
         first_place, first_number = first_place + place.size, first_number + number.size
@@ -62,7 +62,7 @@ def pack(parts: KernelPlan, agents: int, groups: Sequence[object]) -> Table:
     )
 
 
-def _packed(
+def _pack_bonds(
     bonds: Bonds, agents: int, blocks: int, width: int, dimension: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
     """Return the starts of blocks, places (slots, P, W) and numbers (slots, C, W)."""
@@ -148,7 +148,7 @@ def _add_bonds(plan: BondPlan, place: int) -> Callable[..., None]:
     before = _add_bonds(plan, place - 1) if place else None
     k, law, partners, numbers = plan.laws[place]
     dimension, width = plan.agent.dimension, plan.agent.width
-    vector, alone, partners_of = vector_of_lane(dimension, width), alone_of(plan.agent), _partners(plan, partners)
+    vector, alone, partners_of = vector_of_lane(dimension, width), agent_of(plan.agent), _partners(plan, partners)
     are_alive = _are_alive(dimension, width, partners)
     of_bond = tuple(number * width for number in range(numbers))
     keeps, apart, wide = bool(plan.agent.inner), partners * width, numbers * width

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flockenv.engine.accelerations import ResponsePlan, SensePlan, accelerate_of, response_plan, sense_plan
-from flockenv.engine.agent_records import alone_of
+from flockenv.engine.agent_records import agent_of
 from flockenv.engine.blocks import out_of_blocks, place_of, vector_of_lane
 from flockenv.engine.context import Context
 from flockenv.engine.kernel_plan import KernelPlan
@@ -22,7 +22,7 @@ from flockenv.engine.parameters import NumberPlan, numbers_of
 from flockenv.engine.step import StepPlan, step_plan, step_world_of
 from flockenv.jit.decorators import kernel, like
 from flockenv.jit.intrinsics import unaliased
-from flockenv.jit.section import entry_of, in_turn, section, titled
+from flockenv.jit.section import call_in_turn, entry_of, section, set_title
 from flockenv.maths.vectors import zero
 
 __all__ = ["BeginPlan", "begin_inner_of", "begin_of", "begin_plan", "field_of", "step_of"]
@@ -30,7 +30,7 @@ __all__ = ["BeginPlan", "begin_inner_of", "begin_of", "begin_plan", "field_of", 
 
 def step_of(parts: KernelPlan) -> Callable[..., tuple[int, int]]:
     """Return the entry point `step` of a scene: see `_scene_step`."""
-    return titled(_scene_step(step_plan(parts)), f"{_title(parts)}, {parts.integrator.kind}")
+    return set_title(_scene_step(step_plan(parts)), f"{_title(parts)}, {parts.integrator.kind}")
 
 
 def _title(parts: KernelPlan) -> str:
@@ -83,10 +83,10 @@ def begin_inner_of(plan: BeginPlan) -> Callable[..., None]:
     Those of world b, at its current time; fresh (B, N).
     """
     agent, d, width = plan.inner.agent, plan.inner.agent.dimension, plan.inner.agent.width
-    alone, vector, read = alone_of(agent._replace(aims=False)), vector_of_lane(d, width), numbers_of(plan.numbers)
+    alone, vector, read = agent_of(agent._replace(aims=False)), vector_of_lane(d, width), numbers_of(plan.numbers)
     begin, bring_in = begin_agent_of(plan.inner), bring_in_of(agent._replace(inner=()))
     place_in, place, many = place_of(d, width), int(agent.oriented), len(agent.inner)
-    clear, write = in_turn(*map(_clear_number, range(many))), in_turn(*map(_begin_number, range(many)))
+    clear, write = call_in_turn(*map(_clear_number, range(many))), call_in_turn(*map(_begin_number, range(many)))
 
     def begin_inner(worlds: Any, params: Any, dt: Any, fresh: Any, b: Any, scratch: Any) -> None:
         n = worlds.x.shape[2]
@@ -124,7 +124,7 @@ def begin_of(parts: KernelPlan) -> Callable[..., None]:
     """Return the entry point `begin` of a scene with inner states: see `_scene_begin`."""
     plan = begin_plan(parts)
     assert plan is not None, "a scene in which agents keep nothing"
-    return titled(_scene_begin(plan), f"{_title(parts)}, inner states")
+    return set_title(_scene_begin(plan), f"{_title(parts)}, inner states")
 
 
 @entry_of
@@ -143,7 +143,7 @@ def _scene_begin(plan: BeginPlan) -> Callable[..., None]:
 def field_of(parts: KernelPlan) -> Callable[..., None]:
     """Return the entry point `field` of parts that are not `stepped`: see `_scene_field`."""
     made = _scene_field(response_plan(parts), sense_plan(parts), parts.number_plan)
-    return titled(made, f"{_title(parts)}, accelerations")
+    return set_title(made, f"{_title(parts)}, accelerations")
 
 
 @entry_of

@@ -14,7 +14,7 @@ import numpy as np
 
 from flockenv.engine.blocks import place_of, vector_of_lane
 from flockenv.engine.kernel_plan import KernelPlan
-from flockenv.geometry.barnes_hut import BUCKETS, LEVELS, LISTED, gather, line_up, weigh
+from flockenv.geometry.barnes_hut import BUCKETS, LEVELS, LISTED, build_tree, gather, sort_along_curve
 from flockenv.jit.decorators import Law, like
 from flockenv.jit.intrinsics import wait_for_team
 from flockenv.jit.section import section
@@ -76,7 +76,7 @@ def far_of(plan: FarPlan) -> Callable[..., None]:
             leaves, _, digits, _, places = tree
             if rank == 0:
                 keys, bounds = scratch.tree_key, scratch.bounds
-                line_up(pos, living, mass, n, width, sync, bounds, numbers.size, keys, places, digits, leaves)
+                sort_along_curve(pos, living, mass, n, width, sync, bounds, numbers.size, keys, places, digits, leaves)
             share = present, rank, team
             met += walk(numbers.effects, numbers.size, tree, lanes, pulled, sync, scratch.tally, share, time, key)
         else:
@@ -91,13 +91,13 @@ def far_of(plan: FarPlan) -> Callable[..., None]:
 
 
 @section
-def _meet(plan: FarPlan, laws: tuple[FarLaw, ...], in_tree: bool) -> Callable[..., None]:
+def _interact(plan: FarPlan, laws: tuple[FarLaw, ...], in_tree: bool) -> Callable[..., None]:
     """Make `meet(effects, lanes, lane, x, m, xj, heavy, time, key)`: add the effect of a mass at xj to a lane's sums.
 
     The lane is that of an agent at x of mass m. `heavy` is the mass at xj, or in a tree the weight of a node. A mass at
     exactly x adds nothing, because it has no direction: the agent itself above all.
     """
-    before = _meet(plan, laws[:-1], in_tree) if laws[1:] else None
+    before = _interact(plan, laws[:-1], in_tree) if laws[1:] else None
     k, law, by_mass = laws[-1]
     weighs, dimension = by_mass or in_tree, plan.dimension
     first, second, third = (np.uint64(plan.sums + axis * plan.width) for axis in range(3))
@@ -128,7 +128,11 @@ def _direct(plan: FarPlan) -> Callable[..., None]:
     For all laws at once; blocks: the first, and the end.
     """
     dimension, width, sums = plan.dimension, plan.width, np.uint64(plan.sums)
-    meet, vector, place = _meet(plan, plan.direct, False), vector_of_lane(dimension, width), place_of(dimension, width)
+    meet, vector, place = (
+        _interact(plan, plan.direct, False),
+        vector_of_lane(dimension, width),
+        place_of(dimension, width),
+    )
     count = dimension * width
 
     def direct(
@@ -162,7 +166,7 @@ def _walk(plan: FarPlan, laws: tuple[FarLaw, ...]) -> Callable[..., int]:
     """
     before, adds = _walk(plan, laws[:-1]) if laws[1:] else None, bool(plan.direct or laws[1:])
     dimension, width, sums, (k, _, by_mass) = plan.dimension, plan.width, np.uint64(plan.sums), laws[-1]
-    meet, put, vector = _meet(plan, laws[-1:], True), _put(plan, adds), vector_of_lane(dimension, width)
+    meet, put, vector = _interact(plan, laws[-1:], True), _write_sums(plan, adds), vector_of_lane(dimension, width)
     listed, weight = vector_of_lane(dimension, 1), np.uint64(dimension)
     count, step, room = dimension * width, dimension + 1, LISTED * (dimension + 1)
 
@@ -175,7 +179,7 @@ def _walk(plan: FarPlan, laws: tuple[FarLaw, ...]) -> Callable[..., int]:
             total += before(effects, size, tree, lanes, pulled, sync, tally, share, time, key)
         (leaves, nodes, digits, near, places), (present, rank, team) = tree, share
         if rank == 0:
-            weigh(leaves, present, width, size, by_mass, digits, nodes)
+            build_tree(leaves, present, width, size, by_mass, digits, nodes)
         wait_for_team(sync, team)  # the tree is shared by all threads
         met, blocks, begin = 0, (present + width - 1) // width, rank * room
         for block in range(np.uint64(blocks * rank // team), np.uint64(blocks * (rank + 1) // team)):
@@ -206,7 +210,7 @@ def _walk(plan: FarPlan, laws: tuple[FarLaw, ...]) -> Callable[..., int]:
 
 
 @section
-def _put(plan: FarPlan, adds: bool) -> Callable[..., None]:
+def _write_sums(plan: FarPlan, adds: bool) -> Callable[..., None]:
     """Make `put(pulled, lanes, places, first, held)`: write, or add, the sums of a block where its `held` agents lie.
 
     places: which agents they are, from `first` on.

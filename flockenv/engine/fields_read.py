@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from flockenv.jit.decorators import IN_PYTHON, python_of
-from flockenv.jit.sources import held
+from flockenv.jit.sources import free_values
 from flockenv.physics.effects.effect import LAWS, Effect
 
 __all__ = ["OF_PAIRS", "names_read"]
@@ -31,7 +31,7 @@ def names_read(effect: Effect, slots: Sequence[str]) -> set[str]:
         seen.add(id(python))
         names |= set(python.__code__.co_names)
         called: list[Any] = [python.__globals__.get(name) for name in python.__code__.co_names]
-        called += held(python)
+        called += free_values(python)
         modules = [m for m in called if inspect.ismodule(m)]
         called += [getattr(m, name, None) for m in modules for name in python.__code__.co_names]
         todo += [f for f in called if hasattr(f, "py_func") or (IN_PYTHON and inspect.isfunction(f))]

@@ -16,7 +16,7 @@ from flockenv.engine.kernel_plan import KernelPlan
 from flockenv.engine.lane_access import gather, scatter
 from flockenv.jit.decorators import Law, finite, kernel, like
 from flockenv.jit.intrinsics import wait_for_team
-from flockenv.jit.section import in_turn, section
+from flockenv.jit.section import call_in_turn, section
 from flockenv.maths.vectors import add, dot, scale, sub, zero
 from flockenv.physics.effects.effect import Members
 
@@ -51,7 +51,7 @@ def group_plan(parts: KernelPlan) -> GroupPlan:
 @section
 def find_groups_of(plan: GroupPlan) -> Callable[..., None]:
     """Make `find_groups(context, pos, vel)`: compute the groups that laws are about, at this time."""
-    find = in_turn(*(_find(plan, law) for law in plan.laws))
+    find = call_in_turn(*(_find(plan, law) for law in plan.laws))
 
     def find_groups(context: Any, pos: Any, vel: Any) -> None:
         sync, team = context.scratch.sync, context.team

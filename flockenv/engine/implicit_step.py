@@ -64,17 +64,17 @@ def solve_steps(
         bad, reason = -1, ""
         with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is reported
             for _ in range(steps):
-                bad, reason = _solved(scene, method, alone, evaluate, step)
+                bad, reason = _solve_step(scene, method, alone, evaluate, step)
                 if bad >= 0:
                     break
         if bad < 0:
-            _put(state, b, alone)
+            _write_back(state, b, alone)
         elif broken[0] < 0:
             broken = (b, bad, reason)
     return broken
 
 
-def _solved(
+def _solve_step(
     scene: SceneView, method: Implicit, alone: State, evaluate: Evaluate,
     step: Callable[[State, int, Floats, Floats], tuple[int, int]],
 ) -> tuple[int, str]:  # fmt: skip
@@ -97,7 +97,7 @@ def _solved(
     return step(alone, 0, pos, vel)[1], ""
 
 
-def _put(state: State, b: int, alone: State) -> None:
+def _write_back(state: State, b: int, alone: State) -> None:
     """Write a world back to its place in the batch."""
     state.x[:, b], state.v[:, b] = alone.x[:, 0], alone.v[:, 0]
     state.frame[:, b], state.inner[:, b] = alone.frame[:, 0], alone.inner[:, 0]

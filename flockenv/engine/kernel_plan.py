@@ -27,7 +27,7 @@ from flockenv.physics.effects.effect import LAWS, Effect, Sight
 from flockenv.physics.integrators.integrator import Integrator
 from flockenv.physics.integrators.single_stage import OneStage
 
-__all__ = ["KernelPlan", "Look", "flattened"]
+__all__ = ["KernelPlan", "Look", "flatten_effects"]
 
 
 class Look(NamedTuple):
@@ -45,7 +45,7 @@ class KernelPlan(MetObstacles):
     dimension: int
     space: Space
     effects: tuple[Effect, ...]
-    """In the order of `flattened`: behaviours lie before the effect that combines their forces."""
+    """In the order of `flatten_effects`: behaviours lie before the effect that combines their forces."""
     integrator: Integrator
     dtype: str = "float64"
     sorts: bool = True
@@ -415,6 +415,6 @@ class KernelPlan(MetObstacles):
         return {name: place for place, name in enumerate([*names, "bad"])}
 
 
-def flattened(effects: Sequence[Effect]) -> tuple[Effect, ...]:
+def flatten_effects(effects: Sequence[Effect]) -> tuple[Effect, ...]:
     """Return effects with the behaviours that each combines before it: each has laws and numbers of its own."""
     return tuple(each for effect in effects for each in (*effect.wishes, effect))

@@ -19,12 +19,12 @@ from flockenv.jit.memory import array_of
 
 __all__ = [
     "add_where",
-    "chosen",
+    "choose",
     "copy_each",
     "fill",
     "gather",
     "gather_each",
-    "picked",
+    "pick_items",
     "places_each",
     "scatter",
     "scatter_each",
@@ -144,7 +144,7 @@ def _add_where_in_python(
 add_where: Any = intrinsic_or_python(_add_where, _add_where_in_python)
 
 
-def _chosen(typing_context: Any, condition: Any, numbers: Any, others: Any) -> Any:
+def _choose(typing_context: Any, condition: Any, numbers: Any, others: Any) -> Any:
     """Return one of two tuples of numbers, without a branch."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -155,10 +155,10 @@ def _chosen(typing_context: Any, condition: Any, numbers: Any, others: Any) -> A
     return numbers(types.boolean, numbers, numbers), generate
 
 
-chosen: Any = intrinsic_or_python(_chosen, lambda condition, numbers, others: numbers if condition else others)
+choose: Any = intrinsic_or_python(_choose, lambda condition, numbers, others: numbers if condition else others)
 
 
-def _picked(typing_context: Any, given: Any, more: Any, indices: Any) -> Any:
+def _pick_items(typing_context: Any, given: Any, more: Any, indices: Any) -> Any:
     """Return a tuple of some items of two tuples or records; indices count through the first, then the second."""
     wanted, many = _constants(indices, "indices"), len(given)
 
@@ -172,7 +172,9 @@ def _picked(typing_context: Any, given: Any, more: Any, indices: Any) -> Any:
     return _tuple_of([given[k] if k < many else more[k - many] for k in wanted])(given, more, indices), generate
 
 
-picked: Any = intrinsic_or_python(_picked, lambda given, more, indices: tuple((*given, *more)[k] for k in indices))
+pick_items: Any = intrinsic_or_python(
+    _pick_items, lambda given, more, indices: tuple((*given, *more)[k] for k in indices)
+)
 
 
 def _places_each(typing_context: Any, starts: Any, which: Any, further: Any) -> Any:

@@ -13,7 +13,7 @@ from flockenv.maths.vectors import add
 if TYPE_CHECKING:
     from flockenv.engine.kernel_plan import KernelPlan
 
-__all__ = ["OneLaw", "given_of", "laws_of", "says_of", "sum_of"]
+__all__ = ["OneLaw", "arguments_of", "laws_of", "sum_of", "value_of"]
 
 
 class OneLaw(NamedTuple):
@@ -36,7 +36,7 @@ def laws_of(parts: KernelPlan, slot: str) -> tuple[OneLaw, ...]:
 
 
 @functools.cache
-def given_of(k: int, images: Images | None) -> Callable[[Any, Any], Any]:
+def arguments_of(k: int, images: Images | None) -> Callable[[Any, Any], Any]:
     """Return a function `given(numbers, me)`: what the laws of effect k are passed.
 
     Points are replaced by their images nearest to the agent.
@@ -48,9 +48,9 @@ def given_of(k: int, images: Images | None) -> Callable[[Any, Any], Any]:
 
 
 @functools.cache
-def says_of(one: OneLaw) -> Callable[[Any, Any], Any]:
+def value_of(one: OneLaw) -> Callable[[Any, Any], Any]:
     """Return a function `says(numbers, me)`: the value of a law for an agent."""
-    given, law = given_of(one.k, one.images), one.law
+    given, law = arguments_of(one.k, one.images), one.law
     return kernel(lambda numbers, me: law(given(numbers, me), me))
 
 

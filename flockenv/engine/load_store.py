@@ -11,7 +11,7 @@ import numpy as np
 from flockenv.engine.agent_records import AgentPlan
 from flockenv.engine.blocks import into_blocks, out_of_blocks, put_vector_of, vector_of_lane
 from flockenv.jit.decorators import Law, kernel
-from flockenv.jit.section import in_turn, section
+from flockenv.jit.section import call_in_turn, section
 
 __all__ = ["bring_in_of", "bring_inside_of", "bring_out_of", "take_drive_of"]
 
@@ -33,11 +33,11 @@ def _write_number(number: int) -> Callable[..., None]:
 
 
 @section
-def _between(agent: AgentPlan, inwards: bool) -> Callable[..., None]:
+def _copy_between(agent: AgentPlan, inwards: bool) -> Callable[..., None]:
     """Make `bring(worlds, scratch, b, first, end)`: copy these blocks of world b into scratch, or back."""
     d, width, oriented, inner = agent.dimension, agent.width, agent.oriented, len(agent.inner)
     copy, place = (into_blocks if inwards else out_of_blocks)(d, width), int(oriented)
-    copy_numbers = in_turn(*map(_read_number if inwards else _write_number, range(inner)))
+    copy_numbers = call_in_turn(*map(_read_number if inwards else _write_number, range(inner)))
 
     def bring(worlds: Any, scratch: Any, b: Any, first: Any, end: Any) -> None:
         n = worlds.x.shape[2]
@@ -56,12 +56,12 @@ def _between(agent: AgentPlan, inwards: bool) -> Callable[..., None]:
 
 def bring_in_of(agent: AgentPlan) -> Callable[..., None]:
     """Return `bring_in(worlds, scratch, b, first, end)`: copy these blocks of world b into scratch."""
-    return _between(agent, True)
+    return _copy_between(agent, True)
 
 
 def bring_out_of(agent: AgentPlan) -> Callable[..., None]:
     """Return `bring_out(worlds, scratch, b, first, end)`: copy these blocks of scratch back to world b."""
-    return _between(agent, False)
+    return _copy_between(agent, False)
 
 
 @section

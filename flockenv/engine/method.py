@@ -39,7 +39,7 @@ def advance_of(method: Callable[[Provided], Method], plan: MethodPlan) -> Callab
     damping, largest = _damping(plan), _largest(plan.dimension, plan.width)
 
     def advance_of(accelerate: Any) -> Method:
-        made: Method = kernel(method(Provided(accelerate, _settings, damping, largest, _counted)))
+        made: Method = kernel(method(Provided(accelerate, _settings, damping, largest, _count_substeps)))
         return made
 
     return advance_of
@@ -52,7 +52,7 @@ def _settings(context: Any) -> Any:
 
 
 @kernel
-def _counted(context: Any, accepted: Any, rejected: Any) -> None:
+def _count_substeps(context: Any, accepted: Any, rejected: Any) -> None:
     """Count the accepted and rejected substeps of the method."""
     context.work[context.b, SUBSTEPS] += accepted
     context.work[context.b, SUBSTEPS + 1] += rejected

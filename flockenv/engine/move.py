@@ -11,15 +11,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flockenv.engine.accelerations import felt_of
-from flockenv.engine.agent_records import AgentPlan, agent_plan, alone_of
+from flockenv.engine.accelerations import pair_force_of
+from flockenv.engine.agent_records import AgentPlan, agent_of, agent_plan
 from flockenv.engine.blocks import common_places, put_vector_of, vector_of_lane
 from flockenv.engine.kernel_plan import KernelPlan
-from flockenv.engine.law_calls import OneLaw, given_of, says_of
+from flockenv.engine.law_calls import OneLaw, arguments_of, value_of
 from flockenv.jit.decorators import Law, Vec, finite, kernel, like
-from flockenv.jit.section import in_turn, section, tuple_from
+from flockenv.jit.section import call_in_turn, section, tuple_from
 from flockenv.maths.counter_rng import normal
-from flockenv.maths.heading import faced, held, leant, raised, turned
+from flockenv.maths.heading import bank, heading_for, limit_to_heading, turn_towards, up_for
 from flockenv.maths.vectors import add, dot, limit, norm, scale, select, sub, zero
 from flockenv.physics.integrators.single_stage import OneStage
 
@@ -30,7 +30,7 @@ CHANNELS = 8
 """Channels of random numbers of each effect."""
 
 
-class Kept(NamedTuple):
+class KeepLaw(NamedTuple):
     """The laws of an effect that keeps inner states."""
 
     begin: OneLaw
@@ -42,7 +42,7 @@ class InnerPlan(NamedTuple):
     """What changing the inner states of agents depends on."""
 
     agent: AgentPlan
-    laws: tuple[Kept, ...]
+    laws: tuple[KeepLaw, ...]
     numbers: tuple[tuple[tuple[int, int], ...], ...]  # per number: (law, index in its result) of each law that sets it
     felt: int  # count of numbers of a block in `felt`
 
@@ -68,7 +68,7 @@ def inner_plan(parts: KernelPlan) -> InnerPlan | None:
     if not parts.inner:
         return None
     laws = [
-        Kept(
+        KeepLaw(
             OneLaw.of(parts, k, "begin_law"), OneLaw.of(parts, k, "keep_law"),
             parts.felt_at(f"n{k}_") if effect.pair_law else -1,
         )
@@ -96,7 +96,7 @@ def move_plan(parts: KernelPlan) -> MovePlan:
 
 
 @section
-def _moved(plan: MovePlan) -> Callable[..., Any]:
+def _method_step(plan: MovePlan) -> Callable[..., Any]:
     """Make `moved(scratch, pos, vel, at, past, dt)`: return old position and velocity, then new ones by the method.
 
     The agent lies at `at`; what the method saved of it at `past` of `aside`. For a method of one stage that is its
@@ -128,16 +128,16 @@ def _moved(plan: MovePlan) -> Callable[..., Any]:
 
 
 @functools.cache
-def _draws(channel: int) -> Callable[..., float]:
+def _draw(channel: int) -> Callable[..., float]:
     """Return `draws(drawn, instant, i, dt)`: a normal number of (world, step, agent, channel), in dt's precision."""
     return kernel(lambda drawn, instant, i, dt: like(dt, normal(drawn, instant, np.int64(i), channel)))  # type: ignore[arg-type]
 
 
 @functools.cache
-def _kicked(kicks: tuple[tuple[int, Law], ...], dimension: int) -> Callable[..., tuple[Vec, Vec]]:
+def _apply_kicks(kicks: tuple[tuple[int, Law], ...], dimension: int) -> Callable[..., tuple[Vec, Vec]]:
     """Return `kicked(numbers, me, free, drawn, instant, dt, x, v)`: x and v after the step's velocity kicks."""
-    before, (k, law) = _kicked(kicks[:-1], dimension) if kicks[1:] else None, kicks[-1]
-    draws = tuple_from(*(_draws(CHANNELS * k + j) for j in range(dimension)))
+    before, (k, law) = _apply_kicks(kicks[:-1], dimension) if kicks[1:] else None, kicks[-1]
+    draws = tuple_from(*(_draw(CHANNELS * k + j) for j in range(dimension)))
 
     def kicked(numbers: Any, me: Any, free: Any, drawn: Any, instant: Any, dt: Any, x: Any, v: Any) -> Any:
         if before is not None:
@@ -153,7 +153,7 @@ def _kicked(kicks: tuple[tuple[int, Law], ...], dimension: int) -> Callable[...,
 
 
 @section
-def _turned(plan: MovePlan) -> Callable[..., Any]:
+def _limit_turn(plan: MovePlan) -> Callable[..., Any]:
     """Make `turn(scratch, i, at, dt, was, x, v)`: x, v, heading of an agent that turns by at most max_turn_rate dt.
 
     Both its velocity and its displacement in this step are limited so; the displacement by a medium is left out.
@@ -165,16 +165,16 @@ def _turned(plan: MovePlan) -> Callable[..., Any]:
         before, way = vector(scratch.facing, at), sub(x, was)
         if flows:
             way = sub(x, add(was, scale(vector(scratch.carrying, at), dt)))
-        there, over = turned(way, before, most)
-        x = add(x, sub(held(way, there, over), way))
-        ahead, over = turned(v, before, most)
-        return x, held(v, ahead, over), ahead
+        there, over = turn_towards(way, before, most)
+        x = add(x, sub(limit_to_heading(way, there, over), way))
+        ahead, over = turn_towards(v, before, most)
+        return x, limit_to_heading(v, ahead, over), ahead
 
     return turn
 
 
 @section
-def _facing(plan: MovePlan) -> Callable[..., None]:
+def _update_heading(plan: MovePlan) -> Callable[..., None]:
     """Make `face(scratch, i, at, dt, v, ahead)`: write the heading of agent i after the step, and its up vector.
 
     An agent whose turn rate is limited also turns while it stands still: `ahead` is the heading that it has reached.
@@ -184,13 +184,13 @@ def _facing(plan: MovePlan) -> Callable[..., None]:
 
     def face(scratch: Any, i: Any, at: Any, dt: Any, v: Any, ahead: Any) -> None:
         before = vector(scratch.facing, at)
-        now = faced(v, ahead) if turns else faced(v, before)
+        now = heading_for(v, ahead) if turns else heading_for(v, before)
         put(scratch.facing, at, now)
         if dimension == 3:
             up = vector(scratch.above, at)
             if leans:
-                up = leant(now, before, up, norm(v), dt, scratch.banking[i])
-            put(scratch.above, at, raised(now, before, up))
+                up = bank(now, before, up, norm(v), dt, scratch.banking[i])
+            put(scratch.above, at, up_for(now, before, up))
 
     return face
 
@@ -199,32 +199,32 @@ def _facing(plan: MovePlan) -> Callable[..., None]:
 
 
 @functools.cache
-def _becomes(number: int, said: tuple[tuple[int, int], ...]) -> Callable[[Any, Any], float]:
+def _new_number(number: int, said: tuple[tuple[int, int], ...]) -> Callable[[Any, Any], float]:
     """Return `becomes(was, says)`: a number as its only law sets it, or changed by several laws."""
     if said[1:]:
-        return _changed(number, said)
+        return _sum_of_changes(number, said)
     ((law, place),) = said
     return kernel(lambda was, says: says[law][place])
 
 
 @functools.cache
-def _changed(number: int, said: tuple[tuple[int, int], ...]) -> Callable[[Any, Any], float]:
+def _sum_of_changes(number: int, said: tuple[tuple[int, int], ...]) -> Callable[[Any, Any], float]:
     """Return `changed(was, says)`: the old number, plus the changes to it by several laws."""
-    before, (law, place) = _changed(number, said[:-1]) if said[1:] else None, said[-1]
+    before, (law, place) = _sum_of_changes(number, said[:-1]) if said[1:] else None, said[-1]
     if before is None:
         return kernel(lambda was, says: was[number] + (says[law][place] - was[number]))
     return kernel(lambda was, says: before(was, says) + (says[law][place] - was[number]))
 
 
-def _all_become(plan: InnerPlan) -> Callable[..., tuple[float, ...]]:
-    return tuple_from(*(_becomes(number, said) for number, said in enumerate(plan.numbers)))
+def _new_numbers(plan: InnerPlan) -> Callable[..., tuple[float, ...]]:
+    return tuple_from(*(_new_number(number, said) for number, said in enumerate(plan.numbers)))
 
 
 @functools.cache
-def _keeps(plan: InnerPlan, kept: Kept) -> Callable[..., Any]:
+def _evaluate_keep_law(plan: InnerPlan, kept: KeepLaw) -> Callable[..., Any]:
     """Return `keeps(numbers, scratch, me, row, lane, dt)`: the new values of the numbers that a law keeps."""
-    given, law, agent = given_of(kept.keep.k, kept.keep.images), kept.keep.law, plan.agent
-    felt = felt_of(agent.dimension, agent.width, plan.felt, kept.felt) if kept.felt >= 0 else None
+    given, law, agent = arguments_of(kept.keep.k, kept.keep.images), kept.keep.law, plan.agent
+    felt = pair_force_of(agent.dimension, agent.width, plan.felt, kept.felt) if kept.felt >= 0 else None
 
     def keeps(numbers: Any, scratch: Any, me: Any, row: Any, lane: Any, dt: Any) -> Any:
         if felt is not None:
@@ -260,13 +260,13 @@ def _total(count: int) -> Callable[[Any], float]:
 
 
 @section
-def _keep(plan: InnerPlan) -> Callable[..., bool]:
+def _write_inner(plan: InnerPlan) -> Callable[..., bool]:
     """Make `keep(scratch, numbers, me, i, row, lane, dt)`: write agent i's inner states.
 
     It returns True if they are finite.
     """
-    says, become = tuple_from(*(_keeps(plan, kept) for kept in plan.laws)), _all_become(plan)
-    put, sound = in_turn(*map(_put_number, range(len(plan.numbers)))), _all_finite(len(plan.numbers))
+    says, become = tuple_from(*(_evaluate_keep_law(plan, kept) for kept in plan.laws)), _new_numbers(plan)
+    put, sound = call_in_turn(*map(_put_number, range(len(plan.numbers)))), _all_finite(len(plan.numbers))
 
     def keep(scratch: Any, numbers: Any, me: Any, i: Any, row: Any, lane: Any, dt: Any) -> Any:
         now = become(me.inner, says(numbers, scratch, me, row, lane, dt))
@@ -279,7 +279,7 @@ def _keep(plan: InnerPlan) -> Callable[..., bool]:
 @section
 def begin_agent_of(plan: InnerPlan) -> Callable[..., tuple[float, ...]]:
     """Make `begin(numbers, me)`: return the initial inner states of an agent."""
-    says, become = tuple_from(*(says_of(kept.begin) for kept in plan.laws)), _all_become(plan)
+    says, become = tuple_from(*(value_of(kept.begin) for kept in plan.laws)), _new_numbers(plan)
 
     def begin(numbers: Any, me: Any) -> Any:
         return become(me.inner, says(numbers, me))
@@ -294,17 +294,17 @@ def begin_agent_of(plan: InnerPlan) -> Callable[..., tuple[float, ...]]:
 def move_of(plan: MovePlan) -> Callable[..., None]:
     """Make `move(context, pos, vel, time, dt, instant, block, past)`: move the agents of a block.
 
-    past: where the values saved for the block begin, see `_moved`; instant: number of steps that the world has made. No
+    past: where the values saved for the block begin, see `_method_step`; instant: number of steps that the world has made. No
     agent moves faster than max_speed, whatever a method does to its velocity within the step. The lowest number of an
     agent that is not finite is noted in each lane.
     """
     agent, d, width = plan.agent, plan.agent.dimension, plan.agent.width
     size, bad, put = np.uint64(d * width), np.uint64(plan.bad), put_vector_of(d, width)
-    alone, common, moved = alone_of(agent), common_places(d, width, plan.masked), _moved(plan)
-    kicked = _kicked(plan.kicks, d) if plan.kicks else None
-    turn = _turned(plan) if plan.turns else None
-    face = _facing(plan) if agent.oriented else None
-    keep = _keep(plan.inner) if plan.inner is not None else None
+    alone, common, moved = agent_of(agent), common_places(d, width, plan.masked), _method_step(plan)
+    kicked = _apply_kicks(plan.kicks, d) if plan.kicks else None
+    turn = _limit_turn(plan) if plan.turns else None
+    face = _update_heading(plan) if agent.oriented else None
+    keep = _write_inner(plan.inner) if plan.inner is not None else None
     confine, bounce = plan.confine, plan.bounce
 
     def move(context: Any, pos: Any, vel: Any, time: Any, dt: Any, instant: Any, block: Any, past: Any) -> None:

@@ -16,7 +16,7 @@ from numba.core import types
 
 from flockenv.jit.intrinsics import intrinsic_or_python
 
-__all__ = ["AT_ONCE", "exchanges", "inserted", "kept", "merged"]
+__all__ = ["AT_ONCE", "exchanges", "insert", "insert_distance", "merge"]
 
 AT_ONCE = 4
 """The number of keys that are inserted into a list at once."""
@@ -24,7 +24,7 @@ AT_ONCE = 4
 _tuple_of: Callable[..., Any] = types.BaseTuple.from_types
 
 
-def _inserted(typing_context: Any, numbers: Any, far: Any, place: Any) -> Any:
+def _insert(typing_context: Any, numbers: Any, far: Any, place: Any) -> Any:
     """Return a list, sorted distances and then their places, with a distance and its place inserted."""
     many = len(numbers) // 2
 
@@ -42,7 +42,7 @@ def _inserted(typing_context: Any, numbers: Any, far: Any, place: Any) -> Any:
     return _tuple_of([number] * (2 * many))(numbers, number, number), generate
 
 
-def _inserted_in_python(numbers: tuple[Any, ...], far: Any, place: Any) -> tuple[Any, ...]:
+def _insert_in_python(numbers: tuple[Any, ...], far: Any, place: Any) -> tuple[Any, ...]:
     many, found = len(numbers) // 2, list(numbers)
     for k in range(many):
         if far < found[k]:
@@ -50,10 +50,10 @@ def _inserted_in_python(numbers: tuple[Any, ...], far: Any, place: Any) -> tuple
     return tuple(found)
 
 
-inserted: Any = intrinsic_or_python(_inserted, _inserted_in_python)
+insert: Any = intrinsic_or_python(_insert, _insert_in_python)
 
 
-def _kept(typing_context: Any, numbers: Any, far: Any) -> Any:
+def _insert_distance(typing_context: Any, numbers: Any, far: Any) -> Any:
     """Return a list of sorted distances with one inserted; the largest drops out."""
     many = len(numbers)
 
@@ -67,7 +67,7 @@ def _kept(typing_context: Any, numbers: Any, far: Any) -> Any:
     return numbers(numbers, numbers[0]), generate
 
 
-def _kept_in_python(numbers: tuple[Any, ...], far: Any) -> tuple[Any, ...]:
+def _insert_distance_in_python(numbers: tuple[Any, ...], far: Any) -> tuple[Any, ...]:
     found = list(numbers)
     for k, near in enumerate(numbers):
         if far < near:
@@ -75,7 +75,7 @@ def _kept_in_python(numbers: tuple[Any, ...], far: Any) -> tuple[Any, ...]:
     return tuple(found)
 
 
-kept: Any = intrinsic_or_python(_kept, _kept_in_python)
+insert_distance: Any = intrinsic_or_python(_insert_distance, _insert_distance_in_python)
 
 
 def exchanges(many: int, come: int) -> Iterator[tuple[int, int]]:
@@ -101,7 +101,7 @@ def exchanges(many: int, come: int) -> Iterator[tuple[int, int]]:
         half //= 2
 
 
-def _merged(typing_context: Any, numbers: Any, come: Any) -> Any:
+def _merge(typing_context: Any, numbers: Any, come: Any) -> Any:
     """Return a list of keys (stored as float32) with new keys inserted; its length stays the same."""
     many = len(numbers)
     if len(come) != AT_ONCE or set(come) != {types.uint32} or set(numbers) != {types.float32}:
@@ -120,11 +120,11 @@ def _merged(typing_context: Any, numbers: Any, come: Any) -> Any:
     return numbers(numbers, come), generate
 
 
-def _merged_in_python(numbers: tuple[Any, ...], come: tuple[Any, ...]) -> tuple[Any, ...]:
+def _merge_in_python(numbers: tuple[Any, ...], come: tuple[Any, ...]) -> tuple[Any, ...]:
     found = [*(np.float32(number).view(np.uint32) for number in numbers), *come]
     for a, b in exchanges(len(numbers), len(come)):
         found[a], found[b] = min(found[a], found[b]), max(found[a], found[b])
     return tuple(key.view(np.float32) for key in found[: len(numbers)])
 
 
-merged: Any = intrinsic_or_python(_merged, _merged_in_python)
+merge: Any = intrinsic_or_python(_merge, _merge_in_python)

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from flockenv.engine.blocks import handed_of, place_of
-from flockenv.engine.lane_access import copy_each, gather, gather_each, picked, places_each, scatter
+from flockenv.engine.blocks import arrays_of, place_of
+from flockenv.engine.lane_access import copy_each, gather, gather_each, pick_items, places_each, scatter
 from flockenv.engine.scratch import SMALL_STRIDE, array_names
 from flockenv.geometry.cell_list import DISTANT, candidates, count_cells, order_records, row_of
-from flockenv.geometry.spatial_sort import FAR_FROM_HOME, count_from_home, order_cells, order_shared
+from flockenv.geometry.spatial_sort import FAR_FROM_HOME, count_from_home_tiles, order_cells, order_shared
 from flockenv.jit.decorators import Law
 from flockenv.jit.intrinsics import prefetch_for_write, wait_for_team
 from flockenv.jit.section import section
@@ -69,7 +69,7 @@ class Listing(NamedTuple):
         return 1 + len(self.record)
 
     @property
-    def headed(self) -> bool:
+    def has_headings(self) -> bool:
         """True if headings are computed from velocities."""
         return "h0" in self.fields
 
@@ -100,7 +100,7 @@ class Listing(NamedTuple):
         k = self.fields.index(field)
         return int(self.slot(f"mine{k}")) if self.sorts else k * SMALL_STRIDE
 
-    def listed(self, fields: Sequence[str]) -> tuple[int, ...]:
+    def candidate_places(self, fields: Sequence[str]) -> tuple[int, ...]:
         """Return where fields of a candidate lie: in its record, or in the rows of a small world; -1: nowhere.
 
         Headings are in no record: no law reads that of a candidate.
@@ -134,7 +134,7 @@ def list_living(plan: Listing) -> Callable[..., Any]:
     That is (nx, ny, nz, fine, fold), or zeros if they are listed by number.
     """
     sorts, periodic, wraps, width, homely = plan.sorts, plan.periodic, plan.wraps, plan.width, plan.homely
-    by_number = (_enter if sorts else _fill)(plan)
+    by_number = (_list_as_records if sorts else _list_in_rows)(plan)
     by_cell: Any = _sort(plan) if sorts else None
 
     def list_all(context: Any, pos: Any, vel: Any) -> Any:
@@ -145,7 +145,7 @@ def list_living(plan: Listing) -> Callable[..., Any]:
             size, reach = context.numbers.size, context.numbers.reach
             if homely:
                 if context.arranged:
-                    shape = count_from_home(
+                    shape = count_from_home_tiles(
                         pos, scratch.living, context.first, context.end, width, rank, team, scratch.sync,
                         scratch.bounds, size, reach, periodic, wraps, context.n, scratch.homes, scratch.strangers,
                         scratch.tally, scratch.cell, scratch.start, scratch.offset,
@@ -174,9 +174,9 @@ def list_living(plan: Listing) -> Callable[..., Any]:
 
 
 @section
-def _fill(plan: Listing) -> Callable[..., None]:
+def _list_in_rows(plan: Listing) -> Callable[..., None]:
     """Make `fill(context, pos, vel)`: list the living of a small world by number, a row for each field."""
-    width, headed, handed = plan.width, plan.headed, handed_of("inner0" in plan.arrays)
+    width, headed, handed = plan.width, plan.has_headings, arrays_of("inner0" in plan.arrays)
     (arrays, which, further), to = plan.sources(), plan.lanes_of(plan.record)
     velocity, heading = plan.lanes_of(plan.axes("v")), plan.lanes_of(plan.axes("h"))
     size, place_in = plan.dimension * width, place_of(plan.dimension, width)
@@ -185,7 +185,7 @@ def _fill(plan: Listing) -> Callable[..., None]:
         scratch, n = context.scratch, context.n
         rows = scratch.sorted_rows
         if context.rank == 0:
-            sources = picked(handed(scratch, pos, vel), scratch, arrays)
+            sources = pick_items(handed(scratch, pos, vel), scratch, arrays)
             if context.present == n:
                 for block in range((n + width - 1) // width):
                     base, row = np.uint64(block * size), np.uint64(block * width)
@@ -207,19 +207,19 @@ def _fill(plan: Listing) -> Callable[..., None]:
 
 
 @section
-def _enter(plan: Listing) -> Callable[..., None]:
+def _list_as_records(plan: Listing) -> Callable[..., None]:
     """Make `enter(context, pos, vel)`: list the living of a large world by number, a record each."""
     length, place_in, handed = (
         np.uint64(plan.length),
         place_of(plan.dimension, plan.width),
-        handed_of("inner0" in plan.arrays),
+        arrays_of("inner0" in plan.arrays),
     )
     (arrays, which, further), to = plan.sources(), tuple(range(1, plan.length))
 
     def enter(context: Any, pos: Any, vel: Any) -> None:
         scratch, n = context.scratch, context.n
         if context.rank == 0:
-            sources, records = picked(handed(scratch, pos, vel), scratch, arrays), scratch.records
+            sources, records = pick_items(handed(scratch, pos, vel), scratch, arrays), scratch.records
             if context.arranged:  # all agents live, and lie by tile, not by number
                 for place in range(np.uint64(n)):
                     scratch.cell[np.uint64(scratch.ident[place])] = place
@@ -241,7 +241,7 @@ def _sort(plan: Listing) -> Callable[..., None]:
     So each agent takes one access to distant memory, which is prefetched.
     """
     d, width, wraps, confine = plan.dimension, plan.width, plan.wraps, plan.confine
-    length, handed = np.uint64(plan.length), handed_of("inner0" in plan.arrays)
+    length, handed = np.uint64(plan.length), arrays_of("inner0" in plan.arrays)
     arrays, which, further = plan.sources()
     inside = tuple(int(plan.slot("inside0")) + k * width for k in range(d))
     if wraps:  # read wrapped positions from where they are written first: the lanes of this thread
@@ -250,13 +250,13 @@ def _sort(plan: Listing) -> Callable[..., None]:
         which = tuple(2 if m else k for m, k in zip(moved, which, strict=True))
         lanes = iter(inside)
         further = tuple(next(lanes) if m else k for m, k in zip(moved, further, strict=True))
-    order: Any = _in_order(plan) if plan.tiled else None
+    order: Any = _order_in_cells(plan) if plan.tiled else None
     vector, size = tuple(k * width for k in range(d)), np.uint64(d * width)
 
     def sort(context: Any, pos: Any, vel: Any, shape: Any) -> None:
         scratch, n, rank = context.scratch, context.n, context.rank
         records, cell, offset = scratch.records, scratch.cell, scratch.offset
-        sources = picked(handed(scratch, pos, vel), scratch, arrays)
+        sources = pick_items(handed(scratch, pos, vel), scratch, arrays)
         for block in range(np.uint64(context.first), np.uint64(context.end)):
             base, row = block * size, block * np.uint64(width)
             if n >= DISTANT:
@@ -280,7 +280,7 @@ def _sort(plan: Listing) -> Callable[..., None]:
 
 
 @section
-def _in_order(plan: Listing) -> Callable[..., None]:
+def _order_in_cells(plan: Listing) -> Callable[..., None]:
     """Make `order(context, shape)`: sort records by number within each cell, if agents lie by tiles."""
     homely, length, width = plan.homely, plan.length, plan.width
 
@@ -316,7 +316,7 @@ def _in_order(plan: Listing) -> Callable[..., None]:
 @section
 def _take(plan: Listing) -> Callable[..., None]:
     """Make `take(lanes, records, block)`: copy the records of a block to lanes, which its laws then read."""
-    width, headed = plan.width, plan.headed
+    width, headed = plan.width, plan.has_headings
     to = (int(plan.slot("home0")), *plan.lanes_of(plan.record))
     first = (0,) * len(to)
     velocity, heading = plan.lanes_of(plan.axes("v")), plan.lanes_of(plan.axes("h"))

@@ -15,7 +15,7 @@ from flockenv.jit.section import record, section
 from flockenv.maths.vectors import zero
 from flockenv.physics.effects.effect import Me
 
-__all__ = ["Besides", "Block", "Candidate", "agent_listed", "candidate_listed", "tie_of", "with_tie"]
+__all__ = ["Besides", "Block", "Candidate", "listed_agent", "listed_candidate", "separation_direction_of", "with_tie"]
 
 
 class Candidate(NamedTuple):
@@ -38,7 +38,7 @@ class Besides(NamedTuple):
 
 
 @section
-def agent_listed(listing: Listing, inner: tuple[str, ...], oriented: bool) -> Callable[..., Me]:
+def listed_agent(listing: Listing, inner: tuple[str, ...], oriented: bool) -> Callable[..., Me]:
     """Make `agent(array, at, time, drawn)`: return the agent in a lane of a block, as pair laws see it."""
     pos, vel, tie, aim, heading = (
         listing.lanes_of(listing.axes(x)) for x in ("x", "v", "t", "a", "d" if oriented else "h")
@@ -65,10 +65,13 @@ def _inner_fields(inner: tuple[str, ...]) -> tuple[str, ...]:
 
 
 @section
-def candidate_listed(listing: Listing, inner: tuple[str, ...]) -> Callable[..., Candidate]:
+def listed_candidate(listing: Listing, inner: tuple[str, ...]) -> Callable[..., Candidate]:
     """Make `candidate(array, at)`: return the agent whose record, or place in rows, begins at `at`."""
-    pos, vel, tie = (listing.listed(listing.axes(letter)) for letter in "xvt")
-    numbers, within = listing.listed(("who", "radius", "mass")), listing.listed(_inner_fields(inner))
+    pos, vel, tie = (listing.candidate_places(listing.axes(letter)) for letter in "xvt")
+    numbers, within = (
+        listing.candidate_places(("who", "radius", "mass")),
+        listing.candidate_places(_inner_fields(inner)),
+    )
     kind, feels = record(inner), bool(inner)
 
     def candidate(array: Any, at: Any) -> Any:
@@ -91,7 +94,7 @@ def with_tie(me: Me, tie: Any) -> Me:
 
 
 @section
-def tie_of(dimension: int, width: int) -> Callable[..., Any]:
+def separation_direction_of(dimension: int, width: int) -> Callable[..., Any]:
     """Make `tie(ties, i)`: return the tie of agent i."""
     vector, place = tuple(k * width for k in range(dimension)), place_of(dimension, width)
     return lambda ties, i: gather(ties[0], place(np.uint64(ties[1][i])), vector)

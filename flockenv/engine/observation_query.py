@@ -12,7 +12,7 @@ import numpy as np
 
 from flockenv.engine.blocks import into_blocks, vector_of, vector_of_lane
 from flockenv.engine.lane_access import fill, gather, scatter
-from flockenv.engine.nearest import AT_ONCE, inserted
+from flockenv.engine.nearest import AT_ONCE, insert
 from flockenv.engine.neighbour_lists import list_living, walk_blocks
 from flockenv.engine.query_keys import by_keys_of
 from flockenv.engine.query_plan import Looking, LookPlan, Nearest, Span
@@ -89,7 +89,7 @@ def _among_agents(plan: LookPlan) -> Callable[[Any], bool]:
 def _block(plan: LookPlan) -> Callable[..., int]:
     """Make the function of one block for `walk_blocks`; it returns 1 if keys were not used for the block, else 0."""
     sorts, keyed = plan.listing.sorts, plan.keyed
-    by_keys, by_squares, tell = by_keys_of(plan) if keyed else None, _by_squares(plan), _tell(plan)
+    by_keys, by_squares, tell = by_keys_of(plan) if keyed else None, _by_squares(plan), _write_lists(plan)
 
     def block(looking: Any, shape: Any, block: Any, at: Any, upto: Any, found: Any, time: Any) -> Any:
         scratch, near, span = looking.scratch, looking.near, looking.numbers
@@ -123,8 +123,8 @@ def _by_squares(plan: LookPlan) -> Callable[..., None]:
     """
     listing, width = plan.listing, plan.listing.width
     squares, places = plan.slots("square", plan.agents), plan.slots("place", plan.agents)
-    meet, both = _meet(plan, listing.periodic), listing.periodic and listing.sorts
-    plain = _meet(plan, False) if both else None
+    meet, both = _insert_candidates(plan, listing.periodic), listing.periodic and listing.sorts
+    plain = _insert_candidates(plan, False) if both else None
 
     def by_squares(
         mine: Any, first: Any, theirs: Any, number: Any, lanes: Any, span: Any, block: Any, ranges: Any, found: Any
@@ -146,11 +146,11 @@ def _by_squares(plan: LookPlan) -> Callable[..., None]:
 
 
 @section
-def _meet(plan: LookPlan, wrapped: bool) -> Callable[..., None]:
+def _insert_candidates(plan: LookPlan, wrapped: bool) -> Callable[..., None]:
     """Make `meet(mine, first, theirs, number, lanes, span, block, j, last)`: insert candidates [j, last)."""
     listing, width, exact, offset_to = plan.listing, plan.listing.width, plan.exact, plan.offset_to
     length = np.uint64(listing.length if listing.sorts else 1)
-    place, there = plan.place, listing.listed(listing.axes("x"))
+    place, there = plan.place, listing.candidate_places(listing.axes("x"))
     slots = plan.slots("square", plan.agents) + plan.slots("place", plan.agents)
 
     def meet(
@@ -164,14 +164,14 @@ def _meet(plan: LookPlan, wrapped: bool) -> Callable[..., None]:
                 square = exact_dot(to, to) if exact else dot(to, to)
                 seen = (own != number[lane]) & (square < span.within)
                 far = square if seen else like(square, np.inf)
-                scatter(lanes, lane, slots, inserted(gather(lanes, lane, slots), far, like(square, j)))
+                scatter(lanes, lane, slots, insert(gather(lanes, lane, slots), far, like(square, j)))
             j += np.uint64(1)
 
     return meet
 
 
 @section
-def _tell(plan: LookPlan) -> Callable[..., None]:
+def _write_lists(plan: LookPlan) -> Callable[..., None]:
     """Make `tell(listed, lanes, near, block, upto, by_number)`: write the lists of a block to the output arrays.
 
     listed: the agent at each place: records, or their order. by_number: True if the lists lie as the lanes do.
@@ -236,7 +236,7 @@ def _among_obstacles(plan: LookPlan) -> Callable[..., None]:
                 for lane in range(np.uint64(width)):
                     far = norm(offset_to(span.size, vector(pos, base + lane), centre)) - rho
                     far = far if far < limit else like(rho, np.inf)
-                    scatter(lanes, lane, slots, inserted(gather(lanes, lane, slots), far, like(rho, m)))
+                    scatter(lanes, lane, slots, insert(gather(lanes, lane, slots), far, like(rho, m)))
             for lane in range(np.uint64(width)):
                 i, found = np.uint64(block * width) + lane, np.int32(0)
                 for k in range(many):

@@ -12,15 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.engine.lane_access import chosen, gather, scatter
+from flockenv.engine.lane_access import choose, gather, scatter
 from flockenv.engine.obstacle_plan import Fold
 from flockenv.engine.shape_rows import Surroundings, number_of
-from flockenv.engine.visibility import blocked
+from flockenv.engine.visibility import is_blocked_of
 from flockenv.geometry.shapes.ray_contact import touched_offset, touched_spot
 from flockenv.geometry.shapes.round import normal, touched_normal
 from flockenv.geometry.shapes.table import law_of
 from flockenv.jit.decorators import kernel, like
-from flockenv.jit.section import in_turn, section
+from flockenv.jit.section import call_in_turn, section
 from flockenv.maths.vectors import add, dot, norm, scale, sub, zero
 from flockenv.physics.effects.effect import Obstacle
 from flockenv.steering.around import threat
@@ -48,7 +48,7 @@ def _in_sight(around: Surroundings | None) -> Callable[..., bool]:
     """Make `in_sight(world, me, gap, out)`: return True if the line to a nearest point is free."""
     if around is None:
         return kernel(lambda world, me, gap, out: True)
-    hidden = blocked(around)
+    hidden = is_blocked_of(around)
 
     def in_sight(world: Any, me: Any, gap: Any, out: Any) -> Any:
         obstacle_x, obstacle_radius, params, size, b = world
@@ -59,7 +59,7 @@ def _in_sight(around: Surroundings | None) -> Callable[..., bool]:
 
 
 @section
-def _keeps(fold: Fold) -> Callable[..., None]:
+def _update_fold(fold: Fold) -> Callable[..., None]:
     """Make `keep(p, world, me, it, form, place, lanes, lane)`: update a fold by an obstacle, as its law sees it.
 
     For a fold with `ahead`, if its first number changes, it also notes the form and place of the obstacle.
@@ -72,9 +72,9 @@ def _keeps(fold: Fold) -> Callable[..., None]:
         found = law(p, me, it, was)
         if notes:
             what = like(found[0], form), like(found[0], place)
-            scatter(lanes, lane, ahead, chosen(found[0] != was[0], what, gather(lanes, lane, ahead)))
+            scatter(lanes, lane, ahead, choose(found[0] != was[0], what, gather(lanes, lane, ahead)))
         if occluded:
-            scatter(lanes, lane, slots, chosen(in_sight(world, me, it.gap, it.normal), found, was))
+            scatter(lanes, lane, slots, choose(in_sight(world, me, it.gap, it.normal), found, was))
         else:
             scatter(lanes, lane, slots, found)
 
@@ -89,13 +89,13 @@ def meet_circle(folds: tuple[Fold, ...]) -> Callable[..., None]:
 
     to: the offset to its centre; rho: its radius, m.
     """
-    return in_turn(*(_circle(fold, j) for fold in folds for j in range(fold.rays)))
+    return call_in_turn(*(_circle(fold, j) for fold in folds for j in range(fold.rays)))
 
 
 @section
 def _circle(fold: Fold, j: int) -> Callable[..., None]:
     """Make the same for one fold, and for ray j if it casts rays."""
-    k, ray_of, origin, keep = fold.k, fold.ray, fold.origin, _keeps(fold)
+    k, ray_of, origin, keep = fold.k, fold.ray, fold.origin, _update_fold(fold)
     cast, elsewhere = fold.ray is not None, fold.origin is not None
 
     def meet(numbers: Any, world: Any, me: Any, to: Any, rho: Any, m: Any, lanes: Any, lane: Any) -> None:
@@ -119,9 +119,13 @@ def _circle(fold: Fold, j: int) -> Callable[..., None]:
 def meet_shape(folds: tuple[Fold, ...], form: str) -> Callable[..., None]:
     """Return `meet(numbers, world, params, me, shape, lanes, lane)`: update all folds by a shape of a form."""
     pieced = {fold for fold in folds if fold.pieces and form in PIECED}
-    return in_turn(
+    return call_in_turn(
         *(
-            _pieces(fold, form) if fold in pieced else _touched(fold, form, j) if fold.ray else _near(fold, form)
+            _pieces(fold, form)
+            if fold in pieced
+            else _ray_contact(fold, form, j)
+            if fold.ray
+            else _nearest_point(fold, form)
             for fold in folds
             for j in range(fold.rays)
         )
@@ -129,9 +133,9 @@ def meet_shape(folds: tuple[Fold, ...], form: str) -> Callable[..., None]:
 
 
 @section
-def _near(fold: Fold, form: str) -> Callable[..., None]:
+def _nearest_point(fold: Fold, form: str) -> Callable[..., None]:
     """Make `meet` for one fold that casts no rays."""
-    k, origin, keep, number = fold.k, fold.origin, _keeps(fold), number_of(form)
+    k, origin, keep, number = fold.k, fold.origin, _update_fold(fold), number_of(form)
     elsewhere, nearest = fold.origin is not None, law_of("nearest", form)
 
     def meet(numbers: Any, world: Any, params: Any, me: Any, shape: Any, lanes: Any, lane: Any) -> None:
@@ -149,12 +153,12 @@ def _near(fold: Fold, form: str) -> Callable[..., None]:
 
 
 @section
-def _touched(fold: Fold, form: str, j: int) -> Callable[..., None]:
+def _ray_contact(fold: Fold, form: str, j: int) -> Callable[..., None]:
     """Make `meet` for ray j of one fold that casts rays.
 
     If the ray touches nothing, the normal is that of the nearest point, which is known.
     """
-    k, ray_of, keep, number = fold.k, fold.ray, _keeps(fold), number_of(form)
+    k, ray_of, keep, number = fold.k, fold.ray, _update_fold(fold), number_of(form)
     nearest, hit_of, chooses = law_of("nearest", form), law_of("hit", form), form in SIDE_BY_SIDE
 
     def meet(numbers: Any, world: Any, params: Any, me: Any, shape: Any, lanes: Any, lane: Any) -> None:
@@ -180,7 +184,7 @@ def _pieces(fold: Fold, form: str) -> Callable[..., None]:
 
     If the nearest point of the shape is out of reach, so are all its sides.
     """
-    k, reach, keep, number = fold.k, fold.reach, _keeps(fold._replace(hidden=None, ahead=())), number_of(form)
+    k, reach, keep, number = fold.k, fold.reach, _update_fold(fold._replace(hidden=None, ahead=())), number_of(form)
     pieces_of, piece_of, reaches = law_of("pieces", form), law_of("piece", form), fold.reach is not None
     in_sight = _in_sight(fold.hidden)
 

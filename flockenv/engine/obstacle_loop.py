@@ -16,18 +16,18 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.engine.agent_records import AgentPlan, alone_of
+from flockenv.engine.agent_records import AgentPlan, agent_of
 from flockenv.engine.blocks import vector_of, vector_of_lane
 from flockenv.engine.lane_access import scatter
 from flockenv.engine.obstacle_folds import meet_circle, meet_shape
 from flockenv.engine.obstacle_plan import Fold, Obstacles, Place, Shape
 from flockenv.engine.shape_rows import near_rows
-from flockenv.engine.silhouette import aside_of
-from flockenv.geometry.shapes.edges import near_way
+from flockenv.engine.silhouette import passing_side_of
+from flockenv.geometry.shapes.edges import near_path
 from flockenv.geometry.shapes.row_header import outside_box, shift_of, velocity_of
 from flockenv.geometry.shapes.table import law_of
 from flockenv.jit.decorators import Vec, kernel, law, like
-from flockenv.jit.section import in_turn, section, vector
+from flockenv.jit.section import call_in_turn, section, vector
 from flockenv.maths.vectors import add, dot, scale, sub, zero
 
 __all__ = ["obstacles_of"]
@@ -45,11 +45,11 @@ def obstacles_of(plan: Obstacles) -> Callable[..., None]:
     d, width, arranges = plan.agent.dimension, plan.agent.width, plan.arranges
     size, wide = np.uint64(d * width), np.uint64(width)
     forms = (
-        _in_turn(plan, j) if form.name not in plan.looked_up else _looked_up(plan, j)
+        _every_shape(plan, j) if form.name not in plan.looked_up else _gridded_shapes(plan, j)
         for j, form in enumerate(plan.around.forms)
     )
-    edges = (_asides(plan, fold) for fold in plan.folds if fold.ahead)
-    passes = in_turn(_starts(plan), _circles(plan), *forms, *edges)
+    edges = (_passing_sides(plan, fold) for fold in plan.folds if fold.ahead)
+    passes = call_in_turn(_starts(plan), _circles(plan), *forms, *edges)
 
     def meet_obstacles(context: Any, pos: Any, vel: Any, time: Any, block: Any) -> None:
         base, row = block * size, block * wide
@@ -62,7 +62,7 @@ def obstacles_of(plan: Obstacles) -> Callable[..., None]:
 @section
 def _agent_of(plan: AgentPlan) -> Callable[..., Any]:
     """Make `agent(scratch, drawn, pos, vel, time, place, lane)`: return an agent of a block, as its laws see it."""
-    vector_at, alone = vector_of_lane(plan.dimension, plan.width), alone_of(plan)
+    vector_at, alone = vector_of_lane(plan.dimension, plan.width), agent_of(plan)
 
     def agent(scratch: Any, drawn: Any, pos: Any, vel: Any, time: Any, place: Any, lane: Any) -> Any:
         at = place.base + lane
@@ -92,7 +92,7 @@ def _world_of(plan: Obstacles) -> Callable[..., Any]:
 @section
 def _starts(plan: Obstacles) -> Callable[..., None]:
     """Make `starts(context, pos, vel, time, place)`: begin all folds of a block, and note how far they reach."""
-    width, agent, begin = plan.agent.width, _agent_of(plan.agent), in_turn(*(_start(plan, f) for f in plan.folds))
+    width, agent, begin = plan.agent.width, _agent_of(plan.agent), call_in_turn(*(_start(plan, f) for f in plan.folds))
     reach, limited = np.uint64(max(plan.reach, 0)), plan.reach >= 0
     furthest: Any = _furthest(plan.folds) if limited else None
 
@@ -163,7 +163,7 @@ def _circles(plan: Obstacles) -> Callable[..., None]:
 
 
 @section
-def _placed(dimension: int, moving: bool) -> Callable[..., tuple[Vec, Vec]]:
+def _motion_of(dimension: int, moving: bool) -> Callable[..., tuple[Vec, Vec]]:
     """Make `placed(params, at, time)`: position (m) and velocity (m/s) of the shape at `at` at a time (s)."""
     vector_at = vector(dimension)
 
@@ -208,10 +208,10 @@ def _row(plan: Obstacles, form: str) -> Callable[..., None]:
 
 
 @section
-def _in_turn(plan: Obstacles, j: int) -> Callable[..., None]:
+def _every_shape(plan: Obstacles, j: int) -> Callable[..., None]:
     """Make `shapes(context, pos, vel, time, place)`: update all folds of a block by every shape of form j."""
     width, agent, world_of = plan.agent.width, _agent_of(plan.agent), _world_of(plan)
-    placed, meet = _placed(plan.agent.dimension, plan.around.moving), _row(plan, plan.around.forms[j].name)
+    placed, meet = _motion_of(plan.agent.dimension, plan.around.moving), _row(plan, plan.around.forms[j].name)
 
     def shapes(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
         scratch, numbers, b, world = context.scratch, context.numbers, context.b, world_of(context)
@@ -230,13 +230,13 @@ def _in_turn(plan: Obstacles, j: int) -> Callable[..., None]:
 
 
 @section
-def _looked_up(plan: Obstacles, j: int) -> Callable[..., None]:
+def _gridded_shapes(plan: Obstacles, j: int) -> Callable[..., None]:
     """Make `shapes(context, pos, vel, time, place)`: update each agent's folds by shapes of form j, found by a grid.
 
     Only those that may lie within reach, in order.
     """
     width, agent, world_of = plan.agent.width, _agent_of(plan.agent), _world_of(plan)
-    placed, meet = _placed(plan.agent.dimension, plan.around.moving), _row(plan, plan.around.forms[j].name)
+    placed, meet = _motion_of(plan.agent.dimension, plan.around.moving), _row(plan, plan.around.forms[j].name)
     near, box = near_rows(plan.around.offset_to, plan.agent.dimension), _box(plan.folds, plan.only_rays)
     first, reach = plan.found, np.uint64(plan.reach)
 
@@ -274,14 +274,14 @@ def _near_a_ray(folds: tuple[Fold, ...]) -> Callable[..., bool]:
         found = False if before is None else before(numbers, params, at, y, me, seen)
         for j in range(rays):
             ray, margin = ray_of(numbers.effects[k], me, j)
-            found |= near_way(params, at, y, ray, me.radius + margin, seen)
+            found |= near_path(params, at, y, ray, me.radius + margin, seen)
         return found
 
     return kernel(near)
 
 
 @law
-def _alike(x: Vec, length: float) -> Vec:
+def _equal_coordinates(x: Vec, length: float) -> Vec:
     """Return the vector of x's dimension whose coordinates are all `length`."""
     if len(x) == 2:
         return (length, length)
@@ -290,7 +290,7 @@ def _alike(x: Vec, length: float) -> Vec:
 
 
 @law
-def _grown(low: Vec, high: Vec, spot: Vec) -> tuple[Vec, Vec]:
+def _grow(low: Vec, high: Vec, spot: Vec) -> tuple[Vec, Vec]:
     """Return the corners of a box, grown to hold a point."""
     a, b = (min(low[0], spot[0]), min(low[1], spot[1])), (max(high[0], spot[0]), max(high[1], spot[1]))
     if len(low) == 2:
@@ -313,8 +313,8 @@ def _box(folds: tuple[Fold, ...], only_rays: bool) -> Callable[..., tuple[Vec, V
             low, high, wide = span(numbers, me, seen)
             wide = wide * like(wide, LOOSE)
             room = scale(sub(high, low), half)
-            return add(x, scale(add(low, high), half)), add(room, _alike(x, wide))
-        return x, _alike(x, seen)
+            return add(x, scale(add(low, high), half)), add(room, _equal_coordinates(x, wide))
+        return x, _equal_coordinates(x, seen)
 
     return box
 
@@ -334,7 +334,7 @@ def _span(folds: tuple[Fold, ...]) -> Callable[..., tuple[Vec, Vec, float]]:
         for j in range(rays):
             ray, margin = ray_of(numbers.effects[k], me, j)
             way, room = scale(ray, seen), me.radius + margin
-            (low, high), wide = _grown(low, high, way), max(wide, room)
+            (low, high), wide = _grow(low, high, way), max(wide, room)
         return low, high, wide
 
     return kernel(span)
@@ -344,13 +344,13 @@ def _span(folds: tuple[Fold, ...]) -> Callable[..., tuple[Vec, Vec, float]]:
 
 
 @section
-def _asides(plan: Obstacles, fold: Fold) -> Callable[..., None]:
+def _passing_sides(plan: Obstacles, fold: Fold) -> Callable[..., None]:
     """Make `asides(context, pos, vel, time, place)`: write on which side each agent passes the obstacle ahead.
 
     For a law that reads it, see steering/around.py.
     """
     k, ray_of, slots, ahead, width = fold.k, fold.ray, fold.slots, fold.ahead, plan.agent.width
-    agent, aside, sides = _agent_of(plan.agent), aside_of(plan.around), fold.slots[-plan.agent.dimension :]
+    agent, aside, sides = _agent_of(plan.agent), passing_side_of(plan.around), fold.slots[-plan.agent.dimension :]
     first, which, place_at = np.uint64(slots[0]), np.uint64(ahead[0]), np.uint64(ahead[1])
 
     def asides(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:

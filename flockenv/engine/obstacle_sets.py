@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flockenv.engine.parameters import NumberPlan
 from flockenv.engine.shape_rows import FormPlan, Surroundings
-from flockenv.geometry.shapes import packed
+from flockenv.geometry.shapes import pack_shapes
 from flockenv.geometry.shapes.cells import FEWEST_ROWS, cells_of
 from flockenv.geometry.space import Space
 from flockenv.physics.effects.effect import Effect, Sight
@@ -46,7 +46,7 @@ class MetObstacles:
         if not self.meets_obstacles:
             return np.zeros(0), {}
         period = np.array(self.space.extent(self.dimension)) if self.space.periodic else None
-        return packed(self.shapes, self.dimension, self.circles, period)
+        return pack_shapes(self.shapes, self.dimension, self.circles, period)
 
     @property
     def moving(self) -> bool:

@@ -19,15 +19,15 @@ from flockenv.engine.neighbour_records import (
     Besides,
     Block,
     Candidate,
-    agent_listed,
-    candidate_listed,
-    tie_of,
+    listed_agent,
+    listed_candidate,
+    separation_direction_of,
     with_tie,
 )
 from flockenv.engine.pair_plan import Pairs
-from flockenv.engine.pair_sums import add_candidate, begin_sums, finish_sums, keep_nearest, tell_sums
+from flockenv.engine.pair_sums import add_candidate, begin_sums, finish_sums, keep_nearest, write_sums
 from flockenv.jit.decorators import kernel, like
-from flockenv.jit.intrinsics import tallied, tally_of, wait_for_team
+from flockenv.jit.intrinsics import count_as_float, count_if, wait_for_team
 from flockenv.jit.section import section
 from flockenv.maths.vectors import dot, exact_dot, sub
 from flockenv.physics.effects.effect import Other
@@ -41,20 +41,20 @@ NEAREST, CONTACTS = "another agent, to find the nearest", "another agent that ma
 
 
 @section
-def _over_lanes(plan: Pairs, which: str, wrapped: bool, each: Callable[..., None]) -> Callable[..., bool]:
+def _visit_lanes(plan: Pairs, which: str, wrapped: bool, each: Callable[..., None]) -> Callable[..., bool]:
     """Make `lanes_meet(numbers, besides, block, j, it)`: call `each` for all lanes of a block and candidate j.
 
     It returns True if some agent may touch the candidate. wrapped: True if the nearest image around the edge of a
     periodic box is used.
     """
     width, parting, masks, sorts = plan.lanes, plan.parting, plan.masks, plan.listing.sorts
-    agent, offset_to = agent_listed(plan.listing, plan.inner, plan.oriented), plan.offset_to
+    agent, offset_to = listed_agent(plan.listing, plan.inner, plan.oriented), plan.offset_to
     exact, periodic = any(view.near[1] for view in plan.views), wrapped
     together, apart = which == TOGETHER, which == APART
     contacts = tuple(sorted({law.sight for law in plan.laws if law.contact}))
     touches, tied = bool(contacts) and which in (APART, OTHER), together and plan.seldom
     within: Any = _within_any(contacts) if touches else None
-    tie = tie_of(plan.listing.dimension, width)
+    tie = separation_direction_of(plan.listing.dimension, width)
     here, home = plan.listing.slot("here0"), plan.listing.slot("home0")
 
     def lanes_meet(numbers: Any, besides: Any, block: Any, j: Any, it: Any) -> Any:
@@ -77,7 +77,7 @@ def _over_lanes(plan: Pairs, which: str, wrapped: bool, each: Callable[..., None
             him = Other(it.who, to, square, it.vel, it.radius, it.tie, it.mass, it.inner)
             each(numbers, besides, me, him, other, gap, o, lanes, lane)
             if apart and parting:
-                lanes[here + lane] = tallied(lanes[here + lane], other)
+                lanes[here + lane] = count_if(lanes[here + lane], other)
             if touches:
                 touch |= within(numbers.views, other, square)
         return touch
@@ -98,17 +98,17 @@ def _within_any(sights: tuple[int, ...]) -> Callable[..., bool]:
 
 
 @section
-def _one_after_another(plan: Pairs, which: str, wrapped: bool, each: Callable[..., None]) -> Callable[..., None]:
+def _visit_candidates(plan: Pairs, which: str, wrapped: bool, each: Callable[..., None]) -> Callable[..., None]:
     """Make `meet(numbers, besides, block, r)`: apply `each` to a block and the candidates of range r."""
     candidate, sorts, length = (
-        candidate_listed(plan.listing, plan.inner),
+        listed_candidate(plan.listing, plan.inner),
         plan.listing.sorts,
         np.uint64(plan.listing.length),
     )
-    lanes_meet, tied = _over_lanes(plan, which, wrapped, each), which == TOGETHER and plan.seldom
-    tie = tie_of(plan.listing.dimension, plan.lanes)
+    lanes_meet, tied = _visit_lanes(plan, which, wrapped, each), which == TOGETHER and plan.seldom
+    tie = separation_direction_of(plan.listing.dimension, plan.lanes)
     contacts = which in (APART, OTHER) and any(law.contact for law in plan.laws)
-    by_touch = _over_lanes(plan, CONTACTS, wrapped, add_candidate(plan, True, False)) if contacts else None
+    by_touch = _visit_lanes(plan, CONTACTS, wrapped, add_candidate(plan, True, False)) if contacts else None
 
     def meet(numbers: Any, besides: Any, block: Any, r: Any) -> None:
         j, last = np.uint64(block.ranges[r, 0]), np.uint64(block.ranges[r, 1])
@@ -128,16 +128,16 @@ def _one_after_another(plan: Pairs, which: str, wrapped: bool, each: Callable[..
 
 
 @section
-def _looking_ahead(plan: Pairs, each: Callable[..., None]) -> Callable[..., None]:
+def _visit_ahead(plan: Pairs, each: Callable[..., None]) -> Callable[..., None]:
     """Make `meet(numbers, besides, block, r)` for a small world: the next candidate's distance is computed early.
 
     The number behind the last candidate is arbitrary: a row has room for it, and its distance is never used.
     """
     listing, width, parting = plan.listing, plan.lanes, plan.parting
-    agent, candidate = agent_listed(listing, plan.inner, plan.oriented), candidate_listed(listing, plan.inner)
+    agent, candidate = listed_agent(listing, plan.inner, plan.oriented), listed_candidate(listing, plan.inner)
     d, periodic, offset_to = listing.dimension, listing.periodic, plan.offset_to
     exact = any(view.near[1] for view in plan.views)
-    place, way = listing.listed(listing.axes("x")), plan.slots(int(listing.slot("next0")), d)
+    place, way = listing.candidate_places(listing.axes("x")), plan.slots(int(listing.slot("next0")), d)
     square_at, here = listing.slot(f"next{d}"), listing.slot("here0")
 
     def meet(numbers: Any, besides: Any, block: Any, r: Any) -> None:
@@ -163,7 +163,7 @@ def _looking_ahead(plan: Pairs, each: Callable[..., None]) -> Callable[..., None
                 him = Other(it.who, to, square, it.vel, it.radius, it.tie, it.mass, it.inner)
                 each(numbers, besides, me, him, other, square, o, lanes, lane)
                 if parting:
-                    lanes[here + lane] = tallied(lanes[here + lane], other)
+                    lanes[here + lane] = count_if(lanes[here + lane], other)
                 scatter(lanes, lane, way, onward)
                 lanes[square_at + lane] = further
 
@@ -171,7 +171,7 @@ def _looking_ahead(plan: Pairs, each: Callable[..., None]) -> Callable[..., None
 
 
 @section
-def _over_ranges(plan: Pairs, which: str, each: Callable[..., None]) -> Callable[..., None]:
+def _visit_ranges(plan: Pairs, which: str, each: Callable[..., None]) -> Callable[..., None]:
     """Make `meet(numbers, besides, block, found)`: apply `each` to a block and the candidates of all its ranges.
 
     Images are considered only around the edge of a periodic box. The rare pass over agents in the same position is
@@ -179,8 +179,8 @@ def _over_ranges(plan: Pairs, which: str, each: Callable[..., None]) -> Callable
     """
     listing = plan.listing
     ahead, both = plan.ahead and which == APART, listing.periodic and listing.sorts and which != TOGETHER
-    one = _looking_ahead(plan, each) if ahead else _one_after_another(plan, which, listing.periodic, each)
-    plain = _one_after_another(plan, which, False, each) if both else None
+    one = _visit_ahead(plan, each) if ahead else _visit_candidates(plan, which, listing.periodic, each)
+    plain = _visit_candidates(plan, which, False, each) if both else None
 
     def meet(numbers: Any, besides: Any, block: Any, found: Any) -> None:
         for r in range(found):
@@ -201,11 +201,11 @@ def _over_ranges(plan: Pairs, which: str, each: Callable[..., None]) -> Callable
 @section
 def _block(plan: Pairs) -> Callable[..., int]:
     """Make the function of one block for `walk_blocks`: evaluate pair laws, write sums; return the number of pairs."""
-    begin, finish, tell = begin_sums(plan), finish_sums(plan), tell_sums(plan)
-    meet = _over_ranges(plan, APART if plan.parting else OTHER, add_candidate(plan, False, plan.parting))
+    begin, finish, tell = begin_sums(plan), finish_sums(plan), write_sums(plan)
+    meet = _visit_ranges(plan, APART if plan.parting else OTHER, add_candidate(plan, False, plan.parting))
     nearest = any(view.near[1] for view in plan.views)
-    select = _over_ranges(plan, NEAREST, keep_nearest(plan)) if nearest else None
-    together = _over_ranges(plan, TOGETHER, add_candidate(plan, False, False)) if plan.parting else None
+    select = _visit_ranges(plan, NEAREST, keep_nearest(plan)) if nearest else None
+    together = _visit_ranges(plan, TOGETHER, add_candidate(plan, False, False)) if plan.parting else None
     width, here, hides, sorts = plan.lanes, plan.listing.slot("here0"), plan.hidden is not None, plan.listing.sorts
     tied = plan.parting and plan.seldom
 
@@ -236,7 +236,7 @@ def _block(plan: Pairs) -> Callable[..., int]:
         if together is not None:  # two agents rarely share a position
             crowded, all_of_them = False, like(numbers.reach, others)
             for lane in range(np.uint64(width)):
-                crowded |= tally_of(scratch.lanes[here + lane]) < all_of_them
+                crowded |= count_as_float(scratch.lanes[here + lane]) < all_of_them
             if crowded:
                 together(numbers, besides, block, found)
         finish(numbers, block)

@@ -9,32 +9,32 @@ from typing import Any
 import numpy as np
 
 from flockenv.engine.blocks import place_of, vector_of
-from flockenv.engine.lane_access import add_where, chosen, copy_each, fill, gather, picked, scatter
-from flockenv.engine.law_calls import given_of
-from flockenv.engine.nearest import kept
-from flockenv.engine.neighbour_records import agent_listed
+from flockenv.engine.lane_access import add_where, choose, copy_each, fill, gather, pick_items, scatter
+from flockenv.engine.law_calls import arguments_of
+from flockenv.engine.nearest import insert_distance
+from flockenv.engine.neighbour_records import listed_agent
 from flockenv.engine.pair_plan import PairLaw, Pairs
-from flockenv.engine.visibility import blocked
+from flockenv.engine.visibility import is_blocked_of
 from flockenv.jit.decorators import kernel, like
-from flockenv.jit.intrinsics import tallied, tally_of
-from flockenv.jit.section import in_turn, section, tuple_from
+from flockenv.jit.intrinsics import count_as_float, count_if
+from flockenv.jit.section import call_in_turn, section, tuple_from
 from flockenv.maths.vectors import add, dot, zero
 from flockenv.physics.effects.effect import Other, in_view
 
-__all__ = ["add_candidate", "begin_sums", "finish_sums", "keep_nearest", "tell_sums"]
+__all__ = ["add_candidate", "begin_sums", "finish_sums", "keep_nearest", "write_sums"]
 
 
 # --- sights ---------------------------------------------------------------------------------------------------------
 
 
 @section
-def _seen(plan: Pairs, q: int, cut: bool) -> Callable[..., bool]:
+def _is_in_sight(plan: Pairs, q: int, cut: bool) -> Callable[..., bool]:
     """Make `seen(numbers, besides, me, it, other, gap, lanes, lane)`: return True if a candidate is in a sight.
 
     cut: for a topological sight, True if the distances of its nearest neighbours are known already.
     """
     view, masks = plan.views[q], plan.masks
-    hidden: Any = blocked(plan.hidden) if plan.hidden is not None else None
+    hidden: Any = is_blocked_of(plan.hidden) if plan.hidden is not None else None
     fov, grouped, occluded, counts = view.fov, view.grouped, view.occluded, cut and view.near[1] > 0
     last = np.uint64(view.near[0] + max(view.near[1] - 1, 0) * plan.lanes)
 
@@ -64,7 +64,7 @@ def _seen(plan: Pairs, q: int, cut: bool) -> Callable[..., bool]:
 
 
 @section
-def _adds(plan: Pairs, law: PairLaw, q: int, apart: bool) -> Callable[..., None]:
+def _add_one(plan: Pairs, law: PairLaw, q: int, apart: bool) -> Callable[..., None]:
     """Make `adds(numbers, me, it, seen, o, lanes, lane)`: add one candidate to the running numbers of a law.
 
     seen: for each sight that is tested, True if the candidate is in it; q: index of the law's sight in `seen`.
@@ -75,7 +75,7 @@ def _adds(plan: Pairs, law: PairLaw, q: int, apart: bool) -> Callable[..., None]
     def adds(numbers: Any, me: Any, it: Any, seen: Any, o: Any, lanes: Any, lane: Any) -> None:
         if folds:
             was = gather(lanes, lane, slots)
-            scatter(lanes, lane, slots, chosen(seen[q], says_of(numbers.effects[k], me, it, was), was))
+            scatter(lanes, lane, slots, choose(seen[q], says_of(numbers.effects[k], me, it, was), was))
         elif vanishes:
             square = it.square if seen[q] else like(it.square, np.inf)
             far = Other(it.who, it.offset, square, it.vel, it.radius, it.tie, it.mass, it.inner)
@@ -95,10 +95,10 @@ def add_candidate(plan: Pairs, touch: bool, apart: bool) -> Callable[..., None]:
     laws = [law for law in plan.laws if law.contact == touch]
     laws.sort(key=lambda law: law.vanishes)  # others need one register less while the first are computed
     asked = sorted({law.sight for law in laws})
-    see = tuple_from(*(_seen(plan, q, True) for q in asked))
-    add_all = in_turn(*(_adds(plan, law, asked.index(law.sight), apart) for law in laws))
+    see = tuple_from(*(_is_in_sight(plan, q, True) for q in asked))
+    add_all = call_in_turn(*(_add_one(plan, law, asked.index(law.sight), apart) for law in laws))
     counted = [(k, plan.views[q].counted) for k, q in enumerate(asked) if plan.views[q].counted >= 0]
-    count, counts = in_turn(*(_count_one(*each) for each in counted)), bool(counted) and not touch
+    count, counts = call_in_turn(*(_count_one(*each) for each in counted)), bool(counted) and not touch
     some = bool(laws)
 
     def meet(numbers: Any, besides: Any, me: Any, it: Any, other: Any, gap: Any, o: Any, lanes: Any, lane: Any) -> None:
@@ -117,7 +117,7 @@ def _count_one(q: int, place: int) -> Callable[..., None]:
     at = np.uint64(place)
 
     def count(seen: Any, lanes: Any, lane: Any) -> None:
-        lanes[at + lane] = tallied(lanes[at + lane], seen[q])
+        lanes[at + lane] = count_if(lanes[at + lane], seen[q])
 
     return kernel(count)
 
@@ -128,7 +128,7 @@ def keep_nearest(plan: Pairs) -> Callable[..., None]:
 
     It has the arguments of the function that `add_candidate` makes.
     """
-    keep = in_turn(*(_keep_one(plan, q) for q, view in enumerate(plan.views) if view.near[1]))
+    keep = call_in_turn(*(_keep_one(plan, q) for q, view in enumerate(plan.views) if view.near[1]))
 
     def meet(numbers: Any, besides: Any, me: Any, it: Any, other: Any, gap: Any, o: Any, lanes: Any, lane: Any) -> None:
         keep(numbers, besides, me, it, other, gap, lanes, lane)
@@ -138,12 +138,12 @@ def keep_nearest(plan: Pairs) -> Callable[..., None]:
 
 @section
 def _keep_one(plan: Pairs, q: int) -> Callable[..., None]:
-    see, slots = _seen(plan, q, False), plan.slots(*plan.views[q].near)
+    see, slots = _is_in_sight(plan, q, False), plan.slots(*plan.views[q].near)
 
     def keep(numbers: Any, besides: Any, me: Any, it: Any, other: Any, gap: Any, lanes: Any, lane: Any) -> None:
         seen = see(numbers, besides, me, it, other, gap, lanes, lane)
         square = it.square if seen else like(it.square, np.inf)
-        scatter(lanes, lane, slots, kept(gather(lanes, lane, slots), square))
+        scatter(lanes, lane, slots, insert_distance(gather(lanes, lane, slots), square))
 
     return keep
 
@@ -158,9 +158,9 @@ def begin_sums(plan: Pairs) -> Callable[..., None]:
     sums = [slot for law in plan.laws if law.start is None for slot in plan.slots(law.first, law.sums)]
     sums += [int(listing.slot("here0"))] * plan.parting + [view.counted for view in plan.views if view.counted >= 0]
     clear, far = tuple(sums), tuple(slot for view in plan.views for slot in plan.slots(*view.near))
-    starts = in_turn(*(_start(plan, law) for law in plan.laws if law.start is not None))
+    starts = call_in_turn(*(_start(plan, law) for law in plan.laws if law.start is not None))
     folds = any(law.start is not None for law in plan.laws)
-    agent = agent_listed(listing, plan.inner, plan.oriented)
+    agent = listed_agent(listing, plan.inner, plan.oriented)
 
     def begin(numbers: Any, obstacles: Any, block: Any) -> None:
         o = like(numbers.reach, 0.0)
@@ -180,7 +180,7 @@ def _start(plan: Pairs, law: PairLaw) -> Callable[..., None]:
 
     If the fold is also one over obstacles, they come first: (obstacle_x, obstacle_radius, b).
     """
-    begin, joined, offset_to, given = law.start, law.joined, plan.offset_to, given_of(law.k, law.images)
+    begin, joined, offset_to, given = law.start, law.joined, plan.offset_to, arguments_of(law.k, law.images)
     slots, centre = plan.slots(law.first, law.sums), vector_of(plan.listing.dimension)
 
     def start(numbers: Any, obstacles: Any, me: Any, lanes: Any, lane: Any) -> None:
@@ -202,8 +202,8 @@ def _start(plan: Pairs, law: PairLaw) -> Callable[..., None]:
 @section
 def finish_sums(plan: Pairs) -> Callable[..., None]:
     """Make `finish(numbers, block)`: compute the sum of each target from the running numbers of a block."""
-    agent, width = agent_listed(plan.listing, plan.inner, plan.oriented), plan.lanes
-    ends = in_turn(*(_end(plan, t) for t in range(len(plan.targets))))
+    agent, width = listed_agent(plan.listing, plan.inner, plan.oriented), plan.lanes
+    ends = call_in_turn(*(_end(plan, t) for t in range(len(plan.targets))))
 
     def finish(numbers: Any, block: Any) -> None:
         for lane in range(np.uint64(width)):
@@ -224,14 +224,14 @@ def _end(plan: Pairs, target: int) -> Callable[..., None]:
 @section
 def _total(plan: Pairs, laws: tuple[PairLaw, ...]) -> Callable[..., Any]:
     before, law = _total(plan, laws[:-1]) if laws[1:] else None, laws[-1]
-    slots, finish, given = plan.slots(law.first, law.sums), law.finish, given_of(law.k, law.images)
+    slots, finish, given = plan.slots(law.first, law.sums), law.finish, arguments_of(law.k, law.images)
     averages, many = law.averages, np.uint64(max(plan.views[law.sight].counted, 0))
 
     def total(numbers: Any, me: Any, lanes: Any, lane: Any) -> Any:
         p = given(numbers, me)
         sums = gather(lanes, lane, slots)
         if averages:
-            mine = finish(p, me, sums + (tally_of(lanes[many + lane]),))  # noqa: RUF005
+            mine = finish(p, me, sums + (count_as_float(lanes[many + lane]),))  # noqa: RUF005
         else:
             mine = finish(p, me, sums)
         return add(zero(me.pos) if before is None else before(numbers, me, lanes, lane), mine)
@@ -240,7 +240,7 @@ def _total(plan: Pairs, laws: tuple[PairLaw, ...]) -> Callable[..., Any]:
 
 
 @section
-def tell_sums(plan: Pairs) -> Callable[..., None]:
+def write_sums(plan: Pairs) -> Callable[..., None]:
     """Make `tell(felt, order, block, by_number)`: write the sums of a block to `felt`, by agent."""
     width, sorts, home = plan.lanes, plan.listing.sorts, plan.listing.slot("home0")
     slots = tuple(slot for first in plan.targets for slot in plan.slots(first, plan.listing.dimension))
@@ -250,7 +250,7 @@ def tell_sums(plan: Pairs) -> Callable[..., None]:
     def tell(felt: Any, order: Any, block: Any, by_number: Any) -> None:
         lanes, begin = block.lanes, np.uint64(0)
         if by_number:
-            sources = picked((lanes,), (), first)
+            sources = pick_items((lanes,), (), first)
             copy_each(felt, block.at * whole, rows, sources, (begin,), first, slots, width)
         else:
             for lane in range(block.upto - block.at):

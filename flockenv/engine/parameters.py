@@ -15,7 +15,7 @@ import numpy as np
 
 from flockenv.engine.lane_access import gather
 from flockenv.jit.decorators import Law, kernel
-from flockenv.jit.section import joined_from, record, section, tuple_from
+from flockenv.jit.section import concatenation_from, record, section, tuple_from
 from flockenv.maths.vectors import add
 
 if TYPE_CHECKING:
@@ -273,7 +273,7 @@ def _effect(plan: EffectPlan) -> Callable[..., Any]:
     if len(runs) == 1 and runs[0][0] == "number":
         places = _places(*runs[0][1:])
         return kernel(lambda params, counters: kind(*gather(params, np.uint64(0), places)))
-    values = joined_from(*map(_run, runs))
+    values = concatenation_from(*map(_run, runs))
     return kernel(lambda params, counters: kind(*values(params, counters)))
 
 
@@ -325,7 +325,7 @@ def images_in(parts: Numbered, effect: Effect) -> Images | None:
 def images_of(plan: Images) -> Callable[..., Any]:
     """Make `images_of(p, size, here)`: return an effect's record with the images of its points nearest to `here`."""
     kind = record(plan.names)
-    values = _imaged(tuple(name in plan.points for name in plan.names), plan.offset_to)
+    values = _nearest_images(tuple(name in plan.points for name in plan.names), plan.offset_to)
 
     def images(p: Any, size: Any, here: Any) -> Any:
         return kind(*values(p, size, here))
@@ -334,10 +334,10 @@ def images_of(plan: Images) -> Callable[..., Any]:
 
 
 @functools.cache
-def _imaged(points: tuple[bool, ...], offset_to: Law) -> Callable[..., tuple[Any, ...]]:
+def _nearest_images(points: tuple[bool, ...], offset_to: Law) -> Callable[..., tuple[Any, ...]]:
     """Make a function that returns the values of a record, points as the images nearest to a position."""
     *earlier, point = points
-    before, last = _imaged(tuple(earlier), offset_to) if earlier else None, len(earlier)
+    before, last = _nearest_images(tuple(earlier), offset_to) if earlier else None, len(earlier)
 
     def values(p: Any, size: Any, here: Any) -> Any:
         mine = (add(here, offset_to(size, here, p[last])),) if point else (p[last],)

@@ -1,6 +1,6 @@
 """Lists of the nearest agents of a block of a small world as keys: squares whose last bits are places.
 
-Four candidates at once are sorted and merged with a list (`nearest.merged`).
+Four candidates at once are sorted and merged with a list (`nearest.merge`).
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ import numpy as np
 
 from flockenv.engine.blocks import vector_of
 from flockenv.engine.lane_access import fill, gather, scatter
-from flockenv.engine.nearest import AT_ONCE, merged
+from flockenv.engine.nearest import AT_ONCE, merge
 from flockenv.engine.query_plan import LookPlan
 from flockenv.engine.scratch import SMALL_STRIDE
 from flockenv.jit.decorators import like
 from flockenv.jit.section import section
-from flockenv.jit.simd_rows import key_of, key_read, key_written, pick, same_key, tag_of
+from flockenv.jit.simd_rows import float_as_key, key_as_float, key_of, pick, same_key, tag_of
 from flockenv.maths.vectors import exact_dot, sub
 
 __all__ = ["by_keys_of"]
@@ -34,7 +34,7 @@ def by_keys_of(plan: LookPlan) -> Callable[..., bool]:
     the bits that remain of a square, it returns False: then the lists must be computed again from squares.
     """
     width, lists, key = plan.listing.width, plan.slots("square", plan.agents + 1), _key(plan)
-    tell, place, place_them = _tell_keys(plan), plan.place, _place_them(plan)
+    tell, place, place_them = _write_keys(plan), plan.place, _write_positions(plan)
 
     def by_keys(rows: Any, number: Any, lanes: Any, near: Any, span: Any, block: Any, n: Any) -> Any:
         room, size = 1, span.size
@@ -43,7 +43,7 @@ def by_keys_of(plan: LookPlan) -> Callable[..., bool]:
         tags = np.int32(room - 1)
         edge = key_of(span.within, np.int32(0), tags)
         for lane in range(np.uint64(width)):
-            fill(lanes, lane, lists, key_written(NOBODY))
+            fill(lanes, lane, lists, key_as_float(NOBODY))
         for j in range(np.uint64(0), np.uint64(n), np.uint64(AT_ONCE)):
             for lane in range(np.uint64(width)):
                 here, mine = gather(rows, block + lane, place), number[block + lane]
@@ -53,7 +53,7 @@ def by_keys_of(plan: LookPlan) -> Callable[..., bool]:
                     key(rows, number, j + np.uint64(2), size, here, mine, tags),
                     key(rows, number, j + np.uint64(3), size, here, mine, tags),
                 )
-                scatter(lanes, lane, lists, merged(gather(lanes, lane, lists), come))
+                scatter(lanes, lane, lists, merge(gather(lanes, lane, lists), come))
         sure = tell(lanes, near, block, tags, edge)
         if sure:
             place_them(rows, lanes, near, span, block, n, edge)
@@ -77,7 +77,7 @@ def _key(plan: LookPlan) -> Callable[..., Any]:
 
 
 @section
-def _tell_keys(plan: LookPlan) -> Callable[..., bool]:
+def _write_keys(plan: LookPlan) -> Callable[..., bool]:
     """Make `tell(lanes, near, block, tags, edge)`: write the lists of a block.
 
     It returns True if rounding leaves no doubt about them.
@@ -87,9 +87,9 @@ def _tell_keys(plan: LookPlan) -> Callable[..., bool]:
     def tell(lanes: Any, near: Any, block: Any, tags: Any, edge: Any) -> Any:
         doubt = False
         for lane in range(np.uint64(width)):
-            i, count, following = block + lane, np.int32(0), key_read(lanes[squares + lane])
+            i, count, following = block + lane, np.int32(0), float_as_key(lanes[squares + lane])
             for k in range(many):
-                key, following = following, key_read(lanes[squares + np.uint64((k + 1) * width) + lane])
+                key, following = following, float_as_key(lanes[squares + np.uint64((k + 1) * width) + lane])
                 seen = key < edge
                 near.who[k, i] = tag_of(key, tags) if seen else np.int32(0)
                 count += np.int32(1) if seen else np.int32(0)
@@ -101,7 +101,7 @@ def _tell_keys(plan: LookPlan) -> Callable[..., bool]:
 
 
 @section
-def _place_them(plan: LookPlan) -> Callable[..., None]:
+def _write_positions(plan: LookPlan) -> Callable[..., None]:
     """Make `place_them(rows, lanes, near, span, block, n, edge)`: write positions of the nearest, and exact squares."""
     width, many, d, squares = plan.listing.width, plan.agents, plan.listing.dimension, plan.listing.slot("square0")
     first = np.uint64(plan.place[0])
@@ -116,7 +116,7 @@ def _place_them(plan: LookPlan) -> Callable[..., None]:
                 i, here = block + lane, gather(rows, block + lane, place)
                 there = listed_at(near.pos, k, i)
                 to = offset_to(span.size, here, there) if periodic else sub(there, here)
-                square, key = exact_dot(to, to), key_read(lanes[squares + np.uint64(k * width) + lane])
+                square, key = exact_dot(to, to), float_as_key(lanes[squares + np.uint64(k * width) + lane])
                 near.square[k, i] = square if key < edge else like(span.within, np.inf)
 
     return place_them

@@ -14,17 +14,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flockenv.engine.blocks import handed_of, place_of
+from flockenv.engine.blocks import arrays_of, place_of
 from flockenv.engine.kernel_plan import KernelPlan
-from flockenv.engine.lane_access import gather, picked, places_each, scatter_each
+from flockenv.engine.lane_access import gather, pick_items, places_each, scatter_each
 from flockenv.engine.scratch import array_names
 from flockenv.geometry.cell_list import FEWEST_ARRANGED, STEPS_ARRANGED, WORTH_ARRANGING
-from flockenv.geometry.spatial_sort import count_tiles, find_homes
+from flockenv.geometry.spatial_sort import count_tiles, find_home_tiles
 from flockenv.jit.intrinsics import prefetch_for_write, wait_for_team
 from flockenv.jit.section import section
 from flockenv.jit.transpose import put_lines
 
-__all__ = ["Luggage", "arrange_plan", "go_home_of", "move_in_of"]
+__all__ = ["PackedFields", "arrange_plan", "move_back_of", "move_in_of"]
 
 AHEAD = 64
 """How many agents ahead packed data is prefetched."""
@@ -33,7 +33,7 @@ _COMMON = {**dict.fromkeys(("mass", "radius", "max_speed", "max_force"), 0), "wa
 """What all agents may share, and by which mask it is read then, see `blocks.common_places`."""
 
 
-class Luggage(NamedTuple):
+class PackedFields(NamedTuple):
     """What is packed of each agent: numbers of arrays, each at a place; see `lane_access.places_each`."""
 
     arrays: tuple[int, ...]  # in which array each lies
@@ -51,7 +51,7 @@ class ArrangePlan(NamedTuple):
     wraps: bool  # True if agents may lie outside a periodic box
     homely: bool
     inner: bool
-    luggage: Luggage
+    luggage: PackedFields
     size: int  # numbers of a packed agent, in whole cache lines
 
 
@@ -63,7 +63,7 @@ def arrange_plan(parts: KernelPlan) -> ArrangePlan:
     starts = [
         (2 if mask is not None else 0) + (1 if axis else 0) for mask, (_, _, axis) in zip(common, packed, strict=True)
     ]
-    luggage = Luggage(
+    luggage = PackedFields(
         tuple(names.index(name) for name, _, _ in packed),
         tuple(starts),
         tuple(int(axis) * parts.width if axis else 0 for _, _, axis in packed),
@@ -83,7 +83,7 @@ def move_in_of(plan: ArrangePlan) -> Callable[..., bool]:
     count: steps until they move back. share: (n, present, first, end, rank, team).
     """
     width, periodic, wraps, homely = plan.width, plan.periodic, plan.wraps, plan.homely
-    carry = _carry(plan, True)
+    carry = _reorder(plan, True)
 
     def move_in(scratch: Any, numbers: Any, count: Any, share: Any) -> Any:
         n, present, first, end, rank, team = share
@@ -98,19 +98,19 @@ def move_in_of(plan: ArrangePlan) -> Callable[..., bool]:
             if arranged:
                 carry(scratch, share)
                 if homely:
-                    find_homes(first, end, width, n, shape, scratch.start, scratch.homes)
+                    find_home_tiles(first, end, width, n, shape, scratch.start, scratch.homes)
         return arranged
 
     return move_in
 
 
-def go_home_of(plan: ArrangePlan) -> Callable[..., None]:
+def move_back_of(plan: ArrangePlan) -> Callable[..., None]:
     """Return `go_home(scratch, share)`: move agents back to the places of their numbers."""
-    return _carry(plan, False)
+    return _reorder(plan, False)
 
 
 @section
-def _carry(plan: ArrangePlan, to_tiles: bool) -> Callable[..., None]:
+def _reorder(plan: ArrangePlan, to_tiles: bool) -> Callable[..., None]:
     """Make `carry(scratch, share)`: pack this thread's agents, wait for all threads, and unpack the new ones.
 
     Packed agents go to distant places, in no order: to their tile, or to the place of their number. `cell` holds where;
@@ -118,12 +118,12 @@ def _carry(plan: ArrangePlan, to_tiles: bool) -> Callable[..., None]:
     """
     dimension, width, (arrays, which, further, _) = plan.dimension, plan.width, plan.luggage
     size, count, wide = np.uint64(dimension * width), plan.size, np.uint64(plan.size)
-    place_in, handed, unpack = place_of(dimension, width), handed_of(plan.inner), _unpack(plan)
+    place_in, handed, unpack = place_of(dimension, width), arrays_of(plan.inner), _unpack(plan)
 
     def carry(scratch: Any, share: Any) -> None:
         n, _, first, end, rank, team = share
         luggage, cell, offset, spread = scratch.luggage, scratch.cell, scratch.offset, scratch.spread
-        sources = picked(handed(scratch, scratch.pos, scratch.vel), scratch, arrays)
+        sources = pick_items(handed(scratch, scratch.pos, scratch.vel), scratch, arrays)
         for block in range(np.uint64(first), np.uint64(end)):
             base, row = block * size, block * np.uint64(width)
             for i in range(row, min(row + np.uint64(width), np.uint64(n))):
@@ -146,8 +146,8 @@ def _carry(plan: ArrangePlan, to_tiles: bool) -> Callable[..., None]:
 @section
 def _unpack(plan: ArrangePlan) -> Callable[..., None]:
     """Make `unpack(scratch, sources, i, place)`: unpack all data of agent i but what all agents share."""
-    own = _put_back(plan.luggage, plan.luggage.own[0])
-    bodies, wants = _put_back(plan.luggage, plan.luggage.own[1]), _put_back(plan.luggage, plan.luggage.own[2])
+    own = _unpack_fields(plan.luggage, plan.luggage.own[0])
+    bodies, wants = _unpack_fields(plan.luggage, plan.luggage.own[1]), _unpack_fields(plan.luggage, plan.luggage.own[2])
     wide = np.uint64(plan.size)
 
     def unpack(scratch: Any, sources: Any, i: Any, place: Any) -> None:
@@ -162,11 +162,11 @@ def _unpack(plan: ArrangePlan) -> Callable[..., None]:
 
 
 @section
-def _put_back(luggage: Luggage, mine: tuple[int, ...]) -> Callable[..., None]:
+def _unpack_fields(luggage: PackedFields, mine: tuple[int, ...]) -> Callable[..., None]:
     """Make `put_back(packed, at, sources, i, place)`: write numbers of agent i that lie packed at `at`."""
     which, further = tuple(luggage.which[k] % 2 for k in mine), tuple(luggage.further[k] for k in mine)
 
     def put_back(packed: Any, at: Any, sources: Any, i: Any, place: Any) -> None:
-        scatter_each(picked(sources, (), mine), (i, place), which, further, gather(packed, at, mine))
+        scatter_each(pick_items(sources, (), mine), (i, place), which, further, gather(packed, at, mine))
 
     return put_back

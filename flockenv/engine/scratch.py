@@ -20,7 +20,7 @@ from flockenv.jit.section import record
 if TYPE_CHECKING:
     from flockenv.engine.kernel_plan import KernelPlan
 
-__all__ = ["GIVEN", "OWN", "SMALL_STRIDE", "Array", "array_names", "scratch_bytes", "scratch_of", "scratch_record"]
+__all__ = ["OWN", "SMALL_STRIDE", "TABLES", "Array", "array_names", "scratch_bytes", "scratch_of", "scratch_record"]
 
 SMALL_STRIDE = 128
 """Length of a row of listed agents if these are too few to be sorted by cell: their blocks, and one more."""
@@ -28,7 +28,7 @@ SMALL_STRIDE = 128
 OWN = ("lanes", "ranges", "spread")
 """What each thread has for itself: running numbers of a block, ranges of candidates, masks of shared numbers."""
 
-GIVEN = ("bond_place", "bond_number", "bond_start")
+TABLES = ("bond_place", "bond_number", "bond_start")
 """Tables of bonds, which a scene has made: passed along with scratch, and only read."""
 
 Array = tuple[tuple[int, ...], Any]
@@ -56,19 +56,19 @@ def scratch_of(parts: KernelPlan, agents: int, team: int = 1) -> dict[str, Array
     found |= numbers(*parts.frame_numbers, *(f"inner{k}" for k in range(len(parts.inner))))
     found["counters"] = (max(parts.counters, 1),), real
     if parts.sweeps:
-        found |= _of_the_query(parts, agents, team)
+        found |= _query_arrays(parts, agents, team)
     if parts.arranges:
-        found |= _of_tiles(parts, agents)
+        found |= _tile_arrays(parts, agents)
     if parts.treed:
-        found |= _of_trees(parts, agents, team)
+        found |= _tree_arrays(parts, agents, team)
     if parts.bonded:
         kinds = np.dtype(np.int32), real, np.dtype(np.int64)
-        found |= {name: ((0,), kind) for name, kind in zip(GIVEN, kinds, strict=True)}
+        found |= {name: ((0,), kind) for name, kind in zip(TABLES, kinds, strict=True)}
     found |= {"tally": ((2 * team,), np.dtype(np.int64)), "sync": ((8,), np.dtype(np.int64))}
     return found | {"lanes": ((len(parts.slots) * width,), real)}
 
 
-def _of_the_query(parts: KernelPlan, agents: int, team: int) -> dict[str, Array]:
+def _query_arrays(parts: KernelPlan, agents: int, team: int) -> dict[str, Array]:
     """Return what finding neighbours needs: small worlds are listed in rows, others in cells, as records."""
     real, whole, width = np.dtype(parts.dtype), np.dtype(np.int32), parts.width
     padded = -(-agents // width) * width
@@ -88,7 +88,7 @@ def _of_the_query(parts: KernelPlan, agents: int, team: int) -> dict[str, Array]
     }
 
 
-def _of_tiles(parts: KernelPlan, agents: int) -> dict[str, Array]:
+def _tile_arrays(parts: KernelPlan, agents: int) -> dict[str, Array]:
     """Return what reordering a large world needs."""
     whole, width = np.dtype(np.int32), parts.width
     many = agents >= FEWEST_ARRANGED
@@ -102,7 +102,7 @@ def _of_tiles(parts: KernelPlan, agents: int) -> dict[str, Array]:
     return found
 
 
-def _of_trees(parts: KernelPlan, agents: int, team: int) -> dict[str, Array]:
+def _tree_arrays(parts: KernelPlan, agents: int, team: int) -> dict[str, Array]:
     """Return what a tree of agents needs, for laws about all agents."""
     real, long, width = np.dtype(parts.dtype), np.dtype(np.int64), parts.width
     padded = -(-agents // width) * width

@@ -15,10 +15,10 @@ from flockenv.geometry.shapes.cells import (
     MOST_FOUND,
     count_of,
     entry_length,
+    is_near_box,
     keep_in_order,
     list_of,
-    meets_box,
-    row_listed,
+    row_of_entry,
     span_of,
 )
 from flockenv.geometry.shapes.row_header import shift_of, vector_at
@@ -27,7 +27,16 @@ from flockenv.jit.decorators import Law, Vec, kernel, law
 from flockenv.jit.section import section
 from flockenv.maths.vectors import add
 
-__all__ = ["FormPlan", "Surroundings", "box_of_way", "by_form", "each_row", "near_rows", "number_of", "seen_from"]
+__all__ = [
+    "FormPlan",
+    "Surroundings",
+    "box_of_path",
+    "by_form",
+    "each_row",
+    "near_rows",
+    "number_of",
+    "offset_from_shape",
+]
 
 
 class FormPlan(NamedTuple):
@@ -77,7 +86,7 @@ def by_form(laws: tuple[tuple[str, Law], ...], otherwise: Law) -> Callable[..., 
 
 
 @section
-def seen_from(offset_to: Law, moving: bool) -> Callable[..., Vec]:
+def offset_from_shape(offset_to: Law, moving: bool) -> Callable[..., Vec]:
     """Make `seen(params, size, at, time, x)`: the offset of x from the anchor of the shape at `at`, m.
 
     time: s.
@@ -93,7 +102,7 @@ def seen_from(offset_to: Law, moving: bool) -> Callable[..., Vec]:
 
 
 @law
-def box_of_way(x: Vec, half: Vec, room: float) -> tuple[Vec, Vec]:
+def box_of_path(x: Vec, half: Vec, room: float) -> tuple[Vec, Vec]:
     """Return the box around the path of a body of radius `room` from x: the middle, and half the edges, m.
 
     half: half of the displacement.
@@ -112,7 +121,7 @@ def each_row(around: Surroundings, form: FormPlan, meet: Law, box: Law, done: La
     half the edges along each axis, m), which is updated after each row, until `done(state)`. Some of these may be
     visited twice, and their order is not defined.
     """
-    place, gridded, of_first = form.place, form.gridded, _of_first(meet)
+    place, gridded, of_first = form.place, form.gridded, _relative_to_first(meet)
     each_listed = _each_listed(around.offset_to, around.dimension, of_first, box, done)
 
     def each(params: Any, size: Any, given: Any, state: Any) -> Any:
@@ -128,7 +137,7 @@ def each_row(around: Surroundings, form: FormPlan, meet: Law, box: Law, done: La
 
 
 @section
-def _of_first(meet: Law) -> Callable[..., Any]:
+def _relative_to_first(meet: Law) -> Callable[..., Any]:
     """Make `meet` for a row that is given by its offset behind the first one."""
 
     def meet_listed(params: Any, size: Any, at: Any, row: Any, given: Any, state: Any) -> Any:
@@ -151,8 +160,8 @@ def _each_listed(offset_to: Law, dimension: int, meet: Law, box: Law, done: Law)
         for k in range(count_of(span)):
             begin, end = list_of(params, cells, middle, span, k)
             for entry in range(begin, end, length):
-                if meets_box(params, entry, offset_to(size, middle, vector_at(params, entry + 1, middle)), reach):
-                    state = meet(params, size, at, row_listed(params, entry), given, state)
+                if is_near_box(params, entry, offset_to(size, middle, vector_at(params, entry + 1, middle)), reach):
+                    state = meet(params, size, at, row_of_entry(params, entry), given, state)
                     if done(state):
                         return state
                     middle, reach = box(given, state)

@@ -1,4 +1,4 @@
-"""The side on which an agent passes what is ahead: `aside_of`, that of the nearest silhouette edge (Reynolds 1988).
+"""The side on which an agent passes what is ahead: `passing_side_of`, that of the nearest silhouette edge (Reynolds 1988).
 
 An obstacle is passed as grown by the body's radius. If another obstacle leaves no room beside an edge, the two count as
 one, and the edge of the other is searched for on the same side: so joined walls, and gaps that are too narrow, have no
@@ -19,8 +19,16 @@ from typing import Any
 import numpy as np
 
 from flockenv.engine.blocks import vector_of
-from flockenv.engine.shape_rows import FormPlan, Surroundings, box_of_way, by_form, each_row, number_of, seen_from
-from flockenv.geometry.shapes.edges import near_way, sphere_edge
+from flockenv.engine.shape_rows import (
+    FormPlan,
+    Surroundings,
+    box_of_path,
+    by_form,
+    each_row,
+    number_of,
+    offset_from_shape,
+)
+from flockenv.geometry.shapes.edges import near_path, sphere_edge
 from flockenv.geometry.shapes.ray_contact import touched_spot
 from flockenv.geometry.shapes.round import touched_normal
 from flockenv.geometry.shapes.table import law_of
@@ -29,7 +37,7 @@ from flockenv.jit.section import section
 from flockenv.maths.vectors import add, cross, dot, lateral, norm, perpendicular, scale, select, sub, unit, zero
 from flockenv.steering.around import threat
 
-__all__ = ["aside_of"]
+__all__ = ["passing_side_of"]
 
 FOLLOWED = 8
 """Obstacles in a row, edge to edge, that count as one; with more there is no edge on that side."""
@@ -49,7 +57,7 @@ SPINES = ("chain", "block")
 
 def _laws(verb: str, forms: tuple[FormPlan, ...]) -> tuple[tuple[str, Law], ...]:
     """Return the laws `edge_FORM` or `spine_FORM` of some forms, see shapes/edges.py."""
-    module = importlib.import_module(near_way.__module__)
+    module = importlib.import_module(near_path.__module__)
     return tuple((form.name, getattr(module, f"{verb}_{form.name}")) for form in forms)
 
 
@@ -60,7 +68,7 @@ def _no_edge(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) -> t
 
 
 @law
-def _nowhere(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
+def _no_surface(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
     """Return an infinite distance and no normal: there is no shape."""
     return like(x[0], np.inf), zero(x)
 
@@ -105,7 +113,7 @@ def _first_row(around: Surroundings) -> Callable[..., tuple[float, int, int]]:
     """Make `first(params, size, given, state)`: return `state` after all shapes; given: (time, x, ray, room)."""
     first, form = len(around.forms) == 1, around.forms[-1]
     before: Any = None if first else _first_row(around._replace(forms=around.forms[:-1]))
-    each = each_row(around, form, _touches(around, form), _box_of_way, _never)
+    each = each_row(around, form, _first_touched(around, form), _box_of_path, _never)
 
     def first_row(params: Any, size: Any, given: Any, state: Any) -> Any:
         if first:
@@ -116,15 +124,19 @@ def _first_row(around: Surroundings) -> Callable[..., tuple[float, int, int]]:
 
 
 @section
-def _touches(around: Surroundings, form: FormPlan) -> Callable[..., tuple[float, int, int]]:
+def _first_touched(around: Surroundings, form: FormPlan) -> Callable[..., tuple[float, int, int]]:
     """Make the function for each row: keep (distance, form, row) of what is touched first."""
-    seen, hit, number = seen_from(around.offset_to, around.moving), law_of("hit", form.name), number_of(form.name)
+    seen, hit, number = (
+        offset_from_shape(around.offset_to, around.moving),
+        law_of("hit", form.name),
+        number_of(form.name),
+    )
 
     def touches(params: Any, size: Any, at: Any, given: Any, state: Any) -> Any:
         time, x, ray, room = given
         best, touched, row = state
         y = seen(params, size, at, time, x)
-        if near_way(params, at, y, ray, room, best):
+        if near_path(params, at, y, ray, room, best):
             here = hit(params, at, y, ray, room)
             if here < best or (here == best and touched == number and at < row):
                 best, touched, row = here, number, at
@@ -134,10 +146,10 @@ def _touches(around: Surroundings, form: FormPlan) -> Callable[..., tuple[float,
 
 
 @kernel
-def _box_of_way(given: Any, state: Any) -> Any:
+def _box_of_path(given: Any, state: Any) -> Any:
     """Return the box around the free path of a body: the middle, and half the edges."""
     _, x, ray, room = given
-    return box_of_way(x, scale(ray, state[0] * like(state[0], 0.5)), room)
+    return box_of_path(x, scale(ray, state[0] * like(state[0], 0.5)), room)
 
 
 @kernel
@@ -181,7 +193,7 @@ def edge(around: Surroundings) -> Callable[..., tuple[float, float]]:
     Towards `side`; rad, and m along the turned ray until the body is beside the obstacle.
     """
     offset_to, circle, shaped = around.offset_to, vector_of(around.dimension), bool(around.forms)
-    seen, edge_of = seen_from(around.offset_to, around.moving), by_form(_laws("edge", around.forms), _no_edge)
+    seen, edge_of = offset_from_shape(around.offset_to, around.moving), by_form(_laws("edge", around.forms), _no_edge)
 
     def edge(world: Any, form: Any, row: Any, x: Any, ray: Any, side: Any, room: Any) -> Any:
         obstacle_x, obstacle_radius, params, size, b, time = world
@@ -203,7 +215,7 @@ def normal_hit(around: Surroundings) -> Callable[..., Vec]:
     """
     offset_to, circle, shaped = around.offset_to, vector_of(around.dimension), bool(around.forms)
     laws = tuple((form.name, law_of("nearest", form.name)) for form in around.forms)
-    seen, nearest = seen_from(around.offset_to, around.moving), by_form(laws, _nowhere)
+    seen, nearest = offset_from_shape(around.offset_to, around.moving), by_form(laws, _no_surface)
 
     def normal_hit(world: Any, form: Any, row: Any, x: Any, ray: Any, hit: Any, room: Any) -> Any:
         obstacle_x, _, params, size, b, time = world
@@ -255,8 +267,8 @@ def edge_beyond(around: Surroundings) -> Callable[..., tuple[float, Vec]]:
 
 
 @functools.cache
-def aside_of(around: Surroundings) -> Callable[..., Vec]:
-    """Make `aside_of(world, x, ray, room, known)`: the unit vector across a ray to the side of the nearest edge.
+def passing_side_of(around: Surroundings) -> Callable[..., Vec]:
+    """Make `passing_side_of(world, x, ray, room, known)`: the unit vector across a ray to the side of the nearest edge.
 
     Nearest to the impact; 0 if the obstacle ahead has no edge that the body can pass. known: its distance, m, form, and
     place in that. In the plane both sides are compared; in 3-D the side of the normal and those along and across an
@@ -294,7 +306,7 @@ def _sides_in_space(around: Surroundings) -> Callable[..., tuple[Vec, ...]]:
     coordinates is preferred, and agents of the mirrored scene take the mirrored path.
     """
     laws = _laws("spine", tuple(form for form in around.forms if form.name in SPINES))
-    some, seen, spine_of = bool(laws), seen_from(around.offset_to, around.moving), by_form(laws, _no_spine)
+    some, seen, spine_of = bool(laws), offset_from_shape(around.offset_to, around.moving), by_form(laws, _no_spine)
 
     def sides(world: Any, form: Any, row: Any, x: Any, ray: Any, own: Any, off: Any) -> Any:
         _, _, params, size, _, time = world

@@ -21,20 +21,20 @@ from flockenv.engine.accelerations import (
     sense_of,
     sense_plan,
 )
-from flockenv.engine.agent_records import AgentPlan, agent_plan, alone_of
+from flockenv.engine.agent_records import AgentPlan, agent_of, agent_plan
 from flockenv.engine.blocks import place_of, vector_of_lane
 from flockenv.engine.context import Context
 from flockenv.engine.kernel_plan import KernelPlan
 from flockenv.engine.lane_access import gather
-from flockenv.engine.law_calls import OneLaw, laws_of, says_of
+from flockenv.engine.law_calls import OneLaw, laws_of, value_of
 from flockenv.engine.load_store import bring_in_of, bring_inside_of, bring_out_of, take_drive_of
 from flockenv.engine.method import MethodPlan, advance_of, method_plan
 from flockenv.engine.move import MovePlan, move_of, move_plan
 from flockenv.engine.parameters import NumberPlan, numbers_of
-from flockenv.engine.reorder import ArrangePlan, arrange_plan, go_home_of, move_in_of
+from flockenv.engine.reorder import ArrangePlan, arrange_plan, move_back_of, move_in_of
 from flockenv.jit.decorators import Law, finite, kernel, like
 from flockenv.jit.intrinsics import prefetch_for_write, wait_for_team
-from flockenv.jit.section import in_turn, section
+from flockenv.jit.section import call_in_turn, section
 from flockenv.maths.vectors import zero
 from flockenv.model.state import COUNTED_BY_KERNELS
 from flockenv.physics.integrators.integrator import Method, Provided
@@ -85,9 +85,9 @@ def step_plan(parts: KernelPlan) -> StepPlan:
 
 
 @functools.cache
-def _counting(law: OneLaw) -> Callable[..., None]:
+def _count_one(law: OneLaw) -> Callable[..., None]:
     """Return `counts(numbers, me, lives)`: add a living agent to the counter that a law selects."""
-    which_of, k = says_of(law), law.k
+    which_of, k = value_of(law), law.k
 
     def counts(numbers: Any, me: Any, lives: Any) -> None:
         which: Any = np.int64(which_of(numbers, me))
@@ -98,7 +98,7 @@ def _counting(law: OneLaw) -> Callable[..., None]:
 
 
 @functools.cache
-def _clearing(k: int) -> Callable[..., None]:
+def _clear_counters(k: int) -> Callable[..., None]:
     def clears(numbers: Any) -> None:
         numbers.effects[k].counted[:] = 0
 
@@ -109,8 +109,8 @@ def _clearing(k: int) -> Callable[..., None]:
 def _count(agent: AgentPlan, laws: tuple[OneLaw, ...]) -> Callable[..., None]:
     """Make `count_agents(context, pos, vel, time)`: count all agents of a world, by one thread of the team."""
     d, width = agent.dimension, agent.width
-    place_in, vector, alone = place_of(d, width), vector_of_lane(d, width), alone_of(agent._replace(aims=False))
-    clear, counts = in_turn(*(_clearing(law.k) for law in laws)), in_turn(*map(_counting, laws))
+    place_in, vector, alone = place_of(d, width), vector_of_lane(d, width), agent_of(agent._replace(aims=False))
+    clear, counts = call_in_turn(*(_clear_counters(law.k) for law in laws)), call_in_turn(*map(_count_one, laws))
 
     def count_agents(context: Any, pos: Any, vel: Any, time: Any) -> None:
         scratch, numbers, drawn = context.scratch, context.numbers, context.key[context.b]
@@ -128,22 +128,22 @@ def _count(agent: AgentPlan, laws: tuple[OneLaw, ...]) -> Callable[..., None]:
 
 
 @functools.cache
-def _asking(many: int, width: int) -> Callable[[Any, Any], None]:
+def _prefetch_block(many: int, width: int) -> Callable[[Any, Any], None]:
     """Return `asks(array, block)`: prefetch `many` numbers of a block of an array."""
     places = tuple(range(0, many, width))
-    return kernel(lambda array, block: _ask_all(array, block * np.uint64(many), places))
+    return kernel(lambda array, block: _prefetch_all(array, block * np.uint64(many), places))
 
 
 @kernel
-def _ask_all(array: Any, at: Any, places: Any) -> None:
+def _prefetch_all(array: Any, at: Any, places: Any) -> None:
     for place in places:
         prefetch_for_write(array, at + np.uint64(place))
 
 
 @section
-def _ask_ahead(numbers: tuple[int, ...], width: int) -> Callable[..., None]:
+def _prefetch_ahead(numbers: tuple[int, ...], width: int) -> Callable[..., None]:
     """Make `ask_ahead(scratch, pos, vel, block)`: prefetch what moves a later block."""
-    (of_pos, of_vel, of_felt, of_ident), felt = (_asking(many, width) for many in numbers), numbers[2] > 0
+    (of_pos, of_vel, of_felt, of_ident), felt = (_prefetch_block(many, width) for many in numbers), numbers[2] > 0
 
     def ask_ahead(scratch: Any, pos: Any, vel: Any, block: Any) -> None:
         ahead = block + np.uint64(AHEAD)
@@ -165,7 +165,7 @@ def _in_two_loops(plan: StepPlan) -> Callable[..., None]:
     """
     size = np.uint64(plan.agent.dimension * plan.agent.width)
     respond, move = respond_of(plan.response), move_of(plan.move)
-    ask_ahead = _ask_ahead(plan.ahead, plan.agent.width) if plan.ahead else None
+    ask_ahead = _prefetch_ahead(plan.ahead, plan.agent.width) if plan.ahead else None
     sense = sense_of(plan.sense)
 
     def advance(context: Any, pos: Any, vel: Any, time: Any, dt: Any, instant: Any) -> None:
@@ -227,7 +227,7 @@ def _first_bad(bad: int, width: int) -> Callable[..., Any]:
 
 
 @section
-def _failing(bad: int, width: int) -> Callable[..., Any]:
+def _first_failure(bad: int, width: int) -> Callable[..., Any]:
     """Make `failing(lanes, well, step, n, failed, none_failed)`: return which agent failed first, and in which step.
 
     As one number, step * n + agent; `none_failed`, n (count + 1), as long as no agent has.
@@ -246,7 +246,7 @@ def _failing(bad: int, width: int) -> Callable[..., Any]:
 
 
 @section
-def _enter(plan: StepPlan) -> Callable[..., Context]:
+def _copy_in(plan: StepPlan) -> Callable[..., Context]:
     """Make `enter(worlds, drive, asked, params, count, b, rank, team, scratch)`: copy this thread's agents into blocks.
 
     It returns the context of world b, reordered for `count` steps if that pays.
@@ -292,11 +292,14 @@ def step_world_of(plan: StepPlan) -> Callable[..., int]:
     empty.
     """
     agent, width, bad = plan.agent, plan.agent.width, np.uint64(plan.move.bad)
-    enter, bring_out, counted = _enter(plan), bring_out_of(agent), tuple(range(COUNTED_BY_KERNELS))
+    enter, bring_out, counted = _copy_in(plan), bring_out_of(agent), tuple(range(COUNTED_BY_KERNELS))
     count_agents = _count(agent, plan.counts) if plan.counts else None
     advance = _in_two_loops(plan) if plan.method is None else _by_method(plan)
-    first_bad, failing = _first_bad(plan.move.bad, width), _failing(plan.move.bad, width) if plan.spreads else None
-    go_home = go_home_of(plan.arrange) if plan.arrange is not None else None
+    first_bad, failing = (
+        _first_bad(plan.move.bad, width),
+        _first_failure(plan.move.bad, width) if plan.spreads else None,
+    )
+    go_home = move_back_of(plan.arrange) if plan.arrange is not None else None
     verdict = _verdict(plan.trusts, agent.dimension)
 
     def step_world(

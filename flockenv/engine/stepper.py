@@ -18,7 +18,7 @@ from flockenv.engine.implicit_step import solve_steps
 from flockenv.engine.kernel_plan import KernelPlan
 from flockenv.engine.scratch import scratch_record
 from flockenv.engine.workspace import Workspace
-from flockenv.jit.thread_pool import LARGEST, AutoTuners, at_work, share
+from flockenv.jit.thread_pool import LARGEST, AutoTuners, run_parallel, usable_threads
 from flockenv.model.scene_view import SceneView
 from flockenv.model.state import Floats, State
 from flockenv.physics.constraints import Settler
@@ -67,10 +67,10 @@ class Stepper:
         if steps == 0:
             return -1, -1, ""
         if self.scene.integrator.solves:
-            return solve_steps(self.scene, state, drive, steps, self._take_over)
-        return *self._stepped(state, drive, steps), ""
+            return solve_steps(self.scene, state, drive, steps, self._finish_step)
+        return *self._step(state, drive, steps), ""
 
-    def _take_over(self, state: State, world: int, x: Floats, v: Floats) -> tuple[int, int]:
+    def _finish_step(self, state: State, world: int, x: Floats, v: Floats) -> tuple[int, int]:
         """Let the kernel finish a step with the solved positions and velocities, (D, N): limits, space, time."""
         width, (_, n) = self.scene.parts.width, x.shape
         stages = self.workspaces(1, 1)[0].arrays["stages"]
@@ -78,24 +78,24 @@ class Stepper:
             padded = np.zeros((self.scene.dimension, -(-n // width) * width), self.scene.dtype)
             padded[:, :n] = solved
             row[:] = padded.reshape(self.scene.dimension, -1, width).transpose(1, 0, 2).ravel()
-        return self._stepped(state, np.zeros((self.scene.dimension, 0, 0), self.scene.dtype), 1)
+        return self._step(state, np.zeros((self.scene.dimension, 0, 0), self.scene.dtype), 1)
 
-    def _stepped(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
+    def _step(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
         """Step in place with the kernel: all steps in one call, or one by one with constraints and population."""
         ends = self.scene.constraints or self.scene.population
-        return self._settled(state, drive, steps) if ends else self._moved(state, drive, steps)
+        return self._step_one_by_one(state, drive, steps) if ends else self._step_by_kernel(state, drive, steps)
 
-    def _settled(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
+    def _step_one_by_one(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
         """Step in place, with constraints and population after each step; a world that fails stays as it was."""
-        kept, x0, v0 = self._remembered(state)
+        kept, x0, v0 = self._back_up(state)
         begun, failed = state.tick.copy(), np.zeros(len(state.tick), np.bool_)
         found, births = (-1, -1), bool(self.scene.population and self.scene.parts.inner)
         for step in range(steps):
             if self._looks_back:
                 x0[...], v0[...] = state.x, state.v
-            moved = self._moved(state, drive, 1)
+            moved = self._step_by_kernel(state, drive, 1)
             who = state.identity.copy() if births else None
-            mended = self._mended(x0, v0, state)
+            mended = self._apply_constraints(x0, v0, state)
             if who is not None:
                 self.begin(state, state.identity != who)
             failed |= state.tick != begun + step + 1
@@ -113,7 +113,7 @@ class Stepper:
         """True if constraints or population depend on the start of the step."""
         return bool(self.scene.constraints) or any(member.looks_back for member in self.scene.population)
 
-    def _remembered(self, state: State) -> tuple[State, Floats, Floats]:
+    def _back_up(self, state: State) -> tuple[State, Floats, Floats]:
         """Return a copy of a state, and buffers for positions and velocities: memory of this thread, reused."""
         memory = vars(self._threads)
         sizes = state.shape, state.obstacle_radius.shape
@@ -124,10 +124,10 @@ class Stepper:
         kept.copy_from(state)
         return kept, x0, v0
 
-    def _mended(self, x0: Floats, v0: Floats, state: State) -> list[tuple[int, int]]:
+    def _apply_constraints(self, x0: Floats, v0: Floats, state: State) -> list[tuple[int, int]]:
         """Apply all constraints to a step that began at x0, v0; return every (world, agent) that is not finite."""
         worlds, agents, _ = state.shape
-        crew, work = min(at_work(), worlds), worlds * agents
+        crew, work = min(usable_threads(), worlds), worlds * agents
 
         def settle(settlers: list[Settler], first: int, end: int) -> list[tuple[int, int]]:
             return [bad for each in settlers if (bad := each(x0, v0, state, first, end))[0] >= 0]
@@ -138,9 +138,11 @@ class Stepper:
         def shared() -> list[tuple[int, int]]:
             bounds = [worlds * k // crew for k in range(crew + 1)]
             parts = zip(self._settlers(crew), bounds[:-1], bounds[1:], strict=False)
-            return [bad for found in share([functools.partial(settle, *part) for part in parts]) for bad in found]
+            return [
+                bad for found in run_parallel([functools.partial(settle, *part) for part in parts]) for bad in found
+            ]
 
-        return alone() if crew <= 1 else self.tuners.of("mending", work, crew).made(alone, shared, work >= LARGEST)
+        return alone() if crew <= 1 else self.tuners.of("mending", work, crew).run(alone, shared, work >= LARGEST)
 
     def _settlers(self, count: int) -> list[list[Settler]]:
         """Return the constraints and population of `count` threads, each with scratch memory of its own."""
@@ -150,7 +152,7 @@ class Stepper:
             kept.append([constraint.settler(self.scene) for constraint in self.scene.constraints] + last)
         return kept
 
-    def _moved(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
+    def _step_by_kernel(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
         """Step in place by the kernel alone, on all threads in use.
 
         Threads divide the worlds, or the agents of a large world.
@@ -158,7 +160,7 @@ class Stepper:
         worlds, agents, _ = state.shape
         move, kind = self.move, self._scratch_kind
         arrays = worlds_of(state), drive, self.params, self.dt, steps
-        crew, team = self._divided(worlds, agents)
+        crew, team = self._thread_counts(worlds, agents)
 
         def alone() -> tuple[int, int]:
             return move(*arrays, 0, worlds, 0, 1, self.workspaces(1, 1)[0].of(0, kind))
@@ -170,7 +172,7 @@ class Stepper:
             spaces = self.workspaces(crew // team, team)
             spaces[0].arrays["sync"][:] = 0
             parts = [(0, worlds) if team > 1 else (worlds * k // crew, worlds * (k + 1) // crew) for k in range(crew)]
-            found = share([
+            found = run_parallel([
                 functools.partial(move, *arrays, *parts[k], k % team, team, spaces[k // team].of(k % team, kind))
                 for k in range(crew)
             ])  # fmt: skip
@@ -178,14 +180,14 @@ class Stepper:
 
         work = worlds * agents * steps
         surely = work >= LARGEST and (team == 1 or agents >= SURELY_TOGETHER)
-        return self.tuners.of("together" if team > 1 else "apart", work, crew).made(alone, shared, surely)
+        return self.tuners.of("together" if team > 1 else "apart", work, crew).run(alone, shared, surely)
 
-    def _divided(self, worlds: int, agents: int) -> tuple[int, int]:
+    def _thread_counts(self, worlds: int, agents: int) -> tuple[int, int]:
         """Return the number of threads that may step these worlds, and the number that share each world.
 
         With an implicit method the solution is in one thread's scratch memory.
         """
-        crew, solves = at_work(), self.scene.integrator.adaptive or self.scene.integrator.solves
+        crew, solves = usable_threads(), self.scene.integrator.adaptive or self.scene.integrator.solves
         together = worlds < crew and agents >= FEWEST_TOGETHER and not solves
         return (crew, crew) if together else (min(crew, worlds), 1)
 

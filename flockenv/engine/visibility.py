@@ -1,4 +1,4 @@
-"""Occlusion by obstacles: `blocked`, for laws that ignore what an obstacle hides."""
+"""Occlusion by obstacles: `is_blocked_of`, for laws that ignore what an obstacle hides."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ from collections.abc import Callable
 from typing import Any
 
 from flockenv.engine.blocks import vector_of
-from flockenv.engine.shape_rows import FormPlan, Surroundings, box_of_way, each_row, seen_from
+from flockenv.engine.shape_rows import FormPlan, Surroundings, box_of_path, each_row, offset_from_shape
 from flockenv.geometry.shapes.round import blocks
 from flockenv.geometry.shapes.table import law_of
 from flockenv.jit.decorators import kernel, like
 from flockenv.jit.section import section
 from flockenv.maths.vectors import norm, scale, unit
 
-__all__ = ["blocked"]
+__all__ = ["is_blocked_of"]
 
 
 @section
-def blocked(around: Surroundings) -> Callable[..., bool]:
-    """Make `blocked(obstacle_x, obstacle_radius, params, size, b, time, x, to)`.
+def is_blocked_of(around: Surroundings) -> Callable[..., bool]:
+    """Make `is_blocked_of(obstacle_x, obstacle_radius, params, size, b, time, x, to)`.
 
     It returns True if an obstacle intersects the straight line from place x to the offset `to`, m.
     """
     offset_to, circle, shaped = around.offset_to, vector_of(around.dimension), bool(around.forms)
-    hidden: Any = _hidden(around) if shaped else None
+    hidden: Any = _is_hidden_by_shape(around) if shaped else None
 
     def is_blocked(
         obstacle_x: Any, obstacle_radius: Any, params: Any, size: Any, b: Any, time: Any, x: Any, to: Any
@@ -41,11 +41,11 @@ def blocked(around: Surroundings) -> Callable[..., bool]:
 
 
 @section
-def _hidden(around: Surroundings) -> Callable[..., bool]:
+def _is_hidden_by_shape(around: Surroundings) -> Callable[..., bool]:
     """Make `hidden(params, size, time, x, to, found)`: return True if `found`, or if a shape intersects the line."""
     first, form = len(around.forms) == 1, around.forms[-1]
-    before: Any = None if first else _hidden(around._replace(forms=around.forms[:-1]))
-    each = each_row(around, form, _hides(around, form), _box_of_way, _found)
+    before: Any = None if first else _is_hidden_by_shape(around._replace(forms=around.forms[:-1]))
+    each = each_row(around, form, _blocks_line(around, form), _box_of_line, _is_found)
 
     def hidden(params: Any, size: Any, time: Any, x: Any, to: Any, found: Any) -> Any:
         if first:
@@ -56,9 +56,9 @@ def _hidden(around: Surroundings) -> Callable[..., bool]:
 
 
 @section
-def _hides(around: Surroundings, form: FormPlan) -> Callable[..., bool]:
+def _blocks_line(around: Surroundings, form: FormPlan) -> Callable[..., bool]:
     """Make the function for each row: return True if it or an earlier one intersects the line."""
-    seen, hit = seen_from(around.offset_to, around.moving), law_of("hit", form.name)
+    seen, hit = offset_from_shape(around.offset_to, around.moving), law_of("hit", form.name)
 
     def hides(params: Any, size: Any, at: Any, given: Any, found: Any) -> Any:
         time, x, to = given
@@ -69,13 +69,13 @@ def _hides(around: Surroundings, form: FormPlan) -> Callable[..., bool]:
 
 
 @kernel
-def _box_of_way(given: Any, found: Any) -> Any:
+def _box_of_line(given: Any, found: Any) -> Any:
     """Return the box around the line: the middle, and half the edges."""
     _, x, to = given
-    return box_of_way(x, scale(to, like(to[0], 0.5)), like(to[0], 0.0))
+    return box_of_path(x, scale(to, like(to[0], 0.5)), like(to[0], 0.0))
 
 
 @kernel
-def _found(found: Any) -> Any:
+def _is_found(found: Any) -> Any:
     """Return True if the search is done: one shape is enough."""
     return found

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.engine import GIVEN, OWN, KernelPlan, Table, scratch_of
+from flockenv.engine import OWN, TABLES, KernelPlan, Table, scratch_of
 from flockenv.jit.cpu import LINE
 from flockenv.model.state import Body
 from flockenv.physics.effects.effect import ties
@@ -39,8 +39,8 @@ class Workspace:
     def allocate(cls, parts: KernelPlan, body: Body, table: Table, team: int = 1) -> Workspace:
         """Return scratch for neighbours, queries and the integrator: the arrays of engine.scratch.scratch_of."""
         agents, wanted = len(body.mass), scratch_of(parts, len(body.mass), team)
-        made = _zeros({name: array for name, array in wanted.items() if name not in (*OWN, *GIVEN)})
-        arrays = made | {name: getattr(table, name.removeprefix("bond_")) for name in GIVEN if name in wanted}
+        made = _zeros({name: array for name, array in wanted.items() if name not in (*OWN, *TABLES)})
+        arrays = made | {name: getattr(table, name.removeprefix("bond_")) for name in TABLES if name in wanted}
         padded = len(arrays["mass"])
         for name, pad in (("mass", 1), ("radius", 0), ("max_speed", 1), ("max_force", 1)):
             arrays[name][:] = pad

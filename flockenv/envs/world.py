@@ -16,12 +16,12 @@ from numpy.typing import ArrayLike, NDArray
 from flockenv.core.errors import nearest
 from flockenv.engine import Look, pack, scratch_record
 from flockenv.engine.workspace import Workspace
-from flockenv.jit.buffer_pool import Recycler
+from flockenv.jit.buffer_pool import BufferPool
 from flockenv.jit.cpu import LINE
 from flockenv.jit.memory import zeros
 from flockenv.jit.section import without_dispatch
-from flockenv.jit.simd_rows import PAIR, apart
-from flockenv.jit.thread_pool import LARGEST, AutoTuners, at_work, share
+from flockenv.jit.simd_rows import PAIR, column_distance
+from flockenv.jit.thread_pool import LARGEST, AutoTuners, run_parallel, usable_threads
 from flockenv.maths.counter_rng import MASK, keys_of
 from flockenv.model import state as states
 from flockenv.model.snapshot import Snapshot
@@ -122,7 +122,7 @@ class World:
         self._untold = tuple(np.empty(shape, kind) for shape, kind in fields[1:])  # results that a reset does not write
         row, size = 4 * math.prod(self._shapes[0][1:]), 4 * math.prod(self._shapes[0])
         self._past = size >= PAST and row <= AT_HAND
-        kinds, maker = zip(self._shapes, self._dtypes, strict=True), Recycler(line=LINE).maker
+        kinds, maker = zip(self._shapes, self._dtypes, strict=True), BufferPool(line=LINE).maker
         self._fresh: tuple[Callable[[], NDArray[Any]], ...] = tuple(
             maker(*kind) if size >= RECYCLE else functools.partial(np.empty, *kind) for kind in kinds
         )
@@ -154,15 +154,15 @@ class World:
         padded = -(-n // lanes) * lanes
         wide: tuple[NDArray[Any], ...] = ()
         if task.abreast:
-            beside = zeros(task.abreast * apart(self.learners), np.float32)
+            beside = zeros(task.abreast * column_distance(self.learners), np.float32)
             own, vel = (2 * d + 1 + task.memory, padded), (d, look.agents, padded)
             wide = (zeros(own, real), zeros(vel, real), zeros((1, look.agents, padded), real), beside)
             wide[2][:] = scene.body.radius[0]  # all agents have it, or it is gathered
         decision = Decision(
             zeros(self._shapes[0][1:] if self._past else (0, 0), np.float32),
             zeros((d, 1, n), real), zeros((d, n), real), zeros((d, n), real), zeros(n, np.bool_),
-            zeros(self.action_size * apart(self.learners), real if task.abreast else float),
-            zeros(len(task.terms) * apart(self.learners), real if task.abreast else float), wide,
+            zeros(self.action_size * column_distance(self.learners), real if task.abreast else float),
+            zeros(len(task.terms) * column_distance(self.learners), real if task.abreast else float), wide,
         )  # fmt: skip
         near = [
             zeros(shape, kind)
@@ -321,7 +321,7 @@ class World:
         everyone: observe all worlds in a reset, and write the terms of all in a decision. Returns (world, agent) of the
         first agent that is not finite, or (-1, -1).
         """
-        crew, work = min(at_work(), busy), busy * self.agents * self.task.substeps
+        crew, work = min(usable_threads(), busy), busy * self.agents * self.task.substeps
         whole = acting, mask, everyone, acting, 0, self.worlds, actions, limit, told
         if crew <= 1:
             return self._calls[0](*whole)
@@ -330,7 +330,7 @@ class World:
             return self._shared(crew, acting, mask, everyone, limit, told, actions)
 
         choice = self._tuners.of("deciding" if acting else "beginning", work, crew)
-        return choice.made(functools.partial(self._calls[0], *whole), shared, work >= LARGEST)
+        return choice.run(functools.partial(self._calls[0], *whole), shared, work >= LARGEST)
 
     def _shared(
         self, crew: int, acting: bool, mask: NDArray[np.bool_], everyone: bool, limit: int,
@@ -350,7 +350,7 @@ class World:
                 found.append(call(acting, mask, everyone, False, first, end, actions, limit, told))
             return min((bad for bad in found if bad[0] >= 0), default=(-1, -1))
 
-        bad = [found for found in share([functools.partial(several, k) for k in range(crew)]) if found[0] >= 0]
+        bad = [found for found in run_parallel([functools.partial(several, k) for k in range(crew)]) if found[0] >= 0]
         return min(bad, default=(-1, -1))
 
     def _taken(self, actions: ArrayLike) -> NDArray[Any]:

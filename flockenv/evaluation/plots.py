@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.core.atomic_files import replacing
+from flockenv.core.atomic_files import replace_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,7 +51,7 @@ class Column:
 def write_chart(path: str | Path, columns: Sequence[Column], title: str, note: str = "") -> None:
     """Write the plot as a PNG file, atomically and without a display; the same numbers give the same bytes."""
     figure = draw_chart(columns, title, note)
-    with replacing(path) as file:
+    with replace_file(path) as file:
         figure.savefig(file, format="png", dpi=150, metadata={"Software": "flockenv"})
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from flockenv.geometry.cell_list import region
 from flockenv.jit.decorators import kernel
 
-__all__ = ["BUCKETS", "LEVELS", "LISTED", "MOST_DIRECT", "gather", "line_up", "tree_sizes", "weigh"]
+__all__ = ["BUCKETS", "LEVELS", "LISTED", "MOST_DIRECT", "build_tree", "gather", "sort_along_curve", "tree_sizes"]
 
 MOST_DIRECT = 2000
 """Number of agents up to which all pairs are summed exactly.
@@ -80,7 +80,7 @@ def _exchange(x: Any, other: Any, k: int) -> Any:
 
 
 @kernel
-def _along_curve(cells: Any, flat: bool, bits: int) -> None:
+def _curve_positions(cells: Any, flat: bool, bits: int) -> None:
     """Convert cells to their positions along a Hilbert curve (Skilling 2004, AIP Conf. Proc. 707:381).
 
     cells: the x of TOGETHER cells, then their y, then their z; the positions overwrite x.
@@ -116,9 +116,9 @@ def _cell(x: float, low: float, pace: float, cells: Any) -> Any:
 
 
 @kernel
-def _place(keys: Any, first: int, end: int, cells: Any, flat: bool, bits: int) -> None:
+def _write_keys(keys: Any, first: int, end: int, cells: Any, flat: bool, bits: int) -> None:
     """Write the keys of agents [first, end), at most TOGETHER."""
-    _along_curve(cells, flat, bits)
+    _curve_positions(cells, flat, bits)
     for i in range(first, end):
         keys[i] = cells[i - first]
 
@@ -146,7 +146,7 @@ def _sort(keys: Any, places: Any, digits: Any, count: int, room: int) -> None:
 
 
 @kernel
-def line_up(
+def sort_along_curve(
     pos: Any, living: Any, mass: Any, n: int, lanes: int, sync: Any, bounds: Any, size: Any, keys: Any, places: Any,
     digits: Any, leaves: Any,
 ) -> int:  # fmt: skip
@@ -170,8 +170,8 @@ def line_up(
             places[count] = i
             count += 1
             if count % TOGETHER == 0:
-                _place(keys, count - TOGETHER, count, digits, d == 2, bits)
-    _place(keys, count // TOGETHER * TOGETHER, count, digits, d == 2, bits)
+                _write_keys(keys, count - TOGETHER, count, digits, d == 2, bits)
+    _write_keys(keys, count // TOGETHER * TOGETHER, count, digits, d == 2, bits)
     _sort(keys, places, digits, count, room)
     for i in range((count + lanes - 1) // lanes * lanes):
         who: Any = np.int64(places[min(i, count - 1)])
@@ -233,7 +233,7 @@ def _measure(nodes: Any, at: int, d: int) -> None:
 
 
 @kernel
-def weigh(leaves: Any, count: int, lanes: int, size: Any, by_mass: bool, digits: Any, nodes: Any) -> None:
+def build_tree(leaves: Any, count: int, lanes: int, size: Any, by_mass: bool, digits: Any, nodes: Any) -> None:
     """Build the tree over the blocks of `count` agents; the weight of a node is their mass or their number.
 
     Writes nodes, a record each (see `tree_sizes`), level after level; digits[BUCKETS + k]: the first node of level k,
@@ -258,7 +258,7 @@ def weigh(leaves: Any, count: int, lanes: int, size: Any, by_mass: bool, digits:
 
 
 @kernel
-def _onward(level: int, node: int, top: int, digits: Any) -> tuple[int, int]:
+def _next_node(level: int, node: int, top: int, digits: Any) -> tuple[int, int]:
     """Return the next node (level, node) after this one and its descendants; level top + 1 if there is none."""
     while level < top and (
         node % CHILDREN == CHILDREN - 1 or digits[BUCKETS + level] + node + 1 == digits[BUCKETS + level + 1]
@@ -301,7 +301,7 @@ def gather(
                 listed[to + k] = nodes[at + k]
             listed[to + d] = nodes[at + 3 * d]
             many += 1
-            level, node = _onward(level, node, top, digits)
+            level, node = _next_node(level, node, top, digits)
         elif level > 0:
             level, node = level - 1, node * CHILDREN
         else:
@@ -312,5 +312,5 @@ def gather(
                 listed[to + d] = leaves[source + d * lanes + l] if by_mass else 1.0
                 to += d + 1
             many += held
-            level, node = _onward(level, node, top, digits)
+            level, node = _next_node(level, node, top, digits)
     return many, level, node

@@ -7,7 +7,7 @@ cell, then by agent number) does not depend on the number of threads.
 
 In an unbounded space the cells divide the bounding box of the agents. One agent far away stretches the cells until all
 others share one. If that has happened, the cells are folded instead: they are as wide as the reach, there are
-infinitely many, and they share a fixed number of slots in memory, like the cells of a torus (`_folded`).
+infinitely many, and they share a fixed number of slots in memory, like the cells of a torus (`_folded_shape`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from flockenv.jit.intrinsics import prefetch_for_write, wait_for_team
 
 __all__ = [
     "AHEAD", "DISTANT", "FEWEST_AGENTS", "FEWEST_ARRANGED", "FINEST", "MAX_RANGES", "STEPS_ARRANGED",
-    "WORTH_ARRANGING", "begin_cells", "candidates", "cell_of", "count_cells", "divided", "grid_of", "order_records",
+    "WORTH_ARRANGING", "begin_cells", "candidates", "cell_of", "count_cells", "divide_region", "grid_of", "order_records",
     "row_of", "tally_cells",
 ]  # fmt: skip
 
@@ -85,7 +85,7 @@ def _fit(cells: Any, count: int) -> tuple[int, int, int]:
 
 
 @kernel
-def _along(length: float, reach: float) -> int:
+def _cells_along(length: float, reach: float) -> int:
     return int(min(max(1.0, length / (reach * _MARGIN)), 2.0**20))  # bounded first: 1e100 m overflow an integer
 
 
@@ -95,12 +95,12 @@ def grid_of(lengths: Any, count: int, reach: float, periodic: bool) -> tuple[int
 
     The last number is 0: these cells are not folded. All are zeros if brute force is as fast.
     """
-    fine, nx, ny, nz = FINEST, _along(lengths[0], reach / FINEST), _along(lengths[1], reach), 1
+    fine, nx, ny, nz = FINEST, _cells_along(lengths[0], reach / FINEST), _cells_along(lengths[1], reach), 1
     if len(lengths) == 3:
-        nz = _along(lengths[len(lengths) - 1], reach)
+        nz = _cells_along(lengths[len(lengths) - 1], reach)
     while fine > 1 and float(nx) * float(ny) * float(nz) > count:
         fine -= 1
-        nx = _along(lengths[0], reach / fine)
+        nx = _cells_along(lengths[0], reach / fine)
     nx, ny, nz = _fit((nx, ny, nz), count)
     wide = max(1, nx // fine)
     few = periodic and (
@@ -165,7 +165,7 @@ def _part(x: float, low: float, pace: float, count: int) -> Any:
 
 
 @kernel
-def divided(
+def divide_region(
     pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, bounds: Any, size: Any,
     reach: float, periodic: bool, capacity: int,
 ) -> tuple[tuple[int, int, int, int, int], Any, Any]:  # fmt: skip
@@ -220,7 +220,7 @@ def count_cells(
     Writes cell (agents, padded), -1 for the dead; start (capacity + 1,): first sorted agent of each cell;
     offset (team, capacity): where this thread puts its next agent of each cell. Returns zeros for brute force.
     """
-    shape, low, pace = divided(
+    shape, low, pace = divide_region(
         pos, living, first, end, lanes, rank, team, sync, bounds, size, reach, periodic, capacity
     )
     cells = shape[0] * shape[1] * shape[2]
@@ -229,13 +229,13 @@ def count_cells(
     _find_cells(pos, living, first, end, lanes, low, pace, size, wraps, shape, cell)
     tally_cells(cell, first * lanes, end * lanes, rank, cells, offset)
     begin_cells(rank, team, sync, cells, start, offset)
-    if periodic or not crowded(shape, pace, reach, start):
+    if periodic or not is_crowded(shape, pace, reach, start):
         return shape
     return count_folded(pos, living, first, end, lanes, rank, team, sync, size, reach, capacity, cell, start, offset)
 
 
 @kernel
-def crowded(shape: Any, pace: Any, reach: float, start: Ints) -> bool:
+def is_crowded(shape: Any, pace: Any, reach: float, start: Ints) -> bool:
     """Return True if cells are much wider than the reach and many agents share one; pace: cells per metre per axis."""
     stretched = 1.0
     for k in range(len(pace)):
@@ -251,7 +251,7 @@ def crowded(shape: Any, pace: Any, reach: float, start: Ints) -> bool:
 
 
 @kernel
-def _folded(capacity: int, d: int) -> tuple[int, int, int, int, int]:
+def _folded_shape(capacity: int, d: int) -> tuple[int, int, int, int, int]:
     """Return the shape of folded cells, at most `capacity` in all; its last number is more than 0.
 
     The cell (x, y, z) of an endless lattice lies in row (y mod ny, z mod nz), at x + fold (y div ny) + twist (z div nz)
@@ -283,7 +283,7 @@ def count_folded(
 ) -> tuple[int, int, int, int, int]:  # fmt: skip
     """Do the same as `count_cells`, with folded cells."""
     d, w, pace = np.uint64(len(size)), np.uint64(lanes), 1.0 / (reach * _MARGIN)
-    shape = _folded(capacity, len(size))
+    shape = _folded_shape(capacity, len(size))
     for block in range(np.uint64(first), np.uint64(end)):
         for l in range(w):  # noqa: E741  # a lane
             at = block * d * w + l

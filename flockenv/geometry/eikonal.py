@@ -21,9 +21,9 @@ from flockenv.geometry.shapes.table import nearest
 from flockenv.geometry.targets import Target
 from flockenv.jit.decorators import kernel
 from flockenv.jit.section import entry
-from flockenv.maths.grid import packed, points_of
+from flockenv.maths.grid import pack_grid, points_of
 
-__all__ = ["NO_WAY", "Start", "distances_around", "free_part", "way_table"]
+__all__ = ["NO_WAY", "Start", "distances_around", "floor_field_table", "free_part"]
 
 Floats = NDArray[np.float64]
 NEAR = 4.0
@@ -33,7 +33,7 @@ NO_WAY = 1e30
 
 
 @kernel
-def _updated(a: float, b: float, c: float, h: float) -> float:
+def _solve_point(a: float, b: float, c: float, h: float) -> float:
     """Return u such that the sum of ((u - neighbour) / h)^2 is 1; a, b, c: the smaller neighbour along each axis.
 
     Only neighbours smaller than u contribute.
@@ -69,7 +69,7 @@ def _sweep(u: Any, free: Any, h: float) -> float:
                     b = min(u[i, j - 1, k] if j > 0 else np.inf, u[i, j + 1, k] if j < ny - 1 else np.inf)
                     c = min(u[i, j, k - 1] if k > 0 else np.inf, u[i, j, k + 1] if k < nz - 1 else np.inf)
                     if min(a, b, c) < np.inf:
-                        new = _updated(a, b, c, h)
+                        new = _solve_point(a, b, c, h)
                         if new < u[i, j, k]:
                             changed = max(changed, u[i, j, k] - new if u[i, j, k] < np.inf else 1.0)
                             u[i, j, k] = new
@@ -162,7 +162,7 @@ def ground(shapes: tuple[Shape, ...], low: tuple[float, ...], high: tuple[float,
     return Ground(low, spacing, points, *_nearest_surface(shapes, points))
 
 
-def way_table(
+def floor_field_table(
     shapes: Sequence[Shape], targets: Sequence[Target], low: Sequence[float], high: Sequence[float], spacing: float,
     clearance: float, names: Sequence[str] = ("target",), starts: Sequence[Start] = (),
 ) -> Floats:  # fmt: skip
@@ -180,7 +180,7 @@ def way_table(
     found = ground(tuple(shapes), tuple(map(float, low)), tuple(map(float, high)), spacing)
     begin, towards = np.full(found.gap.shape, np.inf), np.zeros_like(found.points)
     for name, target in zip(names, targets, strict=True):
-        _begin_at(found, shapes, target, clearance, name, high, begin, towards)
+        _begin_near_target(found, shapes, target, clearance, name, high, begin, towards)
     free = found.gap >= clearance
     near = np.any(towards != 0, axis=-1) | (begin == 0)
     u = distances_around(free, spacing, begin)
@@ -188,15 +188,15 @@ def way_table(
     for start in starts:
         room = np.all((found.points >= start.low - spacing) & (found.points <= start.high + spacing), axis=-1) & free
         if room.any() and not (room & reached).any():
-            shown = " or ".join(target.shown for target in targets)
+            places = " or ".join(target.points_text for target in targets)
             raise ValueError(
-                f"{names[0]} = {shown}: no way leads there from {start.name}, {clearance:g} m clear of all"
+                f"{names[0]} = {places}: no way leads there from {start.name}, {clearance:g} m clear of all"
             )
     way = np.where(near[..., None], towards, -_slopes(u, spacing))
     size = np.linalg.norm(way, axis=-1, keepdims=True)
     way = np.where(reached[..., None], way / np.where(size > 0, size, 1), np.where(free[..., None], 0.0, found.out))
     length = _lengths_beside(u, reached, free, spacing, clearance)
-    return packed(np.concatenate([length[..., None], way], axis=-1), found.low, spacing)
+    return pack_grid(np.concatenate([length[..., None], way], axis=-1), found.low, spacing)
 
 
 def _lengths_beside(
@@ -224,7 +224,7 @@ def free_part(
     if not free.any():
         where = "" if len(samples) == 1 else "at most "
         raise ValueError(
-            f"{name} = {target.shown}: is {where}{gap.max():.3g} m from an obstacle, must be at least {clearance:g} m"
+            f"{name} = {target.points_text}: is {where}{gap.max():.3g} m from an obstacle, must be at least {clearance:g} m"
         )
     if target.ends is not None and not free.all():
         core = samples[: target.count(spacing)][free[: target.count(spacing)]]
@@ -234,7 +234,7 @@ def free_part(
     return target, samples[free], gap[free]
 
 
-def _begin_at(
+def _begin_near_target(
     found: Ground, shapes: Sequence[Shape], whole: Target, clearance: float, name: str, high: Sequence[float],
     begin: Floats, towards: Floats,
 ) -> None:  # fmt: skip
@@ -244,7 +244,7 @@ def _begin_at(
     """
     spacing, d = found.spacing, whole.dimension
     if (whole.extremes[0] < found.low).any() or (whole.extremes[1] > high).any():
-        raise ValueError(f"{name} = {whole.shown}: is outside the grid, {found.low} to {tuple(high)} m")
+        raise ValueError(f"{name} = {whole.points_text}: is outside the grid, {found.low} to {tuple(high)} m")
     sight = np.maximum(NEAR * spacing, 1.0001 * spacing * math.sqrt(d))
     target, places, gap = free_part(shapes, whole, name, spacing, clearance)
     first = np.maximum(np.floor((target.extremes[0] - sight - found.low) / spacing), 0).astype(int)
@@ -259,7 +259,7 @@ def _begin_at(
     reach = np.minimum(sight, gap[nearby] - clearance + spacing * math.sqrt(d))
     known = free & (np.linalg.norm(places[nearby] - points, axis=-1) <= reach)
     if not known.any():
-        raise ValueError(f"{name} = {whole.shown}: no point of the grid beside it is free; use a smaller spacing")
+        raise ValueError(f"{name} = {whole.points_text}: no point of the grid beside it is free; use a smaller spacing")
     nearer = known & (straight < begin[here])
     begin[here] = np.where(nearer, straight, begin[here])
     close = nearer & (straight <= 2 * spacing)

@@ -17,10 +17,20 @@ from numpy.typing import ArrayLike, NDArray
 from flockenv.geometry.space import Plane, Space
 from flockenv.jit.decorators import Vec, kernel, law, like
 from flockenv.jit.section import entry
-from flockenv.maths.approximations import nearest_whole
+from flockenv.maths.approximations import round_half_even
 from flockenv.maths.vectors import add, dot, scale, select, zero
 
-__all__ = ["Floats", "Table", "gained", "nearest", "on_spine", "pieces", "projected", "spine", "to_end"]
+__all__ = [
+    "Floats",
+    "Table",
+    "arc_difference",
+    "distance_to_end",
+    "nearest",
+    "pieces",
+    "project",
+    "spine",
+    "spine_points",
+]
 
 Floats = NDArray[np.float64]
 Table = Any
@@ -37,24 +47,24 @@ def pieces(points: Sequence[Sequence[float]], closed: bool, space: Space | None 
         raise ValueError("points: must be finite")
     space = space or Plane()
     to = np.roll(at, -1, axis=0) if closed else at[1:]
-    way = space.displacement(at if closed else at[:-1], to)
-    length = np.linalg.norm(way, axis=1)
+    steps = space.displacement(at if closed else at[:-1], to)
+    length = np.linalg.norm(steps, axis=1)
     if not length.all():
         k = int(np.argmin(length)) + 1
         raise ValueError(f"points[{k % len(at)}] = {tuple(at[k % len(at)].tolist())}: is where the one before it is")
     ends = np.cumsum(length)
     begin = at if closed else at[:-1]
     edges = space.extent(at.shape[1]) if space.periodic else (0.0,) * at.shape[1]
-    rows = np.column_stack([begin + way / 2, way / length[:, None], length / 2, ends - length / 2])
+    rows = np.column_stack([begin + steps / 2, steps / length[:, None], length / 2, ends - length / 2])
     return np.concatenate([[float(closed), ends[-1], *edges], rows.ravel()])
 
 
 @law
-def _short(table: Table, d: Vec, k: int) -> float:
+def _nearest_image(table: Table, d: Vec, k: int) -> float:
     """Return coordinate k of an offset, of the nearest image if the path lies on a torus."""
     edge = table[2 + k]
     around = like(edge, 1.0) / edge if edge > like(edge, 0.0) else like(edge, 0.0)
-    return d[k] - edge * nearest_whole(d[k] * around)  # type: ignore[no-any-return]
+    return d[k] - edge * round_half_even(d[k] * around)  # type: ignore[no-any-return]
 
 
 @law
@@ -62,10 +72,10 @@ def _middle(table: Table, x: Vec, at: int) -> Vec:
     """Return the offset from x to the middle of the segment whose numbers begin at `at`."""
     if len(x) == 2:
         d = (table[at] - x[0], table[at + 1] - x[1])
-        return (_short(table, d, 0), _short(table, d, 1))
+        return (_nearest_image(table, d, 0), _nearest_image(table, d, 1))
     else:
         d3 = (table[at] - x[0], table[at + 1] - x[1], table[at + 2] - x[2])
-        return (_short(table, d3, 0), _short(table, d3, 1), _short(table, d3, 2))
+        return (_nearest_image(table, d3, 0), _nearest_image(table, d3, 1), _nearest_image(table, d3, 2))
 
 
 @law
@@ -77,12 +87,12 @@ def _direction(table: Table, x: Vec, at: int) -> Vec:
 
 
 @law
-def _within(s: float, half: float) -> float:
+def _clamp(s: float, half: float) -> float:
     return -half if s < -half else (half if s > half else s)
 
 
 @law
-def _without(found: Vec) -> Vec:
+def _without_first(found: Vec) -> Vec:
     """Return the vector without its first number."""
     if len(found) == 4:
         return (found[1], found[2], found[3])
@@ -103,11 +113,11 @@ def nearest(table: Table, x: Vec) -> Vec:
     for k in range((len(table) - head) // size):
         at = head + k * size
         to, u = _middle(table, x, at), _direction(table, x, at)
-        s = _within(-dot(to, u), table[at + size - 2])
+        s = _clamp(-dot(to, u), table[at + size - 2])
         offset = add(to, scale(u, s))
         found = (dot(offset, offset), table[at + size - 1] + s) + offset  # noqa: RUF005
         best = select(found[0] < best[0], found, best)
-    return _without(best)
+    return _without_first(best)
 
 
 @law
@@ -121,7 +131,7 @@ def spine(table: Table, x: Vec, s: float) -> Vec:
     for k in range((len(table) - head) // size):
         at = head + k * size
         half, along = table[at + size - 2], s - table[at + size - 1]
-        point = add(_middle(table, x, at), scale(_direction(table, x, at), _within(along, half)))
+        point = add(_middle(table, x, at), scale(_direction(table, x, at), _clamp(along, half)))
         found = (abs(along) - half,) + point  # noqa: RUF005
         best = select(found[0] < best[0], found, best)
     if len(x) == 2:
@@ -131,7 +141,7 @@ def spine(table: Table, x: Vec, s: float) -> Vec:
 
 
 @law
-def gained(table: Table, begin: float, end: float) -> float:
+def arc_difference(table: Table, begin: float, end: float) -> float:
     """Return the signed distance along the path from one arc length to another, m; the shorter one if it is closed."""
     s, length = end - begin, table[1]
     round_ = length * np.floor(s / length + like(s, 0.5))
@@ -139,10 +149,10 @@ def gained(table: Table, begin: float, end: float) -> float:
 
 
 @law
-def to_end(table: Table, s: float, way: float) -> float:
-    """Return the distance along the path to its end in direction `way` (> 0: forward), m; inf if the path is closed."""
+def distance_to_end(table: Table, s: float, direction: float) -> float:
+    """Return the distance to the end of an open path, m; inf if it is closed. direction: > 0 is forward."""
     o = like(s, 0.0)
-    left = table[1] - s if way > o else s
+    left = table[1] - s if direction > o else s
     return like(s, np.inf) if table[0] > o else left
 
 
@@ -172,7 +182,7 @@ def _point(table: Any, s: Any, origin: Any, out: Any) -> None:
                 out[r, k] = found3[k] + origin[k]
 
 
-def projected(table: Floats, points: ArrayLike) -> tuple[Floats, Floats]:
+def project(table: Floats, points: ArrayLike) -> tuple[Floats, Floats]:
     """Return arc lengths (...) m of the path's nearest points, and offsets to them, (..., D) m; not for laws."""
     where = np.asarray(points, np.float64)
     flat = np.ascontiguousarray(where.reshape(-1, where.shape[-1]))
@@ -181,7 +191,7 @@ def projected(table: Floats, points: ArrayLike) -> tuple[Floats, Floats]:
     return out[:, 0].reshape(where.shape[:-1]), out[:, 1:].reshape(where.shape)
 
 
-def on_spine(table: Floats, s: ArrayLike, dimension: int) -> Floats:
+def spine_points(table: Floats, s: ArrayLike, dimension: int) -> Floats:
     """Return the points at arc lengths s, (..., D) m; not for laws."""
     lengths = np.asarray(s, np.float64)
     flat, out = np.ascontiguousarray(lengths.reshape(-1)), np.empty((lengths.size, dimension))

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from flockenv.core.record import Record
 from flockenv.jit.decorators import Law, Vec, finite, law, like
-from flockenv.maths.approximations import nearest_whole
+from flockenv.maths.approximations import round_half_even
 from flockenv.maths.vectors import sub
 
 __all__ = ["AnySpace", "Box", "Plane", "Space", "Torus"]
@@ -36,7 +36,7 @@ def plane_offset(size: Vec, a: Vec, b: Vec) -> Vec:
 @law
 def _shortest(d: float, length: float) -> float:
     # times the reciprocal, which is the same for all pairs: a division per pair would double the cost of the pair loop
-    return d - length * nearest_whole(d * (like(d, 1.0) / length))
+    return d - length * round_half_even(d * (like(d, 1.0) / length))
 
 
 @law
@@ -62,7 +62,7 @@ def plane_confine(size: Vec, radius: float, x: Vec, v: Vec) -> tuple[Vec, Vec]:
 
 
 @law
-def _into(x: float, length: float) -> float:
+def _wrap(x: float, length: float) -> float:
     o = like(x, 0.0)
     inside = x - length * np.floor(x * (like(x, 1.0) / length))
     # (-1e-17) wraps to exactly `length` in floating point: that is 0
@@ -75,13 +75,13 @@ def _into(x: float, length: float) -> float:
 def torus_confine(size: Vec, radius: float, x: Vec, v: Vec) -> tuple[Vec, Vec]:
     """Bring x back into [0, size)."""
     if len(x) == 2:
-        return (_into(x[0], size[0]), _into(x[1], size[1])), v
+        return (_wrap(x[0], size[0]), _wrap(x[1], size[1])), v
     else:
-        return (_into(x[0], size[0]), _into(x[1], size[1]), _into(x[2], size[2])), v
+        return (_wrap(x[0], size[0]), _wrap(x[1], size[1]), _wrap(x[2], size[2])), v
 
 
 @law
-def _wall(x: float, v: float, radius: float, length: float) -> tuple[float, float]:
+def _stop_at_wall(x: float, v: float, radius: float, length: float) -> tuple[float, float]:
     o = like(x, 0.0)
     low = x < radius
     high = x > length - radius
@@ -92,17 +92,17 @@ def _wall(x: float, v: float, radius: float, length: float) -> tuple[float, floa
 @law
 def box_confine(size: Vec, radius: float, x: Vec, v: Vec) -> tuple[Vec, Vec]:
     """Keep a body of this radius inside the walls; the part of its velocity into a wall is lost there."""
-    x0, v0 = _wall(x[0], v[0], radius, size[0])
-    x1, v1 = _wall(x[1], v[1], radius, size[1])
+    x0, v0 = _stop_at_wall(x[0], v[0], radius, size[0])
+    x1, v1 = _stop_at_wall(x[1], v[1], radius, size[1])
     if len(x) == 2:
         return (x0, x1), (v0, v1)
     else:
-        x2, v2 = _wall(x[2], v[2], radius, size[2])
+        x2, v2 = _stop_at_wall(x[2], v[2], radius, size[2])
         return (x0, x1, x2), (v0, v1, v2)
 
 
 @law
-def _meets(gap: float, away: float, push: float) -> tuple[float, float]:
+def _impact(gap: float, away: float, push: float) -> tuple[float, float]:
     """Return the time at which a body reaches a wall, s (inf if never), and its speed then.
 
     Its distance is gap + away t + push t^2 / 2. Each root is computed in the form without cancellation.
@@ -133,7 +133,7 @@ def _flight(dt: float, was: float, before: float, x: float, v: float) -> tuple[f
 
 
 @law
-def _bounced(
+def _bounce(
     radius: float, length: float, restitution: float, dt: float, was: float, before: float, x: float, v: float
 ) -> tuple[float, float]:
     """Return position and velocity along one axis after a step with impacts; each keeps `restitution` of the speed.
@@ -148,8 +148,8 @@ def _bounced(
     speed = o if (before == o) & ((was == low) | (was == high)) else speed
     at, left, hit = was, dt, False
     for bounce in range(BOUNCES):
-        fall, down = _meets(at - low, speed, a)
-        rise, up = _meets(high - at, -speed, -a)
+        fall, down = _impact(at - low, speed, a)
+        rise, up = _impact(high - at, -speed, -a)
         below = fall <= rise
         seconds = fall if below else rise
         if not seconds < left:
@@ -170,14 +170,14 @@ def _bounced(
 
 
 @law
-def _hop(
+def _bounce_or_stop(
     size: float, radius: float, restitution: float, dt: float, was: float, before: float, x: float, v: float
 ) -> tuple[float, float]:
     """Return position and velocity along one axis of `box_bounce`."""
     if was < radius or was > size - radius:
-        return _wall(x, v, radius, size)
+        return _stop_at_wall(x, v, radius, size)
     else:
-        return _bounced(radius, size, restitution, dt, was, before, x, v)
+        return _bounce(radius, size, restitution, dt, was, before, x, v)
 
 
 @law
@@ -188,12 +188,12 @@ def box_bounce(
 
     Exact under a constant force, axis by axis. A body that was outside is put at the wall.
     """
-    x0, v0 = _hop(size[0], radius, restitution, dt, was[0], before[0], x[0], v[0])
-    x1, v1 = _hop(size[1], radius, restitution, dt, was[1], before[1], x[1], v[1])
+    x0, v0 = _bounce_or_stop(size[0], radius, restitution, dt, was[0], before[0], x[0], v[0])
+    x1, v1 = _bounce_or_stop(size[1], radius, restitution, dt, was[1], before[1], x[1], v[1])
     if len(x) == 2:
         return (x0, x1), (v0, v1)
     else:
-        x2, v2 = _hop(size[2], radius, restitution, dt, was[2], before[2], x[2], v[2])
+        x2, v2 = _bounce_or_stop(size[2], radius, restitution, dt, was[2], before[2], x[2], v[2])
         return (x0, x1, x2), (v0, v1, v2)
 
 

@@ -11,19 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.geometry.cell_list import Ints, begin_cells, cell_of, count_folded, crowded, divided, tally_cells
+from flockenv.geometry.cell_list import Ints, begin_cells, cell_of, count_folded, divide_region, is_crowded, tally_cells
 from flockenv.jit.decorators import kernel
 from flockenv.jit.intrinsics import prefetch_for_write
 
 __all__ = [
-    "FAR_FROM_HOME", "HOME", "TILE", "count_from_home", "count_tiles", "find_homes", "order_cells", "order_shared",
+    "FAR_FROM_HOME", "HOME", "TILE", "count_from_home_tiles", "count_tiles", "find_home_tiles", "order_cells", "order_shared",
 ]  # fmt: skip
 
 TILE = 256
 """Mean number of agents per tile."""
 
 HOME = 8
-"""Numbers per block that describe the home tiles of its agents, see `find_homes`; the last is unused."""
+"""Numbers per block that describe the home tiles of its agents, see `find_home_tiles`; the last is unused."""
 
 FAR_FROM_HOME = 4
 """If more than 1 in 4 agents has left its home tile, all records are sorted instead of only those agents' cells."""
@@ -66,7 +66,7 @@ def count_tiles(
     reach: float, periodic: bool, wraps: bool, capacity: int, cell: Ints, start: Ints, offset: Ints,
 ) -> tuple[int, int, int, int, int]:  # fmt: skip
     """Do the same as `count_cells`, with tiles instead of cells; return the shape of the cells that make up tiles."""
-    shape, low, pace = divided(
+    shape, low, pace = divide_region(
         pos, living, first, end, lanes, rank, team, sync, bounds, size, reach, periodic, capacity
     )
     if shape[0] == 0:
@@ -87,7 +87,7 @@ def count_tiles(
 
 
 @kernel
-def find_homes(first: int, end: int, lanes: int, n: int, shape: Any, start: Ints, homes: Ints) -> None:
+def find_home_tiles(first: int, end: int, lanes: int, n: int, shape: Any, start: Ints, homes: Ints) -> None:
     """Write the home tiles of the agents of these blocks, just after sorting; start: where each tile begins.
 
     homes (blocks * HOME,): the number of agents in the first of two tiles, then the lowest cell along each of three
@@ -113,7 +113,7 @@ def find_homes(first: int, end: int, lanes: int, n: int, shape: Any, start: Ints
 
 
 @kernel
-def count_from_home(
+def count_from_home_tiles(
     pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, bounds: Any, size: Any,
     reach: float, periodic: bool, wraps: bool, capacity: int, homes: Ints, strangers: Ints, tally: Any, cell: Ints,
     start: Ints, offset: Ints,
@@ -123,7 +123,7 @@ def count_from_home(
     The cells of such agents are written to `strangers` (agents, padded), from this thread's first agent on; their
     number to tally[team + rank].
     """
-    shape, low, pace = divided(
+    shape, low, pace = divide_region(
         pos, living, first, end, lanes, rank, team, sync, bounds, size, reach, periodic, capacity
     )
     cells = shape[0] * shape[1] * shape[2]
@@ -163,7 +163,7 @@ def count_from_home(
                 offset[rank, c] += 1
     tally[team + rank] = np.int64(away) - first * lanes
     begin_cells(rank, team, sync, cells, start, offset)
-    if periodic or not crowded(shape, pace, reach, start):
+    if periodic or not is_crowded(shape, pace, reach, start):
         return shape
     tally[team + rank] = (end - first) * lanes  # folded cells are not parts of tiles
     return count_folded(pos, living, first, end, lanes, rank, team, sync, size, reach, capacity, cell, start, offset)
@@ -187,11 +187,11 @@ def order_cells(
     size, last, before = np.uint64(length), np.uint64(end), max(rank - 1, 0)
     mine = np.uint64(rank * offset.shape[1])
     for m in range(np.uint64(begin), last):
-        c = _later(listed, m, AHEAD[0], last)
+        c = _cell_ahead(listed, m, AHEAD[0], last)
         prefetch_for_write(start, c)
         prefetch_for_write(offset, mine + c)
-        prefetch_for_write(records, np.uint64(start[_later(listed, m, AHEAD[1], last)]) * size)
-        c = _later(listed, m, AHEAD[2], last)
+        prefetch_for_write(records, np.uint64(start[_cell_ahead(listed, m, AHEAD[1], last)]) * size)
+        c = _cell_ahead(listed, m, AHEAD[2], last)
         for k in range(np.uint64(start[c]), np.uint64(min(start[c + np.uint64(1)], start[c] + FEW))):
             prefetch_for_write(ident, np.uint64(records[k * size]))
         c = np.uint64(listed[m])
@@ -202,7 +202,7 @@ def order_cells(
 
 
 @kernel
-def _later(listed: Ints, m: Any, ahead: int, end: Any) -> Any:
+def _cell_ahead(listed: Ints, m: Any, ahead: int, end: Any) -> Any:
     """Return the cell `ahead` entries later in the list, or the last one."""
     return np.uint64(listed[min(m + np.uint64(ahead), end - np.uint64(1))])
 

@@ -12,7 +12,7 @@ from flockenv.core.record import Record
 from flockenv.jit.decorators import Vec, law, like
 from flockenv.maths.vectors import dot, norm, scale, select
 
-__all__ = ["Target", "passed", "row_size", "to_any", "to_target"]
+__all__ = ["Target", "is_reached", "row_size", "to_any", "to_target"]
 
 Floats = NDArray[np.float64]
 Place = Annotated[tuple[Annotated[float, Field(strict=True)], ...], Field(min_length=2, max_length=3)]
@@ -28,15 +28,15 @@ class Target(Record):
     radius: float = Field(default=0.0, ge=0, description="m, points within this distance belong to the target")
 
     @model_validator(mode="after")
-    def _one_of_three(self) -> Target:
+    def _check_place(self) -> Target:
         """Raise ValueError if not exactly one of the three is given, or if the numbers do not fit together."""
         box = self.low is not None or self.high is not None
         if (self.at is not None) + (self.ends is not None) + box != 1 or (self.low is None) != (self.high is None):
             raise ValueError("at: give one of at, ends, or low and high")
         if len({len(place) for place in self._places}) != 1:
-            raise ValueError(f"{self._word} = {self.shown}: both must have as many numbers")
+            raise ValueError(f"{self._word} = {self.points_text}: both must have as many numbers")
         if self.ends is not None and self.ends[0] == self.ends[1]:
-            raise ValueError(f"ends = {self.shown}: is a point; give at")
+            raise ValueError(f"ends = {self.points_text}: is a point; give at")
         if box and any(a > b for a, b in zip(*self._places, strict=True)):
             raise ValueError(f"low = {self.low}: must not be above high = {self.high}")
         return self
@@ -53,7 +53,7 @@ class Target(Record):
         return "at" if self.at is not None else "ends" if self.ends is not None else "low, high"
 
     @property
-    def shown(self) -> str:
+    def points_text(self) -> str:
         """The points that define it, as messages show them."""
         return ", ".join(str(place) for place in self._places)
 
@@ -125,13 +125,13 @@ def row_size(dimension: int) -> int:
 
 
 @law
-def _beyond(x: float, half: float) -> float:
+def _excess(x: float, half: float) -> float:
     """Return the signed distance of x from [-half, half]; 0 inside."""
     return x - half if x > half else (x + half if x < -half else like(x, 0.0))
 
 
 @law
-def _within(offset: Vec, radius: float) -> Vec:
+def _shorten(offset: Vec, radius: float) -> Vec:
     """Return the offset shortened by `radius`; 0 if it is not longer than that."""
     length = norm(offset)
     return scale(offset, (length - radius) / length if length > radius else like(radius, 0.0))
@@ -151,15 +151,15 @@ def to_target(table: Any, at: Any, x: Vec) -> Vec:
     if len(x) == 2:
         a, b, u, v = table[at] - x[0], table[at + 1] - x[1], table[at + 2], table[at + 3]
         s = _share(a * u + b * v, u * u + v * v)
-        to: Vec = (_beyond(a + s * u, table[at + 4]), _beyond(b + s * v, table[at + 5]))
-        return _within(to, table[at + 6])
+        to: Vec = (_excess(a + s * u, table[at + 4]), _excess(b + s * v, table[at + 5]))
+        return _shorten(to, table[at + 6])
     else:
         a, b, c = table[at] - x[0], table[at + 1] - x[1], table[at + 2] - x[2]
         u, v, w = table[at + 3], table[at + 4], table[at + 5]
         s = _share(a * u + b * v + c * w, u * u + v * v + w * w)
-        beyond = (_beyond(a + s * u, table[at + 6]), _beyond(b + s * v, table[at + 7]))
-        to = beyond + (_beyond(c + s * w, table[at + 8]),)  # noqa: RUF005  # numba joins tuples, but unpacks none
-        return _within(to, table[at + 9])
+        beyond = (_excess(a + s * u, table[at + 6]), _excess(b + s * v, table[at + 7]))
+        to = beyond + (_excess(c + s * w, table[at + 8]),)  # noqa: RUF005  # numba joins tuples, but unpacks none
+        return _shorten(to, table[at + 9])
 
 
 @law
@@ -174,7 +174,7 @@ def to_any(table: Any, at: Any, count: Any, x: Vec) -> Vec:
 
 
 @law
-def passed(table: Any, at: Any, was: Vec, now: Vec) -> bool:
+def is_reached(table: Any, at: Any, was: Vec, now: Vec) -> bool:
     """Return True if a move from `was` to `now` ends in the target whose row begins at `at`, or crosses a door; 2-D."""
     to = to_target(table, at, now)
     a, b, u, v = table[at], table[at + 1], table[at + 2], table[at + 3]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Recycler"]
+__all__ = ["BufferPool"]
 
 Key = tuple[tuple[int, ...], np.dtype[Any]]
 Memory = tuple[NDArray[np.uint8], int]
@@ -30,7 +30,7 @@ _NOBODY = _holders([(np.empty(0, np.uint8), 0)], 0)
 """The count if only the list refers to a buffer; measured, because versions of Python count differently."""
 
 
-class Recycler:
+class BufferPool:
     """Buffer pool that returns arrays like np.empty, in memory of earlier ones that nothing refers to any more.
 
     It is not thread-safe, but arrays may be released in any thread.

@@ -6,7 +6,7 @@ import os
 import tempfile
 from pathlib import Path
 
-from flockenv.jit.private_folder import first_private, prepared
+from flockenv.jit.private_folder import ensure_private, first_private
 
 __all__ = [
     "cache_folder",
@@ -24,7 +24,7 @@ def cache_folder() -> Path:
     named = os.environ.get("FLOCKENV_CACHE")
     if named:
         try:
-            return prepared(Path(named))
+            return ensure_private(Path(named))
         except OSError as error:
             reason = error.strerror or error
             raise type(error)(f"FLOCKENV_CACHE = {named}: refused for compiled kernels: {reason}") from error

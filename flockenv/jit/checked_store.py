@@ -11,7 +11,7 @@ import functools
 import hashlib
 from pathlib import Path
 
-from flockenv.core.atomic_files import remove_leftovers, replacing
+from flockenv.core.atomic_files import remove_leftovers, replace_file
 from flockenv.jit.private_folder import read_private, say_once
 
 __all__ = ["Store"]
@@ -24,37 +24,37 @@ DAY = 86_400.0
 
 
 class Store:
-    """Store of data by name, one file each, in a folder that `private_folder.prepared` returned."""
+    """Store of data by name, one file each, in a folder that `private_folder.ensure_private` returned."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        _swept(folder)
+        _remove_old_leftovers(folder)
 
     def read(self, name: str) -> bytes | None:
         """Return the data of this name, or None if there is none or it has changed since it was written."""
-        found = self._found(name)
+        found = self._content(name)
         if found is None:
             return None
         size = len(HEAD) + hashlib.sha256().digest_size
         data = found[size:]
-        if found[:size] != _head(name, data):
-            self._say_damaged(name)
+        if found[:size] != _header(name, data):
+            self._report_damaged(name)
             return None
         return data
 
     def write(self, name: str, data: bytes) -> None:
         """Store data under this name; if it cannot be written, report the reason in one line on stderr."""
-        self._keep(name, _head(name, data) + data)
+        self._write_or_report(name, _header(name, data) + data)
 
     def write_text(self, name: str, text: str) -> None:
         """Store a text unchanged, for people to read; a changed file is replaced, and one line reports it."""
-        wanted, found = text.encode(), self._found(name)
+        wanted, found = text.encode(), self._content(name)
         if found != wanted:
             if found is not None:
-                self._say_damaged(name)
-            self._keep(name, wanted)
+                self._report_damaged(name)
+            self._write_or_report(name, wanted)
 
-    def _found(self, name: str) -> bytes | None:
+    def _content(self, name: str) -> bytes | None:
         """Return a file's content; None if it is missing, or not private or not readable, which one line reports."""
         path = self.folder / name
         try:
@@ -65,13 +65,13 @@ class Store:
             say_once(f"{error if error.strerror is None else f'{path}: {error.strerror}'}; rebuilt")
             return None
 
-    def _say_damaged(self, name: str) -> None:
+    def _report_damaged(self, name: str) -> None:
         say_once(f"{self.folder / name}: damaged; rebuilt")
 
-    def _keep(self, name: str, data: bytes) -> None:
+    def _write_or_report(self, name: str, data: bytes) -> None:
         """Write a file, or report why it could not be written: only the next process's startup time depends on it."""
         try:
-            with replacing(self.folder / name, 0o600) as file:
+            with replace_file(self.folder / name, 0o600) as file:
                 file.write(data)
         except OSError as error:
             line = f"compiled kernels cannot be kept ({error}); the next process compiles them again"
@@ -79,10 +79,10 @@ class Store:
 
 
 @functools.cache
-def _swept(folder: Path) -> None:
+def _remove_old_leftovers(folder: Path) -> None:
     """Remove incomplete files of killed processes from a folder, once per process."""
     remove_leftovers(folder, DAY)
 
 
-def _head(name: str, data: bytes) -> bytes:
+def _header(name: str, data: bytes) -> bytes:
     return HEAD + hashlib.sha256(b"%d " % len(name.encode()) + name.encode() + data).digest()

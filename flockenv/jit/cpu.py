@@ -27,7 +27,7 @@ def _features() -> frozenset[str]:
     return frozenset(name[1:] for name in found.split(",") if name.startswith("+"))
 
 
-def _register() -> int:
+def _register_width() -> int:
     """Return the register width in bytes; ValueError if FLOCKENV_REGISTER is neither 32 nor 64 nor empty."""
     told = os.environ.get("FLOCKENV_REGISTER", "")
     if told not in ("", "32", "64"):
@@ -38,5 +38,5 @@ def _register() -> int:
 FEATURES = _features()
 """Features of the processor; only "avx512f" and "avx2" make a difference here."""
 
-REGISTER = _register()
+REGISTER = _register_width()
 """Bytes of a vector register: 64 with AVX-512, otherwise 32 (one of AVX2, or two of 16 bytes)."""

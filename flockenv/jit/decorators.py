@@ -31,7 +31,7 @@ __all__ = [
     "law",
     "like",
     "python_of",
-    "replaced",
+    "replace_at",
     "routine",
     "shared",
     "unfused",
@@ -70,7 +70,7 @@ if IN_PYTHON:
     np.seterr(all="ignore")  # as in machine code: infinities and NaN are values, unsigned integers wrap
 
 
-def _marked(function: F, **options: Any) -> F:
+def _compile_part(function: F, **options: Any) -> F:
     """Compile a part of kernels with numba; its signature is stored, as numba computes it twice, which is slow."""
     function.__signature__ = inspect.signature(function)  # type: ignore[attr-defined]
     return cast(F, _njit(**{**OPTIONS, **options})(function))
@@ -81,22 +81,22 @@ def law(function: F) -> F:
 
     For numba it is the same as `kernel`; the two names distinguish physics from engine.
     """
-    return _marked(function)
+    return _compile_part(function)
 
 
 def unfused(function: F) -> F:
     """Mark a law that must give the same bits in every loop it is inlined into: no multiply is fused with an add."""
-    return _marked(function, fastmath=False)
+    return _compile_part(function, fastmath=False)
 
 
 def kernel(function: F) -> F:
     """Mark a part of a kernel, which reads and writes arrays or combines laws; it is compiled into its callers."""
-    return _marked(function)
+    return _compile_part(function)
 
 
 def routine(function: F) -> F:
     """Mark a function that a kernel calls from several places; it is compiled once and not inlined."""
-    return _marked(function, forceinline=False)
+    return _compile_part(function, forceinline=False)
 
 
 def shared(function: F) -> F:
@@ -121,13 +121,13 @@ def _like(x, constant):  # type: ignore[no-untyped-def]  # numba compares signat
     return lambda x, constant: to(constant)
 
 
-def replaced(numbers: tuple[float, ...], k: int, x: float) -> tuple[float, ...]:
+def replace_at(numbers: tuple[float, ...], k: int, x: float) -> tuple[float, ...]:
     """Return the numbers with the k-th replaced by x."""
     return (*numbers[:k], x, *numbers[k + 1 :])
 
 
-@overload(replaced, jit_options=OPTIONS)
-def _replaced(numbers, k, x):  # type: ignore[no-untyped-def]
+@overload(replace_at, jit_options=OPTIONS)
+def _replace_at(numbers, k, x):  # type: ignore[no-untyped-def]
     return lambda numbers, k, x: tuple_setitem(numbers, k, x)  # type: ignore[call-arg]
 
 

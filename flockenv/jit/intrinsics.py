@@ -21,16 +21,16 @@ from flockenv.jit.cpu import LINE
 from flockenv.jit.decorators import IN_PYTHON, kernel
 
 __all__ = [
-    "asked",
     "copy_lanes",
+    "count_as_float",
+    "count_if",
+    "generate_prefetch",
     "intrinsic_or_python",
+    "literal_value",
     "prefetch_for_write",
-    "stacked",
-    "tallied",
-    "tally_of",
+    "tuple_as_array",
     "unaliased",
     "wait_for_team",
-    "written",
 ]
 
 
@@ -39,7 +39,7 @@ def intrinsic_or_python(generate: Callable[..., Any], plain: Callable[..., Any])
     return plain if IN_PYTHON else intrinsic(generate)
 
 
-def written(number: Any, name: str) -> int:
+def literal_value(number: Any, name: str) -> int:
     """Return an integer literal's value; else raise TypingError, after which numba tries again with literal types."""
     if not isinstance(number, types.IntegerLiteral):
         raise numba.TypingError(f"{name}: {number}, must be written as a number")
@@ -80,7 +80,7 @@ def _copy_lanes(typing_context: Any, to: Any, at: Any, source: Any, place: Any, 
     """
     if to.dtype != source.dtype or (to.layout, source.layout, to.ndim, source.ndim) != ("C", "C", 1, 1):
         raise numba.TypingError(f"copy_lanes: {source} into {to}, must be one row of the same numbers, in one piece")
-    wide = written(width, "width")
+    wide = literal_value(width, "width")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         make: Any = arrayobj.make_array
@@ -98,14 +98,14 @@ def _copy_lanes(typing_context: Any, to: Any, at: Any, source: Any, place: Any, 
     return types.void(to, types.uint64, source, types.uint64, width), generate
 
 
-def _copied_in_python(to: Any, at: Any, source: Any, place: Any, width: int) -> None:
+def _copy_in_python(to: Any, at: Any, source: Any, place: Any, width: int) -> None:
     to[int(at) : int(at) + width] = source[int(place) : int(place) + width]
 
 
-copy_lanes: Any = intrinsic_or_python(_copy_lanes, _copied_in_python)
+copy_lanes: Any = intrinsic_or_python(_copy_lanes, _copy_in_python)
 
 
-def asked(builder: Any, address: Any) -> None:
+def generate_prefetch(builder: Any, address: Any) -> None:
     """Generate a prefetch, for writing, of the cache line at an address; an invalid address has no effect."""
     byte, flag = ir.IntType(8).as_pointer(), ir.IntType(32)
     declare: Any = cgutils.get_or_insert_function
@@ -123,7 +123,7 @@ def _prefetch_for_write(typing_context: Any, array: Any, place: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         make: Any = arrayobj.make_array
         data = make(signature.args[0])(context, builder, arguments[0]).data
-        asked(builder, builder.gep(data, [arguments[1]]))
+        generate_prefetch(builder, builder.gep(data, [arguments[1]]))
         return context.get_dummy_value()
 
     return types.void(array, types.uint64), generate
@@ -132,7 +132,7 @@ def _prefetch_for_write(typing_context: Any, array: Any, place: Any) -> Any:
 prefetch_for_write: Any = intrinsic_or_python(_prefetch_for_write, lambda array, place: None)
 
 
-def _stacked(typing_context: Any, numbers: Any) -> Any:
+def _tuple_as_array(typing_context: Any, numbers: Any) -> Any:
     """Return the numbers of a tuple as an array that a law may write, valid while its caller runs.
 
     It is on the stack, as laws allocate nothing. A law must not return it.
@@ -156,11 +156,11 @@ def _stacked(typing_context: Any, numbers: Any) -> Any:
     return array(numbers), generate
 
 
-stacked: Any = intrinsic_or_python(_stacked, np.array)
+tuple_as_array: Any = intrinsic_or_python(_tuple_as_array, np.array)
 
 
-def _tallied(typing_context: Any, number: Any, flag: Any) -> Any:
-    """Return the counter `number`, 0 at the start, incremented if `flag` is set; `tally_of` reads it.
+def _count_if(typing_context: Any, number: Any, flag: Any) -> Any:
+    """Return the counter `number`, 0 at the start, incremented if `flag` is set; `count_as_float` reads it.
 
     With AVX-512 it is a float: a masked addition of 1 is one instruction. Otherwise its bits are an integer, from which
     the result of the comparison, -1 if the flag is set, is subtracted directly.
@@ -177,8 +177,8 @@ def _tallied(typing_context: Any, number: Any, flag: Any) -> Any:
     return number(number, types.boolean), generate
 
 
-def _tally(typing_context: Any, number: Any) -> Any:
-    """Return the count of a counter of `tallied` as a float."""
+def _count_as_float(typing_context: Any, number: Any) -> Any:
+    """Return the count of a counter of `count_if` as a float."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         if cpu.REGISTER == LINE:
@@ -190,12 +190,12 @@ def _tally(typing_context: Any, number: Any) -> Any:
     return number(number), generate
 
 
-tallied: Any = intrinsic_or_python(_tallied, lambda number, flag: number + type(number)(flag))
+count_if: Any = intrinsic_or_python(_count_if, lambda number, flag: number + type(number)(flag))
 
-tally_of: Any = intrinsic_or_python(_tally, lambda number: number)
+count_as_float: Any = intrinsic_or_python(_count_as_float, lambda number: number)
 
 
-def _add_at_once(typing_context: Any, array: Any, amount: Any) -> Any:
+def _atomic_fetch_add(typing_context: Any, array: Any, amount: Any) -> Any:
     """Atomically add to array[0]; return its previous value."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -206,20 +206,22 @@ def _add_at_once(typing_context: Any, array: Any, amount: Any) -> Any:
     return types.int64(array, types.int64), generate
 
 
-def _added_in_python(array: Any, amount: int) -> int:
+def _fetch_add_in_python(array: Any, amount: int) -> int:
     before = int(array[0])
     array[0] += amount
     return before
 
 
-_fetch_add: Any = intrinsic_or_python(_add_at_once, _added_in_python)  # Any: numba's stubs say that it never returns
+_fetch_add: Any = intrinsic_or_python(
+    _atomic_fetch_add, _fetch_add_in_python
+)  # Any: numba's stubs say that it never returns
 
 _PATIENCE = 2000  # rounds of spinning before the thread yields its core
 
-_give_way: Any = numba.njit(lambda: 0)
+_yield_core: Any = numba.njit(lambda: 0)
 
 if os.name == "posix":
-    _give_way = types.ExternalFunction("sched_yield", types.int32())
+    _yield_core = types.ExternalFunction("sched_yield", types.int32())
 
 
 @kernel
@@ -232,4 +234,4 @@ def wait_for_team(sync: Any, team: int) -> None:
         while _fetch_add(sync, 0) < all_here:
             rounds += 1
             if rounds > _PATIENCE:
-                _give_way()
+                _yield_core()

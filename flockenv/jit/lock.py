@@ -10,7 +10,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flockenv.jit.startup import nothing_to_collect
+from flockenv.jit.startup import no_garbage_collection
 
 if TYPE_CHECKING:
     from filelock import FileLock
@@ -57,7 +57,7 @@ class OneAtATime:
             self._lock.release()
         return found
 
-    @nothing_to_collect()
+    @no_garbage_collection()
     def _read(self, signature: Any, context: Any) -> Any:
         return self._cache.load_overload(signature, context)
 

@@ -22,7 +22,7 @@ from flockenv.jit.checked_store import Store
 __all__ = ["MachineCode"]
 
 
-def _alone(reduced: tuple[Any, ...]) -> tuple[Any, ...]:
+def _without_callers_part(reduced: tuple[Any, ...]) -> tuple[Any, ...]:
     """Return numba's reduced form of an entry point without what only compiled callers need, as it has none.
 
     That is the code of all its functions, replaced by empty ones for those that Python calls, and an environment for
@@ -61,7 +61,9 @@ class MachineCode:
             warnings.warn(said, NumbaWarning, stacklevel=2)
             return
         pickled: Any = dumps
-        self._store.write(self._file(signature, compiled.codegen), pickled((signature, _alone(compiled._reduce()))))
+        self._store.write(
+            self._file(signature, compiled.codegen), pickled((signature, _without_callers_part(compiled._reduce())))
+        )
 
     def flush(self) -> None:
         """Do nothing: a function that is compiled again replaces the stored form."""

@@ -18,9 +18,17 @@ from numba.np import arrayobj
 from numpy.typing import NDArray
 
 from flockenv.jit.cpu import LINE
-from flockenv.jit.intrinsics import asked, intrinsic_or_python
+from flockenv.jit.intrinsics import generate_prefetch, intrinsic_or_python
 
-__all__ = ["array_of", "in_one_piece", "prefetch", "put_past", "store_fence", "stream_store", "zeros"]
+__all__ = [
+    "array_of",
+    "check_contiguous",
+    "generate_streaming_store",
+    "prefetch",
+    "store_fence",
+    "stream_store",
+    "zeros",
+]
 
 
 def zeros(shape: int | tuple[int, ...], dtype: Any = np.float64) -> NDArray[Any]:
@@ -31,7 +39,7 @@ def zeros(shape: int | tuple[int, ...], dtype: Any = np.float64) -> NDArray[Any]
     return np.ndarray(shape, kind, room, first)
 
 
-def in_one_piece(array: Any) -> None:
+def check_contiguous(array: Any) -> None:
     """Raise TypingError unless an array type is contiguous (C layout)."""
     if array.layout != "C":
         raise TypingError(f"{array} must lie in one piece")
@@ -64,7 +72,7 @@ def _prefetch(typing_context: Any, array: Any, part: Any, parts: Any) -> Any:
         data = builder.bitcast(old.data, ir.IntType(8).as_pointer())
         each: Any = cgutils.for_range_slice
         with each(builder, first, builder.add(first, length), line) as (at, _):
-            asked(builder, builder.gep(data, [at]))
+            generate_prefetch(builder, builder.gep(data, [at]))
         return context.get_dummy_value()
 
     return types.void(array, part, parts), generate
@@ -73,7 +81,7 @@ def _prefetch(typing_context: Any, array: Any, part: Any, parts: Any) -> Any:
 prefetch: Any = intrinsic_or_python(_prefetch, lambda array, part, parts: None)
 
 
-def put_past(builder: Any, vector: Any, place: Any, size: int) -> None:
+def generate_streaming_store(builder: Any, vector: Any, place: Any, size: int) -> None:
     """Generate a streaming store of a vector of `size` bytes to an address that is a multiple of `size`.
 
     The caller must write whole cache lines, so that none is read before.
@@ -88,8 +96,8 @@ def _stream_store(typing_context: Any, to: Any, at: Any, source: Any) -> Any:
     Whole cache lines bypass the caches; a partial line at either end does not. Other threads see all after
     `store_fence`.
     """
-    in_one_piece(to)
-    in_one_piece(source)
+    check_contiguous(to)
+    check_contiguous(source)
     if to.dtype != source.dtype:
         raise TypingError(f"{source} is copied into {to}: their numbers differ")
 
@@ -108,7 +116,7 @@ def _stream_store(typing_context: Any, to: Any, at: Any, source: Any) -> Any:
         each: Any = cgutils.for_range_slice
         with each(builder, head, tail, word(side)) as (k, _):
             here, there = (builder.bitcast(builder.gep(base, [k]), vector) for base in (old.data, start))
-            put_past(builder, builder.load(here, align=size), there, LINE)
+            generate_streaming_store(builder, builder.load(here, align=size), there, LINE)
         for begin, end in ((word(0), head), (tail, old.nitems)):
             with each(builder, begin, end, word(1)) as (k, _):
                 builder.store(builder.load(builder.gep(old.data, [k])), builder.gep(start, [k]))

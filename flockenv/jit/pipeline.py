@@ -25,7 +25,7 @@ from llvmlite import ir as llvm
 from numba import _dynfunc  # type: ignore[attr-defined]  # compiled
 from numba.core import analysis, compiler, compiler_machinery, ir, lowering, typed_passes
 
-from flockenv.jit.numba_patches.front_end import lighter, spared
+from flockenv.jit.numba_patches.front_end import apply_patches, replace_passes
 from flockenv.jit.numba_patches.lowering import Brief, BriefPart, insert_part, is_brief
 
 __all__ = ["Inlined", "Whole"]
@@ -55,7 +55,7 @@ _depth = 0
 
 @contextmanager
 def _short_loops() -> Iterator[None]:
-    """Vectorise short loops, too, while one of our functions compiles: under numba's lock, see `lighter`."""
+    """Vectorise short loops, too, while one of our functions compiles: under numba's lock, see `apply_patches`."""
     global _depth
     known = binding.llvm_version_info[0] in LLVMS
     if known and _depth == 0:
@@ -70,7 +70,7 @@ def _short_loops() -> Iterator[None]:
 
 
 @contextmanager
-def _deep() -> Iterator[None]:
+def _deep_recursion() -> Iterator[None]:
     """Raise Python's recursion limit: numba needs about 24 Python calls per nested call, and the default is 1,000."""
     before = sys.getrecursionlimit()
     sys.setrecursionlimit(max(before, DEEPEST))
@@ -81,7 +81,7 @@ def _deep() -> Iterator[None]:
 
 
 @functools.cache
-def _refusal() -> int:
+def _refusal_address() -> int:
     """Return the address of the wrapper that runs if Python calls a part of a kernel: it raises TypeError."""
 
     def part_of_a_kernel() -> None:
@@ -93,7 +93,7 @@ def _refusal() -> int:
     return int(made.library.get_pointer_to_function(made.fndesc.llvm_cpython_wrapper_name))
 
 
-def _optimise_a_little(library: Any) -> None:
+def _optimise_cheaply(library: Any) -> None:
     """Run only the cheap passes: the code is optimised again in the caller."""
     codegen = library._codegen
     passes, builder = codegen._module_pass_manager(
@@ -102,7 +102,7 @@ def _optimise_a_little(library: Any) -> None:
     passes.run(library._final_module, builder)
 
 
-def _finalise_unmade(library: Any) -> None:
+def _finalise_without_code(library: Any) -> None:
     """Finalise a library like numba, but do not add it to the execution engine, which generates machine code."""
     library._finalize_dynamic_globals()
     library._verify_declare_only_symbols()
@@ -135,7 +135,7 @@ class _LanesStay(_Lower):  # type: ignore[misc]
         for loop in graph.loops().values():
             if _lanes(self.func_ir, self.blocks, loop.header) >= FEWEST_LANES:
                 lasts = [self._ends[last] for last, _ in graph.predecessors(loop.header) if last in loop.body]
-                self._keep([last.terminator for last in lasts])
+                self._mark_not_unrolled([last.terminator for last in lasts])
         return entry
 
     def lower_block(self, block: Any) -> None:
@@ -143,7 +143,7 @@ class _LanesStay(_Lower):  # type: ignore[misc]
         super().lower_block(block)
         self._ends[next(offset for offset, other in self.blocks.items() if other is block)] = self.builder.basic_block
 
-    def _keep(self, ways_back: list[Any]) -> None:
+    def _mark_not_unrolled(self, ways_back: list[Any]) -> None:
         """Mark a loop on its back edges: it is not unrolled, but its vectorised form may be."""
         module = self.module
 
@@ -169,14 +169,14 @@ def _lanes(code: Any, blocks: Any, header: Any) -> int:
     values = [line.value for line in block.body if isinstance(line, ir.Assign) and isinstance(line.value, ir.Expr)]
     try:
         iterator = next(value.value for value in values if value.op == "iternext")
-        over = _called(code, code.get_definition(iterator).value, "range")
-        number = code.get_definition(_called(code, over, "uint64"))
+        over = _call_argument(code, code.get_definition(iterator).value, "range")
+        number = code.get_definition(_call_argument(code, over, "uint64"))
         return int(number.value) if isinstance(number, (ir.Const, ir.Global, ir.FreeVar)) else 0
     except (AttributeError, KeyError, StopIteration, TypeError, ValueError):  # KeyError: defined in several places
         return 0
 
 
-def _called(code: Any, variable: Any, name: str) -> Any:
+def _call_argument(code: Any, variable: Any, name: str) -> Any:
     """Return the only argument of the call of `name` that defines a variable; TypeError if there is no such call."""
     call = code.get_definition(variable)
     function = code.get_definition(call.func)
@@ -203,13 +203,15 @@ class _Lowering(_Native):  # type: ignore[misc]
         state.flags.no_cfunc_wrapper = True
         codegen = state.targetctx.codegen()
         state.library = library = codegen.create_library(state.func_id.func_qualname)
-        library._optimize_final_module = types.MethodType(_optimise_a_little, library)
-        library._finalize_final_module = types.MethodType(_finalise_unmade, library)
+        library._optimize_final_module = types.MethodType(_optimise_cheaply, library)
+        library._finalize_final_module = types.MethodType(_finalise_without_code, library)
         super().run_pass(state)
         lowered = state["cr"]
         # callers find a function by a function object; if Python calls this one, it raises an error that explains it
         name = lowered.fndesc.qualname.split(".")[-1]
-        stub = _dynfunc.make_function(lowered.fndesc.lookup_module(), name, "", _refusal(), lowered.env, (library,))
+        stub = _dynfunc.make_function(
+            lowered.fndesc.lookup_module(), name, "", _refusal_address(), lowered.env, (library,)
+        )
         insert = insert_part if is_brief() else type(state.targetctx).insert_user_function
         insert(state.targetctx, stub, lowered.fndesc, (library,))
         state["cr"] = lowered._replace(cfunc=stub)
@@ -236,12 +238,12 @@ class Whole(_Compiler):  # type: ignore[misc]
     def define_pipelines(self) -> list[Any]:
         """Return the pipeline as a list of one pass manager."""
         passes = _Passes.define_nopython_pipeline(self.state)
-        passes.passes = [(self._lowering if p is _Native else p, text) for p, text in spared(passes.passes)]
+        passes.passes = [(self._lowering if p is _Native else p, text) for p, text in replace_passes(passes.passes)]
         passes.finalize()
         return [passes]
 
     def _compile_core(self) -> Any:
-        with lighter(), _short_loops(), _deep():
+        with apply_patches(), _short_loops(), _deep_recursion():
             return super()._compile_core()
 
 

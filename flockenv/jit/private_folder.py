@@ -15,7 +15,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-__all__ = ["NotPrivateError", "first_private", "prepared", "read_private", "say_once"]
+__all__ = ["NotPrivateError", "ensure_private", "first_private", "read_private", "say_once"]
 
 CHECKED = hasattr(os, "geteuid")
 """True if this system has owners and modes to check."""
@@ -34,15 +34,15 @@ def say_once(line: str, about: str = "") -> None:
         print(f"flockenv: {line}", file=sys.stderr, flush=True)
 
 
-def prepared(folder: Path) -> Path:
+def ensure_private(folder: Path) -> Path:
     """Return a folder that only this user can change; create it (mode 0700) if it is missing.
 
     Raises:
         NotPrivateError: the folder is a link, or it or a parent belongs to another user or can be changed by one.
         OSError: it cannot be created or written.
     """
-    _make(folder)
-    for place in _way_to(folder):
+    _create(folder)
+    for place in _path_entries(folder):
         _check_above(place)
     check_folder(folder)
     if not os.access(folder, os.W_OK):
@@ -89,7 +89,7 @@ def first_private(home: Path, temporary: Path, name: str) -> Path:
         OSError: none of them can be created.
     """
     fallback, wrong = temporary / name, []
-    for find, folder in ((prepared, home), (prepared, fallback), (_beside, fallback)):
+    for find, folder in ((ensure_private, home), (ensure_private, fallback), (_private_sibling, fallback)):
         try:
             found = find(folder)
         except NotPrivateError as error:
@@ -103,19 +103,19 @@ def first_private(home: Path, temporary: Path, name: str) -> Path:
     raise OSError("; ".join([f"no folder for compiled kernels (tried {home} and {fallback})", *wrong]))
 
 
-def _beside(folder: Path) -> Path:
+def _private_sibling(folder: Path) -> Path:
     """Return a private folder beside `folder` with -XXXXXXXX appended to its name: an existing one, or a new one."""
-    for place in _way_to(folder):
+    for place in _path_entries(folder):
         _check_above(place)
     for other in sorted(folder.parent.glob(f"{folder.name}-*")):
         try:
-            return prepared(other)
+            return ensure_private(other)
         except OSError:  # it belongs to another user
             continue
-    return prepared(Path(tempfile.mkdtemp(prefix=f"{folder.name}-", dir=folder.parent)))
+    return ensure_private(Path(tempfile.mkdtemp(prefix=f"{folder.name}-", dir=folder.parent)))
 
 
-def _make(folder: Path) -> None:
+def _create(folder: Path) -> None:
     """Create a folder for this user alone; missing parents are created readable, but not writable, for others."""
     if not os.path.lexists(folder):
         for above in reversed(folder.absolute().parents):
@@ -124,7 +124,7 @@ def _make(folder: Path) -> None:
         folder.mkdir(mode=0o700, exist_ok=True)
 
 
-def _way_to(folder: Path) -> Iterator[Path]:
+def _path_entries(folder: Path) -> Iterator[Path]:
     """Yield every folder and every link on the path to a folder, except the folder itself."""
     at, left = Path(folder.absolute().anchor), list(reversed(folder.absolute().parts[1:]))
     while left:
@@ -147,7 +147,7 @@ def _check_above(place: Path) -> None:
     trusted = {0, os.geteuid(), os.stat("/").st_uid}  # the last: in a container the administrator may have another id
     if found.st_uid not in trusted:
         raise NotPrivateError(f"{place}: belongs to user {found.st_uid}, which could replace its content")
-    if not stat.S_ISLNK(found.st_mode) and _others_write(found) and not found.st_mode & stat.S_ISVTX:
+    if not stat.S_ISLNK(found.st_mode) and _is_writable_by_others(found) and not found.st_mode & stat.S_ISVTX:
         raise NotPrivateError(f"{place}: other users can replace its content (mode {_mode(found)}); chmod go-w it")
 
 
@@ -161,17 +161,17 @@ def _check(found: os.stat_result, path: Path, is_kind: Callable[[int], bool], ki
         return
     if found.st_uid != os.geteuid():
         raise NotPrivateError(f"{path}: belongs to user {found.st_uid}, must belong to user {os.geteuid()}")
-    if _others_write(found):
+    if _is_writable_by_others(found):
         raise NotPrivateError(f"{path}: other users can write it (mode {_mode(found)}); chmod go-w it")
 
 
-def _others_write(found: os.stat_result) -> bool:
+def _is_writable_by_others(found: os.stat_result) -> bool:
     """Return True if users other than the owner can write it; root's group and this user's own group do not count."""
     mode = found.st_mode
-    return bool(mode & stat.S_IWOTH) or (bool(mode & stat.S_IWGRP) and not _of_one(found.st_gid))
+    return bool(mode & stat.S_IWOTH) or (bool(mode & stat.S_IWGRP) and not _is_of_one_user(found.st_gid))
 
 
-def _of_one(group: int) -> bool:
+def _is_of_one_user(group: int) -> bool:
     """Return True if a group is root's, or the private group of this user: same name, and no other member."""
     import grp  # here: Windows has neither
     import pwd

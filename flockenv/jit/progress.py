@@ -16,7 +16,7 @@ from numba.core import event
 from flockenv.jit.lock import OneAtATime
 from flockenv.jit.numba_patches import front_end, lowering
 
-__all__ = ["Compiled", "compiled", "unmatched"]
+__all__ = ["Compiled", "compiled_kernels", "unapplied_patches"]
 
 
 class Compiled(NamedTuple):
@@ -30,18 +30,18 @@ class Compiled(NamedTuple):
 _done: list[Compiled] = []
 
 
-def compiled() -> tuple[Compiled, ...]:
+def compiled_kernels() -> tuple[Compiled, ...]:
     """Return the kernels that this process has compiled so far; empty if all came from the cache."""
     return tuple(_done)
 
 
-def unmatched() -> tuple[str, ...]:
+def unapplied_patches() -> tuple[str, ...]:
     """Return the patches of numba that are not applied because the source of the installed numba differs."""
     every = [
-        *((each.title, each.reads) for each in (*front_end.TRICKS, *front_end.SPARED)),
+        *((each.title, each.reads) for each in (*front_end.PATCHES, *front_end.REPLACED_PASSES)),
         ("lowering", lowering.READS),
     ]
-    return tuple(title for title, reads in every if not front_end.reads_as_known(reads))
+    return tuple(title for title, reads in every if not front_end.is_known_source(reads))
 
 
 class _Watch(event.Listener):
@@ -56,7 +56,7 @@ class _Watch(event.Listener):
         if function is not None:
             self.began[id(event.data["dispatcher"])] = perf_counter()
             folder = _folder(event.data["dispatcher"])
-            _say(f"flockenv: compiling {_described(event.data['dispatcher'])} (once; kept in {folder}) ...")
+            _print(f"flockenv: compiling {_kernel_title(event.data['dispatcher'])} (once; kept in {folder}) ...")
 
     def on_end(self, event: Any) -> None:
         """Record the duration and complete the line."""
@@ -64,8 +64,8 @@ class _Watch(event.Listener):
         began = self.began.pop(id(event.data["dispatcher"]), None)
         if function is not None and began is not None:
             seconds = perf_counter() - began
-            _done.append(Compiled(function.__name__, _described(event.data["dispatcher"]), seconds))
-            _say(f" {seconds:.1f} s\n")
+            _done.append(Compiled(function.__name__, _kernel_title(event.data["dispatcher"]), seconds))
+            _print(f" {seconds:.1f} s\n")
 
 
 def _entry_point(event: Any) -> Any:
@@ -75,7 +75,7 @@ def _entry_point(event: Any) -> Any:
     return dispatcher.py_func if ours else None
 
 
-def _described(dispatcher: Any) -> str:
+def _kernel_title(dispatcher: Any) -> str:
     """Return the title of an entry point, or the first line of its docstring, or its name."""
     text: str = vars(dispatcher).get("title") or dispatcher.py_func.__doc__ or dispatcher.py_func.__name__
     return text.split("\n")[0]
@@ -86,7 +86,7 @@ def _folder(dispatcher: Any) -> str:
     return folder.replace(os.path.expanduser("~"), "~", 1)
 
 
-def _say(text: str) -> None:
+def _print(text: str) -> None:
     if sys.stderr is not None and sys.stderr.isatty() and not os.environ.get("FLOCKENV_QUIET"):
         sys.stderr.write(text)
         sys.stderr.flush()

@@ -29,20 +29,20 @@ from flockenv.jit.decorators import FAST, IN_PYTHON, Vec, kernel, python_of
 from flockenv.jit.lock import OneAtATime
 from flockenv.jit.machine_code import MachineCode
 from flockenv.jit.pipeline import Whole
-from flockenv.jit.private_folder import prepared
-from flockenv.jit.sources import described, functions_in, laws_digest, texts_outside
-from flockenv.jit.startup import numba_before_scipy
+from flockenv.jit.private_folder import ensure_private
+from flockenv.jit.sources import description, functions_in, laws_digest, texts_outside
+from flockenv.jit.startup import import_numba_before_scipy
 
 __all__ = [
+    "call_in_turn",
+    "concatenation_from",
     "digest_of",
     "entry",
     "entry_of",
-    "in_turn",
-    "joined_from",
+    "read_several",
     "record",
     "section",
-    "several",
-    "titled",
+    "set_title",
     "tuple_from",
     "vector",
     "without_dispatch",
@@ -87,7 +87,7 @@ def without_dispatch(function: Any) -> Callable[..., Any]:
     return compiled[0].entry_point if len(compiled) == 1 else function  # type: ignore[no-any-return]
 
 
-def titled(entry_point: Callable[..., Any], title: str) -> Callable[..., Any]:
+def set_title(entry_point: Callable[..., Any], title: str) -> Callable[..., Any]:
     """Return the entry point with the title shown while it compiles; the first title it gets is kept."""
     vars(entry_point).setdefault("title", title)
     return entry_point
@@ -102,7 +102,7 @@ def entry(function: Callable[..., Any]) -> Callable[..., Any]:
 def digest_of(plan: Any) -> str:
     """Return a digest of all that the code of a plan depends on: laws by their code, numbers by their repr."""
     modules = {each.__module__ for each in functions_in(plan)}
-    told = f"{described(plan)}{laws_digest()}{texts_outside(modules)}"
+    told = f"{description(plan)}{laws_digest()}{texts_outside(modules)}"
     return hashlib.sha256(told.encode()).hexdigest()[:20]
 
 
@@ -113,21 +113,21 @@ def _entry(make: Callable[..., Callable[..., Any]], plan: tuple[Any, ...]) -> Ca
     """
     if IN_PYTHON:
         return make(*plan)
-    numba_before_scipy()
+    import_numba_before_scipy()
     digest, store = digest_of((make, plan, cpu.REGISTER)), Store(cache_folder())
     stand_in = _stand_in(store.read(f"{digest}.plan"))
     function = stand_in or make(*plan)
     if stand_in is None:
-        store.write(f"{digest}.plan", _told_of(function))
+        store.write(f"{digest}.plan", _stand_in_data(function))
     name = f"{function.__name__.strip('_')}_{digest}"
     compiled = _njit(fastmath=set(FAST), error_model="numpy", nogil=True, _nrt=False, pipeline_class=Whole)(function)
-    lock = prepared(store.folder / "locks") / f"{name}.lock"
-    compiled._cache = _Late(MachineCode(store, name), lock, compiled, make, plan)
+    lock = ensure_private(store.folder / "locks") / f"{name}.lock"
+    compiled._cache = _LateBuilt(MachineCode(store, name), lock, compiled, make, plan)
     compiled.made_of = make, plan
     return compiled  # type: ignore[no-any-return]
 
 
-def _told_of(function: Callable[..., Any]) -> bytes:
+def _stand_in_data(function: Callable[..., Any]) -> bytes:
     """Return the data from which a stand-in for a function is built, as JSON."""
     parameters = list(inspect.signature(function).parameters)
     told = (function.__name__, function.__qualname__, function.__module__, function.__doc__, parameters)
@@ -148,7 +148,7 @@ def _stand_in(told: bytes | None) -> Callable[..., Any] | None:
     return stand_in
 
 
-class _Late(OneAtATime):
+class _LateBuilt(OneAtATime):
     """Machine code of an entry point; its function is built only if the code for its argument types is not cached."""
 
     def __init__(
@@ -183,14 +183,14 @@ def __getattr__(name: str) -> Any:
 
 
 @functools.cache
-def several(count: int, item: Callable[[Any, int], Any]) -> Callable[[Any, int], tuple[Any, ...]]:
+def read_several(count: int, item: Callable[[Any, int], Any]) -> Callable[[Any, int], tuple[Any, ...]]:
     """Return `items(array, at)`: a tuple of `count` items, item(array, at), item(array, at + 1), ...
 
     More than four are split into two halves, as numba compiles nested calls.
     """
     half = count // 2
-    before = several(half, item) if count > 4 else None
-    after = several(count - half, item) if count > 4 else None
+    before = read_several(half, item) if count > 4 else None
+    after = read_several(count - half, item) if count > 4 else None
 
     def items(array: Any, at: int) -> tuple[Any, ...]:
         if before is not None:
@@ -206,7 +206,7 @@ def several(count: int, item: Callable[[Any, int], Any]) -> Callable[[Any, int],
     return kernel(items)
 
 
-def _calls(functions: tuple[Any, ...], joined: bool, plain: Callable[..., Any]) -> Any:
+def _call_all(functions: tuple[Any, ...], joined: bool, plain: Callable[..., Any]) -> Any:
     """Return a function that calls `functions` in turn with its own arguments and returns a tuple of their results.
 
     joined: each returns a tuple, and these are concatenated. If all return None, so does the function. It is an
@@ -252,24 +252,24 @@ def tuple_from(*functions: Callable[..., Any]) -> Callable[..., tuple[Any, ...]]
     """Return a function that returns the tuple of the results of `functions` for its arguments."""
     if not functions:
         return kernel(lambda *given: ())
-    return _calls(functions, False, lambda *given: tuple(function(*given) for function in functions))  # type: ignore[no-any-return]
+    return _call_all(functions, False, lambda *given: tuple(function(*given) for function in functions))  # type: ignore[no-any-return]
 
 
 @functools.cache
-def joined_from(*functions: Callable[..., tuple[Any, ...]]) -> Callable[..., tuple[Any, ...]]:
+def concatenation_from(*functions: Callable[..., tuple[Any, ...]]) -> Callable[..., tuple[Any, ...]]:
     """Return a function that concatenates the tuples that `functions` return for its arguments."""
-    return _calls(functions, True, lambda *given: sum((function(*given) for function in functions), ()))  # type: ignore[no-any-return]
+    return _call_all(functions, True, lambda *given: sum((function(*given) for function in functions), ()))  # type: ignore[no-any-return]
 
 
 @functools.cache
-def in_turn(*functions: Callable[..., None]) -> Callable[..., None]:
+def call_in_turn(*functions: Callable[..., None]) -> Callable[..., None]:
     """Return a function that calls `functions` in turn with its arguments; they return None."""
 
     def plain(*given: Any) -> None:
         for function in functions:
             function(*given)
 
-    return _calls(functions, False, plain) if functions else kernel(lambda *given: None)
+    return _call_all(functions, False, plain) if functions else kernel(lambda *given: None)
 
 
 @functools.cache

@@ -18,12 +18,25 @@ from numba.np import arrayobj
 from flockenv.jit import cpu
 from flockenv.jit.cpu import LINE
 from flockenv.jit.decorators import kernel
-from flockenv.jit.intrinsics import intrinsic_or_python, written
-from flockenv.jit.memory import array_of, in_one_piece
+from flockenv.jit.intrinsics import intrinsic_or_python, literal_value
+from flockenv.jit.memory import array_of, check_contiguous
 
 __all__ = [
-    "PAIR", "SIDE", "apart", "columns", "in_one_row", "into_rows", "key_of", "key_read", "key_written", "ordered",
-    "packed", "pick", "same_key", "tag_of", "take",
+    "PAIR",
+    "SIDE",
+    "as_contiguous",
+    "column_distance",
+    "columns",
+    "flatten",
+    "float_as_key",
+    "into_rows",
+    "key_as_float",
+    "key_of",
+    "order_keys",
+    "pick",
+    "same_key",
+    "tag_of",
+    "take",
 ]  # fmt: skip
 
 SIDE = LINE // 4
@@ -39,7 +52,7 @@ PAIR = 2 * SIDE
 """Arrays of agents in lanes are padded to a multiple of this many agents."""
 
 
-def apart(count: int) -> int:
+def column_distance(count: int) -> int:
     """Return the distance between columns of `count` agents, in numbers; in a kernel it is a constant.
 
     A constant lets LLVM prove that columns do not overlap, without checks at run time. It is the same for many counts,
@@ -48,7 +61,7 @@ def apart(count: int) -> int:
     return max(64, 1 << (count - 1).bit_length()) + SIDE
 
 
-def _shown(context: Any, builder: Any, kind: Any, old: Any, shape: Any, strides: Any) -> Any:
+def _view(context: Any, builder: Any, kind: Any, old: Any, shape: Any, strides: Any) -> Any:
     """Return a view of an array with another shape and strides."""
     fill: Any = arrayobj.populate_array
     new = array_of(context, builder, kind)
@@ -61,12 +74,12 @@ def _bytes(context: Any, kind: Any) -> Any:
     return context.get_constant(types.intp, context.get_abi_sizeof(context.get_data_type(kind.dtype)))
 
 
-def _packed(typing_context: Any, array: Any) -> Any:
+def _as_contiguous(typing_context: Any, array: Any) -> Any:
     """Return a contiguous array with strides computed from its shape, of which the last is a constant.
 
     A view of one world, (D, B, N) -> (D, N), derives its strides from it, so LLVM knows that its agents are adjacent.
     """
-    in_one_piece(array)
+    check_contiguous(array)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         old = array_of(context, builder, array, arguments[0])
@@ -75,27 +88,27 @@ def _packed(typing_context: Any, array: Any) -> Any:
         strides = [_bytes(context, array)]
         for count in reversed(shape[1:]):
             strides.insert(0, builder.mul(strides[0], count))
-        return _shown(context, builder, array, old, shape, strides)
+        return _view(context, builder, array, old, shape, strides)
 
     return array(array), generate
 
 
-packed: Any = intrinsic_or_python(_packed, lambda array: array)
+as_contiguous: Any = intrinsic_or_python(_as_contiguous, lambda array: array)
 
 
-def _in_one_row(typing_context: Any, array: Any) -> Any:
+def _flatten(typing_context: Any, array: Any) -> Any:
     """Return a flat view of a contiguous array."""
-    in_one_piece(array)
+    check_contiguous(array)
     view = types.Array(array.dtype, 1, "C")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         old = array_of(context, builder, array, arguments[0])
-        return _shown(context, builder, view, old, [old.nitems], [_bytes(context, array)])
+        return _view(context, builder, view, old, [old.nitems], [_bytes(context, array)])
 
     return view(array), generate
 
 
-in_one_row: Any = intrinsic_or_python(_in_one_row, lambda array: array.reshape(-1))
+flatten: Any = intrinsic_or_python(_flatten, lambda array: array.reshape(-1))
 
 
 def _columns(typing_context: Any, flat: Any, count: Any, many: Any, distance: Any) -> Any:
@@ -109,7 +122,7 @@ def _columns(typing_context: Any, flat: Any, count: Any, many: Any, distance: An
             for a, kind in zip(arguments[1:], signature.args[1:], strict=True)
         )
         size = _bytes(context, flat)
-        return _shown(context, builder, view, old, [n, m], [size, builder.mul(size, step)])
+        return _view(context, builder, view, old, [n, m], [size, builder.mul(size, step)])
 
     return view(flat, count, many, distance), generate
 
@@ -139,7 +152,7 @@ def _lookup(builder: Any, vector: Any, size: int) -> tuple[int, Any]:
     return 0, None
 
 
-def _looked_up(builder: Any, part: Any, named: Any, vector: Any, size: int, count: Any) -> Any:
+def _look_up(builder: Any, part: Any, named: Any, vector: Any, size: int, count: Any) -> Any:
     """Generate the look-up of the indices `named` in a whole table, a PAIR at a time; `part` reads its registers."""
     step, lookup = _lookup(builder, vector, size)
     word = ir.IntType(64)
@@ -166,7 +179,7 @@ def _looked_up(builder: Any, part: Any, named: Any, vector: Any, size: int, coun
     return builder.load(found)
 
 
-def _read(builder: Any, part: Any, named: Any, vector: Any) -> Any:
+def _read_each(builder: Any, part: Any, named: Any, vector: Any) -> Any:
     """Generate code that reads the entries of the indices `named` one by one."""
     found = ir.Constant(vector, ir.Undefined)
     for k in range(vector.count):
@@ -175,7 +188,7 @@ def _read(builder: Any, part: Any, named: Any, vector: Any) -> Any:
     return found
 
 
-def _picks(
+def _pick(
     typing_context: Any, to: Any, at: Any, beside: Any, table: Any, first: Any, length: Any, many: Any, count: Any,
     who: Any, place: Any, width: Any,
 ) -> Any:  # fmt: skip
@@ -186,8 +199,8 @@ def _picks(
     Short rows are looked up in registers, if the processor can do that; otherwise entries are read one by one.
     """
     for array in (to, table, who):
-        in_one_piece(array)
-    wide = written(width, "width")
+        check_contiguous(array)
+    wide = literal_value(width, "width")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         number, word = context.get_data_type(to.dtype), ir.IntType(64)
@@ -218,9 +231,9 @@ def _picks(
             with builder.if_else(few) as (short, long):
                 with short:
                     if step:
-                        each(begin, named, _looked_up, size, arguments[7])
+                        each(begin, named, _look_up, size, arguments[7])
                 with long:
-                    each(begin, named, _read)
+                    each(begin, named, _read_each)
         return context.get_dummy_value()
 
     number = types.uint64
@@ -228,7 +241,7 @@ def _picks(
     return types.void(*given), generate
 
 
-def _picked_in_python(
+def _pick_in_python(
     to: Any, at: Any, beside: Any, table: Any, first: Any, length: Any, many: Any, count: Any, who: Any, place: Any,
     width: int,
 ) -> None:  # fmt: skip
@@ -239,7 +252,7 @@ def _picked_in_python(
         to.reshape(-1)[start : start + width] = row[named]
 
 
-pick: Any = intrinsic_or_python(_picks, _picked_in_python)
+pick: Any = intrinsic_or_python(_pick, _pick_in_python)
 
 
 # A key: a squared distance, in single precision, whose low bits are replaced by a place (an index). The bits of numbers
@@ -257,7 +270,7 @@ def _key_of(typing_context: Any, square: Any, place: Any, tags: Any) -> Any:
     return types.uint32(types.float32, types.int32, types.int32), generate
 
 
-def _key_read(typing_context: Any, number: Any) -> Any:
+def _float_as_key(typing_context: Any, number: Any) -> Any:
     """Return the key whose bits are stored as a float32."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -266,7 +279,7 @@ def _key_read(typing_context: Any, number: Any) -> Any:
     return types.uint32(types.float32), generate
 
 
-def _key_written(typing_context: Any, key: Any) -> Any:
+def _key_as_float(typing_context: Any, key: Any) -> Any:
     """Return the float32 with the bits of a key."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -294,7 +307,7 @@ def _same_key(typing_context: Any, one: Any, other: Any, tags: Any) -> Any:
     return types.boolean(types.uint32, types.uint32, types.int32), generate
 
 
-def _ordered(typing_context: Any, one: Any, other: Any) -> Any:
+def _order_keys(typing_context: Any, one: Any, other: Any) -> Any:
     """Return two keys, the smaller one first."""
     pair: Any = types.UniTuple
 
@@ -312,11 +325,11 @@ def _key_in_python(square: Any, place: Any, tags: Any) -> Any:
 
 
 key_of: Any = intrinsic_or_python(_key_of, _key_in_python)
-key_read: Any = intrinsic_or_python(_key_read, lambda number: np.float32(number).view(np.uint32))
-key_written: Any = intrinsic_or_python(_key_written, lambda key: np.uint32(key).view(np.float32))
+float_as_key: Any = intrinsic_or_python(_float_as_key, lambda number: np.float32(number).view(np.uint32))
+key_as_float: Any = intrinsic_or_python(_key_as_float, lambda key: np.uint32(key).view(np.float32))
 tag_of: Any = intrinsic_or_python(_tag_of, lambda key, tags: np.int32(key & np.uint32(tags)))
 same_key: Any = intrinsic_or_python(_same_key, lambda one, other, tags: (one ^ other) & ~np.uint32(tags) == 0)
-ordered: Any = intrinsic_or_python(_ordered, lambda one, other: (min(one, other), max(one, other)))
+order_keys: Any = intrinsic_or_python(_order_keys, lambda one, other: (min(one, other), max(one, other)))
 
 
 @kernel
@@ -337,15 +350,15 @@ def take(to: Any, table: Any, who: Any, count: int) -> None:
                     to[r, s, i] = table[r, np.uint64(who[s, i])]
 
 
-def _turned_square(
+def _transpose_one_square(
     typing_context: Any, to: Any, at: Any, across: Any, many: Any, source: Any, place: Any, down: Any
 ) -> Any:
     """Transpose a square of side SQUARE: column k, from `place` + k * `down`, goes to every `across`-th from `at` + k.
 
     Only the first `many` rows of the result are written.
     """
-    in_one_piece(to)
-    in_one_piece(source)
+    check_contiguous(to)
+    check_contiguous(source)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         vector = ir.VectorType(context.get_data_type(to.dtype), SQUARE)
@@ -372,14 +385,14 @@ def _turned_square(
     return types.void(to, types.uint64, types.uint64, types.uint64, source, types.uint64, types.uint64), generate
 
 
-def _turned_in_python(to: Any, at: Any, across: Any, many: Any, source: Any, place: Any, down: Any) -> None:
+def _transpose_in_python(to: Any, at: Any, across: Any, many: Any, source: Any, place: Any, down: Any) -> None:
     rows, numbers = to.reshape(-1), source.reshape(-1)
     for i in range(min(int(many), SQUARE)):
         start, first = int(at) + i * int(across), int(place) + i
         rows[start : start + SQUARE] = numbers[first : first + SQUARE * int(down) : int(down)][:SQUARE]
 
 
-_turn_square: Any = intrinsic_or_python(_turned_square, _turned_in_python)
+_transpose_square: Any = intrinsic_or_python(_transpose_one_square, _transpose_in_python)
 
 
 @kernel
@@ -394,7 +407,7 @@ def into_rows(rows: Any, flat: Any, many: int, distance: int) -> None:
             row, left = np.uint64(i), np.uint64(count - i)
             for c in range(0, many, SQUARE):
                 column = np.uint64(min(c, many - SQUARE))
-                _turn_square(rows, row * size + column, size, left, flat, column * step + row, step)
+                _transpose_square(rows, row * size + column, size, left, flat, column * step + row, step)
     else:
         for i in range(count):
             for c in range(many):

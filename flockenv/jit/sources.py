@@ -22,9 +22,9 @@ from flockenv.jit.decorators import python_of
 
 __all__ = [
     "code_text",
-    "described",
+    "description",
+    "free_values",
     "functions_in",
-    "held",
     "laws_digest",
     "sources_of_code",
     "texts_outside",
@@ -85,7 +85,7 @@ def code_text(function: Any) -> str:
     return text(python_of(function).__code__)
 
 
-def held(python: FunctionType) -> tuple[Any, ...]:
+def free_values(python: FunctionType) -> tuple[Any, ...]:
     """Return the values of a function's free variables."""
     return tuple(cell.cell_contents for cell in python.__closure__ or ())
 
@@ -95,23 +95,23 @@ def functions_in(part: Any) -> Iterator[FunctionType]:
     python = python_of(part)
     if isinstance(python, FunctionType):
         yield python
-        part = held(python)
+        part = free_values(python)
     for inner in part if isinstance(part, tuple) else ():
         yield from functions_in(inner)
 
 
-def described(part: Any) -> str:
+def description(part: Any) -> str:
     """Return a part of a plan as text: functions by code and free variables, numbers by repr, arrays by bytes."""
     python = python_of(part)
     if isinstance(python, FunctionType):
-        return _described(python)
+        return _function_description(python)
     if isinstance(part, tuple):
-        return f"({', '.join(map(described, part))})"
+        return f"({', '.join(map(description, part))})"
     return f"{part.dtype} {part.shape} {part.tobytes()!r}" if isinstance(part, np.ndarray) else repr(part)
 
 
 @functools.lru_cache(maxsize=4096)
-def _described(python: FunctionType) -> str:
+def _function_description(python: FunctionType) -> str:
     """Return a function's name and the digest of its code and free variables, which keeps nested text short."""
-    told = f"{code_text(python)} {described(held(python))}"
+    told = f"{code_text(python)} {description(free_values(python))}"
     return f"{python.__module__}.{python.__qualname__} {hashlib.sha256(told.encode()).hexdigest()}"

@@ -11,13 +11,13 @@ import threading
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-__all__ = ["import_all", "nothing_to_collect", "numba_before_scipy"]
+__all__ = ["import_all", "import_numba_before_scipy", "no_garbage_collection"]
 
 _one_at_a_time = threading.Lock()
 
 
 @contextlib.contextmanager
-def nothing_to_collect() -> Iterator[None]:
+def no_garbage_collection() -> Iterator[None]:
     """Disable garbage collection in a block whose objects nearly all stay alive, and would be traversed repeatedly.
 
     Collection took a seventh of the time until a process's first step.
@@ -33,13 +33,13 @@ def nothing_to_collect() -> Iterator[None]:
 
 def import_all(package: str, path: Iterable[str], but: str = "") -> None:
     """Import every module of a package's folder except `but`, so that the classes defined there register themselves."""
-    with nothing_to_collect():
+    with no_garbage_collection():
         for module in pkgutil.iter_modules(path):
             if module.name != but:
                 importlib.import_module(f"{package}.{module.name}")
 
 
-def numba_before_scipy() -> None:
+def import_numba_before_scipy() -> None:
     """Import numba's array functions without scipy.linalg, which took a tenth of the time until a process's first step.
 
     numba imports scipy.linalg there only to check that it is available, and imports it again on use: when np.dot is

@@ -21,7 +21,7 @@ from collections.abc import Callable, Sequence
 from time import perf_counter
 from typing import Any, TypeVar
 
-__all__ = ["AutoTuner", "AutoTuners", "at_work", "share", "threads", "use_threads"]
+__all__ = ["AutoTuner", "AutoTuners", "run_parallel", "threads", "usable_threads", "use_threads"]
 
 T = TypeVar("T")
 
@@ -54,7 +54,7 @@ class _ThreadPool:
             threading.Thread(target=_work, args=(desk,), daemon=True, name=f"flockenv-{k + 1}").start()
 
 
-def _how_to_ask() -> Callable[[], int] | None:
+def _core_getter() -> Callable[[], int] | None:
     """Return the function that returns the current thread's core; None if the system has none, or no affinities."""
     if not hasattr(os, "sched_setaffinity"):
         return None
@@ -65,14 +65,14 @@ def _how_to_ask() -> Callable[[], int] | None:
     return ask
 
 
-_asked = _how_to_ask()
+_current_core_number = _core_getter()
 
 
-def _here() -> tuple[int, set[int]]:
+def _current_core() -> tuple[int, set[int]]:
     """Return the core that this thread runs on, and those that it may run on; (-1, empty set) if unknown."""
-    if _asked is not None:
+    if _current_core_number is not None:
         with contextlib.suppress(OSError):
-            return _asked(), os.sched_getaffinity(0)
+            return _current_core_number(), os.sched_getaffinity(0)
     return -1, set()
 
 
@@ -82,7 +82,7 @@ class _Place:
     def __init__(self) -> None:
         self.kept: set[int] = set()
 
-    def keep_off(self, core: int, cores: set[int], many: int) -> None:
+    def avoid_core(self, core: int, cores: set[int], many: int) -> None:
         """Run on the caller's `cores` from now on, without `core` if at least `many` others are left."""
         others = cores - {core}
         kept = others if len(others) >= many else cores
@@ -97,7 +97,7 @@ def _work(desk: queue.SimpleQueue[Any]) -> None:
     while True:
         job, done, here = desk.get()
         try:
-            place.keep_off(*here)
+            place.avoid_core(*here)
             done.put((job(), None))
         except BaseException as error:
             done.put((None, error))
@@ -105,7 +105,7 @@ def _work(desk: queue.SimpleQueue[Any]) -> None:
 
 _count = 1
 _cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-_crew: _ThreadPool | None = None
+_pool: _ThreadPool | None = None
 _in_python = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")  # numba itself takes long to import
 
 
@@ -114,7 +114,7 @@ def threads() -> int:
     return _count
 
 
-def at_work() -> int:
+def usable_threads() -> int:
     """Return the number of threads that a step uses if that is faster: at most one per core, and one in plain Python.
 
     In plain Python the barrier's counter is not atomic.
@@ -130,21 +130,24 @@ def use_threads(count: int) -> None:
     _count = count
 
 
-def _crew_of(count: int) -> _ThreadPool:
+def _pool_of(count: int) -> _ThreadPool:
     """Return a pool for `count` threads; two callers at once may create two, and each uses its own."""
-    global _crew
-    crew = _crew
+    global _pool
+    crew = _pool
     if crew is None or crew.pid != os.getpid() or len(crew.desks) < count - 1:
-        crew = _crew = _ThreadPool(max(count, _count))
+        crew = _pool = _ThreadPool(max(count, _count))
     return crew
 
 
-def share(jobs: Sequence[Callable[[], Any]]) -> list[Any]:
+def run_parallel(jobs: Sequence[Callable[[], Any]]) -> list[Any]:
     """Run jobs in parallel, the first in this thread; return their results, or raise the error of one of them.
 
     All of them run at the same time, so they may wait for each other. Returns, or raises, only after all have ended.
     """
-    crew, here = _crew_of(len(jobs)), (*_here(), len(jobs) - 1)  # a pinned caller keeps the pool's threads on its cores
+    crew, here = (
+        _pool_of(len(jobs)),
+        (*_current_core(), len(jobs) - 1),
+    )  # a pinned caller keeps the pool's threads on its cores
     done: list[queue.SimpleQueue[Any]] = [queue.SimpleQueue() for _ in jobs[1:]]
     with crew.lock:  # all queues under one lock: the jobs of two callers, which wait for each other, never interleave
         for desk, job, answer in zip(crew.desks, jobs[1:], done, strict=False):
@@ -184,13 +187,13 @@ class AutoTuner:
             if self._wait > 0:
                 self._wait -= 1
                 return bool(self.best)
-            self._try(1 - self.best)
+            self._start_trial(1 - self.best)
         if self._tried and self.took[0] < SHORTEST:
             self._left, self._wait = 0, self._pause
             return False
         return bool(self._tried)
 
-    def made(self, alone: Callable[[], T], shared: Callable[[], T], surely: bool = False) -> T:
+    def run(self, alone: Callable[[], T], shared: Callable[[], T], surely: bool = False) -> T:
         """Call `alone` or `shared`, record the time it took, and return its result.
 
         surely: the work is so large that `shared` is called without a trial.
@@ -208,17 +211,17 @@ class AutoTuner:
         if self._left < TRIAL - 1:
             self._least = min(self._least, seconds)
         if not self._left:
-            self._judge()
+            self._end_trial()
         return result
 
-    def _try(self, way: int) -> None:
+    def _start_trial(self, way: int) -> None:
         self._tried, self._left, self._least = way, TRIAL, math.inf
 
-    def _judge(self) -> None:
+    def _end_trial(self) -> None:
         """Record the time of a trial; start the other trial if it never ran, otherwise wait."""
         before, self.took[self._tried] = self.best, self._least
         if self.took[1] == math.inf:
-            self._try(1)
+            self._start_trial(1)
         else:
             self._pause = AGAIN if self.best != before else min(2 * self._pause, SELDOM)
             self._wait = self._pause

@@ -14,8 +14,8 @@ from numba.core import types
 
 from flockenv.jit import cpu
 from flockenv.jit.cpu import LINE
-from flockenv.jit.intrinsics import intrinsic_or_python, written
-from flockenv.jit.memory import array_of, put_past
+from flockenv.jit.intrinsics import intrinsic_or_python, literal_value
+from flockenv.jit.memory import array_of, generate_streaming_store
 
 __all__ = ["out_of_records", "put_lines", "put_records"]
 
@@ -23,12 +23,12 @@ Vectors = list[Any]
 _several: Any = types.UniTuple
 
 
-def _whole(length: int) -> int:
+def _power_of_two(length: int) -> int:
     """Return the next power of two, the number of rows that are transposed."""
     return 1 << (length - 1).bit_length()
 
 
-def _transposed(builder: Any, rows: Vectors) -> Vectors:
+def _transpose(builder: Any, rows: Vectors) -> Vectors:
     """Return P vectors of W numbers, both powers of two, as the P numbers of lane 0, then those of lane 1, and so on.
 
     Each of log2 P passes interleaves the first half of the vectors, laid end to end, with the second half.
@@ -42,8 +42,8 @@ def _transposed(builder: Any, rows: Vectors) -> Vectors:
     return rows
 
 
-def _restored(builder: Any, rows: Vectors) -> Vectors:
-    """Undo `_transposed`."""
+def _transpose_back(builder: Any, rows: Vectors) -> Vectors:
+    """Undo `_transpose`."""
     width = rows[0].type.count
     masks = [_mask([2 * k + odd for k in range(width)]) for odd in (0, 1)]
     for _ in range(len(rows).bit_length() - 1):
@@ -74,8 +74,8 @@ def _put_records(
     side from `places[k]` on. cell: int32, -1 for an agent without one: its record is written to place `spare`, behind
     all others. offset: int32, the next place of each cell. All arrays are contiguous.
     """
-    wide, many = written(width, "width"), 1 + sources.count
-    size = _whole(many)
+    wide, many = literal_value(width, "width"), 1 + sources.count
+    size = _power_of_two(many)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         to, cells, offsets = (array_of(context, builder, signature.args[k], arguments[k]).data for k in (0, 4, 6))
@@ -99,7 +99,7 @@ def _put_records(
 
         flat: Vectors = []
         for begin in range(0, wide, side):
-            flat += _transposed(builder, list(rows(begin)))
+            flat += _transpose(builder, list(rows(begin)))
         starts = []  # all computed before the records are stored, so that no store delays the next address
         for k in range(wide):
             c = builder.load(builder.gep(cells, [builder.add(arguments[5], word(k))]))
@@ -148,14 +148,14 @@ def _put_lines(
     (int32, in records; -1 for place `spare`). The numbers behind that of the last source are undefined. Streaming
     stores bypass the caches, so that a line, far from the next one, is not read before it is written.
     """
-    wide, many, piece = written(width, "width"), sources.count, written(length, "length")
+    wide, many, piece = literal_value(width, "width"), sources.count, literal_value(length, "length")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         data, where = (array_of(context, builder, signature.args[k], arguments[k]).data for k in (0, 4))
         array, real = signature.args[1].dtype, context.get_data_type(signature.args[0].dtype)
         itemsize = context.get_abi_sizeof(real)
         side = min(wide, cpu.REGISTER // itemsize)
-        size = max(_whole(many), LINE // itemsize)
+        size = max(_power_of_two(many), LINE // itemsize)
         vector, word = ir.VectorType(real, side), ir.IntType(64)
 
         def row(k: int, begin: int) -> Any:
@@ -166,7 +166,7 @@ def _put_lines(
             return builder.load(_pointer(builder, source, place, vector), align=itemsize)
 
         for begin in range(0, wide, side):
-            flat = _transposed(builder, [row(k, begin) for k in range(size)])
+            flat = _transpose(builder, [row(k, begin) for k in range(size)])
             for lane in range(side):
                 here = builder.add(arguments[5], word(begin + lane))
                 place = builder.sext(builder.load(builder.gep(where, [here])), word)
@@ -174,7 +174,7 @@ def _put_lines(
                 start = builder.mul(place, word(piece))
                 for done in range(0, piece, side):
                     pointer = _pointer(builder, data, builder.add(start, word(done)), vector)
-                    put_past(builder, flat[(lane * size + done) // side], pointer, side * itemsize)
+                    generate_streaming_store(builder, flat[(lane * size + done) // side], pointer, side * itemsize)
         return context.get_dummy_value()
 
     numbers = _several(types.uint64, sources.count)
@@ -200,8 +200,8 @@ def _out_of_records(typing_context: Any, numbers: Any, places: Any, at: Any, wid
     `places` has one entry for the agent's index and one for each number after it. The array must extend behind the last
     record, up to the next power of two of a record's length.
     """
-    wide, many = written(width, "width"), places.count
-    size = _whole(many)
+    wide, many = literal_value(width, "width"), places.count
+    size = _power_of_two(many)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         to, source = (array_of(context, builder, signature.args[k], arguments[k]).data for k in (0, 4))
@@ -224,7 +224,7 @@ def _out_of_records(typing_context: Any, numbers: Any, places: Any, at: Any, wid
                     both = _mask(list(range(2 * parts[0].type.count)))
                     parts = [builder.shuffle_vector(*parts[j : j + 2], both) for j in range(0, len(parts), 2)]
                 flat.append(parts[0])
-            for k, row in enumerate(_restored(builder, flat)[:many]):
+            for k, row in enumerate(_transpose_back(builder, flat)[:many]):
                 place = builder.add(builder.extract_value(arguments[1], k), word(first))
                 builder.store(row, _pointer(builder, to, place, vector), align=itemsize)
         return context.get_dummy_value()
@@ -233,11 +233,11 @@ def _out_of_records(typing_context: Any, numbers: Any, places: Any, at: Any, wid
     return types.void(numbers, numbered, types.uint64, width, records), generate
 
 
-def _read_in_python(numbers: Any, places: Any, at: Any, width: int, records: Any) -> None:
+def _out_of_records_in_python(numbers: Any, places: Any, at: Any, width: int, records: Any) -> None:
     many = len(places)
     for lane in range(width):
         for k, place in enumerate(places):
             numbers[int(place) + lane] = records[(int(at) + lane) * many + k]
 
 
-out_of_records: Any = intrinsic_or_python(_out_of_records, _read_in_python)
+out_of_records: Any = intrinsic_or_python(_out_of_records, _out_of_records_in_python)

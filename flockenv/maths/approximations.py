@@ -19,7 +19,7 @@ from numba.extending import overload
 from flockenv.jit.decorators import OPTIONS, law, like
 from flockenv.jit.intrinsics import intrinsic_or_python
 
-__all__ = ["atan2", "exp", "nearest_whole"]
+__all__ = ["atan2", "exp", "round_half_even"]
 
 LARGEST = {types.float32: 87.0, types.float64: 708.0}
 """Largest |x| for which e^x is a normal number."""
@@ -37,7 +37,7 @@ def _ones_of(x):  # type: ignore[no-untyped-def]  # numba compares signatures, a
 
 
 @law
-def nearest_whole(x: float) -> float:
+def round_half_even(x: float) -> float:
     """Return x rounded to the nearest integer, ties to even: a faster np.rint.
 
     Exact for |x| < 2^22 in float32, 2^51 in float64; beyond, it may be off by one.

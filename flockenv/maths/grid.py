@@ -1,7 +1,7 @@
 """Interpolation on a regular grid: fields of velocities, distances and potentials.
 
 A grid is one array (a table), so that it can be passed to a law: the lowest corner (D, m), the spacing (m), the number
-of points along each axis (D), the number of values per point (K), then these values, the last axis fastest. `packed`
+of points along each axis (D), the number of values per point (K), then these values, the last axis fastest. `pack_grid`
 builds a table from an array; the laws read it at any position. Unless stated otherwise, a position outside the grid is
 clamped to the nearest point on its edge.
 """
@@ -17,7 +17,17 @@ from numpy.typing import ArrayLike, NDArray
 from flockenv.jit.decorators import Vec, kernel, law, like
 from flockenv.jit.section import entry
 
-__all__ = ["MOST_POINTS", "Floats", "Table", "covers", "packed", "points_of", "sample", "sample_vector", "sampled"]
+__all__ = [
+    "MOST_POINTS",
+    "Floats",
+    "Table",
+    "covers",
+    "pack_grid",
+    "points_of",
+    "sample",
+    "sample_points",
+    "sample_vector",
+]
 
 Floats = NDArray[np.float64]
 Table = Any
@@ -26,7 +36,7 @@ MOST_POINTS = 2**22
 """Most points of a grid in a scene: with a distance and a direction each, 100 MB in 2-D."""
 
 
-def packed(values: ArrayLike, low: Sequence[float], spacing: float) -> Floats:
+def pack_grid(values: ArrayLike, low: Sequence[float], spacing: float) -> Floats:
     """Return the table of `values` (nx, ny[, nz], K) at low + spacing (i, j[, k]); ValueError if they form no grid."""
     array = np.asarray(values, np.float64)
     d = len(low)
@@ -49,7 +59,7 @@ def points_of(low: Sequence[float], spacing: float, counts: Sequence[int]) -> Fl
 
 
 @law
-def _along(table: Table, x: float, d: int, k: int) -> tuple[Any, float]:
+def _cell_along(table: Table, x: float, d: int, k: int) -> tuple[Any, float]:
     """Return the cell along axis k that contains x, and the position in it: 0 at its lower edge, 1 at its upper."""
     o, e = like(x, 0.0), like(x, 1.0)
     last = table[d + 1 + k] - e
@@ -67,17 +77,17 @@ def sample(table: Table, x: Vec, k: int) -> float:
     """Return value k of a grid at x, interpolated linearly along each axis (bilinear, trilinear)."""
     e = like(x[0], 1.0)
     if len(x) == 2:
-        i, a = _along(table, x[0], 2, 0)
-        j, b = _along(table, x[1], 2, 1)
+        i, a = _cell_along(table, x[0], 2, 0)
+        j, b = _cell_along(table, x[1], 2, 1)
         step = np.int64(table[5])
         row = np.int64(table[4]) * step
         at = 6 + i * row + j * step + k
         low = table[at] * (e - b) + table[at + step] * b
         return low * (e - a) + (table[at + row] * (e - b) + table[at + row + step] * b) * a  # type: ignore[no-any-return]
     else:
-        i, a = _along(table, x[0], 3, 0)
-        j, b = _along(table, x[1], 3, 1)
-        m, c = _along(table, x[2], 3, 2)
+        i, a = _cell_along(table, x[0], 3, 0)
+        j, b = _cell_along(table, x[1], 3, 1)
+        m, c = _cell_along(table, x[2], 3, 2)
         step = np.int64(table[7])
         row = np.int64(table[6]) * step
         slab = np.int64(table[5]) * row
@@ -100,7 +110,7 @@ def sample_vector(table: Table, x: Vec, k: int) -> Vec:
 
 
 @law
-def _between(table: Table, x: float, d: int, k: int) -> bool:
+def _covers_axis(table: Table, x: float, d: int, k: int) -> bool:
     return (x >= table[k]) & (x <= table[k] + table[d] * (table[d + 1 + k] - like(x, 1.0)))  # type: ignore[no-any-return]
 
 
@@ -108,13 +118,13 @@ def _between(table: Table, x: float, d: int, k: int) -> bool:
 def covers(table: Table, x: Vec) -> bool:
     """Return True if x is inside the grid, its edge included; False if x is NaN."""
     if len(x) == 2:
-        return _between(table, x[0], 2, 0) & _between(table, x[1], 2, 1)
+        return _covers_axis(table, x[0], 2, 0) & _covers_axis(table, x[1], 2, 1)
     else:
-        return _between(table, x[0], 3, 0) & _between(table, x[1], 3, 1) & _between(table, x[2], 3, 2)
+        return _covers_axis(table, x[0], 3, 0) & _covers_axis(table, x[1], 3, 1) & _covers_axis(table, x[2], 3, 2)
 
 
 @kernel
-def _over_points(table: Any, points: Any, out: Any) -> None:
+def _sample_all(table: Any, points: Any, out: Any) -> None:
     """Write every value of a grid at every point; points (R, D), out (R, K)."""
     for r in range(points.shape[0]):
         for k in range(out.shape[1]):
@@ -124,11 +134,11 @@ def _over_points(table: Any, points: Any, out: Any) -> None:
                 out[r, k] = sample(table, (points[r, 0], points[r, 1], points[r, 2]), k)
 
 
-def sampled(table: Floats, points: ArrayLike) -> Floats:
+def sample_points(table: Floats, points: ArrayLike) -> Floats:
     """Return the values (..., K) of a grid at points (..., D); for Python, not for laws."""
     where = np.ascontiguousarray(points, np.float64)
     d = where.shape[-1]
     flat = where.reshape(-1, d)
     out = np.empty((len(flat), int(table[2 * d + 1])))
-    entry(_over_points)(np.ascontiguousarray(table, np.float64), flat, out)
+    entry(_sample_all)(np.ascontiguousarray(table, np.float64), flat, out)
     return out.reshape((*where.shape[:-1], -1))

@@ -16,7 +16,7 @@ import numpy as np
 from flockenv.jit.decorators import Vec, kernel, law, like
 from flockenv.maths.vectors import add, axis, cross, dot, lateral, norm, perpendicular, scale, select, unit
 
-__all__ = ["GRAVITY", "SLOWEST", "face", "faced", "held", "leant", "raised", "turned"]
+__all__ = ["GRAVITY", "SLOWEST", "bank", "face", "heading_for", "limit_to_heading", "turn_towards", "up_for"]
 
 SLOWEST = 1e-30
 """(m/s)^2: below 1e-15 m/s an agent stands still; also in single precision this is far from underflow."""
@@ -26,37 +26,37 @@ GRAVITY = 9.81
 
 
 @law
-def faced(velocity: Vec, heading: Vec) -> Vec:
+def heading_for(velocity: Vec, heading: Vec) -> Vec:
     """Return the heading for a velocity: its direction, or the previous heading at standstill."""
     return select(dot(velocity, velocity) > like(heading[0], SLOWEST), unit(velocity), heading)
 
 
 @law
-def turned(way: Vec, heading: Vec, angle: float) -> tuple[Vec, bool]:
-    """Return the unit vector along `way`, at most `angle` [rad] from `heading`, and True if the turn was limited.
+def turn_towards(direction: Vec, heading: Vec, angle: float) -> tuple[Vec, bool]:
+    """Return the unit vector along `direction`, at most `angle` [rad] from `heading`, and True if the turn was limited.
 
-    If `way` points exactly backwards, the turn is to the right (`perpendicular`). For a zero `way` it is the heading.
+    If it points exactly backwards, the turn is to the right (`perpendicular`). For a zero vector it is the heading.
     """
-    along, aside = dot(way, heading), lateral(way, heading)
-    across, length = norm(aside), norm(way)
+    along, sideways = dot(direction, heading), lateral(direction, heading)
+    across, length = norm(sideways), norm(direction)
     # the angle, not its cosine, which is 1 for small angles in single precision, so that agents would turn too far
     over = (np.arctan2(across, along) > angle) & (length > like(length, 0.0))
     known = across > like(across, 1e-6) * length
-    bent = scale(select(known, unit(aside), perpendicular(heading)), np.sin(angle))
+    bent = scale(select(known, unit(sideways), perpendicular(heading)), np.sin(angle))
     bent = unit(add(scale(heading, np.cos(angle)), bent))
-    return select(over, bent, faced(way, heading)), over
+    return select(over, bent, heading_for(direction, heading)), over
 
 
 @law
-def held(way: Vec, ahead: Vec, over: bool) -> Vec:
-    """Return `way` or, if the turn was limited (`over`), its component along `ahead`, at least 0."""
-    along = dot(way, ahead)
+def limit_to_heading(direction: Vec, ahead: Vec, over: bool) -> Vec:
+    """Return `direction` or, if the turn was limited (`over`), its component along `ahead`, at least 0."""
+    along = dot(direction, ahead)
     onward = along if along > like(along, 0.0) else like(along, 0.0)
-    return select(over, scale(ahead, onward), way)
+    return select(over, scale(ahead, onward), direction)
 
 
 @law
-def leant(heading: Vec, before: Vec, up: Vec, speed: float, seconds: float, memory: float) -> Vec:
+def bank(heading: Vec, before: Vec, up: Vec, speed: float, seconds: float, memory: float) -> Vec:
     """Return the up vector of an agent that banks into a turn, in 3-D: it follows lateral acceleration + g upwards.
 
     The lateral acceleration is s (f - f_before)/dt across f, that of the path. `memory` [s] is the time constant: up
@@ -69,7 +69,7 @@ def leant(heading: Vec, before: Vec, up: Vec, speed: float, seconds: float, memo
 
 
 @law
-def raised(heading: Vec, before: Vec, up: Vec) -> Vec:
+def up_for(heading: Vec, before: Vec, up: Vec) -> Vec:
     """Return the unit vector perpendicular to `heading` nearest to `up`; if `up` is along it, side is kept."""
     side, old = cross(heading, up), cross(before, up)
     side = select(dot(side, side) > like(up[0], 1e-8), side, old)
@@ -83,16 +83,16 @@ def face_one(v: Any, frame: Any, b: int, i: int, anew: bool) -> None:
     if anew:
         frame[:, b, i] = 0
     if v.shape[0] == 2:
-        heading = faced((v[0, b, i], v[1, b, i]), (frame[0, b, i], frame[1, b, i]))
+        heading = heading_for((v[0, b, i], v[1, b, i]), (frame[0, b, i], frame[1, b, i]))
         heading = select(dot(heading, heading) > like(heading[0], 0.0), heading, axis(heading, 0))
         frame[0, b, i], frame[1, b, i] = heading
     else:
         old: Vec = (frame[0, b, i], frame[1, b, i], frame[2, b, i])
-        ahead = faced((v[0, b, i], v[1, b, i], v[2, b, i]), old)
+        ahead = heading_for((v[0, b, i], v[1, b, i], v[2, b, i]), old)
         ahead = select(dot(ahead, ahead) > like(ahead[0], 0.0), ahead, axis(ahead, 0))
         up: Vec = (frame[3, b, i], frame[4, b, i], frame[5, b, i])
         up = select(dot(up, up) > like(up[0], 0.0), up, axis(up, 2))
-        up = raised(ahead, axis(ahead, 1), up)
+        up = up_for(ahead, axis(ahead, 1), up)
         frame[0, b, i], frame[1, b, i], frame[2, b, i] = ahead
         frame[3, b, i], frame[4, b, i], frame[5, b, i] = up
 

@@ -46,7 +46,7 @@ class Appearance(Record):
     trail: float = Field(default=0.0, ge=0, description="s, duration of the trail drawn behind it")
 
     @model_validator(mode="after")
-    def _consistent(self) -> Appearance:
+    def _check_consistent(self) -> Appearance:
         """Raise ValueError if the range is empty, or `by` and what depends on it do not fit together."""
         if not self.over[0] < self.over[1]:
             raise ValueError(f"over = {self.over}: the least comes first, and they differ")
@@ -77,10 +77,10 @@ class Appearance(Record):
         r, g, b = (round(first + (last - first) * (place - k)) for first, last in zip(*ends, strict=True))
         return r, g, b
 
-    def opaque(self, shade: float) -> float:
+    def opacity_at(self, shade: float) -> float:
         """Return the opacity at a shade."""
         return self.opacity[0] + (self.opacity[1] - self.opacity[0]) * shade
 
-    def sized(self, shade: float, radius: float) -> float:
+    def size_at(self, shade: float, radius: float) -> float:
         """Return the size at a shade, m; radius: the body's, m."""
         return radius if self.size is None else self.size[0] + (self.size[1] - self.size[0]) * shade

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from flockenv.core.record import Record
 
-__all__ = ["Spread", "drawn", "largest"]
+__all__ = ["Spread", "draw", "largest"]
 
 MOST = 10_000_000
 """Most agents for which numbers are drawn to find the largest: larger groups are rejected elsewhere."""
@@ -26,7 +26,7 @@ class Spread(Record):
     seed: int = Field(default=0, ge=0, description="of the random numbers")
 
     @model_validator(mode="after")
-    def _one_of_both(self) -> Spread:
+    def _check_kind(self) -> Spread:
         """Raise ValueError if it is neither uniform nor normal, or its range is not valid."""
         if (self.mean is None) != (self.sd is None):
             raise ValueError("mean and sd go together: give both or neither")
@@ -63,7 +63,7 @@ class Spread(Record):
         return np.asarray(np.clip(found, self.least, self.most))
 
 
-def drawn(value: float | Spread, count: int, channel: int) -> NDArray[np.float64]:
+def draw(value: float | Spread, count: int, channel: int) -> NDArray[np.float64]:
     """Return `count` numbers; spreads of one channel and seed have the same ranks (a heavy agent is wide)."""
     if not isinstance(value, Spread):
         return np.full(count, float(value))
@@ -74,4 +74,4 @@ def largest(value: float | Spread, count: int, channel: int) -> float:
     """Return an upper bound of these numbers: that of the spread, or if it is infinite, the largest number drawn."""
     if not isinstance(value, Spread):
         return float(value)
-    return value.most if math.isfinite(value.most) else float(drawn(value, min(count, MOST), channel).max())
+    return value.most if math.isfinite(value.most) else float(draw(value, min(count, MOST), channel).max())

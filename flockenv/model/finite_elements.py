@@ -112,7 +112,7 @@ def stiffness(points: ArrayLike, elements: ArrayLike, material: Material) -> Spa
     outer = np.einsum("eai,ebj->eaibj", g, g)
     inner = np.einsum("eai,ebi->eab", g, g)
     parts = L * outer + G * outer.transpose(0, 3, 2, 1, 4) + G * np.einsum("eab,ij->eaibj", inner, np.eye(d))
-    return _assembled(volume[:, None, None, None, None] * parts, elements, len(points))
+    return _assemble(volume[:, None, None, None, None] * parts, elements, len(points))
 
 
 def mass(points: ArrayLike, elements: ArrayLike, material: Material, lumped: bool = True) -> Sparse:
@@ -125,7 +125,7 @@ def mass(points: ArrayLike, elements: ArrayLike, material: Material, lumped: boo
     k, d = elements.shape[1], points.shape[1]
     kg = contents(points, elements) * material.section(k) * material.density
     share = np.eye(k) / k if lumped else (1 + np.eye(k)) / (k * (k + 1))
-    found = _assembled(np.einsum("e,ab,ij->eaibj", kg, share, np.eye(d)), elements, len(points))
+    found = _assemble(np.einsum("e,ab,ij->eaibj", kg, share, np.eye(d)), elements, len(points))
     found.eliminate_zeros()
     return found
 
@@ -154,7 +154,7 @@ def solve_static(K: Sparse, F: ArrayLike, fixed: ArrayLike) -> Floats:
     free = _free(K.shape[0], fixed)
     u = np.zeros(force.size)
     if len(free):
-        soft, scale = _scaled(K.tocsr()[free][:, free], free, force.shape[1])
+        soft, scale = _scale(K.tocsr()[free][:, free], free, force.shape[1])
         lu, mode = _factor(soft)
         if lu is None:
             _refuse_motion(free[np.argmax(np.abs(scale * mode))], force.shape[1])
@@ -262,7 +262,7 @@ def _row(row: NDArray[Any]) -> tuple[int, ...]:
     return tuple(int(i) for i in row)
 
 
-def _assembled(parts: Floats, elements: NDArray[np.int64], count: int) -> Sparse:
+def _assemble(parts: Floats, elements: NDArray[np.int64], count: int) -> Sparse:
     """Return the sum over elements of their matrices (E, k, D, k, D) as csr (n D, n D)."""
     from scipy import sparse  # here: a scene without finite elements need not wait for it
 
@@ -289,7 +289,7 @@ def _free(count: int, fixed: ArrayLike) -> NDArray[np.intp]:
     return np.flatnonzero(free)
 
 
-def _scaled(K: Sparse, free: NDArray[np.intp], dimension: int) -> tuple[Sparse, Floats]:
+def _scale(K: Sparse, free: NDArray[np.intp], dimension: int) -> tuple[Sparse, Floats]:
     """Return K, csc, with the stiffest axis of each particle scaled to 1, and the scale of each freedom.
 
     Thick and thin parts are then comparable, and an axis that is stiff only by rounding is still detected.

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from flockenv.core.record import Record
 from flockenv.model.appearance import Appearance
-from flockenv.model.distribution import Spread, drawn, largest
+from flockenv.model.distribution import Spread, draw, largest
 from flockenv.model.networks import AnyNetwork
 from flockenv.model.spawn import Spawn
 
@@ -70,7 +70,7 @@ class Group(Record):
     appearance: Appearance | None = Field(default=None, description="how it is drawn (default: as its role)")
 
     @model_validator(mode="after")
-    def _one_or_the_other(self) -> Group:
+    def _check_source(self) -> Group:
         """Raise ValueError unless either a count or a network is given, and the other fields fit it."""
         if (self.count is None) == (self.network is None):
             raise ValueError("count: give either a count or a network")
@@ -103,12 +103,12 @@ class Group(Record):
     @property
     def radii(self) -> NDArray[np.float64]:
         """The radius of each agent, (size,) m."""
-        return drawn(self.radius, self.size, SIZE)
+        return draw(self.radius, self.size, SIZE)
 
     @property
     def desired_speeds(self) -> NDArray[np.float64]:
         """The desired speed of each agent, (size,) m/s; 0 if not given."""
-        return drawn(self.desired_speed or 0.0, self.size, PACE)
+        return draw(self.desired_speed or 0.0, self.size, PACE)
 
     @property
     def max_speeds(self) -> NDArray[np.float64]:
@@ -135,7 +135,7 @@ class Group(Record):
     def masses(self, dimension: int) -> NDArray[np.float64]:
         """Return the mass of each agent, (size,) kg; infinite for pinned particles of a network."""
         if self.network is None:
-            return drawn(self.mass, self.size, SIZE)
+            return draw(self.mass, self.size, SIZE)
         assert not isinstance(self.mass, Spread)
         out = self.network.masses(self.mass * self.size, dimension)
         out[self.network.pins()] = np.inf

@@ -72,7 +72,7 @@ class Network(Record):
     )
 
     @model_validator(mode="after")
-    def _sound(self) -> Self:
+    def _check_fields(self) -> Self:
         """Raise ValueError on too many particles, points of mixed dimensions, invalid shapes or unknown pins."""
         if self.size > MOST:
             raise ValueError(f"{self.size:,} particles: at most {MOST:,} are allowed")
@@ -89,7 +89,7 @@ class Network(Record):
 
     def _refuse_mixture(self) -> None:
         first: tuple[str, tuple[float, ...]] | None = None
-        for name, point in self._given():
+        for name, point in self._given_points():
             first = first or (name, point)
             if len(point) != len(first[1]):
                 raise ValueError(
@@ -99,11 +99,11 @@ class Network(Record):
     def _refuse_shape(self) -> None:
         """Raise ValueError if the fields do not define a shape together."""
 
-    def _given(self) -> Iterator[tuple[str, tuple[float, ...]]]:
+    def _given_points(self) -> Iterator[tuple[str, tuple[float, ...]]]:
         """Yield the names and points of the fields that were given."""
         return iter(())
 
-    def _demand(self, dimension: int) -> None:
+    def _check_dimension(self, dimension: int) -> None:
         if dimension not in (2, 3):
             raise ValueError(f"dimension = {dimension!r}: must be 2 or 3")
         if self.dimension not in (None, dimension):
@@ -117,7 +117,7 @@ class Network(Record):
     @property
     def dimension(self) -> int | None:
         """Dimension of the given points, 2 or 3; None if it fits both."""
-        return next((len(point) for _, point in self._given()), None)
+        return next((len(point) for _, point in self._given_points()), None)
 
     @property
     def places(self) -> tuple[str, ...]:
@@ -143,7 +143,7 @@ class Network(Record):
 
     def hinges(self, dimension: int) -> Ints:
         """Return the angles that resist bending, (H, 3): end, apex, end."""
-        self._demand(dimension)
+        self._check_dimension(dimension)
         return np.zeros((0, 3), np.int32)
 
     @abstractmethod
@@ -164,7 +164,7 @@ class Network(Record):
         Geometric: each element, or spring if there are no elements, divides its length, area or volume equally among
         its corners. Raises ValueError if a particle has no mass.
         """
-        self._demand(dimension)
+        self._check_dimension(dimension)
         if not 0 < total < np.inf:
             raise ValueError(f"total = {total!r}: must be a number > 0 (kg)")
         if self.lumping == "equal":
@@ -211,7 +211,7 @@ class Rope(Network):
     def _place(self, name: str) -> NDArray[Any]:
         return np.array({"start": [0], "end": [self.links], "ends": [0, self.links]}[name])
 
-    def _given(self) -> Iterator[tuple[str, tuple[float, ...]]]:
+    def _given_points(self) -> Iterator[tuple[str, tuple[float, ...]]]:
         for name in ("start", "end", "direction", "sag"):
             point = getattr(self, name)
             if point is not None:
@@ -251,7 +251,7 @@ class Rope(Network):
 
     def points(self, dimension: int) -> Floats:
         """Return its particles, evenly spaced from start to end, or on an arc if it is slack."""
-        self._demand(dimension)
+        self._check_dimension(dimension)
         start, end = self._ends(dimension)
         slack = self.end is not None and self.length is not None and self._reach() < self.length
         if not slack or self.links == 1:
@@ -263,14 +263,14 @@ class Rope(Network):
 
     def rest_points(self, dimension: int) -> Floats:
         """Return its particles on a straight line, at their rest lengths."""
-        self._demand(dimension)
+        self._check_dimension(dimension)
         start, end = self._ends(dimension)
         along, _ = _frame(end - start, end - start)
         return np.asarray(np.linspace(start, start + along * (self._link() * self.links), self.size))
 
     def springs(self, dimension: int) -> Springs:
         """Return a spring for each link and, with `bend`, one spanning each two links in a row."""
-        self._demand(dimension)
+        self._check_dimension(dimension)
         ids = np.arange(self.size, dtype=np.int32)
         over = _runs(ids, 0, 3)[:, ::2] if self.bend else np.zeros((0, 2), np.int32)
         found = _springs([(_runs(ids, 0, 2), EDGE), (over, BEND)], self.rest_points(dimension))
@@ -278,12 +278,12 @@ class Rope(Network):
 
     def hinges(self, dimension: int) -> Ints:
         """Return all triples of consecutive particles."""
-        self._demand(dimension)
+        self._check_dimension(dimension)
         return _runs(np.arange(self.size, dtype=np.int32), 0, 3)
 
     def elements(self, dimension: int) -> Ints:
         """Return a bar for each link."""
-        self._demand(dimension)
+        self._check_dimension(dimension)
         return _runs(np.arange(self.size, dtype=np.int32), 0, 2)
 
 
@@ -303,7 +303,7 @@ class _Lattice(Network):
         """Number of particles: one more than cells along each edge."""
         return math.prod(count + 1 for count in self.cells)
 
-    def _given(self) -> Iterator[tuple[str, tuple[float, ...]]]:
+    def _given_points(self) -> Iterator[tuple[str, tuple[float, ...]]]:
         if self.origin is not None:
             yield "origin", self.origin
         yield from ((f"edges[{k}]", edge) for k, edge in enumerate(self.edges or ()))
@@ -346,7 +346,7 @@ class _Lattice(Network):
 
     def points(self, dimension: int) -> Floats:
         """Return the sites of the lattice; the index along the first edge varies fastest."""
-        self._demand(dimension)
+        self._check_dimension(dimension)
         points = np.tile(np.array(self.origin or (0.0,) * dimension, float), (self.size, 1))
         edges = self.edges if self.edges is not None else np.diag(self.sides or ()).tolist()
         place = np.unravel_index(np.arange(self.size), self._ids().shape, order="F")
@@ -365,11 +365,11 @@ class _Lattice(Network):
 
     def elements(self, dimension: int) -> Ints:
         """Return its cells cut into triangles or tetrahedra with conforming faces."""
-        self._demand(dimension)
+        self._check_dimension(dimension)
         corners, mirrored = self._corners()
         cuts = _CUTS[len(self.cells), self.diagonals][mirrored]
         found = corners[np.arange(len(corners))[:, None, None], cuts].reshape(-1, cuts.shape[2])
-        return _turned(self.rest_points(dimension), found)
+        return _orient(self.rest_points(dimension), found)
 
 
 class Cloth(_Lattice):
@@ -385,7 +385,7 @@ class Cloth(_Lattice):
 
     def springs(self, dimension: int) -> Springs:
         """Return springs along the sides of cells, along both diagonals, and spanning two sides in a row."""
-        self._demand(dimension)
+        self._check_dimension(dimension)
         ids, (corners, _) = self._ids(), self._corners()
         groups = [(_runs(ids, axis, 2), EDGE) for axis in (0, 1)]
         if self.shear:
@@ -396,7 +396,7 @@ class Cloth(_Lattice):
 
     def hinges(self, dimension: int) -> Ints:
         """Return all triples of consecutive particles along both edges."""
-        self._demand(dimension)
+        self._check_dimension(dimension)
         return np.concatenate([_runs(self._ids(), axis, 3) for axis in (0, 1)])
 
 
@@ -416,13 +416,13 @@ class Jelly(_Lattice):
 
     def _refuse_shape(self) -> None:
         super()._refuse_shape()
-        for name, point in self._given():
+        for name, point in self._given_points():
             if len(point) != len(self.cells):
                 raise ValueError(f"{name} = {point}: cells = {self.cells} lies in {len(self.cells)} dimensions")
 
     def springs(self, dimension: int) -> Springs:
         """Return a spring for each edge of its elements: EDGE along the sides of cells, SHEAR across."""
-        self._demand(dimension)
+        self._check_dimension(dimension)
         along = np.concatenate([_runs(self._ids(), axis, 2) for axis in range(dimension)])
         every = _element_edges(self.elements(dimension), self.size)
         across = np.setdiff1d(every, _keys(along, self.size), assume_unique=True)
@@ -456,7 +456,7 @@ class Mesh(Network):
         """Number of vertices."""
         return len(self.vertices)
 
-    def _given(self) -> Iterator[tuple[str, tuple[float, ...]]]:
+    def _given_points(self) -> Iterator[tuple[str, tuple[float, ...]]]:
         return ((f"vertices[{k}]", point) for k, point in enumerate(self.vertices))
 
     def _refuse_shape(self) -> None:
@@ -467,7 +467,7 @@ class Mesh(Network):
             raise ValueError("tetrahedra: vertices have 2 coordinates, they need 3")
         for name in ("pairs", *self._ELEMENTS, "angles"):
             _refuse_rows(name, getattr(self, name) or (), self.size)
-        thin = flat(self.vertices, self._joined())
+        thin = flat(self.vertices, self._element_array())
         if len(thin):
             raise ValueError(f"{given[0]}[{thin[0]}] = {getattr(self, given[0])[thin[0]]}: it has no extent")
         if self.rest is not None and len(self.rest) != len(self.pairs or ()):
@@ -479,21 +479,21 @@ class Mesh(Network):
         if self.lumping == "geometric":
             self.masses(1.0, len(self.vertices[0]))  # raises if a particle is part of no element
 
-    def _joined(self) -> Ints:
+    def _element_array(self) -> Ints:
         """Return its elements as given; an empty array of bars if there are none."""
         given = next((rows for rows in (self.triangles, self.tetrahedra) if rows), self.bars)
         return np.array(given, np.int32) if given else np.zeros((0, 2), np.int32)
 
     def points(self, dimension: int) -> Floats:
         """Return its vertices."""
-        self._demand(dimension)
+        self._check_dimension(dimension)
         return np.array(self.vertices, float)
 
     def springs(self, dimension: int) -> Springs:
         """Return its pairs, or the edges of its elements."""
-        self._demand(dimension)
+        self._check_dimension(dimension)
         if self.pairs is None:
-            pairs = _pairs(_element_edges(self._joined(), self.size), self.size)
+            pairs = _pairs(_element_edges(self._element_array(), self.size), self.size)
         else:
             pairs = np.array(self.pairs, np.int32).reshape(-1, 2)
         found = _springs([(pairs, EDGE)], self.rest_points(dimension))
@@ -503,13 +503,13 @@ class Mesh(Network):
 
     def hinges(self, dimension: int) -> Ints:
         """Return its angles."""
-        self._demand(dimension)
+        self._check_dimension(dimension)
         return np.array(self.angles, np.int32).reshape(-1, 3)
 
     def elements(self, dimension: int) -> Ints:
         """Return its bars, triangles or tetrahedra."""
-        self._demand(dimension)
-        return _turned(self.points(dimension), self._joined())
+        self._check_dimension(dimension)
+        return _orient(self.points(dimension), self._element_array())
 
 
 AnyNetwork = Annotated[Rope | Cloth | Jelly | Mesh, Field(discriminator="kind")]
@@ -584,7 +584,7 @@ def _element_edges(elements: Ints, size: int) -> NDArray[np.int64]:
     return np.delete(keys, again)
 
 
-def _turned(points: Floats, elements: Ints) -> Ints:
+def _orient(points: Floats, elements: Ints) -> Ints:
     """Return elements with positive determinant: two corners are swapped if it is negative (k = D + 1 only)."""
     elements = elements.astype(np.int32)
     if elements.shape[1] == points.shape[1] + 1:
@@ -615,11 +615,11 @@ def _refuse_rows(name: str, rows: tuple[tuple[int, ...], ...], size: int) -> Non
 # --- ropes ----------------------------------------------------------------------------------------------------------
 
 
-def _frame(way: Floats, aside: Floats) -> tuple[Floats, Floats]:
-    """Return unit vectors along `way` and perpendicular to it, towards `aside` unless that is parallel to `way`."""
-    axes = np.eye(len(way))
-    along = way / np.linalg.norm(way) if way.any() else axes[0]
-    for towards in (aside / np.linalg.norm(aside) if aside.any() else aside, axes[np.argmin(np.abs(along))]):
+def _frame(direction: Floats, lateral: Floats) -> tuple[Floats, Floats]:
+    """Return unit vectors along `direction` and across it, towards `lateral` unless that is parallel."""
+    axes = np.eye(len(direction))
+    along = direction / np.linalg.norm(direction) if direction.any() else axes[0]
+    for towards in (lateral / np.linalg.norm(lateral) if lateral.any() else lateral, axes[np.argmin(np.abs(along))]):
         across = towards - (towards @ along) * along
         if np.linalg.norm(across) > 1e-9:
             break

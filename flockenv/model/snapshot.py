@@ -39,11 +39,11 @@ class Mark:
     radius: float
 
     def __post_init__(self) -> None:
-        _known("Mark.kind", self.kind, KINDS)
+        _check_name("Mark.kind", self.kind, KINDS)
         at = _array("Mark.at", self.at, (None,))
         _dimension("Mark.at", len(at))
         radius = float(_array("Mark.radius", self.radius, ()))
-        _demand(radius >= 0.0, "Mark.radius", "must be >= 0 m", radius)
+        _require(radius >= 0.0, "Mark.radius", "must be >= 0 m", radius)
         _fix(self, at=at, vector=_array("Mark.vector", self.vector, at.shape), radius=radius)
 
 
@@ -110,9 +110,9 @@ class Snapshot:
             bonds=_pairs("Snapshot.bonds", self.bonds, agents),
             outlines=tuple(_array("Snapshot.outlines", polygon, (None, 2)) for polygon in self.outlines),
             looks=tuple(self.looks),
-            look=_whole("Snapshot.look", np.full(agents, -1) if self.look is None else self.look, agents),
+            look=_integers("Snapshot.look", np.full(agents, -1) if self.look is None else self.look, agents),
             age=None if self.age is None else _array("Snapshot.age", self.age, (agents,)),
-            identity=None if self.identity is None else _whole("Snapshot.identity", self.identity, agents),
+            identity=None if self.identity is None else _integers("Snapshot.identity", self.identity, agents),
             inner=None if self.inner is None else _array("Snapshot.inner", self.inner, (agents,)),
         )
         if self.look is not None and not (self.look < len(self.looks)).all():
@@ -149,14 +149,14 @@ class Snapshot:
             shade[mine] = look.shade(age[mine], speed[mine], None if self.inner is None else self.inner[mine])
         return shade
 
-    def same(self, other: Snapshot) -> NDArray[np.bool_]:
+    def is_same(self, other: Snapshot) -> NDArray[np.bool_]:
         """True for rows that hold the same agent in another snapshot, (N,) bool."""
         if self.identity is None or other.identity is None:
             return np.ones(self.agents, np.bool_)
         return np.asarray(self.identity == other.identity)
 
     @property
-    def tied(self) -> NDArray[np.bool_]:
+    def has_bonds(self) -> NDArray[np.bool_]:
         """True for agents with bonds, (N,) bool: particles of a network, which are drawn as dots."""
         tied = np.zeros(self.agents, np.bool_)
         tied[self.bonds] = True
@@ -173,12 +173,12 @@ def _fix(record: Mark | Snapshot, **fields: object) -> None:
         object.__setattr__(record, name, value)
 
 
-def _demand(good: bool | np.bool_, field: str, rule: str, value: object) -> None:
+def _require(good: bool | np.bool_, field: str, rule: str, value: object) -> None:
     if not good:
         raise ValueError(f"{field}: {rule}, got {value}")
 
 
-def _known(field: str, name: object, names: tuple[str, ...]) -> None:
+def _check_name(field: str, name: object, names: tuple[str, ...]) -> None:
     if name in names:
         return
     near = get_close_matches(str(name), names, n=1)
@@ -188,7 +188,7 @@ def _known(field: str, name: object, names: tuple[str, ...]) -> None:
 
 
 def _dimension(field: str, dimension: int) -> None:
-    _demand(dimension in (2, 3), field, "must have 2 or 3 coordinates", dimension)
+    _require(dimension in (2, 3), field, "must have 2 or 3 coordinates", dimension)
 
 
 def _array(field: str, value: ArrayLike, shape: tuple[int | None, ...], *, finite: bool = True) -> Floats:
@@ -199,7 +199,7 @@ def _array(field: str, value: ArrayLike, shape: tuple[int | None, ...], *, finit
         raise TypeError(f"{field}: must be numbers, got {type(value).__name__} ({error})") from None
     fits = array.ndim == len(shape) and all(want in (None, have) for want, have in zip(shape, array.shape, strict=True))
     wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ("," if len(shape) == 1 else "") + ")"
-    _demand(fits, field, f"must have shape {wanted}", f"shape {array.shape}")
+    _require(fits, field, f"must have shape {wanted}", f"shape {array.shape}")
     if finite and not np.isfinite(array).all():
         raise ValueError(f"{field}: must be finite, got {array[~np.isfinite(array)][0]}")
     array.flags.writeable = False
@@ -208,7 +208,7 @@ def _array(field: str, value: ArrayLike, shape: tuple[int | None, ...], *, finit
 
 def _lengths(field: str, value: ArrayLike, count: int) -> Floats:
     lengths = _array(field, value, (count,))
-    _demand((lengths >= 0.0).all(), field, "must be >= 0 m", lengths.min(initial=0.0))
+    _require((lengths >= 0.0).all(), field, "must be >= 0 m", lengths.min(initial=0.0))
     return lengths
 
 
@@ -217,17 +217,17 @@ def _switches(field: str, value: ArrayLike, count: int) -> NDArray[np.bool_]:
     # An empty list is float64 to numpy; a world without agents is still a world.
     if switches.dtype != np.bool_ and switches.size:
         raise TypeError(f"{field}: must be bool, got {switches.dtype}")
-    _demand(switches.shape == (count,), field, f"must have shape ({count},)", f"shape {switches.shape}")
+    _require(switches.shape == (count,), field, f"must have shape ({count},)", f"shape {switches.shape}")
     switches = switches.astype(np.bool_)
     switches.flags.writeable = False
     return switches
 
 
-def _whole(field: str, value: ArrayLike, count: int) -> NDArray[np.int64]:
+def _integers(field: str, value: ArrayLike, count: int) -> NDArray[np.int64]:
     numbers = np.array(value)
     if numbers.size and numbers.dtype.kind not in "iu":
         raise TypeError(f"{field}: must be integers, got {numbers.dtype}")
-    _demand(numbers.shape == (count,), field, f"must have shape ({count},)", f"shape {numbers.shape}")
+    _require(numbers.shape == (count,), field, f"must have shape ({count},)", f"shape {numbers.shape}")
     numbers = numbers.astype(np.int64)
     numbers.flags.writeable = False
     return numbers
@@ -237,9 +237,9 @@ def _pairs(field: str, value: ArrayLike, count: int) -> NDArray[np.int32]:
     pairs = np.array(value)
     if pairs.size and pairs.dtype.kind not in "iu":
         raise TypeError(f"{field}: must be integers, got {pairs.dtype}")
-    _demand(pairs.ndim == 2 and pairs.shape[1] == 2, field, "must have shape (any, 2)", f"shape {pairs.shape}")
+    _require(pairs.ndim == 2 and pairs.shape[1] == 2, field, "must have shape (any, 2)", f"shape {pairs.shape}")
     outside = pairs[(pairs < 0) | (pairs >= count)]
-    _demand(not len(outside), field, f"must be agents from 0 to {count - 1}", outside[:1])
+    _require(not len(outside), field, f"must be agents from 0 to {count - 1}", outside[:1])
     pairs = pairs.astype(np.int32)
     pairs.flags.writeable = False
     return pairs
@@ -249,9 +249,9 @@ def _names(field: str, value: Iterable[str], count: int) -> tuple[str, ...]:
     if isinstance(value, str):
         raise TypeError(f"{field}: must be a tuple of {count} names, got the one str {value!r}")
     names = tuple(value)
-    _demand(len(names) == count, field, f"must have {count} names, one per agent", len(names))
+    _require(len(names) == count, field, f"must have {count} names, one per agent", len(names))
     for name in dict.fromkeys(names):
-        _known(field, name, ROLES)
+        _check_name(field, name, ROLES)
     return names
 
 
@@ -260,5 +260,5 @@ def _marks(value: Iterable[Mark], dimension: int) -> tuple[Mark, ...]:
     for mark in marks:
         if not isinstance(mark, Mark):
             raise TypeError(f"Snapshot.marks: must hold Mark, got {type(mark).__name__}")
-        _demand(len(mark.at) == dimension, "Snapshot.marks", f"must have {dimension} coordinates", len(mark.at))
+        _require(len(mark.at) == dimension, "Snapshot.marks", f"must have {dimension} coordinates", len(mark.at))
     return marks

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv.core.record import Record
-from flockenv.geometry.shapes import Shape, clear_of
+from flockenv.geometry.shapes import Shape, distance_to_shapes
 from flockenv.jit.decorators import kernel
 from flockenv.maths.counter_rng import uniform
 
@@ -53,7 +53,7 @@ class Spawn(Record):
     heading: tuple[float, ...] | None = Field(default=None, description="direction of the velocity (default: random)")
 
     @model_validator(mode="after")
-    def _ordered(self) -> Spawn:
+    def _check_ranges(self) -> Spawn:
         """Raise ValueError if a range is reversed, or a field lacks the one it goes with."""
         if self.speed[0] > self.speed[1]:
             raise ValueError(f"speed = {self.speed}: the least comes first")
@@ -83,18 +83,18 @@ def cells(
     along = [math.floor((b - a) / edge + 1e-9) for a, b, edge in zip(low, high, spacing, strict=True)]
     total = math.prod(along)
     if total > MOST_CELLS:
-        raise ValueError(f"spacing = {_said(spacing)}: {total:,} cells; at most {MOST_CELLS:,} are allowed")
+        raise ValueError(f"spacing = {_edges_text(spacing)}: {total:,} cells; at most {MOST_CELLS:,} are allowed")
     found = np.zeros((0, dimension))
     for first in range(0, total, 65_536):
         if len(found) >= count:
             break
         ids = np.unravel_index(np.arange(first, min(first + 65_536, total)), along, order="F")
         middles = np.array(low, float) + np.array(spacing) * (np.stack(ids, axis=1) + 0.5)
-        free = clear_of(shapes, middles, period) >= body + spawn.jitter * math.sqrt(dimension)
+        free = distance_to_shapes(shapes, middles, period) >= body + spawn.jitter * math.sqrt(dimension)
         found = np.concatenate([found, middles[free]])
     if len(found) < count:
         raise ValueError(
-            f"spacing = {_said(spacing)}: room for {len(found):,} of {count:,} agents "
+            f"spacing = {_edges_text(spacing)}: room for {len(found):,} of {count:,} agents "
             f"from {tuple(low)} to {tuple(high)}"
         )
     return found[:count]
@@ -108,13 +108,13 @@ def _edges(spawn: Spawn, dimension: int, radius: float) -> tuple[float, ...]:
     least = 2 * (radius + spawn.jitter)
     if not spawn.wider and min(given) < least * (1 - 1e-12):
         raise ValueError(
-            f"spacing = {_said(given)}: bodies of radius {radius:g} m, up to {spawn.jitter:g} m from the middle, need "
+            f"spacing = {_edges_text(given)}: bodies of radius {radius:g} m, up to {spawn.jitter:g} m from the middle, need "
             f"cells of at least {least:g} m"
         )
     return given
 
 
-def _said(spacing: tuple[float, ...]) -> str:
+def _edges_text(spacing: tuple[float, ...]) -> str:
     """Return edges as text for messages: one number, or all if they differ."""
     return f"{spacing[0]:g}" if len(set(spacing)) == 1 else f"({', '.join(f'{edge:g}' for edge in spacing)})"
 

@@ -144,7 +144,7 @@ class State:
         d, b, n = self.x.shape
         return b, n, d
 
-    def counted(self, what: str) -> int:
+    def count_of(self, what: str) -> int:
         """Return one work counter, summed over the worlds; what: a name in WORK."""
         return int(self.work[:, WORK.index(what)].sum())
 

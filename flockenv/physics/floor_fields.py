@@ -1,6 +1,6 @@
 """Floor fields: shortest paths around all obstacles of a scene, on a grid, for behaviours, aims, journeys and routes.
 
-One grid (eikonal.way_table) serves all agents with the same targets; laws read it by `way_ahead`.
+One grid (eikonal.floor_field_table) serves all agents with the same targets; laws read it by `way_ahead`.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flockenv.core.warnings import NoWayWarning
-from flockenv.geometry.eikonal import NO_WAY, Start, free_part, way_table
+from flockenv.geometry.eikonal import NO_WAY, Start, floor_field_table, free_part
 from flockenv.geometry.space import Torus
 from flockenv.geometry.targets import Target, to_any
 from flockenv.jit.decorators import Vec, law
-from flockenv.maths.grid import MOST_POINTS, covers, sample, sample_vector, sampled
+from flockenv.maths.grid import MOST_POINTS, covers, sample, sample_points, sample_vector
 from flockenv.maths.vectors import norm, select, unit
 from flockenv.model.scene_view import SceneView
 
@@ -87,7 +87,7 @@ def starts_of(scene: SceneView, which: int | None) -> list[Start]:
 
 def lengths_on(grid: Floats, points: ArrayLike) -> Floats:
     """Return path lengths from points (..., D), (...) m: inf without a path; outside the grid, that of its edge."""
-    found = sampled(grid, points)[..., 0]
+    found = sample_points(grid, points)[..., 0]
     return np.asarray(np.where(found > NO_WAY * 1e-12, np.inf, found))  # also next to points without a path
 
 
@@ -110,7 +110,7 @@ def ways_to(
 ) -> Floats:  # fmt: skip
     """Return the floor field to the nearest of some targets."""
     low, high = (corner.tolist() for corner in corners)
-    return way_table(list(scene.obstacles), targets, low, high, spacing, clearance, names, starts)
+    return floor_field_table(list(scene.obstacles), targets, low, high, spacing, clearance, names, starts)
 
 
 def way_block(
@@ -135,7 +135,7 @@ def check_ways(
     """Raise ValueError for a torus, moving obstacles, walls that the grid misses, and too large a grid."""
     for name, target in zip(names, targets, strict=True):
         if target.dimension != scene.dimension:
-            raise ValueError(f"{name} = {target.shown}: dimension = {scene.dimension}")
+            raise ValueError(f"{name} = {target.points_text}: dimension = {scene.dimension}")
     for k, shape in enumerate(scene.obstacles):
         if shape.moves:
             raise ValueError(f"kind = {kind}: its path is found once, and obstacles[{k}] moves")

@@ -18,7 +18,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockenv.core.errors import nearest, shown
+from flockenv.core.errors import nearest, printable
 
 if TYPE_CHECKING:
     from flockenv.players.policy import Policy
@@ -61,7 +61,7 @@ def load_player(spec: str | os.PathLike[str], task: Task, seed: int = 0, trust_p
         return load_file(name, task, seed, trust_pickle)
     hint = f"is called {FORMER[name]!r}" if name in FORMER else f"unknown{nearest(name, NAMES)}"
     allowed = f"{', '.join(NAMES)}, or a {' or '.join(SUFFIXES)} file"
-    raise ValueError(f"player {shown(name)}: {hint}; allowed: {allowed}")
+    raise ValueError(f"player {printable(name)}: {hint}; allowed: {allowed}")
 
 
 def named_player(name: str, task: Task, seed: int = 0) -> Policy:

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.core.errors import shown_path
+from flockenv.core.errors import printable_path
 from flockenv.players.policy import MlpPolicy, Observation, Policy, State
 
 if TYPE_CHECKING:
@@ -51,11 +51,11 @@ def load_file(name: str, task: Task, seed: int = 0, trust_pickle: bool = False) 
     suffix = Path(name).suffix.lower()
     if suffix == ".zip" and not trust_pickle:
         raise ValueError(
-            f"player {shown_path(name)}: loading a Stable-Baselines3 zip executes the code stored in it; "
+            f"player {printable_path(name)}: loading a Stable-Baselines3 zip executes the code stored in it; "
             "if the file is your own, pass --trust-pickle (trust_pickle=True)"
         )
     if not os.path.isfile(name):  # Path.is_file raises for a name that no file can have
-        raise ValueError(f"player {shown_path(name)}: no such file")
+        raise ValueError(f"player {printable_path(name)}: no such file")
     if suffix == ".safetensors":
         return MlpPolicy.load(name, task, seed)
     return _load_python(Path(name), task) if suffix == ".py" else _load_zip(Path(name))
@@ -72,18 +72,18 @@ def _load_python(path: Path, task: Task) -> FilePlayer:
     module = _guarded(path, "while loading it", _execute, path)
     kinds = [name for name in ("player", "Player", "predict") if hasattr(module, name)]
     if not kinds:
-        raise PlayerError(f"player {shown_path(path)}: offers none of player, Player, predict; {WANTED}")
+        raise PlayerError(f"player {printable_path(path)}: offers none of player, Player, predict; {WANTED}")
     kind, offer = kinds[0], getattr(module, kinds[0])
     if not callable(offer):
-        raise PlayerError(f"player {shown_path(path)}: {kind} is {_article(offer)}, not a function; {WANTED}")
+        raise PlayerError(f"player {printable_path(path)}: {kind} is {_article(offer)}, not a function; {WANTED}")
     if kind == "predict":
         return FilePlayer(path, kind, offer, task.action_layout.size)
     arguments = (task,) if kind == "player" or _takes(offer, 1) else ()
     if not _takes(offer, len(arguments)):
-        raise PlayerError(f"player {shown_path(path)}: {kind} cannot be called with {_listed(arguments)}; {WANTED}")
+        raise PlayerError(f"player {printable_path(path)}: {kind} cannot be called with {_listed(arguments)}; {WANTED}")
     made = _guarded(path, f"in {kind}", offer, *arguments)
     if isinstance(made, type) or not callable(getattr(made, "predict", None)):
-        raise PlayerError(f"player {shown_path(path)}: {kind} made {_article(made)} without a predict(); {WANTED}")
+        raise PlayerError(f"player {printable_path(path)}: {kind} made {_article(made)} without a predict(); {WANTED}")
     return FilePlayer(path, f"{type(made).__name__}.predict", made.predict, task.action_layout.size)
 
 
@@ -115,7 +115,7 @@ class FilePlayer:
         self._action_size = action_size
         if not self._whole and not _takes(function, 1):
             raise PlayerError(
-                f"player {shown_path(path)}: {name} takes neither four arguments nor the observation alone; {WANTED}"
+                f"player {printable_path(path)}: {name} takes neither four arguments nor the observation alone; {WANTED}"
             )
 
     def predict(
@@ -150,7 +150,7 @@ def _guarded(path: Path, where: str, function: Callable[..., Any], *arguments: A
     except (Exception, SystemExit) as error:
         said = f"{type(error).__name__} {where}{_line_in(path, error)}"
         text = " ".join(str(error).split()) if error.args != (None,) else ""  # exit() without a code
-        raise PlayerError(f"player {shown_path(path)}: {said}{': ' + text if text else ''}") from error
+        raise PlayerError(f"player {printable_path(path)}: {said}{': ' + text if text else ''}") from error
 
 
 def _line_in(path: Path, error: BaseException) -> str:

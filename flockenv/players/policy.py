@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.core.atomic_files import deliver
-from flockenv.core.errors import nearest, shown, shown_path
+from flockenv.core.atomic_files import write_all_or_none
+from flockenv.core.errors import nearest, printable, printable_path
 from flockenv.core.warnings import OtherTaskWarning
 
 if TYPE_CHECKING:
@@ -146,11 +146,11 @@ class MlpPolicy:
             _check_sizes(policy)
             policy.differences = () if task is None else _differences(card, task)
         except ValueError as error:
-            raise ValueError(f"policy {shown_path(path)}: {error}") from None
+            raise ValueError(f"policy {printable_path(path)}: {error}") from None
         if policy.differences:
             said, more = policy.differences[:MOST_SAID], len(policy.differences) - MOST_SAID
             text = "; ".join([*said, *([f"and {more} more"] if more > 0 else [])])
-            warnings.warn(f"policy {shown_path(path)}: {text}", OtherTaskWarning, stacklevel=2)
+            warnings.warn(f"policy {printable_path(path)}: {text}", OtherTaskWarning, stacklevel=2)
         return policy
 
     def predict(
@@ -199,7 +199,7 @@ def save_policy(path: str | os.PathLike[str], tensors: Mapping[str, NDArray[Any]
 
     path = Path(path)
     if path.suffix != ".safetensors":
-        raise ValueError(f"policy {shown_path(path)}: the file name must end in .safetensors")
+        raise ValueError(f"policy {printable_path(path)}: the file name must end in .safetensors")
     tensors = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
     policy = MlpPolicy(tensors, card)
     data = save(tensors)
@@ -212,10 +212,10 @@ def save_policy(path: str | os.PathLike[str], tensors: Mapping[str, NDArray[Any]
     for key in derived.keys() & card.keys() - {"sha256"}:
         if card[key] != derived[key]:
             raise ValueError(
-                f"policy {shown_path(path)}: card: {key} = {card[key]!r}, the weights say {derived[key]!r}"
+                f"policy {printable_path(path)}: card: {key} = {card[key]!r}, the weights say {derived[key]!r}"
             )
     text = json.dumps({**card, **derived}, indent=2, allow_nan=False) + "\n"
-    deliver(path.parent, {
+    write_all_or_none(path.parent, {
         path.name: lambda part: part.write_bytes(data),
         path.with_suffix(".json").name: lambda part: part.write_bytes(text.encode()),
     })  # fmt: skip
@@ -305,7 +305,7 @@ def _differences(card: Mapping[str, Any], task: Task) -> tuple[str, ...]:
     usual = type(task).model_construct().model_dump(mode="json")
     trained = {key: trained_on.get(key, usual.get(key)) for key in now}  # a card may be older than an argument
     changed = [key for key in now if trained[key] != now[key]]
-    return (*(f"{key} = {shown(now[key])}, trained with {shown(trained[key])}" for key in changed), *found)
+    return (*(f"{key} = {printable(now[key])}, trained with {printable(trained[key])}" for key in changed), *found)
 
 
 def _differences_of_digest(card: Mapping[str, Any], task: Task) -> tuple[str, ...]:
@@ -329,18 +329,18 @@ def _slots_of(card: Mapping[str, Any], kind: str) -> list[dict[str, Any]]:
     """Return the slots that a card lists; ValueError if it lists anything else."""
     slots = card.get(kind)
     if not isinstance(slots, list) or not all(isinstance(slot, dict) for slot in slots):
-        raise ValueError(f"the card's {kind!r} is {shown(slots)}, must be a list of slots")
+        raise ValueError(f"the card's {kind!r} is {printable(slots)}, must be a list of slots")
     for slot in slots:
         wrong = next((key for key, kinds in _SLOT_TYPES.items() if not isinstance(slot.get(key), kinds)), None)
         if wrong is not None:
-            raise ValueError(f"the card's {kind!r} has a slot whose {wrong!r} is {shown(slot.get(wrong))}")
+            raise ValueError(f"the card's {kind!r} has a slot whose {wrong!r} is {printable(slot.get(wrong))}")
     return slots
 
 
 def _slot(slot: Mapping[str, Any] | None) -> str:
     if slot is None:
         return "nothing"
-    return f"{shown(slot['name'])} of shape {shown(tuple(slot['shape']))} in {shown(slot['unit'])}"
+    return f"{printable(slot['name'])} of shape {printable(tuple(slot['shape']))} in {printable(slot['unit'])}"
 
 
 def _layers(tensors: Mapping[str, NDArray[Any]]) -> tuple[list[Layer], Layer]:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from flockenv.core.atomic_files import replacing
+from flockenv.core.atomic_files import replace_file
 
 __all__ = ["write_gif", "write_png"]
 
@@ -43,14 +43,14 @@ def write_gif(path: str | os.PathLike[str], frames: Iterable[Pixels], fps: float
         raise TypeError(f"fps: must be a number, got {fps!r}")
     if not (math.isfinite(fps) and 0.0 < fps <= _MOST_FPS):
         raise ValueError(f"fps: must be above 0 and at most {_MOST_FPS:g} (GIF viewers slow down beyond), got {fps:g}")
-    with replacing(path) as file:
+    with replace_file(path) as file:
         return _stream(file, frames, float(fps))
 
 
 def write_png(path: str | os.PathLike[str], frame: Pixels) -> None:
     """Write one frame (H, W, 3) uint8 as PNG; the file appears whole or not at all."""
     _check(frame, "frame")
-    with replacing(path) as file:
+    with replace_file(path) as file:
         Image.fromarray(frame).save(file, "PNG")
 
 

@@ -292,7 +292,7 @@ def _bodies(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot) -> None:
     swell = 0.7 + 0.5 * depth if snapshot.dimension == 3 else depth
     body = snapshot.radius * view.metre * swell
     reach = np.maximum(body, DART_REACH * view.width * swell)
-    tied, dot = snapshot.tied, view.width * BOND
+    tied, dot = snapshot.has_bonds, view.width * BOND
     spots = view.place(snapshot.pos)
     aim = _aim(np.where(snapshot.visible[:, None], snapshot.aim, 0.0))
     darts = _darts(spots, aim, 0.94 * reach)
@@ -347,7 +347,7 @@ def _trails(pen: ImageDraw.ImageDraw, view: View, path: Sequence[Snapshot]) -> N
         if old.pos.shape != now.pos.shape:
             raise ValueError(f"trails: must have positions of shape {now.pos.shape}, got {old.pos.shape}")
     spots = view.place(np.stack([old.pos for old in path]))
-    there = np.stack([old.alive & old.visible & ~now.tied & _plain(now) for old in path])
+    there = np.stack([old.alive & old.visible & ~now.has_bonds & _plain(now) for old in path])
     linked = there[1:] & there[:-1] & _steady(view, spots, path)
     lines = np.concatenate([spots[:-1], spots[1:]], axis=2)
     for k in range(len(linked)):
@@ -366,7 +366,7 @@ def _plain(snapshot: Snapshot) -> NDArray[np.bool_]:
 def _steady(view: View, spots: Floats, path: Sequence[Snapshot]) -> NDArray[np.bool_]:
     """Return the slots that keep their agent from each snapshot to the next, without a leap, (T - 1, N) bool."""
     leap = np.abs(np.diff(spots, axis=0)) < JUMP * np.array([view.right - view.left, view.bottom - view.top])
-    same = np.stack([old.same(new) for old, new in itertools.pairwise(path)])
+    same = np.stack([old.is_same(new) for old, new in itertools.pairwise(path)])
     return np.asarray(leap.all(axis=2) & same)
 
 
@@ -387,7 +387,7 @@ def _dressed_trails(pen: ImageDraw.ImageDraw, view: View, path: Sequence[Snapsho
             dress, left = now.looks[which], 1.0 - behind / length[which] if length[which] > 0 else 0.0
             if left > 1e-9:
                 colour = dress.colour(float(shade[i]), ROLE_COLOURS[now.roles[i]][0])
-                fill = (*colour, round(255 * 0.6 * left * dress.opaque(float(shade[i]))))
+                fill = (*colour, round(255 * 0.6 * left * dress.opacity_at(float(shade[i]))))
                 pen.line(lines[k, i].tolist(), fill=fill, width=thick)
 
 
@@ -398,8 +398,8 @@ def _dressed(
     """Draw an agent by its look."""
     dress = snapshot.looks[int(np.asarray(snapshot.look)[i])]
     x, y = spot
-    reach = dress.sized(shade, float(snapshot.radius[i])) * view.metre * swell
-    fill = (*dress.colour(shade, ROLE_COLOURS[snapshot.roles[i]][0]), round(255 * dress.opaque(shade)))
+    reach = dress.size_at(shade, float(snapshot.radius[i])) * view.metre * swell
+    fill = (*dress.colour(shade, ROLE_COLOURS[snapshot.roles[i]][0]), round(255 * dress.opacity_at(shade)))
     if dress.form == "polygon":
         length = math.hypot(*aim)
         c, s = (aim / length).tolist() if length > 0 else (1.0, 0.0)

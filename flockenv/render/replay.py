@@ -21,7 +21,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.core.atomic_files import replacing
+from flockenv.core.atomic_files import replace_file
 from flockenv.model.appearance import Appearance
 from flockenv.model.snapshot import Floats, Mark, Snapshot
 from flockenv.render.palette import ARROW, BODY_DISC, BOND, DART, DART_REACH, JUMP, PAPER, POINT, ROLE_COLOURS, WAY
@@ -124,7 +124,7 @@ def write_replay(path: str | os.PathLike[str], groups: Sequence[Group], title: s
     page = files("flockenv.render").joinpath("replay.html").read_text(encoding="utf-8")
     # One pass: a title that reads like a slot is not filled in again.
     page = re.sub(r"__(TITLE|DATA)__", lambda slot: fills[slot[1]], page)
-    with replacing(path) as file:
+    with replace_file(path) as file:
         file.write(page.encode("utf-8", "replace"))
 
 
@@ -177,7 +177,7 @@ def _dress(shots: Sequence[Snapshot]) -> dict[str, Any]:
         found["shade"] = _packed(np.stack([np.rint(255 * shot.shade).astype(np.uint8) for shot in shots]))
     if first.identity is not None:
         before = [first, *shots[:-1]]
-        fresh = [~old.same(new) for old, new in zip(before, shots, strict=True)]
+        fresh = [~old.is_same(new) for old, new in zip(before, shots, strict=True)]
         found["fresh"] = _packed(np.stack(fresh).astype(np.uint8))
     return found
 
@@ -191,8 +191,8 @@ def _look(look: Appearance) -> dict[str, Any]:
         "vertices": look.vertices,
         "trail": look.trail,
         "colours": colours,
-        "opacity": [_short(look.opaque(s), 3) for s in places],
-        "size": None if look.size is None else [_short(look.sized(s, 0.0), 4) for s in places],
+        "opacity": [_short(look.opacity_at(s), 3) for s in places],
+        "size": None if look.size is None else [_short(look.size_at(s, 0.0), 4) for s in places],
     }
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.geometry.shapes import clear_of
+from flockenv.geometry.shapes import distance_to_shapes
 from flockenv.jit.section import entry
 from flockenv.model.scene_view import SceneView
 from flockenv.model.spawn import Spawn, cells, scatter
@@ -88,7 +88,7 @@ def _scatter(scene: SceneView, state: State, b: int, first: int, group: Group, m
         if middles is not None:
             state.pos[b, mine] += middles
             return
-        inside = clear_of(scene.shapes, np.array(state.pos[b, mine], np.float64), period) < group.radii
+        inside = distance_to_shapes(scene.shapes, np.array(state.pos[b, mine], np.float64), period) < group.radii
         if not inside.any():
             return
         tried[mine] += inside

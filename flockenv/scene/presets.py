@@ -24,7 +24,7 @@ from flockenv.behaviours import (
     WalkingGroup,
 )
 from flockenv.behaviours.steer import Steer
-from flockenv.core.errors import KeyPath, key_path, nearest, refusals, shown, steps_of
+from flockenv.core.errors import KeyPath, key_path, nearest, parse_key_path, printable, refusals
 from flockenv.core.record import Record
 from flockenv.model.distribution import Spread
 from flockenv.physics.effects import Contact, Effect, ObstacleContact
@@ -202,7 +202,7 @@ def _model(name: str) -> Model:
     full = ALIASES.get(name, name)
     if full not in PRESETS:
         raise ValueError(
-            f"preset = {shown(name)}: unknown{nearest(name, [*PRESETS, *ALIASES]) or ';'} allowed: {', '.join(PRESETS)}"
+            f"preset = {printable(name)}: unknown{nearest(name, [*PRESETS, *ALIASES]) or ';'} allowed: {', '.join(PRESETS)}"
         )
     return PRESETS[full]
 
@@ -250,7 +250,7 @@ class Origins(dict[KeyPath, list[int]]):
 
     def text(self, text: str) -> str:
         """Return a message with its leading key path replaced by that in the file."""
-        path = steps_of(text)
+        path = parse_key_path(text)
         for k in range(len(path), 0, -1):
             before, after = key_path(path[:k]), key_path(self.path(path[:k]))
             if text.startswith(before) and before != after:

@@ -20,11 +20,11 @@ from pydantic import Field, WrapValidator, model_validator
 
 from flockenv.behaviours.steer import EVERY_EFFECT
 from flockenv.core.magnitudes import check_numbers
-from flockenv.core.record import Record, keep
+from flockenv.core.record import Record, instance_of
 from flockenv.engine import (
     KernelPlan,
     Table,
-    flattened,
+    flatten_effects,
     pack,
     scratch_bytes,
     scratch_record,
@@ -73,19 +73,19 @@ if TYPE_CHECKING:
 else:
     AnyEffect = Annotated[
         Annotated[functools.reduce(operator.or_, EVERY_EFFECT), Field(discriminator="kind")],
-        WrapValidator(keep(Effect)),
+        WrapValidator(instance_of(Effect)),
     ]
     AnyIntegrator = Annotated[
         Annotated[functools.reduce(operator.or_, INTEGRATORS.values()), Field(discriminator="kind")],
-        WrapValidator(keep(Integrator)),
+        WrapValidator(instance_of(Integrator)),
     ]
     AnyConstraint = Annotated[
         Annotated[functools.reduce(operator.or_, CONSTRAINTS.values()), Field(discriminator="kind")],
-        WrapValidator(keep(Constraint)),
+        WrapValidator(instance_of(Constraint)),
     ]
     AnyMember = Annotated[
         Annotated[functools.reduce(operator.or_, POPULATION.values()), Field(discriminator="kind")],
-        WrapValidator(keep(Member)),
+        WrapValidator(instance_of(Member)),
     ]
 
 
@@ -320,7 +320,7 @@ class Scene(Record):
         """The kernel plan: all that the kernel is compiled from."""
         sorts = self.agents >= FEWEST_AGENTS
         crowded = self.agents > MOST_DIRECT
-        effects = flattened(self.effects)
+        effects = flatten_effects(self.effects)
         walled = any(isinstance(constraint, Collisions) and constraint.obstacles for constraint in self.constraints)
         space = Plane() if walled and isinstance(self.space, Box) else self.space  # its walls are then obstacles
         return KernelPlan(

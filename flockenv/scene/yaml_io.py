@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from flockenv.core.errors import KeyPath, key_path, nearest, refusals, shown, steps_of
+from flockenv.core.errors import KeyPath, key_path, nearest, parse_key_path, printable, refusals
 from flockenv.scene import Scene
 from flockenv.scene.presets import Preset, expanded
 
@@ -87,13 +87,13 @@ def load(source: str | Path, model: type[M]) -> M:
     except ConfigError:
         raise
     except ValueError as error:
-        raise ConfigError(f"{name}:{reader.line(steps_of(str(error)))}: {error}") from None
+        raise ConfigError(f"{name}:{reader.line(parse_key_path(str(error)))}: {error}") from None
     try:
         # Through JSON, because strict mode then takes a list for a tuple and 1 for 1.0, but not "1" for 1.
         return model.model_validate_json(json.dumps(data), strict=True)
     except ValidationError as error:
         wrong = sorted(
-            (reader.line(origins.path(r.path or steps_of(str(r)))), origins.text(str(r)))
+            (reader.line(origins.path(r.path or parse_key_path(str(r)))), origins.text(str(r)))
             for r in refusals(error, model, data)
         )
     lines = [f"{name}:{line}: {text}" for line, text in wrong[:MAX_LINES]]
@@ -218,10 +218,10 @@ def _scalar(text: str) -> str | int | float | bool | None:
     whole, digits = found["whole"] or "", text.replace("_", "")
     if found["point"] is None and found["power"] is None and re.match("0[0-9]", whole):
         raise ValueError(
-            f"{shown(text)[1:-1]} begins with 0, which some read as octal: write {digits.lstrip('+-0') or 0}"
+            f"{printable(text)[1:-1]} begins with 0, which some read as octal: write {digits.lstrip('+-0') or 0}"
         )
     if len(text) > 400 or math.isinf(float(digits)):
-        raise ValueError(f"{shown(text)} is too large or too long for a number")
+        raise ValueError(f"{printable(text)} is too large or too long for a number")
     if found["point"] is None and (found["power"] is None or float(digits).is_integer()):
         return int(Decimal(digits))
     return float(digits)
@@ -283,7 +283,7 @@ class _Reader:
             raise self._refuse(event, f"{key_path(path)}: anchors and aliases are not read: write the value out")
         if event.tag is not None:
             raise self._refuse(
-                event, f"{key_path(path)}: the tag {shown(event.tag)[1:-1]} is not read: write a plain value"
+                event, f"{key_path(path)}: the tag {printable(event.tag)[1:-1]} is not read: write a plain value"
             )
         if len(path) > MAX_DEPTH:
             raise self._refuse(event, f"nested more than {MAX_DEPTH} deep")

@@ -20,7 +20,7 @@ from numba.extending import overload
 from pydantic import Field
 
 from flockenv.core.record import Record
-from flockenv.jit.decorators import OPTIONS, Law, Vec, law, like, replaced
+from flockenv.jit.decorators import OPTIONS, Law, Vec, law, like, replace_at
 from flockenv.maths.counter_rng import uniform
 from flockenv.maths.vectors import add, axis, cross, dot, limit, norm, perpendicular, scale, select, unit, zero
 from flockenv.steering.motivation import INTENTIONS
@@ -81,7 +81,7 @@ def _blended(wishes: Wishes, budget: float) -> Shares:
     length, shares = norm(total), no_shares(wishes)
     share = budget / length if length > budget else like(length, 1.0)
     for k in range(len(wishes)):
-        shares = replaced(shares, k, share)
+        shares = replace_at(shares, k, share)
     return shares
 
 
@@ -93,7 +93,7 @@ def _first(wishes: Wishes, threshold: float, budget: float) -> Shares:
         length = norm(wishes[k])
         takes = open_ and length > threshold
         cut = budget / length if length > budget else like(length, 1.0)
-        shares = replaced(shares, k, cut if takes else like(length, 0.0))
+        shares = replace_at(shares, k, cut if takes else like(length, 0.0))
         open_ = open_ and not takes
     return shares
 
@@ -105,7 +105,7 @@ def _allocated(wishes: Wishes, budget: float) -> Shares:
     for k in range(len(wishes)):
         length = norm(wishes[k])
         whole = length <= left
-        shares = replaced(shares, k, like(length, 1.0) if whole else left / length)
+        shares = replace_at(shares, k, like(length, 1.0) if whole else left / length)
         left = left - length if whole else o
     return shares
 
@@ -118,7 +118,7 @@ def _run_up(wishes: Wishes, budget: float) -> Shares:
         length, left = norm(wishes[k]), budget - norm(total)
         left = left if left > o else o
         share = like(length, 1.0) if length <= left else left / length
-        shares = replaced(shares, k, share)
+        shares = replace_at(shares, k, share)
         total = add(total, scale(wishes[k], share))
     return shares
 
@@ -227,7 +227,7 @@ def dithered(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
         drawn = uniform(me.key, frame, who, 50_000 + k) < p.probability[k]
         takes = open_ and drawn and length > p.threshold
         cut = me.max_force / length if length > me.max_force else like(length, 1.0)
-        shares = replaced(shares, k, cut if takes else like(length, 0.0))
+        shares = replace_at(shares, k, cut if takes else like(length, 0.0))
         open_ = open_ and not takes
     return granted(wishes, shares), shares
 
@@ -294,7 +294,7 @@ def in_turn(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
     for k in range(len(wishes)):
         length = norm(wishes[k])
         cut = me.max_force / length if length > me.max_force else like(length, 1.0)
-        shares = replaced(shares, k, cut if k == turn else like(length, 0.0))
+        shares = replace_at(shares, k, cut if k == turn else like(length, 0.0))
     return granted(wishes, shares), shares
 
 
@@ -363,7 +363,7 @@ def by_context(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
     for k in range(len(wishes)):
         square = dot(wishes[k], wishes[k])
         share = dot(force, wishes[k]) / square if square > o else o
-        shares = replaced(shares, k, min(max(share, o), e))
+        shares = replace_at(shares, k, min(max(share, o), e))
     return force, shares
 
 
@@ -390,7 +390,7 @@ def by_intention(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
         heard = (p.when[k] < o) | (p.when[k] == me.inner.intention)
         whole = length <= left
         share = e if whole else left / length
-        shares = replaced(shares, k, share if heard else o)
+        shares = replace_at(shares, k, share if heard else o)
         left = left - (length if whole else left) if heard else left
     return granted(wishes, shares), shares
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from flockenv.jit.decorators import Numbers, Vec, law, like
-from flockenv.jit.intrinsics import stacked
+from flockenv.jit.intrinsics import tuple_as_array
 from flockenv.maths.vectors import add, axis, dot, limit, norm, scale, select, sub, unit
 
 __all__ = ["SLOT", "clear", "half_plane", "orca"]
@@ -136,7 +136,7 @@ def orca(
     give way) are never given up for others. A desired velocity that is not free is turned right by `turn` [rad], so
     that symmetric encounters do not stop; a free one is returned as it is, up to `max_speed`.
     """
-    given, lines, relaxed = stacked(neighbours), stacked(neighbours), stacked(neighbours)
+    given, lines, relaxed = tuple_as_array(neighbours), tuple_as_array(neighbours), tuple_as_array(neighbours)
     asked = (wish, max_speed, turn)
     return clear(velocity, radius, asked, horizon, step, given, len(neighbours) // SLOT, lines, relaxed)
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.jit.decorators import Law, Vec, kernel, python_of
-from flockenv.jit.section import entry_of, several
+from flockenv.jit.section import entry_of, read_several
 
 __all__ = ["loop_of", "rows"]
 
@@ -139,7 +139,7 @@ def _element(tail: tuple[int, ...]) -> Callable[[Any, int], Any]:
         return _item
     if len(tail) == 1 and tail[0] in (2, 3):
         return _vector(tail[0])
-    items = several(tail[0], _element(tail[1:]))
+    items = read_several(tail[0], _element(tail[1:]))
 
     def element(array: Any, r: int) -> Any:
         return items(array[r], 0)

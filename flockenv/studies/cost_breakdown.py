@@ -149,7 +149,7 @@ def _calls(scene: Scene, k: int) -> tuple[str, ...]:
 
 def _work(scene: Scene, state: State) -> dict[str, float]:
     after = scene.step(state)
-    return {what: (after.counted(what) - state.counted(what)) / state.shape[0] for what in WORK}
+    return {what: (after.count_of(what) - state.count_of(what)) / state.shape[0] for what in WORK}
 
 
 def _shares(scene: Scene, state: State) -> tuple[tuple[str, str, float], ...]:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.core.atomic_files import deliver
+from flockenv.core.atomic_files import write_all_or_none
 from flockenv.geometry.space import Plane
 from flockenv.model.snapshot import Snapshot
 from flockenv.model.state import WORK, Floats, State
@@ -99,7 +99,7 @@ class Trajectory:
             "instants": len(self.step),
             "stopped": self.stopped,
             "measures": {name: {"start": _json(a), "end": _json(b)} for name, (a, b) in self.measures().items()},
-            "work": {what: self.last.counted(what) for what in WORK},
+            "work": {what: self.last.count_of(what) for what in WORK},
             "wall_s": self.wall,
             "agent_steps_per_s": _json(self.rate),
         }
@@ -114,7 +114,9 @@ class Trajectory:
         """
         beside = path.with_suffix(".json")
         summary = json.dumps(self.summary(), indent=2, allow_nan=False) + os.linesep
-        deliver(path.parent, {path.name: self._write, beside.name: lambda part: part.write_bytes(summary.encode())})
+        write_all_or_none(
+            path.parent, {path.name: self._write, beside.name: lambda part: part.write_bytes(summary.encode())}
+        )
         return beside
 
     def _write(self, path: Path) -> None:

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from flockenv.core.errors import nearest_few, shown
+from flockenv.core.errors import nearest_few, printable
 from flockenv.core.record import ResultRecord
 from flockenv.model.divergence import SimulationDiverged
 
@@ -128,7 +128,7 @@ def cases_named(cases: Sequence[Case], names: Sequence[str]) -> tuple[Case, ...]
     known = {case.name for case in cases} | {case.name.split()[0] for case in cases}
     for name in names:
         if name not in known:
-            raise ValueError(f"case {shown(name)}: unknown{nearest_few(name, known)}")
+            raise ValueError(f"case {printable(name)}: unknown{nearest_few(name, known)}")
     return tuple(c for c in cases if not names or c.name in names or c.name.split()[0] in names)
 
 

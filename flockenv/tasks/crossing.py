@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from flockenv.engine import Look
 from flockenv.geometry.space import Plane
 from flockenv.jit.decorators import kernel, like
-from flockenv.jit.intrinsics import stacked
+from flockenv.jit.intrinsics import tuple_as_array
 from flockenv.maths.counter_rng import uniform
 from flockenv.model.snapshot import Mark
 from flockenv.model.spawn import Spawn
@@ -62,7 +62,7 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
 @kernel
 def _walker(p: Any, frame: Frame, i: int, force: Any) -> None:
     """Write the force of a scripted walker by ORCA: the collision-free velocity (2 s) nearest to that to its goal."""
-    given, lines, relaxed = stacked(_NOBODY), stacked(_NOBODY), stacked(_NOBODY)
+    given, lines, relaxed = tuple_as_array(_NOBODY), tuple_as_array(_NOBODY), tuple_as_array(_NOBODY)
     v = (np.float64(frame.vel[0, i]), np.float64(frame.vel[1, i]))
     found, last, last_square = 0, -1, -1.0
     for _ in range(_HEEDED):

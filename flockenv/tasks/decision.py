@@ -10,10 +10,10 @@ import numpy as np
 
 from flockenv.engine import begin_inner_of, look_of, step_world_of
 from flockenv.engine.lane_access import gather
-from flockenv.jit.decorators import kernel, like, replaced
+from flockenv.jit.decorators import kernel, like, replace_at
 from flockenv.jit.memory import prefetch, stream_store
 from flockenv.jit.section import record, section
-from flockenv.jit.simd_rows import columns, into_rows, packed, take
+from flockenv.jit.simd_rows import as_contiguous, columns, into_rows, take
 from flockenv.maths.heading import face
 from flockenv.tasks.lasting import lasts
 from flockenv.tasks.play_plan import Plan
@@ -36,8 +36,8 @@ def _fixed(counts: tuple[tuple[int, float], ...]) -> Callable[[Any], Any]:
 
     def fixed(values: Any) -> Any:
         if before is None:
-            return replaced(values, k, like(values[0], value))
-        return replaced(before(values), k, like(values[0], value))
+            return replace_at(values, k, like(values[0], value))
+        return replace_at(before(values), k, like(values[0], value))
 
     return kernel(fixed)
 
@@ -138,7 +138,7 @@ def _decide(plan: Plan) -> Callable[..., None]:
                 action[i, k] = min(max(given[at], like(given[at], -1.0)), like(given[at], 1.0))
         for i in range(np.uint64(learners)):
             over[b, i] = False
-        force = packed(made.force) if shows else made.force
+        force = as_contiguous(made.force) if shows else made.force
         drive(p, now, action, force[:, 0])
 
     return decide

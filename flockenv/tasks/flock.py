@@ -14,7 +14,7 @@ from flockenv import steering
 from flockenv.engine import Look
 from flockenv.geometry.space import Torus
 from flockenv.jit.decorators import kernel, like
-from flockenv.jit.intrinsics import stacked
+from flockenv.jit.intrinsics import tuple_as_array
 from flockenv.jit.simd_rows import SIDE
 from flockenv.maths.counter_rng import uniform
 from flockenv.maths.vectors import norm, scale, sub, unit
@@ -105,7 +105,7 @@ def _flockmate(p: Any, frame: Frame, i: int, force: Any) -> None:
     """
     x, y = frame.pos[0, i], frame.pos[1, i]
     v = (np.float64(frame.vel[0, i]), np.float64(frame.vel[1, i]))
-    squares, who = stacked(_FAR), stacked(_NOBODY)
+    squares, who = tuple_as_array(_FAR), tuple_as_array(_NOBODY)
     found = _list_nearest(p, frame, i, squares, who)
     push, sum_v, centre = (0.0, 0.0), (0.0, 0.0), (0.0, 0.0)
     for s in range(found):
@@ -211,7 +211,7 @@ def _order(frame: Frame) -> tuple[float, float]:
     """Return the polarisation, and the mean speed along the heading, m/s."""
     n, lanes = np.uint64(frame.alive.shape[0]), np.uint64(SIDE)
     o, one, least = like(frame.vel[0, 0], 0.0), like(frame.vel[0, 0], 1.0), like(frame.vel[0, 0], 1e-12)
-    ux, uy, along = stacked(_ZEROS), stacked(_ZEROS), stacked(_ZEROS)
+    ux, uy, along = tuple_as_array(_ZEROS), tuple_as_array(_ZEROS), tuple_as_array(_ZEROS)
     for first in range(np.uint64(0), n, lanes):
         for k in range(lanes):
             i = np.uint64(first + k)
@@ -262,7 +262,7 @@ def metrics(p: Any, at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> 
 @kernel
 def _nearest(p: Any, frame: Frame) -> float:
     """Return the mean distance of the nearest neighbour, m; `sight` counts for an agent that sees none."""
-    n, lanes, sums = np.uint64(frame.alive.shape[0]), np.uint64(SIDE), stacked(_ZEROS)
+    n, lanes, sums = np.uint64(frame.alive.shape[0]), np.uint64(SIDE), tuple_as_array(_ZEROS)
     for first in range(np.uint64(0), n, lanes):
         for k in range(lanes):
             i = np.uint64(first + k)

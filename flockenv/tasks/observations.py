@@ -9,7 +9,7 @@ import numpy as np
 
 from flockenv.geometry.shapes import ray_hit
 from flockenv.jit.decorators import Vec, kernel, like
-from flockenv.maths.approximations import nearest_whole
+from flockenv.maths.approximations import round_half_even
 from flockenv.maths.vectors import dot
 from flockenv.tasks.layout import Slot
 
@@ -31,7 +31,7 @@ def offset(a: float, b: float, size: float) -> float:
     d = b - a
     o, one = like(d, 0.0), like(d, 1.0)
     around = one / like(d, size) if size > o else o  # equal for all pairs, so that it is hoisted out of the loop
-    return d - like(d, size) * nearest_whole(d * around)
+    return d - like(d, size) * round_half_even(d * around)
 
 
 @kernel

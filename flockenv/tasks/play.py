@@ -18,7 +18,7 @@ from flockenv.jit.decorators import Law, finite, kernel
 from flockenv.jit.intrinsics import unaliased
 from flockenv.jit.memory import store_fence
 from flockenv.jit.section import digest_of, entry_of
-from flockenv.jit.simd_rows import apart, columns, in_one_row, packed
+from flockenv.jit.simd_rows import as_contiguous, column_distance, columns, flatten
 from flockenv.tasks.decision import (
     act_of,
     answer_of,
@@ -56,7 +56,7 @@ def plan_of(task: Task) -> Plan:
     return Plan(
         kernels, tuple(task.parameters()), _counts(task), task.measures, task.lasting_aim, parts.oriented, task.alike,
         parts.dimension, parts.width, task.terms, tuple(task.layout.places.items()), task.action_layout.size,
-        task.memory, task.abreast, apart(task.learners) if task.abreast else 0,
+        task.memory, task.abreast, column_distance(task.learners) if task.abreast else 0,
     )  # fmt: skip
 
 
@@ -144,8 +144,8 @@ def _refuses(given: Any, check: bool) -> bool:
 def _packed(worlds: Any) -> Any:
     """Return the arrays of worlds, marked as contiguous over agents for the compiler."""
     return Worlds(
-        packed(worlds.x), packed(worlds.v), worlds.alive, worlds.tick, packed(worlds.obstacle_x),
-        worlds.obstacle_radius, worlds.work, worlds.key, packed(worlds.memory), worlds.steps, worlds.carried,
+        as_contiguous(worlds.x), as_contiguous(worlds.v), worlds.alive, worlds.tick, as_contiguous(worlds.obstacle_x),
+        worlds.obstacle_radius, worlds.work, worlds.key, as_contiguous(worlds.memory), worlds.steps, worlds.carried,
     )  # fmt: skip
 
 
@@ -171,7 +171,7 @@ def _play(plan: Plan) -> Callable[..., tuple[int, int]]:
         unaliased()
         w, table, learners = _packed(worlds), given.table, results.over.shape[1]
         distance = far if far else actions.shape[1]
-        action, listed = columns(made.decided, actions.shape[1], size, distance), in_one_row(actions)
+        action, listed = columns(made.decided, actions.shape[1], size, distance), flatten(actions)
         if _refuses(listed, check):
             return REFUSED, 0
         p = parameters(given.numbers)

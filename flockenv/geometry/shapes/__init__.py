@@ -21,12 +21,12 @@ from flockenv.geometry.shapes.records import (
     Shape,
     Sway,
     Wall,
-    clear_of,
+    distance_to_shapes,
 )
 from flockenv.geometry.shapes.round import blocks, gap, normal, ray_hit, silhouette, touched_normal
-from flockenv.geometry.shapes.table import FORMS, packed
+from flockenv.geometry.shapes.table import FORMS, pack_shapes
 
 __all__ = [
     "FORMS", "SHAPES", "AnyShape", "Block", "Bound", "Capsule", "Circle", "DistanceField", "HalfSpace", "Polygon",
-    "Shape", "Sway", "Wall", "blocks", "clear_of", "gap", "normal", "packed", "ray_hit", "silhouette", "touched_normal",
+    "Shape", "Sway", "Wall", "blocks", "distance_to_shapes", "gap", "normal", "pack_shapes", "ray_hit", "silhouette", "touched_normal",
 ]  # fmt: skip

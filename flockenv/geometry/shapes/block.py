@@ -19,7 +19,7 @@ from flockenv.maths.vectors import add, axis, dot, norm, scale, select, sub, uni
 
 __all__ = [
     "box_hit", "box_nearest", "half_edges", "hit_block", "hit_half_space", "nearest_block", "nearest_half_space",
-    "turned", "turned_back",
+    "to_block_frame", "to_world_frame",
 ]  # fmt: skip
 
 
@@ -35,7 +35,7 @@ def _axis(table: Any, at: int, k: int, x: Vec) -> Vec:
 
 
 @law
-def turned(table: Any, at: int, x: Vec) -> Vec:
+def to_block_frame(table: Any, at: int, x: Vec) -> Vec:
     """Return x in the frame of a block's axes."""
     if len(x) == 2:
         return (dot(_axis(table, at, 0, x), x), dot(_axis(table, at, 1, x), x))
@@ -44,7 +44,7 @@ def turned(table: Any, at: int, x: Vec) -> Vec:
 
 
 @law
-def turned_back(table: Any, at: int, y: Vec) -> Vec:
+def to_world_frame(table: Any, at: int, y: Vec) -> Vec:
     """Return a vector y, given in the frame of a block's axes, in the frame of the world."""
     out = add(scale(_axis(table, at, 0, y), y[0]), scale(_axis(table, at, 1, y), y[1]))
     if len(y) == 2:
@@ -54,7 +54,7 @@ def turned_back(table: Any, at: int, y: Vec) -> Vec:
 
 
 @law
-def _beyond(y: float, h: float) -> float:
+def _excess(y: float, h: float) -> float:
     """Return the signed distance of y from [-h, h]; 0 inside."""
     return y - h if y > h else (y + h if y < -h else like(y, 0.0))
 
@@ -65,7 +65,7 @@ def _depth(y: float, h: float) -> float:
 
 
 @law
-def _signed(y: float, k: int, x: Vec) -> Vec:
+def _signed_axis(y: float, k: int, x: Vec) -> Vec:
     return scale(axis(x, k), like(y, 1.0) if y >= like(y, 0.0) else like(y, -1.0))
 
 
@@ -74,15 +74,15 @@ def box_nearest(y: Vec, h: Vec) -> tuple[float, Vec]:
     """Return the distance to an axis-aligned box around 0, m (negative inside), and its outward unit normal."""
     x_, y_ = _depth(y[0], h[0]), _depth(y[1], h[1])
     wide = x_ > y_
-    deepest, face = x_ if wide else y_, select(wide, _signed(y[0], 0, y), _signed(y[1], 1, y))
+    deepest, face = x_ if wide else y_, select(wide, _signed_axis(y[0], 0, y), _signed_axis(y[1], 1, y))
     out: Vec
     if len(y) == 2:
-        out = (_beyond(y[0], h[0]), _beyond(y[1], h[1]))
+        out = (_excess(y[0], h[0]), _excess(y[1], h[1]))
     else:
-        out = (_beyond(y[0], h[0]), _beyond(y[1], h[1]), _beyond(y[2], h[2]))
+        out = (_excess(y[0], h[0]), _excess(y[1], h[1]), _excess(y[2], h[2]))
         z_ = _depth(y[2], h[2])
         tall = z_ > deepest
-        deepest, face = z_ if tall else deepest, select(tall, _signed(y[2], 2, y), face)
+        deepest, face = z_ if tall else deepest, select(tall, _signed_axis(y[2], 2, y), face)
     outside = dot(out, out) > like(deepest, 0.0)
     return norm(out) if outside else deepest, select(outside, unit(out), face)
 
@@ -147,8 +147,8 @@ def _rounded_cube(y: Vec, d: Vec, h: Vec, r: float) -> float:
 @law
 def nearest_block(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
     """Return the distance to the surface, m (negative inside), and the outward unit normal at its nearest point."""
-    gap, normal = box_nearest(turned(table, at, x), half_edges(table, at, x))
-    return gap, turned_back(table, at, normal)
+    gap, normal = box_nearest(to_block_frame(table, at, x), half_edges(table, at, x))
+    return gap, to_world_frame(table, at, normal)
 
 
 @law
@@ -157,7 +157,7 @@ def hit_block(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> 
 
     0 if the body already overlaps it.
     """
-    y, d, h = turned(table, at, x), turned(table, at, direction), half_edges(table, at, x)
+    y, d, h = to_block_frame(table, at, x), to_block_frame(table, at, direction), half_edges(table, at, x)
     if len(x) == 2:
         return _rounded_square(y, d, h, clearance)
     else:

@@ -23,8 +23,16 @@ from flockenv.geometry.shapes.row_header import vector_at
 from flockenv.jit.decorators import Vec, kernel, law, like
 
 __all__ = [
-    "FEWEST_ROWS", "MOST_FOUND", "cells_of", "count_of", "entry_length", "keep_in_order", "list_of", "meets_box",
-    "row_listed", "span_of",
+    "FEWEST_ROWS",
+    "MOST_FOUND",
+    "cells_of",
+    "count_of",
+    "entry_length",
+    "is_near_box",
+    "keep_in_order",
+    "list_of",
+    "row_of_entry",
+    "span_of",
 ]  # fmt: skip
 
 Floats = NDArray[np.float64]
@@ -173,7 +181,7 @@ def list_of(table: Any, at: int, x: Vec, span: tuple[tuple[int, int], ...], k: i
 
 
 @law
-def meets_box(table: Any, entry: int, to: Vec, reach: Vec) -> bool:
+def is_near_box(table: Any, entry: int, to: Vec, reach: Vec) -> bool:
     """Return True if a box is within `reach` (m, per axis) of a point; `to`: offset from the point to its middle."""
     half = vector_at(table, entry + 1 + len(to), to)
     near = (abs(to[0]) <= half[0] + reach[0]) & (abs(to[1]) <= half[1] + reach[1])
@@ -183,7 +191,7 @@ def meets_box(table: Any, entry: int, to: Vec, reach: Vec) -> bool:
 
 
 @law
-def row_listed(table: Any, entry: int) -> int:
+def row_of_entry(table: Any, entry: int) -> int:
     """Return the offset of a listed shape's row from the first row of its form."""
     return np.int64(table[entry])  # type: ignore[return-value]  # an int to numba
 

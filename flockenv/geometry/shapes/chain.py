@@ -148,7 +148,7 @@ def pieces_chain(table: Any, at: int, x: Vec, gap: float) -> int:
 
 
 @law
-def _shares(table: Any, at: int, j: int, x: Vec) -> bool:
+def _corner_acts(table: Any, at: int, j: int, x: Vec) -> bool:
     """Return True if the corner at the start of edge j acts: it is also the nearest point of the adjoining edge."""
     body = body_of(at, x)
     count: Any = np.int64(table[body])
@@ -205,7 +205,7 @@ def piece_facing(table: Any, at: int, j: int, x: Vec, gap: float, out: Vec, faci
     faces = (dot(off, side) * facing >= o) | (share <= o) | (share >= e)
     acts = (share > o) & (share < e)
     if share <= o:
-        acts = _shares(table, at, j, x)
+        acts = _corner_acts(table, at, j, x)
     elif share >= e:
         acts = (not closed) & (j + 2 >= count) & end_acts(table, at, 1, x)
     apart = square > like(square, 1e-24)

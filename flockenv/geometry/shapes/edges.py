@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.geometry.shapes.block import half_edges, turned
+from flockenv.geometry.shapes.block import half_edges, to_block_frame
 from flockenv.geometry.shapes.chain import segment_hit, vertex
 from flockenv.geometry.shapes.field import hit_distance_field
 from flockenv.geometry.shapes.inverted import hit_hollow_distance_field
@@ -28,7 +28,7 @@ from flockenv.maths.vectors import add, axis, dot, scale, sub
 
 __all__ = [
     "edge_block", "edge_chain", "edge_distance_field", "edge_half_space", "edge_hollow_block",
-    "edge_hollow_chain", "edge_hollow_distance_field", "near_way", "sphere_edge", "spine_block", "spine_chain",
+    "edge_hollow_chain", "edge_hollow_distance_field", "near_path", "sphere_edge", "spine_block", "spine_chain",
 ]  # fmt: skip
 
 FAN = 24
@@ -46,7 +46,7 @@ def _bearing(to: Vec, ray: Vec, side: Vec) -> float:
 
 
 @law
-def _beside(to: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
+def _tangent(to: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
     """Return the angle between the centre of a disc of radius `room` and its tangent, rad, and the tangent's length."""
     along, across, o = dot(to, ray), dot(to, side), like(room, 0.0)
     square = along * along + across * across - room * room
@@ -57,7 +57,7 @@ def _beside(to: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
 
 
 @law
-def near_way(table: Any, at: int, x: Vec, ray: Vec, room: float, length: float) -> bool:
+def near_path(table: Any, at: int, x: Vec, ray: Vec, room: float, length: float) -> bool:
     """Return True if a body that moves `length` m along a ray intersects the bounding circle or sphere of a row."""
     middle, around = bound_of(table, at, x)
     to, o = sub(middle, x), like(room, 0.0)
@@ -71,7 +71,7 @@ def near_way(table: Any, at: int, x: Vec, ray: Vec, room: float, length: float) 
 @law
 def _disc_edge(to: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
     """Return the edge of the projection of a circle or sphere centred at `to`, m; room: as for `sphere_edge`."""
-    half, reach = _beside(to, ray, side, room)
+    half, reach = _tangent(to, ray, side, room)
     return _bearing(to, ray, side) + half, reach
 
 
@@ -116,7 +116,7 @@ def edge_chain(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) ->
         # the angle between two vectors projected onto the plane of `ray` and `side`
         p, q, r, s = dot(last, ray), dot(last, side), dot(to, ray), dot(to, side)
         bearing += atan2(p * s - q * r, p * r + q * s)
-        half, far = _beside(to, ray, side, room)
+        half, far = _tangent(to, ray, side, room)
         turn, reach = (turn, reach) if turn >= bearing + half else (bearing + half, far)
         last = to
     return turn, reach
@@ -139,8 +139,8 @@ def _touched_piece(table: Any, at: int, x: Vec, ray: Vec, room: float) -> int:
 @law
 def edge_block(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
     """Return the edge of a block: that of its corner farthest to the side."""
-    y, h = turned(table, at, x), half_edges(table, at, x)
-    ahead, across = turned(table, at, ray), turned(table, at, side)
+    y, h = to_block_frame(table, at, x), half_edges(table, at, x)
+    ahead, across = to_block_frame(table, at, ray), to_block_frame(table, at, side)
     turn, reach = like(room, -np.inf), like(room, 0.0)
     for corner in range(2 ** len(x)):
         u, v = h[0] if corner & 1 else -h[0], h[1] if corner & 2 else -h[1]

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.geometry.shapes.block import half_edges, nearest_block, turned, turned_back
+from flockenv.geometry.shapes.block import half_edges, nearest_block, to_block_frame, to_world_frame
 from flockenv.geometry.shapes.chain import crosses, nearest_chain, piece_facing, segment_hit, segment_share, vertex
 from flockenv.geometry.shapes.field import STEPS, nearest_distance_field, on_grid
 from flockenv.geometry.shapes.row_header import body_of
@@ -28,7 +28,7 @@ __all__ = [
 
 
 @law
-def _inside_out(found: tuple[float, Vec]) -> tuple[float, Vec]:
+def _invert(found: tuple[float, Vec]) -> tuple[float, Vec]:
     gap, normal = found
     return -gap, scale(normal, like(gap, -1.0))
 
@@ -36,19 +36,19 @@ def _inside_out(found: tuple[float, Vec]) -> tuple[float, Vec]:
 @law
 def nearest_hollow_chain(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
     """Return the distance to the surface, m (negative outside), and the inward unit normal at its nearest point."""
-    return _inside_out(nearest_chain(table, at, x))
+    return _invert(nearest_chain(table, at, x))
 
 
 @law
 def nearest_hollow_block(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
     """Return the distance to the surface, m (negative outside), and the inward unit normal at its nearest point."""
-    return _inside_out(nearest_block(table, at, x))
+    return _invert(nearest_block(table, at, x))
 
 
 @law
 def nearest_hollow_distance_field(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
     """Return the distance to the surface, m (negative outside), and the inward unit normal at its nearest point."""
-    return _inside_out(nearest_distance_field(table, at, x))
+    return _invert(nearest_distance_field(table, at, x))
 
 
 @law
@@ -111,7 +111,7 @@ def hit_hollow_chain(table: Any, at: int, x: Vec, direction: Vec, clearance: flo
 
 
 @law
-def _leaves(y: float, d: float, h: float) -> float:
+def _exit_distance(y: float, d: float, h: float) -> float:
     """Return the distance at which a ray leaves [-h, h] along one axis."""
     o = like(h, 0.0)
     ends = h - y if d > o else -h - y
@@ -124,15 +124,15 @@ def hit_hollow_block(table: Any, at: int, x: Vec, direction: Vec, clearance: flo
 
     0 if the body already overlaps it.
     """
-    y, d, h = turned(table, at, x), turned(table, at, direction), half_edges(table, at, x)
+    y, d, h = to_block_frame(table, at, x), to_block_frame(table, at, direction), half_edges(table, at, x)
     h0, h1 = h[0] - clearance, h[1] - clearance
     free = (abs(y[0]) <= h0) & (abs(y[1]) <= h1)
-    a, b = _leaves(y[0], d[0], h0), _leaves(y[1], d[1], h1)
+    a, b = _exit_distance(y[0], d[0], h0), _exit_distance(y[1], d[1], h1)
     out = a if a < b else b
     if len(x) == 3:
         h2 = h[2] - clearance
         free &= abs(y[2]) <= h2
-        c = _leaves(y[2], d[2], h2)
+        c = _exit_distance(y[2], d[2], h2)
         out = c if c < out else out
     return out if free else like(out, 0.0)
 
@@ -191,11 +191,11 @@ def pieces_hollow_block(table: Any, at: int, x: Vec, gap: float) -> int:
 def piece_hollow_block(table: Any, at: int, j: int, x: Vec, gap: float, out: Vec) -> tuple[float, Vec, bool]:
     """Return the distance to face j of a room, m, and the inward unit normal; every face acts."""
     o, e = like(gap, 0.0), like(gap, 1.0)
-    y, h = turned(table, at, x), half_edges(table, at, x)
+    y, h = to_block_frame(table, at, x), half_edges(table, at, x)
     k, sign = j // 2, e if j % 2 == 0 else -e
     depth = h[0] - sign * y[0] if k == 0 else h[1] - sign * y[1]
     if len(x) == 3:
         depth = depth if k < 2 else h[2] - sign * y[2]
     if gap >= o:
-        return depth, scale(turned_back(table, at, axis(x, k)), -sign), True
+        return depth, scale(to_world_frame(table, at, axis(x, k)), -sign), True
     return gap, out, True

@@ -10,7 +10,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["area", "around", "band", "behind", "crossing", "distinct", "hull", "silhouette", "strips", "width"]
+__all__ = [
+    "area",
+    "band",
+    "crossing",
+    "distinct",
+    "half_plane",
+    "hull",
+    "inflated_hull",
+    "silhouette",
+    "strips",
+    "width",
+]
 
 Floats = NDArray[np.float64]
 ROUND = 48
@@ -94,13 +105,13 @@ def width(polygon: Floats) -> float:
     return float(np.ptp(along, axis=0).min())
 
 
-def around(points: Floats, radius: float) -> Floats:
+def inflated_hull(points: Floats, radius: float) -> Floats:
     """Return the convex hull of one or two points (n, 2), inflated by `radius`, as a polygon."""
-    return _around(tuple(map(tuple, points.tolist())), radius).copy()
+    return _inflated_hull(tuple(map(tuple, points.tolist())), radius).copy()
 
 
 @functools.lru_cache(maxsize=1024)  # an animation draws the same walls in every frame
-def _around(places: tuple[tuple[float, ...], ...], radius: float) -> Floats:
+def _inflated_hull(places: tuple[tuple[float, ...], ...], radius: float) -> Floats:
     points = np.array(places)
     turn = np.linspace(0, 2 * np.pi, ROUND, endpoint=False)
     ring = radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)
@@ -118,7 +129,7 @@ def band(vertices: Floats, width: float) -> Floats:
     return np.concatenate([outer, outer[:1], inner[:1], inner[::-1]])
 
 
-def behind(point: Floats, direction: Floats, low: Floats, high: Floats) -> list[Floats]:
+def half_plane(point: Floats, direction: Floats, low: Floats, high: Floats) -> list[Floats]:
     """Return the part of a region behind a line, as a polygon; nothing if the direction is 0 (a floor)."""
     if not direction.any():
         return []

@@ -18,14 +18,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, WrapValidator, field_validator, model_validator
 
-from flockenv.core.record import Record, in_tuples, keep
+from flockenv.core.record import Record, instance_of, lists_to_tuples
 from flockenv.geometry.shapes import outlines, table
 from flockenv.geometry.shapes.table import Floats, hits, nearest
-from flockenv.maths.grid import MOST_POINTS, packed, points_of
+from flockenv.maths.grid import MOST_POINTS, pack_grid, points_of
 
 __all__ = [
     "SHAPES", "AnyShape", "Block", "Bound", "Capsule", "Circle", "Closed", "DistanceField", "HalfSpace", "Polygon",
-    "Shape", "Sway", "Wall", "clear_of",
+    "Shape", "Sway", "Wall", "distance_to_shapes",
 ]  # fmt: skip
 
 Point = Annotated[tuple[float, ...], Field(min_length=2, max_length=3)]
@@ -57,7 +57,7 @@ class Shape(Record):
     """Name of its laws while it is solid; see shapes/table.py."""
 
     @model_validator(mode="after")
-    def _moves_in_its_dimension(self) -> Self:
+    def _check_motion(self) -> Self:
         """Raise ValueError if a motion has another dimension."""
         swaying = self.sway.amplitude if self.sway else None
         for name, value in (("velocity", self.velocity), ("sway.amplitude", swaying)):
@@ -114,7 +114,7 @@ class Shape(Record):
     @functools.cached_property
     def table(self) -> Floats:
         """A table of this shape alone, as laws read it."""
-        return table.packed([self], self.dimension)[0]
+        return table.pack_shapes([self], self.dimension)[0]
 
     @functools.cached_property
     def bound(self) -> Bound:
@@ -235,7 +235,7 @@ class Circle(Closed):
 
     def polygons(self, low: Floats, high: Floats) -> list[Floats]:
         """Return a circle."""
-        return [outlines.around(np.array([self.centre[:2]]), self.radius)]
+        return [outlines.inflated_hull(np.array([self.centre[:2]]), self.radius)]
 
 
 class Wall(Shape):
@@ -249,7 +249,7 @@ class Wall(Shape):
     radius: float = Field(default=0.0, ge=0, description="m, half its thickness")
 
     @model_validator(mode="after")
-    def _in_one_dimension(self) -> Wall:
+    def _check_dimension(self) -> Wall:
         _one_dimension(self.vertices)
         return self
 
@@ -275,7 +275,7 @@ class Wall(Shape):
     @property
     def extremes(self) -> Floats:
         """The corners of boxes around its vertices, of its thickness."""
-        return _fattened(self.vertices, self.radius)
+        return _inflate(self.vertices, self.radius)
 
     def row(self, dimension: int) -> Sequence[float]:
         """Return an open chain."""
@@ -286,7 +286,7 @@ class Wall(Shape):
         """Return a capsule around each piece."""
         flat = np.array(self.vertices)[:, :2]
         radius = max(self.radius, 0.002 * float((high - low).max()))
-        return [outlines.around(flat[k : k + 2], radius) for k in range(len(flat) - 1)]
+        return [outlines.inflated_hull(flat[k : k + 2], radius) for k in range(len(flat) - 1)]
 
 
 class Capsule(Closed):
@@ -298,7 +298,7 @@ class Capsule(Closed):
     radius: float = Field(default=0.0, ge=0, description="m")
 
     @model_validator(mode="after")
-    def _in_one_dimension(self) -> Capsule:
+    def _check_dimension(self) -> Capsule:
         if len(self.start) != len(self.end):
             raise ValueError(f"end = {self.end}: start has {len(self.start)} numbers")
         if self.hollow and self.radius == 0:
@@ -355,12 +355,12 @@ class Polygon(Closed):
 
     @field_validator("vertices")
     @classmethod
-    def _opened(cls, vertices: tuple[Point, ...]) -> tuple[Point, ...]:
+    def _open_ring(cls, vertices: tuple[Point, ...]) -> tuple[Point, ...]:
         """Return the vertices without the last one of a closed ring."""
         return vertices[:-1] if len(vertices) > 3 and vertices[0] == vertices[-1] else vertices
 
     @model_validator(mode="after")
-    def _simple(self) -> Polygon:
+    def _check_simple(self) -> Polygon:
         """Raise ValueError if a vertex is given twice, edges cross or touch, or the area is 0."""
         first: dict[Point, int] = {}
         for k, vertex in enumerate(self.vertices):
@@ -418,7 +418,7 @@ class Block(Closed):
     )
 
     @model_validator(mode="after")
-    def _in_one_dimension(self) -> Block:
+    def _check_dimension(self) -> Block:
         if len(self.centre) != len(self.size):
             raise ValueError(f"size = {self.size}: centre has {len(self.centre)} numbers")
         if not math.hypot(*self.axis) > 0:
@@ -475,7 +475,7 @@ class HalfSpace(Shape):
     direction: Point = Field(description="outward normal, of any length")
 
     @model_validator(mode="after")
-    def _points_somewhere(self) -> HalfSpace:
+    def _check_direction(self) -> HalfSpace:
         if len(self.point) != len(self.direction):
             raise ValueError(f"direction = {self.direction}: point has {len(self.point)} numbers")
         if not 1e-15 <= math.hypot(*self.direction) <= 1e15:
@@ -502,7 +502,7 @@ class HalfSpace(Shape):
 
     def polygons(self, low: Floats, high: Floats) -> list[Floats]:
         """Return the part of the region behind it; nothing if it is a floor."""
-        return outlines.behind(np.array(self.point[:2]), np.array(self.direction[:2]), low, high)
+        return outlines.half_plane(np.array(self.point[:2]), np.array(self.direction[:2]), low, high)
 
 
 class DistanceField(Closed):
@@ -530,7 +530,7 @@ class DistanceField(Closed):
         return made
 
     @model_validator(mode="after")
-    def _one_or_the_other(self) -> DistanceField:
+    def _check_source(self) -> DistanceField:
         if bool(self.shapes) == (self.values is not None):
             raise ValueError("values: give either shapes or values")
         if bool(self.shapes) != (self.high is not None):
@@ -593,7 +593,7 @@ class DistanceField(Closed):
         slopes = np.stack(along, axis=-1)
         size = np.linalg.norm(slopes, axis=-1, keepdims=True)
         numbers = np.concatenate([self.distances[..., None], slopes / np.maximum(size, 1e-12)], axis=-1)
-        return packed(numbers, (0.0,) * len(self.low), self.spacing)
+        return pack_grid(numbers, (0.0,) * len(self.low), self.spacing)
 
     def row(self, dimension: int) -> Floats:
         """Return its grid: distances and unit gradients."""
@@ -628,7 +628,7 @@ def _middle(vertices: Sequence[tuple[float, ...]]) -> tuple[float, ...]:
     return tuple(((array.min(axis=0) + array.max(axis=0)) / 2).tolist())
 
 
-def _fattened(vertices: Sequence[tuple[float, ...]], radius: float) -> Floats:
+def _inflate(vertices: Sequence[tuple[float, ...]], radius: float) -> Floats:
     array = np.array(vertices)
     return np.concatenate([array - radius, array + radius])
 
@@ -644,7 +644,7 @@ def _round_by_default(value: Any, handler: Any) -> Any:
     """Validate a shape; one without a kind is a circle."""
     if isinstance(value, Mapping) and "kind" not in value:
         value = {"kind": "circle", **value}
-    return keep(Shape)(value, handler)
+    return instance_of(Shape)(value, handler)
 
 
 if TYPE_CHECKING:
@@ -664,10 +664,10 @@ def shape_of(data: Any) -> Shape:
     if kind not in SHAPES or kind == "distance_field":
         allowed = ", ".join(name for name in SHAPES if name != "distance_field")
         raise ValueError(f"shapes: kind = {kind!r}; must be one of {allowed}")
-    return SHAPES[kind](**in_tuples(data))
+    return SHAPES[kind](**lists_to_tuples(data))
 
 
-def clear_of(shapes: Sequence[Shape], points: Floats, period: Floats, time: float = 0.0) -> Floats:
+def distance_to_shapes(shapes: Sequence[Shape], points: Floats, period: Floats, time: float = 0.0) -> Floats:
     """Return the distance of points (N, D) to the nearest of some shapes, (N,) m; inf if there are none.
 
     period: of each axis, (D,) m; 0 if the axis is not periodic. time: s, of moving shapes.

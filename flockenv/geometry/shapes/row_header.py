@@ -53,14 +53,14 @@ def outside_box(table: Any, at: int, x: Vec) -> Vec:
     """Return the distance of x from the bounding box, per axis, m: 0 inside. A tighter bound than the circle's."""
     middle, half = box_of(table, at, x)
     if len(x) == 2:
-        return (_beyond(x[0] - middle[0], half[0]), _beyond(x[1] - middle[1], half[1]))
+        return (_excess(x[0] - middle[0], half[0]), _excess(x[1] - middle[1], half[1]))
     else:
-        out = (_beyond(x[0] - middle[0], half[0]), _beyond(x[1] - middle[1], half[1]))
-        return out + (_beyond(x[2] - middle[2], half[2]),)  # noqa: RUF005  # numba does not unpack tuples
+        out = (_excess(x[0] - middle[0], half[0]), _excess(x[1] - middle[1], half[1]))
+        return out + (_excess(x[2] - middle[2], half[2]),)  # noqa: RUF005  # numba does not unpack tuples
 
 
 @law
-def _beyond(x: float, half: float) -> float:
+def _excess(x: float, half: float) -> float:
     far, o = abs(x) - half, like(x, 0.0)
     return far if far > o else o
 

@@ -20,7 +20,7 @@ from flockenv.jit.decorators import Law
 from flockenv.jit.section import entry_of, vector
 from flockenv.maths.vectors import sub
 
-__all__ = ["FORMS", "Floats", "hits", "law_of", "nearest", "packed"]
+__all__ = ["FORMS", "Floats", "hits", "law_of", "nearest", "pack_shapes"]
 
 Floats = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ UP = 1 + 1e-6
 """Factor that enlarges bounds: a point beyond them is clear of the shape, also with rounding in single precision."""
 
 
-def packed(
+def pack_shapes(
     shapes: Sequence[Any], dimension: int, first: int = 0, period: Floats | None = None
 ) -> tuple[Floats, dict[str, tuple[int, int]]]:
     """Return the table of some shapes, numbered from `first`, and for each form present (first index, number of rows).

@@ -32,10 +32,20 @@ from numba.core.compiler_machinery import register_pass
 from numba.core.ir_utils import fixup_var_define_in_scope
 from numba.core.types import functions
 
-from flockenv.core.errors import nearest, shown
-from flockenv.jit.startup import nothing_to_collect
+from flockenv.core.errors import nearest, printable
+from flockenv.jit.startup import no_garbage_collection
 
-__all__ = ["LEFT_OUT", "SPARED", "TRICKS", "Spared", "Trick", "applies", "lighter", "reads_as_known", "spared"]
+__all__ = [
+    "LEFT_OUT",
+    "PATCHES",
+    "REPLACED_PASSES",
+    "Patch",
+    "ReplacedPass",
+    "applies",
+    "apply_patches",
+    "is_known_source",
+    "replace_passes",
+]
 
 LEFT_OUT = "FLOCKENV_NUMBA_ALONE"
 """Environment variable with the names of patches to leave out, separated by commas; `all` leaves out every one."""
@@ -57,7 +67,7 @@ class Known(NamedTuple):
     digest: str
 
 
-class Trick(NamedTuple):
+class Patch(NamedTuple):
     """A patch: `owner.name` is replaced by `make(original)`."""
 
     owner: Any
@@ -82,7 +92,7 @@ def digest(owner: Any, name: str) -> str:
 
 
 @functools.cache
-def reads_as_known(reads: tuple[Known, ...]) -> bool:
+def is_known_source(reads: tuple[Known, ...]) -> bool:
     """Return True if the source of every function is the one that the patch was tested with."""
     return all(digest(known.owner, known.name) == known.digest for known in reads)
 
@@ -93,11 +103,11 @@ def applies(title: str, reads: tuple[Known, ...]) -> bool:
     Raise ValueError for a name in LEFT_OUT that is not the title of a patch.
     """
     left_out = [name for name in os.environ.get(LEFT_OUT, "").split(",") if name]
-    allowed = ["all", "lowering", *(each.title for each in (*TRICKS, *SPARED))]
+    allowed = ["all", "lowering", *(each.title for each in (*PATCHES, *REPLACED_PASSES))]
     for name in left_out:
         if name not in allowed:
-            raise ValueError(f"{LEFT_OUT}: {shown(name)} is none{nearest(name, allowed)} ({', '.join(allowed)})")
-    return reads_as_known(reads) and title not in left_out and "all" not in left_out
+            raise ValueError(f"{LEFT_OUT}: {printable(name)} is none{nearest(name, allowed)} ({', '.join(allowed)})")
+    return is_known_source(reads) and title not in left_out and "all" not in left_out
 
 
 # --- cached: the implementation of a call with given types ------------------------------------------------------------
@@ -118,7 +128,7 @@ def _call(context: Any, args: Any, kws: Any) -> tuple[Any, ...]:
     return context, tuple(args), tuple(kws.items()) if kws else (), flags
 
 
-def _recalled(function: Any, call: tuple[Any, ...]) -> Any:
+def _cached_signature(function: Any, call: tuple[Any, ...]) -> Any:
     """Return the cached signature, None if there is none."""
     known = _memory(function).get(call)
     if known is None:
@@ -129,12 +139,12 @@ def _recalled(function: Any, call: tuple[Any, ...]) -> Any:
     return signature
 
 
-def _known_calls(resolve: Any) -> Any:
+def _cache_calls(resolve: Any) -> Any:
     """Cache the resolution of operators such as `+`: numba tries dozens of templates, several times for every `+`."""
 
     def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
         call = _call(context, args, kws)
-        signature = _recalled(self, call)
+        signature = _cached_signature(self, call)
         if signature is None:
             signature = resolve(self, context, args, kws)
             if signature is not None and signature.args in self._impl_keys:
@@ -144,12 +154,12 @@ def _known_calls(resolve: Any) -> Any:
     return get_call_type
 
 
-def _known_laws(resolve: Any) -> Any:
+def _cache_laws(resolve: Any) -> Any:
     """Cache the signature of a compiled function for given types, as long as its compiled form exists."""
 
     def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
         call = _call(context, args, kws)
-        signature = _recalled(self, call)
+        signature = _cached_signature(self, call)
         if signature is None:
             signature = resolve(self, context, args, kws)
             if signature is not None:
@@ -162,7 +172,7 @@ def _known_laws(resolve: Any) -> Any:
 # --- cheaper: the same result, computed faster ------------------------------------------------------------------------
 
 
-def _values(_: Any) -> Any:
+def _faster_values(_: Any) -> Any:
     """Return a faster `values` of flags: the cached defaults, updated with the set values."""
     defaults: dict[Any, dict[str, Any]] = {}
 
@@ -176,7 +186,7 @@ def _values(_: Any) -> Any:
     return values
 
 
-def _when_asked(slowly: Any) -> Any:
+def _lifetimes_on_demand(slowly: Any) -> Any:
     """Compute the lifetimes of variables only on demand: numba computes them after each of its passes.
 
     `block_entry_vars` is needed only for generators and Python objects, which kernels do not have.
@@ -196,7 +206,7 @@ def _when_asked(slowly: Any) -> Any:
     return run
 
 
-def _if_new(refresh: Any) -> Any:
+def _refresh_if_new(refresh: Any) -> Any:
     """Refresh registries only if there are new declarations: numba goes through all of them for each function."""
     seen: dict[int, int] = {}  # by id of the registries, which the copies of a target share
 
@@ -214,7 +224,7 @@ def _if_new(refresh: Any) -> Any:
     return refreshed
 
 
-def _where_it_is(slowly: Any) -> Any:
+def _rewrite_where_used(slowly: Any) -> Any:
     """Rewrite only blocks that contain a variable: numba goes through all of a function's statements for each one."""
 
     def names(block: Any) -> frozenset[str]:
@@ -234,21 +244,21 @@ def _where_it_is(slowly: Any) -> Any:
     return rewritten
 
 
-TRICKS = (
-    Trick(functions.BaseFunction, "get_call_type", _known_calls, (
+PATCHES = (
+    Patch(functions.BaseFunction, "get_call_type", _cache_calls, (
         Known(functions.BaseFunction, "get_call_type", "6559c167bfc0"),
         Known(functions.BaseFunction, "get_impl_key", "ebed5750a018"),
     )),
-    Trick(functions.Dispatcher, "get_call_type", _known_laws, (
+    Patch(functions.Dispatcher, "get_call_type", _cache_laws, (
         Known(functions.Dispatcher, "get_call_type", "ae1ef289d128"),
         Known(dispatcher._DispatcherBase, "get_call_template", "f15b62d0e9c0"),
     )),
-    Trick(targetconfig.TargetConfig, "values", _values, (
+    Patch(targetconfig.TargetConfig, "values", _faster_values, (
         Known(targetconfig.TargetConfig, "values", "12a29dc810f6"),
         Known(targetconfig._MetaTargetConfig, "__init__", "f2ff91c25728"),
     )),
-    Trick(postproc.PostProcessor, "run", _when_asked, (Known(postproc.PostProcessor, "run", "e1a8e77d6f17"),)),
-    Trick(ssa, "_run_block_rewrite", _where_it_is, (
+    Patch(postproc.PostProcessor, "run", _lifetimes_on_demand, (Known(postproc.PostProcessor, "run", "e1a8e77d6f17"),)),
+    Patch(ssa, "_run_block_rewrite", _rewrite_where_used, (
         Known(ssa, "_run_ssa", "c497422bcf04"),
         Known(ssa, "_run_block_rewrite", "d17efdbed570"),
         Known(ssa, "_run_ssa_block_pass", "b48d590f81cc"),
@@ -260,7 +270,7 @@ TRICKS = (
         Known(ssa._FixSSAVars, "on_other", "a17f1fff547c"),
         Known(ssa._FixSSAVars, "_fix_var", "9735dd01ed8f"),
     )),
-    Trick(base.BaseContext, "refresh", _if_new, (
+    Patch(base.BaseContext, "refresh", _refresh_if_new, (
         Known(base.BaseContext, "refresh", "83e8f5cc63a7"),
         Known(base.BaseContext, "install_registry", "bdaf4e9db8fe"),
     )),
@@ -272,7 +282,7 @@ TRICKS = (
 def _replacements() -> tuple[tuple[Any, str, Any, Any], ...]:
     """Return (owner, name, original, patch) of all patches that apply to this numba."""
     found = []
-    for trick in TRICKS:
+    for trick in PATCHES:
         if applies(trick.title, trick.reads):
             numbas = vars(trick.owner)[trick.name]
             found.append((trick.owner, trick.name, numbas, trick.make(numbas)))
@@ -283,10 +293,10 @@ _depth = 0
 
 
 @contextmanager
-def lighter() -> Iterator[None]:
+def apply_patches() -> Iterator[None]:
     """Compile with all patches that apply, and without garbage collection: a kernel leaves at most 100 MB."""
     global _depth
-    with _lock, nothing_to_collect():
+    with _lock, no_garbage_collection():
         if _depth == 0:
             for owner, name, _, ours in _replacements():
                 setattr(owner, name, ours)
@@ -330,7 +340,7 @@ def _may_be_inlined(statement: Any) -> bool:
 _INLINED = ("reduce", "stencil")
 
 
-class Spared(NamedTuple):
+class ReplacedPass(NamedTuple):
     """A pass of numba and its replacement."""
 
     numbas: Any
@@ -343,8 +353,8 @@ class Spared(NamedTuple):
         return self.numbas.__name__  # type: ignore[no-any-return]
 
 
-SPARED = (
-    Spared(_Closures, ClosuresIfAny, (
+REPLACED_PASSES = (
+    ReplacedPass(_Closures, ClosuresIfAny, (
         Known(_Closures, "run_pass", "b61f17f30105"),
         Known(inline_closurecall.InlineClosureCallPass, "run", "d826ba18dd63"),
     )),
@@ -353,9 +363,9 @@ SPARED = (
 
 @functools.cache
 def _places() -> dict[Any, Any]:
-    return {pair.numbas: pair.ours for pair in SPARED if applies(pair.title, pair.reads)}
+    return {pair.numbas: pair.ours for pair in REPLACED_PASSES if applies(pair.title, pair.reads)}
 
 
-def spared(passes: list[tuple[Any, str]]) -> list[tuple[Any, str]]:
+def replace_passes(passes: list[tuple[Any, str]]) -> list[tuple[Any, str]]:
     """Return numba's list of passes with the replaced ones exchanged."""
     return [(_places().get(each, each), text) for each, text in passes]

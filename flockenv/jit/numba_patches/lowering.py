@@ -110,7 +110,7 @@ class Brief(_Lower):  # type: ignore[misc]
     def lower_getitem(self, resty: Any, expr: Any, value: Any, index: Any, signature: Any) -> Any:
         """Read a number of an array directly, or make a view of a part; leave everything else to numba."""
         kind = self.typeof(value.name)
-        places = self._places(kind, index)
+        places = self._axis_indices(kind, index)
         if places is None or not (resty == kind.dtype or isinstance(resty, types.Array)):
             return super().lower_getitem(resty, expr, value, index, signature)
         return self._view(kind, resty, self.loadvar(value.name), places, index)
@@ -118,7 +118,7 @@ class Brief(_Lower):  # type: ignore[misc]
     def lower_setitem(self, target_var: Any, index_var: Any, value_var: Any, signature: Any) -> Any:
         """Write a number of an array directly; leave everything else to numba."""
         kind, given = self.typeof(target_var.name), self.typeof(value_var.name)
-        places = self._places(kind, index_var) if isinstance(given, (types.Number, types.Boolean)) else None
+        places = self._axis_indices(kind, index_var) if isinstance(given, (types.Number, types.Boolean)) else None
         if places is None or len(places) < kind.ndim or any(isinstance(place, slice) for place in places):
             return super().lower_setitem(target_var, index_var, value_var, signature)
         value = self.context.cast(self.builder, self.loadvar(value_var.name), given, signature.args[2])
@@ -128,7 +128,7 @@ class Brief(_Lower):  # type: ignore[misc]
         _arrays.store_item(self.context, self.builder, kind, value, where)
         return None
 
-    def _places(self, kind: Any, index: Any) -> tuple[Any, ...] | None:
+    def _axis_indices(self, kind: Any, index: Any) -> tuple[Any, ...] | None:
         """Return the index of each axis: the type of an integer, or a slice with literal bounds.
 
         None if the array or the index is of any other kind.
@@ -149,27 +149,27 @@ class Brief(_Lower):  # type: ignore[misc]
 
     def _slice(self, index: Any, place: int, many: int) -> slice | None:
         """Return a slice with literal, non-negative bounds and no step; None if it is another."""
-        known = self._known(index)
+        known = self._definition(index)
         if isinstance(known, tuple):
             known = known[place]
         elif isinstance(known, ir.Expr) and known.op == "build_tuple":
-            known = self._known(known.items[place])
+            known = self._definition(known.items[place])
         elif many > 1:
             return None
-        if self._calls(known, slice) and not known.vararg:
-            known = slice(*(self._known(argument) for argument in known.args))
+        if self._is_call_of(known, slice) and not known.vararg:
+            known = slice(*(self._definition(argument) for argument in known.args))
         if not isinstance(known, slice) or known.step is not None:
             return None
         ends = [end for end in (known.start, known.stop) if end is not None]
         return known if all(type(end) is int and 0 <= end <= types.intp.maxval for end in ends) else None
 
-    def _calls(self, made: Any, function: Any) -> bool:
+    def _is_call_of(self, made: Any, function: Any) -> bool:
         """Return True if the definition of a variable is a call of a Python function."""
         if not isinstance(made, ir.Expr) or made.op != "call":
             return False
         return getattr(self.typeof(made.func.name), "typing_key", None) is function
 
-    def _known(self, variable: Any) -> Any:
+    def _definition(self, variable: Any) -> Any:
         """Return the constant value of a variable, or its definition; the variable itself if it has several."""
         try:
             made = self.func_ir.get_definition(variable)
@@ -206,7 +206,7 @@ class Brief(_Lower):  # type: ignore[misc]
                 return builder.extract_value(self._part(kind, array, "shape"), axis)
 
             if isinstance(place, slice):
-                found.append(_within(builder, size(), place.start or 0, place.stop))
+                found.append(_slice_bounds(builder, size(), place.start or 0, place.stop))
                 continue
             at = self.loadvar(index.name)
             if isinstance(self.typeof(index.name), types.BaseTuple):
@@ -240,8 +240,8 @@ class Brief(_Lower):  # type: ignore[misc]
     def lower_expr(self, resty: Any, expr: Any) -> Any:
         """Lower loops over `range` with step 1, and pairs, to short code; leave everything else to numba."""
         kind = self.typeof(expr.value.name) if expr.op in LOOPS else None
-        if isinstance(kind, types.RangeType) and expr.op == "getiter" and self._by_ones(expr.value):
-            return self._begun(kind, self.loadvar(expr.value.name))
+        if isinstance(kind, types.RangeType) and expr.op == "getiter" and self._has_step_one(expr.value):
+            return self._range_iterator(kind, self.loadvar(expr.value.name))
         if isinstance(kind, types.RangeIteratorType) and expr.op == "iternext":
             return self._next(resty, self.loadvar(expr.value.name))
         if isinstance(kind, types.Pair) and not self.context.enable_nrt:
@@ -249,12 +249,12 @@ class Brief(_Lower):  # type: ignore[misc]
             return self.builder.extract_value(self.loadvar(expr.value.name), place)
         return super().lower_expr(resty, expr)
 
-    def _by_ones(self, variable: Any) -> bool:
+    def _has_step_one(self, variable: Any) -> bool:
         """Return True if a variable is a `range` of one or two arguments, with step 1."""
-        call = self._known(variable)
-        return self._calls(call, range) and len(call.args) < START_STOP_STEP and not call.vararg
+        call = self._definition(variable)
+        return self._is_call_of(call, range) and len(call.args) < START_STOP_STEP and not call.vararg
 
-    def _begun(self, kind: Any, numbers: Any) -> Any:
+    def _range_iterator(self, kind: Any, numbers: Any) -> Any:
         """Return the iterator of a range: pointer to the next number, end, step, pointer to the count left."""
         builder = self.builder
         start, stop, step = (builder.extract_value(numbers, place) for place in range(START_STOP_STEP))
@@ -303,7 +303,7 @@ def _struct(builder: Any, kind: Any, parts: Sequence[Any]) -> Any:
     return whole
 
 
-def _within(builder: Any, size: Any, start: int, stop: int | None) -> tuple[Any, Any]:
+def _slice_bounds(builder: Any, size: Any, start: int, stop: int | None) -> tuple[Any, Any]:
     """Return the first index of a slice of an axis, None for 0, and its length."""
 
     def least(number: int) -> Any:
@@ -317,7 +317,7 @@ def _within(builder: Any, size: Any, start: int, stop: int | None) -> tuple[Any,
     return first, builder.select(builder.icmp_signed("<", long, long.type(0)), long.type(0), long)
 
 
-def _takes_whole(fndesc: Any) -> bool:
+def _is_passed_directly(fndesc: Any) -> bool:
     """Return True if a function can receive its arguments without unpacking.
 
     Not if it has omitted defaults, which have no value, nor if it is recursive, as numba has its own method for such
@@ -332,23 +332,23 @@ class BriefPart(Brief):
 
     def setup_function(self, fndesc: Any) -> None:
         """Create the function, its entry block and its builder."""
-        if not _takes_whole(fndesc):
+        if not _is_passed_directly(fndesc):
             super().setup_function(fndesc)
             return
-        self.function = _declared(self.context, self.module, fndesc)
+        self.function = _declare(self.context, self.module, fndesc)
         self.entry_block = self.function.append_basic_block("entry")
         self.builder = llvm.IRBuilder(self.entry_block)
         self.call_helper = self.call_conv.init_call_helper(self.builder)
 
     def extract_function_arguments(self) -> Any:
         """Use the arguments without packing them."""
-        if not _takes_whole(self.fndesc):
+        if not _is_passed_directly(self.fndesc):
             return super().extract_function_arguments()
         self.fnargs = list(self.call_conv.get_arguments(self.function))
         return self.fnargs
 
 
-def _declared(context: Any, module: Any, fndesc: Any) -> Any:
+def _declare(context: Any, module: Any, fndesc: Any) -> Any:
     """Declare a function like numba, except that its arguments are not unpacked."""
     convention = context.call_conv
     known = convention.get_function_type(fndesc.restype, ())
@@ -368,13 +368,13 @@ def _declared(context: Any, module: Any, fndesc: Any) -> Any:
 
 def insert_part(context: Any, function: Any, fndesc: Any, libraries: tuple[Any, ...]) -> None:
     """Register a function for its callers, like numba's `insert_user_function`, but with arguments not unpacked."""
-    if not _takes_whole(fndesc):
+    if not _is_passed_directly(fndesc):
         context.insert_user_function(function, fndesc, libraries)
         return
 
     def call(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         convention = context.call_conv
-        called = _declared(context, builder.module, fndesc)
+        called = _declare(context, builder.module, fndesc)
         error_type = llvm.PointerType(callconv.excinfo_t)
         with builder.goto_entry_block():
             result = builder.alloca(convention.get_return_type(fndesc.restype).pointee)

@@ -12,7 +12,7 @@ import numpy as np
 
 from flockenv.geometry.cell_list import candidates, count_cells, row_of
 from flockenv.jit.decorators import Vec, kernel, law
-from flockenv.maths.approximations import nearest_whole
+from flockenv.maths.approximations import round_half_even
 from flockenv.maths.vectors import dot, sub
 
 __all__ = ["image", "led", "loaded", "near", "nearby", "vector", "write"]
@@ -45,7 +45,7 @@ def loaded(size: Vec, array: Any, b: int, i: int) -> Vec:
 
 @law
 def _shift(d: float, period: float) -> float:
-    return d - period * nearest_whole(d / period) if period > 0.0 else d
+    return d - period * round_half_even(d / period) if period > 0.0 else d
 
 
 @law

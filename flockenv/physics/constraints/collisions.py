@@ -11,7 +11,7 @@ from pydantic import Field
 
 from flockenv.core.warnings import UnsolvedContactsWarning
 from flockenv.geometry.cell_list import MAX_RANGES
-from flockenv.geometry.shapes import HalfSpace, packed
+from flockenv.geometry.shapes import HalfSpace, pack_shapes
 from flockenv.geometry.space import Box, Torus
 from flockenv.jit.section import entry
 from flockenv.model.scene_view import SceneView
@@ -159,7 +159,7 @@ class _Settler:
                     restitution.append(scene.space.restitution)
         if not self.record.obstacles:
             shapes, restitution = [], []
-        table, where = packed(shapes, d)
+        table, where = pack_shapes(shapes, d)
         rows = []
         for at, count in where.values():
             for _ in range(count):

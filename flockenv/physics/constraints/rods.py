@@ -13,7 +13,7 @@ from flockenv.core.warnings import UnmetWarning
 from flockenv.geometry.space import Torus
 from flockenv.jit.decorators import finite, kernel, like
 from flockenv.jit.section import entry
-from flockenv.maths.approximations import nearest_whole
+from flockenv.maths.approximations import round_half_even
 from flockenv.model.networks import EDGE
 from flockenv.model.scene_view import SceneView
 from flockenv.model.state import Floats, State
@@ -70,7 +70,7 @@ def _to(x: Any, b: int, i: int, j: int, period: Any, way: Any) -> float:
     for k in range(x.shape[0]):
         d = x[k, b, j] - x[k, b, i]
         if period[k] > 0:
-            d -= period[k] * nearest_whole(d / period[k])
+            d -= period[k] * round_half_even(d / period[k])
         way[k] = d
         square += d * d
     return np.sqrt(square)  # type: ignore[no-any-return]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv.geometry.eikonal import NO_WAY
-from flockenv.geometry.targets import Target, passed, row_size
+from flockenv.geometry.targets import Target, is_reached, row_size
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import scale, sub, unit, zero
 from flockenv.model.scene_view import SceneView
@@ -104,7 +104,7 @@ def routes_kept(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
     if not about(p, me) or door >= p.many:
         return (door, left, ready, was[0], was[1])
     e, now, mine = like(door, 1.0), me.time + seconds, np.int64(door)
-    if passed(p.table, 1 + mine * np.int64(p.size) + 2, was, me.pos):
+    if is_reached(p.table, 1 + mine * np.int64(p.size) + 2, was, me.pos):
         place = onwards(me)
         return (p.many, like(door, 0.0), ready, place[0], place[1])
     if now >= ready - like(seconds, 0.01) * seconds:

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from flockenv.geometry.targets import Target, passed, row_size, to_target
+from flockenv.geometry.targets import Target, is_reached, row_size, to_target
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import norm, scale, select, sub, unit, zero
-from flockenv.model.distribution import Spread, drawn
+from flockenv.model.distribution import Spread, draw
 from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.aims import about
 from flockenv.physics.effects.effect import Me
@@ -90,7 +90,7 @@ def journey_kept(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
     if waits:
         over = now >= ready - like(seconds, 0.01) * seconds
         stage = on if over else stage
-    elif stage < p.many and passed(p.table, stage_row(p, stage) + 2, was, me.pos):
+    elif stage < p.many and is_reached(p.table, stage_row(p, stage) + 2, was, me.pos):
         each = np.int64(p.many) + 1
         begin = np.int64(p.many) * np.int64(p.size) + np.int64(me.who - p.first) * each
         wait = p.table[begin + 1 + np.int64(stage)]
@@ -154,7 +154,7 @@ class Journey(Around):
         members = self.members(scene.starts)
         count = int(members["end"] - members["first"])
         given = [(self.premovement, PREMOVEMENT), *((s.wait, PREMOVEMENT + 1 + k) for k, s in enumerate(self.stages))]
-        waits = np.stack([drawn(value, count, channel) for value, channel in given], axis=1)
+        waits = np.stack([draw(value, count, channel) for value, channel in given], axis=1)
         places = {Target(**stage.place): name for stage, name in zip(*self.goals, strict=True)}
         blocks = [self.ways(scene, (place,), (name,)) for place, name in places.items()]
         begin = len(self.stages) * (HEAD + row_size(2)) + waits.size

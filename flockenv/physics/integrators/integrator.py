@@ -20,7 +20,7 @@ import numpy as np
 from numba.core import types
 from numba.extending import overload
 
-from flockenv.core.errors import nearest, shown
+from flockenv.core.errors import nearest, printable
 from flockenv.core.record import Record
 from flockenv.jit.decorators import OPTIONS
 from flockenv.model.state import WORK, Floats, State
@@ -100,7 +100,9 @@ def methods_named(names: Sequence[str]) -> tuple[Integrator, ...]:
     """Return methods by their kinds, each once; raise ValueError, with the nearest name, for an unknown one."""
     for name in names:
         if name not in INTEGRATORS:
-            raise ValueError(f"methods: {shown(name)} is none{nearest(name, INTEGRATORS)} ({', '.join(INTEGRATORS)})")
+            raise ValueError(
+                f"methods: {printable(name)} is none{nearest(name, INTEGRATORS)} ({', '.join(INTEGRATORS)})"
+            )
     return tuple(INTEGRATORS[name]() for name in dict.fromkeys(names))
 
 

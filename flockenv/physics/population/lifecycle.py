@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.geometry.shapes.table import packed
+from flockenv.geometry.shapes.table import pack_shapes
 from flockenv.geometry.space import Box
 from flockenv.jit.section import entry
 from flockenv.model.scene_view import SceneView
@@ -118,7 +118,7 @@ def _passing(scene: SceneView, sinks: Sequence[Sink], channel: int) -> Part:
 
 
 def _drain(scene: SceneView, sink: Drain) -> Part:
-    table, _ = packed([sink.shape], scene.dimension)
+    table, _ = pack_shapes([sink.shape], scene.dimension)
     anchor, slots = tuple(float(a) for a in sink.shape.anchor), _slots(scene, sink)
     kernel, period, dt = entry(drain), tuple(_period(scene)[: scene.dimension].tolist()), float(scene.dt)
 

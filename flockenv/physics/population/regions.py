@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, WrapValidator, model_validator
 
-from flockenv.core.record import Record, keep
+from flockenv.core.record import Record, instance_of
 from flockenv.geometry.shapes import AnyShape
 from flockenv.model.scene_view import SceneView
 from flockenv.physics.population.members import dimensions
@@ -223,5 +223,5 @@ if TYPE_CHECKING:
 else:
     AnyPlace = Annotated[
         Annotated[functools.reduce(operator.or_, PLACES.values()), Field(discriminator="kind")],
-        WrapValidator(keep(Place)),
+        WrapValidator(instance_of(Place)),
     ]

@@ -68,8 +68,8 @@ class _Trial:
             "momentum": _momentum_off(self.problem, path, reference.path),
         }
         self.point = self._point(
-            path.counted("evaluations"), {k: v for k, v in errors.items() if np.isfinite(v)},
-            unmatched(path, reference.path), path.counted("unsolved"),
+            path.count_of("evaluations"), {k: v for k, v in errors.items() if np.isfinite(v)},
+            unmatched(path, reference.path), path.count_of("unsolved"),
         )  # fmt: skip
 
     def _point(self, evaluations: int, errors: dict[str, float], unmatched: int = 0, unsolved: int = 0) -> Point:

@@ -25,7 +25,7 @@ class Path:
     who: NDArray[np.int64] | None = None  # (K, N) identity of the agent in each slot, -1 = empty slot
     work: NDArray[np.int64] | None = None  # (len(WORK),) work counters, see State.work
 
-    def counted(self, what: str) -> int:
+    def count_of(self, what: str) -> int:
         """Return one work counter; `what` is a name in WORK."""
         return 0 if self.work is None else int(self.work[WORK.index(what)])
 

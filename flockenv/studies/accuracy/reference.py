@@ -97,7 +97,7 @@ def own_steps(problem: Problem, finer: int | None = None, reason: str = "") -> R
 
 def _left_over(path: Path) -> list[str]:
     """Return notes on deviations of a run from its scene: contacts left unsolved, births without a free slot."""
-    unsolved, refused = path.counted("unsolved"), path.counted("births_refused")
+    unsolved, refused = path.count_of("unsolved"), path.count_of("births_refused")
     found = [f"{unsolved:,} contacts unsolved"] if unsolved else []
     slots = f"{refused:,} births found no free slot, so which agents are born depends on the step"
     return found + ([slots] if refused else [])

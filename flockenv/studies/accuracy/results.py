@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from flockenv.core.errors import nearest, shown
+from flockenv.core.errors import nearest, printable
 from flockenv.core.record import ResultRecord
 
 __all__ = ["COSTS", "FORMAT", "Choice", "Cost", "Curve", "Machine", "Point", "Report", "Results"]
@@ -177,7 +177,7 @@ class Report(ResultRecord):
             if curve.method == method:
                 return curve
         names = [curve.method for curve in self.curves]
-        raise ValueError(f"method = {shown(method)}: was not measured{nearest(method, names)} ({', '.join(names)})")
+        raise ValueError(f"method = {printable(method)}: was not measured{nearest(method, names)} ({', '.join(names)})")
 
     def cheapest(self, tolerance: float, by: Cost = "evaluations", interpolate: bool = True) -> Choice | None:
         """Return the cheapest choice with an error of at most `tolerance`, m; None if no method reaches it.

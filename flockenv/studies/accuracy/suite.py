@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from flockenv.behaviours import Alignment, Cohesion, Separation
-from flockenv.core.errors import nearest, shown
+from flockenv.core.errors import nearest, printable
 from flockenv.geometry.shapes import HalfSpace
 from flockenv.geometry.space import Torus
 from flockenv.model.networks import Rope
@@ -274,5 +274,5 @@ def problems_named(names: Sequence[str] = ()) -> list[Problem]:
     """Return problems by name (no names: all); raise ValueError, with the nearest name, for an unknown one."""
     for name in names:
         if name not in SUITE:
-            raise ValueError(f"problems: {shown(name)} is none{nearest(name, SUITE)} ({', '.join(SUITE)})")
+            raise ValueError(f"problems: {printable(name)} is none{nearest(name, SUITE)} ({', '.join(SUITE)})")
     return [SUITE[name]() for name in (dict.fromkeys(names) or SUITE)]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from flockenv.core.errors import nearest, shown
+from flockenv.core.errors import nearest, printable
 from flockenv.scene.yaml_io import ConfigError, load
 from flockenv.studies.experiments.experiment import Cell, Experiment, Results, Trial, run
 from flockenv.studies.experiments.plan import Case, Plan, SteerPlan, Variant
@@ -47,6 +47,6 @@ def load_plan(source: str | Path) -> Plan:
     measure = load(source, _Named).measure
     if measure not in PLANS:
         raise ConfigError(
-            f"measure = {shown(measure)}: unknown{nearest(measure, PLANS) or ';'} allowed: {', '.join(PLANS)}"
+            f"measure = {printable(measure)}: unknown{nearest(measure, PLANS) or ';'} allowed: {', '.join(PLANS)}"
         )
     return load(source, PLANS[measure])

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from flockenv.geometry.shapes import clear_of
+from flockenv.geometry.shapes import distance_to_shapes
 from flockenv.model.state import State
 from flockenv.scene import Scene
 from flockenv.studies.measures.order import nearest_distances, polarisation
@@ -45,7 +45,7 @@ def _measure(scene: Scene, state: State, world: int, progress: Callable[[int], N
         touching |= (size > 0) & (np.linalg.norm(scene.space.displacement(pos, centre), axis=1) < radius + size)
     if scene.shapes:
         period = np.array(scene.space.extent(scene.dimension) if scene.space.periodic else (0.0,) * scene.dimension)
-        touching |= clear_of(scene.shapes, np.asarray(pos, float), period, float(state.time[world])) < radius
+        touching |= distance_to_shapes(scene.shapes, np.asarray(pos, float), period, float(state.time[world])) < radius
     return {
         "agents": float(alive.sum()),
         "speed": float(speed.mean()) if len(speed) else np.nan,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.core.atomic_files import replacing
+from flockenv.core.atomic_files import replace_file
 from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK
 from flockenv.studies.measures import JUELICH, Tail, survival, weidmann_flow, weidmann_speed
 
@@ -150,7 +150,7 @@ def new_figure(wide: float, tall: float, title: str) -> Figure:
 
 def save(figure: Figure, path: str | Path) -> None:
     """Write a figure as a PNG file, whole or not at all; the same numbers give the same bytes."""
-    with replacing(path) as file:
+    with replace_file(path) as file:
         figure.savefig(file, format="png", dpi=100, metadata={"Software": "flockenv"})
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flockenv.core.errors import shown
+from flockenv.core.errors import printable
 from flockenv.geometry.shapes.outlines import area, crossing
 
 __all__ = ["Corners", "checked", "contains", "convex", "cut", "rectangle"]
@@ -21,12 +21,12 @@ def checked(name: str, polygon: ArrayLike, is_convex: bool = False) -> Floats:
     """Return a polygon (n, 2), m, counter-clockwise; raise ValueError if it has no area or crosses itself."""
     vertices = np.asarray(polygon, np.float64)
     if vertices.ndim != 2 or vertices.shape[1:] != (2,) or len(vertices) < 3 or not np.isfinite(vertices).all():
-        raise ValueError(f"{name} = {shown(vertices.tolist())}: must be at least three corners (x, y), all finite")
+        raise ValueError(f"{name} = {printable(vertices.tolist())}: must be at least three corners (x, y), all finite")
     if area(vertices) == 0 or crossing(vertices) is not None:
-        raise ValueError(f"{name} = {shown(vertices.tolist())}: must enclose an area, and its edges must not cross")
+        raise ValueError(f"{name} = {printable(vertices.tolist())}: must enclose an area, and its edges must not cross")
     vertices = vertices if area(vertices) > 0 else vertices[::-1].copy()
     if is_convex and not convex(vertices):
-        raise ValueError(f"{name} = {shown(vertices.tolist())}: must be convex")
+        raise ValueError(f"{name} = {printable(vertices.tolist())}: must be convex")
     return vertices
 
 

@@ -36,12 +36,12 @@ def cloth(stiffness: float, steps: int = 20) -> Callable[[Integrator], Value]:
         for _ in range(steps):
             state = scene.step(state)
             most = max(most, _energy(scene, state) / max(_fallen(scene, state), 1e-12))
-        newton, linear = state.counted("newton_iterations"), state.counted("linear_iterations")
+        newton, linear = state.count_of("newton_iterations"), state.count_of("linear_iterations")
         note = f"energy at most {most:.3g} of the work of gravity"
         if newton:
             note += f"; {newton / steps:.3g} iterations of Newton's method and {linear / steps:.3g} solves a step"
-        if state.counted("substeps"):
-            note += f"; {state.counted('substeps') / steps:.4g} steps of its own in each"
+        if state.count_of("substeps"):
+            note += f"; {state.count_of('substeps') / steps:.4g} steps of its own in each"
         return Value(most, most <= 1.05, note)
 
     return trial

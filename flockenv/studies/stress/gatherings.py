@@ -137,7 +137,7 @@ def chaos(method: Integrator, response: Response) -> Value:
         if off > 1e-9:
             break
         till = (k + 1) * scene.dt
-    note = f"the same bits: {same}; renumbered within 1e-9 m until {till:.2f} s and {one.counted('impacts')} impacts"
+    note = f"the same bits: {same}; renumbered within 1e-9 m until {till:.2f} s and {one.count_of('impacts')} impacts"
     return Value(till, same and till >= 1.0, note)
 
 

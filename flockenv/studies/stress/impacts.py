@@ -258,7 +258,7 @@ def far_away(method: Integrator, response: Response) -> Value:
         scene = gas(method, response, offset)
         state: State = scene.run(batch(scene, place + np.array((offset, -offset)), vel), 30)
         ends.append(state.pos[0] - (offset, -offset))
-        impacts = int(state.counted("impacts"))
+        impacts = int(state.count_of("impacts"))
     off = max(float(np.abs(end - ends[0]).max()) for end in ends[1:])
     refused = 0
     for offset in (1e4 + 1, 1e7):

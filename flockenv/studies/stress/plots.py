@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockenv.core.atomic_files import replacing
+from flockenv.core.atomic_files import replace_file
 from flockenv.evaluation.plots import INK
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ FILL: dict[Verdict, str] = {
 def write_verdicts(path: str | Path, results: Results) -> None:
     """Write the picture as a PNG file, whole or not at all; the same findings give the same bytes."""
     figure = draw_verdicts(results)
-    with replacing(path) as file:
+    with replace_file(path) as file:
         figure.savefig(file, format="png", dpi=120, metadata={"Software": "flockenv"})
 
 

@@ -9,7 +9,7 @@ missed bound is a verdict and not an error.
 
 from __future__ import annotations
 
-from flockenv.core.errors import nearest, shown
+from flockenv.core.errors import nearest, printable
 from flockenv.scene.presets import PRESETS
 from flockenv.studies.trial_log import VERDICTS, Case, Finding, Results, Value, cases_named, trials
 from flockenv.studies.validation.alone import ALONE
@@ -36,6 +36,6 @@ def presets_named(names: list[str]) -> tuple[str, ...]:
     for name in names:
         if name not in PRESETS and name not in ALIASES:
             raise ValueError(
-                f"--preset = {shown(name)}: unknown{nearest(name, [*PRESETS, *ALIASES])}; {', '.join(PRESETS)}"
+                f"--preset = {printable(name)}: unknown{nearest(name, [*PRESETS, *ALIASES])}; {', '.join(PRESETS)}"
             )
     return tuple(dict.fromkeys(ALIASES.get(name, name) for name in names)) or VALIDATED

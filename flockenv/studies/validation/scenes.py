@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from flockenv.core.atomic_files import made, replacing
+from flockenv.core.atomic_files import new_folder, replace_file
 from flockenv.scene.yaml_io import dump_scene
 from flockenv.studies.trial_log import Case
 from flockenv.studies.validation import alone, corridors, doors
@@ -39,7 +39,7 @@ def write_scenes(folder: Path, cases: Sequence[Case], presets: Sequence[str], fo
     for path, case, name, built in todo:
         with quietly():
             text = dump_scene(built(name), [name], brief=True)
-        with made(path.parent), replacing(path) as file:
+        with new_folder(path.parent), replace_file(path) as file:
             file.write(f"{_head(case, path)}{text}".encode())
     return [path for path, *_ in todo]
 
