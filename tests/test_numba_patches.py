@@ -187,7 +187,8 @@ def dispatchers(part):
     if hasattr(part, "signatures"):
         yield part
     function = python_of(part)
-    for inner in part if isinstance(part, tuple) else free_values(function) if isinstance(function, FunctionType) else ():
+    parts = free_values(function) if isinstance(function, FunctionType) else ()
+    for inner in part if isinstance(part, tuple) else parts:
         yield from dispatchers(inner)
 
 scene = scene_under(next(row for row in EFFECTS if row.effect.kind == "drag"), 2)

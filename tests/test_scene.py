@@ -544,7 +544,7 @@ def test_a_scene_of_gravity_alone_allocates_nothing_for_other_laws() -> None:
     few, many = (Workspace.allocate(s.parts, s.body, s.table).arrays for s in scenes)
     growing = {name for name in few if many[name].size > few[name].size}
     body = {"mass", "radius", "max_speed", "max_force", "living", "ident"}
-    assert growing == {"pos", "vel", "aside", "want"} | body
+    assert growing == {"pos", "vel", "saved", "requested_force"} | body
     handed = set(scratch_of(scenes[0].parts, 160))
     assert handed == growing | {"counters", "tally", "sync", "lanes"}  # of agents, threads, and of divergence
     start = scenes[0].start(0)

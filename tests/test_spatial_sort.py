@@ -51,11 +51,11 @@ def test_cells_with_agents_from_other_tiles_are_sorted_by_agent_number(size: Any
     np.testing.assert_array_equal(tile, (z_of * up + y_of) * along + x_of)
     ident = np.argsort(tile, kind="stable")
     home = tile[ident]
-    homes, strangers = np.zeros(blocks * HOME, np.int32), np.full(n + 1, -7, np.int32)
-    entry(find_home_tiles)(0, blocks, LANES, n, shape, start, homes)
+    home_tiles, displaced = np.zeros(blocks * HOME, np.int32), np.full(n + 1, -7, np.int32)
+    entry(find_home_tiles)(0, blocks, LANES, n, shape, start, home_tiles)
     moved = ((x[ident] + rng.uniform(-stride, stride, (n, d))) % size).astype(np.float32)
     tally = np.zeros(2, np.int64)
-    again, cell, start = counted(count_from_home_tiles, moved, homes, strangers, tally)
+    again, cell, start = counted(count_from_home_tiles, moved, home_tiles, displaced, tally)
     plain, expected, begins = counted(count_cells, moved)
     assert shape == again == plain
     np.testing.assert_array_equal(cell, expected)
@@ -63,14 +63,14 @@ def test_cells_with_agents_from_other_tiles_are_sorted_by_agent_number(size: Any
     many = [len(set(home[k : k + LANES])) > 2 for k in range(0, n, LANES)]  # such a block has no home tile
     away = (counted(count_tiles, moved)[1] != home) | np.repeat(many, LANES)[:n]
     assert any(many) == (empty > 0)
-    np.testing.assert_array_equal(strangers[: tally[1]], cell[away])
+    np.testing.assert_array_equal(displaced[: tally[1]], cell[away])
 
     place = np.argsort(cell, kind="stable")  # the order in which agents are put into cells
     numbers = ident.astype(np.float32)
     records = np.column_stack([place, place + 0.5, -place]).astype(np.float32)
     ends = start[1:][None].copy()
     flat = records.reshape(-1).copy()
-    entry(order_cells)(flat, 3, numbers, start, ends, 0, strangers, 0, int(tally[1]))
+    entry(order_cells)(flat, 3, numbers, start, ends, 0, displaced, 0, int(tally[1]))
     np.testing.assert_array_equal(flat.reshape(n, 3), records[np.lexsort((ident[place], cell[place]))])
     assert (flat != records.reshape(-1)).any() == (stride > 0)
-    assert (ends[0, strangers[: tally[1]]] == -1).all()  # each cell is sorted once, for any number of strangers
+    assert (ends[0, displaced[: tally[1]]] == -1).all()  # each cell is sorted once, for any number of displaced agents

@@ -90,4 +90,4 @@ def test_tables_beyond_the_integers_of_float32_are_refused(lookup: Any, monkeypa
 def test_a_scene_without_tables_has_no_numbers_of_tables(lookup: Any) -> None:
     scene = scene_with()
     assert scene.parts.tables == ()
-    assert len(scene.parts.given()) == len(scene.parts.parameters())
+    assert len(scene.parts.packed_numbers()) == len(scene.parts.parameters())

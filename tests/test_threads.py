@@ -215,10 +215,10 @@ def test_a_team_reorders_smaller_worlds_than_one_thread_does() -> None:
     for team, count in ((2, STEPS_ARRANGED - 1), (2, STEPS_ARRANGED), (3, STEPS_ARRANGED)):
         use_threads(team)
         found = scene.step(start, steps=count)
-        luggage = scene.stepper.workspaces(1, team)[0].arrays["luggage"]
-        assert luggage.any() == (count == STEPS_ARRANGED)
+        buffer = scene.stepper.workspaces(1, team)[0].arrays["reorder_buffer"]
+        assert buffer.any() == (count == STEPS_ARRANGED)
         assert_same(scene.step(found, steps=STEPS_ARRANGED - count), expected)
-    assert not scene.stepper.workspaces(1, 1)[0].arrays["luggage"].any()
+    assert not scene.stepper.workspaces(1, 1)[0].arrays["reorder_buffer"].any()
 
 
 def scene_is_flat(name: str) -> bool:

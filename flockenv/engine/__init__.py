@@ -28,8 +28,8 @@ from flockenv.engine.scratch import OWN, TABLES, scratch_bytes, scratch_of, scra
 from flockenv.engine.step import StepPlan, step_plan, step_world_of
 
 __all__ = [
-    "GIVEN",
     "OWN",
+    "TABLES",
     "BeginPlan",
     "KernelPlan",
     "Look",
@@ -41,7 +41,7 @@ __all__ = [
     "begin_of",
     "begin_plan",
     "field_of",
-    "flattened",
+    "flatten_effects",
     "look_of",
     "pack",
     "plan_look",

@@ -1,10 +1,10 @@
 """The acceleration of every agent of a world: the forces of all laws, summed and divided by mass.
 
-Pair laws come first, in one pass over the candidates (`sense`), and leave their sums in `felt`, by agent; laws about
-all agents, and bonds, leave theirs in `pulled`. Then each block adds the steering and external forces of its agents,
-and the folds over the obstacles (`respond`); the steering force is limited to max_force. With a method of one stage the
-step continues from there, a few blocks at a time; `accelerate` serves all other methods, and calls for accelerations
-alone.
+Pair laws come first, in one pass over the candidates (`sense`), and write their sums to `pair_force`, by agent; laws
+about all agents, and bonds, write theirs to `far_bond_force`. Then each block adds the steering and external forces of
+its agents, and the folds over the obstacles (`respond`); the steering force is limited to max_force. With a method of
+one stage the step continues from there, a few blocks at a time; `accelerate` serves all other methods, and calls for
+accelerations alone.
 """
 
 from __future__ import annotations
@@ -37,9 +37,11 @@ __all__ = ["accelerate_of", "pair_force_of", "respond_of", "response_plan", "sen
 class Added(NamedTuple):
     """A vector that is added to an agent's steering force, to its external force, or to the force of one behaviour."""
 
-    kind: str  # "own" law, "still": an own law without its drag, "group", "fold" over obstacles, "felt", "pulled"
+    kind: str
+    """An "own" law, an own law without its drag ("still"), a "group" law, a "fold" over obstacles, or the scratch array
+    "pair_force" or "far_bond_force"."""
     law: OneLaw | None = None  # of a fold: its finish law
-    places: tuple[int, ...] = ()  # of a fold: its numbers among the lanes; of "felt": where it lies in a block
+    places: tuple[int, ...] = ()  # of a fold: its numbers among the lanes; of "pair_force": where it lies in a block
 
 
 class Combination(NamedTuple):
@@ -47,7 +49,7 @@ class Combination(NamedTuple):
 
     k: int
     law: Law
-    wishes: tuple[int, ...]
+    behaviours: tuple[int, ...]
 
 
 class ResponsePlan(NamedTuple):
@@ -59,16 +61,16 @@ class ResponsePlan(NamedTuple):
     flows: tuple[OneLaw, ...]
     added: tuple[Added, ...]
     totals: tuple[tuple[int, ...], ...]  # indices into `added`: of steering, external and behaviour forces
-    reconciled: tuple[Combination, ...]
-    steered: tuple[tuple[int, ...], tuple[int, ...]]  # indices into `reconciled`: of steering, external forces
-    felt: int  # count of numbers of a block in `felt`
+    combinations: tuple[Combination, ...]
+    combined_into: tuple[tuple[int, ...], tuple[int, ...]]  # indices into `combinations`: of steering, external forces
+    pair_force_size: int  # count of numbers of a block in `pair_force`
     obstacles: Obstacles | None
     groups: GroupPlan | None
 
 
 def response_plan(parts: KernelPlan) -> ResponsePlan:
     """Return the plan of a scene."""
-    targets, wishes = ["s", "f", *(f"w{k}_" for k in parts.wishes)], list(parts.wishes)
+    targets, combined = ["s", "f", *(f"w{k}_" for k in parts.combined)], list(parts.combined)
     added: list[tuple[str, Added]] = []
     for k, effect in enumerate(parts.effects):
         if effect.own_law is not None:
@@ -80,19 +82,21 @@ def response_plan(parts: KernelPlan) -> ResponsePlan:
             slots = tuple(place * parts.width for name, place in parts.slots.items() if name.startswith(f"o{k}_"))
             # A fold is passed no image points: its law already gets the shortest offset to each obstacle.
             added.append((parts.target(k), Added("fold", OneLaw(k, effect.obstacle_finish), slots)))
-    added += [(name, Added("felt", None, (parts.felt_at(name),))) for name in parts.targets if name[0] != "n"]
-    added += [("f", Added("pulled"))] * parts.pulls
+    added += [
+        (name, Added("pair_force", None, (parts.pair_force_at(name),))) for name in parts.targets if name[0] != "n"
+    ]
+    added += [("f", Added("far_bond_force"))] * parts.has_far_bond_force
     mine = [(k, e) for k, e in enumerate(parts.effects) if e.wishes]
-    reconciled = tuple(
-        Combination(k, e.steer_law, tuple(j for j, wish in enumerate(wishes) if parts.wishes[wish] == k))
+    combinations = tuple(
+        Combination(k, e.steer_law, tuple(j for j, behaviour in enumerate(combined) if parts.combined[behaviour] == k))
         for k, e in mine
     )
-    steered = [tuple(j for j, (k, _) in enumerate(mine) if parts.target(k) == name) for name in ("s", "f")]
+    combined_into = [tuple(j for j, (k, _) in enumerate(mine) if parts.target(k) == name) for name in ("s", "f")]
     return ResponsePlan(
         agent_plan(parts), parts.arranges, laws_of(parts, "medium_law"), laws_of(parts, "flow_law"),
         tuple(one for _, one in added),
         tuple(tuple(j for j, (to, _) in enumerate(added) if to == name) for name in targets),
-        reconciled, (steered[0], steered[1]), parts.felt_size,
+        combinations, (combined_into[0], combined_into[1]), parts.pair_force_size,
         obstacle_plan(parts, agent_plan(parts)) if parts.folds_obstacles else None,
         group_plan(parts) if parts.grouped else None,
     )  # fmt: skip
@@ -180,9 +184,9 @@ def _sum_all(laws: tuple[Any, ...]) -> Callable[[Vec, Any], Vec]:
 
 @functools.cache
 def pair_force_of(dimension: int, width: int, each: int, place: int) -> Callable[..., Vec]:
-    """Return `felt(scratch, row, lane)`: the sum of pair laws for the agent in a lane of the block at `row`."""
+    """Return `pair_force(scratch, row, lane)`: the sum of pair laws for the agent in a lane of the block at `row`."""
     vector, first, rows = vector_of_lane(dimension, width), np.uint64(place), np.uint64(each // width)
-    return kernel(lambda scratch, row, lane: vector(scratch.felt, row * rows + first + lane))
+    return kernel(lambda scratch, row, lane: vector(scratch.pair_force, row * rows + first + lane))
 
 
 @functools.cache
@@ -190,11 +194,11 @@ def _added_vector(plan: ResponsePlan, added: Added) -> Callable[..., Vec]:
     """Return `adds(numbers, scratch, me, row, at, lane)`: a vector that is added for an agent."""
     kind, one, places = added
     vector = vector_of_lane(plan.agent.dimension, plan.agent.width)
-    if kind == "pulled":
-        return kernel(lambda numbers, scratch, me, row, at, lane: vector(scratch.pulled, at))
-    if kind == "felt":
-        felt = pair_force_of(plan.agent.dimension, plan.agent.width, plan.felt, *places)
-        return kernel(lambda numbers, scratch, me, row, at, lane: felt(scratch, row, lane))
+    if kind == "far_bond_force":
+        return kernel(lambda numbers, scratch, me, row, at, lane: vector(scratch.far_bond_force, at))
+    if kind == "pair_force":
+        pair_force = pair_force_of(plan.agent.dimension, plan.agent.width, plan.pair_force_size, *places)
+        return kernel(lambda numbers, scratch, me, row, at, lane: pair_force(scratch, row, lane))
     assert one is not None
     if kind == "fold":
         k, law = one.k, one.law
@@ -210,42 +214,42 @@ def _added_vector(plan: ResponsePlan, added: Added) -> Callable[..., Vec]:
                 given(numbers, me), me, members(scratch.lanes, numbers.size, me.pos)
             )
         )
-    says = value_of(one)
+    value = value_of(one)
     if kind == "still":
-        return kernel(lambda numbers, scratch, me, row, at, lane: says(numbers, at_rest(me)))
-    return kernel(lambda numbers, scratch, me, row, at, lane: says(numbers, me))
+        return kernel(lambda numbers, scratch, me, row, at, lane: value(numbers, at_rest(me)))
+    return kernel(lambda numbers, scratch, me, row, at, lane: value(numbers, me))
 
 
 @section
 def _totals(plan: ResponsePlan) -> Callable[..., Any]:
-    """Make `totals(numbers, scratch, me, wanted, row, at, lane)`: sum the forces of an agent.
+    """Make `totals(numbers, scratch, me, requested, row, at, lane)`: sum the forces of an agent.
 
-    `wanted` is the commanded steering force. Returns the steering force, the external force, and the tuple of the
+    `requested` is the commanded steering force. Returns the steering force, the external force, and the tuple of the
     forces of those behaviours that an effect combines.
     """
     adding = tuple_from(*(_added_vector(plan, one) for one in plan.added)) if plan.added else None
-    want, force, *wishes = map(sum_of, plan.totals)
-    wishing: Any = tuple_from(*wishes) if wishes else kernel(lambda start, vectors: ())
+    steering, external, *behaviours = map(sum_of, plan.totals)
+    each_behaviour: Any = tuple_from(*behaviours) if behaviours else kernel(lambda start, vectors: ())
 
-    def totals(numbers: Any, scratch: Any, me: Any, wanted: Any, row: Any, at: Any, lane: Any) -> Any:
+    def totals(numbers: Any, scratch: Any, me: Any, requested: Any, row: Any, at: Any, lane: Any) -> Any:
         o = zero(me.pos)
         if adding is None:
-            return wanted, o, ()
+            return requested, o, ()
         vectors = adding(numbers, scratch, me, row, at, lane)
-        return want(wanted, vectors), force(o, vectors), wishing(o, vectors)
+        return steering(requested, vectors), external(o, vectors), each_behaviour(o, vectors)
 
     return totals
 
 
 @functools.cache
 def _combined_force(one: Combination) -> Callable[..., Vec]:
-    """Return `steers(numbers, me, wishes)`: an effect's combined behaviours; 0 for an agent of another group."""
+    """Return `steers(numbers, me, forces)`: an effect's combined behaviours; 0 for an agent of another group."""
     k, law, places = one
 
-    def steers(numbers: Any, me: Any, wishes: Any) -> Any:
+    def steers(numbers: Any, me: Any, forces: Any) -> Any:
         p = numbers.effects[k]
         member = (me.who >= p.first) & (me.who < p.end)
-        return select(member, law(p, me, pick_items(wishes, (), places))[0], zero(me.pos))
+        return select(member, law(p, me, pick_items(forces, (), places))[0], zero(me.pos))
 
     return kernel(steers)
 
@@ -255,7 +259,7 @@ def respond_of(plan: ResponsePlan) -> Callable[..., None]:
     """Make `respond(context, pos, vel, time, block, out, to)`: write the accelerations of a block, m/s^2.
 
     They are written at `to` in the array of vectors `out`. If a medium carries the agents, its velocity goes to
-    `carrying`.
+    `advection`.
     """
     agent, d, width = plan.agent, plan.agent.dimension, plan.agent.width
     size, vector, put = np.uint64(d * width), vector_of_lane(d, width), put_vector_of(d, width)
@@ -263,14 +267,14 @@ def respond_of(plan: ResponsePlan) -> Callable[..., None]:
     medium: Any = tuple_from(*map(value_of, plan.media)) if plan.media else None
     of_medium, of_flow = _sum_all(plan.media), _sum_all(plan.flows)
     flow: Any = tuple_from(*map(value_of, plan.flows)) if plan.flows else None
-    steering: Any = tuple_from(*map(_combined_force, plan.reconciled)) if plan.reconciled else None
-    to_want, to_force = map(sum_of, plan.steered)
+    combine: Any = tuple_from(*map(_combined_force, plan.combinations)) if plan.combinations else None
+    to_steering, to_external = map(sum_of, plan.combined_into)
     meet_obstacles = obstacles_of(plan.obstacles) if plan.obstacles is not None else None
 
     def respond(context: Any, pos: Any, vel: Any, time: Any, block: Any, out: Any, to: Any) -> None:
         scratch, numbers, drawn = context.scratch, context.numbers, context.key[context.b]
         base, row = block * size, block * np.uint64(width)
-        one, live, wish = common(scratch, context.n, context.present, block)
+        one, live, request = common(scratch, context.n, context.present, block)
         if meet_obstacles is not None:
             meet_obstacles(context, pos, vel, time, block)
         for lane in range(np.uint64(width)):
@@ -281,18 +285,20 @@ def respond_of(plan: ResponsePlan) -> Callable[..., None]:
             if medium is not None:
                 moves = of_medium(o, medium(numbers, me))
                 me = alone(scratch, drawn, time, at, i, one + lane, x, v, moves)
-            wants, acts, wishes = totals(numbers, scratch, me, vector(scratch.want, wish + lane), row, at, lane)
-            if steering is not None:
-                steered = steering(numbers, me, wishes)
-                wants, acts = to_want(wants, steered), to_force(acts, steered)
-            wants = limit(wants, scratch.max_force[one + lane])
+            steering, external, forces = totals(
+                numbers, scratch, me, vector(scratch.requested_force, request + lane), row, at, lane
+            )
+            if combine is not None:
+                combined = combine(numbers, me, forces)
+                steering, external = to_steering(steering, combined), to_external(external, combined)
+            steering = limit(steering, scratch.max_force[one + lane])
             # Select, do not multiply by 0: a law may be infinite for dead agents, for agents of infinite mass (held in
             # place) and in the lanes beyond the last agent.
             here = (scratch.living[live + lane] > o[0]) & (scratch.mass[one + lane] < like(o[0], np.inf))
             share = like(o[0], 1.0) / scratch.mass[one + lane]
-            put(out, to + lane, select(here, scale(add(wants, acts), share), o))
+            put(out, to + lane, select(here, scale(add(steering, external), share), o))
             if flow is not None:
-                put(scratch.carrying, at, select(here, of_flow(o, flow(numbers, me)), o))
+                put(scratch.advection, at, select(here, of_flow(o, flow(numbers, me)), o))
 
     return respond
 

@@ -47,7 +47,7 @@ def agent_of(plan: AgentPlan) -> Callable[..., Me]:
     def alone(scratch: Any, drawn: Any, time: Any, place: Any, i: Any, one: Any, x: Any, v: Any, medium: Any) -> Any:
         heading = vector(scratch.facing, place) if oriented else unit(v)
         aim = vector(scratch.aiming, place) if aims else zero(x)
-        wished = scratch.desired_speed[i] if paced else like(x[0], 0.0)
+        desired_speed = scratch.desired_speed[i] if paced else like(x[0], 0.0)
         return Me(
             scratch.ident[i],
             x,
@@ -62,7 +62,7 @@ def agent_of(plan: AgentPlan) -> Callable[..., Me]:
             medium,
             drawn,
             aim,
-            wished,
+            desired_speed,
             inner(scratch, i),
         )
 

@@ -57,7 +57,7 @@ def put_vector_of(dimension: int, width: int) -> Callable[..., None]:
 
 @section
 def common_places(dimension: int, width: int, masked: bool) -> Callable[..., tuple[Any, Any, Any]]:
-    """Make `common(scratch, n, present, block)`: return where the bodies, `living` and `want` of a block begin.
+    """Make `common(scratch, n, present, block)`: where bodies, `living` and `requested_force` of a block begin.
 
     In a large world numbers that all agents share are read from the first block, because large worlds are limited by
     memory bandwidth.

@@ -46,7 +46,9 @@ def pack(parts: KernelPlan, agents: int, groups: Sequence[object]) -> Table:
         try:
             found = effect.bonds(groups, d)
         except ValueError as error:
-            listed = k - sum(wish < k for wish in parts.wishes)  # the effects listed before the one that combines them
+            listed = k - sum(
+                each < k for each in parts.combined
+            )  # the effects listed before the one that combines them
             raise ValueError(f"effects[{listed}].{error}") from None
         start, place, number = _pack_bonds(found, agents, blocks, w, d)
         starts.append(start)
@@ -104,7 +106,7 @@ class BondPlan(NamedTuple):
     laws: tuple[BondLaw, ...]  # in the order of the table
     sums: int  # where the sums of a block begin in the scratch of lanes
     waits: bool  # True if no earlier phase has waited until all threads have written their positions
-    adds: bool  # True if `pulled` already holds forces of far laws
+    adds: bool  # True if `far_bond_force` already holds forces of far laws
 
 
 def bond_plan(parts: KernelPlan, agent: AgentPlan) -> BondPlan:
@@ -117,23 +119,26 @@ def bond_plan(parts: KernelPlan, agent: AgentPlan) -> BondPlan:
 
 @section
 def bonds_of(plan: BondPlan) -> Callable[..., None]:
-    """Make `bonds(context, pos, vel, time)`: write the forces of bonds on this thread's agents, N, into `pulled`."""
+    """Make `bonds(context, pos, vel, time)`: write the forces of bonds, N, into `far_bond_force`.
+
+    Those on this thread's agents.
+    """
     add = _add_bonds(plan, len(plan.laws) - 1)
     waits, adds = plan.waits, plan.adds
     count, sums = plan.agent.dimension * plan.agent.width, np.uint64(plan.sums)
 
     def bonds(context: Any, pos: Any, vel: Any, time: Any) -> None:
         scratch, numbers, key, n = context.scratch, context.numbers, context.key[context.b], context.n
-        sync, team, lanes, pulled = scratch.sync, context.team, scratch.lanes, scratch.pulled
+        sync, team, lanes, forces = scratch.sync, context.team, scratch.lanes, scratch.far_bond_force
         if waits:
             wait_for_team(sync, team)  # all threads have written their positions now
         for block in range(np.uint64(context.first), np.uint64(context.end)):
             base = block * np.uint64(count)
             for place in range(np.uint64(count)):
-                lanes[sums + place] = pulled[base + place] if adds else like(pulled[0], 0.0)
+                lanes[sums + place] = forces[base + place] if adds else like(forces[0], 0.0)
             add(scratch, numbers.effects, numbers.size, pos, vel, time, key, n, block)
             for place in range(np.uint64(count)):
-                pulled[base + place] = lanes[sums + place]
+                forces[base + place] = lanes[sums + place]
         wait_for_team(sync, team)  # no agent moves before all threads have read positions
 
     return bonds
@@ -170,14 +175,14 @@ def _add_bonds(plan: BondPlan, place: int) -> Callable[..., None]:
                 x, v = vector(pos, at), vector(vel, at)
                 me = alone(scratch, key, time, at, i, i, x, v, zero(x))
                 others = partners_of(kept, placed, pos, vel, scratch.radius, scratch.mass, size, x, places + lane)
-                says = law(effects[k], me, others, gather(numbered, first + lane, of_bond))
+                value = law(effects[k], me, others, gather(numbered, first + lane, of_bond))
                 whole = are_alive(placed, living, places + lane)  # a bond with a dead partner exerts no force
                 # exact_sum: each form of the loop would fuse the products differently, and bits would depend on the
                 # processor
-                lanes[sum_x + lane] = exact_sum(lanes[sum_x + lane], says[0] if whole else like(x[0], -0.0))
-                lanes[sum_y + lane] = exact_sum(lanes[sum_y + lane], says[1] if whole else like(x[0], -0.0))
+                lanes[sum_x + lane] = exact_sum(lanes[sum_x + lane], value[0] if whole else like(x[0], -0.0))
+                lanes[sum_y + lane] = exact_sum(lanes[sum_y + lane], value[1] if whole else like(x[0], -0.0))
                 if dimension == 3:
-                    lanes[sum_z + lane] = exact_sum(lanes[sum_z + lane], says[2] if whole else like(x[0], -0.0))
+                    lanes[sum_z + lane] = exact_sum(lanes[sum_z + lane], value[2] if whole else like(x[0], -0.0))
 
     return add
 

@@ -14,7 +14,7 @@ class Worlds(NamedTuple):
 
     x: Any  # (D, B, N) m
     v: Any  # (D, B, N) m/s
-    carried: Any  # a tuple of arrays: frames and inner states, if there are any
+    frame_and_inner: Any  # a tuple of arrays: frames and inner states, if there are any
     alive: Any  # (B, N)
     tick: Any  # (B,) steps since the start
     key: Any  # (B,) key of random numbers
@@ -26,8 +26,8 @@ class Worlds(NamedTuple):
 def worlds_of(state: State) -> Worlds:
     """Return the arrays of a state."""
     return Worlds(
-        state.x, state.v, state.carried, state.alive, state.tick, state.key, state.obstacle_x, state.obstacle_radius,
-        state.work,
+        state.x, state.v, state.frame_and_inner, state.alive, state.tick, state.key, state.obstacle_x,
+        state.obstacle_radius, state.work,
     )  # fmt: skip
 
 

@@ -99,7 +99,7 @@ def begin_inner_of(plan: BeginPlan) -> Callable[..., None]:
                 x, v = vector(scratch.pos, at), vector(scratch.vel, at)
                 clear(scratch.inner, i)
                 me = alone(scratch, worlds.key[b], time, at, i, i, x, v, zero(x))
-                write(worlds.carried[place], b, i, begin(numbers, me))
+                write(worlds.frame_and_inner[place], b, i, begin(numbers, me))
 
     return begin_inner
 
@@ -170,9 +170,9 @@ def _scene_field(plan: ResponsePlan, sensed: SensePlan, number_plan: NumberPlan)
                 worlds.obstacle_x, worlds.obstacle_radius, worlds.work, params, read(params, scratch.counters),
                 worlds.key, b, n, present, False, 0, end, 0, 1, scratch,
             )  # fmt: skip
-            accelerate(context, scratch.pos, scratch.vel, times[b], scratch.aside)
-            out(scratch.aside, acc, b, n, 0, end)
+            accelerate(context, scratch.pos, scratch.vel, times[b], scratch.saved)
+            out(scratch.saved, acc, b, n, 0, end)
             if flows:
-                out(scratch.carrying, flow, b, n, 0, end)
+                out(scratch.advection, flow, b, n, 0, end)
 
     return scene_field

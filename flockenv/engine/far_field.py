@@ -2,7 +2,7 @@
 
 Where agents are few, or an effect requires exact sums, each agent interacts with each other one, lane beside lane
 (`_direct`); else blocks walk through a tree (`_walk`, see flockenv.geometry.barnes_hut). The choice depends only on the
-number of agents and the effect's opening. The sums are left in `pulled`, by agent, and bonds add to them.
+number of agents and the effect's opening. The sums are left in `far_bond_force`, by agent, and bonds add to them.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def far_plan(parts: KernelPlan) -> FarPlan:
 
 @section
 def far_of(plan: FarPlan) -> Callable[..., None]:
-    """Make `far(context, pos, time)`: write the forces of all other agents on this thread's agents, N, into `pulled`.
+    """Make `far(context, pos, time)`: write the forces of all other agents, N, into `far_bond_force`.
 
     It begins with a barrier even after pair laws: by then all threads have written their positions, and have read the
     counts.
@@ -63,14 +63,20 @@ def far_of(plan: FarPlan) -> Callable[..., None]:
 
     def far(context: Any, pos: Any, time: Any) -> None:
         scratch, numbers, key = context.scratch, context.numbers, context.key[context.b]
-        sync, lanes, living, mass, pulled = scratch.sync, scratch.lanes, scratch.living, scratch.mass, scratch.pulled
+        sync, lanes, living, mass, forces = (
+            scratch.sync,
+            scratch.lanes,
+            scratch.living,
+            scratch.mass,
+            scratch.far_bond_force,
+        )
         n, present, rank, team = context.n, context.present, context.rank, context.team
         wait_for_team(sync, team)
-        met = 0
+        interactions = 0
         if direct is not None:
             block_range = context.first, context.end
-            direct(numbers.effects, pos, living, mass, lanes, pulled, block_range, n, time, key)
-            met += present * present
+            direct(numbers.effects, pos, living, mass, lanes, forces, block_range, n, time, key)
+            interactions += present * present
         if walk is not None:
             tree = scratch.tree_leaf, scratch.tree_node, scratch.tree_digit, scratch.tree_near, scratch.tree_place
             leaves, _, digits, _, places = tree
@@ -78,11 +84,13 @@ def far_of(plan: FarPlan) -> Callable[..., None]:
                 keys, bounds = scratch.tree_key, scratch.bounds
                 sort_along_curve(pos, living, mass, n, width, sync, bounds, numbers.size, keys, places, digits, leaves)
             share = present, rank, team
-            met += walk(numbers.effects, numbers.size, tree, lanes, pulled, sync, scratch.tally, share, time, key)
+            interactions += walk(
+                numbers.effects, numbers.size, tree, lanes, forces, sync, scratch.tally, share, time, key
+            )
         else:
             wait_for_team(sync, team)  # no agent moves before all threads have read positions
         if rank == 0:
-            context.work[context.b, 2] += met
+            context.work[context.b, 2] += interactions
 
     return far
 
@@ -109,11 +117,11 @@ def _interact(plan: FarPlan, laws: tuple[FarLaw, ...], in_tree: bool) -> Callabl
         square, o, z = dot(to, to), like(m, -0.0), zero(x)
         there = square > o
         me = Me(m, x, z, z, m, m, m, m, z, time, z, key, z, m, ())
-        says = law(effects[k], me, Far(to, square, heavy if weighs else like(m, 1.0)))
-        lanes[first + lane] += says[0] if there else o  # add a selected value, see lane_access.add_where
-        lanes[second + lane] += says[1] if there else o
+        value = law(effects[k], me, Far(to, square, heavy if weighs else like(m, 1.0)))
+        lanes[first + lane] += value[0] if there else o  # add a selected value, see lane_access.add_where
+        lanes[second + lane] += value[1] if there else o
         if dimension == 3:
-            lanes[third + lane] += says[2] if there else o
+            lanes[third + lane] += value[2] if there else o
 
     return meet
 
@@ -123,7 +131,7 @@ def _interact(plan: FarPlan, laws: tuple[FarLaw, ...], in_tree: bool) -> Callabl
 
 @section
 def _direct(plan: FarPlan) -> Callable[..., None]:
-    """Make `direct(effects, pos, living, mass, lanes, pulled, blocks, n, time, key)`: sum over all living agents.
+    """Make `direct(effects, pos, living, mass, lanes, forces, blocks, n, time, key)`: sum over all living agents.
 
     For all laws at once; blocks: the first, and the end.
     """
@@ -136,7 +144,7 @@ def _direct(plan: FarPlan) -> Callable[..., None]:
     count = dimension * width
 
     def direct(
-        effects: Any, pos: Any, living: Any, mass: Any, lanes: Any, pulled: Any, blocks: Any, n: Any, time: Any,
+        effects: Any, pos: Any, living: Any, mass: Any, lanes: Any, forces: Any, blocks: Any, n: Any, time: Any,
         key: Any,
     ) -> None:  # fmt: skip
         for block in range(np.uint64(blocks[0]), np.uint64(blocks[1])):
@@ -149,7 +157,7 @@ def _direct(plan: FarPlan) -> Callable[..., None]:
                     for lane in range(np.uint64(width)):
                         meet(effects, lanes, lane, vector(pos, base + lane), mass[row + lane], xj, heavy, time, key)
             for lane in range(np.uint64(count)):
-                pulled[base + lane] = lanes[sums + lane]
+                forces[base + lane] = lanes[sums + lane]
 
     return direct
 
@@ -159,7 +167,7 @@ def _direct(plan: FarPlan) -> Callable[..., None]:
 
 @section
 def _walk(plan: FarPlan, laws: tuple[FarLaw, ...]) -> Callable[..., int]:
-    """Make `walk(effects, size, tree, lanes, pulled, sync, tally, share, time, key)`: sorted blocks walk through trees.
+    """Make `walk(effects, size, tree, lanes, forces, sync, tally, share, time, key)`: sorted blocks walk through trees.
 
     There is one tree for each of `laws`, one after another: nodes weigh kilograms or count agents. share: (agents
     alive, rank, team), which gives this thread's blocks. Returns, on rank 0, the number of interactions of all threads.
@@ -171,17 +179,17 @@ def _walk(plan: FarPlan, laws: tuple[FarLaw, ...]) -> Callable[..., int]:
     count, step, room = dimension * width, dimension + 1, LISTED * (dimension + 1)
 
     def walk(
-        effects: Any, size: Any, tree: Any, lanes: Any, pulled: Any, sync: Any, tally: Any, share: Any, time: Any,
+        effects: Any, size: Any, tree: Any, lanes: Any, forces: Any, sync: Any, tally: Any, share: Any, time: Any,
         key: Any,
     ) -> int:  # fmt: skip
         total = 0
         if before is not None:
-            total += before(effects, size, tree, lanes, pulled, sync, tally, share, time, key)
+            total += before(effects, size, tree, lanes, forces, sync, tally, share, time, key)
         (leaves, nodes, digits, near, places), (present, rank, team) = tree, share
         if rank == 0:
             build_tree(leaves, present, width, size, by_mass, digits, nodes)
         wait_for_team(sync, team)  # the tree is shared by all threads
-        met, blocks, begin = 0, (present + width - 1) // width, rank * room
+        interactions, blocks, begin = 0, (present + width - 1) // width, rank * room
         for block in range(np.uint64(blocks * rank // team), np.uint64(blocks * (rank + 1) // team)):
             own: Any = np.int64(block)
             base, held = block * np.uint64(step * width), min(width, present - own * width)
@@ -193,15 +201,15 @@ def _walk(plan: FarPlan, laws: tuple[FarLaw, ...]) -> Callable[..., int]:
                     leaves, nodes, digits, present, width, size, by_mass, effects[k].opening, own, level, node, near,
                     begin,
                 )  # fmt: skip
-                met += many * held
+                interactions += many * held
                 for j in range(np.uint64(begin), np.uint64(begin + many * step), np.uint64(step)):
                     xj, heavy = listed(near, j), near[j + weight]
                     for lane in range(np.uint64(width)):
                         x, m = vector(leaves, base + lane), leaves[base + np.uint64(count) + lane]
                         meet(effects, lanes, lane, x, m, xj, heavy, time, key)
-            put(pulled, lanes, places, block * np.uint64(width), held)
-        tally[rank] = met
-        wait_for_team(sync, team)  # `pulled` was written by other threads
+            put(forces, lanes, places, block * np.uint64(width), held)
+        tally[rank] = interactions
+        wait_for_team(sync, team)  # `far_bond_force` was written by other threads
         for r in range(team if rank == 0 else 0):
             total += tally[r]
         return total
@@ -211,18 +219,18 @@ def _walk(plan: FarPlan, laws: tuple[FarLaw, ...]) -> Callable[..., int]:
 
 @section
 def _write_sums(plan: FarPlan, adds: bool) -> Callable[..., None]:
-    """Make `put(pulled, lanes, places, first, held)`: write, or add, the sums of a block where its `held` agents lie.
+    """Make `put(forces, lanes, places, first, held)`: write, or add, the sums of a block where its `held` agents lie.
 
     places: which agents they are, from `first` on.
     """
     place, dimension = place_of(plan.dimension, plan.width), plan.dimension
     sums, width = np.uint64(plan.sums), np.uint64(plan.width)
 
-    def put(pulled: Any, lanes: Any, places: Any, first: Any, held: Any) -> None:
+    def put(forces: Any, lanes: Any, places: Any, first: Any, held: Any) -> None:
         for lane in range(np.uint64(held)):
             at = place(np.uint64(places[first + lane]))
             for axis in range(np.uint64(dimension)):
                 to, found = at + axis * width, lanes[sums + axis * width + lane]
-                pulled[to] = pulled[to] + found if adds else found
+                forces[to] = forces[to] + found if adds else found
 
     return put

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.engine.fields_read import OF_PAIRS, names_read
-from flockenv.engine.obstacle_sets import MetObstacles
+from flockenv.engine.obstacle_sets import ObstacleSets
 from flockenv.engine.parameters import NumberPlan, pack_numbers
 from flockenv.geometry.shapes.cells import MOST_FOUND
 from flockenv.geometry.space import Space
@@ -39,7 +39,7 @@ class Look(NamedTuple):
 
 
 @dataclass(frozen=True)
-class KernelPlan(MetObstacles):
+class KernelPlan(ObstacleSets):
     """Which laws make up a scene: all that its kernel depends on."""
 
     dimension: int
@@ -122,8 +122,8 @@ class KernelPlan(MetObstacles):
         return [(k, e) for k, e in self.far if self.crowded and e.parameters()["opening"] != 0]
 
     @property
-    def pulls(self) -> bool:
-        """True if some law leaves forces in `pulled`."""
+    def has_far_bond_force(self) -> bool:
+        """True if some law leaves forces in `far_bond_force`."""
         return bool(self.far or self.bonded)
 
     @property
@@ -208,7 +208,7 @@ class KernelPlan(MetObstacles):
         """How many numbers the kernel is passed."""
         return len(self.parameters()) + sum(map(len, self.tables))
 
-    def given(self) -> NDArray[Any]:
+    def packed_numbers(self) -> NDArray[Any]:
         """Return `parameters()` and the tables behind them, in the scene's precision, as the kernel is passed them."""
         every: list[Any] = [self.parameters(), self.shaped[0], *self.cells.values(), *self.tables]
         return np.concatenate(every).astype(self.dtype)
@@ -223,7 +223,7 @@ class KernelPlan(MetObstacles):
         return [*self.numbers_of(effect), *more]
 
     @functools.cached_property
-    def wishes(self) -> dict[int, int]:
+    def combined(self) -> dict[int, int]:
         """The behaviours whose forces another effect combines, each with the index of that effect."""
         found: dict[int, int] = {}
         for k, effect in enumerate(self.effects):
@@ -232,7 +232,7 @@ class KernelPlan(MetObstacles):
 
     def target(self, k: int) -> str:
         """Return what effect k adds to: a behaviour's own force, the steering force, or the external force."""
-        return f"w{k}_" if k in self.wishes else "s" if self.effects[k].steering else "f"
+        return f"w{k}_" if k in self.combined else "s" if self.effects[k].steering else "f"
 
     def pair_target(self, k: int) -> str:
         """Return what the pair law of effect k adds to: as `target`, or an input of its obstacle fold or keep law."""
@@ -260,7 +260,7 @@ class KernelPlan(MetObstacles):
         return any(e.aim_law is not None for e in self.effects)
 
     @functools.cached_property
-    def read(self) -> set[str]:
+    def law_names(self) -> set[str]:
         """Every name in the code of all laws."""
         return set().union(*(names_read(e, LAWS) for e in self.effects))
 
@@ -278,16 +278,16 @@ class KernelPlan(MetObstacles):
     def targets(self) -> list[str]:
         """What pair laws add to: steering force, external force, behaviour forces, inputs of folds and keep laws."""
         found = {self.pair_target(k) for k, _ in self.pairs}
-        names = ("s", "f", *(f"w{k}_" for k in self.wishes), *(f"n{k}_" for k, _ in self.pairs))
+        names = ("s", "f", *(f"w{k}_" for k in self.combined), *(f"n{k}_" for k, _ in self.pairs))
         return [name for name in names if name in found]
 
     @property
-    def felt_size(self) -> int:
-        """How many numbers of a block lie in `felt`: a vector of each agent for each target."""
+    def pair_force_size(self) -> int:
+        """How many numbers of a block lie in `pair_force`: a vector of each agent for each target."""
         return self.dimension * len(self.targets) * self.width
 
-    def felt_at(self, target: str) -> int:
-        """Return where in a block of `felt` the sum of pair laws for a target lies."""
+    def pair_force_at(self, target: str) -> int:
+        """Return where in a block of `pair_force` the sum of pair laws for a target lies."""
         return self.targets.index(target) * self.dimension * self.width
 
     @property
@@ -296,8 +296,8 @@ class KernelPlan(MetObstacles):
         return isinstance(self.integrator, OneStage)
 
     @property
-    def aside(self) -> int:
-        """Numbers of every agent that are saved in `aside`.
+    def saved_size(self) -> int:
+        """Numbers of every agent that are saved in `saved`.
 
         For a method of one stage its acceleration; else its old position, and its old velocity if bodies bounce.
         """
@@ -354,10 +354,10 @@ class KernelPlan(MetObstacles):
 
         Not if places matter: bonds refer to partners by place, and far laws and groups visit agents in their order.
         """
-        return self.sorts and bool(self.pairs) and not self.pulls and not self.grouped
+        return self.sorts and bool(self.pairs) and not self.has_far_bond_force and not self.grouped
 
     @property
-    def homely(self) -> bool:
+    def tracks_home_tiles(self) -> bool:
         """True if reordered agents that have left their tiles are tracked: if the grid is the same in every step."""
         return self.arranges and self.space.periodic
 
@@ -369,7 +369,7 @@ class KernelPlan(MetObstacles):
     @property
     def frame_numbers(self) -> list[str]:
         """Further numbers of an agent's body, by `Body`'s names, which not every scene needs."""
-        paced = "desired_speed" in self.read
+        paced = "desired_speed" in self.law_names
         return ["max_turn_rate"] * self.turns + ["banking"] * self.leans + ["desired_speed"] * paced
 
     @property
@@ -378,18 +378,24 @@ class KernelPlan(MetObstacles):
         return self.dimension * len(self.frame_vectors)
 
     @property
-    def luggage(self) -> list[str]:
+    def reordered_fields(self) -> list[str]:
         """What of an agent moves when agents are reordered: an array, and the axis of a vector."""
-        vectors = ["pos", "vel", "want", *self.frame_vectors, *(["tie"] if "t0" in self.sorted_fields else [])]
+        vectors = [
+            "pos",
+            "vel",
+            "requested_force",
+            *self.frame_vectors,
+            *(["tie"] if "t0" in self.sorted_fields else []),
+        ]
         vector = [f"{name} {k}" for name in vectors for k in range(self.dimension)]
         inner = (f"inner{k}" for k in range(len(self.inner)))
         return [*vector, "mass", "radius", "max_speed", "max_force", *self.frame_numbers, *inner, "ident"]
 
     @property
-    def luggage_size(self) -> int:
+    def reordered_size(self) -> int:
         """How many numbers that takes, in whole cache lines."""
         one = LINE // self.itemsize
-        return -(-len(self.luggage) // one) * one
+        return -(-len(self.reordered_fields) // one) * one
 
     @functools.cached_property
     def slots(self) -> dict[str, int]:

@@ -49,7 +49,7 @@ def arguments_of(k: int, images: Images | None) -> Callable[[Any, Any], Any]:
 
 @functools.cache
 def value_of(one: OneLaw) -> Callable[[Any, Any], Any]:
-    """Return a function `says(numbers, me)`: the value of a law for an agent."""
+    """Return a function `value(numbers, me)`: the value of a law for an agent."""
     given, law = arguments_of(one.k, one.images), one.law
     return kernel(lambda numbers, me: law(given(numbers, me), me))
 

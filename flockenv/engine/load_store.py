@@ -44,12 +44,12 @@ def _copy_between(agent: AgentPlan, inwards: bool) -> Callable[..., None]:
         copy(scratch.pos, worlds.x, b, n, first, end)
         copy(scratch.vel, worlds.v, b, n, first, end)
         if oriented:
-            copy(scratch.facing, worlds.carried[0][:d], b, n, first, end)
+            copy(scratch.facing, worlds.frame_and_inner[0][:d], b, n, first, end)
             if d == 3:
-                copy(scratch.above, worlds.carried[0][d:], b, n, first, end)
+                copy(scratch.above, worlds.frame_and_inner[0][d:], b, n, first, end)
         if inner:
             for i in range(first * width, min(end * width, n)):
-                copy_numbers(scratch.inner, worlds.carried[place], b, i)
+                copy_numbers(scratch.inner, worlds.frame_and_inner[place], b, i)
 
     return bring
 
@@ -66,20 +66,20 @@ def bring_out_of(agent: AgentPlan) -> Callable[..., None]:
 
 @section
 def take_drive_of(dimension: int, width: int, masked: bool) -> Callable[..., None]:
-    """Make `take_drive(scratch, drive, asked, n, first, end)`: want = drive[:, asked], the commanded forces, or 0."""
+    """Make `take_drive(scratch, drive, drive_row, n, first, end)`= drive[:, drive_row], the commanded forces, or 0."""
     into, size = into_blocks(dimension, width), dimension * width
 
-    def take_drive(scratch: Any, drive: Any, asked: Any, n: Any, first: Any, end: Any) -> None:
+    def take_drive(scratch: Any, drive: Any, drive_row: Any, n: Any, first: Any, end: Any) -> None:
         if drive.shape[1] > 0:
-            into(scratch.want, drive, asked, n, first, end)
+            into(scratch.requested_force, drive, drive_row, n, first, end)
             if masked:
                 scratch.spread[1] = ~np.uint64(0)
         else:
             if masked:
-                scratch.want[:size] = 0
+                scratch.requested_force[:size] = 0
                 scratch.spread[1] = np.uint64(0)
             else:
-                scratch.want[first * size : end * size] = 0
+                scratch.requested_force[first * size : end * size] = 0
 
     return take_drive
 

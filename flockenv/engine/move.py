@@ -35,7 +35,7 @@ class KeepLaw(NamedTuple):
 
     begin: OneLaw
     keep: OneLaw
-    felt: int  # where the sum of its pair law lies, see KernelPlan.felt_at; -1: it has none
+    pair_force_at: int  # where the sum of its pair law lies, see KernelPlan.pair_force_at; -1: it has none
 
 
 class InnerPlan(NamedTuple):
@@ -44,7 +44,7 @@ class InnerPlan(NamedTuple):
     agent: AgentPlan
     laws: tuple[KeepLaw, ...]
     numbers: tuple[tuple[tuple[int, int], ...], ...]  # per number: (law, index in its result) of each law that sets it
-    felt: int  # count of numbers of a block in `felt`
+    pair_force_size: int  # count of numbers of a block in `pair_force`
 
 
 class MovePlan(NamedTuple):
@@ -70,7 +70,7 @@ def inner_plan(parts: KernelPlan) -> InnerPlan | None:
     laws = [
         KeepLaw(
             OneLaw.of(parts, k, "begin_law"), OneLaw.of(parts, k, "keep_law"),
-            parts.felt_at(f"n{k}_") if effect.pair_law else -1,
+            parts.pair_force_at(f"n{k}_") if effect.pair_law else -1,
         )
         for k, effect in parts.keeping
     ]  # fmt: skip
@@ -78,7 +78,7 @@ def inner_plan(parts: KernelPlan) -> InnerPlan | None:
         tuple((j, effect.keeps.index(name)) for j, (_, effect) in enumerate(parts.keeping) if name in effect.keeps)
         for name in parts.inner
     )
-    return InnerPlan(agent_plan(parts), tuple(laws), numbers, parts.felt_size)
+    return InnerPlan(agent_plan(parts), tuple(laws), numbers, parts.pair_force_size)
 
 
 def move_plan(parts: KernelPlan) -> MovePlan:
@@ -99,7 +99,7 @@ def move_plan(parts: KernelPlan) -> MovePlan:
 def _method_step(plan: MovePlan) -> Callable[..., Any]:
     """Make `moved(scratch, pos, vel, at, past, dt)`: return old position and velocity, then new ones by the method.
 
-    The agent lies at `at`; what the method saved of it at `past` of `aside`. For a method of one stage that is its
+    The agent lies at `at`; what the method saved of it at `past` of `saved`. For a method of one stage that is its
     acceleration; for any other its old position, and its old velocity if bodies bounce.
     """
     dimension, vector, bounces = plan.agent.dimension, vector_of_lane(*plan.agent[:2]), plan.bounce is not None
@@ -108,11 +108,11 @@ def _method_step(plan: MovePlan) -> Callable[..., Any]:
     def moved(scratch: Any, pos: Any, vel: Any, at: Any, past: Any, dt: Any) -> Any:
         x, v = vector(pos, at), vector(vel, at)
         if method is None:
-            was, earlier = vector(scratch.aside, at), v
+            was, earlier = vector(scratch.saved, at), v
             if bounces:
-                earlier = vector(scratch.aside, np.uint64(len(pos)) + at)
+                earlier = vector(scratch.saved, np.uint64(len(pos)) + at)
             return was, earlier, x, v
-        a = vector(scratch.aside, past)
+        a = vector(scratch.saved, past)
         x0, v0 = method(x[0], v[0], a[0], dt)
         x1, v1 = method(x[1], v[1], a[1], dt)
         there: Any = (x0, x1)
@@ -121,7 +121,7 @@ def _method_step(plan: MovePlan) -> Callable[..., Any]:
             x2, v2 = method(x[2], v[2], a[2], dt)
             there, fast = (x0, x1, x2), (v0, v1, v2)
         if flows:
-            there = add(there, scale(vector(scratch.carrying, at), dt))
+            there = add(there, scale(vector(scratch.advection, at), dt))
         return x, v, there, fast
 
     return moved
@@ -142,8 +142,8 @@ def _apply_kicks(kicks: tuple[tuple[int, Law], ...], dimension: int) -> Callable
     def kicked(numbers: Any, me: Any, free: Any, drawn: Any, instant: Any, dt: Any, x: Any, v: Any) -> Any:
         if before is not None:
             x, v = before(numbers, me, free, drawn, instant, dt, x, v)
-        says = law(numbers.effects[k], me, dt, draws(drawn, instant, me.who, dt))
-        kick = select(free, says, zero(x))
+        value = law(numbers.effects[k], me, dt, draws(drawn, instant, me.who, dt))
+        kick = select(free, value, zero(x))
         return add(x, scale(kick, like(dt, 0.5) * dt)), add(v, kick)  # as if it came in the middle of the step
 
     return kernel(kicked)
@@ -164,7 +164,7 @@ def _limit_turn(plan: MovePlan) -> Callable[..., Any]:
         most = min(scratch.max_turn_rate[i] * dt, like(dt, np.pi))
         before, way = vector(scratch.facing, at), sub(x, was)
         if flows:
-            way = sub(x, add(was, scale(vector(scratch.carrying, at), dt)))
+            way = sub(x, add(was, scale(vector(scratch.advection, at), dt)))
         there, over = turn_towards(way, before, most)
         x = add(x, sub(limit_to_heading(way, there, over), way))
         ahead, over = turn_towards(v, before, most)
@@ -200,20 +200,20 @@ def _update_heading(plan: MovePlan) -> Callable[..., None]:
 
 @functools.cache
 def _new_number(number: int, said: tuple[tuple[int, int], ...]) -> Callable[[Any, Any], float]:
-    """Return `becomes(was, says)`: a number as its only law sets it, or changed by several laws."""
+    """Return `becomes(was, value)`: a number as its only law sets it, or changed by several laws."""
     if said[1:]:
         return _sum_of_changes(number, said)
     ((law, place),) = said
-    return kernel(lambda was, says: says[law][place])
+    return kernel(lambda was, value: value[law][place])
 
 
 @functools.cache
 def _sum_of_changes(number: int, said: tuple[tuple[int, int], ...]) -> Callable[[Any, Any], float]:
-    """Return `changed(was, says)`: the old number, plus the changes to it by several laws."""
+    """Return `changed(was, value)`: the old number, plus the changes to it by several laws."""
     before, (law, place) = _sum_of_changes(number, said[:-1]) if said[1:] else None, said[-1]
     if before is None:
-        return kernel(lambda was, says: was[number] + (says[law][place] - was[number]))
-    return kernel(lambda was, says: before(was, says) + (says[law][place] - was[number]))
+        return kernel(lambda was, value: was[number] + (value[law][place] - was[number]))
+    return kernel(lambda was, value: before(was, value) + (value[law][place] - was[number]))
 
 
 def _new_numbers(plan: InnerPlan) -> Callable[..., tuple[float, ...]]:
@@ -224,11 +224,15 @@ def _new_numbers(plan: InnerPlan) -> Callable[..., tuple[float, ...]]:
 def _evaluate_keep_law(plan: InnerPlan, kept: KeepLaw) -> Callable[..., Any]:
     """Return `keeps(numbers, scratch, me, row, lane, dt)`: the new values of the numbers that a law keeps."""
     given, law, agent = arguments_of(kept.keep.k, kept.keep.images), kept.keep.law, plan.agent
-    felt = pair_force_of(agent.dimension, agent.width, plan.felt, kept.felt) if kept.felt >= 0 else None
+    pair_force = (
+        pair_force_of(agent.dimension, agent.width, plan.pair_force_size, kept.pair_force_at)
+        if kept.pair_force_at >= 0
+        else None
+    )
 
     def keeps(numbers: Any, scratch: Any, me: Any, row: Any, lane: Any, dt: Any) -> Any:
-        if felt is not None:
-            return law(given(numbers, me), me, felt(scratch, row, lane), dt)
+        if pair_force is not None:
+            return law(given(numbers, me), me, pair_force(scratch, row, lane), dt)
         return law(given(numbers, me), me, zero(me.pos), dt)
 
     return kernel(keeps)
@@ -265,11 +269,11 @@ def _write_inner(plan: InnerPlan) -> Callable[..., bool]:
 
     It returns True if they are finite.
     """
-    says, become = tuple_from(*(_evaluate_keep_law(plan, kept) for kept in plan.laws)), _new_numbers(plan)
+    value, become = tuple_from(*(_evaluate_keep_law(plan, kept) for kept in plan.laws)), _new_numbers(plan)
     put, sound = call_in_turn(*map(_put_number, range(len(plan.numbers)))), _all_finite(len(plan.numbers))
 
     def keep(scratch: Any, numbers: Any, me: Any, i: Any, row: Any, lane: Any, dt: Any) -> Any:
-        now = become(me.inner, says(numbers, scratch, me, row, lane, dt))
+        now = become(me.inner, value(numbers, scratch, me, row, lane, dt))
         put(scratch.inner, i, me.inner, now, scratch.living[i] > like(dt, 0.0))
         return sound(now)
 
@@ -279,10 +283,10 @@ def _write_inner(plan: InnerPlan) -> Callable[..., bool]:
 @section
 def begin_agent_of(plan: InnerPlan) -> Callable[..., tuple[float, ...]]:
     """Make `begin(numbers, me)`: return the initial inner states of an agent."""
-    says, become = tuple_from(*(value_of(kept.begin) for kept in plan.laws)), _new_numbers(plan)
+    value, become = tuple_from(*(value_of(kept.begin) for kept in plan.laws)), _new_numbers(plan)
 
     def begin(numbers: Any, me: Any) -> Any:
-        return become(me.inner, says(numbers, me))
+        return become(me.inner, value(numbers, me))
 
     return begin
 
@@ -294,9 +298,9 @@ def begin_agent_of(plan: InnerPlan) -> Callable[..., tuple[float, ...]]:
 def move_of(plan: MovePlan) -> Callable[..., None]:
     """Make `move(context, pos, vel, time, dt, instant, block, past)`: move the agents of a block.
 
-    past: where the values saved for the block begin, see `_method_step`; instant: number of steps that the world has made. No
-    agent moves faster than max_speed, whatever a method does to its velocity within the step. The lowest number of an
-    agent that is not finite is noted in each lane.
+    past: where the values saved for the block begin, see `_method_step`; instant: number of steps that the world has made.
+    No agent moves faster than max_speed, whatever a method does to its velocity within the step. The lowest number of
+    an agent that is not finite is noted in each lane.
     """
     agent, d, width = plan.agent, plan.agent.dimension, plan.agent.width
     size, bad, put = np.uint64(d * width), np.uint64(plan.bad), put_vector_of(d, width)

@@ -49,7 +49,7 @@ class Listing(NamedTuple):
     fields: tuple[str, ...]
     inside: bool  # True if all agents are inside a periodic box already
     tiled: bool  # True if agents may lie in the order of tiles, not by number
-    homely: bool  # True if the agents that have left their tiles are tracked
+    tracks_home_tiles: bool  # True if the agents that have left their tiles are tracked
     confine: Law
     slots: tuple[tuple[str, int], ...]  # where running numbers of a block lie in the scratch `lanes`, by name
     arrays: tuple[str, ...]  # the names of `pos`, `vel` and inner states, which are passed separately, then of scratch
@@ -119,7 +119,7 @@ def listing_of(parts: KernelPlan, fields: list[str], inside: bool = False, tiled
     slots = tuple((name, place * parts.width) for name, place in parts.slots.items())
     return Listing(
         parts.dimension, parts.width, parts.sorts, parts.space.periodic, tuple(fields), inside, tiled,
-        tiled and parts.homely, parts.space.confine_law, slots,
+        tiled and parts.tracks_home_tiles, parts.space.confine_law, slots,
         array_names(parts),
     )  # fmt: skip
 
@@ -133,7 +133,13 @@ def list_living(plan: Listing) -> Callable[..., Any]:
 
     That is (nx, ny, nz, fine, fold), or zeros if they are listed by number.
     """
-    sorts, periodic, wraps, width, homely = plan.sorts, plan.periodic, plan.wraps, plan.width, plan.homely
+    sorts, periodic, wraps, width, tracks_home_tiles = (
+        plan.sorts,
+        plan.periodic,
+        plan.wraps,
+        plan.width,
+        plan.tracks_home_tiles,
+    )
     by_number = (_list_as_records if sorts else _list_in_rows)(plan)
     by_cell: Any = _sort(plan) if sorts else None
 
@@ -143,11 +149,11 @@ def list_living(plan: Listing) -> Callable[..., Any]:
         shape = (0, 0, 0, 0, 0)
         if sorts:
             size, reach = context.numbers.size, context.numbers.reach
-            if homely:
+            if tracks_home_tiles:
                 if context.arranged:
                     shape = count_from_home_tiles(
                         pos, scratch.living, context.first, context.end, width, rank, team, scratch.sync,
-                        scratch.bounds, size, reach, periodic, wraps, context.n, scratch.homes, scratch.strangers,
+                        scratch.bounds, size, reach, periodic, wraps, context.n, scratch.home_tiles, scratch.displaced,
                         scratch.tally, scratch.cell, scratch.start, scratch.offset,
                     )  # fmt: skip
                 else:
@@ -282,13 +288,13 @@ def _sort(plan: Listing) -> Callable[..., None]:
 @section
 def _order_in_cells(plan: Listing) -> Callable[..., None]:
     """Make `order(context, shape)`: sort records by number within each cell, if agents lie by tiles."""
-    homely, length, width = plan.homely, plan.length, plan.width
+    tracks_home_tiles, length, width = plan.tracks_home_tiles, plan.length, plan.width
 
     def order(context: Any, shape: Any) -> None:
         scratch, rank, team = context.scratch, context.rank, context.team
         records, ident, start, offset = scratch.records, scratch.ident, scratch.start, scratch.offset
         nx, rows, everything = shape[0], shape[1] * shape[2], True
-        if homely:
+        if tracks_home_tiles:
             away = np.int64(0)
             for r in range(team):
                 away += scratch.tally[team + r]
@@ -298,10 +304,10 @@ def _order_in_cells(plan: Listing) -> Callable[..., None]:
                 mine: Any = np.int64(start[line * nx])
                 beyond: Any = np.int64(start[(line + 1) * nx])
                 order_records(records, scratch.cell, ident, length, mine, beyond, offset[rank])
-        elif homely:
+        elif tracks_home_tiles:
             first = context.first * width
             till = first + scratch.tally[team + rank]
-            order_cells(records, length, ident, start, offset, rank, scratch.strangers, first, till)
+            order_cells(records, length, ident, start, offset, rank, scratch.displaced, first, till)
             if team > 1:
                 cells = nx * rows
                 here, there = cells * rank // team, cells * (rank + 1) // team
@@ -345,7 +351,7 @@ def walk_blocks(plan: Listing, meet: Callable[..., int]) -> Callable[..., int]:
         ranges, nx = scratch.ranges, shape[0]
         blocks = (present + width - 1) // width
         at, stop = blocks * rank // team * width, min(blocks * (rank + 1) // team * width, present)
-        met, line, spot = 0, 0, 0
+        interactions, line, spot = 0, 0, 0
         if sorts:
             start = scratch.start
             if nx > 0:  # whole rows of cells, so that blocks are the same for any number of threads
@@ -369,8 +375,8 @@ def walk_blocks(plan: Listing, meet: Callable[..., int]) -> Callable[..., int]:
                 take(scratch.lanes, scratch.records, np.uint64(at))
             else:
                 ranges[0, 0], ranges[0, 1], ranges[0, 2] = 0, present, 1
-            met += meet(context, shape, np.uint64(at), at, upto, found, time)
+            interactions += meet(context, shape, np.uint64(at), at, upto, found, time)
             at = upto
-        return met
+        return interactions
 
     return walk

@@ -34,7 +34,7 @@ class Besides(NamedTuple):
     """Data that pair laws need in some scenes only: empty tuples in all others."""
 
     scenery: Any  # obstacle_x, obstacle_radius, params, world: for sights that obstacles block
-    ties: Any  # tie, ident, order: for ties that are not listed
+    separation_directions: Any  # arrays tie, ident, order: for ties that are not listed
 
 
 @section
@@ -44,16 +44,16 @@ def listed_agent(listing: Listing, inner: tuple[str, ...], oriented: bool) -> Ca
         listing.lanes_of(listing.axes(x)) for x in ("x", "v", "t", "a", "d" if oriented else "h")
     )
     numbers = listing.lanes_of(("who", "mass", "radius", "max_speed", "max_force", "desired_speed"))
-    inside, kind, feels = _inner_fields(inner), record(inner), bool(inner)
+    inside, kind, has_inner = _inner_fields(inner), record(inner), bool(inner)
     within = listing.lanes_of(inside)
 
     def agent(array: Any, at: Any, time: Any, drawn: Any) -> Any:
         x = gather(array, at, pos)
-        who, mass, radius, max_speed, max_force, wished = gather(array, at, numbers)
+        who, mass, radius, max_speed, max_force, desired_speed = gather(array, at, numbers)
         return Me(
             who, x, gather(array, at, vel), gather(array, at, heading), mass, radius, max_speed, max_force,
-            gather(array, at, tie), time, zero(x), drawn, gather(array, at, aim), wished,
-            kind(*gather(array, at, within)) if feels else (),
+            gather(array, at, tie), time, zero(x), drawn, gather(array, at, aim), desired_speed,
+            kind(*gather(array, at, within)) if has_inner else (),
         )  # fmt: skip
 
     return agent
@@ -72,13 +72,13 @@ def listed_candidate(listing: Listing, inner: tuple[str, ...]) -> Callable[..., 
         listing.candidate_places(("who", "radius", "mass")),
         listing.candidate_places(_inner_fields(inner)),
     )
-    kind, feels = record(inner), bool(inner)
+    kind, has_inner = record(inner), bool(inner)
 
     def candidate(array: Any, at: Any) -> Any:
         who, radius, mass = gather(array, at, numbers)
-        felt = kind(*gather(array, at, within)) if feels else ()
+        states = kind(*gather(array, at, within)) if has_inner else ()
         return Candidate(
-            gather(array, at, pos), gather(array, at, vel), gather(array, at, tie), who, radius, mass, felt
+            gather(array, at, pos), gather(array, at, vel), gather(array, at, tie), who, radius, mass, states
         )
 
     return candidate
@@ -95,9 +95,9 @@ def with_tie(me: Me, tie: Any) -> Me:
 
 @section
 def separation_direction_of(dimension: int, width: int) -> Callable[..., Any]:
-    """Make `tie(ties, i)`: return the tie of agent i."""
+    """Make `tie(arrays, i)`: return the tie, or separation direction, of agent i."""
     vector, place = tuple(k * width for k in range(dimension)), place_of(dimension, width)
-    return lambda ties, i: gather(ties[0], place(np.uint64(ties[1][i])), vector)
+    return lambda arrays, i: gather(arrays[0], place(np.uint64(arrays[1][i])), vector)
 
 
 class Block(NamedTuple):

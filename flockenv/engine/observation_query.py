@@ -157,10 +157,10 @@ def _insert_candidates(plan: LookPlan, wrapped: bool) -> Callable[..., None]:
         mine: Any, first: Any, theirs: Any, number: Any, lanes: Any, span: Any, block: Any, j: Any, last: Any
     ) -> None:  # fmt: skip
         while j < last:
-            his, own = gather(theirs, j * length, there), np.int32(j - block)
+            candidate, own = gather(theirs, j * length, there), np.int32(j - block)
             for lane in range(np.uint64(width)):
                 here = gather(mine, first + lane, place)
-                to = offset_to(span.size, here, his) if wrapped else sub(his, here)
+                to = offset_to(span.size, here, candidate) if wrapped else sub(candidate, here)
                 square = exact_dot(to, to) if exact else dot(to, to)
                 seen = (own != number[lane]) & (square < span.within)
                 far = square if seen else like(square, np.inf)

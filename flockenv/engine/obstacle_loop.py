@@ -40,7 +40,7 @@ LOOSE = 1 + 1e-6
 def obstacles_of(plan: Obstacles) -> Callable[..., None]:
     """Make `meet_obstacles(context, pos, vel, time, block)`: compute the folds of a block over the obstacles.
 
-    The results are written into `lanes`, where the plan says; time, s.
+    The results are written into `lanes`, where the plan value; time, s.
     """
     d, width, arranges = plan.agent.dimension, plan.agent.width, plan.arranges
     size, wide = np.uint64(d * width), np.uint64(width)
@@ -111,13 +111,13 @@ def _starts(plan: Obstacles) -> Callable[..., None]:
 @section
 def _start(plan: Obstacles, fold: Fold) -> Callable[..., None]:
     """Make `start(scratch, numbers, me, row, lanes, lane)`: write the initial numbers of one fold."""
-    k, start, slots, told = fold.k, fold.start, fold.slots, fold.told >= 0
-    each, place = np.uint64(plan.felt // plan.agent.width), np.uint64(max(fold.told, 0))
+    k, start, slots, adds_pair_force = fold.k, fold.start, fold.slots, fold.pair_force_at >= 0
+    each, place = np.uint64(plan.pair_force_size // plan.agent.width), np.uint64(max(fold.pair_force_at, 0))
     vector_at = vector_of_lane(plan.agent.dimension, plan.agent.width)
 
     def begin(scratch: Any, numbers: Any, me: Any, row: Any, lanes: Any, lane: Any) -> None:
-        if told:
-            others = vector_at(scratch.felt, row * each + place + lane)
+        if adds_pair_force:
+            others = vector_at(scratch.pair_force, row * each + place + lane)
             scatter(lanes, lane, slots, start(numbers.effects[k], me, others))
         else:
             scatter(lanes, lane, slots, start(numbers.effects[k], me))

@@ -28,7 +28,7 @@ class Fold(NamedTuple):
     hidden: Surroundings | None  # the obstacles that may hide others; None: occlusion does not matter
     slots: tuple[int, ...]  # where its running numbers lie
     ahead: tuple[int, ...]  # where form and place of the obstacle ahead are noted; empty if no law reads them
-    told: int  # where the sum of its pair law lies in a block of `felt`; -1: it has none
+    pair_force_at: int  # where the sum of its pair law lies in a block of `pair_force`; -1: it has none
 
 
 class Obstacles(NamedTuple):
@@ -38,7 +38,7 @@ class Obstacles(NamedTuple):
     around: Surroundings
     folds: tuple[Fold, ...]
     arranges: bool  # True if numbers that all agents share may be read from the first block
-    felt: int  # count of numbers of `felt` in a block
+    pair_force_size: int  # count of numbers of `pair_force` in a block
     reach: int  # where the largest reach of all folds is noted, m; -1: nowhere
     found: int  # where the rows that a grid lists are written; -1: nowhere
     bounded: tuple[str, ...]  # forms whose shapes are skipped if their box is out of reach
@@ -78,13 +78,13 @@ def obstacle_plan(parts: KernelPlan, agent: AgentPlan) -> Obstacles:
             e.rays(d) if e.obstacle_ray is not None else 1, e.obstacle_pieces,
             around if e.occluded_obstacles else None, places(f"o{k}_"),
             places(f"ahead{k}_") if e.obstacle_edges else (),
-            parts.felt_at(parts.pair_target(k)) if e.pair_law is not None else -1,
+            parts.pair_force_at(parts.pair_target(k)) if e.pair_law is not None else -1,
         )
         for k, e in enumerate(parts.effects)
         if e.obstacle_start is not None and e.obstacle_law is not None
     )  # fmt: skip
     return Obstacles(
-        agent, around, folds, parts.arranges, parts.felt_size,
+        agent, around, folds, parts.arranges, parts.pair_force_size,
         slots["reach0"] * width if "reach0" in slots else -1, slots["found0"] * width if "found0" in slots else -1,
         parts.bounded, parts.looked_up, parts.only_rays,
     )  # fmt: skip

@@ -15,13 +15,13 @@ from flockenv.geometry.shapes.cells import FEWEST_ROWS, cells_of
 from flockenv.geometry.space import Space
 from flockenv.physics.effects.effect import Effect, Sight
 
-__all__ = ["MetObstacles"]
+__all__ = ["ObstacleSets"]
 
 MOST_NUMBERS = 2**24
 """Numbers of a form's rows and of their grid, up to which single precision represents indices exactly."""
 
 
-class MetObstacles:
+class ObstacleSets:
     """The part of `KernelPlan` that is about obstacles."""
 
     dimension: int

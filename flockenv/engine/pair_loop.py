@@ -63,8 +63,14 @@ def _visit_lanes(plan: Pairs, which: str, wrapped: bool, each: Callable[..., Non
         for lane in range(np.uint64(width)):
             me = agent(block.mine, block.first + lane, block.time, block.drawn)
             if tied:  # lanes beyond the last agent hold stale numbers
-                mine = np.uint64(lanes[home + lane]) if sorts else np.uint64(besides.ties[2][block.at + lane])
-                me = with_tie(me, tie(besides.ties, mine if block.at + lane < block.upto else np.uint64(0)))
+                mine = (
+                    np.uint64(lanes[home + lane])
+                    if sorts
+                    else np.uint64(besides.separation_directions[2][block.at + lane])
+                )
+                me = with_tie(
+                    me, tie(besides.separation_directions, mine if block.at + lane < block.upto else np.uint64(0))
+                )
             to = offset_to(size, me.pos, it.pos) if periodic else sub(it.pos, me.pos)
             square = exact_dot(to, to) if exact else dot(to, to)
             if apart:
@@ -74,8 +80,8 @@ def _visit_lanes(plan: Pairs, which: str, wrapped: bool, each: Callable[..., Non
             else:
                 other = own != block.number[lane]
             gap = square if masks else (square if other else like(square, np.inf))
-            him = Other(it.who, to, square, it.vel, it.radius, it.tie, it.mass, it.inner)
-            each(numbers, besides, me, him, other, gap, o, lanes, lane)
+            neighbour = Other(it.who, to, square, it.vel, it.radius, it.tie, it.mass, it.inner)
+            each(numbers, besides, me, neighbour, other, gap, o, lanes, lane)
             if apart and parting:
                 lanes[here + lane] = count_if(lanes[here + lane], other)
             if touches:
@@ -116,8 +122,10 @@ def _visit_candidates(plan: Pairs, which: str, wrapped: bool, each: Callable[...
             at = j * length if sorts else j
             it = candidate(block.theirs, at)
             if tied:
-                i = np.uint64(np.int32(block.theirs[at])) if sorts else np.uint64(besides.ties[2][j])
-                it = Candidate(it.pos, it.vel, tie(besides.ties, i), it.who, it.radius, it.mass, it.inner)
+                i = np.uint64(np.int32(block.theirs[at])) if sorts else np.uint64(besides.separation_directions[2][j])
+                it = Candidate(
+                    it.pos, it.vel, tie(besides.separation_directions, i), it.who, it.radius, it.mass, it.inner
+                )
             touch = lanes_meet(numbers, besides, block, j, it)
             if by_touch is not None:  # noqa: SIM102  # numba drops the branch by this alone
                 if touch:
@@ -160,8 +168,8 @@ def _visit_ahead(plan: Pairs, each: Callable[..., None]) -> Callable[..., None]:
                 further = exact_dot(onward, onward) if exact else dot(onward, onward)
                 to, square = gather(lanes, lane, way), lanes[square_at + lane]
                 other = square > like(square, ONE_PLACE)
-                him = Other(it.who, to, square, it.vel, it.radius, it.tie, it.mass, it.inner)
-                each(numbers, besides, me, him, other, square, o, lanes, lane)
+                neighbour = Other(it.who, to, square, it.vel, it.radius, it.tie, it.mass, it.inner)
+                each(numbers, besides, me, neighbour, other, square, o, lanes, lane)
                 if parting:
                     lanes[here + lane] = count_if(lanes[here + lane], other)
                 scatter(lanes, lane, way, onward)
@@ -228,9 +236,9 @@ def _block(plan: Pairs) -> Callable[..., int]:
         begin(numbers, obstacles, block)
         if select is not None:
             select(numbers, besides, block, found)
-        met, others = 0, -1
+        interactions, others = 0, -1
         for r in range(found):
-            met += (ranges[r, 1] - ranges[r, 0]) * (upto - at)
+            interactions += (ranges[r, 1] - ranges[r, 0]) * (upto - at)
             others += ranges[r, 1] - ranges[r, 0]
         meet(numbers, besides, block, found)
         if together is not None:  # two agents rarely share a position
@@ -242,17 +250,17 @@ def _block(plan: Pairs) -> Callable[..., int]:
         finish(numbers, block)
         by_number = shape[0] == 0 and context.present == context.n
         if sorts:
-            tell(scratch.felt, scratch.cell, block, by_number and not context.arranged)
+            tell(scratch.pair_force, scratch.cell, block, by_number and not context.arranged)
         else:
-            tell(scratch.felt, scratch.order, block, by_number)
-        return met
+            tell(scratch.pair_force, scratch.order, block, by_number)
+        return interactions
 
     return block_of
 
 
 @section
 def meet_neighbours(plan: Pairs) -> Callable[..., None]:
-    """Make `meet(context, pos, vel, time)`: write the sums of pair laws for this thread's blocks to `felt`.
+    """Make `meet(context, pos, vel, time)`: write the sums of pair laws for this thread's blocks to `pair_force`.
 
     One listing per evaluation, one loop over candidates for all pair laws. A team of threads shares both.
     """
@@ -266,7 +274,7 @@ def meet_neighbours(plan: Pairs) -> Callable[..., None]:
             work[b, 3] += folds * context.n * context.obstacle_radius.shape[1]
         shape = list_all(context, pos, vel)
         scratch.tally[context.rank] = walk(context, shape, time)
-        wait_for_team(scratch.sync, context.team)  # `felt` was written by other threads
+        wait_for_team(scratch.sync, context.team)  # `pair_force` was written by other threads
         if context.rank == 0:
             for r in range(context.team):
                 work[b, 2] += scratch.tally[r]

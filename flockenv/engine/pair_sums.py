@@ -241,20 +241,20 @@ def _total(plan: Pairs, laws: tuple[PairLaw, ...]) -> Callable[..., Any]:
 
 @section
 def write_sums(plan: Pairs) -> Callable[..., None]:
-    """Make `tell(felt, order, block, by_number)`: write the sums of a block to `felt`, by agent."""
+    """Make `tell(pair_force, order, block, by_number)`: write the sums of a block to `pair_force`, by agent."""
     width, sorts, home = plan.lanes, plan.listing.sorts, plan.listing.slot("home0")
     slots = tuple(slot for first in plan.targets for slot in plan.slots(first, plan.listing.dimension))
     rows, first = tuple(k * width for k in range(len(slots))), (0,) * len(slots)
     whole, place_in = np.uint64(len(slots)), place_of(len(slots), width)
 
-    def tell(felt: Any, order: Any, block: Any, by_number: Any) -> None:
+    def tell(pair_force: Any, order: Any, block: Any, by_number: Any) -> None:
         lanes, begin = block.lanes, np.uint64(0)
         if by_number:
             sources = pick_items((lanes,), (), first)
-            copy_each(felt, block.at * whole, rows, sources, (begin,), first, slots, width)
+            copy_each(pair_force, block.at * whole, rows, sources, (begin,), first, slots, width)
         else:
             for lane in range(block.upto - block.at):
                 i = np.uint64(lanes[home + lane]) if sorts else np.uint64(order[block.at + lane])
-                scatter(felt, place_in(i), rows, gather(lanes, lane, slots))
+                scatter(pair_force, place_in(i), rows, gather(lanes, lane, slots))
 
     return tell

@@ -29,7 +29,7 @@ __all__ = ["PackedFields", "arrange_plan", "move_back_of", "move_in_of"]
 AHEAD = 64
 """How many agents ahead packed data is prefetched."""
 
-_COMMON = {**dict.fromkeys(("mass", "radius", "max_speed", "max_force"), 0), "want": 1}
+_COMMON = {**dict.fromkeys(("mass", "radius", "max_speed", "max_force"), 0), "requested_force": 1}
 """What all agents may share, and by which mask it is read then, see `blocks.common_places`."""
 
 
@@ -49,21 +49,21 @@ class ArrangePlan(NamedTuple):
     width: int
     periodic: bool
     wraps: bool  # True if agents may lie outside a periodic box
-    homely: bool
+    tracks_home_tiles: bool
     inner: bool
-    luggage: PackedFields
+    fields: PackedFields
     size: int  # numbers of a packed agent, in whole cache lines
 
 
 def arrange_plan(parts: KernelPlan) -> ArrangePlan:
     """Return the plan of a scene."""
     names = array_names(parts)
-    packed = [field.partition(" ") for field in parts.luggage]  # an array, and for vectors the axis
+    packed = [field.partition(" ") for field in parts.reordered_fields]  # an array, and for vectors the axis
     common = [_COMMON.get(name) for name, _, _ in packed]
     starts = [
         (2 if mask is not None else 0) + (1 if axis else 0) for mask, (_, _, axis) in zip(common, packed, strict=True)
     ]
-    luggage = PackedFields(
+    fields = PackedFields(
         tuple(names.index(name) for name, _, _ in packed),
         tuple(starts),
         tuple(int(axis) * parts.width if axis else 0 for _, _, axis in packed),
@@ -71,8 +71,8 @@ def arrange_plan(parts: KernelPlan) -> ArrangePlan:
     )
     wraps = parts.space.periodic and not parts.confines
     return ArrangePlan(
-        parts.dimension, parts.width, parts.space.periodic, wraps, parts.homely, bool(parts.inner), luggage,
-        parts.luggage_size,
+        parts.dimension, parts.width, parts.space.periodic, wraps, parts.tracks_home_tiles, bool(parts.inner), fields,
+        parts.reordered_size,
     )  # fmt: skip
 
 
@@ -82,7 +82,7 @@ def move_in_of(plan: ArrangePlan) -> Callable[..., bool]:
 
     count: steps until they move back. share: (n, present, first, end, rank, team).
     """
-    width, periodic, wraps, homely = plan.width, plan.periodic, plan.wraps, plan.homely
+    width, periodic, wraps, tracks_home_tiles = plan.width, plan.periodic, plan.wraps, plan.tracks_home_tiles
     carry = _reorder(plan, True)
 
     def move_in(scratch: Any, numbers: Any, count: Any, share: Any) -> Any:
@@ -97,15 +97,15 @@ def move_in_of(plan: ArrangePlan) -> Callable[..., bool]:
             arranged = shape[0] > 0
             if arranged:
                 carry(scratch, share)
-                if homely:
-                    find_home_tiles(first, end, width, n, shape, scratch.start, scratch.homes)
+                if tracks_home_tiles:
+                    find_home_tiles(first, end, width, n, shape, scratch.start, scratch.home_tiles)
         return arranged
 
     return move_in
 
 
 def move_back_of(plan: ArrangePlan) -> Callable[..., None]:
-    """Return `go_home(scratch, share)`: move agents back to the places of their numbers."""
+    """Return `move_back(scratch, share)`: move agents back to the places of their numbers."""
     return _reorder(plan, False)
 
 
@@ -116,13 +116,13 @@ def _reorder(plan: ArrangePlan, to_tiles: bool) -> Callable[..., None]:
     Packed agents go to distant places, in no order: to their tile, or to the place of their number. `cell` holds where;
     -1 is nowhere.
     """
-    dimension, width, (arrays, which, further, _) = plan.dimension, plan.width, plan.luggage
+    dimension, width, (arrays, which, further, _) = plan.dimension, plan.width, plan.fields
     size, count, wide = np.uint64(dimension * width), plan.size, np.uint64(plan.size)
     place_in, handed, unpack = place_of(dimension, width), arrays_of(plan.inner), _unpack(plan)
 
     def carry(scratch: Any, share: Any) -> None:
         n, _, first, end, rank, team = share
-        luggage, cell, offset, spread = scratch.luggage, scratch.cell, scratch.offset, scratch.spread
+        buffer, cell, offset, spread = scratch.reorder_buffer, scratch.cell, scratch.offset, scratch.spread
         sources = pick_items(handed(scratch, scratch.pos, scratch.vel), scratch, arrays)
         for block in range(np.uint64(first), np.uint64(end)):
             base, row = block * size, block * np.uint64(width)
@@ -134,10 +134,10 @@ def _reorder(plan: ArrangePlan, to_tiles: bool) -> Callable[..., None]:
                 else:
                     cell[i] = np.int32(scratch.ident[i])
             starts = row, base, row & spread[0], base & spread[1]
-            put_lines(luggage, sources, places_each(starts, which, further), width, cell, row, count, np.uint64(n))
+            put_lines(buffer, sources, places_each(starts, which, further), width, cell, row, count, np.uint64(n))
         wait_for_team(scratch.sync, team)
         for i in range(np.uint64(first * width), np.uint64(min(end * width, n))):
-            prefetch_for_write(luggage, (i + np.uint64(AHEAD)) * wide)
+            prefetch_for_write(buffer, (i + np.uint64(AHEAD)) * wide)
             unpack(scratch, sources, i, place_in(i))
 
     return carry
@@ -146,25 +146,25 @@ def _reorder(plan: ArrangePlan, to_tiles: bool) -> Callable[..., None]:
 @section
 def _unpack(plan: ArrangePlan) -> Callable[..., None]:
     """Make `unpack(scratch, sources, i, place)`: unpack all data of agent i but what all agents share."""
-    own = _unpack_fields(plan.luggage, plan.luggage.own[0])
-    bodies, wants = _unpack_fields(plan.luggage, plan.luggage.own[1]), _unpack_fields(plan.luggage, plan.luggage.own[2])
+    own = _unpack_fields(plan.fields, plan.fields.own[0])
+    bodies, requests = _unpack_fields(plan.fields, plan.fields.own[1]), _unpack_fields(plan.fields, plan.fields.own[2])
     wide = np.uint64(plan.size)
 
     def unpack(scratch: Any, sources: Any, i: Any, place: Any) -> None:
-        luggage, spread = scratch.luggage, scratch.spread
-        own(luggage, i * wide, sources, i, place)
+        buffer, spread = scratch.reorder_buffer, scratch.spread
+        own(buffer, i * wide, sources, i, place)
         if spread[0] > np.uint64(0):
-            bodies(luggage, i * wide, sources, i, place)
+            bodies(buffer, i * wide, sources, i, place)
         if spread[1] > np.uint64(0):
-            wants(luggage, i * wide, sources, i, place)
+            requests(buffer, i * wide, sources, i, place)
 
     return unpack
 
 
 @section
-def _unpack_fields(luggage: PackedFields, mine: tuple[int, ...]) -> Callable[..., None]:
+def _unpack_fields(fields: PackedFields, mine: tuple[int, ...]) -> Callable[..., None]:
     """Make `put_back(packed, at, sources, i, place)`: write numbers of agent i that lie packed at `at`."""
-    which, further = tuple(luggage.which[k] % 2 for k in mine), tuple(luggage.further[k] for k in mine)
+    which, further = tuple(fields.which[k] % 2 for k in mine), tuple(fields.further[k] for k in mine)
 
     def put_back(packed: Any, at: Any, sources: Any, i: Any, place: Any) -> None:
         scatter_each(pick_items(sources, (), mine), (i, place), which, further, gather(packed, at, mine))

@@ -46,13 +46,13 @@ def scratch_of(parts: KernelPlan, agents: int, team: int = 1) -> dict[str, Array
     def numbers(*names: str) -> dict[str, Array]:
         return dict.fromkeys(names, ((padded,), real))
 
-    found = vectors("pos", "vel", "want")
-    found["aside"] = (padded * parts.aside,), real
+    found = vectors("pos", "vel", "requested_force")
+    found["saved"] = (padded * parts.saved_size,), real
     if not parts.one_stage:
         found["stages"] = (parts.integrator.stages, padded * d), real
     found |= numbers("mass", "radius", "max_speed", "max_force", "living", "ident")
-    found |= vectors(*parts.frame_vectors, *["aiming"] * parts.aims, *["carrying"] * parts.flows)
-    found |= vectors(*["tie"] * ("t0" in parts.fields), *["pulled"] * parts.pulls)
+    found |= vectors(*parts.frame_vectors, *["aiming"] * parts.aims, *["advection"] * parts.flows)
+    found |= vectors(*["tie"] * ("t0" in parts.fields), *["far_bond_force"] * parts.has_far_bond_force)
     found |= numbers(*parts.frame_numbers, *(f"inner{k}" for k in range(len(parts.inner))))
     found["counters"] = (max(parts.counters, 1),), real
     if parts.sweeps:
@@ -73,7 +73,7 @@ def _query_arrays(parts: KernelPlan, agents: int, team: int) -> dict[str, Array]
     real, whole, width = np.dtype(parts.dtype), np.dtype(np.int32), parts.width
     padded = -(-agents // width) * width
     found: dict[str, Array] = {
-        "felt": ((max(padded * parts.dimension * len(parts.targets), 1),), real),
+        "pair_force": ((max(padded * parts.dimension * len(parts.targets), 1),), real),
         "number": ((SMALL_STRIDE,), whole),
         "ranges": ((MAX_RANGES, 3), np.dtype(np.int64)),
     }
@@ -94,11 +94,14 @@ def _tile_arrays(parts: KernelPlan, agents: int) -> dict[str, Array]:
     many = agents >= FEWEST_ARRANGED
     padded = -(-agents // width) * width if many else 0
     found: dict[str, Array] = {
-        "luggage": (((agents if many else 1) * parts.luggage_size + parts.luggage_size,), np.dtype(parts.dtype)),
+        "reorder_buffer": (
+            ((agents if many else 1) * parts.reordered_size + parts.reordered_size,),
+            np.dtype(parts.dtype),
+        ),
         "spread": ((2,), np.dtype(np.uint64)),
     }
-    if parts.homely:
-        found |= {"homes": ((padded // width * HOME + 1,), whole), "strangers": ((padded + 1,), whole)}
+    if parts.tracks_home_tiles:
+        found |= {"home_tiles": ((padded // width * HOME + 1,), whole), "displaced": ((padded + 1,), whole)}
     return found
 
 

@@ -1,4 +1,4 @@
-"""The side on which an agent passes what is ahead: `passing_side_of`, that of the nearest silhouette edge (Reynolds 1988).
+"""`passing_side_of`: the side on which an agent passes what is ahead, that of the nearest silhouette edge (Reynolds 1988).
 
 An obstacle is passed as grown by the body's radius. If another obstacle leaves no room beside an edge, the two count as
 one, and the edge of the other is searched for on the same side: so joined walls, and gaps that are too narrow, have no

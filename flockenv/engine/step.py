@@ -61,8 +61,8 @@ class StepPlan(NamedTuple):
     move: MovePlan
     method: Callable[[Provided], Method] | None  # of several stages
     method_plan: MethodPlan
-    tells: bool  # True if `sense` runs at the beginning of a step, for inner states
-    ahead: tuple[int, ...]  # numbers of a block in `pos`, `vel`, `felt` and `ident`, to be prefetched; or empty
+    senses_first: bool  # True if `sense` runs at the beginning of a step, for inner states
+    ahead: tuple[int, ...]  # numbers of a block in `pos`, `vel`, `pair_force` and `ident`, to be prefetched; or empty
     trusts: bool  # True if every agent has a finite position until a step has failed, see KernelPlan.trusts
     spreads: bool  # True if a NaN position reaches every neighbour within one step
 
@@ -77,7 +77,7 @@ def step_plan(parts: KernelPlan) -> StepPlan:
         arrange_plan(parts) if parts.arranges else None, laws_of(parts, "count_law"), sense_plan(parts),
         response_plan(parts),
         move_plan(parts), method, method_plan(parts), parts.inner != () and parts.integrator.solves,
-        (d * w, d * w, parts.felt_size, w) if parts.sorts else (), parts.trusts, parts.spreads,
+        (d * w, d * w, parts.pair_force_size, w) if parts.sorts else (), parts.trusts, parts.spreads,
     )  # fmt: skip
 
 
@@ -142,41 +142,44 @@ def _prefetch_all(array: Any, at: Any, places: Any) -> None:
 
 @section
 def _prefetch_ahead(numbers: tuple[int, ...], width: int) -> Callable[..., None]:
-    """Make `ask_ahead(scratch, pos, vel, block)`: prefetch what moves a later block."""
-    (of_pos, of_vel, of_felt, of_ident), felt = (_prefetch_block(many, width) for many in numbers), numbers[2] > 0
+    """Make `prefetch_ahead(scratch, pos, vel, block)`: prefetch what moves a later block."""
+    (of_pos, of_vel, of_pair_force, of_ident), pair_force = (
+        (_prefetch_block(many, width) for many in numbers),
+        numbers[2] > 0,
+    )
 
-    def ask_ahead(scratch: Any, pos: Any, vel: Any, block: Any) -> None:
+    def prefetch_ahead(scratch: Any, pos: Any, vel: Any, block: Any) -> None:
         ahead = block + np.uint64(AHEAD)
         of_pos(pos, ahead)
         of_vel(vel, ahead)
-        if felt:
-            of_felt(scratch.felt, ahead)
+        if pair_force:
+            of_pair_force(scratch.pair_force, ahead)
         of_ident(scratch.ident, ahead)
 
-    return ask_ahead
+    return prefetch_ahead
 
 
 @section
 def _in_two_loops(plan: StepPlan) -> Callable[..., None]:
     """Make `advance` for a method of one stage: once `sense` is done, no agent reads what another writes.
 
-    PART blocks at a time, which stay in the nearest cache; their accelerations are saved in `aside`. In a single loop,
+    PART blocks at a time, which stay in the nearest cache; their accelerations are saved in `saved`. In a single loop,
     from forces to new positions, too few agents would be in flight at a time.
     """
     size = np.uint64(plan.agent.dimension * plan.agent.width)
     respond, move = respond_of(plan.response), move_of(plan.move)
-    ask_ahead = _prefetch_ahead(plan.ahead, plan.agent.width) if plan.ahead else None
+    prefetch_ahead = _prefetch_ahead(plan.ahead, plan.agent.width) if plan.ahead else None
     sense = sense_of(plan.sense)
 
     def advance(context: Any, pos: Any, vel: Any, time: Any, dt: Any, instant: Any) -> None:
-        aside, first, end = context.scratch.aside, context.first, context.end
+        saved, first, end = context.scratch.saved, context.first, context.end
         sense(context, pos, vel, time)
         for begin in range(first, end, PART):
             until, before = min(begin + PART, end), np.uint64(begin - first)  # each thread at a place of its own
             for block in range(np.uint64(begin), np.uint64(until)):
-                if ask_ahead is not None:
-                    ask_ahead(context.scratch, pos, vel, block)
-                respond(context, pos, vel, time, block, aside, (block - before) * size)
+                if prefetch_ahead is not None:
+                    prefetch_ahead(context.scratch, pos, vel, block)
+                respond(context, pos, vel, time, block, saved, (block - before) * size)
             for block in range(np.uint64(begin), np.uint64(until)):
                 move(context, pos, vel, time, dt, instant, block, (block - before) * size)
 
@@ -189,18 +192,22 @@ def _by_method(plan: StepPlan) -> Callable[..., None]:
     assert plan.method is not None
     size, move = plan.agent.dimension * plan.agent.width, move_of(plan.move)
     advance_by = advance_of(plan.method, plan.method_plan)(accelerate_of(plan.response, plan.sense))
-    flows, bounces, sense = plan.move.flows, plan.move.bounce is not None, sense_of(plan.sense) if plan.tells else None
+    flows, bounces, sense = (
+        plan.move.flows,
+        plan.move.bounce is not None,
+        sense_of(plan.sense) if plan.senses_first else None,
+    )
 
     def advance(context: Any, pos: Any, vel: Any, time: Any, dt: Any, instant: Any) -> None:
         scratch, first, end = context.scratch, context.first, context.end
         if sense is not None:
             sense(context, pos, vel, time)
         for i in range(np.uint64(first * size), np.uint64(end * size)):
-            scratch.aside[i] = pos[i]
+            scratch.saved[i] = pos[i]
             if bounces:
-                scratch.aside[np.uint64(len(pos)) + i] = vel[i]
+                scratch.saved[np.uint64(len(pos)) + i] = vel[i]
         if flows:
-            advance_by(context, pos, vel, scratch.carrying, time, dt, scratch.stages, first * size, end * size)
+            advance_by(context, pos, vel, scratch.advection, time, dt, scratch.stages, first * size, end * size)
         else:
             advance_by(context, pos, vel, (), time, dt, scratch.stages, first * size, end * size)
         for block in range(np.uint64(first), np.uint64(end)):
@@ -247,9 +254,9 @@ def _first_failure(bad: int, width: int) -> Callable[..., Any]:
 
 @section
 def _copy_in(plan: StepPlan) -> Callable[..., Context]:
-    """Make `enter(worlds, drive, asked, params, count, b, rank, team, scratch)`: copy this thread's agents into blocks.
+    """Make `enter(worlds, drive, drive_row, params, count, b, rank, team, scratch)`: copy agents into blocks.
 
-    It returns the context of world b, reordered for `count` steps if that pays.
+    Those of this thread. It returns the context of world b, reordered for `count` steps if that pays.
     """
     agent, d, width, ordered = plan.agent, plan.agent.dimension, plan.agent.width, plan.arrange is not None
     read, bring_in, take_drive = numbers_of(plan.numbers), bring_in_of(agent), take_drive_of(d, width, ordered)
@@ -257,7 +264,7 @@ def _copy_in(plan: StepPlan) -> Callable[..., Context]:
     move_in = move_in_of(plan.arrange) if plan.arrange is not None else None
 
     def enter(
-        worlds: Any, drive: Any, asked: Any, params: Any, count: Any, b: Any, rank: Any, team: Any, scratch: Any
+        worlds: Any, drive: Any, drive_row: Any, params: Any, count: Any, b: Any, rank: Any, team: Any, scratch: Any
     ) -> Any:
         n, alive = worlds.x.shape[2], worlds.alive
         blocks = (n + (width - 1)) // width
@@ -268,7 +275,7 @@ def _copy_in(plan: StepPlan) -> Callable[..., Context]:
         for i in range(first * width, min(end * width, n)):
             scratch.living[i] = alive[b, i]
         bring_in(worlds, scratch, b, first, end)
-        take_drive(scratch, drive, asked, n, first, end)
+        take_drive(scratch, drive, drive_row, n, first, end)
         numbers, arranged = read(params, scratch.counters), False
         if bring_inside is not None:
             bring_inside(scratch, numbers.size, first, end)
@@ -284,12 +291,12 @@ def _copy_in(plan: StepPlan) -> Callable[..., Context]:
 
 @section
 def step_world_of(plan: StepPlan) -> Callable[..., int]:
-    """Make `step_world(worlds, drive, asked, params, dt, count, b, rank, team, scratch)`.
+    """Make `step_world(worlds, drive, drive_row, params, dt, count, b, rank, team, scratch)`.
 
     It advances this thread's part of world b by `count` steps, and returns -1, or an agent that is not finite: the
     lowest at the end of the call, or, if agents make others not finite (`spreads`), the lowest after the first step
-    that failed. Then nothing of the world is written. The commanded steering force is drive[:, asked], N; 0 if drive is
-    empty.
+    that failed. Then nothing of the world is written. The commanded steering force is drive[:, drive_row], N; 0 if drive
+    is empty.
     """
     agent, width, bad = plan.agent, plan.agent.width, np.uint64(plan.move.bad)
     enter, bring_out, counted = _copy_in(plan), bring_out_of(agent), tuple(range(COUNTED_BY_KERNELS))
@@ -299,14 +306,14 @@ def step_world_of(plan: StepPlan) -> Callable[..., int]:
         _first_bad(plan.move.bad, width),
         _first_failure(plan.move.bad, width) if plan.spreads else None,
     )
-    go_home = move_back_of(plan.arrange) if plan.arrange is not None else None
+    move_back = move_back_of(plan.arrange) if plan.arrange is not None else None
     verdict = _verdict(plan.trusts, agent.dimension)
 
     def step_world(
-        worlds: Any, drive: Any, asked: Any, params: Any, dt: Any, count: Any, b: Any, rank: Any, team: Any,
+        worlds: Any, drive: Any, drive_row: Any, params: Any, dt: Any, count: Any, b: Any, rank: Any, team: Any,
         scratch: Any,
     ) -> Any:  # fmt: skip
-        context = enter(worlds, drive, asked, params, count, b, rank, team, scratch)
+        context = enter(worlds, drive, drive_row, params, count, b, rank, team, scratch)
         n, first, end, pos, vel, lanes = context.n, context.first, context.end, scratch.pos, scratch.vel, scratch.lanes
         well, begun, before = like(dt, np.inf), worlds.tick[b], gather(worlds.work[b], np.uint64(0), counted)
         none_failed = np.int64(n * (count + 1))
@@ -320,9 +327,9 @@ def step_world_of(plan: StepPlan) -> Callable[..., int]:
             advance(context, pos, vel, time, dt, begun + step)
             if failing is not None:
                 failed = failing(lanes, well, step, n, failed, none_failed)
-        if go_home is not None:  # noqa: SIM102  # numba drops the branch by this alone
+        if move_back is not None:  # noqa: SIM102  # numba drops the branch by this alone
             if context.arranged:
-                go_home(scratch, (n, context.present, first, end, rank, team))
+                move_back(scratch, (n, context.present, first, end, rank, team))
         if failing is None:
             worst = first_bad(lanes, well)
             failed = np.int64(worst) if worst < well else none_failed

@@ -48,8 +48,8 @@ class Stepper:
     @functools.cached_property
     def params(self) -> Floats:
         """Every number that the kernel is passed."""
-        given: Floats = self.scene.parts.given()
-        return given
+        numbers: Floats = self.scene.parts.packed_numbers()
+        return numbers
 
     @property
     def dt(self) -> Any:

@@ -111,7 +111,7 @@ class World:
         self._enter, self._tell = self._entries
         b, i, real = self.worlds, self.learners, scene.dtype
         self._actions = zeros((b, i, self.action_size), real)
-        numbers = (task.parts.given(), list(task.parameters().values()), task.table() or (0.0,))
+        numbers = (task.parts.packed_numbers(), list(task.parameters().values()), task.table() or (0.0,))
         fields = (
             ((b, i, self.observation_size), np.float32), ((b, i), float), ((len(task.terms), b, i), float),
             ((b, i), bool), ((b,), bool), ((b,), bool), ((b, i), bool),
@@ -129,7 +129,7 @@ class World:
         given = Given(*(np.array(values, real) for values in numbers))
         worlds = Worlds(
             s.x, s.v, s.alive, s.tick, s.obstacle_x, s.obstacle_radius, s.work, s.key, self._memory, self.steps,
-            s.carried,
+            s.frame_and_inner,
         )  # fmt: skip
         self._always = (
             worlds, given, np.dtype(real).type(scene.dt), task.substeps, not task.ends_together, self._past,

@@ -24,8 +24,8 @@ from flockenv.jit.intrinsics import prefetch_for_write, wait_for_team
 
 __all__ = [
     "AHEAD", "DISTANT", "FEWEST_AGENTS", "FEWEST_ARRANGED", "FINEST", "MAX_RANGES", "STEPS_ARRANGED",
-    "WORTH_ARRANGING", "begin_cells", "candidates", "cell_of", "count_cells", "divide_region", "grid_of", "order_records",
-    "row_of", "tally_cells",
+    "WORTH_ARRANGING", "begin_cells", "candidates", "cell_of", "count_cells", "divide_region", "grid_of",
+    "order_records", "row_of", "tally_cells",
 ]  # fmt: skip
 
 MAX_RANGES = 27

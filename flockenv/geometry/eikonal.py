@@ -224,7 +224,8 @@ def free_part(
     if not free.any():
         where = "" if len(samples) == 1 else "at most "
         raise ValueError(
-            f"{name} = {target.points_text}: is {where}{gap.max():.3g} m from an obstacle, must be at least {clearance:g} m"
+            f"{name} = {target.points_text}: is {where}{gap.max():.3g} m from an obstacle, must be at least "
+            f"{clearance:g} m"
         )
     if target.ends is not None and not free.all():
         core = samples[: target.count(spacing)][free[: target.count(spacing)]]

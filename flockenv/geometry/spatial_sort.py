@@ -16,7 +16,8 @@ from flockenv.jit.decorators import kernel
 from flockenv.jit.intrinsics import prefetch_for_write
 
 __all__ = [
-    "FAR_FROM_HOME", "HOME", "TILE", "count_from_home_tiles", "count_tiles", "find_home_tiles", "order_cells", "order_shared",
+    "FAR_FROM_HOME", "HOME", "TILE", "count_from_home_tiles", "count_tiles", "find_home_tiles", "order_cells",
+    "order_shared",
 ]  # fmt: skip
 
 TILE = 256
@@ -87,11 +88,11 @@ def count_tiles(
 
 
 @kernel
-def find_home_tiles(first: int, end: int, lanes: int, n: int, shape: Any, start: Ints, homes: Ints) -> None:
+def find_home_tiles(first: int, end: int, lanes: int, n: int, shape: Any, start: Ints, home_tiles: Ints) -> None:
     """Write the home tiles of the agents of these blocks, just after sorting; start: where each tile begins.
 
-    homes (blocks * HOME,): the number of agents in the first of two tiles, then the lowest cell along each of three
-    axes, of that tile and of the other. A block that spans more tiles has none: all its agents count as strangers.
+    home_tiles (blocks * HOME,): the number of agents in the first of two tiles, then the lowest cell along each of
+    three axes, of that tile and of the other. A block that spans more tiles has none: all its agents count as displaced.
     """
     edge = _edge(shape, n)
     along, up, _ = _tiles(shape, edge)
@@ -104,23 +105,23 @@ def find_home_tiles(first: int, end: int, lanes: int, n: int, shape: Any, start:
         while start[other + 1] <= last:
             other += 1
         few = start[other] <= start[tile + 1]  # no agents in between
-        homes[at] = start[tile + 1] - begin
+        home_tiles[at] = start[tile + 1] - begin
         for k in range(2):
             t = other if k > 0 else tile
-            homes[at + 1 + 3 * k] = (t % along) * edge * shape[3] if few else -_AWAY
-            homes[at + 2 + 3 * k] = (t // along) % up * edge
-            homes[at + 3 + 3 * k] = (t // along) // up * edge
+            home_tiles[at + 1 + 3 * k] = (t % along) * edge * shape[3] if few else -_AWAY
+            home_tiles[at + 2 + 3 * k] = (t // along) % up * edge
+            home_tiles[at + 3 + 3 * k] = (t // along) // up * edge
 
 
 @kernel
 def count_from_home_tiles(
     pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, bounds: Any, size: Any,
-    reach: float, periodic: bool, wraps: bool, capacity: int, homes: Ints, strangers: Ints, tally: Any, cell: Ints,
+    reach: float, periodic: bool, wraps: bool, capacity: int, home_tiles: Ints, displaced: Ints, tally: Any, cell: Ints,
     start: Ints, offset: Ints,
 ) -> tuple[int, int, int, int, int]:  # fmt: skip
     """Do the same as `count_cells` if all `capacity` agents live and lie in tiles; list those outside their home tile.
 
-    The cells of such agents are written to `strangers` (agents, padded), from this thread's first agent on; their
+    The cells of such agents are written to `displaced` (agents, padded), from this thread's first agent on; their
     number to tally[team + rank].
     """
     shape, low, pace = divide_region(
@@ -141,9 +142,9 @@ def count_from_home_tiles(
             for k in range(d):
                 prefetch_for_write(pos, (later * d + k) * w)
             prefetch_for_write(cell, later * w)
-            first_of_two = np.uint64(homes[at])
-            x0, y0, z0 = _corner(homes, at + np.uint64(1))
-            x1, y1, z1 = _corner(homes, at + np.uint64(4))
+            first_of_two = np.uint64(home_tiles[at])
+            x0, y0, z0 = _corner(home_tiles, at + np.uint64(1))
+            x1, y1, z1 = _corner(home_tiles, at + np.uint64(4))
             for l in range(w):  # noqa: E741  # a lane
                 x, y, z = cell_of(pos, block * d * w + l, w, low, pace, size, wraps, shape)
                 index = (z * shape[1] + y) * shape[0] + x
@@ -154,11 +155,11 @@ def count_from_home_tiles(
                 cell[block * w + l] = np.int32(index) if block * w + l < np.uint64(capacity) else np.int32(-1)
         for i in range(np.uint64(begin * lanes), np.uint64(until * lanes)):
             c = cell[i]
-            stranger = c >= np.int32(_AWAY)
-            c -= np.int32(_AWAY) if stranger else np.int32(0)
+            is_displaced = c >= np.int32(_AWAY)
+            c -= np.int32(_AWAY) if is_displaced else np.int32(0)
             cell[i] = c
-            strangers[away] = c
-            away += np.uint64(1) if stranger else np.uint64(0)
+            displaced[away] = c
+            away += np.uint64(1) if is_displaced else np.uint64(0)
             if c >= 0:
                 offset[rank, c] += 1
     tally[team + rank] = np.int64(away) - first * lanes
@@ -170,9 +171,9 @@ def count_from_home_tiles(
 
 
 @kernel
-def _corner(homes: Ints, at: Any) -> tuple[Any, Any, Any]:
+def _corner(home_tiles: Ints, at: Any) -> tuple[Any, Any, Any]:
     """Return the lowest cell of a tile along each axis."""
-    return np.int64(homes[at]), np.int64(homes[at + np.uint64(1)]), np.int64(homes[at + np.uint64(2)])
+    return np.int64(home_tiles[at]), np.int64(home_tiles[at + np.uint64(1)]), np.int64(home_tiles[at + np.uint64(2)])
 
 
 @kernel
@@ -182,7 +183,7 @@ def order_cells(
     """Sort the records of each cell of listed[begin:end] by agent number, if only this thread has filled the cell.
 
     Records have `length` numbers and begin with their place; ident holds agent numbers by place; offset holds where
-    each thread stopped, and -1 for a cell once it is sorted, as a cell is listed once for each stranger in it.
+    each thread stopped, and -1 for a cell once it is sorted, as a cell is listed once for each displaced agent in it.
     """
     size, last, before = np.uint64(length), np.uint64(end), max(rank - 1, 0)
     mine = np.uint64(rank * offset.shape[1])

@@ -108,8 +108,8 @@ def _edges(spawn: Spawn, dimension: int, radius: float) -> tuple[float, ...]:
     least = 2 * (radius + spawn.jitter)
     if not spawn.wider and min(given) < least * (1 - 1e-12):
         raise ValueError(
-            f"spacing = {_edges_text(given)}: bodies of radius {radius:g} m, up to {spawn.jitter:g} m from the middle, need "
-            f"cells of at least {least:g} m"
+            f"spacing = {_edges_text(given)}: bodies of radius {radius:g} m, up to {spawn.jitter:g} m from the middle, "
+            f"need cells of at least {least:g} m"
         )
     return given
 

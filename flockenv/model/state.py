@@ -100,7 +100,7 @@ class State:
         return self.v.transpose(1, 2, 0)
 
     @property
-    def carried(self) -> tuple[Floats, ...]:
+    def frame_and_inner(self) -> tuple[Floats, ...]:
         """Frames and inner states, those that are not empty, as passed to kernels."""
         return tuple(array for array in (self.frame, self.inner) if len(array))
 

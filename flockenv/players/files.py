@@ -115,7 +115,8 @@ class FilePlayer:
         self._action_size = action_size
         if not self._whole and not _takes(function, 1):
             raise PlayerError(
-                f"player {printable_path(path)}: {name} takes neither four arguments nor the observation alone; {WANTED}"
+                f"player {printable_path(path)}: {name} takes neither four arguments nor the observation alone; "
+                f"{WANTED}"
             )
 
     def predict(

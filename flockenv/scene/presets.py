@@ -202,7 +202,8 @@ def _model(name: str) -> Model:
     full = ALIASES.get(name, name)
     if full not in PRESETS:
         raise ValueError(
-            f"preset = {printable(name)}: unknown{nearest(name, [*PRESETS, *ALIASES]) or ';'} allowed: {', '.join(PRESETS)}"
+            f"preset = {printable(name)}: unknown{nearest(name, [*PRESETS, *ALIASES]) or ';'} "
+            f"allowed: {', '.join(PRESETS)}"
         )
     return PRESETS[full]
 

@@ -112,7 +112,7 @@ def begin_of(plan: Plan) -> Callable[..., None]:
             w.alive[b, i] = True
         spawn(p, frame_of(w, scratch, near, given.table, b))
         if oriented:
-            face(w.v, w.carried[0], b, True)
+            face(w.v, w.frame_and_inner[0], b, True)
         if begin_inner is not None:
             begin_inner(w, given.params, dt, w.alive, b, scratch)
 

@@ -145,7 +145,8 @@ def _packed(worlds: Any) -> Any:
     """Return the arrays of worlds, marked as contiguous over agents for the compiler."""
     return Worlds(
         as_contiguous(worlds.x), as_contiguous(worlds.v), worlds.alive, worlds.tick, as_contiguous(worlds.obstacle_x),
-        worlds.obstacle_radius, worlds.work, worlds.key, as_contiguous(worlds.memory), worlds.steps, worlds.carried,
+        worlds.obstacle_radius, worlds.work, worlds.key, as_contiguous(worlds.memory), worlds.steps,
+        worlds.frame_and_inner,
     )  # fmt: skip
 
 

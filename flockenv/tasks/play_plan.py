@@ -26,7 +26,7 @@ class Worlds(NamedTuple):
     key: Any  # (B,)
     memory: Any  # (K, B, N)
     steps: Any  # (B,) decisions since the start
-    carried: Any  # a tuple of arrays: frames and inner states, if any
+    frame_and_inner: Any  # a tuple of arrays: frames and inner states, if any
 
 
 class Given(NamedTuple):

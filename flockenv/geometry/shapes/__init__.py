@@ -28,5 +28,6 @@ from flockenv.geometry.shapes.table import FORMS, pack_shapes
 
 __all__ = [
     "FORMS", "SHAPES", "AnyShape", "Block", "Bound", "Capsule", "Circle", "DistanceField", "HalfSpace", "Polygon",
-    "Shape", "Sway", "Wall", "blocks", "distance_to_shapes", "gap", "normal", "pack_shapes", "ray_hit", "silhouette", "touched_normal",
+    "Shape", "Sway", "Wall", "blocks", "distance_to_shapes", "gap", "normal", "pack_shapes", "ray_hit", "silhouette",
+    "touched_normal",
 ]  # fmt: skip
