@@ -429,7 +429,7 @@ def test_walls_are_joined_across_the_seam_of_a_torus() -> None:
         space=Torus(size=(10, 12)), groups=(Group(count=3, spawn=Spawn(speed=(0, 0))),), effects=(PUSH,),
         obstacles=tuple(halves), dt=1e-3,
     )  # fmt: skip
-    assert [row[-6:].tolist()[::3] for row in np.split(scene.parts.shaped[0], 4)] == [[1, 1], [2, 2]] * 2
+    assert [row[-6:].tolist()[::3] for row in np.split(scene.parts.shape_table[0], 4)] == [[1, 1], [2, 2]] * 2
 
 
 # --- when models oscillate --------------------------------------------------------------------------------------------

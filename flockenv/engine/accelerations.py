@@ -159,18 +159,18 @@ def _aim(agent: AgentPlan, laws: tuple[OneLaw, ...]) -> Callable[..., None]:
     """Make `aim(context, pos, vel, time)`: write the desired direction of each of this thread's agents."""
     d, width = agent.dimension, agent.width
     size, vector, put = np.uint64(d * width), vector_of_lane(d, width), put_vector_of(d, width)
-    alone, ways, total = agent_of(agent._replace(aims=False)), tuple_from(*map(value_of, laws)), _sum_all(laws)
+    agent_at, directions, total = agent_of(agent._replace(aims=False)), tuple_from(*map(value_of, laws)), _sum_all(laws)
 
     def aim(context: Any, pos: Any, vel: Any, time: Any) -> None:
-        scratch, numbers, drawn = context.scratch, context.numbers, context.key[context.b]
+        scratch, numbers, random_key = context.scratch, context.numbers, context.key[context.b]
         for block in range(np.uint64(context.first), np.uint64(context.end)):
             base, row = block * size, block * np.uint64(width)
             for lane in range(np.uint64(width)):
                 i, at = row + lane, base + lane
                 x, v = vector(pos, at), vector(vel, at)
-                me = alone(scratch, drawn, time, at, i, i, x, v, zero(x))
-                way = total(zero(x), ways(numbers, me))
-                put(scratch.aiming, at, limit(way, like(x[0], 1.0)))
+                me = agent_at(scratch, random_key, time, at, i, i, x, v, zero(x))
+                direction = total(zero(x), directions(numbers, me))
+                put(scratch.aiming, at, limit(direction, like(x[0], 1.0)))
 
     return aim
 
@@ -263,7 +263,7 @@ def respond_of(plan: ResponsePlan) -> Callable[..., None]:
     """
     agent, d, width = plan.agent, plan.agent.dimension, plan.agent.width
     size, vector, put = np.uint64(d * width), vector_of_lane(d, width), put_vector_of(d, width)
-    alone, totals, common = agent_of(agent), _totals(plan), common_places(d, width, plan.masked)
+    agent_at, totals, common = agent_of(agent), _totals(plan), common_places(d, width, plan.masked)
     medium: Any = tuple_from(*map(value_of, plan.media)) if plan.media else None
     of_medium, of_flow = _sum_all(plan.media), _sum_all(plan.flows)
     flow: Any = tuple_from(*map(value_of, plan.flows)) if plan.flows else None
@@ -272,7 +272,7 @@ def respond_of(plan: ResponsePlan) -> Callable[..., None]:
     meet_obstacles = obstacles_of(plan.obstacles) if plan.obstacles is not None else None
 
     def respond(context: Any, pos: Any, vel: Any, time: Any, block: Any, out: Any, to: Any) -> None:
-        scratch, numbers, drawn = context.scratch, context.numbers, context.key[context.b]
+        scratch, numbers, random_key = context.scratch, context.numbers, context.key[context.b]
         base, row = block * size, block * np.uint64(width)
         one, live, request = common(scratch, context.n, context.present, block)
         if meet_obstacles is not None:
@@ -281,10 +281,10 @@ def respond_of(plan: ResponsePlan) -> Callable[..., None]:
             i, at = row + lane, base + lane
             x, v = vector(pos, at), vector(vel, at)
             o = zero(x)
-            me = alone(scratch, drawn, time, at, i, one + lane, x, v, o)
+            me = agent_at(scratch, random_key, time, at, i, one + lane, x, v, o)
             if medium is not None:
                 moves = of_medium(o, medium(numbers, me))
-                me = alone(scratch, drawn, time, at, i, one + lane, x, v, moves)
+                me = agent_at(scratch, random_key, time, at, i, one + lane, x, v, moves)
             steering, external, forces = totals(
                 numbers, scratch, me, vector(scratch.requested_force, request + lane), row, at, lane
             )

@@ -37,14 +37,16 @@ def agent_plan(parts: KernelPlan) -> AgentPlan:
 
 @section
 def agent_of(plan: AgentPlan) -> Callable[..., Me]:
-    """Make `alone(scratch, drawn, time, place, i, one, x, v, medium)`: agent i as the laws of one agent see it.
+    """Make `agent_at(scratch, random_key, time, place, i, one, x, v, medium)`: agent i as the laws of one agent see it.
 
     Its vectors lie at `place`, its body at `one`. Its tie is 0: only pairs in the same position need one.
     """
     vector, inner = vector_of_lane(plan.dimension, plan.width), inner_of(plan.inner)
     oriented, aims, paced = plan.oriented, plan.aims, plan.paced
 
-    def alone(scratch: Any, drawn: Any, time: Any, place: Any, i: Any, one: Any, x: Any, v: Any, medium: Any) -> Any:
+    def agent_at(
+        scratch: Any, random_key: Any, time: Any, place: Any, i: Any, one: Any, x: Any, v: Any, medium: Any
+    ) -> Any:
         heading = vector(scratch.facing, place) if oriented else unit(v)
         aim = vector(scratch.aiming, place) if aims else zero(x)
         desired_speed = scratch.desired_speed[i] if paced else like(x[0], 0.0)
@@ -60,13 +62,13 @@ def agent_of(plan: AgentPlan) -> Callable[..., Me]:
             zero(x),
             time,
             medium,
-            drawn,
+            random_key,
             aim,
             desired_speed,
             inner(scratch, i),
         )
 
-    return alone
+    return agent_at
 
 
 @law

@@ -153,7 +153,7 @@ def _add_bonds(plan: BondPlan, place: int) -> Callable[..., None]:
     before = _add_bonds(plan, place - 1) if place else None
     k, law, partners, numbers = plan.laws[place]
     dimension, width = plan.agent.dimension, plan.agent.width
-    vector, alone, partners_of = vector_of_lane(dimension, width), agent_of(plan.agent), _partners(plan, partners)
+    vector, agent_at, partners_of = vector_of_lane(dimension, width), agent_of(plan.agent), _partners(plan, partners)
     are_alive = _are_alive(dimension, width, partners)
     of_bond = tuple(number * width for number in range(numbers))
     keeps, apart, wide = bool(plan.agent.inner), partners * width, numbers * width
@@ -173,7 +173,7 @@ def _add_bonds(plan: BondPlan, place: int) -> Callable[..., None]:
             for lane in range(np.uint64(width)):
                 i, at = row + lane, base + lane
                 x, v = vector(pos, at), vector(vel, at)
-                me = alone(scratch, key, time, at, i, i, x, v, zero(x))
+                me = agent_at(scratch, key, time, at, i, i, x, v, zero(x))
                 others = partners_of(kept, placed, pos, vel, scratch.radius, scratch.mass, size, x, places + lane)
                 value = law(effects[k], me, others, gather(numbered, first + lane, of_bond))
                 whole = are_alive(placed, living, places + lane)  # a bond with a dead partner exerts no force

@@ -83,7 +83,7 @@ def begin_inner_of(plan: BeginPlan) -> Callable[..., None]:
     Those of world b, at its current time; fresh (B, N).
     """
     agent, d, width = plan.inner.agent, plan.inner.agent.dimension, plan.inner.agent.width
-    alone, vector, read = agent_of(agent._replace(aims=False)), vector_of_lane(d, width), numbers_of(plan.numbers)
+    agent_at, vector, read = agent_of(agent._replace(aims=False)), vector_of_lane(d, width), numbers_of(plan.numbers)
     begin, bring_in = begin_agent_of(plan.inner), bring_in_of(agent._replace(inner=()))
     place_in, place, many = place_of(d, width), int(agent.oriented), len(agent.inner)
     clear, write = call_in_turn(*map(_clear_number, range(many))), call_in_turn(*map(_begin_number, range(many)))
@@ -98,7 +98,7 @@ def begin_inner_of(plan: BeginPlan) -> Callable[..., None]:
                 at = place_in(i)
                 x, v = vector(scratch.pos, at), vector(scratch.vel, at)
                 clear(scratch.inner, i)
-                me = alone(scratch, worlds.key[b], time, at, i, i, x, v, zero(x))
+                me = agent_at(scratch, worlds.key[b], time, at, i, i, x, v, zero(x))
                 write(worlds.frame_and_inner[place], b, i, begin(numbers, me))
 
     return begin_inner

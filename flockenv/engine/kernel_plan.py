@@ -210,7 +210,7 @@ class KernelPlan(ObstacleSets):
 
     def packed_numbers(self) -> NDArray[Any]:
         """Return `parameters()` and the tables behind them, in the scene's precision, as the kernel is passed them."""
-        every: list[Any] = [self.parameters(), self.shaped[0], *self.cells.values(), *self.tables]
+        every: list[Any] = [self.parameters(), self.shape_table[0], *self.cells.values(), *self.tables]
         return np.concatenate(every).astype(self.dtype)
 
     def numbers_of(self, effect: Effect) -> dict[str, Any]:
@@ -410,8 +410,8 @@ class KernelPlan(ObstacleSets):
         runs += [("bond", d * bool(self.bonded)), ("far", d * bool(self.far))]
         edges = [k for k, e in enumerate(self.effects) if e.obstacle_start and e.obstacle_edges]
         runs += [(f"ahead{k}_", 2) for k in edges]
-        runs += [("found", -(-MOST_FOUND // self.width) * bool(self.looked_up))]
-        runs += [("reach", int(bool(self.bounded or self.looked_up))), ("here", int(self.parting))]
+        runs += [("found", -(-MOST_FOUND // self.width) * bool(self.gridded_forms))]
+        runs += [("reach", int(bool(self.bounded or self.gridded_forms))), ("here", int(self.parting))]
         runs += [("next", (d + 1) * self.looks_ahead)]
         runs += [("square", look.agents + self.keyed), ("place", look.agents)]
         runs += [("gap", look.obstacles), ("which", look.obstacles)]

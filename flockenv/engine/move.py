@@ -129,20 +129,20 @@ def _method_step(plan: MovePlan) -> Callable[..., Any]:
 
 @functools.cache
 def _draw(channel: int) -> Callable[..., float]:
-    """Return `draws(drawn, instant, i, dt)`: a normal number of (world, step, agent, channel), in dt's precision."""
-    return kernel(lambda drawn, instant, i, dt: like(dt, normal(drawn, instant, np.int64(i), channel)))  # type: ignore[arg-type]
+    """Return `draws(random_key, instant, i, dt)`: a normal number of (world, step, agent, channel), like dt."""
+    return kernel(lambda random_key, instant, i, dt: like(dt, normal(random_key, instant, np.int64(i), channel)))  # type: ignore[arg-type]
 
 
 @functools.cache
 def _apply_kicks(kicks: tuple[tuple[int, Law], ...], dimension: int) -> Callable[..., tuple[Vec, Vec]]:
-    """Return `kicked(numbers, me, free, drawn, instant, dt, x, v)`: x and v after the step's velocity kicks."""
+    """Return `kicked(numbers, me, free, random_key, instant, dt, x, v)`: x and v after velocity kicks."""
     before, (k, law) = _apply_kicks(kicks[:-1], dimension) if kicks[1:] else None, kicks[-1]
     draws = tuple_from(*(_draw(CHANNELS * k + j) for j in range(dimension)))
 
-    def kicked(numbers: Any, me: Any, free: Any, drawn: Any, instant: Any, dt: Any, x: Any, v: Any) -> Any:
+    def kicked(numbers: Any, me: Any, free: Any, random_key: Any, instant: Any, dt: Any, x: Any, v: Any) -> Any:
         if before is not None:
-            x, v = before(numbers, me, free, drawn, instant, dt, x, v)
-        value = law(numbers.effects[k], me, dt, draws(drawn, instant, me.who, dt))
+            x, v = before(numbers, me, free, random_key, instant, dt, x, v)
+        value = law(numbers.effects[k], me, dt, draws(random_key, instant, me.who, dt))
         kick = select(free, value, zero(x))
         return add(x, scale(kick, like(dt, 0.5) * dt)), add(v, kick)  # as if it came in the middle of the step
 
@@ -162,11 +162,11 @@ def _limit_turn(plan: MovePlan) -> Callable[..., Any]:
 
     def turn(scratch: Any, i: Any, at: Any, dt: Any, was: Any, x: Any, v: Any) -> Any:
         most = min(scratch.max_turn_rate[i] * dt, like(dt, np.pi))
-        before, way = vector(scratch.facing, at), sub(x, was)
+        before, path = vector(scratch.facing, at), sub(x, was)
         if flows:
-            way = sub(x, add(was, scale(vector(scratch.advection, at), dt)))
-        there, over = turn_towards(way, before, most)
-        x = add(x, sub(limit_to_heading(way, there, over), way))
+            path = sub(x, add(was, scale(vector(scratch.advection, at), dt)))
+        there, over = turn_towards(path, before, most)
+        x = add(x, sub(limit_to_heading(path, there, over), path))
         ahead, over = turn_towards(v, before, most)
         return x, limit_to_heading(v, ahead, over), ahead
 
@@ -298,13 +298,13 @@ def begin_agent_of(plan: InnerPlan) -> Callable[..., tuple[float, ...]]:
 def move_of(plan: MovePlan) -> Callable[..., None]:
     """Make `move(context, pos, vel, time, dt, instant, block, past)`: move the agents of a block.
 
-    past: where the values saved for the block begin, see `_method_step`; instant: number of steps that the world has made.
+    past: where the values saved for the block begin, see `_method_step`; instant: number of steps made by the world.
     No agent moves faster than max_speed, whatever a method does to its velocity within the step. The lowest number of
     an agent that is not finite is noted in each lane.
     """
     agent, d, width = plan.agent, plan.agent.dimension, plan.agent.width
     size, bad, put = np.uint64(d * width), np.uint64(plan.bad), put_vector_of(d, width)
-    alone, common, moved = agent_of(agent), common_places(d, width, plan.masked), _method_step(plan)
+    agent_at, common, moved = agent_of(agent), common_places(d, width, plan.masked), _method_step(plan)
     kicked = _apply_kicks(plan.kicks, d) if plan.kicks else None
     turn = _limit_turn(plan) if plan.turns else None
     face = _update_heading(plan) if agent.oriented else None
@@ -312,7 +312,7 @@ def move_of(plan: MovePlan) -> Callable[..., None]:
     confine, bounce = plan.confine, plan.bounce
 
     def move(context: Any, pos: Any, vel: Any, time: Any, dt: Any, instant: Any, block: Any, past: Any) -> None:
-        scratch, numbers, drawn = context.scratch, context.numbers, context.key[context.b]
+        scratch, numbers, random_key = context.scratch, context.numbers, context.key[context.b]
         lanes, ident, well = scratch.lanes, scratch.ident, like(dt, np.inf)
         base, row = block * size, block * np.uint64(width)
         one, live, _ = common(scratch, context.n, context.present, block)
@@ -320,9 +320,9 @@ def move_of(plan: MovePlan) -> Callable[..., None]:
             i, at = row + lane, base + lane
             was, earlier, x, v = moved(scratch, pos, vel, at, past + lane, dt)
             if kicked is not None:
-                me = alone(scratch, drawn, time, at, i, i, x, v, zero(x))
+                me = agent_at(scratch, random_key, time, at, i, i, x, v, zero(x))
                 free = (scratch.living[i] > like(dt, 0.0)) & (scratch.mass[i] < like(dt, np.inf))
-                x, v = kicked(numbers, me, free, drawn, instant, dt, x, v)
+                x, v = kicked(numbers, me, free, random_key, instant, dt, x, v)
             where = well if finite(dot(x, x) + dot(v, v)) else ident[i]
             lanes[bad + lane] = where if where < lanes[bad + lane] else lanes[bad + lane]
             ahead = x
@@ -343,7 +343,7 @@ def move_of(plan: MovePlan) -> Callable[..., None]:
             put(pos, at, x)
             put(vel, at, v)
             if keep is not None:
-                me = alone(scratch, drawn, time, at, i, i, x, v, zero(x))
+                me = agent_at(scratch, random_key, time, at, i, i, x, v, zero(x))
                 where = well if keep(scratch, numbers, me, i, row, lane, dt) else ident[i]
                 lanes[bad + lane] = where if where < lanes[bad + lane] else lanes[bad + lane]
 

@@ -39,7 +39,7 @@ class Besides(NamedTuple):
 
 @section
 def listed_agent(listing: Listing, inner: tuple[str, ...], oriented: bool) -> Callable[..., Me]:
-    """Make `agent(array, at, time, drawn)`: return the agent in a lane of a block, as pair laws see it."""
+    """Make `agent(array, at, time, random_key)`: return the agent in a lane of a block, as pair laws see it."""
     pos, vel, tie, aim, heading = (
         listing.lanes_of(listing.axes(x)) for x in ("x", "v", "t", "a", "d" if oriented else "h")
     )
@@ -47,12 +47,12 @@ def listed_agent(listing: Listing, inner: tuple[str, ...], oriented: bool) -> Ca
     inside, kind, has_inner = _inner_fields(inner), record(inner), bool(inner)
     within = listing.lanes_of(inside)
 
-    def agent(array: Any, at: Any, time: Any, drawn: Any) -> Any:
+    def agent(array: Any, at: Any, time: Any, random_key: Any) -> Any:
         x = gather(array, at, pos)
         who, mass, radius, max_speed, max_force, desired_speed = gather(array, at, numbers)
         return Me(
             who, x, gather(array, at, vel), gather(array, at, heading), mass, radius, max_speed, max_force,
-            gather(array, at, tie), time, zero(x), drawn, gather(array, at, aim), desired_speed,
+            gather(array, at, tie), time, zero(x), random_key, gather(array, at, aim), desired_speed,
             kind(*gather(array, at, within)) if has_inner else (),
         )  # fmt: skip
 
@@ -112,4 +112,4 @@ class Block(NamedTuple):
     upto: Any  # one past the last, as they are listed
     ranges: Any  # (found, 3) its candidates
     time: Any  # s
-    drawn: Any  # the key of random numbers
+    random_key: Any  # the key of random numbers

@@ -52,8 +52,10 @@ def _in_sight(around: Surroundings | None) -> Callable[..., bool]:
 
     def in_sight(world: Any, me: Any, gap: Any, out: Any) -> Any:
         obstacle_x, obstacle_radius, params, size, b = world
-        way = scale(out, -gap * like(gap, SHORT))
-        return (gap <= like(gap, 0.0)) or not hidden(obstacle_x, obstacle_radius, params, size, b, me.time, me.pos, way)
+        line = scale(out, -gap * like(gap, SHORT))
+        return (gap <= like(gap, 0.0)) or not hidden(
+            obstacle_x, obstacle_radius, params, size, b, me.time, me.pos, line
+        )
 
     return kernel(in_sight)
 
@@ -106,8 +108,10 @@ def _circle(fold: Fold, j: int) -> Callable[..., None]:
             out = touched_normal(to, ray, hit)
             it = Obstacle(like(rho, m), to, dot(to, to), o, rho, o, norm(to) - rho, out, hit, ray)
         else:
-            way = sub(to, origin(p, me)) if elsewhere else to
-            it = Obstacle(like(rho, m), way, dot(way, way), o, rho, o, norm(way) - rho, normal(way), far, o)
+            offset = sub(to, origin(p, me)) if elsewhere else to
+            it = Obstacle(
+                like(rho, m), offset, dot(offset, offset), o, rho, o, norm(offset) - rho, normal(offset), far, o
+            )
         keep(p, world, me, it, CIRCLE, m, lanes, lane)
 
     return meet

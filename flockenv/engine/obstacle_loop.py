@@ -45,7 +45,7 @@ def obstacles_of(plan: Obstacles) -> Callable[..., None]:
     d, width, arranges = plan.agent.dimension, plan.agent.width, plan.arranges
     size, wide = np.uint64(d * width), np.uint64(width)
     forms = (
-        _every_shape(plan, j) if form.name not in plan.looked_up else _gridded_shapes(plan, j)
+        _every_shape(plan, j) if form.name not in plan.gridded_forms else _gridded_shapes(plan, j)
         for j, form in enumerate(plan.around.forms)
     )
     edges = (_passing_sides(plan, fold) for fold in plan.folds if fold.ahead)
@@ -61,13 +61,13 @@ def obstacles_of(plan: Obstacles) -> Callable[..., None]:
 
 @section
 def _agent_of(plan: AgentPlan) -> Callable[..., Any]:
-    """Make `agent(scratch, drawn, pos, vel, time, place, lane)`: return an agent of a block, as its laws see it."""
-    vector_at, alone = vector_of_lane(plan.dimension, plan.width), agent_of(plan)
+    """Make `agent(scratch, random_key, pos, vel, time, place, lane)`: an agent of a block, as laws see it."""
+    vector_at, agent_at = vector_of_lane(plan.dimension, plan.width), agent_of(plan)
 
-    def agent(scratch: Any, drawn: Any, pos: Any, vel: Any, time: Any, place: Any, lane: Any) -> Any:
+    def agent(scratch: Any, random_key: Any, pos: Any, vel: Any, time: Any, place: Any, lane: Any) -> Any:
         at = place.base + lane
         x, v = vector_at(pos, at), vector_at(vel, at)
-        return alone(scratch, drawn, time, at, place.row + lane, place.one + lane, x, v, zero(x))
+        return agent_at(scratch, random_key, time, at, place.row + lane, place.one + lane, x, v, zero(x))
 
     return agent
 
@@ -97,10 +97,10 @@ def _starts(plan: Obstacles) -> Callable[..., None]:
     furthest: Any = _furthest(plan.folds) if limited else None
 
     def starts(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
-        scratch, numbers, drawn = context.scratch, context.numbers, context.key[context.b]
+        scratch, numbers, random_key = context.scratch, context.numbers, context.key[context.b]
         lanes = scratch.lanes
         for lane in range(np.uint64(width)):
-            me = agent(scratch, drawn, pos, vel, time, place, lane)
+            me = agent(scratch, random_key, pos, vel, time, place, lane)
             begin(scratch, numbers, me, place.row, lanes, lane)
             if limited:
                 lanes[reach + lane] = furthest(numbers, me)
@@ -148,7 +148,7 @@ def _circles(plan: Obstacles) -> Callable[..., None]:
 
     def circles(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
         scratch, numbers, b, world = context.scratch, context.numbers, context.b, world_of(context)
-        radius, lanes, drawn = context.obstacle_radius, scratch.lanes, context.key[b]
+        radius, lanes, random_key = context.obstacle_radius, scratch.lanes, context.key[b]
         if place.row == 0:
             context.work[b, 3] += context.n * radius.shape[1]
         for m in range(radius.shape[1]):
@@ -156,7 +156,7 @@ def _circles(plan: Obstacles) -> Callable[..., None]:
             if rho > 0:
                 centre = circle(context.obstacle_x, b, m)
                 for lane in range(np.uint64(width)):
-                    me = agent(scratch, drawn, pos, vel, time, place, lane)
+                    me = agent(scratch, random_key, pos, vel, time, place, lane)
                     meet(numbers, world, me, offset_to(numbers.size, me.pos, centre), rho, m, lanes, lane)
 
     return circles
@@ -185,7 +185,7 @@ def _row(plan: Obstacles, form: str) -> Callable[..., None]:
     offset_to, nearest, meet = plan.around.offset_to, law_of("nearest", form), meet_shape(plan.folds, form)
     bounded, picks, reach = (
         form in plan.bounded,
-        form in plan.looked_up and plan.only_rays,
+        form in plan.gridded_forms and plan.only_rays,
         np.uint64(max(plan.reach, 0)),
     )
     near_a_ray: Any = _near_a_ray(plan.folds) if picks else None
@@ -215,14 +215,14 @@ def _every_shape(plan: Obstacles, j: int) -> Callable[..., None]:
 
     def shapes(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
         scratch, numbers, b, world = context.scratch, context.numbers, context.b, world_of(context)
-        params, lanes, drawn = context.params, scratch.lanes, context.key[b]
+        params, lanes, random_key = context.params, scratch.lanes, context.key[b]
         at, many = numbers.forms[j].at, numbers.forms[j].many
         if place.row == 0:
             context.work[b, 3] += context.n * many
         for m in range(many):
             where, glide = placed(params, at, time)
             for lane in range(np.uint64(width)):
-                me = agent(scratch, drawn, pos, vel, time, place, lane)
+                me = agent(scratch, random_key, pos, vel, time, place, lane)
                 meet(numbers, world, params, me, at, m, where, glide, lanes, lane)
             at += np.int64(params[at])
 
@@ -242,11 +242,11 @@ def _gridded_shapes(plan: Obstacles, j: int) -> Callable[..., None]:
 
     def shapes(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
         scratch, numbers, b, world = context.scratch, context.numbers, context.b, world_of(context)
-        params, lanes, drawn, mine = context.params, scratch.lanes, context.key[b], numbers.forms[j]
+        params, lanes, random_key, mine = context.params, scratch.lanes, context.key[b], numbers.forms[j]
         if place.row == 0:
             context.work[b, 3] += context.n * mine.many
         for lane in range(np.uint64(width)):
-            me = agent(scratch, drawn, pos, vel, time, place, lane)
+            me = agent(scratch, random_key, pos, vel, time, place, lane)
             middle, around = box(numbers, me, lanes[reach + lane] * like(me.pos[0], LOOSE))
             listed = near(params, numbers.size, mine.cells, middle, around, lanes, np.int64(first))
             at = mine.at
@@ -333,8 +333,8 @@ def _span(folds: tuple[Fold, ...]) -> Callable[..., tuple[Vec, Vec, float]]:
         low, high, wide = (o, o, like(seen, 0.0)) if before is None else before(numbers, me, seen)
         for j in range(rays):
             ray, margin = ray_of(numbers.effects[k], me, j)
-            way, room = scale(ray, seen), me.radius + margin
-            (low, high), wide = _grow(low, high, way), max(wide, room)
+            end, room = scale(ray, seen), me.radius + margin
+            (low, high), wide = _grow(low, high, end), max(wide, room)
         return low, high, wide
 
     return kernel(span)
@@ -355,12 +355,12 @@ def _passing_sides(plan: Obstacles, fold: Fold) -> Callable[..., None]:
 
     def asides(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
         scratch, numbers, b = context.scratch, context.numbers, context.b
-        lanes, drawn = scratch.lanes, context.key[b]
+        lanes, random_key = scratch.lanes, context.key[b]
         world = context.obstacle_x, context.obstacle_radius, context.params, numbers.size, b, time
         for lane in range(np.uint64(width)):
             impact = lanes[first + lane]
             if impact > 0 and impact < like(impact, np.inf):
-                me = agent(scratch, drawn, pos, vel, time, place, lane)
+                me = agent(scratch, random_key, pos, vel, time, place, lane)
                 ray, margin = ray_of(numbers.effects[k], me, 0)
                 known = impact, np.int64(lanes[which + lane]), np.int64(lanes[place_at + lane])
                 scatter(lanes, lane, sides, aside(world, me.pos, ray, me.radius + margin, known))

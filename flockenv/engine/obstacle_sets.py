@@ -41,7 +41,7 @@ class ObstacleSets:
             """See KernelPlan."""
 
     @functools.cached_property
-    def shaped(self) -> tuple[NDArray[np.float64], dict[str, tuple[int, int]]]:
+    def shape_table(self) -> tuple[NDArray[np.float64], dict[str, tuple[int, int]]]:
         """The table of shapes that are not in the state, and, by form, where the rows begin and how many there are."""
         if not self.meets_obstacles:
             return np.zeros(0), {}
@@ -60,7 +60,9 @@ class ObstacleSets:
         These are the forms whose laws loop over edges or cells. Laws of blocks and half-spaces are evaluated lane
         beside lane, so some lane would need the whole law anyhow: there a test was no faster, with rays or without.
         """
-        return tuple(form for form in ("chain", "distance_field") if form in self.shaped[1]) if self.reaches else ()
+        return (
+            tuple(form for form in ("chain", "distance_field") if form in self.shape_table[1]) if self.reaches else ()
+        )
 
     @property
     def reaches(self) -> bool:
@@ -71,7 +73,7 @@ class ObstacleSets:
     @functools.cached_property
     def cells(self) -> dict[str, NDArray[np.float64]]:
         """Grids over the shapes of each form of finite extent that has many of them: see shapes/cells.py."""
-        table, forms = self.shaped
+        table, forms = self.shape_table
         period = np.array(self.space.extent(self.dimension)) if self.space.periodic else None
         found = {}
         for form, (begin, count) in forms.items():
@@ -87,7 +89,7 @@ class ObstacleSets:
         return found
 
     @property
-    def looked_up(self) -> tuple[str, ...]:
+    def gridded_forms(self) -> tuple[str, ...]:
         """The forms for which folds use only the shapes that may lie within reach, found by a grid."""
         return tuple(self.cells) if self.reaches else ()
 
@@ -104,7 +106,7 @@ class ObstacleSets:
     @property
     def surroundings(self) -> Surroundings:
         """What code about obstacles depends on."""
-        plans = zip(self.shaped[1], self.number_plan.forms, strict=True)
+        plans = zip(self.shape_table[1], self.number_plan.forms, strict=True)
         forms = tuple(FormPlan(form, *plan) for form, plan in plans)
         return Surroundings(self.dimension, self.space.offset_law, self.moving, forms)
 

@@ -61,7 +61,7 @@ def _visit_lanes(plan: Pairs, which: str, wrapped: bool, each: Callable[..., Non
         lanes, size = block.lanes, numbers.size
         own, o, touch = np.int32(j - block.at), like(numbers.reach, -0.0), False
         for lane in range(np.uint64(width)):
-            me = agent(block.mine, block.first + lane, block.time, block.drawn)
+            me = agent(block.mine, block.first + lane, block.time, block.random_key)
             if tied:  # lanes beyond the last agent hold stale numbers
                 mine = (
                     np.uint64(lanes[home + lane])
@@ -145,7 +145,7 @@ def _visit_ahead(plan: Pairs, each: Callable[..., None]) -> Callable[..., None]:
     agent, candidate = listed_agent(listing, plan.inner, plan.oriented), listed_candidate(listing, plan.inner)
     d, periodic, offset_to = listing.dimension, listing.periodic, plan.offset_to
     exact = any(view.near[1] for view in plan.views)
-    place, way = listing.candidate_places(listing.axes("x")), plan.slots(int(listing.slot("next0")), d)
+    place, next_offset = listing.candidate_places(listing.axes("x")), plan.slots(int(listing.slot("next0")), d)
     square_at, here = listing.slot(f"next{d}"), listing.slot("here0")
 
     def meet(numbers: Any, besides: Any, block: Any, r: Any) -> None:
@@ -154,25 +154,25 @@ def _visit_ahead(plan: Pairs, each: Callable[..., None]) -> Callable[..., None]:
         j, last = np.uint64(block.ranges[r, 0]), np.uint64(block.ranges[r, 1])
         following = gather(rows, j, place)
         for lane in range(np.uint64(width)):
-            me = agent(rows, block.first + lane, block.time, block.drawn)
+            me = agent(rows, block.first + lane, block.time, block.random_key)
             onward = offset_to(size, me.pos, following) if periodic else sub(following, me.pos)
-            scatter(lanes, lane, way, onward)
+            scatter(lanes, lane, next_offset, onward)
             lanes[square_at + lane] = exact_dot(onward, onward) if exact else dot(onward, onward)
         while j < last:
             it = candidate(rows, j)
             j += np.uint64(1)
             following = gather(rows, j, place)
             for lane in range(np.uint64(width)):
-                me = agent(rows, block.first + lane, block.time, block.drawn)
+                me = agent(rows, block.first + lane, block.time, block.random_key)
                 onward = offset_to(size, me.pos, following) if periodic else sub(following, me.pos)
                 further = exact_dot(onward, onward) if exact else dot(onward, onward)
-                to, square = gather(lanes, lane, way), lanes[square_at + lane]
+                to, square = gather(lanes, lane, next_offset), lanes[square_at + lane]
                 other = square > like(square, ONE_PLACE)
                 neighbour = Other(it.who, to, square, it.vel, it.radius, it.tie, it.mass, it.inner)
                 each(numbers, besides, me, neighbour, other, square, o, lanes, lane)
                 if parting:
                     lanes[here + lane] = count_if(lanes[here + lane], other)
-                scatter(lanes, lane, way, onward)
+                scatter(lanes, lane, next_offset, onward)
                 lanes[square_at + lane] = further
 
     return meet

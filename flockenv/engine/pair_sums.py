@@ -167,7 +167,7 @@ def begin_sums(plan: Pairs) -> Callable[..., None]:
         for lane in range(np.uint64(width)):
             fill(block.lanes, lane, clear, o)
             if folds:
-                me = agent(block.mine, block.first + lane, block.time, block.drawn)
+                me = agent(block.mine, block.first + lane, block.time, block.random_key)
                 starts(numbers, obstacles, me, block.lanes, lane)
             fill(block.lanes, lane, far, like(o, np.inf))
 
@@ -207,7 +207,7 @@ def finish_sums(plan: Pairs) -> Callable[..., None]:
 
     def finish(numbers: Any, block: Any) -> None:
         for lane in range(np.uint64(width)):
-            me = agent(block.mine, block.first + lane, block.time, block.drawn)
+            me = agent(block.mine, block.first + lane, block.time, block.random_key)
             ends(numbers, me, block.lanes, lane)
 
     return finish

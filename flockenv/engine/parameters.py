@@ -124,7 +124,7 @@ class Numbered(Protocol):
         """The integrator."""
 
     @property
-    def shaped(self) -> tuple[Any, dict[Any, tuple[int, int]]]:
+    def shape_table(self) -> tuple[Any, dict[Any, tuple[int, int]]]:
         """Rows of shapes, and where those of each form lie."""
 
     @property
@@ -167,7 +167,7 @@ def pack_numbers(parts: Numbered) -> tuple[list[float], NumberPlan]:
 
     What follows (rows of shapes, grids, tables) is addressed by where it begins, a table also by where it ends.
     """
-    shapes, forms = parts.shaped
+    shapes, forms = parts.shape_table
     ends = np.cumsum([len(shapes), *map(len, parts.cells.values())]).tolist()
     grids = dict(zip(parts.cells, ends, strict=False))
     tables = iter(np.cumsum([ends[-1], *map(len, parts.tables)]).tolist())

@@ -1,4 +1,6 @@
-"""`passing_side_of`: the side on which an agent passes what is ahead, that of the nearest silhouette edge (Reynolds 1988).
+"""The side on which an agent passes what is ahead, that of the nearest silhouette edge: `passing_side_of`.
+
+Source: Reynolds 1988.
 
 An obstacle is passed as grown by the body's radius. If another obstacle leaves no room beside an edge, the two count as
 one, and the edge of the other is searched for on the same side: so joined walls, and gaps that are too narrow, have no
@@ -88,8 +90,8 @@ def first_hit(around: Surroundings) -> Callable[..., tuple[float, int, int]]:
 
     At most `most`. If several are touched at once, it returns the first as they are listed.
     """
-    offset_to, circle, shaped = around.offset_to, vector_of(around.dimension), bool(around.forms)
-    first_row: Any = _first_row(around) if shaped else None
+    offset_to, circle, has_shapes = around.offset_to, vector_of(around.dimension), bool(around.forms)
+    first_row: Any = _first_row(around) if has_shapes else None
 
     def first_hit(world: Any, x: Any, ray: Any, room: Any, most: Any) -> Any:
         obstacle_x, obstacle_radius, params, size, b, time = world
@@ -101,7 +103,7 @@ def first_hit(around: Surroundings) -> Callable[..., tuple[float, int, int]]:
                 here = threat(ray, to, room + rho, like(room, np.inf))
                 if here < best:
                     best, form, row = here, -1, m
-        if shaped:
+        if has_shapes:
             return first_row(params, size, (time, x, ray, room), (best, form, row))
         return best, form, row
 
@@ -192,7 +194,7 @@ def edge(around: Surroundings) -> Callable[..., tuple[float, float]]:
 
     Towards `side`; rad, and m along the turned ray until the body is beside the obstacle.
     """
-    offset_to, circle, shaped = around.offset_to, vector_of(around.dimension), bool(around.forms)
+    offset_to, circle, has_shapes = around.offset_to, vector_of(around.dimension), bool(around.forms)
     seen, edge_of = offset_from_shape(around.offset_to, around.moving), by_form(_laws("edge", around.forms), _no_edge)
 
     def edge(world: Any, form: Any, row: Any, x: Any, ray: Any, side: Any, room: Any) -> Any:
@@ -200,7 +202,7 @@ def edge(around: Surroundings) -> Callable[..., tuple[float, float]]:
         if form == -1:
             to = offset_to(size, x, circle(obstacle_x, b, row))
             return sphere_edge(to, ray, side, room + obstacle_radius[b, row])
-        if shaped:
+        if has_shapes:
             return edge_of(params, form, row, (seen(params, size, row, time, x), ray, side, room))
         return like(room, np.inf), like(room, np.inf)
 
@@ -213,7 +215,7 @@ def normal_hit(around: Surroundings) -> Callable[..., Vec]:
 
     hit: distance along the ray, m.
     """
-    offset_to, circle, shaped = around.offset_to, vector_of(around.dimension), bool(around.forms)
+    offset_to, circle, has_shapes = around.offset_to, vector_of(around.dimension), bool(around.forms)
     laws = tuple((form.name, law_of("nearest", form.name)) for form in around.forms)
     seen, nearest = offset_from_shape(around.offset_to, around.moving), by_form(laws, _no_surface)
 
@@ -221,7 +223,7 @@ def normal_hit(around: Surroundings) -> Callable[..., Vec]:
         obstacle_x, _, params, size, b, time = world
         if form == -1:
             return touched_normal(offset_to(size, x, circle(obstacle_x, b, row)), ray, hit)
-        if shaped:
+        if has_shapes:
             return nearest(params, form, row, (touched_spot(seen(params, size, row, time, x), ray, hit, room),))[1]
         return zero(x)
 
@@ -242,22 +244,22 @@ def edge_beyond(around: Surroundings) -> Callable[..., tuple[float, Vec]]:
         world: Any, form: Any, row: Any, hit: Any, x: Any, ray: Any, side: Any, room: Any, most: Any
     ) -> Any:
         far, off, first = like(room, np.inf), zero(x), True
-        spot, way, across, turned_by = scale(ray, hit), ray, side, like(room, 0.0)
+        spot, direction, across, turned_by = scale(ray, hit), ray, side, like(room, 0.0)
         for _ in range(FOLLOWED):
-            turn, reach = edge_at(world, form, row, x, way, across, room)
+            turn, reach = edge_at(world, form, row, x, direction, across, room)
             turned_by += turn
             if not (turned_by < like(room, ALL_AROUND)) or reach == far:
                 return far, off
             c, s = np.cos(turn), np.sin(turn)
-            way, across = add(scale(way, c), scale(across, s)), sub(scale(across, c), scale(way, s))
-            beyond = norm(sub(scale(way, reach), spot))
+            direction, across = add(scale(direction, c), scale(across, s)), sub(scale(across, c), scale(direction, s))
+            beyond = norm(sub(scale(direction, reach), spot))
             if not (beyond < most):
                 return far, off
-            hit, form, row = touched(world, x, way, room * like(room, JUST), reach + room)
+            hit, form, row = touched(world, x, direction, room * like(room, JUST), reach + room)
             if form == -2:
                 return beyond, off
             if space and first:
-                off, first = normal_at(world, form, row, x, way, hit, room), False
+                off, first = normal_at(world, form, row, x, direction, hit, room), False
         return far, off
 
     return routine(edge_beyond)

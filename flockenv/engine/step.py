@@ -109,18 +109,18 @@ def _clear_counters(k: int) -> Callable[..., None]:
 def _count(agent: AgentPlan, laws: tuple[OneLaw, ...]) -> Callable[..., None]:
     """Make `count_agents(context, pos, vel, time)`: count all agents of a world, by one thread of the team."""
     d, width = agent.dimension, agent.width
-    place_in, vector, alone = place_of(d, width), vector_of_lane(d, width), agent_of(agent._replace(aims=False))
+    place_in, vector, agent_at = place_of(d, width), vector_of_lane(d, width), agent_of(agent._replace(aims=False))
     clear, counts = call_in_turn(*(_clear_counters(law.k) for law in laws)), call_in_turn(*map(_count_one, laws))
 
     def count_agents(context: Any, pos: Any, vel: Any, time: Any) -> None:
-        scratch, numbers, drawn = context.scratch, context.numbers, context.key[context.b]
+        scratch, numbers, random_key = context.scratch, context.numbers, context.key[context.b]
         wait_for_team(scratch.sync, context.team)  # inner states were written by other threads
         if context.rank == 0:
             clear(numbers)
             for i in range(np.uint64(context.n)):
                 at = place_in(i)
                 x, v = vector(pos, at), vector(vel, at)
-                me = alone(scratch, drawn, time, at, i, i, x, v, zero(x))
+                me = agent_at(scratch, random_key, time, at, i, i, x, v, zero(x))
                 counts(numbers, me, scratch.living[i] > like(x[0], 0.0))
         wait_for_team(scratch.sync, context.team)  # before any agent changes
 
@@ -295,8 +295,8 @@ def step_world_of(plan: StepPlan) -> Callable[..., int]:
 
     It advances this thread's part of world b by `count` steps, and returns -1, or an agent that is not finite: the
     lowest at the end of the call, or, if agents make others not finite (`spreads`), the lowest after the first step
-    that failed. Then nothing of the world is written. The commanded steering force is drive[:, drive_row], N; 0 if drive
-    is empty.
+    that failed. Then nothing of the world is written. The commanded steering force is drive[:, drive_row], N; 0 if
+    drive is empty.
     """
     agent, width, bad = plan.agent, plan.agent.width, np.uint64(plan.move.bad)
     enter, bring_out, counted = _copy_in(plan), bring_out_of(agent), tuple(range(COUNTED_BY_KERNELS))

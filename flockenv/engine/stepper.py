@@ -127,7 +127,7 @@ class Stepper:
     def _apply_constraints(self, x0: Floats, v0: Floats, state: State) -> list[tuple[int, int]]:
         """Apply all constraints to a step that began at x0, v0; return every (world, agent) that is not finite."""
         worlds, agents, _ = state.shape
-        crew, work = min(usable_threads(), worlds), worlds * agents
+        threads, work = min(usable_threads(), worlds), worlds * agents
 
         def settle(settlers: list[Settler], first: int, end: int) -> list[tuple[int, int]]:
             return [bad for each in settlers if (bad := each(x0, v0, state, first, end))[0] >= 0]
@@ -136,13 +136,13 @@ class Stepper:
             return settle(self._settlers(1)[0], 0, worlds)
 
         def shared() -> list[tuple[int, int]]:
-            bounds = [worlds * k // crew for k in range(crew + 1)]
-            parts = zip(self._settlers(crew), bounds[:-1], bounds[1:], strict=False)
+            bounds = [worlds * k // threads for k in range(threads + 1)]
+            parts = zip(self._settlers(threads), bounds[:-1], bounds[1:], strict=False)
             return [
                 bad for found in run_parallel([functools.partial(settle, *part) for part in parts]) for bad in found
             ]
 
-        return alone() if crew <= 1 else self.tuners.of("mending", work, crew).run(alone, shared, work >= LARGEST)
+        return alone() if threads <= 1 else self.tuners.of("mending", work, threads).run(alone, shared, work >= LARGEST)
 
     def _settlers(self, count: int) -> list[list[Settler]]:
         """Return the constraints and population of `count` threads, each with scratch memory of its own."""
@@ -160,36 +160,39 @@ class Stepper:
         worlds, agents, _ = state.shape
         move, kind = self.move, self._scratch_kind
         arrays = worlds_of(state), drive, self.params, self.dt, steps
-        crew, team = self._thread_counts(worlds, agents)
+        threads, team = self._thread_counts(worlds, agents)
 
         def alone() -> tuple[int, int]:
             return move(*arrays, 0, worlds, 0, 1, self.workspaces(1, 1)[0].of(0, kind))
 
-        if crew <= 1:
+        if threads <= 1:
             return alone()
 
         def shared() -> tuple[int, int]:
-            spaces = self.workspaces(crew // team, team)
+            spaces = self.workspaces(threads // team, team)
             spaces[0].arrays["sync"][:] = 0
-            parts = [(0, worlds) if team > 1 else (worlds * k // crew, worlds * (k + 1) // crew) for k in range(crew)]
+            parts = [
+                (0, worlds) if team > 1 else (worlds * k // threads, worlds * (k + 1) // threads)
+                for k in range(threads)
+            ]
             found = run_parallel([
                 functools.partial(move, *arrays, *parts[k], k % team, team, spaces[k // team].of(k % team, kind))
-                for k in range(crew)
+                for k in range(threads)
             ])  # fmt: skip
             return min([bad for bad in found if bad[0] >= 0], default=(-1, -1))
 
         work = worlds * agents * steps
         surely = work >= LARGEST and (team == 1 or agents >= SURELY_TOGETHER)
-        return self.tuners.of("together" if team > 1 else "apart", work, crew).run(alone, shared, surely)
+        return self.tuners.of("together" if team > 1 else "apart", work, threads).run(alone, shared, surely)
 
     def _thread_counts(self, worlds: int, agents: int) -> tuple[int, int]:
         """Return the number of threads that may step these worlds, and the number that share each world.
 
         With an implicit method the solution is in one thread's scratch memory.
         """
-        crew, solves = usable_threads(), self.scene.integrator.adaptive or self.scene.integrator.solves
-        together = worlds < crew and agents >= FEWEST_TOGETHER and not solves
-        return (crew, crew) if together else (min(crew, worlds), 1)
+        threads, solves = usable_threads(), self.scene.integrator.adaptive or self.scene.integrator.solves
+        together = worlds < threads and agents >= FEWEST_TOGETHER and not solves
+        return (threads, threads) if together else (min(threads, worlds), 1)
 
     @functools.cached_property
     def plain_parts(self) -> KernelPlan:

@@ -22,8 +22,8 @@ def is_blocked_of(around: Surroundings) -> Callable[..., bool]:
 
     It returns True if an obstacle intersects the straight line from place x to the offset `to`, m.
     """
-    offset_to, circle, shaped = around.offset_to, vector_of(around.dimension), bool(around.forms)
-    hidden: Any = _is_hidden_by_shape(around) if shaped else None
+    offset_to, circle, has_shapes = around.offset_to, vector_of(around.dimension), bool(around.forms)
+    hidden: Any = _is_hidden_by_shape(around) if has_shapes else None
 
     def is_blocked(
         obstacle_x: Any, obstacle_radius: Any, params: Any, size: Any, b: Any, time: Any, x: Any, to: Any
@@ -33,7 +33,7 @@ def is_blocked_of(around: Surroundings) -> Callable[..., bool]:
             rho = obstacle_radius[b, m]
             if rho > 0:
                 found |= blocks(offset_to(size, x, circle(obstacle_x, b, m)), rho, to)
-        if shaped:
+        if has_shapes:
             return hidden(params, size, time, x, to, found)
         return found
 

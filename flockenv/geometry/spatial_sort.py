@@ -92,7 +92,7 @@ def find_home_tiles(first: int, end: int, lanes: int, n: int, shape: Any, start:
     """Write the home tiles of the agents of these blocks, just after sorting; start: where each tile begins.
 
     home_tiles (blocks * HOME,): the number of agents in the first of two tiles, then the lowest cell along each of
-    three axes, of that tile and of the other. A block that spans more tiles has none: all its agents count as displaced.
+    three axes, of that tile and of the other. A block that spans more tiles has none: its agents count as displaced.
     """
     edge = _edge(shape, n)
     along, up, _ = _tiles(shape, edge)

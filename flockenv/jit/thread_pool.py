@@ -133,10 +133,10 @@ def use_threads(count: int) -> None:
 def _pool_of(count: int) -> _ThreadPool:
     """Return a pool for `count` threads; two callers at once may create two, and each uses its own."""
     global _pool
-    crew = _pool
-    if crew is None or crew.pid != os.getpid() or len(crew.desks) < count - 1:
-        crew = _pool = _ThreadPool(max(count, _count))
-    return crew
+    pool = _pool
+    if pool is None or pool.pid != os.getpid() or len(pool.desks) < count - 1:
+        pool = _pool = _ThreadPool(max(count, _count))
+    return pool
 
 
 def run_parallel(jobs: Sequence[Callable[[], Any]]) -> list[Any]:
@@ -144,13 +144,13 @@ def run_parallel(jobs: Sequence[Callable[[], Any]]) -> list[Any]:
 
     All of them run at the same time, so they may wait for each other. Returns, or raises, only after all have ended.
     """
-    crew, here = (
+    pool, here = (
         _pool_of(len(jobs)),
         (*_current_core(), len(jobs) - 1),
     )  # a pinned caller keeps the pool's threads on its cores
     done: list[queue.SimpleQueue[Any]] = [queue.SimpleQueue() for _ in jobs[1:]]
-    with crew.lock:  # all queues under one lock: the jobs of two callers, which wait for each other, never interleave
-        for desk, job, answer in zip(crew.desks, jobs[1:], done, strict=False):
+    with pool.lock:  # all queues under one lock: the jobs of two callers, which wait for each other, never interleave
+        for desk, job, answer in zip(pool.desks, jobs[1:], done, strict=False):
             desk.put((job, answer, here))
     try:
         first = jobs[0]()
