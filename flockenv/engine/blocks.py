@@ -138,9 +138,9 @@ def out_of_blocks(dimension: int, width: int) -> Callable[..., None]:
 
 @section
 def arrays_of(inner: bool) -> Callable[..., Any]:
-    """Make `handed(scratch, pos, vel)`: a tuple of arrays, positions, velocities and, if any, inner states.
+    """Make `arrays(scratch, pos, vel)`: a tuple of arrays, positions, velocities and, if any, inner states.
 
-    The indices of the arrays of scratch follow on from theirs, see `lane_access.picked`.
+    The indices of the arrays of scratch follow on from theirs, see `lane_access.pick_items`.
     """
     if inner:
         return lambda scratch, pos, vel: (pos, vel) + scratch.inner  # noqa: RUF005  # numba adds tuples, and unpacks none

@@ -97,7 +97,7 @@ def move_plan(parts: KernelPlan) -> MovePlan:
 
 @section
 def _method_step(plan: MovePlan) -> Callable[..., Any]:
-    """Make `moved(scratch, pos, vel, at, past, dt)`: return old position and velocity, then new ones by the method.
+    """Make `method_step(scratch, pos, vel, at, past, dt)`: old position and velocity, then new ones by the method.
 
     The agent lies at `at`; what the method saved of it at `past` of `saved`. For a method of one stage that is its
     acceleration; for any other its old position, and its old velocity if bodies bounce.
@@ -105,7 +105,7 @@ def _method_step(plan: MovePlan) -> Callable[..., Any]:
     dimension, vector, bounces = plan.agent.dimension, vector_of_lane(*plan.agent[:2]), plan.bounce is not None
     method, flows = plan.method, plan.flows
 
-    def moved(scratch: Any, pos: Any, vel: Any, at: Any, past: Any, dt: Any) -> Any:
+    def method_step(scratch: Any, pos: Any, vel: Any, at: Any, past: Any, dt: Any) -> Any:
         x, v = vector(pos, at), vector(vel, at)
         if method is None:
             was, earlier = vector(scratch.saved, at), v
@@ -124,7 +124,7 @@ def _method_step(plan: MovePlan) -> Callable[..., Any]:
             there = add(there, scale(vector(scratch.advection, at), dt))
         return x, v, there, fast
 
-    return moved
+    return method_step
 
 
 @functools.cache
@@ -135,18 +135,18 @@ def _draw(channel: int) -> Callable[..., float]:
 
 @functools.cache
 def _apply_kicks(kicks: tuple[tuple[int, Law], ...], dimension: int) -> Callable[..., tuple[Vec, Vec]]:
-    """Return `kicked(numbers, me, free, random_key, instant, dt, x, v)`: x and v after velocity kicks."""
+    """Return `apply_kicks(numbers, me, free, random_key, instant, dt, x, v)`: x and v after velocity kicks."""
     before, (k, law) = _apply_kicks(kicks[:-1], dimension) if kicks[1:] else None, kicks[-1]
     draws = tuple_from(*(_draw(CHANNELS * k + j) for j in range(dimension)))
 
-    def kicked(numbers: Any, me: Any, free: Any, random_key: Any, instant: Any, dt: Any, x: Any, v: Any) -> Any:
+    def apply_kicks(numbers: Any, me: Any, free: Any, random_key: Any, instant: Any, dt: Any, x: Any, v: Any) -> Any:
         if before is not None:
             x, v = before(numbers, me, free, random_key, instant, dt, x, v)
         value = law(numbers.effects[k], me, dt, draws(random_key, instant, me.who, dt))
         kick = select(free, value, zero(x))
         return add(x, scale(kick, like(dt, 0.5) * dt)), add(v, kick)  # as if it came in the middle of the step
 
-    return kernel(kicked)
+    return kernel(apply_kicks)
 
 
 # --- headings ---------------------------------------------------------------------------------------------------------
@@ -199,34 +199,34 @@ def _update_heading(plan: MovePlan) -> Callable[..., None]:
 
 
 @functools.cache
-def _new_number(number: int, said: tuple[tuple[int, int], ...]) -> Callable[[Any, Any], float]:
-    """Return `becomes(was, value)`: a number as its only law sets it, or changed by several laws."""
-    if said[1:]:
-        return _sum_of_changes(number, said)
-    ((law, place),) = said
+def _new_number(number: int, setters: tuple[tuple[int, int], ...]) -> Callable[[Any, Any], float]:
+    """Return `new_number(was, value)`: a number as its only law sets it, or changed by several laws."""
+    if setters[1:]:
+        return _sum_of_changes(number, setters)
+    ((law, place),) = setters
     return kernel(lambda was, value: value[law][place])
 
 
 @functools.cache
-def _sum_of_changes(number: int, said: tuple[tuple[int, int], ...]) -> Callable[[Any, Any], float]:
-    """Return `changed(was, value)`: the old number, plus the changes to it by several laws."""
-    before, (law, place) = _sum_of_changes(number, said[:-1]) if said[1:] else None, said[-1]
+def _sum_of_changes(number: int, setters: tuple[tuple[int, int], ...]) -> Callable[[Any, Any], float]:
+    """Return `new_number(was, value)`: the old number, plus the changes to it by several laws."""
+    before, (law, place) = _sum_of_changes(number, setters[:-1]) if setters[1:] else None, setters[-1]
     if before is None:
         return kernel(lambda was, value: was[number] + (value[law][place] - was[number]))
     return kernel(lambda was, value: before(was, value) + (value[law][place] - was[number]))
 
 
 def _new_numbers(plan: InnerPlan) -> Callable[..., tuple[float, ...]]:
-    return tuple_from(*(_new_number(number, said) for number, said in enumerate(plan.numbers)))
+    return tuple_from(*(_new_number(number, setters) for number, setters in enumerate(plan.numbers)))
 
 
 @functools.cache
-def _evaluate_keep_law(plan: InnerPlan, kept: KeepLaw) -> Callable[..., Any]:
+def _evaluate_keep_law(plan: InnerPlan, keeper: KeepLaw) -> Callable[..., Any]:
     """Return `keeps(numbers, scratch, me, row, lane, dt)`: the new values of the numbers that a law keeps."""
-    given, law, agent = arguments_of(kept.keep.k, kept.keep.images), kept.keep.law, plan.agent
+    given, law, agent = arguments_of(keeper.keep.k, keeper.keep.images), keeper.keep.law, plan.agent
     pair_force = (
-        pair_force_of(agent.dimension, agent.width, plan.pair_force_size, kept.pair_force_at)
-        if kept.pair_force_at >= 0
+        pair_force_of(agent.dimension, agent.width, plan.pair_force_size, keeper.pair_force_at)
+        if keeper.pair_force_at >= 0
         else None
     )
 
@@ -250,7 +250,7 @@ def _put_number(number: int) -> Callable[..., None]:
 
 @functools.cache
 def _all_finite(count: int) -> Callable[[Any], bool]:
-    """Return `sound(now)`: True if all numbers are finite."""
+    """Return `all_finite(now)`: True if all numbers are finite."""
     total = _total(count)
     return kernel(lambda now: finite(total(now)))
 
@@ -269,13 +269,13 @@ def _write_inner(plan: InnerPlan) -> Callable[..., bool]:
 
     It returns True if they are finite.
     """
-    value, become = tuple_from(*(_evaluate_keep_law(plan, kept) for kept in plan.laws)), _new_numbers(plan)
-    put, sound = call_in_turn(*map(_put_number, range(len(plan.numbers)))), _all_finite(len(plan.numbers))
+    value, new_numbers = tuple_from(*(_evaluate_keep_law(plan, keeper) for keeper in plan.laws)), _new_numbers(plan)
+    put, all_finite = call_in_turn(*map(_put_number, range(len(plan.numbers)))), _all_finite(len(plan.numbers))
 
     def keep(scratch: Any, numbers: Any, me: Any, i: Any, row: Any, lane: Any, dt: Any) -> Any:
-        now = become(me.inner, value(numbers, scratch, me, row, lane, dt))
+        now = new_numbers(me.inner, value(numbers, scratch, me, row, lane, dt))
         put(scratch.inner, i, me.inner, now, scratch.living[i] > like(dt, 0.0))
-        return sound(now)
+        return all_finite(now)
 
     return keep
 
@@ -283,10 +283,10 @@ def _write_inner(plan: InnerPlan) -> Callable[..., bool]:
 @section
 def begin_agent_of(plan: InnerPlan) -> Callable[..., tuple[float, ...]]:
     """Make `begin(numbers, me)`: return the initial inner states of an agent."""
-    value, become = tuple_from(*(value_of(kept.begin) for kept in plan.laws)), _new_numbers(plan)
+    value, new_numbers = tuple_from(*(value_of(keeper.begin) for keeper in plan.laws)), _new_numbers(plan)
 
     def begin(numbers: Any, me: Any) -> Any:
-        return become(me.inner, value(numbers, me))
+        return new_numbers(me.inner, value(numbers, me))
 
     return begin
 
@@ -304,8 +304,8 @@ def move_of(plan: MovePlan) -> Callable[..., None]:
     """
     agent, d, width = plan.agent, plan.agent.dimension, plan.agent.width
     size, bad, put = np.uint64(d * width), np.uint64(plan.bad), put_vector_of(d, width)
-    agent_at, common, moved = agent_of(agent), common_places(d, width, plan.masked), _method_step(plan)
-    kicked = _apply_kicks(plan.kicks, d) if plan.kicks else None
+    agent_at, common, method_step = agent_of(agent), common_places(d, width, plan.masked), _method_step(plan)
+    apply_kicks = _apply_kicks(plan.kicks, d) if plan.kicks else None
     turn = _limit_turn(plan) if plan.turns else None
     face = _update_heading(plan) if agent.oriented else None
     keep = _write_inner(plan.inner) if plan.inner is not None else None
@@ -318,11 +318,11 @@ def move_of(plan: MovePlan) -> Callable[..., None]:
         one, live, _ = common(scratch, context.n, context.present, block)
         for lane in range(np.uint64(width)):
             i, at = row + lane, base + lane
-            was, earlier, x, v = moved(scratch, pos, vel, at, past + lane, dt)
-            if kicked is not None:
+            was, earlier, x, v = method_step(scratch, pos, vel, at, past + lane, dt)
+            if apply_kicks is not None:
                 me = agent_at(scratch, random_key, time, at, i, i, x, v, zero(x))
                 free = (scratch.living[i] > like(dt, 0.0)) & (scratch.mass[i] < like(dt, np.inf))
-                x, v = kicked(numbers, me, free, random_key, instant, dt, x, v)
+                x, v = apply_kicks(numbers, me, free, random_key, instant, dt, x, v)
             where = well if finite(dot(x, x) + dot(v, v)) else ident[i]
             lanes[bad + lane] = where if where < lanes[bad + lane] else lanes[bad + lane]
             ahead = x

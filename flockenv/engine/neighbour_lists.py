@@ -182,7 +182,7 @@ def list_living(plan: Listing) -> Callable[..., Any]:
 @section
 def _list_in_rows(plan: Listing) -> Callable[..., None]:
     """Make `fill(context, pos, vel)`: list the living of a small world by number, a row for each field."""
-    width, headed, handed = plan.width, plan.has_headings, arrays_of("inner0" in plan.arrays)
+    width, headed, arrays_in = plan.width, plan.has_headings, arrays_of("inner0" in plan.arrays)
     (arrays, which, further), to = plan.sources(), plan.lanes_of(plan.record)
     velocity, heading = plan.lanes_of(plan.axes("v")), plan.lanes_of(plan.axes("h"))
     size, place_in = plan.dimension * width, place_of(plan.dimension, width)
@@ -191,7 +191,7 @@ def _list_in_rows(plan: Listing) -> Callable[..., None]:
         scratch, n = context.scratch, context.n
         rows = scratch.sorted_rows
         if context.rank == 0:
-            sources = pick_items(handed(scratch, pos, vel), scratch, arrays)
+            sources = pick_items(arrays_in(scratch, pos, vel), scratch, arrays)
             if context.present == n:
                 for block in range((n + width - 1) // width):
                     base, row = np.uint64(block * size), np.uint64(block * width)
@@ -215,7 +215,7 @@ def _list_in_rows(plan: Listing) -> Callable[..., None]:
 @section
 def _list_as_records(plan: Listing) -> Callable[..., None]:
     """Make `enter(context, pos, vel)`: list the living of a large world by number, a record each."""
-    length, place_in, handed = (
+    length, place_in, arrays_in = (
         np.uint64(plan.length),
         place_of(plan.dimension, plan.width),
         arrays_of("inner0" in plan.arrays),
@@ -225,7 +225,7 @@ def _list_as_records(plan: Listing) -> Callable[..., None]:
     def enter(context: Any, pos: Any, vel: Any) -> None:
         scratch, n = context.scratch, context.n
         if context.rank == 0:
-            sources, records = pick_items(handed(scratch, pos, vel), scratch, arrays), scratch.records
+            sources, records = pick_items(arrays_in(scratch, pos, vel), scratch, arrays), scratch.records
             if context.arranged:  # all agents live, and lie by tile, not by number
                 for place in range(np.uint64(n)):
                     scratch.cell[np.uint64(scratch.ident[place])] = place
@@ -247,7 +247,7 @@ def _sort(plan: Listing) -> Callable[..., None]:
     So each agent takes one access to distant memory, which is prefetched.
     """
     d, width, wraps, confine = plan.dimension, plan.width, plan.wraps, plan.confine
-    length, handed = np.uint64(plan.length), arrays_of("inner0" in plan.arrays)
+    length, arrays_in = np.uint64(plan.length), arrays_of("inner0" in plan.arrays)
     arrays, which, further = plan.sources()
     inside = tuple(int(plan.slot("inside0")) + k * width for k in range(d))
     if wraps:  # read wrapped positions from where they are written first: the lanes of this thread
@@ -262,7 +262,7 @@ def _sort(plan: Listing) -> Callable[..., None]:
     def sort(context: Any, pos: Any, vel: Any, shape: Any) -> None:
         scratch, n, rank = context.scratch, context.n, context.rank
         records, cell, offset = scratch.records, scratch.cell, scratch.offset
-        sources = pick_items(handed(scratch, pos, vel), scratch, arrays)
+        sources = pick_items(arrays_in(scratch, pos, vel), scratch, arrays)
         for block in range(np.uint64(context.first), np.uint64(context.end)):
             base, row = block * size, block * np.uint64(width)
             if n >= DISTANT:

@@ -89,7 +89,7 @@ def _among_agents(plan: LookPlan) -> Callable[[Any], bool]:
 def _block(plan: LookPlan) -> Callable[..., int]:
     """Make the function of one block for `walk_blocks`; it returns 1 if keys were not used for the block, else 0."""
     sorts, keyed = plan.listing.sorts, plan.keyed
-    by_keys, by_squares, tell = by_keys_of(plan) if keyed else None, _by_squares(plan), _write_lists(plan)
+    by_keys, by_squares, write = by_keys_of(plan) if keyed else None, _by_squares(plan), _write_lists(plan)
 
     def block(looking: Any, shape: Any, block: Any, at: Any, upto: Any, found: Any, time: Any) -> Any:
         scratch, near, span = looking.scratch, looking.near, looking.numbers
@@ -103,13 +103,13 @@ def _block(plan: LookPlan) -> Callable[..., int]:
                     scratch.lanes, np.uint64(0), scratch.records, scratch.number, scratch.lanes, span, block,
                     scratch.ranges, found,
                 )  # fmt: skip
-                tell(scratch.records, scratch.lanes, near, block, upto, shape[0] == 0 and all_alive)
+                write(scratch.records, scratch.lanes, near, block, upto, shape[0] == 0 and all_alive)
             else:
                 by_squares(
                     scratch.sorted_rows, block, scratch.sorted_rows, scratch.number, scratch.lanes, span, block,
                     scratch.ranges, found,
                 )  # fmt: skip
-                tell(scratch.order, scratch.lanes, near, block, upto, all_alive)
+                write(scratch.order, scratch.lanes, near, block, upto, all_alive)
         return 0 if sure else 1
 
     return block
@@ -172,7 +172,7 @@ def _insert_candidates(plan: LookPlan, wrapped: bool) -> Callable[..., None]:
 
 @section
 def _write_lists(plan: LookPlan) -> Callable[..., None]:
-    """Make `tell(listed, lanes, near, block, upto, by_number)`: write the lists of a block to the output arrays.
+    """Make `write(listed, lanes, near, block, upto, by_number)`: write the lists of a block to the output arrays.
 
     listed: the agent at each place: records, or their order. by_number: True if the lists lie as the lanes do.
     """
@@ -180,7 +180,7 @@ def _write_lists(plan: LookPlan) -> Callable[..., None]:
     squares, places, home = listing.slot("square0"), listing.slot("place0"), listing.slot("home0")
     sorts, length = listing.sorts, np.uint64(listing.length)
 
-    def tell(listed: Any, lanes: Any, near: Any, block: Any, upto: Any, by_number: Any) -> None:
+    def write(listed: Any, lanes: Any, near: Any, block: Any, upto: Any, by_number: Any) -> None:
         if by_number:
             for lane in range(np.uint64(width)):
                 i, count = block + lane, np.int32(0)
@@ -202,7 +202,7 @@ def _write_lists(plan: LookPlan) -> Callable[..., None]:
                     count += np.int32(1) if square < np.inf else np.int32(0)
                 near.count[i] = count
 
-    return tell
+    return write
 
 
 # --- obstacles --------------------------------------------------------------------------------------------------------

@@ -164,16 +164,16 @@ def _circles(plan: Obstacles) -> Callable[..., None]:
 
 @section
 def _motion_of(dimension: int, moving: bool) -> Callable[..., tuple[Vec, Vec]]:
-    """Make `placed(params, at, time)`: position (m) and velocity (m/s) of the shape at `at` at a time (s)."""
+    """Make `motion_of(params, at, time)`: position (m) and velocity (m/s) of the shape at `at` at a time (s)."""
     vector_at = vector(dimension)
 
-    def placed(params: Any, at: Any, time: Any) -> Any:
+    def motion_of(params: Any, at: Any, time: Any) -> Any:
         place = vector_at(params, at + 2)
         if moving:
             return add(place, shift_of(params, at, time, place)), velocity_of(params, at, time, place)
         return place, zero(place)
 
-    return placed
+    return motion_of
 
 
 @section
@@ -211,7 +211,7 @@ def _row(plan: Obstacles, form: str) -> Callable[..., None]:
 def _every_shape(plan: Obstacles, j: int) -> Callable[..., None]:
     """Make `shapes(context, pos, vel, time, place)`: update all folds of a block by every shape of form j."""
     width, agent, world_of = plan.agent.width, _agent_of(plan.agent), _world_of(plan)
-    placed, meet = _motion_of(plan.agent.dimension, plan.around.moving), _row(plan, plan.around.forms[j].name)
+    motion_of, meet = _motion_of(plan.agent.dimension, plan.around.moving), _row(plan, plan.around.forms[j].name)
 
     def shapes(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
         scratch, numbers, b, world = context.scratch, context.numbers, context.b, world_of(context)
@@ -220,7 +220,7 @@ def _every_shape(plan: Obstacles, j: int) -> Callable[..., None]:
         if place.row == 0:
             context.work[b, 3] += context.n * many
         for m in range(many):
-            where, glide = placed(params, at, time)
+            where, glide = motion_of(params, at, time)
             for lane in range(np.uint64(width)):
                 me = agent(scratch, random_key, pos, vel, time, place, lane)
                 meet(numbers, world, params, me, at, m, where, glide, lanes, lane)
@@ -236,7 +236,7 @@ def _gridded_shapes(plan: Obstacles, j: int) -> Callable[..., None]:
     Only those that may lie within reach, in order.
     """
     width, agent, world_of = plan.agent.width, _agent_of(plan.agent), _world_of(plan)
-    placed, meet = _motion_of(plan.agent.dimension, plan.around.moving), _row(plan, plan.around.forms[j].name)
+    motion_of, meet = _motion_of(plan.agent.dimension, plan.around.moving), _row(plan, plan.around.forms[j].name)
     near, box = near_rows(plan.around.offset_to, plan.agent.dimension), _box(plan.folds, plan.only_rays)
     first, reach = plan.found, np.uint64(plan.reach)
 
@@ -252,7 +252,7 @@ def _gridded_shapes(plan: Obstacles, j: int) -> Callable[..., None]:
             at = mine.at
             for m in range(listed if listed >= 0 else mine.many):
                 at = mine.at + np.int64(lanes[np.uint64(first) + np.uint64(m)]) if listed >= 0 else at
-                where, glide = placed(params, at, time)
+                where, glide = motion_of(params, at, time)
                 meet(numbers, world, params, me, at, at - mine.at, where, glide, lanes, lane)
                 at += np.int64(params[at])
 
@@ -345,15 +345,19 @@ def _span(folds: tuple[Fold, ...]) -> Callable[..., tuple[Vec, Vec, float]]:
 
 @section
 def _passing_sides(plan: Obstacles, fold: Fold) -> Callable[..., None]:
-    """Make `asides(context, pos, vel, time, place)`: write on which side each agent passes the obstacle ahead.
+    """Make `passing_sides(context, pos, vel, time, place)`: write on which side each agent passes the obstacle ahead.
 
     For a law that reads it, see steering/around.py.
     """
     k, ray_of, slots, ahead, width = fold.k, fold.ray, fold.slots, fold.ahead, plan.agent.width
-    agent, aside, sides = _agent_of(plan.agent), passing_side_of(plan.around), fold.slots[-plan.agent.dimension :]
+    agent, passing_side, sides = (
+        _agent_of(plan.agent),
+        passing_side_of(plan.around),
+        fold.slots[-plan.agent.dimension :],
+    )
     first, which, place_at = np.uint64(slots[0]), np.uint64(ahead[0]), np.uint64(ahead[1])
 
-    def asides(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
+    def passing_sides(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
         scratch, numbers, b = context.scratch, context.numbers, context.b
         lanes, random_key = scratch.lanes, context.key[b]
         world = context.obstacle_x, context.obstacle_radius, context.params, numbers.size, b, time
@@ -363,6 +367,6 @@ def _passing_sides(plan: Obstacles, fold: Fold) -> Callable[..., None]:
                 me = agent(scratch, random_key, pos, vel, time, place, lane)
                 ray, margin = ray_of(numbers.effects[k], me, 0)
                 known = impact, np.int64(lanes[which + lane]), np.int64(lanes[place_at + lane])
-                scatter(lanes, lane, sides, aside(world, me.pos, ray, me.radius + margin, known))
+                scatter(lanes, lane, sides, passing_side(world, me.pos, ray, me.radius + margin, known))
 
-    return asides
+    return passing_sides

@@ -209,7 +209,7 @@ def _visit_ranges(plan: Pairs, which: str, each: Callable[..., None]) -> Callabl
 @section
 def _block(plan: Pairs) -> Callable[..., int]:
     """Make the function of one block for `walk_blocks`: evaluate pair laws, write sums; return the number of pairs."""
-    begin, finish, tell = begin_sums(plan), finish_sums(plan), write_sums(plan)
+    begin, finish, write = begin_sums(plan), finish_sums(plan), write_sums(plan)
     meet = _visit_ranges(plan, APART if plan.parting else OTHER, add_candidate(plan, False, plan.parting))
     nearest = any(view.near[1] for view in plan.views)
     select = _visit_ranges(plan, NEAREST, keep_nearest(plan)) if nearest else None
@@ -250,9 +250,9 @@ def _block(plan: Pairs) -> Callable[..., int]:
         finish(numbers, block)
         by_number = shape[0] == 0 and context.present == context.n
         if sorts:
-            tell(scratch.pair_force, scratch.cell, block, by_number and not context.arranged)
+            write(scratch.pair_force, scratch.cell, block, by_number and not context.arranged)
         else:
-            tell(scratch.pair_force, scratch.order, block, by_number)
+            write(scratch.pair_force, scratch.order, block, by_number)
         return interactions
 
     return block_of

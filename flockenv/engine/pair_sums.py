@@ -94,10 +94,10 @@ def add_candidate(plan: Pairs, touch: bool, apart: bool) -> Callable[..., None]:
     """
     laws = [law for law in plan.laws if law.contact == touch]
     laws.sort(key=lambda law: law.vanishes)  # others need one register less while the first are computed
-    asked = sorted({law.sight for law in laws})
-    see = tuple_from(*(_is_in_sight(plan, q, True) for q in asked))
-    add_all = call_in_turn(*(_add_one(plan, law, asked.index(law.sight), apart) for law in laws))
-    counted = [(k, plan.views[q].counted) for k, q in enumerate(asked) if plan.views[q].counted >= 0]
+    sights = sorted({law.sight for law in laws})
+    see = tuple_from(*(_is_in_sight(plan, q, True) for q in sights))
+    add_all = call_in_turn(*(_add_one(plan, law, sights.index(law.sight), apart) for law in laws))
+    counted = [(k, plan.views[q].counted) for k, q in enumerate(sights) if plan.views[q].counted >= 0]
     count, counts = call_in_turn(*(_count_one(*each) for each in counted)), bool(counted) and not touch
     some = bool(laws)
 
@@ -241,13 +241,13 @@ def _total(plan: Pairs, laws: tuple[PairLaw, ...]) -> Callable[..., Any]:
 
 @section
 def write_sums(plan: Pairs) -> Callable[..., None]:
-    """Make `tell(pair_force, order, block, by_number)`: write the sums of a block to `pair_force`, by agent."""
+    """Make `write(pair_force, order, block, by_number)`: write the sums of a block to `pair_force`, by agent."""
     width, sorts, home = plan.lanes, plan.listing.sorts, plan.listing.slot("home0")
     slots = tuple(slot for first in plan.targets for slot in plan.slots(first, plan.listing.dimension))
     rows, first = tuple(k * width for k in range(len(slots))), (0,) * len(slots)
     whole, place_in = np.uint64(len(slots)), place_of(len(slots), width)
 
-    def tell(pair_force: Any, order: Any, block: Any, by_number: Any) -> None:
+    def write(pair_force: Any, order: Any, block: Any, by_number: Any) -> None:
         lanes, begin = block.lanes, np.uint64(0)
         if by_number:
             sources = pick_items((lanes,), (), first)
@@ -257,4 +257,4 @@ def write_sums(plan: Pairs) -> Callable[..., None]:
                 i = np.uint64(lanes[home + lane]) if sorts else np.uint64(order[block.at + lane])
                 scatter(pair_force, place_in(i), rows, gather(lanes, lane, slots))
 
-    return tell
+    return write

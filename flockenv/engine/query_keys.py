@@ -34,7 +34,7 @@ def by_keys_of(plan: LookPlan) -> Callable[..., bool]:
     the bits that remain of a square, it returns False: then the lists must be computed again from squares.
     """
     width, lists, key = plan.listing.width, plan.slots("square", plan.agents + 1), _key(plan)
-    tell, place, place_them = _write_keys(plan), plan.place, _write_positions(plan)
+    write, place, write_positions = _write_keys(plan), plan.place, _write_positions(plan)
 
     def by_keys(rows: Any, number: Any, lanes: Any, near: Any, span: Any, block: Any, n: Any) -> Any:
         room, size = 1, span.size
@@ -54,9 +54,9 @@ def by_keys_of(plan: LookPlan) -> Callable[..., bool]:
                     key(rows, number, j + np.uint64(3), size, here, mine, tags),
                 )
                 scatter(lanes, lane, lists, merge(gather(lanes, lane, lists), come))
-        sure = tell(lanes, near, block, tags, edge)
+        sure = write(lanes, near, block, tags, edge)
         if sure:
-            place_them(rows, lanes, near, span, block, n, edge)
+            write_positions(rows, lanes, near, span, block, n, edge)
         return sure
 
     return by_keys
@@ -78,13 +78,13 @@ def _key(plan: LookPlan) -> Callable[..., Any]:
 
 @section
 def _write_keys(plan: LookPlan) -> Callable[..., bool]:
-    """Make `tell(lanes, near, block, tags, edge)`: write the lists of a block.
+    """Make `write(lanes, near, block, tags, edge)`: write the lists of a block.
 
     It returns True if rounding leaves no doubt about them.
     """
     width, many, squares = plan.listing.width, plan.agents, plan.listing.slot("square0")
 
-    def tell(lanes: Any, near: Any, block: Any, tags: Any, edge: Any) -> Any:
+    def write(lanes: Any, near: Any, block: Any, tags: Any, edge: Any) -> Any:
         doubt = False
         for lane in range(np.uint64(width)):
             i, count, following = block + lane, np.int32(0), float_as_key(lanes[squares + lane])
@@ -97,17 +97,17 @@ def _write_keys(plan: LookPlan) -> Callable[..., bool]:
             near.count[i] = count
         return not doubt
 
-    return tell
+    return write
 
 
 @section
 def _write_positions(plan: LookPlan) -> Callable[..., None]:
-    """Make `place_them(rows, lanes, near, span, block, n, edge)`: write positions of the nearest, and exact squares."""
+    """Make `write_positions(rows, lanes, near, span, block, n, edge)`: positions of the nearest, and exact squares."""
     width, many, d, squares = plan.listing.width, plan.agents, plan.listing.dimension, plan.listing.slot("square0")
     first = np.uint64(plan.place[0])
     place, offset_to, periodic, listed_at = plan.place, plan.offset_to, plan.listing.periodic, vector_of(d)
 
-    def place_them(rows: Any, lanes: Any, near: Any, span: Any, block: Any, n: Any, edge: Any) -> None:
+    def write_positions(rows: Any, lanes: Any, near: Any, span: Any, block: Any, n: Any, edge: Any) -> None:
         listed, length, axes = np.uint64(near.who.shape[1]), np.uint64(SMALL_STRIDE), np.uint64(d)
         for k in range(many):
             line, beside = np.uint64(k) * listed + block, np.uint64(many) * listed
@@ -119,4 +119,4 @@ def _write_positions(plan: LookPlan) -> Callable[..., None]:
                 square, key = exact_dot(to, to), float_as_key(lanes[squares + np.uint64(k * width) + lane])
                 near.square[k, i] = square if key < edge else like(span.within, np.inf)
 
-    return place_them
+    return write_positions

@@ -83,7 +83,7 @@ def move_in_of(plan: ArrangePlan) -> Callable[..., bool]:
     count: steps until they move back. share: (n, present, first, end, rank, team).
     """
     width, periodic, wraps, tracks_home_tiles = plan.width, plan.periodic, plan.wraps, plan.tracks_home_tiles
-    carry = _reorder(plan, True)
+    reorder = _reorder(plan, True)
 
     def move_in(scratch: Any, numbers: Any, count: Any, share: Any) -> Any:
         n, present, first, end, rank, team = share
@@ -96,7 +96,7 @@ def move_in_of(plan: ArrangePlan) -> Callable[..., bool]:
             )  # fmt: skip
             arranged = shape[0] > 0
             if arranged:
-                carry(scratch, share)
+                reorder(scratch, share)
                 if tracks_home_tiles:
                     find_home_tiles(first, end, width, n, shape, scratch.start, scratch.home_tiles)
         return arranged
@@ -111,19 +111,19 @@ def move_back_of(plan: ArrangePlan) -> Callable[..., None]:
 
 @section
 def _reorder(plan: ArrangePlan, to_tiles: bool) -> Callable[..., None]:
-    """Make `carry(scratch, share)`: pack this thread's agents, wait for all threads, and unpack the new ones.
+    """Make `reorder(scratch, share)`: pack this thread's agents, wait for all threads, and unpack the new ones.
 
     Packed agents go to distant places, in no order: to their tile, or to the place of their number. `cell` holds where;
     -1 is nowhere.
     """
     dimension, width, (arrays, which, further, _) = plan.dimension, plan.width, plan.fields
     size, count, wide = np.uint64(dimension * width), plan.size, np.uint64(plan.size)
-    place_in, handed, unpack = place_of(dimension, width), arrays_of(plan.inner), _unpack(plan)
+    place_in, arrays_in, unpack = place_of(dimension, width), arrays_of(plan.inner), _unpack(plan)
 
-    def carry(scratch: Any, share: Any) -> None:
+    def reorder(scratch: Any, share: Any) -> None:
         n, _, first, end, rank, team = share
         buffer, cell, offset, spread = scratch.reorder_buffer, scratch.cell, scratch.offset, scratch.spread
-        sources = pick_items(handed(scratch, scratch.pos, scratch.vel), scratch, arrays)
+        sources = pick_items(arrays_in(scratch, scratch.pos, scratch.vel), scratch, arrays)
         for block in range(np.uint64(first), np.uint64(end)):
             base, row = block * size, block * np.uint64(width)
             for i in range(row, min(row + np.uint64(width), np.uint64(n))):
@@ -140,7 +140,7 @@ def _reorder(plan: ArrangePlan, to_tiles: bool) -> Callable[..., None]:
             prefetch_for_write(buffer, (i + np.uint64(AHEAD)) * wide)
             unpack(scratch, sources, i, place_in(i))
 
-    return carry
+    return reorder
 
 
 @section
@@ -163,10 +163,10 @@ def _unpack(plan: ArrangePlan) -> Callable[..., None]:
 
 @section
 def _unpack_fields(fields: PackedFields, mine: tuple[int, ...]) -> Callable[..., None]:
-    """Make `put_back(packed, at, sources, i, place)`: write numbers of agent i that lie packed at `at`."""
+    """Make `unpack_fields(packed, at, sources, i, place)`: write numbers of agent i that lie packed at `at`."""
     which, further = tuple(fields.which[k] % 2 for k in mine), tuple(fields.further[k] for k in mine)
 
-    def put_back(packed: Any, at: Any, sources: Any, i: Any, place: Any) -> None:
+    def unpack_fields(packed: Any, at: Any, sources: Any, i: Any, place: Any) -> None:
         scatter_each(pick_items(sources, (), mine), (i, place), which, further, gather(packed, at, mine))
 
-    return put_back
+    return unpack_fields

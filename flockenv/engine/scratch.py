@@ -127,7 +127,7 @@ def scratch_record(parts: KernelPlan) -> Any:
 
 
 def array_names(parts: KernelPlan) -> tuple[str, ...]:
-    """Return the names of all arrays of a world in progress, in the order of `blocks.handed_of` and of scratch."""
+    """Return the names of all arrays of a world in progress, in the order of `blocks.arrays_of` and of scratch."""
     return ("pos", "vel", *(f"inner{k}" for k in range(len(parts.inner))), *scratch_record(parts)._fields)
 
 
