@@ -319,7 +319,7 @@ def test_neighbours_of_equal_sights_are_counted_once() -> None:
     far = Cohesion(weight=0.2, radius=2.5)
     for rules, many in (((RULES[1], RULES[2]), 2), ((RULES[1], far.model_copy(update={"radius": 2})), 1)):
         scene, state = crowd(10, 2, "float64", False, *rules)
-        assert len(scene.parts.averaged) == many
+        assert len(scene.parts.counted_sights) == many
         each = [crowd(10, 2, "float64", False, rule)[0].acceleration(state) for rule in rules]
         np.testing.assert_allclose(scene.acceleration(state), sum(each), atol=1e-12)
 

@@ -25,7 +25,7 @@ from flockenv.engine.lane_access import gather, pick_items
 from flockenv.engine.law_calls import OneLaw, arguments_of, laws_of, sum_of, value_of
 from flockenv.engine.obstacle_loop import obstacles_of
 from flockenv.engine.obstacle_plan import Obstacles, obstacle_plan
-from flockenv.engine.pair_loop import meet_neighbours
+from flockenv.engine.pair_loop import sum_pair_laws
 from flockenv.engine.pair_plan import Pairs, pairs_of
 from flockenv.jit.decorators import Law, Vec, kernel, like
 from flockenv.jit.section import section, tuple_from
@@ -98,7 +98,7 @@ def response_plan(parts: KernelPlan) -> ResponsePlan:
         tuple(tuple(j for j, (to, _) in enumerate(added) if to == name) for name in targets),
         combinations, (combined_into[0], combined_into[1]), parts.pair_force_size,
         obstacle_plan(parts, agent_plan(parts)) if parts.folds_obstacles else None,
-        group_plan(parts) if parts.grouped else None,
+        group_plan(parts) if parts.group_effects else None,
     )  # fmt: skip
 
 
@@ -123,8 +123,8 @@ def sense_plan(parts: KernelPlan) -> SensePlan:
         agent, laws_of(parts, "aim_law"),
         pairs_of(parts) if parts.pairs else None,
         far_plan(parts) if parts.far else None,
-        bond_plan(parts, agent) if parts.bonded else None,
-        group_plan(parts) if parts.grouped else None,
+        bond_plan(parts, agent) if parts.bond_effects else None,
+        group_plan(parts) if parts.group_effects else None,
     )  # fmt: skip
 
 
@@ -132,7 +132,7 @@ def sense_plan(parts: KernelPlan) -> SensePlan:
 def sense_of(plan: SensePlan) -> Callable[..., None]:
     """Make `sense(context, pos, vel, time)`: write the effect of other agents on this thread's agents of one world."""
     aim = _aim(plan.agent, plan.aims) if plan.aims else None
-    meet = meet_neighbours(plan.pairs) if plan.pairs is not None else None
+    sum_pairs = sum_pair_laws(plan.pairs) if plan.pairs is not None else None
     far = far_of(plan.far) if plan.far is not None else None
     bonds = bonds_of(plan.bonds) if plan.bonds is not None else None
     find_groups = find_groups_of(plan.groups) if plan.groups is not None else None
@@ -142,8 +142,8 @@ def sense_of(plan: SensePlan) -> Callable[..., None]:
             context.work[context.b, 0] += 1
         if aim is not None:
             aim(context, pos, vel, time)
-        if meet is not None:
-            meet(context, pos, vel, time)
+        if sum_pairs is not None:
+            sum_pairs(context, pos, vel, time)
         if far is not None:
             far(context, pos, time)
         if bonds is not None:
@@ -269,14 +269,14 @@ def respond_of(plan: ResponsePlan) -> Callable[..., None]:
     flow: Any = tuple_from(*map(value_of, plan.flows)) if plan.flows else None
     combine: Any = tuple_from(*map(_combined_force, plan.combinations)) if plan.combinations else None
     to_steering, to_external = map(sum_of, plan.combined_into)
-    meet_obstacles = obstacles_of(plan.obstacles) if plan.obstacles is not None else None
+    fold_obstacles = obstacles_of(plan.obstacles) if plan.obstacles is not None else None
 
     def respond(context: Any, pos: Any, vel: Any, time: Any, block: Any, out: Any, to: Any) -> None:
         scratch, numbers, random_key = context.scratch, context.numbers, context.key[context.b]
         base, row = block * size, block * np.uint64(width)
         one, live, request = common(scratch, context.n, context.present, block)
-        if meet_obstacles is not None:
-            meet_obstacles(context, pos, vel, time, block)
+        if fold_obstacles is not None:
+            fold_obstacles(context, pos, vel, time, block)
         for lane in range(np.uint64(width)):
             i, at = row + lane, base + lane
             x, v = vector(pos, at), vector(vel, at)

@@ -42,7 +42,7 @@ def pack(parts: KernelPlan, agents: int, groups: Sequence[object]) -> Table:
     blocks = -(-agents // w)
     places, numbers, starts, bases = [], [], [], []
     first_place = first_number = 0
-    for k, effect in parts.bonded:
+    for k, effect in parts.bond_effects:
         try:
             found = effect.bonds(groups, d)
         except ValueError as error:
@@ -112,7 +112,9 @@ class BondPlan(NamedTuple):
 def bond_plan(parts: KernelPlan, agent: AgentPlan) -> BondPlan:
     """Return the plan of a scene."""
     d = parts.dimension
-    laws = tuple(BondLaw(k, e.bond_law, e.partners, e.numbers(d)) for k, e in parts.bonded if e.bond_law is not None)
+    laws = tuple(
+        BondLaw(k, e.bond_law, e.partners, e.numbers(d)) for k, e in parts.bond_effects if e.bond_law is not None
+    )
     sums, waits = parts.slots["bond0"] * parts.width, not (parts.pairs or parts.far)
     return BondPlan(agent, parts.space.offset_law, laws, sums, waits, bool(parts.far))
 

@@ -39,16 +39,16 @@ class FarPlan(NamedTuple):
     width: int
     sums: int  # where the sums of a block begin in the scratch of lanes
     direct: tuple[FarLaw, ...]  # laws that are evaluated for each agent
-    treed: tuple[FarLaw, ...]  # laws that are evaluated for nodes of a tree
+    in_tree: tuple[FarLaw, ...]  # laws that are evaluated for nodes of a tree
 
 
 def far_plan(parts: KernelPlan) -> FarPlan:
     """Return the plan of a scene."""
     laws = {k: FarLaw(k, effect.far_law, effect.weighs_mass) for k, effect in parts.far if effect.far_law is not None}
-    treed = [k for k, _ in parts.treed]
-    direct = tuple(law for k, law in laws.items() if k not in treed)
+    in_tree = [k for k, _ in parts.tree_effects]
+    direct = tuple(law for k, law in laws.items() if k not in in_tree)
     sums = parts.slots["far0"] * parts.width
-    return FarPlan(parts.dimension, parts.width, sums, direct, tuple(laws[k] for k in treed))
+    return FarPlan(parts.dimension, parts.width, sums, direct, tuple(laws[k] for k in in_tree))
 
 
 @section
@@ -58,7 +58,7 @@ def far_of(plan: FarPlan) -> Callable[..., None]:
     It begins with a barrier even after pair laws: by then all threads have written their positions, and have read the
     counts.
     """
-    direct, walk = _direct(plan) if plan.direct else None, _walk(plan, plan.treed) if plan.treed else None
+    direct, walk = _direct(plan) if plan.direct else None, _walk(plan, plan.in_tree) if plan.in_tree else None
     width = plan.width
 
     def far(context: Any, pos: Any, time: Any) -> None:
@@ -100,7 +100,7 @@ def far_of(plan: FarPlan) -> Callable[..., None]:
 
 @section
 def _interact(plan: FarPlan, laws: tuple[FarLaw, ...], in_tree: bool) -> Callable[..., None]:
-    """Make `meet(effects, lanes, lane, x, m, xj, heavy, time, key)`: add the effect of a mass at xj to a lane's sums.
+    """Make `interact(effects, lanes, lane, x, m, xj, heavy, time, key)`: add the effect of a mass at xj to a lane.
 
     The lane is that of an agent at x of mass m. `heavy` is the mass at xj, or in a tree the weight of a node. A mass at
     exactly x adds nothing, because it has no direction: the agent itself above all.
@@ -110,7 +110,7 @@ def _interact(plan: FarPlan, laws: tuple[FarLaw, ...], in_tree: bool) -> Callabl
     weighs, dimension = by_mass or in_tree, plan.dimension
     first, second, third = (np.uint64(plan.sums + axis * plan.width) for axis in range(3))
 
-    def meet(effects: Any, lanes: Any, lane: Any, x: Any, m: Any, xj: Any, heavy: Any, time: Any, key: Any) -> None:
+    def interact(effects: Any, lanes: Any, lane: Any, x: Any, m: Any, xj: Any, heavy: Any, time: Any, key: Any) -> None:
         if before is not None:
             before(effects, lanes, lane, x, m, xj, heavy, time, key)
         to = sub(xj, x)
@@ -123,7 +123,7 @@ def _interact(plan: FarPlan, laws: tuple[FarLaw, ...], in_tree: bool) -> Callabl
         if dimension == 3:
             lanes[third + lane] += value[2] if there else o
 
-    return meet
+    return interact
 
 
 # --- one by one -------------------------------------------------------------------------------------------------------
@@ -136,7 +136,7 @@ def _direct(plan: FarPlan) -> Callable[..., None]:
     For all laws at once; blocks: the first, and the end.
     """
     dimension, width, sums = plan.dimension, plan.width, np.uint64(plan.sums)
-    meet, vector, place = (
+    interact, vector, place = (
         _interact(plan, plan.direct, False),
         vector_of_lane(dimension, width),
         place_of(dimension, width),
@@ -155,7 +155,7 @@ def _direct(plan: FarPlan) -> Callable[..., None]:
                 if living[j] > 0:
                     xj, heavy = vector(pos, place(j)), mass[j]
                     for lane in range(np.uint64(width)):
-                        meet(effects, lanes, lane, vector(pos, base + lane), mass[row + lane], xj, heavy, time, key)
+                        interact(effects, lanes, lane, vector(pos, base + lane), mass[row + lane], xj, heavy, time, key)
             for lane in range(np.uint64(count)):
                 forces[base + lane] = lanes[sums + lane]
 
@@ -174,7 +174,7 @@ def _walk(plan: FarPlan, laws: tuple[FarLaw, ...]) -> Callable[..., int]:
     """
     before, adds = _walk(plan, laws[:-1]) if laws[1:] else None, bool(plan.direct or laws[1:])
     dimension, width, sums, (k, _, by_mass) = plan.dimension, plan.width, np.uint64(plan.sums), laws[-1]
-    meet, put, vector = _interact(plan, laws[-1:], True), _write_sums(plan, adds), vector_of_lane(dimension, width)
+    interact, put, vector = _interact(plan, laws[-1:], True), _write_sums(plan, adds), vector_of_lane(dimension, width)
     listed, weight = vector_of_lane(dimension, 1), np.uint64(dimension)
     count, step, room = dimension * width, dimension + 1, LISTED * (dimension + 1)
 
@@ -206,7 +206,7 @@ def _walk(plan: FarPlan, laws: tuple[FarLaw, ...]) -> Callable[..., int]:
                     xj, heavy = listed(near, j), near[j + weight]
                     for lane in range(np.uint64(width)):
                         x, m = vector(leaves, base + lane), leaves[base + np.uint64(count) + lane]
-                        meet(effects, lanes, lane, x, m, xj, heavy, time, key)
+                        interact(effects, lanes, lane, x, m, xj, heavy, time, key)
             put(forces, lanes, places, block * np.uint64(width), held)
         tally[rank] = interactions
         wait_for_team(sync, team)  # `far_bond_force` was written by other threads

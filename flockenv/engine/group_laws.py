@@ -43,7 +43,7 @@ def group_plan(parts: KernelPlan) -> GroupPlan:
     """Return the plan of a scene."""
     laws = [
         GroupLaw(k, tuple(at * parts.width for name, at in parts.slots.items() if name.startswith(f"group{k}_")))
-        for k, _ in parts.grouped
+        for k, _ in parts.group_effects
     ]
     return GroupPlan(parts.dimension, parts.width, parts.space.offset_law, tuple(laws))
 

@@ -34,7 +34,7 @@ def coupling_of(scene: SceneView) -> Coupling | None:
         pairs = np.indices((scene.agents, scene.agents)).reshape(2, -1)
         return coupled(scene.agents, *pairs)
     first, second = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    for _, effect in scene.parts.bonded:
+    for _, effect in scene.parts.bond_effects:
         bonds = effect.bonds(scene.groups, scene.dimension)
         for column in bonds.partner.T:
             first.append(bonds.agent.astype(np.int64))
@@ -110,7 +110,7 @@ def _evaluation(scene: SceneView, alone: State, drive: Floats) -> Evaluate:
     d, n = scene.dimension, scene.agents
     portion = max(1, MOST_NUMBERS // (d * n))
 
-    def some(x: Floats, v: Floats, time: float) -> tuple[Floats, Floats | None]:
+    def rates_of(x: Floats, v: Floats, time: float) -> tuple[Floats, Floats | None]:
         many = len(x)
 
         def axes_first(rows: Floats) -> Floats:
@@ -132,7 +132,7 @@ def _evaluation(scene: SceneView, alone: State, drive: Floats) -> Evaluate:
         return rows, None if flow is None else flow.transpose(0, 2, 1).reshape(many, d * n)
 
     def evaluate(x: Floats, v: Floats, time: float) -> tuple[Floats, Floats | None]:
-        parts = [some(x[k : k + portion], v[k : k + portion], time) for k in range(0, len(x), portion)]
+        parts = [rates_of(x[k : k + portion], v[k : k + portion], time) for k in range(0, len(x), portion)]
         if len(parts) == 1:
             return parts[0]
         flows = [flow for _, flow in parts if flow is not None]

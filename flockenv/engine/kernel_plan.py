@@ -102,12 +102,12 @@ class KernelPlan(ObstacleSets):
         return [(k, e) for k, e in enumerate(self.effects) if e.pair_law is not None]
 
     @functools.cached_property
-    def bonded(self) -> list[tuple[int, Effect]]:
+    def bond_effects(self) -> list[tuple[int, Effect]]:
         """The effects with a law of bonds, and their indices."""
         return [(k, e) for k, e in enumerate(self.effects) if e.bond_law is not None]
 
     @functools.cached_property
-    def grouped(self) -> list[tuple[int, Effect]]:
+    def group_effects(self) -> list[tuple[int, Effect]]:
         """The effects with a law about a group as one, and their indices."""
         return [(k, e) for k, e in enumerate(self.effects) if e.group_law is not None]
 
@@ -117,14 +117,14 @@ class KernelPlan(ObstacleSets):
         return [(k, e) for k, e in enumerate(self.effects) if e.far_law is not None]
 
     @functools.cached_property
-    def treed(self) -> list[tuple[int, Effect]]:
+    def tree_effects(self) -> list[tuple[int, Effect]]:
         """Those of `far` that treat distant groups as one."""
         return [(k, e) for k, e in self.far if self.crowded and e.parameters()["opening"] != 0]
 
     @property
     def has_far_bond_force(self) -> bool:
         """True if some law leaves forces in `far_bond_force`."""
-        return bool(self.far or self.bonded)
+        return bool(self.far or self.bond_effects)
 
     @property
     def flows(self) -> bool:
@@ -176,10 +176,10 @@ class KernelPlan(ObstacleSets):
     @property
     def spreads(self) -> bool:
         """True if a NaN position reaches every neighbour within one step."""
-        return self.trusts and (bool(self.grouped) or any(effect.vanishes for effect in self.effects))
+        return self.trusts and (bool(self.group_effects) or any(effect.vanishes for effect in self.effects))
 
     @functools.cached_property
-    def averaged(self) -> list[int]:
+    def counted_sights(self) -> list[int]:
         """The sights whose agents are counted (not of contact laws: these are evaluated for few candidates)."""
         if any(effect.averages and effect.contact for effect in self.effects):
             raise TypeError("an effect with `contact` counts no agents: it cannot have `averages`")
@@ -354,7 +354,7 @@ class KernelPlan(ObstacleSets):
 
         Not if places matter: bonds refer to partners by place, and far laws and groups visit agents in their order.
         """
-        return self.sorts and bool(self.pairs) and not self.has_far_bond_force and not self.grouped
+        return self.sorts and bool(self.pairs) and not self.has_far_bond_force and not self.group_effects
 
     @property
     def tracks_home_tiles(self) -> bool:
@@ -403,15 +403,15 @@ class KernelPlan(ObstacleSets):
         d, look = self.dimension, self.look or Look(0.0)
         runs = [(f"c{k}_", e.sums(d)) for k, e in self.pairs]
         runs += [(f"near{q}_", sight.nearest or 0) for q, sight in enumerate(self.sights)]
-        runs += [(f"many{q}_", 1) for q in self.averaged]
+        runs += [(f"many{q}_", 1) for q in self.counted_sights]
         runs += [(f"o{k}_", e.folded(d) if e.obstacle_start else 0) for k, e in enumerate(self.effects)]
         runs += [(f"g{name}", d) for name in self.targets]
-        runs += [(f"group{k}_", 1 + 3 * d) for k, _ in self.grouped]
-        runs += [("bond", d * bool(self.bonded)), ("far", d * bool(self.far))]
+        runs += [(f"group{k}_", 1 + 3 * d) for k, _ in self.group_effects]
+        runs += [("bond", d * bool(self.bond_effects)), ("far", d * bool(self.far))]
         edges = [k for k, e in enumerate(self.effects) if e.obstacle_start and e.obstacle_edges]
         runs += [(f"ahead{k}_", 2) for k in edges]
         runs += [("found", -(-MOST_FOUND // self.width) * bool(self.gridded_forms))]
-        runs += [("reach", int(bool(self.bounded or self.gridded_forms))), ("here", int(self.parting))]
+        runs += [("reach", int(bool(self.bounded_forms or self.gridded_forms))), ("here", int(self.parting))]
         runs += [("next", (d + 1) * self.looks_ahead)]
         runs += [("square", look.agents + self.keyed), ("place", look.agents)]
         runs += [("gap", look.obstacles), ("which", look.obstacles)]

@@ -337,10 +337,10 @@ def _take(plan: Listing) -> Callable[..., None]:
 
 
 @section
-def walk_blocks(plan: Listing, meet: Callable[..., int]) -> Callable[..., int]:
-    """Make `walk(context, shape, time)`: call `meet` for each of this thread's blocks; return the sum of its results.
+def walk_blocks(plan: Listing, visit: Callable[..., int]) -> Callable[..., int]:
+    """Make `walk(context, shape, time)`: call `visit` for each of this thread's blocks; return the sum of its results.
 
-    `meet` is passed context, shape, block, at, upto, found, time: the block is [at, upto), and its candidates are the
+    `visit` is passed context, shape, block, at, upto, found, time: the block is [at, upto), and its candidates are the
     first `found` ranges of listed agents in `scratch.ranges`.
     """
     width, sorts, periodic = plan.width, plan.sorts, plan.periodic
@@ -375,7 +375,7 @@ def walk_blocks(plan: Listing, meet: Callable[..., int]) -> Callable[..., int]:
                 take(scratch.lanes, scratch.records, np.uint64(at))
             else:
                 ranges[0, 0], ranges[0, 1], ranges[0, 2] = 0, present, 1
-            interactions += meet(context, shape, np.uint64(at), at, upto, found, time)
+            interactions += visit(context, shape, np.uint64(at), at, upto, found, time)
             at = upto
         return interactions
 

@@ -123,7 +123,7 @@ def _by_squares(plan: LookPlan) -> Callable[..., None]:
     """
     listing, width = plan.listing, plan.listing.width
     squares, places = plan.slots("square", plan.agents), plan.slots("place", plan.agents)
-    meet, both = _insert_candidates(plan, listing.periodic), listing.periodic and listing.sorts
+    visit, both = _insert_candidates(plan, listing.periodic), listing.periodic and listing.sorts
     plain = _insert_candidates(plan, False) if both else None
 
     def by_squares(
@@ -136,24 +136,24 @@ def _by_squares(plan: LookPlan) -> Callable[..., None]:
             j, last = np.uint64(ranges[r, 0]), np.uint64(ranges[r, 1])
             if plain is not None:
                 if ranges[r, 2] > 0:
-                    meet(mine, first, theirs, number, lanes, span, block, j, last)
+                    visit(mine, first, theirs, number, lanes, span, block, j, last)
                 else:
                     plain(mine, first, theirs, number, lanes, span, block, j, last)
             else:
-                meet(mine, first, theirs, number, lanes, span, block, j, last)
+                visit(mine, first, theirs, number, lanes, span, block, j, last)
 
     return by_squares
 
 
 @section
 def _insert_candidates(plan: LookPlan, wrapped: bool) -> Callable[..., None]:
-    """Make `meet(mine, first, theirs, number, lanes, span, block, j, last)`: insert candidates [j, last)."""
+    """Make `visit(mine, first, theirs, number, lanes, span, block, j, last)`: insert candidates [j, last)."""
     listing, width, exact, offset_to = plan.listing, plan.listing.width, plan.exact, plan.offset_to
     length = np.uint64(listing.length if listing.sorts else 1)
     place, there = plan.place, listing.candidate_places(listing.axes("x"))
     slots = plan.slots("square", plan.agents) + plan.slots("place", plan.agents)
 
-    def meet(
+    def visit(
         mine: Any, first: Any, theirs: Any, number: Any, lanes: Any, span: Any, block: Any, j: Any, last: Any
     ) -> None:  # fmt: skip
         while j < last:
@@ -167,7 +167,7 @@ def _insert_candidates(plan: LookPlan, wrapped: bool) -> Callable[..., None]:
                 scatter(lanes, lane, slots, insert(gather(lanes, lane, slots), far, like(square, j)))
             j += np.uint64(1)
 
-    return meet
+    return visit
 
 
 @section

@@ -25,7 +25,7 @@ from flockenv.maths.vectors import add, dot, norm, scale, sub, zero
 from flockenv.physics.effects.effect import Obstacle
 from flockenv.steering.around import threat
 
-__all__ = ["meet_circle", "meet_shape"]
+__all__ = ["update_by_circle", "update_by_shape"]
 
 CIRCLE = -1
 """The form that is noted for a circle of the state."""
@@ -86,8 +86,8 @@ def _update_fold(fold: Fold) -> Callable[..., None]:
 # --- a circle of the state --------------------------------------------------------------------------------------------
 
 
-def meet_circle(folds: tuple[Fold, ...]) -> Callable[..., None]:
-    """Return `meet(numbers, world, me, to, rho, m, lanes, lane)`: update all folds by circle m of the state.
+def update_by_circle(folds: tuple[Fold, ...]) -> Callable[..., None]:
+    """Return `update(numbers, world, me, to, rho, m, lanes, lane)`: update all folds by circle m of the state.
 
     to: the offset to its centre; rho: its radius, m.
     """
@@ -100,7 +100,7 @@ def _circle(fold: Fold, j: int) -> Callable[..., None]:
     k, ray_of, origin, keep = fold.k, fold.ray, fold.origin, _update_fold(fold)
     cast, elsewhere = fold.ray is not None, fold.origin is not None
 
-    def meet(numbers: Any, world: Any, me: Any, to: Any, rho: Any, m: Any, lanes: Any, lane: Any) -> None:
+    def update(numbers: Any, world: Any, me: Any, to: Any, rho: Any, m: Any, lanes: Any, lane: Any) -> None:
         p, o, far = numbers.effects[k], zero(me.pos), like(rho, np.inf)
         if cast:
             ray, margin = ray_of(p, me, j)
@@ -114,14 +114,14 @@ def _circle(fold: Fold, j: int) -> Callable[..., None]:
             )
         keep(p, world, me, it, CIRCLE, m, lanes, lane)
 
-    return meet
+    return update
 
 
 # --- any other shape --------------------------------------------------------------------------------------------------
 
 
-def meet_shape(folds: tuple[Fold, ...], form: str) -> Callable[..., None]:
-    """Return `meet(numbers, world, params, me, shape, lanes, lane)`: update all folds by a shape of a form."""
+def update_by_shape(folds: tuple[Fold, ...], form: str) -> Callable[..., None]:
+    """Return `update(numbers, world, params, me, shape, lanes, lane)`: update all folds by a shape of a form."""
     pieced = {fold for fold in folds if fold.pieces and form in PIECED}
     return call_in_turn(
         *(
@@ -138,11 +138,11 @@ def meet_shape(folds: tuple[Fold, ...], form: str) -> Callable[..., None]:
 
 @section
 def _nearest_point(fold: Fold, form: str) -> Callable[..., None]:
-    """Make `meet` for one fold that casts no rays."""
+    """Make `update` for one fold that casts no rays."""
     k, origin, keep, number = fold.k, fold.origin, _update_fold(fold), number_of(form)
     elsewhere, nearest = fold.origin is not None, law_of("nearest", form)
 
-    def meet(numbers: Any, world: Any, params: Any, me: Any, shape: Any, lanes: Any, lane: Any) -> None:
+    def update(numbers: Any, world: Any, params: Any, me: Any, shape: Any, lanes: Any, lane: Any) -> None:
         p, o = numbers.effects[k], zero(me.pos)
         if elsewhere:
             gap, out = nearest(params, shape.at, add(shape.y, origin(p, me)))
@@ -153,19 +153,19 @@ def _nearest_point(fold: Fold, form: str) -> Callable[..., None]:
         it = Obstacle(who, to, dot(to, to), shape.vel, none, o, gap, out, far, o)
         keep(p, world, me, it, number, shape.place, lanes, lane)
 
-    return meet
+    return update
 
 
 @section
 def _ray_contact(fold: Fold, form: str, j: int) -> Callable[..., None]:
-    """Make `meet` for ray j of one fold that casts rays.
+    """Make `update` for ray j of one fold that casts rays.
 
     If the ray touches nothing, the normal is that of the nearest point, which is known.
     """
     k, ray_of, keep, number = fold.k, fold.ray, _update_fold(fold), number_of(form)
     nearest, hit_of, chooses = law_of("nearest", form), law_of("hit", form), form in SIDE_BY_SIDE
 
-    def meet(numbers: Any, world: Any, params: Any, me: Any, shape: Any, lanes: Any, lane: Any) -> None:
+    def update(numbers: Any, world: Any, params: Any, me: Any, shape: Any, lanes: Any, lane: Any) -> None:
         p, at, y, gap = numbers.effects[k], shape.at, shape.y, shape.gap
         ray, margin = ray_of(p, me, j)
         room, none = me.radius + margin, like(gap, 0.0)
@@ -179,12 +179,12 @@ def _ray_contact(fold: Fold, form: str, j: int) -> Callable[..., None]:
         it = Obstacle(params[at + 1], to, dot(to, to), shape.vel, none, zero(me.pos), gap, out, hit, ray)
         keep(p, world, me, it, number, shape.place, lanes, lane)
 
-    return meet
+    return update
 
 
 @section
 def _pieces(fold: Fold, form: str) -> Callable[..., None]:
-    """Make `meet` for one fold that handles the sides of a shape one by one: the nearest point of each that acts.
+    """Make `update` for one fold that handles the sides of a shape one by one: the nearest point of each that acts.
 
     If the nearest point of the shape is out of reach, so are all its sides.
     """
@@ -192,7 +192,7 @@ def _pieces(fold: Fold, form: str) -> Callable[..., None]:
     pieces_of, piece_of, reaches = law_of("pieces", form), law_of("piece", form), fold.reach is not None
     in_sight = _in_sight(fold.hidden)
 
-    def meet(numbers: Any, world: Any, params: Any, me: Any, shape: Any, lanes: Any, lane: Any) -> None:
+    def update(numbers: Any, world: Any, params: Any, me: Any, shape: Any, lanes: Any, lane: Any) -> None:
         p, at, y, gap, o = numbers.effects[k], shape.at, shape.y, shape.gap, zero(me.pos)
         near = gap < reach(p, me) if reaches else True
         if near:
@@ -206,4 +206,4 @@ def _pieces(fold: Fold, form: str) -> Callable[..., None]:
                     )  # fmt: skip
                     keep(p, world, me, it, number, shape.place, lanes, lane)
 
-    return meet
+    return update

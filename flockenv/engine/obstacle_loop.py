@@ -19,7 +19,7 @@ import numpy as np
 from flockenv.engine.agent_records import AgentPlan, agent_of
 from flockenv.engine.blocks import vector_of, vector_of_lane
 from flockenv.engine.lane_access import scatter
-from flockenv.engine.obstacle_folds import meet_circle, meet_shape
+from flockenv.engine.obstacle_folds import update_by_circle, update_by_shape
 from flockenv.engine.obstacle_plan import Fold, Obstacles, Place, Shape
 from flockenv.engine.shape_rows import near_rows
 from flockenv.engine.silhouette import passing_side_of
@@ -38,7 +38,7 @@ LOOSE = 1 + 1e-6
 
 @section
 def obstacles_of(plan: Obstacles) -> Callable[..., None]:
-    """Make `meet_obstacles(context, pos, vel, time, block)`: compute the folds of a block over the obstacles.
+    """Make `fold_obstacles(context, pos, vel, time, block)`: compute the folds of a block over the obstacles.
 
     The results are written into `lanes`, where the plan value; time, s.
     """
@@ -51,12 +51,12 @@ def obstacles_of(plan: Obstacles) -> Callable[..., None]:
     edges = (_passing_sides(plan, fold) for fold in plan.folds if fold.ahead)
     passes = call_in_turn(_starts(plan), _circles(plan), *forms, *edges)
 
-    def meet_obstacles(context: Any, pos: Any, vel: Any, time: Any, block: Any) -> None:
+    def fold_obstacles(context: Any, pos: Any, vel: Any, time: Any, block: Any) -> None:
         base, row = block * size, block * wide
         one = row & context.scratch.spread[0] if arranges else row
         passes(context, pos, vel, time, Place(base, row, one))
 
-    return meet_obstacles
+    return fold_obstacles
 
 
 @section
@@ -144,7 +144,7 @@ def _furthest(folds: tuple[Fold, ...]) -> Callable[..., float]:
 def _circles(plan: Obstacles) -> Callable[..., None]:
     """Make `circles(context, pos, vel, time, place)`: update all folds of a block by every circle of the state."""
     width, agent, circle = plan.agent.width, _agent_of(plan.agent), vector_of(plan.agent.dimension)
-    offset_to, meet, world_of = plan.around.offset_to, meet_circle(plan.folds), _world_of(plan)
+    offset_to, update, world_of = plan.around.offset_to, update_by_circle(plan.folds), _world_of(plan)
 
     def circles(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
         scratch, numbers, b, world = context.scratch, context.numbers, context.b, world_of(context)
@@ -157,7 +157,7 @@ def _circles(plan: Obstacles) -> Callable[..., None]:
                 centre = circle(context.obstacle_x, b, m)
                 for lane in range(np.uint64(width)):
                     me = agent(scratch, random_key, pos, vel, time, place, lane)
-                    meet(numbers, world, me, offset_to(numbers.size, me.pos, centre), rho, m, lanes, lane)
+                    update(numbers, world, me, offset_to(numbers.size, me.pos, centre), rho, m, lanes, lane)
 
     return circles
 
@@ -178,19 +178,19 @@ def _motion_of(dimension: int, moving: bool) -> Callable[..., tuple[Vec, Vec]]:
 
 @section
 def _row(plan: Obstacles, form: str) -> Callable[..., None]:
-    """Make `meet(numbers, world, params, me, at, place, where, vel, lanes, lane)`: update an agent's folds by a shape.
+    """Make `update(numbers, world, params, me, at, place, where, vel, lanes, lane)`: update an agent's folds.
 
     It is skipped if it is not within reach. where: its anchor, m; vel: m/s.
     """
-    offset_to, nearest, meet = plan.around.offset_to, law_of("nearest", form), meet_shape(plan.folds, form)
+    offset_to, nearest, update = plan.around.offset_to, law_of("nearest", form), update_by_shape(plan.folds, form)
     bounded, picks, reach = (
-        form in plan.bounded,
+        form in plan.bounded_forms,
         form in plan.gridded_forms and plan.only_rays,
         np.uint64(max(plan.reach, 0)),
     )
     near_a_ray: Any = _near_a_ray(plan.folds) if picks else None
 
-    def meet_row(
+    def update_by_row(
         numbers: Any, world: Any, params: Any, me: Any, at: Any, place: Any, where: Any, vel: Any, lanes: Any, lane: Any
     ) -> None:
         y = offset_to(numbers.size, where, me.pos)
@@ -202,16 +202,16 @@ def _row(plan: Obstacles, form: str) -> Callable[..., None]:
             if not (dot(beside, beside) < seen * seen):
                 return
         gap, out = nearest(params, at, y)
-        meet(numbers, world, params, me, Shape(at, place, y, vel, gap, out), lanes, lane)
+        update(numbers, world, params, me, Shape(at, place, y, vel, gap, out), lanes, lane)
 
-    return meet_row
+    return update_by_row
 
 
 @section
 def _every_shape(plan: Obstacles, j: int) -> Callable[..., None]:
     """Make `shapes(context, pos, vel, time, place)`: update all folds of a block by every shape of form j."""
     width, agent, world_of = plan.agent.width, _agent_of(plan.agent), _world_of(plan)
-    motion_of, meet = _motion_of(plan.agent.dimension, plan.around.moving), _row(plan, plan.around.forms[j].name)
+    motion_of, update = _motion_of(plan.agent.dimension, plan.around.moving), _row(plan, plan.around.forms[j].name)
 
     def shapes(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
         scratch, numbers, b, world = context.scratch, context.numbers, context.b, world_of(context)
@@ -223,7 +223,7 @@ def _every_shape(plan: Obstacles, j: int) -> Callable[..., None]:
             where, glide = motion_of(params, at, time)
             for lane in range(np.uint64(width)):
                 me = agent(scratch, random_key, pos, vel, time, place, lane)
-                meet(numbers, world, params, me, at, m, where, glide, lanes, lane)
+                update(numbers, world, params, me, at, m, where, glide, lanes, lane)
             at += np.int64(params[at])
 
     return shapes
@@ -236,7 +236,7 @@ def _gridded_shapes(plan: Obstacles, j: int) -> Callable[..., None]:
     Only those that may lie within reach, in order.
     """
     width, agent, world_of = plan.agent.width, _agent_of(plan.agent), _world_of(plan)
-    motion_of, meet = _motion_of(plan.agent.dimension, plan.around.moving), _row(plan, plan.around.forms[j].name)
+    motion_of, update = _motion_of(plan.agent.dimension, plan.around.moving), _row(plan, plan.around.forms[j].name)
     near, box = near_rows(plan.around.offset_to, plan.agent.dimension), _box(plan.folds, plan.only_rays)
     first, reach = plan.found, np.uint64(plan.reach)
 
@@ -253,7 +253,7 @@ def _gridded_shapes(plan: Obstacles, j: int) -> Callable[..., None]:
             for m in range(listed if listed >= 0 else mine.many):
                 at = mine.at + np.int64(lanes[np.uint64(first) + np.uint64(m)]) if listed >= 0 else at
                 where, glide = motion_of(params, at, time)
-                meet(numbers, world, params, me, at, at - mine.at, where, glide, lanes, lane)
+                update(numbers, world, params, me, at, at - mine.at, where, glide, lanes, lane)
                 at += np.int64(params[at])
 
     return shapes

@@ -41,7 +41,7 @@ class Obstacles(NamedTuple):
     pair_force_size: int  # count of numbers of `pair_force` in a block
     reach: int  # where the largest reach of all folds is noted, m; -1: nowhere
     found: int  # where the rows that a grid lists are written; -1: nowhere
-    bounded: tuple[str, ...]  # forms whose shapes are skipped if their box is out of reach
+    bounded_forms: tuple[str, ...]  # forms whose shapes are skipped if their box is out of reach
     gridded_forms: tuple[str, ...]  # forms whose shapes within reach are found by a grid
     only_rays: bool  # True if all folds cast rays
 
@@ -86,5 +86,5 @@ def obstacle_plan(parts: KernelPlan, agent: AgentPlan) -> Obstacles:
     return Obstacles(
         agent, around, folds, parts.arranges, parts.pair_force_size,
         slots["reach0"] * width if "reach0" in slots else -1, slots["found0"] * width if "found0" in slots else -1,
-        parts.bounded, parts.gridded_forms, parts.only_rays,
+        parts.bounded_forms, parts.gridded_forms, parts.only_rays,
     )  # fmt: skip

@@ -43,7 +43,7 @@ class ObstacleSets:
     @functools.cached_property
     def shape_table(self) -> tuple[NDArray[np.float64], dict[str, tuple[int, int]]]:
         """The table of shapes that are not in the state, and, by form, where the rows begin and how many there are."""
-        if not self.meets_obstacles:
+        if not self.reads_obstacles:
             return np.zeros(0), {}
         period = np.array(self.space.extent(self.dimension)) if self.space.periodic else None
         return pack_shapes(self.shapes, self.dimension, self.circles, period)
@@ -54,7 +54,7 @@ class ObstacleSets:
         return any(shape.moves for shape in self.shapes)
 
     @functools.cached_property
-    def bounded(self) -> tuple[str, ...]:
+    def bounded_forms(self) -> tuple[str, ...]:
         """The forms of shapes that are skipped if out of reach; empty if some fold has no reach.
 
         These are the forms whose laws loop over edges or cells. Laws of blocks and half-spaces are evaluated lane
@@ -111,7 +111,7 @@ class ObstacleSets:
         return Surroundings(self.dimension, self.space.offset_law, self.moving, forms)
 
     @property
-    def meets_obstacles(self) -> bool:
+    def reads_obstacles(self) -> bool:
         """True if some law depends on obstacles, or on what they hide."""
         return any(e.obstacle_law is not None for e in self.effects) or self.occludes
 

@@ -33,7 +33,7 @@ from flockenv.maths.vectors import dot, exact_dot, sub
 from flockenv.physics.effects.effect import Other
 from flockenv.steering.others import ONE_PLACE
 
-__all__ = ["meet_neighbours"]
+__all__ = ["sum_pair_laws"]
 
 APART, OTHER, TOGETHER = "in another place", "another agent", "another agent in the same place"
 NEAREST, CONTACTS = "another agent, to find the nearest", "another agent that may be touched"
@@ -105,7 +105,7 @@ def _within_any(sights: tuple[int, ...]) -> Callable[..., bool]:
 
 @section
 def _visit_candidates(plan: Pairs, which: str, wrapped: bool, each: Callable[..., None]) -> Callable[..., None]:
-    """Make `meet(numbers, besides, block, r)`: apply `each` to a block and the candidates of range r."""
+    """Make `visit(numbers, besides, block, r)`: apply `each` to a block and the candidates of range r."""
     candidate, sorts, length = (
         listed_candidate(plan.listing, plan.inner),
         plan.listing.sorts,
@@ -116,7 +116,7 @@ def _visit_candidates(plan: Pairs, which: str, wrapped: bool, each: Callable[...
     contacts = which in (APART, OTHER) and any(law.contact for law in plan.laws)
     by_touch = _visit_lanes(plan, CONTACTS, wrapped, add_candidate(plan, True, False)) if contacts else None
 
-    def meet(numbers: Any, besides: Any, block: Any, r: Any) -> None:
+    def visit(numbers: Any, besides: Any, block: Any, r: Any) -> None:
         j, last = np.uint64(block.ranges[r, 0]), np.uint64(block.ranges[r, 1])
         while j < last:
             at = j * length if sorts else j
@@ -132,12 +132,12 @@ def _visit_candidates(plan: Pairs, which: str, wrapped: bool, each: Callable[...
                     by_touch(numbers, besides, block, j, it)
             j += np.uint64(1)
 
-    return meet
+    return visit
 
 
 @section
 def _visit_ahead(plan: Pairs, each: Callable[..., None]) -> Callable[..., None]:
-    """Make `meet(numbers, besides, block, r)` for a small world: the next candidate's distance is computed early.
+    """Make `visit(numbers, besides, block, r)` for a small world: the next candidate's distance is computed early.
 
     The number behind the last candidate is arbitrary: a row has room for it, and its distance is never used.
     """
@@ -148,7 +148,7 @@ def _visit_ahead(plan: Pairs, each: Callable[..., None]) -> Callable[..., None]:
     place, next_offset = listing.candidate_places(listing.axes("x")), plan.slots(int(listing.slot("next0")), d)
     square_at, here = listing.slot(f"next{d}"), listing.slot("here0")
 
-    def meet(numbers: Any, besides: Any, block: Any, r: Any) -> None:
+    def visit(numbers: Any, besides: Any, block: Any, r: Any) -> None:
         rows, lanes, size = block.theirs, block.lanes, numbers.size
         o = like(numbers.reach, -0.0)
         j, last = np.uint64(block.ranges[r, 0]), np.uint64(block.ranges[r, 1])
@@ -175,12 +175,12 @@ def _visit_ahead(plan: Pairs, each: Callable[..., None]) -> Callable[..., None]:
                 scatter(lanes, lane, next_offset, onward)
                 lanes[square_at + lane] = further
 
-    return meet
+    return visit
 
 
 @section
 def _visit_ranges(plan: Pairs, which: str, each: Callable[..., None]) -> Callable[..., None]:
-    """Make `meet(numbers, besides, block, found)`: apply `each` to a block and the candidates of all its ranges.
+    """Make `visit(numbers, besides, block, found)`: apply `each` to a block and the candidates of all its ranges.
 
     Images are considered only around the edge of a periodic box. The rare pass over agents in the same position is
     compiled once, with images: the nearest image of a near agent is the agent itself.
@@ -190,7 +190,7 @@ def _visit_ranges(plan: Pairs, which: str, each: Callable[..., None]) -> Callabl
     one = _visit_ahead(plan, each) if ahead else _visit_candidates(plan, which, listing.periodic, each)
     plain = _visit_candidates(plan, which, False, each) if both else None
 
-    def meet(numbers: Any, besides: Any, block: Any, found: Any) -> None:
+    def visit(numbers: Any, besides: Any, block: Any, found: Any) -> None:
         for r in range(found):
             if plain is not None:
                 if block.ranges[r, 2] > 0:
@@ -200,7 +200,7 @@ def _visit_ranges(plan: Pairs, which: str, each: Callable[..., None]) -> Callabl
             else:
                 one(numbers, besides, block, r)
 
-    return meet
+    return visit
 
 
 # --- a block ----------------------------------------------------------------------------------------------------------
@@ -210,7 +210,7 @@ def _visit_ranges(plan: Pairs, which: str, each: Callable[..., None]) -> Callabl
 def _block(plan: Pairs) -> Callable[..., int]:
     """Make the function of one block for `walk_blocks`: evaluate pair laws, write sums; return the number of pairs."""
     begin, finish, write = begin_sums(plan), finish_sums(plan), write_sums(plan)
-    meet = _visit_ranges(plan, APART if plan.parting else OTHER, add_candidate(plan, False, plan.parting))
+    visit = _visit_ranges(plan, APART if plan.parting else OTHER, add_candidate(plan, False, plan.parting))
     nearest = any(view.near[1] for view in plan.views)
     select = _visit_ranges(plan, NEAREST, keep_nearest(plan)) if nearest else None
     together = _visit_ranges(plan, TOGETHER, add_candidate(plan, False, False)) if plan.parting else None
@@ -240,7 +240,7 @@ def _block(plan: Pairs) -> Callable[..., int]:
         for r in range(found):
             interactions += (ranges[r, 1] - ranges[r, 0]) * (upto - at)
             others += ranges[r, 1] - ranges[r, 0]
-        meet(numbers, besides, block, found)
+        visit(numbers, besides, block, found)
         if together is not None:  # two agents rarely share a position
             crowded, all_of_them = False, like(numbers.reach, others)
             for lane in range(np.uint64(width)):
@@ -259,15 +259,15 @@ def _block(plan: Pairs) -> Callable[..., int]:
 
 
 @section
-def meet_neighbours(plan: Pairs) -> Callable[..., None]:
-    """Make `meet(context, pos, vel, time)`: write the sums of pair laws for this thread's blocks to `pair_force`.
+def sum_pair_laws(plan: Pairs) -> Callable[..., None]:
+    """Make `visit(context, pos, vel, time)`: write the sums of pair laws for this thread's blocks to `pair_force`.
 
     One listing per evaluation, one loop over candidates for all pair laws. A team of threads shares both.
     """
     list_all, walk = list_living(plan.listing), walk_blocks(plan.listing, _block(plan))
     folds = sum(law.joined is not None for law in plan.laws)
 
-    def meet(context: Any, pos: Any, vel: Any, time: Any) -> None:
+    def visit(context: Any, pos: Any, vel: Any, time: Any) -> None:
         scratch, work, b = context.scratch, context.work, context.b
         if context.rank == 0:
             work[b, 1] += 1
@@ -279,4 +279,4 @@ def meet_neighbours(plan: Pairs) -> Callable[..., None]:
             for r in range(context.team):
                 work[b, 2] += scratch.tally[r]
 
-    return meet
+    return visit

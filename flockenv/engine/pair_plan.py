@@ -80,7 +80,7 @@ def pairs_of(parts: KernelPlan) -> Pairs:
             sight.group is not None,
             sight.occluded,
             (int(listing.slot(f"near{q}_0")), sight.nearest) if sight.nearest else (0, 0),
-            int(listing.slot(f"many{q}_0")) if q in parts.averaged else -1,
+            int(listing.slot(f"many{q}_0")) if q in parts.counted_sights else -1,
         )
         for q, sight in enumerate(parts.sights)
     )

@@ -88,7 +88,7 @@ def _add_one(plan: Pairs, law: PairLaw, q: int, apart: bool) -> Callable[..., No
 
 @section
 def add_candidate(plan: Pairs, touch: bool, apart: bool) -> Callable[..., None]:
-    """Make `meet(numbers, besides, me, it, other, gap, o, lanes, lane)`: add one candidate to the sums of all laws.
+    """Make `visit(numbers, besides, me, it, other, gap, o, lanes, lane)`: add one candidate to the sums of all laws.
 
     touch: of contact laws, or of all others; apart: True if no agent that the candidate counts for shares its position.
     """
@@ -101,14 +101,16 @@ def add_candidate(plan: Pairs, touch: bool, apart: bool) -> Callable[..., None]:
     count, counts = call_in_turn(*(_count_one(*each) for each in counted)), bool(counted) and not touch
     some = bool(laws)
 
-    def meet(numbers: Any, besides: Any, me: Any, it: Any, other: Any, gap: Any, o: Any, lanes: Any, lane: Any) -> None:
+    def visit(
+        numbers: Any, besides: Any, me: Any, it: Any, other: Any, gap: Any, o: Any, lanes: Any, lane: Any
+    ) -> None:
         if some:
             seen = see(numbers, besides, me, it, other, gap, lanes, lane)
             if counts:
                 count(seen, lanes, lane)
             add_all(numbers, me, it, seen, o, lanes, lane)
 
-    return meet
+    return visit
 
 
 @functools.cache
@@ -130,10 +132,12 @@ def keep_nearest(plan: Pairs) -> Callable[..., None]:
     """
     keep = call_in_turn(*(_keep_one(plan, q) for q, view in enumerate(plan.views) if view.near[1]))
 
-    def meet(numbers: Any, besides: Any, me: Any, it: Any, other: Any, gap: Any, o: Any, lanes: Any, lane: Any) -> None:
+    def visit(
+        numbers: Any, besides: Any, me: Any, it: Any, other: Any, gap: Any, o: Any, lanes: Any, lane: Any
+    ) -> None:
         keep(numbers, besides, me, it, other, gap, lanes, lane)
 
-    return meet
+    return visit
 
 
 @section

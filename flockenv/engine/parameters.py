@@ -299,11 +299,11 @@ def _run(run: tuple[str, int, int]) -> Callable[..., tuple[Any, ...]]:
     if kind == "table":
         return kernel(lambda params, counters: (params[np.int64(params[at]) : np.int64(params[at + 1])],))
 
-    def counted(params: Any, counters: Any) -> Any:
+    def counters_of(params: Any, counters: Any) -> Any:
         end = len(counters)
         return (counters[end - np.int64(params[at]) : end - np.int64(params[at + 1])],)
 
-    return kernel(counted)
+    return kernel(counters_of)
 
 
 class Images(NamedTuple):

@@ -59,9 +59,9 @@ def scratch_of(parts: KernelPlan, agents: int, team: int = 1) -> dict[str, Array
         found |= _query_arrays(parts, agents, team)
     if parts.arranges:
         found |= _tile_arrays(parts, agents)
-    if parts.treed:
+    if parts.tree_effects:
         found |= _tree_arrays(parts, agents, team)
-    if parts.bonded:
+    if parts.bond_effects:
         kinds = np.dtype(np.int32), real, np.dtype(np.int64)
         found |= {name: ((0,), kind) for name, kind in zip(TABLES, kinds, strict=True)}
     found |= {"tally": ((2 * team,), np.dtype(np.int64)), "sync": ((8,), np.dtype(np.int64))}

@@ -87,18 +87,18 @@ def by_form(laws: tuple[tuple[str, Law], ...], otherwise: Law) -> Callable[..., 
 
 @section
 def offset_from_shape(offset_to: Law, moving: bool) -> Callable[..., Vec]:
-    """Make `seen(params, size, at, time, x)`: the offset of x from the anchor of the shape at `at`, m.
+    """Make `offset_of(params, size, at, time, x)`: the offset of x from the anchor of the shape at `at`, m.
 
     time: s.
     """
 
-    def seen(params: Any, size: Any, at: Any, time: Any, x: Any) -> Any:
+    def offset_of(params: Any, size: Any, at: Any, time: Any, x: Any) -> Any:
         place = vector_at(params, at + 2, x)
         if moving:
             return offset_to(size, add(place, shift_of(params, at, time, x)), x)
         return offset_to(size, place, x)
 
-    return seen
+    return offset_of
 
 
 @law
@@ -114,14 +114,14 @@ def box_of_path(x: Vec, half: Vec, room: float) -> tuple[Vec, Vec]:
 
 
 @section
-def each_row(around: Surroundings, form: FormPlan, meet: Law, box: Law, done: Law) -> Callable[..., Any]:
-    """Make `each(params, size, given, state)`: `state = meet(params, size, at, given, state)` for the rows of a form.
+def each_row(around: Surroundings, form: FormPlan, visit: Law, box: Law, done: Law) -> Callable[..., Any]:
+    """Make `each(params, size, given, state)`: `state = visit(params, size, at, given, state)` for the rows of a form.
 
     All rows, in order. For a form with a grid, only those that it lists in the box `box(given, state)` (the middle, and
     half the edges along each axis, m), which is updated after each row, until `done(state)`. Some of these may be
     visited twice, and their order is not defined.
     """
-    place, gridded, of_first = form.place, form.gridded, _relative_to_first(meet)
+    place, gridded, of_first = form.place, form.gridded, _relative_to_first(visit)
     each_listed = _each_listed(around.offset_to, around.dimension, of_first, box, done)
 
     def each(params: Any, size: Any, given: Any, state: Any) -> Any:
@@ -129,7 +129,7 @@ def each_row(around: Surroundings, form: FormPlan, meet: Law, box: Law, done: La
         if gridded:
             return each_listed(params, size, np.int64(params[place + 2]), at, given, state)
         for _ in range(np.int64(params[place + 1])):
-            state = meet(params, size, at, given, state)
+            state = visit(params, size, at, given, state)
             at += np.int64(params[at])
         return state
 
@@ -137,20 +137,20 @@ def each_row(around: Surroundings, form: FormPlan, meet: Law, box: Law, done: La
 
 
 @section
-def _relative_to_first(meet: Law) -> Callable[..., Any]:
-    """Make `meet` for a row that is given by its offset behind the first one."""
+def _relative_to_first(visit: Law) -> Callable[..., Any]:
+    """Make `visit` for a row that is given by its offset behind the first one."""
 
-    def meet_listed(params: Any, size: Any, at: Any, row: Any, given: Any, state: Any) -> Any:
-        return meet(params, size, at + row, given, state)
+    def visit_listed(params: Any, size: Any, at: Any, row: Any, given: Any, state: Any) -> Any:
+        return visit(params, size, at + row, given, state)
 
-    return meet_listed
+    return visit_listed
 
 
 @section
-def _each_listed(offset_to: Law, dimension: int, meet: Law, box: Law, done: Law) -> Callable[..., Any]:
+def _each_listed(offset_to: Law, dimension: int, visit: Law, box: Law, done: Law) -> Callable[..., Any]:
     """Make `each(params, size, cells, at, given, state)`: the loop over the rows that the grid at `cells` lists.
 
-    `state = meet(params, size, at, row, given, state)`; row: how far it lies behind the first row of the form.
+    `state = visit(params, size, at, row, given, state)`; row: how far it lies behind the first row of the form.
     """
     length = entry_length(dimension)
 
@@ -161,7 +161,7 @@ def _each_listed(offset_to: Law, dimension: int, meet: Law, box: Law, done: Law)
             begin, end = list_of(params, cells, middle, span, k)
             for entry in range(begin, end, length):
                 if is_near_box(params, entry, offset_to(size, middle, vector_at(params, entry + 1, middle)), reach):
-                    state = meet(params, size, at, row_of_entry(params, entry), given, state)
+                    state = visit(params, size, at, row_of_entry(params, entry), given, state)
                     if done(state):
                         return state
                     middle, reach = box(given, state)

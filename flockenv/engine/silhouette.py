@@ -128,7 +128,7 @@ def _first_row(around: Surroundings) -> Callable[..., tuple[float, int, int]]:
 @section
 def _first_touched(around: Surroundings, form: FormPlan) -> Callable[..., tuple[float, int, int]]:
     """Make the function for each row: keep (distance, form, row) of what is touched first."""
-    seen, hit, number = (
+    offset_of, hit, number = (
         offset_from_shape(around.offset_to, around.moving),
         law_of("hit", form.name),
         number_of(form.name),
@@ -137,7 +137,7 @@ def _first_touched(around: Surroundings, form: FormPlan) -> Callable[..., tuple[
     def touches(params: Any, size: Any, at: Any, given: Any, state: Any) -> Any:
         time, x, ray, room = given
         best, touched, row = state
-        y = seen(params, size, at, time, x)
+        y = offset_of(params, size, at, time, x)
         if near_path(params, at, y, ray, room, best):
             here = hit(params, at, y, ray, room)
             if here < best or (here == best and touched == number and at < row):
@@ -195,7 +195,10 @@ def edge(around: Surroundings) -> Callable[..., tuple[float, float]]:
     Towards `side`; rad, and m along the turned ray until the body is beside the obstacle.
     """
     offset_to, circle, has_shapes = around.offset_to, vector_of(around.dimension), bool(around.forms)
-    seen, edge_of = offset_from_shape(around.offset_to, around.moving), by_form(_laws("edge", around.forms), _no_edge)
+    offset_of, edge_of = (
+        offset_from_shape(around.offset_to, around.moving),
+        by_form(_laws("edge", around.forms), _no_edge),
+    )
 
     def edge(world: Any, form: Any, row: Any, x: Any, ray: Any, side: Any, room: Any) -> Any:
         obstacle_x, obstacle_radius, params, size, b, time = world
@@ -203,7 +206,7 @@ def edge(around: Surroundings) -> Callable[..., tuple[float, float]]:
             to = offset_to(size, x, circle(obstacle_x, b, row))
             return sphere_edge(to, ray, side, room + obstacle_radius[b, row])
         if has_shapes:
-            return edge_of(params, form, row, (seen(params, size, row, time, x), ray, side, room))
+            return edge_of(params, form, row, (offset_of(params, size, row, time, x), ray, side, room))
         return like(room, np.inf), like(room, np.inf)
 
     return routine(edge)
@@ -217,14 +220,14 @@ def normal_hit(around: Surroundings) -> Callable[..., Vec]:
     """
     offset_to, circle, has_shapes = around.offset_to, vector_of(around.dimension), bool(around.forms)
     laws = tuple((form.name, law_of("nearest", form.name)) for form in around.forms)
-    seen, nearest = offset_from_shape(around.offset_to, around.moving), by_form(laws, _no_surface)
+    offset_of, nearest = offset_from_shape(around.offset_to, around.moving), by_form(laws, _no_surface)
 
     def normal_hit(world: Any, form: Any, row: Any, x: Any, ray: Any, hit: Any, room: Any) -> Any:
         obstacle_x, _, params, size, b, time = world
         if form == -1:
             return touched_normal(offset_to(size, x, circle(obstacle_x, b, row)), ray, hit)
         if has_shapes:
-            return nearest(params, form, row, (touched_spot(seen(params, size, row, time, x), ray, hit, room),))[1]
+            return nearest(params, form, row, (touched_spot(offset_of(params, size, row, time, x), ray, hit, room),))[1]
         return zero(x)
 
     return routine(normal_hit)
@@ -279,7 +282,7 @@ def passing_side_of(around: Surroundings) -> Callable[..., Vec]:
     row_of, normal_at, beyond = _row_ahead(around.forms), normal_hit(around), edge_beyond(around)
     sides_of = _sides_in_space(around) if around.dimension == 3 else _both_sides
 
-    def aside_of(world: Any, x: Any, ray: Any, room: Any, known: Any) -> Any:
+    def passing_side(world: Any, x: Any, ray: Any, room: Any, known: Any) -> Any:
         hit, form, place = known
         row, right = row_of(world[2], form, place), perpendicular(ray)
         out = lateral(normal_at(world, form, row, x, ray, hit, room), ray)
@@ -291,7 +294,7 @@ def passing_side_of(around: Surroundings) -> Callable[..., Vec]:
             best, found = (far, side) if far < best else (best, found)
         return found
 
-    return routine(aside_of)
+    return routine(passing_side)
 
 
 @kernel
@@ -308,13 +311,13 @@ def _sides_in_space(around: Surroundings) -> Callable[..., tuple[Vec, ...]]:
     coordinates is preferred, and agents of the mirrored scene take the mirrored path.
     """
     laws = _laws("spine", tuple(form for form in around.forms if form.name in SPINES))
-    some, seen, spine_of = bool(laws), offset_from_shape(around.offset_to, around.moving), by_form(laws, _no_spine)
+    some, offset_of, spine_of = bool(laws), offset_from_shape(around.offset_to, around.moving), by_form(laws, _no_spine)
 
     def sides(world: Any, form: Any, row: Any, x: Any, ray: Any, own: Any, off: Any) -> Any:
         _, _, params, size, _, time = world
         ax, e = zero(x), like(x[0], 1.0)
         if some and form >= 0:
-            ax = lateral(spine_of(params, form, row, (seen(params, size, row, time, x), ray)), ray)
+            ax = lateral(spine_of(params, form, row, (offset_of(params, size, row, time, x), ray)), ray)
         if dot(ax, ax) <= like(e, 1e-10):
             ax = lateral(lateral(off, ray), own)
         if dot(ax, ax) <= like(e, 1e-10):

@@ -23,7 +23,7 @@ def is_blocked_of(around: Surroundings) -> Callable[..., bool]:
     It returns True if an obstacle intersects the straight line from place x to the offset `to`, m.
     """
     offset_to, circle, has_shapes = around.offset_to, vector_of(around.dimension), bool(around.forms)
-    hidden: Any = _is_hidden_by_shape(around) if has_shapes else None
+    is_hidden: Any = _is_hidden_by_shape(around) if has_shapes else None
 
     def is_blocked(
         obstacle_x: Any, obstacle_radius: Any, params: Any, size: Any, b: Any, time: Any, x: Any, to: Any
@@ -34,7 +34,7 @@ def is_blocked_of(around: Surroundings) -> Callable[..., bool]:
             if rho > 0:
                 found |= blocks(offset_to(size, x, circle(obstacle_x, b, m)), rho, to)
         if has_shapes:
-            return hidden(params, size, time, x, to, found)
+            return is_hidden(params, size, time, x, to, found)
         return found
 
     return is_blocked
@@ -42,27 +42,27 @@ def is_blocked_of(around: Surroundings) -> Callable[..., bool]:
 
 @section
 def _is_hidden_by_shape(around: Surroundings) -> Callable[..., bool]:
-    """Make `hidden(params, size, time, x, to, found)`: return True if `found`, or if a shape intersects the line."""
+    """Make `is_hidden(params, size, time, x, to, found)`: return True if `found`, or if a shape intersects the line."""
     first, form = len(around.forms) == 1, around.forms[-1]
     before: Any = None if first else _is_hidden_by_shape(around._replace(forms=around.forms[:-1]))
     each = each_row(around, form, _blocks_line(around, form), _box_of_line, _is_found)
 
-    def hidden(params: Any, size: Any, time: Any, x: Any, to: Any, found: Any) -> Any:
+    def is_hidden(params: Any, size: Any, time: Any, x: Any, to: Any, found: Any) -> Any:
         if first:
             return each(params, size, (time, x, to), found)
         return each(params, size, (time, x, to), before(params, size, time, x, to, found))
 
-    return hidden
+    return is_hidden
 
 
 @section
 def _blocks_line(around: Surroundings, form: FormPlan) -> Callable[..., bool]:
     """Make the function for each row: return True if it or an earlier one intersects the line."""
-    seen, hit = offset_from_shape(around.offset_to, around.moving), law_of("hit", form.name)
+    offset_of, hit = offset_from_shape(around.offset_to, around.moving), law_of("hit", form.name)
 
     def hides(params: Any, size: Any, at: Any, given: Any, found: Any) -> Any:
         time, x, to = given
-        y = seen(params, size, at, time, x)
+        y = offset_of(params, size, at, time, x)
         return found | (hit(params, at, y, unit(to), like(to[0], 0.0)) < norm(to))
 
     return hides

@@ -33,7 +33,7 @@ class Workspace:
 
     arrays: dict[str, NDArray[Any]]
     own: tuple[dict[str, NDArray[Any]], ...]  # lanes, ranges and spread of each thread
-    _given: dict[tuple[int, Any], Any] = field(default_factory=dict)
+    _records: dict[tuple[int, Any], Any] = field(default_factory=dict)
 
     @classmethod
     def allocate(cls, parts: KernelPlan, body: Body, table: Table, team: int = 1) -> Workspace:
@@ -61,11 +61,11 @@ class Workspace:
 
     def of(self, rank: int, kind: Any) -> Any:
         """Return what one thread of the team is passed: a record of this kind, which names its arrays."""
-        if (rank, kind) not in self._given:
+        if (rank, kind) not in self._records:
             arrays: dict[str, Any] = self.arrays | self.own[rank]
             arrays["inner"] = tuple(array for name, array in arrays.items() if name.startswith("inner"))
-            self._given[rank, kind] = kind(*(arrays[name] for name in kind._fields))
-        return self._given[rank, kind]
+            self._records[rank, kind] = kind(*(arrays[name] for name in kind._fields))
+        return self._records[rank, kind]
 
 
 def _spread(body: Body, width: int) -> NDArray[np.uint64]:

@@ -22,17 +22,17 @@ LINE = 64
 
 def _features() -> frozenset[str]:
     """Return the processor's features by their names in LLVM."""
-    told: str | None = numba.config.CPU_FEATURES  # type: ignore[attr-defined]  # made from the environment
-    found: str = codegen.get_host_cpu_features() if told is None else told  # type: ignore[no-untyped-call]
+    setting: str | None = numba.config.CPU_FEATURES  # type: ignore[attr-defined]  # made from the environment
+    found: str = codegen.get_host_cpu_features() if setting is None else setting  # type: ignore[no-untyped-call]
     return frozenset(name[1:] for name in found.split(",") if name.startswith("+"))
 
 
 def _register_width() -> int:
     """Return the register width in bytes; ValueError if FLOCKENV_REGISTER is neither 32 nor 64 nor empty."""
-    told = os.environ.get("FLOCKENV_REGISTER", "")
-    if told not in ("", "32", "64"):
-        raise ValueError(f"FLOCKENV_REGISTER = {told!r}: must be 32 or 64 (bytes of a register), or empty")
-    return int(told) if told else 64 if "avx512f" in FEATURES else 32
+    setting = os.environ.get("FLOCKENV_REGISTER", "")
+    if setting not in ("", "32", "64"):
+        raise ValueError(f"FLOCKENV_REGISTER = {setting!r}: must be 32 or 64 (bytes of a register), or empty")
+    return int(setting) if setting else 64 if "avx512f" in FEATURES else 32
 
 
 FEATURES = _features()

@@ -69,5 +69,5 @@ class MachineCode:
         """Do nothing: a function that is compiled again replaces the stored form."""
 
     def _file(self, signature: Any, codegen: Any) -> str:
-        told = repr((signature, codegen.magic_tuple(), llvmlite.__version__))
-        return f"{self._name}.{hashlib.sha256(told.encode()).hexdigest()[:20]}.nbc"
+        text = repr((signature, codegen.magic_tuple(), llvmlite.__version__))
+        return f"{self._name}.{hashlib.sha256(text.encode()).hexdigest()[:20]}.nbc"

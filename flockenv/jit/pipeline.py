@@ -147,11 +147,13 @@ class _LanesStay(_Lower):  # type: ignore[misc]
         """Mark a loop on its back edges: it is not unrolled, but its vectorised form may be."""
         module = self.module
 
-        def said(text: str, *more: Any) -> Any:
+        def metadata(text: str, *more: Any) -> Any:
             return module.add_metadata([llvm.MetaDataString(module, text), *more])
 
-        stay = said("llvm.loop.unroll.disable")
-        then = said("llvm.loop.vectorize.followup_vectorized", said("llvm.loop.isvectorized", llvm.IntType(32)(1)))
+        stay = metadata("llvm.loop.unroll.disable")
+        then = metadata(
+            "llvm.loop.vectorize.followup_vectorized", metadata("llvm.loop.isvectorized", llvm.IntType(32)(1))
+        )
         name = _LoopId(module, [stay, then], name=str(len(module.metadata)))
         for way_back in ways_back:
             way_back.set_metadata("llvm.loop", name)

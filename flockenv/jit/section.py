@@ -56,10 +56,10 @@ def section(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[.
 
     @functools.lru_cache(maxsize=4096, typed=True)
     @functools.wraps(make)
-    def made(*plan: Any) -> Callable[..., Any]:
+    def build_once(*plan: Any) -> Callable[..., Any]:
         return kernel(make(*plan))
 
-    return made
+    return build_once
 
 
 def entry_of(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[..., Any]]:
@@ -71,10 +71,10 @@ def entry_of(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[
 
     @functools.lru_cache(maxsize=512, typed=True)
     @functools.wraps(make)
-    def made(*plan: Any) -> Callable[..., Any]:
+    def build_once(*plan: Any) -> Callable[..., Any]:
         return _entry(make, plan)
 
-    return made
+    return build_once
 
 
 def without_dispatch(function: Any) -> Callable[..., Any]:
@@ -102,8 +102,8 @@ def entry(function: Callable[..., Any]) -> Callable[..., Any]:
 def digest_of(plan: Any) -> str:
     """Return a digest of all that the code of a plan depends on: laws by their code, numbers by their repr."""
     modules = {each.__module__ for each in functions_in(plan)}
-    told = f"{description(plan)}{laws_digest()}{texts_outside(modules)}"
-    return hashlib.sha256(told.encode()).hexdigest()[:20]
+    text = f"{description(plan)}{laws_digest()}{texts_outside(modules)}"
+    return hashlib.sha256(text.encode()).hexdigest()[:20]
 
 
 def _entry(make: Callable[..., Callable[..., Any]], plan: tuple[Any, ...]) -> Callable[..., Any]:
@@ -130,19 +130,19 @@ def _entry(make: Callable[..., Callable[..., Any]], plan: tuple[Any, ...]) -> Ca
 def _stand_in_data(function: Callable[..., Any]) -> bytes:
     """Return the data from which a stand-in for a function is built, as JSON."""
     parameters = list(inspect.signature(function).parameters)
-    told = (function.__name__, function.__qualname__, function.__module__, function.__doc__, parameters)
-    return json.dumps(told).encode()
+    data = (function.__name__, function.__qualname__, function.__module__, function.__doc__, parameters)
+    return json.dumps(data).encode()
 
 
-def _stand_in(told: bytes | None) -> Callable[..., Any] | None:
+def _stand_in(data: bytes | None) -> Callable[..., Any] | None:
     """Return a function with the stored name, docstring and parameters, which numba accepts; it is never called."""
-    if told is None:
+    if data is None:
         return None
 
     def stand_in() -> None:
         raise AssertionError("a stand-in is never compiled")
 
-    stand_in.__name__, stand_in.__qualname__, stand_in.__module__, stand_in.__doc__, parameters = json.loads(told)
+    stand_in.__name__, stand_in.__qualname__, stand_in.__module__, stand_in.__doc__, parameters = json.loads(data)
     kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
     stand_in.__signature__ = inspect.Signature([inspect.Parameter(name, kind) for name in parameters])  # type: ignore[attr-defined]
     return stand_in
@@ -242,9 +242,9 @@ def _call_all(functions: tuple[Any, ...], joined: bool, plain: Callable[..., Any
 
     first = inspect.Parameter("typing_context", inspect.Parameter.POSITIONAL_OR_KEYWORD)
     calls.__signature__ = signature.replace(parameters=[first, *signature.parameters.values()])  # type: ignore[attr-defined]
-    made: Any = intrinsic(calls)
-    made.py_func = plain  # its free variables are part of a section's digest
-    return made
+    together: Any = intrinsic(calls)
+    together.py_func = plain  # its free variables are part of a section's digest
+    return together
 
 
 @functools.cache

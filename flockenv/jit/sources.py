@@ -113,5 +113,5 @@ def description(part: Any) -> str:
 @functools.lru_cache(maxsize=4096)
 def _function_description(python: FunctionType) -> str:
     """Return a function's name and the digest of its code and free variables, which keeps nested text short."""
-    told = f"{code_text(python)} {description(free_values(python))}"
-    return f"{python.__module__}.{python.__qualname__} {hashlib.sha256(told.encode()).hexdigest()}"
+    text = f"{code_text(python)} {description(free_values(python))}"
+    return f"{python.__module__}.{python.__qualname__} {hashlib.sha256(text.encode()).hexdigest()}"

@@ -141,7 +141,7 @@ class _Timer:
 
 def _calls(scene: Scene, k: int) -> tuple[str, ...]:
     effect = scene.effects[k]
-    how = "tree" if (k, effect) in scene.parts.treed else "direct"
+    how = "tree" if (k, effect) in scene.parts.tree_effects else "direct"
     within = f" within {effect.reach:g} m" if effect.reach else ""
     more = {"neighbour query": within, "all others": f" ({how})"}
     return tuple(what + more.get(what, "") for what in effect.calls_for())

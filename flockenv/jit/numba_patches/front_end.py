@@ -210,7 +210,7 @@ def _refresh_if_new(refresh: Any) -> Any:
     """Refresh registries only if there are new declarations: numba goes through all of them for each function."""
     seen: dict[int, int] = {}  # by id of the registries, which the copies of a target share
 
-    def refreshed(self: Any) -> None:
+    def refresh_if_new(self: Any) -> None:
         known = sum(
             len(getattr(registry, kind))
             for context in (self, getattr(self, "typing_context", None) or self)
@@ -221,7 +221,7 @@ def _refresh_if_new(refresh: Any) -> Any:
             refresh(self)
             seen[id(self._registries)] = known
 
-    return refreshed
+    return refresh_if_new
 
 
 def _rewrite_where_used(slowly: Any) -> Any:
@@ -234,14 +234,14 @@ def _rewrite_where_used(slowly: Any) -> Any:
             known = block._flockenv_names = block.body, found
         return known[1]  # type: ignore[no-any-return]
 
-    def rewritten(blocks: Any, states: Any, handler: Any) -> Any:
+    def rewrite(blocks: Any, states: Any, handler: Any) -> Any:
         name = states["varname"]
         return {
             label: slowly({label: block}, states, handler)[label] if name in names(block) else block
             for label, block in blocks.items()
         }
 
-    return rewritten
+    return rewrite
 
 
 PATCHES = (
