@@ -23,7 +23,7 @@ from flockenv.jit.memory import zeros
 from flockenv.jit.pipeline import Inlined, Whole
 from flockenv.maths.approximations import round_half_even
 from flockenv.model.state import State
-from flockenv.physics.effects.effect import ties
+from flockenv.physics.effects.effect import separation_directions
 from flockenv.scene import Scene
 
 __all__ = ["MIXES", "by_hand"]
@@ -324,7 +324,7 @@ def by_hand(mix: str, scene: Scene, state: State, steps: int) -> Callable[[], ob
     body[...] = 1
     body[:, : scene.agents] = scene.body.mass, scene.body.max_speed, scene.body.max_force
     now, want, sums = (zeros(shape, real) for shape in ((ROWS, padded), (2, padded), (10 * width,)))
-    now[7:, : scene.agents] = ties(scene.agents, 2).T
+    now[7:, : scene.agents] = separation_directions(scene.agents, 2).T
     counts = zeros(3 * width, real if REGISTER == LINE else f"i{real.itemsize}")
     arguments = (
         state.x, state.v, state.alive, np.zeros((2, 0, 0), real), body, state.work, np.array(numbers, real),

@@ -21,7 +21,7 @@ from benchmarks.scenes import crowd, restarting, stepping, world
 from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.jit.thread_pool import use_threads
 from flockenv.model.state import State
-from flockenv.physics.effects.effect import ties
+from flockenv.physics.effects.effect import separation_directions
 from flockenv.scene import Scene
 
 __all__ = ["ROWS", "Reference", "Row", "disagreement"]
@@ -71,7 +71,7 @@ class Reference:
         step = getattr(self.limit, f"{kind}_{'f32' if scene.dtype == 'float32' else 'f64'}_{scene.dimension}d")
         numbers = np.array(_numbers(scene), scene.dtype)
         sizes = (*state.shape[:2], steps) if kind == "worlds" else (state.shape[1], steps)
-        apart = np.ascontiguousarray(ties(state.shape[1], scene.dimension).T, scene.dtype)
+        apart = np.ascontiguousarray(separation_directions(state.shape[1], scene.dimension).T, scene.dtype)
         arguments = (*map(_pointer, (state.x, state.v, apart)), *map(ctypes.c_long, sizes), _pointer(numbers))
         return lambda numbers=numbers, apart=apart: step(*arguments)  # it keeps the memory of these
 

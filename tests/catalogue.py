@@ -194,7 +194,7 @@ STEERING = (
     Law(steering.wander_turn, ("vector", "noise", "positive", "positive"), "vector"),
     # left and right are exchanged in a mirror image
     Law(steering.wander, ("own", "vector", "positive", "positive"), "vector", turns="upright", mirrors=False),
-    Law(steering.in_frame, ("own", "vector"), "vector", turns="upright", mirrors=False),
+    Law(steering.to_world_axes, ("own", "vector"), "vector", turns="upright", mirrors=False),
     Law(steering.match_velocity, ("vector", "vector"), "vector"),
     Law(steering.target_speed, ("vector", "positive"), "vector"),
     Law(steering.face, ("vector", "heading"), "vector"),
@@ -235,9 +235,9 @@ STEERING = (
     Law(steering.follow_path, ("positive", "positive", "vector", "vector", "positive"), "vector"),
     Law(steering.follow_flow, ("vector", "vector"), "vector"),
     Law(steering.contain, ("walls", "walls", "vector", "positive", "positive"), "vector", turns="none", mirrors=False),
-    Law(steering.looking, ("heading", "heading"), "vector"),
+    Law(steering.gaze_direction, ("heading", "heading"), "vector"),
     Law(steering.view_weight, ("heading", "vector", "positive"), "positive"),
-    Law(steering.in_cone, ("heading", "vector", "positive", "positive"), "positive"),
+    Law(steering.cone_weight, ("heading", "vector", "positive", "positive"), "positive"),
     Law(steering.repulsion, ("vector", "heading", "positive", "length"), "vector"),
     Law(steering.elliptical_repulsion, ("vector", "vector", "heading", "length"), "vector"),
     # it passes every neighbour on the same side
@@ -245,12 +245,12 @@ STEERING = (
         steering.sidestep, ("vector", "vector", "vector", "heading", *("positive",) * 5), "vector", turns="upright",
         mirrors=False,
     ),
-    Law(steering.draw, ("vector", "length"), "vector"),
+    Law(steering.attraction, ("vector", "length"), "vector"),
     Law(steering.gaze_turn, ("heading", "vector", "positive"), "positive"),
     Law(steering.collision_distance, ("heading", "vector", "vector", "positive", "positive"), "positive"),
-    Law(steering.heed, ("vector",) * 5 + ("positive",) * 5, "vector"),
-    Law(steering.behind, ("vector", "vector", "length"), "vector"),
-    Law(steering.herd_from, ("vector", "vector", "vector", "length", "positive", "positive"), "vector"),
+    Law(steering.sheep_direction, ("vector",) * 5 + ("positive",) * 5, "vector"),
+    Law(steering.point_behind, ("vector", "vector", "length"), "vector"),
+    Law(steering.herding_offset, ("vector", "vector", "vector", "length", "positive", "positive"), "vector"),
 )  # fmt: skip
 
 ARBITRATION = (arbitration.blend, arbitration.prioritise, arbitration.allocate, arbitration.allocate_running)

@@ -16,7 +16,7 @@ from flockenv.behaviours import Separation
 from flockenv.cli.main import main
 from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import Effect, Fluctuation, Swing, Tether
-from flockenv.physics.integrators import RK4, Integrator, methods_named
+from flockenv.physics.integrators import RK4, Integrator, methods_of
 from flockenv.scene import Group, Scene
 from flockenv.studies.accuracy import SUITE, Problem, Report, Results, chaos, measure, problems_named, usual_methods
 from flockenv.studies.accuracy import problem as problems
@@ -55,7 +55,7 @@ def swinging(angle: float, seconds: float, steps: tuple[int, ...] = (512, 1024))
     return Problem.of(scene, seconds, steps, motion=([[angle, 0.0]], [[0.0, 0.0]]))
 
 
-FEW = methods_named(["semi_implicit_euler", "velocity_verlet", "rk4", "dormand_prince"])
+FEW = methods_of(["semi_implicit_euler", "velocity_verlet", "rk4", "dormand_prince"])
 """One method of each order, because each compiles a kernel."""
 
 
@@ -92,7 +92,7 @@ def test_orders_are_the_declared_ones_on_every_smooth_problem(name: str) -> None
         assert curve.order == pytest.approx(curve.declared, abs=0.25), curve.method
 
 
-METHODS = methods_named(["semi_implicit_euler", "velocity_verlet", "rk4"])
+METHODS = methods_of(["semi_implicit_euler", "velocity_verlet", "rk4"])
 
 
 @pytest.mark.slow
@@ -182,7 +182,7 @@ def test_a_horizon_that_is_too_long_for_a_chaotic_scene_is_refused() -> None:
         measure(swinging(math.pi - 1e-9, 5.0), METHODS)
     assert "\n" not in str(caught.value)
     shorter = float(str(caught.value).split("try ")[1].split(" s")[0])
-    measure(swinging(math.pi - 1e-9, shorter), methods_named(["rk4"]), repetitions=0)
+    measure(swinging(math.pi - 1e-9, shorter), methods_of(["rk4"]), repetitions=0)
 
 
 # --- evaluations, energy, momentum ------------------------------------------------------------------------------------
@@ -206,7 +206,7 @@ def assert_evaluations(damped: Report, methods: Sequence[Integrator]) -> None:
 def test_tolerances_end_once_they_cost_more_than_the_finest_fixed_steps() -> None:
     """If forces jump, a tenth of the tolerance takes ten times the steps, without end."""
     few = replace(one("damped"), steps=(8,))
-    (curve,) = measure(few, methods_named(["dormand_prince"]), repetitions=0).curves
+    (curve,) = measure(few, methods_of(["dormand_prince"]), repetitions=0).curves
     costs = [point.evaluations for point in curve.points]
     assert 1 <= len(costs) < 10
     assert costs[-1] > 4 * 8 and all(cost <= 4 * 8 for cost in costs[:-1])
@@ -215,7 +215,7 @@ def test_tolerances_end_once_they_cost_more_than_the_finest_fixed_steps() -> Non
 def test_the_energy_error_of_rk4_has_its_closed_form() -> None:
     """RK4 keeps 1 - y^6/72 + y^8/576 of the energy per step, y = h w."""
     oscillator = one("oscillator")
-    report = measure(oscillator, methods_named(["rk4"]), repetitions=0)
+    report = measure(oscillator, methods_of(["rk4"]), repetitions=0)
     assert report.energy == "kinetic and potential (tether)"
     for point in report.curve("rk4").points[:6]:
         y = oscillator.seconds / point.steps
@@ -227,7 +227,7 @@ def test_the_energy_error_of_rk4_has_its_closed_form() -> None:
 def test_a_diverged_run_has_no_error_and_does_not_affect_other_runs() -> None:
     """The coarse steps of h w = 15 diverge, the fine ones do not."""
     problem = sprung(900.0, 20.0, (40, 20480))
-    report = measure(problem, methods_named(["explicit_euler", "semi_implicit_euler"]), repetitions=1)
+    report = measure(problem, methods_of(["explicit_euler", "semi_implicit_euler"]), repetitions=1)
     coarse, fine = report.curve("semi_implicit_euler").points
     assert coarse.error is None and coarse.seconds is None
     assert fine.error is not None and fine.seconds is not None
@@ -238,7 +238,7 @@ def test_a_diverged_run_has_no_error_and_does_not_affect_other_runs() -> None:
 def test_momentum_is_conserved_by_mutual_separation() -> None:
     spawn = Spawn(low=ORIGIN, high=(4.0, 4.0), speed=(0.5, 1.0))
     scene = Scene(groups=(Group(count=8, spawn=spawn),), effects=(Separation(weight=0.3, radius=50),))
-    report = measure(Problem.of(scene, 1.0, (64, 128)), methods_named(["rk4"]), repetitions=0)
+    report = measure(Problem.of(scene, 1.0, (64, 128)), methods_of(["rk4"]), repetitions=0)
     assert all(point.momentum is not None and point.momentum < 1e-13 for point in report.curve("rk4").points)
     assert report.energy == "kinetic"
 
@@ -268,7 +268,7 @@ def test_an_interpolated_point_reaches_its_error_at_its_cost(damped: Report) -> 
     assert choice is not None and choice.interpolated
     problem = one("damped")
     steps = math.ceil(problem.seconds / choice.dt)
-    found = measure(replace(problem, steps=(steps,)), methods_named(["rk4"]), repetitions=0).curves[0].points[0]
+    found = measure(replace(problem, steps=(steps,)), methods_of(["rk4"]), repetitions=0).curves[0].points[0]
     assert found.error is not None and found.error < 1.1 * 3e-5
     assert choice.cost == pytest.approx(found.evaluations, rel=0.1)
 
@@ -312,7 +312,7 @@ TABULATED = ("explicit_euler", "semi_implicit_euler", "velocity_verlet", "midpoi
 def test_errors_are_reached_with_the_evaluations_of_the_table(name: str) -> None:
     """Velocity Verlet evaluates forces twice per step, so that drag leaves it order 2; the table counts once."""
     problem = replace(one(name), steps=tuple(2**k for k in range(2, 19)))
-    report = measure(problem, methods_named(TABULATED), repetitions=0)
+    report = measure(problem, methods_of(TABULATED), repetitions=0)
     for tolerance, expected in EVALUATIONS[name].items():
         for kind, evaluations in zip(TABULATED, expected, strict=True):
             twice = 2 if kind == "velocity_verlet" else 1
@@ -408,7 +408,7 @@ def test_an_invalid_problem_is_refused(change: dict[str, Any], text: str) -> Non
 
 def test_unknown_names_are_refused_with_the_nearest_one() -> None:
     with pytest.raises(ValueError, match="methods: 'rk44' is none, did you mean `rk4`"):
-        methods_named(["rk44"])
+        methods_of(["rk44"])
     with pytest.raises(ValueError, match="problems: 'keppler' is none, did you mean `kepler`"):
         problems_named(["keppler"])
     with pytest.raises(ValueError, match="repetitions = -1"):
@@ -564,7 +564,5 @@ def test_times_of_comparison_are_steps_of_every_run() -> None:
 def test_implicit_methods_are_measured_only_if_named() -> None:
     usual: tuple[Integrator, ...] = usual_methods()
     assert not any(method.solves for method in usual) and RK4() in usual
-    report = measure(
-        replace(one("damped"), steps=(16, 32, 64, 128)), methods_named(["implicit_midpoint"]), repetitions=1
-    )
+    report = measure(replace(one("damped"), steps=(16, 32, 64, 128)), methods_of(["implicit_midpoint"]), repetitions=1)
     assert report.curves[0].order == pytest.approx(2, abs=0.2)

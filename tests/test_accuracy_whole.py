@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from flockenv.cli.main import main
-from flockenv.physics.integrators import methods_named
+from flockenv.physics.integrators import methods_of
 from flockenv.scene.yaml_io import load_scene
 from flockenv.studies.accuracy import Problem, Report, Results, measure, problems_named
 from flockenv.studies.accuracy.paths import Path as Way
@@ -53,7 +53,7 @@ population:
   - {kind: emitter, place: {kind: point, at: [2, 1]}, rate: 9.3, speed: [1, 1]}
 dt: 0.025
 """
-FEW = methods_named(["semi_implicit_euler", "velocity_verlet", "rk4"])
+FEW = methods_of(["semi_implicit_euler", "velocity_verlet", "rk4"])
 
 
 def of(text: str, seconds: float, steps: tuple[int, ...], **more: Any) -> Problem:
@@ -123,7 +123,7 @@ def test_the_reference_of_a_pendulum_includes_its_rod() -> None:
 @pytest.mark.slow
 def test_the_reference_of_newtons_cradle_includes_its_constraints() -> None:
     problem = Problem.of(load_scene(Path("configs/scenes/newtons_cradle.yaml")), 0.6, (600, 1200), name="cradle")
-    report = measure(problem, methods_named(["velocity_verlet"]), repetitions=0, finer=8)
+    report = measure(problem, methods_of(["velocity_verlet"]), repetitions=0, finer=8)
     assert report.reference == "event-exact steps"
     assert 0.1 < report.reach < 1.5  # 1.8 m in free fall
     assert all(point.error is not None and point.error < 0.02 for point in report.curves[0].points)
@@ -216,7 +216,7 @@ def test_a_map_from_step_to_step_is_refused_in_one_line() -> None:
 
 @pytest.fixture(scope="module")
 def ball() -> Report:
-    return measure(of(BALL, 0.5, (25, 50, 100, 200)), methods_named(["semi_implicit_euler", "rk4"]), repetitions=0)
+    return measure(of(BALL, 0.5, (25, 50, 100, 200)), methods_of(["semi_implicit_euler", "rk4"]), repetitions=0)
 
 
 def test_errors_near_that_of_the_reference_are_marked(ball: Report) -> None:
@@ -280,7 +280,7 @@ def test_every_shipped_scene_has_a_reference_or_one_line_with_the_reason(path: P
     scene = load_scene(path)
     try:
         problem = Problem.of(scene, 4 * scene.dt, (4, 8), name=path.stem)
-        report = measure(problem, methods_named(["rk4"]), repetitions=0, finer=4)
+        report = measure(problem, methods_of(["rk4"]), repetitions=0, finer=4)
     except ValueError as reason:
         assert "\n" not in str(reason)
         assert any(word in str(reason) for word in REASONS)

@@ -21,7 +21,7 @@ from flockenv.jit.thread_pool import use_threads
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import Floats, State
 from flockenv.physics.constraints import Collisions
-from flockenv.physics.constraints.broad_phase import nearby
+from flockenv.physics.constraints.broad_phase import list_near_pairs
 from flockenv.physics.effects import Gravity
 from flockenv.physics.integrators import RK4, Integrator, SemiImplicitEuler, VelocityVerlet
 from flockenv.scene import Group, Scene
@@ -284,7 +284,7 @@ def test_candidate_pairs_equal_those_of_brute_force(count: int, period: float) -
         np.zeros(max(count, 64), np.int64), np.zeros(count, int32), np.zeros(count, int32), np.zeros(count + 1, int32),
         np.zeros((1, count), int32), np.zeros((1, 6)), np.zeros(8, np.int64), np.zeros((27, 3), np.int64),
     )  # fmt: skip
-    found = entry(nearby)((period,) * 2, at, living.astype(np.int64), radius, reach, count, *scratch, one, other)
+    found = entry(list_near_pairs)((period,) * 2, at, living.astype(np.int64), radius, reach, count, *scratch, one, other)
     d = at[:, None] - at[None]
     d -= period * np.floor(d / period + 0.5) if period else 0.0
     room = radius[:, None] + radius[None] + reach[:, None] + reach[None]

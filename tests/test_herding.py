@@ -8,7 +8,7 @@ import pytest
 from flockenv import steering
 from flockenv.steering.vectorize import rows
 
-heed, behind, herd_from = rows(steering.heed), rows(steering.behind), rows(steering.herd_from)
+heed, behind, herd_from = rows(steering.sheep_direction), rows(steering.point_behind), rows(steering.herding_offset)
 
 ZERO = np.zeros(2)
 PAPER = (0.5, 1.05, 2.0, 1.0, 0.3)  # h, c, rho_a, rho_s, e

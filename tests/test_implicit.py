@@ -16,7 +16,7 @@ from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
 from flockenv.physics.effects import Carried, Drag, Effect, Gravity, Springs, Vortex
 from flockenv.physics.integrators import INTEGRATORS, ImplicitEuler, ImplicitMidpoint
-from flockenv.physics.integrators.newton import Coupling, NotSolvedError, coupled, solve_stage
+from flockenv.physics.integrators.newton import Coupling, NotSolvedError, coupling_between, solve_stage
 from flockenv.scene import Group, Scene
 from tests.catalogue import Array
 
@@ -39,7 +39,7 @@ def linear(rng: Any, agents: int, dimension: int, stiff: float) -> tuple[Any, Ar
         return -x @ stiffness.T - v @ damping.T + force * time, x @ flow.T
 
     own = np.arange(agents - 1)
-    return evaluate, stiffness, damping, flow, force, coupled(agents, np.r_[own, own + 1], np.r_[own + 1, own])
+    return evaluate, stiffness, damping, flow, force, coupling_between(agents, np.r_[own, own + 1], np.r_[own + 1, own])
 
 
 @SOLVERS
@@ -67,7 +67,7 @@ def test_no_agent_depends_on_two_agents_of_one_colour() -> None:
         (40, rng.integers(0, 40, 60), rng.integers(0, 40, 60), 40),
     ):  # fmt: skip
         pairs = np.asarray(first, int), np.asarray(second, int)
-        found = coupled(agents, *pairs)
+        found = coupling_between(agents, *pairs)
         seen = set(zip(found.row.tolist(), found.column.tolist(), strict=True))
         expected_pairs = {(i, i) for i in range(agents)} | set(zip(*(p.tolist() for p in pairs), strict=True))
         assert seen == expected_pairs
@@ -83,7 +83,7 @@ def test_a_stage_without_a_solution_raises_an_error() -> None:
         (lambda x, v, t: (np.full_like(x, np.nan), None), "not finite"),
         (lambda x, v, t: (np.where(v > 0, -10.0, 10.0) * np.ones_like(x), None), "converged|derivative"),
     ):
-        for coupling in (None, coupled(1, np.zeros(0, int), np.zeros(0, int))):
+        for coupling in (None, coupling_between(1, np.zeros(0, int), np.zeros(0, int))):
             with pytest.raises(NotSolvedError, match=message):
                 solve_stage(law, x0, v0, 0.0, 1.0, 2, coupling)
 
@@ -174,7 +174,7 @@ def test_all_solvers_find_the_same_solution() -> None:
         assert scene.coupling is not None
         assert scene.coupling.colours < 15
         if solver != "sparse":
-            scene.__dict__["coupling"] = None if solver == "free" else coupled(scene.agents, *all_pairs)
+            scene.__dict__["coupling"] = None if solver == "free" else coupling_between(scene.agents, *all_pairs)
         found.append(scene.run(shaken(scene), 5))
     for other in found[1:]:
         np.testing.assert_allclose(other.pos, found[0].pos, atol=1e-9)

@@ -31,7 +31,7 @@ from flockenv.physics.integrators import (
     VelocityVerlet,
 )
 from flockenv.physics.integrators.exponential_drag import phi_functions
-from flockenv.physics.integrators.step_size import TRIES, Clock, begun, excess, judged
+from flockenv.physics.integrators.step_size import TRIES, Clock, excess_square, initial_clock, next_clock
 from flockenv.scene import Group, Scene
 from tests.catalogue import INTEGRATORS, Array, IntegratorRow
 from tests.motion import METHODS, V0, WAYS, X0, at_start, first_of, motion, order, tethered
@@ -345,7 +345,7 @@ def test_exponential_drag_uses_the_mass_of_each_agent(tether: Any) -> None:
 def judge(
     clock: Clock, error: float, tolerance: float = 1e-6, least: float = 0.0, most: float = 1e5, dt: float = 1.0
 ) -> Clock:
-    return judged(clock, error, (tolerance, least, most), dt, 4)
+    return next_clock(clock, error, (tolerance, least, most), dt, 4)
 
 
 def test_the_next_step_is_that_of_the_standard_controller() -> None:
@@ -363,7 +363,7 @@ def test_the_next_step_is_that_of_the_standard_controller() -> None:
 
 
 def test_steps_do_not_grow_again_before_the_end_of_a_rejected_step() -> None:
-    clock = judge(begun(1.0), 1.0)
+    clock = judge(initial_clock(1.0), 1.0)
     assert (clock.step, clock.wary) == (pytest.approx(0.2), 1.0)
     again = judge(clock, 2e-6)
     assert (again.step, again.wary) == (pytest.approx(0.04), pytest.approx(0.2))  # a fifth, although 0.78 might suffice
@@ -376,7 +376,7 @@ def test_steps_do_not_grow_again_before_the_end_of_a_rejected_step() -> None:
 @pytest.mark.parametrize("dt", [0.02, 1 / 3, 1e6, 1e-9])
 def test_adaptive_steps_end_exactly_at_the_end_of_the_step(seed: int, dt: float) -> None:
     rng = np.random.default_rng(seed)
-    clock, total = begun(dt), 0.0
+    clock, total = initial_clock(dt), 0.0
     while clock.done < dt:
         assert 0 < clock.step <= dt - clock.done
         before, clock = clock, judge(clock, 10.0 ** rng.uniform(-9, -5), dt=dt)
@@ -387,7 +387,7 @@ def test_adaptive_steps_end_exactly_at_the_end_of_the_step(seed: int, dt: float)
 
 
 def test_a_world_is_given_up_after_too_many_tries_or_if_its_steps_vanish() -> None:
-    clock, tries = begun(1.0), 0
+    clock, tries = initial_clock(1.0), 0
     while not clock.lost:
         clock, tries = judge(clock, math.nan), tries + 1
     assert (tries, clock.rejected, clock.accepted, clock.done) == (TRIES, TRIES, 0, 1.0)
@@ -403,11 +403,11 @@ def test_a_world_is_given_up_after_too_many_tries_or_if_its_steps_vanish() -> No
 def test_differences_within_rounding_count_as_no_error() -> None:
     """In float32 rounding makes the two results of a step differ by more than a tolerance of 1e-9."""
     tiny = 8 * np.finfo(np.float32).eps
-    assert excess(np.float32(9e-6), np.float32(10.0), tiny) == 0
-    assert excess(np.float32(9e-6), np.float32(1.0), tiny) > 0
-    assert excess(-3.0, 1.0, 0.0) == 9.0
-    assert math.isnan(excess(math.nan, 1.0, tiny))
-    assert math.isinf(excess(math.inf, 1.0, tiny))
+    assert excess_square(np.float32(9e-6), np.float32(10.0), tiny) == 0
+    assert excess_square(np.float32(9e-6), np.float32(1.0), tiny) > 0
+    assert excess_square(-3.0, 1.0, 0.0) == 9.0
+    assert math.isnan(excess_square(math.nan, 1.0, tiny))
+    assert math.isinf(excess_square(math.inf, 1.0, tiny))
 
 
 @ADAPTIVE

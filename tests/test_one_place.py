@@ -20,7 +20,7 @@ from flockenv.model.divergence import SimulationDiverged
 from flockenv.model.group import Group
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
-from flockenv.physics.effects.effect import Effect, Me, Other, ties
+from flockenv.physics.effects.effect import Effect, Me, Other, separation_directions
 from flockenv.physics.integrators import RK4
 from flockenv.scene import Scene
 from flockenv.steering.others import ONE_PLACE
@@ -52,7 +52,7 @@ def crowd(
 def expected(scene: Scene, state: State) -> Any:
     """Return the acceleration from the formulas of the three rules, agent by agent, in double precision."""
     x, v, d = state.pos[0].astype(float), state.vel[0].astype(float), scene.dimension
-    tie, out = ties(len(x), d), np.zeros((len(x), d))
+    tie, out = separation_directions(len(x), d), np.zeros((len(x), d))
     for i in range(len(x)):
         to = x - x[i]
         if isinstance(scene.space, Torus):
@@ -90,7 +90,7 @@ def test_all_agents_in_one_place_part_with_zero_total_force() -> None:
     scene, state = crowd(40, 2, "float64", False, RULES[0])
     state.x[...] = 3.0
     found = scene.acceleration(state)[0]
-    tie = ties(40, 2)
+    tie = separation_directions(40, 2)
     np.testing.assert_allclose(found, 1.5 * (40 * tie - tie.sum(axis=0)), atol=1e-11)
     np.testing.assert_allclose(found.sum(axis=0), 0, atol=1e-10)
 
@@ -101,7 +101,7 @@ def test_agents_in_the_same_place_are_among_the_nearest(nearest: int) -> None:
         10, 2, "float64", False, Cohesion(weight=1, radius=9), Separation(weight=1, radius=9, nearest=nearest)
     )
     assert scene.parts.parting
-    tie, pull = ties(10, 2), scene.acceleration(state)[0]
+    tie, pull = separation_directions(10, 2), scene.acceleration(state)[0]
     lone, _ = crowd(10, 2, "float64", False, Cohesion(weight=1, radius=9))
     push = pull - lone.acceleration(state)[0]
     pair = STACKS[0]
@@ -117,7 +117,7 @@ def test_absent_agents_push_no_agent_in_the_same_place() -> None:
     whole = scene.acceleration(state)[0]
     state.alive[0, 5] = False
     found = scene.acceleration(state)[0]
-    tie = ties(10, 2)
+    tie = separation_directions(10, 2)
     lone, _ = crowd(10, 2, "float64", False, RULES[0])
     state.alive[0, 5] = True
     before = lone.acceleration(state)[0, 3]

@@ -36,7 +36,7 @@ from flockenv.physics.population import (
     Point,
     Segment,
     Surface,
-    settler,
+    make_settler,
 )
 from flockenv.render import draw, write_replay
 from flockenv.render.replay import Group as ReplayGroup
@@ -384,7 +384,7 @@ def test_crowding_removes_the_youngest_agents(space: Space, dtype: str) -> None:
     crowd = scene(Crowding(radius=radius, most=most), count=n, space=space, group=group, dtype=dtype)
     before = crowd.start(0)
     after = before.copy()
-    settler(crowd)(before.x, before.v, after, 0, 1)  # the end of a step without motion
+    make_settler(crowd)(before.x, before.v, after, 0, 1)  # the end of a step without motion
     offset = np.asarray(space.displacement(before.pos[0][:, None], before.pos[0][None]))
     near = (offset**2).sum(axis=2) <= radius**2
     elders = np.tril(near, -1).sum(axis=1)  # of equal age: those with smaller indices

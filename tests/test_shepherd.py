@@ -46,7 +46,7 @@ def expected(scene: Scene, state: State) -> Array:
     farthest = sheep[np.linalg.norm(sheep - centre, axis=1).argmax()]
     n, r = len(sheep), drive.spacing
     goal = np.array(drive.goal)
-    place = rows(steering.herd_from)(centre - pos, farthest - pos, goal - pos, r * n ** (2 / 3), r, r * n**0.5)
+    place = rows(steering.herding_offset)(centre - pos, farthest - pos, goal - pos, r * n ** (2 / 3), r, r * n**0.5)
     change = rows(steering.arrive)(place, vel, 2.0, drive.slow_radius)
     return np.where(state.alive[0][:, None], drive.weight * change / 1.5, 0)
 

@@ -168,14 +168,14 @@ def test_agents_ahead_weigh_more_and_all_weigh_the_same_without_a_direction() ->
     around = np.array([[2.0, 0.0], [0.0, 3.0], [-1.0, 0.0]])
     assert np.allclose(weight((1.0, 0.0), around, 0.1), [1, 0.55, 0.1])
     assert (weight((0.0, 0.0), around, 0.1) == 1).all()
-    cone = rows(steering.in_cone)  # takes the force, which points away from its source
+    cone = rows(steering.cone_weight)  # takes the force, which points away from its source
     assert cone((1.0, 0.0), -around, math.cos(math.radians(100)), 0.5).tolist() == [1, 1, 0.5]
     assert cone((3.0, 0.0), -around, math.cos(math.radians(100)), 0.5).tolist() == [1, 1, 0.5]
     assert (cone((0.0, 0.0), -around, math.cos(math.radians(100)), 0.5) == 1).all()
 
 
 def test_looking_is_along_the_aim_and_without_an_aim_along_the_heading() -> None:
-    looking = rows(steering.looking)
+    looking = rows(steering.gaze_direction)
     assert looking((0.0, 0.5), (1.0, 0.0)).tolist() == [0, 0.5]  # the length of the aim does not matter
     assert looking((0.0, 0.0), (1.0, 0.0)).tolist() == [1, 0]
 

@@ -21,7 +21,7 @@ from flockenv.physics.integrators import (
     Integrator,
     SemiImplicitEuler,
     VelocityVerlet,
-    methods_named,
+    methods_of,
 )
 from flockenv.studies.stress import CASES, Case, Finding, Results, Value, cases_named, fingerprint, run, usual_methods
 from flockenv.studies.stress.gatherings import GATHERINGS
@@ -175,7 +175,7 @@ def test_cases_and_methods_are_found_by_name_and_unknown_names_are_refused() -> 
     assert cases_named(CASES, ()) == CASES
     assert [case.name for case in cases_named(CASES, ("N14",))] == [f"N14 {power}" for power in range(3, 9)]
     assert [case.name for case in cases_named(CASES, ("N20 10", "N04"))] == ["N04", "N20 10"]
-    assert methods_named(("rk4", "heun", "rk4")) == (RK4(), Heun())
+    assert methods_of(("rk4", "heun", "rk4")) == (RK4(), Heun())
     assert {method.kind for method in usual_methods()} == set(INTEGRATORS)
     solving = [method.solves for method in usual_methods()]
     assert solving == sorted(solving)
@@ -183,7 +183,7 @@ def test_cases_and_methods_are_found_by_name_and_unknown_names_are_refused() -> 
         cases_named(CASES, ("N41",))
     assert "\n" not in str(caught.value)
     with pytest.raises(ValueError, match=r"^methods: 'rk44' is none.*rk4") as caught:
-        methods_named(("rk44",))
+        methods_of(("rk44",))
     assert "\n" not in str(caught.value)
 
 

@@ -35,14 +35,14 @@ effects:
 
 
 @law
-def nothing(p: Any, me: Me) -> Vec:
+def no_threat(p: Any, me: Me) -> Vec:
     """Return the initial value: a threat at infinity, and no side."""
     o, far = like(me.who, 0.0), like(me.who, np.inf)
     return (far, o) + zero(me.pos) + zero(me.pos)  # noqa: RUF005  # numba joins tuples, but does not unpack them
 
 
 @law
-def _kept(acc: Vec) -> Vec:
+def _without_side(acc: Vec) -> Vec:
     """Return all but the side, which is found after the obstacle."""
     if len(acc) == 6:
         return (acc[0], acc[1], acc[2], acc[3])
@@ -51,7 +51,7 @@ def _kept(acc: Vec) -> Vec:
 
 
 @law
-def straight_on(p: Any, me: Me, k: int) -> tuple[Vec, float]:
+def ray_ahead(p: Any, me: Me, k: int) -> tuple[Vec, float]:
     """Return its heading, and the margin."""
     return me.heading, p.margin
 
@@ -63,17 +63,17 @@ def nearest_threat(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
     distance = other.hit if other.hit <= norm(me.vel) * p.horizon else far
     # an agent that overlaps already must turn away, however the sum of the radii is rounded
     clearance = me.radius + other.radius + p.margin if other.hit > like(me.who, 0.0) else far
-    return select(distance < acc[0], (distance, clearance) + other.offset, _kept(acc)) + zero(me.pos)  # noqa: RUF005
+    return select(distance < acc[0], (distance, clearance) + other.offset, _without_side(acc)) + zero(me.pos)  # noqa: RUF005
 
 
 @law
-def in_time(p: Any, me: Me) -> float:
+def horizon_reach(p: Any, me: Me) -> float:
     """Return the distance travelled within the horizon, plus radius and margin."""
     return norm(me.vel) * p.horizon + me.radius + p.margin  # type: ignore[no-any-return]
 
 
 @law
-def _sides(acc: Vec) -> tuple[Vec, Vec]:
+def _offset_and_side(acc: Vec) -> tuple[Vec, Vec]:
     """Return the offset of the threat, and the side of its nearest edge."""
     if len(acc) == 6:
         return (acc[2], acc[3]), (acc[4], acc[5])
@@ -82,7 +82,7 @@ def _sides(acc: Vec) -> tuple[Vec, Vec]:
 
 
 @law
-def _turns_in_time(p: Any, me: Me, normal: Vec, aside: Vec, hit: float) -> bool:
+def _can_turn(p: Any, me: Me, normal: Vec, aside: Vec, hit: float) -> bool:
     """Return True if it can turn to that side before it reaches the surface, with a turning radius R = m v^2 / F.
 
     Towards the normal's side the result is always True. To the other side the agent first turns towards the surface,
@@ -98,15 +98,15 @@ def _turns_in_time(p: Any, me: Me, normal: Vec, aside: Vec, hit: float) -> bool:
 
 
 @law
-def around(p: Any, me: Me, acc: Vec) -> Vec:
+def sidestep_threat(p: Any, me: Me, acc: Vec) -> Vec:
     """Return F = w (1 m/s) sideways to the nearest edge; without one, or too near to turn, to the normal's side."""
     e = like(me.who, 1.0)
-    offset, aside = _sides(acc)
+    offset, aside = _offset_and_side(acc)
     away = steering.avoid(me.heading, offset, acc[1], e)
     some = dot(aside, aside) > like(e, 0.0)
     normal = scale(sub(scale(me.heading, acc[0] if some else like(e, 0.0)), offset), e / acc[1])
     # away from a circle's centre is towards its nearest edge: if the two differ by rounding only, `away` is kept
-    other = some & (dot(aside, away) < like(e, 1 - 1e-5)) & _turns_in_time(p, me, normal, aside, acc[0])
+    other = some & (dot(aside, away) < like(e, 1 - 1e-5)) & _can_turn(p, me, normal, aside, acc[0])
     wish = select(other, aside, away)
     return scale(select(acc[0] < like(me.who, np.inf), wish, zero(me.pos)), p.weight)
 
@@ -128,11 +128,11 @@ class AvoidObstacles(Effect):
     horizon: float = Field(default=2.0, gt=0, description="s, look-ahead time, at the present speed")
     margin: float = Field(default=0.0, ge=0, description="m, clearance beyond both radii")
     steering: ClassVar[bool] = True
-    obstacle_start: ClassVar[Law | None] = nothing
-    obstacle_ray: ClassVar[Law | None] = straight_on
+    obstacle_start: ClassVar[Law | None] = no_threat
+    obstacle_ray: ClassVar[Law | None] = ray_ahead
     obstacle_law: ClassVar[Law | None] = nearest_threat
-    obstacle_finish: ClassVar[Law | None] = around
-    obstacle_reach: ClassVar[Law | None] = in_time
+    obstacle_finish: ClassVar[Law | None] = sidestep_threat
+    obstacle_reach: ClassVar[Law | None] = horizon_reach
     obstacle_edges: ClassVar[bool] = True
     demo: ClassVar[str | None] = AVOIDING
 
@@ -149,18 +149,18 @@ class AvoidObstacles(Effect):
 
 
 @law
-def whisker(p: Any, me: Me, k: int) -> tuple[Vec, float]:
+def whisker_ray(p: Any, me: Me, k: int) -> tuple[Vec, float]:
     """Return the direction of whisker k: straight ahead, then left and right, then (in 3-D) up and down."""
     o, e = like(me.who, 0.0), like(me.who, 1.0)
     right = perpendicular(me.heading)
     turn = p.angle * like(me.who, np.pi / 180)
     c, s = e if k == 0 else np.cos(turn), o if k == 0 else np.sin(turn)
     s = s if k % 2 == 0 else -s
-    return add(scale(me.heading, c), scale(_across(me.heading, right, k), s)), o
+    return add(scale(me.heading, c), scale(_whisker_side(me.heading, right, k), s)), o
 
 
 @law
-def _across(heading: Vec, right: Vec, k: int) -> Vec:
+def _whisker_side(heading: Vec, right: Vec, k: int) -> Vec:
     if len(heading) == 2:
         return right
     else:
@@ -185,22 +185,22 @@ def deepest_whisker(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
     share = e - other.hit / length if (other.hit < length) & (length > o) else o
     middle = dot(other.ray, me.heading) > like(e, 1 - 1e-6)
     ahead = other.hit if middle else like(e, np.inf)
-    return select(share > acc[1], (ahead, share) + other.normal, _kept(acc)) + zero(me.pos)  # noqa: RUF005
+    return select(share > acc[1], (ahead, share) + other.normal, _without_side(acc)) + zero(me.pos)  # noqa: RUF005
 
 
 @law
-def whiskers_end(p: Any, me: Me) -> float:
+def whisker_reach(p: Any, me: Me) -> float:
     """Return the length of a whisker plus the radius."""
     return norm(me.vel) * p.horizon + me.radius  # type: ignore[no-any-return]
 
 
 @law
-def along_normal(p: Any, me: Me, acc: Vec) -> Vec:
+def whisker_force(p: Any, me: Me, acc: Vec) -> Vec:
     """Return F = w (share inside) (n + side): n alone would mostly brake.
 
     The side is that of the nearest edge of the obstacle ahead; without one unit(lateral n), and head-on the right.
     """
-    normal, edge = _sides(acc)
+    normal, edge = _offset_and_side(acc)
     aside = lateral(normal, me.heading)
     headon = dot(aside, aside) < like(me.who, 1e-6)
     side = select(headon, perpendicular(me.heading), unit(aside))
@@ -223,10 +223,10 @@ class Whiskers(Effect):
     angle: float = Field(default=35.0, gt=0, lt=90, description="degrees between the middle and the other whiskers")
     steering: ClassVar[bool] = True
     obstacle_start: ClassVar[Law | None] = no_whisker
-    obstacle_ray: ClassVar[Law | None] = whisker
+    obstacle_ray: ClassVar[Law | None] = whisker_ray
     obstacle_law: ClassVar[Law | None] = deepest_whisker
-    obstacle_finish: ClassVar[Law | None] = along_normal
-    obstacle_reach: ClassVar[Law | None] = whiskers_end
+    obstacle_finish: ClassVar[Law | None] = whisker_force
+    obstacle_reach: ClassVar[Law | None] = whisker_reach
     obstacle_edges: ClassVar[bool] = True
     demo: ClassVar[str | None] = AVOIDING.replace("avoid_obstacles, weight: 8", "whiskers, weight: 20")
 
@@ -243,13 +243,13 @@ class Whiskers(Effect):
 
 
 @law
-def no_push(p: Any, me: Me) -> Vec:
+def zero_force(p: Any, me: Me) -> Vec:
     """Return the initial force, zero."""
     return zero(me.pos)
 
 
 @law
-def field_push(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
+def add_field(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
     """Add n / d^p, within range."""
     room = other.gap - me.radius
     near = room if room > p.nearest else p.nearest
@@ -258,7 +258,7 @@ def field_push(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
 
 
 @law
-def field_end(p: Any, me: Me) -> float:
+def field_reach(p: Any, me: Me) -> float:
     """Return its range plus the radius."""
     return p.range + me.radius  # type: ignore[no-any-return]
 
@@ -282,10 +282,10 @@ class ForceField(Effect):
     range: float = Field(default=3.0, gt=0, description="m between the surfaces, beyond which there is no force")
     nearest: float = Field(default=0.05, gt=0, description="m, smaller distances count as this one")
     steering: ClassVar[bool] = True
-    obstacle_start: ClassVar[Law | None] = no_push
-    obstacle_law: ClassVar[Law | None] = field_push
+    obstacle_start: ClassVar[Law | None] = zero_force
+    obstacle_law: ClassVar[Law | None] = add_field
     obstacle_finish: ClassVar[Law | None] = field_force
-    obstacle_reach: ClassVar[Law | None] = field_end
+    obstacle_reach: ClassVar[Law | None] = field_reach
     demo: ClassVar[str | None] = AVOIDING.replace("avoid_obstacles, weight: 8", "force_field, weight: 3")
 
     def folded(self, dimension: int) -> int:

@@ -21,8 +21,8 @@ __all__ = [
     "Behaviour",
     "Moving",
     "gains",
+    "mean_nearest",
     "nearest_one",
-    "seen_one",
     "steered_groups",
     "top_speed",
 ]
@@ -45,7 +45,7 @@ def nearest_one(p: Any, me: Me, other: Other) -> Vec:
 
 
 @law
-def seen_one(sums: Vec) -> tuple[Vec, Vec, bool]:
+def mean_nearest(sums: Vec) -> tuple[Vec, Vec, bool]:
     """Return the mean offset and velocity of the nearest neighbour, and True if there is one."""
     o, e = like(sums[0], 0.0), like(sums[0], 1.0)
     count = sums[len(sums) - 1]

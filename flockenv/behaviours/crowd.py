@@ -11,7 +11,7 @@ from pydantic import Field
 
 from flockenv import steering
 from flockenv.behaviours.behaviour import Behaviour, Moving, gains, top_speed
-from flockenv.behaviours.wander import wandered
+from flockenv.behaviours.wander import wander_force
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import scale, select, sub, unit, zero
 from flockenv.model.scene_view import SceneView
@@ -24,13 +24,13 @@ __all__ = ["Explore", "Forage", "Queue", "UnalignedAvoidance"]
 
 
 @law
-def no_meeting(p: Any, me: Me) -> Vec:
+def no_collision(p: Any, me: Me) -> Vec:
     """Return the initial value: no collision, at time inf."""
     return (like(me.radius, np.inf),) + zero(me.pos)  # noqa: RUF005  # numba joins tuples, but does not unpack them
 
 
 @law
-def first_meeting(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
+def earliest_collision(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
     """Keep the earliest predicted collision: (time, direction of evasion)."""
     clearance = me.radius + other.radius + p.margin
     time = steering.unaligned_threat(other.offset, me.vel, other.vel, clearance, p.horizon)
@@ -39,7 +39,7 @@ def first_meeting(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
 
 
 @law
-def giving_way(p: Any, me: Me, acc: Vec) -> Vec:
+def give_way_force(p: Any, me: Me, acc: Vec) -> Vec:
     """Return F = w (1 m/s) away from the predicted collision."""
     away: Vec
     if len(acc) == 3:
@@ -59,9 +59,9 @@ class UnalignedAvoidance(Behaviour):
     horizon: float = Field(default=3.0, gt=0, description="s, look-ahead time")
     margin: float = Field(default=0.0, ge=0, description="m, clearance beyond both radii")
     group: int | None = Field(default=None, ge=0, description="group that it avoids (default: all)")
-    pair_start: ClassVar[Law | None] = no_meeting
-    pair_law: ClassVar[Law | None] = first_meeting
-    finish_law: ClassVar[Law | None] = giving_way
+    pair_start: ClassVar[Law | None] = no_collision
+    pair_law: ClassVar[Law | None] = earliest_collision
+    finish_law: ClassVar[Law | None] = give_way_force
     demo_time: ClassVar[float] = 7.0
     demo: ClassVar[str | None] = """
 dt: 0.05
@@ -112,7 +112,7 @@ def free_way(p: Any, me: Me) -> Vec:
 
 
 @law
-def held_up(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
+def shortest_gap(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
     """Keep the shortest gap."""
     way: Vec
     if len(acc) == 3:
@@ -126,7 +126,7 @@ def held_up(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
 
 
 @law
-def queueing(p: Any, me: Me, acc: Vec) -> Vec:
+def queue_force(p: Any, me: Me, acc: Vec) -> Vec:
     """Return F = w (v_queue - v)."""
     way: Vec
     if len(acc) == 3:
@@ -148,8 +148,8 @@ class Queue(Moving):
     group: int | None = Field(default=None, ge=0, description="group that it queues behind (default: all)")
     places: ClassVar[tuple[str, ...]] = ("target",)
     pair_start: ClassVar[Law | None] = free_way
-    pair_law: ClassVar[Law | None] = held_up
-    finish_law: ClassVar[Law | None] = queueing
+    pair_law: ClassVar[Law | None] = shortest_gap
+    finish_law: ClassVar[Law | None] = queue_force
     demo: ClassVar[str | None] = """
 dt: 0.05
 obstacles: [{centre: [0, 2.7], radius: 2}, {centre: [0, -2.7], radius: 2}]
@@ -200,7 +200,7 @@ def nearest_food(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
 
 
 @law
-def foraging(p: Any, me: Me, acc: Vec) -> Vec:
+def forage_force(p: Any, me: Me, acc: Vec) -> Vec:
     """Return F = w (v_arrive - v) if there is food in sight, else F = w (v_wander - v)."""
     o = like(me.radius, 0.0)
     offset: Vec
@@ -210,7 +210,7 @@ def foraging(p: Any, me: Me, acc: Vec) -> Vec:
         offset = (acc[2], acc[3], acc[4])
     speed = top_speed(p, me)
     feed = steering.arrive(offset, me.vel, speed, p.slow_radius)
-    return select(acc[0] < like(o, np.inf), scale(feed, p.weight), wandered(p, me))
+    return select(acc[0] < like(o, np.inf), scale(feed, p.weight), wander_force(p, me))
 
 
 class Forage(Moving):
@@ -225,7 +225,7 @@ class Forage(Moving):
     strength: float = Field(default=1.0, ge=0, description="m sideways per m ahead while it wanders")
     pair_start: ClassVar[Law | None] = no_food
     pair_law: ClassVar[Law | None] = nearest_food
-    finish_law: ClassVar[Law | None] = foraging
+    finish_law: ClassVar[Law | None] = forage_force
     demo_time: ClassVar[float] = 20.0
     demo: ClassVar[str | None] = """
 dt: 0.05
@@ -256,7 +256,7 @@ effects:
 
 
 @law
-def sweeping(p: Any, me: Me) -> Vec:
+def explore_force(p: Any, me: Me) -> Vec:
     """Return F = w (v_track - v)."""
     to_low, to_high = sub(me.pos, p.low), sub(p.high, me.pos)
     return scale(steering.explore(to_low, to_high, me.vel, top_speed(p, me), p.track), p.weight)
@@ -275,7 +275,7 @@ class Explore(Moving):
         gt=0, description="m, largest distance of tracks; a range of sight of 1.25 tracks misses nothing"
     )
     places: ClassVar[tuple[str, ...]] = ("low", "high")
-    own_law: ClassVar[Law | None] = sweeping
+    own_law: ClassVar[Law | None] = explore_force
     demo_time: ClassVar[float] = 60.0
     demo: ClassVar[str | None] = """
 dt: 0.05

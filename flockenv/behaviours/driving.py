@@ -19,7 +19,7 @@ __all__ = ["Driving", "LineUp"]
 
 
 @law
-def driving(p: Any, me: Me) -> Vec:
+def driving_force(p: Any, me: Me) -> Vec:
     """Return F = m (v0 e - v) / tau, e = me.aim."""
     return scale(sub(scale(me.aim, me.desired_speed), me.vel), me.mass / p.tau)
 
@@ -35,7 +35,7 @@ class Driving(Behaviour):
     weight: float = Field(default=1.0, ge=0, description="a factor, 1 as published")
     tau: float = Field(default=0.5, gt=0, description="s, relaxation time")
     always: ClassVar[bool] = True
-    own_law: ClassVar[Law | None] = driving
+    own_law: ClassVar[Law | None] = driving_force
     demo: ClassVar[str | None] = """
 dt: 0.05
 groups:
@@ -74,13 +74,13 @@ def _demand_speeds(effect: Behaviour, scene: SceneView) -> None:
 
 
 @law
-def nobody_ahead(p: Any, me: Me) -> Vec:
+def no_agent_ahead(p: Any, me: Me) -> Vec:
     """Return the initial gap, inf: no agent ahead."""
     return (like(me.radius, np.inf),)
 
 
 @law
-def next_ahead(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
+def gap_ahead(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
     """Keep the shortest gap to a slower agent ahead in the direction of the aim.
 
     Ahead is within 45 degrees: two agents whose directions differ by less than 90 degrees never wait for each other.
@@ -95,7 +95,7 @@ def next_ahead(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
 
 
 @law
-def lining_up(p: Any, me: Me, acc: Vec) -> Vec:
+def line_up_force(p: Any, me: Me, acc: Vec) -> Vec:
     """Return F = m (e min(v0, gap / T) - v) / tau."""
     top = me.desired_speed * norm(me.aim)
     return scale(steering.queue(unit(me.aim), me.vel, acc[0], top, p.headway), me.mass / p.tau)
@@ -116,9 +116,9 @@ class LineUp(Behaviour):
     margin: float = Field(default=0.0, ge=0, description="m, gap between bodies that stand in line")
     radius: float = Field(default=3.0, gt=0, description="m, range within which agents ahead block")
     group: int | None = Field(default=None, ge=0, description="group that it waits behind (default: all)")
-    pair_start: ClassVar[Law | None] = nobody_ahead
-    pair_law: ClassVar[Law | None] = next_ahead
-    finish_law: ClassVar[Law | None] = lining_up
+    pair_start: ClassVar[Law | None] = no_agent_ahead
+    pair_law: ClassVar[Law | None] = gap_ahead
+    finish_law: ClassVar[Law | None] = line_up_force
     demo_time: ClassVar[float] = 14.0
     demo: ClassVar[str | None] = """
 dt: 0.05

@@ -27,7 +27,7 @@ __all__ = ["Alignment", "Cohesion", "Separation"]
 @law
 def separation_pair(p: Any, me: Me, other: Other) -> Vec:
     """Return the repulsion from one neighbour."""
-    return others.part(other.offset, other.square, sub(me.tie, other.tie))
+    return others.separate_at(other.offset, other.square, sub(me.tie, other.tie))
 
 
 @law
@@ -49,7 +49,7 @@ def alignment_pair(p: Any, me: Me, other: Other) -> Vec:
 
 
 @law
-def _mean(sums: Vec) -> tuple[Vec, bool]:
+def _mean_of_sums(sums: Vec) -> tuple[Vec, bool]:
     """Return the vector part of the sums divided by their count, the last entry, and True if the count is positive."""
     e = like(sums[0], 1.0)
     count = sums[len(sums) - 1]
@@ -64,7 +64,7 @@ def _mean(sums: Vec) -> tuple[Vec, bool]:
 @law
 def alignment(p: Any, me: Me, sums: Vec) -> Vec:
     """Return F = w (mean v_j - v), 0 without neighbours."""
-    mean, some = _mean(sums)
+    mean, some = _mean_of_sums(sums)
     return select(some, scale(steering.align(me.vel, mean), p.weight), zero(mean))
 
 
@@ -77,7 +77,7 @@ def cohesion_pair(p: Any, me: Me, other: Other) -> Vec:
 @law
 def cohesion(p: Any, me: Me, sums: Vec) -> Vec:
     """Return F = w (mean x_j - x)."""
-    mean, _ = _mean(sums)
+    mean, _ = _mean_of_sums(sums)
     return scale(mean, p.weight)
 
 

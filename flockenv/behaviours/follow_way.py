@@ -14,16 +14,24 @@ from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import norm, scale, sub
 from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.effect import Me, Vector
-from flockenv.physics.floor_fields import check_ways, lengths_on, region, starts_of, warn_cut_off, way_ahead, ways_to
+from flockenv.physics.floor_fields import (
+    check_floor_field,
+    floor_field_to,
+    grid_corners,
+    path_ahead,
+    path_lengths,
+    start_boxes,
+    warn_cut_off,
+)
 
 __all__ = ["FollowWay"]
 
 
 @law
-def follow_way(p: Any, me: Me) -> Vec:
+def follow_way_force(p: Any, me: Me) -> Vec:
     """Return F = w (V e - v), e the descent direction of the path length; slower over the last `slow_radius`."""
     straight = sub(p.target, me.pos)
-    length, direction = way_ahead(p.table, me.pos, straight)
+    length, direction = path_ahead(p.table, me.pos, straight)
     near = norm(straight)
     length = near if near < length else length
     ramp = length / p.slow_radius
@@ -45,7 +53,7 @@ class FollowWay(Moving):
     slow_radius: float = Field(default=1.0, gt=0, description="m before the target, over which it slows down to stop")
     margin: float = Field(default=3.0, gt=0, description="m of grid around obstacles, target and initial positions")
     tabled: ClassVar[bool] = True
-    own_law: ClassVar[Law | None] = follow_way
+    own_law: ClassVar[Law | None] = follow_way_force
     places: ClassVar[tuple[str, ...]] = ("target",)
     demo: ClassVar[str | None] = """
 groups:
@@ -72,13 +80,13 @@ effects:
 
     def table(self, scene: SceneView) -> NDArray[np.float64]:
         """Return the floor field."""
-        corners = region(scene, self._given[0], self.margin)
-        starts = [start for k in steered_groups(self, scene) for start in starts_of(scene, k)]
-        return ways_to(scene, *self._given, corners, self.spacing, self.clearance, starts)
+        corners = grid_corners(scene, self._given[0], self.margin)
+        starts = [start for k in steered_groups(self, scene) for start in start_boxes(scene, k)]
+        return floor_field_to(scene, *self._given, corners, self.spacing, self.clearance, starts)
 
     def check_start(self, scene: SceneView, state: Any) -> None:
         """Warn of agents whose initial position has no path to the target."""
-        lost = np.isinf(lengths_on(scene.table_of(self), state.pos))
+        lost = np.isinf(path_lengths(scene.table_of(self), state.pos))
         for k in set(range(len(scene.groups))) - set(steered_groups(self, scene)):
             lost[:, scene.starts[k] : scene.starts[k + 1]] = False
         warn_cut_off(self._given[1][0], lost, state)
@@ -86,5 +94,5 @@ effects:
     def check(self, scene: SceneView) -> None:
         """Raise ValueError for a torus, moving obstacles, too large a grid, or a target in an obstacle."""
         super().check(scene)
-        check_ways(scene, self.kind, *self._given, self.margin, self.spacing, self.clearance)
+        check_floor_field(scene, self.kind, *self._given, self.margin, self.spacing, self.clearance)
         scene.table_of(self)

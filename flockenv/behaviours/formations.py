@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from flockenv import steering
-from flockenv.behaviours.behaviour import AboutNearest, Moving, seen_one, top_speed
+from flockenv.behaviours.behaviour import AboutNearest, Moving, mean_nearest, top_speed
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import norm, scale, select, zero
 from flockenv.physics.effects.effect import Me, Other, Sight
@@ -27,25 +27,25 @@ def _station(p: Any, offset: Vec) -> Vec:
 
 
 @law
-def in_formation(p: Any, me: Me, sums: Vec) -> Vec:
+def formation_force(p: Any, me: Me, sums: Vec) -> Vec:
     """Return F = w (v_L + V min(1, d / d_slow) unit(d) - v)."""
-    offset, velocity, some = seen_one(sums)
+    offset, velocity, some = mean_nearest(sums)
     place, top = _station(p, offset), top_speed(p, me)
     wish = steering.keep_station(offset, me.vel, velocity, place, top, p.slow_radius)
     return select(some, scale(wish, p.weight), zero(wish))
 
 
 @law
-def following(p: Any, me: Me, sums: Vec) -> Vec:
+def follow_leader_force(p: Any, me: Me, sums: Vec) -> Vec:
     """Return F = w S: stay behind the leader, and out of its path."""
-    offset, velocity, some = seen_one(sums)
+    offset, velocity, some = mean_nearest(sums)
     behind = p.distance + p.headway * norm(velocity)
     wish = steering.follow_leader(offset, me.vel, velocity, behind, p.ahead, p.aside, top_speed(p, me), p.slow_radius)
     return select(some, scale(wish, p.weight), zero(wish))
 
 
 @law
-def _halves(acc: Vec) -> tuple[Vec, Vec]:
+def _two_agents(acc: Vec) -> tuple[Vec, Vec]:
     """Return (squared distance, offset, velocity) of the first and of the second agent."""
     if len(acc) == 10:
         return acc[:5], acc[5:]
@@ -54,7 +54,7 @@ def _halves(acc: Vec) -> tuple[Vec, Vec]:
 
 
 @law
-def _either(condition: bool, a: Vec, b: Vec) -> Vec:
+def _choose(condition: bool, a: Vec, b: Vec) -> Vec:
     """Return a where the condition holds, else b, of 5 or 7 numbers."""
     if len(a) == 5:
         return select(condition, a, b)
@@ -63,7 +63,7 @@ def _either(condition: bool, a: Vec, b: Vec) -> Vec:
 
 
 @law
-def _parts(one: Vec) -> tuple[Vec, Vec]:
+def _offset_and_velocity(one: Vec) -> tuple[Vec, Vec]:
     """Return offset and velocity, 0 if there is no agent."""
     if len(one) == 5:
         return (one[1], one[2]), (one[3], one[4])
@@ -72,7 +72,7 @@ def _parts(one: Vec) -> tuple[Vec, Vec]:
 
 
 @law
-def nobody_yet(p: Any, me: Me) -> Vec:
+def no_agents(p: Any, me: Me) -> Vec:
     """Return the initial value: both infinitely far."""
     o = zero(me.pos)
     none = (like(me.radius, np.inf),) + o + o  # noqa: RUF005
@@ -82,23 +82,23 @@ def nobody_yet(p: Any, me: Me) -> Vec:
 @law
 def nearest_two(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
     """Keep the nearest of each group; if both are the same group, its two nearest."""
-    a, b = _halves(acc)
+    a, b = _two_agents(acc)
     it = (other.square,) + other.offset + other.vel  # noqa: RUF005
     in_a = (other.who >= p.first) & (other.who < p.end)
     in_b = (other.who >= p.other_first) & (other.who < p.other_end)
     nearer = in_a & (other.square < a[0])
-    left = _either(nearer, a, it)  # the one that is not kept as a: if both are one group, it is the candidate for b
-    return _either(nearer, it, a) + _either(in_b & (left[0] < b[0]), left, b)
+    left = _choose(nearer, a, it)  # the one that is not kept as a: if both are one group, it is the candidate for b
+    return _choose(nearer, it, a) + _choose(in_b & (left[0] < b[0]), left, b)
 
 
 @law
-def between(p: Any, me: Me, acc: Vec) -> Vec:
+def interpose_force(p: Any, me: Me, acc: Vec) -> Vec:
     """Return F = w S, 0 unless both are visible."""
-    a, b = _halves(acc)
+    a, b = _two_agents(acc)
     far = like(me.max_speed, np.inf)
     both = (a[0] < far) & (b[0] < far)
-    offset_a, velocity_a = _parts(a)
-    offset_b, velocity_b = _parts(b)
+    offset_a, velocity_a = _offset_and_velocity(a)
+    offset_b, velocity_b = _offset_and_velocity(b)
     top = top_speed(p, me)
     wish = steering.interpose(offset_a, velocity_a, offset_b, velocity_b, me.vel, p.share, top, p.slow_radius)
     return select(both, scale(wish, p.weight), zero(wish))
@@ -116,7 +116,7 @@ class Formation(AboutNearest, Moving):
     left: float = Field(default=0.0, description="m, to its left; negative = to its right")
     up: float = Field(default=0.0, description="m, above it, in 3-D")
     slow_radius: float = Field(gt=0, description="d_slow, m, distance within which it slows down")
-    finish_law: ClassVar[Law | None] = in_formation
+    finish_law: ClassVar[Law | None] = formation_force
     demo: ClassVar[str | None] = """
 groups:
   - count: 1
@@ -150,7 +150,7 @@ class FollowLeader(AboutNearest, Moving):
     ahead: float = Field(default=2.0, ge=0, description="m, length of the box in front of the leader")
     aside: float = Field(default=0.5, ge=0, description="m, half the width of the box")
     slow_radius: float = Field(gt=0, description="m, distance within which it slows down")
-    finish_law: ClassVar[Law | None] = following
+    finish_law: ClassVar[Law | None] = follow_leader_force
     demo: ClassVar[str | None] = """
 groups:
   - {count: 1, max_speed: 1, role: learner, spawn: {low: [-6, 0], high: [-6, 0], speed: [1, 1], heading: [1, 0]}}
@@ -179,9 +179,9 @@ class Interpose(Moving):
     fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
     share: float = Field(default=0.5, ge=0, le=1, description="share of the path from the first to the other")
     slow_radius: float = Field(gt=0, description="m, distance within which it slows down")
-    pair_start: ClassVar[Law | None] = nobody_yet
+    pair_start: ClassVar[Law | None] = no_agents
     pair_law: ClassVar[Law | None] = nearest_two
-    finish_law: ClassVar[Law | None] = between
+    finish_law: ClassVar[Law | None] = interpose_force
     demo: ClassVar[str | None] = """
 groups:
   - {count: 1, max_speed: 2, max_force: 10, role: learner, spawn: {low: [-4, -4], high: [-4, -4]}}

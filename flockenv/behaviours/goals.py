@@ -17,13 +17,13 @@ __all__ = ["Arrive", "Dock", "Face", "Flee", "Seek", "TargetSpeed"]
 
 
 @law
-def sought(p: Any, me: Me) -> Vec:
+def seek_force(p: Any, me: Me) -> Vec:
     """Return F = w (V unit(T - x) - v)."""
     return scale(steering.seek(sub(p.target, me.pos), me.vel, top_speed(p, me)), p.weight)
 
 
 @law
-def fled(p: Any, me: Me) -> Vec:
+def flee_force(p: Any, me: Me) -> Vec:
     """Return F = w (V unit(x - T) - v), 0 beyond the radius."""
     offset = sub(p.target, me.pos)
     away = scale(steering.flee(offset, me.vel, top_speed(p, me)), p.weight)
@@ -31,13 +31,13 @@ def fled(p: Any, me: Me) -> Vec:
 
 
 @law
-def arrived(p: Any, me: Me) -> Vec:
+def arrive_force(p: Any, me: Me) -> Vec:
     """Return F = w (V min(1, d / d_slow) unit(T - x) - v)."""
     return scale(steering.arrive(sub(p.target, me.pos), me.vel, top_speed(p, me), p.slow_radius), p.weight)
 
 
 @law
-def docked(p: Any, me: Me) -> Vec:
+def dock_force(p: Any, me: Me) -> Vec:
     """Return F = w S: through the gate, then along the axis."""
     offset = sub(p.target, me.pos)
     wish = steering.dock(offset, me.vel, p.direction, top_speed(p, me), p.gate, p.width, p.slow_radius)
@@ -45,13 +45,13 @@ def docked(p: Any, me: Me) -> Vec:
 
 
 @law
-def faced(p: Any, me: Me) -> Vec:
+def face_force(p: Any, me: Me) -> Vec:
     """Return F = w S, perpendicular to the velocity."""
     return scale(steering.face(me.vel, p.heading), p.weight)
 
 
 @law
-def at_speed(p: Any, me: Me) -> Vec:
+def target_speed_force(p: Any, me: Me) -> Vec:
     """Return F = w S, along the velocity."""
     return scale(steering.target_speed(me.vel, p.speed), p.weight)
 
@@ -73,7 +73,7 @@ class Seek(_ToTarget):
     """Head for a place at full speed: S = V unit(T - x) - v (Reynolds 1999's figure; its pseudo-code flees)."""
 
     kind: Literal["seek"] = "seek"
-    own_law: ClassVar[Law | None] = sought
+    own_law: ClassVar[Law | None] = seek_force
     demo: ClassVar[str | None] = """
 groups:
   - {count: 6, max_speed: 2, max_force: 4, spawn: {low: [-6, -5], high: [-4, 5], speed: [1, 2]}}
@@ -87,7 +87,7 @@ class Flee(_ToTarget):
 
     kind: Literal["flee"] = "flee"
     radius: float | None = Field(default=None, gt=0, description="m, beyond it the force is 0 (default: unlimited)")
-    own_law: ClassVar[Law | None] = fled
+    own_law: ClassVar[Law | None] = flee_force
     unlimited: ClassVar[tuple[str, ...]] = ("speed", "radius")
     demo: ClassVar[str | None] = """
 groups:
@@ -105,7 +105,7 @@ class Arrive(_ToTarget):
 
     kind: Literal["arrive"] = "arrive"
     slow_radius: float = Field(gt=0, description="d_slow, m, distance within which it slows down")
-    own_law: ClassVar[Law | None] = arrived
+    own_law: ClassVar[Law | None] = arrive_force
     demo: ClassVar[str | None] = """
 groups:
   - {count: 6, max_speed: 2, max_force: 4, spawn: {low: [-6, -5], high: [-4, 5], speed: [1, 2]}}
@@ -127,7 +127,7 @@ class Dock(_ToTarget):
     gate: float = Field(gt=0, description="m, distance of the gate before the place")
     width: float = Field(gt=0, description="m, distance from the axis within which it goes along it")
     slow_radius: float = Field(gt=0, description="m, distance within which it slows down")
-    own_law: ClassVar[Law | None] = docked
+    own_law: ClassVar[Law | None] = dock_force
     steepness: ClassVar[float] = 4.0  # it aims at the axis half-way to the place; up to 3.2 was measured
     demo: ClassVar[str | None] = """
 groups:
@@ -151,7 +151,7 @@ class Face(Behaviour):
 
     kind: Literal["face"] = "face"
     heading: Vector = Field(description="direction, of any length")
-    own_law: ClassVar[Law | None] = faced
+    own_law: ClassVar[Law | None] = face_force
     demo: ClassVar[str | None] = """
 groups:
   - {count: 7, max_speed: 2, spawn: {low: [-6, -5], high: [-4, 5], speed: [1, 2]}}
@@ -170,7 +170,7 @@ class TargetSpeed(Behaviour):
 
     kind: Literal["target_speed"] = "target_speed"
     speed: float = Field(ge=0, description="v_t, m/s")
-    own_law: ClassVar[Law | None] = at_speed
+    own_law: ClassVar[Law | None] = target_speed_force
     demo: ClassVar[str | None] = """
 groups:
   - {count: 7, spawn: {low: [-6, -5], high: [-4, 5], speed: [0.2, 2], heading: [1, 0]}}

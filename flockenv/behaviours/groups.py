@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockenv import steering
-from flockenv.behaviours.social import Social, size_of
+from flockenv.behaviours.social import Social, strength_of
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.approximations import exp
 from flockenv.maths.vectors import add, limit, norm, scale, select, sub, unit, zero
@@ -25,7 +25,7 @@ __all__ = ["Friends", "Interest", "WalkingGroup"]
 
 
 @law
-def faded(p: Any, time: float) -> float:
+def remaining_interest(p: Any, time: float) -> float:
     """Return the remaining share of an interest that began at `since`: exp(-(t - t0) / T), 0 before."""
     o = like(time, 0.0)
     age = time - p.since
@@ -33,9 +33,11 @@ def faded(p: Any, time: float) -> float:
 
 
 @law
-def drawn_there(p: Any, me: Me) -> Vec:
+def interest_force(p: Any, me: Me) -> Vec:
     """Return A exp(-d / B) exp(-(t - t0) / T) towards the place."""
-    pull = scale(steering.draw(sub(p.target, me.pos), p.decay), size_of(p, me) * faded(p, me.time))
+    pull = scale(
+        steering.attraction(sub(p.target, me.pos), p.decay), strength_of(p, me) * remaining_interest(p, me.time)
+    )
     near = norm(sub(p.target, me.pos)) < p.radius
     return select(near, pull, zero(me.pos))
 
@@ -58,7 +60,7 @@ class Interest(Effect):
     steering: ClassVar[bool] = True
     strengths: ClassVar[tuple[str, ...]] = ("strength", "acceleration")
     places: ClassVar[tuple[str, ...]] = ("target",)
-    own_law: ClassVar[Law | None] = drawn_there
+    own_law: ClassVar[Law | None] = interest_force
     demo: ClassVar[str | None] = """
 dt: 0.02
 groups: [{count: 5, mass: 80, radius: 0.25, desired_speed: 1.3, spawn: {low: [-6, -2], high: [-3, 2]}}]
@@ -79,15 +81,15 @@ effects:
 
 
 @law
-def drawn_together(p: Any, me: Me, other: Other) -> Vec:
+def friend_attraction(p: Any, me: Me, other: Other) -> Vec:
     """Return exp(-d / B) towards the neighbour, cut so that A times it is at most the bound."""
-    return limit(steering.draw(other.offset, p.decay), p.bound / size_of(p, me))
+    return limit(steering.attraction(other.offset, p.decay), p.bound / strength_of(p, me))
 
 
 @law
-def as_friends(p: Any, me: Me, sums: Vec) -> Vec:
+def friends_force(p: Any, me: Me, sums: Vec) -> Vec:
     """Return A exp(-(t - t0) / T) times the sum."""
-    return scale(sums, size_of(p, me) * faded(p, me.time))
+    return scale(sums, strength_of(p, me) * remaining_interest(p, me.time))
 
 
 class Friends(Social):
@@ -100,8 +102,8 @@ class Friends(Social):
     decay: float = Field(gt=0, description="B, m, over which the pull falls to 1/e")
     fades: float | None = Field(default=None, gt=0, description="T, s, in which interest falls to 1/e (default: never)")
     since: float = Field(default=0.0, ge=0, description="t0, s, when it begins")
-    pair_law: ClassVar[Law | None] = drawn_together
-    finish_law: ClassVar[Law | None] = as_friends
+    pair_law: ClassVar[Law | None] = friend_attraction
+    finish_law: ClassVar[Law | None] = friends_force
     demo: ClassVar[str | None] = """
 dt: 0.02
 groups:
@@ -135,7 +137,7 @@ def _party(p: Any, who: float) -> float:
 
 
 @law
-def of_the_party(p: Any, me: Me, other: Other) -> Vec:
+def party_sums(p: Any, me: Me, other: Other) -> Vec:
     """Return count 1, offset, and repulsion direction if too near, of a neighbour; 0 if it is of another party."""
     o, e = like(other.square, 0.0), like(other.square, 1.0)
     mine = _party(p, me.who) == _party(p, other.who)
@@ -147,7 +149,7 @@ def of_the_party(p: Any, me: Me, other: Other) -> Vec:
 
 
 @law
-def as_a_party(p: Any, me: Me, sums: Vec) -> Vec:
+def party_force(p: Any, me: Me, sums: Vec) -> Vec:
     """Return m (-beta1 alpha v + beta2 q_A U + beta3 sum q_R W)."""
     o, e = like(me.mass, 0.0), like(me.mass, 1.0)
     others = sums[0]
@@ -188,8 +190,8 @@ class WalkingGroup(Effect):
     steering: ClassVar[bool] = True
     always: ClassVar[bool] = False
     strengths: ClassVar[tuple[str, ...]] = ("gaze", "cohesion", "repulsion")
-    pair_law: ClassVar[Law | None] = of_the_party
-    finish_law: ClassVar[Law | None] = as_a_party
+    pair_law: ClassVar[Law | None] = party_sums
+    finish_law: ClassVar[Law | None] = party_force
     demo: ClassVar[str | None] = """
 dt: 0.02
 groups: [{count: 9, mass: 80, radius: 0.25, desired_speed: 1.2, spawn: {low: [-6, -4], high: [-3, 4]}}]

@@ -35,12 +35,12 @@ ENDLESS = 1e4
 
 
 @law
-def turned_by(way: Vec, cosine: float, sine: float) -> Vec:
+def turn_left(way: Vec, cosine: float, sine: float) -> Vec:
     """Return the vector turned to the left."""
     return (way[0] * cosine - way[1] * sine, way[0] * sine + way[1] * cosine)
 
 
-def nearer(
+def reduce_distances(
     found: Vec, way: Vec, aim: Vec, cosine: float, sine: float, offset: Vec, velocity: Vec, clearance: float,
     speed: float,
 ) -> Vec:  # fmt: skip
@@ -53,12 +53,12 @@ def nearer(
         ahead = way if k < DIRECTIONS else aim
         moving.append(steering.collision_distance(ahead, offset, velocity, clearance, speed))
         standing.append(steering.collision_distance(ahead, offset, still, clearance, one))
-        way = turned_by(way, cosine, sine)
+        way = turn_left(way, cosine, sine)
     return tuple(map(min, (*moving, *standing), found))
 
 
-@overload(nearer, jit_options=OPTIONS)
-def _nearer(found, way, aim, cosine, sine, offset, velocity, clearance, speed):  # type: ignore[no-untyped-def]
+@overload(reduce_distances, jit_options=OPTIONS)
+def _reduce_distances(found, way, aim, cosine, sine, offset, velocity, clearance, speed):  # type: ignore[no-untyped-def]
     """Return the function with its loop unrolled, for use of SIMD lanes."""
     count = DIRECTIONS + 1
     lines = [
@@ -77,56 +77,56 @@ def _nearer(found, way, aim, cosine, sine, offset, velocity, clearance, speed): 
             lines.append("    way = turned_by(way, cosine, sine)")
     lines.append(f"    return ({', '.join(f'{name}{k}' for name in 'ms' for k in range(count))})")
     made: dict[str, Any] = {
-        "zero": zero, "like": like, "turned_by": turned_by, "distance": steering.collision_distance
+        "zero": zero, "like": like, "turned_by": turn_left, "distance": steering.collision_distance
     }  # fmt: skip
     exec("\n".join(lines), made)  # noqa: S102  # the number of directions is a constant
     return made["all_ways"]
 
 
-def unseen(far: float) -> Vec:
+def infinite_distances(far: float) -> Vec:
     """Return the initial distances, all infinite."""
     return (far,) * (2 * DIRECTIONS + 2)
 
 
-@overload(unseen, jit_options=OPTIONS)
-def _unseen(far):  # type: ignore[no-untyped-def]
+@overload(infinite_distances, jit_options=OPTIONS)
+def _infinite_distances(far):  # type: ignore[no-untyped-def]
     made: dict[str, Any] = {}
     exec(f"def none(far):\n    return ({'far, ' * (2 * DIRECTIONS + 2)})", made)  # noqa: S102
     return made["none"]
 
 
 @law
-def all_free(p: Any, me: Me) -> Vec:
+def initial_distances(p: Any, me: Me) -> Vec:
     """Return the initial distances: all directions are free."""
-    return unseen(like(me.radius, np.inf))
+    return infinite_distances(like(me.radius, np.inf))
 
 
 @law
-def _view(p: Any, me: Me) -> tuple[Vec, Vec]:
+def _first_direction_and_aim(p: Any, me: Me) -> tuple[Vec, Vec]:
     """Return the rightmost direction of its field of view, and its aim; an agent at rest faces its aim."""
     aim = unit(me.aim)
     moves = dot(me.heading, me.heading) > like(me.radius, 0.0)
-    return turned_by(select(moves, me.heading, aim), p.edge_cosine, -p.edge_sine), aim
+    return turn_left(select(moves, me.heading, aim), p.edge_cosine, -p.edge_sine), aim
 
 
 @law
-def in_the_way(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
+def reduce_by_agent(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
     """Reduce the free distances by one more agent."""
-    way, aim = _view(p, me)
+    way, aim = _first_direction_and_aim(p, me)
     room = me.radius + other.radius
-    return nearer(acc, way, aim, p.cosine, p.sine, other.offset, other.vel, room, me.desired_speed)
+    return reduce_distances(acc, way, aim, p.cosine, p.sine, other.offset, other.vel, room, me.desired_speed)
 
 
 @law
-def round_in_the_way(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
+def reduce_by_obstacle(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
     """Reduce the free distances by a round obstacle, which is at rest."""
-    way, aim = _view(p, me)
+    way, aim = _first_direction_and_aim(p, me)
     room = me.radius + other.radius
-    return nearer(acc, way, aim, p.cosine, p.sine, other.offset, zero(me.vel), room, me.desired_speed)
+    return reduce_distances(acc, way, aim, p.cosine, p.sine, other.offset, zero(me.vel), room, me.desired_speed)
 
 
 @law
-def until_a_wall(p: Any, me: Me, way: Vec, reach: float) -> float:
+def wall_distance(p: Any, me: Me, way: Vec, reach: float) -> float:
     """Return how far its body goes until it touches a straight side, m; inf if that is further than `reach`.
 
     A side that it touches already does not block directions that lead off it.
@@ -151,12 +151,12 @@ def until_a_wall(p: Any, me: Me, way: Vec, reach: float) -> float:
 
 
 @law
-def chosen_way(p: Any, me: Me, acc: Vec) -> Vec:
+def heuristics_force(p: Any, me: Me, acc: Vec) -> Vec:
     """Return F = m (v_des e(alpha) - v) / tau, alpha that of least d(alpha); of two equal ones, the right one."""
     free = tuple_as_array(acc)
     count = DIRECTIONS + 1
     e, o = like(me.radius, 1.0), like(me.radius, 0.0)
-    way, aim = _view(p, me)
+    way, aim = _first_direction_and_aim(p, me)
     eager = norm(me.aim)
     moves = dot(me.heading, me.heading) > o
     sees = (dot(me.heading, aim) >= p.edge_cosine) | (not moves)
@@ -165,14 +165,14 @@ def chosen_way(p: Any, me: Me, acc: Vec) -> Vec:
         k = DIRECTIONS if j == 0 else j - 1  # the aim first: it wins against equal directions
         u = aim if j == 0 else way
         if (k < DIRECTIONS) | sees:
-            wall = until_a_wall(p, me, u, p.radius)
+            wall = wall_distance(p, me, u, p.radius)
             f = min(min(free[k], wall), p.radius)
             d = p.radius * p.radius + f * f - (f + f) * p.radius * dot(aim, u)
             better = d < best - like(d, 1e-6) * p.radius * p.radius  # a difference by rounding is a tie
             best, chosen = d if better else best, select(better, u, chosen)
             ahead = min(free[count + k], wall) if better else ahead
         if j > 0:
-            way = turned_by(way, p.cosine, p.sine)
+            way = turn_left(way, p.cosine, p.sine)
     speed = min(me.desired_speed * min(eager, e), ahead / p.tau)
     return scale(sub(scale(chosen, speed), me.vel), p.weight * me.mass / p.tau)
 
@@ -198,10 +198,10 @@ class Heuristics(Effect):
     group: int | None = Field(default=None, ge=0, description="group that it sees (default: all)")
     steering: ClassVar[bool] = True
     tabled: ClassVar[bool] = True
-    pair_start: ClassVar[Law | None] = all_free
-    pair_law: ClassVar[Law | None] = in_the_way
-    obstacle_law: ClassVar[Law | None] = round_in_the_way
-    finish_law: ClassVar[Law | None] = chosen_way
+    pair_start: ClassVar[Law | None] = initial_distances
+    pair_law: ClassVar[Law | None] = reduce_by_agent
+    obstacle_law: ClassVar[Law | None] = reduce_by_obstacle
+    finish_law: ClassVar[Law | None] = heuristics_force
     demo: ClassVar[str | None] = """
 dt: 0.005
 groups:
@@ -237,7 +237,7 @@ effects:
     def table(self, scene: SceneView) -> Floats:
         """Return the edges of a torus, and every straight side."""
         size = scene.space.extent(2) if scene.space.periodic else (0.0, 0.0)
-        sides = [side for shape in scene.shapes for side in _sides(shape)]
+        sides = [side for shape in scene.shapes for side in _straight_sides(shape)]
         return np.array([*size, *(number for side in sides for number in side)])
 
     def check(self, scene: SceneView) -> None:
@@ -270,7 +270,7 @@ effects:
         return np.zeros(n), np.full(n, self.weight / self.tau)
 
 
-def _sides(shape: Any) -> list[list[float]]:
+def _straight_sides(shape: Any) -> list[list[float]]:
     """Return the straight sides of an obstacle, (5,) m each: both ends, and half the thickness."""
     if shape.kind in ("wall", "capsule"):
         corners, around = shape.corners

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from flockenv import steering
-from flockenv.behaviours.behaviour import AboutNearest, Moving, seen_one, top_speed
+from flockenv.behaviours.behaviour import AboutNearest, Moving, mean_nearest, top_speed
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import add, dot, norm, scale, select, zero
 from flockenv.physics.effects.effect import Me, Other
@@ -17,9 +17,9 @@ __all__ = ["Hide"]
 
 
 @law
-def seeker(p: Any, me: Me, sums: Vec) -> Vec:
+def seeker_offset(p: Any, me: Me, sums: Vec) -> Vec:
     """Return the offset of the seeker's predicted position, m; 0 if there is no seeker."""
-    offset, velocity, some = seen_one(sums)
+    offset, velocity, some = mean_nearest(sums)
     time = steering.approach_time(offset, norm(velocity), p.longest)
     return select(some, add(offset, scale(velocity, time)), zero(offset))
 
@@ -31,7 +31,7 @@ def no_place(p: Any, me: Me, threat: Vec) -> Vec:
 
 
 @law
-def _places(acc: Vec) -> tuple[Vec, Vec]:
+def _place_and_threat(acc: Vec) -> tuple[Vec, Vec]:
     """Return the offsets of the nearest hiding place and of the seeker."""
     if len(acc) == 5:
         return (acc[1], acc[2]), (acc[3], acc[4])
@@ -42,7 +42,7 @@ def _places(acc: Vec) -> tuple[Vec, Vec]:
 @law
 def nearest_place(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
     """Keep the nearest hiding place behind an obstacle."""
-    goal, threat = _places(acc)
+    goal, threat = _place_and_threat(acc)
     place = steering.hiding_place(other.offset, other.radius, me.radius + p.margin, threat)
     square = dot(place, place)
     nearer = (square < acc[0]) & (other.radius > like(square, 0.0))  # round obstacles only
@@ -50,9 +50,9 @@ def nearest_place(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
 
 
 @law
-def hidden(p: Any, me: Me, acc: Vec) -> Vec:
+def hide_force(p: Any, me: Me, acc: Vec) -> Vec:
     """Return F = w S: arrive at the place; flee if there is none; 0 without a seeker."""
-    goal, threat = _places(acc)
+    goal, threat = _place_and_threat(acc)
     top, o = top_speed(p, me), like(me.radius, 0.0)
     there = steering.arrive(goal, me.vel, top, p.slow_radius)
     wish = select(acc[0] < like(o, np.inf), there, steering.flee(threat, me.vel, top))
@@ -70,10 +70,10 @@ class Hide(AboutNearest, Moving):
     margin: float = Field(default=0.5, ge=0, description="m, gap between an obstacle and the hidden agent")
     slow_radius: float = Field(gt=0, description="m, distance from the place within which it slows down")
     longest: float = Field(default=0.5, ge=0, description="s, longest prediction of the seeker")
-    finish_law: ClassVar[Law | None] = seeker
+    finish_law: ClassVar[Law | None] = seeker_offset
     obstacle_start: ClassVar[Law | None] = no_place
     obstacle_law: ClassVar[Law | None] = nearest_place
-    obstacle_finish: ClassVar[Law | None] = hidden
+    obstacle_finish: ClassVar[Law | None] = hide_force
     demo: ClassVar[str | None] = """
 groups:
   - {count: 4, max_speed: 2, max_force: 10, role: evader, spawn: {low: [-2, -6], high: [2, -4]}}

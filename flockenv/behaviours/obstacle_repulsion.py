@@ -19,13 +19,13 @@ __all__ = ["ObstacleRepulsion"]
 
 
 @law
-def nowhere(p: Any, me: Me) -> Vec:
+def zero_force(p: Any, me: Me) -> Vec:
     """Return the initial force, zero."""
     return zero(me.pos)
 
 
 @law
-def pushed_off(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
+def add_repulsion(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
     """Add A exp((r_i - d) / B) n, within range."""
     force = (p.strength + me.mass * p.acceleration) * exp((p.bodies * me.radius - other.gap) / p.decay)
     force = force if force < p.bound else p.bound
@@ -33,13 +33,13 @@ def pushed_off(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
 
 
 @law
-def within(p: Any, me: Me) -> float:
+def repulsion_reach(p: Any, me: Me) -> float:
     """Return its range, m."""
     return p.radius  # type: ignore[no-any-return]
 
 
 @law
-def all_sides(p: Any, me: Me, acc: Vec) -> Vec:
+def total_repulsion(p: Any, me: Me, acc: Vec) -> Vec:
     """Return the sum."""
     return acc
 
@@ -62,10 +62,10 @@ class ObstacleRepulsion(Push):
     radius: float = Field(default=3.0, gt=0, description="m from its centre, range within which walls act")
     occluded: bool = Field(default=False, description="True if obstacles hide the sides of others")
     obstacle_pieces: ClassVar[bool] = True
-    obstacle_start: ClassVar[Law | None] = nowhere
-    obstacle_law: ClassVar[Law | None] = pushed_off
-    obstacle_finish: ClassVar[Law | None] = all_sides
-    obstacle_reach: ClassVar[Law | None] = within
+    obstacle_start: ClassVar[Law | None] = zero_force
+    obstacle_law: ClassVar[Law | None] = add_repulsion
+    obstacle_finish: ClassVar[Law | None] = total_repulsion
+    obstacle_reach: ClassVar[Law | None] = repulsion_reach
     demo: ClassVar[str | None] = """
 dt: 0.02
 groups:

@@ -19,23 +19,23 @@ from flockenv.steering import orca
 __all__ = ["Orca"]
 
 
-def kept(slots: Vec, new: Vec) -> Vec:
+def with_inserted(slots: Vec, new: Vec) -> Vec:
     """Return the slots with a new one inserted by its power distance, |offset|^2 - radius^2; the last is dropped."""
     size = len(new)
     listed: Vec = ()
     for k in range(0, len(slots), size):
         old = slots[k : k + size]
-        near, far = (new, old) if _power(new) < _power(old) else (old, new)
+        near, far = (new, old) if _power_distance(new) < _power_distance(old) else (old, new)
         listed, new = (*listed, *near), far
     return listed
 
 
-def _power(slot: Vec) -> float:
+def _power_distance(slot: Vec) -> float:
     return slot[0] * slot[0] + slot[1] * slot[1] - slot[4] * slot[4]
 
 
-@overload(kept, jit_options=OPTIONS)
-def _kept(slots, new):  # type: ignore[no-untyped-def]  # numba compares signatures, annotations included
+@overload(with_inserted, jit_options=OPTIONS)
+def _with_inserted(slots, new):  # type: ignore[no-untyped-def]  # numba compares signatures, annotations included
     """Return the function unrolled for the number of slots, with selects instead of branches, for SIMD lanes."""
     size, lines = len(new), ["def sort_in(slots, new):"]
     held = [f"c{j}" for j in range(size)]
@@ -56,7 +56,7 @@ def _kept(slots, new):  # type: ignore[no-untyped-def]  # numba compares signatu
 
 
 @law
-def nobody(p: Any, me: Me) -> Vec:
+def no_neighbours(p: Any, me: Me) -> Vec:
     """Return six empty slots."""
     far, o, e = like(me.radius, np.inf), like(me.radius, 0.0), like(me.radius, 1.0)
     empty = (far, far, o, o, -e, o)
@@ -64,22 +64,22 @@ def nobody(p: Any, me: Me) -> Vec:
 
 
 @law
-def near_agent(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
+def insert_agent(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
     """Keep an agent if it is among the nearest; one in the same place is moved a little to one side."""
     one_place = other.square <= like(other.square, 1e-12)
     to = select(one_place, scale(sub(me.tie, other.tie), like(other.square, -1e-6)), other.offset)
-    return kept(acc, (to[0], to[1], other.vel[0], other.vel[1], other.radius, like(other.square, 0.5)))
+    return with_inserted(acc, (to[0], to[1], other.vel[0], other.vel[1], other.radius, like(other.square, 0.5)))
 
 
 @law
-def near_obstacle(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
+def insert_obstacle(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
     """Keep an obstacle if it is among the nearest: it does not give way."""
     o = like(other.square, 0.0)
-    return kept(acc, (other.offset[0], other.offset[1], o, o, other.radius, like(other.square, 1.0)))
+    return with_inserted(acc, (other.offset[0], other.offset[1], o, o, other.radius, like(other.square, 1.0)))
 
 
 @law
-def reciprocal(p: Any, me: Me, acc: Vec) -> Vec:
+def orca_force(p: Any, me: Me, acc: Vec) -> Vec:
     """Return F = w (v_orca - v), with arrival as the preferred velocity."""
     speed = top_speed(p, me)
     wish = steering.arrive(sub(p.target, me.pos), zero(me.vel), speed, p.slow_radius)
@@ -111,10 +111,10 @@ class Orca(Moving):
     )
     group: int | None = Field(default=None, ge=0, description="group that it avoids (default: all)")
     places: ClassVar[tuple[str, ...]] = ("target",)
-    pair_start: ClassVar[Law | None] = nobody
-    pair_law: ClassVar[Law | None] = near_agent
-    obstacle_law: ClassVar[Law | None] = near_obstacle
-    finish_law: ClassVar[Law | None] = reciprocal
+    pair_start: ClassVar[Law | None] = no_neighbours
+    pair_law: ClassVar[Law | None] = insert_agent
+    obstacle_law: ClassVar[Law | None] = insert_obstacle
+    finish_law: ClassVar[Law | None] = orca_force
     demo: ClassVar[str | None] = """
 dt: 0.05
 obstacles: [{centre: [0, 0], radius: 0.6}]

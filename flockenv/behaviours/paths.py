@@ -34,7 +34,7 @@ MOST_PLACES = 500
 
 
 @law
-def _offset(found: Vec) -> Vec:
+def _offset_part(found: Vec) -> Vec:
     """Return the offset part of a result of `polyline.nearest`."""
     if len(found) == 3:
         return (found[1], found[2])
@@ -43,7 +43,7 @@ def _offset(found: Vec) -> Vec:
 
 
 @law
-def path_followed(p: Any, me: Me) -> Vec:
+def follow_path_force(p: Any, me: Me) -> Vec:
     """Return F = w S of following the path."""
     top = top_speed(p, me)
     o, way = like(top, 0.0), like(top, p.way)
@@ -52,7 +52,7 @@ def path_followed(p: Any, me: Me) -> Vec:
     gained = way * polyline.arc_difference(p.table, now[0], then[0]) - p.keep * top * p.time
     ahead = p.time * max(norm(me.vel), like(top, SLOWEST) * top)
     target = polyline.spine(p.table, me.pos, now[0] + way * ahead)
-    wish = steering.follow_path(norm(_offset(then)) - p.radius, gained, target, me.vel, top)
+    wish = steering.follow_path(norm(_offset_part(then)) - p.radius, gained, target, me.vel, top)
     slow = max(p.slow_radius, like(top, 1e-9))
     end = polyline.spine(p.table, me.pos, p.table[1] if way > o else o)
     arriving = polyline.distance_to_end(p.table, now[0], way) < p.slow_radius
@@ -60,17 +60,17 @@ def path_followed(p: Any, me: Me) -> Vec:
 
 
 @law
-def path_kept(p: Any, me: Me) -> Vec:
+def stay_on_path_force(p: Any, me: Me) -> Vec:
     """Return F = w S of staying on the path."""
     step = scale(me.vel, p.time)
-    to_spine = _offset(polyline.nearest(p.table, add(me.pos, step)))
+    to_spine = _offset_part(polyline.nearest(p.table, add(me.pos, step)))
     beyond = norm(to_spine) - p.radius
     wish = steering.stay_on_path(beyond, add(step, to_spine), me.vel, top_speed(p, me))
     return scale(wish, p.weight)
 
 
 @law
-def _middle(table: Any, x: Vec) -> Vec:
+def _grid_centre(table: Any, x: Vec) -> Vec:
     """Return the centre of a grid."""
     d = len(x)
     half = like(x[0], 0.5) * table[d]
@@ -83,10 +83,10 @@ def _middle(table: Any, x: Vec) -> Vec:
 
 
 @law
-def flow_followed(p: Any, me: Me) -> Vec:
+def follow_flow_force(p: Any, me: Me) -> Vec:
     """Return F = w (u - v), 0 outside the grid."""
     there = add(me.pos, scale(me.vel, p.time))
-    at = add(sub(there, p.centre), _middle(p.table, there))  # on a torus p.centre is the nearest image
+    at = add(sub(there, p.centre), _grid_centre(p.table, there))  # on a torus p.centre is the nearest image
     wish = steering.follow_flow(grid.sample_vector(p.table, at, 0), me.vel)
     return scale(select(grid.covers(p.table, at), wish, zero(me.vel)), p.weight)
 
@@ -154,7 +154,7 @@ class FollowPath(_OnPath):
     slow_radius: float = Field(
         default=0.0, ge=0, description="m, distance from the end of an open path at which it brakes"
     )
-    own_law: ClassVar[Law | None] = path_followed
+    own_law: ClassVar[Law | None] = follow_path_force
     demo: ClassVar[str | None] = """
 groups:
   - {count: 5, max_speed: 2, max_force: 6, spawn: {low: [3, 0], high: [9, 3], speed: [0.5, 1.5]}}
@@ -189,7 +189,7 @@ class StayOnPath(_OnPath):
     """Stay in a path's tube, in either direction: seek the nearest spine if the position after `time` s is outside."""
 
     kind: Literal["stay_on_path"] = "stay_on_path"
-    own_law: ClassVar[Law | None] = path_kept
+    own_law: ClassVar[Law | None] = stay_on_path_force
     demo: ClassVar[str | None] = """
 groups:
   - {count: 12, max_speed: 2, max_force: 6, spawn: {low: [2, 2], high: [10, 6], speed: [1, 2]}}
@@ -214,7 +214,7 @@ class FollowFlow(Behaviour):
     tabled: ClassVar[bool] = True
     places: ClassVar[tuple[str, ...]] = ("centre",)
     heads_for: ClassVar[bool] = False
-    own_law: ClassVar[Law | None] = flow_followed
+    own_law: ClassVar[Law | None] = follow_flow_force
     demo: ClassVar[str | None] = """
 groups:
   - {count: 15, max_speed: 2, max_force: 4, spawn: {low: [1, 1], high: [9, 9]}}

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field
 
 from flockenv import steering
-from flockenv.behaviours.behaviour import AboutNearest, Moving, seen_one, top_speed
+from flockenv.behaviours.behaviour import AboutNearest, Moving, mean_nearest, top_speed
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import norm, scale, select, zero
 from flockenv.physics.effects.effect import Me
@@ -18,7 +18,7 @@ PREDICTORS = ("distance", "opensteer", "exact")
 
 
 @law
-def chosen(p: Any, distance: float, table: float, exact: float) -> float:
+def prediction_time(p: Any, distance: float, table: float, exact: float) -> float:
     """Return the prediction time of the selected predictor, s, at most p.longest."""
     e = like(distance, 1.0)
     time = distance if p.method < e else (table if p.method < e + e else exact)
@@ -26,65 +26,67 @@ def chosen(p: Any, distance: float, table: float, exact: float) -> float:
 
 
 @law
-def to_meet(p: Any, me: Me, offset: Vec, velocity: Vec) -> float:
+def pursuer_time(p: Any, me: Me, offset: Vec, velocity: Vec) -> float:
     """Return the prediction time of a pursuer, s."""
     top = top_speed(p, me)
     distance = steering.distance_time(offset, top, p.factor)
     table = steering.opensteer_time(offset, me.vel, velocity, p.longest)
-    return chosen(p, distance, table, steering.interception_time(offset, velocity, top))
+    return prediction_time(p, distance, table, steering.interception_time(offset, velocity, top))
 
 
 @law
-def until_met(p: Any, me: Me, offset: Vec, velocity: Vec) -> float:
+def evader_time(p: Any, me: Me, offset: Vec, velocity: Vec) -> float:
     """Return the prediction time of an evader, s: "exact" is when the pursuer at its speed can intercept it."""
     top, theirs = top_speed(p, me), norm(velocity)
     distance = steering.distance_time(offset, top, p.factor)
     table = steering.approach_time(offset, theirs, p.longest)
     least = like(top, 1e-6) * top  # a pursuer at rest has no such time
     back = scale(offset, like(top, -1.0))
-    return chosen(p, distance, table, steering.interception_time(back, me.vel, theirs if theirs > least else least))
+    return prediction_time(
+        p, distance, table, steering.interception_time(back, me.vel, theirs if theirs > least else least)
+    )
 
 
 @law
-def pursued(p: Any, me: Me, sums: Vec) -> Vec:
+def pursue_force(p: Any, me: Me, sums: Vec) -> Vec:
     """Return F = w (V unit(x_q + v_q T - x) - v)."""
-    offset, velocity, some = seen_one(sums)
-    time = to_meet(p, me, offset, velocity)
+    offset, velocity, some = mean_nearest(sums)
+    time = pursuer_time(p, me, offset, velocity)
     wish = steering.pursue(offset, me.vel, velocity, top_speed(p, me), time)
     return select(some, scale(wish, p.weight), zero(wish))
 
 
 @law
-def evaded(p: Any, me: Me, sums: Vec) -> Vec:
+def evade_force(p: Any, me: Me, sums: Vec) -> Vec:
     """Return F = w (V unit(x - x_p - v_p T) - v)."""
-    offset, velocity, some = seen_one(sums)
-    time = until_met(p, me, offset, velocity)
+    offset, velocity, some = mean_nearest(sums)
+    time = evader_time(p, me, offset, velocity)
     wish = steering.evade(offset, me.vel, velocity, top_speed(p, me), time)
     return select(some, scale(wish, p.weight), zero(wish))
 
 
 @law
-def passed(p: Any, me: Me, sums: Vec) -> Vec:
+def offset_pursue_force(p: Any, me: Me, sums: Vec) -> Vec:
     """Return F = w S: pursue a point beside the quarry."""
-    offset, velocity, some = seen_one(sums)
-    time = to_meet(p, me, steering.passing_point(offset, me.vel, p.distance), velocity)
+    offset, velocity, some = mean_nearest(sums)
+    time = pursuer_time(p, me, steering.passing_point(offset, me.vel, p.distance), velocity)
     wish = steering.offset_pursue(offset, me.vel, velocity, top_speed(p, me), p.distance, time)
     return select(some, scale(wish, p.weight), zero(wish))
 
 
 @law
-def shadowed(p: Any, me: Me, sums: Vec) -> Vec:
+def shadow_force(p: Any, me: Me, sums: Vec) -> Vec:
     """Return F = w S: pursue from afar, match velocity near by."""
-    offset, velocity, some = seen_one(sums)
-    time = to_meet(p, me, offset, velocity)
+    offset, velocity, some = mean_nearest(sums)
+    time = pursuer_time(p, me, offset, velocity)
     wish = steering.shadow(offset, me.vel, velocity, top_speed(p, me), p.distance, p.band, time)
     return select(some, scale(wish, p.weight), zero(wish))
 
 
 @law
-def matched(p: Any, me: Me, sums: Vec) -> Vec:
+def match_velocity_force(p: Any, me: Me, sums: Vec) -> Vec:
     """Return F = w (v_j - v)."""
-    _, velocity, some = seen_one(sums)
+    _, velocity, some = mean_nearest(sums)
     return select(some, scale(steering.match_velocity(me.vel, velocity), p.weight), zero(velocity))
 
 
@@ -111,7 +113,7 @@ class Pursue(Predicting):
     """
 
     kind: Literal["pursue"] = "pursue"
-    finish_law: ClassVar[Law | None] = pursued
+    finish_law: ClassVar[Law | None] = pursue_force
     demo: ClassVar[str | None] = """
 groups:
   - {count: 4, max_speed: 2, max_force: 10, role: pursuer, spawn: {low: [-6, -5], high: [-5, -1]}}
@@ -133,7 +135,7 @@ class Evade(Predicting):
     predictor: Literal["distance", "opensteer", "exact"] = Field(
         default="opensteer", description="prediction time: factor d / V, d / |v_p|, or time to interception"
     )
-    finish_law: ClassVar[Law | None] = evaded
+    finish_law: ClassVar[Law | None] = evade_force
     demo: ClassVar[str | None] = """
 groups:
   - {count: 1, max_speed: 1.5, max_force: 4, role: pursuer, spawn: {low: [-6, 0], high: [-6, 0], speed: [1, 1]}}
@@ -149,7 +151,7 @@ class OffsetPursue(Predicting):
 
     kind: Literal["offset_pursue"] = "offset_pursue"
     distance: float = Field(ge=0, description="m, at which it passes")
-    finish_law: ClassVar[Law | None] = passed
+    finish_law: ClassVar[Law | None] = offset_pursue_force
     demo: ClassVar[str | None] = """
 groups:
   - count: 6
@@ -174,7 +176,7 @@ class Shadow(Predicting):
     kind: Literal["shadow"] = "shadow"
     distance: float = Field(ge=0, description="m, within which it only matches speed and heading")
     band: float = Field(default=1.0, gt=0, description="m, width beyond `distance` over which pursuit grows")
-    finish_law: ClassVar[Law | None] = shadowed
+    finish_law: ClassVar[Law | None] = shadow_force
     copies: ClassVar[bool] = True
     demo: ClassVar[str | None] = """
 groups:
@@ -195,7 +197,7 @@ class MatchVelocity(AboutNearest):
     """Match the velocity of the nearest of a group: S = v_j - v (Reynolds 1987)."""
 
     kind: Literal["match_velocity"] = "match_velocity"
-    finish_law: ClassVar[Law | None] = matched
+    finish_law: ClassVar[Law | None] = match_velocity_force
     copies: ClassVar[bool] = True
     demo: ClassVar[str | None] = """
 groups:

@@ -18,11 +18,11 @@ __all__ = ["Shepherd"]
 
 
 @law
-def shepherded(p: Any, me: Me, flock: Members) -> Vec:
+def shepherd_force(p: Any, me: Me, flock: Members) -> Vec:
     """Return F = w S: arrive behind the stray member, or else behind the whole group; 0 without members."""
     n, o = flock.size, like(flock.size, 0.0)
     together, driving = p.spacing * np.cbrt(n * n), p.spacing * np.sqrt(n)
-    place = steering.herd_from(flock.centre, flock.farthest, sub(p.goal, me.pos), together, p.spacing, driving)
+    place = steering.herding_offset(flock.centre, flock.farthest, sub(p.goal, me.pos), together, p.spacing, driving)
     wish = scale(steering.arrive(place, me.vel, top_speed(p, me), p.slow_radius), p.weight)
     return select(n > o, wish, zero(me.pos))
 
@@ -41,7 +41,7 @@ class Shepherd(Moving):
     goal: Vector = Field(description="m, place to which it drives the group")
     spacing: float = Field(gt=0, description="r_a, m, spacing of the members")
     slow_radius: float = Field(gt=0, description="m, distance from its target within which it slows down")
-    group_law: ClassVar[Law | None] = shepherded
+    group_law: ClassVar[Law | None] = shepherd_force
     places: ClassVar[tuple[str, ...]] = ("goal",)
     demo: ClassVar[str | None] = """
 groups:

@@ -40,13 +40,13 @@ effects:
 
 
 @law
-def as_felt(p: Any, me: Me, sums: Vec) -> Vec:
+def total_force(p: Any, me: Me, sums: Vec) -> Vec:
     """Return the sum over all visible neighbours."""
     return sums
 
 
 @law
-def size_of(p: Any, me: Me) -> float:
+def strength_of(p: Any, me: Me) -> float:
     """Return A of this agent, N."""
     return p.strength + me.mass * p.acceleration  # type: ignore[no-any-return]
 
@@ -57,7 +57,7 @@ class Social(Push):
     radius: float = Field(gt=0, description="m, range within which neighbours count")
     group: int | None = Field(default=None, ge=0, description="group that it interacts with (default: all)")
     occluded: bool = Field(default=False, description="True if obstacles hide neighbours")
-    finish_law: ClassVar[Law | None] = as_felt
+    finish_law: ClassVar[Law | None] = total_force
 
     @property
     def sight(self) -> Sight:
@@ -89,16 +89,16 @@ class Social(Push):
 
 
 @law
-def pushed_by_distance(p: Any, me: Me, other: Other) -> Vec:
+def circular_pair(p: Any, me: Me, other: Other) -> Vec:
     """Return f n and the distinct entries of f n n^T: f = A exp((r_ij - d) / B), n away from the neighbour."""
-    n, distance = social.apart(other.offset, sub(me.tie, other.tie))
-    force = size_of(p, me) * exp((p.bodies * (me.radius + other.radius) - distance) * p.slope)
+    n, distance = social.unit_away(other.offset, sub(me.tie, other.tie))
+    force = strength_of(p, me) * exp((p.bodies * (me.radius + other.radius) - distance) * p.slope)
     force = force if force < p.bound else p.bound
-    return _products(n, force)
+    return _force_products(n, force)
 
 
 @law
-def _products(n: Vec, force: float) -> Vec:
+def _force_products(n: Vec, force: float) -> Vec:
     f = scale(n, force)
     if len(n) == 2:
         return (f[0], f[1], f[0] * n[0], f[0] * n[1], f[1] * n[1])
@@ -107,10 +107,10 @@ def _products(n: Vec, force: float) -> Vec:
 
 
 @law
-def weighed_by_view(p: Any, me: Me, sums: Vec) -> Vec:
+def circular_force(p: Any, me: Me, sums: Vec) -> Vec:
     """Return the sum of w f n; w = lambda + (1 - lambda)(1 - n . e) / 2 is linear in n, so it follows from the sums."""
     e, half = like(me.mass, 1.0), like(me.mass, 0.5)
-    way = unit(steering.looking(me.aim, me.heading))
+    way = unit(steering.gaze_direction(me.aim, me.heading))
     push: Vec
     along: Vec
     if len(sums) == 5:
@@ -140,8 +140,8 @@ class CircularRepulsion(Social):
     decay: float = Field(gt=0, description="B, m, over which the force falls to 1/e")
     bodies: bool = Field(default=True, description="True: distance between surfaces; False: between centres")
     anisotropy: float = Field(default=1.0, ge=0, le=1, description="lambda, weight of neighbours straight behind")
-    pair_law: ClassVar[Law | None] = pushed_by_distance
-    finish_law: ClassVar[Law | None] = weighed_by_view
+    pair_law: ClassVar[Law | None] = circular_pair
+    finish_law: ClassVar[Law | None] = circular_force
     demo: ClassVar[str | None] = HEAD_ON.replace(
         "FORCE", "{kind: circular_repulsion, strength: 2000, decay: 0.08, radius: 3}"
     )
@@ -167,13 +167,13 @@ class CircularRepulsion(Social):
 
 
 @law
-def pushed_by_ellipse(p: Any, me: Me, other: Other) -> Vec:
+def elliptical_pair(p: Any, me: Me, other: Other) -> Vec:
     """Return A w (-B grad exp(-b / B))."""
     step = scale(sub(other.vel, scale(me.vel, p.relative)), p.step)
-    out, size = social.off_ellipse(other.offset, step, sub(me.tie, other.tie), p.decay)
-    way = steering.looking(me.aim, me.heading)
-    weight = steering.view_weight(way, other.offset, p.anisotropy) * steering.in_cone(way, out, p.edge, p.outside)
-    force = size * size_of(p, me)
+    out, size = social.elliptical_direction(other.offset, step, sub(me.tie, other.tie), p.decay)
+    way = steering.gaze_direction(me.aim, me.heading)
+    weight = steering.view_weight(way, other.offset, p.anisotropy) * steering.cone_weight(way, out, p.edge, p.outside)
+    force = size * strength_of(p, me)
     return scale(out, weight * (force if force < p.bound else p.bound))
 
 
@@ -194,7 +194,7 @@ class EllipticalRepulsion(Social):
     anisotropy: float = Field(default=1.0, ge=0, le=1, description="lambda, weight of neighbours straight behind")
     fov: float = Field(default=360.0, gt=0, le=360, description="degrees, 2 phi, full angle of the field of view")
     outside: float = Field(default=1.0, ge=0, le=1, description="c, weight of forces from outside the field of view")
-    pair_law: ClassVar[Law | None] = pushed_by_ellipse
+    pair_law: ClassVar[Law | None] = elliptical_pair
     demo: ClassVar[str | None] = HEAD_ON.replace(
         "FORCE", "{kind: elliptical_repulsion, acceleration: 7, decay: 0.3, step: 2, fov: 200, outside: 0.5, radius: 5}"
     )
@@ -216,12 +216,12 @@ class EllipticalRepulsion(Social):
 
 
 @law
-def stepped_aside(p: Any, me: Me, other: Other) -> Vec:
+def sidestep_pair(p: Any, me: Me, other: Other) -> Vec:
     """Return A (f_t t + f_n n)."""
     wish = steering.sidestep(
         other.offset, me.vel, other.vel, sub(other.tie, me.tie), p.importance, p.gamma, p.angular, p.forward, p.bias
     )
-    return limit(scale(wish, size_of(p, me)), p.bound)
+    return limit(scale(wish, strength_of(p, me)), p.bound)
 
 
 class Sidestep(Social):
@@ -238,7 +238,7 @@ class Sidestep(Social):
     angular: float = Field(default=2.0, ge=0, description="n, 1/m, of turning")
     forward: float = Field(default=3.0, ge=0, description="n', 1/m, of slowing down")
     bias: float = Field(default=0.005, ge=0, description="eps, 1/m: to the right")
-    pair_law: ClassVar[Law | None] = stepped_aside
+    pair_law: ClassVar[Law | None] = sidestep_pair
     demo: ClassVar[str | None] = HEAD_ON.replace("FORCE", "{kind: sidestep, acceleration: 4.5, radius: 8}")
 
     def parameters(self) -> dict[str, float | Vec]:

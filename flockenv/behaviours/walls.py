@@ -23,7 +23,7 @@ __all__ = ["Contain", "FollowWall"]
 
 
 @law
-def soon(p: Any, me: Me) -> Vec:
+def predicted_offset(p: Any, me: Me) -> Vec:
     """Return the displacement after `time` s at the present velocity."""
     return scale(me.vel, p.time)
 
@@ -41,13 +41,13 @@ def nearest_wall(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
 
 
 @law
-def walls_seen(p: Any, me: Me) -> float:
+def wall_reach(p: Any, me: Me) -> float:
     """Return its range around the predicted position, m."""
     return p.range + norm(me.vel) * p.time  # type: ignore[no-any-return]
 
 
 @law
-def along_wall(p: Any, me: Me, acc: Vec) -> Vec:
+def follow_wall_force(p: Any, me: Me, acc: Vec) -> Vec:
     """Return F = w S, which seeks q + D n, with q the point of the wall nearest to the predicted position."""
     o, e = like(me.who, 0.0), like(me.who, 1.0)
     normal: Vec
@@ -78,11 +78,11 @@ class FollowWall(Moving):
     distance: float = Field(gt=0, description="m, from the wall to its centre")
     time: float = Field(default=0.5, gt=0, description="s, look-ahead time")
     range: float = Field(default=5.0, gt=0, description="m, range within which walls are seen")
-    obstacle_from: ClassVar[Law | None] = soon
+    obstacle_from: ClassVar[Law | None] = predicted_offset
     obstacle_start: ClassVar[Law | None] = no_wall
     obstacle_law: ClassVar[Law | None] = nearest_wall
-    obstacle_finish: ClassVar[Law | None] = along_wall
-    obstacle_reach: ClassVar[Law | None] = walls_seen
+    obstacle_finish: ClassVar[Law | None] = follow_wall_force
+    obstacle_reach: ClassVar[Law | None] = wall_reach
     demo: ClassVar[str | None] = """
 groups:
 - count: 2
@@ -105,7 +105,7 @@ effects:
 
 
 @law
-def back_inside(p: Any, me: Me, now: float, gap: float, out: Vec) -> Vec:
+def contain_force(p: Any, me: Me, now: float, gap: float, out: Vec) -> Vec:
     """Return F = w S: turn along the wall that it would cross, brake if head-on; from outside, go straight back."""
     o, e = like(me.who, 0.0), like(me.who, 1.0)
     aside = scale(lateral(out, me.heading), -e)
@@ -122,25 +122,25 @@ def back_inside(p: Any, me: Me, now: float, gap: float, out: Vec) -> Vec:
 @law
 def contain_chain(p: Any, me: Me) -> Vec:
     """Return the force for a circle, a polygon or another chain."""
-    x = _relative(p.table, me.pos)
+    x = _table_offset(p.table, me.pos)
     now, away = nearest_chain(p.table, 0, x)
     gap, out = nearest_chain(p.table, 0, add(x, scale(me.vel, p.time)))
     beyond = now + me.radius > like(me.who, 0.0)
-    return back_inside(p, me, now, now if beyond else gap, select(beyond, away, out))
+    return contain_force(p, me, now, now if beyond else gap, select(beyond, away, out))
 
 
 @law
 def contain_block(p: Any, me: Me) -> Vec:
     """Return the force for a block."""
-    x = _relative(p.table, me.pos)
+    x = _table_offset(p.table, me.pos)
     now, away = nearest_block(p.table, 0, x)
     gap, out = nearest_block(p.table, 0, add(x, scale(me.vel, p.time)))
     beyond = now + me.radius > like(me.who, 0.0)
-    return back_inside(p, me, now, now if beyond else gap, select(beyond, away, out))
+    return contain_force(p, me, now, now if beyond else gap, select(beyond, away, out))
 
 
 @law
-def _relative(table: Any, x: Vec) -> Vec:
+def _table_offset(table: Any, x: Vec) -> Vec:
     if len(x) == 2:
         return (x[0] - table[2], x[1] - table[3])
     else:

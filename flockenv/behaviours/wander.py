@@ -20,7 +20,7 @@ GOLDEN = 0.6180339887498949
 
 
 @law
-def _aside(way: Vec, left: float, up: float) -> Vec:
+def _sideways(way: Vec, left: float, up: float) -> Vec:
     """Return a sideways offset in the agent's own frame."""
     o = like(left, 0.0)
     if len(way) == 2:
@@ -30,7 +30,7 @@ def _aside(way: Vec, left: float, up: float) -> Vec:
 
 
 @law
-def wandered(p: Any, me: Any) -> Vec:
+def wander_force(p: Any, me: Any) -> Vec:
     """Return F = w (V unit(forward + strength (n1 left + n2 up)) - v) with n1, n2 smooth in time."""
     o, e = like(p.strength, 0.0), like(p.strength, 1.0)
     who = int(me.who)
@@ -39,7 +39,7 @@ def wandered(p: Any, me: Any) -> Vec:
     # each agent at rest starts in a random direction
     begin = 2.0 * np.pi * uniform(me.key, 0, who, CHANNEL + 2)
     way = select(dot(me.vel, me.vel) > o, me.vel, planar(me.vel, like(e, np.cos(begin)), like(e, np.sin(begin))))
-    target = _aside(way, left * p.strength, up * p.strength)
+    target = _sideways(way, left * p.strength, up * p.strength)
     velocity = add(steering.wander(target, way, top_speed(p, me), e), way)
     return scale(sub(velocity, me.vel), p.weight)
 
@@ -54,7 +54,7 @@ class Wander(Moving):
     kind: Literal["wander"] = "wander"
     strength: float = Field(default=1.0, ge=0, description="m sideways per m ahead: 1 = up to 45 degrees")
     period: float = Field(default=1.0, gt=0, description="s, correlation time of its turns")
-    own_law: ClassVar[Law | None] = wandered
+    own_law: ClassVar[Law | None] = wander_force
     demo: ClassVar[str | None] = """
 groups:
   - {count: 6, max_speed: 1, max_force: 4, spawn: {low: [-1, -1], high: [1, 1], speed: [1, 1]}}

@@ -78,13 +78,13 @@ def accuracy(
 ) -> None:
     """Show the cost of accuracy: the final error of each integrator for each step length, and its time."""
     from flockenv.core.output_paths import valid_file
-    from flockenv.physics.integrators import methods_named
+    from flockenv.physics.integrators import methods_of
     from flockenv.studies.accuracy import usual_methods
 
     todo = _todo(scenes or (), suite, problems, seconds, steps, dts, seed)
     aimed = _numbers("--tolerance", tolerance)
     path = valid_file(out, [".json", ".png"], force, beside=".json") if out is not None else None
-    chosen = methods_named(_words(methods)) if methods else usual_methods()
+    chosen = methods_of(_words(methods)) if methods else usual_methods()
     console = new_console()
 
     reports, refused = _measured(todo, chosen, repetitions, finer, aimed, console, functools.partial(_keep, path))
@@ -307,12 +307,12 @@ def stress(
 ) -> None:
     """Run every hard case with every integrator, and show value, bound and verdict of each."""
     from flockenv.core.output_paths import valid_file
-    from flockenv.physics.integrators import methods_named
+    from flockenv.physics.integrators import methods_of
     from flockenv.studies.stress import CASES, cases_named, fingerprint, run, trials, usual_methods
 
     path = valid_file(out, [".json", ".png"], True, beside=".json") if out is not None else None
     todo = cases_named(CASES, _words(cases))
-    under = methods_named(_words(methods)) if methods else usual_methods()
+    under = methods_of(_words(methods)) if methods else usual_methods()
     kinds = [method.kind for method in under]
     known = None if force else stored(path, "hard cases", fingerprint())
     found, stopped = try_all("hard cases", trials(todo, kinds), path, known, lambda *given: run(todo, under, *given))

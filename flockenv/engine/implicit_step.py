@@ -14,7 +14,7 @@ import numpy as np
 from flockenv.model.scene_view import SceneView
 from flockenv.model.state import WORK, Floats, State
 from flockenv.physics.integrators.implicit import Implicit
-from flockenv.physics.integrators.newton import Coupling, Evaluate, NotSolvedError, coupled
+from flockenv.physics.integrators.newton import Coupling, Evaluate, NotSolvedError, coupling_between
 
 __all__ = ["coupling_of", "solve_steps"]
 
@@ -32,14 +32,14 @@ def coupling_of(scene: SceneView) -> Coupling | None:
         if scene.agents * scene.dimension > MOST_DENSE:
             return None
         pairs = np.indices((scene.agents, scene.agents)).reshape(2, -1)
-        return coupled(scene.agents, *pairs)
+        return coupling_between(scene.agents, *pairs)
     first, second = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for _, effect in scene.parts.bond_effects:
         bonds = effect.bonds(scene.groups, scene.dimension)
         for column in bonds.partner.T:
             first.append(bonds.agent.astype(np.int64))
             second.append(column.astype(np.int64))
-    return coupled(scene.agents, np.concatenate(first), np.concatenate(second))
+    return coupling_between(scene.agents, np.concatenate(first), np.concatenate(second))
 
 
 def solve_steps(

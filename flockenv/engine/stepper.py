@@ -23,7 +23,7 @@ from flockenv.model.scene_view import SceneView
 from flockenv.model.state import Floats, State
 from flockenv.physics.constraints import Settler
 from flockenv.physics.integrators import SemiImplicitEuler
-from flockenv.physics.population import settler as population_settler
+from flockenv.physics.population import make_settler as population_settler
 
 __all__ = ["FEWEST_TOGETHER", "Stepper"]
 

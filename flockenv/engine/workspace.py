@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from flockenv.engine import OWN, TABLES, KernelPlan, Table, scratch_of
 from flockenv.jit.cpu import LINE
 from flockenv.model.state import Body
-from flockenv.physics.effects.effect import ties
+from flockenv.physics.effects.effect import separation_directions
 
 __all__ = ["Workspace"]
 
@@ -49,7 +49,11 @@ class Workspace:
             arrays[name][:agents], arrays[name][agents:] = getattr(body, name), 1
         arrays["ident"][:] = np.arange(padded)
         if "tie" in arrays:
-            blocks = ties(padded, parts.dimension).reshape(-1, parts.width, parts.dimension).transpose(0, 2, 1)
+            blocks = (
+                separation_directions(padded, parts.dimension)
+                .reshape(-1, parts.width, parts.dimension)
+                .transpose(0, 2, 1)
+            )
             arrays["tie"][:] = blocks.reshape(-1)
         if "number" in arrays:
             arrays["number"][:] = np.arange(len(arrays["number"]))

@@ -21,15 +21,23 @@ from flockenv.maths.grid import MOST_POINTS, covers, sample, sample_points, samp
 from flockenv.maths.vectors import norm, select, unit
 from flockenv.model.scene_view import SceneView
 
-__all__ = [ "check_ways", "lengths_on", "region", "starts_of", "towards", "warn_cut_off", "way_ahead",
-    "way_block", "ways_to",
+__all__ = [
+    "check_floor_field",
+    "floor_field_block",
+    "floor_field_to",
+    "grid_corners",
+    "path_ahead",
+    "path_lengths",
+    "path_to_target",
+    "start_boxes",
+    "warn_cut_off",
 ]  # fmt: skip
 
 Floats = NDArray[np.float64]
 
 
 @law
-def way_ahead(table: Any, x: Vec, straight: Vec) -> tuple[float, Vec]:
+def path_ahead(table: Any, x: Vec, straight: Vec) -> tuple[float, Vec]:
     """Return the length of the path from x, m, and its first direction; beyond the grid, those of the straight line."""
     here = covers(table, x)
     length = sample(table, x, 0) if here else norm(straight)
@@ -38,7 +46,7 @@ def way_ahead(table: Any, x: Vec, straight: Vec) -> tuple[float, Vec]:
 
 
 @law
-def towards(table: Any, x: Vec) -> tuple[float, Vec]:
+def path_to_target(table: Any, x: Vec) -> tuple[float, Vec]:
     """Return the length of the path to the nearest target of a block, m, and its first direction; 0 and 0 within it.
 
     A block (see `way_block`) holds the number of targets, the distance within which the straight line to them is free,
@@ -46,13 +54,13 @@ def towards(table: Any, x: Vec) -> tuple[float, Vec]:
     """
     count, size = np.int64(table[0]), 3 * len(x) + 1
     straight = to_any(table, 2, count, x)
-    length, direction = way_ahead(table[2 + count * size :], x, straight)
+    length, direction = path_ahead(table[2 + count * size :], x, straight)
     near = norm(straight)
     close = near <= table[1]
     return near if close else length, select(close, unit(straight), direction)
 
 
-def region(scene: SceneView, targets: Sequence[Target], margin: float) -> tuple[Floats, Floats]:
+def grid_corners(scene: SceneView, targets: Sequence[Target], margin: float) -> tuple[Floats, Floats]:
     """Return the corners of the grid: those of the box, or of everything in the scene and a margin around it."""
     size = getattr(scene.space, "size", None)
     if size is not None:
@@ -69,7 +77,7 @@ def region(scene: SceneView, targets: Sequence[Target], margin: float) -> tuple[
     return every.min(axis=0) - margin, every.max(axis=0) + margin
 
 
-def starts_of(scene: SceneView, which: int | None) -> list[Start]:
+def start_boxes(scene: SceneView, which: int | None) -> list[Start]:
     """Return the boxes in which agents of a group (None: all groups) begin or are born; none for networks."""
     size = getattr(scene.space, "size", None)
     found = []
@@ -85,7 +93,7 @@ def starts_of(scene: SceneView, which: int | None) -> list[Start]:
     return found
 
 
-def lengths_on(grid: Floats, points: ArrayLike) -> Floats:
+def path_lengths(grid: Floats, points: ArrayLike) -> Floats:
     """Return path lengths from points (..., D), (...) m: inf without a path; outside the grid, that of its edge."""
     found = sample_points(grid, points)[..., 0]
     return np.asarray(np.where(found > NO_WAY * 1e-12, np.inf, found))  # also next to points without a path
@@ -104,7 +112,7 @@ def warn_cut_off(name: str, lost: NDArray[np.bool_], state: Any) -> None:
         )  # fmt: skip
 
 
-def ways_to(
+def floor_field_to(
     scene: SceneView, targets: Sequence[Target], names: Sequence[str], corners: tuple[Floats, Floats], spacing: float,
     clearance: float, starts: Sequence[Start] = (),
 ) -> Floats:  # fmt: skip
@@ -113,7 +121,7 @@ def ways_to(
     return floor_field_table(list(scene.obstacles), targets, low, high, spacing, clearance, names, starts)
 
 
-def way_block(
+def floor_field_block(
     scene: SceneView, targets: Sequence[Target], names: Sequence[str], corners: tuple[Floats, Floats], spacing: float,
     clearance: float, starts: Sequence[Start] = (),
 ) -> Floats:  # fmt: skip
@@ -121,14 +129,14 @@ def way_block(
 
     At distances from a target below the spacing and below its distance to obstacles, the straight line is taken.
     """
-    grid = ways_to(scene, targets, names, corners, spacing, clearance, starts)
+    grid = floor_field_to(scene, targets, names, corners, spacing, clearance, starts)
     free = [free_part(scene.obstacles, *given, spacing, clearance) for given in zip(targets, names, strict=True)]
     direct = min([spacing, *(float(gap.min()) for _, _, gap in free)])
     rows = [target.row for target, _, _ in free]
     return np.concatenate([[len(targets), direct], np.ravel(rows), grid])
 
 
-def check_ways(
+def check_floor_field(
     scene: SceneView, kind: str, targets: Sequence[Target], names: Sequence[str], margin: float, spacing: float,
     clearance: float,
 ) -> None:  # fmt: skip
@@ -150,7 +158,7 @@ def check_ways(
             )
     if isinstance(scene.space, Torus):
         raise ValueError(f"kind = {kind}: on a torus paths lead around; only a plane or a box is allowed")
-    low, high = region(scene, targets, margin)
+    low, high = grid_corners(scene, targets, margin)
     points = float(np.prod((high - low) / spacing + 1))
     if points > MOST_POINTS:
         raise ValueError(f"spacing = {spacing:g}: {points:,.0f} points, at most {MOST_POINTS:,} are allowed")

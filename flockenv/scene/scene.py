@@ -49,7 +49,7 @@ from flockenv.physics.effects import EFFECTS, Effect
 from flockenv.physics.effects.effect import all_masses
 from flockenv.physics.integrators import INTEGRATORS, Adaptive, ImplicitEuler, Integrator, SemiImplicitEuler
 from flockenv.physics.integrators.newton import Coupling
-from flockenv.physics.population import POPULATION, Member, beget
+from flockenv.physics.population import POPULATION, Member, create_initial
 from flockenv.physics.population.lifecycle import NUMBERS as POPULATION_NUMBERS
 from flockenv.scene.placement import cells_of, place_groups
 from flockenv.scene.stability import check_contact, check_dt, check_lookahead
@@ -402,7 +402,7 @@ class Scene(Record):
             state.obstacles.centre[:, m] = obstacle.centre
             state.obstacle_radius[:, m] = obstacle.radius
         place_groups(self, state, self._cells)
-        beget(self, state)
+        create_initial(self, state)
         self.stepper.begin(state, np.ones_like(state.alive))
         for effect in self.effects:
             effect.check_start(self, state)

@@ -30,7 +30,7 @@ __all__ = [
     "Intentions", "Priority", "RoundRobin", "RunningSum", "allocate", "allocate_running", "blend", "prioritise",
 ]  # fmt: skip
 
-Wishes = tuple[Vec, ...]
+Forces = tuple[Vec, ...]
 Shares = tuple[float, ...]
 
 Chance = Annotated[float, Field(ge=0, le=1)]
@@ -39,7 +39,7 @@ ARBITRATIONS: dict[str, type[Arbitration]] = {}
 """Every arbitration by its kind; a class registers itself when it is defined."""
 
 
-def no_shares(wishes: Wishes) -> Shares:
+def no_shares(wishes: Forces) -> Shares:
     """Return a zero for each wish."""
     return (0.0,) * len(wishes)
 
@@ -53,7 +53,7 @@ def _no_shares(wishes):  # type: ignore[no-untyped-def]  # numba compares signat
 
 
 @law
-def _turn(time: float, period: float) -> int:
+def _period_number(time: float, period: float) -> int:
     """Number the periods: a thousandth of one early, so that no step that ends with a period misses it by a rounding.
 
     0.3 s in steps of 0.02 s and in steps of 0.05 s are two numbers: 0.3 / 0.1 is 2 or 3.
@@ -62,7 +62,7 @@ def _turn(time: float, period: float) -> int:
 
 
 @law
-def granted(wishes: Wishes, shares: Shares) -> Vec:
+def total_share(wishes: Forces, shares: Shares) -> Vec:
     """Return what the shares of all wishes come to."""
     total = zero(wishes[0])
     for k in range(len(wishes)):
@@ -74,7 +74,7 @@ def granted(wishes: Wishes, shares: Shares) -> Vec:
 
 
 @law
-def _blended(wishes: Wishes, budget: float) -> Shares:
+def _blend_shares(wishes: Forces, budget: float) -> Shares:
     total = zero(wishes[0])
     for k in range(len(wishes)):
         total = add(total, wishes[k])
@@ -86,7 +86,7 @@ def _blended(wishes: Wishes, budget: float) -> Shares:
 
 
 @law
-def _first(wishes: Wishes, threshold: float, budget: float) -> Shares:
+def _first_share(wishes: Forces, threshold: float, budget: float) -> Shares:
     """The first wish longer than the threshold, cut to the budget."""
     shares, open_ = no_shares(wishes), True
     for k in range(len(wishes)):
@@ -99,7 +99,7 @@ def _first(wishes: Wishes, threshold: float, budget: float) -> Shares:
 
 
 @law
-def _allocated(wishes: Wishes, budget: float) -> Shares:
+def _allocate_shares(wishes: Forces, budget: float) -> Shares:
     shares, left = no_shares(wishes), budget
     o = like(budget, 0.0)
     for k in range(len(wishes)):
@@ -111,7 +111,7 @@ def _allocated(wishes: Wishes, budget: float) -> Shares:
 
 
 @law
-def _run_up(wishes: Wishes, budget: float) -> Shares:
+def _running_shares(wishes: Forces, budget: float) -> Shares:
     shares, total = no_shares(wishes), zero(wishes[0])
     o = like(budget, 0.0)
     for k in range(len(wishes)):
@@ -124,7 +124,7 @@ def _run_up(wishes: Wishes, budget: float) -> Shares:
 
 
 @law
-def blend(wishes: Wishes, weights: Vec, budget: float) -> Vec:
+def blend(wishes: Forces, weights: Vec, budget: float) -> Vec:
     """Return the weighted sum, shortened to the budget (Reynolds 1999). Opposite wishes cancel: +8 and -8 give 0."""
     total = zero(wishes[0])
     for k in range(len(wishes)):
@@ -133,28 +133,28 @@ def blend(wishes: Wishes, weights: Vec, budget: float) -> Vec:
 
 
 @law
-def prioritise(wishes: Wishes, threshold: float, budget: float) -> Vec:
+def prioritise(wishes: Forces, threshold: float, budget: float) -> Vec:
     """Return the first wish longer than the threshold, shortened to the budget, and nothing of the others."""
-    return granted(wishes, _first(wishes, threshold, budget))
+    return total_share(wishes, _first_share(wishes, threshold, budget))
 
 
 @law
-def allocate(wishes: Wishes, budget: float) -> Vec:
+def allocate(wishes: Forces, budget: float) -> Vec:
     """Grant wishes in order until their lengths have used up the budget; the last one served is cut to what is left.
 
     Prioritised acceleration allocation (Reynolds 1987): lengths add up as scalars, so the sum needs no shortening, and
     in an emergency the most pressing wish is served whole. (8,0), (-8,0), (0,5) within 10 give (6, 0).
     """
-    return granted(wishes, _allocated(wishes, budget))
+    return total_share(wishes, _allocate_shares(wishes, budget))
 
 
 @law
-def allocate_running(wishes: Wishes, budget: float) -> Vec:
+def allocate_running(wishes: Forces, budget: float) -> Vec:
     """Grant wishes in order, each as far as the length of the sum so far leaves room (Buckland 2004).
 
     Unlike `allocate`, opposite wishes give room back: (8,0), (-8,0), (0,5) within 10 give (6, 4).
     """
-    return granted(wishes, _run_up(wishes, budget))
+    return total_share(wishes, _running_shares(wishes, budget))
 
 
 # --- records, for scenes ----------------------------------------------------------------------------------------------
@@ -183,12 +183,12 @@ class Arbitration(Record):
 
 
 @law
-def blend_wishes(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
+def blend_forces(p: Any, me: Any, wishes: Forces) -> tuple[Vec, Shares]:
     """All of them: the sum of whatever an agent wants is cut to max_force anyway, and only once."""
     total = zero(wishes[0])
     for k in range(len(wishes)):
         total = add(total, wishes[k])
-    return total, _blended(wishes, me.max_force)
+    return total, _blend_shares(wishes, me.max_force)
 
 
 class Blend(Arbitration):
@@ -198,14 +198,14 @@ class Blend(Arbitration):
     """
 
     kind: Literal["blend"] = "blend"
-    law: ClassVar[Law] = blend_wishes
+    law: ClassVar[Law] = blend_forces
 
 
 @law
-def first_wish(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
+def take_first(p: Any, me: Any, wishes: Forces) -> tuple[Vec, Shares]:
     """One of them."""
-    shares = _first(wishes, p.threshold, me.max_force)
-    return granted(wishes, shares), shares
+    shares = _first_share(wishes, p.threshold, me.max_force)
+    return total_share(wishes, shares), shares
 
 
 class Priority(Arbitration):
@@ -213,15 +213,15 @@ class Priority(Arbitration):
 
     kind: Literal["priority"] = "priority"
     threshold: float = Field(default=1e-3, ge=0, description="N, a wish that is no longer asks for nothing")
-    law: ClassVar[Law] = first_wish
+    law: ClassVar[Law] = take_first
     exclusive: ClassVar[bool] = True
 
 
 @law
-def dithered(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
+def take_at_random(p: Any, me: Any, wishes: Forces) -> tuple[Vec, Shares]:
     """One of them, by lot."""
     shares, open_ = no_shares(wishes), True
-    frame, who = _turn(me.time, p.period), int(me.who)
+    frame, who = _period_number(me.time, p.period), int(me.who)
     for k in range(len(wishes)):
         length = norm(wishes[k])
         drawn = uniform(me.key, frame, who, 50_000 + k) < p.probability[k]
@@ -229,7 +229,7 @@ def dithered(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
         cut = me.max_force / length if length > me.max_force else like(length, 1.0)
         shares = replace_at(shares, k, cut if takes else like(length, 0.0))
         open_ = open_ and not takes
-    return granted(wishes, shares), shares
+    return total_share(wishes, shares), shares
 
 
 class Dithering(Arbitration):
@@ -244,7 +244,7 @@ class Dithering(Arbitration):
     )
     period: float = Field(default=0.1, gt=0, description="s, how long a draw lasts")
     threshold: float = Field(default=1e-3, ge=0, description="N, a wish that is no longer asks for nothing")
-    law: ClassVar[Law] = dithered
+    law: ClassVar[Law] = take_at_random
     exclusive: ClassVar[bool] = True
 
     def parameters(self, wishes: int) -> dict[str, float | Vec]:
@@ -259,43 +259,43 @@ class Dithering(Arbitration):
 
 
 @law
-def allocated(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
+def allocate_force(p: Any, me: Any, wishes: Forces) -> tuple[Vec, Shares]:
     """Lengths use up the budget."""
-    shares = _allocated(wishes, me.max_force)
-    return granted(wishes, shares), shares
+    shares = _allocate_shares(wishes, me.max_force)
+    return total_share(wishes, shares), shares
 
 
 class Allocation(Arbitration):
     """Prioritised acceleration allocation (Reynolds 1987): in order, until their lengths have used up max_force."""
 
     kind: Literal["allocation"] = "allocation"
-    law: ClassVar[Law] = allocated
+    law: ClassVar[Law] = allocate_force
 
 
 @law
-def run_up(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
+def allocate_running_force(p: Any, me: Any, wishes: Forces) -> tuple[Vec, Shares]:
     """The length of their sum uses up the budget."""
-    shares = _run_up(wishes, me.max_force)
-    return granted(wishes, shares), shares
+    shares = _running_shares(wishes, me.max_force)
+    return total_share(wishes, shares), shares
 
 
 class RunningSum(Arbitration):
     """As allocation, but it is the length of the sum so far that uses up max_force (Buckland 2004)."""
 
     kind: Literal["running_sum"] = "running_sum"
-    law: ClassVar[Law] = run_up
+    law: ClassVar[Law] = allocate_running_force
 
 
 @law
-def in_turn(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
+def take_turns(p: Any, me: Any, wishes: Forces) -> tuple[Vec, Shares]:
     """Whose turn it is."""
     shares = no_shares(wishes)
-    turn = _turn(me.time, p.period) % len(wishes)
+    turn = _period_number(me.time, p.period) % len(wishes)
     for k in range(len(wishes)):
         length = norm(wishes[k])
         cut = me.max_force / length if length > me.max_force else like(length, 1.0)
         shares = replace_at(shares, k, cut if k == turn else like(length, 0.0))
-    return granted(wishes, shares), shares
+    return total_share(wishes, shares), shares
 
 
 class RoundRobin(Arbitration):
@@ -303,12 +303,12 @@ class RoundRobin(Arbitration):
 
     kind: Literal["round_robin"] = "round_robin"
     period: float = Field(default=0.05, gt=0, description="s, how long a turn lasts")
-    law: ClassVar[Law] = in_turn
+    law: ClassVar[Law] = take_turns
     exclusive: ClassVar[bool] = True
 
 
 @law
-def _direction(ahead: Vec, j: int, n: int) -> Vec:
+def _spread_direction(ahead: Vec, j: int, n: int) -> Vec:
     """Return direction j of n, spread evenly about `ahead`, which is the first."""
     e = like(ahead[0], 1.0)
     if len(ahead) == 2:
@@ -325,7 +325,7 @@ def _direction(ahead: Vec, j: int, n: int) -> Vec:
 
 
 @law
-def _maps(p: Any, wishes: Wishes, way: Vec) -> tuple[float, float]:
+def _danger_and_interest(p: Any, wishes: Forces, way: Vec) -> tuple[float, float]:
     """Return how dangerous a direction is, and how much is to be said for it."""
     o = like(way[0], 0.0)
     danger, interest = o, o
@@ -337,7 +337,7 @@ def _maps(p: Any, wishes: Wishes, way: Vec) -> tuple[float, float]:
 
 
 @law
-def by_context(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
+def choose_direction(p: Any, me: Any, wishes: Forces) -> tuple[Vec, Shares]:
     """The best of the least dangerous directions."""
     o, e = like(wishes[0][0], 0.0), like(wishes[0][0], 1.0)
     total = zero(wishes[0])
@@ -349,13 +349,13 @@ def by_context(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
     least, most = like(o, np.inf), o
     count = int(p.directions)
     for j in range(count):
-        danger, _ = _maps(p, wishes, _direction(ahead, j, count))
+        danger, _ = _danger_and_interest(p, wishes, _spread_direction(ahead, j, count))
         least, most = min(least, danger), max(most, danger)
     bound = least + like(o, 1e-3) * (most - least)  # as good as the least
     best, chosen = -e, zero(total)
     for j in range(count):
-        way = _direction(ahead, j, count)
-        danger, interest = _maps(p, wishes, way)
+        way = _spread_direction(ahead, j, count)
+        danger, interest = _danger_and_interest(p, wishes, way)
         better = (danger <= bound) & (interest > best)
         best, chosen = interest if better else best, select(better, way, chosen)
     force = limit(scale(chosen, best if best > o else o), me.max_force)
@@ -377,11 +377,11 @@ class ContextSteering(Arbitration):
     kind: Literal["context"] = "context"
     dangers: int = Field(default=1, ge=0, description="how many behaviours, from the first on, avert a danger")
     directions: int = Field(default=24, ge=4, le=256, description="how many directions are weighed")
-    law: ClassVar[Law] = by_context
+    law: ClassVar[Law] = choose_direction
 
 
 @law
-def by_intention(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
+def take_by_intention(p: Any, me: Any, wishes: Forces) -> tuple[Vec, Shares]:
     """Those that are always heard and those of the intention, until their lengths have used up the budget."""
     shares, left = no_shares(wishes), me.max_force
     o, e = like(left, 0.0), like(left, 1.0)
@@ -392,7 +392,7 @@ def by_intention(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
         share = e if whole else left / length
         shares = replace_at(shares, k, share if heard else o)
         left = left - (length if whole else left) if heard else left
-    return granted(wishes, shares), shares
+    return total_share(wishes, shares), shares
 
 
 class Intentions(Arbitration):
@@ -405,7 +405,7 @@ class Intentions(Arbitration):
     when: tuple[Literal["avoid", "escape", "eat", "mate", "school", "wander"], ...] = Field(
         min_length=1, description="state in which each behaviour is active; avoid = always"
     )
-    law: ClassVar[Law] = by_intention
+    law: ClassVar[Law] = take_by_intention
     recalls: ClassVar[tuple[str, ...]] = ("intention",)
 
     def parameters(self, wishes: int) -> dict[str, float | Vec]:

@@ -47,7 +47,7 @@ def avoid(forward: Vec, offset: Vec, clearance: float, max_speed: float) -> Vec:
 
 
 @law
-def _clamped(x: float, low: float, high: float) -> float:
+def _clamp(x: float, low: float, high: float) -> float:
     return low if x < low else (high if x > high else x)
 
 
@@ -59,16 +59,16 @@ def contain(to_low: Vec, to_high: Vec, velocity: Vec, max_speed: float, time: fl
     (Reynolds 1999, containment).
     """
     step = scale(velocity, time)
-    x = _clamped(step[0], -to_low[0], to_high[0])
-    y = _clamped(step[1], -to_low[1], to_high[1])
+    x = _clamp(step[0], -to_low[0], to_high[0])
+    y = _clamp(step[1], -to_low[1], to_high[1])
     if len(velocity) == 2:
-        return _return(step, (x, y), velocity, max_speed)
+        return _return_change(step, (x, y), velocity, max_speed)
     else:
-        return _return(step, (x, y, _clamped(step[2], -to_low[2], to_high[2])), velocity, max_speed)
+        return _return_change(step, (x, y, _clamp(step[2], -to_low[2], to_high[2])), velocity, max_speed)
 
 
 @law
-def _return(step: Vec, goal: Vec, velocity: Vec, max_speed: float) -> Vec:
+def _return_change(step: Vec, goal: Vec, velocity: Vec, max_speed: float) -> Vec:
     change = sub(goal, step)
     leaving = dot(change, change) > like(max_speed, 0.0)
     return select(leaving, seek(goal, velocity, max_speed), zero(velocity))

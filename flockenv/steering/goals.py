@@ -12,10 +12,10 @@ __all__ = [
     "dock",
     "face",
     "flee",
-    "in_frame",
     "match_velocity",
     "seek",
     "target_speed",
+    "to_world_axes",
     "wander",
     "wander_turn",
 ]
@@ -57,7 +57,7 @@ def wander_turn(target: Vec, noise: Vec, rate: float, dt: float) -> Vec:
 
 
 @law
-def in_frame(own: Vec, velocity: Vec) -> Vec:
+def to_world_axes(own: Vec, velocity: Vec) -> Vec:
     """Return in world axes a vector given as (forward, left) or (forward, left, up) of an agent at this velocity.
 
     Left is level unless the agent flies straight up; at standstill forward is the x axis.
@@ -78,7 +78,7 @@ def wander(target: Vec, velocity: Vec, max_speed: float, ahead: float) -> Vec:
 
     `target` is in the agent's own frame: (forward, left) or (forward, left, up). At standstill, forward is the x axis.
     """
-    goal = add(in_frame(target, velocity), in_frame(scale(axis(target, 0), ahead), velocity))
+    goal = add(to_world_axes(target, velocity), to_world_axes(scale(axis(target, 0), ahead), velocity))
     return sub(scale(unit(goal), max_speed), velocity)
 
 

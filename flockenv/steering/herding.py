@@ -9,11 +9,11 @@ from __future__ import annotations
 from flockenv.jit.decorators import Vec, law
 from flockenv.maths.vectors import add, norm, scale, select, sub, unit
 
-__all__ = ["behind", "heed", "herd_from"]
+__all__ = ["herding_offset", "point_behind", "sheep_direction"]
 
 
 @law
-def heed(
+def sheep_direction(
     velocity: Vec, centre: Vec, crowd: Vec, away: Vec, noise: Vec,
     inertia: float, attraction: float, apart: float, fear: float, error: float,
 ) -> Vec:  # fmt: skip
@@ -28,13 +28,13 @@ def heed(
 
 
 @law
-def behind(offset: Vec, goal: Vec, distance: float) -> Vec:
+def point_behind(offset: Vec, goal: Vec, distance: float) -> Vec:
     """Return the offset of the place `distance` m behind a thing, as seen from the goal that it shall be driven to."""
     return add(offset, scale(unit(sub(offset, goal)), distance))
 
 
 @law
-def herd_from(
+def herding_offset(
     centre: Vec, farthest: Vec, goal: Vec, together: float, collecting: float, driving: float
 ) -> Vec:  # fmt: skip
     """Return the offset of the place for a dog: behind a stray, to collect it; else behind the flock, to drive it.
@@ -44,4 +44,4 @@ def herd_from(
     r_a sqrt(N) for N sheep that keep r_a m apart).
     """
     strays = norm(sub(farthest, centre)) > together
-    return select(strays, behind(farthest, centre, collecting), behind(centre, goal, driving))
+    return select(strays, point_behind(farthest, centre, collecting), point_behind(centre, goal, driving))

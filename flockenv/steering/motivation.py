@@ -16,8 +16,19 @@ import numpy as np
 from flockenv.jit.decorators import law, like
 
 __all__ = [
-    "EAT", "ESCAPE", "INTENTIONS", "MATE", "SCHOOL", "WANDER", "bite", "calmed", "desire", "fright", "hungrier",
-    "intention", "regrown",
+    "EAT",
+    "ESCAPE",
+    "INTENTIONS",
+    "MATE",
+    "SCHOOL",
+    "WANDER",
+    "bite",
+    "desire",
+    "fright",
+    "grow_hunger",
+    "intention",
+    "regrow",
+    "update_fear",
 ]  # fmt: skip
 
 INTENTIONS = ("wander", "school", "mate", "eat", "escape")
@@ -27,7 +38,7 @@ WANDER, SCHOOL, MATE, EAT, ESCAPE = range(5)
 
 
 @law
-def hungrier(hunger: float, rate: float, effort: float, pace: float, seconds: float) -> float:
+def grow_hunger(hunger: float, rate: float, effort: float, pace: float, seconds: float) -> float:
     """Return hunger, 0 (full) to 1 (starved), after some seconds: dH/dt = rate + effort pace^2, 1/s.
 
     `pace` is speed over max_speed.
@@ -44,7 +55,7 @@ def bite(amount: float, hunger: float, rate: float, seconds: float) -> float:
 
 
 @law
-def regrown(amount: float, growth: float, capacity: float, seconds: float) -> float:
+def regrow(amount: float, growth: float, capacity: float, seconds: float) -> float:
     """Return an amount after logistic growth da/dt = r a (1 - a / K): its closed form, whatever the step."""
     share = amount / capacity
     return amount / (share + (like(amount, 1.0) - share) * np.exp(-growth * seconds))  # type: ignore[no-any-return]
@@ -65,7 +76,7 @@ def fright(distance: float, span: float) -> float:
 
 
 @law
-def calmed(fear: float, felt: float, memory: float, seconds: float) -> float:
+def update_fear(fear: float, felt: float, memory: float, seconds: float) -> float:
     """Return fear: what is felt now, or what is left of before, exp(-t / memory), if that is more."""
     left = fear * np.exp(-seconds / memory)
     return felt if felt > left else left

@@ -18,7 +18,7 @@ from flockenv.jit.decorators import Numbers, Vec, law, like
 from flockenv.jit.intrinsics import tuple_as_array
 from flockenv.maths.vectors import add, axis, dot, limit, norm, scale, select, sub, unit
 
-__all__ = ["SLOT", "clear", "half_plane", "orca"]
+__all__ = ["SLOT", "half_plane", "orca", "orca_change"]
 
 SLOT = 6
 """Numbers of one neighbour in `orca`: offset (2) m, velocity (2) m/s, radius m (< 0: empty slot), share."""
@@ -59,7 +59,7 @@ def half_plane(
 
 
 @law
-def _on_line(lines: Any, count: int, normal: Vec, bound: float, wish: Vec, top: float, outward: bool) -> Any:
+def _best_on_line(lines: Any, count: int, normal: Vec, bound: float, wish: Vec, top: float, outward: bool) -> Any:
     """Return whether the first `count` half-planes and the speed limit leave a part of a line, and the best of it.
 
     The best is nearest to the wish, or, `outward`, furthest in its direction.
@@ -85,13 +85,13 @@ def _on_line(lines: Any, count: int, normal: Vec, bound: float, wish: Vec, top: 
 
 
 @law
-def _nearest(lines: Any, count: int, wish: Vec, top: float, outward: bool) -> Any:
+def _nearest_velocity(lines: Any, count: int, wish: Vec, top: float, outward: bool) -> Any:
     """Return how many half-planes are kept, all of them or those before the first that cannot be, and the velocity."""
     found = scale(wish, top) if outward else limit(wish, top)
     for i in range(count):
         normal, bound = (lines[3 * i], lines[3 * i + 1]), lines[3 * i + 2]
         if dot(normal, found) < bound:
-            fits, better = _on_line(lines, i, normal, bound, wish, top, outward)
+            fits, better = _best_on_line(lines, i, normal, bound, wish, top, outward)
             if not fits:
                 return i, found
             found = better
@@ -99,7 +99,7 @@ def _nearest(lines: Any, count: int, wish: Vec, top: float, outward: bool) -> An
 
 
 @law
-def _least_bad(lines: Any, count: int, hard: int, kept: int, found: Vec, top: float, relaxed: Any) -> Vec:
+def _least_violation(lines: Any, count: int, hard: int, kept: int, found: Vec, top: float, relaxed: Any) -> Vec:
     """Return the velocity whose worst violation is least: all soft half-planes recede alike until one is left.
 
     The first `hard` half-planes recede only among themselves.
@@ -118,7 +118,7 @@ def _least_bad(lines: Any, count: int, hard: int, kept: int, found: Vec, top: fl
                     relaxed[3 * m], relaxed[3 * m + 1] = apart[0] / length, apart[1] / length
                     relaxed[3 * m + 2] = (limit_ if stays else limit_ - bound) / length
                     m += 1
-            all_kept, better = _nearest(relaxed, m, normal, top, True)
+            all_kept, better = _nearest_velocity(relaxed, m, normal, top, True)
             if all_kept == m:  # otherwise it is rounding: what there is cannot be bettered
                 found = better
             worst = bound - dot(normal, found)
@@ -138,11 +138,11 @@ def orca(
     """
     given, lines, relaxed = tuple_as_array(neighbours), tuple_as_array(neighbours), tuple_as_array(neighbours)
     asked = (wish, max_speed, turn)
-    return clear(velocity, radius, asked, horizon, step, given, len(neighbours) // SLOT, lines, relaxed)
+    return orca_change(velocity, radius, asked, horizon, step, given, len(neighbours) // SLOT, lines, relaxed)
 
 
 @law
-def clear(
+def orca_change(
     velocity: Vec, radius: float, asked: Any, horizon: float, step: float, given: Any, slots: int, lines: Any,
     relaxed: Any,
 ) -> Vec:  # fmt: skip
@@ -161,7 +161,7 @@ def clear(
         hard = hard if soft == 1 else count
     aside = like(radius, 0.0) if free else turn
     wanted = (wish[0] + aside * wish[1], wish[1] - aside * wish[0])
-    kept, found = _nearest(lines, count, wanted, max_speed, False)
+    kept, found = _nearest_velocity(lines, count, wanted, max_speed, False)
     if kept < count:
-        found = _least_bad(lines, count, hard, kept, found, max_speed, relaxed)
+        found = _least_violation(lines, count, hard, kept, found, max_speed, relaxed)
     return sub(found, velocity)

@@ -20,7 +20,7 @@ from flockenv.maths.vectors import (
     unit,
     zero,
 )
-from flockenv.steering.goals import arrive, flee, in_frame, match_velocity, seek
+from flockenv.steering.goals import arrive, flee, match_velocity, seek, to_world_axes
 
 __all__ = [
     "align",
@@ -35,11 +35,11 @@ __all__ = [
     "keep_station",
     "offset_pursue",
     "opensteer_time",
-    "part",
     "passing_point",
     "pursue",
     "push_off",
     "separate",
+    "separate_at",
     "shadow",
 ]
 
@@ -81,7 +81,7 @@ def approach_time(offset: Vec, speed: float, longest: float) -> float:
 
 
 @law
-def _third(x: float) -> float:
+def cosine_sector(x: float) -> float:
     """Return 1, 0 or -1: within 45 degrees of straight on, across, opposite."""
     edge = like(x, 0.707)
     return like(x, 1.0) if x > edge else (like(x, -1.0) if x < -edge else like(x, 0.0))
@@ -94,7 +94,7 @@ def opensteer_time(offset: Vec, velocity: Vec, quarry_velocity: Vec, longest: fl
     Ahead, aside or behind; on a parallel way, across, or against: (4, 1.8, 0.85), (1, 0.8, 4), (0.5, 2, 2).
     """
     forward = unit(velocity)
-    place, way = _third(dot(forward, unit(offset))), _third(dot(forward, unit(quarry_velocity)))
+    place, way = cosine_sector(dot(forward, unit(offset))), cosine_sector(dot(forward, unit(quarry_velocity)))
     o = like(place, 0.0)
     parallel = like(o, 4.0) if place > o else (like(o, 0.5) if place < o else like(o, 1.0))
     across = like(o, 1.8) if place > o else (like(o, 2.0) if place < o else like(o, 0.8))
@@ -128,11 +128,11 @@ def separate(offset: Vec, tie: Vec) -> Vec:
 
     `tie` is the direction to take where the two coincide, a unit vector that is opposite for the other one.
     """
-    return part(offset, dot(offset, offset), tie)
+    return separate_at(offset, dot(offset, offset), tie)
 
 
 @law
-def part(offset: Vec, square: float, tie: Vec) -> Vec:
+def separate_at(offset: Vec, square: float, tie: Vec) -> Vec:
     """The same with the squared distance given, m^2; zero if it is infinite."""
     return select(square > like(square, ONE_PLACE), push_off(offset, square), tie)
 
@@ -184,7 +184,7 @@ def keep_station(
     v_d = v_L + V min(1, d / slow_radius) towards the place, at most V. An agent that arrives at the predicted place,
     as in offset pursuit (Reynolds 1999), has v_d = 0 there and lags behind a moving leader.
     """
-    station = add(offset, in_frame(place, leader_velocity))
+    station = add(offset, to_world_axes(place, leader_velocity))
     towards = arrive(station, zero(velocity), max_speed, slow_radius)
     return sub(limit(add(leader_velocity, towards), max_speed), velocity)
 

@@ -18,16 +18,16 @@ from flockenv.maths.vectors import add, cross, dot, lateral, norm, perpendicular
 from flockenv.steering.others import ONE_PLACE
 
 __all__ = [
-    "apart",
+    "attraction",
     "collision_distance",
-    "draw",
+    "cone_weight",
+    "elliptical_direction",
     "elliptical_repulsion",
+    "gaze_direction",
     "gaze_turn",
-    "in_cone",
-    "looking",
-    "off_ellipse",
     "repulsion",
     "sidestep",
+    "unit_away",
     "view_weight",
 ]
 
@@ -36,7 +36,7 @@ NO_SIDE = 1e-14
 
 
 @law
-def looking(aim: Vec, heading: Vec) -> Vec:
+def gaze_direction(aim: Vec, heading: Vec) -> Vec:
     """Return the direction in which an agent looks: its aim, else its velocity; 0 if it has neither.
 
     The length is arbitrary: laws use the direction alone.
@@ -59,7 +59,7 @@ def view_weight(way: Vec, offset: Vec, least: float) -> float:
 
 
 @law
-def in_cone(way: Vec, force: Vec, cosine: float, outside: float) -> float:
+def cone_weight(way: Vec, force: Vec, cosine: float, outside: float) -> float:
     """Return 1 if what a repulsive `force` comes from is within the field of view, else `outside`; 1 without a way.
 
     w = 1 if e . (-f) >= |f| cos phi, else c; 2 phi is the full angle (Helbing and Molnar 1995, equation 8).
@@ -70,7 +70,7 @@ def in_cone(way: Vec, force: Vec, cosine: float, outside: float) -> float:
 
 
 @law
-def apart(offset: Vec, tie: Vec) -> tuple[Vec, float]:
+def unit_away(offset: Vec, tie: Vec) -> tuple[Vec, float]:
     """Return the unit vector away from the other, along the tie where both are in one place, and the distance, m."""
     square = dot(offset, offset)
     some = square > like(square, ONE_PLACE)
@@ -87,7 +87,7 @@ def repulsion(offset: Vec, tie: Vec, size: float, decay: float) -> Vec:
 
     Helbing, Farkas and Vicsek 2000; the circular specification of Johansson, Helbing and Shukla 2007.
     """
-    away, distance = apart(offset, tie)
+    away, distance = unit_away(offset, tie)
     return scale(away, exp((size - distance) / decay))
 
 
@@ -103,12 +103,12 @@ def elliptical_repulsion(offset: Vec, step: Vec, tie: Vec, decay: float) -> Vec:
     It has no direction if i stands on the step of j, and grows as 1 / sqrt(q) at its end: there a tie gives the
     direction, and (p + q) / (2 sqrt(p q)) is at most 500.
     """
-    out, size = off_ellipse(offset, step, tie, decay)
+    out, size = elliptical_direction(offset, step, tie, decay)
     return scale(out, size)
 
 
 @law
-def off_ellipse(offset: Vec, step: Vec, tie: Vec, decay: float) -> tuple[Vec, float]:
+def elliptical_direction(offset: Vec, step: Vec, tie: Vec, decay: float) -> tuple[Vec, float]:
     """Return direction and size of `elliptical_repulsion`."""
     o, e, half = like(decay, 0.0), like(decay, 1.0), like(decay, 0.5)
     d = scale(offset, -e)
@@ -150,7 +150,7 @@ def sidestep(
     least = like(gamma, 1e-6)
     b = gamma * size
     b = b if b > least else least
-    side, theta = _side_of(towards, t)
+    side, theta = _side_and_angle(towards, t)
     theta = theta + b * bias
     pi = like(gamma, np.pi)
     theta = theta - (pi + pi) if theta > pi else theta
@@ -162,7 +162,7 @@ def sidestep(
 
 
 @law
-def _side_of(towards: Vec, t: Vec) -> tuple[Vec, float]:
+def _side_and_angle(towards: Vec, t: Vec) -> tuple[Vec, float]:
     """Return a unit vector across t, and the angle from t towards it: its left in a plane, the other's side in space.
 
     In space a neighbour dead ahead counts as left, so that it is passed on the right; so does any if t is 0.
@@ -178,7 +178,7 @@ def _side_of(towards: Vec, t: Vec) -> tuple[Vec, float]:
 
 
 @law
-def draw(offset: Vec, decay: float) -> Vec:
+def attraction(offset: Vec, decay: float) -> Vec:
     """Towards a thing, exp(-d / B): times A the pull of a potential that grows with the distance, up to A B far away.
 
     Helbing and Molnar 1995 ask for such a one, W(d, t), and give no form: this is ours.

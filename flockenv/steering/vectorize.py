@@ -1,7 +1,7 @@
 """Laws over rows: the thin wrapper that loops a law of one agent over arrays of agents.
 
 `rows(seek)(offset, velocity, max_speed)` takes arrays (..., D) where the law takes a vector, (...) or a number where it
-takes a number, and (..., K, D) where it takes a tuple of K wishes; leading shapes broadcast. It returns the same shape
+takes a number, and (..., K, D) where it takes a tuple of K forces; leading shapes broadcast. It returns the same shape
 of answer. This is how a hand-written player calls exactly what the simulator calls.
 """
 
@@ -20,14 +20,14 @@ from flockenv.jit.section import entry_of, read_several
 
 __all__ = ["loop_of", "rows"]
 
-_RANK = {"Vec": 1, "Numbers": 1, "Wishes": 2, "float": 0}
+_RANK = {"Vec": 1, "Numbers": 1, "Forces": 2, "float": 0}
 
 
 @functools.lru_cache(maxsize=256)
 def rows(law: Law) -> Callable[..., NDArray[np.float64]]:
     """Return the law over arrays; float64 inside. The loop is compiled once per law and shape of vector.
 
-    Raises TypeError for a law whose annotations do not tell numbers, vectors and wishes apart.
+    Raises TypeError for a law whose annotations do not distinguish numbers, vectors and tuples of vectors.
     """
     python: Any = python_of(law)
     parameters = inspect.signature(python).parameters
@@ -64,7 +64,7 @@ def rows(law: Law) -> Callable[..., NDArray[np.float64]]:
 
 
 def _rank(python: Any, name: str, annotation: Any) -> int:
-    """Return how many axes a row of an argument has: 0 of a number, 1 of a vector, 2 of wishes."""
+    """Return how many axes a row of an argument has: 0 of a number, 1 of a vector, 2 of a tuple of forces."""
     found = _RANK.get(annotation if isinstance(annotation, str) else getattr(annotation, "__name__", ""))
     if found is None:
         allowed = ", ".join(_RANK)

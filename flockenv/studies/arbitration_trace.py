@@ -21,7 +21,7 @@ from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import zero
 from flockenv.model.state import State
 from flockenv.scene import Scene
-from flockenv.steering.arbitration import Shares, Wishes
+from flockenv.steering.arbitration import Forces, Shares
 
 __all__ = ["Granted", "Grants", "granted"]
 
@@ -83,7 +83,7 @@ class _Heard(Steer):
 
 
 @law
-def heard(p: Any, me: Any, wishes: Wishes) -> tuple[Vec, Shares]:
+def heard(p: Any, me: Any, wishes: Forces) -> tuple[Vec, Shares]:
     """Return the force of behaviour `which`, and no other."""
     total = zero(wishes[0])
     for k in range(len(wishes)):

@@ -80,7 +80,7 @@ def _walker(p: Any, frame: Frame, i: int, force: Any) -> None:
     top = np.float64(frame.max_speed[i])
     share = min(top, distance) / max(distance, 1e-9)
     asked = ((gx * share, gy * share), top, 0.3)
-    change = orca.clear(v, np.float64(frame.radius[i]), asked, 2.0, p.control_dt, given, found, lines, relaxed)
+    change = orca.orca_change(v, np.float64(frame.radius[i]), asked, 2.0, p.control_dt, given, found, lines, relaxed)
     fx, fy = change[0] / p.control_dt, change[1] / p.control_dt
     cut = min(1.0, frame.max_force[i] / max(math.sqrt(fx * fx + fy * fy), 1e-9))
     force[0, i], force[1, i] = cut * fx, cut * fy

@@ -132,7 +132,7 @@ def _sheep(p: Any, frame: Frame, i: int, force: Any) -> None:
     time = frame.step * p.control_dt
     noise = (smooth(frame.key, time, i, 21), smooth(frame.key, time, i, 22))
     if away[0] != 0.0 or away[1] != 0.0:
-        way = steering.heed(
+        way = steering.sheep_direction(
             velocity, centre, crowd, away, noise, p.inertia, p.attraction, p.apart, p.fear, p.error
         )  # fmt: skip
         wanted = scale(way, np.float64(frame.max_speed[i]))

@@ -213,7 +213,7 @@ def keep(p: Any, before: Frame, after: Frame) -> None:
         if before.alive[i]:
             _intend(after, i)
     for j in range(foes, n):
-        grown = motivation.regrown(np.float64(after.memory[FOOD, j]), p.growth, p.capacity, p.control_dt)
+        grown = motivation.regrow(np.float64(after.memory[FOOD, j]), p.growth, p.capacity, p.control_dt)
         after.memory[FOOD, j] = grown - after.memory[EATEN, j]
 
 
@@ -243,7 +243,7 @@ def _face_hunters(p: Any, frame: Frame, i: int) -> None:
             felt += motivation.fright(norm(_to(frame, i, j)), p.fear_distance)
         if _has(p, frame, j, i):
             frame.memory[FATE, i] = CAUGHT
-    frame.memory[FEAR, i] = motivation.calmed(
+    frame.memory[FEAR, i] = motivation.update_fear(
         np.float64(frame.memory[FEAR, i]), min(felt, 1.0), p.fear_memory, p.control_dt
     )
 
@@ -267,7 +267,7 @@ def _digest(p: Any, frame: Frame, i: int) -> None:
     if hunts:
         for j in range(int(p.fish)):
             less += p.meal if frame.memory[FATE, j] == CAUGHT and _has(p, frame, i, j) else 0.0
-    later = motivation.hungrier(hunger, rate, p.effort, pace, p.control_dt)
+    later = motivation.grow_hunger(hunger, rate, p.effort, pace, p.control_dt)
     frame.memory[HUNGER, i] = max(later - less, 0.0)
     if not hunts and later - less >= 1.0 and frame.memory[FATE, i] == 0.0:
         frame.memory[FATE, i] = STARVED

@@ -8,12 +8,28 @@ import numpy as np
 
 from flockenv.jit.decorators import Vec, kernel
 from flockenv.maths.vectors import add, norm, scale, sub
-from flockenv.physics.constraints.broad_phase import image, near, vector, write
-from flockenv.physics.constraints.impact import POINT, along, flight
+from flockenv.physics.constraints.broad_phase import balls_overlap, nearest_image, vector_at, write_vector
+from flockenv.physics.constraints.impact import POINT, parabola_of, position_along
 
 __all__ = [
-    "ANEW", "DEEP", "GIVEN_UP", "RESTS", "STOPPED", "Bodies", "Meetings", "Rules", "Things", "gained", "link", "met",
-    "position", "relative", "take_off", "velocity", "widened", "width",
+    "ANEW",
+    "DEEP",
+    "GIVEN_UP",
+    "RESTS",
+    "STOPPED",
+    "Bodies",
+    "Meetings",
+    "Rules",
+    "Things",
+    "add_to_lists",
+    "contact_row",
+    "larger_acceleration",
+    "position",
+    "relative_motion",
+    "set_parabola",
+    "velocity",
+    "widen_reach",
+    "width",
 ]  # fmt: skip
 
 ANEW = 4
@@ -102,30 +118,32 @@ def width(bodies: Bodies, i: int, j: int) -> float:
 def position(period: Vec, bodies: Bodies, i: int, t: float) -> Vec:
     """Return the position of body i at time t of the step, m."""
     s = t - bodies.since[i]
-    return along(vector(period, bodies.at, i), vector(period, bodies.vel, i), vector(period, bodies.acc, i), s)
+    return position_along(
+        vector_at(period, bodies.at, i), vector_at(period, bodies.vel, i), vector_at(period, bodies.acc, i), s
+    )
 
 
 @kernel
 def velocity(period: Vec, bodies: Bodies, i: int, t: float) -> Vec:
     """Return the velocity of body i at time t of the step, m/s."""
-    return add(vector(period, bodies.vel, i), scale(vector(period, bodies.acc, i), t - bodies.since[i]))
+    return add(vector_at(period, bodies.vel, i), scale(vector_at(period, bodies.acc, i), t - bodies.since[i]))
 
 
 @kernel
-def take_off(period: Vec, bodies: Bodies, i: int, seconds: float, moved: Vec, before: Vec, after: Vec) -> None:
+def set_parabola(period: Vec, bodies: Bodies, i: int, seconds: float, moved: Vec, before: Vec, after: Vec) -> None:
     """Set up the parabola of body i for a step that moved it by `moved` m and changed its velocity."""
-    v, a, excess = flight(seconds, moved, before, after)
-    write(bodies.vel, i, v)
-    write(bodies.acc, i, a)
-    write(bodies.free, i, a)
-    write(bodies.excess, i, excess)
+    v, a, excess = parabola_of(seconds, moved, before, after)
+    write_vector(bodies.vel, i, v)
+    write_vector(bodies.acc, i, a)
+    write_vector(bodies.free, i, a)
+    write_vector(bodies.excess, i, excess)
     bodies.since[i] = 0.0
     bodies.moved[i], bodies.leans[i], bodies.first[i] = 0, 0, -1
     bodies.reach[i] = (norm(v) + 0.5 * norm(a) * seconds) * seconds
 
 
 @kernel
-def link(bodies: Bodies, meetings: Meetings, c: int) -> None:
+def add_to_lists(bodies: Bodies, meetings: Meetings, c: int) -> None:
     """Initialise a new meeting, and add it to the lists of its bodies."""
     i, j = meetings.who[c], meetings.other[c]
     meetings.hits[c], meetings.closed[c], meetings.listed[c], meetings.time[c] = 0, 0, 0, np.inf
@@ -138,20 +156,20 @@ def link(bodies: Bodies, meetings: Meetings, c: int) -> None:
 
 
 @kernel
-def relative(period: Vec, bodies: Bodies, things: Things, i: int, j: int, t: float) -> tuple[Vec, Vec, Vec]:
+def relative_motion(period: Vec, bodies: Bodies, things: Things, i: int, j: int, t: float) -> tuple[Vec, Vec, Vec]:
     """Return position, velocity and acceleration of body i relative to body j or obstacle -1 - j, at time t."""
-    x, v, a = position(period, bodies, i, t), velocity(period, bodies, i, t), vector(period, bodies.acc, i)
+    x, v, a = position(period, bodies, i, t), velocity(period, bodies, i, t), vector_at(period, bodies.acc, i)
     if j >= 0:
         x, v = sub(x, position(period, bodies, j, t)), sub(v, velocity(period, bodies, j, t))
-        a = sub(a, vector(period, bodies.acc, j))
+        a = sub(a, vector_at(period, bodies.acc, j))
     else:
-        drift = vector(period, things.drift, -1 - j)
-        x, v = sub(x, add(vector(period, things.place, -1 - j), scale(drift, t))), sub(v, drift)
-    return image(period, x), v, a
+        drift = vector_at(period, things.drift, -1 - j)
+        x, v = sub(x, add(vector_at(period, things.place, -1 - j), scale(drift, t))), sub(v, drift)
+    return nearest_image(period, x), v, a
 
 
 @kernel
-def met(bodies: Bodies, things: Things, i: int, j: int) -> tuple[int, float]:
+def contact_row(bodies: Bodies, things: Things, i: int, j: int) -> tuple[int, float]:
     """Return the row of the shape that body i may touch, and the distance of its centre at contact, m."""
     if j >= 0:
         return POINT, bodies.radius[i] + bodies.radius[j]
@@ -159,36 +177,36 @@ def met(bodies: Bodies, things: Things, i: int, j: int) -> tuple[int, float]:
 
 
 @kernel
-def gained(period: Vec, bodies: Bodies, i: int, j: int) -> float:
+def larger_acceleration(period: Vec, bodies: Bodies, i: int, j: int) -> float:
     """Return the larger free acceleration of two bodies, or that of the body if j is an obstacle, m/s^2."""
-    hard = norm(vector(period, bodies.free, i))
-    return float(max(hard, norm(vector(period, bodies.free, j))) if j >= 0 else hard)
+    hard = norm(vector_at(period, bodies.free, i))
+    return float(max(hard, norm(vector_at(period, bodies.free, j))) if j >= 0 else hard)
 
 
 @kernel
-def widened(
+def widen_reach(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, i: int, t: float, count: int
 ) -> int:
     """Enlarge the reach of body i if it may now exceed it, and add its new meetings; return the number of meetings."""
-    d = image(period, sub(position(period, bodies, i, t), vector(period, bodies.start, i)))
+    d = nearest_image(period, sub(position(period, bodies, i, t), vector_at(period, bodies.start, i)))
     left = rules.seconds - t
-    v, a = vector(period, bodies.vel, i), vector(period, bodies.acc, i)
+    v, a = vector_at(period, bodies.vel, i), vector_at(period, bodies.acc, i)
     reach = norm(d) + (norm(v) + 0.5 * norm(a) * left) * left
     if reach <= bodies.reach[i]:
         return count
     bodies.reach[i] = 1.5 * reach
     for m in range(things.row.shape[0]):
         if things.size[m] >= 0.0:
-            count = _joined(bodies, meetings, i, -1 - m, count)
+            count = _add_meeting(bodies, meetings, i, -1 - m, count)
     for j in range(bodies.living.shape[0]):
         here = rules.pairs and bodies.living[j] > 0 and j != i and bodies.light[i] + bodies.light[j] > 0.0
-        if here and near(period, bodies.start, bodies.radius, bodies.reach, i, j):
-            count = _joined(bodies, meetings, i, j, count)
+        if here and balls_overlap(period, bodies.start, bodies.radius, bodies.reach, i, j):
+            count = _add_meeting(bodies, meetings, i, j, count)
     return count
 
 
 @kernel
-def _joined(bodies: Bodies, meetings: Meetings, i: int, j: int, count: int) -> int:
+def _add_meeting(bodies: Bodies, meetings: Meetings, i: int, j: int, count: int) -> int:
     """Add the meeting of body i with body j, or obstacle -1 - j, if it is not listed; return the number of meetings."""
     who, other = (i, j) if j < 0 else (min(i, j), max(i, j))
     place = bodies.first[i]
@@ -199,5 +217,5 @@ def _joined(bodies: Bodies, meetings: Meetings, i: int, j: int, count: int) -> i
         place = meetings.following[place % 2, c]
     if count < meetings.who.shape[0]:
         meetings.who[count], meetings.other[count] = who, other
-        link(bodies, meetings, count)
+        add_to_lists(bodies, meetings, count)
     return count + 1

@@ -15,11 +15,19 @@ from flockenv.jit.decorators import Vec, kernel, law
 from flockenv.maths.approximations import round_half_even
 from flockenv.maths.vectors import dot, sub
 
-__all__ = ["image", "led", "loaded", "near", "nearby", "vector", "write"]
+__all__ = [
+    "balls_overlap",
+    "displacement_near",
+    "list_near_pairs",
+    "load_vector",
+    "nearest_image",
+    "vector_at",
+    "write_vector",
+]
 
 
 @law
-def vector(size: Vec, array: Any, i: int) -> Vec:
+def vector_at(size: Vec, array: Any, i: int) -> Vec:
     """Return row i of an array (N, D); D is the length of `size`."""
     if len(size) == 2:
         return (array[i, 0], array[i, 1])
@@ -28,14 +36,14 @@ def vector(size: Vec, array: Any, i: int) -> Vec:
 
 
 @law
-def write(array: Any, i: int, x: Vec) -> None:
+def write_vector(array: Any, i: int, x: Vec) -> None:
     """Set row i of an array (N, D)."""
     for k in range(len(x)):
         array[i, k] = x[k]
 
 
 @kernel
-def loaded(size: Vec, array: Any, b: int, i: int) -> Vec:
+def load_vector(size: Vec, array: Any, b: int, i: int) -> Vec:
     """Return the vector of agent i of world b in an array (D, B, N), in double precision; D is the length of `size`."""
     if len(size) == 2:
         return (np.float64(array[0, b, i]), np.float64(array[1, b, i]))
@@ -49,7 +57,7 @@ def _shift(d: float, period: float) -> float:
 
 
 @law
-def image(period: Vec, d: Vec) -> Vec:
+def nearest_image(period: Vec, d: Vec) -> Vec:
     """Return the shortest periodic image of an offset; a period of 0 has no images."""
     if len(d) == 2:
         return (_shift(d[0], period[0]), _shift(d[1], period[1]))
@@ -58,16 +66,16 @@ def image(period: Vec, d: Vec) -> Vec:
 
 
 @law
-def led(period: Vec, apart: Vec, guess: Vec) -> Vec:
+def displacement_near(period: Vec, apart: Vec, guess: Vec) -> Vec:
     """Return the displacement of a step whose ends are `apart`: the periodic image nearest to a guess."""
     off = sub(apart, guess)
-    return sub(apart, sub(off, image(period, off)))
+    return sub(apart, sub(off, nearest_image(period, off)))
 
 
 @kernel
-def near(period: Vec, at: Any, radius: Any, reach: Any, i: int, j: int) -> bool:
+def balls_overlap(period: Vec, at: Any, radius: Any, reach: Any, i: int, j: int) -> bool:
     """Return True if the balls of two bodies overlap."""
-    d = image(period, sub(vector(period, at, j), vector(period, at, i)))
+    d = nearest_image(period, sub(vector_at(period, at, j), vector_at(period, at, i)))
     room = radius[i] + radius[j] + reach[i] + reach[j]
     return bool(dot(d, d) <= room * room)
 
@@ -98,7 +106,7 @@ def _common_reach(living: Any, radius: Any, reach: Any, n: int, many: Any) -> fl
 
 
 @kernel
-def nearby(
+def list_near_pairs(
     period: Vec, at: Any, living: Any, radius: Any, reach: Any, n: int, grid: Any, order: Any, cell: Any, start: Any,
     offset: Any, bounds: Any, sync: Any, ranges: Any, first: Any, second: Any,
 ) -> int:  # fmt: skip
@@ -126,12 +134,12 @@ def nearby(
         for r in range(count):
             for q in range(ranges[r, 0], ranges[r, 1]):
                 if cells == 0 or order[q] > order[p]:
-                    found = _kept(period, at, radius, reach, order[p], order[q], found, first, second)
+                    found = _write_pair(period, at, radius, reach, order[p], order[q], found, first, second)
     for i in range(n):
         if living[i] > 0 and grid[i] == 0:
             for j in range(n):
                 if living[j] > 0 and j != i and (grid[j] > 0 or j > i):
-                    found = _kept(period, at, radius, reach, i, j, found, first, second)
+                    found = _write_pair(period, at, radius, reach, i, j, found, first, second)
     return found
 
 
@@ -160,9 +168,11 @@ def _arrange(grid: Any, cell: Any, offset: Any, n: int, cells: int, order: Any) 
 
 
 @kernel
-def _kept(period: Vec, at: Any, radius: Any, reach: Any, i: int, j: int, found: int, first: Any, second: Any) -> int:
+def _write_pair(
+    period: Vec, at: Any, radius: Any, reach: Any, i: int, j: int, found: int, first: Any, second: Any
+) -> int:
     """Count a pair if its balls overlap, and write it if there is room; return the number of pairs."""
-    if not near(period, at, radius, reach, i, j):
+    if not balls_overlap(period, at, radius, reach, i, j):
         return found
     if found < first.shape[0]:
         first[found], second[found] = min(i, j), max(i, j)

@@ -7,10 +7,10 @@ from typing import Any
 from flockenv.geometry.shapes.row_header import bound_of
 from flockenv.jit.decorators import Vec, kernel
 from flockenv.maths.vectors import add, dot, norm, scale, sub, zero
-from flockenv.physics.constraints.bodies import Bodies, Meetings, Rules, Things, link
-from flockenv.physics.constraints.broad_phase import image, nearby, vector
+from flockenv.physics.constraints.bodies import Bodies, Meetings, Rules, Things, add_to_lists
+from flockenv.physics.constraints.broad_phase import list_near_pairs, nearest_image, vector_at
 from flockenv.physics.constraints.contacts import NEARLY, Ends
-from flockenv.physics.constraints.impact import surface
+from flockenv.physics.constraints.impact import surface_at
 
 __all__ = ["list_meetings"]
 
@@ -29,24 +29,26 @@ def list_meetings(
     n, count = bodies.living.shape[0], 0
     where = bodies.start if ahead else ends.pos
     if ahead:
-        _reach_further(bodies)
+        _enlarge_reach(bodies)
     for i in range(n):
         bodies.first[i] = -1
         reach[i] = (bodies.reach[i] if ahead else 0.0) + (rules.touch + NEARLY * bodies.radius[i] if nearly else 0.0)
     if rules.pairs:
-        count = nearby(
+        count = list_near_pairs(
             period, where, bodies.living, bodies.radius, reach, n, grid, order, cell, start, offset, bounds, sync,
             ranges, meetings.who, meetings.other,
         )  # fmt: skip
-    count = _with_obstacles(period, bodies, meetings, things, where, reach, rules.seconds, rules.touch, ahead, count)
+    count = _add_obstacle_pairs(
+        period, bodies, meetings, things, where, reach, rules.seconds, rules.touch, ahead, count
+    )
     if count <= meetings.who.shape[0]:
         for c in range(count):
-            link(bodies, meetings, c)
+            add_to_lists(bodies, meetings, c)
     return count
 
 
 @kernel
-def _reach_further(bodies: Bodies) -> None:
+def _enlarge_reach(bodies: Bodies) -> None:
     """Enlarge the reach of all bodies, so that few that are hit leave it."""
     total, present = 0.0, 0
     for i in range(bodies.living.shape[0]):
@@ -57,7 +59,7 @@ def _reach_further(bodies: Bodies) -> None:
 
 
 @kernel
-def _with_obstacles(
+def _add_obstacle_pairs(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, at: Any, reach: Any, seconds: float, touch: float,
     ahead: bool, count: int,
 ) -> int:  # fmt: skip
@@ -66,7 +68,7 @@ def _with_obstacles(
     for m in range(things.row.shape[0]):
         if things.size[m] < 0.0:
             continue
-        drift, place = vector(period, things.drift, m), vector(period, things.place, m)
+        drift, place = vector_at(period, things.drift, m), vector_at(period, things.place, m)
         place = place if ahead else add(place, scale(drift, seconds))
         way = norm(drift) * seconds if ahead else 0.0
         bounded, middle, radius = things.row[m] >= 0, zero(period), things.size[m]
@@ -74,12 +76,12 @@ def _with_obstacles(
             middle, radius = bound_of(things.table, things.row[m], period)
         for i in range(bodies.living.shape[0]):
             if bodies.living[i] > 0 and bodies.light[i] > 0.0:
-                y = image(period, sub(vector(period, at, i), place))
+                y = nearest_image(period, sub(vector_at(period, at, i), place))
                 room = bodies.radius[i] + touch + way + reach[i]
                 off, far = sub(y, middle), radius + room
                 if bounded and not dot(off, off) <= far * far:
                     continue  # outside the bounding circle or sphere
-                gap, _ = surface(things.table, things.row[m], y)
+                gap, _ = surface_at(things.table, things.row[m], y)
                 if gap - things.size[m] <= room:
                     if count < capacity:
                         meetings.who[count], meetings.other[count] = i, -1 - m

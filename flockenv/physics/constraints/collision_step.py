@@ -9,13 +9,13 @@ import numpy as np
 from flockenv.geometry.shapes.row_header import shift_of
 from flockenv.jit.decorators import Vec, kernel
 from flockenv.maths.vectors import add, axis, dot, norm, scale, sub, zero
-from flockenv.physics.constraints.bodies import STOPPED, Bodies, Meetings, Rules, Things, take_off
-from flockenv.physics.constraints.broad_phase import led, loaded, vector, write
+from flockenv.physics.constraints.bodies import STOPPED, Bodies, Meetings, Rules, Things, set_parabola
+from flockenv.physics.constraints.broad_phase import displacement_near, load_vector, vector_at, write_vector
 from flockenv.physics.constraints.candidates import list_meetings
 from flockenv.physics.constraints.contacts import Contacts, Ends
-from flockenv.physics.constraints.continuous import goes_round, may_pass
-from flockenv.physics.constraints.event_driven import play, together
-from flockenv.physics.constraints.impact import along
+from flockenv.physics.constraints.continuous import may_meet_around, may_pass
+from flockenv.physics.constraints.event_driven import process_impacts, start_touching
+from flockenv.physics.constraints.impact import position_along
 from flockenv.physics.constraints.step_end import RAISED, settle_ends
 
 __all__ = ["COUNTED", "LOST", "collide"]
@@ -31,7 +31,7 @@ EXACT = 8 * 2.0**-52
 
 
 @kernel
-def _board(
+def _load_bodies(
     period: Vec, x0: Any, v0: Any, x: Any, v: Any, alive: Any, b: int, bodies: Bodies, ends: Ends, before: Any,
     seconds: float,
 ) -> tuple[float, float, float, Vec]:  # fmt: skip
@@ -39,19 +39,19 @@ def _board(
     far, fast, hard, mean = 0.0, 0.0, 0.0, zero(period)
     for i in range(x.shape[2]):
         bodies.living[i] = 1 if alive[b, i] else 0
-        begun, done = loaded(period, x0, b, i), loaded(period, x, b, i)
-        was, now = loaded(period, v0, b, i), loaded(period, v, b, i)
-        write(bodies.start, i, begun)
-        write(bodies.at, i, begun)
-        write(before, i, was)
-        write(ends.pos, i, done)
-        write(ends.vel, i, now)
-        moved = led(period, sub(done, begun), scale(add(was, now), 0.5 * seconds))
-        take_off(period, bodies, i, seconds, moved, was, now)
+        begun, done = load_vector(period, x0, b, i), load_vector(period, x, b, i)
+        was, now = load_vector(period, v0, b, i), load_vector(period, v, b, i)
+        write_vector(bodies.start, i, begun)
+        write_vector(bodies.at, i, begun)
+        write_vector(before, i, was)
+        write_vector(ends.pos, i, done)
+        write_vector(ends.vel, i, now)
+        moved = displacement_near(period, sub(done, begun), scale(add(was, now), 0.5 * seconds))
+        set_parabola(period, bodies, i, seconds, moved, was, now)
         if bodies.living[i] > 0 and bodies.light[i] > 0.0:
             for k in range(len(period)):
                 far = max(far, abs(begun[k]), abs(done[k]))
-            a = vector(period, bodies.acc, i)
+            a = vector_at(period, bodies.acc, i)
             fast, hard, mean = max(fast, norm(now), norm(was)), max(hard, norm(a)), add(mean, a)
     return far, fast, hard, mean
 
@@ -65,12 +65,12 @@ def _obstacles(
         if m < obstacle_radius.shape[1]:
             radius = np.float64(obstacle_radius[b, m])
             things.size[m] = radius if radius > 0.0 else -1.0
-            write(things.place, m, loaded(period, obstacle_x, b, m))
+            write_vector(things.place, m, load_vector(period, obstacle_x, b, m))
         else:
             here = shift_of(things.table, things.row[m], begun, period)
             there = shift_of(things.table, things.row[m], ended, period)
-            write(things.place, m, add(vector(period, things.anchor, m), here))
-            write(things.drift, m, scale(sub(there, here), 1.0 / (ended - begun)))
+            write_vector(things.place, m, add(vector_at(period, things.anchor, m), here))
+            write_vector(things.drift, m, scale(sub(there, here), 1.0 / (ended - begun)))
 
 
 @kernel
@@ -95,7 +95,7 @@ def collide(
     for b in range(first, end):
         impacts_before, unsolved_before = report[3], report[4]
         seconds_before, joules_before, stopped_before, raised_before = lost[0], lost[1], lost[2], lost[RAISED]
-        far, fast, hard, mean = _board(period, x0, v0, x, v, alive, b, bodies, ends, before, rules.seconds)
+        far, fast, hard, mean = _load_bodies(period, x0, v0, x, v, alive, b, bodies, ends, before, rules.seconds)
         if not (far < np.inf and fast < np.inf):
             continue
         began = (tick[b] - 1) * rules.seconds
@@ -108,9 +108,9 @@ def collide(
         ahead = in_time or passing or not once
         count = list_meetings(period, bodies, meetings, things, ends, told, reach, ahead, not in_time, scratch)
         if in_time and count <= meetings.who.shape[0]:
-            count = _fly(period, bodies, meetings, things, ends, told, before, count, report, lost)
+            count = _move_bodies(period, bodies, meetings, things, ends, told, before, count, report, lost)
         if count <= meetings.who.shape[0]:
-            round_about = goes_round(period, fast * rules.seconds)
+            round_about = may_meet_around(period, fast * rules.seconds)
             report[4] += 1 if round_about else 0
             mean = scale(mean, -1.0 / norm(mean)) if norm(mean) > 1e-9 * hard * x.shape[2] else axis(mean, 0)
             count = settle_ends(
@@ -126,47 +126,47 @@ def collide(
         work[b, at_work] += report[3] - impacts_before
         work[b, at_work + 1] += report[4] - unsolved_before
         work[b, at_work + 2] += np.int64(lost[2] - stopped_before)
-        bad = _leave(period, x, v, b, ends, bodies)
+        bad = _write_bodies(period, x, v, b, ends, bodies)
         if bad >= 0 and report[0] < 0:
             report[0], report[1] = b, bad
     return -1
 
 
 @kernel
-def _fly(
+def _move_bodies(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, before: Any, count: int,
     report: Any, lost: Any,
 ) -> int:  # fmt: skip
     """Move all bodies through the step; return the number of meetings, even if it exceeds their capacity."""
-    together(period, bodies, meetings, things, rules, count, before)
-    some, cut, count = play(period, bodies, meetings, things, rules, count, lost)
+    start_touching(period, bodies, meetings, things, rules, count, before)
+    some, cut, count = process_impacts(period, bodies, meetings, things, rules, count, lost)
     if count <= meetings.who.shape[0]:
         report[3] += some
         report[4] += cut
         for i in range(bodies.living.shape[0]):
             if bodies.moved[i] > 0:
-                _land(period, bodies, ends, i, rules.seconds)
+                _write_end(period, bodies, ends, i, rules.seconds)
     return count
 
 
 @kernel
-def _land(period: Vec, bodies: Bodies, ends: Ends, i: int, seconds: float) -> None:
+def _write_end(period: Vec, bodies: Bodies, ends: Ends, i: int, seconds: float) -> None:
     """Write the position and velocity at which the path of body i ends."""
     left = seconds - bodies.since[i]
-    v, a = vector(period, bodies.vel, i), vector(period, bodies.acc, i)
-    write(ends.pos, i, along(vector(period, bodies.at, i), v, a, left))
+    v, a = vector_at(period, bodies.vel, i), vector_at(period, bodies.acc, i)
+    write_vector(ends.pos, i, position_along(vector_at(period, bodies.at, i), v, a, left))
     now = zero(v) if bodies.moved[i] == STOPPED else add(v, scale(a, left))
-    write(ends.vel, i, add(now, vector(period, bodies.excess, i)))
+    write_vector(ends.vel, i, add(now, vector_at(period, bodies.excess, i)))
 
 
 @kernel
-def _leave(period: Vec, x: Any, v: Any, b: int, ends: Ends, bodies: Bodies) -> int:
+def _write_bodies(period: Vec, x: Any, v: Any, b: int, ends: Ends, bodies: Bodies) -> int:
     """Write all living bodies back into the batch; return the first whose state is not finite, or -1."""
     bad = -1
     for i in range(x.shape[2]):
         if bodies.living[i] == 0:
             continue
-        at, now = vector(period, ends.pos, i), vector(period, ends.vel, i)
+        at, now = vector_at(period, ends.pos, i), vector_at(period, ends.vel, i)
         if not dot(at, at) + dot(now, now) < np.inf and bad < 0:
             bad = i
         for k in range(len(period)):

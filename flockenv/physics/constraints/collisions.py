@@ -22,7 +22,7 @@ from flockenv.physics.constraints.constraint import Constraint, Settler
 from flockenv.physics.constraints.contacts import Contacts, Ends
 from flockenv.physics.constraints.impact import POINT
 from flockenv.physics.constraints.step_end import LEFT, RAISED, SUNK
-from flockenv.physics.effects.effect import ties
+from flockenv.physics.effects.effect import separation_directions
 
 __all__ = [
     "Collisions",
@@ -115,7 +115,7 @@ class _Settler:
             radius=np.asarray(body.radius, np.float64), light=light, living=np.zeros(n, np.int64),
             moved=np.zeros(n, np.int64), leans=np.zeros(n, np.int64), first=np.full(n, -1),
         )  # fmt: skip
-        self.ends = Ends(np.zeros((n, d)), np.zeros((n, d)), ties(n, d))
+        self.ends = Ends(np.zeros((n, d)), np.zeros((n, d)), separation_directions(n, d))
         self.before, self.reach = np.zeros((n, d)), np.zeros(n)
         self.query = (
             np.zeros(max(n, 64), np.int64), np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n + 1, np.int32),

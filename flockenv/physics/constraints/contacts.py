@@ -14,11 +14,20 @@ from typing import Any, NamedTuple
 
 from flockenv.jit.decorators import Vec, kernel
 from flockenv.maths.vectors import add, axis, dot, norm, scale, select, sub, unit, zero
-from flockenv.physics.constraints.bodies import RESTS, Bodies, Meetings, Things, gained, width
-from flockenv.physics.constraints.broad_phase import image, vector, write
-from flockenv.physics.constraints.impact import bounced, surface
+from flockenv.physics.constraints.bodies import RESTS, Bodies, Meetings, Things, larger_acceleration, width
+from flockenv.physics.constraints.broad_phase import nearest_image, vector_at, write_vector
+from flockenv.physics.constraints.impact import bounce, surface_at
 
-__all__ = ["NEARLY", "Contacts", "Ends", "deepest", "gather", "impacts", "part", "press"]
+__all__ = [
+    "NEARLY",
+    "Contacts",
+    "Ends",
+    "deepest_overlap",
+    "gather_contacts",
+    "move_apart",
+    "resolve_impacts",
+    "stop_approach",
+]
 
 
 NEARLY = 0.1
@@ -57,28 +66,28 @@ def _normal(
 
     pos (N, D) m: places `seconds` after the beginning of the step.
     """
-    x = vector(period, pos, i)
+    x = vector_at(period, pos, i)
     if j >= 0:
-        d = image(period, sub(x, vector(period, pos, j)))
+        d = nearest_image(period, sub(x, vector_at(period, pos, j)))
         far = norm(d)
-        aside = unit(sub(vector(period, ends.tie, i), vector(period, ends.tie, j)))
+        aside = unit(sub(vector_at(period, ends.tie, i), vector_at(period, ends.tie, j)))
         aside = select(dot(aside, aside) > 0.0, aside, axis(d, 0))
         return far - bodies.radius[i] - bodies.radius[j], select(far > 0.0, unit(d), aside)
     m = -1 - j
-    place = add(vector(period, things.place, m), scale(vector(period, things.drift, m), seconds))
-    gap, n = surface(things.table, things.row[m], image(period, sub(x, place)))
+    place = add(vector_at(period, things.place, m), scale(vector_at(period, things.drift, m), seconds))
+    gap, n = surface_at(things.table, things.row[m], nearest_image(period, sub(x, place)))
     return gap - bodies.radius[i] - things.size[m], n
 
 
 @kernel
-def _seen(period: Vec, things: Things, vel: Any, i: int, j: int) -> Vec:
+def _relative_velocity(period: Vec, things: Things, vel: Any, i: int, j: int) -> Vec:
     """Return the velocity of a body relative to another, or to an obstacle."""
-    v = vector(period, vel, i)
-    return sub(v, vector(period, vel, j)) if j >= 0 else sub(v, vector(period, things.drift, -1 - j))
+    v = vector_at(period, vel, i)
+    return sub(v, vector_at(period, vel, j)) if j >= 0 else sub(v, vector_at(period, things.drift, -1 - j))
 
 
 @kernel
-def gather(
+def gather_contacts(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, contacts: Contacts, seconds: float,
     up: Vec, touch: float, slow: float, restitution: float, in_time: bool, passing: bool, count: int,
 ) -> int:  # fmt: skip
@@ -103,18 +112,23 @@ def gather(
             n = select(passed, first, n)
         if (gap <= margin and not (passing and gap < -margin)) or passed:  # a body from afar stops on its path
             contacts.who[found], contacts.other[found] = i, j
-            w = -dot(_seen(period, things, ends.vel, i, j), n)
+            w = -dot(_relative_velocity(period, things, ends.vel, i, j), n)
             heap = restitution < 1.0 if j >= 0 else bodies.leans[i] > 0
-            later = w > gained(period, bodies, i, j) * seconds if heap else gap > touch or w > slow
+            later = w > larger_acceleration(period, bodies, i, j) * seconds if heap else gap > touch or w > slow
             resting = gap <= touch and meetings.closed[c] == RESTS
             contacts.open[found] = 1 if in_time and later and not resting else 0
             contacts.allowed[found] = max(gap, 0.0) / seconds if gap > touch else 0.0
             if not in_time:
-                going = _moved(period, bodies, ends, i)
-                going = sub(going, _moved(period, bodies, ends, j) if j >= 0 else _drifted(period, things, j, seconds))
+                going = _displacement(period, bodies, ends, i)
+                going = sub(
+                    going,
+                    _displacement(period, bodies, ends, j)
+                    if j >= 0
+                    else _obstacle_displacement(period, things, j, seconds),
+                )
                 contacts.allowed[found] = max(begun if passed else gap - dot(going, n), 0.0) / seconds
-            write(contacts.normal, found, n)
-            middle = sub(vector(period, ends.pos, i), scale(n, bodies.radius[i]))
+            write_vector(contacts.normal, found, n)
+            middle = sub(vector_at(period, ends.pos, i), scale(n, bodies.radius[i]))
             contacts.rank[found] = dot(middle, up)
             contacts.order[found] = found
             found += 1
@@ -125,21 +139,21 @@ def gather(
 @kernel
 def _far_apart(period: Vec, bodies: Bodies, ends: Ends, i: int, j: int, margin: float) -> bool:
     """Return True if two bodies are further apart than a margin, m, at the end of a step; without a square root."""
-    d = image(period, sub(vector(period, ends.pos, i), vector(period, ends.pos, j)))
+    d = nearest_image(period, sub(vector_at(period, ends.pos, i), vector_at(period, ends.pos, j)))
     room = 1.000001 * (bodies.radius[i] + bodies.radius[j] + margin)
     return bool(dot(d, d) > room * room)
 
 
 @kernel
-def _moved(period: Vec, bodies: Bodies, ends: Ends, i: int) -> Vec:
+def _displacement(period: Vec, bodies: Bodies, ends: Ends, i: int) -> Vec:
     """Return the displacement of a body in the step, m."""
-    return image(period, sub(vector(period, ends.pos, i), vector(period, bodies.start, i)))
+    return nearest_image(period, sub(vector_at(period, ends.pos, i), vector_at(period, bodies.start, i)))
 
 
 @kernel
-def _drifted(period: Vec, things: Things, j: int, seconds: float) -> Vec:
+def _obstacle_displacement(period: Vec, things: Things, j: int, seconds: float) -> Vec:
     """Return the displacement of obstacle -1 - j in the step, m."""
-    return scale(vector(period, things.drift, -1 - j), seconds)
+    return scale(vector_at(period, things.drift, -1 - j), seconds)
 
 
 @kernel
@@ -165,21 +179,21 @@ def _sort(rank: Any, order: Any, count: int) -> None:
 
 
 @kernel
-def _give(period: Vec, bodies: Bodies, vel: Any, i: int, j: int, impulse: Vec) -> None:
+def _apply_impulse(period: Vec, bodies: Bodies, vel: Any, i: int, j: int, impulse: Vec) -> None:
     """Apply an impulse to a body, and the opposite to the other."""
-    write(vel, i, add(vector(period, vel, i), scale(impulse, bodies.light[i])))
+    write_vector(vel, i, add(vector_at(period, vel, i), scale(impulse, bodies.light[i])))
     if j >= 0:
-        write(vel, j, sub(vector(period, vel, j), scale(impulse, bodies.light[j])))
+        write_vector(vel, j, sub(vector_at(period, vel, j), scale(impulse, bodies.light[j])))
 
 
 @kernel
-def _ease(bodies: Bodies, i: int, j: int) -> float:
+def _inverse_reduced_mass(bodies: Bodies, i: int, j: int) -> float:
     """Return the inverse reduced mass of a pair, 1/kg: the change of relative velocity per impulse."""
     return float(bodies.light[i] + (bodies.light[j] if j >= 0 else 0.0))
 
 
 @kernel
-def impacts(
+def resolve_impacts(
     period: Vec, bodies: Bodies, things: Things, contacts: Contacts, vel: Any, restitution: float, friction: float,
     sticky: bool, rounds: int, slow: float, count: int,
 ) -> tuple[int, int]:  # fmt: skip
@@ -193,20 +207,23 @@ def impacts(
         some = 0
         for k in range(count):
             c = contacts.order[k if turn % 2 == 0 else count - 1 - k]
-            i, j, n = contacts.who[c], contacts.other[c], vector(period, contacts.normal, c)
-            ease = _ease(bodies, i, j)
-            v = _seen(period, things, vel, i, j)
+            i, j, n = contacts.who[c], contacts.other[c], vector_at(period, contacts.normal, c)
+            ease = _inverse_reduced_mass(bodies, i, j)
+            v = _relative_velocity(period, things, vel, i, j)
             if ease > 0.0 and contacts.open[c] == 0 and -dot(v, n) > slow + contacts.allowed[c]:
                 e = restitution if j >= 0 else things.restitution[-1 - j]
-                change = scale(v, -1.0) if sticky else sub(bounced(v, n, e, friction), v)
-                _give(period, bodies, vel, i, j, scale(change, 1.0 / ease))
+                change = scale(v, -1.0) if sticky else sub(bounce(v, n, e, friction), v)
+                _apply_impulse(period, bodies, vel, i, j, scale(change, 1.0 / ease))
                 some += 1
         done += some
         if some == 0:
             return done, 0
     if rounds > 1:
         for c in range(count):
-            w = -dot(_seen(period, things, vel, contacts.who[c], contacts.other[c]), vector(period, contacts.normal, c))
+            w = -dot(
+                _relative_velocity(period, things, vel, contacts.who[c], contacts.other[c]),
+                vector_at(period, contacts.normal, c),
+            )
             if w > slow + contacts.allowed[c]:
                 contacts.open[c] = 1
                 left += 1
@@ -214,7 +231,7 @@ def impacts(
 
 
 @kernel
-def _press_once(
+def _stop_approach_once(
     period: Vec, bodies: Bodies, things: Things, contacts: Contacts, vel: Any, friction: float, sticky: bool, up: bool,
     count: int,
 ) -> tuple[float, float]:  # fmt: skip
@@ -222,15 +239,15 @@ def _press_once(
     worst, square = 0.0, 0.0
     for k in range(count):
         c = contacts.order[k if up else count - 1 - k]
-        i, j, n = contacts.who[c], contacts.other[c], vector(period, contacts.normal, c)
-        ease = _ease(bodies, i, j)
+        i, j, n = contacts.who[c], contacts.other[c], vector_at(period, contacts.normal, c)
+        ease = _inverse_reduced_mass(bodies, i, j)
         if ease == 0.0 or contacts.open[c] > 0:
             continue
-        v = _seen(period, things, vel, i, j)
+        v = _relative_velocity(period, things, vel, i, j)
         if sticky:
             impulse = scale(v, -1.0 / ease)
-            write(contacts.rub, c, add(vector(period, contacts.rub, c), impulse))
-            _give(period, bodies, vel, i, j, impulse)
+            write_vector(contacts.rub, c, add(vector_at(period, contacts.rub, c), impulse))
+            _apply_impulse(period, bodies, vel, i, j, impulse)
             worst = max(worst, norm(v))
             square += dot(impulse, impulse)
             continue
@@ -240,20 +257,20 @@ def _press_once(
         impulse = scale(n, given)
         if friction > 0.0:
             v = add(v, scale(impulse, ease))
-            before = vector(period, contacts.rub, c)
+            before = vector_at(period, contacts.rub, c)
             rub = sub(before, scale(sub(v, scale(n, dot(v, n))), 1.0 / ease))
             size = norm(rub)
             rub = scale(rub, friction * total / size if size > friction * total else 1.0)
-            write(contacts.rub, c, rub)
+            write_vector(contacts.rub, c, rub)
             impulse = add(impulse, sub(rub, before))
-        _give(period, bodies, vel, i, j, impulse)
+        _apply_impulse(period, bodies, vel, i, j, impulse)
         worst = max(worst, norm(impulse) * ease)
         square += dot(impulse, impulse)
     return worst, square
 
 
 @kernel
-def press(
+def stop_approach(
     period: Vec, bodies: Bodies, things: Things, contacts: Contacts, vel: Any, friction: float, sticky: bool,
     rounds: int, slow: float, count: int,
 ) -> float:  # fmt: skip
@@ -266,7 +283,7 @@ def press(
     """
     for c in range(count):
         contacts.push[c] = 0.0
-        write(contacts.rub, c, zero(period))
+        write_vector(contacts.rub, c, zero(period))
         for k in range(len(period)):
             contacts.way[c, k] = 0.0
         contacts.way[c, len(period)] = 0.0
@@ -276,7 +293,9 @@ def press(
             contacts.was[c, len(period)] = contacts.push[c]
             for k in range(len(period)):
                 contacts.was[c, k] = contacts.rub[c, k]
-        worst, square = _press_once(period, bodies, things, contacts, vel, friction, sticky, turn % 2 == 0, count)
+        worst, square = _stop_approach_once(
+            period, bodies, things, contacts, vel, friction, sticky, turn % 2 == 0, count
+        )
         if worst <= slow or turn == rounds - 1:
             break
         share = square / before if turn > 0 and square < before else 0.0
@@ -290,16 +309,16 @@ def press(
             if share > 0.0 and contacts.open[c] == 0:
                 more = contacts.was[c, len(period)]
                 contacts.push[c] += more
-                impulse = scale(vector(period, contacts.normal, c), more)
+                impulse = scale(vector_at(period, contacts.normal, c), more)
                 for k in range(len(period)):
                     contacts.rub[c, k] += contacts.was[c, k]
-                impulse = add(impulse, vector(period, contacts.was, c))
-                _give(period, bodies, vel, contacts.who[c], contacts.other[c], impulse)
+                impulse = add(impulse, vector_at(period, contacts.was, c))
+                _apply_impulse(period, bodies, vel, contacts.who[c], contacts.other[c], impulse)
     return worst
 
 
 @kernel
-def part(
+def move_apart(
     period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: float, rounds: int, touch: float, most: float,
     contacts: Contacts, count: int,
 ) -> float:  # fmt: skip
@@ -317,13 +336,13 @@ def part(
             c = contacts.order[k if turn % 2 == 0 else count - 1 - k]
             i, j = contacts.who[c], contacts.other[c]
             gap, n = _normal(period, bodies, things, ends.pos, ends, seconds, i, j)
-            if gap < 0.0 and _ease(bodies, i, j) > 0.0:
+            if gap < 0.0 and _inverse_reduced_mass(bodies, i, j) > 0.0:
                 far = min(-gap, most - contacts.push[c])
                 contacts.push[c] += far
                 share = _share(bodies, i, j, 2 * turn >= rounds and turn > 0)
-                write(ends.pos, i, add(vector(period, ends.pos, i), scale(n, far * share)))
+                write_vector(ends.pos, i, add(vector_at(period, ends.pos, i), scale(n, far * share)))
                 if j >= 0:
-                    write(ends.pos, j, sub(vector(period, ends.pos, j), scale(n, far * (1.0 - share))))
+                    write_vector(ends.pos, j, sub(vector_at(period, ends.pos, j), scale(n, far * (1.0 - share))))
                 worst = max(worst, far)
         if worst <= touch:
             break
@@ -331,7 +350,7 @@ def part(
 
 
 @kernel
-def deepest(
+def deepest_overlap(
     period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: float, who: Any, other: Any, count: int
 ) -> float:
     """Return the deepest overlap of these pairs at the end of a step, as a part of the smaller radius.
@@ -342,7 +361,7 @@ def deepest(
     for c in range(count):
         i, j = who[c], other[c]
         gap, _ = _normal(period, bodies, things, ends.pos, ends, seconds, i, j)
-        if gap < 0.0 and _ease(bodies, i, j) > 0.0:
+        if gap < 0.0 and _inverse_reduced_mass(bodies, i, j) > 0.0:
             deep = max(deep, -gap / max(width(bodies, i, j), 1e-300))
     return deep
 

@@ -20,18 +20,18 @@ from flockenv.physics.constraints.bodies import (
     Meetings,
     Rules,
     Things,
-    link,
-    met,
-    relative,
-    widened,
+    add_to_lists,
+    contact_row,
+    relative_motion,
+    widen_reach,
     width,
 )
-from flockenv.physics.constraints.broad_phase import led, vector, write
+from flockenv.physics.constraints.broad_phase import displacement_near, vector_at, write_vector
 from flockenv.physics.constraints.contacts import Ends
-from flockenv.physics.constraints.event_driven import play
-from flockenv.physics.constraints.impact import surface
+from flockenv.physics.constraints.event_driven import process_impacts
+from flockenv.physics.constraints.impact import surface_at
 
-__all__ = ["goes_round", "may_pass", "stop_on_the_way", "take_aim"]
+__all__ = ["may_meet_around", "may_pass", "set_reach", "stop_on_path"]
 
 SLOW = 0.75
 """Part of its radius that a body may move in a step without passing what it touches."""
@@ -41,7 +41,7 @@ LOST = 0.5
 
 
 @kernel
-def goes_round(period: Vec, path: float) -> bool:
+def may_meet_around(period: Vec, path: float) -> bool:
     """Return True if two bodies whose paths are `path` m long may meet where they are not nearest images."""
     least = np.inf
     for k in range(len(period)):
@@ -57,7 +57,7 @@ def may_pass(period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: f
     """
     drift = 0.0
     for m in range(things.row.shape[0]):
-        drift = max(drift, norm(vector(period, things.drift, m)) if things.size[m] >= 0.0 else 0.0)
+        drift = max(drift, norm(vector_at(period, things.drift, m)) if things.size[m] >= 0.0 else 0.0)
     for i in range(bodies.living.shape[0]):
         if bodies.living[i] > 0 and bodies.light[i] > 0.0:
             moved = norm(_path(period, bodies, ends, i, seconds)) if turned else bodies.reach[i]
@@ -67,7 +67,7 @@ def may_pass(period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: f
 
 
 @kernel
-def take_aim(period: Vec, bodies: Bodies, ends: Ends, seconds: float) -> None:
+def set_reach(period: Vec, bodies: Bodies, ends: Ends, seconds: float) -> None:
     """Set the reach of each body to the distance from the beginning to the end of its step."""
     for i in range(bodies.living.shape[0]):
         bodies.reach[i] = norm(_path(period, bodies, ends, i, seconds))
@@ -76,12 +76,12 @@ def take_aim(period: Vec, bodies: Bodies, ends: Ends, seconds: float) -> None:
 @kernel
 def _path(period: Vec, bodies: Bodies, ends: Ends, i: int, seconds: float) -> Vec:
     """Return the vector from the beginning to the end of the step of body i, m."""
-    apart = sub(vector(period, ends.pos, i), vector(period, bodies.start, i))
-    return led(period, apart, scale(vector(period, ends.vel, i), seconds))
+    apart = sub(vector_at(period, ends.pos, i), vector_at(period, bodies.start, i))
+    return displacement_near(period, apart, scale(vector_at(period, ends.vel, i), seconds))
 
 
 @kernel
-def stop_on_the_way(
+def stop_on_path(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, strict: bool, count: int,
     lost: Any,
 ) -> int:  # fmt: skip
@@ -94,25 +94,25 @@ def stop_on_the_way(
     n, seconds, known = bodies.living.shape[0], rules.seconds, count
     for i in range(n):
         if strict and bodies.moved[i] == STOPPED:  # its velocity is already what it is where it stopped
-            write(bodies.free, i, zero(period))
+            write_vector(bodies.free, i, zero(period))
         straight = scale(_path(period, bodies, ends, i, seconds), 1.0 / seconds)
-        write(bodies.at, i, vector(period, bodies.start, i))
-        write(bodies.vel, i, straight)
-        write(bodies.acc, i, zero(period))
-        write(bodies.excess, i, sub(vector(period, ends.vel, i), straight))
+        write_vector(bodies.at, i, vector_at(period, bodies.start, i))
+        write_vector(bodies.vel, i, straight)
+        write_vector(bodies.acc, i, zero(period))
+        write_vector(bodies.excess, i, sub(vector_at(period, ends.vel, i), straight))
         bodies.since[i], bodies.moved[i], bodies.first[i] = 0.0, 0, -1
     for c in range(known):
-        link(bodies, meetings, c)
+        add_to_lists(bodies, meetings, c)
     for i in range(n):
         if bodies.living[i] > 0 and bodies.light[i] > 0.0:
-            count = widened(period, bodies, meetings, things, rules, i, 0.0, count)
+            count = widen_reach(period, bodies, meetings, things, rules, i, 0.0, count)
     if count > meetings.who.shape[0]:
         return count
     for c in range(count):
         i, j = meetings.who[c], meetings.other[c]
-        y, _, _ = relative(period, bodies, things, i, j, 0.0)
-        row, room = met(bodies, things, i, j)
-        begun = surface(things.table, row, y)[0] - room
+        y, _, _ = relative_motion(period, bodies, things, i, j, 0.0)
+        row, room = contact_row(bodies, things, i, j)
+        begun = surface_at(things.table, row, y)[0] - room
         if strict:
             wide = width(bodies, i, j)
             meetings.deep[c] = max(DEEP * wide, -begun) + 10.0 * rules.touch
@@ -122,16 +122,16 @@ def stop_on_the_way(
         # the surface, or separation would lift it out
         near = max(DEEP * width(bodies, i, j) - max(begun, 0.0), 0.0)
         meetings.deep[c] = near + 10.0 * rules.touch + max(-begun, 0.0)
-    _, _, count = play(period, bodies, meetings, things, rules, count, lost)
+    _, _, count = process_impacts(period, bodies, meetings, things, rules, count, lost)
     if count <= meetings.who.shape[0]:
         for i in range(n):
             if bodies.moved[i] == STOPPED:
-                _end(period, bodies, ends, i, seconds)
+                _write_stop(period, bodies, ends, i, seconds)
     return count
 
 
 @kernel
-def _end(period: Vec, bodies: Bodies, ends: Ends, i: int, seconds: float) -> None:
+def _write_stop(period: Vec, bodies: Bodies, ends: Ends, i: int, seconds: float) -> None:
     """Write the place where body i stopped, or to which an obstacle pushed it, and its velocity."""
     left = seconds - bodies.since[i]
     for k in range(len(period)):

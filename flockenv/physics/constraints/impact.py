@@ -17,8 +17,15 @@ from flockenv.jit.decorators import Vec, kernel, law, routine
 from flockenv.maths.vectors import add, axis, dot, norm, scale, select, sub, unit
 
 __all__ = [
-    "POINT", "along", "bounced", "ends_here", "first_impact", "flight", "hops_in_touch", "rubbed",
-    "surface",
+    "POINT",
+    "bounce",
+    "comes_to_rest",
+    "first_impact",
+    "hops_within",
+    "parabola_of",
+    "position_along",
+    "slow_by_friction",
+    "surface_at",
 ]  # fmt: skip
 
 POINT = -1
@@ -32,7 +39,7 @@ POLISH = 40
 
 
 @routine
-def surface(table: Any, at: int, y: Vec) -> tuple[float, Vec]:
+def surface_at(table: Any, at: int, y: Vec) -> tuple[float, Vec]:
     """Return the distance to the surface of a shape or a point, m, and the unit normal there, from y relative to it."""
     if at >= 0:
         return nearest_shape(table, at, y)
@@ -41,7 +48,7 @@ def surface(table: Any, at: int, y: Vec) -> tuple[float, Vec]:
 
 
 @routine
-def _hit(table: Any, at: int, y: Vec, way: Vec, room: float) -> float:
+def _ray_hit(table: Any, at: int, y: Vec, way: Vec, room: float) -> float:
     """Return the distance along the unit vector `way` after which a body of radius `room` touches, m."""
     if at >= 0:
         return hit_shape(table, at, y, way, room)
@@ -49,13 +56,13 @@ def _hit(table: Any, at: int, y: Vec, way: Vec, room: float) -> float:
 
 
 @law
-def along(x: Vec, v: Vec, a: Vec, t: float) -> Vec:
+def position_along(x: Vec, v: Vec, a: Vec, t: float) -> Vec:
     """Return x + v t + a t^2 / 2."""
     return add(x, scale(add(v, scale(a, 0.5 * t)), t))
 
 
 @law
-def flight(dt: float, moved: Vec, before: Vec, after: Vec) -> tuple[Vec, Vec, Vec]:
+def parabola_of(dt: float, moved: Vec, before: Vec, after: Vec) -> tuple[Vec, Vec, Vec]:
     """Return the velocity at the beginning of a step, the acceleration, and the method's excess of velocity at its end.
 
     The parabola leads `moved` m further in a step over which the method changed velocity from `before` to `after`. A
@@ -68,7 +75,7 @@ def flight(dt: float, moved: Vec, before: Vec, after: Vec) -> tuple[Vec, Vec, Ve
 
 
 @law
-def _starts(w: float, a: float, far: float, touch: float) -> float:
+def _earliest_contact(w: float, a: float, far: float, touch: float) -> float:
     """Return the time from which a body that touches already may touch anew: 0 = now, inf = never.
 
     w, a: velocity and acceleration along the outward normal. A motion that goes in by less than half of `touch` until
@@ -88,25 +95,25 @@ def first_impact(table: Any, at: int, y: Vec, v: Vec, a: Vec, far: float, room: 
     hundredth of the room. Each chord is followed exactly; where one hits, the time is refined on the parabola. A body
     that overlaps already and goes in deeper touches now; one that leaves touches only where it comes back.
     """
-    gap, n = surface(table, at, y)
+    gap, n = surface_at(table, at, y)
     if gap - room > touch:
         if gap - room > (norm(v) + 0.5 * norm(a) * far) * far + touch:
             return np.inf  # it does not come that far
-        return _followed(table, at, y, v, a, 0.0, far, room, room, touch)
-    top = _starts(dot(v, n), dot(a, n), far, touch)
+        return _follow_path(table, at, y, v, a, 0.0, far, room, room, touch)
+    top = _earliest_contact(dot(v, n), dot(a, n), far, touch)
     if top <= 0.0:
         return 0.0
     away = min(top, far)  # until then it leaves the surface that it touches, but may hit another part of the same shape
-    t = _followed(table, at, y, v, a, 0.0, away, room, gap - 1e-9 * room - touch, touch)
+    t = _follow_path(table, at, y, v, a, 0.0, away, room, gap - 1e-9 * room - touch, touch)
     if t < np.inf or top >= far:
         return t
-    if surface(table, at, along(y, v, a, top))[0] - room <= touch:  # it never got away
+    if surface_at(table, at, position_along(y, v, a, top))[0] - room <= touch:  # it never got away
         return min(2.0 * top, far)
-    return _followed(table, at, y, v, a, top, far, room, room, touch)
+    return _follow_path(table, at, y, v, a, top, far, room, room, touch)
 
 
 @routine
-def _followed(
+def _follow_path(
     table: Any, at: int, y: Vec, v: Vec, a: Vec, begin: float, far: float, room: float, seen: float,
     touch: float,
 ) -> float:  # fmt: skip
@@ -116,20 +123,20 @@ def _followed(
     each = (far - begin) / chords
     for c in range(chords):
         since = begin + c * each
-        here = along(y, v, a, since)
-        way = sub(along(y, v, a, since + each), here)
+        here = position_along(y, v, a, since)
+        way = sub(position_along(y, v, a, since + each), here)
         length = norm(way)
-        hit = _hit(table, at, here, unit(way), max(seen, 0.0)) if length > 0.0 else np.inf
+        hit = _ray_hit(table, at, here, unit(way), max(seen, 0.0)) if length > 0.0 else np.inf
         if hit <= length:
-            t = _polished(table, at, y, v, a, since, since + each, room, since + each * hit / length)
-            gap, n = surface(table, at, along(y, v, a, t))
+            t = _refine_time(table, at, y, v, a, since, since + each, room, since + each * hit / length)
+            gap, n = surface_at(table, at, position_along(y, v, a, t))
             if gap - room <= touch + 1e-9 * room and dot(add(v, scale(a, t)), n) < 0.0:
                 return t
     return np.inf
 
 
 @kernel
-def _polished(
+def _refine_time(
     table: Any, at: int, y: Vec, v: Vec, a: Vec, early: float, late: float, room: float, t: float
 ) -> float:  # fmt: skip
     """Return the time near t, within [early, late], at which the surface is reached, by a safeguarded Newton's method.
@@ -137,9 +144,9 @@ def _polished(
     If the body is beyond the surface at `late`, bisection replaces each Newton step that leaves the bracket: a chord
     may hit while the body still rises.
     """
-    through = surface(table, at, along(y, v, a, late))[0] < room
+    through = surface_at(table, at, position_along(y, v, a, late))[0] < room
     for _ in range(POLISH):
-        gap, n = surface(table, at, along(y, v, a, t))
+        gap, n = surface_at(table, at, position_along(y, v, a, t))
         off, w = gap - room, dot(add(v, scale(a, t)), n)
         if off > 0.0:
             early = t
@@ -158,7 +165,7 @@ def _polished(
 
 
 @law
-def bounced(c: Vec, n: Vec, restitution: float, friction: float) -> Vec:
+def bounce(c: Vec, n: Vec, restitution: float, friction: float) -> Vec:
     """Return the velocity after an impact at velocity c relative to a surface of normal n; c if it does not approach.
 
     The normal part is reversed and multiplied by `restitution`. Coulomb friction reduces the tangential part by at most
@@ -168,24 +175,24 @@ def bounced(c: Vec, n: Vec, restitution: float, friction: float) -> Vec:
     if w <= 0.0:
         return c
     side = add(c, scale(n, w))
-    return add(rubbed(side, friction * (1.0 + restitution) * w), scale(n, restitution * w))
+    return add(slow_by_friction(side, friction * (1.0 + restitution) * w), scale(n, restitution * w))
 
 
 @law
-def rubbed(side: Vec, most: float) -> Vec:
+def slow_by_friction(side: Vec, most: float) -> Vec:
     """Return a velocity along a surface, reduced by `most` m/s, and zero if it is slower than that."""
     speed = norm(side)
     return scale(side, 1.0 - most / speed if speed > most else 0.0)
 
 
 @law
-def hops_in_touch(w: float, push: float, touch: float) -> bool:
+def hops_within(w: float, push: float, touch: float) -> bool:
     """Return True if a body that comes at w, m/s, hops at most `touch`, m, high under an acceleration `push` < 0."""
     return push < 0.0 and w * w <= -2.0 * push * touch
 
 
 @law
-def ends_here(w: float, push: float, restitution: float, left: float) -> bool:
+def comes_to_rest(w: float, push: float, restitution: float, left: float) -> bool:
     """Return True if all further bounces on a plane end within `left` s, each at `restitution` = e times the speed.
 
     A body that comes at w > 0 and is accelerated by `push` < 0 into the plane bounces 2 e w / (-push (1 - e)) s long.

@@ -19,7 +19,7 @@ from flockenv.model.scene_view import SceneView
 from flockenv.model.state import Floats, State
 from flockenv.physics.constraints.constraint import Constraint, Settler
 
-__all__ = ["Rods", "hold"]
+__all__ = ["Rods", "hold_rods"]
 
 Number = Annotated[int, Field(ge=0, strict=True)]
 Pair = tuple[Number, Number]
@@ -32,7 +32,7 @@ POWERS, LEAST = 50, 1e-9
 """Steps of inverse iteration that estimate it, and a shift of the matrix, which redundant rods make singular."""
 
 
-class Ties(NamedTuple):
+class RodPairs(NamedTuple):
     """R pairs of agents that are held together, in layers; each agent is at most once in a layer."""
 
     i: NDArray[np.int32]  # (R,)
@@ -64,7 +64,7 @@ class Hold(NamedTuple):
 
 
 @kernel
-def _to(x: Any, b: int, i: int, j: int, period: Any, way: Any) -> float:
+def _offset_to(x: Any, b: int, i: int, j: int, period: Any, way: Any) -> float:
     """Write the offset from agent i to agent j, the shortest one on a torus; return its length."""
     square = like(way[0], 0.0)
     for k in range(x.shape[0]):
@@ -77,7 +77,7 @@ def _to(x: Any, b: int, i: int, j: int, period: Any, way: Any) -> float:
 
 
 @kernel
-def _sum(a: Any, b: Any) -> float:
+def _dot(a: Any, b: Any) -> float:
     """Return a . b."""
     total = like(a[0], 0.0)
     for k in range(a.shape[0]):
@@ -86,7 +86,7 @@ def _sum(a: Any, b: Any) -> float:
 
 
 @kernel
-def _push(x: Any, b: int, rods: Any, r: int, by: float) -> None:
+def _add_along(x: Any, b: int, rods: Any, r: int, by: float) -> None:
     """Add `by` times weight times direction to x of one end of a rod, and subtract it from x of the other."""
     i, j = rods.i[r], rods.j[r]
     for k in range(x.shape[0]):
@@ -95,11 +95,11 @@ def _push(x: Any, b: int, rods: Any, r: int, by: float) -> None:
 
 
 @kernel
-def _begin(x0: Any, x: Any, b: int, rods: Any) -> None:
+def _write_offsets(x0: Any, x: Any, b: int, rods: Any) -> None:
     """Write each rod's offset before the step, and its allowed error: at least the rounding error of positions."""
     for r in range(rods.i.shape[0]):
         i, j = rods.i[r], rods.j[r]
-        rods.before[r] = _to(x0, b, i, j, rods.period, rods.old[r])
+        rods.before[r] = _offset_to(x0, b, i, j, rods.period, rods.old[r])
         most = like(rods.per_dt, 0.0)
         for k in range(x.shape[0]):
             most = max(most, max(abs(x[k, b, i]), abs(x[k, b, j])))
@@ -107,14 +107,14 @@ def _begin(x0: Any, x: Any, b: int, rods: Any) -> None:
 
 
 @kernel
-def _moves(alive: Any, b: int, rods: Any, r: int) -> bool:
+def _can_move(alive: Any, b: int, rods: Any, r: int) -> bool:
     """Return True if both ends of a rod are alive, and at least one of them can move."""
     i, j = rods.i[r], rods.j[r]
     return alive[b, i] and alive[b, j] and rods.weight[i] + rods.weight[j] > 0  # type: ignore[no-any-return]
 
 
 @kernel
-def _sooner(over: float, rho: float, sweep: int) -> float:
+def _next_relaxation(over: float, rho: float, sweep: int) -> float:
     """Return the over-relaxation of the next sweep: Chebyshev's sequence from 1 to Young's 2 / (1 + sqrt(1 - rho^2)).
 
     (Golub and Varga 1961.) Errors do not grow meanwhile, as they do if the first sweep uses the final value.
@@ -124,7 +124,7 @@ def _sooner(over: float, rho: float, sweep: int) -> float:
 
 
 @kernel
-def _aim(rods: Any, r: int) -> float:
+def _target_length(rods: Any, r: int) -> float:
     """Return the target length of a rod in the stage that also changes velocities: its old length if that was wrong."""
     aim, before, allowed = rods.length[r], rods.before[r], rods.allowed[r]
     if before > aim + allowed or (before < aim - allowed and not rods.slack):
@@ -133,14 +133,14 @@ def _aim(rods: Any, r: int) -> float:
 
 
 @kernel
-def _turned(rods: Any, r: int, now: float, carry: bool) -> float:
+def _write_direction(rods: Any, r: int, now: float, carry: bool) -> float:
     """Write the direction in which a rod acts, and return way . along, > 0.
 
     With `carry` it is that before the step. Without, or if the rod has turned too far since, it is the current one.
     """
     o = like(now, 0.0)
     if carry:
-        cosine = _sum(rods.way, rods.old[r])
+        cosine = _dot(rods.way, rods.old[r])
         if cosine > like(o, 0.3) * now * rods.before[r]:
             for k in range(rods.way.shape[0]):
                 rods.along[k] = rods.old[r, k]
@@ -154,34 +154,34 @@ def _turned(rods: Any, r: int, now: float, carry: bool) -> float:
 
 
 @kernel
-def _longer(x: Any, v: Any, b: int, rods: Any, r: int, over: float, carry: bool) -> tuple[float, bool]:
+def _correct_length(x: Any, v: Any, b: int, rods: Any, r: int, over: float, carry: bool) -> tuple[float, bool]:
     """Move the ends of a rod to its target length; return its relative error, and whether that exceeds the tolerance.
 
     With `carry` velocities change by the change of positions per time step.
     """
-    o, aim = like(over, 0.0), _aim(rods, r) if carry else rods.length[r]
-    now = _to(x, b, rods.i[r], rods.j[r], rods.period, rods.way)
+    o, aim = like(over, 0.0), _target_length(rods, r) if carry else rods.length[r]
+    now = _offset_to(x, b, rods.i[r], rods.j[r], rods.period, rods.way)
     if rods.slack and now <= aim and rods.pull[r] <= o:
         return o, False
-    cosine, w = _turned(rods, r, now, carry), rods.weight[rods.i[r]] + rods.weight[rods.j[r]]
+    cosine, w = _write_direction(rods, r, now, carry), rods.weight[rods.i[r]] + rods.weight[rods.j[r]]
     by = over * (now * now - aim * aim) / (like(o, 2.0) * w * cosine)
     if rods.slack:
         by = max(by, -rods.pull[r])
     rods.pull[r] += by
-    _push(x, b, rods, r, by)
+    _add_along(x, b, rods, r, by)
     if carry:
-        _push(v, b, rods, r, by * rods.per_dt)
+        _add_along(v, b, rods, r, by * rods.per_dt)
     return abs(now - aim) / rods.length[r], abs(now - aim) > like(o, 0.5) * rods.allowed[r]
 
 
 @kernel
-def _stiller(x: Any, v: Any, b: int, rods: Any, r: int, over: float) -> tuple[float, bool]:
+def _correct_velocity(x: Any, v: Any, b: int, rods: Any, r: int, over: float) -> tuple[float, bool]:
     """Remove the velocity along a rod, or that which stretches a taut rope; return its relative size, and if it counts.
 
     The size is relative to one length per time step.
     """
     o, allowed = like(over, 0.0), rods.allowed[r]
-    now = _to(x, b, rods.i[r], rods.j[r], rods.period, rods.way)
+    now = _offset_to(x, b, rods.i[r], rods.j[r], rods.period, rods.way)
     if not now > o or (rods.slack and now < rods.length[r] - like(o, 2.0) * allowed):
         return o, False
     rate, w = o, rods.weight[rods.i[r]] + rods.weight[rods.j[r]]
@@ -194,12 +194,12 @@ def _stiller(x: Any, v: Any, b: int, rods: Any, r: int, over: float) -> tuple[fl
     if rods.slack:
         by = max(by, -rods.pull[r])
     rods.pull[r] += by
-    _push(v, b, rods, r, by)
+    _add_along(v, b, rods, r, by)
     return abs(rate) / (rods.length[r] * rods.per_dt), abs(rate) > like(o, 0.5) * allowed * rods.per_dt
 
 
 @kernel
-def _swept(x: Any, v: Any, alive: Any, b: int, rods: Any, stage: int) -> tuple[int, float]:
+def _sweep(x: Any, v: Any, alive: Any, b: int, rods: Any, stage: int) -> tuple[int, float]:
     """Sweep over all rods with over-relaxation until they are within tolerance.
 
     Returns the worst rod if they are not, else -1, and its relative error.
@@ -212,16 +212,16 @@ def _swept(x: Any, v: Any, alive: Any, b: int, rods: Any, stage: int) -> tuple[i
     for sweep in range(rods.most):
         worst, off = -1, o
         for r in range(count):
-            if _moves(alive, b, rods, r):
+            if _can_move(alive, b, rods, r):
                 if stage < 2:
-                    wrong, counts = _longer(x, v, b, rods, r, over, stage == 0)
+                    wrong, counts = _correct_length(x, v, b, rods, r, over, stage == 0)
                 else:
-                    wrong, counts = _stiller(x, v, b, rods, r, over)
+                    wrong, counts = _correct_velocity(x, v, b, rods, r, over)
                 if counts and wrong > off:
                     worst, off = r, wrong
         if worst < 0:
             break
-        over = _sooner(over, rods.rho, sweep)
+        over = _next_relaxation(over, rods.rho, sweep)
     return worst, off
 
 
@@ -237,7 +237,7 @@ def _copy(x: Any, v: Any, kept: Any, b: int, keep: bool) -> None:
 
 
 @kernel
-def _inside(x: Any, v: Any, b: int, i: int, period: Any) -> bool:
+def _wrap_position(x: Any, v: Any, b: int, i: int, period: Any) -> bool:
     """Wrap the position of an agent on a torus; return True if its state is finite."""
     sound = True
     for k in range(x.shape[0]):
@@ -251,7 +251,7 @@ def _inside(x: Any, v: Any, b: int, i: int, period: Any) -> bool:
 
 
 @kernel
-def hold(x0: Any, x: Any, v: Any, alive: Any, rods: Any, first: int, end: int) -> tuple[int, int, int, float]:
+def hold_rods(x0: Any, x: Any, v: Any, alive: Any, rods: Any, first: int, end: int) -> tuple[int, int, int, float]:
     """Apply the rods of worlds [first, end), in place.
 
     If the first stage does not converge, as in far too long a step, its changes are undone: unconverged velocities
@@ -262,16 +262,16 @@ def hold(x0: Any, x: Any, v: Any, alive: Any, rods: Any, first: int, end: int) -
     world, agent, rod, off = -1, -1, -1, like(rods.per_dt, 0.0)
     for b in range(first, end):
         _copy(x, v, rods.kept, b, True)
-        _begin(x0, x, b, rods)
+        _write_offsets(x0, x, b, rods)
         for stage in range(3):
-            worst, by = _swept(x, v, alive, b, rods, stage)
+            worst, by = _sweep(x, v, alive, b, rods, stage)
             if worst >= 0:
                 rod, off = worst, by
                 if stage == 0:
                     _copy(x, v, rods.kept, b, False)
         for r in range(2 * rods.i.shape[0]):
             i = rods.i[r // 2] if r % 2 == 0 else rods.j[r // 2]
-            if not _inside(x, v, b, i, rods.period) and world < 0:
+            if not _wrap_position(x, v, b, i, rods.period) and world < 0:
                 world, agent = b, i
     return world, agent, rod, off
 
@@ -313,12 +313,12 @@ class Rods(Constraint):
                 raise ValueError(f"pairs[{k}] = {pair}: is pairs[{seen[frozenset(pair)]}] again")
         return self
 
-    def ties(self, scene: SceneView) -> Ties:
+    def ties(self, scene: SceneView) -> RodPairs:
         """Return the pairs that are held together in a scene; raise ValueError if it has no such group or network."""
         d = scene.dimension
         if self.group is None:
             i, j = np.array(self.pairs, np.int32).T
-            return _layered(Ties(i, j, np.resize(np.array(self.lengths), len(i)), np.zeros((len(i), d))))
+            return _sort_by_layer(RodPairs(i, j, np.resize(np.array(self.lengths), len(i)), np.zeros((len(i), d))))
         if self.group >= len(scene.groups):
             raise ValueError(f"group = {self.group}: there are {len(scene.groups)} groups, counted from 0")
         network = scene.groups[self.group].network
@@ -327,7 +327,9 @@ class Rods(Constraint):
         springs, points, first = network.springs(d), network.rest_points(d), scene.starts[self.group]
         edges = springs.role == EDGE
         i, j = springs.i[edges], springs.j[edges]
-        return _layered(Ties(i + np.int32(first), j + np.int32(first), springs.rest[edges], points[j] - points[i]))
+        return _sort_by_layer(
+            RodPairs(i + np.int32(first), j + np.int32(first), springs.rest[edges], points[j] - points[i])
+        )
 
     def check(self, scene: SceneView) -> None:
         """Raise ValueError if an agent or network is missing, an end can be newborn, or a rod wraps around a torus."""
@@ -360,11 +362,11 @@ class Rods(Constraint):
         length = ties.length.astype(real)
         rods = Hold(
             weight, ties.i, ties.j, length, period, real(1 / scene.dt), self.slack,
-            real(self.tolerance), self.most, real(_slowness(ties, weight)), np.zeros_like(length),
+            real(self.tolerance), self.most, real(_spectral_radius(ties, weight)), np.zeros_like(length),
             np.zeros((len(length), d), real), np.zeros_like(length), np.zeros_like(length), np.zeros(d, real),
             np.zeros(d, real), np.zeros((2, d, scene.agents), real),
         )  # fmt: skip
-        solve, told = entry(hold), False
+        solve, told = entry(hold_rods), False
 
         def settle(x0: Floats, v0: Floats, state: State, first: int, end: int) -> tuple[int, int]:
             nonlocal told
@@ -383,7 +385,7 @@ class Rods(Constraint):
         return settle
 
 
-def _layered(ties: Ties) -> Ties:
+def _sort_by_layer(ties: RodPairs) -> RodPairs:
     """Return the same pairs sorted layer by layer: the order in which they were given makes no difference.
 
     Each agent is at most once in a layer. The layers of a chain are every other link, which is Young's ordering.
@@ -399,10 +401,10 @@ def _layered(ties: Ties) -> Ties:
         of[int(i[r])].add(int(layer[r]))
         of[int(j[r])].add(int(layer[r]))
     order = order[np.argsort(layer[order], kind="stable")]
-    return Ties(i[order], j[order], ties.length[order], way[order])
+    return RodPairs(i[order], j[order], ties.length[order], way[order])
 
 
-def _slowness(ties: Ties, weight: Floats) -> float:
+def _spectral_radius(ties: RodPairs, weight: Floats) -> float:
     """Return rho, the spectral radius of Jacobi's iteration for the network at rest.
 
     It is 1 less the smallest eigenvalue of the matrix that couples the rods, by inverse iteration. Rods of unknown

@@ -12,18 +12,18 @@ from flockenv.maths.vectors import norm, scale, select, sub, unit, zero
 from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.effect import Effect, Me, Vector, demand_group
 
-__all__ = ["Aim", "Antipode", "Course", "Goal", "about", "easing"]
+__all__ = ["Aim", "Antipode", "Course", "Goal", "applies_to", "ramped"]
 
 
 @law
-def about(p: Any, me: Me) -> bool:
+def applies_to(p: Any, me: Me) -> bool:
     """Return True if the effect applies to this agent, one of [p.first, p.end)."""
     inside: bool = (me.who >= p.first) & (me.who < p.end)
     return inside
 
 
 @law
-def easing(offset: Vec, slow_radius: float) -> Vec:
+def ramped(offset: Vec, slow_radius: float) -> Vec:
     """Return the direction of an offset, shorter within slow_radius, m: 0 at the target itself."""
     length, one = norm(offset), like(slow_radius, 1.0)
     share = length / slow_radius
@@ -51,7 +51,7 @@ class Aim(Effect):
 @law
 def goal_aim(p: Any, me: Me) -> Vec:
     """Return the direction to the target."""
-    return select(about(p, me), scale(easing(sub(p.target, me.pos), p.slow_radius), p.share), zero(me.pos))
+    return select(applies_to(p, me), scale(ramped(sub(p.target, me.pos), p.slow_radius), p.share), zero(me.pos))
 
 
 class Goal(Aim):
@@ -71,7 +71,7 @@ class Goal(Aim):
 @law
 def course_aim(p: Any, me: Me) -> Vec:
     """Return the given direction."""
-    return select(about(p, me), scale(unit(p.direction), p.share), zero(me.pos))
+    return select(applies_to(p, me), scale(unit(p.direction), p.share), zero(me.pos))
 
 
 class Course(Aim):
@@ -93,7 +93,7 @@ class Course(Aim):
 
 
 @law
-def goal_kept(p: Any, me: Me) -> Vec:
+def stored_target(p: Any, me: Me) -> Vec:
     """Return the agent's stored target."""
     return me.inner.goal_x, me.inner.goal_y
 
@@ -102,19 +102,21 @@ def goal_kept(p: Any, me: Me) -> Vec:
 def antipode(p: Any, me: Me) -> Vec:
     """Return the point opposite to the initial position, across the centre."""
     across = sub(scale(p.centre, like(me.mass, 2.0)), me.pos)
-    return select(about(p, me), across, zero(me.pos))
+    return select(applies_to(p, me), across, zero(me.pos))
 
 
 @law
-def goal_as_before(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
+def keep_target(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
     """Return the stored target, unchanged."""
-    return goal_kept(p, me)
+    return stored_target(p, me)
 
 
 @law
 def antipode_aim(p: Any, me: Me) -> Vec:
     """Return the direction to the stored target."""
-    return select(about(p, me), scale(easing(sub(goal_kept(p, me), me.pos), p.slow_radius), p.share), zero(me.pos))
+    return select(
+        applies_to(p, me), scale(ramped(sub(stored_target(p, me), me.pos), p.slow_radius), p.share), zero(me.pos)
+    )
 
 
 class Antipode(Aim):
@@ -125,7 +127,7 @@ class Antipode(Aim):
     slow_radius: float = Field(default=0.5, gt=0, description="m before the target, over which it slows down to stop")
     aim_law: ClassVar[Law | None] = antipode_aim
     begin_law: ClassVar[Law | None] = antipode
-    keep_law: ClassVar[Law | None] = goal_as_before
+    keep_law: ClassVar[Law | None] = keep_target
     keeps: ClassVar[tuple[str, ...]] = ("goal_x", "goal_y")
     heads_for: ClassVar[bool] = False
 

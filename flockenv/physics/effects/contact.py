@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 
 
 @law
-def pressing(p: Any, overlap: float, parting: float, reduced: float) -> float:
+def normal_force(p: Any, overlap: float, parting: float, reduced: float) -> float:
     """Return the normal force, k d - c u with u the speed of separation; at least 0 unless adhesive.
 
     With a largest speed of separation U, k d becomes min(k d, U sqrt(k m)) (1 - u / U).
@@ -37,7 +37,7 @@ def pressing(p: Any, overlap: float, parting: float, reduced: float) -> float:
 
 
 @law
-def rubbing(p: Any, overlap: float, force: float, slip: Vec) -> Vec:
+def friction_force(p: Any, overlap: float, force: float, slip: Vec) -> Vec:
     """Return the friction -kappa d s against the slip s, at most mu times the normal force."""
     o = like(overlap, 0.0)
     rate, speed, most = p.friction * overlap, norm(slip), p.grip * max(force, o)
@@ -46,47 +46,47 @@ def rubbing(p: Any, overlap: float, force: float, slip: Vec) -> Vec:
 
 
 @law
-def met(p: Any, normal: Vec, overlap: float, vel: Vec, reduced: float) -> Vec:
+def contact_force(p: Any, normal: Vec, overlap: float, vel: Vec, reduced: float) -> Vec:
     """Return the force on a body that overlaps another; normal: away from the other; vel: relative to the other."""
     parting = dot(vel, normal)
-    force = pressing(p, overlap, parting, reduced)
+    force = normal_force(p, overlap, parting, reduced)
     slip = sub(vel, scale(normal, parting))
-    said = add(scale(normal, force), rubbing(p, overlap, force, slip))
+    said = add(scale(normal, force), friction_force(p, overlap, force, slip))
     return select(overlap > like(overlap, 0.0), said, zero(vel))
 
 
 @law
-def untouched(p: Any, me: Me) -> Vec:
+def zero_force(p: Any, me: Me) -> Vec:
     """Return no force: the start of the fold."""
     return zero(me.pos)
 
 
 @law
-def pushed_out(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
+def add_obstacle_force(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
     """Add the force of one obstacle, which is held in place."""
-    return add(acc, met(p, other.normal, me.radius - other.gap, sub(me.vel, other.vel), me.mass))
+    return add(acc, contact_force(p, other.normal, me.radius - other.gap, sub(me.vel, other.vel), me.mass))
 
 
 @law
-def touching(p: Any, me: Me) -> float:
+def contact_reach(p: Any, me: Me) -> float:
     """Return the agent's radius: obstacles farther away do not touch it."""
     return me.radius
 
 
 @law
-def of_all(p: Any, me: Me, acc: Vec) -> Vec:
+def total_force(p: Any, me: Me, acc: Vec) -> Vec:
     """Return the sum over all obstacles."""
     return acc
 
 
 @law
-def pushed_apart(p: Any, me: Me, other: Other) -> Vec:
+def pair_force(p: Any, me: Me, other: Other) -> Vec:
     """Return the force of one neighbour; two agents in one place part along their ties."""
     e = like(other.square, 1.0)
     apart = other.square > like(other.square, ONE_PLACE)
     normal = unit(select(apart, scale(other.offset, -e), sub(me.tie, other.tie)))
     overlap = me.radius + other.radius - np.sqrt(other.square)
-    return met(p, normal, overlap, sub(me.vel, other.vel), e / (e / me.mass + e / other.mass))
+    return contact_force(p, normal, overlap, sub(me.vel, other.vel), e / (e / me.mass + e / other.mass))
 
 
 def restitution(ratio: float, adhesive: bool = False) -> float:
@@ -156,10 +156,10 @@ class ObstacleContact(_Solid):
     """
 
     kind: Literal["obstacle_contact"] = "obstacle_contact"
-    obstacle_start: ClassVar[Law | None] = untouched
-    obstacle_law: ClassVar[Law | None] = pushed_out
-    obstacle_finish: ClassVar[Law | None] = of_all
-    obstacle_reach: ClassVar[Law | None] = touching
+    obstacle_start: ClassVar[Law | None] = zero_force
+    obstacle_law: ClassVar[Law | None] = add_obstacle_force
+    obstacle_finish: ClassVar[Law | None] = total_force
+    obstacle_reach: ClassVar[Law | None] = contact_reach
 
     def folded(self, dimension: int) -> int:
         """Return D, for the force so far."""
@@ -171,7 +171,7 @@ class ObstacleContact(_Solid):
 
 
 @law
-def contacts(p: Any, me: Me, sums: Vec) -> Vec:
+def sum_of_contacts(p: Any, me: Me, sums: Vec) -> Vec:
     """Return the sum over all neighbours."""
     return sums
 
@@ -196,8 +196,8 @@ class Contact(_Solid):
         gt=0,
         description="m, candidates are nearer (default: largest distance at which two touch)",
     )
-    pair_law: ClassVar[Law | None] = pushed_apart
-    finish_law: ClassVar[Law | None] = contacts
+    pair_law: ClassVar[Law | None] = pair_force
+    finish_law: ClassVar[Law | None] = sum_of_contacts
     conserves_momentum: ClassVar[bool] = True
 
     @property

@@ -73,7 +73,7 @@ from flockenv.model.scene_view import SceneView
 
 __all__ = [
     "EFFECTS", "LAWS", "Bonds", "Effect", "Far", "Me", "Members", "Obstacle", "Other", "Sight", "Vector", "all_masses",
-    "demand_group", "in_view", "network_of", "ties",
+    "demand_group", "in_view", "network_of", "separation_directions",
 ]  # fmt: skip
 
 Vector = Annotated[tuple[Annotated[float, Field(strict=True)], ...], Field(min_length=2, max_length=3)]
@@ -196,7 +196,7 @@ def in_view(view: float, heading: Vec, offset: Vec, square: float) -> bool:
     return (ahead * abs(ahead) >= view * square) | still
 
 
-def ties(count: int, dimension: int) -> NDArray[np.float64]:
+def separation_directions(count: int, dimension: int) -> NDArray[np.float64]:
     """Return a unit vector for each agent, (count, D), all different, in no preferred direction.
 
     me.tie - other.tie is the direction in which two agents in one place should part: opposite for the two, different

@@ -29,7 +29,7 @@ def rayleigh_mass(p: Any, me: Me) -> Vec:
 
 
 @law
-def _stretched(u: Vec, number: Vec) -> Vec:
+def _stretch_force(u: Vec, number: Vec) -> Vec:
     """Return -K_ij u, with the block K_ij in the first numbers of a bond."""
     if len(u) == 2:
         return (-(number[0] * u[0] + number[1] * u[1]), -(number[2] * u[0] + number[3] * u[1]))
@@ -42,7 +42,7 @@ def _stretched(u: Vec, number: Vec) -> Vec:
 
 
 @law
-def _way(like_this: Vec, number: Vec) -> Vec:
+def _rest_offset(like_this: Vec, number: Vec) -> Vec:
     """Return the offset to the neighbour in the undeformed shape, the last numbers of a bond."""
     if len(like_this) == 2:
         return (number[4], number[5])
@@ -56,8 +56,8 @@ def elastic(p: Any, me: Me, others: Any, number: Vec) -> Vec:
 
     Rows of K sum to zero, so displacements relative to neighbours are enough.
     """
-    stretch = sub(others[0].offset, _way(others[0].offset, number))
-    return _stretched(add(stretch, scale(sub(others[0].vel, me.vel), p.beta)), number)
+    stretch = sub(others[0].offset, _rest_offset(others[0].offset, number))
+    return _stretch_force(add(stretch, scale(sub(others[0].vel, me.vel), p.beta)), number)
 
 
 class Elastic(Effect):

@@ -13,11 +13,11 @@ from flockenv.geometry.targets import Target, is_reached, row_size
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import scale, sub, unit, zero
 from flockenv.model.scene_view import SceneView
-from flockenv.physics.effects.aims import about
+from flockenv.physics.effects.aims import applies_to
 from flockenv.physics.effects.effect import Me
 from flockenv.physics.effects.floor_field import Around
-from flockenv.physics.effects.waypoints import onwards, place_kept
-from flockenv.physics.floor_fields import towards
+from flockenv.physics.effects.waypoints import place_behind, stored_position
+from flockenv.physics.floor_fields import path_to_target
 
 __all__ = ["Door", "Routes"]
 
@@ -28,9 +28,9 @@ BINS = 256
 
 
 @law
-def way_to_door(p: Any, me: Me, k: Any) -> tuple[float, Vec]:
+def path_to_door(p: Any, me: Me, k: Any) -> tuple[float, Vec]:
     """Return the length of the path to door k, m, and its first direction."""
-    return towards(p.table[np.int64(p.table[1 + k * np.int64(p.size)]) :], me.pos)
+    return path_to_target(p.table[np.int64(p.table[1 + k * np.int64(p.size)]) :], me.pos)
 
 
 @law
@@ -42,15 +42,15 @@ def bin_of(p: Any, length: float) -> float:
 
 
 @law
-def at_door(p: Any, me: Me) -> float:
+def door_counter(p: Any, me: Me) -> float:
     """Return the counter of the agent's door and bin of path length, or -1 if it has passed its door."""
     door = me.inner.door
-    heading = about(p, me) & (door < p.many)
+    heading = applies_to(p, me) & (door < p.many)
     return door * p.bins + bin_of(p, me.inner.left) if heading else like(door, -1.0)
 
 
 @law
-def ahead_at(p: Any, me: Me, k: Any, length: float) -> float:
+def count_ahead(p: Any, me: Me, k: Any, length: float) -> float:
     """Return the number of agents that head for door k and are nearer to it than me; the same bin counts half."""
     o, e = like(length, 0.0), like(length, 1.0)
     mine, begin = np.int64(bin_of(p, length)), k * np.int64(p.bins)
@@ -65,65 +65,65 @@ def ahead_at(p: Any, me: Me, k: Any, length: float) -> float:
 
 
 @law
-def expected(p: Any, me: Me, k: Any, waits: bool) -> float:
+def expected_time(p: Any, me: Me, k: Any, waits: bool) -> float:
     """Return the time to get through door k, s: the walk there, and, if `waits`, the queue in front of it."""
-    length, _ = way_to_door(p, me, k)
+    length, _ = path_to_door(p, me, k)
     time = length / me.desired_speed
     if waits:
-        time += ahead_at(p, me, k, length) / p.table[2 + k * np.int64(p.size)]
+        time += count_ahead(p, me, k, length) / p.table[2 + k * np.int64(p.size)]
     return time
 
 
 @law
-def quickest(p: Any, me: Me, waits: bool) -> tuple[Any, float]:
+def quickest_door(p: Any, me: Me, waits: bool) -> tuple[Any, float]:
     """Return the door of the shortest expected time, and that time, s; of equals, the first."""
-    best, time = 0, expected(p, me, 0, waits)
+    best, time = 0, expected_time(p, me, 0, waits)
     for k in range(1, np.int64(p.many)):
-        other = expected(p, me, k, waits)
+        other = expected_time(p, me, k, waits)
         if other < time:
             best, time = k, other
     return best, time
 
 
 @law
-def routes_begun(p: Any, me: Me) -> Vec:
+def initial_route(p: Any, me: Me) -> Vec:
     """Return the nearest door, and a time of first decision within a period, different for each agent."""
     o = like(p.share, 0.0)
-    if not about(p, me):
+    if not applies_to(p, me):
         return (o, o, o, me.inner.was_x, me.inner.was_y)
-    door, _ = quickest(p, me, False)
-    left, _ = way_to_door(p, me, door)
+    door, _ = quickest_door(p, me, False)
+    left, _ = path_to_door(p, me, door)
     turn = (me.who + like(o, 1.0)) * like(o, 0.6180339887498949)
     return (like(o, door), left, me.time + p.period * (turn - np.floor(turn)), me.pos[0], me.pos[1])
 
 
 @law
-def routes_kept(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
+def update_route(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
     """Return its door (reconsidered once per period), path length, time of next decision, and position."""
-    door, left, ready, was = me.inner.door, me.inner.left, me.inner.ready, place_kept(me)
-    if not about(p, me) or door >= p.many:
+    door, left, ready, was = me.inner.door, me.inner.left, me.inner.ready, stored_position(me)
+    if not applies_to(p, me) or door >= p.many:
         return (door, left, ready, was[0], was[1])
     e, now, mine = like(door, 1.0), me.time + seconds, np.int64(door)
     if is_reached(p.table, 1 + mine * np.int64(p.size) + 2, was, me.pos):
-        place = onwards(me)
+        place = place_behind(me)
         return (p.many, like(door, 0.0), ready, place[0], place[1])
     if now >= ready - like(seconds, 0.01) * seconds:
-        found, time = quickest(p, me, True)
-        if time < (e - p.hysteresis) * expected(p, me, mine, True):
+        found, time = quickest_door(p, me, True)
+        if time < (e - p.hysteresis) * expected_time(p, me, mine, True):
             mine = np.int64(found)
         ready += p.period
-    length, _ = way_to_door(p, me, mine)
+    length, _ = path_to_door(p, me, mine)
     return (like(door, float(mine)), length, ready, me.pos[0], me.pos[1])
 
 
 @law
 def routes_aim(p: Any, me: Me) -> Vec:
     """Return the direction of the path to its door, or straight on once it is through."""
-    if not about(p, me):
+    if not applies_to(p, me):
         return zero(me.pos)
     if me.inner.door >= p.many:
-        return scale(unit(sub(me.pos, place_kept(me))), p.share)
-    _, direction = way_to_door(p, me, np.int64(me.inner.door))
+        return scale(unit(sub(me.pos, stored_position(me))), p.share)
+    _, direction = path_to_door(p, me, np.int64(me.inner.door))
     return scale(direction, p.share)
 
 
@@ -162,9 +162,9 @@ class Routes(Around):
     period: float = Field(default=2.0, gt=0, description="s, between decisions")
     hysteresis: float = Field(default=0.1, ge=0, lt=1, description="fraction by which another door must be faster")
     aim_law: ClassVar[Law | None] = routes_aim
-    begin_law: ClassVar[Law | None] = routes_begun
-    keep_law: ClassVar[Law | None] = routes_kept
-    count_law: ClassVar[Law | None] = at_door
+    begin_law: ClassVar[Law | None] = initial_route
+    keep_law: ClassVar[Law | None] = update_route
+    count_law: ClassVar[Law | None] = door_counter
     keeps: ClassVar[tuple[str, ...]] = ("door", "left", "ready", "was_x", "was_y")
 
     @property

@@ -30,13 +30,13 @@ __all__ = ["Carried", "Sink", "Source", "Uniform", "Vortex", "Wind"]
 Floats = NDArray[np.float64]
 
 
-def swing(p: Any, me: Me) -> float:
+def oscillation(p: Any, me: Me) -> float:
     """Return cos(2 pi t / period + phase); 1, and no code, for a field without a period."""
     return float(np.cos(2 * np.pi * me.time / p.period + p.phase)) if hasattr(p, "period") else 1.0
 
 
-@overload(swing, jit_options=OPTIONS)
-def _swing(p, me):  # type: ignore[no-untyped-def]  # numba compares signatures, annotations included
+@overload(oscillation, jit_options=OPTIONS)
+def _oscillation(p, me):  # type: ignore[no-untyped-def]  # numba compares signatures, annotations included
     if "period" in p.fields:
         return lambda p, me: np.cos(like(me.time, 2 * np.pi) * me.time / p.period + p.phase)
     return lambda p, me: like(me.time, 1.0)
@@ -46,13 +46,13 @@ def _swing(p, me):  # type: ignore[no-untyped-def]  # numba compares signatures,
 def _magnitude(p: Any, me: Me, square: float) -> float:
     """Return W = Phi / (|Phi| / Phi_max + r^2) at this time; 0 at the centre."""
     o = like(square, 0.0)
-    return p.strength / (abs(p.strength) / p.maximum + square) * swing(p, me) if square > o else o
+    return p.strength / (abs(p.strength) / p.maximum + square) * oscillation(p, me) if square > o else o
 
 
 @law
 def uniform(p: Any, me: Me) -> Vec:
     """Return the same vector everywhere."""
-    return scale(p.strength, swing(p, me))
+    return scale(p.strength, oscillation(p, me))
 
 
 @law
@@ -70,7 +70,7 @@ def sink(p: Any, me: Me) -> Vec:
 
 
 @law
-def _turn(p: Any, away: Vec) -> Vec:
+def _perpendicular(p: Any, away: Vec) -> Vec:
     """Return the vector of length r at right angles to the offset from the centre or axis, counterclockwise."""
     if len(away) == 2:
         return (-away[1], away[0])
@@ -83,7 +83,7 @@ def _turn(p: Any, away: Vec) -> Vec:
 @law
 def vortex(p: Any, me: Me) -> Vec:
     """Return W around the centre or the axis."""
-    across = _turn(p, sub(me.pos, p.centre))
+    across = _perpendicular(p, sub(me.pos, p.centre))
     return scale(unit(across), _magnitude(p, me, dot(across, across)))
 
 
@@ -96,11 +96,11 @@ def wind(p: Any, me: Me) -> Vec:
 @law
 def gusty_wind(p: Any, me: Me) -> Vec:
     """Return U + G (1 - cos) / 2."""
-    return add(p.velocity, scale(p.gust, like(me.time, 0.5) - like(me.time, 0.5) * swing(p, me)))
+    return add(p.velocity, scale(p.gust, like(me.time, 0.5) - like(me.time, 0.5) * oscillation(p, me)))
 
 
 @law
-def carried(p: Any, me: Me) -> Vec:
+def carry_velocity(p: Any, me: Me) -> Vec:
     """Return the flow of x' = v + share u: share u."""
     return scale(me.medium, p.share)
 
@@ -266,5 +266,5 @@ class Carried(Effect):
 
     kind: Literal["carried"] = "carried"
     share: float = Field(default=1.0, ge=0, le=1, description="fraction of the medium's velocity; below 1 agents slip")
-    flow_law: ClassVar[Law | None] = carried
+    flow_law: ClassVar[Law | None] = carry_velocity
     strengths: ClassVar[tuple[str, ...]] = ("share",)

@@ -12,24 +12,32 @@ from flockenv.geometry.targets import Target, row_size
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import scale, select, zero
 from flockenv.model.scene_view import SceneView
-from flockenv.physics.effects.aims import Aim, about
+from flockenv.physics.effects.aims import Aim, applies_to
 from flockenv.physics.effects.effect import Me
-from flockenv.physics.floor_fields import check_ways, lengths_on, region, starts_of, towards, warn_cut_off, way_block
+from flockenv.physics.floor_fields import (
+    check_floor_field,
+    floor_field_block,
+    grid_corners,
+    path_lengths,
+    path_to_target,
+    start_boxes,
+    warn_cut_off,
+)
 
-__all__ = ["Around", "Way", "slowed"]
+__all__ = ["Around", "Way", "slow_down"]
 
 
 @law
-def slowed(direction: Vec, length: float, slow_radius: float) -> Vec:
+def slow_down(direction: Vec, length: float, slow_radius: float) -> Vec:
     """Return a direction, shorter if less than slow_radius, m, of the path is left."""
     return scale(direction, length / slow_radius if length < slow_radius else like(length, 1.0))
 
 
 @law
-def way_aim(p: Any, me: Me) -> Vec:
+def path_aim(p: Any, me: Me) -> Vec:
     """Return the direction of the path to the target with the shortest one."""
-    length, direction = towards(p.table, me.pos)
-    return select(about(p, me), scale(slowed(direction, length, p.slow_radius), p.share), zero(me.pos))
+    length, direction = path_to_target(p.table, me.pos)
+    return select(applies_to(p, me), scale(slow_down(direction, length, p.slow_radius), p.share), zero(me.pos))
 
 
 class Around(Aim):
@@ -44,9 +52,9 @@ class Around(Aim):
 
     def ways(self, scene: SceneView, targets: tuple[Target, ...], names: tuple[str, ...]) -> NDArray[np.float64]:
         """Return the block of the floor field to the nearest target; see flockenv.physics.floor_fields."""
-        corners = region(scene, self.goals[0], self.margin)
-        starts = starts_of(scene, self.group)
-        return way_block(scene, targets, names, corners, self.spacing, self.clearance, starts)
+        corners = grid_corners(scene, self.goals[0], self.margin)
+        starts = start_boxes(scene, self.group)
+        return floor_field_block(scene, targets, names, corners, self.spacing, self.clearance, starts)
 
     @property
     def goals(self) -> tuple[tuple[Target, ...], tuple[str, ...]]:
@@ -57,8 +65,8 @@ class Around(Aim):
         """Raise ValueError for a torus, moving obstacles, too large a grid, targets in obstacles or out of reach."""
         super().check(scene)
         if self.keeps:
-            _alone(self, scene)
-        check_ways(scene, self.kind, *self.goals, self.margin, self.spacing, self.clearance)
+            _check_alone(self, scene)
+        check_floor_field(scene, self.kind, *self.goals, self.margin, self.spacing, self.clearance)
         scene.table_of(self)
 
     def grids(self, scene: SceneView) -> list[NDArray[np.float64]]:
@@ -68,7 +76,7 @@ class Around(Aim):
     def check_start(self, scene: SceneView, state: Any) -> None:
         """Warn of agents that begin where no path leads to any target, or to a stage of a journey."""
         first, end = (int(k) for k in self.members(scene.starts).values())
-        lengths = np.array([lengths_on(grid, state.pos[:, first:end]) for grid in self.grids(scene)])
+        lengths = np.array([path_lengths(grid, state.pos[:, first:end]) for grid in self.grids(scene)])
         if not len(lengths):
             return
         lost = np.zeros(state.alive.shape, bool)
@@ -76,7 +84,7 @@ class Around(Aim):
         warn_cut_off(" or ".join(self.goals[1]), lost, state)
 
 
-def _alone(effect: Aim, scene: SceneView) -> None:
+def _check_alone(effect: Aim, scene: SceneView) -> None:
     """Raise ValueError if another effect keeps the same numbers of the same agents: changes would add up."""
     first, end = effect.members(scene.starts).values()
     for k, other in enumerate(scene.effects):
@@ -97,7 +105,7 @@ class Way(Around):
     kind: Literal["way"] = "way"
     targets: tuple[Target, ...] = Field(min_length=1, description="points, doors, boxes")
     slow_radius: float = Field(default=0.0, ge=0, description="m before the target, over which it slows down to stop")
-    aim_law: ClassVar[Law | None] = way_aim
+    aim_law: ClassVar[Law | None] = path_aim
 
     @property
     def goals(self) -> tuple[tuple[Target, ...], tuple[str, ...]]:
@@ -114,7 +122,7 @@ class Way(Around):
 
     def lengths(self, scene: SceneView, points: ArrayLike) -> NDArray[np.float64]:
         """Return path lengths from points (..., D), (...) m; inf without a path; outside the grid, that of its edge."""
-        return lengths_on(self.grids(scene)[0], points)
+        return path_lengths(self.grids(scene)[0], points)
 
     def grids(self, scene: SceneView) -> list[NDArray[np.float64]]:
         """Return the one floor field, to the nearest target."""

@@ -25,7 +25,7 @@ __all__ = ["Gravitation", "InverseSquare"]
 
 
 @law
-def _per_cube(p: Any, other: Far) -> float:
+def _inverse_cube(p: Any, other: Far) -> float:
     """Return 1 / (d^2 + eps^2)^(3/2), 1/m^3, times the weight."""
     square = other.square + p.softening * p.softening
     return other.weight / (square * np.sqrt(square))  # type: ignore[no-any-return]  # np.sqrt keeps float32
@@ -34,13 +34,13 @@ def _per_cube(p: Any, other: Far) -> float:
 @law
 def gravitation(p: Any, me: Me, other: Far) -> Vec:
     """Return F = G m m_j d / (d^2 + eps^2)^(3/2)."""
-    return scale(other.offset, p.constant * me.mass * _per_cube(p, other))
+    return scale(other.offset, p.constant * me.mass * _inverse_cube(p, other))
 
 
 @law
 def inverse_square(p: Any, me: Me, other: Far) -> Vec:
     """Return F = k d / (d^2 + eps^2)^(3/2)."""
-    return scale(other.offset, p.strength * _per_cube(p, other))
+    return scale(other.offset, p.strength * _inverse_cube(p, other))
 
 
 class _Softened(Effect):

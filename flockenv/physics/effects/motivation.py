@@ -27,19 +27,19 @@ CHANNEL = 81_000
 
 
 @law
-def _among(who: float, first: float, end: float) -> bool:
+def _is_member(who: float, first: float, end: float) -> bool:
     """Return True if an agent is one of [first, end)."""
     inside: bool = (who >= first) & (who < end)
     return inside
 
 
 @law
-def _drawn(p: Any, me: Any, channel: int) -> float:
+def _draw_initial(p: Any, me: Any, channel: int) -> float:
     """Return its initial value: start, and up to half of `spread` more or less; 0 outside the group."""
     half = like(p.start, 0.5)
     share = like(p.start, uniform(me.key, 0, int(me.who), channel)) - half
     mine = p.start + p.spread * share
-    return mine if _among(me.who, p.first, p.end) else like(p.start, 0.0)
+    return mine if _is_member(me.who, p.first, p.end) else like(p.start, 0.0)
 
 
 class _Urge(Effect):
@@ -73,18 +73,18 @@ class _Urge(Effect):
 
 
 @law
-def hungry_from(p: Any, me: Me) -> Vec:
+def initial_hunger(p: Any, me: Me) -> Vec:
     """Return the initial hunger."""
-    return (_drawn(p, me, CHANNEL),)
+    return (_draw_initial(p, me, CHANNEL),)
 
 
 @law
-def digesting(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
+def update_hunger(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
     """Return the hunger after a step: it grows with time and effort."""
     o = like(me.max_speed, 0.0)
     pace = norm(me.vel) / me.max_speed if me.max_speed > o else o
-    later = motivation.hungrier(me.inner.hunger, p.rate, p.effort, pace, seconds)
-    return (later if _among(me.who, p.first, p.end) else me.inner.hunger,)
+    later = motivation.grow_hunger(me.inner.hunger, p.rate, p.effort, pace, seconds)
+    return (later if _is_member(me.who, p.first, p.end) else me.inner.hunger,)
 
 
 class Metabolism(_Urge):
@@ -98,8 +98,8 @@ class Metabolism(_Urge):
     effort: float = Field(default=0.0, ge=0, description="1/s more at max_speed")
     start: float = Field(default=0.3, ge=0, le=1, description="mean initial hunger")
     spread: float = Field(default=0.0, ge=0, le=1, description="width of the uniform distribution of initial values")
-    begin_law: ClassVar[Law | None] = hungry_from
-    keep_law: ClassVar[Law | None] = digesting
+    begin_law: ClassVar[Law | None] = initial_hunger
+    keep_law: ClassVar[Law | None] = update_hunger
     keeps: ClassVar[tuple[str, ...]] = ("hunger",)
     strengths: ClassVar[tuple[str, ...]] = ("rate", "effort")
 
@@ -124,36 +124,36 @@ def _demand_range(start: float, spread: float, most: float) -> None:
 
 
 @law
-def food_from(p: Any, me: Me) -> Vec:
+def initial_food(p: Any, me: Me) -> Vec:
     """Return the initial numbers: a patch's amount of food; nothing eaten yet."""
     o = like(p.capacity, 0.0)
-    return o, (p.start * p.capacity if _among(me.who, p.from_other, p.to_other) else o), o
+    return o, (p.start * p.capacity if _is_member(me.who, p.from_other, p.to_other) else o), o
 
 
 @law
-def at_table(p: Any, me: Me, other: Other) -> Vec:
+def food_and_hunger(p: Any, me: Me, other: Other) -> Vec:
     """Return the food of a patch in reach, and the hunger of an agent that eats of this patch."""
     o = like(other.square, 0.0)
-    eats = _among(me.who, p.first, p.end) & _among(other.who, p.from_other, p.to_other)
-    eaten = _among(me.who, p.from_other, p.to_other) & _among(other.who, p.first, p.end)
+    eats = _is_member(me.who, p.first, p.end) & _is_member(other.who, p.from_other, p.to_other)
+    eaten = _is_member(me.who, p.from_other, p.to_other) & _is_member(other.who, p.first, p.end)
     return (other.inner.food if eats else o), (other.inner.hunger if eaten else o)
 
 
 @law
-def told_both(p: Any, me: Me, sums: Vec) -> Vec:
+def both_sums(p: Any, me: Me, sums: Vec) -> Vec:
     """Return both sums as a vector."""
     return planar(me.pos, sums[0], sums[1])
 
 
 @law
-def grazed(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
+def update_grazing(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
     """Return the numbers after a step: eaters get less hungry; patches regrow, and lose what is eaten."""
     o = like(p.rate, 0.0)
-    patch = _among(me.who, p.from_other, p.to_other)
+    patch = _is_member(me.who, p.from_other, p.to_other)
     taken = motivation.bite(told[0], me.inner.hunger, p.rate, seconds)
     lost = motivation.bite(me.inner.food, told[1], p.rate, seconds)
     less = me.inner.hunger - taken / p.appetite
-    grown = motivation.regrown(me.inner.food, p.growth, p.capacity, seconds) if patch else me.inner.food
+    grown = motivation.regrow(me.inner.food, p.growth, p.capacity, seconds) if patch else me.inner.food
     return (less if less > o else o), grown - lost, me.inner.eaten + taken
 
 
@@ -173,10 +173,10 @@ class Grazing(_Urge):
     capacity: float = Field(default=3.0, gt=0, description="K, units of food in a full patch")
     start: float = Field(default=1.0, gt=0, le=1, description="initial amount, as a fraction of capacity")
     appetite: float = Field(default=1.0, gt=0, description="units of food that it takes from starved to full")
-    pair_law: ClassVar[Law | None] = at_table
-    finish_law: ClassVar[Law | None] = told_both
-    begin_law: ClassVar[Law | None] = food_from
-    keep_law: ClassVar[Law | None] = grazed
+    pair_law: ClassVar[Law | None] = food_and_hunger
+    finish_law: ClassVar[Law | None] = both_sums
+    begin_law: ClassVar[Law | None] = initial_food
+    keep_law: ClassVar[Law | None] = update_grazing
     keeps: ClassVar[tuple[str, ...]] = ("hunger", "food", "eaten")
     strengths: ClassVar[tuple[str, ...]] = ("rate", "growth")
 
@@ -212,23 +212,23 @@ class Grazing(_Urge):
 
 
 @law
-def not_caught(p: Any, me: Me) -> Vec:
+def no_catches(p: Any, me: Me) -> Vec:
     """Return 0 hunger and 0 catches."""
     return like(me.mass, 0.0), like(me.mass, 0.0)
 
 
 @law
-def in_reach(p: Any, me: Me, other: Other) -> Vec:
+def catches(p: Any, me: Me, other: Other) -> Vec:
     """Return 1 if the other catches me, and 1 if I catch it: a hunter must be hungry enough."""
     o, e = like(other.square, 0.0), like(other.square, 1.0)
-    mine = _among(me.who, p.from_other, p.to_other) & _among(other.who, p.first, p.end)
-    prey = _among(me.who, p.first, p.end) & _among(other.who, p.from_other, p.to_other)
+    mine = _is_member(me.who, p.from_other, p.to_other) & _is_member(other.who, p.first, p.end)
+    prey = _is_member(me.who, p.first, p.end) & _is_member(other.who, p.from_other, p.to_other)
     has_me = mine & (other.inner.hunger > p.hungry) & (p.meal > o)
     return (e if has_me else o), (e if prey & (me.inner.hunger > p.hungry) & (p.meal > o) else o)
 
 
 @law
-def caught(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
+def update_catches(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
     """Return the numbers after a step: each catch reduces the hunger of a hunter, and is counted by its prey."""
     o = like(p.meal, 0.0)
     less = me.inner.hunger - p.meal * told[1]
@@ -247,10 +247,10 @@ class Predation(_Urge):
     radius: float = Field(gt=0, description="m between centres")
     meal: float = Field(default=0.5, ge=0, le=1, description="reduction of hunger per catch")
     hungry: float = Field(default=0.3, ge=0, le=1, description="hunger above which a hunter catches prey")
-    pair_law: ClassVar[Law | None] = in_reach
-    finish_law: ClassVar[Law | None] = told_both
-    begin_law: ClassVar[Law | None] = not_caught
-    keep_law: ClassVar[Law | None] = caught
+    pair_law: ClassVar[Law | None] = catches
+    finish_law: ClassVar[Law | None] = both_sums
+    begin_law: ClassVar[Law | None] = no_catches
+    keep_law: ClassVar[Law | None] = update_catches
     keeps: ClassVar[tuple[str, ...]] = ("hunger", "caught")
     strengths: ClassVar[tuple[str, ...]] = ("meal",)
 
@@ -278,29 +278,29 @@ class Predation(_Urge):
 
 
 @law
-def unafraid(p: Any, me: Me) -> Vec:
+def no_fear(p: Any, me: Me) -> Vec:
     """Return 0: no fear at the start."""
     return (like(me.mass, 0.0),)
 
 
 @law
-def frightened(p: Any, me: Me, other: Other) -> Vec:
+def fear_of(p: Any, me: Me, other: Other) -> Vec:
     """Return the fear of one neighbour."""
     return (motivation.fright(np.sqrt(other.square), p.span),)
 
 
 @law
-def told_one(p: Any, me: Me, sums: Vec) -> Vec:
+def one_sum(p: Any, me: Me, sums: Vec) -> Vec:
     """Return the sum as a vector."""
     return planar(me.pos, sums[0], like(sums[0], 0.0))
 
 
 @law
-def afraid(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
+def keep_fear(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
     """Return the fear after a step: of all in sight together, at most 1; it fades."""
     one = like(p.span, 1.0)
-    later = motivation.calmed(me.inner.fear, told[0] if told[0] < one else one, p.memory, seconds)
-    return (later if _among(me.who, p.first, p.end) else me.inner.fear,)
+    later = motivation.update_fear(me.inner.fear, told[0] if told[0] < one else one, p.memory, seconds)
+    return (later if _is_member(me.who, p.first, p.end) else me.inner.fear,)
 
 
 class Fear(_Urge):
@@ -316,10 +316,10 @@ class Fear(_Urge):
     occluded: bool = Field(default=False, description="True: obstacles hide agents")
     span: float = Field(default=2.0, ge=0, description="D0, m, distance within which the fear of one agent is 1")
     memory: float = Field(default=3.0, gt=0, description="s, over which fear falls to 1/e")
-    pair_law: ClassVar[Law | None] = frightened
-    finish_law: ClassVar[Law | None] = told_one
-    begin_law: ClassVar[Law | None] = unafraid
-    keep_law: ClassVar[Law | None] = afraid
+    pair_law: ClassVar[Law | None] = fear_of
+    finish_law: ClassVar[Law | None] = one_sum
+    begin_law: ClassVar[Law | None] = no_fear
+    keep_law: ClassVar[Law | None] = keep_fear
     keeps: ClassVar[tuple[str, ...]] = ("fear",)
     strengths: ClassVar[tuple[str, ...]] = ("span",)
 
@@ -341,24 +341,24 @@ class Fear(_Urge):
 
 
 @law
-def urge_from(p: Any, me: Me) -> Vec:
+def initial_urge(p: Any, me: Me) -> Vec:
     """Return the initial urge, and 0 matings."""
-    return _drawn(p, me, CHANNEL + 1), like(p.start, 0.0)
+    return _draw_initial(p, me, CHANNEL + 1), like(p.start, 0.0)
 
 
 @law
-def willing(p: Any, me: Me, other: Other) -> Vec:
+def count_willing(p: Any, me: Me, other: Other) -> Vec:
     """Return 1 if the neighbour is willing, else 0."""
     o, e = like(other.square, 0.0), like(other.square, 1.0)
     would = motivation.desire(other.inner.libido, other.inner.hunger) > p.ready
-    return (e if would & _among(other.who, p.first, p.end) else o,)
+    return (e if would & _is_member(other.who, p.first, p.end) else o,)
 
 
 @law
-def mating(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
+def update_urge(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
     """Return urge and count after a step: the urge grows; a willing agent near another mates, which resets it."""
     o, e = like(p.rate, 0.0), like(p.rate, 1.0)
-    mine = _among(me.who, p.first, p.end)
+    mine = _is_member(me.who, p.first, p.end)
     mates = mine & (told[0] > o) & (motivation.desire(me.inner.libido, me.inner.hunger) > p.ready)
     grown = me.inner.libido + (p.rate * seconds if mine else o)
     return (o if mates else grown), me.inner.mated + (e if mates else o)
@@ -377,10 +377,10 @@ class Libido(_Urge):
     ready: float = Field(default=0.4, ge=0, le=1, description="libido above which an agent is willing")
     start: float = Field(default=0.0, ge=0, description="mean initial urge")
     spread: float = Field(default=0.0, ge=0, description="width of the uniform distribution of initial values")
-    pair_law: ClassVar[Law | None] = willing
-    finish_law: ClassVar[Law | None] = told_one
-    begin_law: ClassVar[Law | None] = urge_from
-    keep_law: ClassVar[Law | None] = mating
+    pair_law: ClassVar[Law | None] = count_willing
+    finish_law: ClassVar[Law | None] = one_sum
+    begin_law: ClassVar[Law | None] = initial_urge
+    keep_law: ClassVar[Law | None] = update_urge
     keeps: ClassVar[tuple[str, ...]] = ("libido", "mated")
     recalls: ClassVar[tuple[str, ...]] = ("hunger",)
     strengths: ClassVar[tuple[str, ...]] = ("rate",)
@@ -409,19 +409,19 @@ class Libido(_Urge):
 
 
 @law
-def no_intention(p: Any, me: Me) -> Vec:
+def initial_intention(p: Any, me: Me) -> Vec:
     """Return the initial intention: wander."""
     return (like(me.mass, motivation.WANDER),)
 
 
 @law
-def intending(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
+def update_intention(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
     """Return the next intention, from the present one, hunger, libido and fear."""
     libido = motivation.desire(me.inner.libido, me.inner.hunger)
     now = motivation.intention(
         me.inner.intention, me.inner.hunger, libido, me.inner.fear, p.escape, p.school, p.need, p.calm, p.content
     )
-    return (now if _among(me.who, p.first, p.end) else me.inner.intention,)
+    return (now if _is_member(me.who, p.first, p.end) else me.inner.intention,)
 
 
 class Intention(_Urge):
@@ -438,8 +438,8 @@ class Intention(_Urge):
     need: float = Field(default=0.5, gt=0, le=1, description="hunger or libido above which an agent acts on it")
     calm: float = Field(default=0.1, ge=0, description="decrease of fear below the threshold that ends either")
     content: float = Field(default=0.3, ge=0, description="decrease of the need below the threshold that ends it")
-    begin_law: ClassVar[Law | None] = no_intention
-    keep_law: ClassVar[Law | None] = intending
+    begin_law: ClassVar[Law | None] = initial_intention
+    keep_law: ClassVar[Law | None] = update_intention
     keeps: ClassVar[tuple[str, ...]] = ("intention",)
     recalls: ClassVar[tuple[str, ...]] = ("hunger", "libido", "fear")
     strengths: ClassVar[tuple[str, ...]] = ("calm", "content")

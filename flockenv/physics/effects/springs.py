@@ -41,13 +41,13 @@ def spring(p: Any, me: Me, others: Any, number: Vec) -> Vec:
 
 
 @law
-def _turned(a: Vec) -> Vec:
+def _turn_left(a: Vec) -> Vec:
     """Return a 2-D vector turned a quarter to the left."""
     return (-a[1], a[0])
 
 
 @law
-def _opening(a: Vec, b: Vec) -> tuple[float, Vec, Vec]:
+def _angle_and_gradients(a: Vec, b: Vec) -> tuple[float, Vec, Vec]:
     """Return the angle from arm a to arm b and its gradients, d angle / da and d angle / db.
 
     In 2-D the angle has a sign; in 3-D it is between 0 and pi, and the gradients of collinear arms are 0.
@@ -58,7 +58,7 @@ def _opening(a: Vec, b: Vec) -> tuple[float, Vec, Vec]:
     per_a, per_b = e / aa if sound else o, e / bb if sound else o
     if len(a) == 2:
         angle = np.arctan2(a[0] * b[1] - a[1] * b[0], a[0] * b[0] + a[1] * b[1])
-        return angle, scale(_turned(a), -per_a), scale(_turned(b), per_b)
+        return angle, scale(_turn_left(a), -per_a), scale(_turn_left(b), per_b)
     else:
         across = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
         sine, cosine = norm(across), dot(a, b)
@@ -71,7 +71,7 @@ def _opening(a: Vec, b: Vec) -> tuple[float, Vec, Vec]:
 
 
 @law
-def _wrapped(angle: float) -> float:
+def _wrap_angle(angle: float) -> float:
     """Return an angle in [-pi, pi)."""
     turn = like(angle, 2 * np.pi)
     return angle - turn * np.floor(angle / turn + like(angle, 0.5))  # type: ignore[no-any-return]
@@ -90,9 +90,9 @@ def angular_spring(p: Any, me: Me, others: Any, number: Vec) -> Vec:
     b = select(apex, far.offset, select(first, beyond, back))
     va = select(apex, sub(near.vel, me.vel), select(first, moves, passes))
     vb = select(apex, sub(far.vel, me.vel), select(first, passes, moves))
-    angle, grows_a, grows_b = _opening(a, b)
+    angle, grows_a, grows_b = _angle_and_gradients(a, b)
     rate = dot(grows_a, va) + dot(grows_b, vb)
-    moment = -number[0] * _wrapped(angle - number[2]) - number[1] * rate
+    moment = -number[0] * _wrap_angle(angle - number[2]) - number[1] * rate
     on_a, on_b = scale(grows_a, moment), scale(grows_b, moment)
     both = scale(add(on_a, on_b), like(half, -1.0))
     return select(apex, both, select(first, on_a, on_b))

@@ -13,12 +13,12 @@ from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import norm, scale, select, sub, unit, zero
 from flockenv.model.distribution import Spread, draw
 from flockenv.model.scene_view import SceneView
-from flockenv.physics.effects.aims import about
+from flockenv.physics.effects.aims import applies_to
 from flockenv.physics.effects.effect import Me
-from flockenv.physics.effects.floor_field import Around, slowed
-from flockenv.physics.floor_fields import towards
+from flockenv.physics.effects.floor_field import Around, slow_down
+from flockenv.physics.floor_fields import path_to_target
 
-__all__ = ["Journey", "Stage", "onwards", "place_kept"]
+__all__ = ["Journey", "Stage", "place_behind", "stored_position"]
 
 Seconds = Annotated[float, Field(ge=0)] | Spread
 
@@ -29,15 +29,15 @@ HEAD = 2
 
 
 @law
-def place_kept(me: Me) -> Vec:
+def stored_position(me: Me) -> Vec:
     """Return the stored position, that at the end of the step before."""
     return me.inner.was_x, me.inner.was_y
 
 
 @law
-def onwards(me: Me) -> Vec:
+def place_behind(me: Me) -> Vec:
     """Return a point a metre behind the agent, against the direction of its last step."""
-    return sub(me.pos, unit(sub(me.pos, place_kept(me))))
+    return sub(me.pos, unit(sub(me.pos, stored_position(me))))
 
 
 @law
@@ -59,30 +59,30 @@ def journey_aim(p: Any, me: Me) -> Vec:
     block = np.int64(p.table[row])
     length, direction = norm(straight), unit(straight)
     if block >= 0:
-        length, direction = towards(p.table[block:], me.pos)
-    e = slowed(direction, length, p.table[row + 1])
-    e = select((stage >= p.many) & (p.leaves > o), unit(sub(me.pos, place_kept(me))), e)
-    return select(about(p, me) & (stage >= o), scale(e, p.share), zero(me.pos))
+        length, direction = path_to_target(p.table[block:], me.pos)
+    e = slow_down(direction, length, p.table[row + 1])
+    e = select((stage >= p.many) & (p.leaves > o), unit(sub(me.pos, stored_position(me))), e)
+    return select(applies_to(p, me) & (stage >= o), scale(e, p.share), zero(me.pos))
 
 
 @law
-def journey_begun(p: Any, me: Me) -> Vec:
+def initial_stage(p: Any, me: Me) -> Vec:
     """Return the initial stage, -1/2 if it waits before it sets out, the end of that wait, and the position."""
     o = like(p.share, 0.0)
     begin = np.int64(p.many) * np.int64(p.size)
     each = np.int64(p.many) + 1
-    mine = about(p, me)
+    mine = applies_to(p, me)
     wait = p.table[begin + np.int64(me.who - p.first) * each] if mine else o
     stage = like(o, -0.5) if wait > o else o
     return select(mine, (stage, me.time + wait, me.pos[0], me.pos[1]), (o, o, o, o))
 
 
 @law
-def journey_kept(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
+def update_stage(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
     """Return the stage, k, or k + 1/2 while it waits there; the time until which it waits; and the position."""
-    stage, ready, was = me.inner.stage, me.inner.ready, place_kept(me)
+    stage, ready, was = me.inner.stage, me.inner.ready, stored_position(me)
     before = (stage, ready, was[0], was[1])
-    if not about(p, me) or (stage >= p.many and p.leaves > like(stage, 0.0)):
+    if not applies_to(p, me) or (stage >= p.many and p.leaves > like(stage, 0.0)):
         return before
     half, now = like(stage, 0.5), me.time + seconds
     on = np.floor(stage) + like(stage, 1.0)
@@ -98,7 +98,7 @@ def journey_kept(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
         stage = stage + half if wait > like(wait, 0.0) else on
     ended = stage >= p.many
     stage = like(stage, 0.0) if ended and p.loops > like(stage, 0.0) else stage
-    place = select(ended & (p.leaves > like(stage, 0.0)), onwards(me), me.pos)
+    place = select(ended & (p.leaves > like(stage, 0.0)), place_behind(me), me.pos)
     return (stage, ready, place[0], place[1])
 
 
@@ -134,8 +134,8 @@ class Journey(Around):
     slow_radius: float = Field(default=0.5, gt=0, description="m, over which agents slow down before a stop")
     needs_all: ClassVar[bool] = True
     aim_law: ClassVar[Law | None] = journey_aim
-    begin_law: ClassVar[Law | None] = journey_begun
-    keep_law: ClassVar[Law | None] = journey_kept
+    begin_law: ClassVar[Law | None] = initial_stage
+    keep_law: ClassVar[Law | None] = update_stage
     keeps: ClassVar[tuple[str, ...]] = ("stage", "ready", "was_x", "was_y")
 
     @property

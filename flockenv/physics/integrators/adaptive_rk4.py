@@ -9,7 +9,7 @@ import numpy as np
 from flockenv.jit.decorators import like
 from flockenv.physics.integrators.adaptive import Adaptive
 from flockenv.physics.integrators.integrator import Method, Provided
-from flockenv.physics.integrators.step_size import add_slopes, begun, copy, judged, misfit, slope_of
+from flockenv.physics.integrators.step_size import add_slopes, copy, initial_clock, next_clock, slope_of, write_errors
 
 __all__ = ["AdaptiveRK4"]
 
@@ -29,7 +29,7 @@ def advance(provided: Provided) -> Method:
         x, v, x0, v0, new_x, new_v = stages[0], stages[1], stages[2], stages[3], stages[4], stages[5]
         whole_x, whole_v = stages[6], stages[7]
         limits = settings(context)
-        clock, known = begun(dt), False
+        clock, known = initial_clock(dt), False
         while clock.done < dt:
             for part in range(3):  # the whole, its first half, its second half
                 h = clock.step if part == 0 else clock.step / 2
@@ -52,13 +52,13 @@ def advance(provided: Provided) -> Method:
                         slope_of(slope, v, flow, first, end)
                         known = True
                     add_slopes(new_x, new_v, h / 6 if stage == 0 or stage == 3 else h / 3, slope, a, first, end)
-            misfit(whole_x, new_x, new_v, whole_x, whole_v, first, end)
+            write_errors(whole_x, new_x, new_v, whole_x, whole_v, first, end)
             square, where = largest(context, whole_x, first, end)
             error = np.sqrt(square)
             if error <= limits[0]:
                 known = False
                 copy(pos, vel, new_x, new_v, first, end)
-            clock = judged(clock, error, limits, dt, 4)
+            clock = next_clock(clock, error, limits, dt, 4)
             if clock.lost:
                 pos[where] = like(dt, np.nan)
         counted(context, clock.accepted, clock.rejected)

@@ -9,7 +9,7 @@ import numpy as np
 from flockenv.jit.decorators import like
 from flockenv.physics.integrators.adaptive import Adaptive
 from flockenv.physics.integrators.integrator import Method, Provided
-from flockenv.physics.integrators.step_size import add_slopes, begun, copy, judged, misfit, slope_of
+from flockenv.physics.integrators.step_size import add_slopes, copy, initial_clock, next_clock, slope_of, write_errors
 
 __all__ = ["DormandPrince"]
 
@@ -45,7 +45,7 @@ def advance(provided: Provided) -> Method:
         x, v = stages[0], stages[1]
         other_x, other_v = stages[3], stages[10]  # the second slope has weight 0 in the result and in its error
         limits = settings(context)
-        clock, known = begun(dt), False
+        clock, known = initial_clock(dt), False
         while clock.done < dt:
             h = clock.step
             for stage in range(7):
@@ -59,13 +59,13 @@ def advance(provided: Provided) -> Method:
             for k in range(7):
                 if k != 1:
                     add_slopes(other_x, other_v, -h * like(h, ERRORS[k]), stages[2 + k], stages[9 + k], first, end)
-            misfit(other_x, x, v, other_x, other_v, first, end)
+            write_errors(other_x, x, v, other_x, other_v, first, end)
             square, where = largest(context, other_x, first, end)
             error, known = np.sqrt(square), True
             if error <= limits[0]:
                 copy(pos, vel, x, v, first, end)
                 copy(stages[2], stages[9], stages[8], stages[15], first, end)
-            clock = judged(clock, error, limits, dt, 4)
+            clock = next_clock(clock, error, limits, dt, 4)
             if clock.lost:
                 pos[where] = like(dt, np.nan)
         counted(context, clock.accepted, clock.rejected)

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from flockenv.jit.decorators import like, shared
-from flockenv.physics.integrators.integrator import Integrator, Method, Provided, carried
+from flockenv.physics.integrators.integrator import Integrator, Method, Provided, carry
 
 __all__ = ["ExponentialDrag", "phi_functions"]
 
@@ -63,11 +63,11 @@ def advance(provided: Provided) -> Method:
                 if stage == 0:
                     x[i] = pos[i] + dt * (one * v[i] + dt * two * a[i])
                     v[i] = decay * v[i] + dt * one * a[i]
-                    pos[i] = carried(x[i] - dt * dt * three * a[i], half, flow, i)
+                    pos[i] = carry(x[i] - dt * dt * three * a[i], half, flow, i)
                     vel[i] = v[i] - dt * two * a[i]
-                    x[i] = carried(x[i], dt, flow, i)
+                    x[i] = carry(x[i], dt, flow, i)
                 else:
-                    pos[i] = carried(pos[i] + dt * dt * three * a[i], half, flow, i)
+                    pos[i] = carry(pos[i] + dt * dt * three * a[i], half, flow, i)
                     vel[i] += dt * two * a[i]
 
     return advance

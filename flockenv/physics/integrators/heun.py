@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from flockenv.jit.decorators import like
-from flockenv.physics.integrators.integrator import Integrator, Method, Provided, carried
+from flockenv.physics.integrators.integrator import Integrator, Method, Provided, carry
 
 __all__ = ["Heun"]
 
@@ -26,9 +26,9 @@ def advance(provided: Provided) -> Method:
             acceleration(context, x, v, time if stage == 0 else time + dt, a)
             for i in range(np.uint64(first), np.uint64(end)):
                 slope = v[i]
-                pos[i] = carried(pos[i] + half * slope, half, flow, i)
+                pos[i] = carry(pos[i] + half * slope, half, flow, i)
                 vel[i] += half * a[i]
-                x[i] = carried(x[i] + dt * slope, dt, flow, i)
+                x[i] = carry(x[i] + dt * slope, dt, flow, i)
                 v[i] += dt * a[i]
 
     return advance

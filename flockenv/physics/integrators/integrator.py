@@ -26,7 +26,7 @@ from flockenv.jit.decorators import OPTIONS
 from flockenv.model.state import WORK, Floats, State
 
 __all__ = [
-    "INTEGRATORS", "SUBSTEPS", "Alone", "Integrator", "Method", "Provided", "carried", "methods_named",
+    "INTEGRATORS", "SUBSTEPS", "Alone", "Integrator", "Method", "Provided", "carry", "methods_of",
 ]  # fmt: skip
 
 Method = Callable[..., None]
@@ -36,13 +36,13 @@ INTEGRATORS: dict[str, type[Integrator]] = {}
 """Every integrator by its kind; a class registers itself when it is defined."""
 
 
-def carried(x: float, seconds: float, flow: Any, i: int) -> float:
+def carry(x: float, seconds: float, flow: Any, i: int) -> float:
     """Return a coordinate x, carried for some seconds by the medium; x itself if `flow` is empty."""
     return float(x + seconds * flow[i]) if len(flow) else x
 
 
-@overload(carried, jit_options=OPTIONS)
-def _carried(x, seconds, flow, i):  # type: ignore[no-untyped-def]  # numba compares signatures, annotations included
+@overload(carry, jit_options=OPTIONS)
+def _carry(x, seconds, flow, i):  # type: ignore[no-untyped-def]  # numba compares signatures, annotations included
     if isinstance(flow, types.BaseTuple):
         return lambda x, seconds, flow, i: x
     return lambda x, seconds, flow, i: x + seconds * flow[i]
@@ -65,13 +65,13 @@ def _settings(context: Any) -> tuple[float, ...]:
     return tuple(context.settings)
 
 
-def _largest(context: Any, squares: Any, first: int, end: int) -> tuple[float, int]:
+def _largest_sum(context: Any, squares: Any, first: int, end: int) -> tuple[float, int]:
     sums = squares[first:end].reshape(context.dimension, -1).sum(axis=0)
     agent = int(np.argmax(sums))
     return sums[agent], first + agent
 
 
-def _counted(context: Any, accepted: int, rejected: int) -> None:
+def _count_substeps(context: Any, accepted: int, rejected: int) -> None:
     if context.work is not None:
         context.work[SUBSTEPS] += accepted
         context.work[SUBSTEPS + 1] += rejected
@@ -86,9 +86,9 @@ class Provided(NamedTuple):
     """(context): the settings of the method, in the order of its fields."""
     damping: Callable[..., None] = _damping
     """(context, rate, first, end): write c / m, 1/s, of coordinates [first, end), for a method with `splits_drag`."""
-    largest: Callable[..., tuple[float, int]] = _largest
+    largest: Callable[..., tuple[float, int]] = _largest_sum
     """(context, squares, first, end): the largest sum over an agent's coordinates, NaN if one is, and its index."""
-    counted: Callable[..., None] = _counted
+    counted: Callable[..., None] = _count_substeps
     """(context, accepted, rejected): count substeps in State.work."""
 
 
@@ -96,7 +96,7 @@ SUBSTEPS = WORK.index("substeps")
 """Column of State.work; rejected substeps are in the next."""
 
 
-def methods_named(names: Sequence[str]) -> tuple[Integrator, ...]:
+def methods_of(names: Sequence[str]) -> tuple[Integrator, ...]:
     """Return methods by their kinds, each once; raise ValueError, with the nearest name, for an unknown one."""
     for name in names:
         if name not in INTEGRATORS:

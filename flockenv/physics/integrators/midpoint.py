@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from flockenv.jit.decorators import like
-from flockenv.physics.integrators.integrator import Integrator, Method, Provided, carried
+from flockenv.physics.integrators.integrator import Integrator, Method, Provided, carry
 
 __all__ = ["Midpoint"]
 
@@ -26,11 +26,11 @@ def advance(provided: Provided) -> Method:
             acceleration(context, x, v, time if stage == 0 else time + half, a)
             if stage == 0:
                 for i in range(np.uint64(first), np.uint64(end)):
-                    x[i] = carried(pos[i] + half * vel[i], half, flow, i)
+                    x[i] = carry(pos[i] + half * vel[i], half, flow, i)
                     v[i] = vel[i] + half * a[i]
             else:
                 for i in range(np.uint64(first), np.uint64(end)):
-                    pos[i] = carried(pos[i] + dt * v[i], dt, flow, i)
+                    pos[i] = carry(pos[i] + dt * v[i], dt, flow, i)
                     vel[i] += dt * a[i]
 
     return advance

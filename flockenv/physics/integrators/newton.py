@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Coupling", "NotSolvedError", "Stage", "coupled", "solve_stage"]
+__all__ = ["Coupling", "NotSolvedError", "Stage", "coupling_between", "solve_stage"]
 
 Rows = NDArray[np.floating[Any]]
 
@@ -62,7 +62,7 @@ class Coupling:
         return int(self.colour.max(initial=-1)) + 1
 
 
-def coupled(agents: int, first: NDArray[np.integer[Any]], second: NDArray[np.integer[Any]]) -> Coupling:
+def coupling_between(agents: int, first: NDArray[np.integer[Any]], second: NDArray[np.integer[Any]]) -> Coupling:
     """Return the coupling in which each agent depends on itself, and `first` on `second`, (R,) each."""
     from scipy import sparse  # here: loading takes a third of a second, needed by implicit methods alone
 
@@ -122,7 +122,7 @@ def solve_stage(
     residual = _Residual(evaluate, x0, v0, time, h)
     for w in residual.guesses():
         try:
-            return _solved(residual, w, dimension, coupling)
+            return _solve_newton(residual, w, dimension, coupling)
         except _SingularError:
             continue
     raise NotSolvedError("forces have no derivative where Newton's method begins", residual(w[None])[0])
@@ -132,7 +132,7 @@ class _SingularError(ArithmeticError):
     """Corrections vanish although the residual does not: derivatives are unbounded."""
 
 
-def _solved(residual: _Residual, w: Rows, dimension: int, coupling: Coupling | None) -> Stage:
+def _solve_newton(residual: _Residual, w: Rows, dimension: int, coupling: Coupling | None) -> Stage:
     """Return the solution of Newton's method from a first guess.
 
     It ends when a correction is at rounding, relative to the velocities, or stops shrinking near it; a correction that
@@ -150,7 +150,11 @@ def _solved(residual: _Residual, w: Rows, dimension: int, coupling: Coupling | N
             raise NotSolvedError("the acceleration is not finite", r)
         if size == 0.0:
             return residual.stage(w, iteration - 1, linear)
-        solve = _free(residual, w, r) if coupling is None else _matrix(residual, w, r, dimension, coupling)
+        solve = (
+            _matrix_free_solver(residual, w, r)
+            if coupling is None
+            else _factorised_solver(residual, w, r, dimension, coupling)
+        )
         correction, took = solve(-r)
         linear += took + (coupling is not None)
         scale = max(1.0, float(np.abs(w).max()), float(np.abs(residual.v0).max()))
@@ -161,12 +165,12 @@ def _solved(residual: _Residual, w: Rows, dimension: int, coupling: Coupling | N
                 raise _SingularError
             return residual.stage(w + correction if small else w, iteration, linear)
         before = change
-        w, r, more = _searched(residual, w, correction, solve)
+        w, r, more = _search_along(residual, w, correction, solve)
         linear += more
     raise NotSolvedError(f"Newton's method has not converged in {MOST_ITERATIONS} iterations", r)
 
 
-def _searched(
+def _search_along(
     residual: _Residual, w: Rows, correction: Rows, solve: Callable[[Rows], tuple[Rows, int]]
 ) -> tuple[Rows, Rows, int]:
     """Return the next w and R, and the linear iterations: the correction is halved until the next one is smaller.
@@ -187,19 +191,19 @@ def _searched(
     return new, r_new, took  # the best found; the next correction shows if it is enough
 
 
-def _step_of(w: Rows) -> float:
+def _difference_step(w: Rows) -> float:
     """Return the step of the finite differences."""
     return float(np.sqrt(np.finfo(w.dtype).eps)) * max(1.0, float(np.abs(w).max()))
 
 
-def _matrix(
+def _factorised_solver(
     residual: _Residual, w: Rows, r: Rows, dimension: int, coupling: Coupling
 ) -> Callable[[Rows], tuple[Rows, int]]:
     """Return a solver of J s = b by a sparse factorisation."""
     from scipy import sparse
     from scipy.sparse import linalg
 
-    agents, step = len(w) // dimension, _step_of(w)
+    agents, step = len(w) // dimension, _difference_step(w)
     moved = np.repeat(w[None], coupling.colours * dimension, axis=0)
     who = np.arange(agents)
     for k in range(dimension):
@@ -222,7 +226,7 @@ def _matrix(
     return lambda b: (factors.solve(b.astype(float)).astype(w.dtype), 0)
 
 
-def _free(residual: _Residual, w: Rows, r: Rows) -> Callable[[Rows], tuple[Rows, int]]:
+def _matrix_free_solver(residual: _Residual, w: Rows, r: Rows) -> Callable[[Rows], tuple[Rows, int]]:
     """Return a solver of J s = b by GMRES, with J s as a difference along s."""
     from scipy.sparse import linalg
 
@@ -234,7 +238,7 @@ def _free(residual: _Residual, w: Rows, r: Rows) -> Callable[[Rows], tuple[Rows,
         length = float(np.abs(direction).max())
         if length == 0.0:
             return np.zeros_like(direction)
-        step = _step_of(w) / length
+        step = _difference_step(w) / length
         return np.asarray((residual((w + step * direction)[None])[0] - r) / step)
 
     def solve(b: Rows) -> tuple[Rows, int]:

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from flockenv.jit.decorators import like
-from flockenv.physics.integrators.integrator import Integrator, Method, Provided, carried
+from flockenv.physics.integrators.integrator import Integrator, Method, Provided, carry
 
 __all__ = ["RK4"]
 
@@ -32,9 +32,9 @@ def advance(provided: Provided) -> Method:
             acceleration(context, x, v, when, a)
             for i in range(np.uint64(first), np.uint64(end)):
                 slope = v[i]
-                pos[i] = carried(pos[i] + weight * slope, weight, flow, i)
+                pos[i] = carry(pos[i] + weight * slope, weight, flow, i)
                 vel[i] += weight * a[i]
-                x[i] = carried(x0[i] + ahead * slope, ahead, flow, i)
+                x[i] = carry(x0[i] + ahead * slope, ahead, flow, i)
                 v[i] = v0[i] + ahead * a[i]
 
     return advance

@@ -19,9 +19,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flockenv.jit.decorators import like, shared
-from flockenv.physics.integrators.integrator import carried
+from flockenv.physics.integrators.integrator import carry
 
-__all__ = ["TRIES", "Clock", "add_slopes", "begun", "copy", "excess", "judged", "misfit", "slope_of"]
+__all__ = [
+    "TRIES",
+    "Clock",
+    "add_slopes",
+    "copy",
+    "excess_square",
+    "initial_clock",
+    "next_clock",
+    "slope_of",
+    "write_errors",
+]
 
 TRIES = 20
 """Number of rejections in a row at which a world is given up: from the second on, each divides the substep by 5."""
@@ -40,20 +50,20 @@ class Clock(NamedTuple):
 
 
 @shared
-def begun(dt: float) -> Clock:
+def initial_clock(dt: float) -> Clock:
     """Return the clock at the beginning of a step of the scene: the first substep is the whole step."""
     return Clock(like(dt, 0.0), dt, like(dt, 0.0), 0, 0, 0, False)
 
 
 @shared
-def excess(difference: float, size: float, tiny: float) -> float:
+def excess_square(difference: float, size: float, tiny: float) -> float:
     """Return the square of a difference, less the rounding of a number of that size; NaN stays NaN."""
     beyond = abs(difference) - tiny * abs(size)
     return like(beyond, 0.0) if beyond <= like(beyond, 0.0) else beyond * beyond
 
 
 @shared
-def _stretched(error: float, tolerance: float, dt: float, order: int) -> float:
+def _step_factor(error: float, tolerance: float, dt: float, order: int) -> float:
     """Return the factor of the next substep, from 1/5 (also if the error is NaN) to 5."""
     none = error <= like(dt, 0.0)
     ratio = tolerance / (tolerance if none else error)
@@ -62,7 +72,7 @@ def _stretched(error: float, tolerance: float, dt: float, order: int) -> float:
 
 
 @shared
-def judged(clock: Clock, error: float, limits: tuple[float, ...], dt: float, order: int) -> Clock:
+def next_clock(clock: Clock, error: float, limits: tuple[float, ...], dt: float, order: int) -> Clock:
     """Return the clock after a substep with that error; for the rules see the module.
 
     limits: tolerance, least, most.
@@ -72,7 +82,7 @@ def judged(clock: Clock, error: float, limits: tuple[float, ...], dt: float, ord
     last = clock.step >= dt - clock.done
     done = (dt if last else clock.done + clock.step) if taken else clock.done
     wary = clock.wary if taken else clock.done + clock.step
-    factor = _stretched(error, tolerance, dt, order)
+    factor = _step_factor(error, tolerance, dt, order)
     factor = like(dt, 0.2) if clock.tries > 0 and not taken else factor
     factor = min(factor, like(dt, 1.0)) if done < wary else factor
     step = min(clock.step * factor, dt - done)
@@ -97,7 +107,7 @@ def copy(to_x: Any, to_v: Any, x: Any, v: Any, first: int, end: int) -> None:
 def slope_of(x: Any, v: Any, flow: Any, first: int, end: int) -> None:
     """Write into x the rate of change of positions: v and the flow, as of the last acceleration."""
     for i in range(np.uint64(first), np.uint64(end)):
-        x[i] = carried(v[i], like(v[i], 1.0), flow, i)
+        x[i] = carry(v[i], like(v[i], 1.0), flow, i)
 
 
 @shared
@@ -109,8 +119,8 @@ def add_slopes(x: Any, v: Any, weight: float, slope: Any, a: Any, first: int, en
 
 
 @shared
-def misfit(squares: Any, x: Any, v: Any, other_x: Any, other_v: Any, first: int, end: int) -> None:
+def write_errors(squares: Any, x: Any, v: Any, other_x: Any, other_v: Any, first: int, end: int) -> None:
     """Write the squared difference of two results beyond rounding, per coordinate; `squares` may be other_x."""
     tiny = like(x[0], 8 * np.finfo(x.dtype).eps)
     for i in range(np.uint64(first), np.uint64(end)):
-        squares[i] = excess(x[i] - other_x[i], x[i], tiny) + excess(v[i] - other_v[i], v[i], tiny)
+        squares[i] = excess_square(x[i] - other_x[i], x[i], tiny) + excess_square(v[i] - other_v[i], v[i], tiny)

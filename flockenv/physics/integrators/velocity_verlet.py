@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from flockenv.jit.decorators import like
-from flockenv.physics.integrators.integrator import Integrator, Method, Provided, carried
+from flockenv.physics.integrators.integrator import Integrator, Method, Provided, carry
 
 __all__ = ["VelocityVerlet"]
 
@@ -29,11 +29,11 @@ def advance(provided: Provided) -> Method:
             acceleration(context, x, v, time if stage == 0 else time + dt, a)
             for i in range(np.uint64(first), np.uint64(end)):
                 vel[i] += half * a[i]
-                pos[i] = carried(pos[i], half, flow, i)
+                pos[i] = carry(pos[i], half, flow, i)
             if stage == 0:
                 for i in range(np.uint64(first), np.uint64(end)):
                     pos[i] += dt * vel[i]
-                    x[i] = carried(pos[i], half, flow, i)
+                    x[i] = carry(pos[i], half, flow, i)
                     v[i] += dt * a[i]
 
     return advance

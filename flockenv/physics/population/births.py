@@ -18,7 +18,7 @@ from flockenv.maths.vectors import add, cross, dot, scale, select, sub, unit
 from flockenv.model.state import WORK
 from flockenv.physics.population.occupancy import count_near, sort_living
 
-__all__ = ["births", "due"]
+__all__ = ["births_due", "create_births"]
 
 BIRTHS, DEATHS, REFUSED = (WORK.index(name) for name in ("births", "deaths", "births_refused"))
 
@@ -36,7 +36,7 @@ PLACE = 17
 
 
 @kernel
-def due(row: Any, time: float, dt: float) -> int:
+def births_due(row: Any, time: float, dt: float) -> int:
     """Return the number of births of a stream until `time`, s; one that is due then, within rounding, counts."""
     if row[4] == 0.0:
         return int(row[5]) if time + 1e-9 * dt >= row[2] else 0
@@ -51,59 +51,61 @@ def _draw(key: Any, who: int, channel: int) -> Vec:
 
 
 @law
-def _three(row: Any, at: int) -> Vec:
+def _three_numbers(row: Any, at: int) -> Vec:
     """Return three numbers of a row, from index `at`, as a vector."""
     return row[at], row[at + 1], row[at + 2]
 
 
 @law
-def _across(axis: Vec) -> Vec:
+def _perpendicular(axis: Vec) -> Vec:
     """Return a unit vector perpendicular to a unit vector; in the plane z = 0 if the axis is."""
     return unit(select(abs(axis[2]) < 0.9, (-axis[1], axis[0], 0.0), (0.0, -axis[2], axis[1])))
 
 
 @law
-def _around(axis: Vec, turn: float) -> Vec:
+def _turn_about(axis: Vec, turn: float) -> Vec:
     """Return the unit vector perpendicular to an axis, turned about it by `turn`, rad."""
-    u = _across(axis)
+    u = _perpendicular(axis)
     return add(scale(u, math.cos(turn)), scale(cross(axis, u), math.sin(turn)))
 
 
 @law
-def _cone(flat: bool, axis: Vec, spread: float, s: float, t: float) -> Vec:
+def _direction_in_cone(flat: bool, axis: Vec, spread: float, s: float, t: float) -> Vec:
     """Return a uniformly distributed unit vector within `spread` [rad] of an axis; s, t uniform in [0, 1)."""
     angle = spread * (2.0 * s - 1.0)
     along = math.cos(angle) if flat else 1.0 - s * (1.0 - math.cos(spread))
     aside = math.sin(angle) if flat else math.sqrt(max(0.0, 1.0 - along * along))
-    return add(scale(axis, along), scale(_around(axis, 0.0 if flat else 2.0 * math.pi * t), aside))
+    return add(scale(axis, along), scale(_turn_about(axis, 0.0 if flat else 2.0 * math.pi * t), aside))
 
 
 @law
-def _on_flat(piece: Any, flat: bool, s: float, t: float) -> tuple[Vec, Vec]:
+def _point_on_flat(piece: Any, flat: bool, s: float, t: float) -> tuple[Vec, Vec]:
     """Return a point on an edge or a face, and the outward normal."""
-    u, v = _three(piece, 5), _three(piece, 8)
+    u, v = _three_numbers(piece, 5), _three_numbers(piece, 8)
     right = (u[1], -u[0], 0.0)
     normal = unit(select(flat, right, cross(u, v)))
-    return add(_three(piece, 2), add(scale(u, s), scale(v, t))), scale(normal, piece[11])
+    return add(_three_numbers(piece, 2), add(scale(u, s), scale(v, t))), scale(normal, piece[11])
 
 
 @law
-def _on_round(piece: Any, flat: bool, s: float, t: float) -> tuple[Vec, Vec]:
+def _point_on_round(piece: Any, flat: bool, s: float, t: float) -> tuple[Vec, Vec]:
     """Return a point on the side of a tube, or on its ends, and the outward normal there."""
-    a, b = _three(piece, 2), _three(piece, 5)
+    a, b = _three_numbers(piece, 2), _three_numbers(piece, 5)
     line = sub(b, a)
     axis = select(dot(line, line) > 0.0, unit(line), (1.0, 0.0, 0.0))
     turn = (0.0 if t < 0.5 else math.pi) if flat else 2.0 * math.pi * t
     side = piece[1] == 1.0
-    normal = select(side, _around(axis, turn), _cone(flat, axis, math.pi, s, t))  # each end is half of a ball
+    normal = select(
+        side, _turn_about(axis, turn), _direction_in_cone(flat, axis, math.pi, s, t)
+    )  # each end is half of a ball
     end = select(dot(axis, normal) > 0.0, b, a)
     return add(select(side, add(a, scale(line, s)), end), scale(normal, piece[8])), normal
 
 
 @law
-def _within(piece: Any, spot: Vec) -> bool:
+def _is_within(piece: Any, spot: Vec) -> bool:
     """Return True if a point lies inside a segment of a thick line, not on its surface."""
-    line, way = sub(_three(piece, 5), _three(piece, 2)), sub(spot, _three(piece, 2))
+    line, way = sub(_three_numbers(piece, 5), _three_numbers(piece, 2)), sub(spot, _three_numbers(piece, 2))
     square = dot(line, line)
     share = min(max(dot(line, way) / square, 0.0), 1.0) if square > 0.0 else 0.0
     gap = sub(way, scale(line, share))
@@ -111,7 +113,7 @@ def _within(piece: Any, spot: Vec) -> bool:
 
 
 @kernel
-def _on_surface(flat: bool, row: Any, pieces: Any, key: Any, who: int, channel: int) -> tuple[Vec, Vec]:
+def _point_on_surface(flat: bool, row: Any, pieces: Any, key: Any, who: int, channel: int) -> tuple[Vec, Vec]:
     """Return a random point on a surface, and the outward normal there."""
     first, end = int(row[PLACE]), int(row[PLACE + 1])
     spot: Vec = (0.0, 0.0, 0.0)
@@ -125,32 +127,32 @@ def _on_surface(flat: bool, row: Any, pieces: Any, key: Any, who: int, channel: 
             low, high = (low, middle) if beyond else (middle + 1, high)
         piece = pieces[low]
         if piece[1] == 0.0:
-            spot, normal = _on_flat(piece, flat, draws[1], draws[2])
+            spot, normal = _point_on_flat(piece, flat, draws[1], draws[2])
         else:
-            spot, normal = _on_round(piece, flat, draws[1], draws[2])
+            spot, normal = _point_on_round(piece, flat, draws[1], draws[2])
         hidden = False
         for other in range(first, end):
-            hidden = hidden or _within(pieces[other], spot)
+            hidden = hidden or _is_within(pieces[other], spot)
         if not hidden:
             break
     return spot, normal
 
 
 @law
-def _in_disc(row: Any, flat: bool, draws: Vec) -> Vec:
+def _point_in_disc(row: Any, flat: bool, draws: Vec) -> Vec:
     """Return a point in a disc, a ball, or a flat disc in 3-D."""
-    axis = _three(row, PLACE + 4)
+    axis = _three_numbers(row, PLACE + 4)
     across = dot(axis, axis) > 0.0
-    out = _cone(flat, (1.0, 0.0, 0.0), math.pi, draws[1], draws[2])
-    out = select(across, _around(axis, 2.0 * math.pi * draws[1]), out)
+    out = _direction_in_cone(flat, (1.0, 0.0, 0.0), math.pi, draws[1], draws[2])
+    out = select(across, _turn_about(axis, 2.0 * math.pi * draws[1]), out)
     share = math.sqrt(draws[0]) if flat or across else draws[0] ** (1.0 / 3.0)
-    return add(_three(row, PLACE), scale(out, row[PLACE + 3] * share))
+    return add(_three_numbers(row, PLACE), scale(out, row[PLACE + 3] * share))
 
 
 @law
-def _in_box(row: Any, draws: Vec) -> Vec:
+def _point_in_box(row: Any, draws: Vec) -> Vec:
     """Return a point between two corners; on the line between them if all three draws are equal."""
-    low, high = _three(row, PLACE), _three(row, PLACE + 3)
+    low, high = _three_numbers(row, PLACE), _three_numbers(row, PLACE + 3)
     return (
         low[0] + draws[0] * (high[0] - low[0]),
         low[1] + draws[1] * (high[1] - low[1]),
@@ -159,7 +161,7 @@ def _in_box(row: Any, draws: Vec) -> Vec:
 
 
 @kernel
-def _in_clearing(
+def _point_in_clearing(
     x: Any, b: int, row: Any, key: Any, who: int, channel: int, period: Any, grid: Any, start: Any, order: Any,
     born: Any, identity: Any,
 ) -> Vec:  # fmt: skip
@@ -167,7 +169,7 @@ def _in_clearing(
     best: Vec = (0.0, 0.0, 0.0)
     fewest = 2**62
     for attempt in range(int(row[PLACE + 7])):
-        spot = _in_box(row, _draw(key, who, channel + 16 * attempt))
+        spot = _point_in_box(row, _draw(key, who, channel + 16 * attempt))
         near = count_near(x, b, spot, row[PLACE + 6], fewest, period, grid, start, order, born, identity, -1)
         if near < fewest:
             best, fewest = spot, near
@@ -175,7 +177,7 @@ def _in_clearing(
 
 
 @kernel
-def _into_space(walls: bool, period: Any, size: float, radius: float, p: float) -> float:
+def _wrap_or_clamp(walls: bool, period: Any, size: float, radius: float, p: float) -> float:
     """Return a coordinate wrapped to a periodic axis, or clamped between walls."""
     if period > 0.0:
         inside = p - period * math.floor(p / period)
@@ -184,28 +186,28 @@ def _into_space(walls: bool, period: Any, size: float, radius: float, p: float) 
 
 
 @kernel
-def _spot(
+def _birth_place(
     d: int, row: Any, pieces: Any, x: Any, b: int, key: Any, who: int, channel: int, period: Any, grid: Any, start: Any,
     order: Any, born: Any, identity: Any,
 ) -> tuple[Vec, Vec]:  # fmt: skip
     """Return the place of a birth, and its direction: that of the row, or the outward normal of a surface."""
-    draws, aim = _draw(key, who, channel), _three(row, 10)
+    draws, aim = _draw(key, who, channel), _three_numbers(row, 10)
     if row[16] <= 1.0:
-        return _in_box(row, (draws[0], draws[0], draws[0])), aim
+        return _point_in_box(row, (draws[0], draws[0], draws[0])), aim
     if row[16] == 2.0:
-        return _in_disc(row, d == 2, draws), aim
+        return _point_in_disc(row, d == 2, draws), aim
     if row[16] == 4.0:
-        spot, normal = _on_surface(d == 2, row, pieces, key, who, channel)
+        spot, normal = _point_on_surface(d == 2, row, pieces, key, who, channel)
         return spot, select(row[9] == 1.0, normal, aim)
-    spot = _in_box(row, draws)
+    spot = _point_in_box(row, draws)
     if order is not None:  # noqa: SIM102  # numba prunes only a test that is alone
         if row[16] == 5.0:
-            spot = _in_clearing(x, b, row, key, who, channel, period, grid, start, order, born, identity)
+            spot = _point_in_clearing(x, b, row, key, who, channel, period, grid, start, order, born, identity)
     return spot, aim
 
 
 @kernel
-def births(
+def create_births(
     streams: Any, pieces: Any, clearing: float, x: Any, v: Any, frame: Any, alive: Any, identity: Any, born: Any,
     dies: Any, tick: Any, key: Any, work: Any, radius: Any, dt: float, walls: bool, size: Any, period: Any, first: int,
     end: int, grid: Any, cell: Any, start: Any, order: Any,
@@ -221,8 +223,8 @@ def births(
         sorted_, slot, until = False, 0, -1
         for e in range(kinds):
             row = streams[e]
-            before = due(row, (tick[b] - 1) * dt, dt) if tick[b] > 0 else 0
-            after = due(row, tick[b] * dt, dt)
+            before = births_due(row, (tick[b] - 1) * dt, dt) if tick[b] > 0 else 0
+            after = births_due(row, tick[b] * dt, dt)
             if order is not None:  # noqa: SIM102  # numba prunes only a test that is alone
                 if after > before and not sorted_:
                     sort_living(x, alive, b, 0, n, clearing, period, grid, cell, start, order)
@@ -230,14 +232,14 @@ def births(
             # streams of a group are consecutive, and each continues at the slot where the last one ended
             if until != int(row[1]):
                 slot, until = int(row[0]), int(row[1])
-            slot = _bear(
+            slot = _create_agents(
                 before, after, e, kinds, slot, until, row, pieces, x, v, frame, alive, identity, born, dies,
                 tick[b] * dt, key[b], work, radius, dt, walls, size, period, b, grid, start, order,
             )  # fmt: skip
 
 
 @kernel
-def _bear(
+def _create_agents(
     before: int, after: int, stream: int, kinds: int, slot: int, until: int, row: Any, pieces: Any, x: Any, v: Any,
     frame: Any, alive: Any, identity: Any, born: Any, dies: Any, now: float, key: Any, work: Any, radius: Any,
     dt: float, walls: bool, size: Any, period: Any, b: int, grid: Any, start: Any, order: Any,
@@ -261,15 +263,15 @@ def _bear(
             work[b, REFUSED] += after - k
             break
         drawn, channel = (n + stream, TOGETHER) if row[15] == 1.0 else (who, CHANNEL + 16)
-        spot, aim = _spot(
+        spot, aim = _birth_place(
             d, row, pieces, x, b, key, drawn, channel, period, grid, start, order, born, identity
         )  # fmt: skip
         draws = _draw(key, who, CHANNEL)
-        vel = scale(_cone(d == 2, aim, row[8], draws[1], draws[2]), row[6] + (row[7] - row[6]) * draws[0])
+        vel = scale(_direction_in_cone(d == 2, aim, row[8], draws[1], draws[2]), row[6] + (row[7] - row[6]) * draws[0])
         spot = add(spot, scale(vel, now - when))
         for j in range(d):
             v[j, b, slot] = vel[j]
-            x[j, b, slot] = _into_space(walls, period[j], size[j], float(radius[slot]), spot[j])
+            x[j, b, slot] = _wrap_or_clamp(walls, period[j], size[j], float(radius[slot]), spot[j])
         alive[b, slot] = True
         identity[b, slot], born[b, slot], dies[b, slot] = who, when, when + life
         if frame.shape[0] > 0:

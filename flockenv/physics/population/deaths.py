@@ -16,18 +16,18 @@ from flockenv.geometry.shapes.row_header import shift_of
 from flockenv.jit.decorators import Vec, kernel, law
 from flockenv.maths.counter_rng import uniform
 from flockenv.maths.vectors import add, norm, sub, unit
-from flockenv.physics.constraints.broad_phase import image, loaded
+from flockenv.physics.constraints.broad_phase import load_vector, nearest_image
 from flockenv.physics.population.births import DEATHS
 from flockenv.physics.population.occupancy import count_near, sort_living
 
-__all__ = ["crowding", "drain", "passing", "reaching"]
+__all__ = ["remove_at_level", "remove_crowded", "remove_drained", "remove_expired"]
 
 DECAY = 2_000_000
 """RNG channel of the first sink; each further sink has the next one."""
 
 
 @kernel
-def _die(b: int, i: int, v: Any, alive: Any, work: Any) -> None:
+def _remove(b: int, i: int, v: Any, alive: Any, work: Any) -> None:
     """Remove an agent: its slot becomes free, and keeps the place of death and the identity."""
     alive[b, i] = False
     for k in range(v.shape[0]):
@@ -46,7 +46,7 @@ def _chance(rate: float, usual: float, born: float, now: float, dt: float) -> fl
 
 
 @kernel
-def passing(
+def remove_expired(
     sinks: Any, x: Any, v: Any, alive: Any, identity: Any, born: Any, dies: Any, tick: Any, key: Any, work: Any,
     dt: float, first: int, end: int, channel: int,
 ) -> None:  # fmt: skip
@@ -58,7 +58,7 @@ def passing(
         now = tick[b] * dt
         for i in range(alive.shape[1]):
             if dies[b, i] <= now + 1e-9 * dt and alive[b, i]:
-                _die(b, i, v, alive, work)
+                _remove(b, i, v, alive, work)
         for s in range(sinks.shape[0]):
             row = sinks[s]
             usual = 1.0 - math.exp(-row[3] * dt) if row[0] == 2.0 else 0.0
@@ -75,11 +75,11 @@ def passing(
                     chance = _chance(row[3], usual, born[b, i], now, dt)
                     gone = uniform(key[b], tick[b], identity[b, i], DECAY + channel + s) < chance
                 if gone:
-                    _die(b, i, v, alive, work)
+                    _remove(b, i, v, alive, work)
 
 
 @kernel
-def drain(
+def remove_drained(
     table: Any, margin: float, slots: Any, anchor: Vec, period: Vec, x0: Any, x: Any, v: Any, alive: Any, tick: Any,
     work: Any, dt: float, first: int, end: int,
 ) -> None:  # fmt: skip
@@ -94,16 +94,16 @@ def drain(
         for i in range(slots[0], slots[1]):
             if not alive[b, i]:
                 continue
-            here = loaded(anchor, x, b, i)
-            y = image(period, sub(here, place))
-            way = sub(image(period, sub(here, loaded(anchor, x0, b, i))), moved)
+            here = load_vector(anchor, x, b, i)
+            y = nearest_image(period, sub(here, place))
+            way = sub(nearest_image(period, sub(here, load_vector(anchor, x0, b, i))), moved)
             gap, _ = nearest_shape(table, 0, y)
             if gap <= margin or hit_shape(table, 0, sub(y, way), unit(way), margin) <= norm(way):
-                _die(b, i, v, alive, work)
+                _remove(b, i, v, alive, work)
 
 
 @kernel
-def crowding(
+def remove_crowded(
     row: Any, channel: int, x: Any, v: Any, alive: Any, identity: Any, born: Any, tick: Any, key: Any, work: Any,
     dt: float, period: Any, first: int, end: int, grid: Any, cell: Any, start: Any, order: Any, doomed: Any,
 ) -> None:  # fmt: skip
@@ -129,13 +129,15 @@ def crowding(
             doomed[i] = count_near(x, b, place, row[3], most, period, grid, start, order, born, identity, i) > most
         for i in range(low, high):
             if doomed[i]:
-                _die(b, i, v, alive, work)
+                _remove(b, i, v, alive, work)
 
 
 @kernel
-def reaching(numbers: Any, level: float, slots: Any, v: Any, alive: Any, work: Any, first: int, end: int) -> None:
+def remove_at_level(
+    numbers: Any, level: float, slots: Any, v: Any, alive: Any, work: Any, first: int, end: int
+) -> None:
     """Remove agents whose value in `numbers` (B, N) is at least `level`; slots (first, end)."""
     for b in range(first, end):
         for i in range(slots[0], slots[1]):
             if alive[b, i] and numbers[b, i] >= level:
-                _die(b, i, v, alive, work)
+                _remove(b, i, v, alive, work)

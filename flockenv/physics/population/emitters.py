@@ -15,8 +15,8 @@ from pydantic import Field, model_validator
 from flockenv.core.record import Record
 from flockenv.geometry.space import Box, Torus
 from flockenv.model.scene_view import SceneView
-from flockenv.physics.population.members import Member, demand_group, dimensions
-from flockenv.physics.population.regions import AnyPlace, Clearing, Surface, Vector, in_space
+from flockenv.physics.population.members import Member, check_dimensions, demand_group
+from flockenv.physics.population.regions import AnyPlace, Clearing, Surface, Vector, three_numbers
 
 __all__ = ["MOST_RATE", "Burst", "Emitter"]
 
@@ -86,7 +86,7 @@ class Emitter(Member):
         group = scene.groups[self.group]
         if group.network is not None:
             raise ValueError(f"group = {self.group}: is a network, whose particles are not born one by one")
-        dimensions(scene, direction=self.direction)
+        check_dimensions(scene, direction=self.direction)
         try:
             self.place.check(scene)
         except ValueError as error:
@@ -114,7 +114,7 @@ class Emitter(Member):
         """Return a row of numbers for the rate and for each burst, as births.py reads them; slots are [first, end)."""
         spread = 0.0 if self.direction is not None or isinstance(self.place, Surface) else 180.0
         spread = math.radians(spread if self.spread is None else self.spread)
-        aim = in_space(self.direction or (1.0,) + (0.0,) * (dimension - 1))
+        aim = three_numbers(self.direction or (1.0,) + (0.0,) * (dimension - 1))
         length = math.hypot(*aim)
         lifetime = (math.inf, math.inf) if self.lifetime is None else self.lifetime
         along_normal = float(self.direction is None and isinstance(self.place, Surface))

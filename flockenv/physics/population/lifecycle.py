@@ -13,13 +13,13 @@ from flockenv.geometry.space import Box
 from flockenv.jit.section import entry
 from flockenv.model.scene_view import SceneView
 from flockenv.model.state import Floats, State
-from flockenv.physics.population.births import PLACE, births
-from flockenv.physics.population.deaths import crowding, drain, passing, reaching
+from flockenv.physics.population.births import PLACE, create_births
+from flockenv.physics.population.deaths import remove_at_level, remove_crowded, remove_drained, remove_expired
 from flockenv.physics.population.emitters import Emitter
 from flockenv.physics.population.regions import Clearing, Surface
 from flockenv.physics.population.sinks import Crowding, Drain, Sink, Threshold
 
-__all__ = ["NUMBERS", "beget", "settler"]
+__all__ = ["NUMBERS", "create_initial", "make_settler"]
 
 NUMBERS = 4
 """Numbers of scratch memory per agent: cells, the agents in them, the agents that are to die."""
@@ -48,7 +48,7 @@ class _Scratch:
         return cls(np.zeros((4, 3)), cell, start, order, np.zeros(n, np.bool_))
 
 
-def _sized(scene: SceneView, there: bool) -> NDArray[np.float64]:
+def _space_size(scene: SceneView, there: bool) -> NDArray[np.float64]:
     """Return the size of the space, (3,) m; zeros unless `there`."""
     size = np.zeros(3)
     if there:
@@ -57,7 +57,7 @@ def _sized(scene: SceneView, there: bool) -> NDArray[np.float64]:
 
 
 def _period(scene: SceneView) -> NDArray[np.float64]:
-    return _sized(scene, scene.space.periodic)
+    return _space_size(scene, scene.space.periodic)
 
 
 def _streams(scene: SceneView) -> tuple[Floats, Floats, float]:
@@ -82,10 +82,10 @@ def _streams(scene: SceneView) -> tuple[Floats, Floats, float]:
     return table, np.concatenate(pieces), clearing
 
 
-def _births(scene: SceneView, scratch: _Scratch) -> Part:
+def _make_births(scene: SceneView, scratch: _Scratch) -> Part:
     streams, pieces, clearing = _streams(scene)
-    walls, size, period = isinstance(scene.space, Box), _sized(scene, isinstance(scene.space, Box)), _period(scene)
-    kernel, radius, dt = entry(births), scene.body.radius, float(scene.dt)
+    walls, size, period = isinstance(scene.space, Box), _space_size(scene, isinstance(scene.space, Box)), _period(scene)
+    kernel, radius, dt = entry(create_births), scene.body.radius, float(scene.dt)
     near = (scratch.grid, scratch.cell, scratch.start, scratch.order) if clearing else (None,) * 4
 
     def part(x0: Floats, s: State, first: int, end: int) -> None:
@@ -102,12 +102,12 @@ def _slots(scene: SceneView, sink: Sink) -> tuple[int, int]:
     return (0, scene.agents) if sink.group is None else (scene.starts[sink.group], scene.starts[sink.group + 1])
 
 
-def _passing(scene: SceneView, sinks: Sequence[Sink], channel: int) -> Part:
+def _make_expiry(scene: SceneView, sinks: Sequence[Sink], channel: int) -> Part:
     table = np.zeros((len(sinks), 9))
     for k, sink in enumerate(sinks):
         row = [sink.code, *_slots(scene, sink), *sink.row()]
         table[k, : len(row)] = row
-    kernel, dt = entry(passing), float(scene.dt)
+    kernel, dt = entry(remove_expired), float(scene.dt)
 
     def part(x0: Floats, s: State, first: int, end: int) -> None:
         kernel(
@@ -117,10 +117,10 @@ def _passing(scene: SceneView, sinks: Sequence[Sink], channel: int) -> Part:
     return part
 
 
-def _drain(scene: SceneView, sink: Drain) -> Part:
+def _make_drain(scene: SceneView, sink: Drain) -> Part:
     table, _ = pack_shapes([sink.shape], scene.dimension)
     anchor, slots = tuple(float(a) for a in sink.shape.anchor), _slots(scene, sink)
-    kernel, period, dt = entry(drain), tuple(_period(scene)[: scene.dimension].tolist()), float(scene.dt)
+    kernel, period, dt = entry(remove_drained), tuple(_period(scene)[: scene.dimension].tolist()), float(scene.dt)
 
     def part(x0: Floats, s: State, first: int, end: int) -> None:
         kernel(
@@ -130,9 +130,9 @@ def _drain(scene: SceneView, sink: Drain) -> Part:
     return part
 
 
-def _crowding(scene: SceneView, sink: Crowding, channel: int, scratch: _Scratch) -> Part:
+def _make_crowding(scene: SceneView, sink: Crowding, channel: int, scratch: _Scratch) -> Part:
     row = np.array([sink.code, *_slots(scene, sink), *sink.row()], np.float64)
-    kernel, period, dt = entry(crowding), _period(scene), float(scene.dt)
+    kernel, period, dt = entry(remove_crowded), _period(scene), float(scene.dt)
 
     def part(x0: Floats, s: State, first: int, end: int) -> None:
         kernel(
@@ -143,8 +143,8 @@ def _crowding(scene: SceneView, sink: Crowding, channel: int, scratch: _Scratch)
     return part
 
 
-def _reaching(scene: SceneView, sink: Threshold) -> Part:
-    kernel, slots, which = entry(reaching), _slots(scene, sink), scene.parts.inner.index(sink.of)
+def _make_threshold(scene: SceneView, sink: Threshold) -> Part:
+    kernel, slots, which = entry(remove_at_level), _slots(scene, sink), scene.parts.inner.index(sink.of)
 
     def part(x0: Floats, s: State, first: int, end: int) -> None:
         kernel(s.inner[which], sink.level, slots, s.v, s.alive, s.work, first, end)
@@ -152,7 +152,7 @@ def _reaching(scene: SceneView, sink: Threshold) -> Part:
     return part
 
 
-def _asks(scene: SceneView) -> bool:
+def _counts_agents(scene: SceneView) -> bool:
     """Return True if a member of the population counts agents near a place."""
     places = [member.place for member in scene.population if isinstance(member, Emitter)]
     return any(isinstance(m, (Crowding, Clearing)) for m in (*scene.population, *places))
@@ -160,7 +160,7 @@ def _asks(scene: SceneView) -> bool:
 
 def _parts(scene: SceneView) -> list[Part]:
     """Return the functions of the end of a step: lifetimes, then sinks in the scene's order, then births."""
-    scratch = _Scratch.of(scene.agents, _asks(scene))
+    scratch = _Scratch.of(scene.agents, _counts_agents(scene))
     emits = any(isinstance(member, Emitter) for member in scene.population)
     mortal = any(isinstance(m, Emitter) and m.lifetime is not None for m in scene.population)
     found: list[Part] = []
@@ -171,24 +171,24 @@ def _parts(scene: SceneView) -> list[Part]:
             simple.append(sink)
             continue
         if simple or (mortal and k == len(sinks)):
-            found.append(_passing(scene, simple, k - len(simple)))
+            found.append(_make_expiry(scene, simple, k - len(simple)))
             mortal, simple = False, []
         if isinstance(sink, Drain):
-            found.append(_drain(scene, sink))
+            found.append(_make_drain(scene, sink))
         elif isinstance(sink, Threshold):
-            found.append(_reaching(scene, sink))
+            found.append(_make_threshold(scene, sink))
         elif isinstance(sink, Crowding):
-            found.append(_crowding(scene, sink, k, scratch))
-    return [*found, *([_births(scene, scratch)] if emits else [])]
+            found.append(_make_crowding(scene, sink, k, scratch))
+    return [*found, *([_make_births(scene, scratch)] if emits else [])]
 
 
-def beget(scene: SceneView, state: State) -> None:
+def create_initial(scene: SceneView, state: State) -> None:
     """Create the agents that are born at time 0, in place."""
     if any(isinstance(member, Emitter) for member in scene.population):
-        _births(scene, _Scratch.of(scene.agents, _asks(scene)))(state.x, state, 0, state.shape[0])
+        _make_births(scene, _Scratch.of(scene.agents, _counts_agents(scene)))(state.x, state, 0, state.shape[0])
 
 
-def settler(scene: SceneView) -> Callable[[Floats, Floats, State, int, int], tuple[int, int]]:
+def make_settler(scene: SceneView) -> Callable[[Floats, Floats, State, int, int], tuple[int, int]]:
     """Return a function that updates the population at the end of a step, with scratch memory of its own."""
     parts = _parts(scene)
 

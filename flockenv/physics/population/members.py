@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 from flockenv.core.record import Record
 from flockenv.model.scene_view import SceneView
 
-__all__ = ["POPULATION", "Member", "demand_group", "dimensions"]
+__all__ = ["POPULATION", "Member", "check_dimensions", "demand_group"]
 
 POPULATION: dict[str, type[Member]] = {}
 """Every emitter and sink by its kind; a class registers itself when it is defined."""
@@ -42,7 +42,7 @@ def demand_group(scene: SceneView, which: int | None) -> None:
         raise ValueError(f"group = {which}: {known}; did you mean {count - 1}?")
 
 
-def dimensions(scene: SceneView, **given: tuple[float, ...] | None) -> None:
+def check_dimensions(scene: SceneView, **given: tuple[float, ...] | None) -> None:
     """Raise ValueError if the length of a vector is not the scene's dimension."""
     for name, value in given.items():
         if value is not None and len(value) != scene.dimension:

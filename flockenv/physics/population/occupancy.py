@@ -15,7 +15,7 @@ __all__ = ["count_near", "sort_living"]
 
 
 @kernel
-def _inside(p: float, size: float) -> float:
+def _wrap(p: float, size: float) -> float:
     """Return a coordinate of a periodic axis wrapped to [0, size); unchanged if size is 0."""
     return p - size * math.floor(p / size) if size > 0.0 else p
 
@@ -36,7 +36,7 @@ def _bounds(x: Any, alive: Any, b: int, first: int, end: int, period: Any, grid:
 
 
 @kernel
-def _divide(d: int, reach: float, most: int, grid: Any) -> int:
+def _divide_cells(d: int, reach: float, most: int, grid: Any) -> int:
     """Write cells per axis, grid[2], each at least `reach` wide, and at most `most` in all; return their number."""
     for k in range(3):
         grid[2, k] = 1.0
@@ -71,7 +71,7 @@ def sort_living(
     """
     d = x.shape[0]
     _bounds(x, alive, b, first, end, period, grid)
-    cells = _divide(d, reach, max(end - first, 1), grid)
+    cells = _divide_cells(d, reach, max(end - first, 1), grid)
     for c in range(cells + 1):
         start[c] = 0
     for i in range(first, end):
@@ -80,7 +80,7 @@ def sort_living(
             c = 0
             for j in range(d):
                 k = d - 1 - j
-                c = c * int(grid[2, k]) + _cell_along(_inside(float(x[k, b, i]), period[k]), k, grid)
+                c = c * int(grid[2, k]) + _cell_along(_wrap(float(x[k, b, i]), period[k]), k, grid)
             cell[i] = c
             start[c + 1] += 1
     for c in range(cells):
@@ -100,7 +100,7 @@ def sort_living(
 
 
 @kernel
-def _neighbouring(c: int, turn: int, count: int, periodic: bool) -> int:
+def _neighbour_cell(c: int, turn: int, count: int, periodic: bool) -> int:
     """Return one of up to three cells along an axis, c - 1 to c + 1 by `turn` 0 to 2; -1 if there is none."""
     if periodic:
         if turn >= count:  # each of one or two cells is visited once
@@ -122,15 +122,15 @@ def count_near(
     """
     d, found = x.shape[0], 0
     nx, ny, nz = int(grid[2, 0]), int(grid[2, 1]), int(grid[2, 2])
-    cx = math.floor((_inside(place[0], period[0]) - grid[0, 0]) * grid[3, 0])
-    cy = math.floor((_inside(place[1], period[1]) - grid[0, 1]) * grid[3, 1])
-    cz = math.floor((_inside(place[2], period[2]) - grid[0, 2]) * grid[3, 2]) if d == 3 else 0
+    cx = math.floor((_wrap(place[0], period[0]) - grid[0, 0]) * grid[3, 0])
+    cy = math.floor((_wrap(place[1], period[1]) - grid[0, 1]) * grid[3, 1])
+    cz = math.floor((_wrap(place[2], period[2]) - grid[0, 2]) * grid[3, 2]) if d == 3 else 0
     for tz in range(3):
-        z = _neighbouring(cz, tz, nz, period[2] > 0.0) if d == 3 else (0 if tz == 0 else -1)
+        z = _neighbour_cell(cz, tz, nz, period[2] > 0.0) if d == 3 else (0 if tz == 0 else -1)
         for ty in range(3):
-            y = _neighbouring(cy, ty, ny, period[1] > 0.0)
+            y = _neighbour_cell(cy, ty, ny, period[1] > 0.0)
             for tx in range(3):
-                x_ = _neighbouring(cx, tx, nx, period[0] > 0.0)
+                x_ = _neighbour_cell(cx, tx, nx, period[0] > 0.0)
                 if x_ < 0 or y < 0 or z < 0:
                     continue
                 c = (z * ny + y) * nx + x_

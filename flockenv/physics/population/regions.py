@@ -16,7 +16,7 @@ from pydantic import Field, WrapValidator, model_validator
 from flockenv.core.record import Record, instance_of
 from flockenv.geometry.shapes import AnyShape
 from flockenv.model.scene_view import SceneView
-from flockenv.physics.population.members import dimensions
+from flockenv.physics.population.members import check_dimensions
 from flockenv.physics.population.surface import pieces
 
 __all__ = ["PLACES", "AnyPlace", "BoxPlace", "Clearing", "Disc", "Place", "Point", "Segment", "Surface"]
@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 Vector = Annotated[tuple[float, ...], Field(min_length=2, max_length=3)]
 
 
-def in_space(vector: Sequence[float]) -> list[float]:
+def three_numbers(vector: Sequence[float]) -> list[float]:
     """Return a vector with three numbers: the third is 0 in 2-D."""
     return [*vector, *[0.0] * (3 - len(vector))]
 
@@ -63,7 +63,7 @@ class Point(Place):
 
     def row(self) -> list[float]:
         """Return the point, twice: as both ends of a segment."""
-        return in_space(self.at) * 2
+        return three_numbers(self.at) * 2
 
     @property
     def extremes(self) -> Floats:
@@ -72,7 +72,7 @@ class Point(Place):
 
     def check(self, scene: SceneView) -> None:
         """Raise ValueError if its dimension is not the scene's."""
-        dimensions(scene, at=self.at)
+        check_dimensions(scene, at=self.at)
 
 
 class Segment(Place):
@@ -85,7 +85,7 @@ class Segment(Place):
 
     def row(self) -> list[float]:
         """Return its ends."""
-        return in_space(self.start) + in_space(self.end)
+        return three_numbers(self.start) + three_numbers(self.end)
 
     @property
     def extremes(self) -> Floats:
@@ -94,7 +94,7 @@ class Segment(Place):
 
     def check(self, scene: SceneView) -> None:
         """Raise ValueError if its dimension is not the scene's."""
-        dimensions(scene, start=self.start, end=self.end)
+        check_dimensions(scene, start=self.start, end=self.end)
 
 
 class Disc(Place):
@@ -115,7 +115,7 @@ class Disc(Place):
     def row(self) -> list[float]:
         """Return centre, radius and axis."""
         length = math.hypot(*self.axis) if self.axis is not None else 1.0
-        return [*in_space(self.centre), self.radius, *(x / length for x in self.axis or (0.0, 0.0, 0.0))]
+        return [*three_numbers(self.centre), self.radius, *(x / length for x in self.axis or (0.0, 0.0, 0.0))]
 
     @property
     def extremes(self) -> Floats:
@@ -124,7 +124,7 @@ class Disc(Place):
 
     def check(self, scene: SceneView) -> None:
         """Raise ValueError if its dimension is not the scene's."""
-        dimensions(scene, centre=self.centre, axis=self.axis)
+        check_dimensions(scene, centre=self.centre, axis=self.axis)
         if self.axis is not None and scene.dimension == 2:
             raise ValueError(f"axis = {self.axis}: only a disc in 3-D has an axis")
 
@@ -138,12 +138,12 @@ class _Corners(Place):
     @model_validator(mode="after")
     def _ordered(self) -> _Corners:
         """Raise ValueError if the corners are not in order."""
-        ordered(self.low, self.high)
+        check_corners(self.low, self.high)
         return self
 
     def row(self) -> list[float]:
         """Return its corners."""
-        return in_space(self.low) + in_space(self.high)
+        return three_numbers(self.low) + three_numbers(self.high)
 
     @property
     def extremes(self) -> Floats:
@@ -152,7 +152,7 @@ class _Corners(Place):
 
     def check(self, scene: SceneView) -> None:
         """Raise ValueError if its dimension is not the scene's."""
-        dimensions(scene, low=self.low, high=self.high)
+        check_dimensions(scene, low=self.low, high=self.high)
 
 
 class BoxPlace(_Corners):
@@ -207,7 +207,7 @@ class Clearing(_Corners):
         return [*super().row(), self.radius, float(self.candidates)]
 
 
-def ordered(low: Sequence[float], high: Sequence[float]) -> None:
+def check_corners(low: Sequence[float], high: Sequence[float]) -> None:
     """Raise ValueError if the lower corner is not below the upper one, or their lengths differ."""
     if len(low) != len(high) or any(a > b for a, b in zip(low, high, strict=True)):
         raise ValueError(f"low = {low}, high = {high}: the lower corner comes first, with as many numbers")

@@ -9,8 +9,8 @@ from pydantic import Field, model_validator
 from flockenv.geometry.shapes import AnyShape
 from flockenv.geometry.space import Torus
 from flockenv.model.scene_view import SceneView
-from flockenv.physics.population.members import Member, demand_group, dimensions
-from flockenv.physics.population.regions import Vector, in_space, ordered
+from flockenv.physics.population.members import Member, check_dimensions, demand_group
+from flockenv.physics.population.regions import Vector, check_corners, three_numbers
 
 __all__ = ["Ageing", "Crowding", "Decay", "Drain", "Leaving", "Sink", "Threshold"]
 
@@ -57,17 +57,17 @@ class Leaving(Sink):
 
     @model_validator(mode="after")
     def _ordered(self) -> Leaving:
-        ordered(self.low, self.high)
+        check_corners(self.low, self.high)
         return self
 
     def row(self) -> list[float]:
         """Return the corners."""
-        return in_space(self.low) + in_space(self.high)
+        return three_numbers(self.low) + three_numbers(self.high)
 
     def check(self, scene: SceneView) -> None:
         """Raise ValueError if its dimension is not the scene's."""
         super().check(scene)
-        dimensions(scene, low=self.low, high=self.high)
+        check_dimensions(scene, low=self.low, high=self.high)
 
 
 class Decay(Sink):

@@ -47,13 +47,13 @@ def pieces(shape: Any) -> Floats:
     return rows
 
 
-def _full(vector: Any) -> list[float]:
+def _in_3d(vector: Any) -> list[float]:
     flat = [float(x) for x in vector]
     return flat + [0.0] * (3 - len(flat))
 
 
-def _flat(corner: Any, u: Any, v: Any, size: float, sign: float = 1.0) -> list[float]:
-    return [size, FLAT, *_full(corner), *_full(u), *_full(v), sign, 0.0, 0.0]
+def _flat_piece(corner: Any, u: Any, v: Any, size: float, sign: float = 1.0) -> list[float]:
+    return [size, FLAT, *_in_3d(corner), *_in_3d(u), *_in_3d(v), sign, 0.0, 0.0]
 
 
 def _polygon(shape: Any) -> list[list[float]]:
@@ -61,7 +61,7 @@ def _polygon(shape: Any) -> list[list[float]]:
     corners = np.array(shape.vertices)
     corners = corners if area(corners) > 0 else corners[::-1]
     edges = np.roll(corners, -1, axis=0) - corners
-    return [_flat(a, e, (), math.hypot(*e)) for a, e in zip(corners, edges, strict=True)]
+    return [_flat_piece(a, e, (), math.hypot(*e)) for a, e in zip(corners, edges, strict=True)]
 
 
 def _block(shape: Any) -> list[list[float]]:
@@ -76,7 +76,7 @@ def _block(shape: Any) -> list[list[float]]:
             u, v = others[0], others[1] if d == 3 else ()
             out = np.cross(u, v) if d == 3 else np.array([u[1], -u[0]])
             size = math.prod(float(np.linalg.norm(e)) for e in others)
-            found.append(_flat(corner, u, v, size, float(np.sign(out @ edges[k] * side))))
+            found.append(_flat_piece(corner, u, v, size, float(np.sign(out @ edges[k] * side))))
     return found
 
 
@@ -96,7 +96,7 @@ def _chain(shape: Any) -> list[list[float]]:
         size = length * (around if around > 0 else 1.0)
         for kind, measure in ((SIDE, size), (ENDS, ends)):
             if measure > 0:
-                found.append([measure, kind, *_full(a), *_full(b), radius, *[0.0] * 5])
+                found.append([measure, kind, *_in_3d(a), *_in_3d(b), radius, *[0.0] * 5])
     if not found:
         raise ValueError(f"shape.kind = {shape.kind}: a point has no surface; give it a radius")
     return found

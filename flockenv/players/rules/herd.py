@@ -19,7 +19,7 @@ __all__ = ["HerdRules", "herd"]
 allocate = rows(arbitration.allocate)
 arrive = rows(steering.arrive)
 avoid = rows(steering.avoid)
-herd_from = rows(steering.herd_from)
+herd_from = rows(steering.herding_offset)
 threat = rows(steering.threat)
 
 
