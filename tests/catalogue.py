@@ -299,10 +299,10 @@ class EffectRow:
         """Return the effect among the idle effects of its family; with `idle` it is idle itself."""
         if not self.family:
             effect, *beside = self.at(dimension)
-            return (effect.idle() if idle else effect, *beside)
+            return (effect.idle_copy() if idle else effect, *beside)
         family = [row for row in EFFECTS if row.family == self.family]
         here = [(in_dimension(row.effect, dimension), row is self and not idle) for row in family]
-        return tuple(effect if acts else effect.idle() for effect, acts in here)
+        return tuple(effect if acts else effect.idle_copy() for effect, acts in here)
 
 
 def vectors(effect: Effect) -> dict[str, tuple[Any, ...]]:
@@ -659,7 +659,7 @@ def everything(dimension: int, *chosen: Effect, **fields: Any) -> Scene:
     others = [row.effect for row in FIRST if row.effect.kind in AMONG_ALL]
     rest = {effect.kind: in_dimension(effect, dimension) for effect in others}
     given = {"space": SPACES["torus"][dimension]} | fields
-    effects = ({kind: effect.idle() for kind, effect in rest.items()} if chosen else rest) | own
+    effects = ({kind: effect.idle_copy() for kind, effect in rest.items()} if chosen else rest) | own
     return scene_of(*effects.values(), dimension=dimension, **given)
 
 

@@ -49,15 +49,15 @@ BUDGET = 10.0
 def requests(dimension: int, count: int = 3, many: int = 200) -> Array:
     """Return steering forces of all magnitudes, some of them zero, (R, K, D) N."""
     rng = np.random.default_rng(3)
-    wishes = rng.normal(size=(many, count, dimension)) * 10 ** rng.uniform(-3, 3, (many, count, 1))
-    return np.asarray(wishes * (rng.random((many, count, 1)) < 0.8))
+    forces = rng.normal(size=(many, count, dimension)) * 10 ** rng.uniform(-3, 3, (many, count, 1))
+    return np.asarray(forces * (rng.random((many, count, 1)) < 0.8))
 
 
-def reconciled(arbitration: Arbitration, wishes: Array, **more: Any) -> tuple[Any, Any]:
+def reconciled(arbitration: Arbitration, forces: Array, **more: Any) -> tuple[Any, Any]:
     """Return force and shares for different agents, each at another time."""
-    r = len(wishes)
+    r = len(forces)
     given = {"max_force": BUDGET, "time": np.arange(r) * 0.05, "key": key_of(1, 0), "who": np.arange(r)} | more
-    return reconcile(arbitration, wishes, **given)
+    return reconcile(arbitration, forces, **given)
 
 
 # --- what all obey ----------------------------------------------------------------------------------------------------
@@ -68,8 +68,8 @@ def reconciled(arbitration: Arbitration, wishes: Array, **more: Any) -> tuple[An
 @ALL
 def test_shares_are_between_0_and_1_and_sum_to_the_force(arbitration: Arbitration, dtype: str, dimension: int) -> None:
     """For blend before the sum is bounded. Not for context steering: its force is no sum of the steering forces."""
-    wishes = requests(dimension).astype(dtype)
-    force, share = reconciled(arbitration, wishes, dtype=dtype)
+    forces = requests(dimension).astype(dtype)
+    force, share = reconciled(arbitration, forces, dtype=dtype)
     assert force.dtype == share.dtype == np.dtype(dtype)
     assert ((share >= 0) & (share <= 1)).all()
     length = np.linalg.norm(force, axis=-1, keepdims=True)
@@ -78,8 +78,8 @@ def test_shares_are_between_0_and_1_and_sum_to_the_force(arbitration: Arbitratio
     else:
         assert (length <= BUDGET * (1 + 8 * np.finfo(dtype).eps)).all()
     if not isinstance(arbitration, ContextSteering):
-        atol = 64 * np.finfo(dtype).eps * BUDGET * max(1, np.abs(wishes).max() / BUDGET)
-        np.testing.assert_allclose((share[..., None] * wishes).sum(axis=1), force, atol=atol)
+        atol = 64 * np.finfo(dtype).eps * BUDGET * max(1, np.abs(forces).max() / BUDGET)
+        np.testing.assert_allclose((share[..., None] * forces).sum(axis=1), force, atol=atol)
 
 
 @DIMENSIONS
@@ -89,9 +89,9 @@ def test_the_force_is_finite_for_zero_forces_and_for_a_budget_of_0_or_infinity(
     arbitration: Arbitration, dtype: str, dimension: int
 ) -> None:
     """Without a bound each share is 0 or 1."""
-    wishes = np.concatenate([requests(dimension), np.zeros((1, 3, dimension)), np.ones((1, 3, dimension))])
+    forces = np.concatenate([requests(dimension), np.zeros((1, 3, dimension)), np.ones((1, 3, dimension))])
     for budget in (0.0, math.inf, BUDGET):
-        force, share = reconciled(arbitration, wishes, max_force=budget, dtype=dtype)
+        force, share = reconciled(arbitration, forces, max_force=budget, dtype=dtype)
         assert np.isfinite(force).all()
         assert np.isfinite(share).all()
         np.testing.assert_array_equal(force[-2], 0)
@@ -104,13 +104,13 @@ def test_the_force_is_finite_for_zero_forces_and_for_a_budget_of_0_or_infinity(
 @ALL
 def test_a_single_force_within_the_budget_is_granted_in_full(arbitration: Arbitration) -> None:
     """By context steering exactly, because the direction of the force is one of those it scores."""
-    wishes = np.array([[(3.0, 4.0)], [(-6.0, 8.0)], [(0.0, 0.5)]])
+    forces = np.array([[(3.0, 4.0)], [(-6.0, 8.0)], [(0.0, 0.5)]])
     arbitration = arbitration.model_copy(update={"dangers": 0}) if arbitration.kind == "context" else arbitration
     arbitration = (
         arbitration.model_copy(update={"probability": 1.0}) if arbitration.kind == "dithering" else arbitration
     )
-    force, share = reconciled(arbitration, wishes)
-    np.testing.assert_allclose(force, wishes[:, 0], rtol=1e-12)
+    force, share = reconciled(arbitration, forces)
+    np.testing.assert_allclose(force, forces[:, 0], rtol=1e-12)
     np.testing.assert_allclose(share, 1, rtol=1e-12)
 
 
@@ -161,11 +161,11 @@ def test_priority_skips_forces_up_to_its_threshold() -> None:
 def test_dithering_selects_each_force_with_its_probability() -> None:
     """p, (1 - p) q and otherwise none, within four standard deviations of 20,000 worlds, times or agents."""
     many = 20_000
-    wishes = np.tile(CONFLICT[:, :2], (many, 1, 1))
+    forces = np.tile(CONFLICT[:, :2], (many, 1, 1))
     keys = np.array([key_of(seed, 0) for seed in range(many)])
     dithering = Dithering(probability=(0.7, 0.5), period=0.1)
     for more in ({"key": keys, "time": 0.0, "who": 0}, {"time": 0.1 * np.arange(many), "who": 0}, {"time": 0.0}):
-        _, share = reconciled(dithering, wishes, **more)
+        _, share = reconciled(dithering, forces, **more)
         found = [share[:, 0].mean(), share[:, 1].mean(), (share == 0).all(axis=1).mean()]
         np.testing.assert_allclose(found, [0.7, 0.15, 0.15], atol=4 * 0.5 / math.sqrt(many))
 
@@ -196,14 +196,14 @@ def test_round_robin_selects_each_force_for_one_period() -> None:
 def test_context_steering_selects_a_least_dangerous_direction(dimension: int) -> None:
     """Least dangerous of all directions, not only of those that it scores, up to the angle between two of these."""
     context = ContextSteering(dangers=2, directions=256)
-    wishes = requests(dimension, count=4)
-    force, _ = reconciled(context, wishes, max_force=math.inf)
+    forces = requests(dimension, count=4)
+    force, _ = reconciled(context, forces, max_force=math.inf)
     some = np.linalg.norm(force, axis=-1) > 1e-9
     ways = np.random.default_rng(0).normal(size=(4000, dimension))
     ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
 
     def danger(way: Array) -> Array:
-        return np.asarray(np.maximum(0, -np.einsum("rkd,rwd->rwk", wishes[some][:, :2], way)).sum(axis=-1))
+        return np.asarray(np.maximum(0, -np.einsum("rkd,rwd->rwk", forces[some][:, :2], way)).sum(axis=-1))
 
     gone = force[some] / np.linalg.norm(force[some], axis=-1, keepdims=True)
     many = np.broadcast_to(ways, (int(some.sum()), *ways.shape))
@@ -215,11 +215,11 @@ def test_context_steering_selects_a_least_dangerous_direction(dimension: int) ->
 
 def test_context_steering_goes_around_a_danger_that_stalls_a_blend() -> None:
     """A danger ahead is as strong as the goal behind it: their sum almost vanishes, a safe force does not."""
-    wishes = np.array([[(-8.0, 0.0), (8.0, 0.5)]])
-    force, _ = reconciled(ContextSteering(), wishes)
+    forces = np.array([[(-8.0, 0.0), (8.0, 0.5)]])
+    force, _ = reconciled(ContextSteering(), forces)
     assert np.linalg.norm(force) > 0.4
     assert force[0, 0] <= 0.1
-    np.testing.assert_allclose(reconciled(Blend(), wishes)[0], [(0, 0.5)])
+    np.testing.assert_allclose(reconciled(Blend(), forces)[0], [(0, 0.5)])
 
 
 # --- Steer, in scenes -------------------------------------------------------------------------------------------------
@@ -349,7 +349,7 @@ def test_an_invalid_arbitration_is_refused_in_one_line(make: Any, words: tuple[s
 
 
 def test_forces_of_a_wrong_shape_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"wishes has shape \(3, 2\), expected \(R, K, D\)"):
+    with pytest.raises(ValueError, match=r"forces has shape \(3, 2\), expected \(R, K, D\)"):
         reconcile(Blend(), np.zeros((3, 2)), BUDGET)
 
 

@@ -53,7 +53,7 @@ def family(effect: Effect) -> tuple[Effect, ...]:
     found = []
     for row in EFFECTS:
         if row.family == name:
-            other = in_dimension(row.effect, 2).idle()
+            other = in_dimension(row.effect, 2).idle_copy()
             fields = type(other).model_fields
             change: dict[str, Any] = {"radius": RADIUS} if name == "others" else {}
             change |= {"group": 1} if getattr(other, "group", None) is not None else {}

@@ -33,7 +33,7 @@ def ring(pieces: int = 240, radius: float = RING_RADIUS) -> tuple[tuple[float, f
 
 def traffic(*follow: FollowPath, apart: float = 0.0, counts: tuple[int, ...] = (1,), **fields: Any) -> Scene:
     """Return a scene of two groups with a path each; the second may be idle, so that tests in 2-D share a kernel."""
-    both = follow if len(follow) == 2 else (follow[0], follow[0].idle())
+    both = follow if len(follow) == 2 else (follow[0], follow[0].idle_copy())
     each = counts if len(counts) == 2 else (counts[0], 1)
     groups = tuple(
         Group(count=n, mass=1.0, radius=0.2, max_speed=2.0, max_force=fields.pop("max_force", 20.0), spawn=ANYWHERE)

@@ -48,7 +48,7 @@ def scene(
 ) -> Scene:
     """Return a scene of one agent under the chosen effects of UNDER, among obstacles."""
     kinds = {type(effect): effect for effect in chosen}
-    effects = tuple(kinds.get(type(effect), effect.idle()) for effect in UNDER)
+    effects = tuple(kinds.get(type(effect), effect.idle_copy()) for effect in UNDER)
     speed = math.hypot(*v)
     spawn = Spawn(low=at, high=at, speed=(speed, speed), heading=v if speed else None)
     group = Group(count=1, radius=0.2, max_speed=2, max_force=30, spawn=spawn)

@@ -39,7 +39,7 @@ def test_every_effect_has_a_row() -> None:
 
 
 def test_every_effect_can_be_idle() -> None:
-    assert [row.name for row in catalogue.EFFECTS if row.effect.idle() == row.effect] == []
+    assert [row.name for row in catalogue.EFFECTS if row.effect.idle_copy() == row.effect] == []
 
 
 WITH_GROUPS = [
@@ -58,7 +58,7 @@ def test_missing_group_is_refused_with_the_name_of_the_field(row: catalogue.Effe
     beyond = row.at(2)[0].model_copy(update={name: 2})
     with pytest.raises(ValueError, match=rf"effects\[0\]\.{message}"):
         catalogue.scene_of(beyond).start(0)
-    if beyond.steering and not beyond.wishes:
+    if beyond.steering and not beyond.components:
         with pytest.raises(ValueError, match=rf"effects\[0\]\.behaviours\[0\]\.{message}"):
             catalogue.scene_of(Steer(group=0, behaviours=(beyond,)))
 

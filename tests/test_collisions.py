@@ -284,7 +284,9 @@ def test_candidate_pairs_equal_those_of_brute_force(count: int, period: float) -
         np.zeros(max(count, 64), np.int64), np.zeros(count, int32), np.zeros(count, int32), np.zeros(count + 1, int32),
         np.zeros((1, count), int32), np.zeros((1, 6)), np.zeros(8, np.int64), np.zeros((27, 3), np.int64),
     )  # fmt: skip
-    found = entry(list_near_pairs)((period,) * 2, at, living.astype(np.int64), radius, reach, count, *scratch, one, other)
+    found = entry(list_near_pairs)(
+        (period,) * 2, at, living.astype(np.int64), radius, reach, count, *scratch, one, other
+    )
     d = at[:, None] - at[None]
     d -= period * np.floor(d / period + 0.5) if period else 0.0
     room = radius[:, None] + radius[None] + reach[:, None] + reach[None]

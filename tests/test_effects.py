@@ -101,7 +101,7 @@ def assert_moves_alike(scene: Scene, matrix: Array, shift: Array) -> None:
     start = scene.start(3, worlds=2)
     end = scene.run(start, STEPS)
     assert not np.allclose(end.vel, start.vel)
-    idle = [effect == effect.idle() for effect in scene.effects]  # their regions may be invalid after a rotation
+    idle = [effect == effect.idle_copy() for effect in scene.effects]  # their regions may be invalid after a rotation
     other = scene.with_effects(
         *(effect if rests else turned(effect, matrix, shift) for effect, rests in zip(scene.effects, idle, strict=True))
     )

@@ -41,9 +41,9 @@ def test_every_arbitration_is_a_variant_of_every_case() -> None:
 
 def test_follow_way_has_the_target_of_the_seek_behaviour_it_replaces() -> None:
     plan = steer_plan("avoidance")
-    avoid, way = plan.scene_of("U trap", "to avoid, global way").effects[0].wishes
+    avoid, way = plan.scene_of("U trap", "to avoid, global way").effects[0].components
     assert (avoid.kind, way.kind, way.target) == ("avoid_obstacles", "follow_way", (12, 0))  # type: ignore[attr-defined]
-    assert [each.kind for each in plan.scene_of("U trap", "whiskers").effects[0].wishes] == ["whiskers", "seek"]
+    assert [each.kind for each in plan.scene_of("U trap", "whiskers").effects[0].components] == ["whiskers", "seek"]
 
 
 def test_collisions_and_depths_are_counted_per_agent() -> None:

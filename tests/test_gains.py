@@ -51,7 +51,7 @@ def alone(kind: str) -> Scene:
     """Return the scene of a behaviour's demo without other behaviours and without force limits."""
     shown, effects = load_scene(str(EFFECTS[kind].demo)), []
     for effect in shown.effects:
-        left = tuple(each for each in effect.wishes if each.kind == kind)
+        left = tuple(each for each in effect.components if each.kind == kind)
         if left:
             effects.append(Steer(group=effect.group, behaviours=left, arbitration={"kind": "blend"}))  # type: ignore[attr-defined, arg-type]
         elif effect.kind == kind or (not effect.steering and effect.rates(shown.groups, shown.dimension) is None):
@@ -112,7 +112,7 @@ def test_every_behaviour_with_a_gain_warns_only_beyond_its_limit(kind: str) -> N
 def test_only_behaviours_without_a_gain_return_no_rates() -> None:
     for kind in BEHAVIOURS:
         shown = load_scene(str(EFFECTS[kind].demo))
-        behaviour = next(b for effect in shown.effects for b in (*effect.wishes, effect) if b.kind == kind)
+        behaviour = next(b for effect in shown.effects for b in (*effect.components, effect) if b.kind == kind)
         knows = behaviour.rates(shown.groups, shown.dimension) is not None
         assert knows != (kind in UNBOUNDED), kind
 

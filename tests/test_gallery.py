@@ -29,7 +29,7 @@ def test_the_demo_of_every_behaviour_contains_it(kind: str) -> None:
 @pytest.mark.parametrize("kind", BEHAVIOURS)
 def test_every_behaviour_changes_the_motion_in_its_demo(kind: str) -> None:
     run = shown(BEHAVIOURS[kind])
-    others = tuple(effect.idle() if effect.kind in (kind, "steer") else effect for effect in run.scene.effects)
+    others = tuple(effect.idle_copy() if effect.kind in (kind, "steer") else effect for effect in run.scene.effects)
     without = run.scene.with_effects(*others).run(run.first, int(run.step[-1]))
     assert np.abs(run.last.pos - without.pos).max() > 0.1
 

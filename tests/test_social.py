@@ -70,7 +70,7 @@ LISTED: tuple[Effect, ...] = (
 def crowd(*acting: Effect, count: int = 2, walls: tuple[Shape, ...] = (), **fields: Any) -> Scene:
     """Return a scene of `count` pedestrians of 80 kg with an aim along x, and `count` without an aim."""
     own = {effect.kind: effect for effect in acting}
-    effects = tuple(own.pop(effect.kind, effect.idle()) for effect in LISTED)
+    effects = tuple(own.pop(effect.kind, effect.idle_copy()) for effect in LISTED)
     assert not own
     forms = {shape.form for shape in walls}
     body = {"mass": 80.0, "radius": 0.25, "desired_speed": 1.34, "spawn": Spawn(low=(0, 0), high=(50, 50))} | fields

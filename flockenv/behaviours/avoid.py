@@ -103,12 +103,12 @@ def sidestep_threat(p: Any, me: Me, acc: Vec) -> Vec:
     e = like(me.who, 1.0)
     offset, aside = _offset_and_side(acc)
     away = steering.avoid(me.heading, offset, acc[1], e)
-    some = dot(aside, aside) > like(e, 0.0)
-    normal = scale(sub(scale(me.heading, acc[0] if some else like(e, 0.0)), offset), e / acc[1])
+    has_edge = dot(aside, aside) > like(e, 0.0)
+    normal = scale(sub(scale(me.heading, acc[0] if has_edge else like(e, 0.0)), offset), e / acc[1])
     # away from a circle's centre is towards its nearest edge: if the two differ by rounding only, `away` is kept
-    other = some & (dot(aside, away) < like(e, 1 - 1e-5)) & _can_turn(p, me, normal, aside, acc[0])
-    wish = select(other, aside, away)
-    return scale(select(acc[0] < like(me.who, np.inf), wish, zero(me.pos)), p.weight)
+    other = has_edge & (dot(aside, away) < like(e, 1 - 1e-5)) & _can_turn(p, me, normal, aside, acc[0])
+    direction = select(other, aside, away)
+    return scale(select(acc[0] < like(me.who, np.inf), direction, zero(me.pos)), p.weight)
 
 
 class AvoidObstacles(Effect):
@@ -140,7 +140,7 @@ class AvoidObstacles(Effect):
         """Return the distance travelled within the horizon, m."""
         return speed * self.horizon
 
-    def folded(self, dimension: int) -> int:
+    def fold_size(self, dimension: int) -> int:
         """Return the size of distance, clearance and offset of the nearest threat, and the side of its nearest edge."""
         return 2 + 2 * dimension
 
@@ -234,7 +234,7 @@ class Whiskers(Effect):
         """Return the number of whiskers: one ahead, and two for each other axis."""
         return 2 * dimension - 1
 
-    def folded(self, dimension: int) -> int:
+    def fold_size(self, dimension: int) -> int:
         """Return the size of a distance, a share, a normal and a side."""
         return 2 + 2 * dimension
 
@@ -288,6 +288,6 @@ class ForceField(Effect):
     obstacle_reach: ClassVar[Law | None] = field_reach
     demo: ClassVar[str | None] = AVOIDING.replace("avoid_obstacles, weight: 8", "force_field, weight: 3")
 
-    def folded(self, dimension: int) -> int:
+    def fold_size(self, dimension: int) -> int:
         """Return the size of a vector."""
         return dimension

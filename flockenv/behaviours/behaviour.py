@@ -61,8 +61,8 @@ def steered_groups(effect: Effect, scene: SceneView) -> list[int]:
     """Return the indices of the groups that a behaviour of a scene steers."""
     found: set[int] = set()
     for each in scene.effects:
-        if each == effect or effect in each.wishes:
-            only = getattr(each, "group", None) if each.wishes else None
+        if each == effect or effect in each.components:
+            only = getattr(each, "group", None) if each.components else None
             every = set(range(len(scene.groups)))
             found |= every if only is None else every & {only}
     return sorted(found)

@@ -114,26 +114,26 @@ def free_way(p: Any, me: Me) -> Vec:
 @law
 def shortest_gap(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
     """Keep the shortest gap."""
-    way: Vec
+    direction: Vec
     if len(acc) == 3:
-        way = (acc[0], acc[1])
+        direction = (acc[0], acc[1])
     else:
-        way = (acc[0], acc[1], acc[2])
+        direction = (acc[0], acc[1], acc[2])
     clearance = me.radius + other.radius + p.margin
-    gap = steering.queue_gap(way, other.offset, other.vel, clearance, top_speed(p, me))
+    gap = steering.queue_gap(direction, other.offset, other.vel, clearance, top_speed(p, me))
     nearest = acc[len(acc) - 1]
-    return way + (gap if gap < nearest else nearest,)  # noqa: RUF005
+    return direction + (gap if gap < nearest else nearest,)  # noqa: RUF005
 
 
 @law
 def queue_force(p: Any, me: Me, acc: Vec) -> Vec:
     """Return F = w (v_queue - v)."""
-    way: Vec
+    direction: Vec
     if len(acc) == 3:
-        way = (acc[0], acc[1])
+        direction = (acc[0], acc[1])
     else:
-        way = (acc[0], acc[1], acc[2])
-    return scale(steering.queue(way, me.vel, acc[len(acc) - 1], top_speed(p, me), p.headway), p.weight)
+        direction = (acc[0], acc[1], acc[2])
+    return scale(steering.queue(direction, me.vel, acc[len(acc) - 1], top_speed(p, me), p.headway), p.weight)
 
 
 class Queue(Moving):

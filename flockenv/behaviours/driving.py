@@ -85,12 +85,12 @@ def gap_ahead(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
 
     Ahead is within 45 degrees: two agents whose directions differ by less than 90 degrees never wait for each other.
     """
-    way, o = unit(me.aim), like(me.radius, 0.0)
-    along = dot(other.offset, way)
+    direction, o = unit(me.aim), like(me.radius, 0.0)
+    along = dot(other.offset, direction)
     ahead = (along > o) & (like(o, 2.0) * along * along > other.square)
     clearance = me.radius + other.radius + p.margin
     top = me.desired_speed * norm(me.aim)
-    gap = steering.queue_gap(way, other.offset, other.vel, clearance, top)
+    gap = steering.queue_gap(direction, other.offset, other.vel, clearance, top)
     return (gap if ahead & (gap < acc[0]) else acc[0],)
 
 

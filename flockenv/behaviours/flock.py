@@ -53,19 +53,19 @@ def _mean_of_sums(sums: Vec) -> tuple[Vec, bool]:
     """Return the vector part of the sums divided by their count, the last entry, and True if the count is positive."""
     e = like(sums[0], 1.0)
     count = sums[len(sums) - 1]
-    some = count > like(e, 0.0)
-    share = e / count if some else like(e, 0.0)
+    found = count > like(e, 0.0)
+    share = e / count if found else like(e, 0.0)
     if len(sums) == 3:
-        return (sums[0] * share, sums[1] * share), some
+        return (sums[0] * share, sums[1] * share), found
     else:
-        return (sums[0] * share, sums[1] * share, sums[2] * share), some
+        return (sums[0] * share, sums[1] * share, sums[2] * share), found
 
 
 @law
 def alignment(p: Any, me: Me, sums: Vec) -> Vec:
     """Return F = w (mean v_j - v), 0 without neighbours."""
-    mean, some = _mean_of_sums(sums)
-    return select(some, scale(steering.align(me.vel, mean), p.weight), zero(mean))
+    mean, found = _mean_of_sums(sums)
+    return select(found, scale(steering.align(me.vel, mean), p.weight), zero(mean))
 
 
 @law

@@ -74,25 +74,25 @@ effects:
         }  # fmt: skip
 
     @property
-    def _given(self) -> tuple[tuple[Target], tuple[str]]:
+    def _target_and_name(self) -> tuple[tuple[Target], tuple[str]]:
         """The target, and the name of its field."""
         return (Target(at=self.target),), ("target",)
 
     def table(self, scene: SceneView) -> NDArray[np.float64]:
         """Return the floor field."""
-        corners = grid_corners(scene, self._given[0], self.margin)
+        corners = grid_corners(scene, self._target_and_name[0], self.margin)
         starts = [start for k in steered_groups(self, scene) for start in start_boxes(scene, k)]
-        return floor_field_to(scene, *self._given, corners, self.spacing, self.clearance, starts)
+        return floor_field_to(scene, *self._target_and_name, corners, self.spacing, self.clearance, starts)
 
     def check_start(self, scene: SceneView, state: Any) -> None:
         """Warn of agents whose initial position has no path to the target."""
         lost = np.isinf(path_lengths(scene.table_of(self), state.pos))
         for k in set(range(len(scene.groups))) - set(steered_groups(self, scene)):
             lost[:, scene.starts[k] : scene.starts[k + 1]] = False
-        warn_cut_off(self._given[1][0], lost, state)
+        warn_cut_off(self._target_and_name[1][0], lost, state)
 
     def check(self, scene: SceneView) -> None:
         """Raise ValueError for a torus, moving obstacles, too large a grid, or a target in an obstacle."""
         super().check(scene)
-        check_floor_field(scene, self.kind, *self._given, self.margin, self.spacing, self.clearance)
+        check_floor_field(scene, self.kind, *self._target_and_name, self.margin, self.spacing, self.clearance)
         scene.table_of(self)

@@ -29,19 +29,19 @@ def _station(p: Any, offset: Vec) -> Vec:
 @law
 def formation_force(p: Any, me: Me, sums: Vec) -> Vec:
     """Return F = w (v_L + V min(1, d / d_slow) unit(d) - v)."""
-    offset, velocity, some = mean_nearest(sums)
+    offset, velocity, found = mean_nearest(sums)
     place, top = _station(p, offset), top_speed(p, me)
-    wish = steering.keep_station(offset, me.vel, velocity, place, top, p.slow_radius)
-    return select(some, scale(wish, p.weight), zero(wish))
+    change = steering.keep_station(offset, me.vel, velocity, place, top, p.slow_radius)
+    return select(found, scale(change, p.weight), zero(change))
 
 
 @law
 def follow_leader_force(p: Any, me: Me, sums: Vec) -> Vec:
     """Return F = w S: stay behind the leader, and out of its path."""
-    offset, velocity, some = mean_nearest(sums)
+    offset, velocity, found = mean_nearest(sums)
     behind = p.distance + p.headway * norm(velocity)
-    wish = steering.follow_leader(offset, me.vel, velocity, behind, p.ahead, p.aside, top_speed(p, me), p.slow_radius)
-    return select(some, scale(wish, p.weight), zero(wish))
+    change = steering.follow_leader(offset, me.vel, velocity, behind, p.ahead, p.aside, top_speed(p, me), p.slow_radius)
+    return select(found, scale(change, p.weight), zero(change))
 
 
 @law
@@ -100,8 +100,8 @@ def interpose_force(p: Any, me: Me, acc: Vec) -> Vec:
     offset_a, velocity_a = _offset_and_velocity(a)
     offset_b, velocity_b = _offset_and_velocity(b)
     top = top_speed(p, me)
-    wish = steering.interpose(offset_a, velocity_a, offset_b, velocity_b, me.vel, p.share, top, p.slow_radius)
-    return select(both, scale(wish, p.weight), zero(wish))
+    change = steering.interpose(offset_a, velocity_a, offset_b, velocity_b, me.vel, p.share, top, p.slow_radius)
+    return select(both, scale(change, p.weight), zero(change))
 
 
 class Formation(AboutNearest, Moving):

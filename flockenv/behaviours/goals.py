@@ -40,8 +40,8 @@ def arrive_force(p: Any, me: Me) -> Vec:
 def dock_force(p: Any, me: Me) -> Vec:
     """Return F = w S: through the gate, then along the axis."""
     offset = sub(p.target, me.pos)
-    wish = steering.dock(offset, me.vel, p.direction, top_speed(p, me), p.gate, p.width, p.slow_radius)
-    return scale(wish, p.weight)
+    change = steering.dock(offset, me.vel, p.direction, top_speed(p, me), p.gate, p.width, p.slow_radius)
+    return scale(change, p.weight)
 
 
 @law
@@ -138,7 +138,7 @@ effects:
     demo_time: ClassVar[float] = 14.0
 
     @model_validator(mode="after")
-    def _points_somewhere(self) -> Self:
+    def _check_direction(self) -> Self:
         _demand_direction("direction", self.direction)
         return self
 
@@ -160,7 +160,7 @@ effects:
 """
 
     @model_validator(mode="after")
-    def _points_somewhere(self) -> Self:
+    def _check_direction(self) -> Self:
         _demand_direction("heading", self.heading)
         return self
 

@@ -162,9 +162,9 @@ def party_force(p: Any, me: Me, sums: Vec) -> Vec:
     centre = scale(to, e / (others + e))  # of the party, including itself
     alpha = steering.gaze_turn(me.heading, to, p.edge)
     far = norm(centre) > others * like(me.mass, 0.5)  # (N - 1) / 2 m
-    wish = add(scale(me.vel, -p.gaze * alpha), scale(unit(centre), p.cohesion if far else o))
+    change = add(scale(me.vel, -p.gaze * alpha), scale(unit(centre), p.cohesion if far else o))
     has = (others > o) & (me.who >= p.first) & (me.who < p.end)
-    return select(has, scale(add(wish, scale(away, p.repulsion)), me.mass), zero(me.vel))
+    return select(has, scale(add(change, scale(away, p.repulsion)), me.mass), zero(me.vel))
 
 
 class WalkingGroup(Effect):

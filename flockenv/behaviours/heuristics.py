@@ -35,38 +35,38 @@ ENDLESS = 1e4
 
 
 @law
-def turn_left(way: Vec, cosine: float, sine: float) -> Vec:
+def turn_left(direction: Vec, cosine: float, sine: float) -> Vec:
     """Return the vector turned to the left."""
-    return (way[0] * cosine - way[1] * sine, way[0] * sine + way[1] * cosine)
+    return (direction[0] * cosine - direction[1] * sine, direction[0] * sine + direction[1] * cosine)
 
 
 def reduce_distances(
-    found: Vec, way: Vec, aim: Vec, cosine: float, sine: float, offset: Vec, velocity: Vec, clearance: float,
+    found: Vec, direction: Vec, aim: Vec, cosine: float, sine: float, offset: Vec, velocity: Vec, clearance: float,
     speed: float,
 ) -> Vec:  # fmt: skip
     """Return the free distances `found`, reduced by one more neighbour: at constant velocity, then as if at rest.
 
-    found: DIRECTIONS distances, that along the aim, and as many again. way: the rightmost direction.
+    found: DIRECTIONS distances, that along the aim, and as many again. direction: the rightmost direction.
     """
     still, one, moving, standing = zero(velocity), like(speed, 1.0), [], []
     for k in range(DIRECTIONS + 1):
-        ahead = way if k < DIRECTIONS else aim
+        ahead = direction if k < DIRECTIONS else aim
         moving.append(steering.collision_distance(ahead, offset, velocity, clearance, speed))
         standing.append(steering.collision_distance(ahead, offset, still, clearance, one))
-        way = turn_left(way, cosine, sine)
+        direction = turn_left(direction, cosine, sine)
     return tuple(map(min, (*moving, *standing), found))
 
 
 @overload(reduce_distances, jit_options=OPTIONS)
-def _reduce_distances(found, way, aim, cosine, sine, offset, velocity, clearance, speed):  # type: ignore[no-untyped-def]
+def _reduce_distances(found, direction, aim, cosine, sine, offset, velocity, clearance, speed):  # type: ignore[no-untyped-def]
     """Return the function with its loop unrolled, for use of SIMD lanes."""
     count = DIRECTIONS + 1
     lines = [
-        "def all_ways(found, way, aim, cosine, sine, offset, velocity, clearance, speed):",
+        "def all_directions(found, direction, aim, cosine, sine, offset, velocity, clearance, speed):",
         "    still, one = zero(velocity), like(speed, 1.0)",
     ]
     for k in range(count):
-        u = "way" if k < DIRECTIONS else "aim"
+        u = "direction" if k < DIRECTIONS else "aim"
         lines += [
             f"    m{k} = distance({u}, offset, velocity, clearance, speed)",
             f"    m{k} = m{k} if m{k} < found[{k}] else found[{k}]",
@@ -74,13 +74,13 @@ def _reduce_distances(found, way, aim, cosine, sine, offset, velocity, clearance
             f"    s{k} = s{k} if s{k} < found[{count + k}] else found[{count + k}]",
         ]
         if k < DIRECTIONS - 1:
-            lines.append("    way = turned_by(way, cosine, sine)")
+            lines.append("    direction = turn_left(direction, cosine, sine)")
     lines.append(f"    return ({', '.join(f'{name}{k}' for name in 'ms' for k in range(count))})")
-    made: dict[str, Any] = {
-        "zero": zero, "like": like, "turned_by": turn_left, "distance": steering.collision_distance
+    namespace: dict[str, Any] = {
+        "zero": zero, "like": like, "turn_left": turn_left, "distance": steering.collision_distance
     }  # fmt: skip
-    exec("\n".join(lines), made)  # noqa: S102  # the number of directions is a constant
-    return made["all_ways"]
+    exec("\n".join(lines), namespace)  # noqa: S102  # the number of directions is a constant
+    return namespace["all_directions"]
 
 
 def infinite_distances(far: float) -> Vec:
@@ -90,9 +90,9 @@ def infinite_distances(far: float) -> Vec:
 
 @overload(infinite_distances, jit_options=OPTIONS)
 def _infinite_distances(far):  # type: ignore[no-untyped-def]
-    made: dict[str, Any] = {}
-    exec(f"def none(far):\n    return ({'far, ' * (2 * DIRECTIONS + 2)})", made)  # noqa: S102
-    return made["none"]
+    namespace: dict[str, Any] = {}
+    exec(f"def none(far):\n    return ({'far, ' * (2 * DIRECTIONS + 2)})", namespace)  # noqa: S102
+    return namespace["none"]
 
 
 @law
@@ -112,21 +112,21 @@ def _first_direction_and_aim(p: Any, me: Me) -> tuple[Vec, Vec]:
 @law
 def reduce_by_agent(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
     """Reduce the free distances by one more agent."""
-    way, aim = _first_direction_and_aim(p, me)
+    direction, aim = _first_direction_and_aim(p, me)
     room = me.radius + other.radius
-    return reduce_distances(acc, way, aim, p.cosine, p.sine, other.offset, other.vel, room, me.desired_speed)
+    return reduce_distances(acc, direction, aim, p.cosine, p.sine, other.offset, other.vel, room, me.desired_speed)
 
 
 @law
 def reduce_by_obstacle(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
     """Reduce the free distances by a round obstacle, which is at rest."""
-    way, aim = _first_direction_and_aim(p, me)
+    direction, aim = _first_direction_and_aim(p, me)
     room = me.radius + other.radius
-    return reduce_distances(acc, way, aim, p.cosine, p.sine, other.offset, zero(me.vel), room, me.desired_speed)
+    return reduce_distances(acc, direction, aim, p.cosine, p.sine, other.offset, zero(me.vel), room, me.desired_speed)
 
 
 @law
-def wall_distance(p: Any, me: Me, way: Vec, reach: float) -> float:
+def wall_distance(p: Any, me: Me, direction: Vec, reach: float) -> float:
     """Return how far its body goes until it touches a straight side, m; inf if that is further than `reach`.
 
     A side that it touches already does not block directions that lead off it.
@@ -144,8 +144,8 @@ def wall_distance(p: Any, me: Me, way: Vec, reach: float) -> float:
         y = high * round_half_even(y / high) if high > o else o
         spot, room = sub(me.pos, (x, y)), me.radius + p.table[at + 4]
         off = sub(spot, add(a, scale(sub(b, a), segment_share(spot, a, b))))
-        leaves = (dot(off, off) < room * room) & (dot(off, way) >= o)
-        here = segment_hit(spot, way, a, b, room)
+        leaves = (dot(off, off) < room * room) & (dot(off, direction) >= o)
+        here = segment_hit(spot, direction, a, b, room)
         best = here if (here < best) & (here < reach) & (not leaves) else best
     return best
 
@@ -156,14 +156,14 @@ def heuristics_force(p: Any, me: Me, acc: Vec) -> Vec:
     free = tuple_as_array(acc)
     count = DIRECTIONS + 1
     e, o = like(me.radius, 1.0), like(me.radius, 0.0)
-    way, aim = _first_direction_and_aim(p, me)
+    direction, aim = _first_direction_and_aim(p, me)
     eager = norm(me.aim)
     moves = dot(me.heading, me.heading) > o
     sees = (dot(me.heading, aim) >= p.edge_cosine) | (not moves)
     best, chosen, ahead = like(me.radius, np.inf), zero(me.vel), o
     for j in range(count):
         k = DIRECTIONS if j == 0 else j - 1  # the aim first: it wins against equal directions
-        u = aim if j == 0 else way
+        u = aim if j == 0 else direction
         if (k < DIRECTIONS) | sees:
             wall = wall_distance(p, me, u, p.radius)
             f = min(min(free[k], wall), p.radius)
@@ -172,7 +172,7 @@ def heuristics_force(p: Any, me: Me, acc: Vec) -> Vec:
             best, chosen = d if better else best, select(better, u, chosen)
             ahead = min(free[count + k], wall) if better else ahead
         if j > 0:
-            way = turn_left(way, p.cosine, p.sine)
+            direction = turn_left(direction, p.cosine, p.sine)
     speed = min(me.desired_speed * min(eager, e), ahead / p.tau)
     return scale(sub(scale(chosen, speed), me.vel), p.weight * me.mass / p.tau)
 
@@ -249,7 +249,7 @@ effects:
             if shape.in_state:
                 continue
             if shape.moves or shape.kind not in SIDES or (shape.kind == "capsule" and shape.is_hollow):
-                what = "moves" if shape.moves else "is not made of straight sides"
+                what = "moves" if shape.moves else "is not namespace of straight sides"
                 raise ValueError(
                     f"kind = heuristics: obstacles[{k}].kind = {shape.kind} {what}; circles and {', '.join(SIDES)} "
                     "that stand still are seen"

@@ -19,9 +19,9 @@ __all__ = ["Hide"]
 @law
 def seeker_offset(p: Any, me: Me, sums: Vec) -> Vec:
     """Return the offset of the seeker's predicted position, m; 0 if there is no seeker."""
-    offset, velocity, some = mean_nearest(sums)
+    offset, velocity, found = mean_nearest(sums)
     time = steering.approach_time(offset, norm(velocity), p.longest)
-    return select(some, add(offset, scale(velocity, time)), zero(offset))
+    return select(found, add(offset, scale(velocity, time)), zero(offset))
 
 
 @law
@@ -55,8 +55,8 @@ def hide_force(p: Any, me: Me, acc: Vec) -> Vec:
     goal, threat = _place_and_threat(acc)
     top, o = top_speed(p, me), like(me.radius, 0.0)
     there = steering.arrive(goal, me.vel, top, p.slow_radius)
-    wish = select(acc[0] < like(o, np.inf), there, steering.flee(threat, me.vel, top))
-    return select(dot(threat, threat) > o, scale(wish, p.weight), zero(wish))
+    change = select(acc[0] < like(o, np.inf), there, steering.flee(threat, me.vel, top))
+    return select(dot(threat, threat) > o, scale(change, p.weight), zero(change))
 
 
 class Hide(AboutNearest, Moving):
@@ -88,6 +88,6 @@ effects:
       - {kind: hide, weight: 8, group: 1, radius: 30, slow_radius: 1}
 """
 
-    def folded(self, dimension: int) -> int:
+    def fold_size(self, dimension: int) -> int:
         """Return the size of squared distance, and offsets of the nearest place and of the seeker."""
         return 1 + 2 * dimension

@@ -89,7 +89,7 @@ effects:
         about = {"decay": self.decay, "bodies": float(self.bodies), "radius": self.radius}
         return {**super().parameters(), **about}
 
-    def folded(self, dimension: int) -> int:
+    def fold_size(self, dimension: int) -> int:
         """Return the size of a force."""
         return dimension
 

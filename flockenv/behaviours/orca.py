@@ -50,9 +50,9 @@ def _with_inserted(slots, new):  # type: ignore[no-untyped-def]  # numba compare
             lines.append(f"    k{k + j}, c{j} = (c{j}, {old[j]}) if near else ({old[j]}, c{j})")
             kept_.append(f"k{k + j}")
     lines.append(f"    return ({', '.join(kept_)},)")
-    made: dict[str, Any] = {}
-    exec("\n".join(lines), made)  # noqa: S102  # their number is part of the type
-    return made["sort_in"]
+    namespace: dict[str, Any] = {}
+    exec("\n".join(lines), namespace)  # noqa: S102  # their number is part of the type
+    return namespace["sort_in"]
 
 
 @law
@@ -82,9 +82,9 @@ def insert_obstacle(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
 def orca_force(p: Any, me: Me, acc: Vec) -> Vec:
     """Return F = w (v_orca - v), with arrival as the preferred velocity."""
     speed = top_speed(p, me)
-    wish = steering.arrive(sub(p.target, me.pos), zero(me.vel), speed, p.slow_radius)
+    desired = steering.arrive(sub(p.target, me.pos), zero(me.vel), speed, p.slow_radius)
     top = min(p.hurry * speed, me.max_speed)
-    return scale(orca.orca(me.vel, wish, me.radius + p.margin, top, p.horizon, p.step, p.turn, acc), p.weight)
+    return scale(orca.orca(me.vel, desired, me.radius + p.margin, top, p.horizon, p.step, p.turn, acc), p.weight)
 
 
 class Orca(Moving):

@@ -52,11 +52,11 @@ def follow_path_force(p: Any, me: Me) -> Vec:
     gained = way * polyline.arc_difference(p.table, now[0], then[0]) - p.keep * top * p.time
     ahead = p.time * max(norm(me.vel), like(top, SLOWEST) * top)
     target = polyline.spine(p.table, me.pos, now[0] + way * ahead)
-    wish = steering.follow_path(norm(_offset_part(then)) - p.radius, gained, target, me.vel, top)
+    change = steering.follow_path(norm(_offset_part(then)) - p.radius, gained, target, me.vel, top)
     slow = max(p.slow_radius, like(top, 1e-9))
     end = polyline.spine(p.table, me.pos, p.table[1] if way > o else o)
     arriving = polyline.distance_to_end(p.table, now[0], way) < p.slow_radius
-    return scale(select(arriving, steering.arrive(end, me.vel, top, slow), wish), p.weight)
+    return scale(select(arriving, steering.arrive(end, me.vel, top, slow), change), p.weight)
 
 
 @law
@@ -65,8 +65,8 @@ def stay_on_path_force(p: Any, me: Me) -> Vec:
     step = scale(me.vel, p.time)
     to_spine = _offset_part(polyline.nearest(p.table, add(me.pos, step)))
     beyond = norm(to_spine) - p.radius
-    wish = steering.stay_on_path(beyond, add(step, to_spine), me.vel, top_speed(p, me))
-    return scale(wish, p.weight)
+    change = steering.stay_on_path(beyond, add(step, to_spine), me.vel, top_speed(p, me))
+    return scale(change, p.weight)
 
 
 @law
@@ -87,8 +87,8 @@ def follow_flow_force(p: Any, me: Me) -> Vec:
     """Return F = w (u - v), 0 outside the grid."""
     there = add(me.pos, scale(me.vel, p.time))
     at = add(sub(there, p.centre), _grid_centre(p.table, there))  # on a torus p.centre is the nearest image
-    wish = steering.follow_flow(grid.sample_vector(p.table, at, 0), me.vel)
-    return scale(select(grid.covers(p.table, at), wish, zero(me.vel)), p.weight)
+    change = steering.follow_flow(grid.sample_vector(p.table, at, 0), me.vel)
+    return scale(select(grid.covers(p.table, at), change, zero(me.vel)), p.weight)
 
 
 class _OnPath(Moving):
@@ -106,7 +106,7 @@ class _OnPath(Moving):
     time: float = Field(default=0.5, ge=0, description="s, look-ahead time")
 
     @model_validator(mode="after")
-    def _is_a_path(self) -> _OnPath:
+    def _check_path(self) -> _OnPath:
         """Raise ValueError if points differ in dimension, or two coincide."""
         for k, point in enumerate(self.points):
             if len(point) != len(self.points[0]):
@@ -122,7 +122,7 @@ class _OnPath(Moving):
         """Return the pieces of the path."""
         return polyline.pieces(self.points, self.closed, scene.space)
 
-    def way_shown(self, scene: SceneView) -> tuple[tuple[Vec, ...], float] | None:
+    def path_to_draw(self, scene: SceneView) -> tuple[tuple[Vec, ...], float] | None:
         """Return its tube for pictures: points half a radius apart, at most MOST_PLACES pieces, and the radius."""
         path = scene.table_of(self)
         count = min(math.ceil(path[1] / (0.5 * self.radius)), MOST_PLACES)
@@ -225,7 +225,7 @@ effects:
 """
 
     @model_validator(mode="after")
-    def _fills_the_grid(self) -> FollowFlow:
+    def _check_grid(self) -> FollowFlow:
         """Raise ValueError if the number of velocities is not that of points, or dimensions differ."""
         d = len(self.centre)
         if len(self.counts) != d:

@@ -50,44 +50,44 @@ def evader_time(p: Any, me: Me, offset: Vec, velocity: Vec) -> float:
 @law
 def pursue_force(p: Any, me: Me, sums: Vec) -> Vec:
     """Return F = w (V unit(x_q + v_q T - x) - v)."""
-    offset, velocity, some = mean_nearest(sums)
+    offset, velocity, found = mean_nearest(sums)
     time = pursuer_time(p, me, offset, velocity)
-    wish = steering.pursue(offset, me.vel, velocity, top_speed(p, me), time)
-    return select(some, scale(wish, p.weight), zero(wish))
+    change = steering.pursue(offset, me.vel, velocity, top_speed(p, me), time)
+    return select(found, scale(change, p.weight), zero(change))
 
 
 @law
 def evade_force(p: Any, me: Me, sums: Vec) -> Vec:
     """Return F = w (V unit(x - x_p - v_p T) - v)."""
-    offset, velocity, some = mean_nearest(sums)
+    offset, velocity, found = mean_nearest(sums)
     time = evader_time(p, me, offset, velocity)
-    wish = steering.evade(offset, me.vel, velocity, top_speed(p, me), time)
-    return select(some, scale(wish, p.weight), zero(wish))
+    change = steering.evade(offset, me.vel, velocity, top_speed(p, me), time)
+    return select(found, scale(change, p.weight), zero(change))
 
 
 @law
 def offset_pursue_force(p: Any, me: Me, sums: Vec) -> Vec:
     """Return F = w S: pursue a point beside the quarry."""
-    offset, velocity, some = mean_nearest(sums)
+    offset, velocity, found = mean_nearest(sums)
     time = pursuer_time(p, me, steering.passing_point(offset, me.vel, p.distance), velocity)
-    wish = steering.offset_pursue(offset, me.vel, velocity, top_speed(p, me), p.distance, time)
-    return select(some, scale(wish, p.weight), zero(wish))
+    change = steering.offset_pursue(offset, me.vel, velocity, top_speed(p, me), p.distance, time)
+    return select(found, scale(change, p.weight), zero(change))
 
 
 @law
 def shadow_force(p: Any, me: Me, sums: Vec) -> Vec:
     """Return F = w S: pursue from afar, match velocity near by."""
-    offset, velocity, some = mean_nearest(sums)
+    offset, velocity, found = mean_nearest(sums)
     time = pursuer_time(p, me, offset, velocity)
-    wish = steering.shadow(offset, me.vel, velocity, top_speed(p, me), p.distance, p.band, time)
-    return select(some, scale(wish, p.weight), zero(wish))
+    change = steering.shadow(offset, me.vel, velocity, top_speed(p, me), p.distance, p.band, time)
+    return select(found, scale(change, p.weight), zero(change))
 
 
 @law
 def match_velocity_force(p: Any, me: Me, sums: Vec) -> Vec:
     """Return F = w (v_j - v)."""
-    _, velocity, some = mean_nearest(sums)
-    return select(some, scale(steering.match_velocity(me.vel, velocity), p.weight), zero(velocity))
+    _, velocity, found = mean_nearest(sums)
+    return select(found, scale(steering.match_velocity(me.vel, velocity), p.weight), zero(velocity))
 
 
 class Predicting(AboutNearest, Moving):

@@ -19,20 +19,20 @@ Reals = NDArray[np.floating[Any]]
 
 
 def reconcile(
-    arbitration: Arbitration, wishes: ArrayLike, max_force: ArrayLike, time: ArrayLike = 0.0, key: ArrayLike = 0,
+    arbitration: Arbitration, forces: ArrayLike, max_force: ArrayLike, time: ArrayLike = 0.0, key: ArrayLike = 0,
     who: ArrayLike = 0, heading: ArrayLike | None = None, dtype: Any = np.float64,
     inner: Mapping[str, ArrayLike] | None = None,
 ) -> tuple[Reals, Reals]:  # fmt: skip
-    """Return the force, (R, D) N, and the share of each behaviour, (R, K), from steering forces `wishes` (R, K, D) N.
+    """Return the force, (R, D) N, and the share of each behaviour, (R, K), from steering forces (R, K, D) N.
 
     The other arguments are (R,), or one number for all: max_force, N; time, s; key of the world; agent `who`; heading
     (R, D); `inner` numbers by name, each (R,), if the arbitration recalls them.
     """
-    asked = np.ascontiguousarray(wishes, dtype)
-    if asked.ndim != 3 or asked.shape[1] < 1 or asked.shape[2] not in (2, 3):
-        raise ValueError(f"wishes has shape {asked.shape}, expected (R, K, D) with K >= 1 and D = 2 or 3")
-    rows, count, dimension = asked.shape
-    real = asked.dtype.type
+    requested = np.ascontiguousarray(forces, dtype)
+    if requested.ndim != 3 or requested.shape[1] < 1 or requested.shape[2] not in (2, 3):
+        raise ValueError(f"forces has shape {requested.shape}, expected (R, K, D) with K >= 1 and D = 2 or 3")
+    rows, count, dimension = requested.shape
+    real = requested.dtype.type
     ahead = np.zeros((rows, dimension)) if heading is None else heading
     numbers = arbitration.parameters(count)
     force, share = np.empty((rows, dimension), dtype), np.empty((rows, count), dtype)
@@ -41,7 +41,7 @@ def reconcile(
     given = {k: tuple(map(real, v)) if isinstance(v, tuple) else real(v) for k, v in numbers.items()}
     p = record(tuple(given))(*(given or {"nothing": real(0)}).values())
     _over_rows(arbitration.law, count, dimension, tuple(recalled))(
-        p, asked, *(np.ascontiguousarray(np.broadcast_to(x, rows), kind) for x, kind in
+        p, requested, *(np.ascontiguousarray(np.broadcast_to(x, rows), kind) for x, kind in
                  ((max_force, dtype), (time, dtype), (key, np.uint64), (who, dtype))),
         np.ascontiguousarray(np.broadcast_to(ahead, (rows, dimension)), dtype), np.ascontiguousarray(kept), force,
         share,
@@ -57,13 +57,13 @@ def _number(numbers: Any, k: int) -> float:
 @entry_of
 def _over_rows(law: Law, count: int, dimension: int, recalled: tuple[str, ...]) -> Callable[..., None]:
     """Return the loop of one arbitration over rows."""
-    direction, wish = vector(dimension), kernel(lambda wishes, k: direction(wishes[k], 0))
-    wishes_of, kept_of = read_several(count, wish), read_several(max(len(recalled), 1), _number)
+    direction, force_of = vector(dimension), kernel(lambda forces, k: direction(forces[k], 0))
+    forces_of, kept_of = read_several(count, force_of), read_several(max(len(recalled), 1), _number)
     inner_of, recalls = record(recalled), bool(recalled)
 
     def over_rows(
         p: Any,
-        wishes: Any,
+        forces: Any,
         max_force: Any,
         time: Any,
         key: Any,
@@ -74,11 +74,11 @@ def _over_rows(law: Law, count: int, dimension: int, recalled: tuple[str, ...]) 
         share: Any,
     ) -> None:
         o = max_force.dtype.type(0)
-        for r in range(wishes.shape[0]):
+        for r in range(forces.shape[0]):
             h = direction(heading[r], 0)
             inner = inner_of(*kept_of(kept[r], 0)) if recalls else ()
             me = Me(who[r], h, h, h, o, o, o, max_force[r], h, time[r], h, key[r], h, o, inner)
-            f, s = law(p, me, wishes_of(wishes[r], 0))
+            f, s = law(p, me, forces_of(forces[r], 0))
             for j in range(dimension):
                 force[r, j] = f[j]
             for k in range(count):

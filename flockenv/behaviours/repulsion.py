@@ -25,7 +25,7 @@ class Push(Effect):
     strengths: ClassVar[tuple[str, ...]] = ("strength", "acceleration")
 
     @model_validator(mode="after")
-    def _does_something(self) -> Self:
+    def _check_strength(self) -> Self:
         """Raise ValueError if no strength is given; an explicit 0 is allowed."""
         if not {"strength", "acceleration"} & self.model_fields_set:
             raise ValueError("strength: missing; give strength, N, or acceleration, m/s^2")

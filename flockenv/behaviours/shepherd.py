@@ -23,8 +23,8 @@ def shepherd_force(p: Any, me: Me, flock: Members) -> Vec:
     n, o = flock.size, like(flock.size, 0.0)
     together, driving = p.spacing * np.cbrt(n * n), p.spacing * np.sqrt(n)
     place = steering.herding_offset(flock.centre, flock.farthest, sub(p.goal, me.pos), together, p.spacing, driving)
-    wish = scale(steering.arrive(place, me.vel, top_speed(p, me), p.slow_radius), p.weight)
-    return select(n > o, wish, zero(me.pos))
+    force = scale(steering.arrive(place, me.vel, top_speed(p, me), p.slow_radius), p.weight)
+    return select(n > o, force, zero(me.pos))
 
 
 class Shepherd(Moving):

@@ -110,22 +110,22 @@ def _force_products(n: Vec, force: float) -> Vec:
 def circular_force(p: Any, me: Me, sums: Vec) -> Vec:
     """Return the sum of w f n; w = lambda + (1 - lambda)(1 - n . e) / 2 is linear in n, so it follows from the sums."""
     e, half = like(me.mass, 1.0), like(me.mass, 0.5)
-    way = unit(steering.gaze_direction(me.aim, me.heading))
+    gaze = unit(steering.gaze_direction(me.aim, me.heading))
     push: Vec
     along: Vec
     if len(sums) == 5:
         push = (sums[0], sums[1])
-        along = (sums[2] * way[0] + sums[3] * way[1], sums[3] * way[0] + sums[4] * way[1])
+        along = (sums[2] * gaze[0] + sums[3] * gaze[1], sums[3] * gaze[0] + sums[4] * gaze[1])
     else:
         push = (sums[0], sums[1], sums[2])
         along = (
-            sums[3] * way[0] + sums[4] * way[1] + sums[5] * way[2],
-            sums[4] * way[0] + sums[6] * way[1] + sums[7] * way[2],
-            sums[5] * way[0] + sums[7] * way[1] + sums[8] * way[2],
+            sums[3] * gaze[0] + sums[4] * gaze[1] + sums[5] * gaze[2],
+            sums[4] * gaze[0] + sums[6] * gaze[1] + sums[7] * gaze[2],
+            sums[5] * gaze[0] + sums[7] * gaze[1] + sums[8] * gaze[2],
         )
     rest = half * (e - p.anisotropy)
     weighed = sub(scale(push, p.anisotropy + rest), scale(along, rest))
-    return select(dot(way, way) > like(me.mass, 0.0), weighed, push)
+    return select(dot(gaze, gaze) > like(me.mass, 0.0), weighed, push)
 
 
 class CircularRepulsion(Social):
@@ -171,8 +171,8 @@ def elliptical_pair(p: Any, me: Me, other: Other) -> Vec:
     """Return A w (-B grad exp(-b / B))."""
     step = scale(sub(other.vel, scale(me.vel, p.relative)), p.step)
     out, size = social.elliptical_direction(other.offset, step, sub(me.tie, other.tie), p.decay)
-    way = steering.gaze_direction(me.aim, me.heading)
-    weight = steering.view_weight(way, other.offset, p.anisotropy) * steering.cone_weight(way, out, p.edge, p.outside)
+    gaze = steering.gaze_direction(me.aim, me.heading)
+    weight = steering.view_weight(gaze, other.offset, p.anisotropy) * steering.cone_weight(gaze, out, p.edge, p.outside)
     force = size * strength_of(p, me)
     return scale(out, weight * (force if force < p.bound else p.bound))
 
@@ -218,10 +218,10 @@ class EllipticalRepulsion(Social):
 @law
 def sidestep_pair(p: Any, me: Me, other: Other) -> Vec:
     """Return A (f_t t + f_n n)."""
-    wish = steering.sidestep(
+    change = steering.sidestep(
         other.offset, me.vel, other.vel, sub(other.tie, me.tie), p.importance, p.gamma, p.angular, p.forward, p.bias
     )
-    return limit(scale(wish, strength_of(p, me)), p.bound)
+    return limit(scale(change, strength_of(p, me)), p.bound)
 
 
 class Sidestep(Social):

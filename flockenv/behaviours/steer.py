@@ -45,16 +45,16 @@ class Steer(Effect):
     steering: ClassVar[bool] = True
 
     @model_validator(mode="after")
-    def _wishes_alone(self) -> Steer:
+    def _check_behaviours(self) -> Steer:
         """Raise ValueError if an entry is no behaviour, or the arbitration's numbers do not fit their count."""
         for k, behaviour in enumerate(self.behaviours):
-            if not behaviour.steering or behaviour.wishes:
+            if not behaviour.steering or behaviour.components:
                 raise ValueError(f"behaviours[{k}].kind = {behaviour.kind}: is no behaviour; {', '.join(BEHAVIOURS)}")
         self.arbitration.parameters(len(self.behaviours))
         return self
 
     @property
-    def wishes(self) -> tuple[Effect, ...]:
+    def components(self) -> tuple[Effect, ...]:
         """Its behaviours."""
         return self.behaviours
 
@@ -64,7 +64,7 @@ class Steer(Effect):
         return self.arbitration.law
 
     @property
-    def recalled(self) -> tuple[str, ...]:
+    def required_inner(self) -> tuple[str, ...]:
         """The inner numbers that the arbitration recalls."""
         return self.arbitration.recalls
 
@@ -103,14 +103,14 @@ class Steer(Effect):
         """True if all of its behaviours act all the time."""
         return all(behaviour.always for behaviour in self.behaviours)
 
-    def in_the_open(self) -> Effect | None:
+    def without_obstacles(self) -> Effect | None:
         """Return a copy with those of its behaviours that act without obstacles, or None."""
-        left = tuple(behaviour for behaviour in self.behaviours if behaviour.in_the_open() is not None)
+        left = tuple(behaviour for behaviour in self.behaviours if behaviour.without_obstacles() is not None)
         return self.model_copy(update={"behaviours": left}) if left else None
 
-    def idle(self) -> Effect:
+    def idle_copy(self) -> Effect:
         """Return a copy whose behaviours are all idle."""
-        return self.model_copy(update={"behaviours": tuple(behaviour.idle() for behaviour in self.behaviours)})
+        return self.model_copy(update={"behaviours": tuple(behaviour.idle_copy() for behaviour in self.behaviours)})
 
     def check(self, scene: SceneView) -> None:
         """Raise ValueError if the group does not exist, or a behaviour does not suit the scene."""

@@ -63,8 +63,8 @@ def follow_wall_force(p: Any, me: Me, acc: Vec) -> Vec:
     still = dot(step, step) <= o
     onward = select(still, scale(perpendicular(normal), p.time * top_speed(p, me)), step)
     goal = add(onward, scale(normal, p.distance - gap))
-    wish = scale(steering.seek(goal, me.vel, top_speed(p, me)), p.weight)
-    return select(near, wish, zero(wish))
+    force = scale(steering.seek(goal, me.vel, top_speed(p, me)), p.weight)
+    return select(near, force, zero(force))
 
 
 class FollowWall(Moving):
@@ -96,7 +96,7 @@ effects:
 - {kind: steer, behaviours: [{kind: follow_wall, weight: 8, distance: 0.8, time: 0.25}]}
 """
 
-    def folded(self, dimension: int) -> int:
+    def fold_size(self, dimension: int) -> int:
         """Return the size of a distance and a normal."""
         return 1 + dimension
 
@@ -115,8 +115,8 @@ def contain_force(p: Any, me: Me, now: float, gap: float, out: Vec) -> Vec:
     brake = scale(me.vel, -(ahead * ahead if ahead > o else o))
     turn = add(scale(side, top_speed(p, me)), brake)
     home = sub(scale(out, -top_speed(p, me)), me.vel)
-    wish = scale(select(now + me.radius > o, home, turn), p.weight)
-    return select(gap + me.radius > o, wish, zero(wish))
+    force = scale(select(now + me.radius > o, home, turn), p.weight)
+    return select(gap + me.radius > o, force, zero(force))
 
 
 @law
@@ -174,7 +174,7 @@ effects:
 """
 
     @model_validator(mode="after")
-    def _has_an_inside(self) -> Self:
+    def _check_shape(self) -> Self:
         if self.within.kind not in ("circle", "block", "polygon"):
             raise ValueError(f"within.kind = {self.within.kind}: must be one of circle, block, polygon")
         if self.within.moves or self.within.form.startswith("hollow"):

@@ -20,10 +20,10 @@ GOLDEN = 0.6180339887498949
 
 
 @law
-def _sideways(way: Vec, left: float, up: float) -> Vec:
+def _sideways(heading: Vec, left: float, up: float) -> Vec:
     """Return a sideways offset in the agent's own frame."""
     o = like(left, 0.0)
-    if len(way) == 2:
+    if len(heading) == 2:
         return (o, left)
     else:
         return (o, left, up)
@@ -38,9 +38,9 @@ def wander_force(p: Any, me: Any) -> Vec:
     left, up = like(e, smooth(me.key, when, who, CHANNEL)), like(e, smooth(me.key, when, who, CHANNEL + 1))
     # each agent at rest starts in a random direction
     begin = 2.0 * np.pi * uniform(me.key, 0, who, CHANNEL + 2)
-    way = select(dot(me.vel, me.vel) > o, me.vel, planar(me.vel, like(e, np.cos(begin)), like(e, np.sin(begin))))
-    target = _sideways(way, left * p.strength, up * p.strength)
-    velocity = add(steering.wander(target, way, top_speed(p, me), e), way)
+    heading = select(dot(me.vel, me.vel) > o, me.vel, planar(me.vel, like(e, np.cos(begin)), like(e, np.sin(begin))))
+    target = _sideways(heading, left * p.strength, up * p.strength)
+    velocity = add(steering.wander(target, heading, top_speed(p, me), e), heading)
     return scale(sub(velocity, me.vel), p.weight)
 
 

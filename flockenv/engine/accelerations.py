@@ -86,7 +86,7 @@ def response_plan(parts: KernelPlan) -> ResponsePlan:
         (name, Added("pair_force", None, (parts.pair_force_at(name),))) for name in parts.targets if name[0] != "n"
     ]
     added += [("f", Added("far_bond_force"))] * parts.has_far_bond_force
-    mine = [(k, e) for k, e in enumerate(parts.effects) if e.wishes]
+    mine = [(k, e) for k, e in enumerate(parts.effects) if e.components]
     combinations = tuple(
         Combination(k, e.steer_law, tuple(j for j, behaviour in enumerate(combined) if parts.combined[behaviour] == k))
         for k, e in mine

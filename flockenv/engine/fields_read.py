@@ -18,9 +18,9 @@ OF_PAIRS = ("pair_start", "pair_law", "apart_law", "finish_law")
 
 def names_read(effect: Effect, slots: Sequence[str]) -> set[str]:
     """Return every name in the code of some of an effect's laws and of the laws that they call."""
-    laws = [*(getattr(effect, slot) for slot in slots), effect.obstacle_law if effect.joined else None]
+    laws = [*(getattr(effect, slot) for slot in slots), effect.obstacle_law if effect.is_joint_fold else None]
     todo: list[Any] = [law for law in laws if law is not None]
-    if effect.wishes and slots == LAWS:
+    if effect.components and slots == LAWS:
         todo.append(effect.steer_law)
     seen: set[int] = set()
     names: set[str] = set()

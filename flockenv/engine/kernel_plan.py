@@ -227,7 +227,7 @@ class KernelPlan(ObstacleSets):
         """The behaviours whose forces another effect combines, each with the index of that effect."""
         found: dict[int, int] = {}
         for k, effect in enumerate(self.effects):
-            found |= dict.fromkeys(range(k - len(effect.wishes), k), k)
+            found |= dict.fromkeys(range(k - len(effect.components), k), k)
         return found
 
     def target(self, k: int) -> str:
@@ -404,7 +404,7 @@ class KernelPlan(ObstacleSets):
         runs = [(f"c{k}_", e.sums(d)) for k, e in self.pairs]
         runs += [(f"near{q}_", sight.nearest or 0) for q, sight in enumerate(self.sights)]
         runs += [(f"many{q}_", 1) for q in self.counted_sights]
-        runs += [(f"o{k}_", e.folded(d) if e.obstacle_start else 0) for k, e in enumerate(self.effects)]
+        runs += [(f"o{k}_", e.fold_size(d) if e.obstacle_start else 0) for k, e in enumerate(self.effects)]
         runs += [(f"g{name}", d) for name in self.targets]
         runs += [(f"group{k}_", 1 + 3 * d) for k, _ in self.group_effects]
         runs += [("bond", d * bool(self.bond_effects)), ("far", d * bool(self.far))]
@@ -423,4 +423,4 @@ class KernelPlan(ObstacleSets):
 
 def flatten_effects(effects: Sequence[Effect]) -> tuple[Effect, ...]:
     """Return effects with the behaviours that each combines before it: each has laws and numbers of its own."""
-    return tuple(each for effect in effects for each in (*effect.wishes, effect))
+    return tuple(each for effect in effects for each in (*effect.components, effect))

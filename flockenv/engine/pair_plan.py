@@ -86,7 +86,7 @@ def pairs_of(parts: KernelPlan) -> Pairs:
     )
     laws = tuple(
         PairLaw(
-            k, e.pair_start, e.pair_law, e.apart_law, e.finish_law, e.obstacle_law if e.joined else None,
+            k, e.pair_start, e.pair_law, e.apart_law, e.finish_law, e.obstacle_law if e.is_joint_fold else None,
             int(listing.slot(f"c{k}_0")), e.sums(parts.dimension), parts.sights.index(parts.sight_of(e)), e.contact,
             e.vanishes and parts.trusts, e.averages,
             images_in(parts, e), parts.targets.index(parts.pair_target(k)),

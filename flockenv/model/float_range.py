@@ -50,6 +50,6 @@ def _places(scene: SceneView) -> Iterator[tuple[str, Any]]:
     for k, effect in enumerate(scene.effects):
         for name in effect.places:
             yield f"effects[{k}].{name}", getattr(effect, name)
-        for j, behaviour in enumerate(effect.wishes):
+        for j, behaviour in enumerate(effect.components):
             for name in behaviour.places:
                 yield f"effects[{k}].behaviours[{j}].{name}", getattr(behaviour, name)

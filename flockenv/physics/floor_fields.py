@@ -1,6 +1,6 @@
 """Floor fields: shortest paths around all obstacles of a scene, on a grid, for behaviours, aims, journeys and routes.
 
-One grid (eikonal.floor_field_table) serves all agents with the same targets; laws read it by `way_ahead`.
+One grid (eikonal.floor_field_table) serves all agents with the same targets; laws read it by `path_ahead`.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ def path_ahead(table: Any, x: Vec, straight: Vec) -> tuple[float, Vec]:
 def path_to_target(table: Any, x: Vec) -> tuple[float, Vec]:
     """Return the length of the path to the nearest target of a block, m, and its first direction; 0 and 0 within it.
 
-    A block (see `way_block`) holds the number of targets, the distance within which the straight line to them is free,
-    m, a row for each target, and a grid.
+    A block (see `floor_field_block`) holds the number of targets, the distance within which the straight line to
+    them is free, m, a row for each target, and a grid.
     """
     count, size = np.int64(table[0]), 3 * len(x) + 1
     straight = to_any(table, 2, count, x)
@@ -125,7 +125,7 @@ def floor_field_block(
     scene: SceneView, targets: Sequence[Target], names: Sequence[str], corners: tuple[Floats, Floats], spacing: float,
     clearance: float, starts: Sequence[Start] = (),
 ) -> Floats:  # fmt: skip
-    """Return the block that `towards` reads: the reachable parts of the targets, and the floor field to them.
+    """Return the block that `path_to_target` reads: the reachable parts of the targets, and the floor field to them.
 
     At distances from a target below the spacing and below its distance to obstacles, the straight line is taken.
     """

@@ -163,10 +163,10 @@ class Scene(Record):
 
     def _check_recalled(self) -> None:
         """Raise ValueError for laws that read inner numbers which no effect keeps."""
-        kept = {name for effect in self.effects for each in (*effect.wishes, effect) for name in each.keeps}
+        kept = {name for effect in self.effects for each in (*effect.components, effect) for name in each.keeps}
         for k, effect in enumerate(self.effects):
-            for each in (*effect.wishes, effect):
-                if missing := [name for name in each.recalled if name not in kept]:
+            for each in (*effect.components, effect):
+                if missing := [name for name in each.required_inner if name not in kept]:
                     keepers = sorted(kind for kind, e in EFFECTS.items() if missing[0] in e.keeps)
                     raise ValueError(
                         f"effects[{k}].kind = {each.kind}: needs {missing[0]!r}, which no effect of this scene keeps; "
@@ -463,7 +463,7 @@ class Scene(Record):
         most = float(np.finfo(self.dtype).max) ** 0.25
         near = dataclasses.replace(state, x=np.clip(state.x, -most, most), v=np.clip(state.v, -most, most))
         for k, effect in enumerate(self.effects):
-            others = tuple(e if j == k else e.idle() for j, e in enumerate(self.effects))
+            others = tuple(e if j == k else e.idle_copy() for j, e in enumerate(self.effects))
             # nothing is stepped: with a method without a limit no dt is warned of or rejected
             alone = self.model_copy(update={"effects": others, "integrator": ImplicitEuler()})
             size = float(np.abs(alone.acceleration(near)[0, agent]).max())

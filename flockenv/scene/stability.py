@@ -198,7 +198,7 @@ def _found(scene: SceneView) -> list[tuple[Effect, _Rates]]:
     """Return the effects with a known stiffness, and their rates."""
     out = []
     for k, effect in enumerate(scene.effects):
-        acting = effect if scene.obstacles else effect.in_the_open()
+        acting = effect if scene.obstacles else effect.without_obstacles()
         try:
             found = acting.rates(scene.groups, scene.dimension) if acting is not None else None
         except ValueError as error:
@@ -302,7 +302,7 @@ def contact_limit(method: Integrator) -> float:
 def check_contact(scene: SceneView) -> None:
     """Warn if contacts of bouncing bodies last too few steps, naming the limit and the consequence."""
     for k, effect in enumerate(scene.effects):
-        acting = effect if scene.obstacles else effect.in_the_open()
+        acting = effect if scene.obstacles else effect.without_obstacles()
         found = acting.rates(scene.groups, scene.dimension) if acting is not None and effect.contact else None
         if found is None:
             continue
@@ -336,7 +336,7 @@ def _what_comes_of_it(scene: SceneView, frequency: float, agent: int) -> str:
 def check_lookahead(scene: SceneView) -> None:
     """Warn if a lookahead is shorter than the stopping distance V^2 m/(2 F) plus the radius."""
     for k, effect in enumerate(scene.effects):
-        several = [(f"effects[{k}].behaviours[{j}]", each) for j, each in enumerate(effect.wishes)]
+        several = [(f"effects[{k}].behaviours[{j}]", each) for j, each in enumerate(effect.components)]
         only = getattr(effect, "group", None) if several else None
         for name, each in several or [(f"effects[{k}]", effect)]:
             for g, group in enumerate(scene.groups):

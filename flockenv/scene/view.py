@@ -112,7 +112,7 @@ class View:
     @functools.cached_property
     def _tracks(self) -> tuple[tuple[tuple[tuple[float, ...], ...], float], ...]:
         """The paths of steering behaviours, each once."""
-        ways = dict.fromkeys(effect.way_shown(self.scene) for effect in self.scene.parts.effects if effect.steering)
+        ways = dict.fromkeys(effect.path_to_draw(self.scene) for effect in self.scene.parts.effects if effect.steering)
         return tuple(way for way in ways if way is not None)
 
     @property

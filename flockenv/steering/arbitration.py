@@ -1,8 +1,8 @@
 """Arbitration: one steering force from several behaviours that disagree.
 
-`wishes` is a tuple of steering forces in order of priority, all in one unit; a zero vector is an idle behaviour.
+`forces` is a tuple of steering forces in order of priority, all in one unit; a zero vector is an idle behaviour.
 `budget` bounds the result, in the same unit. The first laws need no scene, so players call them too. Each record below
-can be the arbitration of a `Steer` effect: its law (p, me, wishes) -> (force, shares) returns the resulting force, N,
+can be the arbitration of a `Steer` effect: its law (p, me, forces) -> (force, shares) returns the resulting force, N,
 and the share of each steering force that is in it.
 
 Sources: Reynolds 1987 (prioritised acceleration allocation) and 1999 (blending, priority, dithering); Buckland,
@@ -39,34 +39,35 @@ ARBITRATIONS: dict[str, type[Arbitration]] = {}
 """Every arbitration by its kind; a class registers itself when it is defined."""
 
 
-def no_shares(wishes: Forces) -> Shares:
-    """Return a zero for each wish."""
-    return (0.0,) * len(wishes)
+def no_shares(forces: Forces) -> Shares:
+    """Return a zero for each force."""
+    return (0.0,) * len(forces)
 
 
 @overload(no_shares, jit_options=OPTIONS)
-def _no_shares(wishes):  # type: ignore[no-untyped-def]  # numba compares signatures, annotations included
-    zeros = "".join("o, " for _ in range(len(wishes)))
-    made: dict[str, Any] = {"like": like}
-    exec(f"def zeros(wishes):\n    o = like(wishes[0][0], 0.0)\n    return ({zeros})", made)  # noqa: S102  # K is a type's
-    return made["zeros"]
+def _no_shares(forces):  # type: ignore[no-untyped-def]  # numba compares signatures, annotations included
+    zeros = "".join("o, " for _ in range(len(forces)))
+    namespace: dict[str, Any] = {"like": like}
+    exec(f"def zeros(forces):\n    o = like(forces[0][0], 0.0)\n    return ({zeros})", namespace)  # noqa: S102  # K is a type's
+    return namespace["zeros"]
 
 
 @law
 def _period_number(time: float, period: float) -> int:
-    """Number the periods: a thousandth of one early, so that no step that ends with a period misses it by a rounding.
+    """Return the number of the period.
 
+    Each begins a thousandth of itself early, so that no step that ends with a period misses it by a rounding.
     0.3 s in steps of 0.02 s and in steps of 0.05 s are two numbers: 0.3 / 0.1 is 2 or 3.
     """
     return np.int64(np.floor(time / period + like(period, 1e-3)))  # type: ignore[return-value]  # a number in a kernel
 
 
 @law
-def total_share(wishes: Forces, shares: Shares) -> Vec:
-    """Return what the shares of all wishes come to."""
-    total = zero(wishes[0])
-    for k in range(len(wishes)):
-        total = add(total, scale(wishes[k], shares[k]))
+def total_share(forces: Forces, shares: Shares) -> Vec:
+    """Return the sum of the forces times their shares."""
+    total = zero(forces[0])
+    for k in range(len(forces)):
+        total = add(total, scale(forces[k], shares[k]))
     return total
 
 
@@ -74,23 +75,23 @@ def total_share(wishes: Forces, shares: Shares) -> Vec:
 
 
 @law
-def _blend_shares(wishes: Forces, budget: float) -> Shares:
-    total = zero(wishes[0])
-    for k in range(len(wishes)):
-        total = add(total, wishes[k])
-    length, shares = norm(total), no_shares(wishes)
+def _blend_shares(forces: Forces, budget: float) -> Shares:
+    total = zero(forces[0])
+    for k in range(len(forces)):
+        total = add(total, forces[k])
+    length, shares = norm(total), no_shares(forces)
     share = budget / length if length > budget else like(length, 1.0)
-    for k in range(len(wishes)):
+    for k in range(len(forces)):
         shares = replace_at(shares, k, share)
     return shares
 
 
 @law
-def _first_share(wishes: Forces, threshold: float, budget: float) -> Shares:
-    """The first wish longer than the threshold, cut to the budget."""
-    shares, open_ = no_shares(wishes), True
-    for k in range(len(wishes)):
-        length = norm(wishes[k])
+def _first_share(forces: Forces, threshold: float, budget: float) -> Shares:
+    """Return the shares if the first force longer than the threshold, cut to the budget, is all there is."""
+    shares, open_ = no_shares(forces), True
+    for k in range(len(forces)):
+        length = norm(forces[k])
         takes = open_ and length > threshold
         cut = budget / length if length > budget else like(length, 1.0)
         shares = replace_at(shares, k, cut if takes else like(length, 0.0))
@@ -99,74 +100,74 @@ def _first_share(wishes: Forces, threshold: float, budget: float) -> Shares:
 
 
 @law
-def _allocate_shares(wishes: Forces, budget: float) -> Shares:
-    shares, left = no_shares(wishes), budget
+def _allocate_shares(forces: Forces, budget: float) -> Shares:
+    shares, left = no_shares(forces), budget
     o = like(budget, 0.0)
-    for k in range(len(wishes)):
-        length = norm(wishes[k])
-        whole = length <= left
-        shares = replace_at(shares, k, like(length, 1.0) if whole else left / length)
-        left = left - length if whole else o
+    for k in range(len(forces)):
+        length = norm(forces[k])
+        fits = length <= left
+        shares = replace_at(shares, k, like(length, 1.0) if fits else left / length)
+        left = left - length if fits else o
     return shares
 
 
 @law
-def _running_shares(wishes: Forces, budget: float) -> Shares:
-    shares, total = no_shares(wishes), zero(wishes[0])
+def _running_shares(forces: Forces, budget: float) -> Shares:
+    shares, total = no_shares(forces), zero(forces[0])
     o = like(budget, 0.0)
-    for k in range(len(wishes)):
-        length, left = norm(wishes[k]), budget - norm(total)
+    for k in range(len(forces)):
+        length, left = norm(forces[k]), budget - norm(total)
         left = left if left > o else o
         share = like(length, 1.0) if length <= left else left / length
         shares = replace_at(shares, k, share)
-        total = add(total, scale(wishes[k], share))
+        total = add(total, scale(forces[k], share))
     return shares
 
 
 @law
-def blend(wishes: Forces, weights: Vec, budget: float) -> Vec:
-    """Return the weighted sum, shortened to the budget (Reynolds 1999). Opposite wishes cancel: +8 and -8 give 0."""
-    total = zero(wishes[0])
-    for k in range(len(wishes)):
-        total = add(total, scale(wishes[k], weights[k]))
+def blend(forces: Forces, weights: Vec, budget: float) -> Vec:
+    """Return the weighted sum, shortened to the budget (Reynolds 1999). Opposite forces cancel: +8 and -8 give 0."""
+    total = zero(forces[0])
+    for k in range(len(forces)):
+        total = add(total, scale(forces[k], weights[k]))
     return limit(total, budget)
 
 
 @law
-def prioritise(wishes: Forces, threshold: float, budget: float) -> Vec:
-    """Return the first wish longer than the threshold, shortened to the budget, and nothing of the others."""
-    return total_share(wishes, _first_share(wishes, threshold, budget))
+def prioritise(forces: Forces, threshold: float, budget: float) -> Vec:
+    """Return the first force longer than the threshold, shortened to the budget, and nothing of the others."""
+    return total_share(forces, _first_share(forces, threshold, budget))
 
 
 @law
-def allocate(wishes: Forces, budget: float) -> Vec:
-    """Grant wishes in order until their lengths have used up the budget; the last one served is cut to what is left.
+def allocate(forces: Forces, budget: float) -> Vec:
+    """Add forces in order until their lengths have used up the budget; the last one is cut to what is left.
 
     Prioritised acceleration allocation (Reynolds 1987): lengths add up as scalars, so the sum needs no shortening, and
-    in an emergency the most pressing wish is served whole. (8,0), (-8,0), (0,5) within 10 give (6, 0).
+    in an emergency the most important force is not shortened. (8,0), (-8,0), (0,5) within 10 give (6, 0).
     """
-    return total_share(wishes, _allocate_shares(wishes, budget))
+    return total_share(forces, _allocate_shares(forces, budget))
 
 
 @law
-def allocate_running(wishes: Forces, budget: float) -> Vec:
-    """Grant wishes in order, each as far as the length of the sum so far leaves room (Buckland 2004).
+def allocate_running(forces: Forces, budget: float) -> Vec:
+    """Add forces in order, each as far as the length of the sum so far leaves room (Buckland 2004).
 
-    Unlike `allocate`, opposite wishes give room back: (8,0), (-8,0), (0,5) within 10 give (6, 4).
+    Unlike `allocate`, opposite forces give room back: (8,0), (-8,0), (0,5) within 10 give (6, 4).
     """
-    return total_share(wishes, _running_shares(wishes, budget))
+    return total_share(forces, _running_shares(forces, budget))
 
 
 # --- records, for scenes ----------------------------------------------------------------------------------------------
 
 
 class Arbitration(Record):
-    """How wishes are reconciled; `law` is a law (p, me, wishes) -> (force, shares)."""
+    """How forces are combined; `law` is a law (p, me, forces) -> (force, shares)."""
 
     kind: str
     law: ClassVar[Law]
     exclusive: ClassVar[bool] = False
-    """True if one behaviour at a time has what it asks for, and the others have nothing."""
+    """True if one behaviour at a time acts, and the others do not."""
     recalls: ClassVar[tuple[str, ...]] = ()
     """Names of the numbers inside agents that its law reads as me.inner.NAME, and that some effect keeps."""
 
@@ -177,22 +178,22 @@ class Arbitration(Record):
         if isinstance(kind, str):
             ARBITRATIONS[kind] = cls
 
-    def parameters(self, wishes: int) -> dict[str, float | Vec]:
-        """Return the numbers its law is given, by name."""
+    def parameters(self, forces: int) -> dict[str, float | Vec]:
+        """Return the numbers passed to its law, by name, for a number of forces."""
         return {name: float(getattr(self, name)) for name in type(self).model_fields if name != "kind"}
 
 
 @law
-def blend_forces(p: Any, me: Any, wishes: Forces) -> tuple[Vec, Shares]:
-    """All of them: the sum of whatever an agent wants is cut to max_force anyway, and only once."""
-    total = zero(wishes[0])
-    for k in range(len(wishes)):
-        total = add(total, wishes[k])
-    return total, _blend_shares(wishes, me.max_force)
+def blend_forces(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
+    """Return the sum of all forces: it is cut to max_force later, and only once."""
+    total = zero(forces[0])
+    for k in range(len(forces)):
+        total = add(total, forces[k])
+    return total, _blend_shares(forces, me.max_force)
 
 
 class Blend(Arbitration):
-    """Everything at once, shortened to max_force: weights are those of the behaviours. Opposite wishes cancel.
+    """All forces at once, shortened to max_force: weights are those of the behaviours. Opposite forces cancel.
 
     It is as if the behaviours stood in the scene's list of effects.
     """
@@ -202,34 +203,34 @@ class Blend(Arbitration):
 
 
 @law
-def take_first(p: Any, me: Any, wishes: Forces) -> tuple[Vec, Shares]:
-    """One of them."""
-    shares = _first_share(wishes, p.threshold, me.max_force)
-    return total_share(wishes, shares), shares
+def take_first(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
+    """Return the first force above the threshold, and the shares."""
+    shares = _first_share(forces, p.threshold, me.max_force)
+    return total_share(forces, shares), shares
 
 
 class Priority(Arbitration):
-    """The first behaviour that asks for more than the threshold has it all, the others nothing (Reynolds 1999)."""
+    """The first behaviour whose force exceeds the threshold acts alone (Reynolds 1999)."""
 
     kind: Literal["priority"] = "priority"
-    threshold: float = Field(default=1e-3, ge=0, description="N, a wish that is no longer asks for nothing")
+    threshold: float = Field(default=1e-3, ge=0, description="N, a force of at most this size counts as zero")
     law: ClassVar[Law] = take_first
     exclusive: ClassVar[bool] = True
 
 
 @law
-def take_at_random(p: Any, me: Any, wishes: Forces) -> tuple[Vec, Shares]:
-    """One of them, by lot."""
-    shares, open_ = no_shares(wishes), True
+def take_at_random(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
+    """Return the first force that is drawn and above the threshold, and the shares."""
+    shares, open_ = no_shares(forces), True
     frame, who = _period_number(me.time, p.period), int(me.who)
-    for k in range(len(wishes)):
-        length = norm(wishes[k])
+    for k in range(len(forces)):
+        length = norm(forces[k])
         drawn = uniform(me.key, frame, who, 50_000 + k) < p.probability[k]
         takes = open_ and drawn and length > p.threshold
         cut = me.max_force / length if length > me.max_force else like(length, 1.0)
         shares = replace_at(shares, k, cut if takes else like(length, 0.0))
         open_ = open_ and not takes
-    return total_share(wishes, shares), shares
+    return total_share(forces, shares), shares
 
 
 class Dithering(Arbitration):
@@ -240,29 +241,29 @@ class Dithering(Arbitration):
 
     kind: Literal["dithering"] = "dithering"
     probability: Chance | Annotated[tuple[Chance, ...], Field(min_length=1)] = Field(
-        default=0.9, description="to be heard: of all behaviours, or of each, 0 to 1 (Reynolds 1999: 0.9)"
+        default=0.9, description="that it may act: of all behaviours, or of each, 0 to 1 (Reynolds 1999: 0.9)"
     )
     period: float = Field(default=0.1, gt=0, description="s, how long a draw lasts")
-    threshold: float = Field(default=1e-3, ge=0, description="N, a wish that is no longer asks for nothing")
+    threshold: float = Field(default=1e-3, ge=0, description="N, a force of at most this size counts as zero")
     law: ClassVar[Law] = take_at_random
     exclusive: ClassVar[bool] = True
 
-    def parameters(self, wishes: int) -> dict[str, float | Vec]:
-        """A probability for each wish."""
-        each = self.probability if isinstance(self.probability, tuple) else (self.probability,) * wishes
-        if len(each) != wishes:
+    def parameters(self, forces: int) -> dict[str, float | Vec]:
+        """Return period, threshold, and a probability for each force."""
+        each = self.probability if isinstance(self.probability, tuple) else (self.probability,) * forces
+        if len(each) != forces:
             raise ValueError(
                 f"arbitration.probability = {self.probability}: must be one number, or one for each of "
-                f"{wishes} behaviours"
+                f"{forces} behaviours"
             )
         return {"period": self.period, "threshold": self.threshold, "probability": tuple(map(float, each))}
 
 
 @law
-def allocate_force(p: Any, me: Any, wishes: Forces) -> tuple[Vec, Shares]:
-    """Lengths use up the budget."""
-    shares = _allocate_shares(wishes, me.max_force)
-    return total_share(wishes, shares), shares
+def allocate_force(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
+    """Return the sum of forces whose lengths use up max_force in order, and the shares."""
+    shares = _allocate_shares(forces, me.max_force)
+    return total_share(forces, shares), shares
 
 
 class Allocation(Arbitration):
@@ -273,10 +274,10 @@ class Allocation(Arbitration):
 
 
 @law
-def allocate_running_force(p: Any, me: Any, wishes: Forces) -> tuple[Vec, Shares]:
-    """The length of their sum uses up the budget."""
-    shares = _running_shares(wishes, me.max_force)
-    return total_share(wishes, shares), shares
+def allocate_running_force(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
+    """Return the sum of forces, each as long as the sum so far leaves of max_force, and the shares."""
+    shares = _running_shares(forces, me.max_force)
+    return total_share(forces, shares), shares
 
 
 class RunningSum(Arbitration):
@@ -287,19 +288,19 @@ class RunningSum(Arbitration):
 
 
 @law
-def take_turns(p: Any, me: Any, wishes: Forces) -> tuple[Vec, Shares]:
-    """Whose turn it is."""
-    shares = no_shares(wishes)
-    turn = _period_number(me.time, p.period) % len(wishes)
-    for k in range(len(wishes)):
-        length = norm(wishes[k])
+def take_turns(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
+    """Return the force of the behaviour whose turn it is, and the shares."""
+    shares = no_shares(forces)
+    turn = _period_number(me.time, p.period) % len(forces)
+    for k in range(len(forces)):
+        length = norm(forces[k])
         cut = me.max_force / length if length > me.max_force else like(length, 1.0)
         shares = replace_at(shares, k, cut if k == turn else like(length, 0.0))
-    return total_share(wishes, shares), shares
+    return total_share(forces, shares), shares
 
 
 class RoundRobin(Arbitration):
-    """One behaviour after another has its turn, whatever it asks for: cheap, and late by as many turns."""
+    """One behaviour after another has its turn, whatever its force: cheap, and late by as many turns."""
 
     kind: Literal["round_robin"] = "round_robin"
     period: float = Field(default=0.05, gt=0, description="s, how long a turn lasts")
@@ -325,74 +326,74 @@ def _spread_direction(ahead: Vec, j: int, n: int) -> Vec:
 
 
 @law
-def _danger_and_interest(p: Any, wishes: Forces, way: Vec) -> tuple[float, float]:
-    """Return how dangerous a direction is, and how much is to be said for it."""
-    o = like(way[0], 0.0)
+def _danger_and_interest(p: Any, forces: Forces, direction: Vec) -> tuple[float, float]:
+    """Return the danger of a direction, and the interest in it."""
+    o = like(direction[0], 0.0)
     danger, interest = o, o
-    for k in range(len(wishes)):
-        along = dot(wishes[k], way)
+    for k in range(len(forces)):
+        along = dot(forces[k], direction)
         interest += along if along > o else o
         danger -= along if (along < o) & (like(o, k) < p.dangers) else o
     return danger, interest
 
 
 @law
-def choose_direction(p: Any, me: Any, wishes: Forces) -> tuple[Vec, Shares]:
-    """The best of the least dangerous directions."""
-    o, e = like(wishes[0][0], 0.0), like(wishes[0][0], 1.0)
-    total = zero(wishes[0])
-    for k in range(len(wishes)):
-        total = add(total, wishes[k])
+def choose_direction(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
+    """Return a force in the best of the least dangerous directions, and the shares."""
+    o, e = like(forces[0][0], 0.0), like(forces[0][0], 1.0)
+    total = zero(forces[0])
+    for k in range(len(forces)):
+        total = add(total, forces[k])
     ahead = unit(total)
     ahead = select(dot(ahead, ahead) > o, ahead, me.heading)
     ahead = select(dot(ahead, ahead) > o, ahead, axis(total, 0))
     least, most = like(o, np.inf), o
     count = int(p.directions)
     for j in range(count):
-        danger, _ = _danger_and_interest(p, wishes, _spread_direction(ahead, j, count))
+        danger, _ = _danger_and_interest(p, forces, _spread_direction(ahead, j, count))
         least, most = min(least, danger), max(most, danger)
     bound = least + like(o, 1e-3) * (most - least)  # as good as the least
     best, chosen = -e, zero(total)
     for j in range(count):
-        way = _spread_direction(ahead, j, count)
-        danger, interest = _danger_and_interest(p, wishes, way)
+        direction = _spread_direction(ahead, j, count)
+        danger, interest = _danger_and_interest(p, forces, direction)
         better = (danger <= bound) & (interest > best)
-        best, chosen = interest if better else best, select(better, way, chosen)
+        best, chosen = interest if better else best, select(better, direction, chosen)
     force = limit(scale(chosen, best if best > o else o), me.max_force)
-    shares = no_shares(wishes)
-    for k in range(len(wishes)):
-        square = dot(wishes[k], wishes[k])
-        share = dot(force, wishes[k]) / square if square > o else o
+    shares = no_shares(forces)
+    for k in range(len(forces)):
+        square = dot(forces[k], forces[k])
+        share = dot(force, forces[k]) / square if square > o else o
         shares = replace_at(shares, k, min(max(share, o), e))
     return force, shares
 
 
 class ContextSteering(Arbitration):
-    """Directions are weighed, not wishes added: the best of those that are least dangerous (Fray 2015).
+    """Directions are scored, not forces added: the best of those that are least dangerous (Fray 2015).
 
-    Of the first `dangers` behaviours the opposite of a wish is dangerous; what all of them wish for is interesting. The
-    share of a wish is how much of it lies in what is done.
+    Of the first `dangers` behaviours the opposite of a force is dangerous; the direction of every force is interesting.
+    The share of a force is the part of it that is in the result.
     """
 
     kind: Literal["context"] = "context"
-    dangers: int = Field(default=1, ge=0, description="how many behaviours, from the first on, avert a danger")
-    directions: int = Field(default=24, ge=4, le=256, description="how many directions are weighed")
+    dangers: int = Field(default=1, ge=0, description="number of behaviours, from the first on, that avert a danger")
+    directions: int = Field(default=24, ge=4, le=256, description="number of directions")
     law: ClassVar[Law] = choose_direction
 
 
 @law
-def take_by_intention(p: Any, me: Any, wishes: Forces) -> tuple[Vec, Shares]:
-    """Those that are always heard and those of the intention, until their lengths have used up the budget."""
-    shares, left = no_shares(wishes), me.max_force
+def take_by_intention(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
+    """Return the sum of forces that always act or belong to the intention, as in allocation, and the shares."""
+    shares, left = no_shares(forces), me.max_force
     o, e = like(left, 0.0), like(left, 1.0)
-    for k in range(len(wishes)):
-        length = norm(wishes[k])
-        heard = (p.when[k] < o) | (p.when[k] == me.inner.intention)
-        whole = length <= left
-        share = e if whole else left / length
-        shares = replace_at(shares, k, share if heard else o)
-        left = left - (length if whole else left) if heard else left
-    return total_share(wishes, shares), shares
+    for k in range(len(forces)):
+        length = norm(forces[k])
+        acts = (p.when[k] < o) | (p.when[k] == me.inner.intention)
+        fits = length <= left
+        share = e if fits else left / length
+        shares = replace_at(shares, k, share if acts else o)
+        left = left - (length if fits else left) if acts else left
+    return total_share(forces, shares), shares
 
 
 class Intentions(Arbitration):
@@ -408,10 +409,10 @@ class Intentions(Arbitration):
     law: ClassVar[Law] = take_by_intention
     recalls: ClassVar[tuple[str, ...]] = ("intention",)
 
-    def parameters(self, wishes: int) -> dict[str, float | Vec]:
-        """The number of a state for each wish; -1 = always."""
-        if len(self.when) != wishes:
-            raise ValueError(f"arbitration.when = {list(self.when)}: must be one for each of {wishes} behaviours")
+    def parameters(self, forces: int) -> dict[str, float | Vec]:
+        """Return the number of a state for each force; -1 = always."""
+        if len(self.when) != forces:
+            raise ValueError(f"arbitration.when = {list(self.when)}: must be one for each of {forces} behaviours")
         return {"when": tuple(float(INTENTIONS.index(name)) if name != "avoid" else -1.0 for name in self.when)}
 
 

@@ -43,28 +43,28 @@ def give_way(offset: Vec, velocity: Vec, other_velocity: Vec, time: float, max_s
 
 
 @law
-def queue_gap(way: Vec, offset: Vec, other_velocity: Vec, clearance: float, max_speed: float) -> float:
-    """Return the gap along `way` (a unit vector) to a neighbour slower than the desired speed, m; inf if there is none.
+def queue_gap(direction: Vec, offset: Vec, other_velocity: Vec, clearance: float, max_speed: float) -> float:
+    """Return the gap along a unit vector to a neighbour slower than the desired speed, m; inf if there is none.
 
-    A neighbour behind, beside the way, or as fast as the desired speed does not count (Reynolds 1999: near, ahead and
+    A neighbour behind, beside the path, or as fast as the desired speed does not count (Reynolds 1999: near, ahead and
     slower).
     """
     far = like(clearance, np.inf)
-    holds_up = (dot(offset, way) > like(clearance, 0.0)) & (dot(other_velocity, way) < max_speed)
-    gap = threat(way, offset, clearance, far)
+    holds_up = (dot(offset, direction) > like(clearance, 0.0)) & (dot(other_velocity, direction) < max_speed)
+    gap = threat(direction, offset, clearance, far)
     return gap if holds_up else far
 
 
 @law
-def queue(way: Vec, velocity: Vec, gap: float, max_speed: float, headway: float) -> Vec:
-    """Follow `way` as fast as the gap allows: S = way min(V, gap / T) - v, m/s; T = headway [s].
+def queue(direction: Vec, velocity: Vec, gap: float, max_speed: float, headway: float) -> Vec:
+    """Go in a `direction` as fast as the gap allows: S = direction min(V, gap / T) - v, m/s; T = headway [s].
 
     The brake of Reynolds 1999 in the form of Tordeux, Chraibi, Seyfried 2016 (doi 10.1007/978-3-319-33482-0_29): a gap
     closes as exp(-t / T) and never to less than nothing, and 1 / (T + l / V) agents of length l pass in a second. With
     a gain of k = 4 m / T or more no agent overshoots.
     """
     held = gap / headway
-    return sub(scale(way, held if held < max_speed else max_speed), velocity)
+    return sub(scale(direction, held if held < max_speed else max_speed), velocity)
 
 
 @law

@@ -90,13 +90,13 @@ def match_velocity(velocity: Vec, target_velocity: Vec) -> Vec:
 
 @law
 def target_speed(velocity: Vec, speed: float) -> Vec:
-    """Take on a speed, on the way that one is on: S = (v_t - |v|) unit(v), m/s; at standstill there is no way."""
+    """Take on a speed in the present direction: S = (v_t - |v|) unit(v), m/s; 0 at standstill."""
     return scale(unit(velocity), speed - norm(velocity))
 
 
 @law
 def face(velocity: Vec, heading: Vec) -> Vec:
-    """Turn the velocity toward `heading` and leave the speed as it is: S = |v| n sin(a), m/s, across the way.
+    """Turn the velocity toward `heading` and leave the speed as it is: S = |v| n sin(a), m/s, across the velocity.
 
     a is the angle between the two and n points to the heading's side; of a heading behind, S = |v| n, and of one
     straight behind n is to the right. Under F = w S tan(a/2) falls as exp(-w t / m) from 90 degrees on.
@@ -133,6 +133,6 @@ def dock(
     side = select(aside > like(gate, 1e-10) * norm(offset), unit(beside), perpendicular(forward))
     aim = sub(offset, scale(forward, before))
     aim = select(behind, add(aim, scale(side, half * gate)), aim)  # around the point, not through it
-    way = norm(aim) + before
-    ramped = max_speed * (way / slow_radius)
+    length = norm(aim) + before
+    ramped = max_speed * (length / slow_radius)
     return sub(scale(unit(aim), ramped if ramped < max_speed else max_speed), velocity)

@@ -22,9 +22,9 @@ def sheep_direction(
     C leads to the centre of those around it, R_a and R_s are sums of unit vectors away from sheep that are too near and
     from dogs (Strombom et al. 2014, H'; there h = 0.5, c = 1.05, rho_a = 2, rho_s = 1, e = 0.3). 0 if all of it is.
     """
-    wanted = add(scale(unit(velocity), inertia), scale(unit(centre), attraction))
-    wanted = add(wanted, add(scale(unit(crowd), apart), scale(unit(away), fear)))
-    return unit(add(wanted, scale(noise, error)))
+    total = add(scale(unit(velocity), inertia), scale(unit(centre), attraction))
+    total = add(total, add(scale(unit(crowd), apart), scale(unit(away), fear)))
+    return unit(add(total, scale(noise, error)))
 
 
 @law

@@ -1,7 +1,7 @@
 """Hunger, libido, fear, and the intention that follows from them: laws for scenes, tasks and players.
 
 After Tu and Terzopoulos, "Artificial Fishes" (SIGGRAPH 1994). Theirs are: hunger H = 1 - n / a, of which the food n in
-the stomach is digested at a constant rate (`hungrier`, as a rate of change); libido L = s(t) (1 - H) with s growing
+the stomach is digested at a constant rate (`grow_hunger`, as a rate of change); libido L = s(t) (1 - H) with s growing
 evenly since the last mating (`desire`); fear of one predator min(D0 / d, 1), of all of them the sum, at most 1
 (`fright`); and the order in which intentions are looked for: collision, then fear (above one level flee, above a lower
 one school), then the larger of hunger and libido above a level, then wander (`intention`). Ours are: effort makes
@@ -76,10 +76,10 @@ def fright(distance: float, span: float) -> float:
 
 
 @law
-def update_fear(fear: float, felt: float, memory: float, seconds: float) -> float:
-    """Return fear: what is felt now, or what is left of before, exp(-t / memory), if that is more."""
+def update_fear(fear: float, present: float, memory: float, seconds: float) -> float:
+    """Return fear: the present one, or what is left of the previous one, exp(-t / memory), if that is more."""
     left = fear * np.exp(-seconds / memory)
-    return felt if felt > left else left
+    return present if present > left else left
 
 
 @law

@@ -59,10 +59,10 @@ def half_plane(
 
 
 @law
-def _best_on_line(lines: Any, count: int, normal: Vec, bound: float, wish: Vec, top: float, outward: bool) -> Any:
+def _best_on_line(lines: Any, count: int, normal: Vec, bound: float, desired: Vec, top: float, outward: bool) -> Any:
     """Return whether the first `count` half-planes and the speed limit leave a part of a line, and the best of it.
 
-    The best is nearest to the wish, or, `outward`, furthest in its direction.
+    The best is nearest to the desired velocity, or, `outward`, furthest in its direction.
     """
     o, little = like(bound, 0.0), like(bound, _PARALLEL)
     along, base = (normal[1], -normal[0]), scale(normal, bound)
@@ -78,20 +78,20 @@ def _best_on_line(lines: Any, count: int, normal: Vec, bound: float, wish: Vec, 
             low = max(low, lack / slope)
         else:
             high = min(high, lack / slope)
-    best = dot(wish, along)
+    best = dot(desired, along)
     end = high if best > o else low
     t = end if outward else min(max(best, low), high)
     return fits & (low <= high), add(base, scale(along, t))
 
 
 @law
-def _nearest_velocity(lines: Any, count: int, wish: Vec, top: float, outward: bool) -> Any:
+def _nearest_velocity(lines: Any, count: int, desired: Vec, top: float, outward: bool) -> Any:
     """Return how many half-planes are kept, all of them or those before the first that cannot be, and the velocity."""
-    found = scale(wish, top) if outward else limit(wish, top)
+    found = scale(desired, top) if outward else limit(desired, top)
     for i in range(count):
         normal, bound = (lines[3 * i], lines[3 * i + 1]), lines[3 * i + 2]
         if dot(normal, found) < bound:
-            fits, better = _best_on_line(lines, i, normal, bound, wish, top, outward)
+            fits, better = _best_on_line(lines, i, normal, bound, desired, top, outward)
             if not fits:
                 return i, found
             found = better
@@ -127,7 +127,7 @@ def _least_violation(lines: Any, count: int, hard: int, kept: int, found: Vec, t
 
 @law
 def orca(
-    velocity: Vec, wish: Vec, radius: float, max_speed: float, horizon: float, step: float, turn: float,
+    velocity: Vec, desired: Vec, radius: float, max_speed: float, horizon: float, step: float, turn: float,
     neighbours: Numbers,
 ) -> Vec:  # fmt: skip
     """Change to the velocity nearest to the desired one that keeps clear of the neighbours for `horizon` s: S, m/s.
@@ -137,17 +137,20 @@ def orca(
     that symmetric encounters do not stop; a free one is returned as it is, up to `max_speed`.
     """
     given, lines, relaxed = tuple_as_array(neighbours), tuple_as_array(neighbours), tuple_as_array(neighbours)
-    asked = (wish, max_speed, turn)
-    return orca_change(velocity, radius, asked, horizon, step, given, len(neighbours) // SLOT, lines, relaxed)
+    request = (desired, max_speed, turn)
+    return orca_change(velocity, radius, request, horizon, step, given, len(neighbours) // SLOT, lines, relaxed)
 
 
 @law
 def orca_change(
-    velocity: Vec, radius: float, asked: Any, horizon: float, step: float, given: Any, slots: int, lines: Any,
+    velocity: Vec, radius: float, request: Any, horizon: float, step: float, given: Any, slots: int, lines: Any,
     relaxed: Any,
 ) -> Vec:  # fmt: skip
-    """Do what `orca` says, for `slots` neighbours in an array; `asked` is (wish, max_speed, turn), the rest scratch."""
-    wish, max_speed, turn = asked
+    """Do the same as `orca` for `slots` neighbours in an array.
+
+    request: (desired, max_speed, turn); lines, relaxed: scratch.
+    """
+    desired, max_speed, turn = request
     count, hard, free = 0, 0, True
     for soft in range(2):
         for k in range(slots):
@@ -156,12 +159,12 @@ def orca_change(
                 offset, other = (given[at], given[at + 1]), (given[at + 2], given[at + 3])
                 line = half_plane(velocity, offset, other, radius + given[at + 4], given[at + 5], horizon, step)
                 lines[3 * count], lines[3 * count + 1], lines[3 * count + 2] = line[0], line[1], line[2]
-                free = free & (line[0] * wish[0] + line[1] * wish[1] >= line[2])
+                free = free & (line[0] * desired[0] + line[1] * desired[1] >= line[2])
                 count += 1
         hard = hard if soft == 1 else count
     aside = like(radius, 0.0) if free else turn
-    wanted = (wish[0] + aside * wish[1], wish[1] - aside * wish[0])
-    kept, found = _nearest_velocity(lines, count, wanted, max_speed, False)
+    turned = (desired[0] + aside * desired[1], desired[1] - aside * desired[0])
+    kept, found = _nearest_velocity(lines, count, turned, max_speed, False)
     if kept < count:
         found = _least_violation(lines, count, hard, kept, found, max_speed, relaxed)
     return sub(found, velocity)

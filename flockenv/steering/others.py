@@ -91,15 +91,15 @@ def cosine_sector(x: float) -> float:
 def opensteer_time(offset: Vec, velocity: Vec, quarry_velocity: Vec, longest: float) -> float:
     """Predict as OpenSteer does: T = k |offset| / |v|, s, at most `longest` [s]; k by where the quarry is and heads.
 
-    Ahead, aside or behind; on a parallel way, across, or against: (4, 1.8, 0.85), (1, 0.8, 4), (0.5, 2, 2).
+    Ahead, aside or behind; on a parallel course, across, or against: (4, 1.8, 0.85), (1, 0.8, 4), (0.5, 2, 2).
     """
     forward = unit(velocity)
-    place, way = cosine_sector(dot(forward, unit(offset))), cosine_sector(dot(forward, unit(quarry_velocity)))
+    place, course = cosine_sector(dot(forward, unit(offset))), cosine_sector(dot(forward, unit(quarry_velocity)))
     o = like(place, 0.0)
     parallel = like(o, 4.0) if place > o else (like(o, 0.5) if place < o else like(o, 1.0))
     across = like(o, 1.8) if place > o else (like(o, 2.0) if place < o else like(o, 0.8))
     against = like(o, 0.85) if place > o else (like(o, 2.0) if place < o else like(o, 4.0))
-    k = parallel if way > o else (against if way < o else across)
+    k = parallel if course > o else (against if course < o else across)
     time, speed = k * norm(offset), norm(velocity)
     return time / speed if time < longest * speed else longest
 
@@ -146,8 +146,8 @@ def align(velocity: Vec, mean_velocity: Vec) -> Vec:
 @law
 def cohere(mean_offset: Vec, velocity: Vec, max_speed: float) -> Vec:
     """Seek the neighbours' centre, at `mean_offset` [m] (Reynolds 1999). Without offset there is nothing to seek."""
-    some = dot(mean_offset, mean_offset) > like(max_speed, 0.0)
-    return select(some, seek(mean_offset, velocity, max_speed), zero(velocity))
+    found = dot(mean_offset, mean_offset) > like(max_speed, 0.0)
+    return select(found, seek(mean_offset, velocity, max_speed), zero(velocity))
 
 
 @law
@@ -212,9 +212,9 @@ def follow_leader(
     square = dot(beside, beside)
     in_the_way = (along > o) & (along < ahead) & (square < aside * aside)
     out = select(square > like(behind, 1e-20), unit(beside), perpendicular(forward))
-    way = sub(scale(out, max_speed), lateral(velocity, forward))
+    evasion = sub(scale(out, max_speed), lateral(velocity, forward))
     place = scale(axis(offset, 0), -behind)
-    return select(in_the_way, way, keep_station(offset, velocity, leader_velocity, place, max_speed, slow_radius))
+    return select(in_the_way, evasion, keep_station(offset, velocity, leader_velocity, place, max_speed, slow_radius))
 
 
 @law

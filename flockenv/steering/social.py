@@ -45,26 +45,26 @@ def gaze_direction(aim: Vec, heading: Vec) -> Vec:
 
 
 @law
-def view_weight(way: Vec, offset: Vec, least: float) -> float:
-    """Return lambda + (1 - lambda)(1 + cos phi) / 2: 1 straight ahead on the `way`, lambda behind.
+def view_weight(direction: Vec, offset: Vec, least: float) -> float:
+    """Return lambda + (1 - lambda)(1 + cos phi) / 2: 1 straight ahead, lambda behind.
 
-    phi lies between the way and `offset`, which leads to the other (Johansson, Helbing and Shukla 2007, where cos phi
-    is -n . e with n from the other to me). Without a way, and in one place, it is 1.
+    phi lies between `direction` and `offset`, which leads to the other (Johansson, Helbing and Shukla 2007: cos phi is
+    -n . e with n from the other to me). Without a direction, and in one place, it is 1.
     """
     e, half = like(least, 1.0), like(least, 0.5)
-    long = dot(offset, offset) * dot(way, way)
-    some = long > like(least, 0.0)
-    cosine = dot(way, offset) / np.sqrt(long) if some else e
+    long = dot(offset, offset) * dot(direction, direction)
+    known = long > like(least, 0.0)
+    cosine = dot(direction, offset) / np.sqrt(long) if known else e
     return least + (e - least) * half * (e + cosine)
 
 
 @law
-def cone_weight(way: Vec, force: Vec, cosine: float, outside: float) -> float:
-    """Return 1 if what a repulsive `force` comes from is within the field of view, else `outside`; 1 without a way.
+def cone_weight(direction: Vec, force: Vec, cosine: float, outside: float) -> float:
+    """Return 1 if the source of a repulsive `force` is within the field of view, else `outside`; 1 without a direction.
 
     w = 1 if e . (-f) >= |f| cos phi, else c; 2 phi is the full angle (Helbing and Molnar 1995, equation 8).
     """
-    ahead, square = -dot(way, force), dot(way, way)
+    ahead, square = -dot(direction, force), dot(direction, direction)
     seen = (ahead >= np.sqrt(dot(force, force) * square) * cosine) | (square <= like(cosine, 0.0))
     return like(cosine, 1.0) if seen else outside
 
@@ -73,12 +73,12 @@ def cone_weight(way: Vec, force: Vec, cosine: float, outside: float) -> float:
 def unit_away(offset: Vec, tie: Vec) -> tuple[Vec, float]:
     """Return the unit vector away from the other, along the tie where both are in one place, and the distance, m."""
     square = dot(offset, offset)
-    some = square > like(square, ONE_PLACE)
-    away = select(some, scale(offset, like(square, -1.0)), tie)
+    apart = square > like(square, ONE_PLACE)
+    away = select(apart, scale(offset, like(square, -1.0)), tie)
     long = dot(away, away)
     length = np.sqrt(long)
     o, e = like(square, 0.0), like(square, 1.0)
-    return scale(away, e / length if long > o else o), length if some else o
+    return scale(away, e / length if long > o else o), length if apart else o
 
 
 @law
@@ -203,14 +203,14 @@ def gaze_turn(heading: Vec, offset: Vec, half: float) -> float:
 
 
 @law
-def collision_distance(way: Vec, offset: Vec, other_velocity: Vec, clearance: float, speed: float) -> float:
-    """Return the free distance along the unit vector `way` at `speed` until contact with a moving neighbour, m; or inf.
+def collision_distance(direction: Vec, offset: Vec, other_velocity: Vec, clearance: float, speed: float) -> float:
+    """Return the free distance along a unit vector at `speed` until contact with a moving neighbour, m; or inf.
 
-    The smallest t >= 0 with |x_j + v_j t - v t way| = clearance, times v (f(alpha) of Moussaid, Helbing and Theraulaz
-    2011); 0 for two that overlap and approach.
+    The smallest t >= 0 with |x_j + v_j t - v t e| = clearance, times v; e the direction (f(alpha) of Moussaid, Helbing
+    and Theraulaz 2011); 0 for two that overlap and approach.
     """
     o, far = like(speed, 0.0), like(speed, np.inf)
-    closing = sub(scale(way, speed), other_velocity)
+    closing = sub(scale(direction, speed), other_velocity)
     a, b, c = dot(closing, closing), dot(offset, closing), dot(offset, offset) - clearance * clearance
     room = b * b - a * c
     meets = (b > o) & (room >= o)

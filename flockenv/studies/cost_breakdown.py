@@ -154,7 +154,7 @@ def _work(scene: Scene, state: State) -> dict[str, float]:
 
 def _shares(scene: Scene, state: State) -> tuple[tuple[str, str, float], ...]:
     """Return the mean share granted to each behaviour while its force is not 0, over INSTANTS of a run from `state`."""
-    if not any(effect.wishes for effect in scene.effects):
+    if not any(effect.components for effect in scene.effects):
         return ()
     grants, found = Grants(scene), []
     for _ in range(INSTANTS):

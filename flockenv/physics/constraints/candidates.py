@@ -70,14 +70,14 @@ def _add_obstacle_pairs(
             continue
         drift, place = vector_at(period, things.drift, m), vector_at(period, things.place, m)
         place = place if ahead else add(place, scale(drift, seconds))
-        way = norm(drift) * seconds if ahead else 0.0
+        travel = norm(drift) * seconds if ahead else 0.0
         bounded, middle, radius = things.row[m] >= 0, zero(period), things.size[m]
         if bounded:
             middle, radius = bound_of(things.table, things.row[m], period)
         for i in range(bodies.living.shape[0]):
             if bodies.living[i] > 0 and bodies.light[i] > 0.0:
                 y = nearest_image(period, sub(vector_at(period, at, i), place))
-                room = bodies.radius[i] + touch + way + reach[i]
+                room = bodies.radius[i] + touch + travel + reach[i]
                 off, far = sub(y, middle), radius + room
                 if bounded and not dot(off, off) <= far * far:
                     continue  # outside the bounding circle or sphere

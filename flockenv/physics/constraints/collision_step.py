@@ -100,22 +100,22 @@ def collide(
             continue
         began = (tick[b] - 1) * rules.seconds
         _obstacles(period, things, obstacle_x, obstacle_radius, b, began, tick[b] * rules.seconds)
-        told = Rules(
+        revised = Rules(
             rules.seconds, rules.restitution, rules.friction, rules.sticky, rules.most, rules.again,
             rules.touch + EXACT * far, rules.pairs, not in_time,
         )  # fmt: skip
         passing = not in_time and may_pass(period, bodies, things, ends, rules.seconds, False)
         ahead = in_time or passing or not once
-        count = list_meetings(period, bodies, meetings, things, ends, told, reach, ahead, not in_time, scratch)
+        count = list_meetings(period, bodies, meetings, things, ends, revised, reach, ahead, not in_time, scratch)
         if in_time and count <= meetings.who.shape[0]:
-            count = _move_bodies(period, bodies, meetings, things, ends, told, before, count, report, lost)
+            count = _move_bodies(period, bodies, meetings, things, ends, revised, before, count, report, lost)
         if count <= meetings.who.shape[0]:
             round_about = may_meet_around(period, fast * rules.seconds)
             report[4] += 1 if round_about else 0
             mean = scale(mean, -1.0 / norm(mean)) if norm(mean) > 1e-9 * hard * x.shape[2] else axis(mean, 0)
             count = settle_ends(
-                period, bodies, meetings, things, contacts, ends, before, reach, told, in_time, once, passing, rounds,
-                fast, hard, mean, spread, round_about, count, scratch, lost, report,
+                period, bodies, meetings, things, contacts, ends, before, reach, revised, in_time, once, passing,
+                rounds, fast, hard, mean, spread, round_about, count, scratch, lost, report,
             )  # fmt: skip
         report[2] = count
         if count > meetings.who.shape[0]:
@@ -139,9 +139,9 @@ def _move_bodies(
 ) -> int:  # fmt: skip
     """Move all bodies through the step; return the number of meetings, even if it exceeds their capacity."""
     start_touching(period, bodies, meetings, things, rules, count, before)
-    some, cut, count = process_impacts(period, bodies, meetings, things, rules, count, lost)
+    impacts, cut, count = process_impacts(period, bodies, meetings, things, rules, count, lost)
     if count <= meetings.who.shape[0]:
-        report[3] += some
+        report[3] += impacts
         report[4] += cut
         for i in range(bodies.living.shape[0]):
             if bodies.moved[i] > 0:

@@ -103,7 +103,7 @@ class _Settler:
 
     def __init__(self, record: Collisions, scene: SceneView) -> None:
         n, d = scene.agents, scene.dimension
-        self.record, self.scene, self.told = record, scene, False
+        self.record, self.scene, self.warned = record, scene, False
         self.period = (
             tuple(float(s) for s in scene.space.extent(scene.dimension)) if scene.space.periodic else (0.0,) * d
         )
@@ -121,7 +121,7 @@ class _Settler:
             np.zeros(max(n, 64), np.int64), np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n + 1, np.int32),
             np.zeros((1, n), np.int32), np.zeros((1, 6)), np.zeros(8, np.int64), np.zeros((MAX_RANGES, 3), np.int64),
         )  # fmt: skip
-        self.things = self._things()
+        self.things = self._obstacles()
         self.report, self.lost = np.zeros(COUNTED, np.int64), np.zeros(LOST)
         self._make_room(record.capacity * n + 64)
 
@@ -140,10 +140,10 @@ class _Settler:
         self.contacts = Contacts(
             who=whole(places), other=whole(places), normal=np.zeros((places, d)), allowed=np.zeros(places),
             open=whole(places), push=np.zeros(places), rub=np.zeros((places, d)), was=np.zeros((places, d + 1)),
-            way=np.zeros((places, d + 1)), rank=np.zeros(places), order=whole(places),
+            search=np.zeros((places, d + 1)), rank=np.zeros(places), order=whole(places),
         )  # fmt: skip
 
-    def _things(self) -> Things:
+    def _obstacles(self) -> Things:
         """Return the obstacles: round ones, with positions of each world, then other shapes, then walls of a box."""
         scene, d = self.scene, self.scene.dimension
         shapes, given = list(scene.shapes), self.record.restitution
@@ -202,29 +202,29 @@ class _Settler:
                 break
             first = short
             self._make_room(2 * needed)
-        if unsolved and not self.told:
-            self.told = True
-            warnings.warn(self._unsolved(unsolved, lost), UnsolvedContactsWarning, stacklevel=2)
+        if unsolved and not self.warned:
+            self.warned = True
+            warnings.warn(self._warning_text(unsolved, lost), UnsolvedContactsWarning, stacklevel=2)
         return bad
 
-    def _unsolved(self, unsolved: int, lost: NDArray[np.float64]) -> str:
-        """Return the warning about a step: see event_driven.play and step_end.py for the numbers in `lost`."""
+    def _warning_text(self, unsolved: int, lost: NDArray[np.float64]) -> str:
+        """Return the warning about a step; `lost`: see event_driven.process_impacts and step_end.py."""
         r, seconds, joules, stopped = self.record, float(lost[0]), float(lost[1]), float(lost[2])
-        said = (
+        text = (
             f"constraints: collisions: in a step {unsolved} impacts or worlds with contacts were not solved within "
             f"most = {r.most} and passes = {r.passes}"
         )
         if self.period[0] > 0:
-            said += ", or a body went further than a quarter of the torus"
+            text += ", or a body went further than a quarter of the torus"
         if stopped > 0:
             early = seconds / stopped
-            said += f"; {stopped:.0f} bodies stopped {early:.3g} s before its end, and keep their velocities"
+            text += f"; {stopped:.0f} bodies stopped {early:.3g} s before its end, and keep their velocities"
         if joules > 0:
-            said += f"; {joules:.3g} J lost by bodies that came to rest"
+            text += f"; {joules:.3g} J lost by bodies that came to rest"
         if lost[RAISED] > 0:
-            said += f"; up to {lost[RAISED]:.3g} J gained by bodies that were moved apart"
+            text += f"; up to {lost[RAISED]:.3g} J gained by bodies that were moved apart"
         if lost[LEFT] > 0:
-            said += f"; the last pass still changed velocities, by up to {lost[LEFT]:.2g} m/s"
+            text += f"; the last pass still changed velocities, by up to {lost[LEFT]:.2g} m/s"
         if r.response in ("impulses", "project"):
-            said += f"; the deepest overlap is {lost[SUNK]:.2g} of a radius"
-        return said
+            text += f"; the deepest overlap is {lost[SUNK]:.2g} of a radius"
+        return text

@@ -45,7 +45,7 @@ class Contacts(NamedTuple):
     push: Any  # kg m/s, normal impulse so far
     rub: Any  # (places, D) kg m/s, tangential impulse so far
     was: Any  # (places, D + 1) kg m/s, tangential and normal impulse before a pass
-    way: Any  # (places, D + 1) kg m/s, search direction of the passes
+    search: Any  # (places, D + 1) kg m/s, search direction of the passes
     rank: Any  # m, height against the mean acceleration
     order: Any  # the contacts, lowest first
 
@@ -204,7 +204,7 @@ def resolve_impacts(
     """
     done, left = 0, 0
     for turn in range(rounds):
-        some = 0
+        now = 0
         for k in range(count):
             c = contacts.order[k if turn % 2 == 0 else count - 1 - k]
             i, j, n = contacts.who[c], contacts.other[c], vector_at(period, contacts.normal, c)
@@ -214,9 +214,9 @@ def resolve_impacts(
                 e = restitution if j >= 0 else things.restitution[-1 - j]
                 change = scale(v, -1.0) if sticky else sub(bounce(v, n, e, friction), v)
                 _apply_impulse(period, bodies, vel, i, j, scale(change, 1.0 / ease))
-                some += 1
-        done += some
-        if some == 0:
+                now += 1
+        done += now
+        if now == 0:
             return done, 0
     if rounds > 1:
         for c in range(count):
@@ -285,8 +285,8 @@ def stop_approach(
         contacts.push[c] = 0.0
         write_vector(contacts.rub, c, zero(period))
         for k in range(len(period)):
-            contacts.way[c, k] = 0.0
-        contacts.way[c, len(period)] = 0.0
+            contacts.search[c, k] = 0.0
+        contacts.search[c, len(period)] = 0.0
     worst, before = 0.0, 0.0
     for turn in range(rounds):
         for c in range(count):
@@ -302,9 +302,9 @@ def stop_approach(
         before = square
         for c in range(count):
             for k in range(len(period) + 1):
-                step = share * contacts.way[c, k]
+                step = share * contacts.search[c, k]
                 done = (contacts.push[c] if k == len(period) else contacts.rub[c, k]) - contacts.was[c, k]
-                contacts.way[c, k] = step + done
+                contacts.search[c, k] = step + done
                 contacts.was[c, k] = step
             if share > 0.0 and contacts.open[c] == 0:
                 more = contacts.was[c, len(period)]

@@ -55,7 +55,7 @@ CALM = 0.01
 """A step is short for a body at rest if it would fall by less than this part of its radius."""
 
 JOLTED = 3
-"""Index in `lost` of the flag that the last impact changed velocities by more than the step does; see `play`."""
+"""Index in `lost` of the flag that the last impact changed velocities by more than the step; see `process_impacts`."""
 
 
 @kernel

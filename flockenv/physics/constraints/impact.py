@@ -48,11 +48,11 @@ def surface_at(table: Any, at: int, y: Vec) -> tuple[float, Vec]:
 
 
 @routine
-def _ray_hit(table: Any, at: int, y: Vec, way: Vec, room: float) -> float:
-    """Return the distance along the unit vector `way` after which a body of radius `room` touches, m."""
+def _ray_hit(table: Any, at: int, y: Vec, direction: Vec, room: float) -> float:
+    """Return the distance along the unit vector `direction` after which a body of radius `room` touches, m."""
     if at >= 0:
-        return hit_shape(table, at, y, way, room)
-    return ray_hit(scale(y, -1.0), way, room)
+        return hit_shape(table, at, y, direction, room)
+    return ray_hit(scale(y, -1.0), direction, room)
 
 
 @law
@@ -124,9 +124,9 @@ def _follow_path(
     for c in range(chords):
         since = begin + c * each
         here = position_along(y, v, a, since)
-        way = sub(position_along(y, v, a, since + each), here)
-        length = norm(way)
-        hit = _ray_hit(table, at, here, unit(way), max(seen, 0.0)) if length > 0.0 else np.inf
+        chord = sub(position_along(y, v, a, since + each), here)
+        length = norm(chord)
+        hit = _ray_hit(table, at, here, unit(chord), max(seen, 0.0)) if length > 0.0 else np.inf
         if hit <= length:
             t = _refine_time(table, at, y, v, a, since, since + each, room, since + each * hit / length)
             gap, n = surface_at(table, at, position_along(y, v, a, t))

@@ -38,7 +38,7 @@ class RodPairs(NamedTuple):
     i: NDArray[np.int32]  # (R,)
     j: NDArray[np.int32]  # (R,)
     length: NDArray[np.float64]  # (R,) m
-    way: NDArray[np.float64]  # (R, D) from i to j at rest; 0 = unknown
+    direction: NDArray[np.float64]  # (R, D) from i to j at rest; 0 = unknown
 
 
 class Hold(NamedTuple):
@@ -53,25 +53,25 @@ class Hold(NamedTuple):
     slack: bool
     tolerance: float
     most: int
-    rho: float  # see _slowness
+    rho: float  # see _spectral_radius
     allowed: Any  # (R,) m, allowed error of a length
     old: Any  # (R, D) m, from i to j before the step
     before: Any  # (R,) m, length before the step
     pull: Any  # (R,) summed correction of each rod in these sweeps
-    way: Any  # (D,) m, from i to j now
+    offset: Any  # (D,) m, from i to j now
     along: Any  # (D,) the direction in which it acts, of any length
     kept: Any  # (2, D, N) positions and velocities after the method
 
 
 @kernel
-def _offset_to(x: Any, b: int, i: int, j: int, period: Any, way: Any) -> float:
+def _offset_to(x: Any, b: int, i: int, j: int, period: Any, out: Any) -> float:
     """Write the offset from agent i to agent j, the shortest one on a torus; return its length."""
-    square = like(way[0], 0.0)
+    square = like(out[0], 0.0)
     for k in range(x.shape[0]):
         d = x[k, b, j] - x[k, b, i]
         if period[k] > 0:
             d -= period[k] * round_half_even(d / period[k])
-        way[k] = d
+        out[k] = d
         square += d * d
     return np.sqrt(square)  # type: ignore[no-any-return]
 
@@ -134,19 +134,19 @@ def _target_length(rods: Any, r: int) -> float:
 
 @kernel
 def _write_direction(rods: Any, r: int, now: float, carry: bool) -> float:
-    """Write the direction in which a rod acts, and return way . along, > 0.
+    """Write the direction in which a rod acts, and return offset . along, > 0.
 
     With `carry` it is that before the step. Without, or if the rod has turned too far since, it is the current one.
     """
     o = like(now, 0.0)
     if carry:
-        cosine = _dot(rods.way, rods.old[r])
+        cosine = _dot(rods.offset, rods.old[r])
         if cosine > like(o, 0.3) * now * rods.before[r]:
-            for k in range(rods.way.shape[0]):
+            for k in range(rods.offset.shape[0]):
                 rods.along[k] = rods.old[r, k]
             return cosine
-    for k in range(rods.way.shape[0]):
-        rods.along[k] = rods.way[k]
+    for k in range(rods.offset.shape[0]):
+        rods.along[k] = rods.offset[k]
     if now > o:
         return now * now
     rods.along[0] = rods.length[r]  # both are in one place: any direction will do
@@ -160,7 +160,7 @@ def _correct_length(x: Any, v: Any, b: int, rods: Any, r: int, over: float, carr
     With `carry` velocities change by the change of positions per time step.
     """
     o, aim = like(over, 0.0), _target_length(rods, r) if carry else rods.length[r]
-    now = _offset_to(x, b, rods.i[r], rods.j[r], rods.period, rods.way)
+    now = _offset_to(x, b, rods.i[r], rods.j[r], rods.period, rods.offset)
     if rods.slack and now <= aim and rods.pull[r] <= o:
         return o, False
     cosine, w = _write_direction(rods, r, now, carry), rods.weight[rods.i[r]] + rods.weight[rods.j[r]]
@@ -181,12 +181,12 @@ def _correct_velocity(x: Any, v: Any, b: int, rods: Any, r: int, over: float) ->
     The size is relative to one length per time step.
     """
     o, allowed = like(over, 0.0), rods.allowed[r]
-    now = _offset_to(x, b, rods.i[r], rods.j[r], rods.period, rods.way)
+    now = _offset_to(x, b, rods.i[r], rods.j[r], rods.period, rods.offset)
     if not now > o or (rods.slack and now < rods.length[r] - like(o, 2.0) * allowed):
         return o, False
     rate, w = o, rods.weight[rods.i[r]] + rods.weight[rods.j[r]]
-    for k in range(rods.way.shape[0]):
-        rods.along[k] = rods.way[k] / now
+    for k in range(rods.offset.shape[0]):
+        rods.along[k] = rods.offset[k] / now
         rate += rods.along[k] * (v[k, b, rods.j[r]] - v[k, b, rods.i[r]])
     if rods.slack and rate <= o and rods.pull[r] <= o:
         return o, False
@@ -298,7 +298,7 @@ class Rods(Constraint):
     most: int = Field(default=5000, ge=1, le=1_000_000, description="sweeps over all rods in one step; then it warns")
 
     @model_validator(mode="after")
-    def _one_or_the_other(self) -> Self:
+    def _check_pairs(self) -> Self:
         """Raise ValueError unless there is a group or there are pairs, of different agents, each once, with lengths."""
         if (self.group is None) == (not self.pairs):
             raise ValueError("group: give either a group with a network or pairs")
@@ -313,7 +313,7 @@ class Rods(Constraint):
                 raise ValueError(f"pairs[{k}] = {pair}: is pairs[{seen[frozenset(pair)]}] again")
         return self
 
-    def ties(self, scene: SceneView) -> RodPairs:
+    def rod_pairs(self, scene: SceneView) -> RodPairs:
         """Return the pairs that are held together in a scene; raise ValueError if it has no such group or network."""
         d = scene.dimension
         if self.group is None:
@@ -333,48 +333,48 @@ class Rods(Constraint):
 
     def check(self, scene: SceneView) -> None:
         """Raise ValueError if an agent or network is missing, an end can be newborn, or a rod wraps around a torus."""
-        ties = self.ties(scene)
-        most = int(max(ties.i.max(initial=0), ties.j.max(initial=0)))
+        pairs = self.rod_pairs(scene)
+        most = int(max(pairs.i.max(initial=0), pairs.j.max(initial=0)))
         if most >= scene.agents:
             raise ValueError(f"pairs: there is no agent {most}, they are 0 to {scene.agents - 1}")
         for k, member in enumerate(scene.population):
-            for agent in np.unique([ties.i, ties.j]):
+            for agent in np.unique([pairs.i, pairs.j]):
                 if member.feeds(int(np.searchsorted(scene.starts, agent, "right")) - 1):
                     raise ValueError(
                         f"pairs: agent {agent} is of a group that population[{k}] fills: a newborn has no rod"
                     )
-        if isinstance(scene.space, Torus) and ties.length.max(initial=0.0) > min(scene.space.size) / 2:
+        if isinstance(scene.space, Torus) and pairs.length.max(initial=0.0) > min(scene.space.size) / 2:
             raise ValueError(
-                f"lengths: {ties.length.max():g} m reaches around the torus; at most half its shortest edge, "
+                f"lengths: {pairs.length.max():g} m reaches around the torus; at most half its shortest edge, "
                 f"{min(scene.space.size) / 2:g} m, is allowed"
             )
 
     def numbers(self, scene: SceneView) -> int:
         """Return the size of the arrays of `Hold`, and of a copy of positions and velocities, per agent."""
         d = int(scene.dimension)
-        return 2 * d - (-(6 + d) * len(self.ties(scene).i) // int(scene.agents))
+        return 2 * d - (-(6 + d) * len(self.rod_pairs(scene).i) // int(scene.agents))
 
     def settler(self, scene: SceneView) -> Settler:
         """Return a function that corrects a step, with scratch memory of its own; it warns once if lengths are off."""
-        ties, real, d = self.ties(scene), np.dtype(scene.dtype).type, scene.dimension
+        pairs, real, d = self.rod_pairs(scene), np.dtype(scene.dtype).type, scene.dimension
         weight = (1 / scene.body.mass).astype(real)  # agents held in place have an infinite mass
         period = np.array(scene.space.extent(d) if scene.space.periodic else (0.0,) * d, real)
-        length = ties.length.astype(real)
+        length = pairs.length.astype(real)
         rods = Hold(
-            weight, ties.i, ties.j, length, period, real(1 / scene.dt), self.slack,
-            real(self.tolerance), self.most, real(_spectral_radius(ties, weight)), np.zeros_like(length),
+            weight, pairs.i, pairs.j, length, period, real(1 / scene.dt), self.slack,
+            real(self.tolerance), self.most, real(_spectral_radius(pairs, weight)), np.zeros_like(length),
             np.zeros((len(length), d), real), np.zeros_like(length), np.zeros_like(length), np.zeros(d, real),
             np.zeros(d, real), np.zeros((2, d, scene.agents), real),
         )  # fmt: skip
-        solve, told = entry(hold_rods), False
+        solve, warned = entry(hold_rods), False
 
         def settle(x0: Floats, v0: Floats, state: State, first: int, end: int) -> tuple[int, int]:
-            nonlocal told
+            nonlocal warned
             world, agent, rod, off = solve(x0, state.x, state.v, state.alive, rods, first, end)
-            if rod >= 0 and world < 0 and not told:
-                told = True
+            if rod >= 0 and world < 0 and not warned:
+                warned = True
                 warnings.warn(
-                    f"rods: after most = {self.most} sweeps agents {ties.i[rod]} and {ties.j[rod]} were {off:.2g} of "
+                    f"rods: after most = {self.most} sweeps agents {pairs.i[rod]} and {pairs.j[rod]} were {off:.2g} of "
                     f"their length off (tolerance = {self.tolerance:g}); their speeds are only damped then, so allow "
                     "more sweeps, or make shorter steps",
                     UnmetWarning,
@@ -385,14 +385,14 @@ class Rods(Constraint):
         return settle
 
 
-def _sort_by_layer(ties: RodPairs) -> RodPairs:
+def _sort_by_layer(pairs: RodPairs) -> RodPairs:
     """Return the same pairs sorted layer by layer: the order in which they were given makes no difference.
 
     Each agent is at most once in a layer. The layers of a chain are every other link, which is Young's ordering.
     """
-    swap = ties.i > ties.j
-    i, j = np.where(swap, ties.j, ties.i), np.where(swap, ties.i, ties.j)
-    way = np.where(swap[:, None], -ties.way, ties.way)
+    swap = pairs.i > pairs.j
+    i, j = np.where(swap, pairs.j, pairs.i), np.where(swap, pairs.i, pairs.j)
+    direction = np.where(swap[:, None], -pairs.direction, pairs.direction)
     order = np.lexsort((j, i))
     layer, of = np.zeros(len(i), np.int64), dict[int, set[int]]()
     for r in order:
@@ -401,10 +401,10 @@ def _sort_by_layer(ties: RodPairs) -> RodPairs:
         of[int(i[r])].add(int(layer[r]))
         of[int(j[r])].add(int(layer[r]))
     order = order[np.argsort(layer[order], kind="stable")]
-    return RodPairs(i[order], j[order], ties.length[order], way[order])
+    return RodPairs(i[order], j[order], pairs.length[order], direction[order])
 
 
-def _spectral_radius(ties: RodPairs, weight: Floats) -> float:
+def _spectral_radius(pairs: RodPairs, weight: Floats) -> float:
     """Return rho, the spectral radius of Jacobi's iteration for the network at rest.
 
     It is 1 less the smallest eigenvalue of the matrix that couples the rods, by inverse iteration. Rods of unknown
@@ -414,22 +414,22 @@ def _spectral_radius(ties: RodPairs, weight: Floats) -> float:
     from scipy.sparse.linalg import splu
 
     weight = weight.astype(np.float64)
-    moves = weight[ties.i] + weight[ties.j] > 0
-    way, d = ties.way[moves], ties.way.shape[1]
-    long = np.linalg.norm(way, axis=1)
+    moves = weight[pairs.i] + weight[pairs.j] > 0
+    direction, d = pairs.direction[moves], pairs.direction.shape[1]
+    long = np.linalg.norm(direction, axis=1)
     known = bool(long.all())
-    ways = way / long[:, None] if known else np.eye(1, d).repeat(len(way), axis=0)
+    units = direction / long[:, None] if known else np.eye(1, d).repeat(len(direction), axis=0)
     speeds: Any = 0  # velocity along each rod per velocity of its ends, (R, N D)
-    for ends, sign in ((ties.i[moves], -1.0 if known else 1.0), (ties.j[moves], 1.0)):
-        share = np.sqrt(weight[ends] / (weight[ties.i] + weight[ties.j])[moves])
+    for ends, sign in ((pairs.i[moves], -1.0 if known else 1.0), (pairs.j[moves], 1.0)):
+        share = np.sqrt(weight[ends] / (weight[pairs.i] + weight[pairs.j])[moves])
         column = ends[:, None] * d + np.arange(d)
-        entries = (sign * share[:, None] * ways).ravel(), (np.repeat(np.arange(len(way)), d), column.ravel())
-        speeds = sparse.csr_array(entries, shape=(len(way), len(weight) * d)) + speeds
-    if not len(way):
+        entries = (sign * share[:, None] * units).ravel(), (np.repeat(np.arange(len(direction)), d), column.ravel())
+        speeds = sparse.csr_array(entries, shape=(len(direction), len(weight) * d)) + speeds
+    if not len(direction):
         return 0.0
-    lu = splu((speeds @ speeds.T + LEAST * sparse.eye_array(len(way))).tocsc())
-    said, grown = np.random.default_rng(0).normal(size=len(way)), 1.0
+    lu = splu((speeds @ speeds.T + LEAST * sparse.eye_array(len(direction))).tocsc())
+    vector, growth = np.random.default_rng(0).normal(size=len(direction)), 1.0
     for _ in range(POWERS):
-        said = lu.solve(said / np.linalg.norm(said))
-        grown = float(np.linalg.norm(said))
-    return min(max(0.0, 1 - 1 / grown), KNOWN if known else UNKNOWN)
+        vector = lu.solve(vector / np.linalg.norm(vector))
+        growth = float(np.linalg.norm(vector))
+    return min(max(0.0, 1 - 1 / growth), KNOWN if known else UNKNOWN)

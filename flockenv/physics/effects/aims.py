@@ -106,7 +106,7 @@ def antipode(p: Any, me: Me) -> Vec:
 
 
 @law
-def keep_target(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
+def keep_target(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
     """Return the stored target, unchanged."""
     return stored_target(p, me)
 

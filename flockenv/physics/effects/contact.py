@@ -51,8 +51,8 @@ def contact_force(p: Any, normal: Vec, overlap: float, vel: Vec, reduced: float)
     parting = dot(vel, normal)
     force = normal_force(p, overlap, parting, reduced)
     slip = sub(vel, scale(normal, parting))
-    said = add(scale(normal, force), friction_force(p, overlap, force, slip))
-    return select(overlap > like(overlap, 0.0), said, zero(vel))
+    total = add(scale(normal, force), friction_force(p, overlap, force, slip))
+    return select(overlap > like(overlap, 0.0), total, zero(vel))
 
 
 @law
@@ -161,7 +161,7 @@ class ObstacleContact(_Solid):
     obstacle_finish: ClassVar[Law | None] = total_force
     obstacle_reach: ClassVar[Law | None] = contact_reach
 
-    def folded(self, dimension: int) -> int:
+    def fold_size(self, dimension: int) -> int:
         """Return D, for the force so far."""
         return dimension
 

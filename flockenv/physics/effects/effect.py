@@ -21,10 +21,10 @@ An effect has one or more of these forms, each a law (a compiled function) for o
 * `kick_law(p, me, seconds, gauss) -> velocity`: added once per step, however often the method evaluates forces, from
   one standard normal number per axis (fluctuations);
 * `aim_law(p, me) -> direction` of travel that is desired: the sum over all effects is `me.aim` in the other laws;
-* `begin_law(p, me) -> numbers` and `keep_law(p, me, told, seconds) -> numbers`: the inner state of an agent, the
+* `begin_law(p, me) -> numbers` and `keep_law(p, me, message, seconds) -> numbers`: the inner state of an agent, the
   numbers named in `keeps` (its hunger, the door it heads for). begin_law returns their values when the agent comes into
   being. keep_law returns their values after a step of `seconds`, from the values before, the position after the step,
-  and `told`: what `finish_law` returned in the last stage, here a vector that is not a force (0 without a pair law).
+  and `message`: what `finish_law` returned in the last stage, here a vector that is not a force (0 without a pair law).
   Changes by several effects add up. Laws read the numbers as `me.inner.NAME` and `other.inner.NAME`; an effect lists in
   `recalls` those that it reads and does not keep;
 * `count_law(p, me) -> number` of the counter in which an agent is counted, or a negative number for no counter: global
@@ -44,7 +44,7 @@ An effect has one or more of these forms, each a law (a compiled function) for o
   the obstacle that is hit; obstacles with gaps too narrow for the body count as one (engine/silhouette.py). They stay 0
   without such an edge, or if the body overlaps already.
   If the effect also has a pair law, `finish_law` returns no force but a vector of what it found out about neighbours,
-  which is passed to `obstacle_start(p, me, told)` (hide). Without an obstacle_start the fold visits circles alone,
+  which is passed to `obstacle_start(p, me, message)` (hide). Without an obstacle_start the fold visits circles alone,
   runs before a fold over neighbours and passes acc on to it: one fold over both (orca).
 
 `p` holds the effect's `parameters()` by name, and, if the effect is `tabled`, an array of numbers as `p.table`: the
@@ -101,7 +101,7 @@ class Me(NamedTuple):
     radius: float  # m
     max_speed: float  # m/s
     max_force: float  # N
-    tie: Vec  # a unit vector of its own, see ties(); 0 outside pair laws
+    tie: Vec  # a unit vector of its own, see separation_directions(); 0 outside pair laws
     time: float  # s, of the stage that is evaluated
     medium: Vec  # m/s, velocity of the medium here; 0 in pair laws and bonds
     key: int  # of its world, for random numbers that are functions of time, see maths/counter_rng.py
@@ -180,7 +180,7 @@ class Bonds(NamedTuple):
     number: NDArray[np.float64]  # (R, C) arguments of the law: stiffness, rest length, ...
 
     @classmethod
-    def none(cls, partners: int, numbers: int) -> Bonds:
+    def empty(cls, partners: int, numbers: int) -> Bonds:
         """Return no bonds at all."""
         return cls(np.zeros(0, np.int32), np.zeros((0, partners), np.int32), np.zeros((0, numbers)))
 
@@ -318,27 +318,27 @@ class Effect(Record):
         """True if its obstacle law skips what another obstacle hides."""
         return False
 
-    def in_the_open(self) -> Effect | None:
+    def without_obstacles(self) -> Effect | None:
         """Return the effect as it acts in a scene without obstacles, or None if it then does nothing."""
         return None if self.obstacle_law is not None and self.pair_law is None else self
 
     @property
-    def joined(self) -> bool:
+    def is_joint_fold(self) -> bool:
         """True if it is one fold over obstacles and neighbours."""
         return self.obstacle_law is not None and self.obstacle_start is None
 
     @property
-    def wishes(self) -> tuple[Effect, ...]:
+    def components(self) -> tuple[Effect, ...]:
         """The component effects whose steering forces it combines, in order of priority; see Steer."""
         return ()
 
     @property
     def steer_law(self) -> Law:
-        """The law (p, me, wishes) -> force that combines the forces of its components."""
-        raise TypeError(f"{type(self).__name__} reconciles no wishes")
+        """The law (p, me, forces) -> force that combines the forces of its components."""
+        raise TypeError(f"{type(self).__name__} combines no forces")
 
     @property
-    def recalled(self) -> tuple[str, ...]:
+    def required_inner(self) -> tuple[str, ...]:
         """The inner numbers that must be kept for it; see `recalls`. For Steer: those that its arbitration reads."""
         return self.recalls
 
@@ -355,7 +355,7 @@ class Effect(Record):
         """Return the number of running sums of its pair law."""
         return 0
 
-    def folded(self, dimension: int) -> int:
+    def fold_size(self, dimension: int) -> int:
         """Return the number of values that its fold over obstacles carries from one to the next."""
         return 0
 
@@ -369,9 +369,9 @@ class Effect(Record):
 
     def bonds(self, groups: Sequence[Any], dimension: int) -> Bonds:
         """Return its bonds in a scene of these groups; raise ValueError, in one line, if the groups do not suit it."""
-        return Bonds.none(self.partners, self.numbers(dimension))
+        return Bonds.empty(self.partners, self.numbers(dimension))
 
-    def idle(self) -> Effect:
+    def idle_copy(self) -> Effect:
         """Return a copy with all strengths 0: it does nothing, but has the same sight and the same compiled code."""
         fields = {name: getattr(self, name) for name in self.strengths if name in type(self).model_fields}
         return self.model_copy(
@@ -389,7 +389,7 @@ class Effect(Record):
         """
         raise TypeError(f"{type(self).__name__} has no table")
 
-    def way_shown(self, scene: SceneView) -> tuple[tuple[Vec, ...], float] | None:
+    def path_to_draw(self, scene: SceneView) -> tuple[tuple[Vec, ...], float] | None:
         """Return the path it follows, for pictures: points along it, m, and half its width, m; None without a path."""
         return None
 

@@ -98,7 +98,7 @@ def initial_route(p: Any, me: Me) -> Vec:
 
 
 @law
-def update_route(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
+def update_route(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
     """Return its door (reconsidered once per period), path length, time of next decision, and position."""
     door, left, ready, was = me.inner.door, me.inner.left, me.inner.ready, stored_position(me)
     if not applies_to(p, me) or door >= p.many:
@@ -133,14 +133,14 @@ class Door(Target):
     width: float | None = Field(default=None, gt=0, description="m (default: from one end to the other)")
 
     @model_validator(mode="after")
-    def _wide(self) -> Door:
+    def _check_width(self) -> Door:
         """Raise ValueError if the door has neither width nor ends."""
         if self.width is None and self.ends is None:
             raise ValueError("width = None: a door without ends needs one; give m")
         return self
 
     @property
-    def room(self) -> float:
+    def opening_width(self) -> float:
         """Its width, m."""
         return self.length if self.width is None else self.width
 
@@ -184,10 +184,10 @@ class Routes(Around):
 
     def table(self, scene: SceneView) -> NDArray[np.float64]:
         """Return the width of a bin, m, a row for each door, and the floor field of each."""
-        blocks = [self.ways(scene, (door,), (name,)) for door, name in zip(*self.goals, strict=True)]
+        blocks = [self.field_block(scene, (door,), (name,)) for door, name in zip(*self.goals, strict=True)]
         begin = 1 + len(self.doors) * (HEAD + row_size(2))
         at = begin + np.cumsum([0, *map(len, blocks)])
-        rows = [[float(a), self.flow * d.room, *d.row] for a, d in zip(at[:-1], self.doors, strict=True)]
+        rows = [[float(a), self.flow * d.opening_width, *d.row] for a, d in zip(at[:-1], self.doors, strict=True)]
         lengths = np.concatenate([block[2 + row_size(2) + 6 :: 3] for block in blocks])
         longest = float(lengths[lengths < NO_WAY].max())
         return np.concatenate([[max(longest, self.spacing) / (BINS - 1)], np.ravel(rows), *blocks])

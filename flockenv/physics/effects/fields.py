@@ -112,7 +112,7 @@ class _Timed(Effect):
     phase: float = Field(default=0.0, description="radians, of the oscillation at time 0")
 
     @model_validator(mode="after")
-    def _phase_of_something(self) -> Self:
+    def _check_phase(self) -> Self:
         if self.period is None and self.phase != 0.0:
             raise ValueError(f"phase = {self.phase:g}: only with a period")
         return self
@@ -222,7 +222,7 @@ class Vortex(_Central):
     formula: ClassVar[Law] = vortex
 
     @model_validator(mode="after")
-    def _axis_in_space(self) -> Self:
+    def _check_axis(self) -> Self:
         if self.axis is not None and (len(self.axis) != 3 or not any(self.axis)):
             raise ValueError(f"axis = {self.axis}: must be three numbers, not all 0, or None for the z axis")
         return self
@@ -246,7 +246,7 @@ class Wind(_Timed):
     strengths: ClassVar[tuple[str, ...]] = ("velocity", "gust")
 
     @model_validator(mode="after")
-    def _gusts_come_and_go(self) -> Self:
+    def _check_gusts(self) -> Self:
         if (self.gust is None) != (self.period is None):
             raise ValueError("gust and period go together: give both or neither")
         return self

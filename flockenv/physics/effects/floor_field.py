@@ -50,7 +50,7 @@ class Around(Aim):
     needs_all: ClassVar[bool] = False
     """True if an agent must visit all targets, False if one of them is enough."""
 
-    def ways(self, scene: SceneView, targets: tuple[Target, ...], names: tuple[str, ...]) -> NDArray[np.float64]:
+    def field_block(self, scene: SceneView, targets: tuple[Target, ...], names: tuple[str, ...]) -> NDArray[np.float64]:
         """Return the block of the floor field to the nearest target; see flockenv.physics.floor_fields."""
         corners = grid_corners(scene, self.goals[0], self.margin)
         starts = start_boxes(scene, self.group)
@@ -118,7 +118,7 @@ class Way(Around):
 
     def table(self, scene: SceneView) -> NDArray[np.float64]:
         """Return its targets and the floor field to the nearest."""
-        return self.ways(scene, *self.goals)
+        return self.field_block(scene, *self.goals)
 
     def lengths(self, scene: SceneView, points: ArrayLike) -> NDArray[np.float64]:
         """Return path lengths from points (..., D), (...) m; inf without a path; outside the grid, that of its edge."""

@@ -64,7 +64,7 @@ class _Urge(Effect):
             demand_group(name, getattr(self, name, None), scene.groups)
         super().check(scene)
 
-    def given(self, *names: str) -> dict[str, float | Vec]:
+    def numbers_of(self, *names: str) -> dict[str, float | Vec]:
         """Return some fields as numbers for its laws."""
         return {name: float(getattr(self, name)) for name in names}
 
@@ -79,7 +79,7 @@ def initial_hunger(p: Any, me: Me) -> Vec:
 
 
 @law
-def update_hunger(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
+def update_hunger(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
     """Return the hunger after a step: it grows with time and effort."""
     o = like(me.max_speed, 0.0)
     pace = norm(me.vel) / me.max_speed if me.max_speed > o else o
@@ -104,14 +104,14 @@ class Metabolism(_Urge):
     strengths: ClassVar[tuple[str, ...]] = ("rate", "effort")
 
     @model_validator(mode="after")
-    def _within(self) -> Metabolism:
+    def _check_initial(self) -> Metabolism:
         """Raise ValueError if the initial hunger may be outside 0 to 1."""
         _demand_range(self.start, self.spread, 1.0)
         return self
 
     def parameters(self) -> dict[str, float | Vec]:
         """Return rates and initial values."""
-        return self.given("rate", "effort", "start", "spread")
+        return self.numbers_of("rate", "effort", "start", "spread")
 
 
 def _demand_range(start: float, spread: float, most: float) -> None:
@@ -146,12 +146,12 @@ def both_sums(p: Any, me: Me, sums: Vec) -> Vec:
 
 
 @law
-def update_grazing(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
+def update_grazing(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
     """Return the numbers after a step: eaters get less hungry; patches regrow, and lose what is eaten."""
     o = like(p.rate, 0.0)
     patch = _is_member(me.who, p.from_other, p.to_other)
-    taken = motivation.bite(told[0], me.inner.hunger, p.rate, seconds)
-    lost = motivation.bite(me.inner.food, told[1], p.rate, seconds)
+    taken = motivation.bite(message[0], me.inner.hunger, p.rate, seconds)
+    lost = motivation.bite(me.inner.food, message[1], p.rate, seconds)
     less = me.inner.hunger - taken / p.appetite
     grown = motivation.regrow(me.inner.food, p.growth, p.capacity, seconds) if patch else me.inner.food
     return (less if less > o else o), grown - lost, me.inner.eaten + taken
@@ -191,7 +191,7 @@ class Grazing(_Urge):
 
     def parameters(self) -> dict[str, float | Vec]:
         """Return growth, feeding and initial amount."""
-        return self.given("rate", "growth", "capacity", "start", "appetite")
+        return self.numbers_of("rate", "growth", "capacity", "start", "appetite")
 
     def check(self, scene: SceneView) -> None:
         """Raise ValueError if all together could eat more than a patch in one step, or patches eat."""
@@ -228,11 +228,11 @@ def catches(p: Any, me: Me, other: Other) -> Vec:
 
 
 @law
-def update_catches(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
+def update_catches(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
     """Return the numbers after a step: each catch reduces the hunger of a hunter, and is counted by its prey."""
     o = like(p.meal, 0.0)
-    less = me.inner.hunger - p.meal * told[1]
-    return (less if less > o else o), me.inner.caught + told[0]
+    less = me.inner.hunger - p.meal * message[1]
+    return (less if less > o else o), me.inner.caught + message[0]
 
 
 class Predation(_Urge):
@@ -265,7 +265,7 @@ class Predation(_Urge):
 
     def parameters(self) -> dict[str, float | Vec]:
         """Return meal and hungry."""
-        return self.given("meal", "hungry")
+        return self.numbers_of("meal", "hungry")
 
     def check(self, scene: SceneView) -> None:
         """Raise ValueError if a group hunts itself."""
@@ -296,10 +296,10 @@ def one_sum(p: Any, me: Me, sums: Vec) -> Vec:
 
 
 @law
-def keep_fear(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
+def keep_fear(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
     """Return the fear after a step: of all in sight together, at most 1; it fades."""
     one = like(p.span, 1.0)
-    later = motivation.update_fear(me.inner.fear, told[0] if told[0] < one else one, p.memory, seconds)
+    later = motivation.update_fear(me.inner.fear, message[0] if message[0] < one else one, p.memory, seconds)
     return (later if _is_member(me.who, p.first, p.end) else me.inner.fear,)
 
 
@@ -334,7 +334,7 @@ class Fear(_Urge):
 
     def parameters(self) -> dict[str, float | Vec]:
         """Return span and memory."""
-        return self.given("span", "memory")
+        return self.numbers_of("span", "memory")
 
 
 # --- libido -----------------------------------------------------------------------------------------------------------
@@ -355,11 +355,11 @@ def count_willing(p: Any, me: Me, other: Other) -> Vec:
 
 
 @law
-def update_urge(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
+def update_urge(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
     """Return urge and count after a step: the urge grows; a willing agent near another mates, which resets it."""
     o, e = like(p.rate, 0.0), like(p.rate, 1.0)
     mine = _is_member(me.who, p.first, p.end)
-    mates = mine & (told[0] > o) & (motivation.desire(me.inner.libido, me.inner.hunger) > p.ready)
+    mates = mine & (message[0] > o) & (motivation.desire(me.inner.libido, me.inner.hunger) > p.ready)
     grown = me.inner.libido + (p.rate * seconds if mine else o)
     return (o if mates else grown), me.inner.mated + (e if mates else o)
 
@@ -386,7 +386,7 @@ class Libido(_Urge):
     strengths: ClassVar[tuple[str, ...]] = ("rate",)
 
     @model_validator(mode="after")
-    def _within(self) -> Libido:
+    def _check_initial(self) -> Libido:
         """Raise ValueError if the initial urge may be below 0."""
         _demand_range(self.start, self.spread, float("inf"))
         return self
@@ -402,7 +402,7 @@ class Libido(_Urge):
 
     def parameters(self) -> dict[str, float | Vec]:
         """Return rate, threshold and initial values."""
-        return self.given("rate", "ready", "start", "spread")
+        return self.numbers_of("rate", "ready", "start", "spread")
 
 
 # --- intention --------------------------------------------------------------------------------------------------------
@@ -415,7 +415,7 @@ def initial_intention(p: Any, me: Me) -> Vec:
 
 
 @law
-def update_intention(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
+def update_intention(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
     """Return the next intention, from the present one, hunger, libido and fear."""
     libido = motivation.desire(me.inner.libido, me.inner.hunger)
     now = motivation.intention(
@@ -445,7 +445,7 @@ class Intention(_Urge):
     strengths: ClassVar[tuple[str, ...]] = ("calm", "content")
 
     @model_validator(mode="after")
-    def _ordered(self) -> Intention:
+    def _check_order(self) -> Intention:
         """Raise ValueError if the levels are out of order, or an intention would never end."""
         if self.school > self.escape:
             raise ValueError(f"school = {self.school:g}: must not be above escape = {self.escape:g}")
@@ -456,4 +456,4 @@ class Intention(_Urge):
 
     def parameters(self) -> dict[str, float | Vec]:
         """Return the levels."""
-        return self.given("escape", "school", "need", "calm", "content")
+        return self.numbers_of("escape", "school", "need", "calm", "content")

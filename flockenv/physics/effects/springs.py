@@ -188,8 +188,8 @@ class AngularSprings(Effect):
         first, network, _ = network_of(groups, self.group, dimension)
         hinges, points, mass = network.hinges(dimension), network.rest_points(dimension), all_masses(groups, dimension)
         per_a, per_b = (1 / np.linalg.norm(points[hinges[:, end]] - points[hinges[:, 1]], axis=1) for end in (0, 2))
-        whole = np.stack([per_a, per_a + per_b, per_b]) * 2 * (per_a + per_b)
-        rows = np.bincount((hinges + first).T.ravel(), whole.ravel(), len(mass)) / mass
+        gradients = np.stack([per_a, per_a + per_b, per_b]) * 2 * (per_a + per_b)
+        rows = np.bincount((hinges + first).T.ravel(), gradients.ravel(), len(mass)) / mass
         return self.stiffness * rows, self.damping * rows
 
     def potential(self, groups: Sequence[Any], state: State, offset: Any) -> Floats:

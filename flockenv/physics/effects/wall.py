@@ -49,7 +49,7 @@ class WallRepulsion(Effect):
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
 
     @model_validator(mode="after")
-    def _normal_points_somewhere(self) -> Self:
+    def _check_normal(self) -> Self:
         if not SHORTEST <= math.hypot(*self.normal) <= LONGEST:
             raise ValueError(
                 f"normal = {self.normal}: must be a direction, not all 0 (from {SHORTEST:g} to {LONGEST:g} m long)"

@@ -78,7 +78,7 @@ def initial_stage(p: Any, me: Me) -> Vec:
 
 
 @law
-def update_stage(p: Any, me: Me, told: Vec, seconds: float) -> Vec:
+def update_stage(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
     """Return the stage, k, or k + 1/2 while it waits there; the time until which it waits; and the position."""
     stage, ready, was = me.inner.stage, me.inner.ready, stored_position(me)
     before = (stage, ready, was[0], was[1])
@@ -109,7 +109,7 @@ class Stage(Target):
     around: bool = Field(default=True, description="True: by the path around obstacles; False: straight")
 
     @model_validator(mode="after")
-    def _reached(self) -> Stage:
+    def _check_radius(self) -> Stage:
         """Raise ValueError for a point of radius 0, which is never reached."""
         if self.at is not None and self.radius == 0:
             raise ValueError("radius = 0: a point is reached within a radius; give m")
@@ -156,11 +156,11 @@ class Journey(Around):
         given = [(self.premovement, PREMOVEMENT), *((s.wait, PREMOVEMENT + 1 + k) for k, s in enumerate(self.stages))]
         waits = np.stack([draw(value, count, channel) for value, channel in given], axis=1)
         places = {Target(**stage.place): name for stage, name in zip(*self.goals, strict=True)}
-        blocks = [self.ways(scene, (place,), (name,)) for place, name in places.items()]
+        blocks = [self.field_block(scene, (place,), (name,)) for place, name in places.items()]
         begin = len(self.stages) * (HEAD + row_size(2)) + waits.size
         at = dict(zip(places, begin + np.cumsum([0, *map(len, blocks)])[:-1], strict=True))
         rows = [
-            [float(at[Target(**stage.place)]) if stage.around else -1.0, self.slowing(k), *stage.row]
+            [float(at[Target(**stage.place)]) if stage.around else -1.0, self.slow_radius_of(k), *stage.row]
             for k, stage in enumerate(self.stages)
         ]
         return np.concatenate([np.ravel(rows), waits.ravel(), *blocks])
@@ -171,7 +171,7 @@ class Journey(Around):
         blocks = [int(table[k * size]) for k, stage in enumerate(self.stages) if stage.around]
         return [table[at + 2 + row_size(2) :] for at in blocks]
 
-    def slowing(self, k: int) -> float:
+    def slow_radius_of(self, k: int) -> float:
         """Return the distance over which agents slow down before stage k, m."""
         stays = self.then == "stay" and k == len(self.stages) - 1
         return self.slow_radius if stays or self.stages[k].wait != 0 else 0.0

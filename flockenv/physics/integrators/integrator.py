@@ -137,14 +137,14 @@ class Integrator(Record):
         return tuple(float(getattr(self, name)) for name in type(self).model_fields if name != "kind")
 
     @classmethod
-    def of_module(cls, name: str) -> Any:
+    def module_object(cls, name: str) -> Any:
         """Return the object of this name in the method's module."""
         return vars(sys.modules[cls.__module__])[name]
 
     @classmethod
     def advance(cls) -> Callable[[Provided], Method]:
         """Return the section `advance` of the method's module."""
-        return cls.of_module("advance")  # type: ignore[no-any-return]
+        return cls.module_object("advance")  # type: ignore[no-any-return]
 
     def __call__(
         self,

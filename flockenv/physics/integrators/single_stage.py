@@ -20,7 +20,7 @@ class OneStage(Integrator):
     @classmethod
     def move(cls) -> Any:
         """Return the compiled `move` of the method's module."""
-        return cls.of_module("move")
+        return cls.module_object("move")
 
     def _step(
         self, law: Any, context: Any, x: Floats, v: Floats, flow: Any, time: float, dt: float, stages: Floats

@@ -105,10 +105,10 @@ def _point_on_round(piece: Any, flat: bool, s: float, t: float) -> tuple[Vec, Ve
 @law
 def _is_within(piece: Any, spot: Vec) -> bool:
     """Return True if a point lies inside a segment of a thick line, not on its surface."""
-    line, way = sub(_three_numbers(piece, 5), _three_numbers(piece, 2)), sub(spot, _three_numbers(piece, 2))
+    line, to_spot = sub(_three_numbers(piece, 5), _three_numbers(piece, 2)), sub(spot, _three_numbers(piece, 2))
     square = dot(line, line)
-    share = min(max(dot(line, way) / square, 0.0), 1.0) if square > 0.0 else 0.0
-    gap = sub(way, scale(line, share))
+    share = min(max(dot(line, to_spot) / square, 0.0), 1.0) if square > 0.0 else 0.0
+    gap = sub(to_spot, scale(line, share))
     return piece[1] == 1.0 and dot(gap, gap) < piece[8] * piece[8] * (1.0 - 1e-9)  # type: ignore[no-any-return]
 
 

@@ -96,9 +96,9 @@ def remove_drained(
                 continue
             here = load_vector(anchor, x, b, i)
             y = nearest_image(period, sub(here, place))
-            way = sub(nearest_image(period, sub(here, load_vector(anchor, x0, b, i))), moved)
+            path = sub(nearest_image(period, sub(here, load_vector(anchor, x0, b, i))), moved)
             gap, _ = nearest_shape(table, 0, y)
-            if gap <= margin or hit_shape(table, 0, sub(y, way), unit(way), margin) <= norm(way):
+            if gap <= margin or hit_shape(table, 0, sub(y, path), unit(path), margin) <= norm(path):
                 _remove(b, i, v, alive, work)
 
 

@@ -58,7 +58,7 @@ class Emitter(Member):
     lifetime: Range | None = Field(default=None, description="s, least and most (default: no limit)")
 
     @model_validator(mode="after")
-    def _consistent(self) -> Emitter:
+    def _check_ranges(self) -> Emitter:
         """Raise ValueError if a range is reversed, or the emitter has no births."""
         for name in ("speed", "lifetime"):
             value = getattr(self, name)

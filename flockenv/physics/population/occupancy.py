@@ -138,9 +138,9 @@ def count_near(
                     i = order[at]
                     square = 0.0
                     for k in range(d):
-                        way = float(x[k, b, i]) - place[k]
-                        way -= period[k] * math.floor(way / period[k] + 0.5) if period[k] > 0.0 else 0.0
-                        square += way * way
+                        offset = float(x[k, b, i]) - place[k]
+                        offset -= period[k] * math.floor(offset / period[k] + 0.5) if period[k] > 0.0 else 0.0
+                        square += offset * offset
                     if square > reach * reach:
                         continue
                     if elder_than >= 0:

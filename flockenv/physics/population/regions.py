@@ -107,7 +107,7 @@ class Disc(Place):
     axis: Vector | None = Field(default=None, description="in 3-D: normal of the flat disc (default: a ball)")
 
     @model_validator(mode="after")
-    def _points_somewhere(self) -> Disc:
+    def _check_axis(self) -> Disc:
         if self.axis is not None and not math.hypot(*self.axis) > 0:
             raise ValueError(f"axis = {self.axis}: a direction, not all 0")
         return self
@@ -136,7 +136,7 @@ class _Corners(Place):
     high: Vector = Field(description="m, upper corner")
 
     @model_validator(mode="after")
-    def _ordered(self) -> _Corners:
+    def _check_order(self) -> _Corners:
         """Raise ValueError if the corners are not in order."""
         check_corners(self.low, self.high)
         return self

@@ -56,7 +56,7 @@ class Leaving(Sink):
     high: Vector = Field(description="m, upper corner of the region")
 
     @model_validator(mode="after")
-    def _ordered(self) -> Leaving:
+    def _check_order(self) -> Leaving:
         check_corners(self.low, self.high)
         return self
 

@@ -225,7 +225,7 @@ class Problem:
 def _refuse_draws(scene: Scene) -> None:
     """Raise ValueError for random draws in every step: other step lengths draw other numbers."""
     for k, effect in enumerate(scene.effects):
-        if any(each.kick_law is not None for each in (effect, *effect.wishes)):
+        if any(each.kick_law is not None for each in (effect, *effect.components)):
             raise ValueError(
                 f"effects[{k}] {effect.kind}: kicks at random, so there is no one path to come close to; only averages "
                 "over many runs could be compared (weak error), which this does not measure"

@@ -27,7 +27,7 @@ SHOWN = ("collisions", "switches")
 def more_columns(plan: SteerPlan) -> dict[str, str]:
     """Return a column for every behaviour of the cases."""
     scenes = (plan.scene_of(case, variant) for case in plan.cases for variant in plan.variants)
-    names = dict.fromkeys(wish.kind for scene in scenes for wish in scene.effects[0].wishes)
+    names = dict.fromkeys(wish.kind for scene in scenes for wish in scene.effects[0].components)
     return {f"share {name}": f"of what {name} wishes for, granted on average while it wishes" for name in names}
 
 
