@@ -1,6 +1,6 @@
 """Reynolds' verbs, one law each, for one agent: every sweep, scripted agent and hand-written player calls these.
 
-A steering law returns the change of velocity it asks for, S = v_desired - v, in m/s; the caller turns it into a force
+A steering law returns the desired change of velocity, S = v_desired - v, in m/s; the caller turns it into a force
 with a gain in kg/s (m/tau makes `seek` Helbing's driving force). `offset` is always other minus self. Laws take tuples
 of D = 2 or 3 floats and are finite for every finite input, at standstill and at zero distance too.
 Over arrays of rows they are called through `flockenv.steering.vectorize.rows(law)`.

@@ -53,7 +53,7 @@ def _clamp(x: float, low: float, high: float) -> float:
 
 @law
 def contain(to_low: Vec, to_high: Vec, velocity: Vec, max_speed: float, time: float) -> Vec:
-    """Stay in a box: if the place after `time` [s] is outside, seek the nearest place inside, else ask for nothing.
+    """Stay in a box: if the place after `time` [s] is outside, seek the nearest place inside, else return zero.
 
     `to_low` and `to_high` are the distances to the lower and the upper wall per axis, m; negative beyond it
     (Reynolds 1999, containment).

@@ -17,7 +17,7 @@ def sheep_direction(
     velocity: Vec, centre: Vec, crowd: Vec, away: Vec, noise: Vec,
     inertia: float, attraction: float, apart: float, fear: float, error: float,
 ) -> Vec:  # fmt: skip
-    """Where a sheep goes that heeds a dog: unit(h unit(v) + c unit(C) + rho_a unit(R_a) + rho_s unit(R_s) + e noise).
+    """Return the direction of a sheep, unit(h unit(v) + c unit(C) + rho_a unit(R_a) + rho_s unit(R_s) + e noise).
 
     C leads to the centre of those around it, R_a and R_s are sums of unit vectors away from sheep that are too near and
     from dogs (Strombom et al. 2014, H'; there h = 0.5, c = 1.05, rho_a = 2, rho_s = 1, e = 0.3). 0 if all of it is.

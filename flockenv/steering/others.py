@@ -106,7 +106,7 @@ def opensteer_time(offset: Vec, velocity: Vec, quarry_velocity: Vec, longest: fl
 
 @law
 def pursue(offset: Vec, velocity: Vec, quarry_velocity: Vec, max_speed: float, time: float) -> Vec:
-    """Seek where the quarry will be after `time` [s], as a predictor says (Reynolds 1999)."""
+    """Seek where the quarry will be after `time` [s], which a predictor returns (Reynolds 1999)."""
     return seek(add(offset, scale(quarry_velocity, time)), velocity, max_speed)
 
 
@@ -118,13 +118,13 @@ def evade(offset: Vec, velocity: Vec, pursuer_velocity: Vec, max_speed: float, t
 
 @law
 def push_off(offset: Vec, square: float) -> Vec:
-    """One neighbour's push where the two are not in one place, 1/m: see `separate`. Their distance squared is known."""
+    """Return the push of a neighbour that is not in the same place, 1/m, given the squared distance; see `separate`."""
     return opposite(scale(offset, like(square, 1.0) / square))  # 0 for an infinite distance: a mask, not a branch
 
 
 @law
 def separate(offset: Vec, tie: Vec) -> Vec:
-    """One neighbour's push: away from it, weighted 1/distance, 1/m (Reynolds 1999). Sum over neighbours.
+    """Return the push of a neighbour: away from it, weighted 1/distance, 1/m (Reynolds 1999). Sum over neighbours.
 
     `tie` is the direction to take where the two coincide, a unit vector that is opposite for the other one.
     """
@@ -133,7 +133,7 @@ def separate(offset: Vec, tie: Vec) -> Vec:
 
 @law
 def separate_at(offset: Vec, square: float, tie: Vec) -> Vec:
-    """The same with the squared distance given, m^2; zero if it is infinite."""
+    """Return the same as `separate`, given the squared distance, m^2; zero if it is infinite."""
     return select(square > like(square, ONE_PLACE), push_off(offset, square), tie)
 
 

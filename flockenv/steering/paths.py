@@ -1,4 +1,4 @@
-"""Along paths and fields: what to ask for once it is known where the path, or how fast the flow, is.
+"""Along paths and fields, given the nearest point of the path, or the velocity of the flow.
 
 Where the nearest point of a path lies is geometry (`flockenv.geometry.polyline`), and so is what a grid says
 (`flockenv.maths.grid`).
@@ -15,7 +15,7 @@ __all__ = ["follow_flow", "follow_path", "stay_on_path"]
 
 @law
 def stay_on_path(beyond: float, to_spine: Vec, velocity: Vec, max_speed: float) -> Vec:
-    """Ask for nothing where the predicted place is in the tube, else seek the spine's nearest point (Reynolds 1999).
+    """Return zero if the predicted place is in the tube, else seek the spine's nearest point (Reynolds 1999).
 
     `beyond` is how far the predicted place lies outside the tube, m, negative inside; `to_spine` leads to the spine.
     """
@@ -36,5 +36,5 @@ def follow_path(beyond: float, gained: float, target: Vec, velocity: Vec, max_sp
 
 @law
 def follow_flow(flow: Vec, velocity: Vec) -> Vec:
-    """Move as a field says: S = F - v, with F the velocity that it asks for at the predicted place (Reynolds 1999)."""
+    """Take on the velocity of a field: S = F - v, with F its velocity at the predicted place (Reynolds 1999)."""
     return sub(flow, velocity)

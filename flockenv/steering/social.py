@@ -83,7 +83,7 @@ def unit_away(offset: Vec, tie: Vec) -> tuple[Vec, float]:
 
 @law
 def repulsion(offset: Vec, tie: Vec, size: float, decay: float) -> Vec:
-    """Away from the other, exp((size - d) / B): 1 where d is `size`, the sum of both radii, or 0 (of distances alone).
+    """Return exp((size - d) / B) away from the other; `size` is the sum of both radii, or 0 (of distances alone).
 
     Helbing, Farkas and Vicsek 2000; the circular specification of Johansson, Helbing and Shukla 2007.
     """
@@ -179,16 +179,16 @@ def _side_and_angle(towards: Vec, t: Vec) -> tuple[Vec, float]:
 
 @law
 def attraction(offset: Vec, decay: float) -> Vec:
-    """Towards a thing, exp(-d / B): times A the pull of a potential that grows with the distance, up to A B far away.
+    """Return exp(-d / B) towards a thing: times A, the pull of a potential that grows to A B far away.
 
-    Helbing and Molnar 1995 ask for such a one, W(d, t), and give no form: this is ours.
+    Helbing and Molnar 1995 have such a potential, W(d, t), and give no form: this is ours.
     """
     return scale(unit(offset), exp(-norm(offset) / decay))
 
 
 @law
 def gaze_turn(heading: Vec, offset: Vec, half: float) -> float:
-    """Return by which angle the head must turn to see what is at `offset`, rad: what it is beyond `half` the view.
+    """Return the angle by which the head must turn to see what is at `offset`, rad: the part beyond `half` the view.
 
     Moussaid et al. 2010, alpha of the gaze; 0 at standstill.
     """

@@ -86,8 +86,8 @@ class Collisions(Constraint):
 
     def calls_for(self) -> tuple[str, ...]:
         """Return the neighbour query, and obstacles, if they are used."""
-        asked = ("neighbour query", self.agents), ("obstacles", self.obstacles)
-        return tuple(what for what, is_met in asked if is_met)
+        needs = ("neighbour query", self.agents), ("obstacles", self.obstacles)
+        return tuple(what for what, needed in needs if needed)
 
     def numbers(self, scene: SceneView) -> int:
         """Return the size of bodies, ends and meetings, per agent."""
@@ -129,18 +129,18 @@ class _Settler:
         """Allocate room for `places` meetings."""
         d = self.scene.dimension
 
-        def whole(*shape: int) -> NDArray[np.int64]:
+        def zeros(*shape: int) -> NDArray[np.int64]:
             return np.zeros(shape, np.int64)
 
         self.meetings = Meetings(
-            who=whole(places), other=whole(places), time=np.zeros(places), hits=whole(places), closed=whole(places),
-            deep=np.zeros(places), following=whole(2, places), listed=whole(places), active=whole(places),
-            todo=whole(2 * places),
+            who=zeros(places), other=zeros(places), time=np.zeros(places), hits=zeros(places), closed=zeros(places),
+            deep=np.zeros(places), following=zeros(2, places), listed=zeros(places), active=zeros(places),
+            todo=zeros(2 * places),
         )  # fmt: skip
         self.contacts = Contacts(
-            who=whole(places), other=whole(places), normal=np.zeros((places, d)), allowed=np.zeros(places),
-            open=whole(places), push=np.zeros(places), rub=np.zeros((places, d)), was=np.zeros((places, d + 1)),
-            search=np.zeros((places, d + 1)), rank=np.zeros(places), order=whole(places),
+            who=zeros(places), other=zeros(places), normal=np.zeros((places, d)), allowed=np.zeros(places),
+            open=zeros(places), push=np.zeros(places), rub=np.zeros((places, d)), was=np.zeros((places, d + 1)),
+            search=np.zeros((places, d + 1)), rank=np.zeros(places), order=zeros(places),
         )  # fmt: skip
 
     def _obstacles(self) -> Things:

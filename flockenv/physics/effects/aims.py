@@ -12,7 +12,7 @@ from flockenv.maths.vectors import norm, scale, select, sub, unit, zero
 from flockenv.model.scene_view import SceneView
 from flockenv.physics.effects.effect import Effect, Me, Vector, demand_group
 
-__all__ = ["Aim", "Antipode", "Course", "Goal", "applies_to", "ramped"]
+__all__ = ["Aim", "Antipode", "Course", "Goal", "applies_to", "direction_with_ramp"]
 
 
 @law
@@ -23,7 +23,7 @@ def applies_to(p: Any, me: Me) -> bool:
 
 
 @law
-def ramped(offset: Vec, slow_radius: float) -> Vec:
+def direction_with_ramp(offset: Vec, slow_radius: float) -> Vec:
     """Return the direction of an offset, shorter within slow_radius, m: 0 at the target itself."""
     length, one = norm(offset), like(slow_radius, 1.0)
     share = length / slow_radius
@@ -51,7 +51,9 @@ class Aim(Effect):
 @law
 def goal_aim(p: Any, me: Me) -> Vec:
     """Return the direction to the target."""
-    return select(applies_to(p, me), scale(ramped(sub(p.target, me.pos), p.slow_radius), p.share), zero(me.pos))
+    return select(
+        applies_to(p, me), scale(direction_with_ramp(sub(p.target, me.pos), p.slow_radius), p.share), zero(me.pos)
+    )
 
 
 class Goal(Aim):
@@ -115,7 +117,9 @@ def keep_target(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
 def antipode_aim(p: Any, me: Me) -> Vec:
     """Return the direction to the stored target."""
     return select(
-        applies_to(p, me), scale(ramped(sub(stored_target(p, me), me.pos), p.slow_radius), p.share), zero(me.pos)
+        applies_to(p, me),
+        scale(direction_with_ramp(sub(stored_target(p, me), me.pos), p.slow_radius), p.share),
+        zero(me.pos),
     )
 
 

@@ -296,7 +296,7 @@ def one_sum(p: Any, me: Me, sums: Vec) -> Vec:
 
 
 @law
-def keep_fear(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
+def update_fear(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
     """Return the fear after a step: of all in sight together, at most 1; it fades."""
     one = like(p.span, 1.0)
     later = motivation.update_fear(me.inner.fear, message[0] if message[0] < one else one, p.memory, seconds)
@@ -319,7 +319,7 @@ class Fear(_Urge):
     pair_law: ClassVar[Law | None] = fear_of
     finish_law: ClassVar[Law | None] = one_sum
     begin_law: ClassVar[Law | None] = no_fear
-    keep_law: ClassVar[Law | None] = keep_fear
+    keep_law: ClassVar[Law | None] = update_fear
     keeps: ClassVar[tuple[str, ...]] = ("fear",)
     strengths: ClassVar[tuple[str, ...]] = ("span",)
 

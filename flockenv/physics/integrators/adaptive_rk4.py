@@ -21,7 +21,7 @@ def advance(provided: Provided) -> Method:
     The whole step, its first half, and the next try after a rejection begin with the same slope.
     """
     acceleration, settings = provided.acceleration, provided.settings
-    largest, counted = provided.largest, provided.counted
+    largest, count_substeps = provided.largest, provided.count_substeps
 
     def advance(
         context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int, end: int
@@ -61,7 +61,7 @@ def advance(provided: Provided) -> Method:
             clock = next_clock(clock, error, limits, dt, 4)
             if clock.lost:
                 pos[where] = like(dt, np.nan)
-        counted(context, clock.accepted, clock.rejected)
+        count_substeps(context, clock.accepted, clock.rejected)
 
     return advance
 

@@ -37,7 +37,7 @@ def advance(provided: Provided) -> Method:
     Rows 2 to 8 of the stages are slopes of positions, rows 9 to 15 slopes of velocities.
     """
     acceleration, settings = provided.acceleration, provided.settings
-    largest, counted = provided.largest, provided.counted
+    largest, count_substeps = provided.largest, provided.count_substeps
 
     def advance(
         context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int, end: int
@@ -68,7 +68,7 @@ def advance(provided: Provided) -> Method:
             clock = next_clock(clock, error, limits, dt, 4)
             if clock.lost:
                 pos[where] = like(dt, np.nan)
-        counted(context, clock.accepted, clock.rejected)
+        count_substeps(context, clock.accepted, clock.rejected)
 
     return advance
 

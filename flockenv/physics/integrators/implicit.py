@@ -69,11 +69,11 @@ class Implicit(Integrator):
         """Advance one world under laws that are Python functions: the sparsity of the derivatives is unknown."""
 
         def evaluate(pos: Floats, vel: Floats, when: float) -> tuple[Floats, Floats | None]:
-            acc, carrying = np.empty_like(pos), np.empty_like(pos)
+            acc, advection = np.empty_like(pos), np.empty_like(pos)
             for row in range(len(pos)):
                 law(context, pos[row], vel[row], when, acc[row])
-                carrying[row] = flow if len(flow) else 0.0
-            return acc, carrying if len(flow) else None
+                advection[row] = flow if len(flow) else 0.0
+            return acc, advection if len(flow) else None
 
         found = self.solve(evaluate, x.copy(), v.copy(), time, dt, 1, None)
         x[...], v[...] = found.x, found.v

@@ -88,7 +88,7 @@ class Provided(NamedTuple):
     """(context, rate, first, end): write c / m, 1/s, of coordinates [first, end), for a method with `splits_drag`."""
     largest: Callable[..., tuple[float, int]] = _largest_sum
     """(context, squares, first, end): the largest sum over an agent's coordinates, NaN if one is, and its index."""
-    counted: Callable[..., None] = _count_substeps
+    count_substeps: Callable[..., None] = _count_substeps
     """(context, accepted, rejected): count substeps in State.work."""
 
 
@@ -164,19 +164,19 @@ class Integrator(Record):
             raise ValueError(f"dt is {dt}, must be a positive number of seconds")
         new = state.copy()
         b, n, d = state.shape
-        carrying: Any = np.zeros(d * n, state.x.dtype) if flow is not None else ()
+        advection: Any = np.zeros(d * n, state.x.dtype) if flow is not None else ()
 
         def law(context: Any, pos: Floats, vel: Floats, time: float, out: Floats) -> None:
             x, v = pos.reshape(d, n).T, vel.reshape(d, n).T
             out[...] = np.asarray(acceleration(x, v, time)).T.reshape(-1)
             if flow is not None:
-                carrying[...] = np.asarray(flow(x, time)).T.reshape(-1)
+                advection[...] = np.asarray(flow(x, time)).T.reshape(-1)
 
         for k in range(b):
             x, v = new.x[:, k].ravel(), new.v[:, k].ravel()
             stages = np.zeros((max(self.stages, 1), d * n), state.x.dtype)
             context = Alone(drag, self.settings(), d, new.work[k])
-            self._step(law, context, x, v, carrying, float(state.time[k]), dt, stages)
+            self._step(law, context, x, v, advection, float(state.time[k]), dt, stages)
             new.x[:, k], new.v[:, k] = x.reshape(d, n), v.reshape(d, n)
         return replace(new, tick=new.tick + 1)
 
