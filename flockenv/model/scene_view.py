@@ -91,7 +91,7 @@ class SceneView(Protocol):
         """The other obstacles."""
 
     @property
-    def touching(self) -> float:
+    def contact_distance(self) -> float:
         """Sum of the two largest radii, m: agents further apart do not touch."""
 
     @property

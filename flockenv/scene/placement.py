@@ -32,23 +32,23 @@ def cells_of(scene: SceneView) -> Cells:
     Raise ValueError, naming the group and the field, if there is no room.
     """
     return tuple(
-        None if group.spawn.spacing is None else _cells(scene, k, group) for k, group in enumerate(scene.groups)
+        None if group.spawn.spacing is None else _group_cells(scene, k, group) for k, group in enumerate(scene.groups)
     )
 
 
-def place_groups(scene: SceneView, state: State, middles: Cells) -> None:
+def place_groups(scene: SceneView, state: State, centres: Cells) -> None:
     """Write the initial state: positions, velocities, headings, and which agents live.
 
-    middles: the cell centres of `cells_of`.
+    centres: the cell centres of `cells_of`.
     """
     for b in range(len(state.key)):
-        for first, group, mine in zip(scene.starts, scene.groups, middles, strict=False):
+        for first, group, own_centres in zip(scene.starts, scene.groups, centres, strict=False):
             if group.network is not None:
-                _tie(scene, state, b, first, group)
+                _place_network(scene, state, b, first, group)
             else:
-                _scatter(scene, state, b, first, group, mine)
-    _bury(scene, state)
-    _face(scene, state)
+                _place_scattered(scene, state, b, first, group, own_centres)
+    _clear_empty_slots(scene, state)
+    _write_headings(scene, state)
 
 
 def _period(scene: SceneView) -> NDArray[np.float64]:
@@ -61,7 +61,7 @@ def _corners(scene: SceneView, spawn: Spawn) -> tuple[Sequence[float], Sequence[
     return spawn.low or (0.0,) * scene.dimension, spawn.high or scene.space.extent(scene.dimension)
 
 
-def _cells(scene: SceneView, k: int, group: Group) -> Floats:
+def _group_cells(scene: SceneView, k: int, group: Group) -> Floats:
     """Return the centres of a group's cells, (size, D) m."""
     try:
         box = _corners(scene, group.spawn)
@@ -70,54 +70,54 @@ def _cells(scene: SceneView, k: int, group: Group) -> Floats:
         raise ValueError(f"groups[{k}].spawn.{error}") from None
 
 
-def _scatter(scene: SceneView, state: State, b: int, first: int, group: Group, middles: Floats | None) -> None:
+def _place_scattered(scene: SceneView, state: State, b: int, first: int, group: Group, centres: Floats | None) -> None:
     """Write a group's initial positions in one world: anywhere in its box, or each near the centre of its cell."""
     spawn, d, period = group.spawn, scene.dimension, _period(scene)
     low, high = (np.array(corner, float) for corner in _corners(scene, spawn))
-    if middles is not None:
+    if centres is not None:
         low, high = np.full(d, -spawn.jitter), np.full(d, spawn.jitter)
     heading = np.array(spawn.heading if spawn.heading is not None else (0.0,) * d, float)
-    tried, mine = np.zeros(scene.agents, np.int64), slice(first, first + group.size)
-    looked = 0 if middles is not None else len(scene.circles)  # cells are clear of all circles
+    attempts, slots = np.zeros(scene.agents, np.int64), slice(first, first + group.size)
+    circles = 0 if centres is not None else len(scene.circles)  # cells are clear of all circles
     for _ in range(ROUNDS if scene.shapes else 1):
         entry(scatter)(
-            state.key[b], state.x[:, b], state.v[:, b], scene.body.radius, mine.start, mine.stop, low, high,
-            *spawn.speed, heading, state.obstacle_x[:, b, :looked], state.obstacle_radius[b, :looked],
-            period, np.zeros(d), tried,
+            state.key[b], state.x[:, b], state.v[:, b], scene.body.radius, slots.start, slots.stop, low, high,
+            *spawn.speed, heading, state.obstacle_x[:, b, :circles], state.obstacle_radius[b, :circles],
+            period, np.zeros(d), attempts,
         )  # fmt: skip
-        if middles is not None:
-            state.pos[b, mine] += middles
+        if centres is not None:
+            state.pos[b, slots] += centres
             return
-        inside = distance_to_shapes(scene.shapes, np.array(state.pos[b, mine], np.float64), period) < group.radii
+        inside = distance_to_shapes(scene.shapes, np.array(state.pos[b, slots], np.float64), period) < group.radii
         if not inside.any():
             return
-        tried[mine] += inside
+        attempts[slots] += inside
 
 
-def _tie(scene: SceneView, state: State, b: int, first: int, group: Group) -> None:
+def _place_network(scene: SceneView, state: State, b: int, first: int, group: Group) -> None:
     """Write the initial positions and common velocity of a network's particles in one world."""
     assert group.network is not None
-    mine = slice(first, first + group.size)
-    state.pos[b, mine] = group.network.points(scene.dimension)
+    slots = slice(first, first + group.size)
+    state.pos[b, slots] = group.network.points(scene.dimension)
     if group.spawn.heading is not None:
         heading = np.asarray(group.spawn.heading, float)
-        state.vel[b, mine] = group.spawn.speed[0] * heading / np.linalg.norm(heading)
+        state.vel[b, slots] = group.spawn.speed[0] * heading / np.linalg.norm(heading)
         state.vel[b, first + group.network.pins()] = 0
 
 
-def _bury(scene: SceneView, state: State) -> None:
+def _clear_empty_slots(scene: SceneView, state: State) -> None:
     """Clear the slots of agents that do not live at the start, and place them at their emitter, if any."""
     for k, (first, alive) in enumerate(zip(scene.starts, scene.living, strict=False)):
         dead = slice(first + alive, scene.starts[k + 1])
-        feeding = [member for member in scene.population if isinstance(member, Emitter) and member.feeds(k)]
+        emitters = [member for member in scene.population if isinstance(member, Emitter) and member.feeds(k)]
         state.alive[:, dead], state.vel[:, dead] = False, 0
         if scene.population:
             state.identity[:, dead] = -1
-        if feeding:
-            state.pos[:, dead] = feeding[0].place.extremes.mean(axis=0)
+        if emitters:
+            state.pos[:, dead] = emitters[0].place.extremes.mean(axis=0)
 
 
-def _face(scene: SceneView, state: State) -> None:
+def _write_headings(scene: SceneView, state: State) -> None:
     """Write the initial headings: along the velocity, or the heading of the group."""
     for first, group in zip(scene.starts, scene.groups, strict=False):
         if scene.parts.oriented and group.spawn.heading is not None:

@@ -30,7 +30,7 @@ from flockenv.model.distribution import Spread
 from flockenv.physics.effects import Contact, Effect, ObstacleContact
 from flockenv.steering.arbitration import Blend
 
-__all__ = ["ALIASES", "PRESETS", "Model", "Preset", "expanded", "preset"]
+__all__ = ["ALIASES", "PRESETS", "Model", "Preset", "expand_presets", "preset"]
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Model:
     """A published model: its behaviours, contact forces, pedestrians, and sources."""
 
     source: str
-    wishes: Callable[[bool, int | None], tuple[Effect, ...]] = field(repr=False)
+    behaviours: Callable[[bool, int | None], tuple[Effect, ...]] = field(repr=False)
     """(True if walls occlude, group for models of walking groups) -> behaviours."""
     bodies: tuple[Effect, ...] = ()
     people: Mapping[str, Any] = field(default_factory=dict)
@@ -51,8 +51,8 @@ class Model:
     @property
     def numbers(self) -> dict[str, float]:
         """The parameters of the behaviours, as kind_field: driving_tau, sidestep_gamma."""
-        wishes = self.wishes(False, None)
-        fields = {f"{wish.kind}_{name}": getattr(wish, name) for wish in wishes for name in type(wish).model_fields}
+        effects = self.behaviours(False, None)
+        fields = {f"{each.kind}_{name}": getattr(each, name) for each in effects for name in type(each).model_fields}
         return {name: value for name, value in fields.items() if isinstance(value, float)}
 
 
@@ -73,11 +73,11 @@ def _helbing_farkas_vicsek_2000(hidden: bool, group: int | None) -> tuple[Effect
 
 
 def _johansson_2007(repulsion: Callable[[bool], Effect]) -> Callable[[bool, int | None], tuple[Effect, ...]]:
-    def wishes(hidden: bool, group: int | None) -> tuple[Effect, ...]:
+    def behaviours(hidden: bool, group: int | None) -> tuple[Effect, ...]:
         wall = ObstacleRepulsion(acceleration=50.0, decay=0.2, bodies=False, radius=3.0, occluded=hidden)
         return (Driving(tau=0.5), repulsion(hidden), wall)
 
-    return wishes
+    return behaviours
 
 
 def _moussaid_2009(hidden: bool, group: int | None) -> tuple[Effect, ...]:
@@ -198,7 +198,7 @@ ALIASES = {
 """Shorter names."""
 
 
-def _model(name: str) -> Model:
+def _find_model(name: str) -> Model:
     full = ALIASES.get(name, name)
     if full not in PRESETS:
         raise ValueError(
@@ -214,12 +214,12 @@ def preset(name: str, group: int | None = None, contacts: bool = True, occluded:
     Contacts act between all groups: of two presets for two groups give one `contacts=False`. occluded: True if walls
     hide pedestrians and walls. Raise ValueError, in one line, for an unknown name.
     """
-    model = _model(name)
-    wishes = model.wishes(occluded, group)
+    model = _find_model(name)
+    behaviours = model.behaviours(occluded, group)
     bodies = model.bodies if contacts else ()
     if group is None:
-        return (*wishes, *bodies)
-    return (Steer(group=group, arbitration=Blend(), behaviours=wishes), *bodies)
+        return (*behaviours, *bodies)
+    return (Steer(group=group, arbitration=Blend(), behaviours=behaviours), *bodies)
 
 
 class Preset(Record):
@@ -239,7 +239,7 @@ class Preset(Record):
 
 
 class Origins(dict[KeyPath, list[int]]):
-    """Origins of the items in expanded lists of effects: for each list, the index of each item in the file."""
+    """For each list of effects with presets: the index in the file of each item of the expanded list."""
 
     def path(self, path: KeyPath) -> KeyPath:
         """Return the key path in the file."""
@@ -259,48 +259,48 @@ class Origins(dict[KeyPath, list[int]]):
         return text
 
 
-def expanded(data: Any) -> tuple[Any, Origins]:
+def expand_presets(data: Any) -> tuple[Any, Origins]:
     """Return the data of a file with every preset in a list of effects replaced by its effects, and their origins.
 
     Contact effects that two presets share are included once. Raise ValueError, beginning with the key path, if their
     contacts differ.
     """
     origins = Origins()
-    return _expanded(data, (), origins), origins
+    return _expand(data, (), origins), origins
 
 
-def _expanded(value: Any, path: KeyPath, origins: Origins) -> Any:
+def _expand(value: Any, path: KeyPath, origins: Origins) -> Any:
     if isinstance(value, dict):
-        return {key: _expanded(inner, (*path, key), origins) for key, inner in value.items()}
+        return {key: _expand(inner, (*path, key), origins) for key, inner in value.items()}
     if not isinstance(value, list):
         return value
     if not path or path[-1] != "effects" or not any(isinstance(item, dict) and "preset" in item for item in value):
-        return [_expanded(item, (*path, k), origins) for k, item in enumerate(value)]
+        return [_expand(item, (*path, k), origins) for k, item in enumerate(value)]
     out: list[Any] = []
     origins[path] = []
     bodies: list[Any] = []
     for k, item in enumerate(value):
-        found = [item]
+        effects = [item]
         if isinstance(item, dict) and "preset" in item:
-            found = [effect.model_dump(mode="json") for effect in _read(item, (*path, k)).effects()]
-            touching = [each for each in found if each["kind"] in ("contact", "obstacle_contact")]
-            if touching and bodies and touching != bodies:
+            effects = [effect.model_dump(mode="json") for effect in _read_preset(item, (*path, k)).effects()]
+            contacts = [each for each in effects if each["kind"] in ("contact", "obstacle_contact")]
+            if contacts and bodies and contacts != bodies:
                 raise ValueError(
                     f"{key_path((*path, k))}.preset = {item['preset']}: its contacts differ from those of a "
                     "preset before it; give contacts: false to one of them"
                 )
-            found = [each for each in found if each not in bodies]
-            bodies = touching or bodies
-        out += found
-        origins[path] += [k] * len(found)
+            effects = [each for each in effects if each not in bodies]
+            bodies = contacts or bodies
+        out += effects
+        origins[path] += [k] * len(effects)
     return out
 
 
-def _read(item: dict[str, Any], path: KeyPath) -> Preset:
+def _read_preset(item: dict[str, Any], path: KeyPath) -> Preset:
     """Return an item of a file as a preset; raise ValueError, beginning with its key path, if it is invalid."""
     try:
         out = Preset.model_validate(item, strict=True)
-        _model(out.preset)
+        _find_model(out.preset)
         return out
     except ValidationError as error:
         raise ValueError(f"{key_path(path)}.{refusals(error, Preset, item)[0]}") from None

@@ -93,15 +93,15 @@ TURNING = ("max_turn_rate", "banking")
 """Numbers that bodies have only if some group sets them."""
 
 
-def _demand_whole(name: str, value: object, least: int, most: int | None = None) -> None:
+def _check_integer(name: str, value: object, least: int, most: int | None = None) -> None:
     """Raise ValueError unless the value is an integer from `least` to `most`, and not a bool."""
-    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not whole or value < least or (most is not None and value > most):  # type: ignore[operator]  # whole is an int
+    is_integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not is_integer or value < least or (most is not None and value > most):  # type: ignore[operator]  # is_integer
         allowed = f"from {least} to {most}" if most is not None else f">= {least}"
         raise ValueError(f"{name} is {value!r}, must be an integer {allowed}")
 
 
-def _demand_one_piece(out: State) -> None:
+def _check_contiguous(out: State) -> None:
     """Raise ValueError if positions or velocities are not contiguous, as kernels need them."""
     for name, array in (("x", out.x), ("v", out.v)):
         if not array.flags.c_contiguous:
@@ -129,22 +129,22 @@ class Scene(Record):
     dtype: Literal["float64", "float32"] = Field(default="float64", description="precision of everything")
 
     @model_validator(mode="after")
-    def _consistent(self) -> Scene:
+    def _check_fields(self) -> Scene:
         """Check what involves several fields: equal dimensions, reach on a torus, memory; raise ValueError."""
         self._check_dimensions()
         check_places(self)
         if self.dtype == "float32":  # each record checks the bounds of float64 itself
             check_numbers(self, "float32")
-        listed: dict[str, tuple[Effect | Constraint | Member, ...]] = {
+        lists: dict[str, tuple[Effect | Constraint | Member, ...]] = {
             "effects": self.effects, "constraints": self.constraints, "population": self.population,
         }  # fmt: skip
-        for name, members in listed.items():
+        for name, members in lists.items():
             for k, member in enumerate(members):
                 try:
                     member.check(self)
                 except ValueError as error:
                     raise ValueError(f"{name}[{k}].{error}") from None
-        self._check_recalled()
+        self._check_inner_numbers()
         self._check_space()
         if self.dtype == "float32":
             self._check_counts()
@@ -161,19 +161,19 @@ class Scene(Record):
         check_lookahead(self)
         return self
 
-    def _check_recalled(self) -> None:
+    def _check_inner_numbers(self) -> None:
         """Raise ValueError for laws that read inner numbers which no effect keeps."""
-        kept = {name for effect in self.effects for each in (*effect.components, effect) for name in each.keeps}
+        kept_numbers = {name for effect in self.effects for each in (*effect.components, effect) for name in each.keeps}
         for k, effect in enumerate(self.effects):
             for each in (*effect.components, effect):
-                if missing := [name for name in each.required_inner if name not in kept]:
+                if missing := [name for name in each.required_inner if name not in kept_numbers]:
                     keepers = sorted(kind for kind, e in EFFECTS.items() if missing[0] in e.keeps)
                     raise ValueError(
                         f"effects[{k}].kind = {each.kind}: needs {missing[0]!r}, which no effect of this scene keeps; "
                         f"{' or '.join(keepers) or 'none'} does"
                     )
         for k, group in enumerate(self.groups):
-            if group.appearance is not None and group.appearance.of not in {None, *kept}:
+            if group.appearance is not None and group.appearance.of not in {None, *kept_numbers}:
                 of = group.appearance.of
                 raise ValueError(f"groups[{k}].appearance.of = {of!r}: no effect of this scene keeps it")
 
@@ -260,10 +260,10 @@ class Scene(Record):
     @functools.cached_property
     def living(self) -> tuple[int, ...]:
         """Number of agents of each group that live at the start: its first ones."""
-        fed = (any(member.feeds(k) for member in self.population) for k in range(len(self.groups)))
+        fed_groups = (any(member.feeds(k) for member in self.population) for k in range(len(self.groups)))
         return tuple(
-            group.alive if group.alive is not None else (0 if by else group.size)
-            for group, by in zip(self.groups, fed, strict=True)
+            group.alive if group.alive is not None else (0 if is_fed else group.size)
+            for group, is_fed in zip(self.groups, fed_groups, strict=True)
         )
 
     @functools.cached_property
@@ -290,13 +290,13 @@ class Scene(Record):
         """Return the memory of one world's state and its scratch, in bytes, before anything is allocated."""
         real = 8 if self.dtype == "float64" else 4
         d, parts = self.dimension, self.parts
-        reals, whole = 2 * d + 5, 1  # positions, velocities, bodies; alive flags
+        reals, other_bytes = 2 * d + 5, 1  # positions, velocities, bodies; alive flags
         reals += parts.frame_rows + len(parts.inner)
         if self.constraints or self.population:
             reals += 4 * d + sum(constraint.numbers(self) for constraint in self.constraints)
         if self.population:
-            whole += 2 * 3 * 8 + 4 * POPULATION_NUMBERS  # identity, times, and their values before the step
-        return self.agents * (reals * real + whole) + scratch_bytes(parts, self.agents)
+            other_bytes += 2 * 3 * 8 + 4 * POPULATION_NUMBERS  # identity, times, and their values before the step
+        return self.agents * (reals * real + other_bytes) + scratch_bytes(parts, self.agents)
 
     @functools.cached_property
     def body(self) -> Body:
@@ -307,13 +307,13 @@ class Scene(Record):
             return np.repeat(np.array(values, self.dtype), [g.size for g in self.groups])
 
         mass = all_masses(self.groups, self.dimension).astype(self.dtype)
-        nobody = np.zeros(0, self.dtype)
-        turning = (per_agent(name) if name in self.parts.frame_numbers else nobody for name in TURNING)
+        empty = np.zeros(0, self.dtype)
+        turn_limits = (per_agent(name) if name in self.parts.frame_numbers else empty for name in TURNING)
         radius, fastest, pace = (
             np.concatenate([getattr(group, name) for group in self.groups]).astype(self.dtype)
             for name in ("radii", "max_speeds", "desired_speeds")
         )
-        return Body(mass, radius, fastest, per_agent("max_force"), pace, *turning)
+        return Body(mass, radius, fastest, per_agent("max_force"), pace, *turn_limits)
 
     @functools.cached_property
     def parts(self) -> KernelPlan:
@@ -321,19 +321,20 @@ class Scene(Record):
         sorts = self.agents >= FEWEST_AGENTS
         crowded = self.agents > MOST_DIRECT
         effects = flatten_effects(self.effects)
-        walled = any(isinstance(constraint, Collisions) and constraint.obstacles for constraint in self.constraints)
-        space = Plane() if walled and isinstance(self.space, Box) else self.space  # its walls are then obstacles
+        solid_walls = any(isinstance(each, Collisions) and each.obstacles for each in self.constraints)
+        space = Plane() if solid_walls and isinstance(self.space, Box) else self.space  # its walls are then obstacles
         return KernelPlan(
             self.dimension, space, effects, self.integrator, self.dtype, sorts, crowded=crowded,
             oriented=any(group.keeps_heading for group in self.groups),
             turns=any(group.max_turn_rate is not None for group in self.groups),
             leans=any(group.banking is not None for group in self.groups),
-            starts=self.starts, shapes=self.shapes, circles=len(self.circles), touching=1.001 * self.touching or 1e-300,
+            starts=self.starts, shapes=self.shapes, circles=len(self.circles),
+            touching=1.001 * self.contact_distance or 1e-300,
             tables=tuple(self.table_of(effect) for effect in effects if effect.tabled),
         )  # fmt: skip
 
     @property
-    def touching(self) -> float:
+    def contact_distance(self) -> float:
         """Sum of the two largest radii, m: agents farther apart do not touch."""
         return sum(sorted(group.widest for group in self.groups for _ in range(min(group.size, 2)))[-2:])
 
@@ -387,8 +388,8 @@ class Scene(Record):
 
     def start(self, seed: int, worlds: int = 1) -> State:
         """Return the initial state: world k is drawn from seed + k, independent of the batch."""
-        _demand_whole("seed", seed, 0, MASK)
-        _demand_whole("worlds", worlds, 1)
+        _check_integer("seed", seed, 0, MASK)
+        _check_integer("worlds", worlds, 1)
         if self.bytes_per_world() * worlds > MEMORY_LIMIT:
             need = self.bytes_per_world() * worlds / 2**30
             most = MEMORY_LIMIT / 2**30
@@ -428,25 +429,25 @@ class Scene(Record):
         if out is None:
             out = state.copy()
         else:
-            _demand_one_piece(out)
+            _check_contiguous(out)
             if out is not state:
                 out.copy_from(state)
         world, agent, reason = self.stepper.advance(out, forces, steps)
         if world >= 0:
-            raise self._diverged(out, forces, world, agent, steps, reason)
+            raise self._divergence_error(out, forces, world, agent, steps, reason)
         return out
 
-    def _diverged(
+    def _divergence_error(
         self, state: State, drive: Floats, world: int, agent: int, steps: int, reason: str
     ) -> SimulationDiverged:
         """Return the error for a world that could not make its steps; its last finite state is computed again."""
-        alone = state.worlds([world])
-        push = drive[:, world : world + 1].copy() if drive.shape[1] else drive
+        single = state.worlds([world])
+        single_drive = drive[:, world : world + 1].copy() if drive.shape[1] else drive
         done = 0
-        while done < steps and (bad := self.stepper.advance(alone, push, 1))[0] < 0:
+        while done < steps and (failure := self.stepper.advance(single, single_drive, 1))[0] < 0:
             done += 1
-        agent = bad[1] if done < steps else agent
-        last, effect = int(alone.tick[0]) + 1, self._blamed(alone, agent)
+        agent = failure[1] if done < steps else agent
+        last, effect = int(single.tick[0]) + 1, self._strongest_effect(single, agent)
         if isinstance(self.integrator, Adaptive):
             most, tolerance = self.integrator.most, self.integrator.tolerance
             reason = f"not finite, or not within tolerance = {tolerance:g} by {most:,} steps of its own"
@@ -454,21 +455,21 @@ class Scene(Record):
         error.state = state
         return error
 
-    def _blamed(self, state: State, agent: int) -> str | None:
+    def _strongest_effect(self, state: State, agent: int) -> str | None:
         """Return the kind of the effect that accelerates an agent most, or by a value that is not finite.
 
         Positions and velocities are clipped: at very large ones an idle effect is not finite either (0 x infinity).
         """
-        found: list[tuple[float, str]] = []
+        sizes: list[tuple[float, str]] = []
         most = float(np.finfo(self.dtype).max) ** 0.25
-        near = dataclasses.replace(state, x=np.clip(state.x, -most, most), v=np.clip(state.v, -most, most))
+        clipped = dataclasses.replace(state, x=np.clip(state.x, -most, most), v=np.clip(state.v, -most, most))
         for k, effect in enumerate(self.effects):
             others = tuple(e if j == k else e.idle_copy() for j, e in enumerate(self.effects))
             # nothing is stepped: with a method without a limit no dt is warned of or rejected
-            alone = self.model_copy(update={"effects": others, "integrator": ImplicitEuler()})
-            size = float(np.abs(alone.acceleration(near)[0, agent]).max())
-            found.append((size if math.isfinite(size) else math.inf, effect.kind))
-        return max(found)[1] if found and max(found)[0] > 0 else None
+            single = self.model_copy(update={"effects": others, "integrator": ImplicitEuler()})
+            size = float(np.abs(single.acceleration(clipped)[0, agent]).max())
+            sizes.append((size if math.isfinite(size) else math.inf, effect.kind))
+        return max(sizes)[1] if sizes and max(sizes)[0] > 0 else None
 
     def acceleration(self, state: State, drive: ArrayLike | None = None) -> Floats:
         """Return the acceleration of every agent in this state, (B, N, D) m/s^2, without moving it.
@@ -488,15 +489,15 @@ class Scene(Record):
         b, n, d = state.shape
         acc = np.empty((d, b, n), self.dtype)
         flow = np.empty((d, b, n) if self.parts.flows else (d, 0, 0), self.dtype)
-        given = np.asarray(state.time if times is None else times, float)
-        if given.shape not in ((), (b,)) or not np.isfinite(given).all():
+        all_times = np.asarray(state.time if times is None else times, float)
+        if all_times.shape not in ((), (b,)) or not np.isfinite(all_times).all():
             raise ValueError(f"times is {times!r}, must be a finite number for each of {b} worlds, or one for all")
-        when, x = np.ascontiguousarray(np.broadcast_to(given, b), self.dtype), state.x
+        time, x = np.ascontiguousarray(np.broadcast_to(all_times, b), self.dtype), state.x
         if self.parts.confines:  # as at the start of a step; a given state may be outside the box
             with np.errstate(invalid="ignore"):  # an infinite position has no image, and is no neighbour
                 x = np.ascontiguousarray(self.space.wrap(state.pos).transpose(2, 0, 1), self.dtype)
         self.stepper.accelerate(
-            worlds_of(state)._replace(x=x), self._drive(drive, state), self.stepper.params, when, acc, flow,
+            worlds_of(state)._replace(x=x), self._drive(drive, state), self.stepper.params, time, acc, flow,
             self.stepper.workspaces(1, 1)[0].of(0, scratch_record(self.stepper.plain_parts)),
         )  # fmt: skip
         return acc.transpose(1, 2, 0), flow.transpose(1, 2, 0) if self.parts.flows else None
@@ -523,7 +524,7 @@ class Scene(Record):
                 f"the state counts steps of {state.dt:g} s, but this scene makes steps of {self.dt:g} s; "
                 "state.with_dt(scene.dt) changes its clock"
             )
-        _demand_whole("steps", steps, 0)
+        _check_integer("steps", steps, 0)
 
     def run(self, state: State, steps: int) -> State:
         """Return the state after `steps` steps."""
@@ -532,13 +533,13 @@ class Scene(Record):
     def _drive(self, drive: ArrayLike | None, state: State) -> Floats:
         if drive is None:
             return np.zeros((self.dimension, 0, 0), self.dtype)
-        given = np.asarray(drive, self.dtype)
-        if given.shape != state.shape:
-            raise ValueError(f"drive has shape {given.shape}, but the state has (B, N, D) = {state.shape}")
-        if not np.isfinite(given).all():
-            world, agent, axis = (int(k) for k in np.argwhere(~np.isfinite(given))[0])
-            raise ValueError(f"drive of world {world}, agent {agent}, axis {axis} is {given[world, agent, axis]}")
-        return np.ascontiguousarray(given.transpose(2, 0, 1))
+        forces = np.asarray(drive, self.dtype)
+        if forces.shape != state.shape:
+            raise ValueError(f"drive has shape {forces.shape}, but the state has (B, N, D) = {state.shape}")
+        if not np.isfinite(forces).all():
+            world, agent, axis = (int(k) for k in np.argwhere(~np.isfinite(forces))[0])
+            raise ValueError(f"drive of world {world}, agent {agent}, axis {axis} is {forces[world, agent, axis]}")
+        return np.ascontiguousarray(forces.transpose(2, 0, 1))
 
     # --- looking at it ----------------------------------------------------------------------------------------------
 

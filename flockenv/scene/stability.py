@@ -85,24 +85,25 @@ class Suggestion(NamedTuple):
     damping: float  # 1/s, of velocity, there
 
 
-def amplification(method: Integrator, y: Floats, zeta: float, told: float = 0.0) -> Floats:
+def amplification(method: Integrator, y: Floats, zeta: float, drag_zeta: float = 0.0) -> Floats:
     """Return the amplification matrices of (x, v) in one step of h = 1 s, (K, 2, 2), for oscillators of h w = y, (K,).
 
-    zeta, told: damping as fractions of critical damping; `told` is passed to a method that integrates drag separately.
+    zeta, drag_zeta: damping as fractions of critical damping; `drag_zeta` belongs to drag, which some methods integrate
+    separately.
     """
     y = np.asarray(y, float)
     state = blank(1, len(y), 2, 0, 1.0)
     state.x[0], state.v[1] = 1.0, 1.0  # two initial states at once: the axes are independent
-    own = told if method.splits_drag else 0.0
-    square, drag = (y * y)[:, None], (2 * (zeta + told - own) * y)[:, None]
-    after = method(lambda x, v, t: -square * x - drag * v, state, 1.0, drag=np.tile(2 * own * y, 2))
+    separate = drag_zeta if method.splits_drag else 0.0
+    square, drag = (y * y)[:, None], (2 * (zeta + drag_zeta - separate) * y)[:, None]
+    after = method(lambda x, v, t: -square * x - drag * v, state, 1.0, drag=np.tile(2 * separate * y, 2))
     return np.stack([after.pos[0], after.vel[0]], axis=1)  # (K, output, input)
 
 
-def growth(method: Integrator, y: Floats, zeta: float, told: float = 0.0) -> Floats:
+def growth(method: Integrator, y: Floats, zeta: float, drag_zeta: float = 0.0) -> Floats:
     """Return the largest factor of the amplitude in one step, (K,): the spectral radius."""
     with np.errstate(all="ignore"):
-        matrices = amplification(method, y, zeta, told)
+        matrices = amplification(method, y, zeta, drag_zeta)
         matrices[~np.isfinite(matrices)] = 1e300
         # in units in which position and velocity have equal weight
         scaled = matrices * np.stack(
@@ -112,16 +113,16 @@ def growth(method: Integrator, y: Floats, zeta: float, told: float = 0.0) -> Flo
 
 
 @functools.lru_cache(maxsize=1024)
-def limit(method: Integrator, zeta: float, told: float = 0.0) -> float:
+def limit(method: Integrator, zeta: float, drag_zeta: float = 0.0) -> float:
     """Return the largest stable h w, for damping as fractions of critical damping (see amplification).
 
     inf: any h w is stable; 0: none is, as there is no damping and the method grows for arbitrarily small h w.
     """
     if method.solves or method.adaptive:
         return math.inf
-    if zeta <= 0 and told <= 0 and (growth(method, np.array(NEAR), 0.0) > 1 + ROUNDING).all():
+    if zeta <= 0 and drag_zeta <= 0 and (growth(method, np.array(NEAR), 0.0) > 1 + ROUNDING).all():
         return 0.0
-    return _first_unstable(lambda y: growth(method, y, zeta, told))
+    return _first_unstable(lambda y: growth(method, y, zeta, drag_zeta))
 
 
 @functools.lru_cache(maxsize=64)
@@ -130,19 +131,19 @@ def drag_limit(method: Integrator) -> float:
     if method.solves or method.adaptive:
         return math.inf
 
-    def slowed(z: Floats) -> Floats:
+    def speed_factor(z: Floats) -> Floats:
         state = blank(1, len(z), 2, 0, 1.0)
         state.v[...] = 1.0
         return np.asarray(np.abs(method(lambda x, v, t: -z[:, None] * v, state, 1.0).vel[0, :, 0]))
 
-    return _first_unstable(slowed)
+    return _first_unstable(speed_factor)
 
 
-def _first_unstable(grown: Callable[[Floats], Floats]) -> float:
+def _first_unstable(growth_at: Callable[[Floats], Floats]) -> float:
     """Return the smallest argument at which the amplitude grows in a step."""
     y = np.geomspace(SMALLEST, LARGEST, POINTS)
     for _ in range(ROUNDS):
-        grows = grown(y) > 1 + ROUNDING
+        grows = growth_at(y) > 1 + ROUNDING
         if not grows.any():
             return math.inf
         first = int(np.argmax(grows))
@@ -157,11 +158,11 @@ class _Rates(NamedTuple):
 
     square: Floats  # w^2, 1/s^2
     damping: Floats  # 1/s
-    told: Floats  # 1/s, damping that the method integrates separately
+    drag: Floats  # 1/s, damping that the method integrates separately
 
     def of(self, agent: int) -> tuple[float, float, float]:
         """Return the rates of one agent."""
-        return float(self.square[agent]), float(self.damping[agent]), float(self.told[agent])
+        return float(self.square[agent]), float(self.damping[agent]), float(self.drag[agent])
 
 
 def suggest_dt(scene: SceneView) -> Suggestion:
@@ -172,29 +173,29 @@ def suggest_dt(scene: SceneView) -> Suggestion:
     that needs damping to be stable (explicit Euler, Heun, midpoint), less damped motions may be unstable, such as
     springs across their length.
     """
-    return _suggested(scene, _found(scene))
+    return _suggest(scene, _effect_rates(scene))
 
 
-def _suggested(scene: SceneView, found: list[tuple[Effect, _Rates]]) -> Suggestion:
+def _suggest(scene: SceneView, rates_of_effects: list[tuple[Effect, _Rates]]) -> Suggestion:
     """Return the largest stable step under some effects of a scene."""
-    if not found:
+    if not rates_of_effects:
         return Suggestion(math.inf, None, None, 0.0, 0.0)
-    whole = _Rates(*(sum(rates[k] for _, rates in found) + np.zeros(scene.agents) for k in range(3)))
-    dt, agent = _tightest(scene.integrator, whole)
+    total = _Rates(*(sum(rates[k] for _, rates in rates_of_effects) + np.zeros(scene.agents) for k in range(3)))
+    dt, agent = _smallest_limit(scene.integrator, total)
     if not math.isfinite(dt):
-        most = (float(np.sqrt(whole.square.max())), float((whole.damping + whole.told).max()))
+        most = (float(np.sqrt(total.square.max())), float((total.damping + total.drag).max()))
         return Suggestion(math.inf, None, None, *most)
-    alone = [(*_urgency(scene.integrator, *rates.of(agent)), effect.kind) for effect, rates in found]
-    square, damping, told = whole.of(agent)
-    return Suggestion(dt, min(alone)[-1], agent, math.sqrt(square), damping + told)
+    alone = [(*_urgency(scene.integrator, *rates.of(agent)), effect.kind) for effect, rates in rates_of_effects]
+    square, damping, drag = total.of(agent)
+    return Suggestion(dt, min(alone)[-1], agent, math.sqrt(square), damping + drag)
 
 
-def _urgency(method: Integrator, square: float, damping: float, told: float) -> tuple[float, float]:
+def _urgency(method: Integrator, square: float, damping: float, drag: float) -> tuple[float, float]:
     """Return the largest stable step of one oscillator, and minus its rates: of equal steps the fastest comes first."""
-    return _limit_of(method, square, damping, told), -max(math.sqrt(square), damping + told)
+    return _stable_step(method, square, damping, drag), -max(math.sqrt(square), damping + drag)
 
 
-def _found(scene: SceneView) -> list[tuple[Effect, _Rates]]:
+def _effect_rates(scene: SceneView) -> list[tuple[Effect, _Rates]]:
     """Return the effects with a known stiffness, and their rates."""
     out = []
     for k, effect in enumerate(scene.effects):
@@ -205,13 +206,13 @@ def _found(scene: SceneView) -> list[tuple[Effect, _Rates]]:
             raise ValueError(f"effects[{k}].{error}") from None
         if found is not None:
             square, damping = found
-            none = np.zeros(len(damping))
-            own = scene.integrator.splits_drag and effect.linear_drag is not None
-            out.append((effect, _Rates(square, none, damping) if own else _Rates(square, damping, none)))
+            zeros = np.zeros(len(damping))
+            separate = scene.integrator.splits_drag and effect.linear_drag is not None
+            out.append((effect, _Rates(square, zeros, damping) if separate else _Rates(square, damping, zeros)))
     return out
 
 
-def _tightest(method: Integrator, rates: _Rates) -> tuple[float, int]:
+def _smallest_limit(method: Integrator, rates: _Rates) -> tuple[float, int]:
     """Return the smallest limit of all agents, s, and the agent; of many different agents the FASTEST are tested."""
     table = np.stack(rates, axis=1)
     begins = np.flatnonzero(np.r_[True, (table[1:] != table[:-1]).any(axis=1)])  # of runs of equal agents
@@ -222,7 +223,7 @@ def _tightest(method: Integrator, rates: _Rates) -> tuple[float, int]:
     return dt, agent
 
 
-def _limit_of(method: Integrator, square: float, damping: float, told: float) -> float:
+def _stable_step(method: Integrator, square: float, damping: float, drag: float) -> float:
     """Return the largest stable step of one oscillator, s."""
     if square <= 0 and damping <= 0:
         return math.inf
@@ -230,8 +231,8 @@ def _limit_of(method: Integrator, square: float, damping: float, told: float) ->
         return drag_limit(method) / damping
     frequency = math.sqrt(square)
     # to a few digits, so that agents of nearly the same damping are tested once
-    zeta, own = (float(f"{rate / (2 * frequency):.4g}") for rate in (damping, told))
-    return limit(method, zeta, own) / frequency
+    zeta, drag_zeta = (float(f"{rate / (2 * frequency):.4g}") for rate in (damping, drag))
+    return limit(method, zeta, drag_zeta) / frequency
 
 
 def check_dt(scene: SceneView) -> None:
@@ -239,42 +240,43 @@ def check_dt(scene: SceneView) -> None:
 
     Effects that act at times, or with bounded forces, do not make it blow up: see `Effect.always`.
     """
-    found = suggest_dt(scene)
-    if scene.dt <= found.dt:
+    suggestion = suggest_dt(scene)
+    if scene.dt <= suggestion.dt:
         return
-    always = _suggested(scene, [(effect, rates) for effect, rates in _found(scene) if effect.always])
+    always = _suggest(scene, [(effect, rates) for effect, rates in _effect_rates(scene) if effect.always])
     if scene.dt > CERTAIN * always.dt and _blows_up(scene, always):
-        raise ValueError(_too_long(scene, always))
-    warnings.warn(_too_long(scene, found), UnstableStepWarning, stacklevel=2)
+        raise ValueError(_limit_message(scene, always))
+    warnings.warn(_limit_message(scene, suggestion), UnstableStepWarning, stacklevel=2)
 
 
-def _too_long(scene: SceneView, found: Suggestion) -> str:
+def _limit_message(scene: SceneView, suggestion: Suggestion) -> str:
     """Return a line with the largest stable step and what sets it."""
-    kind, text = scene.integrator.kind, f"{found.frequency:.4g} rad/s, {found.damping:.4g} 1/s at agent {found.agent}"
-    if found.dt == 0:
+    kind = scene.integrator.kind
+    text = f"{suggestion.frequency:.4g} rad/s, {suggestion.damping:.4g} 1/s at agent {suggestion.agent}"
+    if suggestion.dt == 0:
         limit_text = (
             f"no step is stable, for nothing damps it (at this one the amplitude grows e-fold in "
-            f"{_growing(scene, found):.3g} s), so take another integrator ({STEADY}), or add damping"
+            f"{_growth_time(scene, suggestion):.3g} s), so take another integrator ({STEADY}), or add damping"
         )
-    elif found.dt * max(found.frequency, found.damping) < WEAK or found.dt < 1e-2 * scene.dt:
-        limit_text = f"at most {found.dt:.3g} s is stable, so take another integrator"
+    elif suggestion.dt * max(suggestion.frequency, suggestion.damping) < WEAK or suggestion.dt < 1e-2 * scene.dt:
+        limit_text = f"at most {suggestion.dt:.3g} s is stable, so take another integrator"
     else:
-        limit_text = f"at most {found.dt:.4g} s is stable"
-    return f"dt = {scene.dt:g} s: {kind} with {found.effect} ({text}): {limit_text}"
+        limit_text = f"at most {suggestion.dt:.4g} s is stable"
+    return f"dt = {scene.dt:g} s: {kind} with {suggestion.effect} ({text}): {limit_text}"
 
 
-def _growing(scene: SceneView, found: Suggestion) -> float:
+def _growth_time(scene: SceneView, suggestion: Suggestion) -> float:
     """Return the time in which an undamped oscillation grows e-fold at the scene's dt, s; inf if rounding hides it."""
-    rate = math.log(float(growth(scene.integrator, np.array([scene.dt * found.frequency]), 0.0)[0]))
+    rate = math.log(float(growth(scene.integrator, np.array([scene.dt * suggestion.frequency]), 0.0)[0]))
     return scene.dt / rate if rate > 0 else math.inf
 
 
-def _blows_up(scene: SceneView, found: Suggestion) -> bool:
+def _blows_up(scene: SceneView, suggestion: Suggestion) -> bool:
     """Return True if the amplitude grows a hundredfold in a hundred steps, even with rates far below their bounds."""
-    y = np.array([scene.dt * found.frequency / CERTAIN])
-    if found.damping > 1e4 * found.frequency:
+    y = np.array([scene.dt * suggestion.frequency / CERTAIN])
+    if suggestion.damping > 1e4 * suggestion.frequency:
         return True  # drag alone, whose rates are exact
-    zeta = found.damping / (2 * found.frequency)
+    zeta = suggestion.damping / (2 * suggestion.frequency)
     slowest = min(growth(scene.integrator, y, *shares)[0] for shares in ((zeta, 0.0), (0.0, zeta)))
     return bool(slowest > 100 ** (1 / 100))
 
@@ -314,18 +316,19 @@ def check_contact(scene: SceneView) -> None:
             message = (
                 f"dt = {scene.dt:g} s: effects[{k}].{effect.kind} lasts {lasts:.3g} s at agent {agent}; bodies come "
                 f"out of it at the right speed with {scene.integrator.kind} if dt is at most {most:.3g} s"
-                f"{_what_comes_of_it(scene, float(frequency[agent]), agent)}"
+                f"{_describe_consequence(scene, float(frequency[agent]), agent)}"
             )
             warnings.warn(message, CoarseContactWarning, stacklevel=2)
 
 
-def _what_comes_of_it(scene: SceneView, frequency: float, agent: int) -> str:
+def _describe_consequence(scene: SceneView, frequency: float, agent: int) -> str:
     """Return the change of speed in an undamped contact at this dt, and the dt above which it is unstable, in words."""
     method, y = scene.integrator, scene.dt * frequency
     if method.adaptive:
         return ""
-    rates = [each.of(agent) for _, each in _found(scene)]
-    most = _limit_of(method, frequency**2, sum(damping for _, damping, _ in rates), sum(told for _, _, told in rates))
+    rates = [each.of(agent) for _, each in _effect_rates(scene)]
+    damping, drag = sum(each[1] for each in rates), sum(each[2] for each in rates)
+    most = _stable_step(method, frequency**2, damping, drag)
     back = float(growth(method, np.array([y]), 0.0)[0]) ** (math.pi / y)
     text = f"; at this dt {back:.3g} times as fast as they went in" if abs(math.log(back)) > math.log(OFF) else ""
     if most == 0:
@@ -336,23 +339,23 @@ def _what_comes_of_it(scene: SceneView, frequency: float, agent: int) -> str:
 def check_lookahead(scene: SceneView) -> None:
     """Warn if a lookahead is shorter than the stopping distance V^2 m/(2 F) plus the radius."""
     for k, effect in enumerate(scene.effects):
-        several = [(f"effects[{k}].behaviours[{j}]", each) for j, each in enumerate(effect.components)]
-        only = getattr(effect, "group", None) if several else None
-        for name, each in several or [(f"effects[{k}]", effect)]:
+        behaviours = [(f"effects[{k}].behaviours[{j}]", each) for j, each in enumerate(effect.components)]
+        group_index = getattr(effect, "group", None) if behaviours else None
+        for name, each in behaviours or [(f"effects[{k}]", effect)]:
             for g, group in enumerate(scene.groups):
-                if only in (None, g):
-                    _warn_late(name, each, g, group)
+                if group_index in (None, g):
+                    _warn_short_lookahead(name, each, g, group)
 
 
-def _warn_late(name: str, effect: Effect, g: int, group: Group) -> None:
+def _warn_short_lookahead(name: str, effect: Effect, g: int, group: Group) -> None:
     """Warn if one effect detects too late for one group; skipped without a largest speed or force."""
     fastest, strongest = group.fastest, group.max_force
-    if fastest is None or not strongest or (sees := effect.lookahead(fastest)) is None:
+    if fastest is None or not strongest or (seen := effect.lookahead(fastest)) is None:
         return
-    needs = fastest**2 * group.heaviest / (2 * strongest) + group.widest
-    if sees < needs:
+    stopping = fastest**2 * group.heaviest / (2 * strongest) + group.widest
+    if seen < stopping:
         message = (
-            f"{name}.horizon = {sees / fastest:g}: groups[{g}] at {fastest:g} m/s sees {sees:.3g} m ahead, and needs "
-            f"{needs:.3g} m to stop (V^2 m/(2 max_force) + radius); at least {needs / fastest:.3g} s is enough"
+            f"{name}.horizon = {seen / fastest:g}: groups[{g}] at {fastest:g} m/s sees {seen:.3g} m ahead, and needs "
+            f"{stopping:.3g} m to stop (V^2 m/(2 max_force) + radius); at least {stopping / fastest:.3g} s is enough"
         )
         warnings.warn(message, LookaheadWarning, stacklevel=2)

@@ -36,7 +36,7 @@ class View:
 
     def snapshot(self, state: State, world: int = 0, title: str = "") -> Snapshot:
         """Return one world at one instant, for pictures."""
-        low, high = self._view(state, world)
+        low, high = self._region(state, world)
         return Snapshot(
             time=float(state.time[world]), pos=state.pos[world], vel=state.vel[world], alive=state.alive[world],
             heading=state.heading[world] if len(state.frame) else None,
@@ -48,19 +48,19 @@ class View:
             outlines=self.outlines(low, high, float(state.time[world])),
             looks=self.looks, look=self.look if self.looks else None,
             age=state.age[world] if self.scene.population else None,
-            identity=state.identity[world] if self.scene.population else None, inner=self.shown(state, world),
+            identity=state.identity[world] if self.scene.population else None, inner=self.inner_numbers(state, world),
         )  # fmt: skip
 
-    def shown(self, state: State, world: int = 0) -> NDArray[np.float64] | None:
+    def numbers(self, state: State, world: int = 0) -> NDArray[np.float64] | None:
         """Return the inner number of every agent that pictures show, (N,), set by its appearance; None without one."""
         if not any(look.by == "inner" for look in self.looks):
             return None
-        shown = np.zeros(self.scene.agents)
+        numbers = np.zeros(self.scene.agents)
         for k, group in enumerate(self.scene.groups):
             if group.appearance is not None and group.appearance.of is not None:
-                mine = slice(self.scene.starts[k], self.scene.starts[k + 1])
-                shown[mine] = self.scene.inner(state, group.appearance.of)[world, mine]
-        return shown
+                slots = slice(self.scene.starts[k], self.scene.starts[k + 1])
+                numbers[slots] = self.scene.inner(state, group.appearance.of)[world, slots]
+        return numbers
 
     @property
     def looks(self) -> tuple[Appearance, ...]:
@@ -70,8 +70,8 @@ class View:
     @property
     def look(self) -> NDArray[np.int32]:
         """Index into `looks` of every agent, (N,); -1: no appearance."""
-        dressed = [group.appearance is not None for group in self.scene.groups]
-        number = np.where(dressed, np.cumsum(dressed) - 1, -1)
+        has_appearance = [group.appearance is not None for group in self.scene.groups]
+        number = np.where(has_appearance, np.cumsum(has_appearance) - 1, -1)
         return np.repeat(number, [group.size for group in self.scene.groups]).astype(np.int32)
 
     def outlines(
@@ -91,7 +91,7 @@ class View:
             return shift
         return np.asarray(self.scene.space.wrap(np.array(shape.anchor) + shift)) - shape.anchor
 
-    def _view(self, state: State, world: int) -> tuple[Sequence[float], Sequence[float]]:
+    def _region(self, state: State, world: int) -> tuple[Sequence[float], Sequence[float]]:
         """Return the region to show: the space, or the bounds of all agents and obstacles."""
         if not isinstance(self.scene.space, Plane):
             return (0.0,) * self.scene.dimension, self.scene.space.extent(self.scene.dimension)
@@ -99,29 +99,29 @@ class View:
         pos = pos[living] if self.scene.population and living.any() else pos  # empty slots have no position
         margin = 1.0 + 0.05 * float(np.ptp(pos, axis=0).max())
         low, high = pos.min(axis=0) - margin, pos.max(axis=0) + margin
-        every = np.concatenate([low[None], high[None], *self.extremes(float(state.time[world]))])
-        return tuple(every.min(axis=0)), tuple(every.max(axis=0))
+        points = np.concatenate([low[None], high[None], *self.extremes(float(state.time[world]))])
+        return tuple(points.min(axis=0)), tuple(points.max(axis=0))
 
     def extremes(self, *times: float) -> list[Floats]:
         """Return points that pictures at some times, s, must show: of shapes, emitters, and paths of behaviours."""
-        tracks = [np.asarray(track) + side for track, radius in self._tracks for side in (-radius, radius)]
-        shown = [shape.extremes + shape.shift(time) for shape in self.scene.shapes for time in times]
+        paths = [np.asarray(track) + side for track, radius in self._paths for side in (-radius, radius)]
+        corners = [shape.extremes + shape.shift(time) for shape in self.scene.shapes for time in times]
         places = [member.place.extremes for member in self.scene.population if isinstance(member, Emitter)]
-        return [*shown, *places, *tracks]
+        return [*corners, *places, *paths]
 
     @functools.cached_property
-    def _tracks(self) -> tuple[tuple[tuple[tuple[float, ...], ...], float], ...]:
+    def _paths(self) -> tuple[tuple[tuple[tuple[float, ...], ...], float], ...]:
         """The paths of steering behaviours, each once."""
-        ways = dict.fromkeys(effect.path_to_draw(self.scene) for effect in self.scene.parts.effects if effect.steering)
-        return tuple(way for way in ways if way is not None)
+        paths = dict.fromkeys(effect.path_to_draw(self.scene) for effect in self.scene.parts.effects if effect.steering)
+        return tuple(path for path in paths if path is not None)
 
     @property
     def marks(self) -> tuple[Mark, ...]:
         """The paths and targets of steering behaviours."""
         still, size = np.zeros(self.scene.dimension), 2 * max(group.widest for group in self.scene.groups)
-        wishes = [effect for effect in self.scene.parts.effects if effect.steering]
-        places = [getattr(wish, name) for wish in wishes if wish.heads_for for name in wish.places]
+        behaviours = [effect for effect in self.scene.parts.effects if effect.steering]
+        places = [getattr(each, name) for each in behaviours if each.heads_for for name in each.places]
         return (
-            *(Mark("way", np.array(at), still, radius) for track, radius in self._tracks for at in track),
+            *(Mark("way", np.array(at), still, radius) for track, radius in self._paths for at in track),
             *(Mark("goal", np.array(place), still, size) for place in places if place is not None),
         )

@@ -22,7 +22,7 @@ from pydantic import BaseModel, ValidationError
 
 from flockenv.core.errors import KeyPath, key_path, nearest, parse_key_path, printable, refusals
 from flockenv.scene import Scene
-from flockenv.scene.presets import Preset, expanded
+from flockenv.scene.presets import Preset, expand_presets
 
 __all__ = ["MAX_BYTES", "ConfigError", "dump", "dump_scene", "load", "load_scene", "schema"]
 
@@ -49,17 +49,17 @@ def dump_scene(scene: Scene, models: Sequence[str] = (), brief: bool = False) ->
 
     models: presets to write by name, if all their effects are consecutive in the scene; brief: see `dump`.
     """
-    return dump(scene, brief, {"effects": functools.partial(_by_name, scene, models)} if models else {})
+    return dump(scene, brief, {"effects": functools.partial(_name_presets, scene, models)} if models else {})
 
 
-def _by_name(scene: Scene, models: Sequence[str], effects: list[Any]) -> list[Any]:
+def _name_presets(scene: Scene, models: Sequence[str], effects: list[Any]) -> list[Any]:
     """Return the written effects of a scene, with those of presets replaced by the preset's name."""
     out = list(effects)
     for name in models:
-        stands_for = Preset(preset=name).effects()
-        for k in range(len(out) - len(stands_for), -1, -1):
-            if scene.effects[k : k + len(stands_for)] == stands_for:
-                out[k : k + len(stands_for)] = [{"preset": name}]
+        members = Preset(preset=name).effects()
+        for k in range(len(out) - len(members), -1, -1):
+            if scene.effects[k : k + len(members)] == members:
+                out[k : k + len(members)] = [{"preset": name}]
                 break
     return out
 
@@ -83,7 +83,7 @@ def load(source: str | Path, model: type[M]) -> M:
     name, text = _read(source)
     reader = _Reader(name, text)
     try:
-        data, origins = expanded(reader.document())
+        data, origins = expand_presets(reader.document())
     except ConfigError:
         raise
     except ValueError as error:
@@ -110,7 +110,7 @@ def dump(
     that differ from their defaults, to be readable. Infinite defaults are left out, as YAML readers disagree about
     infinity. `written` maps names of fields to functions that convert their values for writing.
     """
-    data = _finite(_brief(record) if brief else record.model_dump())
+    data = _drop_infinite(_drop_defaults(record) if brief else record.model_dump())
     text: str = yaml.dump(
         {name: written[name](value) if name in written else value for name, value in data.items()},
         Dumper=_Dumper,
@@ -128,20 +128,20 @@ def dump(
     return text
 
 
-def _brief(value: Any) -> Any:
+def _drop_defaults(value: Any) -> Any:
     """Return a record's kind and the fields that differ from their defaults, also in the records within it."""
     if isinstance(value, BaseModel):
-        usual = {name: f.get_default(call_default_factory=True) for name, f in type(value).model_fields.items()}
-        given = {name: getattr(value, name) for name in usual}
-        return {name: _brief(each) for name, each in given.items() if name == "kind" or each != usual[name]}
-    return [_brief(each) for each in value] if isinstance(value, (list, tuple)) else value
+        defaults = {name: f.get_default(call_default_factory=True) for name, f in type(value).model_fields.items()}
+        values = {name: getattr(value, name) for name in defaults}
+        return {name: _drop_defaults(each) for name, each in values.items() if name == "kind" or each != defaults[name]}
+    return [_drop_defaults(each) for each in value] if isinstance(value, (list, tuple)) else value
 
 
-def _finite(value: Any) -> Any:
+def _drop_infinite(value: Any) -> Any:
     """Return the value as lists and dicts, without infinite values: `dump` checks that those were defaults."""
     if isinstance(value, dict):
-        return {key: _finite(v) for key, v in value.items() if not (isinstance(v, float) and math.isinf(v))}
-    return [_finite(v) for v in value] if isinstance(value, (list, tuple)) else value
+        return {key: _drop_infinite(v) for key, v in value.items() if not (isinstance(v, float) and math.isinf(v))}
+    return [_drop_infinite(v) for v in value] if isinstance(value, (list, tuple)) else value
 
 
 class _Dumper(yaml.SafeDumper):
@@ -153,7 +153,7 @@ class _Dumper(yaml.SafeDumper):
 
 def _represent_text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
     try:
-        plain = _scalar(text) == text
+        plain = _parse_scalar(text) == text
     except ValueError:
         plain = False
     return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=None if plain else "'")
@@ -206,7 +206,7 @@ _NUMBER = re.compile(r"[-+]?(?=\.?[0-9])(?P<whole>[0-9]+(?:_[0-9]+)*)?(?P<point>
 _WORDS: dict[str, bool | None] = {"": None, "~": None, "null": None, "true": True, "false": False}
 
 
-def _scalar(text: str) -> str | int | float | bool | None:
+def _parse_scalar(text: str) -> str | int | float | bool | None:
     """Return the value of an unquoted scalar; raise ValueError for an ambiguous one."""
     if text.lower() in _WORDS:
         return _WORDS[text.lower()]
@@ -227,7 +227,7 @@ def _scalar(text: str) -> str | int | float | bool | None:
     return float(digits)
 
 
-def _line(event: yaml.Event) -> int:
+def _line_of(event: yaml.Event) -> int:
     return int(event.start_mark.line) + 1 if event.start_mark else 1
 
 
@@ -253,7 +253,7 @@ class _Reader:
         first = next(self._events)
         if isinstance(first, yaml.StreamEndEvent):
             raise ConfigError(f"{self._name}: empty")
-        data = self._value(next(self._events), ())
+        data = self._read_value(next(self._events), ())
         next(self._events)  # end of the document
         if not isinstance(next(self._events), yaml.StreamEndEvent):
             raise ConfigError(f"{self._name}: holds more than one document (---)")
@@ -275,51 +275,51 @@ class _Reader:
             before = text[: getattr(error, "position", None) or getattr(error, "start", 0)]
             raise ConfigError(f"{self._name}:{before.count(chr(10)) + 1}: not YAML text: {reason}") from None
 
-    def _refuse(self, event: Any, reason: str) -> ConfigError:
-        return ConfigError(f"{self._name}:{_line(event)}: {reason}")
+    def _error(self, event: Any, reason: str) -> ConfigError:
+        return ConfigError(f"{self._name}:{_line_of(event)}: {reason}")
 
-    def _value(self, event: Any, path: KeyPath) -> Any:
+    def _read_value(self, event: Any, path: KeyPath) -> Any:
         if isinstance(event, yaml.AliasEvent) or event.anchor is not None:
-            raise self._refuse(event, f"{key_path(path)}: anchors and aliases are not read: write the value out")
+            raise self._error(event, f"{key_path(path)}: anchors and aliases are not read: write the value out")
         if event.tag is not None:
-            raise self._refuse(
+            raise self._error(
                 event, f"{key_path(path)}: the tag {printable(event.tag)[1:-1]} is not read: write a plain value"
             )
         if len(path) > MAX_DEPTH:
-            raise self._refuse(event, f"nested more than {MAX_DEPTH} deep")
+            raise self._error(event, f"nested more than {MAX_DEPTH} deep")
         if isinstance(event, yaml.MappingStartEvent):
-            return self._mapping(path)
+            return self._read_mapping(path)
         if isinstance(event, yaml.SequenceStartEvent):
-            return self._sequence(path)
+            return self._read_sequence(path)
         if event.style:  # quoted, or a block of text
             return event.value
         try:
-            return _scalar(event.value)
+            return _parse_scalar(event.value)
         except ValueError as error:
-            raise self._refuse(event, f"{key_path(path)}: {error}") from None
+            raise self._error(event, f"{key_path(path)}: {error}") from None
 
-    def _sequence(self, path: KeyPath) -> list[Any]:
+    def _read_sequence(self, path: KeyPath) -> list[Any]:
         items: list[Any] = []
         while not isinstance(event := next(self._events), yaml.SequenceEndEvent):
-            place = (*path, len(items))
-            self._lines[place] = _line(event)
-            items.append(self._value(event, place))
+            item_path = (*path, len(items))
+            self._lines[item_path] = _line_of(event)
+            items.append(self._read_value(event, item_path))
         return items
 
-    def _mapping(self, path: KeyPath) -> dict[str, Any]:
+    def _read_mapping(self, path: KeyPath) -> dict[str, Any]:
         block: dict[str, Any] = {}
         while not isinstance(event := next(self._events), yaml.MappingEndEvent):
-            place = (*path, self._key(event, path))
-            if place in self._lines:
-                first = self._lines[place]
-                raise self._refuse(event, f"{key_path(place)}: given twice, first on line {first}")
-            self._lines[place] = _line(event)
-            block[str(place[-1])] = self._value(next(self._events), place)
+            item_path = (*path, self._read_key(event, path))
+            if item_path in self._lines:
+                first = self._lines[item_path]
+                raise self._error(event, f"{key_path(item_path)}: given twice, first on line {first}")
+            self._lines[item_path] = _line_of(event)
+            block[str(item_path[-1])] = self._read_value(next(self._events), item_path)
         return block
 
-    def _key(self, event: Any, path: KeyPath) -> str:
+    def _read_key(self, event: Any, path: KeyPath) -> str:
         if not isinstance(event, yaml.ScalarEvent) or event.tag is not None or event.anchor is not None:
-            raise self._refuse(event, f"{key_path(path) or 'the document'}: a key must be a plain word")
+            raise self._error(event, f"{key_path(path) or 'the document'}: a key must be a plain word")
         if event.value == "<<":
-            raise self._refuse(event, f"{key_path((*path, '<<'))}: merge keys (<<) are not read: write the values out")
+            raise self._error(event, f"{key_path((*path, '<<'))}: merge keys (<<) are not read: write the values out")
         return str(event.value)

@@ -207,7 +207,7 @@ class _Film:
             if self.identity is not None and self.born is not None:
                 self.identity[k], self.born[k] = state.identity[0], state.born[0]
             if self.shown is not None:
-                self.shown[k] = self.scene.view.shown(state)
+                self.shown[k] = self.scene.view.inner_numbers(state)
             self.step.append(step)
 
 

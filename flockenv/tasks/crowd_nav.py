@@ -258,7 +258,7 @@ class CrowdNav(Task):
         seen = {"radius": self.sight, "group": None if self.visible else 1}
         wishes = tuple(  # there are no walls
             wish.model_copy(update=seen) if isinstance(wish, Social) else wish
-            for wish in PRESETS[self.crowd].wishes(False, 1)
+            for wish in PRESETS[self.crowd].behaviours(False, 1)
             if wish.obstacle_law is None
         )
         return Scene(

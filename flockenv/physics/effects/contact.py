@@ -203,7 +203,7 @@ class Contact(_Solid):
     @property
     def sight(self) -> Sight:
         """All directions, within the radius."""
-        return Sight(math.inf if self.radius is None else self.radius)  # see Scene.touching
+        return Sight(math.inf if self.radius is None else self.radius)  # see Scene.contact_distance
 
     @property
     def reach(self) -> float:
@@ -217,7 +217,7 @@ class Contact(_Solid):
     def check(self, scene: SceneView) -> None:
         """Raise ValueError if the radius is too small for two bodies that touch, or they touch around a torus."""
         super().check(scene)
-        touch = scene.touching if scene.agents > 1 else 0.0
+        touch = scene.contact_distance if scene.agents > 1 else 0.0
         if self.radius is not None and self.radius < touch:
             raise ValueError(
                 f"radius = {self.radius:g}: two bodies touch at up to {touch:g} m; at least that is allowed"
