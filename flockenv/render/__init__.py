@@ -1,6 +1,6 @@
-"""Pictures of snapshots: pixels, PNG, GIF, a window, an HTML replay; a backend is imported when first needed.
+"""Pictures of snapshots, as pixels, PNG, GIF, HTML replay, or in a window.
 
-Nothing here opens a display except Window, and `import flockenv.render` imports neither Pillow nor pygame.
+Only `Window` opens a display. Pillow and pygame are imported when they are first needed.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Group", "Panel", "Window", "draw", "write_gif", "write_png", "write_replay"]
 
-_HOMES: Final = {
+_MODULES: Final = {
     "Group": "replay",
     "Panel": "replay",
     "Window": "window",
@@ -28,9 +28,9 @@ _HOMES: Final = {
 
 
 def __getattr__(name: str) -> object:
-    if name not in _HOMES:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
-    value = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    value = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
     globals()[name] = value  # the next look-up no longer comes here
     return value
 

@@ -1,4 +1,4 @@
-"""Colours and shapes that the still picture and the replay share, so that a pursuer looks alike in both."""
+"""Colours and shapes that pictures and replays share."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from typing import Final
 
 __all__ = ["ARROW", "BODY_DISC", "BOND", "DART", "DART_REACH", "JUMP", "PAPER", "POINT", "ROLE_COLOURS", "mix", "rgb"]
 
-#: role -> (on light paper, on dark paper): after Okabe and Ito's set, told apart with any colour vision
-#: (jfly.uni-koeln.de/color).
+#: role -> (colour on a light, on a dark background), after the palette of Okabe and Ito, whose colours can be
+#: distinguished with any colour vision (jfly.uni-koeln.de/color).
 ROLE_COLOURS: Final[dict[str, tuple[str, str]]] = {
     "pursuer": ("#d55e00", "#f0803c"),
     "evader": ("#0072b2", "#4fb0e8"),
@@ -20,10 +20,10 @@ ROLE_COLOURS: Final[dict[str, tuple[str, str]]] = {
     "agent 4": ("#1f8a8a", "#5cc7c7"),
 }
 
-#: share of the colour of goals in that of ways
+#: Opacity of paths, which have the colour of goals.
 WAY: Final = 0.18
 
-#: part of the picture -> (light, dark)
+#: part of the picture -> (colour in the light, in the dark theme)
 PAPER: Final[dict[str, tuple[str, str]]] = {
     "page": ("#f3f5f8", "#0e1218"),
     "paper": ("#ffffff", "#161c25"),
@@ -36,35 +36,36 @@ PAPER: Final[dict[str, tuple[str, str]]] = {
     "goal": ("#009e73", "#2cc79a"),
 }
 
-#: Corners of an agent's dart in its own frame, x forward, in units of its reach.
+#: Corners of the dart that shows an agent, x forward, in units of its reach (from its middle to its tip).
 DART: Final = ((1.0, 0.0), (-0.78, 0.66), (-0.42, 0.0), (-0.78, -0.66))
 
-#: The least reach of a dart, as a share of the picture's width: a heading must be readable however small the body.
+#: Least reach of a dart, as a share of the picture's width, so that headings of small bodies can be read.
 DART_REACH: Final = 0.0135
 
-#: A body of at least this share of its dart's reach is a disc under the dart; a smaller one would not be seen there and
-#: is a dark dot on it.
+#: A body of at least this share of its dart's reach is drawn as a disc under the dart; a smaller one, which the dart
+#: would hide, as a dark dot on it.
 BODY_DISC: Final = 0.4
 
-#: Width of the line of a bond, and the least radius of a dot at its end, as a share of the picture's width.
+#: Width of a bond's line, and least radius of the dots at its ends, as a share of the picture's width.
 BOND: Final = 0.0022
 
-#: The least radius of a point of an agent with a look, as a share of the picture's width.
+#: Least radius of agents drawn as points, as a share of the picture's width.
 POINT: Final = 0.0022
 
 #: Corners of the arrow that shows a heading, x along it, in units of its length.
 ARROW: Final = ((0.0, 0.035), (0.7, 0.05), (0.66, 0.16), (1.0, 0.0), (0.66, -0.16), (0.7, -0.05), (0.0, -0.035))
 
-#: A body that moved further than this share of the world between two pictures crossed the seam or was born again.
+#: No line joins two positions of an agent that are farther apart than this share of the world: it has crossed the edge
+#: of a torus, or was born again.
 JUMP: Final = 0.25
 
 
 def rgb(colour: str) -> tuple[int, int, int]:
-    """Return "#rrggbb" as three numbers 0..255."""
+    """Return the colour "#rrggbb" as three numbers from 0 to 255."""
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
 
 
 def mix(colour: str, ground: str, share: float) -> tuple[int, int, int]:
-    """Return `share` (0..1) of `colour` laid over `ground`."""
+    """Return the mixture of `colour`, with a share from 0 to 1, and `ground`."""
     r, g, b = (round(share * top + (1.0 - share) * below) for top, below in zip(rgb(colour), rgb(ground), strict=True))
     return r, g, b

@@ -1,4 +1,4 @@
-"""View: where the world lies in a picture, metres to pixels."""
+"""View: the place of the world in a picture, and the conversion of metres to pixels."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ import numpy as np
 
 from flockenv.model.snapshot import Floats, Snapshot
 
-__all__ = ["View", "look"]
+__all__ = ["View", "view_of"]
 
 _MARGIN: Final = 0.03
 _BAND: Final = 0.068
-#: Bodies further out than this many extents are drawn there instead: off the picture, and no number overflows.
+#: Distance, in extents of the world, to which farther agents are moved: they are outside the picture, and no number
+#: overflows.
 _FARTHEST: Final = 5.0
 
 
 @dataclass(frozen=True)
 class View:
-    """The world's rectangle in a picture of (width, height) px; y points up in the world and down in the picture.
+    """Rectangle of the world in a picture of (width, height) px; y points up in the world and down in the picture.
 
-    left, top, right, bottom: px, the edges of [low, high]. metre: px per m. low, high: (x, y) in m.
-    spill: px beyond those edges that bodies may still cover. band: px, height of the caption.
+    low, high: corners of the world, (x, y) m. left, top, right, bottom: its edges in the picture, px. metre: px per m.
+    spill: px beyond the edges that agents may cover. band: height of the caption, px.
     """
 
     width: int
@@ -39,36 +40,36 @@ class View:
     spill: float
     band: float
 
-    def place(self, points: Floats) -> Floats:
-        """Return the pixels (..., 2) of points (..., D) in m, by their x and y."""
+    def to_pixels(self, points: Floats) -> Floats:
+        """Return the pixel coordinates, (..., 2), of points, (..., D) m; z is ignored."""
         low, high = np.array(self.low), np.array(self.high)
         reach = _FARTHEST * (high - low)
         near = np.clip(points[..., :2], low - reach, high + reach)
         offset = (near - low) * self.metre
         return np.stack([self.left + offset[..., 0], self.bottom - offset[..., 1]], axis=-1)
 
-    def sightings(self, x: float, y: float, reach: float) -> list[tuple[float, float]]:
-        """Return where a body of `reach` px is seen: at (x, y) and, if periodic, across every edge that it overlaps."""
+    def visible_positions(self, x: float, y: float, reach: float) -> list[tuple[float, float]]:
+        """Return the positions at which a body of `reach` px is drawn: (x, y), and, on a torus, images at the edges."""
         if not self.periodic:
             return [(x, y)]
-        xs = _copies(x, reach, self.left, self.right)
-        ys = _copies(y, reach, self.top, self.bottom)
+        xs = _axis_positions(x, reach, self.left, self.right)
+        ys = _axis_positions(y, reach, self.top, self.bottom)
         return [(a, b) for a in xs for b in ys]
 
 
-def _copies(x: float, reach: float, first: float, last: float) -> list[float]:
-    places = [x]
+def _axis_positions(x: float, reach: float, first: float, last: float) -> list[float]:
+    positions = [x]
     if x - reach < first:
-        places.append(x + last - first)
+        positions.append(x + last - first)
     if x + reach > last:
-        places.append(x - last + first)
-    return places
+        positions.append(x - last + first)
+    return positions
 
 
-def look(snapshot: Snapshot, size: int, scale: int) -> View:
-    """Return the view of a picture `size` px wide and at most as high, drawn `scale` times larger.
+def view_of(snapshot: Snapshot, size: int, scale: int) -> View:
+    """Return the view of a picture that is `size` px wide and at most as high, drawn `scale` times larger.
 
-    Width and height are even, as video encoders ask. Tall worlds are centred, wide ones make the picture lower.
+    Width and height are even, as video encoders require. A tall world is centred; a wide one makes the picture lower.
     """
     (low_x, low_y), (high_x, high_y) = snapshot.low[:2].tolist(), snapshot.high[:2].tolist()
     width, margin, band = size - size % 2, size * _MARGIN, size * _BAND

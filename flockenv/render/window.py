@@ -1,4 +1,4 @@
-"""Window: frames on a screen, for render_mode="human"; the one part that needs pygame, imported when one is made."""
+"""Window: frames on a screen, for render_mode="human". Only this file needs pygame, imported with the first window."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ __all__ = ["Window"]
 
 
 class Window:
-    """A window that shows frames at a steady rate; closed by close() or by its user, after which show() does nothing.
+    """A window that shows frames at a steady rate. After it is closed, by close() or by the user, show() does nothing.
 
-    Needs pygame-ce, and of it the display alone. SDL gives a process one such window: several Windows share it.
-    Raises ImportError where pygame-ce is not installed and RuntimeError without a display, in one line with the remedy.
+    A process has one window, which all objects of this class share. Raises ImportError without pygame-ce, and
+    RuntimeError without a display, in one line with the remedy.
     """
 
     def __init__(self, title: str = "flockenv") -> None:
-        # Otherwise pygame greets on stdout, in the middle of a program's own output.
+        # Otherwise pygame prints a greeting to stdout.
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         try:
             import pygame
@@ -68,7 +68,7 @@ class Window:
             self._pygame.display.quit()
 
     def _start(self) -> None:
-        # display alone, never pygame.init(): that also opens sound and joysticks, and keeps a core busy.
+        # Not pygame.init(), which also opens sound and joysticks, and keeps a core busy.
         try:
             self._pygame.display.init()
         except self._pygame.error as error:
