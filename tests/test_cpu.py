@@ -28,7 +28,7 @@ from flockenv.physics.effects import Effect, Gravitation
 from flockenv.scene import Scene
 from flockenv.scene.yaml_io import load_scene
 from flockenv.tasks import TASKS, Flock, Task
-from flockenv.tasks.observations import block_ways, compass
+from flockenv.tasks.observations import ray_directions, shorten_free_paths
 from tests.catalogue import everything
 
 ROOT = Path(__file__).parent.parent
@@ -197,9 +197,11 @@ def test_short_loops_are_vectorised(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_block_ways_stores_without_a_mask() -> None:
     def shorten(row: Any, table: Any) -> None:
-        block_ways(row, 0, 16, table, (np.float32(1.0), np.float32(0.5)), (np.float32(1), np.float32(0)), 0.4, 6.0)
+        shorten_free_paths(
+            row, 0, 16, table, (np.float32(1.0), np.float32(0.5)), (np.float32(1), np.float32(0)), 0.4, 6.0
+        )
 
     row = np.ones(16, np.float32)
-    _, machine = code(shorten, row, np.array(compass(16), np.float32))
+    _, machine = code(shorten, row, np.array(ray_directions(16), np.float32))
     assert 0 < row.min() < row.max() == 1.0
     assert not re.search(r"vmaskmovps\s+%[xy]mm\d+, %[xy]mm\d+, [-\w]*\(", machine)

@@ -140,13 +140,13 @@ def test_wrappers_work_with_several_learners_in_each_world(name):
 @pytest.mark.parametrize("mode", MODES)
 def test_a_metric_without_a_value_is_left_out(monkeypatch, mode):
     """NaN would make equal infos unequal; in a batch the mask marks the worlds that have a value."""
-    write_metrics, k = World._tell_of, Pursuit.metric_names.index("least_distance")
+    write_metrics, k = World._write_metrics, Pursuit.metric_names.index("least_distance")
 
     def sometimes(self, first, metrics):
         write_metrics(self, first, metrics)
         metrics[k, metrics[k] >= 8.0] = np.nan
 
-    monkeypatch.setattr(World, "_tell_of", sometimes)
+    monkeypatch.setattr(World, "_write_metrics", sometimes)
     native = gymnasium.make_vec("flockenv/Pursuit-v0", 4, autoreset_mode=mode, max_episode_steps=30)
     loop = gymnasium.make_vec(
         "flockenv/Pursuit-v0",

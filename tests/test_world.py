@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.envs.world import AT_HAND, PAST, Step, World, _portions
+from flockenv.envs.world import AT_HAND, PAST, Step, World, _chunks
 from flockenv.jit.section import without_dispatch
 from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.maths.counter_rng import key_of, keys_of
@@ -127,7 +127,7 @@ def test_streaming_stores_give_the_same_results(row: TaskRow, monkeypatch: pytes
     direct = World(row.task, 5, time_limit=7)
     monkeypatch.setattr("flockenv.envs.world.PAST", 0)
     past = World(row.task, 5, time_limit=7)
-    assert (direct._past, past._past) == (False, True)
+    assert (direct._streaming, past._streaming) == (False, True)
     np.testing.assert_array_equal(past.reset(5), direct.reset(5))
     for k, actions in enumerate(actions_for(direct, 20)):
         one, other = past.step(actions), direct.step(actions)
@@ -143,16 +143,16 @@ def test_a_fence_follows_all_streaming_stores() -> None:
     """Without it other threads nearly always see the same results. The source is checked, as `play` may be cached."""
     (play,) = (node for node in ast.walk(ast.parse(inspect.getsource(_play))) if getattr(node, "name", "") == "play")
     *_, fence, last = play.body
-    assert ast.unparse(fence) == "if past:\n    store_fence()" and isinstance(last, ast.Return)
+    assert ast.unparse(fence) == "if streaming:\n    store_fence()" and isinstance(last, ast.Return)
 
 
 def test_streaming_stores_are_used_for_large_results_only() -> None:
     """Except if one world's observations exceed a core's cache: they would go to memory twice."""
     size = 4 * Obstacles().layout.size
     few, many = World(Obstacles(), (PAST - 1) // size), World(Obstacles(), -(-PAST // size))
-    assert (few._past, many._past) == (False, True)
+    assert (few._streaming, many._streaming) == (False, True)
     agents = AT_HAND // (4 * Flock().layout.size) + 1
-    assert not World(Flock(agents=agents, size=400), -(-PAST // (4 * Flock().layout.size * agents)))._past
+    assert not World(Flock(agents=agents, size=400), -(-PAST // (4 * Flock().layout.size * agents)))._streaming
 
 
 @EVERY
@@ -434,7 +434,7 @@ def test_a_copy_has_its_own_memory(copied: Any) -> None:
     world.step(a)
     held = [world.step(b).observation]
     other = copied(world)
-    assert other._fresh[0] is not world._fresh[0]
+    assert other._make_results[0] is not world._make_results[0]
     assert len(pickle.dumps(world)) < 2 * len(pickle.dumps(World(Flock(agents=32), 64)))  # without results
     held += [other.step(a).observation, world.step(a).observation]
     assert not any(np.shares_memory(held[i], held[k]) for i, k in ((0, 1), (0, 2), (1, 2)))
@@ -451,7 +451,7 @@ def test_a_copy_of_a_world_that_was_never_reset_needs_a_reset() -> None:
 @pytest.mark.parametrize("team", [1, 2, 3, 16])
 @pytest.mark.parametrize("worlds", [1, 2, 3, 31, 1024, 4097])
 def test_portions_cover_all_worlds_and_never_grow(worlds: int, team: int) -> None:
-    portions = np.array(_portions(worlds, team))
+    portions = np.array(_chunks(worlds, team))
     first, end = portions.T
     assert first[0] == 0 and end[-1] == worlds and (first[1:] == end[:-1]).all()
     size = end - first

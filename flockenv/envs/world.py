@@ -28,8 +28,8 @@ from flockenv.model.snapshot import Snapshot
 from flockenv.model.state import State
 from flockenv.scene import MEMORY_LIMIT
 from flockenv.tasks import Task
-from flockenv.tasks.play import play_of, tell_of
-from flockenv.tasks.play_plan import REFUSED, Decision, Given, Near, Results, Totals, Worlds
+from flockenv.tasks.play import metrics_of, play_of
+from flockenv.tasks.play_plan import REFUSED, Constants, Decision, Near, Results, Totals, WorldArrays
 
 __all__ = ["Step", "World"]
 
@@ -78,9 +78,9 @@ class World:
 
     def __init__(self, task: Task, worlds: int = 1, time_limit: int | None = None) -> None:
         """worlds: B >= 1. time_limit: decisions until truncation; None: no limit."""
-        if not _whole(worlds) or worlds < 1:
+        if not _is_integer(worlds) or worlds < 1:
             raise ValueError(f"worlds is {worlds!r}, must be an integer >= 1")
-        if time_limit is not None and (not _whole(time_limit) or time_limit < 1):
+        if time_limit is not None and (not _is_integer(time_limit) or time_limit < 1):
             raise ValueError(f"time_limit is {time_limit}, must be an integer >= 1 (decisions), or None")
         scene = task.scene
         bytes_ = worlds * (scene.bytes_per_world() + task.learners * 8 * task.layout.size)
@@ -102,13 +102,13 @@ class World:
         self._last: Final = zeros((self.worlds, len(task.measures)))
         self._seeds: NDArray[np.uint64] | None = None
         self._episodes = np.zeros(self.worlds, np.uint64)
-        self._prepare()
+        self._compile_and_allocate()
 
-    def _prepare(self) -> None:
+    def _compile_and_allocate(self) -> None:
         """Make what follows from the task: kernel, scratch, and the constant arguments of each step."""
         scene, task, s = self.task.scene, self.task, self.state
-        self._entries = play_of(task), tell_of(task)
-        self._enter, self._tell = self._entries
+        self._entries = play_of(task), metrics_of(task)
+        self._enter, self._compute_metrics = self._entries
         b, i, real = self.worlds, self.learners, scene.dtype
         self._actions = zeros((b, i, self.action_size), real)
         numbers = (task.parts.packed_numbers(), list(task.parameters().values()), task.table() or (0.0,))
@@ -118,32 +118,32 @@ class World:
         )  # fmt: skip
         self._shapes = tuple(shape for shape, _ in fields)  # of a Step, with terms as the first axis
         self._dtypes = tuple(np.dtype(kind) for _, kind in fields)
-        self._everywhere = np.ones(b, np.bool_)
-        self._untold = tuple(np.empty(shape, kind) for shape, kind in fields[1:])  # results that a reset does not write
-        row, size = 4 * math.prod(self._shapes[0][1:]), 4 * math.prod(self._shapes[0])
-        self._past = size >= PAST and row <= AT_HAND
-        kinds, maker = zip(self._shapes, self._dtypes, strict=True), BufferPool(line=LINE).maker
-        self._fresh: tuple[Callable[[], NDArray[Any]], ...] = tuple(
-            maker(*kind) if size >= RECYCLE else functools.partial(np.empty, *kind) for kind in kinds
+        self._all_worlds = np.ones(b, np.bool_)
+        self._unwritten = tuple(np.empty(shape, kind) for shape, kind in fields[1:])  # a reset does not write these
+        row_bytes, total_bytes = 4 * math.prod(self._shapes[0][1:]), 4 * math.prod(self._shapes[0])
+        self._streaming = total_bytes >= PAST and row_bytes <= AT_HAND
+        shapes_and_types, make = zip(self._shapes, self._dtypes, strict=True), BufferPool(line=LINE).maker
+        self._make_results: tuple[Callable[[], NDArray[Any]], ...] = tuple(
+            make(*kind) if total_bytes >= RECYCLE else functools.partial(np.empty, *kind) for kind in shapes_and_types
         )
-        given = Given(*(np.array(values, real) for values in numbers))
-        worlds = Worlds(
+        constants = Constants(*(np.array(values, real) for values in numbers))
+        worlds = WorldArrays(
             s.x, s.v, s.alive, s.tick, s.obstacle_x, s.obstacle_radius, s.work, s.key, self._memory, self.steps,
             s.frame_and_inner,
         )  # fmt: skip
-        self._always = (
-            worlds, given, np.dtype(real).type(scene.dt), task.substeps, not task.ends_together, self._past,
+        self._constant_arguments = (
+            worlds, constants, np.dtype(real).type(scene.dt), task.substeps, not task.ends_together, self._streaming,
             Totals(self._last, self._sums, self._paid),
         )  # fmt: skip
-        self._counted = (self.steps, np.array(numbers[1], float), self._last, self._sums)
-        self._alone = np.empty((len(task.metric_names), 1))  # metrics of one world
+        self._metric_arguments = (self.steps, np.array(numbers[1], float), self._last, self._sums)
+        self._metrics_row = np.empty((len(task.metric_names), 1))  # metrics of one world
         self._scratch, self._tuners = [self._allocate()], AutoTuners()
-        self._hire()
+        self._bind_calls()
 
-    def _hire(self) -> None:
+    def _bind_calls(self) -> None:
         """Bind the entry point to its constant arguments, once for each thread, which has its own scratch."""
         self._calls: list[Callable[..., tuple[int, int]]] = [
-            functools.partial(self._enter, *self._always, *scratch) for scratch in self._scratch
+            functools.partial(self._enter, *self._constant_arguments, *scratch) for scratch in self._scratch
         ]
 
     def _allocate(self) -> tuple[Decision, Near, Any]:
@@ -152,17 +152,17 @@ class World:
         d, real, look = scene.dimension, scene.dtype, task.look or Look(0.0)
         lanes = PAIR if task.abreast else task.parts.width
         padded = -(-n // lanes) * lanes
-        wide: tuple[NDArray[Any], ...] = ()
+        padded_arrays: tuple[NDArray[Any], ...] = ()
         if task.abreast:
-            beside = zeros(task.abreast * column_distance(self.learners), np.float32)
+            row_columns = zeros(task.abreast * column_distance(self.learners), np.float32)
             own, vel = (2 * d + 1 + task.memory, padded), (d, look.agents, padded)
-            wide = (zeros(own, real), zeros(vel, real), zeros((1, look.agents, padded), real), beside)
-            wide[2][:] = scene.body.radius[0]  # all agents have it, or it is gathered
+            padded_arrays = (zeros(own, real), zeros(vel, real), zeros((1, look.agents, padded), real), row_columns)
+            padded_arrays[2][:] = scene.body.radius[0]  # all agents have it, or it is gathered
         decision = Decision(
-            zeros(self._shapes[0][1:] if self._past else (0, 0), np.float32),
+            zeros(self._shapes[0][1:] if self._streaming else (0, 0), np.float32),
             zeros((d, 1, n), real), zeros((d, n), real), zeros((d, n), real), zeros(n, np.bool_),
             zeros(self.action_size * column_distance(self.learners), real if task.abreast else float),
-            zeros(len(task.terms) * column_distance(self.learners), real if task.abreast else float), wide,
+            zeros(len(task.terms) * column_distance(self.learners), real if task.abreast else float), padded_arrays,
         )  # fmt: skip
         near = [
             zeros(shape, kind)
@@ -174,17 +174,18 @@ class World:
         return decision, Near(*[*near, places]), space.of(0, scratch_record(task.parts))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the attributes that `_prepare` cannot make again."""
-        made = (
-            "_entries", "_enter", "_tell", "_actions", "_always", "_scratch", "_choices", "_calls", "_counted",
-            "_alone", "_shapes", "_dtypes", "_everywhere", "_untold", "_fresh", "_past",
+        """Return the attributes that `_compile_and_allocate` cannot make again."""
+        derived = (
+            "_entries", "_enter", "_compute_metrics", "_actions", "_constant_arguments", "_scratch", "_choices",
+            "_calls", "_metric_arguments", "_metrics_row", "_shapes", "_dtypes", "_all_worlds", "_unwritten",
+            "_make_results", "_streaming",
         )  # fmt: skip
-        return {name: value for name, value in vars(self).items() if name not in made}
+        return {name: value for name, value in vars(self).items() if name not in derived}
 
-    def __setstate__(self, kept: dict[str, Any]) -> None:
+    def __setstate__(self, state: dict[str, Any]) -> None:
         """Continue from a pickled world."""
-        vars(self).update(kept)
-        self._prepare()
+        vars(self).update(state)
+        self._compile_and_allocate()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> World:
         """Return an independent world that continues from here."""
@@ -213,12 +214,12 @@ class World:
         if into is not None and not into.flags.carray:
             raise ValueError("into must be writable and contiguous: the observations of a step, no part of them")
         self._seed(seeds, rows)
-        observation: Rows = self._fresh[0]() if into is None else into
-        begun = self.worlds if into is None else int(np.count_nonzero(rows))
-        self._play(False, rows, into is None, begun, 0, Results(observation, *self._untold), self._actions)
+        observation: Rows = self._make_results[0]() if into is None else into
+        busy = self.worlds if into is None else int(np.count_nonzero(rows))
+        self._play(False, rows, into is None, busy, 0, Results(observation, *self._unwritten), self._actions)
         if self._enter is self._entries[0]:
             self._enter = without_dispatch(self._enter)  # argument types do not change after this call
-            self._hire()
+            self._bind_calls()
         for numbers in (self._sums, self._last, self.paid):
             numbers[rows] = 0
         return observation
@@ -227,25 +228,29 @@ class World:
         if seeds is None and self._seeds is None:
             seeds = secrets.randbits(31)
         if seeds is not None:
-            given = np.array(self._checked(seeds), np.uint64)
-            self._seeds = given if self._seeds is None else np.where(rows, given, self._seeds)
+            new_seeds = np.array(self._check_seeds(seeds), np.uint64)
+            self._seeds = new_seeds if self._seeds is None else np.where(rows, new_seeds, self._seeds)
             self._episodes[rows] = 0
         else:
             self._episodes[rows] += np.uint64(1)
         assert self._seeds is not None
         self.state.key[rows] = keys_of(self._seeds[rows], self._episodes[rows])
 
-    def _checked(self, seeds: int | Sequence[int]) -> list[int]:
+    def _check_seeds(self, seeds: int | Sequence[int]) -> list[int]:
         """Return one seed per world; ValueError for another number of seeds, or no integers in 0 ... 2^64 - 1."""
-        if not (_whole(seeds) or (isinstance(seeds, (Sequence, np.ndarray)) and not isinstance(seeds, (str, bytes)))):
+        if not (
+            _is_integer(seeds) or (isinstance(seeds, (Sequence, np.ndarray)) and not isinstance(seeds, (str, bytes)))
+        ):
             raise ValueError(f"seeds is {seeds!r}, must be an integer, or a sequence of integers, one for each world")
-        several = [seeds + k for k in range(self.worlds)] if isinstance(seeds, (int, np.integer)) else list(seeds)
-        if len(several) != self.worlds:
-            raise ValueError(f"{len(several)} seeds for {self.worlds} worlds")
-        for k, seed in enumerate(several):
-            if not _whole(seed) or not 0 <= seed <= MASK:
+        seeds_of_worlds = (
+            [seeds + k for k in range(self.worlds)] if isinstance(seeds, (int, np.integer)) else list(seeds)
+        )
+        if len(seeds_of_worlds) != self.worlds:
+            raise ValueError(f"{len(seeds_of_worlds)} seeds for {self.worlds} worlds")
+        for k, seed in enumerate(seeds_of_worlds):
+            if not _is_integer(seed) or not 0 <= seed <= MASK:
                 raise ValueError(f"seed of world {k} is {seed!r}, must be an integer from 0 to 2^64 - 1")
-        return [int(seed) for seed in several]
+        return [int(seed) for seed in seeds_of_worlds]
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -260,11 +265,11 @@ class World:
         if self._seeds is None:
             raise RuntimeError("arrays before the first reset: call reset() first")
         state = {each.name: getattr(self.state, each.name) for each in dataclasses.fields(State) if each.name != "dt"}
-        mine = {
+        own = {
             "steps": self.steps, "paid": self._paid, "memory": self._memory, "sums": self._sums, "last": self._last,
             "seeds": self._seeds, "episodes": self._episodes,
         }  # fmt: skip
-        return {**{f"state.{name}": array for name, array in state.items()}, **mine}
+        return {**{f"state.{name}": array for name, array in state.items()}, **own}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Continue from what `arrays` returned for as many worlds of the same task; the next step is equal bit for bit.
@@ -272,15 +277,15 @@ class World:
         Raises ValueError, with the array that is missing, unknown, or of another shape or type, before any is written;
         RuntimeError before the first reset.
         """
-        mine = self.arrays()
-        if odd := sorted(mine.keys() ^ arrays.keys()):
-            raise ValueError(f"arrays: {odd[0]!r} is {'missing' if odd[0] in mine else 'unknown'}")
+        own = self.arrays()
+        if mismatch := sorted(own.keys() ^ arrays.keys()):
+            raise ValueError(f"arrays: {mismatch[0]!r} is {'missing' if mismatch[0] in own else 'unknown'}")
         for name, array in arrays.items():
-            if (array.shape, array.dtype) != (mine[name].shape, mine[name].dtype):
-                expected = f"{mine[name].shape} of {mine[name].dtype}"
+            if (array.shape, array.dtype) != (own[name].shape, own[name].dtype):
+                expected = f"{own[name].shape} of {own[name].dtype}"
                 raise ValueError(f"arrays: {name!r} is {array.shape} of {array.dtype}, expected {expected}")
         for name, array in arrays.items():
-            mine[name][...] = array
+            own[name][...] = array
 
     @property
     def memory(self) -> NDArray[Any]:
@@ -302,78 +307,84 @@ class World:
             raise RuntimeError("step before the first reset: call reset() first")
         if terms not in TERMS:
             raise ValueError(f"terms: {terms!r} is unknown{nearest(str(terms), TERMS)}; allowed: {', '.join(TERMS)}")
-        taken = self._taken(actions)
-        rows, reward, earned, over, late, success, present = told = Results(*[make() for make in self._fresh])
+        checked = self._check_actions(actions)
+        rows, reward, earned, over, late, success, present = results = Results(*[make() for make in self._make_results])
         limit = _NEVER if self.time_limit is None else min(int(self.time_limit), _NEVER)
-        world, who = self._play(True, self._everywhere, terms == "steps", self.worlds, limit, told, taken)
+        world, agent = self._play(True, self._all_worlds, terms == "steps", self.worlds, limit, results, checked)
         if world == REFUSED:
-            self._refuse(taken)
+            self._raise_for_action(checked)
         if world >= 0:
-            raise FloatingPointError(f"world {world}, agent {who}: not finite at t = {self.state.time[world]:g} s")
+            raise FloatingPointError(f"world {world}, agent {agent}: not finite at t = {self.state.time[world]:g} s")
         return Step(rows, reward, earned.transpose(1, 2, 0), over, late, success, present)
 
     def _play(
-        self, acting: bool, mask: NDArray[np.bool_], everyone: bool, busy: int, limit: int,
-        told: Results, actions: NDArray[Any],
+        self, acting: bool, mask: NDArray[np.bool_], all_worlds: bool, busy: int, limit: int,
+        results: Results, actions: NDArray[Any],
     ) -> tuple[int, int]:  # fmt: skip
         """Take a decision in all worlds, or begin those in the mask, by a thread pool if `busy` worlds are enough.
 
-        everyone: observe all worlds in a reset, and write the terms of all in a decision. Returns (world, agent) of the
+        all_worlds: observe all worlds in a reset, and write the terms of all in a decision. Returns (world, agent) of the
         first agent that is not finite, or (-1, -1).
         """
-        crew, work = min(usable_threads(), busy), busy * self.agents * self.task.substeps
-        whole = acting, mask, everyone, acting, 0, self.worlds, actions, limit, told
-        if crew <= 1:
-            return self._calls[0](*whole)
+        threads, work = min(usable_threads(), busy), busy * self.agents * self.task.substeps
+        arguments = acting, mask, all_worlds, acting, 0, self.worlds, actions, limit, results
+        if threads <= 1:
+            return self._calls[0](*arguments)
 
-        def shared() -> tuple[int, int]:
-            return self._shared(crew, acting, mask, everyone, limit, told, actions)
+        def play_shared() -> tuple[int, int]:
+            return self._play_threads(threads, acting, mask, all_worlds, limit, results, actions)
 
-        choice = self._tuners.of("deciding" if acting else "beginning", work, crew)
-        return choice.run(functools.partial(self._calls[0], *whole), shared, work >= LARGEST)
+        choice = self._tuners.of("deciding" if acting else "beginning", work, threads)
+        return choice.run(functools.partial(self._calls[0], *arguments), play_shared, work >= LARGEST)
 
-    def _shared(
-        self, crew: int, acting: bool, mask: NDArray[np.bool_], everyone: bool, limit: int,
-        told: Results, actions: NDArray[Any],
+    def _play_threads(
+        self, threads: int, acting: bool, mask: NDArray[np.bool_], all_worlds: bool, limit: int,
+        results: Results, actions: NDArray[Any],
     ) -> tuple[int, int]:  # fmt: skip
-        """Do what `_play` does, with `crew` threads."""
-        if crew > len(self._scratch):
-            self._scratch += [self._allocate() for _ in range(crew - len(self._scratch))]
-            self._hire()
-        if acting and self._calls[0](True, mask, everyone, True, 0, 0, actions, limit, told)[0] == REFUSED:
+        """Do what `_play` does, with several threads."""
+        if threads > len(self._scratch):
+            self._scratch += [self._allocate() for _ in range(threads - len(self._scratch))]
+            self._bind_calls()
+        if acting and self._calls[0](True, mask, all_worlds, True, 0, 0, actions, limit, results)[0] == REFUSED:
             return REFUSED, 0  # no world moves before all actions are checked
-        portions = iter(_portions(self.worlds, crew))  # a thread that is done takes the next chunk
+        chunks = iter(_chunks(self.worlds, threads))  # a thread that is done takes the next chunk
 
-        def several(k: int) -> tuple[int, int]:
-            found, call = [], self._calls[k]
-            for first, end in portions:
-                found.append(call(acting, mask, everyone, False, first, end, actions, limit, told))
-            return min((bad for bad in found if bad[0] >= 0), default=(-1, -1))
+        def play_chunks(k: int) -> tuple[int, int]:
+            failures, call = [], self._calls[k]
+            for first, end in chunks:
+                failures.append(call(acting, mask, all_worlds, False, first, end, actions, limit, results))
+            return min((bad for bad in failures if bad[0] >= 0), default=(-1, -1))
 
-        bad = [found for found in run_parallel([functools.partial(several, k) for k in range(crew)]) if found[0] >= 0]
+        bad = [
+            failures
+            for failures in run_parallel([functools.partial(play_chunks, k) for k in range(threads)])
+            if failures[0] >= 0
+        ]
         return min(bad, default=(-1, -1))
 
-    def _taken(self, actions: ArrayLike) -> NDArray[Any]:
+    def _check_actions(self, actions: ArrayLike) -> NDArray[Any]:
         """Return the actions in the precision of the scene, the kernel's only type; copied only if necessary."""
-        given, kept = np.asarray(actions), self._actions
-        if given.shape != kept.shape:
-            raise ValueError(f"actions have shape {given.shape}, expected (worlds, learners, numbers) = {kept.shape}")
-        if given.dtype == kept.dtype and given.flags.carray:
-            return given
-        if given.dtype == _SINGLE:  # as spaces sample them; exact in doubles
-            kept[...] = given
-            return kept
+        array, buffer = np.asarray(actions), self._actions
+        if array.shape != buffer.shape:
+            raise ValueError(f"actions have shape {array.shape}, expected (worlds, learners, numbers) = {buffer.shape}")
+        if array.dtype == buffer.dtype and array.flags.carray:
+            return array
+        if array.dtype == _SINGLE:  # as spaces sample them; exact in doubles
+            buffer[...] = array
+            return buffer
         try:
             with np.errstate(over="ignore"):
-                kept[...] = given
-            if kept.dtype == _SINGLE and np.isinf(kept).any():  # float32 overflow: the number is beyond 1, not infinite
-                exact = given.astype(float)
-                kept[...] = np.where(np.isfinite(exact), np.clip(exact, -1, 1), exact)
+                buffer[...] = array
+            if (
+                buffer.dtype == _SINGLE and np.isinf(buffer).any()
+            ):  # float32 overflow: the number is beyond 1, not infinite
+                exact = array.astype(float)
+                buffer[...] = np.where(np.isfinite(exact), np.clip(exact, -1, 1), exact)
         except (TypeError, ValueError):
-            raise TypeError(f"actions are of type {given.dtype}, expected numbers in [-1, 1]") from None
-        return kept
+            raise TypeError(f"actions are of type {array.dtype}, expected numbers in [-1, 1]") from None
+        return buffer
 
-    def _refuse(self, actions: NDArray[Any]) -> NoReturn:
+    def _raise_for_action(self, actions: NDArray[Any]) -> NoReturn:
         """Raise ValueError with the first action that is not finite."""
         b, i, k = np.argwhere(~np.isfinite(actions))[0]
         raise ValueError(
@@ -384,24 +395,24 @@ class World:
 
     def measure(self) -> dict[str, NDArray[np.float64]]:
         """Return the domain metrics of the episodes so far, each (B,), by name; NaN: no value yet."""
-        told = np.empty((len(self.task.metric_names), self.worlds))
-        self._tell_of(0, told)
-        return dict(zip(self.task.metric_names, told, strict=True))
+        values = np.empty((len(self.task.metric_names), self.worlds))
+        self._write_metrics(0, values)
+        return dict(zip(self.task.metric_names, values, strict=True))
 
     def metrics(self, world: int = 0) -> dict[str, float]:
         """Return the domain metrics of one world's episode so far, by name, without those that have no value yet.
 
         NaN is not used, since two equal infos would then differ.
         """
-        self._tell_of(range(self.worlds)[world], self._alone)
-        values = self._alone.ravel().tolist()
+        self._write_metrics(range(self.worlds)[world], self._metrics_row)
+        values = self._metrics_row.ravel().tolist()
         return {name: value for name, value in zip(self.task.metric_names, values, strict=True) if value == value}
 
-    def _tell_of(self, first: int, told: NDArray[np.float64]) -> None:
-        """Write the metrics of the worlds from `first` on into `told`, (K, B)."""
-        self._tell(*self._counted, first, told)
-        if self._tell is self._entries[1]:
-            self._tell = without_dispatch(self._tell)
+    def _write_metrics(self, first: int, out: NDArray[np.float64]) -> None:
+        """Write the metrics of the worlds from `first` on into `out`, (K, B)."""
+        self._compute_metrics(*self._metric_arguments, first, out)
+        if self._compute_metrics is self._entries[1]:
+            self._compute_metrics = without_dispatch(self._compute_metrics)
 
     def snapshot(self, world: int = 0) -> Snapshot:
         """Return one world at this instant, for pictures."""
@@ -420,19 +431,19 @@ class World:
 
 
 @functools.cache
-def _portions(worlds: int, crew: int) -> tuple[tuple[int, int], ...]:
-    """Return the chunks of worlds for `crew` threads: the first world and the one after the last of each chunk.
+def _chunks(worlds: int, threads: int) -> tuple[tuple[int, int], ...]:
+    """Return the chunks of worlds for this many threads: the first world and the one after the last of each chunk.
 
     Each is a thread's share of half of the rest, so that all threads end at the same time even if some start late.
     """
-    least, at, portions = -(-worlds // (LEAST * crew)), 0, []
+    least, at, chunks = -(-worlds // (LEAST * threads)), 0, []
     while at < worlds:
-        end = min(at + max(-(-(worlds - at) // (2 * crew)), least), worlds)
-        portions.append((at, end))
+        end = min(at + max(-(-(worlds - at) // (2 * threads)), least), worlds)
+        chunks.append((at, end))
         at = end
-    return tuple(portions)
+    return tuple(chunks)
 
 
-def _whole(value: object) -> bool:
+def _is_integer(value: object) -> bool:
     """Return True if it is an integer; False for a bool."""
     return isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.bool_))

@@ -51,7 +51,7 @@ class View:
             identity=state.identity[world] if self.scene.population else None, inner=self.inner_numbers(state, world),
         )  # fmt: skip
 
-    def numbers(self, state: State, world: int = 0) -> NDArray[np.float64] | None:
+    def inner_numbers(self, state: State, world: int = 0) -> NDArray[np.float64] | None:
         """Return the inner number of every agent that pictures show, (N,), set by its appearance; None without one."""
         if not any(look.by == "inner" for look in self.looks):
             return None

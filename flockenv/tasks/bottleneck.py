@@ -24,7 +24,15 @@ from flockenv.physics.effects import Contact, ObstacleContact
 from flockenv.scene import Group, Scene
 from flockenv.scene.presets import PRESETS
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.observations import clip, neighbour_slots, place_of, put, put_crowding, put_neighbour, velocity_of
+from flockenv.tasks.observations import (
+    clip,
+    neighbour_slots,
+    position_of,
+    velocity_of,
+    write_crowding,
+    write_neighbour,
+    write_vector,
+)
 from flockenv.tasks.task import Frame, Task
 
 __all__ = ["Bottleneck"]
@@ -53,7 +61,7 @@ def spawn(p: Any, frame: Frame) -> None:
 
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
-    """Write each learner's action as a force along the room's axes; the others follow `_walker`.
+    """Write each learner's action as a force along the room's axes; the others follow `_steer_person`.
 
     An agent that left in the decision before is removed now, so that the last observation still holds it.
     """
@@ -63,24 +71,24 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
             force[0, i] = action[i, 0] * frame.max_force[i]
             force[1, i] = action[i, 1] * frame.max_force[i]
         else:
-            _walker(p, frame, i, force)
+            _steer_person(p, frame, i, force)
 
 
 @kernel
-def _walker(p: Any, frame: Frame, i: int, force: Any) -> None:
+def _steer_person(p: Any, frame: Frame, i: int, force: Any) -> None:
     """Write the force of a scripted person: to the door at up to 1.34 m/s, off others, as in Helbing et al. 2000."""
-    velocity, top = velocity_of(frame, i), min(1.34, p.max_speed)
+    velocity, speed = velocity_of(frame, i), min(1.34, p.max_speed)
     y, fits = 0.5 * p.room - np.float64(frame.pos[1, i]), max(0.5 * p.width - 1.2 * _RADIUS, 0.0)
-    aside = y - min(max(y, -fits), fits)
-    way = unit((max(p.room - np.float64(frame.pos[0, i]), 0.0) + 0.1, aside))
-    wish = scale(sub(scale(way, top), velocity), _MASS / p.driving_tau)
+    sideways = y - min(max(y, -fits), fits)
+    direction = unit((max(p.room - np.float64(frame.pos[0, i]), 0.0) + 0.1, sideways))
+    total = scale(sub(scale(direction, speed), velocity), _MASS / p.driving_tau)
     for j in range(frame.pos.shape[1]):
-        to = sub(place_of(frame, j), place_of(frame, i))
+        to = sub(position_of(frame, j), position_of(frame, i))
         if j != i and frame.alive[j] and norm(to) < p.sight:
-            tie = (1.0, 0.0) if j < i else (-1.0, 0.0)
-            push = steering.repulsion(to, tie, 2.0 * _RADIUS, p.circular_repulsion_decay)
-            wish = add(wish, scale(push, p.circular_repulsion_strength))
-    force[0, i], force[1, i] = wish[0], wish[1]
+            separation = (1.0, 0.0) if j < i else (-1.0, 0.0)
+            push = steering.repulsion(to, separation, 2.0 * _RADIUS, p.circular_repulsion_decay)
+            total = add(total, scale(push, p.circular_repulsion_strength))
+    force[0, i], force[1, i] = total[0], total[1]
 
 
 @kernel
@@ -117,7 +125,7 @@ def keep(p: Any, before: Frame, after: Frame) -> None:
 
 
 @kernel
-def _left(p: Any, frame: Frame, i: int) -> float:
+def _exit_distance(p: Any, frame: Frame, i: int) -> float:
     """Return the distance from agent i to the middle of the door's far side, m."""
     x, y = p.room + _RADIUS - np.float64(frame.pos[0, i]), 0.5 * p.room - np.float64(frame.pos[1, i])
     return math.hypot(max(x, 0.0), y)
@@ -131,7 +139,7 @@ def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any
             terms[i, k] = 0.0
         if after.memory[2, i] < 2.0:
             pressure = np.float64(after.memory[0, i])
-            terms[i, at.progress] = p.progress_reward * (_left(p, before, i) - _left(p, after, i))
+            terms[i, at.progress] = p.progress_reward * (_exit_distance(p, before, i) - _exit_distance(p, after, i))
             terms[i, at.out] = p.out_reward if after.memory[2, i] > 0.0 else 0.0
             terms[i, at.pressed] = -p.press_cost * min(pressure / p.limit, 1.0) * p.control_dt
             terms[i, at.hurt] = -p.hurt_cost * p.control_dt if pressure > p.limit else 0.0
@@ -141,16 +149,16 @@ def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any
 @kernel
 def ended(p: Any, at: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """End the learners that are through the door; return True if all are out and none of them was ever hurt."""
-    everybody, unhurt = True, True
+    all_out, unhurt = True, True
     for i in range(over.shape[0]):
         out = bool(after.memory[2, i] > 0.0)
         over[i] = out
-        everybody &= out
+        all_out &= out
         unhurt &= bool(after.memory[1, i] <= p.limit)
     if p.together > 0.0:
         for i in range(over.shape[0]):
-            over[i] = everybody
-    return everybody and unhurt
+            over[i] = all_out
+    return all_out and unhurt
 
 
 @kernel
@@ -200,18 +208,18 @@ def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
         if frame.memory[2, i] > 0.0:
             continue
         x, y = p.room - frame.pos[0, i], half - frame.pos[1, i]
-        put(row, at.velocity, (clip(frame.vel[0, i] / p.max_speed), clip(frame.vel[1, i] / p.max_speed)))
-        put(row, at.door, (clip(x / p.room), clip(y / p.room)))
-        put(row, at.door_near, (clip(x / p.close), clip(y / p.close)))
-        put(row, at.to_sides, (clip(frame.pos[1, i] / p.room), clip((p.room - frame.pos[1, i]) / p.room)))
+        write_vector(row, at.velocity, (clip(frame.vel[0, i] / p.max_speed), clip(frame.vel[1, i] / p.max_speed)))
+        write_vector(row, at.door, (clip(x / p.room), clip(y / p.room)))
+        write_vector(row, at.door_near, (clip(x / p.close), clip(y / p.close)))
+        write_vector(row, at.to_sides, (clip(frame.pos[1, i] / p.room), clip((p.room - frame.pos[1, i]) / p.room)))
         row[np.uint64(at.pressure)] = min(np.float64(frame.memory[0, i]) / p.limit, 1.0)
         for s in range(frame.near_count[i]):
-            j = np.uint64(frame.near_who[s, i])
+            j = np.uint64(frame.near_index[s, i])
             to = (frame.pos[0, j] - frame.pos[0, i], frame.pos[1, j] - frame.pos[1, i])
             relative = (frame.vel[0, j] - frame.vel[0, i], frame.vel[1, j] - frame.vel[1, i])
             distance = max(math.sqrt(to[0] * to[0] + to[1] * to[1]), 1e-9)
-            put_neighbour(row, at, s, to, relative, axis, one / p.sight, 0.5 * one / p.max_speed)
-            put_crowding(row, at, s, to, axis, distance, distance - 2.0 * _RADIUS, p.near)
+            write_neighbour(row, at, s, to, relative, axis, one / p.sight, 0.5 * one / p.max_speed)
+            write_crowding(row, at, s, to, axis, distance, distance - 2.0 * _RADIUS, p.near)
 
 
 class Bottleneck(Task):
@@ -265,7 +273,7 @@ class Bottleneck(Task):
     time_cost: float = Field(default=0.5, ge=0, description="per s in the room")
 
     @model_validator(mode="after")
-    def _room_for_all(self) -> Bottleneck:
+    def _check_room(self) -> Bottleneck:
         """Raise ValueError for more learners than people, a door wider than its wall, or more people than fit."""
         if self.learners > self.people:
             raise ValueError(f"learners = {self.learners}: there are only {self.people} people")
@@ -287,8 +295,8 @@ class Bottleneck(Task):
     def parameters(self) -> dict[str, float]:
         """Return the fields, the grid of starting cells, and the parameters of scripted people."""
         columns, rows = self.cells
-        begin = {"columns": float(columns), "rows": float(rows)}
-        return super().parameters() | begin | _MODEL.numbers
+        cells = {"columns": float(columns), "rows": float(rows)}
+        return super().parameters() | cells | _MODEL.numbers
 
     @property
     def agents(self) -> int:

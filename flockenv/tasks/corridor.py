@@ -22,9 +22,17 @@ from flockenv.model.state import State
 from flockenv.physics.effects import ObstacleContact
 from flockenv.scene import Group, Scene
 from flockenv.scene.presets import PRESETS
-from flockenv.tasks.lasting import MEASURES, METRICS, LastingTask, judge, tell_lasting
+from flockenv.tasks.lasting import MEASURES, METRICS, LastingTask, write_aim_measures, write_aim_metrics
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.observations import neighbour_slots, offset, put, put_crowding, put_neighbour, turned, velocity_of
+from flockenv.tasks.observations import (
+    local_components,
+    neighbour_slots,
+    offset,
+    velocity_of,
+    write_crowding,
+    write_neighbour,
+    write_vector,
+)
 from flockenv.tasks.task import Frame
 
 __all__ = ["Corridor"]
@@ -59,52 +67,53 @@ def spawn(p: Any, frame: Frame) -> None:
 
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
-    """Write each learner's action as a force (along its walking direction, to the left); others follow `_walker`."""
+    """Write each learner's action as a force (along its walking direction, to its left); others: `_steer_walker`."""
     for i in range(frame.pos.shape[1]):
-        way = np.float64(frame.memory[0, i])
+        direction = np.float64(frame.memory[0, i])
         if i < action.shape[0]:
-            force[0, i], force[1, i] = way * action[i, 0] * frame.max_force[i], way * action[i, 1] * frame.max_force[i]
+            force[0, i] = direction * action[i, 0] * frame.max_force[i]
+            force[1, i] = direction * action[i, 1] * frame.max_force[i]
         else:
-            _walker(p, frame, i, force)
+            _steer_walker(p, frame, i, force)
 
 
 @kernel
-def _walker(p: Any, frame: Frame, i: int, force: Any) -> None:
+def _steer_walker(p: Any, frame: Frame, i: int, force: Any) -> None:
     """Write the force of a scripted walker: the social force of Moussaid et al. 2009, with repulsion from walls."""
     velocity, y = velocity_of(frame, i), np.float64(frame.pos[1, i]) - _WALL
-    wanted = (np.float64(frame.memory[0, i] * frame.memory[1, i]), 0.0)
+    desired = (np.float64(frame.memory[0, i] * frame.memory[1, i]), 0.0)
     decay = p.obstacle_repulsion_decay
-    off = p.obstacle_repulsion_acceleration * (
+    wall_force = p.obstacle_repulsion_acceleration * (
         math.exp(-max(y, 0.0) / decay) - math.exp(-max(p.width - y, 0.0) / decay)
     )
-    wish = add(scale(sub(wanted, velocity), 1.0 / p.driving_tau), (0.0, off))
+    total = add(scale(sub(desired, velocity), 1.0 / p.driving_tau), (0.0, wall_force))
     for j in range(frame.pos.shape[1]):
         x = offset(np.float64(frame.pos[0, i]), np.float64(frame.pos[0, j]), p.length)
         to = (x, np.float64(frame.pos[1, j] - frame.pos[1, i]))
         if j != i and norm(to) < p.sight:
-            tie = (1.0, 0.0) if j < i else (-1.0, 0.0)
-            aside = steering.sidestep(
-                to, velocity, velocity_of(frame, j), tie, p.sidestep_importance, p.sidestep_gamma, p.sidestep_angular,
-                p.sidestep_forward, p.sidestep_bias,
+            separation = (1.0, 0.0) if j < i else (-1.0, 0.0)
+            push = steering.sidestep(
+                to, velocity, velocity_of(frame, j), separation, p.sidestep_importance, p.sidestep_gamma,
+                p.sidestep_angular, p.sidestep_forward, p.sidestep_bias,
             )  # fmt: skip
-            wish = add(wish, scale(aside, p.sidestep_acceleration))
-    force[0, i], force[1, i] = wish[0], wish[1]
+            total = add(total, scale(push, p.sidestep_acceleration))
+    force[0, i], force[1, i] = total[0], total[1]
 
 
 @kernel
-def _share(frame: Frame, i: int) -> float:
+def _speed_share(frame: Frame, i: int) -> float:
     """Return the speed of agent i along its walking direction over its desired speed."""
     return np.float64(frame.vel[0, i]) * np.float64(frame.memory[0, i]) / np.float64(frame.memory[1, i])
 
 
 @kernel
-def _suited(frame: Frame, i: int) -> float:
+def _speed_score(frame: Frame, i: int) -> float:
     """Return 1 - |speed along the walking direction / desired speed - 1|."""
-    return 1.0 - abs(_share(frame, i) - 1.0)
+    return 1.0 - abs(_speed_share(frame, i) - 1.0)
 
 
 @kernel
-def _touches(frame: Frame, i: int) -> float:
+def _count_touches(frame: Frame, i: int) -> float:
     """Return the number of agents that agent i touches."""
     touches = 0.0
     for s in range(frame.near_count[i]):
@@ -117,13 +126,13 @@ def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any
     """Write the terms along (largest at the desired speed), touch, effort."""
     for i in range(terms.shape[0]):
         push = action[i, 0] * action[i, 0] + action[i, 1] * action[i, 1]
-        terms[i, at.along] = p.along_reward * _suited(after, i) * p.control_dt
-        terms[i, at.touch] = -p.touch_cost * _touches(after, i) * p.control_dt
+        terms[i, at.along] = p.along_reward * _speed_score(after, i) * p.control_dt
+        terms[i, at.touch] = -p.touch_cost * _count_touches(after, i) * p.control_dt
         terms[i, at.effort] = -p.effort_cost * min(push, 1.0) * p.control_dt
 
 
 @kernel
-def _order(p: Any, frame: Frame) -> float:
+def _lane_order(p: Any, frame: Frame) -> float:
     """Return the lane order: the share of pairs in a row with the same direction minus that with opposite directions.
 
     Rows run along the corridor. For n people in a row whose directions (+-1) sum to D it is (D^2 - n) / (n^2 - n),
@@ -133,13 +142,13 @@ def _order(p: Any, frame: Frame) -> float:
     rows = int(p.lane_rows)
     same, pairs = 0.0, 0.0
     for r in range(rows):
-        ways, n = 0.0, 0.0
+        directions, n = 0.0, 0.0
         for i in range(frame.pos.shape[1]):
             row = int((np.float64(frame.pos[1, i]) - _WALL) * rows / p.width)
             if min(max(row, 0), rows - 1) == r:
-                ways += frame.memory[0, i]
+                directions += frame.memory[0, i]
                 n += 1.0
-        same += ways * ways - n
+        same += directions * directions - n
         pairs += n * n - n
     return same / pairs if pairs > 0.0 else 0.0
 
@@ -150,10 +159,10 @@ def ended(p: Any, at: Any, before: Frame, after: Frame, numbers: Any, over: Any)
     n = over.shape[0]
     share, touches = 0.0, 0.0
     for i in range(n):
-        share += _suited(after, i)
-        touches += _touches(after, i)
+        share += _speed_score(after, i)
+        touches += _count_touches(after, i)
     holds = bool(share > p.aim * n and touches == 0.0)
-    judge(p, at, after.step, holds, numbers)
+    write_aim_measures(p, at, after.step, holds, numbers)
     return holds
 
 
@@ -163,24 +172,24 @@ def measure(p: Any, at: Any, before: Frame, after: Frame, numbers: Any) -> None:
     n, length = int(p.learners), p.length
     share, began = 0.0, 0.0
     for i in range(n):
-        share += _share(after, i) / n
+        share += _speed_share(after, i) / n
         for s in range(after.near_count[i]):
             if after.near_square[s, i] >= 4.0 * _RADIUS * _RADIUS:
                 break
-            j = after.near_who[s, i]
+            j = after.near_index[s, i]
             x = offset(np.float64(before.pos[0, i]), np.float64(before.pos[0, j]), length)
             y = np.float64(before.pos[1, j] - before.pos[1, i])
             both = 0.5 if j < n else 1.0  # a pair of learners is counted from both sides
             began += both if x * x + y * y >= 4.0 * _RADIUS * _RADIUS else 0.0
     late = 2 * after.step > p.horizon
     numbers[at.share], numbers[at.touches] = share, began
-    numbers[at.order], numbers[at.late] = _order(p, after) if late else 0.0, 1.0 if late else 0.0
+    numbers[at.order], numbers[at.late] = _lane_order(p, after) if late else 0.0, 1.0 if late else 0.0
 
 
 @kernel
 def metrics(p: Any, at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
     """Write mean speed over the desired one; contacts that began; lane order in the second half; those of the aim."""
-    tell_lasting(at, sums, last, steps, numbers)
+    write_aim_metrics(at, sums, last, steps, numbers)
     numbers[at.speed] = sums.share / max(steps, 1)
     numbers[at.collisions] = sums.touches
     if sums.late > 0:
@@ -195,19 +204,20 @@ def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
         row = rows[i]
         for c in range(rows.shape[1]):
             row[np.uint64(c)] = 0.0
-        way = (frame.memory[0, i], like(frame.memory[0, i], 0.0))
+        direction = (frame.memory[0, i], like(frame.memory[0, i], 0.0))
         low, high = frame.pos[1, i] - _WALL, _WALL + p.width - frame.pos[1, i]
         left, right = (high, low) if frame.memory[0, i] > 0.0 else (low, high)
-        put(row, at.velocity, turned((frame.vel[0, i], frame.vel[1, i]), way, one / p.max_speed))
+        velocity = (frame.vel[0, i], frame.vel[1, i])
+        write_vector(row, at.velocity, local_components(velocity, direction, one / p.max_speed))
         row[np.uint64(at.desired_speed)] = min(frame.memory[1, i] / p.max_speed, one)
-        put(row, at.walls, (min(max(left / p.width, 0.0), 1.0), min(max(right / p.width, 0.0), 1.0)))
+        write_vector(row, at.walls, (min(max(left / p.width, 0.0), 1.0), min(max(right / p.width, 0.0), 1.0)))
         for s in range(frame.near_count[i]):
-            j = np.uint64(frame.near_who[s, i])
+            j = np.uint64(frame.near_index[s, i])
             x, y = offset(frame.pos[0, i], frame.pos[0, j], p.length), frame.pos[1, j] - frame.pos[1, i]
             relative = (frame.vel[0, j] - frame.vel[0, i], frame.vel[1, j] - frame.vel[1, i])
             distance = max(math.sqrt(x * x + y * y), 1e-9)
-            put_neighbour(row, at, s, (x, y), relative, way, one / p.sight, 0.5 * one / p.max_speed)
-            put_crowding(row, at, s, (x, y), way, distance, distance - 2.0 * _RADIUS, p.near)
+            write_neighbour(row, at, s, (x, y), relative, direction, one / p.sight, 0.5 * one / p.max_speed)
+            write_crowding(row, at, s, (x, y), direction, distance, distance - 2.0 * _RADIUS, p.near)
 
 
 class Corridor(LastingTask):
@@ -255,7 +265,7 @@ class Corridor(LastingTask):
     effort_cost: float = Field(default=0.1, ge=0, description="per s at full force")
 
     @model_validator(mode="after")
-    def _room(self) -> Corridor:
+    def _check_room(self) -> Corridor:
         """Raise ValueError for more learners than people, more people than fit, or a sight beyond half the length."""
         if self.learners > self.people:
             raise ValueError(f"learners = {self.learners}: there are only {self.people} people")
@@ -275,8 +285,8 @@ class Corridor(LastingTask):
     def parameters(self) -> dict[str, float]:
         """Return the fields, the grid of starting cells, and the parameters of scripted walkers."""
         columns, rows = self.cells
-        begin = {"columns": float(columns), "rows": float(rows)}
-        return super().parameters() | begin | PRESETS["moussaid_2009"].numbers
+        cells = {"columns": float(columns), "rows": float(rows)}
+        return super().parameters() | cells | PRESETS["moussaid_2009"].numbers
 
     @property
     def agents(self) -> int:

@@ -21,13 +21,13 @@ from flockenv.model.state import State
 from flockenv.scene import Group, Scene
 from flockenv.steering import orca
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.observations import neighbour_slots, put, put_neighbour, turned
+from flockenv.tasks.observations import local_components, neighbour_slots, write_neighbour, write_vector
 from flockenv.tasks.task import Frame, Task
 
 __all__ = ["Crossing"]
 
-_HEEDED = 6  # neighbours that a scripted walker avoids
-_NOBODY = (0.0,) * (_HEEDED * orca.SLOT)
+_AVOIDED = 6  # neighbours that a scripted walker avoids
+_EMPTY = (0.0,) * (_AVOIDED * orca.SLOT)
 
 
 @kernel
@@ -56,68 +56,68 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
             force[0, i] = along * hx - left * hy
             force[1, i] = along * hy + left * hx
         else:
-            _walker(p, frame, i, force)
+            _steer_walker(p, frame, i, force)
 
 
 @kernel
-def _walker(p: Any, frame: Frame, i: int, force: Any) -> None:
+def _steer_walker(p: Any, frame: Frame, i: int, force: Any) -> None:
     """Write the force of a scripted walker by ORCA: the collision-free velocity (2 s) nearest to that to its goal."""
-    given, lines, relaxed = tuple_as_array(_NOBODY), tuple_as_array(_NOBODY), tuple_as_array(_NOBODY)
+    neighbours, lines, relaxed = tuple_as_array(_EMPTY), tuple_as_array(_EMPTY), tuple_as_array(_EMPTY)
     v = (np.float64(frame.vel[0, i]), np.float64(frame.vel[1, i]))
-    found, last, last_square = 0, -1, -1.0
-    for _ in range(_HEEDED):
-        j, square = _next_nearest(p, frame, i, last, last_square)
+    count, previous, previous_square = 0, -1, -1.0
+    for _ in range(_AVOIDED):
+        j, square = _next_nearest(p, frame, i, previous, previous_square)
         if j < 0:
             break
-        at, last, last_square = orca.SLOT * found, j, square
+        at, previous, previous_square = orca.SLOT * count, j, square
         for k in range(2):
-            given[at + k] = frame.pos[k, j] - frame.pos[k, i]
-            given[at + 2 + k] = frame.vel[k, j]
-        given[at + 4], given[at + 5] = frame.radius[j] + 0.1, 0.5
-        found += 1
-    gx, gy = _to_goal(frame, i)
+            neighbours[at + k] = frame.pos[k, j] - frame.pos[k, i]
+            neighbours[at + 2 + k] = frame.vel[k, j]
+        neighbours[at + 4], neighbours[at + 5] = frame.radius[j] + 0.1, 0.5
+        count += 1
+    gx, gy = _goal_offset(frame, i)
     distance = math.sqrt(gx * gx + gy * gy)
     top = np.float64(frame.max_speed[i])
     share = min(top, distance) / max(distance, 1e-9)
-    asked = ((gx * share, gy * share), top, 0.3)
-    change = orca.orca_change(v, np.float64(frame.radius[i]), asked, 2.0, p.control_dt, given, found, lines, relaxed)
+    desired = ((gx * share, gy * share), top, 0.3)
+    change = orca.orca_change(v, np.float64(frame.radius[i]), desired, 2.0, p.control_dt, neighbours, count, lines, relaxed)
     fx, fy = change[0] / p.control_dt, change[1] / p.control_dt
-    cut = min(1.0, frame.max_force[i] / max(math.sqrt(fx * fx + fy * fy), 1e-9))
-    force[0, i], force[1, i] = cut * fx, cut * fy
+    factor = min(1.0, frame.max_force[i] / max(math.sqrt(fx * fx + fy * fy), 1e-9))
+    force[0, i], force[1, i] = factor * fx, factor * fy
 
 
 @kernel
-def _next_nearest(p: Any, frame: Frame, i: int, last: int, last_square: float) -> tuple[int, float]:
-    """Return the next nearest agent to i after `last`, within sight, ties by index, and its squared distance; or -1."""
-    best, who = np.float64(p.sight * p.sight), -1
+def _next_nearest(p: Any, frame: Frame, i: int, previous: int, previous_square: float) -> tuple[int, float]:
+    """Return the nearest agent to i after `previous`, in sight, ties by index, and its squared distance; or -1."""
+    least, nearest = np.float64(p.sight * p.sight), -1
     for j in range(frame.pos.shape[1]):
         dx, dy = frame.pos[0, j] - frame.pos[0, i], frame.pos[1, j] - frame.pos[1, i]
         square = np.float64(dx * dx + dy * dy)
-        beyond = square > last_square or (square == last_square and j > last)
-        if j != i and frame.alive[j] and beyond and square < best:
-            best, who = square, j
-    return who, best
+        beyond = square > previous_square or (square == previous_square and j > previous)
+        if j != i and frame.alive[j] and beyond and square < least:
+            least, nearest = square, j
+    return nearest, least
 
 
 @kernel
-def _to_goal(frame: Frame, i: int) -> tuple[float, float]:
+def _goal_offset(frame: Frame, i: int) -> tuple[float, float]:
     """Return the offset from agent i to its goal, m."""
     return frame.memory[0, i] - np.float64(frame.pos[0, i]), frame.memory[1, i] - np.float64(frame.pos[1, i])
 
 
 @kernel
-def _left(frame: Frame, i: int) -> float:
+def _goal_distance(frame: Frame, i: int) -> float:
     """Return the distance from agent i to its goal, m."""
-    x, y = _to_goal(frame, i)
+    x, y = _goal_offset(frame, i)
     return math.sqrt(x * x + y * y)
 
 
 @kernel
-def _touches(frame: Frame, i: int) -> float:
+def _count_touches(frame: Frame, i: int) -> float:
     """Return the number of agents that agent i touches."""
     touches = 0.0
     for s in range(frame.near_count[i]):
-        contact = frame.radius[i] + frame.radius[frame.near_who[s, i]]
+        contact = frame.radius[i] + frame.radius[frame.near_index[s, i]]
         touches += 1.0 if frame.near_square[s, i] < contact * contact else 0.0
     return touches
 
@@ -126,46 +126,46 @@ def _touches(frame: Frame, i: int) -> float:
 def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
     """Write the terms progress, arrival (taken back on leaving), touch, time (while away from the goal), effort."""
     for i in range(terms.shape[0]):
-        was, left = _left(before, i), _left(after, i)
-        came = (1.0 if left <= p.goal_radius else 0.0) - (1.0 if was <= p.goal_radius else 0.0)
+        before_distance, distance = _goal_distance(before, i), _goal_distance(after, i)
+        arrivals = (1.0 if distance <= p.goal_radius else 0.0) - (1.0 if before_distance <= p.goal_radius else 0.0)
         push = action[i, 0] * action[i, 0] + action[i, 1] * action[i, 1]
-        terms[i, at.progress] = p.progress_reward * (was - left)
-        terms[i, at.arrival] = p.arrival_reward * came
-        terms[i, at.touch] = -p.touch_cost * _touches(after, i) * p.control_dt
-        terms[i, at.time] = -p.time_cost * p.control_dt if left > p.goal_radius else 0.0
+        terms[i, at.progress] = p.progress_reward * (before_distance - distance)
+        terms[i, at.arrival] = p.arrival_reward * arrivals
+        terms[i, at.touch] = -p.touch_cost * _count_touches(after, i) * p.control_dt
+        terms[i, at.time] = -p.time_cost * p.control_dt if distance > p.goal_radius else 0.0
         terms[i, at.effort] = -p.effort_cost * min(push, 1.0) * p.control_dt
 
 
 @kernel
 def ended(p: Any, at: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """End all learners once every one is at its goal, which is success."""
-    there = True
+    all_there = True
     for i in range(over.shape[0]):
-        there &= _left(after, i) <= p.goal_radius
+        all_there &= _goal_distance(after, i) <= p.goal_radius
     for i in range(over.shape[0]):
-        over[i] = there
-    return there
+        over[i] = all_there
+    return all_there
 
 
 @kernel
 def measure(p: Any, at: Any, before: Frame, after: Frame, numbers: Any) -> None:
     """Write the learners' contacts that began; share at the goal; mean metres gained, and walked."""
     learners = int(p.learners)
-    began, there, gained, walked = 0.0, 0.0, 0.0, 0.0
+    began, at_goal, gained, walked = 0.0, 0.0, 0.0, 0.0
     for i in range(learners):
-        left = _left(after, i)
-        there += 1.0 if left <= p.goal_radius else 0.0
-        gained += _left(before, i) - left
+        distance = _goal_distance(after, i)
+        at_goal += 1.0 if distance <= p.goal_radius else 0.0
+        gained += _goal_distance(before, i) - distance
         walked += math.hypot(after.pos[0, i] - before.pos[0, i], after.pos[1, i] - before.pos[1, i])
         for s in range(after.near_count[i]):
-            j = after.near_who[s, i]
+            j = after.near_index[s, i]
             contact = after.radius[i] + after.radius[j]
             if after.near_square[s, i] >= contact * contact:
                 break
             x, y = before.pos[0, j] - before.pos[0, i], before.pos[1, j] - before.pos[1, i]
             both = 0.5 if j < learners else 1.0  # a pair of learners is counted from both sides
             began += both if x * x + y * y >= contact * contact else 0.0
-    numbers[at.touches], numbers[at.there] = began, there / learners
+    numbers[at.touches], numbers[at.there] = began, at_goal / learners
     numbers[at.gained], numbers[at.walked] = gained / learners, walked / learners
 
 
@@ -186,13 +186,13 @@ def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
         row, course = rows[i], (frame.memory[2, i], frame.memory[3, i])
         for c in range(rows.shape[1]):
             row[np.uint64(c)] = 0.0
-        put(row, at.velocity, turned((frame.vel[0, i], frame.vel[1, i]), course, one / p.max_speed))
-        put(row, at.goal, turned(_to_goal(frame, i), course, one / (3.0 * p.circle)))
+        write_vector(row, at.velocity, local_components((frame.vel[0, i], frame.vel[1, i]), course, one / p.max_speed))
+        write_vector(row, at.goal, local_components(_goal_offset(frame, i), course, one / (3.0 * p.circle)))
         for s in range(frame.near_count[i]):
-            j = np.uint64(frame.near_who[s, i])
+            j = np.uint64(frame.near_index[s, i])
             to = (frame.pos[0, j] - frame.pos[0, i], frame.pos[1, j] - frame.pos[1, i])
             relative = (frame.vel[0, j] - frame.vel[0, i], frame.vel[1, j] - frame.vel[1, i])
-            put_neighbour(row, at, s, to, relative, course, one / p.sight, 0.5 * one / p.max_speed)
+            write_neighbour(row, at, s, to, relative, course, one / p.sight, 0.5 * one / p.max_speed)
 
 
 class Crossing(Task):
@@ -233,7 +233,7 @@ class Crossing(Task):
     effort_cost: float = Field(default=0.1, ge=0, description="per s at full force")
 
     @model_validator(mode="after")
-    def _enough(self) -> Crossing:
+    def _check_numbers(self) -> Crossing:
         """Raise ValueError for more learners than agents, or more agents than fit on the circle."""
         if self.learners > self.agents:
             raise ValueError(f"learners = {self.learners}: there are only {self.agents} agents")

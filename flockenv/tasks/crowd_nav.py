@@ -24,7 +24,7 @@ from flockenv.scene import Group, Scene
 from flockenv.scene.presets import PRESETS
 from flockenv.steering.arbitration import Blend
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.observations import neighbour_slots, put, put_crowding, put_neighbour, turned
+from flockenv.tasks.observations import local_components, neighbour_slots, write_crowding, write_neighbour, write_vector
 from flockenv.tasks.task import Frame, Task
 
 __all__ = ["CrowdNav"]
@@ -36,7 +36,7 @@ Crowd = Literal[
 """The models of `flockenv.scene.presets` without stiff bodies."""
 
 _RADIUS = 0.3  # m, of the robot, as in CrowdNav
-_NOBODY = 1e3  # m, gap to the nearest pedestrian if there is none
+_NO_GAP = 1e3  # m, gap to the nearest pedestrian if there is none
 
 
 @kernel
@@ -53,7 +53,7 @@ def spawn(p: Any, frame: Frame) -> None:
         frame.vel[0, i], frame.vel[1, i] = 0.0, 0.0
         frame.memory[0, i], frame.memory[1, i] = -r * c, -r * s
         frame.memory[2, i], frame.memory[3, i] = -c, -s
-        frame.memory[4, i], frame.memory[5, i] = _NOBODY, _NOBODY
+        frame.memory[4, i], frame.memory[5, i] = _NO_GAP, _NO_GAP
 
 
 @kernel
@@ -69,7 +69,7 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
 @kernel
 def keep(p: Any, before: Frame, after: Frame) -> None:
     """Store the least gap between surfaces along the path of this decision, and so far in the episode, m."""
-    least = np.float64(_NOBODY)
+    least = np.float64(_NO_GAP)
     for j in range(1, after.pos.shape[1]):
         x, y = np.float64(before.pos[0, j] - before.pos[0, 0]), np.float64(before.pos[1, j] - before.pos[1, 0])
         dx = np.float64(after.pos[0, j] - after.pos[0, 0]) - x
@@ -83,15 +83,15 @@ def keep(p: Any, before: Frame, after: Frame) -> None:
 
 
 @kernel
-def _to_goal(frame: Frame) -> tuple[float, float]:
+def _goal_offset(frame: Frame) -> tuple[float, float]:
     """Return the offset from the robot to its goal, m."""
     return frame.memory[0, 0] - np.float64(frame.pos[0, 0]), frame.memory[1, 0] - np.float64(frame.pos[1, 0])
 
 
 @kernel
-def _left(frame: Frame) -> float:
+def _goal_distance(frame: Frame) -> float:
     """Return the distance from the robot to its goal, m."""
-    x, y = _to_goal(frame)
+    x, y = _goal_offset(frame)
     return math.sqrt(x * x + y * y)
 
 
@@ -104,14 +104,14 @@ def _collides(after: Frame) -> bool:
 @kernel
 def _arrives(p: Any, after: Frame) -> bool:
     """Return True if the robot is at its goal and touched no pedestrian in this decision."""
-    return bool(_left(after) <= p.goal_radius) and not _collides(after)
+    return bool(_goal_distance(after) <= p.goal_radius) and not _collides(after)
 
 
 @kernel
 def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
     """Write the terms progress, success, collision, discomfort, time."""
     gap = np.float64(after.memory[4, 0])
-    terms[0, at.progress] = p.progress_reward * (_left(before) - _left(after))
+    terms[0, at.progress] = p.progress_reward * (_goal_distance(before) - _goal_distance(after))
     terms[0, at.success] = p.success_reward if _arrives(p, after) else 0.0
     terms[0, at.collision] = -p.collision_cost if gap < 0.0 else 0.0
     near = p.comfort_distance - gap if gap >= 0.0 else 0.0
@@ -161,16 +161,16 @@ def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
     row, course = rows[0], (frame.memory[2, 0], frame.memory[3, 0])
     for c in range(rows.shape[1]):
         row[np.uint64(c)] = 0.0
-    put(row, at.velocity, turned((frame.vel[0, 0], frame.vel[1, 0]), course, one / p.max_speed))
-    put(row, at.goal, turned(_to_goal(frame), course, one / (3.0 * p.circle)))
+    write_vector(row, at.velocity, local_components((frame.vel[0, 0], frame.vel[1, 0]), course, one / p.max_speed))
+    write_vector(row, at.goal, local_components(_goal_offset(frame), course, one / (3.0 * p.circle)))
     for s in range(frame.near_count[0]):
-        j = np.uint64(frame.near_who[s, 0])
+        j = np.uint64(frame.near_index[s, 0])
         to = (frame.pos[0, j] - frame.pos[0, 0], frame.pos[1, j] - frame.pos[1, 0])
         relative = (frame.vel[0, j] - frame.vel[0, 0], frame.vel[1, j] - frame.vel[1, 0])
         distance = max(math.sqrt(to[0] * to[0] + to[1] * to[1]), 1e-9)
         gap = distance - frame.radius[0] - frame.radius[j]
-        put_neighbour(row, at, s, to, relative, course, one / p.sight, 0.25 * one / p.max_speed)
-        put_crowding(row, at, s, to, course, distance, gap, p.near)
+        write_neighbour(row, at, s, to, relative, course, one / p.sight, 0.25 * one / p.max_speed)
+        write_crowding(row, at, s, to, course, distance, gap, p.near)
 
 
 class CrowdNav(Task):
@@ -226,7 +226,7 @@ class CrowdNav(Task):
     time_cost: float = Field(default=0.2, ge=0, description="per s")
 
     @model_validator(mode="after")
-    def _enough(self) -> CrowdNav:
+    def _check_room(self) -> CrowdNav:
         """Raise ValueError for more people than fit on the circle."""
         n = self.people + 1
         room = 2 * math.pi * self.circle * (1 - 2 * self.jitter) / n
@@ -255,11 +255,11 @@ class CrowdNav(Task):
         """A plane; pedestrians cross the circle and avoid each other, and also the robot if it is visible."""
         around = Spawn(low=(-self.circle, -self.circle), high=(self.circle, self.circle))  # before an episode begins
         robot = {"radius": _RADIUS, "max_speed": self.max_speed, "max_force": self.max_force, "role": "learner"}
-        seen = {"radius": self.sight, "group": None if self.visible else 1}
-        wishes = tuple(  # there are no walls
-            wish.model_copy(update=seen) if isinstance(wish, Social) else wish
-            for wish in PRESETS[self.crowd].behaviours(False, 1)
-            if wish.obstacle_law is None
+        sight = {"radius": self.sight, "group": None if self.visible else 1}
+        behaviours = tuple(  # there are no walls
+            effect.model_copy(update=sight) if isinstance(effect, Social) else effect
+            for effect in PRESETS[self.crowd].behaviours(False, 1)
+            if effect.obstacle_law is None
         )
         return Scene(
             space=Plane(),
@@ -269,7 +269,7 @@ class CrowdNav(Task):
             ),
             effects=(
                 Antipode(centre=(0.0, 0.0), group=1),
-                Steer(group=1, arbitration=Blend(), behaviours=wishes),
+                Steer(group=1, arbitration=Blend(), behaviours=behaviours),
             ),
             integrator=self.integrator,
             dt=self.dt,

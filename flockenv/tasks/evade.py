@@ -19,7 +19,7 @@ from flockenv.physics.effects import ObstacleContact
 from flockenv.scene import Group, Scene
 from flockenv.steering import arbitration
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.observations import block_ways, clip, compass, leaves_gap, velocity_of
+from flockenv.tasks.observations import clip, leaves_gap, ray_directions, shorten_free_paths, velocity_of
 from flockenv.tasks.task import Frame, Task
 
 __all__ = ["Evade"]
@@ -47,32 +47,32 @@ def spawn(p: Any, frame: Frame) -> None:
         for t in range(_TRIES):
             for k in range(2):
                 frame.pos[k, i] = 1.0 + (p.size - 2.0) * uniform(frame.key, t, i, k)
-            if _clear(p, frame, i):
+            if _is_clear(p, frame, i):
                 break
         frame.memory[:, i] = 0.0
         frame.memory[2, i] = p.patience  # it has not seen the evader yet
 
 
 @kernel
-def _clear(p: Any, frame: Frame, i: int) -> bool:
+def _is_clear(p: Any, frame: Frame, i: int) -> bool:
     """Return True if agent i is clear of cover, and far enough from the evader and from the pursuers before it."""
     for m in range(frame.rho.shape[0]):
-        if frame.rho[m] > 0.0 and norm(_to_cover(frame, i, m)) < frame.rho[m] + 2.0 * frame.radius[i]:
+        if frame.rho[m] > 0.0 and norm(_cover_offset(frame, i, m)) < frame.rho[m] + 2.0 * frame.radius[i]:
             return False
     for j in range(i):  # noqa: SIM110  # there are no generators in compiled code
-        if norm(_to(frame, i, j)) < (p.start_distance if j == 0 else 2.0):
+        if norm(_offset_to(frame, i, j)) < (p.start_distance if j == 0 else 2.0):
             return False
     return True
 
 
 @kernel
-def _to(frame: Frame, i: int, j: int) -> Vec:
+def _offset_to(frame: Frame, i: int, j: int) -> Vec:
     """Return the offset of agent j from agent i, m; subtracted in the precision of the scene, as in training."""
     return (np.float64(frame.pos[0, j] - frame.pos[0, i]), np.float64(frame.pos[1, j] - frame.pos[1, i]))
 
 
 @kernel
-def _to_cover(frame: Frame, i: int, m: int) -> Vec:
+def _cover_offset(frame: Frame, i: int, m: int) -> Vec:
     """Return the offset of the centre of cover m from agent i, m."""
     return (np.float64(frame.centre[0, m] - frame.pos[0, i]), np.float64(frame.centre[1, m] - frame.pos[1, i]))
 
@@ -80,27 +80,27 @@ def _to_cover(frame: Frame, i: int, m: int) -> Vec:
 @kernel
 def _sees(p: Any, frame: Frame, i: int) -> bool:
     """Return True if pursuer i sees the evader: it is within sight, and no cover blocks the straight line to it."""
-    to = _to(frame, i, 0)
-    distance, way = norm(to), unit(to)
+    to = _offset_to(frame, i, 0)
+    distance, direction = norm(to), unit(to)
     if distance > p.sight:
         return False
     for m in range(frame.rho.shape[0]):
-        if frame.rho[m] > 0.0 and ray_hit(_to_cover(frame, i, m), way, np.float64(frame.rho[m])) < distance:
+        if frame.rho[m] > 0.0 and ray_hit(_cover_offset(frame, i, m), direction, np.float64(frame.rho[m])) < distance:
             return False
     return True
 
 
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
-    """Write the learner's action as a force along the field's axes; pursuers follow `_hunt`."""
+    """Write the learner's action as a force along the field's axes; pursuers follow `_steer_pursuer`."""
     for k in range(2):
         force[k, 0] = action[0, k] * frame.max_force[0]
     for i in range(1, frame.pos.shape[1]):
-        _hunt(p, frame, i, force)
+        _steer_pursuer(p, frame, i, force)
 
 
 @kernel
-def _hunt(p: Any, frame: Frame, i: int, force: Any) -> None:
+def _steer_pursuer(p: Any, frame: Frame, i: int, force: Any) -> None:
     """Write a pursuer's force; priorities: avoid cover, separate from mates, stay in the field, chase the evader."""
     velocity, top = velocity_of(frame, i), np.float64(frame.max_speed[i])
     margin = 0.5
@@ -109,83 +109,83 @@ def _hunt(p: Any, frame: Frame, i: int, force: Any) -> None:
     inside = steering.contain(
         (np.float64(low[0]), np.float64(low[1])), (np.float64(high[0]), np.float64(high[1])), velocity, top, 0.3
     )  # fmt: skip
-    wishes = (
-        scale(_around(frame, i, velocity, top), _GAIN), scale(_apart(frame, i), 2.0), scale(inside, _GAIN),
-        scale(_after(p, frame, i, velocity, top), _GAIN),
+    forces = (
+        scale(_avoid_cover(frame, i, velocity, top), _GAIN), scale(_separation(frame, i), 2.0), scale(inside, _GAIN),
+        scale(_chase(p, frame, i, velocity, top), _GAIN),
     )  # fmt: skip
-    wish = arbitration.allocate(wishes, np.float64(frame.max_force[i]))
-    force[0, i], force[1, i] = wish[0], wish[1]
+    total = arbitration.allocate(forces, np.float64(frame.max_force[i]))
+    force[0, i], force[1, i] = total[0], total[1]
 
 
 @kernel
-def _after(p: Any, frame: Frame, i: int, velocity: Vec, top: float) -> Vec:
+def _chase(p: Any, frame: Frame, i: int, velocity: Vec, top: float) -> Vec:
     """Return the steering vector of the chase: pursue the evader if it is seen, else seek its last seen position.
 
     Once there, or after `patience` s, look behind random cover. Memory: where the evader was last seen, m, and how long
     ago, s.
     """
     if _sees(p, frame, i):
-        to, theirs = _to(frame, i, 0), velocity_of(frame, 0)
+        to, theirs = _offset_to(frame, i, 0), velocity_of(frame, 0)
         frame.memory[0, i], frame.memory[1, i], frame.memory[2, i] = frame.pos[0, 0], frame.pos[1, 0], 0.0
         return steering.pursue(to, velocity, theirs, top, min(steering.interception_time(to, theirs, top), 1.0))
     frame.memory[2, i] += p.control_dt
-    back = (np.float64(frame.memory[0, i] - frame.pos[0, i]), np.float64(frame.memory[1, i] - frame.pos[1, i]))
-    if frame.memory[2, i] < p.patience and norm(back) > 0.5:
-        return steering.seek(back, velocity, top)
+    to_last = (np.float64(frame.memory[0, i] - frame.pos[0, i]), np.float64(frame.memory[1, i] - frame.pos[1, i]))
+    if frame.memory[2, i] < p.patience and norm(to_last) > 0.5:
+        return steering.seek(to_last, velocity, top)
     frame.memory[2, i] = p.patience
-    many = frame.rho.shape[0]
-    goal = (p.size * 0.5 - frame.pos[0, i], p.size * 0.5 - frame.pos[1, i])
-    aim: Vec = (np.float64(goal[0]), np.float64(goal[1]))
-    if many > 0:
+    covers = frame.rho.shape[0]
+    middle = (p.size * 0.5 - frame.pos[0, i], p.size * 0.5 - frame.pos[1, i])
+    target: Vec = (np.float64(middle[0]), np.float64(middle[1]))
+    if covers > 0:
         turn = int(frame.step * p.control_dt / _SEARCH)
-        m = min(int(many * uniform(frame.key, turn, i, 7)), many - 1)
+        m = min(int(covers * uniform(frame.key, turn, i, 7)), covers - 1)
         if frame.rho[m] > 0.0:
-            aim = steering.hiding_place(_to_cover(frame, i, m), np.float64(frame.rho[m]), 1.0, (0.0, 0.0))
-    return steering.arrive(aim, velocity, top, 1.0)
+            target = steering.hiding_place(_cover_offset(frame, i, m), np.float64(frame.rho[m]), 1.0, (0.0, 0.0))
+    return steering.arrive(target, velocity, top, 1.0)
 
 
 @kernel
-def _around(frame: Frame, i: int, velocity: Vec, top: float) -> Vec:
+def _avoid_cover(frame: Frame, i: int, velocity: Vec, top: float) -> Vec:
     """Return the steering vector around the cover that would be hit first within 1 s."""
     forward = unit(velocity)
-    where: Vec = (0.0, 0.0)
-    nearest, room = np.inf, 0.0
+    position: Vec = (0.0, 0.0)
+    nearest, least_clearance = np.inf, 0.0
     for m in range(frame.rho.shape[0]):
         if frame.rho[m] > 0.0:
-            to, clearance = _to_cover(frame, i, m), np.float64(frame.rho[m] + frame.radius[i]) + 0.1
+            to, clearance = _cover_offset(frame, i, m), np.float64(frame.rho[m] + frame.radius[i]) + 0.1
             t = steering.threat(forward, to, clearance, norm(velocity))
             if t < nearest:
-                nearest, where, room = t, to, clearance
+                nearest, position, least_clearance = t, to, clearance
     if nearest < np.inf:
-        return steering.avoid(forward, where, room, top)
+        return steering.avoid(forward, position, least_clearance, top)
     else:
         return (0.0, 0.0)
 
 
 @kernel
-def _apart(frame: Frame, i: int) -> Vec:
+def _separation(frame: Frame, i: int) -> Vec:
     """Return the separation from pursuers within 2 m, so that they come from several sides."""
     push: Vec = (0.0, 0.0)
     for j in range(1, frame.pos.shape[1]):
-        to = _to(frame, i, j)
+        to = _offset_to(frame, i, j)
         if j != i and norm(to) < 2.0:
             push = add(push, steering.separate(to, (1.0, 0.0) if j < i else (-1.0, 0.0)))
     return push
 
 
 @kernel
-def _nearest(frame: Frame) -> float:
+def _nearest_distance(frame: Frame) -> float:
     """Return the distance of the nearest pursuer from the evader, m."""
     best = np.inf
     for j in range(1, frame.pos.shape[1]):
-        best = min(best, norm(_to(frame, 0, j)))
+        best = min(best, norm(_offset_to(frame, 0, j)))
     return best
 
 
 @kernel
 def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
     """Write the terms alive, caught, effort."""
-    caught = _nearest(after) <= p.capture_distance
+    caught = _nearest_distance(after) <= p.capture_distance
     square = min(action[0, 0] * action[0, 0] + action[0, 1] * action[0, 1], 1.0)
     terms[0, at.alive] = 0.0 if caught else p.alive_reward * p.control_dt
     terms[0, at.caught] = -p.caught_cost if caught else 0.0
@@ -195,7 +195,7 @@ def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any
 @kernel
 def ended(p: Any, at: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """End the episode at a capture; return True as long as the evader is not caught."""
-    over[0] = _nearest(after) <= p.capture_distance
+    over[0] = _nearest_distance(after) <= p.capture_distance
     return not over[0]
 
 
@@ -207,7 +207,7 @@ def measure(p: Any, at: Any, before: Frame, after: Frame, numbers: Any) -> None:
         seen = seen or _sees(p, after, i)
     numbers[at.time] = p.control_dt
     numbers[at.hidden] = 0.0 if seen else p.control_dt
-    numbers[at.distance] = _nearest(after)
+    numbers[at.distance] = _nearest_distance(after)
     numbers[at.caught] = 1.0 if numbers[at.distance] <= p.capture_distance else 0.0
 
 
@@ -228,10 +228,10 @@ def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
         row[at.velocity + k] = clip(frame.vel[k, 0] / p.evader_speed)
         row[at.to_low + k] = clip(frame.pos[k, 0] / p.size)
         row[at.to_high + k] = clip((p.size - frame.pos[k, 0]) / p.size)
-    _show_pursuers(p, at, frame, row)
+    _write_pursuers(p, at, frame, row)
     rays = int(p.rays)
     for s in range(frame.obstacle_count[0]):
-        m = frame.obstacle_who[s, 0]
+        m = frame.obstacle_index[s, 0]
         for k in range(2):
             row[at.cover + 2 * s + k] = clip((frame.centre[k, m] - frame.pos[k, 0]) / p.size)
         row[at.cover_radius + s] = frame.rho[m] / p.greatest_radius
@@ -241,29 +241,30 @@ def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
         if frame.rho[m] > 0.0:
             to = (frame.centre[0, m] - frame.pos[0, 0], frame.centre[1, m] - frame.pos[1, 0])
             ahead = (like(to[0], 1.0), like(to[0], 0.0))
-            block_ways(row, at.free_way, rays, frame.table, to, ahead, frame.rho[m] + frame.radius[0], p.way_sight)
+            clearance = frame.rho[m] + frame.radius[0]
+            shorten_free_paths(row, at.free_way, rays, frame.table, to, ahead, clearance, p.way_sight)
 
 
 @kernel
-def _show_pursuers(p: Any, at: Any, frame: Frame, row: Any) -> None:
+def _write_pursuers(p: Any, at: Any, frame: Frame, row: Any) -> None:
     """Write the pursuers, nearest first."""
     count = frame.pos.shape[1] - 1
-    last, chosen = -1.0, 0
+    previous, chosen = -1.0, 0
     for s in range(count):
-        best, who = np.inf, 0
+        least, nearest = np.inf, 0
         for j in range(1, count + 1):
-            distance = norm(_to(frame, 0, j))
-            later = distance > last or (distance == last and j > chosen)
-            if later and distance < best:
-                best, who = distance, j
-        to, way = _to(frame, 0, who), unit(_to(frame, 0, who))
+            distance = norm(_offset_to(frame, 0, j))
+            later = distance > previous or (distance == previous and j > chosen)
+            if later and distance < least:
+                least, nearest = distance, j
+        to, direction = _offset_to(frame, 0, nearest), unit(_offset_to(frame, 0, nearest))
         for k in range(2):
             row[at.pursuers + 2 * s + k] = clip(to[k] / p.size)
-            row[at.pursuer_velocity + 2 * s + k] = clip(frame.vel[k, who] / p.pursuer_speed)
-            row[at.bearing + 2 * s + k] = way[k]
-        row[at.closeness + s] = max(1.0 - best / p.near, 0.0)
-        row[at.seen + s] = 1.0 if _sees(p, frame, who) else 0.0
-        last, chosen = best, who
+            row[at.pursuer_velocity + 2 * s + k] = clip(frame.vel[k, nearest] / p.pursuer_speed)
+            row[at.bearing + 2 * s + k] = direction[k]
+        row[at.closeness + s] = max(1.0 - least / p.near, 0.0)
+        row[at.seen + s] = 1.0 if _sees(p, frame, nearest) else 0.0
+        previous, chosen = least, nearest
 
 
 class Evade(Task):
@@ -311,7 +312,7 @@ class Evade(Task):
     )
 
     @model_validator(mode="after")
-    def _fitting(self) -> Evade:
+    def _check_sizes(self) -> Evade:
         """Raise ValueError for radii in the wrong order or too large, or a start distance above half the field."""
         widest = 2 * (self.greatest_radius + self.min_gap)
         if self.least_radius > self.greatest_radius or widest > self.size:
@@ -366,7 +367,7 @@ class Evade(Task):
 
     def table(self) -> tuple[float, ...]:
         """Return the directions of the rays."""
-        return compass(self.rays)
+        return ray_directions(self.rays)
 
     @functools.cached_property
     def layout(self) -> Layout:

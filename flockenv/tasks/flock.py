@@ -22,9 +22,9 @@ from flockenv.model.snapshot import Mark
 from flockenv.model.state import State
 from flockenv.scene import Group, Scene
 from flockenv.steering import arbitration
-from flockenv.tasks.lasting import MEASURES, METRICS, LastingTask, judge, tell_lasting
+from flockenv.tasks.lasting import MEASURES, METRICS, LastingTask, write_aim_measures, write_aim_metrics
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.observations import block_ways, compass, offset, turned
+from flockenv.tasks.observations import local_components, offset, ray_directions, shorten_free_paths
 from flockenv.tasks.task import Frame
 
 __all__ = ["Flock"]
@@ -43,7 +43,7 @@ def spawn(p: Any, frame: Frame) -> None:
             a = 2.0 * math.pi * uniform(frame.key, t, i, 1)
             frame.pos[0, i] = p.size / 2 + r * math.cos(a)
             frame.pos[1, i] = p.size / 2 + r * math.sin(a)
-            if _clear(frame, i, 4.0 * frame.radius[i]):
+            if _is_clear(frame, i, 4.0 * frame.radius[i]):
                 break
         course = 2.0 * math.pi * uniform(frame.key, 0, i, 2)
         speed = p.cruise * uniform(frame.key, 0, i, 3)
@@ -55,13 +55,13 @@ def spawn(p: Any, frame: Frame) -> None:
             x = p.size * uniform(frame.key, t, 20000 + m, 1)
             y = p.size * uniform(frame.key, t, 20000 + m, 2)
             away = math.hypot(x - p.size / 2, y - p.size / 2) > radius + rho + 2.0
-            if away and _fits(p, frame, m, x, y, rho):
+            if away and _obstacle_fits(p, frame, m, x, y, rho):
                 frame.centre[0, m], frame.centre[1, m], frame.rho[m] = x, y, rho
                 break
 
 
 @kernel
-def _clear(frame: Frame, i: int, distance: float) -> bool:
+def _is_clear(frame: Frame, i: int, distance: float) -> bool:
     """Return True if agent i is at least `distance` m from those placed before it."""
     for j in range(i):
         dx, dy = frame.pos[0, j] - frame.pos[0, i], frame.pos[1, j] - frame.pos[1, i]
@@ -71,7 +71,7 @@ def _clear(frame: Frame, i: int, distance: float) -> bool:
 
 
 @kernel
-def _fits(p: Any, frame: Frame, m: int, x: float, y: float, rho: float) -> bool:
+def _obstacle_fits(p: Any, frame: Frame, m: int, x: float, y: float, rho: float) -> bool:
     """Return True if an obstacle at (x, y) leaves a gap of 3 m to those before it."""
     for k in range(m):
         if frame.rho[k] > 0.0:
@@ -83,52 +83,52 @@ def _fits(p: Any, frame: Frame, m: int, x: float, y: float, rho: float) -> bool:
 
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
-    """Write each learner's action as a force in the frame of the heading; flockmates follow `_flockmate`."""
+    """Write each learner's action as a force in the frame of the heading; flockmates follow `_steer_flockmate`."""
     for i in range(np.uint64(action.shape[0])):  # no branches, so that SIMD is used
         hx, hy = frame.memory[0, i], frame.memory[1, i]
         along, left = action[i, 0] * frame.max_force[i], action[i, 1] * frame.max_force[i]
         force[0, i] = along * hx - left * hy
         force[1, i] = along * hy + left * hx
     for i in range(action.shape[0], frame.pos.shape[1]):
-        _flockmate(p, frame, i, force)
+        _steer_flockmate(p, frame, i, force)
 
 
 _MOST = 32  # limit of `neighbours`
-_FAR, _NOBODY = (math.inf,) * _MOST, (np.uint64(0),) * _MOST
+_FAR, _NO_INDEX = (math.inf,) * _MOST, (np.uint64(0),) * _MOST
 
 
 @kernel
-def _flockmate(p: Any, frame: Frame, i: int, force: Any) -> None:
+def _steer_flockmate(p: Any, frame: Frame, i: int, force: Any) -> None:
     """Write a flockmate's force; priorities: avoid obstacles, separate, align, cohere, follow the heading.
 
     It reacts to the `neighbours` nearest within sight.
     """
     x, y = frame.pos[0, i], frame.pos[1, i]
     v = (np.float64(frame.vel[0, i]), np.float64(frame.vel[1, i]))
-    squares, who = tuple_as_array(_FAR), tuple_as_array(_NOBODY)
-    found = _list_nearest(p, frame, i, squares, who)
+    squares, indices = tuple_as_array(_FAR), tuple_as_array(_NO_INDEX)
+    found = _list_nearest(p, frame, i, squares, indices)
     push, sum_v, centre = (0.0, 0.0), (0.0, 0.0), (0.0, 0.0)
     for s in range(found):
-        j, square = who[s], squares[s]
+        j, square = indices[s], squares[s]
         d = (np.float64(offset(x, frame.pos[0, j], p.size)), np.float64(offset(y, frame.pos[1, j], p.size)))
         one = steering.separate(d, (1.0, 0.0))
-        near = 1.0 if math.sqrt(square) < p.spacing else 0.0
-        push = (push[0] + near * one[0], push[1] + near * one[1])
+        is_near = 1.0 if math.sqrt(square) < p.spacing else 0.0
+        push = (push[0] + is_near * one[0], push[1] + is_near * one[1])
         sum_v = (sum_v[0] + frame.vel[0, j], sum_v[1] + frame.vel[1, j])
         centre = (centre[0] + d[0], centre[1] + d[1])
     share = 1.0 / max(np.float64(found), 1.0)
-    agree = steering.align(v, scale(sum_v, share)) if found > 0 else (0.0, 0.0)
+    alignment = steering.align(v, scale(sum_v, share)) if found > 0 else (0.0, 0.0)
     course = (p.cruise * frame.memory[0, i] - v[0], p.cruise * frame.memory[1, i] - v[1])
-    around = _around(p, frame, i, v)
-    wishes = (around, scale(push, 2.0), scale(agree, 1.5), scale(centre, 0.3 * share), scale(course, 2.0))
-    wish = arbitration.allocate(wishes, np.float64(frame.max_force[i]))
-    force[0, i], force[1, i] = wish[0], wish[1]
+    avoidance = _avoid_obstacles(p, frame, i, v)
+    forces = (avoidance, scale(push, 2.0), scale(alignment, 1.5), scale(centre, 0.3 * share), scale(course, 2.0))
+    total = arbitration.allocate(forces, np.float64(frame.max_force[i]))
+    force[0, i], force[1, i] = total[0], total[1]
 
 
 @kernel
-def _list_nearest(p: Any, frame: Frame, i: int, squares: Any, who: Any) -> Any:
+def _list_nearest(p: Any, frame: Frame, i: int, squares: Any, indices: Any) -> Any:
     """List the nearest within sight of agent i, ties by index, and squared distances; return their number."""
-    one, found, last = np.uint64(1), np.uint64(0), np.uint64(p.neighbours) - np.uint64(1)
+    one, count, last = np.uint64(1), np.uint64(0), np.uint64(p.neighbours) - np.uint64(1)
     for j in range(np.uint64(frame.pos.shape[1])):
         dx = offset(frame.pos[0, i], frame.pos[0, j], p.size)
         dy = offset(frame.pos[1, i], frame.pos[1, j], p.size)
@@ -136,18 +136,18 @@ def _list_nearest(p: Any, frame: Frame, i: int, squares: Any, who: Any) -> Any:
         if j != np.uint64(i) and frame.alive[j] and square < min(np.float64(p.sight * p.sight), squares[last]):
             place = last
             while place > 0 and square < squares[place - one]:
-                squares[place], who[place] = squares[place - one], who[place - one]
+                squares[place], indices[place] = squares[place - one], indices[place - one]
                 place -= one
-            squares[place], who[place] = square, j
-            found = min(found + one, last + one)
-    return found
+            squares[place], indices[place] = square, j
+            count = min(count + one, last + one)
+    return count
 
 
 @kernel
-def _around(p: Any, frame: Frame, i: int, v: Any) -> Any:
+def _avoid_obstacles(p: Any, frame: Frame, i: int, v: Any) -> Any:
     """Return the force around the obstacle that would be hit first within 2 s, at the force limit."""
     forward = unit(v)
-    nearest, where, room = np.inf, (0.0, 0.0), 0.0
+    nearest, position, least_clearance = np.inf, (0.0, 0.0), 0.0
     for m in range(frame.rho.shape[0]):
         if frame.rho[m] > 0.0:
             dx = offset(frame.pos[0, i], frame.centre[0, m], p.size)
@@ -156,9 +156,9 @@ def _around(p: Any, frame: Frame, i: int, v: Any) -> Any:
             clearance = np.float64(frame.rho[m] + frame.radius[i]) + 0.3
             t = steering.threat(forward, d, clearance, 2.0 * norm(v))
             if t < nearest:
-                nearest, where, room = t, d, clearance
+                nearest, position, least_clearance = t, d, clearance
     if nearest < np.inf:
-        return steering.avoid(forward, where, room, np.float64(frame.max_force[i]))
+        return steering.avoid(forward, position, least_clearance, np.float64(frame.max_force[i]))
     else:
         return (0.0, 0.0)
 
@@ -171,22 +171,22 @@ def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any
     for i in range(np.uint64(terms.shape[0])):  # no branches, so that SIMD is used
         v = (after.vel[0, i], after.vel[1, i])
         along = v[0] * like(one, after.memory[0, i]) + v[1] * like(one, after.memory[1, i])
-        found = after.near_count[i]
+        count = after.near_count[i]
         mean, touches, inside = (o, o), o, o
         for s in range(np.uint64(p.listed)):
-            there = np.int32(s) < found
+            exists = np.int32(s) < count
             vx, vy = after.near_vel[0, s, i], after.near_vel[1, s, i]
-            mean = (mean[0] + (vx if there else o), mean[1] + (vy if there else o))
+            mean = (mean[0] + (vx if exists else o), mean[1] + (vy if exists else o))
             contact = after.radius[i] + after.near_radius[s, i]
             touches += one if after.near_square[s, i] < contact * contact else o
         for s in range(np.uint64(p.obstacles_seen)):
             inside += one if after.obstacle_gap[s, i] < after.radius[i] else o
-        seen = like(one, found)
-        disagree = norm(sub(v, scale(mean, one / max(seen, one)))) * per_cruise if found > 0 else one
-        gap = np.sqrt(after.near_square[0, i]) if found > 0 else p.sight
+        seen = like(one, count)
+        deviation = norm(sub(v, scale(mean, one / max(seen, one)))) * per_cruise if count > 0 else one
+        gap = np.sqrt(after.near_square[0, i]) if count > 0 else p.sight
         off_speed, off_place = abs(along - p.cruise) * per_cruise, abs(gap - p.spacing) * per_spacing
         terms[i, at.progress] = p.progress_reward * (one - min(off_speed, one)) * p.control_dt
-        terms[i, at.alignment] = -p.alignment_cost * min(disagree, one) * p.control_dt
+        terms[i, at.alignment] = -p.alignment_cost * min(deviation, one) * p.control_dt
         terms[i, at.spacing] = -p.spacing_cost * min(off_place, one) * p.control_dt
         terms[i, at.together] = -p.loneliness_cost * (one - seen * per_slot) * p.control_dt
         terms[i, at.touch] = -p.touch_cost * touches * p.control_dt
@@ -196,9 +196,9 @@ def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any
 @kernel
 def ended(p: Any, at: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """End no learner; return whether the aim holds now: aligned, moving along the heading, no contact."""
-    polarisation, along = numbers[at.polarisation], numbers[at.along] = _order(after)
-    holds = polarisation > 0.9 and along > 0.8 * p.cruise and not _anybody_touches(after)
-    judge(p, at, after.step, holds, numbers)
+    polarisation, along = numbers[at.polarisation], numbers[at.along] = _polarisation_and_speed(after)
+    holds = polarisation > 0.9 and along > 0.8 * p.cruise and not _any_agent_touches(after)
+    write_aim_measures(p, at, after.step, holds, numbers)
     return holds
 
 
@@ -207,7 +207,7 @@ _ZEROS = (0.0,) * SIDE
 
 
 @kernel
-def _order(frame: Frame) -> tuple[float, float]:
+def _polarisation_and_speed(frame: Frame) -> tuple[float, float]:
     """Return the polarisation, and the mean speed along the heading, m/s."""
     n, lanes = np.uint64(frame.alive.shape[0]), np.uint64(SIDE)
     o, one, least = like(frame.vel[0, 0], 0.0), like(frame.vel[0, 0], 1.0), like(frame.vel[0, 0], 1e-12)
@@ -228,7 +228,7 @@ def _order(frame: Frame) -> tuple[float, float]:
 
 
 @kernel
-def _anybody_touches(frame: Frame) -> bool:
+def _any_agent_touches(frame: Frame) -> bool:
     """Return True if an agent touches its nearest neighbour or its nearest obstacle."""
     touching = np.int32(0)  # a count vectorises; of an early exit LLVM makes a scalar search
     for i in range(np.uint64(frame.alive.shape[0])):
@@ -246,21 +246,21 @@ def _touches(frame: Frame, i: int) -> Any:
 @kernel
 def measure(p: Any, at: Any, before: Frame, after: Frame, numbers: Any) -> None:
     """Write the mean nearest distance in sight, m, and contacts that began; `ended` writes the order measures."""
-    numbers[at.nearest] = _nearest(p, after)
-    numbers[at.touches] = _began(p, before, after) if _anybody_touches(after) else 0.0
+    numbers[at.nearest] = _mean_nearest_distance(p, after)
+    numbers[at.touches] = _count_new_contacts(p, before, after) if _any_agent_touches(after) else 0.0
 
 
 @kernel
 def metrics(p: Any, at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
     """Write polarisation, nearest distance, m, and speed along, m/s (means); contacts that began; those of the aim."""
     n = max(steps, 1)
-    tell_lasting(at, sums, last, steps, numbers)
+    write_aim_metrics(at, sums, last, steps, numbers)
     numbers[at.polarisation], numbers[at.nearest_neighbour] = sums.polarisation / n, sums.nearest / n
     numbers[at.collisions], numbers[at.speed_along] = sums.touches, sums.along / n
 
 
 @kernel
-def _nearest(p: Any, frame: Frame) -> float:
+def _mean_nearest_distance(p: Any, frame: Frame) -> float:
     """Return the mean distance of the nearest neighbour, m; `sight` counts for an agent that sees none."""
     n, lanes, sums = np.uint64(frame.alive.shape[0]), np.uint64(SIDE), tuple_as_array(_ZEROS)
     for first in range(np.uint64(0), n, lanes):
@@ -276,28 +276,28 @@ def _nearest(p: Any, frame: Frame) -> float:
 
 
 @kernel
-def _began(p: Any, before: Frame, after: Frame) -> float:
+def _count_new_contacts(p: Any, before: Frame, after: Frame) -> float:
     """Return the number of contacts that began in this step, of two agents, or of an agent and an obstacle."""
     began = 0.0
     for i in range(after.alive.shape[0]):
         if not _touches(after, i):
             continue
         for s in range(after.near_count[i]):
-            j = after.near_who[s, i]
+            j = after.near_index[s, i]
             contact = after.radius[i] + after.radius[j]
             if after.near_square[s, i] >= contact * contact:
                 break
-            began += 0.0 if _touched(p, before, i, before.pos[0, j], before.pos[1, j], contact) else 0.5
+            began += 0.0 if _was_near(p, before, i, before.pos[0, j], before.pos[1, j], contact) else 0.5
         for s in range(after.obstacle_count[i]):
-            m = after.obstacle_who[s, i]
+            m = after.obstacle_index[s, i]
             if after.obstacle_gap[s, i] < after.radius[i]:
                 clearance = after.rho[m] + after.radius[i]
-                began += 0.0 if _touched(p, before, i, after.centre[0, m], after.centre[1, m], clearance) else 1.0
+                began += 0.0 if _was_near(p, before, i, after.centre[0, m], after.centre[1, m], clearance) else 1.0
     return began
 
 
 @kernel
-def _touched(p: Any, frame: Frame, i: int, x: float, y: float, contact: float) -> bool:
+def _was_near(p: Any, frame: Frame, i: int, x: float, y: float, contact: float) -> bool:
     """Return True if agent i was nearer than `contact` m to the point (x, y)."""
     dx, dy = offset(frame.pos[0, i], x, p.size), offset(frame.pos[1, i], y, p.size)
     return dx * dx + dy * dy < contact * contact
@@ -310,16 +310,16 @@ def abreast(p: Any, at: Any, frame: Frame, columns: Any) -> None:
     listed, seen = np.uint64(p.listed), np.uint64(p.obstacles_seen)
     scales = (one / p.sight, like(one, 0.5) / p.max_speed, one / p.spacing)
     for i in range(n):
-        own = turned((frame.vel[0, i], frame.vel[1, i]), _heading(p, frame, i), like(one, 2.0) * scales[1])
+        own = local_components((frame.vel[0, i], frame.vel[1, i]), _heading(p, frame, i), like(one, 2.0) * scales[1])
         columns[i, at.velocity], columns[i, at.velocity + 1] = own[0], own[1]
     for s in range(listed):
         for i in range(n):
-            _show_neighbour(p, at, frame, i, s, scales, columns)
-    some = seen if frame.rho.shape[0] > 0 else np.uint64(0)
-    for s in range(some):
+            _write_neighbour(p, at, frame, i, s, scales, columns)
+    shown = seen if frame.rho.shape[0] > 0 else np.uint64(0)
+    for s in range(shown):
         for i in range(n):
-            _show_obstacle(p, at, frame, i, s, columns)
-    for s in range(some, seen):
+            _write_obstacle(p, at, frame, i, s, columns)
+    for s in range(shown, seen):
         for c in (at.obstacles + 2 * s, at.obstacles + 2 * s + 1, at.obstacle_radius + s):
             columns[:, c] = like(p.sight, 0.0)
 
@@ -331,54 +331,55 @@ def _heading(p: Any, frame: Frame, i: int) -> Any:
 
 
 @kernel
-def _show_neighbour(p: Any, at: Any, frame: Frame, i: int, s: int, scales: Any, columns: Any) -> None:
+def _write_neighbour(p: Any, at: Any, frame: Frame, i: int, s: int, scales: Any, columns: Any) -> None:
     """Write the offset, relative velocity, presence and crowding of agent i's s-th nearest neighbour.
 
     Zeros if there is none. The values are computed in any case: an empty entry of the list holds a valid index.
     """
     o, one, two, heading = like(p.sight, 0.0), like(p.sight, 1.0), np.uint64(2), _heading(p, frame, i)
-    there = np.int32(s) < frame.near_count[i]
+    exists = np.int32(s) < frame.near_count[i]
     x, y = frame.near_pos[0, s, i], frame.near_pos[1, s, i]
     to = (offset(frame.pos[0, i], x, p.size), offset(frame.pos[1, i], y, p.size))
     relative = (frame.near_vel[0, s, i] - frame.vel[0, i], frame.near_vel[1, s, i] - frame.vel[1, i])
     distance = np.sqrt(frame.near_square[s, i])
     closeness = one - distance * scales[2]
     crowded = (closeness > o) & (distance > o)
-    _put_if(there, columns, i, np.uint64(at.neighbours) + two * s, turned(to, heading, scales[0]))
-    _put_if(there, columns, i, np.uint64(at.neighbour_velocity) + two * s, turned(relative, heading, scales[1]))
-    columns[i, np.uint64(at.neighbour_present) + s] = one if there else o
-    crowding = turned(to, heading, closeness / distance if crowded else o)
-    _put_if(there, columns, i, np.uint64(at.crowding) + two * s, crowding)
+    to_local, relative_local = local_components(to, heading, scales[0]), local_components(relative, heading, scales[1])
+    _write_if(exists, columns, i, np.uint64(at.neighbours) + two * s, to_local)
+    _write_if(exists, columns, i, np.uint64(at.neighbour_velocity) + two * s, relative_local)
+    columns[i, np.uint64(at.neighbour_present) + s] = one if exists else o
+    crowding = local_components(to, heading, closeness / distance if crowded else o)
+    _write_if(exists, columns, i, np.uint64(at.crowding) + two * s, crowding)
 
 
 @kernel
-def _show_obstacle(p: Any, at: Any, frame: Frame, i: int, s: int, columns: Any) -> None:
+def _write_obstacle(p: Any, at: Any, frame: Frame, i: int, s: int, columns: Any) -> None:
     """Write the offset and radius of agent i's s-th nearest obstacle, or zeros.
 
     As with neighbours, an empty entry of the list holds a valid index if there are obstacles at all.
     """
-    there = np.int32(s) < frame.obstacle_count[i]
+    exists = np.int32(s) < frame.obstacle_count[i]
     centre, rho = _obstacle(frame, i, s)
     o = like(rho, 0.0)
     to = (offset(frame.pos[0, i], centre[0], p.size), offset(frame.pos[1, i], centre[1], p.size))
-    vector = turned(to, _heading(p, frame, i), like(o, 1.0) / (p.sight + p.greatest_radius))
-    _put_if(there, columns, i, np.uint64(at.obstacles) + np.uint64(2) * s, vector)
-    columns[i, np.uint64(at.obstacle_radius) + s] = rho / p.greatest_radius if there else o
+    vector = local_components(to, _heading(p, frame, i), like(o, 1.0) / (p.sight + p.greatest_radius))
+    _write_if(exists, columns, i, np.uint64(at.obstacles) + np.uint64(2) * s, vector)
+    columns[i, np.uint64(at.obstacle_radius) + s] = rho / p.greatest_radius if exists else o
 
 
 @kernel
 def _obstacle(frame: Frame, i: int, s: int) -> Any:
     """Return centre and radius of the s-th nearest obstacle of agent i."""
-    m = np.uint64(frame.obstacle_who[s, i])
+    m = np.uint64(frame.obstacle_index[s, i])
     return (frame.centre[0, m], frame.centre[1, m]), frame.rho[m]
 
 
 @kernel
-def _put_if(there: Any, columns: Any, i: int, at: Any, vector: Any) -> None:
+def _write_if(exists: Any, columns: Any, i: int, at: Any, vector: Any) -> None:
     """Write two numbers of agent i from column `at` on, or zeros."""
     o = like(vector[0], 0.0)
-    columns[i, at] = vector[0] if there else o
-    columns[i, at + np.uint64(1)] = vector[1] if there else o
+    columns[i, at] = vector[0] if exists else o
+    columns[i, at + np.uint64(1)] = vector[1] if exists else o
 
 
 @kernel
@@ -397,7 +398,7 @@ def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
         for s in range(frame.obstacle_count[i]):
             centre, rho = _obstacle(frame, i, s)
             to = (offset(frame.pos[0, i], centre[0], p.size), offset(frame.pos[1, i], centre[1], p.size))
-            block_ways(row, at.free_way, rays, frame.table, to, heading, rho + frame.radius[i], p.sight)
+            shorten_free_paths(row, at.free_way, rays, frame.table, to, heading, rho + frame.radius[i], p.sight)
 
 
 class Flock(LastingTask):
@@ -455,7 +456,7 @@ class Flock(LastingTask):
     obstacle_cost: float = Field(default=10.0, ge=0, description="per s and obstacle touched")
 
     @model_validator(mode="after")
-    def _enough(self) -> Flock:
+    def _check_numbers(self) -> Flock:
         """Raise ValueError for more learners than agents, radii in the wrong order, or sight above half the field."""
         if self.learners > self.agents:
             raise ValueError(f"learners = {self.learners}: there are only {self.agents} agents")
@@ -498,28 +499,28 @@ class Flock(LastingTask):
         )
 
     @property
-    def _listed(self) -> int:
+    def _list_length(self) -> int:
         """Length of the neighbour lists; at least 1, also for a single agent."""
         return min(self.neighbours, max(self.agents - 1, 1))
 
     def parameters(self) -> dict[str, float]:
         """Return the fields, and the length of neighbour lists."""
-        return {**super().parameters(), "listed": float(self._listed)}
+        return {**super().parameters(), "listed": float(self._list_length)}
 
     @property
     def look(self) -> Look:
         """The nearest flockmates and obstacles."""
-        return Look(self.sight, self._listed, self.obstacles_seen)
+        return Look(self.sight, self._list_length, self.obstacles_seen)
 
     def table(self) -> tuple[float, ...]:
         """Return the directions of the rays."""
-        return compass(self.rays)
+        return ray_directions(self.rays)
 
     @functools.cached_property
     def layout(self) -> Layout:
         """The observation; every vector is (along the heading, to its left)."""
         n, m = self.neighbours, self.obstacles_seen
-        ways = "free path length of the body to the nearest obstacle in each direction, anticlockwise from the heading"
+        free_path = "free path length of the body to the nearest obstacle in each direction, anticlockwise from the heading"
         here = "1 for each neighbour, 0 for an empty slot, whose other numbers are also 0"
         crowding = "unit vectors towards them, times 1 - distance / spacing; 0 for a distance above the spacing"
         seen = "offsets of the centres of the nearest obstacles, nearest surface first; zeros: empty slot"
@@ -531,7 +532,7 @@ class Flock(LastingTask):
             Slot("crowding", (n, 2), 1.0, "1", crowding),
             Slot("obstacles", (m, 2), self.sight + self.greatest_radius, "m", seen),
             Slot("obstacle_radius", (m,), self.greatest_radius, "m", "their radii; 0: empty slot", low=0.0),
-            Slot("free_way", (self.rays,), self.sight, "m", ways, low=0.0),
+            Slot("free_way", (self.rays,), self.sight, "m", free_path, low=0.0),
         ))  # fmt: skip
 
     @functools.cached_property

@@ -20,7 +20,7 @@ from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
 from flockenv.scene import Group, Scene
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.observations import clip, place_of, velocity_of
+from flockenv.tasks.observations import clip, position_of, velocity_of
 from flockenv.tasks.task import Frame, Task
 
 __all__ = ["Herd"]
@@ -35,7 +35,7 @@ def spawn(p: Any, frame: Frame) -> None:
     frame.vel[:, :] = 0.0
     middle: Vec = (0.0, 0.0)
     for t in range(_TRIES):
-        pen, middle = _somewhere(p, frame, t, 0), _somewhere(p, frame, t, 1)
+        pen, middle = _random_point(p, frame, t, 0), _random_point(p, frame, t, 1)
         frame.memory[0, :], frame.memory[1, :] = pen[0], pen[1]
         if norm(sub(pen, middle)) >= p.away:
             break
@@ -45,40 +45,40 @@ def spawn(p: Any, frame: Frame) -> None:
             r = p.scatter * math.sqrt(uniform(frame.key, t, i, 3))
             a = 2.0 * math.pi * uniform(frame.key, t, i, 4)
             frame.pos[0, i], frame.pos[1, i] = middle[0] + r * math.cos(a), middle[1] + r * math.sin(a)
-            if _clear(frame, i, dogs, i, p.apart_distance):
+            if _is_clear(frame, i, dogs, i, p.apart_distance):
                 break
     for i in range(dogs):
         for t in range(_TRIES):
-            place = _somewhere(p, frame, t, 10 + i)
+            place = _random_point(p, frame, t, 10 + i)
             frame.pos[0, i], frame.pos[1, i] = place[0], place[1]
-            if _clear(frame, i, dogs, n, p.fear_distance) and _clear(frame, i, 0, i, 2.0):
+            if _is_clear(frame, i, dogs, n, p.fear_distance) and _is_clear(frame, i, 0, i, 2.0):
                 break
 
 
 @kernel
-def _somewhere(p: Any, frame: Frame, t: int, channel: int) -> Vec:
+def _random_point(p: Any, frame: Frame, t: int, channel: int) -> Vec:
     """Return a random point of the middle half of the field, at least a quarter of the edge from its border."""
     x = p.size * (0.25 + 0.5 * uniform(frame.key, t, 500 + channel, 5))
     return (np.float64(x), np.float64(p.size * (0.25 + 0.5 * uniform(frame.key, t, 500 + channel, 6))))
 
 
 @kernel
-def _clear(frame: Frame, i: int, first: int, end: int, distance: float) -> bool:
+def _is_clear(frame: Frame, i: int, first: int, end: int, distance: float) -> bool:
     """Return True if agent i is at least `distance` m from the agents [first, end)."""
     for j in range(first, end):  # noqa: SIM110  # there are no generators in compiled code
-        if norm(_to(frame, i, j)) < distance:
+        if norm(_offset_to(frame, i, j)) < distance:
             return False
     return True
 
 
 @kernel
-def _to(frame: Frame, i: int, j: int) -> Vec:
+def _offset_to(frame: Frame, i: int, j: int) -> Vec:
     """Return the offset of agent j from agent i, m."""
-    return sub(place_of(frame, j), place_of(frame, i))
+    return sub(position_of(frame, j), position_of(frame, i))
 
 
 @kernel
-def _centre(p: Any, frame: Frame) -> Vec:
+def _flock_centre(p: Any, frame: Frame) -> Vec:
     """Return the centre of the flock, m."""
     x, y, dogs, n = 0.0, 0.0, int(p.dogs), frame.pos.shape[1]
     for j in range(dogs, n):
@@ -88,94 +88,94 @@ def _centre(p: Any, frame: Frame) -> Vec:
 
 
 @kernel
-def _pen(frame: Frame) -> Vec:
+def _pen_position(frame: Frame) -> Vec:
     return (np.float64(frame.memory[0, 0]), np.float64(frame.memory[1, 0]))
 
 
 @kernel
 def _course(p: Any, frame: Frame) -> Vec:
     """Return the unit vector from the flock's centre to the pen; the x axis if it is there."""
-    way = unit(sub(_pen(frame), _centre(p, frame)))
-    return way if way[0] != 0.0 or way[1] != 0.0 else (1.0, 0.0)
+    direction = unit(sub(_pen_position(frame), _flock_centre(p, frame)))
+    return direction if direction[0] != 0.0 or direction[1] != 0.0 else (1.0, 0.0)
 
 
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
-    """Write each dog's action as a force in the frame of the course; sheep follow `_sheep`."""
+    """Write each dog's action as a force in the frame of the course; sheep follow `_steer_sheep`."""
     course, dogs = _course(p, frame), int(p.dogs)
     for i in range(dogs):
         along, left = action[i, 0] * frame.max_force[i], action[i, 1] * frame.max_force[i]
         force[0, i] = along * course[0] - left * course[1]
         force[1, i] = along * course[1] + left * course[0]
     for i in range(dogs, frame.pos.shape[1]):
-        _sheep(p, frame, i, force)
+        _steer_sheep(p, frame, i, force)
 
 
 @kernel
-def _sheep(p: Any, frame: Frame, i: int, force: Any) -> None:
+def _steer_sheep(p: Any, frame: Frame, i: int, force: Any) -> None:
     """Write a sheep's force: flee dogs within `fear_distance` as in Strombom et al. 2014, else graze slowly, apart."""
     velocity, dogs = velocity_of(frame, i), int(p.dogs)
     crowd: Vec = (0.0, 0.0)
     centre: Vec = (0.0, 0.0)
     away: Vec = (0.0, 0.0)
     for j in range(dogs, frame.pos.shape[1]):
-        to = _to(frame, i, j)
+        to = _offset_to(frame, i, j)
         square = to[0] * to[0] + to[1] * to[1]
         if j != i and square < p.flock_sight * p.flock_sight:
             centre = add(centre, to)
             if square < p.apart_distance * p.apart_distance:
                 crowd = sub(crowd, unit(to))
     for j in range(dogs):
-        to = _to(frame, i, j)
+        to = _offset_to(frame, i, j)
         if norm(to) < p.fear_distance:
             away = sub(away, unit(to))
     time = frame.step * p.control_dt
     noise = (smooth(frame.key, time, i, 21), smooth(frame.key, time, i, 22))
     if away[0] != 0.0 or away[1] != 0.0:
-        way = steering.sheep_direction(
+        direction = steering.sheep_direction(
             velocity, centre, crowd, away, noise, p.inertia, p.attraction, p.apart, p.fear, p.error
         )  # fmt: skip
-        wanted = scale(way, np.float64(frame.max_speed[i]))
+        desired = scale(direction, np.float64(frame.max_speed[i]))
     else:
-        wanted = scale(add(unit(crowd), noise), np.float64(p.graze_speed))
-    wish = scale(sub(wanted, velocity), _GAIN)
-    force[0, i], force[1, i] = wish[0], wish[1]
+        desired = scale(add(unit(crowd), noise), np.float64(p.graze_speed))
+    total = scale(sub(desired, velocity), _GAIN)
+    force[0, i], force[1, i] = total[0], total[1]
 
 
 @kernel
 def _farthest(p: Any, frame: Frame, centre: Vec) -> tuple[int, float]:
     """Return the sheep that is farthest from the centre, and the mean distance of all sheep from it, m."""
-    who, most, total, dogs, n = 0, -1.0, 0.0, int(p.dogs), frame.pos.shape[1]
+    farthest, most, total, dogs, n = 0, -1.0, 0.0, int(p.dogs), frame.pos.shape[1]
     for j in range(dogs, n):
-        distance = norm(sub(place_of(frame, j), centre))
+        distance = norm(sub(position_of(frame, j), centre))
         total += distance
         if distance > most:
-            who, most = j, distance
-    return who, total / (n - dogs)
+            farthest, most = j, distance
+    return farthest, total / (n - dogs)
 
 
 @kernel
-def _penned(p: Any, frame: Frame) -> int:
+def _count_penned(p: Any, frame: Frame) -> int:
     """Return the number of sheep in the pen."""
-    count, pen = 0, _pen(frame)
+    count, pen = 0, _pen_position(frame)
     for j in range(int(p.dogs), frame.pos.shape[1]):
-        count += 1 if norm(sub(place_of(frame, j), pen)) <= p.pen_radius else 0
+        count += 1 if norm(sub(position_of(frame, j), pen)) <= p.pen_radius else 0
     return count
 
 
 @kernel
-def _all_in(p: Any, frame: Frame) -> bool:
-    return bool(_penned(p, frame) == frame.pos.shape[1] - int(p.dogs))
+def _all_penned(p: Any, frame: Frame) -> bool:
+    return bool(_count_penned(p, frame) == frame.pos.shape[1] - int(p.dogs))
 
 
 @kernel
 def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
     """Write the terms progress, gathering, success, time; the same for every dog."""
-    here, there = _centre(p, before), _centre(p, after)
-    nearer = norm(sub(_pen(before), here)) - norm(sub(_pen(after), there))
+    here, there = _flock_centre(p, before), _flock_centre(p, after)
+    nearer = norm(sub(_pen_position(before), here)) - norm(sub(_pen_position(after), there))
     _, wide = _farthest(p, before, here)
     _, now_wide = _farthest(p, after, there)
-    success = p.success_reward if _all_in(p, after) else 0.0
+    success = p.success_reward if _all_penned(p, after) else 0.0
     for i in range(terms.shape[0]):
         terms[i, at.progress] = p.progress_reward * nearer
         terms[i, at.gathering] = p.gathering_reward * (wide - now_wide)
@@ -186,7 +186,7 @@ def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any
 @kernel
 def ended(p: Any, at: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """End the episode when all sheep are in the pen, which is success."""
-    done = _all_in(p, after)
+    done = _all_penned(p, after)
     for i in range(over.shape[0]):
         over[i] = done
     return done
@@ -196,12 +196,12 @@ def ended(p: Any, at: Any, before: Frame, after: Frame, numbers: Any, over: Any)
 def measure(p: Any, at: Any, before: Frame, after: Frame, numbers: Any) -> None:
     """Write the share of sheep penned; time, s; mean distance of sheep from their centre, m; mean path of a dog, m."""
     n, dogs = after.pos.shape[1], int(p.dogs)
-    numbers[at.penned] = _penned(p, after) / (n - dogs)
+    numbers[at.penned] = _count_penned(p, after) / (n - dogs)
     numbers[at.time] = p.control_dt
-    _, numbers[at.spread] = _farthest(p, after, _centre(p, after))
+    _, numbers[at.spread] = _farthest(p, after, _flock_centre(p, after))
     path = 0.0
     for i in range(dogs):
-        path += norm(sub(place_of(after, i), place_of(before, i)))
+        path += norm(sub(position_of(after, i), position_of(before, i)))
     numbers[at.path] = path / dogs
 
 
@@ -217,55 +217,55 @@ def metrics(p: Any, at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> 
 @kernel
 def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
     """Write own velocity, pen, flock, farthest and nearest sheep, other dogs, in the frame of the course."""
-    centre, course, pen = _centre(p, frame), _course(p, frame), _pen(frame)
+    centre, course, pen = _flock_centre(p, frame), _course(p, frame), _pen_position(frame)
     far, spread = _farthest(p, frame, centre)
     dogs = int(p.dogs)
     for i in range(rows.shape[0]):
         row = rows[i]
         for c in range(rows.shape[1]):
             row[c] = 0.0
-        here = place_of(frame, i)
-        _put(row, at.velocity, scale(velocity_of(frame, i), 1.0 / p.dog_speed), course)
-        _put(row, at.goal, scale(sub(pen, here), 1.0 / p.sight), course)
+        here = position_of(frame, i)
+        _write_local(row, at.velocity, scale(velocity_of(frame, i), 1.0 / p.dog_speed), course)
+        _write_local(row, at.goal, scale(sub(pen, here), 1.0 / p.sight), course)
         to_centre = sub(centre, here)
-        _put(row, at.centre, scale(to_centre, 1.0 / p.sight), course)
-        _put(row, at.centre_bearing, unit(to_centre), course)
-        _put(row, at.farthest, scale(_to(frame, i, far), 1.0 / p.sight), course)
+        _write_local(row, at.centre, scale(to_centre, 1.0 / p.sight), course)
+        _write_local(row, at.centre_bearing, unit(to_centre), course)
+        _write_local(row, at.farthest, scale(_offset_to(frame, i, far), 1.0 / p.sight), course)
         row[at.spread] = min(spread / p.spread_scale, 1.0)
-        row[at.stray] = min(norm(sub(place_of(frame, far), centre)) / p.spread_scale, 1.0)
-        _show_sheep(p, at, frame, i, course, row)
+        row[at.stray] = min(norm(sub(position_of(frame, far), centre)) / p.spread_scale, 1.0)
+        _write_sheep(p, at, frame, i, course, row)
         for j in range(dogs):
             if j != i:
                 mate = j if j < i else j - 1
-                _put(row, at.mates + 2 * mate, scale(_to(frame, i, j), 1.0 / p.sight), course)
+                _write_local(row, at.mates + 2 * mate, scale(_offset_to(frame, i, j), 1.0 / p.sight), course)
 
 
 @kernel
-def _show_sheep(p: Any, at: Any, frame: Frame, i: int, course: Vec, row: Any) -> None:
+def _write_sheep(p: Any, at: Any, frame: Frame, i: int, course: Vec, row: Any) -> None:
     """Write the nearest sheep of dog i, nearest first, and the direction and closeness of the first."""
-    last, chosen = -1.0, -1
+    previous, chosen = -1.0, -1
     for s in range(int(p.sheep_seen)):
-        best, who = np.inf, -1
+        least, nearest = np.inf, -1
         for j in range(int(p.dogs), frame.pos.shape[1]):
-            to = _to(frame, i, j)
+            to = _offset_to(frame, i, j)
             square = to[0] * to[0] + to[1] * to[1]
-            later = square > last or (square == last and j > chosen)
-            if later and square < best:
-                best, who = square, j
-        if who < 0:
+            later = square > previous or (square == previous and j > chosen)
+            if later and square < least:
+                least, nearest = square, j
+        if nearest < 0:
             break
-        to = _to(frame, i, who)
-        _put(row, at.sheep + 2 * s, scale(to, 1.0 / p.sight), course)
-        _put(row, at.sheep_velocity + 2 * s, scale(velocity_of(frame, who), 1.0 / p.sheep_speed), course)
+        to = _offset_to(frame, i, nearest)
+        _write_local(row, at.sheep + 2 * s, scale(to, 1.0 / p.sight), course)
+        _write_local(row, at.sheep_velocity + 2 * s, scale(velocity_of(frame, nearest), 1.0 / p.sheep_speed), course)
         row[at.sheep_present + s] = 1.0
         if s == 0:
-            _put(row, at.bearing, unit(to), course)
+            _write_local(row, at.bearing, unit(to), course)
             row[at.closeness] = max(1.0 - norm(to) / p.fear_distance, 0.0)
-        last, chosen = best, who
+        previous, chosen = least, nearest
 
 
 @kernel
-def _put(row: Any, at: int, vector: Vec, course: Vec) -> None:
+def _write_local(row: Any, at: int, vector: Vec, course: Vec) -> None:
     """Write a vector's components along the course and to its left, clipped to [-1, 1]."""
     row[at] = clip(vector[0] * course[0] + vector[1] * course[1])
     row[at + 1] = clip(vector[1] * course[0] - vector[0] * course[1])
@@ -324,7 +324,7 @@ class Herd(Task):
     time_cost: float = Field(default=0.2, ge=0, description="per s")
 
     @model_validator(mode="after")
-    def _room(self) -> Herd:
+    def _check_room(self) -> Herd:
         """Raise ValueError if `away` is more than a third of the field."""
         if self.away > self.size / 3:
             raise ValueError(f"away = {self.away:g} m: must be at most size / 3 = {self.size / 3:g} m")
@@ -348,12 +348,12 @@ class Herd(Task):
     @functools.cached_property
     def scene(self) -> Scene:
         """An open plane, in which only the agents' own forces act."""
-        begin: dict[str, Any] = {"radius": 0.3, "spawn": Spawn(low=(0.0, 0.0), high=(self.size, self.size))}
+        common: dict[str, Any] = {"radius": 0.3, "spawn": Spawn(low=(0.0, 0.0), high=(self.size, self.size))}
         dogs = Group(
-            count=self.dogs, max_speed=self.dog_speed, max_force=self.dog_force, role="learner", **begin
+            count=self.dogs, max_speed=self.dog_speed, max_force=self.dog_force, role="learner", **common
         )  # fmt: skip
         sheep = Group(
-            count=self.sheep, max_speed=self.sheep_speed, max_force=self.sheep_force, role="flockmate", **begin
+            count=self.sheep, max_speed=self.sheep_speed, max_force=self.sheep_force, role="flockmate", **common
         )  # fmt: skip
         return Scene(
             space=Plane(),

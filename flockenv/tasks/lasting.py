@@ -1,6 +1,6 @@
 """Success over a whole episode, for tasks that only the time limit ends: the aim has to hold most of the time.
 
-Such a task's `ended` returns whether the aim holds at this instant, which `judge` writes into the measures; `lasts`
+Such a task's `ended` returns whether the aim holds at this instant, which `write_aim_measures` stores; `aim_has_lasted`
 computes success from their sums. The measures of such a task include MEASURES, its metrics METRICS.
 """
 
@@ -14,7 +14,7 @@ from pydantic import Field
 from flockenv.jit.decorators import kernel
 from flockenv.tasks.task import Task
 
-__all__ = ["MEASURES", "METRICS", "LastingTask", "judge", "lasts", "tell_lasting"]
+__all__ = ["MEASURES", "METRICS", "LastingTask", "aim_has_lasted", "write_aim_measures", "write_aim_metrics"]
 
 MEASURES = ("holds", "judged", "held")
 """Of one decision, 1 or 0: the aim holds; the decision is judged, as it is after the settling time; both."""
@@ -24,7 +24,7 @@ METRICS = ("held", "success_at_end")
 
 
 @kernel
-def judge(p: Any, at: Any, step: int, holds: bool, numbers: Any) -> None:
+def write_aim_measures(p: Any, at: Any, step: int, holds: bool, numbers: Any) -> None:
     """Write the measures of a lasting aim, `step` decisions after the start."""
     judged = step > p.settled
     numbers[at.holds] = 1.0 if holds else 0.0
@@ -33,13 +33,13 @@ def judge(p: Any, at: Any, step: int, holds: bool, numbers: Any) -> None:
 
 
 @kernel
-def lasts(p: Any, sums: Any) -> bool:
+def aim_has_lasted(p: Any, sums: Any) -> bool:
     """Return True if the aim has held in at least the share `lasting` of the judged decisions, and there is one."""
     return bool(sums.judged > 0.0 and sums.held >= p.lasting * sums.judged - 1e-4)
 
 
 @kernel
-def tell_lasting(at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
+def write_aim_metrics(at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
     """Write the metrics of a lasting aim; `held` has no value before a decision is judged."""
     if sums.judged > 0.0:
         numbers[at.held] = sums.held / sums.judged

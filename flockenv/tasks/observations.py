@@ -14,8 +14,8 @@ from flockenv.maths.vectors import dot
 from flockenv.tasks.layout import Slot
 
 __all__ = [
-    "block_ways", "clip", "compass", "leaves_gap", "neighbour_slots", "offset", "place_of", "put", "put_crowding",
-    "put_neighbour", "turned", "velocity_of",
+    "clip", "leaves_gap", "local_components", "neighbour_slots", "offset", "position_of", "ray_directions",
+    "shorten_free_paths", "velocity_of", "write_crowding", "write_neighbour", "write_vector",
 ]  # fmt: skip
 
 
@@ -35,14 +35,14 @@ def offset(a: float, b: float, size: float) -> float:
 
 
 @kernel
-def turned(vector: Any, heading: Any, factor: float) -> Any:
+def local_components(vector: Any, heading: Any, factor: float) -> Any:
     """Return a vector's components along the heading and to its left, scaled, then clipped to [-1, 1]."""
     along, left = vector[0] * heading[0] + vector[1] * heading[1], vector[1] * heading[0] - vector[0] * heading[1]
     return clip(along * factor), clip(left * factor)
 
 
 @kernel
-def place_of(frame: Any, i: int) -> Vec:
+def position_of(frame: Any, i: int) -> Vec:
     """Return the position of agent i, m."""
     return (np.float64(frame.pos[0, i]), np.float64(frame.pos[1, i]))
 
@@ -65,31 +65,31 @@ def leaves_gap(p: Any, frame: Any, m: int, x: float, y: float, rho: float) -> bo
 
 
 @kernel
-def put(row: Any, at: int, vector: Any) -> None:
-    """Write two numbers into a row from index `at` on (unsigned, see block_ways)."""
+def write_vector(row: Any, at: int, vector: Any) -> None:
+    """Write two numbers into a row from index `at` on (unsigned, see shorten_free_paths)."""
     row[np.uint64(at)] = vector[0]
     row[np.uint64(at + 1)] = vector[1]
 
 
 @kernel
-def put_neighbour(row: Any, at: Any, s: int, to: Any, relative: Any, ahead: Any, near_by: float, pace: float) -> None:
+def write_neighbour(row: Any, at: Any, s: int, to: Any, relative: Any, ahead: Any, near_by: float, pace: float) -> None:
     """Write presence, offset and relative velocity of the s-th nearest agent, times `near_by`, 1/m, and `pace`, s/m.
 
     The slots are those of `neighbour_slots`; vectors are rotated so that the unit vector `ahead` is the x axis.
     """
-    put(row, at.neighbours + 2 * s, turned(to, ahead, near_by))
-    put(row, at.neighbour_velocity + 2 * s, turned(relative, ahead, pace))
+    write_vector(row, at.neighbours + 2 * s, local_components(to, ahead, near_by))
+    write_vector(row, at.neighbour_velocity + 2 * s, local_components(relative, ahead, pace))
     row[np.uint64(at.neighbour_present + s)] = 1.0
 
 
 @kernel
-def put_crowding(row: Any, at: Any, s: int, to: Any, ahead: Any, distance: float, gap: float, near: float) -> None:
+def write_crowding(row: Any, at: Any, s: int, to: Any, ahead: Any, distance: float, gap: float, near: float) -> None:
     """Write the direction of the s-th nearest agent times 1 - gap / near, 0 for a gap of `near` m or more."""
     share = min(max(1.0 - gap / near, 0.0), 1.0) / distance
-    put(row, at.crowding + 2 * s, turned(to, ahead, share))
+    write_vector(row, at.crowding + 2 * s, local_components(to, ahead, share))
 
 
-def neighbour_slots(count: int, sight: float, most_relative: float, who: str, crowding: bool) -> tuple[Slot, ...]:
+def neighbour_slots(count: int, sight: float, most_relative: float, others: str, crowding: bool) -> tuple[Slot, ...]:
     """Return the slots of the nearest agents in a row; `most_relative`, m/s, scales relative velocities.
 
     crowding: add unit vectors towards them, scaled by closeness.
@@ -97,24 +97,27 @@ def neighbour_slots(count: int, sight: float, most_relative: float, who: str, cr
     present = "1 for each neighbour, 0 for an empty slot, whose other numbers are also 0"
     close = "unit vectors towards them, times 1 - gap between the bodies / near; 0 for a gap above near"
     return (
-        Slot("neighbours", (count, 2), sight, "m", f"offsets of the nearest {who}, nearest first"),
+        Slot("neighbours", (count, 2), sight, "m", f"offsets of the nearest {others}, nearest first"),
         Slot("neighbour_velocity", (count, 2), most_relative, "m/s", "their velocities minus the agent's own"),
         *((Slot("crowding", (count, 2), 1.0, "1", close),) if crowding else ()),
         Slot("neighbour_present", (count,), 1.0, "1", present, low=0.0),
     )
 
 
-def compass(rays: int) -> tuple[float, ...]:
+def ray_directions(rays: int) -> tuple[float, ...]:
     """Return the cosines, then the sines, of `rays` directions, anticlockwise from the first axis."""
     angles = [2.0 * math.pi * r / rays for r in range(rays)]
     return (*map(math.cos, angles), *map(math.sin, angles))
 
 
 @kernel
-def block_ways(row: Any, at: int, rays: int, table: Any, to: Any, ahead: Any, clearance: float, sight: float) -> None:
+def shorten_free_paths(
+    row: Any, at: int, rays: int, table: Any, to: Any, ahead: Any, clearance: float, sight: float
+) -> None:
     """Shorten the free paths in row[at : at + rays], in units of `sight` m, by an obstacle at `to` m, if in sight.
 
-    Paths lead in the directions of `compass`, passed as `table`, rotated so that the first is `ahead`, a unit vector.
+    Paths lead in the directions of `ray_directions`, passed as `table`, rotated so that the first is the unit vector
+    `ahead`.
     """
     if dot(to, to) >= (sight + clearance) * (sight + clearance):
         return

@@ -18,7 +18,7 @@ from flockenv.model.snapshot import Mark
 from flockenv.model.state import State
 from flockenv.scene import Group, Scene
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.observations import block_ways, clip, compass, leaves_gap
+from flockenv.tasks.observations import clip, leaves_gap, ray_directions, shorten_free_paths
 from flockenv.tasks.task import Frame, Task
 
 __all__ = ["Obstacles"]
@@ -53,7 +53,7 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
 
 
 @kernel
-def _to_goal(frame: Frame) -> float:
+def _goal_distance(frame: Frame) -> float:
     return math.hypot(frame.memory[0, 0] - frame.pos[0, 0], frame.memory[1, 0] - frame.pos[1, 0])
 
 
@@ -62,11 +62,11 @@ def _touches(before: Frame, after: Frame) -> bool:
     """Return True if the straight path of the decision comes nearer to an obstacle than the sum of radii."""
     x, y = before.pos[0, 0], before.pos[1, 0]
     dx, dy = after.pos[0, 0] - x, after.pos[1, 0] - y
-    way = dx * dx + dy * dy
+    squared_length = dx * dx + dy * dy
     for m in range(after.rho.shape[0]):
         if after.rho[m] > 0.0:
             cx, cy = after.centre[0, m] - x, after.centre[1, m] - y
-            share = min(max((cx * dx + cy * dy) / way, 0.0), 1.0) if way > 0.0 else 0.0
+            share = min(max((cx * dx + cy * dy) / squared_length, 0.0), 1.0) if squared_length > 0.0 else 0.0
             off_x, off_y = cx - share * dx, cy - share * dy
             if math.sqrt(off_x * off_x + off_y * off_y) < after.rho[m] + after.radius[0]:
                 return True
@@ -83,8 +83,8 @@ def keep(p: Any, before: Frame, after: Frame) -> None:
 def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
     """Write the terms progress, goal, touch, time."""
     touch = after.memory[3, 0] > 0.0
-    there = not touch and _to_goal(after) <= p.goal_radius
-    terms[0, at.progress] = p.progress_reward * (_to_goal(before) - _to_goal(after))
+    there = not touch and _goal_distance(after) <= p.goal_radius
+    terms[0, at.progress] = p.progress_reward * (_goal_distance(before) - _goal_distance(after))
     terms[0, at.goal] = p.goal_reward if there else 0.0
     terms[0, at.touch] = -p.touch_cost if touch else 0.0
     terms[0, at.time] = -p.time_cost * p.control_dt
@@ -94,7 +94,7 @@ def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any
 def ended(p: Any, at: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """End the episode at a contact, or at the goal, which is success."""
     touch = after.memory[3, 0] > 0.0
-    there = not touch and _to_goal(after) <= p.goal_radius
+    there = not touch and _goal_distance(after) <= p.goal_radius
     over[0] = touch or there
     return there
 
@@ -104,7 +104,7 @@ def measure(p: Any, at: Any, before: Frame, after: Frame, numbers: Any) -> None:
     """Write path, m; contacts (0 or 1); distance to the goal, m, now and at the start."""
     numbers[at.path] = math.hypot(after.pos[0, 0] - before.pos[0, 0], after.pos[1, 0] - before.pos[1, 0])
     numbers[at.touch] = after.memory[3, 0]
-    numbers[at.left] = _to_goal(after)
+    numbers[at.left] = _goal_distance(after)
     numbers[at.straight] = after.memory[2, 0]
 
 
@@ -130,7 +130,7 @@ def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
         row[at.to_high + k] = clip((p.size - frame.pos[k, 0]) / p.size)
     rays = int(p.rays)
     for s in range(frame.obstacle_count[0]):
-        m, gap = frame.obstacle_who[s, 0], frame.obstacle_gap[s, 0] - frame.radius[0]
+        m, gap = frame.obstacle_index[s, 0], frame.obstacle_gap[s, 0] - frame.radius[0]
         for k in range(2):
             row[at.obstacles + 2 * s + k] = clip((frame.centre[k, m] - frame.pos[k, 0]) / (p.sight + p.greatest_radius))
         row[at.obstacle_radius + s] = frame.rho[m] / p.greatest_radius
@@ -141,7 +141,7 @@ def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
         if frame.rho[m] > 0.0:
             to = (frame.centre[0, m] - frame.pos[0, 0], frame.centre[1, m] - frame.pos[1, 0])
             ahead = (like(to[0], 1.0), like(to[0], 0.0))
-            block_ways(row, at.free_way, rays, frame.table, to, ahead, frame.rho[m] + frame.radius[0], p.sight)
+            shorten_free_paths(row, at.free_way, rays, frame.table, to, ahead, frame.rho[m] + frame.radius[0], p.sight)
 
 
 class Obstacles(Task):
@@ -177,7 +177,7 @@ class Obstacles(Task):
     time_cost: float = Field(default=0.5, ge=0, description="per s")
 
     @model_validator(mode="after")
-    def _fitting(self) -> Obstacles:
+    def _check_sizes(self) -> Obstacles:
         """Raise ValueError for radii in the wrong order, or large enough to cover the start or the goal."""
         if not self.least_radius <= self.greatest_radius <= 2.0:
             raise ValueError(
@@ -225,7 +225,7 @@ class Obstacles(Task):
 
     def table(self) -> tuple[float, ...]:
         """Return the directions of the rays."""
-        return compass(self.rays)
+        return ray_directions(self.rays)
 
     @functools.cached_property
     def layout(self) -> Layout:

@@ -35,7 +35,7 @@ WINDOW = 16
 # memory of a world: x and y of every corner, its arc length, the length of the track, metres gained, running direction
 _Y, _S, _LENGTH, _GAINED, _TURN = POINTS, 2 * POINTS, 3 * POINTS, 3 * POINTS + 1, 3 * POINTS + 2
 # position of the agent (x, y); its place on the track (piece, metres along it), now and before this step
-_HERE, _NOW, _THEN = 3 * POINTS + 3, 3 * POINTS + 5, 3 * POINTS + 7
+_HERE, _NOW, _BEFORE = 3 * POINTS + 3, 3 * POINTS + 5, 3 * POINTS + 7
 
 
 @kernel
@@ -60,7 +60,7 @@ def spawn(p: Any, frame: Frame) -> None:
     begin = int(POINTS * uniform(frame.key, 0, 3, 0))
     frame.pos[0, 0], frame.pos[1, 0] = _corner(frame, begin)
     frame.vel[:, 0] = 0.0
-    _remember(p, frame)
+    _store_place(p, frame)
 
 
 @kernel
@@ -84,7 +84,7 @@ def _piece(frame: Frame, i: int) -> tuple[Vec, Vec, float]:
 
 
 @kernel
-def _way(frame: Frame, i: int) -> Vec:
+def _direction(frame: Frame, i: int) -> Vec:
     _, u, _ = _piece(frame, i)
     return (np.float64(u[0]), np.float64(u[1]))
 
@@ -113,7 +113,7 @@ def _nearest(p: Any, frame: Frame) -> tuple[int, float]:
 
 
 @kernel
-def _remember(p: Any, frame: Frame) -> None:
+def _store_place(p: Any, frame: Frame) -> None:
     """Store the agent's position, and its place on the track."""
     i, s = _nearest(p, frame)
     m = frame.memory
@@ -130,7 +130,7 @@ def _place(p: Any, frame: Frame) -> tuple[int, float]:
 
 
 @kernel
-def _left(p: Any, frame: Frame) -> float:
+def _signed_offset(p: Any, frame: Frame) -> float:
     """Return the agent's signed distance from the middle line, m; positive to the left."""
     i, s = _place(p, frame)
     a, u, _ = _piece(frame, i)
@@ -141,10 +141,10 @@ def _left(p: Any, frame: Frame) -> float:
 
 
 @kernel
-def _gain(after: Frame) -> float:
+def _progress(after: Frame) -> float:
     """Return the progress along the track in this step, m."""
     m = after.memory
-    i, a = int(m[_THEN, 0]), np.float64(m[_THEN + 1, 0])
+    i, a = int(m[_BEFORE, 0]), np.float64(m[_BEFORE + 1, 0])
     j, b = int(m[_NOW, 0]), np.float64(m[_NOW + 1, 0])
     gained, length = m[_S + j, 0] + b - m[_S + i, 0] - a, m[_LENGTH, 0]
     return gained - length * math.floor(gained / length + 0.5)  # type: ignore[no-any-return]
@@ -154,62 +154,62 @@ def _gain(after: Frame) -> float:
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
     """Write the learner's action as a force in the frame of the track beside it: (along, left)."""
     i, _ = _place(p, frame)
-    way, f = _way(frame, i), frame.max_force[0]
-    force[0, 0] = f * (action[0, 0] * way[0] - action[0, 1] * way[1])
-    force[1, 0] = f * (action[0, 0] * way[1] + action[0, 1] * way[0])
+    direction, f = _direction(frame, i), frame.max_force[0]
+    force[0, 0] = f * (action[0, 0] * direction[0] - action[0, 1] * direction[1])
+    force[1, 0] = f * (action[0, 0] * direction[1] + action[0, 1] * direction[0])
 
 
 @kernel
 def keep(p: Any, before: Frame, after: Frame) -> None:
     """Store the place on the track before and after the step, searched only here, and the progress since the start."""
     i, s = _place(p, before)
-    after.memory[_THEN, 0], after.memory[_THEN + 1, 0] = i, s
-    _remember(p, after)
-    after.memory[_GAINED, 0] += _gain(after)
+    after.memory[_BEFORE, 0], after.memory[_BEFORE + 1, 0] = i, s
+    _store_place(p, after)
+    after.memory[_GAINED, 0] += _progress(after)
 
 
 @kernel
 def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any) -> None:
     """Write the terms progress, off_track, lost."""
-    left = _left(p, after)
-    terms[0, at.progress] = p.progress_reward * _gain(after)
-    terms[0, at.off_track] = -p.off_cost * p.control_dt if abs(left) > p.half_width else 0.0
-    terms[0, at.lost] = -p.lost_cost if abs(left) > p.lost_distance else 0.0
+    offset = _signed_offset(p, after)
+    terms[0, at.progress] = p.progress_reward * _progress(after)
+    terms[0, at.off_track] = -p.off_cost * p.control_dt if abs(offset) > p.half_width else 0.0
+    terms[0, at.lost] = -p.lost_cost if abs(offset) > p.lost_distance else 0.0
 
 
 @kernel
 def ended(p: Any, at: Any, before: Frame, after: Frame, numbers: Any, over: Any) -> bool:
     """End the episode if the agent is lost; return True once it has run a whole lap."""
-    over[0] = abs(_left(p, after)) > p.lost_distance
+    over[0] = abs(_signed_offset(p, after)) > p.lost_distance
     return not over[0] and after.memory[_GAINED, 0] >= after.memory[_LENGTH, 0]
 
 
 @kernel
 def measure(p: Any, at: Any, before: Frame, after: Frame, numbers: Any) -> None:
     """Write progress, m; off the track (0 or 1); path, m."""
-    numbers[at.gained] = _gain(after)
-    numbers[at.off] = 1.0 if abs(_left(p, after)) > p.half_width else 0.0
+    numbers[at.gained] = _progress(after)
+    numbers[at.off] = 1.0 if abs(_signed_offset(p, after)) > p.half_width else 0.0
     numbers[at.path] = math.hypot(after.pos[0, 0] - before.pos[0, 0], after.pos[1, 0] - before.pos[1, 0])
 
 
 @kernel
 def metrics(p: Any, at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
     """Write progress along the track, m; share of the time off it; mean speed, m/s."""
-    made = max(steps, 1)
-    numbers[at.progress], numbers[at.off_track] = sums.gained, sums.off / made
-    numbers[at.mean_speed] = sums.path / (made * p.control_dt)
+    count = max(steps, 1)
+    numbers[at.progress], numbers[at.off_track] = sums.gained, sums.off / count
+    numbers[at.mean_speed] = sums.path / (count * p.control_dt)
 
 
 @kernel
 def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
     """Write own velocity, offset to the left, middle line ahead and its curvature, in the frame of the track here."""
     i, along = _place(p, frame)
-    left, way = _left(p, frame), _way(frame, i)
+    offset, direction = _signed_offset(p, frame), _direction(frame, i)
     row, count = rows[0], int(p.ahead)
     vx, vy = frame.vel[0, 0], frame.vel[1, 0]
-    row[at.velocity] = clip((vx * way[0] + vy * way[1]) / p.max_speed)
-    row[at.velocity + 1] = clip((vy * way[0] - vx * way[1]) / p.max_speed)
-    row[at.left] = clip(left / p.lost_distance)
+    row[at.velocity] = clip((vx * direction[0] + vy * direction[1]) / p.max_speed)
+    row[at.velocity + 1] = clip((vy * direction[0] - vx * direction[1]) / p.max_speed)
+    row[at.left] = clip(offset / p.lost_distance)
     scale = p.spacing * p.ahead + p.lost_distance
     for k in range(count):
         along += p.spacing
@@ -221,19 +221,19 @@ def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
             i += 1
             a, u, size = _line(frame, i)
         to = (a[0] + along / size * u[0] - frame.pos[0, 0], a[1] + along / size * u[1] - frame.pos[1, 0])
-        row[at.points + 2 * k] = clip((to[0] * way[0] + to[1] * way[1]) / scale)
-        row[at.points + 2 * k + 1] = clip((to[1] * way[0] - to[0] * way[1]) / scale)
-        row[at.curvature + k] = clip(_bend(frame, i, along / size) * p.half_width)
+        row[at.points + 2 * k] = clip((to[0] * direction[0] + to[1] * direction[1]) / scale)
+        row[at.points + 2 * k + 1] = clip((to[1] * direction[0] - to[0] * direction[1]) / scale)
+        row[at.curvature + k] = clip(_curvature(frame, i, along / size) * p.half_width)
 
 
 @kernel
-def _bend(frame: Frame, i: int, share: float) -> float:
+def _curvature(frame: Frame, i: int, share: float) -> float:
     """Return the curvature at a share of piece i, 1/m, left positive, interpolated between its two corners."""
-    return (1.0 - share) * _corner_bend(frame, i) + share * _corner_bend(frame, i + 1)
+    return (1.0 - share) * _corner_curvature(frame, i) + share * _corner_curvature(frame, i + 1)
 
 
 @kernel
-def _corner_bend(frame: Frame, i: int) -> float:
+def _corner_curvature(frame: Frame, i: int) -> float:
     """Return the curvature of the circle through a corner and its two neighbours, 1/m."""
     a, b, c = _corner(frame, i + POINTS - 1), _corner(frame, i), _corner(frame, i + 1)
     u, v, w = sub(b, a), sub(c, b), sub(c, a)
@@ -273,7 +273,7 @@ class PathFollow(Task):
     lost_cost: float = Field(default=10.0, ge=0, description="once, when lost")
 
     @model_validator(mode="after")
-    def _widths(self) -> PathFollow:
+    def _check_widths(self) -> PathFollow:
         """Raise ValueError unless half_width < lost_distance <= 0.3 ring and the points span at most half a ring."""
         if self.half_width >= self.lost_distance:
             raise ValueError(
@@ -339,8 +339,8 @@ class PathFollow(Task):
     @functools.cached_property
     def action_layout(self) -> Layout:
         """A force, in the same frame."""
-        said = "force (along the track, to its left) / max_force, shortened to length 1"
-        return Layout((Slot("force", (2,), self.max_force, "N", said),))
+        meaning = "force (along the track, to its left) / max_force, shortened to length 1"
+        return Layout((Slot("force", (2,), self.max_force, "N", meaning),))
 
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
         """Return the track as marks: a disc of its width at every corner."""

@@ -1,7 +1,7 @@
-"""The compiled entry points of a task, `play` and `tell`, made of its kernels and its scene's step.
+"""The compiled entry points of a task, `play` and `compute_metrics`, made of its kernels and its scene's step.
 
-`play` begins episodes or takes decisions; most of it is the neighbour search, which is compiled once. `tell` computes
-metrics from the sums that `play` has kept. Parameters that are loop bounds (`Task.counts`) are constants in both.
+`play` begins episodes or takes decisions; most of it is the neighbour search, which is compiled once. `compute_metrics`
+reads the sums that `play` has kept. Parameters that are loop bounds (`Task.counts`) are constants in both.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from flockenv.jit.section import digest_of, entry_of
 from flockenv.jit.simd_rows import as_contiguous, column_distance, columns, flatten
 from flockenv.tasks.decision import (
     act_of,
-    answer_of,
     begin_of,
     by_name_of,
+    evaluate_of,
     frame_before,
     frame_of,
     indices_of,
-    look_in,
+    padded_frame_of,
     parameters_of,
-    show_of,
-    wide_of,
+    search_of,
+    write_rows_of,
 )
-from flockenv.tasks.play_plan import REFUSED, Kernels, Plan, Worlds
+from flockenv.tasks.play_plan import REFUSED, Kernels, Plan, WorldArrays
 from flockenv.tasks.task import Task
 
-__all__ = ["name_of", "plan_of", "play_of", "tell_of"]
+__all__ = ["metrics_of", "name_of", "plan_of", "play_of"]
 
 
 def play_of(task: Task) -> Callable[..., tuple[int, int]]:
@@ -65,19 +65,19 @@ def name_of(task: Task) -> str:
     return f"task_{task.name}_{digest_of(plan_of(task))}"
 
 
-def tell_of(task: Task) -> Callable[..., None]:
+def metrics_of(task: Task) -> Callable[..., None]:
     """Return the entry point of a task that computes metrics."""
     kernel = _kernel_of(task, "metrics")
-    return _tell(kernel, tuple(task.parameters()), _counts(task), task.measures, task.metric_names)
+    return _compute_metrics(kernel, tuple(task.parameters()), _counts(task), task.measures, task.metric_names)
 
 
 def _kernel_of(task: Task, name: str) -> Law:
     """Return a kernel of the module in which a task is defined."""
     module = type(task).__module__
-    found: Law | None = getattr(sys.modules[module], name, None)
-    if found is None:
+    kernel: Law | None = getattr(sys.modules[module], name, None)
+    if kernel is None:
         raise TypeError(f"{type(task).__name__}: {module} has no kernel `{name}`")
-    return found
+    return kernel
 
 
 def _counts(task: Task) -> tuple[tuple[int, float], ...]:
@@ -103,47 +103,47 @@ def _check(task: Task) -> None:
                 raise TypeError(f"{kind}.{what}: {name!r} must be a valid field name, and unique")
 
 
-# --- tell -------------------------------------------------------------------------------------------------------------
+# --- metrics ----------------------------------------------------------------------------------------------------------
 
 
 @entry_of
-def _tell(
+def _compute_metrics(
     metrics: Law,
     names: tuple[str, ...],
     counts: tuple[tuple[int, float], ...],
     measures: tuple[str, ...],
     metric_names: tuple[str, ...],
 ) -> Callable[..., None]:
-    """Return `tell`, which writes the metrics (K, B) of the B worlds from `first` on into `told`; NaN: no value."""
+    """Return `compute_metrics`, which writes the metrics, (K, B), of B worlds from `first` on into `out`; NaN: none."""
     parameters, by_name, at = parameters_of(names, counts), by_name_of(measures), indices_of(metric_names)
 
-    def tell(steps: Any, numbers: Any, last: Any, sums: Any, first: int, told: Any) -> None:
+    def compute_metrics(steps: Any, numbers: Any, last: Any, sums: Any, first: int, out: Any) -> None:
         unaliased()
         p = parameters(numbers)
-        for k in range(told.shape[1]):
+        for k in range(out.shape[1]):
             b = first + k
-            told[:, k] = np.nan
-            metrics(p, at, by_name(sums[b]), by_name(last[b]), steps[b], told[:, k])
+            out[:, k] = np.nan
+            metrics(p, at, by_name(sums[b]), by_name(last[b]), steps[b], out[:, k])
 
-    return tell
+    return compute_metrics
 
 
 # --- play -------------------------------------------------------------------------------------------------------------
 
 
 @kernel
-def _refuses(given: Any, check: bool) -> bool:
+def _has_invalid_action(actions: Any, check: bool) -> bool:
     """Return True if `check` and an action is not finite."""
-    refused = np.int32(0)
-    for k in range(np.uint64(given.shape[0] if check else 0)):
-        refused += np.int32(0) if finite(given[k]) else np.int32(1)
-    return bool(refused > np.int32(0))
+    count = np.int32(0)
+    for k in range(np.uint64(actions.shape[0] if check else 0)):
+        count += np.int32(0) if finite(actions[k]) else np.int32(1)
+    return bool(count > np.int32(0))
 
 
 @kernel
-def _packed(worlds: Any) -> Any:
+def _mark_contiguous(worlds: Any) -> Any:
     """Return the arrays of worlds, marked as contiguous over agents for the compiler."""
-    return Worlds(
+    return WorldArrays(
         as_contiguous(worlds.x), as_contiguous(worlds.v), worlds.alive, worlds.tick, as_contiguous(worlds.obstacle_x),
         worlds.obstacle_radius, worlds.work, worlds.key, as_contiguous(worlds.memory), worlds.steps,
         worlds.frame_and_inner,
@@ -155,54 +155,56 @@ def _play(plan: Plan) -> Callable[..., tuple[int, int]]:
     """Return `play`, which takes a decision or begins an episode in worlds [from_world, to_world), and observes them.
 
     If `acting`, it returns the first (world, agent) that is not finite, or -1s, observes all worlds, and writes the
-    terms of worlds in which an agent ends, or of all (`everyone`). With `check`, it returns REFUSED as the world, and
+    terms of worlds in which an agent ends, or of all (`all_worlds`). With `check`, it returns REFUSED as the world, and
     changes nothing, if an action is not finite. If not `acting`, it begins the worlds in `mask`, and observes these, or
-    all (`everyone`). With `past`, rows are made on the canvas and written with streaming stores.
+    all (`all_worlds`). With `streaming`, rows are made in a buffer and written with streaming stores.
     """
     keep, keeps, parameters = plan.kernels.keep, plan.kernels.keep is not None, parameters_of(plan.names, plan.counts)
-    begin, act, look, answer, show = (part(plan) for part in (begin_of, act_of, look_in, answer_of, show_of))
-    widen = wide_of(plan)
-    terms, size, far = len(plan.terms), plan.action, plan.apart
+    begin, act, search, evaluate = (part(plan) for part in (begin_of, act_of, search_of, evaluate_of))
+    pad, write_rows = padded_frame_of(plan), write_rows_of(plan)
+    terms, size, column_distance = len(plan.terms), plan.action, plan.apart
 
     def play(
-        worlds: Any, given: Any, dt: float, count: int, mortal: bool, past: bool, totals: Any, made: Any, near: Any,
-        scratch: Any, acting: bool, mask: Any, everyone: bool, check: bool, from_world: int, to_world: int,
-        actions: Any, limit: int, results: Any,
+        worlds: Any, constants: Any, dt: float, count: int, removes_ended: bool, streaming: bool, totals: Any,
+        decision: Any, near: Any, scratch: Any, acting: bool, mask: Any, all_worlds: bool, check: bool,
+        from_world: int, to_world: int, actions: Any, limit: int, results: Any,
     ) -> tuple[int, int]:  # fmt: skip
         unaliased()
-        w, table, learners = _packed(worlds), given.table, results.over.shape[1]
-        distance = far if far else actions.shape[1]
-        action, listed = columns(made.decided, actions.shape[1], size, distance), flatten(actions)
-        if _refuses(listed, check):
+        arrays, table, learners = _mark_contiguous(worlds), constants.table, results.over.shape[1]
+        distance = column_distance if column_distance else actions.shape[1]
+        action, action_list = columns(decision.actions, actions.shape[1], size, distance), flatten(actions)
+        if _has_invalid_action(action_list, check):
             return REFUSED, 0
-        p = parameters(given.numbers)
-        broken, who = -1, -1
+        p = parameters(constants.numbers)
+        bad_world, bad_agent = -1, -1
         for b in range(from_world, to_world):
-            if not acting and not mask[b] and not everyone:
+            if not acting and not mask[b] and not all_worlds:
                 continue
             if not acting and mask[b]:
-                begin(p, w, given, near, scratch, dt, b)
+                begin(p, arrays, constants, near, scratch, dt, b)
             if acting:
-                now = frame_of(w, scratch, near, table, b)
+                frame = frame_of(arrays, scratch, near, table, b)
                 bad = act(
-                    p, w, given, dt, count, made, now, scratch, listed, action, totals, results, everyone, past, b
-                )
-                if bad >= 0 and broken < 0:
-                    broken, who = b, bad
-            placed = look(w, given, near, scratch, b)
-            now, before = frame_of(w, scratch, near, table, b), frame_before(w, scratch, made, near, table, b)
-            if keeps and acting:
-                keep(p, before, now)  # type: ignore[misc]
-            rounded, wide = widen(w, scratch, made, near, table, now, placed, learners, b)
-            if acting:
-                earns, following = columns(made.earned, rounded, terms, distance), min(b + 1, to_world - 1)
-                answer(
-                    p, w, before, wide, action, actions, earns, totals, results, mortal, everyone, past, limit,
-                    following, b,
+                    p, arrays, constants, dt, count, decision, frame, scratch, action_list, action, totals, results,
+                    all_worlds, streaming, b,
                 )  # fmt: skip
-            show(p, now, wide, made, rounded, results.rows, past, b)
-        if past:
+                if bad >= 0 and bad_world < 0:
+                    bad_world, bad_agent = b, bad
+            placed = search(arrays, constants, near, scratch, b)
+            frame = frame_of(arrays, scratch, near, table, b)
+            before = frame_before(arrays, scratch, decision, near, table, b)
+            if keeps and acting:
+                keep(p, before, frame)  # type: ignore[misc]
+            padded_count, padded = pad(arrays, scratch, decision, near, table, frame, placed, learners, b)
+            if acting:
+                earned, next_world = columns(decision.rewards, padded_count, terms, distance), min(b + 1, to_world - 1)
+                evaluate(
+                    p, arrays, before, padded, action, actions, earned, totals, results, removes_ended, all_worlds,
+                    streaming, limit, next_world, b,
+                )  # fmt: skip
+            write_rows(p, frame, padded, decision, padded_count, results.rows, streaming, b)
+        if streaming:
             store_fence()
-        return broken, who
+        return bad_world, bad_agent
 
     return play

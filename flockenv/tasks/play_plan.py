@@ -7,13 +7,15 @@ from typing import Any, NamedTuple
 from flockenv.engine import BeginPlan, LookPlan, StepPlan
 from flockenv.jit.decorators import Law
 
-__all__ = ["REFUSED", "Decision", "Given", "Kernels", "Near", "Plan", "Results", "Totals", "Worlds"]
+__all__ = [
+    "REFUSED", "Constants", "Decision", "Kernels", "Near", "Plan", "Results", "Totals", "WorldArrays",
+]  # fmt: skip
 
 REFUSED = -2
 """The world that `play` returns if an action is not finite."""
 
 
-class Worlds(NamedTuple):
+class WorldArrays(NamedTuple):
     """Arrays that change during episodes. B worlds, N agents, D axes, M obstacles."""
 
     x: Any  # (D, B, N) m
@@ -29,7 +31,7 @@ class Worlds(NamedTuple):
     frame_and_inner: Any  # a tuple of arrays: frames and inner states, if any
 
 
-class Given(NamedTuple):
+class Constants(NamedTuple):
     """Constant numbers."""
 
     params: Any  # of the scene
@@ -48,21 +50,21 @@ class Totals(NamedTuple):
 class Decision(NamedTuple):
     """Scratch arrays of a decision in one world."""
 
-    canvas: Any  # (L, O), or (0, 0) without streaming stores
+    row_buffer: Any  # (L, O), or (0, 0) without streaming stores
     force: Any  # (D, 1, N) N
     x0: Any  # (D, N) m, positions before the decision
     v0: Any  # (D, N) m/s
     alive0: Any  # (N,)
-    decided: Any  # actions in columns
-    earned: Any  # terms in columns
-    wide: Any  # (own, near_vel, near_radius, beside) for a task with `abreast`, else empty
+    actions: Any  # actions in columns
+    rewards: Any  # terms in columns
+    padded: Any  # (own, near_vel, near_radius, row_columns) for a task with `abreast`, else empty
 
 
 class Near(NamedTuple):
     """Results of `look`; see Frame."""
 
     square: Any
-    who: Any
+    index: Any
     count: Any
     gap: Any
     obstacle: Any

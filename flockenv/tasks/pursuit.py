@@ -49,49 +49,49 @@ def _distance(frame: Frame, i: int, j: int) -> float:
 
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
-    """Write each learner's action as a force along the field's axes; scripted evaders follow `_escape`."""
+    """Write each learner's action as a force along the field's axes; scripted evaders follow `_steer_evader`."""
     for i in range(frame.pos.shape[1]):
         if i < action.shape[0]:
             for k in range(2):
                 force[k, i] = action[i, k] * frame.max_force[i]
         else:
-            _escape(p, frame, i, force)
+            _steer_evader(p, frame, i, force)
 
 
 @kernel
-def _escape(p: Any, frame: Frame, i: int, force: Any) -> None:
+def _steer_evader(p: Any, frame: Frame, i: int, force: Any) -> None:
     """Write a scripted evader's force; priorities: contain, evade the nearest pursuer, wander."""
     velocity, top = (frame.vel[0, i], frame.vel[1, i]), frame.max_speed[i]
     noise = (2.0 * uniform(frame.key, frame.step, i, 11) - 1.0, 2.0 * uniform(frame.key, frame.step, i, 12) - 1.0)
     target = steering.wander_turn((frame.memory[0, i], frame.memory[1, i]), noise, 2.0, p.control_dt)
     frame.memory[0, i], frame.memory[1, i] = target[0], target[1]
-    roam = steering.wander(target, velocity, top, 1.5)
+    wandering = steering.wander(target, velocity, top, 1.5)
     threat, distance = _nearest(frame, i, 0, int(p.pursuers))
-    away: Vec = (0.0, 0.0)
+    evasion: Vec = (0.0, 0.0)
     if threat >= 0 and distance < p.alarm_distance:
         offset = (frame.pos[0, threat] - frame.pos[0, i], frame.pos[1, threat] - frame.pos[1, i])
-        coming = (frame.vel[0, threat], frame.vel[1, threat])
-        away = steering.evade(offset, velocity, coming, top, min(0.5, distance / frame.max_speed[threat]))
+        threat_velocity = (frame.vel[0, threat], frame.vel[1, threat])
+        evasion = steering.evade(offset, velocity, threat_velocity, top, min(0.5, distance / frame.max_speed[threat]))
     margin = 1.0
     low = (frame.pos[0, i] - margin, frame.pos[1, i] - margin)
     high = (p.size - margin - frame.pos[0, i], p.size - margin - frame.pos[1, i])
     inside = steering.contain(low, high, velocity, top, 0.5)
     gain = 1.0 / 0.2  # kg/s: the desired velocity is reached within 0.2 s
-    wishes = (scale(inside, gain), scale(away, gain), scale(roam, gain))
-    wish = arbitration.allocate(wishes, frame.max_force[i])
-    force[0, i], force[1, i] = wish[0], wish[1]
+    forces = (scale(inside, gain), scale(evasion, gain), scale(wandering, gain))
+    total = arbitration.allocate(forces, frame.max_force[i])
+    force[0, i], force[1, i] = total[0], total[1]
 
 
 @kernel
 def _nearest(frame: Frame, i: int, first: int, end: int) -> tuple[int, float]:
     """Return the nearest living agent in [first, end) other than i, and its distance; -1 if there is none."""
-    best, who = _FAR, -1
+    least, nearest = _FAR, -1
     for j in range(first, end):
         if j != i and frame.alive[j]:
             d = _distance(frame, i, j)
-            if d < best:
-                best, who = d, j
-    return who, best
+            if d < least:
+                least, nearest = d, j
+    return nearest, least
 
 
 @kernel
@@ -105,7 +105,7 @@ def _sides(p: Any, frame: Frame, i: int) -> tuple[int, int, int, int, float]:
 
 
 @kernel
-def _caught(p: Any, before: Frame, after: Frame, j: int) -> bool:
+def _is_caught(p: Any, before: Frame, after: Frame, j: int) -> bool:
     """Return True if evader j was alive before and a pursuer is within the capture distance now."""
     _, distance = _nearest(after, j, 0, int(p.pursuers))
     return bool(before.alive[j]) and distance <= p.capture_distance
@@ -116,7 +116,7 @@ def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any
     """Write the terms closing, capture, time; evaders get them with the opposite sign."""
     caught = 0
     for j in range(int(p.pursuers), after.pos.shape[1]):
-        caught += 1 if _caught(p, before, after, j) else 0
+        caught += 1 if _is_caught(p, before, after, j) else 0
     for i in range(terms.shape[0]):
         for k in range(terms.shape[1]):
             terms[i, k] = 0.0
@@ -126,7 +126,7 @@ def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any
         opponent, d0 = _nearest(before, i, first, end)
         if opponent >= 0:
             terms[i, at.closing] = side * p.closing_reward * (d0 - _distance(after, i, opponent))
-        prey = caught if side > 0 else (1 if _caught(p, before, after, i) else 0)
+        prey = caught if side > 0 else (1 if _is_caught(p, before, after, i) else 0)
         terms[i, at.capture] = side * p.capture_reward * prey
         terms[i, at.time] = -side * p.time_cost * p.control_dt
 
@@ -137,7 +137,7 @@ def ended(p: Any, at: Any, before: Frame, after: Frame, numbers: Any, over: Any)
     pursuers, n = int(p.pursuers), after.pos.shape[1]
     left = 0
     for j in range(pursuers, n):
-        out = not before.alive[j] or _caught(p, before, after, j)
+        out = not before.alive[j] or _is_caught(p, before, after, j)
         if j < over.shape[0]:
             over[j] = out
         after.alive[j] = not out
@@ -186,9 +186,9 @@ def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
             row[at.to_high + k] = _clip((p.size - frame.pos[k, i]) / p.size)
         slots = int(p.opponent_slots)
         opponents = (at.opponents, at.opponent_velocity, at.opponent_present)
-        _show_nearest(p, frame, i, first, end, slots, row, opponents)
+        _write_nearest(p, frame, i, first, end, slots, row, opponents)
         mates = (at.mates, at.mate_velocity, at.mate_present)
-        _show_nearest(p, frame, i, mate, mates_end, int(p.mate_slots), row, mates)
+        _write_nearest(p, frame, i, mate, mates_end, int(p.mate_slots), row, mates)
         for s in range(slots):
             dx, dy = row[at.opponents + 2 * s] * p.size, row[at.opponents + 2 * s + 1] * p.size
             distance = math.sqrt(dx * dx + dy * dy)
@@ -198,25 +198,25 @@ def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
 
 
 @kernel
-def _show_nearest(p: Any, frame: Frame, i: int, first: int, end: int, slots: int, row: Any, places: Any) -> None:
+def _write_nearest(p: Any, frame: Frame, i: int, first: int, end: int, slots: int, row: Any, places: Any) -> None:
     """Write the nearest `slots` living agents of [first, end): offsets, velocities, presence, from these indices on."""
     offsets, velocities, presence = places
     closest = -1.0
     chosen = -1
     for s in range(slots):
-        best, who = _FAR, -1
+        least, nearest = _FAR, -1
         for j in range(first, end):
             d = _distance(frame, i, j)
             after_last = d > closest or (d == closest and j > chosen)
-            if j != i and frame.alive[j] and after_last and d < best:
-                best, who = d, j
-        if who < 0:
+            if j != i and frame.alive[j] and after_last and d < least:
+                least, nearest = d, j
+        if nearest < 0:
             break
         for k in range(2):
-            row[offsets + 2 * s + k] = _clip((frame.pos[k, who] - frame.pos[k, i]) / p.size)
-            row[velocities + 2 * s + k] = _clip(frame.vel[k, who] / p.speed_scale)
+            row[offsets + 2 * s + k] = _clip((frame.pos[k, nearest] - frame.pos[k, i]) / p.size)
+            row[velocities + 2 * s + k] = _clip(frame.vel[k, nearest] / p.speed_scale)
         row[presence + s] = 1.0
-        closest, chosen = best, who
+        closest, chosen = least, nearest
 
 
 @kernel

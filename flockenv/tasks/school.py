@@ -21,7 +21,7 @@ from flockenv.physics.effects.effect import in_view
 from flockenv.scene import Group, Scene
 from flockenv.steering import arbitration, motivation
 from flockenv.tasks.layout import Layout, Slot
-from flockenv.tasks.observations import clip, place_of, velocity_of
+from flockenv.tasks.observations import clip, position_of, velocity_of
 from flockenv.tasks.task import Frame, Task
 
 __all__ = ["School"]
@@ -50,11 +50,11 @@ def spawn(p: Any, frame: Frame) -> None:
             for k in range(2):
                 frame.pos[k, i] = edge + (p.size - 2.0 * edge) * uniform(frame.key, t, i, k)
             if i >= foes:
-                clear = _clear(frame, i, foes, i, p.size / (1.0 + p.patches))
+                clear = _is_clear(frame, i, foes, i, p.size / (1.0 + p.patches))
             elif i >= fish:
-                clear = _clear(frame, i, 0, fish, p.start_distance)
+                clear = _is_clear(frame, i, 0, fish, p.start_distance)
             else:
-                clear = _clear(frame, i, 0, i, 4.0 * frame.radius[i])
+                clear = _is_clear(frame, i, 0, i, 4.0 * frame.radius[i])
             if clear:
                 break
         if i < foes:
@@ -64,39 +64,41 @@ def spawn(p: Any, frame: Frame) -> None:
 
 
 @kernel
-def _clear(frame: Frame, i: int, first: int, end: int, distance: float) -> bool:
+def _is_clear(frame: Frame, i: int, first: int, end: int, distance: float) -> bool:
     """Return True if agent i is at least `distance` m from the agents [first, end)."""
     for j in range(first, end):  # noqa: SIM110  # there are no generators in compiled code
-        if norm(_to(frame, i, j)) < distance:
+        if norm(_offset_to(frame, i, j)) < distance:
             return False
     return True
 
 
 @kernel
-def _to(frame: Frame, i: int, j: int) -> Vec:
+def _offset_to(frame: Frame, i: int, j: int) -> Vec:
     """Return the offset of agent j from agent i, m."""
-    return sub(place_of(frame, j), place_of(frame, i))
+    return sub(position_of(frame, j), position_of(frame, i))
 
 
 @kernel
 def _sees(p: Any, frame: Frame, i: int, j: int) -> bool:
     """Return True if fish i sees agent j: within sight, and not in the blind angle behind it."""
-    to = _to(frame, i, j)
+    to = _offset_to(frame, i, j)
     square = dot(to, to)
     inside: bool = square < p.sight * p.sight and in_view(p.cone, unit(velocity_of(frame, i)), to, square)
     return inside
 
 
 @kernel
-def _next_seen(p: Any, frame: Frame, i: int, first: int, end: int, last: int, past: float) -> tuple[int, float]:
-    """Return the next nearest agent of [first, end) after `last` seen by fish i, ties by index, and distance; or -1."""
-    best, who = np.inf, -1
+def _next_visible(
+    p: Any, frame: Frame, i: int, first: int, end: int, previous: int, previous_distance: float
+) -> tuple[int, float]:
+    """Return the next nearest agent of [first, end) that fish i sees, after `previous`, and its distance; or -1."""
+    least, nearest = np.inf, -1
     for j in range(first, end):
-        distance = norm(_to(frame, i, j))
-        later = distance > past or (distance == past and j > last)
-        if j != i and frame.alive[j] and later and distance < best and _sees(p, frame, i, j):
-            best, who = distance, j
-    return who, best
+        distance = norm(_offset_to(frame, i, j))
+        later = distance > previous_distance or (distance == previous_distance and j > previous)
+        if j != i and frame.alive[j] and later and distance < least and _sees(p, frame, i, j):
+            least, nearest = distance, j
+    return nearest, least
 
 
 # --- scripted agents --------------------------------------------------------------------------------------------------
@@ -104,7 +106,7 @@ def _next_seen(p: Any, frame: Frame, i: int, first: int, end: int, last: int, pa
 
 @kernel
 def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
-    """Write each learner's action as a force along the tank's axes; other fish follow `_fish`, hunters `_hunter`."""
+    """Write each learner's action as a force along the tank's axes; others follow `_fish_force` or `_hunter_force`."""
     fish, foes = int(p.fish), int(p.fish + p.hunters)
     for i in range(frame.pos.shape[1]):
         if not frame.alive[i] or i >= foes:
@@ -113,53 +115,55 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
             for k in range(2):
                 force[k, i] = action[i, k] * frame.max_force[i]
         else:
-            wish = _fish(p, frame, i) if i < fish else _hunter(p, frame, i)
+            own = _fish_force(p, frame, i) if i < fish else _hunter_force(p, frame, i)
             velocity, top = velocity_of(frame, i), np.float64(frame.max_speed[i])
-            here = place_of(frame, i)
+            here = position_of(frame, i)
             low, high = sub(here, (_MARGIN, _MARGIN)), sub((p.size - _MARGIN, p.size - _MARGIN), here)
             inside = scale(steering.contain(low, high, velocity, top, 0.3), _GAIN)
-            both = arbitration.allocate((inside, _apart(frame, i), wish), np.float64(frame.max_force[i]))
-            force[0, i], force[1, i] = both[0], both[1]
+            forces = (inside, _separation(frame, i), own)
+            total = arbitration.allocate(forces, np.float64(frame.max_force[i]))
+            force[0, i], force[1, i] = total[0], total[1]
 
 
 @kernel
-def _apart(frame: Frame, i: int) -> Vec:
+def _separation(frame: Frame, i: int) -> Vec:
     """Return the separation from agents of the same radius that are nearer than three radii."""
     push: Vec = (0.0, 0.0)
     for j in range(frame.pos.shape[1]):
-        to, mine = _to(frame, i, j), frame.radius[i]
+        to, mine = _offset_to(frame, i, j), frame.radius[i]
         if j != i and frame.alive[j] and frame.radius[j] == mine and norm(to) < 3.0 * mine:
             push = add(push, steering.separate(to, (1.0, 0.0) if j < i else (-1.0, 0.0)))
     return push
 
 
 @kernel
-def _roam(frame: Frame, i: int, time: float, speed: float) -> Vec:
+def _wander(frame: Frame, i: int, time: float, speed: float) -> Vec:
     """Return the force of wandering (Reynolds 1999) at this speed, m/s."""
     velocity = velocity_of(frame, i)
-    begin = 2.0 * math.pi * uniform(frame.key, 0, i, 3)
-    way: Vec = (math.cos(begin), math.sin(begin))
+    angle = 2.0 * math.pi * uniform(frame.key, 0, i, 3)
+    direction: Vec = (math.cos(angle), math.sin(angle))
     if velocity[0] != 0.0 or velocity[1] != 0.0:
-        way = velocity
-    aside: Vec = (0.0, np.float64(smooth(frame.key, time, i, 4)))
-    wanted = add(steering.wander(aside, way, speed, 1.0), way)
-    return scale(sub(wanted, velocity), 2.0)
+        direction = velocity
+    turn: Vec = (0.0, np.float64(smooth(frame.key, time, i, 4)))
+    desired = add(steering.wander(turn, direction, speed, 1.0), direction)
+    return scale(sub(desired, velocity), 2.0)
 
 
 @kernel
-def _fish(p: Any, frame: Frame, i: int) -> Vec:
+def _fish_force(p: Any, frame: Frame, i: int) -> Vec:
     """Return the force of a scripted fish by its intention: evade, forage, school, or wander."""
     velocity, top = velocity_of(frame, i), np.float64(frame.max_speed[i])
     fish, foes, intent = int(p.fish), int(p.fish + p.hunters), frame.memory[INTENT, i]
     if intent == motivation.ESCAPE:
-        who, distance = _next_seen(p, frame, i, fish, foes, -1, -1.0)
-        if who >= 0:
+        target, distance = _next_visible(p, frame, i, fish, foes, -1, -1.0)
+        if target >= 0:
             ahead = min(distance / p.hunter_speed, 0.5)
-            return scale(steering.evade(_to(frame, i, who), velocity, velocity_of(frame, who), top, ahead), _GAIN)
+            to, theirs = _offset_to(frame, i, target), velocity_of(frame, target)
+            return scale(steering.evade(to, velocity, theirs, top, ahead), _GAIN)
     if intent == motivation.EAT:
-        who, _ = _next_seen(p, frame, i, foes, frame.pos.shape[1], -1, -1.0)
-        if who >= 0:
-            return scale(steering.arrive(_to(frame, i, who), velocity, top, 1.0), _GAIN)
+        target, _ = _next_visible(p, frame, i, foes, frame.pos.shape[1], -1, -1.0)
+        if target >= 0:
+            return scale(steering.arrive(_offset_to(frame, i, target), velocity, top, 1.0), _GAIN)
     if intent == motivation.SCHOOL:
         count = 0.0
         centre: Vec = (0.0, 0.0)
@@ -167,27 +171,27 @@ def _fish(p: Any, frame: Frame, i: int) -> Vec:
         for j in range(fish):
             if j != i and frame.alive[j] and _sees(p, frame, i, j):
                 count += 1.0
-                centre, course = add(centre, _to(frame, i, j)), add(course, velocity_of(frame, j))
+                centre, course = add(centre, _offset_to(frame, i, j)), add(course, velocity_of(frame, j))
         if count > 0.0:
-            agree = steering.align(velocity, scale(course, 1.0 / count))
-            return add(scale(agree, 2.0), scale(centre, 1.0 / count))
-    return _roam(frame, i, 0.5 * frame.step * p.control_dt, 0.5 * top)
+            alignment = steering.align(velocity, scale(course, 1.0 / count))
+            return add(scale(alignment, 2.0), scale(centre, 1.0 / count))
+    return _wander(frame, i, 0.5 * frame.step * p.control_dt, 0.5 * top)
 
 
 @kernel
-def _hunter(p: Any, frame: Frame, i: int) -> Vec:
+def _hunter_force(p: Any, frame: Frame, i: int) -> Vec:
     """Return a hunter's force: if hungry, pursue the nearest fish within `hunter_sight`, else wander slowly."""
-    best, who = p.hunter_sight, -1
+    least, prey = p.hunter_sight, -1
     for j in range(int(p.fish)):
-        distance = norm(_to(frame, i, j))
-        if frame.alive[j] and distance < best:
-            best, who = distance, j
+        distance = norm(_offset_to(frame, i, j))
+        if frame.alive[j] and distance < least:
+            least, prey = distance, j
     velocity, top = velocity_of(frame, i), np.float64(frame.max_speed[i])
-    if frame.memory[INTENT, i] == motivation.EAT and who >= 0:
-        to, theirs = _to(frame, i, who), velocity_of(frame, who)
+    if frame.memory[INTENT, i] == motivation.EAT and prey >= 0:
+        to, theirs = _offset_to(frame, i, prey), velocity_of(frame, prey)
         ahead = min(steering.interception_time(to, theirs, top), 1.0)
         return scale(steering.pursue(to, velocity, theirs, top, ahead), _GAIN)
-    return _roam(frame, i, 0.5 * frame.step * p.control_dt, 0.4 * top)
+    return _wander(frame, i, 0.5 * frame.step * p.control_dt, 0.4 * top)
 
 
 # --- hunger, fear and food --------------------------------------------------------------------------------------------
@@ -204,52 +208,52 @@ def keep(p: Any, before: Frame, after: Frame) -> None:
         after.memory[EATEN, i], after.memory[FATE, i] = 0.0, 0.0
     for i in range(int(p.fish)):
         if before.alive[i]:
-            _graze(p, after, i)
-            _face_hunters(p, after, i)
+            _eat(p, after, i)
+            _update_fear(p, after, i)
     for i in range(foes):
         if before.alive[i]:
-            _digest(p, after, i)
+            _update_hunger(p, after, i)
     for i in range(foes):
         if before.alive[i]:
-            _intend(after, i)
+            _update_intention(after, i)
     for j in range(foes, n):
         grown = motivation.regrow(np.float64(after.memory[FOOD, j]), p.growth, p.capacity, p.control_dt)
         after.memory[FOOD, j] = grown - after.memory[EATEN, j]
 
 
 @kernel
-def _graze(p: Any, frame: Frame, i: int) -> None:
+def _eat(p: Any, frame: Frame, i: int) -> None:
     """Add what fish i eats of each patch within reach to the counts of the fish and of the patch."""
     hunger = np.float64(frame.memory[HUNGER, i])
     for j in range(int(p.fish + p.hunters), frame.pos.shape[1]):
-        if norm(_to(frame, i, j)) < p.reach:
+        if norm(_offset_to(frame, i, j)) < p.reach:
             taken = motivation.bite(np.float64(frame.memory[FOOD, j]), hunger, p.grazing, p.control_dt)
             frame.memory[EATEN, i] += taken
             frame.memory[EATEN, j] += taken
 
 
 @kernel
-def _has(p: Any, frame: Frame, j: int, i: int) -> bool:
+def _captures(p: Any, frame: Frame, j: int, i: int) -> bool:
     """Return True if hunter j is hunting and fish i is within its capture distance."""
-    return bool(frame.memory[INTENT, j] == motivation.EAT and norm(_to(frame, j, i)) <= p.capture_distance)
+    return bool(frame.memory[INTENT, j] == motivation.EAT and norm(_offset_to(frame, j, i)) <= p.capture_distance)
 
 
 @kernel
-def _face_hunters(p: Any, frame: Frame, i: int) -> None:
+def _update_fear(p: Any, frame: Frame, i: int) -> None:
     """Update the fear of fish i from the hunters that it sees and its previous fear, and whether it is caught."""
-    felt = 0.0
+    fear = 0.0
     for j in range(int(p.fish), int(p.fish + p.hunters)):
         if _sees(p, frame, i, j):
-            felt += motivation.fright(norm(_to(frame, i, j)), p.fear_distance)
-        if _has(p, frame, j, i):
+            fear += motivation.fright(norm(_offset_to(frame, i, j)), p.fear_distance)
+        if _captures(p, frame, j, i):
             frame.memory[FATE, i] = CAUGHT
     frame.memory[FEAR, i] = motivation.update_fear(
-        np.float64(frame.memory[FEAR, i]), min(felt, 1.0), p.fear_memory, p.control_dt
+        np.float64(frame.memory[FEAR, i]), min(fear, 1.0), p.fear_memory, p.control_dt
     )
 
 
 @kernel
-def _intend(frame: Frame, i: int) -> None:
+def _update_intention(frame: Frame, i: int) -> None:
     """Update the intention of fish or hunter i."""
     now, hunger = np.float64(frame.memory[INTENT, i]), np.float64(frame.memory[HUNGER, i])
     fear = np.float64(frame.memory[FEAR, i])
@@ -257,19 +261,19 @@ def _intend(frame: Frame, i: int) -> None:
 
 
 @kernel
-def _digest(p: Any, frame: Frame, i: int) -> None:
+def _update_hunger(p: Any, frame: Frame, i: int) -> None:
     """Update the hunger of fish or hunter i: time and effort raise it, food lowers it."""
     hunts = i >= int(p.fish)
     pace = norm(velocity_of(frame, i)) / np.float64(frame.max_speed[i])
     rate = p.hunter_metabolism if hunts else p.metabolism
     hunger = np.float64(frame.memory[HUNGER, i])
-    less = np.float64(frame.memory[EATEN, i])
+    food = np.float64(frame.memory[EATEN, i])
     if hunts:
         for j in range(int(p.fish)):
-            less += p.meal if frame.memory[FATE, j] == CAUGHT and _has(p, frame, i, j) else 0.0
+            food += p.meal if frame.memory[FATE, j] == CAUGHT and _captures(p, frame, i, j) else 0.0
     later = motivation.grow_hunger(hunger, rate, p.effort, pace, p.control_dt)
-    frame.memory[HUNGER, i] = max(later - less, 0.0)
-    if not hunts and later - less >= 1.0 and frame.memory[FATE, i] == 0.0:
+    frame.memory[HUNGER, i] = max(later - food, 0.0)
+    if not hunts and later - food >= 1.0 and frame.memory[FATE, i] == 0.0:
         frame.memory[FATE, i] = STARVED
 
 
@@ -352,33 +356,33 @@ def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
             row[at.to_high + k] = clip((p.size - frame.pos[k, i]) / p.size)
         row[at.hunger], row[at.fear] = frame.memory[HUNGER, i], frame.memory[FEAR, i]
         hunters = (at.hunters, at.hunter_bearing, at.hunter_velocity, at.hunter_closeness, at.hunter_present)
-        _show(p, frame, i, fish, foes, int(p.hunters), row, hunters)
+        _write_visible(p, frame, i, fish, foes, int(p.hunters), row, hunters)
         food = (at.food, at.food_bearing, at.food_velocity, at.food_closeness, at.food_amount)
-        _show(p, frame, i, foes, n, int(p.food_seen), row, food)
+        _write_visible(p, frame, i, foes, n, int(p.food_seen), row, food)
         mates = (at.mates, at.mate_bearing, at.mate_velocity, at.mate_closeness, at.mate_present)
-        _show(p, frame, i, 0, fish, int(p.fish_seen), row, mates)
+        _write_visible(p, frame, i, 0, fish, int(p.fish_seen), row, mates)
 
 
 @kernel
-def _show(p: Any, frame: Frame, i: int, first: int, end: int, slots: int, row: Any, places: Any) -> None:
+def _write_visible(p: Any, frame: Frame, i: int, first: int, end: int, slots: int, row: Any, places: Any) -> None:
     """Write the agents of [first, end) that fish i sees: offset, bearing, velocity, closeness, presence or amount.
 
     Each of these begins at its index in `places`.
     """
-    offset, bearing, velocity, closeness, kept = places
-    last, past = -1, -1.0
+    offset, bearing, velocity, closeness, presence = places
+    previous, previous_distance = -1, -1.0
     for s in range(slots):
-        who, distance = _next_seen(p, frame, i, first, end, last, past)
-        if who < 0:
+        index, distance = _next_visible(p, frame, i, first, end, previous, previous_distance)
+        if index < 0:
             break
-        to, way = _to(frame, i, who), unit(_to(frame, i, who))
+        to, direction = _offset_to(frame, i, index), unit(_offset_to(frame, i, index))
         for k in range(2):
             row[offset + 2 * s + k] = clip(to[k] / p.sight)
-            row[bearing + 2 * s + k] = way[k]
-            row[velocity + 2 * s + k] = clip(frame.vel[k, who] / p.hunter_speed)
+            row[bearing + 2 * s + k] = direction[k]
+            row[velocity + 2 * s + k] = clip(frame.vel[k, index] / p.hunter_speed)
         row[closeness + s] = max(1.0 - distance / p.near, 0.0)
-        row[kept + s] = 1.0 if end < frame.pos.shape[1] else min(frame.memory[FOOD, who] / p.capacity, 1.0)
-        last, past = who, distance
+        row[presence + s] = 1.0 if end < frame.pos.shape[1] else min(frame.memory[FOOD, index] / p.capacity, 1.0)
+        previous, previous_distance = index, distance
 
 
 class School(Task):
@@ -445,7 +449,7 @@ class School(Task):
     death_cost: float = Field(default=10.0, ge=0, description="once, when caught or starved")
 
     @model_validator(mode="after")
-    def _fitting(self) -> School:
+    def _check_sizes(self) -> School:
         """Raise ValueError for more learners than fish, a start distance above half the tank, or too much grazing."""
         if self.learners > self.fish:
             raise ValueError(f"learners = {self.learners}: there are only {self.fish} fish")
@@ -537,10 +541,10 @@ class School(Task):
         """Return a mark at each patch, with an area proportional to its food."""
         first = self.fish + self.hunters
         return tuple(
-            Mark("goal", state.pos[world, j], np.zeros(2), self._shown(float(memory[FOOD, world, j])))
+            Mark("goal", state.pos[world, j], np.zeros(2), self._drawn_radius(float(memory[FOOD, world, j])))
             for j in range(first, self.agents)
         )
 
-    def _shown(self, amount: float) -> float:
+    def _drawn_radius(self, amount: float) -> float:
         """Return the radius at which a patch is drawn, m."""
         return self.reach * math.sqrt(min(max(amount / self.capacity, 0.01), 1.0))

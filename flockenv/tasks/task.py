@@ -10,7 +10,7 @@ world:
   test checks;
 * `ended(p, at, before, after, numbers, over) -> success` writes which learners are over (L,), may clear `after.alive`
   of agents, and returns whether the aim is reached; it may also write those of the `measures` (Q,) that it needs
-  itself. If the task has a `lasting_aim`, it returns whether the aim holds now, and success is what `lasts` in
+  itself. If the task has a `lasting_aim`, it returns whether the aim holds now, and success is what `aim_has_lasted` in
   tasks/lasting.py returns for the sums of the measures;
 * `measure(p, at, before, after, numbers)` runs next and writes the other measures: what this step adds to each;
 * `metrics(p, at, sums, last, steps, numbers)` writes the domain metrics of an episode so far, in the order of
@@ -73,10 +73,10 @@ class Frame(NamedTuple):
     max_force: Any  # (N,) N
     # Neighbours and obstacles, as the task's `look` defines them; empty in the frame `before`.
     near_square: Any  # (K, N) m^2, squared distances to the nearest agents, nearest first; inf: none
-    near_who: Any  # (K, N) their indices; a valid index also where there is none
+    near_index: Any  # (K, N) their indices; a valid index also where there is none
     near_count: Any  # (N,) number of agents within sight, at most K
     obstacle_gap: Any  # (J, N) m, distances to the surfaces of the nearest obstacles; inf: none
-    obstacle_who: Any  # (J, N)
+    obstacle_index: Any  # (J, N)
     obstacle_count: Any  # (N,)
     # Positions, velocities and radii of the nearest agents: only in tasks with `abreast`, for the kernels `abreast`,
     # `reward`, `ended` and `measure`; else empty.
