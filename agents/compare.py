@@ -35,7 +35,7 @@ from flockenv.evaluation import WORLDS_PER_SEED, Episodes, rollout, task_digest,
 from flockenv.players import NAMES, load_player, other_tasks
 from flockenv.players.files import SUFFIXES, PlayerError
 from flockenv.players.policy import Policy
-from flockenv.players.rules import tuned
+from flockenv.players.rules import load_tuned
 from flockenv.tasks import TASKS, Task
 
 __all__ = [
@@ -228,7 +228,7 @@ def _costs(task: Task, policies: Mapping[str, Policy]) -> dict[str, report.Resul
     for name, policy in policies.items():
         card = getattr(policy, "card", None) or {}
         costs[name] = {key: card[key] for key in ("wall_time_s", "steps") if key in card}
-    steps = tuned(task.name).found.get("agent_steps")
+    steps = load_tuned(task.name).found.get("agent_steps")
     if steps and "rules" in policies:
         costs["rules"] = {"of": "tuning", "steps": round(steps)}
     return costs

@@ -22,7 +22,7 @@ from flockenv.cli.terminal import one_line, program
 from flockenv.core.atomic_files import replace_file, write_all_or_none
 from flockenv.core.output_paths import check_room, valid_file, valid_path
 from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK
-from flockenv.players.rules import tuned
+from flockenv.players.rules import load_tuned
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -78,7 +78,7 @@ def learned(experiment: Experiment, name: str, runs: Path) -> Curve:
 
 def measured(experiment: Experiment, runs: Path) -> Numbers:
     """Return what there is to show of a task, once all of its settings are trained."""
-    rules = tuned(experiment.task).found.get("tuning_mean")
+    rules = load_tuned(experiment.task).found.get("tuning_mean")
     rows = {}
     for name, p in experiment.settings().items():
         curve = learned(experiment, name, runs)

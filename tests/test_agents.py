@@ -29,7 +29,7 @@ from flockenv.evaluation import compare, rollout, worlds_for
 from flockenv.jit.thread_pool import threads
 from flockenv.players import WEIGHTS
 from flockenv.players.policy import MlpPolicy, RandomPolicy
-from flockenv.players.rules import RULES, Tuned, as_dict, player, tuned
+from flockenv.players.rules import RULES, Tuned, as_dict, load_tuned, player
 from flockenv.players.rules.parameter import ranges_of
 from flockenv.tasks import TASKS, School, Task
 from tests.training import PURSUIT, TINY, interrupt
@@ -69,7 +69,7 @@ def test_the_shipped_policy_is_far_above_random_and_its_card_is_complete(name: s
 def test_the_page_states_when_training_passed_the_rules(name: str) -> None:
     """The numbers are those of the policy's card and of the search."""
     card = json.loads((WEIGHTS / f"{name}.json").read_text(encoding="utf-8"))
-    rules = tuned(name).found["tuning_mean"]
+    rules = load_tuned(name).found["tuning_mean"]
     past = next((point for point in card["curve"] if point["mean"] > rules), None)
     cells = (
         [f"{past['mean']:.2f}", f"{past['seconds']:.0f}", f"{past['steps'] / 1e6:.1f} M"] if past else ["never", "", ""]
@@ -106,7 +106,7 @@ def test_every_parameter_of_the_rules_has_a_range_around_its_textbook_value() ->
 
 def test_tuned_rules_have_every_parameter_and_beat_the_textbook_on_tuning_worlds() -> None:
     for name in TASKS:
-        record = tuned(name)
+        record = load_tuned(name)
         assert record.parameters == as_dict(player(TASKS[name]()).rules)
         assert record.found["tuning_mean"] > record.found["textbook_mean"]
 
@@ -117,11 +117,11 @@ def test_the_rules_use_the_parameters_that_the_search_found(tmp_path: Path, monk
     config.write_text(yaml.safe_dump({"task": "pursuit", "search": search}), encoding="utf-8")
     monkeypatch.setattr(tune, "TUNED", tmp_path / "tuned")
     monkeypatch.setattr("flockenv.players.rules.TUNED", tmp_path / "tuned")
-    assert tuned("pursuit") == Tuned(), "no search yet"
+    assert load_tuned("pursuit") == Tuned(), "no search yet"
     result = CliRunner().invoke(tune.app, [str(config)])
     assert result.exit_code == 0, result.output
     rules, found = tune.search(load_experiment(config))
-    assert tuned("pursuit") == Tuned(rules, found), "the search is reproducible"
+    assert load_tuned("pursuit") == Tuned(rules, found), "the search is reproducible"
     assert as_dict(player(TASKS["pursuit"]()).rules) == rules
     assert found["agent_steps"] > 0 and found["tuning_mean"] >= found["textbook_mean"]
 
@@ -311,7 +311,7 @@ def test_the_stored_curves_match_the_settings_in_the_configs() -> None:
     assert stored.keys() == {name for name in TASKS if load_experiment(CONFIGS / f"{name}.yaml").curves}
     for name, numbers in stored.items():
         experiment = load_experiment(CONFIGS / f"{name}.yaml")
-        assert numbers["rules"] == tuned(name).found["tuning_mean"]
+        assert numbers["rules"] == load_tuned(name).found["tuning_mean"]
         kept = {setting: PpoSettings(**{**row["ppo"], "threads": 2}) for setting, row in numbers["settings"].items()}
         assert kept == {setting: p.model_copy(update={"threads": 2}) for setting, p in experiment.settings().items()}
 

@@ -8,7 +8,7 @@ import pettingzoo
 import pytest
 from gymnasium.vector import AutoresetMode
 
-from flockenv.envs.common import ByAgent, named
+from flockenv.envs.common import ByAgent, iterate_by_name
 from flockenv.envs.sb3 import WorldVecEnv
 from flockenv.envs.table import id_of
 from flockenv.envs.world import World
@@ -187,6 +187,6 @@ class Odd(enum.StrEnum):
 def test_numbers_keep_their_names_of_any_string_type(names):
     rows = np.arange(6.0).reshape(3, 2)
     expected = [dict(zip(map(str, names), row, strict=True)) for row in rows.tolist()]
-    assert list(named(names, rows)) == expected
+    assert list(iterate_by_name(names, rows)) == expected
     infos = ByAgent(names, ["x", "y", "z"]).of(rows, [0.0] * 3, [False] * 3, False, rows.T.tolist(), True)[-1]
     assert infos == {agent: {**its, "is_success": True} for agent, its in zip("xyz", expected, strict=True)}

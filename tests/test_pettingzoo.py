@@ -330,14 +330,14 @@ def test_dictionaries_by_agent_are_equal_with_generated_code_and_with_loops(monk
     paid, earned = rng.random(len(agents)).tolist(), rng.random((2, len(agents))).tolist()
     for displayed in (0, 1000):
         monkeypatch.setattr(common, "DISPLAYED", displayed)
-        common._by_agent.cache_clear()
+        common._compile_by_agent.cache_clear()
         found = common.ByAgent(terms, agents).of(seen, paid, over, True, earned, False)
         assert [list(each) for each in found] == [list(agents)] * 5
         for i, agent in enumerate(agents):
             info = {**{term: earned[k][i] for k, term in enumerate(terms)}, "is_success": False}
             np.testing.assert_array_equal(found[0][agent], seen[i])
             assert [each[agent] for each in found[1:]] == [paid[i], over[i], True, info]
-    common._by_agent.cache_clear()
+    common._compile_by_agent.cache_clear()
 
 
 def test_changes_of_the_list_of_agents_have_no_effect():

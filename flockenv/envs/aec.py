@@ -55,7 +55,7 @@ class _Checked(BaseWrapper):  # type: ignore[misc]  # pettingzoo ships no types
         turns = self.env  # plain attributes: the properties of this wrapper would slow down each turn
         agent = turns.agent_selection
         if not (turns.terminations[agent] or turns.truncations[agent]):
-            turns.unwrapped.checked_action(agent, action)
+            turns.unwrapped.check_action(agent, action)
         elif action is not None:
             raise ValueError(f"actions: agent {agent!r} has ended, so that its action must be None")
         turns.step(action)

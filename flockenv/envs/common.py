@@ -25,15 +25,15 @@ __all__ = [
     "Rows",
     "Screen",
     "action_space",
-    "begun",
     "build",
-    "checked_options",
-    "checked_seed",
-    "named",
+    "check_ends_together",
+    "check_options",
+    "check_seed",
+    "iterate_by_name",
     "observation_space",
     "render_fps",
+    "require_episode",
     "reward_keys",
-    "together",
 ]
 
 Rows = NDArray[Any]
@@ -63,7 +63,7 @@ def build(task_type: type[Task], parameters: Mapping[str, Any], limit: str, own:
     return task_type(**parameters)
 
 
-def together(task: Task) -> Task:
+def check_ends_together(task: Task) -> Task:
     """Return the task; ValueError if its learners end one by one, as a row would have no meaning after its end."""
     if not task.ends_together:
         raise ValueError(
@@ -91,23 +91,23 @@ def reward_keys(task: Task) -> tuple[str, ...]:
     return tuple(f"reward/{name}" for name in task.terms)
 
 
-def named(names: Sequence[str], rows: Rows) -> Iterator[dict[str, float]]:
+def iterate_by_name(names: Sequence[str], rows: Rows) -> Iterator[dict[str, float]]:
     """Return an iterator over dictionaries, by name, of the rows of numbers (R, K).
 
     Columns become lists, and rows are made one at a time: a list for each row would trigger the garbage collector.
     """
-    return map(_named(*names), *rows.T.tolist())
+    return map(_dict_maker(*names), *rows.T.tolist())
 
 
 @functools.cache
-def _named(*names: str) -> Callable[..., dict[str, float]]:
+def _dict_maker(*names: str) -> Callable[..., dict[str, float]]:
     """Return a function of K numbers that makes a dictionary; a dict display takes half the time of dict(zip(...))."""
     numbers = [f"n{k}" for k in range(len(names))]
-    made: Callable[..., dict[str, float]] = eval(f"lambda {', '.join(numbers)}: {_display(names, numbers)}")  # noqa: S307  # reprs alone
-    return made
+    make_dict: Callable[..., dict[str, float]] = eval(f"lambda {', '.join(numbers)}: {_dict_source(names, numbers)}")  # noqa: S307  # reprs alone
+    return make_dict
 
 
-def _display(names: Iterable[str], values: Iterable[str]) -> str:
+def _dict_source(names: Iterable[str], values: Iterable[str]) -> str:
     """Return the source of a dict display with the source of a value for each name."""
     return f"{{{', '.join(f'{str.__str__(name)!r}: {value}' for name, value in zip(names, values, strict=True))}}}"
 
@@ -124,34 +124,34 @@ class ByAgent:
     """
 
     def __init__(self, keys: Sequence[str], agents: Sequence[str]) -> None:
-        self._about = tuple(keys), tuple(agents)
-        self.of: Callable[..., tuple[dict[str, Any], ...]] = _by_agent(*self._about)
+        self._arguments = tuple(keys), tuple(agents)
+        self.of: Callable[..., tuple[dict[str, Any], ...]] = _compile_by_agent(*self._arguments)
 
     def __reduce__(self) -> tuple[type[ByAgent], tuple[tuple[str, ...], tuple[str, ...]]]:
-        return ByAgent, self._about
+        return ByAgent, self._arguments
 
 
 @functools.lru_cache(64)
-def _by_agent(keys: tuple[str, ...], agents: tuple[str, ...]) -> Callable[..., tuple[dict[str, Any], ...]]:
+def _compile_by_agent(keys: tuple[str, ...], agents: tuple[str, ...]) -> Callable[..., tuple[dict[str, Any], ...]]:
     def info(numbers: Iterable[str]) -> str:
-        return _display((*keys, "is_success"), (*numbers, "success"))
+        return _dict_source((*keys, "is_success"), (*numbers, "success"))
 
     if len(agents) <= DISPLAYED:
         many = range(len(agents))
         lists = {"s": "seen", "r": "paid", "o": "over"} | {f"t{k}_": f"terms[{k}]" for k in range(len(keys))}
         each = {one: [f"{one}{i}" for i in many] for one in lists}
-        lines = [f"{', '.join(each[one])}, = {several}" for one, several in lists.items()]
+        lines = [f"{', '.join(each[one])}, = {target}" for one, target in lists.items()]
         infos = [info(each[f"t{k}_"][i] for k in range(len(keys))) for i in many]
-        shown = (each["s"], each["r"], each["o"], ["late"] * len(agents), infos)
-        lines += [f"return {', '.join(_display(agents, values) for values in shown)}"]
+        columns = (each["s"], each["r"], each["o"], ["late"] * len(agents), infos)
+        lines += [f"return {', '.join(_dict_source(agents, values) for values in columns)}"]
     else:
         numbers = [f"n{k}" for k in range(len(keys))]
-        told = f"{{agent: {info(numbers)} for agent, {', '.join(numbers)} in zip(agents, *terms, strict=True)}}"
-        several = ", ".join(f"dict(zip(agents, {what}, strict=True))" for what in ("seen", "paid", "over"))
-        lines = [f"return {several}, dict.fromkeys(agents, late), {told}"]
-    made: dict[str, Any] = {"agents": agents}
-    exec("def of(seen, paid, over, late, terms, success):\n " + "\n ".join(lines), made)  # noqa: S102  # reprs alone
-    return made["of"]  # type: ignore[no-any-return]
+        infos_source = f"{{agent: {info(numbers)} for agent, {', '.join(numbers)} in zip(agents, *terms, strict=True)}}"
+        target = ", ".join(f"dict(zip(agents, {what}, strict=True))" for what in ("seen", "paid", "over"))
+        lines = [f"return {target}, dict.fromkeys(agents, late), {infos_source}"]
+    namespace: dict[str, Any] = {"agents": agents}
+    exec("def of(seen, paid, over, late, terms, success):\n " + "\n ".join(lines), namespace)  # noqa: S102  # reprs alone
+    return namespace["of"]  # type: ignore[no-any-return]
 
 
 def render_fps(task: Task) -> int:
@@ -159,7 +159,7 @@ def render_fps(task: Task) -> int:
     return max(1, round(1.0 / task.control_dt))
 
 
-def checked_seed(seed: Any) -> int | None:
+def check_seed(seed: Any) -> int | None:
     """Return the seed as an int, or None; TypeError if it is not an integer, ValueError outside 0 ... 2**63 - 1."""
     if seed is None:
         return None
@@ -174,7 +174,7 @@ def checked_seed(seed: Any) -> int | None:
     return number
 
 
-def checked_options(options: Mapping[str, Any] | None, known: Iterable[str] = ()) -> Mapping[str, Any]:
+def check_options(options: Mapping[str, Any] | None, known: Iterable[str] = ()) -> Mapping[str, Any]:
     """Return the options of a reset; ValueError for a name not in `known`, with the nearest known name."""
     if options is None:
         return {}
@@ -183,12 +183,12 @@ def checked_options(options: Mapping[str, Any] | None, known: Iterable[str] = ()
     known = list(known)
     unknown = [name for name in options if name not in known]
     if unknown:
-        meant = nearest(str(unknown[0]), known)
-        raise ValueError(f"options: {unknown[0]!r} is unknown{meant}; allowed: {', '.join(known) or 'none'}")
+        suggestion = nearest(str(unknown[0]), known)
+        raise ValueError(f"options: {unknown[0]!r} is unknown{suggestion}; allowed: {', '.join(known) or 'none'}")
     return options
 
 
-def begun(running: bool, call: str) -> None:
+def require_episode(running: bool, call: str) -> None:
     """Raise ResetNeeded for a step or a picture of an environment that was not reset, or was closed."""
     if not running:
         raise ResetNeeded(f"{call}: there is no episode; call reset() first")

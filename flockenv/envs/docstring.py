@@ -35,20 +35,20 @@ def page(info: EnvInfo, task: Task) -> str:
 
 
 def _rewards(task: Task) -> str:
-    return f"The reward is the sum of these terms: {_quoted(task.terms)}."
+    return f"The reward is the sum of these terms: {_quote(task.terms)}."
 
 
 def _infos(task: Task) -> str:
     rows = [
-        (_quoted(reward_keys(task)), "each term of the reward of this step"),
+        (_quote(reward_keys(task)), "each term of the reward of this step"),
         ("`is_success`", "True if the episode so far is a success"),
-        (_quoted(task.metric_names), "metrics of the episode so far, if they have a value"),
+        (_quote(task.metric_names), "metrics of the episode so far, if they have a value"),
         ("`seed`", "the seed of the world, only in the info of a reset"),
     ]
     return "Infos are flat: each value is one number or bool.\n\n" + _table(("key", "value"), rows)
 
 
-def _quoted(names: Sequence[str]) -> str:
+def _quote(names: Sequence[str]) -> str:
     return ", ".join(f"`{name}`" for name in names)
 
 

@@ -20,12 +20,12 @@ from flockenv.envs.common import (
     Rows,
     Screen,
     action_space,
-    begun,
     build,
-    checked_options,
-    checked_seed,
+    check_options,
+    check_seed,
     observation_space,
     render_fps,
+    require_episode,
     reward_keys,
 )
 from flockenv.envs.table import EnvInfo, class_of
@@ -99,13 +99,13 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
 
     def observation_space(self, agent: str) -> Box:
         """Return the space of an agent's observations, the same object each time."""
-        return self.observation_spaces[self._known(agent)]
+        return self.observation_spaces[self._check_agent(agent)]
 
     def action_space(self, agent: str) -> Box:
         """Return the space of an agent's actions, the same object each time."""
-        return self.action_spaces[self._known(agent)]
+        return self.action_spaces[self._check_agent(agent)]
 
-    def _known(self, agent: str) -> str:
+    def _check_agent(self, agent: str) -> str:
         if agent not in self.action_spaces:
             raise ValueError(f"agent: {agent!r} is unknown{nearest(str(agent), self.possible_agents)}")
         return agent
@@ -115,9 +115,9 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
 
         The seed is `world.seeds[0]`. It is not in the infos, because TorchRL takes their keys as all keys of infos.
         """
-        seed = checked_seed(seed)
+        seed = check_seed(seed)
         # PettingZoo's own test suite resets every environment with {"options": 1}; all other options are rejected.
-        checked_options(options, ("options",))
+        check_options(options, ("options",))
         observation = self.world.reset(seeds=seed)[0]
         if seed is not None:
             self.np_random = seeding.np_random(seed)[0]
@@ -139,7 +139,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         """
         if self._running and not self._live and isinstance(actions, dict) and not actions:
             return {}, {}, {}, {}, {}
-        begun(bool(self._live), "step")
+        require_episode(bool(self._live), "step")
         result = self._step(actions)
         present, truncated, terminated = self._live, result.truncated.item(), result.terminated[0].tolist()
         outcome = self._by_agent.of(
@@ -162,35 +162,35 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         if not isinstance(actions, Mapping):
             raise TypeError(f"actions: {type(actions).__name__}, must be a dictionary from agent to action")
         if [*actions] == [*self._live]:  # in the order of `_live`, as most callers pass them
-            given = [*actions.values()]
+            rows = [*actions.values()]
         elif self._live.keys() <= actions.keys() <= self.action_spaces.keys():
-            given = [actions[name] for name in self._live]
+            rows = [actions[name] for name in self._live]
         else:
-            self._refuse_names(actions)
+            self._raise_for_names(actions)
         try:
-            return self.world.step(self._rows(given))
+            return self.world.step(self._action_rows(rows))
         except (TypeError, ValueError):
             for name in self._live:
-                self.checked_action(name, actions[name])
+                self.check_action(name, actions[name])
             raise
 
-    def _rows(self, given: list[Rows]) -> Rows:
+    def _action_rows(self, actions: list[Rows]) -> Rows:
         """Return the actions of all living agents as (1, L, A), with zeros for agents that have left."""
-        block, everybody = np.asarray(given), len(self.possible_agents)
-        if len(given) == everybody:
+        block, count = np.asarray(actions), len(self.possible_agents)
+        if len(actions) == count:
             return block[None]
-        rows = np.zeros((1, everybody, *block.shape[1:]))
+        rows = np.zeros((1, count, *block.shape[1:]))
         rows[0, list(self._live.values())] = block
         return rows
 
-    def _refuse_names(self, actions: Mapping[str, Rows]) -> NoReturn:
+    def _raise_for_names(self, actions: Mapping[str, Rows]) -> NoReturn:
         for name in actions:
             if name not in self.action_spaces:
                 raise ValueError(f"actions: agent {name!r} is unknown{nearest(str(name), self._live)}")
         lacking = next(name for name in self._live if name not in actions)
         raise ValueError(f"actions: agent {lacking!r} has none")
 
-    def checked_action(self, agent: str, action: Rows | None) -> Rows:
+    def check_action(self, agent: str, action: Rows | None) -> Rows:
         """Return an action as an array, (A,); ValueError, with the agent, on NaN, infinity or another shape."""
         size = self.task.action_layout.size
         try:
@@ -208,9 +208,9 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
     @functools.cached_property
     def state_space(self) -> Box:
         """The space of state(), (S,) float32 in [-1, 1]."""
-        begun_elsewhere = World(self.task)
-        begun_elsewhere.reset(seeds=0)
-        return Box(-1.0, 1.0, _everything(begun_elsewhere, 1).shape, np.float32)
+        other = World(self.task)
+        other.reset(seeds=0)
+        return Box(-1.0, 1.0, _state_row(other, 1).shape, np.float32)
 
     def state(self) -> NDArray[np.float32]:
         """Return the state of the world as one row, for centralised critics; (S,) float32 in [-1, 1].
@@ -218,8 +218,8 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         Positions (N, D) in the region shown, velocities (N, D) over the largest speed, alive (N,), obstacles
         (M, D + 1), goals and headings (K, 2 D), and the share of the time limit that has passed; all clipped.
         """
-        begun(bool(self.world.seeds), "state")
-        return _everything(self.world, self.max_cycles)
+        require_episode(bool(self.world.seeds), "state")
+        return _state_row(self.world, self.max_cycles)
 
     def _show(self) -> None:
         if self.render_mode == "human":
@@ -232,7 +232,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
                 "render() shows nothing without a render mode: make(..., render_mode='rgb_array')", stacklevel=2
             )
             return None
-        begun(bool(self.world.seeds), "render")
+        require_episode(bool(self.world.seeds), "render")
         return self._screen.show(self.world.snapshot())
 
     def close(self) -> None:
@@ -241,7 +241,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         self._screen.close()
 
 
-def _everything(world: World, limit: int) -> NDArray[np.float32]:
+def _state_row(world: World, limit: int) -> NDArray[np.float32]:
     now = world.snapshot()
     middle, half = (now.low + now.high) / 2, (now.high - now.low) / 2
     speed = world.task.scene.body.max_speed.max()

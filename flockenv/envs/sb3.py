@@ -25,14 +25,14 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 from flockenv.envs.common import (
     Screen,
     action_space,
-    begun,
-    checked_options,
-    checked_seed,
-    named,
+    check_ends_together,
+    check_options,
+    check_seed,
+    iterate_by_name,
     observation_space,
     render_fps,
+    require_episode,
     reward_keys,
-    together,
 )
 from flockenv.envs.table import ENVIRONMENTS
 from flockenv.envs.world import Step, World
@@ -100,7 +100,7 @@ class WorldVecEnv(VecEnv):
         self, task: Task, worlds: int = 1, time_limit: int | None = None, render_mode: str | None = None,
         leaving: bool = False,
     ) -> None:  # fmt: skip
-        self.task = task if leaving else together(task)
+        self.task = task if leaving else check_ends_together(task)
         self.world = World(task, worlds, time_limit=task.horizon if time_limit is None else time_limit)
         self.render_mode = render_mode
         self._screen = Screen(render_mode, render_fps(task), modes=("rgb_array",))
@@ -120,7 +120,7 @@ class WorldVecEnv(VecEnv):
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Give world k the seed s + k at the next reset; None draws s. Returns the seed of every row."""
-        first = checked_seed(seed)
+        first = check_seed(seed)
         first = int(np.random.default_rng().integers(2**32)) if first is None else first
         self._seeds = [first + i // self.task.learners for i in range(self.num_envs)]
         return self._seeds
@@ -128,7 +128,7 @@ class WorldVecEnv(VecEnv):
     def reset(self) -> NDArray[np.float32]:
         """Begin an episode in every world; return (B L, O) float32. `reset_infos` holds the seed of each row."""
         for options in self._options:
-            checked_options(options)
+            check_options(options)
         seeds = [seed for seed in self._seeds[:: self.task.learners] if seed is not None]
         seeded = len(seeds) == self.world.worlds
         observation = self.world.reset(seeds=seeds if seeded else None)
@@ -143,7 +143,7 @@ class WorldVecEnv(VecEnv):
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Store the actions of all rows, (B L, A), clipped to [-1, 1]; ValueError on another shape."""
-        begun(self._running, "step")
+        require_episode(self._running, "step")
         rows = np.asarray(actions)
         expected = (self.num_envs, self.task.action_layout.size)
         if rows.shape != expected:
@@ -163,27 +163,27 @@ class WorldVecEnv(VecEnv):
         done = (ended[:, None] | result.terminated) & self._present
         infos: list[Info] = [NOTHING] * self.num_envs
         if done.any():
-            self._tell(infos, result, done)
+            self._write_infos(infos, result, done)
             self._present = (self._present & ~done) | ended[:, None]
         if ended.any():
             self.world.reset(mask=ended, into=result.observation)
         return self._rows(result.observation), result.reward.reshape(-1), done.reshape(-1), infos
 
-    def _tell(self, infos: list[Info], result: Step, done: NDArray[np.bool_]) -> None:
+    def _write_infos(self, infos: list[Info], result: Step, done: NDArray[np.bool_]) -> None:
         """Write the infos of the rows that are done, done (B, L); the only loop over rows."""
-        worlds, each = np.flatnonzero(done.any(axis=1)), self.task.learners
-        of_world = self._ends(result, np.flatnonzero(result.ended))
-        picked = done[worlds].reshape(-1)
+        worlds, learners = np.flatnonzero(done.any(axis=1)), self.task.learners
+        of_world = self._final_infos(result, np.flatnonzero(result.ended))
+        done_rows = done[worlds].reshape(-1)
         rows = np.flatnonzero(done).tolist()
-        paid = named(self._reward_keys, self.world.paid[worlds].reshape(len(picked), -1)[picked])
-        seen, over = self._rows(result.observation[worlds], worlds)[picked], result.terminated[done].tolist()
+        paid = iterate_by_name(self._reward_keys, self.world.paid[worlds].reshape(len(done_rows), -1)[done_rows])
+        seen, over = self._rows(result.observation[worlds], worlds)[done_rows], result.terminated[done].tolist()
         for row, info, last, terminated in zip(rows, paid, seen, over, strict=True):
             infos[row] = info
             info["terminal_observation"] = last
             info["TimeLimit.truncated"] = not terminated  # an episode ends by termination or by the time limit
-            info |= of_world.get(row // each, {})
+            info |= of_world.get(row // learners, {})
 
-    def _ends(self, result: Step, worlds: NDArray[np.intp]) -> dict[int, Info]:
+    def _final_infos(self, result: Step, worlds: NDArray[np.intp]) -> dict[int, Info]:
         """Return the metrics and success of each world that ended, for the infos of its rows, by world."""
         columns = {name: column[worlds].tolist() for name, column in self.world.measure().items()}
         columns["is_success"] = result.success[worlds].tolist()
@@ -202,21 +202,21 @@ class WorldVecEnv(VecEnv):
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
         """Return the picture of world 0 only: one per row would repeat each world for each of its learners."""
-        begun(self._running, "render")
+        require_episode(self._running, "render")
         return [self._screen.show(self.world.snapshot(), "rgb_array")]
 
     def render(self, mode: str | None = None) -> NDArray[np.uint8] | None:
         """Return the picture of world 0, (H, W, 3) uint8, or show it ("human") in flockenv's window, without OpenCV."""
-        begun(self._running, "render")
+        require_episode(self._running, "render")
         return self._screen.show(self.world.snapshot(), mode)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of this object (`task`, `world`, ...) for each of the rows."""
-        return [getattr(self, attr_name)] * len(self._picked(indices))
+        return [getattr(self, attr_name)] * len(self._row_indices(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set an attribute of this object; ValueError for a subset of rows, since all rows share one simulator."""
-        if len(self._picked(indices)) != self.num_envs:
+        if len(self._row_indices(indices)) != self.num_envs:
             raise ValueError(f"set_attr({attr_name!r}): the rows share one simulator; leave out indices")
         setattr(self, attr_name, value)
 
@@ -224,16 +224,16 @@ class WorldVecEnv(VecEnv):
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         """Call a method of this object once, and return its result for each of the rows."""
-        picked = self._picked(indices)
-        return [getattr(self, method_name)(*method_args, **method_kwargs)] * len(picked)
+        rows = self._row_indices(indices)
+        return [getattr(self, method_name)(*method_args, **method_kwargs)] * len(rows)
 
     def env_is_wrapped(
         self, wrapper_class: type[Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
     ) -> list[bool]:
         """Return False for each of the rows: they contain no gymnasium environment that could be wrapped."""
-        return [False] * len(self._picked(indices))
+        return [False] * len(self._row_indices(indices))
 
-    def _picked(self, indices: VecEnvIndices) -> list[int]:
+    def _row_indices(self, indices: VecEnvIndices) -> list[int]:
         return list(self._get_indices(indices))
 
 

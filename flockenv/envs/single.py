@@ -18,12 +18,12 @@ from flockenv.envs.common import (
     Rows,
     Screen,
     action_space,
-    begun,
     build,
-    checked_options,
-    checked_seed,
+    check_options,
+    check_seed,
     observation_space,
     render_fps,
+    require_episode,
     reward_keys,
 )
 from flockenv.envs.docstring import page
@@ -31,10 +31,10 @@ from flockenv.envs.table import EnvInfo, class_of
 from flockenv.envs.world import Step, World
 from flockenv.tasks import Task
 
-__all__ = ["SingleEnv", "one_learner"]
+__all__ = ["SingleEnv", "single_learner_task"]
 
 
-def one_learner(task_type: type[Task], parameters: dict[str, Any]) -> Task:
+def single_learner_task(task_type: type[Task], parameters: dict[str, Any]) -> Task:
     """Make the task of an environment with one learner; ValueError if the task has several."""
     task = build(task_type, parameters, limit="max_episode_steps", own=("render_mode",))
     if task.learners != 1:
@@ -65,7 +65,7 @@ class SingleEnv(gymnasium.Env[Rows, Rows]):
             cls.__doc__ = page(cls.info, task)
 
     def __init__(self, render_mode: str | None = None, **parameters: Any) -> None:
-        self.task = one_learner(self.task_type, {**self.fixed, **parameters})
+        self.task = single_learner_task(self.task_type, {**self.fixed, **parameters})
         self.metadata = {**self.metadata, "render_fps": render_fps(self.task)}
         self._screen = Screen(render_mode, render_fps(self.task))
         self.render_mode = render_mode
@@ -79,8 +79,8 @@ class SingleEnv(gymnasium.Env[Rows, Rows]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Begin an episode; return (O,) float32 and info with the seed. Raises ValueError for any option."""
-        seed = checked_seed(seed)
-        checked_options(options)
+        seed = check_seed(seed)
+        check_options(options)
         super().reset(seed=seed)
         if seed is None and not self.world.seeds:
             seed = int(self.np_random.integers(SEEDS))
@@ -94,14 +94,14 @@ class SingleEnv(gymnasium.Env[Rows, Rows]):
 
         `truncated` is always False here: the wrapper that gymnasium.make adds applies the time limit.
         """
-        begun(self._running, "step")
-        result = self.world.step(self._row(action))
+        require_episode(self._running, "step")
+        result = self.world.step(self._check_action(action))
         terminated = result.terminated.item()
         self._running = not terminated
         self._show()
         return result.observation[0, 0], result.reward.item(), terminated, False, self._info(result)
 
-    def _row(self, action: Rows) -> Rows:
+    def _check_action(self, action: Rows) -> Rows:
         row = np.asarray(action)
         if row.shape != self.action_space.shape:
             raise ValueError(f"action: shape {row.shape}, must be {self.action_space.shape}")
@@ -120,7 +120,7 @@ class SingleEnv(gymnasium.Env[Rows, Rows]):
         if self.render_mode is None:
             logger.warn("render() shows nothing without a render mode: gymnasium.make(..., render_mode='rgb_array')")
             return None
-        begun(bool(self.world.seeds), "render")
+        require_episode(bool(self.world.seeds), "render")
         return self._screen.show(self.world.snapshot())
 
     def close(self) -> None:

@@ -23,14 +23,14 @@ from flockenv.envs.common import (
     Rows,
     Screen,
     action_space,
-    begun,
     build,
-    checked_options,
-    checked_seed,
+    check_ends_together,
+    check_options,
+    check_seed,
     observation_space,
     render_fps,
+    require_episode,
     reward_keys,
-    together,
 )
 from flockenv.envs.table import EnvInfo, class_of
 from flockenv.envs.world import Step, World
@@ -82,8 +82,8 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         if infos not in INFOS:
             raise ValueError(f"infos: {infos!r} is unknown{nearest(str(infos), INFOS)}; allowed: {', '.join(INFOS)}")
         self.infos: Literal["steps", "ends"] = infos
-        self.task = together(build(self.task_type, {**self.fixed, **parameters}, "max_episode_steps", OWN))
-        self.autoreset_mode = _autoreset(autoreset_mode)
+        self.task = check_ends_together(build(self.task_type, {**self.fixed, **parameters}, "max_episode_steps", OWN))
+        self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self._screen = Screen(render_mode, render_fps(self.task), modes=("rgb_array",))
         self.render_mode = render_mode
         self.metadata = {
@@ -91,7 +91,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
             "render_fps": render_fps(self.task),
             "autoreset_mode": self.autoreset_mode,
         }
-        self.world = World(self.task, _worlds(num_envs, self.task.learners), time_limit=max_episode_steps)
+        self.world = World(self.task, _count_worlds(num_envs, self.task.learners), time_limit=max_episode_steps)
         self.num_envs = num_envs = self.world.worlds * self.task.learners
         self.single_observation_space = observation_space(self.task)
         self.single_action_space = action_space(self.task)
@@ -99,8 +99,8 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._reward_keys = reward_keys(self.task)
         self._seeds = np.full(self.world.worlds, NONE, np.int64)
-        self._nobody = np.zeros(self.world.worlds, np.bool_)
-        self._ended = self._nobody
+        self._no_worlds = np.zeros(self.world.worlds, np.bool_)
+        self._ended = self._no_worlds
         self._running = False
 
     def reset(
@@ -114,16 +114,16 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         seed: s for worlds s, s + 1, ...; or one per row, None for the next episode of its world's seed.
         """
         seeds = self._seed_column(seed)
-        mask = self._reset_mask(checked_options(options, ("reset_mask",)))
+        mask = self._reset_mask(check_options(options, ("reset_mask",)))
         super().reset(seed=int(seeds[0]) if seeds[0] != NONE else None)
         if ((seeds == NONE) & (self._seeds == NONE)).any():
             drawn = self.np_random.integers(SEEDS - len(seeds)) + np.arange(len(seeds))
             seeds = np.where(seeds == NONE, drawn, seeds)
         observation = self._begin(mask, seeds)
         self._running = True
-        return observation.reshape(self.num_envs, -1), self._begun(mask)
+        return observation.reshape(self.num_envs, -1), self._reset_infos(mask)
 
-    def _rows(self, column: NDArray[Any]) -> NDArray[Any]:
+    def _repeat_rows(self, column: NDArray[Any]) -> NDArray[Any]:
         """Return the values of worlds, (B, ...), repeated for each of their rows; always a copy."""
         return np.repeat(column, self.task.learners, axis=0)
 
@@ -133,13 +133,13 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         if seed is None:
             return np.full(worlds, NONE, np.int64)
         if not isinstance(seed, list | tuple):
-            first = checked_seed(seed) or 0
-            checked_seed(first + worlds - 1)
+            first = check_seed(seed) or 0
+            check_seed(first + worlds - 1)
             return np.arange(first, first + worlds)
-        given = [checked_seed(s) for s in seed]
-        if len(given) != self.num_envs:
-            raise ValueError(f"seed: {len(given)} seeds for {self.num_envs} rows")
-        return self._one_per_world("seed", np.array([NONE if s is None else s for s in given], np.int64))
+        seeds = [check_seed(s) for s in seed]
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"seed: {len(seeds)} seeds for {self.num_envs} rows")
+        return self._one_per_world("seed", np.array([NONE if s is None else s for s in seeds], np.int64))
 
     def _reset_mask(self, options: Mapping[str, Any]) -> Mask:
         """Return the worlds to reset, (B,) bool."""
@@ -157,13 +157,13 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
 
     def _one_per_world(self, what: str, column: NDArray[Any]) -> NDArray[Any]:
         """Return the value of each world's first row; ValueError if another row of that world differs."""
-        several = column.reshape(self.world.worlds, self.task.learners)
-        differ = several != several[:, :1]
+        values = column.reshape(self.world.worlds, self.task.learners)
+        differ = values != values[:, :1]
         if differ.any():
             world, learner = (int(k) for k in np.argwhere(differ)[0])
             row = world * self.task.learners
             raise ValueError(f"{what}: rows {row} and {row + learner} are one world, number {world}, and must agree")
-        return several[:, 0]
+        return values[:, 0]
 
     def _begin(
         self, mask: Mask, seeds: NDArray[np.int64] | None = None, into: NDArray[np.float32] | None = None
@@ -186,9 +186,9 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         Raises ValueError on NaN (with the world) or another shape; ResetNeeded for a world that ended, if
         `autoreset_mode` is "Disabled".
         """
-        begun(self._running, "step")
-        resting = self._resting()
-        result = self.world.step(self._blocks(actions, resting), terms=self.infos)
+        require_episode(self._running, "step")
+        resting = self._worlds_to_reset()
+        result = self.world.step(self._actions_by_world(actions, resting), terms=self.infos)
         terminated, truncated = result.terminated, result.truncated
         if resting is not None:
             terminated[resting], truncated[resting], result.reward[resting] = False, False, 0.0
@@ -196,43 +196,43 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         same_step = self.autoreset_mode is AutoresetMode.SAME_STEP
         info = self._infos(result, self._ended if same_step else resting, final=same_step)
         observation, reward = result.observation.reshape(self.num_envs, -1), result.reward.reshape(-1)
-        late = self._rows(truncated) if truncated.any() else np.zeros(self.num_envs, np.bool_)
-        return observation, reward, terminated.reshape(-1), late, info
+        truncated_rows = self._repeat_rows(truncated) if truncated.any() else np.zeros(self.num_envs, np.bool_)
+        return observation, reward, terminated.reshape(-1), truncated_rows, info
 
-    def _infos(self, result: Step, anew: Mask | None, final: bool) -> Info:
-        """Return infos of all rows, or of those that ended; reset the worlds `anew`, in the result's observations.
+    def _infos(self, result: Step, to_reset: Mask | None, final: bool) -> Info:
+        """Return infos of all rows, or of those that ended; reset the worlds `to_reset`, in the result's observations.
 
         final: these worlds have just ended, so that their last observations and infos are entered first.
         """
         info: Info = {}
-        told, anew = self._told(), self._nobody if anew is None else anew
-        begin = bool(anew.any())
-        if not begin and not told.any():
+        reported, to_reset = self._reported_worlds(), self._no_worlds if to_reset is None else to_reset
+        resets = bool(to_reset.any())
+        if not resets and not reported.any():
             return info
         columns, lacks = self._columns(result)
-        mask = self._rows(anew)
-        if begin:
+        mask = self._repeat_rows(to_reset)
+        if resets:
             if final:
-                _put_final(info, result.observation[anew], columns, mask, lacks)
-            self._begin(anew, into=result.observation)
-            info |= self._begun(anew)
-        here = self._rows(told & ~anew)
-        _blank(columns, np.flatnonzero(~here))
-        _put(info, columns, here, lacks)
+                _enter_final(info, result.observation[to_reset], columns, mask, lacks)
+            self._begin(to_reset, into=result.observation)
+            info |= self._reset_infos(to_reset)
+        reported_rows = self._repeat_rows(reported & ~to_reset)
+        _clear_rows(columns, np.flatnonzero(~reported_rows))
+        _enter_columns(info, columns, reported_rows, lacks)
         return info
 
-    def _told(self) -> Mask:
+    def _reported_worlds(self) -> Mask:
         """Return the worlds that this step's infos report, (B,) bool."""
         return self._ended if self.infos == "ends" else np.ones(self.world.worlds, np.bool_)
 
-    def _begun(self, worlds: Mask) -> Info:
+    def _reset_infos(self, worlds: Mask) -> Info:
         """Return the infos of reset worlds: their seeds."""
         info: Info = {}
-        mask = self._rows(worlds)
-        _put(info, _only({"seed": self._rows(self._seeds)}, np.flatnonzero(mask)), mask)
+        mask = self._repeat_rows(worlds)
+        _enter_columns(info, _keep_rows({"seed": self._repeat_rows(self._seeds)}, np.flatnonzero(mask)), mask)
         return info
 
-    def _resting(self) -> Mask | None:
+    def _worlds_to_reset(self) -> Mask | None:
         """Return the worlds that this step resets, if any; ResetNeeded if one has ended and autoreset is disabled."""
         if self.autoreset_mode is AutoresetMode.NEXT_STEP and self._ended.any():
             return self._ended
@@ -242,24 +242,24 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
             )
         return None
 
-    def _blocks(self, actions: Rows, resting: Mask | None) -> Rows:
+    def _actions_by_world(self, actions: Rows, resting: Mask | None) -> Rows:
         """Return the actions by world and learner, (B, L, A), with zeros for worlds that this step resets."""
-        given = np.asarray(actions)
-        if given.shape != self.action_space.shape:
-            raise ValueError(f"actions: shape {given.shape}, must be {self.action_space.shape}, a row per learner")
-        blocks = given.reshape(self.world.worlds, self.task.learners, -1)
+        array = np.asarray(actions)
+        if array.shape != self.action_space.shape:
+            raise ValueError(f"actions: shape {array.shape}, must be {self.action_space.shape}, a row per learner")
+        blocks = array.reshape(self.world.worlds, self.task.learners, -1)
         return blocks if resting is None else np.where(resting[:, None, None], 0.0, blocks)
 
     def _columns(self, result: Step) -> tuple[Info, dict[str, Mask]]:
         """Return infos as columns over rows, and by column the rows that have no value yet (0 instead)."""
         columns: Info = {key: result.terms[..., k].reshape(-1) for k, key in enumerate(self._reward_keys)}
-        columns["is_success"] = self._rows(result.success)
+        columns["is_success"] = self._repeat_rows(result.success)
         lacks = {}
         for name, column in self.world.measure().items():
             lacking = np.isnan(column)
             if lacking.any():
-                column[lacking], lacks[name] = 0.0, self._rows(lacking)
-            columns[name] = self._rows(column)
+                column[lacking], lacks[name] = 0.0, self._repeat_rows(lacking)
+            columns[name] = self._repeat_rows(column)
         return columns, lacks
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
@@ -267,7 +267,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         if self.render_mode is None:
             logger.warn("render() shows nothing without a render mode: make_vec(..., render_mode='rgb_array')")
             return None
-        begun(self._running, "render")
+        require_episode(self._running, "render")
         frames = (self._screen.show(self.world.snapshot(k)) for k in range(self.world.worlds))
         return tuple(frame for frame in frames if frame is not None)
 
@@ -276,7 +276,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         self._running = False
 
 
-def _autoreset(mode: str | AutoresetMode) -> AutoresetMode:
+def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
     try:
         return AutoresetMode(mode)
     except ValueError:
@@ -286,7 +286,7 @@ def _autoreset(mode: str | AutoresetMode) -> AutoresetMode:
         ) from None
 
 
-def _worlds(rows: Any, learners: int) -> int:
+def _count_worlds(rows: Any, learners: int) -> int:
     """Return the number of worlds with this many rows; ValueError unless `learners` divides it."""
     if learners == 1 or not isinstance(rows, int | np.integer):
         return rows  # type: ignore[no-any-return]  # World checks the number of worlds
@@ -304,7 +304,9 @@ def _worlds(rows: Any, learners: int) -> int:
 # Columns of a result are the step's own arrays, so that they need no copy.
 
 
-def _put(info: Info, columns: Mapping[str, Any], mask: Mask, lacks: Mapping[str, Mask] = MappingProxyType({})) -> None:
+def _enter_columns(
+    info: Info, columns: Mapping[str, Any], mask: Mask, lacks: Mapping[str, Mask] = MappingProxyType({})
+) -> None:
     """Enter columns, with the mask of their rows; a column without rows is left out."""
     for name, column in columns.items():
         here = mask & ~lacks[name] if name in lacks else mask.copy()
@@ -312,18 +314,18 @@ def _put(info: Info, columns: Mapping[str, Any], mask: Mask, lacks: Mapping[str,
             info[name], info[f"_{name}"] = column, here
 
 
-def _put_final(info: Info, seen: NDArray[np.float32], columns: Info, mask: Mask, lacks: Mapping[str, Mask]) -> None:
+def _enter_final(info: Info, seen: NDArray[np.float32], columns: Info, mask: Mask, lacks: Mapping[str, Mask]) -> None:
     """Enter the ends of rows: their last observations as objects, their infos as columns."""
     rows = np.flatnonzero(mask)
     last = np.full(len(mask), None, object)
     last[rows] = np.fromiter(seen.reshape(len(rows), -1), object, len(rows))
     final: Info = {}
-    _put(final, _only(columns, rows), mask, lacks)
+    _enter_columns(final, _keep_rows(columns, rows), mask, lacks)
     info["final_obs"], info["_final_obs"] = last, mask.copy()
     info["final_info"], info["_final_info"] = final, mask.copy()
 
 
-def _only(columns: Mapping[str, Any], rows: NDArray[np.intp]) -> Info:
+def _keep_rows(columns: Mapping[str, Any], rows: NDArray[np.intp]) -> Info:
     """Return new columns that are zero except in these rows."""
     new = {name: np.zeros_like(column) for name, column in columns.items()}
     for name, column in new.items():
@@ -331,7 +333,7 @@ def _only(columns: Mapping[str, Any], rows: NDArray[np.intp]) -> Info:
     return new
 
 
-def _blank(columns: Mapping[str, Any], rows: NDArray[np.intp]) -> None:
+def _clear_rows(columns: Mapping[str, Any], rows: NDArray[np.intp]) -> None:
     """Write zeros into these rows."""
     for column in columns.values():
         column[rows] = 0

@@ -323,8 +323,8 @@ class World:
     ) -> tuple[int, int]:  # fmt: skip
         """Take a decision in all worlds, or begin those in the mask, by a thread pool if `busy` worlds are enough.
 
-        all_worlds: observe all worlds in a reset, and write the terms of all in a decision. Returns (world, agent) of the
-        first agent that is not finite, or (-1, -1).
+        all_worlds: observe all worlds in a reset, and write the terms of all in a decision. Returns (world, agent) of
+        the first agent that is not finite, or (-1, -1).
         """
         threads, work = min(usable_threads(), busy), busy * self.agents * self.task.substeps
         arguments = acting, mask, all_worlds, acting, 0, self.worlds, actions, limit, results

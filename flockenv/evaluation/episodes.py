@@ -63,8 +63,8 @@ def worlds_for(purpose: Purpose, seed: int = 0, worlds: int = 1) -> int:
     """
     if purpose not in _BLOCKS:
         raise ValueError(f"purpose: {purpose!r}, must be one of {', '.join(_BLOCKS)}")
-    _whole("seed", seed, 0, SEEDS - 1)
-    _whole("worlds", worlds, 1, WORLDS_PER_SEED)
+    _check_integer("seed", seed, 0, SEEDS - 1)
+    _check_integer("worlds", worlds, 1, WORLDS_PER_SEED)
     return _BLOCKS[purpose] + seed * WORLDS_PER_SEED
 
 
@@ -150,10 +150,10 @@ def rollout(
     Raises:
         ValueError: a bad argument, actions of a wrong shape or not finite, or a reward that is not finite.
     """
-    _whole("worlds", worlds, 1, WORLDS_PER_SEED)
-    _whole("seed", seed, 0, 2**63 - 1 - worlds)
+    _check_integer("worlds", worlds, 1, WORLDS_PER_SEED)
+    _check_integer("seed", seed, 0, 2**63 - 1 - worlds)
     if record is not None:
-        _whole("record", record, 0, worlds - 1)
+        _check_integer("record", record, 0, worlds - 1)
     world = make_world(task, worlds, task.horizon)
     observation = world.reset(seed)
     latency = _latency(policy, observation[0, :1], deterministic)  # first: what compiles on first use does so here
@@ -188,12 +188,12 @@ def _play(
         observation = step.observation
         if progress is not None:
             progress(number, task.horizon)
-        if ledger.closed:
+        if ledger.is_complete:
             return
     raise RuntimeError(f"task {task.name!r}: world {int(np.argmax(ledger.running))} continues after its time limit")
 
 
-class _staying:  # noqa: N801  # a class, not a generator, which would cost time inside the timed call
+class _exit_as_error:  # noqa: N801  # a class, not a generator, which would cost time inside the timed call
     """Context manager that turns a policy's SystemExit into a ValueError."""
 
     def __enter__(self) -> None:
@@ -216,10 +216,10 @@ class _Pilot:
         """Return the actions (B, L, A) for observations (B, L, O)."""
         rows = observation.reshape(-1, observation.shape[-1])
         starts = np.full(len(rows), not self._times)
-        began = perf_counter()
-        with _staying():
+        start = perf_counter()
+        with _exit_as_error():
             action, self._state = self._policy.predict(rows, self._state, starts, self._deterministic)
-        self._times.append(1e6 * (perf_counter() - began) / len(rows))
+        self._times.append(1e6 * (perf_counter() - start) / len(rows))
         action = np.asarray(action)
         if action.shape != (len(rows), action_size):
             raise ValueError(f"policy: actions of shape {action.shape}, must be {(len(rows), action_size)}")
@@ -241,7 +241,7 @@ class _Ledger:
         self.running = np.ones(worlds, np.bool_)
 
     @property
-    def closed(self) -> bool:
+    def is_complete(self) -> bool:
         return not self.running.any()
 
     def enter(self, step: Step, measure: Callable[[], Mapping[str, Floats]]) -> NDArray[np.bool_]:
@@ -291,10 +291,10 @@ def _latency(policy: Policy, row: NDArray[np.float32], deterministic: bool) -> f
     """Return the median time of a decision for one agent, as on a single robot, in us."""
     times = []
     for _ in range(LATENCY_CALLS):
-        began = perf_counter()
-        with _staying():
+        start = perf_counter()
+        with _exit_as_error():
             policy.predict(row, None, np.ones(1, np.bool_), deterministic)
-        times.append(perf_counter() - began)
+        times.append(perf_counter() - start)
     return 1e6 * float(np.median(times))
 
 
@@ -342,24 +342,24 @@ def bootstrap(
     if resamples < 1:
         raise ValueError(f"resamples = {resamples}: an interval needs at least one")
     estimate = _STATISTICS[statistic]
-    drawn = np.concatenate([estimate(x[worlds]) for worlds in _resampled(len(x), resamples, seed)])
+    drawn = np.concatenate([estimate(x[worlds]) for worlds in _resample(len(x), resamples, seed)])
     low, high = np.quantile(drawn, (0.025, 0.975))
     return Interval(float(estimate(x[None])[0]), float(low), float(high))
 
 
-def _resampled(worlds: int, resamples: int, seed: int) -> Iterator[NDArray[np.int64]]:
+def _resample(worlds: int, resamples: int, seed: int) -> Iterator[NDArray[np.int64]]:
     """Yield the indices of the worlds drawn, (n, worlds), n resamples at a time; they depend only on the arguments."""
-    some = max(1, DRAWN_AT_ONCE // worlds)
-    if resamples <= some:
-        yield _drawn(worlds, resamples, seed)
+    at_once = max(1, DRAWN_AT_ONCE // worlds)
+    if resamples <= at_once:
+        yield _draw_worlds(worlds, resamples, seed)
         return
     generator = np.random.default_rng(seed)
-    for done in range(0, resamples, some):
-        yield generator.integers(worlds, size=(min(some, resamples - done), worlds))
+    for done in range(0, resamples, at_once):
+        yield generator.integers(worlds, size=(min(at_once, resamples - done), worlds))
 
 
 @functools.lru_cache(maxsize=1)  # all players of a task use the same resamples
-def _drawn(worlds: int, resamples: int, seed: int) -> NDArray[np.int64]:
+def _draw_worlds(worlds: int, resamples: int, seed: int) -> NDArray[np.int64]:
     drawn = np.random.default_rng(seed).integers(worlds, size=(resamples, worlds))
     drawn.flags.writeable = False
     return drawn
@@ -395,11 +395,11 @@ def summarise(episodes: Episodes, resamples: int = RESAMPLES, seed: int = 0) -> 
         iqm=bootstrap(episodes.returns, "iqm", resamples, seed),
         mean=bootstrap(episodes.returns, "mean", resamples, seed),
         success=proportion(episodes.success),
-        metrics={name: _applicable(values) for name, values in episodes.metrics.items()},
+        metrics={name: _finite_mean(values) for name, values in episodes.metrics.items()},
     )
 
 
-def _applicable(values: Floats) -> tuple[float, int]:
+def _finite_mean(values: Floats) -> tuple[float, int]:
     finite = values[np.isfinite(values)]
     return (float(finite.mean()) if len(finite) else math.nan), len(finite)
 
@@ -441,6 +441,6 @@ def compare(first: Episodes, second: Episodes, resamples: int = RESAMPLES, seed:
     )
 
 
-def _whole(name: str, value: object, least: int, most: int) -> None:
+def _check_integer(name: str, value: object, least: int, most: int) -> None:
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not least <= value <= most:
         raise ValueError(f"{name}: {value!r}, must be an integer from {least} to {most}")

@@ -70,15 +70,15 @@ def draw_chart(columns: Sequence[Column], title: str, note: str = "") -> Figure:
 
     wide = -(-len(columns) // -(-len(columns) // ABREAST))  # bands of equal width, except the last
     bands = [columns[k : k + wide] for k in range(0, len(columns), wide)]
-    heights = [h for band in bands for h in _heights(band)]
+    heights = [h for band in bands for h in _plot_heights(band)]
     size = (1.2 + 4.2 * wide, sum(heights) + 0.85 * len(heights) + 1.0)
     figure = Figure(figsize=size, facecolor="white", layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08))
     FigureCanvasAgg(figure)
     grid = figure.subplots(len(heights), wide, squeeze=False, height_ratios=heights)
-    colours = _colours([row.name for column in columns for row in column.rows])
+    colours = _choose_colours([row.name for column in columns for row in column.rows])
     first = 0
     for band in bands:
-        rows = grid[first : first + len(_heights(band))]
+        rows = grid[first : first + len(_plot_heights(band))]
         for k in range(wide):
             _draw_column(list(rows[:, k]), band[k] if k < len(band) else None, colours)
         first += len(rows)
@@ -87,7 +87,7 @@ def draw_chart(columns: Sequence[Column], title: str, note: str = "") -> Figure:
     return figure
 
 
-def _heights(band: Sequence[Column]) -> list[float]:
+def _plot_heights(band: Sequence[Column]) -> list[float]:
     """Return the heights of the plots of tasks side by side, inches: scores, success, differences if any."""
     players, pairs = max(len(c.rows) for c in band), max(len(c.pairs) for c in band)
     return [0.62 * players + 0.5, 0.34 * players + 0.4] + [0.34 * pairs + 0.4] * (pairs > 0)
@@ -100,22 +100,22 @@ def _draw_column(plots: Sequence[Axes], column: Column | None, colours: Mapping[
             axes.set_axis_off()
     if column is None:
         return
-    _scores(plots[0], column, colours)
-    _success(plots[1], column, colours)
+    _draw_scores(plots[0], column, colours)
+    _draw_success(plots[1], column, colours)
     if len(plots) > 2:
-        _differences(plots[2], column)
+        _draw_differences(plots[2], column)
     for axes in plots:
-        _plain(axes)
+        _simplify_frame(axes)
 
 
-def _colours(names: Sequence[str]) -> dict[str, str]:
+def _choose_colours(names: Sequence[str]) -> dict[str, str]:
     names = list(dict.fromkeys(names))
     free = [c for c in COLOURS if c not in {FIXED.get(name) for name in names}] or list(COLOURS)
     others = [name for name in names if name not in FIXED]
     return {**FIXED, **{name: free[k % len(free)] for k, name in enumerate(others)}}
 
 
-def _scores(axes: Axes, column: Column, colours: Mapping[str, str]) -> None:
+def _draw_scores(axes: Axes, column: Column, colours: Mapping[str, str]) -> None:
     """Draw each world as a faint dot, and the interval above them."""
     axes.set_title(column.title, loc="left", fontsize=12.5, fontweight="bold", color=INK, pad=10)
     axes.set_xlabel("return: interquartile mean, 95 % (dots: worlds)")
@@ -123,8 +123,8 @@ def _scores(axes: Axes, column: Column, colours: Mapping[str, str]) -> None:
         # fixed heights instead of random ones: dots of similar scores do not overlap, and the file is reproducible
         heights = y + 0.30 * (np.argsort(np.argsort(row.scores)) * 0.618034 % 1.0 * 2 - 1)
         axes.scatter(row.scores, heights, s=7, color=colours[row.name], alpha=0.22, linewidths=0, zorder=2)
-        _interval(axes, y, row.score, colours[row.name], f"{row.score.value:.3g}")
-    _rows(axes, [row.name for row in column.rows])
+        _draw_interval(axes, y, row.score, colours[row.name], f"{row.score.value:.3g}")
+    _label_rows(axes, [row.name for row in column.rows])
     scores = np.concatenate([row.scores for row in column.rows])
     low, high = np.quantile(scores, (0.005, 0.995))  # one outlier must not compress all intervals
     low, high = min([low, *(r.score.low for r in column.rows)]), max([high, *(r.score.high for r in column.rows)])
@@ -132,27 +132,27 @@ def _scores(axes: Axes, column: Column, colours: Mapping[str, str]) -> None:
     axes.set_xlim(low - margin, high + margin)
 
 
-def _success(axes: Axes, column: Column, colours: Mapping[str, str]) -> None:
+def _draw_success(axes: Axes, column: Column, colours: Mapping[str, str]) -> None:
     axes.set_xlabel("success rate, 95 %")
     for y, row in enumerate(column.rows):
         axes.barh(y, row.success.value, height=0.56, color=colours[row.name], alpha=0.25, zorder=2)
-        _interval(axes, y, row.success, colours[row.name], f"{100 * row.success.value:.0f} %")
-    _rows(axes, [row.name for row in column.rows])
+        _draw_interval(axes, y, row.success, colours[row.name], f"{100 * row.success.value:.0f} %")
+    _label_rows(axes, [row.name for row in column.rows])
     axes.set_xlim(0.0, 1.19)
     axes.set_xticks([0, 0.25, 0.5, 0.75, 1], ["0", "25", "50", "75", "100 %"])
 
 
-def _differences(axes: Axes, column: Column) -> None:
+def _draw_differences(axes: Axes, column: Column) -> None:
     axes.set_xlabel("difference in the same world: mean, 95 %")
     axes.axvline(0.0, color=FAINT, linewidth=1, linestyle=(0, (4, 3)), zorder=1)
     for y, interval in enumerate(column.pairs.values()):
         clear = interval.low > 0 or interval.high < 0
-        _interval(axes, y, interval, INK if clear else FAINT, f"{interval.value:+.3g}")
-    _rows(axes, list(column.pairs))
+        _draw_interval(axes, y, interval, INK if clear else FAINT, f"{interval.value:+.3g}")
+    _label_rows(axes, list(column.pairs))
     axes.margins(x=0.12)
 
 
-def _interval(axes: Axes, y: float, interval: Interval, colour: str, text: str) -> None:
+def _draw_interval(axes: Axes, y: float, interval: Interval, colour: str, text: str) -> None:
     """Draw a bar from low to high, a dot at the value, and the number above it."""
     from matplotlib.patheffects import withStroke
 
@@ -167,12 +167,12 @@ def _interval(axes: Axes, y: float, interval: Interval, colour: str, text: str) 
     )  # fmt: skip
 
 
-def _rows(axes: Axes, names: Sequence[str]) -> None:
+def _label_rows(axes: Axes, names: Sequence[str]) -> None:
     axes.set_yticks(range(len(names)), names, parse_math=False)
     axes.set_ylim(max(len(names), 1) - 0.45, -0.62)
 
 
-def _plain(axes: Axes) -> None:
+def _simplify_frame(axes: Axes) -> None:
     """Remove the parts of the frame that carry no information."""
     for side in ("top", "right", "left"):
         axes.spines[side].set_visible(False)

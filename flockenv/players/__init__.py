@@ -71,10 +71,10 @@ def named_player(name: str, task: Task, seed: int = 0) -> Policy:
 
     if name == "random":
         return RandomPolicy(task.action_layout.size, seed)
-    return _trained(task, seed) if name == "ppo" else player(task, name)
+    return _load_trained(task, seed) if name == "ppo" else player(task, name)
 
 
-def _trained(task: Task, seed: int) -> Policy:
+def _load_trained(task: Task, seed: int) -> Policy:
     from flockenv.players.policy import MlpPolicy
 
     path = WEIGHTS / f"{task.name}.safetensors"

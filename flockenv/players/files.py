@@ -36,7 +36,7 @@ __all__ = ["SUFFIXES", "FilePlayer", "PlayerError", "load_file"]
 
 SUFFIXES = (".safetensors", ".py", ".zip")
 
-WANTED = (
+EXPECTED = (
     "a player file has a function player(task) or a class Player, whose player has predict(observation, state, "
     "episode_start, deterministic) or predict(observation), or such a function predict"
 )
@@ -69,22 +69,24 @@ def _load_zip(path: Path) -> Policy:
 
 def _load_python(path: Path, task: Task) -> FilePlayer:
     """Execute a player file and return its player."""
-    module = _guarded(path, "while loading it", _execute, path)
-    kinds = [name for name in ("player", "Player", "predict") if hasattr(module, name)]
-    if not kinds:
-        raise PlayerError(f"player {printable_path(path)}: offers none of player, Player, predict; {WANTED}")
-    kind, offer = kinds[0], getattr(module, kinds[0])
-    if not callable(offer):
-        raise PlayerError(f"player {printable_path(path)}: {kind} is {_article(offer)}, not a function; {WANTED}")
+    module = _call_guarded(path, "while loading it", _execute, path)
+    found = [name for name in ("player", "Player", "predict") if hasattr(module, name)]
+    if not found:
+        raise PlayerError(f"player {printable_path(path)}: offers none of player, Player, predict; {EXPECTED}")
+    kind, offered = found[0], getattr(module, found[0])
+    if not callable(offered):
+        raise PlayerError(f"player {printable_path(path)}: {kind} is {_describe_type(offered)}, not a function; {EXPECTED}")
     if kind == "predict":
-        return FilePlayer(path, kind, offer, task.action_layout.size)
-    arguments = (task,) if kind == "player" or _takes(offer, 1) else ()
-    if not _takes(offer, len(arguments)):
-        raise PlayerError(f"player {printable_path(path)}: {kind} cannot be called with {_listed(arguments)}; {WANTED}")
-    made = _guarded(path, f"in {kind}", offer, *arguments)
-    if isinstance(made, type) or not callable(getattr(made, "predict", None)):
-        raise PlayerError(f"player {printable_path(path)}: {kind} made {_article(made)} without a predict(); {WANTED}")
-    return FilePlayer(path, f"{type(made).__name__}.predict", made.predict, task.action_layout.size)
+        return FilePlayer(path, kind, offered, task.action_layout.size)
+    arguments = (task,) if kind == "player" or _accepts(offered, 1) else ()
+    if not _accepts(offered, len(arguments)):
+        given = _describe_arguments(arguments)
+        raise PlayerError(f"player {printable_path(path)}: {kind} cannot be called with {given}; {EXPECTED}")
+    player = _call_guarded(path, f"in {kind}", offered, *arguments)
+    if isinstance(player, type) or not callable(getattr(player, "predict", None)):
+        what = _describe_type(player)
+        raise PlayerError(f"player {printable_path(path)}: {kind} made {what} without a predict(); {EXPECTED}")
+    return FilePlayer(path, f"{type(player).__name__}.predict", player.predict, task.action_layout.size)
 
 
 def _execute(path: Path) -> Any:
@@ -111,12 +113,12 @@ class FilePlayer:
     """
 
     def __init__(self, path: Path, name: str, function: Callable[..., Any], action_size: int) -> None:
-        self.path, self._name, self._function, self._whole = path, name, function, _takes(function, 4)
+        self.path, self._name, self._function, self._takes_all = path, name, function, _accepts(function, 4)
         self._action_size = action_size
-        if not self._whole and not _takes(function, 1):
+        if not self._takes_all and not _accepts(function, 1):
             raise PlayerError(
                 f"player {printable_path(path)}: {name} takes neither four arguments nor the observation alone; "
-                f"{WANTED}"
+                f"{EXPECTED}"
             )
 
     def predict(
@@ -127,31 +129,31 @@ class FilePlayer:
         deterministic: bool = False,
     ) -> tuple[NDArray[Any], State | None]:
         """Return the file's actions for observations, (R, O) -> (R, A), and its state."""
-        arguments = (observation, state, episode_start, deterministic) if self._whole else (observation,)
-        answer = _guarded(self.path, f"in {self._name}", self._answer, state, arguments)
+        arguments = (observation, state, episode_start, deterministic) if self._takes_all else (observation,)
+        answer = _call_guarded(self.path, f"in {self._name}", self._call_function, state, arguments)
         return answer[0], answer[1]
 
-    def _answer(self, state: State | None, arguments: tuple[Any, ...]) -> tuple[NDArray[Any], State | None]:
+    def _call_function(self, state: State | None, arguments: tuple[Any, ...]) -> tuple[NDArray[Any], State | None]:
         answer = self._function(*arguments)
         if isinstance(answer, tuple) and len(answer) != 2:
             raise TypeError(f"returned {len(answer)} values, must be actions, or (actions, state)")
         actions, state = answer if isinstance(answer, tuple) else (np.asarray(answer, np.float32), state)
-        actions, wanted = np.asarray(actions), (*np.shape(arguments[0])[:-1], self._action_size)
-        if actions.shape != wanted:
-            raise ValueError(f"actions of shape {actions.shape}, must be {wanted}")
+        actions, expected = np.asarray(actions), (*np.shape(arguments[0])[:-1], self._action_size)
+        if actions.shape != expected:
+            raise ValueError(f"actions of shape {actions.shape}, must be {expected}")
         if not np.isfinite(actions).all():
             raise ValueError("an action is not finite")
         return actions, state
 
 
-def _guarded(path: Path, where: str, function: Callable[..., Any], *arguments: Any) -> Any:
+def _call_guarded(path: Path, where: str, function: Callable[..., Any], *arguments: Any) -> Any:
     """Call code of a player file; an exception becomes one line that names the file."""
     try:
         return function(*arguments)
     except (Exception, SystemExit) as error:
-        said = f"{type(error).__name__} {where}{_line_in(path, error)}"
+        description = f"{type(error).__name__} {where}{_line_in(path, error)}"
         text = " ".join(str(error).split()) if error.args != (None,) else ""  # exit() without a code
-        raise PlayerError(f"player {printable_path(path)}: {said}{': ' + text if text else ''}") from error
+        raise PlayerError(f"player {printable_path(path)}: {description}{': ' + text if text else ''}") from error
 
 
 def _line_in(path: Path, error: BaseException) -> str:
@@ -161,7 +163,7 @@ def _line_in(path: Path, error: BaseException) -> str:
     return f", line {own[-1]}" if own else ""
 
 
-def _takes(function: Callable[..., Any], count: int) -> bool:
+def _accepts(function: Callable[..., Any], count: int) -> bool:
     """Return True if a function accepts `count` arguments; also for built-in ones without a signature."""
     try:
         signature = inspect.signature(function)
@@ -174,9 +176,9 @@ def _takes(function: Callable[..., Any], count: int) -> bool:
     return True
 
 
-def _article(value: object) -> str:
+def _describe_type(value: object) -> str:
     return f"the class {value.__name__}" if isinstance(value, type) else f"an object of type {type(value).__name__}"
 
 
-def _listed(arguments: tuple[Any, ...]) -> str:
+def _describe_arguments(arguments: tuple[Any, ...]) -> str:
     return "the task" if arguments else "the task, nor without arguments"

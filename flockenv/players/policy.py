@@ -77,7 +77,7 @@ class RandomPolicy:
         if action_size < 1:
             raise ValueError(f"action_size: {action_size!r}, must be at least 1")
         self.action_size = action_size
-        self.seed, self._generator = _seeded(seed)
+        self.seed, self._generator = _new_generator(seed)
 
     def __repr__(self) -> str:
         return f"RandomPolicy({self.action_size}, seed={self.seed})"
@@ -115,13 +115,13 @@ class MlpPolicy:
 
     def __init__(self, tensors: Mapping[str, NDArray[Any]], card: Mapping[str, Any], seed: int | None = 0) -> None:
         self.card = dict(card)
-        self._activation = ACTIVATIONS[_known(card.get("activation"), ACTIVATIONS, "activation")]
+        self._activation = ACTIVATIONS[_check_known(card.get("activation"), ACTIVATIONS, "activation")]
         self._hidden, self._head = _layers(tensors)
         self._deviation = np.exp(tensors["log_std"])
         self._block = max(1, ONE_THREAD // max(weight.size for weight, _ in [*self._hidden, self._head]))
         self.observation_size = int([*self._hidden, self._head][0][0].shape[0])
         self.action_size = int(self._head[1].shape[0])
-        self.seed, self._generator = _seeded(seed)
+        self.seed, self._generator = _new_generator(seed)
         self.differences: tuple[str, ...] = ()
         """Differences between the task that it plays and the one that it was trained on, a phrase each."""
 
@@ -224,7 +224,8 @@ def save_policy(path: str | os.PathLike[str], tensors: Mapping[str, NDArray[Any]
 def _read_card(path: Path) -> dict[str, Any]:
     """Read a card strictly: no duplicate keys, no NaN, and of the supported version."""
     try:
-        card = json.loads(_read(path, LARGEST_CARD), object_pairs_hook=_unique, parse_constant=_no_constant)
+        text = _read_file(path, LARGEST_CARD)
+        card = json.loads(text, object_pairs_hook=_check_unique, parse_constant=_reject_constant)
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise ValueError(f"the card {path.name!r} is not JSON: {error}") from None
     if not isinstance(card, dict):
@@ -241,7 +242,7 @@ def _read_tensors(path: Path, card: Mapping[str, Any]) -> dict[str, NDArray[Any]
     from safetensors import SafetensorError
     from safetensors.numpy import load
 
-    data = _read(path, LARGEST_WEIGHTS)
+    data = _read_file(path, LARGEST_WEIGHTS)
     if hashlib.sha256(data).hexdigest() != card["sha256"]:
         raise ValueError(f"the weights ({len(data)} bytes) are not those of the card: their SHA-256 differs")
     try:
@@ -250,7 +251,7 @@ def _read_tensors(path: Path, card: Mapping[str, Any]) -> dict[str, NDArray[Any]
         raise ValueError(f"not a safetensors file: {error}") from None
 
 
-def _read(path: Path, largest: int) -> bytes:
+def _read_file(path: Path, largest: int) -> bytes:
     try:
         if path.stat().st_size > largest:
             raise ValueError(f"{path.name!r} has {path.stat().st_size} bytes, at most {largest} are read")
@@ -288,24 +289,25 @@ def _differences(card: Mapping[str, Any], task: Task) -> tuple[str, ...]:
     """Return the differences of a card and a task, a phrase each; raise ValueError if the slots do not match."""
     if "observation" not in card:
         return _differences_of_digest(card, task)
-    found = []
+    differences = []
     for kind, layout in (("observation", task.layout), ("action", task.action_layout)):
         for trained, here in zip_longest(_slots_of(card, kind), _slots(layout)):
             if trained is None or here is None or any(trained[key] != here[key] for key in ("name", "shape", "unit")):
-                raise ValueError(f"made for {kind} {_slot(trained)}, task {task.name!r} has {_slot(here)} there")
-            found += [
+                texts = _describe_slot(trained), _describe_slot(here)
+                raise ValueError(f"made for {kind} {texts[0]}, task {task.name!r} has {texts[1]} there")
+            differences += [
                 f"{kind} {here['name']} has {key} {here[key]:g} {here['unit']}, trained with {trained[key]:g}"
                 for key in ("scale", "low")
                 if trained[key] != here[key]
             ]
     if card.get("task") != task.name:
-        return (f"plays task {task.name!r}, trained on {card.get('task')!r}", *found)
+        return (f"plays task {task.name!r}, trained on {card.get('task')!r}", *differences)
     now = task.model_dump(mode="json")
     trained_on = card["arguments"] if isinstance(card.get("arguments"), dict) else {}
-    usual = type(task).model_construct().model_dump(mode="json")
-    trained = {key: trained_on.get(key, usual.get(key)) for key in now}  # a card may be older than an argument
+    defaults = type(task).model_construct().model_dump(mode="json")
+    trained = {key: trained_on.get(key, defaults.get(key)) for key in now}  # a card may be older than an argument
     changed = [key for key in now if trained[key] != now[key]]
-    return (*(f"{key} = {printable(now[key])}, trained with {printable(trained[key])}" for key in changed), *found)
+    return (*(f"{key} = {printable(now[key])}, trained with {printable(trained[key])}" for key in changed), *differences)
 
 
 def _differences_of_digest(card: Mapping[str, Any], task: Task) -> tuple[str, ...]:
@@ -337,7 +339,7 @@ def _slots_of(card: Mapping[str, Any], kind: str) -> list[dict[str, Any]]:
     return slots
 
 
-def _slot(slot: Mapping[str, Any] | None) -> str:
+def _describe_slot(slot: Mapping[str, Any] | None) -> str:
     if slot is None:
         return "nothing"
     return f"{printable(slot['name'])} of shape {printable(tuple(slot['shape']))} in {printable(slot['unit'])}"
@@ -347,10 +349,10 @@ def _layers(tensors: Mapping[str, NDArray[Any]]) -> tuple[list[Layer], Layer]:
     """Check every tensor and return the layers as (in, out) weights and biases: the hidden ones, and the last."""
     depth = sum(name.startswith("policy.") and name.endswith(".weight") for name in tensors)
     names = [f"policy.{i}" for i in range(depth)] + ["action"]
-    wanted = {f"{name}.{part}" for name in names for part in ("weight", "bias")} | {"log_std"}
-    if wanted != tensors.keys():
-        name = sorted(wanted ^ tensors.keys())[0]
-        raise ValueError(f"tensor {name!r} is {'missing' if name in wanted else 'not one of an MLP actor'}")
+    expected = {f"{name}.{part}" for name in names for part in ("weight", "bias")} | {"log_std"}
+    if expected != tensors.keys():
+        name = sorted(expected ^ tensors.keys())[0]
+        raise ValueError(f"tensor {name!r} is {'missing' if name in expected else 'not one of an MLP actor'}")
     for name, tensor in tensors.items():
         if tensor.dtype != np.float32:
             raise ValueError(f"tensor {name!r} is {tensor.dtype}, must be float32")
@@ -360,40 +362,40 @@ def _layers(tensors: Mapping[str, NDArray[Any]]) -> tuple[list[Layer], Layer]:
     for name in names:
         weight, bias = tensors[f"{name}.weight"], tensors[f"{name}.bias"]
         inputs = layers[-1][1].shape[0] if layers else weight.shape[-1] if weight.ndim else 0
-        _expect(f"{name}.weight", weight, (weight.shape[0] if weight.ndim else 0, inputs))
-        _expect(f"{name}.bias", bias, weight.shape[:1])
+        _check_shape(f"{name}.weight", weight, (weight.shape[0] if weight.ndim else 0, inputs))
+        _check_shape(f"{name}.bias", bias, weight.shape[:1])
         layers.append((np.ascontiguousarray(weight.T), bias))
-    _expect("log_std", tensors["log_std"], layers[-1][1].shape)
+    _check_shape("log_std", tensors["log_std"], layers[-1][1].shape)
     return layers[:-1], layers[-1]
 
 
-def _expect(name: str, tensor: NDArray[Any], shape: tuple[int, ...]) -> None:
+def _check_shape(name: str, tensor: NDArray[Any], shape: tuple[int, ...]) -> None:
     if tensor.shape != shape or 0 in shape:
         raise ValueError(f"tensor {name!r} has shape {tensor.shape}, its neighbours call for {shape}")
 
 
-def _known(value: Any, allowed: Mapping[str, Any], what: str) -> str:
+def _check_known(value: Any, allowed: Mapping[str, Any], what: str) -> str:
     if not isinstance(value, str) or value not in allowed:
-        raise ValueError(f"{what}: {value!r}{nearest(str(value)[:200], allowed)}; allowed: {_listed(allowed)}")
+        raise ValueError(f"{what}: {value!r}{nearest(str(value)[:200], allowed)}; allowed: {_quote_names(allowed)}")
     return value
 
 
-def _listed(names: Mapping[str, Any]) -> str:
+def _quote_names(names: Mapping[str, Any]) -> str:
     return ", ".join(map(repr, names)) or "no name"
 
 
-def _seeded(seed: int | None) -> tuple[int, np.random.Generator]:
+def _new_generator(seed: int | None) -> tuple[int, np.random.Generator]:
     if seed is None:
         seed = int(np.random.SeedSequence().generate_state(1, np.uint64)[0])
     return seed, np.random.default_rng(seed)
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _check_unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     keys = [key for key, _ in pairs]
     if len(set(keys)) < len(keys):
         raise ValueError(f"the card names {next(k for k in keys if keys.count(k) > 1)!r} twice")
     return dict(pairs)
 
 
-def _no_constant(text: str) -> Any:
+def _reject_constant(text: str) -> Any:
     raise ValueError(f"the card holds {text}, which is not JSON")

@@ -36,7 +36,7 @@ from flockenv.players.rules import (
 )
 from flockenv.tasks import Task
 
-__all__ = ["PLAYERS", "RULES", "TUNED", "RulesPlayer", "Tuned", "as_dict", "player", "tuned"]
+__all__ = ["PLAYERS", "RULES", "TUNED", "RulesPlayer", "Tuned", "as_dict", "load_tuned", "player"]
 
 TUNED = Path(__file__).resolve().parent.parent / "tuned"
 """Folder of parameters found by the search, a file per task."""
@@ -112,7 +112,7 @@ class Tuned:
     found: dict[str, float] = field(default_factory=dict)  # agent_steps, tuning_mean, tuning_worlds, textbook_mean
 
 
-def tuned(name: str) -> Tuned:
+def load_tuned(name: str) -> Tuned:
     """Return the parameters that the search found for a task; an empty record if there was no search yet."""
     path = TUNED / f"{name}.json"
     if not path.is_file():
@@ -128,8 +128,8 @@ def player(task: Task, name: str = "rules") -> RulesPlayer:
         raise ValueError(
             f"there is no hand-written player {name!r} for {task.name!r}; there is one for: {', '.join(known)}"
         )
-    found = tuned(task.name).parameters if name == "rules" else {}
-    return RulesPlayer(task, replace(known[task.name][1](), **found), name)
+    parameters = load_tuned(task.name).parameters if name == "rules" else {}
+    return RulesPlayer(task, replace(known[task.name][1](), **parameters), name)
 
 
 def as_dict(rules: Any) -> dict[str, float]:

@@ -34,25 +34,25 @@ class BottleneckRules:
 
 def bottleneck(see: Any, task: Bottleneck, p: BottleneckRules) -> NDArray[np.float64]:
     """Drive to the door, with exponential repulsion from other agents and from walls."""
-    drive = 80.0 * (p.speed * task.max_speed * _to_opening(see, task) - see.velocity) / p.tau
-    tie = np.array([1.0, 0.0])
-    push = p.strength * repulsion(see.neighbours, tie, 2 * _PERSON, p.decay) * see.neighbour_present[..., None]
+    drive = 80.0 * (p.speed * task.max_speed * _exit_direction(see, task) - see.velocity) / p.tau
+    separation = np.array([1.0, 0.0])
+    push = p.strength * repulsion(see.neighbours, separation, 2 * _PERSON, p.decay) * see.neighbour_present[..., None]
     x, y, half = see.door[:, 0], see.door[:, 1], task.width / 2
     points = [
         np.stack([x, np.minimum(y - half, 0.0)], axis=-1), np.stack([x, np.maximum(y + half, 0.0)], axis=-1),
         np.stack([0.0 * x, -see.to_sides[:, 0]], axis=-1), np.stack([0.0 * x, see.to_sides[:, 1]], axis=-1),
     ]  # fmt: skip
-    off = p.walls * repulsion(np.stack(points, axis=1), tie, _PERSON, p.decay)
+    off = p.walls * repulsion(np.stack(points, axis=1), separation, _PERSON, p.decay)
     force: NDArray[np.float64] = drive + push.sum(axis=1) + off.sum(axis=1)
     return force
 
 
-def _to_opening(see: Any, task: Bottleneck) -> NDArray[np.float64]:
+def _exit_direction(see: Any, task: Bottleneck) -> NDArray[np.float64]:
     """Return the unit vectors to the nearest place of the door where a body fits; straight on before it."""
     half = max(task.width / 2 - 1.2 * _PERSON, 0.0)
-    aside = see.door[:, 1] - np.clip(see.door[:, 1], -half, half)
-    way = np.stack([np.maximum(see.door[:, 0], 0.0) + 0.1, aside], axis=-1)
-    direction: NDArray[np.float64] = way / np.linalg.norm(way, axis=-1)[:, None]
+    sideways = see.door[:, 1] - np.clip(see.door[:, 1], -half, half)
+    offset = np.stack([np.maximum(see.door[:, 0], 0.0) + 0.1, sideways], axis=-1)
+    direction: NDArray[np.float64] = offset / np.linalg.norm(offset, axis=-1)[:, None]
     return direction
 
 
@@ -69,13 +69,13 @@ class QueueingRules:
 
 def queueing(see: Any, task: Bottleneck, p: QueueingRules) -> NDArray[np.float64]:
     """Go to the door as fast as the gap ahead allows, with a small separation force."""
-    way, present = _to_opening(see, task), see.neighbour_present > 0
+    direction, present = _exit_direction(see, task), see.neighbour_present > 0
     others = see.velocity[:, None] + see.neighbour_velocity
-    gap = queue_gap(way[:, None], see.neighbours, others, 2 * _PERSON + p.margin, task.max_speed)
+    gap = queue_gap(direction[:, None], see.neighbours, others, 2 * _PERSON + p.margin, task.max_speed)
     gap = np.where(present, gap, np.inf).min(axis=1).clip(max=1e3)
     near = present & (np.linalg.norm(see.neighbours, axis=-1) < p.radius)
     push = p.apart * np.sum(separate(see.neighbours, np.array([1.0, 0.0])) * near[..., None], axis=1)
-    force: NDArray[np.float64] = 80.0 * p.gain * queue(way, see.velocity, gap, task.max_speed, p.headway) + push
+    force: NDArray[np.float64] = 80.0 * p.gain * queue(direction, see.velocity, gap, task.max_speed, p.headway) + push
     return force
 
 

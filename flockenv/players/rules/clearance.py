@@ -16,19 +16,19 @@ clear = rows(orca)
 
 
 def keep_clear(
-    see: Any, task: Any, p: Any, wish: NDArray[np.float64], radius: float, others: float, share: float
+    see: Any, task: Any, p: Any, desired: NDArray[np.float64], radius: float, others: float, share: float
 ) -> NDArray[np.float64]:
-    """Return the force towards the free velocity nearest to `wish`, the desired one, (rows, 2) m/s.
+    """Return the force towards the free velocity nearest to the `desired` one, (rows, 2) m/s.
 
     van den Berg et al. 2011. radius: of the agent's body, m; others: radius of those in sight, m; share: the agent's
     part of the change. `p` has the time for which the velocity must be free (horizon, s), the clearance (margin, m),
     the angle by which a desired velocity that is not free is turned right (turn, rad), and the gain, kg/s.
     """
     velocities = see.velocity[:, None] + see.neighbour_velocity
-    wide = np.where(see.neighbour_present > 0, others + p.margin, -1.0)[..., None]
-    seen = np.concatenate([see.neighbours, velocities, wide, np.full_like(wide, share)], axis=-1)
+    reach = np.where(see.neighbour_present > 0, others + p.margin, -1.0)[..., None]
+    seen = np.concatenate([see.neighbours, velocities, reach, np.full_like(reach, share)], axis=-1)
     change = clear(
-        see.velocity, wish, radius, task.max_speed, p.horizon, task.control_dt, p.turn, seen.reshape(len(seen), -1)
+        see.velocity, desired, radius, task.max_speed, p.horizon, task.control_dt, p.turn, seen.reshape(len(seen), -1)
     )
     force: NDArray[np.float64] = p.gain * change
     return force

@@ -40,21 +40,22 @@ class CorridorRules:
 def corridor(see: Any, task: Corridor, p: CorridorRules) -> NDArray[np.float64]:
     """Drive at the desired speed, away from others and from walls; vectors are (along the desired direction, left)."""
     own = see.velocity[:, None]
-    wish = sidestep(
+    sidesteps = sidestep(
         see.neighbours, own, own + see.neighbour_velocity, np.array([1.0, 0.0]), p.importance, p.gamma, p.angular,
         p.forward, p.bias,
     )  # fmt: skip
-    push = p.strength * np.sum(wish * see.neighbour_present[..., None], axis=1)
-    force: NDArray[np.float64] = (_ahead(see) - see.velocity) / p.tau + push + _off_walls(see, p.walls, p.wall_decay)
+    push = p.strength * np.sum(sidesteps * see.neighbour_present[..., None], axis=1)
+    walls = _wall_force(see, p.walls, p.wall_decay)
+    force: NDArray[np.float64] = (_desired_velocity(see) - see.velocity) / p.tau + push + walls
     return force
 
 
-def _ahead(see: Any) -> NDArray[np.float64]:
+def _desired_velocity(see: Any) -> NDArray[np.float64]:
     """Return the desired velocities, m/s."""
     return np.stack([see.desired_speed, 0.0 * see.desired_speed], axis=-1)
 
 
-def _off_walls(see: Any, strength: float, decay: float) -> NDArray[np.float64]:
+def _wall_force(see: Any, strength: float, decay: float) -> NDArray[np.float64]:
     """Return the push off both walls, a exp(-d / b), d from the body's centre."""
     push = strength * (np.exp(-see.walls[:, 1] / decay) - np.exp(-see.walls[:, 0] / decay))
     return np.stack([0.0 * push, push], axis=-1)
@@ -72,4 +73,4 @@ class CorridorOrcaRules:
 
 def orca_corridor(see: Any, task: Corridor, p: CorridorOrcaRules) -> NDArray[np.float64]:
     """Optimal reciprocal collision avoidance (van den Berg et al. 2011) along the corridor; walls are no neighbours."""
-    return keep_clear(see, task, p, _ahead(see), _PERSON, _PERSON, 0.5) + _off_walls(see, 3.0, 0.1)
+    return keep_clear(see, task, p, _desired_velocity(see), _PERSON, _PERSON, 0.5) + _wall_force(see, 3.0, 0.1)

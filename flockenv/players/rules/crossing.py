@@ -71,8 +71,8 @@ class OrcaRules:
 def orca_crossing(see: Any, task: Crossing, p: OrcaRules) -> NDArray[np.float64]:
     """Optimal reciprocal collision avoidance (van den Berg et al. 2011) towards the goal."""
     still = np.zeros_like(see.goal)
-    wish = arrive(see.goal, still, task.max_speed, p.slow_radius)
-    return keep_clear(see, task, p, wish, _WALKER, _WALKER, 0.5)
+    desired = arrive(see.goal, still, task.max_speed, p.slow_radius)
+    return keep_clear(see, task, p, desired, _WALKER, _WALKER, 0.5)
 
 
 _WALKER = 0.3

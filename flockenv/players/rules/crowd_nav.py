@@ -38,13 +38,13 @@ class CrowdNavRules:
 def crowd_nav(see: Any, task: CrowdNav, p: CrowdNavRules) -> NDArray[np.float64]:
     """Drive to the goal, slow down before others and pass them on one side; vectors are (along the course, left)."""
     own = see.velocity[:, None]
-    wish = sidestep(
+    sidesteps = sidestep(
         see.neighbours, own, own + see.neighbour_velocity, np.array([1.0, 0.0]), p.importance, p.gamma, p.angular,
         p.forward, p.bias,
     )  # fmt: skip
-    way = see.goal / np.maximum(np.linalg.norm(see.goal, axis=-1), 1e-9)[:, None]
-    push = p.strength * np.sum(wish * see.neighbour_present[..., None], axis=1)
-    force: NDArray[np.float64] = (p.speed * task.max_speed * way - see.velocity) / p.tau + push
+    direction = see.goal / np.maximum(np.linalg.norm(see.goal, axis=-1), 1e-9)[:, None]
+    push = p.strength * np.sum(sidesteps * see.neighbour_present[..., None], axis=1)
+    force: NDArray[np.float64] = (p.speed * task.max_speed * direction - see.velocity) / p.tau + push
     return force
 
 
@@ -61,8 +61,8 @@ class RobotOrcaRules:
 
 def orca_crowd_nav(see: Any, task: CrowdNav, p: RobotOrcaRules) -> NDArray[np.float64]:
     """Optimal reciprocal collision avoidance (van den Berg et al. 2011) towards the goal."""
-    wish = seek(see.goal, np.zeros_like(see.goal), task.max_speed)
-    return keep_clear(see, task, p, wish, _ROBOT, _PEDESTRIAN, 0.5 if task.visible else p.share)
+    desired = seek(see.goal, np.zeros_like(see.goal), task.max_speed)
+    return keep_clear(see, task, p, desired, _ROBOT, _PEDESTRIAN, 0.5 if task.visible else p.share)
 
 
 @dataclass(frozen=True)
@@ -82,18 +82,19 @@ def heuristics_crowd_nav(see: Any, task: CrowdNav, p: HeuristicsRules) -> NDArra
     gaze = np.where(speed > 0.05, see.velocity / np.maximum(speed, 1e-9), aim)
     turn = np.radians(np.linspace(-p.view, p.view, 31))
     cosine, sine = np.cos(turn), np.sin(turn)
-    ways = np.stack([gaze[:, :1] * cosine - gaze[:, 1:] * sine, gaze[:, :1] * sine + gaze[:, 1:] * cosine], axis=-1)
-    ways = np.concatenate([aim[:, None], ways], axis=1)  # the aim first: it is selected of equally good directions
+    x, y = gaze[:, :1] * cosine - gaze[:, 1:] * sine, gaze[:, :1] * sine + gaze[:, 1:] * cosine
+    # the aim first: it is selected of equally good directions
+    directions = np.concatenate([aim[:, None], np.stack([x, y], axis=-1)], axis=1)
     seen, moving = see.neighbour_present[:, :, None] > 0, see.velocity[:, None] + see.neighbour_velocity
-    clearance, one = _ROBOT + _PEDESTRIAN + p.margin, ways[:, None]
+    clearance, one = _ROBOT + _PEDESTRIAN + p.margin, directions[:, None]
     free = collision_distance(one, see.neighbours[:, :, None], moving[:, :, None], clearance, task.max_speed)
     free = np.where(seen, free, np.inf).min(axis=1).clip(max=p.reach)
     now = collision_distance(one, see.neighbours[:, :, None], np.zeros(2), clearance, 1.0)
     now = np.where(seen, now, np.inf).min(axis=1)
-    left = p.reach**2 + free**2 - 2.0 * p.reach * free * np.sum(ways * aim[:, None], axis=-1)
-    row, best = np.arange(len(left)), np.argmin(left, axis=1)
+    remaining = p.reach**2 + free**2 - 2.0 * p.reach * free * np.sum(directions * aim[:, None], axis=-1)
+    row, best = np.arange(len(remaining)), np.argmin(remaining, axis=1)
     safe = np.minimum(task.max_speed, now[row, best] / p.tau)[:, None]
-    force: NDArray[np.float64] = (safe * ways[row, best] - see.velocity) / p.tau
+    force: NDArray[np.float64] = (safe * directions[row, best] - see.velocity) / p.tau
     return force
 
 

@@ -53,8 +53,8 @@ def evade(see: Any, task: Evade, p: EvadeRules) -> NDArray[np.float64]:
     there, clearance = see.cover_radius > 0, see.cover_radius + 0.4
     hit = np.where(there, threat(forward[:, None], see.cover, clearance, (speed * p.horizon)[:, None]), np.inf)
     first = np.argmin(hit, axis=1)
-    aside = p.avoid * avoid(forward, see.cover[row, first], clearance[row, first], top)
-    aside *= np.isfinite(hit[row, first])[:, None]
+    avoidance = p.avoid * avoid(forward, see.cover[row, first], clearance[row, first], top)
+    avoidance *= np.isfinite(hit[row, first])[:, None]
     inside = 5.0 * contain(see.to_low - 0.5, see.to_high - 0.5, see.velocity, top, p.wall)
 
     distance = np.linalg.norm(see.pursuers, axis=-1)
@@ -68,19 +68,20 @@ def evade(see: Any, task: Evade, p: EvadeRules) -> NDArray[np.float64]:
 
     places = hiding_place(see.cover, see.cover_radius, p.margin, see.pursuers[:, :1])
     theirs = np.linalg.norm(places[:, :, None] - see.pursuers[:, None], axis=-1).min(axis=-1)
-    way = np.linalg.norm(places, axis=-1) + p.danger * np.maximum(10.0 - theirs, 0.0)
-    way += p.exposed * _watchers(places, see)
-    soonest = np.argmin(np.where(there, way, np.inf), axis=1)
-    hidden = p.hide * arrive(places[row, soonest], see.velocity, top, 0.5) * there.any(axis=1)[:, None]
-    return allocate(np.stack([aside, inside, away, hidden], axis=1), task.evader_force)
+    cost = np.linalg.norm(places, axis=-1) + p.danger * np.maximum(10.0 - theirs, 0.0)
+    cost += p.exposed * _count_watchers(places, see)
+    nearest = np.argmin(np.where(there, cost, np.inf), axis=1)
+    hidden = p.hide * arrive(places[row, nearest], see.velocity, top, 0.5) * there.any(axis=1)[:, None]
+    return allocate(np.stack([avoidance, inside, away, hidden], axis=1), task.evader_force)
 
 
-def _watchers(places: NDArray[np.float64], see: Any) -> NDArray[np.float64]:
+def _count_watchers(places: NDArray[np.float64], see: Any) -> NDArray[np.float64]:
     """Return how many pursuers have no cover between themselves and each of the places (R, K)."""
-    ways = places[:, :, None] - see.pursuers[:, None]
-    length = np.linalg.norm(ways, axis=-1)
-    stones = (see.cover[:, None, :] - see.pursuers[:, :, None])[:, None]
-    hit = ray_hit(stones, (ways / np.maximum(length, 1e-9)[..., None])[..., None, :], see.cover_radius[:, None, None])
+    offsets = places[:, :, None] - see.pursuers[:, None]
+    length = np.linalg.norm(offsets, axis=-1)
+    covers = (see.cover[:, None, :] - see.pursuers[:, :, None])[:, None]
+    rays = offsets / np.maximum(length, 1e-9)[..., None]
+    hit = ray_hit(covers, rays[..., None, :], see.cover_radius[:, None, None])
     hit = np.where(see.cover_radius[:, None, None] > 0, hit, np.inf)
     count: NDArray[np.float64] = np.sum(hit.min(axis=-1) > length, axis=-1)
     return count

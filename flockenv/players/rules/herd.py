@@ -46,10 +46,10 @@ def herd(see: Any, task: Herd, p: HerdRules) -> NDArray[np.float64]:
     nearest = np.where(see.sheep_present[:, 0] > 0, np.linalg.norm(see.sheep[:, 0], axis=-1), np.inf)
     speed = np.where(nearest < p.near * r, p.slow, 1.0) * top
     course = p.gain * arrive(place, see.velocity, speed, 0.5)
-    way = place / np.maximum(np.linalg.norm(place, axis=-1), 1e-9)[:, None]
+    direction = place / np.maximum(np.linalg.norm(place, axis=-1), 1e-9)[:, None]
     clearance = p.width * see.stray + 2.0 * r
-    blocked = np.isfinite(threat(way, see.centre, clearance, np.linalg.norm(place, axis=-1)))
-    detour = p.around * avoid(way, see.centre, clearance, top) * blocked[:, None]
+    blocked = np.isfinite(threat(direction, see.centre, clearance, np.linalg.norm(place, axis=-1)))
+    detour = p.around * avoid(direction, see.centre, clearance, top) * blocked[:, None]
     distance = np.linalg.norm(see.mates, axis=-1)[..., None]
     push = -see.mates / np.maximum(distance, 1e-9) * np.maximum(1.0 - distance / 10.0, 0.0)
     mates = p.apart * np.sum(push, axis=1)

@@ -51,8 +51,8 @@ def obstacles(see: Any, task: Obstacles, p: ObstaclesRules) -> NDArray[np.float6
     danger = np.isfinite(nearest)
     nearness = 1.0 - np.where(danger, nearest / np.maximum(reach, 1e-9), 1.0)
     strength = p.evade * (1.0 - p.urgency * (1.0 - nearness)) * danger
-    aside = avoid(forward, see.obstacles[row, first], clearance[row, first], task.max_speed)
-    evasion = aside * strength[:, None] - p.brake * see.velocity * nearness[:, None]
+    avoidance = avoid(forward, see.obstacles[row, first], clearance[row, first], task.max_speed)
+    evasion = avoidance * strength[:, None] - p.brake * see.velocity * nearness[:, None]
     away = -see.obstacles / np.maximum(np.linalg.norm(see.obstacles, axis=-1), 1e-9)[..., None]
     seen = (see.obstacle_radius > 0) & (see.clearance < 1.0)
     field = p.push * np.sum(away * (seen / np.maximum(see.clearance, 0.05))[..., None], axis=1)

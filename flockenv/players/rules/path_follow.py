@@ -50,9 +50,9 @@ def path_follow(see: Any, task: PathFollow, p: PathFollowRules) -> NDArray[np.fl
     gained = then * step - p.keep * top * p.time
     ahead = p.lead * np.maximum(speed, 0.25 * top)
     target = fine[row, np.minimum(np.round(ahead / step), task.ahead * _FINE - 1).astype(int)]
-    wish = p.gain * follow_path(gap[row, then] - p.tube * task.half_width, gained, target, see.velocity, top)
+    following = p.gain * follow_path(gap[row, then] - p.tube * task.half_width, gained, target, see.velocity, top)
     slower = -p.brake * (np.maximum(speed - top, 0.0) / np.maximum(speed, 1e-9))[:, None] * see.velocity
-    force: NDArray[np.float64] = slower + wish
+    force: NDArray[np.float64] = slower + following
     return force
 
 

@@ -62,11 +62,11 @@ def school(
     now = intention(was, see.hunger, 0.0, see.fear, max(p.escape, p.school), p.school, p.need, calm, content)
     hunted = see.hunter_present[:, 0] > 0
     # no hunter or no food is in sight: go on, and look around
-    some = np.linalg.norm(see.food_bearing, axis=-1) > 0
-    now_heard = np.where((now == motivation.ESCAPE) & ~hunted, motivation.WANDER, now)
-    now_heard = np.where((now == motivation.EAT) & ~some.any(axis=1), motivation.WANDER, now_heard)
+    has_food = np.linalg.norm(see.food_bearing, axis=-1) > 0
+    selected = np.where((now == motivation.ESCAPE) & ~hunted, motivation.WANDER, now)
+    selected = np.where((now == motivation.EAT) & ~has_food.any(axis=1), motivation.WANDER, selected)
     here = see.mate_present
-    now_heard = np.where((now == motivation.SCHOOL) & (here.sum(axis=1) == 0), motivation.WANDER, now_heard)
+    selected = np.where((now == motivation.SCHOOL) & (here.sum(axis=1) == 0), motivation.WANDER, selected)
 
     inside = 5.0 * contain(see.to_low - 0.5, see.to_high - 0.5, see.velocity, top, p.wall)
     near = here * (np.linalg.norm(see.mates, axis=-1) < 0.6)
@@ -78,12 +78,12 @@ def school(
     course = np.sum(see.mate_velocity * here[..., None], axis=1) / many
     centre = np.sum(see.mates * here[..., None], axis=1) / many
     join = p.match * align(see.velocity, course) + p.centre * centre
-    way = np.linalg.norm(see.food, axis=-1) - p.rich * see.food_amount / task.capacity
-    best = np.argmin(np.where(some, way, np.inf), axis=1)
+    cost = np.linalg.norm(see.food, axis=-1) - p.rich * see.food_amount / task.capacity
+    best = np.argmin(np.where(has_food, cost, np.inf), axis=1)
     eat = p.forage * arrive(see.food[np.arange(count), best], see.velocity, top, 1.0)
     still = np.linalg.norm(see.velocity, axis=-1, keepdims=True) < 1e-6
     heading = np.where(still, ahead, see.velocity)
     roam = 2.0 * (wander(np.array([0.0, p.turn]), heading, p.pace * top, 1.0) + heading - see.velocity)
     wishes = np.stack([inside, push, flight, join, eat, roam], axis=1)
-    force, _ = reconcile(_WHEN, wishes, task.fish_force, inner={"intention": now_heard})
+    force, _ = reconcile(_WHEN, wishes, task.fish_force, inner={"intention": selected})
     return force, now
