@@ -23,7 +23,7 @@ from rich.table import Table
 
 from agents.compare import blaming, field_of, split
 from agents.experiment import load_experiment, one_line_errors
-from flockenv.cli.terminal import program, shown_progress
+from flockenv.cli.terminal import run_program, show_progress
 from flockenv.envs.world import Step, World
 from flockenv.evaluation import Episodes, Interval, bootstrap, compare, rollout, worlds_for
 from flockenv.model.snapshot import Snapshot
@@ -183,7 +183,7 @@ def main(
         if not out.is_terminal:
             out = Console(highlight=False, width=200)  # a pipe has no width
         for task, field in zip(tasks, fields, strict=True):
-            with shown_progress(Progress(console=console, transient=True)) as progress:
+            with show_progress(Progress(console=console, transient=True)) as progress:
                 bar = progress.add_task(task.name, total=len(field) ** 2)
                 found = invade(task, field, worlds, seed, lambda: progress.advance(bar))  # noqa: B023  # called at once
             out.print(f"{task.name}: mean return of one agent that plays the row, among others that play the column")
@@ -206,4 +206,4 @@ def _makers(task: Task, asked: Sequence[str], seed: int, trust_pickle: bool) -> 
 
 
 if __name__ == "__main__":
-    program("best_response", app)
+    run_program("best_response", app)

@@ -26,7 +26,7 @@ import flockenv
 from agents import report
 from agents.experiment import CONFIGS, Experiment, load_experiment
 from agents.processes import Tell, side_by_side
-from flockenv.cli.terminal import one_line, program, shown_progress
+from flockenv.cli.terminal import report_errors, run_program, show_progress
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import nearest, printable
 from flockenv.core.output_paths import check_room, valid_file, valid_path
@@ -284,7 +284,7 @@ def main(
     debug: Annotated[bool, typer.Option("--debug", help="Show where an error came from.")] = False,
 ) -> None:
     """Play all tasks with all players in the same worlds, and compare their scores."""
-    with one_line("compare", "interrupted, nothing written", debug):
+    with report_errors("compare", "interrupted, nothing written", debug):
         folder = folder_of(out, FILES)
         chosen = [experiment_of(name).build() for name in pick("--tasks", split(tasks) or list(TASKS), TASKS)]
         field = field_of(split(players) or usual_players(chosen))
@@ -339,7 +339,7 @@ def _bars(tasks: Sequence[Task], players: int) -> Iterator[Advance]:
     """Show a bar per task on a terminal, and a line per player and task anywhere else."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description:<24}"), BarColumn(40), TimeElapsedColumn())
-    with shown_progress(Progress(*columns, console=console, transient=True)) as progress:
+    with show_progress(Progress(*columns, console=console, transient=True)) as progress:
         bars = {task.name: progress.add_task(task.name, total=players * task.horizon, start=False) for task in tasks}
         played: dict[str, list[str]] = {task.name: [] for task in tasks}
 
@@ -417,4 +417,4 @@ def _show(results: report.Results, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    program("compare", app, "interrupted, nothing written")
+    run_program("compare", app, "interrupted, nothing written")

@@ -18,7 +18,7 @@ import typer
 from rich.console import Console
 
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors
-from flockenv.cli.terminal import one_line, program
+from flockenv.cli.terminal import report_errors, run_program
 from flockenv.core.atomic_files import replace_file, write_all_or_none
 from flockenv.core.output_paths import check_room, valid_file, valid_path
 from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK
@@ -142,7 +142,7 @@ def main(
         experiments = experiments_of(configs)
         check_room(picture, ROOM)
     stays = f"interrupted; what is trained stays in {runs}, the same command goes on"
-    with one_line("curves", stays), one_line_errors((FloatingPointError,)):
+    with report_errors("curves", stays), one_line_errors((FloatingPointError,)):
         tasks = {task: measured(experiment, folder) for task, experiment in experiments.items()}
         write_all_or_none(picture.parent, {
             picture.name: lambda path: draw(path, tasks),
@@ -157,4 +157,4 @@ def main(
 
 
 if __name__ == "__main__":
-    program("curves", app)
+    run_program("curves", app)

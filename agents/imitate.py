@@ -19,7 +19,7 @@ from rich.progress import Progress
 from agents.dagger import WORLDS, teach
 from agents.experiment import Experiment, load_experiment, one_line_errors
 from agents.ppo import build, on_threads, score, tensors_of
-from flockenv.cli.terminal import DIVERGED, program, shown_progress
+from flockenv.cli.terminal import DIVERGED, run_program, show_progress
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.players.rules import player
 
@@ -70,7 +70,7 @@ def main(
         experiment = load_experiment(config)
         name = experiment.build().name
     try:
-        with shown_progress(Progress(console=console)) as progress:
+        with show_progress(Progress(console=console)) as progress:
             bar = progress.add_task(f"{name}: gradient steps", total=updates)
             found = imitate(experiment, worlds, updates, lambda n: progress.advance(bar, n))
     except FloatingPointError as error:
@@ -83,4 +83,4 @@ def main(
 
 
 if __name__ == "__main__":
-    program("imitate", app)
+    run_program("imitate", app)

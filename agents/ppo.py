@@ -38,7 +38,7 @@ from agents.learning_env import ForLearning
 from agents.run import Run, checkpoint, checkpointed, expected_bytes, recipe_of
 from agents.team_credit import CaringBuffer
 from agents.training_state import capture, restore, surroundings
-from flockenv.cli.terminal import DIVERGED, interruptible, program, shown_progress
+from flockenv.cli.terminal import DIVERGED, handle_interrupt, run_program, show_progress
 from flockenv.core import signals
 from flockenv.core.output_paths import check_room, valid_file, valid_path
 from flockenv.envs.sb3 import WorldVecEnv
@@ -210,7 +210,7 @@ def _teach(model: PPO, task: Task, p: PpoSettings) -> float:
     if p.taught == 0:
         return 0.0
     began = time.perf_counter()
-    with on_threads(p.threads), shown_progress(Progress(console=console, transient=True)) as progress:
+    with on_threads(p.threads), show_progress(Progress(console=console, transient=True)) as progress:
         bar = progress.add_task(f"{task.name}: is taught", total=p.taught)
         teach(model, task, player(task), p.taught, advance=lambda n: progress.advance(bar, n))
     return time.perf_counter() - began
@@ -275,7 +275,7 @@ def _train(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
         TextColumn("{task.fields[score]}"),
     )  # fmt: skip
-    with on_threads(p.threads), shown_progress(Progress(*columns, console=console)) as progress:
+    with on_threads(p.threads), show_progress(Progress(*columns, console=console)) as progress:
         watch = Watch(task, p, run, folder, progress, saved)
         try:
             with _named_divergence(model):
@@ -344,7 +344,7 @@ def main(
         folder = valid_path(str(runs / name), "--runs")
         _check_outputs(experiment, target, folder, tensorboard)
     kept: deque[Run] = deque(maxlen=1)  # the last one alone: a run holds all arrays of the model
-    with interruptible(), one_line_errors((CheckpointError, OSError, MemoryError)):
+    with handle_interrupt(), one_line_errors((CheckpointError, OSError, MemoryError)):
         try:
             run = train(experiment, folder, go_on, tensorboard, kept.append)
         except KeyboardInterrupt:
@@ -387,4 +387,4 @@ def _last_good(saved: Sequence[Run], folder: Path, target: Path) -> str:
 
 
 if __name__ == "__main__":
-    program("ppo", app)
+    run_program("ppo", app)

@@ -19,7 +19,7 @@ from agents.compare import ROOT
 from agents.experiment import one_line_errors
 from agents.report import Results, grid
 from agents.summary_chart import write_summary
-from flockenv.cli.terminal import program
+from flockenv.cli.terminal import run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.tasks import TASKS
 
@@ -136,4 +136,4 @@ def _write(content: bytes, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    program("publish", app)
+    run_program("publish", app)

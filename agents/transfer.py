@@ -45,7 +45,7 @@ from agents.transfer_cache import (
     run_round,
 )
 from agents.transfer_report import Setting
-from flockenv.cli.terminal import one_line, program, shown_progress
+from flockenv.cli.terminal import report_errors, run_program, show_progress
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import nearest, printable
 from flockenv.evaluation import WORLDS_PER_SEED, worlds_for
@@ -92,7 +92,7 @@ def main(
     debug: Annotated[bool, typer.Option("--debug", help="Show where an error came from.")] = False,
 ) -> None:
     """Play the same worlds solved better and worse, and say what that does to each policy and what it costs."""
-    with one_line("transfer", STOPPED, debug):
+    with report_errors("transfer", STOPPED, debug):
         folder = folder_of(out, FILES)
         _check("--worlds", worlds, 2, WORLDS_PER_SEED)
         _check("--rounds", rounds, 1, 1000)
@@ -202,7 +202,7 @@ def _bar(steps: int) -> Iterator[Advance]:
     """Show one bar on a terminal, and a line per kernel and per round anywhere else."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description:<44}"), BarColumn(30), TimeElapsedColumn())
-    with shown_progress(Progress(*columns, console=console, transient=True)) as progress:
+    with show_progress(Progress(*columns, console=console, transient=True)) as progress:
         bar = progress.add_task("compiling and playing", total=steps)
 
         def advance(what: str, done: int) -> None:
@@ -220,4 +220,4 @@ def _draw(path: Path, results: report.Results) -> None:
 
 
 if __name__ == "__main__":
-    program("transfer", app, STOPPED)
+    run_program("transfer", app, STOPPED)

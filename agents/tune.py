@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from agents.experiment import Experiment, load_experiment, one_line_errors
-from flockenv.cli.terminal import program, shown_progress
+from flockenv.cli.terminal import run_program, show_progress
 from flockenv.core.atomic_files import new_folder, replace_file
 from flockenv.core.output_paths import check_room, valid_file
 from flockenv.evaluation import rollout, worlds_for
@@ -104,7 +104,7 @@ def main(
         target = TUNED / f"{task.name}.json" if out is None else valid_file(str(out), (".json",), force=True)
         check_room(target, ROOM)
     s = experiment.search
-    with shown_progress(Progress(console=console)) as progress:
+    with show_progress(Progress(console=console)) as progress:
         bar = progress.add_task(f"{task.name}: parameter sets", total=_plays(s.candidates, s.rounds))
         rules, found = search(experiment, lambda n: progress.advance(bar, n))
     console.print(f"{task.name}: found {json.dumps(rules)}", markup=False, highlight=False, soft_wrap=True)
@@ -115,4 +115,4 @@ def main(
 
 
 if __name__ == "__main__":
-    program("tune", app, "interrupted, nothing written")
+    run_program("tune", app, "interrupted, nothing written")

@@ -28,7 +28,7 @@ from typing import Annotated
 
 import typer
 
-from flockenv.cli.terminal import program, progress_bar
+from flockenv.cli.terminal import progress_bar, run_program
 
 __all__ = ["COMMANDS", "Outcome", "interrupted"]
 
@@ -207,4 +207,4 @@ def main(
 if __name__ == "__main__":
     app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
     app.command()(main)
-    program("interrupts", app)
+    run_program("interrupts", app)

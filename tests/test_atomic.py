@@ -319,7 +319,7 @@ def _training(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("first", "write"),
     [
-        ("flockenv.cli.gallery.shown", _gallery),
+        ("flockenv.cli.gallery.run_demo", _gallery),
         ("flockenv.studies.validation.plots.write_pictures", _validation),
         ("agents.checkpoint.FileLock", _training),
     ],

@@ -373,7 +373,7 @@ def test_long_commands_print_progress(command: list[str], monkeypatch: pytest.Mo
      (7e7, "2 years"), (1e12, "31,688 years")],
 )  # fmt: skip
 def test_duration_in_words(seconds: float, words: str) -> None:
-    assert terminal.in_words(seconds) == words
+    assert terminal.duration_text(seconds) == words
 
 
 # --- render -----------------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from flockenv.behaviours import BEHAVIOURS, Separation
-from flockenv.cli.gallery import page, shown
+from flockenv.cli.gallery import page, run_demo
 from flockenv.cli.main import main
 from flockenv.scene.yaml_io import load_scene
 
@@ -28,7 +28,7 @@ def test_the_demo_of_every_behaviour_contains_it(kind: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", BEHAVIOURS)
 def test_every_behaviour_changes_the_motion_in_its_demo(kind: str) -> None:
-    run = shown(BEHAVIOURS[kind])
+    run = run_demo(BEHAVIOURS[kind])
     others = tuple(effect.idle_copy() if effect.kind in (kind, "steer") else effect for effect in run.scene.effects)
     without = run.scene.with_effects(*others).run(run.first, int(run.step[-1]))
     assert np.abs(run.last.pos - without.pos).max() > 0.1
@@ -60,4 +60,4 @@ def test_the_command_writes_a_page_and_its_pictures(
 def test_a_behaviour_without_a_demo_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Separation, "demo", None)
     with pytest.raises(ValueError, match=r"^separation: has no demo"):
-        shown(Separation)
+        run_demo(Separation)

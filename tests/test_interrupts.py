@@ -153,16 +153,16 @@ def test_the_last_line_of_a_command_begins_with_the_signal_that_ended_it(
 ) -> None:
     body = """\
 import typer
-from flockenv.cli.terminal import one_line, program
+from flockenv.cli.terminal import report_errors, run_program
 app = typer.Typer()
 @app.command()
 def main():
-    with one_line('toy', 'interrupted, nothing kept'):
+    with report_errors('toy', 'interrupted, nothing kept'):
         say('ready')
         while True:
             time.sleep(0.01)
 sys.argv = ['toy']
-program('toy', app)"""
+run_program('toy', app)"""
     process = toy(body, tmp_path)
     process.send_signal(number)
     assert process.communicate(timeout=60)[1] == f"toy: {message}\n"

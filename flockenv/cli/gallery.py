@@ -18,7 +18,7 @@ from flockenv.render.picture import draw
 from flockenv.scene.yaml_io import load_scene
 from flockenv.studies.trajectory import Trajectory, record
 
-__all__ = ["page", "shown", "write_gallery"]
+__all__ = ["page", "run_demo", "write_gallery"]
 
 SIZE = 360
 """Width of a picture, pixels."""
@@ -27,7 +27,7 @@ INSTANTS = 160
 """Approximate number of instants at which a drawn trajectory is sampled."""
 
 
-def shown(behaviour: type[Effect]) -> Trajectory:
+def run_demo(behaviour: type[Effect]) -> Trajectory:
     """Return the run of a behaviour's demo scene; ValueError if it has none, or the run stops early."""
     kind = behaviour.model_fields["kind"].default
     if behaviour.demo is None:
@@ -65,7 +65,7 @@ def page(behaviours: Mapping[str, type[Effect]], pictures: str) -> str:
     for title, members in families(behaviours).items():
         lines += [f"## {title.rstrip('.')}", ""]
         for behaviour in members:
-            lines += _entry(behaviour, pictures)
+            lines += _entry_lines(behaviour, pictures)
     return "\n".join(lines)
 
 
@@ -77,18 +77,18 @@ def write_gallery(
     with new_folder(folder):
         for done, (kind, behaviour) in enumerate(behaviours.items()):
             progress(done)
-            snapshots = list(shown(behaviour).snapshots())
+            snapshots = list(run_demo(behaviour).snapshots())
             write_png(folder / f"{kind}.png", draw(snapshots[-1], SIZE, 3, snapshots))
     with replace_file(path) as file:
         file.write(page(behaviours, folder.name).encode())
     return len(behaviours)
 
 
-def _entry(behaviour: type[Effect], pictures: str) -> list[str]:
+def _entry_lines(behaviour: type[Effect], pictures: str) -> list[str]:
     """Return the lines of the page about one behaviour."""
     kind = behaviour.model_fields["kind"].default
     fields = [
-        f"| `{name}` | {field.description or ''} | {'' if field.is_required() else _default(field.default)} |"
+        f"| `{name}` | {field.description or ''} | {'' if field.is_required() else _default_text(field.default)} |"
         for name, field in behaviour.model_fields.items()
         if name != "kind"
     ]
@@ -103,7 +103,7 @@ def _entry(behaviour: type[Effect], pictures: str) -> list[str]:
     ]  # fmt: skip
 
 
-def _default(value: object) -> str:
+def _default_text(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else "none" if value is None else str(value)
 
 

@@ -31,14 +31,14 @@ from flockenv.cli.terminal import (
     EarlyEnd,
     Force,
     Seed,
-    complain,
+    describe_error,
     flush_output,
-    naming_stdout,
+    name_stdout_errors,
     new_console,
+    print_error,
     progress_bar,
-    relative,
+    relative_path,
     show_table,
-    verdict,
 )
 from flockenv.cli.validate import validate
 from flockenv.core import signals
@@ -65,7 +65,7 @@ TRAIL = 25  # past positions of each agent that a PNG shows
 RECORDED_EVERY = 0.1  # s, rounded to whole steps
 
 
-def _task_or_file(incomplete: str) -> list[str]:
+def _complete_target(incomplete: str) -> list[str]:
     """Return the tasks, scene files and folders that complete a word (shell completion)."""
     from flockenv.envs.table import ENVIRONMENTS
 
@@ -109,23 +109,23 @@ def _run(words: Sequence[str]) -> int:
     debug = "--debug" in words
     signals.set_message("")  # discard the text of an earlier command of this process
     try:
-        with warnings.catch_warnings(), naming_stdout():
+        with warnings.catch_warnings(), name_stdout_errors():
             warnings.showwarning = _warn
             code = app([w for w in words if w != "--debug"], prog_name="flockenv", standalone_mode=False)
         flush_output()
         # typer turns a KeyboardInterrupt into this code without a message
-        return _interrupted() if code == INTERRUPTED else int(code or OK)
+        return _report_interrupt() if code == INTERRUPTED else int(code or OK)
     except (typer.Abort, KeyboardInterrupt):
-        return _interrupted()
+        return _report_interrupt()
     except EarlyEnd as end:
-        return _interrupted(str(end)) if end.code == INTERRUPTED else _complain(str(end), end.code)
+        return _report_interrupt(str(end)) if end.code == INTERRUPTED else _report_error(str(end), end.code)
     except Exception as error:
         if debug:
             raise
-        return _complain(*verdict(error))
+        return _report_error(*describe_error(error))
 
 
-def _interrupted(text: str = "") -> int:
+def _report_interrupt(text: str = "") -> int:
     """Print the line about the signal that ended the command, `text` if given; return the exit code."""
     if text:
         signals.set_message(text)
@@ -136,11 +136,11 @@ def _interrupted(text: str = "") -> int:
 
 def _warn(message: Warning | str, *place: object, **more: object) -> None:
     """Print a warning like an error, in one line, without the line of source code."""
-    _complain(f"warning: {message}", OK)
+    _report_error(f"warning: {message}", OK)
 
 
-def _complain(text: str, code: int) -> int:
-    complain("flockenv", text)
+def _report_error(text: str, code: int) -> int:
+    print_error("flockenv", text)
     return code
 
 
@@ -151,7 +151,7 @@ def _show_version(asked: bool) -> None:
 
 
 @app.callback()
-def _options(
+def _define_options(
     debug: Annotated[bool, typer.Option("--debug", help="Show a traceback if something goes wrong.")] = False,
     version: Annotated[
         bool, typer.Option("--version", help="Show the version and exit.", is_eager=True, callback=_show_version)
@@ -177,17 +177,17 @@ def listing() -> None:
     console = new_console()
     single = [env_id for env_id in gymnasium.registry if env_id.startswith("flockenv/")]
     many = [env_id for env_id in pettingzoo.parallel_registry if env_id.startswith("flockenv/")]
-    show_table(console, "Tasks", ((name, _sentence(task)) for name, task in TASKS.items()))
+    show_table(console, "Tasks", ((name, _first_sentence(task)) for name, task in TASKS.items()))
     show_table(console, "gymnasium.make, gymnasium.make_vec", ((env_id, "one learner") for env_id in single))
     show_table(console, 'pettingzoo.make("parallel" or "aec", ...)', ((env_id, "many learners") for env_id in many))
     effects = {kind: effect for kind, effect in EFFECTS.items() if kind not in BEHAVIOURS}
-    show_table(console, "Effects", ((kind, _sentence(effect)) for kind, effect in sorted(effects.items())))
-    show_table(console, "Behaviours", ((kind, _sentence(effect)) for kind, effect in sorted(BEHAVIOURS.items())))
-    show_table(console, "Arbitrations", ((kind, _sentence(how)) for kind, how in sorted(ARBITRATIONS.items())))
-    show_table(console, "Integrators", ((kind, _sentence(method)) for kind, method in sorted(INTEGRATORS.items())))
-    show_table(console, "Population", ((kind, _sentence(member)) for kind, member in sorted(POPULATION.items())))
+    show_table(console, "Effects", ((kind, _first_sentence(effect)) for kind, effect in sorted(effects.items())))
+    show_table(console, "Behaviours", ((kind, _first_sentence(effect)) for kind, effect in sorted(BEHAVIOURS.items())))
+    show_table(console, "Arbitrations", ((kind, _first_sentence(how)) for kind, how in sorted(ARBITRATIONS.items())))
+    show_table(console, "Integrators", ((kind, _first_sentence(each)) for kind, each in sorted(INTEGRATORS.items())))
+    show_table(console, "Population", ((kind, _first_sentence(member)) for kind, member in sorted(POPULATION.items())))
     spaces = get_args(get_args(AnySpace)[0])
-    show_table(console, "Spaces", ((space.model_fields["kind"].default, _sentence(space)) for space in spaces))
+    show_table(console, "Spaces", ((space.model_fields["kind"].default, _first_sentence(space)) for space in spaces))
 
 
 @app.command()
@@ -214,12 +214,12 @@ def run(
     steps = whole_steps("--duration", duration, loaded.dt)
     usual = max(1, round(RECORDED_EVERY / loaded.dt))
     stride = usual if every is None else whole_steps("--every", every, loaded.dt, 1)
-    trajectory = _recorded(loaded, seed, steps, stride if path is not None else max(1, steps))
+    trajectory = _record(loaded, seed, steps, stride if path is not None else max(1, steps))
     console = new_console()
     _show_measures(console, trajectory)
     if path is not None:
         beside = trajectory.save(path)
-        console.print(f"{len(trajectory.step)} instants in {relative(path)}, summary in {relative(beside)}")
+        console.print(f"{len(trajectory.step)} instants in {relative_path(path)}, summary in {relative_path(beside)}")
     if trajectory.stopped:
         text = f"{trajectory.stopped}; results until {trajectory.last.time[0]:g} s are shown"
         raise EarlyEnd(text, INTERRUPTED if trajectory.stopped == "interrupted" else DIVERGED)
@@ -232,7 +232,7 @@ def render(
         typer.Argument(
             metavar="SCENE.yaml|TASK",
             help="A scene file, or a task from `flockenv list`.",
-            autocompletion=_task_or_file,
+            autocompletion=_complete_target,
         ),
     ],
     out: Annotated[str, typer.Option(metavar="X.gif|X.png|X.html", help="Output file; a PNG shows the end.")],
@@ -264,9 +264,9 @@ def render(
     if what in TASKS:
         if duration is not None:
             raise ValueError(f"--duration = {duration:g}: only for scenes; an episode of a task ends by itself")
-        (panels, fps), left = _episodes(TASKS[what](), player.split(","), seed, trust_pickle), ""
+        (panels, fps), left = _film_episodes(TASKS[what](), player.split(","), seed, trust_pickle), ""
     elif what.endswith((".yaml", ".yml")) or Path(what).exists():
-        panel, fps, left = _film(what, 10.0 if duration is None else duration, seed)
+        panel, fps, left = _film_scene(what, 10.0 if duration is None else duration, seed)
         panels = [panel]
     else:
         raise ValueError(
@@ -275,7 +275,7 @@ def render(
     with new_folder(path.parent):
         _write_picture(path, panels, what if what in TASKS else Path(what).stem, fps, size)
     end = max(panel.snapshots[-1].time for panel in panels)
-    new_console().print(f"{relative(path)}: {path.stat().st_size:,} bytes, {end:g} s{left}")
+    new_console().print(f"{relative_path(path)}: {path.stat().st_size:,} bytes, {end:g} s{left}")
 
 
 @app.command()
@@ -286,20 +286,21 @@ def explain(scene: SceneFile) -> None:
 
     loaded = load_scene(Path(scene))
     with progress_bar("compiling and timing", len(loaded.effects) + 2, "variants") as progress:
-        found = cost_breakdown.explain(loaded, progress=progress)
+        breakdown = cost_breakdown.explain(loaded, progress=progress)
     console = new_console()
-    rows = [(row.name, ", ".join(row.calls_for) or "nothing", str(row.cost)) for row in found.rows]
-    rows.append(("shared by several effects", "", str(found.shared)))
-    rows.append((found.remains, "", f"{found.rest:.3g}"))
-    title = f"One step of {loaded.agents:,} agents: {found.step:.3g} us"
+    rows = [(row.name, ", ".join(row.calls_for) or "nothing", str(row.cost)) for row in breakdown.rows]
+    rows.append(("shared by several effects", "", str(breakdown.shared)))
+    rows.append((breakdown.remains, "", f"{breakdown.rest:.3g}"))
+    title = f"One step of {loaded.agents:,} agents: {breakdown.step:.3g} us"
     show_table(console, title, rows, ("effect", "calls for", "costs us/step [95 % interval]"))
-    counted = (f"{number:g} {name.replace('_', ' ')}" for name, number in found.work.items())
-    console.print(f"Per step: {', '.join(counted)}")
-    console.print(f"Largest stable step: {found.largest_step}")
-    if found.shares:
-        shares = [(k, name, "-" if math.isnan(x) else f"{x:.3g}") for k, name, x in found.shares]
+    counts = (f"{number:g} {name.replace('_', ' ')}" for name, number in breakdown.work.items())
+    console.print(f"Per step: {', '.join(counts)}")
+    console.print(f"Largest stable step: {breakdown.largest_step}")
+    if breakdown.shares:
+        shares = [(k, name, "-" if math.isnan(x) else f"{x:.3g}") for k, name, x in breakdown.shares]
         show_table(console, "Mean share of each behaviour's steering granted", shares, ("effect", "behaviour", "share"))
-    show_table(console, "Left out, because nothing in the scene needs it", ([line] for line in found.left_out), [""])
+    left_out = ([line] for line in breakdown.left_out)
+    show_table(console, "Left out, because nothing in the scene needs it", left_out, [""])
 
 
 app.command()(measure)
@@ -318,7 +319,7 @@ def warmup(
             metavar="TASK|SCENE.yaml",
             help="What to compile.",
             show_default="every task",
-            autocompletion=_task_or_file,
+            autocompletion=_complete_target,
         ),
     ] = None,
     dtype: Annotated[
@@ -350,11 +351,11 @@ def warmup(
     with progress_bar("compiling", len(jobs), "kernels") as progress:
         for done, (name, job) in enumerate(jobs):
             progress(done)
-            before, began = len(compiled_kernels()), perf_counter()
+            before, start = len(compiled_kernels()), perf_counter()
             job()
-            took, new = perf_counter() - began, compiled_kernels()[before:]
+            seconds, new = perf_counter() - start, compiled_kernels()[before:]
             note = f"compiled in {sum(k.seconds for k in new):.1f} s" if new else "was in the cache"
-            rows.append((name, note, f"{took:.1f}"))
+            rows.append((name, note, f"{seconds:.1f}"))
     show_table(new_console(), "First steps", rows, ("of", "", "s"))
     if unapplied_patches():
         import numba
@@ -387,14 +388,14 @@ def schema() -> None:
     print(json.dumps(json_schema(), indent=2, allow_nan=False))
 
 
-def _sentence(kind: type) -> str:
+def _first_sentence(kind: type) -> str:
     """Return the first sentence of a class's docstring."""
     text = " ".join((kind.__doc__ or "").split("\n\n")[0].split())
     found = re.match(r".*?\.(?=\s+[A-Z]|$)", text)
     return found[0] if found else text
 
 
-def _recorded(scene: Scene, seed: int, steps: int, every: int) -> Trajectory:
+def _record(scene: Scene, seed: int, steps: int, every: int) -> Trajectory:
     from flockenv.studies.trajectory import record
 
     with progress_bar("simulating", steps, "steps", f"placing {scene.agents:,} agents, compiling") as progress:
@@ -415,18 +416,18 @@ def _show_measures(console: Console, trajectory: Trajectory) -> None:
     title = f"{scene.agents:,} agents, {int(trajectory.step[-1]):,} steps of {scene.dt:g} s, seed {trajectory.seed}"
     show_table(console, title, rows, ("measure", "t = 0 s", f"t = {time:g} s", "unit"))
     work = {"neighbour queries": "neighbour_queries", "candidate pairs": "pairs", "obstacle tests": "obstacle_tests"}
-    counted = ", ".join(f"{trajectory.last.count_of(name):,} {words}" for words, name in work.items())
-    counted += _unsolved(trajectory.last)
-    console.print(f"{text(trajectory.rate / 1e6)} million agent-steps/s ({trajectory.wall:.3g} s); {counted}")
+    counts = ", ".join(f"{trajectory.last.count_of(name):,} {words}" for words, name in work.items())
+    counts += _unsolved_text(trajectory.last)
+    console.print(f"{text(trajectory.rate / 1e6)} million agent-steps/s ({trajectory.wall:.3g} s); {counts}")
 
 
-def _unsolved(state: State) -> str:
+def _unsolved_text(state: State) -> str:
     """Return the number of contacts that a run left unsolved, to be appended to a line; "" if there are none."""
     count = state.count_of("unsolved")
     return f", {count:,} times contacts left unsolved" if count else ""
 
 
-def _film(file: str, duration: float, seed: int) -> tuple[Panel, float, str]:
+def _film_scene(file: str, duration: float, seed: int) -> tuple[Panel, float, str]:
     """Return the run of a scene as a panel, its frames per second, and the text about unsolved contacts."""
     from flockenv.render import Panel
     from flockenv.scene.yaml_io import load_scene
@@ -434,15 +435,15 @@ def _film(file: str, duration: float, seed: int) -> tuple[Panel, float, str]:
 
     scene = load_scene(Path(file))
     every = max(1, round(1.0 / (FPS * scene.dt)))
-    trajectory = _recorded(scene, seed, whole_steps("--duration", duration, scene.dt), every)
+    trajectory = _record(scene, seed, whole_steps("--duration", duration, scene.dt), every)
     if trajectory.stopped == "interrupted":
         raise KeyboardInterrupt
     snapshots = list(trajectory.snapshots(title=Path(file).stem))
     panel = Panel("", snapshots, None, trajectory.stopped)
-    return panel, 1.0 / (every * scene.dt), _unsolved(trajectory.last)
+    return panel, 1.0 / (every * scene.dt), _unsolved_text(trajectory.last)
 
 
-def _episodes(task: Task, players: Sequence[str], seed: int, trust_pickle: bool) -> tuple[list[Panel], float]:
+def _film_episodes(task: Task, players: Sequence[str], seed: int, trust_pickle: bool) -> tuple[list[Panel], float]:
     """Return an episode of the same world per player as something to draw, and frames per second."""
     from flockenv.evaluation import rollout
     from flockenv.players import load_player
@@ -474,21 +475,21 @@ def _write_picture(path: Path, panels: Sequence[Panel], title: str, fps: float, 
     if path.suffix.lower() == ".html":
         write_replay(path, [Group(title, list(panels))], title)
     elif path.suffix.lower() == ".png":
-        write_png(path, np.hstack([_last_frame(film, size // len(films), fps) for film in films]))
+        write_png(path, np.hstack([_draw_last_frame(film, size // len(films), fps) for film in films]))
     else:
         stride = math.ceil(fps / MOST_FPS)
-        frames = _frames([film[::stride] for film in films], size // len(films), fps / stride)
+        frames = _draw_frames([film[::stride] for film in films], size // len(films), fps / stride)
         write_gif(path, frames, fps / stride)
 
 
-def _last_frame(snapshots: Sequence[Snapshot], size: int, fps: float) -> Any:
+def _draw_last_frame(snapshots: Sequence[Snapshot], size: int, fps: float) -> Any:
     from flockenv.render import draw
 
     behind = max(TRAIL, 1 + math.ceil(fps * max((look.trail for look in snapshots[-1].looks), default=0.0)))
     return draw(snapshots[-1], size=size, trails=snapshots[-behind:-1])
 
 
-def _frames(films: Sequence[Sequence[Snapshot]], size: int, fps: float) -> Iterator[Any]:
+def _draw_frames(films: Sequence[Sequence[Snapshot]], size: int, fps: float) -> Iterator[Any]:
     """Draw the snapshots of several films side by side; a film that has ended shows its last snapshot."""
     import numpy as np
 

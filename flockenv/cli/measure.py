@@ -19,7 +19,7 @@ from flockenv.cli.terminal import (
     Seed,
     new_console,
     progress_bar,
-    relative,
+    relative_path,
     show_table,
 )
 from flockenv.core.errors import printable
@@ -84,29 +84,30 @@ def measure(
 
     loaded = load_scene(Path(scene))
     numbers = valid_file(json_file, [".json"], force, "--json") if json_file is not None else None
-    folder = _checked_folder(out, force) if out is not None else None
+    folder = _check_folder(out, force) if out is not None else None
     steps = whole_steps("--time", time, loaded.dt, 1)
     if not (math.isfinite(skip) and 0 <= skip < time):
         raise ValueError(f"--skip = {skip:g}: must be >= 0 and less than --time = {time:g}")
     stride = max(1, round(EVERY / loaded.dt)) if every is None else whole_steps("--every", every, loaded.dt, 1)
-    asked = Asked(_line(line), _area("--area", area, True), _area("--walkable", walkable, False), skip)
+    areas = _parse_area("--area", area, True), _parse_area("--walkable", walkable, False)
+    asked = Asked(_parse_line(line), *areas, skip)
     asked.check(loaded)
-    found, first = _surveyed(loaded, seed, seeds, steps, stride, asked)
-    means, above = combined(found), _above(found)
-    _show(loaded, found, means, above, first, stride)
+    found, first = _run_surveys(loaded, seed, seeds, steps, stride, asked)
+    means, above = combined(found), _compare_with_chance(found)
+    _show_tables(loaded, found, means, above, first, stride)
     if numbers is not None:
         _write_numbers(numbers, _summary(loaded, asked, found, means, above, first, stride))
     if folder is not None:
         with new_folder(folder):
-            drawn = _draw(folder, first, found, asked, Path(scene).stem)
-        new_console().print(f"{', '.join(drawn) or 'no pictures'} in {relative(folder)}")
+            drawn = _draw_pictures(folder, first, found, asked, Path(scene).stem)
+        new_console().print(f"{', '.join(drawn) or 'no pictures'} in {relative_path(folder)}")
     stopped = found[-1].stopped or ("interrupted" if len(found) < seeds else "")
     if stopped:
         text = f"{stopped}; results until then are shown"
         raise EarlyEnd(text, INTERRUPTED if stopped == "interrupted" else DIVERGED)
 
 
-def _surveyed(
+def _run_surveys(
     scene: Scene, seed: int, seeds: int, steps: int, stride: int, asked: Asked
 ) -> tuple[list[Survey], Trajectory]:
     """Run a scene with several seeds and measure each run; return the surveys, and the first run.
@@ -138,7 +139,7 @@ def _surveyed(
 PICTURES = ("flow_density.png", "lanes.png", "gaps.png", "space_time.png")
 
 
-def _checked_folder(text: str, force: bool) -> Path:
+def _check_folder(text: str, force: bool) -> Path:
     from flockenv.core.output_paths import valid_file, valid_path
 
     folder = valid_path(text)
@@ -149,7 +150,7 @@ def _checked_folder(text: str, force: bool) -> Path:
     return folder
 
 
-def _numbers(option: str, text: str) -> list[float]:
+def _parse_numbers(option: str, text: str) -> list[float]:
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:
@@ -159,29 +160,29 @@ def _numbers(option: str, text: str) -> list[float]:
     return numbers
 
 
-def _line(text: str | None) -> Any:
+def _parse_line(text: str | None) -> Any:
     import numpy as np
 
     if text is None:
         return None
-    numbers = _numbers("--line", text)
+    numbers = _parse_numbers("--line", text)
     if len(numbers) != 4 or numbers[:2] == numbers[2:]:
         raise ValueError(f"--line = {printable(text)}: must be the two ends of a line, X0,Y0,X1,Y1 in metres")
     return np.array(numbers).reshape(2, 2)
 
 
-def _area(option: str, text: str | None, is_convex: bool) -> Any:
+def _parse_area(option: str, text: str | None, is_convex: bool) -> Any:
     import numpy as np
 
     from flockenv.studies.measures.polygons import checked, rectangle
 
     if text is None:
         return None
-    corners = np.array(_numbers(option, text)).reshape(-1, 2)
+    corners = np.array(_parse_numbers(option, text)).reshape(-1, 2)
     return checked(option, rectangle(*corners) if len(corners) == 2 else corners, is_convex)
 
 
-def _above(found: Sequence[Survey]) -> dict[str, Above]:
+def _compare_with_chance(found: Sequence[Survey]) -> dict[str, Above]:
     """Return the comparison with chance of each measure in ABOVE_CHANCE that at least five runs have."""
     from flockenv.studies.measures import above_null
 
@@ -194,11 +195,11 @@ def _above(found: Sequence[Survey]) -> dict[str, Above]:
     return out
 
 
-def _text(value: float) -> str:
+def _format(value: float) -> str:
     return f"{value:.4g}" if math.isfinite(value) else "-"
 
 
-def _show(
+def _show_tables(
     scene: Scene, found: Sequence[Survey], means: dict[str, Mean], above: dict[str, Above], run: Trajectory, stride: int
 ) -> None:
     """Print the table of measures; for several runs, means with 95 % intervals."""
@@ -209,16 +210,16 @@ def _show(
     seeds = f"seed {run.seed}" if many == 1 else f"seeds {run.seed} to {run.seed + many - 1}: means and 95 % intervals"
     title = f"{scene.agents:,} agents, {float(run.last.time[0]):g} s, {kept}, {seeds}"
     if many == 1:
-        single = [(name, _text(mean.mean), UNITS[name]) for name, mean in means.items()]
+        single = [(name, _format(mean.mean), UNITS[name]) for name, mean in means.items()]
         show_table(console, title, single, ("measure", "value", ""))
         return
     rows = [
-        (name, _text(x.mean), f"{_text(x.low)} to {_text(x.high)}", f"{x.runs}", UNITS[name])
+        (name, _format(x.mean), f"{_format(x.low)} to {_format(x.high)}", f"{x.runs}", UNITS[name])
         for name, x in means.items()
     ]
     show_table(console, title, rows, ("measure", "mean", "95 %", "runs", ""))
     verdicts = [
-        (name, _text(x.excess), f"{_text(x.low)} to {_text(x.high)}", f"{x.runs}", "yes" if x.holds else "no")
+        (name, _format(x.excess), f"{_format(x.low)} to {_format(x.high)}", f"{x.runs}", "yes" if x.holds else "no")
         for name, x in above.items()
     ]
     if verdicts:
@@ -270,10 +271,10 @@ def _write_numbers(path: Path, summary: dict[str, Any]) -> None:
 
     with new_folder(path.parent), replace_file(path) as file:
         file.write((json.dumps(summary, indent=1, allow_nan=False) + os.linesep).encode())
-    new_console().print(f"numbers in {relative(path)}")
+    new_console().print(f"numbers in {relative_path(path)}")
 
 
-def _draw(folder: Path, run: Trajectory, found: Sequence[Survey], asked: Asked, name: str) -> list[str]:
+def _draw_pictures(folder: Path, run: Trajectory, found: Sequence[Survey], asked: Asked, name: str) -> list[str]:
     """Write the pictures that have data; return their names."""
     import numpy as np
 
@@ -292,7 +293,7 @@ def _draw(folder: Path, run: Trajectory, found: Sequence[Survey], asked: Asked, 
         alive = run.alive & np.isfinite(run.pos).all(axis=2)
         write_lanes(
             folder / PICTURES[1], run.pos, alive, found[0].way, (start.low, start.high),
-            f"{name}: trajectories (orange along {_pointing(found[0].axis)}, blue against it)",
+            f"{name}: trajectories (orange along {_direction_text(found[0].axis)}, blue against it)",
             solids, asked.line, asked.area,
         )  # fmt: skip
         drawn.append(PICTURES[1])
@@ -309,7 +310,7 @@ def _draw(folder: Path, run: Trajectory, found: Sequence[Survey], asked: Asked, 
     return drawn
 
 
-def _pointing(axis: Any) -> str:
+def _direction_text(axis: Any) -> str:
     """Return a direction as text: +x, +y, -x, -y, or its angle."""
     names = {(1.0, 0.0): "+x", (0.0, 1.0): "+y", (-1.0, 0.0): "-x", (0.0, -1.0): "-y"}
     plain = (float(axis[0]) + 0.0, float(axis[1]) + 0.0)

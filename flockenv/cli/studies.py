@@ -18,7 +18,7 @@ from flockenv.cli.terminal import (
     flush_output,
     new_console,
     progress_bar,
-    relative,
+    relative_path,
     show_table,
 )
 from flockenv.core import signals
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     Run = Callable[[Results | None, Callable[[int], None], Callable[[Results], None]], Results]
 
-__all__ = ["accuracy", "experiment", "gallery", "stored", "stress", "try_all", "write_numbers"]
+__all__ = ["accuracy", "experiment", "gallery", "read_findings", "run_trials", "stress", "write_numbers"]
 
 INTERRUPTED_LATER = "interrupted; results so far are shown"
 """Message about an interrupt after the first problem has been measured."""
@@ -81,31 +81,32 @@ def accuracy(
     from flockenv.physics.integrators import methods_of
     from flockenv.studies.accuracy import usual_methods
 
-    todo = _todo(scenes or (), suite, problems, seconds, steps, dts, seed)
-    aimed = _numbers("--tolerance", tolerance)
+    todo = _problem_makers(scenes or (), suite, problems, seconds, steps, dts, seed)
+    aimed = _parse_numbers("--tolerance", tolerance)
     path = valid_file(out, [".json", ".png"], force, beside=".json") if out is not None else None
-    chosen = methods_of(_words(methods)) if methods else usual_methods()
+    chosen = methods_of(_split_words(methods)) if methods else usual_methods()
     console = new_console()
 
-    reports, refused = _measured(todo, chosen, repetitions, finer, aimed, console, functools.partial(_keep, path))
+    write = functools.partial(_write_reports, path)
+    reports, refused = _measure_problems(todo, chosen, repetitions, finer, aimed, console, write)
     if path is not None and reports:
         if path.suffix.lower() == ".png":
             _draw_precision(reports, path)
-        console.print(f"{len(reports)} problems in {relative(path)}")
+        console.print(f"{len(reports)} problems in {relative_path(path)}")
     if len(reports) + refused < len(todo) or (reports and reports[-1].stopped):
         raise EarlyEnd(INTERRUPTED_LATER, INTERRUPTED)
     if not reports:
         raise ValueError("accuracy: no problem has a reference; each line gives the reason")
 
 
-def _keep(path: Path | None, reports: Sequence[Report]) -> None:
+def _write_reports(path: Path | None, reports: Sequence[Report]) -> None:
     from flockenv.studies.accuracy import Results
 
     if path is not None:
         write_numbers(path, Results(reports=tuple(reports)))
 
 
-def _todo(
+def _problem_makers(
     scenes: Sequence[str], suite: bool, problems: str, seconds: float | None, steps: str, dts: str, seed: int
 ) -> dict[str, Callable[[], Problem]]:
     """Return name or file -> function that makes the problem; ValueError for options that exclude each other."""
@@ -118,11 +119,11 @@ def _todo(
     if problems and not suite:
         raise ValueError("--problems: needs --suite")
     if suite:
-        return {each.name: functools.partial(_same, each) for each in problems_named(_words(problems))}
-    return {file: functools.partial(_problem, file, seconds, steps, dts, seed) for file in scenes}
+        return {each.name: functools.partial(_return_problem, each) for each in problems_named(_split_words(problems))}
+    return {file: functools.partial(_problem_of_scene, file, seconds, steps, dts, seed) for file in scenes}
 
 
-def _measured(
+def _measure_problems(
     todo: Mapping[str, Callable[[], Problem]], methods: Sequence[Integrator], repetitions: int, finer: int | None,
     tolerances: Sequence[float], console: Console, keep: Callable[[Sequence[Report]], None],
 ) -> tuple[list[Report], int]:  # fmt: skip
@@ -134,18 +135,18 @@ def _measured(
     from flockenv.studies.accuracy import measure
 
     reports: list[Report] = []
-    refused = 0
+    rejected = 0
     try:
         for name, problem in todo.items():
             try:
-                made = problem()
-                with progress_bar(f"measuring {made.name}", 100, "%") as progress:
-                    reports.append(measure(made, methods, repetitions, finer=finer, progress=progress))
+                current = problem()
+                with progress_bar(f"measuring {current.name}", 100, "%") as progress:
+                    reports.append(measure(current, methods, repetitions, finer=finer, progress=progress))
             except ValueError as error:
                 if len(todo) < 2:
                     raise
-                refused += 1
-                console.print(f"{_refusal(name, error)}\n", soft_wrap=True)
+                rejected += 1
+                console.print(f"{_error_line(name, error)}\n", soft_wrap=True)
                 continue
             keep(reports)
             _show_accuracy(console, reports[-1], tolerances)
@@ -157,10 +158,10 @@ def _measured(
         if not reports:
             raise
         keep(reports)
-    return reports, refused
+    return reports, rejected
 
 
-def _refusal(name: str, error: ValueError) -> str:
+def _error_line(name: str, error: ValueError) -> str:
     """Return the first line of an error, prefixed by the name of the problem."""
     first, *more = str(error).splitlines()
     where = "" if first.startswith(name) else f"{name}: "
@@ -182,11 +183,11 @@ def _show_accuracy(console: Console, report: Report, tolerances: Sequence[float]
     show_table(console, "The cheapest", ([line] for line in table.best(report, tolerances)), [""])
 
 
-def _same(problem: Problem) -> Problem:
+def _return_problem(problem: Problem) -> Problem:
     return problem
 
 
-def _problem(file: str, seconds: float | None, steps: str, dts: str, seed: int) -> Problem:
+def _problem_of_scene(file: str, seconds: float | None, steps: str, dts: str, seed: int) -> Problem:
     """Return the problem of a scene; by default with 8 step lengths, halved from 4 dt (or 2 dt, or dt) on."""
     from flockenv.scene.yaml_io import load_scene
     from flockenv.studies.accuracy import Problem
@@ -197,9 +198,9 @@ def _problem(file: str, seconds: float | None, steps: str, dts: str, seed: int) 
     if steps and dts:
         raise ValueError("--steps and --dts: both set the steps; give one of them")
     if steps:
-        counts = [int(n) if n == int(n) else n for n in _numbers("--steps", steps)]
+        counts = [int(n) if n == int(n) else n for n in _parse_numbers("--steps", steps)]
     elif dts:
-        counts = [whole_steps("--seconds", horizon, dt, 1) for dt in _numbers("--dts", dts)]
+        counts = [whole_steps("--seconds", horizon, dt, 1) for dt in _parse_numbers("--dts", dts)]
     else:
         usual = whole_steps("--seconds", horizon, loaded.dt, 1)
         coarsest = max(d for d in (1, 2, 4) if usual % d == 0)
@@ -207,7 +208,7 @@ def _problem(file: str, seconds: float | None, steps: str, dts: str, seed: int) 
     return Problem.of(loaded, horizon, counts, seed, name=Path(file).stem, title=Path(file).name)
 
 
-def _write(path: Path, numbers: Record, draw: Callable[[Path], None]) -> None:
+def _write_results(path: Path, numbers: Record, draw: Callable[[Path], None]) -> None:
     """Write results as JSON and, if `path` is a picture, draw them there: both files or neither."""
     from flockenv.core.atomic_files import write_all_or_none
 
@@ -227,7 +228,7 @@ def write_numbers(path: Path, numbers: Record) -> None:
         file.write((numbers.model_dump_json(indent=1) + "\n").encode())
 
 
-def stored(path: Path | None, what: str, sources: str) -> Results | None:
+def read_findings(path: Path | None, what: str, sources: str) -> Results | None:
     """Return the findings stored beside a path, None if there are none.
 
     Raise ValueError if the file has other content, or findings of another version of the sources.
@@ -247,7 +248,7 @@ def stored(path: Path | None, what: str, sources: str) -> Results | None:
     return found
 
 
-def try_all(what: str, count: int, path: Path | None, known: Results | None, run: Run) -> tuple[Results, bool]:
+def run_trials(what: str, count: int, path: Path | None, known: Results | None, run: Run) -> tuple[Results, bool]:
     """Run the trials that are not known yet, and write all results after each; return them, and True if interrupted."""
     found = known
 
@@ -278,14 +279,14 @@ def _draw_verdicts(results: Results, path: Path) -> None:
     write_verdicts(path, results)
 
 
-def _words(text: str) -> list[str]:
+def _split_words(text: str) -> list[str]:
     return [word.strip() for word in text.split(",") if word.strip()]
 
 
-def _numbers(option: str, text: str) -> list[float]:
+def _parse_numbers(option: str, text: str) -> list[float]:
     """Return comma-separated positive numbers; ValueError if the text is anything else."""
     try:
-        numbers = [float(word) for word in _words(text)]
+        numbers = [float(word) for word in _split_words(text)]
     except ValueError:
         numbers = []
     if not numbers or not all(math.isfinite(x) and x > 0 for x in numbers):
@@ -311,11 +312,11 @@ def stress(
     from flockenv.studies.stress import CASES, cases_named, fingerprint, run, trials, usual_methods
 
     path = valid_file(out, [".json", ".png"], True, beside=".json") if out is not None else None
-    todo = cases_named(CASES, _words(cases))
-    under = methods_of(_words(methods)) if methods else usual_methods()
+    todo = cases_named(CASES, _split_words(cases))
+    under = methods_of(_split_words(methods)) if methods else usual_methods()
     kinds = [method.kind for method in under]
-    known = None if force else stored(path, "hard cases", fingerprint())
-    found, stopped = try_all("hard cases", trials(todo, kinds), path, known, lambda *given: run(todo, under, *given))
+    known = None if force else read_findings(path, "hard cases", fingerprint())
+    found, stopped = run_trials("hard cases", trials(todo, kinds), path, known, lambda *given: run(todo, under, *given))
     asked = found.only({case.name for case in todo}, kinds)
     console = new_console()
     show_table(console, "Hard cases", asked.rows(), ("case", "scene", "bound", *asked.unders))
@@ -323,9 +324,9 @@ def stress(
         show_table(console, "Findings that did not pass", notes, ("case", "method", "", ""))
     show_table(console, "Verdicts", asked.legend())
     if path is not None:
-        _write(path, found, functools.partial(_draw_verdicts, found))
+        _write_results(path, found, functools.partial(_draw_verdicts, found))
         every = trials(CASES, [method.kind for method in usual_methods()])
-        console.print(f"{relative(path)} contains {len(found.findings)} of {every} findings")
+        console.print(f"{relative_path(path)} contains {len(found.findings)} of {every} findings")
     if stopped:
         raise EarlyEnd("interrupted; results so far are shown, the same command continues", INTERRUPTED)
 
@@ -353,8 +354,8 @@ def experiment(
     show_table(console, "Columns", results.columns.items())
     if path is not None:
         draw = write_trials if chosen.curve is None else write_order
-        _write(path, results, lambda picture: draw(picture, chosen, trials))
-        console.print(f"{len(results.cells)} trials in {relative(path)}")
+        _write_results(path, results, lambda picture: draw(picture, chosen, trials))
+        console.print(f"{len(results.cells)} trials in {relative_path(path)}")
 
 
 def gallery(
@@ -369,4 +370,4 @@ def gallery(
     path = valid_file(out, [".md"], force, beside="")
     with progress_bar("drawing", len(BEHAVIOURS), "behaviours") as advance:
         many = write_gallery(path, progress=advance)
-    new_console().print(f"{many} behaviours in {relative(path)}")
+    new_console().print(f"{many} behaviours in {relative_path(path)}")

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from rich.progress import Progress, Task
 
 __all__ = [
-    "BAD_INPUT", "DIVERGED", "INTERRUPTED", "OK", "EarlyEnd", "Force", "Seed", "complain", "flush_output",
-    "in_words", "interruptible", "naming_stdout", "new_console", "one_line", "printable", "program", "progress_bar",
-    "relative", "show_table", "shown_progress", "verdict",
+    "BAD_INPUT", "DIVERGED", "INTERRUPTED", "OK", "EarlyEnd", "Force", "Seed", "describe_error", "duration_text",
+    "flush_output", "handle_interrupt", "name_stdout_errors", "new_console", "print_error", "printable", "progress_bar",
+    "relative_path", "report_errors", "run_program", "show_progress", "show_table",
 ]  # fmt: skip
 
 OK, DIVERGED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -43,13 +43,13 @@ class EarlyEnd(Exception):  # noqa: N818  # not an error: the results so far are
         self.code = code
 
 
-def complain(name: str, text: str) -> None:
+def print_error(name: str, text: str) -> None:
     """Write lines to stderr, each prefixed by the name of the command."""
     for line in text.splitlines():
         print(f"{name}: {printable(line)}", file=sys.stderr)
 
 
-def verdict(error: Exception) -> tuple[str, int]:
+def describe_error(error: Exception) -> tuple[str, int]:
     """Return the text for an error in a command, and the exit code."""
     usage = getattr(error, "format_message", None)  # typer's own errors about the command line
     if usage is not None:
@@ -73,7 +73,7 @@ def _first_line(error: Exception) -> str:
 
 
 @contextmanager
-def interruptible(interrupted: str = "interrupted") -> Iterator[None]:
+def handle_interrupt(interrupted: str = "interrupted") -> Iterator[None]:
     """End a command that a signal interrupts with one line on stderr, and the exit code of the signal.
 
     interrupted: the line; a leading "interrupted" is replaced by the signal's own word.
@@ -88,23 +88,23 @@ def interruptible(interrupted: str = "interrupted") -> Iterator[None]:
 
 
 @contextmanager
-def one_line(name: str, interrupted: str = "interrupted", debug: bool = False) -> Iterator[None]:
+def report_errors(name: str, interrupted: str = "interrupted", debug: bool = False) -> Iterator[None]:
     """End a command with one line on stderr and an exit code if its input is invalid or a signal interrupts it.
 
-    interrupted: as for `interruptible`. debug: errors are raised unchanged.
+    interrupted: as for `handle_interrupt`. debug: errors are raised unchanged.
     """
-    with interruptible(interrupted), naming_stdout():
+    with handle_interrupt(interrupted), name_stdout_errors():
         try:
             yield
         except (ValueError, TypeError, OSError, MemoryError) as error:
             if debug:
                 raise
-            text, code = verdict(error) if isinstance(error, (OSError, MemoryError)) else (str(error), BAD_INPUT)
-            complain(name, " ".join(text.split()))
+            text, code = describe_error(error) if isinstance(error, (OSError, MemoryError)) else (str(error), BAD_INPUT)
+            print_error(name, " ".join(text.split()))
             raise typer.Exit(code) from None
 
 
-def program(name: str, app: typer.Typer, interrupted: str = "interrupted") -> None:
+def run_program(name: str, app: typer.Typer, interrupted: str = "interrupted") -> None:
     """Run an app as the main program of this process, and end the process with its exit code.
 
     interrupted: the line about an interrupt, unless the command itself sets another.
@@ -131,16 +131,16 @@ class _Output:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        with _named():
+        with _name_stdout():
             return self._stream.write(text)
 
     def flush(self) -> None:
-        with _named():
+        with _name_stdout():
             self._stream.flush()
 
 
 @contextmanager
-def _named() -> Iterator[None]:
+def _name_stdout() -> Iterator[None]:
     """Name standard output in an error; a broken pipe keeps its own text."""
     try:
         yield
@@ -153,7 +153,7 @@ def _named() -> Iterator[None]:
 
 
 @contextmanager
-def naming_stdout() -> Iterator[None]:
+def name_stdout_errors() -> Iterator[None]:
     """Make errors of standard output name it, for everything printed in the block."""
     with redirect_stdout(cast("TextIO", _Output(sys.stdout))) if sys.stdout is not None else nullcontext():
         yield
@@ -161,7 +161,7 @@ def naming_stdout() -> Iterator[None]:
 
 def flush_output() -> None:
     """Flush stdout; if that fails, raise an OSError that names it. A closed pipe is no error."""
-    with suppress(BrokenPipeError), _named():
+    with suppress(BrokenPipeError), _name_stdout():
         sys.stdout.flush()
 
 
@@ -192,7 +192,7 @@ def show_table(console: Console, title: str, rows: Iterable[Sequence[str]], colu
     console.print()
 
 
-def relative(path: Path) -> str:
+def relative_path(path: Path) -> str:
     """Return a path, relative to the current folder if it is below it."""
     here = Path.cwd().resolve()
     return str(path.relative_to(here) if path.is_relative_to(here) else path)
@@ -208,7 +208,7 @@ def progress_bar(title: str, total: int, unit: str, first: str = "compiling") ->
         TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total} " + unit),
         TimeElapsedColumn(), TextColumn("{task.fields[left]}"),
     )  # fmt: skip
-    with shown_progress(Progress(*columns, console=Console(stderr=True), transient=True)) as bar:
+    with show_progress(Progress(*columns, console=Console(stderr=True), transient=True)) as bar:
         task = bar.add_task(first, total=total, left="")
         clock = _Clock()
 
@@ -224,18 +224,18 @@ class _Clock:
     def __init__(self) -> None:
         self._since: tuple[float, int] | None = None
 
-    def left(self, done: int, total: float) -> str:
+    def remaining(self, done: int, total: float) -> str:
         """Return the remaining time in words, "" until some work is done."""
         now = time.monotonic()
         if self._since is None:
             self._since = now, done
-        began, first = self._since
+        start, first = self._since
         if done <= first or done >= total:
             return ""
-        return f"about {in_words((now - began) * (total - done) / (done - first))} left"
+        return f"about {duration_text((now - start) * (total - done) / (done - first))} left"
 
 
-def in_words(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     """Return a duration in its largest fitting unit: 40 s, 3 min, 5 h, 12 days, 2,000 years."""
     for unit, size, most in (("s", 1.0, 90.0), ("min", 60.0, 5400.0), ("h", 3600.0, 172800.0)):
         if seconds < most:
@@ -245,7 +245,7 @@ def in_words(seconds: float) -> str:
 
 
 @contextmanager
-def shown_progress(progress: Progress) -> Iterator[Progress]:
+def show_progress(progress: Progress) -> Iterator[Progress]:
     """Show bars on a terminal; otherwise write a line to stderr after FIRST seconds and then every OFTEN seconds."""
     if progress.console.is_terminal:
         with progress:
@@ -253,28 +253,28 @@ def shown_progress(progress: Progress) -> Iterator[Progress]:
         return
     progress.disable = True
     done = threading.Event()
-    teller = threading.Thread(target=_tell, args=(progress, done), daemon=True)
-    teller.start()
+    writer = threading.Thread(target=_write_progress, args=(progress, done), daemon=True)
+    writer.start()
     try:
         yield progress
     finally:
         done.set()
 
 
-def _tell(progress: Progress, done: threading.Event) -> None:
+def _write_progress(progress: Progress, done: threading.Event) -> None:
     """Write a line about each active bar at intervals, until `done` is set."""
     wait = FIRST
     while not done.wait(wait):
         wait = OFTEN
         for task in progress.tasks:
             if task.started and not task.finished:
-                print(_told(task), file=sys.stderr, flush=True)
+                print(_progress_line(task), file=sys.stderr, flush=True)
 
 
-def _told(task: Task) -> str:
+def _progress_line(task: Task) -> str:
     """Return one line about a bar: task, percentage done, elapsed time and remaining time."""
     share = f" {100 * task.completed / task.total:.3g} %" if task.total and task.completed else ""
-    more = [f"{in_words(task.elapsed or 0.0)} so far", *(str(text) for text in task.fields.values() if text)]
+    more = [f"{duration_text(task.elapsed or 0.0)} so far", *(str(text) for text in task.fields.values() if text)]
     if "left" not in task.fields and task.completed and task.time_remaining is not None:
-        more.append(f"about {in_words(task.time_remaining)} left")
+        more.append(f"about {duration_text(task.time_remaining)} left")
     return f"{task.description}:{share} ({', '.join(more)})"

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flockenv.cli.studies import stored, try_all, write_numbers
-from flockenv.cli.terminal import INTERRUPTED, EarlyEnd, Force, new_console, relative, show_table
+from flockenv.cli.studies import read_findings, run_trials, write_numbers
+from flockenv.cli.terminal import INTERRUPTED, EarlyEnd, Force, new_console, relative_path, show_table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -49,8 +49,8 @@ def validate(
     if scenes is not None:
         _write_scenes(scenes, force, todo, under)
         return
-    known = None if force else stored(path, "crowds", fingerprint())
-    found, stopped = try_all("crowds", trials(todo, under), path, known, lambda *given: run(todo, under, *given))
+    known = None if force else read_findings(path, "crowds", fingerprint())
+    found, stopped = run_trials("crowds", trials(todo, under), path, known, lambda *given: run(todo, under, *given))
     asked = found.only({case.name for case in todo}, set(under))
     if as_json:
         print(asked.model_dump_json(indent=1))
@@ -62,7 +62,7 @@ def validate(
     if path is not None:
         _write(path, found)
         if not as_json:
-            new_console().print(f"{relative(path)} contains {len(found.findings)} findings")
+            new_console().print(f"{relative_path(path)} contains {len(found.findings)} findings")
     if stopped:
         raise EarlyEnd("interrupted; results so far are shown, the same command continues", INTERRUPTED)
 
@@ -74,7 +74,7 @@ def _write_scenes(folder: str, force: bool, cases: Sequence[Case], presets: Sequ
 
     path = valid_path(folder, "--scenes")
     written = write_scenes(path, cases, presets, force)
-    new_console().print(f"{relative(path)} contains {len(written)} scenes")
+    new_console().print(f"{relative_path(path)} contains {len(written)} scenes")
 
 
 def _write(path: Path, results: Results) -> None:
