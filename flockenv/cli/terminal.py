@@ -213,7 +213,7 @@ def progress_bar(title: str, total: int, unit: str, first: str = "compiling") ->
         clock = _Clock()
 
         def update(done: int) -> None:
-            bar.update(task, completed=done, description=title, left=clock.left(done, total))
+            bar.update(task, completed=done, description=title, left=clock.remaining(done, total))
 
         yield update
 
