@@ -17,7 +17,7 @@ from flockenv.envs.common import Rows
 __all__ = ["by_turns"]
 
 
-class _Checked(BaseWrapper):  # type: ignore[misc]  # pettingzoo ships no types
+class _CheckedAEC(BaseWrapper):  # type: ignore[misc]  # pettingzoo ships no types
     """Rejects a bad action on its agent's turn, not later, when the last agent of the round acts.
 
     It also gives access to what PettingZoo's conversion hides behind a deprecation warning (the dictionaries of spaces)
@@ -69,7 +69,7 @@ def by_turns(env: parallel.WorldParallelEnv) -> AECEnv[str, Any, Any]:
 
     Actions out of [-1, 1] are clipped by the world, as in all other APIs, and not by a wrapper that warns.
     """
-    return OrderEnforcingWrapper(_Checked(parallel_to_aec_wrapper(env)))
+    return OrderEnforcingWrapper(_CheckedAEC(parallel_to_aec_wrapper(env)))
 
 
 def __getattr__(name: str) -> Callable[..., AECEnv[str, Any, Any]]:
@@ -77,10 +77,10 @@ def __getattr__(name: str) -> Callable[..., AECEnv[str, Any, Any]]:
     several = name.removesuffix("AECEnv")
     if several == name:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    made: type[parallel.WorldParallelEnv] = getattr(parallel, f"{several}ParallelEnv")
+    env_class: type[parallel.WorldParallelEnv] = getattr(parallel, f"{several}ParallelEnv")
 
     def env(max_cycles: int | None = None, render_mode: str | None = None, **parameters: Any) -> AECEnv[str, Any, Any]:
         """Make the turn-based environment (AEC); the parameters are those of the task."""
-        return by_turns(made(max_cycles, render_mode, **parameters))
+        return by_turns(env_class(max_cycles, render_mode, **parameters))
 
     return env

@@ -125,6 +125,6 @@ def class_of(base: type, suffix: str, name: str, team: bool = False) -> type:
         raise AttributeError(f"module {base.__module__!r} has no attribute {name!r}")
     fixed = info.parallel if team else info.single
     fields = {"info": info, "task_type": info.task_type(), "fixed": dict(fixed), "__module__": base.__module__}
-    made = type(base)(name, (base,), {**fields, "__doc__": info.team if team else info.summary})
-    setattr(sys.modules[base.__module__], name, made)
-    return made
+    cls = type(base)(name, (base,), {**fields, "__doc__": info.team if team else info.summary})
+    setattr(sys.modules[base.__module__], name, cls)
+    return cls

@@ -148,8 +148,8 @@ class MlpPolicy:
         except ValueError as error:
             raise ValueError(f"policy {printable_path(path)}: {error}") from None
         if policy.differences:
-            said, more = policy.differences[:MOST_SAID], len(policy.differences) - MOST_SAID
-            text = "; ".join([*said, *([f"and {more} more"] if more > 0 else [])])
+            differences, more = policy.differences[:MOST_SAID], len(policy.differences) - MOST_SAID
+            text = "; ".join([*differences, *([f"and {more} more"] if more > 0 else [])])
             warnings.warn(f"policy {printable_path(path)}: {text}", OtherTaskWarning, stacklevel=2)
         return policy
 

@@ -215,8 +215,8 @@ def _parse_scalar(text: str) -> str | int | float | bool | None:
     found = _NUMBER.fullmatch(text)
     if not found:
         return text
-    whole, digits = found["whole"] or "", text.replace("_", "")
-    if found["point"] is None and found["power"] is None and re.match("0[0-9]", whole):
+    integer_part, digits = found["whole"] or "", text.replace("_", "")
+    if found["point"] is None and found["power"] is None and re.match("0[0-9]", integer_part):
         raise ValueError(
             f"{printable(text)[1:-1]} begins with 0, which some read as octal: write {digits.lstrip('+-0') or 0}"
         )

@@ -373,7 +373,7 @@ class Evade(Task):
     def layout(self) -> Layout:
         """The observation; axes are the field's, and offsets are relative to the agent."""
         n, m = self.pursuers, self.slots
-        ways = "free path length of the body to the nearest cover in each direction, anticlockwise from the x axis"
+        paths = "free path length of the body to the nearest cover in each direction, anticlockwise from the x axis"
         seen = "offsets of the centres of the nearest obstacles, nearest surface first; zeros: empty slot"
         return Layout((
             Slot("velocity", (2,), self.evader_speed, "m/s", "own velocity (x, y)"),
@@ -386,7 +386,7 @@ class Evade(Task):
             Slot("seen", (n,), 1.0, "1", "1 if that pursuer sees the evader, else 0", low=0.0),
             Slot("cover", (m, 2), self.size, "m", seen),
             Slot("cover_radius", (m,), self.greatest_radius, "m", "their radii; 0: empty slot", low=0.0),
-            Slot("free_way", (self.rays,), self.way_sight, "m", ways, low=0.0),
+            Slot("free_way", (self.rays,), self.way_sight, "m", paths, low=0.0),
         ))  # fmt: skip
 
     @functools.cached_property

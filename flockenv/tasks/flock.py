@@ -520,7 +520,7 @@ class Flock(LastingTask):
     def layout(self) -> Layout:
         """The observation; every vector is (along the heading, to its left)."""
         n, m = self.neighbours, self.obstacles_seen
-        free_path = "free path length of the body to the nearest obstacle in each direction, anticlockwise from the heading"
+        paths = "free path length of the body to the nearest obstacle in each direction, anticlockwise from the heading"
         here = "1 for each neighbour, 0 for an empty slot, whose other numbers are also 0"
         crowding = "unit vectors towards them, times 1 - distance / spacing; 0 for a distance above the spacing"
         seen = "offsets of the centres of the nearest obstacles, nearest surface first; zeros: empty slot"
@@ -532,7 +532,7 @@ class Flock(LastingTask):
             Slot("crowding", (n, 2), 1.0, "1", crowding),
             Slot("obstacles", (m, 2), self.sight + self.greatest_radius, "m", seen),
             Slot("obstacle_radius", (m,), self.greatest_radius, "m", "their radii; 0: empty slot", low=0.0),
-            Slot("free_way", (self.rays,), self.sight, "m", free_path, low=0.0),
+            Slot("free_way", (self.rays,), self.sight, "m", paths, low=0.0),
         ))  # fmt: skip
 
     @functools.cached_property

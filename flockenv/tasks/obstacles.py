@@ -230,7 +230,7 @@ class Obstacles(Task):
     @functools.cached_property
     def layout(self) -> Layout:
         """The observation; axes are the field's, and offsets are relative to the agent."""
-        ways = "free path length of the body to the nearest obstacle in each direction, anticlockwise from the x axis"
+        paths = "free path length of the body to the nearest obstacle in each direction, anticlockwise from the x axis"
         seen = "offsets of the centres of the nearest obstacles, nearest surface first; zeros: empty slot"
         return Layout((
             Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (x, y)"),
@@ -240,7 +240,7 @@ class Obstacles(Task):
             Slot("obstacles", (self.slots, 2), self.sight + self.greatest_radius, "m", seen),
             Slot("obstacle_radius", (self.slots,), self.greatest_radius, "m", "their radii; 0: empty slot", low=0.0),
             Slot("clearance", (self.slots,), 1.0, "m", "gap between the bodies, at most 1 m; 0: empty slot"),
-            Slot("free_way", (self.rays,), self.sight, "m", ways, low=0.0),
+            Slot("free_way", (self.rays,), self.sight, "m", paths, low=0.0),
         ))  # fmt: skip
 
     @functools.cached_property

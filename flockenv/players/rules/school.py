@@ -84,6 +84,6 @@ def school(
     still = np.linalg.norm(see.velocity, axis=-1, keepdims=True) < 1e-6
     heading = np.where(still, ahead, see.velocity)
     roam = 2.0 * (wander(np.array([0.0, p.turn]), heading, p.pace * top, 1.0) + heading - see.velocity)
-    wishes = np.stack([inside, push, flight, join, eat, roam], axis=1)
-    force, _ = reconcile(_WHEN, wishes, task.fish_force, inner={"intention": selected})
+    forces = np.stack([inside, push, flight, join, eat, roam], axis=1)
+    force, _ = reconcile(_WHEN, forces, task.fish_force, inner={"intention": selected})
     return force, now
