@@ -279,7 +279,7 @@ def frame(world: World) -> list[Any]:
     decision, found, _ = world._scratch[0]  # those of the last world that was observed
     near, d = [*found[:-1], *[np.zeros(0)] * 3], scene.dimension
     if world.task.abreast:
-        own, near_vel, near_radius = decision.wide[:3]
+        own, near_vel, near_radius = decision.padded[:3]
         arrays[:2], arrays[5], body[0] = (own[:d], own[d : 2 * d]), own[2 * d + 1 :], own[2 * d]
         near[-3:] = found.pos, near_vel, near_radius[0]
     table = np.array(world.task.table())
@@ -778,7 +778,7 @@ def test_numbers_beyond_the_last_agent_make_no_difference(agents: int, dtype: st
     results = []
     for beyond in (0.0, np.nan):
         world = world_of(Flock(agents=agents, dtype=dtype, settling=0.0), worlds=3)
-        own, *near = world._scratch[0][0].wide[:3]
+        own, *near = world._scratch[0][0].padded[:3]
         near.append(world._scratch[0][1].pos)
         found = []
         for actions in random_actions(world, 5):
