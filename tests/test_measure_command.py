@@ -16,7 +16,7 @@ import flockenv.studies.measured_run
 import flockenv.studies.trajectory
 from flockenv.cli.main import main
 from flockenv.scene.yaml_io import load_scene
-from flockenv.studies.measured_run import UNITS, Asked, survey
+from flockenv.studies.measured_run import UNITS, Scope, survey
 from flockenv.studies.trajectory import record
 
 STREAMS = """\
@@ -205,9 +205,9 @@ def test_the_area_of_an_obstacle_does_not_count_for_the_density() -> None:
         "obstacles: [{kind: polygon, vertices: [[2, 0], [4, 0], [4, 4], [2, 4]]}]\ndt: 0.05\n"
     )
     run = record(load_scene(Path("half.yaml")), 0, 2, 1)
-    assert survey(run, Asked()).values["density"] == pytest.approx(1)  # 8 agents in 8 m^2 of walkable area
+    assert survey(run, Scope()).values["density"] == pytest.approx(1)  # 8 agents in 8 m^2 of walkable area
     left = np.array([(0, 0), (2, 0), (2, 4), (0, 4)], float)
-    assert survey(run, Asked(area=left)).values["density"] == pytest.approx(1)
+    assert survey(run, Scope(area=left)).values["density"] == pytest.approx(1)
 
 
 @pytest.mark.parametrize(
@@ -282,7 +282,7 @@ def test_the_pictures_and_scenes_of_the_page_on_measures_exist() -> None:
 
 def test_a_run_of_one_instant_has_density_and_lanes_but_no_flow() -> None:
     run = record(load_scene(Path("streams.yaml")), 0, 0, 1)
-    found = survey(run, Asked(line=np.array([(5.0, 0.0), (5.0, 4.0)]))).values
+    found = survey(run, Scope(line=np.array([(5.0, 0.0), (5.0, 4.0)]))).values
     assert found["density"] == pytest.approx(2)
     assert found["lanes"] == 1
     assert "flow" not in found

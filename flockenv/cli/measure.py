@@ -26,7 +26,7 @@ from flockenv.core.errors import printable
 
 if TYPE_CHECKING:
     from flockenv.scene import Scene
-    from flockenv.studies.measured_run import Asked, Survey
+    from flockenv.studies.measured_run import Scope, Survey
     from flockenv.studies.measures import Above, Mean
     from flockenv.studies.trajectory import Trajectory
 
@@ -79,7 +79,7 @@ def measure(
     from flockenv.core.atomic_files import new_folder
     from flockenv.core.output_paths import valid_file
     from flockenv.scene.yaml_io import load_scene
-    from flockenv.studies.measured_run import Asked, combined
+    from flockenv.studies.measured_run import Scope, mean_measures
     from flockenv.studies.trajectory import whole_steps
 
     loaded = load_scene(Path(scene))
@@ -90,10 +90,10 @@ def measure(
         raise ValueError(f"--skip = {skip:g}: must be >= 0 and less than --time = {time:g}")
     stride = max(1, round(EVERY / loaded.dt)) if every is None else whole_steps("--every", every, loaded.dt, 1)
     areas = _parse_area("--area", area, True), _parse_area("--walkable", walkable, False)
-    asked = Asked(_parse_line(line), *areas, skip)
+    asked = Scope(_parse_line(line), *areas, skip)
     asked.check(loaded)
     found, first = _run_surveys(loaded, seed, seeds, steps, stride, asked)
-    means, above = combined(found), _compare_with_chance(found)
+    means, above = mean_measures(found), _compare_with_chance(found)
     _show_tables(loaded, found, means, above, first, stride)
     if numbers is not None:
         _write_numbers(numbers, _summary(loaded, asked, found, means, above, first, stride))
@@ -108,7 +108,7 @@ def measure(
 
 
 def _run_surveys(
-    scene: Scene, seed: int, seeds: int, steps: int, stride: int, asked: Asked
+    scene: Scene, seed: int, seeds: int, steps: int, stride: int, asked: Scope
 ) -> tuple[list[Survey], Trajectory]:
     """Run a scene with several seeds and measure each run; return the surveys, and the first run.
 
@@ -174,12 +174,12 @@ def _parse_line(text: str | None) -> Any:
 def _parse_area(option: str, text: str | None, is_convex: bool) -> Any:
     import numpy as np
 
-    from flockenv.studies.measures.polygons import checked, rectangle
+    from flockenv.studies.measures.polygons import valid_polygon, rectangle
 
     if text is None:
         return None
     corners = np.array(_parse_numbers(option, text)).reshape(-1, 2)
-    return checked(option, rectangle(*corners) if len(corners) == 2 else corners, is_convex)
+    return valid_polygon(option, rectangle(*corners) if len(corners) == 2 else corners, is_convex)
 
 
 def _compare_with_chance(found: Sequence[Survey]) -> dict[str, Above]:
@@ -227,7 +227,7 @@ def _show_tables(
 
 
 def _summary(
-    scene: Scene, asked: Asked, found: Sequence[Survey], means: dict[str, Mean], above: dict[str, Above],
+    scene: Scene, asked: Scope, found: Sequence[Survey], means: dict[str, Mean], above: dict[str, Above],
     run: Trajectory, stride: int,
 ) -> dict[str, Any]:  # fmt: skip
     """Return all measurements, ready for JSON: undefined numbers are null, never NaN."""
@@ -274,7 +274,7 @@ def _write_numbers(path: Path, summary: dict[str, Any]) -> None:
     new_console().print(f"numbers in {relative_path(path)}")
 
 
-def _draw_pictures(folder: Path, run: Trajectory, found: Sequence[Survey], asked: Asked, name: str) -> list[str]:
+def _draw_pictures(folder: Path, run: Trajectory, found: Sequence[Survey], asked: Scope, name: str) -> list[str]:
     """Write the pictures that have data; return their names."""
     import numpy as np
 

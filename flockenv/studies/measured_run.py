@@ -14,10 +14,10 @@ from flockenv.geometry.space import Plane
 from flockenv.physics.population import Emitter
 from flockenv.scene import Scene
 from flockenv.studies import measures as m
-from flockenv.studies.measures.polygons import checked, contains, rectangle
+from flockenv.studies.measures.polygons import valid_polygon, contains, rectangle
 from flockenv.studies.trajectory import Trajectory
 
-__all__ = ["UNITS", "Asked", "Survey", "combined", "survey"]
+__all__ = ["UNITS", "Scope", "Survey", "mean_measures", "survey"]
 
 Floats = NDArray[np.float64]
 
@@ -77,7 +77,7 @@ UNITS = {
 
 
 @dataclass(frozen=True)
-class Asked:
+class Scope:
     """Where and when a run is measured."""
 
     line: Floats | None = None  # (2, 2) m
@@ -105,7 +105,7 @@ class Survey:
 
 
 def survey(
-    trajectory: Trajectory, asked: Asked, progress: Callable[[int], None] = lambda done: None
+    trajectory: Trajectory, asked: Scope, progress: Callable[[int], None] = lambda done: None
 ) -> Survey:  # fmt: skip
     """Return the measures of a run that make sense for its scene.
 
@@ -134,7 +134,7 @@ class _Run:
     """A run as the measures need it: with a first instant after the skipped time, and a walking direction."""
 
     scene: Scene
-    asked: Asked
+    asked: Scope
     time: Floats  # (T,) s, of all instants
     pos: NDArray[np.floating[Any]]  # (T, N, D)
     vel: NDArray[np.floating[Any]]
@@ -147,7 +147,7 @@ class _Run:
     high: Floats
 
     @classmethod
-    def of(cls, run: Trajectory, asked: Asked) -> _Run:
+    def of(cls, run: Trajectory, asked: Scope) -> _Run:
         """Return a trajectory with its walking direction; raise ValueError if a line or area is given in 3-D."""
         scene, time = run.scene, np.asarray(run.step * run.scene.dt, np.float64)
         asked.check(scene)
@@ -178,9 +178,9 @@ class _Run:
         """Return the walkable area, less static obstacles, and the measured area."""
         hollow = [s for s in self.scene.shapes if s.is_hollow and not s.moves]
         if self.asked.walkable is not None:
-            walk = checked("walkable", self.asked.walkable)
+            walk = valid_polygon("walkable", self.asked.walkable)
         elif len(hollow) == 1:
-            walk = checked("walkable", hollow[0].polygons(self.low, self.high)[0])
+            walk = valid_polygon("walkable", hollow[0].polygons(self.low, self.high)[0])
         else:
             walk = rectangle(self.low, self.high)
         solid = [s for s in self.scene.obstacles if not (s.is_hollow or s.moves)]
@@ -296,7 +296,7 @@ def _lanes(run: _Run) -> Part:
         return {}, {}
     at, across = run.instants(), np.array([-run.axis[1], run.axis[0]])
     pos, alive = np.asarray(run.pos[at], float), run.alive[at]
-    here = alive if run.area is None else alive & contains(checked("area", run.area), pos)
+    here = alive if run.area is None else alive & contains(valid_polygon("area", run.area), pos)
     seen = here.any(axis=0)
     both = (run.way[seen] > 0).any() and (run.way[seen] < 0).any()
     if not both or not _straight(run):
@@ -349,7 +349,7 @@ def _bodies(run: _Run) -> Part:
     return values, {}
 
 
-def combined(found: Sequence[Survey]) -> dict[str, m.Mean]:
+def mean_measures(found: Sequence[Survey]) -> dict[str, m.Mean]:
     """Return the mean of every measure over runs, with its 95 % interval."""
     names = [name for name in UNITS if any(name in each.values for each in found)]
     return {name: m.mean_of_runs([each.values.get(name, np.nan) for each in found]) for name in names}

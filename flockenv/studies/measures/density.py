@@ -13,7 +13,7 @@ from scipy.spatial import Voronoi
 from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 
-from flockenv.studies.measures.polygons import Corners, checked, contains, cut, rectangle
+from flockenv.studies.measures.polygons import Corners, valid_polygon, contains, cut, rectangle
 
 __all__ = ["Ground", "Room", "classical_density", "speed_in_area", "voronoi", "voronoi_density", "voronoi_speed"]
 
@@ -37,7 +37,7 @@ def classical_density(pos: ArrayLike, area: ArrayLike, alive: ArrayLike | None =
     pos (T, N, 2) m; area (n, 2) m, its corners; alive (T, N), default: all. With few agents it takes few values.
     Raises ValueError if the polygon is invalid. Source: Steffen & Seyfried 2010, Physica A 389, 1902, eq. 1.
     """
-    corners = checked("area", area)
+    corners = valid_polygon("area", area)
     inside = contains(corners, _flat(pos))
     if alive is not None:
         inside = inside & np.asarray(alive, np.bool_)
@@ -52,7 +52,7 @@ def speed_in_area(
     pos, vel (T, N, 2) m, m/s; along: a direction (2,); if given, the component of velocity along it replaces |v|.
     Raises ValueError if the polygon is invalid or the direction has length 0.
     """
-    inside = contains(checked("area", area), _flat(pos))
+    inside = contains(valid_polygon("area", area), _flat(pos))
     if alive is not None:
         inside = inside & np.asarray(alive, np.bool_)
     speed = np.linalg.norm(_flat(vel), axis=-1) if along is None else _flat(vel) @ _unit("along", along)
@@ -96,9 +96,9 @@ class Ground(NamedTuple):
         period: tuple[float, float] = (0.0, 0.0),
     ) -> Ground:  # fmt: skip
         """Return the ground of these polygons; see `voronoi` for the arguments and errors."""
-        walk = checked("walkable", walkable)
-        polygon = None if area is None else checked("area", area, is_convex=True)
-        solid = [checked(f"holes[{k}]", hole) for k, hole in enumerate(holes)]
+        walk = valid_polygon("walkable", walkable)
+        polygon = None if area is None else valid_polygon("area", area, is_convex=True)
+        solid = [valid_polygon(f"holes[{k}]", hole) for k, hole in enumerate(holes)]
         free = Polygon(walk).difference(_everywhere(solid, period))
         target = free if polygon is None else free.intersection(_everywhere([polygon], period))
         if not target.area > 0:

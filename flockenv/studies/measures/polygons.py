@@ -10,14 +10,14 @@ from numpy.typing import ArrayLike, NDArray
 from flockenv.core.errors import printable
 from flockenv.geometry.shapes.outlines import area, crossing
 
-__all__ = ["Corners", "checked", "contains", "convex", "cut", "rectangle"]
+__all__ = ["Corners", "valid_polygon", "contains", "is_convex_polygon", "cut", "rectangle"]
 
 Floats = NDArray[np.float64]
 Corners = list[tuple[float, float]]
 """A polygon while it is clipped: plain numbers, as there are many polygons of few corners."""
 
 
-def checked(name: str, polygon: ArrayLike, is_convex: bool = False) -> Floats:
+def valid_polygon(name: str, polygon: ArrayLike, is_convex: bool = False) -> Floats:
     """Return a polygon (n, 2), m, counter-clockwise; raise ValueError if it has no area or crosses itself."""
     vertices = np.asarray(polygon, np.float64)
     if vertices.ndim != 2 or vertices.shape[1:] != (2,) or len(vertices) < 3 or not np.isfinite(vertices).all():
@@ -25,7 +25,7 @@ def checked(name: str, polygon: ArrayLike, is_convex: bool = False) -> Floats:
     if area(vertices) == 0 or crossing(vertices) is not None:
         raise ValueError(f"{name} = {printable(vertices.tolist())}: must enclose an area, and its edges must not cross")
     vertices = vertices if area(vertices) > 0 else vertices[::-1].copy()
-    if is_convex and not convex(vertices):
+    if is_convex and not is_convex_polygon(vertices):
         raise ValueError(f"{name} = {printable(vertices.tolist())}: must be convex")
     return vertices
 
@@ -35,7 +35,7 @@ def rectangle(low: Sequence[float] | Floats, high: Sequence[float] | Floats) -> 
     return np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])], np.float64)
 
 
-def convex(polygon: Floats) -> bool:
+def is_convex_polygon(polygon: Floats) -> bool:
     """Return True if a counter-clockwise polygon (n, 2) is convex."""
     edges = np.roll(polygon, -1, axis=0) - polygon
     after = np.roll(edges, -1, axis=0)
