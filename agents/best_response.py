@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from agents.compare import blaming, field_of, split
+from agents.compare import blame, players_in_order, split
 from agents.experiment import load_experiment, one_line_errors
 from flockenv.cli.terminal import run_program, show_progress
 from flockenv.envs.world import Step, World
@@ -100,24 +100,25 @@ class Payoffs:
         """Return a line: the gain of one agent that changes its policy, and the gain if all agents change it."""
         a, b = sorted((a, b), key=lambda name: self.mean(name, name).value)
         into, back = self.gain(a, b), self.gain(b, a)
-        whole = compare(self.of[a, a], self.of[b, b]).difference
-        said = (
-            f"{a} among {b}: {_signed(into)} for one agent; {b} among {a}: {_signed(back)}; all {a}: {_signed(whole)}"
+        together = compare(self.of[a, a], self.of[b, b]).difference
+        gains = (
+            f"{a} among {b}: {_signed_text(into)} for one agent; {b} among {a}: {_signed_text(back)}; "
+            f"all {a}: {_signed_text(together)}"
         )
-        if into.low > 0 and back.high < 0 and whole.high < 0:
-            return f"{said}: a prisoner's dilemma, each agent does better with {a} and all together with {b}"
+        if into.low > 0 and back.high < 0 and together.high < 0:
+            return f"{gains}: a prisoner's dilemma, each agent does better with {a} and all together with {b}"
         if into.high < 0 and back.low > 0:
-            return f"{said}: {b} is the better answer to both"
+            return f"{gains}: {b} is the better answer to both"
         if into.high < 0 and back.high < 0:
-            return f"{said}: either is best among its own kind"
+            return f"{gains}: either is best among its own kind"
         if into.low > 0 and back.low > 0:
-            return f"{said}: either does better among the other kind"
+            return f"{gains}: either does better among the other kind"
         if into.low > 0 and back.high < 0:
-            return f"{said}: {a} is the better answer to both"
-        return f"{said}: not decided in these worlds"
+            return f"{gains}: {a} is the better answer to both"
+        return f"{gains}: not decided in these worlds"
 
 
-def _signed(interval: Interval) -> str:
+def _signed_text(interval: Interval) -> str:
     return f"{interval.value:+.2f} [{interval.low:+.2f}, {interval.high:+.2f}]"
 
 
@@ -149,7 +150,7 @@ def invade(
             def make(task: Task, worlds: int, limit: int, theirs: Callable[[Task], Policy] = theirs) -> Among:
                 return Among(task, worlds, limit, theirs(task))
 
-            with blaming(f"{one} among {others}", task):
+            with blame(f"{one} among {others}", task):
                 of[one, others] = rollout(task, mine(task), worlds, first, make_world=make)
             advance()
     return Payoffs(task.name, tuple(players), of)
@@ -178,7 +179,7 @@ def main(
     """Measure whether one agent gains by a policy other than that of all others in its world."""
     with one_line_errors():
         tasks = [load_experiment(config).build() for config in configs]
-        fields = [_makers(task, split(players), seed, trust_pickle) for task in tasks]
+        fields = [_policy_makers(task, split(players), seed, trust_pickle) for task in tasks]
         out = Console(highlight=False)
         if not out.is_terminal:
             out = Console(highlight=False, width=200)  # a pipe has no width
@@ -192,12 +193,14 @@ def main(
                 out.print(found.verdict(*pair), markup=False)
 
 
-def _makers(task: Task, asked: Sequence[str], seed: int, trust_pickle: bool) -> dict[str, Callable[[Task], Policy]]:
+def _policy_makers(
+    task: Task, names: Sequence[str], seed: int, trust_pickle: bool
+) -> dict[str, Callable[[Task], Policy]]:
     """Return the factory of each player of a task, by name; bad ones raise before any episode."""
-    specs = asked or [name for name in NAMES if name not in ("random", "textbook") and not other_tasks(name, task.name)]
+    specs = names or [name for name in NAMES if name not in ("random", "textbook") and not other_tasks(name, task.name)]
     makers = {
         player.name: functools.partial(player.policy, seed=seed, trust_pickle=trust_pickle)
-        for player in field_of(specs)
+        for player in players_in_order(specs)
     }
     for name, make in makers.items():
         for phrase in getattr(make(task), "differences", ()):

@@ -42,8 +42,8 @@ class CentralVecEnv(WorldVecEnv):
         mean = (observation * here).sum(axis=1) / np.maximum(left, 1)
         gone = world.steps[worlds, None] / (world.time_limit or world.task.horizon)
         shared = np.concatenate([mean, left / n, gone, world.memory[worlds, :, n:].reshape(count, -1)], axis=1)
-        whole = np.concatenate([observation, np.repeat(shared[:, None], n, axis=1)], axis=2, dtype=np.float32)
-        return whole.reshape(count * n, -1)
+        rows = np.concatenate([observation, np.repeat(shared[:, None], n, axis=1)], axis=2, dtype=np.float32)
+        return rows.reshape(count * n, -1)
 
 
 class _Extractor(MlpExtractor):

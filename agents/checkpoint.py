@@ -29,8 +29,19 @@ from flockenv.core.errors import printable, refusals
 from flockenv.core.record import Record
 
 __all__ = [
-    "FILE", "TIMES", "CheckpointError", "Damaged", "InUse", "KernelPlan", "as_json", "claimed", "digest", "from_json",
-    "path_in", "read", "write",
+    "FILE",
+    "TIMES",
+    "CheckpointError",
+    "CheckpointParts",
+    "Damaged",
+    "InUse",
+    "claim",
+    "digest",
+    "from_json",
+    "json_part",
+    "path_in",
+    "read",
+    "write",
 ]  # fmt: skip
 
 FILE, TIMES, JSON = "checkpoint.safetensors", "times", "json"
@@ -39,7 +50,7 @@ BEFORE = ("run.json", "policy.pt", "optimizer.pt", "best.npz")
 """The files of the format before this one: four that could be of different moments."""
 
 Tensors = dict[str, NDArray[Any]]
-KernelPlan = dict[str, Tensors]
+CheckpointParts = dict[str, Tensors]
 R = TypeVar("R", bound=Record)
 
 
@@ -64,7 +75,7 @@ def path_in(folder: Path) -> Path:
 
 
 @contextmanager
-def claimed(folder: Path) -> Iterator[None]:
+def claim(folder: Path) -> Iterator[None]:
     """Hold a folder, made if it is not there; InUse at once if another training holds it, in any process.
 
     What a killed process left half-written is removed; the lock of a killed process is free.
@@ -85,12 +96,12 @@ def claimed(folder: Path) -> Iterator[None]:
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
-def as_json(content: Any) -> Tensors:
+def json_part(content: Any) -> Tensors:
     """Return a part that holds JSON."""
     return {JSON: np.frombuffer(json.dumps(content, allow_nan=False).encode(), np.uint8)}
 
 
-def write(folder: Path, parts: KernelPlan) -> None:
+def write(folder: Path, parts: CheckpointParts) -> None:
     """Write a checkpoint, which takes the place of the one before when all of it is on the disk."""
     digests = {part: _digest(tensors) for part, tensors in parts.items()}
     tensors = {f"{part}/{name}": np.asarray(t, order="C") for part, named in parts.items() for name, t in named.items()}
@@ -99,7 +110,7 @@ def write(folder: Path, parts: KernelPlan) -> None:
         file.write(data)
 
 
-def digest(parts: KernelPlan) -> str:
+def digest(parts: CheckpointParts) -> str:
     """Return the SHA-256 of all that a checkpoint holds, but for the part `times`."""
     each = [f"{part} {_digest(tensors)}" for part, tensors in sorted(parts.items()) if part != TIMES]
     return hashlib.sha256("\n".join(each).encode()).hexdigest()
@@ -116,7 +127,7 @@ def _digest(tensors: Mapping[str, NDArray[Any]]) -> str:
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
-def read(folder: Path, largest: int) -> KernelPlan | None:
+def read(folder: Path, largest: int) -> CheckpointParts | None:
     """Return the parts of a folder's checkpoint, each with the digest that was recorded; None if there is none.
 
     largest: bytes; a larger file is not read.
@@ -136,14 +147,14 @@ def read(folder: Path, largest: int) -> KernelPlan | None:
         if (size := path.stat().st_size) > largest:
             raise Damaged(folder, f"{FILE} has {size:,} bytes, one of this training has at most {largest:,}")
         with safe_open(path, "numpy") as file:
-            recorded, parts = _recorded(file.metadata() or {}, folder), _parts(file, folder)
+            recorded, parts = _recorded_digests(file.metadata() or {}, folder), _parts(file, folder)
     except (SafetensorError, OSError, TypeError, KeyError) as error:
         raise Damaged(folder, f"{FILE}: {' '.join(str(error).split())}") from None
     _compare(parts, recorded, folder)
     return parts
 
 
-def _recorded(metadata: Mapping[str, str], folder: Path) -> dict[str, str]:
+def _recorded_digests(metadata: Mapping[str, str], folder: Path) -> dict[str, str]:
     """Return the digests that a header names."""
     if metadata.get("format") != FORMAT:
         raise Damaged(folder, f"header: format = {printable(metadata.get('format'))}, must be {FORMAT!r}")
@@ -156,8 +167,8 @@ def _recorded(metadata: Mapping[str, str], folder: Path) -> dict[str, str]:
     return digests
 
 
-def _parts(file: Any, folder: Path) -> KernelPlan:
-    parts: KernelPlan = {}
+def _parts(file: Any, folder: Path) -> CheckpointParts:
+    parts: CheckpointParts = {}
     for name in file.keys():  # noqa: SIM118  # not a dictionary
         part, slash, rest = name.partition("/")
         if not slash or not rest:
@@ -166,7 +177,7 @@ def _parts(file: Any, folder: Path) -> KernelPlan:
     return parts
 
 
-def _compare(parts: KernelPlan, recorded: Mapping[str, str], folder: Path) -> None:
+def _compare(parts: CheckpointParts, recorded: Mapping[str, str], folder: Path) -> None:
     """Refuse a part that is missing, unknown, or not what its digest was taken of; one without tensors is there."""
     for part in sorted({*recorded, *parts}):
         if part not in recorded:
@@ -175,13 +186,13 @@ def _compare(parts: KernelPlan, recorded: Mapping[str, str], folder: Path) -> No
             raise Damaged(folder, f"{part}: its SHA-256 is not the recorded one")
 
 
-def from_json(kind: type[R], parts: KernelPlan, part: str, folder: Path) -> R:
+def from_json(kind: type[R], parts: CheckpointParts, part: str, folder: Path) -> R:
     """Return the record that a part holds in JSON, read strictly; Damaged, with the key, if it is not of that kind."""
     tensors = parts.get(part, {})
     if tensors.keys() != {JSON} or tensors[JSON].dtype != np.uint8:
         raise Damaged(folder, f"{part}: must be one tensor of bytes, {part}/{JSON}")
     try:
-        data = json.loads(tensors[JSON].tobytes(), parse_constant=_constant)
+        data = json.loads(tensors[JSON].tobytes(), parse_constant=_refuse_constant)
         return kind.model_validate_json(tensors[JSON].tobytes(), strict=True)
     except ValidationError as error:
         raise Damaged(folder, f"{part}: {next(iter(refusals(error, kind, data)), 'not what it must be')}") from None
@@ -189,5 +200,5 @@ def from_json(kind: type[R], parts: KernelPlan, part: str, folder: Path) -> R:
         raise Damaged(folder, f"{part}: is not JSON: {' '.join(str(error).split())}") from None
 
 
-def _constant(text: str) -> float:
+def _refuse_constant(text: str) -> float:
     raise ValueError(f"{text} is not a number of JSON's" if math.isnan(float(text)) else f"{text} is not finite")

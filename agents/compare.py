@@ -39,8 +39,19 @@ from flockenv.players.rules import load_tuned
 from flockenv.tasks import TASKS, Task
 
 __all__ = [
-    "Player", "app", "blaming", "compare", "experiment_of", "field_of", "folder_of", "pick", "players_of", "provenance",
-     "split", "usual_players", "write_text",
+    "Player",
+    "app",
+    "blame",
+    "compare",
+    "experiment_of",
+    "folder_of",
+    "pick",
+    "players_in_order",
+    "players_of",
+    "provenance",
+    "split",
+    "usual_players",
+    "write_text",
 ]  # fmt: skip
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -78,7 +89,7 @@ class Player:
 
     def policy(self, task: Task, seed: int, trust_pickle: bool = False) -> Policy:
         """Return it, ready to play a task; ValueError: one line that names it."""
-        with blaming(self.name, task, ValueError), warnings.catch_warnings():
+        with blame(self.name, task, ValueError), warnings.catch_warnings():
             warnings.simplefilter("ignore", OtherTaskWarning)  # the results say what differs
             return load_player(self.spec, task, seed, trust_pickle)
 
@@ -108,7 +119,7 @@ def compare(
         for task in tasks
     }
     jobs = [_Job(task, fields[task.name], worlds, seed, resamples, trust_pickle) for task in tasks]
-    played = dict(zip((task.name for task in tasks), _all(jobs, plays, advance), strict=True))
+    played = dict(zip((task.name for task in tasks), _play_all(jobs, plays, advance), strict=True))
     episodes = {name: each for name, (each, _) in played.items()}
     results: report.Results = {
         "seed": seed,
@@ -168,15 +179,15 @@ class _Job:
 Played = tuple[dict[str, Episodes], report.Results]
 
 
-def _all(jobs: Sequence[_Job], plays: Plays, advance: Advance) -> Iterator[Played]:
+def _play_all(jobs: Sequence[_Job], plays: Plays, advance: Advance) -> Iterator[Played]:
     """Yield what came of every job: worked off side by side, a process for each core, where that is worth a process."""
     cores = min(os.cpu_count() or 1, len(jobs))
     if cores < 2 or jobs[0].worlds < WORLDS:
         return (_play(job, plays[job.task.name], advance) for job in jobs)
-    return side_by_side(_work, jobs, cores, advance)
+    return side_by_side(_play_in_process, jobs, cores, advance)
 
 
-def _work(job: _Job, tell: Tell) -> Played:
+def _play_in_process(job: _Job, tell: Tell) -> Played:
     """Do a job in a process that plays for another one; the players are made anew from what was asked for."""
     last = [0.0]
 
@@ -199,7 +210,7 @@ def _play(job: _Job, policies: Mapping[str, Policy], advance: Advance) -> Played
         def progress(done: int, most: int, name: str = name) -> None:
             advance(task.name, name, done, most)
 
-        with blaming(name, task):
+        with blame(name, task):
             episodes[name] = rollout(task, policy, job.worlds, job.first, record=RECORDED, progress=progress)
     costs = _costs(task, policies)
     differences = {name: getattr(policy, "differences", ()) for name, policy in policies.items()}
@@ -207,7 +218,7 @@ def _play(job: _Job, policies: Mapping[str, Policy], advance: Advance) -> Played
 
 
 @contextmanager
-def blaming(player: str, task: Task, *clear: type[Exception]) -> Iterator[None]:
+def blame(player: str, task: Task, *clear: type[Exception]) -> Iterator[None]:
     """Name the player and the task in an error that its `predict` raises, or its actions cause, unless it is `clear`.
 
     A PlayerError names the file already; the task is added.
@@ -287,7 +298,7 @@ def main(
     with report_errors("compare", "interrupted, nothing written", debug):
         folder = folder_of(out, FILES)
         chosen = [experiment_of(name).build() for name in pick("--tasks", split(tasks) or list(TASKS), TASKS)]
-        field = field_of(split(players) or usual_players(chosen))
+        field = players_in_order(split(players) or usual_players(chosen))
         count = worlds if worlds is not None else SMOKE_WORLDS if smoke else WORLDS
         if not 2 <= count <= WORLDS_PER_SEED:
             raise ValueError(f"--worlds {count}: must be from 2 to {WORLDS_PER_SEED}")
@@ -295,7 +306,7 @@ def main(
         with _bars(chosen, len(field)) as advance:
             results, episodes = compare(chosen, field, count, seed, resamples, trust_pickle, advance)
         results["smoke"] = smoke
-        write_all_or_none(folder, _files(results, episodes))
+        write_all_or_none(folder, _file_writers(results, episodes))
     _show(results, folder)
 
 
@@ -324,7 +335,7 @@ def pick(option: str, names: Sequence[str], allowed: Mapping[str, object]) -> li
     return list(dict.fromkeys(names))
 
 
-def field_of(specs: Sequence[str]) -> list[Player]:
+def players_in_order(specs: Sequence[str]) -> list[Player]:
     """Return the players in the order of the tables: the known ones from the least, then files as they were given."""
     field = [Player.of(spec) for spec in dict.fromkeys(specs)]
     names = [player.name for player in field]
@@ -357,7 +368,7 @@ def _bars(tasks: Sequence[Task], players: int) -> Iterator[Advance]:
             progress.update(bars[task.name], completed=players * task.horizon)
 
 
-def _files(
+def _file_writers(
     results: report.Results, episodes: Mapping[str, Mapping[str, Episodes]]
 ) -> dict[str, Callable[[Path], None]]:
     """Return the writer of each file."""
@@ -378,7 +389,7 @@ def write_text(path: Path, text: str) -> None:
 def _draw(path: Path, results: report.Results, episodes: Mapping[str, Mapping[str, Episodes]]) -> None:
     from flockenv.evaluation.plots import write_chart
 
-    columns = [report.column(task, about, episodes[task]) for task, about in results["tasks"].items()]
+    columns = [report.chart_column(task, about, episodes[task]) for task, about in results["tasks"].items()]
     note = f"{results['worlds']} worlds per task, the same for every player; level differences are grey"
     write_chart(path, columns, "Hand-written steering against learning", note)
 
@@ -387,14 +398,14 @@ def _replay(path: Path, results: report.Results, episodes: Mapping[str, Mapping[
     from flockenv.render.replay import Group, Panel, write_replay
 
     groups = [
-        Group(task, [Panel(name, *_film(played)) for name, played in players.items()])
+        Group(task, [Panel(name, *_replay_parts(played)) for name, played in players.items()])
         for task, players in episodes.items()
     ]
     first = results["world_seeds"]["first"] + RECORDED
     write_replay(path, groups, f"The same world under each player (seed {first})")
 
 
-def _film(played: Episodes) -> tuple[Any, ...]:
+def _replay_parts(played: Episodes) -> tuple[Any, ...]:
     """Return what a replay shows of an episode: instants, return so far, and how it ended."""
     recording = played.recording
     assert recording is not None  # every rollout here is recorded

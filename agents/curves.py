@@ -57,16 +57,16 @@ def label(name: str, p: PpoSettings) -> str:
     return f"{name}: {p.epochs} epoch{'s' * (p.epochs > 1)}, minibatch {p.minibatch:,}, rate {p.learning_rate:g}"
 
 
-def learned(experiment: Experiment, name: str, runs: Path) -> Curve:
+def learning_curve(experiment: Experiment, name: str, runs: Path) -> Curve:
     """Return the curve of one setting: read where training is finished, else trained to the end."""
     from agents import ppo  # with torch
-    from agents.run import OtherRecipe, checkpointed
+    from agents.run import OtherRecipe, load_checkpoint
 
     p = experiment.settings()[name]
     wanted, folder = experiment.model_copy(update={"ppo": p}), runs / experiment.task / name
     run, how = None, "begins"
     try:
-        run = checkpointed(wanted, folder)
+        run = load_checkpoint(wanted, folder)
     except OtherRecipe as other:
         how = f"begins anew ({other})"
     if run is None or run.steps < p.steps:
@@ -76,12 +76,12 @@ def learned(experiment: Experiment, name: str, runs: Path) -> Curve:
     return run.curve
 
 
-def measured(experiment: Experiment, runs: Path) -> Numbers:
+def measure_task(experiment: Experiment, runs: Path) -> Numbers:
     """Return what there is to show of a task, once all of its settings are trained."""
     rules = load_tuned(experiment.task).found.get("tuning_mean")
     rows = {}
     for name, p in experiment.settings().items():
-        curve = learned(experiment, name, runs)
+        curve = learning_curve(experiment, name, runs)
         past = next((point["seconds"] for point in curve if rules is not None and point["mean"] > rules), None)
         rows[name] = {"ppo": p.model_dump(mode="json"), "past_the_rules_s": past, "curve": curve}
     return {"rules": rules, "settings": rows}
@@ -143,7 +143,7 @@ def main(
         check_room(picture, ROOM)
     stays = f"interrupted; what is trained stays in {runs}, the same command goes on"
     with report_errors("curves", stays), one_line_errors((FloatingPointError,)):
-        tasks = {task: measured(experiment, folder) for task, experiment in experiments.items()}
+        tasks = {task: measure_task(experiment, folder) for task, experiment in experiments.items()}
         write_all_or_none(picture.parent, {
             picture.name: lambda path: draw(path, tasks),
             picture.with_suffix(".json").name: lambda path: path.write_bytes(json.dumps(tasks).encode()),
@@ -152,8 +152,8 @@ def main(
         for name, row in numbers["settings"].items():
             last, past = row["curve"][-1], row["past_the_rules_s"]
             text = f"past the rules after {past:.0f} s" if past is not None else "not past the rules"
-            said = f"{task:10} {name:28} {last['seconds']:6.0f} s  {text}; ends at {last['mean']:.3f}"
-            console.print(said, markup=False, highlight=False)
+            line = f"{task:10} {name:28} {last['seconds']:6.0f} s  {text}; ends at {last['mean']:.3f}"
+            console.print(line, markup=False, highlight=False)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from flockenv.evaluation import worlds_for
 from flockenv.players.rules import RulesPlayer
 from flockenv.tasks import Task
 
-__all__ = ["shown", "teach"]
+__all__ = ["collect_answers", "teach"]
 
 Answers = Callable[[torch.Tensor], torch.Tensor]
 
@@ -22,7 +22,7 @@ MINIBATCH, RATE = 2048, 2e-3
 WORLDS, ROUNDS = 96, 4
 
 
-def shown(
+def collect_answers(
     task: Task, rules: RulesPlayer, worlds: int, actor: Answers | None = None, first: int = 0
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the observations of one episode in each of some training worlds, (rows, size), and the rules' actions.
@@ -30,11 +30,11 @@ def shown(
     actor: the acting policy (default: the rules). first: the number of training worlds before these.
     """
     world, state = World(task, worlds, task.horizon), None
-    seen = world.reset(worlds_for("training", 0, first + worlds) + first)
+    observation = world.reset(worlds_for("training", 0, first + worlds) + first)
     playing, begins = np.ones((worlds, task.learners), np.bool_), True
     rows, answers = [], []
     while playing.any():
-        given = seen.reshape(-1, task.layout.size)
+        given = observation.reshape(-1, task.layout.size)
         actions, state = rules.predict(given, state, np.full(len(given), begins))
         rows.append(given[playing.ravel()])
         answers.append(np.asarray(actions, np.float32)[playing.ravel()])
@@ -42,7 +42,7 @@ def shown(
             with torch.no_grad():
                 actions = actor(torch.from_numpy(given)).numpy()
         step = world.step(actions.reshape(worlds, task.learners, -1))
-        seen, begins = step.observation, False
+        observation, begins = step.observation, False
         playing &= ~(step.terminated | step.truncated[:, None])
     return torch.from_numpy(np.concatenate(rows)), torch.from_numpy(np.concatenate(answers))
 
@@ -64,18 +64,18 @@ def teach(
     def answer(rows: torch.Tensor) -> torch.Tensor:
         return _finite_answers(model, rows)
 
-    rows, answers = shown(task, rules, worlds)
+    rows, answers = collect_answers(task, rules, worlds)
     optimiser = torch.optim.Adam(model.policy.parameters(), RATE)
     loss = torch.zeros(())
     begins = {-(-updates * turn // ROUNDS): turn for turn in range(1, ROUNDS)}
     for k in range(updates):
         if k in begins:
-            met = shown(task, rules, worlds, answer, first=worlds * begins[k])
-            rows, answers = torch.cat([rows, met[0]]), torch.cat([answers, met[1]])
+            more = collect_answers(task, rules, worlds, answer, first=worlds * begins[k])
+            rows, answers = torch.cat([rows, more[0]]), torch.cat([answers, more[1]])
         for group in optimiser.param_groups:
             group["lr"] = RATE * (1.0 - 0.95 * k / updates)
-        some = torch.randint(len(rows), (MINIBATCH,))
-        loss = ((answer(rows[some]) - answers[some]) ** 2).mean()
+        batch = torch.randint(len(rows), (MINIBATCH,))
+        loss = ((answer(rows[batch]) - answers[batch]) ** 2).mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

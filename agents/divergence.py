@@ -1,4 +1,4 @@
-"""Learning that is no longer finite: found where it happens, and named by world, learner, decision and quantity."""
+"""Checks of a training for NaN and infinity; errors name the world, learner, decision and quantity."""
 
 from __future__ import annotations
 
@@ -13,38 +13,41 @@ from flockenv.tasks import Task
 
 __all__ = ["LearningDiverged", "check_answers", "check_model", "check_step"]
 
-Told = tuple[NDArray[Any], NDArray[Any], NDArray[Any], list[dict[str, Any]]]
-"""What a VecEnv returns of a step: observations, rewards, dones, infos."""
+StepResult = tuple[NDArray[Any], NDArray[Any], NDArray[Any], list[dict[str, Any]]]
+"""Result of a VecEnv's step: observations, rewards, dones, infos."""
 
 
 class LearningDiverged(FloatingPointError):  # noqa: N818  # as SimulationDiverged
     """A reward, an observation, a loss or a weight is NaN or infinite."""
 
 
-def check_step(task: Task, told: Told, decisions: NDArray[np.int64]) -> Told:
-    """Return what a step of all rows told, if all of it is finite.
+def check_step(task: Task, result: StepResult, decisions: NDArray[np.int64]) -> StepResult:
+    """Return the result of a step unchanged, if all its observations and rewards are finite.
 
-    decisions: (B,), how many each world's episode had before the step.
+    decisions: (B,), number of decisions in the episode of each world before this step.
 
     Raises:
-        LearningDiverged: it names the first world, learner and quantity that are not, and the decision.
+        LearningDiverged: with the first world, learner and quantity that is not finite, and the decision.
     """
-    observation, reward, done, infos = told
-    with np.errstate(all="ignore"):  # one sum is NaN or infinite if a number is; it may be too when all are finite
-        whole = np.isfinite(observation.sum() + reward.sum())
-    if not whole:
-        _name_row(task, "reward", reward[:, None], decisions)
-        _name_row(task, "observation", observation, decisions)
+    observation, reward, done, infos = result
+    with np.errstate(all="ignore"):  # if a number is not finite, this sum is not; the reverse need not hold
+        is_finite = np.isfinite(observation.sum() + reward.sum())
+    if not is_finite:
+        _check_rows(task, "reward", reward[:, None], decisions)
+        _check_rows(task, "observation", observation, decisions)
     if done.any():
         last = [(row, info["terminal_observation"]) for row, info in enumerate(infos) if "terminal_observation" in info]
-        for row, seen in last:
-            if not np.isfinite(seen).all():
-                _name_row(task, "observation at the end", seen[None], decisions, row)
-    return told
+        for row, final in last:
+            if not np.isfinite(final).all():
+                _check_rows(task, "observation at the end", final[None], decisions, row)
+    return result
 
 
-def _name_row(task: Task, quantity: str, rows: NDArray[Any], decisions: NDArray[np.int64], first: int = 0) -> None:
-    """Raise LearningDiverged if a number of rows (R, K) is not finite; `first` is the row that the first of them is."""
+def _check_rows(task: Task, quantity: str, rows: NDArray[Any], decisions: NDArray[np.int64], first: int = 0) -> None:
+    """Raise LearningDiverged if one of these rows, (R, K), has a number that is not finite.
+
+    first: index of the first of these rows among the rows of all worlds.
+    """
     bad = np.argwhere(~np.isfinite(rows))
     if len(bad):
         at, column = (int(k) for k in bad[0])
@@ -57,7 +60,7 @@ def _name_row(task: Task, quantity: str, rows: NDArray[Any], decisions: NDArray[
 
 
 def _slot(task: Task, column: int) -> str:
-    """Return the name of the slot that a number of a row is in; beyond them is what only a critic is shown."""
+    """Return the name of the slot at a column of an observation; later columns are inputs of a central critic alone."""
     at = 0
     for slot in task.layout.slots:
         at += slot.size
@@ -67,7 +70,10 @@ def _slot(task: Task, column: int) -> str:
 
 
 def check_model(model: PPO) -> None:
-    """Raise LearningDiverged if a weight is not finite, and name the first thing of the last update that was not."""
+    """Raise LearningDiverged if a weight of the network is not finite.
+
+    The message names the first array of the last rollout that was not finite; if all were, the weight and the loss.
+    """
     weights = dict(model.policy.named_parameters())
     bad = [name for name, tensor in weights.items() if not torch.isfinite(tensor).all()]
     if not bad:
@@ -86,11 +92,11 @@ def check_model(model: PPO) -> None:
 
 
 def check_answers(model: PPO) -> None:
-    """Raise LearningDiverged if the network, whose weights are finite, answers the last observations with NaN."""
+    """Raise LearningDiverged if finite weights give the last observations no valid distribution of actions."""
     policy = model.policy
     with torch.no_grad():
-        seen = policy.extract_features(torch.as_tensor(model._last_obs), policy.pi_features_extractor)
-        mean, deviation = policy.action_net(policy.mlp_extractor.forward_actor(seen)), policy.log_std.exp()
+        features = policy.extract_features(torch.as_tensor(model._last_obs), policy.pi_features_extractor)
+        mean, deviation = policy.action_net(policy.mlp_extractor.forward_actor(features)), policy.log_std.exp()
         largest = max(float(tensor.abs().max()) for tensor in policy.parameters())
     for what, tensor in (("mean", mean), ("standard deviation", deviation)):
         if not torch.isfinite(tensor).all() or (tensor is deviation and not (tensor > 0).all()):

@@ -18,7 +18,7 @@ from rich.progress import Progress
 
 from agents.dagger import WORLDS, teach
 from agents.experiment import Experiment, load_experiment, one_line_errors
-from agents.ppo import build, on_threads, score, tensors_of
+from agents.ppo import build, score, tensors_of, use_thread_count
 from flockenv.cli.terminal import DIVERGED, run_program, show_progress
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.players.rules import player
@@ -49,7 +49,7 @@ def imitate(
     """
     task, p = experiment.build(), experiment.ppo
     rules = player(task)
-    with on_threads(p.threads):
+    with use_thread_count(p.threads):
         model = build(task, p, None)
         rows, missed = teach(model, task, rules, updates, worlds, advance)
         own = rollout(task, rules, p.evaluate_worlds, worlds_for("tuning", p.seed, p.evaluate_worlds))

@@ -45,18 +45,18 @@ class ForLearning(VecEnvWrapper):
 
     def step_wait(self) -> Any:
         """Act for `hold` decisions of the world, and scale what is paid."""
-        observation, reward, done, infos = self._decided()
+        observation, reward, done, infos = self._decide()
         done |= ~self.acted  # nothing that is learned of a row without a learner reaches into its next episode
         for _ in range(self.hold - 1):
             self.venv.step_async(self.actions)
-            observation, more, over, told = self._decided()
+            observation, more, over, new_infos = self._decide()
             reward += np.where(done, 0.0, more)
-            if any(told):  # a world has ended, or a learner has left
-                infos = [before or new for before, new in zip(infos, told, strict=True)]
+            if any(new_infos):  # a world has ended, or a learner has left
+                infos = [before or new for before, new in zip(infos, new_infos, strict=True)]
             done = done | over
         return observation, reward * self.scale, done, infos
 
-    def _decided(self) -> Any:
+    def _decide(self) -> Any:
         """Return what one decision of the world brought; LearningDiverged if a number of it is not finite."""
         world: World = self.venv.world
         before = world.steps.copy()

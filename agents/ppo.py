@@ -30,12 +30,12 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
 from agents.central_critic import CentralPolicy, CentralVecEnv
-from agents.checkpoint import CheckpointError, claimed, path_in
+from agents.checkpoint import CheckpointError, claim, path_in
 from agents.dagger import teach
 from agents.divergence import LearningDiverged, check_answers, check_model
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors
 from agents.learning_env import ForLearning
-from agents.run import Run, checkpoint, checkpointed, expected_bytes, recipe_of
+from agents.run import Run, expected_bytes, load_checkpoint, recipe_of, save_checkpoint
 from agents.team_credit import CaringBuffer
 from agents.training_state import capture, restore, surroundings
 from flockenv.cli.terminal import DIVERGED, handle_interrupt, run_program, show_progress
@@ -49,7 +49,7 @@ from flockenv.players.policy import MlpPolicy, describe, save_policy
 from flockenv.players.rules import player
 from flockenv.tasks import TASKS, Task
 
-__all__ = ["app", "build", "export", "on_threads", "score", "tensors_of", "train"]
+__all__ = ["app", "build", "export", "score", "tensors_of", "train", "use_thread_count"]
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 console = Console(stderr=True)
@@ -70,7 +70,7 @@ def tensors_of(model: PPO) -> dict[str, np.ndarray]:
 
 
 @contextmanager
-def on_threads(count: int) -> Iterator[None]:
+def use_thread_count(count: int) -> Iterator[None]:
     """Set the number of threads of torch and of the worlds for a block; restore both afterwards."""
     before = torch.get_num_threads(), threads()
     torch.set_num_threads(count)
@@ -83,7 +83,7 @@ def on_threads(count: int) -> Iterator[None]:
 
 
 def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
-    """Make the worlds and the model; how many threads they use is for `on_threads` to say."""
+    """Make the worlds and the model; `use_thread_count` sets how many threads they use."""
     torch.manual_seed(p.seed)
     learned = task.model_copy(update={"dtype": p.dtype})
     shows = CentralVecEnv if p.central_critic else WorldVecEnv
@@ -154,11 +154,11 @@ class Watch(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         check_model(self.model)
-        self._keep()
+        self._remember()
         if self.due:
             self.save()
 
-    def _keep(self) -> None:
+    def _remember(self) -> None:
         """Remember this moment: whatever comes before the next one, training can go on from here."""
         self.run.wall = self.before + time.perf_counter() - self.since
         self.run.state = capture(self.model)
@@ -167,7 +167,7 @@ class Watch(BaseCallback):
     def save(self) -> None:
         """Write a checkpoint of the moment that is remembered, if there is one."""
         if self.kept is not None:
-            checkpoint(self.folder, self.kept)
+            save_checkpoint(self.folder, self.kept)
             self.saved(self.kept)
         self.due = False
 
@@ -180,9 +180,9 @@ class Watch(BaseCallback):
         self.progress.update(self.bar, completed=min(self.run.steps, self.p.steps))
         due = len(self.run.curve) * self.p.evaluate_every
         if self.run.steps >= due:
-            self.point()
+            self.add_point()
 
-    def point(self) -> None:
+    def add_point(self) -> None:
         """Measure the policy of the moment, and keep it if it is the best so far; a checkpoint is due then."""
         self.run.wall = self.before + time.perf_counter() - self.since
         self.run.steps = self.num_timesteps * self.p.hold
@@ -200,17 +200,17 @@ class Watch(BaseCallback):
     def finish(self) -> None:
         """Measure the last policy, and write the last checkpoint."""
         check_model(self.model)
-        self.point()
-        self._keep()
+        self.add_point()
+        self._remember()
         self.save()
 
 
-def _teach(model: PPO, task: Task, p: PpoSettings) -> float:
+def _teach_first(model: PPO, task: Task, p: PpoSettings) -> float:
     """Let the network first learn what the tuned rules answer, if it is to; return the seconds that took."""
     if p.taught == 0:
         return 0.0
     began = time.perf_counter()
-    with on_threads(p.threads), show_progress(Progress(console=console, transient=True)) as progress:
+    with use_thread_count(p.threads), show_progress(Progress(console=console, transient=True)) as progress:
         bar = progress.add_task(f"{task.name}: is taught", total=p.taught)
         teach(model, task, player(task), p.taught, advance=lambda n: progress.advance(bar, n))
     return time.perf_counter() - began
@@ -224,9 +224,9 @@ def resume(folder: Path, model: PPO, run: Run, p: PpoSettings) -> None:
         before |= earlier["surroundings"]
     if others := {name: value for name, value in now.items() if before.get(name) != value}:
         run.resumed.append({"steps": run.steps, "surroundings": others})
-        said = ", ".join(f"{name} {value} after {before.get(name, 'nothing')}" for name, value in others.items())
-        said = f"resumed under {said}: weights may differ from those of an uninterrupted training"
-        console.print(said, markup=False, highlight=False, soft_wrap=True)
+        changes = ", ".join(f"{name} {value} after {before.get(name, 'nothing')}" for name, value in others.items())
+        text = f"resumed under {changes}: weights may differ from those of an uninterrupted training"
+        console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def train(
@@ -250,18 +250,18 @@ def train(
         CheckpointError: it is damaged, or another training holds the folder.
         FloatingPointError: learning or a world diverged; the checkpoint is of the last moment before that.
     """
-    with claimed(folder):
-        run = checkpointed(experiment, folder) if go_on else None
+    with claim(folder):
+        run = load_checkpoint(experiment, folder) if go_on else None
         if run is not None:
             saved(replace(run, curve=list(run.curve), resumed=list(run.resumed)))
         if run is not None and run.steps >= experiment.ppo.steps:
             return run
         if go_on and run is None:
             console.print(f"no checkpoint in {folder}: starts anew", markup=False, highlight=False, soft_wrap=True)
-        return _train(experiment, folder, run, tensorboard, saved)
+        return _train_from(experiment, folder, run, tensorboard, saved)
 
 
-def _train(
+def _train_from(
     experiment: Experiment, folder: Path, run: Run | None, tensorboard: str | None, saved: Callable[[Run], None]
 ) -> Run:
     task, p, anew = experiment.build(), experiment.ppo, run is None
@@ -270,15 +270,15 @@ def _train(
         resume(folder, model, run, p)
     else:
         run = Run(recipe_of(experiment), surroundings(model.get_env().get_attr("task", 0)[0]))
-        run.wall = _teach(model, task, p)
+        run.wall = _teach_first(model, task, p)
     columns = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
         TextColumn("{task.fields[score]}"),
     )  # fmt: skip
-    with on_threads(p.threads), show_progress(Progress(*columns, console=console)) as progress:
+    with use_thread_count(p.threads), show_progress(Progress(*columns, console=console)) as progress:
         watch = Watch(task, p, run, folder, progress, saved)
         try:
-            with _named_divergence(model):
+            with _name_divergence(model):
                 model.learn(
                     -(-(p.steps - run.steps) // p.hold),
                     callback=watch,
@@ -293,7 +293,7 @@ def _train(
 
 
 @contextmanager
-def _named_divergence(model: PPO) -> Iterator[None]:
+def _name_divergence(model: PPO) -> Iterator[None]:
     """Raise LearningDiverged where torch refuses to draw actions from what a network that diverged answers."""
     try:
         yield
@@ -352,7 +352,7 @@ def main(
             signals.set_message(f"interrupted; {stays}")
             raise
         except FloatingPointError as error:
-            typer.echo(f"error: {error}; {_last_good(kept, folder, target)}", err=True)
+            typer.echo(f"error: {error}; {_export_last_good(kept, folder, target)}", err=True)
             raise typer.Exit(DIVERGED) from None
         export(run, target)
     best = f"mean return {run.best:.3f} on the tuning worlds"
@@ -371,7 +371,7 @@ def _check_outputs(experiment: Experiment, target: Path, folder: Path, tensorboa
             raise ValueError("--tensorboard: the package tensorboard is not installed")
 
 
-def _last_good(saved: Sequence[Run], folder: Path, target: Path) -> str:
+def _export_last_good(saved: Sequence[Run], folder: Path, target: Path) -> str:
     """Export the best policy of a training that diverged, if it has saved one; return what was kept, and where."""
     if not saved:
         return "nothing was learnt before"

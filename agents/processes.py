@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from flockenv.core import signals
 
-__all__ = ["Tell", "parenting", "serve", "side_by_side", "starting"]
+__all__ = ["Tell", "announce_parent", "guard_process_starts", "serve", "side_by_side"]
 
 Job = TypeVar("Job")
 Done = TypeVar("Done")
@@ -41,13 +41,13 @@ def side_by_side(work: Callable[[Job, Tell], Done], jobs: Sequence[Job], process
     context = get_context("spawn")
     if os.name == "posix":
         _start_tracker()
-    with _heard(context, tell) as (mouth, turn, trouble):
+    with _forward_news(context, tell) as (sender, turn, trouble):
         others, workers = active_children(), []
         at_work: list[Future[Done]] = []
-        with ProcessPoolExecutor(processes, context, _begin, (mouth, turn)) as pool:
+        with ProcessPoolExecutor(processes, context, _begin_worker, (sender, turn)) as pool:
             try:
-                with starting():
-                    at_work += [pool.submit(_work, work, job) for job in jobs]
+                with guard_process_starts():
+                    at_work += [pool.submit(_do_job, work, job) for job in jobs]
                     workers += [process for process in active_children() if process not in others]
                 for working in at_work:
                     wait((working, trouble), return_when=FIRST_COMPLETED)
@@ -65,19 +65,19 @@ def side_by_side(work: Callable[[Job, Tell], Done], jobs: Sequence[Job], process
 
 
 @contextmanager
-def _heard(context: Any, tell: Tell) -> Iterator[tuple[Connection, Any, Future[None]]]:
+def _forward_news(context: Any, tell: Tell) -> Iterator[tuple[Connection, Any, Future[None]]]:
     """Have what other processes tell passed on by a thread of its own.
 
     Yields where they tell it, the lock that says whose turn it is to speak, and what has an error of `tell`, if it
     raised one; after that nothing more is passed on.
     """
-    ear, mouth = context.Pipe(duplex=False)
+    receiver, sender = context.Pipe(duplex=False)
     trouble: Future[None] = Future()
 
     def listen() -> None:
         while True:
             try:
-                news = ear.recv()
+                news = receiver.recv()
             except Exception:  # no process is left to report or to finish
                 return
             if news is None:
@@ -91,16 +91,16 @@ def _heard(context: Any, tell: Tell) -> Iterator[tuple[Connection, Any, Future[N
     listener = threading.Thread(target=listen, daemon=True)
     listener.start()
     try:
-        yield mouth, context.Lock(), trouble
+        yield sender, context.Lock(), trouble
     finally:
-        mouth.send(None)  # closing the pipe ends it as well, unless a process never took its end
-        mouth.close()
+        sender.send(None)  # closing the pipe ends it as well, unless a process never took its end
+        sender.close()
         listener.join()
-        ear.close()
+        receiver.close()
 
 
 @contextmanager
-def parenting() -> Iterator[None]:
+def announce_parent() -> Iterator[None]:
     """Let processes that are started in a block know that they are to end with this one."""
     before = os.environ.get(signals.PARENT)
     os.environ[signals.PARENT] = str(os.getpid())
@@ -114,9 +114,9 @@ def parenting() -> Iterator[None]:
 
 
 @contextmanager
-def starting() -> Iterator[None]:
+def guard_process_starts() -> Iterator[None]:
     """Start processes that end with this one and do not see Ctrl-C: they inherit what this thread blocks."""
-    with parenting():
+    with announce_parent():
         if os.name != "posix":
             yield
             return
@@ -144,13 +144,13 @@ _tell: Tell
 """In a process that works for another one: how it tells news."""
 
 
-def _begin(mouth: Connection, turn: Any) -> None:
+def _begin_worker(sender: Connection, turn: Any) -> None:
     """Get ready in a process that works for another one, beside others like it."""
     global _tell
 
     def tell(*news: Any) -> None:
         with turn:
-            mouth.send(news)
+            sender.send(news)
 
     _tell = tell
     serve()
@@ -162,14 +162,14 @@ def serve() -> None:
     os.environ["FLOCKENV_QUIET"] = "1"
     parent = parent_process()
     if parent is not None:
-        threading.Thread(target=_follow, args=(parent.sentinel,), daemon=True).start()
+        threading.Thread(target=_end_with_parent, args=(parent.sentinel,), daemon=True).start()
 
 
-def _follow(sentinel: int) -> None:
+def _end_with_parent(sentinel: int) -> None:
     """End this process when its parent has ended; a sentinel is ready then, even after SIGKILL."""
     wait_for([sentinel])
     os.kill(os.getpid(), signal.SIGTERM)
 
 
-def _work(work: Callable[[Job, Tell], Done], job: Job) -> Done:
+def _do_job(work: Callable[[Job, Tell], Done], job: Job) -> Done:
     return work(job, _tell)

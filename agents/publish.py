@@ -90,7 +90,7 @@ def _lead(pair: Results) -> str:
     return f"{difference}, higher in {pair['probability_better']:.0%}"
 
 
-def _checked(folder: Path) -> Results:
+def _read_comparison(folder: Path) -> Results:
     """Read a comparison; ValueError unless it is a whole one: all tasks, the usual players, not a quick look."""
     file = folder / "results.json"
     if not file.is_file():
@@ -112,10 +112,10 @@ def main(
 ) -> None:
     """Copy a comparison's results and picture into docs/, draw its summary, and write the tables of the pages."""
     with one_line_errors():
-        results = _checked(folder)
+        results = _read_comparison(folder)
         contents = {f"docs/{name}": (folder / name).read_bytes() for name in ("results.json", "comparison.png")}
         for name, table in (("README.md", summary(results)), ("docs/results.md", tables(results))):
-            contents[name] = _page(root / name, table).encode()
+            contents[name] = _page_with_table(root / name, table).encode()
         writers = {name: functools.partial(_write, content) for name, content in contents.items()}
         writers["docs/summary.png"] = functools.partial(write_summary, results=results)
         write_all_or_none(root, writers)
@@ -123,7 +123,7 @@ def main(
         typer.echo(f"{root / name}: written")
 
 
-def _page(path: Path, table: str) -> str:
+def _page_with_table(path: Path, table: str) -> str:
     """Return a page with a new table between its two marks."""
     text = path.read_text(encoding="utf-8")
     if len(BLOCK.findall(text)) != 1:

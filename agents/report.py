@@ -18,7 +18,7 @@ from flockenv.evaluation import Comparison, Episodes, Interval, compare, summari
 from flockenv.evaluation.plots import Column, Row
 
 __all__ = [
-    "column", "differences", "grid", "interval_fields", "interval_text", "json_text", "markdown", "number_text",
+    "chart_column", "differences", "grid", "interval_fields", "interval_text", "json_text", "markdown", "number_text",
     "player_tables", "table_of", "task_results", "verdict",
 ]  # fmt: skip
 
@@ -109,7 +109,7 @@ def verdict(task: str, results: Results) -> str:
     key = next(key for key in results["pairs"] if set(key.split(" - ")) == set(names))
     pair, (first, second) = results["pairs"][key], key.split(" - ")
     if pair["difference"] < 0:
-        pair, first, second = _reversed(pair), second, first
+        pair, first, second = _reverse(pair), second, first
     gap = interval_text(pair, "difference", "ci")
     wins = f"{percent_text(pair, 'probability_better', 'better')} of the same {pair['worlds']} worlds"
     rates = f"success {players[first]['success_rate']:.0%} against {players[second]['success_rate']:.0%}"
@@ -127,7 +127,7 @@ def differences(task: str, results: Results) -> Iterator[str]:
             yield f"{task}: {name} plays another task than it was trained on: {'; '.join(player['differs'])}."
 
 
-def _reversed(pair: Results) -> Results:
+def _reverse(pair: Results) -> Results:
     turned = {"difference": -pair["difference"], "ci_low": -pair["ci_high"], "ci_high": -pair["ci_low"]}
     better = {"probability_better": 1 - pair["probability_better"]}
     return {**pair, **turned, **better, "better_low": 1 - pair["better_high"], "better_high": 1 - pair["better_low"]}
@@ -198,7 +198,7 @@ def pair_cells(results: Results) -> tuple[list[str], list[list[str]]]:
     return header, rows
 
 
-def column(task: str, results: Results, episodes: Mapping[str, Episodes]) -> Column:
+def chart_column(task: str, results: Results, episodes: Mapping[str, Episodes]) -> Column:
     """Return the column of one task in the picture: all players, and the pairs without random actions."""
 
     def interval(about: Results, name: str, prefix: str) -> Interval:

@@ -12,14 +12,14 @@ import numpy as np
 from pydantic import Field
 
 from agents import checkpoint as files
-from agents.checkpoint import CheckpointError, KernelPlan
+from agents.checkpoint import CheckpointError, CheckpointParts
 from agents.experiment import Experiment
 from flockenv.core.errors import KeyPath, key_path, printable
 from flockenv.core.record import ResultRecord
 from flockenv.players.policy import MlpPolicy
 from flockenv.players.rules import as_dict, player
 
-__all__ = ["OtherRecipe", "Run", "checkpoint", "checkpointed", "expected_bytes", "recipe_of"]
+__all__ = ["OtherRecipe", "Run", "expected_bytes", "load_checkpoint", "recipe_of", "save_checkpoint"]
 
 STATE = ("policy", "optimizer", "worlds", "rollout", "random")
 """The parts of a checkpoint that are the model's, see agents.training_state."""
@@ -34,10 +34,10 @@ class OtherRecipe(CheckpointError):  # noqa: N818  # not an error for a caller t
 
 def recipe_of(experiment: Experiment) -> dict[str, Any]:
     """Return all that training depends on: with another value anywhere it is another training."""
-    task, told = experiment.build(), experiment.model_dump(mode="json", include={"task", "arguments", "ppo"})
+    task, recipe = experiment.build(), experiment.model_dump(mode="json", include={"task", "arguments", "ppo"})
     if experiment.ppo.taught:
-        told["rules"] = as_dict(player(task).rules)  # the policy that it imitated first
-    return {**told, "layout": task.layout.digest}
+        recipe["rules"] = as_dict(player(task).rules)  # the policy that it imitated first
+    return {**recipe, "layout": task.layout.digest}
 
 
 @dataclass
@@ -52,7 +52,7 @@ class Run:
     curve: list[dict[str, float]] = field(default_factory=list)
     best: float | None = None
     tensors: dict[str, np.ndarray] = field(default_factory=dict)
-    state: KernelPlan = field(default_factory=dict)  # of the model, see agents.training_state
+    state: CheckpointParts = field(default_factory=dict)  # of the model, see agents.training_state
 
 
 class Point(ResultRecord):
@@ -88,16 +88,16 @@ class Times(ResultRecord):
     seconds: tuple[float, ...] = Field(description="of each point of the curve")
 
 
-def checkpoint(folder: Path, run: Run) -> None:
+def save_checkpoint(folder: Path, run: Run) -> None:
     """Write the run so far."""
     notes = {name: getattr(run, name) for name in Notes.model_fields}
     curve = [{name: point[name] for name in Point.model_fields} for point in run.curve]
     times = {"wall": run.wall, "seconds": [point["seconds"] for point in run.curve]}
-    words = {"notes": files.as_json({**notes, "curve": curve}), files.TIMES: files.as_json(times)}
+    words = {"notes": files.json_part({**notes, "curve": curve}), files.TIMES: files.json_part(times)}
     files.write(folder, {**run.state, "best": run.tensors, **words})
 
 
-def checkpointed(experiment: Experiment, folder: Path) -> Run | None:
+def load_checkpoint(experiment: Experiment, folder: Path) -> Run | None:
     """Return the run whose checkpoint lies in a folder, if there is one.
 
     Raises:
@@ -117,10 +117,10 @@ def checkpointed(experiment: Experiment, folder: Path) -> Run | None:
     best = parts["best"]
     if fault := _fault(notes, times, best, experiment):
         raise files.Damaged(folder, fault)
-    told = notes.model_dump(mode="json")
+    fields = notes.model_dump(mode="json")
     seconds = [{"seconds": value} for value in times.seconds]
-    told["curve"] = [{"steps": p["steps"], **s, **p} for p, s in zip(told["curve"], seconds, strict=True)]
-    return Run(**told, wall=times.wall, tensors=best, state={part: parts[part] for part in STATE})
+    fields["curve"] = [{"steps": p["steps"], **s, **p} for p, s in zip(fields["curve"], seconds, strict=True)]
+    return Run(**fields, wall=times.wall, tensors=best, state={part: parts[part] for part in STATE})
 
 
 def expected_bytes(experiment: Experiment) -> int:
@@ -133,11 +133,11 @@ def expected_bytes(experiment: Experiment) -> int:
 
 def _compare(kept: dict[str, Any], wanted: dict[str, Any], folder: Path) -> None:
     """Raise OtherRecipe, with the first key, if two recipes differ."""
-    of_kept, of_wanted = dict(_numbers(kept)), dict(_numbers(wanted))
+    of_kept, of_wanted = dict(_values_by_path(kept)), dict(_values_by_path(wanted))
     for key in {**of_wanted, **of_kept}:
         if of_kept.get(key) != of_wanted.get(key):
-            has, asked = (printable(of[key]) if key in of else "nothing" for of in (of_kept, of_wanted))
-            raise OtherRecipe(f"{key} = {asked}: the checkpoint in {folder} is of another recipe, with {has}")
+            has, wants = (printable(of[key]) if key in of else "nothing" for of in (of_kept, of_wanted))
+            raise OtherRecipe(f"{key} = {wants}: the checkpoint in {folder} is of another recipe, with {has}")
 
 
 def _fault(notes: Notes, times: Times, best: dict[str, np.ndarray], experiment: Experiment) -> str:
@@ -159,10 +159,10 @@ def _fault(notes: Notes, times: Times, best: dict[str, np.ndarray], experiment: 
     return ""
 
 
-def _numbers(block: dict[str, Any], path: KeyPath = ()) -> Iterator[tuple[str, Any]]:
+def _values_by_path(block: dict[str, Any], path: KeyPath = ()) -> Iterator[tuple[str, Any]]:
     """Yield every value of nested blocks by its key path."""
     for key, value in block.items():
         if isinstance(value, dict):
-            yield from _numbers(value, (*path, key))
+            yield from _values_by_path(value, (*path, key))
         else:
             yield key_path((*path, key)), value

@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
 
-from agents.checkpoint import JSON, Damaged, KernelPlan, Tensors, as_json
+from agents.checkpoint import JSON, CheckpointParts, Damaged, Tensors, json_part
 from flockenv.envs.world import World
 from flockenv.studies.accuracy.benchmark import machine
 from flockenv.tasks import Task
@@ -36,23 +36,23 @@ POSITIONS = ("state.x", "state.v")
 """What must be finite of worlds: a lifetime, or a measure that does not apply yet, may be infinite or NaN."""
 
 
-def capture(model: PPO) -> KernelPlan:
+def capture(model: PPO) -> CheckpointParts:
     """Return copies of all that training goes on from, by part; to be called where a rollout begins."""
     assert isinstance(model._last_obs, np.ndarray) and model._last_episode_starts is not None
     return {
-        "policy": {name: _copied(tensor) for name, tensor in model.policy.state_dict().items()},
+        "policy": {name: _copy_of(tensor) for name, tensor in model.policy.state_dict().items()},
         "optimizer": {
-            f"{index}.{name}": _copied(moments[name])
+            f"{index}.{name}": _copy_of(moments[name])
             for index, moments in model.policy.optimizer.state_dict()["state"].items()
             for name in MOMENTS
         },
         "worlds": {name: array.copy() for name, array in _world(model).arrays().items()},
         "rollout": {"observation": model._last_obs.copy(), "starts": model._last_episode_starts.astype(np.bool_)},
-        "random": {"torch": torch.get_rng_state().numpy().copy(), **as_json(_generators(model))},
+        "random": {"torch": torch.get_rng_state().numpy().copy(), **json_part(_generators(model))},
     }
 
 
-def restore(model: PPO, parts: KernelPlan, steps: int, folder: Path) -> None:
+def restore(model: PPO, parts: CheckpointParts, steps: int, folder: Path) -> None:
     """Restore the captured state of a training into a model built by the same recipe.
 
     Raises:
@@ -68,7 +68,7 @@ def restore(model: PPO, parts: KernelPlan, steps: int, folder: Path) -> None:
         if fault := _fault(parts.get(part, {}), wanted, finite):
             raise Damaged(folder, f"{part}: {fault}")
     try:
-        _put(model, parts)
+        _write_into(model, parts)
     except (ValueError, TypeError, KeyError, RuntimeError, RecursionError) as error:
         raise Damaged(folder, f"random: {' '.join(str(error).split())}") from None
     model.num_timesteps = steps
@@ -80,7 +80,7 @@ def _world(model: PPO) -> World:
     return world
 
 
-def _copied(tensor: torch.Tensor) -> NDArray[Any]:
+def _copy_of(tensor: torch.Tensor) -> NDArray[Any]:
     return tensor.detach().cpu().numpy().copy()
 
 
@@ -107,7 +107,7 @@ def _fault(kept: Tensors, wanted: Tensors, finite: Sequence[str]) -> str:
     return ""
 
 
-def _put(model: PPO, parts: KernelPlan) -> None:
+def _write_into(model: PPO, parts: CheckpointParts) -> None:
     """Write what a checkpoint holds into a model that it fits; the generators last, since building draws numbers."""
     policy, optimizer, moments = model.policy, model.policy.optimizer, parts["optimizer"]
     policy.load_state_dict({name: torch.from_numpy(array) for name, array in parts["policy"].items()})

@@ -23,25 +23,25 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from agents import report, transfer_report
 from agents.compare import (
     experiment_of,
-    field_of,
     folder_of,
     pick,
+    players_in_order,
     players_of,
     provenance,
     split,
     usual_players,
     write_text,
 )
-from agents.processes import parenting, serve, starting
+from agents.processes import announce_parent, guard_process_starts, serve
 from agents.transfer_cache import (
     KEPT,
     Plan,
-    clocked,
+    all_cells,
     jobs,
+    play_again,
     play_missing,
-    played,
-    played_again,
     rounds_missing,
+    run_clock,
     run_round,
 )
 from agents.transfer_report import Setting
@@ -99,13 +99,13 @@ def main(
         _check("--workers", workers, 1, 64)
         worlds_for("evaluation", seed, worlds)
         chosen = [experiment_of(name).build() for name in pick("TASK", split(tasks) or list(TASKS), TASKS)]
-        fields = players_of(chosen, field_of(split(players) or usual_players(chosen)))
+        fields = players_of(chosen, players_in_order(split(players) or usual_players(chosen)))
         solvers, steps = _solvers(split(methods) or list(METHODS)), _substeps(split(substeps), SUBSTEPS)
         plans = [
             Plan(task, _settings(task, solvers, steps), tuple(fields[task.name]), worlds, seed, rounds, trust_pickle)
             for task in chosen
         ]
-        results = _measured(plans, workers)
+        results = _measure(plans, workers)
         write_all_or_none(folder, {
             "transfer.json": lambda path: write_text(path, report.json_text(results)),
             "transfer.md": lambda path: write_text(path, transfer_report.markdown(results)),
@@ -144,11 +144,11 @@ def _substeps(texts: Sequence[str], usual: Sequence[int]) -> list[int]:
 
 def _settings(task: Task, solvers: Sequence[tuple[str, str]], substeps: Sequence[int]) -> tuple[Setting, ...]:
     """Return the settings to play, beginning with the one that players were made for, even if it is not selected."""
-    asked = [Setting(method, dtype, steps) for method, dtype in solvers for steps in substeps]
-    return tuple(dict.fromkeys([Setting.trained(task), *asked]))
+    chosen = [Setting(method, dtype, steps) for method, dtype in solvers for steps in substeps]
+    return tuple(dict.fromkeys([Setting.of_training(task), *chosen]))
 
 
-def _measured(plans: Sequence[Plan], workers: int) -> report.Results:
+def _measure(plans: Sequence[Plan], workers: int) -> report.Results:
     """Play the missing episodes, time the settings, and return everything as plain data."""
     began = perf_counter()
     for plan in plans:
@@ -157,13 +157,19 @@ def _measured(plans: Sequence[Plan], workers: int) -> report.Results:
     missing, rounds = [job for plan in plans for job in jobs(plan)], rounds_missing(plans)
     steps = sum(len(settings) * len(plan.players) for plan, settings in missing) + len(rounds) * len(plans)
     with _bar(steps) as advance:
-        for doing, work, crew in ((play_missing, missing, workers), (run_round, rounds, 1)):
-            with _crew(crew if workers > 1 else 0, work) as over:
-                for what, done in over(doing, work):
+        for function, work, processes in ((play_missing, missing, workers), (run_round, rounds, 1)):
+            with _process_map(processes if workers > 1 else 0, work) as map_:
+                for what, done in map_(function, work):
                     advance(what, done)
     about = {
         plan.task.name: transfer_report.task_results(
-            plan.task, plan.settings, played(plan), clocked(plan, plan.rounds), played_again(plan), RESAMPLES, plan.seed
+            plan.task,
+            plan.settings,
+            all_cells(plan),
+            run_clock(plan, plan.rounds),
+            play_again(plan),
+            RESAMPLES,
+            plan.seed,
         )
         for plan in plans
     }
@@ -181,7 +187,7 @@ def _measured(plans: Sequence[Plan], workers: int) -> report.Results:
 
 
 @contextmanager
-def _crew(processes: int, work: Sequence[Any]) -> Iterator[Callable[[Any, Iterable[Any]], Iterable[Any]]]:
+def _process_map(processes: int, work: Sequence[Any]) -> Iterator[Callable[[Any, Iterable[Any]], Iterable[Any]]]:
     """Yield a map over some work: by a number of processes, which end with this one; by none, in this one.
 
     A single process does one piece of work and makes room for a fresh one.
@@ -190,8 +196,8 @@ def _crew(processes: int, work: Sequence[Any]) -> Iterator[Callable[[Any, Iterab
         yield map
         return
     count = min(processes, len(work))
-    with parenting():  # a thread of the pool starts fresh ones later
-        with starting():
+    with announce_parent():  # a thread of the pool starts fresh ones later
+        with guard_process_starts():
             pool = get_context("spawn").Pool(count, serve, maxtasksperchild=1 if processes == 1 else None)
         with pool:
             yield pool.imap_unordered

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.compare import Player, blaming
+from agents.compare import Player, blame
 from agents.transfer_report import Cell, Clock, Setting
 from flockenv.core.atomic_files import new_folder, replace_file
 from flockenv.envs.world import World
@@ -28,8 +28,19 @@ from flockenv.tasks import Task
 from flockenv.tasks.play import name_of
 
 __all__ = [
-    "KEPT", "Job", "Plan", "Round", "cell_path", "clocked", "jobs", "play", "play_missing", "played", "played_again",
-    "rounds_missing", "run_round",
+    "KEPT",
+    "Job",
+    "Plan",
+    "Round",
+    "all_cells",
+    "cell_path",
+    "jobs",
+    "play",
+    "play_again",
+    "play_missing",
+    "rounds_missing",
+    "run_clock",
+    "run_round",
 ]  # fmt: skip
 
 DECISIONS = 30
@@ -60,7 +71,7 @@ class Plan:
         return worlds_for("evaluation", self.seed, self.worlds)
 
     @property
-    def trained(self) -> Setting:
+    def trained_setting(self) -> Setting:
         """The setting that players were made for."""
         return self.settings[0]
 
@@ -85,20 +96,20 @@ Round = tuple[tuple[Plan, ...], int]
 
 def play(plan: Plan, setting: Setting, player: Player) -> Cell:
     """Let one player play all worlds under one setting."""
-    task = setting.of(plan.task)
-    with blaming(player.name, task):
+    task = setting.applied_to(plan.task)
+    with blame(player.name, task):
         episodes = rollout(task, plan.policy(player, task), plan.worlds, plan.first)
     return Cell(episodes.returns, episodes.success)
 
 
 def cell_path(plan: Plan, setting: Setting, player: Player, prefix: str = "") -> Path:
     """Return where a cell is kept: the name tells apart all that its scores depend on."""
-    task = setting.of(plan.task)
-    about = [task_digest(task), _kernel(task), _print(player, plan), plan.worlds, plan.first]
-    return _place(plan.task, f"{prefix}{player.name}-{setting.method}-{setting.dtype}-{setting.substeps}", about)
+    task = setting.applied_to(plan.task)
+    about = [task_digest(task), _kernel(task), _player_digest(player, plan), plan.worlds, plan.first]
+    return _cache_path(plan.task, f"{prefix}{player.name}-{setting.method}-{setting.dtype}-{setting.substeps}", about)
 
 
-def _place(task: Task, name: str, about: list[Any]) -> Path:
+def _cache_path(task: Task, name: str, about: list[Any]) -> Path:
     digest = hashlib.sha256(json.dumps(about).encode()).hexdigest()[:16]
     return KEPT / task.name / f"{name}-{digest}.json"
 
@@ -109,26 +120,26 @@ def _kernel(task: Task) -> str:
     return name_of(task)
 
 
-def _print(player: Player, plan: Plan) -> str:
+def _player_digest(player: Player, plan: Plan) -> str:
     """Return what tells a player from itself after a change: its file, or its code, parameters and weights."""
     known = player.spec in NAMES
-    return _print_of_known(player, plan) if known else hashlib.sha256(Path(player.spec).read_bytes()).hexdigest()
+    return _known_player_digest(player, plan) if known else hashlib.sha256(Path(player.spec).read_bytes()).hexdigest()
 
 
 @functools.lru_cache(maxsize=512)
-def _print_of_known(player: Player, plan: Plan) -> str:
+def _known_player_digest(player: Player, plan: Plan) -> str:
     policy = plan.policy(player, plan.task)
     weights = (getattr(policy, "card", None) or {}).get("sha256", "")
     code = Path(inspect.getfile(type(policy))).read_text(encoding="utf-8")
     return hashlib.sha256(f"{policy!r} {weights} {code}".encode()).hexdigest()
 
 
-def _keep(path: Path, content: Any) -> None:
+def _store(path: Path, content: Any) -> None:
     with new_folder(path.parent), replace_file(path) as file:
         file.write(json.dumps(content, allow_nan=False).encode())
 
 
-def _kept(path: Path, of_json: Callable[[Any], Kept]) -> Kept:
+def _read(path: Path, of_json: Callable[[Any], Kept]) -> Kept:
     """Return what a file keeps; ValueError, in one line that names it, if it is not what was written there."""
     try:
         return of_json(json.loads(path.read_text(encoding="utf-8")))
@@ -156,8 +167,8 @@ def _cell(plan: Plan, setting: Setting, player: Player, prefix: str = "") -> Cel
     """Return a cell as it is kept, played first if it is not."""
     path = cell_path(plan, setting, player, prefix)
     if not path.is_file():
-        _keep(path, play(plan, setting, player).to_json())
-    return _kept(path, functools.partial(_cell_of, worlds=plan.worlds))
+        _store(path, play(plan, setting, player).to_json())
+    return _read(path, functools.partial(_cell_of, worlds=plan.worlds))
 
 
 def play_missing(job: Job) -> tuple[str, int]:
@@ -176,26 +187,26 @@ def jobs(plan: Plan) -> Iterator[Job]:
             yield plan, settings
 
 
-def played(plan: Plan) -> dict[tuple[Setting, str], Cell]:
+def all_cells(plan: Plan) -> dict[tuple[Setting, str], Cell]:
     """Return all cells of a plan."""
     return {(s, player.name): _cell(plan, s, player) for s, player in product(plan.settings, plan.players)}
 
 
-def played_again(plan: Plan) -> dict[str, Cell]:
+def play_again(plan: Plan) -> dict[str, Cell]:
     """Return by player what the trained setting gives a second time: the same, to the last bit."""
-    return {player.name: _cell(plan, plan.trained, player, "again-") for player in plan.players}
+    return {player.name: _cell(plan, plan.trained_setting, player, "again-") for player in plan.players}
 
 
 # --- the clock --------------------------------------------------------------------------------------------------------
 
 
-def clocked(plan: Plan, rounds: int) -> Clock:
+def run_clock(plan: Plan, rounds: int) -> Clock:
     """Replay the same actions under every setting: where they lead, and in each round how long a step takes.
 
     A round goes through all settings, so that whatever else the machine does meets each of them alike; rounds that are
     kept are not run again.
     """
-    path, clock = _clock_path(plan), _kept_clock(plan)
+    path, clock = _clock_path(plan), _read_clock(plan)
     if len(clock.rounds) >= rounds:
         return clock
     actions = _actions(plan)
@@ -204,13 +215,13 @@ def clocked(plan: Plan, rounds: int) -> Clock:
     for number in range(len(clock.rounds), rounds):
         order = plan.settings if number % 2 == 0 else plan.settings[::-1]
         clock.rounds.append({setting.name: _seconds(plan, setting, actions) for setting in order})
-        _keep(path, {"rounds": clock.rounds, "error_mm": clock.error_mm})
+        _store(path, {"rounds": clock.rounds, "error_mm": clock.error_mm})
     return clock
 
 
 def rounds_missing(plans: Sequence[Plan]) -> list[Round]:
     """Return the rounds that are not kept for all plans yet."""
-    done = min(len(_kept_clock(plan).rounds) for plan in plans)
+    done = min(len(_read_clock(plan).rounds) for plan in plans)
     return [(tuple(plans), number) for number in range(done + 1, max(plan.rounds for plan in plans) + 1)]
 
 
@@ -222,36 +233,38 @@ def run_round(job: Round) -> tuple[str, int]:
     """
     plans, number = job
     for plan in plans:
-        clocked(plan, number)
+        run_clock(plan, number)
     return f"by the clock: round {number}", len(plans)
 
 
 def _clock_path(plan: Plan) -> Path:
-    about = [[task_digest(s.of(plan.task)), _kernel(s.of(plan.task))] for s in plan.settings]
-    return _place(plan.task, "clock", [about, _print(plan.pilot, plan), plan.worlds, plan.first, DECISIONS])
+    kernels = [[task_digest(s.applied_to(plan.task)), _kernel(s.applied_to(plan.task))] for s in plan.settings]
+    return _cache_path(
+        plan.task, "clock", [kernels, _player_digest(plan.pilot, plan), plan.worlds, plan.first, DECISIONS]
+    )
 
 
-def _kept_clock(plan: Plan) -> Clock:
+def _read_clock(plan: Plan) -> Clock:
     path = _clock_path(plan)
-    return _kept(path, _clock_of) if path.is_file() else Clock()
+    return _read(path, _clock_of) if path.is_file() else Clock()
 
 
 def _actions(plan: Plan) -> Actions:
     """Return what the pilot decides in the first decisions of every world, under the trained setting."""
     task = plan.task
     world, policy = World(task, plan.worlds), plan.policy(plan.pilot, task)
-    observation, taken, state = world.reset(plan.first), [], None
+    observation, actions, state = world.reset(plan.first), [], None
     for number in range(min(DECISIONS, task.horizon)):
         rows = observation.reshape(-1, observation.shape[-1])
         action, state = policy.predict(rows, state, np.full(len(rows), number == 0), True)
-        taken.append(np.asarray(action).reshape(*observation.shape[:-1], -1))
-        observation = world.step(taken[-1]).observation
-    return taken
+        actions.append(np.asarray(action).reshape(*observation.shape[:-1], -1))
+        observation = world.step(actions[-1]).observation
+    return actions
 
 
 def _seconds(plan: Plan, setting: Setting, actions: Actions) -> float:
     """Return the median time of one decision's physics, observations and rewards, s for all worlds together."""
-    world, times = World(setting.of(plan.task), plan.worlds), []
+    world, times = World(setting.applied_to(plan.task), plan.worlds), []
     world.reset(plan.first)
     for action in actions:
         began = perf_counter()
@@ -265,15 +278,15 @@ def _errors(plan: Plan, actions: Actions) -> dict[str, float]:
     task = plan.task
     count = max(1, min(len(actions), round(1.0 / task.control_dt)))
     exact = {"integrator": RK4(), "dtype": "float64", "dt": task.control_dt / REFERENCE}
-    right = _end(task.model_copy(update=exact), plan, actions[:count])
+    right = _end_positions(task.model_copy(update=exact), plan, actions[:count])
     errors = {}
     for setting in plan.settings:
-        off = task.scene.space.displacement(_end(setting.of(task), plan, actions[:count]), right)
+        off = task.scene.space.displacement(_end_positions(setting.applied_to(task), plan, actions[:count]), right)
         errors[setting.name] = 1e3 * float(np.median(np.linalg.norm(off, axis=-1)))
     return errors
 
 
-def _end(task: Task, plan: Plan, actions: Actions) -> NDArray[np.float64]:
+def _end_positions(task: Task, plan: Plan, actions: Actions) -> NDArray[np.float64]:
     """Return where the learners are after some actions, (B, L, D) m."""
     world = World(task, plan.worlds)
     world.reset(plan.first)

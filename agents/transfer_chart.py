@@ -1,4 +1,4 @@
-"""The picture of agents.transfer: what a setting does to the policy's return, and what everybody's return costs."""
+"""The picture of agents.transfer: the change of a policy's return by setting, and all returns over computing time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["draw_chart", "write_chart"]
 
 MARKS = "osD^vP*X<>"
-OTHERS = ("#009E73", "#CC79A7", "#56B4E9")  # of Okabe and Ito's palette, for players without a colour of their own
+OTHERS = ("#009E73", "#CC79A7", "#56B4E9")  # of Okabe and Ito's palette, for players that FIXED gives no colour
 
 
 def write_chart(path: str | Path, results: Results) -> None:
@@ -29,7 +29,7 @@ def write_chart(path: str | Path, results: Results) -> None:
 
 
 def draw_chart(results: Results) -> Figure:
-    """Return the picture: a row per task, differences of the last player on the left, everybody's cost on the right."""
+    """Return the picture, a row per task: left, changes of the last player's return; right, all returns over time."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -41,24 +41,24 @@ def draw_chart(results: Results) -> Figure:
     for row, (task, about) in zip(grid, tasks.items(), strict=True):
         _heat(row[0], task, about)
         _costs(row[1], about, colours)
-    shown = {}
+    legend = {}
     for axes in grid[:, 1]:
         handles, labels = axes.get_legend_handles_labels()
-        shown |= dict(zip(labels, handles, strict=True))
-    figure.legend(shown.values(), shown.keys(), loc="outside lower right", ncols=5, frameon=False, fontsize=9)
+        legend |= dict(zip(labels, handles, strict=True))
+    figure.legend(legend.values(), legend.keys(), loc="outside lower right", ncols=5, frameon=False, fontsize=9)
     pilots = " and ".join(dict.fromkeys(list(about["again"])[-1] for about in tasks.values()))
     figure.suptitle(f"What accuracy buys {pilots}", x=0.01, ha="left", fontsize=15, fontweight="bold", color=INK)
     return figure
 
 
-def _shown(results: Results) -> list[str]:
-    """Return the players whose returns are shown: random is too far below."""
+def _drawn_players(results: Results) -> list[str]:
+    """Return the players whose returns are drawn: all but random, whose returns are too low to share an axis."""
     return [name for name in results["again"] if name != "random"] or list(results["again"])
 
 
 def _colours(tasks: Results) -> dict[str, str]:
     """Return a colour for each player, the same in every task."""
-    players = dict.fromkeys(name for about in tasks.values() for name in _shown(about) if name not in FIXED)
+    players = dict.fromkeys(name for about in tasks.values() for name in _drawn_players(about) if name not in FIXED)
     return dict(zip(players, OTHERS * len(players), strict=False)) | FIXED
 
 
@@ -67,7 +67,7 @@ def _solver(about: Results) -> str:
 
 
 def _heat(axes: Axes, task: str, results: Results) -> None:
-    """Draw the difference of the last player's return to its trained setting, white at none."""
+    """Draw a heat map, method by dt, of the last player's return minus that under its trained setting; white = 0."""
     settings = results["settings"]
     pilot = list(results["again"])[-1]
     solvers = list(dict.fromkeys(_solver(about) for about in settings.values()))
@@ -80,7 +80,7 @@ def _heat(axes: Axes, task: str, results: Results) -> None:
     shades = axes.imshow(table, cmap="RdBu", vmin=-bound, vmax=bound, aspect="auto")
     for name, about in settings.items():
         y, x = solvers.index(_solver(about)), steps.index(about["substeps"])
-        _number(axes, x, y, about["players"][pilot], bound, name == results["trained"])
+        _write_number(axes, x, y, about["players"][pilot], bound, name == results["trained"])
     assert axes.figure is not None
     axes.figure.colorbar(shades, ax=axes, pad=0.015, aspect=22).set_label(f"{pilot}: return minus trained", fontsize=9)
     axes.set_yticks(range(len(solvers)), solvers)
@@ -92,7 +92,8 @@ def _heat(axes: Axes, task: str, results: Results) -> None:
         side.set_visible(False)
 
 
-def _number(axes: Axes, x: int, y: int, player: Results, bound: float, trained: bool) -> None:
+def _write_number(axes: Axes, x: int, y: int, player: Results, bound: float, trained: bool) -> None:
+    """Write a cell's number: the difference, with (level) if its interval holds 0; a frame marks the trained one."""
     from matplotlib.patches import Rectangle
 
     value = player["difference"]
@@ -106,14 +107,14 @@ def _number(axes: Axes, x: int, y: int, player: Results, bound: float, trained: 
 
 
 def _costs(axes: Axes, results: Results, colours: dict[str, str]) -> None:
-    """Draw the returns against the time of a simulated second."""
-    settings, players = results["settings"], _shown(results)
+    """Draw the mean return of each player over the time that a simulated second takes, a mark per method."""
+    settings, players = results["settings"], _drawn_players(results)
     solvers = list(dict.fromkeys(_solver(about) for about in settings.values()))
     for k, solver in enumerate(solvers):
-        found = sorted((a for a in settings.values() if _solver(a) == solver), key=lambda a: a["substeps"])
-        times = [about["us_per_s"] for about in found]
+        about_solver = sorted((a for a in settings.values() if _solver(a) == solver), key=lambda a: a["substeps"])
+        times = [about["us_per_s"] for about in about_solver]
         for name in players:
-            heights = [about["players"][name]["mean"] for about in found]
+            heights = [about["players"][name]["mean"] for about in about_solver]
             axes.plot(times, heights, color=colours[name], linewidth=0.7, alpha=0.35, zorder=1)
             style: dict[str, Any] = {"marker": MARKS[k % len(MARKS)], "s": 30, "linewidths": 0, "alpha": 0.85}
             axes.scatter(times, heights, color=colours[name], zorder=2, **style)

@@ -15,7 +15,9 @@ from flockenv.evaluation import bootstrap, task_digest
 from flockenv.physics.integrators import INTEGRATORS
 from flockenv.tasks import Task
 
-__all__ = ["Cell", "Clock", "Setting", "finest", "frugal", "markdown", "show", "task_results", "verdict"]
+__all__ = [
+    "Cell", "Clock", "Setting", "cheapest_accurate", "markdown", "most_accurate", "show", "task_results", "verdict",
+]  # fmt: skip
 
 SURVIVES = 0.95
 """A policy survives if it keeps this share of its lead over random in its worst setting."""
@@ -59,11 +61,11 @@ class Setting:
     substeps: int
 
     @classmethod
-    def trained(cls, task: Task) -> Setting:
+    def of_training(cls, task: Task) -> Setting:
         """Return the setting in the config of a task, for which its players were made."""
         return cls(task.integrator.kind, task.dtype, task.substeps)
 
-    def of(self, task: Task) -> Task:
+    def applied_to(self, task: Task) -> Task:
         """Return the task with this setting; the same task, to the last bit of dt, if it has this setting."""
         changes: dict[str, Any] = {"dtype": self.dtype}
         if self.method != task.integrator.kind:
@@ -121,7 +123,7 @@ def task_results(
     names = list(again)
     found: Results = {}
     for setting in settings:
-        dt, method = setting.of(task).dt, INTEGRATORS[setting.method]
+        dt, method = setting.applied_to(task).dt, INTEGRATORS[setting.method]
         each = next(len(cells[setting, name].returns) for name in names) * task.control_dt
         times = [1e6 * times[setting.name] / each for times in clock.rounds]
         found[setting.name] = {
@@ -171,14 +173,14 @@ def _difference(first: Cell, second: Cell, resamples: int, seed: int) -> Results
 # --- sentences --------------------------------------------------------------------------------------------------------
 
 
-def finest(results: Results) -> str:
+def most_accurate(results: Results) -> str:
     """Return the setting of the least error; of those within a tenth of it, or of rounding, the cheapest."""
     settings = results["settings"]
     least = max(NOTHING, 1.1 * min(about["error_mm"] for about in settings.values()))
     return _cheapest(settings, least)
 
 
-def frugal(results: Results) -> str:
+def cheapest_accurate(results: Results) -> str:
     """Return the cheapest setting that has at most a tenth of the error of the trained one."""
     settings = results["settings"]
     least = min(about["error_mm"] for about in settings.values())
@@ -194,13 +196,13 @@ def verdict(task: str, results: Results) -> str:
     """Return a sentence on the last player: whether it keeps its scores, and what accuracy costs."""
     settings, trained = results["settings"], results["settings"][results["trained"]]
     pilot = list(trained["players"])[-1]
-    best, cheap = finest(results), frugal(results)
+    best, cheap = most_accurate(results), cheapest_accurate(results)
     fine, saving = settings[best], settings[cheap]
     claims = [_survival(results, pilot)]
-    told = f"solved to {length_text(fine['error_mm'])} ({title(fine)}; trained: {length_text(trained['error_mm'])})"
+    text = f"solved to {length_text(fine['error_mm'])} ({title(fine)}; trained: {length_text(trained['error_mm'])})"
     rates = [about["players"][pilot]["success_rate"] for about in (fine, trained)]
     change = f"{_change(fine['players'][pilot])}, success {rates[0]:.0%} against {rates[1]:.0%}"
-    claims.append(f"{told} it {change}, and {_standing(fine, pilot)}")
+    claims.append(f"{text} it {change}, and {_standing(fine, pilot)}")
     claims.append(
         f"at most a tenth of the trained error ({title(saving)}: {length_text(saving['error_mm'])}) costs "
         + _times(saving, trained)
@@ -216,12 +218,12 @@ def _survival(results: Results, pilot: str) -> str:
     worst, trained = settings[name]["players"], settings[results["trained"]]["players"]
     if name == results["trained"]:
         return f"{pilot} does nowhere worse than where it was made"
-    told = f"in its worst setting ({title(settings[name])}) it {_change(worst[pilot])}"
+    text = f"in its worst setting ({title(settings[name])}) it {_change(worst[pilot])}"
     if "random" not in worst or pilot == "random":
-        return f"{pilot}: {told}"
+        return f"{pilot}: {text}"
     kept = (worst[pilot]["mean"] - worst["random"]["mean"]) / (trained[pilot]["mean"] - trained["random"]["mean"])
     says = "survives every setting" if kept >= SURVIVES else "does not survive every setting"
-    return f"{pilot} {says}: {told} and keeps {100 * kept:.0f} % of its lead over random"
+    return f"{pilot} {says}: {text} and keeps {100 * kept:.0f} % of its lead over random"
 
 
 def _change(player: Results) -> str:

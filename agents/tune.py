@@ -53,14 +53,14 @@ def search(experiment: Experiment, advance: Any = lambda steps: None) -> tuple[d
         best_score = scored[0][0]
         keep = [candidate for _, candidate in scored[: max(2, len(scored) // 4)]]
         spread = 0.25 / (round_ + 1)
-        pool = [*keep, *(_near(keep[k % len(keep)], ranges, spread, rng) for k in range(len(keep)))]
+        pool = [*keep, *(_vary(keep[k % len(keep)], ranges, spread, rng) for k in range(len(keep)))]
         worlds *= 2
     found = {"agent_steps": float(spent), "tuning_mean": best_score, "tuning_worlds": float(worlds // 2)}
     found["textbook_mean"] = _score(task, textbook, worlds // 2, s.seed)[0]
     return {k: float(np.round(v, 4)) for k, v in scored[0][1].items()}, found
 
 
-def _plays(candidates: int, rounds: int) -> int:
+def _count_plays(candidates: int, rounds: int) -> int:
     """Return how many parameter sets are played in all rounds."""
     pool, total = candidates, 0
     for _ in range(rounds):
@@ -69,7 +69,7 @@ def _plays(candidates: int, rounds: int) -> int:
     return total
 
 
-def _near(base: dict[str, float], ranges: dict[str, tuple[float, float]], spread: float, rng: Any) -> dict[str, float]:
+def _vary(base: dict[str, float], ranges: dict[str, tuple[float, float]], spread: float, rng: Any) -> dict[str, float]:
     """Return a set of parameters near another: each moved by a share of its range."""
     return {k: float(np.clip(base[k] + spread * (hi - lo) * rng.normal(), lo, hi)) for k, (lo, hi) in ranges.items()}
 
@@ -105,7 +105,7 @@ def main(
         check_room(target, ROOM)
     s = experiment.search
     with show_progress(Progress(console=console)) as progress:
-        bar = progress.add_task(f"{task.name}: parameter sets", total=_plays(s.candidates, s.rounds))
+        bar = progress.add_task(f"{task.name}: parameter sets", total=_count_plays(s.candidates, s.rounds))
         rules, found = search(experiment, lambda n: progress.advance(bar, n))
     console.print(f"{task.name}: found {json.dumps(rules)}", markup=False, highlight=False, soft_wrap=True)
     with one_line_errors():

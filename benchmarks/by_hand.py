@@ -35,7 +35,7 @@ ROWS = 9  # of scratch: x, y, vx, vy, the steering force, alive flags, and direc
 
 
 @njit(**PARTS)
-def _image(d, size, inverse):
+def _nearest_image(d, size, inverse):
     return d - size * round_half_even(d * inverse)
 
 
@@ -55,23 +55,23 @@ def _store(now, x, v, b, n):
 
 
 @njit(**PARTS)
-def _shortened(longest, square):
+def _limit_factor(longest, square):
     one = like(square, 1.0)
     return longest / np.sqrt(square) if square > longest * longest else one
 
 
 @njit(**PARTS)
-def _into(x, size, inverse):
+def _wrap(x, size, inverse):
     inside = x - size * np.floor(x * inverse)
     zero = like(x, 0.0)
     return zero if inside >= size or inside < zero else inside
 
 
 def _move(width):
-    """Wish and drive -> new velocities and positions of a world; says whether everything is finite."""
+    """Neighbour force and drive -> new velocities and positions of a world; says whether everything is finite."""
 
     @njit(**PARTS)
-    def move(now, want, body, blocks, size, dt):
+    def move(now, requested, body, blocks, size, dt):
         inverse, far = like(size, 1.0) / size, like(size, np.inf)
         good = True
         for block in range(blocks):
@@ -79,15 +79,15 @@ def _move(width):
             for lane in range(np.uint64(width)):
                 i = first + lane
                 mass, fastest, strongest, living = body[0, i], body[1, i], body[2, i], now[6, i]
-                fx, fy = now[4, i] + want[0, i], now[5, i] + want[1, i]
-                share = _shortened(strongest, fx * fx + fy * fy) * living / mass
+                fx, fy = now[4, i] + requested[0, i], now[5, i] + requested[1, i]
+                share = _limit_factor(strongest, fx * fx + fy * fy) * living / mass
                 vx, vy = now[2, i] + dt * (fx * share), now[3, i] + dt * (fy * share)
                 dx, dy = dt * vx, dt * vy
                 good &= abs(dx * dx + dy * dy + vx * vx + vy * vy) < far
-                brake = _shortened(fastest * dt, dx * dx + dy * dy) * living
-                slow = _shortened(fastest, vx * vx + vy * vy) * living
-                now[0, i] = _into(now[0, i] + dx * brake, size, inverse)
-                now[1, i] = _into(now[1, i] + dy * brake, size, inverse)
+                brake = _limit_factor(fastest * dt, dx * dx + dy * dy) * living
+                slow = _limit_factor(fastest, vx * vx + vy * vy) * living
+                now[0, i] = _wrap(now[0, i] + dx * brake, size, inverse)
+                now[1, i] = _wrap(now[1, i] + dy * brake, size, inverse)
                 now[2, i], now[3, i] = vx * slow, vy * slow
         return good
 
@@ -99,12 +99,12 @@ def _rows(width):
     return tuple(np.uint64(k * width) for k in range(10))
 
 
-def _together(width):
+def _add_coincident(width):
     """Neighbours in the same place: nearly always the agent itself, so a branch handles them."""
     at = _rows(width)
 
     @njit(**PARTS)
-    def together(now, sums, counts, number, n, first, three, p):
+    def add_coincident(now, sums, counts, number, n, first, three, p):
         crowded, others = False, like(counts[0], n - 1)
         for lane in range(np.uint64(width)):
             crowded |= counts[at[2] + lane] < others
@@ -112,8 +112,8 @@ def _together(width):
             for j in range(np.uint64(n)):
                 for lane in range(np.uint64(width)):
                     i = first + lane
-                    dx = _image(now[0, j] - now[0, i], p[0], like(p[0], 1.0) / p[0])
-                    dy = _image(now[1, j] - now[1, i], p[0], like(p[0], 1.0) / p[0])
+                    dx = _nearest_image(now[0, j] - now[0, i], p[0], like(p[0], 1.0) / p[0])
+                    dy = _nearest_image(now[1, j] - now[1, i], p[0], like(p[0], 1.0) / p[0])
                     square = dx * dx + dy * dy
                     if np.int32(j - first) != number[lane] and square <= like(square, 1e-30):
                         sums[at[0] + lane] += now[7, i] - now[7, j]
@@ -124,7 +124,7 @@ def _together(width):
                             sums[at[3] + lane] += now[3, j]
                             counts[at[0] + lane] += 1
 
-    return together
+    return add_coincident
 
 
 # --- what neighbours come to, by mix --------------------------------------------------------------------------------
@@ -132,10 +132,10 @@ def _together(width):
 
 def _three(width):
     """Separation, alignment and cohesion."""
-    at, together = _rows(width), _together(width)
+    at, add_coincident = _rows(width), _add_coincident(width)
 
     @njit(**PARTS)
-    def wish(now, sums, counts, number, n, blocks, p):
+    def neighbour_force(now, sums, counts, number, n, blocks, p):
         size, apart, agree, near, w_apart, w_agree, w_near = p[0], p[1], p[2], p[3], p[4], p[5], p[6]
         zero, one, inverse = like(size, 0.0), like(size, 1.0), like(size, 1.0) / size
         none, up, stay = like(size, -0.0), like(counts[0], 1.0), like(counts[0], -0.0)
@@ -148,10 +148,10 @@ def _three(width):
             for j in range(np.uint64(n)):
                 xj, yj, ux, uy = now[0, j], now[1, j], now[2, j], now[3, j]
                 for lane in range(np.uint64(width)):
-                    dx = _image(xj - now[0, first + lane], size, inverse)
-                    dy = _image(yj - now[1, first + lane], size, inverse)
+                    dx = _nearest_image(xj - now[0, first + lane], size, inverse)
+                    dy = _nearest_image(yj - now[1, first + lane], size, inverse)
                     square = dx * dx + dy * dy
-                    seen = square > like(square, 1e-30)  # oneself is not
+                    seen = square > like(square, 1e-30)  # the agent itself is not
                     share = -one / square if seen & (square < apart) else zero
                     with_me, by_me = seen & (square < agree), seen & (square < near)
                     sums[at[0] + lane] += dx * share
@@ -163,27 +163,27 @@ def _three(width):
                     sums[at[6] + lane] += dy if by_me else none
                     counts[at[1] + lane] += up if by_me else stay
                     counts[at[2] + lane] += up if seen else stay
-            together(now, sums, counts, number, n, first, True, p)
+            add_coincident(now, sums, counts, number, n, first, True, p)
             for lane in range(np.uint64(width)):
                 i = first + lane
-                some = counts[at[0] + lane] > 0
-                mates = one / like(one, counts[at[0] + lane]) if some else zero
+                has_mates = counts[at[0] + lane] > 0
+                mates = one / like(one, counts[at[0] + lane]) if has_mates else zero
                 many = counts[at[1] + lane]
                 company = one / like(one, many) if many > 0 else zero
-                agree_x = sums[at[2] + lane] * mates - now[2, i] if some else zero
-                agree_y = sums[at[3] + lane] * mates - now[3, i] if some else zero
+                agree_x = sums[at[2] + lane] * mates - now[2, i] if has_mates else zero
+                agree_y = sums[at[3] + lane] * mates - now[3, i] if has_mates else zero
                 now[4, i] = w_apart * sums[at[0] + lane] + w_agree * agree_x + w_near * (sums[at[5] + lane] * company)
                 now[5, i] = w_apart * sums[at[1] + lane] + w_agree * agree_y + w_near * (sums[at[6] + lane] * company)
 
-    return wish
+    return neighbour_force
 
 
 def _two(width):
     """Separation and cohesion."""
-    at, together = _rows(width), _together(width)
+    at, add_coincident = _rows(width), _add_coincident(width)
 
     @njit(**PARTS)
-    def wish(now, sums, counts, number, n, blocks, p):
+    def neighbour_force(now, sums, counts, number, n, blocks, p):
         size, apart, near, w_apart, w_near = p[0], p[1], p[3], p[4], p[6]
         zero, one, inverse = like(size, 0.0), like(size, 1.0), like(size, 1.0) / size
         none, up, stay = like(size, -0.0), like(counts[0], 1.0), like(counts[0], -0.0)
@@ -196,10 +196,10 @@ def _two(width):
             for j in range(np.uint64(n)):
                 xj, yj = now[0, j], now[1, j]
                 for lane in range(np.uint64(width)):
-                    dx = _image(xj - now[0, first + lane], size, inverse)
-                    dy = _image(yj - now[1, first + lane], size, inverse)
+                    dx = _nearest_image(xj - now[0, first + lane], size, inverse)
+                    dy = _nearest_image(yj - now[1, first + lane], size, inverse)
                     square = dx * dx + dy * dy
-                    seen = square > like(square, 1e-30)  # oneself is not
+                    seen = square > like(square, 1e-30)  # the agent itself is not
                     share = -one / square if seen & (square < apart) else zero
                     by_me = seen & (square < near)
                     sums[at[0] + lane] += dx * share
@@ -208,7 +208,7 @@ def _two(width):
                     sums[at[3] + lane] += dy if by_me else none
                     counts[at[1] + lane] += up if by_me else stay
                     counts[at[2] + lane] += up if seen else stay
-            together(now, sums, counts, number, n, first, False, p)
+            add_coincident(now, sums, counts, number, n, first, False, p)
             for lane in range(np.uint64(width)):
                 i = first + lane
                 many = counts[at[1] + lane]
@@ -216,15 +216,15 @@ def _two(width):
                 now[4, i] = w_apart * sums[at[0] + lane] + w_near * (sums[at[2] + lane] * company)
                 now[5, i] = w_apart * sums[at[1] + lane] + w_near * (sums[at[3] + lane] * company)
 
-    return wish
+    return neighbour_force
 
 
-def _seeing(width):
+def _field_of_view(width):
     """Separation, alignment and cohesion of neighbours in a field of view."""
-    at, together = _rows(width), _together(width)
+    at, add_coincident = _rows(width), _add_coincident(width)
 
     @njit(**PARTS)
-    def wish(now, sums, counts, number, n, blocks, p):
+    def neighbour_force(now, sums, counts, number, n, blocks, p):
         size, apart, agree, near, w_apart, w_agree, w_near, view = p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7]
         zero, one, inverse = like(size, 0.0), like(size, 1.0), like(size, 1.0) / size
         none, up, stay = like(size, -0.0), like(counts[0], 1.0), like(counts[0], -0.0)
@@ -243,8 +243,8 @@ def _seeing(width):
             for j in range(np.uint64(n)):
                 xj, yj, ux, uy = now[0, j], now[1, j], now[2, j], now[3, j]
                 for lane in range(np.uint64(width)):
-                    dx = _image(xj - now[0, first + lane], size, inverse)
-                    dy = _image(yj - now[1, first + lane], size, inverse)
+                    dx = _nearest_image(xj - now[0, first + lane], size, inverse)
+                    dy = _nearest_image(yj - now[1, first + lane], size, inverse)
                     square = dx * dx + dy * dy
                     ahead = dx * sums[at[8] + lane] + dy * sums[at[9] + lane]
                     still = sums[at[8] + lane] * sums[at[8] + lane] + sums[at[9] + lane] * sums[at[9] + lane] <= zero
@@ -261,44 +261,44 @@ def _seeing(width):
                     sums[at[6] + lane] += dy if by_me else none
                     counts[at[1] + lane] += up if by_me else stay
                     counts[at[2] + lane] += up if alone else stay
-            together(now, sums, counts, number, n, first, True, p)
+            add_coincident(now, sums, counts, number, n, first, True, p)
             for lane in range(np.uint64(width)):
                 i = first + lane
-                some = counts[at[0] + lane] > 0
-                mates = one / like(one, counts[at[0] + lane]) if some else zero
+                has_mates = counts[at[0] + lane] > 0
+                mates = one / like(one, counts[at[0] + lane]) if has_mates else zero
                 many = counts[at[1] + lane]
                 company = one / like(one, many) if many > 0 else zero
-                agree_x = sums[at[2] + lane] * mates - now[2, i] if some else zero
-                agree_y = sums[at[3] + lane] * mates - now[3, i] if some else zero
+                agree_x = sums[at[2] + lane] * mates - now[2, i] if has_mates else zero
+                agree_y = sums[at[3] + lane] * mates - now[3, i] if has_mates else zero
                 now[4, i] = w_apart * sums[at[0] + lane] + w_agree * agree_x + w_near * (sums[at[5] + lane] * company)
                 now[5, i] = w_apart * sums[at[1] + lane] + w_agree * agree_y + w_near * (sums[at[6] + lane] * company)
 
-    return wish
+    return neighbour_force
 
 
 # --- all worlds -----------------------------------------------------------------------------------------------------
 
-MIXES: dict[str, Callable[[int], Any]] = {"three": _three, "two": _two, "seeing": _seeing}
+MIXES: dict[str, Callable[[int], Any]] = {"three": _three, "two": _two, "seeing": _field_of_view}
 
 
 @functools.cache
 def _kernel(mix: str, width: int) -> Any:
     """Return the compiled step of a mix."""
-    wish, move = MIXES[mix](width), _move(width)
+    neighbour_force, move = MIXES[mix](width), _move(width)
 
     @njit(pipeline_class=Whole, **FAST)
-    def step(x, v, alive, drive, body, work, p, dt, steps, now, want, sums, counts, number):
+    def step(x, v, alive, drive, body, work, p, dt, steps, now, requested, sums, counts, number):
         unaliased()
         n = x.shape[2]
         blocks = (n + width - 1) // width
         for b in range(x.shape[1]):
             for i in range(np.uint64(n)):
-                want[0, i] = drive[0, b, i] if drive.shape[1] > 0 else like(dt, 0.0)
-                want[1, i] = drive[1, b, i] if drive.shape[1] > 0 else like(dt, 0.0)
+                requested[0, i] = drive[0, b, i] if drive.shape[1] > 0 else like(dt, 0.0)
+                requested[1, i] = drive[1, b, i] if drive.shape[1] > 0 else like(dt, 0.0)
             _load(now, x, v, alive, b, n)
             for _ in range(steps):
-                wish(now, sums, counts, number, n, blocks, p)
-                if not move(now, want, body, blocks, p[0], dt):
+                neighbour_force(now, sums, counts, number, n, blocks, p)
+                if not move(now, requested, body, blocks, p[0], dt):
                     return b
                 work[b, 0] += 1
                 work[b, 2] += n * n
@@ -323,12 +323,12 @@ def by_hand(mix: str, scene: Scene, state: State, steps: int) -> Callable[[], ob
     body = zeros((3, padded), real)
     body[...] = 1
     body[:, : scene.agents] = scene.body.mass, scene.body.max_speed, scene.body.max_force
-    now, want, sums = (zeros(shape, real) for shape in ((ROWS, padded), (2, padded), (10 * width,)))
+    now, requested, sums = (zeros(shape, real) for shape in ((ROWS, padded), (2, padded), (10 * width,)))
     now[7:, : scene.agents] = separation_directions(scene.agents, 2).T
     counts = zeros(3 * width, real if REGISTER == LINE else f"i{real.itemsize}")
     arguments = (
         state.x, state.v, state.alive, np.zeros((2, 0, 0), real), body, state.work, np.array(numbers, real),
-        real.type(scene.dt), steps, now, want, sums, counts,
+        real.type(scene.dt), steps, now, requested, sums, counts,
         np.arange(width, dtype=np.int32),
     )  # fmt: skip
     kernel = _kernel(mix, width)

@@ -1,7 +1,7 @@
-"""Discs that are solid: `python -m benchmarks.collisions`.
+"""The cost of hard collisions: `python -m benchmarks.collisions`.
 
-What a step costs with hard collisions, by response, against the same step without: a gas of discs with a fifth of the
-plane covered, and a heap that rests on a floor between walls. Impacts per step are said beside.
+Times a step of solid discs under each collision response, as a ratio to the same step without collisions. Two scenes: a
+gas, whose discs cover a fifth of a torus, and a heap that rests on the floor of a box. Notes give the impacts per step.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import typer
 
 from benchmarks.floors import machine, of_scene
 from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_line
-from benchmarks.scenes import stepping
+from benchmarks.scenes import step_from_start
 from flockenv.geometry.space import Box, Torus
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
@@ -30,7 +30,7 @@ RESPONSES = ("project", "impulses", "back_up", "earliest")
 
 
 def gas(count: int) -> tuple[Scene, State]:
-    """Elastic discs at 1 m/s on a torus, a fifth of which they cover."""
+    """Return a scene of elastic discs at 1 m/s that cover a fifth of a torus, and its state after 2 s."""
     edge = math.sqrt(count * math.pi * RADIUS**2 / 0.2)
     side = math.ceil(math.sqrt(count))
     spawn = Spawn(speed=(1.0, 1.0))
@@ -45,7 +45,7 @@ def gas(count: int) -> tuple[Scene, State]:
 
 
 def heap(count: int) -> tuple[Scene, State]:
-    """Discs that have fallen into a box that is as wide as twenty of them."""
+    """Return a scene of discs in a box 22 diameters wide, and its state after they have fallen for 2 s."""
     width = 22 * RADIUS * 2
     scene = Scene(
         groups=(Group(count=count, radius=RADIUS, spawn=Spawn(low=(0.0, 0.0), high=(1.0, 1.0))),),
@@ -64,19 +64,19 @@ def main(
     rounds: Rounds = None,
     out: Out = None,
 ) -> None:
-    """Measure steps with collisions, by response, against the same without."""
+    """Measure steps with collisions, by response, as ratios to the same steps without."""
     with Bench("collisions", quick, rounds, out) as bench:
         most = machine(bench)
         for name, (scene, state) in (("gas", gas(count)), ("heap", heap(min(count, 300)))):
-            discs, given = scene.agents, scene.constraints[0]
+            discs, collisions = scene.agents, scene.constraints[0]
             bare = scene.model_copy(update={"constraints": ()})
-            floor = most.floor(of_scene(bare, state, STEPS)) if most else None  # what collides is not counted
-            pack = [Contestant("none", stepping(bare, state, STEPS), discs * STEPS, floor, f"{discs:,} discs")]
+            floor = most.floor(of_scene(bare, state, STEPS)) if most else None  # collisions are not counted
+            pack = [Contestant("none", step_from_start(bare, state, STEPS), discs * STEPS, floor, f"{discs:,} discs")]
             for response in RESPONSES:
-                kind = scene.model_copy(update={"constraints": (given.model_copy(update={"response": response}),)})
+                kind = scene.model_copy(update={"constraints": (collisions.model_copy(update={"response": response}),)})
                 after = kind.run(state, 60)
                 hits = (after.count_of("impacts") - state.count_of("impacts")) / 60
-                step, note = stepping(kind, state, STEPS), f"{hits:.3g} impacts a step"
+                step, note = step_from_start(kind, state, STEPS), f"{hits:.3g} impacts a step"
                 pack.append(Contestant(response, step, discs * STEPS, floor, note))
             for result in bench.race(f"{name} of {discs:,}", pack, baseline="none")[1:]:
                 bench.note(f"{name}, {result.name}: {1e6 * discs / result.rate:,.0f} us per step of {discs:,} discs.")

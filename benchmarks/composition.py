@@ -19,8 +19,8 @@ import typer
 from benchmarks.by_hand import MIXES, by_hand
 from benchmarks.floors import Machine, machine, of_scene
 from benchmarks.measure import Bench, Contestant, Floor, Out, Quick, Result, Rounds, command_line, number
-from benchmarks.peers import PeerError, running
-from benchmarks.scenes import WORLD_RADII, crowd, restarting, rules, stepping, world
+from benchmarks.peers import PeerError, start_script
+from benchmarks.scenes import WORLD_RADII, crowd, restart_each_call, rules, step_from_start, world
 from flockenv.jit.thread_pool import use_threads
 from flockenv.model.state import State
 from flockenv.scene import Scene
@@ -43,15 +43,15 @@ def _mixes(effects: Sequence[Any]) -> dict[str, tuple[Any, ...]]:
     }  # fmt: skip
 
 
-def _rules(bench: Bench, title: str, scene: Scene, worlds: int, most: Machine | None) -> None:
+def _race_rules(bench: Bench, title: str, scene: Scene, worlds: int, most: Machine | None) -> None:
     """Race rules alone, together, and in sweeps of their own."""
     start = scene.start(0, worlds=worlds)
     work = worlds * scene.agents * STEPS
     contestants = []
     for name, effects in _mixes(scene.effects).items():
         mix = scene.with_effects(*effects)
-        contestants.append(Contestant(name, stepping(mix, start, STEPS), work, _floor(mix, start, most)))
-    alone = [stepping(scene.with_effects(effect), start, STEPS) for effect in scene.effects]
+        contestants.append(Contestant(name, step_from_start(mix, start, STEPS), work, _floor(mix, start, most)))
+    alone = [step_from_start(scene.with_effects(effect), start, STEPS) for effect in scene.effects]
 
     def apart() -> None:
         for step in alone:
@@ -59,14 +59,14 @@ def _rules(bench: Bench, title: str, scene: Scene, worlds: int, most: Machine | 
 
     contestants.append(Contestant("three scenes of one each", apart, work))
     results = bench.race(title, contestants, baseline="all three")
-    _summed(bench, results)
+    _note_costs(bench, results)
 
 
 def _floor(scene: Scene, start: State, most: Machine | None) -> Floor | None:
     return most.floor(of_scene(scene, start, STEPS)) if most else None
 
 
-def _summed(bench: Bench, results: Sequence[Result]) -> None:
+def _note_costs(bench: Bench, results: Sequence[Result]) -> None:
     """Say what rules cost alone and together, less what a scene without any costs; ratios are of the same rounds."""
     rounds = min((len(r.rates) for r in results), default=0)
     if len(results) < len(_mixes(("", "", ""))) or not rounds:
@@ -76,10 +76,10 @@ def _summed(bench: Bench, results: Sequence[Result]) -> None:
     saved = [sum(beyond[name][k] for name in NAMES) / beyond["all three"][k] for k in range(rounds)]
     alone = [sum(cost[name][k] for name in NAMES) / len(NAMES) for k in range(rounds)]
     times = statistics.median(cost["all three"][k] / alone[k] for k in range(rounds))
-    said = ", ".join(f"{name} {number(statistics.median(beyond[name]))}" for name in (*NAMES, "all three"))
+    costs = ", ".join(f"{name} {number(statistics.median(beyond[name]))}" for name in (*NAMES, "all three"))
     bench.note(
         f"{results[0].race}: without effects {number(statistics.median(cost['no effect']))} ns per agent and step; "
-        f"beyond that {said}. One by one they cost {number(statistics.median(saved))} times what they cost together. "
+        f"beyond that {costs}. One by one they cost {number(statistics.median(saved))} times what they cost together. "
         f"With all it costs {number(times)} times what a scene of one rule does (the mean of the three)."
     )
 
@@ -93,7 +93,7 @@ def mix_scene(mix: str, dtype: str) -> Scene:
     return world(dtype).with_effects(*((a, c) if mix == "two" else (a, b, c)))
 
 
-def _by_hand(bench: Bench, mix: str, dtype: str, most: Machine | None) -> bool:
+def _race_by_hand(bench: Bench, mix: str, dtype: str, most: Machine | None) -> bool:
     """Race a generated kernel against the one by hand; False where they do not do the same."""
     scene = mix_scene(mix, dtype)
     start = scene.start(0, worlds=WORLDS)
@@ -112,14 +112,14 @@ def _by_hand(bench: Bench, mix: str, dtype: str, most: Machine | None) -> bool:
     bench.extra.setdefault("by_hand_apart_m", {})[title] = apart
     work, floor = WORLDS * scene.agents * STEPS, _floor(scene, start, most)
     contestants = [
-        Contestant("by hand", restarting(start, theirs, step), work, floor),
-        Contestant("generated", stepping(scene, start, STEPS), work, floor),
+        Contestant("by hand", restart_each_call(start, theirs, step), work, floor),
+        Contestant("generated", step_from_start(scene, start, STEPS), work, floor),
     ]
     bench.race(title, contestants, baseline="by hand")
     return True
 
 
-def _hand_ratios(bench: Bench) -> None:
+def _note_hand_ratios(bench: Bench) -> None:
     ratios = [f"{r.race} {number(r.ratio)}" for r in bench.results if r.name == "generated" and r.ratio]
     if ratios:
         bench.note(f"generated over by hand: {'; '.join(ratios)}.")
@@ -128,14 +128,14 @@ def _hand_ratios(bench: Bench) -> None:
 # --- what is not listed ---------------------------------------------------------------------------------------------
 
 
-def _unlisted(bench: Bench) -> bool:
+def _race_unlisted(bench: Bench) -> bool:
     """Race a scene against itself where one more effect exists; False if bits or work differ."""
     seconds = QUICK_SAMPLE if bench.quick else SAMPLE
     python = Path(sys.executable)
     try:
         with (
-            running("as it is", python, "run_unlisted.py", "plain", 1, seconds) as plain,
-            running("one more defined", python, "run_unlisted.py", "another", 1, seconds) as another,
+            start_script("as it is", python, "run_unlisted.py", "plain", 1, seconds) as plain,
+            start_script("one more defined", python, "run_unlisted.py", "another", 1, seconds) as another,
         ):
             bench.race("an effect that is listed nowhere, 1024 x 32, float32", [plain, another], baseline=plain.name)
             same = plain.note == another.note
@@ -151,11 +151,11 @@ def main(quick: Quick = False, rounds: Rounds = None, out: Out = None) -> None:
     use_threads(1)
     with Bench("composition", quick, rounds, out) as bench:
         most = machine(bench)
-        _rules(bench, f"rules, {WORLDS} worlds x 32, float32", world("float32"), WORLDS, most)
-        _rules(bench, f"rules, one world of {CROWD:,}, float32", crowd(CROWD, "float32"), 1, most)
-        same = [_by_hand(bench, mix, dtype, most) for dtype in ("float32", "float64") for mix in MIXES]
-        _hand_ratios(bench)
-        same.append(_unlisted(bench))
+        _race_rules(bench, f"rules, {WORLDS} worlds x 32, float32", world("float32"), WORLDS, most)
+        _race_rules(bench, f"rules, one world of {CROWD:,}, float32", crowd(CROWD, "float32"), 1, most)
+        same = [_race_by_hand(bench, mix, dtype, most) for dtype in ("float32", "float64") for mix in MIXES]
+        _note_hand_ratios(bench)
+        same.append(_race_unlisted(bench))
         bench.note(f"One thread, 2-D torus; every call begins in the same state and does {STEPS} steps.")
     if not all(same):
         raise typer.Exit(1)

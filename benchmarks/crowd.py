@@ -18,8 +18,8 @@ import typer
 
 from benchmarks.floors import Machine, machine, of_scene
 from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_line, number
-from benchmarks.peers import CACHE, DONE, SAMPLE, PeerError, python_of, running
-from benchmarks.scenes import stepping
+from benchmarks.peers import CACHE, DONE, SAMPLE, PeerError, python_of, start_script
+from benchmarks.scenes import step_from_start
 from flockenv.geometry.space import Torus
 from flockenv.jit.thread_pool import use_threads
 from flockenv.model.spawn import Spawn
@@ -46,7 +46,7 @@ def crowd(name: str, people: int = PEOPLE, dtype: str = "float64") -> Scene:
         return Scene(space=Torus(size=(edge, edge)), groups=(group, group), effects=effects, dt=DT, dtype=dtype)
 
 
-def _models(bench: Bench, dtype: str, most: Machine | None) -> None:
+def _race_models(bench: Bench, dtype: str, most: Machine | None) -> None:
     """Race all models, as they are after a second."""
     contestants = []
     for name in PRESETS:
@@ -56,28 +56,28 @@ def _models(bench: Bench, dtype: str, most: Machine | None) -> None:
             bench.note(f"{name} is not raced: {error}")
             continue
         start = scene.run(scene.start(0), 100)
-        met = scene.step(start).count_of("pairs") - start.count_of("pairs")
-        note = f"each looks at {number(met / PEOPLE)} others"
+        pairs = scene.step(start).count_of("pairs") - start.count_of("pairs")
+        note = f"each looks at {number(pairs / PEOPLE)} others"
         floor = most.floor(of_scene(scene, start)) if most else None
-        contestants.append(Contestant(name, stepping(scene, start, 1), PEOPLE, floor, note))
+        contestants.append(Contestant(name, step_from_start(scene, start, 1), PEOPLE, floor, note))
     bench.race(f"{PEOPLE:,} people, {dtype}", contestants, baseline="helbing_farkas_vicsek_2000")
 
 
-def _a_minute(bench: Bench, name: str) -> None:
+def _time_a_minute(bench: Bench, name: str) -> None:
     """Say how long a minute of a crowd's time takes, a second a call."""
-    scene, said = crowd(name), []
+    scene, times = crowd(name), []
     start = scene.run(scene.start(0), 100)
     for threads in (1, 2):
         use_threads(threads)
         state, began = start, perf_counter()
         for _ in range(round(SECONDS)):
             state = scene.run(state, round(1 / DT))
-        said.append(f"{perf_counter() - began:.1f} s on {threads} thread{'s' * (threads > 1)}")
+        times.append(f"{perf_counter() - began:.1f} s on {threads} thread{'s' * (threads > 1)}")
     use_threads(1)
-    bench.note(f"{PEOPLE:,} people for {SECONDS:g} s at dt = {DT:g} s, {name}: {', '.join(said)}.")
+    bench.note(f"{PEOPLE:,} people for {SECONDS:g} s at dt = {DT:g} s, {name}: {', '.join(times)}.")
 
 
-def _beside_jupedsim(bench: Bench, cache: Path, most: Machine | None) -> None:
+def _race_jupedsim(bench: Bench, cache: Path, most: Machine | None) -> None:
     """Race a corridor of 1,000 people under the model of 2000, turn by turn."""
     python = python_of(cache / "jupedsim")
     if not (cache / "jupedsim" / DONE).is_file() or not python.exists():
@@ -85,8 +85,8 @@ def _beside_jupedsim(bench: Bench, cache: Path, most: Machine | None) -> None:
         return
     try:
         with (
-            running("jupedsim", python, "run_jupedsim.py", "crowd", 1, SAMPLE) as theirs,
-            running("flockenv", Path(sys.executable), "run_ours.py", "crowd_1000", 1, SAMPLE, None, most) as ours,
+            start_script("jupedsim", python, "run_jupedsim.py", "crowd", 1, SAMPLE) as theirs,
+            start_script("flockenv", Path(sys.executable), "run_ours.py", "crowd_1000", 1, SAMPLE, None, most) as ours,
         ):
             results = bench.race("corridor, 1,000 people, 2000", [theirs, ours], baseline="jupedsim")
         if results[1].ratio:
@@ -107,13 +107,13 @@ def main(
     """Measure crowds."""
     with Bench("crowd", quick, rounds, out) as bench:
         most = machine(bench)
-        _beside_jupedsim(bench, cache.expanduser(), most)
+        _race_jupedsim(bench, cache.expanduser(), most)
         if minute:
             for name in ("helbing_farkas_vicsek_2000", "helbing_molnar_1995"):
-                _a_minute(bench, name)
+                _time_a_minute(bench, name)
         for dtype in ("float64", "float32") if single else ("float64",):
             if models:
-                _models(bench, dtype, most)
+                _race_models(bench, dtype, most)
 
 
 if __name__ == "__main__":

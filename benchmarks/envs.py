@@ -53,7 +53,7 @@ def _named_draws(env: Any) -> Iterator[dict[str, Any]]:
 # --- a step through each face ---------------------------------------------------------------------------------------
 
 
-def _world(task: Task, worlds: int = 1) -> Step:
+def _world_step(task: Task, worlds: int = 1) -> Step:
     world = World(task, worlds, task.horizon)
     world.reset(0)
     actions = _draws(worlds, world.learners, world.action_size)
@@ -66,7 +66,7 @@ def _world(task: Task, worlds: int = 1) -> Step:
     return step
 
 
-def _single(env: gymnasium.Env[Any, Any]) -> Step:
+def _gymnasium_step(env: gymnasium.Env[Any, Any]) -> Step:
     assert env.action_space.shape is not None
     env.reset(seed=0)
     actions = _draws(*env.action_space.shape)
@@ -79,14 +79,14 @@ def _single(env: gymnasium.Env[Any, Any]) -> Step:
     return step
 
 
-def _rows(env: Any, rows: int) -> Step:
+def _vector_step(env: Any, rows: int) -> Step:
     """Step gymnasium's and Stable-Baselines3's vector environments alike: both begin anew by themselves."""
     env.reset()
     actions = _draws(rows, env.action_space.shape[-1])
     return lambda: env.step(next(actions))
 
 
-def _parallel(env: Any) -> Step:
+def _parallel_step(env: Any) -> Step:
     actions = _named_draws(env)
     env.reset(seed=0)
 
@@ -99,7 +99,7 @@ def _parallel(env: Any) -> Step:
     return step
 
 
-def _by_turns(env: Any) -> Step:
+def _aec_step(env: Any) -> Step:
     """Step all agents once, one after another, as PettingZoo's own example does."""
     actions = _named_draws(env)
     env.reset(seed=0)
@@ -130,7 +130,7 @@ class _Nothing(gymnasium.Env[Any, Any]):
         return self._row.copy(), 0.0, False, False, {}
 
 
-def _nothing(like: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
+def _make_nothing(like: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
     """Return it as gymnasium.make makes any."""
     assert like.spec is not None
     spec = EnvSpec("Nothing-v0", lambda: _Nothing(like), max_episode_steps=like.spec.max_episode_steps)
@@ -164,58 +164,58 @@ def _sb3(bench: Bench, task: Task, worlds: int, floor: Floor | None) -> list[Con
             bench.note(note)
         return []
     rows = worlds * task.learners
-    return [Contestant("WorldVecEnv", _rows(WorldVecEnv(task, worlds), rows), rows, floor)]
+    return [Contestant("WorldVecEnv", _vector_step(WorldVecEnv(task, worlds), rows), rows, floor)]
 
 
 # --- the races ------------------------------------------------------------------------------------------------------
 
 
-def _one_learner(bench: Bench, env_id: str, most: Machine | None) -> None:
+def _race_one_learner(bench: Bench, env_id: str, most: Machine | None) -> None:
     """Race the faces of one world with one learner."""
-    made = gymnasium.make(env_id)
-    task: Task = made.unwrapped.task  # type: ignore[attr-defined]  # our own environment
+    env = gymnasium.make(env_id)
+    task: Task = env.unwrapped.task  # type: ignore[attr-defined]  # our own environment
     floor = _floor(task, 1, most)
     contestants = [
-        Contestant("World.step", _world(task), 1, floor),
-        Contestant("gymnasium.make", _single(made), 1, floor),
-        Contestant(NOTHING, _single(_nothing(made)), 1),
-        Contestant("the first, unwrapped", _single(gymnasium.make(env_id).unwrapped), 1, floor),
-        Contestant("make_vec of 1", _rows(gymnasium.make_vec(env_id, num_envs=1), 1), 1, floor),
+        Contestant("World.step", _world_step(task), 1, floor),
+        Contestant("gymnasium.make", _gymnasium_step(env), 1, floor),
+        Contestant(NOTHING, _gymnasium_step(_make_nothing(env)), 1),
+        Contestant("the first, unwrapped", _gymnasium_step(gymnasium.make(env_id).unwrapped), 1, floor),
+        Contestant("make_vec of 1", _vector_step(gymnasium.make_vec(env_id, num_envs=1), 1), 1, floor),
         *_sb3(bench, task, 1, floor),
     ]
-    _microseconds(bench, bench.race(_title(env_id, task, 1), contestants, baseline="World.step"), 1)
+    _note_microseconds(bench, bench.race(_title(env_id, task, 1), contestants, baseline="World.step"), 1)
 
 
-def _many_learners(bench: Bench, env_id: str, most: Machine | None) -> None:
+def _race_many_learners(bench: Bench, env_id: str, most: Machine | None) -> None:
     """Race the faces of one world whose learners all have names."""
     env = pettingzoo.make("parallel", env_id)
     task: Task = env.unwrapped.task
     work, floor = task.learners, _floor(task, 1, most)
     contestants = [
-        Contestant("World.step", _world(task), work, floor),
-        Contestant("PettingZoo parallel", _parallel(env), work, floor),
-        Contestant(NOTHING, _parallel(_NobodyActs(env)), work),
-        Contestant("PettingZoo AEC", _by_turns(pettingzoo.make("aec", env_id)), work, floor),
+        Contestant("World.step", _world_step(task), work, floor),
+        Contestant("PettingZoo parallel", _parallel_step(env), work, floor),
+        Contestant(NOTHING, _parallel_step(_NobodyActs(env)), work),
+        Contestant("PettingZoo AEC", _aec_step(pettingzoo.make("aec", env_id)), work, floor),
         *(_sb3(bench, task, 1, floor) if task.ends_together else []),
     ]
-    _microseconds(bench, bench.race(_title(env_id, task, 1), contestants, baseline="World.step"), work)
+    _note_microseconds(bench, bench.race(_title(env_id, task, 1), contestants, baseline="World.step"), work)
 
 
-def _batched(bench: Bench, env_id: str, most: Machine | None) -> None:
+def _race_batches(bench: Bench, env_id: str, most: Machine | None) -> None:
     """Race the faces of many worlds with one learner each."""
     vector: Any = gymnasium.make_vec(env_id, num_envs=WORLDS)
     task: Task = vector.unwrapped.task
     single, floor = task.model_copy(update={"dtype": "float32"}), _floor(task, WORLDS, most)
     contestants = [
-        Contestant("World.step", _world(task, WORLDS), WORLDS, floor),
-        Contestant("World.step, float32", _world(single, WORLDS), WORLDS, _floor(single, WORLDS, most)),
-        Contestant("make_vec", _rows(vector, WORLDS), WORLDS, floor),
+        Contestant("World.step", _world_step(task, WORLDS), WORLDS, floor),
+        Contestant("World.step, float32", _world_step(single, WORLDS), WORLDS, _floor(single, WORLDS, most)),
+        Contestant("make_vec", _vector_step(vector, WORLDS), WORLDS, floor),
         *_sb3(bench, task, WORLDS, floor),
     ]
     bench.race(_title(env_id, task, WORLDS), contestants, baseline="World.step")
 
 
-def _flocks(bench: Bench, threads: Sequence[int], most: Machine | None) -> None:
+def _race_flocks(bench: Bench, threads: Sequence[int], most: Machine | None) -> None:
     """Race 1024 flocks of learners as a vector environment, on one thread and on several."""
     from flockenv.envs.vector import FlockVectorEnv
 
@@ -224,11 +224,11 @@ def _flocks(bench: Bench, threads: Sequence[int], most: Machine | None) -> None:
     flock: dict[str, Any] = {"max_episode_steps": Flock().horizon, "agents": LEARNERS, "learners": LEARNERS}
     for dtype, infos in (("float64", "steps"), ("float32", "steps"), ("float32", "ends")):
         env = FlockVectorEnv(rows, dtype=dtype, infos=infos, **flock)
-        step = _rows(env, rows)
+        step = _vector_step(env, rows)
         kind = dtype if infos == "steps" else f"{dtype}, infos of ends"
         names = {count: f"{kind}, {count} thread{'s' * (count > 1)}" for count in threads}
         for count, name in names.items():
-            contestants.append(Contestant(name, _on(count, step), rows, _floor(env.task, WORLDS, most, count)))
+            contestants.append(Contestant(name, _on_threads(count, step), rows, _floor(env.task, WORLDS, most, count)))
     title = f"Flock as a VectorEnv, {WORLDS} worlds x {LEARNERS} learners"
     bench.race(title, contestants, baseline="float64, 1 thread")
     use_threads(1)
@@ -238,7 +238,7 @@ def _floor(task: Task, worlds: int, most: Machine | None, threads: int = 1) -> F
     return most.floor(of_decisions(task, worlds), threads) if most else None
 
 
-def _on(threads: int, step: Step) -> Step:
+def _on_threads(threads: int, step: Step) -> Step:
     """Return a step on a number of threads."""
 
     def call() -> None:
@@ -256,18 +256,18 @@ def _title(env_id: str, task: Task, worlds: int) -> str:
     )
 
 
-def _microseconds(bench: Bench, results: Sequence[Result], work: int) -> None:
+def _note_microseconds(bench: Bench, results: Sequence[Result], work: int) -> None:
     """Say what a step of one world takes, and what each face adds to World.step."""
     if not results or not results[0].rates:
         return
     inside = results[0]
-    said = []
+    texts = []
     for r in results:
         took = 1e6 * work / r.rate
         more = statistics.median(1e6 * work * (1 / a - 1 / b) for a, b in zip(r.rates, inside.rates, strict=False))
         wraps = r.name not in (inside.name, NOTHING)
-        said.append(f"{r.name} {number(took)}" + (f" (+{number(more)})" if wraps else ""))
-    bench.note(f"{inside.race.split(':')[0]}, microseconds per step of the world: {'; '.join(said)}.")
+        texts.append(f"{r.name} {number(took)}" + (f" (+{number(more)})" if wraps else ""))
+    bench.note(f"{inside.race.split(':')[0]}, microseconds per step of the world: {'; '.join(texts)}.")
 
 
 def main(
@@ -286,14 +286,14 @@ def main(
     with Bench("envs", quick, rounds, out, unit="k agent-steps/s", scale=1e3) as bench:
         most = machine(bench, *several)
         for env_id in ids:
-            _one_learner(bench, env_id, most)
+            _race_one_learner(bench, env_id, most)
         for env_id in ids:
             if env_id in pettingzoo.parallel_registry:
-                _many_learners(bench, env_id, most)
+                _race_many_learners(bench, env_id, most)
         for env_id in ids:
-            _batched(bench, env_id, most)
+            _race_batches(bench, env_id, most)
         if only in ("", "flock"):
-            _flocks(bench, several, most)
+            _race_flocks(bench, several, most)
         bench.note("Agent-steps are decisions of learners: physics steps within one are not counted. One thread.")
 
 

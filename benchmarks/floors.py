@@ -29,7 +29,7 @@ from flockenv.model.state import State
 from flockenv.scene import Scene
 from flockenv.tasks import Task
 
-__all__ = ["FLAGS", "Machine", "Work", "compiled", "machine", "of_decisions", "of_learning", "of_scene"]
+__all__ = ["FLAGS", "Machine", "Work", "compile_sources", "machine", "of_decisions", "of_learning", "of_scene"]
 
 FLAGS = ("-O3", "-march=native", "-shared", "-fPIC")
 CACHED = 2**20  # bytes: what is no larger need not come from memory in every call
@@ -56,17 +56,17 @@ class Machine:
     bandwidth: dict[int, float]  # bytes/s to and from memory, by threads
 
     @classmethod
-    def measured(cls, pace: ctypes.CDLL, threads: Sequence[int]) -> Machine:
+    def measure(cls, pace: ctypes.CDLL, threads: Sequence[int]) -> Machine:
         """Measure it, at best of some tries: independent operations, and adding to 128 MB a thread in place."""
         arrays = [np.ones(2**25, np.float32) for _ in range(max(threads))]  # not zeros: those are not in memory yet
 
         def bandwidth(k: int) -> float:
-            return _at_once([lambda a=a: (np.add(a, 1.0, out=a), 2 * a.nbytes)[1] for a in arrays[:k]])
+            return _total_rate([lambda a=a: (np.add(a, 1.0, out=a), 2 * a.nbytes)[1] for a in arrays[:k]])
 
         def operations(dtype: str, k: int) -> float:
             run = getattr(pace, f"operations_{dtype}")
             run.restype = ctypes.c_long
-            return _at_once([lambda: run(ctypes.c_long(ROUNDS))] * k)
+            return _total_rate([lambda: run(ctypes.c_long(ROUNDS))] * k)
 
         return cls(
             {(dtype, k): operations(dtype, k) for dtype in ("float32", "float64") for k in threads},
@@ -80,9 +80,9 @@ class Machine:
             f"{work.why}: {number(work.operations)} operations at {pace / 1e9:.0f} G/s, "
             f"{number(work.bytes)} bytes at {bandwidth / 1e9:.0f} GB/s"
         )
-        return Floor.counted(work.operations, work.bytes, pace, bandwidth, why)
+        return Floor.from_counts(work.operations, work.bytes, pace, bandwidth, why)
 
-    def said(self) -> str:
+    def text(self) -> str:
         """Return what was measured, in a sentence."""
         paces = ", ".join(
             f"{pace / 1e9:.0f} G operations/s in {dtype} on {k} thread{'s' * (k > 1)}"
@@ -92,7 +92,7 @@ class Machine:
         return f"Floors: counted operations and bytes (benchmarks/floors.py) at {paces}; {widths}; the slower of both."
 
 
-def _at_once(jobs: Sequence[Callable[[], float]]) -> float:
+def _total_rate(jobs: Sequence[Callable[[], float]]) -> float:
     """Return how much is done per second by jobs that run at the same time and say how much they do."""
     rates, until = [0.0], perf_counter() + SECONDS
     while (began := perf_counter()) < until:
@@ -102,21 +102,21 @@ def _at_once(jobs: Sequence[Callable[[], float]]) -> float:
 
 
 @contextmanager
-def compiled(bench: Bench, *names: str) -> Iterator[list[ctypes.CDLL] | None]:
+def compile_sources(bench: Bench, *names: str) -> Iterator[list[ctypes.CDLL] | None]:
     """Compile sources of this folder for as long as the block lasts; say in a note why that fails, and give None."""
     with tempfile.TemporaryDirectory() as folder:
         found = None
         try:
             if shutil.which("gcc") is None:
                 raise OSError("there is no gcc")
-            found = [_library(name, Path(folder)) for name in names]
+            found = [_compile(name, Path(folder)) for name in names]
         except (OSError, subprocess.CalledProcessError) as error:
             last = (getattr(error, "stderr", "") or str(error)).strip().splitlines()[-1]
             bench.note(f"no {' and no '.join(f'{name}.c' for name in names)}: {last}")
         yield found
 
 
-def _library(name: str, folder: Path) -> ctypes.CDLL:
+def _compile(name: str, folder: Path) -> ctypes.CDLL:
     """Compile a source; subprocess.CalledProcessError or OSError where that fails."""
     library, source = folder / f"{name}.so", Path(__file__).with_name(f"{name}.c")
     subprocess.run(["gcc", *FLAGS, "-o", str(library), str(source), "-lm"], check=True, capture_output=True, text=True)
@@ -125,11 +125,11 @@ def _library(name: str, folder: Path) -> ctypes.CDLL:
 
 def machine(bench: Bench, *threads: int) -> Machine | None:
     """Measure what this machine does at most and say so in a note; None, and why, where there is no gcc."""
-    with compiled(bench, "pace") as libraries:
+    with compile_sources(bench, "pace") as libraries:
         if libraries is None:
             return None
-        found = Machine.measured(libraries[0], threads or (1,))
-    bench.note(found.said())
+        found = Machine.measure(libraries[0], threads or (1,))
+    bench.note(found.text())
     bench.extra["machine_at_most"] = {
         "operations_per_second": {f"{dtype}, {k} threads": pace for (dtype, k), pace in found.pace.items()},
         "bytes_per_second": found.bandwidth,
@@ -147,28 +147,33 @@ def of_scene(scene: Scene, start: State, steps: int = 1) -> Work:
     alive = int(start.alive.sum())
     pairs = (after.count_of("pairs") - start.count_of("pairs")) / alive
     on_torus = isinstance(scene.space, Torus)
-    each, law = _pair(d, on_torus and pairs >= alive / worlds - 1), 0.0
+    each, law = _pair_operations(d, on_torus and pairs >= alive / worlds - 1), 0.0
     for _, effect in scene.parts.pairs:
         seeing = d + 1 if effect.sight.fov < 360 else 0  # along the heading; in view?
-        told = effect.sums(d) + effect.averages
-        law += 1 + told + seeing + (effect.kind in DIVIDING)  # within its radius?
+        summed = effect.sums(d) + effect.averages
+        law += 1 + summed + seeing + (effect.kind in DIVIDING)  # within its radius?
     law += sum(d + 2 for effect in scene.parts.effects if effect.far_law is not None)  # a root, a division, a sum
     calls = steps if worlds > 1 else 1  # a world of a batch stays in the caches for a call
     moved = 4 * d * np.dtype(scene.dtype).itemsize  # positions and velocities, read and written
     why = f"{number(each + law if pairs else 0)} operations for each of {number(pairs)} candidates, moving"
-    return Work(pairs * (each + law) + _moving(d, on_torus), _from_memory(moved / calls, alive), scene.dtype, why)
+    return Work(
+        pairs * (each + law) + _motion_operations(d, on_torus),
+        _bytes_from_memory(moved / calls, alive),
+        scene.dtype,
+        why,
+    )
 
 
 def of_decisions(task: Task, worlds: int = 1) -> Work:
     """Count a decision of a learner: each agent and obstacle is read once, moved, and observed."""
     scene = task.scene
     d, on_torus, each = scene.dimension, isinstance(scene.space, Torus), task.agents / task.learners
-    others, obstacles = _pair(d, on_torus), _pair(d, on_torus) + 1  # from its surface
+    others, obstacles = _pair_operations(d, on_torus), _pair_operations(d, on_torus) + 1  # from its surface
     looking = task.agents * others + task.obstacle_slots * obstacles
-    moving = each * task.substeps * _moving(d, on_torus)
+    moving = each * task.substeps * _motion_operations(d, on_torus)
     motion = each * 4 * d * np.dtype(scene.dtype).itemsize
-    shown = 4 * (task.layout.size + task.action_layout.size) + 8 + 2  # float32, and a reward, and two flags
-    bytes_ = _from_memory(shown + motion, worlds * task.learners)
+    row_bytes = 4 * (task.layout.size + task.action_layout.size) + 8 + 2  # float32, and a reward, and two flags
+    bytes_ = _bytes_from_memory(row_bytes + motion, worlds * task.learners)
     seen = f"{task.agents} agents and {task.obstacle_slots} obstacles looked at"
     why = f"{seen}, {task.layout.size} numbers shown, moving"
     return Work(looking + moving + task.layout.size, bytes_, scene.dtype, why)
@@ -190,16 +195,16 @@ def of_learning(policy: Any, epochs: int, decision: Work) -> Work:
     return Work(operations, decision.bytes + 4 * seen * epochs, "float32", why)
 
 
-def _pair(d: int, images: bool) -> float:
+def _pair_operations(d: int, images: bool) -> float:
     """Operations for one neighbour: offset, square, test for itself; nearest image on a torus."""
     return 2 * d + 1 + 3 * d * images
 
 
-def _moving(d: int, on_torus: bool) -> float:
+def _motion_operations(d: int, on_torus: bool) -> float:
     """Count a substep of motion: velocity and position, and back into the torus."""
     return 2 * d + 3 * d * on_torus
 
 
-def _from_memory(each: float, items: float) -> float:
+def _bytes_from_memory(each: float, items: float) -> float:
     """Return bytes of an item; none where all items fit the caches."""
     return each if each * items > CACHED else 0.0

@@ -14,7 +14,7 @@ import typer
 
 from benchmarks.floors import Machine, machine, of_scene
 from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_line, number
-from benchmarks.scenes import stepping
+from benchmarks.scenes import step_from_start
 from flockenv.geometry.barnes_hut import MOST_DIRECT
 from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import Gravitation
@@ -41,11 +41,11 @@ def _contestant(agents: int, dimension: int, dtype: str, opening: float, most: M
     """Return a scene stepped once a call."""
     scene = cloud(agents, dimension, dtype, opening)
     start = scene.start(0)
-    met = scene.step(start).count_of("pairs") / agents
-    note = f"each meets {number(met)} of {agents:,}"
+    pairs = scene.step(start).count_of("pairs") / agents
+    note = f"each meets {number(pairs)} of {agents:,}"
     name = f"{agents:,}, {'tree' if opening else 'direct'}"
     floor = most.floor(of_scene(scene, start)) if most else None
-    return Contestant(name, stepping(scene, start, 1), agents, floor, note)
+    return Contestant(name, step_from_start(scene, start, 1), agents, floor, note)
 
 
 def _compare(bench: Bench, dimension: int, dtype: str, largest: int, most: Machine | None) -> None:
@@ -55,9 +55,9 @@ def _compare(bench: Bench, dimension: int, dtype: str, largest: int, most: Machi
         pair = [_contestant(agents, dimension, dtype, opening, most) for opening in (0.0, OPENING)]
         results = bench.race(f"{agents:,} agents, {dimension}-D, {dtype}", pair, baseline=pair[0].name)
         ratios[agents] = results[1].ratio
-    said = "; ".join(f"{agents:,} {number(ratio)}" for agents, ratio in ratios.items() if ratio)
+    text = "; ".join(f"{agents:,} {number(ratio)}" for agents, ratio in ratios.items() if ratio)
     bench.extra.setdefault("tree_over_direct", {})[f"{dimension}-D {dtype}"] = ratios
-    bench.note(f"{dimension}-D, {dtype}, how many times faster the tree is than the exact sum: {said}.")
+    bench.note(f"{dimension}-D, {dtype}, how many times faster the tree is than the exact sum: {text}.")
 
 
 def main(

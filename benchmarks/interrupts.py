@@ -30,7 +30,7 @@ import typer
 
 from flockenv.cli.terminal import progress_bar, run_program
 
-__all__ = ["COMMANDS", "Outcome", "interrupted"]
+__all__ = ["COMMANDS", "Outcome", "interrupt"]
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENES = ROOT / "configs" / "scenes"
@@ -70,10 +70,10 @@ class Outcome:
     early: bool  # before flockenv blocked or handled signals
     code: int
     faults: tuple[str, ...]
-    said: str
+    stderr: str
 
 
-def interrupted(
+def interrupt(
     command: str, at: float, number: signal.Signals, group: bool, twice: bool, cache: Path, folder: Path
 ) -> Outcome | None:
     """Run a command in a folder, send it a signal after a number of seconds, and look at what is left.
@@ -84,14 +84,14 @@ def interrupted(
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "FLOCKENV_CACHE": str(cache)}
     process = subprocess.Popen(
         [sys.executable, *COMMANDS[command]], cwd=folder, env=environment, text=True, stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE, start_new_session=True, preexec_fn=_hear,
+        stderr=subprocess.PIPE, start_new_session=True, preexec_fn=_reset_signals,
     )  # fmt: skip
     time.sleep(at)
     if process.poll() is not None:
         process.communicate()
         return None
-    early = not _in(process.pid, signal.SIGTERM, "Blk|Cgt|Ign")
-    done = _in(process.pid, number, "Ign")  # the command ignores signals once it has done its work
+    early = not _is_in_mask(process.pid, signal.SIGTERM, "Blk|Cgt|Ign")
+    done = _is_in_mask(process.pid, number, "Ign")  # the command ignores signals once it has done its work
     sent = time.monotonic()
     for _ in range(1 + twice):
         (os.killpg if group else os.kill)(process.pid, number)
@@ -101,28 +101,28 @@ def interrupted(
                 break
     faults = []
     try:
-        said = process.communicate(timeout=PATIENCE)[1]
+        stderr = process.communicate(timeout=PATIENCE)[1]
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
-        said = process.communicate()[1]
+        stderr = process.communicate()[1]
         faults.append("hangs")
-    if _lives(process.pid):
+    if _is_alive(process.pid):
         faults.append("orphan")
         os.killpg(process.pid, signal.SIGKILL)
-    if process.returncode == 0 and not said and (done or time.monotonic() - sent < LATE):
+    if process.returncode == 0 and not stderr and (done or time.monotonic() - sent < LATE):
         return None
     if process.returncode != 128 + number:
         faults.append(f"exit code {process.returncode}")
-    faults += [*_faults_of(said), *_leftovers(folder, cache)]
-    return Outcome(command, at, early, process.returncode, tuple(faults), said)
+    faults += [*_faults_of(stderr), *_leftovers(folder, cache)]
+    return Outcome(command, at, early, process.returncode, tuple(faults), stderr)
 
 
-def _hear() -> None:
+def _reset_signals() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):  # a shell in the background ignores them, for all below
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
 
 
-def _in(pid: int, number: int, names: str) -> bool:
+def _is_in_mask(pid: int, number: int, names: str) -> bool:
     """True if a signal is in one of a process's masks, named as in /proc/PID/status: Blk|Cgt|Ign."""
     masks = re.findall(rf"^Sig(?:{names}):\s*(\w+)", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE)
     return any(int(mask, 16) >> (number - 1) & 1 for mask in masks)
@@ -132,12 +132,12 @@ def _ending(outcome: Outcome) -> str:
     """Return how a run ended whose signal arrived while Python was starting."""
     if not outcome.faults:
         return "one line of flockenv's"  # the first statement ran between the look into /proc and the signal
-    if re.search(r"Traceback|Fatal Python error|^KeyboardInterrupt$", outcome.said, re.MULTILINE):
+    if re.search(r"Traceback|Fatal Python error|^KeyboardInterrupt$", outcome.stderr, re.MULTILINE):
         return "traceback of Python's"
-    return "killed without a word" if outcome.code < 0 and not outcome.said else f"exit code {outcome.code}"
+    return "killed without a word" if outcome.code < 0 and not outcome.stderr else f"exit code {outcome.code}"
 
 
-def _lives(group: int) -> bool:
+def _is_alive(group: int) -> bool:
     """True if a process of a group is still there after ORPHANED seconds."""
     until = time.monotonic() + ORPHANED
     while time.monotonic() < until:
@@ -149,12 +149,12 @@ def _lives(group: int) -> bool:
     return True
 
 
-def _faults_of(said: str) -> Iterator[str]:
-    if "Traceback" in said or "Exception ignored" in said:
+def _faults_of(stderr: str) -> Iterator[str]:
+    if "Traceback" in stderr or "Exception ignored" in stderr:
         yield "traceback"
-    elif any(not ALLOWED.fullmatch(line) for line in said.splitlines()):
+    elif any(not ALLOWED.fullmatch(line) for line in stderr.splitlines()):
         yield "words"
-    ends = [line for line in said.splitlines() if re.match(r"(\w+: )?(interrupted|terminated)", line)]
+    ends = [line for line in stderr.splitlines() if re.match(r"(\w+: )?(interrupted|terminated)", line)]
     if len(ends) != 1:
         yield f"{len(ends)} lines"
 
@@ -189,14 +189,14 @@ def main(
             group, twice, empty = rng.random() < 0.6, rng.random() < 0.1, rng.random() < cold
             with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryDirectory() as fresh:
                 place = Path(fresh if empty else warm)
-                outcome = interrupted(command, at, number, group, twice, place, Path(folder))
+                outcome = interrupt(command, at, number, group, twice, place, Path(folder))
             if outcome is None:
                 continue
             outcomes.append(outcome)
             progress(len(outcomes))
             if outcome.faults and (not outcome.early or _ending(outcome).startswith("exit")):
                 how = f"{number.name} at {at:.2f} s, group {group}, twice {twice}, cold {empty}"
-                print(f"{command}, {how}: {', '.join(outcome.faults)}\n{outcome.said}", flush=True)
+                print(f"{command}, {how}: {', '.join(outcome.faults)}\n{outcome.stderr}", flush=True)
     counted = [outcome for outcome in outcomes if not outcome.early]
     faults = Counter(fault.split(":")[0] for outcome in counted for fault in outcome.faults)
     print(f"{len(counted)} interrupts of {len(names)} commands: {dict(faults) or 'nothing went wrong'}")

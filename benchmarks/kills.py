@@ -1,11 +1,10 @@
 """Kill trainings at random moments and resume them: `python -m benchmarks.kills --times 200`.
 
-Two short trainings take turns: Pursuit as agents.ppo trains by default, and School with everything that has a memory of
-its own (a central critic, care, held actions, teaching, staggered worlds). Each is killed with SIGKILL again and again,
-at moments uniform over its whole life, up to eight times; every third kill waits for the next checkpoint to be written,
-and comes in the middle of that. A training that ends must have exported the weights, and left the checkpoint, of one
-that was never killed: the same SHA-256. Processes are forked from a server that has imported torch, since that takes
-longest.
+Two short trainings alternate: Pursuit with the defaults of agents.ppo, and School with every setting that adds state to
+a checkpoint (a central critic, care, held actions, imitation of the rules, staggered worlds). Each is killed by SIGKILL
+and resumed up to eight times, at random moments of its duration; every third kill is timed to hit a checkpoint while it
+is being written. A training that then ends must have the weights and the checkpoint of one that was never killed: the
+same SHA-256. Processes are forked from a server that has already imported torch, which is the slowest part of a start.
 """
 
 from __future__ import annotations
@@ -43,21 +42,21 @@ TRAININGS = (
     ),
 )  # fmt: skip
 WEIGHTS, REFUSED = "weights.safetensors", "refused.txt"
-LARGEST = 2**26  # bytes of a checkpoint; of these trainings it has a thousandth of that
-POLL = 2e-4  # s, between looks for a checkpoint that is being written
-AIMED = 3  # one kill in three is aimed at one
-CHAIN = 8  # most kills of one training: on a busy machine hardly any would end, and none would be compared
+LARGEST = 2**26  # bytes, most that is read of a checkpoint; those of these trainings have a thousandth of it
+POLL = 2e-4  # s, between two checks for a checkpoint that is being written
+AIMED = 3  # every third kill is timed to hit one
+CHAIN = 8  # most kills of one training; with more, few would ever end on a busy machine, and be compared
 
 
 @dataclass
 class Count:
-    """Outcomes of the kills."""
+    """Counts of kills, and of how the trainings ended."""
 
     kills: int = 0
-    writing: int = 0  # of them, those that left a half-written checkpoint
-    same: int = 0  # trainings that ended with the digests of one that was never killed
-    different: list[str] = field(default_factory=list)
-    refused: list[str] = field(default_factory=list)  # in one line
+    writing: int = 0  # kills that left a half-written checkpoint
+    same: int = 0  # trainings that ended with the digests of an undisturbed one
+    different: list[str] = field(default_factory=list)  # those that did not, a line each
+    refused: list[str] = field(default_factory=list)  # trainings that failed, most by a refused checkpoint, a line each
 
     def __str__(self) -> str:
         lines = [
@@ -68,8 +67,11 @@ class Count:
         return "\n".join([*lines, *self.different, *self.refused])
 
 
-def live(experiment: Experiment, folder: str) -> None:
-    """Train, or go on, to the end and export; what is refused is written down. To be run in a process of its own."""
+def train_and_export(experiment: Experiment, folder: str) -> None:
+    """Train to the end, from the checkpoint if there is one, and export the weights; run this in a separate process.
+
+    If the checkpoint is refused, its message is written to a file, and the exit code is 2.
+    """
     from agents import ppo
 
     ppo.console.quiet = True
@@ -81,27 +83,27 @@ def live(experiment: Experiment, folder: str) -> None:
 
 
 def digests(folder: Path) -> str:
-    """Return the digests of the weights and of the last checkpoint that a training came to."""
+    """Return the digests of the exported weights and of the last checkpoint in a folder."""
     parts = files.read(folder, LARGEST)
     weights = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
     return f"weights {weights}, checkpoint {files.digest(parts or {})}"
 
 
-class Lives:
-    """Starts the lives of trainings, one at a time."""
+class TrainingServer:
+    """Starter of training processes, which are forked from a process that has imported torch."""
 
     def __init__(self) -> None:
         self._context = get_context("forkserver")
         self._context.set_forkserver_preload(["agents.ppo", "torch._dynamo"])  # Adam imports the second
 
     def begin(self, experiment: Experiment, folder: Path) -> BaseProcess:
-        """Start one in a folder, from what an earlier one left there."""
-        process = self._context.Process(target=live, args=(experiment, str(folder)))
+        """Start a training in a folder, from the checkpoint there if there is one."""
+        process = self._context.Process(target=train_and_export, args=(experiment, str(folder)))
         process.start()
         return process
 
-    def whole(self, experiment: Experiment, folder: Path) -> tuple[float, str]:
-        """Return how long a training takes that is never killed, s, and its digests."""
+    def run_undisturbed(self, experiment: Experiment, folder: Path) -> tuple[float, str]:
+        """Run a training that is not killed; return its duration, s, and its digests."""
         began = time.perf_counter()
         process = self.begin(experiment, folder)
         process.join()
@@ -110,14 +112,18 @@ class Lives:
         return time.perf_counter() - began, digests(folder)
 
 
-def _being_written(folder: Path) -> bool:
+def _is_being_written(folder: Path) -> bool:
+    """Return True if a folder has a checkpoint that is being written, or was when its process was killed."""
     return any(folder.glob(LEFTOVERS))
 
 
-def _killed(process: BaseProcess, folder: Path, moment: float, aimed: bool) -> bool:
-    """Kill a life at a moment, s, aimed: in the next checkpoint after it; return False if it ended before."""
+def _kill(process: BaseProcess, folder: Path, moment: float, aimed: bool) -> bool:
+    """Kill a training `moment` s from now; return False if it ends before.
+
+    aimed: wait longer, until it writes its next checkpoint, and kill it during that.
+    """
     process.join(moment)
-    while aimed and process.is_alive() and not _being_written(folder):
+    while aimed and process.is_alive() and not _is_being_written(folder):
         time.sleep(POLL)
     if not process.is_alive():
         process.join()
@@ -128,49 +134,54 @@ def _killed(process: BaseProcess, folder: Path, moment: float, aimed: bool) -> b
 
 
 def kill_and_resume(times: int, seed: int, folder: Path, say: bool = False) -> Count:
-    """Kill trainings `times` times in all, at most CHAIN times each, and let each end; return the counts."""
-    lives, rng, count = Lives(), np.random.default_rng(seed), Count()
-    known = [_known(lives, experiment, folder / f"whole{k}") for k, experiment in enumerate(TRAININGS)]
+    """Kill trainings `times` times in all, at most CHAIN times each, let each of them end, and count the outcomes."""
+    server, rng, count = TrainingServer(), np.random.default_rng(seed), Count()
+    undisturbed = [
+        _measure_undisturbed(server, experiment, folder / f"undisturbed{k}") for k, experiment in enumerate(TRAININGS)
+    ]
     number = 0
     while count.kills < times:
         which = number % len(TRAININGS)
-        experiment, (seconds, expected) = TRAININGS[which], known[which]
-        _chain(lives, experiment, folder / f"killed{number}", seconds, expected, times, rng, count)
+        experiment, (seconds, expected) = TRAININGS[which], undisturbed[which]
+        _kill_until_it_ends(server, experiment, folder / f"killed{number}", seconds, expected, times, rng, count)
         number += 1
         if say:
             typer.echo(f"{number}: {experiment.task}, {count.kills} kills so far", err=True)
     return count
 
 
-def _known(lives: Lives, experiment: Experiment, folder: Path) -> tuple[float, str]:
-    """Return the duration, s, and the digests of a training that is not killed; a first one compiles."""
-    _, first = lives.whole(experiment, Path(f"{folder}.first"))
-    seconds, second = lives.whole(experiment, folder)
+def _measure_undisturbed(server: TrainingServer, experiment: Experiment, folder: Path) -> tuple[float, str]:
+    """Return the duration, s, and the digests of a training that is not killed.
+
+    It is run twice: the first run also compiles, and its duration does not count; the digests must be equal.
+    """
+    _, first = server.run_undisturbed(experiment, Path(f"{folder}.first"))
+    seconds, second = server.run_undisturbed(experiment, folder)
     if first != second:
         raise RuntimeError(f"{experiment.task}: two trainings that were not killed differ: {first}; {second}")
     return seconds, second
 
 
-def _chain(
-    lives: Lives, experiment: Experiment, folder: Path, seconds: float, expected: str, times: int,
+def _kill_until_it_ends(
+    server: TrainingServer, experiment: Experiment, folder: Path, seconds: float, expected: str, times: int,
     rng: np.random.Generator, count: Count,
 ) -> None:  # fmt: skip
-    """Let one training live until it ends, killed on the way, and compare its digests."""
+    """Kill and resume one training until it ends, then count whether its digests are the `expected` ones."""
     folder.mkdir()
     last = min(times, count.kills + CHAIN)
     while True:
-        process, moment = lives.begin(experiment, folder), rng.uniform(0, seconds)
-        if count.kills < last and _killed(process, folder, moment, count.kills % AIMED == 0):
+        process, moment = server.begin(experiment, folder), rng.uniform(0, seconds)
+        if count.kills < last and _kill(process, folder, moment, count.kills % AIMED == 0):
             count.kills += 1
-            count.writing += _being_written(folder)
+            count.writing += _is_being_written(folder)
             continue
         process.join()
         break
     if process.exitcode:
-        said = folder / REFUSED
-        text = said.read_text(encoding="utf-8") if said.exists() else f"ended with {process.exitcode}"
+        message = folder / REFUSED
+        text = message.read_text(encoding="utf-8") if message.exists() else f"ended with {process.exitcode}"
         count.refused.append(f"{folder.name}: {text}")
-    elif (found := digests(folder)) == expected and not _being_written(folder):
+    elif (found := digests(folder)) == expected and not _is_being_written(folder):
         count.same += 1
     else:
         count.different.append(f"{folder.name}: {found}, expected {expected}")

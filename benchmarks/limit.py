@@ -15,9 +15,9 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from benchmarks.floors import Machine, compiled, machine, of_scene
+from benchmarks.floors import Machine, compile_sources, machine, of_scene
 from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_line, number
-from benchmarks.scenes import crowd, restarting, stepping, world
+from benchmarks.scenes import crowd, restart_each_call, step_from_start, world
 from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.jit.thread_pool import use_threads
 from flockenv.model.state import State
@@ -98,7 +98,7 @@ def disagreement(scene: Scene, mine: State, theirs: State) -> tuple[float, float
     return float(np.quantile(apart, NEARLY_ALL)), float(apart.max())
 
 
-def _agree(bench: Bench, row: Row, scene: Scene, start: State, by: Reference) -> bool:
+def _check_agreement(bench: Bench, row: Row, scene: Scene, start: State, by: Reference) -> bool:
     """Let both do a few steps from one state; say it where they are not in the same places then."""
     mine, theirs = start.copy(), start.copy()
     scene.step(mine, out=mine, steps=FEW)
@@ -118,14 +118,14 @@ def _race(bench: Bench, row: Row, by: Reference | None, most: Machine | None) ->
     """Race one row; False if both sides do not do the same."""
     scene = row.scene()
     start = scene.start(0, worlds=row.worlds)
-    if by is not None and not _agree(bench, row, scene, start, by):
+    if by is not None and not _check_agreement(bench, row, scene, start, by):
         return False
     floor = most.floor(of_scene(scene, start, row.steps)) if most else None
     work = row.worlds * scene.agents * row.steps
-    contestants = [Contestant("flockenv", stepping(scene, start, row.steps), work, floor)]
+    contestants = [Contestant("flockenv", step_from_start(scene, start, row.steps), work, floor)]
     if by is not None:
         theirs = start.copy()
-        step = restarting(start, theirs, by.stepper(scene, theirs, row.steps))
+        step = restart_each_call(start, theirs, by.stepper(scene, theirs, row.steps))
         contestants.insert(0, Contestant("C", step, work, floor))
     bench.race(row.title, contestants, baseline=contestants[0].name)
     return True
@@ -142,15 +142,15 @@ def main(
     rows = [row for row in ROWS if only in row.title]
     if not rows:
         raise typer.BadParameter(f"--only {only!r}: in no title; titles: {'; '.join(row.title for row in ROWS)}")
-    with Bench("limit", quick, rounds, out) as bench, compiled(bench, "limit") as libraries:
+    with Bench("limit", quick, rounds, out) as bench, compile_sources(bench, "limit") as libraries:
         by, most = Reference(libraries[0]) if libraries else None, machine(bench)
         same = [_race(bench, row, by, most) for row in rows]
-        _remarks(bench, by)
+        _note_remarks(bench, by)
     if not all(same):
         raise typer.Exit(1)
 
 
-def _remarks(bench: Bench, by: Reference | None) -> None:
+def _note_remarks(bench: Bench, by: Reference | None) -> None:
     """Say what a call does, what C is written in, and all ratios in one line."""
     bench.note(
         "One thread. Every call begins in the same state; 10 steps a call unless a row says otherwise. C keeps the "

@@ -93,7 +93,7 @@ class Floor:
     bytes: float | None = None  # per item, to and from memory
 
     @classmethod
-    def counted(cls, operations: float, bytes_: float, pace: float, bandwidth: float, why: str) -> Floor:
+    def from_counts(cls, operations: float, bytes_: float, pace: float, bandwidth: float, why: str) -> Floor:
         """Take the slower of computing (pace, operations/s) and fetching (bandwidth, bytes/s); 0 = not counted."""
         seconds = max(operations / pace, bytes_ / bandwidth)
         return cls(1.0 / seconds, why, operations, bytes_)
@@ -169,7 +169,7 @@ class Result:
         return self.ratios[1] if self.ratios else None
 
 
-def _quiet(what: str, done: int, most: int) -> None:
+def _report_nothing(what: str, done: int, most: int) -> None:
     """Report nothing."""
 
 
@@ -178,7 +178,7 @@ def race(
     contestants: Sequence[Contestant],
     baseline: str,
     plan: Plan | None = None,
-    advance: Advance = _quiet,
+    advance: Advance = _report_nothing,
 ) -> tuple[list[Result], bool]:
     """Measure contestants in turns; return their results, and whether Ctrl-C cut it short (what was done is kept).
 

@@ -13,13 +13,13 @@ import numpy as np
 import typer
 
 from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_line
-from benchmarks.scenes import stepping
+from benchmarks.scenes import step_from_start
 from flockenv.behaviours import AvoidObstacles
 from flockenv.geometry.shapes import Block, Capsule, Circle, Shape
 from flockenv.model.spawn import Spawn
 from flockenv.scene import Group, Scene
 
-__all__ = ["among"]
+__all__ = ["agents_among_obstacles"]
 
 AGENTS, STEPS = 2_000, 10
 COUNTS = (1, 4, 10, 100, 1_000)
@@ -27,7 +27,7 @@ APART = 5.0  # m, between obstacles
 FEWEST = 10  # obstacles that the plane has room for: with fewer, the same agents are in the same plane
 
 
-def among(count: int, kind: str = "block", dtype: str = "float64") -> Scene:
+def agents_among_obstacles(count: int, kind: str = "block", dtype: str = "float64") -> Scene:
     """Return agents among a number of obstacles, in the plane, that lie near the points of a square lattice."""
     side, rows = APART * math.sqrt(max(count, FEWEST)), math.ceil(math.sqrt(count))
     rng = np.random.default_rng(1)
@@ -60,8 +60,8 @@ def main(
     with Bench("obstacles", quick, rounds, out) as bench:
         contestants = []
         for count in COUNTS:
-            scene = among(count, kind, dtype)
-            call = stepping(scene, scene.start(0), STEPS)
+            scene = agents_among_obstacles(count, kind, dtype)
+            call = step_from_start(scene, scene.start(0), STEPS)
             contestants.append(Contestant(f"{count:,}", call, AGENTS * STEPS, note=f"{count:,} x {kind}"))
         bench.race(f"{AGENTS:,} agents among obstacles", contestants, baseline="10")
         bench.note(f"{dtype}, one obstacle per {APART**2:g} m^2, one thread")

@@ -31,7 +31,7 @@ import typer
 from benchmarks.floors import Machine, Work, machine
 from benchmarks.measure import ROOT, Bench, Contestant, Numbers, Out, Quick, Rounds, Sample, command_line, number
 
-__all__ = ["PAIRS", "PEERS", "PeerError", "Turns", "install", "running"]
+__all__ = ["PAIRS", "PEERS", "PeerError", "Turns", "install", "start_script"]
 
 SCRIPTS = Path(__file__).resolve().parent / "peers_scripts"
 CACHE = Path("~/.cache/flockenv-peers")
@@ -118,12 +118,12 @@ class Turns(Contestant):
             self.script.stdin.flush()
         except OSError:
             raise PeerError(f"{self.name}: the script has ended") from None
-        said = _answer(self.name, self.script)
-        return Sample(said["agent_steps"], said["seconds"], said["cpu_seconds"])
+        answer = _answer(self.name, self.script)
+        return Sample(answer["agent_steps"], answer["seconds"], answer["cpu_seconds"])
 
 
 @contextmanager
-def running(
+def start_script(
     name: str, python: Path, script: str, case: str, threads: int, seconds: float,
     variables: Mapping[str, str] | None = None, most: Machine | None = None,
 ) -> Iterator[Turns]:  # fmt: skip
@@ -175,8 +175,8 @@ def _answer(name: str, process: subprocess.Popen[str]) -> Numbers:
             if not line:
                 raise PeerError(f"{name}: the script ended")
             if line.startswith("{"):
-                said: Numbers = json.loads(line)
-                return said
+                answer: Numbers = json.loads(line)
+                return answer
     raise PeerError(f"{name}: no answer within {PATIENCE:g} s")
 
 
@@ -230,25 +230,25 @@ def main(
     out: Out = None,
 ) -> None:
     """Measure other packages beside flockenv, each pair in turns: ratios, and what each side does, in words."""
-    wanted = _chosen("--install", to_install)
-    asked = _chosen("--peers", peers) or (wanted or list(PEERS))
+    wanted = _choose_peers("--install", to_install)
+    chosen = _choose_peers("--peers", peers) or (wanted or list(PEERS))
     cache = cache.expanduser()
     with Bench("peers", quick, rounds, out) as bench:
         bench.extra["threads"] = threads
         most = machine(bench, threads)
         for peer in wanted:
             typer.echo(f"installing {peer}: {', '.join(PEERS[peer])}", err=True)
-            _noting(bench, lambda peer=peer: install(peer, cache))
-        present = [peer for peer in asked if (cache / peer / DONE).is_file() and python_of(cache / peer).exists()]
-        missing = [peer for peer in asked if peer not in present]
+            _note_failure(bench, lambda peer=peer: install(peer, cache))
+        present = [peer for peer in chosen if (cache / peer / DONE).is_file() and python_of(cache / peer).exists()]
+        missing = [peer for peer in chosen if peer not in present]
         for pair in (pair for pair in PAIRS if pair.peer in present):
-            _noting(bench, lambda pair=pair: _race(bench, pair, cache, threads, most))
+            _note_failure(bench, lambda pair=pair: _race(bench, pair, cache, threads, most))
         if missing:
             bench.note(f"not installed: {', '.join(missing)} (--install {','.join(missing)})")
-        _remarks(bench, threads)
+        _note_remarks(bench, threads)
 
 
-def _chosen(option: str, text: str) -> list[str]:
+def _choose_peers(option: str, text: str) -> list[str]:
     """Return the peers that an option names; an unknown one is a usage error."""
     names = list(PEERS) if text == "all" else [name.strip() for name in text.split(",") if name.strip()]
     for name in names:
@@ -257,7 +257,7 @@ def _chosen(option: str, text: str) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def _noting(bench: Bench, work: Any) -> None:
+def _note_failure(bench: Bench, work: Any) -> None:
     """Do something; if a peer fails at it, say so in a note and go on."""
     try:
         work()
@@ -272,13 +272,13 @@ def _race(bench: Bench, pair: Pair, cache: Path, threads: int, most: Machine | N
     seconds = QUICK_SAMPLE if bench.quick else SAMPLE
     typer.echo(f"starting {title}", err=True)
     with (
-        running(pair.peer, python_of(cache / pair.peer), script, pair.case, threads, seconds) as theirs,
-        running("flockenv", Path(sys.executable), "run_ours.py", pair.ours, threads, seconds, None, most) as ours,
+        start_script(pair.peer, python_of(cache / pair.peer), script, pair.case, threads, seconds) as theirs,
+        start_script("flockenv", Path(sys.executable), "run_ours.py", pair.ours, threads, seconds, None, most) as ours,
     ):
         bench.race(title, [theirs, ours], baseline=pair.peer)
 
 
-def _remarks(bench: Bench, threads: int) -> None:
+def _note_remarks(bench: Bench, threads: int) -> None:
     """Add what a reader should know: how the sides were kept apart, disturbances, and all ratios in one line."""
     if not bench.results:
         return

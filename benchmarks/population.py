@@ -13,13 +13,13 @@ import typer
 
 from benchmarks.floors import Machine, machine, of_scene
 from benchmarks.measure import Bench, Contestant, Out, Quick, Rounds, command_line, number
-from benchmarks.scenes import stepping
+from benchmarks.scenes import step_from_start
 from flockenv.model.state import State
 from flockenv.physics.effects import Drag, Gravity
 from flockenv.physics.population import Decay, Disc, Emitter
 from flockenv.scene import Group, Scene
 
-__all__ = ["fountain", "settled"]
+__all__ = ["fountain", "settle"]
 
 STEPS = 10
 DT = 1 / 60
@@ -40,7 +40,7 @@ def fountain(alive: int, dtype: str, dimension: int, mortal: bool) -> Scene:
     )  # fmt: skip
 
 
-def settled(scene: Scene) -> State:
+def settle(scene: Scene) -> State:
     """Return a state in which as many are born as die."""
     return scene.run(scene.start(0), round((LIFETIME + 2.0) / DT))
 
@@ -48,22 +48,22 @@ def settled(scene: Scene) -> State:
 def _contestants(alive: int, dtype: str, dimension: int, most: Machine | None) -> list[Contestant]:
     """Return the fountain, one whose particles decay besides, and the same motion without a population."""
     scene = fountain(alive, dtype, dimension, True)
-    start = settled(scene)
+    start = settle(scene)
     more = scene.model_copy(update={"population": (Decay(rate=1e-6), *scene.population)})
     plain = scene.model_copy(update={"population": (), "groups": (scene.groups[0].model_copy(update={
         "count": alive, "spawn": {"low": (0.0,) * dimension, "high": (1.0,) * dimension}}),)})  # fmt: skip
     living = int(start.alive.sum())
     note = f"{living:,} alive, {number(scene.population[0].rate)} born per s"
     floor = most.floor(of_scene(plain, plain.start(0), STEPS)) if most else None  # birth and death are not counted
-    forever = stepping(plain, plain.start(0), STEPS)
+    forever = step_from_start(plain, plain.start(0), STEPS)
     return [
         Contestant("no population", forever, alive * STEPS, floor, f"{alive:,} alive"),
-        Contestant("fountain", _going_on(scene, start), living * STEPS, floor, note),
-        Contestant("fountain with decay", _going_on(more, start), living * STEPS, floor, note),
+        Contestant("fountain", _keep_stepping(scene, start), living * STEPS, floor, note),
+        Contestant("fountain with decay", _keep_stepping(more, start), living * STEPS, floor, note),
     ]
 
 
-def _going_on(scene: Scene, start: State) -> Callable[[], object]:
+def _keep_stepping(scene: Scene, start: State) -> Callable[[], object]:
     """Return a call that does STEPS steps and goes on where the last one ended: births and deaths stay in balance."""
     state = start.copy()
     return lambda: scene.step(state, out=state, steps=STEPS)

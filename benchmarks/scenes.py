@@ -12,7 +12,7 @@ from flockenv.model.state import State
 from flockenv.physics.effects import Effect
 from flockenv.scene import Group, Scene
 
-__all__ = ["boids", "crowd", "edge_for", "restarting", "rules", "stepping", "world"]
+__all__ = ["boids", "crowd", "edge_for", "restart_each_call", "rules", "step_from_start", "world"]
 
 REACH = 2.0  # m, how far agents of a crowd look
 NEIGHBOURS = 15.0  # within that, on average
@@ -54,7 +54,7 @@ def crowd(agents: int, dtype: str, dimension: int = 2) -> Scene:
     return boids(agents, edge_for(agents, dimension), rules((REACH / 2, REACH, REACH)), dtype, dimension)
 
 
-def restarting(start: State, state: State, step: Callable[[], object]) -> Callable[[], object]:
+def restart_each_call(start: State, state: State, step: Callable[[], object]) -> Callable[[], object]:
     """Return a call that steps from the same state each time: later on flocks are denser, and that is other work."""
 
     def call() -> None:
@@ -65,7 +65,7 @@ def restarting(start: State, state: State, step: Callable[[], object]) -> Callab
     return call
 
 
-def stepping(scene: Scene, start: State, steps: int) -> Callable[[], object]:
+def step_from_start(scene: Scene, start: State, steps: int) -> Callable[[], object]:
     """Return a call that makes a number of steps of a scene, from the same state each time."""
     state = start.copy()
-    return restarting(start, state, lambda: scene.step(state, out=state, steps=steps))
+    return restart_each_call(start, state, lambda: scene.step(state, out=state, steps=steps))

@@ -89,9 +89,9 @@ def main(
         }
         contestants = [Process(name, lambda: None, 1, code=code, variables=variables) for name, code in codes.items()]
         results = bench.race("until the first step of a process", contestants, baseline=contestants[-2].name)
-        said = "; ".join(f"{r.name} {number(1 / r.rate)} ({number(1 / r.quartiles[2])}-{number(1 / r.quartiles[0])})"
+        text = "; ".join(f"{r.name} {number(1 / r.rate)} ({number(1 / r.quartiles[2])}-{number(1 / r.quartiles[0])})"
                          for r in results)  # fmt: skip
-        bench.note(f"Seconds: {said}.")
+        bench.note(f"Seconds: {text}.")
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ import typer
 from agents.experiment import CONFIGS, PpoSettings, load_experiment
 from benchmarks.floors import Machine, machine, of_decisions, of_learning
 from benchmarks.measure import Bench, Contestant, Numbers, Out, Quick, Result, Rounds, Sample, command_line, number
-from benchmarks.peers import PeerError, running
+from benchmarks.peers import PeerError, start_script
 from flockenv.tasks import Task
 
 __all__ = ["EXPERIMENTS", "Learning", "settings"]
@@ -46,7 +46,7 @@ def settings(p: PpoSettings, learners: int) -> Iterator[tuple[str, PpoSettings]]
     other = "tanh" if p.activation == "relu" else "relu"
     yield f"4 epochs, {other}", p.model_copy(update={**four, "activation": other})
     count = 1 if p.threads > 1 else 2
-    yield f"4 epochs, {_on(count)}", p.model_copy(update={**four, "threads": count})
+    yield f"4 epochs, {_threads_text(count)}", p.model_copy(update={**four, "threads": count})
     yield "4 epochs, minibatch x 4", p.model_copy(update={**four, "minibatch": 4 * p.minibatch})
     wide = {"worlds": 2 * p.worlds, "rollout": max(1, p.rollout // 2)}
     yield "4 epochs, rows x 2, rollout / 2", p.model_copy(update={**four, **wide})
@@ -56,7 +56,7 @@ def settings(p: PpoSettings, learners: int) -> Iterator[tuple[str, PpoSettings]]
     )  # fmt: skip
 
 
-def _on(threads: int) -> str:
+def _threads_text(threads: int) -> str:
     """Return a number of threads in words."""
     return "one thread" if threads == 1 else f"{threads} threads"
 
@@ -88,17 +88,17 @@ class Learning(Contestant):
         return Sample(steps, took, process_time() - cpu)
 
     def _once(self) -> float:
-        from agents.ppo import on_threads
+        from agents.ppo import use_thread_count
 
         before = self.model.num_timesteps
         steps = self.model.n_steps * self.model.n_envs
-        with on_threads(self.threads), _watched(self.model, self.spent):
+        with use_thread_count(self.threads), _clock_parts(self.model, self.spent):
             self.model.learn(steps, reset_num_timesteps=not before, log_interval=None)
         return float(steps)
 
 
 @contextmanager
-def _watched(model: Any, spent: dict[str, float]) -> Iterator[None]:
+def _clock_parts(model: Any, spent: dict[str, float]) -> Iterator[None]:
     """Time what a model does, in seconds added to `spent`, by name; nothing of it stays in place."""
     import torch
 
@@ -110,7 +110,7 @@ def _watched(model: Any, spent: dict[str, float]) -> Iterator[None]:
     ]  # fmt: skip
     kept = [(owner, name, vars(owner).get(name)) for owner, name, _ in places]
     for owner, name, what in places:
-        setattr(owner, name, _timed(getattr(owner, name), what, spent))
+        setattr(owner, name, _with_clock(getattr(owner, name), what, spent))
     try:
         yield
     finally:
@@ -121,17 +121,17 @@ def _watched(model: Any, spent: dict[str, float]) -> Iterator[None]:
                 setattr(owner, name, before)
 
 
-def _timed(call: Callable[..., Any], what: str, spent: dict[str, float]) -> Callable[..., Any]:
+def _with_clock(call: Callable[..., Any], what: str, spent: dict[str, float]) -> Callable[..., Any]:
     """Return the same callable with a clock around it."""
 
-    def timed(*arguments: Any, **named: Any) -> Any:
+    def timed_call(*arguments: Any, **named: Any) -> Any:
         began = perf_counter()
         try:
             return call(*arguments, **named)
         finally:
             spent[what] += perf_counter() - began
 
-    return timed
+    return timed_call
 
 
 # --- the races ------------------------------------------------------------------------------------------------------
@@ -148,11 +148,11 @@ def _race(bench: Bench, name: str, seconds: float, most: Machine | None) -> None
         model = build(task, p, None)
         work = of_learning(model.policy, p.epochs, of_decisions(task, p.worlds))
         floor = most.floor(work, p.threads) if most and p.threads <= MOST_THREADS else None
-        contestants.append(Learning(title, lambda: None, 0, floor, _said(p, task), model, p.threads, seconds))
-    _shares(bench, name, bench.race(f"PPO on {name}", contestants, baseline="as configured"), contestants)
+        contestants.append(Learning(title, lambda: None, 0, floor, _setting_text(p, task), model, p.threads, seconds))
+    _note_shares(bench, name, bench.race(f"PPO on {name}", contestants, baseline="as configured"), contestants)
 
 
-def _spinning(bench: Bench, seconds: float) -> None:
+def _race_spins(bench: Bench, seconds: float) -> None:
     """Race forward passes and steps of Flock on two threads, by how long torch's threads spin before they sleep."""
     script, case = "run_ours.py", "flock_after_a_pass"
     try:
@@ -160,7 +160,7 @@ def _spinning(bench: Bench, seconds: float) -> None:
             contestants = []
             for spins in SPINS:
                 environment = {"GOMP_SPINCOUNT": spins}
-                side = running(f"{spins} rounds", Path(sys.executable), script, case, 2, seconds, environment)
+                side = start_script(f"{spins} rounds", Path(sys.executable), script, case, 2, seconds, environment)
                 contestants.append(stack.enter_context(side))
             title = "a forward pass and a step of Flock, 2 threads, by how long torch's spin"
             bench.race(title, contestants, baseline=contestants[0].name)
@@ -168,16 +168,16 @@ def _spinning(bench: Bench, seconds: float) -> None:
         bench.note(str(error))
 
 
-def _said(p: PpoSettings, task: Task) -> str:
+def _setting_text(p: PpoSettings, task: Task) -> str:
     """Return a setting in words."""
     rows = p.worlds * task.learners
     return (
         f"{rows} rows x {p.rollout}, minibatch {p.minibatch}, {p.epochs} epochs, {p.activation} "
-        f"{'x'.join(map(str, p.hidden))}, torch and worlds on {_on(p.threads)}"
+        f"{'x'.join(map(str, p.hidden))}, torch and worlds on {_threads_text(p.threads)}"
     )
 
 
-def _shares(bench: Bench, name: str, results: list[Result], contestants: list[Learning]) -> None:
+def _note_shares(bench: Bench, name: str, results: list[Result], contestants: list[Learning]) -> None:
     """Say what share of the time each thing took."""
     for result, contestant in zip(results, contestants, strict=False):
         s = contestant.spent
@@ -192,11 +192,11 @@ def _shares(bench: Bench, name: str, results: list[Result], contestants: list[Le
         }  # fmt: skip
         shares = {what: value / s["all"] for what, value in parts.items()}
         bench.extra.setdefault("shares", {}).setdefault(name, {})[result.name] = shares
-        said = ", ".join(f"{what} {share:.1%}" for what, share in shares.items() if share > 0.0005)
-        bench.note(f"{name}, {result.name}: rollout {s['rollout'] / s['all']:.0%} of the time; {said}.")
+        text = ", ".join(f"{what} {share:.1%}" for what, share in shares.items() if share > 0.0005)
+        bench.note(f"{name}, {result.name}: rollout {s['rollout'] / s['all']:.0%} of the time; {text}.")
 
 
-def _summary(bench: Bench) -> None:
+def _note_summary(bench: Bench) -> None:
     """Say how far five minutes go, and what SB3's defaults would come to."""
     for name in EXPERIMENTS:
         mine = {r.name: r for r in bench.results if r.race == f"PPO on {name}"}
@@ -222,11 +222,11 @@ def main(
     with Bench("training", quick, turns, out, unit="k agent-steps/s", scale=1e3) as bench:
         turn, most = seconds or (QUICK_SECONDS if quick else SECONDS), machine(bench, *range(1, MOST_THREADS + 1))
         if not only:
-            _spinning(bench, turn)
+            _race_spins(bench, turn)
         for name in EXPERIMENTS:
             if only in ("", name) and Path(CONFIGS / f"{name}.yaml").exists():
                 _race(bench, name, turn, most)
-        _summary(bench)
+        _note_summary(bench)
         bench.note("End to end: rollouts and updates. Torch and the worlds use as many threads as the setting says.")
 
 

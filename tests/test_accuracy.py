@@ -18,12 +18,12 @@ from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import Effect, Fluctuation, Swing, Tether
 from flockenv.physics.integrators import RK4, Integrator, methods_of
 from flockenv.scene import Group, Scene
-from flockenv.studies.accuracy import SUITE, Problem, Report, Results, chaos, measure, problems_named, usual_methods
+from flockenv.studies.accuracy import SUITE, Problem, Report, Results, chaos, measure, select_problems, usual_methods
 from flockenv.studies.accuracy import problem as problems
 from flockenv.studies.accuracy import reference as references
 from flockenv.studies.accuracy.plots import draw_precision, write_precision
 from flockenv.studies.accuracy.results import Curve, Point, measured_order
-from flockenv.studies.accuracy.table import best, columns, headlines, rows
+from flockenv.studies.accuracy.table import cheapest_lines, columns, headlines, rows
 
 ORIGIN = (0.0, 0.0)
 TINY = """\
@@ -34,7 +34,7 @@ dt: 0.02
 
 
 def one(name: str) -> Problem:
-    return problems_named([name])[0]
+    return select_problems([name])[0]
 
 
 def body(effect: Effect, **group: Any) -> Scene:
@@ -143,7 +143,7 @@ def test_references_agree_with_each_other() -> None:
     known = one("damped")
     exact = references.find_reference(known)
     scipy = references.find_reference(replace(known, exact=None))
-    own = references.own_steps(known, 64)
+    own = references.reference_by_own_steps(known, 64)
     assert [r.kind for r in (exact, scipy, own)] == ["closed form", "DOP853", "own steps"]
     for other in (scipy, own):
         assert np.abs(exact.path.pos - other.path.pos).max() < 1e-11
@@ -278,7 +278,7 @@ def test_a_coarse_point_that_is_right_by_chance_is_not_taken() -> None:
     curve = Curve(
         method="rk4", declared=4, order=None, used=0, points=tuple(_point(2**k, e, 1.0) for k, e in enumerate(errors))
     )
-    choice = curve.needed(1e-3, interpolate=False)
+    choice = curve.cheapest_choice(1e-3, interpolate=False)
     assert choice is not None and choice.cost == 8
     assert curve.needed(1e-5) is None
     unknown = curve.needed(1e-2)
@@ -288,7 +288,7 @@ def test_a_coarse_point_that_is_right_by_chance_is_not_taken() -> None:
 def test_errors_below_the_floor_are_refused(damped: Report) -> None:
     with pytest.raises(ValueError, match="tolerance = 1e-14 m: must be finite and >="):
         damped.cheapest(1e-14)
-    assert best(damped, [1e-14])[0].startswith("to 1e-14 m: errors below")
+    assert cheapest_lines(damped, [1e-14])[0].startswith("to 1e-14 m: errors below")
     assert rows(damped, [1e-14])[0][3:5] == ["-", "-"]
 
 
@@ -339,7 +339,7 @@ def test_a_report_becomes_headlines_and_a_table(damped: Report) -> None:
     table = rows(damped, [1e-2, 1e-4])
     assert all(len(row) == len(columns([1e-2, 1e-4])) for row in table)
     assert [row[0] for row in table] == [curve.method for curve in damped.curves]
-    assert len(best(damped, [1e-2, 1e-4])) == 2
+    assert len(cheapest_lines(damped, [1e-2, 1e-4])) == 2
     with pytest.raises(ValueError, match="'rk44': was not measured, did you mean `rk4`"):
         damped.curve("rk44")
 
@@ -410,13 +410,13 @@ def test_unknown_names_are_refused_with_the_nearest_one() -> None:
     with pytest.raises(ValueError, match="methods: 'rk44' is none, did you mean `rk4`"):
         methods_of(["rk44"])
     with pytest.raises(ValueError, match="problems: 'keppler' is none, did you mean `kepler`"):
-        problems_named(["keppler"])
+        select_problems(["keppler"])
     with pytest.raises(ValueError, match="repetitions = -1"):
         measure(one("damped"), METHODS, repetitions=-1)
 
 
 def test_every_problem_of_the_suite_agrees_with_its_closed_form_at_the_start() -> None:
-    for name, problem in zip(SUITE, problems_named(), strict=True):
+    for name, problem in zip(SUITE, select_problems(), strict=True):
         assert problem.name == name
         assert problem.steps == tuple(sorted(problem.steps)) and len(problem.steps) >= 9
         assert len(problem.times) >= 8

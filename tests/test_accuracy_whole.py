@@ -12,11 +12,11 @@ import pytest
 from flockenv.cli.main import main
 from flockenv.physics.integrators import methods_of
 from flockenv.scene.yaml_io import load_scene
-from flockenv.studies.accuracy import Problem, Report, Results, measure, problems_named
+from flockenv.studies.accuracy import Problem, Report, Results, measure, select_problems
 from flockenv.studies.accuracy.paths import Path as Way
-from flockenv.studies.accuracy.paths import apart, reach, unmatched
+from flockenv.studies.accuracy.paths import count_unmatched, distances, reach
 from flockenv.studies.accuracy.plots import draw_precision
-from flockenv.studies.accuracy.reference import _closing_in, find_reference, own_steps
+from flockenv.studies.accuracy.reference import _convergence, find_reference, reference_by_own_steps
 from flockenv.studies.accuracy.table import errors, headlines
 
 BALL = """\
@@ -102,11 +102,11 @@ def test_order_1_is_distinguished_from_rounding_on_the_bouncing_ball() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["bounces", "rod"])
 def test_closed_forms_agree_with_the_scenes_own_steps(name: str) -> None:
-    known = problems_named([name])[0]
-    exact, own = find_reference(known), own_steps(known, 16)
+    known = select_problems([name])[0]
+    exact, own = find_reference(known), reference_by_own_steps(known, 16)
     assert exact.kind == "closed form"
     assert exact.error == 0
-    off = np.abs(known.apart(exact.path, own.path)).max()
+    off = np.abs(known.distances(exact.path, own.path)).max()
     assert off <= max(own.error, 1e-9)
 
 
@@ -146,8 +146,8 @@ def test_paths_are_matched_by_identity_and_not_by_slot() -> None:
     one = Way(np.array([[[0.0, 0], [5.0, 0], [9.0, 9]]]), np.zeros((1, 3, 2)), np.array([[7, 8, -1]]))
     two = Way(np.array([[[5.0, 1], [0.5, 0], [3.0, 3]]]), np.zeros((1, 3, 2)), np.array([[8, 7, 11]]))
     minus = np.subtract
-    np.testing.assert_array_equal(apart(one, two, minus), [[0.5, 1.0, np.nan]])
-    assert unmatched(one, two) == 1
+    np.testing.assert_array_equal(distances(one, two, minus), [[0.5, 1.0, np.nan]])
+    assert count_unmatched(one, two) == 1
     later = Way(np.concatenate([one.pos, one.pos + 2]), np.zeros((2, 3, 2)), np.array([[7, 8, -1], [8, -1, 7]]))
     assert reach(later, np.zeros((3, 2)), minus) == pytest.approx(math.hypot(11, 11))
 
@@ -155,15 +155,15 @@ def test_paths_are_matched_by_identity_and_not_by_slot() -> None:
 def test_the_error_of_a_reference_is_estimated_by_richardson_extrapolation() -> None:
     for order in (1.0, 2.0, 4.0):
         ends = [0.3 * 0.5 ** (order * k) for k in range(4)]  # of steps h, h/2, h/4, h/8
-        found, error = _closing_in(ends[0] - ends[1], ends[1] - ends[2], 1e-15)
+        found, error = _convergence(ends[0] - ends[1], ends[1] - ends[2], 1e-15)
         assert found == pytest.approx(order)
         assert error >= ends[2]
         if order == 1:
             assert error == pytest.approx(ends[2])
-    assert _closing_in(1e-3, 2e-3, 1e-12)[1] == 2e-3  # no convergence: the larger of the two
-    assert _closing_in(1e-14, 3e-14, 1e-12) == (None, 3e-14)  # rounding
-    assert _closing_in(0.0, 1e-3, 1e-12)[1] == 1e-3  # a jump in the finest run alone
-    assert _closing_in(1e-3, 0.0, 1e-12) == (None, 1e-3)
+    assert _convergence(1e-3, 2e-3, 1e-12)[1] == 2e-3  # no convergence: the larger of the two
+    assert _convergence(1e-14, 3e-14, 1e-12) == (None, 3e-14)  # rounding
+    assert _convergence(0.0, 1e-3, 1e-12)[1] == 1e-3  # a jump in the finest run alone
+    assert _convergence(1e-3, 0.0, 1e-12) == (None, 1e-3)
 
 
 # --- refusals ---------------------------------------------------------------------------------------------------------

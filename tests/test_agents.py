@@ -17,11 +17,11 @@ from typer.testing import CliRunner
 
 from agents import dagger, tune
 from agents import imitate as imitation
-from agents.dagger import shown
+from agents.dagger import collect_answers
 from agents.experiment import AS_CONFIGURED, CONFIGS, Experiment, PpoSettings, load_experiment
 from agents.imitate import imitate
 from agents.learning_env import ForLearning
-from agents.run import checkpointed, recipe_of
+from agents.run import load_checkpoint, recipe_of
 from agents.team_credit import CaringBuffer
 from flockenv.envs.sb3 import WorldVecEnv
 from flockenv.envs.world import World
@@ -189,7 +189,7 @@ def test_interrupted_training_resumes_and_finished_training_is_not_repeated(
     from agents import ppo
 
     interrupt(PURSUIT, tmp_path)
-    begun = checkpointed(PURSUIT, tmp_path)
+    begun = load_checkpoint(PURSUIT, tmp_path)
     assert begun is not None and 0 < begun.steps < 1024
     run = ppo.train(PURSUIT, tmp_path, go_on=True)
     assert run.steps >= 1024 and run.curve[: len(begun.curve)] == begun.curve
@@ -328,7 +328,7 @@ def test_training_restores_the_number_of_threads(tmp_path: Path, monkeypatch: py
         raise KeyboardInterrupt
 
     before = torch.get_num_threads(), threads()
-    monkeypatch.setattr(ppo, "checkpoint", interrupted)
+    monkeypatch.setattr(ppo, "save_checkpoint", interrupted)
     with pytest.raises(KeyboardInterrupt):
         ppo.train(PURSUIT.model_copy(update={"ppo": PpoSettings(**{**TINY, "threads": 3})}), tmp_path)
     assert inside[0] == (3, 3)
@@ -390,7 +390,7 @@ def test_rules_are_queried_on_the_observations_of_the_acting_policy() -> None:
     """The acting policy does nothing; its worlds are those after the first five training worlds."""
     task = School(fish=3, horizon=20)
     rules = player(task)
-    rows, answers = shown(task, rules, 2, lambda rows: torch.zeros(len(rows), 2), first=5)
+    rows, answers = collect_answers(task, rules, 2, lambda rows: torch.zeros(len(rows), 2), first=5)
     world, state = World(task, 2, task.horizon), None
     seen, first = world.reset(worlds_for("training") + 5), True
     for step in range(20):
@@ -515,7 +515,7 @@ def test_a_taught_run_stores_its_teacher_and_counts_the_time_of_teaching(tmp_pat
 
     taught = Experiment(task="pursuit", ppo=PpoSettings(**TINY, steps=1024, taught=5, critic_first=1024))
     interrupt(taught, tmp_path)  # after it was taught
-    begun = checkpointed(taught, tmp_path)
+    begun = load_checkpoint(taught, tmp_path)
     assert begun is not None and begun.recipe["rules"] == as_dict(player(taught.build()).rules)
     assert "rules" not in recipe_of(PURSUIT)
     kept = begun.state["policy"]
@@ -542,13 +542,13 @@ def test_ctrl_c_during_teaching_reports_no_checkpoint_and_deletes_none(
     monkeypatch.setattr(ppo, "teach", interrupted)
     result = CliRunner().invoke(ppo.app, [str(tmp_path / "p.yaml"), "--runs", str(tmp_path / "runs")])
     assert result.exit_code == 130 and "nothing was learnt yet" in result.stderr
-    assert checkpointed(PURSUIT, tmp_path / "runs" / "pursuit") is not None
+    assert load_checkpoint(PURSUIT, tmp_path / "runs" / "pursuit") is not None
 
 
 def test_observations_are_collected_until_each_episode_ends() -> None:
     task = load_experiment(CONFIGS / "pursuit.yaml").build()
     rules = player(task)
-    rows, answers = shown(task, rules, 6)
+    rows, answers = collect_answers(task, rules, 6)
     episodes = rollout(task, rules, 6, worlds_for("training", 0, 6))
     assert len(rows) == len(answers) == episodes.lengths.sum() * task.learners
     np.testing.assert_allclose(answers, rules.predict(rows.numpy())[0], atol=1e-6)

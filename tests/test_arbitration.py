@@ -33,7 +33,7 @@ from flockenv.steering.arbitration import (
     allocate_running,
 )
 from flockenv.steering.vectorize import rows
-from flockenv.studies.arbitration_trace import granted
+from flockenv.studies.arbitration_trace import arbitration_shares
 from flockenv.studies.cost_breakdown import _shares
 from tests import catalogue
 from tests.catalogue import Array
@@ -258,23 +258,23 @@ def test_steer_acts_on_its_group_alone_and_its_trace_matches_the_force() -> None
     assert not np.allclose(end.vel[:, 9:], state.vel[:, 9:])
 
     before = end.work.copy()
-    found = granted(scene, end)[0]
+    found = arbitration_shares(scene, end)[0]
     np.testing.assert_array_equal(end.work, before)  # the trace leaves the scene's counters alone
     assert (found.names, found.effect) == (("avoid_obstacles", "separation"), 0)
-    np.testing.assert_array_equal(found.wish[:, :9], 0)
+    np.testing.assert_array_equal(found.requested[:, :9], 0)
     np.testing.assert_array_equal(found.share[:, :9], 0)
     np.testing.assert_allclose(found.force, scene.acceleration(end), atol=1e-12)  # 1 kg
     np.testing.assert_allclose((found.share[..., None] * found.wish).sum(axis=2), found.force, atol=1e-12)
     assert np.linalg.norm(found.wish, axis=-1).max() > 4.0  # a single behaviour's force is not bounded
     assert found.cut.any()
     assert set(found.mean_share()) == {"avoid_obstacles", "separation"}
-    where = found.asked[..., 1]
+    where = found.is_active[..., 1]
     assert found.mean_share()["separation"] == pytest.approx(float(found.share[..., 1][where].mean()))
     shares = _shares(scene, state)  # as shown by `flockenv explain`: means over a run
     assert [(where, name) for where, name, _ in shares] == [("effects[0]", name) for name in found.names]
     assert all(0 < mean <= 1 for _, _, mean in shares)
     assert _shares(crowd(SEPARATION), state) == ()
-    order = found.asked[..., 0] & found.asked[..., 1]
+    order = found.is_active[..., 0] & found.is_active[..., 1]
     assert (found.share[order][:, 0] >= found.share[order][:, 1]).all()
 
 
@@ -308,7 +308,7 @@ def test_every_arbitration_steers_a_scene(arbitration: Arbitration, dtype: str, 
     change["obstacles"] = tuple({"centre": (x,) * dimension, "radius": 0.7} for x in (3.0, 6.5))
     scene = crowd(Steer(behaviours=(AVOID, SEPARATION), arbitration=arbitration), **change)
     end = scene.run(scene.start(4, worlds=2), 25)
-    found = granted(scene, end)[0].force
+    found = arbitration_shares(scene, end)[0].force
     length = np.linalg.norm(found, axis=-1, keepdims=True)
     bounded = found * np.minimum(1, 4 / np.maximum(length, 1e-9))
     tolerance = 1e-11 if dtype == "float64" else 2e-3

@@ -312,7 +312,7 @@ def _validation(folder: Path) -> None:
 
 
 def _training(folder: Path) -> None:
-    with checkpoint.claimed(folder / "run"):
+    with checkpoint.claim(folder / "run"):
         pass
 
 

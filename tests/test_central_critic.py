@@ -10,7 +10,7 @@ import torch
 from agents import ppo
 from agents.central_critic import CentralVecEnv
 from agents.experiment import Experiment, PpoSettings
-from agents.run import OtherRecipe, checkpointed
+from agents.run import OtherRecipe, load_checkpoint
 from flockenv.envs.sb3 import WorldVecEnv
 from flockenv.envs.world import World
 from flockenv.players.policy import MlpPolicy
@@ -110,7 +110,7 @@ def test_training_with_a_central_critic_and_held_actions_can_be_resumed(tmp_path
     changes = {"taught": 3, "critic_first": 4 * update, "hold": 3, "steps": 3 * update, "evaluate_every": update}
     experiment = settings(**changes)
     interrupt(experiment, tmp_path)
-    begun = checkpointed(experiment, tmp_path)
+    begun = load_checkpoint(experiment, tmp_path)
     assert begun is not None and begun.steps == update
     kept = begun.state["policy"]
     run = ppo.train(experiment, tmp_path, go_on=True)

@@ -22,10 +22,10 @@ from typer.testing import CliRunner
 
 from agents import checkpoint as files
 from agents import ppo
-from agents.checkpoint import FILE, Damaged, InUse, KernelPlan, claimed, digest
+from agents.checkpoint import FILE, CheckpointParts, Damaged, InUse, claim, digest
 from agents.divergence import LearningDiverged
 from agents.experiment import CONFIGS, Experiment
-from agents.run import checkpoint, checkpointed
+from agents.run import load_checkpoint, save_checkpoint
 from benchmarks import kills
 from flockenv.core.atomic_files import LEFTOVERS
 from flockenv.core.output_paths import check_room
@@ -38,7 +38,7 @@ LARGEST = 2**26
 TWO_THREADS = PURSUIT.model_copy(update={"ppo": PURSUIT.ppo.model_copy(update={"threads": 2})})
 
 
-def parts_in(folder: Path) -> KernelPlan:
+def parts_in(folder: Path) -> CheckpointParts:
     parts = files.read(folder, LARGEST)
     assert parts is not None
     return parts
@@ -82,7 +82,7 @@ def test_resumed_training_equals_the_uninterrupted_one(
     tmp_path: Path, whole: Callable[[Experiment], Path], experiment: Experiment, points: int
 ) -> None:
     interrupt(experiment, tmp_path, points)
-    begun = checkpointed(experiment, tmp_path)
+    begun = load_checkpoint(experiment, tmp_path)
     assert begun is not None and begun.steps < experiment.ppo.steps and len(begun.curve) <= points
     run = ppo.train(experiment, tmp_path, go_on=True)
     same_training(tmp_path, whole(experiment))
@@ -150,15 +150,15 @@ def test_kills_are_spread_over_several_trainings(tmp_path: Path, monkeypatch: py
         def join(self) -> None:
             pass
 
-    class Lives:
+    class TrainingServer:
         def begin(self, *given: object) -> Life:
             return Life()
 
-        def whole(self, *given: object) -> tuple[float, str]:
+        def run_undisturbed(self, *given: object) -> tuple[float, str]:
             return 1.0, "digests"
 
-    monkeypatch.setattr(kills, "Lives", Lives)
-    monkeypatch.setattr(kills, "_killed", lambda *given: True)
+    monkeypatch.setattr(kills, "TrainingServer", TrainingServer)
+    monkeypatch.setattr(kills, "_kill", lambda *given: True)
     monkeypatch.setattr(kills, "digests", lambda folder: "digests")
     count = kills.kill_and_resume(20, 0, tmp_path)
     assert (count.kills, count.same, count.different, count.refused) == (20, 3, [], [])
@@ -227,7 +227,7 @@ def refused(folder: Path, message: str) -> None:
     assert {path.name for path in folder.iterdir()} == {"pursuit.yaml", "runs"}
 
 
-def changed(change: Callable[[KernelPlan], Any]) -> Callable[[Path], None]:
+def changed(change: Callable[[CheckpointParts], Any]) -> Callable[[Path], None]:
     """Return a function that changes a checkpoint and rewrites it with valid digests."""
 
     def write(folder: Path) -> None:
@@ -241,7 +241,7 @@ def changed(change: Callable[[KernelPlan], Any]) -> Callable[[Path], None]:
 def noted(**changes: Any) -> Callable[[Path], None]:
     """Return a function that changes the notes of a checkpoint; the value "gone" removes a key."""
 
-    def change(parts: KernelPlan) -> None:
+    def change(parts: CheckpointParts) -> None:
         notes = {**json.loads(parts["notes"]["json"].tobytes()), **changes}
         text = json.dumps({key: value for key, value in notes.items() if value != "gone"})
         parts["notes"] = {"json": np.frombuffer(text.encode(), np.uint8)}
@@ -258,7 +258,7 @@ def as_bytes(text: str) -> dict[str, Any]:
 
 
 def tensor(part: str, name: str, value: Callable[[Any], Any]) -> Callable[[Path], None]:
-    def change(parts: KernelPlan) -> None:
+    def change(parts: CheckpointParts) -> None:
         parts[part][name] = value(parts[part][name].copy())
 
     return changed(change)
@@ -340,8 +340,8 @@ def test_results_of_any_finite_size_are_stored(tmp_path: Path, mean: float) -> N
     run = ppo.train(PURSUIT, tmp_path)
     run.curve = [{**point, "mean": mean, "seconds": 1e-160} for point in run.curve]
     run.best, run.wall = mean, 1e-160
-    checkpoint(tmp_path, run)
-    again = checkpointed(PURSUIT, tmp_path)
+    save_checkpoint(tmp_path, run)
+    again = load_checkpoint(PURSUIT, tmp_path)
     assert again is not None and (again.best, again.wall, again.curve) == (mean, 1e-160, run.curve)
 
 
@@ -398,7 +398,7 @@ def test_checkpoint_contains_only_numeric_tensors(copied: Path) -> None:
 def test_second_training_in_a_folder_is_refused_at_once(copied: Path) -> None:
     folder = copied / "runs" / "pursuit"
     before = (folder / FILE).read_bytes()
-    with claimed(folder):
+    with claim(folder):
         for more in ((), ("--resume",)):
             result = command(copied, *more)
             message = f"error: {folder} is in use by another training: wait for its end, or choose another --runs\n"
@@ -406,7 +406,7 @@ def test_second_training_in_a_folder_is_refused_at_once(copied: Path) -> None:
         with pytest.raises(InUse):
             ppo.train(PURSUIT, folder)
     assert (folder / FILE).read_bytes() == before and not (copied / "p.safetensors").exists()
-    with claimed(folder):
+    with claim(folder):
         pass
 
 
@@ -414,8 +414,8 @@ def test_lock_of_another_process_is_released_when_it_ends(copied: Path) -> None:
     folder = copied / "runs" / "pursuit"
     code = f"""
 from pathlib import Path
-from agents.checkpoint import claimed
-with claimed(Path({str(folder)!r})):
+from agents.checkpoint import claim
+with claim(Path({str(folder)!r})):
     print("held", flush=True)
     input()
 """
@@ -425,10 +425,10 @@ with claimed(Path({str(folder)!r})):
     )
     with holder:
         assert holder.stdout is not None and holder.stdout.readline() == "held\n"
-        with pytest.raises(InUse, match="in use by another training"), claimed(folder):
+        with pytest.raises(InUse, match="in use by another training"), claim(folder):
             pass
         holder.kill()
-    with claimed(folder):
+    with claim(folder):
         pass
 
 
@@ -437,7 +437,7 @@ def test_partial_files_of_a_killed_training_are_removed(copied: Path) -> None:
     half = folder / LEFTOVERS.replace("*", "4711")
     half.mkdir()
     (half / "new").write_bytes(b"half")
-    with claimed(folder):
+    with claim(folder):
         assert not half.exists() and (folder / FILE).exists()
 
 
@@ -558,7 +558,7 @@ def test_non_finite_number_is_named_and_the_last_good_policy_is_kept(
     lines = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
     kept = f"kept: the checkpoint of 512 steps in {folder}, and the best policy so far (mean return "
     assert len(lines) == 1 and message.format(slot=slot) in lines[0] and kept in lines[0]
-    run = checkpointed(PURSUIT, folder)
+    run = load_checkpoint(PURSUIT, folder)
     assert run is not None and run.steps == 512 and len(run.curve) == 2
     assert MlpPolicy.load(target, PURSUIT.build()).card["tuning_mean"] == run.best
 
@@ -637,7 +637,7 @@ def test_non_finite_loss_is_reported(tmp_path: Path, scale: float, message: str)
 
 
 def test_different_versions_are_reported_and_listed_in_the_card(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    begun, real = checkpointed(PURSUIT, copied / "runs" / "pursuit"), ppo.surroundings
+    begun, real = load_checkpoint(PURSUIT, copied / "runs" / "pursuit"), ppo.surroundings
     monkeypatch.setattr(ppo, "surroundings", lambda task: {**real(task), "torch": "9.1.0", "numpy": "3.0.0"})
     result = command(copied, "--resume")
     assert result.exit_code == 0, result.output

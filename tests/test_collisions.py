@@ -439,7 +439,7 @@ def test_explain_lists_the_neighbour_query_of_collisions() -> None:
     found = explain(scene([1, 1], obstacles=FLOOR, space=Box(size=(4, 4))))
     assert found.work["neighbour_queries"] == 1
     assert not [line for line in found.left_out if line.startswith(("neighbour query", "pass over obstacles"))]
-    assert found.remains == "semi_implicit_euler, limits, box, collisions"
+    assert found.remaining_parts == "semi_implicit_euler, limits, box, collisions"
     alone = explain(scene([1, 1], agents=False, space=Box(size=(4, 4))))
     assert alone.work["neighbour_queries"] == 0
     assert "neighbour query: no effect needs neighbours" in alone.left_out

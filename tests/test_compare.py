@@ -149,7 +149,7 @@ def test_results_in_parallel_equal_serial_ones_and_progress_is_reported(
     side_by_side: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tasks = [TASKS["pursuit"](), TASKS["obstacles"]()]
-    field = comparison.field_of(["random", "rules"])
+    field = comparison.players_in_order(["random", "rules"])
     reports: list[tuple[str, str, int, int]] = []
     both, films = comparison.compare(tasks, field, 2, resamples=100, advance=lambda *row: reports.append(row))
     monkeypatch.setattr(comparison.os, "cpu_count", lambda: 1)
@@ -200,7 +200,7 @@ def test_error_in_the_progress_callback_is_raised_in_parallel(
         raise RuntimeError("enough")
 
     with pytest.raises(RuntimeError, match="enough"):
-        comparison.compare(tasks, comparison.field_of(["random"]), 2, resamples=100, advance=advance)
+        comparison.compare(tasks, comparison.players_in_order(["random"]), 2, resamples=100, advance=advance)
     assert len(reports) == 1 and not died
     assert not multiprocessing.active_children()
 
@@ -290,7 +290,7 @@ def columns() -> list[Column]:
     luck = np.random.default_rng(0).normal(size=50)
     scores = {"random": luck - 5, "rules": luck, "$mine_": luck + 0.5}
     episodes = {name: artificial(x) for name, x in scores.items()}
-    return [report.column("toy", report.task_results("d", episodes, {}, 200, 0), episodes)]
+    return [report.chart_column("toy", report.task_results("d", episodes, {}, 200, 0), episodes)]
 
 
 def test_chart_draws_the_intervals() -> None:
@@ -367,7 +367,7 @@ def test_equal_seeds_give_equal_scores_and_different_seeds_do_not() -> None:
 
 def test_order_of_players_does_not_depend_on_the_arguments() -> None:
     Path("mine.py").write_text(STILL)
-    field = comparison.field_of(["mine.py", "ppo", "random", "rules", "textbook", "ppo"])
+    field = comparison.players_in_order(["mine.py", "ppo", "random", "rules", "textbook", "ppo"])
     assert [player.name for player in field] == ["random", "textbook", "rules", "ppo", "mine"]
 
 

@@ -12,16 +12,26 @@ import pytest
 from flockenv.cli.main import main
 from flockenv.scene import Scene
 from flockenv.scene.yaml_io import load_scene
-from flockenv.studies.validation import CASES, VALIDATED, Case, Finding, Results, Value, cases_named, presets_named, run
+from flockenv.studies.validation import (
+    CASES,
+    VALIDATED,
+    Case,
+    Finding,
+    Results,
+    Value,
+    run,
+    select_cases,
+    select_presets,
+)
 from flockenv.studies.validation.alone import corridor, crossing_time
 from flockenv.studies.validation.corridors import DENSITIES, EACH_WAY
-from flockenv.studies.validation.doors import DATA, _off
+from flockenv.studies.validation.doors import DATA, _excess_over
 from flockenv.studies.validation.page import page
 from flockenv.studies.validation.plots import write_pictures
-from flockenv.studies.validation.quiet import quietly
+from flockenv.studies.validation.quiet import ignore_contact_warnings
 from flockenv.studies.validation.rooms import bottleneck, corner, room
 from flockenv.studies.validation.scenes import SCENES
-from flockenv.studies.validation.walk import Walk, walked
+from flockenv.studies.validation.walk import Walk, run_walk
 
 ROOT = Path(__file__).parent.parent
 NERVOUS = "helbing_farkas_vicsek_2000"
@@ -30,7 +40,7 @@ slow = pytest.mark.slow
 
 
 def found(name: str, preset: str = NERVOUS) -> Finding:
-    return run(cases_named(CASES, (name,)), (preset,)).findings[0]
+    return run(select_cases(CASES, (name,)), (preset,)).findings[0]
 
 
 # --- motion -----------------------------------------------------------------------------------------------------------
@@ -43,8 +53,8 @@ def test_single_pedestrian_passes_the_guidelines(name: str) -> None:
 
 
 def test_crossing_time_at_a_desired_speed_below_that_of_rimea_1() -> None:
-    with quietly():
-        run_ = walked(corridor(NERVOUS, 1.1, length=40), 60)
+    with ignore_contact_warnings():
+        run_ = run_walk(corridor(NERVOUS, 1.1, length=40), 60)
     assert crossing_time(run_.time, run_.pos[:, 0, 0, 0], 40.0) == pytest.approx(40 / 1.1 + 0.5, abs=0.02)
 
 
@@ -65,7 +75,7 @@ def test_cases_that_the_preset_of_2000_passes(name: str) -> None:
 @slow
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_crowds_in_configs_move(path: Path) -> None:
-    with quietly():
+    with ignore_contact_warnings():
         scene = load_scene(path)
         start = scene.start(0)
         end = scene.run(start, round(2.0 / scene.dt))
@@ -81,12 +91,12 @@ DENSE = sorted(p for p in (ROOT / "configs" / "crowds").glob("rimea_*") if p.ste
 @pytest.mark.parametrize("path", DENSE, ids=lambda path: path.stem)
 def test_dense_crowds_start_without_deep_overlap_and_stay_in_the_corridor(path: Path) -> None:
     """With uniformly random positions, overlaps of up to 0.65 m caused speeds of 3,000 m/s, or divergence."""
-    with quietly():
+    with ignore_contact_warnings():
         scene = load_scene(path)
     here, radius = scene.start(0).alive[0], scene.body.radius
     limit = 2 / scene.dt * 80 / (2 * 2.4e5)  # m of overlap d; friction of two bodies, kappa d 2 / m, is unstable beyond
     for seed in range(10):
-        with quietly():
+        with ignore_contact_warnings():
             state = scene.start(seed)
             apart = state.pos[0][:, None] - state.pos[0]
             apart -= scene.space.extent(2) * np.round(apart / scene.space.extent(2))
@@ -109,7 +119,7 @@ def test_dense_crowds_start_without_deep_overlap_and_stay_in_the_corridor(path: 
     ],
 )
 def test_scenes_in_configs_equal_those_of_the_cases(name: str, built: Any) -> None:
-    with quietly():
+    with ignore_contact_warnings():
         loaded, expected = load_scene(ROOT / "configs" / "scenes" / f"{name}.yaml"), built()
     assert _walls(loaded) == _walls(expected)
     assert loaded.groups[0].size == expected.groups[0].size
@@ -122,7 +132,7 @@ def test_scene_files_equal_the_scenes_of_the_cases(case: Case) -> None:
     """To update the files: flockenv validate --preset helbing_2000 --scenes configs/crowds --force."""
     for variant, built in SCENES[case.name].items():
         file = ROOT / "configs" / "crowds" / f"{'_'.join([*case.name.split(), *variant.split()])}.yaml"
-        with quietly():
+        with ignore_contact_warnings():
             assert load_scene(file) == built(NERVOUS)
 
 
@@ -155,7 +165,7 @@ def test_scenes_are_written_with_the_preset_by_name_and_never_overwrite(
     "preset", [VALIDATED[0], *(pytest.param(name, marks=pytest.mark.slow) for name in VALIDATED[1:])]
 )
 def test_every_case_can_be_built_with_every_preset(preset: str, case: Case) -> None:
-    with quietly():
+    with ignore_contact_warnings():
         for built in SCENES[case.name].values():
             assert sum(built(preset).living) > 0
 
@@ -170,9 +180,9 @@ def _walls(scene: Scene) -> set[tuple[tuple[float, ...], tuple[float, ...]]]:
 
 
 def test_unknown_names_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert [case.name for case in cases_named(CASES, ("juelich",))] == ["juelich 2", "juelich 6"]
-    assert presets_named(["helbing_2000"]) == (NERVOUS,)
-    assert presets_named([]) == VALIDATED
+    assert [case.name for case in select_cases(CASES, ("juelich",))] == ["juelich 2", "juelich 6"]
+    assert select_presets(["helbing_2000"]) == (NERVOUS,)
+    assert select_presets([]) == VALIDATED
     assert main(["validate", "rimea 21"]) == 2
     assert "case 'rimea 21': unknown" in capsys.readouterr().err
     assert main(["validate", "rimea 1", "--preset", "helbing_2001"]) == 2
@@ -213,14 +223,14 @@ def test_crossing_and_leaving_times() -> None:
     assert math.isnan(crossing_time(time, np.array([0.0, 1.0, 3.0]), 4.0))
     alive = np.array([[[True, True, False]], [[True, True, False]], [[False, True, False]]])
     none = np.zeros((3, 1, 3, 2))
-    gone = Walk(time, none, none, alive, np.zeros(3), None).gone()  # type: ignore[arg-type]
+    gone = Walk(time, none, none, alive, np.zeros(3), None).leaving_times()  # type: ignore[arg-type]
     np.testing.assert_array_equal(gone, [2.0, np.nan, np.nan])
 
 
 def test_deviation_of_a_flow_is_its_relative_distance_to_the_band() -> None:
-    assert _off(1.8, DATA[1.0]) == 0
-    assert _off(0.9 * 1.71, DATA[1.0]) == pytest.approx(-0.1)
-    assert _off(1.2 * 2.02, DATA[1.0]) == pytest.approx(0.2)
+    assert _excess_over(1.8, DATA[1.0]) == 0
+    assert _excess_over(0.9 * 1.71, DATA[1.0]) == pytest.approx(-0.1)
+    assert _excess_over(1.2 * 2.02, DATA[1.0]) == pytest.approx(0.2)
 
 
 def artificial() -> Results:

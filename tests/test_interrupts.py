@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.processes import starting
+from agents.processes import guard_process_starts
 from flockenv.core import signals
 from flockenv.core.signals import ONE_PRESS
 
@@ -311,7 +311,7 @@ def test_the_mark_of_worker_processes_is_removed_after_they_are_started(
     monkeypatch.delenv(signals.PARENT, raising=False)
     if before is not None:
         monkeypatch.setenv(signals.PARENT, before)
-    with suppress(ValueError), starting():
+    with suppress(ValueError), guard_process_starts():
         assert os.environ[signals.PARENT] == str(os.getpid())
         if error:
             raise error

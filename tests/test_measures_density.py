@@ -14,8 +14,7 @@ from flockenv.studies.measures import (
     JUELICH,
     classical_density,
     diagram,
-    from_weidmann,
-    in_juelich,
+    juelich_share,
     required_length,
     single_file_density,
     single_file_speed,
@@ -23,6 +22,7 @@ from flockenv.studies.measures import (
     voronoi,
     voronoi_density,
     voronoi_speed,
+    weidmann_deviation,
     weidmann_flow,
     weidmann_speed,
 )
@@ -196,24 +196,24 @@ def test_a_crowd_drawn_from_the_juelich_data_fits_it_and_is_below_weidmann() -> 
     rng = np.random.default_rng(0)
     low, high, mean, spread = (np.repeat(column, 500) for column in np.array(JUELICH).T)
     rho, v = rng.uniform(low, high), rng.normal(mean, 0.5 * spread)
-    assert in_juelich(rho, v) == 1
-    assert in_juelich(rho, v + 0.3) == 0
-    off = from_weidmann(rho, v)
+    assert juelich_share(rho, v) == 1
+    assert juelich_share(rho, v + 0.3) == 0
+    off = weidmann_deviation(rho, v)
     assert off.samples == 2500
     assert -0.25 < off.mean < -0.1  # speeds measured in corridors lie below the curve
-    assert from_weidmann(rho, weidmann_speed(rho))[1:3] == pytest.approx((0, 0), abs=1e-12)
-    assert from_weidmann(rho, weidmann_speed(rho) + 0.2).worst == pytest.approx(0.2, abs=0.01)
-    assert math.isnan(in_juelich([0.1], [1.0]))
-    assert from_weidmann([0.1], [1.0])[0] == 0
+    assert weidmann_deviation(rho, weidmann_speed(rho))[1:3] == pytest.approx((0, 0), abs=1e-12)
+    assert weidmann_deviation(rho, weidmann_speed(rho) + 0.2).worst == pytest.approx(0.2, abs=0.01)
+    assert math.isnan(juelich_share([0.1], [1.0]))
+    assert weidmann_deviation([0.1], [1.0])[0] == 0
 
 
 def test_samples_beyond_the_bounds_do_not_count() -> None:
-    one = from_weidmann([0.55, 0.6], [1.0, 1.1], 0.5, 0.7)
+    one = weidmann_deviation([0.55, 0.6], [1.0, 1.1], 0.5, 0.7)
     assert one.samples == 2 and one.worst == pytest.approx(1.05 - weidmann_speed([0.575])[0])
-    far = from_weidmann([0.6, 0.95], [weidmann_speed([0.6])[0], 9.0], 0.5, 0.9)
+    far = weidmann_deviation([0.6, 0.95], [weidmann_speed([0.6])[0], 9.0], 0.5, 0.9)
     assert far.samples == 1 and far.worst == pytest.approx(0, abs=1e-12)
     with pytest.raises(ValueError, match=r"low = 2: must be at least 0 and below high = 1"):
-        from_weidmann([0.5], [1.0], 2.0, 1.0)
+        weidmann_deviation([0.5], [1.0], 2.0, 1.0)
 
 
 def test_bins_of_the_fundamental_diagram_hold_samples_means_and_spreads() -> None:

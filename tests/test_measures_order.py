@@ -90,7 +90,7 @@ def test_agents_that_are_not_present_do_not_count_for_lanes() -> None:
     assert lanes(spoilt, ways, 0, 3, deals=20).order < 0.95
     present[:, 40:] = False
     assert lanes(spoilt, ways, 0, 3, present, deals=20).order == 1
-    with pytest.raises(ValueError, match="way: lanes need agents in both directions"):
+    with pytest.raises(ValueError, match="direction: lanes need agents in both directions"):
         lanes(y, np.ones(40), 0, 3)
     with pytest.raises(ValueError, match="rows from 3 to 0 m"):
         lanes(y, way, 3, 0)

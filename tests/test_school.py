@@ -22,7 +22,7 @@ from flockenv.scene import Group, Scene
 from flockenv.steering import motivation
 from flockenv.steering.arbitration import Intentions
 from flockenv.steering.vectorize import rows
-from flockenv.studies.arbitration_trace import granted
+from flockenv.studies.arbitration_trace import arbitration_shares
 from flockenv.tasks import School
 from flockenv.tasks.school import CAUGHT, EATEN, FATE, FEAR, FOOD, HUNGER, INTENT
 
@@ -221,7 +221,7 @@ def test_fish_flee_hunters_in_sight_only() -> None:
 def test_the_trace_of_arbitration_follows_the_intention() -> None:
     scene = tank(mortal=False, predation={"meal": 0.0}, hungry={"start": 0.2, "spread": 0.0})
     state = placed(scene, [(3, 0), (-3, 0)], [(0, 0)], velocity=(-0.5, 0.0))
-    share = granted(scene, scene.run(state, 2))[0].share[0]
+    share = arbitration_shares(scene, scene.run(state, 2))[0].share[0]
     assert share[0, 1] > 0
     assert (share[0, 2:] == 0).all()
     assert (share[1, 1:5] == 0).all()

@@ -23,7 +23,7 @@ from flockenv.physics.integrators import (
     VelocityVerlet,
     methods_of,
 )
-from flockenv.studies.stress import CASES, Case, Finding, Results, Value, cases_named, fingerprint, run, usual_methods
+from flockenv.studies.stress import CASES, Case, Finding, Results, Value, fingerprint, run, select_cases, usual_methods
 from flockenv.studies.stress.gatherings import GATHERINGS
 from flockenv.studies.stress.heaps import HEAPS
 from flockenv.studies.stress.impacts import IMPACTS
@@ -172,15 +172,15 @@ def test_results_become_a_table_and_json() -> None:
 
 def test_cases_and_methods_are_found_by_name_and_unknown_names_are_refused() -> None:
     assert len(set(NAMES)) == len(NAMES)
-    assert cases_named(CASES, ()) == CASES
-    assert [case.name for case in cases_named(CASES, ("N14",))] == [f"N14 {power}" for power in range(3, 9)]
-    assert [case.name for case in cases_named(CASES, ("N20 10", "N04"))] == ["N04", "N20 10"]
+    assert select_cases(CASES, ()) == CASES
+    assert [case.name for case in select_cases(CASES, ("N14",))] == [f"N14 {power}" for power in range(3, 9)]
+    assert [case.name for case in select_cases(CASES, ("N20 10", "N04"))] == ["N04", "N20 10"]
     assert methods_of(("rk4", "heun", "rk4")) == (RK4(), Heun())
     assert {method.kind for method in usual_methods()} == set(INTEGRATORS)
     solving = [method.solves for method in usual_methods()]
     assert solving == sorted(solving)
     with pytest.raises(ValueError, match=r"^case 'N41': unknown; the nearest of \d+: N") as caught:
-        cases_named(CASES, ("N41",))
+        select_cases(CASES, ("N41",))
     assert "\n" not in str(caught.value)
     with pytest.raises(ValueError, match=r"^methods: 'rk44' is none.*rk4") as caught:
         methods_of(("rk44",))

@@ -59,18 +59,18 @@ class Counted:
 
 def test_the_trained_setting_is_the_task_and_others_replace_method_dtype_and_step() -> None:
     task = Pursuit()
-    trained = Setting.trained(task)
+    trained = Setting.of_training(task)
     assert trained == Setting("semi_implicit_euler", "float64", 2)
-    assert trained.of(task) == task
+    assert trained.applied_to(task) == task
     other = Setting("rk4", "float32", 8)
-    assert other.of(task) == Pursuit(integrator=RK4(), dtype="float32", dt=task.control_dt / 8)
+    assert other.applied_to(task) == Pursuit(integrator=RK4(), dtype="float32", dt=task.control_dt / 8)
     assert (trained.name, other.name) == ("semi_implicit_euler /2", "rk4 float32 /8")
 
 
 @pytest.mark.parametrize("control_dt", [0.1, 0.3, 0.7])
 def test_a_setting_has_its_number_of_steps_per_decision(control_dt: float) -> None:
     for steps in (1, 2, 3, 7, 1000):
-        task = Setting("midpoint", "float64", steps).of(Pursuit(control_dt=control_dt, dt=control_dt))
+        task = Setting("midpoint", "float64", steps).applied_to(Pursuit(control_dt=control_dt, dt=control_dt))
         assert task.substeps == steps
 
 
@@ -81,10 +81,10 @@ def test_a_setting_has_its_number_of_steps_per_decision(control_dt: float) -> No
 def test_the_trained_setting_scores_as_in_the_comparison_bit_for_bit() -> None:
     run(*TINY, *TRAINED, "--players", "random,rules,ppo")
     task = TASKS["pursuit"]()
-    field = comparison.field_of(["random", "rules", "ppo"])
+    field = comparison.players_in_order(["random", "rules", "ppo"])
     report, _ = comparison.compare([task], field, worlds=3, resamples=100)
-    plan = Plan(task, (Setting.trained(task),), tuple(field), 3, 0, 2)
-    for (_, name), cell in transfer_cache.played(plan).items():
+    plan = Plan(task, (Setting.of_training(task),), tuple(field), 3, 0, 2)
+    for (_, name), cell in transfer_cache.all_cells(plan).items():
         assert cell.returns.tolist() == report["tasks"]["pursuit"]["players"][name]["returns"]
     about = results()["tasks"]["pursuit"]
     assert about["again"] == {"random": 0.0, "rules": 0.0, "ppo": 0.0}
@@ -214,7 +214,7 @@ LUCK = np.random.default_rng(0).normal(size=60)
 def made_up(policy: Any, error_mm: tuple[float, float] = (80.0, 0.5), *rounds: tuple[float, float]) -> Any:
     """Return results of two settings: the policy scores LUCK + 10 in the trained one, and `policy` in RK4."""
     task = Pursuit()
-    settings = (Setting.trained(task), Setting("rk4", "float64", 4))
+    settings = (Setting.of_training(task), Setting("rk4", "float64", 4))
     scores = {
         (settings[0], "random"): LUCK,
         (settings[1], "random"): LUCK,
@@ -260,7 +260,7 @@ def test_the_verdict_reports_failures_and_uncertainty() -> None:
 
 def test_the_cheapest_of_the_settings_without_error_is_named() -> None:
     about = made_up(LUCK + 10, error_mm=(1e-9, 1e-12))
-    assert transfer_report.finest(about) == about["trained"]
+    assert transfer_report.most_accurate(about) == about["trained"]
     assert "solved to rounding (semi_implicit_euler, dt 0.05 s" in about["verdict"]
 
 

@@ -22,7 +22,7 @@ def flock_batch(agents: int) -> Case:
         f"Flock, {WORLDS} worlds x {agents} learners, 5 obstacles, {task.scene.dtype}: drives in {task.substeps} "
         f"substeps; {task.layout.size} observations each (6 neighbours, 16 free ways), 6 reward terms, metrics"
     )
-    return _batch(World(task, WORLDS, HORIZON), np.random.default_rng(0), does)
+    return _batch_case(World(task, WORLDS, HORIZON), np.random.default_rng(0), does)
 
 
 def flock_vector(threads: int) -> Case:
@@ -81,10 +81,10 @@ def pursuit_batch(threads: int) -> Case:
         f"Pursuit, {WORLDS} worlds x 4 learners, {task.scene.dtype}: drives in {task.substeps} substeps, walls; "
         f"{task.layout.size} observations each, 3 reward terms, captures, metrics"
     )
-    return _batch(World(task, WORLDS, HORIZON), np.random.default_rng(0), does)
+    return _batch_case(World(task, WORLDS, HORIZON), np.random.default_rng(0), does)
 
 
-def _batch(world: Any, rng: Any, does: str) -> Case:
+def _batch_case(world: Any, rng: Any, does: str) -> Case:
     """Step under random actions drawn before, and reset the worlds that are over (that is timed too)."""
     from benchmarks.floors import of_decisions
 
@@ -105,7 +105,7 @@ def flock_parallel(threads: int) -> Case:
 
     env = flock_v1.parallel_env(max_cycles=HORIZON, agents=3, obstacle_count=3)
     size = env.task.layout.size
-    return _parallel(
+    return _parallel_case(
         env, 3, f"Flock, one world x 3 agents, 3 obstacles: drives in {env.task.substeps} substeps; {size} "
         "observations each, rewards, metrics"
     )  # fmt: skip
@@ -117,14 +117,14 @@ def pursuit_parallel(pursuers: int, evaders: int) -> Case:
 
     env = pursuit_v0.parallel_env(max_cycles=HORIZON, pursuers=pursuers, evaders=evaders)
     size = env.task.layout.size
-    return _parallel(
+    return _parallel_case(
         env, pursuers + evaders,
         f"Pursuit, one world x {pursuers} + {evaders} agents (pursuers, evaders; all counted): drives in "
         f"{env.task.substeps} substeps, walls; {size} observations each, rewards, metrics",
     )  # fmt: skip
 
 
-def _parallel(env: Any, agents: int, does: str) -> Case:
+def _parallel_case(env: Any, agents: int, does: str) -> Case:
     """Step with actions drawn before, and reset where an episode is over (that is timed too)."""
     from benchmarks.floors import of_decisions
 
@@ -196,7 +196,7 @@ def social_corridor(agents: int) -> Case:
         "repulsion within 1.6 m (beyond it is below 4e-4 m/s2), body force and friction, four walls, one way to go; "
         "no observations, no rewards"
     )
-    return _walking(scene, does)
+    return _crowd_case(scene, does)
 
 
 def social_field(agents: int) -> Case:
@@ -215,10 +215,10 @@ def social_field(agents: int) -> Case:
         f"social force of Moussaid 2009, one crowd of {agents} people, 1 per m2 at first, float64: turning and slowing "
         "down for all within 8 m, no walls; no observations, no rewards"
     )
-    return _walking(scene, does)
+    return _crowd_case(scene, does)
 
 
-def _walking(scene: Any, does: str) -> Case:
+def _crowd_case(scene: Any, does: str) -> Case:
     """Make ten steps per call, and begin again after 2,000, before it piles up or is gone (that is timed too)."""
     from benchmarks.floors import of_scene
 

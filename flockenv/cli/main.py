@@ -290,7 +290,7 @@ def explain(scene: SceneFile) -> None:
     console = new_console()
     rows = [(row.name, ", ".join(row.calls_for) or "nothing", str(row.cost)) for row in breakdown.rows]
     rows.append(("shared by several effects", "", str(breakdown.shared)))
-    rows.append((breakdown.remains, "", f"{breakdown.rest:.3g}"))
+    rows.append((breakdown.remaining_parts, "", f"{breakdown.rest:.3g}"))
     title = f"One step of {loaded.agents:,} agents: {breakdown.step:.3g} us"
     show_table(console, title, rows, ("effect", "calls for", "costs us/step [95 % interval]"))
     counts = (f"{number:g} {name.replace('_', ' ')}" for name, number in breakdown.work.items())

@@ -76,39 +76,55 @@ def measure(
     force: Force = False,
 ) -> None:
     """Run a scene and measure its crowd: flow, density, lanes, bursts, clogging, order; table, JSON and pictures."""
-    from flockenv.core.atomic_files import new_folder
-    from flockenv.core.output_paths import valid_file
     from flockenv.scene.yaml_io import load_scene
-    from flockenv.studies.measured_run import Scope, mean_measures
-    from flockenv.studies.trajectory import whole_steps
+    from flockenv.studies.measured_run import mean_measures
 
     loaded = load_scene(Path(scene))
+    numbers, folder = _output_paths(json_file, out, force)
+    steps, stride = _step_counts(loaded, time, skip, every)
+    scope = _scope(loaded, line, area, walkable, skip)
+    surveys, first = _survey_seeds(loaded, seed, seeds, steps, stride, scope)
+    means, above = mean_measures(surveys), _compare_with_chance(surveys)
+    _show_tables(loaded, surveys, means, above, first, stride)
+    if numbers is not None:
+        _write_numbers(numbers, _summary(loaded, scope, surveys, means, above, first, stride))
+    if folder is not None:
+        _write_pictures(folder, first, surveys, scope, Path(scene).stem)
+    _report_early_end(surveys, seeds)
+
+
+def _output_paths(json_file: str | None, out: str | None, force: bool) -> tuple[Path | None, Path | None]:
+    """Return the paths for the numbers and the pictures; raise ValueError if one cannot be written."""
+    from flockenv.core.output_paths import valid_file
+
     numbers = valid_file(json_file, [".json"], force, "--json") if json_file is not None else None
-    folder = _check_folder(out, force) if out is not None else None
-    steps = whole_steps("--time", time, loaded.dt, 1)
+    return numbers, _check_folder(out, force) if out is not None else None
+
+
+def _step_counts(scene: Scene, time: float, skip: float, every: float | None) -> tuple[int, int]:
+    """Return the number of steps of a run, and of steps between two recorded instants."""
+    from flockenv.studies.trajectory import whole_steps
+
+    steps = whole_steps("--time", time, scene.dt, 1)
     if not (math.isfinite(skip) and 0 <= skip < time):
         raise ValueError(f"--skip = {skip:g}: must be >= 0 and less than --time = {time:g}")
-    stride = max(1, round(EVERY / loaded.dt)) if every is None else whole_steps("--every", every, loaded.dt, 1)
-    areas = _parse_area("--area", area, True), _parse_area("--walkable", walkable, False)
-    asked = Scope(_parse_line(line), *areas, skip)
-    asked.check(loaded)
-    found, first = _run_surveys(loaded, seed, seeds, steps, stride, asked)
-    means, above = mean_measures(found), _compare_with_chance(found)
-    _show_tables(loaded, found, means, above, first, stride)
-    if numbers is not None:
-        _write_numbers(numbers, _summary(loaded, asked, found, means, above, first, stride))
-    if folder is not None:
-        with new_folder(folder):
-            drawn = _draw_pictures(folder, first, found, asked, Path(scene).stem)
-        new_console().print(f"{', '.join(drawn) or 'no pictures'} in {relative_path(folder)}")
-    stopped = found[-1].stopped or ("interrupted" if len(found) < seeds else "")
-    if stopped:
-        text = f"{stopped}; results until then are shown"
-        raise EarlyEnd(text, INTERRUPTED if stopped == "interrupted" else DIVERGED)
+    stride = max(1, round(EVERY / scene.dt)) if every is None else whole_steps("--every", every, scene.dt, 1)
+    return steps, stride
 
 
-def _run_surveys(
-    scene: Scene, seed: int, seeds: int, steps: int, stride: int, asked: Scope
+def _scope(scene: Scene, line: str | None, area: str | None, walkable: str | None, skip: float) -> Scope:
+    """Return where and when the scene is measured; raise ValueError for options that do not fit it."""
+    from flockenv.studies.measured_run import Scope
+
+    scope = Scope(
+        _parse_line(line), _parse_area("--area", area, True), _parse_area("--walkable", walkable, False), skip
+    )
+    scope.check(scene)
+    return scope
+
+
+def _survey_seeds(
+    scene: Scene, seed: int, seeds: int, steps: int, stride: int, scope: Scope
 ) -> tuple[list[Survey], Trajectory]:
     """Run a scene with several seeds and measure each run; return the surveys, and the first run.
 
@@ -125,7 +141,7 @@ def _run_surveys(
             with progress_bar(title, steps, "steps") as progress:
                 run = record(scene, seed + k, steps, stride, progress)
             with progress_bar("measuring", 6, "families") as progress:
-                found.append(survey(run, asked, progress))
+                found.append(survey(run, scope, progress))
             first = first or run
             if found[-1].stopped:
                 break
@@ -134,6 +150,14 @@ def _run_surveys(
             raise
     assert first is not None  # there is at least one seed
     return found, first
+
+
+def _report_early_end(surveys: Sequence[Survey], seeds: int) -> None:
+    """Raise EarlyEnd if a run stopped early, or if some of the seeds were not run."""
+    stopped = surveys[-1].stopped or ("interrupted" if len(surveys) < seeds else "")
+    if stopped:
+        text = f"{stopped}; results until then are shown"
+        raise EarlyEnd(text, INTERRUPTED if stopped == "interrupted" else DIVERGED)
 
 
 PICTURES = ("flow_density.png", "lanes.png", "gaps.png", "space_time.png")
@@ -174,7 +198,7 @@ def _parse_line(text: str | None) -> Any:
 def _parse_area(option: str, text: str | None, is_convex: bool) -> Any:
     import numpy as np
 
-    from flockenv.studies.measures.polygons import valid_polygon, rectangle
+    from flockenv.studies.measures.polygons import rectangle, valid_polygon
 
     if text is None:
         return None
@@ -227,7 +251,7 @@ def _show_tables(
 
 
 def _summary(
-    scene: Scene, asked: Scope, found: Sequence[Survey], means: dict[str, Mean], above: dict[str, Above],
+    scene: Scene, scope: Scope, found: Sequence[Survey], means: dict[str, Mean], above: dict[str, Above],
     run: Trajectory, stride: int,
 ) -> dict[str, Any]:  # fmt: skip
     """Return all measurements, ready for JSON: undefined numbers are null, never NaN."""
@@ -236,13 +260,13 @@ def _summary(
     def plain(value: float) -> float | None:
         return value if math.isfinite(value) else None
 
-    corners = {"line": asked.line, "area": asked.area, "walkable": asked.walkable}
+    corners = {"line": scope.line, "area": scope.area, "walkable": scope.walkable}
     return {
         "format": FORMAT,
         "scene": scene.model_dump(mode="json"),
         "seeds": [run.seed + k for k in range(len(found))],
         "time_s": float(run.last.time[0]),
-        "skip_s": asked.skip,
+        "skip_s": scope.skip,
         "every_s": stride * scene.dt,
         **{name: None if given is None else given.tolist() for name, given in corners.items()},
         "stopped": found[-1].stopped,
@@ -274,7 +298,16 @@ def _write_numbers(path: Path, summary: dict[str, Any]) -> None:
     new_console().print(f"numbers in {relative_path(path)}")
 
 
-def _draw_pictures(folder: Path, run: Trajectory, found: Sequence[Survey], asked: Scope, name: str) -> list[str]:
+def _write_pictures(folder: Path, run: Trajectory, found: Sequence[Survey], scope: Scope, name: str) -> None:
+    """Draw into a folder, which is created if it is missing, and print the names of the pictures."""
+    from flockenv.core.atomic_files import new_folder
+
+    with new_folder(folder):
+        drawn = _draw_pictures(folder, run, found, scope, name)
+    new_console().print(f"{', '.join(drawn) or 'no pictures'} in {relative_path(folder)}")
+
+
+def _draw_pictures(folder: Path, run: Trajectory, found: Sequence[Survey], scope: Scope, name: str) -> list[str]:
     """Write the pictures that have data; return their names."""
     import numpy as np
 
@@ -292,9 +325,9 @@ def _draw_pictures(folder: Path, run: Trajectory, found: Sequence[Survey], asked
         solids = [*start.outlines, *(p for shape in run.scene.circles for p in shape.polygons(start.low, start.high))]
         alive = run.alive & np.isfinite(run.pos).all(axis=2)
         write_lanes(
-            folder / PICTURES[1], run.pos, alive, found[0].way, (start.low, start.high),
+            folder / PICTURES[1], run.pos, alive, found[0].direction, (start.low, start.high),
             f"{name}: trajectories (orange along {_direction_text(found[0].axis)}, blue against it)",
-            solids, asked.line, asked.area,
+            solids, scope.line, scope.area,
         )  # fmt: skip
         drawn.append(PICTURES[1])
     if (gaps > 0).any():
@@ -304,7 +337,7 @@ def _draw_pictures(folder: Path, run: Trajectory, found: Sequence[Survey], asked
         drawn.append(PICTURES[2])
     if run.scene.dimension == 2 and len(run.step) > 2:
         time, place, image = _space_time(run, found[0])
-        where = None if asked.line is None else float(asked.line.mean(axis=0) @ found[0].axis)
+        where = None if scope.line is None else float(scope.line.mean(axis=0) @ found[0].axis)
         write_space_time(folder / PICTURES[3], time, place, image, f"{name}: density along the walking axis", where)
         drawn.append(PICTURES[3])
     return drawn

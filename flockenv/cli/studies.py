@@ -110,7 +110,7 @@ def _problem_makers(
     scenes: Sequence[str], suite: bool, problems: str, seconds: float | None, steps: str, dts: str, seed: int
 ) -> dict[str, Callable[[], Problem]]:
     """Return name or file -> function that makes the problem; ValueError for options that exclude each other."""
-    from flockenv.studies.accuracy import problems_named
+    from flockenv.studies.accuracy import select_problems
 
     if suite == bool(scenes):
         raise ValueError("accuracy: needs either a SCENE.yaml or --suite")
@@ -119,7 +119,7 @@ def _problem_makers(
     if problems and not suite:
         raise ValueError("--problems: needs --suite")
     if suite:
-        return {each.name: functools.partial(_return_problem, each) for each in problems_named(_split_words(problems))}
+        return {each.name: functools.partial(_return_problem, each) for each in select_problems(_split_words(problems))}
     return {file: functools.partial(_problem_of_scene, file, seconds, steps, dts, seed) for file in scenes}
 
 
@@ -180,7 +180,7 @@ def _show_accuracy(console: Console, report: Report, tolerances: Sequence[float]
         )
         show_table(console, title, rows, heads)
     show_table(console, "Cost", table.rows(report, tolerances), table.columns(tolerances))
-    show_table(console, "The cheapest", ([line] for line in table.best(report, tolerances)), [""])
+    show_table(console, "The cheapest", ([line] for line in table.cheapest_lines(report, tolerances)), [""])
 
 
 def _return_problem(problem: Problem) -> Problem:
@@ -309,10 +309,10 @@ def stress(
     """Run every hard case with every integrator, and show value, bound and verdict of each."""
     from flockenv.core.output_paths import valid_file
     from flockenv.physics.integrators import methods_of
-    from flockenv.studies.stress import CASES, cases_named, fingerprint, run, trials, usual_methods
+    from flockenv.studies.stress import CASES, fingerprint, run, select_cases, trials, usual_methods
 
     path = valid_file(out, [".json", ".png"], True, beside=".json") if out is not None else None
-    todo = cases_named(CASES, _split_words(cases))
+    todo = select_cases(CASES, _split_words(cases))
     under = methods_of(_split_words(methods)) if methods else usual_methods()
     kinds = [method.kind for method in under]
     known = None if force else read_findings(path, "hard cases", fingerprint())

@@ -40,12 +40,12 @@ def validate(
 ) -> None:
     """Run published models of pedestrians in the test scenes of RiMEA and NIST: value, bound and verdict of each."""
     from flockenv.core.output_paths import valid_file
-    from flockenv.studies.validation import CASES, cases_named, fingerprint, presets_named, run, trials
+    from flockenv.studies.validation import CASES, fingerprint, run, select_cases, select_presets, trials
 
     path = valid_file(out, [".json", ".md"], True, beside=".json") if out is not None else None
     if path is not None and path.suffix.lower() == ".md":
         valid_file(str(path), [".md"], True, beside="")  # the folder of pictures
-    todo, under = cases_named(CASES, cases or []), presets_named(preset or [])
+    todo, under = select_cases(CASES, cases or []), select_presets(preset or [])
     if scenes is not None:
         _write_scenes(scenes, force, todo, under)
         return

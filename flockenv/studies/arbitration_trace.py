@@ -1,7 +1,7 @@
 """Trace of arbitration: for every `Steer` of a scene, the force of each behaviour and the share granted to it.
 
-found = granted(scene, state)[0]
-found.mean_share()  # {"avoid_obstacles": 1.0, "wander": 0.27}
+shares = arbitration_shares(scene, state)[0]
+shares.mean_share()  # {"avoid_obstacles": 1.0, "wander": 0.27}
 
 The steering force of each behaviour comes from the scene's own kernel, run with one behaviour at a time; shares come
 from the law by which the scene reconciles them, in a loop over agents.
@@ -23,18 +23,18 @@ from flockenv.model.state import State
 from flockenv.scene import Scene
 from flockenv.steering.arbitration import Forces, Shares
 
-__all__ = ["Granted", "Grants", "granted"]
+__all__ = ["Grants", "SteerShares", "arbitration_shares"]
 
 Reals = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True, eq=False)
-class Granted:
+class SteerShares:
     """Shares that one `Steer` effect granted at one instant. B worlds, N agents, K behaviours in order of priority."""
 
     steer: Steer
     effect: int  # its index in scene.effects
-    wish: Reals  # (B, N, K, D) N, steering forces; 0 for agents that are dead or not steered
+    requested: Reals  # (B, N, K, D) N, steering forces; 0 for agents that are dead or not steered
     share: Reals  # (B, N, K) of each steering force, 0 to 1; 0 if that force is 0
     force: Reals  # (B, N, D) N, their combination, before it is bounded together with a drive
 
@@ -47,25 +47,25 @@ class Granted:
         )
 
     @property
-    def asked(self) -> NDArray[np.bool_]:
+    def is_active(self) -> NDArray[np.bool_]:
         """True where a behaviour's steering force is not 0, (B, N, K)."""
-        return np.asarray((self.wish != 0).any(axis=-1))
+        return np.asarray((self.requested != 0).any(axis=-1))
 
     @property
-    def cut(self) -> NDArray[np.bool_]:
+    def is_cut(self) -> NDArray[np.bool_]:
         """True where a steering force was not granted in full, (B, N, K)."""
-        return self.asked & (self.share < 1)
+        return self.is_active & (self.share < 1)
 
     def mean_share(self) -> dict[str, float]:
         """Return the mean share of each behaviour over agents in which its force is not 0; NaN without such agents."""
-        asked = self.asked
+        active = self.is_active
         return {
-            name: float(self.share[..., k][asked[..., k]].mean()) if asked[..., k].any() else float("nan")
+            name: float(self.share[..., k][active[..., k]].mean()) if active[..., k].any() else float("nan")
             for k, name in enumerate(self.names)
         }
 
 
-class _Heard(Steer):
+class _OneBehaviour(Steer):
     """The same behaviours with only one of them active; its force is not bounded by max_force."""
 
     kind: str  # type: ignore[assignment]  # without a default it is not registered: no scene in YAML has it
@@ -75,7 +75,7 @@ class _Heard(Steer):
     @property
     def steer_law(self) -> Law:
         """Law that returns the force of one behaviour."""
-        return heard
+        return force_of_one
 
     def parameters(self) -> dict[str, float | Vec]:
         """Index of the active behaviour."""
@@ -83,12 +83,12 @@ class _Heard(Steer):
 
 
 @law
-def heard(p: Any, me: Any, wishes: Forces) -> tuple[Vec, Shares]:
+def force_of_one(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
     """Return the force of behaviour `which`, and no other."""
-    total = zero(wishes[0])
-    for k in range(len(wishes)):
+    total = zero(forces[0])
+    for k in range(len(forces)):
         if like(p.which, k) == p.which:
-            total = wishes[k]
+            total = forces[k]
     return total, (p.which,)
 
 
@@ -100,42 +100,42 @@ class Grants:
         self.scene = scene
         # behaviours may read a medium, an aim or kept state; effects with a force of their own are left out
         media = tuple(e for e in scene.effects if e.own_law is None and (e.medium_law or e.aim_law or e.keeps))
-        self._heard = {
-            k: [scene.with_effects(*media, _heard_alone(effect, j)) for j in range(len(effect.behaviours))]
+        self._scenes = {
+            k: [scene.with_effects(*media, _only_behaviour(effect, j)) for j in range(len(effect.behaviours))]
             for k, effect in enumerate(scene.effects)
             if isinstance(effect, Steer)
         }
 
-    def at(self, state: State) -> tuple[Granted, ...]:
+    def at(self, state: State) -> tuple[SteerShares, ...]:
         """Return what each `Steer` grants in this state, in the order of the effects; the state stays as it is."""
-        return tuple(self._one(state, k) for k in self._heard)
+        return tuple(self._shares_of(state, k) for k in self._scenes)
 
-    def _one(self, state: State, which: int) -> Granted:
+    def _shares_of(self, state: State, which: int) -> SteerShares:
         """Return what the effect with index `which` grants."""
         steer, body = self.scene.effects[which], self.scene.body
         assert isinstance(steer, Steer)
         counted = state.copy()  # a copy, as acceleration() changes work counters
         mass = np.where(np.isfinite(body.mass), body.mass, 0)[:, None]
-        wish = np.stack([scene.acceleration(counted) * mass for scene in self._heard[which]], axis=2)
+        requested = np.stack([scene.acceleration(counted) * mass for scene in self._scenes[which]], axis=2)
         b, n, d = state.shape
         force, share = reconcile(
-            steer.arbitration, wish.reshape(b * n, -1, d), max_force=np.tile(body.max_force, b),
+            steer.arbitration, requested.reshape(b * n, -1, d), max_force=np.tile(body.max_force, b),
             time=np.repeat(state.time, n), key=np.repeat(state.key, n), who=np.arange(b * n) % n,
             heading=state.heading.reshape(b * n, d), dtype=self.scene.dtype,
             inner={name: self.scene.inner(state, name).ravel() for name in self.scene.parts.inner},
         )  # fmt: skip
-        share = np.where((wish != 0).any(axis=-1), share.reshape(wish.shape[:-1]), 0)
-        return Granted(steer, which, wish, share, force.reshape(state.shape))
+        share = np.where((requested != 0).any(axis=-1), share.reshape(requested.shape[:-1]), 0)
+        return SteerShares(steer, which, requested, share, force.reshape(state.shape))
 
 
-def _heard_alone(steer: Steer, which: int) -> _Heard:
+def _only_behaviour(steer: Steer, which: int) -> _OneBehaviour:
     """Return an effect in which one of the behaviours is active."""
-    return _Heard(
-        kind="heard", behaviours=steer.behaviours, arbitration=steer.arbitration, group=steer.group, which=which
+    return _OneBehaviour(
+        kind="one_behaviour", behaviours=steer.behaviours, arbitration=steer.arbitration, group=steer.group, which=which
     )
 
 
-def granted(scene: Scene, state: State) -> tuple[Granted, ...]:
+def arbitration_shares(scene: Scene, state: State) -> tuple[SteerShares, ...]:
     """Return what each `Steer` of a scene grants in this state, in the order of its effects; the state stays as it is.
 
     The budget is max_force, whatever else drives the agents. `Grants(scene).at(state)` is faster for repeated calls.

@@ -56,8 +56,8 @@ class Row:
     def name(self) -> str:
         """Kind of the effect, and its fields that differ from their defaults."""
         usual = {name: f.get_default(call_default_factory=True) for name, f in type(self.effect).model_fields.items()}
-        given = {name: getattr(self.effect, name) for name in usual if name != "kind"}
-        return f"{self.effect.kind}({', '.join(f'{k}={v}' for k, v in given.items() if v != usual[k])})"
+        values = {name: getattr(self.effect, name) for name in usual if name != "kind"}
+        return f"{self.effect.kind}({', '.join(f'{k}={v}' for k, v in values.items() if v != usual[k])})"
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Explanation:
     shares: tuple[tuple[str, str, float], ...] = ()  # of each Steer's behaviours: which, and the mean share granted
 
     @property
-    def remains(self) -> str:
+    def remaining_parts(self) -> str:
         """Parts of a step that remain without any effect, in words."""
         scene = self.scene
         parts = [scene.integrator.kind, "limits", scene.space.kind, *(each.kind for each in scene.constraints)]
@@ -84,14 +84,14 @@ class Explanation:
     @property
     def largest_step(self) -> str:
         """The largest stable step, in words, next to the step of the scene."""
-        found, made = self.stable, f"dt = {self.scene.dt:g} s"
+        found, chosen = self.stable, f"dt = {self.scene.dt:g} s"
         if found.dt == 0:
-            return f"none is stable with {self.scene.integrator.kind} ({found.effect} at agent {found.agent}), {made}"
+            return f"none is stable with {self.scene.integrator.kind} ({found.effect} at agent {found.agent}), {chosen}"
         if math.isfinite(found.dt):
-            return f"{found.dt:.3g} s ({found.effect}, agent {found.agent}), {made}"
+            return f"{found.dt:.3g} s ({found.effect}, agent {found.agent}), {chosen}"
         if found.frequency or found.damping:
-            return f"any is stable with {self.scene.integrator.kind}, {made}"
-        return f"nothing in it sets a limit, unless agents that meet do; {made}"
+            return f"any is stable with {self.scene.integrator.kind}, {chosen}"
+        return f"nothing in it sets a limit, unless agents that meet do; {chosen}"
 
 
 def explain(
@@ -111,13 +111,13 @@ def explain(
         progress(done)
         timers.append(_Timer(scene.with_effects(*kept), state))
     times = np.array([[timer.measure() for timer in timers] for _ in range(ROUNDS)])  # (rounds, variants) us
-    whole, bare = times[:, :1], times[:, -1]
-    saved = whole - times[:, 1:-1]
-    rows = tuple(Row(effect, _calls(scene, k), Cost.of(saved[:, k])) for k, effect in enumerate(effects))
-    shared = Cost.of(whole[:, 0] - bare - saved.sum(axis=1))
+    full, bare = times[:, :1], times[:, -1]
+    saved = full - times[:, 1:-1]
+    rows = tuple(Row(effect, _requirements(scene, k), Cost.of(saved[:, k])) for k, effect in enumerate(effects))
+    shared = Cost.of(full[:, 0] - bare - saved.sum(axis=1))
     return Explanation(
-        scene, rows, float(np.median(whole)), float(np.median(bare)), shared, _work(scene, state), _left_out(scene),
-        suggest_dt(scene), _shares(scene, state),
+        scene, rows, float(np.median(full)), float(np.median(bare)), shared, _work_per_step(scene, state),
+        _not_computed(scene), suggest_dt(scene), _shares(scene, state),
     )  # fmt: skip
 
 
@@ -139,7 +139,7 @@ class _Timer:
         return 1e6 * (perf_counter() - began) / self._steps / self._state.shape[0]
 
 
-def _calls(scene: Scene, k: int) -> tuple[str, ...]:
+def _requirements(scene: Scene, k: int) -> tuple[str, ...]:
     effect = scene.effects[k]
     how = "tree" if (k, effect) in scene.parts.tree_effects else "direct"
     within = f" within {effect.reach:g} m" if effect.reach else ""
@@ -147,7 +147,7 @@ def _calls(scene: Scene, k: int) -> tuple[str, ...]:
     return tuple(what + more.get(what, "") for what in effect.calls_for())
 
 
-def _work(scene: Scene, state: State) -> dict[str, float]:
+def _work_per_step(scene: Scene, state: State) -> dict[str, float]:
     after = scene.step(state)
     return {what: (after.count_of(what) - state.count_of(what)) / state.shape[0] for what in WORK}
 
@@ -162,21 +162,21 @@ def _shares(scene: Scene, state: State) -> tuple[tuple[str, str, float], ...]:
         state = scene.run(state, BETWEEN)
     rows = []
     for one in zip(*found, strict=True):
-        share, asked = np.stack([g.share for g in one]), np.stack([g.asked for g in one])
+        share, active = np.stack([g.share for g in one]), np.stack([g.is_active for g in one])
         for k, name in enumerate(one[0].names):
-            mean = float(share[..., k][asked[..., k]].mean()) if asked[..., k].any() else math.nan
+            mean = float(share[..., k][active[..., k]].mean()) if active[..., k].any() else math.nan
             rows.append((f"effects[{one[0].effect}]", name, mean))
     return tuple(rows)
 
 
-def _left_out(scene: Scene) -> tuple[str, ...]:
-    asked = {what for effect in scene.effects for what in effect.calls_for()}
-    asked |= {what for constraint in scene.constraints for what in constraint.calls_for()}
+def _not_computed(scene: Scene) -> tuple[str, ...]:
+    needed = {what for effect in scene.effects for what in effect.calls_for()}
+    needed |= {what for constraint in scene.constraints for what in constraint.calls_for()}
     others = sorted(EFFECTS.keys() - {effect.kind for effect in scene.parts.effects})
     lines = []
-    if "neighbour query" not in asked:
+    if "neighbour query" not in needed:
         lines.append("neighbour query: no effect needs neighbours")
-    if "obstacles" not in asked:
+    if "obstacles" not in needed:
         lines.append(f"pass over obstacles ({len(scene.obstacles)}): no effect needs them")
     if not scene.constraints:
         lines.append("collisions, rods: no constraint is listed; bodies pass through each other and through obstacles")

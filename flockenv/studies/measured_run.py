@@ -14,7 +14,7 @@ from flockenv.geometry.space import Plane
 from flockenv.physics.population import Emitter
 from flockenv.scene import Scene
 from flockenv.studies import measures as m
-from flockenv.studies.measures.polygons import valid_polygon, contains, rectangle
+from flockenv.studies.measures.polygons import contains, rectangle, valid_polygon
 from flockenv.studies.trajectory import Trajectory
 
 __all__ = ["UNITS", "Scope", "Survey", "mean_measures", "survey"]
@@ -97,7 +97,7 @@ class Survey:
 
     values: dict[str, float]  # by names of UNITS; NaN if a measure has no meaning
     axis: Floats  # (2,) the walking direction
-    way: NDArray[np.int64]  # (N,) 1 = along it, -1 = against it, 0 = neither
+    direction: NDArray[np.int64]  # (N,) 1 = along it, -1 = against it, 0 = neither
     stopped: str = ""  # why it ended early
     density: Floats = field(default_factory=lambda: np.zeros(0))  # (S,) 1/m^2, by cells
     speed: Floats = field(default_factory=lambda: np.zeros(0))  # (S,) m/s
@@ -105,13 +105,13 @@ class Survey:
 
 
 def survey(
-    trajectory: Trajectory, asked: Scope, progress: Callable[[int], None] = lambda done: None
+    trajectory: Trajectory, scope: Scope, progress: Callable[[int], None] = lambda done: None
 ) -> Survey:  # fmt: skip
     """Return the measures of a run that make sense for its scene.
 
     A KeyboardInterrupt ends it early: the measures so far are returned, with `stopped` = "interrupted".
     """
-    run = _Run.of(trajectory, asked)
+    run = _Run.of(trajectory, scope)
     found: dict[str, Any] = {}
     values: dict[str, float] = {}
     stopped = trajectory.stopped
@@ -123,7 +123,7 @@ def survey(
             found |= arrays
     except KeyboardInterrupt:
         stopped = "interrupted"
-    return Survey({name: values[name] for name in UNITS if name in values}, run.axis, run.way, stopped, **found)
+    return Survey({name: values[name] for name in UNITS if name in values}, run.axis, run.direction, stopped, **found)
 
 
 Part = tuple[dict[str, float], dict[str, Floats]]
@@ -134,7 +134,7 @@ class _Run:
     """A run as the measures need it: with a first instant after the skipped time, and a walking direction."""
 
     scene: Scene
-    asked: Scope
+    scope: Scope
     time: Floats  # (T,) s, of all instants
     pos: NDArray[np.floating[Any]]  # (T, N, D)
     vel: NDArray[np.floating[Any]]
@@ -142,22 +142,22 @@ class _Run:
     identity: NDArray[np.int64] | None
     first: int  # the first instant that is measured
     axis: Floats
-    way: NDArray[np.int64]
+    direction: NDArray[np.int64]
     low: Floats  # corners of the region
     high: Floats
 
     @classmethod
-    def of(cls, run: Trajectory, asked: Scope) -> _Run:
+    def of(cls, run: Trajectory, scope: Scope) -> _Run:
         """Return a trajectory with its walking direction; raise ValueError if a line or area is given in 3-D."""
         scene, time = run.scene, np.asarray(run.step * run.scene.dt, np.float64)
-        asked.check(scene)
+        scope.check(scene)
         alive = run.alive & np.isfinite(run.pos).all(axis=2)
-        first = min(int(np.searchsorted(time, asked.skip - 1e-9)), len(time) - 1)
-        axis = _axis(run, alive, asked.line)
+        first = min(int(np.searchsorted(time, scope.skip - 1e-9)), len(time) - 1)
+        axis = _axis(run, alive, scope.line)
         along = np.where(alive, run.vel[..., :2] @ axis, 0.0)[first:].sum(axis=0)
         shown = next(iter(run.snapshots()))
         return cls(
-            scene, asked, time, run.pos, run.vel, alive, run.identity, first, axis, np.sign(along).astype(np.int64),
+            scene, scope, time, run.pos, run.vel, alive, run.identity, first, axis, np.sign(along).astype(np.int64),
             np.array(shown.low[:2]), np.array(shown.high[:2]),
         )  # fmt: skip
 
@@ -170,15 +170,15 @@ class _Run:
     @property
     def area(self) -> Floats | None:
         """The measured area: the given one, else the whole space if it has a size, else None."""
-        if self.asked.area is not None or self.scene.dimension == 3:
-            return self.asked.area
+        if self.scope.area is not None or self.scene.dimension == 3:
+            return self.scope.area
         return None if isinstance(self.scene.space, Plane) else rectangle(self.low, self.high)
 
     def ground(self) -> m.Ground:
         """Return the walkable area, less static obstacles, and the measured area."""
         hollow = [s for s in self.scene.shapes if s.is_hollow and not s.moves]
-        if self.asked.walkable is not None:
-            walk = valid_polygon("walkable", self.asked.walkable)
+        if self.scope.walkable is not None:
+            walk = valid_polygon("walkable", self.scope.walkable)
         elif len(hollow) == 1:
             walk = valid_polygon("walkable", hollow[0].polygons(self.low, self.high)[0])
         else:
@@ -214,8 +214,8 @@ def _axis(run: Trajectory, alive: NDArray[np.bool_], line: Floats | None) -> Flo
 
 def _mean(values: Sequence[float]) -> float:
     """Return the mean of the finite values; NaN if there are none."""
-    some = [x for x in values if math.isfinite(x)]
-    return float(np.mean(some)) if some else np.nan
+    finite = [x for x in values if math.isfinite(x)]
+    return float(np.mean(finite)) if finite else np.nan
 
 
 def _motion(run: _Run) -> Part:
@@ -225,9 +225,9 @@ def _motion(run: _Run) -> Part:
 
 def _flow(run: _Run) -> Part:
     """Measure flow, gaps, bursts and evacuation at the line."""
-    if run.asked.line is None:
+    if run.scope.line is None:
         return {}, {}
-    line = run.asked.line
+    line = run.scope.line
     every = m.crossings(run.time, run.pos, line, run.alive, run.identity, run.period)
     late = every.time >= run.time[run.first]
     found = m.Crossings(*(each[late] for each in every))
@@ -281,11 +281,11 @@ def _room(run: _Run) -> Part:
         density.append(m.voronoi_density(room))
         speed.append(m.voronoi_speed(room, np.linalg.norm(vel, axis=1)))
     rho, v = np.array(density), np.array(speed)
-    off = m.from_weidmann(rho, v)
+    off = m.weidmann_deviation(rho, v)
     values = {
         "density counted": _mean(counted), "density": _mean(density), "walking speed": _mean(speed),
         "density times speed": _mean((rho * v).tolist()), "off Weidmann": off.mean, "off Weidmann, worst": off.worst,
-        "in Juelich bins": m.in_juelich(rho, v),
+        "in Juelich bins": m.juelich_share(rho, v),
     }  # fmt: skip
     return values, {"density": rho, "speed": v}
 
@@ -298,21 +298,21 @@ def _lanes(run: _Run) -> Part:
     pos, alive = np.asarray(run.pos[at], float), run.alive[at]
     here = alive if run.area is None else alive & contains(valid_polygon("area", run.area), pos)
     seen = here.any(axis=0)
-    both = (run.way[seen] > 0).any() and (run.way[seen] < 0).any()
-    if not both or not _straight(run):
+    both = (run.direction[seen] > 0).any() and (run.direction[seen] < 0).any()
+    if not both or not _is_straight(run):
         return {}, {}
     y = pos @ across
     low, high = float(y[here].min()), float(y[here].max())
     deals = min(400, max(50, MOST_DEALT // y.shape[1]))
-    found = m.lanes(y, run.way, low, high + 1e-9 * (1 + abs(high)), here, deals=deals)
+    found = m.lanes(y, run.direction, low, high + 1e-9 * (1 + abs(high)), here, deals=deals)
     return {"lanes": found.order, "lanes by chance": found.null, "lanes p": found.p, "band index": found.bands}, {}
 
 
-def _straight(run: _Run) -> bool:
+def _is_straight(run: _Run) -> bool:
     """Return True if more than half of all movement is along the axis, in either direction."""
     v = np.where(run.alive[..., None], run.vel[..., :2], 0.0)[run.first :]
-    along, whole = np.abs((v @ run.axis).sum(axis=0)).sum(), np.linalg.norm(v, axis=2).sum()
-    return bool(along > 0.5 * whole)
+    along, total = np.abs((v @ run.axis).sum(axis=0)).sum(), np.linalg.norm(v, axis=2).sum()
+    return bool(along > 0.5 * total)
 
 
 def _order(run: _Run) -> Part:
@@ -341,9 +341,9 @@ def _bodies(run: _Run) -> Part:
             values |= {"overlap": found.mean, "overlapping": found.share}
         values["collisions"] = m.collision_rate(run.time[at], run.pos[at], radius, space, run.alive[at])
     body = run.scene.body  # without a desired speed it is max_speed
-    wished = np.asarray(np.where(body.desired_speed > 0, body.desired_speed, body.max_speed), float)
-    if run.scene.dimension == 2 and np.isfinite(wished).all() and _straight(run):
-        desired = (run.way * wished)[:, None] * run.axis
+    speed = np.asarray(np.where(body.desired_speed > 0, body.desired_speed, body.max_speed), float)
+    if run.scene.dimension == 2 and np.isfinite(speed).all() and _is_straight(run):
+        desired = (run.direction * speed)[:, None] * run.axis
         back = m.oscillation_proportion(run.vel[at], desired, run.alive[at])
         values |= {"oscillation": back.mean, "oscillating": back.share}
     return values, {}

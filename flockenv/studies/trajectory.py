@@ -139,7 +139,7 @@ def record(
     that is no longer finite, ends the run early: the instants until then are returned, and `stopped` has the reason.
     Raises ValueError, before anything is computed, if the instants would take more than MEMORY_LIMIT.
     """
-    film = _Film.of(scene, _checked_instants(scene, steps, every))
+    film = _Film.of(scene, _count_instants(scene, steps, every))
     first = last = scene.start(seed)
     piece = max(1, PATIENCE // scene.agents)
     stopped, began = "", perf_counter()
@@ -211,7 +211,7 @@ class _Film:
             self.step.append(step)
 
 
-def _checked_instants(scene: Scene, steps: int, every: int) -> int:
+def _count_instants(scene: Scene, steps: int, every: int) -> int:
     if steps < 0 or every < 1:
         raise ValueError(f"steps = {steps} must be at least 0 and every = {every} at least 1")
     instants = 1 + -(-steps // every)

@@ -19,7 +19,7 @@ from flockenv.core.errors import nearest_few, printable
 from flockenv.core.record import ResultRecord
 from flockenv.model.divergence import SimulationDiverged
 
-__all__ = ["VERDICTS", "Case", "Finding", "Results", "Value", "Verdict", "cases_named", "run", "trials"]
+__all__ = ["VERDICTS", "Case", "Finding", "Results", "Value", "Verdict", "run", "select_cases", "trials"]
 
 Verdict = Literal["pass", "warned", "reported", "refused", "fails", "diverges"]
 
@@ -59,7 +59,7 @@ class Case:
     only: tuple[str, ...] = ()
     """Names of the methods or models that it is run under (default: all)."""
 
-    def under(self, name: str) -> bool:
+    def runs_under(self, name: str) -> bool:
         """Return True if the case is run under this method or model."""
         return not self.only or name in self.only
 
@@ -119,11 +119,11 @@ class Results(ResultRecord):
 
     def legend(self) -> list[tuple[str, str]]:
         """Return the verdicts that occur, each with its meaning."""
-        there = {f.verdict for f in self.findings}
-        return [(verdict, text) for verdict, text in VERDICTS.items() if verdict in there]
+        occurring = {f.verdict for f in self.findings}
+        return [(verdict, text) for verdict, text in VERDICTS.items() if verdict in occurring]
 
 
-def cases_named(cases: Sequence[Case], names: Sequence[str]) -> tuple[Case, ...]:
+def select_cases(cases: Sequence[Case], names: Sequence[str]) -> tuple[Case, ...]:
     """Return cases by name or first word of a name (no names: all); raise ValueError for an unknown one."""
     known = {case.name for case in cases} | {case.name.split()[0] for case in cases}
     for name in names:
@@ -134,7 +134,7 @@ def cases_named(cases: Sequence[Case], names: Sequence[str]) -> tuple[Case, ...]
 
 def trials(cases: Sequence[Case], unders: Collection[str]) -> int:
     """Return the number of trials of these cases under these methods or models."""
-    return sum(case.under(name) for case in cases for name in unders)
+    return sum(case.runs_under(name) for case in cases for name in unders)
 
 
 def run(
@@ -144,36 +144,36 @@ def run(
     known: Results | None = None,
     progress: Callable[[int], None] = lambda done: None,
     keep: Callable[[Results], None] = lambda results: None,
-    told: tuple[type[Warning], ...] = (),
+    warning_kinds: tuple[type[Warning], ...] = (),
 ) -> Results:
     """Run every case under every method or model in `unders`, by name; return these findings with the known ones.
 
-    A case with names in `only` is run under no others. `told` are warnings that lead to the verdict "warned".
+    A case with names in `only` is run under no others. `warning_kinds` lead to the verdict "warned".
     Known findings from the same sources are kept and not run again; those from other sources are dropped. `progress`
     is called with the number done, `keep` with all findings after each trial, so an interrupted run loses nothing.
     """
     found = {(f.case, f.under): f for f in known.findings} if known and known.sources == sources else {}
     place = {case.name: k for k, case in enumerate(cases)}
 
-    def all_() -> Results:
+    def results_so_far() -> Results:
         ordered = sorted(found.values(), key=lambda f: (place.get(f.case, len(place)), f.case))
         return Results(findings=tuple(ordered), sources=sources)
 
-    pairs = [(name, case) for name in unders for case in cases if case.under(name)]
+    pairs = [(name, case) for name in unders for case in cases if case.runs_under(name)]
     for done, (name, case) in enumerate(pairs):
         progress(done)
         if (case.name, name) not in found:
-            found[case.name, name] = _tried(case, name, unders[name], told)
-            keep(all_())
-    return all_()
+            found[case.name, name] = _try_case(case, name, unders[name], warning_kinds)
+            keep(results_so_far())
+    return results_so_far()
 
 
-def _tried(case: Case, name: str, argument: Any, told: tuple[type[Warning], ...]) -> Finding:
+def _try_case(case: Case, name: str, argument: Any, warning_kinds: tuple[type[Warning], ...]) -> Finding:
     """Return the finding of one case under one method or model."""
     began, value = perf_counter(), Value(math.nan, False)
     verdict: Verdict
-    with warnings.catch_warnings(record=bool(told)) as caught:
-        for kind in told:
+    with warnings.catch_warnings(record=bool(warning_kinds)) as caught:
+        for kind in warning_kinds:
             warnings.simplefilter("always", kind)
         try:
             value = case.trial(argument)
@@ -182,31 +182,31 @@ def _tried(case: Case, name: str, argument: Any, told: tuple[type[Warning], ...]
         except ValueError as error:
             verdict, note = "refused", str(error)
         else:
-            verdict, note = _judged(value), value.note
-    said = next((str(w.message) for w in caught or () if issubclass(w.category, told)), "")
+            verdict, note = _judge(value), value.note
+    warning = next((str(w.message) for w in caught or () if issubclass(w.category, warning_kinds)), "")
     return Finding(
-        case=case.name, title=case.title, under=name, bound=case.bound, value=_known(value.number),
-        verdict="warned" if said and verdict == "pass" else verdict,
-        note="; ".join(text for text in (note, said) if text), seconds=perf_counter() - began,
-        series=_rounded(value.series),
+        case=case.name, title=case.title, under=name, bound=case.bound, value=_finite_or_none(value.number),
+        verdict="warned" if warning and verdict == "pass" else verdict,
+        note="; ".join(text for text in (note, warning) if text), seconds=perf_counter() - began,
+        series=_round_series(value.series),
     )  # fmt: skip
 
 
-def _judged(value: Value) -> Verdict:
+def _judge(value: Value) -> Verdict:
     """Return the verdict on a result; NaN is within no bound."""
     if value.holds is None:
         return "reported"
     return "pass" if value.holds and not math.isnan(value.number) else "fails"
 
 
-def _known(number: float) -> float | None:
+def _finite_or_none(number: float) -> float | None:
     """Return a finite number; None for any other."""
     return float(number) if math.isfinite(number) else None
 
 
-def _rounded(series: Mapping[str, Sequence[float]]) -> dict[str, tuple[float | None, ...]]:
+def _round_series(series: Mapping[str, Sequence[float]]) -> dict[str, tuple[float | None, ...]]:
     """Return numbers rounded to six digits, enough for a picture; None if not finite."""
     return {
-        name: tuple(None if (x := _known(v)) is None else float(f"{x:.6g}") for v in values)
+        name: tuple(None if (x := _finite_or_none(v)) is None else float(f"{x:.6g}") for v in values)
         for name, values in series.items()
     }

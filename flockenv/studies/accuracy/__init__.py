@@ -10,9 +10,9 @@ from __future__ import annotations
 from flockenv.studies.accuracy.benchmark import measure, usual_methods
 from flockenv.studies.accuracy.problem import Problem
 from flockenv.studies.accuracy.results import Choice, Curve, Machine, Point, Report, Results
-from flockenv.studies.accuracy.suite import SUITE, problems_named
+from flockenv.studies.accuracy.suite import SUITE, select_problems
 
 __all__ = [
-    "SUITE", "Choice", "Curve", "Machine", "Point", "Problem", "Report", "Results", "measure", "problems_named",
+    "SUITE", "Choice", "Curve", "Machine", "Point", "Problem", "Report", "Results", "measure", "select_problems",
     "usual_methods",
 ]  # fmt: skip

@@ -19,7 +19,7 @@ from flockenv.model.state import State
 from flockenv.physics.integrators import INTEGRATORS, Integrator
 from flockenv.scene import Scene
 from flockenv.studies.accuracy.chaos import find_sensitivity
-from flockenv.studies.accuracy.paths import Path, farthest, largest, unmatched
+from flockenv.studies.accuracy.paths import Path, count_unmatched, largest_distance, largest_value
 from flockenv.studies.accuracy.problem import Problem
 from flockenv.studies.accuracy.reference import COARSE, LEAST_FINER, Reference, find_reference
 from flockenv.studies.accuracy.results import Curve, Machine, Point, Report, measured_order
@@ -58,18 +58,18 @@ class _Trial:
         except ArithmeticError:  # divergence, or equations that were not solved
             self.point = self._point(self.steps * self.method.evaluations, {})
             return
-        off = self.problem.apart(path, reference.path)
+        off = self.problem.distances(path, reference.path)
         last = off[-1][~np.isnan(off[-1])]
         errors = {
-            "error": largest(last),
+            "error": largest_value(last),
             "rms": float(np.sqrt((last**2).mean())) if len(last) else float("nan"),
-            "along": farthest(off),
-            "energy": _energy_off(self.problem, path, reference.path),
-            "momentum": _momentum_off(self.problem, path, reference.path),
+            "along": largest_distance(off),
+            "energy": _energy_error(self.problem, path, reference.path),
+            "momentum": _momentum_error(self.problem, path, reference.path),
         }
         self.point = self._point(
             path.count_of("evaluations"), {k: v for k, v in errors.items() if np.isfinite(v)},
-            unmatched(path, reference.path), path.count_of("unsolved"),
+            count_unmatched(path, reference.path), path.count_of("unsolved"),
         )  # fmt: skip
 
     def _point(self, evaluations: int, errors: dict[str, float], unmatched: int = 0, unsolved: int = 0) -> Point:
@@ -81,24 +81,24 @@ class _Trial:
 
     def clock(self) -> None:
         """Time one call for the whole run; a step before it brings the code back into the caches."""
-        scene, start, out = self._ready
+        scene, start, out = self._run_arguments
         scene.step(start, out=out)
         began = perf_counter()
         scene.step(start, out=out, steps=self.steps)
         self.times.append(perf_counter() - began)
 
     @cached_property
-    def _ready(self) -> tuple[Scene, State, State]:
-        scene, start = self.problem.ready(self.method, self.steps)
+    def _run_arguments(self) -> tuple[Scene, State, State]:
+        scene, start = self.problem.prepare(self.method, self.steps)
         return scene, start, start.copy()
 
     @property
-    def good(self) -> bool:
+    def has_error(self) -> bool:
         """True if the run reached the end and has an error."""
         return self.point is not None and self.point.error is not None
 
     @property
-    def timed(self) -> Point:
+    def timed_point(self) -> Point:
         """The point with the median of its times."""
         assert self.point is not None
         return self.point.model_copy(update={"seconds": median(self.times)}) if self.times else self.point
@@ -114,11 +114,11 @@ def measure(
     """Return the error at the end and the cost of each method in each number of steps.
 
     methods: instances (default: those of `usual_methods`). repetitions: number of wall times per point, taken in turns
-    after compiling; 0 = none. finer: ratio of steps for a reference by own steps (see reference.own_steps). progress is
-    called with percents. A KeyboardInterrupt ends it early: the report has what was done, with `stopped` =
+    after compiling; 0 = none. finer: ratio of steps for a reference by own steps (see `reference_by_own_steps`).
+    progress is called with percents. A KeyboardInterrupt ends it early: the report has what was done, with `stopped` =
     "interrupted"; it is raised again if no run has reached the end by then.
     Raises ValueError if there is no reference: the scene is chaotic over its horizon (see chaos.find_sensitivity), or
-    does not converge to one path (see reference.own_steps).
+    does not converge to one path (see `reference_by_own_steps`).
     """
     chosen = usual_methods() if methods is None else tuple(methods)
     if repetitions < 0 or (finer is not None and (finer < LEAST_FINER or finer % LEAST_FINER)):
@@ -129,11 +129,11 @@ def measure(
     try:
         for done, trial in enumerate(trials):
             progress(100 * done // all_)
-            if done == 0 or not _worse_than_dear(trials[done - 1], trial):
+            if done == 0 or not _is_too_costly(trials[done - 1], trial):
                 trial.compare(reference)
-        _clock([trial for trial in trials if trial.good], repetitions, progress)
+        _clock([trial for trial in trials if trial.has_error], repetitions, progress)
     except KeyboardInterrupt:
-        if not any(trial.good for trial in trials):
+        if not any(trial.has_error for trial in trials):
             raise
         stopped = "interrupted"
     floor = max(TRUSTED * reference.error, sensitivity.error)
@@ -156,7 +156,7 @@ def _settings(problem: Problem, method: Integrator) -> list[tuple[Integrator, in
     return [(method.model_copy(update={"tolerance": t}), few, t) for t in TOLERANCES]
 
 
-def _worse_than_dear(before: _Trial, trial: _Trial) -> bool:
+def _is_too_costly(before: _Trial, trial: _Trial) -> bool:
     """Return True if the previous, looser tolerance of this method took more evaluations than any fixed steps.
 
     If forces jump back and forth, an adaptive method may need as many steps as 1 / tolerance.
@@ -184,33 +184,33 @@ def _curves(trials: Sequence[_Trial], least: float, most: float) -> list[Curve]:
     kinds = dict.fromkeys(trial.method.kind for trial in trials)
     curves = []
     for kind in kinds:
-        mine = [trial for trial in trials if trial.method.kind == kind and trial.point is not None]
-        if not mine:
+        trials_of_kind = [trial for trial in trials if trial.method.kind == kind and trial.point is not None]
+        if not trials_of_kind:
             continue
-        points = tuple(trial.timed for trial in mine)
-        chosen = mine[0].tolerance is not None
+        points = tuple(trial.timed_point for trial in trials_of_kind)
+        chosen = trials_of_kind[0].tolerance is not None
         order, used = (None, 0) if chosen else measured_order(points, least, most)
-        declared = min(mine[0].method.order, mine[0].method.order_with_drag)
+        declared = min(trials_of_kind[0].method.order, trials_of_kind[0].method.order_with_drag)
         curves.append(Curve(method=kind, declared=declared, points=points, order=order, used=used))
     return curves
 
 
-def _energy_off(problem: Problem, path: Path, reference: Path) -> float:
+def _energy_error(problem: Problem, path: Path, reference: Path) -> float:
     """Return the largest error of the energy, as a share of the largest kinetic energy of the reference."""
     if path.who is not None:
         return float("nan")
-    off = largest(np.abs(problem.energy(path.pos, path.vel) - problem.energy(reference.pos, reference.vel)))
-    scale = largest(problem.kinetic(reference.vel))
+    off = largest_value(np.abs(problem.energy(path.pos, path.vel) - problem.energy(reference.pos, reference.vel)))
+    scale = largest_value(problem.kinetic(reference.vel))
     return off / scale if scale > 0 else float("nan")
 
 
-def _momentum_off(problem: Problem, path: Path, reference: Path) -> float:
+def _momentum_error(problem: Problem, path: Path, reference: Path) -> float:
     """Return the largest change of a conserved momentum, as a share of the summed magnitudes of all momenta."""
     if not problem.conserves_momentum:
         return float("nan")
     before = problem.momentum(problem.start.vel[0].astype(np.float64))
-    carried = largest(problem.impulse(reference.vel))
-    off = largest(np.linalg.norm(problem.momentum(path.vel) - before, axis=-1))
+    carried = largest_value(problem.impulse(reference.vel))
+    off = largest_value(np.linalg.norm(problem.momentum(path.vel) - before, axis=-1))
     return off / carried if carried > 0 else float("nan")
 
 

@@ -37,12 +37,12 @@ def find_sensitivity(problem: Problem) -> Sensitivity:
     """
     start = problem.start
     shift = PERTURBATION * max(1.0, float(np.abs(start.pos).max()))
-    steps = problem.steps[-1] * problem.stable(RK4(), FINER)
+    steps = problem.steps[-1] * problem.stability_divisor(RK4(), FINER)
     try:
-        paths = [problem.path(RK4(), steps, begin) for begin in (start, _shifted(start, shift))]
+        paths = [problem.path(RK4(), steps, begin) for begin in (start, _shift_start(start, shift))]
     except FloatingPointError as error:
         raise ValueError(f"the finest steps given, {problem.seconds / steps:g} s, are too long: {error}") from None
-    off = np.nan_to_num(problem.apart(*paths))
+    off = np.nan_to_num(problem.distances(*paths))
     growth = np.maximum.accumulate(off.max(axis=1)) / shift
     if not growth[-1] <= MOST_GROWTH:
         kept = problem.times[growth <= 1e-2 * MOST_GROWTH]
@@ -58,7 +58,7 @@ def find_sensitivity(problem: Problem) -> Sensitivity:
     return Sensitivity(float(growth[-1]), float(growth[-1] * shift), rate)
 
 
-def _shifted(start: State, shift: float) -> State:
+def _shift_start(start: State, shift: float) -> State:
     """Return a start with positions changed by `shift` m and velocities by `shift` m/s, at random.
 
     An agent at rest stays at rest, as its heading could change by any angle.

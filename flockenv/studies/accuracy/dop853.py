@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from flockenv.studies.accuracy.paths import Floats, Path, largest
+from flockenv.studies.accuracy.paths import Floats, Path, largest_value
 from flockenv.studies.accuracy.problem import Problem
 
-__all__ = ["NotSmoothError", "integrated_twice"]
+__all__ = ["NotSmoothError", "integrate_twice"]
 
 TIGHT, LOOSE = 1e-13, 1e-12
 """rtol = atol of the two runs of DOP853."""
@@ -28,21 +28,21 @@ class NotSmoothError(Exception):
     """DOP853 cannot follow this scene; the message has the reason."""
 
 
-def integrated_twice(problem: Problem) -> tuple[Path, float, str]:
+def integrate_twice(problem: Problem) -> tuple[Path, float, str]:
     """Return the path, its error in m, and a note; raise NotSmoothError if DOP853 cannot follow the scene."""
     if problem.after_steps:
         raise NotSmoothError(f"DOP853 does not include what acts after each step ({problem.after_steps})")
-    (tight, evaluations), (loose, _) = _integrated(problem, TIGHT), _integrated(problem, LOOSE)
-    apart = largest(problem.apart(tight, loose))
-    gone = largest(problem.apart(tight, Path(problem.start.pos[0], problem.start.vel[0])))
-    if not apart <= AGREED * max(gone, AGREED):
+    (tight, evaluations), (loose, _) = _integrate(problem, TIGHT), _integrate(problem, LOOSE)
+    difference = largest_value(problem.distances(tight, loose))
+    gone = largest_value(problem.distances(tight, Path(problem.start.pos[0], problem.start.vel[0])))
+    if not difference <= AGREED * max(gone, AGREED):
         raise NotSmoothError(
-            f"DOP853 does not converge: at rtol {TIGHT:g} and {LOOSE:g} its paths are {apart:.1e} m apart"
+            f"DOP853 does not converge: at rtol {TIGHT:g} and {LOOSE:g} its paths are {difference:.1e} m apart"
         )
-    return tight, apart, f"rtol = atol = {TIGHT:g}, {evaluations:,} evaluations"
+    return tight, difference, f"rtol = atol = {TIGHT:g}, {evaluations:,} evaluations"
 
 
-def _integrated(problem: Problem, tolerance: float) -> tuple[Path, int]:
+def _integrate(problem: Problem, tolerance: float) -> tuple[Path, int]:
     """Integrate x' = v + flow, v' = a from instant to instant; return the path, and the number of evaluations."""
     from scipy.integrate import solve_ivp
 

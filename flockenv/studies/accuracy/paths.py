@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from flockenv.model.state import WORK
 
-__all__ = ["Floats", "Path", "apart", "farthest", "largest", "reach", "unmatched"]
+__all__ = ["Floats", "Path", "count_unmatched", "distances", "largest_distance", "largest_value", "reach"]
 
 Floats = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ class Path:
         return 0 if self.work is None else int(self.work[WORK.index(what)])
 
 
-def apart(path: Path, other: Path, displacement: Callable[[Floats, Floats], Floats]) -> Floats:
+def distances(path: Path, other: Path, displacement: Callable[[Floats, Floats], Floats]) -> Floats:
     """Return the distance of every agent between two paths, (K, N) m, along the shortest path.
 
     If agents are born and die, they are compared by identity: NaN for agents that live in only one path.
@@ -46,7 +46,7 @@ def apart(path: Path, other: Path, displacement: Callable[[Floats, Floats], Floa
     return off
 
 
-def unmatched(path: Path, other: Path) -> int:
+def count_unmatched(path: Path, other: Path) -> int:
     """Return the number of agents that live in only one of two paths, at the instant with most of them."""
     if path.who is None or other.who is None:
         return 0
@@ -58,7 +58,7 @@ def unmatched(path: Path, other: Path) -> int:
 def reach(path: Path, start: Floats, displacement: Callable[[Floats, Floats], Floats]) -> float:
     """Return the largest distance of an agent from `start`, (N, D), or from its first position after birth, m."""
     if path.who is None:
-        return largest(np.linalg.norm(displacement(path.pos, start), axis=-1))
+        return largest_value(np.linalg.norm(displacement(path.pos, start), axis=-1))
     most, first = 0.0, {int(who): start[who] for who in range(len(start))}
     for who, pos in zip(path.who, path.pos, strict=True):
         for slot in np.flatnonzero(who >= 0):
@@ -67,11 +67,11 @@ def reach(path: Path, start: Floats, displacement: Callable[[Floats, Floats], Fl
     return most
 
 
-def largest(values: Floats) -> float:
+def largest_value(values: Floats) -> float:
     """Return the largest of some numbers; NaN if one is NaN, or if there are none."""
     return float(np.max(values)) if np.size(values) else math.nan
 
 
-def farthest(off: Floats) -> float:
+def largest_distance(off: Floats) -> float:
     """Return the largest distance of agents that live in both paths, m; NaN if there are none."""
-    return largest(off[~np.isnan(off)])
+    return largest_value(off[~np.isnan(off)])

@@ -89,7 +89,7 @@ def _panel(axes: Axes, report: Report, by: Cost, styles: dict[str, dict[str, Any
     axes.set_xscale("log")
     axes.set_yscale("log")
     high = 10.0 ** math.ceil(math.log10(3 * report.reach)) if report.reach > 0 else 1.0
-    low = max(report.floor / 3, high * 10.0**-DECADES, _least(report) / 3)
+    low = max(report.floor / 3, high * 10.0**-DECADES, _smallest_error(report) / 3)
     axes.set_ylim(low, high)
     for curve in report.curves:
         _line(axes, curve, by, styles[curve.method], report.floor, low)
@@ -100,7 +100,7 @@ def _panel(axes: Axes, report: Report, by: Cost, styles: dict[str, dict[str, Any
     else:
         axes.set_title(report.title, loc="left", fontsize=13, fontweight="bold", color=INK, pad=22)
         axes.annotate(
-            _against(report), (0, 1), (0, 6), xycoords="axes fraction", textcoords="offset points", fontsize=9.5,
+            _reference_text(report), (0, 1), (0, 6), xycoords="axes fraction", textcoords="offset points", fontsize=9.5,
             color=FAINT,
         )  # fmt: skip
     axes.set_xlabel(AXES[by], fontsize=10.5, color=INK)
@@ -114,18 +114,18 @@ def _panel(axes: Axes, report: Report, by: Cost, styles: dict[str, dict[str, Any
         axes.spines[side].set_color(GRID)
 
 
-def _shown(curve: Curve, by: Cost) -> list[tuple[float, float]]:
+def _drawable_points(curve: Curve, by: Cost) -> list[tuple[float, float]]:
     """Return (cost, error) of the points that have both."""
     return [(cost, p.error) for p in curve.points if (cost := p.cost(by)) is not None and p.error is not None]
 
 
-def _least(report: Report) -> float:
+def _smallest_error(report: Report) -> float:
     """Return the smallest error."""
     errors = [p.error for curve in report.curves for p in curve.points if p.error]
     return min(errors, default=report.reach)
 
 
-def _against(report: Report) -> str:
+def _reference_text(report: Report) -> str:
     """Return the reference of errors, its own error, and the growth rate of a difference, in a line."""
     wrong = "" if report.reference_error == 0 else f", \u00b1 {report.reference_error:.0e} m"
     grows = f"; differences grow {report.growth:.0e}-fold" if report.sensitive else ""
@@ -134,7 +134,7 @@ def _against(report: Report) -> str:
 
 def _line(axes: Axes, curve: Curve, by: Cost, style: dict[str, Any], floor: float, low: float) -> None:
     """Draw a curve; what lies below the picture is on its lower edge."""
-    shown = [(cost, max(error, low)) for cost, error in _shown(curve, by)]
+    shown = [(cost, max(error, low)) for cost, error in _drawable_points(curve, by)]
     if shown:
         axes.plot(*zip(*shown, strict=True), markersize=5, linewidth=1.8, zorder=3, **style)
     doubtful = [(cost, error) for cost, error in shown if error <= floor]
@@ -147,7 +147,7 @@ def _orders(axes: Axes, report: Report, styles: dict[str, dict[str, Any]], low: 
     """Write the measured orders at the ends of the lines, pushed apart so that each can be read."""
     ends = []
     for curve in report.curves:
-        inside = [(x, y) for x, y in _shown(curve, "evaluations") if low < y < high]
+        inside = [(x, y) for x, y in _drawable_points(curve, "evaluations") if low < y < high]
         if curve.order is not None and inside:
             ends.append((math.log(inside[-1][1]), inside[-1], curve))
     gap, above = LABEL * math.log(high / low), math.inf
@@ -161,7 +161,7 @@ def _orders(axes: Axes, report: Report, styles: dict[str, dict[str, Any]], low: 
 
 def _slopes(axes: Axes, report: Report, low: float, high: float) -> None:
     """Draw what orders 1, 2 and 4 look like, from one corner."""
-    costs = [x for curve in report.curves for x, _ in _shown(curve, "evaluations")]
+    costs = [x for curve in report.curves for x, _ in _drawable_points(curve, "evaluations")]
     if not costs:
         axes.annotate(
             "no method arrives in these steps", (0.5, 0.5), xycoords="axes fraction", ha="center", color=FAINT

@@ -19,7 +19,7 @@ from flockenv.physics.integrators import RK4, Integrator
 from flockenv.physics.population import Crowding, Decay
 from flockenv.scene import Scene
 from flockenv.scene.stability import suggest_dt
-from flockenv.studies.accuracy.paths import Floats, Path, apart
+from flockenv.studies.accuracy.paths import Floats, Path, distances
 
 __all__ = ["Exact", "Problem"]
 
@@ -79,7 +79,7 @@ class Problem:
         if motion is not None:
             start = start.with_motion(*(np.asarray(array, float)[None] for array in motion))
         problem = cls(name, title, scene, start, float(seconds), tuple(sorted(set(steps))), exact)
-        problem.ready(RK4(), FINER * problem.steps[-1])
+        problem.prepare(RK4(), FINER * problem.steps[-1])
         return problem
 
     @property
@@ -90,7 +90,7 @@ class Problem:
         return self.seconds * np.arange(1, many + 1) / many
 
     @property
-    def _moving(self) -> Floats:
+    def _moving_mass(self) -> Floats:
         """The masses of agents, (N,) kg; 0 for those held in place."""
         mass = self.scene.body.mass.astype(np.float64)
         return np.where(np.isfinite(mass), mass, 0.0)
@@ -106,7 +106,7 @@ class Problem:
         return ", ".join(found)
 
     @property
-    def by_events(self) -> Problem:
+    def with_impacts_in_order(self) -> Problem:
         """The same problem with impacts found in the order of time, if its own response converges to that."""
         constraints = tuple(
             each.model_copy(update={"response": "earliest"})
@@ -116,7 +116,7 @@ class Problem:
         )
         return replace(self, scene=self.scene.model_copy(update={"constraints": constraints}))
 
-    def ready(self, method: Integrator, steps: int) -> tuple[Scene, State]:
+    def prepare(self, method: Integrator, steps: int) -> tuple[Scene, State]:
         """Return the scene with a method and the step of `steps` steps, and its start.
 
         Raises ValueError if the scene refuses such steps as unstable; warnings about long steps are ignored.
@@ -127,12 +127,12 @@ class Problem:
                 warnings.simplefilter("ignore", kind)
             return self.scene.model_copy(update={"integrator": method, "dt": dt}), replace(self.start, dt=dt)
 
-    def stable(self, method: Integrator, most: int) -> int:
+    def stability_divisor(self, method: Integrator, most: int) -> int:
         """Return the smallest power of 2 by which the finest steps must be divided for a method to be stable.
 
         Raises ValueError if that is more than `most`.
         """
-        limit = suggest_dt(self.ready(method, most * self.steps[-1])[0]).dt
+        limit = suggest_dt(self.prepare(method, most * self.steps[-1])[0]).dt
         finest, times = self.seconds / self.steps[-1], 1
         while finest / times > limit:
             times *= 2
@@ -146,7 +146,7 @@ class Problem:
     def path(self, method: Integrator, steps: int, start: State | None = None) -> Path:
         """Run, and return the path of all agents at the instants; raise FloatingPointError if it diverges."""
         try:
-            scene, state = self.ready(method, steps)
+            scene, state = self.prepare(method, steps)
         except ValueError as error:  # the steps are unstable
             raise FloatingPointError(str(error)) from None
         state = replace(start, dt=scene.dt) if start is not None else state
@@ -165,16 +165,16 @@ class Problem:
             state.work.sum(axis=0) - before,
         )  # fmt: skip
 
-    def apart(self, path: Path, other: Path) -> Floats:
-        """Return the distance of every agent between two paths, (K, N) m; see `paths.apart`."""
-        return apart(path, other, self.scene.space.displacement)
+    def distances(self, path: Path, other: Path) -> Floats:
+        """Return the distance of every agent between two paths, (K, N) m; see `paths.distances`."""
+        return distances(path, other, self.scene.space.displacement)
 
     def energy(self, pos: Floats, vel: Floats) -> Floats:
         """Return kinetic energy plus the potential energies that effects have, at instants (K, N, D), (K,) J."""
         instants, agents, dimension = pos.shape  # a world for every instant
         state = blank(instants, agents, dimension, 0, self.start.dt).with_motion(pos, vel)
         total = self.kinetic(vel)
-        for effect in self._with_potential:
+        for effect in self._potential_effects:
             potential = self._potential(effect, state)
             total = total if potential is None else total + potential
         return total
@@ -184,28 +184,28 @@ class Problem:
 
     def momentum(self, vel: Floats) -> Floats:
         """Return the total momentum, (..., D) kg m/s."""
-        return np.asarray((self._moving[:, None] * vel).sum(axis=-2))
+        return np.asarray((self._moving_mass[:, None] * vel).sum(axis=-2))
 
     @property
-    def _with_potential(self) -> list[Effect]:
+    def _potential_effects(self) -> list[Effect]:
         """The effects with a potential energy; empty on a torus, where it jumps between images."""
         known = [] if self.scene.space.periodic else self.scene.effects
         return [effect for effect in known if self._potential(effect, self.start) is not None]
 
     def impulse(self, vel: Floats) -> Floats:
         """Return the sum of the magnitudes of all momenta, (...) kg m/s."""
-        return np.asarray((self._moving * np.linalg.norm(vel, axis=-1)).sum(axis=-1))
+        return np.asarray((self._moving_mass * np.linalg.norm(vel, axis=-1)).sum(axis=-1))
 
     def kinetic(self, vel: Floats) -> Floats:
         """Return the kinetic energy, (...) J."""
-        return np.asarray(0.5 * (self._moving * (vel**2).sum(axis=-1)).sum(axis=-1))
+        return np.asarray(0.5 * (self._moving_mass * (vel**2).sum(axis=-1)).sum(axis=-1))
 
     @property
     def energies(self) -> str:
         """The energies that `energy` sums up, in words."""
         if self.scene.population:
             return "not compared: agents are born and die"
-        kinds = [effect.kind for effect in self._with_potential]
+        kinds = [effect.kind for effect in self._potential_effects]
         return f"kinetic and potential ({', '.join(kinds)})" if kinds else "kinetic"
 
     @property

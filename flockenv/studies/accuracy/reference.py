@@ -17,11 +17,11 @@ import numpy as np
 
 from flockenv.physics.constraints import Collisions
 from flockenv.physics.integrators import RK4
-from flockenv.studies.accuracy.dop853 import NotSmoothError, integrated_twice
-from flockenv.studies.accuracy.paths import Floats, Path, farthest, reach
+from flockenv.studies.accuracy.dop853 import NotSmoothError, integrate_twice
+from flockenv.studies.accuracy.paths import Floats, Path, largest_distance, reach
 from flockenv.studies.accuracy.problem import FINER, Problem
 
-__all__ = ["COARSE", "LEAST_FINER", "Reference", "find_reference", "own_steps"]
+__all__ = ["COARSE", "LEAST_FINER", "Reference", "find_reference", "reference_by_own_steps"]
 
 LEAST_FINER = 4
 """Least ratio of the finest measured step to the step of a reference by own steps."""
@@ -56,46 +56,48 @@ class Reference:
 def find_reference(problem: Problem, finer: int | None = None) -> Reference:
     """Return the best reference there is.
 
-    finer: see `own_steps`. Raises ValueError if there is none: the scene diverges even in the finest steps, or does not
-    converge to one path.
+    finer: see `reference_by_own_steps`. Raises ValueError if there is none: the scene diverges even in the finest
+    steps, or does not converge to one path.
     """
     if problem.exact is not None:
         pos, vel = zip(*(problem.exact(t) for t in problem.times), strict=True)
         path = Path(np.array(pos, float), np.array(vel, float))
         return Reference("closed form", path, 0.0, _reach(problem, path))
     try:
-        path, error, note = integrated_twice(problem)
+        path, error, note = integrate_twice(problem)
     except NotSmoothError as reason:
-        return own_steps(problem, finer, str(reason))
+        return reference_by_own_steps(problem, finer, str(reason))
     return Reference("DOP853", path, error, _reach(problem, path), note)
 
 
-def own_steps(problem: Problem, finer: int | None = None, reason: str = "") -> Reference:
+def reference_by_own_steps(problem: Problem, finer: int | None = None, reason: str = "") -> Reference:
     """Return the reference of the whole scene by its own steps with RK4.
 
     finer: ratio of the finest measured step to that of the reference, a multiple of 4 (default: 64, or the largest
     within MOST_WORK). Raises ValueError if the scene diverges or does not converge to one path.
     """
-    fine = problem.by_events
-    many = max(affordable(problem) if finer is None else finer, LEAST_FINER * problem.stable(RK4(), FINER))
+    fine = problem.with_impacts_in_order
+    many = max(
+        affordable_ratio(problem) if finer is None else finer, LEAST_FINER * problem.stability_divisor(RK4(), FINER)
+    )
     steps = problem.steps[-1] * many
     try:
         runs = [fine.path(RK4(), steps // k) for k in (4, 2, 1)]
     except FloatingPointError as fault:
         raise ValueError(f"no reference: {reason}; and in steps of its own: {fault}") from None
-    off = [problem.apart(finer_one, coarser) for coarser, finer_one in itertools.pairwise(runs)]
+    off = [problem.distances(finer_one, coarser) for coarser, finer_one in itertools.pairwise(runs)]
     path, gone = runs[-1], _reach(problem, runs[-1])
-    before, last = (farthest(each) for each in off)
-    order, error = _closing_in(before, last, max(ROUNDING, ROUNDING_STEP * steps) * max(1.0, gone))
-    _refuse_unsettled(problem, steps, off[1], error, gone)
+    before, last = (largest_distance(each) for each in off)
+    order, error = _convergence(before, last, max(ROUNDING, ROUNDING_STEP * steps) * max(1.0, gone))
+    _refuse_no_limit(problem, steps, off[1], error, gone)
     exactly = any(isinstance(each, Collisions) and each.response == "earliest" for each in fine.scene.constraints)
-    found = [reason, f"RK4 in {steps:,} steps, dt/{many} of the finest", _told(order, last)]
+    found = [reason, f"RK4 in {steps:,} steps, dt/{many} of the finest", _convergence_note(order, last)]
     found += ["impacts in the order of time"] if exactly else []
-    note = "; ".join(each for each in found + _left_over(path) if each)
+    note = "; ".join(each for each in found + _deviation_notes(path) if each)
     return Reference("event-exact steps" if exactly else "own steps", path, error, gone, note)
 
 
-def _left_over(path: Path) -> list[str]:
+def _deviation_notes(path: Path) -> list[str]:
     """Return notes on deviations of a run from its scene: contacts left unsolved, births without a free slot."""
     unsolved, refused = path.count_of("unsolved"), path.count_of("births_refused")
     found = [f"{unsolved:,} contacts unsolved"] if unsolved else []
@@ -103,7 +105,7 @@ def _left_over(path: Path) -> list[str]:
     return found + ([slots] if refused else [])
 
 
-def affordable(problem: Problem) -> int:
+def affordable_ratio(problem: Problem) -> int:
     """Return the largest ratio of the finest measured step to that of a reference within MOST_WORK."""
     ends = problem.scene.constraints or problem.scene.population
     work = (problem.scene.agents + (BETWEEN_STEPS if ends else 0)) * problem.steps[-1]
@@ -113,7 +115,7 @@ def affordable(problem: Problem) -> int:
     return finer
 
 
-def _closing_in(before: float, last: float, rounding: float) -> tuple[float | None, float]:
+def _convergence(before: float, last: float, rounding: float) -> tuple[float | None, float]:
     """Return the order of convergence of three runs, and the error of the finest, m, from their differences.
 
     Richardson: with order q the error of the finest is last / (2^q - 1). Orders above 1 are not relied upon, as forces
@@ -125,7 +127,7 @@ def _closing_in(before: float, last: float, rounding: float) -> tuple[float | No
     return order, last / (2 ** min(order, 1.0) - 1) if order >= SETTLED else max(before, last)
 
 
-def _told(order: float | None, last: float) -> str:
+def _convergence_note(order: float | None, last: float) -> str:
     """Return a note on the convergence of a reference."""
     if order is None:
         return f"{last:.1e} m from half as many, which is rounding"
@@ -133,7 +135,7 @@ def _told(order: float | None, last: float) -> str:
     return f"{last:.1e} m from half as many, {settles}"
 
 
-def _refuse_unsettled(problem: Problem, steps: int, off: Floats, error: float, gone: float) -> None:
+def _refuse_no_limit(problem: Problem, steps: int, off: Floats, error: float, gone: float) -> None:
     """Raise ValueError, with a horizon to try, if a scene does not converge with shorter steps."""
     if math.isnan(error):
         raise ValueError(f"seconds = {problem.seconds:g}: no agent lives at any instant at which runs are compared")

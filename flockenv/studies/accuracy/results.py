@@ -97,7 +97,7 @@ class Curve(ResultRecord):
     used: int
     """Points that the order was measured over."""
 
-    def needed(self, tolerance: float, by: Cost = "evaluations", interpolate: bool = True) -> Choice | None:
+    def cheapest_choice(self, tolerance: float, by: Cost = "evaluations", interpolate: bool = True) -> Choice | None:
         """Return the cheapest setting of this method with an error of at most `tolerance`, m; None if there is none.
 
         All finer points must also be within the tolerance, so a coarse point that is accurate by chance is not taken.
@@ -106,13 +106,13 @@ class Curve(ResultRecord):
         """
         known = [p for p in self.points if p.cost(by) is not None]
         good = list(takewhile(lambda p: p.error is not None and p.error <= tolerance, reversed(known)))
-        found = [self._at(point, by) for point in good]
+        found = [self._as_choice(point, by) for point in good]
         coarser = known[: len(known) - len(good)]
         if interpolate and good and coarser and coarser[-1].error and good[-1].error:
-            found.append(self._between(coarser[-1], good[-1], tolerance, by))
+            found.append(self._choice_between(coarser[-1], good[-1], tolerance, by))
         return min(found, key=lambda choice: choice.cost, default=None)
 
-    def _at(self, point: Point, by: Cost) -> Choice:
+    def _as_choice(self, point: Point, by: Cost) -> Choice:
         """Return a point as a choice."""
         cost, error = point.cost(by), point.error
         assert cost is not None and error is not None
@@ -120,16 +120,16 @@ class Curve(ResultRecord):
             method=self.method, dt=point.dt, tolerance=point.tolerance, cost=cost, error=error, interpolated=False
         )
 
-    def _between(self, worse: Point, better: Point, error: float, by: Cost) -> Choice:
+    def _choice_between(self, worse: Point, better: Point, error: float, by: Cost) -> Choice:
         """Return the interpolated choice with a given error, between a point of larger and one of smaller error."""
-        a, b = self._at(worse, by), self._at(better, by)
+        a, b = self._as_choice(worse, by), self._as_choice(better, by)
         share = math.log(a.error / error) / math.log(a.error / b.error)
         tolerances = None
         if a.tolerance is not None and b.tolerance is not None:
-            tolerances = _between(a.tolerance, b.tolerance, share)
+            tolerances = _interpolate(a.tolerance, b.tolerance, share)
         return Choice(
-            method=self.method, dt=_between(a.dt, b.dt, share), tolerance=tolerances,
-            cost=_between(a.cost, b.cost, share), error=error, interpolated=True,
+            method=self.method, dt=_interpolate(a.dt, b.dt, share), tolerance=tolerances,
+            cost=_interpolate(a.cost, b.cost, share), error=error, interpolated=True,
         )  # fmt: skip
 
 
@@ -189,7 +189,7 @@ class Report(ResultRecord):
                 f"tolerance = {tolerance:g} m: must be finite and >= {self.floor:.1e} m, below which "
                 f"errors of {self.name} are not trusted"
             )
-        found = [c for curve in self.curves if (c := curve.needed(tolerance, by, interpolate)) is not None]
+        found = [c for curve in self.curves if (c := curve.cheapest_choice(tolerance, by, interpolate)) is not None]
         return min(found, key=lambda choice: choice.cost, default=None)
 
 
@@ -214,6 +214,6 @@ def measured_order(points: Iterable[Point], least: float, most: float) -> tuple[
     return float(-np.polyfit(work, error, 1)[0]), len(kept)
 
 
-def _between(a: float, b: float, share: float) -> float:
+def _interpolate(a: float, b: float, share: float) -> float:
     """Return the logarithmic interpolation between two positive numbers."""
     return math.exp((1 - share) * math.log(a) + share * math.log(b))

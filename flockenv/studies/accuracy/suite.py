@@ -33,7 +33,7 @@ from flockenv.scene import Group, Scene
 from flockenv.studies.accuracy.paths import Floats
 from flockenv.studies.accuracy.problem import Exact, Problem
 
-__all__ = ["SUITE", "problems_named"]
+__all__ = ["SUITE", "select_problems"]
 
 ORIGIN = (0.0, 0.0)
 BIRDS, EDGE, REACH = 24, 40.0, 20.0
@@ -270,7 +270,7 @@ SUITE: dict[str, Callable[[], Problem]] = {
 """Every problem by its name, in the order in which they are shown."""
 
 
-def problems_named(names: Sequence[str] = ()) -> list[Problem]:
+def select_problems(names: Sequence[str] = ()) -> list[Problem]:
     """Return problems by name (no names: all); raise ValueError, with the nearest name, for an unknown one."""
     for name in names:
         if name not in SUITE:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from flockenv.studies.accuracy.results import HALVINGS, Choice, Cost, Curve, Point, Report
 
-__all__ = ["COLUMNS", "best", "columns", "errors", "headlines", "rows"]
+__all__ = ["COLUMNS", "cheapest_lines", "columns", "errors", "headlines", "rows"]
 
 COLUMNS = ("method", "order", "declared")
 DRIFTS = ("energy off", "momentum off")
@@ -19,7 +19,7 @@ def headlines(report: Report) -> list[str]:
     lines = [
         f"{report.agents:,} agents, {report.seconds:g} s, {report.dtype}; the farthest goes {report.reach:.3g} m",
         f"errors against: {report.reference}" + (f" ({report.note})" if report.note else ""),
-        f"off by itself: {_wrong(report)}; errors below {report.floor:.1e} m are not trusted",
+        f"off by itself: {_reference_error_text(report)}; errors below {report.floor:.1e} m are not trusted",
         f"a tiny difference at the start grows {report.growth:.2g}-fold{_rate(report)}",
         f"energy: {report.energy}",
         f"times: {times} on {report.machine.cpu}, {report.machine.cores} cores{load}",
@@ -32,7 +32,7 @@ def headlines(report: Report) -> list[str]:
     return lines + ([f"{report.stopped}: what was done until then is shown"] if report.stopped else [])
 
 
-def _wrong(report: Report) -> str:
+def _reference_error_text(report: Report) -> str:
     """Return the error of the reference, in words."""
     return f"about {report.reference_error:.1e} m" if report.reference_error > 0 else "nothing"
 
@@ -102,7 +102,7 @@ def _order(curve: Curve, floor: float) -> str:
 
 
 def _cost(curve: Curve, tolerance: float, by: Cost, floor: float) -> str:
-    choice = curve.needed(tolerance, by) if tolerance >= floor else None
+    choice = curve.cheapest_choice(tolerance, by) if tolerance >= floor else None
     return "-" if choice is None else _amount(choice, by)
 
 
@@ -111,7 +111,7 @@ def _amount(choice: Choice, by: Cost) -> str:
     return ("~" if choice.interpolated else "") + number
 
 
-def best(report: Report, tolerances: Sequence[float]) -> list[str]:
+def cheapest_lines(report: Report, tolerances: Sequence[float]) -> list[str]:
     """Return, a line per tolerance, the cheapest method by time and by evaluations."""
     lines = []
     for tolerance in tolerances:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from flockenv.model.state import Floats
-from flockenv.studies.arbitration_trace import Granted, Grants
+from flockenv.studies.arbitration_trace import Grants, SteerShares
 from flockenv.studies.experiments.experiment import Trial, depth
 from flockenv.studies.experiments.plan import SteerPlan
 
@@ -27,7 +27,7 @@ SHOWN = ("collisions", "switches")
 def more_columns(plan: SteerPlan) -> dict[str, str]:
     """Return a column for every behaviour of the cases."""
     scenes = (plan.scene_of(case, variant) for case in plan.cases for variant in plan.variants)
-    names = dict.fromkeys(wish.kind for scene in scenes for wish in scene.effects[0].components)
+    names = dict.fromkeys(behaviour.kind for scene in scenes for behaviour in scene.effects[0].components)
     return {f"share {name}": f"of what {name} wishes for, granted on average while it wishes" for name in names}
 
 
@@ -37,13 +37,13 @@ def trial(plan: SteerPlan, case: str, variant: str) -> Trial:
     grants, steps = Grants(scene), round(plan.cases[case].seconds / scene.dt)
     state = scene.start(plan.seed, worlds=plan.worlds)
     began = np.linalg.norm(state.pos - target, axis=-1)
-    deep, granted, path = [], [], [state.pos[0].copy()]
+    deep, instants, path = [], [], [state.pos[0].copy()]
     for _ in range(steps):
-        granted.append(grants.at(state)[0])
+        instants.append(grants.at(state)[0])
         state = scene.step(state)
         deep.append(depth(scene, state))
         path.append(state.pos[0].copy())
-    numbers = _contacts(np.array(deep)) | _grants(granted, scene.dt)
+    numbers = _contacts(np.array(deep)) | _shares_and_switches(instants, scene.dt)
     nearer = began - np.linalg.norm(state.pos - target, axis=-1)
     return Trial(numbers | {"nearer": float(nearer.mean())}, scene, np.array(path))
 
@@ -55,16 +55,16 @@ def _contacts(depth: Floats) -> dict[str, float]:
     return {"collisions": float(entered / inside[0].size), "deepest": float(max(depth.max(), 0.0))}
 
 
-def _grants(granted: list[Granted], dt: float) -> dict[str, float]:
+def _shares_and_switches(instants: list[SteerShares], dt: float) -> dict[str, float]:
     """Return how often the behaviour with the largest part of the force changes, and the mean share of each."""
-    share = np.stack([each.share for each in granted])  # (T, B, N, K)
-    wish = np.stack([np.linalg.norm(each.wish, axis=-1) for each in granted])
-    part = share * wish
+    share = np.stack([each.share for each in instants])  # (T, B, N, K)
+    size = np.stack([np.linalg.norm(each.requested, axis=-1) for each in instants])
+    part = share * size
     leader = np.where(part.max(axis=-1) > 0, part.argmax(axis=-1), -1)
     switches = (leader[1:] != leader[:-1]).sum(axis=0).mean() / ((len(leader) - 1) * dt)
-    names = granted[0].names
+    names = instants[0].names
     shares = {
-        f"share {name}": float(share[..., k][wish[..., k] > 0].mean()) if (wish[..., k] > 0).any() else np.nan
+        f"share {name}": float(share[..., k][size[..., k] > 0].mean()) if (size[..., k] > 0).any() else np.nan
         for k, name in enumerate(names)
     }
     return {"switches": float(switches), **shares}

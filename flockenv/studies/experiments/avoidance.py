@@ -43,22 +43,22 @@ def trial(plan: SteerPlan, case: str, variant: str) -> Trial:
         path.append(state.pos[:, 0].copy())
         speed.append(np.linalg.norm(state.vel[:, 0], axis=1))
         deep.append(depth(scene, state)[:, 0])
-    way, within, fast = np.array(path), np.array(deep), np.array(speed)
-    near = np.linalg.norm(way - target, axis=-1) < ARRIVED
-    there = near.any(axis=0)
-    last = np.where(there, near.argmax(axis=0), len(way) - 1)  # (B,) steps until then
-    until = np.arange(len(way))[:, None] <= last
-    moved = np.linalg.norm(np.diff(way, axis=0), axis=-1)
+    track, within, fast = np.array(path), np.array(deep), np.array(speed)
+    near = np.linalg.norm(track - target, axis=-1) < ARRIVED
+    has_arrived = near.any(axis=0)
+    last = np.where(has_arrived, near.argmax(axis=0), len(track) - 1)  # (B,) steps until then
+    until = np.arange(len(track))[:, None] <= last
+    moved = np.linalg.norm(np.diff(track, axis=0), axis=-1)
     length = (moved * until[1:]).sum(axis=0)
     straight = np.linalg.norm(target - begin, axis=1) - ARRIVED
     inside = (within > 0) & until
     lost = 1 - (fast * until[1:]).sum(axis=0) / (fastest * np.maximum(last, 1))
     numbers = {
-        "arrived": float(there.mean()),
-        "time": float((last * scene.dt)[there].mean()) if there.any() else np.nan,
-        "path": float((length / straight)[there].mean()) if there.any() else np.nan,
+        "arrived": float(has_arrived.mean()),
+        "time": float((last * scene.dt)[has_arrived].mean()) if has_arrived.any() else np.nan,
+        "path": float((length / straight)[has_arrived].mean()) if has_arrived.any() else np.nan,
         "speed lost": float(lost.mean()),
         "collisions": float((inside[0] + (inside[1:] & ~inside[:-1]).sum(axis=0)).mean()),
         "deepest": float(max(0.0, (within * until).max())),
     }
-    return Trial(numbers, scene, way[: int(last.max()) + 1, :1])
+    return Trial(numbers, scene, track[: int(last.max()) + 1, :1])

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flockenv.evaluation.plots import COLOURS, FAINT, INK
-from flockenv.studies.measures.plots import named, new_figure, save
+from flockenv.studies.measures.plots import name_axes, new_figure, save
 
 if TYPE_CHECKING:
     from flockenv.studies.experiments import Experiment, Trial
@@ -35,5 +35,5 @@ def write_order(path: str | Path, experiment: Experiment, trials: Mapping[tuple[
             axes.plot(x, column[seen], "x", color=INK, ms=8, mew=1.6, label=seen, zorder=5)
     axes.legend(fontsize=8, frameon=False)
     axes.set_ylim(bottom=0)
-    named(axes, *experiment.curve)
+    name_axes(axes, *experiment.curve)
     save(figure, path)

@@ -86,7 +86,7 @@ def run(
             progress(len(trials))
             trials[case, variant] = experiment.trial(case, variant)
     cells = tuple(
-        Cell(case=case, variant=variant, numbers=_known(trial.numbers, tuple(experiment.columns)))
+        Cell(case=case, variant=variant, numbers=_finite_by_column(trial.numbers, tuple(experiment.columns)))
         for (case, variant), trial in trials.items()
     )
     sources = fingerprint((*SIMULATOR, "studies/experiments"), but=("plots.py", "curves.py"))
@@ -97,7 +97,7 @@ def run(
     return results, trials
 
 
-def _known(numbers: Mapping[str, float], columns: Sequence[str]) -> dict[str, float | None]:
+def _finite_by_column(numbers: Mapping[str, float], columns: Sequence[str]) -> dict[str, float | None]:
     """Return the numbers in the order of the columns; None for those that are not finite."""
     found = {name: numbers.get(name, math.nan) for name in columns}
     return {name: float(x) if math.isfinite(x) else None for name, x in found.items()}

@@ -42,10 +42,10 @@ class Case(Record):
     scene: Scene
 
     @model_validator(mode="after")
-    def _seeks(self) -> Case:
+    def _check_seek(self) -> Case:
         """Raise ValueError if the first effect is not a steer with a seek, or if there are no obstacles."""
         steer = self.scene.effects[0] if self.scene.effects else None
-        if not isinstance(steer, Steer) or not any(isinstance(wish, Seek) for wish in steer.behaviours):
+        if not isinstance(steer, Steer) or not any(isinstance(behaviour, Seek) for behaviour in steer.behaviours):
             raise ValueError("scene.effects[0]: must be a steer, and seek among its behaviours")
         if not self.scene.obstacles:
             raise ValueError("scene.obstacles: must not be empty")
@@ -61,7 +61,7 @@ class Case(Record):
     @property
     def target(self) -> tuple[float, ...]:
         """Target of the seek behaviour, m."""
-        return next(wish.target for wish in self.steer.behaviours if isinstance(wish, Seek))
+        return next(each.target for each in self.steer.behaviours if isinstance(each, Seek))
 
 
 class GlobalWay(Record):
@@ -71,11 +71,11 @@ class GlobalWay(Record):
     spacing: float = Field(gt=0, description="m, between points of its grid")
     slow_radius: float = Field(gt=0, description="m before the target, over which the agent slows down")
 
-    def instead_of(self, wish: Effect) -> Effect:
+    def replace_seek(self, behaviour: Effect) -> Effect:
         """Return a FollowWay to the same target for a Seek; return other behaviours unchanged."""
-        if not isinstance(wish, Seek):
-            return wish
-        return FollowWay(speed=wish.speed, weight=wish.weight, target=wish.target, **self.model_dump())
+        if not isinstance(behaviour, Seek):
+            return behaviour
+        return FollowWay(speed=behaviour.speed, weight=behaviour.weight, target=behaviour.target, **self.model_dump())
 
 
 class Variant(Record):
@@ -96,10 +96,10 @@ class SteerPlan(Plan):
     def scene_of(self, case: str, variant: str) -> Scene:
         """Return the scene of a case under a variant."""
         given, varied = self.cases[case], self.variants[variant]
-        wishes = (varied.way.instead_of(w) if varied.way else w for w in given.steer.behaviours)
+        behaviours = (varied.way.replace_seek(each) if varied.way else each for each in given.steer.behaviours)
         steer = given.steer.model_copy(
             update={
-                "behaviours": (*varied.first, *wishes),
+                "behaviours": (*varied.first, *behaviours),
                 "arbitration": varied.arbitration or given.steer.arbitration,
             }
         )

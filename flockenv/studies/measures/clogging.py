@@ -43,7 +43,7 @@ class Tail(NamedTuple):
 
 def survival(gaps: ArrayLike) -> tuple[Floats, Floats]:
     """Return gaps in ascending order, (n,) s, and the share of gaps that are at least as long as each."""
-    ordered = np.sort(_checked(gaps))
+    ordered = np.sort(_check_gaps(gaps))
     return ordered, 1.0 - np.arange(len(ordered)) / max(1, len(ordered))
 
 
@@ -58,17 +58,17 @@ def tail(gaps: ArrayLike, start: float | None = None) -> Tail:
     Source: Clauset, Shalizi, Newman 2009, SIAM Review 51, 661, eqs. 3.1, 3.2, 3.9; the transition: Zuriguel et al.
     2014, Sci. Rep. 4, 7324.
     """
-    ordered = np.sort(_checked(gaps))
+    ordered = np.sort(_check_gaps(gaps))
     ordered = ordered[ordered > 0]
     none = Tail(np.nan, np.nan, np.nan, 0, np.nan)
     if start is not None:
         if not (start > 0 and np.isfinite(start)):
             raise ValueError(f"start = {start:g}: must be a finite time above 0, s: a power law has no mass at 0")
-        return _fitted(ordered[ordered >= start], start) or none
+        return _fit_tail(ordered[ordered >= start], start) or none
     starts = np.unique(ordered[: max(0, len(ordered) - LEAST + 1)])
     if len(starts) > MOST_STARTS:
         starts = starts[np.linspace(0, len(starts) - 1, MOST_STARTS).astype(int)]
-    fits = [_fitted(ordered[np.searchsorted(ordered, x) :], float(x)) for x in starts]
+    fits = [_fit_tail(ordered[np.searchsorted(ordered, x) :], float(x)) for x in starts]
     return min((fit for fit in fits if fit is not None), key=lambda fit: fit.distance, default=none)
 
 
@@ -78,7 +78,7 @@ def goodness(gaps: ArrayLike, fit: Tail, samples: int = 200, seed: int = 0) -> f
     Below .1 a power law is rejected (Clauset, Shalizi, Newman 2009, 4.1): each sample has as many gaps as given; its
     tail is drawn from the fit, the rest from the gaps before `fit.start`. NaN without a tail.
     """
-    given = _checked(gaps)
+    given = _check_gaps(gaps)
     given = given[given > 0]
     if not np.isfinite(fit.alpha):
         return np.nan
@@ -92,7 +92,7 @@ def goodness(gaps: ArrayLike, fit: Tail, samples: int = 200, seed: int = 0) -> f
     return further / samples
 
 
-def _fitted(long: Floats, start: float) -> Tail | None:
+def _fit_tail(long: Floats, start: float) -> Tail | None:
     """Return the fit to gaps in ascending order, all >= start; None if they are too few or all equal to start."""
     logs = float(np.log(long / start).sum()) if len(long) >= LEAST else 0.0
     if not logs > 0:
@@ -105,7 +105,7 @@ def _fitted(long: Floats, start: float) -> Tail | None:
     return Tail(alpha, (alpha - 1.0) / np.sqrt(n), start, n, float(distance))
 
 
-def _checked(gaps: ArrayLike) -> Floats:
+def _check_gaps(gaps: ArrayLike) -> Floats:
     given = np.asarray(gaps, np.float64)
     if given.ndim != 1 or not (np.isfinite(given).all() and (given >= 0).all()):
         raise ValueError("gaps: must be a list of finite times >= 0, s")

@@ -13,7 +13,7 @@ from scipy.spatial import Voronoi
 from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 
-from flockenv.studies.measures.polygons import Corners, valid_polygon, contains, cut, rectangle
+from flockenv.studies.measures.polygons import Corners, contains, cut, rectangle, valid_polygon
 
 __all__ = ["Ground", "Room", "classical_density", "speed_in_area", "voronoi", "voronoi_density", "voronoi_speed"]
 
@@ -99,8 +99,8 @@ class Ground(NamedTuple):
         walk = valid_polygon("walkable", walkable)
         polygon = None if area is None else valid_polygon("area", area, is_convex=True)
         solid = [valid_polygon(f"holes[{k}]", hole) for k, hole in enumerate(holes)]
-        free = Polygon(walk).difference(_everywhere(solid, period))
-        target = free if polygon is None else free.intersection(_everywhere([polygon], period))
+        free = Polygon(walk).difference(_union_of_images(solid, period))
+        target = free if polygon is None else free.intersection(_union_of_images([polygon], period))
         if not target.area > 0:
             raise ValueError("area: nothing of it is walkable")
         return cls(walk, free, target, period, float(target.area))
@@ -113,18 +113,18 @@ class Ground(NamedTuple):
         if len(here):
             places, which, many = np.unique(points[here], axis=0, return_inverse=True, return_counts=True)
             cells = _cells(places, self.walk, self.period)
-            whole, part = (_shared(cells, ground, self.period) / many for ground in (self.free, self.target))
-            cell[here], inside[here] = whole[which.ravel()], part[which.ravel()]
+            total, part = (_shared_areas(cells, ground, self.period) / many for ground in (self.free, self.target))
+            cell[here], inside[here] = total[which.ravel()], part[which.ravel()]
         return Room(cell, inside, self.area)
 
 
-def _everywhere(polygons: Sequence[Floats], period: tuple[float, float]) -> BaseGeometry:
+def _union_of_images(polygons: Sequence[Floats], period: tuple[float, float]) -> BaseGeometry:
     """Return the union of polygons, including their images in a periodic world."""
     steps = np.array(_shifts(period)) * period
     return shapely.union_all([Polygon(polygon + step) for polygon in polygons for step in steps])
 
 
-def _shared(cells: Sequence[Corners], ground: BaseGeometry, period: tuple[float, float]) -> Floats:
+def _shared_areas(cells: Sequence[Corners], ground: BaseGeometry, period: tuple[float, float]) -> Floats:
     """Return the area of the intersection of each convex cell, or of its images, with the ground, (N,) m^2."""
     places = np.concatenate([np.array(cell).reshape(-1, 2) for cell in cells])
     which = np.repeat(np.arange(len(cells)), [len(cell) for cell in cells])
@@ -161,17 +161,17 @@ def _cells(places: Floats, walk: Floats, period: tuple[float, float]) -> list[Co
     margin = EDGE * float(np.sqrt(np.prod(high - low) / len(places)))
     if len(images) > 1:
         near = [each[((each > low - margin) & (each < high + margin)).all(axis=1)] for each in images[1:]]
-        cells = _cut(places, np.concatenate([places, *near]), low, high, period)
+        cells = _cut_cells(places, np.concatenate([places, *near]), low, high, period)
         far = max(
             max((x - u) ** 2 + (y - v) ** 2 for x, y in cell)
             for cell, (u, v) in zip(cells, places.tolist(), strict=True)
         )
         if 4 * far < margin**2:
             return cells
-    return _cut(places, np.concatenate(images), low, high, period)
+    return _cut_cells(places, np.concatenate(images), low, high, period)
 
 
-def _cut(places: Floats, every: Floats, low: Floats, high: Floats, period: tuple[float, float]) -> list[Corners]:
+def _cut_cells(places: Floats, every: Floats, low: Floats, high: Floats, period: tuple[float, float]) -> list[Corners]:
     """Return the cells of `places`, which are the first points in `every`."""
     middle, far = (low + high) / 2, 20 * float(max(np.ptp(every - every.mean(axis=0)), *(high - low), *period))
     # four more points far outside bound every cell, and are too far away to take any of the walkable area

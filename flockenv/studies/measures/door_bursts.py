@@ -57,9 +57,9 @@ def runs_probability(many: int, first: int, second: int) -> float:
     """Return the probability of `many` runs in a random order of `first` items of one kind and `second` of another."""
     k, odd = divmod(many, 2)
     a, b = first - 1, second - 1
-    ways = [(k, k - 1), (k - 1, k)] if odd else [(k - 1, k - 1), (k - 1, k - 1)]
-    whole = _log_choose(first + second, first)
-    return float(sum(np.exp(_log_choose(a, i) + _log_choose(b, j) - whole) for i, j in ways))
+    splits = [(k, k - 1), (k - 1, k)] if odd else [(k - 1, k - 1), (k - 1, k - 1)]
+    log_total = _log_choose(first + second, first)
+    return float(sum(np.exp(_log_choose(a, i) + _log_choose(b, j) - log_total) for i, j in splits))
 
 
 def _log_choose(n: int, k: int) -> float:

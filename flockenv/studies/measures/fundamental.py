@@ -8,8 +8,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
-    "JUELICH", "Bin", "Deviation", "diagram", "from_weidmann", "in_juelich", "required_length", "single_file_density",
-    "single_file_speed", "weidmann_flow", "weidmann_speed",
+    "JUELICH",
+    "Bin",
+    "Deviation",
+    "diagram",
+    "juelich_share",
+    "required_length",
+    "single_file_density",
+    "single_file_speed",
+    "weidmann_deviation",
+    "weidmann_flow",
+    "weidmann_speed",
 ]  # fmt: skip
 
 Floats = NDArray[np.float64]
@@ -104,8 +113,8 @@ def diagram(density: ArrayLike, speed: ArrayLike, edges: ArrayLike | None = None
     rho, v = (np.asarray(each, np.float64).ravel() for each in (density, speed))
     if len(rho) != len(v):
         raise ValueError(f"density has {len(rho)} samples, speed {len(v)}: must be as many")
-    some = np.isfinite(rho) & np.isfinite(v)
-    rho, v = rho[some], v[some]
+    finite = np.isfinite(rho) & np.isfinite(v)
+    rho, v = rho[finite], v[finite]
     ends = np.asarray([0.0, *(b[0] for b in JUELICH), JUELICH[-1][1]] if edges is None else edges, np.float64)
     bins = []
     for low, high in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True):
@@ -116,7 +125,7 @@ def diagram(density: ArrayLike, speed: ArrayLike, edges: ArrayLike | None = None
     return bins
 
 
-def from_weidmann(density: ArrayLike, speed: ArrayLike, low: float = 0.5, high: float = 3.0) -> Deviation:
+def weidmann_deviation(density: ArrayLike, speed: ArrayLike, low: float = 0.5, high: float = 3.0) -> Deviation:
     """Return the deviation of speeds (S,) from Weidmann's at densities (S,) in [low, high), 1/m^2; NaN without samples.
 
     `worst` is over the means of bins .5 per m^2 wide; the last may be narrower. A model is close enough if it stays
@@ -135,7 +144,7 @@ def from_weidmann(density: ArrayLike, speed: ArrayLike, low: float = 0.5, high: 
     return Deviation(len(off), float(off.mean()), float(np.sqrt((off**2).mean())), worst)
 
 
-def in_juelich(density: ArrayLike, speed: ArrayLike) -> float:
+def juelich_share(density: ArrayLike, speed: ArrayLike) -> float:
     """Return the share of sampled bins of `JUELICH` whose mean lies within one deviation; NaN without samples."""
     found = diagram(density, speed)[1:]
     inside = [

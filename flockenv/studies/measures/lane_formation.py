@@ -44,29 +44,31 @@ def rows_of(across: ArrayLike, low: float, high: float, width: float) -> NDArray
         return np.where((y >= low) & (y < high), row, -1).astype(np.int64)
 
 
-def lane_order(across: ArrayLike, way: ArrayLike, low: float, high: float, width: float = ROW) -> float:
+def lane_order(across: ArrayLike, direction: ArrayLike, low: float, high: float, width: float = ROW) -> float:
     """Return Phi, the mean over occupied rows of ((n+ - n-) / (n+ + n-))^2; NaN without agents.
 
-    across (N,) m, perpendicular to the walking direction; way (N,), > 0 or < 0: the direction of each agent. 1 = no row
+    across (N,) m, perpendicular to the walking direction; direction (N,), > 0 or < 0: that of each agent. 1 = no row
     holds agents of both directions; by chance it is not 0 but about 1/n in rows of n. Source: Feliciani & Nishinari
     2016, Phys. Rev. E 94, 032304, rows .2 m wide; after Rex & Loewen 2007, Phys. Rev. E 75, 051402.
     """
-    forward, many = _counted(across, way, low, high, width)
+    forward, many = _count_by_row(across, direction, low, high, width)
     return float((((2 * forward - many) / many) ** 2).mean()) if len(many) else np.nan
 
 
-def band_index(across: ArrayLike, way: ArrayLike, low: float, high: float, width: float = BAND) -> float:
+def band_index(across: ArrayLike, direction: ArrayLike, low: float, high: float, width: float = BAND) -> float:
     """Return Y, the mean over occupied bands of |n+ - n-| / (n+ + n-); NaN without agents.
 
     Like `lane_order`, but without the square and with bands .3 m wide. Source: Yamori 1998, Psychol. Rev. 105, 530.
     """
-    forward, many = _counted(across, way, low, high, width)
+    forward, many = _count_by_row(across, direction, low, high, width)
     return float((np.abs(2 * forward - many) / many).mean()) if len(many) else np.nan
 
 
-def _counted(across: ArrayLike, way: ArrayLike, low: float, high: float, width: float) -> tuple[Floats, Floats]:
+def _count_by_row(
+    across: ArrayLike, direction: ArrayLike, low: float, high: float, width: float
+) -> tuple[Floats, Floats]:
     """Return the number of agents that go forward, and of all agents, in each occupied row."""
-    row, sign = rows_of(across, low, high, width), np.asarray(way, np.float64)
+    row, sign = rows_of(across, low, high, width), np.asarray(direction, np.float64)
     here = (row >= 0) & (sign != 0)
     many = np.bincount(row[here], np.ones(int(here.sum())))
     forward = np.bincount(row[here], sign[here] > 0, len(many))
@@ -75,7 +77,7 @@ def _counted(across: ArrayLike, way: ArrayLike, low: float, high: float, width: 
 
 def lanes(
     across: ArrayLike,
-    way: ArrayLike,
+    direction: ArrayLike,
     low: float,
     high: float,
     present: ArrayLike | None = None,
@@ -85,21 +87,21 @@ def lanes(
 ) -> Lanes:
     """Return the order of lanes over a run, and over `deals` permutations of its directions.
 
-    across (T, N) m; way (N,): the direction of each agent over the whole run, > 0 or < 0; agents with 0 are not
+    across (T, N) m; direction (N,): that of each agent over the whole run, > 0 or < 0; agents with 0 are not
     counted; present (T, N): True for agents in the measured region (default: all). This is a permutation test:
     positions stay as they are, each agent keeps one direction, and as many go in each direction as before.
     Raises ValueError if shapes do not match, or if all agents go in one direction.
     """
-    y, sign = np.asarray(across, np.float64), np.sign(np.asarray(way, np.float64))
+    y, sign = np.asarray(across, np.float64), np.sign(np.asarray(direction, np.float64))
     if y.ndim != 2 or sign.shape != y.shape[1:]:
-        raise ValueError(f"across: of shape {y.shape}, way of {sign.shape}: must be (T, N) and (N,)")
+        raise ValueError(f"across: of shape {y.shape}, direction of {sign.shape}: must be (T, N) and (N,)")
     row = rows_of(y, low, high, width)
     if present is not None:
         row = np.where(np.asarray(present, np.bool_), row, -1)
     row = np.where(sign != 0, row, -1)
     seen = np.flatnonzero((row >= 0).any(axis=0))
     if not ((sign[seen] > 0).any() and (sign[seen] < 0).any()):
-        raise ValueError("way: lanes need agents in both directions, here all go in one")
+        raise ValueError("direction: lanes need agents in both directions, here all go in one")
     row, forward = row[:, seen], (sign[seen] > 0).astype(np.float64)
     rng = np.random.default_rng(seed)
     dealt = np.stack([forward, *(rng.permutation(forward) for _ in range(deals))], axis=1)

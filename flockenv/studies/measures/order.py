@@ -45,10 +45,10 @@ def milling(pos: Floats, vel: Floats, space: Space) -> float:
     """
     out = space.displacement(centre(pos, space), pos) if len(pos) else pos
     far, speed = np.linalg.norm(out, axis=1), np.linalg.norm(vel, axis=1)
-    some = (far > 0) & (speed > 0)
-    if not some.any():
+    moving = (far > 0) & (speed > 0)
+    if not moving.any():
         return np.nan
-    r, v = out[some] / far[some, None], vel[some] / speed[some, None]
+    r, v = out[moving] / far[moving, None], vel[moving] / speed[moving, None]
     turn = np.cross(r, v) if pos.shape[1] == 3 else (r[:, 0] * v[:, 1] - r[:, 1] * v[:, 0])[:, None]
     return float(np.linalg.norm(turn.mean(axis=0)))
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["named", "new_figure", "save", "write_flow_density", "write_gaps", "write_lanes", "write_space_time"]
+__all__ = ["name_axes", "new_figure", "save", "write_flow_density", "write_gaps", "write_lanes", "write_space_time"]
 
 Floats = NDArray[np.float64]
 
@@ -31,8 +31,8 @@ MOST_POINTS = 500
 def write_flow_density(path: str | Path, density: Floats, speed: Floats, title: str) -> None:
     """Draw flow, and speed, over density, (S,) each, with Weidmann's curves and the corridor data of ug-180."""
     figure = new_figure(9.6, 4.2, title)
-    some = np.isfinite(density) & np.isfinite(speed)
-    rho, v = density[some], speed[some]
+    finite = np.isfinite(density) & np.isfinite(speed)
+    rho, v = density[finite], speed[finite]
     curve = np.linspace(0.0, 5.4, 300)
     low, high, mean, spread = np.array(JUELICH).T
     middle = (low + high) / 2
@@ -48,17 +48,17 @@ def write_flow_density(path: str | Path, density: Floats, speed: Floats, title: 
         axes.scatter(rho, data, s=12, color=FORWARD, alpha=0.35, linewidths=0, label="this run, by cells", zorder=4)
         axes.set_xlim(0, max(5.4, 1.05 * float(rho.max(initial=0))))
         axes.set_ylim(0, 1.15 * max(float(reference.max()), float(data.max(initial=0))))
-        named(axes, "density, 1/m²", label)
+        name_axes(axes, "density, 1/m²", label)
     figure.axes[0].legend(fontsize=7.5, frameon=False, loc="upper right")
     save(figure, path)
 
 
 def write_lanes(
     path: str | Path, pos: NDArray[np.floating[Any]], alive: NDArray[np.bool_],
-    way: NDArray[np.int64], region: tuple[Floats, Floats],
+    direction: NDArray[np.int64], region: tuple[Floats, Floats],
     title: str, solids: Sequence[Floats] = (), line: Floats | None = None, area: Floats | None = None,
 ) -> None:  # fmt: skip
-    """Draw the path of each agent, (T, N, 2) m, in the colour of its direction `way` (N,), and a dot at its end.
+    """Draw the path of each agent, (T, N, 2) m, coloured by its `direction` (N,), and a dot at its end.
 
     region: corners of what is shown, m; solids: polygons. A path that jumps by half of the region is cut there.
     """
@@ -67,17 +67,22 @@ def write_lanes(
     tall = float(high[1] - low[1])
     figure = new_figure(9.6, min(9.0, max(1.0, 8.6 * tall / wide)) + 1.2, title)
     axes = figure.subplots()
-    _solid(axes, solids)
+    _draw_solids(axes, solids)
     every = -(-pos.shape[0] // MOST_POINTS)
     jump = 0.5 * np.array([wide, tall])
     for k in range(0, pos.shape[1], -(-pos.shape[1] // MOST_WAYS)):
         places = np.where(alive[::every, k, None], pos[::every, k], np.nan).astype(np.float64)
         far = (np.abs(np.diff(places, axis=0)) > jump).any(axis=1)
         places = np.insert(places, np.flatnonzero(far) + 1, np.nan, axis=0)
-        axes.plot(*places.T, color=_colour(int(way[k])), lw=0.6, alpha=0.5, zorder=2)
+        axes.plot(*places.T, color=_colour(int(direction[k])), lw=0.6, alpha=0.5, zorder=2)
     here = alive[-1]
     axes.scatter(
-        pos[-1, here, 0], pos[-1, here, 1], s=14, color=[_colour(int(w)) for w in way[here]], linewidths=0, zorder=4
+        pos[-1, here, 0],
+        pos[-1, here, 1],
+        s=14,
+        color=[_colour(int(w)) for w in direction[here]],
+        linewidths=0,
+        zorder=4,
     )
     if area is not None:
         axes.plot(*np.concatenate([area, area[:1]]).T, color=COLOURS[3], lw=1.4, zorder=5)
@@ -86,7 +91,7 @@ def write_lanes(
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_aspect("equal")
-    named(axes, "x, m", "y, m")
+    name_axes(axes, "x, m", "y, m")
     axes.grid(False)
     save(figure, path)
 
@@ -104,8 +109,8 @@ def write_gaps(path: str | Path, gaps: Floats, fit: Tail, p: float, title: str) 
     if np.isfinite(fit.alpha):
         tail = np.geomspace(fit.start, max(times[-1], 1.2 * fit.start), 50)
         at = float((times >= fit.start).mean())
-        said = fit.verdict if p >= 0.1 else "no power law"
-        label = f"α = {fit.alpha:.2f} ± {fit.error:.2f}, from {fit.start:.2g} s on, p = {p:.2g}: {said}"
+        text = fit.verdict if p >= 0.1 else "no power law"
+        label = f"α = {fit.alpha:.2f} ± {fit.error:.2f}, from {fit.start:.2g} s on, p = {p:.2g}: {text}"
         axes.plot(tail, at * (tail / fit.start) ** (1 - fit.alpha), color=FORWARD, lw=2, label=label, zorder=4)
         limit = at * (tail / fit.start) ** -1.0
         axes.plot(tail, limit, color=FAINT, lw=1, ls=(0, (4, 3)), label="α = 2: the mean gap diverges", zorder=2)
@@ -113,7 +118,7 @@ def write_gaps(path: str | Path, gaps: Floats, fit: Tail, p: float, title: str) 
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_ylim(0.5 / len(times), 1.3)
-    named(axes, "gap τ between two passages, s", "share of gaps ≥ τ")
+    name_axes(axes, "gap τ between two passages, s", "share of gaps ≥ τ")
     save(figure, path)
 
 
@@ -130,7 +135,7 @@ def write_space_time(
     bar.outline.set_visible(False)
     if where is not None:
         axes.axhline(where, color="white", lw=1.2, ls=(0, (4, 3)))
-    named(axes, "time, s", "along the way of walking, m")
+    name_axes(axes, "time, s", "along the way of walking, m")
     axes.grid(False)
     save(figure, path)
 
@@ -154,7 +159,7 @@ def save(figure: Figure, path: str | Path) -> None:
         figure.savefig(file, format="png", dpi=100, metadata={"Software": "flockenv"})
 
 
-def named(axes: Axes, x: str, y: str) -> None:
+def name_axes(axes: Axes, x: str, y: str) -> None:
     """Name the axes, and keep of the frame only what carries information."""
     axes.set_xlabel(x, fontsize=9, color=FAINT)
     axes.set_ylabel(y, fontsize=9, color=FAINT)
@@ -165,12 +170,12 @@ def named(axes: Axes, x: str, y: str) -> None:
         spine.set_color(GRID)
 
 
-def _solid(axes: Axes, polygons: Sequence[Floats]) -> None:
+def _draw_solids(axes: Axes, polygons: Sequence[Floats]) -> None:
     from matplotlib.patches import Polygon
 
     for corners in polygons:
         axes.add_patch(Polygon(corners, closed=True, facecolor=GRID, edgecolor=FAINT, lw=0.6, zorder=1))
 
 
-def _colour(way: int) -> str:
-    return {1: FORWARD, -1: BACKWARD}.get(way, FAINT)
+def _colour(direction: int) -> str:
+    return {1: FORWARD, -1: BACKWARD}.get(direction, FAINT)

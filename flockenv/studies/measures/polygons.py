@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from flockenv.core.errors import printable
 from flockenv.geometry.shapes.outlines import area, crossing
 
-__all__ = ["Corners", "valid_polygon", "contains", "is_convex_polygon", "cut", "rectangle"]
+__all__ = ["Corners", "contains", "cut", "is_convex_polygon", "rectangle", "valid_polygon"]
 
 Floats = NDArray[np.float64]
 Corners = list[tuple[float, float]]

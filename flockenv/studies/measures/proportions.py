@@ -11,7 +11,14 @@ from scipy.spatial import cKDTree
 
 from flockenv.geometry.space import Space, Torus
 
-__all__ = ["Proportion", "collision_rate", "oscillation_proportion", "overlap_area", "overlap_proportion", "touching"]
+__all__ = [
+    "Proportion",
+    "collision_rate",
+    "oscillation_proportion",
+    "overlap_area",
+    "overlap_proportion",
+    "touching_pairs",
+]
 
 Floats = NDArray[np.float64]
 
@@ -38,7 +45,7 @@ def overlap_area(distance: ArrayLike, first: ArrayLike, second: ArrayLike) -> Fl
     return np.asarray(np.where(d >= a + b, 0.0, np.where(d <= large - small, np.pi * small**2, lens)))
 
 
-def touching(pos: Floats, radius: Floats, space: Space, margin: float = 0.0) -> tuple[NDArray[np.int64], Floats]:
+def touching_pairs(pos: Floats, radius: Floats, space: Space, margin: float = 0.0) -> tuple[NDArray[np.int64], Floats]:
     """Return the pairs of discs (N, D), m, that overlap, (P, 2), the smaller index first, and their distances, (P,) m.
 
     Radii, (N,) m, are enlarged by a share `margin`, at most .001.
@@ -61,7 +68,7 @@ def overlap_proportion(pos: ArrayLike, radius: ArrayLike, space: Space, alive: A
     """
     total, many, seen, people = 0.0, 0, 0, 0
     for where, size, _ in _instants(pos, radius, alive):
-        pairs, far = touching(where, size, space, -ROUNDING)
+        pairs, far = touching_pairs(where, size, space, -ROUNDING)
         a, b = size[pairs[:, 0]], size[pairs[:, 1]]
         least = np.pi * np.minimum(a, b) ** 2
         # a point inside a body overlaps it entirely
@@ -81,12 +88,12 @@ def oscillation_proportion(vel: ArrayLike, desired: ArrayLike, alive: ArrayLike 
     Source: Chraibi, Seyfried, Schadschneider 2010, Phys. Rev. E 82, 046111, S = (|s| - s) / 2 with s = v . v0 / |v0|^2.
     """
     v = np.asarray(vel, np.float64)
-    wish = np.broadcast_to(np.asarray(desired, np.float64), v.shape)
-    square = (wish**2).sum(axis=-1)
+    v0 = np.broadcast_to(np.asarray(desired, np.float64), v.shape)
+    square = (v0**2).sum(axis=-1)
     here = square > 0
     if alive is not None:
         here = here & np.asarray(alive, np.bool_)
-    s = (v * wish).sum(axis=-1)[here] / square[here]
+    s = (v * v0).sum(axis=-1)[here] / square[here]
     back = -s[s < 0]
     return Proportion(float(back.mean()) if len(back) else 0.0, len(back) / len(s) if len(s) else np.nan)
 
@@ -103,7 +110,7 @@ def collision_rate(
     before: set[int] | None = None
     began, lived, count = 0, 0.0, len(np.asarray(radius))
     for k, (where, size, who) in enumerate(_instants(pos, radius, alive)):
-        pairs = who[touching(where, size, space, ROUNDING)[0]]
+        pairs = who[touching_pairs(where, size, space, ROUNDING)[0]]
         now = set((pairs[:, 0] * count + pairs[:, 1]).tolist())
         if before is not None:
             began += len(now - before)

@@ -52,7 +52,7 @@ def crossings(
     Raises ValueError if shapes do not match, the line has length 0, or times do not increase.
     """
     when, where = np.asarray(time, np.float64), np.asarray(pos, np.float64)
-    ends = _checked_line(line)
+    ends = _check_line(line)
     if where.ndim != 3 or where.shape[2] != 2 or when.shape != where.shape[:1]:
         raise ValueError(f"pos: of shape {where.shape}, time of {when.shape}: must be (T, N, 2) and (T,)")
     if (np.diff(when) <= 0).any():
@@ -66,7 +66,7 @@ def crossings(
         moved = there[at][1:] & there[at][:-1]
         if same is not None:
             moved &= same[at][1:] == same[at][:-1]
-        found += _crossed(when[at], where[at], ends, moved, around)
+        found += _crossings_between(when[at], where[at], ends, moved, around)
     times, agents, signs = (np.concatenate(each) for each in zip(*found, strict=True)) if found else _NOBODY
     order = np.lexsort((agents, times))
     return Crossings(times[order], agents[order], signs[order])
@@ -75,22 +75,22 @@ def crossings(
 _NOBODY = (np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
-def _crossed(
+def _crossings_between(
     time: Floats, pos: Floats, line: Floats, moved: NDArray[np.bool_], period: Floats
 ) -> list[tuple[Floats, NDArray[np.int64], NDArray[np.int64]]]:
     """Return times, agents and signs of crossings of the line and of its images, over some instants."""
-    way = pos[1:] - pos[:-1]
-    way -= period * np.round(way / np.where(period > 0, period, np.inf))
+    move = pos[1:] - pos[:-1]
+    move -= period * np.round(move / np.where(period > 0, period, np.inf))
     begin, along = pos[:-1], line[1] - line[0]
     found = []
     for shift in product(*[(0, -1, 1) if length > 0 else (0,) for length in period]):
         first, second = line + np.array(shift) * period
         to = begin - first
         side = along[0] * to[..., 1] - along[1] * to[..., 0]
-        then = side + along[0] * way[..., 1] - along[1] * way[..., 0]
+        then = side + along[0] * move[..., 1] - along[1] * move[..., 0]
         k, i = np.nonzero(((side >= 0) != (then >= 0)) & moved)
         share = side[k, i] / (side[k, i] - then[k, i])
-        place = begin[k, i] + share[:, None] * way[k, i]
+        place = begin[k, i] + share[:, None] * move[k, i]
         on = ((place - first) @ along >= 0) & ((place - second) @ along < 0)
         k, i, share = k[on], i[on], share[on]
         sign = np.where(side[k, i] >= 0, 1, -1)
@@ -98,7 +98,7 @@ def _crossed(
     return found
 
 
-def _checked_line(line: ArrayLike) -> Floats:
+def _check_line(line: ArrayLike) -> Floats:
     ends = np.asarray(line, np.float64)
     if ends.shape != (2, 2) or not np.isfinite(ends).all() or (ends[0] == ends[1]).all():
         raise ValueError(f"line = {ends.tolist()}: must be two different ends (x, y), all finite")

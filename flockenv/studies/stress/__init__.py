@@ -18,10 +18,19 @@ from flockenv.studies.stress.gatherings import GATHERINGS
 from flockenv.studies.stress.heaps import HEAPS
 from flockenv.studies.stress.impacts import IMPACTS
 from flockenv.studies.stress.runner import fingerprint, run, usual_methods
-from flockenv.studies.trial_log import VERDICTS, Case, Finding, Results, Value, cases_named, trials
+from flockenv.studies.trial_log import VERDICTS, Case, Finding, Results, Value, select_cases, trials
 
 __all__ = [
-    "CASES", "VERDICTS", "Case", "Finding", "Results", "Value", "cases_named", "fingerprint", "run", "trials",
+    "CASES",
+    "VERDICTS",
+    "Case",
+    "Finding",
+    "Results",
+    "Value",
+    "fingerprint",
+    "run",
+    "select_cases",
+    "trials",
     "usual_methods",
 ]  # fmt: skip
 

@@ -21,7 +21,7 @@ from flockenv.physics.effects import Attraction, Carried, Drag, Gravity, Swing, 
 from flockenv.physics.integrators import Adaptive, Integrator
 from flockenv.scene import Group, Scene
 from flockenv.scene.stability import amplification, limit
-from flockenv.studies.stress.setup import quietly, started
+from flockenv.studies.stress.setup import collect_step_warnings, start_with
 from flockenv.studies.trial_log import Case, Value
 
 __all__ = ["BODIES"]
@@ -33,7 +33,7 @@ O2 = (0.0, 0.0)
 W = 2 * math.pi
 
 
-def body(
+def one_body_scene(
     method: Integrator, dt: float, *, stiffness: float = 0.0, damping: float = 0.0, swing: float = 0.0,
     push: float = 0.0, period: float = 1.0, gravity: float = 0.0, drag: float = 0.0, orbit: float = 0.0,
 ) -> Scene:  # fmt: skip
@@ -46,9 +46,9 @@ def body(
     return Scene(groups=ONE, effects=effects, integrator=method, dt=dt)
 
 
-def ended(scene: Scene, pos: Any, vel: Any, steps: int) -> tuple[Floats, Floats]:
+def end_state(scene: Scene, pos: Any, vel: Any, steps: int) -> tuple[Floats, Floats]:
     """Return position and velocity of the one body after some steps, (2,) each."""
-    end = scene.run(started(scene, [pos], [vel]), steps)
+    end = scene.run(start_with(scene, [pos], [vel]), steps)
     return np.asarray(end.pos[0, 0]), np.asarray(end.vel[0, 0])
 
 
@@ -70,7 +70,7 @@ PRINTED: dict[str, Callable[[float, int], tuple[float, float]]] = {
 def oscillator(method: Integrator) -> Value:
     """100 periods at 100 steps each: the energy is that of the method's formula, or of its own amplification."""
     y, steps = W / 100, 10_000
-    x, v = ended(body(method, 0.01, stiffness=W * W), (1.0, 0.0), O2, steps)
+    x, v = end_state(one_body_scene(method, 0.01, stiffness=W * W), (1.0, 0.0), O2, steps)
     found = float(v @ v + W * W * x @ x) / W**2
     if method.kind in PRINTED:
         low, high = PRINTED[method.kind](y, steps)
@@ -95,7 +95,7 @@ def _slope(make: Callable[[float], Scene], end: Floats, begin: tuple[Any, Any], 
     counts = [20 * 2**k for k in range(6)]
     errors = []
     for n in counts:
-        x, v = ended(make(seconds / n), *begin, n)
+        x, v = end_state(make(seconds / n), *begin, n)
         errors.append(float(np.linalg.norm(np.concatenate([x, v]) - end)))
     kept = np.array(errors) > 1e-11
     if kept.sum() < 4:
@@ -118,21 +118,22 @@ def orders(method: Integrator) -> Value:
     x, v = damped(seconds)
     found = {
         "damped": _slope(
-            lambda dt: body(method, dt, stiffness=W * W, damping=2 * zeta * W),
+            lambda dt: one_body_scene(method, dt, stiffness=W * W, damping=2 * zeta * W),
             np.array([x, 0, v, 0]), ((1.0, 0.0), O2), seconds,
         ),
         "forced": _slope(
-            lambda dt: body(method, dt, stiffness=9.0, push=1.0, period=math.pi),
+            lambda dt: one_body_scene(method, dt, stiffness=9.0, push=1.0, period=math.pi),
             np.array([
                 (math.cos(2 * 1.7) - math.cos(3 * 1.7)) / 5, 0,
                 (3 * math.sin(3 * 1.7) - 2 * math.sin(2 * 1.7)) / 5, 0,
             ]), (O2, O2), 1.7,
         ),
         "pendulum": _slope(
-            lambda dt: body(method, dt, swing=9.81), _pendulum(1.3), ((1.0, 0.0), O2), 1.3
+            lambda dt: one_body_scene(method, dt, swing=9.81), _pendulum(1.3), ((1.0, 0.0), O2), 1.3
         ),
         "projectile": _slope(
-            lambda dt: body(method, dt, gravity=9.81, drag=0.2), _projectile(1.3, 0.2), (O2, (10.0, 15.0)), 1.3
+            lambda dt: one_body_scene(method, dt, gravity=9.81, drag=0.2), _projectile(1.3, 0.2), (O2, (10.0, 15.0)),
+            1.3,
         ),
     }  # fmt: skip
     off = max((abs(s - method.order_with_drag) for s in found.values() if s == s), default=0.0)
@@ -162,29 +163,29 @@ def _projectile(t: float, k: float) -> Floats:
 def threshold(method: Integrator) -> Value:
     """Bounded at .99 of the largest stable step for 100,000 steps, and reported at 1.01."""
     if not math.isfinite(limit(method, 0.0)):
-        scene = body(method, 1.0, stiffness=100.0**2)
-        x, _ = ended(scene, (1.0, 0.0), O2, 300)
+        scene = one_body_scene(method, 1.0, stiffness=100.0**2)
+        x, _ = end_state(scene, (1.0, 0.0), O2, 300)
         return Value(math.inf, abs(float(x[0])) <= 2.0, "no limit: bounded at h w = 100")
-    told = []
+    notes = []
     for zeta in (0.0, 1.0):
         most = limit(method, zeta)
         if most < 0.1:
-            told.append(f"zeta = {zeta:g}: none")  # it grows at every step, but slowly: see N01
+            notes.append(f"zeta = {zeta:g}: none")  # it grows at every step, but slowly: see N01
             continue
-        inside = body(method, 0.99 * most, stiffness=1.0, damping=2 * zeta)
-        x, _ = ended(inside, (1.0, 0.0), O2, 100_000)
+        inside = one_body_scene(method, 0.99 * most, stiffness=1.0, damping=2 * zeta)
+        x, _ = end_state(inside, (1.0, 0.0), O2, 100_000)
         if not abs(float(x[0])) < 1e3:
             return Value(most, False, f"zeta = {zeta:g}: {x[0]:.3g} m at .99 of the limit {most:.4g}")
-        with quietly() as caught:
-            outside = body(method, 1.01 * most, stiffness=1.0, damping=2 * zeta)
+        with collect_step_warnings() as caught:
+            outside = one_body_scene(method, 1.01 * most, stiffness=1.0, damping=2 * zeta)
             try:
-                ended(outside, (1.0, 0.0), O2, 400_000)
+                end_state(outside, (1.0, 0.0), O2, 400_000)
                 return Value(most, False, f"zeta = {zeta:g}: not reported at 1.01 of the limit {most:.4g}")
             except SimulationDiverged as error:
-                told.append(f"zeta = {zeta:g}: {most:.4g}, reported after step {error.step}, warned: {bool(caught)}")
+                notes.append(f"zeta = {zeta:g}: {most:.4g}, reported after step {error.step}, warned: {bool(caught)}")
                 if not caught:
-                    return Value(most, False, told[-1])
-    return Value(limit(method, 0.0), True, "largest h w: " + "; ".join(told))
+                    return Value(most, False, notes[-1])
+    return Value(limit(method, 0.0), True, "largest h w: " + "; ".join(notes))
 
 
 # --- N04: an orbit ---------------------------------------------------------------------------------------------------
@@ -199,8 +200,8 @@ ORBIT = {
 def orbit(method: Integrator) -> Value:
     """Kepler, e = .6, 1,000 steps per period: the energy over 100 periods (10 where equations are solved)."""
     periods = 10 if method.solves else 100
-    scene = body(method, 2 * math.pi / 1000, orbit=1.0)
-    state = started(scene, [(0.4, 0.0)], [(0.0, 2.0)])
+    scene = one_body_scene(method, 2 * math.pi / 1000, orbit=1.0)
+    state = start_with(scene, [(0.4, 0.0)], [(0.0, 2.0)])
     energy, spin, before = 0.0, 0.0, _constants(state)
     for _ in range(20 * periods):
         state = scene.run(state, 50)
@@ -229,7 +230,7 @@ def tracer(method: Integrator) -> Value:
     dt = 2 * math.pi * R / speed / 200
     effects = (Vortex(strength=PHI, centre=O2, maximum=MOST, acts="medium"), Carried())
     scene = Scene(groups=ONE, effects=effects, integrator=method, dt=dt)
-    end = scene.run(started(scene, [(R, 0.0)], [O2]), 2000)
+    end = scene.run(start_with(scene, [(R, 0.0)], [O2]), 2000)
     radius = float(np.linalg.norm(end.pos[0, 0]))
     if method.order == 1 and not method.solves:
         square = R * R
@@ -250,9 +251,9 @@ def stiff_drag(share: float) -> Callable[[Integrator], Value]:
 
     def trial(method: Integrator) -> Value:
         dt = 0.5
-        with quietly() as caught:
-            scene = body(method, dt, drag=share / dt)
-            state, speeds = started(scene, [O2], [(10.0, 0.0)]), [10.0]
+        with collect_step_warnings() as caught:
+            scene = one_body_scene(method, dt, drag=share / dt)
+            state, speeds = start_with(scene, [O2], [(10.0, 0.0)]), [10.0]
             for _ in range(50):
                 state = scene.step(state)
                 speeds.append(float(state.vel[0, 0, 0]))
@@ -272,10 +273,10 @@ def stiff_drag(share: float) -> Callable[[Integrator], Value]:
 
 def in_the_centre(method: Integrator) -> Value:
     """At rest exactly in the centre of an attraction, of a spring and of a vortex: nothing has a direction there."""
-    x, v = ended(body(method, 0.05, stiffness=4.0, orbit=3.0), O2, O2, 100)
+    x, v = end_state(one_body_scene(method, 0.05, stiffness=4.0, orbit=3.0), O2, O2, 100)
     effects = (Vortex(strength=PHI, centre=O2, maximum=MOST, acts="medium"), Carried())
     scene = Scene(groups=ONE, effects=effects, integrator=method, dt=0.05)
-    end = scene.run(started(scene, [O2], [O2]), 100)
+    end = scene.run(start_with(scene, [O2], [O2]), 100)
     far = float(np.abs(np.concatenate([x, v, end.pos[0, 0], end.vel[0, 0]])).max())
     return Value(far, far == 0.0, "stays where it is")
 
@@ -296,7 +297,7 @@ def approach(speed: float, tau: float, decay: float) -> Callable[[Integrator], V
             Uniform(strength=(speed / tau, 0.0)), Drag(rate=1 / tau),
         )  # fmt: skip
         scene = Scene(groups=ONE, effects=effects, integrator=method, dt=0.01)
-        state, speeds = started(scene, [(-4.0, 0.0)], [(speed, 0.0)]), []
+        state, speeds = start_with(scene, [(-4.0, 0.0)], [(speed, 0.0)]), []
         for _ in range(500):
             state = scene.run(state, 4)
             speeds.append(float(state.vel[0, 0, 0]))
@@ -328,7 +329,7 @@ def _bounce(method: Integrator, dt: float, height: float) -> tuple[float, float,
     group = (Group(count=1, radius=0.0, spawn=Spawn(low=(0, 0), high=(1, 1))),)
     room = Box(size=(2.0, 50.0), restitution=0.8)
     scene = Scene(space=room, groups=group, effects=(Gravity(),), integrator=method, dt=dt)
-    state, low, rest = started(scene, [(1.0, height)], [O2]), 0.0, math.inf
+    state, low, rest = start_with(scene, [(1.0, height)], [O2]), 0.0, math.inf
     expected = math.sqrt(2 * height / 9.81) * (1 + 0.8) / (1 - 0.8)
     for k in range(math.ceil(1.1 * expected / dt)):
         state = scene.step(state)

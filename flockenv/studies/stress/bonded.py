@@ -19,7 +19,9 @@ G = 9.81
 FRAME = 1 / 60  # s
 
 
-def hanging(method: Integrator, network: Network, stiffness: float, dt: float, each: float, damping: float) -> Scene:
+def hanging_scene(
+    method: Integrator, network: Network, stiffness: float, dt: float, each: float, damping: float
+) -> Scene:
     """Return a network in 3-D under gravity: one set of laws for all cases of this file."""
     effects = (Springs(stiffness=stiffness, damping=damping), Gravity(acceleration=(0.0, 0.0, -G)))
     group = Group(network=network, mass=each)
@@ -31,11 +33,11 @@ def cloth(stiffness: float, steps: int = 20) -> Callable[[Integrator], Value]:
 
     def trial(method: Integrator) -> Value:
         sheet = Cloth(cells=(19, 19), edges=((1, 0, 0), (0, 1, 0)), pinned=("top",))
-        scene = hanging(method, sheet, stiffness, FRAME, each=1 / 400, damping=0.0)
+        scene = hanging_scene(method, sheet, stiffness, FRAME, each=1 / 400, damping=0.0)
         state, most = scene.start(0), 0.0
         for _ in range(steps):
             state = scene.step(state)
-            most = max(most, _energy(scene, state) / max(_fallen(scene, state), 1e-12))
+            most = max(most, _energy(scene, state) / max(_work_of_gravity(scene, state), 1e-12))
         newton, linear = state.count_of("newton_iterations"), state.count_of("linear_iterations")
         note = f"energy at most {most:.3g} of the work of gravity"
         if newton:
@@ -56,7 +58,7 @@ def _energy(scene: Scene, state: State) -> float:
     return float(elastic[0] + 0.5 * (mass * (state.vel[0] ** 2).sum(axis=1)).sum())
 
 
-def _fallen(scene: Scene, state: State) -> float:
+def _work_of_gravity(scene: Scene, state: State) -> float:
     """Return the work of gravity since all particles were at height 0, J."""
     mass = np.where(np.isfinite(scene.body.mass), scene.body.mass, 0.0)
     return float(-G * (mass * state.pos[0, :, 2]).sum())
@@ -66,7 +68,7 @@ def chain(method: Integrator) -> Value:
     """A damped chain of ten links comes to rest at N L + (m g / k) N (N + 1) / 2 = 1.1348875 m."""
     rope = Rope(links=10, length=1.0, direction=(0, 0, -1), pinned=("start",))
     dt, steps = (0.05, 400) if method.solves else (0.004, 8000)
-    scene = hanging(method, rope, 400.0, dt, each=0.1, damping=2.0)
+    scene = hanging_scene(method, rope, 400.0, dt, each=0.1, damping=2.0)
     end = scene.run(scene.start(0), steps)
     long = float(-end.pos[0, -1, 2])
     return Value(long, abs(long - 1.1348875) <= 1e-4, f"{long:.7f} m")
@@ -76,9 +78,9 @@ def far_away(method: Integrator) -> Value:
     """The same swinging chain at 0, 1e4 and 1e7 m from the origin, in float64."""
     found = []
     for offset in (0.0, 1e4, 1e7):
-        start, way = (offset, -offset, offset), (1.0, 0.0, 0.2)
-        rope = Rope(links=10, length=1.0, start=start, direction=way, pinned=("start",))
-        scene = hanging(method, rope, 400.0, 0.004, each=0.1, damping=0.5)
+        start, direction = (offset, -offset, offset), (1.0, 0.0, 0.2)
+        rope = Rope(links=10, length=1.0, start=start, direction=direction, pinned=("start",))
+        scene = hanging_scene(method, rope, 400.0, 0.004, each=0.1, damping=0.5)
         end = scene.run(scene.start(0), 100)
         found.append(end.pos[0] - np.array(start))
     off = max(float(np.abs(other - found[0]).max()) for other in found[1:])

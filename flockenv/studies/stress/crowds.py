@@ -8,7 +8,7 @@ from flockenv.behaviours import Alignment, Cohesion, Separation
 from flockenv.geometry.space import Torus
 from flockenv.physics.integrators import Adaptive, Integrator
 from flockenv.scene import Group, Scene
-from flockenv.studies.stress.setup import started
+from flockenv.studies.stress.setup import start_with
 from flockenv.studies.trial_log import Case, Value
 
 __all__ = ["CROWDS"]
@@ -30,7 +30,7 @@ def in_one_place(method: Integrator) -> Value:
     scene = flock(method, 52, together=0.0)  # separation alone conserves momentum
     pos = np.full((52, 2), 10.0)
     pos[50:] = 30.0, 20.0
-    end = scene.run(started(scene, pos, np.zeros((52, 2))), 50)
+    end = scene.run(start_with(scene, pos, np.zeros((52, 2))), 50)
     momentum = float(np.abs(end.vel[0].sum(axis=0)).max())
     gaps = np.linalg.norm(scene.space.displacement(end.pos[0, :, None], end.pos[0, None]), axis=2)
     least = float(gaps[~np.eye(52, dtype=bool)].min())
@@ -41,7 +41,7 @@ def in_one_place(method: Integrator) -> Value:
 def at_rest_and_alone(method: Integrator) -> Value:
     """Two agents with opposite headings, and one alone at rest: no NaN, and no force along +x (N10)."""
     scene = flock(method, 3)
-    start = started(scene, [(10, 10), (11, 10), (30, 30)], [(0, 1.0), (0, -1.0), (0, 0)])
+    start = start_with(scene, [(10, 10), (11, 10), (30, 30)], [(0, 1.0), (0, -1.0), (0, 0)])
     end = scene.run(start, 50)
     lone = float(np.abs(end.vel[0, 2]).max())
     drift = float(np.abs(end.vel[0, :2].sum(axis=0)).max())
@@ -52,16 +52,16 @@ def seam(method: Integrator) -> Value:
     """A pair across the edge moves as in the middle; all agents stay in [0, L), also one at -1e-17."""
     scene, rng = flock(method, 12), np.random.default_rng(0)
     pos, vel = rng.uniform(15, 25, (12, 2)), rng.normal(size=(12, 2))
-    one = scene.run(started(scene, pos, vel), 60)
+    one = scene.run(start_with(scene, pos, vel), 60)
     worst, inside = 0.0, True
     for shift in ((20.0, 0.0), (-20.0, 20.0), (17.3, -22.9)):
         moved = (pos + shift) % EDGE
-        other = scene.run(started(scene, moved, vel), 60)
+        other = scene.run(start_with(scene, moved, vel), 60)
         apart = scene.space.displacement(one.pos[0] + shift, other.pos[0])
         worst = max(worst, float(np.abs(apart).max()))
         inside &= bool(((other.pos >= 0) & (other.pos < EDGE)).all())
     alone = flock(method, 1)
-    end = alone.step(started(alone, [(-1e-17, EDGE)], [(0.0, 0.0)]))
+    end = alone.step(start_with(alone, [(-1e-17, EDGE)], [(0.0, 0.0)]))
     inside &= bool(((end.pos >= 0) & (end.pos < EDGE)).all())
     bound = method.tolerance if isinstance(method, Adaptive) else 1e-9  # the step taken depends on rounding
     return Value(worst, worst <= bound and inside, f"{worst:.1g} m apart; inside: {inside}")

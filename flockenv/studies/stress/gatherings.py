@@ -15,7 +15,7 @@ from flockenv.physics.constraints import Collisions
 from flockenv.physics.integrators import Integrator
 from flockenv.scene import Group, Scene
 from flockenv.steering.arbitration import Allocation, Blend
-from flockenv.studies.stress.solids import Response, batch, overlap, per_response, solid
+from flockenv.studies.stress.solids import Response, batch, cases_by_response, disc_scene, overlap
 from flockenv.studies.trial_log import Case, Value
 
 __all__ = ["GATHERINGS"]
@@ -45,13 +45,13 @@ def crossing(count: int, circle: float, seconds: float) -> Callable[[Integrator,
         begin = circle * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         state, deep, arrived = batch(scene, begin[None], 0.0), 0.0, np.full(count, np.inf)
         for k in range(round(seconds / scene.dt)):
-            way = -begin - state.pos[0]
-            far = np.linalg.norm(way, axis=1)
+            to_goal = -begin - state.pos[0]
+            far = np.linalg.norm(to_goal, axis=1)
             arrived[(far < R) & np.isinf(arrived)] = (k + 1) * scene.dt
             if np.isfinite(arrived).all():
                 break
-            wish = 1.3 * way / np.maximum(far, 0.5)[:, None] - state.vel[0]
-            state = scene.step(state, drive=(wish / 0.5)[None])
+            change = 1.3 * to_goal / np.maximum(far, 0.5)[:, None] - state.vel[0]
+            state = scene.step(state, drive=(change / 0.5)[None])
             deep = max(deep, overlap(state.pos[0], R) / R)
         there = int(np.isfinite(arrived).sum())
         when = (
@@ -67,15 +67,16 @@ def crossing(count: int, circle: float, seconds: float) -> Callable[[Integrator,
 
 def stalls(method: Integrator) -> Value:
     """An obstacle exactly ahead: a field of force stalls before it, steering to avoid passes (Reynolds 1988)."""
-    ends, aside = [], []
+    ends, offsets = [], []
     for variant in ("force field", "to avoid"):
-        scene = _heading_for((Circle(centre=(6, 0), radius=1),), variant, method)
+        scene = _agent_with_goal((Circle(centre=(6, 0), radius=1),), variant, method)
         end = scene.run(scene.start(0).with_motion(np.zeros((1, 1, 2)), np.zeros((1, 1, 2))), 600)
         ends.append(float(end.pos[0, 0, 0]))
-        aside.append(float(np.abs(end.pos[0, 0, 1])))
-    holds = ends[0] < 5.0 and aside[0] == 0.0 and ends[1] > 7.0
+        offsets.append(float(np.abs(end.pos[0, 0, 1])))
+    holds = ends[0] < 5.0 and offsets[0] == 0.0 and ends[1] > 7.0
     note = (
-        f"after 12 s the field is at x = {ends[0]:.2f} m, {aside[0]:.1g} m aside; to avoid at x = {ends[1]:.2f} m of 12"
+        f"after 12 s the field is at x = {ends[0]:.2f} m, {offsets[0]:.1g} m aside; "
+        f"to avoid at x = {ends[1]:.2f} m of 12"
     )
     return Value(ends[0], holds, note)
 
@@ -84,7 +85,7 @@ def along_a_wall(method: Integrator) -> Value:
     """Parallel to a wall, .4 m beside it: steering to avoid has exactly no force across; a field of force has one."""
     forces = []
     for variant in ("to avoid", "force field"):
-        scene = _heading_for((Polygon(vertices=WALL),), variant, method)
+        scene = _agent_with_goal((Polygon(vertices=WALL),), variant, method)
         state = scene.start(0).with_motion(np.array([[[0.0, 0.0]]]), np.array([[[2.0, 0.0]]]))
         worst = 0.0
         for _ in range(200):
@@ -94,7 +95,7 @@ def along_a_wall(method: Integrator) -> Value:
     return Value(forces[0], forces[0] == 0.0, f"across: {forces[0]:g} m/s^2; a field of force {forces[1]:.2g} m/s^2")
 
 
-def _heading_for(obstacles: tuple[Circle | Polygon, ...], variant: str, method: Integrator) -> Scene:
+def _agent_with_goal(obstacles: tuple[Circle | Polygon, ...], variant: str, method: Integrator) -> Scene:
     """Return an agent with a goal 12 m ahead that avoids obstacles; see configs/experiments/avoidance.yaml."""
     seek = Seek(weight=4, target=(12, 0))
     steer = Steer(behaviours=(AvoidObstacles(weight=12, horizon=1, margin=0.05), seek), arbitration=Allocation())
@@ -104,7 +105,7 @@ def _heading_for(obstacles: tuple[Circle | Polygon, ...], variant: str, method: 
     return Scene(groups=(group,), effects=(steer,), obstacles=obstacles, dt=0.02, integrator=method)
 
 
-def _under(scene: Scene, method: Integrator) -> Scene:
+def _with_method(scene: Scene, method: Integrator) -> Scene:
     """Return a scene under another method."""
     return scene.model_copy(update={"integrator": method})
 
@@ -115,7 +116,7 @@ def _under(scene: Scene, method: Integrator) -> Scene:
 def chaos(method: Integrator, response: Response) -> Value:
     """60 discs in a room, 72 worlds: the same bits again and by 4 threads; renumbered within 1e-9, up to which time."""
     room = Block(centre=(0.0, 0.0), size=(8.0, 8.0), hollow=True)
-    scene = solid(method, response, 0.02, count=60, obstacles=(room,), restitution=0.9, pull=(0.0, -1.0))
+    scene = disc_scene(method, response, 0.02, count=60, obstacles=(room,), restitution=0.9, pull=(0.0, -1.0))
     rng = np.random.default_rng(0)
     places = np.stack(np.meshgrid(np.arange(8) - 3.5, np.arange(8) - 3.5), axis=-1).reshape(64, 2)[:60]
     pos = places + rng.uniform(-0.3, 0.3, (72, 60, 2))
@@ -150,7 +151,7 @@ def _crowds() -> Sequence[Case]:
     ):  # fmt: skip
         title = {"pair": "two head-on", "four": "four at a crossing"}.get(name, f"{name} across a circle")
         bound = "pass or told, overlap 5 % R"
-        cases += per_response(f"N11 {name}", title, bound, crossing(count, circle, seconds), methods=ONE)
+        cases += cases_by_response(f"N11 {name}", title, bound, crossing(count, circle, seconds), methods=ONE)
     return cases
 
 
@@ -158,5 +159,5 @@ GATHERINGS = (
     *_crowds(),
     Case("N25 ahead", "an obstacle exactly ahead", "field stalls, steering passes", stalls, ONE),
     Case("N25 wall", "flight along a wall", "force across exactly 0", along_a_wall, ONE),
-    *per_response("N27", "60 discs again; threads; renumbered", "same bits; 1e-9 m for 1 s", chaos, methods=ONE),
+    *cases_by_response("N27", "60 discs again; threads; renumbered", "same bits; 1e-9 m for 1 s", chaos, methods=ONE),
 )

@@ -9,7 +9,7 @@ import numpy as np
 
 from flockenv.geometry.shapes import HalfSpace, Wall
 from flockenv.physics.integrators import Integrator
-from flockenv.studies.stress.solids import Floats, G, Response, batch, overlap, per_response, solid
+from flockenv.studies.stress.solids import Floats, G, Response, batch, cases_by_response, disc_scene, overlap
 from flockenv.studies.trial_log import Value
 
 __all__ = ["HEAPS", "funnel"]
@@ -35,7 +35,7 @@ INFLOW = 15.0  # s, after which no disc is added, and energy may not grow
 def funnel(method: Integrator, response: Response, seconds: float = 60.0, count: int = 1000) -> Value:
     """Discs fall into a funnel and through its gate: overlap, discs through a wall, energy after the inflow."""
     dt = 1 / 480
-    scene = solid(
+    scene = disc_scene(
         method, response, dt, count=count, radius=GRAIN, pull=(0.0, -G), obstacles=ROOM, restitution=0.2, friction=0.3,
         passes=60,
     )  # fmt: skip
@@ -47,7 +47,7 @@ def funnel(method: Integrator, response: Response, seconds: float = 60.0, count:
             pos = state.pos[0].copy()
             walls = min(float(shape.gap(pos).min()) for shape in ROOM)
             deep = max(deep, overlap(pos, GRAIN), GRAIN - walls)
-            lost |= _left(before, pos)
+            lost |= _has_left(before, pos)
             before = pos
         if k % 480 == 479:
             energies.append(float((0.5 * (state.vel[0] ** 2).sum(axis=1) + G * state.pos[0, :, 1]).sum()))
@@ -70,19 +70,19 @@ def _lattice(count: int) -> Floats:
     return np.stack([x, 2.8 + row * 2.2 * GRAIN], axis=1) + off
 
 
-def _left(before: Floats, after: Floats) -> bool:
+def _has_left(before: Floats, after: Floats) -> bool:
     """Return True if a disc has crossed the middle of a wall, or a plane, between two instants."""
     out = (np.abs(after[:, 0]) > 2.5) | (after[:, 1] < 0)
     for shape in SIDES:
         corners = np.array(shape.vertices)
         for a, b in itertools.pairwise(corners):
-            way = after - before
-            crosses = _turn(b - a, before - a) * _turn(b - a, after - a) < 0
-            out |= crosses & (_turn(way, a - before) * _turn(way, b - before) < 0)
+            move = after - before
+            crosses = _cross(b - a, before - a) * _cross(b - a, after - a) < 0
+            out |= crosses & (_cross(move, a - before) * _cross(move, b - before) < 0)
     return bool(out.any())
 
 
-def _turn(a: Floats, b: Floats) -> Floats:
+def _cross(a: Floats, b: Floats) -> Floats:
     """Return the cross product a x b of vectors of the plane."""
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
@@ -93,10 +93,10 @@ def _turn(a: Floats, b: Floats) -> Floats:
 def incline(method: Integrator, response: Response) -> Value:
     """Friction .3: stays for 60 s at 16.6 degrees, slides at 16.8 and 30; at 3 m/s with .4 it stops after 1.14679 m."""
     rests = 6.0 if method.solves else 60.0  # s
-    creep = _slid(method, response, 16.6, rests)
-    slow = _slid(method, response, 16.8, 4.0) / (0.5 * _pull(16.8) * 16.0)
-    fast = _slid(method, response, 30.0, 2.0) / (0.5 * _pull(30.0) * 4.0)
-    scene = solid(method, response, 0.005, pull=(0.0, -G), obstacles=(FLOOR,), friction=0.4)
+    creep = _sliding_distance(method, response, 16.6, rests)
+    slow = _sliding_distance(method, response, 16.8, 4.0) / (0.5 * _pull(16.8) * 16.0)
+    fast = _sliding_distance(method, response, 30.0, 2.0) / (0.5 * _pull(30.0) * 4.0)
+    scene = disc_scene(method, response, 0.005, pull=(0.0, -G), obstacles=(FLOOR,), friction=0.4)
     end = scene.run(batch(scene, [[[0.0, R]]], [[[3.0, 0.0]]]), 400)
     stop, still = float(end.pos[0, 0, 0]), float(np.abs(end.vel[0, 0]).max())
     off = max(abs(stop / 1.1467890 - 1), abs(slow - 1), abs(fast - 1))
@@ -112,12 +112,12 @@ def _pull(degrees: float, friction: float = 0.3) -> float:
     return G * (math.sin(math.radians(degrees)) - friction * math.cos(math.radians(degrees)))
 
 
-def _slid(method: Integrator, response: Response, degrees: float, seconds: float) -> float:
+def _sliding_distance(method: Integrator, response: Response, degrees: float, seconds: float) -> float:
     """Return the distance that a body slides down an incline from rest, m."""
     angle = math.radians(degrees)
     up = np.array([-math.sin(angle), math.cos(angle)])
     ramp = HalfSpace(point=(0.0, 0.0), direction=(float(up[0]), float(up[1])))
-    scene = solid(method, response, 0.01, pull=(0.0, -G), obstacles=(ramp,), friction=0.3)
+    scene = disc_scene(method, response, 0.01, pull=(0.0, -G), obstacles=(ramp,), friction=0.3)
     end = scene.run(batch(scene, [[R * up]], 0.0), round(seconds / scene.dt))
     return float((end.pos[0, 0] - R * up) @ (-math.cos(angle), -math.sin(angle)))
 
@@ -127,7 +127,7 @@ def _slid(method: Integrator, response: Response, degrees: float, seconds: float
 
 def stack(method: Integrator, response: Response) -> Value:
     """A stack of ten discs for 20 s: the largest displacement of a disc, in radii."""
-    scene = solid(method, response, 0.01, count=10, pull=(0.0, -G), obstacles=(FLOOR,), friction=0.3)
+    scene = disc_scene(method, response, 0.01, count=10, pull=(0.0, -G), obstacles=(FLOOR,), friction=0.3)
     begin = np.stack([np.zeros(10), R * (1 + 2 * np.arange(10))], axis=1)
     state, far = batch(scene, begin[None], 0.0), 0.0
     for _ in range(200):
@@ -137,10 +137,12 @@ def stack(method: Integrator, response: Response) -> Value:
 
 
 HEAPS = (
-    *per_response("N22", "incline, friction .3; a stop", "stays at 16.6, slides at 16.8; 1.14679 m +- 1 %", incline),
-    *per_response(
+    *cases_by_response(
+        "N22", "incline, friction .3; a stop", "stays at 16.6, slides at 16.8; 1.14679 m +- 1 %", incline,
+    ),
+    *cases_by_response(
         "N23", "1,000 discs in a funnel for 60 s", "overlap 5 % R, none out, no energy gained", funnel,
         ("impulses",), ("semi_implicit_euler",),
     ),
-    *per_response("P19", "a stack of ten for 20 s", "drift 1 % R", stack),
+    *cases_by_response("P19", "a stack of ten for 20 s", "drift 1 % R", stack),
 )  # fmt: skip

@@ -12,7 +12,7 @@ from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
 from flockenv.physics.integrators import Integrator
 from flockenv.scene import Scene
-from flockenv.studies.stress.solids import Floats, G, Response, batch, overlap, per_response, solid
+from flockenv.studies.stress.solids import Floats, G, Response, batch, cases_by_response, disc_scene, overlap
 from flockenv.studies.trial_log import Value
 
 __all__ = ["IMPACTS"]
@@ -25,7 +25,7 @@ FLOOR = HalfSpace(point=(0.0, 0.0), direction=(0.0, 1.0))
 # --- N05, N06: a ball on a floor --------------------------------------------------------------------------------------
 
 
-def dropped(
+def drop_balls(
     method: Integrator, response: Response, dt: float, e: float, steps: int
 ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
     """Return heights and velocities of sixteen balls after each step, (K, 16), and their starting heights, (16,) m.
@@ -34,7 +34,7 @@ def dropped(
     are those of the lowest point.
     """
     pull = (0.0, -G)
-    scene = solid(method, response, dt, count=PHASES, pull=pull, obstacles=(FLOOR,), restitution=e, agents=False)
+    scene = disc_scene(method, response, dt, count=PHASES, pull=pull, obstacles=(FLOOR,), restitution=e, agents=False)
     begin = 1 + np.arange(PHASES) / PHASES * dt * math.sqrt(2 * G)
     state = batch(scene, np.stack([0 * begin, begin + R], axis=1)[None], 0.0)
     y, v = np.empty((steps, PHASES)), np.empty((steps, PHASES))
@@ -59,7 +59,7 @@ def bouncing(method: Integrator, response: Response) -> Value:
     """e = .8: the tops e^2n h, n <= 4; 4.0637 s until it is at rest; at rest from then on, never below the floor."""
     tops, total, low, moving = 0.0, 0.0, 0.0, 0.0
     for dt in (0.02,) if method.solves else (0.001, 0.005, 0.02):
-        y, v, begin = dropped(method, response, dt, 0.8, round(5.0 / dt))
+        y, v, begin = drop_balls(method, response, dt, 0.8, round(5.0 / dt))
         low = min(low, float(y.min()))
         for ball in range(PHASES):
             found = apexes(y[:, ball])[:4]
@@ -82,7 +82,7 @@ def elastic(method: Integrator, response: Response) -> Value:
     """
     most, least, few, low = 0.0, math.inf, 1000, 0.0
     for dt, seconds in ((0.02, 20.0),) if method.solves else ((0.005, 10.0), (0.02, 96.0)):
-        y, _, begin = dropped(method, response, dt, 1.0, round(seconds / dt))
+        y, _, begin = drop_balls(method, response, dt, 1.0, round(seconds / dt))
         low = min(low, float(y.min()))
         for ball in range(PHASES):
             start = begin[ball], y[0, ball], y[1, ball]
@@ -111,10 +111,10 @@ def bullets(method: Integrator, response: Response) -> Value:
     room = Block(centre=(0.0, 0.0), size=(2 * HALF, 2 * HALF), hollow=True)
     coming = wall.model_copy(update={"velocity": (-50.0, 0.0)})
     found = {
-        "wall": _through(method, response, wall, 0.0),
-        "moving wall": _through(method, response, coming, -50.0),
-        "corner": _out_of(method, response, room),
-        "head-on": _past_each_other(method, response),
+        "wall": _count_passes(method, response, wall, 0.0),
+        "moving wall": _count_passes(method, response, coming, -50.0),
+        "corner": _count_escapes(method, response, room),
+        "head-on": _count_missed_pairs(method, response),
     }
     note = ", ".join(f"{name} {count}" for name, count in found.items())
     return Value(sum(found.values()), not any(found.values()), f"through, of 128 each: {note}")
@@ -126,12 +126,12 @@ def _shots() -> tuple[Floats, Floats]:
     return phase.ravel(), np.stack([np.cos(angle.ravel()), np.sin(angle.ravel())], axis=1)
 
 
-def _through(method: Integrator, response: Response, wall: Shape, speed: float) -> int:
+def _count_passes(method: Integrator, response: Response, wall: Shape, speed: float) -> int:
     """Return the number of discs that get behind a wall that begins at x = 0 and moves at `speed`, m/s."""
-    phase, way = _shots()
-    scene = solid(method, response, FRAME, count=len(phase), obstacles=(wall,), restitution=0.5, agents=False)
-    begin = -way * (SPEED * FRAME * (1.5 + phase[:, None])) - (0.5, 0.0)
-    state = batch(scene, begin[None], (SPEED * way)[None])
+    phase, direction = _shots()
+    scene = disc_scene(method, response, FRAME, count=len(phase), obstacles=(wall,), restitution=0.5, agents=False)
+    begin = -direction * (SPEED * FRAME * (1.5 + phase[:, None])) - (0.5, 0.0)
+    state = batch(scene, begin[None], (SPEED * direction)[None])
     through = np.zeros(len(phase), bool)
     for k in range(30):
         state = scene.step(state, out=state)
@@ -139,13 +139,13 @@ def _through(method: Integrator, response: Response, wall: Shape, speed: float) 
     return int(through.sum())
 
 
-def _out_of(method: Integrator, response: Response, room: Block) -> int:
+def _count_escapes(method: Integrator, response: Response, room: Block) -> int:
     """Return the number of discs that leave a square, shot at and near its corner."""
     phase, _ = _shots()
-    scene = solid(method, response, FRAME, count=len(phase), obstacles=(room,), restitution=1.0, agents=False)
+    scene = disc_scene(method, response, FRAME, count=len(phase), obstacles=(room,), restitution=1.0, agents=False)
     angle = np.arctan2(HALF, HALF) + np.repeat(np.linspace(-0.05, 0.05, len(ANGLES)), PHASES)
-    way = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    state = batch(scene, (-way * phase[:, None] * SPEED * FRAME)[None], (SPEED * way)[None])
+    direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    state = batch(scene, (-direction * phase[:, None] * SPEED * FRAME)[None], (SPEED * direction)[None])
     out = np.zeros(len(phase), bool)
     for _ in range(30):
         state = scene.step(state, out=state)
@@ -153,15 +153,15 @@ def _out_of(method: Integrator, response: Response, room: Block) -> int:
     return int(out.sum())
 
 
-def _past_each_other(method: Integrator, response: Response) -> int:
+def _count_missed_pairs(method: Integrator, response: Response) -> int:
     """Return the number of pairs, head-on at 400 m/s, that pass each other."""
-    scene = solid(method, response, FRAME, masses=(1.0, 1.0), restitution=0.5)
-    phase, way = _shots()
-    far = way * (SPEED * FRAME * (1.5 + phase[:, None]))
-    state = batch(scene, np.stack([-far, far], axis=1), np.stack([SPEED * way, -SPEED * way], axis=1))
+    scene = disc_scene(method, response, FRAME, masses=(1.0, 1.0), restitution=0.5)
+    phase, direction = _shots()
+    far = direction * (SPEED * FRAME * (1.5 + phase[:, None]))
+    state = batch(scene, np.stack([-far, far], axis=1), np.stack([SPEED * direction, -SPEED * direction], axis=1))
     for _ in range(30):
         state = scene.step(state, out=state)
-    apart = ((state.pos[:, 1] - state.pos[:, 0]) * way).sum(axis=1)
+    apart = ((state.pos[:, 1] - state.pos[:, 0]) * direction).sum(axis=1)
     return int((apart <= 0).sum())
 
 
@@ -182,7 +182,7 @@ def cradle(method: Integrator, response: Response) -> Value:
         for turned in (1, -1):
             for dt in (0.001, 0.1):
                 m = np.array(masses[::turned], float)
-                scene = solid(method, response, dt, masses=m.tolist(), restitution=1.0)
+                scene = disc_scene(method, response, dt, masses=m.tolist(), restitution=1.0)
                 x = np.arange(len(m)) * 2.05 * R
                 pos = np.stack([x[::turned], 0 * x], axis=1)
                 vel = np.stack([np.array(before[::turned], float), 0 * x], axis=1)
@@ -200,7 +200,7 @@ def uneven(method: Integrator, response: Response) -> Value:
     energy, momentum = 0.0, 0.0
     for heavy in (1e3, 1e6, 1e9, 1e12):
         for v1, v2 in ((1.0, 0.0), (0.0, -1.0)):
-            scene = solid(method, response, 0.01, masses=(1.0, heavy), restitution=1.0)
+            scene = disc_scene(method, response, 0.01, masses=(1.0, heavy), restitution=1.0)
             m, v = np.array([1.0, heavy]), np.array([[v1, 0.0], [v2, 0.0]])
             end = scene.run(batch(scene, [[[0.0, 0.0], [0.3, 0.0]]], v[None]), 40).vel[0]
             start = m @ v[:, 0] ** 2
@@ -216,7 +216,7 @@ def uneven(method: Integrator, response: Response) -> Value:
 
 def one_place(method: Integrator, response: Response) -> Value:
     """50 discs in one place, at rest: apart after a second, without a preferred direction, momentum kept, no blast."""
-    scene = solid(method, response, 0.02, count=50)
+    scene = disc_scene(method, response, 0.02, count=50)
     state, fast = batch(scene, np.zeros((1, 50, 2)), 0.0), 0.0
     for _ in range(50):
         state = scene.step(state, out=state)
@@ -240,7 +240,7 @@ def one_place(method: Integrator, response: Response) -> Value:
 def gas(method: Integrator, response: Response, offset: float = 0.0, dtype: str = "float64") -> Scene:
     """Return 24 discs in a square room about (offset, -offset)."""
     room = Block(centre=(offset, -offset), size=(3.0, 3.0), hollow=True)
-    scene = solid(method, response, 0.01, count=24, obstacles=(room,), restitution=0.9)
+    scene = disc_scene(method, response, 0.01, count=24, obstacles=(room,), restitution=0.9)
     near = Spawn(low=(offset - 1, -offset - 1), high=(offset + 1, -offset + 1))
     groups = (scene.groups[0].model_copy(update={"spawn": near}),)
     given = {name: getattr(scene, name) for name in ("effects", "obstacles", "integrator", "constraints", "dt")}
@@ -271,11 +271,11 @@ def far_away(method: Integrator, response: Response) -> Value:
 
 
 IMPACTS = (
-    *per_response("N05", "ball, e = .8, 16 phases", "tops 2 %, 4.064 s +- 2 %, then at rest, y >= 0", bouncing),
-    *per_response("N06", "elastic ball, 100 bounces", "top <= 1.01 h; in time: h +- 1e-6", elastic),
-    *per_response("N07", "bullets: wall, moving wall, corner, each other", "0 through, of 16 x 8 each", bullets),
-    *per_response("N08", "cradle; 1, 2, 1 kg; both orders", "velocities, energy, momentum 1e-12", cradle),
-    *per_response("N17", "a gas at 0, 1e4, 1e7 m", "1e-6 m; float32 refused", far_away),
-    *per_response("P24", "1 kg and 1e3 ... 1e12 kg", "energy 1e-12, momentum 1e-15 m2 v", uneven),
-    *per_response("P28", "50 discs in one place", "apart within 1 s, no drift, no direction", one_place),
+    *cases_by_response("N05", "ball, e = .8, 16 phases", "tops 2 %, 4.064 s +- 2 %, then at rest, y >= 0", bouncing),
+    *cases_by_response("N06", "elastic ball, 100 bounces", "top <= 1.01 h; in time: h +- 1e-6", elastic),
+    *cases_by_response("N07", "bullets: wall, moving wall, corner, each other", "0 through, of 16 x 8 each", bullets),
+    *cases_by_response("N08", "cradle; 1, 2, 1 kg; both orders", "velocities, energy, momentum 1e-12", cradle),
+    *cases_by_response("N17", "a gas at 0, 1e4, 1e7 m", "1e-6 m; float32 refused", far_away),
+    *cases_by_response("P24", "1 kg and 1e3 ... 1e12 kg", "energy 1e-12, momentum 1e-15 m2 v", uneven),
+    *cases_by_response("P28", "50 discs in one place", "apart within 1 s, no drift, no direction", one_place),
 )

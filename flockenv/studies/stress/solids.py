@@ -20,7 +20,7 @@ from flockenv.physics.integrators import Integrator
 from flockenv.scene import Group, Scene
 from flockenv.studies.trial_log import Case, Value
 
-__all__ = ["RESPONSES", "Floats", "G", "Response", "batch", "overlap", "per_response", "solid"]
+__all__ = ["RESPONSES", "Floats", "G", "Response", "batch", "cases_by_response", "disc_scene", "overlap"]
 
 Floats = NDArray[np.float64]
 Response = Literal["earliest", "back_up", "impulses", "project"]
@@ -29,7 +29,7 @@ G = 9.81  # m/s^2
 HERE = Spawn(low=(0, 0), high=(1, 1))
 
 
-def solid(
+def disc_scene(
     method: Integrator, response: Response, dt: float, *, masses: Sequence[float] = (1.0,), count: int = 0,
     radius: float = 0.1, pull: tuple[float, float] = (0.0, 0.0), obstacles: Sequence[Shape] = (), **rules: Any,
 ) -> Scene:  # fmt: skip
@@ -58,7 +58,7 @@ def overlap(pos: Floats, radius: float) -> float:
     return float(2 * radius - np.linalg.norm(pos[pairs[:, 0]] - pos[pairs[:, 1]], axis=1).min())
 
 
-def per_response(
+def cases_by_response(
     name: str, title: str, bound: str, trial: Callable[[Integrator, Response], Value],
     responses: Sequence[Response] = RESPONSES, methods: Sequence[str] = (),
 ) -> tuple[Case, ...]:  # fmt: skip

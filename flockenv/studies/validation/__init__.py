@@ -11,15 +11,25 @@ from __future__ import annotations
 
 from flockenv.core.errors import nearest, printable
 from flockenv.scene.presets import PRESETS
-from flockenv.studies.trial_log import VERDICTS, Case, Finding, Results, Value, cases_named, trials
+from flockenv.studies.trial_log import VERDICTS, Case, Finding, Results, Value, select_cases, trials
 from flockenv.studies.validation.alone import ALONE
 from flockenv.studies.validation.corridors import CORRIDORS
 from flockenv.studies.validation.doors import DOORS
 from flockenv.studies.validation.runner import fingerprint, run
 
 __all__ = [
-    "CASES", "VALIDATED", "VERDICTS", "Case", "Finding", "Results", "Value", "cases_named", "fingerprint",
-    "presets_named", "run", "trials",
+    "CASES",
+    "VALIDATED",
+    "VERDICTS",
+    "Case",
+    "Finding",
+    "Results",
+    "Value",
+    "fingerprint",
+    "run",
+    "select_cases",
+    "select_presets",
+    "trials",
 ]  # fmt: skip
 
 CASES: tuple[Case, ...] = (*ALONE, *CORRIDORS, *DOORS)
@@ -29,7 +39,7 @@ VALIDATED = tuple(name for name in PRESETS if name != "moussaid_2010_groups")
 """Every preset of a whole model: the omitted one is moussaid_2009 plus forces that keep groups together."""
 
 
-def presets_named(names: list[str]) -> tuple[str, ...]:
+def select_presets(names: list[str]) -> tuple[str, ...]:
     """Return presets by name or alias (no names: all); raise ValueError with the nearest name for an unknown one."""
     from flockenv.scene.presets import ALIASES
 

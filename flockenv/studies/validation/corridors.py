@@ -32,15 +32,15 @@ from flockenv.studies.validation.walk import (
     STEPS,
     Floats,
     Scenes,
-    filled,
-    nobody,
+    empty_group,
+    filling_grid,
     people,
+    run_walk,
     scene_of,
-    walked,
     wall,
 )
 
-__all__ = ["CORRIDORS", "SCENES", "endless", "lined_up"]
+__all__ = ["CORRIDORS", "SCENES", "endless", "start_on_grid"]
 
 EDGE = 32.0
 """m, size of the torus across the corridor, and least length of one: the largest radius of a preset is 15 m."""
@@ -62,12 +62,12 @@ EACH_WAY = 48
 
 
 def endless(
-    name: str, counts: tuple[int, int], length: float = EDGE, width: float = WIDTH, ways: tuple[int, int] = (1, -1),
-    dense: bool = False,
+    name: str, counts: tuple[int, int], length: float = EDGE, width: float = WIDTH,
+    directions: tuple[int, int] = (1, -1), dense: bool = False,
 ) -> Scene:  # fmt: skip
     """Return two groups in a corridor without ends, each with its direction; dense: with bodies that overlap.
 
-    Each begins in a half of its own; `lined_up` mixes them.
+    Each begins in a half of its own; `start_on_grid` mixes them.
     """
     middle, half = EDGE / 2, length / 2
     groups = []
@@ -80,18 +80,18 @@ def endless(
         if width <= 1:
             begin = {"spawn": Spawn(low=low, high=high, spacing=file, wider=dense, jitter=SHAKEN if dense else 0.0)}
         elif not roomy:
-            begin = {"spawn": filled(count, low, high, people(name, count, low, high).widest)}
+            begin = {"spawn": filling_grid(count, low, high, people(name, count, low, high).widest)}
         groups.append(people(name, count, low, high, **begin))
     if sum(counts) < FEWEST_AGENTS:  # so that small and large crowds share a kernel
-        groups.append(nobody(name, (half, middle), FEWEST_AGENTS - sum(counts)))
-    aims = [Course(group=k, direction=(way, 0)) for k, way in enumerate(ways)]
+        groups.append(empty_group(name, (half, middle), FEWEST_AGENTS - sum(counts)))
+    aims = [Course(group=k, direction=(direction, 0)) for k, direction in enumerate(directions)]
     return scene_of(
-        name, groups, aims, space=Torus(size=(length, EDGE)), obstacles=_sides(length, middle, width),
+        name, groups, aims, space=Torus(size=(length, EDGE)), obstacles=_side_walls(length, middle, width),
         dt=(DENSE if dense else STEPS).get(name, 0.02),
     )  # fmt: skip
 
 
-def _sides(length: float, middle: float, width: float) -> tuple[Wall, ...]:
+def _side_walls(length: float, middle: float, width: float) -> tuple[Wall, ...]:
     """Return both walls, in thirds: on a torus a shape may not be longer than half of it."""
     cuts = np.linspace(0.0, length, 4)
     return tuple(
@@ -101,7 +101,7 @@ def _sides(length: float, middle: float, width: float) -> tuple[Wall, ...]:
     )
 
 
-def lined_up(scene: Scene, length: float, width: float, worlds: int = 1, seed: int = 0) -> State:
+def start_on_grid(scene: Scene, length: float, width: float, worlds: int = 1, seed: int = 0) -> State:
     """Return a start at rest on a grid that fills the corridor; each world has a permutation of its own."""
     count = sum(scene.living)
     rows = max(1, round(np.sqrt(count * width / length)))
@@ -117,21 +117,21 @@ def lined_up(scene: Scene, length: float, width: float, worlds: int = 1, seed: i
     return begin.with_motion(pos, np.zeros_like(pos))
 
 
-def _flowing(name: str, density: float) -> Scene:
+def _one_way_crowd(name: str, density: float) -> Scene:
     """Return a crowd of some density, 1/m^2, with one direction of walking."""
     count = max(100, round(density * EDGE * WIDTH))
     return endless(name, (count // 2, count - count // 2), count / (density * WIDTH), WIDTH, (1, 1), density > 2)
 
 
-def _in_file(name: str, density: float) -> Scene:
+def _single_file(name: str, density: float) -> Scene:
     """Return people in single file, `density` of them per m."""
     count = round(density * EDGE)
     return endless(name, (count // 2, count - count // 2), EDGE, 0.8, (1, 1), density > 1.25)
 
 
 SCENES: Scenes = {
-    "rimea 4": {f"{density:g} per m2": partial(_flowing, density=density) for density in DENSITIES},
-    "rimea 16": {f"{density:g} per m": partial(_in_file, density=density) for density in ALONG},
+    "rimea 4": {f"{density:g} per m2": partial(_one_way_crowd, density=density) for density in DENSITIES},
+    "rimea 16": {f"{density:g} per m": partial(_single_file, density=density) for density in ALONG},
     "lanes": {"": partial(endless, counts=(EACH_WAY, EACH_WAY))},
 }
 """Builders of scenes from a preset's name, by case and by the variant of the scene."""
@@ -144,7 +144,7 @@ def rimea_4(name: str) -> Value:
     for built in SCENES["rimea 4"].values():
         scene = built(name)
         length = scene.space.extent(2)[0]
-        run = walked(scene, SECONDS, every=1.0, begin=lined_up(scene, length, WIDTH))
+        run = run_walk(scene, SECONDS, every=1.0, begin=start_on_grid(scene, length, WIDTH))
         late = run.time > DROPPED
         pos, vel = run.pos[late, 0], run.vel[late, 0]
         means.append(float(vel[..., 0].mean()))
@@ -156,7 +156,9 @@ def rimea_4(name: str) -> Value:
     off = v - weidmann_speed(rho)
     falls = bool((np.diff(v) < 0).all())
     worst = float(off[np.abs(off).argmax()])
-    note = f"v = {_listed(v)} m/s at {_listed(rho)} per m^2; {'falls' if falls else 'does not fall everywhere'}"
+    note = (
+        f"v = {_number_list(v)} m/s at {_number_list(rho)} per m^2; {'falls' if falls else 'does not fall everywhere'}"
+    )
     series = {**cloud, "densities": rho.tolist(), "speeds": v.tolist()}
     return Value(worst, falls and abs(worst) <= 0.25, note, series)
 
@@ -173,30 +175,32 @@ def rimea_16(name: str) -> Value:
     for built in SCENES["rimea 16"].values():
         scene = built(name)
         count = sum(scene.living)
-        run = walked(scene, SECONDS, every=1.0, begin=lined_up(scene, EDGE, 0.8 / 4))
+        run = run_walk(scene, SECONDS, every=1.0, begin=start_on_grid(scene, EDGE, 0.8 / 4))
         means.append(float(run.vel[run.time > DROPPED, 0, :count, 0].mean()))
     rho, v = np.array(ALONG), np.array(means)
     off = v - np.minimum(single_file_speed(rho), 1.34)
     worst = float(off[np.abs(off).argmax()])
     falls = bool((np.diff(v) < 0).all())
-    note = f"v = {_listed(v)} m/s at {_listed(rho)} per m; {'falls' if falls else 'does not fall everywhere'}"
+    note = f"v = {_number_list(v)} m/s at {_number_list(rho)} per m; {'falls' if falls else 'does not fall everywhere'}"
     return Value(worst, falls and abs(worst) <= 0.25, note, {"densities": rho.tolist(), "speeds": v.tolist()})
 
 
-def _listed(values: Floats) -> str:
+def _number_list(values: Floats) -> str:
     return ", ".join(f"{x:.2f}" for x in values)
 
 
 def lanes_of(name: str) -> Value:
     """48 people per direction in a corridor 4 m wide: order above its permutation null, over 20 seeds."""
     scene = SCENES["lanes"][""](name)
-    run = walked(scene, LANE_SECONDS, worlds=LANE_SEEDS, every=1.0, begin=lined_up(scene, EDGE, WIDTH, LANE_SEEDS))
+    run = run_walk(
+        scene, LANE_SECONDS, worlds=LANE_SEEDS, every=1.0, begin=start_on_grid(scene, EDGE, WIDTH, LANE_SEEDS)
+    )
     late = run.time > LANE_SECONDS - LANE_LAST
-    way = np.repeat([1.0, -1.0], EACH_WAY)
+    direction = np.repeat([1.0, -1.0], EACH_WAY)
     low, high = EDGE / 2 - WIDTH / 2, EDGE / 2 + WIDTH / 2
-    found = [lanes(run.pos[late, b, :, 1], way, low, high, deals=100) for b in range(LANE_SEEDS)]
+    found = [lanes(run.pos[late, b, :, 1], direction, low, high, deals=100) for b in range(LANE_SEEDS)]
     above = above_null([f.order for f in found], [f.null for f in found])
-    speed = float((run.vel[late][..., 0] * way).mean())
+    speed = float((run.vel[late][..., 0] * direction).mean())
     note = (
         f"order {np.mean([f.order for f in found]):.3f}, null {np.mean([f.null for f in found]):.3f}; 95 % of the "
         f"excess {above.low:.3f} to {above.high:.3f}; p < .05 in {sum(f.p < 0.05 for f in found)} of {LANE_SEEDS}; "

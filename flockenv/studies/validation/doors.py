@@ -23,13 +23,13 @@ from flockenv.studies.validation.rooms import (
     corner,
     counterflow,
     door_between,
+    is_empty,
     many_rooms,
-    nobody_left,
     public_room,
     room,
-    straight,
+    straight_corridor,
 )
-from flockenv.studies.validation.walk import Floats, Scenes, Walk, walked
+from flockenv.studies.validation.walk import Floats, Scenes, Walk, run_walk
 
 __all__ = ["DATA", "DOORS", "SCENES", "WIDTHS"]
 
@@ -54,16 +54,16 @@ def _room_of_2000(name: str, speed: float) -> Scene:
     return room(name, 200, (15.0, 15.0), 1.0, speed, dt=0.0025)
 
 
-def _shut(name: str, method: Integrator, dt: float) -> Scene:
+def _shut_room(name: str, method: Integrator, dt: float) -> Scene:
     return room(name, 200, (15.0, 15.0), 0.0, 1.5, integrator=method, dt=dt)
 
 
 SCENES: Scenes = {
     "rimea 6": {"": lambda name: corner(name, 20, 2.0, 10.0, 8.0)},
     "rimea 15": {
-        "short": lambda name: straight(name, 100, 4.0, 36.0, 16.0),
+        "short": lambda name: straight_corridor(name, 100, 4.0, 36.0, 16.0),
         "corner": lambda name: corner(name, 100, 4.0, 18.0, 16.0),
-        "long": lambda name: straight(name, 100, 4.0, 44.0, 16.0),
+        "long": lambda name: straight_corridor(name, 100, 4.0, 44.0, 16.0),
     },
     "rimea 9": {f"{doors} doors": partial(public_room, count=1000, doors=doors) for doors in (4, 2)},
     "rimea 12": {f"{width:g} m": partial(bottleneck, width=width) for width in WIDTHS},
@@ -72,13 +72,13 @@ SCENES: Scenes = {
     "nist 5.1": {"": lambda name: room(name, 100, (10.0, 6.0), 1.0)},
     "bursts": {"": lambda name: door_between(name, 48, 1.0)},
     "faster is slower": {f"{speed:g} m per s": partial(_room_of_2000, speed=speed) for speed in FASTER},
-    "pressed fixed": {"": partial(_shut, method=SemiImplicitEuler(), dt=0.005)},
-    "pressed adaptive": {"": partial(_shut, method=DormandPrince(), dt=0.01)},
+    "pressed fixed": {"": partial(_shut_room, method=SemiImplicitEuler(), dt=0.005)},
+    "pressed adaptive": {"": partial(_shut_room, method=DormandPrince(), dt=0.01)},
 }
 """Builders of scenes from a preset's name, by case and by the variant of the scene."""
 
 
-def _through(run: Walk, x: float, half: float, world: int = 0) -> Crossings:
+def _door_crossings(run: Walk, x: float, half: float, world: int = 0) -> Crossings:
     """Return the crossings of x between y = -half and half; forward is to the right."""
     return crossings(run.time, run.pos[:, world], [(x, -half), (x, half)], run.alive[:, world])
 
@@ -90,13 +90,13 @@ def _density(run: Walk, corners: Sequence[tuple[float, float]], world: int = 0) 
     return np.convolve(found, np.full(5, 0.2), "valid")
 
 
-def _left(run: Walk, world: int = 0, share: float = 1.0) -> float:
+def _time_until_out(run: Walk, world: int = 0, share: float = 1.0) -> float:
     """Return the time at which all were out, s, or a share of all; NaN if some of those are still in."""
-    gone = np.sort(run.gone(world)[run.alive[0, world]])  # NaN come last
+    gone = np.sort(run.leaving_times(world)[run.alive[0, world]])  # NaN come last
     return float(gone[math.ceil(share * len(gone)) - 1])
 
 
-def _beyond_walls(scene: Scene, run: Walk) -> int:
+def _count_wall_crossings(scene: Scene, run: Walk) -> int:
     """Return how many paths from one instant to the next cross a wall."""
     many = 0
     for shape in scene.shapes:
@@ -113,8 +113,8 @@ def _beyond_walls(scene: Scene, run: Walk) -> int:
 def rimea_6(name: str) -> Value:
     """20 people around a left corner: all out within 60 s, and none through a wall."""
     scene = SCENES["rimea 6"][""](name)
-    run = walked(scene, 90, until=nobody_left)
-    took, through = _left(run), _beyond_walls(scene, run)
+    run = run_walk(scene, 90, until=is_empty)
+    took, through = _time_until_out(run), _count_wall_crossings(scene, run)
     late = int(run.alive[-1].sum())
     note = f"{through} times through a wall" + (f"; {late} of 20 stuck" if late else "")
     return Value(took, took < 60 and through == 0, note)
@@ -124,9 +124,9 @@ def rimea_15(name: str) -> Value:
     """A crowd around a corner, and along corridors as long as its inner and its outer path."""
     times, note = [], ""
     for what, built in SCENES["rimea 15"].items():
-        run = walked(built(name), 150, until=nobody_left)
+        run = run_walk(built(name), 150, until=is_empty)
         inside = int(run.alive[-1].sum())
-        times.append(_left(run))
+        times.append(_time_until_out(run))
         note += f"{what} {times[-1]:.1f} s, " if not inside else f"{what}: {inside} of 100 stuck, "
     short, around, long = times
     return Value(around, short <= around <= long, note.rstrip(", "))
@@ -139,9 +139,9 @@ def rimea_9(name: str) -> Value:
     """1000 people out of a public room by four doors, and by two."""
     times, most, note = [], [], ""
     for (doors, built), longest in zip(SCENES["rimea 9"].items(), (400.0, 800.0), strict=True):
-        run = walked(built(name), longest, every=0.5, until=nobody_left)
-        times.append(_left(run))
-        most.append(_left(run, share=0.95))
+        run = run_walk(built(name), longest, every=0.5, until=is_empty)
+        times.append(_time_until_out(run))
+        most.append(_time_until_out(run, share=0.95))
         inside = int(run.alive[-1].sum())
         note += f"{doors} {times[-1]:.1f} s; " if not inside else f"{doors}: {inside} stuck; "
     ratio, of_most = times[1] / times[0], most[1] / most[0]
@@ -155,16 +155,16 @@ def rimea_12(name: str) -> Value:
     found, jams, notes, through = [], True, [], 0
     for width, built in zip(WIDTHS, SCENES["rimea 12"].values(), strict=True):
         scene = built(name)
-        run = walked(scene, 300, worlds=SEEDS, until=nobody_left)
+        run = run_walk(scene, 300, worlds=SEEDS, until=is_empty)
         entry, leave, ahead, behind = [], [], [], []
         for b in range(SEEDS):
-            entry.append(flow(_through(run, 2.5, width / 2, b), width, run.time[-1]).passing)
-            leave.append(flow(_through(run, 15.0, width / 2, b), width, run.time[-1]).passing)
+            entry.append(flow(_door_crossings(run, 2.5, width / 2, b), width, run.time[-1]).passing)
+            leave.append(flow(_door_crossings(run, 15.0, width / 2, b), width, run.time[-1]).passing)
             ahead.append(float(np.median(_density(run, ((-2.0, -1.0), (0.0, 1.0)), b)[50:300])))
             behind.append(float(np.median(_density(run, ((13.0, -1.0), (15.0, 1.0)), b)[50:300])))
         found.append(float(np.nan_to_num(np.median(entry))))  # without people that pass the flow is 0
         jams &= bool(np.median(ahead) > np.median(behind) and np.median(entry) - np.median(leave) >= -0.05)
-        stuck, through = int(run.alive[-1].sum()), through + _beyond_walls(scene, run)
+        stuck, through = int(run.alive[-1].sum()), through + _count_wall_crossings(scene, run)
         notes.append(
             f"w = {width:g}: J = {found[-1]:.2f} ({min(entry):.2f}-{max(entry):.2f}), exit {np.median(leave):.2f} /s, "
             f"density before {np.median(ahead):.1f}, before the exit {np.median(behind):.1f} /m2"
@@ -174,13 +174,13 @@ def rimea_12(name: str) -> Value:
     notes.append("grows" if grows else "does not grow")
     notes.append("jam before the bottleneck alone" if jams else "jams elsewhere")
     notes.append(f"{through} times through a wall")
-    off = [_off(j, DATA[w]) for j, w in zip(found, WIDTHS, strict=True)]
+    off = [_excess_over(j, DATA[w]) for j, w in zip(found, WIDTHS, strict=True)]
     worst = max(off, key=abs)
     series = {"width": list(WIDTHS), "flow": found}
     return Value(worst, grows and jams and not through and abs(worst) <= 0.15, "; ".join(notes), series)
 
 
-def _off(flow_: float, band: tuple[float, float]) -> float:
+def _excess_over(flow_: float, band: tuple[float, float]) -> float:
     """Return the excess of a flow over a band as a share of its edge, negative below it; 0 within."""
     low, high = band
     return flow_ / low - 1 if flow_ < low else max(0.0, flow_ / high - 1)
@@ -189,16 +189,18 @@ def _off(flow_: float, band: tuple[float, float]) -> float:
 def nist_3_1(name: str) -> Value:
     """23 people in 12 rooms, two exits: the share that leaves by its assigned exit."""
     scene = SCENES["nist 3.1"][""](name)
-    run = walked(scene, 120, until=nobody_left)
+    run = run_walk(scene, 120, until=is_empty)
     right = np.zeros(23)
     for k in range(23):
         here = np.flatnonzero(run.alive[:, 0, k])[-1]
         right[k] = run.alive[-1, 0, k] == 0 and (run.pos[here, 0, k, 0] > 12) == (k < 15)
     share, inside = 100 * float(right.mean()), int(run.alive[-1].sum())
-    note = f"the last after {_left(run):.1f} s" if not inside else f"{inside} stuck"
+    note = f"the last after {_time_until_out(run):.1f} s" if not inside else f"{inside} stuck"
     wrong = 23 - inside - int(right.sum())
     return Value(
-        share, share == 100, f"{note}; {wrong} by the other exit; {_beyond_walls(scene, run)} times through a wall"
+        share,
+        share == 100,
+        f"{note}; {wrong} by the other exit; {_count_wall_crossings(scene, run)} times through a wall",
     )
 
 
@@ -207,11 +209,11 @@ def nist_5(name: str) -> tuple[Walk, float]:
 
     The room is 10 x 6 m: 8 x 5 m, NIST's and IMO's, has no room for 100 bodies .7 m across.
     """
-    run = walked(SCENES["nist 5.1"][""](name), 200, until=nobody_left)
-    return run, _left(run)
+    run = run_walk(SCENES["nist 5.1"][""](name), 200, until=is_empty)
+    return run, _time_until_out(run)
 
 
-def _out(run: Walk, took: float) -> str:
+def _outcome_text(run: Walk, took: float) -> str:
     """Return, as text, the time at which all were out, or the number of people still in."""
     return f"out after {took:.1f} s" if np.isfinite(took) else f"{int(run.alive[-1].sum())} stuck"
 
@@ -220,16 +222,16 @@ def nist_5_1(name: str) -> Value:
     """The place of the largest density: before the door, or beyond it."""
     run, took = nist_5(name)
     peaks = [float(_density(run, corners).max()) for corners in (((-1.5, -1.0), (0.0, 1.0)), ((0.0, -0.5), (2.0, 0.5)))]
-    note = f"at the door {peaks[0]:.1f}, beyond it {peaks[1]:.1f} per m^2; {_out(run, took)}"
+    note = f"at the door {peaks[0]:.1f}, beyond it {peaks[1]:.1f} per m^2; {_outcome_text(run, took)}"
     return Value(peaks[0] / peaks[1] if peaks[1] else np.inf, peaks[0] > peaks[1], note)
 
 
 def nist_5_2(name: str) -> Value:
     """The flow by a door of 1 m, per metre."""
     run, took = nist_5(name)
-    found = flow(_through(run, 0.0, 0.5), 1.0, run.time[-1])
+    found = flow(_door_crossings(run, 0.0, 0.5), 1.0, run.time[-1])
     verdict = "not above" if found.passing <= 1.33 else "above"
-    return Value(found.passing, None, f"{verdict} IMO's 1.33 /(m s); {_out(run, took)}")
+    return Value(found.passing, None, f"{verdict} IMO's 1.33 /(m s); {_outcome_text(run, took)}")
 
 
 # --- two directions ---------------------------------------------------------------------------------------------------
@@ -239,8 +241,8 @@ def nist_2_8(name: str) -> Value:
     """100 people through a corridor against 0, 10, 50 and 100: the number that comes through."""
     done, last = [], []
     for built in SCENES["nist 2.8"].values():
-        run = walked(built(name), 400, every=0.5, until=nobody_left)
-        gone = run.gone()[:100]
+        run = run_walk(built(name), 400, every=0.5, until=is_empty)
+        gone = run.leaving_times()[:100]
         done.append(int(np.isfinite(gone).sum()))
         last.append(float(np.nanmax(gone)) if done[-1] else float("nan"))
     falls = all(a >= b for a, b in pairwise(done))
@@ -251,10 +253,10 @@ def nist_2_8(name: str) -> Value:
 def door_bursts(name: str) -> Value:
     """48 people per direction through a door of 1 m: bursts longer than those of a coin, over 20 seeds."""
     scene = SCENES["bursts"][""](name)
-    run = walked(scene, 120, worlds=BURST_SEEDS, every=0.2, until=nobody_left)
+    run = run_walk(scene, 120, worlds=BURST_SEEDS, every=0.2, until=is_empty)
     found, nulls, through, stuck = [], [], 0, 0
     for b in range(BURST_SEEDS):
-        crossed = _through(run, 0.0, 0.5, b)
+        crossed = _door_crossings(run, 0.0, 0.5, b)
         through += len(crossed.time)
         stuck += int(run.alive[-1, b].sum())
         both = [crossed.time[crossed.sign == s] for s in (-1, 1)]
@@ -280,8 +282,8 @@ def faster_is_slower(name: str) -> Value:
     """200 people, 15 x 15 m, a door of 1 m: the time of evacuation by desired speed."""
     medians, lows, highs, stuck = [], [], [], 0
     for built in SCENES["faster is slower"].values():
-        run = walked(built(name), 300, worlds=FASTER_SEEDS, every=0.5, until=nobody_left)
-        times = np.array([_left(run, b) for b in range(FASTER_SEEDS)])
+        run = run_walk(built(name), 300, worlds=FASTER_SEEDS, every=0.5, until=is_empty)
+        times = np.array([_time_until_out(run, b) for b in range(FASTER_SEEDS)])
         stuck += int(np.isnan(times).sum())
         times = np.where(np.isnan(times), run.time[-1], times)
         medians.append(float(np.median(times)))
@@ -294,7 +296,7 @@ def faster_is_slower(name: str) -> Value:
     return Value(best, None, note, series)
 
 
-def pressed(how: str) -> Callable[[str], Value]:
+def push_against_door(how: str) -> Callable[[str], Value]:
     """Return the trial of 200 people that push against a shut door for ten minutes: all numbers stay finite."""
 
     def trial(name: str) -> Value:
@@ -335,14 +337,14 @@ DOORS = (
         "pressed fixed",
         "200 people, shut door, semi-implicit: finite for, s",
         "600 s",
-        pressed("fixed"),
+        push_against_door("fixed"),
         (NERVOUS,),
     ),
     Case(
         "pressed adaptive",
         "200 people, shut door, Dormand-Prince: finite for, s",
         "600 s",
-        pressed("adaptive"),
+        push_against_door("adaptive"),
         (NERVOUS,),
     ),
 )

@@ -10,7 +10,7 @@ import numpy as np
 
 from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK
 from flockenv.studies.measures import weidmann_flow, weidmann_speed
-from flockenv.studies.measures.plots import named, new_figure, save
+from flockenv.studies.measures.plots import name_axes, new_figure, save
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -81,7 +81,7 @@ def _write_diagrams(path: Path, found: Sequence[Finding]) -> None:
             _numbers(finding, "densities"), _numbers(finding, "speeds"), "o-", color=_tone(finding.under), ms=4, lw=1,
             zorder=4, label="means",
         )  # fmt: skip
-        named(axes, "density, 1/m²", "speed forward, m/s")
+        name_axes(axes, "density, 1/m²", "speed forward, m/s")
         axes.set_title(f"{_short(finding.under)}: {finding.verdict}", fontsize=8, color=INK)
         axes.set_xlim(0, 5.4)
         axes.set_ylim(-0.6, 1.7)
@@ -116,7 +116,7 @@ def _write_widths(path: Path, found: Sequence[Finding]) -> None:
             _numbers(finding, "width"), _numbers(finding, "flow"), marker=_mark(finding.under), ms=5, lw=1,
             color=_tone(finding.under), label=_short(finding.under), zorder=3,
         )  # fmt: skip
-    named(axes, "width, m", "flow, 1/s")
+    name_axes(axes, "width, m", "flow, 1/s")
     axes.set_ylim(bottom=0)
     axes.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
     save(figure, path)
@@ -161,7 +161,7 @@ def _write_haste(path: Path, found: Sequence[Finding]) -> None:
             speed, time, (time - low, high - time), fmt="o-", color=_tone(finding.under), ms=4, lw=1.2, capsize=2,
             label=_short(finding.under),
         )  # fmt: skip
-    named(axes, "desired speed, m/s", "until all are out, s")
+    name_axes(axes, "desired speed, m/s", "until all are out, s")
     axes.set_ylim(bottom=0)
     axes.legend(fontsize=7.5, frameon=False)
     save(figure, path)

@@ -8,11 +8,11 @@ from contextlib import contextmanager
 
 from flockenv.core.warnings import CoarseContactWarning, UnstableStepWarning
 
-__all__ = ["quietly"]
+__all__ = ["ignore_contact_warnings"]
 
 
 @contextmanager
-def quietly() -> Iterator[None]:
+def ignore_contact_warnings() -> Iterator[None]:
     """Ignore warnings of contacts that a step resolves badly: presets have the time step of their papers."""
     with warnings.catch_warnings():
         for kind in (UnstableStepWarning, CoarseContactWarning):

@@ -18,11 +18,21 @@ from flockenv.physics.effects import Way
 from flockenv.physics.population import Leaving
 from flockenv.physics.population.members import Member
 from flockenv.scene import Group, Scene
-from flockenv.studies.validation.walk import nobody, people, scene_of, wall
+from flockenv.studies.validation.walk import empty_group, people, scene_of, wall
 
 __all__ = [
-    "beside", "bottleneck", "corner", "counterflow", "door_between", "gated", "many_rooms", "nobody_left",
-    "public_room", "room", "straight", "towards",
+    "bottleneck",
+    "corner",
+    "counterflow",
+    "door_between",
+    "goal_region",
+    "group_floor_field",
+    "is_empty",
+    "many_rooms",
+    "public_room",
+    "room",
+    "straight_corridor",
+    "wall_with_doors",
 ]  # fmt: skip
 
 CLEARANCE, SPACING = 0.3, 0.1
@@ -31,7 +41,7 @@ CLEARANCE, SPACING = 0.3, 0.1
 Point = tuple[float, float]
 
 
-def beside(*corners: Point) -> Target:
+def goal_region(*corners: Point) -> Target:
     """Return a goal: a door by its ends, a box by its corners if neither edge is 0."""
     (x, y), (u, v) = corners
     if x == u or y == v:
@@ -39,35 +49,35 @@ def beside(*corners: Point) -> Target:
     return Target(low=(min(x, u), min(y, v)), high=(max(x, u), max(y, v)))
 
 
-def towards(group: int, *targets: Target, spacing: float = SPACING) -> Way:
+def group_floor_field(group: int, *targets: Target, spacing: float = SPACING) -> Way:
     """Return the floor field of a group, to the nearest of some places around all walls."""
     return Way(group=group, targets=targets, clearance=CLEARANCE, spacing=spacing)
 
 
-def nobody_left(state: State) -> bool:
+def is_empty(state: State) -> bool:
     """True if no agent is left in any world."""
     return not bool(state.alive.any())
 
 
 def _scene(
-    name: str, groups: Sequence[Group], ways: Sequence[Sequence[Target]], walls: Sequence[Wall],
+    name: str, groups: Sequence[Group], targets: Sequence[Sequence[Target]], walls: Sequence[Wall],
     sinks: Sequence[Member], spacing: float = SPACING, **fields: Any,
 ) -> Scene:  # fmt: skip
     """Return a scene of two groups, each with its floor field; the second may be one without living agents.
 
     That group has as many slots as make the scene a large one: small and large crowds then share a kernel.
     """
-    everybody, goals = list(groups), [*ways, ways[0]][:2]
+    all_groups, goals = list(groups), [*targets, targets[0]][:2]
     low = groups[0].spawn.low
     assert low is not None
     missing = max(1, FEWEST_AGENTS - sum(group.size for group in groups))
     if len(groups) == 1 or missing > 1:
-        everybody.append(nobody(name, (low[0] + 0.5, low[1] + 0.5), missing))
-    aims = [towards(k, *targets, spacing=spacing) for k, targets in enumerate(goals)]
-    return scene_of(name, everybody, aims, obstacles=tuple(walls), population=tuple(sinks), **fields)
+        all_groups.append(empty_group(name, (low[0] + 0.5, low[1] + 0.5), missing))
+    aims = [group_floor_field(k, *targets, spacing=spacing) for k, targets in enumerate(goals)]
+    return scene_of(name, all_groups, aims, obstacles=tuple(walls), population=tuple(sinks), **fields)
 
 
-def gated(x: float, low: float, high: float, *doors: tuple[float, float]) -> tuple[Wall, ...]:
+def wall_with_doors(x: float, low: float, high: float, *doors: tuple[float, float]) -> tuple[Wall, ...]:
     """Return a wall at x from low to high with doors, each from and to a y, m."""
     ends = [low, *(y for door in sorted(doors) for y in door), high]
     return tuple(wall((x, a), (x, b)) for a, b in zip(ends[::2], ends[1::2], strict=True) if b > a)
@@ -80,9 +90,10 @@ def room(name: str, count: int, size: Point, door: float, speed: Any = None, see
     """
     wide, high = size[0], size[1] / 2
     walls = (
-        wall((0.0, high), (-wide, high), (-wide, -high), (0.0, -high)), *gated(0.0, -high, high, (-door / 2, door / 2)),
+        wall((0.0, high), (-wide, high), (-wide, -high), (0.0, -high)),
+        *wall_with_doors(0.0, -high, high, (-door / 2, door / 2)),
     )  # fmt: skip
-    goal = beside((2.5, -2.0), (3.5, 2.0)) if door else beside((-0.35, -0.5), (-0.35, 0.5))
+    goal = goal_region((2.5, -2.0), (3.5, 2.0)) if door else goal_region((-0.35, -0.5), (-0.35, 0.5))
     changes = {} if speed is None else {"desired_speed": speed}
     group = people(name, count, (-wide + 0.1, -high + 0.1), (-0.3, high - 0.1), **changes)
     out = Leaving(low=(-wide - 1, -high - 1), high=(2.0, high + 1))
@@ -99,7 +110,7 @@ def bottleneck(name: str, width: float, count: int = 150, long: float = 5.0) -> 
     )  # fmt: skip
     group = people(name, count, (-9.9, -4.9), (-0.3, 4.9))
     out = Leaving(low=(-11.0, -6.0), high=(end + 2, 6.0))
-    return _scene(name, [group], [[beside((end + 2.5, -2.0), (end + 3.5, 2.0))]], walls, [out])
+    return _scene(name, [group], [[goal_region((end + 2.5, -2.0), (end + 3.5, 2.0))]], walls, [out])
 
 
 def corner(name: str, count: int, width: float, arm: float, begin: float) -> Scene:
@@ -111,15 +122,15 @@ def corner(name: str, count: int, width: float, arm: float, begin: float) -> Sce
     walls = (wall((0.0, width), (0.0, 0.0), (end, 0.0), (end, end)), wall((0.0, width), (arm, width), (arm, end)))
     group = people(name, count, (0.1, 0.1), (begin, width - 0.1))
     out = Leaving(low=(-1.0, -1.0), high=(end + 1, end))
-    return _scene(name, [group], [[beside((arm + 0.5, end + 1.0), (end - 0.5, end + 2.0))]], walls, [out])
+    return _scene(name, [group], [[goal_region((arm + 0.5, end + 1.0), (end - 0.5, end + 2.0))]], walls, [out])
 
 
-def straight(name: str, count: int, width: float, length: float, begin: float) -> Scene:
+def straight_corridor(name: str, count: int, width: float, length: float, begin: float) -> Scene:
     """Return people in the first metres of a straight corridor along x; people at its end are removed."""
     walls = (wall((length, 0.0), (0.0, 0.0), (0.0, width), (length, width)),)
     group = people(name, count, (0.1, 0.1), (begin, width - 0.1))
     out = Leaving(low=(-1.0, -1.0), high=(length, width + 1))
-    return _scene(name, [group], [[beside((length + 1.0, 0.5), (length + 2.0, width - 0.5))]], walls, [out])
+    return _scene(name, [group], [[goal_region((length + 1.0, 0.5), (length + 2.0, width - 0.5))]], walls, [out])
 
 
 def counterflow(name: str, there: int, back: int) -> Scene:
@@ -132,20 +143,20 @@ def counterflow(name: str, there: int, back: int) -> Scene:
         people(name, there, (-14.9, -4.9), (-5.3, 4.9)), people(name, 100, (5.3, -4.9), (14.9, 4.9), alive=back),
     ]  # fmt: skip
     sinks = [Leaving(group=0, low=(-16.0, -6.0), high=(7.0, 6.0)), Leaving(group=1, low=(-7.0, -6.0), high=(16.0, 6.0))]
-    ways = [[beside((8.0, -4.0), (14.0, 4.0))], [beside((-14.0, -4.0), (-8.0, 4.0))]]
-    return _scene(name, groups, ways, walls, sinks)
+    targets = [[goal_region((8.0, -4.0), (14.0, 4.0))], [goal_region((-14.0, -4.0), (-8.0, 4.0))]]
+    return _scene(name, groups, targets, walls, sinks)
 
 
 def door_between(name: str, each: int, door: float) -> Scene:
     """Return two halves of a room of 16 x 8 m, and people in both that go through a door to the other."""
     walls = (
         wall((-8.0, -4.0), (8.0, -4.0), (8.0, 4.0), (-8.0, 4.0), (-8.0, -4.0)),
-        *gated(0.0, -4.0, 4.0, (-door / 2, door / 2)),
+        *wall_with_doors(0.0, -4.0, 4.0, (-door / 2, door / 2)),
     )  # fmt: skip
     groups = [people(name, each, (-7.9, -3.9), (-0.6, 3.9)), people(name, each, (0.6, -3.9), (7.9, 3.9))]
     sinks = [Leaving(group=0, low=(-9.0, -5.0), high=(3.0, 5.0)), Leaving(group=1, low=(-3.0, -5.0), high=(9.0, 5.0))]
-    ways = [[beside((4.0, -3.0), (7.0, 3.0))], [beside((-7.0, -3.0), (-4.0, 3.0))]]
-    return _scene(name, groups, ways, walls, sinks)
+    targets = [[goal_region((4.0, -3.0), (7.0, 3.0))], [goal_region((-7.0, -3.0), (-4.0, 3.0))]]
+    return _scene(name, groups, targets, walls, sinks)
 
 
 def public_room(name: str, count: int, doors: int) -> Scene:
@@ -157,10 +168,10 @@ def public_room(name: str, count: int, doors: int) -> Scene:
     if doors == 2:
         high = tuple(wall((a, 10.0), (b, 10.0)) for a, b in ((-15.0, -5.0), (-5.0, 5.0), (5.0, 15.0)))
     sides = (wall((-15.0, -10.0), (-15.0, 10.0)), wall((15.0, -10.0), (15.0, 10.0)))
-    ways = [beside((x - 2, s * 12.5), (x + 2, s * 13.5)) for s in (-1, 1)[: doors // 2] for x in at]
+    targets = [goal_region((x - 2, s * 12.5), (x + 2, s * 13.5)) for s in (-1, 1)[: doors // 2] for x in at]
     group = people(name, count, (-14.9, -9.9), (14.9, 9.9))
     out = Leaving(low=(-16.0, -12.0), high=(16.0, 12.0))
-    return _scene(name, [group], [ways], [*low, *high, *sides], [out], spacing=0.15)
+    return _scene(name, [group], [targets], [*low, *high, *sides], [out], spacing=0.15)
 
 
 def many_rooms(name: str) -> Scene:
@@ -180,5 +191,5 @@ def many_rooms(name: str) -> Scene:
         people(name, count, spawn.low or (), spawn.high or (), spawn=spawn)
         for count, spawn in zip((15, 8), begin, strict=True)
     ]
-    ways = [[beside((26.0, -1.0), (27.0, 1.0))], [beside((-3.0, -1.0), (-2.0, 1.0))]]
-    return _scene(name, groups, ways, walls, [Leaving(low=(-1.0, -6.0), high=(25.0, 6.0))])
+    targets = [[goal_region((26.0, -1.0), (27.0, 1.0))], [goal_region((-3.0, -1.0), (-2.0, 1.0))]]
+    return _scene(name, groups, targets, walls, [Leaving(low=(-1.0, -6.0), high=(25.0, 6.0))])

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from flockenv.studies import sources, trial_log
 from flockenv.studies.sources import SIMULATOR
 from flockenv.studies.trial_log import Case, Results
-from flockenv.studies.validation.quiet import quietly
+from flockenv.studies.validation.quiet import ignore_contact_warnings
 
 __all__ = ["fingerprint", "run"]
 
@@ -25,5 +25,5 @@ def run(
     keep: Callable[[Results], None] = lambda results: None,
 ) -> Results:
     """Run every case with every preset, and return the findings with the known ones; see `trial_log.run`."""
-    with quietly():
+    with ignore_contact_warnings():
         return trial_log.run(cases, {name: name for name in presets}, fingerprint(), known, progress, keep)

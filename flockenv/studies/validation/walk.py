@@ -16,7 +16,19 @@ from flockenv.physics.effects import Effect, ObstacleContact
 from flockenv.scene import Group, Scene
 from flockenv.scene.presets import PRESETS, preset
 
-__all__ = ["STEPS", "WEIDMANN", "Scenes", "Walk", "filled", "lane", "nobody", "people", "scene_of", "walked", "wall"]
+__all__ = [
+    "STEPS",
+    "WEIDMANN",
+    "Scenes",
+    "Walk",
+    "empty_group",
+    "filling_grid",
+    "lane",
+    "people",
+    "run_walk",
+    "scene_of",
+    "wall",
+]
 
 Floats = NDArray[np.float64]
 Scenes = Mapping[str, Mapping[str, Callable[[str], Scene]]]
@@ -47,7 +59,7 @@ class Walk(NamedTuple):
     radius: Floats  # (N,) m
     last: State
 
-    def gone(self, world: int = 0) -> Floats:
+    def leaving_times(self, world: int = 0) -> Floats:
         """Return the first instant at which each agent is gone, (N,) s; NaN if it is still there at the end."""
         here = self.alive[:, world]
         last = len(here) - 1 - here[::-1].argmax(axis=0)
@@ -61,11 +73,11 @@ def people(name: str, count: int, low: Sequence[float], high: Sequence[float], *
     """
     fields = {**PRESETS[name].people, "desired_speed": WEIDMANN, **changes}
     if "spawn" not in fields:
-        fields["spawn"] = _apart(count, low, high, Group(count=count, **fields).widest)
+        fields["spawn"] = _widest_grid(count, low, high, Group(count=count, **fields).widest)
     return Group(count=count, **fields)
 
 
-def _apart(count: int, low: Sequence[float], high: Sequence[float], widest: float) -> Spawn:
+def _widest_grid(count: int, low: Sequence[float], high: Sequence[float], widest: float) -> Spawn:
     """Return the widest grid of cells with room for `count`, each at a random place in the middle of a cell.
 
     If bodies are wider than such cells, they begin in the middles of the widest cells possible.
@@ -75,12 +87,12 @@ def _apart(count: int, low: Sequence[float], high: Sequence[float], widest: floa
     while int(wide / spacing + 1e-9) * int(deep / spacing + 1e-9) < count:
         spacing *= 0.995
     if spacing < 2 * widest:
-        return filled(count, low, high, widest)
+        return filling_grid(count, low, high, widest)
     jitter = max(0.0, (spacing / 2 - widest) * 0.9)
     return Spawn(low=tuple(low), high=tuple(high), spacing=float(spacing), jitter=float(jitter))
 
 
-def filled(count: int, low: Sequence[float], high: Sequence[float], widest: float) -> Spawn:
+def filling_grid(count: int, low: Sequence[float], high: Sequence[float], widest: float) -> Spawn:
     """Return a grid of `count` cells that fills a box, with the longest shorter edge.
 
     Bodies are apart if they fit in the cells; else they are up to SHAKEN from the middles of their cells.
@@ -93,7 +105,7 @@ def filled(count: int, low: Sequence[float], high: Sequence[float], widest: floa
     return Spawn(low=tuple(low), high=tuple(high), spacing=spacing, jitter=jitter, wider=room < 0)
 
 
-def nobody(name: str, at: tuple[float, float], count: int) -> Group:
+def empty_group(name: str, at: tuple[float, float], count: int) -> Group:
     """Return a group without living people."""
     return people(name, count, at, at, alive=0, spawn=Spawn(low=at, high=at), desired_speed=1.0)
 
@@ -116,7 +128,7 @@ def scene_of(name: str, groups: Sequence[Group], aims: Sequence[Effect], **field
     return Scene(groups=tuple(groups), effects=(*aims, *model, *solid), **fields)
 
 
-def walked(
+def run_walk(
     scene: Scene, seconds: float, *, seed: int = 0, worlds: int = 1, every: float = 0.1,
     until: Callable[[State], bool] | None = None, begin: State | None = None,
 ) -> Walk:  # fmt: skip
