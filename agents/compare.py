@@ -145,7 +145,7 @@ def players_of(tasks: Sequence[Task], players: Sequence[Player]) -> dict[str, li
     Raises:
         ValueError: a task without a player.
     """
-    fields = {task.name: [player for player in players if not _sits_out(player, task, tasks)] for task in tasks}
+    fields = {task.name: [player for player in players if not _is_left_out(player, task, tasks)] for task in tasks}
     for task, field in fields.items():
         if not field:
             names = ", ".join(player.name for player in players)
@@ -153,7 +153,7 @@ def players_of(tasks: Sequence[Task], players: Sequence[Player]) -> dict[str, li
     return fields
 
 
-def _sits_out(player: Player, task: Task, tasks: Sequence[Task]) -> bool:
+def _is_left_out(player: Player, task: Task, tasks: Sequence[Task]) -> bool:
     """True if it is a hand-written player of other tasks, one of which is played here."""
     of = other_tasks(player.spec, task.name)
     return any(other.name in of for other in tasks)

@@ -94,10 +94,10 @@ class Experiment(Record):
 
     def settings(self) -> dict[str, PpoSettings]:
         """Return all settings of PPO by name: the config's own, and those to compare it with."""
-        others = {name: self._other(name, changes) for name, changes in self.curves.items()}
+        others = {name: self._other_settings(name, changes) for name, changes in self.curves.items()}
         return {AS_CONFIGURED: self.ppo, **others}
 
-    def _other(self, name: str, changes: dict[str, Any]) -> PpoSettings:
+    def _other_settings(self, name: str, changes: dict[str, Any]) -> PpoSettings:
         place = key_path(("curves", name))
         if name == AS_CONFIGURED:
             raise ValueError(f"{place}: that is what the settings under ppo are called; choose another name")

@@ -66,10 +66,10 @@ def side_by_side(work: Callable[[Job, Tell], Done], jobs: Sequence[Job], process
 
 @contextmanager
 def _forward_news(context: Any, tell: Tell) -> Iterator[tuple[Connection, Any, Future[None]]]:
-    """Have what other processes tell passed on by a thread of its own.
+    """Pass the news of other processes on to `tell`, in a thread of its own, while the block lasts.
 
-    Yields where they tell it, the lock that says whose turn it is to speak, and what has an error of `tell`, if it
-    raised one; after that nothing more is passed on.
+    Yields the connection that they send news to, the lock that a process holds while it sends, and a future that has
+    the error of `tell`, if it raised one; after that no more news is passed on.
     """
     receiver, sender = context.Pipe(duplex=False)
     trouble: Future[None] = Future()
@@ -101,7 +101,7 @@ def _forward_news(context: Any, tell: Tell) -> Iterator[tuple[Connection, Any, F
 
 @contextmanager
 def announce_parent() -> Iterator[None]:
-    """Let processes that are started in a block know that they are to end with this one."""
+    """Set the environment so that processes that are started in a block end when this one ends."""
     before = os.environ.get(signals.PARENT)
     os.environ[signals.PARENT] = str(os.getpid())
     try:
@@ -115,7 +115,7 @@ def announce_parent() -> Iterator[None]:
 
 @contextmanager
 def guard_process_starts() -> Iterator[None]:
-    """Start processes that end with this one and do not see Ctrl-C: they inherit what this thread blocks."""
+    """Let processes that are started in a block end with this one and ignore Ctrl-C, by inherited blocked signals."""
     with announce_parent():
         if os.name != "posix":
             yield

@@ -41,7 +41,7 @@ def tables(results: Results) -> str:
         [task, *(_score(about["players"][name]) for name in SHOWN), _lead(about["pairs"]["ppo - rules"])]
         for task, about in results["tasks"].items()
     ]
-    others = list(_others(results))
+    others = list(_other_rows(results))
     return (
         f"{grid(header, rows)}\n\n{grid(['task', 'player', 'score', '`ppo` - player, in the same worlds'], others)}\n"
     )
@@ -51,18 +51,18 @@ def summary(results: Results) -> str:
     """Return README's table: scores at two digits, and success rates below 100 %."""
     header = ["task", *(f"`{name}`" for name in SHOWN), "`ppo` - `rules`"]
     rows = [
-        [task, *(_brief(about["players"][name]) for name in SHOWN), _brief_lead(about["pairs"]["ppo - rules"])]
+        [task, *(_short_score(about["players"][name]) for name in SHOWN), _short_lead(about["pairs"]["ppo - rules"])]
         for task, about in results["tasks"].items()
     ]
     return f"{grid(header, rows)}\n"
 
 
-def _brief(player: Results) -> str:
+def _short_score(player: Results) -> str:
     rate = f"{player['success_rate']:.0%}"
     return _digits(player["iqm"]) if rate == "100%" else f"{_digits(player['iqm'])}, {rate}"
 
 
-def _brief_lead(pair: Results) -> str:
+def _short_lead(pair: Results) -> str:
     return f"{'+' * (pair['difference'] > 0)}{_digits(pair['difference'])}" if pair["separated"] else "level"
 
 
@@ -71,7 +71,7 @@ def _digits(value: float) -> str:
     return f"{float(f'{value:.2g}'):g}"
 
 
-def _others(results: Results) -> Iterator[list[str]]:
+def _other_rows(results: Results) -> Iterator[list[str]]:
     for task, about in results["tasks"].items():
         for name, player in about["players"].items():
             if name not in SHOWN:

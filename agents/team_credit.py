@@ -45,9 +45,9 @@ class CaringBuffer(RolloutBuffer):
         super().add(*args)
 
     def compute_returns_and_advantage(self, last_values: torch.Tensor, dones: np.ndarray) -> None:
-        """Find everybody's own advantages and returns (what critics learn), and share the advantages."""
+        """Compute each learner's own advantages and returns (which critics learn), then share the advantages."""
         super().compute_returns_and_advantage(last_values, dones)
         own = np.where(self.acted, self.advantages, np.float32(0))
-        everybody = own.reshape(self.buffer_size, -1, self.learners).sum(axis=2)
-        others = np.repeat(everybody, self.learners, axis=1) - own
+        team = own.reshape(self.buffer_size, -1, self.learners).sum(axis=2)
+        others = np.repeat(team, self.learners, axis=1) - own
         self.advantages = np.where(self.acted, own + np.float32(self.care) * others, np.float32(0))

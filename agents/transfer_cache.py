@@ -201,20 +201,20 @@ def play_again(plan: Plan) -> dict[str, Cell]:
 
 
 def run_clock(plan: Plan, rounds: int) -> Clock:
-    """Replay the same actions under every setting: where they lead, and in each round how long a step takes.
+    """Replay the same actions under every setting; return the position errors, and the time of a decision per round.
 
-    A round goes through all settings, so that whatever else the machine does meets each of them alike; rounds that are
+    A round goes through all settings, so that other work of the machine affects each of them alike; rounds that are
     kept are not run again.
     """
     path, clock = _clock_path(plan), _read_clock(plan)
     if len(clock.rounds) >= rounds:
         return clock
-    actions = _actions(plan)
+    actions = _pilot_actions(plan)
     if not clock.error_mm:
-        clock.error_mm.update(_errors(plan, actions))
+        clock.error_mm.update(_position_errors(plan, actions))
     for number in range(len(clock.rounds), rounds):
         order = plan.settings if number % 2 == 0 else plan.settings[::-1]
-        clock.rounds.append({setting.name: _seconds(plan, setting, actions) for setting in order})
+        clock.rounds.append({setting.name: _time_per_decision(plan, setting, actions) for setting in order})
         _store(path, {"rounds": clock.rounds, "error_mm": clock.error_mm})
     return clock
 
@@ -249,7 +249,7 @@ def _read_clock(plan: Plan) -> Clock:
     return _read(path, _clock_of) if path.is_file() else Clock()
 
 
-def _actions(plan: Plan) -> Actions:
+def _pilot_actions(plan: Plan) -> Actions:
     """Return what the pilot decides in the first decisions of every world, under the trained setting."""
     task = plan.task
     world, policy = World(task, plan.worlds), plan.policy(plan.pilot, task)
@@ -262,7 +262,7 @@ def _actions(plan: Plan) -> Actions:
     return actions
 
 
-def _seconds(plan: Plan, setting: Setting, actions: Actions) -> float:
+def _time_per_decision(plan: Plan, setting: Setting, actions: Actions) -> float:
     """Return the median time of one decision's physics, observations and rewards, s for all worlds together."""
     world, times = World(setting.applied_to(plan.task), plan.worlds), []
     world.reset(plan.first)
@@ -273,7 +273,7 @@ def _seconds(plan: Plan, setting: Setting, actions: Actions) -> float:
     return float(np.median(times))
 
 
-def _errors(plan: Plan, actions: Actions) -> dict[str, float]:
+def _position_errors(plan: Plan, actions: Actions) -> dict[str, float]:
     """Return by setting how far learners are from where they should be after one second, mm, median of all."""
     task = plan.task
     count = max(1, min(len(actions), round(1.0 / task.control_dt)))

@@ -39,8 +39,8 @@ def draw_chart(results: Results) -> Figure:
     grid = figure.subplots(len(tasks), 2, squeeze=False, width_ratios=(1.05, 1.0))
     colours = _colours(tasks)
     for row, (task, about) in zip(grid, tasks.items(), strict=True):
-        _heat(row[0], task, about)
-        _costs(row[1], about, colours)
+        _draw_heat_map(row[0], task, about)
+        _draw_returns(row[1], about, colours)
     legend = {}
     for axes in grid[:, 1]:
         handles, labels = axes.get_legend_handles_labels()
@@ -66,7 +66,7 @@ def _solver(about: Results) -> str:
     return str(about["method"]) + (" f32" if about["dtype"] == "float32" else "")
 
 
-def _heat(axes: Axes, task: str, results: Results) -> None:
+def _draw_heat_map(axes: Axes, task: str, results: Results) -> None:
     """Draw a heat map, method by dt, of the last player's return minus that under its trained setting; white = 0."""
     settings = results["settings"]
     pilot = list(results["again"])[-1]
@@ -106,7 +106,7 @@ def _write_number(axes: Axes, x: int, y: int, player: Results, bound: float, tra
         axes.add_patch(Rectangle((x - 0.48, y - 0.47), 0.96, 0.94, fill=False, edgecolor=INK, linewidth=1.6))
 
 
-def _costs(axes: Axes, results: Results, colours: dict[str, str]) -> None:
+def _draw_returns(axes: Axes, results: Results, colours: dict[str, str]) -> None:
     """Draw the mean return of each player over the time that a simulated second takes, a mark per method."""
     settings, players = results["settings"], _drawn_players(results)
     solvers = list(dict.fromkeys(_solver(about) for about in settings.values()))

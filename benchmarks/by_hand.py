@@ -68,7 +68,7 @@ def _wrap(x, size, inverse):
 
 
 def _move(width):
-    """Neighbour force and drive -> new velocities and positions of a world; says whether everything is finite."""
+    """Return a kernel that moves a world by one step and returns True if all numbers are finite."""
 
     @njit(**PARTS)
     def move(now, requested, body, blocks, size, dt):
@@ -95,12 +95,12 @@ def _move(width):
 
 
 def _rows(width):
-    """Where each sum lies in a flat array: at constant distances the compiler sees that none of them is another."""
+    """Return where each sum lies in a flat array; constant distances show the compiler that none overlap."""
     return tuple(np.uint64(k * width) for k in range(10))
 
 
 def _add_coincident(width):
-    """Neighbours in the same place: nearly always the agent itself, so a branch handles them."""
+    """Return a kernel that adds neighbours in the same place, which are rare: a branch skips them."""
     at = _rows(width)
 
     @njit(**PARTS)
@@ -131,7 +131,7 @@ def _add_coincident(width):
 
 
 def _three(width):
-    """Separation, alignment and cohesion."""
+    """Return a kernel for separation, alignment and cohesion."""
     at, add_coincident = _rows(width), _add_coincident(width)
 
     @njit(**PARTS)
@@ -179,7 +179,7 @@ def _three(width):
 
 
 def _two(width):
-    """Separation and cohesion."""
+    """Return a kernel for separation and cohesion."""
     at, add_coincident = _rows(width), _add_coincident(width)
 
     @njit(**PARTS)
@@ -220,7 +220,7 @@ def _two(width):
 
 
 def _field_of_view(width):
-    """Separation, alignment and cohesion of neighbours in a field of view."""
+    """Return a kernel for separation, alignment and cohesion of neighbours in a field of view."""
     at, add_coincident = _rows(width), _add_coincident(width)
 
     @njit(**PARTS)

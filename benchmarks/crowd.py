@@ -33,7 +33,7 @@ PEOPLE, SECONDS, DT = 1000, 60.0, 0.01
 
 
 def crowd(name: str, people: int = PEOPLE, dtype: str = "float64") -> Scene:
-    """Two streams of a published model on a torus, a person per square metre."""
+    """Return two streams of a published model on a torus, a person per square metre."""
     edge = math.sqrt(people)
     group = Group(
         count=people // 2, mass=80.0, radius=0.25, desired_speed=1.3, haste=1.3,

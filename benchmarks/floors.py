@@ -196,7 +196,7 @@ def of_learning(policy: Any, epochs: int, decision: Work) -> Work:
 
 
 def _pair_operations(d: int, images: bool) -> float:
-    """Operations for one neighbour: offset, square, test for itself; nearest image on a torus."""
+    """Count the operations for one neighbour: offset, square, test for itself; nearest image on a torus."""
     return 2 * d + 1 + 3 * d * images
 
 

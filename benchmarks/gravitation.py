@@ -27,7 +27,7 @@ OPENING = 0.5
 
 
 def cloud(agents: int, dimension: int, dtype: str, opening: float) -> Scene:
-    """Agents in a unit square or cube, under a gravitation too weak to change their places while one looks."""
+    """Return agents in a unit square or cube; gravitation is too weak to move them noticeably during a benchmark."""
     spawn = Spawn(low=(0.0,) * dimension, high=(1.0,) * dimension)
     scene = Scene(
         dimension=dimension, groups=(Group(count=agents, spawn=spawn),), dt=1e-3, dtype=dtype,

@@ -63,7 +63,7 @@ LEFT = re.compile(r".*(\.part|\.tmp.*)$|\.partial-.*|tmp\w{8}|.*\.pyc\.\d+$")
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one run came to: what is wrong, one word each; none if nothing is."""
+    """Outcome of one run; `faults` are one word each, and empty if nothing is wrong."""
 
     command: str
     at: float  # s
@@ -118,7 +118,11 @@ def interrupt(
 
 
 def _reset_signals() -> None:
-    for number in (signal.SIGINT, signal.SIGTERM):  # a shell in the background ignores them, for all below
+    """Let a new process handle SIGINT and SIGTERM as by default."""
+    for number in (
+        signal.SIGINT,
+        signal.SIGTERM,
+    ):  # processes of a shell in the background inherit that it ignores them
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
 
 
@@ -128,7 +132,7 @@ def _is_in_mask(pid: int, number: int, names: str) -> bool:
     return any(int(mask, 16) >> (number - 1) & 1 for mask in masks)
 
 
-def _ending(outcome: Outcome) -> str:
+def _ending_text(outcome: Outcome) -> str:
     """Return how a run ended whose signal arrived while Python was starting."""
     if not outcome.faults:
         return "one line of flockenv's"  # the first statement ran between the look into /proc and the signal
@@ -194,13 +198,13 @@ def main(
                 continue
             outcomes.append(outcome)
             progress(len(outcomes))
-            if outcome.faults and (not outcome.early or _ending(outcome).startswith("exit")):
+            if outcome.faults and (not outcome.early or _ending_text(outcome).startswith("exit")):
                 how = f"{number.name} at {at:.2f} s, group {group}, twice {twice}, cold {empty}"
                 print(f"{command}, {how}: {', '.join(outcome.faults)}\n{outcome.stderr}", flush=True)
     counted = [outcome for outcome in outcomes if not outcome.early]
     faults = Counter(fault.split(":")[0] for outcome in counted for fault in outcome.faults)
     print(f"{len(counted)} interrupts of {len(names)} commands: {dict(faults) or 'nothing went wrong'}")
-    early = Counter(_ending(outcome) for outcome in outcomes if outcome.early)
+    early = Counter(_ending_text(outcome) for outcome in outcomes if outcome.early)
     print(f"{early.total()} while Python was starting, before flockenv blocks or handles signals: {dict(early)}")
 
 

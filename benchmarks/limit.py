@@ -69,14 +69,14 @@ class Reference:
         """Return a call that advances the arrays of `state` by a number of steps, in place."""
         kind = "worlds" if state.shape[0] > 1 else "crowd"
         step = getattr(self.limit, f"{kind}_{'f32' if scene.dtype == 'float32' else 'f64'}_{scene.dimension}d")
-        numbers = np.array(_numbers(scene), scene.dtype)
+        numbers = np.array(_rule_numbers(scene), scene.dtype)
         sizes = (*state.shape[:2], steps) if kind == "worlds" else (state.shape[1], steps)
         apart = np.ascontiguousarray(separation_directions(state.shape[1], scene.dimension).T, scene.dtype)
         arguments = (*map(_pointer, (state.x, state.v, apart)), *map(ctypes.c_long, sizes), _pointer(numbers))
         return lambda numbers=numbers, apart=apart: step(*arguments)  # it keeps the memory of these
 
 
-def _numbers(scene: Scene) -> list[float]:
+def _rule_numbers(scene: Scene) -> list[float]:
     """Return what limit_kernel.h calls `rules`, in its order."""
     effects = [e for e in scene.effects if isinstance(e, (Separation, Alignment, Cohesion))]
     group = scene.groups[0]

@@ -111,7 +111,7 @@ class Turns(Contestant):
         return 1
 
     def sample(self, calls: int) -> Sample:
-        """Tell it to work for about `seconds` s, and wait for what it says."""
+        """Let it run for about `seconds` s, and wait for its answer."""
         assert self.script is not None and self.script.stdin is not None
         try:
             self.script.stdin.write(f"{self.seconds}\n")
@@ -238,11 +238,11 @@ def main(
         most = machine(bench, threads)
         for peer in wanted:
             typer.echo(f"installing {peer}: {', '.join(PEERS[peer])}", err=True)
-            _note_failure(bench, lambda peer=peer: install(peer, cache))
+            _try_or_note(bench, lambda peer=peer: install(peer, cache))
         present = [peer for peer in chosen if (cache / peer / DONE).is_file() and python_of(cache / peer).exists()]
         missing = [peer for peer in chosen if peer not in present]
         for pair in (pair for pair in PAIRS if pair.peer in present):
-            _note_failure(bench, lambda pair=pair: _race(bench, pair, cache, threads, most))
+            _try_or_note(bench, lambda pair=pair: _race(bench, pair, cache, threads, most))
         if missing:
             bench.note(f"not installed: {', '.join(missing)} (--install {','.join(missing)})")
         _note_remarks(bench, threads)
@@ -257,8 +257,8 @@ def _choose_peers(option: str, text: str) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def _note_failure(bench: Bench, work: Any) -> None:
-    """Do something; if a peer fails at it, say so in a note and go on."""
+def _try_or_note(bench: Bench, work: Any) -> None:
+    """Call `work`; if a peer fails in it, add a note and go on."""
     try:
         work()
     except PeerError as error:

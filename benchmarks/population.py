@@ -27,7 +27,7 @@ LIFETIME = 4.0  # s, on average
 
 
 def fountain(alive: int, dtype: str, dimension: int, mortal: bool) -> Scene:
-    """A number of particles, alive on average: born at a nozzle, gone after 3 to 5 s; or the same that never die."""
+    """Return `alive` particles on average, born at a nozzle, that die after 3 to 5 s; or the same that never die."""
     up = (0.0,) * (dimension - 1)
     nozzle = Disc(centre=(0.0,) * dimension, radius=0.5)
     emitter = Emitter(place=nozzle, rate=alive / LIFETIME, speed=(15.0, 20.0), direction=(*up, 1.0), spread=15.0,

@@ -103,14 +103,14 @@ def memory_growth(dtype: str, agents: int = MANY) -> float:
     small = crowd(1000, dtype)
     small.step(small.start(0))  # whatever compiles, compiles now
     scene = crowd(agents, dtype)
-    before = _resident()
+    before = _resident_bytes()
     state = scene.start(0)
     scene.step(state, out=state)
-    return (_resident() - before) / agents
+    return (_resident_bytes() - before) / agents
 
 
-def _resident() -> int:
-    """Bytes of this process that are in memory."""
+def _resident_bytes() -> int:
+    """Return the bytes of this process that are in memory."""
     return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 

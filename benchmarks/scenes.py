@@ -21,7 +21,7 @@ EDGES = {2: 12.0, 3: 10.0}  # m, of a small world
 
 
 def rules(radii: tuple[float, float, float], fov: float = 360.0) -> tuple[Effect, Effect, Effect]:
-    """Separation, alignment and cohesion within these radii, m, and a field of view, degrees."""
+    """Return separation, alignment and cohesion within these radii, m, and a field of view, degrees."""
     apart, agree, near = radii
     return (
         Separation(weight=1.5, radius=apart, fov=fov),
@@ -31,7 +31,7 @@ def rules(radii: tuple[float, float, float], fov: float = 360.0) -> tuple[Effect
 
 
 def boids(agents: int, edge: float, effects: tuple[Effect, ...], dtype: str, dimension: int = 2) -> Scene:
-    """One world on a torus `edge` m wide."""
+    """Return a scene of one world on a torus `edge` m wide."""
     return Scene(
         dimension=dimension, space=Torus(size=(edge,) * dimension), effects=effects, dt=0.05, dtype=dtype,
         groups=(Group(count=agents, max_speed=3.0, max_force=4.0, spawn=Spawn(speed=(1.0, 2.0))),),
@@ -39,7 +39,7 @@ def boids(agents: int, edge: float, effects: tuple[Effect, ...], dtype: str, dim
 
 
 def world(dtype: str, dimension: int = 2, agents: int = 32) -> Scene:
-    """A small world, where each agent interacts with all others."""
+    """Return a small world, in which each agent interacts with all others."""
     return boids(agents, EDGES[dimension], rules(WORLD_RADII[dimension]), dtype, dimension)
 
 
@@ -50,7 +50,7 @@ def edge_for(agents: int, dimension: int = 2) -> float:
 
 
 def crowd(agents: int, dtype: str, dimension: int = 2) -> Scene:
-    """A large world at the same density whatever its size; separation looks half as far as the other two."""
+    """Return a large world; its density does not depend on its size. Separation has half the radius of the others."""
     return boids(agents, edge_for(agents, dimension), rules((REACH / 2, REACH, REACH)), dtype, dimension)
 
 

@@ -75,7 +75,7 @@ class Learning(Contestant):
 
     def warm(self, seconds: float) -> int:
         """Roll out and update once; a call is then a turn, however many rollouts it takes."""
-        self._once()
+        self._learn_once()
         self.spent.clear()
         return 1
 
@@ -83,11 +83,12 @@ class Learning(Contestant):
         """Roll out and update until the turn is over."""
         cpu, began, steps = process_time(), perf_counter(), 0.0
         while (took := perf_counter() - began) < self.seconds or not steps:
-            steps += self._once()
+            steps += self._learn_once()
         self.spent["all"] += took
         return Sample(steps, took, process_time() - cpu)
 
-    def _once(self) -> float:
+    def _learn_once(self) -> float:
+        """Run one rollout and one update; return the number of agent-steps."""
         from agents.ppo import use_thread_count
 
         before = self.model.num_timesteps

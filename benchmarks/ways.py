@@ -29,7 +29,7 @@ COLOURS = ("#d55e00", "#0072b2", "#52637a")
 
 
 def building(effect: Way | Routes) -> Scene:
-    """6 x 6 rooms of 10 m, each with a door of 1.2 m to the right and to the top."""
+    """Return 6 x 6 rooms of 10 m, each with a door of 1.2 m to the right and to the top."""
     walls: list[Wall] = []
     for x in range(0, 60, 10):
         for y in range(0, 60, 10):

@@ -67,11 +67,11 @@ def draw_precision(reports: Sequence[Report]) -> Figure:
         by: Cost = "evaluations" if row % 2 else "seconds"
         for column, axes in enumerate(axes_row):
             if column < len(bands[row // 2]):
-                _panel(axes, bands[row // 2][column], by, styles)
+                _draw_panel(axes, bands[row // 2][column], by, styles)
             else:
                 axes.set_axis_off()
-    _legend(figure, styles, reports)
-    figure.supxlabel(_note(reports), x=0.01, ha="left", fontsize=9, color=FAINT)
+    _draw_legend(figure, styles, reports)
+    figure.supxlabel(_note_text(reports), x=0.01, ha="left", fontsize=9, color=FAINT)
     return figure
 
 
@@ -83,7 +83,7 @@ def _style(k: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _panel(axes: Axes, report: Report, by: Cost, styles: dict[str, dict[str, Any]]) -> None:
+def _draw_panel(axes: Axes, report: Report, by: Cost, styles: dict[str, dict[str, Any]]) -> None:
     from matplotlib.ticker import LogLocator, NullFormatter
 
     axes.set_xscale("log")
@@ -92,11 +92,11 @@ def _panel(axes: Axes, report: Report, by: Cost, styles: dict[str, dict[str, Any
     low = max(report.floor / 3, high * 10.0**-DECADES, _smallest_error(report) / 3)
     axes.set_ylim(low, high)
     for curve in report.curves:
-        _line(axes, curve, by, styles[curve.method], report.floor, low)
+        _draw_line(axes, curve, by, styles[curve.method], report.floor, low)
     axes.axhspan(low, max(low, report.floor), color=GRID, zorder=0, linewidth=0)
     if by == "evaluations":
-        _slopes(axes, report, low, high)
-        _orders(axes, report, styles, low, high)
+        _draw_slopes(axes, report, low, high)
+        _draw_orders(axes, report, styles, low, high)
     else:
         axes.set_title(report.title, loc="left", fontsize=13, fontweight="bold", color=INK, pad=22)
         axes.annotate(
@@ -132,7 +132,7 @@ def _reference_text(report: Report) -> str:
     return f"against {report.reference}{wrong}{grows}"
 
 
-def _line(axes: Axes, curve: Curve, by: Cost, style: dict[str, Any], floor: float, low: float) -> None:
+def _draw_line(axes: Axes, curve: Curve, by: Cost, style: dict[str, Any], floor: float, low: float) -> None:
     """Draw a curve; what lies below the picture is on its lower edge."""
     shown = [(cost, max(error, low)) for cost, error in _drawable_points(curve, by)]
     if shown:
@@ -143,7 +143,7 @@ def _line(axes: Axes, curve: Curve, by: Cost, style: dict[str, Any], floor: floa
         axes.plot(*zip(*doubtful, strict=True), markersize=5, zorder=3, clip_on=False, **hollow)
 
 
-def _orders(axes: Axes, report: Report, styles: dict[str, dict[str, Any]], low: float, high: float) -> None:
+def _draw_orders(axes: Axes, report: Report, styles: dict[str, dict[str, Any]], low: float, high: float) -> None:
     """Write the measured orders at the ends of the lines, pushed apart so that each can be read."""
     ends = []
     for curve in report.curves:
@@ -159,7 +159,7 @@ def _orders(axes: Axes, report: Report, styles: dict[str, dict[str, Any]], low: 
         )  # fmt: skip
 
 
-def _slopes(axes: Axes, report: Report, low: float, high: float) -> None:
+def _draw_slopes(axes: Axes, report: Report, low: float, high: float) -> None:
     """Draw what orders 1, 2 and 4 look like, from one corner."""
     costs = [x for curve in report.curves for x, _ in _drawable_points(curve, "evaluations")]
     if not costs:
@@ -182,10 +182,10 @@ def _slopes(axes: Axes, report: Report, low: float, high: float) -> None:
         )  # fmt: skip
 
 
-def _legend(figure: Figure, styles: dict[str, dict[str, Any]], reports: Sequence[Report]) -> None:
+def _draw_legend(figure: Figure, styles: dict[str, dict[str, Any]], reports: Sequence[Report]) -> None:
     from matplotlib.lines import Line2D
 
-    orders = {curve.method: _order(curve, reports[0]) for curve in reports[0].curves} if len(reports) == 1 else {}
+    orders = {curve.method: _order_text(curve, reports[0]) for curve in reports[0].curves} if len(reports) == 1 else {}
     handles = [
         Line2D([], [], markersize=6, linewidth=2, label=name.replace("_", " ") + orders.get(name, ""), **style)
         for name, style in styles.items()
@@ -196,7 +196,7 @@ def _legend(figure: Figure, styles: dict[str, dict[str, Any]], reports: Sequence
     )  # fmt: skip
 
 
-def _order(curve: Curve, report: Report) -> str:
+def _order_text(curve: Curve, report: Report) -> str:
     """Return the measured order as the legend has it, "exact" for a method whose errors are all too small to trust."""
     if curve.order is not None:
         return f" ({curve.order:.1f})"
@@ -204,7 +204,7 @@ def _order(curve: Curve, report: Report) -> str:
     return " (exact)" if arrived and not any(report.trusts(point) for point in arrived) else ""
 
 
-def _note(reports: Sequence[Report]) -> str:
+def _note_text(reports: Sequence[Report]) -> str:
     first = reports[0]
     load = "" if first.machine.load is None else f", load {first.machine.load:.1f} on {first.machine.cores} cores"
     times = f"median of {first.repetitions} runs" if first.repetitions else "no times taken"

@@ -30,7 +30,7 @@ def write_pictures(folder: Path, results: Results) -> list[Path]:
         ("fundamental_diagram.png", "rimea 4", _write_diagrams),
         ("bottleneck.png", "rimea 12", _write_widths),
         ("lanes.png", "lanes", _write_lanes),
-        ("faster_is_slower.png", "faster is slower", _write_haste),
+        ("faster_is_slower.png", "faster is slower", _write_evacuation_times),
     ):
         found = [f for f in results.findings if f.case == case and f.series]
         if found:
@@ -39,17 +39,17 @@ def write_pictures(folder: Path, results: Results) -> list[Path]:
     return drawn
 
 
-def _short(preset: str) -> str:
+def _preset_title(preset: str) -> str:
     return preset.replace("_", " ")
 
 
-def _tone(preset: str) -> str:
+def _colour(preset: str) -> str:
     from flockenv.scene.presets import PRESETS
 
     return TONES[list(PRESETS).index(preset) % len(TONES)]
 
 
-def _mark(preset: str) -> str:
+def _preset_marker(preset: str) -> str:
     from flockenv.scene.presets import PRESETS
 
     return MARKS[list(PRESETS).index(preset) % len(MARKS)]
@@ -74,15 +74,15 @@ def _write_diagrams(path: Path, found: Sequence[Finding]) -> None:
         axes.fill_between(inside, speed - 0.25, speed + 0.25, color=GRID, zorder=1, label="within .25 m/s")
         axes.plot(curve, weidmann_speed(curve), color=INK, lw=1.2, zorder=2, label="Weidmann 1993")
         axes.scatter(
-            _numbers(finding, "density"), _numbers(finding, "speed"), s=5, color=_tone(finding.under), alpha=0.25,
+            _numbers(finding, "density"), _numbers(finding, "speed"), s=5, color=_colour(finding.under), alpha=0.25,
             linewidths=0, zorder=3,
         )  # fmt: skip
         axes.plot(
-            _numbers(finding, "densities"), _numbers(finding, "speeds"), "o-", color=_tone(finding.under), ms=4, lw=1,
+            _numbers(finding, "densities"), _numbers(finding, "speeds"), "o-", color=_colour(finding.under), ms=4, lw=1,
             zorder=4, label="means",
         )  # fmt: skip
         name_axes(axes, "density, 1/m²", "speed forward, m/s")
-        axes.set_title(f"{_short(finding.under)}: {finding.verdict}", fontsize=8, color=INK)
+        axes.set_title(f"{_preset_title(finding.under)}: {finding.verdict}", fontsize=8, color=INK)
         axes.set_xlim(0, 5.4)
         axes.set_ylim(-0.6, 1.7)
     grid[0, 0].legend(fontsize=6.5, frameon=False, loc="upper right")
@@ -113,8 +113,8 @@ def _write_widths(path: Path, found: Sequence[Finding]) -> None:
     )
     for finding in found:
         axes.plot(
-            _numbers(finding, "width"), _numbers(finding, "flow"), marker=_mark(finding.under), ms=5, lw=1,
-            color=_tone(finding.under), label=_short(finding.under), zorder=3,
+            _numbers(finding, "width"), _numbers(finding, "flow"), marker=_preset_marker(finding.under), ms=5, lw=1,
+            color=_colour(finding.under), label=_preset_title(finding.under), zorder=3,
         )  # fmt: skip
     name_axes(axes, "width, m", "flow, 1/s")
     axes.set_ylim(bottom=0)
@@ -146,20 +146,22 @@ def _draw_lanes(axes: Axes, finding: Finding) -> None:
     axes.set_ylim(EDGE / 2 - WIDTH / 2 - 0.1, EDGE / 2 + WIDTH / 2 + 0.1)
     axes.set_xticks([])
     axes.set_yticks([])
-    axes.set_title(f"{_short(finding.under)}: {finding.verdict}, {finding.note.split(';')[0]}", fontsize=7.5, color=INK)
+    axes.set_title(
+        f"{_preset_title(finding.under)}: {finding.verdict}, {finding.note.split(';')[0]}", fontsize=7.5, color=INK
+    )
     for spine in axes.spines.values():
         spine.set_color(GRID)
 
 
-def _write_haste(path: Path, found: Sequence[Finding]) -> None:
+def _write_evacuation_times(path: Path, found: Sequence[Finding]) -> None:
     """Draw the time that a room takes to empty by the desired speed: medians and quartiles."""
     figure = new_figure(5.6, 4.0, "200 people, 15 x 15 m, a door of 1 m")
     axes = figure.subplots()
     for finding in found:
         speed, time, low, high = (_numbers(finding, name) for name in ("speed", "time", "low", "high"))
         axes.errorbar(
-            speed, time, (time - low, high - time), fmt="o-", color=_tone(finding.under), ms=4, lw=1.2, capsize=2,
-            label=_short(finding.under),
+            speed, time, (time - low, high - time), fmt="o-", color=_colour(finding.under), ms=4, lw=1.2, capsize=2,
+            label=_preset_title(finding.under),
         )  # fmt: skip
     name_axes(axes, "desired speed, m/s", "until all are out, s")
     axes.set_ylim(bottom=0)
