@@ -264,7 +264,7 @@ def test_the_cheapest_point_is_the_one_of_least_cost_in_the_table(damped: Report
 
 
 def test_an_interpolated_point_reaches_its_error_at_its_cost(damped: Report) -> None:
-    choice = damped.curve("rk4").needed(3e-5)
+    choice = damped.curve("rk4").cheapest_choice(3e-5)
     assert choice is not None and choice.interpolated
     problem = one("damped")
     steps = math.ceil(problem.seconds / choice.dt)
@@ -280,8 +280,8 @@ def test_a_coarse_point_that_is_right_by_chance_is_not_taken() -> None:
     )
     choice = curve.cheapest_choice(1e-3, interpolate=False)
     assert choice is not None and choice.cost == 8
-    assert curve.needed(1e-5) is None
-    unknown = curve.needed(1e-2)
+    assert curve.cheapest_choice(1e-5) is None
+    unknown = curve.cheapest_choice(1e-2)
     assert unknown is not None and not unknown.interpolated  # not from a diverged point
 
 

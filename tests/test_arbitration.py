@@ -264,9 +264,9 @@ def test_steer_acts_on_its_group_alone_and_its_trace_matches_the_force() -> None
     np.testing.assert_array_equal(found.requested[:, :9], 0)
     np.testing.assert_array_equal(found.share[:, :9], 0)
     np.testing.assert_allclose(found.force, scene.acceleration(end), atol=1e-12)  # 1 kg
-    np.testing.assert_allclose((found.share[..., None] * found.wish).sum(axis=2), found.force, atol=1e-12)
-    assert np.linalg.norm(found.wish, axis=-1).max() > 4.0  # a single behaviour's force is not bounded
-    assert found.cut.any()
+    np.testing.assert_allclose((found.share[..., None] * found.requested).sum(axis=2), found.force, atol=1e-12)
+    assert np.linalg.norm(found.requested, axis=-1).max() > 4.0  # a single behaviour's force is not bounded
+    assert found.is_cut.any()
     assert set(found.mean_share()) == {"avoid_obstacles", "separation"}
     where = found.is_active[..., 1]
     assert found.mean_share()["separation"] == pytest.approx(float(found.share[..., 1][where].mean()))
