@@ -75,7 +75,9 @@ def _load_python(path: Path, task: Task) -> FilePlayer:
         raise PlayerError(f"player {printable_path(path)}: offers none of player, Player, predict; {EXPECTED}")
     kind, offered = found[0], getattr(module, found[0])
     if not callable(offered):
-        raise PlayerError(f"player {printable_path(path)}: {kind} is {_describe_type(offered)}, not a function; {EXPECTED}")
+        raise PlayerError(
+            f"player {printable_path(path)}: {kind} is {_describe_type(offered)}, not a function; {EXPECTED}"
+        )
     if kind == "predict":
         return FilePlayer(path, kind, offered, task.action_layout.size)
     arguments = (task,) if kind == "player" or _accepts(offered, 1) else ()

@@ -307,7 +307,10 @@ def _differences(card: Mapping[str, Any], task: Task) -> tuple[str, ...]:
     defaults = type(task).model_construct().model_dump(mode="json")
     trained = {key: trained_on.get(key, defaults.get(key)) for key in now}  # a card may be older than an argument
     changed = [key for key in now if trained[key] != now[key]]
-    return (*(f"{key} = {printable(now[key])}, trained with {printable(trained[key])}" for key in changed), *differences)
+    return (
+        *(f"{key} = {printable(now[key])}, trained with {printable(trained[key])}" for key in changed),
+        *differences,
+    )
 
 
 def _differences_of_digest(card: Mapping[str, Any], task: Task) -> tuple[str, ...]:

@@ -80,7 +80,9 @@ def _steer_walker(p: Any, frame: Frame, i: int, force: Any) -> None:
     top = np.float64(frame.max_speed[i])
     share = min(top, distance) / max(distance, 1e-9)
     desired = ((gx * share, gy * share), top, 0.3)
-    change = orca.orca_change(v, np.float64(frame.radius[i]), desired, 2.0, p.control_dt, neighbours, count, lines, relaxed)
+    change = orca.orca_change(
+        v, np.float64(frame.radius[i]), desired, 2.0, p.control_dt, neighbours, count, lines, relaxed
+    )
     fx, fy = change[0] / p.control_dt, change[1] / p.control_dt
     factor = min(1.0, frame.max_force[i] / max(math.sqrt(fx * fx + fy * fy), 1e-9))
     force[0, i], force[1, i] = factor * fx, factor * fy
