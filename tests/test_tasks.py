@@ -454,7 +454,7 @@ def test_with_two_sides_a_captured_evader_is_removed() -> None:
 def test_evaders_are_paid_the_opposite() -> None:
     world = world_of(Pursuit(sides="both"))
     place(world, [[10, 10], [13, 10]], [[3, 0], [0, 0]])
-    step = act(world)
+    step = world.step(np.full((1, 2, 2), [[[0.3, 0.4]]]))
     np.testing.assert_allclose(step.terms[0, 0], -step.terms[0, 1])
     assert step.terms[0, 0, 0] > 0
 

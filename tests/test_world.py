@@ -17,6 +17,7 @@ from flockenv.envs.world import AT_HAND, PAST, Step, World, _chunks
 from flockenv.jit.section import without_dispatch
 from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.maths.counter_rng import key_of, keys_of
+from flockenv.model.divergence import SimulationDiverged
 from flockenv.tasks import Crossing, Flock, Obstacles, Pursuit
 from flockenv.tasks.play import _play
 from tests.catalogue import TASKS, TaskRow
@@ -666,9 +667,12 @@ def test_divergence_names_the_world_and_the_agent(row: TaskRow) -> None:
     world = World(row.task, 3)
     world.reset(2)
     world.state.vel[1, 0] = np.nan
-    with pytest.raises(FloatingPointError, match="world 1, agent 0") as caught:
+    with pytest.raises(
+        SimulationDiverged, match="world 1, agent 0: .* in the decision that begins in step 1"
+    ) as caught:
         world.step(np.zeros((3, world.learners, 2)))
     assert "\n" not in str(caught.value)
+    assert (caught.value.world, caught.value.agent, caught.value.dt) == (1, 0, row.task.dt)
 
 
 @EVERY

@@ -2,7 +2,7 @@
 
 list | run | measure | render | explain | accuracy | stress | experiment | gallery | validate | warmup | schema
 
-Errors are one line on stderr, exit code 2.
+Errors are one line on stderr. Exit codes: 0, 1 (a run failed), 2 (bad input), 130 (interrupted).
 """
 
 from __future__ import annotations

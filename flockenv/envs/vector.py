@@ -246,7 +246,9 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         """Return the actions by world and learner, (B, L, A), with zeros for worlds that this step resets."""
         array = np.asarray(actions)
         if array.shape != self.action_space.shape:
-            raise ValueError(f"actions: shape {array.shape}, must be {self.action_space.shape}, a row per learner")
+            raise ValueError(
+                f"actions: shape {array.shape}, must be {self.action_space.shape}, one row per learner of each world"
+            )
         blocks = array.reshape(self.world.worlds, self.task.learners, -1)
         return blocks if resting is None else np.where(resting[:, None, None], 0.0, blocks)
 

@@ -24,6 +24,7 @@ from flockenv.jit.simd_rows import PAIR, column_distance
 from flockenv.jit.thread_pool import LARGEST, AutoTuners, run_parallel, usable_threads
 from flockenv.maths.counter_rng import MASK, keys_of
 from flockenv.model import state as states
+from flockenv.model.divergence import SimulationDiverged
 from flockenv.model.snapshot import Snapshot
 from flockenv.model.state import State
 from flockenv.scene import MEMORY_LIMIT
@@ -314,8 +315,13 @@ class World:
         if world == REFUSED:
             self._raise_for_action(checked)
         if world >= 0:
-            raise FloatingPointError(f"world {world}, agent {agent}: not finite at t = {self.state.time[world]:g} s")
+            raise self._diverged(world, agent)
         return Step(rows, reward, earned.transpose(1, 2, 0), over, late, success, present)
+
+    def _diverged(self, world: int, agent: int) -> SimulationDiverged:
+        step, dt, method = int(self.state.tick[world]) + 1, self.task.dt, self.task.integrator.kind
+        reason = "position or velocity is not finite in the decision that begins"
+        return SimulationDiverged(world, agent, step, step * dt, None, dt, method, reason)
 
     def _play(
         self, acting: bool, mask: NDArray[np.bool_], all_worlds: bool, busy: int, limit: int,

@@ -64,7 +64,9 @@ class Layout:
         """Return the quantities of rows (..., size) by name, in SI units: arrays (..., *shape), float64."""
         array = np.asarray(rows, np.float64)
         if array.shape[-1:] != (self.size,):
-            raise ValueError(f"rows have {array.shape[-1:]} numbers, this layout has {self.size}")
+            raise ValueError(
+                f"unpack: rows have shape {array.shape}, must end with {self.size} numbers, one per slot entry"
+            )
         named: dict[str, Any] = {}
         at = 0
         for slot in self.slots:
