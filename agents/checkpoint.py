@@ -201,4 +201,4 @@ def from_json(kind: type[R], parts: CheckpointParts, part: str, folder: Path) ->
 
 
 def _refuse_constant(text: str) -> float:
-    raise ValueError(f"{text} is not a number of JSON's" if math.isnan(float(text)) else f"{text} is not finite")
+    raise ValueError(f"{text} is not a JSON number" if math.isnan(float(text)) else f"{text} is not finite")

@@ -149,7 +149,7 @@ def players_of(tasks: Sequence[Task], players: Sequence[Player]) -> dict[str, li
     for task, field in fields.items():
         if not field:
             names = ", ".join(player.name for player in players)
-            raise ValueError(f"task {task!r}: no player for it; in other tasks alone: {names}")
+            raise ValueError(f"task {task!r}: no player for it; these play other tasks only: {names}")
     return fields
 
 

@@ -92,7 +92,7 @@ def _finite_answers(model: PPO, rows: torch.Tensor) -> torch.Tensor:
         answers = torch.full((1,), torch.nan)
     if not torch.isfinite(answers).all():
         largest = max(float(tensor.detach().abs().max()) for tensor in model.policy.parameters())
-        raise LearningDiverged(f"the network's answers are not finite: its largest weight is {largest:.3g}")
+        raise LearningDiverged(f"the network's outputs are not finite: its largest weight is {largest:.3g}")
     return answers
 
 

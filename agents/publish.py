@@ -101,7 +101,7 @@ def _read_comparison(folder: Path) -> Results:
     ]
     if results["smoke"] or missing:
         what = "a quick look (--smoke)" if results["smoke"] else f"a part of a comparison, without {missing[0]},"
-        raise ValueError(f"{file}: {what} is not for the documents")
+        raise ValueError(f"{file}: {what} must not be published")
     return results
 
 

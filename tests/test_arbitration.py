@@ -325,8 +325,8 @@ def test_every_arbitration_steers_a_scene(arbitration: Arbitration, dtype: str, 
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: Steer(behaviours=(Drag(rate=1),)), ("behaviours[0].kind = drag", "is no behaviour")),
-        (lambda: Steer(behaviours=(Steer(behaviours=(AVOID,)),)), ("behaviours[0].kind = steer", "is no behaviour")),
+        (lambda: Steer(behaviours=(Drag(rate=1),)), ("behaviours[0].kind = drag", "is not a behaviour")),
+        (lambda: Steer(behaviours=(Steer(behaviours=(AVOID,)),)), ("behaviours[0].kind = steer", "is not a behaviour")),
         (lambda: Steer(behaviours=()), ("behaviours",)),
         (lambda: crowd(Steer(group=2, behaviours=(AVOID,))), ("effects[0].group = 2", "2 groups")),
         (

@@ -357,10 +357,14 @@ def test_explore_covers_the_whole_region_in_one_round_from_any_start() -> None:
 @pytest.mark.parametrize(
     ("effect", "space", "message"),
     [
-        (Explore(weight=1, low=(0, 0), high=(9, 9), speed=1, track=1), Torus(size=(9, 9)), "space.kind = 'torus'"),
+        (Explore(weight=1, low=(0, 0), high=(9, 9), speed=1, track=1), Torus(size=(9, 9)), "of kind 'torus'"),
         (Explore(weight=1, low=(0, 0), high=(9, 2), speed=1, track=1), None, "must be at least 3 tracks = 3 m"),
         (Forage(weight=1, food=2, speed=1), None, "food = 2: there are 1 groups, counted from 0"),
-        (Queue(weight=1, target=(0, 0, 0), speed=1), None, "target = (0.0, 0.0, 0.0): dimension = 2"),
+        (
+            Queue(weight=1, target=(0, 0, 0), speed=1),
+            None,
+            "target = (0.0, 0.0, 0.0): has 3 numbers, but dimension = 2",
+        ),
         (Queue(weight=1, target=(0, 0)), None, "speed = None: groups[0].max_speed is not given"),
         (Forage(weight=1, food=0), None, "speed = None: groups[0].max_speed is not given"),
         (Explore(weight=1, low=(0, 0), high=(9, 9), track=1), None, "speed = None: groups[0].max_speed is not given"),

@@ -509,7 +509,10 @@ def test_motion_is_finite_for_agents_in_one_place_or_on_one_line(row: Any, speed
             (Steer(group=1, behaviours=(Wander(weight=1),)),),
             "effects[0].behaviours[0].speed = None: groups[1].max_speed is not given either",
         ),
-        ((Seek(weight=1, target=(0, 0, 0), speed=1),), "effects[0].target = (0.0, 0.0, 0.0): dimension = 2"),
+        (
+            (Seek(weight=1, target=(0, 0, 0), speed=1),),
+            "effects[0].target = (0.0, 0.0, 0.0): has 3 numbers, but dimension = 2",
+        ),
     ],
 )
 def test_a_behaviour_that_does_not_fit_its_scene_is_refused_in_one_line(effects: Any, message: str) -> None:
@@ -522,7 +525,7 @@ def test_a_behaviour_that_does_not_fit_its_scene_is_refused_in_one_line(effects:
 
 
 def test_a_direction_of_zero_length_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"heading = \(0.0, 0.0\): a direction"):
+    with pytest.raises(ValueError, match=r"heading = \(0.0, 0.0\): must be a direction"):
         Face(weight=1, heading=(0, 0))
-    with pytest.raises(ValueError, match=r"direction = \(0.0, 0.0\): a direction"):
+    with pytest.raises(ValueError, match=r"direction = \(0.0, 0.0\): must be a direction"):
         Dock(weight=1, target=(0, 0), direction=(0, 0), gate=1, width=1, slow_radius=1)

@@ -99,10 +99,10 @@ def test_on_a_torus_pieces_of_a_path_and_offsets_are_the_shortest() -> None:
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"points": ((0.0, 0.0), (1.0, 0.0, 0.0))}, r"points\[1\] = .*: the first point has 2 coordinates"),
-        ({"points": ((0.0, 0.0), (1.0, 0.0), (1.0, 0.0))}, r"points\[2\] = .*: is where the one before it is"),
-        ({"points": ((0.0, 0.0), (1.0, 0.0)), "closed": True}, "a closed path has at least 3"),
-        ({"points": ((0.0, 0.0), (1.0, 0.0), (0.0, 0.0)), "closed": True}, r"points\[0\] = .*: is where the one"),
+        ({"points": ((0.0, 0.0), (1.0, 0.0, 0.0))}, r"points\[1\] = .*: must have 2 numbers, as points\[0\] has"),
+        ({"points": ((0.0, 0.0), (1.0, 0.0), (1.0, 0.0))}, r"points\[2\] = .*: is where the point before it is"),
+        ({"points": ((0.0, 0.0), (1.0, 0.0)), "closed": True}, "a closed path needs at least 3"),
+        ({"points": ((0.0, 0.0), (1.0, 0.0), (0.0, 0.0)), "closed": True}, r"points\[0\] = .*: is where the point"),
         ({"way": 0}, "way"),
         ({"time": 0.0}, "time"),
     ],
@@ -115,7 +115,7 @@ def test_an_invalid_path_is_refused_in_one_line(change: dict[str, Any], text: st
 
 def test_a_path_of_another_dimension_than_its_scene_is_refused() -> None:
     flat = Group(count=1, spawn=Spawn(low=(0, 0, 0), high=(1, 1, 1)))
-    with pytest.raises(ValueError, match=r"effects\[0\]\.points\[0\] = .*: dimension = 3"):
+    with pytest.raises(ValueError, match=r"effects\[0\]\.points\[0\] = .*, but dimension = 3"):
         Scene(dimension=3, groups=(flat,), effects=(STRAIGHT,))
 
 
@@ -354,7 +354,7 @@ def test_on_a_torus_the_nearest_image_of_the_grid_counts() -> None:
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"counts": (9, 7, 2)}, r"counts = .*: the centre has 2 coordinates"),
+        ({"counts": (9, 7, 2)}, r"counts = .*: must have 2 numbers, as centre has"),
         ({"counts": (9, 8)}, "velocities: 63, must be 72"),
         ({"velocities": ((0.0, 0.0),) * 62 + ((1.0, 1.0, 1.0),)}, r"velocities\[62\] = .*: must be 2 finite numbers"),
         ({"velocities": ((0.0, 0.0),) * 62 + ((1.0, math.inf),)}, "velocities"),

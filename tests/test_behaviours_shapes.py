@@ -439,7 +439,7 @@ def test_a_floor_field_is_solved_once_per_scene(monkeypatch: pytest.MonkeyPatch)
             {"target": (5, 2)},
             r"effects\[0\]\.behaviours\[0\]\.target = \(5.0, 2.0\): is -0.2 m from an obstacle, must be at least 0.3 m",
         ),
-        ({"spacing": 1e-5}, "points, at most"),
+        ({"spacing": 1e-5}, "points; at most"),
         ({"target": (1, 2, 3)}, "dimension = 2"),
     ],
 )

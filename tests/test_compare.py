@@ -537,7 +537,7 @@ def test_hand_written_player_plays_only_the_tasks_that_it_supports() -> None:
     assert fields == {"crossing": [chance, orca], "flock": [chance]}
     with pytest.raises(ValueError, match="no hand-written player 'orca' for 'flock'; there is one for: crossing"):
         comparison.compare([flock], [orca], 2)
-    with pytest.raises(ValueError, match="task 'flock': no player for it; in other tasks alone: orca"):
+    with pytest.raises(ValueError, match="task 'flock': no player for it; these play other tasks only: orca"):
         comparison.compare([crossing, flock], [orca], 2)
 
 

@@ -125,5 +125,5 @@ def test_an_invalid_plan_is_refused(old: str, new: str, message: str) -> None:
 
 def test_a_group_without_a_maximum_speed_is_refused() -> None:
     limitless = SMALL.replace("max_speed: 2, ", "").replace("weight: 4,", "weight: 4, speed: 2,")
-    with pytest.raises(ValueError, match=r"cases.ahead.scene.groups\[0\].max_speed = None: give m/s"):
+    with pytest.raises(ValueError, match=r"cases.ahead.scene.groups\[0\].max_speed = None: must be given, in m/s"):
         run(load_plan(limitless).experiment())

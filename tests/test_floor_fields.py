@@ -416,8 +416,8 @@ DOOR = Door(ends=LEFT)
         (lambda: Target(at=(1, 1), low=(0, 0), high=(1, 1)), "at: give one of"),
         (lambda: Target(low=(0, 2), high=(1, 1)), r"low = \(0.0, 2.0\): must not be above high"),
         (lambda: Target(ends=((0, 2), (0, 2))), "is a point; give at"),
-        (lambda: Stage(at=(1, 1)), "radius = 0: a point is reached within a radius"),
-        (lambda: Door(at=(1, 1), radius=1), "width = None: a door without ends needs one"),
+        (lambda: Stage(at=(1, 1)), "radius = 0: must be above 0"),
+        (lambda: Door(at=(1, 1), radius=1), "width = None: must be given, in m, for a door without ends"),
         (lambda: Way(targets=()), "targets: must be a list of at least 1"),
         (lambda: Journey(stages=()), "stages: must be a list of at least 1"),
         (lambda: Routes(doors=()), "doors: must be a list of at least 1"),
@@ -429,14 +429,17 @@ DOOR = Door(ends=LEFT)
             lambda: Way(targets=(Target(at=(3, 3)), Target(ends=((0, 0), (0, 1))))),
             r"targets\[1\] = .*: is at most -0.1 m",
         ),
-        (lambda: Way(targets=(Target(at=(1, 2, 3)),)), r"targets\[0\] = \(1.0, 2.0, 3.0\): dimension = 2"),
+        (
+            lambda: Way(targets=(Target(at=(1, 2, 3)),)),
+            r"targets\[0\] = \(1.0, 2.0, 3.0\): lies in 3 dimensions, but dimension = 2",
+        ),
         (lambda: Way(targets=(Target(at=(3, 3)),), clearance=0.1, spacing=0.5), "spacing = 0.5: paths lead through"),
         (lambda: Way(targets=(Target(at=(3, 3)),), group=4), "group = 4: there are 1 groups"),
         (
             lambda: Way(targets=(Target(at=(12, 3)),), clearance=1.0),
             r"targets\[0\] = \(12.0, 3.0\): no way leads",
         ),
-        (lambda: Way(targets=(Target(at=(3, 3)),), spacing=1e-4), "points, at most"),
+        (lambda: Way(targets=(Target(at=(3, 3)),), spacing=1e-4), "points; at most"),
         (lambda: Journey(stages=(Stage(at=(5, 0), radius=0.1),)), r"stages\[0\] = \(5.0, 0.0\): is -0.1 m"),
         (lambda: Routes(doors=(DOOR, Door(ends=((0, 0), (0, 1))))), r"doors\[1\] = .*: is at most -0.1 m"),
     ],
@@ -452,7 +455,7 @@ def test_two_aims_of_one_group_and_door_choice_without_a_speed_are_refused() -> 
     with pytest.raises(ValueError, match=r"effects\[0\].group = 0: effects\[1\], a routes, also steers some"):
         Scene(groups=groups, obstacles=ROOM, effects=(THERE, Routes(doors=(DOOR,))))
     slow = Group(count=1, spawn=Spawn(low=(2, 2), high=(3, 3)))
-    with pytest.raises(ValueError, match=r"groups\[0\].desired_speed = None: give m/s"):
+    with pytest.raises(ValueError, match=r"groups\[0\].desired_speed = None: must be given, in m/s"):
         Scene(groups=(slow,), obstacles=ROOM, effects=(Routes(doors=(DOOR,)),))
 
 
@@ -466,7 +469,7 @@ def thin(x: float = 5.0, wide: float = 0.05) -> Polygon:
         ((thin(),), 0.0, r"obstacles\[0\], 0.05 m thick, unless a clearance of more than 0.075 m or a spacing of less"),
         ((thin(),), 0.01, "unless a clearance of more than 0.075 m"),
         (tuple(Circle(centre=(5, 0.06 + 0.12 * k), radius=0.06) for k in range(40)), 0.0, "0.12 m thick"),
-        ((Wall(vertices=((5, 0), (5, 5))),), 0.0, r"clearance = 0: paths lead through obstacles\[0\], a line"),
+        ((Wall(vertices=((5, 0), (5, 5))),), 0.0, r"clearance = 0: paths lead through obstacles\[0\], which is a line"),
         ((Block(centre=(5, 2.5), size=(0.1, 5)),), 0.04, "0.1 m thick"),
     ],
 )

@@ -360,7 +360,7 @@ def test_snapshots_and_records_contain_the_heading(tmp_path: Path) -> None:
     [
         ({"max_turn_rate": 0.0}, "max_turn_rate = 0"),
         ({"max_turn_rate": -1.0}, "max_turn_rate = -1"),
-        ({"banking": 0.3}, r"groups\[0\].banking = 0.3: only in 3-D"),
+        ({"banking": 0.3}, r"groups\[0\].banking = 0.3: needs dimension = 3"),
     ],
 )
 def test_invalid_turn_rates_and_banking_in_2d_are_refused(group: dict[str, Any], message: str) -> None:

@@ -180,7 +180,7 @@ def test_spreads_have_the_given_moments_and_bounds() -> None:
         ({"low": 2.0, "high": 1.0}, "low = 2: must not be above high = 1"),
         ({"mean": 2.0}, "mean and sd go together"),
         ({"low": 2.0}, "low: give low and high, or mean and sd"),
-        ({"low": -1.0, "high": 1.0}, "low = -1: at least 0 is allowed"),
+        ({"low": -1.0, "high": 1.0}, "low = -1: must be at least 0"),
         ({"mean": 3.0, "sd": 1.0, "high": 2.0}, "mean = 3: must lie between low and high"),
     ],
 )
@@ -190,9 +190,9 @@ def test_invalid_spreads_are_refused(given: dict[str, float], message: str) -> N
 
 
 def test_missing_speeds_and_zero_directions_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"groups\[0\].desired_speed = None: give m/s"):
+    with pytest.raises(ValueError, match=r"groups\[0\].desired_speed = None: must be given, in m/s"):
         Scene(groups=(Group(count=1, spawn=Spawn(low=(0, 0), high=(1, 1))),), effects=(Driving(),))
     with pytest.raises(ValueError, match=r"direction = \(0.0, 0.0\): leads nowhere"):
         Scene(groups=(WALKERS,), effects=(Course(direction=(0, 0)), Driving()))
-    with pytest.raises(ValueError, match=r"haste = 1\.3: goes with a desired_speed"):
+    with pytest.raises(ValueError, match=r"haste = 1\.3: needs a desired_speed"):
         Group(count=1, haste=1.3)

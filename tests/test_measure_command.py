@@ -229,7 +229,7 @@ def test_the_area_of_an_obstacle_does_not_count_for_the_density() -> None:
         ("room.yaml --out ../p", "--out '../p': must not go up with '..'"),
         ("room.yaml --seeds 0", "Invalid value for '--seeds'"),
         ("rom.yaml", "rom.yaml: no such file, did you mean `room.yaml`?"),
-        ("cube.yaml --time 1 --line 0,0,1,0", "dimension = 3: lines and areas are of the plane"),
+        ("cube.yaml --time 1 --line 0,0,1,0", "dimension = 3: lines and areas can only be given in 2-D"),
     ],
 )
 def test_an_invalid_argument_gives_one_line_and_writes_no_file(
@@ -257,7 +257,7 @@ def test_lines_and_areas_in_three_dimensions_are_refused_before_the_run(
     monkeypatch.setattr(flockenv.studies.trajectory, "record", started)
     Path("cube.yaml").write_text("dimension: 3\ngroups: [{count: 1, spawn: {low: [0, 0, 0], high: [1, 1, 1]}}]\n")
     assert main(["measure", "cube.yaml", "--time", "1", *option.split(" ")]) == 2
-    assert capsys.readouterr().err == "flockenv: dimension = 3: lines and areas are of the plane\n"
+    assert capsys.readouterr().err == "flockenv: dimension = 3: lines and areas can only be given in 2-D\n"
 
 
 def test_existing_files_are_not_overwritten_without_force() -> None:

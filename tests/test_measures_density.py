@@ -137,7 +137,7 @@ def test_an_invalid_area_is_refused_in_one_line(polygon: list[tuple[float, float
         assert "\n" not in str(caught.value)
     with pytest.raises(ValueError, match=r"area = .*: must be convex"):
         voronoi(np.zeros((1, 2)), SQUARE, NOTCHED)
-    with pytest.raises(ValueError, match="areas are of the plane"):
+    with pytest.raises(ValueError, match="areas exist only in 2-D"):
         classical_density(np.zeros((1, 1, 3)), SQUARE)
 
 

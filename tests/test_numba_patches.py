@@ -83,7 +83,7 @@ def test_each_patch_has_its_own_title_and_other_names_are_refused(
     titles = [each.title for each in (*front_end.PATCHES, *front_end.REPLACED_PASSES)]
     assert len(set(titles)) == len(titles)
     monkeypatch.setenv(front_end.LEFT_OUT, "lowring")
-    with pytest.raises(ValueError, match=r"^FLOCKENV_NUMBA_ALONE: 'lowring' is none, did you mean `lowering`"):
+    with pytest.raises(ValueError, match=r"^FLOCKENV_NUMBA_ALONE: 'lowring': unknown, did you mean `lowering`"):
         front_end._replacements()
 
 

@@ -310,7 +310,7 @@ def test_the_nearest_obstacles_count_in_any_order_of_the_list() -> None:
 
 
 def test_obstacles_that_are_not_round_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"sees round obstacles only, obstacles\[0\].kind = wall"):
+    with pytest.raises(ValueError, match=r"only sees solid circles at rest; obstacles\[0\].kind = wall"):
         walkers(obstacles=({"kind": "wall", "vertices": ((0.0, 0.0), (1.0, 0.0))},))
 
 

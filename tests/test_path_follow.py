@@ -228,7 +228,7 @@ def test_a_picture_shows_the_track() -> None:
     [
         ({"half_width": 3.0}, "lost_distance = 2.5: must be more than half_width = 3"),
         ({"ring": 6.0}, "lost_distance = 2.5: at most 0.3 of ring = 6"),
-        ({"ahead": 64}, "spacing = 1.2: 64 points are 76.8 m, at most half a ring"),
+        ({"ahead": 64}, "spacing = 1.2: 64 points span 76.8 m; at most half a ring"),
         ({"winding": 0.9}, "winding = 0.9"),
     ],
 )

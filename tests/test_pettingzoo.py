@@ -188,7 +188,7 @@ def test_a_step_without_agents_takes_an_empty_dictionary(env_id):
     with pytest.raises(ResetNeeded, match="reset"):
         env.step({})
     env.reset(seed=0)
-    with pytest.raises(ValueError, match=f"'{env.agents[0]}' has none"):
+    with pytest.raises(ValueError, match=f"'{env.agents[0]}' has no action"):
         env.step({})
     for _ in range(3):
         last = {agent: env.action_space(agent).sample() for agent in env.agents}
@@ -260,7 +260,7 @@ def test_actions_of_agents_that_have_left_do_not_replace_missing_ones():
     for lacking in env.agents:
         refused(env, {**still(env), gone: np.zeros(2)} | {lacking: np.zeros(3)}, repr(lacking))
         given = {name: np.zeros(2) for name in env.possible_agents if name != lacking}
-        refused(env, given, repr(lacking), "has none")
+        refused(env, given, repr(lacking), "has no action")
     refused(env, {**still(env), gone: np.zeros(2), gone + "x": np.zeros(2)}, repr(gone + "x"), "is unknown")
     assert gone not in env.step({**still(env), gone: np.zeros(2)})[0]
 

@@ -69,8 +69,8 @@ def test_a_full_comparison_is_published_and_a_quick_or_partial_one_is_refused(tm
     without = {**results, "tasks": {name: task for name, task in results["tasks"].items() if name != "herd"}}
     for given, message in (
         (None, "no such file; `python -m agents.compare` writes it"),
-        ({**results, "smoke": True}, "a quick look (--smoke) is not for the documents"),
-        (without, "a part of a comparison, without herd, is not for the documents"),
+        ({**results, "smoke": True}, "a quick look (--smoke) must not be published"),
+        (without, "a part of a comparison, without herd, must not be published"),
     ):
         refused = published(given)
         assert refused.exit_code == 2 and message in refused.stderr and refused.stderr.count("\n") == 1

@@ -421,7 +421,10 @@ BAD_SCENES = [
     ({"groups": (Group(count=3),)}, ["groups[0].spawn.low", "missing"]),
     ({"groups": (Group(count=3, spawn=Spawn(low=(0, 0, 0), high=(1, 1, 1))),)}, ["groups[0].spawn.low", "dimension"]),
     ({"groups": (Group(count=3, spawn=SPAWN), {"count": 2, "mas": 1})}, ["groups[1].mas", "did you mean `mass`"]),
-    ({"groups": (Group(count=3, spawn=Spawn(low=(0, 0), high=(1, 0.4), spacing=0.4)),)}, ["room for 2 of 3 agents"]),
+    (
+        {"groups": (Group(count=3, spawn=Spawn(low=(0, 0), high=(1, 0.4), spacing=0.4)),)},
+        ["room for only 2 of 3 agents"],
+    ),
     ({"groups": (Group(count=3, spawn=Spawn(low=(0, 0), high=(1, 1), spacing=0.3, jitter=0.1)),)}, ["at least 0.4 m"]),
     ({"groups": (Group(count=3, radius=0, spawn=Spawn(low=(0, 0), high=(9, 9), spacing=1e-4)),)}, ["8,100,000,000"]),
     ({"groups": (Group(count=3, spawn=Spawn(low=(0, 0), high=(9, 9), spacing=(1, 1, 1))),)}, ["one per axis (2)"]),
@@ -467,9 +470,9 @@ def test_a_bad_scene_raises_an_error_of_one_line_before_allocating(fields: Any, 
         ({"spawn": {"speed": (2, 1)}}, "speed = (2.0, 1.0)"),
         ({"spawn": {"low": (1, 1), "high": (0, 2)}}, "low = (1.0, 1.0)"),
         ({"spawn": {"low": (1, 1)}}, "low and high"),
-        ({"spawn": {"jitter": 0.1}}, "jitter = 0.1: goes with spacing"),
+        ({"spawn": {"jitter": 0.1}}, "jitter = 0.1: needs spacing"),
         ({"spawn": {"spacing": 0}}, "spacing = 0"),
-        ({"spawn": {"wider": True}}, "wider = true: goes with spacing"),
+        ({"spawn": {"wider": True}}, "wider = true: needs spacing"),
     ],
     ids=str,
 )
@@ -599,14 +602,14 @@ def test_a_noncontiguous_state_is_copied_as_input_and_refused_as_output() -> Non
     state = scene.start(0)
     pieces = State(**{**vars(state), "x": np.asfortranarray(state.x)})
     np.testing.assert_array_equal(scene.step(pieces).x, scene.step(state).x)
-    with pytest.raises(ValueError, match=r"out\.x does not lie in one piece"):
+    with pytest.raises(ValueError, match=r"out\.x is not contiguous"):
         scene.step(pieces, out=pieces)
 
 
 @pytest.mark.parametrize(
     ("fault", "drive", "x"),
     [
-        (r"out\.x does not lie in one piece", None, np.asfortranarray),
+        (r"out\.x is not contiguous", None, np.asfortranarray),
         (r"drive has shape", np.zeros(3), np.copy),
         (r"drive of world 0, agent 0, axis 0 is nan", np.full((1, 64, 2), np.nan), np.copy),
     ],

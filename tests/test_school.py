@@ -259,10 +259,13 @@ def test_eating_does_not_depend_on_order_batch_or_threads() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: tank(grazing={"rate": 4.0}), "effects[2].rate = 4: all 6 of groups[0] could eat more than there is"),
-        (lambda: Metabolism(start=0.9, spread=0.4), "spread = 0.4: start = 0.9 leaves room for 0.2"),
+        (
+            lambda: tank(grazing={"rate": 4.0}),
+            "effects[2].rate = 4: all 6 of groups[0] could eat more than a patch holds",
+        ),
+        (lambda: Metabolism(start=0.9, spread=0.4), "spread = 0.4: at most 0.2 is allowed"),
         (lambda: Intention(school=0.5), "school = 0.5: must not be above escape = 0.4"),
-        (lambda: Intention(content=0.5), "content = 0.5: must be below 0.5"),
+        (lambda: Intention(content=0.5), "content = 0.5: must be below need = 0.5"),
         (
             lambda: Scene(
                 groups=(Group(count=1, spawn=Spawn(low=(0, 0), high=(1, 1))),), population=(Threshold(of="hunger"),)

@@ -182,7 +182,7 @@ def test_cases_and_methods_are_found_by_name_and_unknown_names_are_refused() -> 
     with pytest.raises(ValueError, match=r"^case 'N41': unknown; the nearest of \d+: N") as caught:
         select_cases(CASES, ("N41",))
     assert "\n" not in str(caught.value)
-    with pytest.raises(ValueError, match=r"^methods: 'rk44' is none.*rk4") as caught:
+    with pytest.raises(ValueError, match=r"^methods: 'rk44': unknown.*rk4") as caught:
         methods_of(("rk44",))
     assert "\n" not in str(caught.value)
 

@@ -91,5 +91,5 @@ def test_a_width_that_is_not_a_literal_is_refused() -> None:
     def take(numbers, records, width):
         out_of_records(numbers, (np.uint64(0),), np.uint64(0), width, records)
 
-    with pytest.raises(numba.TypingError, match="must be written as a number"):
+    with pytest.raises(numba.TypingError, match="must be an integer literal"):
         take(np.zeros(64), np.zeros(64), 8)

@@ -288,7 +288,9 @@ effects:
         """Raise ValueError if the space is periodic, or the region is less than 3 tracks wide."""
         super().check(scene)
         if scene.space.periodic:
-            raise ValueError(f"low = {self.low}: a region has edges; space.kind = {scene.space.kind!r} has none")
+            raise ValueError(
+                f"low = {self.low}: a region cannot lie in a space of kind {scene.space.kind!r}, which has no edges"
+            )
         if any(b - a < 3 * self.track for a, b in zip(self.low[:2], self.high[:2], strict=True)):
             raise ValueError(
                 f"high = {self.high}: must be at least 3 tracks = {3 * self.track:g} m above low, per axis"

@@ -70,7 +70,7 @@ def _demand_speeds(effect: Behaviour, scene: SceneView) -> None:
     """Raise ValueError if a group that an effect steers has no desired speed."""
     for k in steered_groups(effect, scene):
         if scene.groups[k].desired_speed is None and scene.groups[k].max_force != 0:
-            raise ValueError(f"kind = {effect.kind}: groups[{k}].desired_speed = None: give m/s")
+            raise ValueError(f"kind = {effect.kind}: groups[{k}].desired_speed = None: must be given, in m/s")
 
 
 @law

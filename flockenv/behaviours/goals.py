@@ -59,7 +59,7 @@ def target_speed_force(p: Any, me: Me) -> Vec:
 def _demand_direction(name: str, value: tuple[float, ...]) -> None:
     """Raise ValueError if a direction is zero, or so long or short that its square is out of range in float32."""
     if not 1e-15 <= math.hypot(*value) <= 1e15:
-        raise ValueError(f"{name} = {value}: a direction, not all 0 (from 1e-15 to 1e+15 long)")
+        raise ValueError(f"{name} = {value}: must be a direction, not all 0, of length 1e-15 to 1e+15")
 
 
 class _ToTarget(Moving):

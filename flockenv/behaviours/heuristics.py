@@ -251,8 +251,8 @@ effects:
             if shape.moves or shape.kind not in SIDES or (shape.kind == "capsule" and shape.is_hollow):
                 what = "moves" if shape.moves else "is not namespace of straight sides"
                 raise ValueError(
-                    f"kind = heuristics: obstacles[{k}].kind = {shape.kind} {what}; circles and {', '.join(SIDES)} "
-                    "that stand still are seen"
+                    f"kind = heuristics: obstacles[{k}].kind = {shape.kind} {what}; only circles and "
+                    f"{', '.join(SIDES)} that stand still are seen"
                 )
         super().check(scene)
 

@@ -147,7 +147,9 @@ effects:
         for k, obstacle in enumerate(scene.obstacles):
             if not obstacle.in_state:
                 what = ", which moves or is hollow" if obstacle.kind == "circle" else ""
-                raise ValueError(f"kind = orca: sees round obstacles only, obstacles[{k}].kind = {obstacle.kind}{what}")
+                raise ValueError(
+                    f"kind = orca: only sees solid circles at rest; obstacles[{k}].kind = {obstacle.kind}{what}"
+                )
         super().check(scene)
 
     def sums(self, dimension: int) -> int:

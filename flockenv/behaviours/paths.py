@@ -110,7 +110,7 @@ class _OnPath(Moving):
         """Raise ValueError if points differ in dimension, or two coincide."""
         for k, point in enumerate(self.points):
             if len(point) != len(self.points[0]):
-                raise ValueError(f"points[{k}] = {point}: the first point has {len(self.points[0])} coordinates")
+                raise ValueError(f"points[{k}] = {point}: must have {len(self.points[0])} numbers, as points[0] has")
         polyline.pieces(self.points, self.closed)
         return self
 
@@ -132,7 +132,9 @@ class _OnPath(Moving):
     def check(self, scene: SceneView) -> None:
         """Raise ValueError if the path has another dimension, or a piece has no length on a torus."""
         if len(self.points[0]) != scene.dimension:
-            raise ValueError(f"points[0] = {self.points[0]}: dimension = {scene.dimension}")
+            raise ValueError(
+                f"points[0] = {self.points[0]}: has {len(self.points[0])} numbers, but dimension = {scene.dimension}"
+            )
         super().check(scene)
         scene.table_of(self)
 
@@ -229,7 +231,7 @@ effects:
         """Raise ValueError if the number of velocities is not that of points, or dimensions differ."""
         d = len(self.centre)
         if len(self.counts) != d:
-            raise ValueError(f"counts = {self.counts}: the centre has {d} coordinates")
+            raise ValueError(f"counts = {self.counts}: must have {d} numbers, as centre has")
         if len(self.velocities) != math.prod(self.counts):
             raise ValueError(f"velocities: {len(self.velocities)}, must be {math.prod(self.counts)}, one at each point")
         for k, velocity in enumerate(self.velocities):

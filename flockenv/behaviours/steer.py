@@ -49,7 +49,9 @@ class Steer(Effect):
         """Raise ValueError if an entry is no behaviour, or the arbitration's numbers do not fit their count."""
         for k, behaviour in enumerate(self.behaviours):
             if not behaviour.steering or behaviour.components:
-                raise ValueError(f"behaviours[{k}].kind = {behaviour.kind}: is no behaviour; {', '.join(BEHAVIOURS)}")
+                raise ValueError(
+                    f"behaviours[{k}].kind = {behaviour.kind}: is not a behaviour; allowed: {', '.join(BEHAVIOURS)}"
+                )
         self.arbitration.parameters(len(self.behaviours))
         return self
 

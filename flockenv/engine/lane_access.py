@@ -37,7 +37,7 @@ _WORD = ir.IntType(64)
 def _constants(numbers: Any, name: str) -> list[int]:
     """Return the integers of a tuple that a function holds; numba retries with literals if they are not known yet."""
     if not all(isinstance(number, types.IntegerLiteral) for number in numbers):
-        raise numba.TypingError(f"{name}: {numbers}, must be a tuple of integers that the function holds")
+        raise numba.TypingError(f"{name}: {numbers}, must be a tuple of integers that are constants of the function")
     return [int(number.literal_value) for number in numbers]
 
 
@@ -74,7 +74,7 @@ def _scatter(typing_context: Any, array: Any, at: Any, places: Any, numbers: Any
     """Write the numbers of a tuple to some places of an array behind `at`."""
     wanted = _constants(places, "places")
     if len(wanted) != len(numbers):
-        raise numba.TypingError(f"scatter: {numbers} to {len(wanted)} places")
+        raise numba.TypingError(f"scatter: {numbers} to {len(wanted)} places, must be as many")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         pointers, size = _pointers(context, builder, signature.args[0], arguments[0], arguments[1], wanted)
@@ -266,7 +266,7 @@ def _copy_each(
         return context.get_dummy_value()
 
     if any(array.dtype != to.dtype for array in arrays):
-        raise numba.TypingError(f"copy_each: {arrays} into {to}, must be the same numbers")
+        raise numba.TypingError(f"copy_each: {arrays} into {to}, must have one dtype")
     many = types.UniTuple(types.uint64, len(starts))  # type: ignore[no-untyped-call]
     return types.void(to, types.uint64, places, arrays, many, which, further, width), generate
 

@@ -105,7 +105,7 @@ def _merge(typing_context: Any, numbers: Any, come: Any) -> Any:
     """Return a list of keys (stored as float32) with new keys inserted; its length stays the same."""
     many = len(numbers)
     if len(come) != AT_ONCE or set(come) != {types.uint32} or set(numbers) != {types.float32}:
-        raise numba.TypingError(f"merged: {come} into {numbers}, must be AT_ONCE keys and float32 numbers")
+        raise numba.TypingError(f"merged: {come} into {numbers}, must be AT_ONCE uint32 keys into float32 numbers")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         found = [builder.bitcast(builder.extract_value(arguments[0], k), ir.IntType(32)) for k in range(many)]

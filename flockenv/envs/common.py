@@ -67,7 +67,7 @@ def check_ends_together(task: Task) -> Task:
     """Return the task; ValueError if its learners end one by one, as a row would have no meaning after its end."""
     if not task.ends_together:
         raise ValueError(
-            f"{task.name}: its learners leave one by one, and a row of a vector env cannot; "
+            f"{task.name}: its learners leave one by one, but rows of a vector environment end together; "
             "use pettingzoo.make('parallel', ...), or a task in which all learners end together"
         )
     return task

@@ -188,7 +188,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
             if name not in self.action_spaces:
                 raise ValueError(f"actions: agent {name!r} is unknown{nearest(str(name), self._live)}")
         lacking = next(name for name in self._live if name not in actions)
-        raise ValueError(f"actions: agent {lacking!r} has none")
+        raise ValueError(f"actions: agent {lacking!r} has no action")
 
     def check_action(self, agent: str, action: Rows | None) -> Rows:
         """Return an action as an array, (A,); ValueError, with the agent, on NaN, infinity or another shape."""
@@ -202,7 +202,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         if row.shape != (size,):
             raise ValueError(f"actions: agent {agent!r} has shape {row.shape}, must be ({size},)")
         if not np.isfinite(row).all():
-            raise ValueError(f"actions: agent {agent!r} has {row.tolist()}; allowed: numbers, clipped to [-1, 1]")
+            raise ValueError(f"actions: agent {agent!r} has {row.tolist()}, must be finite (clipped to [-1, 1])")
         return row
 
     @functools.cached_property

@@ -213,7 +213,7 @@ class World:
         if into is not None and (into.shape, into.dtype) != (self._shapes[0], self._dtypes[0]):
             raise ValueError(f"into has shape {into.shape} and type {into.dtype}, expected {self._shapes[0]} float32")
         if into is not None and not into.flags.carray:
-            raise ValueError("into must be writable and contiguous: the observations of a step, no part of them")
+            raise ValueError("into must be writable and contiguous: it takes all observations of a step")
         self._seed(seeds, rows)
         observation: Rows = self._make_results[0]() if into is None else into
         busy = self.worlds if into is None else int(np.count_nonzero(rows))

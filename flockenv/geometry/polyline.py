@@ -42,7 +42,7 @@ def pieces(points: Sequence[Sequence[float]], closed: bool, space: Space | None 
     at = np.asarray(points, np.float64)
     least = 3 if closed else 2
     if at.ndim != 2 or len(at) < least:
-        raise ValueError(f"points: a {'closed' if closed else 'open'} path has at least {least}")
+        raise ValueError(f"points: a {'closed' if closed else 'open'} path needs at least {least}")
     if not np.isfinite(at).all():
         raise ValueError("points: must be finite")
     space = space or Plane()
@@ -51,7 +51,7 @@ def pieces(points: Sequence[Sequence[float]], closed: bool, space: Space | None 
     length = np.linalg.norm(steps, axis=1)
     if not length.all():
         k = int(np.argmin(length)) + 1
-        raise ValueError(f"points[{k % len(at)}] = {tuple(at[k % len(at)].tolist())}: is where the one before it is")
+        raise ValueError(f"points[{k % len(at)}] = {tuple(at[k % len(at)].tolist())}: is where the point before it is")
     ends = np.cumsum(length)
     begin = at if closed else at[:-1]
     edges = space.extent(at.shape[1]) if space.periodic else (0.0,) * at.shape[1]

@@ -34,7 +34,7 @@ class Target(Record):
         if (self.at is not None) + (self.ends is not None) + box != 1 or (self.low is None) != (self.high is None):
             raise ValueError("at: give one of at, ends, or low and high")
         if len({len(place) for place in self._places}) != 1:
-            raise ValueError(f"{self._word} = {self.points_text}: both must have as many numbers")
+            raise ValueError(f"{self._word} = {self.points_text}: both must have the same number of coordinates")
         if self.ends is not None and self.ends[0] == self.ends[1]:
             raise ValueError(f"ends = {self.points_text}: is a point; give at")
         if box and any(a > b for a, b in zip(*self._places, strict=True)):

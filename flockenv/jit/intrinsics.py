@@ -42,7 +42,7 @@ def intrinsic_or_python(generate: Callable[..., Any], plain: Callable[..., Any])
 def literal_value(number: Any, name: str) -> int:
     """Return an integer literal's value; else raise TypingError, after which numba tries again with literal types."""
     if not isinstance(number, types.IntegerLiteral):
-        raise numba.TypingError(f"{name}: {number}, must be written as a number")
+        raise numba.TypingError(f"{name}: {number}, must be an integer literal")
     return int(number.literal_value)
 
 
@@ -79,7 +79,7 @@ def _copy_lanes(typing_context: Any, to: Any, at: Any, source: Any, place: Any, 
     Both arrays have one axis and are contiguous; indices are unsigned, and the width is a literal.
     """
     if to.dtype != source.dtype or (to.layout, source.layout, to.ndim, source.ndim) != ("C", "C", 1, 1):
-        raise numba.TypingError(f"copy_lanes: {source} into {to}, must be one row of the same numbers, in one piece")
+        raise numba.TypingError(f"copy_lanes: {source} into {to}, must be contiguous 1-D arrays of one dtype")
     wide = literal_value(width, "width")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -138,7 +138,7 @@ def _tuple_as_array(typing_context: Any, numbers: Any) -> Any:
     It is on the stack, as laws allocate nothing. A law must not return it.
     """
     if not isinstance(numbers, types.UniTuple):
-        raise numba.TypingError(f"stacked: {numbers}, must be a tuple of numbers of one kind")
+        raise numba.TypingError(f"stacked: {numbers}, must be a tuple of numbers of one dtype")
     array = types.Array(numbers.dtype, 1, "C")
     on_stack: Any = cgutils.alloca_once_value
     fill: Any = arrayobj.populate_array

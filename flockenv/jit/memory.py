@@ -42,7 +42,7 @@ def zeros(shape: int | tuple[int, ...], dtype: Any = np.float64) -> NDArray[Any]
 def check_contiguous(array: Any) -> None:
     """Raise TypingError unless an array type is contiguous (C layout)."""
     if array.layout != "C":
-        raise TypingError(f"{array} must lie in one piece")
+        raise TypingError(f"{array} must be contiguous")
 
 
 def array_of(context: Any, builder: Any, kind: Any, value: Any = None) -> Any:
@@ -99,7 +99,7 @@ def _stream_store(typing_context: Any, to: Any, at: Any, source: Any) -> Any:
     check_contiguous(to)
     check_contiguous(source)
     if to.dtype != source.dtype:
-        raise TypingError(f"{source} is copied into {to}: their numbers differ")
+        raise TypingError(f"{source} is copied into {to}: their dtypes differ")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         target, old = (array_of(context, builder, signature.args[k], arguments[k]) for k in (0, 2))

@@ -226,7 +226,7 @@ def _call_all(functions: tuple[Any, ...], joined: bool, plain: Callable[..., Any
         nothing = all(silent)
         if any(silent) and not nothing:
             which = python_of(functions[silent.index(True)]).__name__
-            raise numba.TypingError(f"{which} returns nothing, and functions beside it return something")
+            raise numba.TypingError(f"{which} returns nothing, but functions combined with it return something")
 
         def generate(context: Any, builder: Any, own: Any, arguments: Any) -> Any:
             found = []

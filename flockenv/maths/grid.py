@@ -41,9 +41,11 @@ def pack_grid(values: ArrayLike, low: Sequence[float], spacing: float) -> Floats
     array = np.asarray(values, np.float64)
     d = len(low)
     if array.ndim != d + 1:
-        raise ValueError(f"values: shape {array.shape}, must have {d} axes of points and one of numbers")
+        raise ValueError(f"values: shape {array.shape}, must have {d} axes of points, then one of numbers")
     if min(array.shape[:d]) < 2 or array.shape[d] < 1:
-        raise ValueError(f"values: shape {array.shape}, must have at least 2 points along each axis, and a number each")
+        raise ValueError(
+            f"values: shape {array.shape}, must have at least 2 points along each axis, and a number for each point"
+        )
     if not spacing > 0:
         raise ValueError(f"spacing = {spacing:g}, must be positive")
     if not np.isfinite(array).all():

@@ -49,13 +49,13 @@ class Appearance(Record):
     def _check_consistent(self) -> Appearance:
         """Raise ValueError if the range is empty, or `by` and what depends on it do not fit together."""
         if not self.over[0] < self.over[1]:
-            raise ValueError(f"over = {self.over}: the least comes first, and they differ")
+            raise ValueError(f"over = {self.over}: the first number must be below the second")
         changes = len(self.colours) > 1 or self.opacity[0] != self.opacity[1]
         changes |= self.size is not None and self.size[0] != self.size[1]
         if changes and self.by is None:
             raise ValueError("by: missing; colours, opacity or size depend on age, speed or an inner state")
         if (self.by == "inner") != (self.of is not None):
-            raise ValueError(f"of = {self.of}: goes with by = inner, and names the inner state")
+            raise ValueError(f"of = {self.of}: is needed if by = inner, to name the inner state, and only then")
         return self
 
     def shade(

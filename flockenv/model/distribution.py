@@ -35,7 +35,7 @@ class Spread(Record):
         if self.low is not None and self.high is not None and self.low > self.high:
             raise ValueError(f"low = {self.low:g}: must not be above high = {self.high:g}")
         if self.least < 0:
-            raise ValueError(f"low = {self.least:g}: at least 0 is allowed")
+            raise ValueError(f"low = {self.least:g}: must be at least 0")
         if self.mean is not None and not self.least <= self.mean <= self.most:
             raise ValueError(f"mean = {self.mean:g}: must lie between low and high")
         return self

@@ -170,9 +170,11 @@ def frequencies(K: Sparse, M: Sparse, fixed: ArrayLike = (), count: int | None =
     """
     free = _free(K.shape[0], fixed)
     if count is not None and not 1 <= count <= len(free):
-        raise ValueError(f"count = {count!r}: must be an integer from 1 to {len(free)}, the free freedoms")
+        raise ValueError(f"count = {count!r}: must be an integer from 1 to {len(free)} (those not fixed)")
     if len(free) > DENSE and (count is None or count > DENSE):
-        raise ValueError(f"count = {count}: {len(free):,} freedoms have too many frequencies; ask for up to {DENSE}")
+        raise ValueError(
+            f"count = {count}: {len(free):,} degrees of freedom have too many frequencies; ask for up to {DENSE}"
+        )
     K, M = (matrix.tocsr()[free][:, free].tocsc() for matrix in (K, M))
     empty = np.flatnonzero(M.diagonal() <= 0)
     if len(empty):
@@ -335,7 +337,8 @@ def _lu(A: Sparse) -> Any:
 def _refuse_motion(freedom: int, dimension: int) -> None:
     particle, axis = divmod(int(freedom), dimension)
     raise ValueError(
-        f"the structure can move without resistance, particle {particle} along {'xyz'[axis]} most: fix more freedoms"
+        f"the structure can move without resistance, particle {particle} along {'xyz'[axis]} most: fix more degrees of "
+        "freedom"
     )
 
 

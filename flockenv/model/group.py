@@ -81,11 +81,11 @@ class Group(Record):
         ):
             raise ValueError("spawn: a network defines its own positions; only speed, with a heading, may be given")
         if self.network is not None and (isinstance(self.mass, Spread) or isinstance(self.radius, Spread)):
-            raise ValueError("mass: of a network it is the mean, and its radius is a number")
+            raise ValueError("mass: a network has one mass (the mean of its particles) and one radius")
         if self.haste is not None and (self.max_speed is not None or self.desired_speed is None):
-            raise ValueError(f"haste = {self.haste:g}: goes with a desired_speed, and instead of a max_speed")
+            raise ValueError(f"haste = {self.haste:g}: needs a desired_speed, and no max_speed beside it")
         if self.alive is not None and self.network is not None:
-            raise ValueError(f"alive = {self.alive}: all particles of a network live")
+            raise ValueError(f"alive = {self.alive}: must be left out, since all particles of a network are alive")
         if self.alive is not None and self.alive > self.size:
             raise ValueError(f"alive = {self.alive}: at most its count, {self.size}, is allowed")
         return self

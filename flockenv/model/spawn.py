@@ -56,16 +56,16 @@ class Spawn(Record):
     def _check_ranges(self) -> Spawn:
         """Raise ValueError if a range is reversed, or a field lacks the one it goes with."""
         if self.speed[0] > self.speed[1]:
-            raise ValueError(f"speed = {self.speed}: the least comes first")
+            raise ValueError(f"speed = {self.speed}: the lower number must come first")
         if (self.low is None) != (self.high is None):
             raise ValueError("low and high go together: give both or neither")
         corners = tuple(zip(self.low or (), self.high or (), strict=False))
         if len(self.low or ()) != len(self.high or ()) or any(a > b for a, b in corners):
             raise ValueError(f"low = {self.low}, high = {self.high}: the lower corner comes first")
         if self.jitter and self.spacing is None:
-            raise ValueError(f"jitter = {self.jitter:g}: goes with spacing, within whose cells it is")
+            raise ValueError(f"jitter = {self.jitter:g}: needs spacing, the grid in whose cells agents are moved")
         if self.wider and self.spacing is None:
-            raise ValueError("wider = true: goes with spacing, whose cells bodies may be wider than")
+            raise ValueError("wider = true: needs spacing, and then allows bodies that are wider than a cell")
         return self
 
 
@@ -83,7 +83,7 @@ def cells(
     along = [math.floor((b - a) / edge + 1e-9) for a, b, edge in zip(low, high, spacing, strict=True)]
     total = math.prod(along)
     if total > MOST_CELLS:
-        raise ValueError(f"spacing = {_edges_text(spacing)}: {total:,} cells; at most {MOST_CELLS:,} are allowed")
+        raise ValueError(f"spacing = {_edges_text(spacing)}: a grid of {total:,} cells; at most {MOST_CELLS:,} are allowed")
     found = np.zeros((0, dimension))
     for first in range(0, total, 65_536):
         if len(found) >= count:
@@ -94,7 +94,7 @@ def cells(
         found = np.concatenate([found, middles[free]])
     if len(found) < count:
         raise ValueError(
-            f"spacing = {_edges_text(spacing)}: room for {len(found):,} of {count:,} agents "
+            f"spacing = {_edges_text(spacing)}: there is room for only {len(found):,} of {count:,} agents "
             f"from {tuple(low)} to {tuple(high)}"
         )
     return found[:count]
@@ -108,8 +108,8 @@ def _edges(spawn: Spawn, dimension: int, radius: float) -> tuple[float, ...]:
     least = 2 * (radius + spawn.jitter)
     if not spawn.wider and min(given) < least * (1 - 1e-12):
         raise ValueError(
-            f"spacing = {_edges_text(given)}: bodies of radius {radius:g} m, up to {spawn.jitter:g} m from the middle, "
-            f"need cells of at least {least:g} m"
+            f"spacing = {_edges_text(given)}: bodies of radius {radius:g} m, up to {spawn.jitter:g} m from the middle of "
+            f"their cells, need at least {least:g} m"
         )
     return given
 

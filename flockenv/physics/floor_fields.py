@@ -143,22 +143,24 @@ def check_floor_field(
     """Raise ValueError for a torus, moving obstacles, walls that the grid misses, and too large a grid."""
     for name, target in zip(names, targets, strict=True):
         if target.dimension != scene.dimension:
-            raise ValueError(f"{name} = {target.points_text}: dimension = {scene.dimension}")
+            raise ValueError(
+                f"{name} = {target.points_text}: lies in {target.dimension} dimensions, but dimension = {scene.dimension}"
+            )
     for k, shape in enumerate(scene.obstacles):
         if shape.moves:
-            raise ValueError(f"kind = {kind}: its path is found once, and obstacles[{k}] moves")
+            raise ValueError(f"kind = {kind}: paths are found once, at the start, but obstacles[{k}] moves")
         thick = shape.thickness
         if spacing >= 2 * clearance + thick:
             raise ValueError(
                 f"spacing = {spacing:g}: paths lead through obstacles[{k}], {thick:g} m thick, unless a clearance of "
                 f"more than {(spacing - thick) / 2:g} m or a spacing of less than {2 * clearance + thick:g} m is given"
                 if clearance or thick
-                else f"clearance = 0: paths lead through obstacles[{k}], a line; more than half of the spacing, "
-                f"{spacing / 2:g} m, is allowed"
+                else f"clearance = 0: paths lead through obstacles[{k}], which is a line; must be more than half of "
+                f"the spacing, {spacing / 2:g} m"
             )
     if isinstance(scene.space, Torus):
-        raise ValueError(f"kind = {kind}: on a torus paths lead around; only a plane or a box is allowed")
+        raise ValueError(f"kind = {kind}: finds no paths around a torus; only a plane or a box is allowed")
     low, high = grid_corners(scene, targets, margin)
     points = float(np.prod((high - low) / spacing + 1))
     if points > MOST_POINTS:
-        raise ValueError(f"spacing = {spacing:g}: {points:,.0f} points, at most {MOST_POINTS:,} are allowed")
+        raise ValueError(f"spacing = {spacing:g}: a grid of {points:,.0f} points; at most {MOST_POINTS:,} are allowed")

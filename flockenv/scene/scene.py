@@ -105,7 +105,7 @@ def _check_contiguous(out: State) -> None:
     """Raise ValueError if positions or velocities are not contiguous, as kernels need them."""
     for name, array in (("x", out.x), ("v", out.v)):
         if not array.flags.c_contiguous:
-            raise ValueError(f"out.{name} does not lie in one piece (its strides are {array.strides}); use copy()")
+            raise ValueError(f"out.{name} is not contiguous (its strides are {array.strides}); use copy()")
 
 
 class Scene(Record):
@@ -170,7 +170,7 @@ class Scene(Record):
                     keepers = sorted(kind for kind, e in EFFECTS.items() if missing[0] in e.keeps)
                     raise ValueError(
                         f"effects[{k}].kind = {each.kind}: needs {missing[0]!r}, which no effect of this scene keeps; "
-                        f"{' or '.join(keepers) or 'none'} does"
+                        f"kinds that keep it: {', '.join(keepers) or 'none'}"
                     )
         for k, group in enumerate(self.groups):
             if group.appearance is not None and group.appearance.of not in {None, *kept_numbers}:
@@ -211,23 +211,27 @@ class Scene(Record):
         for k, obstacle in enumerate(self.obstacles):
             if obstacle.dimension != self.dimension:
                 where = f"centre = {obstacle.centre}" if isinstance(obstacle, Circle) else f"kind = {obstacle.kind}"
-                lies = "" if isinstance(obstacle, Circle) else f"lies in {obstacle.dimension} dimensions, but "
-                raise ValueError(f"obstacles[{k}].{where}: {lies}dimension = {self.dimension}")
+                raise ValueError(
+                    f"obstacles[{k}].{where}: lies in {obstacle.dimension} dimensions, but dimension = {self.dimension}"
+                )
             self._check_shape(k, obstacle)
         for k, group in enumerate(self.groups):
             if group.banking is not None and self.dimension == 2:
-                raise ValueError(f"groups[{k}].banking = {group.banking:g}: only in 3-D is there a side to lean to")
+                raise ValueError(f"groups[{k}].banking = {group.banking:g}: needs dimension = 3")
             for name in ("low", "high", "heading"):
                 value = getattr(group.spawn, name)
                 if value is not None and len(value) != self.dimension:
-                    raise ValueError(f"groups[{k}].spawn.{name} = {value}: dimension = {self.dimension}")
+                    raise ValueError(
+                        f"groups[{k}].spawn.{name} = {value}: has {len(value)} numbers, "
+                        f"but dimension = {self.dimension}"
+                    )
             if group.network is not None:
                 try:
                     group.network.rest_points(self.dimension)
                 except ValueError as error:
                     raise ValueError(f"groups[{k}].network.{error}") from None
             elif size is None and group.spawn.low is None and self.living[k]:
-                raise ValueError(f"groups[{k}].spawn.low: missing; a plane has no size to spread agents over")
+                raise ValueError(f"groups[{k}].spawn.low: missing; a plane has no edges, so give low and high")
 
     def _check_shape(self, k: int, shape: Shape) -> None:
         """Raise ValueError if a shape reaches around a torus: only its nearest image is used."""
@@ -235,14 +239,14 @@ class Scene(Record):
             return
         if isinstance(shape, HalfSpace):
             raise ValueError(
-                f"obstacles[{k}].kind = {shape.kind}: on a torus a plane has no two sides; only a plane or a box is "
-                "allowed"
+                f"obstacles[{k}].kind = {shape.kind}: on a torus a half-space has no inside; only a plane or a box "
+                "is allowed"
             )
         edges = np.ptp(shape.extremes, axis=0)
         if (edges > np.array(self.space.size) / 2).any():
             raise ValueError(
-                f"obstacles[{k}].kind = {shape.kind}: {np.round(edges, 3).tolist()} m; at most half of the torus, "
-                f"{(np.array(self.space.size) / 2).tolist()} m, is allowed"
+                f"obstacles[{k}].kind = {shape.kind}: extends over {np.round(edges, 3).tolist()} m; at most half "
+                f"of the torus, {(np.array(self.space.size) / 2).tolist()} m, is allowed"
             )
 
     # --- what follows from the fields -------------------------------------------------------------------------------
@@ -538,7 +542,8 @@ class Scene(Record):
             raise ValueError(f"drive has shape {forces.shape}, but the state has (B, N, D) = {state.shape}")
         if not np.isfinite(forces).all():
             world, agent, axis = (int(k) for k in np.argwhere(~np.isfinite(forces))[0])
-            raise ValueError(f"drive of world {world}, agent {agent}, axis {axis} is {forces[world, agent, axis]}")
+            number = forces[world, agent, axis]
+            raise ValueError(f"drive of world {world}, agent {agent}, axis {axis} is {number}, must be finite")
         return np.ascontiguousarray(forces.transpose(2, 0, 1))
 
     # --- looking at it ----------------------------------------------------------------------------------------------

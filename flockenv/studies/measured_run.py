@@ -88,7 +88,7 @@ class Scope:
     def check(self, scene: Scene) -> None:
         """Raise ValueError if a line or an area is given for a 3-D scene."""
         if scene.dimension == 3 and (self.line is not None or self.area is not None or self.walkable is not None):
-            raise ValueError("dimension = 3: lines and areas are of the plane")
+            raise ValueError("dimension = 3: lines and areas can only be given in 2-D")
 
 
 @dataclass(frozen=True, eq=False)

@@ -278,12 +278,12 @@ class Bottleneck(Task):
         if self.learners > self.people:
             raise ValueError(f"learners = {self.learners}: there are only {self.people} people")
         if self.width >= self.room:
-            raise ValueError(f"width = {self.width:g} m: the wall has {self.room:g} m")
+            raise ValueError(f"width = {self.width:g} m: must be below room = {self.room:g} m")
         if self.clear >= self.room - 1.0:
             raise ValueError(f"clear = {self.clear:g} m: at most room - 1 = {self.room - 1:g} m is allowed")
         columns, rows = self.cells
         if min((self.room - self.clear) / columns, self.room / rows) < 2 * _RADIUS:
-            raise ValueError(f"people = {self.people}: have no room in {self.room:g} m x {self.room - self.clear:g} m")
+            raise ValueError(f"people = {self.people}: do not fit into {self.room:g} m x {self.room - self.clear:g} m")
         return self
 
     @property

@@ -271,7 +271,7 @@ class Corridor(LastingTask):
             raise ValueError(f"learners = {self.learners}: there are only {self.people} people")
         columns, rows = self.cells
         if min(self.length / columns, self.width / rows) < 2 * _RADIUS:
-            raise ValueError(f"people = {self.people}: have no room in {self.length:g} m x {self.width:g} m")
+            raise ValueError(f"people = {self.people}: do not fit into {self.length:g} m x {self.width:g} m")
         if self.sight > self.length / 2:
             raise ValueError(f"sight = {self.sight:g} m: at most length / 2 = {self.length / 2:g} m is allowed")
         return self

@@ -283,7 +283,7 @@ class PathFollow(Task):
             raise ValueError(f"lost_distance = {self.lost_distance:g}: at most 0.3 of ring = {self.ring:g} is allowed")
         if self.ahead * self.spacing > math.pi * self.ring:
             raise ValueError(
-                f"spacing = {self.spacing:g}: {self.ahead} points are {self.ahead * self.spacing:g} m, at most half a "
+                f"spacing = {self.spacing:g}: {self.ahead} points span {self.ahead * self.spacing:g} m; at most half a "
                 f"ring, {math.pi * self.ring:g} m, is allowed"
             )
         return self

@@ -457,8 +457,8 @@ class School(Task):
             raise ValueError(f"start_distance = {self.start_distance:g}: at most size / 2 = {self.size / 2:g} m")
         if self.grazing * self.control_dt * self.fish > 1:
             raise ValueError(
-                f"grazing = {self.grazing:g}: {self.fish} fish could eat more than there is in a decision; at most "
-                f"{1 / (self.control_dt * self.fish):g} 1/s is allowed"
+                f"grazing = {self.grazing:g}: {self.fish} fish could eat more than there is within one decision; "
+                f"at most {1 / (self.control_dt * self.fish):g} 1/s is allowed"
             )
         return self
 

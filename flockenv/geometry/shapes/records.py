@@ -300,9 +300,9 @@ class Capsule(Closed):
     @model_validator(mode="after")
     def _check_dimension(self) -> Capsule:
         if len(self.start) != len(self.end):
-            raise ValueError(f"end = {self.end}: start has {len(self.start)} numbers")
+            raise ValueError(f"end = {self.end}: must have {len(self.start)} numbers, as start has")
         if self.hollow and self.radius == 0:
-            raise ValueError("radius = 0: a hollow capsule has room inside, its radius is greater than 0")
+            raise ValueError("radius = 0: a hollow capsule needs a radius above 0, or it has no inside")
         return self
 
     @property
@@ -365,10 +365,10 @@ class Polygon(Closed):
         first: dict[Point, int] = {}
         for k, vertex in enumerate(self.vertices):
             if first.setdefault(vertex, k) != k:
-                raise ValueError(f"vertices[{k}] = {vertex}: is where vertices[{first[vertex]}] is; leave it out")
+                raise ValueError(f"vertices[{k}] = {vertex}: is the same as vertices[{first[vertex]}]; leave it out")
         crossing = outlines.crossing(np.array(self.vertices))
         if crossing is not None:
-            raise ValueError(f"vertices: the edges from vertices {crossing[0]} and {crossing[1]} cross or touch")
+            raise ValueError(f"vertices: the edges after vertices {crossing[0]} and {crossing[1]} cross or touch")
         if outlines.area(np.array(self.vertices)) == 0:
             raise ValueError("vertices: enclose no area")
         return self
@@ -420,11 +420,11 @@ class Block(Closed):
     @model_validator(mode="after")
     def _check_dimension(self) -> Block:
         if len(self.centre) != len(self.size):
-            raise ValueError(f"size = {self.size}: centre has {len(self.centre)} numbers")
+            raise ValueError(f"size = {self.size}: must have {len(self.centre)} numbers, as centre has")
         if not math.hypot(*self.axis) > 0:
-            raise ValueError(f"axis = {self.axis}: a direction, not all 0")
+            raise ValueError(f"axis = {self.axis}: must be a direction, not all 0")
         if len(self.centre) == 2 and self.axis != (0.0, 0.0, 1.0):
-            raise ValueError(f"axis = {self.axis}: in the plane a block turns about the third axis alone")
+            raise ValueError(f"axis = {self.axis}: a block in 2-D turns about the z axis only; leave axis out")
         return self
 
     @property
@@ -477,9 +477,9 @@ class HalfSpace(Shape):
     @model_validator(mode="after")
     def _check_direction(self) -> HalfSpace:
         if len(self.point) != len(self.direction):
-            raise ValueError(f"direction = {self.direction}: point has {len(self.point)} numbers")
+            raise ValueError(f"direction = {self.direction}: must have {len(self.point)} numbers, as point has")
         if not 1e-15 <= math.hypot(*self.direction) <= 1e15:
-            raise ValueError(f"direction = {self.direction}: not all 0 (from 1e-15 to 1e15 long)")
+            raise ValueError(f"direction = {self.direction}: must be a direction, not all 0, of length 1e-15 to 1e15")
         return self
 
     @property
@@ -534,17 +534,19 @@ class DistanceField(Closed):
         if bool(self.shapes) == (self.values is not None):
             raise ValueError("values: give either shapes or values")
         if bool(self.shapes) != (self.high is not None):
-            raise ValueError("high: goes with shapes, and shapes with it")
+            raise ValueError("shapes and high go together: give both or neither")
         counts = self.counts
         if len(counts) != len(self.low) or min(counts) < 2:
             raise ValueError(
-                f"spacing: a grid of {counts} points, must be at least 2 along each of {len(self.low)} axes"
+                f"spacing: gives a grid of {counts} points; needs at least 2 along each of {len(self.low)} axes"
             )
         if math.prod(counts) > MOST_POINTS:
-            raise ValueError(f"spacing = {self.spacing:g}: {math.prod(counts):,} points, at most {MOST_POINTS:,}")
+            raise ValueError(
+                f"spacing = {self.spacing:g}: {math.prod(counts):,} points; at most {MOST_POINTS:,} allowed"
+            )
         for k, shape in enumerate(self.shapes):
             if shape.dimension != len(self.low):
-                raise ValueError(f"shapes[{k}]: lies in {shape.dimension} dimensions, low in {len(self.low)}")
+                raise ValueError(f"shapes[{k}]: lies in {shape.dimension} dimensions, but low in {len(self.low)}")
             if shape.moves:
                 raise ValueError(f"shapes[{k}]: moves; a distance field moves as a whole, by its own velocity and sway")
         if not np.isfinite(self.distances).all():
@@ -620,7 +622,7 @@ def _nested(values: Any) -> tuple[Any, ...]:
 def _one_dimension(vertices: Sequence[tuple[float, ...]]) -> None:
     for k, vertex in enumerate(vertices):
         if len(vertex) != len(vertices[0]):
-            raise ValueError(f"vertices[{k}] = {vertex}: the first has {len(vertices[0])} numbers")
+            raise ValueError(f"vertices[{k}] = {vertex}: must have {len(vertices[0])} numbers, as vertices[0] has")
 
 
 def _middle(vertices: Sequence[tuple[float, ...]]) -> tuple[float, ...]:

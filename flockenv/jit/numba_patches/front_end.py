@@ -106,7 +106,7 @@ def applies(title: str, reads: tuple[Known, ...]) -> bool:
     allowed = ["all", "lowering", *(each.title for each in (*PATCHES, *REPLACED_PASSES))]
     for name in left_out:
         if name not in allowed:
-            raise ValueError(f"{LEFT_OUT}: {printable(name)} is none{nearest(name, allowed)} ({', '.join(allowed)})")
+            raise ValueError(f"{LEFT_OUT}: {printable(name)}: unknown{nearest(name, allowed)} ({', '.join(allowed)})")
     return is_known_source(reads) and title not in left_out and "all" not in left_out
 
 

@@ -304,13 +304,13 @@ class Rods(Constraint):
             raise ValueError("group: give either a group with a network or pairs")
         if len(self.lengths) not in ((1, len(self.pairs)) if self.pairs else (0,)):
             allowed = f"1 or {len(self.pairs)}" if self.pairs else "none with a group"
-            raise ValueError(f"lengths: {len(self.lengths)} of them; {allowed} is allowed")
+            raise ValueError(f"lengths: there are {len(self.lengths)}; allowed: {allowed}")
         seen: dict[frozenset[int], int] = {}
         for k, pair in enumerate(self.pairs):
             if pair[0] == pair[1]:
                 raise ValueError(f"pairs[{k}] = {pair}: two different agents are needed")
             if seen.setdefault(frozenset(pair), k) != k:
-                raise ValueError(f"pairs[{k}] = {pair}: is pairs[{seen[frozenset(pair)]}] again")
+                raise ValueError(f"pairs[{k}] = {pair}: is the same pair as pairs[{seen[frozenset(pair)]}]")
         return self
 
     def rod_pairs(self, scene: SceneView) -> RodPairs:
@@ -341,7 +341,7 @@ class Rods(Constraint):
             for agent in np.unique([pairs.i, pairs.j]):
                 if member.feeds(int(np.searchsorted(scene.starts, agent, "right")) - 1):
                     raise ValueError(
-                        f"pairs: agent {agent} is of a group that population[{k}] fills: a newborn has no rod"
+                        f"pairs: agent {agent} is of a group that population[{k}] fills: newborn agents have no rods"
                     )
         if isinstance(scene.space, Torus) and pairs.length.max(initial=0.0) > min(scene.space.size) / 2:
             raise ValueError(

@@ -219,9 +219,7 @@ class Contact(_Solid):
         super().check(scene)
         touch = scene.contact_distance if scene.agents > 1 else 0.0
         if self.radius is not None and self.radius < touch:
-            raise ValueError(
-                f"radius = {self.radius:g}: two bodies touch at up to {touch:g} m; at least that is allowed"
-            )
+            raise ValueError(f"radius = {self.radius:g}: must be at least {touch:g} m, where two bodies touch")
         if scene.space.periodic and touch > min(scene.space.extent(scene.dimension)) / 2:
             raise ValueError(
                 f"kind = {self.kind}: two bodies touch at up to {touch:g} m; at most half the torus's shortest edge, "

@@ -418,7 +418,7 @@ class Effect(Record):
         """
         for name, value in self.parameters().items():
             if isinstance(value, tuple) and len(value) != scene.dimension:
-                raise ValueError(f"{name} = {value}: dimension = {scene.dimension}")
+                raise ValueError(f"{name} = {value}: has {len(value)} numbers, but dimension = {scene.dimension}")
         if self.sight is not None:
             demand_group("group", self.sight.group, scene.groups)
 

@@ -136,7 +136,7 @@ class Door(Target):
     def _check_width(self) -> Door:
         """Raise ValueError if the door has neither width nor ends."""
         if self.width is None and self.ends is None:
-            raise ValueError("width = None: a door without ends needs one; give m")
+            raise ValueError("width = None: must be given, in m, for a door without ends")
         return self
 
     @property
@@ -204,4 +204,4 @@ class Routes(Around):
         super().check(scene)
         for k, group in enumerate(scene.groups):
             if self.group in (None, k) and group.desired_speed is None:
-                raise ValueError(f"kind = {self.kind}: groups[{k}].desired_speed = None: give m/s")
+                raise ValueError(f"kind = {self.kind}: groups[{k}].desired_speed = None: must be given, in m/s")

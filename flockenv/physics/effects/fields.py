@@ -114,7 +114,7 @@ class _Timed(Effect):
     @model_validator(mode="after")
     def _check_phase(self) -> Self:
         if self.period is None and self.phase != 0.0:
-            raise ValueError(f"phase = {self.phase:g}: only with a period")
+            raise ValueError(f"phase = {self.phase:g}: needs a period")
         return self
 
     def parameters(self) -> dict[str, float | Vec]:

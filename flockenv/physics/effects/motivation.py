@@ -117,7 +117,10 @@ class Metabolism(_Urge):
 def _demand_range(start: float, spread: float, most: float) -> None:
     """Raise ValueError if start and spread reach outside 0 to `most`."""
     if spread / 2 > min(start, most - start) * (1 + 1e-12):
-        raise ValueError(f"spread = {spread:g}: start = {start:g} leaves room for {2 * min(start, most - start):g}")
+        raise ValueError(
+            f"spread = {spread:g}: at most {2 * min(start, most - start):g} is allowed, so that values around "
+            f"start = {start:g} lie between 0 and {most:g}"
+        )
 
 
 # --- food -------------------------------------------------------------------------------------------------------------
@@ -197,14 +200,14 @@ class Grazing(_Urge):
         """Raise ValueError if all together could eat more than a patch in one step, or patches eat."""
         super().check(scene)
         if self.group in (None, self.other):
-            raise ValueError(f"group = {self.group}: give the group that eats, another than other = {self.other}")
+            raise ValueError(f"group = {self.group}: must be the group that eats, different from other = {self.other}")
         assert self.group is not None
         share = self.rate * scene.dt * scene.groups[self.group].size
         if share > 1:
             all_ = f"all {scene.groups[self.group].size} of groups[{self.group}]"
             raise ValueError(
-                f"rate = {self.rate:g}: {all_} could eat more than there is of a patch in a step of dt = {scene.dt:g} "
-                f"s; at most {self.rate / share:g} 1/s is allowed"
+                f"rate = {self.rate:g}: {all_} could eat more than a patch holds within a step of dt = {scene.dt:g} s; "
+                f"at most {self.rate / share:g} 1/s is allowed"
             )
 
 
@@ -271,7 +274,7 @@ class Predation(_Urge):
         """Raise ValueError if a group hunts itself."""
         super().check(scene)
         if self.group in (None, self.other):
-            raise ValueError(f"group = {self.group}: give the group that hunts, another than other = {self.other}")
+            raise ValueError(f"group = {self.group}: must be the group that hunts, different from other = {self.other}")
 
 
 # --- fear -------------------------------------------------------------------------------------------------------------
@@ -450,8 +453,11 @@ class Intention(_Urge):
         if self.school > self.escape:
             raise ValueError(f"school = {self.school:g}: must not be above escape = {self.escape:g}")
         if self.calm >= self.school or self.content >= self.need:
-            name, most = ("calm", self.school) if self.calm >= self.school else ("content", self.need)
-            raise ValueError(f"{name} = {getattr(self, name):g}: must be below {most:g}, or it would never end")
+            name, level = ("calm", "school") if self.calm >= self.school else ("content", "need")
+            raise ValueError(
+                f"{name} = {getattr(self, name):g}: must be below {level} = {getattr(self, level):g}, "
+                "or the intention would never end"
+            )
         return self
 
     def parameters(self) -> dict[str, float | Vec]:

@@ -52,7 +52,7 @@ class WallRepulsion(Effect):
     def _check_normal(self) -> Self:
         if not SHORTEST <= math.hypot(*self.normal) <= LONGEST:
             raise ValueError(
-                f"normal = {self.normal}: must be a direction, not all 0 (from {SHORTEST:g} to {LONGEST:g} m long)"
+                f"normal = {self.normal}: must be a direction, not all 0, of length {SHORTEST:g} to {LONGEST:g}"
             )
         return self
 
@@ -61,7 +61,7 @@ class WallRepulsion(Effect):
         super().check(scene)
         if isinstance(scene.space, Torus):
             raise ValueError(
-                f"kind = {self.kind}: on a torus a wall has no two sides; only a plane or a box is allowed"
+                f"kind = {self.kind}: on a torus a wall has no inner and outer side; only a plane or a box is allowed"
             )
 
     def potential(self, groups: Sequence[Any], state: State, offset: Any) -> NDArray[np.float64]:

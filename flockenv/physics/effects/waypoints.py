@@ -112,7 +112,7 @@ class Stage(Target):
     def _check_radius(self) -> Stage:
         """Raise ValueError for a point of radius 0, which is never reached."""
         if self.at is not None and self.radius == 0:
-            raise ValueError("radius = 0: a point is reached within a radius; give m")
+            raise ValueError("radius = 0: must be above 0, in m, for a point: it is reached within this distance")
         return self
 
 

@@ -101,7 +101,7 @@ def methods_of(names: Sequence[str]) -> tuple[Integrator, ...]:
     for name in names:
         if name not in INTEGRATORS:
             raise ValueError(
-                f"methods: {printable(name)} is none{nearest(name, INTEGRATORS)} ({', '.join(INTEGRATORS)})"
+                f"methods: {printable(name)}: unknown{nearest(name, INTEGRATORS)} ({', '.join(INTEGRATORS)})"
             )
     return tuple(INTEGRATORS[name]() for name in dict.fromkeys(names))
 

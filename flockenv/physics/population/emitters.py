@@ -63,7 +63,7 @@ class Emitter(Member):
         for name in ("speed", "lifetime"):
             value = getattr(self, name)
             if value is not None and value[0] > value[1]:
-                raise ValueError(f"{name} = {value}: the least comes first")
+                raise ValueError(f"{name} = {value}: the lower number must come first")
         if self.lifetime is not None and not self.lifetime[0] > 0:
             raise ValueError(f"lifetime = {self.lifetime}: must be more than 0 s")
         if self.rate == 0 and not self.bursts:
@@ -71,9 +71,9 @@ class Emitter(Member):
         if self.end is not None and self.end <= self.start:
             raise ValueError(f"end = {self.end:g}: must be after start = {self.start:g} s")
         if self.direction is not None and not math.hypot(*self.direction) > 0:
-            raise ValueError(f"direction = {self.direction}: a direction, not all 0")
+            raise ValueError(f"direction = {self.direction}: must be a direction, not all 0")
         if self.spread is not None and self.direction is None and not isinstance(self.place, Surface):
-            raise ValueError(f"spread = {self.spread:g}: goes with a direction, or with a surface")
+            raise ValueError(f"spread = {self.spread:g}: needs a direction, or a place on a surface")
         return self
 
     def feeds(self, group: int) -> bool:
@@ -93,7 +93,7 @@ class Emitter(Member):
             raise ValueError(f"place.{error}") from None
         limit = group.fastest
         if limit is not None and self.speed[1] > limit:
-            raise ValueError(f"speed = {self.speed}: groups[{self.group}].max_speed = {limit:g} m/s is the most")
+            raise ValueError(f"speed = {self.speed}: must not exceed groups[{self.group}].max_speed = {limit:g} m/s")
         self._check_space(scene, group)
 
     def _check_space(self, scene: SceneView, group: Any) -> None:

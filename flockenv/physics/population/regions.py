@@ -109,7 +109,7 @@ class Disc(Place):
     @model_validator(mode="after")
     def _check_axis(self) -> Disc:
         if self.axis is not None and not math.hypot(*self.axis) > 0:
-            raise ValueError(f"axis = {self.axis}: a direction, not all 0")
+            raise ValueError(f"axis = {self.axis}: must be a direction, not all 0")
         return self
 
     def row(self) -> list[float]:
@@ -210,7 +210,7 @@ class Clearing(_Corners):
 def check_corners(low: Sequence[float], high: Sequence[float]) -> None:
     """Raise ValueError if the lower corner is not below the upper one, or their lengths differ."""
     if len(low) != len(high) or any(a > b for a, b in zip(low, high, strict=True)):
-        raise ValueError(f"low = {low}, high = {high}: the lower corner comes first, with as many numbers")
+        raise ValueError(f"low = {low}, high = {high}: the lower corner comes first, and both have as many numbers")
 
 
 PLACES: dict[str, type[Place]] = {

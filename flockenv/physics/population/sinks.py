@@ -110,7 +110,7 @@ class Drain(Sink):
                 f"but dimension = {scene.dimension}"
             )
         if isinstance(scene.space, Torus) and self.shape.kind == "half_space":
-            raise ValueError("shape.kind = half_space: on a torus a plane has no two sides")
+            raise ValueError("shape.kind = half_space: on a torus a half-space has no inside")
 
 
 class Crowding(Sink):

@@ -50,7 +50,7 @@ def find_sensitivity(problem: Problem) -> Sensitivity:
         over = int(np.argmax(~(growth <= MOST_GROWTH)))
         per = problem.times[over] / math.log(growth[over])
         raise ValueError(
-            f"seconds = {problem.seconds:g}: too long a horizon, the scene is chaotic: a difference of {shift:.0e} m "
+            f"seconds = {problem.seconds:g}: too long, because the scene is chaotic: a difference of {shift:.0e} m "
             f"at the start grows {growth[-1]:.1e}-fold until the end (e-fold in {per:.2g} s), whatever the method; "
             f"{advice}"
         )

@@ -31,7 +31,7 @@ class NotSmoothError(Exception):
 def integrate_twice(problem: Problem) -> tuple[Path, float, str]:
     """Return the path, its error in m, and a note; raise NotSmoothError if DOP853 cannot follow the scene."""
     if problem.after_steps:
-        raise NotSmoothError(f"DOP853 does not include what acts after each step ({problem.after_steps})")
+        raise NotSmoothError(f"DOP853 cannot include what acts after each step ({problem.after_steps})")
     (tight, evaluations), (loose, _) = _integrate(problem, TIGHT), _integrate(problem, LOOSE)
     difference = largest_value(problem.distances(tight, loose))
     gone = largest_value(problem.distances(tight, Path(problem.start.pos[0], problem.start.vel[0])))
@@ -96,9 +96,9 @@ class _Laws:
             if space.kind == "box":
                 extent, radius = np.array(space.extent(pos.shape[1])), body.radius[:, None]
                 if ((pos < radius) | (pos > extent - radius)).any():
-                    raise NotSmoothError(f"an agent reaches a wall at t = {t:.3g} s, which acts after each step")
+                    raise NotSmoothError(f"an agent reaches a wall at t = {t:.3g} s, and walls act after a step")
             if limited:
                 derivative = self(t, row)
                 speeds = (np.linalg.norm(self._split(part)[k], axis=-1) for part, k in ((row, 1), (derivative, 0)))
                 if any((speed > body.max_speed * (1 + 1e-9)).any() for speed in speeds):
-                    raise NotSmoothError(f"the speed limit is reached at t = {t:.3g} s, which acts after each step")
+                    raise NotSmoothError(f"a speed limit is reached at t = {t:.3g} s, and acts after a step")

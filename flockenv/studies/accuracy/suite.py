@@ -274,5 +274,5 @@ def select_problems(names: Sequence[str] = ()) -> list[Problem]:
     """Return problems by name (no names: all); raise ValueError, with the nearest name, for an unknown one."""
     for name in names:
         if name not in SUITE:
-            raise ValueError(f"problems: {printable(name)} is none{nearest(name, SUITE)} ({', '.join(SUITE)})")
+            raise ValueError(f"problems: {printable(name)}: unknown{nearest(name, SUITE)} ({', '.join(SUITE)})")
     return [SUITE[name]() for name in (dict.fromkeys(names) or SUITE)]

@@ -35,7 +35,9 @@ def trial(plan: SteerPlan, case: str, variant: str) -> Trial:
     scene, target = plan.scene_of(case, variant), np.array(plan.cases[case].target)
     fastest = float(scene.body.max_speed[0])
     if not np.isfinite(fastest):
-        raise ValueError(f"cases.{case}.scene.groups[0].max_speed = None: give m/s, of which a share is lost")
+        raise ValueError(
+            f"cases.{case}.scene.groups[0].max_speed = None: must be given, in m/s; the loss of speed is a share of it"
+        )
     state = scene.start(plan.seed, worlds=plan.worlds)
     begin, path, deep, speed = state.pos[:, 0].copy(), [state.pos[:, 0].copy()], [depth(scene, state)[:, 0]], []
     for _ in range(round(plan.cases[case].seconds / scene.dt)):

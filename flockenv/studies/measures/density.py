@@ -209,7 +209,7 @@ def _corners(polygon: Floats) -> Corners:
 def _flat(vectors: ArrayLike) -> Floats:
     given = np.asarray(vectors, np.float64)
     if given.shape[-1:] != (2,):
-        raise ValueError(f"pos: of shape {given.shape}, its last axis must be (x, y): areas are of the plane")
+        raise ValueError(f"pos: of shape {given.shape}, its last axis must be (x, y): areas exist only in 2-D")
     return given
 
 

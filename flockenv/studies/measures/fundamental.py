@@ -112,7 +112,7 @@ def diagram(density: ArrayLike, speed: ArrayLike, edges: ArrayLike | None = None
     """
     rho, v = (np.asarray(each, np.float64).ravel() for each in (density, speed))
     if len(rho) != len(v):
-        raise ValueError(f"density has {len(rho)} samples, speed {len(v)}: must be as many")
+        raise ValueError(f"density has {len(rho)} samples, speed {len(v)}: must have the same length")
     finite = np.isfinite(rho) & np.isfinite(v)
     rho, v = rho[finite], v[finite]
     ends = np.asarray([0.0, *(b[0] for b in JUELICH), JUELICH[-1][1]] if edges is None else edges, np.float64)
