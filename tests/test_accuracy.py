@@ -178,7 +178,7 @@ def test_a_perturbation_grows_as_the_closed_form_of_a_pendulum() -> None:
 
 @pytest.mark.slow
 def test_a_horizon_that_is_too_long_for_a_chaotic_scene_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"seconds = 5: too long, because the scene is chaotic: .* try [\d.]+ s") as caught:
+    with pytest.raises(ValueError, match=r"seconds = 5: too long, because .* try [\d.]+ s") as caught:
         measure(swinging(math.pi - 1e-9, 5.0), METHODS)
     assert "\n" not in str(caught.value)
     shorter = float(str(caught.value).split("try ")[1].split(" s")[0])
