@@ -539,7 +539,7 @@ def test_stress_continues_with_the_findings_of_its_file(tried: list[str], capsys
     capsys.readouterr()
     assert main(["stress", "--methods", "rk4", "--out", "hard.json"]) == 2
     assert capsys.readouterr().err == (
-        "flockenv: --out: hard.json contains 3 findings of other sources; --force starts again\n"
+        "flockenv: --out: hard.json contains findings (3) of another version of the code; --force starts again\n"
     )
     assert not tried and json.loads(Path("hard.json").read_text()) == kept
     assert main(["stress", "--methods", "rk4", "--cases", "X01", "--out", "hard.json", "--force"]) == 0

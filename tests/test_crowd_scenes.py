@@ -210,7 +210,7 @@ def test_validate_writes_a_page_and_continues_with_earlier_findings(
     others = Results.model_validate_json(Path("crowds.json").read_text()).model_copy(update={"sources": "others"})
     Path("crowds.json").write_text(others.model_dump_json())
     assert main(["validate", "--preset", "helbing_2000", "--out", "crowds.md"]) == 2
-    assert "crowds.json contains 1 findings of other sources; --force starts again" in capsys.readouterr().err
+    assert "crowds.json contains findings (1) of another version of the code; --force" in capsys.readouterr().err
     assert Results.model_validate_json(Path("crowds.json").read_text()) == others
     Path("mine.json").write_text("{}")
     assert main(["validate", "--out", "mine.json"]) == 2

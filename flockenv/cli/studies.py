@@ -244,7 +244,9 @@ def read_findings(path: Path | None, what: str, sources: str) -> Results | None:
         raise ValueError(f"--out: {numbers.name} contains no findings of {what}; --force overwrites it") from None
     if found.sources != sources:
         count = len(found.findings)
-        raise ValueError(f"--out: {numbers.name} contains {count} findings of other sources; --force starts again")
+        raise ValueError(
+            f"--out: {numbers.name} contains findings ({count}) of another version of the code; --force starts again"
+        )
     return found
 
 
