@@ -668,7 +668,7 @@ def test_divergence_names_the_world_and_the_agent(row: TaskRow) -> None:
     world.reset(2)
     world.state.vel[1, 0] = np.nan
     with pytest.raises(
-        SimulationDiverged, match="world 1, agent 0: .* in the decision that begins in step 1"
+        SimulationDiverged, match=r"world 1, agent 0: .* in the decision that begins in step 1"
     ) as caught:
         world.step(np.zeros((3, world.learners, 2)))
     assert "\n" not in str(caught.value)

@@ -83,7 +83,9 @@ def cells(
     along = [math.floor((b - a) / edge + 1e-9) for a, b, edge in zip(low, high, spacing, strict=True)]
     total = math.prod(along)
     if total > MOST_CELLS:
-        raise ValueError(f"spacing = {_edges_text(spacing)}: a grid of {total:,} cells; at most {MOST_CELLS:,} are allowed")
+        raise ValueError(
+            f"spacing = {_edges_text(spacing)}: a grid of {total:,} cells; at most {MOST_CELLS:,} are allowed"
+        )
     found = np.zeros((0, dimension))
     for first in range(0, total, 65_536):
         if len(found) >= count:
@@ -108,8 +110,8 @@ def _edges(spawn: Spawn, dimension: int, radius: float) -> tuple[float, ...]:
     least = 2 * (radius + spawn.jitter)
     if not spawn.wider and min(given) < least * (1 - 1e-12):
         raise ValueError(
-            f"spacing = {_edges_text(given)}: bodies of radius {radius:g} m, up to {spawn.jitter:g} m from the middle of "
-            f"their cells, need at least {least:g} m"
+            f"spacing = {_edges_text(given)}: bodies of radius {radius:g} m, up to {spawn.jitter:g} m from the middle "
+            f"of their cells, need at least {least:g} m"
         )
     return given
 

@@ -144,7 +144,7 @@ def check_floor_field(
     for name, target in zip(names, targets, strict=True):
         if target.dimension != scene.dimension:
             raise ValueError(
-                f"{name} = {target.points_text}: lies in {target.dimension} dimensions, but dimension = {scene.dimension}"
+                f"{name} = {target.points_text}: lies in {target.dimension}-D, but dimension = {scene.dimension}"
             )
     for k, shape in enumerate(scene.obstacles):
         if shape.moves:
