@@ -143,9 +143,8 @@ def check_floor_field(
     """Raise ValueError for a torus, moving obstacles, walls that the grid misses, and too large a grid."""
     for name, target in zip(names, targets, strict=True):
         if target.dimension != scene.dimension:
-            raise ValueError(
-                f"{name} = {target.points_text}: lies in {target.dimension}-D, but dimension = {scene.dimension}"
-            )
+            mismatch = f"lies in {target.dimension} dimensions, but dimension = {scene.dimension}"
+            raise ValueError(f"{name} = {target.points_text}: {mismatch}")
     for k, shape in enumerate(scene.obstacles):
         if shape.moves:
             raise ValueError(f"kind = {kind}: paths are found once, at the start, but obstacles[{k}] moves")
