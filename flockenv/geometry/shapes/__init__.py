@@ -3,7 +3,7 @@
 `round`, `chain`, `block`, `field` hold the laws of one agent and one shape, `inverted` those of shapes that bodies stay
 in, `edges` those of a silhouette; `row_header` reads what rows of every form share, bounds and motion; `dispatch` calls
 the law of a row's form at run time; `table` packs shapes for kernels, `cells` puts them on a grid, `joints` finds
-joined walls; `records` are what scenes list; `outlines` are for pictures.
+joined walls; `shape` has the base classes, `records` what scenes list; `outlines` are for pictures.
 """
 
 from __future__ import annotations

@@ -10,192 +10,22 @@ from __future__ import annotations
 import functools
 import math
 import operator
-from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 from pydantic import Field, WrapValidator, field_validator, model_validator
 
-from flockenv.core.record import Record, instance_of, lists_to_tuples
-from flockenv.geometry.shapes import outlines, table
-from flockenv.geometry.shapes.table import Floats, hits, nearest
+from flockenv.core.record import instance_of, lists_to_tuples
+from flockenv.geometry.shapes import outlines
+from flockenv.geometry.shapes.shape import Bound, Closed, Point, Shape, Sway
+from flockenv.geometry.shapes.table import Floats
 from flockenv.maths.grid import MOST_POINTS, pack_grid, points_of
 
 __all__ = [
     "SHAPES", "AnyShape", "Block", "Bound", "Capsule", "Circle", "Closed", "DistanceField", "HalfSpace", "Polygon",
     "Shape", "Sway", "Wall", "distance_to_shapes",
 ]  # fmt: skip
-
-Point = Annotated[tuple[float, ...], Field(min_length=2, max_length=3)]
-
-
-class Sway(Record):
-    """Oscillation: amplitude sin(2 pi t / period + phase), added to any other motion."""
-
-    amplitude: Point = Field(description="m, greatest displacement, a vector")
-    period: float = Field(gt=0, description="s, of one oscillation")
-    phase: float = Field(default=0.0, description="rad, at time 0")
-
-
-class Bound(NamedTuple):
-    """Bounds of a shape at the position given by its fields; all infinite but the centre if it is unbounded."""
-
-    centre: Floats  # (D,) m, of the bounding box
-    half: Floats  # (D,) m, half the edges of the axis-aligned box
-    radius: float  # m, of the bounding circle or sphere around the centre
-
-
-class Shape(Record):
-    """Base class of obstacles. Points are (..., D) arrays in m."""
-
-    kind: str
-    velocity: Point | None = Field(default=None, description="m/s, constant from time 0 on (default: it does not move)")
-    sway: Sway | None = Field(default=None, description="oscillation (default: none)")
-    laws: ClassVar[str] = "chain"
-    """Name of its laws while it is solid; see shapes/table.py."""
-
-    @model_validator(mode="after")
-    def _check_motion(self) -> Self:
-        """Raise ValueError if a motion has another dimension."""
-        swaying = self.sway.amplitude if self.sway else None
-        for name, value in (("velocity", self.velocity), ("sway.amplitude", swaying)):
-            if value is not None and len(value) != self.dimension:
-                raise ValueError(f"{name} = {value}: must have {self.dimension} numbers, as the {self.kind} has")
-        return self
-
-    @property
-    def is_hollow(self) -> bool:
-        """True if the shape is free inside and solid outside."""
-        return False
-
-    @property
-    def thickness(self) -> float:
-        """Lower bound of its least thickness, m: 0 for a line or if unknown."""
-        return math.inf if self.is_hollow else self._thickness
-
-    @property
-    def _thickness(self) -> float:
-        return 0.0
-
-    @property
-    def form(self) -> str:
-        """Name of its laws; see shapes/table.py."""
-        return f"hollow_{self.laws}" if self.is_hollow else self.laws
-
-    @property
-    def in_state(self) -> bool:
-        """True if it is a circle or sphere kept in the state; every other shape is the same in all worlds."""
-        return False
-
-    @property
-    def moves(self) -> bool:
-        """True if it has a velocity or a sway."""
-        return any(self.velocity or ()) or (self.sway is not None and any(self.sway.amplitude))
-
-    @property
-    def motion(self) -> list[float]:
-        """Its motion, as laws read it: velocity (D), amplitude of its sway (D), 2 pi / period, phase."""
-        still = (0.0,) * self.dimension
-        sway = (*self.sway.amplitude, math.tau / self.sway.period, self.sway.phase) if self.sway else (*still, 0.0, 0.0)
-        return [*(self.velocity or still), *sway]
-
-    def shift(self, time: float) -> Floats:
-        """Return its displacement at a time, s, (D,) m: v t + a sin(2 pi t / T + phase)."""
-        d, motion = self.dimension, np.array(self.motion)
-        return np.asarray(motion[:d] * time + motion[d:-2] * math.sin(motion[-2] * time + motion[-1]))
-
-    @property
-    def dimension(self) -> int:
-        """Number of dimensions."""
-        return len(self.anchor)
-
-    @functools.cached_property
-    def table(self) -> Floats:
-        """A table of this shape alone, as laws read it."""
-        return table.pack_shapes([self], self.dimension)[0]
-
-    @functools.cached_property
-    def bound(self) -> Bound:
-        """Its bounds; infinite if it is hollow, as the solid is outside."""
-        extremes, (corners, around) = self.extremes, self.corners
-        if self.is_hollow or not len(extremes):
-            return Bound(np.array(self.anchor), np.full(self.dimension, np.inf), math.inf)
-        low, high = extremes.min(axis=0), extremes.max(axis=0)
-        middle = (low + high) / 2
-        return Bound(middle, (high - low) / 2, around + float(np.linalg.norm(corners - middle, axis=1).max()))
-
-    @property
-    def corners(self) -> tuple[Floats, float]:
-        """Points (n, D) m and a radius, m: its hull is that of circles of this radius there; some shapes have none."""
-        return np.zeros((0, self.dimension)), 0.0
-
-    @property
-    @abstractmethod
-    def anchor(self) -> tuple[float, ...]:
-        """The point that laws take positions relative to, m."""
-
-    @property
-    @abstractmethod
-    def extremes(self) -> Floats:
-        """Points (n, D) m whose bounding box contains it; none if it is unbounded."""
-
-    @abstractmethod
-    def row(self, dimension: int) -> Sequence[float] | Floats:
-        """Return the numbers that its laws read, after the row header."""
-
-    @abstractmethod
-    def polygons(self, low: Floats, high: Floats) -> list[Floats]:
-        """Return the polygons, each (n, 2) m, of its solid in a region, as seen from above."""
-
-    def outline(self, low: Floats, high: Floats) -> list[Floats]:
-        """Return the polygons, each (n, 2) m, that show it from above in a region; only its edge if it is hollow."""
-        whole = self.polygons(low, high)
-        return [outlines.band(each, 0.004 * float((high - low).max())) for each in whole] if self.is_hollow else whole
-
-    def gap(self, points: ArrayLike) -> Floats:
-        """Return the distance to its surface, (...) m; negative inside."""
-        return nearest(self, points)[0]
-
-    def normal(self, points: ArrayLike) -> Floats:
-        """Return the outward unit normal at the nearest point of its surface, (..., D)."""
-        return nearest(self, points)[1]
-
-    def nearest(self, points: ArrayLike) -> Floats:
-        """Return the nearest point of its surface, (..., D) m."""
-        gap, normal = nearest(self, points)
-        return np.asarray(points, float) - gap[..., None] * normal
-
-    def inside(self, points: ArrayLike) -> np.ndarray[Any, np.dtype[np.bool_]]:
-        """Return True for points inside it, (...)."""
-        return np.asarray(self.gap(points) < 0)
-
-    def hit(self, points: ArrayLike, directions: ArrayLike, clearance: ArrayLike = 0.0) -> Floats:
-        """Return how far along unit directions a body of radius `clearance` touches it, (...) m; inf if it never does.
-
-        Exact at every angle: the ray is cast at the shape inflated by the body's radius.
-        """
-        return hits(self, points, directions, clearance)
-
-    def silhouette(self, point: ArrayLike, clearance: float = 0.0) -> tuple[Floats, Floats]:
-        """Return the left and right ends of its silhouette as seen from a point outside, m; 2-D only.
-
-        Of the shape inflated by `clearance`: a body that aims there passes it (Reynolds 1987). Raises ValueError if
-        there are no ends.
-        """
-        return outlines.silhouette(self, np.asarray(point, float), clearance)
-
-
-class Closed(Shape):
-    """A shape with an inside, which may be solid or free."""
-
-    hollow: bool = Field(default=False, description="free inside and solid outside; bodies stay inside")
-
-    @property
-    def is_hollow(self) -> bool:
-        """True if the shape is free inside and solid outside."""
-        return self.hollow
 
 
 class Circle(Closed):
