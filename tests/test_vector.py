@@ -445,7 +445,7 @@ def test_a_bad_action_of_one_of_several_is_named():
     with pytest.raises(ValueError, match="boid_2 in world 1"):
         envs.step(bad)
     assert not envs.world.steps.any()
-    with pytest.raises(ValueError, match="a row per learner"):
+    with pytest.raises(ValueError, match="one row per learner"):
         envs.step(bad.reshape(3, 4, 2))
 
 
