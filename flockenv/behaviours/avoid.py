@@ -43,7 +43,7 @@ def no_threat(p: Any, me: Me) -> Vec:
 
 @law
 def _without_side(acc: Vec) -> Vec:
-    """Return all but the side, which is found after the obstacle."""
+    """Return the running numbers without the side, which is found later."""
     if len(acc) == 6:
         return (acc[0], acc[1], acc[2], acc[3])
     else:
@@ -52,7 +52,7 @@ def _without_side(acc: Vec) -> Vec:
 
 @law
 def ray_ahead(p: Any, me: Me, k: int) -> tuple[Vec, float]:
-    """Return its heading, and the margin."""
+    """Return the heading of the agent, and the margin, m."""
     return me.heading, p.margin
 
 
@@ -83,7 +83,7 @@ def _offset_and_side(acc: Vec) -> tuple[Vec, Vec]:
 
 @law
 def _can_turn(p: Any, me: Me, normal: Vec, aside: Vec, hit: float) -> bool:
-    """Return True if it can turn to that side before it reaches the surface, with a turning radius R = m v^2 / F.
+    """Return True if the agent can turn to a side before it reaches the surface, with a turning radius R = m v^2 / F.
 
     Towards the normal's side the result is always True. To the other side the agent first turns towards the surface,
     which takes a depth of R (1 + sin a), a the angle between heading and normal.
@@ -119,8 +119,8 @@ class AvoidObstacles(Effect):
     radius to spare: walls that are joined, or leave a gap that is too narrow, are one obstacle. An obstacle that has no
     edge (a half-space, a room), or is too near for a turn to that edge at a radius of m v^2 / F, is avoided along the
     side of its normal. In 3-D the edges on five sides are compared: the side of the normal, and both directions along
-    and across the obstacle's own axis. A sphere has no axis; for it, they lie away from what blocks the side of the
-    normal, and across that. An obstacle that moves is treated as if it stood still at its current place.
+    and across the obstacle's own axis. A sphere has no axis: its sides lie away from the obstacle that blocks the side
+    of the normal, and across that. An obstacle that moves is treated as if it stood still at its current place.
     """
 
     kind: Literal["avoid_obstacles"] = "avoid_obstacles"
@@ -259,7 +259,7 @@ def add_field(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
 
 @law
 def field_reach(p: Any, me: Me) -> float:
-    """Return its range plus the radius."""
+    """Return the range of the force plus the radius."""
     return p.range + me.radius  # type: ignore[no-any-return]
 
 

@@ -69,7 +69,7 @@ def steered_groups(effect: Effect, scene: SceneView) -> list[int]:
 
 
 def gains(weight: float, groups: Sequence[Any], dimension: int) -> NDArray[np.float64]:
-    """Return weight / mass of every agent, (N,); 0 if it is held in place, or its max_force is 0."""
+    """Return weight / mass of every agent, (N,); 0 for agents held in place, or with a max_force of 0."""
     free = np.repeat([group.max_force != 0 for group in groups], [group.size for group in groups])
     return np.where(free, weight / all_masses(groups, dimension), 0.0)
 
@@ -86,12 +86,12 @@ class Behaviour(Effect):
     steering: ClassVar[bool] = True
     always: ClassVar[bool] = False
     copies: ClassVar[bool] = False
-    """True if it copies the velocity of an agent that may copy its own: together twice as fast."""
+    """True if the agent copies another's velocity: two that copy each other converge twice as fast."""
     unlimited: ClassVar[tuple[str, ...]] = ()
-    """Names of the fields whose None means no limit."""
+    """Names of the fields in which None means no limit."""
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Return its numbers; missing limits are infinite."""
+        """Return the behaviour's numbers; missing limits are infinite."""
         return {**dict.fromkeys(self.unlimited, math.inf), **super().parameters()}
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
@@ -139,7 +139,7 @@ class Moving(Behaviour):
         for k in steered_groups(self, scene):
             group = scene.groups[k]
             if group.max_force == 0:
-                continue  # it is not steered
+                continue  # the group is not steered
             speeds = [speed for speed in (self.speed, group.fastest) if speed is not None]
             if not speeds:
                 raise ValueError(f"speed = None: groups[{k}].max_speed is not given either; give one of them")
@@ -168,7 +168,7 @@ class AboutNearest(Behaviour):
 
     @property
     def sight(self) -> Sight:
-        """The nearest agent of the group."""
+        """The sight: the nearest agent of the group."""
         return Sight(self.radius, self.fov, 1, self.group, self.occluded)
 
     def sums(self, dimension: int) -> int:

@@ -32,7 +32,7 @@ def separation_pair(p: Any, me: Me, other: Other) -> Vec:
 
 @law
 def separation_apart(p: Any, me: Me, other: Other) -> Vec:
-    """Return the same for two agents that do not coincide."""
+    """Return the repulsion from a neighbour in another position."""
     return others.push_off(other.offset, other.square)
 
 

@@ -46,7 +46,7 @@ def reduce_distances(
 ) -> Vec:  # fmt: skip
     """Return the free distances `found`, reduced by one more neighbour: at constant velocity, then as if at rest.
 
-    found: DIRECTIONS distances, that along the aim, and as many again. direction: the rightmost direction.
+    found: DIRECTIONS distances and that along the aim, then as many for neighbours at rest. direction: the rightmost.
     """
     still, one, moving, standing = zero(velocity), like(speed, 1.0), [], []
     for k in range(DIRECTIONS + 1):
@@ -59,7 +59,7 @@ def reduce_distances(
 
 @overload(reduce_distances, jit_options=OPTIONS)
 def _reduce_distances(found, direction, aim, cosine, sine, offset, velocity, clearance, speed):  # type: ignore[no-untyped-def]
-    """Return the function with its loop unrolled, for use of SIMD lanes."""
+    """Return `reduce_distances` with its loop unrolled, for SIMD lanes."""
     count = DIRECTIONS + 1
     lines = [
         "def all_directions(found, direction, aim, cosine, sine, offset, velocity, clearance, speed):",
@@ -103,7 +103,7 @@ def initial_distances(p: Any, me: Me) -> Vec:
 
 @law
 def _first_direction_and_aim(p: Any, me: Me) -> tuple[Vec, Vec]:
-    """Return the rightmost direction of its field of view, and its aim; an agent at rest faces its aim."""
+    """Return the rightmost direction of the agent's field of view, and its aim; at rest it faces its aim."""
     aim = unit(me.aim)
     moves = dot(me.heading, me.heading) > like(me.radius, 0.0)
     return turn_left(select(moves, me.heading, aim), p.edge_cosine, -p.edge_sine), aim
@@ -127,7 +127,7 @@ def reduce_by_obstacle(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
 
 @law
 def wall_distance(p: Any, me: Me, direction: Vec, reach: float) -> float:
-    """Return how far its body goes until it touches a straight side, m; inf if that is further than `reach`.
+    """Return how far the agent's body moves until it touches a straight side, m; inf if farther than `reach`.
 
     A side that it touches already does not block directions that lead off it.
 

@@ -34,7 +34,7 @@ def add_repulsion(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
 
 @law
 def repulsion_reach(p: Any, me: Me) -> float:
-    """Return its range, m."""
+    """Return the range of the force, m."""
     return p.radius  # type: ignore[no-any-return]
 
 

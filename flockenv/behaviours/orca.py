@@ -36,7 +36,7 @@ def _power_distance(slot: Vec) -> float:
 
 @overload(with_inserted, jit_options=OPTIONS)
 def _with_inserted(slots, new):  # type: ignore[no-untyped-def]  # numba compares signatures, annotations included
-    """Return the function unrolled for the number of slots, with selects instead of branches, for SIMD lanes."""
+    """Return `with_inserted` unrolled for the number of slots, with selects instead of branches, for SIMD lanes."""
     size, lines = len(new), ["def sort_in(slots, new):"]
     held = [f"c{j}" for j in range(size)]
     lines.append(f"    {', '.join(held)} = new")

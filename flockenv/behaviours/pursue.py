@@ -150,7 +150,7 @@ class OffsetPursue(Predicting):
     """Pass the nearest of a group at a distance: seek a point beside its predicted position (Reynolds 1999)."""
 
     kind: Literal["offset_pursue"] = "offset_pursue"
-    distance: float = Field(ge=0, description="m, at which it passes")
+    distance: float = Field(ge=0, description="m, distance at which it passes")
     finish_law: ClassVar[Law | None] = offset_pursue_force
     demo: ClassVar[str | None] = """
 groups:

@@ -32,6 +32,6 @@ class Push(Effect):
         return self
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Return its strength and its bound."""
+        """Return strength and bound of the force."""
         most = math.inf if self.most is None else self.most
         return {"strength": self.strength, "acceleration": self.acceleration, "bound": most}

@@ -76,7 +76,7 @@ class Steer(Effect):
         return max(behaviour.reach for behaviour in self.behaviours)
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Return the numbers of the arbitration: behaviours have their own."""
+        """Return the numbers of the arbitration; behaviours have numbers of their own."""
         return self.arbitration.parameters(len(self.behaviours))
 
     def members(self, starts: Sequence[int]) -> dict[str, float]:
@@ -129,7 +129,7 @@ class Steer(Effect):
             behaviour.check_start(scene, state)
 
     def calls_for(self) -> tuple[str, ...]:
-        """Return what its behaviours call for."""
+        """Return the optional data that its behaviours need."""
         return tuple(dict.fromkeys(what for behaviour in self.behaviours for what in behaviour.calls_for()))
 
 

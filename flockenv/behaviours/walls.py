@@ -42,7 +42,7 @@ def nearest_wall(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
 
 @law
 def wall_reach(p: Any, me: Me) -> float:
-    """Return its range around the predicted position, m."""
+    """Return the range of sight around the predicted position, m."""
     return p.range + norm(me.vel) * p.time  # type: ignore[no-any-return]
 
 

@@ -53,7 +53,7 @@ class Combination(NamedTuple):
 
 
 class ResponsePlan(NamedTuple):
-    """What the acceleration of an agent depends on, once `sense` is done."""
+    """Constants of the code that computes an agent's acceleration after `sense`."""
 
     agent: AgentPlan
     masked: bool  # True if numbers that all agents share may be read from the first block
@@ -106,7 +106,7 @@ def response_plan(parts: KernelPlan) -> ResponsePlan:
 
 
 class SensePlan(NamedTuple):
-    """What agents sense of other agents; None where the scene has no such law."""
+    """Plans of the laws about other agents; None where the scene has no such law."""
 
     agent: AgentPlan
     aims: tuple[OneLaw, ...]

@@ -73,7 +73,7 @@ def agent_of(plan: AgentPlan) -> Callable[..., Me]:
 
 @law
 def at_rest(me: Me) -> Me:
-    """Return an agent at rest: what its law gives then is left for a method that integrates linear drag by itself."""
+    """Return an agent as if at rest: its force then lacks linear drag, which the method integrates separately."""
     o = zero(me.pos)
     mass, radius, max_speed, max_force = me.mass, me.radius, me.max_speed, me.max_force
     return Me(

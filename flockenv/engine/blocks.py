@@ -140,7 +140,7 @@ def out_of_blocks(dimension: int, width: int) -> Callable[..., None]:
 def arrays_of(inner: bool) -> Callable[..., Any]:
     """Make `arrays(scratch, pos, vel)`: a tuple of arrays, positions, velocities and, if any, inner states.
 
-    The indices of the arrays of scratch follow on from theirs, see `lane_access.pick_items`.
+    The arrays of scratch have the indices after these, see `lane_access.pick_items`.
     """
     if inner:
         return lambda scratch, pos, vel: (pos, vel) + scratch.inner  # noqa: RUF005  # numba adds tuples, and unpacks none

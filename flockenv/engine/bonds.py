@@ -33,7 +33,7 @@ class Table(NamedTuple):
     number: NDArray[np.floating]
     start: NDArray[
         np.int64
-    ]  # per effect: the first slot of each block, and one more; then where its part begins, twice
+    ]  # per effect: the first slot of each block, and one more; then where its places, and numbers, begin
 
 
 def pack(parts: KernelPlan, agents: int, groups: Sequence[object]) -> Table:
@@ -99,7 +99,7 @@ class BondLaw(NamedTuple):
 
 
 class BondPlan(NamedTuple):
-    """What gathering from bonds depends on."""
+    """Constants of the code that sums the forces of bonds."""
 
     agent: AgentPlan
     offset_to: Law
@@ -121,10 +121,7 @@ def bond_plan(parts: KernelPlan, agent: AgentPlan) -> BondPlan:
 
 @section
 def bonds_of(plan: BondPlan) -> Callable[..., None]:
-    """Make `bonds(context, pos, vel, time)`: write the forces of bonds, N, into `far_bond_force`.
-
-    Those on this thread's agents.
-    """
+    """Make `bonds(context, pos, vel, time)`: write bond forces on this thread's agents, N, into `far_bond_force`."""
     add = _add_bonds(plan, len(plan.laws) - 1)
     waits, adds = plan.waits, plan.adds
     count, sums = plan.agent.dimension * plan.agent.width, np.uint64(plan.sums)
@@ -150,7 +147,7 @@ def bonds_of(plan: BondPlan) -> Callable[..., None]:
 def _add_bonds(plan: BondPlan, place: int) -> Callable[..., None]:
     """Make `add(scratch, effects, size, pos, vel, time, key, n, block)`: add bond forces to the sums of a block.
 
-    Those of the effect at `place` in the table, and of all effects before it.
+    The bonds are those of the effect at `place` in the table, and of all effects before it.
     """
     before = _add_bonds(plan, place - 1) if place else None
     k, law, partners, numbers = plan.laws[place]

@@ -64,7 +64,7 @@ def _scene_step(plan: StepPlan) -> Callable[..., tuple[int, int]]:
 
 
 class BeginPlan(NamedTuple):
-    """What initialising the inner states of agents depends on."""
+    """Constants of the code that initialises inner states."""
 
     inner: InnerPlan
     numbers: NumberPlan
@@ -80,7 +80,7 @@ def begin_plan(parts: KernelPlan) -> BeginPlan | None:
 def begin_inner_of(plan: BeginPlan) -> Callable[..., None]:
     """Make `begin_inner(worlds, params, dt, fresh, b, scratch)`: write the initial inner states of `fresh` agents.
 
-    Those of world b, at its current time; fresh (B, N).
+    The agents are those of world b, at its current time; fresh (B, N).
     """
     agent, d, width = plan.inner.agent, plan.inner.agent.dimension, plan.inner.agent.width
     agent_at, vector, read = agent_of(agent._replace(aims=False)), vector_of_lane(d, width), numbers_of(plan.numbers)
@@ -150,7 +150,7 @@ def field_of(parts: KernelPlan) -> Callable[..., None]:
 def _scene_field(plan: ResponsePlan, sensed: SensePlan, number_plan: NumberPlan) -> Callable[..., None]:
     """Make `scene_field`: write accelerations at given times, and the flow that carries agents if there is one.
 
-    Of all worlds, (D, B, N); nothing moves.
+    Both are of all worlds, (D, B, N); nothing moves.
     """
     agent, d, width = plan.agent, plan.agent.dimension, plan.agent.width
     bring_in, take_drive, out = bring_in_of(agent), take_drive_of(d, width, plan.masked), out_of_blocks(d, width)

@@ -33,7 +33,7 @@ class FarLaw(NamedTuple):
 
 
 class FarPlan(NamedTuple):
-    """What interacting with all agents depends on."""
+    """Constants of the code of laws about all agents."""
 
     dimension: int
     width: int
@@ -133,7 +133,7 @@ def _interact(plan: FarPlan, laws: tuple[FarLaw, ...], in_tree: bool) -> Callabl
 def _direct(plan: FarPlan) -> Callable[..., None]:
     """Make `direct(effects, pos, living, mass, lanes, forces, blocks, n, time, key)`: sum over all living agents.
 
-    For all laws at once; blocks: the first, and the end.
+    It evaluates all laws at once. blocks: the first, and the end.
     """
     dimension, width, sums = plan.dimension, plan.width, np.uint64(plan.sums)
     interact, vector, place = (

@@ -31,7 +31,7 @@ class GroupLaw(NamedTuple):
 
 
 class GroupPlan(NamedTuple):
-    """What finding groups depends on."""
+    """Constants of the code that finds groups."""
 
     dimension: int
     width: int

@@ -158,8 +158,8 @@ class KernelPlan(ObstacleSets):
     def looks_ahead(self) -> bool:
         """True if the distance of the next candidate is computed early, so that more operations are in flight.
 
-        In small scenes, where a block visits all candidates in a row, with several pair laws, and with registers
-        enough.
+        In small scenes, where a block visits all candidates in a row, with several pair laws, and with enough
+        registers.
         """
         return self.parting and self.masks and not self.sorts and self.dimension == 2 and len(self.pairs) > 1
 
@@ -200,7 +200,7 @@ class KernelPlan(ObstacleSets):
 
     @property
     def number_plan(self) -> NumberPlan:
-        """Where each of them lies."""
+        """Where each of `parameters` lies."""
         return self._numbers[1]
 
     @property
@@ -305,7 +305,7 @@ class KernelPlan(ObstacleSets):
 
     @functools.cached_property
     def fields(self) -> list[str]:
-        """What is sorted of each agent: what the pair laws read, found from the names in their code."""
+        """The fields that are sorted with each agent: those that pair laws read, by the names in their code."""
         names = set().union(*(names_read(e, OF_PAIRS) for _, e in self.pairs))
         if any(sight.fov < 360 for sight in self.sights):
             names.add("heading")
@@ -320,13 +320,13 @@ class KernelPlan(ObstacleSets):
 
     @functools.cached_property
     def sorted_fields(self) -> list[str]:
-        """Those that lie side by side in scratch, or in records: rarely read ties do not."""
+        """The `fields` that lie side by side in scratch or in records: all but rarely read ties."""
         seldom = self.sorts and self.parting
         return [name for name in self.fields if not (seldom and name[0] == "t")]
 
     @property
     def seen_fields(self) -> list[str]:
-        """What is sorted of each agent to find the nearest."""
+        """The fields that are sorted with each agent for the query of the nearest."""
         return [f"x{k}" for k in range(self.dimension)]
 
     @property
@@ -336,7 +336,7 @@ class KernelPlan(ObstacleSets):
 
     @property
     def numbers(self) -> int:
-        """Numbers of a record that scratch must have: a place, and all fields but headings."""
+        """How many numbers a record of an agent has: a place, and all fields but headings."""
         kinds = [self.sorted_fields] * bool(self.pairs) + [self.seen_fields] * bool(self.look)
         return 1 + max((sum(name[0] != "h" for name in fields) for fields in kinds), default=0)
 
@@ -379,7 +379,7 @@ class KernelPlan(ObstacleSets):
 
     @property
     def reordered_fields(self) -> list[str]:
-        """What of an agent moves when agents are reordered: an array, and the axis of a vector."""
+        """The data that move with an agent when agents are reordered: an array, and the axis of a vector."""
         vectors = [
             "pos",
             "vel",
@@ -393,7 +393,7 @@ class KernelPlan(ObstacleSets):
 
     @property
     def reordered_size(self) -> int:
-        """How many numbers that takes, in whole cache lines."""
+        """How many numbers move with a reordered agent, in whole cache lines."""
         one = LINE // self.itemsize
         return -(-len(self.reordered_fields) // one) * one
 

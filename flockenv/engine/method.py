@@ -17,7 +17,7 @@ __all__ = ["MethodPlan", "advance_of", "method_plan"]
 
 
 class MethodPlan(NamedTuple):
-    """What the functions that a method is passed depend on."""
+    """Constants of the functions that are passed to a method."""
 
     dimension: int
     width: int

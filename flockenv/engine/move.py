@@ -1,4 +1,4 @@
-"""How the agents of a block move to where the method leads: limits, the space, headings, inner states.
+"""The end of a step for the agents of a block: new positions by the method, limits, space, headings, inner states.
 
 A method of one stage is applied here as well, coordinate by coordinate.
 """
@@ -39,7 +39,7 @@ class KeepLaw(NamedTuple):
 
 
 class InnerPlan(NamedTuple):
-    """What changing the inner states of agents depends on."""
+    """Constants of the code that changes inner states."""
 
     agent: AgentPlan
     laws: tuple[KeepLaw, ...]
@@ -48,7 +48,7 @@ class InnerPlan(NamedTuple):
 
 
 class MovePlan(NamedTuple):
-    """What moving the agents of a block depends on."""
+    """Constants of the code that moves the agents of a block."""
 
     agent: AgentPlan
     masked: bool  # True if numbers that all agents share may be read from the first block
@@ -129,7 +129,7 @@ def _method_step(plan: MovePlan) -> Callable[..., Any]:
 
 @functools.cache
 def _draw(channel: int) -> Callable[..., float]:
-    """Return `draws(random_key, instant, i, dt)`: a normal number of (world, step, agent, channel), like dt."""
+    """Return `draws(random_key, instant, i, dt)`: a normal number of (world, step, agent, channel), of dt's type."""
     return kernel(lambda random_key, instant, i, dt: like(dt, normal(random_key, instant, np.int64(i), channel)))  # type: ignore[arg-type]
 
 

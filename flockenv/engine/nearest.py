@@ -92,7 +92,7 @@ def exchanges(many: int, come: int) -> Iterator[tuple[int, int]]:
             yield many + a, many + b
     for c in range(min(come, many)):
         yield many - 1 - c, many + c
-    length = 1 << (many - 1).bit_length()  # as if the numbers that are missing of that length were the least
+    length = 1 << (many - 1).bit_length()  # as if padded to that length with the least numbers
     half, missing = length // 2, length - many
     while half:
         for k in range(missing, length):

@@ -40,7 +40,7 @@ _ARRAYS = {"x": "pos", "v": "vel", "t": "tie", "d": "facing", "a": "aiming", "wh
 
 
 class Listing(NamedTuple):
-    """What is listed of each agent, and how."""
+    """Which fields of each agent are listed, and how."""
 
     dimension: int
     width: int
@@ -60,7 +60,7 @@ class Listing(NamedTuple):
 
     @property
     def record(self) -> tuple[str, ...]:
-        """What is written of an agent into its record, after its place; headings follow from velocities."""
+        """The fields of an agent's record, after its place; headings follow from velocities."""
         return tuple(field for field in self.fields if field[0] != "h")
 
     @property

@@ -174,7 +174,7 @@ def _insert_candidates(plan: LookPlan, wrapped: bool) -> Callable[..., None]:
 def _write_lists(plan: LookPlan) -> Callable[..., None]:
     """Make `write(listed, lanes, near, block, upto, by_number)`: write the lists of a block to the output arrays.
 
-    listed: the agent at each place: records, or their order. by_number: True if the lists lie as the lanes do.
+    listed: records, or the numbers of agents in the order of listing. by_number: True if lane k is agent block + k.
     """
     listing, width, many = plan.listing, plan.listing.width, plan.agents
     squares, places, home = listing.slot("square0"), listing.slot("place0"), listing.slot("home0")

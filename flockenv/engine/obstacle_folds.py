@@ -96,7 +96,7 @@ def update_by_circle(folds: tuple[Fold, ...]) -> Callable[..., None]:
 
 @section
 def _circle(fold: Fold, j: int) -> Callable[..., None]:
-    """Make the same for one fold, and for ray j if it casts rays."""
+    """Make `update` by a circle for one fold, and for ray j if it casts rays."""
     k, ray_of, origin, keep = fold.k, fold.ray, fold.origin, _update_fold(fold)
     cast, elsewhere = fold.ray is not None, fold.origin is not None
 

@@ -74,7 +74,7 @@ def _agent_of(plan: AgentPlan) -> Callable[..., Any]:
 
 @functools.cache
 def _world_of(plan: Obstacles) -> Callable[..., Any]:
-    """Make `world(context)`: return what occlusion by obstacles depends on; an empty tuple if no fold needs it."""
+    """Make `world(context)`: return the data that occlusion by obstacles needs; an empty tuple if no fold does."""
     if all(fold.hidden is None for fold in plan.folds):
         return kernel(lambda context: ())
 
@@ -137,7 +137,7 @@ def _furthest(folds: tuple[Fold, ...]) -> Callable[..., float]:
     return kernel(furthest)
 
 
-# --- what they interact with ------------------------------------------------------------------------------------------
+# --- loops over obstacles ---------------------------------------------------------------------------------------------
 
 
 @section
@@ -180,7 +180,7 @@ def _motion_of(dimension: int, moving: bool) -> Callable[..., tuple[Vec, Vec]]:
 def _row(plan: Obstacles, form: str) -> Callable[..., None]:
     """Make `update(numbers, world, params, me, at, place, where, vel, lanes, lane)`: update an agent's folds.
 
-    It is skipped if it is not within reach. where: its anchor, m; vel: m/s.
+    The shape is skipped if it is out of reach. where: its anchor, m; vel: m/s.
     """
     offset_to, nearest, update = plan.around.offset_to, law_of("nearest", form), update_by_shape(plan.folds, form)
     bounded, picks, reach = (

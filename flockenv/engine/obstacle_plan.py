@@ -1,4 +1,4 @@
-"""What folds over the obstacles depend on: the laws, where their numbers lie, which shapes they may skip."""
+"""The plan of folds over the obstacles: the laws, where their numbers lie, which shapes they may skip."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Fold(NamedTuple):
 
 
 class Obstacles(NamedTuple):
-    """All that the folds over the obstacles of a scene depend on."""
+    """All constants of the folds over the obstacles of a scene."""
 
     agent: AgentPlan
     around: Surroundings

@@ -1,4 +1,4 @@
-"""What follows from the parts of a scene for its obstacles: which forms there are, and which of them laws use."""
+"""The obstacles of a kernel plan: which forms there are, and which of them laws use."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class ObstacleSets:
 
     @property
     def surroundings(self) -> Surroundings:
-        """What code about obstacles depends on."""
+        """Constants of the code about obstacles."""
         plans = zip(self.shape_table[1], self.number_plan.forms, strict=True)
         forms = tuple(FormPlan(form, *plan) for form, plan in plans)
         return Surroundings(self.dimension, self.space.offset_law, self.moving, forms)

@@ -1,4 +1,4 @@
-"""What the loop over neighbours depends on: the pair laws, their sights, and where their sums lie."""
+"""The plan of the loop over neighbours: the pair laws, their sights, and where their sums lie."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class PairLaw(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """All that the loop over neighbours depends on."""
+    """All constants of the loop over neighbours."""
 
     listing: Listing
     views: tuple[View, ...]
@@ -71,7 +71,7 @@ class Pairs(NamedTuple):
 
 
 def pairs_of(parts: KernelPlan) -> Pairs:
-    """Return what the loop over the neighbours of a scene depends on."""
+    """Return the plan of the loop over the neighbours of a scene."""
     listing = listing_of(parts, parts.sorted_fields, parts.confines, parts.arranges)
     fovs = [sight.fov for sight in parts.sights]
     views = tuple(

@@ -101,7 +101,7 @@ def view_of(fov: float, dtype: str) -> float:
 
 
 class Numbered(Protocol):
-    """What is packed: the members of a kernel's plan that hold numbers."""
+    """The members of a kernel plan that hold the numbers to be packed."""
 
     @property
     def dimension(self) -> int:
@@ -125,7 +125,7 @@ class Numbered(Protocol):
 
     @property
     def shape_table(self) -> tuple[Any, dict[Any, tuple[int, int]]]:
-        """Rows of shapes, and where those of each form lie."""
+        """The rows of all shapes, and where the rows of each form lie."""
 
     @property
     def cells(self) -> dict[Any, Any]:
@@ -278,7 +278,7 @@ def _effect(plan: EffectPlan) -> Callable[..., Any]:
 
 
 def _runs(kinds: tuple[tuple[str, int, int], ...]) -> tuple[tuple[str, int, int], ...]:
-    """Return the same, with consecutive numbers read at once."""
+    """Return the kinds with consecutive numbers joined into one, to be read at once."""
     runs: list[tuple[str, int, int]] = []
     for kind, at, count in kinds:
         if kind == "number" and runs and runs[-1][0] == "number" and sum(runs[-1][1:]) == at:

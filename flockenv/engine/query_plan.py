@@ -1,4 +1,4 @@
-"""What `look` depends on, and what its functions pass each other."""
+"""The plan of `look`, and the records that its functions pass each other."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["LookPlan", "Looking", "Nearest", "Span", "plan_look"]
 
 
 class LookPlan(NamedTuple):
-    """All that `look` depends on."""
+    """All constants of `look`."""
 
     listing: Listing
     agents: int  # number of nearest agents in a list
@@ -35,7 +35,7 @@ class LookPlan(NamedTuple):
 
 
 def plan_look(parts: KernelPlan) -> LookPlan:
-    """Return what `look` depends on for a task whose parts have a look."""
+    """Return the plan of `look` for a task whose parts have one."""
     look, exact = parts.look, parts.keyed or any(sight.nearest for sight in parts.sights)
     assert look is not None
     return LookPlan(

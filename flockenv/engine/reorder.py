@@ -34,16 +34,16 @@ _COMMON = {**dict.fromkeys(("mass", "radius", "max_speed", "max_force"), 0), "re
 
 
 class PackedFields(NamedTuple):
-    """What is packed of each agent: numbers of arrays, each at a place; see `lane_access.places_each`."""
+    """The numbers that are packed of each agent, from several arrays; see `lane_access.places_each`."""
 
     arrays: tuple[int, ...]  # in which array each lies
     which: tuple[int, ...]  # index of the start: of numbers, of vectors, and both again for what all agents may share
     further: tuple[int, ...]
-    own: tuple[tuple[int, ...], ...]  # which of them each agent has for itself: always, by mask 0, by mask 1
+    own: tuple[tuple[int, ...], ...]  # which numbers are the agent's own: always, or if mask 0, or 1, is not 0
 
 
 class ArrangePlan(NamedTuple):
-    """What reordering agents depends on."""
+    """Constants of the code that reorders agents."""
 
     dimension: int
     width: int

@@ -50,7 +50,7 @@ class FormPlan(NamedTuple):
 
 
 class Surroundings(NamedTuple):
-    """What code about the obstacles of a scene depends on."""
+    """Constants of the code about the obstacles of a scene."""
 
     dimension: int
     offset_to: Law

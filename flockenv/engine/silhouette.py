@@ -299,7 +299,7 @@ def passing_side_of(around: Surroundings) -> Callable[..., Vec]:
 
 @kernel
 def _both_sides(world: Any, form: Any, row: Any, x: Any, ray: Any, own: Any, off: Any) -> Any:
-    """Return the other side: opposite to that of the normal."""
+    """Return the side opposite to that of the normal, `own`: in the plane it is the only other."""
     return (scale(own, like(x[0], -1.0)),)
 
 

@@ -49,7 +49,7 @@ AHEAD = 16
 
 
 class StepPlan(NamedTuple):
-    """What a step of a scene depends on."""
+    """Constants of a step of a scene."""
 
     agent: AgentPlan
     numbers: NumberPlan
@@ -256,7 +256,7 @@ def _first_failure(bad: int, width: int) -> Callable[..., Any]:
 def _copy_in(plan: StepPlan) -> Callable[..., Context]:
     """Make `enter(worlds, drive, drive_row, params, count, b, rank, team, scratch)`: copy agents into blocks.
 
-    Those of this thread. It returns the context of world b, reordered for `count` steps if that pays.
+    The agents are those of this thread. It returns the context of world b, reordered for `count` steps if that pays.
     """
     agent, d, width, ordered = plan.agent, plan.agent.dimension, plan.agent.width, plan.arrange is not None
     read, bring_in, take_drive = numbers_of(plan.numbers), bring_in_of(agent), take_drive_of(d, width, ordered)

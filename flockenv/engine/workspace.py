@@ -64,7 +64,7 @@ class Workspace:
         return cls(arrays, own)
 
     def of(self, rank: int, kind: Any) -> Any:
-        """Return what one thread of the team is passed: a record of this kind, which names its arrays."""
+        """Return the arrays that one thread of the team is passed, as a record of this kind."""
         if (rank, kind) not in self._records:
             arrays: dict[str, Any] = self.arrays | self.own[rank]
             arrays["inner"] = tuple(array for name, array in arrays.items() if name.startswith("inner"))
