@@ -40,7 +40,7 @@ WORLDS = 256
 
 
 class Among:
-    """Worlds in which one agent of each is played from outside, (B, 1, O); all other agents play `others`.
+    """Worlds in which the caller acts for one agent of each, (B, 1, O); all other agents play `others`.
 
     In world k that agent is learner k % L, so every learner counts equally if L divides B, otherwise nearly. Its world
     ends when it is out.
@@ -54,7 +54,7 @@ class Among:
         self._begins = True
 
     def reset(self, seeds: int) -> NDArray[np.float32]:
-        """Begin; return the observation of the one agent."""
+        """Begin episodes; return the observations of the one agent per world."""
         self._seen, self._begins = self._world.reset(seeds), True
         return self._seen[self._mine][:, None]
 
@@ -72,11 +72,11 @@ class Among:
         return step._replace(**{name: getattr(step, name)[self._mine][:, None] for name in names})
 
     def measure(self) -> Mapping[str, NDArray[np.float64]]:
-        """Metrics of whole worlds."""
+        """Return the metrics of whole worlds."""
         return self._world.measure()
 
     def snapshot(self, world: int = 0) -> Snapshot:
-        """Return one world at this instant."""
+        """Return one world at this instant, for pictures."""
         return self._world.snapshot(world)
 
 

@@ -1,7 +1,7 @@
-"""A critic that sees more than its actor: trained together, played alone (Lowe et al. 2017; Yu et al. 2022, MAPPO).
+"""A critic with more inputs than its actor, used in training only (Lowe et al. 2017; Yu et al. 2022, MAPPO).
 
-The return of a learner depends on what it does not observe: how hungry the hunter is, how many agents are left. The
-actor must do without; the critic is needed in training alone, so it may see that, and its estimates have less noise.
+The return of a learner depends on quantities that it does not observe, such as the hunger of a hunter or the number of
+agents alive. The critic is needed in training only, so it may use them; its estimates then have less noise.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class CentralVecEnv(WorldVecEnv):
 
 
 class _Extractor(MlpExtractor):
-    """SB3's two networks, of which the actor's is fed with the first `seen` numbers alone."""
+    """SB3's two networks; the actor's gets only the first `seen` numbers of a row."""
 
     def __init__(self, seen: int, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -56,7 +56,7 @@ class _Extractor(MlpExtractor):
         self.policy_net[0] = torch.nn.Linear(seen, first.out_features, device=first.weight.device)
 
     def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
-        """Return what the actor makes of what a learner sees."""
+        """Return the output of the actor's network for the learners' observations."""
         return super().forward_actor(features[..., : self.seen])
 
 
@@ -64,8 +64,8 @@ class CentralPolicy(ActorCriticPolicy):
     """SB3's policy for such rows.
 
     Args:
-        seen: how many numbers of a row the actor is shown, which may also be given alone to whatever acts; the critic
-            needs the whole row.
+        seen: how many numbers of a row the actor gets; actions can be computed from these alone, values need the whole
+        row.
     """
 
     def __init__(self, *args: Any, seen: int, **kwargs: Any) -> None:

@@ -1,10 +1,10 @@
-"""A checkpoint of a training: one file, FOLDER/checkpoint.safetensors, that holds all of it or is the one before.
+"""A checkpoint of a training: one file, FOLDER/checkpoint.safetensors, which is replaced as a whole or not at all.
 
 The file is safetensors: a header in JSON, then numbers. Nothing in it is executed, and nothing is compressed. A tensor
-is called PART/NAME; a part that is JSON is one tensor of bytes, PART/json. What the parts are is for agents.ppo to say.
+is called PART/NAME; a part that is JSON is one tensor of bytes, PART/json. agents.run defines which parts there are.
 The header's metadata hold `format` and `sha256`, the digest of every part: over names, types, shapes and bytes. `times`
-is the part that holds what the clock showed, and the only one that `digest` leaves out: two trainings that are the same
-bit for bit have checkpoints of the same digest.
+is the part with wall times, and the only one that `digest` leaves out: two trainings that are equal bit for bit have
+checkpoints of the same digest.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ __all__ = [
 FILE, TIMES, JSON = "checkpoint.safetensors", "times", "json"
 FORMAT = "flockenv checkpoint 1"
 BEFORE = ("run.json", "policy.pt", "optimizer.pt", "best.npz")
-"""The files of the format before this one: four that could be of different moments."""
+"""The files of the previous format: four, which could be from different moments."""
 
 Tensors = dict[str, NDArray[Any]]
 CheckpointParts = dict[str, Tensors]
@@ -55,18 +55,18 @@ R = TypeVar("R", bound=Record)
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that training cannot go on from."""
+    """A checkpoint from which training cannot continue."""
 
 
 class Damaged(CheckpointError):  # noqa: N818  # the state of a file
-    """A checkpoint that is not what was written, or not a checkpoint of this training."""
+    """A checkpoint that was altered or truncated, or does not belong to this training."""
 
     def __init__(self, folder: Path, why: str) -> None:
         super().__init__(f"the checkpoint in {folder} is damaged: {why}")
 
 
 class InUse(CheckpointError):  # noqa: N818  # the state of a folder
-    """Another training holds the folder."""
+    """A folder that another training has locked."""
 
 
 def path_in(folder: Path) -> Path:
@@ -76,9 +76,9 @@ def path_in(folder: Path) -> Path:
 
 @contextmanager
 def claim(folder: Path) -> Iterator[None]:
-    """Hold a folder, made if it is not there; InUse at once if another training holds it, in any process.
+    """Lock a folder, which is created if it is missing; raise InUse if another training, in any process, has locked it.
 
-    What a killed process left half-written is removed; the lock of a killed process is free.
+    Incomplete files of a killed process are removed; the lock of a killed process is free.
     """
     with new_folder(folder):
         lock = FileLock(folder / "training.lock")
@@ -102,7 +102,7 @@ def json_part(content: Any) -> Tensors:
 
 
 def write(folder: Path, parts: CheckpointParts) -> None:
-    """Write a checkpoint, which takes the place of the one before when all of it is on the disk."""
+    """Write a checkpoint, which replaces the previous one when all of it is on the disk."""
     digests = {part: _digest(tensors) for part, tensors in parts.items()}
     tensors = {f"{part}/{name}": np.asarray(t, order="C") for part, named in parts.items() for name, t in named.items()}
     data = save(tensors, {"format": FORMAT, "sha256": json.dumps(digests)})
@@ -111,7 +111,7 @@ def write(folder: Path, parts: CheckpointParts) -> None:
 
 
 def digest(parts: CheckpointParts) -> str:
-    """Return the SHA-256 of all that a checkpoint holds, but for the part `times`."""
+    """Return the SHA-256 of all parts of a checkpoint except `times`."""
     each = [f"{part} {_digest(tensors)}" for part, tensors in sorted(parts.items()) if part != TIMES]
     return hashlib.sha256("\n".join(each).encode()).hexdigest()
 
@@ -133,8 +133,8 @@ def read(folder: Path, largest: int) -> CheckpointParts | None:
     largest: bytes; a larger file is not read.
 
     Raises:
-        Damaged: it names the part, or says what is wrong with the file.
-        CheckpointError: the files are in the format before this one.
+        Damaged: a part or the file is invalid; the message names it.
+        CheckpointError: the files are in the previous format.
     """
     path = path_in(folder)
     if not path.exists():
@@ -155,7 +155,7 @@ def read(folder: Path, largest: int) -> CheckpointParts | None:
 
 
 def _recorded_digests(metadata: Mapping[str, str], folder: Path) -> dict[str, str]:
-    """Return the digests that a header names."""
+    """Return the digests in a header, by part."""
     if metadata.get("format") != FORMAT:
         raise Damaged(folder, f"header: format = {printable(metadata.get('format'))}, must be {FORMAT!r}")
     try:
@@ -178,7 +178,7 @@ def _parts(file: Any, folder: Path) -> CheckpointParts:
 
 
 def _compare(parts: CheckpointParts, recorded: Mapping[str, str], folder: Path) -> None:
-    """Refuse a part that is missing, unknown, or not what its digest was taken of; one without tensors is there."""
+    """Raise Damaged for a part that is missing, unknown or does not match its digest; an empty part is not missing."""
     for part in sorted({*recorded, *parts}):
         if part not in recorded:
             raise Damaged(folder, f"{part}: a part without a recorded SHA-256")
@@ -187,7 +187,7 @@ def _compare(parts: CheckpointParts, recorded: Mapping[str, str], folder: Path) 
 
 
 def from_json(kind: type[R], parts: CheckpointParts, part: str, folder: Path) -> R:
-    """Return the record that a part holds in JSON, read strictly; Damaged, with the key, if it is not of that kind."""
+    """Return the record that a part holds as JSON, read strictly; raise Damaged, with the key, if it is invalid."""
     tensors = parts.get(part, {})
     if tensors.keys() != {JSON} or tensors[JSON].dtype != np.uint8:
         raise Damaged(folder, f"{part}: must be one tensor of bytes, {part}/{JSON}")

@@ -57,12 +57,12 @@ __all__ = [
 ROOT = Path(__file__).resolve().parent.parent
 WORLDS, SMOKE_WORLDS = 256, 16
 RESAMPLES, SMOKE_RESAMPLES = 10_000, 1_000
-TOLD_EVERY = 0.1  # s, between news of one player's progress from another process
+TOLD_EVERY = 0.1  # s, between two reports of one player's progress from another process
 RECORDED = 0  # the world in the replay: the first, not a selected one
 PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "pettingzoo")
 FILES = ("results.json", "table.md", "comparison.png", "replay.html")
 ROOM = 2**24
-"""Bytes, about what all files take."""
+"""Bytes that all files take, approximately."""
 NAME = re.compile(r"\w[\w.+-]{0,39}")
 """A player's name becomes a key, a table cell, a label and a piece of HTML."""
 
@@ -74,23 +74,23 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions
 
 @dataclass(frozen=True)
 class Player:
-    """A player: as given (a known name or a file), and its name in the tables."""
+    """A player: its specification (a known name or a file), and its name in the tables."""
 
     spec: str
     name: str
 
     @classmethod
     def of(cls, spec: str) -> Player:
-        """Name a file by its stem; ValueError for a stem that is fit for no table."""
+        """Return a player; a file is named by its stem. Raise ValueError for a stem that is not valid in tables."""
         name = Path(spec).stem if Path(spec).suffix.lower() in SUFFIXES else spec
         if not NAME.fullmatch(name):
             raise ValueError(f"--players {printable(spec)}: a name is up to 40 letters, digits and _ . + -")
         return cls(spec, name)
 
     def policy(self, task: Task, seed: int, trust_pickle: bool = False) -> Policy:
-        """Return it, ready to play a task; ValueError: one line that names it."""
+        """Return the policy, ready to play a task; raise ValueError, in one line with the player's name, if it cannot."""
         with blame(self.name, task, ValueError), warnings.catch_warnings():
-            warnings.simplefilter("ignore", OtherTaskWarning)  # the results say what differs
+            warnings.simplefilter("ignore", OtherTaskWarning)  # the results list the differences
             return load_player(self.spec, task, seed, trust_pickle)
 
 
@@ -105,11 +105,11 @@ def compare(
 ) -> tuple[report.Results, dict[str, dict[str, Episodes]]]:
     """Play every task with every player in the same worlds; return the results as plain data, and the episodes.
 
-    From 256 worlds on, tasks are played side by side, by a process for each core: a script that calls this then needs
-    `if __name__ == "__main__":`, as for anything that starts processes. `advance` is called by another thread then.
+    From 256 worlds on, tasks are played in parallel, by a process for each core: a script that calls this then needs
+    `if __name__ == "__main__":`, like any that starts processes, and `advance` is called by another thread.
 
     Raises:
-        ValueError: one line: a player that cannot be had (before anything is played), or that fails while playing.
+        ValueError: a player cannot be loaded (before any episode), or fails while playing; one line.
     """
     began = perf_counter()
     first = worlds_for("evaluation", seed, worlds)
@@ -135,12 +135,12 @@ def compare(
 
 
 def usual_players(tasks: Sequence[Task]) -> list[str]:
-    """Return the default players: all that have a name and are written for one of the tasks."""
+    """Return the default players: all named ones that can play one of the tasks."""
     return [name for name in NAMES if any(not other_tasks(name, task.name) for task in tasks)]
 
 
 def players_of(tasks: Sequence[Task], players: Sequence[Player]) -> dict[str, list[Player]]:
-    """Return the players of each task by its name: all but hand-written ones of other tasks that are played here.
+    """Return the players of each task by its name: all except hand-written ones of other tasks in this comparison.
 
     Raises:
         ValueError: a task without a player.
@@ -154,7 +154,7 @@ def players_of(tasks: Sequence[Task], players: Sequence[Player]) -> dict[str, li
 
 
 def _is_left_out(player: Player, task: Task, tasks: Sequence[Task]) -> bool:
-    """True if it is a hand-written player of other tasks, one of which is played here."""
+    """Return True for a hand-written player of other tasks, one of which is in this comparison."""
     of = other_tasks(player.spec, task.name)
     return any(other.name in of for other in tasks)
 
@@ -172,7 +172,7 @@ class _Job:
 
     @property
     def first(self) -> int:
-        """The seed of its first world."""
+        """Seed of the first world."""
         return worlds_for("evaluation", self.seed, self.worlds)
 
 
@@ -180,7 +180,7 @@ Played = tuple[dict[str, Episodes], report.Results]
 
 
 def _play_all(jobs: Sequence[_Job], plays: Plays, advance: Advance) -> Iterator[Played]:
-    """Yield what came of every job: worked off side by side, a process for each core, where that is worth a process."""
+    """Yield the result of every job; with enough work, jobs run in parallel, in a process for each core."""
     cores = min(os.cpu_count() or 1, len(jobs))
     if cores < 2 or jobs[0].worlds < WORLDS:
         return (_play(job, plays[job.task.name], advance) for job in jobs)
@@ -188,7 +188,7 @@ def _play_all(jobs: Sequence[_Job], plays: Plays, advance: Advance) -> Iterator[
 
 
 def _play_in_process(job: _Job, tell: Tell) -> Played:
-    """Do a job in a process that plays for another one; the players are made anew from what was asked for."""
+    """Run a job in a worker process; the players are loaded there from their specifications."""
     last = [0.0]
 
     def advance(*news: Any) -> None:
@@ -197,13 +197,13 @@ def _play_in_process(job: _Job, tell: Tell) -> Played:
             last[0] = perf_counter()
             tell(*news)
 
-    tell(job.task.name, job.players[0].name, 0, job.task.horizon)  # a process works on it; it may compile first
+    tell(job.task.name, job.players[0].name, 0, job.task.horizon)  # a process has begun; it may compile first
     policies = {player.name: player.policy(job.task, job.seed, job.trust_pickle) for player in job.players}
     return _play(job, policies, advance)
 
 
 def _play(job: _Job, policies: Mapping[str, Policy], advance: Advance) -> Played:
-    """Let every player play the same worlds of one task; return their episodes, and what they come to."""
+    """Play the same worlds of one task with every player; return their episodes, and the results."""
     task, episodes = job.task, {}
     for name, policy in policies.items():
 
@@ -219,7 +219,7 @@ def _play(job: _Job, policies: Mapping[str, Policy], advance: Advance) -> Played
 
 @contextmanager
 def blame(player: str, task: Task, *clear: type[Exception]) -> Iterator[None]:
-    """Name the player and the task in an error that its `predict` raises, or its actions cause, unless it is `clear`.
+    """Add player and task to an error that its `predict` raises or its actions cause; `clear` errors stay as they are.
 
     A PlayerError names the file already; the task is added.
     """
@@ -234,7 +234,7 @@ def blame(player: str, task: Task, *clear: type[Exception]) -> Iterator[None]:
 
 
 def _costs(task: Task, policies: Mapping[str, Policy]) -> dict[str, report.Results]:
-    """Return what each player cost before it could play, as far as known: what for, wall time in s, agent-steps."""
+    """Return the cost of training or tuning each player, as far as known: purpose, wall time in s, agent-steps."""
     costs = {}
     for name, policy in policies.items():
         card = getattr(policy, "card", None) or {}
@@ -246,13 +246,13 @@ def _costs(task: Task, policies: Mapping[str, Policy]) -> dict[str, report.Resul
 
 
 def experiment_of(name: str) -> Experiment:
-    """Return what the config says of a task: with which settings its players were trained and tuned."""
+    """Return the config of a task: the settings with which its players were trained and tuned."""
     path = CONFIGS / f"{name}.yaml"
     return load_experiment(path) if path.is_file() else Experiment(task=name)
 
 
 def provenance() -> report.Results:
-    """Return what is needed to reproduce the numbers."""
+    """Return the data that are needed to reproduce the numbers."""
     changes = _git("status", "--porcelain")
     versions = {"flockenv": flockenv.__version__, "python": platform.python_version()}
     return {
@@ -270,7 +270,7 @@ def _version(package: str) -> str | None:
 
 
 def _git(*command: str) -> str | None:
-    """Ask git about this checkout; None where there is no git or no commit."""
+    """Return the output of git for this checkout; None without git or a commit."""
     try:
         answer = subprocess.run(["git", "-C", str(ROOT), *command], capture_output=True, text=True, timeout=10)
     except (OSError, subprocess.TimeoutExpired):
@@ -311,7 +311,7 @@ def main(
 
 
 def folder_of(text: str, files: Sequence[str]) -> Path:
-    """Return the folder that --out names; ValueError or OSError if these files cannot be written there."""
+    """Return the folder of --out; raise ValueError or OSError if these files cannot be written there."""
     folder = valid_path(text)
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"--out {printable(text)}: is a file, must be a folder")
@@ -322,7 +322,7 @@ def folder_of(text: str, files: Sequence[str]) -> Path:
 
 
 def split(values: Sequence[str] | None) -> list[str]:
-    """Return what an option was given, by comma or repeated."""
+    """Return the values of an option, which may be separated by commas or repeated."""
     return [part.strip() for value in values or () for part in value.split(",") if part.strip()]
 
 
@@ -336,7 +336,7 @@ def pick(option: str, names: Sequence[str], allowed: Mapping[str, object]) -> li
 
 
 def players_in_order(specs: Sequence[str]) -> list[Player]:
-    """Return the players in the order of the tables: the known ones from the least, then files as they were given."""
+    """Return the players in the order of the tables: named ones as in NAMES, then files in the given order."""
     field = [Player.of(spec) for spec in dict.fromkeys(specs)]
     names = [player.name for player in field]
     twice = next((name for name in names if names.count(name) > 1), None)
@@ -347,7 +347,7 @@ def players_in_order(specs: Sequence[str]) -> list[Player]:
 
 @contextmanager
 def _bars(tasks: Sequence[Task], players: int) -> Iterator[Advance]:
-    """Show a bar per task on a terminal, and a line per player and task anywhere else."""
+    """Show a progress bar per task on a terminal; otherwise write a line per player and task."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description:<24}"), BarColumn(40), TimeElapsedColumn())
     with show_progress(Progress(*columns, console=console, transient=True)) as progress:
@@ -371,7 +371,7 @@ def _bars(tasks: Sequence[Task], players: int) -> Iterator[Advance]:
 def _file_writers(
     results: report.Results, episodes: Mapping[str, Mapping[str, Episodes]]
 ) -> dict[str, Callable[[Path], None]]:
-    """Return the writer of each file."""
+    """Return the function that writes each file."""
     writers: tuple[Callable[[Path], None], ...] = (
         lambda path: write_text(path, report.json_text(results)),
         lambda path: write_text(path, report.markdown(results)),
@@ -406,7 +406,7 @@ def _replay(path: Path, results: report.Results, episodes: Mapping[str, Mapping[
 
 
 def _replay_parts(played: Episodes) -> tuple[Any, ...]:
-    """Return what a replay shows of an episode: instants, return so far, and how it ended."""
+    """Return the data of an episode for a replay: instants, return so far, and outcome."""
     recording = played.recording
     assert recording is not None  # every rollout here is recorded
     outcome = "success" if played.success[recording.world] else "no success"
@@ -414,10 +414,10 @@ def _replay_parts(played: Episodes) -> tuple[Any, ...]:
 
 
 def _show(results: report.Results, folder: Path) -> None:
-    """Print the tables and, last and in full, what they come to."""
+    """Print the tables, and then the verdict on each task."""
     console = Console(highlight=False)
     if not console.is_terminal:
-        console = Console(highlight=False, width=160)  # a pipe has no width; 80 would break every cell
+        console = Console(highlight=False, width=160)  # a pipe has no width; with 80 every cell would wrap
     for task, about in results["tasks"].items():
         console.print(*report.player_tables(task, about))
     for task, about in results["tasks"].items():

@@ -1,10 +1,9 @@
 """Learning curves of several settings, side by side: `python -m agents.curves configs/training/obstacles.yaml ...`.
 
-A config names settings beside its own (`curves: {name: what differs}`). Each is trained like agents.ppo trains, into
-RUNS/TASK/NAME, one after the other, so that seconds compare; what is finished is not trained again, what was
-interrupted goes on, and what was made by another recipe is begun anew. The picture has seconds along and the mean
-return on the tuning worlds up, with the tuned rules as a line: more steps with fewer epochs, or fewer with more,
-whichever learns faster on this machine.
+A config may list further settings (`curves: {name: differences}`). Each is trained as by agents.ppo, into
+RUNS/TASK/NAME, one after the other, so that wall times are comparable. A finished training is not repeated, an
+interrupted one continues, and one of another recipe starts again. The picture shows the mean return on the tuning
+worlds over wall time, s, with the tuned rules as a line: so it shows which setting learns fastest on this machine.
 """
 
 from __future__ import annotations
@@ -33,11 +32,11 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions
 console = Console(stderr=True, soft_wrap=True)
 
 ROOM = 2**20
-"""Bytes that a picture has at most."""
+"""Largest size of a picture, bytes."""
 
 Curve = list[dict[str, float]]
 Numbers = Mapping[str, Any]
-"""What was measured of a task: the mean of its rules, and of each setting its curve and recipe; what the file holds."""
+"""Results of a task, as stored: the mean return of its rules, and the curve and recipe of each setting."""
 
 
 def experiments_of(configs: Sequence[Path]) -> dict[str, Experiment]:
@@ -53,12 +52,12 @@ def experiments_of(configs: Sequence[Path]) -> dict[str, Experiment]:
 
 
 def label(name: str, p: PpoSettings) -> str:
-    """Return a setting's name and what matters of it for speed."""
+    """Return the name of a setting, with its numbers that affect speed."""
     return f"{name}: {p.epochs} epoch{'s' * (p.epochs > 1)}, minibatch {p.minibatch:,}, rate {p.learning_rate:g}"
 
 
 def learning_curve(experiment: Experiment, name: str, runs: Path) -> Curve:
-    """Return the curve of one setting: read where training is finished, else trained to the end."""
+    """Return the curve of one setting, from its checkpoint if training is finished; otherwise train it to the end."""
     from agents import ppo  # with torch
     from agents.run import OtherRecipe, load_checkpoint
 
@@ -77,7 +76,7 @@ def learning_curve(experiment: Experiment, name: str, runs: Path) -> Curve:
 
 
 def measure_task(experiment: Experiment, runs: Path) -> Numbers:
-    """Return what there is to show of a task, once all of its settings are trained."""
+    """Return the results of a task, once all of its settings are trained."""
     rules = load_tuned(experiment.task).found.get("tuning_mean")
     rows = {}
     for name, p in experiment.settings().items():
@@ -116,7 +115,7 @@ def _curves(axes: Axes, task: str, numbers: Numbers) -> None:
     if rules is not None:
         axes.axhline(rules, color=INK, linewidth=1, linestyle=(0, (4, 3)), label=f"the rules, tuned: {rules:.2f}")
     worst = min(max(point["mean"] for point in curve) for curve in curves.values())
-    # what happens near the rules is what matters, and what every setting comes to is seen
+    # show the range near the rules, and the end of every curve
     room = max(0.15 * abs(level), 4 * abs(best - level), 1.5 * (level - worst))
     axes.set_ylim(level - room, max(best, level) + 0.25 * room)
     axes.set_title(task, loc="left", fontsize=12, fontweight="bold", color=INK)

@@ -1,4 +1,4 @@
-"""Teach a network the actions of the tuned rules, in the states that it reaches itself: DAgger (Ross et al. 2011)."""
+"""Imitation of the tuned rules by a network, in the states that it reaches itself: DAgger (Ross et al. 2011)."""
 
 from __future__ import annotations
 

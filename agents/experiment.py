@@ -1,4 +1,4 @@
-"""An experiment: what configs/training/<task>.yaml says: how PPO trains on a task, and how its rules are tuned."""
+"""An experiment, configs/training/<task>.yaml: how PPO trains on a task, and how its rules are tuned."""
 
 from __future__ import annotations
 
@@ -25,43 +25,51 @@ __all__ = [
 CONFIGS = Path(__file__).resolve().parent.parent / "configs" / "training"
 
 AS_CONFIGURED = "as configured"
-"""What a config's own settings are called beside others."""
+"""Name of a config's own settings among others."""
 
 _NAME = re.compile(r"\w[\w ,-]{0,39}")
 """A setting's name is a folder of checkpoints and part of a picture's legend."""
 
 
 class PpoSettings(Record):
-    """How PPO learns; the defaults are what two cores like: many rows per step, large minibatches, few epochs."""
+    """Settings of PPO; the defaults suit two cores: many rows per step, large minibatches, few epochs."""
 
     steps: int = Field(default=20_000_000, ge=1, description="agent-steps in all")
     worlds: int = Field(default=2048, ge=1, description="worlds stepped together; rows = worlds x learners")
     rollout: int = Field(default=32, ge=1, description="actions per row and update")
-    minibatch: int = Field(default=8192, ge=1, description="rows")
+    minibatch: int = Field(default=8192, ge=1, description="rows per gradient step")
     epochs: int = Field(default=4, ge=1, description="passes over a rollout")
-    learning_rate: float = Field(default=2e-3, gt=0, description="at the start; falls linearly to a tenth")
-    gamma: float = Field(default=0.99, gt=0, le=1, description="discount per action, held or not")
-    gae_lambda: float = Field(default=0.95, ge=0, le=1, description="of the advantage estimate")
+    learning_rate: float = Field(
+        default=2e-3, gt=0, description="learning rate at the start; falls linearly to a tenth"
+    )
+    gamma: float = Field(default=0.99, gt=0, le=1, description="discount per action, whether it is held or not")
+    gae_lambda: float = Field(default=0.95, ge=0, le=1, description="lambda of the advantage estimate")
     clip: float = Field(default=0.2, gt=0, description="PPO's clip range")
     entropy: float = Field(default=0.0, ge=0, description="weight of the entropy bonus")
     log_std: float = Field(default=-0.5, description="logarithm of the first standard deviation of actions")
     reward_scale: float = Field(default=0.1, gt=0, description="rewards are multiplied by this while learning")
-    hold: int = Field(default=1, ge=1, le=100, description="decisions of the world for which it keeps to an action")
-    care: float = Field(default=0.0, ge=0, le=1, description="weight of the others' advantages, beside 1 for its own")
+    hold: int = Field(default=1, ge=1, le=100, description="decisions of the world for which an action is repeated")
+    care: float = Field(
+        default=0.0, ge=0, le=1, description="weight of the other learners' advantages; its own has weight 1"
+    )
     central_critic: bool = Field(
         default=False,
-        description="the critic also sees its world's mean observation and the memory of non-learners",
+        description="True if the critic also gets its world's mean observation and the memory of non-learners",
     )
     taught: int = Field(
-        default=0, ge=0, description="gradient steps in which it first learns what the tuned rules answer"
+        default=0, ge=0, description="gradient steps of imitation of the tuned rules, before PPO begins"
     )
-    critic_first: int = Field(default=0, ge=0, description="agent-steps in which only the critic learns, after that")
+    critic_first: int = Field(
+        default=0, ge=0, description="agent-steps in which only the critic learns, after the imitation"
+    )
     stagger: bool = Field(default=False, description="begin worlds at different times of their first episode")
     hidden: tuple[int, ...] = Field(default=(64, 64), min_length=1, description="units per layer")
     activation: str = Field(default="relu", pattern="^(relu|tanh)$", description="relu or tanh")
-    threads: int = Field(default=2, ge=1, le=64, description="of torch and of the worlds; 1 where cores are shared")
-    dtype: Literal["float32", "float64"] = Field(default="float32", description="precision of the worlds it learns in")
-    seed: int = Field(default=0, ge=0, lt=1000, description="of the weights and of the training worlds")
+    threads: int = Field(
+        default=2, ge=1, le=64, description="threads of torch and of the worlds; 1 if cores are shared"
+    )
+    dtype: Literal["float32", "float64"] = Field(default="float32", description="precision of the training worlds")
+    seed: int = Field(default=0, ge=0, lt=1000, description="seed of the weights and of the training worlds")
     evaluate_every: int = Field(default=1_000_000, ge=1, description="agent-steps between points of the curve")
     evaluate_worlds: int = Field(default=256, ge=1, description="tuning worlds per point of the curve")
 
@@ -72,28 +80,28 @@ class SearchSettings(Record):
     candidates: int = Field(default=256, ge=2, description="parameter sets drawn at random in the first round")
     worlds: int = Field(default=96, ge=2, description="tuning worlds per candidate, doubled each round")
     rounds: int = Field(default=5, ge=1, description="successive halvings, each with refinements around the best")
-    seed: int = Field(default=0, ge=0, lt=1000, description="of the search")
+    seed: int = Field(default=0, ge=0, lt=1000, description="seed of the search")
 
 
 class Experiment(Record):
-    """One task with its learners."""
+    """One task, and the settings of its training and tuning."""
 
     task: str = Field(description="name of the task")
     arguments: dict[str, Any] = Field(default_factory=dict, description="keyword arguments of the task")
     ppo: PpoSettings = Field(default_factory=PpoSettings)
     curves: dict[str, dict[str, Any]] = Field(
-        default_factory=dict, description="other settings of PPO to compare it with, by name: what differs"
+        default_factory=dict, description="further settings of PPO for comparison, by name: the fields that differ"
     )
     search: SearchSettings = Field(default_factory=SearchSettings)
 
     @model_validator(mode="after")
     def _curves_are_settings(self) -> Experiment:
-        """Refuse settings that cannot be trained when they are read, not hours later."""
+        """Raise ValueError for settings that cannot be trained when they are read, not hours later."""
         self.settings()
         return self
 
     def settings(self) -> dict[str, PpoSettings]:
-        """Return all settings of PPO by name: the config's own, and those to compare it with."""
+        """Return all settings of PPO by name: the config's own, and those of `curves`."""
         others = {name: self._other_settings(name, changes) for name, changes in self.curves.items()}
         return {AS_CONFIGURED: self.ppo, **others}
 
@@ -125,7 +133,7 @@ def load_experiment(path: str | Path) -> Experiment:
 
 @contextmanager
 def one_line_errors(kinds: tuple[type[Exception], ...] = (ValueError, OSError, MemoryError)) -> Iterator[None]:
-    """End a command with status 2 and one line, however narrow the terminal, where its input is refused.
+    """End a command with status 2 and one unwrapped line if it raises one of `kinds`.
 
     kinds: the exceptions that say so.
     """

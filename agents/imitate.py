@@ -1,8 +1,8 @@
-"""Teach a network to answer as the hand-written player does: `python -m agents.imitate configs/training/school.yaml`.
+"""Train a network to imitate the hand-written player: `python -m agents.imitate configs/training/school.yaml`.
 
-Where a trained policy loses to rules, this tells two reasons apart. The network is PPO's, of the same size, fed with
-the same rows; it is shown what the tuned rules answer in training worlds, and then plays the tuning worlds alone. If it
-scores as they do, it can represent them and the search for them failed; if not, look at what it is shown.
+This distinguishes two reasons why a trained policy scores less than rules. The network is PPO's, of the same size, with
+the same inputs; it learns the tuned rules' actions in training worlds, and then plays the tuning worlds alone. If it
+scores as they do, it can represent them, and PPO failed to find them; if not, its observations may lack something.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ console = Console(stderr=True)
 
 @dataclass(frozen=True)
 class Imitation:
-    """Mean returns of rules, and of the network that was taught by them, on the same tuning worlds."""
+    """Mean returns of the rules, and of the network that imitates them, on the same tuning worlds."""
 
     rules: float
     network: float
-    rows: int  # shown
-    missed: float  # mean square of its answers' errors, over the variance of the rules' answers
+    rows: int  # observations that it was trained on
+    missed: float  # mean square error of its actions, over the variance of the rules' actions
 
 
 def imitate(
@@ -65,7 +65,7 @@ def main(
     ] = WORLDS,
     updates: Annotated[int, typer.Option(min=1, help="gradient steps, each of 2,048 rows")] = 6000,
 ) -> None:
-    """Say how well a network of PPO's size plays that was taught by the tuned rules."""
+    """Train a network of PPO's size to imitate the tuned rules, and show how well it plays."""
     with one_line_errors():
         experiment = load_experiment(config)
         name = experiment.build().name

@@ -1,4 +1,4 @@
-"""The environment that PPO learns in: worlds of a task, and what makes learning faster without changing the task."""
+"""The environment of PPO: worlds of a task, with changes that make learning faster and leave the task as it is."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class ForLearning(VecEnvWrapper):
         self.acted = np.ones(venv.num_envs, np.bool_)  # (rows,): rows whose learner acted in the last step
 
     def reset(self) -> np.ndarray:
-        """Begin; staggered, each world with another part of its first episode behind it."""
+        """Begin episodes; if staggered, each world starts after another part of its first episode."""
         observation = self.venv.reset()
         if self.stagger:
             world: World = self.venv.world
@@ -38,15 +38,15 @@ class ForLearning(VecEnvWrapper):
         return observation
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take an action for every row."""
+        """Store an action for every row."""
         self.acted = self.venv.present
         self.actions = actions
         self.venv.step_async(actions)
 
     def step_wait(self) -> Any:
-        """Act for `hold` decisions of the world, and scale what is paid."""
+        """Apply the actions for `hold` decisions of the world, and scale the rewards."""
         observation, reward, done, infos = self._decide()
-        done |= ~self.acted  # nothing that is learned of a row without a learner reaches into its next episode
+        done |= ~self.acted  # returns of a row whose learner has left must not include its next episode
         for _ in range(self.hold - 1):
             self.venv.step_async(self.actions)
             observation, more, over, new_infos = self._decide()
@@ -57,7 +57,7 @@ class ForLearning(VecEnvWrapper):
         return observation, reward * self.scale, done, infos
 
     def _decide(self) -> Any:
-        """Return what one decision of the world brought; LearningDiverged if a number of it is not finite."""
+        """Return the result of one decision of the world; raise LearningDiverged if a number of it is not finite."""
         world: World = self.venv.world
         before = world.steps.copy()
         return check_step(world.task, self.venv.step_wait(), before)

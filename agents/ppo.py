@@ -1,10 +1,10 @@
 """Train a policy with Stable-Baselines3's PPO: `python -m agents.ppo configs/training/pursuit.yaml`.
 
-Reads top to bottom: settings -> worlds -> model -> learn -> export. Every so often the policy of the moment plays the
-tuning worlds in numpy; that is the learning curve, and the best one is what is exported, as safetensors with a card
-that holds the recipe. After each point of the curve, and on Ctrl-C, a checkpoint is written (agents/checkpoint.py) of
-the moment at which the last rollout began; `--resume` goes on from it, if the recipe is still the same. A training that
-was resumed under the same versions on the same machine has the same weights as one that was not, bit for bit.
+The order of the file: settings -> worlds -> model -> learn -> export. At regular intervals the current policy plays the
+tuning worlds in numpy, which gives the learning curve; the best policy is exported, as safetensors with a card that
+holds the recipe. After each point of the curve, and on Ctrl-C, a checkpoint (agents/checkpoint.py) is written, with the
+state at the start of the last rollout; `--resume` continues from it if the recipe is the same. A training that was
+resumed under the same versions on the same machine has the same weights as an uninterrupted one, bit for bit.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ console = Console(stderr=True)
 
 
 def tensors_of(model: PPO) -> dict[str, np.ndarray]:
-    """Return the actor's weights under the names that flockenv.players.policy reads; the critic stays behind."""
+    """Return the actor's weights under the names that flockenv.players.policy reads; the critic is left out."""
     tensors = model.policy.state_dict().items()
     state = {name: tensor.detach().cpu().numpy().astype(np.float32) for name, tensor in tensors}
     out = {"log_std": state["log_std"]}
@@ -83,7 +83,7 @@ def use_thread_count(count: int) -> Iterator[None]:
 
 
 def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
-    """Make the worlds and the model; `use_thread_count` sets how many threads they use."""
+    """Return the model with its worlds; `use_thread_count` sets how many threads they use."""
     torch.manual_seed(p.seed)
     learned = task.model_copy(update={"dtype": p.dtype})
     shows = CentralVecEnv if p.central_critic else WorldVecEnv
@@ -98,7 +98,9 @@ def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
         n_steps=p.rollout,
         batch_size=p.minibatch,
         n_epochs=p.epochs,
-        learning_rate=lambda left: p.learning_rate * max(0.1 + 0.9 * left, 0.05),  # the last rollout may go beyond
+        learning_rate=lambda left: (
+            p.learning_rate * max(0.1 + 0.9 * left, 0.05)
+        ),  # the last rollout may exceed the budget
         gamma=p.gamma,
         gae_lambda=p.gae_lambda,
         clip_range=p.clip,
@@ -124,19 +126,19 @@ def score(task: Task, p: PpoSettings, tensors: dict[str, np.ndarray]) -> tuple[f
     """Return the mean return and the success rate of a policy, without noise, on the tuning worlds.
 
     Raises:
-        LearningDiverged: an answer of the policy, or a reward, is not finite.
+        LearningDiverged: an action of the policy, or a reward, is not finite.
     """
     policy = MlpPolicy(tensors, {"activation": p.activation})
     try:
-        with np.errstate(over="ignore", invalid="ignore"):  # what comes of it is named
+        with np.errstate(over="ignore", invalid="ignore"):  # a result that is not finite raises an error
             episodes = rollout(task, policy, p.evaluate_worlds, worlds_for("tuning", p.seed, p.evaluate_worlds))
-    except ValueError as error:  # it names the world
+    except ValueError as error:  # the message names the world
         raise LearningDiverged(f"on the tuning worlds: {error}") from error
     return float(np.mean(episodes.returns)), float(np.mean(episodes.success))
 
 
 class Watch(BaseCallback):
-    """After each rollout: the progress bar; every so often: a point of the learning curve, and a checkpoint."""
+    """Updates the progress bar after each rollout; adds points of the learning curve and checkpoints at intervals."""
 
     def __init__(
         self, task: Task, p: PpoSettings, run: Run, folder: Path, progress: Progress, saved: Callable[[Run], None]
@@ -146,7 +148,7 @@ class Watch(BaseCallback):
         self.saved = saved
         self.bar = progress.add_task(task.name, total=p.steps, completed=run.steps, score="")
         self.since, self.before = time.perf_counter(), run.wall
-        self.kept: Run | None = None  # as it was when the last rollout began
+        self.kept: Run | None = None  # the state at the start of the last rollout
         self.due = True
 
     def _on_step(self) -> bool:
@@ -159,13 +161,13 @@ class Watch(BaseCallback):
             self.save()
 
     def _remember(self) -> None:
-        """Remember this moment: whatever comes before the next one, training can go on from here."""
+        """Store the state of training at this moment, for the next checkpoint."""
         self.run.wall = self.before + time.perf_counter() - self.since
         self.run.state = capture(self.model)
         self.kept = replace(self.run, curve=list(self.run.curve))
 
     def save(self) -> None:
-        """Write a checkpoint of the moment that is remembered, if there is one."""
+        """Write a checkpoint of the stored state, if there is one."""
         if self.kept is not None:
             save_checkpoint(self.folder, self.kept)
             self.saved(self.kept)
@@ -183,7 +185,7 @@ class Watch(BaseCallback):
             self.add_point()
 
     def add_point(self) -> None:
-        """Measure the policy of the moment, and keep it if it is the best so far; a checkpoint is due then."""
+        """Evaluate the current policy, and keep it if it is the best so far; a checkpoint is then due."""
         self.run.wall = self.before + time.perf_counter() - self.since
         self.run.steps = self.num_timesteps * self.p.hold
         tensors = tensors_of(self.model)
@@ -198,7 +200,7 @@ class Watch(BaseCallback):
         self.due = True
 
     def finish(self) -> None:
-        """Measure the last policy, and write the last checkpoint."""
+        """Evaluate the last policy, and write the last checkpoint."""
         check_model(self.model)
         self.add_point()
         self._remember()
@@ -206,7 +208,7 @@ class Watch(BaseCallback):
 
 
 def _teach_first(model: PPO, task: Task, p: PpoSettings) -> float:
-    """Let the network first learn what the tuned rules answer, if it is to; return the seconds that took."""
+    """Train the network to imitate the tuned rules, if the settings require it; return the time that took, s."""
     if p.taught == 0:
         return 0.0
     began = time.perf_counter()
@@ -217,7 +219,7 @@ def _teach_first(model: PPO, task: Task, p: PpoSettings) -> float:
 
 
 def resume(folder: Path, model: PPO, run: Run, p: PpoSettings) -> None:
-    """Put a model where the run of a checkpoint was, and say what it goes on under if that is not what was before."""
+    """Restore a model to the run of a checkpoint, and print which versions or parts of the machine have changed since."""
     restore(model, run.state, run.steps // p.hold, folder)
     now, before = surroundings(model.get_env().get_attr("task", 0)[0]), dict(run.surroundings)
     for earlier in run.resumed:
@@ -236,19 +238,19 @@ def train(
     tensorboard: str | None = None,
     saved: Callable[[Run], None] = lambda run: None,
 ) -> Run:
-    """Train to the end of the budget, or until Ctrl-C; return what came of it.
+    """Train to the end of the budget, or until Ctrl-C; return the run.
 
     Args:
-        experiment: what is trained, and how.
+        experiment: task and settings.
         folder: of the checkpoint.
-        go_on: from the folder's checkpoint, if there is one; a finished one is returned as it is.
+        go_on: continue from the folder's checkpoint, if there is one; a finished run is returned as it is.
         tensorboard: folder of TensorBoard's logs.
-        saved: called with the run of the checkpoint that training goes on from, and of each that it writes.
+        saved: called with the run of the checkpoint from which training continues, and of each that it writes.
 
     Raises:
-        OtherRecipe: the checkpoint is not of this experiment; weights that two recipes made have none.
+        OtherRecipe: the checkpoint has another recipe; weights of mixed recipes could not be reproduced.
         CheckpointError: it is damaged, or another training holds the folder.
-        FloatingPointError: learning or a world diverged; the checkpoint is of the last moment before that.
+        FloatingPointError: learning or a world diverged; the checkpoint has the last state before that.
     """
     with claim(folder):
         run = load_checkpoint(experiment, folder) if go_on else None
@@ -294,7 +296,7 @@ def _train_from(
 
 @contextmanager
 def _name_divergence(model: PPO) -> Iterator[None]:
-    """Raise LearningDiverged where torch refuses to draw actions from what a network that diverged answers."""
+    """Raise LearningDiverged if torch cannot draw actions because the output of the network has diverged."""
     try:
         yield
     except ValueError:
@@ -304,7 +306,7 @@ def _name_divergence(model: PPO) -> Iterator[None]:
 
 
 def export(run: Run, path: Path) -> None:
-    """Write the best policy with its recipe: everything that is needed to make it again."""
+    """Write the best policy with its recipe, from which it can be reproduced."""
     recipe = run.recipe
     card = {
         **describe(TASKS[recipe["task"]](**recipe["arguments"])),
@@ -343,7 +345,7 @@ def main(
         target = WEIGHTS / f"{name}.safetensors" if out is None else valid_file(str(out), (".safetensors",), True)
         folder = valid_path(str(runs / name), "--runs")
         _check_outputs(experiment, target, folder, tensorboard)
-    kept: deque[Run] = deque(maxlen=1)  # the last one alone: a run holds all arrays of the model
+    kept: deque[Run] = deque(maxlen=1)  # only the last one: a run holds all arrays of the model
     with handle_interrupt(), one_line_errors((CheckpointError, OSError, MemoryError)):
         try:
             run = train(experiment, folder, go_on, tensorboard, kept.append)
@@ -360,7 +362,7 @@ def main(
 
 
 def _check_outputs(experiment: Experiment, target: Path, folder: Path, tensorboard: str | None) -> None:
-    """Refuse, before anything is made, what cannot be written in the end; ValueError or OSError in one line."""
+    """Raise ValueError or OSError, in one line, before any training, if an output cannot be written."""
     if target.with_suffix(".json").is_dir():
         raise ValueError(f"--out {str(target)!r}: its card, {target.with_suffix('.json').name!r}, is a folder")
     for path in (target, path_in(folder)):
@@ -372,7 +374,7 @@ def _check_outputs(experiment: Experiment, target: Path, folder: Path, tensorboa
 
 
 def _export_last_good(saved: Sequence[Run], folder: Path, target: Path) -> str:
-    """Export the best policy of a training that diverged, if it has saved one; return what was kept, and where."""
+    """Export the best policy of a training that diverged, if it has saved one; return, as text, what is kept and where."""
     if not saved:
         return "nothing was learnt before"
     run = saved[-1]

@@ -1,4 +1,4 @@
-"""The same work on many things, side by side: a few processes take one after another, and end with their parent."""
+"""Parallel work on many jobs by a few processes, each of which takes one job after another and ends with its parent."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ Job = TypeVar("Job")
 Done = TypeVar("Done")
 
 Tell = Callable[..., None]
-"""Called with news, whatever they are."""
+"""Called with reports of progress, of any form."""
 
 
 def side_by_side(work: Callable[[Job, Tell], Done], jobs: Sequence[Job], processes: int, tell: Tell) -> Iterator[Done]:
     """Yield the result of every job, in their order, computed by a number of processes.
 
     Args:
-        work: a function of a module (it is found by name there), called with a job and a function that takes news.
-        jobs: its arguments; they and the results are pickled between processes.
-        processes: their number; each is started anew, so a script needs `if __name__ == "__main__":`.
-        tell: called with the news of all of them, by another thread; never again once it has raised.
+        work: a function of a module (it is found by name there), called with a job and a function that takes reports.
+        jobs: the arguments of `work`; they and the results are pickled between processes.
+        processes: number of processes; each imports the main module, so a script needs `if __name__ == "__main__":`.
+        tell: called with the reports of all processes, by another thread; not again once it has raised.
 
     Raises:
         OSError: a process was ended from outside.
-        Exception: the first that `work` or `tell` raises. The other processes end then, and when this one ends, however
-            it ends.
+        Exception: the first that `work` or `tell` raises. The other processes end then, and also whenever this one
+        ends.
     """
     context = get_context("spawn")
     if os.name == "posix":
@@ -66,10 +66,10 @@ def side_by_side(work: Callable[[Job, Tell], Done], jobs: Sequence[Job], process
 
 @contextmanager
 def _forward_news(context: Any, tell: Tell) -> Iterator[tuple[Connection, Any, Future[None]]]:
-    """Pass the news of other processes on to `tell`, in a thread of its own, while the block lasts.
+    """Pass the reports of other processes on to `tell`, in a thread of its own, while the block lasts.
 
-    Yields the connection that they send news to, the lock that a process holds while it sends, and a future that has
-    the error of `tell`, if it raised one; after that no more news is passed on.
+    Yields the connection to which they send reports, the lock that a process holds while it sends, and a future that
+    has the error of `tell`, if it raised one; after that no more reports are passed on.
     """
     receiver, sender = context.Pipe(duplex=False)
     trouble: Future[None] = Future()
@@ -93,7 +93,7 @@ def _forward_news(context: Any, tell: Tell) -> Iterator[tuple[Connection, Any, F
     try:
         yield sender, context.Lock(), trouble
     finally:
-        sender.send(None)  # closing the pipe ends it as well, unless a process never took its end
+        sender.send(None)  # closing the pipe ends the thread as well, unless a process has not opened its end
         sender.close()
         listener.join()
         receiver.close()
@@ -129,7 +129,7 @@ def guard_process_starts() -> Iterator[None]:
 
 
 def _start_tracker() -> None:
-    """Start the process that removes semaphores which others leave behind, one that does so without a warning."""
+    """Start Python's resource tracker, which removes semaphores that processes leave behind, with warnings off."""
     before = os.environ.get("PYTHONWARNINGS")
     os.environ["PYTHONWARNINGS"] = "ignore"
     try:
@@ -141,11 +141,11 @@ def _start_tracker() -> None:
 
 
 _tell: Tell
-"""In a process that works for another one: how it tells news."""
+"""In a worker process: the function that sends reports to the parent."""
 
 
 def _begin_worker(sender: Connection, turn: Any) -> None:
-    """Get ready in a process that works for another one, beside others like it."""
+    """Prepare a worker process: set up its reports, and its end with the parent."""
     global _tell
 
     def tell(*news: Any) -> None:
@@ -157,7 +157,7 @@ def _begin_worker(sender: Connection, turn: Any) -> None:
 
 
 def serve() -> None:
-    """Make this process one that works for its parent: Ctrl-C is the parent's to handle, and it ends when that ends."""
+    """Make this process a worker: it leaves Ctrl-C to its parent, and ends when its parent ends."""
     signals.begin_worker()
     os.environ["FLOCKENV_QUIET"] = "1"
     parent = parent_process()

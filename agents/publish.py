@@ -1,7 +1,7 @@
-"""Put a comparison into the documents: `python -m agents.compare && python -m agents.publish`.
+"""Publish a comparison in README.md and docs/: `python -m agents.compare && python -m agents.publish`.
 
 Copies results.json and comparison.png into docs/, draws docs/summary.png, and writes the tables of README.md and of
-docs/results.md, so that all of them belong to one run.
+docs/results.md, so that all of them are from one run.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from flockenv.tasks import TASKS
 __all__ = ["BLOCK", "app", "summary", "tables"]
 
 BLOCK = re.compile(r"(?<=<!-- python -m agents\.publish -->\n).*?(?=<!-- end -->)", re.DOTALL)
-"""What a page has between its two marks."""
+"""The part of a page between its two marks."""
 
 SHOWN = ("random", "textbook", "rules", "ppo")
 """Players with a column of their own; the others, of some tasks each, have a table below."""
@@ -91,7 +91,7 @@ def _lead(pair: Results) -> str:
 
 
 def _read_comparison(folder: Path) -> Results:
-    """Read a comparison; ValueError unless it is a whole one: all tasks, the usual players, not a quick look."""
+    """Return a comparison; raise ValueError unless it is complete: all tasks, the usual players, all worlds."""
     file = folder / "results.json"
     if not file.is_file():
         raise ValueError(f"{file}: no such file; `python -m agents.compare` writes it")

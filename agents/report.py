@@ -1,4 +1,4 @@
-"""What the comparison says: one dictionary of results, and its tables, sentences and Markdown, all read from it."""
+"""Report of a comparison: one dictionary of results, from which tables, sentences and Markdown are made."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ def task_results(
     seed: int,
     differences: Mapping[str, Sequence[str]] = MappingProxyType({}),
 ) -> Results:
-    """Return everything about one task as plain data: players in order, and each pair, the later minus the earlier.
+    """Return the results of one task as plain data: players in order, and the difference of each pair, later - earlier.
 
-    differences: by player, what differs between the task and the one that it was trained on.
+    differences: by player, the differences between this task and the one that it was trained on.
     """
     pairs = {
         f"{later} - {earlier}": _pair(compare(episodes[later], episodes[earlier], resamples, seed))
@@ -98,7 +98,7 @@ def _number(value: float) -> float | None:
 def verdict(task: str, results: Results) -> str:
     """Return a sentence: which player is ahead by how much in the same worlds, and the cost of both.
 
-    It is about ppo and rules where both played, else about the two players with the best means.
+    It is about ppo and rules if both played, else about the two players with the best means.
     """
     players = results["players"]
     if len(players) < 2:
@@ -144,7 +144,7 @@ def _costs(name: str, player: Results) -> str:
 
 
 def player_tables(task: str, results: Results) -> Iterator[Table]:
-    """Yield what a terminal of 80 columns shows of a task: scores, then what happened, then the pairs."""
+    """Yield the tables of a task for a terminal of 80 columns: scores, then domain metrics, then pairs."""
     header, rows = player_cells(results)
     yield table_of(task, header[:4], [row[:4] for row in rows])
     yield table_of(None, [header[0], *header[4:]], [[row[0], *row[4:]] for row in rows])
@@ -153,7 +153,7 @@ def player_tables(task: str, results: Results) -> Iterator[Table]:
 
 
 def table_of(title: str | None, header: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    """Return a table for a terminal; nothing in it is markup."""
+    """Return a table for a terminal; its text is not interpreted as markup."""
     table = Table(
         title=title and escape(title), title_style="bold", title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1)
     )
@@ -251,7 +251,7 @@ def percent_text(about: Results, name: str, prefix: str) -> str:
 
 
 def number_text(value: float | None) -> str:
-    """Return three significant digits, or a dash where nothing applies."""
+    """Return a number at three significant digits, or a dash if there is none."""
     if value is None:
         return "–"
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value + 0.0:.3g}"  # + 0.0: no "-0"
@@ -263,7 +263,7 @@ def steps_text(steps: float) -> str:
 
 
 def micro_text(microseconds: float) -> str:
-    """Return two digits, or whole µs."""
+    """Return microseconds at two digits, or as an integer."""
     return f"{microseconds:.0f}" if microseconds >= 10 else f"{microseconds:.2g}"
 
 

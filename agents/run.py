@@ -1,4 +1,4 @@
-"""A run of training: what it has come to so far, kept in a checkpoint and read from it, checked."""
+"""A run of training: its state so far, which is written to a checkpoint, and read and checked again."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ STATE = ("policy", "optimizer", "worlds", "rollout", "random")
 """The parts of a checkpoint that are the model's, see agents.training_state."""
 
 PARTS = (*STATE, "best", "notes", files.TIMES)
-"""All of them: the actor of the best policy so far, what is said in words, and what the clock showed."""
+"""All parts of a checkpoint, with the actor of the best policy so far, the notes, and wall times."""
 
 
 class OtherRecipe(CheckpointError):  # noqa: N818  # not an error for a caller that starts anew then
-    """A checkpoint is of another recipe than the one to train by."""
+    """A checkpoint of another recipe than that of the training."""
 
 
 def recipe_of(experiment: Experiment) -> dict[str, Any]:
-    """Return all that training depends on: with another value anywhere it is another training."""
+    """Return the recipe, all that training depends on: if any value differs, it is another training."""
     task, recipe = experiment.build(), experiment.model_dump(mode="json", include={"task", "arguments", "ppo"})
     if experiment.ppo.taught:
         recipe["rules"] = as_dict(player(task).rules)  # the policy that it imitated first
@@ -42,13 +42,13 @@ def recipe_of(experiment: Experiment) -> dict[str, Any]:
 
 @dataclass
 class Run:
-    """What training has come to so far; all that a checkpoint holds."""
+    """The state of training so far: all that a checkpoint holds."""
 
     recipe: dict[str, Any]
-    surroundings: dict[str, str]  # what it ran under when it was started
-    resumed: list[dict[str, Any]] = field(default_factory=list)  # under what else it went on, and from which step
+    surroundings: dict[str, str]  # versions and machine at the start
+    resumed: list[dict[str, Any]] = field(default_factory=list)  # later changes of these, and from which step
     steps: int = 0
-    wall: float = 0.0  # s, with what teaching took
+    wall: float = 0.0  # s, imitation included
     curve: list[dict[str, float]] = field(default_factory=list)
     best: float | None = None
     tensors: dict[str, np.ndarray] = field(default_factory=dict)
@@ -56,40 +56,40 @@ class Run:
 
 
 class Point(ResultRecord):
-    """A point of the learning curve, as a checkpoint holds it; when it was is in Times."""
+    """A point of the learning curve, as a checkpoint holds it; its wall time is in Times."""
 
     steps: int = Field(ge=0, description="agent-steps so far")
     mean: float = Field(description="mean return on the tuning worlds")
-    success: float = Field(ge=0, le=1, description="share of them that were a success")
+    success: float = Field(ge=0, le=1, description="success rate on the tuning worlds")
 
 
 class Resumption(ResultRecord):
     """A resumption under other versions, or on another machine, than before."""
 
     steps: int = Field(ge=0, description="agent-steps until then")
-    surroundings: dict[str, str] = Field(description="what was not as before")
+    surroundings: dict[str, str] = Field(description="versions and parts of the machine that changed")
 
 
 class Notes(ResultRecord):
-    """What a checkpoint says in words and numbers beside its arrays."""
+    """The part of a checkpoint with texts and numbers, in addition to its arrays."""
 
     recipe: dict[str, Any] = Field(description="all that training depends on")
-    surroundings: dict[str, str] = Field(description="what it ran under when it was started")
-    resumed: tuple[Resumption, ...] = Field(description="resumptions under something else")
+    surroundings: dict[str, str] = Field(description="versions and machine at the start")
+    resumed: tuple[Resumption, ...] = Field(description="resumptions under other versions, or on another machine")
     steps: int = Field(ge=0, description="agent-steps so far")
     best: float | None = Field(description="mean return of the best policy so far")
     curve: tuple[Point, ...] = Field(description="the learning curve")
 
 
 class Times(ResultRecord):
-    """What the clock showed: no other part of a checkpoint depends on it."""
+    """Wall times, in a part of their own: no other part of a checkpoint depends on the clock."""
 
-    wall: float = Field(ge=0, description="s, with what teaching took")
-    seconds: tuple[float, ...] = Field(description="of each point of the curve")
+    wall: float = Field(ge=0, description="s, wall time in all, imitation included")
+    seconds: tuple[float, ...] = Field(description="s, wall time at each point of the curve")
 
 
 def save_checkpoint(folder: Path, run: Run) -> None:
-    """Write the run so far."""
+    """Write the run so far as a checkpoint in a folder."""
     notes = {name: getattr(run, name) for name in Notes.model_fields}
     curve = [{name: point[name] for name in Point.model_fields} for point in run.curve]
     times = {"wall": run.wall, "seconds": [point["seconds"] for point in run.curve]}
@@ -124,10 +124,10 @@ def load_checkpoint(experiment: Experiment, folder: Path) -> Run | None:
 
 
 def expected_bytes(experiment: Experiment) -> int:
-    """Return about how many bytes a checkpoint of an experiment has: of worlds, networks and their moments."""
+    """Return the approximate size of an experiment's checkpoint, bytes: worlds, networks and moments of Adam."""
     task, p = experiment.build(), experiment.ppo
     sizes = (task.layout.size, *p.hidden, task.action_layout.size)
-    weights = 24 * sum(a * b for a, b in pairwise(sizes))  # of two networks: themselves, and two moments, float32
+    weights = 24 * sum(a * b for a, b in pairwise(sizes))  # of two networks: weights and two moments of each, float32
     return p.worlds * (task.scene.bytes_per_world() + 4 * task.learners * task.layout.size) + weights + 2**20
 
 
@@ -141,7 +141,7 @@ def _compare(kept: dict[str, Any], wanted: dict[str, Any], folder: Path) -> None
 
 
 def _fault(notes: Notes, times: Times, best: dict[str, np.ndarray], experiment: Experiment) -> str:
-    """Return what of a checkpoint contradicts the rest of it, '' if nothing."""
+    """Return a description of the first contradiction between parts of a checkpoint; '' if there is none."""
     reached = [point.steps for point in notes.curve]
     if reached != sorted(reached) or any(steps > notes.steps for steps in reached):
         return f"notes: curve goes to {max(reached):,} steps in an order that {notes.steps:,} steps cannot have had"

@@ -1,9 +1,9 @@
 """Team credit: learners that share their advantages with the other learners of a world (Peysakhovich and Lerer 2018).
 
 Each learner has its own reward and a critic of its own return; the advantages are shared. A critic of the team's return
-would have to find the effect of one's own hunger in a sum of eight returns, where it is lost in the unexplained part,
-and such learners starve (docs/players.md). The sum of eight critics is a critic of the sum (value decomposition,
-Sunehag et al. 2018), and finds it.
+would have to find the effect of a learner's own hunger in a sum of eight returns, where it is lost in the unexplained
+variance, and such learners starve (docs/players.md). The sum of eight critics is a critic of the sum (value
+decomposition, Sunehag et al. 2018), and finds that effect.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ class CaringBuffer(RolloutBuffer):
         super().__init__(*args, **kwargs)
 
     def reset(self) -> None:
-        """Forget the rollout."""
+        """Clear the rollout."""
         self.acted = np.ones((self.buffer_size, self.n_envs), np.bool_)
         super().reset()
 
     def add(self, *args: Any) -> None:
-        """Take a step of all rows, and which of them acted."""
+        """Add a step of all rows, and note which of them acted."""
         self.acted[self.pos] = self.worlds.acted
         super().add(*args)
 

@@ -1,7 +1,7 @@
-"""All that the next rollout and the next update of a model depend on, as arrays, and a model put back into it.
+"""The state of a training, as arrays: all that the next rollout and update depend on; captured and restored.
 
-It is taken where a rollout begins: the buffer is empty then, and actions, rewards and gradients of before are of no
-more use. Randomness of the worlds is a function of (seed, world, step, agent), so their counters stand for it.
+It is captured at the start of a rollout, when the buffer is empty and earlier actions, rewards and gradients are no
+longer needed. Randomness of the worlds is a function of (seed, world, step, agent), so their counters determine it.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ __all__ = ["capture", "restore", "surroundings"]
 
 PACKAGES = ("flockenv", "numpy", "numba", "gymnasium", "stable-baselines3", "torch")
 MOMENTS = ("exp_avg", "exp_avg_sq", "step")
-"""What Adam keeps of each parameter that has had a gradient."""
+"""The state of Adam for each parameter that has had a gradient."""
 
 POSITIONS = ("state.x", "state.v")
-"""What must be finite of worlds: a lifetime, or a measure that does not apply yet, may be infinite or NaN."""
+"""The arrays of worlds that must be finite: lifetimes may be infinite, and measures without a value NaN."""
 
 
 def capture(model: PPO) -> CheckpointParts:
-    """Return copies of all that training goes on from, by part; to be called where a rollout begins."""
+    """Return a copy of the state of training, by part; to be called at the start of a rollout."""
     assert isinstance(model._last_obs, np.ndarray) and model._last_episode_starts is not None
     return {
         "policy": {name: _copy_of(tensor) for name, tensor in model.policy.state_dict().items()},
@@ -56,7 +56,7 @@ def restore(model: PPO, parts: CheckpointParts, steps: int, folder: Path) -> Non
     """Restore the captured state of a training into a model built by the same recipe.
 
     Raises:
-        Damaged: it names the part that does not fit this model, and says why.
+        Damaged: a part does not fit this model; the message has the part and the reason.
     """
     assert model.env is not None
     model._last_obs = model.env.reset()  # type: ignore[assignment]
@@ -85,7 +85,7 @@ def _copy_of(tensor: torch.Tensor) -> NDArray[Any]:
 
 
 def _optimizer_like(model: PPO, kept: Tensors) -> Tensors:
-    """Return moments such as a checkpoint's should be: of each parameter that it names, all of them or none."""
+    """Return moments in the form that a checkpoint must have: all of them for each parameter that it names."""
     fresh: Tensors = {}
     for index, parameter in enumerate(model.policy.parameters()):
         if any(name.startswith(f"{index}.") for name in kept):
@@ -95,7 +95,7 @@ def _optimizer_like(model: PPO, kept: Tensors) -> Tensors:
 
 
 def _fault(kept: Tensors, wanted: Tensors, finite: Sequence[str]) -> str:
-    """Return the first thing that makes tensors unfit to stand where others do, '' if nothing."""
+    """Return the first difference of names, types, shapes or finiteness between tensors and `wanted`; '' if none."""
     if odd := sorted(kept.keys() ^ wanted.keys()):
         return f"{odd[0]} is {'missing' if odd[0] in wanted else 'unknown'}"
     for name, like in wanted.items():
@@ -108,7 +108,7 @@ def _fault(kept: Tensors, wanted: Tensors, finite: Sequence[str]) -> str:
 
 
 def _write_into(model: PPO, parts: CheckpointParts) -> None:
-    """Write what a checkpoint holds into a model that it fits; the generators last, since building draws numbers."""
+    """Write the parts of a checkpoint into a model; the random generators last, since building draws numbers."""
     policy, optimizer, moments = model.policy, model.policy.optimizer, parts["optimizer"]
     policy.load_state_dict({name: torch.from_numpy(array) for name, array in parts["policy"].items()})
     indices = sorted({int(name.split(".")[0]) for name in moments})
@@ -121,7 +121,7 @@ def _write_into(model: PPO, parts: CheckpointParts) -> None:
 
 
 def _generators(model: PPO) -> dict[str, Any]:
-    """Return the states of what SB3 seeds beside torch: Python's generator, numpy's, and the action space's."""
+    """Return the states of the generators that SB3 seeds besides torch's: Python's, numpy's, and the action space's."""
     numpy = dict(np.random.get_state(legacy=False))  # noqa: NPY002  # SB3 draws minibatches from it
     numpy["state"] = {**numpy["state"], "key": numpy["state"]["key"].tolist()}
     return {"python": random.getstate(), "numpy": numpy, "actions": model.action_space.np_random.bit_generator.state}
@@ -136,11 +136,11 @@ def _seed_generators(model: PPO, states: Mapping[str, Any]) -> None:
     model.action_space.np_random.bit_generator.state = states["actions"]
 
 
-# --- what the same bits depend on beside the recipe -------------------------------------------------------------------
+# --- versions and machine: what results depend on besides the recipe --------------------------------------------------
 
 
 def surroundings(task: Task) -> dict[str, str]:
-    """Return what training ran under, by name: versions, the machine, and the source of the task's kernel."""
+    """Return the surroundings of training, by name: versions, the machine, and the source of the task's kernel."""
     processor = f"{machine().cpu}, {os.cpu_count()} cores, torch uses {torch.backends.cpu.get_cpu_capability()}"
     return {
         **{name: version(name) for name in PACKAGES},

@@ -1,9 +1,9 @@
-"""Accuracy and policies: `python -m agents.transfer [TASK...]` plays the same worlds with other methods and steps.
+"""Transfer of policies to other integrators: `python -m agents.transfer [TASK...]` plays the same worlds with each.
 
 Every player plays the held-out worlds of agents.compare under each integration method, step and precision. It decides
 as often as before; only the motion between two decisions is computed differently. Then the same actions are replayed
-and timed under each setting. Returns and times are stored in runs/transfer at once, so that after an interruption the
-same command continues and plays nothing twice. Writes transfer.json, transfer.md and transfer.png.
+and timed under each setting. Returns and times are stored in runs/transfer at once: after an interruption the same
+command continues. Writes transfer.json, transfer.md and transfer.png.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ FILES = ("transfer.json", "transfer.md", "transfer.png")
 STOPPED = f"interrupted; what was played is in {KEPT}, and the same command goes on"
 
 Advance = Callable[[str, int], None]
-"""Called with a text of what was done, and the number of cells or clocks."""
+"""Called with a text about the work done, and the number of cells or rounds of timing."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -91,7 +91,7 @@ def main(
     trust_pickle: Annotated[bool, typer.Option("--trust-pickle", help="Load zips too: executes code in them.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show where an error came from.")] = False,
 ) -> None:
-    """Play the same worlds solved better and worse, and say what that does to each policy and what it costs."""
+    """Play the same worlds with integrators of different accuracy; show the effect on each policy, and the cost."""
     with report_errors("transfer", STOPPED, debug):
         folder = folder_of(out, FILES)
         _check("--worlds", worlds, 2, WORLDS_PER_SEED)
@@ -121,7 +121,7 @@ def _check(option: str, value: int, least: int, most: int) -> None:
 
 
 def _solvers(names: Sequence[str]) -> list[tuple[str, str]]:
-    """Return kinds of integrators with their precision; ValueError for one that is not known, or cannot play a task."""
+    """Return kinds of integrators with their precision; raise ValueError for an unknown one, or one that tasks reject."""
     allowed = [kind for kind, method in INTEGRATORS.items() if not method.solves]
     found = []
     for name in names:
@@ -143,7 +143,7 @@ def _substeps(texts: Sequence[str], usual: Sequence[int]) -> list[int]:
 
 
 def _settings(task: Task, solvers: Sequence[tuple[str, str]], substeps: Sequence[int]) -> tuple[Setting, ...]:
-    """Return the settings to play, beginning with the one that players were made for, even if it is not selected."""
+    """Return the settings to play; the first is that of training, even if it is not selected."""
     chosen = [Setting(method, dtype, steps) for method, dtype in solvers for steps in substeps]
     return tuple(dict.fromkeys([Setting.of_training(task), *chosen]))
 
@@ -188,15 +188,15 @@ def _measure(plans: Sequence[Plan], workers: int) -> report.Results:
 
 @contextmanager
 def _process_map(processes: int, work: Sequence[Any]) -> Iterator[Callable[[Any, Iterable[Any]], Iterable[Any]]]:
-    """Yield a map over some work: by a number of processes, which end with this one; by none, in this one.
+    """Yield a function like `map`, which uses a number of processes that end with this one, or this process if none.
 
-    A single process does one piece of work and makes room for a fresh one.
+    A single worker process is replaced by a new one after each piece of work.
     """
     if not (processes and work):
         yield map
         return
     count = min(processes, len(work))
-    with announce_parent():  # a thread of the pool starts fresh ones later
+    with announce_parent():  # a thread of the pool starts new ones later
         with guard_process_starts():
             pool = get_context("spawn").Pool(count, serve, maxtasksperchild=1 if processes == 1 else None)
         with pool:
@@ -205,7 +205,7 @@ def _process_map(processes: int, work: Sequence[Any]) -> Iterator[Callable[[Any,
 
 @contextmanager
 def _bar(steps: int) -> Iterator[Advance]:
-    """Show one bar on a terminal, and a line per kernel and per round anywhere else."""
+    """Show one bar on a terminal; otherwise write a line per kernel and per round."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description:<44}"), BarColumn(30), TimeElapsedColumn())
     with show_progress(Progress(*columns, console=console, transient=True)) as progress:

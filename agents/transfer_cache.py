@@ -1,4 +1,4 @@
-"""What agents.transfer plays and times, cell by cell, and keeps: nothing that is kept is played twice."""
+"""The cells and times of agents.transfer, stored in files: what is stored is not computed again."""
 
 from __future__ import annotations
 
@@ -77,25 +77,25 @@ class Plan:
 
     @property
     def pilot(self) -> Player:
-        """The player whose actions are replayed for timing, and that the sentence is about."""
+        """The player whose actions are replayed for timing, and which the verdict is about."""
         return self.players[-1]
 
     def policy(self, player: Player, task: Task) -> Policy:
-        """Return a player that has decided nothing yet."""
+        """Return a new instance of a player, without any state."""
         return player.policy(task, self.seed, self.trust_pickle)
 
 
 Job = tuple[Plan, tuple[Setting, ...]]
-"""Settings of one plan that share a kernel."""
+"""Settings of one plan that share a kernel: one job."""
 Round = tuple[tuple[Plan, ...], int]
-"""Plans that are clocked, and the number of the round, from 1."""
+"""Plans to be timed, and the number of the round, from 1."""
 
 
 # --- playing ----------------------------------------------------------------------------------------------------------
 
 
 def play(plan: Plan, setting: Setting, player: Player) -> Cell:
-    """Let one player play all worlds under one setting."""
+    """Play all worlds under one setting with one player."""
     task = setting.applied_to(plan.task)
     with blame(player.name, task):
         episodes = rollout(task, plan.policy(player, task), plan.worlds, plan.first)
@@ -103,7 +103,7 @@ def play(plan: Plan, setting: Setting, player: Player) -> Cell:
 
 
 def cell_path(plan: Plan, setting: Setting, player: Player, prefix: str = "") -> Path:
-    """Return where a cell is kept: the name tells apart all that its scores depend on."""
+    """Return the file of a cell: its name has a digest of all that its scores depend on."""
     task = setting.applied_to(plan.task)
     about = [task_digest(task), _kernel(task), _player_digest(player, plan), plan.worlds, plan.first]
     return _cache_path(plan.task, f"{prefix}{player.name}-{setting.method}-{setting.dtype}-{setting.substeps}", about)
@@ -121,7 +121,7 @@ def _kernel(task: Task) -> str:
 
 
 def _player_digest(player: Player, plan: Plan) -> str:
-    """Return what tells a player from itself after a change: its file, or its code, parameters and weights."""
+    """Return a digest of a player: of its file, or of its code, parameters and weights."""
     known = player.spec in NAMES
     return _known_player_digest(player, plan) if known else hashlib.sha256(Path(player.spec).read_bytes()).hexdigest()
 
@@ -140,7 +140,7 @@ def _store(path: Path, content: Any) -> None:
 
 
 def _read(path: Path, of_json: Callable[[Any], Kept]) -> Kept:
-    """Return what a file keeps; ValueError, in one line that names it, if it is not what was written there."""
+    """Return the content of a file; raise ValueError, in one line that names it, if it is invalid."""
     try:
         return of_json(json.loads(path.read_text(encoding="utf-8")))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -164,7 +164,7 @@ def _clock_of(content: Any) -> Clock:
 
 
 def _cell(plan: Plan, setting: Setting, player: Player, prefix: str = "") -> Cell:
-    """Return a cell as it is kept, played first if it is not."""
+    """Return a cell from its file; if there is none, play it first."""
     path = cell_path(plan, setting, player, prefix)
     if not path.is_file():
         _store(path, play(plan, setting, player).to_json())
@@ -172,7 +172,7 @@ def _cell(plan: Plan, setting: Setting, player: Player, prefix: str = "") -> Cel
 
 
 def play_missing(job: Job) -> tuple[str, int]:
-    """Play those cells of some settings that are not kept yet, and keep each; return what was done, and how many."""
+    """Play the cells of some settings that are not stored yet, and store each; return a description, and their number."""
     plan, settings = job
     for setting, player in product(settings, plan.players):
         _cell(plan, setting, player)
@@ -193,18 +193,18 @@ def all_cells(plan: Plan) -> dict[tuple[Setting, str], Cell]:
 
 
 def play_again(plan: Plan) -> dict[str, Cell]:
-    """Return by player what the trained setting gives a second time: the same, to the last bit."""
+    """Return, by player, the cells of the trained setting, played a second time: they must be equal to the last bit."""
     return {player.name: _cell(plan, plan.trained_setting, player, "again-") for player in plan.players}
 
 
-# --- the clock --------------------------------------------------------------------------------------------------------
+# --- timing -----------------------------------------------------------------------------------------------------------
 
 
 def run_clock(plan: Plan, rounds: int) -> Clock:
     """Replay the same actions under every setting; return the position errors, and the time of a decision per round.
 
     A round goes through all settings, so that other work of the machine affects each of them alike; rounds that are
-    kept are not run again.
+    stored are not run again.
     """
     path, clock = _clock_path(plan), _read_clock(plan)
     if len(clock.rounds) >= rounds:
@@ -220,16 +220,16 @@ def run_clock(plan: Plan, rounds: int) -> Clock:
 
 
 def rounds_missing(plans: Sequence[Plan]) -> list[Round]:
-    """Return the rounds that are not kept for all plans yet."""
+    """Return the rounds that are not stored for all plans yet."""
     done = min(len(_read_clock(plan).rounds) for plan in plans)
     return [(tuple(plans), number) for number in range(done + 1, max(plan.rounds for plan in plans) + 1)]
 
 
 def run_round(job: Round) -> tuple[str, int]:
-    """Run one round for every plan; return what was done, and how many.
+    """Run one round for every plan; return a description, and the number of plans.
 
-    Each round wants a process of its own: where its arrays happen to lie moves the time of a small world by up to two
-    fifths, and stays as it is until the process ends.
+    Each round needs a process of its own: the addresses of its arrays, which are fixed until the process ends, change
+    the time of a small world by up to two fifths.
     """
     plans, number = job
     for plan in plans:
@@ -250,7 +250,7 @@ def _read_clock(plan: Plan) -> Clock:
 
 
 def _pilot_actions(plan: Plan) -> Actions:
-    """Return what the pilot decides in the first decisions of every world, under the trained setting."""
+    """Return the actions of the pilot in the first decisions of every world, under the trained setting."""
     task = plan.task
     world, policy = World(task, plan.worlds), plan.policy(plan.pilot, task)
     observation, actions, state = world.reset(plan.first), [], None
@@ -274,7 +274,7 @@ def _time_per_decision(plan: Plan, setting: Setting, actions: Actions) -> float:
 
 
 def _position_errors(plan: Plan, actions: Actions) -> dict[str, float]:
-    """Return by setting how far learners are from where they should be after one second, mm, median of all."""
+    """Return, by setting, the median error of the learners' positions after one second, mm."""
     task = plan.task
     count = max(1, min(len(actions), round(1.0 / task.control_dt)))
     exact = {"integrator": RK4(), "dtype": "float64", "dt": task.control_dt / REFERENCE}
@@ -287,7 +287,7 @@ def _position_errors(plan: Plan, actions: Actions) -> dict[str, float]:
 
 
 def _end_positions(task: Task, plan: Plan, actions: Actions) -> NDArray[np.float64]:
-    """Return where the learners are after some actions, (B, L, D) m."""
+    """Return the positions of the learners after some actions, (B, L, D) m."""
     world = World(task, plan.worlds)
     world.reset(plan.first)
     for action in actions:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["draw_chart", "write_chart"]
 
 MARKS = "osD^vP*X<>"
-OTHERS = ("#009E73", "#CC79A7", "#56B4E9")  # of Okabe and Ito's palette, for players that FIXED gives no colour
+OTHERS = ("#009E73", "#CC79A7", "#56B4E9")  # of Okabe and Ito's palette, for players that are not in FIXED
 
 
 def write_chart(path: str | Path, results: Results) -> None:

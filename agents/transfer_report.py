@@ -1,4 +1,4 @@
-"""What agents.transfer says: settings, cells and clocks as plain data, and the tables and sentences read from it."""
+"""Report of agents.transfer: settings, cells and times as plain data, from which tables and sentences are made."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Setting:
 
     @classmethod
     def of_training(cls, task: Task) -> Setting:
-        """Return the setting in the config of a task, for which its players were made."""
+        """Return the setting of a task's config, with which its players were trained."""
         return cls(task.integrator.kind, task.dtype, task.substeps)
 
     def applied_to(self, task: Task) -> Task:
@@ -93,12 +93,12 @@ class Cell:
     success: NDArray[np.bool_]
 
     def to_json(self) -> Results:
-        """Return lists that of_json reads to the same bits."""
+        """Return lists from which of_json reads the same bits."""
         return {"returns": self.returns.tolist(), "success": self.success.tolist()}
 
     @classmethod
     def of_json(cls, content: Results) -> Cell:
-        """Return the cell that to_json wrote."""
+        """Return the cell from the lists of to_json."""
         return cls(np.array(content["returns"], np.float64), np.array(content["success"], np.bool_))
 
 
@@ -119,7 +119,7 @@ def task_results(
     resamples: int,
     seed: int,
 ) -> Results:
-    """Return everything about one task as plain data; the first setting is the one that players were made for."""
+    """Return the results of one task as plain data; the first setting is that of training."""
     names = list(again)
     found: Results = {}
     for setting in settings:
@@ -174,7 +174,7 @@ def _difference(first: Cell, second: Cell, resamples: int, seed: int) -> Results
 
 
 def most_accurate(results: Results) -> str:
-    """Return the setting of the least error; of those within a tenth of it, or of rounding, the cheapest."""
+    """Return the cheapest of the settings whose error is within a tenth of the least, or is rounding."""
     settings = results["settings"]
     least = max(NOTHING, 1.1 * min(about["error_mm"] for about in settings.values()))
     return _cheapest(settings, least)
@@ -212,7 +212,7 @@ def verdict(task: str, results: Results) -> str:
 
 
 def _survival(results: Results, pilot: str) -> str:
-    """Return what a policy keeps in its worst setting, as a share of its lead over random if random played."""
+    """Return the score of a policy in its worst setting, as a share of its lead over random if random played."""
     settings = results["settings"]
     name = min(settings, key=lambda s: settings[s]["players"][pilot]["difference"])
     worst, trained = settings[name]["players"], settings[results["trained"]]["players"]
@@ -237,7 +237,7 @@ def _change(player: Results) -> str:
 
 
 def _standing(about: Results, pilot: str) -> str:
-    """Compare the policy with the last of the other players."""
+    """Return a comparison of the policy with the last of the other players, in words."""
     if not about["leads"]:
         return "no other player took part"
     pair, lead = list(about["leads"].items())[-1]
@@ -292,7 +292,7 @@ def _scores(results: Results, name: str, players: Sequence[str]) -> list[str]:
 
 
 def cells_of(results: Results, players: Sequence[str]) -> tuple[list[str], list[list[str]]]:
-    """Return header and rows: one row per setting, the trained one first with the returns themselves, then it again."""
+    """Return header and rows: one row per setting; the trained one is first with its returns, and again among the others."""
     header = ["method", "dt, s", "evaluations", "µs", "error", *players]
     rows = [[*_costs(about), *_scores(results, name, players)] for name, about in results["settings"].items()]
     again = [f"{results['again'][p]:.3f}" for p in players]

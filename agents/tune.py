@@ -1,8 +1,8 @@
-"""Make the rules as good as they can be: `python -m agents.tune configs/training/pursuit.yaml`.
+"""Search for better parameters of the rules: `python -m agents.tune configs/training/pursuit.yaml`.
 
-A plain search: random parameter sets and the textbook's, played on tuning worlds; the best quarter goes on to twice
-as many worlds, each joined by a small change of itself, for a few rounds. What it found, and the agent-steps that it
-spent, go into flockenv/players/tuned/TASK.json; the default budget is of the order of what learning has.
+A plain search: random parameter sets and the textbook's, played on tuning worlds; the best quarter goes on to twice as
+many worlds, each with a slightly changed copy, for a few rounds. The parameters found, and the agent-steps spent, are
+written to flockenv/players/tuned/TASK.json; the default budget is of the order of that of PPO.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from flockenv.tasks import Task
 __all__ = ["app", "search"]
 
 ROOM = 2**16
-"""Bytes, more than what was found takes."""
+"""Bytes: more than the file takes."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 console = Console(stderr=True)
 
 
 def search(experiment: Experiment, advance: Any = lambda steps: None) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the best parameters, and what was spent and scored."""
+    """Return the best parameters, and the agent-steps and scores of the search."""
     task, s = experiment.build(), experiment.search
     rng = np.random.default_rng(s.seed)
     parameters = RULES[task.name][1]
@@ -77,7 +77,7 @@ def _vary(base: dict[str, float], ranges: dict[str, tuple[float, float]], spread
 def _score(task: Task, values: dict[str, float], worlds: int, seed: int) -> tuple[float, int]:
     """Return the mean return on tuning worlds, and the agent-steps it took.
 
-    The mean, as in the paired differences of the comparison: a disaster in one world out of ten must count.
+    The mean is used, as in the paired differences of the comparison: a failure in one world out of ten must count.
     """
     episodes = rollout(
         task, RulesPlayer(task, RULES[task.name][1](**values)), worlds, worlds_for("tuning", seed, worlds)
@@ -86,7 +86,7 @@ def _score(task: Task, values: dict[str, float], worlds: int, seed: int) -> tupl
 
 
 def write(path: Path, task: str, parameters: dict[str, float], found: dict[str, float]) -> None:
-    """Write what the search found for a task, whole or not at all."""
+    """Write the parameters that the search found for a task, completely or not at all."""
     content = {"task": task, "parameters": parameters, "found": found}
     with new_folder(path.parent), replace_file(path) as file:
         file.write((json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
