@@ -88,7 +88,7 @@ class Player:
         return cls(spec, name)
 
     def policy(self, task: Task, seed: int, trust_pickle: bool = False) -> Policy:
-        """Return the policy, ready to play a task; raise ValueError, in one line with the player's name, if it cannot."""
+        """Return the policy, ready to play a task; raise ValueError, in one line with its name, if it cannot."""
         with blame(self.name, task, ValueError), warnings.catch_warnings():
             warnings.simplefilter("ignore", OtherTaskWarning)  # the results list the differences
             return load_player(self.spec, task, seed, trust_pickle)

@@ -39,9 +39,7 @@ class PpoSettings(Record):
     rollout: int = Field(default=32, ge=1, description="actions per row and update")
     minibatch: int = Field(default=8192, ge=1, description="rows per gradient step")
     epochs: int = Field(default=4, ge=1, description="passes over a rollout")
-    learning_rate: float = Field(
-        default=2e-3, gt=0, description="learning rate at the start; falls linearly to a tenth"
-    )
+    learning_rate: float = Field(default=2e-3, gt=0, description="at the start; falls linearly to a tenth at the end")
     gamma: float = Field(default=0.99, gt=0, le=1, description="discount per action, whether it is held or not")
     gae_lambda: float = Field(default=0.95, ge=0, le=1, description="lambda of the advantage estimate")
     clip: float = Field(default=0.2, gt=0, description="PPO's clip range")
@@ -49,9 +47,7 @@ class PpoSettings(Record):
     log_std: float = Field(default=-0.5, description="logarithm of the first standard deviation of actions")
     reward_scale: float = Field(default=0.1, gt=0, description="rewards are multiplied by this while learning")
     hold: int = Field(default=1, ge=1, le=100, description="decisions of the world for which an action is repeated")
-    care: float = Field(
-        default=0.0, ge=0, le=1, description="weight of the other learners' advantages; its own has weight 1"
-    )
+    care: float = Field(default=0.0, ge=0, le=1, description="weight of the others' advantages; its own has 1")
     central_critic: bool = Field(
         default=False,
         description="True if the critic also gets its world's mean observation and the memory of non-learners",
@@ -59,15 +55,11 @@ class PpoSettings(Record):
     taught: int = Field(
         default=0, ge=0, description="gradient steps of imitation of the tuned rules, before PPO begins"
     )
-    critic_first: int = Field(
-        default=0, ge=0, description="agent-steps in which only the critic learns, after the imitation"
-    )
+    critic_first: int = Field(default=0, ge=0, description="agent-steps in which only the critic learns, then")
     stagger: bool = Field(default=False, description="begin worlds at different times of their first episode")
     hidden: tuple[int, ...] = Field(default=(64, 64), min_length=1, description="units per layer")
     activation: str = Field(default="relu", pattern="^(relu|tanh)$", description="relu or tanh")
-    threads: int = Field(
-        default=2, ge=1, le=64, description="threads of torch and of the worlds; 1 if cores are shared"
-    )
+    threads: int = Field(default=2, ge=1, le=64, description="of torch and of the worlds; 1 if cores are shared")
     dtype: Literal["float32", "float64"] = Field(default="float32", description="precision of the training worlds")
     seed: int = Field(default=0, ge=0, lt=1000, description="seed of the weights and of the training worlds")
     evaluate_every: int = Field(default=1_000_000, ge=1, description="agent-steps between points of the curve")

@@ -98,9 +98,7 @@ def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
         n_steps=p.rollout,
         batch_size=p.minibatch,
         n_epochs=p.epochs,
-        learning_rate=lambda left: (
-            p.learning_rate * max(0.1 + 0.9 * left, 0.05)
-        ),  # the last rollout may exceed the budget
+        learning_rate=lambda left: p.learning_rate * max(0.1 + 0.9 * left, 0.05),  # the last rollout may go beyond
         gamma=p.gamma,
         gae_lambda=p.gae_lambda,
         clip_range=p.clip,
@@ -219,7 +217,7 @@ def _teach_first(model: PPO, task: Task, p: PpoSettings) -> float:
 
 
 def resume(folder: Path, model: PPO, run: Run, p: PpoSettings) -> None:
-    """Restore a model to the run of a checkpoint, and print which versions or parts of the machine have changed since."""
+    """Restore a model to the run of a checkpoint, and print which versions or machine parts have changed."""
     restore(model, run.state, run.steps // p.hold, folder)
     now, before = surroundings(model.get_env().get_attr("task", 0)[0]), dict(run.surroundings)
     for earlier in run.resumed:
@@ -374,7 +372,7 @@ def _check_outputs(experiment: Experiment, target: Path, folder: Path, tensorboa
 
 
 def _export_last_good(saved: Sequence[Run], folder: Path, target: Path) -> str:
-    """Export the best policy of a training that diverged, if it has saved one; return, as text, what is kept and where."""
+    """Export the best policy of a training that diverged, if it has saved one; return what is kept, and where."""
     if not saved:
         return "nothing was learnt before"
     run = saved[-1]

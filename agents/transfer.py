@@ -121,7 +121,7 @@ def _check(option: str, value: int, least: int, most: int) -> None:
 
 
 def _solvers(names: Sequence[str]) -> list[tuple[str, str]]:
-    """Return kinds of integrators with their precision; raise ValueError for an unknown one, or one that tasks reject."""
+    """Return kinds of integrators with their precision; raise ValueError for one that is unknown or not playable."""
     allowed = [kind for kind, method in INTEGRATORS.items() if not method.solves]
     found = []
     for name in names:

@@ -212,7 +212,7 @@ def verdict(task: str, results: Results) -> str:
 
 
 def _survival(results: Results, pilot: str) -> str:
-    """Return the score of a policy in its worst setting, as a share of its lead over random if random played."""
+    """Return, in words, the change of a policy's score in its worst setting, and the share of its lead over random."""
     settings = results["settings"]
     name = min(settings, key=lambda s: settings[s]["players"][pilot]["difference"])
     worst, trained = settings[name]["players"], settings[results["trained"]]["players"]
@@ -292,7 +292,7 @@ def _scores(results: Results, name: str, players: Sequence[str]) -> list[str]:
 
 
 def cells_of(results: Results, players: Sequence[str]) -> tuple[list[str], list[list[str]]]:
-    """Return header and rows: one row per setting; the trained one is first with its returns, and again among the others."""
+    """Return header and rows: one row per setting; the trained one first, with its returns, then again."""
     header = ["method", "dt, s", "evaluations", "µs", "error", *players]
     rows = [[*_costs(about), *_scores(results, name, players)] for name, about in results["settings"].items()]
     again = [f"{results['again'][p]:.3f}" for p in players]
