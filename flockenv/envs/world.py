@@ -78,7 +78,7 @@ class World:
     """
 
     def __init__(self, task: Task, worlds: int = 1, time_limit: int | None = None) -> None:
-        """worlds: B >= 1. time_limit: decisions until truncation; None: no limit."""
+        """Make B = `worlds` >= 1 worlds; `time_limit`: decisions until truncation, None: no limit."""
         if not _is_integer(worlds) or worlds < 1:
             raise ValueError(f"worlds is {worlds!r}, must be an integer >= 1")
         if time_limit is not None and (not _is_integer(time_limit) or time_limit < 1):
@@ -106,7 +106,7 @@ class World:
         self._compile_and_allocate()
 
     def _compile_and_allocate(self) -> None:
-        """Make what follows from the task: kernel, scratch, and the constant arguments of each step."""
+        """Set all that is derived from the task: kernel, scratch, and the constant arguments of each step."""
         scene, task, s = self.task.scene, self.task, self.state
         self._entries = play_of(task), metrics_of(task)
         self._enter, self._compute_metrics = self._entries
@@ -158,7 +158,7 @@ class World:
             row_columns = zeros(task.abreast * column_distance(self.learners), np.float32)
             own, vel = (2 * d + 1 + task.memory, padded), (d, look.agents, padded)
             padded_arrays = (zeros(own, real), zeros(vel, real), zeros((1, look.agents, padded), real), row_columns)
-            padded_arrays[2][:] = scene.body.radius[0]  # all agents have it, or it is gathered
+            padded_arrays[2][:] = scene.body.radius[0]  # the same for all agents; else it is gathered
         decision = Decision(
             zeros(self._shapes[0][1:] if self._streaming else (0, 0), np.float32),
             zeros((d, 1, n), real), zeros((d, n), real), zeros((d, n), real), zeros(n, np.bool_),
@@ -184,7 +184,7 @@ class World:
         return {name: value for name, value in vars(self).items() if name not in derived}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Continue from a pickled world."""
+        """Restore a pickled world."""
         vars(self).update(state)
         self._compile_and_allocate()
 

@@ -156,7 +156,7 @@ def rollout(
         _check_integer("record", record, 0, worlds - 1)
     world = make_world(task, worlds, task.horizon)
     observation = world.reset(seed)
-    latency = _latency(policy, observation[0, :1], deterministic)  # first: what compiles on first use does so here
+    latency = _latency(policy, observation[0, :1], deterministic)  # first: this compiles what is compiled on first use
     pilot, ledger = _Pilot(policy, deterministic), _Ledger(task, worlds)
     film = _Film(world, record)
     _play(task, world, observation, pilot, ledger, film, progress)
@@ -245,7 +245,7 @@ class _Ledger:
         return not self.running.any()
 
     def enter(self, step: Step, measure: Callable[[], Mapping[str, Floats]]) -> NDArray[np.bool_]:
-        """Add one step; return the mask (B,) of the worlds whose episode it belongs to."""
+        """Add one step; return the mask (B,) of the worlds whose episode had not ended before it."""
         running, reward = self.running, step.reward.mean(axis=1)
         wrong = running & ~np.isfinite(reward)
         if wrong.any():

@@ -126,7 +126,7 @@ class Scene(Record):
         default=(), description="deaths and births at the end of every step: sinks, in this order, and emitters"
     )
     dt: float = Field(default=0.02, gt=0, description="s, one physics step")
-    dtype: Literal["float64", "float32"] = Field(default="float64", description="precision of everything")
+    dtype: Literal["float64", "float32"] = Field(default="float64", description="precision of all numbers")
 
     @model_validator(mode="after")
     def _check_fields(self) -> Scene:

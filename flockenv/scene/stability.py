@@ -43,7 +43,7 @@ ROUNDING = 1e-11
 """Growth of the amplitude per step that may be rounding: no method here grows that slowly at any h w of NEAR."""
 
 NEAR = (0.05, 0.1, 0.2)
-"""The h w at which growth near 0 is tested: it is as (h w)^2 or (h w)^4, far above rounding."""
+"""The h w at which growth near 0 is tested: there it is about (h w)^2 or (h w)^4, far above rounding."""
 
 CERTAIN = 2.5
 """Multiple of the limit beyond which a scene raises ValueError: bounds of frequency overestimate by a smaller factor.

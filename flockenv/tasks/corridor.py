@@ -188,7 +188,7 @@ def measure(p: Any, at: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 @kernel
 def metrics(p: Any, at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
-    """Write mean speed over the desired one; contacts that began; lane order in the second half; those of the aim."""
+    """Write mean speed over the desired one; contacts that began; lane order in the second half; metrics of the aim."""
     write_aim_metrics(at, sums, last, steps, numbers)
     numbers[at.speed] = sums.share / max(steps, 1)
     numbers[at.collisions] = sums.touches

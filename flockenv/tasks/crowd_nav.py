@@ -140,7 +140,7 @@ def measure(p: Any, at: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 @kernel
 def metrics(p: Any, at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
-    """Write whether it collided; whether it did neither that nor arrive; time to the goal, s, if it arrived; path, m;
+    """Write collided (0 or 1); timed out (0 or 1); time to the goal, s, if the robot arrived; path, m;
     least gap, m; share of the time below the comfort distance.
     """  # fmt: skip
     time = steps * p.control_dt

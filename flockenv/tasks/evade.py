@@ -220,7 +220,7 @@ def metrics(p: Any, at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> 
 
 @kernel
 def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
-    """Write own velocity, walls, pursuers nearest first, whether they see it, nearest cover, free path lengths."""
+    """Write own velocity, walls, pursuers (nearest first), whether each sees it, nearest cover, free path lengths."""
     row = rows[0]
     for c in range(row.shape[0]):
         row[c] = 0.0

@@ -252,7 +252,7 @@ def measure(p: Any, at: Any, before: Frame, after: Frame, numbers: Any) -> None:
 
 @kernel
 def metrics(p: Any, at: Any, sums: Any, last: Any, steps: int, numbers: Any) -> None:
-    """Write polarisation, nearest distance, m, and speed along, m/s (means); contacts that began; those of the aim."""
+    """Write polarisation, nearest distance, m, and speed along, m/s (means); contacts that began; the aim's."""
     n = max(steps, 1)
     write_aim_metrics(at, sums, last, steps, numbers)
     numbers[at.polarisation], numbers[at.nearest_neighbour] = sums.polarisation / n, sums.nearest / n

@@ -94,7 +94,7 @@ def _pen_position(frame: Frame) -> Vec:
 
 @kernel
 def _course(p: Any, frame: Frame) -> Vec:
-    """Return the unit vector from the flock's centre to the pen; the x axis if it is there."""
+    """Return the unit vector from the flock's centre to the pen; the x axis if the centre is at the pen."""
     direction = unit(sub(_pen_position(frame), _flock_centre(p, frame)))
     return direction if direction[0] != 0.0 or direction[1] != 0.0 else (1.0, 0.0)
 

@@ -17,7 +17,7 @@ from flockenv.tasks.task import Task
 __all__ = ["MEASURES", "METRICS", "LastingTask", "aim_has_lasted", "write_aim_measures", "write_aim_metrics"]
 
 MEASURES = ("holds", "judged", "held")
-"""Of one decision, 1 or 0: the aim holds; the decision is judged, as it is after the settling time; both."""
+"""For one decision, each 1 or 0: the aim holds; it is judged, as after the settling time; both."""
 
 METRICS = ("held", "success_at_end")
 """Share of the judged decisions in which the aim holds; whether it holds at the last one."""

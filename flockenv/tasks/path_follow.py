@@ -40,7 +40,7 @@ _HERE, _NOW, _BEFORE = 3 * POINTS + 3, 3 * POINTS + 5, 3 * POINTS + 7
 
 @kernel
 def spawn(p: Any, frame: Frame) -> None:
-    """Draw a closed track, r(a) = R (1 + sum of waves), run either way round; place the agent on it, at rest."""
+    """Draw a closed track, r(a) = R (1 + sum of waves), run in either direction; place the agent on it, at rest."""
     m, turn = frame.memory, 1.0 if uniform(frame.key, 0, 0, 0) < 0.5 else -1.0
     for i in range(POINTS):
         m[i, 0] = 0.0
@@ -122,7 +122,7 @@ def _store_place(p: Any, frame: Frame) -> None:
 
 @kernel
 def _place(p: Any, frame: Frame) -> tuple[int, float]:
-    """Return what `_nearest` does: the stored place, unless the agent was moved since it was stored."""
+    """Return the stored place on the track; if the agent was moved since it was stored, the result of `_nearest`."""
     m = frame.memory
     if frame.pos[0, 0] == m[_HERE, 0] and frame.pos[1, 0] == m[_HERE + 1, 0]:
         return int(m[_NOW, 0]), np.float64(m[_NOW + 1, 0])
@@ -161,7 +161,7 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
 
 @kernel
 def keep(p: Any, before: Frame, after: Frame) -> None:
-    """Store the place on the track before and after the step, searched only here, and the progress since the start."""
+    """Store the place on the track before and after the step, and the progress since the start; only here it is searched."""
     i, s = _place(p, before)
     after.memory[_BEFORE, 0], after.memory[_BEFORE + 1, 0] = i, s
     _store_place(p, after)
@@ -338,7 +338,7 @@ class PathFollow(Task):
 
     @functools.cached_property
     def action_layout(self) -> Layout:
-        """A force, in the same frame."""
+        """A force in the frame of the track beside the learner."""
         meaning = "force (along the track, to its left) / max_force, shortened to length 1"
         return Layout((Slot("force", (2,), self.max_force, "N", meaning),))
 

@@ -44,7 +44,7 @@ def play_of(task: Task) -> Callable[..., tuple[int, int]]:
 
 
 def plan_of(task: Task) -> Plan:
-    """Return all that `play` of a task depends on; TypeError for a task that cannot be compiled."""
+    """Return the plan of `play` of a task; raise TypeError for a task that cannot be compiled."""
     _check(task)
     parts = task.parts
     own = {name: _kernel_of(task, name) for name in ("spawn", "drive", "reward", "ended", "measure", "observe")}

@@ -1,4 +1,4 @@
-"""What `play` of a task depends on, and the records of arrays that are passed to it."""
+"""The plan of `play` of a task, and the records of arrays that are passed to it."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class Kernels(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """All that `play` of a task depends on."""
+    """All constants of `play` of a task."""
 
     kernels: Kernels
     names: tuple[str, ...]  # of the parameters

@@ -75,7 +75,7 @@ REMEMBERING = (school.school,)
 
 @dataclass(frozen=True)
 class RulesPlayer:
-    """A hand-written player: SB3's `predict` around one of the functions above."""
+    """A hand-written player: SB3's `predict` around a function of a file in this folder."""
 
     task: Task
     rules: Any
@@ -106,7 +106,7 @@ class RulesPlayer:
 
 @dataclass(frozen=True)
 class Tuned:
-    """The parameters that a search found for a task, and what the search spent and scored."""
+    """The parameters that a search found for a task, and the cost and score of the search."""
 
     parameters: dict[str, float] = field(default_factory=dict)
     found: dict[str, float] = field(default_factory=dict)  # agent_steps, tuning_mean, tuning_worlds, textbook_mean

@@ -48,7 +48,7 @@ def bottleneck(see: Any, task: Bottleneck, p: BottleneckRules) -> NDArray[np.flo
 
 
 def _exit_direction(see: Any, task: Bottleneck) -> NDArray[np.float64]:
-    """Return the unit vectors to the nearest place of the door where a body fits; straight on before it."""
+    """Return the unit vectors to the nearest place of the door where a body fits; straight ahead if opposite it."""
     half = max(task.width / 2 - 1.2 * _PERSON, 0.0)
     sideways = see.door[:, 1] - np.clip(see.door[:, 1], -half, half)
     offset = np.stack([np.maximum(see.door[:, 0], 0.0) + 0.1, sideways], axis=-1)

@@ -68,7 +68,7 @@ class CorridorOrcaRules:
     horizon: float = 2.0  # s, for which the velocity must be free of collisions
     margin: float = 0.05  # m, clearance for what inertia delays
     turn: float = 0.3  # rad, a desired velocity that is not free is turned right by this
-    gain: float = 10.0  # kg/s: within a decision
+    gain: float = 10.0  # kg/s: reaches the desired velocity within a decision
 
 
 def orca_corridor(see: Any, task: Corridor, p: CorridorOrcaRules) -> NDArray[np.float64]:

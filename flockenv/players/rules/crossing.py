@@ -28,7 +28,7 @@ unaligned_threat = rows(steering.unaligned_threat)
 class CrossingRules:
     """Textbook: look three seconds ahead, give way with the whole force, arrive with the rest."""
 
-    horizon: float = parameter(3.0, 0.5, 6.0)  # s, how far ahead a meeting counts
+    horizon: float = parameter(3.0, 0.5, 6.0)  # s, look-ahead for collisions
     margin: float = parameter(0.2, 0.0, 0.8)  # m, clearance beyond the touching distance
     evade: float = parameter(5.0, 0.5, 8.0)  # N, strength of an evasion
     urgency: float = parameter(0.0, 0.0, 1.0)  # 0: always evade fully; 1: in proportion to nearness in time
@@ -59,12 +59,12 @@ def crossing(see: Any, task: Crossing, p: CrossingRules) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class OrcaRules:
-    """As published, both take half; a desired velocity that is not free is turned right, or twelve agents deadlock."""
+    """As published, each agent makes half of the change; turning desired velocities right avoids deadlocks."""
 
     horizon: float = 2.0  # s, for which the velocity must be free of collisions
     margin: float = 0.1  # m, clearance for what inertia delays
     turn: float = 0.3  # rad, a desired velocity that is not free is turned right by this
-    gain: float = 10.0  # kg/s: within a decision
+    gain: float = 10.0  # kg/s: reaches the desired velocity within a decision
     slow_radius: float = 1.0  # m, slow down within this of the goal
 
 

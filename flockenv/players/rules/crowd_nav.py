@@ -55,8 +55,8 @@ class RobotOrcaRules:
     horizon: float = 2.0  # s, for which the velocity must be free of collisions
     margin: float = 0.1  # m, clearance for what inertia delays
     turn: float = 0.0  # rad, a desired velocity that is not free is turned right by this
-    gain: float = 10.0  # kg/s: within a decision
-    share: float = 1.0  # of the change, which the robot makes if it is not seen; one half if it is
+    gain: float = 10.0  # kg/s: reaches the desired velocity within a decision
+    share: float = 1.0  # the robot's part of the change if pedestrians do not see it; else it is 0.5
 
 
 def orca_crowd_nav(see: Any, task: CrowdNav, p: RobotOrcaRules) -> NDArray[np.float64]:
@@ -83,7 +83,7 @@ def heuristics_crowd_nav(see: Any, task: CrowdNav, p: HeuristicsRules) -> NDArra
     turn = np.radians(np.linspace(-p.view, p.view, 31))
     cosine, sine = np.cos(turn), np.sin(turn)
     x, y = gaze[:, :1] * cosine - gaze[:, 1:] * sine, gaze[:, :1] * sine + gaze[:, 1:] * cosine
-    # the aim first: it is selected of equally good directions
+    # the aim comes first, so that it is selected among equally good directions
     directions = np.concatenate([aim[:, None], np.stack([x, y], axis=-1)], axis=1)
     seen, moving = see.neighbour_present[:, :, None] > 0, see.velocity[:, None] + see.neighbour_velocity
     clearance, one = _ROBOT + _PEDESTRIAN + p.margin, directions[:, None]

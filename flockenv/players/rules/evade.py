@@ -37,11 +37,11 @@ class EvadeRules:
     alarm: float = parameter(10.0, 2.0, 15.0)  # m, within which a pursuer is evaded: as far as it sees
     predict: float = parameter(0.5, 0.0, 2.0)  # s, how far ahead a pursuer is predicted at most
     evade: float = parameter(5.0, 0.5, 8.0)  # kg/s, strength of an evasion
-    crowd: float = parameter(1.0, 0.0, 2.0)  # how much farther pursuers count beside the nearest; 0: the nearest alone
+    crowd: float = parameter(1.0, 0.0, 2.0)  # weight of pursuers other than the nearest, whose weight is 1
     middle: float = parameter(0.2, 0.0, 1.5)  # N/m towards the middle of the field while evading
     margin: float = parameter(1.0, 0.4, 2.5)  # m, behind cover
     danger: float = parameter(0.0, 0.0, 3.0)  # m added to a hiding place's distance, per m of a pursuer within 10 m
-    exposed: float = parameter(0.0, 0.0, 10.0)  # m added to it for each pursuer that sees that place
+    exposed: float = parameter(0.0, 0.0, 10.0)  # m added to that distance for each pursuer that sees the place
     hide: float = parameter(3.0, 0.0, 8.0)  # kg/s, towards the hiding place
 
 

@@ -25,7 +25,7 @@ threat = rows(steering.threat)
 
 @dataclass(frozen=True)
 class FlockRules:
-    """Textbook: Reynolds' order of 1987, collision avoidance first, then matching velocity, then centring."""
+    """Textbook: the order of Reynolds 1987: collision avoidance, then velocity matching, then flock centring."""
 
     horizon: float = parameter(2.0, 0.5, 4.0)  # s, look-ahead for obstacles
     margin: float = parameter(0.3, 0.0, 1.0)  # m, clearance from obstacles

@@ -1,4 +1,4 @@
-"""Herd: collect a sheep that strays, else drive all of them from behind."""
+"""Herd: collect a sheep that strays, else drive the flock from behind."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class HerdRules:
     together: float = parameter(1.0, 0.3, 2.0)  # times r_a N^(2/3): a sheep farther from the centre is collected
     collecting: float = parameter(1.0, 0.0, 4.0)  # r_a, behind the sheep that is collected
     driving: float = parameter(1.0, 0.3, 2.5)  # times r_a sqrt(N), behind the centre
-    near: float = parameter(3.0, 0.0, 5.0)  # r_a, to the nearest sheep: slower within this
-    slow: float = parameter(0.0, 0.0, 1.0)  # share of the top speed within it
+    near: float = parameter(3.0, 0.0, 5.0)  # r_a, distance of the nearest sheep below which the dog slows down
+    slow: float = parameter(0.0, 0.0, 1.0)  # speed below that distance, as a share of the top speed
     gain: float = parameter(5.0, 1.0, 12.0)  # kg/s, force per m/s of the desired change
     around: float = parameter(0.0, 0.0, 6.0)  # kg/s, off a circle about the flock, on the path to the place behind it
     width: float = parameter(1.0, 0.5, 2.0)  # of that circle, times the distance of the farthest sheep from the centre
@@ -39,7 +39,7 @@ class HerdRules:
 
 
 def herd(see: Any, task: Herd, p: HerdRules) -> NDArray[np.float64]:
-    """Go behind a sheep that strays, or behind all, and stand still near a sheep; vectors are (along, left)."""
+    """Go behind a sheep that strays, or behind the flock, slower near a sheep; vectors are (along the course, left)."""
     r, n, top = task.apart_distance, task.sheep, task.dog_speed
     together, driving = p.together * r * n ** (2 / 3), p.driving * r * n**0.5
     place = herd_from(see.centre, see.farthest, see.goal, together, p.collecting * r, driving)

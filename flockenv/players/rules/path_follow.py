@@ -22,14 +22,14 @@ follow_path = rows(steering.follow_path)
 class PathFollowRules:
     """Textbook: half a second ahead, the whole track is the tube, full speed in every bend."""
 
-    time: float = parameter(0.5, 0.05, 0.8)  # s, how far ahead it predicts itself
+    time: float = parameter(0.5, 0.05, 0.8)  # s, look-ahead for the predicted position
     lead: float = parameter(0.5, 0.1, 0.8)  # s, look-ahead at the present speed to the point that is sought
     tube: float = parameter(1.0, 0.0, 1.0)  # share of the track's width within which there is no correction
     keep: float = parameter(0.5, 0.3, 0.99)  # share of the desired speed, below which it speeds up
     speed: float = parameter(1.0, 0.5, 1.0)  # desired speed as a share of the top speed
-    grip: float = parameter(100.0, 0.3, 2.5)  # share of max_force that a bend may need; a large one: never slow down
-    early: float = parameter(1.0, 0.2, 1.5)  # share of it that braking before a bend counts on
-    brake: float = parameter(0.0, 0.0, 12.0)  # kg/s against the excess of speed
+    grip: float = parameter(100.0, 0.3, 2.5)  # share of max_force that a bend may need; if large, it never slows down
+    early: float = parameter(1.0, 0.2, 1.5)  # share of max_force that is assumed for braking before a bend
+    brake: float = parameter(0.0, 0.0, 12.0)  # kg/s against speed in excess of that which bends allow
     gain: float = parameter(5.0, 1.0, 12.0)  # kg/s, force per m/s of the desired change
 
 
@@ -40,7 +40,7 @@ def path_follow(see: Any, task: PathFollow, p: PathFollowRules) -> NDArray[np.fl
     share = (np.arange(task.ahead * _FINE) / _FINE) % 1.0
     piece = np.arange(task.ahead * _FINE) // _FINE
     fine = spine[:, piece] * (1.0 - share)[:, None] + spine[:, piece + 1] * share[:, None]
-    far = task.spacing * np.arange(task.ahead)[None]  # a bend begins a point earlier
+    far = task.spacing * np.arange(task.ahead)[None]  # a bend is assumed to begin one point earlier
     bend = np.maximum(np.abs(see.curvature), 1e-6)
     allowed = p.grip * task.max_force / bend + 2.0 * p.early * task.max_force * far
     top = np.minimum(p.speed * task.max_speed, np.sqrt(allowed.min(axis=1)))

@@ -24,8 +24,8 @@ class PursuitRules:
     """Textbook: exact interception, full force."""
 
     factor: float = parameter(1.0, 0.0, 1.5)  # look-ahead as a share of the interception time
-    horizon: float = parameter(10.0, 0.2, 6.0)  # s, never look further ahead than this
-    margin: float = parameter(0.3, 0.0, 2.5)  # m, the quarry will not be nearer to a wall than this
+    horizon: float = parameter(10.0, 0.2, 6.0)  # s, longest look-ahead
+    margin: float = parameter(0.3, 0.0, 2.5)  # m, least distance of the predicted place from walls
     gain: float = parameter(5.0, 1.0, 12.0)  # kg/s, force per m/s of the desired change
     slow_radius: float = parameter(0.01, 0.01, 2.0)  # m, brake within this distance of the predicted place (arrive)
 

@@ -1,4 +1,4 @@
-"""School: a state machine: flee, join the others, eat, or wander; always keep off walls and each other."""
+"""School: a state machine: flee, join other fish, eat, or wander; in each state avoid walls and other fish."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ class SchoolRules:
     """Textbook: Tu and Terzopoulos 1994, the levels of the scene's own effect `intention`, the nearest food."""
 
     escape: float = parameter(0.4, 0.05, 1.0)  # fear above which it flees
-    school: float = parameter(0.15, 0.05, 1.0)  # fear above which it joins the others
+    school: float = parameter(0.15, 0.05, 1.0)  # fear above which it joins other fish
     need: float = parameter(0.5, 0.05, 0.8)  # hunger above which it eats
-    calm: float = parameter(0.1, 0.0, 0.2)  # hysteresis: how much less fear ends either
-    content: float = parameter(0.3, 0.0, 0.6)  # hysteresis: how much less hunger ends it
+    calm: float = parameter(0.1, 0.0, 0.2)  # hysteresis: decrease of fear that ends fleeing or schooling
+    content: float = parameter(0.3, 0.0, 0.6)  # hysteresis: decrease of hunger that ends eating
     wall: float = parameter(0.3, 0.1, 1.5)  # s, how far ahead walls count
     apart: float = parameter(1.0, 0.0, 4.0)  # N m, separation from agents that it nearly touches
     predict: float = parameter(0.5, 0.0, 2.0)  # s, how far ahead a hunter is predicted at most
     evade: float = parameter(5.0, 1.0, 8.0)  # kg/s, strength of an evasion
     middle: float = parameter(0.0, 0.0, 1.5)  # N/m towards the middle of the tank while it flees
     forage: float = parameter(5.0, 1.0, 8.0)  # kg/s, towards food
-    rich: float = parameter(0.0, 0.0, 20.0)  # m of distance that a full patch is worth more than an empty one
+    rich: float = parameter(0.0, 0.0, 20.0)  # m by which a full patch counts as nearer than an empty one
     match: float = parameter(2.0, 0.0, 5.0)  # kg/s, alignment
     centre: float = parameter(1.0, 0.0, 3.0)  # N/m, cohesion
-    pace: float = parameter(0.5, 0.1, 1.0)  # share of the top speed that it wanders at
+    pace: float = parameter(0.5, 0.1, 1.0)  # speed of wandering, as a share of the top speed
     turn: float = parameter(0.2, 0.0, 1.0)  # m aside per m ahead, while it wanders
 
 
@@ -61,7 +61,7 @@ def school(
     calm, content = min(p.calm, p.school), min(p.content, p.need)
     now = intention(was, see.hunger, 0.0, see.fear, max(p.escape, p.school), p.school, p.need, calm, content)
     hunted = see.hunter_present[:, 0] > 0
-    # no hunter or no food is in sight: go on, and look around
+    # without a hunter or food in sight: wander
     has_food = np.linalg.norm(see.food_bearing, axis=-1) > 0
     selected = np.where((now == motivation.ESCAPE) & ~hunted, motivation.WANDER, now)
     selected = np.where((now == motivation.EAT) & ~has_food.any(axis=1), motivation.WANDER, selected)
