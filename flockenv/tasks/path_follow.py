@@ -161,7 +161,7 @@ def drive(p: Any, frame: Frame, action: Any, force: Any) -> None:
 
 @kernel
 def keep(p: Any, before: Frame, after: Frame) -> None:
-    """Store the place on the track before and after the step, and the progress since the start; only here it is searched."""
+    """Store the place on the track before and after the step, searched only here, and the progress since the start."""
     i, s = _place(p, before)
     after.memory[_BEFORE, 0], after.memory[_BEFORE + 1, 0] = i, s
     _store_place(p, after)
