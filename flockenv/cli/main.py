@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 __all__ = ["app", "main"]
 
 PICTURES = (".gif", ".png", ".html")
-FPS, MOST_FPS = 25.0, 50.0  # of a scene's GIF; viewers slow down beyond 50
+FPS, MOST_FPS = 25.0, 50.0  # of a scene's GIF; viewers play faster ones slowly
 TRAIL = 25  # past positions of each agent that a PNG shows
 RECORDED_EVERY = 0.1  # s, rounded to whole steps
 
@@ -79,7 +79,7 @@ def _complete_target(incomplete: str) -> list[str]:
 app = typer.Typer(
     help="Steering agents: hand-written rules and learned policies in the same worlds.",
     no_args_is_help=True,
-    rich_markup_mode="markdown",  # in "rich", text in brackets is taken for a style and vanishes
+    rich_markup_mode="markdown",  # in "rich", text in brackets is read as a style and vanishes
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -135,7 +135,7 @@ def _report_interrupt(text: str = "") -> int:
 
 
 def _warn(message: Warning | str, *place: object, **more: object) -> None:
-    """Print a warning like an error, in one line, without the line of source code."""
+    """Print a warning in one line, like an error, without its line of source code."""
     _report_error(f"warning: {message}", OK)
 
 
@@ -444,7 +444,7 @@ def _film_scene(file: str, duration: float, seed: int) -> tuple[Panel, float, st
 
 
 def _film_episodes(task: Task, players: Sequence[str], seed: int, trust_pickle: bool) -> tuple[list[Panel], float]:
-    """Return an episode of the same world per player as something to draw, and frames per second."""
+    """Return an episode of the same world per player, as panels, and the frames per second."""
     from flockenv.evaluation import rollout
     from flockenv.players import load_player
     from flockenv.render import Panel

@@ -109,7 +109,7 @@ def _write_reports(path: Path | None, reports: Sequence[Report]) -> None:
 def _problem_makers(
     scenes: Sequence[str], suite: bool, problems: str, seconds: float | None, steps: str, dts: str, seed: int
 ) -> dict[str, Callable[[], Problem]]:
-    """Return name or file -> function that makes the problem; ValueError for options that exclude each other."""
+    """Return the function that makes each problem, by name or file; raise ValueError for options that exclude each other."""
     from flockenv.studies.accuracy import select_problems
 
     if suite == bool(scenes):
@@ -130,7 +130,7 @@ def _measure_problems(
     """Measure problem after problem, store and show each; return the reports, and the number of problems without one.
 
     keep: called with all reports after each problem; an interrupt during compilation ends the process and loses none.
-    Of several problems, each one without a reference gives a line; a single problem raises its ValueError.
+    If there are several problems, each one without a reference gives a line; a single one raises its ValueError.
     """
     from flockenv.studies.accuracy import measure
 
@@ -251,7 +251,7 @@ def read_findings(path: Path | None, what: str, sources: str) -> Results | None:
 
 
 def run_trials(what: str, count: int, path: Path | None, known: Results | None, run: Run) -> tuple[Results, bool]:
-    """Run the trials that are not known yet, and write all results after each; return them, and True if interrupted."""
+    """Run the trials that are not known yet, and write all results after each; return all results, and True if interrupted."""
     found = known
 
     def keep(results: Results) -> None:

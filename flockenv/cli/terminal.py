@@ -122,7 +122,7 @@ def run_program(name: str, app: typer.Typer, interrupted: str = "interrupted") -
 
 
 class _Output:
-    """Standard output whose errors name it: the system's own do not name a file."""
+    """Standard output that adds its name to errors: those of the system name no file."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -141,20 +141,22 @@ class _Output:
 
 @contextmanager
 def _name_stdout() -> Iterator[None]:
-    """Name standard output in an error; a broken pipe keeps its own text."""
+    """Add the name of standard output to errors; a broken pipe keeps its own text."""
     try:
         yield
     except OSError as error:
-        with suppress(OSError, ValueError):  # its buffer is flushed at the end of the process, which must not fail
+        with suppress(OSError, ValueError):  # the buffer is flushed at the end of the process, which must not fail
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if isinstance(error, BrokenPipeError) or error.strerror is None:  # it already has a name
+        if (
+            isinstance(error, BrokenPipeError) or error.strerror is None
+        ):  # the error already has a name or none is needed
             raise
         raise OSError(f"standard output: {error.strerror}") from None
 
 
 @contextmanager
 def name_stdout_errors() -> Iterator[None]:
-    """Make errors of standard output name it, for everything printed in the block."""
+    """Add the name of standard output to its errors, for everything printed in the block."""
     with redirect_stdout(cast("TextIO", _Output(sys.stdout))) if sys.stdout is not None else nullcontext():
         yield
 

@@ -74,7 +74,7 @@ class _OneBehaviour(Steer):
 
     @property
     def steer_law(self) -> Law:
-        """Law that returns the force of one behaviour."""
+        """The law that returns the force of one behaviour."""
         return force_of_one
 
     def parameters(self) -> dict[str, float | Vec]:
@@ -96,9 +96,9 @@ class Grants:
     """Shares granted by the `Steer` effects of a scene, at any number of states; its kernels are built once."""
 
     def __init__(self, scene: Scene) -> None:
-        """scene: with any number of Steer effects."""
+        """Build the kernels of a scene with any number of `Steer` effects."""
         self.scene = scene
-        # behaviours may read a medium, an aim or kept state; effects with a force of their own are left out
+        # behaviours may read a medium, an aim or inner states; effects with a force of their own are left out
         media = tuple(e for e in scene.effects if e.own_law is None and (e.medium_law or e.aim_law or e.keeps))
         self._scenes = {
             k: [scene.with_effects(*media, _only_behaviour(effect, j)) for j in range(len(effect.behaviours))]

@@ -1,4 +1,4 @@
-"""Cost of a scene: the time of each effect, what it needs computed, and what no effect needs."""
+"""Cost of a scene: the time of each effect, the computations it needs, and those that no effect needs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Cost(NamedTuple):
     @classmethod
     def of(cls, differences: NDArray[np.float64]) -> Cost:
         """Return the median of the differences of each round, with the exact interval of order statistics."""
-        from scipy.stats import quantile_test  # imported here: commands that time nothing do not need it
+        from scipy.stats import quantile_test  # imported here: commands without timing do not need it
 
         interval = quantile_test(differences, p=0.5).confidence_interval(0.95)
         return cls(float(np.median(differences)), float(interval.low), float(interval.high))
@@ -49,8 +49,8 @@ class Row:
     """One effect of a scene."""
 
     effect: Effect
-    calls_for: tuple[str, ...]  # what it needs computed, in words; empty = only the agent itself
-    cost: Cost  # that the scene would save without it; excludes work shared with other effects
+    calls_for: tuple[str, ...]  # computations that it needs, in words; empty = only the agent itself
+    cost: Cost  # time saved without this effect; work shared with other effects is excluded
 
     @property
     def name(self) -> str:
@@ -70,7 +70,7 @@ class Explanation:
     rest: float  # us, a step without any effect: integrator, limits, confinement, constraints, population
     shared: Cost  # not saved by removing any single effect: the neighbour query and the pass that several share
     work: dict[str, float]  # per step, see state.WORK
-    left_out: tuple[str, ...]  # what is not computed, one line each
+    left_out: tuple[str, ...]  # computations that are left out, one line each
     stable: Suggestion  # the largest stable step
     shares: tuple[tuple[str, str, float], ...] = ()  # of each Steer's behaviours: which, and the mean share granted
 

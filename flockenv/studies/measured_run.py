@@ -1,4 +1,4 @@
-"""Measures of a run: those that make sense for its scene, their values, and the data for its pictures."""
+"""Measures of a run: those that apply to its scene, their values, and the data for pictures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ INSTANTS, FEWEST, MOST_CELLS = 200, 10, 400_000
 """Evenly spaced instants at which cells, lanes and order are measured; fewer if that is more than MOST_CELLS cells."""
 
 MOST_DEALT = 20_000_000
-"""Most permuted directions, in all, for the null of lanes."""
+"""Largest number of permuted directions, in all, for the null hypothesis of lanes."""
 
 SAMPLES = 100
 """Samples of a power law that are drawn to test whether gaps follow one."""
@@ -107,7 +107,7 @@ class Survey:
 def survey(
     trajectory: Trajectory, scope: Scope, progress: Callable[[int], None] = lambda done: None
 ) -> Survey:  # fmt: skip
-    """Return the measures of a run that make sense for its scene.
+    """Return the measures of a run that apply to its scene.
 
     A KeyboardInterrupt ends it early: the measures so far are returned, with `stopped` = "interrupted".
     """
@@ -131,7 +131,7 @@ Part = tuple[dict[str, float], dict[str, Floats]]
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """A run as the measures need it: with a first instant after the skipped time, and a walking direction."""
+    """A run, with the first instant after the skipped time, and the walking direction."""
 
     scene: Scene
     scope: Scope
@@ -291,7 +291,7 @@ def _room(run: _Run) -> Part:
 
 
 def _lanes(run: _Run) -> Part:
-    """Measure lanes, if agents go in both directions and mostly along the axis."""
+    """Measure lanes, if agents walk in both directions and mostly along the axis."""
     if run.scene.dimension == 3:
         return {}, {}
     at, across = run.instants(), np.array([-run.axis[1], run.axis[0]])

@@ -28,7 +28,7 @@ __all__ = ["REPETITIONS", "TOLERANCES", "machine", "measure", "usual_methods"]
 
 REPETITIONS = 20
 TOLERANCES = tuple(10.0**-k for k in range(3, 13))
-"""Tolerances of adaptive methods, which choose their steps themselves."""
+"""Tolerances of adaptive methods, which determine their own steps."""
 
 DEAREST = 4
 """Evaluations per step of the most expensive method with fixed steps."""
@@ -37,7 +37,7 @@ TRUSTED = 4.0
 """Errors below this multiple of the reference's own error are not trusted."""
 
 TOLERANCE_WITHIN = 1e-8
-"""Tolerance of an adaptive method if something acts after each step; its steps are then given, as for others."""
+"""Tolerance of an adaptive method if something acts after each step; its steps are then fixed, as for other methods."""
 
 
 @dataclass(eq=False)
@@ -147,7 +147,7 @@ def measure(
 
 
 def _settings(problem: Problem, method: Integrator) -> list[tuple[Integrator, int, float | None]]:
-    """Return the settings of a method: numbers of steps, or tolerances if it chooses its steps itself."""
+    """Return the settings of a method: numbers of steps, or tolerances if it is adaptive."""
     if method.adaptive and problem.after_steps:
         method = method.model_copy(update={"tolerance": TOLERANCE_WITHIN})
     if not method.adaptive or problem.after_steps:
@@ -157,9 +157,9 @@ def _settings(problem: Problem, method: Integrator) -> list[tuple[Integrator, in
 
 
 def _is_too_costly(before: _Trial, trial: _Trial) -> bool:
-    """Return True if the previous, looser tolerance of this method took more evaluations than any fixed steps.
+    """Return True if this method took more evaluations at the previous, larger tolerance than any with fixed steps.
 
-    If forces jump back and forth, an adaptive method may need as many steps as 1 / tolerance.
+    If forces jump repeatedly, an adaptive method may need as many steps as 1 / tolerance.
     """
     if trial.tolerance is None or before.method.kind != trial.method.kind:
         return False

@@ -18,10 +18,10 @@ TIGHT, LOOSE = 1e-13, 1e-12
 """rtol = atol of the two runs of DOP853."""
 
 AGREED = 1e-8
-"""Largest difference of DOP853's two runs, as a share of the distance that agents go."""
+"""Largest difference of DOP853's two runs, as a share of the largest distance that an agent moves."""
 
 MOST_EVALUATIONS, AT_ONCE = 50_000, 0.1
-"""Most evaluations of DOP853; this share is allowed at once, the rest in proportion to the time reached."""
+"""Most evaluations of DOP853; this share is allowed from the start, the rest in proportion to the time reached."""
 
 
 class NotSmoothError(Exception):

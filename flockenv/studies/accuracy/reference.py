@@ -27,16 +27,16 @@ LEAST_FINER = 4
 """Least ratio of the finest measured step to the step of a reference by own steps."""
 
 MOST_WORK = 100_000_000
-"""Most agent-steps in the finest run of such a reference; its steps are coarser if they would be more."""
+"""Most agent-steps in the finest run of such a reference; if more are needed, its steps are coarser."""
 
 BETWEEN_STEPS = 500
 """Cost of what acts between two steps of a scene, as a number of agents whose step takes as long."""
 
 COARSE = 0.1
-"""Errors above this share of the distance that agents go are no approximation."""
+"""A path with errors above this share of the distance that agents move is no approximation."""
 
 ROUNDING, ROUNDING_STEP = 1e-12, 1e-16
-"""m, or share of the distance that agents go: smaller differences of runs, in all or per step, are rounding."""
+"""m, or share of the distance that agents move: smaller differences of runs, in all or per step, are rounding."""
 
 SETTLED = 0.5
 """Least order at which three runs are taken to converge to a limit."""
@@ -49,12 +49,12 @@ class Reference:
     kind: str  # "closed form", "DOP853", "event-exact steps" or "own steps"
     path: Path
     error: float  # m, estimated error at any instant
-    reach: float  # m, the distance that the farthest agent goes
+    reach: float  # m, largest distance that an agent moves
     note: str = ""  # how it was found, and why no better reference was possible
 
 
 def find_reference(problem: Problem, finer: int | None = None) -> Reference:
-    """Return the best reference there is.
+    """Return the best available reference.
 
     finer: see `reference_by_own_steps`. Raises ValueError if there is none: the scene diverges even in the finest
     steps, or does not converge to one path.

@@ -20,7 +20,7 @@ Cost = Literal["seconds", "evaluations"]
 COSTS: dict[Cost, str] = {"seconds": "wall time, s", "evaluations": "force evaluations"}
 
 HALVINGS = 5
-"""Halvings over which an order is measured: the finest whose errors are neither too coarse nor rounding."""
+"""Halvings over which an order is measured: the finest whose errors are neither too large nor rounding."""
 
 SENSITIVE = 100.0
 """Growth of a tiny difference at the start beyond which a report counts as sensitive."""
@@ -44,7 +44,7 @@ class Point(ResultRecord):
     steps: int
     """Calls of the method."""
     dt: float
-    """s; an adaptive method chooses shorter ones."""
+    """s; an adaptive method takes shorter ones."""
     tolerance: float | None
     """Tolerance of an adaptive method."""
     evaluations: int
@@ -95,7 +95,7 @@ class Curve(ResultRecord):
     order: float | None
     """The measured order; None with too few points, and for adaptive methods, whose steps are not halved."""
     used: int
-    """Points that the order was measured over."""
+    """Number of points over which the order was measured."""
 
     def cheapest_choice(self, tolerance: float, by: Cost = "evaluations", interpolate: bool = True) -> Choice | None:
         """Return the cheapest setting of this method with an error of at most `tolerance`, m; None if there is none.
@@ -153,7 +153,7 @@ class Report(ResultRecord):
     floor: float
     """m, errors below this are rounding or the reference's own."""
     reach: float
-    """m, the distance that the farthest agent goes: an error of a tenth of it or more is no approximation."""
+    """m, largest distance that an agent moves: with an error of a tenth of it or more, a path is no approximation."""
     energy: str
     """The kinds of energy that are compared."""
     repetitions: int

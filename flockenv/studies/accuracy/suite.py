@@ -1,6 +1,6 @@
-"""The suite: problems with closed forms, and flocks, for the cost of methods with smooth and non-smooth forces.
+"""The suite of benchmark problems: some with closed forms, and flocks, with smooth and non-smooth forces.
 
-Horizons are not whole numbers of periods, at which semi-implicit Euler would seem to have order 2.
+Durations are not integer multiples of periods, at which semi-implicit Euler would seem to have order 2.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ __all__ = ["SUITE", "select_problems"]
 
 ORIGIN = (0.0, 0.0)
 BIRDS, EDGE, REACH = 24, 40.0, 20.0
-"""Flocks: number of agents, edge of the torus, m, and radius of sight, m, larger than a flock that is together."""
+"""Flocks: number of agents, edge of the torus, m, and radius of sight, m, which is larger than the flock."""
 
 
 def powers(first: int, last: int) -> tuple[int, ...]:
@@ -64,7 +64,7 @@ def _rows(*row: float) -> Floats:
 
 
 def oscillator() -> Problem:
-    """x'' = -x from rest at 1 m."""
+    """Return the oscillator x'' = -x, from rest at 1 m."""
 
     def exact(t: float) -> tuple[Floats, Floats]:
         return _rows(math.cos(t), 0.0), _rows(-math.sin(t), 0.0)
@@ -74,7 +74,7 @@ def oscillator() -> Problem:
 
 
 def damped_oscillator() -> Problem:
-    """x'' = -w^2 x - 2 zeta w x', w = 2 1/s, zeta = 0.1, from (1 m, 0.3 m/s)."""
+    """Return the oscillator x'' = -w^2 x - 2 zeta w x', w = 2 1/s, zeta = 0.1, from (1 m, 0.3 m/s)."""
     w, zeta, x0, v0 = 2.0, 0.1, 1.0, 0.3
 
     def exact(t: float) -> tuple[Floats, Floats]:
@@ -89,14 +89,14 @@ def damped_oscillator() -> Problem:
 
 
 def pendulum() -> Problem:
-    """angle'' = -(2 pi)^2 sin(angle) from rest at 120 degrees, 5 s: five times as long as a small swing takes."""
+    """Return a pendulum, angle'' = -(2 pi)^2 sin(angle), from rest at 120 degrees, for 5 periods of a small swing."""
     swing = Swing(centre=ORIGIN, strength=4 * math.pi**2)
     start = _rows(2 * math.pi / 3, 0.0), _rows(0.0, 0.0)
     return _one_body("pendulum", "Pendulum from 120\u00b0", [swing], 5.0, powers(7, 17), None, start)
 
 
 def forced_oscillator() -> Problem:
-    """x'' = -x + cos 2t from rest at 0: forces are also evaluated within a step."""
+    """Return the oscillator x'' = -x + cos 2t, from rest at 0: its force also varies within a step."""
 
     def exact(t: float) -> tuple[Floats, Floats]:
         x, v = (math.cos(t) - math.cos(2 * t)) / 3, (2 * math.sin(2 * t) - math.sin(t)) / 3
@@ -126,12 +126,12 @@ def _kepler(name: str, eccentricity: float, periods: float, steps: Sequence[int]
 
 
 def kepler() -> Problem:
-    """An orbit of moderate eccentricity."""
+    """Return an orbit of moderate eccentricity."""
     return _kepler("kepler", 0.5, 3.3, powers(7, 17))
 
 
 def kepler_close() -> Problem:
-    """An orbit that passes close to the sun; short steps are needed only there."""
+    """Return an orbit that passes close to the sun; short steps are needed only there."""
     return _kepler("kepler_close", 0.9, 1.3, powers(8, 18))
 
 
@@ -141,7 +141,7 @@ GRAVITY = 9.81
 
 
 def projectile() -> Problem:
-    """A throw of (10, 15) m/s with linear drag."""
+    """Return a throw of (10, 15) m/s with linear drag."""
     rate, vx, vy = 0.2, 10.0, 15.0
 
     def exact(t: float) -> tuple[Floats, Floats]:
@@ -154,7 +154,7 @@ def projectile() -> Problem:
 
 
 def quadratic_fall() -> Problem:
-    """A fall from rest with quadratic drag, towards 20 m/s."""
+    """Return a fall from rest with quadratic drag; the speed tends to 20 m/s."""
     limit = 20.0
 
     def exact(t: float) -> tuple[Floats, Floats]:
@@ -166,7 +166,7 @@ def quadratic_fall() -> Problem:
 
 
 def tracer() -> Problem:
-    """A speck that a vortex carries around in circles, once in 6.94 s."""
+    """Return a particle that a vortex carries around in circles, once in 6.94 s."""
     flow, most, radius = 2.0, 5.0, 1.2
     turn = flow / (flow / most + radius**2) / radius
 
@@ -181,7 +181,7 @@ def tracer() -> Problem:
 
 
 def bounces() -> Problem:
-    """A ball of 0.1 m falls from 1 m and bounces with e = 0.8: impacts after 0.428, 1.114, 1.662, 2.101 s and so on."""
+    """Return a ball of 0.1 m that falls from 1 m and bounces, e = 0.8: impacts at 0.428, 1.114, 1.662, 2.101 s, ..."""
     drop, elastic, radius = 0.9, 0.8, 0.1
 
     def exact(t: float) -> tuple[Floats, Floats]:
@@ -203,7 +203,7 @@ def bounces() -> Problem:
 
 
 def rod() -> Problem:
-    """A bob on a rod of 1 m, released level: sin(angle / 2) = k cd(w t, k), k = sin 45 degrees, w^2 = g / l."""
+    """Return a bob on a rod of 1 m, released level: sin(angle / 2) = k cd(w t, k), k = sin 45 degrees, w^2 = g / l."""
     w, k = math.sqrt(GRAVITY), math.sqrt(0.5)
 
     def exact(t: float) -> tuple[Floats, Floats]:
@@ -237,17 +237,17 @@ def _flock(name: str, title: str, fov: float = 360.0, max_speed: float | None = 
 
 
 def boids() -> Problem:
-    """Three rules with a view of 360 degrees: forces are smooth as long as each agent sees all others."""
+    """Return boids with a view of 360 degrees: forces are smooth as long as each agent sees all others."""
     return _flock("boids", f"{BIRDS} boids that see all around")
 
 
 def boids_cone() -> Problem:
-    """The same with a view cone: forces jump if a neighbour enters or leaves it."""
+    """Return boids with a view cone: forces jump if a neighbour enters or leaves it."""
     return _flock("boids_cone", f"{BIRDS} boids that see 270\u00b0", fov=270.0)
 
 
 def boids_limit() -> Problem:
-    """The same with a speed limit, which is enforced after each step."""
+    """Return boids with a speed limit, which is enforced after each step."""
     return _flock("boids_limit", f"{BIRDS} boids with a speed limit", max_speed=1.5)
 
 

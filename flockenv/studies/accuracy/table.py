@@ -45,7 +45,7 @@ def _rate(report: Report) -> str:
 def errors(report: Report) -> tuple[tuple[str, ...], list[list[str]]]:
     """Return header and rows of the errors at the end, m, of every method in every number of steps.
 
-    ? = not clearly above the error of the reference itself. Methods that choose their steps by tolerance are left out.
+    ? = not clearly above the error of the reference itself. Adaptive methods are left out.
     """
     steps = sorted({p.steps for c in report.curves for p in c.points if p.tolerance is None})
     found = []

@@ -1,7 +1,7 @@
 """Arbitration of behaviours that contradict each other: collisions, and the share granted to each behaviour.
 
-Reynolds 1987: the sum of "left, around the obstacle" and "right, to where the flock is" leads straight into it; and in
-an emergency the most pressing behaviour must not share a bounded force with all others.
+Reynolds 1987: the sum of "left, around the obstacle" and "right, towards the flock" leads straight into the obstacle;
+and in an emergency the most urgent behaviour must not share a bounded force with all others.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Obstacle avoidance: share of agents that arrive, their time and path length, and collisions.
 
 Reynolds 1988, "Not Bumping Into Things": a force field only brakes an agent that comes head-on, and pushes one that
-flies past. Steering to avoid does neither, but like any local method it is caught in a dead end; a global path is not.
+flies past. Steering to avoid does neither, but like any local method it gets stuck in dead ends; a global path does
+not.
 """
 
 from __future__ import annotations

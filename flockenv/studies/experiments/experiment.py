@@ -32,9 +32,9 @@ class Experiment:
 
     name: str
     title: str
-    cases: Mapping[str, str]  # what happens in each
+    cases: Mapping[str, str]  # description of each
     variants: tuple[str, ...]
-    columns: Mapping[str, str]  # what each number is, with its unit
+    columns: Mapping[str, str]  # meaning of each number, with its unit
     shown: tuple[str, ...]  # the columns that are shown below a picture
     trial: Callable[[str, str], Trial]  # runs a case under a variant
     curve: tuple[str, str] | None = None  # labels of axes, if cases are numbers: the first column is drawn over them

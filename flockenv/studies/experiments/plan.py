@@ -26,7 +26,7 @@ class Plan(Record):
 
     measure: str = Field(description="which numbers are measured")
     title: str
-    worlds: int = Field(ge=1, description="number of worlds that each case is run in")
+    worlds: int = Field(ge=1, description="number of worlds in which each case is run")
     seed: int = Field(default=0, ge=0)
 
     def experiment(self) -> Experiment:
@@ -38,7 +38,7 @@ class Case(Record):
     """A case: a scene whose first effect is the `steer` that is varied."""
 
     what: str = Field(description="what happens, in a sentence")
-    seconds: float = Field(gt=0, description="s, for how long at most")
+    seconds: float = Field(gt=0, description="s, longest duration")
     scene: Scene
 
     @model_validator(mode="after")
@@ -65,7 +65,7 @@ class Case(Record):
 
 
 class GlobalWay(Record):
-    """The floor field around all obstacles to the target that would be sought straight ahead, see `follow_way`."""
+    """The floor field around all obstacles to the target of `seek`, see `follow_way`."""
 
     clearance: float = Field(ge=0, description="m, from the path to every obstacle")
     spacing: float = Field(gt=0, description="m, between points of its grid")
@@ -81,8 +81,8 @@ class GlobalWay(Record):
 class Variant(Record):
     """Changes to the steer of every case."""
 
-    first: tuple[AnyBehaviour, ...] = Field(default=(), description="more pressing behaviours than those of the case")
-    arbitration: AnyReconciling | None = Field(default=None, description="default: the case's own")
+    first: tuple[AnyBehaviour, ...] = Field(default=(), description="behaviours of higher priority than the case's own")
+    arbitration: AnyReconciling | None = Field(default=None, description="arbitration (default: the case's own)")
     way: GlobalWay | None = Field(default=None, description="replaces seeking straight ahead (default: straight ahead)")
 
 

@@ -1,6 +1,6 @@
 """Measures from research on flocks and crowds, a family per file: functions of arrays, or of one world.
 
-`flockenv measure SCENE.yaml` runs a scene and shows the measures that make sense for it; docs/measures.md describes
+`flockenv measure SCENE.yaml` runs a scene and shows the measures that apply to it; docs/measures.md describes
 each.
 """
 

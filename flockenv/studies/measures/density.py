@@ -74,9 +74,9 @@ def voronoi(
     obstacles, which may lie anywhere and overlap. Parts of a cell behind a wall count as well, so a walkable area must
     end at walls. area: the convex polygon that is measured (default: all of the walkable area). period: (Lx, Ly) m of
     a periodic world, 0 along an axis that is not periodic; `walkable` is one period of it. An agent outside `walkable`
-    has no cell and takes no room. Agents at the same position share a cell.
-    Raises ValueError if a polygon is invalid, or if the area is not convex or nothing of it is walkable.
-    Source: Steffen & Seyfried 2010, Physica A 389, 1902. Cells by scipy's Qhull, areas by shapely's GEOS.
+    has no cell and takes no area. Agents at the same position share a cell. Raises ValueError if a polygon is invalid,
+    or if the area is not convex or nothing of it is walkable. Source: Steffen & Seyfried 2010, Physica A 389, 1902.
+    Cells by scipy's Qhull, areas by shapely's GEOS.
     """
     return Ground.of(walkable, area, holes, period).room(pos)
 
@@ -85,7 +85,7 @@ class Ground(NamedTuple):
     """The walkable area and the measured area, checked once for many instants."""
 
     walk: Floats
-    free: BaseGeometry  # the part of it that is walkable
+    free: BaseGeometry  # the walkable polygon less the obstacles
     target: BaseGeometry  # the part of that which is measured
     period: tuple[float, float]
     area: float  # m^2, of the measured area

@@ -30,7 +30,7 @@ JUELICH = (
     (0.5, 1.0, 0.94, 0.12), (1.0, 1.5, 0.70, 0.12), (1.5, 2.0, 0.56, 0.08), (2.0, 2.5, 0.42, 0.11),
     (2.5, 3.0, 0.35, 0.06), (3.0, 3.5, 0.23, 0.04), (3.5, 4.0, 0.17, 0.05),
 )  # fmt: skip
-"""From, to, 1/m^2; mean and standard deviation of speed, m/s: one-way corridor, 1.8 m wide, ug-180, n = 434."""
+"""Density from, to, 1/m^2; mean and deviation of speed, m/s: one-way corridor, 1.8 m wide, ug-180, n = 434."""
 
 AT_REST, PER_SPEED = 0.36, 1.06
 """m, and s: length that a pedestrian in single file needs at rest, and its growth per m/s (Seyfried 2005)."""

@@ -31,7 +31,7 @@ class Flow(NamedTuple):
     backward: int
     rate: float  # 1/s, (forward - backward) / the whole time
     specific: float  # 1/(m s), rate / width
-    passing: float  # 1/s, (n - 1) / (t_n - t_1) of forward crossings: while it flows; NaN for fewer than two
+    passing: float  # 1/s, (n - 1) / (t_n - t_1) of forward crossings; NaN for fewer than two
 
 
 def crossings(

@@ -68,7 +68,7 @@ PRINTED: dict[str, Callable[[float, int], tuple[float, float]]] = {
 
 
 def oscillator(method: Integrator) -> Value:
-    """100 periods at 100 steps each: the energy is that of the method's formula, or of its own amplification."""
+    """Compare the energy after 100 periods of 100 steps with the method's formula, or with its amplification matrix."""
     y, steps = W / 100, 10_000
     x, v = end_state(one_body_scene(method, 0.01, stiffness=W * W), (1.0, 0.0), O2, steps)
     found = float(v @ v + W * W * x @ x) / W**2
@@ -104,7 +104,7 @@ def _slope(make: Callable[[float], Scene], end: Floats, begin: tuple[Any, Any], 
 
 
 def orders(method: Integrator) -> Value:
-    """The slope of the error on four problems: damped, forced, a pendulum, a projectile with drag."""
+    """Measure the order of convergence on four problems: damped, forced, a pendulum, a projectile with drag."""
     if method.adaptive:
         method = method.model_copy(update={"tolerance": 1e30})  # it accepts its step at any error
     zeta, seconds = 0.1, 0.7
@@ -161,7 +161,7 @@ def _projectile(t: float, k: float) -> Floats:
 
 
 def threshold(method: Integrator) -> Value:
-    """Bounded at .99 of the largest stable step for 100,000 steps, and reported at 1.01."""
+    """Check that motion is bounded at .99 of the largest stable step for 100,000 steps, and that 1.01 is reported."""
     if not math.isfinite(limit(method, 0.0)):
         scene = one_body_scene(method, 1.0, stiffness=100.0**2)
         x, _ = end_state(scene, (1.0, 0.0), O2, 300)
@@ -170,7 +170,7 @@ def threshold(method: Integrator) -> Value:
     for zeta in (0.0, 1.0):
         most = limit(method, zeta)
         if most < 0.1:
-            notes.append(f"zeta = {zeta:g}: none")  # it grows at every step, but slowly: see N01
+            notes.append(f"zeta = {zeta:g}: none")  # it grows with any step, but slowly: see N01
             continue
         inside = one_body_scene(method, 0.99 * most, stiffness=1.0, damping=2 * zeta)
         x, _ = end_state(inside, (1.0, 0.0), O2, 100_000)
@@ -198,7 +198,7 @@ ORBIT = {
 
 
 def orbit(method: Integrator) -> Value:
-    """Kepler, e = .6, 1,000 steps per period: the energy over 100 periods (10 where equations are solved)."""
+    """Measure the energy error of a Kepler orbit, e = .6, 1,000 steps a period, for 100 periods (10 if implicit)."""
     periods = 10 if method.solves else 100
     scene = one_body_scene(method, 2 * math.pi / 1000, orbit=1.0)
     state = start_with(scene, [(0.4, 0.0)], [(0.0, 2.0)])
@@ -225,7 +225,7 @@ PHI, MOST, R = 2.0, 5.0, 1.2
 
 
 def tracer(method: Integrator) -> Value:
-    """Ten turns in a vortex, 200 steps each: the distance from the circle; explicit Euler spirals by its recursion."""
+    """Measure a tracer's distance from its circle after 10 turns of 200 steps in a vortex; Euler's by its recursion."""
     speed = PHI / (PHI / MOST + R * R)
     dt = 2 * math.pi * R / speed / 200
     effects = (Vortex(strength=PHI, centre=O2, maximum=MOST, acts="medium"), Carried())
@@ -272,7 +272,7 @@ def stiff_drag(share: float) -> Callable[[Integrator], Value]:
 
 
 def in_the_centre(method: Integrator) -> Value:
-    """At rest exactly in the centre of an attraction, of a spring and of a vortex: nothing has a direction there."""
+    """Check that a body at rest in the exact centre of an attraction, a spring or a vortex stays there."""
     x, v = end_state(one_body_scene(method, 0.05, stiffness=4.0, orbit=3.0), O2, O2, 100)
     effects = (Vortex(strength=PHI, centre=O2, maximum=MOST, acts="medium"), Carried())
     scene = Scene(groups=ONE, effects=effects, integrator=method, dt=0.05)
@@ -314,7 +314,7 @@ def approach(speed: float, tau: float, decay: float) -> Callable[[Integrator], V
 
 
 def bounces(method: Integrator) -> Value:
-    """A ball with e = .8 at 16 phases of the step: total time, 4.0637 s from 1 m; then at rest, never below."""
+    """Bounce a ball, e = .8, from 1 m at 16 phases of the step: it must rest after 4.0637 s, and never be below."""
     worst, low, moving = 0.0, 0.0, 0.0
     for dt in (0.005, 0.02):
         for phase in range(16):

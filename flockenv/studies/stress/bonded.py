@@ -1,4 +1,4 @@
-"""Hard cases of springs: a cloth that grows stiffer, a hanging chain, and a swinging chain far from the origin."""
+"""Hard cases of springs: cloths of increasing stiffness, a hanging chain, and a swinging chain far from the origin."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _work_of_gravity(scene: Scene, state: State) -> float:
 
 
 def chain(method: Integrator) -> Value:
-    """A damped chain of ten links comes to rest at N L + (m g / k) N (N + 1) / 2 = 1.1348875 m."""
+    """Check that a damped chain of ten links comes to rest at N L + (m g / k) N (N + 1) / 2 = 1.1348875 m."""
     rope = Rope(links=10, length=1.0, direction=(0, 0, -1), pinned=("start",))
     dt, steps = (0.05, 400) if method.solves else (0.004, 8000)
     scene = hanging_scene(method, rope, 400.0, dt, each=0.1, damping=2.0)
@@ -75,7 +75,7 @@ def chain(method: Integrator) -> Value:
 
 
 def far_away(method: Integrator) -> Value:
-    """The same swinging chain at 0, 1e4 and 1e7 m from the origin, in float64."""
+    """Compare a swinging chain at 0, 1e4 and 1e7 m from the origin, in float64."""
     found = []
     for offset in (0.0, 1e4, 1e7):
         start, direction = (offset, -offset, offset), (1.0, 0.0, 0.2)

@@ -101,12 +101,12 @@ MOST = 2.0  # m/s
 
 
 def inside_each_other(method: Integrator) -> Value:
-    """Two bodies deep inside each other, and 30 in a disc of twice their radius: no pair parts faster than `most`.
+    """Start two bodies that overlap deeply, and 30 in a disc of twice their radius: no pair may part faster than MOST.
 
-    In steps of 1.5 ms; a contact of a pair lasts 38 of them.
+    A step is 1.5 ms; a contact of a pair lasts 38 steps.
     """
     dt, worst = 0.0015, 0.0
-    with collect_step_warnings():  # explicit Euler is never stable without damping, and here it does no harm
+    with collect_step_warnings():  # explicit Euler is never stable without damping; here that is harmless
         pair, heap = contact_scene(method, dt, most=MOST), contact_scene(method, dt, count=30, most=MOST)
     state = start_with(pair, [(0.0, 0.0), (0.1, 0.0)], np.zeros((2, 2)))
     for _ in range(100):

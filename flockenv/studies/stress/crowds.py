@@ -26,7 +26,7 @@ def flock(method: Integrator, count: int, together: float = 1.0, dt: float = 0.0
 
 
 def in_one_place(method: Integrator) -> Value:
-    """50 agents in one place and 2 in another, at rest: finite, momentum kept, apart within a second."""
+    """Start 50 agents in one place and 2 in another, at rest: they must part within 1 s and conserve momentum."""
     scene = flock(method, 52, together=0.0)  # separation alone conserves momentum
     pos = np.full((52, 2), 10.0)
     pos[50:] = 30.0, 20.0
@@ -39,7 +39,7 @@ def in_one_place(method: Integrator) -> Value:
 
 
 def at_rest_and_alone(method: Integrator) -> Value:
-    """Two agents with opposite headings, and one alone at rest: no NaN, and no force along +x (N10)."""
+    """Check two agents with opposite headings, and one alone at rest, for NaN and for forces along +x (N10)."""
     scene = flock(method, 3)
     start = start_with(scene, [(10, 10), (11, 10), (30, 30)], [(0, 1.0), (0, -1.0), (0, 0)])
     end = scene.run(start, 50)
@@ -49,7 +49,7 @@ def at_rest_and_alone(method: Integrator) -> Value:
 
 
 def seam(method: Integrator) -> Value:
-    """A pair across the edge moves as in the middle; all agents stay in [0, L), also one at -1e-17."""
+    """Compare a pair across the edge with one in the middle; all agents must stay in [0, L), also one at -1e-17."""
     scene, rng = flock(method, 12), np.random.default_rng(0)
     pos, vel = rng.uniform(15, 25, (12, 2)), rng.normal(size=(12, 2))
     one = scene.run(start_with(scene, pos, vel), 60)

@@ -62,11 +62,11 @@ def crossing(count: int, circle: float, seconds: float) -> Callable[[Integrator,
     return trial
 
 
-# --- N25: a field of force against steering ---------------------------------------------------------------------------
+# --- N25: a force field against steering ------------------------------------------------------------------------------
 
 
 def stalls(method: Integrator) -> Value:
-    """An obstacle exactly ahead: a field of force stalls before it, steering to avoid passes (Reynolds 1988)."""
+    """Check, with an obstacle dead ahead, that a force field stalls and steering to avoid passes (Reynolds 1988)."""
     ends, offsets = [], []
     for variant in ("force field", "to avoid"):
         scene = _agent_with_goal((Circle(centre=(6, 0), radius=1),), variant, method)
@@ -82,7 +82,7 @@ def stalls(method: Integrator) -> Value:
 
 
 def along_a_wall(method: Integrator) -> Value:
-    """Parallel to a wall, .4 m beside it: steering to avoid has exactly no force across; a field of force has one."""
+    """Check that steering to avoid has no force across on an agent parallel to a wall, .4 m off; a force field has one."""
     forces = []
     for variant in ("to avoid", "force field"):
         scene = _agent_with_goal((Polygon(vertices=WALL),), variant, method)
@@ -114,7 +114,7 @@ def _with_method(scene: Scene, method: Integrator) -> Scene:
 
 
 def chaos(method: Integrator, response: Response) -> Value:
-    """60 discs in a room, 72 worlds: the same bits again and by 4 threads; renumbered within 1e-9, up to which time."""
+    """Run 60 discs in a room, in 72 worlds, twice, and by 4 threads: equal bits; and renumbered: time within 1e-9 m."""
     room = Block(centre=(0.0, 0.0), size=(8.0, 8.0), hollow=True)
     scene = disc_scene(method, response, 0.02, count=60, obstacles=(room,), restitution=0.9, pull=(0.0, -1.0))
     rng = np.random.default_rng(0)

@@ -33,7 +33,7 @@ INFLOW = 15.0  # s, after which no disc is added, and energy may not grow
 
 
 def funnel(method: Integrator, response: Response, seconds: float = 60.0, count: int = 1000) -> Value:
-    """Discs fall into a funnel and through its gate: overlap, discs through a wall, energy after the inflow."""
+    """Drop discs through a funnel; measure overlap, discs that cross a wall, and energy growth after the inflow."""
     dt = 1 / 480
     scene = disc_scene(
         method, response, dt, count=count, radius=GRAIN, pull=(0.0, -G), obstacles=ROOM, restitution=0.2, friction=0.3,
@@ -91,7 +91,7 @@ def _cross(a: Floats, b: Floats) -> Floats:
 
 
 def incline(method: Integrator, response: Response) -> Value:
-    """Friction .3: stays for 60 s at 16.6 degrees, slides at 16.8 and 30; at 3 m/s with .4 it stops after 1.14679 m."""
+    """Check a body on inclines: friction .3 holds at 16.6 degrees, not at 16.8 and 30; .4 stops 3 m/s in 1.14679 m."""
     rests = 6.0 if method.solves else 60.0  # s
     creep = _sliding_distance(method, response, 16.6, rests)
     slow = _sliding_distance(method, response, 16.8, 4.0) / (0.5 * _pull(16.8) * 16.0)
@@ -126,7 +126,7 @@ def _sliding_distance(method: Integrator, response: Response, degrees: float, se
 
 
 def stack(method: Integrator, response: Response) -> Value:
-    """A stack of ten discs for 20 s: the largest displacement of a disc, in radii."""
+    """Measure the largest displacement of a disc in a stack of ten in 20 s, in radii."""
     scene = disc_scene(method, response, 0.01, count=10, pull=(0.0, -G), obstacles=(FLOOR,), friction=0.3)
     begin = np.stack([np.zeros(10), R * (1 + 2 * np.arange(10))], axis=1)
     state, far = batch(scene, begin[None], 0.0), 0.0

@@ -56,7 +56,7 @@ def apexes(y: Floats) -> Floats:
 
 
 def bouncing(method: Integrator, response: Response) -> Value:
-    """e = .8: the tops e^2n h, n <= 4; 4.0637 s until it is at rest; at rest from then on, never below the floor."""
+    """Bounce balls, e = .8: tops must be e^2n h, n <= 4, rest begin at 4.0637 s and last, none be below the floor."""
     tops, total, low, moving = 0.0, 0.0, 0.0, 0.0
     for dt in (0.02,) if method.solves else (0.001, 0.005, 0.02):
         y, v, begin = drop_balls(method, response, dt, 0.8, round(5.0 / dt))
@@ -75,7 +75,7 @@ def bouncing(method: Integrator, response: Response) -> Value:
 
 
 def elastic(method: Integrator, response: Response) -> Value:
-    """e = 1, 100 bounces: no top above 1.01 h; if impacts are located in time, every top is h to 1e-6.
+    """Bounce balls 100 times, e = 1: no top may exceed 1.01 h; with impacts located in time each must be h to 1e-6.
 
     20 bounces for methods that solve equations. h is the top of the parabola on which the method's first step begins:
     off by half a step's fall for methods of first order.
@@ -106,7 +106,7 @@ HALF = 10.0
 
 
 def bullets(method: Integrator, response: Response) -> Value:
-    """Discs of R = .1 m at 200 m/s, 3.3 m a step: the number through each target, of 16 phases x 8 angles."""
+    """Shoot discs of R = .1 m at 200 m/s, 3.3 m a step: count those through each target, of 16 phases x 8 angles."""
     wall = Wall(vertices=((0.0, -400.0), (0.0, 400.0)), radius=0.05)
     room = Block(centre=(0.0, 0.0), size=(2 * HALF, 2 * HALF), hollow=True)
     coming = wall.model_copy(update={"velocity": (-50.0, 0.0)})
@@ -127,7 +127,7 @@ def _shots() -> tuple[Floats, Floats]:
 
 
 def _count_passes(method: Integrator, response: Response, wall: Shape, speed: float) -> int:
-    """Return the number of discs that get behind a wall that begins at x = 0 and moves at `speed`, m/s."""
+    """Return the number of discs that pass a wall that starts at x = 0 and moves at `speed`, m/s."""
     phase, direction = _shots()
     scene = disc_scene(method, response, FRAME, count=len(phase), obstacles=(wall,), restitution=0.5, agents=False)
     begin = -direction * (SPEED * FRAME * (1.5 + phase[:, None])) - (0.5, 0.0)
@@ -176,7 +176,7 @@ CHAINS: tuple[tuple[Sequence[float], Sequence[float], Sequence[float]], ...] = (
 
 
 def cradle(method: Integrator, response: Response) -> Value:
-    """Elastic chains with gaps of a twentieth of R, numbered from either end, hit at two steps; energy, momentum."""
+    """Hit elastic chains with gaps of R / 20, numbered from either end, at two steps; check energy and momentum."""
     worst, kept = 0.0, 0.0
     for masses, before, after in CHAINS:
         for turned in (1, -1):
@@ -196,7 +196,7 @@ def cradle(method: Integrator, response: Response) -> Value:
 
 
 def uneven(method: Integrator, response: Response) -> Value:
-    """Elastic impacts of 1 kg and 1e3 ... 1e12 kg, either of which flies: energy, and momentum in units of m2 v."""
+    """Collide 1 kg and 1e3 ... 1e12 kg, either moving, elastically; check energy, and momentum in units of m2 v."""
     energy, momentum = 0.0, 0.0
     for heavy in (1e3, 1e6, 1e9, 1e12):
         for v1, v2 in ((1.0, 0.0), (0.0, -1.0)):
@@ -215,7 +215,7 @@ def uneven(method: Integrator, response: Response) -> Value:
 
 
 def one_place(method: Integrator, response: Response) -> Value:
-    """50 discs in one place, at rest: apart after a second, without a preferred direction, momentum kept, no blast."""
+    """Start 50 discs in one place: they must part within 1 s, with no preferred direction, drift, or high speeds."""
     scene = disc_scene(method, response, 0.02, count=50)
     state, fast = batch(scene, np.zeros((1, 50, 2)), 0.0), 0.0
     for _ in range(50):
@@ -248,7 +248,7 @@ def gas(method: Integrator, response: Response, offset: float = 0.0, dtype: str 
 
 
 def far_away(method: Integrator, response: Response) -> Value:
-    """The same gas at 0, 1e4 and 1e7 m for .3 s, in float64; float32 refuses both (flockenv/model/float_range.py)."""
+    """Compare a gas at 0, 1e4 and 1e7 m after .3 s, in float64; float32 must refuse the latter two (float_range.py)."""
     place = np.stack(np.meshgrid(np.linspace(-1.2, 1.2, 6), np.linspace(-1.2, 1.2, 4)), axis=-1).reshape(24, 2)
     rng = np.random.default_rng(0)
     place, vel = place + rng.uniform(-0.05, 0.05, place.shape), rng.normal(size=place.shape)

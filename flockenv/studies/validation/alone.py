@@ -1,4 +1,4 @@
-"""Cases of people that walk alone: speed in a corridor, the same one turned, speeds of people of all ages.
+"""Cases of people that walk alone: speed in a corridor, and in a rotated one; speeds by age.
 
 Names and bounds are those of RiMEA, NIST TN 1822 and JuPedSim's tests (Juelich).
 """
@@ -97,20 +97,20 @@ def _distances_walked(scene: Scene, seconds: float, degrees: float = 0.0) -> tup
 
 
 def rimea_1(name: str) -> Value:
-    """40 m at 1.33 m/s, from rest."""
+    """Measure the time for 40 m at 1.33 m/s, from rest."""
     took = crossing_time(*_distances_walked(SCENES["rimea 1"][""](name), 60), 40.0)
     return Value(took, 26.0 <= took <= 34.0, f"{took:.2f} s")
 
 
 def nist_2_1(name: str) -> Value:
-    """The speed over 40 m, after 10 m."""
+    """Measure the speed over 40 m, after 10 m."""
     time, along = _distances_walked(SCENES["nist 2.1"][""](name), 70)
     speed = 40.0 / (crossing_time(time, along, 50.0) - crossing_time(time, along, 10.0))
     return Value(speed, abs(speed - 1.0) <= 0.05, f"{speed:.4f} m/s")
 
 
 def turned_corridor(name: str) -> Value:
-    """10 m at 1 m/s, in a corridor at 45 degrees, and in one that is not turned."""
+    """Measure the time for 10 m at 1 m/s in a corridor at 45 degrees, and in one along x."""
     built = SCENES["juelich 2"]
     took = [
         crossing_time(*_distances_walked(built[how](name), 15, a), 10.0)
@@ -121,7 +121,7 @@ def turned_corridor(name: str) -> Value:
 
 
 def way_points(name: str) -> Value:
-    """10 m at 1 m/s by four gates, one after another, from 1 m/s on."""
+    """Measure the time for 10 m at 1 m/s through four gates in order, with an initial speed of 1 m/s."""
     took = crossing_time(*_distances_walked(SCENES["juelich 6"][""](name), 15), 10.0)
     return Value(took, abs(took - 10.0) <= 0.1, f"{took:.3f} s")
 
@@ -133,7 +133,7 @@ def _free_speeds(scene: Scene) -> Floats:
 
 
 def rimea_7(name: str) -> Value:
-    """50 adults: the speed of each is in the range of its age."""
+    """Measure how far speeds of 50 adults are outside the ranges of their ages."""
     found = np.split(_free_speeds(SCENES["rimea 7"][""](name)), np.cumsum(AGES)[:-1])
     off = max(max(a - v.min(), v.max() - b, 0.0) for v, (a, b) in zip(found, TABLE, strict=True))
     ranges = ", ".join(f"{v.min():.2f}-{v.max():.2f}" for v in found)
@@ -141,7 +141,7 @@ def rimea_7(name: str) -> Value:
 
 
 def nist_2_4(name: str) -> Value:
-    """100 people with normal desired speeds, 1.2 +- .2 m/s: a test that their walking speeds are normal."""
+    """Test whether walking speeds of 100 people with desired speeds of N(1.2, .2) m/s are normal."""
     from scipy.stats import kstest  # imported here: it looks for torch, and takes half a second
 
     speeds = np.concatenate([_free_speeds(built(name)) for built in SCENES["nist 2.4"].values()])

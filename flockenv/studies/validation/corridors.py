@@ -1,6 +1,6 @@
-"""Cases of corridors without ends: the fundamental diagram, in two and in one dimension, and lanes.
+"""Cases of endless corridors: the fundamental diagram, in two and in one dimension, and lanes.
 
-A torus, so wide that no force reaches around it; along its middle a corridor.
+Each lies along the middle of a torus that is so wide that no force reaches around it.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def endless(
     name: str, counts: tuple[int, int], length: float = EDGE, width: float = WIDTH,
     directions: tuple[int, int] = (1, -1), dense: bool = False,
 ) -> Scene:  # fmt: skip
-    """Return two groups in a corridor without ends, each with its direction; dense: with bodies that overlap.
+    """Return two groups in an endless corridor, each with its direction; dense: with bodies that overlap.
 
     Each begins in a half of its own; `start_on_grid` mixes them.
     """
@@ -82,7 +82,7 @@ def endless(
         elif not roomy:
             begin = {"spawn": filling_grid(count, low, high, people(name, count, low, high).widest)}
         groups.append(people(name, count, low, high, **begin))
-    if sum(counts) < FEWEST_AGENTS:  # so that small and large crowds share a kernel
+    if sum(counts) < FEWEST_AGENTS:  # small and large crowds then share a kernel
         groups.append(empty_group(name, (half, middle), FEWEST_AGENTS - sum(counts)))
     aims = [Course(group=k, direction=(direction, 0)) for k, direction in enumerate(directions)]
     return scene_of(
@@ -138,7 +138,7 @@ SCENES: Scenes = {
 
 
 def rimea_4(name: str) -> Value:
-    """The fundamental diagram: densities of .5 to 3 per m^2, one direction of walking, the last 18 of 30 s."""
+    """Measure the fundamental diagram at .5 to 3 people per m^2, all in one direction, in the last 18 of 30 s."""
     cloud: dict[str, list[float]] = {"density": [], "speed": []}
     means = []
     for built in SCENES["rimea 4"].values():
@@ -170,7 +170,7 @@ def _area(x: float) -> list[tuple[float, float]]:
 
 
 def rimea_16(name: str) -> Value:
-    """Single file: a corridor of .8 m, .5 to 1.75 people per m of it."""
+    """Measure the fundamental diagram of single file: a corridor .8 m wide, with .5 to 1.75 people per m."""
     means = []
     for built in SCENES["rimea 16"].values():
         scene = built(name)
@@ -190,7 +190,7 @@ def _number_list(values: Floats) -> str:
 
 
 def lanes_of(name: str) -> Value:
-    """48 people per direction in a corridor 4 m wide: order above its permutation null, over 20 seeds."""
+    """Measure the lane order of 48 people per direction in 4 m of width above its permutation null, over 20 seeds."""
     scene = SCENES["lanes"][""](name)
     run = run_walk(
         scene, LANE_SECONDS, worlds=LANE_SEEDS, every=1.0, begin=start_on_grid(scene, EDGE, WIDTH, LANE_SEEDS)

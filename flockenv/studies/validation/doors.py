@@ -111,7 +111,7 @@ def _count_wall_crossings(scene: Scene, run: Walk) -> int:
 
 
 def rimea_6(name: str) -> Value:
-    """20 people around a left corner: all out within 60 s, and none through a wall."""
+    """Measure the time of 20 people around a left corner: less than 60 s, and no path may cross a wall."""
     scene = SCENES["rimea 6"][""](name)
     run = run_walk(scene, 90, until=is_empty)
     took, through = _time_until_out(run), _count_wall_crossings(scene, run)
@@ -121,7 +121,7 @@ def rimea_6(name: str) -> Value:
 
 
 def rimea_15(name: str) -> Value:
-    """A crowd around a corner, and along corridors as long as its inner and its outer path."""
+    """Compare a crowd's time around a corner with those along corridors as long as its inner and its outer path."""
     times, note = [], ""
     for what, built in SCENES["rimea 15"].items():
         run = run_walk(built(name), 150, until=is_empty)
@@ -136,7 +136,7 @@ def rimea_15(name: str) -> Value:
 
 
 def rimea_9(name: str) -> Value:
-    """1000 people out of a public room by four doors, and by two."""
+    """Compare the evacuation times of 1000 people from a public room by two doors and by four."""
     times, most, note = [], [], ""
     for (doors, built), longest in zip(SCENES["rimea 9"].items(), (400.0, 800.0), strict=True):
         run = run_walk(built(name), longest, every=0.5, until=is_empty)
@@ -151,7 +151,7 @@ def rimea_9(name: str) -> Value:
 
 
 def rimea_12(name: str) -> Value:
-    """150 people through a passage of 5 m, .8, 1.0 and 1.2 m wide: the flow, against measured ones."""
+    """Compare flows of 150 people through a passage of 5 m, .8, 1.0 and 1.2 m wide, with measured ones."""
     found, jams, notes, through = [], True, [], 0
     for width, built in zip(WIDTHS, SCENES["rimea 12"].values(), strict=True):
         scene = built(name)
@@ -162,7 +162,7 @@ def rimea_12(name: str) -> Value:
             leave.append(flow(_door_crossings(run, 15.0, width / 2, b), width, run.time[-1]).passing)
             ahead.append(float(np.median(_density(run, ((-2.0, -1.0), (0.0, 1.0)), b)[50:300])))
             behind.append(float(np.median(_density(run, ((13.0, -1.0), (15.0, 1.0)), b)[50:300])))
-        found.append(float(np.nan_to_num(np.median(entry))))  # without people that pass the flow is 0
+        found.append(float(np.nan_to_num(np.median(entry))))  # without passages the flow is 0
         jams &= bool(np.median(ahead) > np.median(behind) and np.median(entry) - np.median(leave) >= -0.05)
         stuck, through = int(run.alive[-1].sum()), through + _count_wall_crossings(scene, run)
         notes.append(
@@ -187,7 +187,7 @@ def _excess_over(flow_: float, band: tuple[float, float]) -> float:
 
 
 def nist_3_1(name: str) -> Value:
-    """23 people in 12 rooms, two exits: the share that leaves by its assigned exit."""
+    """Measure the share of 23 people, in 12 rooms with two exits, that leave by their assigned exit, %."""
     scene = SCENES["nist 3.1"][""](name)
     run = run_walk(scene, 120, until=is_empty)
     right = np.zeros(23)
@@ -219,7 +219,7 @@ def _outcome_text(run: Walk, took: float) -> str:
 
 
 def nist_5_1(name: str) -> Value:
-    """The place of the largest density: before the door, or beyond it."""
+    """Compare the largest density before the door with that beyond it."""
     run, took = nist_5(name)
     peaks = [float(_density(run, corners).max()) for corners in (((-1.5, -1.0), (0.0, 1.0)), ((0.0, -0.5), (2.0, 0.5)))]
     note = f"at the door {peaks[0]:.1f}, beyond it {peaks[1]:.1f} per m^2; {_outcome_text(run, took)}"
@@ -227,7 +227,7 @@ def nist_5_1(name: str) -> Value:
 
 
 def nist_5_2(name: str) -> Value:
-    """The flow by a door of 1 m, per metre."""
+    """Measure the specific flow through a door of 1 m."""
     run, took = nist_5(name)
     found = flow(_door_crossings(run, 0.0, 0.5), 1.0, run.time[-1])
     verdict = "not above" if found.passing <= 1.33 else "above"
@@ -238,7 +238,7 @@ def nist_5_2(name: str) -> Value:
 
 
 def nist_2_8(name: str) -> Value:
-    """100 people through a corridor against 0, 10, 50 and 100: the number that comes through."""
+    """Count how many of 100 people get through a corridor against 0, 10, 50 and 100 others."""
     done, last = [], []
     for built in SCENES["nist 2.8"].values():
         run = run_walk(built(name), 400, every=0.5, until=is_empty)
@@ -251,7 +251,7 @@ def nist_2_8(name: str) -> Value:
 
 
 def door_bursts(name: str) -> Value:
-    """48 people per direction through a door of 1 m: bursts longer than those of a coin, over 20 seeds."""
+    """Test whether bursts of 48 people per direction at a door of 1 m are longer than by chance, over 20 seeds."""
     scene = SCENES["bursts"][""](name)
     run = run_walk(scene, 120, worlds=BURST_SEEDS, every=0.2, until=is_empty)
     found, nulls, through, stuck = [], [], 0, 0
@@ -279,7 +279,7 @@ def door_bursts(name: str) -> Value:
 
 
 def faster_is_slower(name: str) -> Value:
-    """200 people, 15 x 15 m, a door of 1 m: the time of evacuation by desired speed."""
+    """Measure the evacuation time of 200 people from 15 x 15 m by a door of 1 m, by desired speed."""
     medians, lows, highs, stuck = [], [], [], 0
     for built in SCENES["faster is slower"].values():
         run = run_walk(built(name), 300, worlds=FASTER_SEEDS, every=0.5, until=is_empty)

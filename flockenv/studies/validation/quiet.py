@@ -1,4 +1,4 @@
-"""A context that all trials of crowds share: warnings of coarse contacts are ignored."""
+"""Context manager of all trials of crowds: it ignores warnings of coarse contacts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["ignore_contact_warnings"]
 
 @contextmanager
 def ignore_contact_warnings() -> Iterator[None]:
-    """Ignore warnings of contacts that a step resolves badly: presets have the time step of their papers."""
+    """Ignore warnings of steps that are long for contacts: presets have the time step of their papers."""
     with warnings.catch_warnings():
         for kind in (UnstableStepWarning, CoarseContactWarning):
             warnings.simplefilter("ignore", kind)

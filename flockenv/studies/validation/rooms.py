@@ -65,7 +65,7 @@ def _scene(
 ) -> Scene:  # fmt: skip
     """Return a scene of two groups, each with its floor field; the second may be one without living agents.
 
-    That group has as many slots as make the scene a large one: small and large crowds then share a kernel.
+    The empty group has so many slots that the scene counts as large: small and large crowds then share a kernel.
     """
     all_groups, goals = list(groups), [*targets, targets[0]][:2]
     low = groups[0].spawn.low
@@ -86,7 +86,7 @@ def wall_with_doors(x: float, low: float, high: float, *doors: tuple[float, floa
 def room(name: str, count: int, size: Point, door: float, speed: Any = None, seed: int = 0, **fields: Any) -> Scene:
     """Return people in a room whose right wall, at x = 0, has a door in its middle; people 2 m outside are removed.
 
-    A door of 0 m is shut: people press against its place.
+    A door of 0 m is shut: people push against the wall there.
     """
     wide, high = size[0], size[1] / 2
     walls = (

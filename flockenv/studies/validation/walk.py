@@ -40,7 +40,7 @@ STEPS = {"helbing_farkas_vicsek_2000": 0.005, "moussaid_2011": 0.05}
 """s, one step (default: .02). With friction of bodies, kappa d 2 / m < 2 / dt at 6 cm overlap d of two bodies."""
 
 SOLID = ObstacleContact(stiffness=1.2e5)
-"""Elastic walls (Helbing, Farkas and Vicsek 2000) of models without bodies, whose crowds are else pushed through."""
+"""Elastic walls (Helbing, Farkas and Vicsek 2000) for models without contact forces, whose crowds else cross walls."""
 
 SHAKEN = 0.01
 """m, largest initial distance from a cell's middle, along each axis, of bodies that are wider than their cells."""
