@@ -109,7 +109,7 @@ def _write_reports(path: Path | None, reports: Sequence[Report]) -> None:
 def _problem_makers(
     scenes: Sequence[str], suite: bool, problems: str, seconds: float | None, steps: str, dts: str, seed: int
 ) -> dict[str, Callable[[], Problem]]:
-    """Return the function that makes each problem, by name or file; raise ValueError for options that exclude each other."""
+    """Return functions that make the problems, by name or file; raise ValueError if options exclude each other."""
     from flockenv.studies.accuracy import select_problems
 
     if suite == bool(scenes):
@@ -251,7 +251,7 @@ def read_findings(path: Path | None, what: str, sources: str) -> Results | None:
 
 
 def run_trials(what: str, count: int, path: Path | None, known: Results | None, run: Run) -> tuple[Results, bool]:
-    """Run the trials that are not known yet, and write all results after each; return all results, and True if interrupted."""
+    """Run unknown trials, and write all results after each; return the results, and True if interrupted."""
     found = known
 
     def keep(results: Results) -> None:

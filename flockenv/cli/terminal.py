@@ -147,9 +147,7 @@ def _name_stdout() -> Iterator[None]:
     except OSError as error:
         with suppress(OSError, ValueError):  # the buffer is flushed at the end of the process, which must not fail
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if (
-            isinstance(error, BrokenPipeError) or error.strerror is None
-        ):  # the error already has a name or none is needed
+        if isinstance(error, BrokenPipeError) or error.strerror is None:  # such errors have a text already
             raise
         raise OSError(f"standard output: {error.strerror}") from None
 

@@ -90,10 +90,10 @@ def _add_one(plan: Pairs, law: PairLaw, q: int, apart: bool) -> Callable[..., No
 def add_candidate(plan: Pairs, touch: bool, apart: bool) -> Callable[..., None]:
     """Make `visit(numbers, besides, me, it, other, gap, o, lanes, lane)`: add one candidate to the sums of all laws.
 
-    touch: of contact laws, or of all others; apart: True if no agent that the candidate counts for shares its position.
+    touch: True for contact laws, False for all others; apart: True if the candidate shares no agent's position.
     """
     laws = [law for law in plan.laws if law.contact == touch]
-    laws.sort(key=lambda law: law.vanishes)  # others need one register less while the first are computed
+    laws.sort(key=lambda law: law.vanishes)  # one register less is needed while the first are computed
     sights = sorted({law.sight for law in laws})
     see = tuple_from(*(_is_in_sight(plan, q, True) for q in sights))
     add_all = call_in_turn(*(_add_one(plan, law, sights.index(law.sight), apart) for law in laws))

@@ -42,7 +42,7 @@ class OneAtATime:
         return self._made[os.getpid()]
 
     def load_overload(self, signature: Any, context: Any) -> Any:
-        """Return the entry on the disk, if necessary once another process has written it; None: the caller compiles."""
+        """Return the entry on the disk, waiting while another process writes it; None if the caller must compile."""
         if os.getpid() in self._made:
             self._lock.release(force=True)  # left by a compilation that failed
         found = self._read(signature, context)

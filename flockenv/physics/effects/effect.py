@@ -348,7 +348,7 @@ class Effect(Record):
         return 0
 
     def members(self, starts: Sequence[int]) -> dict[str, float]:
-        """Return more parameters of its laws: which agents it applies to; starts[g] is group g's first agent."""
+        """Return parameters that select agents, such as those it applies to; starts[g]: first agent of group g."""
         return {}
 
     def sums(self, dimension: int) -> int:

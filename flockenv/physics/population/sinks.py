@@ -24,7 +24,7 @@ class Sink(Member):
     group: int | None = Field(default=None, ge=0, description="index of the group whose agents die (default: all)")
 
     def row(self) -> list[float]:
-        """Return its numbers, as deaths.py reads them."""
+        """Return the numbers of the sink, in the order in which deaths.py reads them."""
         return []
 
     def check(self, scene: SceneView) -> None:
