@@ -73,7 +73,7 @@ def insert_agent(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
 
 @law
 def insert_obstacle(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
-    """Keep an obstacle if it is among the nearest: it does not give way."""
+    """Keep an obstacle if it is among the nearest; the agent makes all of the change."""
     o = like(other.square, 0.0)
     return with_inserted(acc, (other.offset[0], other.offset[1], o, o, other.radius, like(other.square, 1.0)))
 

@@ -1,4 +1,4 @@
-"""What kernels are passed: the worlds of a state, and one world in progress as a step sees it."""
+"""The records that kernels are passed: the worlds of a state, and one world in progress as a step sees it."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """KernelPlan: which laws make up a scene, and what follows from that for its kernel.
 
-Which effects interact with neighbours, through how many different `sights`, what is sorted of each agent (`fields`:
-only what some law reads), where each running number lies in the scratch of lanes (`slots`), and the numbers that the
-kernel is passed (`parameters`). Plans of sections are made from parts, and scratch is allocated for them.
+Which effects interact with neighbours, through how many different `sights`, which numbers are sorted with each agent
+(`fields`: those that laws read), where each running number lies in the scratch of lanes (`slots`), and the numbers that
+the kernel is passed (`parameters`). Plans of sections are made from parts, and scratch is allocated for them.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class KernelPlan(ObstacleSets):
     sorts: bool = True
     """True if there are enough agents to sort them by cell; a smaller scene has no code for it."""
     look: Look | None = None
-    """What a task's query finds for its agents, with the same cell list."""
+    """The query of a task, which uses the same cell list."""
     crowded: bool = False
     """True if there are enough agents for distant groups of them to be treated as one."""
     oriented: bool = False
@@ -231,11 +231,11 @@ class KernelPlan(ObstacleSets):
         return found
 
     def target(self, k: int) -> str:
-        """Return what effect k adds to: a behaviour's own force, the steering force, or the external force."""
+        """Return the target of effect k: a behaviour's own force, the steering force, or the external force."""
         return f"w{k}_" if k in self.combined else "s" if self.effects[k].steering else "f"
 
     def pair_target(self, k: int) -> str:
-        """Return what the pair law of effect k adds to: as `target`, or an input of its obstacle fold or keep law."""
+        """Return the target of effect k's pair law: as `target`, or an input of its obstacle fold or keep law."""
         effect = self.effects[k]
         return f"n{k}_" if effect.obstacle_start is not None or effect.keep_law is not None else self.target(k)
 
@@ -276,7 +276,7 @@ class KernelPlan(ObstacleSets):
 
     @functools.cached_property
     def targets(self) -> list[str]:
-        """What pair laws add to: steering force, external force, behaviour forces, inputs of folds and keep laws."""
+        """The targets of pair laws: steering force, external force, behaviour forces, inputs of folds and keep laws."""
         found = {self.pair_target(k) for k, _ in self.pairs}
         names = ("s", "f", *(f"w{k}_" for k in self.combined), *(f"n{k}_" for k, _ in self.pairs))
         return [name for name in names if name in found]

@@ -66,7 +66,7 @@ def bring_out_of(agent: AgentPlan) -> Callable[..., None]:
 
 @section
 def take_drive_of(dimension: int, width: int, masked: bool) -> Callable[..., None]:
-    """Make `take_drive(scratch, drive, drive_row, n, first, end)`= drive[:, drive_row], the commanded forces, or 0."""
+    """Make `take_drive(scratch, drive, drive_row, n, first, end)`: copy drive[:, drive_row], commanded forces, or 0."""
     into, size = into_blocks(dimension, width), dimension * width
 
     def take_drive(scratch: Any, drive: Any, drive_row: Any, n: Any, first: Any, end: Any) -> None:

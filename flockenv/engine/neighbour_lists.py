@@ -1,4 +1,4 @@
-"""The listing: how the living agents are listed, each time forces are computed, so that neighbours lie side by side.
+"""Listing of the living agents, each time forces are computed, so that neighbours lie side by side.
 
 In a small world, or if a grid would have too few cells, they are listed by number and each agent is a candidate; else
 they are sorted by cell. What is listed of each agent are its `fields`: in a small world a row for each field (`x0`,

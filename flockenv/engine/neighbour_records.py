@@ -19,7 +19,7 @@ __all__ = ["Besides", "Block", "Candidate", "listed_agent", "listed_candidate", 
 
 
 class Candidate(NamedTuple):
-    """A listed agent, as pair laws see it; what no law reads is 0."""
+    """A listed agent, as pair laws see it; fields that no law reads are 0."""
 
     pos: Any
     vel: Any
@@ -103,9 +103,9 @@ def separation_direction_of(dimension: int, width: int) -> Callable[..., Any]:
 class Block(NamedTuple):
     """A block of listed agents, which interact with their candidates."""
 
-    mine: Any  # what its agents are read from: lanes, or rows
+    mine: Any  # array with the fields of its agents: lanes, or rows
     first: Any  # where the first agent lies there
-    theirs: Any  # what candidates are read from: records, or rows
+    theirs: Any  # array with the fields of candidates: records, or rows
     lanes: Any  # running numbers
     number: Any  # (W,) index of each lane
     at: Any  # the first of its agents, and

@@ -1,4 +1,4 @@
-"""What tasks add: `look` finds which agents are near each agent of a world, for observations and rewards.
+"""The query of tasks, `look`: it finds the agents near each agent of a world, for observations and rewards.
 
 It lists agents as pair laws do, and keeps, for each lane, sorted lists of the nearest few.
 """

@@ -1,4 +1,4 @@
-"""What a fold does with one obstacle: how its law sees it, and what it keeps.
+"""Update of a fold by one obstacle: how its law sees the obstacle, and what is kept.
 
 A law is passed circles as they are, and of any other shape one point (`physics.effects.effect.Obstacle`): the nearest
 of its surface, or, if the law casts a ray, the first point that the ray touches.

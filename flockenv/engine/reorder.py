@@ -30,7 +30,7 @@ AHEAD = 64
 """How many agents ahead packed data is prefetched."""
 
 _COMMON = {**dict.fromkeys(("mass", "radius", "max_speed", "max_force"), 0), "requested_force": 1}
-"""What all agents may share, and by which mask it is read then, see `blocks.common_places`."""
+"""Fields that all agents may share, and the index of the mask by which they are read, see `blocks.common_places`."""
 
 
 class PackedFields(NamedTuple):

@@ -26,7 +26,7 @@ SMALL_STRIDE = 128
 """Length of a row of listed agents if these are too few to be sorted by cell: their blocks, and one more."""
 
 OWN = ("lanes", "ranges", "spread")
-"""What each thread has for itself: running numbers of a block, ranges of candidates, masks of shared numbers."""
+"""Arrays that each thread has for itself: running numbers of a block, ranges of candidates, masks of shared numbers."""
 
 TABLES = ("bond_place", "bond_number", "bond_start")
 """Tables of bonds, which a scene has made: passed along with scratch, and only read."""
@@ -69,7 +69,7 @@ def scratch_of(parts: KernelPlan, agents: int, team: int = 1) -> dict[str, Array
 
 
 def _query_arrays(parts: KernelPlan, agents: int, team: int) -> dict[str, Array]:
-    """Return what finding neighbours needs: small worlds are listed in rows, others in cells, as records."""
+    """Return the arrays for finding neighbours: small worlds are listed in rows, others in cells, as records."""
     real, whole, width = np.dtype(parts.dtype), np.dtype(np.int32), parts.width
     padded = -(-agents // width) * width
     found: dict[str, Array] = {
@@ -89,7 +89,7 @@ def _query_arrays(parts: KernelPlan, agents: int, team: int) -> dict[str, Array]
 
 
 def _tile_arrays(parts: KernelPlan, agents: int) -> dict[str, Array]:
-    """Return what reordering a large world needs."""
+    """Return the arrays for reordering a large world."""
     whole, width = np.dtype(np.int32), parts.width
     many = agents >= FEWEST_ARRANGED
     padded = -(-agents // width) * width if many else 0
@@ -106,7 +106,7 @@ def _tile_arrays(parts: KernelPlan, agents: int) -> dict[str, Array]:
 
 
 def _tree_arrays(parts: KernelPlan, agents: int, team: int) -> dict[str, Array]:
-    """Return what a tree of agents needs, for laws about all agents."""
+    """Return the arrays of a tree of agents, for laws about all agents."""
     real, long, width = np.dtype(parts.dtype), np.dtype(np.int64), parts.width
     padded = -(-agents // width) * width
     found: dict[str, Array] = {

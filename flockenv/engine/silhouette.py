@@ -1,4 +1,4 @@
-"""The side on which an agent passes what is ahead, that of the nearest silhouette edge: `passing_side_of`.
+"""The side on which an agent passes the obstacle ahead, that of the nearest silhouette edge: `passing_side_of`.
 
 Source: Reynolds 1988.
 

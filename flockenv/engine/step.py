@@ -142,7 +142,7 @@ def _prefetch_all(array: Any, at: Any, places: Any) -> None:
 
 @section
 def _prefetch_ahead(numbers: tuple[int, ...], width: int) -> Callable[..., None]:
-    """Make `prefetch_ahead(scratch, pos, vel, block)`: prefetch what moves a later block."""
+    """Make `prefetch_ahead(scratch, pos, vel, block)`: prefetch forces and states of a later block."""
     (of_pos, of_vel, of_pair_force, of_ident), pair_force = (
         (_prefetch_block(many, width) for many in numbers),
         numbers[2] > 0,

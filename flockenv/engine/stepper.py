@@ -32,7 +32,7 @@ FEWEST_TOGETHER, SURELY_TOGETHER = 128, 4096
 
 
 class Stepper:
-    """The kernels of a scene and what they are passed; each thread that calls it has its own scratch."""
+    """The kernels of a scene and their arguments; each thread that calls them has its own scratch."""
 
     def __init__(self, scene: SceneView) -> None:
         """Compile nothing yet: kernels are compiled by their first call."""

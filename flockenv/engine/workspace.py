@@ -29,7 +29,7 @@ GAP = 5 * LINE
 
 @dataclass(frozen=True)
 class Workspace:
-    """Scratch of a team of threads that step one world: what a step writes, and nothing reads afterwards."""
+    """Scratch of a team of threads that step one world: arrays that a step writes, and nothing reads after it."""
 
     arrays: dict[str, NDArray[Any]]
     own: tuple[dict[str, NDArray[Any]], ...]  # lanes, ranges and spread of each thread

@@ -1,4 +1,4 @@
-"""What all environment APIs share: spaces, seeds, options and pictures."""
+"""Common parts of all environment APIs: spaces, seeds, options and pictures."""
 
 from __future__ import annotations
 

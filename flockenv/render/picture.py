@@ -1,7 +1,7 @@
 """Draw a snapshot as pixels, with Pillow; no display is needed.
 
-Pictures are drawn `scale` times larger and averaged down, which smooths edges. What does not move (background, grid,
-obstacles, caption) is drawn once per world and cached.
+Pictures are drawn `scale` times larger and averaged down, which smooths edges. Parts that do not move (background,
+grid, obstacles, caption) are drawn once per world and cached.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def _check_integer(name: str, value: int, limits: tuple[int, int]) -> None:
 def _draw_backdrop(
     view: View, title: str, roles: tuple[str, ...], circles: bytes, outlines: tuple[bytes, ...]
 ) -> Image.Image:
-    """Draw what does not move; circles and outlines as bytes, so that they can be cached."""
+    """Draw the parts that do not move; circles and outlines are bytes, so that the result can be cached."""
     canvas = Image.new("RGB", (view.width, view.height), rgb(PAPER["page"][0]))
     pen = ImageDraw.Draw(canvas, "RGBA")
     world = (view.left, view.top, view.right, view.bottom)

@@ -21,10 +21,10 @@ __all__ = ["View"]
 
 
 class View:
-    """What pictures show of a scene."""
+    """The content of pictures of a scene."""
 
     def __init__(self, scene: SceneView) -> None:
-        """Compute nothing yet."""
+        """Keep a reference to the scene; compute nothing yet."""
         self._scene = weakref.ref(scene)  # the scene holds this object: its scratch is freed with its last reference
 
     @property

@@ -107,11 +107,11 @@ class Grants:
         }
 
     def at(self, state: State) -> tuple[SteerShares, ...]:
-        """Return what each `Steer` grants in this state, in the order of the effects; the state stays as it is."""
+        """Return the shares that each `Steer` grants in this state, by effect; the state stays as it is."""
         return tuple(self._shares_of(state, k) for k in self._scenes)
 
     def _shares_of(self, state: State, which: int) -> SteerShares:
-        """Return what the effect with index `which` grants."""
+        """Return the shares that effect `which` grants."""
         steer, body = self.scene.effects[which], self.scene.body
         assert isinstance(steer, Steer)
         counted = state.copy()  # a copy, as acceleration() changes work counters
@@ -136,7 +136,7 @@ def _only_behaviour(steer: Steer, which: int) -> _OneBehaviour:
 
 
 def arbitration_shares(scene: Scene, state: State) -> tuple[SteerShares, ...]:
-    """Return what each `Steer` of a scene grants in this state, in the order of its effects; the state stays as it is.
+    """Return the shares that each `Steer` of a scene grants, in the order of its effects; the state stays as it is.
 
     The budget is max_force, whatever else drives the agents. `Grants(scene).at(state)` is faster for repeated calls.
     """

@@ -110,7 +110,7 @@ class Trajectory:
         Arrays: time (T,) s, pos (T, N, D) m, vel (T, N, D) m/s, alive (T, N), radius (N,) m, seed, and `scene`, the
         YAML text that `load_scene` reads; heading (T, N, D) where headings are kept; identity and born (T, N), s, where
         there is a population; shown (T, N), if pictures show inner numbers. None needs pickle. Missing folders are
-        made.
+        created.
         """
         beside = path.with_suffix(".json")
         summary = json.dumps(self.summary(), indent=2, allow_nan=False) + os.linesep
@@ -168,9 +168,9 @@ def record(
 
 
 def _compile(scene: Scene, first: State, steps: int) -> None:
-    """Compile, or read from the cache, what a run needs, by a first step whose result is discarded."""
+    """Compile the kernels of a run, or read them from the cache, by a first step whose result is discarded."""
     if steps > 0:
-        with suppress(FloatingPointError):  # the run itself reports it
+        with suppress(FloatingPointError):  # the run itself reports a divergence
             scene.run(first, 1)
 
 

@@ -75,7 +75,7 @@ class Finding(ResultRecord):
     verdict: Verdict
     note: str = ""
     seconds: float = Field(ge=0, description="s, wall time, compiling included")
-    series: dict[str, tuple[float | None, ...]] = Field(default_factory=dict, description="what pictures show")
+    series: dict[str, tuple[float | None, ...]] = Field(default_factory=dict, description="data for pictures")
 
     def cell(self, digits: int = 2) -> str:
         """Return value and verdict, short."""

@@ -180,7 +180,7 @@ class CrowdNav(Task):
     `flockenv.scene.presets`, as published. Pedestrians of the 2009 model, with bodies of 0.5 m, keep 0.4 m between
     centres in the middle of a circle of 12; those of the models of 1995 and 2007 walk into each other, with 0.1 m and
     less. By default the crowd does not see the robot (`visible`), as in the tests of CrowdNav (Chen et al. 2019,
-    arXiv 1809.08835), so that the robot cannot rely on pedestrians to give way. Observations are relative to the robot,
+    arXiv 1809.08835), so that the robot cannot rely on pedestrians to avoid it. Observations are relative to the robot,
     in the frame of its course, from start to goal.
 
     Rewards are those of Chen et al. times 20: success 1, collision -0.25, and -0.5 per s and per metre by which the

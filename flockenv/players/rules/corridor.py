@@ -66,7 +66,7 @@ class CorridorOrcaRules:
     """As published, each agent makes half of the change; a desired velocity that is not free is turned right."""
 
     horizon: float = 2.0  # s, for which the velocity must be free of collisions
-    margin: float = 0.05  # m, clearance for what inertia delays
+    margin: float = 0.05  # m, clearance for delays by inertia
     turn: float = 0.3  # rad, a desired velocity that is not free is turned right by this
     gain: float = 10.0  # kg/s: reaches the desired velocity within a decision
 

@@ -1,4 +1,4 @@
-"""Crossing: give way to the agent that it would touch first, and go on."""
+"""Crossing: avoid the agent that it would touch first, then head for the goal."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ unaligned_threat = rows(steering.unaligned_threat)
 
 @dataclass(frozen=True)
 class CrossingRules:
-    """Textbook: look three seconds ahead, give way with the whole force, arrive with the rest."""
+    """Textbook: look three seconds ahead; avoidance comes first, arrival gets the rest of the force."""
 
     horizon: float = parameter(3.0, 0.5, 6.0)  # s, look-ahead for collisions
     margin: float = parameter(0.2, 0.0, 0.8)  # m, clearance beyond the touching distance
@@ -62,7 +62,7 @@ class OrcaRules:
     """As published, each agent makes half of the change; without turning right, twelve agents deadlock."""
 
     horizon: float = 2.0  # s, for which the velocity must be free of collisions
-    margin: float = 0.1  # m, clearance for what inertia delays
+    margin: float = 0.1  # m, clearance for delays by inertia
     turn: float = 0.3  # rad, a desired velocity that is not free is turned right by this
     gain: float = 10.0  # kg/s: reaches the desired velocity within a decision
     slow_radius: float = 1.0  # m, slow down within this of the goal

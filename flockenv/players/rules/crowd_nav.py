@@ -53,7 +53,7 @@ class RobotOrcaRules:
     """As published, but for the share: a robot that the pedestrians do not see must make the whole change."""
 
     horizon: float = 2.0  # s, for which the velocity must be free of collisions
-    margin: float = 0.1  # m, clearance for what inertia delays
+    margin: float = 0.1  # m, clearance for delays by inertia
     turn: float = 0.0  # rad, a desired velocity that is not free is turned right by this
     gain: float = 10.0  # kg/s: reaches the desired velocity within a decision
     share: float = 1.0  # the robot's part of the change if pedestrians do not see it; else it is 0.5

@@ -24,7 +24,7 @@ threat = rows(steering.threat)
 
 @dataclass(frozen=True)
 class ObstaclesRules:
-    """Textbook: look two seconds ahead, evade with the whole force, seek with the rest."""
+    """Textbook: look two seconds ahead; avoidance comes first, seeking gets the rest of the force."""
 
     horizon: float = parameter(2.0, 0.4, 3.0)  # s, how far ahead a threat counts at the present speed
     margin: float = parameter(0.2, 0.0, 0.6)  # m, clearance beyond the touching distance

@@ -29,7 +29,7 @@ DECADES = 13
 
 
 LABEL = 0.035
-"""Share of a panel's height that a number at the end of a line takes."""
+"""Height of a number at the end of a line, as a share of the panel's."""
 
 
 def write_precision(path: str | Path, reports: Sequence[Report]) -> None:
@@ -133,7 +133,7 @@ def _reference_text(report: Report) -> str:
 
 
 def _draw_line(axes: Axes, curve: Curve, by: Cost, style: dict[str, Any], floor: float, low: float) -> None:
-    """Draw a curve; what lies below the picture is on its lower edge."""
+    """Draw a curve; points below the range of the picture lie on its lower edge."""
     shown = [(cost, max(error, low)) for cost, error in _drawable_points(curve, by)]
     if shown:
         axes.plot(*zip(*shown, strict=True), markersize=5, linewidth=1.8, zorder=3, **style)

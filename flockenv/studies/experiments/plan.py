@@ -37,7 +37,7 @@ class Plan(Record):
 class Case(Record):
     """A case: a scene whose first effect is the `steer` that is varied."""
 
-    what: str = Field(description="what happens, in a sentence")
+    what: str = Field(description="description of the case, in a sentence")
     seconds: float = Field(gt=0, description="s, longest duration")
     scene: Scene
 

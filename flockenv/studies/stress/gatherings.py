@@ -82,7 +82,7 @@ def stalls(method: Integrator) -> Value:
 
 
 def along_a_wall(method: Integrator) -> Value:
-    """Compare steering to avoid, which has exactly no force across, with a force field, for flight .4 m beside a wall."""
+    """Compare steering to avoid, with exactly no force across, and a force field, for flight .4 m beside a wall."""
     forces = []
     for variant in ("to avoid", "force field"):
         scene = _agent_with_goal((Polygon(vertices=WALL),), variant, method)
