@@ -195,7 +195,7 @@ class KernelPlan(ObstacleSets):
         return pack_numbers(self)
 
     def parameters(self) -> list[float]:
-        """Every number that the kernel is passed; tables follow."""
+        """Return every number that the kernel is passed; tables follow."""
         return self._numbers[0]
 
     @property

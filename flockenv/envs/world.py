@@ -273,7 +273,7 @@ class World:
         return {**{f"state.{name}": array for name, array in state.items()}, **own}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from what `arrays` returned for as many worlds of the same task; the next step is equal bit for bit.
+        """Restore the result of `arrays` of as many worlds of the same task; the next step is then equal bit for bit.
 
         Raises ValueError, with the array that is missing, unknown, or of another shape or type, before any is written;
         RuntimeError before the first reset.

@@ -130,7 +130,7 @@ class Scene(Record):
 
     @model_validator(mode="after")
     def _check_fields(self) -> Scene:
-        """Check what involves several fields: equal dimensions, reach on a torus, memory; raise ValueError."""
+        """Raise ValueError if fields do not fit each other: dimensions, reach on a torus, memory."""
         self._check_dimensions()
         check_places(self)
         if self.dtype == "float32":  # each record checks the bounds of float64 itself

@@ -78,7 +78,7 @@ class _OneBehaviour(Steer):
         return force_of_one
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Index of the active behaviour."""
+        """Return the index of the active behaviour."""
         return {"which": float(self.which)}
 
 

@@ -72,5 +72,5 @@ class CorridorOrcaRules:
 
 
 def orca_corridor(see: Any, task: Corridor, p: CorridorOrcaRules) -> NDArray[np.float64]:
-    """Optimal reciprocal collision avoidance (van den Berg et al. 2011) along the corridor; walls are no neighbours."""
+    """Avoid others by ORCA (van den Berg et al. 2011) along the corridor; walls are not among the neighbours."""
     return keep_clear(see, task, p, _desired_velocity(see), _PERSON, _PERSON, 0.5) + _wall_force(see, 3.0, 0.1)

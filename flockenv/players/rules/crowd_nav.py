@@ -60,7 +60,7 @@ class RobotOrcaRules:
 
 
 def orca_crowd_nav(see: Any, task: CrowdNav, p: RobotOrcaRules) -> NDArray[np.float64]:
-    """Optimal reciprocal collision avoidance (van den Berg et al. 2011) towards the goal."""
+    """Head for the goal, and avoid pedestrians by ORCA (van den Berg et al. 2011)."""
     desired = seek(see.goal, np.zeros_like(see.goal), task.max_speed)
     return keep_clear(see, task, p, desired, _ROBOT, _PEDESTRIAN, 0.5 if task.visible else p.share)
 

@@ -55,7 +55,7 @@ def group_floor_field(group: int, *targets: Target, spacing: float = SPACING) ->
 
 
 def is_empty(state: State) -> bool:
-    """True if no agent is left in any world."""
+    """Return True if no agent is left in any world."""
     return not bool(state.alive.any())
 
 
