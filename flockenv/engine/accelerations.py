@@ -69,7 +69,7 @@ class ResponsePlan(NamedTuple):
 
 
 def response_plan(parts: KernelPlan) -> ResponsePlan:
-    """Return the plan of a scene."""
+    """Return the `ResponsePlan` of a scene."""
     targets, combined = ["s", "f", *(f"w{k}_" for k in parts.combined)], list(parts.combined)
     added: list[tuple[str, Added]] = []
     for k, effect in enumerate(parts.effects):
@@ -117,7 +117,7 @@ class SensePlan(NamedTuple):
 
 
 def sense_plan(parts: KernelPlan) -> SensePlan:
-    """Return the plan of a scene."""
+    """Return the `SensePlan` of a scene."""
     agent = agent_plan(parts)
     return SensePlan(
         agent, laws_of(parts, "aim_law"),

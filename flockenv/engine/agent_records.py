@@ -30,7 +30,7 @@ class AgentPlan(NamedTuple):
 
 
 def agent_plan(parts: KernelPlan) -> AgentPlan:
-    """Return the plan of a scene."""
+    """Return the `AgentPlan` of a scene."""
     paced = "desired_speed" in parts.frame_numbers
     return AgentPlan(parts.dimension, parts.width, parts.oriented, parts.aims, paced, parts.inner)
 

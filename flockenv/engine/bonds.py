@@ -110,7 +110,7 @@ class BondPlan(NamedTuple):
 
 
 def bond_plan(parts: KernelPlan, agent: AgentPlan) -> BondPlan:
-    """Return the plan of a scene."""
+    """Return the `BondPlan` of a scene."""
     d = parts.dimension
     laws = tuple(
         BondLaw(k, e.bond_law, e.partners, e.numbers(d)) for k, e in parts.bond_effects if e.bond_law is not None

@@ -71,7 +71,7 @@ class BeginPlan(NamedTuple):
 
 
 def begin_plan(parts: KernelPlan) -> BeginPlan | None:
-    """Return the plan of a scene; None if its agents have no inner states."""
+    """Return the `BeginPlan` of a scene; None if its agents have no inner states."""
     inner = inner_plan(parts)
     return BeginPlan(inner, parts.number_plan) if inner is not None else None
 

@@ -43,7 +43,7 @@ class FarPlan(NamedTuple):
 
 
 def far_plan(parts: KernelPlan) -> FarPlan:
-    """Return the plan of a scene."""
+    """Return the `FarPlan` of a scene."""
     laws = {k: FarLaw(k, effect.far_law, effect.weighs_mass) for k, effect in parts.far if effect.far_law is not None}
     in_tree = [k for k, _ in parts.tree_effects]
     direct = tuple(law for k, law in laws.items() if k not in in_tree)

@@ -40,7 +40,7 @@ class GroupPlan(NamedTuple):
 
 
 def group_plan(parts: KernelPlan) -> GroupPlan:
-    """Return the plan of a scene."""
+    """Return the `GroupPlan` of a scene."""
     laws = [
         GroupLaw(k, tuple(at * parts.width for name, at in parts.slots.items() if name.startswith(f"group{k}_")))
         for k, _ in parts.group_effects

@@ -25,7 +25,7 @@ class MethodPlan(NamedTuple):
 
 
 def method_plan(parts: KernelPlan) -> MethodPlan:
-    """Return the plan of a scene."""
+    """Return the `MethodPlan` of a scene."""
     drags = tuple((k, parts.names_of(e).index(e.linear_drag)) for k, e in enumerate(parts.effects) if e.linear_drag)
     return MethodPlan(parts.dimension, parts.width, drags)
 

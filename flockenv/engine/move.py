@@ -82,7 +82,7 @@ def inner_plan(parts: KernelPlan) -> InnerPlan | None:
 
 
 def move_plan(parts: KernelPlan) -> MovePlan:
-    """Return the plan of a scene."""
+    """Return the `MovePlan` of a scene."""
     kicks = tuple((k, e.kick_law) for k, e in enumerate(parts.effects) if e.kick_law is not None)
     method = parts.integrator.move() if isinstance(parts.integrator, OneStage) else None
     space = parts.space

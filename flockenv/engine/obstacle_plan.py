@@ -66,7 +66,7 @@ class Shape(NamedTuple):
 
 
 def obstacle_plan(parts: KernelPlan, agent: AgentPlan) -> Obstacles:
-    """Return the plan of a scene."""
+    """Return the `Obstacles` of a scene."""
     d, width, slots, around = parts.dimension, parts.width, parts.slots, parts.surroundings
 
     def places(prefix: str) -> tuple[int, ...]:

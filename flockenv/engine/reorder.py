@@ -56,7 +56,7 @@ class ArrangePlan(NamedTuple):
 
 
 def arrange_plan(parts: KernelPlan) -> ArrangePlan:
-    """Return the plan of a scene."""
+    """Return the `ArrangePlan` of a scene."""
     names = array_names(parts)
     packed = [field.partition(" ") for field in parts.reordered_fields]  # an array, and for vectors the axis
     common = [_COMMON.get(name) for name, _, _ in packed]

@@ -68,7 +68,7 @@ class StepPlan(NamedTuple):
 
 
 def step_plan(parts: KernelPlan) -> StepPlan:
-    """Return the plan of a scene."""
+    """Return the `StepPlan` of a scene."""
     d, w = parts.dimension, parts.width
     method = None if parts.one_stage else parts.integrator.advance()
     return StepPlan(

@@ -40,7 +40,7 @@ class CrossingRules:
 
 
 def crossing(see: Any, task: Crossing, p: CrossingRules) -> NDArray[np.float64]:
-    """Avoid collisions (unaligned avoidance, Reynolds 1999), then arrive; vectors are (along the course, to its left)."""
+    """Avoid collisions (unaligned, Reynolds 1999), then arrive; vectors are (along the course, to its left)."""
     own = see.velocity[:, None]
     others = own + see.neighbour_velocity
     time = unaligned_threat(see.neighbours, own, others, 2 * _WALKER + p.margin, p.horizon)
@@ -69,7 +69,7 @@ class OrcaRules:
 
 
 def orca_crossing(see: Any, task: Crossing, p: OrcaRules) -> NDArray[np.float64]:
-    """Head for the goal, and avoid others by ORCA (optimal reciprocal collision avoidance, van den Berg et al. 2011)."""
+    """Head for the goal; optimal reciprocal collision avoidance (van den Berg et al. 2011) avoids others."""
     still = np.zeros_like(see.goal)
     desired = arrive(see.goal, still, task.max_speed, p.slow_radius)
     return keep_clear(see, task, p, desired, _WALKER, _WALKER, 0.5)

@@ -1,4 +1,4 @@
-"""Evade: around obstacles, off the walls, away from pursuers, into cover."""
+"""Evade: avoid obstacles and walls, flee from pursuers, hide behind cover."""
 
 from __future__ import annotations
 
