@@ -301,7 +301,7 @@ def cells_of(results: Results, players: Sequence[str]) -> tuple[list[str], list[
 
 
 def show(results: Results) -> None:
-    """Print a table per task on the last player, and then the sentence of each task."""
+    """Print a table per task on the last player, and then the verdict on each task."""
     console = Console(highlight=False)
     if not console.is_terminal:
         console = Console(highlight=False, width=160)

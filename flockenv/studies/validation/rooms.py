@@ -65,7 +65,7 @@ def _scene(
 ) -> Scene:  # fmt: skip
     """Return a scene of two groups, each with its floor field; the second may be one without living agents.
 
-    The empty group has so many slots that the scene counts as large: small and large crowds then share a kernel.
+    The empty group has enough slots for the scene to count as large: small and large crowds then share a kernel.
     """
     all_groups, goals = list(groups), [*targets, targets[0]][:2]
     low = groups[0].spawn.low
