@@ -2,9 +2,9 @@
 
 Agents are numbered as the scene lists them, and consecutive agents lie anywhere in space: sorting them by cell takes an
 access to distant memory per agent and step. So at the beginning of a call all data of an agent moves to the place of
-its tile of cells, by number within a tile (`flockenv.geometry.spatial_sort`). Each step then sorts what is nearly sorted, and at
-the end all agents move back. `ident` holds which agent lies where in between. Sums do not change: within a cell agents
-are still visited in the order of their numbers.
+its tile of cells, by number within a tile (`flockenv.geometry.spatial_sort`). Each step then sorts what is nearly
+sorted, and at the end all agents move back. `ident` holds which agent lies where in between. Sums do not change: within
+a cell agents are still visited in the order of their numbers.
 """
 
 from __future__ import annotations
