@@ -123,7 +123,7 @@ class _OnPath(Moving):
         return polyline.pieces(self.points, self.closed, scene.space)
 
     def path_to_draw(self, scene: SceneView) -> tuple[tuple[Vec, ...], float] | None:
-        """Return its tube for pictures: points half a radius apart, at most MOST_PLACES pieces, and the radius."""
+        """Return the tube for pictures: points half a radius apart, at most MOST_PLACES pieces, and the radius."""
         path = scene.table_of(self)
         count = min(math.ceil(path[1] / (0.5 * self.radius)), MOST_PLACES)
         along = polyline.spine_points(path, np.linspace(0.0, path[1], count + 1), scene.dimension)
@@ -182,7 +182,7 @@ effects:
         return None if self.closed or self.slow_radius == 0 else self.slow_radius
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Return its parameters, with direction, progress and slow radius."""
+        """Return the parameters of the path, with direction, progress and slow radius."""
         own = {"way": float(self.way), "keep": float(self.keep), "slow_radius": float(self.slow_radius)}
         return super().parameters() | own
 

@@ -101,7 +101,7 @@ class Predicting(AboutNearest, Moving):
     longest: float = Field(default=10.0, ge=0, description="s, longest prediction")
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Return its numbers; the predictor is one of them."""
+        """Return the behaviour's numbers; the predictor is one of them."""
         return {**super().parameters(), "method": float(PREDICTORS.index(self.predictor))}
 
 

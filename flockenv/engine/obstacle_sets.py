@@ -58,7 +58,7 @@ class ObstacleSets:
         """The forms of shapes that are skipped if out of reach; empty if some fold has no reach.
 
         These are the forms whose laws loop over edges or cells. Laws of blocks and half-spaces are evaluated lane
-        beside lane, so some lane would need the whole law anyhow: there a test was no faster, with rays or without.
+        beside lane, so some lane would need the whole law anyhow: a test was not faster there, with rays or without.
         """
         return (
             tuple(form for form in ("chain", "distance_field") if form in self.shape_table[1]) if self.reaches else ()

@@ -103,7 +103,7 @@ class Stepper:
             found = min([f for f in (moved, *mended) if f[0] >= 0], default=found) if found[0] < 0 else found
             if failed.any():
                 state.put(failed, kept)
-                state.tick[failed] += step + 1  # they go on from the kept state
+                state.tick[failed] += step + 1  # steps continue from the kept state
         if failed.any():
             state.put(failed, kept)
         return found
