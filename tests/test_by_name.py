@@ -13,7 +13,7 @@ from flockenv.envs.world import World
 from flockenv.tasks import Crossing, Layout, Task
 from tests.catalogue import TASKS, TaskRow
 
-QUICK = ("pursuit_both", "flock", "corridor", "school")
+QUICK = ("pursuit_both", "flock")
 """Rows of the default run; each row compiles a kernel of its own."""
 EVERY = pytest.mark.parametrize(
     "row", [pytest.param(row, id=row.name, marks=() if row.name in QUICK else pytest.mark.slow) for row in TASKS]
