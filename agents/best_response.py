@@ -168,12 +168,13 @@ def table_of(payoffs: Payoffs) -> Table:
 def main(
     configs: Annotated[list[Path], typer.Argument(help="experiments, such as configs/training/school.yaml")],
     players: Annotated[
-        list[str] | None, typer.Option(help="by comma or repeated; [rules, ppo, and others written for the task]")
+        list[str] | None,
+        typer.Option(help="players, by comma or repeated [rules, ppo, and others written for the task]"),
     ] = None,
-    worlds: Annotated[int, typer.Option(min=2, help="evaluation worlds")] = WORLDS,
-    seed: Annotated[int, typer.Option(min=0, max=999, help="which of them")] = 0,
+    worlds: Annotated[int, typer.Option(min=2, help="number of evaluation worlds")] = WORLDS,
+    seed: Annotated[int, typer.Option(min=0, max=999, help="block of evaluation worlds")] = 0,
     trust_pickle: Annotated[
-        bool, typer.Option("--trust-pickle", help="load Stable-Baselines3 zips too: executes the code in them")
+        bool, typer.Option("--trust-pickle", help="also load Stable-Baselines3 zips, which executes the code in them")
     ] = False,
 ) -> None:
     """Measure whether one agent gains by a policy other than that of all others in its world."""

@@ -280,19 +280,19 @@ def _git(*command: str) -> str | None:
 
 @app.command()
 def main(
-    tasks: Annotated[list[str] | None, typer.Option(help="Tasks, by comma or repeated; all if left out.")] = None,
+    tasks: Annotated[list[str] | None, typer.Option(help="Tasks, by comma or repeated. [all]")] = None,
     players: Annotated[
         list[str] | None,
         typer.Option(help=f"Players: {', '.join(NAMES)}, a .py file with a predict, or a .safetensors."),
     ] = None,
-    worlds: Annotated[int | None, typer.Option(help=f"Worlds per task, the same for everyone. [{WORLDS}]")] = None,
-    seed: Annotated[int, typer.Option(help="Which evaluation worlds, 0 to 999.")] = 0,
+    worlds: Annotated[int | None, typer.Option(help=f"Worlds per task, the same for every player. [{WORLDS}]")] = None,
+    seed: Annotated[int, typer.Option(help="Block of evaluation worlds, 0 to 999.")] = 0,
     out: Annotated[str, typer.Option(help=f"Folder for {', '.join(FILES)}.")] = "results",
     smoke: Annotated[bool, typer.Option("--smoke", help=f"A quick look: {SMOKE_WORLDS} worlds.")] = False,
     trust_pickle: Annotated[
-        bool, typer.Option("--trust-pickle", help="Load Stable-Baselines3 zips too: executes the code in them.")
+        bool, typer.Option("--trust-pickle", help="Also load Stable-Baselines3 zips, which executes the code in them.")
     ] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show where an error came from.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show a traceback if something goes wrong.")] = False,
 ) -> None:
     """Play all tasks with all players in the same worlds, and compare their scores."""
     with report_errors("compare", "interrupted, nothing written", debug):

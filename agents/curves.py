@@ -131,7 +131,7 @@ def _curves(axes: Axes, task: str, numbers: Numbers) -> None:
 @app.command()
 def main(
     configs: Annotated[list[Path], typer.Argument(help="experiments, such as configs/training/obstacles.yaml")],
-    out: Annotated[str, typer.Option(help="picture; the numbers go beside it")] = "results/learning.png",
+    out: Annotated[str, typer.Option(help="picture; numbers are written beside it")] = "results/learning.png",
     runs: Annotated[Path, typer.Option(help="folder of checkpoints")] = Path("runs/curves"),
 ) -> None:
     """Train several settings of each task, and draw their learning curves side by side."""

@@ -329,10 +329,10 @@ def main(
     config: Annotated[Path, typer.Argument(help="an experiment, such as configs/training/pursuit.yaml")],
     out: Annotated[Path | None, typer.Option(help="default: flockenv/players/weights/TASK.safetensors")] = None,
     runs: Annotated[Path, typer.Option(help="folder of checkpoints")] = Path("runs"),
-    go_on: Annotated[bool, typer.Option("--resume", help="go on from the last checkpoint")] = False,
+    go_on: Annotated[bool, typer.Option("--resume", help="continue from the last checkpoint")] = False,
     tensorboard: Annotated[str | None, typer.Option(help="folder of TensorBoard logs")] = None,
-    steps: Annotated[int | None, typer.Option(help="agent-steps in all, instead of the config's")] = None,
-    seed: Annotated[int | None, typer.Option(help="instead of the config's")] = None,
+    steps: Annotated[int | None, typer.Option(help="total agent-steps, instead of those of the config")] = None,
+    seed: Annotated[int | None, typer.Option(help="training seed, instead of that of the config")] = None,
 ) -> None:
     """Train a policy with PPO and export its weights."""
     with one_line_errors():

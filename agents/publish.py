@@ -107,8 +107,10 @@ def _read_comparison(folder: Path) -> Results:
 
 @app.command()
 def main(
-    folder: Annotated[Path, typer.Argument(help="where `python -m agents.compare` wrote its files")] = Path("results"),
-    root: Annotated[Path, typer.Option(help="the checkout whose documents are written")] = ROOT,
+    folder: Annotated[Path, typer.Argument(help="folder with the files of `python -m agents.compare`")] = Path(
+        "results"
+    ),
+    root: Annotated[Path, typer.Option(help="checkout in which pages are written")] = ROOT,
 ) -> None:
     """Copy a comparison's results and picture into docs/, draw its summary, and write the tables of the pages."""
     with one_line_errors():

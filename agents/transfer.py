@@ -73,23 +73,26 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions
 
 @app.command()
 def main(
-    tasks: Annotated[list[str] | None, typer.Argument(metavar="TASK", help="Tasks; all if left out.")] = None,
+    tasks: Annotated[list[str] | None, typer.Argument(metavar="TASK", help="Tasks. [all]")] = None,
     players: Annotated[list[str] | None, typer.Option(help="Players, as in agents.compare.")] = None,
     methods: Annotated[
-        list[str] | None, typer.Option(help="Kinds of integrators, with :float32 if so. [" + ",".join(METHODS) + "]")
+        list[str] | None,
+        typer.Option(help="Integrators; KIND:float32 in single precision. [" + ",".join(METHODS) + "]"),
     ] = None,
     substeps: Annotated[
         list[str] | None, typer.Option(help="Physics steps per decision. [" + ",".join(map(str, SUBSTEPS)) + "]")
     ] = None,
-    worlds: Annotated[int, typer.Option(help="Worlds per task, the same for everyone.")] = WORLDS,
-    rounds: Annotated[int, typer.Option(help="Rounds by the clock.")] = ROUNDS,
-    seed: Annotated[int, typer.Option(help="Which evaluation worlds, 0 to 999.")] = 0,
-    workers: Annotated[int, typer.Option(help="Processes that compile and play; 1 = none but this one.")] = min(
+    worlds: Annotated[int, typer.Option(help="Worlds per task, the same for every player.")] = WORLDS,
+    rounds: Annotated[int, typer.Option(help="Rounds in which wall time is measured.")] = ROUNDS,
+    seed: Annotated[int, typer.Option(help="Block of evaluation worlds, 0 to 999.")] = 0,
+    workers: Annotated[int, typer.Option(help="Processes that compile and play; 1: only this one.")] = min(
         2, os.cpu_count() or 1
     ),
     out: Annotated[str, typer.Option(help=f"Folder for {', '.join(FILES)}.")] = "results",
-    trust_pickle: Annotated[bool, typer.Option("--trust-pickle", help="Load zips too: executes code in them.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show where an error came from.")] = False,
+    trust_pickle: Annotated[
+        bool, typer.Option("--trust-pickle", help="Also load Stable-Baselines3 zips, which executes the code in them.")
+    ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show a traceback if something goes wrong.")] = False,
 ) -> None:
     """Play the same worlds with integrators of different accuracy; show the effect on each policy, and the cost."""
     with report_errors("transfer", STOPPED, debug):

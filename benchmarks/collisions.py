@@ -59,7 +59,7 @@ def heap(count: int) -> tuple[Scene, State]:
 
 
 def main(
-    count: Annotated[int, typer.Option(min=10, help="How many discs.")] = 1000,
+    count: Annotated[int, typer.Option(min=10, help="Number of discs.")] = 1000,
     quick: Quick = False,
     rounds: Rounds = None,
     out: Out = None,

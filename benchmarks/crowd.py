@@ -96,10 +96,10 @@ def _race_jupedsim(bench: Bench, cache: Path, most: Machine | None) -> None:
 
 
 def main(
-    single: Annotated[bool, typer.Option("--single", help="float32 too, not only float64.")] = False,
-    minute: Annotated[bool, typer.Option(help="Run a minute of the crowd's time too.")] = True,
-    models: Annotated[bool, typer.Option(help="Race all models.")] = True,
-    cache: Annotated[Path, typer.Option(help="Where the virtual environments of peers live.")] = CACHE,
+    single: Annotated[bool, typer.Option("--single", help="Also in float32.")] = False,
+    minute: Annotated[bool, typer.Option(help="Also simulate a minute.")] = True,
+    models: Annotated[bool, typer.Option(help="Compare all models.")] = True,
+    cache: Annotated[Path, typer.Option(help="Folder of the virtual environments of peers.")] = CACHE,
     quick: Quick = False,
     rounds: Rounds = None,
     out: Out = None,

@@ -272,7 +272,7 @@ def _note_microseconds(bench: Bench, results: Sequence[Result], work: int) -> No
 
 def main(
     only: Annotated[str, typer.Option(help=f"One task: {', '.join(TASK_IDS)}.")] = "",
-    threads: Annotated[int, typer.Option(min=1, help="The most threads; 1 is always measured.")] = 2,
+    threads: Annotated[int, typer.Option(min=1, help="Largest number of threads; 1 is always measured.")] = 2,
     quick: Quick = False,
     rounds: Rounds = None,
     out: Out = None,

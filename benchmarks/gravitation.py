@@ -61,8 +61,8 @@ def _compare(bench: Bench, dimension: int, dtype: str, largest: int, most: Machi
 
 
 def main(
-    single: Annotated[bool, typer.Option("--single", help="float32 too, not only float64.")] = False,
-    largest: Annotated[int, typer.Option(min=AGENTS[0], help="No world with more agents than this.")] = AGENTS[-1],
+    single: Annotated[bool, typer.Option("--single", help="Also in float32.")] = False,
+    largest: Annotated[int, typer.Option(min=AGENTS[0], help="Largest number of agents in a world.")] = AGENTS[-1],
     quick: Quick = False,
     rounds: Rounds = None,
     out: Out = None,

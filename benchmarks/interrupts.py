@@ -176,9 +176,11 @@ def _leftovers(folder: Path, cache: Path) -> Iterator[str]:
 
 
 def main(
-    times: Annotated[int, typer.Option(min=1, help="Interrupts in all.")] = 300,
-    seed: Annotated[int, typer.Option(help="Of moments and signals.")] = 0,
-    longest: Annotated[float, typer.Option(help="s, the latest moment; half of them are in the first 1.5 s.")] = 10.0,
+    times: Annotated[int, typer.Option(min=1, help="Total number of interrupts.")] = 300,
+    seed: Annotated[int, typer.Option(help="Seed of moments and signals.")] = 0,
+    longest: Annotated[
+        float, typer.Option(help="Latest moment in seconds; half of the moments are in the first 1.5 s.")
+    ] = 10.0,
     cold: Annotated[float, typer.Option(min=0, max=1, help="Share of runs with an empty cache.")] = 0.25,
     only: Annotated[str, typer.Option(help="Commands, by comma [all].")] = "",
 ) -> None:

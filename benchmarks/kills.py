@@ -189,8 +189,8 @@ def _kill_until_it_ends(
 
 @app.command()
 def main(
-    times: Annotated[int, typer.Option(min=1, help="kills")] = 200,
-    seed: Annotated[int, typer.Option(min=0, help="of their moments")] = 0,
+    times: Annotated[int, typer.Option(min=1, help="number of kills")] = 200,
+    seed: Annotated[int, typer.Option(min=0, help="seed of their moments")] = 0,
 ) -> None:
     """Kill short trainings at random moments, resume them, and count how they end."""
     with tempfile.TemporaryDirectory() as folder:

@@ -50,7 +50,7 @@ def agents_among_obstacles(count: int, kind: str = "block", dtype: str = "float6
 
 
 def main(
-    kind: Annotated[Literal["block", "capsule", "circle"], typer.Option(help="What the obstacles are.")] = "block",
+    kind: Annotated[Literal["block", "capsule", "circle"], typer.Option(help="Kind of the obstacles.")] = "block",
     dtype: Annotated[Literal["float32", "float64"], typer.Option(help="Precision of the scene.")] = "float64",
     quick: Quick = False,
     rounds: Rounds = None,

@@ -223,7 +223,7 @@ def _run(peer: str, command: Sequence[str]) -> None:
 def main(
     peers: Annotated[str, typer.Option(help=f"Packages to run: {', '.join(PEERS)}. [those installed]")] = "",
     to_install: Annotated[str, typer.Option("--install", help="Packages to install first, or `all`.")] = "",
-    cache: Annotated[Path, typer.Option(help="Where the virtual environments live.")] = CACHE,
+    cache: Annotated[Path, typer.Option(help="Folder of the virtual environments.")] = CACHE,
     threads: Annotated[int, typer.Option(min=1, help="Cores for each side.")] = 1,
     quick: Quick = False,
     rounds: Rounds = None,

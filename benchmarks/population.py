@@ -70,7 +70,7 @@ def _keep_stepping(scene: Scene, start: State) -> Callable[[], object]:
 
 
 def main(
-    alive: Annotated[int, typer.Option(min=1000, help="How many are alive.")] = 100_000,
+    alive: Annotated[int, typer.Option(min=1000, help="Number of living agents.")] = 100_000,
     quick: Quick = False,
     rounds: Rounds = None,
     out: Out = None,

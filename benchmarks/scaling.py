@@ -128,9 +128,9 @@ def _note_memory(bench: Bench, dtype: str) -> None:
 
 
 def main(
-    double: Annotated[bool, typer.Option("--double", help="float64 too, not only float32.")] = False,
-    threads: Annotated[int, typer.Option(min=1, help="The most threads; 1 is always measured.")] = 2,
-    largest: Annotated[int, typer.Option(min=1, help="No world with more agents than this.")] = AGENTS[-1],
+    double: Annotated[bool, typer.Option("--double", help="Also in float64.")] = False,
+    threads: Annotated[int, typer.Option(min=1, help="Largest number of threads; 1 is always measured.")] = 2,
+    largest: Annotated[int, typer.Option(min=1, help="Largest number of agents in a world.")] = AGENTS[-1],
     quick: Quick = False,
     rounds: Rounds = None,
     out: Out = None,

@@ -211,7 +211,7 @@ def _note_summary(bench: Bench) -> None:
 
 def main(
     only: Annotated[str, typer.Option(help=f"One task: {', '.join(EXPERIMENTS)}.")] = "",
-    seconds: Annotated[float | None, typer.Option(min=0.1, help="A turn lasts at least. [4; quick: 1]")] = None,
+    seconds: Annotated[float | None, typer.Option(min=0.1, help="Least seconds of a turn. [4; quick: 1]")] = None,
     quick: Quick = False,
     rounds: Rounds = None,
     out: Out = None,

@@ -77,7 +77,7 @@ def picture(path: Path, seconds: float = 3.0) -> None:
 def main() -> None:
     """Measure, or draw."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--picture", type=Path, help="draw the room instead")
+    parser.add_argument("--picture", type=Path, help="draw the room instead of measuring")
     given = parser.parse_args()
     if given.picture:
         picture(given.picture)
