@@ -211,7 +211,7 @@ def _teach_first(model: PPO, task: Task, p: PpoSettings) -> float:
         return 0.0
     began = time.perf_counter()
     with use_thread_count(p.threads), show_progress(Progress(console=console, transient=True)) as progress:
-        bar = progress.add_task(f"{task.name}: is taught", total=p.taught)
+        bar = progress.add_task(f"{task.name}: imitation", total=p.taught)
         teach(model, task, player(task), p.taught, advance=lambda n: progress.advance(bar, n))
     return time.perf_counter() - began
 
@@ -257,7 +257,12 @@ def train(
         if run is not None and run.steps >= experiment.ppo.steps:
             return run
         if go_on and run is None:
-            console.print(f"no checkpoint in {folder}: starts anew", markup=False, highlight=False, soft_wrap=True)
+            console.print(
+                f"no checkpoint in {folder}: training starts from the beginning",
+                markup=False,
+                highlight=False,
+                soft_wrap=True,
+            )
         return _train_from(experiment, folder, run, tensorboard, saved)
 
 

@@ -65,9 +65,7 @@ class Process(Contestant):
 
 
 def main(
-    env_id: Annotated[
-        str, typer.Argument(help="Environment or scene that is made and stepped.")
-    ] = "flockenv/Pursuit-v0",
+    env_id: Annotated[str, typer.Argument(help="Id of the environment.")] = "flockenv/Pursuit-v0",
     quick: Quick = False,
     rounds: Rounds = None,
     out: Out = None,

@@ -380,7 +380,7 @@ def test_checkpoint_of_an_older_format_is_refused_in_one_line(copied: Path, name
 
 def test_resume_without_a_checkpoint_starts_a_training_and_reports_it(fresh: Path) -> None:
     result = command(fresh, "--resume")
-    assert result.stderr == f"no checkpoint in {fresh / 'runs' / 'pursuit'}: starts anew\n"
+    assert result.stderr == f"no checkpoint in {fresh / 'runs' / 'pursuit'}: training starts from the beginning\n"
     assert isinstance(result.exception, AssertionError)  # from the fixture's build
 
 
