@@ -99,7 +99,7 @@ def _can_turn(p: Any, me: Me, normal: Vec, aside: Vec, hit: float) -> bool:
 
 @law
 def sidestep_threat(p: Any, me: Me, acc: Vec) -> Vec:
-    """Return F = w (1 m/s) sideways to the nearest edge; without one, or too near to turn, to the normal's side."""
+    """Return F = w (1 m/s) to the side of the nearest edge or, if none can be reached, of the surface normal."""
     e = like(me.who, 1.0)
     offset, aside = _offset_and_side(acc)
     away = steering.avoid(me.heading, offset, acc[1], e)

@@ -1,4 +1,4 @@
-"""Check of the address space a command needs: too little gives a one-line message, not a failure inside a library.
+"""Check that a command has enough address space: if not, one line is printed before a library fails.
 
 If the address space is limited (`ulimit -v`, batch systems), numpy and llvmlite fail to load with errors that do not
 mention memory, and loading OpenBLAS never returns.

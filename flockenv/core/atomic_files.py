@@ -1,7 +1,8 @@
 """Atomic writes of one file or of several together: each appears complete or not at all.
 
 New files are written in a new folder beside their target. Only this user can enter it, and its name is unique, so no
-other writer and no planted link can share a name with them. They are synced to the disk, then renamed to their target.
+other writer, and no link made by another user, can have the same name. They are synced to the disk, then renamed to
+their target.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ LEFTOVERS = f"{_PREFIX}*{_SUFFIX}"
 
 @contextmanager
 def replace_file(path: str | os.PathLike[str], mode: int = 0o666) -> Iterator[BinaryIO]:
-    """Open a new file for writing and rename it to `path` at the end; on any error nothing is left behind.
+    """Open a new file for writing and rename it to `path` at the end; on any error it is removed.
 
     An existing file is replaced; a link is itself replaced, never followed. The folder must exist.
     mode: permissions of the file, restricted by the umask.
@@ -74,7 +75,7 @@ def write_all_or_none(folder: Path, writers: Mapping[str, Callable[[Path], objec
 
 @contextmanager
 def new_folder(folder: Path) -> Iterator[None]:
-    """Create a folder and its parents; if the block raises, the created folders that are empty are removed again."""
+    """Create a folder and its parents; if the block raises, remove those that were created and are empty."""
     new = [path for path in (folder, *folder.parents) if not path.exists()]
     with ExitStack() as stack:
         for path in reversed(new):
@@ -142,7 +143,7 @@ def _name_in_errors(target: Path, part: Path | None = None) -> Iterator[None]:
 
 
 def _rename(parts: Mapping[Path, Path]) -> None:
-    """Rename files to their targets (`parts`: target -> file); on any error restore the old files."""
+    """Rename files to their targets, as `parts` (target -> file) lists them; on any error restore the old files."""
     with signals.defer_signals():
         kept = {target: _back_up(target, part) for target, part in parts.items()} if len(parts) > 1 else {}
         try:
@@ -172,7 +173,7 @@ def _back_up(target: Path, part: Path) -> Path | None:
 
 
 def _restore(target: Path, old: Path | None) -> bool:
-    """Restore what was at a target: the file `old`, or no file (None). Return True on success."""
+    """Move the file `old` back to its target, or remove the new file if `old` is None; return True on success."""
     try:
         if old is None:
             target.unlink()

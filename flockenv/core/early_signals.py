@@ -1,7 +1,7 @@
-"""The first lines of a command: signals are blocked here until `flockenv.core.signals` handles them.
+"""Blocking of signals from the start of a command until `flockenv.core.signals` handles them.
 
-`signals` takes milliseconds to import. This module imports only what Python has already loaded by itself, and omits
-`from __future__ import annotations`, as `__future__` is a file too.
+`signals` takes milliseconds to import. This module imports only what Python has already loaded by itself; even `from
+__future__ import annotations` would load a file.
 """
 
 import _signal  # type: ignore[import-not-found]  # built in; `signal` imports enum first
@@ -24,7 +24,7 @@ def command() -> str:
 
 
 def _is_beside_flockenv(package: str) -> bool:
-    """Return True if a package that is being imported lies beside flockenv: other programs also have an `agents`."""
+    """Return True if this package lies beside flockenv: other programs may also have a package `agents`."""
     file = getattr(sys.modules.get(package), "__file__", None) or ""
     theirs, ours = (os.path.dirname(os.path.dirname(os.path.realpath(path))) for path in (file, _PACKAGE))
     return theirs == ours

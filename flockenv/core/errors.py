@@ -35,7 +35,7 @@ Schema = dict[str, Any]
 
 MANY = 30  # most allowed names that are listed beside a suggestion
 FEW = 10  # most names that are listed in full
-MOST = 100  # errors that are examined: a file with more has one mistake, not a hundred
+MOST = 100  # most errors that are examined: more usually have one common cause
 
 
 @dataclass(frozen=True)
@@ -72,13 +72,13 @@ def refusals(error: ValidationError, model: type[BaseModel], data: object) -> li
 
 
 def _is_type_error(detail: ErrorDetails) -> bool:
-    """Return True for a type error, which pydantic also reports for each union member that does not fit."""
+    """Return True for a type error; pydantic also reports one for each member of a union that does not match."""
     return detail["type"] in ("float_type", "int_type", "string_type", "bool_type")
 
 
 @functools.cache
 def _schema_of(model: type[BaseModel]) -> Schema:
-    """Return a model's JSON schema, cached: it takes 0.25 s for a Scene, whose kinds are all registered by then."""
+    """Return a model's JSON schema, cached: computing that of Scene takes 0.25 s."""
     return model.model_json_schema()
 
 
@@ -108,7 +108,7 @@ def _close_matches(word: str, allowed: Iterable[str], most: int = 1, least: floa
 
 
 def key_path(path: KeyPath) -> str:
-    """Return effects[1].radius for ("effects", 1, "radius"); a name that is not a word is quoted and escaped."""
+    """Return effects[1].radius for ("effects", 1, "radius"), with names that are not words quoted and escaped."""
     text = ""
     for step in path:
         if isinstance(step, int):
@@ -167,7 +167,7 @@ def _context(detail: ErrorDetails) -> Mapping[str, Any]:
 def _line(path: KeyPath, detail: ErrorDetails, schema: Schema, data: object) -> str:
     place, value = key_path(path), _value(detail)
     reason = _reason(path, detail, schema, data)
-    # Printing a whole block would bury the reason.
+    # The reason would be hard to find behind a whole printed block.
     block = isinstance(value, (Mapping, list, tuple)) and detail["type"] != "extra_forbidden"
     if block or detail["type"] in _MISSING:
         return f"{place}: {reason}" if place else reason
@@ -205,7 +205,7 @@ def _reason(path: KeyPath, detail: ErrorDetails, schema: Schema, data: object) -
 
 
 def _hint(value: object, kind: str) -> str:
-    """Return what to write instead, if a slip of notation is likely."""
+    """Return a hint what to write instead if the notation is likely to be wrong, else ''."""
     if isinstance(value, str) and kind.startswith(("float", "int")):
         return ", not text"
     if isinstance(value, float) and kind.startswith("int") and value.is_integer():
@@ -313,7 +313,7 @@ def _select_member(node: Schema, place: object, schema: Schema) -> Schema:
     if tagged and isinstance(place, Mapping):
         name = tagged["mapping"].get(str(place.get(tagged["propertyName"])))
         if name or tagged["propertyName"] in place or not _fits(_resolve_reference(chosen, schema), place):
-            chosen = {"$ref": name} if name else {}  # else the first kind, the default of a block without one
+            chosen = {"$ref": name} if name else {}  # else the first kind, which is the default
     elif not tagged:
         chosen = next((m for m in members if _fits(_resolve_reference(m, schema), place)), chosen)
     own = {key: value for key, value in node.items() if key == "description"}

@@ -1,10 +1,10 @@
-"""Bounds on the size of numbers, such that laws neither overflow nor divide by zero with them.
+"""Bounds on the size of numbers, within which laws neither overflow nor divide by zero.
 
 Laws multiply: an energy is a mass times two speeds, a spring force a stiffness times a length. They also divide: by a
 mass, by the square of a distance. So neither a product of three numbers nor the reciprocal of a square may overflow.
 Both bounds follow from the largest number M of a precision, as powers of ten: its cube root, 1e102 and 1e12, and the
-reciprocal of its square root, 1e-154 and 1e-19 (float64 and float32). 0 is always in range; the reader of a value
-checks whether 0 makes sense. Positions and velocities, which grow in a simulation, may be as large as their squares
+reciprocal of its square root, 1e-154 and 1e-19 (float64 and float32). 0 is always allowed here; a parameter that must
+not be 0 has its own check. Positions and velocities, which grow in a simulation, may be as large as their squares
 allow: 1e154 and 1e19.
 """
 

@@ -40,7 +40,7 @@ def lists_to_tuples(value: Any) -> Any:
 
 
 class _OneLine(ModelMetaclass):
-    """Metaclass that turns pydantic's report into one line if a record is built by hand; files go through yaml_io."""
+    """Metaclass that turns pydantic's errors into one line if a record is built in Python; yaml_io does for files."""
 
     def __call__(cls, *args: Any, **data: Any) -> Any:  # noqa: N805  # the class of a class
         try:
@@ -64,7 +64,7 @@ class _OneLine(ModelMetaclass):
 
 
 class Record(BaseModel, metaclass=_OneLine):
-    """A frozen record: its repr is its constructor call; it compares, hashes, pickles and converts to a YAML block.
+    """A frozen record that compares, hashes, pickles and converts to YAML; its repr is its constructor call.
 
     An unknown or invalid field raises ValueError at construction, with a one-line message that names it.
     """
@@ -89,7 +89,7 @@ class Record(BaseModel, metaclass=_OneLine):
 
     @model_validator(mode="after")
     def _check_magnitudes(self) -> Self:
-        """Raise ValueError for numbers so large or small that laws overflow; nested records were checked when made."""
+        """Raise ValueError for numbers with which laws overflow; nested records were checked at construction."""
         for name in type(self).model_fields:
             value = getattr(self, name)
             if isinstance(value, (float, tuple)):

@@ -1,4 +1,4 @@
-"""Signal handling of commands: one line on stderr, exit code 128 + signal, no partly written file is left.
+"""Signal handling of commands: one line on stderr, exit code 128 + signal, and removal of unfinished files.
 
 Python raises KeyboardInterrupt wherever the main thread happens to be: in an import, inside numba's compiler, in a
 callback that swallows it and prints a traceback. A command handles its signals itself instead. KeyboardInterrupt is
@@ -6,7 +6,7 @@ raised only while a line of flockenv or agents is being executed, outside of imp
 is reached for PATIENCE seconds, or the command has not started yet, partly written files are removed and the process
 ends.
 
-This module imports nothing slow, so that it is active before Gymnasium, numba and torch are imported.
+This module imports nothing slow, so that it takes effect before Gymnasium, numba and torch are imported.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ def exit_now(code: int) -> None:
 
 
 def begin_worker() -> None:
-    """Make a worker process of a command end on SIGTERM only, without output; the command handles the other signals."""
+    """Let SIGTERM alone end a worker process, without output; the command handles the other signals."""
     begin(_Received.name)
     _Received.written = True
     for which in ("SIGINT", "SIGHUP"):
@@ -144,7 +144,7 @@ def begin_worker() -> None:
 
 
 def _end_after(parent: int) -> None:
-    """End this process after its parent has ended, even by SIGKILL: its parent process id then changes."""
+    """End this process once its parent's id is no longer `parent`: the parent has ended, perhaps by SIGKILL."""
     while os.getppid() == parent:
         time.sleep(0.25)
     os.kill(os.getpid(), signal.SIGTERM)
@@ -176,9 +176,9 @@ def defer_signals() -> Iterator[None]:
 
 @contextmanager
 def remove_at_end(path: str | os.PathLike[str], if_empty: bool = False) -> Iterator[str]:
-    """Remove a file or folder at the end of the block or when a signal ends the process; yield its absolute path.
+    """Remove a path at the end of the block, or if a signal ends the process; yield the absolute path.
 
-    Complete files have been renamed before. if_empty: a folder is removed only if it is empty.
+    Complete files are no longer there, as they were renamed. if_empty: a folder is removed only if it is empty.
     """
     name = os.path.abspath(path)
     _unfinished[name] = if_empty

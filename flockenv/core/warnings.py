@@ -1,4 +1,4 @@
-"""Warnings of a simulation: it continues, but the result may not be the intended one."""
+"""Warnings that the result of a simulation, which continues, may not be the intended one."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ class CoarseContactWarning(UserWarning):
 
 
 class LookaheadWarning(UserWarning):
-    """An agent detects obstacles, or the place where to slow down, too late to stop there."""
+    """An agent detects an obstacle, or starts to slow down for a target, too late to stop in time."""
 
 
 class UnmetWarning(UserWarning):
-    """A rod or rope does not have its length: the allowed number of sweeps did not suffice."""
+    """A rod or rope does not have its length after the allowed number of sweeps."""
 
 
 class UnsolvedContactsWarning(RuntimeWarning):
-    """Too many impacts in a step, contacts that the passes did not resolve, or too long a path round a torus."""
+    """A step has too many impacts, contacts that the passes did not resolve, or too long a path on a torus."""
 
 
 class NoWayWarning(UserWarning):

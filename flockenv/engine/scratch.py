@@ -69,7 +69,7 @@ def scratch_of(parts: KernelPlan, agents: int, team: int = 1) -> dict[str, Array
 
 
 def _query_arrays(parts: KernelPlan, agents: int, team: int) -> dict[str, Array]:
-    """Return the arrays for finding neighbours: small worlds are listed in rows, others in cells, as records."""
+    """Return the arrays of the neighbour search: rows for small worlds, records sorted by cell for others."""
     real, whole, width = np.dtype(parts.dtype), np.dtype(np.int32), parts.width
     padded = -(-agents // width) * width
     found: dict[str, Array] = {

@@ -1,4 +1,4 @@
-"""Buffer pool: new arrays in memory that nothing refers to any more.
+"""Buffer pool: new arrays in the memory of released ones.
 
 A step returns megabytes. Above 32 MB (less with other allocators) the system has to find, zero and map memory for each
 new array; the memory of a released array is already mapped, and often still in the processor's cache.
@@ -22,7 +22,7 @@ Memory = tuple[NDArray[np.uint8], int]
 
 
 def _holders(kept: list[Memory], k: int) -> int:
-    """Return the number of references to a buffer, the list's included; views and tensors refer to their base array."""
+    """Return the number of references to buffer k of the list, whose own, and those of views, are included."""
     return sys.getrefcount(kept[k][0])
 
 
@@ -31,7 +31,7 @@ _NOBODY = _holders([(np.empty(0, np.uint8), 0)], 0)
 
 
 class BufferPool:
-    """Buffer pool that returns arrays like np.empty, in memory of earlier ones that nothing refers to any more.
+    """Buffer pool that returns arrays like np.empty, in the memory of earlier ones without references.
 
     It is not thread-safe, but arrays may be released in any thread.
     """

@@ -1,7 +1,7 @@
 """Named data in a private folder, verified by a digest when it is read.
 
-A file begins with a digest of its name and of all that follows. A file that was emptied, truncated or changed is never
-returned: one line on stderr reports it, and it is replaced when its data is written again. Files are written by
+A file begins with a digest of its name and of all that follows. The content of an emptied, truncated or changed file is
+never returned: one line on stderr reports it, and it is replaced when its data is written again. Files are written by
 `flockenv.core.atomic_files`, so that no process ever reads half of one.
 """
 
@@ -47,7 +47,7 @@ class Store:
         self._write_or_report(name, _header(name, data) + data)
 
     def write_text(self, name: str, text: str) -> None:
-        """Store a text unchanged, for people to read; a changed file is replaced, and one line reports it."""
+        """Store a text without a digest, for people to read; replace a file that differs, reported in one line."""
         wanted, found = text.encode(), self._content(name)
         if found != wanted:
             if found is not None:
@@ -55,7 +55,7 @@ class Store:
             self._write_or_report(name, wanted)
 
     def _content(self, name: str) -> bytes | None:
-        """Return a file's content; None if it is missing, or not private or not readable, which one line reports."""
+        """Return a file's content; None if it is missing, or (reported in one line) not private or not readable."""
         path = self.folder / name
         try:
             return read_private(path)
@@ -69,7 +69,7 @@ class Store:
         say_once(f"{self.folder / name}: damaged; rebuilt")
 
     def _write_or_report(self, name: str, data: bytes) -> None:
-        """Write a file, or report why it could not be written: only the next process's startup time depends on it."""
+        """Write a file, or report the reason for failure: without it, only the next start takes longer."""
         try:
             with replace_file(self.folder / name, 0o600) as file:
                 file.write(data)

@@ -4,7 +4,7 @@ numba's settings (NUMBA_CPU_NAME, NUMBA_CPU_FEATURES, NUMBA_ENABLE_AVX) take pre
 listed: those implied by a processor's name alone are not detected. FLOCKENV_REGISTER=32 or 64 sets the register width
 in bytes, for experiments. On one processor the results are bit-identical in both widths, as lanes are independent. (The
 number of pairs evaluated, `State.work`, does depend on the number of lanes.) On a processor with other instructions
-they mostly are, but need not be: LLVM chooses which product of a sum it fuses.
+they may differ in rare cases: LLVM chooses which product of a sum it fuses.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Decorators of compiled code (laws, kernels, ...) and the few helper functions that both are written with.
+"""Decorators of compiled code (laws, kernels, ...), and the few helper functions that laws and kernels use.
 
 Entry points, which Python calls, are made in `section`.
 """
@@ -71,7 +71,7 @@ if IN_PYTHON:
 
 
 def _compile_part(function: F, **options: Any) -> F:
-    """Compile a part of kernels with numba; its signature is stored, as numba computes it twice, which is slow."""
+    """Compile a part of kernels with numba, with its signature cached, which numba would compute twice."""
     function.__signature__ = inspect.signature(function)  # type: ignore[attr-defined]
     return cast(F, _njit(**{**OPTIONS, **options})(function))
 
@@ -90,17 +90,17 @@ def unfused(function: F) -> F:
 
 
 def kernel(function: F) -> F:
-    """Mark a part of a kernel, which reads and writes arrays or combines laws; it is compiled into its callers."""
+    """Mark a part of a kernel that reads and writes arrays or combines laws; it is inlined into its callers."""
     return _compile_part(function)
 
 
 def routine(function: F) -> F:
-    """Mark a function that a kernel calls from several places; it is compiled once and not inlined."""
+    """Mark a function that kernels call from several places; it is compiled once and not inlined."""
     return _compile_part(function, forceinline=False)
 
 
 def shared(function: F) -> F:
-    """Mark a law that Python also calls, as plain Python: a method's `advance`, for example, runs in both."""
+    """Mark a law that Python code also calls, uncompiled: for example a method's `advance`."""
     mark: Any = register_jitable
     return cast(F, mark(**OPTIONS)(function))
 
@@ -111,7 +111,7 @@ def python_of(function: Any) -> Any:
 
 
 def like(x: float, constant: float) -> float:
-    """Return `constant` in the precision of `x`: a bare 0.5 would turn a float32 law into a float64 one."""
+    """Return `constant` in the precision of `x`: a literal 0.5 would make a float32 law compute in float64."""
     return type(x)(constant)
 
 

@@ -35,12 +35,12 @@ __all__ = [
 
 
 def intrinsic_or_python(generate: Callable[..., Any], plain: Callable[..., Any]) -> Any:
-    """Return an intrinsic; with NUMBA_DISABLE_JIT=1, which runs kernels in plain Python, the function `plain`."""
+    """Return an intrinsic or, with NUMBA_DISABLE_JIT=1, where kernels are plain Python, the function `plain`."""
     return plain if IN_PYTHON else intrinsic(generate)
 
 
 def literal_value(number: Any, name: str) -> int:
-    """Return an integer literal's value; else raise TypingError, after which numba tries again with literal types."""
+    """Return an integer literal's value; otherwise raise TypingError, so that numba retries with literal types."""
     if not isinstance(number, types.IntegerLiteral):
         raise numba.TypingError(f"{name}: {number}, must be an integer literal")
     return int(number.literal_value)
@@ -115,9 +115,9 @@ def generate_prefetch(builder: Any, address: Any) -> None:
 
 
 def _prefetch_for_write(typing_context: Any, array: Any, place: Any) -> Any:
-    """Prefetch the cache line of array[place], with a flat index, which is written soon.
+    """Prefetch the cache line of array[place], `place` a flat index, for a write that follows soon.
 
-    Accesses in random order wait for one line after another; prefetched early, the lines are loaded in parallel.
+    Accesses in random order wait for one line after another; lines that are prefetched early load in parallel.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -133,7 +133,7 @@ prefetch_for_write: Any = intrinsic_or_python(_prefetch_for_write, lambda array,
 
 
 def _tuple_as_array(typing_context: Any, numbers: Any) -> Any:
-    """Return the numbers of a tuple as an array that a law may write, valid while its caller runs.
+    """Return the numbers of a tuple as an array that a law may write; it is valid while the law's caller runs.
 
     It is on the stack, as laws allocate nothing. A law must not return it.
     """
@@ -216,7 +216,7 @@ _fetch_add: Any = intrinsic_or_python(
     _atomic_fetch_add, _fetch_add_in_python
 )  # Any: numba's stubs say that it never returns
 
-_PATIENCE = 2000  # rounds of spinning before the thread yields its core
+_PATIENCE = 2000  # loops of waiting before the thread yields its core
 
 _yield_core: Any = numba.njit(lambda: 0)
 

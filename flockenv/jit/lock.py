@@ -1,7 +1,7 @@
-"""Lock of the disk cache: one process compiles a kernel, the others wait, so a dozen workers start as fast as one.
+"""Lock of the disk cache: one process compiles a kernel while others wait, so many workers start as fast as one.
 
-In numba every process that does not find a kernel on the disk compiles it. Workers of a vectorised environment, or of
-a test run, all miss the same ones at the same time.
+With numba alone, every process that does not find a kernel on the disk compiles it; workers of a vectorised
+environment, or of a test run, would all compile the same ones at the same time.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ class OneAtATime:
     def _make(self) -> FileLock:
         from filelock import FileLock  # imported here: a process that only reads the cache does not need it
 
-        # shared by all threads: numba compiles in one at a time, and one may have to release what another left locked
+        # shared by all threads: numba compiles in one at a time, and one may have to release the lock of another
         return FileLock(self._path, timeout=self._patience, thread_local=False)
 
     @property
     def _lock(self) -> FileLock:
-        """The lock object of this process. One inherited by a fork is kept: dropping it might release the lock."""
+        """The lock object of this process; one inherited by a fork is kept, as its deletion might release the lock."""
         if os.getpid() not in self._made:
             self._made[os.getpid()] = self._make()
         return self._made[os.getpid()]

@@ -23,10 +23,10 @@ __all__ = ["MachineCode"]
 
 
 def _without_callers_part(reduced: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return numba's reduced form of an entry point without what only compiled callers need, as it has none.
+    """Return numba's reduced form of an entry point without the data for compiled callers, as it has none.
 
-    That is the code of all its functions, replaced by empty ones for those that Python calls, and an environment for
-    each of its parts, which contain no Python objects. They were three quarters of a file.
+    Omitted are the code of its functions, of which empty ones remain for those that Python calls, and the environments
+    of its parts, which contain no Python objects: three quarters of a file.
     """
     (name, kind, (code, _)), described, *rest, _ = reduced
     assert kind == "object", f"numba keeps machine code as {kind!r}, expected 'object'"
@@ -38,7 +38,7 @@ def _without_callers_part(reduced: tuple[Any, ...]) -> tuple[Any, ...]:
 
 
 class MachineCode:
-    """Compiled forms of a function in a store, under a name that includes the digest of its sources."""
+    """Disk cache of one function's compiled forms, under a name that includes the digest of its sources."""
 
     def __init__(self, store: Store, name: str) -> None:
         self._store, self._name = store, name
@@ -55,7 +55,7 @@ class MachineCode:
         return rebuild(context, *parts) if kept_signature == signature else None
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
-        """Store a compiled form, unless it contains addresses that are valid only in this process."""
+        """Store a compiled form unless it contains addresses that are valid only in this process."""
         if compiled.library.has_dynamic_globals or any(not loop.can_cache for loop in compiled.lifted):
             said = f"{self._name}: contains addresses, so every process compiles it again"
             warnings.warn(said, NumbaWarning, stacklevel=2)
@@ -66,7 +66,7 @@ class MachineCode:
         )
 
     def flush(self) -> None:
-        """Do nothing: a function that is compiled again replaces the stored form."""
+        """Do nothing, as a function that is compiled again replaces the stored form."""
 
     def _file(self, signature: Any, codegen: Any) -> str:
         text = repr((signature, codegen.magic_tuple(), llvmlite.__version__))

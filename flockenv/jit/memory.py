@@ -1,8 +1,8 @@
 """Cache lines: prefetches, and streaming stores that bypass the caches.
 
-A store to a line that is not in a cache waits until that line is read, in vain if all of it is overwritten. So lines
-are prefetched before they are written. If the output is larger than the caches, it is computed in scratch, which fits,
-and copied by streaming stores line by line, without reading the target.
+A store to a line that is not in a cache waits until that line is read, even if all of it is overwritten. So lines are
+prefetched before they are written. If the output is larger than the caches, it is computed in scratch, which fits, and
+copied by streaming stores line by line, without reading the target.
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ def array_of(context: Any, builder: Any, kind: Any, value: Any = None) -> Any:
 
 
 def _prefetch(typing_context: Any, array: Any, part: Any, parts: Any) -> Any:
-    """Prefetch part number `part` of `parts` of a contiguous array that is written soon.
+    """Prefetch part `part` of `parts` equal parts of a contiguous array that is written soon.
 
-    Rows are written in one go, and a store waits for a line that is not in a cache. Prefetching all lines at once would
-    wait likewise: a processor has room for about a dozen outstanding lines.
+    A store waits for a line that is not in a cache. Prefetching all lines at once would wait as well: a processor can
+    load only about a dozen lines at a time.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -84,7 +84,7 @@ prefetch: Any = intrinsic_or_python(_prefetch, lambda array, part, parts: None)
 def generate_streaming_store(builder: Any, vector: Any, place: Any, size: int) -> None:
     """Generate a streaming store of a vector of `size` bytes to an address that is a multiple of `size`.
 
-    The caller must write whole cache lines, so that none is read before.
+    The caller must write whole cache lines, so that none has to be read first.
     """
     stored = builder.store(vector, place, align=size)
     stored.set_metadata("nontemporal", builder.module.add_metadata([ir.IntType(32)(1)]))
@@ -93,7 +93,7 @@ def generate_streaming_store(builder: Any, vector: Any, place: Any, size: int) -
 def _stream_store(typing_context: Any, to: Any, at: Any, source: Any) -> Any:
     """Copy an array into `to`, from flat index `at` on, by streaming stores; both are contiguous.
 
-    Whole cache lines bypass the caches; a partial line at either end does not. Other threads see all after
+    Whole cache lines bypass the caches; a partial line at either end does not. Other threads see the numbers after
     `store_fence`.
     """
     check_contiguous(to)

@@ -2,8 +2,8 @@
 
 Kernels are code: what is read from their folder is executed. So the folder is checked before anything is read from it:
 it must be a folder and no link, it must belong to this user, no other user may write to it, and no other user may
-rename or replace any folder above it. Files are checked after they have been opened, so that none is replaced in
-between. Windows has one temporary folder per user and no such modes: nothing is checked there.
+rename or replace any folder above it. Files are checked after they have been opened, so that none can be replaced after
+the check. Windows has one temporary folder per user and no such modes: nothing is checked there.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class NotPrivateError(PermissionError):
 
 
 def say_once(line: str, about: str = "") -> None:
-    """Write one line to stderr, unless this process has already written it or one with the same `about`."""
+    """Write one line to stderr unless this process has already written one with the same `about` or text."""
     if (about or line) not in _said and sys.stderr is not None:
         _said.add(about or line)
         print(f"flockenv: {line}", file=sys.stderr, flush=True)
@@ -80,9 +80,9 @@ def read_private(path: Path) -> bytes:
 
 
 def first_private(home: Path, temporary: Path, name: str) -> Path:
-    """Return the first of these folders that only this user can change: home, temporary/name, a new one beside it.
+    """Return the first folder that only this user can change: `home`, temporary/name, or a new one beside that.
 
-    A folder that fails its check is skipped, and one line on stderr reports the reason. The new one is called
+    A folder that fails the check is skipped, and one line on stderr reports the reason. The new one is named
     name-XXXXXXXX; later processes find it again.
 
     Raises:
@@ -140,7 +140,7 @@ def _path_entries(folder: Path) -> Iterator[Path]:
 
 
 def _check_above(place: Path) -> None:
-    """Raise NotPrivateError if another user can rename or replace entries of this folder, or replace this link."""
+    """Raise NotPrivateError if another user can rename or replace the entries of a folder, or replace a link."""
     if not CHECKED:
         return
     found = os.lstat(place)

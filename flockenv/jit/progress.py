@@ -1,7 +1,7 @@
 """Progress of compilation: how long each kernel took, and a line on the terminal while one is compiled.
 
-A kernel is compiled at its first call, once per machine: from then on its code is in the cache folder, see section. On
-a terminal a line names the kernel and, when it is done, the time it took; FLOCKENV_QUIET=1 silences it.
+A kernel is compiled at its first call, once per machine: its code is then in the cache folder (see `section`). On a
+terminal a line names the kernel and, when it is done, the time it took; FLOCKENV_QUIET=1 turns this off.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["Compiled", "compiled_kernels", "unapplied_patches"]
 
 
 class Compiled(NamedTuple):
-    """One kernel that this process had to compile."""
+    """One kernel that this process compiled."""
 
     kernel: str  # the name of its entry point, such as "scene_step"
     what: str  # its title; for a scene: dimension, space, effects and method
@@ -36,7 +36,7 @@ def compiled_kernels() -> tuple[Compiled, ...]:
 
 
 def unapplied_patches() -> tuple[str, ...]:
-    """Return the patches of numba that are not applied because the source of the installed numba differs."""
+    """Return the titles of the patches that are not applied because the installed numba's source differs."""
     every = [
         *((each.title, each.reads) for each in (*front_end.PATCHES, *front_end.REPLACED_PASSES)),
         ("lowering", lowering.READS),

@@ -2,9 +2,9 @@
 
 A section is a factory: it takes a plan (laws as functions, counts, flags) and returns a function that uses them as free
 variables. numba treats those as constants: it removes the branches that they exclude before type inference, and
-inlines the laws. Its own disk cache never finds such a function again; here the key is explicit instead: the plan, with
-the code of every law in it, the sources of all laws and sections, and the register width. So if the machine code is
-cached, no function is built.
+inlines the laws. Its own disk cache never finds such a function again; here the cache has an explicit key: the plan,
+with the code of every law in it, the sources of all laws and sections, and the register width. So if the machine code
+is cached, no function is built.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _njit: Any = numba.njit  # numba's stubs do not know `_nrt`
 
 
 def section(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[..., Any]]:
-    """Decorate a section whose functions kernels call: `section(*plan)` is a part of them, built once for each plan."""
+    """Decorate a section that makes parts of kernels: `section(*plan)` is one, built once for each plan."""
 
     @functools.lru_cache(maxsize=4096, typed=True)
     @functools.wraps(make)
@@ -63,10 +63,10 @@ def section(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[.
 
 
 def entry_of(make: Callable[..., Callable[..., Any]]) -> Callable[..., Callable[..., Any]]:
-    """Decorate a section whose functions Python calls: `section(*plan)` is an entry point, built once for each plan.
+    """Decorate a section that makes entry points: `section(*plan)` is one, which Python calls, built once per plan.
 
-    The plan contains laws, numbers, text, types, and tuples of those. Its functions are built only to be compiled, not
-    if the machine code of an equal plan is cached.
+    The plan contains laws, numbers, text, types, and tuples of those. The function is not built if the machine code of
+    an equal plan is cached.
     """
 
     @functools.lru_cache(maxsize=512, typed=True)
@@ -88,7 +88,7 @@ def without_dispatch(function: Any) -> Callable[..., Any]:
 
 
 def set_title(entry_point: Callable[..., Any], title: str) -> Callable[..., Any]:
-    """Return the entry point with the title shown while it compiles; the first title it gets is kept."""
+    """Return the entry point with the title shown while it compiles; only the first call sets the title."""
     vars(entry_point).setdefault("title", title)
     return entry_point
 
@@ -100,7 +100,7 @@ def entry(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def digest_of(plan: Any) -> str:
-    """Return a digest of all that the code of a plan depends on: laws by their code, numbers by their repr."""
+    """Return a digest of all that a plan's code depends on: the code of its laws, the repr of its numbers."""
     modules = {each.__module__ for each in functions_in(plan)}
     text = f"{description(plan)}{laws_digest()}{texts_outside(modules)}"
     return hashlib.sha256(text.encode()).hexdigest()[:20]
@@ -109,7 +109,7 @@ def digest_of(plan: Any) -> str:
 def _entry(make: Callable[..., Callable[..., Any]], plan: tuple[Any, ...]) -> Callable[..., Any]:
     """Return the entry point that a factory builds from a plan; its machine code is read from the checked store.
 
-    The store also has what numba needs before the function is built, mainly the names of its arguments.
+    The store also holds what numba needs before the function is built, mainly the names of its arguments.
     """
     if IN_PYTHON:
         return make(*plan)
@@ -135,7 +135,7 @@ def _stand_in_data(function: Callable[..., Any]) -> bytes:
 
 
 def _stand_in(data: bytes | None) -> Callable[..., Any] | None:
-    """Return a function with the stored name, docstring and parameters, which numba accepts; it is never called."""
+    """Return a function with the stored name, docstring and parameters, for numba only; it is never called."""
     if data is None:
         return None
 
@@ -175,7 +175,7 @@ def record(names: tuple[str, ...]) -> Any:
 
 
 def __getattr__(name: str) -> Any:
-    """Return the namedtuple type whose name lists its fields."""
+    """Return the namedtuple type with the fields that its name lists, as cached machine code looks it up."""
     kind, *names = name.split("__")
     if kind != "Record" or not all(names):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

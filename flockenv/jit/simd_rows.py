@@ -55,8 +55,8 @@ PAIR = 2 * SIDE
 def column_distance(count: int) -> int:
     """Return the distance between columns of `count` agents, in numbers; in a kernel it is a constant.
 
-    A constant lets LLVM prove that columns do not overlap, without checks at run time. It is the same for many counts,
-    as each distance needs its own kernel, and no power of two, as those compete for the same cache sets.
+    A constant lets LLVM prove that columns do not overlap, without checks at run time. Many counts share one distance,
+    as each distance needs its own kernel. It is no power of two: such columns compete for the same cache sets.
     """
     return max(64, 1 << (count - 1).bit_length()) + SIDE
 
@@ -77,7 +77,8 @@ def _bytes(context: Any, kind: Any) -> Any:
 def _as_contiguous(typing_context: Any, array: Any) -> Any:
     """Return a contiguous array with strides computed from its shape, of which the last is a constant.
 
-    A view of one world, (D, B, N) -> (D, N), derives its strides from it, so LLVM knows that its agents are adjacent.
+    A view of one world, (D, B, N) -> (D, N), has strides derived from these, so LLVM knows that its agents are
+    adjacent.
     """
     check_contiguous(array)
 
@@ -136,7 +137,7 @@ columns: Any = intrinsic_or_python(_columns, _columns_in_python)
 
 
 def _lookup(builder: Any, vector: Any, size: int) -> tuple[int, Any]:
-    """Return the size of a table that one instruction looks up, and the call that generates it; (0, None) without one.
+    """Return the table size of the look-up instruction and the call that generates it; (0, None) if there is none.
 
     The instruction takes the low bits of the indices, and one register of the table, or two.
     """
@@ -153,7 +154,7 @@ def _lookup(builder: Any, vector: Any, size: int) -> tuple[int, Any]:
 
 
 def _look_up(builder: Any, part: Any, named: Any, vector: Any, size: int, count: Any) -> Any:
-    """Generate the look-up of the indices `named` in a whole table, a PAIR at a time; `part` reads its registers."""
+    """Generate the look-up of the indices `named` in a table that `part` reads, PAIR entries at a time."""
     step, lookup = _lookup(builder, vector, size)
     word = ir.IntType(64)
     named = named if size == 4 else builder.sext(named, ir.VectorType(word, vector.count))
@@ -196,7 +197,7 @@ def _pick(
 
     The first row begins at table[first], the next `length` later, and may be read up to a multiple of PAIR. Its entries
     are written to to[at] and on, those of the next row `beside` later. All arrays are contiguous, with flat indices.
-    Short rows are looked up in registers, if the processor can do that; otherwise entries are read one by one.
+    Short rows are looked up in registers if the processor has the instruction; otherwise entries are read one by one.
     """
     for array in (to, table, who):
         check_contiguous(array)
@@ -256,7 +257,7 @@ pick: Any = intrinsic_or_python(_pick, _pick_in_python)
 
 
 # A key: a squared distance, in single precision, whose low bits are replaced by a place (an index). The bits of numbers
-# >= 0 sort like unsigned integers, which are compared in half the time, and the place moves with its square. NaN sorts
+# >= 0 sort like unsigned integers, which are compared in half the time, and each place stays with its square. NaN sorts
 # last.
 
 
@@ -298,7 +299,7 @@ def _tag_of(typing_context: Any, key: Any, tags: Any) -> Any:
 
 
 def _same_key(typing_context: Any, one: Any, other: Any, tags: Any) -> Any:
-    """Return True if two keys differ only in their places: then it is not known which square is smaller."""
+    """Return True if two keys differ only in their places: it is then unknown which square is smaller."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         one, other, tags = arguments
@@ -353,9 +354,9 @@ def take(to: Any, table: Any, who: Any, count: int) -> None:
 def _transpose_one_square(
     typing_context: Any, to: Any, at: Any, across: Any, many: Any, source: Any, place: Any, down: Any
 ) -> Any:
-    """Transpose a square of side SQUARE: column k, from `place` + k * `down`, goes to every `across`-th from `at` + k.
+    """Transpose a square: read line k at `place` + k `down`, write line j of the result at `at` + j `across`.
 
-    Only the first `many` rows of the result are written.
+    Its side is SQUARE; only the first `many` lines of the result are written.
     """
     check_contiguous(to)
     check_contiguous(source)

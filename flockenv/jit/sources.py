@@ -1,4 +1,4 @@
-"""Text of all that machine code depends on: functions with their free variables, and the sources of all laws.
+"""Text of everything that machine code depends on: functions with free variables, and the sources of all laws.
 
 numba's own disk cache never finds a closure again, and does not notice a change of a law that a cached function calls.
 So machine code is stored under a digest of this text. A second process compiles nothing; an edited law is always
@@ -45,7 +45,7 @@ def sources_of_code() -> Iterator[tuple[Path, bytes]]:
 def laws_digest() -> str:
     """Return a digest of `sources_of_code` and of the versions of numba and Python.
 
-    An edit to a source gives new files, never stale machine code. The digest does not depend on the machine.
+    After an edit of a source, machine code is compiled again. The digest does not depend on the machine.
     """
     digest = hashlib.sha256(f"{numba.__version__} {sys.version_info[:2]}".encode())
     for _, text in sources_of_code():

@@ -18,9 +18,9 @@ _one_at_a_time = threading.Lock()
 
 @contextlib.contextmanager
 def no_garbage_collection() -> Iterator[None]:
-    """Disable garbage collection in a block whose objects nearly all stay alive, and would be traversed repeatedly.
+    """Disable garbage collection in a block whose objects nearly all stay alive.
 
-    Collection took a seventh of the time until a process's first step.
+    Collection traverses them repeatedly, and took a seventh of the time until a process's first step.
     """
     collects = gc.isenabled()
     gc.disable()

@@ -2,8 +2,8 @@
 
 The default is one thread: waiting threads spin, which costs more than it gains if another process uses the second core.
 Set it by `use_threads(2)`, or FLOCKENV_THREADS=2 in the environment. Results do not depend on the number. Work is
-distributed if that is faster (`AutoTuner`): handing it over takes 20 microseconds, or 100 on a virtual machine. More
-threads than cores would only wait for each other, so there are never more at work.
+distributed if that is faster (`AutoTuner`): it takes 20 microseconds, or 100 on a virtual machine. More threads than
+cores would only wait for each other, so at most one per core is used.
 
 On Linux the pool's threads avoid the core of the calling thread: woken after a pause, they are often scheduled there,
 and two halves of the work would then run one after the other.
@@ -44,7 +44,7 @@ RISE = 1.25
 
 
 class _ThreadPool:
-    """Pool of threads that wait for work; created when first needed, and again in a forked process, which has none."""
+    """Pool of threads that wait for work; it is created at first use, and again in a forked process."""
 
     def __init__(self, count: int) -> None:
         self.pid = os.getpid()
@@ -69,7 +69,7 @@ _current_core_number = _core_getter()
 
 
 def _current_core() -> tuple[int, set[int]]:
-    """Return the core that this thread runs on, and those that it may run on; (-1, empty set) if unknown."""
+    """Return the core that this thread runs on, and the cores that it may run on; (-1, empty set) if unknown."""
     if _current_core_number is not None:
         with contextlib.suppress(OSError):
             return _current_core_number(), os.sched_getaffinity(0)
@@ -115,7 +115,7 @@ def threads() -> int:
 
 
 def usable_threads() -> int:
-    """Return the number of threads that a step uses if that is faster: at most one per core, and one in plain Python.
+    """Return the number of threads that a step uses if this is faster: at most one per core; 1 in plain Python.
 
     In plain Python the barrier's counter is not atomic.
     """
@@ -123,7 +123,7 @@ def usable_threads() -> int:
 
 
 def use_threads(count: int) -> None:
-    """Let every step from now on use up to `count` threads; ValueError unless it is an integer from 1 to 256."""
+    """Set the largest number of threads of a step; raise ValueError unless it is an integer from 1 to 256."""
     global _count
     if type(count) is not int or not 1 <= count <= _MOST:  # True is not a number of threads
         raise ValueError(f"threads is {count!r}, must be an integer from 1 to {_MOST}")
@@ -165,8 +165,8 @@ def run_parallel(jobs: Sequence[Callable[[], Any]]) -> list[Any]:
 class AutoTuner:
     """Choice between one thread and several for work of one kind and size; both are timed, and rarely timed again.
 
-    Which is faster depends on how the system wakes threads and on the load of its cores, so it is measured. The first
-    piece of work of a trial does not count: in it kernels are compiled, and threads are created or woken.
+    The faster one depends on how the system wakes threads and on the load of its cores, so it is measured. The first
+    piece of work of a trial does not count, as it includes compilation and the start of threads.
     """
 
     always = False  # distribute everything: for tests of results
@@ -218,7 +218,7 @@ class AutoTuner:
         self._tried, self._left, self._least = way, TRIAL, math.inf
 
     def _end_trial(self) -> None:
-        """Record the time of a trial; start the other trial if it never ran, otherwise wait."""
+        """Record the time of a trial; start that of the other alternative if it never ran, otherwise wait."""
         before, self.took[self._tried] = self.best, self._least
         if self.took[1] == math.inf:
             self._start_trial(1)
@@ -228,10 +228,10 @@ class AutoTuner:
 
 
 class AutoTuners(dict[tuple[Any, ...], AutoTuner]):
-    """A `AutoTuner` for each kind and size of work, with sizes in powers of two, and number of threads."""
+    """One `AutoTuner` for each kind of work, size (in powers of two) and number of threads."""
 
     def of(self, kind: str, work: int, count: int) -> AutoTuner:
-        """Return the choice for `work` agent steps and `count` threads."""
+        """Return the tuner for `work` agent-steps and `count` threads."""
         key = kind, work.bit_length(), count
         return self.get(key) or self.setdefault(key, AutoTuner())
 

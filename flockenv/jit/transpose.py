@@ -1,7 +1,7 @@
 """Conversion between records of agents and SIMD lanes, a block of agents at a time, by shuffles.
 
-Sorting moves one record per agent, so that an agent is one access to distant memory; computations use lanes, which hold
-one number of many agents side by side.
+Sorting moves one record per agent, which is one access to distant memory; computations use lanes, which hold one number
+of many agents side by side.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ _several: Any = types.UniTuple
 
 
 def _power_of_two(length: int) -> int:
-    """Return the next power of two, the number of rows that are transposed."""
+    """Return the smallest power of two >= `length`, the number of rows that are transposed."""
     return 1 << (length - 1).bit_length()
 
 
 def _transpose(builder: Any, rows: Vectors) -> Vectors:
-    """Return P vectors of W numbers, both powers of two, as the P numbers of lane 0, then those of lane 1, and so on.
+    """Return the numbers of P vectors of W lanes, both powers of two, lane by lane: P of lane 0, P of lane 1, ...
 
     Each of log2 P passes interleaves the first half of the vectors, laid end to end, with the second half.
     """
@@ -100,7 +100,7 @@ def _put_records(
         flat: Vectors = []
         for begin in range(0, wide, side):
             flat += _transpose(builder, list(rows(begin)))
-        starts = []  # all computed before the records are stored, so that no store delays the next address
+        starts = []  # computed before any record is stored, so that no store delays the next address
         for k in range(wide):
             c = builder.load(builder.gep(cells, [builder.add(arguments[5], word(k))]))
             none = builder.icmp_signed("<", c, whole(0))
@@ -146,7 +146,7 @@ def _put_lines(
 
     Like `_put_records`, but a record is `length` numbers, aligned whole cache lines, and is written to place `to`
     (int32, in records; -1 for place `spare`). The numbers behind that of the last source are undefined. Streaming
-    stores bypass the caches, so that a line, far from the next one, is not read before it is written.
+    stores bypass the caches, so that lines, far from each other, are not read before they are written.
     """
     wide, many, piece = literal_value(width, "width"), sources.count, literal_value(length, "length")
 

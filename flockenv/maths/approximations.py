@@ -1,7 +1,7 @@
 """Rounding, exp and atan2 as polynomials, which vectorise over SIMD lanes.
 
-Those of libm are scalar calls; the rounding instruction takes two operations per register, and a multiplication before
-it a third.
+The functions of libm are scalar calls; the rounding instruction costs two operations per register, and three after a
+multiplication.
 
 In float64 the relative error of `exp` is below 1e-14 and the error of `atan2` below 5e-16 rad; in float32 5e-7 (for
 |x| < 10; beyond, the rounding of x itself dominates) and 3e-7 rad. tests/test_social.py checks these bounds.
@@ -26,7 +26,7 @@ LARGEST = {types.float32: 87.0, types.float64: 708.0}
 
 
 def _ones(x: Any) -> float:
-    """Return a number whose unit in the last place is 1: an x added to it is rounded to an integer, in its low bits."""
+    """Return a number whose unit in the last place is 1: the sum with x has the rounded x in its low bits."""
     return like(x, 1.5 * 2**23 if isinstance(x, np.float32) else 1.5 * 2**52)
 
 
@@ -82,7 +82,7 @@ _limit_of: Any = intrinsic_or_python(_largest, lambda x: like(x, 87.0 if isinsta
 def exp(x: float) -> float:
     """Return e^x; 0 below the smallest normal number, and constant for x above `LARGEST`.
 
-    e^x = 2^k e^r with |r| <= ln 2 / 2, and Taylor's polynomial of degree 11 for e^r.
+    e^x = 2^k e^r with |r| <= ln 2 / 2; e^r is Taylor's polynomial of degree 11.
     """
     most = _limit_of(x)
     y = most if x > most else x  # a selection that keeps NaN
@@ -103,7 +103,7 @@ def exp(x: float) -> float:
 
 @law
 def _arc(x: float) -> float:
-    """Return atan(x) for |x| <= sqrt(2) - 1: a polynomial that interpolates at Chebyshev nodes."""
+    """Return atan(x) for |x| <= sqrt(2) - 1, by a polynomial that interpolates at Chebyshev nodes."""
     z = x * x
     p = like(z, -0.0178023957270003)
     p = p * z + like(z, 0.037962548861582394)

@@ -1,6 +1,6 @@
 """Interpolation on a regular grid: fields of velocities, distances and potentials.
 
-A grid is one array (a table), so that it can be passed to a law: the lowest corner (D, m), the spacing (m), the number
+A grid is one array (a table), which can be passed to a law: the lowest corner (D, m), the spacing (m), the number
 of points along each axis (D), the number of values per point (K), then these values, the last axis fastest. `pack_grid`
 builds a table from an array; the laws read it at any position. Unless stated otherwise, a position outside the grid is
 clamped to the nearest point on its edge.
@@ -62,7 +62,7 @@ def points_of(low: Sequence[float], spacing: float, counts: Sequence[int]) -> Fl
 
 @law
 def _cell_along(table: Table, x: float, d: int, k: int) -> tuple[Any, float]:
-    """Return the cell along axis k that contains x, and the position in it: 0 at its lower edge, 1 at its upper."""
+    """Return the cell that contains x along axis k, and the position in it from 0 (lower edge) to 1 (upper)."""
     o, e = like(x, 0.0), like(x, 1.0)
     last = table[d + 1 + k] - e
     at = (x - table[k]) / table[d]

@@ -59,8 +59,9 @@ def limit_to_heading(direction: Vec, ahead: Vec, over: bool) -> Vec:
 def bank(heading: Vec, before: Vec, up: Vec, speed: float, seconds: float, memory: float) -> Vec:
     """Return the up vector of an agent that banks into a turn, in 3-D: it follows lateral acceleration + g upwards.
 
-    The lateral acceleration is s (f - f_before)/dt across f, that of the path. `memory` [s] is the time constant: up
-    moves by the fraction 1 - exp(-dt/memory) per step, for any dt. An infinite one leaves up unchanged (Reynolds 1999).
+    The lateral acceleration is the component of s (f - f_before)/dt perpendicular to f. `memory` [s] is the time
+    constant: up moves by the fraction 1 - exp(-dt/memory) per step, for any dt. An infinite one leaves up unchanged
+    (Reynolds 1999).
     """
     share = like(speed, 1.0) - np.exp(-seconds / memory)
     toward = scale(lateral(before, heading), -speed / seconds)
@@ -70,7 +71,7 @@ def bank(heading: Vec, before: Vec, up: Vec, speed: float, seconds: float, memor
 
 @law
 def up_for(heading: Vec, before: Vec, up: Vec) -> Vec:
-    """Return the unit vector perpendicular to `heading` nearest to `up`; if `up` is along it, side is kept."""
+    """Return the unit vector perpendicular to `heading` nearest to `up`; if they are parallel, keep side."""
     side, old = cross(heading, up), cross(before, up)
     side = select(dot(side, side) > like(up[0], 1e-8), side, old)
     side = select(dot(side, side) > like(up[0], 1e-8), unit(side), perpendicular(heading))
@@ -101,7 +102,7 @@ def face_one(v: Any, frame: Any, b: int, i: int, anew: bool) -> None:
 def face(v: Any, frame: Any, b: int, anew: bool) -> None:
     """Write headings and up vectors of the agents of world b for their velocities; v (D, B, N), frame (F, B, N).
 
-    At standstill an agent keeps its heading; if it has none yet, or with `anew`, it gets the x axis, and up the z axis.
+    At standstill an agent keeps its heading; without one, or with `anew`, its heading is the x axis and up the z axis.
     """
     for i in range(v.shape[2]):
         face_one(v, frame, b, i, anew)

@@ -141,7 +141,7 @@ class Capsule(Closed):
 
     @property
     def dimension(self) -> int:
-        """Number of coordinates of its start."""
+        """Dimension of space, 2 or 3."""
         return len(self.start)
 
     @property

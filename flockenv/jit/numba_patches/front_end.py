@@ -98,7 +98,7 @@ def is_known_source(reads: tuple[Known, ...]) -> bool:
 
 
 def applies(title: str, reads: tuple[Known, ...]) -> bool:
-    """Return True if a patch is applied: numba's source is as known, and LEFT_OUT does not contain its title.
+    """Return True if a patch is applied: numba's source is as tested, and LEFT_OUT does not contain its title.
 
     Raise ValueError for a name in LEFT_OUT that is not the title of a patch.
     """
@@ -155,7 +155,7 @@ def _cache_calls(resolve: Any) -> Any:
 
 
 def _cache_laws(resolve: Any) -> Any:
-    """Cache the signature of a compiled function for given types, as long as its compiled form exists."""
+    """Cache the signature of a compiled function for given types while its compiled form exists."""
 
     def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
         call = _call(context, args, kws)
@@ -225,7 +225,7 @@ def _refresh_if_new(refresh: Any) -> Any:
 
 
 def _rewrite_where_used(slowly: Any) -> Any:
-    """Rewrite only blocks that contain a variable: numba goes through all of a function's statements for each one."""
+    """Rewrite only the blocks that contain a variable: numba goes through all blocks for each variable."""
 
     def names(block: Any) -> frozenset[str]:
         known = vars(block).get("_flockenv_names")
@@ -294,7 +294,7 @@ _depth = 0
 
 @contextmanager
 def apply_patches() -> Iterator[None]:
-    """Compile with all patches that apply, and without garbage collection: a kernel leaves at most 100 MB."""
+    """Apply the patches, and disable garbage collection, in a block that compiles: a kernel leaves up to 100 MB."""
     global _depth
     with _lock, no_garbage_collection():
         if _depth == 0:
@@ -315,12 +315,12 @@ def apply_patches() -> Iterator[None]:
 
 @_register(mutates_CFG=True, analysis_only=False)
 class ClosuresIfAny(_Closures):  # type: ignore[misc]
-    """Pass that inlines closures, comprehensions, reductions and stencils, run only if there may be one."""
+    """numba's pass that inlines closures, comprehensions and stencils, skipped if a function has none of them."""
 
     _name = "inline_closure_likes_if_any"
 
     def run_pass(self, state: Any) -> bool:
-        """Run numba's pass, or only its final steps."""
+        """Run numba's pass, or only its final steps if there is nothing to inline."""
         if any(_may_be_inlined(statement) for b in state.func_ir.blocks.values() for statement in b.body):
             return bool(super().run_pass(state))
         _Processor(state.func_ir).run()

@@ -7,7 +7,7 @@ view is built only from the fields that differ, a loop with step 1 needs no divi
 inlined receives a namedtuple as one argument. Flock in float64 has 33,000 instructions instead of 86,000; the machine
 code is the same.
 
-If the functions of numba that this relies on differ (another version), it is left out; see `front_end`.
+This lowering is not used if the functions of numba that it relies on differ (another version); see `front_end`.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ READS = (
 
 @functools.cache
 def is_brief() -> bool:
-    """Return True if this lowering is used: numba is as it was tested with, and LEFT_OUT does not exclude it."""
+    """Return True if this lowering is used: numba's source is as tested, and LEFT_OUT does not exclude it."""
     return applies("lowering", READS)
 
 
@@ -131,7 +131,7 @@ class Brief(_Lower):  # type: ignore[misc]
     def _axis_indices(self, kind: Any, index: Any) -> tuple[Any, ...] | None:
         """Return the index of each axis: the type of an integer, or a slice with literal bounds.
 
-        None if the array or the index is of any other kind.
+        Return None if the array or the index is of any other kind.
         """
         given: Any = self.typeof(index.name)
         if not isinstance(kind, types.Array) or kind.layout not in "CA":
@@ -198,7 +198,7 @@ class Brief(_Lower):  # type: ignore[misc]
         return self.builder.extract_value(array, self.context.data_model_manager[kind].get_field_position(name))
 
     def _spans(self, kind: Any, array: Any, places: tuple[Any, ...], index: Any) -> list[tuple[Any, Any]]:
-        """Return for each axis (first, size); first None means 0, size None an integer index, which drops the axis."""
+        """Return (first, size) of each axis; first is None for 0, size is None for an integer, which drops the axis."""
         context, builder, found = self.context, self.builder, []
         for axis, place in enumerate(places):
 
@@ -238,7 +238,7 @@ class Brief(_Lower):  # type: ignore[misc]
         return builder.gep(data, [at]) if kind.layout == "C" else _code.pointer_add(builder, data, at)
 
     def lower_expr(self, resty: Any, expr: Any) -> Any:
-        """Lower loops over `range` with step 1, and pairs, to short code; leave everything else to numba."""
+        """Lower iteration over a `range` with step 1 to short code; leave every other expression to numba."""
         kind = self.typeof(expr.value.name) if expr.op in LOOPS else None
         if isinstance(kind, types.RangeType) and expr.op == "getiter" and self._has_step_one(expr.value):
             return self._range_iterator(kind, self.loadvar(expr.value.name))
@@ -320,8 +320,7 @@ def _slice_bounds(builder: Any, size: Any, start: int, stop: int | None) -> tupl
 def _is_passed_directly(fndesc: Any) -> bool:
     """Return True if a function can receive its arguments without unpacking.
 
-    Not if it has omitted defaults, which have no value, nor if it is recursive, as numba has its own method for such
-    calls.
+    It cannot if it has omitted defaults, which have no value, or is recursive: numba treats such calls differently.
     """
     left_out = any(isinstance(kind, types.Omitted) for kind in fndesc.argtypes)
     return not left_out and not any(isinstance(kind, types.RecursiveCall) for kind in fndesc.typemap.values())
@@ -341,7 +340,7 @@ class BriefPart(Brief):
         self.call_helper = self.call_conv.init_call_helper(self.builder)
 
     def extract_function_arguments(self) -> Any:
-        """Use the arguments without packing them."""
+        """Set the function's arguments as they are, without packing them."""
         if not _is_passed_directly(self.fndesc):
             return super().extract_function_arguments()
         self.fnargs = list(self.call_conv.get_arguments(self.function))

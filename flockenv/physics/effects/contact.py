@@ -215,7 +215,7 @@ class Contact(_Solid):
         return dimension
 
     def check(self, scene: SceneView) -> None:
-        """Raise ValueError if the radius is too small for two bodies that touch, or they touch around a torus."""
+        """Raise ValueError if `radius` is less than the distance at which bodies touch, or the torus is too small."""
         super().check(scene)
         touch = scene.contact_distance if scene.agents > 1 else 0.0
         if self.radius is not None and self.radius < touch:

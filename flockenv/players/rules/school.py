@@ -28,7 +28,7 @@ wander = rows(steering.wander)
 
 @dataclass(frozen=True)
 class SchoolRules:
-    """Textbook: Tu and Terzopoulos 1994, the levels of the scene's own effect `intention`, the nearest food."""
+    """Parameters of `school`; defaults: Tu and Terzopoulos 1994, thresholds as in the scene's `intention`."""
 
     escape: float = parameter(0.4, 0.05, 1.0)  # fear above which it flees
     school: float = parameter(0.15, 0.05, 1.0)  # fear above which it joins other fish

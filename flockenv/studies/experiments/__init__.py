@@ -36,7 +36,7 @@ PLANS: dict[str, type[Plan]] = {"avoidance": SteerPlan, "arbitration": SteerPlan
 
 
 class _Named(BaseModel):
-    """Any plan: `measure` selects its class."""
+    """The one key that is read first: `measure`, which selects a plan's class."""
 
     model_config = ConfigDict(extra="allow")
     measure: str

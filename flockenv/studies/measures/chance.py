@@ -24,7 +24,7 @@ class Mean(NamedTuple):
 
 
 class Above(NamedTuple):
-    """Excess of runs over their own nulls."""
+    """Mean of value - null over runs, with its interval."""
 
     runs: int
     excess: float  # mean of value - null
