@@ -1,12 +1,12 @@
-"""Reynolds' verbs, one law each, for one agent: every sweep, scripted agent and hand-written player calls these.
+"""Steering laws for one agent, one per behaviour of Reynolds; kernels, scripted agents and players call them.
 
 A steering law returns the desired change of velocity, S = v_desired - v, in m/s; the caller turns it into a force
 with a gain in kg/s (m/tau makes `seek` Helbing's driving force). `offset` is always other minus self. Laws take tuples
-of D = 2 or 3 floats and are finite for every finite input, at standstill and at zero distance too.
-Over arrays of rows they are called through `flockenv.steering.vectorize.rows(law)`.
+of D = 2 or 3 floats and are finite for every finite input, also at standstill and at zero distance.
+`flockenv.steering.vectorize.rows(law)` applies one to arrays.
 
 Sources: Reynolds, "Flocks, Herds, and Schools" (SIGGRAPH 1987); "Steering Behaviors for Autonomous Characters"
-(GDC 1999). The sign of seek is the paper's figure, not its pseudo-code, which flees.
+(GDC 1999). The sign of seek is that of the paper's figure; its pseudo-code flees.
 """
 
 from __future__ import annotations

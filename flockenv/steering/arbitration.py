@@ -1,9 +1,9 @@
-"""Arbitration: one steering force from several behaviours that disagree.
+"""Arbitration: one steering force from those of several behaviours.
 
 `forces` is a tuple of steering forces in order of priority, all in one unit; a zero vector is an idle behaviour.
-`budget` bounds the result, in the same unit. The first laws need no scene, so players call them too. Each record below
+`budget` bounds the result, in the same unit. The first laws need no scene, so players also call them. Each record below
 can be the arbitration of a `Steer` effect: its law (p, me, forces) -> (force, shares) returns the resulting force, N,
-and the share of each steering force that is in it.
+and the share of each steering force in it.
 
 Sources: Reynolds 1987 (prioritised acceleration allocation) and 1999 (blending, priority, dithering); Buckland,
 "Programming Game AI by Example" (2004; the running sum); Fray, "Context Steering" (Game AI Pro 2, 2015).
@@ -54,10 +54,10 @@ def _no_shares(forces):  # type: ignore[no-untyped-def]  # numba compares signat
 
 @law
 def _period_number(time: float, period: float) -> int:
-    """Return the number of the period.
+    """Return the index of the period that contains a time.
 
-    Each begins a thousandth of itself early, so that no step that ends with a period misses it by a rounding.
-    0.3 s in steps of 0.02 s and in steps of 0.05 s are two numbers: 0.3 / 0.1 is 2 or 3.
+    Each period begins a thousandth of its length early, because of rounding: 0.3 s in steps of 0.02 s and 0.3 s in
+    steps of 0.05 s are two numbers, and 0.3 / 0.1 would be 2 or 3.
     """
     return np.int64(np.floor(time / period + like(period, 1e-3)))  # type: ignore[return-value]  # a number in a kernel
 
@@ -88,7 +88,7 @@ def _blend_shares(forces: Forces, budget: float) -> Shares:
 
 @law
 def _first_share(forces: Forces, threshold: float, budget: float) -> Shares:
-    """Return the shares if the first force longer than the threshold, cut to the budget, is all there is."""
+    """Return the shares: that of the first force longer than the threshold, cut to the budget; 0 for all others."""
     shares, open_ = no_shares(forces), True
     for k in range(len(forces)):
         length = norm(forces[k])
@@ -135,25 +135,25 @@ def blend(forces: Forces, weights: Vec, budget: float) -> Vec:
 
 @law
 def prioritise(forces: Forces, threshold: float, budget: float) -> Vec:
-    """Return the first force longer than the threshold, shortened to the budget, and nothing of the others."""
+    """Return the first force longer than the threshold, shortened to the budget; all others are ignored."""
     return total_share(forces, _first_share(forces, threshold, budget))
 
 
 @law
 def allocate(forces: Forces, budget: float) -> Vec:
-    """Add forces in order until their lengths have used up the budget; the last one is cut to what is left.
+    """Add forces in order until their lengths have used up the budget; the last one is cut to the remainder.
 
     Prioritised acceleration allocation (Reynolds 1987): lengths add up as scalars, so the sum needs no shortening, and
-    in an emergency the most important force is not shortened. (8,0), (-8,0), (0,5) within 10 give (6, 0).
+    the most important force is never shortened by others. (8,0), (-8,0), (0,5) within 10 give (6, 0).
     """
     return total_share(forces, _allocate_shares(forces, budget))
 
 
 @law
 def allocate_running(forces: Forces, budget: float) -> Vec:
-    """Add forces in order, each as far as the length of the sum so far leaves room (Buckland 2004).
+    """Add forces in order, each cut to the budget less the length of the sum so far (Buckland 2004).
 
-    Unlike `allocate`, opposite forces give room back: (8,0), (-8,0), (0,5) within 10 give (6, 4).
+    Unlike in `allocate`, opposite forces free a part of the budget: (8,0), (-8,0), (0,5) within 10 give (6, 4).
     """
     return total_share(forces, _running_shares(forces, budget))
 
@@ -185,7 +185,7 @@ class Arbitration(Record):
 
 @law
 def blend_forces(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
-    """Return the sum of all forces: it is cut to max_force later, and only once."""
+    """Return the sum of all forces; the caller cuts it to max_force."""
     total = zero(forces[0])
     for k in range(len(forces)):
         total = add(total, forces[k])
@@ -193,9 +193,9 @@ def blend_forces(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
 
 
 class Blend(Arbitration):
-    """All forces at once, shortened to max_force: weights are those of the behaviours. Opposite forces cancel.
+    """The sum of all forces, shortened to max_force; opposite forces cancel. The behaviours have the weights.
 
-    It is as if the behaviours stood in the scene's list of effects.
+    The result is the same as with the behaviours in the scene's list of effects.
     """
 
     kind: Literal["blend"] = "blend"
@@ -220,7 +220,7 @@ class Priority(Arbitration):
 
 @law
 def take_at_random(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
-    """Return the first force that is drawn and above the threshold, and the shares."""
+    """Return the first force above the threshold whose behaviour is drawn, and the shares."""
     shares, open_ = no_shares(forces), True
     frame, who = _period_number(me.time, p.period), int(me.who)
     for k in range(len(forces)):
@@ -234,16 +234,16 @@ def take_at_random(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
 
 
 class Dithering(Arbitration):
-    """Prioritised dithering: each behaviour in order is drawn with a probability; the first active one gets everything.
+    """Prioritised dithering: in order, each behaviour is drawn with a probability; the first drawn and active one acts.
 
     The draw is a function of (world, time, agent) and lasts for `period`: it does not depend on dt.
     """
 
     kind: Literal["dithering"] = "dithering"
     probability: Chance | Annotated[tuple[Chance, ...], Field(min_length=1)] = Field(
-        default=0.9, description="that it may act: of all behaviours, or of each, 0 to 1 (Reynolds 1999: 0.9)"
+        default=0.9, description="probability of a draw, for all behaviours or for each, 0 to 1 (Reynolds 1999: 0.9)"
     )
-    period: float = Field(default=0.1, gt=0, description="s, how long a draw lasts")
+    period: float = Field(default=0.1, gt=0, description="s, duration of a draw")
     threshold: float = Field(default=1e-3, ge=0, description="N, a force of at most this size counts as zero")
     law: ClassVar[Law] = take_at_random
     exclusive: ClassVar[bool] = True
@@ -275,13 +275,13 @@ class Allocation(Arbitration):
 
 @law
 def allocate_running_force(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
-    """Return the sum of forces, each as long as the sum so far leaves of max_force, and the shares."""
+    """Return the sum of forces, each cut to max_force less the length of the sum so far, and the shares."""
     shares = _running_shares(forces, me.max_force)
     return total_share(forces, shares), shares
 
 
 class RunningSum(Arbitration):
-    """As allocation, but it is the length of the sum so far that uses up max_force (Buckland 2004)."""
+    """As allocation, but the length of the sum so far uses up max_force (Buckland 2004)."""
 
     kind: Literal["running_sum"] = "running_sum"
     law: ClassVar[Law] = allocate_running_force
@@ -300,17 +300,17 @@ def take_turns(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
 
 
 class RoundRobin(Arbitration):
-    """One behaviour after another has its turn, whatever its force: cheap, and late by as many turns."""
+    """One behaviour after another acts for a period, whatever its force: cheap, but the others react late."""
 
     kind: Literal["round_robin"] = "round_robin"
-    period: float = Field(default=0.05, gt=0, description="s, how long a turn lasts")
+    period: float = Field(default=0.05, gt=0, description="s, duration of a turn")
     law: ClassVar[Law] = take_turns
     exclusive: ClassVar[bool] = True
 
 
 @law
 def _spread_direction(ahead: Vec, j: int, n: int) -> Vec:
-    """Return direction j of n, spread evenly about `ahead`, which is the first."""
+    """Return direction j of n evenly spread ones, of which `ahead` is the first."""
     e = like(ahead[0], 1.0)
     if len(ahead) == 2:
         angle = like(e, 2 * np.pi) * like(e, j) / like(e, n)
@@ -327,7 +327,7 @@ def _spread_direction(ahead: Vec, j: int, n: int) -> Vec:
 
 @law
 def _danger_and_interest(p: Any, forces: Forces, direction: Vec) -> tuple[float, float]:
-    """Return the danger of a direction, and the interest in it."""
+    """Return the danger and the interest of a direction, N."""
     o = like(direction[0], 0.0)
     danger, interest = o, o
     for k in range(len(forces)):
@@ -339,7 +339,7 @@ def _danger_and_interest(p: Any, forces: Forces, direction: Vec) -> tuple[float,
 
 @law
 def choose_direction(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
-    """Return a force in the best of the least dangerous directions, and the shares."""
+    """Return a force in the most interesting of the least dangerous directions, and the shares."""
     o, e = like(forces[0][0], 0.0), like(forces[0][0], 1.0)
     total = zero(forces[0])
     for k in range(len(forces)):
@@ -371,7 +371,7 @@ def choose_direction(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
 class ContextSteering(Arbitration):
     """Directions are scored, not forces added: the best of those that are least dangerous (Fray 2015).
 
-    Of the first `dangers` behaviours the opposite of a force is dangerous; the direction of every force is interesting.
+    The direction opposite to a force of the first `dangers` behaviours is dangerous; that of any force is interesting.
     The share of a force is the part of it that is in the result.
     """
 
@@ -383,7 +383,7 @@ class ContextSteering(Arbitration):
 
 @law
 def take_by_intention(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
-    """Return the sum of forces that always act or belong to the intention, as in allocation, and the shares."""
+    """Return the allocated sum of the forces that belong to the intention or always act, and the shares."""
     shares, left = no_shares(forces), me.max_force
     o, e = like(left, 0.0), like(left, 1.0)
     for k in range(len(forces)):
@@ -397,7 +397,7 @@ def take_by_intention(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
 
 
 class Intentions(Arbitration):
-    """A finite state machine: each behaviour is active in one state, or always (avoid); the others get nothing.
+    """A finite state machine: each behaviour is active in one state, or always (avoid).
 
     An `intention` effect keeps the state. The active behaviours share max_force in order, as in allocation.
     """
@@ -410,7 +410,7 @@ class Intentions(Arbitration):
     recalls: ClassVar[tuple[str, ...]] = ("intention",)
 
     def parameters(self, forces: int) -> dict[str, float | Vec]:
-        """Return the number of a state for each force; -1 = always."""
+        """Return the index of the state in which each behaviour is active; -1 = always."""
         if len(self.when) != forces:
             raise ValueError(f"arbitration.when = {list(self.when)}: must be one for each of {forces} behaviours")
         return {"when": tuple(float(INTENTIONS.index(name)) if name != "avoid" else -1.0 for name in self.when)}

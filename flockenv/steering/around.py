@@ -1,4 +1,4 @@
-"""What stands in an agent's way: what it would touch, how it passes, where it must stay."""
+"""Laws to avoid a circle or sphere ahead, and to stay in a box."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def threat(forward: Vec, offset: Vec, clearance: float, lookahead: float) -> flo
 
 @law
 def avoid(forward: Vec, offset: Vec, clearance: float, max_speed: float) -> Vec:
-    """Steer around the circle or sphere that `threat` found: sideways, away from its centre, at V m/s (Reynolds 1999).
+    """Steer around a circle or sphere ahead (see `threat`): S = V sideways, away from its centre (Reynolds 1999).
 
-    An obstacle dead ahead is passed on the right; an agent inside is steered straight out. It never brakes.
+    An obstacle dead ahead is passed on the right; an agent inside is steered straight out. The agent never brakes.
     """
     o = like(max_speed, 0.0)
     inside = dot(offset, offset) < clearance * clearance
     aside = lateral(offset, forward)
-    # A lateral part of rounding noise has no side: treat it as dead ahead.
+    # A lateral part that is rounding noise has no side: the obstacle counts as dead ahead.
     noise = like(max_speed, 1e-10) * dot(offset, offset)
     sideways = select(dot(aside, aside) > noise, scale(unit(aside), like(max_speed, -1.0)), perpendicular(forward))
     out = scale(unit(offset), like(max_speed, -1.0))
@@ -53,7 +53,7 @@ def _clamp(x: float, low: float, high: float) -> float:
 
 @law
 def contain(to_low: Vec, to_high: Vec, velocity: Vec, max_speed: float, time: float) -> Vec:
-    """Stay in a box: if the place after `time` [s] is outside, seek the nearest place inside, else return zero.
+    """Stay in a box: if the position after `time` [s] is outside, seek the nearest one inside, else return zero.
 
     `to_low` and `to_high` are the distances to the lower and the upper wall per axis, m; negative beyond it
     (Reynolds 1999, containment).

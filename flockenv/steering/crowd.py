@@ -31,12 +31,12 @@ def unaligned_threat(offset: Vec, velocity: Vec, other_velocity: Vec, clearance:
 def give_way(offset: Vec, velocity: Vec, other_velocity: Vec, time: float, max_speed: float) -> Vec:
     """Steer away from the predicted offset p of a neighbour at the closest approach: S = -V unit(p), m/s.
 
-    p lies across the relative motion. So an agent that meets another head-on steers aside, one that crosses behind
-    steers aside and brakes, one that crosses in front steers aside and speeds up; the two always do opposite things.
-    If p = 0, both keep right of the relative motion: of two that cross, the one on the other's right goes first.
+    p is perpendicular to the relative motion. So an agent that meets another head-on steers aside, one that crosses
+    behind also brakes, and one that crosses in front also speeds up; the changes of the two are opposite. If p = 0,
+    both keep right of the relative motion: of two that cross, the one on the other's right goes first.
     """
     meeting = add(offset, scale(sub(other_velocity, velocity), time))
-    noise = like(time, 1e-10) * dot(offset, offset)  # a rest of rounding has no side
+    noise = like(time, 1e-10) * dot(offset, offset)  # a residue of rounding has no side
     right = perpendicular(unit(sub(velocity, other_velocity)))
     away = select(dot(meeting, meeting) > noise, scale(unit(meeting), like(time, -1.0)), right)
     return scale(away, max_speed)
@@ -60,8 +60,8 @@ def queue(direction: Vec, velocity: Vec, gap: float, max_speed: float, headway: 
     """Go in a `direction` as fast as the gap allows: S = direction min(V, gap / T) - v, m/s; T = headway [s].
 
     The brake of Reynolds 1999 in the form of Tordeux, Chraibi, Seyfried 2016 (doi 10.1007/978-3-319-33482-0_29): a gap
-    closes as exp(-t / T) and never to less than nothing, and 1 / (T + l / V) agents of length l pass in a second. With
-    a gain of k = 4 m / T or more no agent overshoots.
+    closes as exp(-t / T), and 1 / (T + l / V) agents of length l pass per second. With a gain of k = 4 m / T or more no
+    agent overshoots.
     """
     held = gap / headway
     return sub(scale(direction, held if held < max_speed else max_speed), velocity)
@@ -69,12 +69,12 @@ def queue(direction: Vec, velocity: Vec, gap: float, max_speed: float, headway: 
 
 @law
 def explore(to_low: Vec, to_high: Vec, velocity: Vec, max_speed: float, track: float) -> Vec:
-    """Sweep a rectangle for ever along a closed comb of tracks, at most `track` [m] apart: S, m/s.
+    """Cover a rectangle endlessly along a closed comb of tracks, at most `track` [m] apart: S, m/s.
 
-    To and fro along an even number of rows from the lower wall to the upper, and back down beside the left wall. The
-    position alone determines the direction, so nothing is remembered: a displaced agent goes on from there, and all
-    agents sweep the same loop. In space, each at its own height. `to_low` and `to_high` are distances to the walls per
-    axis, m. It takes track > V^2 m / F_max not to fly past a turn. (Ours: the textbook's boustrophedon, made a field.)
+    The loop leads to and fro along an even number of rows from the lower wall to the upper, and back down beside the
+    left wall; in 3-D each agent keeps its height. Direction is a function of position alone, so a displaced agent
+    continues from there. `to_low` and `to_high` are distances to the walls per axis, m. Without overshoot at turns if
+    track > V^2 m / F_max. (Ours: the textbook's boustrophedon as a velocity field.)
     """
     e, half = like(track, 1.0), like(track, 0.5)
     x, y = to_low[0], to_low[1]

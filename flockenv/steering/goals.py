@@ -1,4 +1,4 @@
-"""What one agent wants by itself: to be at a place or away from it, to stand still there, to roam."""
+"""Laws for one agent without others: seek, flee, arrive, wander, match a velocity or heading, dock."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def seek(offset: Vec, velocity: Vec, max_speed: float) -> Vec:
 
 @law
 def flee(offset: Vec, velocity: Vec, max_speed: float) -> Vec:
-    """Head away from a point at full speed; on the very point, go on as before (Reynolds 1999)."""
+    """Head away from a point at full speed; exactly at it, keep the present direction (Reynolds 1999)."""
     away = scale(unit(offset), -max_speed)
     onward = scale(unit(velocity), max_speed)
     return sub(select(dot(offset, offset) > like(max_speed, 0.0), away, onward), velocity)
@@ -37,7 +37,7 @@ def flee(offset: Vec, velocity: Vec, max_speed: float) -> Vec:
 
 @law
 def arrive(offset: Vec, velocity: Vec, max_speed: float, slow_radius: float) -> Vec:
-    """Seek, slowing down linearly within slow_radius [m] to stand still at the point (Reynolds 1999).
+    """Seek, slowing down linearly within slow_radius [m] to a stop at the point (Reynolds 1999).
 
     Feasible if slow_radius >= V^2 m / F_max: the ramp requires that deceleration at its edge.
     """
@@ -48,7 +48,7 @@ def arrive(offset: Vec, velocity: Vec, max_speed: float, slow_radius: float) -> 
 
 @law
 def wander_turn(target: Vec, noise: Vec, rate: float, dt: float) -> Vec:
-    """Move the wander target on its unit sphere by one small random displacement; returns the new target.
+    """Return the wander target, moved on its unit sphere by a small random displacement.
 
     `noise` is uniform in [-1, 1] per axis, `rate` in 1/sqrt(s): scaled with sqrt(dt), the walk does not depend on dt.
     """
@@ -58,7 +58,7 @@ def wander_turn(target: Vec, noise: Vec, rate: float, dt: float) -> Vec:
 
 @law
 def to_world_axes(own: Vec, velocity: Vec) -> Vec:
-    """Return in world axes a vector given as (forward, left) or (forward, left, up) of an agent at this velocity.
+    """Return in world axes a vector given in those of an agent at this velocity: (forward, left[, up]).
 
     Left is level unless the agent flies straight up; at standstill forward is the x axis.
     """
@@ -74,7 +74,7 @@ def to_world_axes(own: Vec, velocity: Vec) -> Vec:
 
 @law
 def wander(target: Vec, velocity: Vec, max_speed: float, ahead: float) -> Vec:
-    """Seek the target on a unit sphere carried `ahead` (in its radii) of the agent (Reynolds 1999).
+    """Seek the target on a unit sphere whose centre is `ahead` (in its radii) of the agent (Reynolds 1999).
 
     `target` is in the agent's own frame: (forward, left) or (forward, left, up). At standstill, forward is the x axis.
     """
@@ -96,10 +96,10 @@ def target_speed(velocity: Vec, speed: float) -> Vec:
 
 @law
 def face(velocity: Vec, heading: Vec) -> Vec:
-    """Turn the velocity toward `heading` and leave the speed as it is: S = |v| n sin(a), m/s, across the velocity.
+    """Turn the velocity towards `heading` at constant speed: S = |v| n sin(a), m/s, perpendicular to the velocity.
 
-    a is the angle between the two and n points to the heading's side; of a heading behind, S = |v| n, and of one
-    straight behind n is to the right. Under F = w S tan(a/2) falls as exp(-w t / m) from 90 degrees on.
+    a is the angle between the two and n points to the heading's side. If the heading is behind, S = |v| n; if straight
+    behind, n points right. Under F = w S tan(a/2) falls as exp(-w t / m) from 90 degrees on.
     """
     forward, wanted = unit(velocity), unit(heading)
     aside = lateral(wanted, forward)
@@ -115,16 +115,16 @@ def dock(
 ) -> Vec:
     """Arrive at a point while flying in a `direction`: through a gate `gate` [m] before it, then along its axis.
 
-    In a cone about the axis, with its tip at the point and `width` [m] from the axis at the gate, it aims at the axis
-    half-way to the point: the distance from the axis falls as the square of the distance to go, and the angle with it.
-    Outside twice that it aims at the gate; from beyond the point, beside it first. Reynolds 1999 has it in words, the
-    construction is ours.
+    In a cone about the axis, with its tip at the point and radius `width` [m] at the gate, the agent aims at the axis
+    half-way to the point: its distance from the axis falls as the square of the distance to go, its angle linearly.
+    Outside twice that cone it aims at the gate; from beyond the point, first at a point beside it. Reynolds 1999
+    describes docking in words; the construction is ours.
     """
     o, e, half = like(gate, 0.0), like(gate, 1.0), like(gate, 0.5)
     forward = unit(direction)
     to_go, beside = dot(offset, forward), scale(lateral(offset, forward), like(gate, -1.0))
     aside = norm(beside)
-    there = like(gate, 0.02) * width  # as near as this it is there, on whichever side
+    there = like(gate, 0.02) * width  # nearer than this, the agent has arrived, on either side
     wide = max(to_go * (width / gate), half * there)
     out = min(max(aside / wide - e, o), e)
     near = min(half * max(to_go, o), gate)

@@ -1,7 +1,7 @@
-"""Sheep and shepherd: how a flock heeds a dog, and where the dog should be.
+"""Shepherding: the direction of a sheep near a dog, and the place for the dog.
 
 Source: Strombom et al., "Solving the shepherding problem" (J. R. Soc. Interface 11:20140719, 2014,
-doi 10.1098/rsif.2014.0719), in continuous time: what is a direction there is one here, and the caller gives it a speed.
+doi 10.1098/rsif.2014.0719), in continuous time: the laws return directions, and the caller chooses the speed.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ def sheep_direction(
 ) -> Vec:  # fmt: skip
     """Return the direction of a sheep, unit(h unit(v) + c unit(C) + rho_a unit(R_a) + rho_s unit(R_s) + e noise).
 
-    C leads to the centre of those around it, R_a and R_s are sums of unit vectors away from sheep that are too near and
-    from dogs (Strombom et al. 2014, H'; there h = 0.5, c = 1.05, rho_a = 2, rho_s = 1, e = 0.3). 0 if all of it is.
+    C leads to the centre of the sheep around it, R_a and R_s are sums of unit vectors away from sheep that are too near
+    and from dogs (Strombom et al. 2014, H'; there h = 0.5, c = 1.05, rho_a = 2, rho_s = 1, e = 0.3). 0 if all terms are
+    0.
     """
     total = add(scale(unit(velocity), inertia), scale(unit(centre), attraction))
     total = add(total, add(scale(unit(crowd), apart), scale(unit(away), fear)))
@@ -29,7 +30,7 @@ def sheep_direction(
 
 @law
 def point_behind(offset: Vec, goal: Vec, distance: float) -> Vec:
-    """Return the offset of the place `distance` m behind a thing, as seen from the goal that it shall be driven to."""
+    """Return the offset of the place `distance` m behind a target, as seen from the goal to drive it to."""
     return add(offset, scale(unit(sub(offset, goal)), distance))
 
 
@@ -37,11 +38,11 @@ def point_behind(offset: Vec, goal: Vec, distance: float) -> Vec:
 def herding_offset(
     centre: Vec, farthest: Vec, goal: Vec, together: float, collecting: float, driving: float
 ) -> Vec:  # fmt: skip
-    """Return the offset of the place for a dog: behind a stray, to collect it; else behind the flock, to drive it.
+    """Return the offset of the place for a dog: behind a stray sheep, to collect it, or else behind the flock.
 
-    If the sheep farthest from the centre is more than `together` m from it, `collecting` m behind that sheep, seen from
-    the centre; else `driving` m behind the centre, seen from the goal (Strombom et al. 2014: r_a N^(2/3), r_a and
-    r_a sqrt(N) for N sheep that keep r_a m apart).
+    It is `collecting` m behind the sheep farthest from the centre, seen from the centre, if that is more than
+    `together` m away; else `driving` m behind the centre, seen from the goal (Strombom et al. 2014: r_a N^(2/3), r_a
+    and r_a sqrt(N) for N sheep that keep r_a m apart).
     """
     strays = norm(sub(farthest, centre)) > together
     return select(strays, point_behind(farthest, centre, collecting), point_behind(centre, goal, driving))

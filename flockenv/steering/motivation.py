@@ -1,12 +1,12 @@
-"""Hunger, libido, fear, and the intention that follows from them: laws for scenes, tasks and players.
+"""Laws of hunger, libido and fear, and of the intention that follows from them.
 
 After Tu and Terzopoulos, "Artificial Fishes" (SIGGRAPH 1994). Theirs are: hunger H = 1 - n / a, of which the food n in
 the stomach is digested at a constant rate (`grow_hunger`, as a rate of change); libido L = s(t) (1 - H) with s growing
 evenly since the last mating (`desire`); fear of one predator min(D0 / d, 1), of all of them the sum, at most 1
-(`fright`); and the order in which intentions are looked for: collision, then fear (above one level flee, above a lower
-one school), then the larger of hunger and libido above a level, then wander (`intention`). Ours are: effort makes
-hungry, fear fades instead of ending at once, eaters share food by mass action, food grows logistically (Verhulst
-1838), and levels are lower for the present intention, where theirs is kept by a memory of the last one.
+(`fright`); and the order in which intentions are tested: collision, then fear (above one level flee, above a lower one
+school), then the larger of hunger and libido above a level, then wander (`intention`). Ours are: effort increases
+hunger, fear decays instead of ending at once, eaters share food by mass action, food grows logistically (Verhulst
+1838), and levels are lower for the present intention (hysteresis), where they use a memory of the last one.
 """
 
 from __future__ import annotations
@@ -50,20 +50,20 @@ def grow_hunger(hunger: float, rate: float, effort: float, pace: float, seconds:
 
 @law
 def bite(amount: float, hunger: float, rate: float, seconds: float) -> float:
-    """Return what is eaten of an amount, in its unit: rate x amount x hunger, 1/s; of sums of either it is the sum."""
+    """Return the part of an amount that is eaten in some seconds: rate x amount x hunger, linear in both."""
     return rate * amount * hunger * seconds
 
 
 @law
 def regrow(amount: float, growth: float, capacity: float, seconds: float) -> float:
-    """Return an amount after logistic growth da/dt = r a (1 - a / K): its closed form, whatever the step."""
+    """Return an amount after logistic growth da/dt = r a (1 - a / K), in closed form, exact for any step."""
     share = amount / capacity
     return amount / (share + (like(amount, 1.0) - share) * np.exp(-growth * seconds))  # type: ignore[no-any-return]
 
 
 @law
 def desire(urge: float, hunger: float) -> float:
-    """Return libido, L = min(s (1 - H), 1): love after dinner."""
+    """Return libido, L = min(s (1 - H), 1): it is low while the agent is hungry."""
     one = like(urge, 1.0)
     libido = urge * (one - hunger)
     return libido if libido < one else one
@@ -77,7 +77,7 @@ def fright(distance: float, span: float) -> float:
 
 @law
 def update_fear(fear: float, present: float, memory: float, seconds: float) -> float:
-    """Return fear: the present one, or what is left of the previous one, exp(-t / memory), if that is more."""
+    """Return fear: the present one, or the previous one times exp(-t / memory) if that is more."""
     left = fear * np.exp(-seconds / memory)
     return present if present > left else left
 

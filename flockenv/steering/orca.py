@@ -23,7 +23,7 @@ __all__ = ["SLOT", "half_plane", "orca", "orca_change"]
 SLOT = 6
 """Numbers of one neighbour in `orca`: offset (2) m, velocity (2) m/s, radius m (< 0: empty slot), share."""
 
-_PARALLEL = 1e-6  # sine below which two lines do not meet
+_PARALLEL = 1e-6  # sine below which two lines count as parallel
 _SLACK = 1e-5  # m/s by which parallel lines may contradict each other, from rounding
 
 
@@ -60,9 +60,9 @@ def half_plane(
 
 @law
 def _best_on_line(lines: Any, count: int, normal: Vec, bound: float, desired: Vec, top: float, outward: bool) -> Any:
-    """Return whether the first `count` half-planes and the speed limit leave a part of a line, and the best of it.
+    """Return if a part of a line is within the first `count` half-planes and the speed limit, and its best point.
 
-    The best is nearest to the desired velocity, or, `outward`, furthest in its direction.
+    The best is nearest to the desired velocity or, if `outward`, furthest in its direction.
     """
     o, little = like(bound, 0.0), like(bound, _PARALLEL)
     along, base = (normal[1], -normal[0]), scale(normal, bound)
@@ -86,7 +86,7 @@ def _best_on_line(lines: Any, count: int, normal: Vec, bound: float, desired: Ve
 
 @law
 def _nearest_velocity(lines: Any, count: int, desired: Vec, top: float, outward: bool) -> Any:
-    """Return how many half-planes are kept, all of them or those before the first that cannot be, and the velocity."""
+    """Return the number of half-planes kept, up to the first that cannot be kept, and the velocity."""
     found = scale(desired, top) if outward else limit(desired, top)
     for i in range(count):
         normal, bound = (lines[3 * i], lines[3 * i + 1]), lines[3 * i + 2]
@@ -100,9 +100,9 @@ def _nearest_velocity(lines: Any, count: int, desired: Vec, top: float, outward:
 
 @law
 def _least_violation(lines: Any, count: int, hard: int, kept: int, found: Vec, top: float, relaxed: Any) -> Vec:
-    """Return the velocity whose worst violation is least: all soft half-planes recede alike until one is left.
+    """Return the velocity whose worst violation is least: all soft half-planes recede equally until it is allowed.
 
-    The first `hard` half-planes recede only among themselves.
+    The first `hard` half-planes recede only if they alone allow no velocity.
     """
     worst = like(top, 0.0)
     for i in range(kept, count):
@@ -112,14 +112,14 @@ def _least_violation(lines: Any, count: int, hard: int, kept: int, found: Vec, t
             for j in range(i):
                 stays = (j < hard) & (i >= hard)
                 other, limit_ = (lines[3 * j], lines[3 * j + 1]), lines[3 * j + 2]
-                apart = other if stays else sub(other, normal)  # where j is violated no more than i
+                apart = other if stays else sub(other, normal)  # where j is violated at most as much as i
                 length = norm(apart)
                 if length > like(top, _PARALLEL):
                     relaxed[3 * m], relaxed[3 * m + 1] = apart[0] / length, apart[1] / length
                     relaxed[3 * m + 2] = (limit_ if stays else limit_ - bound) / length
                     m += 1
             all_kept, better = _nearest_velocity(relaxed, m, normal, top, True)
-            if all_kept == m:  # otherwise it is rounding: what there is cannot be bettered
+            if all_kept == m:  # otherwise rounding prevents an improvement
                 found = better
             worst = bound - dot(normal, found)
     return found
@@ -130,10 +130,10 @@ def orca(
     velocity: Vec, desired: Vec, radius: float, max_speed: float, horizon: float, step: float, turn: float,
     neighbours: Numbers,
 ) -> Vec:  # fmt: skip
-    """Change to the velocity nearest to the desired one that keeps clear of the neighbours for `horizon` s: S, m/s.
+    """Take on the velocity nearest to the desired one that keeps clear of neighbours for `horizon` s: S, m/s.
 
-    `neighbours` holds SLOT numbers of each. Half-planes of neighbours with share 1 (obstacles, agents that do not
-    give way) are never given up for others. A desired velocity that is not free is turned right by `turn` [rad], so
+    `neighbours` holds SLOT numbers of each. Half-planes of neighbours with share 1 (obstacles, agents that do not give
+    way) are never relaxed in favour of others. A desired velocity that is not free is turned right by `turn` [rad], so
     that symmetric encounters do not stop; a free one is returned as it is, up to `max_speed`.
     """
     given, lines, relaxed = tuple_as_array(neighbours), tuple_as_array(neighbours), tuple_as_array(neighbours)
@@ -146,7 +146,7 @@ def orca_change(
     velocity: Vec, radius: float, request: Any, horizon: float, step: float, given: Any, slots: int, lines: Any,
     relaxed: Any,
 ) -> Vec:  # fmt: skip
-    """Do the same as `orca` for `slots` neighbours in an array.
+    """Return the same as `orca`, for `slots` neighbours in an array.
 
     request: (desired, max_speed, turn); lines, relaxed: scratch.
     """

@@ -1,4 +1,4 @@
-"""What an agent wants about others: where a quarry will be, to meet it, to keep off, to stay with neighbours."""
+"""Laws for an agent and others: prediction of a quarry, pursuit, evasion, separation, formations, hiding."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ def distance_time(offset: Vec, max_speed: float, factor: float) -> float:
 def interception_time(offset: Vec, quarry_velocity: Vec, max_speed: float) -> float:
     """Predict exactly: the first time at which a pursuer at full speed V can meet the quarry, s.
 
-    Smallest t > 0 of (w.w - V^2) t^2 + 2 p.w t + p.p = 0 with p = offset, w = quarry velocity, in the form that does
-    not cancel; |p|/V where no interception exists.
+    Smallest t > 0 of (w.w - V^2) t^2 + 2 p.w t + p.p = 0 with p = offset, w = quarry velocity, computed without
+    cancellation; |p|/V if no interception exists.
     """
     a = dot(quarry_velocity, quarry_velocity) - max_speed * max_speed
     b = dot(offset, quarry_velocity)
@@ -72,9 +72,9 @@ def interception_time(offset: Vec, quarry_velocity: Vec, max_speed: float) -> fl
 
 @law
 def approach_time(offset: Vec, speed: float, longest: float) -> float:
-    """Return |offset| / speed, s: how long an agent at this speed takes to arrive here; at most `longest` [s].
+    """Return |offset| / speed, s, the time that an agent at this speed takes to arrive; at most `longest` [s].
 
-    The predictor of evasion (OpenSteer), which divides unguarded there.
+    The predictor of evasion in OpenSteer, which has no guard against a speed of 0.
     """
     distance = norm(offset)
     return distance / speed if distance < longest * speed else longest
@@ -82,16 +82,16 @@ def approach_time(offset: Vec, speed: float, longest: float) -> float:
 
 @law
 def cosine_sector(x: float) -> float:
-    """Return 1, 0 or -1: within 45 degrees of straight on, across, opposite."""
+    """Return 1, 0 or -1 for an angle with cosine x: within 45 degrees of 0, in between, or within 45 of 180."""
     edge = like(x, 0.707)
     return like(x, 1.0) if x > edge else (like(x, -1.0) if x < -edge else like(x, 0.0))
 
 
 @law
 def opensteer_time(offset: Vec, velocity: Vec, quarry_velocity: Vec, longest: float) -> float:
-    """Predict as OpenSteer does: T = k |offset| / |v|, s, at most `longest` [s]; k by where the quarry is and heads.
+    """Predict as OpenSteer does: T = k |offset| / |v|, s, at most `longest` [s].
 
-    Ahead, aside or behind; on a parallel course, across, or against: (4, 1.8, 0.85), (1, 0.8, 4), (0.5, 2, 2).
+    k for a quarry ahead: 4 on a parallel course, 1.8 across, 0.85 opposite; beside: 1, 0.8, 4; behind: 0.5, 2, 2.
     """
     forward = unit(velocity)
     place, course = cosine_sector(dot(forward, unit(offset))), cosine_sector(dot(forward, unit(quarry_velocity)))
@@ -126,7 +126,7 @@ def push_off(offset: Vec, square: float) -> Vec:
 def separate(offset: Vec, tie: Vec) -> Vec:
     """Return the push of a neighbour: away from it, weighted 1/distance, 1/m (Reynolds 1999). Sum over neighbours.
 
-    `tie` is the direction to take where the two coincide, a unit vector that is opposite for the other one.
+    `tie` is the direction if the two coincide, a unit vector that is opposite for the other one.
     """
     return separate_at(offset, dot(offset, offset), tie)
 
@@ -145,7 +145,7 @@ def align(velocity: Vec, mean_velocity: Vec) -> Vec:
 
 @law
 def cohere(mean_offset: Vec, velocity: Vec, max_speed: float) -> Vec:
-    """Seek the neighbours' centre, at `mean_offset` [m] (Reynolds 1999). Without offset there is nothing to seek."""
+    """Seek the neighbours' centre, at `mean_offset` [m] (Reynolds 1999); return zero if the offset is zero."""
     found = dot(mean_offset, mean_offset) > like(max_speed, 0.0)
     return select(found, seek(mean_offset, velocity, max_speed), zero(velocity))
 
@@ -154,7 +154,7 @@ def cohere(mean_offset: Vec, velocity: Vec, max_speed: float) -> Vec:
 def passing_point(offset: Vec, velocity: Vec, distance: float) -> Vec:
     """Return the offset of the point beside a neighbour, `distance` [m] from it towards this agent's path, to pass it.
 
-    It lies across the path; a neighbour dead ahead is passed on the right.
+    Seen from the neighbour it is perpendicular to the path; a neighbour dead ahead is passed on the right.
     """
     forward = unit(velocity)
     aside = lateral(offset, forward)
@@ -167,9 +167,9 @@ def passing_point(offset: Vec, velocity: Vec, distance: float) -> Vec:
 def offset_pursue(
     offset: Vec, velocity: Vec, quarry_velocity: Vec, max_speed: float, distance: float, time: float
 ) -> Vec:
-    """Pass the quarry at a distance [m]: seek a point so far beside where it will be, on this side (Reynolds 1999).
+    """Pass the quarry at a distance [m]: seek a point beside its predicted position, on this side (Reynolds 1999).
 
-    It is passed at that distance if `time` is predicted for the passing point, not for the quarry.
+    The distance is exact if `time` is predicted for the passing point, not for the quarry.
     """
     there = add(offset, scale(quarry_velocity, time))
     return seek(passing_point(there, velocity, distance), velocity, max_speed)
@@ -179,7 +179,7 @@ def offset_pursue(
 def keep_station(
     offset: Vec, velocity: Vec, leader_velocity: Vec, place: Vec, max_speed: float, slow_radius: float
 ) -> Vec:
-    """Arrive at a place in a leader's frame, (forward, left[, up]) of it [m], and keep it: a formation.
+    """Arrive at a place in a leader's frame, (forward, left[, up]) in m, and keep it: a formation.
 
     v_d = v_L + V min(1, d / slow_radius) towards the place, at most V. An agent that arrives at the predicted place,
     as in offset pursuit (Reynolds 1999), has v_d = 0 there and lags behind a moving leader.
@@ -228,9 +228,9 @@ def interpose(
     max_speed: float,
     slow_radius: float,
 ) -> Vec:
-    """Arrive between two others, at `share` of the way from a to b, where that will be (Reynolds 1999).
+    """Arrive between two others: at the predicted point a fraction `share` from a to b (Reynolds 1999).
 
-    Their ways are foreseen for as long as it takes to get between them at full speed.
+    Both are extrapolated over the time to get between them at full speed.
     """
     now = add(offset_a, scale(sub(offset_b, offset_a), share))
     moving = add(velocity_a, scale(sub(velocity_b, velocity_a), share))
@@ -242,9 +242,9 @@ def interpose(
 def shadow(
     offset: Vec, velocity: Vec, quarry_velocity: Vec, max_speed: float, distance: float, band: float, time: float
 ) -> Vec:
-    """Pursue from beyond `distance` + `band` [m], match speed and heading within `distance`, and between them both.
+    """Pursue beyond `distance` + `band` [m], match speed and heading within `distance`, and mix both in between.
 
-    The shares change linearly over the band. Reynolds 1999 switches; a switch with hysteresis would have to remember.
+    The shares change linearly over the band. Reynolds 1999 switches, which would need hysteresis and so a memory.
     """
     o, e = like(band, 0.0), like(band, 1.0)
     share = min(max((norm(offset) - distance) / band, o), e)
@@ -254,7 +254,7 @@ def shadow(
 
 @law
 def hiding_place(offset: Vec, radius: float, margin: float, threat: Vec) -> Vec:
-    """Return the offset [m] of the place behind a round obstacle, `margin` [m] from it, that `threat` cannot see.
+    """Return the offset [m] of the place behind a round obstacle, `margin` [m] from it, hidden from a threat.
 
     h = c + (radius + margin) unit(c - x_threat); `offset` leads to the obstacle's centre c, `threat` to the seeker.
     """

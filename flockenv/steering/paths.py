@@ -1,7 +1,6 @@
-"""Along paths and fields, given the nearest point of the path, or the velocity of the flow.
+"""Laws to follow paths and flow fields, given the nearest point of the path, or the velocity of the flow.
 
-Where the nearest point of a path lies is geometry (`flockenv.geometry.polyline`), and so is what a grid says
-(`flockenv.maths.grid`).
+`flockenv.geometry.polyline` computes the nearest point of a path, `flockenv.maths.grid` the value of a field.
 """
 
 from __future__ import annotations
@@ -15,9 +14,9 @@ __all__ = ["follow_flow", "follow_path", "stay_on_path"]
 
 @law
 def stay_on_path(beyond: float, to_spine: Vec, velocity: Vec, max_speed: float) -> Vec:
-    """Return zero if the predicted place is in the tube, else seek the spine's nearest point (Reynolds 1999).
+    """Return zero if the predicted position is in the tube, else seek the spine's nearest point (Reynolds 1999).
 
-    `beyond` is how far the predicted place lies outside the tube, m, negative inside; `to_spine` leads to the spine.
+    `beyond` is the distance of the predicted position from the tube, m, negative inside; `to_spine` leads to the spine.
     """
     return select(beyond > like(beyond, 0.0), seek(to_spine, velocity, max_speed), zero(velocity))
 
@@ -26,8 +25,8 @@ def stay_on_path(beyond: float, to_spine: Vec, velocity: Vec, max_speed: float) 
 def follow_path(beyond: float, gained: float, target: Vec, velocity: Vec, max_speed: float) -> Vec:
     """Return zero while the agent makes progress in the tube, else seek a point further along it (Reynolds 1999).
 
-    `gained` is the progress of the predicted place along the path, m, less the required one: without it the agent has
-    turned round, or is too slow, and is sent on. `beyond` is how far it lies outside the tube, m, negative inside.
+    `gained` is the progress of the predicted position along the path less the required one, m: it is negative if the
+    agent has turned round or is too slow. `beyond` is the distance of that position from the tube, m, negative inside.
     """
     o = like(beyond, 0.0)
     good = (beyond <= o) & (gained > o)
@@ -36,5 +35,5 @@ def follow_path(beyond: float, gained: float, target: Vec, velocity: Vec, max_sp
 
 @law
 def follow_flow(flow: Vec, velocity: Vec) -> Vec:
-    """Take on the velocity of a field: S = F - v, with F its velocity at the predicted place (Reynolds 1999)."""
+    """Take on the velocity of a field: S = F - v, F at the predicted position (Reynolds 1999)."""
     return sub(flow, velocity)

@@ -2,9 +2,9 @@
 
 Sources: Helbing and Molnar 1995 (Phys. Rev. E 51:4282); Helbing, Farkas and Vicsek 2000 (Nature 407:487); Johansson,
 Helbing and Shukla 2007 (arXiv 0810.4587); Moussaid et al. 2009 (Proc. R. Soc. B 276:2755), 2010 (PLoS ONE 5:e10047) and
-2011 (PNAS 108:6884). docs/social_forces.md has their values, and where they disagree.
+2011 (PNAS 108:6884). docs/social_forces.md has their values, and the differences between them.
 
-`offset` is other minus self, everywhere: repulsion acts along -offset. `aim` is the unit vector of the desired
+`offset` is always other minus self: repulsion acts along -offset. `aim` is the unit vector of the desired
 direction. `tie` is a unit vector, opposite for the other agent, along which two agents in one place part.
 """
 
@@ -49,7 +49,7 @@ def view_weight(direction: Vec, offset: Vec, least: float) -> float:
     """Return lambda + (1 - lambda)(1 + cos phi) / 2: 1 straight ahead, lambda behind.
 
     phi lies between `direction` and `offset`, which leads to the other (Johansson, Helbing and Shukla 2007: cos phi is
-    -n . e with n from the other to me). Without a direction, and in one place, it is 1.
+    -n . e with n from the other to me). Without a direction, or if both are in one place, it is 1.
     """
     e, half = like(least, 1.0), like(least, 0.5)
     long = dot(offset, offset) * dot(direction, direction)
@@ -71,7 +71,7 @@ def cone_weight(direction: Vec, force: Vec, cosine: float, outside: float) -> fl
 
 @law
 def unit_away(offset: Vec, tie: Vec) -> tuple[Vec, float]:
-    """Return the unit vector away from the other, along the tie where both are in one place, and the distance, m."""
+    """Return the unit vector away from the other, or the tie if both are in one place, and the distance, m."""
     square = dot(offset, offset)
     apart = square > like(square, ONE_PLACE)
     away = select(apart, scale(offset, like(square, -1.0)), tie)
@@ -93,15 +93,15 @@ def repulsion(offset: Vec, tie: Vec, size: float, decay: float) -> Vec:
 
 @law
 def elliptical_repulsion(offset: Vec, step: Vec, tie: Vec, decay: float) -> Vec:
-    """-B grad exp(-b / B): away from the other and from the end of its `step` y; times A it is an acceleration.
+    """Return -B grad exp(-b / B), away from the other and from the end of its `step` y; times A: an acceleration.
 
     b = sqrt((|d| + |d - y|)^2 - |y|^2) / 2 is the smaller half axis of the ellipse through this agent i with foci at
     the other agent j and at the end of its step, d from j to i. y is the step of j, v_j dt (Helbing and Molnar 1995;
-    elliptical I of Johansson et al. 2007), or relative to i, (v_j - v_i) dt (elliptical II). In the form that does not
-    cancel: b = sqrt(p q) |u + w| / 2 and grad b = (p + q) / (2 sqrt(p q)) unit(u + w), with p u = d and q w = d - y.
+    elliptical I of Johansson et al. 2007), or relative to i, (v_j - v_i) dt (elliptical II). Without cancellation: b =
+    sqrt(p q) |u + w| / 2 and grad b = (p + q) / (2 sqrt(p q)) unit(u + w), with p u = d and q w = d - y.
 
-    It has no direction if i stands on the step of j, and grows as 1 / sqrt(q) at its end: there a tie gives the
-    direction, and (p + q) / (2 sqrt(p q)) is at most 500.
+    If i stands on the step of j, it has no direction, and it grows as 1 / sqrt(q) at the end of the step: the direction
+    is then the tie, and (p + q) / (2 sqrt(p q)) is at most 500.
     """
     out, size = elliptical_direction(offset, step, tie, decay)
     return scale(out, size)
@@ -123,7 +123,7 @@ def elliptical_direction(offset: Vec, step: Vec, tie: Vec, decay: float) -> tupl
     across = lateral(tie, unit(step))
     there = p * p > like(decay, ONE_PLACE)
     out = select(square > like(decay, NO_SIDE), unit(sides), unit(across))
-    # in one place there is no direction: as strong as without a step
+    # in one place, without a direction, it is as strong as without a step
     return select(there, out, unit(tie)), (ratio if there else e) * exp(-(b if there else o) / decay)
 
 
@@ -132,12 +132,12 @@ def sidestep(
     offset: Vec, velocity: Vec, other_velocity: Vec, tie: Vec,
     importance: float, gamma: float, angular: float, forward: float, bias: float,
 ) -> Vec:  # fmt: skip
-    """Slow down before a neighbour, and turn to one side of it; times A it is an acceleration.
+    """Slow down before a neighbour and turn to one side of it; times A: an acceleration.
 
     D = lambda (v_i - v_j) + e, with e from i to j, t = unit(D), B = gamma |D|; theta is the angle from t to e in
     (-pi, pi], positive if j is to the left of t; -exp(-d / B - (n' B theta)^2) along t, and away from the side of j,
-    exp(-d / B - (n B theta)^2) across it. The side bias theta + B eps, wrapped again, decides for the right if j is
-    dead ahead (Moussaid et al. 2009, equations 4 to 7). In space it turns in the plane of t and e: ours.
+    exp(-d / B - (n B theta)^2) across it. The side bias theta + B eps, wrapped again, selects the right if j is dead
+    ahead (Moussaid et al. 2009, equations 4 to 7). In 3-D the turn is in the plane of t and e (ours).
 
     importance: lambda, s/m; gamma: s (B = gamma |D| m); angular: n; forward: n'; bias: eps.
     """
@@ -163,9 +163,9 @@ def sidestep(
 
 @law
 def _side_and_angle(towards: Vec, t: Vec) -> tuple[Vec, float]:
-    """Return a unit vector across t, and the angle from t towards it: its left in a plane, the other's side in space.
+    """Return a unit vector across t and the angle from t towards it: to the left in 2-D, to the other's side in 3-D.
 
-    In space a neighbour dead ahead counts as left, so that it is passed on the right; so does any if t is 0.
+    In 3-D a neighbour dead ahead, or any if t is 0, counts as left, so that it is passed on the right.
     """
     if len(t) == 2:
         left: Vec = (-t[1], t[0])
@@ -179,9 +179,9 @@ def _side_and_angle(towards: Vec, t: Vec) -> tuple[Vec, float]:
 
 @law
 def attraction(offset: Vec, decay: float) -> Vec:
-    """Return exp(-d / B) towards a thing: times A, the pull of a potential that grows to A B far away.
+    """Return exp(-d / B) towards a place; times A it is the pull of a potential that grows to A B far away.
 
-    Helbing and Molnar 1995 have such a potential, W(d, t), and give no form: this is ours.
+    Helbing and Molnar 1995 have such a potential, W(d, t), without a formula; this one is ours.
     """
     return scale(unit(offset), exp(-norm(offset) / decay))
 

@@ -1,8 +1,8 @@
-"""Laws over rows: the thin wrapper that loops a law of one agent over arrays of agents.
+"""Application of a law of one agent to arrays of agents.
 
-`rows(seek)(offset, velocity, max_speed)` takes arrays (..., D) where the law takes a vector, (...) or a number where it
-takes a number, and (..., K, D) where it takes a tuple of K forces; leading shapes broadcast. It returns the same shape
-of answer. This is how a hand-written player calls exactly what the simulator calls.
+`rows(seek)(offset, velocity, max_speed)` takes arrays (..., D) for vectors, (...) or a number for numbers, and (..., K,
+D) for a tuple of K forces; leading shapes broadcast. Its result has a row for each. Hand-written players thus call the
+same laws as the simulator.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _RANK = {"Vec": 1, "Numbers": 1, "Forces": 2, "float": 0}
 
 @functools.lru_cache(maxsize=256)
 def rows(law: Law) -> Callable[..., NDArray[np.float64]]:
-    """Return the law over arrays; float64 inside. The loop is compiled once per law and shape of vector.
+    """Return a function that applies a law to arrays, in float64; it is compiled once per law and shape of vector.
 
     Raises TypeError for a law whose annotations do not distinguish numbers, vectors and tuples of vectors.
     """
@@ -64,7 +64,7 @@ def rows(law: Law) -> Callable[..., NDArray[np.float64]]:
 
 
 def _rank(python: Any, name: str, annotation: Any) -> int:
-    """Return how many axes a row of an argument has: 0 of a number, 1 of a vector, 2 of a tuple of forces."""
+    """Return the number of axes of an argument's rows: 0 for numbers, 1 for vectors, 2 for tuples of forces."""
     found = _RANK.get(annotation if isinstance(annotation, str) else getattr(annotation, "__name__", ""))
     if found is None:
         allowed = ", ".join(_RANK)
@@ -74,7 +74,7 @@ def _rank(python: Any, name: str, annotation: Any) -> int:
 
 @entry_of
 def loop_of(law: Law, tails: tuple[tuple[int, ...], ...], dimension: int) -> Callable[..., None]:
-    """Make the loop of one law over rows of arrays (R, *tail), into (R, dimension), or (R,) if that is 0."""
+    """Return the loop of a law over rows of arrays (R, *tail), into (R, dimension), or (R,) if that is 0."""
     arguments = _arguments(tails)
 
     def over(arrays: Any, out: Any) -> None:
@@ -92,7 +92,7 @@ def loop_of(law: Law, tails: tuple[tuple[int, ...], ...], dimension: int) -> Cal
 
 @functools.cache
 def _arguments(tails: tuple[tuple[int, ...], ...]) -> Callable[[Any, int], tuple[Any, ...]]:
-    """Return a function that makes what a law takes of row r of each array of a tuple: up to four at once."""
+    """Return a function that returns a law's arguments from row r of each array of a tuple, up to four at once."""
     first = (len(tails) - 1) // 4 * 4
     mine = tails[first:]
     before, count = _arguments(tails[:first]) if first else None, len(mine)
@@ -117,12 +117,12 @@ def _arguments(tails: tuple[tuple[int, ...], ...]) -> Callable[[Any, int], tuple
 
 @kernel
 def _item(items: Any, k: int) -> Any:
-    """Return item k: a number of a row, or a row."""
+    """Return item k of a row or of an array: a number or a row."""
     return items[k]
 
 
 def _vector(dimension: int) -> Callable[[Any, int], Vec]:
-    """Return a function that makes a vector of row r of an array."""
+    """Return a function that returns row r of an array as a vector."""
 
     def vector_of(array: Any, r: int) -> Vec:
         if dimension == 2:
@@ -134,7 +134,7 @@ def _vector(dimension: int) -> Callable[[Any, int], Vec]:
 
 @functools.cache
 def _element(tail: tuple[int, ...]) -> Callable[[Any, int], Any]:
-    """Return a function that makes the number, tuple, or tuple of tuples that a law takes of row r of an array."""
+    """Return a function that returns row r of an array as a law takes it: a number, a tuple, or nested tuples."""
     if not tail:
         return _item
     if len(tail) == 1 and tail[0] in (2, 3):
