@@ -1,1 +1,1 @@
-"""Space and its contents: shapes, targets, polylines, travel distances; and the neighbour search."""
+"""Geometry: space, shapes, targets, polylines, floor fields, and the neighbour search."""

@@ -2,9 +2,9 @@
 
 Agents are sorted along a Hilbert curve, on which neighbours in order are neighbours in space, and cut into blocks of
 one agent per SIMD lane: the leaves. Node i of each level above holds the nodes 4 i to 4 i + 3 below it. So nothing is
-inserted, split or linked, the number of nodes is known beforehand, and agents in one place are a block like any other.
-Each block traverses the tree as a whole (`gather`) and lists the sources that its lanes then interact with: a node if
-it is small for its distance, single agents otherwise.
+inserted, split or linked, the number of nodes is known beforehand, and agents in one place need no special case. Each
+block traverses the tree as a whole (`gather`) and lists the sources that its lanes then interact with: a node if its
+size is small relative to its distance, single agents otherwise.
 
 One thread builds the tree, in a few hundredths of the time of the traversals; the traversals are shared by all threads.
 """
@@ -49,7 +49,7 @@ LEVELS = 32
 
 
 def tree_sizes(agents: int, lanes: int, dimension: int, team: int) -> dict[str, int]:
-    """Return the length of each array: leaves, nodes, and the source lists of a team of threads.
+    """Return the lengths of the arrays: leaves, nodes, and the source lists of a team of threads.
 
     The record of a node: centre, lower corner, upper corner (D each); weight, edge, shift.
     """
@@ -110,7 +110,7 @@ def _curve_positions(cells: Any, flat: bool, bits: int) -> None:
 
 @kernel
 def _cell(x: float, low: float, pace: float, cells: Any) -> Any:
-    """Return the index, of `cells` along an axis, of the cell that x is in; 0 for NaN."""
+    """Return the index of the cell that contains x, of `cells` along an axis; 0 for NaN."""
     at = (np.float64(x) - low) * pace
     return np.int64(min(at, np.float64(cells - 1)) if at > 0.0 else 0.0)
 
@@ -125,7 +125,7 @@ def _write_keys(keys: Any, first: int, end: int, cells: Any, flat: bool, bits: i
 
 @kernel
 def _sort(keys: Any, places: Any, digits: Any, count: int, room: int) -> None:
-    """Sort the first `count` keys, and places with them, by a stable radix sort. Both arrays have length 2 `room`."""
+    """Sort the first `count` keys, and `places` in the same order (stable radix sort); arrays of length 2 `room`."""
     for turn in range(TURNS):
         source = turn % 2 * room
         to, shift = room - source, turn * DIGIT
@@ -201,7 +201,7 @@ def _leaf(leaves: Any, block: int, held: int, lanes: int, by_mass: bool, nodes: 
 
 @kernel
 def _join(nodes: Any, first: int, held: int, at: int, d: int) -> None:
-    """Write weight, centre and corners of a node with `held` children, whose records lie one after another."""
+    """Write weight, centre and corners of a node with `held` children, whose records are contiguous."""
     size, total = 3 * d + 3, 0.0
     for c in range(held):
         total += nodes[first + c * size + 3 * d]
@@ -287,9 +287,9 @@ def gather(
     leaves: Any, nodes: Any, digits: Any, count: int, lanes: int, size: Any, by_mass: bool, angle: float, block: int,
     level: int, node: int, listed: Any, first: int,
 ) -> tuple[int, int, int]:  # fmt: skip
-    """List the sources of a block from a node on, until the list has no room for another leaf.
+    """List the sources of a block, from a node on, until the list has no room for another leaf.
 
-    Returns the number of sources, and the level and node to go on with. Writes, from listed[first] on, D coordinates
+    Returns the number of sources, and the level and node to continue with. Writes, from listed[first] on, D coordinates
     of each source's centre, m, and its weight.
     """
     d = len(size)

@@ -1,13 +1,13 @@
-"""Cell list: one neighbour query per evaluation, at the largest interaction range, shared by all pair forces.
+"""Cell list: one neighbour query per evaluation of forces, at the largest interaction range of all pair forces.
 
-A query sorts the living agents by cell if that pays, and returns contiguous ranges of sorted candidates. No neighbour
-list is built: the pair loop tests every candidate of a range against the interaction range. Brute force is the query
-with one range. Several threads may share one query: each counts and places its own agents, and the resulting order (by
-cell, then by agent number) does not depend on the number of threads.
+A query sorts the living agents by cell if that is faster, and returns contiguous ranges of sorted candidates. No
+neighbour list is built: the pair loop tests every candidate of a range against the interaction range. Brute force is
+the query with one range. Several threads may share one query: each counts and places its own agents, and the resulting
+order (by cell, then by agent number) does not depend on the number of threads.
 
-In an unbounded space the cells divide the bounding box of the agents. One agent far away stretches the cells until all
-others share one. If that has happened, the cells are folded instead: they are as wide as the reach, there are
-infinitely many, and they share a fixed number of slots in memory, like the cells of a torus (`_folded_shape`).
+In an unbounded space the cells divide the bounding box of the agents. One agent far away enlarges the cells until all
+others share one. In that case the cells are folded: they are as wide as the reach, there are infinitely many, and they
+share a fixed number of slots in memory, like the cells of a torus (`_folded_shape`).
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ Ints = NDArray[np.int32]
 
 @kernel
 def _fit(cells: Any, count: int) -> tuple[int, int, int]:
-    """Return cells per axis, at most `count` in all; wider cells also give correct results."""
+    """Return the number of cells per axis, reduced to at most `count` in all: wider cells are also correct."""
     nx, ny, nz = cells
     total = float(nx) * float(ny) * float(nz)
     if total > count:
@@ -86,14 +86,14 @@ def _fit(cells: Any, count: int) -> tuple[int, int, int]:
 
 @kernel
 def _cells_along(length: float, reach: float) -> int:
-    return int(min(max(1.0, length / (reach * _MARGIN)), 2.0**20))  # bounded first: 1e100 m overflow an integer
+    return int(min(max(1.0, length / (reach * _MARGIN)), 2.0**20))  # bounded first: 1e100 would overflow an integer
 
 
 @kernel
 def grid_of(lengths: Any, count: int, reach: float, periodic: bool) -> tuple[int, int, int, int, int]:
-    """Return the number of cells per axis (nx, ny, nz), at most `count` in all, and how many a reach spans along x.
+    """Return cells per axis (nx, ny, nz), at most `count` in all, the cells that a reach spans along x, and 0.
 
-    The last number is 0: these cells are not folded. All are zeros if brute force is as fast.
+    The last number is 0 as these cells are not folded. All are 0 if brute force is as fast.
     """
     fine, nx, ny, nz = FINEST, _cells_along(lengths[0], reach / FINEST), _cells_along(lengths[1], reach), 1
     if len(lengths) == 3:
@@ -112,7 +112,7 @@ def grid_of(lengths: Any, count: int, reach: float, periodic: bool) -> tuple[int
 
 @kernel
 def _spread(pos: Any, living: Any, first: int, end: int, lanes: int, d: int, k: int, bounds: Any, rank: int) -> None:
-    """Write the least and the greatest coordinate k of this thread's living agents."""
+    """Write the least and the greatest coordinate k of the living agents in this thread's blocks."""
     low, high = np.inf, -np.inf
     for b in range(first, end):
         for lane in range(lanes):
@@ -125,7 +125,7 @@ def _spread(pos: Any, living: Any, first: int, end: int, lanes: int, d: int, k: 
 
 @kernel
 def _edge(k: int, team: int, bounds: Any) -> tuple[float, float]:
-    """Return the least coordinate of all threads' agents along axis k, and their extent; (0, 1) if no agent lives."""
+    """Return the least coordinate of all living agents along axis k, and their extent; (0, 1) if there are none."""
     low, high = np.inf, -np.inf
     for r in range(team):
         low, high = min(low, bounds[r, 2 * k]), max(high, bounds[r, 2 * k + 1])
@@ -160,7 +160,7 @@ def region(
 
 @kernel
 def _part(x: float, low: float, pace: float, count: int) -> Any:
-    """Return the index, of `count` cells along an axis, of the cell that x is in; 0 for NaN. pace: cells per metre."""
+    """Return the index of the cell that contains x, of `count` along an axis; 0 for NaN. pace: cells per metre."""
     return min(max(np.int64((np.float64(x) - low) * pace), np.int64(0)), np.int64(count - 1))
 
 
@@ -169,7 +169,7 @@ def divide_region(
     pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, bounds: Any, size: Any,
     reach: float, periodic: bool, capacity: int,
 ) -> tuple[tuple[int, int, int, int, int], Any, Any]:  # fmt: skip
-    """Return the cells as `grid_of` does, the corner of the region they divide, and cells per metre along each axis."""
+    """Return the cells as `grid_of` does, the corner of the divided region, and cells per metre along each axis."""
     low, lengths = region(pos, living, first, end, lanes, rank, team, sync, bounds, size, periodic)
     shape = grid_of(lengths, capacity, reach, periodic)
     if len(size) == 2:
@@ -180,12 +180,12 @@ def divide_region(
 
 @kernel
 def cell_of(pos: Any, at: Any, lanes: Any, low: Any, pace: Any, size: Any, wraps: bool, shape: Any) -> tuple[Any, ...]:
-    """Return the cell along each of three axes of the agent whose coordinates begin at `at`, `lanes` apart."""
+    """Return the cell, along three axes, of the agent whose coordinates begin at `at`, `lanes` apart."""
     if len(size) == 2:
         x: Any = (pos[at], pos[at + lanes])
     else:
         x = (pos[at], pos[at + lanes], pos[at + lanes + lanes])
-    if wraps:  # the cell must be that of the confined position: -1e-17 becomes 0, not a place in the last cell
+    if wraps:  # the cell must be that of the wrapped position: -1e-17 becomes 0, not a position in the last cell
         x, _ = torus_confine(size, size[0], x, x)
     if len(size) == 2:
         third: Any = np.int64(0)
@@ -213,7 +213,7 @@ def count_cells(
     pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, bounds: Any, size: Any,
     reach: float, periodic: bool, wraps: bool, capacity: int, cell: Ints, start: Ints, offset: Ints,
 ) -> tuple[int, int, int, int, int]:  # fmt: skip
-    """Compute the cell of every agent, and where in sorted order each cell begins; return the cells as grid_of does.
+    """Compute each agent's cell, and each cell's beginning in sorted order; return the cells as `grid_of` does.
 
     pos: blocks of (D, lanes) m, wrapped into the periodic box first if `wraps`; living (agents, padded) 0 or 1;
     [first, end): this thread's blocks; capacity: most cells.
@@ -254,10 +254,10 @@ def is_crowded(shape: Any, pace: Any, reach: float, start: Ints) -> bool:
 def _folded_shape(capacity: int, d: int) -> tuple[int, int, int, int, int]:
     """Return the shape of folded cells, at most `capacity` in all; its last number is more than 0.
 
-    The cell (x, y, z) of an endless lattice lies in row (y mod ny, z mod nz), at x + fold (y div ny) + twist (z div nz)
-    modulo nx. So the neighbours of a cell are found as if every cell had a slot of its own; other agents in the same
-    slots are far away and out of reach. The shifts are irrational fractions of a row (the golden ratio; in 3-D, powers
-    of the plastic number), so that a flock of any outline covers the slots evenly.
+    The cell (x, y, z) of an infinite lattice lies in row (y mod ny, z mod nz), at x + fold (y div ny) + twist (z div
+    nz) modulo nx. So the neighbours of a cell are found as if every cell had a slot of its own; other agents in the
+    same slots are out of reach. The shifts are irrational fractions of a row (the golden ratio; in 3-D, powers of the
+    plastic number), so that a flock of any outline covers the slots evenly.
     """
     nz = FOLDED_ROWS if d == 3 else 1
     nx = max(1, capacity // (FOLDED_ROWS * nz))
@@ -272,7 +272,7 @@ def _twist(shape: Any) -> Any:
 
 @kernel
 def _lattice(x: float, pace: float) -> Any:
-    """Return the cell of an endless lattice in which a coordinate lies."""
+    """Return the index of the cell of an infinite lattice that contains a coordinate."""
     return np.int64(math.floor(min(max(np.float64(x) * pace, -_FARTHEST), _FARTHEST)))
 
 
@@ -317,9 +317,9 @@ def tally_cells(cell: Ints, first: int, end: int, rank: int, cells: int, offset:
 
 @kernel
 def begin_cells(rank: int, team: int, sync: Any, cells: int, start: Ints, offset: Ints) -> None:
-    """Write where in sorted order each cell begins, and in `offset`, which holds counts, where each thread's part does.
+    """Write the beginning of each cell in sorted order, and in `offset`, which holds counts, of each thread's part.
 
-    A prefix sum, called by all threads of a team: barriers before and after it, one thread computes.
+    This is a prefix sum. All threads of a team call it and one computes, between two barriers.
     """
     wait_for_team(sync, team)
     if rank == 0:
@@ -351,8 +351,9 @@ def order_records(
     """Sort the records [first, end), already in the order of their cells, by agent number within each cell.
 
     Records have `length` numbers and begin with their place; cell and ident hold cells and agent numbers by place. Most
-    records are in order: those that are not are first collected in `late` (scratch), without a branch, as it would be
-    mispredicted often. Records are prefetched AHEAD of use: since they were written they have left the nearest caches.
+    records are in order. The others are first collected in `late` (scratch), without a branch, which would be
+    mispredicted often. Records are prefetched AHEAD of use, as they have left the nearest caches since they were
+    written.
     """
     if first >= end:
         return
@@ -370,7 +371,7 @@ def order_records(
 
 @kernel
 def _settle(records: Any, cell: Ints, ident: Any, size: Any, first: Any, end: Any, k: Any) -> None:
-    """Move record k back to where it belongs, then those after it, until one is in order."""
+    """Move record k back to its place in order, then those after it, until one is in order."""
     later = _key(records, cell, ident, k * size - size) > _key(records, cell, ident, k * size)
     while later:
         at = k * size
@@ -396,7 +397,7 @@ def row_of(first: int, start: Ints, row: int, nx: int) -> int:
 def candidates(
     first: int, end: int, row: int, at: int, shape: Any, start: Ints, periodic: bool, ranges: Any
 ) -> tuple[int, int]:
-    """Write the ranges (from, to, wrapped) of sorted agents that may be near the block [first, end) of one row.
+    """Write the ranges (from, to, wrapped) of sorted agents that are candidates of the block [first, end) of one row.
 
     `at` is a cell at or before that of `first`; the search begins there. Returns the number of ranges and the cell of
     `first`. A range is `wrapped` if it lies across the edge of a periodic box.
@@ -433,7 +434,7 @@ def candidates(
 def _row_ranges(
     base: int, west: int, east: int, nx: int, start: Ints, periodic: bool, around: bool, ranges: Any, found: int
 ) -> int:
-    """Add the ranges of one row of cells from `west` to `east`; return the new number of ranges."""
+    """Add the ranges of one row's cells, `west` to `east`; return the new number of ranges."""
     if not periodic:
         return _add(start[base + max(west, 0)], start[base + min(east, nx - 1) + 1], False, ranges, found)
     if east - west + 1 >= nx:

@@ -1,9 +1,9 @@
-"""Floor fields: the distance to a target around obstacles, |grad u| = 1 on a grid, second order in the spacing.
+"""Floor fields: path lengths u to a target around obstacles, |grad u| = 1 on a grid, second order in the spacing.
 
-Agents follow -grad u for global navigation; local steering does the rest. Fast sweeping (Zhao, "A fast sweeping method
-for Eikonal equations", Math. Comp. 2005) computes the first-order solution, and with it the order in which a front
-reaches the points; one pass in that order takes one-sided differences of second order (Sethian, "Fast marching
-methods", SIAM Review 1999, section 3.1).
+Agents follow -grad u for global navigation; steering behaviours avoid other agents. Fast sweeping (Zhao, "A fast
+sweeping method for Eikonal equations", Math. Comp. 2005) computes the first-order solution, and with it the order in
+which a front reaches the points; one pass in that order takes one-sided differences of second order (Sethian, "Fast
+marching methods", SIAM Review 1999, section 3.1).
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def _second_order(u: Any, done: Any, order: Any, shape: Any, h: float) -> None:
                 break
             w, wt, wtt = w + weight, wt + weight * t, wtt + weight * t * t
             root = wt * wt - w * wtt
-            if root < 0 or wt + math.sqrt(root) < w * near:  # upwind of this neighbour, which does not contribute to x
+            if root < 0 or wt + math.sqrt(root) < w * near:  # x < this neighbour, which then does not contribute
                 break
             x = (wt + math.sqrt(root)) / w
         u[at], done[at] = x, True
@@ -127,7 +127,7 @@ def distances_around(free: NDArray[np.bool_], spacing: float, begin: Floats) -> 
     u = np.where(free, begin, np.inf).reshape(shape).astype(np.float64)
     open_ = np.ascontiguousarray((free & ~np.isfinite(begin)).reshape(shape))
     while entry(_sweep)(u, open_, spacing) > 1e-9 * spacing:
-        pass  # each round gets around one more corner than the one before, and no distance grows
+        pass  # each round reaches around one more corner than the one before, and no distance grows
     flat = u.reshape(-1)
     done = np.isfinite(flat) & ~open_.reshape(-1)
     order = np.flatnonzero(np.isfinite(flat) & ~done)
@@ -147,7 +147,7 @@ class Ground(NamedTuple):
 
 
 class Start(NamedTuple):
-    """A region in which agents begin and from which a path must lead to a target."""
+    """A box in which agents start, and from which a path must lead to a target."""
 
     name: str
     low: Floats  # (D,) m
@@ -156,7 +156,7 @@ class Start(NamedTuple):
 
 @functools.lru_cache(maxsize=2)
 def ground(shapes: tuple[Shape, ...], low: tuple[float, ...], high: tuple[float, ...], spacing: float) -> Ground:
-    """Return the grid of a region and the distances of its points from obstacles: the same for every target."""
+    """Return the grid of a region with the distances of its points from obstacles, which all targets share."""
     counts = [1 + math.ceil((b - a) / spacing - 1e-9) for a, b in zip(low, high, strict=True)]
     points = points_of(low, spacing, counts)
     return Ground(low, spacing, points, *_nearest_surface(shapes, points))
@@ -168,7 +168,7 @@ def floor_field_table(
 ) -> Floats:  # fmt: skip
     """Return a floor field as a grid (see flockenv/maths/grid.py): distance to the nearest target, m, and direction.
 
-    The shortest paths are those of a body's centre that keeps `clearance` from all shapes. Within `clearance` of an
+    Paths are those of a body's centre at least `clearance` from all shapes. Within `clearance` of an
     obstacle, and inside it, the direction is away from the nearest surface, and the distance is that of the nearest
     clear point plus the distance to that point. Where no path leads the distance is NO_WAY; the direction is then zero
     at points that are clear of all obstacles.
@@ -202,8 +202,8 @@ def floor_field_table(
 def _lengths_beside(
     u: Floats, reached: NDArray[np.bool_], free: NDArray[np.bool_], spacing: float, clearance: float
 ) -> Floats:
-    """Return distances also beside obstacles, m, so that an agent pushed against a wall is about as far as before."""
-    from scipy.ndimage import distance_transform_edt  # here: a scene without floor fields need not wait for it
+    """Return u, m, also extended to points within `clearance` of obstacles, where agents may be pushed."""
+    from scipy.ndimage import distance_transform_edt  # slow to import, and used only by floor fields
 
     far, place = distance_transform_edt(~reached, sampling=spacing, return_indices=True)
     beside = reached | (~free & (far <= clearance + 2 * spacing))
@@ -213,10 +213,10 @@ def _lengths_beside(
 def free_part(
     shapes: Sequence[Shape], target: Target, name: str, spacing: float, clearance: float
 ) -> tuple[Target, Floats, Floats]:
-    """Return the free part of a target, points of it (S, D) m, and their distances to the nearest shape (S,) m.
+    """Return the free part of a target, sample points of it (S, D) m, and their distances to shapes (S,) m.
 
-    A door is cut to the part between its jambs; a box stays whole, but its points are only those at least `clearance`
-    from all shapes. Raises ValueError, in one line, if nothing is left.
+    A door is cut to the part between its jambs; a box stays whole, but only points at least `clearance` from all shapes
+    are returned. Raises ValueError, in one line, if nothing is left.
     """
     samples = target.samples(spacing)
     gap = np.min([shape.gap(samples) for shape in shapes], axis=0) if shapes else np.full(len(samples), np.inf)
@@ -241,7 +241,7 @@ def _begin_near_target(
 ) -> None:  # fmt: skip
     """Write the distances of points near a target, and the straight offset to it from those within two spacings.
 
-    A straight line is used only if no obstacle can be between: if it is shorter than the distance to the nearest one.
+    A straight line is used only if it is shorter than the distance to the nearest obstacle, so that none is in between.
     """
     spacing, d = found.spacing, whole.dimension
     if (whole.extremes[0] < found.low).any() or (whole.extremes[1] > high).any():
@@ -252,7 +252,7 @@ def _begin_near_target(
     last = np.ceil((target.extremes[1] + sight - found.low) / spacing).astype(int) + 1
     here = tuple(slice(a, b) for a, b in zip(first, last, strict=True))
     points, free = found.points[here], found.gap[here] >= clearance
-    from scipy.spatial import cKDTree  # here: a scene without floor fields need not wait for it
+    from scipy.spatial import cKDTree  # slow to import, and used only by floor fields
 
     nearby = cKDTree(places).query(points)[1]
     to = target.offset(points)
@@ -289,7 +289,8 @@ def _nearest_surface(shapes: Sequence[Shape], points: Floats) -> tuple[Floats, F
 def _slopes(u: Floats, spacing: float) -> Floats:
     """Return the gradient, (..., D), by one-sided differences towards the smaller neighbour along each axis.
 
-    Second order where the next point on that side is not larger than the neighbour. No difference crosses an obstacle.
+    The order is 2 where the next value on that side is not larger than the neighbour. No difference crosses an
+    obstacle.
     """
     found = []
     for axis in range(u.ndim):

@@ -2,8 +2,8 @@
 
 A path is one array: 1 if it is closed, else 0; its length (m); the edges of the torus it lies on (D, m; 0 if there is
 none); then for each segment its middle (D, m), its direction (D), half its length (m) and the arc length at its middle
-(m). On a torus segments and offsets follow the minimum image convention. `nearest` returns the point of the path that
-is nearest to a place, `spine` the point at an arc length. Both loop over all segments: a hundred take 0.2 us.
+(m). On a torus segments and offsets follow the minimum image convention. `nearest` returns the point of the path
+nearest to a position, `spine` the point at an arc length. Both loop over all segments: 100 take 0.2 us.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Table = Any
 
 
 def pieces(points: Sequence[Sequence[float]], closed: bool, space: Space | None = None) -> Floats:
-    """Return the table of a path through `points` (P, D) m; raise ValueError, naming the point, if that is no path."""
+    """Return the table of a path through `points` (P, D) m; raise ValueError that names the point if it is invalid."""
     at = np.asarray(points, np.float64)
     least = 3 if closed else 2
     if at.ndim != 2 or len(at) < least:
@@ -61,7 +61,7 @@ def pieces(points: Sequence[Sequence[float]], closed: bool, space: Space | None 
 
 @law
 def _nearest_image(table: Table, d: Vec, k: int) -> float:
-    """Return coordinate k of an offset, of the nearest image if the path lies on a torus."""
+    """Return coordinate k, d, of an offset: that of the nearest image if the path lies on a torus."""
     edge = table[2 + k]
     around = like(edge, 1.0) / edge if edge > like(edge, 0.0) else like(edge, 0.0)
     return d[k] - edge * round_half_even(d[k] * around)  # type: ignore[no-any-return]
@@ -183,7 +183,7 @@ def _point(table: Any, s: Any, origin: Any, out: Any) -> None:
 
 
 def project(table: Floats, points: ArrayLike) -> tuple[Floats, Floats]:
-    """Return arc lengths (...) m of the path's nearest points, and offsets to them, (..., D) m; not for laws."""
+    """Return arc lengths (...) m of the path's nearest points, and offsets to them, (..., D) m, in Python."""
     where = np.asarray(points, np.float64)
     flat = np.ascontiguousarray(where.reshape(-1, where.shape[-1]))
     out = np.empty((len(flat), where.shape[-1] + 1))
@@ -192,7 +192,7 @@ def project(table: Floats, points: ArrayLike) -> tuple[Floats, Floats]:
 
 
 def spine_points(table: Floats, s: ArrayLike, dimension: int) -> Floats:
-    """Return the points at arc lengths s, (..., D) m; not for laws."""
+    """Return the points at arc lengths s, (..., D) m, in Python."""
     lengths = np.asarray(s, np.float64)
     flat, out = np.ascontiguousarray(lengths.reshape(-1)), np.empty((lengths.size, dimension))
     entry(_point)(np.ascontiguousarray(table, np.float64), flat, np.zeros(dimension), out)

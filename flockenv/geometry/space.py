@@ -1,8 +1,8 @@
-"""Space as two functions: offset(a, b), the vector from a to b, and confine(x, v), which puts bodies back inside.
+"""Space as two laws: offset(a, b), the vector from a to b, and confine(x, v), which moves bodies back inside.
 
-If bodies bounce, there is a third: bounce(...) returns where a step that led beyond a wall really ends.
+If bodies bounce, there is a third: bounce(...) returns the end of a step with impacts on walls.
 
-The topology of the world enters a simulation only here; no other file takes a remainder of positions.
+The topology of the world enters a simulation only here: no other file wraps positions.
 """
 
 from __future__ import annotations
@@ -65,15 +65,15 @@ def plane_confine(size: Vec, radius: float, x: Vec, v: Vec) -> tuple[Vec, Vec]:
 def _wrap(x: float, length: float) -> float:
     o = like(x, 0.0)
     inside = x - length * np.floor(x * (like(x, 1.0) / length))
-    # (-1e-17) wraps to exactly `length` in floating point: that is 0
+    # (-1e-17) wraps to exactly `length` in floating point, which is set to 0
     inside = o if inside >= length or inside < o else inside
-    # the last number below `length`, times 1 / length, may round to 1: a position inside is returned unchanged
+    # the largest number below `length`, times 1 / length, may round to 1: a position inside is returned unchanged
     return x if (x >= o) & (x < length) else inside
 
 
 @law
 def torus_confine(size: Vec, radius: float, x: Vec, v: Vec) -> tuple[Vec, Vec]:
-    """Bring x back into [0, size)."""
+    """Return x wrapped into [0, size), and v unchanged."""
     if len(x) == 2:
         return (_wrap(x[0], size[0]), _wrap(x[1], size[1])), v
     else:
@@ -91,7 +91,7 @@ def _stop_at_wall(x: float, v: float, radius: float, length: float) -> tuple[flo
 
 @law
 def box_confine(size: Vec, radius: float, x: Vec, v: Vec) -> tuple[Vec, Vec]:
-    """Keep a body of this radius inside the walls; the part of its velocity into a wall is lost there."""
+    """Return position and velocity of a body inside the walls; at a wall the velocity into it is removed."""
     x0, v0 = _stop_at_wall(x[0], v[0], radius, size[0])
     x1, v1 = _stop_at_wall(x[1], v[1], radius, size[1])
     if len(x) == 2:
@@ -105,7 +105,7 @@ def box_confine(size: Vec, radius: float, x: Vec, v: Vec) -> tuple[Vec, Vec]:
 def _impact(gap: float, away: float, push: float) -> tuple[float, float]:
     """Return the time at which a body reaches a wall, s (inf if never), and its speed then.
 
-    Its distance is gap + away t + push t^2 / 2. Each root is computed in the form without cancellation.
+    Its distance is gap + away t + push t^2 / 2. Each root is computed without cancellation.
     """
     o, never = like(gap, 0.0), like(gap, np.inf)
     square = away * away - like(gap, 2.0) * push * gap
@@ -118,7 +118,7 @@ def _impact(gap: float, away: float, push: float) -> tuple[float, float]:
 
 @law
 def _flight(dt: float, was: float, before: float, x: float, v: float) -> tuple[float, float, float]:
-    """Return initial velocity and acceleration of a step's parabola, and by how much the method's v exceeds its own.
+    """Return initial velocity and acceleration of a step's parabola, and the method's v less that of the parabola.
 
     The parabola goes from `was` to x in a step over which velocity changed from `before` to v. The velocity of a
     first-order method is half a step ahead or behind, but under a constant force its points do lie on a parabola.
@@ -139,7 +139,7 @@ def _bounce(
     """Return position and velocity along one axis after a step with impacts; each keeps `restitution` of the speed.
 
     If all further bounces (a geometric series) end within the step, the body is at rest at their end; so a body that
-    rests at a wall costs one iteration instead of BOUNCES.
+    rests at a wall needs one iteration instead of BOUNCES.
     """
     o, half = like(x, 0.0), like(x, 0.5)
     low, high = radius, length - radius
@@ -186,7 +186,7 @@ def box_bounce(
 ) -> tuple[Vec, Vec]:
     """Return position and velocity after a step from `was` to x, over which velocity changed from `before` to v.
 
-    Exact under a constant force, axis by axis. A body that was outside is put at the wall.
+    It is exact under a constant force, axis by axis. A body that was outside is moved to the wall.
     """
     x0, v0 = _bounce_or_stop(size[0], radius, restitution, dt, was[0], before[0], x[0], v[0])
     x1, v1 = _bounce_or_stop(size[1], radius, restitution, dt, was[1], before[1], x[1], v[1])
@@ -207,20 +207,20 @@ class Space(Record):
     periodic: ClassVar[bool] = False
 
     def extent(self, dimension: int) -> tuple[float, ...]:
-        """Return the size passed to the laws, m per axis; 1 if the space has none."""
+        """Return the size passed to the laws, m per axis; 1 for a space without size."""
         size: tuple[float, ...] | None = getattr(self, "size", None)
         return size if size is not None else (1.0,) * dimension
 
     def numbers(self) -> tuple[float, ...]:
-        """Return the numbers passed to its bounce law besides the size."""
+        """Return the numbers, besides the size, that are passed to the bounce law."""
         return ()
 
     def displacement(self, a: ArrayLike, b: ArrayLike) -> Floats:
-        """Return the offset from a to b, (..., D) m, for arrays: for code outside kernels."""
+        """Return the offset from a to b, (..., D) m, of arrays outside kernels."""
         return np.asarray(np.asarray(b, float) - np.asarray(a, float))
 
     def wrap(self, x: ArrayLike) -> Floats:
-        """Return positions (..., D) m brought back into the space: for code outside kernels."""
+        """Return positions (..., D) m moved back into the space, of arrays outside kernels."""
         return np.asarray(x, np.float64)
 
 
@@ -266,7 +266,7 @@ class Box(Space):
     kind: Literal["box"] = "box"
     size: Size = Field(description="m per axis")
     restitution: float = Field(
-        default=0.0, ge=0, le=1, description="e: 0 = bodies stop at a wall, 1 = they lose nothing"
+        default=0.0, ge=0, le=1, description="e: 0 = bodies stop at a wall, 1 = no speed is lost"
     )
     offset_law: ClassVar[Law] = plane_offset
     confine_law: ClassVar[Law] = box_confine

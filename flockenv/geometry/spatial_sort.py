@@ -1,8 +1,8 @@
-"""Tiles: the memory order of the agents of a large world, and the agents that have left their home tile since.
+"""Tiles: the memory order of agents in a large world, and the agents that have left their home tile since a sort.
 
 A tile is a square (in 3-D a cube) of some 250 agents, made of whole cells. Within a tile agents lie in memory by agent
-number. So the cells of agents still in their home tile are in order as they are filled. Only the few cells that contain
-agents from another tile, and those filled by several threads, have to be sorted.
+number. So cells that contain only agents of their own tile, written by one thread, are in order without sorting. Only
+the few cells with agents from another tile, or filled by several threads, have to be sorted.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ FEW = 8
 ASKED = 16
 """Prefetch distance of positions, in blocks."""
 
-_AWAY = 2**30  # more than any cell: added to the cell of an agent outside its home tile, between two passes over a part
+_AWAY = 2**30  # more than any cell: marks the cell of an agent outside its home tile, between two passes over a part
 
 
 @kernel
@@ -66,7 +66,7 @@ def count_tiles(
     pos: Any, living: Any, first: int, end: int, lanes: int, rank: int, team: int, sync: Any, bounds: Any, size: Any,
     reach: float, periodic: bool, wraps: bool, capacity: int, cell: Ints, start: Ints, offset: Ints,
 ) -> tuple[int, int, int, int, int]:  # fmt: skip
-    """Do the same as `count_cells`, with tiles instead of cells; return the shape of the cells that make up tiles."""
+    """Do the same as `count_cells`, with tiles instead of cells; return the shape of the grid of cells."""
     shape, low, pace = divide_region(
         pos, living, first, end, lanes, rank, team, sync, bounds, size, reach, periodic, capacity
     )
@@ -89,10 +89,11 @@ def count_tiles(
 
 @kernel
 def find_home_tiles(first: int, end: int, lanes: int, n: int, shape: Any, start: Ints, home_tiles: Ints) -> None:
-    """Write the home tiles of the agents of these blocks, just after sorting; start: where each tile begins.
+    """Write the home tiles of each block after sorting; start: the first agent of each tile.
 
     home_tiles (blocks * HOME,): the number of agents in the first of two tiles, then the lowest cell along each of
-    three axes, of that tile and of the other. A block that spans more tiles has none: its agents count as displaced.
+    three axes, of that tile and of the other. A block with agents of more tiles has none: all of its agents count as
+    displaced.
     """
     edge = _edge(shape, n)
     along, up, _ = _tiles(shape, edge)
@@ -182,8 +183,8 @@ def order_cells(
 ) -> None:
     """Sort the records of each cell of listed[begin:end] by agent number, if only this thread has filled the cell.
 
-    Records have `length` numbers and begin with their place; ident holds agent numbers by place; offset holds where
-    each thread stopped, and -1 for a cell once it is sorted, as a cell is listed once for each displaced agent in it.
+    Records have `length` numbers and begin with their place; ident holds agent numbers by place; offset holds the end
+    of each thread's part, and -1 for a cell once it is sorted, as a cell is listed once per displaced agent in it.
     """
     size, last, before = np.uint64(length), np.uint64(end), max(rank - 1, 0)
     mine = np.uint64(rank * offset.shape[1])
@@ -215,7 +216,7 @@ def order_shared(
     """Sort the records of those cells of [first, end) that several threads have filled, by agent number."""
     size = np.uint64(length)
     for r in range(team - 1):
-        for begin in range(first, end, BATCH):  # such cells are rare: a whole batch is tested at once
+        for begin in range(first, end, BATCH):  # shared cells are rare, so a whole batch is tested at once
             until, shared = min(begin + BATCH, end), np.int32(0)
             for c in range(np.uint64(begin), np.uint64(until)):
                 shared |= np.int32((start[c] < offset[r, c]) & (offset[r, c] < start[c + np.uint64(1)]))

@@ -1,4 +1,4 @@
-"""Targets of agents: a point, a door (a segment) or a region (a box), as a record and as numbers that laws read."""
+"""Targets of agents: a point, a door (a segment) or a region (a box), as a record and as numbers for laws."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Target(Record):
 
     @model_validator(mode="after")
     def _check_place(self) -> Target:
-        """Raise ValueError if not exactly one of the three is given, or if the numbers do not fit together."""
+        """Raise ValueError unless exactly one of point, door and box is given, with valid numbers."""
         box = self.low is not None or self.high is not None
         if (self.at is not None) + (self.ends is not None) + box != 1 or (self.low is None) != (self.high is None):
             raise ValueError("at: give one of at, ends, or low and high")
@@ -43,44 +43,44 @@ class Target(Record):
 
     @property
     def _places(self) -> tuple[tuple[float, ...], ...]:
-        """The points that define it."""
+        """The points that define the target."""
         found = (self.at, *(self.ends or ()), self.low, self.high)
         return tuple(place for place in found if place is not None)
 
     @property
     def _word(self) -> str:
-        """The name of the field or fields that define it, for messages."""
+        """Names of the fields that define the target, for messages."""
         return "at" if self.at is not None else "ends" if self.ends is not None else "low, high"
 
     @property
     def points_text(self) -> str:
-        """The points that define it, as messages show them."""
+        """The points that define the target, as text for messages."""
         return ", ".join(str(place) for place in self._places)
 
     @property
     def place(self) -> dict[str, Any]:
-        """The fields that define the place, without those of subclasses."""
+        """The fields of `Target` itself, by name, without those of subclasses."""
         return {name: getattr(self, name) for name in Target.model_fields}
 
     @property
     def dimension(self) -> int:
-        """Number of dimensions."""
+        """Dimension of space, 2 or 3."""
         return len(self._places[0])
 
     @property
     def length(self) -> float:
-        """Length of a door, m; 0 for other targets."""
+        """Length of a door, m; 0 for other kinds of targets."""
         return float(np.linalg.norm(np.subtract(*self.ends))) if self.ends else 0.0
 
     @property
     def extremes(self) -> Floats:
-        """Lower and upper corner of its bounding box, (2, D) m."""
+        """The lower and the upper corner of the bounding box, (2, D) m."""
         places = np.array(self._places)
         return np.array([places.min(axis=0) - self.radius, places.max(axis=0) + self.radius])
 
     @property
     def row(self) -> list[float]:
-        """Its numbers, as laws read them: first end (D), vector to the other end (D), half the edges (D), radius."""
+        """Numbers for laws: first end (D), vector to the other end (D), half the edges (D), radius."""
         places = np.array(self._places)
         box, d = self.low is not None, self.dimension
         begin = places.mean(axis=0) if box else places[0]
@@ -103,11 +103,11 @@ class Target(Record):
         return np.asarray(to * np.maximum(far - self.radius, 0) / np.where(far > 0, far, 1))
 
     def count(self, spacing: float) -> int:
-        """Return how many samples lie along its core (a point or a door): the first ones of `samples`."""
+        """Return the number of samples along the core, a point or a door: these come first in `samples`."""
         return 1 + int(np.ceil(4 * self.length / spacing - 1e-9))
 
     def samples(self, spacing: float) -> Floats:
-        """Return sample points (S, D) m: every point of the target is within about half the spacing of one."""
+        """Return sample points (S, D) m: each point of the target is within about spacing / 2 of one."""
         d, row = self.dimension, np.array(self.row)
         core = row[:d] + np.linspace(0, 1, self.count(spacing))[:, None] * row[d : 2 * d]
         if self.low is None and not self.radius:
@@ -126,7 +126,7 @@ def row_size(dimension: int) -> int:
 
 @law
 def _excess(x: float, half: float) -> float:
-    """Return the signed distance of x from [-half, half]; 0 inside."""
+    """Return x less the nearest number in [-half, half]; 0 inside."""
     return x - half if x > half else (x + half if x < -half else like(x, 0.0))
 
 

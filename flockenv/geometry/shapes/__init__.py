@@ -1,9 +1,9 @@
 """Obstacles: circles, capsules, walls, polygons, blocks, half-spaces, distance fields; in 2-D and (but polygons) 3-D.
 
-`round`, `chain`, `block`, `field` hold the laws of one agent and one shape, `inverted` those of shapes that bodies stay
-in, `edges` those of a silhouette; `row_header` reads what rows of every form share, bounds and motion; `dispatch` calls
-the law of a row's form at run time; `table` packs shapes for kernels, `cells` puts them on a grid, `joints` finds
-joined walls; `shape` has the base classes, `records` what scenes list; `outlines` are for pictures.
+`round`, `chain`, `block`, `field` have the laws of one agent and one shape, `inverted` those of hollow shapes, `edges`
+those of silhouettes; `row_header` reads bounds and motion, which rows of every form have; `dispatch` calls the law of a
+row's form at run time; `table` packs shapes for kernels, `cells` sorts them into a grid, `joints` finds joined walls;
+`shape` has the base classes, `records` the kinds that scenes list; `outlines` is for pictures.
 """
 
 from __future__ import annotations

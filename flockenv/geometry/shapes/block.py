@@ -55,7 +55,7 @@ def to_world_frame(table: Any, at: int, y: Vec) -> Vec:
 
 @law
 def _excess(y: float, h: float) -> float:
-    """Return the signed distance of y from [-h, h]; 0 inside."""
+    """Return y less the nearest number in [-h, h]; 0 inside."""
     return y - h if y > h else (y + h if y < -h else like(y, 0.0))
 
 
@@ -114,7 +114,7 @@ def box_hit(y: Vec, d: Vec, h: Vec) -> float:
 
 @law
 def _rounded_square(y: Vec, d: Vec, h: Vec, r: float) -> float:
-    """Return the distance along a ray to a rectangle inflated by r: two rectangles and four circles."""
+    """Return the distance along a ray to a rectangle inflated by r, the union of two rectangles and four circles."""
     a, b = box_hit(y, d, (h[0] + r, h[1])), box_hit(y, d, (h[0], h[1] + r))
     best = a if a < b else b
     for corner in range(4):
@@ -126,7 +126,7 @@ def _rounded_square(y: Vec, d: Vec, h: Vec, r: float) -> float:
 
 @law
 def _rounded_cube(y: Vec, d: Vec, h: Vec, r: float) -> float:
-    """Return the distance along a ray to a box inflated by r: three boxes, and a tube around each of twelve edges."""
+    """Return the distance along a ray to a box inflated by r, the union of three boxes and twelve round edges."""
     a, b = box_hit(y, d, (h[0] + r, h[1], h[2])), box_hit(y, d, (h[0], h[1] + r, h[2]))
     c = box_hit(y, d, (h[0], h[1], h[2] + r))
     best = a if a < b else b

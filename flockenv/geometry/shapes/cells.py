@@ -1,8 +1,8 @@
 """A grid of cells over the rows of one form, so that a law is evaluated only for shapes that may be near.
 
 It is built once per scene and has about as many cells as there are shapes. A shape is listed in every cell that its box
-overlaps, so that the few cells around a place list all shapes near it. Shapes that move, and those that overlap more
-than MOST_CELLS cells, are in one more list, the last, which every search includes.
+overlaps, so that the few cells around a position list all shapes near it. Shapes that move, and those that overlap more
+than MOST_CELLS cells, are in an additional list, the last one, which every search includes.
 
 The table holds, in order: the lower corner of the grid (D, m), cells per metre (D), the number of cells along each axis
 (D), 1 for a torus and 0 otherwise; the beginning of each list, cells in C order, then the last list, and its end; the
@@ -112,7 +112,7 @@ def _cells(m: Floats, h: Floats, low: Floats, rate: Floats, many: NDArray[np.int
 
 @law
 def _span(table: Any, at: int, d: int, middle: float, reach: float, closes: bool) -> tuple[int, int]:
-    """Return the first cell that a box overlaps along the axis whose numbers begin at `at`, and how many it overlaps.
+    """Return the first cell that a box overlaps along an axis, whose numbers begin at `at`, and their number.
 
     The cells are clipped to the grid.
     """
@@ -148,7 +148,7 @@ def span_of(table: Any, at: int, middle: Vec, reach: Vec) -> tuple[tuple[int, in
 
 @law
 def count_of(span: tuple[tuple[int, int], ...]) -> int:
-    """Return the number of lists to search for a box: those of its cells, and the last list."""
+    """Return the number of lists to search for a box: one per cell, and the last list."""
     if len(span) == 2:
         return span[0][1] * span[1][1] + 1
     else:
@@ -157,7 +157,7 @@ def count_of(span: tuple[tuple[int, int], ...]) -> int:
 
 @law
 def list_of(table: Any, at: int, x: Vec, span: tuple[tuple[int, int], ...], k: int) -> tuple[int, int]:
-    """Return where the k-th list of a span begins and ends; k = 0 is the last list of the table."""
+    """Return the begin and end of the k-th list of a span; k = 0 is the last list of the table."""
     d = len(x)
     cell: Any = 0
     left: Any = k - 1

@@ -54,7 +54,7 @@ def _side_hit(m: Vec, direction: Vec, along: Vec, radius: float) -> float:
 def segment_hit(x: Vec, direction: Vec, a: Vec, b: Vec, radius: float) -> float:
     """Return the distance along a unit `direction` to a segment inflated by `radius`, m: 0 from inside, inf if missed.
 
-    Combines the sides of the tube and a circle or sphere around each end.
+    It is the least of the distances to the sides of the tube and to a circle or sphere around each end.
     """
     o, far = like(radius, 0.0), like(radius, np.inf)
     along, m = sub(b, a), sub(x, a)
@@ -149,7 +149,7 @@ def pieces_chain(table: Any, at: int, x: Vec, gap: float) -> int:
 
 @law
 def _corner_acts(table: Any, at: int, j: int, x: Vec) -> bool:
-    """Return True if the corner at the start of edge j acts: it is also the nearest point of the adjoining edge."""
+    """Return True if the corner at the start of edge j acts, being the nearest point also of the adjoining edge."""
     body = body_of(at, x)
     count: Any = np.int64(table[body])
     closed = table[body + 2] > like(x[0], 0.0)
@@ -162,7 +162,7 @@ def _corner_acts(table: Any, at: int, j: int, x: Vec) -> bool:
 
 @law
 def end_acts(table: Any, at: int, which: int, x: Vec) -> bool:
-    """Return True if the first (0) or last (1) end of an open chain acts on x, if it is its piece's nearest point."""
+    """Return True if the first (0) or last (1) end of an open chain, nearest point of its piece, acts on x."""
     body = body_of(at, x)
     count: Any = np.int64(table[body])
     place = body + 3 + len(x) * count + which * (1 + len(x))
@@ -183,9 +183,10 @@ def piece_chain(table: Any, at: int, j: int, x: Vec, gap: float, out: Vec) -> tu
 def piece_facing(table: Any, at: int, j: int, x: Vec, gap: float, out: Vec, facing: float) -> tuple[float, Vec, bool]:
     """Return the distance to piece j, m, the unit normal there, and whether the piece acts.
 
-    A piece acts if the foot of the perpendicular lies on it; a corner acts once, if it is nearest to all pieces that
-    join there; of a polygon, only sides that face x act. So forces do not depend on how a wall is cut into pieces. gap,
-    out: distance and normal of the whole chain, used inside a solid polygon. facing: 1 if solid, -1 if hollow.
+    A piece acts if the foot of the perpendicular lies on it; a corner acts once, if it is the nearest point of all
+    pieces that join there; of a polygon, only sides that face x act. So forces do not depend on how a wall is cut into
+    pieces. gap, out: distance and normal of the whole chain, used inside a solid polygon. facing: 1 if solid, -1 if
+    hollow.
     """
     body = body_of(at, x)
     count: Any = np.int64(table[body])

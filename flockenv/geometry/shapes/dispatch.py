@@ -1,6 +1,6 @@
-"""Dispatch to the laws of a row's form at run time, for kernels that are compiled once for all scenes.
+"""Calls of the laws of a row's form, selected at run time, for kernels that are compiled once for all scenes.
 
-The kernel of a scene knows its forms when it is generated, and calls their laws directly.
+The kernel of a scene is compiled for the forms in that scene, and calls their laws directly.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ A law `edge_FORM(table, at, x, ray, side, room)` applies to a ray that hits the 
 relative to the anchor, `ray` its direction and `side` a direction across it, both unit vectors, `room` its radius plus
 clearance. It returns the angle (rad, 0 to 2 pi and more) by which the ray must turn towards `side` until the body just
 passes the shape, and the distance along the turned ray to the point of tangency (m). Both are infinite if the shape has
-no edge there: a half-space is passed at infinity, a room never.
+no edge, as a room; a half-space has its edge at infinity.
 
 In 3-D, turned rays lie in the plane of `ray` and `side`. For a sphere the edge is exact; for a chain or block it is
 that of the projection onto that plane, which has no edge for a body beside the shape but inside its projection.
@@ -79,7 +79,8 @@ def _disc_edge(to: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]
 def sphere_edge(to: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
     """Return the edge of a circle or sphere centred at `to`, m; room: both radii plus clearance.
 
-    For a sphere, of the circle in which the plane of `ray` and `side` cuts it: tangents to both are equally long.
+    For a sphere it is the edge of the circle in which the plane of `ray` and `side` cuts it: tangents to both are
+    equally long.
     """
     if len(to) == 2:
         return _disc_edge(to, ray, side, room)
@@ -91,9 +92,9 @@ def sphere_edge(to: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float
 
 @law
 def edge_chain(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
-    """Return the edge of a chain, traced from the piece that is hit; all around a polygon.
+    """Return the edge of a chain, traced from vertex to vertex from the piece that is hit; all around a polygon.
 
-    Bearings are accumulated from vertex to vertex, so that they may exceed half a turn, as out of a concave pocket.
+    Bearings are accumulated, so that they may exceed half a turn, for example out of a concave pocket.
     """
     body = body_of(at, x)
     count: Any = np.int64(table[body])
@@ -138,7 +139,7 @@ def _touched_piece(table: Any, at: int, x: Vec, ray: Vec, room: float) -> int:
 
 @law
 def edge_block(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
-    """Return the edge of a block: that of its corner farthest to the side."""
+    """Return the edge of a block: that of the corner with the largest bearing."""
     y, h = to_block_frame(table, at, x), half_edges(table, at, x)
     ahead, across = to_block_frame(table, at, ray), to_block_frame(table, at, side)
     turn, reach = like(room, -np.inf), like(room, 0.0)
@@ -173,7 +174,7 @@ def _edge_by_fan(hit: Any) -> Any:
 
     @law
     def edge(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
-        """Return the angle of the first ray of a fan that is twice as long as the last, and the length of the last."""
+        """Return the angle of the first ray of a fan that is twice as long as the one before, and that one's length."""
         turn, before = like(room, 0.0), hit(table, at, x, ray, room)
         step, two = like(room, np.pi / FAN), like(room, 2.0)
         for _ in range(FAN):

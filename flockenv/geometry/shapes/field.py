@@ -1,4 +1,4 @@
-"""Any shape as distances on a grid (a signed distance field), interpolated between its points.
+"""Laws of shapes given as distances on a grid (a signed distance field), interpolated between its points.
 
 A field is a grid (see flockenv/maths/grid.py) relative to the anchor, whose points have 1 + D numbers: the distance to
 the surface (m, negative inside) and its outward direction.
@@ -42,7 +42,7 @@ def on_grid(grid: Any, x: Vec) -> Vec:
 def nearest_distance_field(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
     """Return the distance to the surface, m (negative inside), and the outward unit normal at its nearest point.
 
-    Outside the grid: the distance to the grid plus the distance there, an upper bound.
+    Outside the grid it is the distance to the grid plus the distance at the point reached, an upper bound.
     """
     grid = table[body_of(at, x) :]
     y = on_grid(grid, x)

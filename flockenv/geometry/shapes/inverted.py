@@ -1,9 +1,9 @@
-"""Hollow shapes: free inside, solid outside. Rooms, spheres and boxes that bodies stay in.
+"""Laws of hollow shapes, free inside and solid outside: rooms, spheres and boxes that bodies stay in.
 
-Rows are those of the solid shapes; distances and normals are theirs with the sign reversed. A ray from inside ends
-where a body of radius r touches the surface from inside: where its centre leaves the set of points deeper than r. For a
-circle, sphere, capsule or block that set is the same shape, smaller by r; for a polygon, the points inside not within r
-of an edge. All of these are exact; a distance field uses ray marching.
+Rows are those of the solid shapes; distances and normals are theirs with the sign reversed. A ray ends where a body of
+radius r touches the surface from inside: where its centre leaves the set of points deeper than r. For a circle, sphere,
+capsule or block that set is the same shape, smaller by r; for a polygon, the inside without points within r of an edge.
+All of these are exact; a distance field uses ray marching.
 """
 
 from __future__ import annotations
@@ -65,7 +65,8 @@ def _root(a: float, b: float, c: float) -> float:
 def _capsule_exit(x: Vec, direction: Vec, a: Vec, b: Vec, radius: float) -> float:
     """Return the distance at which a ray from inside leaves a segment inflated by `radius`.
 
-    The largest of the distances at which it leaves the sides of the tube and the circle or sphere around each end.
+    It is the largest of the distances at which it leaves the sides of the tube and the circle or sphere around each
+    end.
     """
     o, e = like(radius, 0.0), like(radius, 1.0)
     along, m = sub(b, a), sub(x, a)
@@ -164,7 +165,7 @@ def hit_hollow_distance_field(table: Any, at: int, x: Vec, direction: Vec, clear
 
 @law
 def pieces_hollow_chain(table: Any, at: int, x: Vec, gap: float) -> int:
-    """Return the number of pieces that act: the sides of a polygon from inside, else one."""
+    """Return the number of pieces that act: all sides of a polygon if x is inside, else one."""
     body = body_of(at, x)
     o = like(gap, 0.0)
     return np.int64(table[body]) if (table[body + 2] > o) & (gap >= o) else 1  # type: ignore[return-value]
@@ -183,7 +184,7 @@ def piece_hollow_chain(table: Any, at: int, j: int, x: Vec, gap: float, out: Vec
 
 @law
 def pieces_hollow_block(table: Any, at: int, x: Vec, gap: float) -> int:
-    """Return the number of faces that act: all from inside, else one."""
+    """Return the number of faces that act: all if x is inside, else one."""
     return 2 * len(x) if gap >= like(gap, 0.0) else 1
 
 

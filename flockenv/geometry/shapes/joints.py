@@ -1,7 +1,8 @@
-"""Joints of walls: whether the ends of an open chain are free, or lie on another wall.
+"""Joints of walls: which ends of open chains are free, and which lie on another wall.
 
-In a law that sums over the pieces of walls a corner acts once, however many pieces share it: where it is the nearest
-point of all of them. Within a chain this follows from its vertices; ends that lie on other chains are found here.
+In a law that sums over the pieces of walls a corner acts once, even if several pieces share it, and only where it is
+the nearest point of all of them. Within a chain this follows from its vertices; ends that lie on other chains are found
+here.
 """
 
 from __future__ import annotations
@@ -39,13 +40,13 @@ def _lines(shape: Any) -> Floats | None:
 
 
 def _nearest(place: Floats, points: Floats, period: Floats | None) -> Floats:
-    """Return the offsets from a place to points; period: minimum image."""
+    """Return the offsets from a point to others, by the minimum image of each axis with a period."""
     way = points - place
     return way if period is None else way - period * np.round(way / period)
 
 
 def _touching(place: Floats, pieces: Floats, period: Floats | None) -> tuple[bool, Floats | None]:
-    """Return whether a place lies inside a piece, and the direction of the piece that it is an end of, if any."""
+    """Return if a point lies within a piece, and the direction of the piece that has it as an end, if any."""
     along = pieces[:, 1] - pieces[:, 0]
     first = _nearest(place, pieces.mean(axis=1), period) - along / 2  # offset to the image whose middle is nearest
     square = (along**2).sum(axis=1)
@@ -63,7 +64,7 @@ def _touching(place: Floats, pieces: Floats, period: Floats | None) -> tuple[boo
 
 
 class _Outlines:
-    """The pieces of the outlines of all shapes, and their bounding boxes, so that few have to be tested."""
+    """The pieces of the outlines of all shapes, with bounding boxes, by which few have to be tested."""
 
     def __init__(self, shapes: Sequence[Any], period: Floats | None) -> None:
         self.period, self.pieces = period, [_lines(shape) for shape in shapes]
@@ -74,7 +75,7 @@ class _Outlines:
         self.middle, self.half = (low + high) / 2, (high - low) / 2 + 2 * NEAR
 
     def near(self, place: Floats) -> list[tuple[int, Floats]]:
-        """Return the shapes (index, pieces) whose box contains a place, in order."""
+        """Return the shapes (index, pieces) whose box contains a point, in order."""
         within = (np.abs(_nearest(place, self.middle, self.period)) <= self.half).all(axis=1)
         found = [self.straight[k] for k in np.flatnonzero(within)]
         return [(k, pieces) for k in found if (pieces := self.pieces[k]) is not None]

@@ -1,4 +1,4 @@
-"""Shapes as 2-D polygons, for pictures, and computations on their vertices. numpy, no laws."""
+"""Polygons (n, 2) of shapes, for pictures, and computations on their vertices, in numpy."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def crossing(vertices: Floats) -> tuple[int, int] | None:
         following = (i + 1) % n
         back = float((b[i] - a[i]) @ (b[following] - a[following])) < 0
         if turn[1][following] == 0 and back:
-            return i, following  # it runs back along itself
+            return i, following  # the next edge runs back along this one
         apart[[i, following, (i - 1) % n]] = True
         if not apart.all():
             return i, int(np.flatnonzero(~apart)[0])
@@ -70,7 +70,7 @@ def crossing(vertices: Floats) -> tuple[int, int] | None:
 
 
 def _turn(a: Floats, b: Floats, c: Floats) -> Floats:
-    """Return on which side of the lines from a to b the points c lie: positive on the left."""
+    """Return the cross product of b - a and c - a: positive if c lies on the left of the line from a to b."""
     return np.asarray(
         (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1]) - (b[..., 1] - a[..., 1]) * (c[..., 0] - a[..., 0])
     )
@@ -119,7 +119,7 @@ def _inflated_hull(places: tuple[tuple[float, ...], ...], radius: float) -> Floa
 
 
 def band(vertices: Floats, width: float) -> Floats:
-    """Return a strip along the outside of a closed polygon (n, 2), as one polygon: around it and back."""
+    """Return a strip along the outside of a closed polygon (n, 2), as one polygon that runs around it and back."""
     inner = vertices if area(vertices) > 0 else vertices[::-1]
     along = np.roll(inner, -1, axis=0) - inner
     out = np.stack([along[:, 1], -along[:, 0]], axis=1) / np.hypot(*along.T)[:, None]
@@ -130,7 +130,7 @@ def band(vertices: Floats, width: float) -> Floats:
 
 
 def half_plane(point: Floats, direction: Floats, low: Floats, high: Floats) -> list[Floats]:
-    """Return the part of a region behind a line, as a polygon; nothing if the direction is 0 (a floor)."""
+    """Return the part of a region behind a line, as a polygon; no polygon if the direction is 0 (a floor)."""
     if not direction.any():
         return []
     box = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
@@ -146,7 +146,7 @@ def half_plane(point: Floats, direction: Floats, low: Floats, high: Floats) -> l
 
 
 def strips(distances: Floats, low: Sequence[float], spacing: float) -> list[Floats]:
-    """Return rectangles that cover the points of a grid of distances (nx, ny) that are negative."""
+    """Return rectangles that cover the points with negative distances on a grid (nx, ny)."""
     found = []
     for i, column in enumerate(distances < 0):
         edges = np.flatnonzero(np.diff(np.concatenate([[False], column, [False]]).astype(int)))
@@ -160,7 +160,7 @@ def strips(distances: Floats, low: Sequence[float], spacing: float) -> list[Floa
 def silhouette(shape: Any, point: Floats, clearance: float) -> tuple[Floats, Floats]:
     """Return the left and right ends of a shape's outline, inflated by `clearance`, as seen from a point; m.
 
-    Lines from the point through them touch the shape: tangents of the circles around its corners.
+    Lines from the point through these ends are tangents of the circles around the shape's corners.
     """
     corners, radius = shape.corners
     if len(point) != 2 or shape.dimension != 2:

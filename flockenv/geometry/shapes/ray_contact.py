@@ -24,10 +24,10 @@ def touched_spot(y: Vec, ray: Vec, hit: float, room: float) -> Vec:
 
 @law
 def touched_offset(ray: Vec, hit: float, normal: Vec, room: float, gap: float) -> Vec:
-    """Return the offset to the point of contact: to where the body stops, and from there its radius `room` inward.
+    """Return the offset to the point of contact: to the stopped body's centre, and from there `room` inward.
 
-    For a body that already overlaps it is the nearest point of the surface; for one whose centre is inside, a point
-    equally deep on the inner side, so that the direction away from it leads out.
+    room: the body's radius. For a body that already overlaps, the point is the nearest one of the surface; if its
+    centre is inside, a point equally deep on the inner side, so that the direction away from it leads out.
     """
     o = like(hit, 0.0)
     depth = gap if gap > o else (-gap if gap < o else like(hit, 1e-6))

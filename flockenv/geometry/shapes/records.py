@@ -29,7 +29,7 @@ __all__ = [
 
 
 class Circle(Closed):
-    """A round obstacle of a scene: a circle in 2-D, a sphere in 3-D."""
+    """A round obstacle: a circle in 2-D, a sphere in 3-D."""
 
     kind: Literal["circle"] = "circle"
     centre: tuple[float, ...] = Field(min_length=2, max_length=3, description="m")
@@ -37,7 +37,7 @@ class Circle(Closed):
 
     @property
     def in_state(self) -> bool:
-        """True if it is solid and does not move."""
+        """True if the circle is kept in the state: it is solid and does not move."""
         return not (self.moves or self.hollow)
 
     @property
@@ -46,32 +46,32 @@ class Circle(Closed):
 
     @property
     def anchor(self) -> tuple[float, ...]:
-        """Its centre."""
+        """The centre."""
         return self.centre
 
     @property
     def corners(self) -> tuple[Floats, float]:
-        """Its centre and radius."""
+        """The centre, as the only point, and the radius."""
         return np.array([self.centre]), self.radius
 
     @property
     def extremes(self) -> Floats:
-        """Two opposite corners of its box."""
+        """Two opposite corners of the bounding box."""
         return np.array(self.centre) + self.radius * np.array([[-1.0], [1.0]])
 
     def row(self, dimension: int) -> Sequence[float]:
-        """Return a chain of one vertex."""
+        """Return the numbers of a chain of one vertex."""
         return [1.0, self.radius, 0.0] + [0.0] * dimension
 
     def polygons(self, low: Floats, high: Floats) -> list[Floats]:
-        """Return a circle."""
+        """Return a polygon that approximates the circle."""
         return [outlines.inflated_hull(np.array([self.centre[:2]]), self.radius)]
 
 
 class Wall(Shape):
-    """A polyline, `radius` thick on each side: walls, and in 3-D tubes.
+    """A wall along a polyline, `radius` thick on each side; in 3-D a tube.
 
-    Pieces of length 0 (a vertex given twice) add nothing.
+    Pieces of length 0 (a vertex given twice) have no effect.
     """
 
     kind: Literal["wall"] = "wall"
@@ -85,7 +85,7 @@ class Wall(Shape):
 
     @property
     def dimension(self) -> int:
-        """Number of coordinates of its first vertex."""
+        """Dimension of space: the number of coordinates of a vertex."""
         return len(self.vertices[0])
 
     @property
@@ -94,12 +94,12 @@ class Wall(Shape):
 
     @property
     def anchor(self) -> tuple[float, ...]:
-        """The centre of its box."""
+        """The centre of the bounding box."""
         return _middle(self.vertices)
 
     @property
     def corners(self) -> tuple[Floats, float]:
-        """Its vertices without repetitions, and half its thickness."""
+        """The vertices without repetitions, and the radius."""
         return outlines.distinct(np.array(self.vertices)), self.radius
 
     @property
@@ -108,19 +108,19 @@ class Wall(Shape):
         return _inflate(self.vertices, self.radius)
 
     def row(self, dimension: int) -> Sequence[float]:
-        """Return an open chain."""
+        """Return the numbers of an open chain."""
         around = self.corners[0] - self.anchor
         return [float(len(around)), self.radius, 0.0, *around.ravel().tolist()]
 
     def polygons(self, low: Floats, high: Floats) -> list[Floats]:
-        """Return a capsule around each piece."""
+        """Return the polygon of a capsule for each piece."""
         flat = np.array(self.vertices)[:, :2]
         radius = max(self.radius, 0.002 * float((high - low).max()))
         return [outlines.inflated_hull(flat[k : k + 2], radius) for k in range(len(flat) - 1)]
 
 
 class Capsule(Closed):
-    """A straight piece of wall with round ends; with radius 0 a segment."""
+    """A segment inflated by `radius`: a straight piece of wall with round ends."""
 
     kind: Literal["capsule"] = "capsule"
     start: Point = Field(description="m")
@@ -146,7 +146,7 @@ class Capsule(Closed):
 
     @property
     def corners(self) -> tuple[Floats, float]:
-        """Its ends and radius."""
+        """Both ends, and the radius."""
         return self._wall.corners
 
     @property
@@ -155,7 +155,7 @@ class Capsule(Closed):
 
     @property
     def anchor(self) -> tuple[float, ...]:
-        """The middle."""
+        """The middle between both ends."""
         return _middle((self.start, self.end))
 
     @property
@@ -164,11 +164,11 @@ class Capsule(Closed):
         return self._wall.extremes
 
     def row(self, dimension: int) -> Sequence[float]:
-        """Return a chain of two vertices."""
+        """Return the numbers of a chain of two vertices."""
         return self._wall.row(dimension)
 
     def polygons(self, low: Floats, high: Floats) -> list[Floats]:
-        """Return a capsule."""
+        """Return the polygon of the capsule."""
         return self._wall.polygons(low, high)
 
 
@@ -209,21 +209,21 @@ class Polygon(Closed):
 
     @property
     def anchor(self) -> tuple[float, ...]:
-        """The centre of its box."""
+        """The centre of the bounding box."""
         return _middle(self.vertices)
 
     @property
     def corners(self) -> tuple[Floats, float]:
-        """Its vertices."""
+        """The vertices, and radius 0."""
         return np.array(self.vertices), 0.0
 
     @property
     def extremes(self) -> Floats:
-        """Its vertices."""
+        """The vertices, (n, 2) m."""
         return np.array(self.vertices)
 
     def row(self, dimension: int) -> Sequence[float]:
-        """Return a closed chain, counter-clockwise: the right of an edge is outside."""
+        """Return the numbers of a closed chain, counter-clockwise: the right of an edge is outside."""
         around = np.array(self.vertices) - self.anchor
         around = around if outlines.area(around) > 0 else around[::-1]
         return [float(len(around)), 0.0, 1.0, *around.ravel().tolist()]
@@ -263,12 +263,12 @@ class Block(Closed):
 
     @property
     def anchor(self) -> tuple[float, ...]:
-        """Its centre."""
+        """The centre."""
         return self.centre
 
     @property
     def axes(self) -> Floats:
-        """Its axes as unit vectors, the rows of (D, D) (Rodrigues' rotation)."""
+        """The block's axes as unit vectors, the rows of (D, D) (Rodrigues' rotation)."""
         x, y, z = np.array(self.axis) / math.hypot(*self.axis)
         angle, across = math.radians(self.turn), np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         full = np.eye(3) + math.sin(angle) * across + (1 - math.cos(angle)) * across @ across
@@ -277,22 +277,22 @@ class Block(Closed):
 
     @property
     def corners(self) -> tuple[Floats, float]:
-        """Its corners, and 0."""
+        """The corners, and radius 0."""
         return self.extremes, 0.0
 
     @property
     def extremes(self) -> Floats:
-        """Its corners, (2^D, D)."""
+        """The corners, (2^D, D) m."""
         d = len(self.centre)
         signs = np.stack(np.meshgrid(*[[-0.5, 0.5]] * d, indexing="ij"), axis=-1).reshape(-1, d)
         return np.asarray(np.array(self.centre) + (signs * self.size) @ self.axes)
 
     def row(self, dimension: int) -> Sequence[float]:
-        """Return half edges and axes."""
+        """Return the half edges and the axes."""
         return [*(0.5 * edge for edge in self.size), *self.axes.ravel().tolist()]
 
     def polygons(self, low: Floats, high: Floats) -> list[Floats]:
-        """Return the convex hull of its corners as seen from above."""
+        """Return the convex hull of the corners as seen from above."""
         return [outlines.hull(self.extremes[:, :2])]
 
 
@@ -318,12 +318,12 @@ class HalfSpace(Shape):
 
     @property
     def anchor(self) -> tuple[float, ...]:
-        """Its point."""
+        """The given point of the surface."""
         return self.point
 
     @property
     def extremes(self) -> Floats:
-        """None: it is unbounded."""
+        """None, as it is unbounded."""
         return np.zeros((0, len(self.point)))
 
     def row(self, dimension: int) -> Sequence[float]:
@@ -331,7 +331,7 @@ class HalfSpace(Shape):
         return (np.array(self.direction) / math.hypot(*self.direction)).tolist()  # type: ignore[no-any-return]
 
     def polygons(self, low: Floats, high: Floats) -> list[Floats]:
-        """Return the part of the region behind it; nothing if it is a floor."""
+        """Return the part of the region behind the surface; no polygon for a floor."""
         return outlines.half_plane(np.array(self.point[:2]), np.array(self.direction[:2]), low, high)
 
 
@@ -342,14 +342,14 @@ class DistanceField(Closed):
     laws: ClassVar[str] = "distance_field"
     low: Point = Field(description="m, the lowest corner of the grid")
     high: Point | None = Field(default=None, description="m, the highest corner of the grid; only with shapes")
-    spacing: float = Field(gt=0, description="m, distance of grid points")
-    shapes: tuple[Any, ...] = Field(default=(), description="shapes whose union it is")
+    spacing: float = Field(gt=0, description="m, between grid points")
+    shapes: tuple[Any, ...] = Field(default=(), description="shapes, of whose union the distances are computed")
     values: tuple[Any, ...] | None = Field(default=None, description="m, nested lists (nx, ny[, nz]) of distances")
 
     @model_validator(mode="before")
     @classmethod
     def _read(cls, data: Any) -> Any:
-        """Return the data with its shapes read like obstacles of a scene."""
+        """Return the data with `shapes` converted like obstacles of a scene."""
         if not isinstance(data, Mapping):
             return data
         made = dict(data)
@@ -402,17 +402,17 @@ class DistanceField(Closed):
 
     @property
     def anchor(self) -> tuple[float, ...]:
-        """Its lowest corner."""
+        """The lowest corner of the grid."""
         return self.low
 
     @property
     def extremes(self) -> Floats:
-        """Lower and upper corner of its grid."""
+        """The lower and the upper corner of the grid."""
         return np.array([self.low, np.array(self.low) + self.spacing * (np.array(self.counts) - 1)])
 
     @functools.cached_property
     def bound(self) -> Bound:
-        """The box of its grid, enlarged by its greatest depth there, as the solid may extend beyond the grid."""
+        """The box of the grid, enlarged by the greatest depth, as the solid may extend beyond the grid."""
         if self.hollow:
             return super().bound
         low, high = self.extremes
@@ -428,15 +428,15 @@ class DistanceField(Closed):
         return pack_grid(numbers, (0.0,) * len(self.low), self.spacing)
 
     def row(self, dimension: int) -> Floats:
-        """Return its grid: distances and unit gradients."""
+        """Return the grid with distances and unit gradients."""
         return self._grid
 
     def polygons(self, low: Floats, high: Floats) -> list[Floats]:
-        """Return strips of grid cells inside it; in 3-D, of its projection from above."""
+        """Return strips of grid cells inside the shape; in 3-D, inside its projection from above."""
         return outlines.strips(self._from_above, self.low[:2], self.spacing)
 
     def outline(self, low: Floats, high: Floats) -> list[Floats]:
-        """Return its polygons; if it is hollow, strips along its surface."""
+        """Return the shape's polygons; if it is hollow, strips along its surface."""
         edge = np.abs(self._from_above) - self.spacing / 2
         return outlines.strips(edge, self.low[:2], self.spacing) if self.hollow else self.polygons(low, high)
 
@@ -502,7 +502,7 @@ def shape_of(data: Any) -> Shape:
 def distance_to_shapes(shapes: Sequence[Shape], points: Floats, period: Floats, time: float = 0.0) -> Floats:
     """Return the distance of points (N, D) to the nearest of some shapes, (N,) m; inf if there are none.
 
-    period: of each axis, (D,) m; 0 if the axis is not periodic. time: s, of moving shapes.
+    period: of each axis, (D,) m; 0 if the axis is not periodic. time: s, at which moving shapes are taken.
     """
     best = np.full(len(points), np.inf)
     for shape in shapes:

@@ -21,7 +21,7 @@ def gap(offset: Vec, radius: float) -> float:
 
 @law
 def normal(offset: Vec) -> Vec:
-    """Return the outward unit normal at the nearest point of the surface; the x axis exactly at the centre."""
+    """Return the outward unit normal at the nearest point of the surface; the x axis if at the centre."""
     outside = dot(offset, offset) > like(offset[0], 0.0)
     return select(outside, scale(unit(offset), like(offset[0], -1.0)), axis(offset, 0))
 
@@ -30,7 +30,7 @@ def normal(offset: Vec) -> Vec:
 def ray_hit(offset: Vec, direction: Vec, radius: float) -> float:
     """Return the distance along a unit `direction` to the surface, m: 0 from inside, inf if missed.
 
-    Uses c / (b + sqrt(b^2 - c)), which does not cancel for a grazing ray.
+    It is computed as c / (b + sqrt(b^2 - c)), without cancellation for grazing rays.
     """
     b = dot(offset, direction)
     c = dot(offset, offset) - radius * radius
@@ -43,7 +43,7 @@ def ray_hit(offset: Vec, direction: Vec, radius: float) -> float:
 
 @law
 def touched_normal(offset: Vec, direction: Vec, hit: float) -> Vec:
-    """Return the outward unit normal where a ray arrives after `hit` m; at the nearest point if it never does."""
+    """Return the outward unit normal where a ray hits after `hit` m; if it misses, at the nearest point."""
     o = like(hit, 0.0)
     there = (hit > o) & (hit < like(hit, np.inf))
     return normal(sub(offset, scale(direction, hit if there else o)))

@@ -50,7 +50,7 @@ def bound_of(table: Any, at: int, x: Vec) -> tuple[Vec, float]:
 
 @law
 def outside_box(table: Any, at: int, x: Vec) -> Vec:
-    """Return the distance of x from the bounding box, per axis, m: 0 inside. A tighter bound than the circle's."""
+    """Return the distance of x from the bounding box per axis, m: 0 inside; tighter than the bounding circle."""
     middle, half = box_of(table, at, x)
     if len(x) == 2:
         return (_excess(x[0] - middle[0], half[0]), _excess(x[1] - middle[1], half[1]))
@@ -67,7 +67,7 @@ def _excess(x: float, half: float) -> float:
 
 @law
 def shift_of(table: Any, at: int, time: float, x: Vec) -> Vec:
-    """Return the displacement of the anchor at a time (s), m: v t + a sin(2 pi t / period + phase)."""
+    """Return the anchor's displacement at a time, s, in m: v t + a sin(2 pi t / period + phase)."""
     d = len(x)
     turn = table[at + 4 + 5 * d] * time + table[at + 5 + 5 * d]
     sway = scale(vector_at(table, at + 4 + 4 * d, x), np.sin(turn))
@@ -85,5 +85,5 @@ def velocity_of(table: Any, at: int, time: float, x: Vec) -> Vec:
 
 @law
 def body_of(at: int, x: Vec) -> int:
-    """Return the index at which the numbers of its form begin."""
+    """Return the index at which the numbers of the row's form begin."""
     return at + 6 + 5 * len(x)

@@ -33,7 +33,7 @@ class Sway(Record):
 
 
 class Bound(NamedTuple):
-    """Bounds of a shape at the position given by its fields; all infinite but the centre if it is unbounded."""
+    """Bounds of a shape at the position given by its fields; all except the centre are infinite if it is unbounded."""
 
     centre: Floats  # (D,) m, of the bounding box
     half: Floats  # (D,) m, half the edges of the axis-aligned box
@@ -51,7 +51,7 @@ class Shape(Record):
 
     @model_validator(mode="after")
     def _check_motion(self) -> Self:
-        """Raise ValueError if a motion has another dimension."""
+        """Raise ValueError if velocity or sway do not have the shape's dimension."""
         swaying = self.sway.amplitude if self.sway else None
         for name, value in (("velocity", self.velocity), ("sway.amplitude", swaying)):
             if value is not None and len(value) != self.dimension:
@@ -65,7 +65,7 @@ class Shape(Record):
 
     @property
     def thickness(self) -> float:
-        """Lower bound of its least thickness, m: 0 for a line or if unknown."""
+        """Lower bound of the least thickness, m: 0 for a line or if unknown."""
         return math.inf if self.is_hollow else self._thickness
 
     @property
@@ -74,7 +74,7 @@ class Shape(Record):
 
     @property
     def form(self) -> str:
-        """Name of its laws; see shapes/table.py."""
+        """Name of the form, which selects the laws; see shapes/table.py."""
         return f"hollow_{self.laws}" if self.is_hollow else self.laws
 
     @property
@@ -84,34 +84,34 @@ class Shape(Record):
 
     @property
     def moves(self) -> bool:
-        """True if it has a velocity or a sway."""
+        """True if the shape has a velocity or a sway."""
         return any(self.velocity or ()) or (self.sway is not None and any(self.sway.amplitude))
 
     @property
     def motion(self) -> list[float]:
-        """Its motion, as laws read it: velocity (D), amplitude of its sway (D), 2 pi / period, phase."""
+        """Motion, as laws read it: velocity (D), amplitude of the sway (D), 2 pi / period, phase."""
         still = (0.0,) * self.dimension
         sway = (*self.sway.amplitude, math.tau / self.sway.period, self.sway.phase) if self.sway else (*still, 0.0, 0.0)
         return [*(self.velocity or still), *sway]
 
     def shift(self, time: float) -> Floats:
-        """Return its displacement at a time, s, (D,) m: v t + a sin(2 pi t / T + phase)."""
+        """Return the displacement at a time, s, in (D,) m: v t + a sin(2 pi t / T + phase)."""
         d, motion = self.dimension, np.array(self.motion)
         return np.asarray(motion[:d] * time + motion[d:-2] * math.sin(motion[-2] * time + motion[-1]))
 
     @property
     def dimension(self) -> int:
-        """Number of dimensions."""
+        """Dimension of space, 2 or 3."""
         return len(self.anchor)
 
     @functools.cached_property
     def table(self) -> Floats:
-        """A table of this shape alone, as laws read it."""
+        """The table of this shape alone, for laws."""
         return table.pack_shapes([self], self.dimension)[0]
 
     @functools.cached_property
     def bound(self) -> Bound:
-        """Its bounds; infinite if it is hollow, as the solid is outside."""
+        """Bounds of the solid; infinite if the shape is hollow, as the solid is outside."""
         extremes, (corners, around) = self.extremes, self.corners
         if self.is_hollow or not len(extremes):
             return Bound(np.array(self.anchor), np.full(self.dimension, np.inf), math.inf)
@@ -121,7 +121,7 @@ class Shape(Record):
 
     @property
     def corners(self) -> tuple[Floats, float]:
-        """Points (n, D) m and a radius, m: its hull is that of circles of this radius there; some shapes have none."""
+        """Points (n, D) m and a radius, m: circles there have the same hull; n = 0 for some shapes."""
         return np.zeros((0, self.dimension)), 0.0
 
     @property
@@ -132,31 +132,31 @@ class Shape(Record):
     @property
     @abstractmethod
     def extremes(self) -> Floats:
-        """Points (n, D) m whose bounding box contains it; none if it is unbounded."""
+        """Points (n, D) m whose bounding box contains the shape; None if it is unbounded."""
 
     @abstractmethod
     def row(self, dimension: int) -> Sequence[float] | Floats:
-        """Return the numbers that its laws read, after the row header."""
+        """Return the numbers of the form, which follow the row header."""
 
     @abstractmethod
     def polygons(self, low: Floats, high: Floats) -> list[Floats]:
-        """Return the polygons, each (n, 2) m, of its solid in a region, as seen from above."""
+        """Return the polygons, each (n, 2) m, of the solid in a region, as seen from above."""
 
     def outline(self, low: Floats, high: Floats) -> list[Floats]:
-        """Return the polygons, each (n, 2) m, that show it from above in a region; only its edge if it is hollow."""
+        """Return the polygons, each (n, 2) m, of the shape in a region from above; only its edge if it is hollow."""
         whole = self.polygons(low, high)
         return [outlines.band(each, 0.004 * float((high - low).max())) for each in whole] if self.is_hollow else whole
 
     def gap(self, points: ArrayLike) -> Floats:
-        """Return the distance to its surface, (...) m; negative inside."""
+        """Return the distances of points to the surface, (...) m; negative in the solid."""
         return nearest(self, points)[0]
 
     def normal(self, points: ArrayLike) -> Floats:
-        """Return the outward unit normal at the nearest point of its surface, (..., D)."""
+        """Return the unit normal out of the solid at the nearest point of the surface, (..., D)."""
         return nearest(self, points)[1]
 
     def nearest(self, points: ArrayLike) -> Floats:
-        """Return the nearest point of its surface, (..., D) m."""
+        """Return the nearest point of the surface, (..., D) m."""
         gap, normal = nearest(self, points)
         return np.asarray(points, float) - gap[..., None] * normal
 
@@ -165,16 +165,16 @@ class Shape(Record):
         return np.asarray(self.gap(points) < 0)
 
     def hit(self, points: ArrayLike, directions: ArrayLike, clearance: ArrayLike = 0.0) -> Floats:
-        """Return how far along unit directions a body of radius `clearance` touches it, (...) m; inf if it never does.
+        """Return the distance along unit directions at which a body of radius `clearance` touches, (...) m, or inf.
 
-        Exact at every angle: the ray is cast at the shape inflated by the body's radius.
+        It is exact at every angle, as the ray is cast at the shape inflated by the body's radius.
         """
         return hits(self, points, directions, clearance)
 
     def silhouette(self, point: ArrayLike, clearance: float = 0.0) -> tuple[Floats, Floats]:
-        """Return the left and right ends of its silhouette as seen from a point outside, m; 2-D only.
+        """Return the left and right ends of the silhouette as seen from a point outside, m; 2-D only.
 
-        Of the shape inflated by `clearance`: a body that aims there passes it (Reynolds 1987). Raises ValueError if
+        The shape is inflated by `clearance`: a body that aims at an end passes it (Reynolds 1987). Raises ValueError if
         there are no ends.
         """
         return outlines.silhouette(self, np.asarray(point, float), clearance)

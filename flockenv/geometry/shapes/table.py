@@ -1,4 +1,4 @@
-"""Shapes as rows of one table that kernels read, and loops over points for Python.
+"""The table of shapes that kernels read, one row each, and loops over points for Python.
 
 A row is a header, the same for every form (see row_header.py), then the numbers of its form: see chain.py, block.py and
 field.py. All positions are relative to the anchor, so that on a torus the nearest image is used, and float32 loses no
@@ -43,7 +43,7 @@ UP = 1 + 1e-6
 def pack_shapes(
     shapes: Sequence[Any], dimension: int, first: int = 0, period: Floats | None = None
 ) -> tuple[Floats, dict[str, tuple[int, int]]]:
-    """Return the table of some shapes, numbered from `first`, and for each form present (first index, number of rows).
+    """Return the table of some shapes, numbered from `first`, and (first index, number of rows) of each form.
 
     period: the edges of a torus, m, across which walls may be joined.
     """
