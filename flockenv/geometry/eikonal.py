@@ -202,7 +202,7 @@ def floor_field_table(
 def _lengths_beside(
     u: Floats, reached: NDArray[np.bool_], free: NDArray[np.bool_], spacing: float, clearance: float
 ) -> Floats:
-    """Return u, m, also extended to points within `clearance` of obstacles, where agents may be pushed."""
+    """Return u, m, extended to points within `clearance` of obstacles, where agents may be pushed."""
     from scipy.ndimage import distance_transform_edt  # slow to import, and used only by floor fields
 
     far, place = distance_transform_edt(~reached, sampling=spacing, return_indices=True)

@@ -1,4 +1,4 @@
-"""Appearance: how agents of a group are drawn, as data; read only by pictures, GIFs and replays."""
+"""Appearance of the agents of a group in pictures, GIFs and replays, as data."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ Size = Annotated[float, Field(ge=0)]
 class Appearance(Record):
     """Points, discs or polygons whose colour, opacity and size may depend on age, speed or an inner state.
 
-    `by` names that quantity, and `over` its values for the first and the last colour, opacity and size; in between they
-    are interpolated.
+    `by` names that quantity, and `over` is its range: from the first to the last colour, opacity and size, which are
+    interpolated.
     """
 
     form: Literal["point", "disc", "polygon"] = Field(
@@ -32,11 +32,11 @@ class Appearance(Record):
         description="corners of a polygon, x ahead, in units of its size",
     )  # fmt: skip
     by: Literal["age", "speed", "inner"] | None = Field(
-        default=None, description="quantity that it depends on (default: none)"
+        default=None, description="quantity on which the appearance depends (default: none)"
     )
     of: str | None = Field(default=None, description="name of the inner state; only if by = inner")
     over: tuple[float, float] = Field(
-        default=(0.0, 1.0), description="s, m/s, or the unit of the inner state: range over which it changes"
+        default=(0.0, 1.0), description="s, m/s, or the unit of the inner state: range of that quantity"
     )
     colours: tuple[Colour, ...] = Field(
         default=(), description="#rrggbb, first to last, evenly spaced (default: the colour of its role)"
@@ -47,7 +47,7 @@ class Appearance(Record):
 
     @model_validator(mode="after")
     def _check_consistent(self) -> Appearance:
-        """Raise ValueError if the range is empty, or `by` and what depends on it do not fit together."""
+        """Raise ValueError if `over` is empty, or `by` and the fields that need it do not fit together."""
         if not self.over[0] < self.over[1]:
             raise ValueError(f"over = {self.over}: the first number must be below the second")
         changes = len(self.colours) > 1 or self.opacity[0] != self.opacity[1]
@@ -61,7 +61,7 @@ class Appearance(Record):
     def shade(
         self, age: NDArray[np.float64], speed: NDArray[np.float64], inner: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Return the position of each agent in the range, (N,) from 0 to 1; inner: the inner state named by `of`."""
+        """Return the position of each agent's value within `over`, (N,) from 0 to 1; inner: the state named by `of`."""
         value = {"age": age, "speed": speed, "inner": inner}.get(self.by or "")
         if value is None:
             return np.zeros(len(age))
@@ -69,7 +69,7 @@ class Appearance(Record):
         return np.asarray(np.clip((value - self.over[0]) / (self.over[1] - self.over[0]), 0.0, 1.0))
 
     def colour(self, shade: float, usual: str) -> tuple[int, int, int]:
-        """Return the colour at a shade, 0..255 each; usual: the colour of the role."""
+        """Return the colour at a shade, red, green and blue from 0 to 255; usual: the colour of the role."""
         names = self.colours or (usual,)
         place = shade * (len(names) - 1)
         k = min(int(place), len(names) - 2) if len(names) > 1 else 0

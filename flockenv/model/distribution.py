@@ -1,4 +1,4 @@
-"""Spread: a number that varies within a group, uniform or normal; the same values in every world."""
+"""Spread: the distribution of a number within a group, uniform or normal, with the same values in every world."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ MOST = 10_000_000
 
 
 class Spread(Record):
-    """Uniform from `low` to `high`, or, with `mean` and `sd`, normal and truncated to [low, high]."""
+    """A uniform distribution from `low` to `high` or, with `mean` and `sd`, a normal one truncated to [low, high]."""
 
-    low: float | None = Field(default=None, description="least (default for a normal one: 0)")
-    high: float | None = Field(default=None, description="greatest (default for a normal one: no limit)")
-    mean: float | None = Field(default=None, description="of a normal one, before truncation")
+    low: float | None = Field(default=None, description="lower bound (default for a normal one: 0)")
+    high: float | None = Field(default=None, description="upper bound (default for a normal one: no limit)")
+    mean: float | None = Field(default=None, description="mean of a normal one, before truncation")
     sd: float | None = Field(default=None, ge=0, description="standard deviation of a normal one")
-    seed: int = Field(default=0, ge=0, description="of the random numbers")
+    seed: int = Field(default=0, ge=0, description="seed of the random numbers")
 
     @model_validator(mode="after")
     def _check_kind(self) -> Spread:
@@ -56,7 +56,7 @@ class Spread(Record):
             return self.least + (self.most - self.least) * share
         if self.sd == 0:
             return np.full(len(share), self.mean)
-        from scipy.special import ndtr, ndtri  # here: most scenes have no normal spread, and need not wait for it
+        from scipy.special import ndtr, ndtri  # slow to import, and used only by normal spreads
 
         low, high = (ndtr((bound - self.mean) / self.sd) for bound in (self.least, self.most))
         found = self.mean + self.sd * ndtri(low + (high - low) * share)
@@ -64,14 +64,14 @@ class Spread(Record):
 
 
 def draw(value: float | Spread, count: int, channel: int) -> NDArray[np.float64]:
-    """Return `count` numbers; spreads of one channel and seed have the same ranks (a heavy agent is wide)."""
+    """Return `count` numbers, whose ranks depend on channel and seed alone (so that heavy agents are wide)."""
     if not isinstance(value, Spread):
         return np.full(count, float(value))
     return value.at(np.random.default_rng([value.seed, channel]).random(count))
 
 
 def largest(value: float | Spread, count: int, channel: int) -> float:
-    """Return an upper bound of these numbers: that of the spread, or if it is infinite, the largest number drawn."""
+    """Return the upper bound of the numbers: that of the spread or, if infinite, the largest number drawn."""
     if not isinstance(value, Spread):
         return float(value)
     return value.most if math.isfinite(value.most) else float(draw(value, min(count, MOST), channel).max())

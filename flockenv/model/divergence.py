@@ -8,9 +8,9 @@ __all__ = ["SimulationDiverged"]
 
 
 class SimulationDiverged(FloatingPointError):  # noqa: N818  # the issue and its users call it so
-    """A position or velocity is no longer finite; the worlds that stayed finite have made all their steps.
+    """A position or velocity is no longer finite; worlds that stayed finite have completed all steps.
 
-    The diverged world is as it was before the call; the attributes hold the details.
+    The diverged world keeps its state from before the call; the attributes hold the details.
     """
 
     state: Any = None
@@ -20,9 +20,9 @@ class SimulationDiverged(FloatingPointError):  # noqa: N818  # the issue and its
         self, world: int, agent: int, step: int, time: float, effect: str | None, dt: float, method: str,
         reason: str = "",
     ) -> None:  # fmt: skip
-        """world, agent, step (since the start): where; time: s; effect: the largest acceleration's, None if unknown.
+        """Set the attributes; step: since the start; time, dt: s; effect: of the largest acceleration, or None.
 
-        reason: what happened, if not that a number is no longer finite.
+        reason: text that replaces the usual one, that a number is not finite.
         """
         self.world, self.agent, self.step, self.time, self.effect = world, agent, step, time, effect
         self.dt, self.method, self.reason = dt, method, reason

@@ -1,4 +1,4 @@
-"""Linear finite elements: the response of structures of bars, triangles or tetrahedra to small displacements.
+"""Linear finite elements: structures of bars, triangles or tetrahedra under small displacements.
 
 M a = F - C v - K u, with M, C and K sparse, (n D, n D) for n particles in D dimensions. Degrees of freedom are numbered
 particle by particle: x0, y0, x1, y1, ..., so particle i has i D to i D + D - 1 (`freedoms`), and matrices act on
@@ -49,17 +49,17 @@ class Material(Record):
     """The material of a structure."""
 
     young: float = Field(gt=0, description="Pa, Young's modulus")
-    poisson: float = Field(default=0.3, gt=-1, lt=0.5, description="Poisson's ratio; bars have none")
+    poisson: float = Field(default=0.3, gt=-1, lt=0.5, description="Poisson's ratio; not used for bars")
     density: float = Field(default=1000.0, gt=0, description="kg/m^3")
     area: float = Field(default=1.0, gt=0, description="m^2, cross section of bars")
-    thickness: float = Field(default=1.0, gt=0, description="m, of triangles")
+    thickness: float = Field(default=1.0, gt=0, description="m, thickness of triangles")
 
     def section(self, corners: int) -> float:
         """Return the factor from an element's content to its volume: m^2 (bar), m (triangle), 1 (tetrahedron)."""
         return {2: self.area, 3: self.thickness}.get(corners, 1.0)
 
     def lame(self, corners: int) -> tuple[float, float]:
-        """Return Lame's moduli, Pa: for uniaxial stress (bar), plane stress (triangle), a solid (tetrahedron)."""
+        """Return Lame's moduli, Pa, in uniaxial stress (bar), plane stress (triangle) or a solid (tetrahedron)."""
         E, v = self.young, self.poisson
         if corners == 2:
             return E, 0.0
@@ -88,7 +88,7 @@ def flat(points: ArrayLike, elements: ArrayLike) -> NDArray[np.intp]:
 
 
 def freedoms(particles: ArrayLike, dimension: int) -> NDArray[np.int64]:
-    """Return the degrees of freedom of some particles, (P D,): pass them as `fixed` to hold these particles."""
+    """Return the degrees of freedom of some particles, (P D,), which as `fixed` hold them in place."""
     held = np.asarray(particles, np.int64).reshape(-1, 1)
     return np.asarray((held * dimension + np.arange(dimension)).ravel())
 
@@ -133,7 +133,7 @@ def mass(points: ArrayLike, elements: ArrayLike, material: Material, lumped: boo
 def rayleigh(M: Sparse, K: Sparse, alpha: float, beta: float) -> Sparse:
     """Return C = alpha M + beta K, kg/s: a mode of frequency w is damped by the ratio alpha / (2 w) + beta w / 2.
 
-    alpha: 1/s, damps slow modes and rigid motions; beta: s, damps fast modes. Raises ValueError if one is negative.
+    alpha: 1/s, for slow modes and rigid motions; beta: s, for fast modes. Raises ValueError if one is negative.
     Source: Rayleigh, The Theory of Sound, 1877, 102.
     """
     for name, value in (("alpha", alpha), ("beta", beta)):
@@ -163,10 +163,11 @@ def solve_static(K: Sparse, F: ArrayLike, fixed: ArrayLike) -> Floats:
 
 
 def frequencies(K: Sparse, M: Sparse, fixed: ArrayLike = (), count: int | None = None) -> Floats:
-    """Return the natural frequencies w, rad/s, ascending: K u = w^2 M u; 0 for a rigid motion.
+    """Return the natural frequencies w, rad/s, ascending, with K u = w^2 M u; 0 for a rigid motion.
 
-    fixed: degrees of freedom that are held; count: number of lowest frequencies (default: all, up to DENSE freedoms).
-    Beyond that the lowest are computed by inverse iteration (ARPACK). Raises ValueError if a freedom has no mass.
+    fixed: degrees of freedom that are held; count: number of lowest frequencies (default: all, for up to DENSE
+    freedoms). With more freedoms they are computed by inverse iteration (ARPACK). Raises ValueError if a freedom has no
+    mass.
     """
     free = _free(K.shape[0], fixed)
     if count is not None and not 1 <= count <= len(free):
@@ -187,7 +188,8 @@ def frequencies(K: Sparse, M: Sparse, fixed: ArrayLike = (), count: int | None =
 class Blocks(NamedTuple):
     """The stiffness blocks of each particle: those of particle i are start[i] to start[i + 1], partners ascending.
 
-    F_i = -sum_j K_ij ((x_j - x_i) - (X_j - X_i)), which needs only relative positions of neighbours x; X is at rest.
+    F_i = -sum_j K_ij ((x_j - x_i) - (X_j - X_i)), which needs only relative positions of neighbours; x are the present
+    positions, X those at rest.
     """
 
     start: NDArray[np.int64]  # (n + 1,)
@@ -197,9 +199,10 @@ class Blocks(NamedTuple):
 
 
 def blocks(K: Sparse, points: ArrayLike) -> Blocks:
-    """Return K as blocks per pair of partners, without its diagonal: a translation costs no force (rows sum to 0).
+    """Return K as blocks per pair of partners, without its diagonal, which follows as rows sum to 0.
 
-    points: (n, D) m, undeformed. Raises ValueError if rows of K do not sum to 0, as something holds it to the ground.
+    points: (n, D) m, undeformed. Raises ValueError if rows of K do not sum to 0: a translation then needs a force, as
+    with a support.
     """
     points = np.asarray(points, float)
     n, d = points.shape
@@ -224,7 +227,7 @@ def blocks(K: Sparse, points: ArrayLike) -> Blocks:
 
 
 def _edges(points: Floats, elements: NDArray[Any]) -> Floats:
-    """Return the vectors from an element's first corner to its others, (E, k - 1, D) m."""
+    """Return the vectors from each element's first corner to its others, (E, k - 1, D) m."""
     corners = points[elements]
     return np.asarray(corners[:, 1:] - corners[:, :1])
 
@@ -240,7 +243,7 @@ def _gradients(points: Floats, elements: NDArray[Any]) -> Floats:
 
 
 def _structure(points: ArrayLike, elements: ArrayLike) -> tuple[Floats, NDArray[np.int64]]:
-    """Return points and elements as arrays; raise ValueError, in one line, if they are not a structure."""
+    """Return points and elements as arrays; raise ValueError, in one line, if they are not a valid structure."""
     X, who = np.asarray(points, float), np.asarray(elements)
     if X.ndim != 2 or X.shape[1] not in (1, 2, 3) or not np.isfinite(X).all():
         raise ValueError(f"points of shape {X.shape}: must be finite numbers (n, D), D from 1 to 3")
@@ -266,7 +269,7 @@ def _row(row: NDArray[Any]) -> tuple[int, ...]:
 
 def _assemble(parts: Floats, elements: NDArray[np.int64], count: int) -> Sparse:
     """Return the sum over elements of their matrices (E, k, D, k, D) as csr (n D, n D)."""
-    from scipy import sparse  # here: a scene without finite elements need not wait for it
+    from scipy import sparse  # slow to import, and used only by finite elements
 
     _, k, d, _, _ = parts.shape
     freedom = (elements[:, :, None] * d + np.arange(d)).reshape(-1, k * d)
@@ -292,7 +295,7 @@ def _free(count: int, fixed: ArrayLike) -> NDArray[np.intp]:
 
 
 def _scale(K: Sparse, free: NDArray[np.intp], dimension: int) -> tuple[Sparse, Floats]:
-    """Return K, csc, with the stiffest axis of each particle scaled to 1, and the scale of each freedom.
+    """Return K, csc, with each particle's stiffest axis scaled to 1, and the scale of each freedom.
 
     Thick and thin parts are then comparable, and an axis that is stiff only by rounding is still detected.
     """
@@ -309,9 +312,9 @@ def _scale(K: Sparse, free: NDArray[np.intp], dimension: int) -> tuple[Sparse, F
 
 
 def _factor(K: Sparse) -> tuple[Any, Floats]:
-    """Return the factors of a scaled K and its softest mode; no factors if that mode is rigid.
+    """Return the factors of a scaled K, or None if it allows a rigid motion, and its softest mode.
 
-    A few steps of inverse iteration grow the mode by the reciprocal of its eigenvalue.
+    The mode is computed by inverse iteration, which multiplies it by the reciprocal of its eigenvalue.
     """
     from scipy import sparse
 
@@ -352,7 +355,7 @@ def _all(K: Sparse, M: Sparse) -> Floats:
 
 
 def _lowest(K: Sparse, M: Sparse, count: int | None) -> Floats:
-    """Return the squares of the lowest frequencies, ascending; the shift is just below 0, as K may be singular."""
+    """Return the squares of the lowest frequencies, ascending, with a shift below 0, as K may be singular."""
     from scipy.sparse.linalg import LinearOperator, eigsh
 
     shift = -1e-9 * float(K.diagonal().sum() / M.diagonal().sum())

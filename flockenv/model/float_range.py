@@ -1,4 +1,4 @@
-"""The distance from the origin up to which single precision resolves positions well enough."""
+"""Check of the distance from the origin up to which single precision resolves positions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ At 32,768 m an agent at 1 m/s does not move at all in steps of 1 ms.
 
 
 def check_places(scene: SceneView) -> None:
-    """Raise ValueError if a float32 scene has a place beyond FARTHEST; later motion is not checked."""
+    """Raise ValueError if a float32 scene has a position beyond FARTHEST; later motion is not checked."""
     if scene.dtype != "float32":
         return
     for name, value in _places(scene):
@@ -33,7 +33,7 @@ def check_places(scene: SceneView) -> None:
 
 
 def _places(scene: SceneView) -> Iterator[tuple[str, Any]]:
-    """Yield the key and value of every place in a scene."""
+    """Yield the key and value of every position in a scene."""
     yield "space.size", getattr(scene.space, "size", ())
     for k, group in enumerate(scene.groups):
         if group.network is not None:

@@ -32,12 +32,12 @@ PositiveSpread = Annotated[float, Field(gt=0)] | Annotated[Spread, AfterValidato
 
 
 class Group(Record):
-    """Agents of one kind: `count` separate agents, or the particles of a network; there `mass` is the mean.
+    """Agents of one kind: `count` separate agents, or the particles of a network, of which `mass` is the mean.
 
     Mass, radius and desired_speed are a number, or a `Spread` of numbers that vary within the group.
     """
 
-    count: int | None = Field(default=None, ge=1, description="how many")
+    count: int | None = Field(default=None, ge=1, description="number of agents")
     network: AnyNetwork | None = Field(
         default=None, description="particles joined by springs or elements, and their positions"
     )
@@ -67,11 +67,11 @@ class Group(Record):
     role: Literal["agent", "learner", "pursuer", "evader", "flockmate"] = Field(
         default="agent", description="role in pictures"
     )
-    appearance: Appearance | None = Field(default=None, description="how it is drawn (default: as its role)")
+    appearance: Appearance | None = Field(default=None, description="appearance in pictures (default: as its role)")
 
     @model_validator(mode="after")
     def _check_source(self) -> Group:
-        """Raise ValueError unless either a count or a network is given, and the other fields fit it."""
+        """Raise ValueError unless either a count or a network is given, with fields that it allows."""
         if (self.count is None) == (self.network is None):
             raise ValueError("count: give either a count or a network")
         if self.network is not None and (
@@ -124,7 +124,7 @@ class Group(Record):
 
     @property
     def heaviest(self) -> float:
-        """The largest mass, kg; the mean if it is a network."""
+        """The largest mass, kg; for a network the mean."""
         return largest(self.mass, self.size, SIZE)
 
     @property

@@ -29,7 +29,7 @@ MOST = 10_000_000
 
 
 def _plain(value: object) -> object:
-    """Return numpy integers as int, as indices often come as numpy integers; other values unchanged."""
+    """Return a numpy integer, as indices often are, as an int; any other value unchanged."""
     return int(value) if isinstance(value, np.integer) else value
 
 
@@ -54,19 +54,18 @@ class Springs(NamedTuple):
 
 
 class Network(Record):
-    """Particles joined to each other. Each kind of network defines their positions and what joins them.
+    """Particles joined to each other; each kind of network defines their positions and joints.
 
-    All methods but `size`, `dimension` and `pins` take the dimension D of the world, and raise ValueError if the
-    network has another.
+    Most methods take the dimension D of the world, and raise ValueError if the network has another.
     """
 
     kind: str
     pinned: tuple[Particle | Name, ...] = Field(
         default=(), description="particles held in place: names of places, or indices"
     )
-    stretch: float = Field(default=1.0, ge=1e-6, le=1e6, description="initial lengths over rest lengths")
+    stretch: float = Field(default=1.0, ge=1e-6, le=1e6, description="ratio of initial lengths to rest lengths")
     lumping: Literal["equal", "geometric"] = Field(
-        default="equal", description="mass of each particle: equal, or by the length, area or volume around it"
+        default="equal", description="mass of each particle: equal, or by length, area or volume around it"
     )
 
     @model_validator(mode="after")
@@ -95,7 +94,7 @@ class Network(Record):
                 )
 
     def _refuse_shape(self) -> None:
-        """Raise ValueError if the fields do not define a shape together."""
+        """Raise ValueError if the fields together do not define a shape."""
 
     def _given_points(self) -> Iterator[tuple[str, tuple[float, ...]]]:
         """Yield the names and points of the fields that were given."""
@@ -114,16 +113,16 @@ class Network(Record):
 
     @property
     def dimension(self) -> int | None:
-        """Dimension of the given points, 2 or 3; None if it fits both."""
+        """Dimension of the given points, 2 or 3; None if both are possible."""
         return next((len(point) for _, point in self._given_points()), None)
 
     @property
     def places(self) -> tuple[str, ...]:
-        """Names of places that `pinned` accepts."""
+        """Names of sets of particles that `pinned` accepts."""
         return ()
 
     def _place(self, name: str) -> NDArray[Any]:
-        """Return the particles of a place."""
+        """Return the indices of the particles that a name of `places` stands for."""
         raise ValueError(f"pinned: a {self.kind} has no place {name!r}; give numbers of particles")
 
     @abstractmethod
@@ -180,7 +179,7 @@ class Network(Record):
 
 
 def keys_of(pairs: NDArray[Any], size: int) -> NDArray[np.int64]:
-    """Return a key for each pair, independent of its order: smaller index times size, plus the greater."""
+    """Return a key for each pair, independent of its order: smaller index times `size`, plus the larger one."""
     a, b = pairs[:, 0].astype(np.int64), pairs[:, 1]
     return np.asarray(np.minimum(a, b) * size + np.maximum(a, b))
 
@@ -195,7 +194,7 @@ def springs_of(groups: list[tuple[NDArray[Any], int]], rest_points: Floats) -> S
     """Return pairs and their roles as sorted springs; rest lengths are the distances of their ends."""
     keys = np.concatenate([keys_of(pairs, len(rest_points)) for pairs, _ in groups])
     role = np.repeat(np.array([role for _, role in groups], np.int8), [len(pairs) for pairs, _ in groups])
-    order = np.argsort(keys, kind="stable")  # fast if runs are in order already
+    order = np.argsort(keys, kind="stable")  # fast for runs that are in order
     i, j = np.ascontiguousarray(pairs_of(keys[order], len(rest_points)).T)
     return Springs(i, j, np.linalg.norm(rest_points[j] - rest_points[i], axis=1), role[order])
 
@@ -209,7 +208,7 @@ def element_edges(elements: Ints, size: int) -> NDArray[np.int64]:
 
 
 def orient(points: Floats, elements: Ints) -> Ints:
-    """Return elements with positive determinant: two corners are swapped if it is negative (k = D + 1 only)."""
+    """Return elements with positive determinant (k = D + 1 only): two corners are swapped if it is negative."""
     elements = elements.astype(np.int32)
     if elements.shape[1] == points.shape[1] + 1:
         corners = points[elements]
@@ -219,7 +218,7 @@ def orient(points: Floats, elements: Ints) -> Ints:
 
 
 def check_rows(name: str, rows: tuple[tuple[int, ...], ...], size: int) -> None:
-    """Raise ValueError if a row has an unknown particle, one twice, or the same particles as another row."""
+    """Raise ValueError if a row has an unknown or a repeated particle, or the same particles as another row."""
     if not rows:
         return
     who = np.array(rows, np.int64)
@@ -228,7 +227,7 @@ def check_rows(name: str, rows: tuple[tuple[int, ...], ...], size: int) -> None:
     ordered = np.sort(who, axis=1)
     for k in np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(axis=1)):
         raise ValueError(f"{name}[{k}] = {rows[k]}: the same particle twice")
-    if name == "angles":  # the same three may have another apex
+    if name == "angles":  # the same three particles may have another apex
         ordered = np.concatenate([ordered, who[:, 1:2]], axis=1)
     order = np.lexsort(ordered.T)
     for k in np.flatnonzero((ordered[order[1:]] == ordered[order[:-1]]).all(axis=1)):

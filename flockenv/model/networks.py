@@ -43,19 +43,17 @@ __all__ = ["BEND", "EDGE", "MOST", "SHEAR", "AnyNetwork", "Cloth", "Jelly", "Mes
 class Rope(Network):
     """A chain of links from `start` to `end`, or in a direction.
 
-    With both ends and a length it hangs slack, in an arc of its rest lengths, or is stretched.
+    With both ends and a length it is either stretched, or slack along an arc of its rest lengths.
     """
 
     kind: Literal["rope"] = "rope"
-    links: Count = Field(description="number of links; particles: one more")
+    links: Count = Field(description="number of links; there is one more particle")
     start: Point | None = Field(default=None, description="m (default: the origin)")
     end: Point | None = Field(default=None, description="m (default: given by direction and length)")
     direction: Point | None = Field(default=None, description="from the start, of any length (default: along x)")
-    length: Length | None = Field(
-        default=None, description="m, at rest (default: distance of start and end over stretch)"
-    )
+    length: Length | None = Field(default=None, description="m, at rest (default: distance of start and end / stretch)")
     sag: Point | None = Field(default=None, description="direction in which slack hangs (default: down the last axis)")
-    bend: bool = Field(default=False, description="also springs that span two links")
+    bend: bool = Field(default=False, description="True: also springs that span two links")
 
     @property
     def size(self) -> int:
@@ -64,7 +62,7 @@ class Rope(Network):
 
     @property
     def places(self) -> tuple[str, ...]:
-        """Each end, and both."""
+        """Names of each end, and of both."""
         return ("start", "end", "ends")
 
     def _place(self, name: str) -> NDArray[Any]:
@@ -91,7 +89,7 @@ class Rope(Network):
             raise ValueError(f"end = {self.end}: it is the start, so the rope needs a length")
 
     def _ends(self, dimension: int) -> tuple[Floats, Floats]:
-        """Return its start and its end, (D,) m each."""
+        """Return the start and the end of the rope, (D,) m each."""
         start = np.array(self.start or (0.0,) * dimension, float)
         if self.end is not None:
             return start, np.array(self.end, float)
@@ -100,7 +98,7 @@ class Rope(Network):
         return start, start + way * (self.length * self.stretch / np.linalg.norm(way))
 
     def _reach(self) -> float:
-        """Return the distance from its start to its end, m."""
+        """Return the distance from the start to the end of the rope, m."""
         start, end = self._ends(self.dimension or 2)
         return float(np.linalg.norm(end - start))
 
@@ -109,7 +107,7 @@ class Rope(Network):
         return (self.length if self.length is not None else self._reach() / self.stretch) / self.links
 
     def points(self, dimension: int) -> Floats:
-        """Return its particles, evenly spaced from start to end, or on an arc if it is slack."""
+        """Return the positions of particles, evenly spaced from start to end, or on an arc if the rope is slack."""
         self._check_dimension(dimension)
         start, end = self._ends(dimension)
         slack = self.end is not None and self.length is not None and self._reach() < self.length
@@ -121,14 +119,14 @@ class Rope(Network):
         return np.concatenate([start[None], start + np.cumsum(steps[:-1], axis=0), end[None]])
 
     def rest_points(self, dimension: int) -> Floats:
-        """Return its particles on a straight line, at their rest lengths."""
+        """Return the positions of particles on a straight line, at their rest lengths."""
         self._check_dimension(dimension)
         start, end = self._ends(dimension)
         along, _ = _frame(end - start, end - start)
         return np.asarray(np.linspace(start, start + along * (self._link() * self.links), self.size))
 
     def springs(self, dimension: int) -> Springs:
-        """Return a spring for each link and, with `bend`, one spanning each two links in a row."""
+        """Return a spring for each link and, with `bend`, one across each two successive links."""
         self._check_dimension(dimension)
         ids = np.arange(self.size, dtype=np.int32)
         over = _runs(ids, 0, 3)[:, ::2] if self.bend else np.zeros((0, 2), np.int32)
@@ -136,7 +134,7 @@ class Rope(Network):
         return found._replace(rest=np.asarray(self._link() * (found.j - found.i)))
 
     def hinges(self, dimension: int) -> Ints:
-        """Return all triples of consecutive particles."""
+        """Return a hinge for each three consecutive particles."""
         self._check_dimension(dimension)
         return _runs(np.arange(self.size, dtype=np.int32), 0, 3)
 
@@ -147,19 +145,19 @@ class Rope(Network):
 
 
 class _Lattice(Network):
-    """A lattice of cells, common to cloth and jelly. Particles are numbered along the first edge first."""
+    """A lattice of cells, common to cloth and jelly; particles are numbered along the first edge first."""
 
     cells: tuple[int, ...]
     origin: Point | None = Field(default=None, description="m, its first corner (default: the origin)")
-    sides: tuple[Length, ...] | None = Field(default=None, description="m, of an axis-aligned box; or give edges")
-    edges: tuple[Point, ...] | None = Field(default=None, description="m, vectors from the first corner; or give sides")
+    sides: tuple[Length, ...] | None = Field(default=None, description="m, of an axis-aligned box (or edges)")
+    edges: tuple[Point, ...] | None = Field(default=None, description="m, vectors from the first corner (or sides)")
     diagonals: Literal["alternating", "parallel"] = Field(
-        default="alternating", description="cuts of cells into elements: mirrored from cell to cell, or all alike"
+        default="alternating", description="division of cells into elements: mirrored between neighbours, or all alike"
     )
 
     @property
     def size(self) -> int:
-        """Number of particles: one more than cells along each edge."""
+        """Number of particles; along each edge there is one more than cells."""
         return math.prod(count + 1 for count in self.cells)
 
     def _given_points(self) -> Iterator[tuple[str, tuple[float, ...]]]:
@@ -178,7 +176,7 @@ class _Lattice(Network):
 
     @property
     def places(self) -> tuple[str, ...]:
-        """Its sides; with two edges, each corner; all corners; the whole border."""
+        """Names of each side, of each corner (two edges only), of all corners, and of the border."""
         if len(self.cells) == 3:
             return (*_SIDES, "corners", "border")
         corners = [f"{row}_{column}" for row in ("bottom", "top") for column in ("left", "right")]
@@ -223,7 +221,7 @@ class _Lattice(Network):
         return corners, np.asarray(mirrored, np.int64).ravel(order="F")
 
     def elements(self, dimension: int) -> Ints:
-        """Return its cells cut into triangles or tetrahedra with conforming faces."""
+        """Return the elements of all cells: triangles or tetrahedra with conforming faces."""
         self._check_dimension(dimension)
         corners, mirrored = self._corners()
         cuts = _CUTS[len(self.cells), self.diagonals][mirrored]
@@ -238,12 +236,12 @@ class Cloth(_Lattice):
     """
 
     kind: Literal["cloth"] = "cloth"
-    cells: tuple[Count, Count] = Field(description="along the first and the second edge")
-    shear: bool = Field(default=True, description="springs across cells")
-    bend: bool = Field(default=True, description="springs that span two edges in a row")
+    cells: tuple[Count, Count] = Field(description="number of cells along the first and the second edge")
+    shear: bool = Field(default=True, description="True: springs along the diagonals of cells")
+    bend: bool = Field(default=True, description="True: springs across two successive edges of cells")
 
     def springs(self, dimension: int) -> Springs:
-        """Return springs along the sides of cells, along both diagonals, and spanning two sides in a row."""
+        """Return springs along the sides of cells, along both diagonals, and across two successive sides."""
         self._check_dimension(dimension)
         ids, (corners, _) = self._ids(), self._corners()
         groups = [(_runs(ids, axis, 2), EDGE) for axis in (0, 1)]
@@ -254,13 +252,13 @@ class Cloth(_Lattice):
         return springs_of(groups, self.rest_points(dimension))
 
     def hinges(self, dimension: int) -> Ints:
-        """Return all triples of consecutive particles along both edges."""
+        """Return a hinge for each three consecutive particles along either edge."""
         self._check_dimension(dimension)
         return np.concatenate([_runs(self._ids(), axis, 3) for axis in (0, 1)])
 
 
 class Jelly(_Lattice):
-    """A box of tetrahedra, five per cell or (parallel) six; in 2-D a sheet of triangles.
+    """A box of tetrahedra, five per cell, or six with parallel `diagonals`; in 2-D a sheet of triangles.
 
     "left" is where the first edge begins, "bottom" where the last does, "front" where the one between them does.
     """
@@ -270,7 +268,7 @@ class Jelly(_Lattice):
 
     @property
     def dimension(self) -> int:
-        """Number of its edges."""
+        """Dimension of space: the number of edges."""
         return len(self.cells)
 
     def _refuse_shape(self) -> None:
@@ -280,7 +278,7 @@ class Jelly(_Lattice):
                 raise ValueError(f"{name} = {point}: cells = {self.cells} lies in {len(self.cells)} dimensions")
 
     def springs(self, dimension: int) -> Springs:
-        """Return a spring for each edge of its elements: EDGE along the sides of cells, SHEAR across."""
+        """Return a spring for each edge of the elements: EDGE along the sides of cells, SHEAR across cells."""
         self._check_dimension(dimension)
         along = np.concatenate([_runs(self._ids(), axis, 2) for axis in range(dimension)])
         every = element_edges(self.elements(dimension), self.size)
@@ -289,7 +287,7 @@ class Jelly(_Lattice):
 
 
 class Mesh(Network):
-    """Custom points and joints: elements of one kind; springs are their edges, or the given pairs."""
+    """Custom points with elements of one kind; springs are the edges of elements, or the given pairs."""
 
     kind: Literal["mesh"] = "mesh"
     vertices: tuple[Point, ...] = Field(min_length=1, description="m, initial positions of particles")
@@ -297,7 +295,7 @@ class Mesh(Network):
         default=None, description="springs (default: the edges of its elements)"
     )
     rest: tuple[Annotated[float, Field(ge=0, le=1e100)], ...] | None = Field(
-        default=None, description="m, of each pair (default: distance of its ends, over stretch)"
+        default=None, description="m, of each pair (default: distance of its ends / stretch)"
     )
     bars: tuple[tuple[Particle, Particle], ...] = Field(default=(), description="elements of two corners")
     triangles: tuple[tuple[Particle, Particle, Particle], ...] = Field(
@@ -336,20 +334,20 @@ class Mesh(Network):
         if self.rest is not None and self.stretch != 1:
             raise ValueError(f"stretch = {self.stretch:g}: rest gives the lengths of springs: give one of them")
         if self.lumping == "geometric":
-            self.masses(1.0, len(self.vertices[0]))  # raises if a particle is part of no element
+            self.masses(1.0, len(self.vertices[0]))  # raises ValueError if a particle is part of no element
 
     def _element_array(self) -> Ints:
-        """Return its elements as given; an empty array of bars if there are none."""
+        """Return the elements as given; an empty array of bars if there are none."""
         given = next((rows for rows in (self.triangles, self.tetrahedra) if rows), self.bars)
         return np.array(given, np.int32) if given else np.zeros((0, 2), np.int32)
 
     def points(self, dimension: int) -> Floats:
-        """Return its vertices."""
+        """Return the vertices."""
         self._check_dimension(dimension)
         return np.array(self.vertices, float)
 
     def springs(self, dimension: int) -> Springs:
-        """Return its pairs, or the edges of its elements."""
+        """Return the given pairs, or the edges of elements, as springs."""
         self._check_dimension(dimension)
         if self.pairs is None:
             pairs = pairs_of(element_edges(self._element_array(), self.size), self.size)
@@ -361,12 +359,12 @@ class Mesh(Network):
         return found._replace(rest=np.array(self.rest, float)[np.argsort(keys_of(pairs, self.size))])
 
     def hinges(self, dimension: int) -> Ints:
-        """Return its angles."""
+        """Return the given angles."""
         self._check_dimension(dimension)
         return np.array(self.angles, np.int32).reshape(-1, 3)
 
     def elements(self, dimension: int) -> Ints:
-        """Return its bars, triangles or tetrahedra."""
+        """Return the given bars, triangles or tetrahedra."""
         self._check_dimension(dimension)
         return orient(self.points(dimension), self._element_array())
 
@@ -403,7 +401,7 @@ def _runs(ids: Ints, axis: int, length: int) -> Ints:
 
 
 def _refuse_edges(edges: tuple[tuple[float, ...], ...]) -> None:
-    """Raise ValueError if an edge has no length, or edges are parallel or in one plane."""
+    """Raise ValueError if an edge has length 0, two edges are parallel, or three in one plane."""
     lengths = np.linalg.norm(edges, axis=1)
     for k in np.flatnonzero(~(lengths > 0)):
         raise ValueError(f"edges[{k}] = {edges[k]}: it has no length")
@@ -412,7 +410,7 @@ def _refuse_edges(edges: tuple[tuple[float, ...], ...]) -> None:
 
 
 def _frame(direction: Floats, lateral: Floats) -> tuple[Floats, Floats]:
-    """Return unit vectors along `direction` and across it, towards `lateral` unless that is parallel."""
+    """Return unit vectors along `direction` and perpendicular to it, towards `lateral` unless that is parallel."""
     axes = np.eye(len(direction))
     along = direction / np.linalg.norm(direction) if direction.any() else axes[0]
     for towards in (lateral / np.linalg.norm(lateral) if lateral.any() else lateral, axes[np.argmin(np.abs(along))]):

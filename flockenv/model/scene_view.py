@@ -17,14 +17,14 @@ __all__ = ["SceneView"]
 
 
 class SceneView(Protocol):
-    """A scene as seen by its parts: a record without the step. `flockenv.scene.Scene` is one.
+    """A scene without its step, as its parts read it; `flockenv.scene.Scene` is one.
 
     Members whose types are defined in packages above this one (effects, the method) are `Any` here.
     """
 
     @property
     def dimension(self) -> int:
-        """D, 2 or 3."""
+        """Dimension D, 2 or 3."""
 
     @property
     def dtype(self) -> str:
@@ -32,7 +32,7 @@ class SceneView(Protocol):
 
     @property
     def dt(self) -> float:
-        """s, the length of a physics step."""
+        """Length of a physics step, s."""
 
     @property
     def space(self) -> Space:
@@ -64,11 +64,11 @@ class SceneView(Protocol):
 
     @property
     def agents(self) -> int:
-        """N, the number of agents."""
+        """Number of agents, N."""
 
     @property
     def starts(self) -> tuple[int, ...]:
-        """The first agent of each group, and N."""
+        """The index of the first agent of each group, and N."""
 
     @property
     def roles(self) -> tuple[str, ...]:
@@ -88,7 +88,7 @@ class SceneView(Protocol):
 
     @property
     def shapes(self) -> tuple[Shape, ...]:
-        """The other obstacles."""
+        """The obstacles that are not in the state."""
 
     @property
     def contact_distance(self) -> float:
@@ -100,15 +100,15 @@ class SceneView(Protocol):
 
     @property
     def parts(self) -> Any:
-        """The parts that the kernel of this scene depends on."""
+        """The kernel plan of this scene."""
 
     @property
     def coupling(self) -> Any:
-        """Which agents' accelerations depend on which others, for implicit methods."""
+        """Pairs of agents of which one's acceleration depends on the other, for implicit methods."""
 
     @property
     def table(self) -> Any:
-        """Bonds."""
+        """The bonds of all effects."""
 
     def table_of(self, effect: Any) -> NDArray[Any]:
         """Return the table that the laws of an effect read."""

@@ -24,7 +24,7 @@ KINDS: Final = ("goal", "heading", "way")
 
 @dataclass(frozen=True, eq=False)
 class Mark:
-    """Something to draw that is not a body: a goal, a desired heading, a piece of a path.
+    """A mark in a picture that is not a body: a goal, a desired heading, a piece of a path.
 
     kind: "goal" (a disc of `radius` around `at`; `vector` is not read) or "heading" (an arrow that starts at `at` and
     points along `vector`; only its direction counts, and a zero vector draws nothing; `radius` is not read) or "way" (a
@@ -53,16 +53,15 @@ class Snapshot:
 
     time: s. pos (N, D): m. vel (N, D): m/s. alive (N,): bool. radius (N,): m. roles: N names out of ROLES.
     obstacle_centre (M, D), obstacle_radius (M,): m. marks: goals and headings. low, high (D,): the region to show, m.
-    periodic: True if what leaves the region enters it on the far side. title: one line. D = 2 or 3; N and M may be 0.
+    periodic: True if the region is periodic. title: one line. D = 2 or 3; N and M may be 0.
     outlines: polygons (n, 2), m, of obstacles that are not round, as seen from above.
-    bonds (E, 2): int, pairs of agents that a line is drawn between, the shortest way; none by default.
+    bonds (E, 2): int, pairs of agents joined by a line, the shortest one; none by default.
     heading (N, D): directions that agents face; default: those of the velocities.
     looks: appearances; look (N,): the index of each agent's own, -1 = none. age (N,): s, of the living; default: the
     time. identity (N,): int, the agent in each row; default: the same agents at all times.
-    inner (N,): the inner number of each agent that its look shows; none by default.
-    Arrays are private copies and read-only; positions and velocities may hold NaN or inf (a run that diverged can be
-    looked at: such bodies are left out), everything else is finite.
-    Raises ValueError or TypeError, in one line that names the field, on anything else.
+    inner (N,): the inner state of each agent that its look shows; none by default. Arrays are private copies and
+    read-only. Positions and velocities may hold NaN or inf: such bodies of a run that diverged are not drawn. Raises
+    ValueError or TypeError, in one line that names the field, for other values.
     """
 
     time: float
@@ -124,12 +123,12 @@ class Snapshot:
 
     @property
     def agents(self) -> int:
-        """N, the number of rows, alive or not."""
+        """Number of rows N, alive or not."""
         return len(self.pos)
 
     @property
     def dimension(self) -> int:
-        """D: 2 or 3."""
+        """Dimension D, 2 or 3."""
         return int(self.pos.shape[1])
 
     @property
@@ -139,7 +138,7 @@ class Snapshot:
 
     @property
     def shade(self) -> Floats:
-        """The place of each agent in the range of its look, (N,) from 0 to 1; 0 without one."""
+        """The position of each agent's value in the range of its look, (N,) from 0 to 1; 0 without a look."""
         shade = np.zeros(self.agents)
         age = np.full(self.agents, self.time) if self.age is None else self.age
         with np.errstate(over="ignore", invalid="ignore"):
@@ -164,7 +163,7 @@ class Snapshot:
 
     @property
     def visible(self) -> NDArray[np.bool_]:
-        """True for bodies with a place that can be drawn, (N,) bool: the finite ones."""
+        """True for bodies that can be drawn, at finite positions, (N,) bool."""
         return np.asarray(np.isfinite(self.pos).all(axis=1) & np.isfinite(self.vel).all(axis=1))
 
 
@@ -214,7 +213,7 @@ def _lengths(field: str, value: ArrayLike, count: int) -> Floats:
 
 def _switches(field: str, value: ArrayLike, count: int) -> NDArray[np.bool_]:
     switches = np.array(value)
-    # An empty list is float64 to numpy; a world without agents is still a world.
+    # numpy makes an empty list float64; a world without agents is valid
     if switches.dtype != np.bool_ and switches.size:
         raise TypeError(f"{field}: must be bool, got {switches.dtype}")
     _require(switches.shape == (count,), field, f"must have shape ({count},)", f"shape {switches.shape}")

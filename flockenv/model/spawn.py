@@ -27,7 +27,7 @@ MOST_CELLS = 10_000_000
 
 
 class Spawn(Record):
-    """Uniform in a box (default: the whole space), at a speed drawn from a range, in a random or a given direction.
+    """Positions uniform in a box (default: the space), at speeds from a range, in a random or a given direction.
 
     With `spacing` each agent has its own cell of a grid; bodies then do not overlap, unless `wider` is set.
     """
@@ -45,7 +45,7 @@ class Spawn(Record):
     )
     wider: bool = Field(
         default=False,
-        description="allow bodies wider than their cells, which may overlap neighbours and obstacles at first",
+        description="True: bodies may be wider than their cells, and overlap others and obstacles at the start",
     )
     speed: tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]] = Field(
         default=(0.0, 0.0), description="m/s, least and most"
@@ -54,7 +54,7 @@ class Spawn(Record):
 
     @model_validator(mode="after")
     def _check_ranges(self) -> Spawn:
-        """Raise ValueError if a range is reversed, or a field lacks the one it goes with."""
+        """Raise ValueError if a range is reversed, or a field is given without the one that it needs."""
         if self.speed[0] > self.speed[1]:
             raise ValueError(f"speed = {self.speed}: the lower number must come first")
         if (self.low is None) != (self.high is None):
@@ -73,7 +73,7 @@ def cells(
     spawn: Spawn, low: Sequence[float], high: Sequence[float], count: int, radius: float, shapes: Sequence[Shape],
     period: NDArray[np.float64],
 ) -> NDArray[np.float64]:  # fmt: skip
-    """Return the middles of the first cells of a spawn's grid in [low, high) that are clear of shapes, (count, D) m.
+    """Return the middles of the first grid cells in [low, high) that are clear of shapes, (count, D) m.
 
     Raises ValueError, beginning with the field's name, if bodies of this radius, m, are wider than a cell, or if there
     are too few free cells.
@@ -117,7 +117,7 @@ def _edges(spawn: Spawn, dimension: int, radius: float) -> tuple[float, ...]:
 
 
 def _edges_text(spacing: tuple[float, ...]) -> str:
-    """Return edges as text for messages: one number, or all if they differ."""
+    """Return the edges of a cell as text for messages: one number, or all if they differ."""
     return f"{spacing[0]:g}" if len(set(spacing)) == 1 else f"({', '.join(f'{edge:g}' for edge in spacing)})"
 
 
@@ -153,10 +153,11 @@ def scatter(
     key: Any, pos: Any, vel: Any, radius: Any, first: int, end: int, low: Any, high: Any, slow: float, fast: float,
     heading: Any, centre: Any, obstacle_radius: Any, period: Any, unit: Any, tried: Any,
 ) -> None:  # fmt: skip
-    """Place agents [first, end) of one world: uniform in [low, high), clear of obstacles if 64 tries find room.
+    """Place agents [first, end) of one world uniformly in [low, high), clear of obstacles if 64 tries suffice.
 
     pos, vel (D, N); low, high, heading, period, unit (D,); heading: zeros for a random one; period: size of a periodic
-    box, zeros for none; unit: scratch. tried (N,): in, number of tries already made; out, index of the try kept.
+    box, zeros for none; unit: scratch. tried (N,): on entry the number of tries already made, on return the index of
+    the accepted one.
     """
     dimension = pos.shape[0]
     for i in range(first, end):

@@ -37,7 +37,7 @@ COUNTED_BY_KERNELS = 8
 
 @dataclass(frozen=True, eq=False)
 class Obstacles:
-    """Round obstacles of every world, as views: they may differ from world to world, and do not move.
+    """Round obstacles of every world, as views; they may differ between worlds, and do not move.
 
     Circles that move or are hollow are not among them; like all other shapes they are in `Scene.shapes`.
     """
@@ -63,7 +63,7 @@ class Body:
         return Body(*(np.ascontiguousarray(a, dtype) for a in self.arrays()))
 
     def arrays(self) -> tuple[Floats, ...]:
-        """Return the arrays."""
+        """Return all arrays, in the order of the fields."""
         return tuple(getattr(self, each.name) for each in fields(self))
 
 
@@ -71,7 +71,7 @@ class Body:
 class State:
     """The variables of a simulation: positions, velocities, living agents, number of steps, and more.
 
-    Round obstacles are here because a random field of them differs from world to world and from episode to episode.
+    Round obstacles are included because random ones differ between worlds and between episodes.
     """
 
     x: Floats  # (D, B, N) m, positions, per coordinate
@@ -101,14 +101,14 @@ class State:
 
     @property
     def frame_and_inner(self) -> tuple[Floats, ...]:
-        """Frames and inner states, those that are not empty, as passed to kernels."""
+        """Heading frames and inner states as passed to kernels, without empty ones."""
         return tuple(array for array in (self.frame, self.inner) if len(array))
 
     @property
     def heading(self) -> Floats:
         """Headings, unit vectors (B, N, D): a view if they are kept.
 
-        Otherwise the directions of velocities, 0 at standstill.
+        Otherwise they are the directions of velocities, 0 at standstill.
         """
         if len(self.frame):
             return self.frame[: len(self.x)].transpose(1, 2, 0)
@@ -117,14 +117,14 @@ class State:
 
     @property
     def up(self) -> Floats:
-        """Up vectors, unit vectors perpendicular to the heading, as a view, (B, N, 3); ValueError if not kept."""
+        """Up vectors, unit vectors perpendicular to the headings, a view (B, N, 3); ValueError if not kept."""
         if not len(self.frame) or len(self.x) == 2:
             raise ValueError("up: only scenes in 3-D with an oriented group have up vectors")
         return self.frame[3:].transpose(1, 2, 0)
 
     @property
     def time(self) -> NDArray[np.float64]:
-        """Time of each world, (B,) s: an integer number of steps times dt, so that it never drifts."""
+        """Time of each world, (B,) s: number of steps times dt, without accumulated rounding."""
         return np.asarray(self.tick * self.dt, np.float64)
 
     @property
@@ -145,7 +145,7 @@ class State:
         return b, n, d
 
     def count_of(self, what: str) -> int:
-        """Return one work counter, summed over the worlds; what: a name in WORK."""
+        """Return a work counter, summed over the worlds; what: its name in WORK."""
         return int(self.work[:, WORK.index(what)].sum())
 
     def copy(self) -> State:
@@ -187,7 +187,7 @@ class State:
         return new
 
     def face(self) -> None:
-        """Turn the headings, if kept, along the velocities; an agent at standstill keeps its heading."""
+        """Turn the headings, if kept, into the directions of velocities; at standstill a heading stays."""
         for b in range(self.shape[0] if len(self.frame) else 0):
             entry(face)(self.v, self.frame, b, False)
 
@@ -225,7 +225,7 @@ def blank(
     worlds: int, agents: int, dimension: int, obstacles: int, dt: float, dtype: Any = np.float64, frame_rows: int = 0,
     population: bool = False, inner_rows: int = 0,
 ) -> State:  # fmt: skip
-    """Return a state of zeros with all agents alive, for a spawn to fill; identities, if kept, are slot numbers."""
+    """Return a state of zeros with all agents alive, whose identities, if kept, are slot numbers."""
     slots = agents if population else 0
     return State(
         x=zeros((dimension, worlds, agents), dtype),

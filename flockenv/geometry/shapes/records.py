@@ -104,7 +104,7 @@ class Wall(Shape):
 
     @property
     def extremes(self) -> Floats:
-        """The corners of boxes around its vertices, of its thickness."""
+        """The corners of the boxes around the vertices, each as wide as the wall."""
         return _inflate(self.vertices, self.radius)
 
     def row(self, dimension: int) -> Sequence[float]:
@@ -160,7 +160,7 @@ class Capsule(Closed):
 
     @property
     def extremes(self) -> Floats:
-        """The corners of boxes around its ends, of its thickness."""
+        """The corners of the boxes around both ends, each as wide as the capsule."""
         return self._wall.extremes
 
     def row(self, dimension: int) -> Sequence[float]:
