@@ -1,1 +1,1 @@
-"""What acts on agents, how that is integrated, what a step must end with, and which agents live."""
+"""Physics: effects on agents, integrators, constraints at the end of a step, births and deaths."""

@@ -1,4 +1,4 @@
-"""Conditions on the end of every step, for any method. To add one: write its file, and a row in tests/catalogue.py."""
+"""Constraints at the end of every step, for any method; a new one needs a file, and a row in tests/catalogue.py."""
 
 from __future__ import annotations
 

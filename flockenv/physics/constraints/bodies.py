@@ -1,4 +1,4 @@
-"""The bodies of one world during a step, what they may touch, and the position of each at any time of the step."""
+"""The bodies of one world during a step, their possible contacts, and their positions at any time of the step."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Bodies(NamedTuple):
     radius: Any  # (N,) m
     light: Any  # (N,) 1/kg, 0 = held in place
     living: Any  # (N,) 1 or 0
-    moved: Any  # (N,) 1 if something has happened to it, STOPPED
+    moved: Any  # (N,) 1 if an impact or contact has changed its path; or STOPPED
     leans: Any  # (N,) 1 if it has come to rest on another body in this step
     first: Any  # (N,) its last meeting, 2 c + side; -1 if it has none
 
@@ -78,7 +78,7 @@ class Meetings(NamedTuple):
     deep: Any  # m, how far the two may overlap before they stop
     following: Any  # (2, places) the next meeting of the same body, as in Bodies.first
     listed: Any  # 1 = among the active
-    active: Any  # meetings with a time, and some that have lost theirs
+    active: Any  # meetings with a time, and some that no longer have one
     todo: Any  # (2 places,) meetings whose time is to be computed
 
 
@@ -95,7 +95,7 @@ class Things(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """What happens at an impact."""
+    """Parameters of impacts and of the end of a step."""
 
     seconds: float  # of the step
     restitution: float
@@ -105,7 +105,7 @@ class Rules(NamedTuple):
     again: int  # impacts of the same two bodies in one step
     touch: float  # m, gap at and below which two touch
     pairs: bool  # True if bodies collide with each other
-    stops: bool  # True if there are no impacts, and bodies stop where they hit something
+    stops: bool  # True if there are no impacts, and bodies stop at contact
 
 
 @kernel
@@ -187,7 +187,7 @@ def larger_acceleration(period: Vec, bodies: Bodies, i: int, j: int) -> float:
 def widen_reach(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, i: int, t: float, count: int
 ) -> int:
-    """Enlarge the reach of body i if it may now exceed it, and add its new meetings; return the number of meetings."""
+    """Enlarge the reach of body i if it may now go further, and add new meetings; return the number of meetings."""
     d = nearest_image(period, sub(position(period, bodies, i, t), vector_at(period, bodies.start, i)))
     left = rules.seconds - t
     v, a = vector_at(period, bodies.vel, i), vector_at(period, bodies.acc, i)

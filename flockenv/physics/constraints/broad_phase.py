@@ -1,6 +1,6 @@
 """Pairs that may touch within a step: their bounding balls overlap, found by the common neighbour query.
 
-A ball is centred at the start of the step; its radius is that of the body plus the distance that it may go. The cell
+A ball is centred at the start of the step; its radius is that of the body plus the distance that it may move. The cell
 size is that of the balls of most bodies; the few with much larger balls are compared with all bodies.
 """
 
@@ -82,7 +82,7 @@ def balls_overlap(period: Vec, at: Any, radius: Any, reach: Any, i: int, j: int)
 
 @kernel
 def _common_reach(living: Any, radius: Any, reach: Any, n: int, many: Any) -> float:
-    """Return the largest ball radius but for outliers, m: the largest within the power of two that covers 98 %.
+    """Return the largest ball radius without outliers, m: the largest within the power of two that covers 98 %.
 
     many: scratch (>= 64,), a histogram over powers of two.
     """
@@ -145,7 +145,7 @@ def list_near_pairs(
 
 @kernel
 def _mark(living: Any, radius: Any, reach: Any, n: int, common: float, grid: Any) -> int:
-    """Mark the bodies that the cell list finds; the others are compared with all bodies. Return the number marked."""
+    """Mark the bodies for the cell list (the others are compared with all bodies); return their number."""
     present = 0
     for i in range(n):
         grid[i] = 1 if living[i] > 0 and radius[i] + reach[i] <= common else 0

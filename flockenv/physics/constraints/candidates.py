@@ -1,4 +1,4 @@
-"""The meetings of a step: pairs of bodies, and bodies and obstacles, that may touch within it or touch at its end."""
+"""The meetings of a step: pairs of bodies, or of a body and an obstacle, that may touch within it or at its end."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def list_meetings(
 
 @kernel
 def _enlarge_reach(bodies: Bodies) -> None:
-    """Enlarge the reach of all bodies, so that few that are hit leave it."""
+    """Enlarge the reach of all bodies, so that few leave it after an impact."""
     total, present = 0.0, 0
     for i in range(bodies.living.shape[0]):
         if bodies.living[i] > 0:

@@ -35,7 +35,7 @@ def _load_bodies(
     period: Vec, x0: Any, v0: Any, x: Any, v: Any, alive: Any, b: int, bodies: Bodies, ends: Ends, before: Any,
     seconds: float,
 ) -> tuple[float, float, float, Vec]:  # fmt: skip
-    """Load all bodies of world b; return their largest coordinate, speed and acceleration, and summed acceleration."""
+    """Load the bodies of world b; return the largest coordinate, speed and acceleration, and summed acceleration."""
     far, fast, hard, mean = 0.0, 0.0, 0.0, zero(period)
     for i in range(x.shape[2]):
         bodies.living[i] = 1 if alive[b, i] else 0
@@ -81,12 +81,12 @@ def collide(
     in_time: bool, once: bool, rounds: int, spread: float, first: int, end: int, work: Any, at_work: int, report: Any,
     lost: Any,
 ) -> int:  # fmt: skip
-    """Correct the steps of worlds [first, end) that led from x0, v0 to x, v (D, B, N), in place.
+    """Correct the steps of worlds [first, end) from x0, v0 to x, v (D, B, N), in place.
 
     period: edges of a periodic box, m, zeros if it is not periodic; in_time: impacts within the step, one after
-    another; once: one pass over contacts, and positions are not advanced anew; spread: m, by how much a pair is
-    separated at most. Returns -1, or the first world with more meetings than capacity: report[2] is their number, and
-    that world is left unchanged.
+    another; once: one pass over contacts, and positions are not advanced anew; spread: m, largest separation of a pair.
+    Returns -1, or the first world with more meetings than capacity: report[2] is their number, and that world is left
+    unchanged.
     """
     scratch = (grid, order, cell, start, offset, bounds, sync, ranges)
     report[0], report[1], report[3], report[4] = -1, -1, 0, 0

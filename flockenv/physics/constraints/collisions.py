@@ -1,4 +1,4 @@
-"""Bodies that hit obstacles, walls and each other."""
+"""Collisions of bodies with obstacles, walls and each other."""
 
 from __future__ import annotations
 
@@ -30,33 +30,33 @@ __all__ = [
 
 
 class Collisions(Constraint):
-    """Bodies are solid: discs or balls that do not go through obstacles, the walls of a box, or each other.
+    """Collisions of solid bodies, discs or balls, with obstacles, the walls of a box, and each other.
 
-    The time of an impact within a step is found on the parabola that the method has made of the step, exactly under
+    The time of an impact within a step is computed on a parabola through the method's step, which is exact under
     constant forces, for bodies of any speed. The responses:
 
-    - "earliest": the earliest impact of all happens, both bodies go on from there, their further paths are searched
-      anew, and so on; nothing is missed, and an elastic ball keeps its energy.
+    - "earliest": the earliest impact of all is resolved, both bodies continue from there, their further paths are
+      searched anew, and so on; nothing is missed, and an elastic ball keeps its energy.
     - "back_up": the same with at most 30 impacts of the same two bodies in a step, whatever `most` is.
     - "impulses": at the end of a step all bodies in touch exchange impulses, in passes, until none approach each other.
       For heaps and crowds. A body whose path is blocked stops there, and has its impact in the next step.
     - "project": one such pass, and a body inside another or an obstacle is put on the surface. The cheapest; it loses
       energy at every impact, friction holds no body in place, and bodies that overlap are moved apart even against
-      their weight.
+      gravity.
 
     No body passes another. Beyond the limit of impacts in a step, the two bodies stop: they keep their velocities and
     do not move for the rest of the step, and bodies that run into them also stop. So time is lost, but neither energy
-    nor momentum; "stopped" counts such bodies, and a warning gives the time. Two that approach slower than a step's
-    acceleration changes velocity come to rest instead; the warning gives the energy lost.
+    nor momentum; "stopped" counts such bodies, and a warning gives the time. Two that approach more slowly than the
+    velocity added by the step's acceleration come to rest instead; the warning gives the energy lost.
 
-    All responses end with passes over bodies that are near, so that none overlap. Restitution e is speed after over
-    speed before, across the surface; friction is Coulomb's. A ball dropped from h bounces to e^2 h, and is at rest
-    after sqrt(2 h / g) (1 + e) / (1 - e); a body sticks on an incline up to tan(angle) = friction. Bodies do not spin.
+    All responses end with passes over near bodies, so that none overlap. Restitution e is the normal speed after an
+    impact over that before; friction is Coulomb's. A ball dropped from h bounces to e^2 h, and is at rest after
+    sqrt(2 h / g) (1 + e) / (1 - e); a body sticks on an incline up to tan(angle) = friction. Bodies do not spin.
     """
 
     kind: Literal["collisions"] = "collisions"
     response: Literal["earliest", "back_up", "impulses", "project"] = Field(
-        default="earliest", description="what happens at an impact, and when"
+        default="earliest", description="method by which impacts are resolved"
     )
     agents: bool = Field(default=True, description="True if bodies hit each other")
     obstacles: bool = Field(default=True, description="True if they hit obstacles, and the walls of a box")
@@ -85,12 +85,12 @@ class Collisions(Constraint):
             )
 
     def calls_for(self) -> tuple[str, ...]:
-        """Return the neighbour query, and obstacles, if they are used."""
+        """Return the names of the neighbour query and of obstacles, if they are used."""
         needs = ("neighbour query", self.agents), ("obstacles", self.obstacles)
         return tuple(what for what, needed in needs if needed)
 
     def numbers(self, scene: SceneView) -> int:
-        """Return the size of bodies, ends and meetings, per agent."""
+        """Return the memory of bodies, ends and meetings, in numbers per agent."""
         return int(8 * scene.dimension + 12 + self.capacity * (12 + 4 * scene.dimension))
 
     def settler(self, scene: SceneView) -> Settler:
@@ -99,7 +99,7 @@ class Collisions(Constraint):
 
 
 class _Settler:
-    """Corrects steps of one scene, with scratch memory of its own."""
+    """Correction of the steps of one scene, with scratch memory of its own."""
 
     def __init__(self, record: Collisions, scene: SceneView) -> None:
         n, d = scene.agents, scene.dimension

@@ -30,7 +30,7 @@ state.tick has been incremented already. Returns the first (world, agent) whose 
 
 
 class Constraint(Record):
-    """A condition that every step of a scene ends with."""
+    """A condition that the end of every step of a scene satisfies."""
 
     kind: str
 
@@ -44,11 +44,11 @@ class Constraint(Record):
         """Raise ValueError, beginning with the field's name, if the scene does not suit this constraint."""
 
     def calls_for(self) -> tuple[str, ...]:
-        """Return what else the scene must compute for it, in words, as for effects."""
+        """Return the names of what the scene must compute for the constraint, as for effects."""
         return ()
 
     def numbers(self, scene: SceneView) -> int:
-        """Return how many numbers of scratch memory it takes per agent."""
+        """Return the scratch memory, in numbers per agent."""
         return 0
 
     @abstractmethod

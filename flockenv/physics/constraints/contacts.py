@@ -1,11 +1,11 @@
-"""Contacts of one world at the end of a step, all at once: impulses until no body approaches another, then positions.
+"""Contacts of one world at the end of a step: impulses until no body approaches another, then positions.
 
-Sequential impulses: contact after contact, up and down along the mean acceleration, each as if it were the only one,
-until none changes. First impacts, with the velocities before the step and restitution e (Guendelman, Bridson and
-Fedkiw 2003: the velocity that the step's own acceleration adds never bounces, and a resting body stays still). Then the
-velocity that the step has added, without a bounce: the impulses of each contact are summed, never pull, and bound its
-friction. Remaining overlaps are resolved by moving bodies apart, the lighter one further; velocities do not change by
-that, so no overlap accelerates a body.
+Sequential impulses: contacts are solved one after another, up and down along the mean acceleration, each as if it were
+the only one, until none changes. First impacts, with the velocities before the step and restitution e (Guendelman,
+Bridson and Fedkiw 2003: the velocity that the step's own acceleration adds never bounces, and a resting body stays
+still). Then the velocity that the step has added, without a bounce: the summed impulse of each contact never pulls, and
+bounds its friction. Remaining overlaps are resolved by moving bodies apart, the lighter one further. This does not
+change velocities, so no overlap accelerates a body.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Contacts(NamedTuple):
     who: Any  # a body
     other: Any  # another, or -1 - m
     normal: Any  # (places, D), to the first from the other
-    allowed: Any  # m/s, allowed approach speed: that at which they touch at the end of the step
+    allowed: Any  # m/s, allowed approach speed, at which they just touch at the end of the step
     open: Any  # 1 = their impact is in the next step, and no impulse acts here
     push: Any  # kg m/s, normal impulse so far
     rub: Any  # (places, D) kg m/s, tangential impulse so far
@@ -62,9 +62,9 @@ class Ends(NamedTuple):
 def _normal(
     period: Vec, bodies: Bodies, things: Things, pos: Any, ends: Ends, seconds: float, i: int, j: int
 ) -> tuple[float, Vec]:
-    """Return the gap of a body and another, or an obstacle, m, and the normal to the body.
+    """Return the gap between a body and another, or an obstacle, m, and the normal towards the body.
 
-    pos (N, D) m: places `seconds` after the beginning of the step.
+    pos (N, D) m: positions `seconds` after the beginning of the step.
     """
     x = vector_at(period, pos, i)
     if j >= 0:
@@ -91,12 +91,12 @@ def gather_contacts(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, contacts: Contacts, seconds: float,
     up: Vec, touch: float, slow: float, restitution: float, in_time: bool, passing: bool, count: int,
 ) -> int:  # fmt: skip
-    """Find the meetings that touch at the end of the step, or nearly do, sorted by height; return their number.
+    """List the meetings that touch, or nearly touch, at the end of the step, by height; return their number.
 
-    in_time: True if impacts of the step are done. Pairs that still approach have their impact in the next step. Bodies
-    in a heap are the exception: those that are nearly in touch rest if their approach speed is at most what the step's
-    acceleration has added. For others the limit is `slow` m/s.
-    passing: True if bodies may pass what they touch at the beginning; then the contact is taken from there.
+    in_time: True if the impacts of the step are resolved. Pairs that still approach have their impact in the next step,
+    except in a heap: bodies that nearly touch rest if their approach speed is at most that which the step's
+    acceleration has added. For others the limit is `slow` m/s. passing: True if bodies may pass what they touch at the
+    beginning; the contact is then that at the beginning.
     """
     found = 0
     for c in range(count):
@@ -138,7 +138,7 @@ def gather_contacts(
 
 @kernel
 def _far_apart(period: Vec, bodies: Bodies, ends: Ends, i: int, j: int, margin: float) -> bool:
-    """Return True if two bodies are further apart than a margin, m, at the end of a step; without a square root."""
+    """Return True if two bodies are further apart than a margin, m, at the end of a step."""
     d = nearest_image(period, sub(vector_at(period, ends.pos, i), vector_at(period, ends.pos, j)))
     room = 1.000001 * (bodies.radius[i] + bodies.radius[j] + margin)
     return bool(dot(d, d) > room * room)
@@ -197,9 +197,9 @@ def resolve_impacts(
     period: Vec, bodies: Bodies, things: Things, contacts: Contacts, vel: Any, restitution: float, friction: float,
     sticky: bool, rounds: int, slow: float, count: int,
 ) -> tuple[int, int]:  # fmt: skip
-    """Let bodies that approach each other, at velocities (N, D), bounce until none do; return impacts, and those left.
+    """Let bodies that approach, at velocities (N, D), bounce until none do; return impacts, and those left.
 
-    slow: m/s, approach speed that is ignored. Impacts that are left after `rounds` > 1 passes are left to the next
+    slow: m/s, approach speed that is ignored. Impacts that are left after `rounds` > 1 passes are deferred to the next
     step: their contacts are marked open, so that no energy is lost.
     """
     done, left = 0, 0
@@ -353,7 +353,7 @@ def move_apart(
 def deepest_overlap(
     period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: float, who: Any, other: Any, count: int
 ) -> float:
-    """Return the deepest overlap of these pairs at the end of a step, as a part of the smaller radius.
+    """Return the deepest overlap of these pairs at the end of a step, as a fraction of the smaller radius.
 
     `who`, `other`: (places,) as in Meetings and Contacts.
     """
@@ -368,7 +368,7 @@ def deepest_overlap(
 
 @kernel
 def _share(bodies: Bodies, i: int, j: int, alike: bool) -> float:
-    """Return the part of a move that body i makes, the other makes the rest; alike: True if masses are ignored."""
+    """Return the part of a separation that body i moves, from 0 to 1; alike: True if masses are ignored."""
     one, two = bodies.light[i], bodies.light[j] if j >= 0 else 0.0
     if alike and one > 0.0 and two > 0.0:
         return 0.5

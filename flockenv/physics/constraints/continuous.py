@@ -1,7 +1,7 @@
-"""Straight paths of responses that use the end of a step only, so that no body tunnels through another at any speed.
+"""Straight paths, for responses that use the end of a step only, so that no body tunnels through another.
 
-Impacts and contacts have changed velocities; now each body goes in a straight line to its place at the end of the step.
-If it would go into another body or an obstacle on that path, it stops in touch, and has its impact in the next step.
+After impacts and contacts have changed velocities, each body moves in a straight line to its position at the end of the
+step. If it would enter another body or an obstacle, it stops at contact, and has its impact in the next step.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ LOST = 0.5
 
 @kernel
 def may_meet_around(period: Vec, path: float) -> bool:
-    """Return True if two bodies whose paths are `path` m long may meet where they are not nearest images."""
+    """Return True if bodies with paths `path` m long may touch at other images than the nearest."""
     least = np.inf
     for k in range(len(period)):
         least = min(least, period[k])
@@ -51,7 +51,7 @@ def may_meet_around(period: Vec, path: float) -> bool:
 
 @kernel
 def may_pass(period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: float, turned: bool) -> bool:
-    """Return True if a body, or an obstacle relative to it, moves so far in the step that one may pass the other.
+    """Return True if some body moves so far in the step, or an obstacle relative to it, that one may pass the other.
 
     turned: True if impacts have changed the paths of bodies.
     """
@@ -85,15 +85,15 @@ def stop_on_path(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, strict: bool, count: int,
     lost: Any,
 ) -> int:  # fmt: skip
-    """Stop bodies where their paths hit something; return the number of meetings, even if it exceeds their capacity.
+    """Stop bodies where their paths are blocked; return the number of meetings, even if it exceeds their capacity.
 
-    rules.stops must be set. strict: True if no two bodies may come to overlap by more than when the step began, or than
-    DEEP; two that began with an overlap of more than LOST have no order to keep. A body that stops keeps the velocity
-    that impacts left it with, less what the step's acceleration would have added on the rest of the path.
+    rules.stops must be set. strict: True if no two bodies may overlap by more than at the beginning of the step, or
+    than DEEP; two that began with an overlap of more than LOST have no order to keep. A body that stops keeps its
+    velocity after impacts, less the step's acceleration times the rest of the step.
     """
     n, seconds, known = bodies.living.shape[0], rules.seconds, count
     for i in range(n):
-        if strict and bodies.moved[i] == STOPPED:  # its velocity is already what it is where it stopped
+        if strict and bodies.moved[i] == STOPPED:  # its velocity is already that at the stop
             write_vector(bodies.free, i, zero(period))
         straight = scale(_path(period, bodies, ends, i, seconds), 1.0 / seconds)
         write_vector(bodies.at, i, vector_at(period, bodies.start, i))
@@ -118,7 +118,7 @@ def stop_on_path(
             meetings.deep[c] = max(DEEP * wide, -begun) + 10.0 * rules.touch
             meetings.closed[c] = GIVEN_UP if -begun > LOST * wide else 0
             continue
-        # two bodies that begin near each other rest, and are separated by little; a body that comes from afar stops at
+        # two bodies that begin near each other rest, with a small separation; a body that comes from afar stops at
         # the surface, or separation would lift it out
         near = max(DEEP * width(bodies, i, j) - max(begun, 0.0), 0.0)
         meetings.deep[c] = near + 10.0 * rules.touch + max(-begun, 0.0)
@@ -132,7 +132,7 @@ def stop_on_path(
 
 @kernel
 def _write_stop(period: Vec, bodies: Bodies, ends: Ends, i: int, seconds: float) -> None:
-    """Write the place where body i stopped, or to which an obstacle pushed it, and its velocity."""
+    """Write the position where body i stopped, or to which an obstacle pushed it, and its velocity."""
     left = seconds - bodies.since[i]
     for k in range(len(period)):
         ends.pos[i, k] = bodies.at[i, k] + bodies.vel[i, k] * left

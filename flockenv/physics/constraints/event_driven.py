@@ -1,8 +1,8 @@
-"""Impacts of one world within one step, one after another in the order of time.
+"""Impacts of one world within one step, in the order of time.
 
-Each body flies along the parabola that the method has made of the step. The earliest impact of all is found, both
+Each body moves along a parabola through the method's step. The earliest impact of all is found, both
 bodies respond, and their further paths are searched anew. If the infinite series of hops of a bouncing ball ends within
-the step, the ball rests; from then on the surface carries it: the acceleration into the surface is cancelled, and
+the step, the ball rests. From then on the surface carries the ball: the acceleration into the surface is cancelled, and
 friction acts along it.
 
 The number of impacts of one pair in one step is limited. Beyond the limit the two bodies stop (stalls.py): they keep
@@ -62,14 +62,14 @@ JOLTED = 3
 def start_touching(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, count: int, before: Any
 ) -> None:
-    """Start bodies that touch at the beginning with their velocities before the step, `before` (N, D) m/s."""
+    """Set the velocities of bodies that touch at the beginning to those before the step, `before` (N, D) m/s."""
     for c in range(count):
         _drop_half_step(period, bodies, things, meetings.who[c], meetings.other[c], rules.touch, before)
 
 
 @kernel
 def _drop_half_step(period: Vec, bodies: Bodies, things: Things, i: int, j: int, touch: float, before: Any) -> None:
-    """Drop the half step by which a first-order method is ahead: it would lead into the surface, or away from it."""
+    """Set two bodies in touch to their old velocities: a first-order method is half a step ahead or behind."""
     y, _, _ = relative_motion(period, bodies, things, i, j, 0.0)
     row, room = contact_row(bodies, things, i, j)
     if surface_at(things.table, row, y)[0] - room <= touch:
@@ -89,11 +89,12 @@ def _use_old_velocity(period: Vec, bodies: Bodies, i: int, before: Any) -> None:
 def process_impacts(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, count: int, lost: Any
 ) -> tuple[int, int, int]:
-    """Move all bodies of one world through the step; return numbers of impacts, of those cut short, and of meetings.
+    """Move all bodies of one world through the step; return numbers of impacts, of cut ones, and of meetings.
 
-    lost: added to are the s that stopped bodies did not move for, the J lost by bodies that came to rest at the limit,
-    and the number of bodies that stopped. Entry JOLTED is 1 if the last impact changed velocities by more than the step
-    does, else 0. If there are more meetings than capacity, the caller must repeat the work with more room.
+    lost: incremented by the time for which stopped bodies did not move, s, the energy lost by bodies that came to rest
+    at the limit, J, and the number of bodies that stopped. Entry JOLTED is 1 if the last impact changed velocities by
+    more than the step does, else 0. If there are more meetings than capacity, the caller must repeat the work with more
+    room.
     """
     todo, active, impacts, cut = count, 0, 0, 0
     for c in range(count):
@@ -123,7 +124,7 @@ def process_impacts(
 
 @kernel
 def _is_no_impact(bodies: Bodies, meetings: Meetings, rules: Rules, c: int) -> bool:
-    """Return True if a meeting is no impact: no impacts are allowed, one body has stopped, or the two are at rest."""
+    """Return True if a meeting is no impact: impacts are not allowed, one body has stopped, or the two are at rest."""
     j = meetings.other[c]
     stopped = bodies.moved[meetings.who[c]] == STOPPED or (j >= 0 and bodies.moved[j] == STOPPED)
     return bool(rules.stops or stopped or meetings.closed[c] == RESTS)
@@ -186,7 +187,7 @@ def _list_again(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, i: int, t: float, jolted: bool,
     todo: int,
 ) -> int:  # fmt: skip
-    """List the meetings of body i to be searched anew; return how many are listed.
+    """List the meetings of body i whose times are to be computed again; return the length of the list.
 
     Two bodies at rest need no search if no impact has jolted them and the step is too short for them to overlap much.
     """
@@ -207,7 +208,7 @@ def _list_again(
 def _is_hit_again(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, c: int, t: float
 ) -> bool:
-    """Return True if a third body has driven two at rest into each other, faster than the step's acceleration does.
+    """Return True if a third body drives two at rest together, faster than the step's acceleration does.
 
     It returns False after a bounded number of hits, so that the step ends.
     """
@@ -226,8 +227,8 @@ def _resolve_impact(
 ) -> int:
     """Change the velocities of the two bodies of an impact; return 1 if it exceeds the limit of impacts, else 0.
 
-    Beyond the limit, two that approach slower than the step's acceleration changes velocity are at rest from now on;
-    faster ones respond, and stop.
+    Beyond the limit, two that approach more slowly than the velocity added by the step's acceleration are at rest from
+    now on; faster ones respond, and stop.
     """
     i, j = meetings.who[c], meetings.other[c]
     y, v, a = relative_motion(period, bodies, things, i, j, t)
@@ -238,7 +239,7 @@ def _resolve_impact(
     over = meetings.hits[c] % ((rules.most if j < 0 else rules.again) + 1) == 0
     slow = w <= larger_acceleration(period, bodies, i, j) * rules.seconds
     rests = rules.sticky or comes_to_rest(max(w, 0.0), push, restitution, left) or hops_within(w, push, rules.touch)
-    if j >= 0 and restitution < 1.0:  # in a heap each contact comes to rest, and all are solved together
+    if j >= 0 and restitution < 1.0:  # in a heap contacts come to rest, and are solved together
         rests = rests or slow
     cut = over and not rests
     rests = rests or (over and slow)

@@ -1,8 +1,8 @@
 """The time at which a body on a parabola first touches a surface, and its velocity after the impact.
 
-Laws for one body, relative to what it may touch; lengths in m, times in s. That is a row of a table of shapes
-(flockenv/geometry/shapes/table.py), or a point: two round bodies touch when the distance of their centres is the sum
-of their radii, their `room`.
+Laws for one body, relative to a surface; lengths in m, times in s. The surface is a row of a table of shapes
+(flockenv/geometry/shapes/table.py), or a point: two round bodies touch if the distance of their centres is the sum of
+their radii, their `room`.
 """
 
 from __future__ import annotations
@@ -63,10 +63,10 @@ def position_along(x: Vec, v: Vec, a: Vec, t: float) -> Vec:
 
 @law
 def parabola_of(dt: float, moved: Vec, before: Vec, after: Vec) -> tuple[Vec, Vec, Vec]:
-    """Return the velocity at the beginning of a step, the acceleration, and the method's excess of velocity at its end.
+    """Return velocity at the beginning of a step and acceleration, and the method's final velocity less the parabola's.
 
-    The parabola leads `moved` m further in a step over which the method changed velocity from `before` to `after`. A
-    method of first order is half a step ahead or behind with its velocity; its points lie on a parabola all the same
+    The parabola leads `moved` m further in a step over which the method changed velocity from `before` to `after`. The
+    velocity of a first-order method is half a step ahead or behind, but its points lie on a parabola
     (flockenv/geometry/space.py).
     """
     a = scale(sub(after, before), 1.0 / dt)
@@ -76,38 +76,38 @@ def parabola_of(dt: float, moved: Vec, before: Vec, after: Vec) -> tuple[Vec, Ve
 
 @law
 def _earliest_contact(w: float, a: float, far: float, touch: float) -> float:
-    """Return the time from which a body that touches already may touch anew: 0 = now, inf = never.
+    """Return the time from which a body that now touches may have a new contact: 0 = now, inf = never.
 
-    w, a: velocity and acceleration along the outward normal. A motion that goes in by less than half of `touch` until
-    `far` is rounding, and no impact; otherwise a sliding body would hop over and over.
+    w, a: velocity and acceleration along the outward normal. A motion into the surface by less than half of `touch`
+    until `far` is rounding, and no impact; otherwise a sliding body would hop repeatedly.
     """
     fall = -a if a < 0.0 else 0.0
     if not (0.5 * fall * far - w) * far > 0.5 * touch:
         return np.inf
-    return w / fall if w > 0.0 else 0.0  # the top of its hop, or now
+    return w / fall if w > 0.0 else 0.0  # the top of a hop, or now
 
 
 @routine
 def first_impact(table: Any, at: int, y: Vec, v: Vec, a: Vec, far: float, room: float, touch: float) -> float:
-    """Return when a body at y, with velocity v and acceleration a, first touches within `far` s; inf if it does not.
+    """Return the time of first contact, up to `far` s, of a body at y with velocity v and acceleration a, or inf.
 
-    It touches where its gap is at most `touch`, m. The path is cut into chords so short that it bends by at most a
-    hundredth of the room. Each chord is followed exactly; where one hits, the time is refined on the parabola. A body
-    that overlaps already and goes in deeper touches now; one that leaves touches only where it comes back.
+    Contact is a gap of at most `touch`, m. The path is divided into chords, which differ from it by at most a hundredth
+    of the room. Each chord is followed exactly; if one hits, the time is refined on the parabola. A body that already
+    overlaps and goes deeper touches now; one that leaves touches only when it comes back.
     """
     gap, n = surface_at(table, at, y)
     if gap - room > touch:
         if gap - room > (norm(v) + 0.5 * norm(a) * far) * far + touch:
-            return np.inf  # it does not come that far
+            return np.inf  # it does not reach the surface
         return _follow_path(table, at, y, v, a, 0.0, far, room, room, touch)
     top = _earliest_contact(dot(v, n), dot(a, n), far, touch)
     if top <= 0.0:
         return 0.0
-    away = min(top, far)  # until then it leaves the surface that it touches, but may hit another part of the same shape
+    away = min(top, far)  # until then it leaves the surface, but may hit another part of the same shape
     t = _follow_path(table, at, y, v, a, 0.0, away, room, gap - 1e-9 * room - touch, touch)
     if t < np.inf or top >= far:
         return t
-    if surface_at(table, at, position_along(y, v, a, top))[0] - room <= touch:  # it never got away
+    if surface_at(table, at, position_along(y, v, a, top))[0] - room <= touch:  # it never left the surface
         return min(2.0 * top, far)
     return _follow_path(table, at, y, v, a, top, far, room, room, touch)
 
@@ -117,7 +117,7 @@ def _follow_path(
     table: Any, at: int, y: Vec, v: Vec, a: Vec, begin: float, far: float, room: float, seen: float,
     touch: float,
 ) -> float:  # fmt: skip
-    """Return when the path reaches the surface within [begin, far], else inf; chords are followed with room `seen`."""
+    """Return the time in [begin, far] at which the path reaches the surface, or inf; chords have room `seen`."""
     bend = norm(a) * (far - begin) * (far - begin) / 8.0
     chords = int(min(1.0 + np.sqrt(bend / (0.01 * room + 1e-12)), CHORDS * 1.0))
     each = (far - begin) / chords
@@ -180,14 +180,14 @@ def bounce(c: Vec, n: Vec, restitution: float, friction: float) -> Vec:
 
 @law
 def slow_by_friction(side: Vec, most: float) -> Vec:
-    """Return a velocity along a surface, reduced by `most` m/s, and zero if it is slower than that."""
+    """Return a velocity along a surface, reduced by `most` m/s, or zero if it is slower than that."""
     speed = norm(side)
     return scale(side, 1.0 - most / speed if speed > most else 0.0)
 
 
 @law
 def hops_within(w: float, push: float, touch: float) -> bool:
-    """Return True if a body that comes at w, m/s, hops at most `touch`, m, high under an acceleration `push` < 0."""
+    """Return True if a body of speed w, m/s, hops at most `touch`, m, high under an acceleration `push` < 0."""
     return push < 0.0 and w * w <= -2.0 * push * touch
 
 
@@ -195,6 +195,6 @@ def hops_within(w: float, push: float, touch: float) -> bool:
 def comes_to_rest(w: float, push: float, restitution: float, left: float) -> bool:
     """Return True if all further bounces on a plane end within `left` s, each at `restitution` = e times the speed.
 
-    A body that comes at w > 0 and is accelerated by `push` < 0 into the plane bounces 2 e w / (-push (1 - e)) s long.
+    A body of speed w > 0, accelerated by `push` < 0 into the plane, bounces for 2 e w / (-push (1 - e)) s.
     """
     return push < 0.0 and 2.0 * restitution * w <= -push * (1.0 - restitution) * left

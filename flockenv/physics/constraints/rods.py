@@ -57,9 +57,9 @@ class Hold(NamedTuple):
     allowed: Any  # (R,) m, allowed error of a length
     old: Any  # (R, D) m, from i to j before the step
     before: Any  # (R,) m, length before the step
-    pull: Any  # (R,) summed correction of each rod in these sweeps
+    pull: Any  # (R,) summed correction of each rod over the sweeps
     offset: Any  # (D,) m, from i to j now
-    along: Any  # (D,) the direction in which it acts, of any length
+    along: Any  # (D,) the direction in which the rod acts, of any length
     kept: Any  # (2, D, N) positions and velocities after the method
 
 
@@ -117,7 +117,7 @@ def _can_move(alive: Any, b: int, rods: Any, r: int) -> bool:
 def _next_relaxation(over: float, rho: float, sweep: int) -> float:
     """Return the over-relaxation of the next sweep: Chebyshev's sequence from 1 to Young's 2 / (1 + sqrt(1 - rho^2)).
 
-    (Golub and Varga 1961.) Errors do not grow meanwhile, as they do if the first sweep uses the final value.
+    (Golub and Varga 1961.) So errors do not grow at first, as they do if the first sweep uses the final value.
     """
     e = like(rho, 1.0)
     return e / (e - rho * rho * over * like(rho, 0.5 if sweep == 0 else 0.25))
@@ -125,7 +125,7 @@ def _next_relaxation(over: float, rho: float, sweep: int) -> float:
 
 @kernel
 def _target_length(rods: Any, r: int) -> float:
-    """Return the target length of a rod in the stage that also changes velocities: its old length if that was wrong."""
+    """Return a rod's target length in the stage that also changes velocities: the old length if that was wrong."""
     aim, before, allowed = rods.length[r], rods.before[r], rods.allowed[r]
     if before > aim + allowed or (before < aim - allowed and not rods.slack):
         aim = before
@@ -134,9 +134,10 @@ def _target_length(rods: Any, r: int) -> float:
 
 @kernel
 def _write_direction(rods: Any, r: int, now: float, carry: bool) -> float:
-    """Write the direction in which a rod acts, and return offset . along, > 0.
+    """Write the direction in which a rod acts, `along`, and return offset . along, > 0.
 
-    With `carry` it is that before the step. Without, or if the rod has turned too far since, it is the current one.
+    With `carry` it is the rod's direction before the step. Without, or if the rod has turned too far, it is the current
+    one.
     """
     o = like(now, 0.0)
     if carry:
@@ -149,13 +150,13 @@ def _write_direction(rods: Any, r: int, now: float, carry: bool) -> float:
         rods.along[k] = rods.offset[k]
     if now > o:
         return now * now
-    rods.along[0] = rods.length[r]  # both are in one place: any direction will do
+    rods.along[0] = rods.length[r]  # both are in one place: any direction is possible
     return rods.length[r] * rods.length[r]  # type: ignore[no-any-return]
 
 
 @kernel
 def _correct_length(x: Any, v: Any, b: int, rods: Any, r: int, over: float, carry: bool) -> tuple[float, bool]:
-    """Move the ends of a rod to its target length; return its relative error, and whether that exceeds the tolerance.
+    """Move the ends of a rod to its target length; return the relative error, and if that exceeds the tolerance.
 
     With `carry` velocities change by the change of positions per time step.
     """
@@ -176,9 +177,9 @@ def _correct_length(x: Any, v: Any, b: int, rods: Any, r: int, over: float, carr
 
 @kernel
 def _correct_velocity(x: Any, v: Any, b: int, rods: Any, r: int, over: float) -> tuple[float, bool]:
-    """Remove the velocity along a rod, or that which stretches a taut rope; return its relative size, and if it counts.
+    """Remove the velocity along a rod, or that stretches a taut rope; return its size, and if it exceeds the tolerance.
 
-    The size is relative to one length per time step.
+    The size is in lengths per time step.
     """
     o, allowed = like(over, 0.0), rods.allowed[r]
     now = _offset_to(x, b, rods.i[r], rods.j[r], rods.period, rods.offset)
@@ -202,7 +203,7 @@ def _correct_velocity(x: Any, v: Any, b: int, rods: Any, r: int, over: float) ->
 def _sweep(x: Any, v: Any, alive: Any, b: int, rods: Any, stage: int) -> tuple[int, float]:
     """Sweep over all rods with over-relaxation until they are within tolerance.
 
-    Returns the worst rod if they are not, else -1, and its relative error.
+    Returns the rod of the largest error if they are not, else -1, and that relative error.
     Stage 0: lengths, with velocities; 1: lengths that were wrong before the step; 2: velocities.
     """
     count, o = rods.i.shape[0], like(rods.per_dt, 0.0)
@@ -254,10 +255,9 @@ def _wrap_position(x: Any, v: Any, b: int, i: int, period: Any) -> bool:
 def hold_rods(x0: Any, x: Any, v: Any, alive: Any, rods: Any, first: int, end: int) -> tuple[int, int, int, float]:
     """Apply the rods of worlds [first, end), in place.
 
-    If the first stage does not converge, as in far too long a step, its changes are undone: unconverged velocities
-    could have any value. So energy is lost and never gained.
-    Returns the first (world, agent) that is not finite, or -1s, the last rod out of tolerance, or -1, and its relative
-    error.
+    If the first stage does not converge, as in far too long a step, its changes are undone, as velocities could have
+    any value. So energy is lost and never gained. Returns the first (world, agent) that is not finite, or -1s, the last
+    rod out of tolerance, or -1, and its relative error.
     """
     world, agent, rod, off = -1, -1, -1, like(rods.per_dt, 0.0)
     for b in range(first, end):
@@ -277,29 +277,27 @@ def hold_rods(x0: Any, x: Any, v: Any, alive: Any, rods: Any, first: int, end: i
 
 
 class Rods(Constraint):
-    """Agents keep their distances, as if there were rods without mass between them; or ropes, which may hang slack.
+    """Pairs of agents keep their distances, as if joined by massless rods, or by ropes, which may be slack.
 
-    Each step ends with a correction of positions, and with them velocities, along the directions that the rods had
-    before it; then the velocity along the rods is removed (Ryckaert, Ciccotti and Berendsen 1977; Andersen 1983,
-    RATTLE). Momentum is conserved, and in gravity no energy is gained. A rope that becomes taut loses the speed that
-    would stretch it. Agents that are held in place are not moved. Distances that are wrong at the start are corrected
-    in the first step, without a change of velocity. A chain of n links takes some 6 n sweeps in a step, and so does a
-    cloth of n x n cells. Rods are applied last, after the speed limit and the walls of a box.
+    Each step ends with a correction of positions, and with them velocities, along the rods' directions before the step;
+    then the velocity along the rods is removed (Ryckaert, Ciccotti and Berendsen 1977; Andersen 1983, RATTLE). Momentum
+    is conserved, and in gravity no energy is gained. A rope that becomes taut loses the speed that would stretch it.
+    Agents that are held in place are not moved. Distances that are wrong at the start are corrected in the first step,
+    without a change of velocity. A chain of n links takes some 6 n sweeps in a step, and so does a cloth of n x n
+    cells. Rods are applied last, after the speed limit and the walls of a box.
     """
 
     kind: Literal["rods"] = "rods"
     group: int | None = Field(default=None, ge=0, description="index of a group: rods along the edges of its network")
-    pairs: tuple[Pair, ...] = Field(default=(), description="or pairs of agents, by index")
+    pairs: tuple[Pair, ...] = Field(default=(), description="pairs of agents, by index (instead of a group)")
     lengths: tuple[Length, ...] = Field(default=(), description="m, lengths of the pairs; one for all, or one for each")
-    slack: bool = Field(default=False, description="True: ropes, whose ends may come nearer")
-    tolerance: float = Field(
-        default=1e-10, ge=1e-14, le=0.1, description="relative error of a length, at least rounding"
-    )
+    slack: bool = Field(default=False, description="True: ropes, whose ends may be nearer than the length")
+    tolerance: float = Field(default=1e-10, ge=1e-14, le=0.1, description="tolerated relative error of a length")
     most: int = Field(default=5000, ge=1, le=1_000_000, description="sweeps over all rods in one step; then it warns")
 
     @model_validator(mode="after")
     def _check_pairs(self) -> Self:
-        """Raise ValueError unless there is a group or there are pairs, of different agents, each once, with lengths."""
+        """Raise ValueError unless a group is given, or pairs of different agents, each once, with lengths."""
         if (self.group is None) == (not self.pairs):
             raise ValueError("group: give either a group with a network or pairs")
         if len(self.lengths) not in ((1, len(self.pairs)) if self.pairs else (0,)):
@@ -350,12 +348,12 @@ class Rods(Constraint):
             )
 
     def numbers(self, scene: SceneView) -> int:
-        """Return the size of the arrays of `Hold`, and of a copy of positions and velocities, per agent."""
+        """Return the memory of `Hold`, and of a copy of positions and velocities, in numbers per agent."""
         d = int(scene.dimension)
         return 2 * d - (-(6 + d) * len(self.rod_pairs(scene).i) // int(scene.agents))
 
     def settler(self, scene: SceneView) -> Settler:
-        """Return a function that corrects a step, with scratch memory of its own; it warns once if lengths are off."""
+        """Return a function that corrects a step, with scratch memory of its own, and warns once of wrong lengths."""
         pairs, real, d = self.rod_pairs(scene), np.dtype(scene.dtype).type, scene.dimension
         weight = (1 / scene.body.mass).astype(real)  # agents held in place have an infinite mass
         period = np.array(scene.space.extent(d) if scene.space.periodic else (0.0,) * d, real)
@@ -386,7 +384,7 @@ class Rods(Constraint):
 
 
 def _sort_by_layer(pairs: RodPairs) -> RodPairs:
-    """Return the same pairs sorted layer by layer: the order in which they were given makes no difference.
+    """Return the pairs sorted by layer; their initial order has no influence.
 
     Each agent is at most once in a layer. The layers of a chain are every other link, which is Young's ordering.
     """
@@ -407,10 +405,10 @@ def _sort_by_layer(pairs: RodPairs) -> RodPairs:
 def _spectral_radius(pairs: RodPairs, weight: Floats) -> float:
     """Return rho, the spectral radius of Jacobi's iteration for the network at rest.
 
-    It is 1 less the smallest eigenvalue of the matrix that couples the rods, by inverse iteration. Rods of unknown
-    directions count as if all were in line. A wrong rho costs more sweeps, and does not change the result.
+    It is 1 minus the smallest eigenvalue of the matrix that couples the rods, by inverse iteration. Rods of unknown
+    directions count as parallel. A wrong rho costs more sweeps, and does not change the result.
     """
-    from scipy import sparse  # imported here: scenes without rods need not load it
+    from scipy import sparse  # slow to import, and used only by rods
     from scipy.sparse.linalg import splu
 
     weight = weight.astype(np.float64)

@@ -1,8 +1,8 @@
-"""Bodies that stop within a step: when the impact limit is reached, or the response has no impacts within a step.
+"""Bodies that stop within a step, at the limit of impacts, or if the response has no impacts within a step.
 
-A body that stops keeps its place for the rest of the step, and its velocity for the next one. The time that it does not
-move is lost; energy, momentum and the order of bodies are not. A body that runs into a stopped body also stops. An
-obstacle that moves into a stopped body pushes it, and the body pushes others.
+A body that stops keeps its position for the rest of the step, and its velocity for the next one. That time is lost, but
+neither energy nor momentum nor the order of bodies. A body that runs into a stopped body also stops. An obstacle that
+moves into a stopped body pushes it, and the body pushes others.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ __all__ = ["halt"]
 def halt(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, c: int, t: float, lost: Any
 ) -> None:
-    """Stop the bodies of meeting c at time t; a body that is pushed already pushes the other.
+    """Stop the bodies of meeting c at time t; one that an obstacle pushes also pushes the other.
 
     A meeting is given up after a bounded number of hits, so that the step ends.
     """
@@ -54,7 +54,7 @@ def halt(
 
 @kernel
 def _stop(period: Vec, bodies: Bodies, rules: Rules, i: int, t: float, lost: Any) -> None:
-    """Stop body i at time t: `excess` stores its velocity, and `vel` that by which an obstacle pushes it."""
+    """Stop body i at time t: `excess` stores its velocity, and `vel` the velocity of an obstacle that pushes it."""
     write_vector(bodies.at, i, position(period, bodies, i, t))
     if bodies.moved[i] != STOPPED:
         write_vector(bodies.excess, i, add(vector_at(period, bodies.excess, i), velocity(period, bodies, i, t)))
@@ -81,7 +81,7 @@ def _push_stopped(period: Vec, bodies: Bodies, things: Things, rules: Rules, i: 
 
 @kernel
 def _pass_push(period: Vec, bodies: Bodies, i: int, j: int, n: Vec) -> None:
-    """Let one of two stopped bodies that is pushed into the other push it along n; n leads to i from j."""
+    """Let one of two stopped bodies, if it is pushed into the other, push that along n, which leads from j to i."""
     one, two = vector_at(period, bodies.vel, i), vector_at(period, bodies.vel, j)
     into = dot(sub(two, one), n)
     if into <= 0.0:

@@ -1,4 +1,4 @@
-"""The end of a step of one world: impulses of all contacts at once, blocked paths, resolution of overlaps."""
+"""The end of a step of one world: impulses of all contacts, blocked paths, and resolution of overlaps."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def settle_ends(
         count = _add_late_meetings(period, bodies, meetings, things, ends, rules, count)
     held = False
     if (touching > 0 or again) and count <= meetings.who.shape[0]:
-        for i in range(bodies.living.shape[0]):  # velocities before the step are not used any more
+        for i in range(bodies.living.shape[0]):  # velocities before the step are no longer used
             write_vector(before, i, vector_at(period, ends.pos, i))
         count, deep, stuck = _separate_bodies(
             period, bodies, meetings, things, contacts, ends, reach, rules, once, again or turned, rounds, up, spread,
@@ -107,9 +107,9 @@ def _hold_back(
 ) -> int:  # fmt: skip
     """Stop bodies where the straight paths to their separated places are blocked; return the number of meetings.
 
-    before (N, D) m: positions before separation; stuck: True if passes ran out. Passes may throw a light body past a
-    heavy one, or leave it inside if others block it. Bodies begin the step in order, and stopping at the first contact
-    keeps that order.
+    before (N, D) m: positions before separation; stuck: True if the passes did not suffice. They may move a light body
+    past a heavy one, or leave it inside if others block it. Bodies begin the step in order, and stopping at the first
+    contact keeps that order.
     """
     if not stuck and not (once and _has_moved_far(period, bodies, ends, before, NEARLY)):
         return count
@@ -126,7 +126,7 @@ def _hold_back(
 
 @kernel
 def _lifting_energy(period: Vec, bodies: Bodies, ends: Ends, before: Any) -> float:
-    """Return the energy, J, of bodies that were moved from `before` (N, D) m against the step's acceleration.
+    """Return the energy gained, J, by moving bodies from `before` (N, D) m against the step's acceleration.
 
     It is mass times acceleration times move. Moves along the acceleration are not subtracted, so this is an upper
     bound.
@@ -147,7 +147,7 @@ def _solve_velocities(
     """Change velocities until no body approaches another; return the last pass's largest change, m/s."""
     passes, seconds, n = 1 if once else rounds, rules.seconds, bodies.living.shape[0]
     if not in_time:
-        for i in range(n):  # the velocity that the step adds follows after the impacts; slower approaches do not bounce
+        for i in range(n):  # the velocity added by the step follows after the impacts; slower approaches do not bounce
             write_vector(bodies.vel, i, vector_at(period, ends.vel, i))
             write_vector(bodies.acc, i, sub(vector_at(period, ends.vel, i), vector_at(period, before, i)))
         done, left = resolve_impacts(
@@ -175,7 +175,7 @@ def _separate_bodies(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, contacts: Contacts, ends: Ends, reach: Any,
     rules: Rules, once: bool, anew: bool, rounds: int, up: Vec, spread: float, touching: int, count: int, scratch: Any,
 ) -> tuple[int, float, bool]:  # fmt: skip
-    """Move overlapping bodies apart; return the number of meetings, the last pass's largest move, m, and stuck.
+    """Move overlapping bodies apart; return the number of meetings, the last pass's largest move, m, and `stuck`.
 
     stuck: True if two still overlap by DEEPEST, or bodies were still moved when rounds ran out; always False if
     `spread`, m, limits the separation.
@@ -229,7 +229,7 @@ def _is_beyond_reach(period: Vec, bodies: Bodies, ends: Ends, reach: Any) -> boo
 def _add_late_meetings(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, count: int
 ) -> int:
-    """Add meetings of bodies that impacts made so fast that they leave their reach; return the number of meetings."""
+    """Add meetings of bodies that impacts have driven out of their reach; return the number of meetings."""
     for i in range(bodies.living.shape[0]):
         moved = sub(vector_at(period, ends.pos, i), vector_at(period, bodies.start, i))
         moved = displacement_near(period, moved, scale(vector_at(period, ends.vel, i), rules.seconds))
@@ -254,7 +254,7 @@ def _largest_radius(bodies: Bodies) -> float:
 
 @kernel
 def _has_moved_far(period: Vec, bodies: Bodies, ends: Ends, since: Any, share: float) -> bool:
-    """Return True if a body was moved from its place `since` (N, D) m by more than `share` of its radius."""
+    """Return True if a body was moved from its position `since` (N, D) m by more than `share` of its radius."""
     for i in range(bodies.living.shape[0]):
         d = nearest_image(period, sub(vector_at(period, ends.pos, i), vector_at(period, since, i)))
         if bodies.living[i] > 0 and norm(d) > share * bodies.radius[i]:
