@@ -1,4 +1,4 @@
-"""Floor fields: shortest paths around all obstacles of a scene, on a grid, for behaviours, aims, journeys and routes.
+"""Floor fields: shortest paths around the obstacles of a scene, on a grid, for aims, journeys, routes and behaviours.
 
 One grid (eikonal.floor_field_table) serves all agents with the same targets; laws read it by `path_ahead`.
 """
@@ -38,7 +38,7 @@ Floats = NDArray[np.float64]
 
 @law
 def path_ahead(table: Any, x: Vec, straight: Vec) -> tuple[float, Vec]:
-    """Return the length of the path from x, m, and its first direction; beyond the grid, those of the straight line."""
+    """Return the path length from x, m, and the initial direction; outside the grid, those of a straight line."""
     here = covers(table, x)
     length = sample(table, x, 0) if here else norm(straight)
     direction = unit(select(here, sample_vector(table, x, 1), straight))
@@ -47,7 +47,7 @@ def path_ahead(table: Any, x: Vec, straight: Vec) -> tuple[float, Vec]:
 
 @law
 def path_to_target(table: Any, x: Vec) -> tuple[float, Vec]:
-    """Return the length of the path to the nearest target of a block, m, and its first direction; 0 and 0 within it.
+    """Return the path length to the nearest target of a block, m, and the initial direction; both 0 within it.
 
     A block (see `floor_field_block`) holds the number of targets, the distance within which the straight line to
     them is free, m, a row for each target, and a grid.
@@ -61,7 +61,7 @@ def path_to_target(table: Any, x: Vec) -> tuple[float, Vec]:
 
 
 def grid_corners(scene: SceneView, targets: Sequence[Target], margin: float) -> tuple[Floats, Floats]:
-    """Return the corners of the grid: those of the box, or of everything in the scene and a margin around it."""
+    """Return the corners of the grid: those of the box, or of all contents of the scene with a margin around."""
     size = getattr(scene.space, "size", None)
     if size is not None:
         return np.zeros(scene.dimension), np.array(size, float)
@@ -78,7 +78,7 @@ def grid_corners(scene: SceneView, targets: Sequence[Target], margin: float) -> 
 
 
 def start_boxes(scene: SceneView, which: int | None) -> list[Start]:
-    """Return the boxes in which agents of a group (None: all groups) begin or are born; none for networks."""
+    """Return the boxes in which agents of a group (None: all groups) start or are born; none for networks."""
     size = getattr(scene.space, "size", None)
     found = []
     for k, group in enumerate(scene.groups):
@@ -94,7 +94,7 @@ def start_boxes(scene: SceneView, which: int | None) -> list[Start]:
 
 
 def path_lengths(grid: Floats, points: ArrayLike) -> Floats:
-    """Return path lengths from points (..., D), (...) m: inf without a path; outside the grid, that of its edge."""
+    """Return path lengths from points (..., D), (...) m; inf without a path; outside the grid those of its edge."""
     found = sample_points(grid, points)[..., 0]
     return np.asarray(np.where(found > NO_WAY * 1e-12, np.inf, found))  # also next to points without a path
 
@@ -127,7 +127,7 @@ def floor_field_block(
 ) -> Floats:  # fmt: skip
     """Return the block that `path_to_target` reads: the reachable parts of the targets, and the floor field to them.
 
-    At distances from a target below the spacing and below its distance to obstacles, the straight line is taken.
+    A target nearer than the spacing, and nearer than the obstacles next to it, is reached on a straight line.
     """
     grid = floor_field_to(scene, targets, names, corners, spacing, clearance, starts)
     free = [free_part(scene.obstacles, *given, spacing, clearance) for given in zip(targets, names, strict=True)]

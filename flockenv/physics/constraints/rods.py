@@ -293,7 +293,7 @@ class Rods(Constraint):
     lengths: tuple[Length, ...] = Field(default=(), description="m, lengths of the pairs; one for all, or one for each")
     slack: bool = Field(default=False, description="True: ropes, whose ends may be nearer than the length")
     tolerance: float = Field(default=1e-10, ge=1e-14, le=0.1, description="tolerated relative error of a length")
-    most: int = Field(default=5000, ge=1, le=1_000_000, description="sweeps over all rods in one step; then it warns")
+    most: int = Field(default=5000, ge=1, le=1_000_000, description="sweeps over all rods in a step; then a warning")
 
     @model_validator(mode="after")
     def _check_pairs(self) -> Self:

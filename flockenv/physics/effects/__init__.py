@@ -1,4 +1,4 @@
-"""Effects on a body, one family per file. To add one: write its file here, and a row in tests/catalogue.py."""
+"""Effects on agents, one family per file; a new one needs a file, and a row in tests/catalogue.py."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Aims: the desired direction e, not a force; other laws (driving, social forces) read it as `me.aim`."""
+"""Aims: the desired direction e, which other laws (driving, social forces) read as `me.aim`."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ def applies_to(p: Any, me: Me) -> bool:
 
 @law
 def direction_with_ramp(offset: Vec, slow_radius: float) -> Vec:
-    """Return the direction of an offset, shorter within slow_radius, m: 0 at the target itself."""
+    """Return the unit vector of an offset, shortened within slow_radius, m, to 0 at the target."""
     length, one = norm(offset), like(slow_radius, 1.0)
     share = length / slow_radius
     return scale(unit(offset), share if share < one else one)
 
 
 class Aim(Effect):
-    """The desired direction of a group."""
+    """Base class of effects that set the desired direction of a group."""
 
-    group: int | None = Field(default=None, ge=0, description="group it applies to (default: all)")
+    group: int | None = Field(default=None, ge=0, description="index of the group that it applies to (default: all)")
     share: float = Field(default=1.0, ge=0, le=1, description="fraction of the desired speed")
     strengths: ClassVar[tuple[str, ...]] = ("share",)
 
@@ -57,7 +57,7 @@ def goal_aim(p: Any, me: Me) -> Vec:
 
 
 class Goal(Aim):
-    """Agents of a group head for a point, and slow down over the last `slow_radius`."""
+    """Agents of a group head for a point, and slow down within `slow_radius` of it."""
 
     kind: Literal["goal"] = "goal"
     target: Vector = Field(description="m, the point")
@@ -77,7 +77,7 @@ def course_aim(p: Any, me: Me) -> Vec:
 
 
 class Course(Aim):
-    """Agents of a group head in one direction for ever: along a corridor, around a torus."""
+    """Agents of a group always head in one direction: along a corridor, around a torus."""
 
     kind: Literal["course"] = "course"
     direction: Vector = Field(description="direction of travel; its length does not matter")
@@ -140,7 +140,7 @@ class Antipode(Aim):
         return {"centre": self.centre, "slow_radius": self.slow_radius, "share": self.share}
 
     def check(self, scene: SceneView) -> None:
-        """Raise ValueError on a torus, where two paths lead across, and in 3-D."""
+        """Raise ValueError in 3-D, and on a torus, where the path across is not unique."""
         super().check(scene)
         if scene.space.periodic or scene.dimension != 2:
             raise ValueError(

@@ -19,7 +19,7 @@ __all__ = ["Attraction"]
 
 @law
 def attraction(p: Any, me: Me) -> Vec:
-    """F = k d / (|d|^2 + s^2)^(3/2), d = centre - x; 0 at the centre, for any s."""
+    """Return F = k d / (|d|^2 + s^2)^(3/2), d = centre - x; 0 at the centre, for any s."""
     towards = sub(p.centre, me.pos)
     square = dot(towards, towards)
     o, soft = like(square, 0.0), square + p.softening * p.softening

@@ -57,25 +57,25 @@ def contact_force(p: Any, normal: Vec, overlap: float, vel: Vec, reduced: float)
 
 @law
 def zero_force(p: Any, me: Me) -> Vec:
-    """Return no force: the start of the fold."""
+    """Return the zero vector, the start of the sum over obstacles."""
     return zero(me.pos)
 
 
 @law
 def add_obstacle_force(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
-    """Add the force of one obstacle, which is held in place."""
+    """Return the sum with the force of one obstacle added, which counts as infinitely heavy."""
     return add(acc, contact_force(p, other.normal, me.radius - other.gap, sub(me.vel, other.vel), me.mass))
 
 
 @law
 def contact_reach(p: Any, me: Me) -> float:
-    """Return the agent's radius: obstacles farther away do not touch it."""
+    """Return the agent's radius, m, as obstacles beyond it do not touch."""
     return me.radius
 
 
 @law
 def total_force(p: Any, me: Me, acc: Vec) -> Vec:
-    """Return the sum over all obstacles."""
+    """Return the force, the sum over all obstacles."""
     return acc
 
 
@@ -92,8 +92,7 @@ def pair_force(p: Any, me: Me, other: Other) -> Vec:
 def restitution(ratio: float, adhesive: bool = False) -> float:
     """Return the coefficient of restitution of a contact with damping `ratio`, as a fraction of critical damping.
 
-    An adhesive contact ends when the bodies no longer overlap; another one when it would begin to pull, a little
-    earlier.
+    An adhesive contact ends when the bodies no longer overlap; any other when it would begin to pull, a little earlier.
     """
     if not 0 <= ratio < math.inf:
         raise ValueError(f"ratio is {ratio!r}, must be a number >= 0")
@@ -108,12 +107,12 @@ def restitution(ratio: float, adhesive: bool = False) -> float:
 
 
 class _Solid(Effect):
-    """Fields that contacts have in common."""
+    """Base class with the fields that both kinds of contact have."""
 
     stiffness: float = Field(ge=0, description="k, N/m")
     damping: float = Field(default=0.0, ge=0, description="c, kg/s")
     ratio: float = Field(
-        default=0.0, ge=0, description="more damping, as a fraction of the critical one for the masses"
+        default=0.0, ge=0, description="additional damping, as a fraction of critical damping for the masses"
     )
     adhesive: bool = Field(default=False, description="True: the damper may pull, until the bodies no longer overlap")
     friction: float = Field(default=0.0, ge=0, description="kappa, kg/(m s), against slip, per metre of overlap")
@@ -129,7 +128,7 @@ class _Solid(Effect):
     contact: ClassVar[bool] = True
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Return the fields as numbers; grip: mu, or -1 without a limit; ease: 1 / U, or 0 without a limit."""
+        """Return the fields as numbers; grip is mu, or -1 without a limit; ease is 1 / U, or 0 without a limit."""
         return {
             "stiffness": self.stiffness,
             "damping": self.damping,
@@ -141,7 +140,7 @@ class _Solid(Effect):
         }
 
     def _rates(self, per_mass: Floats) -> tuple[Floats, Floats]:
-        """Return w^2 and damping of contacts; per_mass: 1 / reduced mass, (N,) 1/kg."""
+        """Return w^2, 1/s^2, and damping, 1/s, of contacts; per_mass: 1 / reduced mass, (N,) 1/kg."""
         square = self.stiffness * per_mass
         return square, self.damping * per_mass + 2 * self.ratio * np.sqrt(square)
 
@@ -162,7 +161,7 @@ class ObstacleContact(_Solid):
     obstacle_reach: ClassVar[Law | None] = contact_reach
 
     def fold_size(self, dimension: int) -> int:
-        """Return D, for the force so far."""
+        """Return D, the number of values in a force."""
         return dimension
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:
@@ -172,7 +171,7 @@ class ObstacleContact(_Solid):
 
 @law
 def sum_of_contacts(p: Any, me: Me, sums: Vec) -> Vec:
-    """Return the sum over all neighbours."""
+    """Return the force, the sum over all neighbours."""
     return sums
 
 
@@ -185,8 +184,8 @@ class Contact(_Solid):
     lasts pi sqrt(m / k), m the reduced mass, and needs 30 steps (CoarseContactWarning); friction is stable in steps of
     less than 2 m / (kappa d). Bodies do not spin: friction dissipates slip, and so angular momentum.
 
-    `most` = U keeps bodies that begin in overlap from flying apart: the spring force is at most U sqrt(k m), times
-    1 - u / U while they separate, so no pair is driven apart faster than U (damping as in Hunt and Crossley 1975).
+    `most` = U limits the speed at which bodies that overlap at the start separate: the spring force is at most U sqrt(k
+    m), times 1 - u / U during separation, so no pair separates faster than U (damping as in Hunt and Crossley 1975).
     Impacts at up to U penetrate no deeper than where the limit begins; those at v << U lose v / (3 U) of their speed.
     """
 
@@ -194,7 +193,7 @@ class Contact(_Solid):
     radius: float | None = Field(
         default=None,
         gt=0,
-        description="m, candidates are nearer (default: largest distance at which two touch)",
+        description="m, distance of neighbours (default: the largest at which two bodies touch)",
     )
     pair_law: ClassVar[Law | None] = pair_force
     finish_law: ClassVar[Law | None] = sum_of_contacts
@@ -207,11 +206,11 @@ class Contact(_Solid):
 
     @property
     def reach(self) -> float:
-        """The given radius, m; 0 if it depends on the bodies."""
+        """The given radius, m; 0 if the radius depends on the bodies."""
         return self.radius or 0.0
 
     def sums(self, dimension: int) -> int:
-        """Return D, for the force so far."""
+        """Return D, the number of values in a force."""
         return dimension
 
     def check(self, scene: SceneView) -> None:

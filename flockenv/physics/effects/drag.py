@@ -39,15 +39,15 @@ class Drag(Effect):
     linear_drag: ClassVar[str | None] = "rate"
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return 0, as nothing oscillates, and damping c / m."""
+        """Return w^2 = 0, as nothing oscillates, and the damping c / m."""
         damping = self.rate / all_masses(groups, dimension)
         return np.zeros(len(damping)), damping
 
 
 class QuadraticDrag(Effect):
-    """Drag of a body that leaves a wake, F = -c |v - u| (v - u) in a medium of velocity u.
+    """Quadratic drag (of a body with a wake), F = -c |v - u| (v - u) in a medium of velocity u.
 
-    Under gravity g it falls no faster than v = sqrt(m g / c), which it approaches as v tanh(g t / v).
+    Under gravity g the speed of fall is v tanh(g t / v), with v = sqrt(m g / c) in the end.
     """
 
     kind: Literal["quadratic_drag"] = "quadratic_drag"

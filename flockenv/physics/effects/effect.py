@@ -1,4 +1,4 @@
-"""Effect: what acts on a body. A frozen record that holds its laws; a scene composes the laws of its effects.
+"""Effect: a frozen record that acts on agents and holds its laws; a scene composes the laws of its effects.
 
 An effect has one or more of these forms, each a law (a compiled function) for one agent:
 
@@ -22,11 +22,11 @@ An effect has one or more of these forms, each a law (a compiled function) for o
   one standard normal number per axis (fluctuations);
 * `aim_law(p, me) -> direction` of travel that is desired: the sum over all effects is `me.aim` in the other laws;
 * `begin_law(p, me) -> numbers` and `keep_law(p, me, message, seconds) -> numbers`: the inner state of an agent, the
-  numbers named in `keeps` (its hunger, the door it heads for). begin_law returns their values when the agent comes into
-  being. keep_law returns their values after a step of `seconds`, from the values before, the position after the step,
+  numbers named in `keeps` (its hunger, the door it heads for). begin_law returns their values at the agent's start or
+  birth. keep_law returns their values after a step of `seconds`, from the values before, the position after the step,
   and `message`: what `finish_law` returned in the last stage, here a vector that is not a force (0 without a pair law).
-  Changes by several effects add up. Laws read the numbers as `me.inner.NAME` and `other.inner.NAME`; an effect lists in
-  `recalls` those that it reads and does not keep;
+  Changes by several effects are added. Laws read the numbers as `me.inner.NAME` and `other.inner.NAME`; an effect lists
+  in `recalls` those that it reads and does not keep;
 * `count_law(p, me) -> number` of the counter in which an agent is counted, or a negative number for no counter: global
   counts per world, in integers, so that the order of agents does not matter. The effect's keep_law reads the `counters`
   totals as `p.counted`: the living agents in each counter when the step began. One pass over all agents per step;
@@ -43,15 +43,14 @@ An effect has one or more of these forms, each a law (a compiled function) for o
   numbers, which the law leaves 0, then receive the unit vector across the ray towards the nearest silhouette edge of
   the obstacle that is hit; obstacles with gaps too narrow for the body count as one (engine/silhouette.py). They stay 0
   without such an edge, or if the body overlaps already.
-  If the effect also has a pair law, `finish_law` returns no force but a vector of what it found out about neighbours,
-  which is passed to `obstacle_start(p, me, message)` (hide). Without an obstacle_start the fold visits circles alone,
-  runs before a fold over neighbours and passes acc on to it: one fold over both (orca).
+  If the effect also has a pair law, `finish_law` returns no force but a vector computed from the neighbours, which is
+  passed to `obstacle_start(p, me, message)` (hide). Without an obstacle_start the fold visits circles alone, runs
+  before a fold over neighbours and passes acc on to it: one fold over both (orca).
 
 `p` holds the effect's `parameters()` by name, and, if the effect is `tabled`, an array of numbers as `p.table`: the
-points of a path, the values of a grid. `me` and `other` are the records below.
-A pair law does not decide which neighbours are in sight: it is evaluated for every candidate, and its result is dropped
-for candidates outside the effect's `sight` (and for the agent itself); or, if it `vanishes`, steps pass it an infinite
-`other.square`.
+points of a path, the values of a grid. `me` and `other` are the records below. A pair law is evaluated for every
+candidate, and its result is dropped for candidates outside the effect's `sight` (and for the agent itself); or, if it
+`vanishes`, steps pass it an infinite `other.square`.
 
 Pair laws read the fields of `me` and `other` by name (`me.vel`), never by index (`me[2]`): the engine loads the fields
 that some law names, itself or in a law that it calls, and every other field is a meaningless placeholder.
@@ -105,7 +104,7 @@ class Me(NamedTuple):
     time: float  # s, of the stage that is evaluated
     medium: Vec  # m/s, velocity of the medium here; 0 in pair laws and bonds
     key: int  # of its world, for random numbers that are functions of time, see maths/counter_rng.py
-    aim: Vec  # desired direction: a unit vector, shorter to go slower than desired_speed; 0 to stay, or without an aim
+    aim: Vec  # desired direction: a unit vector, shorter for less than desired_speed; 0 to stay, or without an aim
     desired_speed: float  # m/s
     inner: Any  # its inner numbers, by name; see `Effect.keeps`
 
@@ -126,11 +125,11 @@ class Other(NamedTuple):
 class Obstacle(NamedTuple):
     """An obstacle near the agent: a circle or sphere of the state by its centre and radius, any other shape by a point.
 
-    The point is the nearest one of its surface, or, in a law that casts rays, the point of first contact. A law written
-    for circles thus sees any other shape as a circle of radius 0 at that point. If the agent is inside, or a ray begins
-    in overlap, `offset` points into the shape, and `normal` points out of it.
+    The point is the nearest one of its surface or, in a law that casts rays, the point of first contact. For a law
+    written for circles any other shape is thus a circle of radius 0 at that point. If the agent is inside, or a ray
+    begins in overlap, `offset` points into the shape, and `normal` points out of it.
 
-    Its position is that at the time of the stage. `hit` is along a straight ray, as if the obstacle stood still.
+    The position is that at the time of the stage; `hit` assumes that the obstacle does not move.
     """
 
     who: float  # index: circles of the state in its order, then the other shapes in the order of the scene
@@ -154,19 +153,19 @@ class Far(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """Which neighbours an effect sees: nearer than radius, within fov, and (topological) among the nearest of those."""
+    """Condition for neighbours of an effect: nearer than radius, within fov, and (topological) the nearest of those."""
 
     radius: float  # m
-    fov: float = 360.0  # degrees, full angle; an agent at standstill has no heading and sees all around
+    fov: float = 360.0  # degrees, full angle; an agent at standstill has no heading and sees in all directions
     nearest: int | None = None  # at most this number, and any exactly as far as the last (default: all)
     group: int | None = None  # this group alone (default: all)
-    occluded: bool = False  # True: not neighbours whose centre an obstacle hides on the straight line of sight
+    occluded: bool = False  # True: without neighbours whose centre is hidden by an obstacle
 
 
 class Members(NamedTuple):
     """All living agents of a group, relative to one agent."""
 
-    size: float  # their number; if 0, all that follows is 0, too
+    size: float  # their number; if it is 0, all other fields are also 0
     centre: Vec  # m, their centre minus me; on a torus, of the images that are nearest to the first of them
     vel: Vec  # m/s, the mean velocity
     farthest: Vec  # m, the member farthest from the centre, minus me; of equals, the first
@@ -181,15 +180,16 @@ class Bonds(NamedTuple):
 
     @classmethod
     def empty(cls, partners: int, numbers: int) -> Bonds:
-        """Return no bonds at all."""
+        """Return an empty table of bonds."""
         return cls(np.zeros(0, np.int32), np.zeros((0, partners), np.int32), np.zeros((0, numbers)))
 
 
 @law
 def in_view(view: float, heading: Vec, offset: Vec, square: float) -> bool:
-    """Return True if `offset` is in a cone of half angle a around `heading`. view = cos a |cos a|; no root is taken.
+    """Return True if `offset` is in a cone of half angle a around `heading`, without a root; view = cos a |cos a|.
 
-    offset . heading >= cos a |offset|, both sides squared with their signs. A heading of 0 sees all around.
+    The condition is offset . heading >= cos a |offset|, both sides squared with their signs; always true for a heading
+    of 0.
     """
     ahead = dot(offset, heading)
     still = dot(heading, heading) <= like(ahead, 0.0)
@@ -197,10 +197,10 @@ def in_view(view: float, heading: Vec, offset: Vec, square: float) -> bool:
 
 
 def separation_directions(count: int, dimension: int) -> NDArray[np.float64]:
-    """Return a unit vector for each agent, (count, D), all different, in no preferred direction.
+    """Return a unit vector for each agent, (count, D), all different and evenly distributed.
 
     me.tie - other.tie is the direction in which two agents in one place should part: opposite for the two, different
-    for every pair. Directions are in golden-ratio steps (heights too, in space).
+    for every pair. Directions are in golden-ratio steps (in 3-D heights also).
     """
     who = np.arange(count)
     turn, height = 2 * np.pi * (who * 0.6180339887498949 % 1), 2 * (who * 0.7548776662466927 % 1) - 1
@@ -214,7 +214,7 @@ def all_masses(groups: Sequence[Any], dimension: int) -> NDArray[np.float64]:
 
 
 def demand_group(name: str, which: int | None, groups: Sequence[Any]) -> None:
-    """Raise ValueError, naming the field, if there is no group of this number; None means all groups."""
+    """Raise ValueError that names the field `name` if no group has this index; None means all groups."""
     if which is not None and not 0 <= which < len(groups):
         raise ValueError(f"{name} = {which}: there are {len(groups)} groups, counted from 0")
 
@@ -229,7 +229,7 @@ def network_of(groups: Sequence[Any], which: int, dimension: int) -> tuple[int, 
 
 
 class Effect(Record):
-    """An effect on a body; see the module for the forms of its laws."""
+    """An effect on agents; see the module for the forms of its laws."""
 
     kind: str
     steering: ClassVar[bool] = False
@@ -310,12 +310,12 @@ class Effect(Record):
 
     @property
     def reach(self) -> float:
-        """Largest distance of neighbours, m; 0 without a pair law."""
+        """Largest distance of neighbours that the pair law reads, m; 0 without one."""
         return self.sight.radius if self.sight else 0.0
 
     @property
     def occluded_obstacles(self) -> bool:
-        """True if its obstacle law skips what another obstacle hides."""
+        """True if the obstacle law skips obstacles that another one hides."""
         return False
 
     def without_obstacles(self) -> Effect | None:
@@ -324,12 +324,12 @@ class Effect(Record):
 
     @property
     def is_joint_fold(self) -> bool:
-        """True if it is one fold over obstacles and neighbours."""
+        """True if the effect is one fold over obstacles and neighbours."""
         return self.obstacle_law is not None and self.obstacle_start is None
 
     @property
     def components(self) -> tuple[Effect, ...]:
-        """The component effects whose steering forces it combines, in order of priority; see Steer."""
+        """The component effects whose steering forces are combined, in order of priority; see Steer."""
         return ()
 
     @property
@@ -339,12 +339,12 @@ class Effect(Record):
 
     @property
     def required_inner(self) -> tuple[str, ...]:
-        """The inner numbers that must be kept for it; see `recalls`. For Steer: those that its arbitration reads."""
+        """Names of the inner numbers that the laws read, see `recalls`; for Steer, those that its arbitration reads."""
         return self.recalls
 
     @property
     def counters(self) -> int:
-        """Number of counters of its count_law."""
+        """Number of counters of the count_law."""
         return 0
 
     def members(self, starts: Sequence[int]) -> dict[str, float]:
@@ -352,27 +352,27 @@ class Effect(Record):
         return {}
 
     def sums(self, dimension: int) -> int:
-        """Return the number of running sums of its pair law."""
+        """Return the number of running sums of the pair law."""
         return 0
 
     def fold_size(self, dimension: int) -> int:
-        """Return the number of values that its fold over obstacles carries from one to the next."""
+        """Return the number of values that the fold over obstacles carries."""
         return 0
 
     def rays(self, dimension: int) -> int:
-        """Return the number of rays of its obstacle_ray."""
+        """Return the number of rays of the obstacle_ray."""
         return 1
 
     def numbers(self, dimension: int) -> int:
-        """Return the number of values that describe one of its bonds."""
+        """Return the number of values of a bond."""
         return 0
 
     def bonds(self, groups: Sequence[Any], dimension: int) -> Bonds:
-        """Return its bonds in a scene of these groups; raise ValueError, in one line, if the groups do not suit it."""
+        """Return the bonds in a scene of these groups; raise ValueError, in one line, if the groups do not suit."""
         return Bonds.empty(self.partners, self.numbers(dimension))
 
     def idle_copy(self) -> Effect:
-        """Return a copy with all strengths 0: it does nothing, but has the same sight and the same compiled code."""
+        """Return a copy with all strengths 0, which has no effect but the same sight and the same compiled code."""
         fields = {name: getattr(self, name) for name in self.strengths if name in type(self).model_fields}
         return self.model_copy(
             update={
@@ -383,38 +383,39 @@ class Effect(Record):
         )
 
     def table(self, scene: SceneView) -> NDArray[np.float64]:
-        """Return the numbers that its laws look up as `p.table`, (T,), T >= 1; T depends on the scene.
+        """Return the numbers that laws read as `p.table`, (T,), T >= 1; T depends on the scene.
 
-        Called when a scene is built, after `check`. A table is an argument: another one compiles nothing.
+        It is called when a scene is built, after `check`. A table is an argument, so another one compiles nothing.
         """
         raise TypeError(f"{type(self).__name__} has no table")
 
     def path_to_draw(self, scene: SceneView) -> tuple[tuple[Vec, ...], float] | None:
-        """Return the path it follows, for pictures: points along it, m, and half its width, m; None without a path."""
+        """Return a followed path for pictures: points along it, m, and half its width, m; None without a path."""
         return None
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Return upper bounds of w^2, 1/s^2, and of damping, 1/s, for every agent, (N,): its stiffness in any state.
+        """Return upper bounds, in any state, of w^2, 1/s^2, and of damping, 1/s, for every agent, (N,).
 
-        None if the stiffness depends on the state, or there is none.
+        Return None if there is no bound, or no stiffness.
         """
         return None
 
     def potential(self, groups: Sequence[Any], state: Any, offset: Any) -> NDArray[np.float64] | None:
-        """Return its potential energy in each world, (B,) J, or None without one. `offset(a, b)` is the space's."""
+        """Return the potential energy of each world, (B,) J, or None without one; `offset(a, b)`: that of the space."""
         return None
 
     def lookahead(self, speed: float) -> float | None:
-        """Return how far ahead an agent at this speed detects what it must avoid, m; None if the effect avoids nothing.
+        """Return the distance, m, at which an agent of this speed detects obstacles ahead; None if it avoids none.
 
-        Such an effect has a field `horizon`, s, which sets it.
+        An effect that avoids obstacles has a field `horizon`, s, which sets the distance.
         """
         return None
 
     def check(self, scene: SceneView) -> None:
         """Raise ValueError, beginning with the name of a field, if the scene does not suit the effect.
 
-        Vectors must have the dimension of the scene, and the group of its sight must exist: overrides call this too.
+        Vectors must have the dimension of the scene, and the group of its sight must exist; overrides also call this
+        method.
         """
         for name, value in self.parameters().items():
             if isinstance(value, tuple) and len(value) != scene.dimension:
@@ -423,10 +424,10 @@ class Effect(Record):
             demand_group("group", self.sight.group, scene.groups)
 
     def check_start(self, scene: SceneView, state: Any) -> None:
-        """Warn of problems that depend on the initial state: where agents begin."""
+        """Warn of problems that depend on the initial state, such as the positions of agents."""
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Return the numbers and vectors passed to its laws, by name: all fields except None and strings."""
+        """Return the numbers and vectors passed to the laws, by name: all fields except None and strings."""
         fields = {name: getattr(self, name) for name in type(self).model_fields if name != "kind"}
         return {
             name: tuple(map(float, value)) if isinstance(value, tuple) else float(value)
@@ -435,7 +436,7 @@ class Effect(Record):
         }
 
     def calls_for(self) -> tuple[str, ...]:
-        """Return what must be computed for it, in words: nothing, a neighbour query, a pass over the obstacles."""
+        """Return the names of what must be computed for the effect, such as "neighbour query" or "obstacles"."""
         return tuple(
             text
             for text, law in (

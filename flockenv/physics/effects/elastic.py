@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 
 @law
 def rayleigh_mass(p: Any, me: Me) -> Vec:
-    """F = -alpha m v: the part of the damping proportional to mass."""
+    """Return F = -alpha m v, the part of the damping proportional to mass."""
     return scale(me.vel, -p.alpha * me.mass)
 
 
@@ -52,9 +52,9 @@ def _rest_offset(like_this: Vec, number: Vec) -> Vec:
 
 @law
 def elastic(p: Any, me: Me, others: Any, number: Vec) -> Vec:
-    """F_i = -K_ij ((u_j - u_i) + beta (v_j - v_i)), one neighbour's contribution to -(K (u + beta v))_i.
+    """Return F_i = -K_ij ((u_j - u_i) + beta (v_j - v_i)), one neighbour's part of -(K (u + beta v))_i.
 
-    Rows of K sum to zero, so displacements relative to neighbours are enough.
+    Rows of K sum to zero, so only displacements relative to neighbours are needed.
     """
     stretch = sub(others[0].offset, _rest_offset(others[0].offset, number))
     return _stretch_force(add(stretch, scale(sub(others[0].vel, me.vel), p.beta)), number)
@@ -63,17 +63,18 @@ def elastic(p: Any, me: Me, others: Any, number: Vec) -> Vec:
 class Elastic(Effect):
     """Linear finite elements (bars, triangles in plane stress, tetrahedra) of a group's network, Rayleigh damping.
 
-    Valid for small displacements: a large rotation stretches the body. Masses are those of the group's particles.
+    The theory holds for small displacements: a large rotation stretches the body. Masses are those of the group's
+    particles.
     """
 
     kind: Literal["elastic"] = "elastic"
-    group: int = Field(default=0, ge=0, description="number of the group whose network it acts on")
+    group: int = Field(default=0, ge=0, description="index of the group whose network it acts on")
     young: float = Field(ge=0, description="Pa, Young's modulus")
     poisson: float = Field(default=0.3, gt=-1, lt=0.5, description="Poisson's ratio; unused by bars")
     area: float = Field(default=1.0, gt=0, description="m^2, cross section of bars")
-    thickness: float = Field(default=1.0, gt=0, description="m, of triangles")
-    alpha: float = Field(default=0.0, ge=0, description="1/s, damping D = alpha M + beta K")
-    beta: float = Field(default=0.0, ge=0, description="s")
+    thickness: float = Field(default=1.0, gt=0, description="m, thickness of triangles")
+    alpha: float = Field(default=0.0, ge=0, description="alpha, 1/s, of the damping D = alpha M + beta K")
+    beta: float = Field(default=0.0, ge=0, description="beta, s")
     own_law: ClassVar[Law | None] = rayleigh_mass
     bond_law: ClassVar[Law | None] = elastic
     strengths: ClassVar[tuple[str, ...]] = ("young", "alpha", "beta")
@@ -84,7 +85,7 @@ class Elastic(Effect):
         return self.alpha == 0
 
     def numbers(self, dimension: int) -> int:
-        """Return the size of a block of K and the undeformed offset to the neighbour."""
+        """Return the number of values of a bond: a block of K, and the undeformed offset to the neighbour."""
         return dimension * dimension + dimension
 
     def parameters(self) -> dict[str, float | Vec]:
@@ -98,7 +99,7 @@ class Elastic(Effect):
         return found if self.young else 0 * found
 
     def bonds(self, groups: Sequence[Any], dimension: int) -> Bonds:
-        """Return every pair of neighbours, in both directions."""
+        """Return a bond for every pair of neighbours, in both directions."""
         first, network, _ = network_of(groups, self.group, dimension)
         near = blocks(self.matrix(network, dimension), network.rest_points(dimension))
         agent = np.repeat(np.arange(len(near.start) - 1), np.diff(near.start)) + first
@@ -106,7 +107,7 @@ class Elastic(Effect):
         return Bonds(agent.astype(np.int32), (near.partner[:, None] + first).astype(np.int32), number)
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats] | None:
-        """Return bounds by Gershgorin's circles: w^2 <= the largest row sum of |K| / m."""
+        """Return bounds by Gershgorin's circles: w^2 is at most the largest row sum of |K| / m."""
         first, network, mass = network_of(groups, self.group, dimension)
         rows = np.asarray(abs(self.matrix(network, dimension)).sum(axis=1)).reshape(-1, dimension).max(axis=1)
         square = np.zeros(len(all_masses(groups, dimension)))

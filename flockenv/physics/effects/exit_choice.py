@@ -1,4 +1,4 @@
-"""Routes: a choice among doors by the expected time of each, for walking there and waiting in front of it."""
+"""Routes: choice of the door with the shortest expected time, for the walk there and the queue in front of it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ BINS = 256
 
 @law
 def path_to_door(p: Any, me: Me, k: Any) -> tuple[float, Vec]:
-    """Return the length of the path to door k, m, and its first direction."""
+    """Return the length of the path to door k, m, and its initial direction."""
     return path_to_target(p.table[np.int64(p.table[1 + k * np.int64(p.size)]) :], me.pos)
 
 
@@ -51,7 +51,7 @@ def door_counter(p: Any, me: Me) -> float:
 
 @law
 def count_ahead(p: Any, me: Me, k: Any, length: float) -> float:
-    """Return the number of agents that head for door k and are nearer to it than me; the same bin counts half."""
+    """Return the number of agents that head for door k and are nearer to it; those in the same bin count half."""
     o, e = like(length, 0.0), like(length, 1.0)
     mine, begin = np.int64(bin_of(p, length)), k * np.int64(p.bins)
     count = o
@@ -66,7 +66,7 @@ def count_ahead(p: Any, me: Me, k: Any, length: float) -> float:
 
 @law
 def expected_time(p: Any, me: Me, k: Any, waits: bool) -> float:
-    """Return the time to get through door k, s: the walk there, and, if `waits`, the queue in front of it."""
+    """Return the time to get through door k, s: that of the walk and, if `waits`, of the queue in front of it."""
     length, _ = path_to_door(p, me, k)
     time = length / me.desired_speed
     if waits:
@@ -87,7 +87,7 @@ def quickest_door(p: Any, me: Me, waits: bool) -> tuple[Any, float]:
 
 @law
 def initial_route(p: Any, me: Me) -> Vec:
-    """Return the nearest door, and a time of first decision within a period, different for each agent."""
+    """Return the inner state at the start: the nearest door, and the time of first decision, within a period."""
     o = like(p.share, 0.0)
     if not applies_to(p, me):
         return (o, o, o, me.inner.was_x, me.inner.was_y)
@@ -99,7 +99,7 @@ def initial_route(p: Any, me: Me) -> Vec:
 
 @law
 def update_route(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
-    """Return its door (reconsidered once per period), path length, time of next decision, and position."""
+    """Return the inner state after a step: door (decided once per period), path length, next decision, position."""
     door, left, ready, was = me.inner.door, me.inner.left, me.inner.ready, stored_position(me)
     if not applies_to(p, me) or door >= p.many:
         return (door, left, ready, was[0], was[1])
@@ -118,7 +118,7 @@ def update_route(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
 
 @law
 def routes_aim(p: Any, me: Me) -> Vec:
-    """Return the direction of the path to its door, or straight on once it is through."""
+    """Return the direction of the path to the agent's door, or straight on after the door."""
     if not applies_to(p, me):
         return zero(me.pos)
     if me.inner.door >= p.many:
@@ -128,7 +128,7 @@ def routes_aim(p: Any, me: Me) -> Vec:
 
 
 class Door(Target):
-    """A door, and its width, which sets its capacity."""
+    """A door with its width, which determines its capacity."""
 
     width: float | None = Field(default=None, gt=0, description="m (default: from one end to the other)")
 
@@ -141,7 +141,7 @@ class Door(Target):
 
     @property
     def opening_width(self) -> float:
-        """Its width, m."""
+        """The width of the door, m."""
         return self.length if self.width is None else self.width
 
 
@@ -150,14 +150,14 @@ class Routes(Around):
 
     L is the length of the path to the door, v0 the desired speed, n the number of agents of the group that head for
     that door and are nearer to it, J the `flow` and w the door's width. An agent begins with the nearest door, decides
-    anew every `period`, at times of its own (golden ratio times its index), and changes only to a door that is faster
-    by `hysteresis`. Each agent is assumed to know n for every door: agents are counted once per step, to 1/256 of the
-    longest path. `inner(state, "door")` is the index of the door; it is the number of doors once an agent is through
-    its door, and goes straight on.
+    again after each `period`, with an offset of its own (golden ratio times its index), and changes only to a door that
+    is faster by `hysteresis`. Each agent is assumed to know n for every door: agents are counted once per step, in bins
+    of 1/256 of the longest path. `inner(state, "door")` is the index of the door; for an agent that has passed its
+    door, and then goes straight on, it is the number of doors.
     """
 
     kind: Literal["routes"] = "routes"
-    doors: tuple[Door, ...] = Field(min_length=1, description="doors to choose from; a single one is assigned")
+    doors: tuple[Door, ...] = Field(min_length=1, description="doors to choose from, or a single one")
     flow: float = Field(default=1.9, gt=0, description="1/(m s), agents that get through per metre of width")
     period: float = Field(default=2.0, gt=0, description="s, between decisions")
     hysteresis: float = Field(default=0.1, ge=0, lt=1, description="fraction by which another door must be faster")
@@ -174,11 +174,11 @@ class Routes(Around):
 
     @property
     def counters(self) -> int:
-        """One for each bin of path length and each door."""
+        """Number of counters: one for each bin of path length and each door."""
         return BINS * len(self.doors)
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Return the numbers that the laws read besides the table."""
+        """Return the numbers that the laws read in addition to the table."""
         numbers = {name: float(getattr(self, name)) for name in ("share", "period", "hysteresis")}
         return {**numbers, "many": float(len(self.doors)), "bins": float(BINS), "size": float(HEAD + row_size(2))}
 

@@ -6,8 +6,8 @@ gusts. All of them may oscillate in time, as cos(2 pi t / period + phase).
 
 A medium alone moves no agent. Two effects couple agents to it: `Drag` (and `QuadraticDrag`) pulls an agent's own
 velocity towards the medium's, so that the agent has inertia and lags behind; `Carried` adds the medium's velocity to
-the agent's own, which it does not change: a speck of dust, a passive tracer. With both, an agent is carried, and its
-own velocity, which is already relative to the medium, is dragged towards the medium's once more: rarely intended.
+the agent's own, which stays unchanged, as for dust or a passive tracer. With both, an agent is carried, and its own
+velocity, already relative to the medium, is also dragged towards the medium's, which is rarely intended.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Floats = NDArray[np.float64]
 
 
 def oscillation(p: Any, me: Me) -> float:
-    """Return cos(2 pi t / period + phase); 1, and no code, for a field without a period."""
+    """Return cos(2 pi t / period + phase); 1 for a field without a period."""
     return float(np.cos(2 * np.pi * me.time / p.period + p.phase)) if hasattr(p, "period") else 1.0
 
 
@@ -71,7 +71,7 @@ def sink(p: Any, me: Me) -> Vec:
 
 @law
 def _perpendicular(p: Any, away: Vec) -> Vec:
-    """Return the vector of length r at right angles to the offset from the centre or axis, counterclockwise."""
+    """Return the vector of length r perpendicular to the offset from the centre or axis, counterclockwise."""
     if len(away) == 2:
         return (-away[1], away[0])
     else:
@@ -89,24 +89,24 @@ def vortex(p: Any, me: Me) -> Vec:
 
 @law
 def wind(p: Any, me: Me) -> Vec:
-    """Return U."""
+    """Return U, the velocity of the wind."""
     return p.velocity  # type: ignore[no-any-return]
 
 
 @law
 def gusty_wind(p: Any, me: Me) -> Vec:
-    """Return U + G (1 - cos) / 2."""
+    """Return U + G (1 - cos(2 pi t / period + phase)) / 2."""
     return add(p.velocity, scale(p.gust, like(me.time, 0.5) - like(me.time, 0.5) * oscillation(p, me)))
 
 
 @law
 def carry_velocity(p: Any, me: Me) -> Vec:
-    """Return the flow of x' = v + share u: share u."""
+    """Return share u, the flow that is added to the agent's own velocity."""
     return scale(me.medium, p.share)
 
 
 class _Timed(Effect):
-    """Effects that may oscillate in time; without a period the oscillation is not compiled."""
+    """Base class of effects that may oscillate in time; without a period the oscillation is not compiled."""
 
     period: float | None = Field(default=None, gt=0, description="s, of the oscillation in time (default: steady)")
     phase: float = Field(default=0.0, description="radians, of the oscillation at time 0")
@@ -118,13 +118,13 @@ class _Timed(Effect):
         return self
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Return the numbers of the law; those of the oscillation only with a period."""
+        """Return the parameters of the law; those of the oscillation only with a period."""
         given = super().parameters()
         return given if self.period is not None else {name: given[name] for name in given if name != "phase"}
 
 
 class _Field(_Timed):
-    """A force on agents or a velocity of the medium, depending on `acts`: one law for both."""
+    """Base class of fields that are a force or a velocity of the medium, as `acts` selects."""
 
     formula: ClassVar[Law]
     acts: Literal["force", "medium"] = Field(
@@ -134,27 +134,27 @@ class _Field(_Timed):
 
     @property
     def own_law(self) -> Law | None:  # type: ignore[override]  # its law fills one of two slots
-        """The law if it is a force, else None."""
+        """The law if the field is a force, else None."""
         return self.formula if self.acts == "force" else None
 
     @property
     def medium_law(self) -> Law | None:  # type: ignore[override]
-        """The law if it moves the medium, else None."""
+        """The law if the field is a velocity of the medium, else None."""
         return self.formula if self.acts == "medium" else None
 
     def potential(self, groups: Sequence[Any], state: State, offset: Any) -> Floats | None:
-        """Return the sum over all agents, (B,) J; None for a medium, if it oscillates, or without a potential."""
+        """Return the sum over all agents, (B,) J; None for a medium, an oscillation, or without a potential."""
         steady = self.acts == "force" and self.period is None
         each = self._energy(np.asarray(state.pos, np.float64), offset) if steady else None
         return None if each is None else np.asarray(each.sum(axis=1))
 
     def _energy(self, pos: Floats, offset: Any) -> Floats | None:
-        """Return the potential energy of the steady force, of agents at (B, N, D) m, (B, N) J."""
+        """Return the potential energy of agents at `pos` (B, N, D) m in the steady force, (B, N) J."""
         return None
 
 
 class _Central(_Field):
-    """Fields whose magnitude falls with the distance from a centre (on a torus, its nearest image)."""
+    """Base class of fields whose magnitude falls with the distance from a centre (on a torus, its nearest image)."""
 
     centre: Vector = Field(description="m")
     maximum: float = Field(gt=0, description="Phi_max, N as a force, m/s as a medium: limit near the centre")
@@ -168,7 +168,7 @@ class _Central(_Field):
 
 
 class Uniform(_Field):
-    """The same everywhere. As a force it does work F . (x - x0), independent of the mass: for gravity see `Gravity`."""
+    """A uniform field; as a force it does work F . (x - x0), independent of the mass (for gravity see `Gravity`)."""
 
     kind: Literal["uniform"] = "uniform"
     strength: Vector = Field(description="N as a force, m/s as a medium, per axis")
@@ -180,7 +180,7 @@ class Uniform(_Field):
 
 
 class Source(_Central):
-    """Away from a centre, W = Phi / (Phi / Phi_max + r^2).
+    """A field away from a centre, of magnitude W = Phi / (Phi / Phi_max + r^2).
 
     As a steady force it conserves m v^2 / 2 - Phi / sqrt(a) arctan(r / sqrt(a)), a = Phi / Phi_max.
     """
@@ -195,7 +195,7 @@ class Source(_Central):
 
 
 class Sink(_Central):
-    """Towards a centre, W = Phi / (Phi / Phi_max + r^2): a source reversed.
+    """A field towards a centre, of magnitude W = Phi / (Phi / Phi_max + r^2): a reversed source.
 
     As a steady force it conserves m v^2 / 2 + Phi / sqrt(a) arctan(r / sqrt(a)), a = Phi / Phi_max.
     """
@@ -210,7 +210,7 @@ class Sink(_Central):
 
 
 class Vortex(_Central):
-    """Around a centre, in space around an axis through it, counterclockwise: W = Phi / (|Phi| / Phi_max + r^2).
+    """A counterclockwise field around a centre, in 3-D around an axis, W = Phi / (|Phi| / Phi_max + r^2).
 
     As a medium it carries agents in circles, one turn in 2 pi r / W. As a force it conserves no energy: it does work
     2 pi r W in every turn.
@@ -218,7 +218,7 @@ class Vortex(_Central):
 
     kind: Literal["vortex"] = "vortex"
     strength: float = Field(description="Phi, N m^2 as a force, m^3/s as a medium; negative: clockwise")
-    axis: Vector | None = Field(default=None, description="its direction, in 3-D alone (default: the z axis)")
+    axis: Vector | None = Field(default=None, description="direction of the axis, only in 3-D (default: the z axis)")
     formula: ClassVar[Law] = vortex
 
     @model_validator(mode="after")
@@ -228,7 +228,7 @@ class Vortex(_Central):
         return self
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Return the numbers of the law: with an axis in 3-D, without one in 2-D."""
+        """Return the parameters of the law: with an axis in 3-D, without one in 2-D."""
         given = super().parameters()
         return given if len(self.centre) == 2 else {"axis": (0.0, 0.0, 1.0), **given}
 
@@ -253,15 +253,15 @@ class Wind(_Timed):
 
     @property
     def medium_law(self) -> Law | None:  # type: ignore[override]  # gusts are compiled only if there are some
-        """The law, with gusts or without."""
+        """The law with gusts, or the one without."""
         return wind if self.gust is None else gusty_wind
 
 
 class Carried(Effect):
     """Agents are carried by the medium, in addition to their own velocity: x' = v + share u; at rest they are tracers.
 
-    Not the same as `Drag`, a force that pulls v towards u with time constant m / c: carried is the limit without
-    inertia. v stays the agent's own velocity, and max_speed bounds the sum.
+    Unlike `Drag`, a force that pulls v towards u with time constant m / c, this is the limit without inertia. v stays
+    the agent's own velocity, and max_speed bounds the sum.
     """
 
     kind: Literal["carried"] = "carried"

@@ -1,4 +1,4 @@
-"""Floor fields as aims: the shortest path around all obstacles to a target, or to the nearest of several doors."""
+"""Aims by floor fields: shortest paths around all obstacles to a target, or to the nearest of several."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ __all__ = ["Around", "Way", "slow_down"]
 
 @law
 def slow_down(direction: Vec, length: float, slow_radius: float) -> Vec:
-    """Return a direction, shorter if less than slow_radius, m, of the path is left."""
+    """Return a direction, shortened if less than slow_radius, m, of the path remains."""
     return scale(direction, length / slow_radius if length < slow_radius else like(length, 1.0))
 
 
 @law
 def path_aim(p: Any, me: Me) -> Vec:
-    """Return the direction of the path to the target with the shortest one."""
+    """Return the direction of the shortest path to any of the targets."""
     length, direction = path_to_target(p.table, me.pos)
     return select(applies_to(p, me), scale(slow_down(direction, length, p.slow_radius), p.share), zero(me.pos))
 
 
 class Around(Aim):
-    """An aim by floor fields: shortest paths around obstacles, computed once, on a grid, when the scene is built."""
+    """Base class of aims by floor fields, which are computed on a grid when the scene is built."""
 
-    clearance: float = Field(default=0.3, ge=0, description="m, between paths and obstacles: a body's radius or more")
+    clearance: float = Field(default=0.3, ge=0, description="m, of paths from obstacles: at least a body's radius")
     spacing: float = Field(default=0.2, gt=0, description="m, between points of the grid")
-    margin: float = Field(default=3.0, gt=0, description="m of grid around the whole scene, if the space is not a box")
+    margin: float = Field(default=3.0, gt=0, description="m, of the grid around the scene, if the space is not a box")
     tabled: ClassVar[bool] = True
     needs_all: ClassVar[bool] = False
     """True if an agent must visit all targets, False if one of them is enough."""
@@ -58,7 +58,7 @@ class Around(Aim):
 
     @property
     def goals(self) -> tuple[tuple[Target, ...], tuple[str, ...]]:
-        """All its targets, and their names in errors."""
+        """All targets, with their names in errors."""
         raise NotImplementedError
 
     def check(self, scene: SceneView) -> None:
@@ -70,11 +70,11 @@ class Around(Aim):
         scene.table_of(self)
 
     def grids(self, scene: SceneView) -> list[NDArray[np.float64]]:
-        """Return the floor fields, one for each target or set of alternative targets."""
+        """Return the floor fields, one for each target or set of alternatives."""
         raise TypeError(f"{type(self).__name__} has no floor fields")
 
     def check_start(self, scene: SceneView, state: Any) -> None:
-        """Warn of agents that begin where no path leads to any target, or to a stage of a journey."""
+        """Warn of agents that start where no path leads to any target, or to a stage of a journey."""
         first, end = (int(k) for k in self.members(scene.starts).values())
         lengths = np.array([path_lengths(grid, state.pos[:, first:end]) for grid in self.grids(scene)])
         if not len(lengths):
@@ -85,7 +85,7 @@ class Around(Aim):
 
 
 def _check_alone(effect: Aim, scene: SceneView) -> None:
-    """Raise ValueError if another effect keeps the same numbers of the same agents: changes would add up."""
+    """Raise ValueError if another effect keeps the same numbers of the same agents, as changes would be added."""
     first, end = effect.members(scene.starts).values()
     for k, other in enumerate(scene.effects):
         if isinstance(other, Around) and other is not effect and set(effect.keeps) & set(other.keeps):
@@ -95,7 +95,7 @@ def _check_alone(effect: Aim, scene: SceneView) -> None:
 
 
 class Way(Around):
-    """Agents of a group head for a target around all obstacles, for the nearest of several.
+    """Agents of a group head for a target, or the nearest of several, around all obstacles.
 
     Paths follow the negative gradient of their length u, |grad u| = 1 (eikonal equation). Nearest means by path length,
     not by straight distance. The target of a door is the part at least `clearance` from its jambs. Within a target box
@@ -103,7 +103,7 @@ class Way(Around):
     """
 
     kind: Literal["way"] = "way"
-    targets: tuple[Target, ...] = Field(min_length=1, description="points, doors, boxes")
+    targets: tuple[Target, ...] = Field(min_length=1, description="points, doors or boxes")
     slow_radius: float = Field(default=0.0, ge=0, description="m before the target, over which it slows down to stop")
     aim_law: ClassVar[Law | None] = path_aim
 
@@ -117,11 +117,11 @@ class Way(Around):
         return {"slow_radius": self.slow_radius, "share": self.share}
 
     def table(self, scene: SceneView) -> NDArray[np.float64]:
-        """Return its targets and the floor field to the nearest."""
+        """Return the numbers of the targets and of the floor field to the nearest."""
         return self.field_block(scene, *self.goals)
 
     def lengths(self, scene: SceneView, points: ArrayLike) -> NDArray[np.float64]:
-        """Return path lengths from points (..., D), (...) m; inf without a path; outside the grid, that of its edge."""
+        """Return path lengths from points (..., D), (...) m; inf without a path; outside the grid those of its edge."""
         return path_lengths(self.grids(scene)[0], points)
 
     def grids(self, scene: SceneView) -> list[NDArray[np.float64]]:

@@ -1,4 +1,4 @@
-"""Fluctuations: random kicks, as of a fluid's molecules."""
+"""Fluctuations: random kicks, such as those of a fluid's molecules."""
 
 from __future__ import annotations
 

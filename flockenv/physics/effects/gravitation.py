@@ -1,7 +1,7 @@
 """Inverse-square forces between all agents: proportional to the masses (Newton), or equal for every pair.
 
-Both are softened (Plummer 1911): a body is not a point but a cloud of radius `softening`, so no agent is flung away by
-passing through another. Up to a few thousand agents the sum is exact; for more, far groups are combined into one
+Both are softened (Plummer 1911): a body is not a point but a cloud of radius `softening`, so forces stay bounded when
+agents pass through each other. Up to a few thousand agents the sum is exact; for more, far groups are combined into one
 (Barnes & Hut 1986), unless `opening` is 0. Forces are opposite in every pair; with combined groups, momentum is
 conserved only to the accuracy of the tree.
 """
@@ -44,7 +44,7 @@ def inverse_square(p: Any, me: Me, other: Far) -> Vec:
 
 
 class _Softened(Effect):
-    """Fields that the two have in common."""
+    """Base class with the fields that both forces have."""
 
     softening: float = Field(ge=0, description="eps, m; 0 = point masses, without a bound of the force")
     opening: float = Field(
@@ -73,7 +73,7 @@ class Gravitation(_Softened):
     strengths: ClassVar[tuple[str, ...]] = ("constant",)
 
     def check(self, scene: SceneView) -> None:
-        """Raise ValueError if an agent has infinite mass: it would attract infinitely."""
+        """Raise ValueError if an agent has infinite mass, as its attraction would be infinite."""
         for k, group in enumerate(scene.groups):
             if not np.isfinite(group.masses(scene.dimension)).all():
                 raise ValueError(

@@ -1,8 +1,8 @@
 """Motivation of animals: hunger, libido, fear, intentions; food that grows and is eaten, prey that is caught.
 
 None of these is a force. They keep inner numbers of agents (`State.inner`), which an arbitration (`intentions`), a sink
-(`threshold`) or a law of yours reads. The formulas and their sources are in `flockenv.steering.motivation`. Transfers
-between two agents are computed for both from the same instant: what a fish eats is what its food loses.
+(`threshold`) or a user's law reads. The formulas and their sources are in `flockenv.steering.motivation`. Transfers
+between two agents are computed for both from the same instant: a fish eats as much as its food loses.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def _is_member(who: float, first: float, end: float) -> bool:
 
 @law
 def _draw_initial(p: Any, me: Any, channel: int) -> float:
-    """Return its initial value: start, and up to half of `spread` more or less; 0 outside the group."""
+    """Return an initial value, uniform in start +- spread / 2; 0 for agents outside the group."""
     half = like(p.start, 0.5)
     share = like(p.start, uniform(me.key, 0, int(me.who), channel)) - half
     mine = p.start + p.spread * share
@@ -43,7 +43,7 @@ def _draw_initial(p: Any, me: Any, channel: int) -> float:
 
 
 class _Urge(Effect):
-    """Fields that these effects have in common: the groups they apply to."""
+    """Base class of these effects, with the group that they apply to."""
 
     conserves_momentum: ClassVar[bool] = True  # it exerts no force
 
@@ -65,7 +65,7 @@ class _Urge(Effect):
         super().check(scene)
 
     def numbers_of(self, *names: str) -> dict[str, float | Vec]:
-        """Return some fields as numbers for its laws."""
+        """Return the values of some fields, by name, as floats for laws."""
         return {name: float(getattr(self, name)) for name in names}
 
 
@@ -135,7 +135,7 @@ def initial_food(p: Any, me: Me) -> Vec:
 
 @law
 def food_and_hunger(p: Any, me: Me, other: Other) -> Vec:
-    """Return the food of a patch in reach, and the hunger of an agent that eats of this patch."""
+    """Return the food of the neighbour if it is a patch in reach, and its hunger if it eats of this patch."""
     o = like(other.square, 0.0)
     eats = _is_member(me.who, p.first, p.end) & _is_member(other.who, p.from_other, p.to_other)
     eaten = _is_member(me.who, p.from_other, p.to_other) & _is_member(other.who, p.first, p.end)
@@ -144,13 +144,13 @@ def food_and_hunger(p: Any, me: Me, other: Other) -> Vec:
 
 @law
 def both_sums(p: Any, me: Me, sums: Vec) -> Vec:
-    """Return both sums as a vector."""
+    """Return both sums, food and hunger, as a vector."""
     return planar(me.pos, sums[0], sums[1])
 
 
 @law
 def update_grazing(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
-    """Return the numbers after a step: eaters get less hungry; patches regrow, and lose what is eaten."""
+    """Return the numbers after a step: the hunger of eaters falls; patches regrow, and lose the eaten amount."""
     o = like(p.rate, 0.0)
     patch = _is_member(me.who, p.from_other, p.to_other)
     taken = motivation.bite(message[0], me.inner.hunger, p.rate, seconds)
@@ -161,11 +161,11 @@ def update_grazing(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
 
 
 class Grazing(_Urge):
-    """Food that grows in patches, each an agent of its group, and is eaten by agents within `radius` of one.
+    """Food grows in patches, each an agent of a group, and is eaten by agents within `radius` of one.
 
-    A patch holds an amount a with da/dt = growth a (1 - a / capacity) minus what is eaten: rate a H by each agent
-    there, H its hunger. Hunger falls by what is eaten over `appetite`. The model is ours: in Tu and Terzopoulos (1994)
-    food is particles. Amounts are in units of food: `food` of a patch, `eaten` by an agent until now.
+    A patch holds an amount a with da/dt = growth a (1 - a / capacity) minus rate a H for each agent that eats there, H
+    its hunger. Hunger falls by the amount eaten divided by `appetite`. The model is ours: in Tu and Terzopoulos (1994)
+    food is particles. Amounts are in units of food: `food` of a patch, `eaten` by an agent since the start.
     """
 
     kind: Literal["grazing"] = "grazing"
@@ -175,7 +175,7 @@ class Grazing(_Urge):
     growth: float = Field(default=0.2, ge=0, description="r, 1/s")
     capacity: float = Field(default=3.0, gt=0, description="K, units of food in a full patch")
     start: float = Field(default=1.0, gt=0, le=1, description="initial amount, as a fraction of capacity")
-    appetite: float = Field(default=1.0, gt=0, description="units of food that it takes from starved to full")
+    appetite: float = Field(default=1.0, gt=0, description="units of food from starved to full")
     pair_law: ClassVar[Law | None] = food_and_hunger
     finish_law: ClassVar[Law | None] = both_sums
     begin_law: ClassVar[Law | None] = initial_food
@@ -197,7 +197,7 @@ class Grazing(_Urge):
         return self.numbers_of("rate", "growth", "capacity", "start", "appetite")
 
     def check(self, scene: SceneView) -> None:
-        """Raise ValueError if all together could eat more than a patch in one step, or patches eat."""
+        """Raise ValueError if all eaters together could eat more than a patch holds in one step, or if patches eat."""
         super().check(scene)
         if self.group in (None, self.other):
             raise ValueError(f"group = {self.group}: must be the group that eats, different from other = {self.other}")
@@ -216,13 +216,13 @@ class Grazing(_Urge):
 
 @law
 def no_catches(p: Any, me: Me) -> Vec:
-    """Return 0 hunger and 0 catches."""
+    """Return the initial numbers: 0 hunger and 0 catches."""
     return like(me.mass, 0.0), like(me.mass, 0.0)
 
 
 @law
 def catches(p: Any, me: Me, other: Other) -> Vec:
-    """Return 1 if the other catches me, and 1 if I catch it: a hunter must be hungry enough."""
+    """Return 1 if the other catches this agent, else 0, and the reverse; a hunter must be hungry enough."""
     o, e = like(other.square, 0.0), like(other.square, 1.0)
     mine = _is_member(me.who, p.from_other, p.to_other) & _is_member(other.who, p.first, p.end)
     prey = _is_member(me.who, p.first, p.end) & _is_member(other.who, p.from_other, p.to_other)
@@ -232,7 +232,7 @@ def catches(p: Any, me: Me, other: Other) -> Vec:
 
 @law
 def update_catches(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
-    """Return the numbers after a step: each catch reduces the hunger of a hunter, and is counted by its prey."""
+    """Return the numbers after a step: each catch reduces the hunger of the hunter, and the prey counts it."""
     o = like(p.meal, 0.0)
     less = me.inner.hunger - p.meal * message[1]
     return (less if less > o else o), me.inner.caught + message[0]
@@ -241,8 +241,8 @@ def update_catches(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
 class Predation(_Urge):
     """Hunters, if hungry, catch prey nearer than `radius`; each catch reduces their hunger by `meal`.
 
-    `caught` counts the hunters that have caught an agent; a sink `threshold` at 1 makes a catch deadly. A prey caught
-    by two in one step feeds both. The model is ours.
+    `caught` counts the hunters that have caught an agent; with a sink `threshold` at 1 a caught agent dies. A prey
+    caught by two in one step reduces the hunger of both. The model is ours.
     """
 
     kind: Literal["predation"] = "predation"
@@ -282,7 +282,7 @@ class Predation(_Urge):
 
 @law
 def no_fear(p: Any, me: Me) -> Vec:
-    """Return 0: no fear at the start."""
+    """Return the initial fear, 0."""
     return (like(me.mass, 0.0),)
 
 
@@ -294,22 +294,22 @@ def fear_of(p: Any, me: Me, other: Other) -> Vec:
 
 @law
 def one_sum(p: Any, me: Me, sums: Vec) -> Vec:
-    """Return the sum as a vector."""
+    """Return the sum of fears as a vector."""
     return planar(me.pos, sums[0], like(sums[0], 0.0))
 
 
 @law
 def update_fear(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
-    """Return the fear after a step: of all in sight together, at most 1; it fades."""
+    """Return the fear after a step: that of all in sight, at most 1, or the previous one after decay."""
     one = like(p.span, 1.0)
     later = motivation.update_fear(me.inner.fear, message[0] if message[0] < one else one, p.memory, seconds)
     return (later if _is_member(me.who, p.first, p.end) else me.inner.fear,)
 
 
 class Fear(_Urge):
-    """Fear of others in sight, F = min(sum of min(span / distance, 1), 1), that fades over `memory` seconds.
+    """Fear of others in sight, F = min(sum of min(span / distance, 1), 1), which decays over `memory` seconds.
 
-    Sight, sum and 1 / distance are from Tu and Terzopoulos (1994; a view of 300 degrees); the fading is ours.
+    Sight, sum and 1 / distance are from Tu and Terzopoulos (1994; a view of 300 degrees); the decay is ours.
     """
 
     kind: Literal["fear"] = "fear"
@@ -332,7 +332,7 @@ class Fear(_Urge):
         return Sight(self.radius, self.fov, group=self.other, occluded=self.occluded)
 
     def sums(self, dimension: int) -> int:
-        """Return 1, for the fear."""
+        """Return 1, for the sum of fears."""
         return 1
 
     def parameters(self) -> dict[str, float | Vec]:
@@ -351,7 +351,7 @@ def initial_urge(p: Any, me: Me) -> Vec:
 
 @law
 def count_willing(p: Any, me: Me, other: Other) -> Vec:
-    """Return 1 if the neighbour is willing, else 0."""
+    """Return 1 if the neighbour is willing to mate, else 0."""
     o, e = like(other.square, 0.0), like(other.square, 1.0)
     would = motivation.desire(other.inner.libido, other.inner.hunger) > p.ready
     return (e if would & _is_member(other.who, p.first, p.end) else o,)
@@ -370,14 +370,14 @@ def update_urge(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
 class Libido(_Urge):
     """An urge s that grows linearly since the last mating; libido is s (1 - H) (Tu and Terzopoulos 1994).
 
-    Two agents mate if they come nearer than `radius` while both have a libido above `ready`; `mated` counts matings. Of
-    three in reach of each other all three mate. This replaces the paper's courtship and is ours; no agent is born.
+    Two agents mate if they are nearer than `radius` and both have a libido above `ready`; `mated` counts matings. Three
+    agents in reach of each other all mate. This replaces the paper's courtship and is ours; no agent is born.
     """
 
     kind: Literal["libido"] = "libido"
     radius: float = Field(gt=0, description="m, distance at which agents mate")
     rate: float = Field(default=0.025, ge=0, description="1/s")
-    ready: float = Field(default=0.4, ge=0, le=1, description="libido above which an agent is willing")
+    ready: float = Field(default=0.4, ge=0, le=1, description="libido above which an agent is willing to mate")
     start: float = Field(default=0.0, ge=0, description="mean initial urge")
     spread: float = Field(default=0.0, ge=0, description="width of the uniform distribution of initial values")
     pair_law: ClassVar[Law | None] = count_willing
@@ -430,16 +430,17 @@ def update_intention(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
 class Intention(_Urge):
     """A finite state machine: escape, school, eat, mate or wander, from hunger, libido and fear, with hysteresis.
 
-    Fear above `escape`: flee; above `school`: join the others; else the larger of hunger and libido, if above `need`;
-    else wander (Tu and Terzopoulos 1994). An intention ends only when its level has fallen by `calm` or `content` below
-    the threshold, which avoids dithering; that is ours. An arbitration `intentions` acts on it.
+    With fear above `escape` the intention is to escape; above `school`, to school; else to eat or mate for the larger
+    of hunger and libido, if above `need`; else to wander (Tu and Terzopoulos 1994). An intention ends only when its
+    level has fallen by `calm` or `content` below the threshold, against rapid changes; that is ours. An arbitration
+    `intentions` reads it.
     """
 
     kind: Literal["intention"] = "intention"
     escape: float = Field(default=0.4, ge=0, le=1, description="fear above which an agent flees")
     school: float = Field(default=0.15, gt=0, le=1, description="fear above which an agent joins the others")
     need: float = Field(default=0.5, gt=0, le=1, description="hunger or libido above which an agent acts on it")
-    calm: float = Field(default=0.1, ge=0, description="decrease of fear below the threshold that ends either")
+    calm: float = Field(default=0.1, ge=0, description="decrease of fear below the threshold that ends both")
     content: float = Field(default=0.3, ge=0, description="decrease of the need below the threshold that ends it")
     begin_law: ClassVar[Law | None] = initial_intention
     keep_law: ClassVar[Law | None] = update_intention

@@ -1,4 +1,4 @@
-"""Pressure: agents separate where they are crowded and close up where not, towards a given density."""
+"""Pressure: repulsion and attraction of near agents, which lead to a given density."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PACKED = 0.64
 
 @law
 def pressure_pair(p: Any, me: Me, other: Other) -> Vec:
-    """Return (a^2 - r^2) / (r^2 + (a/8)^2) (1 - r^2/R^2)^2 away from a neighbour; in one place along the ties."""
+    """Return (a^2 - r^2) / (r^2 + (a/8)^2) (1 - r^2/R^2)^2 away from a neighbour, or along the tie in one place."""
     e, square = like(other.square, 1.0), other.square
     rest = p.flat if len(me.pos) == 2 else p.solid
     near = e - square / (p.radius * p.radius)
@@ -43,11 +43,10 @@ class Pressure(Effect):
     distances below a, attraction beyond; finite at distance 0, smoothly 0 at R. a is the distance of neighbours in the
     packing of that density to which a crowd relaxes: rho = 2 / (sqrt(3) a^2) in the plane (triangles),
     0.64 / (pi a^3 / 6) in space (random close packing, which fills 64 %). The force has a potential, so another effect
-    (`Drag`) must dissipate energy, or agents remain a gas. Too few agents to fill their space leave holes in it.
-
-    This is not the pressure of smoothed particles: that is a function of both partners' densities, and needs a second
-    pass over all pairs (Monaghan 1992). A mere sum over pairs has no preferred density in a mean field (its pressure
-    grows with rho^2 for any force); here the distance a and the order of agents set the density, to a few percent.
+    (`Drag`) must dissipate energy, or agents remain a gas. Too few agents to fill their space leave holes in it. This
+    is not the pressure of smoothed particles, which is a function of both partners' densities, and needs a second pass
+    over all pairs (Monaghan 1992). A mere sum over pairs has no preferred density in a mean field (its pressure grows
+    with rho^2 for any force); here the distance a and the order of agents set the density, to a few percent.
     """
 
     kind: Literal["pressure"] = "pressure"
@@ -65,7 +64,7 @@ class Pressure(Effect):
         return Sight(self.radius)
 
     def sums(self, dimension: int) -> int:
-        """Return D, for a vector."""
+        """Return D, the number of values in a vector."""
         return dimension
 
     def distance(self, dimension: int) -> float:
@@ -75,7 +74,7 @@ class Pressure(Effect):
         return math.cbrt(PACKED * 6 / (math.pi * self.density))
 
     def check(self, scene: SceneView) -> None:
-        """Raise ValueError if the radius leaves no attraction, or reaches second neighbours."""
+        """Raise ValueError if the radius is too small for attraction, or reaches second neighbours."""
         a = self.distance(scene.dimension)
         if not 1.1 * a <= self.radius <= 1.4 * a:
             raise ValueError(
@@ -84,7 +83,7 @@ class Pressure(Effect):
             )
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Return strength and radius, and a^2 in 2-D and in 3-D, of which the law takes one."""
+        """Return strength and radius, and a^2 in 2-D and in 3-D, of which the law reads one."""
         return {
             "strength": self.strength,
             "radius": self.radius,

@@ -29,19 +29,19 @@ def speed_limit(p: Any, me: Me) -> Vec:
 class SpeedLimit(Effect):
     """Brake agents that approach a speed V, F = -B 16 s^8 / (15 + s^8) v / V with s = |v| / V.
 
-    It brakes with B at V itself, so an agent driven by B reaches V in the end, by 2 B 1.087 V, by 4 B 1.189 V, by 8 B
-    1.319 V; it brakes with 14 % of B at .8 V and .2 % at V / 2. For high speeds it is a linear drag, 16 B / V: this
-    bounds its stiffness, so any step of less than m V / (8 B) is stable. `Group.max_speed` is the hard limit: it holds
-    exactly, and clips the result of a step, so that with it every method is of order 1.
+    The force is B at V, so an agent driven by a force B reaches V in the end, by 2 B 1.087 V, by 4 B 1.189 V, by 8 B
+    1.319 V; it is 14 % of B at 0.8 V and 0.2 % at V / 2. For high speeds it is a linear drag, 16 B / V: this bounds its
+    stiffness, so any step of less than m V / (8 B) is stable. `Group.max_speed` is the hard limit: it holds exactly,
+    and clips the result of a step, so that with it every method is of order 1.
     """
 
     kind: Literal["speed_limit"] = "speed_limit"
     speed: float = Field(gt=0, description="V, m/s")
-    strength: float = Field(ge=0, description="B, N, braking force at that speed")
+    strength: float = Field(ge=0, description="B, N, braking force at speed V")
     own_law: ClassVar[Law | None] = speed_limit
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return 0, as nothing oscillates, and damping 16 B / (m V), the largest force over speed."""
+        """Return w^2 = 0, as nothing oscillates, and the damping 16 B / (m V), the largest force over speed."""
         damping = 16 * self.strength / self.speed / all_masses(groups, dimension)
         return np.zeros(len(damping)), damping

@@ -1,4 +1,4 @@
-"""Springs between the particles of a network: along their length, and about their angles.
+"""Springs of a network: between two particles, along their distance, and about the angles of three.
 
 Rest lengths and angles are those of the network's undeformed shape. The forces of a spring on its two ends, and of a
 hinge on its three particles, sum to zero.
@@ -102,7 +102,7 @@ class Springs(Effect):
     """Damped springs along the edges of a group's network: F = k (l - L) + c dl/dt towards the other end."""
 
     kind: Literal["springs"] = "springs"
-    group: int = Field(default=0, ge=0, description="number of the group whose network it acts on")
+    group: int = Field(default=0, ge=0, description="index of the group whose network it acts on")
     stiffness: float = Field(ge=0, description="N/m, of edges")
     shear: float | None = Field(default=None, ge=0, description="N/m, of springs across cells (default: as edges)")
     bend: float | None = Field(default=None, ge=0, description="N/m, of springs over two edges (default: as edges)")
@@ -155,7 +155,7 @@ class AngularSprings(Effect):
     """Damped springs about the hinges of a group's network: a moment k (angle - rest angle) at each apex."""
 
     kind: Literal["angular_springs"] = "angular_springs"
-    group: int = Field(default=0, ge=0, description="number of the group whose network it acts on")
+    group: int = Field(default=0, ge=0, description="index of the group whose network it acts on")
     stiffness: float = Field(ge=0, description="N m/rad")
     damping: float = Field(default=0.0, ge=0, description="N m s/rad")
     bond_law: ClassVar[Law | None] = angular_spring

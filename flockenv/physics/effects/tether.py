@@ -1,4 +1,4 @@
-"""Springs to a fixed point, and a field of pendulums: forces of one agent alone, with a potential energy."""
+"""Springs to a fixed point, and pendulums along the axes: forces with a potential energy."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def swing(p: Any, me: Me) -> Vec:
 
 
 class _Centred(Effect):
-    """Fields that forces about a fixed point have in common; on a torus, about its nearest image."""
+    """Base class of forces about a fixed point; on a torus, about its nearest image."""
 
     centre: Vector = Field(description="m")
     places: ClassVar[tuple[str, ...]] = ("centre",)
@@ -80,7 +80,7 @@ class Swing(_Centred):
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:
-        """Return w^2 = s / (m l), that of small oscillations, and no damping."""
+        """Return w^2 = s / (m l), that of small oscillations, and damping 0."""
         square = self.strength / self.length / all_masses(groups, dimension)
         return square, np.zeros(len(square))
 

@@ -1,4 +1,4 @@
-"""Vicsek's flock: without forces, each agent takes on the mean direction of its neighbours, with an error."""
+"""Vicsek's model: each agent takes on the mean direction of its neighbours, with an error."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ def vicsek(p: Any, me: Any, sums: Vec) -> Vec:
 
 
 class Vicsek(Effect):
-    """Agents take on the mean direction within reach, own included, with an error: v' = v0 R(xi) unit(sum of v_j).
+    """Agents take on the mean direction within `radius`, own included, with an error: v' = v0 R(xi) unit(sum of v_j).
 
-    xi is uniform in [-eta/2, eta/2]: a function of (seed, world, step, agent). It is a map, not a force: it
-    is written as the force m (v' - v) / step, with which one step of an Euler method with dt = step is exactly the map;
-    other methods, and other dt, raise ValueError. Under explicit_euler positions move with the old velocity,
-    x' = x + v dt, as in the paper; under semi_implicit_euler with the new one, as in many later works. If the sum of
-    velocities is 0, the agent keeps its direction. In 2-D only.
+    xi is uniform in [-eta/2, eta/2]: a function of (seed, world, step, agent). The model is a map, not a force, and is
+    written as the force m (v' - v) / step, with which one step of an Euler method with dt = step is exactly the map;
+    other methods, and other dt, raise ValueError. Under explicit_euler positions move with the old velocity, x' = x + v
+    dt, as in the paper; under semi_implicit_euler with the new one, as in many later works. If the sum of velocities is
+    0, the agent keeps its direction. In 2-D only.
 
     Source: Vicsek, Czirok, Ben-Jacob, Cohen, Shochet 1995, Phys. Rev. Lett. 75, 1226, eqs. 1 and 2.
     """
@@ -55,7 +55,7 @@ class Vicsek(Effect):
     kind: Literal["vicsek"] = "vicsek"
     speed: float = Field(gt=0, description="v0, m/s, constant, of every agent")
     radius: float = Field(gt=0, description="r, m, of neighbours")
-    noise: float = Field(ge=0, le=2 * math.pi, description="eta, rad, the range of the error: 2 pi = no order at all")
+    noise: float = Field(ge=0, le=2 * math.pi, description="eta, rad, the range of the error: 2 pi = no order")
     step: float = Field(default=1.0, gt=0, description="s, the time of one update; dt must be the same")
     share: float = Field(default=1.0, ge=0, le=1, description="fraction of the change per update; 1 = Vicsek's")
     pair_law: ClassVar[Law | None] = vicsek_pair
@@ -72,7 +72,7 @@ class Vicsek(Effect):
         return dimension
 
     def calls_for(self) -> tuple[str, ...]:
-        """Return neighbour query and random numbers."""
+        """Return the names of the neighbour query and of random numbers."""
         return (*super().calls_for(), "random numbers")
 
     def check(self, scene: SceneView) -> None:

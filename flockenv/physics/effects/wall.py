@@ -33,7 +33,7 @@ def wall_repulsion(p: Any, me: Me) -> Vec:
 class WallRepulsion(Effect):
     """A straight wall repels all agents along its normal n, F = A exp(-d / B) n.
 
-    d is the distance from the wall, negative behind it, where the force goes on growing. A body driven against it with
+    d is the distance from the wall, negative behind it, where the force grows further. A body driven against it with
     desired speed v0 and relaxation time tau rests at d = B ln(A tau / (m v0)), which it approaches without oscillation
     if v0 tau / B <= 1/4. Helbing and Molnar 1995 (A = U0 / R, B = R); Helbing, Farkas and Vicsek 2000 without contact
     (their A times exp(radius / B)); Kretz, arXiv 1507.02566.
@@ -57,7 +57,7 @@ class WallRepulsion(Effect):
         return self
 
     def check(self, scene: SceneView) -> None:
-        """Raise ValueError also on a torus: away from the wall leads behind it, where the force is largest."""
+        """Raise ValueError also on a torus, where the path away from the wall leads behind it, to the largest force."""
         super().check(scene)
         if isinstance(scene.space, Torus):
             raise ValueError(

@@ -1,4 +1,4 @@
-"""Journeys: targets visited in order, each straight ahead or around obstacles, with a wait at each."""
+"""Journeys: targets visited in order, on straight lines or around obstacles, with a wait at each."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ HEAD = 2
 
 @law
 def stored_position(me: Me) -> Vec:
-    """Return the stored position, that at the end of the step before."""
+    """Return the position stored at the end of the previous step."""
     return me.inner.was_x, me.inner.was_y
 
 
@@ -42,7 +42,7 @@ def place_behind(me: Me) -> Vec:
 
 @law
 def stage_row(p: Any, stage: float) -> Any:
-    """Return where the numbers of a stage begin in the table; beyond the last stage, those of the last."""
+    """Return the index in the table at which a stage's numbers begin; after the last stage, that of the last."""
     last = p.many - like(stage, 1.0)
     k = np.floor(stage)
     k = k if k < last else last
@@ -52,7 +52,7 @@ def stage_row(p: Any, stage: float) -> Any:
 
 @law
 def journey_aim(p: Any, me: Me) -> Vec:
-    """Return the direction to the stage; 0 before it sets out; straight on once it has passed the last."""
+    """Return the direction to the stage; 0 before the start of the journey; straight on after the last stage."""
     stage, o = me.inner.stage, like(p.share, 0.0)
     row = stage_row(p, stage)
     straight = to_target(p.table, row + 2, me.pos)
@@ -67,7 +67,7 @@ def journey_aim(p: Any, me: Me) -> Vec:
 
 @law
 def initial_stage(p: Any, me: Me) -> Vec:
-    """Return the initial stage, -1/2 if it waits before it sets out, the end of that wait, and the position."""
+    """Return the initial stage, -1/2 during a wait before the journey, the end of that wait, and the position."""
     o = like(p.share, 0.0)
     begin = np.int64(p.many) * np.int64(p.size)
     each = np.int64(p.many) + 1
@@ -79,7 +79,7 @@ def initial_stage(p: Any, me: Me) -> Vec:
 
 @law
 def update_stage(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
-    """Return the stage, k, or k + 1/2 while it waits there; the time until which it waits; and the position."""
+    """Return the stage, k, or k + 1/2 during a wait there, the end of that wait, and the position."""
     stage, ready, was = me.inner.stage, me.inner.ready, stored_position(me)
     before = (stage, ready, was[0], was[1])
     if not applies_to(p, me) or (stage >= p.many and p.leaves > like(stage, 0.0)):
@@ -103,9 +103,9 @@ def update_stage(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
 
 
 class Stage(Target):
-    """A stage of a journey: reached when an agent is in it (a point: within its radius), or has crossed it (a door)."""
+    """A stage of a journey, reached if an agent is in it (a point: within its radius) or has crossed it (a door)."""
 
-    wait: Seconds = Field(default=0.0, description="s, wait there, or its distribution")
+    wait: Seconds = Field(default=0.0, description="s, duration of the wait there, or its distribution")
     around: bool = Field(default=True, description="True: by the path around obstacles; False: straight")
 
     @model_validator(mode="after")
@@ -117,19 +117,19 @@ class Stage(Target):
 
 
 class Journey(Around):
-    """Agents of a group visit stages in order, and may wait before they set out, and at each stage.
+    """Agents of a group visit stages in order, and may wait before the first, and at each.
 
-    `inner(state, "stage")` is the index of the stage that an agent heads for, from 0; half more while it waits there;
-    -1/2 before it sets out; the number of stages after the last. A wait ends with the first step that begins after its
-    time is over, for any dt. After the last stage, with then = "leave", an agent goes straight on, through a sink if
-    there is one. In 2-D only.
+    `inner(state, "stage")` is the index k of the stage that an agent heads for, from 0; k + 1/2 during a wait there;
+    -1/2 during a wait before the first; the number of stages after the last. A wait ends with the first step that
+    begins after its duration, for any dt. After the last stage, with then = "leave", an agent goes straight on, through
+    a sink if there is one. In 2-D only.
     """
 
     kind: Literal["journey"] = "journey"
     stages: tuple[Stage, ...] = Field(min_length=1, description="targets, in this order")
-    premovement: Seconds = Field(default=0.0, description="s, wait before setting out, or its distribution")
+    premovement: Seconds = Field(default=0.0, description="s, wait before the first stage, or its distribution")
     then: Literal["stay", "leave", "loop"] = Field(
-        default="stay", description="after the last: stay there, go straight on, or begin again"
+        default="stay", description="after the last stage: stay there, go straight on, or repeat the journey"
     )
     slow_radius: float = Field(default=0.5, gt=0, description="m, over which agents slow down before a stop")
     needs_all: ClassVar[bool] = True
@@ -140,12 +140,12 @@ class Journey(Around):
 
     @property
     def goals(self) -> tuple[tuple[Target, ...], tuple[str, ...]]:
-        """The stages that are reached around obstacles."""
+        """The stages that agents reach by paths around obstacles."""
         there = [k for k, stage in enumerate(self.stages) if stage.around]
         return tuple(self.stages[k] for k in there), tuple(f"stages[{k}]" for k in there)
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Return the share, the number of stages, the size of a row, and what follows the last stage."""
+        """Return the share, the number of stages, the size of a row, and the code of `then`."""
         ends = {"leaves": float(self.then == "leave"), "loops": float(self.then == "loop")}
         return {"share": self.share, "many": float(len(self.stages)), "size": float(HEAD + row_size(2)), **ends}
 
@@ -166,7 +166,7 @@ class Journey(Around):
         return np.concatenate([np.ravel(rows), waits.ravel(), *blocks])
 
     def grids(self, scene: SceneView) -> list[NDArray[np.float64]]:
-        """Return the floor field of each stage that is reached around obstacles."""
+        """Return the floor field of each stage that agents reach by paths around obstacles."""
         table, size = scene.table_of(self), HEAD + row_size(2)
         blocks = [int(table[k * size]) for k, stage in enumerate(self.stages) if stage.around]
         return [table[at + 2 + row_size(2) :] for at in blocks]

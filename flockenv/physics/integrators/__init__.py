@@ -1,4 +1,4 @@
-"""Integrators, one method per file. To add one: write its file, and a row in tests/catalogue.py."""
+"""Integrators, one method per file; a new one needs a file, and a row in tests/catalogue.py."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Base of methods with adaptive substeps: the settings of their step-size control."""
+"""The base class of methods with adaptive substeps, with the settings of step-size control."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ __all__ = ["Adaptive"]
 
 
 class Adaptive(Integrator):
-    """A method that chooses substeps within dt, see `step_size`."""
+    """Base class of methods that choose substeps within dt, see `step_size`."""
 
     tolerance: float = Field(default=1e-4, gt=0, description="error of one substep, m and m/s, of the worst agent")
     least: float = Field(
-        default=0.0, ge=0, description="s, smallest substep; a world that needs a smaller one is given up"
+        default=0.0, ge=0, description="s, smallest substep; a world that needs a smaller one diverges"
     )
     most: int = Field(
-        default=100_000, ge=1, description="largest number of substeps within dt; a world that needs more is given up"
+        default=100_000, ge=1, description="largest number of substeps within dt; a world that needs more diverges"
     )
     adaptive: ClassVar[bool] = True

@@ -1,4 +1,4 @@
-"""Runge-Kutta of order 4 with adaptive substeps by step doubling: the result is that of the two half steps."""
+"""Runge-Kutta of order 4 with adaptive substeps by step doubling; the result is that of two half steps."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ __all__ = ["AdaptiveRK4"]
 
 
 def advance(provided: Provided) -> Method:
-    """Make `advance`: step doubling.
+    """Return the function `advance`, which compares one step with two half steps.
 
-    The two results are not extrapolated: that would amplify every oscillation.
-    The whole step, its first half, and the next try after a rejection begin with the same slope.
+    The two results are not extrapolated, as that would amplify every oscillation. The whole step, its first half, and
+    the next try after a rejection begin with the same slope.
     """
     acceleration, settings = provided.acceleration, provided.settings
     largest, count_substeps = provided.largest, provided.count_substeps

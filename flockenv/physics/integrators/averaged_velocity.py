@@ -12,7 +12,7 @@ __all__ = ["AveragedVelocity"]
 
 @kernel
 def move(x: float, v: float, a: float, dt: float) -> tuple[float, float]:
-    """Return x and v after x += h (v + v')/2 with v' = v + h a: exact under a constant force."""
+    """Return x + h (v + v')/2 and v' = v + h a, exact under a constant force."""
     new = v + dt * a
     return x + dt * like(dt, 0.5) * (v + new), new
 

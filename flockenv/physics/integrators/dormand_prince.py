@@ -32,7 +32,7 @@ ERRORS = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1
 
 
 def advance(provided: Provided) -> Method:
-    """Make `advance`: seven slopes, of which the last is the first of the next step.
+    """Return the function `advance` with seven slopes, of which the last is the first of the next step.
 
     Rows 2 to 8 of the stages are slopes of positions, rows 9 to 15 slopes of velocities.
     """

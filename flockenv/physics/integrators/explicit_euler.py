@@ -12,7 +12,7 @@ __all__ = ["ExplicitEuler"]
 
 @kernel
 def move(x: float, v: float, a: float, dt: float) -> tuple[float, float]:
-    """Return x and v after x += h v; v += h a, both from the old values."""
+    """Return x + h v and v + h a, both from the old values."""
     return x + dt * v, v + dt * a
 
 

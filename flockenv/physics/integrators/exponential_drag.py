@@ -22,7 +22,7 @@ INVERSE_FACTORIALS = (
 def phi_functions(z: float) -> tuple[float, float, float, float]:
     """Return exp z and phi1, phi2, phi3 for z <= 0: phi1 = (exp z - 1) / z, phi_(k+1) = (phi_k - 1/k!) / z, 1/k! at 0.
 
-    Computed from phi3 down near 0, where the quotients would lose digits, and from phi1 up elsewhere.
+    They are computed from phi3 down near 0, where the quotients would lose digits, and from phi1 up elsewhere.
     """
     o, e, half = like(z, 0.0), like(z, 1.0), like(z, 0.5)
     near = z >= -e
@@ -41,9 +41,9 @@ def phi_functions(z: float) -> tuple[float, float, float, float]:
 
 
 def advance(provided: Provided) -> Method:
-    """Make `advance`: ETD2RK of Cox and Matthews (2002).
+    """Return the function `advance`, ETD2RK of Cox and Matthews (2002).
 
-    It is the exact flow of x' = v, v' = -k v + a, with a first constant, then linear in t.
+    A step is the exact flow of x' = v, v' = -k v + a, with a constant at first, then linear in t.
 
     The correction, a1 - a0 times h^2 phi3 and h phi2, is split: -a0 after the first evaluation, +a1 after the second.
     """

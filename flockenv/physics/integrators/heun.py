@@ -1,4 +1,4 @@
-"""Heun's method: the explicit trapezoid."""
+"""Heun's method, the explicit trapezoidal rule."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["Heun"]
 
 
 def advance(provided: Provided) -> Method:
-    """Make `advance`: the mean of the slope here and the slope after an Euler step; one call, see rk4."""
+    """Return the function `advance`, with the mean of the present slope and that after an Euler step; see rk4."""
     acceleration = provided.acceleration
 
     def advance(

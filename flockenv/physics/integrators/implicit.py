@@ -1,4 +1,4 @@
-"""Base of implicit methods: one stage, solved by Newton's method in Python, and the step from it."""
+"""The base class of implicit methods with one stage, which Newton's method solves in Python."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MOST_HALVED = 3
 
 
 class Implicit(Integrator):
-    """A method with one implicit stage, at a fraction `share` of the step."""
+    """Base class of methods with one implicit stage, at a fraction `share` of the step."""
 
     share: ClassVar[float]
     """Time of the stage, in steps: 1 = the end (Euler), 1/2 = the middle."""
@@ -29,10 +29,10 @@ class Implicit(Integrator):
         self, evaluate: Evaluate, x: Floats, v: Floats, time: float, dt: float, dimension: int,
         coupling: Coupling | None,
     ) -> Stage:  # fmt: skip
-        """Return positions and velocities one step later, (D N,); raise newton.NotSolvedError if they are not found.
+        """Return positions and velocities one step later, (D N,); raise newton.NotSolvedError without a solution.
 
-        A step whose equations Newton's method does not solve is made in two halves, and each of those again if needed:
-        if forces jump, a solution may exist for one length of step and not for another.
+        A step whose equations Newton's method does not solve is halved, repeatedly if needed: if forces jump, a
+        solution may exist for one step length and not for another.
         """
         total, left = Stage(x, v, 0, 0, 0), [(time, dt, 0)]
         while left:
@@ -66,7 +66,7 @@ class Implicit(Integrator):
     def _step(
         self, law: Any, context: Any, x: Floats, v: Floats, flow: Any, time: float, dt: float, stages: Floats
     ) -> None:
-        """Advance one world under laws that are Python functions: the sparsity of the derivatives is unknown."""
+        """Advance one world under laws that are Python functions, with unknown sparsity of the derivatives."""
 
         def evaluate(pos: Floats, vel: Floats, when: float) -> tuple[Floats, Floats | None]:
             acc, advection = np.empty_like(pos), np.empty_like(pos)

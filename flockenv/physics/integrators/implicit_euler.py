@@ -13,7 +13,7 @@ __all__ = ["ImplicitEuler"]
 
 
 def advance(provided: Provided) -> Method:
-    """Make `advance`: copy positions from the first row of stages, velocities from the second."""
+    """Return the function `advance`, which copies positions from row 0 of stages, velocities from row 1."""
 
     def advance(
         context: Any, pos: Any, vel: Any, flow: Any, time: float, dt: float, stages: Any, first: int, end: int

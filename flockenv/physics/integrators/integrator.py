@@ -1,12 +1,12 @@
 """Integrator: (acceleration, state, dt) -> state. Laws are independent of the method that integrates them.
 
 Each method is one file. A method of one stage is a formula (`single_stage.py`). Any other is a section,
-`advance(provided)`. It makes `advance(context, pos, vel, flow, time, dt, stages, first, end)`, which calls the provided
-functions and updates, in place, the coordinates of one world, stored in one row. It writes only [first, end), because
-several threads may share a world, each with a range of its own. `flow` holds the velocity with which the medium carries
-all agents, as of the last acceleration; it is empty, and costs nothing, without a flow. With compiled functions
-(`engine/method.py`) it is a part of a scene's kernel; with Python functions the same code runs in Python, which is how
-its order is measured.
+`advance(provided)`. It returns `advance(context, pos, vel, flow, time, dt, stages, first, end)`, which calls the
+provided functions and updates, in place, the coordinates of one world, stored in one row. It writes only [first, end),
+because several threads may share a world, each with a range of its own. `flow` holds the velocity with which the medium
+carries all agents, as of the last acceleration; it is empty, and costs nothing, without a flow. With compiled functions
+(`engine/method.py`) it is a part of a scene's kernel; with Python functions the same code runs in Python, where its
+order is measured.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ INTEGRATORS: dict[str, type[Integrator]] = {}
 
 
 def carry(x: float, seconds: float, flow: Any, i: int) -> float:
-    """Return a coordinate x, carried for some seconds by the medium; x itself if `flow` is empty."""
+    """Return a coordinate x after the medium has carried it for some seconds; x itself if `flow` is empty."""
     return float(x + seconds * flow[i]) if len(flow) else x
 
 
@@ -49,7 +49,7 @@ def _carry(x, seconds, flow, i):  # type: ignore[no-untyped-def]  # numba compar
 
 
 class Alone(NamedTuple):
-    """The context of a world whose laws are Python functions."""
+    """Context of a world whose laws are Python functions."""
 
     drag: float | Floats = 0.0  # c / m, 1/s, one for all or one per coordinate (D N,)
     settings: tuple[float, ...] = ()  # of the method, see Integrator.settings
@@ -78,7 +78,7 @@ def _count_substeps(context: Any, accepted: int, rejected: int) -> None:
 
 
 class Provided(NamedTuple):
-    """The functions that a method calls: a scene's compiled ones, or by default those of a world `Alone`, in Python."""
+    """The functions that a method calls: compiled ones of a scene or, by default, Python ones of a world `Alone`."""
 
     acceleration: Callable[..., None]
     """(context, pos, vel, time, out): compute accelerations, once all threads have written their positions."""
@@ -133,7 +133,7 @@ class Integrator(Record):
             INTEGRATORS[kind] = cls
 
     def settings(self) -> tuple[float, ...]:
-        """Return the numbers passed to `advance`: its fields, in order."""
+        """Return the numbers passed to `advance`: the method's fields, in order."""
         return tuple(float(getattr(self, name)) for name in type(self).model_fields if name != "kind")
 
     @classmethod

@@ -13,7 +13,7 @@ __all__ = ["Midpoint"]
 
 
 def advance(provided: Provided) -> Method:
-    """Make `advance`: the slope half a step ahead, used for the whole step; one call, see rk4."""
+    """Return the function `advance`, which uses the slope half a step ahead for the whole step; see rk4."""
     acceleration = provided.acceleration
 
     def advance(

@@ -29,16 +29,16 @@ GMRES_TOLERANCE = 1e-4
 
 
 class NotSolvedError(ArithmeticError):
-    """Newton's method has not converged."""
+    """Error that Newton's method has not converged."""
 
     def __init__(self, reason: str, left: Rows | None = None) -> None:
-        """left: the residual, (D N,); None if unknown."""
+        """Store the reason and the worst coordinate of the residual `left`, (D N,); None if unknown."""
         super().__init__(reason)
         self.place = None if left is None else int(np.argmax(np.abs(left)))  # the first NaN, or the worst
 
 
 class Stage(NamedTuple):
-    """The solution of a stage, and the work it took."""
+    """The solution of a stage, and the work to compute it."""
 
     x: Rows  # (D N,)
     v: Rows  # (D N,)
@@ -50,7 +50,7 @@ class Stage(NamedTuple):
 
 @dataclass(frozen=True)
 class Coupling:
-    """Which agents' accelerations depend on which agents, as a sparse matrix, and a colouring for the differences."""
+    """Pairs of agents of which one's acceleration depends on the other, and a colouring for finite differences."""
 
     row: NDArray[np.int64]  # (P,) the agent that is accelerated
     column: NDArray[np.int64]  # (P,) the agent on whose position it depends
@@ -64,7 +64,7 @@ class Coupling:
 
 def coupling_between(agents: int, first: NDArray[np.integer[Any]], second: NDArray[np.integer[Any]]) -> Coupling:
     """Return the coupling in which each agent depends on itself, and `first` on `second`, (R,) each."""
-    from scipy import sparse  # here: loading takes a third of a second, needed by implicit methods alone
+    from scipy import sparse  # slow to import (0.3 s), and used only by implicit methods
 
     own = np.arange(agents)
     ones = np.ones(agents + len(first))
@@ -86,7 +86,7 @@ class _Residual:
         self.evaluate, self.x0, self.v0, self.time, self.h = evaluate, x0, v0, time, h
 
     def motion(self, w: Rows) -> tuple[Rows, Rows]:
-        """Return positions and own velocities."""
+        """Return the positions and own velocities at w."""
         x = self.x0 + self.h * w
         flow = self.evaluate(x, w, self.time)[1] if self.flows else None
         return x, w if flow is None else w - flow
@@ -129,14 +129,14 @@ def solve_stage(
 
 
 class _SingularError(ArithmeticError):
-    """Corrections vanish although the residual does not: derivatives are unbounded."""
+    """Error that corrections vanish although the residual does not, as derivatives are unbounded."""
 
 
 def _solve_newton(residual: _Residual, w: Rows, dimension: int, coupling: Coupling | None) -> Stage:
     """Return the solution of Newton's method from a first guess.
 
-    It ends when a correction is at rounding, relative to the velocities, or stops shrinking near it; a correction that
-    does not reduce the next one is halved.
+    It ends when a correction is as small as rounding, relative to the velocities, or stops shrinking near that; a
+    correction that does not reduce the next one is halved.
     """
     rounding, linear = float(np.finfo(w.dtype).eps), 0
     r = residual(w[None])[0]
@@ -173,9 +173,9 @@ def _solve_newton(residual: _Residual, w: Rows, dimension: int, coupling: Coupli
 def _search_along(
     residual: _Residual, w: Rows, correction: Rows, solve: Callable[[Rows], tuple[Rows, int]]
 ) -> tuple[Rows, Rows, int]:
-    """Return the next w and R, and the linear iterations: the correction is halved until the next one is smaller.
+    """Return the next w and R, and the number of linear iterations; halve the correction until the next is smaller.
 
-    Corrections with the same derivatives are compared, not residuals: those of stiff springs say little about the
+    Corrections with the same derivatives are compared, not residuals, which for stiff springs are no measure of the
     distance from the solution (the natural monotonicity test of Deuflhard 2004, section 3.3).
     """
     share, took, size = 1.0, 0, float(np.linalg.norm(correction))
@@ -188,7 +188,7 @@ def _search_along(
             if float(np.linalg.norm(left)) <= (1 - share / 4) * size:
                 break
         share /= 2
-    return new, r_new, took  # the best found; the next correction shows if it is enough
+    return new, r_new, took  # the best so far; the next correction shows if it suffices
 
 
 def _difference_step(w: Rows) -> float:

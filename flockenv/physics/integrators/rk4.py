@@ -13,9 +13,9 @@ __all__ = ["RK4"]
 
 
 def advance(provided: Provided) -> Method:
-    """Make `advance`: four slopes, weighted 1, 2, 2, 1, each at a stage reached by the slope before.
+    """Return the function `advance`: four slopes, weighted 1, 2, 2, 1, each at a stage reached by the one before.
 
-    The acceleration is called in one place, so that it is compiled once and not four times.
+    The acceleration is called in one place of the code, so that it is compiled once and not four times.
     """
     acceleration = provided.acceleration
 

@@ -12,7 +12,7 @@ __all__ = ["SemiImplicitEuler"]
 
 @kernel
 def move(x: float, v: float, a: float, dt: float) -> tuple[float, float]:
-    """Return x and v after v += h a; x += h v, with the new v."""
+    """Return x + h v' and v' = v + h a."""
     v = v + dt * a
     return x + dt * v, v
 

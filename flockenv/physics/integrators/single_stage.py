@@ -1,4 +1,4 @@
-"""Base of methods of one stage: one evaluation, at the present, and a formula for each coordinate."""
+"""The base class of methods with one evaluation, at the present, and a formula for each coordinate."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["OneStage"]
 
 
 class OneStage(Integrator):
-    """A method of one formula, `move(x, v, a, dt)`: a coordinate and its velocity one step later."""
+    """Base class of methods of one formula, `move(x, v, a, dt)`: a coordinate and its velocity one step later."""
 
     stages: ClassVar[int] = 0
     evaluations: ClassVar[int] = 1

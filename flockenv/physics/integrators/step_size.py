@@ -1,15 +1,15 @@
-"""Step-size control: substeps as long as the error allows, the last one ending with the step of the scene.
+"""Step-size control: substeps as long as the error allows, the last of which ends with the scene's step.
 
 The error is the distance between two results, of position and velocity together (m and m/s alike), of the worst agent;
-it is absolute, and excludes what may be rounding of a coordinate. The next substep is
-h clip(0.9 (tolerance / error)^(1 / (p + 1)), 0.2, 5), after an accepted substep as after a rejected one.
+it is absolute, and excludes differences that may be rounding of a coordinate. The next substep is h clip(0.9 (tolerance
+/ error)^(1 / (p + 1)), 0.2, 5), after accepted and after rejected substeps.
 
 Two more rules are for forces that jump, whose error falls as h and not as h^(p + 1): a second rejection in a row
 reduces the substep to a fifth, and until the clock reaches the end of the last rejected substep no substep is longer
 than the one before. So a jump costs one rejection for each factor of 5 between the substeps before it and across it.
 
-A world is given up, by a NaN coordinate, after TRIES rejections in a row, if a substep shorter than `least` is needed,
-if a substep does not move the clock, and if `most` substeps have not reached the end.
+A world is given up as diverged, by a NaN coordinate, after TRIES rejections in a row, if a substep shorter than `least`
+is needed, if a substep does not advance the time, or if `most` substeps have not reached the end.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Clock(NamedTuple):
     done: float  # s, since its beginning
     step: float  # s, to be tried next
     wary: float  # s, end of the last rejected substep
-    tries: int  # in a row, rejected
+    tries: int  # number of rejections in a row
     accepted: int
     rejected: int
     lost: bool  # given up
@@ -51,13 +51,13 @@ class Clock(NamedTuple):
 
 @shared
 def initial_clock(dt: float) -> Clock:
-    """Return the clock at the beginning of a step of the scene: the first substep is the whole step."""
+    """Return the clock at the beginning of a scene's step; the first substep is the whole step."""
     return Clock(like(dt, 0.0), dt, like(dt, 0.0), 0, 0, 0, False)
 
 
 @shared
 def excess_square(difference: float, size: float, tiny: float) -> float:
-    """Return the square of a difference, less the rounding of a number of that size; NaN stays NaN."""
+    """Return the square of a difference minus the rounding of a number of that size; NaN stays NaN."""
     beyond = abs(difference) - tiny * abs(size)
     return like(beyond, 0.0) if beyond <= like(beyond, 0.0) else beyond * beyond
 
@@ -98,7 +98,7 @@ def next_clock(clock: Clock, error: float, limits: tuple[float, ...], dt: float,
 
 @shared
 def copy(to_x: Any, to_v: Any, x: Any, v: Any, first: int, end: int) -> None:
-    """Copy: to = (x, v)."""
+    """Copy positions and velocities: to = (x, v)."""
     for i in range(np.uint64(first), np.uint64(end)):
         to_x[i], to_v[i] = x[i], v[i]
 
@@ -112,7 +112,7 @@ def slope_of(x: Any, v: Any, flow: Any, first: int, end: int) -> None:
 
 @shared
 def add_slopes(x: Any, v: Any, weight: float, slope: Any, a: Any, first: int, end: int) -> None:
-    """Add: (x, v) += weight (slope, a)."""
+    """Add a weighted slope: (x, v) += weight (slope, a)."""
     for i in range(np.uint64(first), np.uint64(end)):
         x[i] += weight * slope[i]
         v[i] += weight * a[i]
@@ -120,7 +120,7 @@ def add_slopes(x: Any, v: Any, weight: float, slope: Any, a: Any, first: int, en
 
 @shared
 def write_errors(squares: Any, x: Any, v: Any, other_x: Any, other_v: Any, first: int, end: int) -> None:
-    """Write the squared difference of two results beyond rounding, per coordinate; `squares` may be other_x."""
+    """Write the squared difference of two results, minus rounding, per coordinate; `squares` may be other_x."""
     tiny = like(x[0], 8 * np.finfo(x.dtype).eps)
     for i in range(np.uint64(first), np.uint64(end)):
         squares[i] = excess_square(x[i] - other_x[i], x[i], tiny) + excess_square(v[i] - other_v[i], v[i], tiny)

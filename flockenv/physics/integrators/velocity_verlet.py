@@ -13,9 +13,9 @@ __all__ = ["VelocityVerlet"]
 
 
 def advance(provided: Provided) -> Method:
-    """Make `advance`: half a kick, a drift, half a kick.
+    """Return the function `advance`: half a kick, a drift, half a kick.
 
-    The second force is evaluated at a predicted velocity: with the old one drag would reduce the order to 1.
+    The second force is evaluated at a predicted velocity, as with the old one drag would reduce the order to 1.
     """
     acceleration = provided.acceleration
 

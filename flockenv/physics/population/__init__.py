@@ -1,7 +1,7 @@
-"""Populations: births and deaths of agents in a fixed table of slots, some of which hold a living agent.
+"""Populations: births and deaths of agents in a fixed number of slots, some of which hold a living agent.
 
-A group has `count` slots. An emitter fills its free slots with new agents, and a sink removes living ones; a slot that
-is used again holds another agent, with an identity and a time of birth of its own.
+A group has `count` slots. An emitter fills its free slots with new agents, and a sink removes living ones; a reused
+slot holds another agent, with an identity and a time of birth of its own.
 """
 
 from __future__ import annotations

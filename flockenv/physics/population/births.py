@@ -1,4 +1,4 @@
-"""Births of all worlds in one call: those that are due, with slot, place, velocity and lifetime.
+"""Births that are due, in all worlds in one call, with slot, position, velocity and lifetime.
 
 A row of `streams` is an emitter's rate, or one of its bursts: first slot, one past the last slot; start and end, s;
 rate, 1/s; size of the burst; speed from, to, m/s; spread, rad; 1 if along the normal; direction (3); lifetime from, to,
@@ -37,7 +37,7 @@ PLACE = 17
 
 @kernel
 def births_due(row: Any, time: float, dt: float) -> int:
-    """Return the number of births of a stream until `time`, s; one that is due then, within rounding, counts."""
+    """Return the number of births of a stream until `time`, s, those due then (within rounding) included."""
     if row[4] == 0.0:
         return int(row[5]) if time + 1e-9 * dt >= row[2] else 0
     expected = row[4] * (min(time, row[3]) - row[2])
@@ -52,7 +52,7 @@ def _draw(key: Any, who: int, channel: int) -> Vec:
 
 @law
 def _three_numbers(row: Any, at: int) -> Vec:
-    """Return three numbers of a row, from index `at`, as a vector."""
+    """Return the three numbers of a row from index `at` on as a vector."""
     return row[at], row[at + 1], row[at + 2]
 
 
@@ -64,7 +64,7 @@ def _perpendicular(axis: Vec) -> Vec:
 
 @law
 def _turn_about(axis: Vec, turn: float) -> Vec:
-    """Return the unit vector perpendicular to an axis, turned about it by `turn`, rad."""
+    """Return a unit vector perpendicular to an axis, turned about the axis by `turn`, rad."""
     u = _perpendicular(axis)
     return add(scale(u, math.cos(turn)), scale(cross(axis, u), math.sin(turn)))
 
@@ -104,7 +104,7 @@ def _point_on_round(piece: Any, flat: bool, s: float, t: float) -> tuple[Vec, Ve
 
 @law
 def _is_within(piece: Any, spot: Vec) -> bool:
-    """Return True if a point lies inside a segment of a thick line, not on its surface."""
+    """Return True if a point lies inside a segment of a thick line, but not on its surface."""
     line, to_spot = sub(_three_numbers(piece, 5), _three_numbers(piece, 2)), sub(spot, _three_numbers(piece, 2))
     square = dot(line, line)
     share = min(max(dot(line, to_spot) / square, 0.0), 1.0) if square > 0.0 else 0.0
@@ -165,7 +165,7 @@ def _point_in_clearing(
     x: Any, b: int, row: Any, key: Any, who: int, channel: int, period: Any, grid: Any, start: Any, order: Any,
     born: Any, identity: Any,
 ) -> Vec:  # fmt: skip
-    """Return, of points drawn in a box, the one with the fewest living agents around it; the first of equals."""
+    """Return the point with the fewest living agents around it, of several drawn in a box; of equals, the first."""
     best: Vec = (0.0, 0.0, 0.0)
     fewest = 2**62
     for attempt in range(int(row[PLACE + 7])):
@@ -178,7 +178,7 @@ def _point_in_clearing(
 
 @kernel
 def _wrap_or_clamp(walls: bool, period: Any, size: float, radius: float, p: float) -> float:
-    """Return a coordinate wrapped to a periodic axis, or clamped between walls."""
+    """Return a coordinate wrapped along a periodic axis, or clamped between walls."""
     if period > 0.0:
         inside = p - period * math.floor(p / period)
         return 0.0 if inside >= period else inside
@@ -190,7 +190,7 @@ def _birth_place(
     d: int, row: Any, pieces: Any, x: Any, b: int, key: Any, who: int, channel: int, period: Any, grid: Any, start: Any,
     order: Any, born: Any, identity: Any,
 ) -> tuple[Vec, Vec]:  # fmt: skip
-    """Return the place of a birth, and its direction: that of the row, or the outward normal of a surface."""
+    """Return the position of a birth, and the direction of the row or the outward normal of a surface."""
     draws, aim = _draw(key, who, channel), _three_numbers(row, 10)
     if row[16] <= 1.0:
         return _point_in_box(row, (draws[0], draws[0], draws[0])), aim
@@ -214,9 +214,9 @@ def create_births(
 ) -> None:  # fmt: skip
     """Create the agents that are due in the step that ends now, or at the start, in worlds [first, end).
 
-    clearing: m, the largest radius within which neighbours are counted; if no place counts any, grid, cell, start and
-    order are None, and no code for it is compiled. walls: True if the space is a box of `size` (3,) m. period (3,) m: 0
-    for axes that are not periodic.
+    clearing: m, the largest radius within which neighbours are counted; if no place counts neighbours, grid, cell,
+    start and order are None, and no code for them is compiled. walls: True if the space is a box of `size` (3,) m.
+    period (3,) m: 0 for axes that are not periodic.
     """
     n, kinds = x.shape[2], streams.shape[0]
     for b in range(first, end):
@@ -229,7 +229,7 @@ def create_births(
                 if after > before and not sorted_:
                     sort_living(x, alive, b, 0, n, clearing, period, grid, cell, start, order)
                     sorted_ = True
-            # streams of a group are consecutive, and each continues at the slot where the last one ended
+            # streams of a group are consecutive, and each continues at the slot where the previous one ended
             if until != int(row[1]):
                 slot, until = int(row[0]), int(row[1])
             slot = _create_agents(

@@ -1,7 +1,7 @@
-"""Deaths of all worlds in one call for each sink: by age, on leaving a region, by chance, in a drain, in a crowd.
+"""Deaths in all worlds, one call for each sink: by age, region, chance, drain, crowd or threshold.
 
-Each sink selects among all agents that are alive when its turn comes, before it removes any: the result does not
-depend on the order of agents.
+Each sink first selects among all agents that are then alive, and then removes them, so that the result does not depend
+on the order of agents.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ DECAY = 2_000_000
 
 @kernel
 def _remove(b: int, i: int, v: Any, alive: Any, work: Any) -> None:
-    """Remove an agent: its slot becomes free, and keeps the place of death and the identity."""
+    """Remove an agent: its slot becomes free, but keeps the position of death and the identity."""
     alive[b, i] = False
     for k in range(v.shape[0]):
         v[k, b, i] = 0
@@ -37,9 +37,9 @@ def _remove(b: int, i: int, v: Any, alive: Any, work: Any) -> None:
 
 @law
 def _chance(rate: float, usual: float, born: float, now: float, dt: float) -> float:
-    """Return the probability that an agent died since the sinks last acted; `usual`: in a step, 1 - exp(-rate dt).
+    """Return the probability of death since the last draw; `usual`: that of a whole step, 1 - exp(-rate dt).
 
-    For an agent that was born within the previous step this is the first draw: it covers its time since birth.
+    For an agent born within the previous step this is the first draw, which covers the time since birth.
     """
     late = born > now - (2.0 - 1e-6) * dt and born < now - dt
     return 1.0 - math.exp(-rate * (now - born)) if late else usual
@@ -50,7 +50,7 @@ def remove_expired(
     sinks: Any, x: Any, v: Any, alive: Any, identity: Any, born: Any, dies: Any, tick: Any, key: Any, work: Any,
     dt: float, first: int, end: int, channel: int,
 ) -> None:  # fmt: skip
-    """Remove agents at the end of their own lifetime, then by sinks of age, region and chance; worlds [first, end).
+    """Remove agents of worlds [first, end) whose lifetime is over, then those that sinks of age, region, chance select.
 
     sinks: a row each: kind (0 age, 1 region, 2 chance), first slot, one past the last slot, parameters.
     """
@@ -83,7 +83,7 @@ def remove_drained(
     table: Any, margin: float, slots: Any, anchor: Vec, period: Vec, x0: Any, x: Any, v: Any, alive: Any, tick: Any,
     work: Any, dt: float, first: int, end: int,
 ) -> None:  # fmt: skip
-    """Remove agents inside a shape, and those that crossed it during the step that began at x0.
+    """Remove agents that are inside a shape, or have crossed it during the step that began at x0.
 
     table: the shape's row (see shapes/table.py); slots: (first, end); anchor, period: (D,) m, the latter 0 for axes
     that are not periodic. If the shape moves, paths are relative to it.

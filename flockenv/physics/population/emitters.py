@@ -1,8 +1,8 @@
 """Emitters: the places, times and velocities at which agents are created.
 
 The time of a birth is independent of dt: agent k of an emitter with a rate is born at start + (k + 1) / rate. Its
-place, velocity and lifetime are functions of the world's key and its identity. So another dt, another order or another
-number of threads gives the same births.
+position, velocity and lifetime are functions of the world's key and its identity. So births are the same for any dt,
+order of agents and number of threads.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ Range = tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]]
 class Burst(Record):
     """A number of births at one time."""
 
-    time: float = Field(ge=0, description="s since the start")
+    time: float = Field(ge=0, description="s, time since the start")
     count: int = Field(ge=1, le=2**24, description="number of births")
 
 
 class Emitter(Member):
-    """Creates agents in free slots of a group, at a rate, in bursts, or both; a rate gives floor(rate T) in T seconds.
+    """Agents are created in free slots of a group, at a rate (floor(rate T) in T seconds), in bursts, or both.
 
     An agent born within a step moves with its velocity for the rest of it; forces act from the next step on. If no
     slot is free, a birth is skipped and counted as refused. All slots but the first `alive` of the group start free.
@@ -46,16 +46,16 @@ class Emitter(Member):
     rate: float = Field(default=0.0, ge=0, le=MOST_RATE, description="1/s")
     start: float = Field(default=0.0, ge=0, description="s, time at which the rate begins")
     end: float | None = Field(default=None, gt=0, description="s, time at which the rate ends (default: never)")
-    bursts: tuple[Burst, ...] = Field(default=(), description="numbers of births at given times")
+    bursts: tuple[Burst, ...] = Field(default=(), description="several births at given times")
     together: bool = Field(default=False, description="True if all agents of a burst are born at one point")
-    speed: Range = Field(default=(0.0, 0.0), description="m/s, least and most")
+    speed: Range = Field(default=(0.0, 0.0), description="m/s, least and greatest")
     direction: Vector | None = Field(
-        default=None, description="of the velocity (default: any, or the outward normal of a surface)"
+        default=None, description="direction of the velocity (default: any, or the outward normal of a surface)"
     )
     spread: float | None = Field(
-        default=None, ge=0, le=180, description="degrees to any side of the direction (default: 0 if there is one)"
+        default=None, ge=0, le=180, description="degrees, largest angle with the direction (default: 0 if there is one)"
     )
-    lifetime: Range | None = Field(default=None, description="s, least and most (default: no limit)")
+    lifetime: Range | None = Field(default=None, description="s, least and greatest lifetime (default: no limit)")
 
     @model_validator(mode="after")
     def _check_ranges(self) -> Emitter:
@@ -77,11 +77,11 @@ class Emitter(Member):
         return self
 
     def feeds(self, group: int) -> bool:
-        """Return True if it creates agents of this group."""
+        """Return True if the member creates agents of this group."""
         return group == self.group
 
     def check(self, scene: SceneView) -> None:
-        """Raise ValueError if the group or the place does not suit, or a speed exceeds the group's limit."""
+        """Raise ValueError if group or place are invalid in the scene, or a speed exceeds the group's limit."""
         demand_group(scene, self.group)
         group = scene.groups[self.group]
         if group.network is not None:

@@ -1,4 +1,4 @@
-"""A scene's population as arrays, and its update at the end of every step: first deaths, then births."""
+"""The population of a scene as arrays, and its update at the end of every step: first deaths, then births."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Part = Callable[[Floats, State, int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class _Scratch:
-    """Scratch memory of one thread, which is not read afterwards."""
+    """Scratch memory of one thread."""
 
     grid: NDArray[np.float64]  # (4, 3) corner, edges, cells, cells per metre
     cell: NDArray[np.int32]  # (N,)
@@ -49,7 +49,7 @@ class _Scratch:
 
 
 def _space_size(scene: SceneView, there: bool) -> NDArray[np.float64]:
-    """Return the size of the space, (3,) m; zeros unless `there`."""
+    """Return the size of the space, (3,) m, if `there` is set, else zeros."""
     size = np.zeros(3)
     if there:
         size[: scene.dimension] = scene.space.extent(scene.dimension)
@@ -61,7 +61,7 @@ def _period(scene: SceneView) -> NDArray[np.float64]:
 
 
 def _streams(scene: SceneView) -> tuple[Floats, Floats, float]:
-    """Return a row per rate and burst, by group; the pieces of surfaces; and the largest radius of clearings, m."""
+    """Return a row for each rate and burst, by group; the pieces of surfaces; the largest radius of clearings, m."""
     emitters = sorted((m for m in scene.population if isinstance(m, Emitter)), key=lambda m: m.group)
     found: list[list[float]] = []
     pieces: list[Floats] = [np.zeros((0, 14))]
@@ -159,7 +159,7 @@ def _counts_agents(scene: SceneView) -> bool:
 
 
 def _parts(scene: SceneView) -> list[Part]:
-    """Return the functions of the end of a step: lifetimes, then sinks in the scene's order, then births."""
+    """Return the functions to call at the end of a step: lifetimes, sinks in the scene's order, births."""
     scratch = _Scratch.of(scene.agents, _counts_agents(scene))
     emits = any(isinstance(member, Emitter) for member in scene.population)
     mortal = any(isinstance(m, Emitter) and m.lifetime is not None for m in scene.population)

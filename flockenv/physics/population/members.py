@@ -1,4 +1,4 @@
-"""Member: one line of a scene's population, an emitter or a sink."""
+"""Member: one record of a scene's population, an emitter or a sink."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Member(Record):
         """Raise ValueError, beginning with the field's name, if the scene does not suit this member."""
 
     def feeds(self, group: int) -> bool:
-        """Return True if it creates agents of this group."""
+        """Return True if the member creates agents of this group."""
         return False
 
 

@@ -1,7 +1,7 @@
-"""Counts of living agents near a place: a cell list of the agents of one world, for sinks and clearings only.
+"""Counts of living agents near a position, by a cell list of one world, for sinks and clearings only.
 
-Effects have a query of their own, over blocks of SIMD lanes, before a step. This one runs at the end of a step, its
-places need not be agents, and most scenes never use it.
+Effects have a query of their own, over blocks of SIMD lanes, before a step. This one runs at the end of a step, for any
+positions, and most scenes do not use it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ __all__ = ["count_near", "sort_living"]
 
 @kernel
 def _wrap(p: float, size: float) -> float:
-    """Return a coordinate of a periodic axis wrapped to [0, size); unchanged if size is 0."""
+    """Return a coordinate wrapped into [0, size); unchanged if size is 0, for an axis that is not periodic."""
     return p - size * math.floor(p / size) if size > 0.0 else p
 
 
@@ -37,7 +37,7 @@ def _bounds(x: Any, alive: Any, b: int, first: int, end: int, period: Any, grid:
 
 @kernel
 def _divide_cells(d: int, reach: float, most: int, grid: Any) -> int:
-    """Write cells per axis, grid[2], each at least `reach` wide, and at most `most` in all; return their number."""
+    """Write the number of cells per axis, grid[2], each at least `reach` wide; return their number, at most `most`."""
     for k in range(3):
         grid[2, k] = 1.0
     for k in range(d):
@@ -101,7 +101,7 @@ def sort_living(
 
 @kernel
 def _neighbour_cell(c: int, turn: int, count: int, periodic: bool) -> int:
-    """Return one of up to three cells along an axis, c - 1 to c + 1 by `turn` 0 to 2; -1 if there is none."""
+    """Return cell c - 1, c or c + 1 along an axis, for `turn` 0, 1 or 2; -1 if there is none."""
     if periodic:
         if turn >= count:  # each of one or two cells is visited once
             return -1
@@ -115,9 +115,9 @@ def count_near(
     x: Any, b: int, place: Any, reach: float, most: int, period: Any, grid: Any, start: Any, order: Any, born: Any,
     identity: Any, elder_than: int,
 ) -> int:  # fmt: skip
-    """Return how many of the listed agents are within `reach` of a place (3,), m; counting stops at `most` + 1.
+    """Return the number of listed agents within `reach` of a position (3,), m; counting stops at `most` + 1.
 
-    elder_than: a slot, if only agents born before its agent count (of two born at the same time, the one of lower
+    elder_than: a slot, to count only agents born before its agent (of two born at the same time, the one of lower
     identity is the elder); -1 = all.
     """
     d, found = x.shape[0], 0

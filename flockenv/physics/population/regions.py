@@ -31,7 +31,7 @@ def three_numbers(vector: Sequence[float]) -> list[float]:
 
 
 class Place(Record):
-    """A place of births, uniform over all its points."""
+    """Base class of places of births, which are uniform over all points."""
 
     kind: str
     code: ClassVar[int]
@@ -39,12 +39,12 @@ class Place(Record):
 
     @abstractmethod
     def row(self) -> list[float]:
-        """Return its numbers, as births.py reads them."""
+        """Return the numbers of the place for births.py."""
 
     @property
     @abstractmethod
     def extremes(self) -> Floats:
-        """Points whose bounding box contains it, (n, D) m."""
+        """Points whose bounding box contains the place, (n, D) m."""
 
     def pieces(self) -> Floats:
         """Return the pieces of a surface, (n, 14); see surface.py."""
@@ -55,14 +55,14 @@ class Place(Record):
 
 
 class Point(Place):
-    """A point."""
+    """A point, as a place of births."""
 
     kind: Literal["point"] = "point"
     code: ClassVar[int] = 0
     at: Vector = Field(description="m")
 
     def row(self) -> list[float]:
-        """Return the point, twice: as both ends of a segment."""
+        """Return the point twice, as the ends of a segment."""
         return three_numbers(self.at) * 2
 
     @property
@@ -84,12 +84,12 @@ class Segment(Place):
     end: Vector = Field(description="m")
 
     def row(self) -> list[float]:
-        """Return its ends."""
+        """Return both ends."""
         return three_numbers(self.start) + three_numbers(self.end)
 
     @property
     def extremes(self) -> Floats:
-        """Its ends."""
+        """Both ends."""
         return np.array([self.start, self.end])
 
     def check(self, scene: SceneView) -> None:
@@ -98,7 +98,7 @@ class Segment(Place):
 
 
 class Disc(Place):
-    """A disc; in 3-D a ball, or with an axis the flat disc across it."""
+    """A disc; in 3-D a ball, or with an axis the flat disc perpendicular to it."""
 
     kind: Literal["disc"] = "disc"
     code: ClassVar[int] = 2
@@ -130,7 +130,7 @@ class Disc(Place):
 
 
 class _Corners(Place):
-    """The box between two corners."""
+    """Base class of places that have the shape of a box."""
 
     low: Vector = Field(description="m, lower corner")
     high: Vector = Field(description="m, upper corner")
@@ -142,12 +142,12 @@ class _Corners(Place):
         return self
 
     def row(self) -> list[float]:
-        """Return its corners."""
+        """Return both corners."""
         return three_numbers(self.low) + three_numbers(self.high)
 
     @property
     def extremes(self) -> Floats:
-        """Its corners."""
+        """Both corners."""
         return np.array([self.low, self.high])
 
     def check(self, scene: SceneView) -> None:
@@ -156,7 +156,7 @@ class _Corners(Place):
 
 
 class BoxPlace(_Corners):
-    """A box along the axes."""
+    """An axis-aligned box."""
 
     kind: Literal["box"] = "box"
     code: ClassVar[int] = 3
@@ -167,10 +167,10 @@ class Surface(Place):
 
     kind: Literal["surface"] = "surface"
     code: ClassVar[int] = 4
-    shape: AnyShape = Field(description="a shape, as of an obstacle; it need not be one")
+    shape: AnyShape = Field(description="a shape, with the fields of an obstacle")
 
     def row(self) -> list[float]:
-        """Return an empty list: its pieces describe it."""
+        """Return no numbers, as the pieces describe the surface."""
         return []
 
     @property
@@ -195,15 +195,15 @@ class Surface(Place):
 
 
 class Clearing(_Corners):
-    """A clearing in a box: of some points drawn at random, the one with the fewest living agents around it."""
+    """A clearing in a box: the point with the fewest living agents around it, of some drawn at random."""
 
     kind: Literal["clearing"] = "clearing"
     code: ClassVar[int] = 5
     radius: float = Field(gt=0, description="m, radius within which neighbours count")
-    candidates: int = Field(default=8, ge=1, le=64, description="points that are drawn for each birth")
+    candidates: int = Field(default=8, ge=1, le=64, description="number of points that are drawn for each birth")
 
     def row(self) -> list[float]:
-        """Return its corners, the radius of its count and the number of draws."""
+        """Return the corners, the radius and the number of draws."""
         return [*super().row(), self.radius, float(self.candidates)]
 
 

@@ -1,4 +1,4 @@
-"""Sinks: conditions under which agents die. Each selects among all agents that are alive when its turn comes."""
+"""Sinks: conditions under which agents die, applied one after another to the agents that are still alive."""
 
 from __future__ import annotations
 
@@ -86,15 +86,15 @@ class Decay(Sink):
 
 
 class Drain(Sink):
-    """Removes agents inside a shape, and those that crossed it during the step.
+    """Agents die that are inside a shape, or have crossed it during the step.
 
-    The centre of an agent counts; it dies at a distance of at most `margin` from the shape.
+    An agent counts as inside if its centre is at most `margin` from the shape.
     """
 
     kind: Literal["drain"] = "drain"
     code: ClassVar[int] = 3
     looks_back: ClassVar[bool] = True
-    shape: AnyShape = Field(description="a shape, as of an obstacle; it need not be one")
+    shape: AnyShape = Field(description="a shape, with the fields of an obstacle")
     margin: float = Field(default=0.0, ge=0, description="m")
 
     def row(self) -> list[float]:
@@ -114,10 +114,10 @@ class Drain(Sink):
 
 
 class Crowding(Sink):
-    """Removes the youngest agents of a dense crowd: those that have more than `most` elders within a radius.
+    """The youngest agents of a dense crowd die: those that have more than `most` elders within a radius.
 
     Elders are agents of the same group (or of all) that were born earlier. With a rate, such agents die at random;
-    without, at once.
+    without one, at once.
     """
 
     kind: Literal["crowding"] = "crowding"
@@ -141,12 +141,12 @@ class Crowding(Sink):
 
 
 class Threshold(Sink):
-    """Removes agents whose inner number is at least a level: starved at a hunger of 1, caught."""
+    """Agents die whose inner number is at least a level, for example at a hunger of 1."""
 
     kind: Literal["threshold"] = "threshold"
     code: ClassVar[int] = 5
     of: str = Field(min_length=1, description="name of the inner number, which an effect keeps")
-    level: float = Field(default=1.0, description="the agent dies at this value and above")
+    level: float = Field(default=1.0, description="value at and above which an agent dies")
 
     def row(self) -> list[float]:
         """Return the level."""

@@ -1,9 +1,8 @@
 """Surfaces as pieces from which points can be drawn, with a probability proportional to their size.
 
-A piece is 14 numbers: the cumulative size of it and all before it (m in 2-D, m^2 in 3-D); 0 if it is flat, 1 if it is
-the side of a tube, 2 if it is the two ends of a tube or a ball; then the geometry. Flat: a corner, the two edges from
-there (one in 2-D), and a sign: the side of the edges that is outside. Round: both ends of the tube's line, and its
-radius.
+A piece has 14 numbers: the cumulative size of all pieces up to it (m in 2-D, m^2 in 3-D); 0 if it is flat, 1 for the
+side of a tube, 2 for the two ends of a tube or a ball; then the geometry. Flat: a corner, the two edges from there (one
+in 2-D), and a sign for the outer side. Round: both ends of the tube's line, and its radius.
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ def _polygon(shape: Any) -> list[list[float]]:
 def _block(shape: Any) -> list[list[float]]:
     """Return the edges of a rectangle, or the faces of a box."""
     d, centre = shape.dimension, np.array(shape.centre)
-    edges = shape.axes * np.array(shape.size)[:, None]  # a row each
+    edges = shape.axes * np.array(shape.size)[:, None]  # one row each
     found = []
     for k in range(d):
         others = [edges[j] for j in range(d) if j != k]
