@@ -23,7 +23,7 @@ __all__ = ["LEFTOVERS", "new_folder", "remove_leftovers", "replace_file", "write
 _PREFIX, _SUFFIX = ".flockenv-", ".part"
 
 LEFTOVERS = f"{_PREFIX}*{_SUFFIX}"
-"""Glob of the temporary folders in which files are written; one that is left over is from a killed process."""
+"""Glob of the temporary folders in which files are written; killed processes leave them behind."""
 
 
 @contextmanager

@@ -31,7 +31,7 @@ def _is_beside_flockenv(package: str) -> bool:
 
 
 def _block() -> set[int] | None:
-    """Block the signals of a command; return the previously blocked ones, None if nothing was changed."""
+    """Block the signals that commands handle; return those blocked before, or None if nothing was changed."""
     if os.name != "posix" or not command():
         return None
     return set(_signal.pthread_sigmask(_signal.SIG_BLOCK, (_signal.SIGINT, _signal.SIGTERM, _signal.SIGHUP)))

@@ -44,7 +44,7 @@ AGAIN = 0.02
 """Seconds between two attempts to raise KeyboardInterrupt."""
 
 ONE_PRESS = 0.3
-"""Signals within this number of seconds count as one: a terminal and a wrapper may each send their own."""
+"""Signals within this number of seconds count as one, as a terminal and a wrapper may each send one."""
 
 SIGNALS = {"SIGINT": "interrupted", "SIGTERM": "terminated", "SIGHUP": "terminated: the terminal was closed"}
 """Handled signals, if the system has them, and the text of their line on stderr."""
@@ -77,7 +77,7 @@ class _Received:
 
 
 _ending = _thread.RLock()
-"""Held by the thread that ends the process; any other thread that tries to waits until the process is gone."""
+"""Lock of the thread that ends the process; any other thread that tries to end it waits for the end."""
 
 _unfinished: dict[str, bool] = {}
 """Files and folders that are not complete yet, in order of creation; True: removed only if empty."""

@@ -28,7 +28,7 @@ exact sum of 2,000 takes only 1.7 ms.
 """
 
 CHILDREN = 4
-"""Children per node, also in 3-D: with 8, levels are so far apart that many nodes are opened in vain."""
+"""Children per node, also in 3-D: with 8, levels are so far apart that more nodes are opened than necessary."""
 
 LISTED = 256
 """Capacity of a block's list of sources (nodes and agents); its lanes process the list when it is full."""

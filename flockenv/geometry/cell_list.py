@@ -32,16 +32,16 @@ MAX_RANGES = 27
 """Most ranges of one query: 9 rows of cells in 3-D, each in three pieces if it wraps around twice."""
 
 FEWEST_AGENTS = 96
-"""With fewer agents, sorting costs more than it saves."""
+"""Number of agents from which sorting saves more time than it takes."""
 
 WORTH_ARRANGING = 2**14
 """Number of agents from which a call of several steps sorts them in memory first; fewer fit into the L1/L2 cache."""
 
 FEWEST_ARRANGED = 2**12
-"""The same for a team of threads: with unsorted agents, threads write to the same cache lines (false sharing)."""
+"""The same for a team of threads, which with unsorted agents write to the same cache lines (false sharing)."""
 
 STEPS_ARRANGED = 5
-"""Least number of steps of a call for which sorting agents in memory pays."""
+"""Least number of steps of a call for which sorting agents in memory saves time."""
 
 DISTANT = 2**13
 """Number of agents from which records are prefetched; fewer fit into the L1/L2 cache."""
@@ -50,10 +50,10 @@ AHEAD = 48
 """Prefetch distance, in records; 16 to 64 make no difference."""
 
 FINEST = 3
-"""Most cells along x that a reach spans: rows are cut finely, so that few candidates are out of reach."""
+"""Most cells along x that a reach spans; small cells leave few candidates out of reach."""
 
 CROWDED = 8
-"""Stretched cells are folded if more agents than this share one, in the mean over agents (2 if spread evenly)."""
+"""Cells are folded if more agents than this share one, in the mean over agents (2 if evenly distributed)."""
 
 FOLDED_ROWS = 4
 """Rows of folded cells along each further axis: at least 3, so that a row and its two neighbours are distinct."""

@@ -29,7 +29,7 @@ Floats = NDArray[np.float64]
 NEAR = 4.0
 """Distance from the target, in spacings, within which distances are straight lines if these are free."""
 NO_WAY = 1e30
-"""m, the distance in a floor field where no path leads: finite, so that it can be interpolated, also in float32."""
+"""m, the path length without a path: finite, so that it can be interpolated, also in float32."""
 
 
 @kernel

@@ -39,7 +39,7 @@ AHEAD = (48, 24, 8)
 """Prefetch distances, in cells: of a cell's beginning, its first record, and the numbers of its agents."""
 
 FEW = 8
-"""Most agents of a cell whose numbers are prefetched: a clump of thousands is listed once for each of them."""
+"""Most agents of a cell whose numbers are prefetched, as a cell of thousands is listed once for each of them."""
 
 ASKED = 16
 """Prefetch distance of positions, in blocks."""

@@ -27,7 +27,7 @@ def _holders(kept: list[Memory], k: int) -> int:
 
 
 _NOBODY = _holders([(np.empty(0, np.uint8), 0)], 0)
-"""The count if only the list refers to a buffer; measured, because versions of Python count differently."""
+"""Number of references if only the list refers to a buffer, measured, as it depends on the version of Python."""
 
 
 class BufferPool:

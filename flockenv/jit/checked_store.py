@@ -20,7 +20,7 @@ HEAD = b"flockenv 1\n"
 """The first bytes of a file; the number is the version of the format."""
 
 DAY = 86_400.0
-"""s: no process takes this long to write a file; older incomplete files were left by a killed process."""
+"""s, age from which an incomplete file is assumed to be from a killed process."""
 
 
 class Store:

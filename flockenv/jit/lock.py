@@ -1,4 +1,4 @@
-"""Lock of the disk cache: one process compiles a kernel while others wait, so many workers start as fast as one.
+"""Lock of the disk cache: one process compiles a kernel while others wait; a dozen workers start as fast as one.
 
 With numba alone, every process that does not find a kernel on the disk compiles it; workers of a vectorised
 environment, or of a test run, would all compile the same ones at the same time.
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["PATIENCE", "OneAtATime"]
 
 PATIENCE = 120.0
-"""Seconds to wait for another process's compilation; a process that stopped while compiling delays others no longer."""
+"""Longest wait, s, for another process, which may have stopped while compiling."""
 
 
 class OneAtATime:

@@ -45,7 +45,7 @@ LONG = 16
 """LLVM's default: it does not vectorise shorter loops that need a check for overlapping arrays."""
 
 LLVMS = range(15, 23)
-"""Versions of LLVM known to have the option for it: any other version ends the process on an unknown option."""
+"""Versions of LLVM with the option for shorter loops; other versions may end the process on an unknown option."""
 
 DEEPEST = 6_000
 """Python's recursion limit while one of our functions compiles."""

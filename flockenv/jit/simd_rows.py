@@ -1,7 +1,7 @@
 """SIMD over agents: numbers of many agents side by side in the lanes of vector registers, and rows made from them.
 
 An observation is returned as a row per agent, but computed for a register of agents at a time: a loop over agents
-without branches becomes vector code, while a loop over one agent's neighbours pays for every mispredicted count of
+without branches becomes vector code, while a loop over one agent's neighbours is slowed by every mispredicted count of
 neighbours. So a task writes columns, each one number of all agents, and square blocks of them are transposed into rows.
 """
 

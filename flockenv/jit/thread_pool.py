@@ -28,16 +28,16 @@ T = TypeVar("T")
 _MOST = 256
 
 SHORTEST = 4e-5
-"""s: shorter work is not distributed, as handing it over takes 20 microseconds, on some machines 100."""
+"""s: shorter work is not distributed, as distribution takes 20 microseconds, on some machines 100."""
 
 LARGEST = 500_000
-"""Agent steps, each of at least some 10 ns: this much work is certainly done faster by several threads."""
+"""Agent-steps, of at least some 10 ns each, from which several threads are always faster."""
 
 TRIAL = 3
 """Pieces of work in a trial of one alternative; its time is the best of all but the first."""
 
 AGAIN, SELDOM = 64, 4096
-"""Pieces of work until the slower alternative is tried again: doubled, up to SELDOM, each time it is still slower."""
+"""Pieces of work until the slower alternative is tried again, doubled up to SELDOM each time it is still slower."""
 
 RISE = 1.25
 """Largest factor by which one measurement raises a time, so that a single disturbance counts little."""
@@ -178,7 +178,7 @@ class AutoTuner:
 
     @property
     def best(self) -> int:
-        """The faster alternative as far as is known: 0 one thread, 1 several."""
+        """The alternative that was faster so far: 0 one thread, 1 several."""
         return int(self.took[1] < self.took[0])
 
     def several(self) -> bool:

@@ -19,7 +19,7 @@ from flockenv.maths.vectors import add, axis, cross, dot, lateral, norm, perpend
 __all__ = ["GRAVITY", "SLOWEST", "bank", "face", "heading_for", "limit_to_heading", "turn_towards", "up_for"]
 
 SLOWEST = 1e-30
-"""(m/s)^2: below 1e-15 m/s an agent stands still; also in single precision this is far from underflow."""
+"""(m/s)^2: an agent slower than 1e-15 m/s is at standstill; in single precision this is far from underflow."""
 
 GRAVITY = 9.81
 """m/s^2, against which an agent leans into its turns."""

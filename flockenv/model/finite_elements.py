@@ -33,7 +33,7 @@ __all__ = [
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 Sparse = Any
-"""A scipy.sparse matrix: scipy is imported where it is used, and has no types."""
+"""A scipy.sparse matrix; scipy is imported only in functions, and has no types."""
 
 SOFTEST = 1e-14
 """Least eigenvalue of a stiffness whose diagonal is scaled to about 1: below it the solution is rounding error."""
@@ -42,7 +42,7 @@ DENSE = 1000
 """Number of freedoms up to which all frequencies are computed, from full matrices."""
 
 STILL = 1e-13
-"""Squared frequency, relative to the greatest, below which it is rounding error of 0: a rigid motion."""
+"""Squared frequency, relative to the greatest, below which a motion counts as rigid."""
 
 
 class Material(Record):

@@ -41,7 +41,7 @@ Particle = Annotated[int, Field(ge=0, lt=MOST, strict=True), BeforeValidator(_pl
 Name = Annotated[str, Field(strict=True)]
 
 EDGE, SHEAR, BEND = 0, 1, 2
-"""Roles of springs: along an edge, across a cell, spanning two edges."""
+"""Roles of springs: along an edge, across a cell, across two edges."""
 
 
 class Springs(NamedTuple):

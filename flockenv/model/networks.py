@@ -375,13 +375,13 @@ AnyNetwork = Annotated[Rope | Cloth | Jelly | Mesh, Field(discriminator="kind")]
 # --- lattices -------------------------------------------------------------------------------------------------------
 
 _SIDES = {"left": (0, 0), "right": (0, -1), "bottom": (-1, 0), "top": (-1, -1), "front": (1, 0), "back": (1, -1)}
-"""The edge of each side, and the end of that edge it is at: first (0) or last (-1)."""
+"""The axis perpendicular to each side, and the index of the side along it: first (0) or last (-1)."""
 
 _FIVE = [(0, 3, 5, 6), (1, 0, 3, 5), (2, 0, 3, 6), (4, 0, 5, 6), (7, 3, 5, 6)]
-"""A cell cut into one tetrahedron in the middle and four at corners of the cell."""
+"""Corners of a cell's five tetrahedra: one in the middle and four at corners of the cell."""
 
 _SIX = [(0, 1 << a, (1 << a) | (1 << b), 7) for a, b in itertools.permutations(range(3), 2)]
-"""A cell cut into six tetrahedra around its diagonal. Source: Kuhn 1960, IBM J. Res. Dev. 4, 518."""
+"""Corners of a cell's six tetrahedra around its diagonal. Source: Kuhn 1960, IBM J. Res. Dev. 4, 518."""
 
 _CUTS = {
     (2, "alternating"): np.array([[(0, 1, 3), (0, 3, 2)], [(0, 1, 2), (1, 3, 2)]]),

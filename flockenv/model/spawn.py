@@ -20,7 +20,7 @@ __all__ = ["Spawn", "cells", "direction", "scatter"]
 Edge = Annotated[float, Field(gt=0)]
 
 TRIES = 64
-"""Positions tried per agent before it is put at the one with the least overlap."""
+"""Positions tried per agent, after which the one with the least overlap is taken."""
 
 MOST_CELLS = 10_000_000
 """Most cells of a grid that are searched for free ones."""

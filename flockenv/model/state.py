@@ -27,9 +27,8 @@ WORK = (
     "linear_iterations", "impacts", "unsolved", "stopped", "births", "deaths", "births_refused",
 )  # fmt: skip
 """Counters in State.work: force evaluations, neighbour queries, candidate pairs tested, agent-obstacle tests; of
-adaptive methods, steps accepted and rejected; of implicit methods, iterations; of collisions, impacts, those cut short
-or left unsolved, and bodies that stopped within a step; of a population, births, deaths, and births without a free
-slot."""
+adaptive methods, steps accepted and rejected; of implicit methods, iterations; of collisions, impacts, cut or unsolved
+ones, and bodies that stopped within a step; of a population, births, deaths, and births without a free slot."""
 
 COUNTED_BY_KERNELS = 8
 """Number of these counters, the first ones, that the kernel of a scene updates."""

@@ -167,9 +167,9 @@ class Arbitration(Record):
     kind: str
     law: ClassVar[Law]
     exclusive: ClassVar[bool] = False
-    """True if one behaviour at a time acts, and the others do not."""
+    """True if only one behaviour acts at a time."""
     recalls: ClassVar[tuple[str, ...]] = ()
-    """Names of the numbers inside agents that its law reads as me.inner.NAME, and that some effect keeps."""
+    """Names of the inner numbers that the law reads as me.inner.NAME, and that some effect keeps."""
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
@@ -289,7 +289,7 @@ class RunningSum(Arbitration):
 
 @law
 def take_turns(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
-    """Return the force of the behaviour whose turn it is, and the shares."""
+    """Return the force of the behaviour that acts in this period, and the shares."""
     shares = no_shares(forces)
     turn = _period_number(me.time, p.period) % len(forces)
     for k in range(len(forces)):

@@ -57,7 +57,7 @@ def queue_gap(direction: Vec, offset: Vec, other_velocity: Vec, clearance: float
 
 @law
 def queue(direction: Vec, velocity: Vec, gap: float, max_speed: float, headway: float) -> Vec:
-    """Go in a `direction` as fast as the gap allows: S = direction min(V, gap / T) - v, m/s; T = headway [s].
+    """Move in a `direction` as fast as the gap allows: S = direction min(V, gap / T) - v, m/s; T = headway [s].
 
     The brake of Reynolds 1999 in the form of Tordeux, Chraibi, Seyfried 2016 (doi 10.1007/978-3-319-33482-0_29): a gap
     closes as exp(-t / T), and 1 / (T + l / V) agents of length l pass per second. With a gain of k = 4 m / T or more no

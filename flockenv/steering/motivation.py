@@ -32,7 +32,7 @@ __all__ = [
 ]  # fmt: skip
 
 INTENTIONS = ("wander", "school", "mate", "eat", "escape")
-"""What one may intend; what is kept is the number of it."""
+"""The intentions; agents keep the index of one."""
 
 WANDER, SCHOOL, MATE, EAT, ESCAPE = range(5)
 

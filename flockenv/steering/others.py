@@ -44,7 +44,7 @@ __all__ = [
 ]
 
 ONE_PLACE = 1e-30
-"""m^2: nearer than 1e-15 m is one place. 1 / square must not overflow, in float32 too."""
+"""m^2: agents nearer than 1e-15 m are in one place; 1 / square must not overflow, also in float32."""
 
 
 @law

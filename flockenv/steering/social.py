@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 NO_SIDE = 1e-14
-"""Below this square two directions that nearly cancel have no sum that means anything."""
+"""Squared length below which the sum of two nearly opposite directions is only rounding."""
 
 
 @law

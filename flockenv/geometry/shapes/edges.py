@@ -162,7 +162,7 @@ def edge_half_space(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: floa
 
 @law
 def edge_hollow(table: Any, at: int, x: Vec, ray: Vec, side: Vec, room: float) -> tuple[float, float]:
-    """Return infinities: a room has no edge, as it is all around."""
+    """Return infinities, as a room surrounds the body and has no edge."""
     return like(room, np.inf), like(room, np.inf)
 
 

@@ -18,7 +18,7 @@ __all__ = ["FREE", "NEVER", "SHARED", "joints"]
 Floats = NDArray[np.float64]
 
 FREE, SHARED, NEVER = 0.0, 1.0, 2.0
-"""Codes of an end. FREE: it acts if nearest; SHARED: if also nearest of the joined piece; NEVER: another shape acts."""
+"""Codes of an end: FREE, it acts if nearest; SHARED, if also nearest of the joined piece; NEVER, it does not act."""
 
 NEAR = 1e-6
 """Largest distance, m, at which two walls count as joined."""

@@ -47,7 +47,7 @@ class Shape(Record):
     velocity: Point | None = Field(default=None, description="m/s, constant from time 0 on (default: it does not move)")
     sway: Sway | None = Field(default=None, description="oscillation (default: none)")
     laws: ClassVar[str] = "chain"
-    """Name of its laws while it is solid; see shapes/table.py."""
+    """Name of the laws if the shape is solid; see shapes/table.py."""
 
     @model_validator(mode="after")
     def _check_motion(self) -> Self:

@@ -37,7 +37,7 @@ FORMS = {
 
 
 UP = 1 + 1e-6
-"""Factor that enlarges bounds: a point beyond them is clear of the shape, also with rounding in single precision."""
+"""Factor that enlarges bounds, so that points beyond are clear of the shape also with float32 rounding."""
 
 
 def pack_shapes(

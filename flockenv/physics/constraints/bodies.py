@@ -33,16 +33,16 @@ __all__ = [
 ]  # fmt: skip
 
 ANEW = 4
-"""How often two bodies may come to rest in one step, and be driven into each other again."""
+"""Number of times that two bodies at rest may be driven together again within one step."""
 
 DEEP = 0.05
-"""Part of a radius by which two bodies may overlap."""
+"""Overlap of two bodies that is allowed, as a fraction of a radius."""
 
 RESTS = 1
 """Meetings.closed: the two are at rest relative to each other."""
 
 GIVEN_UP = 2
-"""Meetings.closed: the meeting is not searched any more in this step."""
+"""Meetings.closed: the meeting is no longer searched in this step."""
 
 STOPPED = 2
 """Bodies.moved: the body does not move for the rest of the step, unless an obstacle pushes it."""

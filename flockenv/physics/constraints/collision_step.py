@@ -24,7 +24,7 @@ COUNTED = 5
 """Length of the report of a call: world, agent, number of meetings, of impacts, and of unsolved ones."""
 
 LOST = 7
-"""Length of `lost`: the numbers that event_driven.play adds to, and those that step_end.py names."""
+"""Length of `lost`: the numbers that event_driven.py and step_end.py name."""
 
 EXACT = 8 * 2.0**-52
 """Rounding error of a coordinate, relative to its size."""

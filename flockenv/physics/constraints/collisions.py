@@ -69,9 +69,9 @@ class Collisions(Constraint):
         default=None, gt=0, description="m/s, speed at which overlapping bodies are moved apart (default: at once)"
     )
     capacity: ClassVar[int] = 4
-    """Meetings per agent that there is room for at first."""
+    """Initial capacity, in meetings per agent."""
     again: ClassVar[int] = 30
-    """Impacts of the same two bodies in one step under `back_up`."""
+    """Limit of impacts of the same two bodies in one step under `back_up`."""
 
     def check(self, scene: SceneView) -> None:
         """Raise ValueError if the scene has two such constraints, or bodies too wide for a periodic box."""

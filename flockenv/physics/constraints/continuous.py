@@ -34,10 +34,10 @@ from flockenv.physics.constraints.impact import surface_at
 __all__ = ["may_meet_around", "may_pass", "set_reach", "stop_on_path"]
 
 SLOW = 0.75
-"""Part of its radius that a body may move in a step without passing what it touches."""
+"""Fraction of its radius that a body may move in a step without passing another that it touches."""
 
 LOST = 0.5
-"""Overlap, as a part of the smaller radius, from which on the order of two bodies is undefined."""
+"""Overlap, as a fraction of the smaller radius, from which on the order of two bodies is undefined."""
 
 
 @kernel

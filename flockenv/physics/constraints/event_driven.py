@@ -52,7 +52,7 @@ OBLIQUE = 0.6180339887498949
 """Weight of an axis in a generic direction: coordinates are weighted by 1, this, and its square."""
 
 CALM = 0.01
-"""A step is short for a body at rest if it would fall by less than this part of its radius."""
+"""A step is short for a body at rest if it would fall by less than this fraction of its radius."""
 
 JOLTED = 3
 """Index in `lost` of the flag that the last impact changed velocities by more than the step; see `process_impacts`."""
@@ -189,7 +189,7 @@ def _list_again(
 ) -> int:  # fmt: skip
     """List the meetings of body i whose times are to be computed again; return the length of the list.
 
-    Two bodies at rest need no search if no impact has jolted them and the step is too short for them to overlap much.
+    Two bodies at rest need no search if no impact has moved them and the step is too short for them to overlap much.
     """
     calm = not jolted and larger_acceleration(period, bodies, i, -1) * rules.seconds**2 < CALM * bodies.radius[i]
     place = bodies.first[i]

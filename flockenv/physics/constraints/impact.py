@@ -32,7 +32,7 @@ POINT = -1
 """The row number that stands for a point."""
 
 CHORDS = 8
-"""Most pieces that a path is cut into."""
+"""Largest number of chords of a path."""
 
 POLISH = 40
 """Most steps of Newton's method after a chord has hit; two or three are usual."""

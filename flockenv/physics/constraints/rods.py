@@ -29,7 +29,7 @@ KNOWN, UNKNOWN = 0.9999, 0.99
 """Upper limits of the assumed convergence factor of Jacobi's iteration: if directions at rest are known, or not."""
 
 POWERS, LEAST = 50, 1e-9
-"""Steps of inverse iteration that estimate it, and a shift of the matrix, which redundant rods make singular."""
+"""Steps of inverse iteration for that factor, and a shift of the matrix, which redundant rods make singular."""
 
 
 class RodPairs(NamedTuple):
@@ -292,7 +292,7 @@ class Rods(Constraint):
     pairs: tuple[Pair, ...] = Field(default=(), description="pairs of agents, by index (instead of a group)")
     lengths: tuple[Length, ...] = Field(default=(), description="m, lengths of the pairs; one for all, or one for each")
     slack: bool = Field(default=False, description="True: ropes, whose ends may be nearer than the length")
-    tolerance: float = Field(default=1e-10, ge=1e-14, le=0.1, description="tolerated relative error of a length")
+    tolerance: float = Field(default=1e-10, ge=1e-14, le=0.1, description="relative error of a length, or rounding")
     most: int = Field(default=5000, ge=1, le=1_000_000, description="sweeps over all rods in a step; then a warning")
 
     @model_validator(mode="after")

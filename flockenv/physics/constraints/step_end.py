@@ -26,16 +26,16 @@ from flockenv.physics.constraints.continuous import may_pass, set_reach, stop_on
 __all__ = ["settle_ends"]
 
 UNSOLVED = 0.1
-"""Approach speed that counts as unsolved, as a part of the velocity that a step adds."""
+"""Approach speed that counts as unsolved, as a fraction of the velocity that a step adds."""
 
 ROUNDS = 8
-"""Most times that contacts are gathered, if moving bodies apart leads them into others."""
+"""Largest number of times that contacts are gathered, if separated bodies overlap others."""
 
 CROWDED = 0.5
-"""Move of a body in the single pass of `project`, as a part of its radius, beyond which more passes are made."""
+"""Move of a body in the single pass of `project`, as a fraction of its radius, beyond which more passes follow."""
 
 DEEPEST = 0.25
-"""Largest overlap after the passes that separate bodies, as a part of the smaller radius; beyond it, bodies stop."""
+"""Overlap after the passes that separate bodies, as a fraction of the smaller radius, beyond which bodies stop."""
 
 RAISED = 4
 """Index in `lost` of the energy, J, of bodies that were moved apart against the step's acceleration."""

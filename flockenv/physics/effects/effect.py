@@ -83,7 +83,7 @@ LAWS = (
     "keep_law", "count_law", "pair_start", "pair_law", "apart_law", "finish_law", "obstacle_start", "obstacle_law",
     "obstacle_finish", "obstacle_ray", "obstacle_from", "obstacle_reach",
 )  # fmt: skip
-"""The slots that an effect may fill with a law."""
+"""Names of the class variables in which an effect may have a law."""
 
 EFFECTS: dict[str, type[Effect]] = {}
 """Every effect by its kind; a class registers itself when it is defined."""
@@ -246,21 +246,21 @@ class Effect(Record):
     keep_law: ClassVar[Law | None] = None
     count_law: ClassVar[Law | None] = None
     keeps: ClassVar[tuple[str, ...]] = ()
-    """Names of the inner numbers that it keeps for every agent, see State.inner."""
+    """Names of the inner numbers that the effect keeps for every agent, see State.inner."""
     recalls: ClassVar[tuple[str, ...]] = ()
-    """Names of the inner numbers that its laws read and that other effects keep."""
+    """Names of the inner numbers that the laws read and that other effects keep."""
     pair_start: ClassVar[Law | None] = None
     pair_law: ClassVar[Law | None] = None
     apart_law: ClassVar[Law | None] = None
     finish_law: ClassVar[Law | None] = None
     vanishes: ClassVar[bool] = False
-    """True if its pair law returns zeros for an infinite `other.square` and any `other.offset`.
+    """True if the pair law returns zeros for an infinite `other.square` and any `other.offset`.
 
     Steps with one evaluation of the forces then pass it an infinite square for candidates out of sight, and their true
     offset.
     """
     averages: ClassVar[bool] = False
-    """True if its finish_law receives, after its sums, the number in sight: counted once for effects of equal sight."""
+    """True if finish_law is passed, after its sums, the number of neighbours, shared by effects of equal sight."""
     obstacle_start: ClassVar[Law | None] = None
     obstacle_law: ClassVar[Law | None] = None
     obstacle_finish: ClassVar[Law | None] = None
@@ -278,22 +278,22 @@ class Effect(Record):
     partners: ClassVar[int] = 1
     """Number of partners of a bond, besides the agent it acts on."""
     tabled: ClassVar[bool] = False
-    """True if its laws look numbers up in its `table`."""
+    """True if the laws read numbers of `table`."""
     places: ClassVar[tuple[str, ...]] = ()
-    """Names of the parameters that are points: on a torus laws other than of bonds and obstacles see nearest images."""
+    """Names of the parameters that are points: on a torus nearest images, except in laws of bonds and obstacles."""
     heads_for: ClassVar[bool] = True
-    """True if its places are targets that agents head for. Pictures show them."""
+    """True if `places` are targets that agents head for, which pictures show."""
     always: ClassVar[bool] = True
-    """True if its `rates` are those of an unbounded force that acts all the time: a step far beyond its limit must blow
-    up, and raises ValueError. If False, a step beyond the limit is warned of."""
+    """True if `rates` are those of an unbounded force that acts all the time: a step far beyond its limit must diverge,
+    and raises ValueError. If False, a step beyond the limit causes a warning."""
     contact: ClassVar[bool] = False
-    """True if its `rates` are those of a contact, which ends after half an oscillation."""
+    """True if `rates` are those of a contact, which ends after half an oscillation."""
     strengths: ClassVar[tuple[str, ...]] = ("weight",)
-    """Names of the fields with which, at 0, the effect does nothing."""
+    """Names of the fields that, if they are 0, disable the effect."""
     conserves_momentum: ClassVar[bool] = False
     """True if the force of i on j is the opposite of the force of j on i."""
     demo: ClassVar[str | None] = None
-    """A small example scene as YAML; docs/behaviours.md draws the trajectories of its first `demo_time` s."""
+    """A small example scene as YAML, whose trajectories in the first `demo_time` s docs/behaviours.md shows."""
     demo_time: ClassVar[float] = 8.0
 
     @classmethod

@@ -22,7 +22,7 @@ from flockenv.physics.floor_fields import path_to_target
 __all__ = ["Door", "Routes"]
 
 HEAD = 2
-"""Numbers of a door before those of its target: where its floor field begins in the table; its capacity, 1/s."""
+"""Numbers of a door before those of its target: index of its floor field in the table; its capacity, 1/s."""
 BINS = 256
 """Number of bins of path length to a door, up to the longest, in which agents are counted."""
 
@@ -158,7 +158,7 @@ class Routes(Around):
 
     kind: Literal["routes"] = "routes"
     doors: tuple[Door, ...] = Field(min_length=1, description="doors to choose from, or a single one")
-    flow: float = Field(default=1.9, gt=0, description="1/(m s), agents that get through per metre of width")
+    flow: float = Field(default=1.9, gt=0, description="1/(m s), agents that pass per metre of width")
     period: float = Field(default=2.0, gt=0, description="s, between decisions")
     hysteresis: float = Field(default=0.1, ge=0, lt=1, description="fraction by which another door must be faster")
     aim_law: ClassVar[Law | None] = routes_aim

@@ -20,7 +20,7 @@ from flockenv.physics.effects.effect import Effect, Me, Vector
 __all__ = ["WallRepulsion"]
 
 SHORTEST, LONGEST = 1e-15, 1e15
-"""Lengths of a normal: the square of any other is 0 or infinite in float32."""
+"""Bounds of the length of a normal, outside of which its square may be 0 or infinite in float32."""
 
 
 @law

@@ -25,7 +25,7 @@ Seconds = Annotated[float, Field(ge=0)] | Spread
 PREMOVEMENT = 2
 """RNG channel of premovement times. Group uses channels 0 and 1; the waits at stage k use PREMOVEMENT + 1 + k."""
 HEAD = 2
-"""Numbers of a stage before those of its target: where its floor field begins in the table, or -1; its slow radius."""
+"""Numbers of a stage before those of its target: index of its floor field in the table, or -1; its slow radius."""
 
 
 @law

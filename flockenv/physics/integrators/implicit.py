@@ -13,7 +13,7 @@ from flockenv.physics.integrators.newton import Coupling, Evaluate, NotSolvedErr
 __all__ = ["Implicit"]
 
 MOST_HALVED = 3
-"""Number of times that a step may be halved before its world is given up."""
+"""Number of times that a step may be halved before its world counts as diverged."""
 
 
 class Implicit(Integrator):

@@ -113,17 +113,17 @@ class Integrator(Record):
     order: ClassVar[int]
     """Order of accuracy for forces that depend on position alone."""
     order_with_drag: ClassVar[int]
-    """Order of accuracy for forces that depend on velocity too."""
+    """Order of accuracy for forces that also depend on velocity."""
     stages: ClassVar[int]
     """Rows of coordinates needed as scratch."""
     evaluations: ClassVar[int]
     """Evaluations of the force per step; for adaptive methods, the least number."""
     adaptive: ClassVar[bool] = False
-    """True if it chooses substeps within dt. It then needs a whole world, and threads do not share one."""
+    """True if the method chooses substeps within dt; threads then do not share a world."""
     splits_drag: ClassVar[bool] = False
-    """True if it integrates linear drag separately and exactly, which the acceleration then excludes; see `damping`."""
+    """True if the method integrates linear drag exactly, which the acceleration then excludes; see `damping`."""
     solves: ClassVar[bool] = False
-    """True if it solves equations (scipy, in Python). `advance` then only copies the solution."""
+    """True if the method solves equations (scipy, in Python); `advance` then only copies the solution."""
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:

@@ -25,7 +25,7 @@ Evaluate = Callable[[Rows, Rows, float], tuple[Rows, Rows | None]]
 MOST_ITERATIONS = 50
 MOST_HALVINGS = 12
 GMRES_TOLERANCE = 1e-4
-"""Relative tolerance of one linear solve: Newton's method corrects the rest."""
+"""Relative tolerance of one linear solve, as Newton's method corrects its error."""
 
 
 class NotSolvedError(ArithmeticError):

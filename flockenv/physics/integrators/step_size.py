@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 TRIES = 20
-"""Number of rejections in a row at which a world is given up: from the second on, each divides the substep by 5."""
+"""Number of rejections in a row at which a world is given up; from the second on, each divides the substep by 5."""
 
 
 class Clock(NamedTuple):

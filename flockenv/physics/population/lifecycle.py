@@ -22,7 +22,7 @@ from flockenv.physics.population.sinks import Crowding, Drain, Sink, Threshold
 __all__ = ["NUMBERS", "create_initial", "make_settler"]
 
 NUMBERS = 4
-"""Numbers of scratch memory per agent: cells, the agents in them, the agents that are to die."""
+"""Scratch memory, in numbers per agent: cells, the agents in them, the agents to remove."""
 
 WIDTH = PLACE + 8
 """Length of a row of streams."""

@@ -18,7 +18,7 @@ class Member(Record):
 
     kind: str
     looks_back: ClassVar[bool] = False
-    """True if it reads the positions of all agents before the step."""
+    """True if the member reads the positions of all agents before the step."""
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
