@@ -269,8 +269,8 @@ def _is_writing(frame: FrameType | None) -> bool:
 def _watch(signals: int) -> None:
     """Wait for signals, which the system writes to this pipe even while the main thread runs no Python code.
 
-    Then send the signal to the main thread again every AGAIN seconds until it has raised KeyboardInterrupt; end the
-    process if it does not in time.
+    After a signal, send it to the main thread again every AGAIN seconds until that has raised KeyboardInterrupt; end
+    the process if it does not in time.
     """
     known = False  # KeyboardInterrupt has been raised
     while arrived := os.read(signals, 1):

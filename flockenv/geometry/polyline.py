@@ -104,7 +104,7 @@ def _without_first(found: Vec) -> Vec:
 def nearest(table: Table, x: Vec) -> Vec:
     """Return the arc length of the path's point nearest to x, m, and the offset to it: (s, dx, dy[, dz]).
 
-    Of several points that are equally near, the first along the path.
+    Of several points that are equally near, it is the first along the path.
     """
     d = len(x)
     head, size = 2 + d, 2 * d + 2

@@ -16,7 +16,7 @@ __all__ = [
 def cache_folder() -> Path:
     """Return the checked folder of cached machine code; FLOCKENV_CACHE sets another one.
 
-    Falls back to a folder under the system's temporary one if the home folder cannot be written or is not private.
+    The folder is under the system's temporary one if the home folder cannot be written or is not private.
 
     Raises:
         OSError: the folder in FLOCKENV_CACHE can be changed by other users, or no folder can be written.

@@ -144,9 +144,9 @@ def _put_lines(
 ) -> Any:  # fmt: skip
     """Write the numbers of `width` agents from `first` on, one from each source, as whole cache lines.
 
-    Like `_put_records`, but a record is `length` numbers, aligned whole cache lines, and is written to place `to`
-    (int32, in records; -1 for place `spare`). The numbers behind that of the last source are undefined. Streaming
-    stores bypass the caches, so that lines, far from each other, are not read before they are written.
+    This differs from `_put_records` in that a record is `length` numbers, aligned whole cache lines, and is written to
+    place `to` (int32, in records; -1 for place `spare`). The numbers behind that of the last source are undefined.
+    Streaming stores bypass the caches, so that lines, far from each other, are not read before they are written.
     """
     wide, many, piece = literal_value(width, "width"), sources.count, literal_value(length, "length")
 

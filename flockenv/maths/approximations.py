@@ -40,7 +40,7 @@ def _ones_of(x):  # type: ignore[no-untyped-def]  # numba compares signatures, a
 def round_half_even(x: float) -> float:
     """Return x rounded to the nearest integer, ties to even: a faster np.rint.
 
-    Exact for |x| < 2^22 in float32, 2^51 in float64; beyond, it may be off by one.
+    The result is exact for |x| < 2^22 in float32, 2^51 in float64; beyond, it may be off by one.
     """
     return (x + _ones(x)) - _ones(x)
 

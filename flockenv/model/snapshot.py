@@ -59,9 +59,10 @@ class Snapshot:
     heading (N, D): directions that agents face; default: those of the velocities.
     looks: appearances; look (N,): the index of each agent's own, -1 = none. age (N,): s, of the living; default: the
     time. identity (N,): int, the agent in each row; default: the same agents at all times.
-    inner (N,): the inner state of each agent that its look shows; none by default. Arrays are private copies and
-    read-only. Positions and velocities may hold NaN or inf: such bodies of a run that diverged are not drawn. Raises
-    ValueError or TypeError, in one line that names the field, for other values.
+    inner (N,): the inner state of each agent that its look shows; none by default.
+    Arrays are private copies and read-only. Positions and velocities may hold NaN or inf: such bodies of a run that
+    diverged are not drawn.
+    Raises ValueError or TypeError, in one line that names the field, for other values.
     """
 
     time: float

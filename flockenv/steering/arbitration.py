@@ -281,7 +281,7 @@ def allocate_running_force(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares
 
 
 class RunningSum(Arbitration):
-    """As allocation, but the length of the sum so far uses up max_force (Buckland 2004)."""
+    """Forces in order, as in `Allocation`, but the length of the sum so far uses up max_force (Buckland 2004)."""
 
     kind: Literal["running_sum"] = "running_sum"
     law: ClassVar[Law] = allocate_running_force

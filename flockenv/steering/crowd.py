@@ -73,8 +73,8 @@ def explore(to_low: Vec, to_high: Vec, velocity: Vec, max_speed: float, track: f
 
     The loop leads to and fro along an even number of rows from the lower wall to the upper, and back down beside the
     left wall; in 3-D each agent keeps its height. Direction is a function of position alone, so a displaced agent
-    continues from there. `to_low` and `to_high` are distances to the walls per axis, m. Without overshoot at turns if
-    track > V^2 m / F_max. (Ours: the textbook's boustrophedon as a velocity field.)
+    continues from there. `to_low` and `to_high` are distances to the walls per axis, m. Agents do not overshoot at
+    turns if track > V^2 m / F_max. (Ours: the textbook's boustrophedon as a velocity field.)
     """
     e, half = like(track, 1.0), like(track, 0.5)
     x, y = to_low[0], to_low[1]

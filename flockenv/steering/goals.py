@@ -39,7 +39,7 @@ def flee(offset: Vec, velocity: Vec, max_speed: float) -> Vec:
 def arrive(offset: Vec, velocity: Vec, max_speed: float, slow_radius: float) -> Vec:
     """Seek, slowing down linearly within slow_radius [m] to a stop at the point (Reynolds 1999).
 
-    Feasible if slow_radius >= V^2 m / F_max: the ramp requires that deceleration at its edge.
+    This is feasible if slow_radius >= V^2 m / F_max: the ramp requires that deceleration at its edge.
     """
     distance = norm(offset)
     ramped = max_speed * (distance / slow_radius)

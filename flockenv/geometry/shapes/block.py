@@ -155,7 +155,7 @@ def nearest_block(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
 def hit_block(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
     """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
 
-    0 if the body already overlaps it.
+    It is 0 if the body already overlaps.
     """
     y, d, h = to_block_frame(table, at, x), to_block_frame(table, at, direction), half_edges(table, at, x)
     if len(x) == 2:
@@ -175,7 +175,7 @@ def nearest_half_space(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
 def hit_half_space(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
     """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
 
-    0 if the body already overlaps it.
+    It is 0 if the body already overlaps.
     """
     normal = vector_at(table, body_of(at, x), x)
     room, speed = dot(x, normal) - clearance, dot(direction, normal)

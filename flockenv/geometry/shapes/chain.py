@@ -114,7 +114,7 @@ def nearest_chain(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
 def hit_chain(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
     """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
 
-    0 if the body already overlaps it.
+    It is 0 if the body already overlaps.
     """
     body = body_of(at, x)
     count, room = np.int64(table[body]), table[body + 1] + clearance

@@ -51,7 +51,7 @@ def nearest_shape(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
 def hit_shape(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
     """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
 
-    0 if the body already overlaps it.
+    It is 0 if the body already overlaps.
     """
     form = form_of(table, at, x)
     if form == 0:

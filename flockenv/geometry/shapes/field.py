@@ -56,8 +56,8 @@ def nearest_distance_field(table: Any, at: int, x: Vec) -> tuple[float, Vec]:
 def hit_distance_field(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
     """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
 
-    0 if the body already overlaps it. Ray marching: each step is 0.9 of the distance to the surface; accurate to a
-    hundredth of the grid's spacing.
+    It is 0 if the body already overlaps. Computed by ray marching, with steps of 0.9 of the distance to the surface;
+    accurate to a hundredth of the grid's spacing.
     """
     grid = table[body_of(at, x) :]
     d = len(x)

@@ -87,7 +87,7 @@ def _capsule_exit(x: Vec, direction: Vec, a: Vec, b: Vec, radius: float) -> floa
 def hit_hollow_chain(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
     """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
 
-    0 if the body already overlaps it.
+    It is 0 if the body already overlaps.
     """
     body = body_of(at, x)
     count: Any = np.int64(table[body])
@@ -123,7 +123,7 @@ def _exit_distance(y: float, d: float, h: float) -> float:
 def hit_hollow_block(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
     """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
 
-    0 if the body already overlaps it.
+    It is 0 if the body already overlaps.
     """
     y, d, h = to_block_frame(table, at, x), to_block_frame(table, at, direction), half_edges(table, at, x)
     h0, h1 = h[0] - clearance, h[1] - clearance
@@ -142,7 +142,8 @@ def hit_hollow_block(table: Any, at: int, x: Vec, direction: Vec, clearance: flo
 def hit_hollow_distance_field(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
     """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
 
-    0 if the body already overlaps it. Ray marching as for the solid one, accurate to a hundredth of the grid's spacing.
+    It is 0 if the body already overlaps. Computed by ray marching as for the solid shape, accurate to a hundredth of the
+    grid's spacing.
     """
     grid = table[body_of(at, x) :]
     d = len(x)

@@ -161,7 +161,7 @@ class Shape(Record):
         return np.asarray(points, float) - gap[..., None] * normal
 
     def inside(self, points: ArrayLike) -> np.ndarray[Any, np.dtype[np.bool_]]:
-        """Return True for points inside it, (...)."""
+        """Return True for each point inside the shape, (...) bool."""
         return np.asarray(self.gap(points) < 0)
 
     def hit(self, points: ArrayLike, directions: ArrayLike, clearance: ArrayLike = 0.0) -> Floats:

@@ -95,8 +95,8 @@ def gather_contacts(
 
     in_time: True if the impacts of the step are resolved. Pairs that still approach have their impact in the next step,
     except in a heap: bodies that nearly touch rest if their approach speed is at most that which the step's
-    acceleration has added. For others the limit is `slow` m/s. passing: True if bodies may pass what they touch at the
-    beginning; the contact is then that at the beginning.
+    acceleration has added. For others the limit is `slow` m/s.
+    passing: True if bodies may pass what they touch at the beginning; contacts are then those of the beginning.
     """
     found = 0
     for c in range(count):

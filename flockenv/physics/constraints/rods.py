@@ -117,7 +117,7 @@ def _can_move(alive: Any, b: int, rods: Any, r: int) -> bool:
 def _next_relaxation(over: float, rho: float, sweep: int) -> float:
     """Return the over-relaxation of the next sweep: Chebyshev's sequence from 1 to Young's 2 / (1 + sqrt(1 - rho^2)).
 
-    (Golub and Varga 1961.) So errors do not grow at first, as they do if the first sweep uses the final value.
+    With it errors do not grow at first, as they do if the first sweep uses the final value (Golub and Varga 1961).
     """
     e = like(rho, 1.0)
     return e / (e - rho * rho * over * like(rho, 0.5 if sweep == 0 else 0.25))
@@ -256,8 +256,9 @@ def hold_rods(x0: Any, x: Any, v: Any, alive: Any, rods: Any, first: int, end: i
     """Apply the rods of worlds [first, end), in place.
 
     If the first stage does not converge, as in far too long a step, its changes are undone, as velocities could have
-    any value. So energy is lost and never gained. Returns the first (world, agent) that is not finite, or -1s, the last
-    rod out of tolerance, or -1, and its relative error.
+    any value. So energy is lost and never gained.
+    Returns the first (world, agent) that is not finite, or -1s, the last rod out of tolerance, or -1, and its relative
+    error.
     """
     world, agent, rod, off = -1, -1, -1, like(rods.per_dt, 0.0)
     for b in range(first, end):

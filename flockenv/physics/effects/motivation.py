@@ -47,7 +47,7 @@ class _Urge(Effect):
 
     conserves_momentum: ClassVar[bool] = True  # it exerts no force
 
-    group: int | None = Field(default=None, ge=0, description="group it applies to (default: all)")
+    group: int | None = Field(default=None, ge=0, description="index of the group that it applies to (default: all)")
 
     def members(self, starts: Sequence[int]) -> dict[str, float]:
         """Return the agents it applies to, [first, end), and those of the other group, if any."""
