@@ -162,7 +162,7 @@ def allocate_running(forces: Forces, budget: float) -> Vec:
 
 
 class Arbitration(Record):
-    """How forces are combined; `law` is a law (p, me, forces) -> (force, shares)."""
+    """Base class of the methods that combine forces; `law` is a law (p, me, forces) -> (force, shares)."""
 
     kind: str
     law: ClassVar[Law]

@@ -142,8 +142,8 @@ def hit_hollow_block(table: Any, at: int, x: Vec, direction: Vec, clearance: flo
 def hit_hollow_distance_field(table: Any, at: int, x: Vec, direction: Vec, clearance: float) -> float:
     """Return the distance along a unit `direction` at which a body of radius `clearance` touches it, m; inf if never.
 
-    It is 0 if the body already overlaps. Computed by ray marching as for the solid shape, accurate to a hundredth of the
-    grid's spacing.
+    It is 0 if the body already overlaps. Computed by ray marching as for the solid shape, to a hundredth of the grid's
+    spacing.
     """
     grid = table[body_of(at, x) :]
     d = len(x)

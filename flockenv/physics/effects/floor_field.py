@@ -125,5 +125,5 @@ class Way(Around):
         return path_lengths(self.grids(scene)[0], points)
 
     def grids(self, scene: SceneView) -> list[NDArray[np.float64]]:
-        """Return the one floor field, to the nearest target."""
+        """Return the floor field to the nearest target, the only one."""
         return [scene.table_of(self)[2 + len(self.targets) * row_size(scene.dimension) :]]

@@ -72,7 +72,7 @@ def _angle_and_gradients(a: Vec, b: Vec) -> tuple[float, Vec, Vec]:
 
 @law
 def _wrap_angle(angle: float) -> float:
-    """Return an angle in [-pi, pi)."""
+    """Return the angle wrapped into [-pi, pi)."""
     turn = like(angle, 2 * np.pi)
     return angle - turn * np.floor(angle / turn + like(angle, 0.5))  # type: ignore[no-any-return]
 

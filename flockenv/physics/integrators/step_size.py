@@ -1,8 +1,8 @@
 """Step-size control: substeps as long as the error allows, the last of which ends with the scene's step.
 
 The error is the distance between two results, of position and velocity together (m and m/s alike), of the worst agent;
-it is absolute, and excludes differences that may be rounding of a coordinate. The next substep is h clip(0.9 (tolerance
-/ error)^(1 / (p + 1)), 0.2, 5), after accepted and after rejected substeps.
+it is absolute, and excludes differences that may be rounding of a coordinate. The next substep is
+h clip(0.9 (tolerance / error)^(1 / (p + 1)), 0.2, 5), after accepted and after rejected substeps.
 
 Two more rules are for forces that jump, whose error falls as h and not as h^(p + 1): a second rejection in a row
 reduces the substep to a fifth, and until the clock reaches the end of the last rejected substep no substep is longer

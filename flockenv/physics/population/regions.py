@@ -71,7 +71,7 @@ class Point(Place):
         return np.array([self.at])
 
     def check(self, scene: SceneView) -> None:
-        """Raise ValueError if its dimension is not the scene's."""
+        """Raise ValueError if the dimension is not the scene's."""
         check_dimensions(scene, at=self.at)
 
 
@@ -93,7 +93,7 @@ class Segment(Place):
         return np.array([self.start, self.end])
 
     def check(self, scene: SceneView) -> None:
-        """Raise ValueError if its dimension is not the scene's."""
+        """Raise ValueError if the dimension is not the scene's."""
         check_dimensions(scene, start=self.start, end=self.end)
 
 
@@ -123,7 +123,7 @@ class Disc(Place):
         return np.array(self.centre) + self.radius * np.array([[-1.0], [1.0]])
 
     def check(self, scene: SceneView) -> None:
-        """Raise ValueError if its dimension is not the scene's."""
+        """Raise ValueError if the dimension is not the scene's."""
         check_dimensions(scene, centre=self.centre, axis=self.axis)
         if self.axis is not None and scene.dimension == 2:
             raise ValueError(f"axis = {self.axis}: only a disc in 3-D has an axis")
@@ -151,7 +151,7 @@ class _Corners(Place):
         return np.array([self.low, self.high])
 
     def check(self, scene: SceneView) -> None:
-        """Raise ValueError if its dimension is not the scene's."""
+        """Raise ValueError if the dimension is not the scene's."""
         check_dimensions(scene, low=self.low, high=self.high)
 
 
@@ -183,7 +183,7 @@ class Surface(Place):
         return pieces(self.shape)
 
     def check(self, scene: SceneView) -> None:
-        """Raise ValueError if its dimension is not the scene's, or the shape moves, is hollow or is unbounded."""
+        """Raise ValueError if the dimension is not the scene's, or the shape moves, is hollow or is unbounded."""
         if self.shape.dimension != scene.dimension:
             raise ValueError(
                 f"shape.kind = {self.shape.kind}: lies in {self.shape.dimension} dimensions, "

@@ -65,7 +65,7 @@ class Leaving(Sink):
         return three_numbers(self.low) + three_numbers(self.high)
 
     def check(self, scene: SceneView) -> None:
-        """Raise ValueError if its dimension is not the scene's."""
+        """Raise ValueError if the dimension is not the scene's."""
         super().check(scene)
         check_dimensions(scene, low=self.low, high=self.high)
 
@@ -102,7 +102,7 @@ class Drain(Sink):
         return [self.margin]
 
     def check(self, scene: SceneView) -> None:
-        """Raise ValueError if its dimension is not the scene's."""
+        """Raise ValueError if the dimension is not the scene's."""
         super().check(scene)
         if self.shape.dimension != scene.dimension:
             raise ValueError(
