@@ -50,7 +50,7 @@ def grow_hunger(hunger: float, rate: float, effort: float, pace: float, seconds:
 
 @law
 def bite(amount: float, hunger: float, rate: float, seconds: float) -> float:
-    """Return the part of an amount that is eaten in some seconds: rate x amount x hunger, linear in both."""
+    """Return the eaten part of an amount: rate x amount x hunger x seconds, also for sums of amounts or hungers."""
     return rate * amount * hunger * seconds
 
 
