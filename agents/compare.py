@@ -203,7 +203,7 @@ def _play_in_process(job: _Job, tell: Tell) -> Played:
 
 
 def _play(job: _Job, policies: Mapping[str, Policy], advance: Advance) -> Played:
-    """Play the same worlds of one task with every player; return their episodes, and the results."""
+    """Play the same worlds of one task with every player; return the episodes by player, and the report's numbers."""
     task, episodes = job.task, {}
     for name, policy in policies.items():
 

@@ -199,7 +199,7 @@ def pair_cells(results: Results) -> tuple[list[str], list[list[str]]]:
 
 
 def chart_column(task: str, results: Results, episodes: Mapping[str, Episodes]) -> Column:
-    """Return the column of one task in the picture: all players, and the pairs without random actions."""
+    """Return the column of one task in the picture: all players, and the differences between all but random actions."""
 
     def interval(about: Results, name: str, prefix: str) -> Interval:
         return Interval(about[name], about[f"{prefix}_low"], about[f"{prefix}_high"])
@@ -245,7 +245,7 @@ def interval_text(about: Results, name: str, prefix: str) -> str:
 
 
 def percent_text(about: Results, name: str, prefix: str) -> str:
-    """Return '78 % [73, 83]'."""
+    """Return a share and its interval as text, '78 % [73, 83]', from the entries of `about`."""
     value, low, high = (100 * about[key] for key in (name, f"{prefix}_low", f"{prefix}_high"))
     return f"{value:.0f} % [{low:.0f}, {high:.0f}]"
 
@@ -258,7 +258,7 @@ def number_text(value: float | None) -> str:
 
 
 def steps_text(steps: float) -> str:
-    """Return '950' or '10.7 M'."""
+    """Return a number of steps as text: '950' or, in millions from 100,000 on, '10.7 M'."""
     return f"{steps / 1e6:.1f} M" if steps >= 1e5 else f"{steps:,.0f}"
 
 
@@ -268,5 +268,5 @@ def micro_text(microseconds: float) -> str:
 
 
 def duration_text(seconds: float) -> str:
-    """Return '45 s' or '4.2 min'."""
+    """Return a duration as text: '45 s' or, from 90 s on, '4.2 min'."""
     return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.1f} min"

@@ -172,7 +172,7 @@ def _cell(plan: Plan, setting: Setting, player: Player, prefix: str = "") -> Cel
 
 
 def play_missing(job: Job) -> tuple[str, int]:
-    """Play the cells of some settings that are not stored yet, and store each; return a text, and their number."""
+    """Play and store the cells of a job that are not stored yet; return its name, and the number of all its cells."""
     plan, settings = job
     for setting, player in product(settings, plan.players):
         _cell(plan, setting, player)

@@ -252,13 +252,13 @@ def _times(about: Results, trained: Results) -> str:
 
 
 def title(about: Results) -> str:
-    """Return 'rk4, dt 0.0125 s'."""
+    """Return a setting as text: 'rk4, dt 0.0125 s'."""
     precision = " float32" if about["dtype"] == "float32" else ""
     return f"{about['method']}{precision}, dt {about['dt']:.4g} s"
 
 
 def length_text(millimetres: float) -> str:
-    """Return '74 mm', '0.66 mm' or 'rounding'."""
+    """Return a length as text: '74 mm', '0.66 mm' or, below NOTHING, 'rounding'."""
     return (
         "rounding"
         if millimetres < NOTHING

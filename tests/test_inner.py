@@ -149,7 +149,7 @@ def test_a_born_agent_starts_with_its_own_inner_numbers() -> None:
 def test_a_scene_without_inner_states_has_none() -> None:
     scene = Scene(groups=(WALKERS,), effects=(Course(direction=(1, 0)), Driving()))
     assert scene.start(0).inner.size == 0
-    with pytest.raises(ValueError, match="'hunger': no effect keeps it"):
+    with pytest.raises(ValueError, match="'hunger': no effect of this scene keeps such an inner number"):
         scene.inner(scene.start(0), "hunger")
     kept = Scene(groups=(WALKERS,), effects=(Antipode(centre=(0, 0)), Driving()))
     with pytest.raises(ValueError, match="the state has 0 inner numbers, but effects of this scene keep goal_x"):

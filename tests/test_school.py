@@ -270,7 +270,7 @@ def test_eating_does_not_depend_on_order_batch_or_threads() -> None:
             lambda: Scene(
                 groups=(Group(count=1, spawn=Spawn(low=(0, 0), high=(1, 1))),), population=(Threshold(of="hunger"),)
             ),
-            "population[0].of = 'hunger': no effect of this scene keeps it",
+            "population[0].of = 'hunger': no effect of this scene keeps such an inner number",
         ),
         (lambda: School(learners=9), "learners = 9: there are only 8 fish"),
         (lambda: School(grazing=2.0), "grazing = 2: 8 fish could eat more than there is"),

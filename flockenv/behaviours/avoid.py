@@ -178,7 +178,8 @@ def no_whisker(p: Any, me: Me) -> Vec:
 def deepest_whisker(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
     """Keep the obstacle that a whisker reaches into deepest.
 
-    (Distance if that is the middle whisker, else inf; share inside; normal at the point of entry; no side yet.)
+    The running numbers: the distance if it is the middle whisker, else inf; the share of the whisker's length inside
+    the obstacle; the normal at the point of entry; the side, which is found later, here 0.
     """
     o, e = like(me.who, 0.0), like(me.who, 1.0)
     length = norm(me.vel) * p.horizon

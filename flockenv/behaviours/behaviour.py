@@ -172,5 +172,5 @@ class AboutNearest(Behaviour):
         return Sight(self.radius, self.fov, 1, self.group, self.occluded)
 
     def sums(self, dimension: int) -> int:
-        """Return the size of offset, velocity and count."""
+        """Return how many numbers are summed: offset, velocity and count."""
         return 2 * dimension + 1

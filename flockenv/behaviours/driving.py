@@ -147,7 +147,7 @@ effects:
         return damping / self.headway, damping
 
     def sums(self, dimension: int) -> int:
-        """Return 1: the gap."""
+        """Return 1: the law keeps one number, the gap."""
         return 1
 
     def check(self, scene: SceneView) -> None:

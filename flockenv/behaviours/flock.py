@@ -129,7 +129,7 @@ dt: 0.02
         return self.fov >= 360.0 and self.nearest is None and self.group is None  # occlusion is mutual
 
     def sums(self, dimension: int) -> int:
-        """Return the size of a vector."""
+        """Return how many numbers are summed: D, a vector."""
         return dimension
 
 
@@ -153,7 +153,7 @@ dt: 0.02
         return np.zeros(len(damping)), damping
 
     def sums(self, dimension: int) -> int:
-        """Return the size of a vector."""
+        """Return how many numbers are summed: D, a vector."""
         return dimension
 
 
@@ -179,5 +179,5 @@ dt: 0.02
         return square, np.zeros(len(square))
 
     def sums(self, dimension: int) -> int:
-        """Return the size of a vector."""
+        """Return how many numbers are summed: D, a vector."""
         return dimension

@@ -197,7 +197,7 @@ effects:
         return Sight(self.radius, self.fov)
 
     def sums(self, dimension: int) -> int:
-        """Return the size of squared distance, offset and velocity, of two agents."""
+        """Return how many numbers are kept: squared distance, offset and velocity, of two agents."""
         return 2 * (1 + 2 * dimension)
 
     def members(self, starts: Sequence[int]) -> dict[str, float]:

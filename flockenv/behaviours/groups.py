@@ -224,5 +224,5 @@ effects:
         return np.zeros(len(damping)), damping
 
     def sums(self, dimension: int) -> int:
-        """Return the size of count, summed offset and summed repulsion."""
+        """Return how many numbers are summed: count, offset and repulsion."""
         return 1 + 2 * dimension

@@ -111,7 +111,7 @@ def _first_direction_and_aim(p: Any, me: Me) -> tuple[Vec, Vec]:
 
 @law
 def reduce_by_agent(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
-    """Reduce the free distances by one more agent."""
+    """Reduce the free distances to those at which the agent would touch this neighbour."""
     direction, aim = _first_direction_and_aim(p, me)
     room = me.radius + other.radius
     return reduce_distances(acc, direction, aim, p.cosine, p.sine, other.offset, other.vel, room, me.desired_speed)
@@ -119,7 +119,7 @@ def reduce_by_agent(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
 
 @law
 def reduce_by_obstacle(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
-    """Reduce the free distances by a round obstacle, which is at rest."""
+    """Reduce the free distances to those at which the agent would touch this round obstacle, which is at rest."""
     direction, aim = _first_direction_and_aim(p, me)
     room = me.radius + other.radius
     return reduce_distances(acc, direction, aim, p.cosine, p.sine, other.offset, zero(me.vel), room, me.desired_speed)

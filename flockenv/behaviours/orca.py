@@ -153,5 +153,5 @@ effects:
         super().check(scene)
 
     def sums(self, dimension: int) -> int:
-        """Return the size of six slots."""
+        """Return how many numbers are kept: those of six slots."""
         return 6 * orca.SLOT

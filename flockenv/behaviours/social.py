@@ -65,7 +65,7 @@ class Social(Push):
         return Sight(self.radius, group=self.group, occluded=self.occluded)
 
     def sums(self, dimension: int) -> int:
-        """Return the size of a force."""
+        """Return how many numbers are summed: D, a force."""
         return dimension
 
     def check(self, scene: SceneView) -> None:
@@ -152,7 +152,7 @@ class CircularRepulsion(Social):
         return {**super().parameters(), **shape}
 
     def sums(self, dimension: int) -> int:
-        """Return the size of a vector and a symmetric matrix."""
+        """Return how many numbers are summed: a vector and a symmetric matrix."""
         return dimension + dimension * (dimension + 1) // 2
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats]:

@@ -188,7 +188,10 @@ def _return_problem(problem: Problem) -> Problem:
 
 
 def _problem_of_scene(file: str, seconds: float | None, steps: str, dts: str, seed: int) -> Problem:
-    """Return the problem of a scene; by default with 8 step lengths, halved from 4 dt (or 2 dt, or dt) on."""
+    """Return the `Problem` of a scene file; by default with 8 step lengths, each half of the one before.
+
+    The longest is 4 dt; 2 dt or dt if the duration is no multiple of 4 dt.
+    """
     from flockenv.scene.yaml_io import load_scene
     from flockenv.studies.accuracy import Problem
     from flockenv.studies.trajectory import whole_steps

@@ -103,7 +103,7 @@ def _remove(entry: os.DirEntry[str]) -> None:
 
 
 def _path_below(folder: Path, name: str) -> Path:
-    """Return the path of a file that may be written below a folder, which may be missing."""
+    """Return folder / name; raise as `_valid_target` if no file can be written there. The folder may be missing yet."""
     target = folder / name
     return _valid_target(target) if target.parent.exists() else target
 
@@ -154,7 +154,9 @@ def _rename(parts: Mapping[Path, Path]) -> None:
             moved = [target for target in kept if not os.path.lexists(parts[target])]
             new = [repr(str(target)) for target in moved if not _restore(target, kept[target])]
             if new:
-                raise OSError(f"{error}; of those written together {', '.join(new)} could not be put back") from error
+                raise OSError(
+                    f"{error}; of the files written together, {', '.join(new)} could not be put back"
+                ) from error
             raise
     _sync_folders({target.parent for target in parts})
 

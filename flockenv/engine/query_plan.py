@@ -45,7 +45,7 @@ def plan_look(parts: KernelPlan) -> LookPlan:
 
 
 class Span(NamedTuple):
-    """The radius of the query."""
+    """The size of the space, and the radius within which neighbours are queried."""
 
     size: Any  # m, size of the space
     reach: Any  # m

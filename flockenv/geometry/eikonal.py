@@ -190,7 +190,7 @@ def floor_field_table(
         if room.any() and not (room & reached).any():
             places = " or ".join(target.points_text for target in targets)
             raise ValueError(
-                f"{names[0]} = {places}: no way leads there from {start.name}, {clearance:g} m clear of all"
+                f"{names[0]} = {places}: no way leads there from {start.name}, {clearance:g} m clear of all obstacles"
             )
     way = np.where(near[..., None], towards, -_slopes(u, spacing))
     size = np.linalg.norm(way, axis=-1, keepdims=True)

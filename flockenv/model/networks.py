@@ -332,7 +332,9 @@ class Mesh(Network):
                 f"rest: {len(self.rest)} lengths for {len(self.pairs or ())} pairs; one for each is needed"
             )
         if self.rest is not None and self.stretch != 1:
-            raise ValueError(f"stretch = {self.stretch:g}: rest gives the lengths of springs: give one of them")
+            raise ValueError(
+                f"stretch = {self.stretch:g}: rest already gives the lengths of the springs; give one of the two"
+            )
         if self.lumping == "geometric":
             self.masses(1.0, len(self.vertices[0]))  # raises ValueError if a particle is part of no element
 

@@ -374,7 +374,7 @@ def _layers(tensors: Mapping[str, NDArray[Any]]) -> tuple[list[Layer], Layer]:
 
 def _check_shape(name: str, tensor: NDArray[Any], shape: tuple[int, ...]) -> None:
     if tensor.shape != shape or 0 in shape:
-        raise ValueError(f"tensor {name!r} has shape {tensor.shape}, its neighbours call for {shape}")
+        raise ValueError(f"tensor {name!r} has shape {tensor.shape}, the other layers require {shape}")
 
 
 def _check_known(value: Any, allowed: Mapping[str, Any], what: str) -> str:

@@ -175,7 +175,9 @@ class Scene(Record):
         for k, group in enumerate(self.groups):
             if group.appearance is not None and group.appearance.of not in {None, *kept_numbers}:
                 of = group.appearance.of
-                raise ValueError(f"groups[{k}].appearance.of = {of!r}: no effect of this scene keeps it")
+                raise ValueError(
+                    f"groups[{k}].appearance.of = {of!r}: no effect of this scene keeps such an inner number"
+                )
 
     def _check_space(self) -> None:
         size = getattr(self.space, "size", None)
@@ -416,7 +418,10 @@ class Scene(Record):
     def inner(self, state: State, name: str) -> Floats:
         """Return an inner number of every agent by name, as a view, (B, N); see `Effect.keeps`."""
         if name not in self.parts.inner:
-            raise ValueError(f"{name!r}: no effect keeps it; those of this scene keep {self.parts.inner or 'nothing'}")
+            raise ValueError(
+                f"{name!r}: no effect of this scene keeps such an inner number; "
+                f"they keep {self.parts.inner or 'nothing'}"
+            )
         found: Floats = state.inner[self.parts.inner.index(name)]
         return found
 

@@ -54,7 +54,10 @@ def rows(law: Law) -> Callable[..., NDArray[np.float64]]:
             t[-1] for t, r, name in zip(tails, ranks, parameters, strict=True) if r and name not in any_length
         }
         if len(dimensions) > 1:
-            raise ValueError(f"{python.__name__}: vectors of {' and of '.join(map(str, sorted(dimensions)))} numbers")
+            raise ValueError(
+                f"{python.__name__}: vectors of {' and of '.join(map(str, sorted(dimensions)))} numbers; "
+                "all must have the same number"
+            )
         dimension = max(dimensions, default=0)
         out = np.empty((flat[0].shape[0], dimension) if answer else flat[0].shape[0])
         loop_of(law, tails, dimension if answer else 0)(tuple(flat), out)

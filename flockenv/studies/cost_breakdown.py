@@ -46,7 +46,7 @@ class Cost(NamedTuple):
 
 @dataclass(frozen=True)
 class Row:
-    """One effect of a scene."""
+    """One row of the breakdown: an effect of a scene, what it needs, and what it costs."""
 
     effect: Effect
     calls_for: tuple[str, ...]  # computations that it needs, in words; empty = only the agent itself

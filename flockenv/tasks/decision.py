@@ -283,7 +283,10 @@ def act_of(plan: Plan) -> Callable[..., Any]:
 
 @section
 def search_of(plan: Plan) -> Callable[..., bool]:
-    """Return a function that searches neighbours in world b, if the task has a `look`; True if it wrote positions."""
+    """Return `search(worlds, constants, near, scratch, b)`: find the neighbours in world b, if the task has a `look`.
+
+    It returns True if it has also written the positions of the neighbours, see `look_of`.
+    """
     look = look_of(plan.kernels.look) if plan.kernels.look is not None else None
     has_look = look is not None
 

@@ -66,7 +66,7 @@ def leaves_gap(p: Any, frame: Any, m: int, x: float, y: float, rho: float) -> bo
 
 @kernel
 def write_vector(row: Any, at: int, vector: Any) -> None:
-    """Write two numbers into a row from index `at` on (unsigned, see shorten_free_paths)."""
+    """Write the two numbers of a vector to row[at] and row[at + 1]."""
     row[np.uint64(at)] = vector[0]
     row[np.uint64(at + 1)] = vector[1]
 

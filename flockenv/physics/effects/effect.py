@@ -352,7 +352,7 @@ class Effect(Record):
         return {}
 
     def sums(self, dimension: int) -> int:
-        """Return the number of running sums of the pair law."""
+        """Return how many running numbers the pair law has: sums, or whatever it keeps from neighbour to neighbour."""
         return 0
 
     def fold_size(self, dimension: int) -> int:

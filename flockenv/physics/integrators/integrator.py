@@ -49,7 +49,7 @@ def _carry(x, seconds, flow, i):  # type: ignore[no-untyped-def]  # numba compar
 
 
 class Alone(NamedTuple):
-    """Context of a world whose laws are Python functions."""
+    """What `step` passes to a method as its context: one world, whose laws are Python functions."""
 
     drag: float | Floats = 0.0  # c / m, 1/s, one for all or one per coordinate (D N,)
     settings: tuple[float, ...] = ()  # of the method, see Integrator.settings

@@ -157,4 +157,4 @@ class Threshold(Sink):
         super().check(scene)
         if self.of not in scene.parts.inner:
             kept = ", ".join(scene.parts.inner) or "nothing"
-            raise ValueError(f"of = {self.of!r}: no effect of this scene keeps it; they keep {kept}")
+            raise ValueError(f"of = {self.of!r}: no effect of this scene keeps such an inner number; they keep {kept}")

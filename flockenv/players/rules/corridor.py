@@ -63,7 +63,7 @@ def _wall_force(see: Any, strength: float, decay: float) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class CorridorOrcaRules:
-    """As published, each agent makes half of the change; a desired velocity that is not free is turned right."""
+    """ORCA: as published, each agent makes half of the change; a desired velocity that is not free is turned right."""
 
     horizon: float = 2.0  # s, for which the velocity must be free of collisions
     margin: float = 0.05  # m, clearance for delays by inertia

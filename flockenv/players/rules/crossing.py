@@ -59,7 +59,7 @@ def crossing(see: Any, task: Crossing, p: CrossingRules) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class OrcaRules:
-    """As published, each agent makes half of the change; without turning right, twelve agents deadlock."""
+    """ORCA: as published, each agent makes half of the change; without turning right, twelve agents deadlock."""
 
     horizon: float = 2.0  # s, for which the velocity must be free of collisions
     margin: float = 0.1  # m, clearance for delays by inertia

@@ -50,7 +50,7 @@ def crowd_nav(see: Any, task: CrowdNav, p: CrowdNavRules) -> NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RobotOrcaRules:
-    """As published, but for the share: a robot that the pedestrians do not see must make the whole change."""
+    """ORCA as published, but for the share: a robot that the pedestrians do not see must make the whole change."""
 
     horizon: float = 2.0  # s, for which the velocity must be free of collisions
     margin: float = 0.1  # m, clearance for delays by inertia
@@ -67,7 +67,7 @@ def orca_crowd_nav(see: Any, task: CrowdNav, p: RobotOrcaRules) -> NDArray[np.fl
 
 @dataclass(frozen=True)
 class HeuristicsRules:
-    """As published, but for its range of sight, which is the observation's."""
+    """Parameters of Moussaid et al. 2011 as published, but for the range of sight, which is the observation's."""
 
     tau: float = 0.5  # s, relaxation time, and the least time to a collision ahead
     reach: float = 10.0  # d_max, m

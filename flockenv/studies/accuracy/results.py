@@ -113,7 +113,7 @@ class Curve(ResultRecord):
         return min(found, key=lambda choice: choice.cost, default=None)
 
     def _as_choice(self, point: Point, by: Cost) -> Choice:
-        """Return a point as a choice."""
+        """Return the `Choice` of a measured point: its setting, and its cost in seconds or evaluations."""
         cost, error = point.cost(by), point.error
         assert cost is not None and error is not None
         return Choice(

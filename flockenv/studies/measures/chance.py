@@ -63,5 +63,7 @@ def above_null(values: ArrayLike, nulls: ArrayLike, seed: int = 0) -> Above:
         raise ValueError(f"values of shape {order.shape}, nulls of {null.shape}: must be one of each for each run")
     excess = mean_of_runs(order - null, seed)
     if excess.runs < 5:
-        raise ValueError(f"values: {excess.runs} runs with a null, at least 5 are needed for an interval")
+        raise ValueError(
+            f"values: {excess.runs} runs with a null, the value by chance; at least 5 are needed for an interval"
+        )
     return Above(excess.runs, excess.mean, excess.low, excess.high)

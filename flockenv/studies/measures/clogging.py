@@ -33,7 +33,7 @@ class Tail(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """'flows' or 'clogs' if alpha is 1.96 errors from 2, else 'undecided'; 'no tail' for too few gaps."""
+        """'flows' or 'clogs' if alpha is more than 1.96 errors above or below 2, else 'undecided'; NaN: 'no tail'."""
         if not np.isfinite(self.alpha):
             return "no tail"
         if abs(self.alpha - 2) <= 1.96 * self.error:
