@@ -61,7 +61,7 @@ class _Extractor(MlpExtractor):
 
 
 class CentralPolicy(ActorCriticPolicy):
-    """SB3's policy for such rows.
+    """SB3's policy for the rows of `CentralVecEnv`: the actor sees a learner's observation, the critic the whole row.
 
     Args:
         seen: how many numbers of a row the actor gets; actions can be computed from these alone, values need the whole

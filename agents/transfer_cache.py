@@ -145,7 +145,7 @@ def _read(path: Path, of_json: Callable[[Any], Kept]) -> Kept:
         return of_json(json.loads(path.read_text(encoding="utf-8")))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         why = " ".join(str(error).split())
-        raise ValueError(f"{path} is damaged: {why}; without it the same command makes it anew") from None
+        raise ValueError(f"{path} is damaged: {why}; delete it, and the same command makes it anew") from None
 
 
 def _cell_of(content: Any, worlds: int) -> Cell:

@@ -40,7 +40,7 @@ LOOSE = 1 + 1e-6
 def obstacles_of(plan: Obstacles) -> Callable[..., None]:
     """Make `fold_obstacles(context, pos, vel, time, block)`: compute the folds of a block over the obstacles.
 
-    The results are written into `lanes`, where the plan value; time, s.
+    Results are written into `scratch.lanes`, at the places that the plan names. time: s.
     """
     d, width, arranges = plan.agent.dimension, plan.agent.width, plan.arranges
     size, wide = np.uint64(d * width), np.uint64(width)

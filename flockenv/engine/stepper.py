@@ -40,7 +40,7 @@ class Stepper:
 
     @property
     def scene(self) -> SceneView:
-        """The scene, which must be alive."""
+        """The scene; this object does not keep it alive, but nothing works without it."""
         scene = self._scene()
         assert scene is not None
         return scene

@@ -189,7 +189,7 @@ def _call_argument(code: Any, variable: Any, name: str) -> Any:
 
 @_register(mutates_CFG=True, analysis_only=False)
 class _Lowering(_Native):  # type: ignore[misc]
-    """Lowering without machine code."""
+    """Lowering of a part of kernels: LLVM code for its callers to inline, but no machine code."""
 
     _name = "lowering_to_be_inlined"
 

@@ -527,7 +527,9 @@ class Scene(Record):
             raise ValueError(f"the state has {len(state.inner)} inner numbers, but effects of this scene keep {keeps}")
         if state.identity.shape[1] != (self.agents if self.population else 0):
             has, keeps = ("identities" if k else "no identities" for k in (state.identity.size, self.population))
-            raise ValueError(f"the state has {has}, but this scene has {keeps}: only a population gives them")
+            raise ValueError(
+                f"the state has {has}, but this scene has {keeps}: only scenes with a population have them"
+            )
         if state.dt != self.dt:
             raise ValueError(
                 f"the state counts steps of {state.dt:g} s, but this scene makes steps of {self.dt:g} s; "

@@ -32,7 +32,7 @@ class WorldArrays(NamedTuple):
 
 
 class Constants(NamedTuple):
-    """Constant numbers."""
+    """Numbers that the kernel is passed and never changes."""
 
     params: Any  # of the scene
     numbers: Any  # of the task: its parameters()

@@ -164,14 +164,16 @@ def silhouette(shape: Any, point: Floats, clearance: float) -> tuple[Floats, Flo
     """
     corners, radius = shape.corners
     if len(point) != 2 or shape.dimension != 2:
-        raise ValueError(f"silhouette: of a {shape.kind} in {shape.dimension}-D; the outline has two ends in the plane")
+        raise ValueError(
+            f"silhouette: a {shape.kind} in {shape.dimension}-D; only in 2-D does the outline have two ends"
+        )
     if shape.is_hollow:
-        raise ValueError(f"silhouette: a hollow {shape.kind} is all around, its outline has no ends")
+        raise ValueError(f"silhouette: a hollow {shape.kind} surrounds the point, its outline has no ends")
     if not len(corners):
         raise ValueError(f"silhouette: a {shape.kind} has no corners")
     radius += clearance
     if float(shape.gap(point)) <= clearance:
-        raise ValueError(f"silhouette: {point.tolist()} m is not outside of it")
+        raise ValueError(f"silhouette: point = {point.tolist()} m is not outside of the shape")
     offset = corners - point
     distance = np.linalg.norm(offset, axis=1)
     middle = offset.mean(axis=0)

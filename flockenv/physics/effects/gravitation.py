@@ -44,7 +44,7 @@ def inverse_square(p: Any, me: Me, other: Far) -> Vec:
 
 
 class _Softened(Effect):
-    """Base class with the fields that both forces have."""
+    """Base class of the two inverse-square forces, with their common fields."""
 
     softening: float = Field(ge=0, description="eps, m; 0 = point masses, without a bound of the force")
     opening: float = Field(

@@ -122,7 +122,7 @@ class Springs(Effect):
         return {}
 
     def bonds(self, groups: Sequence[Any], dimension: int) -> Bonds:
-        """Return a row for both ends of every spring."""
+        """Return two rows for every spring, one for each end."""
         first, network, mass = network_of(groups, self.group, dimension)
         springs = network.springs(dimension)
         stiffness = np.full(len(springs.i), self.stiffness)

@@ -134,7 +134,7 @@ class Curve(ResultRecord):
 
 
 class Report(ResultRecord):
-    """One problem, all methods."""
+    """Results of all methods on one problem."""
 
     name: str
     title: str

@@ -63,7 +63,7 @@ def order(scene: Scene, settle: int, steps: int, worlds: int = 4, seed: int = 0)
 
 
 class Flock(Record):
-    """Number of agents, and the integrator."""
+    """A variant of the experiment: the number of agents, and the integrator."""
 
     count: int = Field(ge=2, description="N, at Vicsek's density")
     integrator: AnyIntegrator = Field(

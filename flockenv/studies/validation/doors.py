@@ -205,7 +205,7 @@ def nist_3_1(name: str) -> Value:
 
 
 def nist_5(name: str) -> tuple[Walk, float]:
-    """Return 100 people that leave a room by a door of 1 m, and the time it took, s.
+    """Run 100 people out of a room by a door of 1 m; return the run, and the time it took, s.
 
     The room is 10 x 6 m: 8 x 5 m, NIST's and IMO's, has no room for 100 bodies .7 m across.
     """

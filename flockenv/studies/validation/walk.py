@@ -50,7 +50,7 @@ PATIENCE = 60.0
 
 
 class Walk(NamedTuple):
-    """T instants of B worlds."""
+    """A recorded run: the motion of people at T instants of B worlds, and the last state."""
 
     time: Floats  # (T,) s
     pos: Floats  # (T, B, N, 2) m
