@@ -246,7 +246,7 @@ def test_curves_train_every_setting_once_and_draw_them(tmp_path: Path, monkeypat
 
     experiment = Experiment(task="pursuit", ppo={**TINY, "steps": 512}, curves={"two epochs": {"epochs": 2}})
     interrupt(experiment, tmp_path / "runs" / "pursuit" / AS_CONFIGURED)
-    monkeypatch.setattr("agents.curves.tuned", lambda task: Tuned({}, {"tuning_mean": -100.0}))
+    monkeypatch.setattr("agents.curves.load_tuned", lambda task: Tuned({}, {"tuning_mean": -100.0}))
     message = _curves(tmp_path)
     assert "pursuit, as configured: 1 epoch, minibatch 64, rate 0.002: goes on after 256 steps\n" in message
     assert "pursuit, two epochs: 2 epochs, minibatch 64, rate 0.002: begins\n" in message
