@@ -268,8 +268,16 @@ def test_other_yaml_readers_read_equal_numbers() -> None:
         ("count: 5", "count: 0", "text:4: groups[0].count = 0: must be an integer >= 1 (number of agents)"),
         ("count: 5", "count: -1", "text:4: groups[0].count = -1: must be an integer >= 1 (number of agents)"),
         ("count: 5", "count: 2.5", "text:4: groups[0].count = 2.5: must be an integer >= 1 (number of agents)"),
-        ("count: 5", "count: 5.0", "text:4: groups[0].count = 5.0: must be an integer >= 1: write 5 (number of agents)"),
-        ("count: 5", "count: ten", "text:4: groups[0].count = 'ten': must be an integer >= 1, not text (number of agents)"),
+        (
+            "count: 5",
+            "count: 5.0",
+            "text:4: groups[0].count = 5.0: must be an integer >= 1: write 5 (number of agents)",
+        ),
+        (
+            "count: 5",
+            "count: ten",
+            "text:4: groups[0].count = 'ten': must be an integer >= 1, not text (number of agents)",
+        ),
         ("count: 5", "mass: 1", "text:4: groups[0]: count: give either a count or a network"),
         ("count: 5", "count: 5\n    mass: 0", "text:5: groups[0].mass = 0: must be a number > 0 (kg)"),
         ("count: 5", "count: 5\n    radius: -1", "text:5: groups[0].radius = -1: must be a number >= 0 (m)"),

@@ -12,7 +12,7 @@ import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import data_equivalence
 
-from flockenv.envs import common, crossing_v0, flock_v1, pursuit_v0, school_v0
+from flockenv.envs import aec, common, crossing_v0, flock_v1, pursuit_v0, school_v0
 from flockenv.envs.table import id_of
 from tests.catalogue import RAISED, TEAMS
 
@@ -570,6 +570,9 @@ def test_a_former_version_is_refused_and_the_new_one_is_named() -> None:
         for make in (module.env, module.parallel_env):
             with pytest.raises(ImportError, match=f"use {name.lower()}_v{version} instead"):
                 make()
+    for name in ("WorldAECEnv", "EvadeAECEnv", "NothingAECEnv", "nothing"):
+        with pytest.raises(AttributeError, match=f"'flockenv.envs.aec' has no attribute '{name}'"):
+            getattr(aec, name)
     for never in ("flock_v9", "nothing_v0", "flock_vx"):
         with pytest.raises(AttributeError, match=never):
             getattr(envs, never)

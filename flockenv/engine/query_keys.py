@@ -22,7 +22,7 @@ from flockenv.maths.vectors import exact_dot, sub
 
 __all__ = ["by_keys_of"]
 
-NOBODY = np.uint32(0xFFFFFFFF)
+NO_NEIGHBOUR = np.uint32(0xFFFFFFFF)
 """A key that sorts after those of all agents."""
 
 
@@ -43,7 +43,7 @@ def by_keys_of(plan: LookPlan) -> Callable[..., bool]:
         tags = np.int32(room - 1)
         edge = key_of(span.within, np.int32(0), tags)
         for lane in range(np.uint64(width)):
-            fill(lanes, lane, lists, key_as_float(NOBODY))
+            fill(lanes, lane, lists, key_as_float(NO_NEIGHBOUR))
         for j in range(np.uint64(0), np.uint64(n), np.uint64(AT_ONCE)):
             for lane in range(np.uint64(width)):
                 here, mine = gather(rows, block + lane, place), number[block + lane]
@@ -71,7 +71,7 @@ def _key(plan: LookPlan) -> Callable[..., Any]:
         there, tag = gather(rows, j, place), number[j]
         to = offset_to(size, here, there) if periodic else sub(there, here)
         found = key_of(exact_dot(to, to), tag, tags)
-        return NOBODY if tag == mine else found
+        return NO_NEIGHBOUR if tag == mine else found
 
     return key
 

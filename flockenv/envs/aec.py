@@ -13,6 +13,7 @@ from pettingzoo.utils.wrappers import BaseWrapper, OrderEnforcingWrapper
 
 from flockenv.envs import parallel
 from flockenv.envs.common import Rows
+from flockenv.envs.table import ENVIRONMENTS
 
 __all__ = ["by_turns"]
 
@@ -74,10 +75,10 @@ def by_turns(env: parallel.WorldParallelEnv) -> AECEnv[str, Any, Any]:
 
 def __getattr__(name: str) -> Callable[..., AECEnv[str, Any, Any]]:
     """Return the function that makes the AEC form of an environment in the table, such as PursuitAECEnv."""
-    several = name.removesuffix("AECEnv")
-    if several == name:
+    info = ENVIRONMENTS.get(name.removesuffix("AECEnv")) if name.endswith("AECEnv") else None
+    if info is None or not info.team:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    env_class: type[parallel.WorldParallelEnv] = getattr(parallel, f"{several}ParallelEnv")
+    env_class: type[parallel.WorldParallelEnv] = getattr(parallel, f"{info.name}ParallelEnv")
 
     def env(max_cycles: int | None = None, render_mode: str | None = None, **parameters: Any) -> AECEnv[str, Any, Any]:
         """Make the turn-based environment (AEC); the parameters are those of the task."""

@@ -177,7 +177,7 @@ class World:
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes that `_compile_and_allocate` cannot make again."""
         derived = (
-            "_entries", "_enter", "_compute_metrics", "_actions", "_constant_arguments", "_scratch", "_choices",
+            "_entries", "_enter", "_compute_metrics", "_actions", "_constant_arguments", "_scratch", "_tuners",
             "_calls", "_metric_arguments", "_metrics_row", "_shapes", "_dtypes", "_all_worlds", "_unwritten",
             "_make_results", "_streaming",
         )  # fmt: skip
