@@ -35,6 +35,7 @@ def side_by_side(work: Callable[[Job, Tell], Done], jobs: Sequence[Job], process
 
     Raises:
         OSError: a process was ended from outside.
+        KeyboardInterrupt: the same, by a signal that this process also received.
         Exception: the first that `work` or `tell` raises. The other processes end then, and also whenever this one
         ends.
     """
@@ -55,6 +56,7 @@ def side_by_side(work: Callable[[Job, Tell], Done], jobs: Sequence[Job], process
                         break
                     yield working.result()
             except BrokenExecutor:
+                signals.raise_if_received()  # the signal that ended a worker was sent to the whole process group
                 raise OSError("one of the processes was ended from outside; is there enough memory?") from None
             finally:
                 if len(at_work) < len(jobs) or not all(working.done() for working in at_work):

@@ -18,7 +18,7 @@ from typing import Annotated
 import typer
 
 from benchmarks.measure import ROOT, Bench, Contestant, Out, Quick, Rounds, Sample, command_line
-from flockenv.jit.numba_patches.front_end import LEFT_OUT, PATCHES, REPLACED_PASSES
+from flockenv.jit.numba_patches.front_end import LEFT_OUT, PATCHES
 
 __all__ = ["Compilation"]
 
@@ -68,7 +68,7 @@ def main(
     out: Out = None,
 ) -> None:
     """Measure what each replacement in numba saves of a cold compile."""
-    titles = [*(each.title for each in (*PATCHES, *REPLACED_PASSES)), "lowering"]
+    titles = [*(each.title for each in PATCHES), "lowering"]
     with Bench("compiling", quick, rounds, out, unit="compiles/s", scale=1.0) as bench:
         contestants = [Compilation("all replacements", lambda: None, 1, scene=scene)]
         contestants += [Compilation(f"without {t}", lambda: None, 1, scene=scene, left_out=t) for t in titles]

@@ -34,9 +34,10 @@ __all__ = ["COMMANDS", "Outcome", "interrupt"]
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENES = ROOT / "configs" / "scenes"
-PATIENCE, ORPHANED, LATE = 20.0, 5.0, 2.0
+PATIENCE, ORPHANED, LATE = 60.0, 5.0, 2.0
 """s until a command that was interrupted counts as hanging, and until a process that is left counts as an orphan; one
-that succeeds so soon after its signal without a word had done its work, and was on its way out."""
+that succeeds so soon after its signal without a word had done its work, and was on its way out. A simulation that
+`measure` interrupts is still measured, which takes up to 20 s."""
 
 FLOCKENV = (str(Path(sysconfig.get_path("scripts")) / "flockenv"),)
 COMMANDS: dict[str, tuple[str, ...]] = {
@@ -54,7 +55,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
 
 ALLOWED = re.compile(
     r"\w+: (interrupted|terminated).*|interrupted; .*|flockenv: warning: .*|\w+: \w+ plays|[\w: ]+: done|"
-    r".*\(.* so far.*\)|\s*"
+    r".*\(.* so far.*\)|\s*[\d,]+ steps .*|\s*"
 )
 """Lines of stderr that are not complained of: the one line, warnings, and news of how far a command is."""
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.processes import guard_process_starts
+from agents.processes import Tell, guard_process_starts, side_by_side
 from flockenv.core import signals
 from flockenv.core.signals import ONE_PRESS
 
@@ -316,6 +316,21 @@ def test_the_mark_of_worker_processes_is_removed_after_they_are_started(
         if error:
             raise error
     assert os.environ.get(signals.PARENT) == before
+
+
+def _exit_after_signal(job: int, tell: Tell) -> None:
+    os._exit(143)
+
+
+@pytest.mark.parametrize(("number", "error"), [(signal.SIGTERM, KeyboardInterrupt), (0, OSError)])
+def test_workers_ended_by_a_signal_to_the_whole_group_are_no_error(
+    number: int, error: type[BaseException], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The worker ends at once, while the command waits for a line at which it can raise KeyboardInterrupt."""
+    monkeypatch.setattr(signals._Received, "signal", number)
+    monkeypatch.setattr(signals._Received, "raised", False)
+    with pytest.raises(error):
+        list(side_by_side(_exit_after_signal, [1], 1, lambda: None))
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM], ids=lambda number: number.name)

@@ -8,7 +8,6 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
-from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ import pytest
 from llvmlite.binding import get_host_cpu_features
 from numba import config
 
-from flockenv.jit.decorators import law
+from flockenv.jit.decorators import kernel, law
 from flockenv.jit.intrinsics import unaliased
 from flockenv.jit.numba_patches import front_end, lowering
 from flockenv.jit.pipeline import Whole
@@ -38,7 +37,6 @@ def now() -> list[Any]:
 def test_every_patch_applies_to_the_tested_version_of_numba() -> None:
     front_end._replacements.cache_clear()
     assert len(front_end._replacements()) == len(front_end.PATCHES)
-    assert len(front_end._places()) == len(front_end.REPLACED_PASSES)
     lowering.is_brief.cache_clear()
     assert lowering.is_brief()
     before = now()
@@ -49,7 +47,7 @@ def test_every_patch_applies_to_the_tested_version_of_numba() -> None:
 @pytest.fixture
 def cleared_caches() -> Iterator[None]:
     """Clear the caches of the patches that apply, before and after a test."""
-    caches = (front_end.is_known_source, front_end._replacements, front_end._places, lowering.is_brief)
+    caches = (front_end.is_known_source, front_end._replacements, lowering.is_brief)
     for function in caches:
         function.cache_clear()
     yield
@@ -62,11 +60,8 @@ def test_a_numba_with_other_source_code_is_not_patched(monkeypatch: pytest.Monke
     before = now()
     with front_end.apply_patches():
         assert all(new is old for new, old in zip(now(), before, strict=True))
-    assert front_end.replace_passes([(front_end.REPLACED_PASSES[0].numbas, "")]) == [
-        (front_end.REPLACED_PASSES[0].numbas, "")
-    ]
     assert machine_code(Whole) == machine_code(None)
-    assert len(unapplied_patches()) == len(front_end.PATCHES) + len(front_end.REPLACED_PASSES) + 1
+    assert len(unapplied_patches()) == len(front_end.PATCHES) + 1
 
 
 def test_a_patch_for_other_source_code_is_named(monkeypatch: pytest.MonkeyPatch, cleared_caches: None) -> None:
@@ -80,7 +75,7 @@ def test_a_patch_for_other_source_code_is_named(monkeypatch: pytest.MonkeyPatch,
 def test_each_patch_has_its_own_title_and_other_names_are_refused(
     monkeypatch: pytest.MonkeyPatch, cleared_caches: None
 ) -> None:
-    titles = [each.title for each in (*front_end.PATCHES, *front_end.REPLACED_PASSES)]
+    titles = [each.title for each in front_end.PATCHES]
     assert len(set(titles)) == len(titles)
     monkeypatch.setenv(front_end.LEFT_OUT, "lowring")
     with pytest.raises(ValueError, match=r"^FLOCKENV_NUMBA_ALONE: 'lowring': unknown, did you mean `lowering`"):
@@ -91,10 +86,9 @@ def test_each_patch_has_its_own_title_and_other_names_are_refused(
 def test_an_environment_variable_leaves_patches_out(
     left_out: str, monkeypatch: pytest.MonkeyPatch, cleared_caches: None
 ) -> None:
-    first, *others = (each.title for each in (*front_end.PATCHES, *front_end.REPLACED_PASSES))
+    first, *others = (each.title for each in front_end.PATCHES)
     monkeypatch.setenv(front_end.LEFT_OUT, "all" if left_out == "all" else f"{first},lowering")
-    replaced = len(front_end._replacements()) + len(front_end._places())
-    assert replaced == (0 if left_out == "all" else len(others))
+    assert len(front_end._replacements()) == (0 if left_out == "all" else len(others))
     assert not lowering.is_brief()
     assert machine_code(Whole) == machine_code(None)
 
@@ -166,16 +160,26 @@ def test_an_entry_point_may_use_the_widest_registers() -> None:
         assert "zmm" in next(iter(compiled.inspect_asm().values()))
 
 
-def test_closures_comprehensions_and_reductions_are_still_inlined() -> None:
-    def several(x: Any) -> float:
-        def twice(y: float) -> float:
-            return 2 * y
+@kernel
+def _item(x: Any, k: int) -> float:
+    return x[k]  # type: ignore[no-any-return]
 
-        return reduce(lambda a, b: a + b, x) + twice(x[0]) + sum([y * y for y in x])
 
-    compiled: Any = numba.njit(several, pipeline_class=Whole)
-    x = np.array([1.0, 2.0, 3.0])
-    assert compiled(x) == several(x) == 22.0
+@kernel
+def _part(pair: Any, k: int) -> Any:
+    return pair[k]
+
+
+def test_calls_with_different_literals_share_code() -> None:
+    compiled: Any = numba.njit(lambda x: _item(x, 0) - _item(x, 1) + _item(x, len(x) - 1), pipeline_class=Whole)
+    assert compiled(np.array([5.0, 2.0, 4.0])) == 7.0
+    assert len(_item.signatures) == 1
+
+
+def test_what_needs_a_literal_is_compiled_for_each() -> None:
+    compiled: Any = numba.njit(lambda x: x[_part((1, x[0]), 0)] + _part((1, x[0]), 1), pipeline_class=Whole)
+    assert compiled(np.array([5.0, 2.0, 4.0])) == 7.0
+    assert len(_part.signatures) == 2
 
 
 PARTS = """

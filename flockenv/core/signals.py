@@ -31,6 +31,7 @@ __all__ = [
     "exit_code",
     "exit_now",
     "handle_signals",
+    "raise_if_received",
     "remove_at_end",
     "remove_unfinished",
     "set_message",
@@ -172,6 +173,13 @@ def defer_signals() -> Iterator[None]:
         yield
     finally:
         _deferring.discard(section)
+
+
+def raise_if_received() -> None:
+    """Raise KeyboardInterrupt now if a signal has arrived at a line where that was not possible."""
+    if _Received.signal and not _Received.raised:
+        _Received.raised = True
+        raise KeyboardInterrupt
 
 
 @contextmanager

@@ -25,7 +25,7 @@ from llvmlite import ir as llvm
 from numba import _dynfunc  # type: ignore[attr-defined]  # compiled
 from numba.core import analysis, compiler, compiler_machinery, ir, lowering, typed_passes
 
-from flockenv.jit.numba_patches.front_end import apply_patches, replace_passes
+from flockenv.jit.numba_patches.front_end import apply_patches
 from flockenv.jit.numba_patches.lowering import Brief, BriefPart, insert_part, is_brief
 
 __all__ = ["Inlined", "Whole"]
@@ -91,6 +91,15 @@ def _refusal_address() -> int:
     refuse.compile(())
     made = next(iter(refuse.overloads.values()))
     return int(made.library.get_pointer_to_function(made.fndesc.llvm_cpython_wrapper_name))
+
+
+def _optimise_defined_functions(library: Any, module: Any) -> None:
+    """Run LLVM's function passes like numba, but not on declarations, for which numba sets up passes in vain."""
+    module.data_layout = library._codegen._data_layout
+    for function in module.functions:
+        if not function.is_declaration:
+            passes, builder = library._codegen._function_pass_manager()
+            passes.run(function, builder)
 
 
 def _optimise_cheaply(library: Any) -> None:
@@ -205,6 +214,7 @@ class _Lowering(_Native):  # type: ignore[misc]
         state.flags.no_cfunc_wrapper = True
         codegen = state.targetctx.codegen()
         state.library = library = codegen.create_library(state.func_id.func_qualname)
+        library._optimize_functions = types.MethodType(_optimise_defined_functions, library)
         library._optimize_final_module = types.MethodType(_optimise_cheaply, library)
         library._finalize_final_module = types.MethodType(_finalise_without_code, library)
         super().run_pass(state)
@@ -233,14 +243,14 @@ class _Entry(_Native):  # type: ignore[misc]
 
 
 class Whole(_Compiler):  # type: ignore[misc]
-    """Compiler of entry points: numba's pipeline without the passes that `front_end` skips."""
+    """Compiler of entry points: numba's pipeline with another lowering."""
 
     _lowering = _Entry
 
     def define_pipelines(self) -> list[Any]:
         """Return the pipeline as a list of one pass manager."""
         passes = _Passes.define_nopython_pipeline(self.state)
-        passes.passes = [(self._lowering if p is _Native else p, text) for p, text in replace_passes(passes.passes)]
+        passes.passes = [(self._lowering if p is _Native else p, text) for p, text in passes.passes]
         passes.finalize()
         return [passes]
 

@@ -38,7 +38,7 @@ def compiled_kernels() -> tuple[Compiled, ...]:
 def unapplied_patches() -> tuple[str, ...]:
     """Return the titles of the patches that are not applied because the installed numba's source differs."""
     every = [
-        *((each.title, each.reads) for each in (*front_end.PATCHES, *front_end.REPLACED_PASSES)),
+        *((each.title, each.reads) for each in front_end.PATCHES),
         ("lowering", lowering.READS),
     ]
     return tuple(title for title, reads in every if not front_end.is_known_source(reads))

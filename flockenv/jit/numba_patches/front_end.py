@@ -1,6 +1,6 @@
 """A faster front end of numba: caches and short cuts while it compiles our kernels.
 
-Four fifths of the compile time of a kernel are spent in numba's Python code. The resulting machine code is the same,
+More than half of the compile time of a kernel is spent in numba's Python code. The resulting machine code is the same,
 instruction for instruction. The patches are active only while one of our functions compiles, under numba's own lock,
 and are undone afterwards. Each patch lists the functions of numba that it relies on, with digests of their source: if
 one of them differs (another version of numba), the patch is left out and numba works unchanged.
@@ -13,23 +13,18 @@ import hashlib
 import inspect
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any, NamedTuple
 
 from numba.core import (
-    base,
     compiler_lock,
     dispatcher,
-    inline_closurecall,
-    ir,
+    event,
     postproc,
-    ssa,
     targetconfig,
     transforms,
-    untyped_passes,
+    types,
 )
-from numba.core.compiler_machinery import register_pass
-from numba.core.ir_utils import fixup_var_define_in_scope
 from numba.core.types import functions
 
 from flockenv.core.errors import nearest, printable
@@ -38,13 +33,10 @@ from flockenv.jit.startup import no_garbage_collection
 __all__ = [
     "LEFT_OUT",
     "PATCHES",
-    "REPLACED_PASSES",
     "Patch",
-    "ReplacedPass",
     "applies",
     "apply_patches",
     "is_known_source",
-    "replace_passes",
 ]
 
 LEFT_OUT = "FLOCKENV_NUMBA_ALONE"
@@ -52,11 +44,7 @@ LEFT_OUT = "FLOCKENV_NUMBA_ALONE"
 
 # numba is untyped
 _canonical: Any = transforms.canonicalize_cfg
-_fixup: Any = fixup_var_define_in_scope
 _lock: Any = compiler_lock.global_compiler_lock
-_register: Any = register_pass
-_Closures: Any = untyped_passes.InlineClosureLikes
-_Processor: Any = postproc.PostProcessor
 
 
 class Known(NamedTuple):
@@ -103,7 +91,7 @@ def applies(title: str, reads: tuple[Known, ...]) -> bool:
     Raise ValueError for a name in LEFT_OUT that is not the title of a patch.
     """
     left_out = [name for name in os.environ.get(LEFT_OUT, "").split(",") if name]
-    allowed = ["all", "lowering", *(each.title for each in (*PATCHES, *REPLACED_PASSES))]
+    allowed = ["all", "lowering", *(each.title for each in PATCHES)]
     for name in left_out:
         if name not in allowed:
             raise ValueError(f"{LEFT_OUT}: {printable(name)}: unknown{nearest(name, allowed)} ({', '.join(allowed)})")
@@ -155,9 +143,13 @@ def _cache_calls(resolve: Any) -> Any:
 
 
 def _cache_laws(resolve: Any) -> Any:
-    """Cache the signature of a compiled function for given types while its compiled form exists."""
+    """Cache the signature of a compiled function for given types while its compiled form exists.
+
+    Calls with literal numbers share the code of other calls; numba compiles a function anew for each literal.
+    """
 
     def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
+        args = _without_literals(args)
         call = _call(context, args, kws)
         signature = _cached_signature(self, call)
         if signature is None:
@@ -169,21 +161,17 @@ def _cache_laws(resolve: Any) -> Any:
     return get_call_type
 
 
+def _without_literals(args: Any) -> tuple[Any, ...]:
+    """Return the types of numbers for those of literals, unless a tuple of several types may be indexed by one."""
+    return tuple(args if any(isinstance(kind, types.Tuple) for kind in args) else map(types.unliteral, args))
+
+
 # --- cheaper: the same result, computed faster ------------------------------------------------------------------------
 
 
-def _faster_values(_: Any) -> Any:
-    """Return a faster `values` of flags: the cached defaults, updated with the set values."""
-    defaults: dict[Any, dict[str, Any]] = {}
-
-    def values(self: Any) -> dict[str, Any]:
-        cls = type(self)
-        if cls not in defaults:
-            defaults[cls] = {name: option.default for name, option in cls.options.items()}
-        values: dict[str, Any] = defaults[cls] | self._values
-        return values
-
-    return values
+def _no_timers(_: Any) -> Any:
+    """Measure no times of locks: numba informs two timers for each enclosing function, with every nested call."""
+    return lambda kind, callback: nullcontext()
 
 
 def _lifetimes_on_demand(slowly: Any) -> Any:
@@ -206,44 +194,6 @@ def _lifetimes_on_demand(slowly: Any) -> Any:
     return run
 
 
-def _refresh_if_new(refresh: Any) -> Any:
-    """Refresh registries only if there are new declarations: numba goes through all of them for each function."""
-    seen: dict[int, int] = {}  # by id of the registries, which the copies of a target share
-
-    def refresh_if_new(self: Any) -> None:
-        known = sum(
-            len(getattr(registry, kind))
-            for context in (self, getattr(self, "typing_context", None) or self)
-            for registry, loader in list(context._registries.items())
-            for kind in loader.registry_items
-        )
-        if seen.get(id(self._registries)) != known:
-            refresh(self)
-            seen[id(self._registries)] = known
-
-    return refresh_if_new
-
-
-def _rewrite_where_used(slowly: Any) -> Any:
-    """Rewrite only the blocks that contain a variable: numba goes through all blocks for each variable."""
-
-    def names(block: Any) -> frozenset[str]:
-        known = vars(block).get("_flockenv_names")
-        if known is None or known[0] is not block.body:
-            found = frozenset(variable.name for statement in block.body for variable in statement.list_vars())
-            known = block._flockenv_names = block.body, found
-        return known[1]  # type: ignore[no-any-return]
-
-    def rewrite(blocks: Any, states: Any, handler: Any) -> Any:
-        name = states["varname"]
-        return {
-            label: slowly({label: block}, states, handler)[label] if name in names(block) else block
-            for label, block in blocks.items()
-        }
-
-    return rewrite
-
-
 PATCHES = (
     Patch(functions.BaseFunction, "get_call_type", _cache_calls, (
         Known(functions.BaseFunction, "get_call_type", "6559c167bfc0"),
@@ -253,27 +203,8 @@ PATCHES = (
         Known(functions.Dispatcher, "get_call_type", "ae1ef289d128"),
         Known(dispatcher._DispatcherBase, "get_call_template", "f15b62d0e9c0"),
     )),
-    Patch(targetconfig.TargetConfig, "values", _faster_values, (
-        Known(targetconfig.TargetConfig, "values", "12a29dc810f6"),
-        Known(targetconfig._MetaTargetConfig, "__init__", "f2ff91c25728"),
-    )),
+    Patch(event, "install_timer", _no_timers, (Known(event, "install_timer", "754d2f8aad8c"),)),
     Patch(postproc.PostProcessor, "run", _lifetimes_on_demand, (Known(postproc.PostProcessor, "run", "e1a8e77d6f17"),)),
-    Patch(ssa, "_run_block_rewrite", _rewrite_where_used, (
-        Known(ssa, "_run_ssa", "c497422bcf04"),
-        Known(ssa, "_run_block_rewrite", "d17efdbed570"),
-        Known(ssa, "_run_ssa_block_pass", "b48d590f81cc"),
-        Known(ssa, "_fresh_vars", "4a4d13bc0ec5"),
-        Known(ssa, "_fix_ssa_vars", "3f183045a535"),
-        Known(ssa._FreshVarHandler, "on_assign", "922c4f980745"),
-        Known(ssa._FreshVarHandler, "on_other", "565e6211fbcb"),
-        Known(ssa._FixSSAVars, "on_assign", "af50633e775a"),
-        Known(ssa._FixSSAVars, "on_other", "a17f1fff547c"),
-        Known(ssa._FixSSAVars, "_fix_var", "9735dd01ed8f"),
-    )),
-    Patch(base.BaseContext, "refresh", _refresh_if_new, (
-        Known(base.BaseContext, "refresh", "83e8f5cc63a7"),
-        Known(base.BaseContext, "install_registry", "bdaf4e9db8fe"),
-    )),
 )  # fmt: skip
 """All patches of functions."""
 
@@ -308,64 +239,3 @@ def apply_patches() -> Iterator[None]:
             if _depth == 0:
                 for owner, name, numbas, _ in _replacements():
                     setattr(owner, name, numbas)
-
-
-# --- passes that find nothing to do -----------------------------------------------------------------------------------
-
-
-@_register(mutates_CFG=True, analysis_only=False)
-class ClosuresIfAny(_Closures):  # type: ignore[misc]
-    """numba's pass that inlines closures, comprehensions and stencils, skipped if a function has none of them."""
-
-    _name = "inline_closure_likes_if_any"
-
-    def run_pass(self, state: Any) -> bool:
-        """Run numba's pass, or only its final steps if there is nothing to inline."""
-        if any(_may_be_inlined(statement) for b in state.func_ir.blocks.values() for statement in b.body):
-            return bool(super().run_pass(state))
-        _Processor(state.func_ir).run()
-        _fixup(state.func_ir.blocks)
-        return True
-
-
-def _may_be_inlined(statement: Any) -> bool:
-    value = getattr(statement, "value", None)
-    if isinstance(value, ir.Expr):
-        return value.op in ("make_function", "build_list") or (value.op == "getattr" and value.attr in _INLINED)
-    if isinstance(value, (ir.Global, ir.FreeVar)):
-        return value.name in _INLINED or getattr(value.value, "__name__", "") in _INLINED
-    return False
-
-
-_INLINED = ("reduce", "stencil")
-
-
-class ReplacedPass(NamedTuple):
-    """A pass of numba and its replacement."""
-
-    numbas: Any
-    ours: Any
-    reads: tuple[Known, ...]
-
-    @property
-    def title(self) -> str:
-        """Name of the patch, in lists and in LEFT_OUT."""
-        return self.numbas.__name__  # type: ignore[no-any-return]
-
-
-REPLACED_PASSES = (
-    ReplacedPass(_Closures, ClosuresIfAny, (
-        Known(_Closures, "run_pass", "b61f17f30105"),
-        Known(inline_closurecall.InlineClosureCallPass, "run", "d826ba18dd63"),
-    )),
-)  # fmt: skip
-
-
-@functools.cache
-def _places() -> dict[Any, Any]:
-    return {pair.numbas: pair.ours for pair in REPLACED_PASSES if applies(pair.title, pair.reads)}
-
-
-def replace_passes(passes: list[tuple[Any, str]]) -> list[tuple[Any, str]]:
-    """Return numba's list of passes with the replaced ones exchanged."""
-    return [(_places().get(each, each), text) for each, text in passes]
