@@ -300,10 +300,13 @@ def test_forces_are_right_in_elongated_crowds_in_three_dimensions(size: Any) -> 
     assert_as_expected((rules(1.0)[0],), uniform(300, size), None)
 
 
-def test_one_agent_very_far_away_does_not_change_the_other_forces() -> None:
-    x = uniform(500, (10.0, 10.0))
-    x[7] = 1e12, -1e12
-    assert_as_expected((rules(1.0)[0],), x, None)
+@pytest.mark.parametrize("far", [1e3, 1e5, 1e9, 1e100])
+@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
+def test_one_agent_very_far_away_changes_no_other_force_and_adds_few_candidates(dimension: int, far: float) -> None:
+    x = uniform(3000, (26.0, 26.0) if dimension == 2 else (9.0, 9.0, 9.0))
+    among = assert_as_expected((rules(1.0)[0],), x, None).count_of("pairs")
+    x[7] = (far, -far, far)[:dimension]
+    assert assert_as_expected((rules(1.0)[0],), x, None).count_of("pairs") < 1.5 * among
 
 
 def on_edges(space: Torus, reach: float) -> Array:
