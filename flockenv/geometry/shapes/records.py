@@ -287,6 +287,11 @@ class Block(Closed):
         signs = np.stack(np.meshgrid(*[[-0.5, 0.5]] * d, indexing="ij"), axis=-1).reshape(-1, d)
         return np.asarray(np.array(self.centre) + (signs * self.size) @ self.axes)
 
+    @property
+    def reference_points(self) -> Floats:
+        """The centre, as a face rounds with its own distance from it; of a room, whose faces agents reach, corners."""
+        return self.extremes if self.hollow else np.array([self.centre])
+
     def row(self, dimension: int) -> Sequence[float]:
         """Return the half edges and the axes."""
         return [*(0.5 * edge for edge in self.size), *self.axes.ravel().tolist()]
@@ -325,6 +330,11 @@ class HalfSpace(Shape):
     def extremes(self) -> Floats:
         """None, as it is unbounded."""
         return np.zeros((0, len(self.point)))
+
+    @property
+    def reference_points(self) -> Floats:
+        """The point, each coordinate times that of the unit normal: along the surface it may lie anywhere."""
+        return np.array([self.point]) * self.row(self.dimension)
 
     def row(self, dimension: int) -> Sequence[float]:
         """Return the unit normal."""

@@ -134,6 +134,11 @@ class Shape(Record):
     def extremes(self) -> Floats:
         """Points (n, D) m whose bounding box contains the shape; None if it is unbounded."""
 
+    @property
+    def reference_points(self) -> Floats:
+        """Points (n, D) m by whose coordinates distances are computed: these round as the largest coordinate does."""
+        return self.extremes
+
     @abstractmethod
     def row(self, dimension: int) -> Sequence[float] | Floats:
         """Return the numbers of the form, which follow the row header."""
