@@ -352,6 +352,47 @@ def test_routes_of_a_large_crowd_do_not_depend_on_threads_or_calls() -> None:
     np.testing.assert_array_equal(again.pos, end.pos)
 
 
+# --- doors that stand free --------------------------------------------------------------------------------------------
+
+FREE = ((11.0, 5.0), (11.0, 6.0))
+"""A door without walls, in a box of 12 x 8 m: agents may walk around its ends."""
+PASSING = [Routes(doors=(Door(ends=FREE),)), Journey(stages=(Stage(ends=FREE),), then="leave")]
+
+
+@pytest.mark.parametrize("effect", PASSING, ids=lambda effect: effect.kind)
+def test_a_free_door_is_passed_away_from_the_side_of_approach(effect: Any) -> None:
+    """Several agents pass x = 11 just beside an end of the door; once they turned back and walked away for good."""
+    starts = [(7.07, 6.33), (5.07, 1.76), (4.67, 4.48), (10.1, 0.95), (8.0, 5.5), (11.7, 3.0), (11.7, 5.5)]
+    groups = tuple(walkers(1, place, place, speed=1.3, max_speed=2) for place in starts)
+    scene = Scene(space=Box(size=(12, 8)), groups=groups, effects=(effect, Driving(tau=0.5)), dt=0.01)
+    end = scene.run(scene.start(0), 1000)
+    np.testing.assert_array_equal(scene.inner(end, effect.keeps[0])[0], 1)
+    assert (end.pos[0, :5, 0] > 11.5).all()
+    assert (end.pos[0, 5:, 0] < 10).all()
+
+
+@pytest.mark.parametrize("effect", PASSING, ids=lambda effect: effect.kind)
+@pytest.mark.parametrize(
+    ("places", "passed"),
+    [
+        ([(10.9, 4.8), (11.1, 4.95), (10.9, 5.35)], [0, 0, 0]),  # around the end, and back through the door
+        ([(10.9, 4.8), (11.1, 4.95), (10.9, 5.35), (11.1, 5.35)], [0, 0, 0, 1]),
+        ([(10.9, 4.8), (11.1, 4.95), (11.1, 5.05)], [0, 0, 1]),  # around the end, to a place behind the door
+        ([(10.9, 4.8), (11.1, 4.95), (13.0, 4.95), (10.9, 5.5)], [0, 0, 0, 1]),  # comes again, from the other side
+        ([(11.1, 5.5), (11.1, 4.95), (10.9, 5.35)], [0, 0, 1]),
+    ],
+)
+def test_crossing_a_door_backwards_is_no_passage(effect: Any, places: Any, passed: Any) -> None:
+    still = effect.model_copy(update={"share": 0.0})
+    scene = Scene(groups=(walkers(1, places[0], places[0]),), effects=(still,), dt=0.01)
+    state, found = scene.start(0), []
+    for place in places:
+        state.pos[0, 0] = place
+        scene.step(state, out=state)
+        found.append(int(scene.inner(state, effect.keeps[0])[0, 0]))
+    assert found == passed
+
+
 # --- queues and avoidance ---------------------------------------------------------------------------------------------
 
 

@@ -12,7 +12,7 @@ from flockenv.core.record import Record
 from flockenv.jit.decorators import Vec, law, like
 from flockenv.maths.vectors import dot, norm, scale, select
 
-__all__ = ["Target", "is_reached", "row_size", "to_any", "to_target"]
+__all__ = ["Target", "approach_side", "is_reached", "row_size", "side_of_door", "to_any", "to_target", "way_out"]
 
 Floats = NDArray[np.float64]
 Place = Annotated[tuple[Annotated[float, Field(strict=True)], ...], Field(min_length=2, max_length=3)]
@@ -174,16 +174,64 @@ def to_any(table: Any, at: Any, count: Any, x: Vec) -> Vec:
 
 
 @law
-def is_reached(table: Any, at: Any, was: Vec, now: Vec) -> bool:
-    """Return True if a move from `was` to `now` ends in the target whose row begins at `at`, or crosses a door; 2-D."""
-    to = to_target(table, at, now)
-    a, b, u, v = table[at], table[at + 1], table[at + 2], table[at + 3]
+def side_of_door(table: Any, at: Any, x: Vec) -> float:
+    """Return a number, m^2, whose sign says on which side of the line through a door x lies; 0 for other targets."""
+    side: float = table[at + 2] * (x[1] - table[at + 1]) - table[at + 3] * (x[0] - table[at])
+    return side
+
+
+@law
+def approach_side(table: Any, at: Any, side: float, x: Vec) -> float:
+    """Return the side (see `side_of_door`) from which an agent at x approaches a door: 2-D.
+
+    It is the side on which the agent was when it was last farther away than the door is long, so that it remains the
+    same for an agent that passes beside the end of a door. side: the value so far, 0 if there is none.
+    """
+    to = to_target(table, at, x)
+    anew = (side == like(side, 0.0)) | (dot(to, to) > _square(table, at))
+    return side_of_door(table, at, x) if anew else side
+
+
+@law
+def is_reached(table: Any, at: Any, side: float, was: Vec, now: Vec) -> bool:
+    """Return True if a move from `was` to `now` ends in the target whose row begins at `at`, or behind a door; 2-D.
+
+    A door is reached by crossing it from its `approach_side`, or beside its end to a place behind it, no farther from
+    it than it is long; not by crossing it backwards.
+    """
+    to, square = to_target(table, at, now), _square(table, at)
     o = like(now[0], 0.0)
-    before = u * (was[1] - b) - v * (was[0] - a)
-    after = u * (now[1] - b) - v * (now[0] - a)
+    before, after = side_of_door(table, at, was), side_of_door(table, at, now)
     part = before / (before - after) if before != after else o
-    x, y = was[0] + part * (now[0] - was[0]) - a, was[1] + part * (now[1] - was[1]) - b
-    along, square = x * u + y * v, u * u + v * v
-    across = (before * after <= o) & (before != after) & (along >= o) & (along <= square) & (square > o)
-    there: bool = (dot(to, to) <= o) | across
+    crossing = was[0] + part * (now[0] - was[0]), was[1] + part * (now[1] - was[1])
+    across = (before * after <= o) & (before != after) & _is_beside(table, at, crossing) & (after * side <= o)
+    behind = (after * side < o) & _is_beside(table, at, now) & (dot(to, to) <= square)
+    there: bool = (dot(to, to) <= o) | ((square > o) & (across | behind))
     return there
+
+
+@law
+def _square(table: Any, at: Any) -> float:
+    """Return the square of the length of a door, m^2; 0 for other targets."""
+    square: float = table[at + 2] * table[at + 2] + table[at + 3] * table[at + 3]
+    return square
+
+
+@law
+def _is_beside(table: Any, at: Any, x: Vec) -> bool:
+    """Return True if the perpendicular from x to the line through a door ends on the door."""
+    along = (x[0] - table[at]) * table[at + 2] + (x[1] - table[at + 1]) * table[at + 3]
+    beside: bool = (along >= like(along, 0.0)) & (along <= _square(table, at))
+    return beside
+
+
+@law
+def way_out(table: Any, at: Any, side: float, step: Vec) -> Vec:
+    """Return the direction, of any length, in which an agent goes on that has reached a target with its last `step`.
+
+    It is that of the step; but straight out of a door, if the step led back to its approach side.
+    """
+    o, u, v = like(side, 0.0), table[at + 2], table[at + 3]
+    back = side * (u * step[1] - v * step[0])
+    out = (v, -u) if side > o else (-v, u)
+    return select((back >= o) & (side != o), out, step)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flockenv.geometry.eikonal import NO_WAY
-from flockenv.geometry.targets import Target, is_reached, row_size
+from flockenv.geometry.targets import Target, approach_side, is_reached, row_size, side_of_door
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import scale, sub, unit, zero
 from flockenv.model.scene_view import SceneView
@@ -25,6 +25,12 @@ HEAD = 2
 """Numbers of a door before those of its target: index of its floor field in the table; its capacity, 1/s."""
 BINS = 256
 """Number of bins of path length to a door, up to the longest, in which agents are counted."""
+
+
+@law
+def door_row(p: Any, k: Any) -> Any:
+    """Return the index in the table at which the numbers of door k as a target begin."""
+    return 1 + np.int64(k) * np.int64(p.size) + 2
 
 
 @law
@@ -87,33 +93,35 @@ def quickest_door(p: Any, me: Me, waits: bool) -> tuple[Any, float]:
 
 @law
 def initial_route(p: Any, me: Me) -> Vec:
-    """Return the inner state at the start: the nearest door, and the time of first decision, within a period."""
+    """Return the inner state at the start: the nearest door, the time of first decision, within a period, the side."""
     o = like(p.share, 0.0)
     if not applies_to(p, me):
-        return (o, o, o, me.inner.was_x, me.inner.was_y)
+        return (o, o, o, me.inner.was_x, me.inner.was_y, o)
     door, _ = quickest_door(p, me, False)
     left, _ = path_to_door(p, me, door)
     turn = (me.who + like(o, 1.0)) * like(o, 0.6180339887498949)
-    return (like(o, door), left, me.time + p.period * (turn - np.floor(turn)), me.pos[0], me.pos[1])
+    ready, side = me.time + p.period * (turn - np.floor(turn)), side_of_door(p.table, door_row(p, door), me.pos)
+    return (like(o, door), left, ready, me.pos[0], me.pos[1], side)
 
 
 @law
 def update_route(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
-    """Return the inner state after a step: door (decided once per period), path length, next decision, position."""
-    door, left, ready, was = me.inner.door, me.inner.left, me.inner.ready, stored_position(me)
+    """Return the inner state after a step: door (decided once per period), length, next decision, position, side."""
+    door, left, ready, was, side = me.inner.door, me.inner.left, me.inner.ready, stored_position(me), me.inner.side
     if not applies_to(p, me) or door >= p.many:
-        return (door, left, ready, was[0], was[1])
-    e, now, mine = like(door, 1.0), me.time + seconds, np.int64(door)
-    if is_reached(p.table, 1 + mine * np.int64(p.size) + 2, was, me.pos):
-        place = place_behind(me)
-        return (p.many, like(door, 0.0), ready, place[0], place[1])
+        return (door, left, ready, was[0], was[1], side)
+    o, e, now, mine = like(door, 0.0), like(door, 1.0), me.time + seconds, np.int64(door)
+    if is_reached(p.table, door_row(p, mine), side, was, me.pos):
+        place = place_behind(me, p.table, door_row(p, mine))
+        return (p.many, o, ready, place[0], place[1], side)
     if now >= ready - like(seconds, 0.01) * seconds:
         found, time = quickest_door(p, me, True)
         if time < (e - p.hysteresis) * expected_time(p, me, mine, True):
-            mine = np.int64(found)
+            mine, side = np.int64(found), o
         ready += p.period
     length, _ = path_to_door(p, me, mine)
-    return (like(door, float(mine)), length, ready, me.pos[0], me.pos[1])
+    side = approach_side(p.table, door_row(p, mine), side, me.pos)
+    return (like(door, float(mine)), length, ready, me.pos[0], me.pos[1], side)
 
 
 @law
@@ -153,7 +161,8 @@ class Routes(Around):
     again after each `period`, with an offset of its own (golden ratio times its index), and changes only to a door that
     is faster by `hysteresis`. Each agent is assumed to know n for every door: agents are counted once per step, in bins
     of 1/256 of the longest path. `inner(state, "door")` is the index of the door; for an agent that has passed its
-    door, and then goes straight on, it is the number of doors.
+    door, and then goes straight on, it is the number of doors. A door is passed from the side on which the agent
+    approached it, also just beside an end that stands free; crossing it backwards does not count.
     """
 
     kind: Literal["routes"] = "routes"
@@ -165,7 +174,7 @@ class Routes(Around):
     begin_law: ClassVar[Law | None] = initial_route
     keep_law: ClassVar[Law | None] = update_route
     count_law: ClassVar[Law | None] = door_counter
-    keeps: ClassVar[tuple[str, ...]] = ("door", "left", "ready", "was_x", "was_y")
+    keeps: ClassVar[tuple[str, ...]] = ("door", "left", "ready", "was_x", "was_y", "side")
 
     @property
     def goals(self) -> tuple[tuple[Target, ...], tuple[str, ...]]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from flockenv.geometry.targets import Target, is_reached, row_size, to_target
+from flockenv.geometry.targets import Target, approach_side, is_reached, row_size, side_of_door, to_target, way_out
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import norm, scale, select, sub, unit, zero
 from flockenv.model.distribution import Spread, draw
@@ -35,9 +35,9 @@ def stored_position(me: Me) -> Vec:
 
 
 @law
-def place_behind(me: Me) -> Vec:
-    """Return a point a metre behind the agent, against the direction of its last step."""
-    return sub(me.pos, unit(sub(me.pos, stored_position(me))))
+def place_behind(me: Me, table: Any, at: Any) -> Vec:
+    """Return a point a metre behind an agent that goes on from the target at `at`, which it has just reached."""
+    return sub(me.pos, unit(way_out(table, at, me.inner.side, sub(me.pos, stored_position(me)))))
 
 
 @law
@@ -67,43 +67,48 @@ def journey_aim(p: Any, me: Me) -> Vec:
 
 @law
 def initial_stage(p: Any, me: Me) -> Vec:
-    """Return the initial stage, -1/2 during a wait before the journey, the end of that wait, and the position."""
+    """Return the initial stage, -1/2 during a wait before the journey, the end of that wait, position and side."""
     o = like(p.share, 0.0)
     begin = np.int64(p.many) * np.int64(p.size)
     each = np.int64(p.many) + 1
     mine = applies_to(p, me)
     wait = p.table[begin + np.int64(me.who - p.first) * each] if mine else o
     stage = like(o, -0.5) if wait > o else o
-    return select(mine, (stage, me.time + wait, me.pos[0], me.pos[1]), (o, o, o, o))
+    side = side_of_door(p.table, stage_row(p, stage) + 2, me.pos)
+    return select(mine, (stage, me.time + wait, me.pos[0], me.pos[1], side), (o, o, o, o, o))
+
+
+@law
+def wait_at(p: Any, me: Me, stage: float) -> float:
+    """Return the duration of the agent's wait at a stage, s."""
+    each = np.int64(p.many) + 1
+    begin = np.int64(p.many) * np.int64(p.size) + np.int64(me.who - p.first) * each
+    return p.table[begin + 1 + np.int64(stage)]  # type: ignore[no-any-return]
 
 
 @law
 def update_stage(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
-    """Return the stage, k, or k + 1/2 during a wait there, the end of that wait, and the position."""
-    stage, ready, was = me.inner.stage, me.inner.ready, stored_position(me)
-    before = (stage, ready, was[0], was[1])
-    if not applies_to(p, me) or (stage >= p.many and p.leaves > like(stage, 0.0)):
-        return before
-    half, now = like(stage, 0.5), me.time + seconds
-    on = np.floor(stage) + like(stage, 1.0)
-    waits = stage != np.floor(stage)
-    if waits:
+    """Return the stage, k, or k + 1/2 during a wait there, the end of that wait, the position and the approach side."""
+    stage, ready, was, side = me.inner.stage, me.inner.ready, stored_position(me), me.inner.side
+    o, half, now = like(stage, 0.0), like(stage, 0.5), me.time + seconds
+    if not applies_to(p, me) or (stage >= p.many and p.leaves > o):
+        return (stage, ready, was[0], was[1], side)
+    on, row = np.floor(stage) + like(stage, 1.0), stage_row(p, stage) + 2
+    if stage != np.floor(stage):  # it waits
         over = now >= ready - like(seconds, 0.01) * seconds
-        stage = on if over else stage
-    elif stage < p.many and is_reached(p.table, stage_row(p, stage) + 2, was, me.pos):
-        each = np.int64(p.many) + 1
-        begin = np.int64(p.many) * np.int64(p.size) + np.int64(me.who - p.first) * each
-        wait = p.table[begin + 1 + np.int64(stage)]
-        ready = now + wait
-        stage = stage + half if wait > like(wait, 0.0) else on
+        stage, side = (on, o) if over else (stage, side)
+    elif stage < p.many and is_reached(p.table, row, side, was, me.pos):
+        wait = wait_at(p, me, stage)
+        ready, side = now + wait, o
+        stage = stage + half if wait > o else on
     ended = stage >= p.many
-    stage = like(stage, 0.0) if ended and p.loops > like(stage, 0.0) else stage
-    place = select(ended & (p.leaves > like(stage, 0.0)), place_behind(me), me.pos)
-    return (stage, ready, place[0], place[1])
+    stage = o if ended and p.loops > o else stage
+    place = select(ended & (p.leaves > o), place_behind(me, p.table, row), me.pos)
+    return (stage, ready, place[0], place[1], approach_side(p.table, stage_row(p, stage) + 2, side, me.pos))
 
 
 class Stage(Target):
-    """A stage of a journey, reached if an agent is in it (a point: within its radius) or has crossed it (a door)."""
+    """A stage of a journey, reached if an agent is in it (a point: within its radius) or has passed it (a door)."""
 
     wait: Seconds = Field(default=0.0, description="s, duration of the wait there, or its distribution")
     around: bool = Field(default=True, description="True: by the path around obstacles; False: straight")
@@ -136,7 +141,7 @@ class Journey(Around):
     aim_law: ClassVar[Law | None] = journey_aim
     begin_law: ClassVar[Law | None] = initial_stage
     keep_law: ClassVar[Law | None] = update_stage
-    keeps: ClassVar[tuple[str, ...]] = ("stage", "ready", "was_x", "was_y")
+    keeps: ClassVar[tuple[str, ...]] = ("stage", "ready", "was_x", "was_y", "side")
 
     @property
     def goals(self) -> tuple[tuple[Target, ...], tuple[str, ...]]:
