@@ -116,10 +116,17 @@ def test_help_texts_leave_defaults_to_typer() -> None:
 
 @pytest.mark.parametrize(
     ("words", "expected"),
-    [("render pur", ["pursuit"]), ("warmup path", ["path_follow"]), ("render ti", ["tiny.yaml"]), ("render zz", [])],
+    [
+        ("render pur", ["pursuit"]),
+        ("warmup path", ["path_follow"]),
+        ("render ti", ["tiny.yaml"]),
+        ("render ZZ", ["ZZ.YML"]),
+        ("render zz", []),
+    ],
 )
 def test_shell_completes_tasks_and_scene_files(words: str, expected: list[str]) -> None:
     Path("notes.txt").touch()
+    Path("ZZ.YML").touch()
     done = subprocess.run(
         [sys.executable, "-c", "from flockenv.cli.main import app; app(prog_name='flockenv')"],
         env={**ENVIRONMENT, "_FLOCKENV_COMPLETE": "complete_bash", "COMP_WORDS": f"_ {words}", "COMP_CWORD": "2"},
@@ -617,6 +624,9 @@ def test_interrupted_stress_writes_its_findings(
         ("render pursuit --out x.gif --duration 3", "--duration = 3: only for scenes"),
         ("render tiny.yaml --out x.gif --size 1", "Invalid value for '--size'"),
         ("explain nothing.yaml", "nothing.yaml: no such file"),
+        ("render tinny.YAML --out x.png", "tinny.YAML: no such file, did you mean `tiny.yaml`?"),
+        ("warmup tinny.YML", "tinny.YML: no such file, did you mean `tiny.yaml`?"),
+        ("warmup pursiut", "'pursiut': no such task, did you mean `pursuit`? ("),
     ],
 )
 def test_user_error_is_one_line_with_exit_code_2_and_writes_nothing(
@@ -628,6 +638,19 @@ def test_user_error_is_one_line_with_exit_code_2_and_writes_nothing(
     assert captured.err.startswith(f"flockenv: {message}"), captured.err
     assert len(captured.err.splitlines()) == 1 and len(captured.err) < 600
     assert [p.name for p in tmp_path.iterdir()] == ["tiny.yaml"]
+
+
+SCENE_COMMANDS = [
+    "run - --duration 0", "measure - --time 0.1", "render - --out a.png --duration 0", "explain -", "warmup -",
+    "render - --out a.html --duration 0", "accuracy - --seconds 0.1 --steps 1,2,4,8",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("command", SCENE_COMMANDS)
+def test_every_command_on_a_scene_reads_standard_input(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(TINY.encode())))
+    assert main(command.split()) == 0
+    assert "a.html" not in command or "<title>standard input</title>" in Path("a.html").read_text()
 
 
 def test_error_in_a_scene_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:

@@ -24,6 +24,7 @@ import typer
 import flockenv
 from flockenv.cli.measure import measure
 from flockenv.cli.studies import accuracy, experiment, gallery, stress
+from flockenv.cli.targets import complete_target, is_scene_file
 from flockenv.cli.terminal import (
     DIVERGED,
     INTERRUPTED,
@@ -43,6 +44,7 @@ from flockenv.cli.terminal import (
 from flockenv.cli.validate import validate
 from flockenv.core import signals
 from flockenv.core.errors import nearest, printable
+from flockenv.core.yaml_paths import title_of
 from flockenv.players import NAMES
 
 if TYPE_CHECKING:
@@ -63,17 +65,6 @@ PICTURES = (".gif", ".png", ".html")
 FPS, MOST_FPS = 25.0, 50.0  # of a scene's GIF; viewers play faster ones slowly
 TRAIL = 25  # past positions of each agent that a PNG shows
 RECORDED_EVERY = 0.1  # s, rounded to whole steps
-
-
-def _complete_target(incomplete: str) -> list[str]:
-    """Return the tasks, scene files and folders that complete a word (shell completion)."""
-    from flockenv.envs.table import ENVIRONMENTS
-
-    tasks = (re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower() for name in ENVIRONMENTS)
-    here = Path(incomplete).parent if "/" in incomplete else Path()
-    found = sorted(here.iterdir()) if here.is_dir() else []
-    files = [f"{p}/" if p.is_dir() else str(p) for p in found if p.is_dir() or p.suffix in (".yaml", ".yml")]
-    return [word for word in (*tasks, *files) if word.startswith(incomplete)]
 
 
 app = typer.Typer(
@@ -231,8 +222,8 @@ def render(
         str,
         typer.Argument(
             metavar="SCENE.yaml|TASK",
-            help="A scene file, or a task from `flockenv list`.",
-            autocompletion=_complete_target,
+            help="A scene file (- for standard input), or a task from `flockenv list`.",
+            autocompletion=complete_target,
         ),
     ],
     out: Annotated[str, typer.Option(metavar="X.gif|X.png|X.html", help="Output file; a PNG shows the end.")],
@@ -261,19 +252,16 @@ def render(
     from flockenv.tasks import TASKS
 
     path = valid_file(out, PICTURES, force)
-    if what in TASKS:
+    if is_scene_file(what):
+        panel, fps, left = _film_scene(what, 10.0 if duration is None else duration, seed)
+        panels, title = [panel], title_of(what)
+    else:
         if duration is not None:
             raise ValueError(f"--duration = {duration:g}: only for scenes; an episode of a task ends by itself")
         (panels, fps), left = _film_episodes(TASKS[what](), player.split(","), seed, trust_pickle), ""
-    elif what.endswith((".yaml", ".yml")) or Path(what).exists():
-        panel, fps, left = _film_scene(what, 10.0 if duration is None else duration, seed)
-        panels = [panel]
-    else:
-        raise ValueError(
-            f"{printable(what)}: no such task{nearest(what, TASKS)} ({', '.join(TASKS)}), nor a .yaml file"
-        )
+        title = what
     with new_folder(path.parent):
-        _write_picture(path, panels, what if what in TASKS else Path(what).stem, fps, size)
+        _write_picture(path, panels, title, fps, size)
     end = max(panel.snapshots[-1].time for panel in panels)
     new_console().print(f"{relative_path(path)}: {path.stat().st_size:,} bytes, {end:g} s{left}")
 
@@ -317,9 +305,9 @@ def warmup(
         list[str] | None,
         typer.Argument(
             metavar="TASK|SCENE.yaml",
-            help="What to compile.",
+            help="What to compile; - for a scene from standard input.",
             show_default="every task",
-            autocompletion=_complete_target,
+            autocompletion=complete_target,
         ),
     ] = None,
     dtype: Annotated[
@@ -339,14 +327,11 @@ def warmup(
     change = {} if dtype is None else {"dtype": dtype}
     jobs: list[tuple[str, Callable[[], None]]] = []
     for name in names:
-        if name in TASKS:
-            jobs.append((name, functools.partial(_first_step_of_task, TASKS[name](**change))))
-        elif name.endswith((".yaml", ".yml")) or Path(name).exists():
+        if is_scene_file(name):
             scene = load_scene(Path(name)).model_copy(update=change)
             jobs.append((name, functools.partial(_first_step_of_scene, scene)))
         else:
-            tasks = f"{nearest(name, TASKS)} ({', '.join(TASKS)})"
-            raise ValueError(f"{printable(name)}: no such task{tasks}, nor a .yaml file")
+            jobs.append((name, functools.partial(_first_step_of_task, TASKS[name](**change))))
     rows = []
     with progress_bar("compiling", len(jobs), "kernels") as progress:
         for done, (name, job) in enumerate(jobs):
@@ -438,7 +423,7 @@ def _film_scene(file: str, duration: float, seed: int) -> tuple[Panel, float, st
     trajectory = _record(scene, seed, whole_steps("--duration", duration, scene.dt), every)
     if trajectory.stopped == "interrupted":
         raise KeyboardInterrupt
-    snapshots = list(trajectory.snapshots(title=Path(file).stem))
+    snapshots = list(trajectory.snapshots(title=title_of(file)))
     panel = Panel("", snapshots, None, trajectory.stopped)
     return panel, 1.0 / (every * scene.dt), _unsolved_text(trajectory.last)
 

@@ -23,6 +23,7 @@ from flockenv.cli.terminal import (
     show_table,
 )
 from flockenv.core.errors import printable
+from flockenv.core.yaml_paths import title_of
 
 if TYPE_CHECKING:
     from flockenv.scene import Scene
@@ -89,7 +90,7 @@ def measure(
     if numbers is not None:
         _write_numbers(numbers, _summary(loaded, scope, surveys, means, above, first, stride))
     if folder is not None:
-        _write_pictures(folder, first, surveys, scope, Path(scene).stem)
+        _write_pictures(folder, first, surveys, scope, title_of(scene))
     _report_early_end(surveys, seeds)
 
 

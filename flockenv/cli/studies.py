@@ -23,6 +23,7 @@ from flockenv.cli.terminal import (
 )
 from flockenv.core import signals
 from flockenv.core.errors import printable
+from flockenv.core.yaml_paths import title_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -208,7 +209,7 @@ def _problem_of_scene(file: str, seconds: float | None, steps: str, dts: str, se
         usual = whole_steps("--seconds", horizon, loaded.dt, 1)
         coarsest = max(d for d in (1, 2, 4) if usual % d == 0)
         counts = [usual * 2**k // coarsest for k in range(8)]
-    return Problem.of(loaded, horizon, counts, seed, name=Path(file).stem, title=Path(file).name)
+    return Problem.of(loaded, horizon, counts, seed, name=title_of(file), title=Path(file).name)
 
 
 def _write_results(path: Path, numbers: Record, draw: Callable[[Path], None]) -> None:

@@ -21,6 +21,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from flockenv.core.errors import KeyPath, key_path, nearest, parse_key_path, printable, refusals
+from flockenv.core.yaml_paths import STANDARD_INPUT, has_yaml_suffix
 from flockenv.scene import Scene
 from flockenv.scene.presets import Preset, expand_presets
 
@@ -166,7 +167,7 @@ def _read(source: str | Path) -> tuple[str, str]:
     """Return a name for messages, and the text."""
     if isinstance(source, str) and re.search(r"\n|: |\{|:$", source):
         return "text", source.removeprefix("\ufeff")
-    if str(source) == "-":
+    if str(source) == STANDARD_INPUT:
         return "standard input", _decode("standard input", sys.stdin.buffer.read(MAX_BYTES + 1))
     path = Path(source)
     name = repr(str(source))[1:-1]
@@ -186,7 +187,7 @@ def _nearest_file(path: Path) -> str:
     if path.exists():
         return " (it is a folder)" if path.is_dir() else " (it is a device)"
     siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-    return nearest(path.name, [s for s in siblings if s.endswith((".yaml", ".yml"))])
+    return nearest(path.name, filter(has_yaml_suffix, siblings))
 
 
 def _decode(name: str, content: bytes) -> str:
