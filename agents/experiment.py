@@ -13,6 +13,7 @@ from typing import Any, Literal
 import typer
 from pydantic import Field, ValidationError, model_validator
 
+from flockenv.core.address_space import shortage
 from flockenv.core.errors import key_path, refusals
 from flockenv.core.record import Record
 from flockenv.scene.yaml_io import load
@@ -124,13 +125,15 @@ def load_experiment(path: str | Path) -> Experiment:
 
 
 @contextmanager
-def one_line_errors(kinds: tuple[type[Exception], ...] = (ValueError, OSError, MemoryError)) -> Iterator[None]:
+def one_line_errors(kinds: tuple[type[Exception], ...] = (ValueError, OSError)) -> Iterator[None]:
     """End a command with status 2 and one unwrapped line if it raises one of `kinds`.
 
-    kinds: the exceptions that say so.
+    Lack of memory is left to `run_program`.
     """
     try:
         yield
     except kinds as error:
-        typer.echo(f"error: {error or 'not enough memory'}", err=True)
+        if shortage(error) is not None:
+            raise
+        typer.echo(f"error: {error}", err=True)
         raise typer.Exit(2) from None

@@ -40,6 +40,7 @@ from agents.team_credit import CaringBuffer
 from agents.training_state import capture, restore, surroundings
 from flockenv.cli.terminal import DIVERGED, handle_interrupt, run_program, show_progress
 from flockenv.core import signals
+from flockenv.core.address_space import IN_USE, TRAINING, require_room
 from flockenv.core.output_paths import check_room, valid_file, valid_path
 from flockenv.envs.sb3 import WorldVecEnv
 from flockenv.evaluation import rollout, worlds_for
@@ -83,7 +84,11 @@ def use_thread_count(count: int) -> Iterator[None]:
 
 
 def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
-    """Return the model with its worlds; `use_thread_count` sets how many threads they use."""
+    """Return the model with its worlds; `use_thread_count` sets how many threads they use.
+
+    Raises MemoryError if too little address space is left to train: starting torch's threads would abort the process.
+    """
+    require_room(f"to train, {IN_USE}", TRAINING)
     torch.manual_seed(p.seed)
     learned = task.model_copy(update={"dtype": p.dtype})
     shows = CentralVecEnv if p.central_critic else WorldVecEnv
@@ -349,7 +354,7 @@ def main(
         folder = valid_path(str(runs / name), "--runs")
         _check_outputs(experiment, target, folder, tensorboard)
     kept: deque[Run] = deque(maxlen=1)  # only the last one: a run holds all arrays of the model
-    with handle_interrupt(), one_line_errors((CheckpointError, OSError, MemoryError)):
+    with handle_interrupt(), one_line_errors((CheckpointError, OSError)):
         try:
             run = train(experiment, folder, go_on, tensorboard, kept.append)
         except KeyboardInterrupt:

@@ -13,9 +13,9 @@ Everything else is imported on first use; importing flockenv alone imports neith
 # `signals` handles them.
 from flockenv.core import early_signals, signals, address_space  # isort: skip
 
+address_space.require(early_signals.command())  # before the first thread and the first library that need a lot of it
 signals.begin_early()
 early_signals.release()
-address_space.require(early_signals.command())  # before the first library that needs a lot of it
 
 import importlib  # noqa: E402  # see above
 from typing import TYPE_CHECKING, Any  # noqa: E402  # see above

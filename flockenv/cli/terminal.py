@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TextIO, cast
 import typer
 
 from flockenv.core import signals
+from flockenv.core.address_space import shortage
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -54,8 +55,8 @@ def describe_error(error: Exception) -> tuple[str, int]:
     usage = getattr(error, "format_message", None)  # typer's own errors about the command line
     if usage is not None:
         return usage() or "no command given; see flockenv --help", BAD_INPUT
-    if isinstance(error, MemoryError):
-        return f"not enough memory: {_first_line(error) or 'use fewer agents or worlds'}", BAD_INPUT
+    if (short := shortage(error)) is not None:
+        return f"not enough memory: {short}", BAD_INPUT
     if isinstance(error, OSError) and error.strerror:
         return _os_text(error), BAD_INPUT
     if isinstance(error, (ValueError, OSError, ImportError)):
@@ -66,10 +67,6 @@ def describe_error(error: Exception) -> tuple[str, int]:
 def _os_text(error: OSError) -> str:
     """Return the system's reason for an error, with the file if it is known."""
     return str(error.strerror) if error.filename is None else f"{error.filename}: {error.strerror}"
-
-
-def _first_line(error: Exception) -> str:
-    return next(iter(str(error).splitlines()), "")
 
 
 @contextmanager
@@ -91,15 +88,15 @@ def handle_interrupt(interrupted: str = "interrupted") -> Iterator[None]:
 def report_errors(name: str, interrupted: str = "interrupted", debug: bool = False) -> Iterator[None]:
     """End a command with one line on stderr and an exit code if its input is invalid or a signal interrupts it.
 
-    interrupted: as for `handle_interrupt`. debug: errors are raised unchanged.
+    Lack of memory is left to `run_program`. interrupted: as for `handle_interrupt`. debug: errors are raised unchanged.
     """
     with handle_interrupt(interrupted), name_stdout_errors():
         try:
             yield
-        except (ValueError, TypeError, OSError, MemoryError) as error:
-            if debug:
+        except (ValueError, TypeError, OSError) as error:
+            if debug or shortage(error) is not None:
                 raise
-            text, code = describe_error(error) if isinstance(error, (OSError, MemoryError)) else (str(error), BAD_INPUT)
+            text, code = describe_error(error) if isinstance(error, OSError) else (str(error), BAD_INPUT)
             print_error(name, " ".join(text.split()))
             raise typer.Exit(code) from None
 
@@ -107,6 +104,7 @@ def report_errors(name: str, interrupted: str = "interrupted", debug: bool = Fal
 def run_program(name: str, app: typer.Typer, interrupted: str = "interrupted") -> None:
     """Run an app as the main program of this process, and end the process with its exit code.
 
+    Lack of memory anywhere ends it with one line and code 2, with --debug with a traceback.
     interrupted: the line about an interrupt, unless the command itself sets another.
     """
     signals.set_message(interrupted)
@@ -119,6 +117,11 @@ def run_program(name: str, app: typer.Typer, interrupted: str = "interrupted") -
             if line := signals.take_message():  # typer turns a KeyboardInterrupt into this code without a message
                 print(line, file=sys.stderr)
             signals.exit_now(signals.exit_code())
+        except Exception as error:
+            if shortage(error) is None or "--debug" in sys.argv:
+                raise
+            print_error(name, describe_error(error)[0])
+            sys.exit(BAD_INPUT)
 
 
 class _Output:

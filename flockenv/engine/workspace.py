@@ -101,7 +101,10 @@ def _memory(size: int) -> NDArray[np.uint8]:
     """Return zeros; a large array on large pages, if the system has them: fewer address translations."""
     if size < HUGE or not hasattr(mmap, "MADV_HUGEPAGE"):
         return np.zeros(size, np.uint8)
-    memory = mmap.mmap(-1, size + HUGE, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    try:
+        memory = mmap.mmap(-1, size + HUGE, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    except OSError:
+        raise MemoryError(f"Unable to allocate {size / 1e6:,.0f} MB of scratch for the steps of a world") from None
     memory.madvise(mmap.MADV_HUGEPAGE)
     raw = np.frombuffer(memory, np.uint8)
     return raw[-raw.ctypes.data % HUGE :]

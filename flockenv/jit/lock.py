@@ -44,7 +44,7 @@ class OneAtATime:
     def load_overload(self, signature: Any, context: Any) -> Any:
         """Return the entry on the disk, waiting while another process writes it; None if the caller must compile."""
         if os.getpid() in self._made:
-            self._lock.release(force=True)  # left by a compilation that failed
+            self.release()  # left by a compilation that failed
         found = self._read(signature, context)
         if found is not None:
             return found
@@ -66,7 +66,11 @@ class OneAtATime:
         try:
             self._cache.save_overload(signature, compiled)
         finally:
-            self._lock.release(force=True)
+            self.release()
+
+    def release(self) -> None:
+        """Release the lock, however often this process has acquired it."""
+        self._lock.release(force=True)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._cache, name)

@@ -22,6 +22,7 @@ import numba
 from numba.core import types
 from numba.extending import intrinsic
 
+from flockenv.core.address_space import COMPILING, IN_USE, LOADING, require_room
 from flockenv.jit import cpu
 from flockenv.jit.cache_folder import cache_folder
 from flockenv.jit.checked_store import Store
@@ -158,9 +159,18 @@ class _LateBuilt(OneAtATime):
         self._compiled, self._make_function, self._plan = compiled, make, plan
 
     def load_overload(self, signature: Any, context: Any) -> Any:
-        """Return the cached code; if there is none, build the function to compile and return None."""
+        """Return the cached code; if there is none, build the function to compile and return None.
+
+        Raises MemoryError if too little address space is left to load or compile it: LLVM would abort the process.
+        """
+        require_room(f"to load a compiled kernel, {IN_USE}", LOADING)
         found = super().load_overload(signature, context)
         if found is None:
+            try:
+                require_room(f"to compile a kernel, {IN_USE}", COMPILING)
+            except MemoryError:
+                self.release()
+                raise
             function = self._make_function(*self._plan)
             self._compiled.py_func = self._compiled._compiler.py_func = function
         return found
