@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import pickle
 import shutil
 import stat
 import subprocess
@@ -10,6 +12,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -158,27 +161,92 @@ def test_only_plain_files_of_this_user_are_read(make: Callable[[Path], None], tm
         read_private(tmp_path / "file")
 
 
-def planted(tmp_path: Path, folder: Path) -> Path:
-    """Copy compiled sources into `folder`, each with a line that writes a marker file; return the marker's path."""
-    own, marker = tmp_path / "own", tmp_path / "marker"
-    assert run(USE, FLOCKENV_CACHE=str(own)).returncode == 0
-    for source in own.glob("*.py"):
-        (folder / source.name).write_text(f"open({str(marker)!r}, 'w').close()\n{source.read_text()}")
-        (folder / source.name).chmod(0o644)
-    return marker
+class Payload:
+    """An object whose unpickling writes a file."""
+
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.write_text, (self.marker, "executed")
+
+
+def plant_plan(folder: Path, marker: Path) -> None:
+    """Replace each stored description of a kernel by that of another, `planted`, with a valid digest."""
+    for path in folder.glob("*.plan"):
+        data = json.loads(Store(folder).read(path.name) or b"")
+        Store(folder).write(path.name, json.dumps(["planted", *data[1:]]).encode())
+
+
+def plant_code(folder: Path, marker: Path) -> None:
+    """Replace all machine code by a pickle that writes the marker, with a valid digest; also that of `planted`."""
+    for path in folder.glob("*.nbc"):
+        for name in (path.name, f"planted_{path.name.rpartition('_')[2]}"):
+            Store(folder).write(name, pickle.dumps(Payload(marker)))
+
+
+def plant_lock(folder: Path, marker: Path) -> None:
+    """Replace each lock by a link, so that locking creates or opens the marker."""
+    for path in (folder / "locks").iterdir():
+        path.unlink()
+        path.symlink_to(marker)
+
+
+def is_used(folder: Path, marker: Path) -> bool:
+    """Return True if a process has used something planted in a folder."""
+    return marker.exists() or any(folder.rglob("planted_*.lock"))
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """Return a folder with the compiled kernels of USE, and what USE prints."""
+    folder = tmp_path_factory.mktemp("compiled")
+    folder.chmod(0o700)
+    done = run(USE, FLOCKENV_CACHE=str(folder))
+    assert done.returncode == 0, done.stderr
+    assert {path.suffix for path in folder.iterdir()} == {".plan", ".nbc", ""}, "plant every kind of file that is read"
+    assert [path.name for path in folder.iterdir() if not path.suffix] == ["locks"] and any(
+        (folder / "locks").iterdir()
+    )
+    return folder, done.stdout
+
+
+PLANTS = [plant_plan, plant_code, plant_lock]
+
+
+@pytest.mark.parametrize(("plant", "used"), [(plant_plan, True), (plant_code, True), (plant_lock, False)])
+def test_what_is_planted_in_a_folder_of_ones_own_is_used_but_for_a_linked_lock(
+    plant: Callable[[Path, Path], None], used: bool, compiled: tuple[Path, str], tmp_path: Path
+) -> None:
+    """What the next test plants works. A folder of one's own is trusted; only a link in place of a lock is refused."""
+    folder, marker = tmp_path / "cache", tmp_path / "marker"
+    shutil.copytree(compiled[0], folder)
+    plant(folder, marker)
+    for path in folder.glob("*.nbc") if plant is plant_lock else ():
+        path.unlink()  # a lock is only used if there is no machine code
+    assert not is_used(folder, marker)
+    done = run(USE, FLOCKENV_CACHE=str(folder))
+    assert is_used(folder, marker) == used
+    assert used or done.stdout == compiled[1]
 
 
 @pytest.mark.parametrize("make", [world_writable, a_link, pytest.param(of_a_stranger, marks=as_root)])
-def test_code_planted_in_the_temporary_folder_does_not_run(make: Callable[[Path], None], tmp_path: Path) -> None:
-    temporary = tmp_path / "tmp"
+def test_nothing_planted_in_the_temporary_folder_is_used(
+    make: Callable[[Path], None], compiled: tuple[Path, str], tmp_path: Path
+) -> None:
+    temporary, marker = tmp_path / "tmp", tmp_path / "marker"
     temporary.mkdir()
     temporary.chmod(0o1777)
     folder = temporary / f"flockenv-{os.geteuid()}"
     make(folder)
-    marker = planted(tmp_path, folder)
+    own = shutil.copytree(compiled[0], tmp_path / "own")
+    for plant in PLANTS:
+        plant(own, marker)
+    for path in own.iterdir():
+        path.rename(folder / path.name)
     first, second = (run(USE, HOME="/dev/null", TMPDIR=str(temporary)) for _ in range(2))
-    assert not marker.exists()
-    assert first.returncode == 0 and first.stdout == second.stdout
+    assert not is_used(temporary, marker)
+    assert first.returncode == 0 and first.stdout == second.stdout == compiled[1]
     for done in (first, second):
         assert len(done.stderr.splitlines()) == 1 and str(folder) in done.stderr
     fresh = [each for each in temporary.iterdir() if each.name.startswith(folder.name + "-")]
