@@ -631,6 +631,19 @@ def test_a_replay_is_one_file_that_loads_nothing(tmp_path: Path) -> None:
     assert not re.search(r"https?:|url\(|@import|fetch\(|XMLHttpRequest|innerHTML|eval\(", program)
 
 
+def test_panels_of_a_replay_have_one_width(tmp_path: Path) -> None:
+    """One number, set on the block around all panels, is the width of each, which neither grows nor shrinks."""
+    written(tmp_path / "page.html", [Group("many", [panel(run(), str(k)) for k in range(5)])])
+    text = (tmp_path / "page.html").read_text()
+    rules = {name.strip(): body for name, body in re.findall(r"^ +([^{}\n]+)\{([^{}]*)\}", text, re.MULTILINE)}
+    assert "flex: 0 0 var(--panel, 300px)" in rules["figure"]
+    sized = [name for name, body in rules.items() if re.search(r"(^|[;\s])(flex|flex-grow|(min-)?width):", body)]
+    assert not [name for name in sized if re.search("figure", name) and name != "figure"]
+    assert "wrap" in rules["main"] and "grid" not in rules["main"]
+    assert re.findall(r"(\w+)\.style\.setProperty\(\"--panel\"", text) == ["panels"]
+    assert not re.search(r"figure\.style\.(width|flex|setProperty\(\"(?!--aspect))", text)
+
+
 def test_a_replay_of_three_tasks_stays_small(tmp_path: Path) -> None:
     groups = [Group(f"task {g}", [panel(run(300, 24), f"player {p}") for p in range(3)]) for g in range(3)]
     page = written(tmp_path / "r.html", groups)
