@@ -21,8 +21,9 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from agents.compare import blame, players_in_order, split
+from agents.compare import split
 from agents.experiment import load_experiment, one_line_errors
+from agents.play import blame, players_in_order
 from flockenv.cli.terminal import run_program, show_progress
 from flockenv.envs.world import Step, World
 from flockenv.evaluation import Episodes, Interval, bootstrap, compare, rollout, worlds_for

@@ -7,91 +7,72 @@ from __future__ import annotations
 
 import os
 import platform
-import re
 import subprocess
-import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
+from itertools import zip_longest
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 import flockenv
 from agents import report
 from agents.experiment import CONFIGS, Experiment, load_experiment
-from agents.processes import Tell, side_by_side
-from flockenv.cli.terminal import report_errors, run_program, show_progress
+from agents.play import Player, episodes_of_bytes, play_job, players_in_order, players_of, usual_players
+from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import nearest, printable
 from flockenv.core.output_paths import check_room, valid_file, valid_path
-from flockenv.core.warnings import OtherTaskWarning
-from flockenv.evaluation import WORLDS_PER_SEED, Episodes, rollout, task_digest, worlds_for
-from flockenv.players import NAMES, load_player, other_tasks
-from flockenv.players.files import SUFFIXES, PlayerError
+from flockenv.evaluation import WORLDS_PER_SEED, Episodes, task_digest, worlds_for
+from flockenv.jobs import Job, Store, Work, engine_of, run_jobs
+from flockenv.jobs.local_engine import LocalEngine
+from flockenv.players import NAMES
 from flockenv.players.policy import Policy
 from flockenv.players.rules import load_tuned
 from flockenv.tasks import TASKS, Task
 
 __all__ = [
-    "Player",
+    "JOBS",
+    "STOPPED",
+    "EngineName",
+    "Fresh",
+    "Processes",
     "app",
-    "blame",
     "compare",
     "experiment_of",
     "folder_of",
+    "in_turn",
     "pick",
-    "players_in_order",
-    "players_of",
+    "processes_for",
     "provenance",
     "split",
-    "usual_players",
     "write_text",
 ]  # fmt: skip
 
 ROOT = Path(__file__).resolve().parent.parent
 WORLDS, SMOKE_WORLDS = 256, 16
 RESAMPLES, SMOKE_RESAMPLES = 10_000, 1_000
-TOLD_EVERY = 0.1  # s, between two reports of one player's progress from another process
 RECORDED = 0  # the world in the replay: the first, not a selected one
 PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "pettingzoo")
 FILES = ("results.json", "table.md", "comparison.png", "replay.html")
+JOBS = "jobs"
+"""Folder of the jobs' records, in the results folder."""
+STOPPED = "interrupted; what was played is stored, and the same command goes on"
 ROOM = 2**24
 """Bytes that all files take, approximately."""
-NAME = re.compile(r"\w[\w.+-]{0,39}")
-"""A player's name becomes a key, a table cell, a label and a piece of HTML."""
-
-Plays = Mapping[str, Mapping[str, Policy]]  # task -> player -> policy
-Advance = Callable[[str, str, int, int], None]  # task, player, steps done, steps at most
+EngineName = Annotated[
+    str, typer.Option(help="local: processes of this machine; ray: a Ray cluster (RAY_ADDRESS), or a local Ray.")
+]
+Processes = Annotated[
+    int | None, typer.Option(min=1, max=256, help="Processes of the local engine. [one for each core]")
+]
+Fresh = Annotated[bool, typer.Option("--fresh", help="Run all jobs anew, also those whose record is stored.")]
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-
-
-@dataclass(frozen=True)
-class Player:
-    """A player: its specification (a known name or a file), and its name in the tables."""
-
-    spec: str
-    name: str
-
-    @classmethod
-    def of(cls, spec: str) -> Player:
-        """Return a player; a file is named by its stem. Raise ValueError for a stem that is not valid in tables."""
-        name = Path(spec).stem if Path(spec).suffix.lower() in SUFFIXES else spec
-        if not NAME.fullmatch(name):
-            raise ValueError(f"--players {printable(spec)}: a name is up to 40 letters, digits and _ . + -")
-        return cls(spec, name)
-
-    def policy(self, task: Task, seed: int, trust_pickle: bool = False) -> Policy:
-        """Return the policy, ready to play a task; raise ValueError, in one line with its name, if it cannot."""
-        with blame(self.name, task, ValueError), warnings.catch_warnings():
-            warnings.simplefilter("ignore", OtherTaskWarning)  # the results list the differences
-            return load_player(self.spec, task, seed, trust_pickle)
 
 
 def compare(
@@ -101,136 +82,66 @@ def compare(
     seed: int = 0,
     resamples: int = RESAMPLES,
     trust_pickle: bool = False,
-    advance: Advance = lambda task, player, done, most: None,
+    work: Work | None = None,
 ) -> tuple[report.Results, dict[str, dict[str, Episodes]]]:
     """Play every task with every player in the same worlds; return the results as plain data, and the episodes.
 
-    From 256 worlds on, tasks are played in parallel, by a process for each core: a script that calls this then needs
-    `if __name__ == "__main__":`, like any that starts processes, and `advance` is called by another thread.
+    work: where and how to run the jobs, one for each task and player (default: one after another in this process, and
+    nothing is stored).
 
     Raises:
-        ValueError: a player cannot be loaded (before any episode), or fails while playing; one line.
+        ValueError: a player cannot be loaded (before any episode), or jobs fail while playing; one line.
     """
     began = perf_counter()
     first = worlds_for("evaluation", seed, worlds)
     fields = players_of(tasks, players)
-    plays = {
+    policies = {
         task.name: {player.name: player.policy(task, seed, trust_pickle) for player in fields[task.name]}
         for task in tasks
     }
-    jobs = [_Job(task, fields[task.name], worlds, seed, resamples, trust_pickle) for task in tasks]
-    played = dict(zip((task.name for task in tasks), _play_all(jobs, plays, advance), strict=True))
-    episodes = {name: each for name, (each, _) in played.items()}
+    jobs = {
+        (task.name, player.name): play_job("compare", task, player, worlds, seed, RECORDED, trust_pickle)
+        for task in tasks for player in fields[task.name]
+    }  # fmt: skip
+    with TemporaryDirectory(prefix="flockenv-jobs-") as folder:
+        work = work or Work(Store(Path(folder)), LocalEngine(1))
+        run_jobs(in_turn(jobs), work)
+        episodes = {
+            task.name: {
+                player.name: work.store.read(jobs[task.name, player.name], episodes_of_bytes)
+                for player in fields[task.name]
+            }
+            for task in tasks
+        }
     results: report.Results = {
         "seed": seed,
         "worlds": worlds,
         "world_seeds": {"block": "evaluation", "first": first, "last": first + worlds - 1},
         "bootstrap": {"resamples": resamples, "seed": seed, "interval": "95 % percentile; proportions: 95 % Wilson"},
         "players": {player.name: player.spec for player in players},
-        "tasks": {name: about for name, (_, about) in played.items()},
+        "tasks": {
+            task.name: _task_results(task, episodes[task.name], policies[task.name], resamples, seed) for task in tasks
+        },
         **provenance(),
     }
     results["wall_time_s"] = perf_counter() - began
     return results, episodes
 
 
-def usual_players(tasks: Sequence[Task]) -> list[str]:
-    """Return the default players: all named ones that can play one of the tasks."""
-    return [name for name in NAMES if any(not other_tasks(name, task.name) for task in tasks)]
+def in_turn(jobs: Mapping[tuple[str, str], Job]) -> list[Job]:
+    """Return jobs by task and player so that neighbours are of different tasks: no process waits for a kernel."""
+    tasks = list(dict.fromkeys(task for task, _ in jobs))
+    rows = [[job for (of, _), job in jobs.items() if of == task] for task in tasks]
+    return [job for column in zip_longest(*rows) for job in column if job is not None]
 
 
-def players_of(tasks: Sequence[Task], players: Sequence[Player]) -> dict[str, list[Player]]:
-    """Return the players of each task by its name: all except hand-written ones of other tasks in this comparison.
-
-    Raises:
-        ValueError: a task without a player.
-    """
-    fields = {task.name: [player for player in players if not _is_left_out(player, task, tasks)] for task in tasks}
-    for task, field in fields.items():
-        if not field:
-            names = ", ".join(player.name for player in players)
-            raise ValueError(f"task {task!r}: no player for it; these play other tasks only: {names}")
-    return fields
-
-
-def _is_left_out(player: Player, task: Task, tasks: Sequence[Task]) -> bool:
-    """Return True for a hand-written player of other tasks, one of which is in this comparison."""
-    of = other_tasks(player.spec, task.name)
-    return any(other.name in of for other in tasks)
-
-
-@dataclass(frozen=True)
-class _Job:
-    """One task: its players, the number of worlds, and the settings of the statistics."""
-
-    task: Task
-    players: Sequence[Player]
-    worlds: int
-    seed: int
-    resamples: int
-    trust_pickle: bool
-
-    @property
-    def first(self) -> int:
-        """Seed of the first world."""
-        return worlds_for("evaluation", self.seed, self.worlds)
-
-
-Played = tuple[dict[str, Episodes], report.Results]
-
-
-def _play_all(jobs: Sequence[_Job], plays: Plays, advance: Advance) -> Iterator[Played]:
-    """Yield the result of every job; with enough work, jobs run in parallel, in a process for each core."""
-    cores = min(os.cpu_count() or 1, len(jobs))
-    if cores < 2 or jobs[0].worlds < WORLDS:
-        return (_play(job, plays[job.task.name], advance) for job in jobs)
-    return side_by_side(_play_in_process, jobs, cores, advance)
-
-
-def _play_in_process(job: _Job, tell: Tell) -> Played:
-    """Run a job in a worker process; the players are loaded there from their specifications."""
-    last = [0.0]
-
-    def advance(*news: Any) -> None:
-        done, most = news[2:]
-        if done in (1, most) or perf_counter() - last[0] > TOLD_EVERY:
-            last[0] = perf_counter()
-            tell(*news)
-
-    tell(job.task.name, job.players[0].name, 0, job.task.horizon)  # a process has begun; it may compile first
-    policies = {player.name: player.policy(job.task, job.seed, job.trust_pickle) for player in job.players}
-    return _play(job, policies, advance)
-
-
-def _play(job: _Job, policies: Mapping[str, Policy], advance: Advance) -> Played:
-    """Play the same worlds of one task with every player; return the episodes by player, and the report's numbers."""
-    task, episodes = job.task, {}
-    for name, policy in policies.items():
-
-        def progress(done: int, most: int, name: str = name) -> None:
-            advance(task.name, name, done, most)
-
-        with blame(name, task):
-            episodes[name] = rollout(task, policy, job.worlds, job.first, record=RECORDED, progress=progress)
-    costs = _costs(task, policies)
+def _task_results(
+    task: Task, episodes: Mapping[str, Episodes], policies: Mapping[str, Policy], resamples: int, seed: int
+) -> report.Results:
+    """Return the numbers of one task as plain data."""
     differences = {name: getattr(policy, "differences", ()) for name, policy in policies.items()}
-    return episodes, report.task_results(task_digest(task), episodes, costs, job.resamples, job.seed, differences)
-
-
-@contextmanager
-def blame(player: str, task: Task, *clear: type[Exception]) -> Iterator[None]:
-    """Add player and task to an error that its `predict` raises or its actions cause; `clear` errors stay as they are.
-
-    A PlayerError names the file already; the task is added.
-    """
-    try:
-        yield
-    except clear:
-        raise
-    except PlayerError as error:
-        raise PlayerError(f"{error} (task {task.name!r})") from error
-    except (Exception, SystemExit) as error:
-        raise ValueError(f"player {player!r}, task {task.name!r}: {type(error).__name__}: {error}") from error
+    costs = _costs(task, policies)
+    return report.task_results(task_digest(task), episodes, costs, resamples, seed, differences)
 
 
 def _costs(task: Task, policies: Mapping[str, Policy]) -> dict[str, report.Results]:
@@ -288,6 +199,9 @@ def main(
     worlds: Annotated[int | None, typer.Option(help=f"Worlds per task, the same for every player. [{WORLDS}]")] = None,
     seed: Annotated[int, typer.Option(help="Block of evaluation worlds, 0 to 999.")] = 0,
     out: Annotated[str, typer.Option(help=f"Folder for {', '.join(FILES)}.")] = "results",
+    engine: EngineName = "local",
+    processes: Processes = None,
+    fresh: Fresh = False,
     smoke: Annotated[bool, typer.Option("--smoke", help=f"A quick look: {SMOKE_WORLDS} worlds.")] = False,
     trust_pickle: Annotated[
         bool, typer.Option("--trust-pickle", help="Also load Stable-Baselines3 zips, which executes the code in them.")
@@ -295,7 +209,7 @@ def main(
     debug: Annotated[bool, typer.Option("--debug", help="Show a traceback if something goes wrong.")] = False,
 ) -> None:
     """Play all tasks with all players in the same worlds, and compare their scores."""
-    with report_errors("compare", "interrupted, nothing written", debug):
+    with report_errors("compare", STOPPED, debug):
         folder = folder_of(out, FILES)
         chosen = [experiment_of(name).build() for name in pick("--tasks", split(tasks) or list(TASKS), TASKS)]
         field = players_in_order(split(players) or usual_players(chosen))
@@ -303,11 +217,18 @@ def main(
         if not 2 <= count <= WORLDS_PER_SEED:
             raise ValueError(f"--worlds {count}: must be from 2 to {WORLDS_PER_SEED}")
         resamples = SMOKE_RESAMPLES if smoke else RESAMPLES
-        with _bars(chosen, len(field)) as advance:
-            results, episodes = compare(chosen, field, count, seed, resamples, trust_pickle, advance)
+        runner = engine_of(engine, processes_for(count) if processes is None else processes)
+        with job_bar() as progress:
+            work = Work(Store(folder / JOBS), runner, fresh, progress)
+            results, episodes = compare(chosen, field, count, seed, resamples, trust_pickle, work)
         results["smoke"] = smoke
         write_all_or_none(folder, _file_writers(results, episodes))
     _show(results, folder)
+
+
+def processes_for(worlds: int) -> int | None:
+    """Return the number of processes that play a number of worlds: 1 if they are few; None stands for all cores."""
+    return None if worlds >= WORLDS else 1
 
 
 def folder_of(text: str, files: Sequence[str]) -> Path:
@@ -333,39 +254,6 @@ def pick(option: str, names: Sequence[str], allowed: Mapping[str, object]) -> li
             hint = nearest(name[:200], allowed)
             raise ValueError(f"{option} {printable(name)}: unknown{hint}; allowed: {', '.join(allowed)}")
     return list(dict.fromkeys(names))
-
-
-def players_in_order(specs: Sequence[str]) -> list[Player]:
-    """Return the players in the order of the tables: named ones as in NAMES, then files in the given order."""
-    field = [Player.of(spec) for spec in dict.fromkeys(specs)]
-    names = [player.name for player in field]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice:
-        raise ValueError(f"--players: two players are called {twice!r}; rename a file")
-    return sorted(field, key=lambda player: NAMES.index(player.spec) if player.spec in NAMES else len(NAMES))
-
-
-@contextmanager
-def _bars(tasks: Sequence[Task], players: int) -> Iterator[Advance]:
-    """Show a progress bar per task on a terminal; otherwise write a line per player and task."""
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description:<24}"), BarColumn(40), TimeElapsedColumn())
-    with show_progress(Progress(*columns, console=console, transient=True)) as progress:
-        bars = {task.name: progress.add_task(task.name, total=players * task.horizon, start=False) for task in tasks}
-        played: dict[str, list[str]] = {task.name: [] for task in tasks}
-
-        def advance(task: str, player: str, done: int, most: int) -> None:
-            before = played[task]
-            if player not in before:
-                before.append(player)
-                progress.start_task(bars[task])
-                if not console.is_terminal:
-                    console.print(f"{task}: {player} plays", highlight=False)
-            progress.update(bars[task], completed=(len(before) - 1) * most + done, description=f"{task}: {player}")
-
-        yield advance
-        for task in tasks:
-            progress.update(bars[task.name], completed=players * task.horizon)
 
 
 def _file_writers(
@@ -428,4 +316,4 @@ def _show(results: report.Results, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    run_program("compare", app, "interrupted, nothing written")
+    run_program("compare", app, STOPPED)

@@ -2,53 +2,43 @@
 
 Every player plays the held-out worlds of agents.compare under each integration method, step and precision. It decides
 as often as before; only the motion between two decisions is computed differently. Then the same actions are replayed
-and timed under each setting. Returns and times are stored in runs/transfer at once: after an interruption the same
-command continues. Writes transfer.json, transfer.md and transfer.png.
+and timed under each setting. Every job's record is stored at once: after an interruption the same command continues.
+Writes transfer.json, transfer.md and transfer.png.
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from multiprocessing import get_context
+import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from agents import report, transfer_report
 from agents.compare import (
+    JOBS,
+    STOPPED,
+    EngineName,
+    Fresh,
+    Processes,
     experiment_of,
     folder_of,
     pick,
-    players_in_order,
-    players_of,
     provenance,
     split,
-    usual_players,
     write_text,
 )
-from agents.processes import announce_parent, guard_process_starts, serve
-from agents.transfer_cache import (
-    KEPT,
-    Plan,
-    all_cells,
-    jobs,
-    play_again,
-    play_missing,
-    rounds_missing,
-    run_clock,
-    run_round,
-)
+from agents.play import players_in_order, players_of, usual_players
+from agents.transfer_jobs import Plan, clock_of, jobs_by_kernel, read_again, read_cells, round_jobs
 from agents.transfer_report import Setting
-from flockenv.cli.terminal import report_errors, run_program, show_progress
+from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import nearest, printable
 from flockenv.evaluation import WORLDS_PER_SEED, worlds_for
+from flockenv.jobs import Store, Work, engine_of, run_jobs
+from flockenv.jobs.local_engine import LocalEngine
 from flockenv.physics.integrators import INTEGRATORS
 from flockenv.tasks import TASKS, Task
 
@@ -59,11 +49,6 @@ METHODS = ("semi_implicit_euler", "explicit_euler", "midpoint", "velocity_verlet
 SUBSTEPS = (1, 2, 4, 8)
 MOST_SUBSTEPS = 1000
 FILES = ("transfer.json", "transfer.md", "transfer.png")
-
-STOPPED = f"interrupted; what was played is in {KEPT}, and the same command goes on"
-
-Advance = Callable[[str, int], None]
-"""Called with a text about the work done, and the number of cells or rounds of timing."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -85,9 +70,9 @@ def main(
     worlds: Annotated[int, typer.Option(help="Worlds per task, the same for every player.")] = WORLDS,
     rounds: Annotated[int, typer.Option(help="Rounds in which wall time is measured.")] = ROUNDS,
     seed: Annotated[int, typer.Option(help="Block of evaluation worlds, 0 to 999.")] = 0,
-    workers: Annotated[int, typer.Option(help="Processes that compile and play; 1: only this one.")] = min(
-        2, os.cpu_count() or 1
-    ),
+    engine: EngineName = "local",
+    processes: Processes = None,
+    fresh: Fresh = False,
     out: Annotated[str, typer.Option(help=f"Folder for {', '.join(FILES)}.")] = "results",
     trust_pickle: Annotated[
         bool, typer.Option("--trust-pickle", help="Also load Stable-Baselines3 zips, which executes the code in them.")
@@ -99,7 +84,6 @@ def main(
         folder = folder_of(out, FILES)
         _check("--worlds", worlds, 2, WORLDS_PER_SEED)
         _check("--rounds", rounds, 1, 1000)
-        _check("--workers", workers, 1, 64)
         worlds_for("evaluation", seed, worlds)
         chosen = [experiment_of(name).build() for name in pick("TASK", split(tasks) or list(TASKS), TASKS)]
         fields = players_of(chosen, players_in_order(split(players) or usual_players(chosen)))
@@ -108,7 +92,9 @@ def main(
             Plan(task, _settings(task, solvers, steps), tuple(fields[task.name]), worlds, seed, rounds, trust_pickle)
             for task in chosen
         ]
-        results = _measure(plans, workers)
+        runner = engine_of(engine, processes)
+        with job_bar() as progress:
+            results = _measure(plans, Work(Store(folder / JOBS), runner, fresh, progress))
         write_all_or_none(folder, {
             "transfer.json": lambda path: write_text(path, report.json_text(results)),
             "transfer.md": lambda path: write_text(path, transfer_report.markdown(results)),
@@ -151,31 +137,22 @@ def _settings(task: Task, solvers: Sequence[tuple[str, str]], substeps: Sequence
     return tuple(dict.fromkeys([Setting.of_training(task), *chosen]))
 
 
-def _measure(plans: Sequence[Plan], workers: int) -> report.Results:
-    """Play the missing episodes, time the settings, and return everything as plain data."""
+def _measure(plans: Sequence[Plan], work: Work) -> report.Results:
+    """Play the missing episodes, time the settings on this machine, and return everything as plain data."""
     began = perf_counter()
     for plan in plans:
         for player in plan.players:
             plan.policy(player, plan.task)  # players that cannot be loaded are rejected before any plays
-    missing, rounds = [job for plan in plans for job in jobs(plan)], rounds_missing(plans)
-    steps = sum(len(settings) * len(plan.players) for plan, settings in missing) + len(rounds) * len(plans)
-    with _bar(steps) as advance:
-        for function, work, processes in ((play_missing, missing, workers), (run_round, rounds, 1)):
-            with _process_map(processes if workers > 1 else 0, work) as map_:
-                for what, done in map_(function, work):
-                    advance(what, done)
+    rounds = round_jobs(plans)
+    run_jobs(list(jobs_by_kernel(plans)), work)
+    run_jobs(rounds, dataclasses.replace(work, engine=LocalEngine(1, renew=True)))
     about = {
         plan.task.name: transfer_report.task_results(
-            plan.task,
-            plan.settings,
-            all_cells(plan),
-            run_clock(plan, plan.rounds),
-            play_again(plan),
-            RESAMPLES,
-            plan.seed,
+            plan.task, plan.settings, read_cells(plan, work.store), clock_of(plan, rounds, work.store),
+            read_again(plan, work.store), RESAMPLES, plan.seed,
         )
         for plan in plans
-    }
+    }  # fmt: skip
     first, worlds, seed = plans[0].first, plans[0].worlds, plans[0].seed
     return {
         "seed": seed,
@@ -187,39 +164,6 @@ def _measure(plans: Sequence[Plan], workers: int) -> report.Results:
         **provenance(),
         "wall_time_s": perf_counter() - began,
     }
-
-
-@contextmanager
-def _process_map(processes: int, work: Sequence[Any]) -> Iterator[Callable[[Any, Iterable[Any]], Iterable[Any]]]:
-    """Yield a function like `map`, which uses a number of processes that end with this one, or this process if none.
-
-    A single worker process is replaced by a new one after each piece of work.
-    """
-    if not (processes and work):
-        yield map
-        return
-    count = min(processes, len(work))
-    with announce_parent():  # a thread of the pool starts new ones later
-        with guard_process_starts():
-            pool = get_context("spawn").Pool(count, serve, maxtasksperchild=1 if processes == 1 else None)
-        with pool:
-            yield pool.imap_unordered
-
-
-@contextmanager
-def _bar(steps: int) -> Iterator[Advance]:
-    """Show one bar on a terminal; otherwise write a line per kernel and per round."""
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description:<44}"), BarColumn(30), TimeElapsedColumn())
-    with show_progress(Progress(*columns, console=console, transient=True)) as progress:
-        bar = progress.add_task("compiling and playing", total=steps)
-
-        def advance(what: str, done: int) -> None:
-            progress.update(bar, advance=done, description=what)
-            if not console.is_terminal:
-                console.print(f"{what}: done", highlight=False)
-
-        yield advance
 
 
 def _draw(path: Path, results: report.Results) -> None:

@@ -9,7 +9,6 @@ import re
 import signal
 import subprocess
 import sys
-import threading
 import time
 from io import StringIO
 from pathlib import Path
@@ -23,7 +22,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from agents import compare as comparison
-from agents import report
+from agents import play, report
 from flockenv.evaluation import EVALUATION, Episodes
 from flockenv.evaluation.plots import Column, draw_chart, write_chart
 from flockenv.players.policy import save_policy
@@ -137,79 +136,57 @@ def test_verdict_also_reports_a_loss_of_ppo_or_a_tie() -> None:
     assert level.startswith("toy: ppo and rules are level: difference 0.000")
 
 
-@pytest.fixture
-def side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Play in two processes, each with at least two worlds."""
-    monkeypatch.setattr(comparison, "WORLDS", 2)
-    monkeypatch.setattr(comparison.os, "cpu_count", lambda: 2)
+TWO = ("--processes", "2")
+WITHOUT_CLOCK = ("worlds", "iqm", "mean", "returns", "metrics", "terms", "episode_length", "success_rate")
 
 
 @pytest.mark.slow
-def test_results_in_parallel_equal_serial_ones_and_progress_is_reported(
-    side_by_side: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    tasks = [TASKS["pursuit"](), TASKS["obstacles"]()]
-    field = comparison.players_in_order(["random", "rules"])
-    reports: list[tuple[str, str, int, int]] = []
-    both, films = comparison.compare(tasks, field, 2, resamples=100, advance=lambda *row: reports.append(row))
-    monkeypatch.setattr(comparison.os, "cpu_count", lambda: 1)
-    alone, _ = comparison.compare(tasks, field, 2, resamples=100)
-    assert list(both["tasks"]) == ["pursuit", "obstacles"]
-    for name, about in alone["tasks"].items():
-        assert both["tasks"][name]["pairs"] == about["pairs"]
+def test_results_of_two_processes_equal_those_of_one() -> None:
+    for out, processes in (("one", "1"), ("two", "2")):
+        run("--tasks", "pursuit,obstacles", "--worlds", "2", "--smoke", "--processes", processes, "--out", out)
+    one, two = (json.loads(Path(out, "results.json").read_text())["tasks"] for out in ("one", "two"))
+    assert list(one) == list(two) == ["pursuit", "obstacles"]
+    for name, about in one.items():
+        assert two[name]["pairs"] == about["pairs"]
         for player, numbers in about["players"].items():
-            other = both["tasks"][name]["players"][player]
-            same = {key for key in numbers if not key.startswith("microseconds")}
-            assert {key: other[key] for key in same} == {key: numbers[key] for key in same}
-            assert films[name][player].recording is not None
-    assert {(task, player) for task, player, _, _ in reports} == {
-        (task, player) for task in ("pursuit", "obstacles") for player in ("random", "rules")
-    }
+            assert [two[name]["players"][player][key] for key in WITHOUT_CLOCK] == [
+                numbers[key] for key in WITHOUT_CLOCK
+            ]
 
 
-def test_failing_player_is_named_in_parallel(side_by_side: None) -> None:
+def test_stored_episodes_are_not_played_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = ("--tasks", "obstacles", "--players", "random", "--worlds", "2", "--smoke")
+    run(*arguments)
+    first = json.loads(Path("results/results.json").read_text())["tasks"]
+    with monkeypatch.context() as patch:
+        patch.setattr(play, "rollout", None)
+        run(*arguments)
+        assert json.loads(Path("results/results.json").read_text())["tasks"] == first
+        assert "TypeError" in run(*arguments, "--fresh", code=2).stderr
+    [record] = Path("results/jobs").rglob("*.safetensors")
+    record.write_bytes(record.read_bytes()[:-9])
+    assert f"{record} is damaged: " in run(*arguments, code=2).stderr
+
+
+def test_failing_player_is_named_and_all_others_are_played() -> None:
+    """There are more jobs than processes."""
     Path("odd.py").write_text("def predict(observation):\n    raise RuntimeError('no idea')\n")
-    line = run("--tasks", "pursuit,obstacles", "--players", "odd.py", "--worlds", "2", code=2).stderr
+    names = "pursuit,obstacles,corridor"
+    result = run("--tasks", names, "--players", "odd.py,random", "--worlds", "2", *TWO, code=2)
+    line = result.stderr.splitlines()[-1]
     assert (
-        "player 'odd.py': RuntimeError in predict, line 2: no idea (task 'pursuit')" in line
-        and not Path("results").exists()
+        "player 'odd.py': RuntimeError in predict, line 2: no idea (task 'pursuit') (job compare/pursuit/odd-" in line
     )
-
-
-def test_first_failure_ends_all_parallel_jobs(side_by_side: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """There are more jobs than processes; no thread of the pool may raise an exception."""
-    died: list[Any] = []
-    monkeypatch.setattr(threading, "excepthook", died.append)
-    Path("odd.py").write_text("def predict(observation):\n    raise RuntimeError('no idea')\n")
-    names = ",".join(TASKS)
-    line = run("--tasks", names, "--players", "odd.py", "--worlds", "2", code=2).stderr
-    assert line.strip().endswith("RuntimeError in predict, line 2: no idea (task 'bottleneck')") and not died
-    assert not multiprocessing.active_children()
+    assert line.endswith("; 1 more, see `flockenv jobs results/jobs`")
+    assert [path.name.split("-")[0] for path in Path("results/jobs").rglob("*.safetensors")] == 3 * ["random"]
+    assert not Path("results/results.json").exists() and not multiprocessing.active_children()
 
 
 @pytest.mark.slow
-def test_error_in_the_progress_callback_is_raised_in_parallel(
-    side_by_side: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    died: list[Any] = []
-    monkeypatch.setattr(threading, "excepthook", died.append)
-    tasks, reports = [task() for task in TASKS.values()], []
-
-    def advance(*row: Any) -> None:
-        reports.append(row)
-        raise RuntimeError("enough")
-
-    with pytest.raises(RuntimeError, match="enough"):
-        comparison.compare(tasks, comparison.players_in_order(["random"]), 2, resamples=100, advance=advance)
-    assert len(reports) == 1 and not died
-    assert not multiprocessing.active_children()
-
-
-@pytest.mark.slow
-def test_process_that_exits_is_reported_and_nothing_hangs(side_by_side: None) -> None:
-    Path("gone.py").write_text("import os\n\ndef predict(observation):\n    os._exit(3)\n")
-    line = run("--tasks", "pursuit,obstacles", "--players", "gone.py", "--worlds", "2", code=2).stderr
-    assert "one of the processes was ended from outside" in line and not Path("results").exists()
+def test_process_that_exits_is_reported_and_nothing_hangs() -> None:
+    Path("gone.py").write_text("import os\n\ndef predict(observation):\n    print('farewell')\n    os._exit(3)\n")
+    line = run("--tasks", "pursuit,obstacles", "--players", "gone.py", "--worlds", "2", *TWO, code=2).stderr
+    assert line.count("was ended from outside 3 times") == 2 and not Path("results/results.json").exists()
 
 
 def _enable_interrupts() -> None:
@@ -233,12 +210,13 @@ def test_interrupt_ends_every_process() -> None:
         stdout=subprocess.DEVNULL, start_new_session=True, preexec_fn=_enable_interrupts,
     )  # fmt: skip
     assert process.stderr is not None
-    assert "plays" in process.stderr.readline()
+    while "compare/" not in process.stderr.readline():
+        assert process.poll() is None
     os.killpg(process.pid, signal.SIGINT)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert errors.splitlines()[-1] == "compare: interrupted, nothing written" and "Traceback" not in errors
-    assert not Path("out").exists()
+    assert errors.splitlines()[-1] == f"compare: {comparison.STOPPED}" and "Traceback" not in errors
+    assert [path.name for path in Path("out").iterdir()] == ["jobs"]
     until = time.monotonic() + 10
     while _has_members(process.pid):
         assert time.monotonic() < until, "a process still runs"
@@ -334,7 +312,7 @@ def test_empty_chart_is_refused() -> None:
 def test_one_run_writes_all_four_files(in_temporary_folder: Path) -> None:
     Path("still.py").write_text(STILL)
     result = run("--players", "still.py,random", "--worlds", "6", "--smoke", "--out", "here/results")
-    assert sorted(path.name for path in Path("here/results").iterdir()) == FILES
+    assert sorted(path.name for path in Path("here/results").iterdir() if path.is_file()) == FILES
     results = json.loads(Path("here/results/results.json").read_text(), parse_constant=pytest.fail)
     assert list(results["tasks"]) == list(TASKS)
     for name, about in results["tasks"].items():
@@ -367,7 +345,7 @@ def test_equal_seeds_give_equal_scores_and_different_seeds_do_not() -> None:
 
 def test_order_of_players_does_not_depend_on_the_arguments() -> None:
     Path("mine.py").write_text(STILL)
-    field = comparison.players_in_order(["mine.py", "ppo", "random", "rules", "textbook", "ppo"])
+    field = play.players_in_order(["mine.py", "ppo", "random", "rules", "textbook", "ppo"])
     assert [player.name for player in field] == ["random", "textbook", "rules", "ppo", "mine"]
 
 
@@ -419,7 +397,7 @@ def test_user_s_weights_play_under_the_name_of_their_file() -> None:
 def test_invalid_arguments_are_refused_in_one_line(
     arguments: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(comparison, "rollout", lambda *_, **__: pytest.fail("rollout was called"))
+    monkeypatch.setattr(play, "rollout", lambda *_, **__: pytest.fail("rollout was called"))
     Path("sub").mkdir()
     late = "def player(task):\n    return {}['no']"
     files = {"still.py": STILL, "sub/still.py": STILL, "broken.py": "1 / 0", "late.py": late, "model.zip": "PK"}
@@ -442,7 +420,7 @@ def test_player_that_raises_system_exit_is_named_and_nothing_is_written() -> Non
     Path("leaves.py").write_text("def predict(observation):\n    raise SystemExit(3)\n")
     line = run("--tasks", "pursuit", "--players", "random,leaves.py", "--worlds", "2", code=2).stderr
     assert "player 'leaves.py': SystemExit in predict, line 2: 3 (task 'pursuit')" in line.splitlines()[-1]
-    assert not Path("results").exists()
+    assert not Path("results/results.json").exists()
 
 
 def test_failing_player_is_named_and_nothing_is_written() -> None:
@@ -459,8 +437,8 @@ def test_failing_player_is_named_and_nothing_is_written() -> None:
         Path(f"{name}.py").write_text(source)
         result = run("--tasks", "pursuit", "--players", f"{name}.py", "--worlds", "2", code=2)
         assert f"compare: player '{name}.py': {message}" in result.stderr
-        assert result.stderr.endswith("(task 'pursuit')\n")
-        assert not Path("results").exists()
+        assert re.search(rf"\(task 'pursuit'\) \(job compare/pursuit/{name}-\w+\)\n$", result.stderr)
+        assert not Path("results/results.json").exists()
 
 
 def test_debug_raises_the_exception() -> None:
@@ -468,14 +446,14 @@ def test_debug_raises_the_exception() -> None:
     assert isinstance(result.exception, ValueError)
 
 
-def test_interrupt_is_reported_and_nothing_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupt_is_reported_and_no_result_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: Any, **__: Any) -> Any:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(comparison, "rollout", interrupted)
+    monkeypatch.setattr(play, "rollout", interrupted)
     result = run("--players", "random", "--worlds", "2", code=130)
-    assert "interrupted, nothing written" in result.stderr
-    assert not Path("results").exists()
+    assert comparison.STOPPED in result.stderr
+    assert not Path("results/results.json").exists()
 
 
 def test_cost_of_a_player_comes_from_its_card_or_from_its_tuning(
@@ -530,10 +508,10 @@ def test_compare_needs_no_torch() -> None:
 
 def test_hand_written_player_plays_only_the_tasks_that_it_supports() -> None:
     crossing, flock = TASKS["crossing"](), TASKS["flock"]()
-    assert comparison.usual_players([crossing]) == ["random", "textbook", "orca", "rules", "ppo"]
-    assert comparison.usual_players([flock]) == ["random", "textbook", "rules", "ppo"]
-    orca, chance = comparison.Player.of("orca"), comparison.Player.of("random")
-    fields = comparison.players_of([crossing, flock], [chance, orca])
+    assert play.usual_players([crossing]) == ["random", "textbook", "orca", "rules", "ppo"]
+    assert play.usual_players([flock]) == ["random", "textbook", "rules", "ppo"]
+    orca, chance = play.Player.of("orca"), play.Player.of("random")
+    fields = play.players_of([crossing, flock], [chance, orca])
     assert fields == {"crossing": [chance, orca], "flock": [chance]}
     with pytest.raises(ValueError, match="no hand-written player 'orca' for 'flock'; there is one for: crossing"):
         comparison.compare([flock], [orca], 2)

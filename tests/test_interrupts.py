@@ -13,9 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from agents.processes import Tell, guard_process_starts, side_by_side
 from flockenv.core import signals
 from flockenv.core.signals import ONE_PRESS
+from flockenv.jobs import Failure, Job
+from flockenv.jobs.local_engine import LocalEngine, guard_process_starts
 
 ROOT = Path(__file__).resolve().parent.parent
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -288,17 +289,17 @@ with signals.handle_signals('toy'):
 
 WORK = """\
 import os, time
-from agents.processes import side_by_side
+from pathlib import Path
+from flockenv.jobs import Job
+from flockenv.jobs.local_engine import LocalEngine
 
-def work(job, tell):
-    tell(os.getpid())
+def work(number):
+    Path(str(number)).write_text(str(os.getpid()))
     {doing}
 
-def told(pid):
-    print(pid, flush=True)
-
 if __name__ == "__main__":
-    list(side_by_side(work, [1, 2], 2, told))
+    jobs = [Job(str(number), work, (number,), None) for number in range(2)]
+    list(LocalEngine(2).run(jobs, lambda job: None))
 """
 
 
@@ -318,19 +319,20 @@ def test_the_mark_of_worker_processes_is_removed_after_they_are_started(
     assert os.environ.get(signals.PARENT) == before
 
 
-def _exit_after_signal(job: int, tell: Tell) -> None:
+def _exit_after_signal() -> bytes:
     os._exit(143)
 
 
-@pytest.mark.parametrize(("number", "error"), [(signal.SIGTERM, KeyboardInterrupt), (0, OSError)])
-def test_workers_ended_by_a_signal_to_the_whole_group_are_no_error(
-    number: int, error: type[BaseException], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_workers_ended_by_a_signal_to_the_whole_group_are_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
     """The worker ends at once, while the command waits for a line at which it can raise KeyboardInterrupt."""
-    monkeypatch.setattr(signals._Received, "signal", number)
+    jobs = [Job("exits", _exit_after_signal, (), None)]
     monkeypatch.setattr(signals._Received, "raised", False)
-    with pytest.raises(error):
-        list(side_by_side(_exit_after_signal, [1], 1, lambda: None))
+    with monkeypatch.context() as received:
+        received.setattr(signals._Received, "signal", signal.SIGTERM)
+        with pytest.raises(KeyboardInterrupt):
+            list(LocalEngine(2).run(jobs, lambda job: None))
+    [(_, failure)] = LocalEngine(2).run(jobs, lambda job: None)
+    assert isinstance(failure, Failure) and "was ended from outside 3 times" in str(failure)
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM], ids=lambda number: number.name)
@@ -340,8 +342,12 @@ def test_workers_ended_by_a_signal_to_the_whole_group_are_no_error(
 def test_worker_processes_end_with_their_parent(number: signal.Signals, doing: str, tmp_path: Path) -> None:
     (tmp_path / "parent.py").write_text(WORK.format(doing=doing))
     process = start("parent.py", folder=tmp_path)
-    assert process.stdout is not None
-    workers = [int(process.stdout.readline()) for _ in range(2)]
+    files = [tmp_path / str(number) for number in range(2)]
+    until = time.monotonic() + 60
+    while not all(file.exists() and file.read_text() for file in files):
+        assert time.monotonic() < until, "the workers do not start"
+        time.sleep(0.05)
+    workers = [int(file.read_text()) for file in files]
     assert all(lives(pid) for pid in workers)
     process.send_signal(number)
     process.wait(timeout=60)

@@ -12,14 +12,15 @@ import pytest
 from typer.testing import CliRunner
 
 from agents import compare as comparison
-from agents import transfer, transfer_cache, transfer_chart, transfer_report
-from agents.transfer_cache import KEPT, Plan
+from agents import play, transfer, transfer_chart, transfer_jobs, transfer_report
+from agents.transfer_jobs import Plan
 from agents.transfer_report import Cell, Clock, Setting
+from flockenv.jobs import Store
 from flockenv.physics.integrators import INTEGRATORS, RK4
 from flockenv.tasks import TASKS, Pursuit
 
 FILES = ["transfer.json", "transfer.md", "transfer.png"]
-TINY = ("pursuit", "--worlds", "3", "--rounds", "2", "--workers", "1")
+TINY = ("pursuit", "--worlds", "3", "--rounds", "2", "--processes", "1")
 TRAINED = ("--methods", "semi_implicit_euler", "--substeps", "2")
 STILL = "def predict(observation):\n    return 0 * observation[:, :2]\n"
 
@@ -40,12 +41,20 @@ def results(folder: str = "results") -> Any:
     return json.loads(Path(folder, "transfer.json").read_text(), parse_constant=pytest.fail)
 
 
+JOBS = Path("results/jobs")
+
+
+def records(kind: str) -> dict[Path, bytes]:
+    """Return the bytes of the stored records of some kinds of jobs."""
+    return {path: path.read_bytes() for path in JOBS.glob(f"{kind}/**/*.safetensors")}
+
+
 class Counted:
     """Replacement of `rollout` that counts calls and raises KeyboardInterrupt in the call `stop_at`."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, stop_at: int = 0) -> None:
-        self.calls, self.stop_at, self.real = 0, stop_at, transfer_cache.rollout
-        monkeypatch.setattr(transfer_cache, "rollout", self)
+        self.calls, self.stop_at, self.real = 0, stop_at, play.rollout
+        monkeypatch.setattr(play, "rollout", self)
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
         self.calls += 1
@@ -81,10 +90,10 @@ def test_a_setting_has_its_number_of_steps_per_decision(control_dt: float) -> No
 def test_the_trained_setting_scores_as_in_the_comparison_bit_for_bit() -> None:
     run(*TINY, *TRAINED, "--players", "random,rules,ppo")
     task = TASKS["pursuit"]()
-    field = comparison.players_in_order(["random", "rules", "ppo"])
+    field = play.players_in_order(["random", "rules", "ppo"])
     report, _ = comparison.compare([task], field, worlds=3, resamples=100)
     plan = Plan(task, (Setting.of_training(task),), tuple(field), 3, 0, 2)
-    for (_, name), cell in transfer_cache.all_cells(plan).items():
+    for (_, name), cell in transfer_jobs.read_cells(plan, Store(JOBS)).items():
         assert cell.returns.tolist() == report["tasks"]["pursuit"]["players"][name]["returns"]
     about = results()["tasks"]["pursuit"]
     assert about["again"] == {"random": 0.0, "rules": 0.0, "ppo": 0.0}
@@ -127,18 +136,18 @@ def test_an_interrupted_command_continues_and_plays_nothing_twice(
     cells = 2 * 2 + 2  # settings times players, and the trained setting once more
     first = Counted(monkeypatch, stop_at=4)
     result = run(*request, code=130)
-    assert "interrupted; what was played is in" in result.stderr
-    assert len(list(KEPT.rglob("*.json"))) == 3
-    assert not Path("results").exists()
-    monkeypatch.setattr(transfer_cache, "rollout", first.real)
+    assert transfer.STOPPED in result.stderr
+    assert len(records("transfer*")) == 3
+    assert not Path("results/transfer.json").exists()
+    monkeypatch.setattr(play, "rollout", first.real)
     second = Counted(monkeypatch)
     run(*request)
     assert second.calls == cells - 3
-    kept = {path: path.read_bytes() for path in KEPT.rglob("*.json")}
+    kept = records("*")
     before = results()
     run(*request)
     assert second.calls == cells - 3
-    assert {path: path.read_bytes() for path in KEPT.rglob("*.json")} == kept
+    assert records("*") == kept
     after = results()
     assert after["tasks"] == before["tasks"]  # also the times: no round is run twice
 
@@ -146,37 +155,22 @@ def test_an_interrupted_command_continues_and_plays_nothing_twice(
 @pytest.mark.slow
 def test_more_rounds_are_added_to_the_kept_ones() -> None:
     run(*TINY, *TRAINED, "--players", "random")
-    [path] = KEPT.rglob("clock-*.json")
-    before = json.loads(path.read_text())["rounds"]
+    before = records("transfer-clock")
     run(*TINY, *TRAINED, "--players", "random", "--rounds", "3")
-    rounds = json.loads(path.read_text())["rounds"]
-    assert rounds[:2] == before
-    assert len(rounds) == 3
+    after = records("transfer-clock")
+    assert len(before) == 2 and len(after) == 3 and before.items() <= after.items()
 
 
-DAMAGED = [
-    ("rules-*.json", ""),
-    ("rules-*.json", '{"returns": [1.0, 2.0'),
-    ("rules-*.json", '{"returns": [1.0, 2.0], "success": [true, true]}'),
-    ("rules-*.json", '{"returns": [1.0, 2.0, NaN], "success": [true, true, true]}'),
-    ("rules-*.json", '{"success": [true, true, true]}'),
-    ("rules-*.json", "[1, 2]"),
-    ("clock-*.json", '{"rounds": [{"a": "b"}], "error_mm": {}}'),
-    ("clock-*.json", '{"rounds": [], "error": {}}'),
-    ("clock-*.json", "\x00"),
-]
-
-
-def test_a_damaged_kept_file_is_named_in_one_line() -> None:
+@pytest.mark.parametrize("name", ["transfer/pursuit/rules-*", "transfer-clock/round-1-*"])
+def test_a_damaged_kept_file_is_named_in_one_line(name: str) -> None:
     request = (*TINY, *TRAINED, "--players", "rules")
     run(*request)
-    for name, content in DAMAGED:
-        [path] = KEPT.rglob(name)
-        before = path.read_bytes()
-        path.write_text(content, encoding="utf-8")
-        error = run(*request, code=2).stderr
-        assert error.startswith(f"transfer: {path} is damaged: ") and error.count("\n") == 1, error
-        path.write_bytes(before)
+    [path] = JOBS.glob(name)
+    before = path.read_bytes()
+    for content in (b"", before[:-9], before[:50], b"\x00" * 99, before.replace(b"map", b"mop")):
+        path.write_bytes(content)
+        error = run(*request, code=2).stderr.splitlines()[-1]
+        assert re.match(rf"transfer: \S*{path} is damaged: .*; delete it", error), error
     path.unlink()
     run(*request)
 
@@ -199,11 +193,12 @@ def test_a_changed_player_is_played_again(monkeypatch: pytest.MonkeyPatch) -> No
 def test_results_do_not_depend_on_the_number_of_processes() -> None:
     request = ("--players", "random,rules", "--methods", "semi_implicit_euler,midpoint", "--substeps", "2")
     run(*TINY, *request)
-    alone = {path.name: path.read_bytes() for path in KEPT.rglob("*.json") if "clock" not in path.name}
-    for path in KEPT.rglob("*.json"):
-        path.unlink()
-    run(*TINY, *request, "--workers", "2")
-    assert {path.name: path.read_bytes() for path in KEPT.rglob("*.json") if "clock" not in path.name} == alone
+    alone = results()["tasks"]["pursuit"]["settings"]
+    run(*TINY, *request, "--processes", "2", "--out", "two")
+    both = results("two")["tasks"]["pursuit"]["settings"]
+    assert {name: about["players"] for name, about in both.items()} == {
+        name: about["players"] for name, about in alone.items()
+    }
 
 
 # --- verdicts, page and picture
@@ -319,7 +314,7 @@ def test_a_hand_written_player_plays_only_its_own_tasks() -> None:
 
 
 def test_a_folder_in_place_of_a_file_is_refused_before_anything_is_played(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transfer_cache, "rollout", lambda *_, **__: pytest.fail("something was played"))
+    monkeypatch.setattr(play, "rollout", lambda *_, **__: pytest.fail("something was played"))
     Path("results/transfer.md").mkdir(parents=True)
     assert "transfer.md': is a folder" in run(*TINY, code=2).stderr
 
@@ -327,7 +322,7 @@ def test_a_folder_in_place_of_a_file_is_refused_before_anything_is_played(monkey
 @pytest.mark.slow
 def test_one_run_writes_all_files() -> None:
     result = run(*TINY, *TRAINED, "--players", "random,rules", "--out", "here/out")
-    assert sorted(path.name for path in Path("here/out").iterdir()) == FILES
+    assert sorted(path.name for path in Path("here/out").iterdir() if path.is_file()) == FILES
     assert results("here/out")["tasks"]["pursuit"]["verdict"] in " ".join(result.stdout.split())
     assert Path("here/out/transfer.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
@@ -345,7 +340,6 @@ def test_one_run_writes_all_files() -> None:
         (("--substeps", "1,9999999999"), "--substeps '9999999999': must be"),
         (("--worlds", "1"), "--worlds 1: must be from 2 to 1000000"),
         (("--rounds", "0"), "--rounds 0: must be from 1"),
-        (("--workers", "0"), "--workers 0: must be from 1"),
         (("--seed", "1000"), "seed: 1000, must be"),
         (("--out", "../x"), "--out '../x': must not go up"),
     ],
@@ -353,7 +347,7 @@ def test_one_run_writes_all_files() -> None:
 def test_bad_arguments_are_refused_in_one_line(
     arguments: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(transfer_cache, "rollout", lambda *_, **__: pytest.fail("something was played"))
+    monkeypatch.setattr(play, "rollout", lambda *_, **__: pytest.fail("something was played"))
     result = run(*arguments, code=2)
     assert result.stdout == ""
     [line] = result.stderr.splitlines()

@@ -1,6 +1,6 @@
 """The command line of flockenv.
 
-list | run | measure | render | explain | accuracy | stress | experiment | gallery | validate | warmup | schema
+list | run | measure | render | explain | accuracy | stress | experiment | gallery | validate | jobs | warmup | schema
 
 Errors are one line on stderr. Exit codes: 0, 1 (a run failed), 2 (bad input), 130 (interrupted).
 """
@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 import typer
 
 import flockenv
+from flockenv.cli.jobs import jobs
 from flockenv.cli.measure import measure
 from flockenv.cli.studies import accuracy, experiment, gallery, stress
 from flockenv.cli.targets import complete_target, is_scene_file
@@ -297,6 +298,7 @@ app.command()(stress)
 app.command()(experiment)
 app.command()(gallery)
 app.command()(validate)
+app.command()(jobs)
 
 
 @app.command()

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BAD_INPUT", "DIVERGED", "INTERRUPTED", "OK", "EarlyEnd", "Force", "Seed", "describe_error", "duration_text",
-    "flush_output", "handle_interrupt", "name_stdout_errors", "new_console", "print_error", "printable", "progress_bar",
-    "relative_path", "report_errors", "run_program", "show_progress", "show_table",
+    "flush_output", "handle_interrupt", "job_bar", "name_stdout_errors", "new_console", "print_error", "printable",
+    "progress_bar", "relative_path", "report_errors", "run_program", "show_progress", "show_table",
 ]  # fmt: skip
 
 OK, DIVERGED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -217,6 +217,30 @@ def progress_bar(title: str, total: int, unit: str, first: str = "compiling") ->
 
         def update(done: int) -> None:
             bar.update(task, completed=done, description=title, left=clock.remaining(done, total))
+
+        yield update
+
+
+@contextmanager
+def job_bar() -> Iterator[Callable[[int, int, str], None]]:
+    """Show one bar over all jobs on a terminal; otherwise write a line for each job that ends."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description:<28}"), BarColumn(30), MofNCompleteColumn(), TimeElapsedColumn(),
+        TextColumn("{task.fields[left]}"),
+    )  # fmt: skip
+    with show_progress(Progress(*columns, console=console, transient=True)) as progress:
+        bar = progress.add_task("compiling and playing", total=None, left="")
+        clock = _Clock()
+
+        def update(done: int, most: int, name: str) -> None:
+            left = clock.remaining(done, most)
+            progress.update(bar, completed=done, total=most, description=name or "compiling and playing", left=left)
+            if name and not console.is_terminal:
+                console.print(f"{name}: done ({done} of {most})", highlight=False)
 
         yield update
 

@@ -1,0 +1,46 @@
+"""Engines: what runs jobs; processes of this machine, or Ray."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Generator, Iterable
+from typing import Protocol
+
+from flockenv.jobs.job import Failure, Job
+
+__all__ = ["ENGINES", "TRIES", "Engine", "engine_of"]
+
+ENGINES = ("local", "ray")
+
+TRIES = 3
+"""Attempts to run a job whose process ends, before it counts as failed."""
+
+Begun = Callable[[Job], None]
+"""Called when a job is given to a process."""
+
+
+class Engine(Protocol):
+    """Runs jobs in any order."""
+
+    def run(self, jobs: Iterable[Job], begun: Begun) -> Generator[tuple[Job, bytes | Failure], None, None]:
+        """Yield each job with its record or its failure; closing the generator ends all work."""
+        ...
+
+
+def engine_of(name: str, processes: int | None = None) -> Engine:
+    """Return an engine by name; processes: of a local engine (default: one for each core).
+
+    Raises:
+        ValueError: unknown name, or Ray is not installed.
+    """
+    if name == "local":
+        from flockenv.jobs.local_engine import LocalEngine
+
+        return LocalEngine(processes or len(os.sched_getaffinity(0)))
+    if name == "ray":
+        from flockenv.jobs.ray_engine import RayEngine
+
+        return RayEngine()
+    from flockenv.core.errors import nearest, printable
+
+    raise ValueError(f"--engine {printable(name)}: unknown{nearest(name, ENGINES)}; allowed: {', '.join(ENGINES)}")

@@ -1,0 +1,82 @@
+"""A job: a function of its arguments, with a key that names everything its result depends on."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import platform
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+__all__ = ["Failure", "Job", "code_digest", "execute"]
+
+PACKAGES = ("numpy", "numba", "scipy")
+"""Packages whose version results may depend on."""
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """One piece of work.
+
+    name: path of readable words, "compare/pursuit/rules". function: of a module, found there by its name; it is called
+    with `arguments`, which are pickled, and returns the record as bytes. about: all that the record depends on besides
+    the code and the versions, as JSON.
+    """
+
+    name: str
+    function: Callable[..., bytes]
+    arguments: tuple[Any, ...]
+    about: Any
+
+    @functools.cached_property
+    def key(self) -> str:
+        """The name, with a digest of `about`, of the code and of the versions."""
+        text = json.dumps([self.name, self.about, code_digest()], sort_keys=True, allow_nan=False)
+        return f"{self.name}-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why a job has no result: an error of its function, or the end of its process in every attempt."""
+
+    text: str
+    log: str = ""  # the end of what its process wrote, if the process ended
+
+    def __str__(self) -> str:
+        return f"{self.text}; it wrote: {self.log}" if self.log else self.text
+
+
+def execute(function: Callable[..., bytes], arguments: tuple[Any, ...], code: str) -> bytes | Failure:
+    """Call a job's function in this process; return its record, or a failure if it raises an error.
+
+    code: the digest of the code that the job's key was made with; a process with other code refuses the job.
+    """
+    if code != code_digest():
+        return Failure("this process has another version of flockenv or of numpy, numba, scipy than the one that asked")
+    try:
+        return function(*arguments)
+    except (Exception, SystemExit) as error:
+        text = str(error) if isinstance(error, (ValueError, OSError)) else f"{type(error).__name__}: {error}"
+        return Failure(" ".join(text.split()))
+
+
+@functools.cache
+def code_digest() -> str:
+    """Return a digest of flockenv's and agents' code and of the versions that results depend on."""
+    package = Path(__file__).resolve().parent.parent
+    digest = hashlib.sha256(f"{platform.python_version()} {[_version(name) for name in PACKAGES]}".encode())
+    for folder in (package, package.parent / "agents"):
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(f"{path.relative_to(folder).as_posix()} ".encode() + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "none"

@@ -1,0 +1,179 @@
+"""The local engine: processes of this machine, each of which takes one job after another and ends with its parent."""
+
+from __future__ import annotations
+
+import os
+import signal
+import tempfile
+import threading
+from collections import Counter, deque
+from collections.abc import Generator, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
+from multiprocessing import active_children, get_context, parent_process, resource_tracker
+from multiprocessing.connection import wait as wait_for
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any
+
+from flockenv.core import signals
+from flockenv.jobs.engine import TRIES, Begun
+from flockenv.jobs.job import Failure, Job, code_digest, execute
+
+__all__ = ["LocalEngine", "announce_parent", "guard_process_starts"]
+
+LOG_END = 300
+"""Characters of a process's output that a failure quotes."""
+
+
+class LocalEngine:
+    """Runs jobs in a number of processes; 1: in this process, unless renew.
+
+    renew: every job gets a new process. Each process is a pool of its own, so that one that ends takes no other job
+    with it.
+    """
+
+    def __init__(self, processes: int, renew: bool = False) -> None:
+        self.processes, self.renew = processes, renew
+
+    def run(self, jobs: Iterable[Job], begun: Begun) -> Generator[tuple[Job, bytes | Failure], None, None]:
+        """Yield each job with its record or its failure."""
+        if self.processes == 1 and not self.renew:
+            for job in jobs:
+                begun(job)
+                yield job, execute(job.function, job.arguments, code_digest())
+            return
+        _start_tracker()
+        with tempfile.TemporaryDirectory(prefix="flockenv-logs-") as logs:
+            workers: list[_Worker] = []
+            try:
+                yield from self._run(deque(jobs), begun, workers, Path(logs))
+            finally:
+                for worker in workers:
+                    worker.end()
+
+    def _run(
+        self, waiting: deque[Job], begun: Begun, workers: list[_Worker], logs: Path
+    ) -> Generator[tuple[Job, bytes | Failure], None, None]:
+        """Give each free process the next job, until all are done."""
+        tries: Counter[str] = Counter()
+        workers += [_Worker(logs / str(k)) for k in range(min(self.processes, len(waiting)))]
+        working: dict[Future[bytes | Failure], tuple[Job, _Worker]] = {}
+        idle = list(workers)
+        while waiting or working:
+            while waiting and idle:
+                job, worker = waiting.popleft(), idle.pop()
+                begun(job)
+                working[worker.submit(job)] = job, worker
+            for future in wait(working, return_when=FIRST_COMPLETED).done:
+                job, worker = working.pop(future)
+                idle.append(worker)
+                try:
+                    record = future.result()
+                except BrokenExecutor:
+                    signals.raise_if_received()  # the signal that ended it was sent to the whole process group
+                    tries[job.key] += 1
+                    log = worker.restart()
+                    if tries[job.key] < TRIES:
+                        waiting.appendleft(job)
+                    else:
+                        yield job, Failure(f"its process was ended from outside {TRIES} times; not enough memory?", log)
+                    continue
+                if self.renew:
+                    worker.restart()
+                yield job, record
+
+
+class _Worker:
+    """A process for jobs, which starts with its first job."""
+
+    def __init__(self, log: Path) -> None:
+        self._log, self._processes = log, list[BaseProcess]()
+        self._pool = self._new_pool()
+
+    def _new_pool(self) -> ProcessPoolExecutor:
+        return ProcessPoolExecutor(1, get_context("spawn"), _begin_worker, (str(self._log),))
+
+    def submit(self, job: Job) -> Future[bytes | Failure]:
+        """Give the process a job; it starts now if it does not run."""
+        if self._processes:
+            return self._pool.submit(execute, job.function, job.arguments, code_digest())
+        before = active_children()
+        with guard_process_starts():
+            future = self._pool.submit(execute, job.function, job.arguments, code_digest())
+        self._processes = [process for process in active_children() if process not in before]
+        return future
+
+    def restart(self) -> str:
+        """Replace a process that has ended; return the end of its output."""
+        self.end()
+        text = self._log.read_text(errors="replace") if self._log.exists() else ""
+        self._log.unlink(missing_ok=True)
+        self._processes, self._pool = [], self._new_pool()
+        return " ".join(text.split())[-LOG_END:]
+
+    def end(self) -> None:
+        """End the process."""
+        for process in self._processes:
+            process.terminate()
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextmanager
+def announce_parent() -> Iterator[None]:
+    """Set the environment so that processes that are started in a block end when this one ends."""
+    before = os.environ.get(signals.PARENT)
+    os.environ[signals.PARENT] = str(os.getpid())
+    try:
+        yield
+    finally:
+        if before is None:
+            os.environ.pop(signals.PARENT, None)
+        else:
+            os.environ[signals.PARENT] = before
+
+
+@contextmanager
+def guard_process_starts() -> Iterator[None]:
+    """Let processes that are started in a block end with this one and ignore Ctrl-C, by inherited blocked signals."""
+    with announce_parent():
+        if os.name != "posix":
+            yield
+            return
+        _start_tracker()  # it unblocks signals, so it must be there before they are blocked
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _start_tracker() -> None:
+    """Start Python's resource tracker, which removes semaphores that processes leave behind, with warnings off."""
+    before = os.environ.get("PYTHONWARNINGS")
+    os.environ["PYTHONWARNINGS"] = "ignore"
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        del os.environ["PYTHONWARNINGS"]
+        if before is not None:
+            os.environ["PYTHONWARNINGS"] = before
+
+
+def _begin_worker(log: str) -> None:
+    """Make this process a worker: it writes to a log, leaves Ctrl-C to its parent, and ends when its parent ends."""
+    signals.begin_worker()
+    os.environ["FLOCKENV_QUIET"] = "1"
+    written = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+    for standard in (1, 2):
+        os.dup2(written, standard)
+    os.close(written)
+    parent = parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with_parent, args=(parent.sentinel,), daemon=True).start()
+
+
+def _end_with_parent(sentinel: Any) -> None:
+    """End this process when its parent has ended; a sentinel is ready then, even after SIGKILL."""
+    wait_for([sentinel])
+    os.kill(os.getpid(), signal.SIGTERM)

@@ -1,0 +1,91 @@
+"""The Ray engine: jobs as Ray tasks, on this machine or on every node of a cluster.
+
+The cluster is that of the environment variable RAY_ADDRESS, as for any program of Ray; without it a local Ray is
+started. Ray places the tasks, repeats those whose process or node ends, and moves records through its object store.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Generator, Iterable
+from itertools import islice
+from typing import Any
+
+from flockenv.jobs.engine import TRIES, Begun
+from flockenv.jobs.job import Failure, Job, code_digest, execute
+
+__all__ = ["RayEngine"]
+
+AHEAD = 2
+"""Tasks per core of the cluster that are submitted at a time; the driver holds no more records than that."""
+
+LOG_END = 300
+"""Characters of Ray's report on a process that ended."""
+
+
+class RayEngine:
+    """Runs each job as a Ray task with one core; memory: bytes that Ray reserves for each, 0 = none."""
+
+    def __init__(self, memory: int = 0) -> None:
+        self._ray, self._memory = _import_ray(), memory
+
+    def run(self, jobs: Iterable[Job], begun: Begun) -> Generator[tuple[Job, bytes | Failure], None, None]:
+        """Yield each job with its record or its failure."""
+        ray, started = self._ray, self._start()
+        reserved = {"memory": self._memory} if self._memory else {}
+        task = ray.remote(num_cpus=1, max_retries=TRIES - 1, **reserved)(_execute)
+        running: dict[Any, Job] = {}
+        waiting, code = iter(jobs), code_digest()
+        try:
+            while True:
+                for job in islice(waiting, self._room(len(running))):
+                    running[task.remote(job.function, job.arguments, code)] = job
+                    begun(job)
+                if not running:
+                    return
+                for reference in ray.wait(list(running), num_returns=1)[0]:
+                    yield running.pop(reference), self._result(reference)
+        finally:
+            for reference in running:
+                ray.cancel(reference, force=True)
+            if started:
+                ray.shutdown()
+
+    def _room(self, running: int) -> int:
+        """Return how many more tasks may be submitted; the cluster may grow and shrink."""
+        cores = int(self._ray.cluster_resources().get("CPU", 1))
+        return max(0, AHEAD * max(1, cores) - running)
+
+    def _start(self) -> bool:
+        """Connect to the cluster, or start a local one; return True if this process was not connected before."""
+        if self._ray.is_initialized():
+            return False
+        self._ray.init(include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
+        return True
+
+    def _result(self, reference: Any) -> bytes | Failure:
+        """Return the record of a finished task, or its failure."""
+        errors = self._ray.exceptions
+        try:
+            return self._ray.get(reference)  # type: ignore[no-any-return]
+        except errors.RayTaskError as error:
+            return Failure(" ".join(str(error.cause or error).split()))
+        except errors.RayError as error:
+            return Failure(f"its process or node ended {TRIES} times", " ".join(str(error).split())[-LOG_END:])
+
+
+def _execute(function: Callable[..., bytes], arguments: tuple[Any, ...], code: str) -> bytes | Failure:
+    """Run a job in a process of Ray, without the lines that a terminal shows."""
+    os.environ["FLOCKENV_QUIET"] = "1"
+    return execute(function, arguments, code)
+
+
+def _import_ray() -> Any:
+    """Return the module ray; raise ValueError, in one line, if it is not installed."""
+    try:
+        import ray  # type: ignore[import-not-found, unused-ignore]
+        import ray.exceptions  # type: ignore[import-not-found, unused-ignore]
+    except ImportError as error:
+        raise ValueError(f"--engine ray: {error}; install the extra: pip install 'flockenv[ray]'") from None
+    return ray

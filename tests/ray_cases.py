@@ -1,0 +1,144 @@
+"""Cases for the Ray engine: `python -m tests.ray_cases NAME` in an environment that has Ray, see tests/test_ray.py.
+
+Each case is a function; it prints nothing and raises an error if it fails.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import ray
+from ray.cluster_utils import Cluster
+from typer.testing import CliRunner
+
+from agents import compare
+from flockenv.jobs import FailedJobsError, Job, Store, Work, run_jobs
+from flockenv.jobs.ray_engine import RayEngine
+
+CLOCKS = ("microseconds_per_decision", "microseconds_single", "wall_time_s", "verdict", "versions", "machine", "git")
+"""Keys of results.json that depend on clocks, or on the packages of the environment."""
+
+
+def wait_and_return(folder: str, value: int, seconds: float, size: int = 1) -> bytes:
+    """Note in a file that the job has run to its end; return some bytes."""
+    time.sleep(seconds)
+    with open(Path(folder, f"{value}.txt"), "a") as file:
+        file.write("ran\n")
+    return bytes([value % 256]) * size
+
+
+def end_twice(folder: str) -> bytes:
+    """End the process in the first two attempts."""
+    attempt = len(list(Path(folder).glob("attempt-*")))
+    Path(folder, f"attempt-{attempt}").touch()
+    if attempt < 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return b"survived"
+
+
+def end_always() -> bytes:
+    os.kill(os.getpid(), signal.SIGKILL)
+    return b""
+
+
+@contextmanager
+def cluster(nodes: int) -> Iterator[Any]:
+    """Connect to a cluster of nodes with one core each, all on this machine."""
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    workers = [made.add_node(num_cpus=1) for _ in range(nodes - 1)]
+    ray.init(address=made.address, log_to_driver=False)
+    try:
+        yield made, workers
+    finally:
+        ray.shutdown()
+        made.shutdown()
+
+
+def played(out: str, *arguments: str) -> Any:
+    """Return the results of a small comparison without its clocks."""
+    options = ["--tasks", "pursuit,obstacles", "--players", "random,rules,ppo", "--worlds", "8", "--out", out]
+    result = CliRunner().invoke(compare.app, [*options, *arguments])
+    assert result.exit_code == 0, result.output
+    return without_clocks(json.loads(Path(out, "results.json").read_text()))
+
+
+def without_clocks(content: Any) -> Any:
+    if isinstance(content, dict):
+        return {key: without_clocks(value) for key, value in content.items() if key not in CLOCKS}
+    return [without_clocks(value) for value in content] if isinstance(content, list) else content
+
+
+def results_are_the_same_on_one_node_and_on_two() -> None:
+    """Of the comparison: by the local engine, by a local Ray, and by a cluster of two nodes."""
+    local = played("local", "--processes", "2")
+    assert played("ray", "--engine", "ray") == local
+    with cluster(2):
+        assert played("cluster", "--engine", "ray") == local
+
+
+def a_killed_worker_loses_nothing() -> None:
+    """A job whose process is killed runs again, at most three times; the rest finishes."""
+    folder = os.getcwd()
+    jobs = [Job("killed", end_twice, (folder,), None)]
+    jobs += [Job(f"rest/{k}", wait_and_return, (folder, k, 0.0), k) for k in range(6)]
+    store = Store(Path("jobs"))
+    run_jobs(jobs, Work(store, RayEngine()))
+    assert store.read(jobs[0], bytes) == b"survived"
+    assert all(store.has(job) for job in jobs)
+    try:
+        run_jobs([Job("killer", end_always, (), None), *jobs], Work(store, RayEngine(), fresh=True))
+    except FailedJobsError as error:
+        assert "its process or node ended 3 times" in str(error) and len(error.failures) == 1
+    else:
+        raise AssertionError("a job that kills its process did not fail")
+
+
+def a_killed_node_loses_nothing() -> None:
+    """Jobs of a node that ends in the middle run on the other; every record is there, and none is written twice."""
+    folder, written = os.getcwd(), []
+    jobs = [Job(f"job/{k}", wait_and_return, (folder, k, 0.4), k) for k in range(12)]
+    with cluster(2) as (made, workers):
+
+        def end_node(done: int, most: int, name: str) -> None:
+            written.append(name)
+            if done == 3:
+                made.remove_node(workers.pop(), allow_graceful=False)
+
+        run_jobs(jobs, Work(Store(Path("jobs")), RayEngine(), progress=end_node))
+    assert [Store(Path("jobs")).read(job, bytes) for job in jobs] == [bytes([k]) for k in range(12)]
+    assert sorted(written[1:]) == sorted(job.name for job in jobs) and not workers
+
+
+def memory_of_the_driver_does_not_grow_with_the_number_of_jobs() -> None:
+    """1,000 records of 100 kB: the peak after all of them is that after the first 200, but for 30 MB."""
+    peaks = {}
+
+    def note(done: int, most: int, name: str) -> None:
+        peaks[done] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+    jobs = [Job(f"stub/{k}", wait_and_return, (os.getcwd(), k, 0.0, 100_000), k) for k in range(1000)]
+    run_jobs(jobs, Work(Store(Path("jobs")), RayEngine(), progress=note))
+    assert peaks[1000] < peaks[200] + 30, peaks
+
+
+CASES = (
+    results_are_the_same_on_one_node_and_on_two,
+    a_killed_worker_loses_nothing,
+    a_killed_node_loses_nothing,
+    memory_of_the_driver_does_not_grow_with_the_number_of_jobs,
+)
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as empty:
+        os.chdir(empty)
+        next(case for case in CASES if case.__name__ == sys.argv[1])()

@@ -1,0 +1,267 @@
+"""Jobs: keys, records, engines, failures and resumption, on small jobs."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from flockenv.cli.main import app
+from flockenv.jobs import FailedJobsError, Failure, Job, Store, Work, engine_of, records, run_jobs
+from flockenv.jobs import job as job_module
+from flockenv.jobs.job import code_digest, execute
+from flockenv.jobs.local_engine import LocalEngine
+from flockenv.jobs.store import State
+from flockenv.model.appearance import Appearance
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def number(value: int) -> bytes:
+    return str(value).encode()
+
+
+def note_and_return(folder: str, value: int) -> bytes:
+    """Append a line to a file, so that a test sees how often the job has run."""
+    with open(Path(folder, f"{value}.txt"), "a") as file:
+        file.write("ran\n")
+    return str(value).encode()
+
+
+def fail(value: int) -> bytes:
+    raise ValueError(f"{value} is too much")
+
+
+def end_twice(folder: str) -> bytes:
+    """End the process in the first two attempts."""
+    attempt = len(list(Path(folder).glob("attempt-*")))
+    Path(folder, f"attempt-{attempt}").touch()
+    if attempt < 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return b"survived"
+
+
+def end_always() -> bytes:
+    print("the last words", flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+    return b""
+
+
+def numbers(count: int) -> list[Job]:
+    return [Job(f"test/{k}", number, (k,), k) for k in range(count)]
+
+
+def work(tmp_path: Path, processes: int = 1, **more: Any) -> Work:
+    return Work(Store(tmp_path / "jobs"), LocalEngine(processes), **more)
+
+
+# --- keys
+
+
+def test_a_key_depends_on_the_name_on_all_that_the_record_depends_on_and_on_the_code(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    job = Job("a/b", number, (1,), {"x": 1, "y": [2.5, None]})
+    assert job.key == Job("a/b", fail, (), {"y": [2.5, None], "x": 1}).key
+    others = [Job("a/c", number, (1,), job.about), Job("a/b", number, (1,), {"x": 2, "y": [2.5, None]})]
+    monkeypatch.setattr(job_module, "code_digest", lambda: "other")
+    others.append(dataclasses.replace(job))
+    assert len({job.key, *(other.key for other in others)}) == 4
+
+
+def test_a_process_with_other_code_refuses_a_job() -> None:
+    assert execute(number, (1,), code_digest()) == b"1"
+    assert isinstance(refusal := execute(number, (1,), "0123456789abcdef"), Failure)
+    assert "another version" in str(refusal)
+
+
+# --- records
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Sample:
+    name: str
+    values: tuple[Any, ...]
+    by_name: dict[str, Any]
+
+
+def test_records_come_back_with_the_same_bits() -> None:
+    arrays = [
+        np.linspace(0, 1, 7), np.zeros((0, 2), np.int32), np.array([True, False]), np.float32([[np.nan, np.inf]]),
+        np.arange(12).reshape(3, 4).T,
+    ]  # fmt: skip
+    sample = Sample(
+        "ü", (None, True, 3, -0.0, float("nan"), float("-inf"), *arrays), {"look": Appearance(), "l": [1, 2]}
+    )
+    data = records.to_bytes(sample)
+    back = records.from_bytes(data, (Sample, Appearance))
+    assert back.name == "ü" and back.by_name == {"look": Appearance(), "l": [1, 2]}
+    assert repr(back.values[:6]) == "(None, True, 3, -0.0, nan, -inf)"
+    for array, other in zip(arrays, back.values[6:], strict=True):
+        assert array.dtype == other.dtype and array.shape == other.shape
+        assert array.tobytes() == other.tobytes()
+    assert records.to_bytes(back) == data
+
+
+def test_equal_arrays_are_written_once() -> None:
+    once, twice = (len(records.to_bytes([np.arange(1000.0)] * count)) for count in (1, 2))
+    assert twice < once + 200
+
+
+def test_a_record_of_an_unexpected_class_and_damaged_bytes_are_refused() -> None:
+    data = records.to_bytes(Sample("a", (np.arange(9.0),), {}))
+    with pytest.raises(ValueError, match=r"^damaged: "):
+        records.from_bytes(data, ())
+    for wrong in (b"", data[:-1], data[9:], b"\xff" * 64):
+        with pytest.raises(ValueError, match=r"^damaged: "):
+            records.from_bytes(wrong, (Sample,))
+    with pytest.raises(TypeError, match="a record contains a set"):
+        records.to_bytes({"x": {1}})
+
+
+# --- runs
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_every_job_is_stored_under_its_key_and_none_runs_twice(processes: int, tmp_path: Path) -> None:
+    jobs = [Job(f"test/{k}", note_and_return, (str(tmp_path), k), k) for k in range(5)]
+    reports: list[tuple[int, int, str]] = []
+    run_jobs(jobs[:2], work(tmp_path, processes))
+    run_jobs(jobs, work(tmp_path, processes, progress=lambda *report: reports.append(report)))
+    store = Store(tmp_path / "jobs")
+    assert [store.read(job, bytes.decode) for job in jobs] == ["0", "1", "2", "3", "4"]
+    assert [(tmp_path / f"{k}.txt").read_text() for k in range(5)] == 5 * ["ran\n"]
+    assert [report[:2] for report in reports] == [(2, 5), (3, 5), (4, 5), (5, 5)]
+    run_jobs(jobs[:1], work(tmp_path, processes, fresh=True))
+    assert (tmp_path / "0.txt").read_text() == "ran\nran\n"
+    assert not multiprocessing.active_children()
+
+
+def test_the_rest_is_done_if_jobs_fail(tmp_path: Path) -> None:
+    jobs = [*numbers(3), *(Job(f"bad/{k}", fail, (k,), k) for k in range(4))]
+    with pytest.raises(FailedJobsError) as raised:
+        run_jobs(jobs, work(tmp_path))
+    assert list(raised.value.failures) == [job.key for job in jobs[3:]]
+    assert str(raised.value).startswith(
+        f"0 is too much (job {jobs[3].key}); 1 is too much (job {jobs[4].key}); 2 more, see"
+    )
+    assert all(Store(tmp_path / "jobs").has(job) for job in jobs[:3])
+
+
+def test_a_job_whose_process_is_killed_runs_again_and_nothing_else_is_lost(tmp_path: Path) -> None:
+    jobs = [Job("killed", end_twice, (str(tmp_path),), None), *numbers(6)]
+    run_jobs(jobs, work(tmp_path, 2))
+    assert Store(tmp_path / "jobs").read(jobs[0], bytes) == b"survived"
+    assert all(Store(tmp_path / "jobs").read(job, bytes.decode) == str(k) for k, job in enumerate(jobs[1:]))
+    assert len(list(tmp_path.glob("attempt-*"))) == 3
+
+
+def test_a_job_that_kills_its_process_three_times_fails_with_the_end_of_its_output(tmp_path: Path) -> None:
+    jobs = [Job("killer", end_always, (), None), *numbers(3)]
+    with pytest.raises(FailedJobsError, match=r"was ended from outside 3 times.*it wrote: .*the last words"):
+        run_jobs(jobs, work(tmp_path, 2))
+    assert all(Store(tmp_path / "jobs").has(job) for job in jobs[1:])
+
+
+def test_every_job_gets_a_process_of_its_own_if_wanted() -> None:
+    jobs = [Job(f"pid/{k}", own_process, (), k) for k in range(3)]
+    found = {record for _, record in LocalEngine(1, renew=True).run(jobs, lambda job: None)}
+    assert len(found) == 3 and str(os.getpid()).encode() not in found
+
+
+def own_process() -> bytes:
+    return str(os.getpid()).encode()
+
+
+RUN = """
+import sys, time
+from pathlib import Path
+from flockenv.jobs import Job, Store, Work, run_jobs
+from flockenv.jobs.local_engine import LocalEngine
+
+def slow(k):
+    time.sleep(0.3)
+    return str(k).encode()
+
+if __name__ == "__main__":
+    run_jobs([Job(f"slow/{k}", slow, (k,), k) for k in range(8)], Work(Store(Path("jobs")), LocalEngine(2)))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL], ids=lambda number: number.name)
+def test_a_run_that_is_ended_goes_on_where_it_was(number: signal.Signals, tmp_path: Path) -> None:
+    (tmp_path / "run.py").write_text(RUN)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen(
+        [sys.executable, "run.py"], cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
+    until = time.monotonic() + 60
+    while len(list(tmp_path.glob("jobs/slow/*.safetensors"))) < 3:
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    process.send_signal(number)
+    process.wait(timeout=60)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("jobs/slow/*.safetensors")}
+    assert 3 <= len(before) < 8
+    subprocess.run([sys.executable, "run.py"], cwd=tmp_path, env=environment, check=True)
+    after = {path: path.stat().st_mtime_ns for path in tmp_path.glob("jobs/slow/*.safetensors")}
+    assert len(after) == 8 and before.items() <= after.items()
+
+
+def test_an_unknown_engine_is_refused_with_the_nearest_name() -> None:
+    with pytest.raises(ValueError, match=r"--engine 'locl': unknown, did you mean `local`.*allowed: local, ray"):
+        engine_of("locl")
+
+
+# --- how far a run is
+
+
+def test_the_command_shows_how_many_jobs_are_in_which_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    shown: list[str] = []
+
+    def look(done: int, most: int, name: str) -> None:
+        shown.append(CliRunner().invoke(app, ["jobs", "jobs"]).stdout)
+
+    with pytest.raises(FailedJobsError):
+        run_jobs([*numbers(2), Job("bad/1", fail, (1,), 1)], work(tmp_path, progress=look))
+    last = CliRunner().invoke(app, ["jobs", "jobs"]).stdout
+    assert [row.split() for row in last.splitlines() if row.startswith(("test", "bad"))][:2] == [
+        ["test", "0", "0", "0", "2"], ["bad", "0", "1", "0", "0"],
+    ]  # fmt: skip
+    assert "1 is too much" in last and len(shown) == 4
+    assert CliRunner().invoke(app, ["jobs", "jobs", "--state", "failed"]).stdout.startswith("bad/1-")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda folder: None, "no jobs have run here"),
+        (lambda folder: (folder / "state.json").write_text("{"), "is damaged"),
+        (lambda folder: (folder / "state.json").write_text("[]"), "is damaged"),
+    ],
+)
+def test_a_missing_or_damaged_state_is_one_line(spoil: Callable[[Path], object], message: str, tmp_path: Path) -> None:
+    spoil(tmp_path)
+    with pytest.raises(ValueError, match=message):
+        State.read(tmp_path)
+
+
+def test_parts_of_one_run_are_shown_together(tmp_path: Path) -> None:
+    run_jobs(numbers(2), work(tmp_path))
+    run_jobs([Job("more/1", number, (1,), 1)], work(tmp_path))
+    content = json.loads((tmp_path / "jobs" / "state.json").read_text())
+    assert len(content["keys"]) == 3 and sorted(content["done"]) == sorted(content["keys"])
