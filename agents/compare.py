@@ -23,6 +23,7 @@ import flockenv
 from agents import report
 from agents.experiment import CONFIGS, Experiment, load_experiment
 from agents.play import Player, episodes_of_bytes, play_job, players_in_order, players_of, usual_players
+from flockenv.cli.jobs import EngineName, Fresh, Processes
 from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import nearest, printable
@@ -38,9 +39,6 @@ from flockenv.tasks import TASKS, Task
 __all__ = [
     "JOBS",
     "STOPPED",
-    "EngineName",
-    "Fresh",
-    "Processes",
     "app",
     "compare",
     "experiment_of",
@@ -64,14 +62,6 @@ JOBS = "jobs"
 STOPPED = "interrupted; what was played is stored, and the same command goes on"
 ROOM = 2**24
 """Bytes that all files take, approximately."""
-EngineName = Annotated[
-    str, typer.Option(help="local: processes of this machine; ray: a Ray cluster (RAY_ADDRESS), or a local Ray.")
-]
-Processes = Annotated[
-    int | None, typer.Option(min=1, max=256, help="Processes of the local engine. [one for each core]")
-]
-Fresh = Annotated[bool, typer.Option("--fresh", help="Run all jobs anew, also those whose record is stored.")]
-
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 

@@ -38,19 +38,21 @@ from agents.learning_env import ForLearning
 from agents.run import Run, expected_bytes, load_checkpoint, recipe_of, save_checkpoint
 from agents.team_credit import CaringBuffer
 from agents.training_state import capture, restore, surroundings
-from flockenv.cli.terminal import DIVERGED, handle_interrupt, run_program, show_progress
+from flockenv.cli.jobs import EngineName, Fresh, Processes
+from flockenv.cli.terminal import DIVERGED, handle_interrupt, job_bar, run_program, show_progress
 from flockenv.core import signals
 from flockenv.core.address_space import IN_USE, TRAINING, require_room
 from flockenv.core.output_paths import check_room, valid_file, valid_path
 from flockenv.envs.sb3 import WorldVecEnv
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.jit.thread_pool import threads, use_threads
+from flockenv.jobs import Engine, Store, Work, engine_of, run_jobs
 from flockenv.players import WEIGHTS
 from flockenv.players.policy import MlpPolicy, describe, save_policy
 from flockenv.players.rules import player
 from flockenv.tasks import TASKS, Task
 
-__all__ = ["app", "build", "export", "score", "tensors_of", "train", "use_thread_count"]
+__all__ = ["app", "build", "card_of", "export", "score", "tensors_of", "train", "use_thread_count"]
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 console = Console(stderr=True)
@@ -313,10 +315,10 @@ def _name_divergence(model: PPO) -> Iterator[None]:
         raise
 
 
-def export(run: Run, path: Path) -> None:
-    """Write the best policy with its recipe, from which it can be reproduced."""
+def card_of(run: Run) -> dict[str, Any]:
+    """Return the card of the best policy: its recipe, from which it can be reproduced, and how it was trained."""
     recipe = run.recipe
-    card = {
+    return {
         **describe(TASKS[recipe["task"]](**recipe["arguments"])),
         **({"rules": recipe["rules"]} if "rules" in recipe else {}),
         "activation": recipe["ppo"]["activation"],
@@ -331,7 +333,11 @@ def export(run: Run, path: Path) -> None:
         "versions": run.surroundings,
         **({"resumed": run.resumed} if run.resumed else {}),
     }
-    save_policy(path, run.tensors, card)
+
+
+def export(run: Run, path: Path) -> None:
+    """Write the best policy with its card."""
+    save_policy(path, run.tensors, card_of(run))
 
 
 @app.command()
@@ -343,6 +349,13 @@ def main(
     tensorboard: Annotated[str | None, typer.Option(help="folder of TensorBoard logs")] = None,
     steps: Annotated[int | None, typer.Option(help="total agent-steps, instead of those of the config")] = None,
     seed: Annotated[int | None, typer.Option(help="training seed, instead of that of the config")] = None,
+    seeds: Annotated[
+        str | None,
+        typer.Option(help="several training seeds as jobs, 0-9 or 0,3; --out is then a folder [results/ppo]"),
+    ] = None,
+    engine: EngineName = "local",
+    processes: Processes = None,
+    fresh: Fresh = False,
 ) -> None:
     """Train a policy with PPO and export its weights."""
     with one_line_errors():
@@ -350,6 +363,9 @@ def main(
         changes = {k: v for k, v in (("steps", steps), ("seed", seed)) if v is not None}
         experiment = experiment.model_copy(update={"ppo": PpoSettings(**{**experiment.ppo.model_dump(), **changes})})
         name = experiment.build().name
+        if seeds is not None:
+            _train_seeds(experiment, seeds, out or Path("results/ppo"), runs, engine_of(engine, processes), fresh)
+            return
         target = WEIGHTS / f"{name}.safetensors" if out is None else valid_file(str(out), (".safetensors",), True)
         folder = valid_path(str(runs / name), "--runs")
         _check_outputs(experiment, target, folder, tensorboard)
@@ -367,6 +383,25 @@ def main(
         export(run, target)
     best = f"mean return {run.best:.3f} on the tuning worlds"
     console.print(f"{target}: {best} after {run.steps:,} steps, {run.wall:.0f} s")
+
+
+def _train_seeds(experiment: Experiment, text: str, out: Path, runs: Path, engine: Engine, fresh: bool) -> None:
+    """Train with several seeds as jobs, and write the policy of each."""
+    from agents.training_job import policy_of_bytes, seeds_of, training_job, with_seed
+
+    folder, checkpoints = valid_path(str(out)), valid_path(str(runs), "--runs")
+    jobs = [training_job(with_seed(experiment, seed), checkpoints, not fresh) for seed in seeds_of(text)]
+    store = Store(folder / "jobs")
+    with (
+        handle_interrupt("interrupted; what was trained is stored, and the same command goes on"),
+        job_bar() as progress,
+    ):
+        run_jobs(jobs, Work(store, engine, fresh, progress))
+    for job in jobs:
+        tensors, card = store.read(job, policy_of_bytes)
+        path = folder / f"{job.name.removeprefix('ppo/').replace('/', '-')}.safetensors"
+        save_policy(path, tensors, card)
+        console.print(f"{path}: mean return {card['tuning_mean']:.3f} on the tuning worlds", soft_wrap=True)
 
 
 def _check_outputs(experiment: Experiment, target: Path, folder: Path, tensorboard: str | None) -> None:

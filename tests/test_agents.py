@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from safetensors.numpy import load_file
 from stable_baselines3.common.buffers import RolloutBuffer
 from typer.testing import CliRunner
 
@@ -23,10 +24,13 @@ from agents.imitate import imitate
 from agents.learning_env import ForLearning
 from agents.run import load_checkpoint, recipe_of
 from agents.team_credit import CaringBuffer
+from agents.training_job import seeds_of, with_seed
 from flockenv.envs.sb3 import WorldVecEnv
 from flockenv.envs.world import World
 from flockenv.evaluation import compare, rollout, worlds_for
 from flockenv.jit.thread_pool import threads
+from flockenv.jobs import Store, Work
+from flockenv.jobs.local_engine import LocalEngine
 from flockenv.players import WEIGHTS
 from flockenv.players.policy import MlpPolicy, RandomPolicy
 from flockenv.players.rules import RULES, Tuned, as_dict, load_tuned, player
@@ -115,12 +119,18 @@ def test_the_rules_use_the_parameters_that_the_search_found(tmp_path: Path, monk
     search = {"candidates": 4, "worlds": 2, "rounds": 2}
     config = tmp_path / "pursuit.yaml"
     config.write_text(yaml.safe_dump({"task": "pursuit", "search": search}), encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(tune, "TUNED", tmp_path / "tuned")
     monkeypatch.setattr("flockenv.players.rules.TUNED", tmp_path / "tuned")
     assert load_tuned("pursuit") == Tuned(), "no search yet"
-    result = CliRunner().invoke(tune.app, [str(config)])
+    result = CliRunner().invoke(tune.app, [str(config), "--processes", "2"])
     assert result.exit_code == 0, result.output
-    rules, found = tune.search(load_experiment(config))
+    reports: list[tuple[int, int]] = []
+    work = Work(
+        Store(tmp_path / "again"), LocalEngine(1), progress=lambda done, most, name: reports.append((done, most))
+    )
+    rules, found = tune.search(load_experiment(config), work)
+    assert reports == [(done, 8) for done in (0, 1, 2, 3, 4, 4, 5, 6, 7, 8)]
     assert load_tuned("pursuit") == Tuned(rules, found), "the search is reproducible"
     assert as_dict(player(TASKS["pursuit"]()).rules) == rules
     assert found["agent_steps"] > 0 and found["tuning_mean"] >= found["textbook_mean"]
@@ -176,6 +186,40 @@ def test_training_is_reproducible_and_exports_a_policy(tmp_path: Path, monkeypat
     policy = MlpPolicy.load(tmp_path / "p.safetensors", PURSUIT.build())
     assert policy.observation_size == PURSUIT.build().layout.size
     assert policy.card["recipe"]["ppo"] == PURSUIT.ppo.model_dump(mode="json")
+
+
+@pytest.mark.slow
+def test_trainings_with_several_seeds_are_jobs_with_the_same_policies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from agents import ppo
+
+    monkeypatch.chdir(tmp_path)
+    Path("tiny.yaml").write_text(yaml.safe_dump(PURSUIT.model_dump(mode="json", include={"task", "arguments", "ppo"})))
+    command = ["tiny.yaml", "--seeds", "3-4", "--processes", "2"]
+    result = CliRunner().invoke(ppo.app, command)
+    assert result.exit_code == 0, result.output
+    for seed in (3, 4):
+        alone = ppo.train(with_seed(PURSUIT, seed), tmp_path / f"alone-{seed}")
+        policy = MlpPolicy.load(tmp_path / f"results/ppo/pursuit-seed-{seed}.safetensors", PURSUIT.build())
+        assert policy.card["seed"] == seed
+        assert [point["mean"] for point in policy.card["curve"]] == [point["mean"] for point in alone.curve]
+        stored = load_file(tmp_path / f"results/ppo/pursuit-seed-{seed}.safetensors")
+        for name, tensor in alone.tensors.items():
+            np.testing.assert_array_equal(stored[name], tensor)
+    monkeypatch.setattr(ppo, "build", _fail)
+    assert CliRunner().invoke(ppo.app, command).exit_code == 0, "stored trainings are not repeated"
+
+
+@pytest.mark.parametrize(("text", "seeds"), [("0-3", [0, 1, 2, 3]), ("5, 2,5-6", [5, 2, 6]), ("7", [7])])
+def test_seeds_are_numbers_and_ranges(text: str, seeds: list[int]) -> None:
+    assert seeds_of(text) == seeds
+
+
+@pytest.mark.parametrize("text", ["", "a", "1-", "-1", "3-1", "0-1000", "1.5", "99999999999999999999"])
+def test_other_seeds_are_refused_in_one_line(text: str) -> None:
+    with pytest.raises(ValueError, match=r"^--seeds '.*': .* must be "):
+        seeds_of(text)
 
 
 def _fail(*_: object, **__: object) -> None:

@@ -13,7 +13,15 @@ from flockenv.cli.terminal import new_console, show_table
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = ["jobs"]
+__all__ = ["EngineName", "Fresh", "Processes", "jobs"]
+
+EngineName = Annotated[
+    str, typer.Option(help="local: processes of this machine; ray: a Ray cluster (RAY_ADDRESS), or a local Ray.")
+]
+Processes = Annotated[
+    int | None, typer.Option(min=1, max=256, help="Processes of the local engine. [one for each core]")
+]
+Fresh = Annotated[bool, typer.Option("--fresh", help="Run all jobs anew, also those whose record is stored.")]
 
 STATES = ("running", "failed", "waiting", "done")
 

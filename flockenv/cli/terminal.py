@@ -222,8 +222,8 @@ def progress_bar(title: str, total: int, unit: str, first: str = "compiling") ->
 
 
 @contextmanager
-def job_bar() -> Iterator[Callable[[int, int, str], None]]:
-    """Show one bar over all jobs on a terminal; otherwise write a line for each job that ends."""
+def job_bar(lines: bool = True) -> Iterator[Callable[[int, int, str], None]]:
+    """Show one bar over all jobs on a terminal; otherwise write a line for each job that ends, if `lines`."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -239,7 +239,7 @@ def job_bar() -> Iterator[Callable[[int, int, str], None]]:
         def update(done: int, most: int, name: str) -> None:
             left = clock.remaining(done, most)
             progress.update(bar, completed=done, total=most, description=name or "compiling and playing", left=left)
-            if name and not console.is_terminal:
+            if lines and name and not console.is_terminal:
                 console.print(f"{name}: done ({done} of {most})", highlight=False)
 
         yield update

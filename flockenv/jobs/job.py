@@ -14,8 +14,8 @@ from typing import Any
 
 __all__ = ["Failure", "Job", "code_digest", "execute"]
 
-PACKAGES = ("numpy", "numba", "scipy")
-"""Packages whose version results may depend on."""
+PACKAGES = ("numpy", "numba", "scipy", "torch", "stable-baselines3")
+"""Packages whose version results may depend on; those that are not installed count as well."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,9 @@ def execute(function: Callable[..., bytes], arguments: tuple[Any, ...], code: st
     code: the digest of the code that the job's key was made with; a process with other code refuses the job.
     """
     if code != code_digest():
-        return Failure("this process has another version of flockenv or of numpy, numba, scipy than the one that asked")
+        return Failure(
+            "this process has another version of flockenv, numpy, numba, scipy or torch than the one that asked"
+        )
     try:
         return function(*arguments)
     except (Exception, SystemExit) as error:

@@ -1,0 +1,59 @@
+"""A training as a job: the same experiment with other training seeds, on several processes or machines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from agents.experiment import Experiment
+from agents.ppo import card_of, train
+from agents.run import recipe_of
+from flockenv.core.errors import printable
+from flockenv.jobs import Job, records
+
+__all__ = ["policy_of_bytes", "seeds_of", "training_job", "with_seed"]
+
+MOST = 1000
+"""Number of training seeds: each has a block of worlds."""
+
+
+def seeds_of(text: str) -> list[int]:
+    """Return the seeds of "0-9" or "0,3,5-7"; raise ValueError, in one line, for anything else."""
+    found: list[int] = []
+    for part in text.split(","):
+        first, dash, last = part.strip().partition("-")
+        ends = (first, last if dash else first)
+        if not all(end.isascii() and end.isdigit() and int(end[:9]) < MOST for end in ends):
+            allowed = f"each must be a number from 0 to {MOST - 1} or a range of them, such as 0-9"
+            raise ValueError(f"--seeds {printable(text)}: {allowed}")
+        if int(ends[0]) > int(ends[1]):
+            raise ValueError(f"--seeds {printable(text)}: the first number of a range must be at most the last")
+        found += range(int(ends[0]), int(ends[1]) + 1)
+    return list(dict.fromkeys(found))
+
+
+def with_seed(experiment: Experiment, seed: int) -> Experiment:
+    """Return the experiment with another training seed."""
+    return experiment.model_copy(update={"ppo": experiment.ppo.model_copy(update={"seed": seed})})
+
+
+def training_job(experiment: Experiment, runs: Path, go_on: bool = True) -> Job:
+    """Return the job that trains an experiment; go_on: continue from the checkpoint that a killed process left.
+
+    The record is read by `policy_of_bytes`. The checkpoint is in `runs`, in a folder named after the task and seed.
+    """
+    name = f"{experiment.build().name}/seed-{experiment.ppo.seed}"
+    arguments = experiment.model_dump_json(), str(runs / name.replace("/", "-")), go_on
+    return Job(f"ppo/{name}", _train, arguments, recipe_of(experiment))
+
+
+def _train(experiment: str, folder: str, go_on: bool) -> bytes:
+    """Train to the end of the budget; return the best policy with its card as bytes."""
+    run = train(Experiment.model_validate_json(experiment), Path(folder), go_on)
+    return records.to_bytes({"tensors": dict(run.tensors), "card": card_of(run)})
+
+
+def policy_of_bytes(data: bytes) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the tensors and the card of a trained policy."""
+    found = records.from_bytes(data, ())
+    return found["tensors"], found["card"]
