@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from flockenv.studies.accuracy import Problem, Report, Results, measure, select_
 from flockenv.studies.accuracy.paths import Path as Way
 from flockenv.studies.accuracy.paths import count_unmatched, distances, reach
 from flockenv.studies.accuracy.plots import draw_precision
-from flockenv.studies.accuracy.reference import _convergence, find_reference, reference_by_own_steps
+from flockenv.studies.accuracy.reference import _convergence, _step_counts, find_reference, reference_by_own_steps
 from flockenv.studies.accuracy.table import errors, headlines
 
 BALL = """\
@@ -154,16 +155,63 @@ def test_paths_are_matched_by_identity_and_not_by_slot() -> None:
 
 def test_the_error_of_a_reference_is_estimated_by_richardson_extrapolation() -> None:
     for order in (1.0, 2.0, 4.0):
-        ends = [0.3 * 0.5 ** (order * k) for k in range(4)]  # of steps h, h/2, h/4, h/8
-        found, error = _convergence(ends[0] - ends[1], ends[1] - ends[2], 1e-15)
-        assert found == pytest.approx(order)
-        assert error >= ends[2]
+        ends = {ratio: 0.3 * (ratio / 8) ** order for ratio in (1.0, 2.0, 3.3, 3.9, 4.0)}
+        apart = {ratio: end - ends[1] for ratio, end in ends.items() if ratio > 1}
+        converges, error = _convergence(ends[4] - ends[2], apart, 1e-15)
+        assert converges.endswith(f"order {order:.1f}")
+        assert ends[1] <= error <= 15.001 * ends[1]
         if order == 1:
-            assert error == pytest.approx(ends[2])
-    assert _convergence(1e-3, 2e-3, 1e-12)[1] == 2e-3  # no convergence: the larger of the two
-    assert _convergence(1e-14, 3e-14, 1e-12) == (None, 3e-14)  # rounding
-    assert _convergence(0.0, 1e-3, 1e-12)[1] == 1e-3  # a jump in the finest run alone
-    assert _convergence(1e-3, 0.0, 1e-12) == (None, 1e-3)
+            assert error == pytest.approx(ends[1])
+
+
+@pytest.mark.parametrize(
+    ("before", "apart", "largest", "words"),
+    [
+        (1e-3, {2: 2e-3, 3.6: 1e-3, 4: 2e-3}, 2e-3, "jumps"),
+        (0.0, {2: 1e-3, 3.6: 0.0, 4: 1e-3}, 1e-3, "jumps"),  # a jump in the finest run alone
+        (1e-3, {2: 0.0, 3.6: 0.0, 4: 1e-3}, 1e-3, "jumps"),
+        (9.8e-4, {2: 9e-8, 3.6: 2e-4, 4: 9.8e-4}, 9.8e-4, "jumps"),  # order 13.4
+        (36e-8, {2: 9e-8, 3.6: 5e-4, 4: 45e-8}, 5e-4, "jumps"),  # order 2, which a further run does not confirm
+        (0.0, {2: 0.0, 3.6: 5e-4, 4: 0.0}, 5e-4, "jumps"),
+        (1e-14, {2: 3e-14, 3.6: 1e-14, 4: 2e-14}, 3e-14, "rounding"),
+        (0.0, {2: 0.0, 4: 0.0}, 0.0, "rounding"),
+    ],
+)
+def test_an_order_that_is_an_accident_is_not_believed(
+    before: float, apart: dict[float, float], largest: float, words: str
+) -> None:
+    converges, error = _convergence(before, apart, 1e-12)
+    assert converges.endswith(words)
+    assert error == 2 * largest
+
+
+def test_distances_that_pass_into_rounding_keep_their_order() -> None:
+    apart = {ratio: 3e-14 * (ratio**4 - 1) for ratio in (2, 3.3, 3.6, 4)}
+    converges, error = _convergence(3e-14 * (4**4 - 2**4), apart, 1e-12)
+    assert converges.endswith("order 2.8")
+    assert error == pytest.approx(1e-12)
+
+
+@pytest.mark.parametrize("many", [4, 8, 12, 48, 256, 1280])
+def test_steps_of_further_runs_end_at_other_times(many: int) -> None:
+    counts = _step_counts(16 * many, 16)
+    assert [16 * many / n for n in counts[:3]] == [1, 2, 4]
+    assert all(n % 16 == 0 and 1 < 16 * many / n < 4 for n in counts[3:])
+    assert all(math.gcd(n // 16, many) == 1 for n in counts[3:])
+    assert len(set(counts)) == len(counts) == (4 if many == 4 else 6)
+
+
+@pytest.mark.parametrize("response", ["earliest", "back_up", "impulses", "project"])
+def test_the_error_of_a_reference_with_impacts_is_not_understated(response: str) -> None:
+    """The response `impulses` delays an impact to the end of a step, which often is the same one in half the steps."""
+    for height, e in itertools.product((0.8, 1.0, 1.3, 1.68, 1.94), (0.5, 0.69, 0.8)):
+        text = BALL.replace("low: [0, 1], high: [0, 1]", f"low: [0, {height}], high: [0, {height}]")
+        problem = of(text.replace("restitution: 0.8", f"restitution: {e}, response: {response}"), 1.0, (20, 40))
+        found = find_reference(problem)
+        exact = [0.1 + bounced(t, height - 0.1, e) for t in problem.times]
+        off = np.abs(found.path.pos[:, 0, 1] - exact).max()
+        assert off <= found.error, (height, e, found.note)
+        assert found.error < (3e-2 if response == "impulses" else 1e-11)
 
 
 # --- refusals ---------------------------------------------------------------------------------------------------------

@@ -3,7 +3,9 @@
 In this order: a closed form, if the problem has one; scipy's DOP853 on the scene's laws, if nothing acts between
 its steps; else the scene's own steps, with its constraints, births and deaths, much finer than any that is measured,
 with impacts found in the order of time (`response: earliest`). The error of own steps is estimated by Richardson
-extrapolation: three runs, each in twice as many steps as the one before, give the order of convergence to a limit.
+extrapolation: three runs, each in twice as many steps as the one before, give the order of convergence to a limit. Most
+of their steps end together, so what happens at the ends of steps (impacts, births) may be late by the same time in all
+three. Three further runs, whose steps end at other times, confirm the order or show that it is an accident.
 Source: Roache 1998, Verification and Validation in Computational Science and Engineering, ch. 5 (grid convergence).
 """
 
@@ -11,6 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,8 +41,17 @@ COARSE = 0.1
 ROUNDING, ROUNDING_STEP = 1e-12, 1e-16
 """m, or share of the distance that agents move: smaller differences of runs, in all or per step, are rounding."""
 
-SETTLED = 0.5
-"""Least order at which three runs are taken to converge to a limit."""
+SETTLED, HIGHEST = 0.5, RK4.order + 0.5
+"""Least and highest order at which runs are taken to converge to a limit; a higher one than the method's is chance."""
+
+TOLERANCE = 0.2
+"""Largest deviation of a distance between two runs from the one that the order predicts, as a share of the distance."""
+
+FURTHER = (3.303, 3.618, 3.9)
+"""About how much longer the steps of the further runs are: less than 4, as runs are stable in steps 4 times as long."""
+
+MARGIN = 2.0
+"""Error of a reference without an order, as a multiple of its largest distance from another run."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,17 +93,18 @@ def reference_by_own_steps(problem: Problem, finer: int | None = None, reason: s
         affordable_ratio(problem) if finer is None else finer, LEAST_FINER * problem.stability_divisor(RK4(), FINER)
     )
     steps = problem.steps[-1] * many
+    counts = _step_counts(steps, len(problem.times))
     try:
-        runs = [fine.path(RK4(), steps // k) for k in (4, 2, 1)]
+        path, *coarser = (fine.path(RK4(), n) for n in counts)
     except FloatingPointError as fault:
         raise ValueError(f"no reference: {reason}; and in steps of its own: {fault}") from None
-    off = [problem.distances(finer_one, coarser) for coarser, finer_one in itertools.pairwise(runs)]
-    path, gone = runs[-1], _reach(problem, runs[-1])
-    before, last = (largest_distance(each) for each in off)
-    order, error = _convergence(before, last, max(ROUNDING, ROUNDING_STEP * steps) * max(1.0, gone))
-    _refuse_no_limit(problem, steps, off[1], error, gone)
+    off, gone = [problem.distances(path, each) for each in coarser], _reach(problem, path)
+    before = largest_distance(problem.distances(*coarser[:2]))
+    apart = {steps / n: largest_distance(each) for n, each in zip(counts[1:], off, strict=True)}
+    converges, error = _convergence(before, apart, max(ROUNDING, ROUNDING_STEP * steps) * max(1.0, gone))
+    _refuse_no_limit(problem, steps, np.fmax.reduce(off), error, gone)
     exactly = any(isinstance(each, Collisions) and each.response == "earliest" for each in fine.scene.constraints)
-    found = [reason, f"RK4 in {steps:,} steps, dt/{many} of the finest", _convergence_note(order, last)]
+    found = [reason, f"RK4 in {steps:,} steps, dt/{many} of the finest", converges]
     found += ["impacts in the order of time"] if exactly else []
     note = "; ".join(each for each in found + _deviation_notes(path) if each)
     return Reference("event-exact steps" if exactly else "own steps", path, error, gone, note)
@@ -115,24 +128,37 @@ def affordable_ratio(problem: Problem) -> int:
     return finer
 
 
-def _convergence(before: float, last: float, rounding: float) -> tuple[float | None, float]:
-    """Return the order of convergence of three runs, and the error of the finest, m, from their differences.
+def _step_counts(steps: int, instants: int) -> list[int]:
+    """Return the numbers of steps of all runs: `steps`, a half and a quarter of it, then those of the further runs.
 
-    Richardson: with order q the error of the finest is last / (2^q - 1). Orders above 1 are not relied upon, as forces
-    may jump and bodies may hit; without an order the larger difference is returned.
+    Each is a multiple of the number of instants. Between two instants, no step of a further run ends with one of the
+    finest run. There are fewer than three further runs if steps are few.
     """
-    if not last > rounding:
-        return None, max(before, last)
+    many, further = steps // instants, list[int]()
+    for ratio in FURTHER:
+        free = (n for n in range(math.ceil(many / ratio), many) if math.gcd(n, many) == 1 and n not in further)
+        further += itertools.islice(free, 1)
+    return [steps, steps // 2, steps // 4, *(n * instants for n in further)]
+
+
+def _convergence(before: float, apart: Mapping[float, float], rounding: float) -> tuple[str, float]:
+    """Return how runs converge, in words, and the error of the finest, m.
+
+    before: distance between the runs in steps 4 and 2 times as long, m. apart: distances of the finest run from each
+    other one, m, by the ratio of their steps. Richardson: with order q the error of the finest is apart[2] / (2^q - 1).
+    Orders above 1 are not relied upon, as forces may jump and bodies may hit. Without an order that all runs confirm,
+    and if only rounding is left, the error is MARGIN times the largest distance.
+    """
+    last, largest = max(apart[2], rounding), float(np.max([before, *apart.values()]))
+    if not largest > rounding:
+        return f"{largest:.1e} m from coarser runs, which is rounding", MARGIN * largest
     order = math.log2(max(before, rounding) / last)
-    return order, last / (2 ** min(order, 1.0) - 1) if order >= SETTLED else max(before, last)
-
-
-def _convergence_note(order: float | None, last: float) -> str:
-    """Return a note on the convergence of a reference."""
-    if order is None:
-        return f"{last:.1e} m from half as many, which is rounding"
-    settles = f"order {order:.1f}" if order >= SETTLED else f"no order ({order:.1f}): a path that jumps"
-    return f"{last:.1e} m from half as many, {settles}"
+    if SETTLED <= order <= HIGHEST and all(
+        abs(distance - last * (ratio**order - 1) / (2**order - 1)) <= TOLERANCE * distance + rounding
+        for ratio, distance in apart.items()
+    ):
+        return f"{apart[2]:.1e} m from half as many, order {order:.1f}", last / (2 ** min(order, 1.0) - 1)
+    return f"{largest:.1e} m from coarser runs, no order: a path that jumps", MARGIN * largest
 
 
 def _refuse_no_limit(problem: Problem, steps: int, off: Floats, error: float, gone: float) -> None:
@@ -145,7 +171,7 @@ def _refuse_no_limit(problem: Problem, steps: int, off: Floats, error: float, go
     kept = problem.times[by_instant <= 1e-2 * gone]
     advice = f"try --seconds {kept[-1]:.3g}" if len(kept) else "try a shorter horizon, or shorter steps"
     raise ValueError(
-        f"no reference over {problem.seconds:g} s: RK4 in {steps:,} steps and in half as many end "
+        f"no reference over {problem.seconds:g} s: RK4 in {steps:,} steps and in fewer end up to "
         f"{by_instant[-1]:.1e} m apart, of {gone:.1e} m that the farthest agent goes (a jump occurs on one path and "
         f"not on the other, and what follows differs); {advice}"
     )
