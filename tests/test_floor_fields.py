@@ -148,6 +148,16 @@ def test_one_reachable_door_is_enough_but_every_stage_of_a_journey_is_needed() -
         cut_off(Journey(stages=stages)).start(0, 10)
 
 
+def test_an_agent_without_a_path_to_a_later_stage_walks_to_the_stage_before_it() -> None:
+    scene = cut_off(Journey(stages=(Stage(at=(2, 3), radius=0.3), Stage(at=(9, 3), radius=0.3))), count=2, dt=0.01)
+    with pytest.warns(NoWayWarning, match="they stand still once they head for a place without a way"):
+        state = scene.start(0)
+    first = scene.run(state.with_motion([[[1.0, 1.0], [2.0, 5.0]]], np.zeros((1, 2, 2))), 2000)
+    assert (np.linalg.norm(first.pos[0] - (2, 3), axis=1) < 0.5).all()
+    later = scene.run(first, 500)
+    np.testing.assert_allclose(later.pos, first.pos, atol=1e-6)
+
+
 def test_emitters_and_spawns_without_a_path_are_refused() -> None:
     born = (Emitter(group=0, place=Point(at=(1.5, 3.0)), rate=1.0),)
     with pytest.raises(ValueError, match=r"targets\[0\] = \(9.0, 3.0\): no way leads there from population\[0\]"):

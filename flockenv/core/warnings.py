@@ -34,7 +34,7 @@ class UnsolvedContactsWarning(RuntimeWarning):
 
 
 class NoWayWarning(UserWarning):
-    """Agents start at positions from which no path leads to their target."""
+    """Agents start at positions from which no path leads to their target, or to a later stage of their journey."""
 
 
 class OtherTaskWarning(UserWarning):

@@ -107,7 +107,7 @@ def warn_cut_off(name: str, lost: NDArray[np.bool_], state: Any) -> None:
         place = ", ".join(f"{x:.3g}" for x in state.pos[world, agent])
         warnings.warn(
             f"{name}: no way leads there from where {lost.sum()} of {state.alive.sum()} agents begin (the first: agent "
-            f"{agent} of world {world} at ({place}) m); they stay where they are",
+            f"{agent} of world {world} at ({place}) m); they stand still once they head for a place without a way",
             NoWayWarning, 2,
         )  # fmt: skip
 
