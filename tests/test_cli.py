@@ -25,6 +25,7 @@ import flockenv.studies.stress
 from flockenv.cli import terminal
 from flockenv.cli.main import app, main
 from flockenv.model.networks import Rope
+from flockenv.model.state import State
 from flockenv.physics.effects import EFFECTS
 from flockenv.physics.effects.springs import Springs
 from flockenv.physics.integrators import INTEGRATORS, ImplicitEuler, Integrator
@@ -32,6 +33,7 @@ from flockenv.players.policy import Policy, RandomPolicy
 from flockenv.scene import Group, Scene
 from flockenv.scene.stability import suggest_dt
 from flockenv.scene.yaml_io import load_scene, schema
+from flockenv.studies import cost_breakdown
 from flockenv.studies.cost_breakdown import Cost, Explanation
 from flockenv.studies.stress import Case, Value
 from flockenv.tasks import TASKS
@@ -449,7 +451,7 @@ def test_zip_is_loaded_as_a_player_only_if_trusted(
 
 # --- explain ----------------------------------------------------------------------------------------------------------
 
-COST = r"-?[\d.e+-]+ \[-?[\d.e+-]+, -?[\d.e+-]+\]( level)? *"
+COST = r"-?[\d.e+-]+ \[-?[\d.e+-]+, -?[\d.e+-]+\]( level| not measurable)? *"
 """Pattern of a measured difference of times with its interval."""
 
 
@@ -460,6 +462,42 @@ def test_cost_is_a_median_with_an_interval_and_level_if_that_contains_zero() -> 
     disturbed = np.arange(1.0, 16.0)
     disturbed[-1] = 1e6  # another process slowed one round
     assert Cost.of(disturbed) == clear
+
+
+@pytest.mark.parametrize(
+    ("without_drag", "cost", "note"),
+    [
+        (9.0, "1 [1, 1]", ""),
+        (10.0, "0 [0, 0] level", "level: the interval contains 0."),
+        (10.3, "-0.3 [-0.3, -0.3] not measurable", "not measurable: the step took longer without the effect. Each"),
+    ],
+)
+def test_explain_remarks_on_a_cost_that_is_not_above_zero(
+    without_drag: float,
+    cost: str,
+    note: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Where the compiler puts code may make a step with one effect more the faster one, in every round."""
+    taken = {2: 10.0, 1: without_drag, 0: 5.0}  # us per step, by number of effects
+
+    class Timer:
+        def __init__(self, scene: Scene, state: State) -> None:
+            kinds = [effect.kind for effect in scene.effects]
+            self._us = 7.0 if kinds == ["drag"] else taken[len(kinds)]
+
+        def measure(self) -> float:
+            return self._us
+
+    monkeypatch.setattr(cost_breakdown, "_Timer", Timer)
+    Path("two.yaml").write_text(TINY.replace("[{kind: drag", "[{kind: gravity}, {kind: drag"))
+    assert main(["explain", "two.yaml"]) == 0
+    out = capsys.readouterr().out
+    assert re.search(rf"^drag\(rate=0.5\) +nothing +{re.escape(cost)} *$", out, re.MULTILINE)
+    assert "An interval covers the rounds of this process" in out
+    assert note in out
+    assert [word in out for word in ("level: ", "not measurable: ")] == [note[:1] == "l", note[:1] == "n"]
 
 
 @pytest.mark.slow

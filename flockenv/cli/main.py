@@ -282,6 +282,8 @@ def explain(scene: SceneFile) -> None:
     rows.append((breakdown.remaining_parts, "", f"{breakdown.rest:.3g}"))
     title = f"One step of {loaded.agents:,} agents: {breakdown.step:.3g} us"
     show_table(console, title, rows, ("effect", "calls for", "costs us/step [95 % interval]"))
+    for note in breakdown.notes:
+        console.print(note)
     counts = (f"{number:g} {name.replace('_', ' ')}" for name, number in breakdown.work.items())
     console.print(f"Per step: {', '.join(counts)}")
     console.print(f"Largest stable step: {breakdown.largest_step}")

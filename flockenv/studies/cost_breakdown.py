@@ -24,6 +24,14 @@ INSTANTS, BETWEEN = 20, 10  # at which shares are measured, and the steps betwee
 TIMED = 0.01  # s per measurement: long against the clock, short against a change of the processor's speed
 
 
+ONE_PROCESS = "An interval covers the rounds of this process; in another one a cost may differ by more."
+REMARKS = {
+    "level": "level: the interval contains 0.",
+    "not measurable": "not measurable: the step took longer without the effect. Each variant of a step is compiled by "
+    "itself, and where the compiler puts its code changes its time by more than the effect costs.",
+}
+
+
 class Cost(NamedTuple):
     """A difference of measured times, us per step: the median over rounds and its 95 % interval."""
 
@@ -39,9 +47,15 @@ class Cost(NamedTuple):
         interval = quantile_test(differences, p=0.5).confidence_interval(0.95)
         return cls(float(np.median(differences)), float(interval.low), float(interval.high))
 
+    @property
+    def remark(self) -> str:
+        """A key of REMARKS if the time is not above 0 in nearly all rounds, else ""."""
+        if self.low > 0:
+            return ""
+        return "level" if self.high >= 0 else "not measurable"
+
     def __str__(self) -> str:
-        level = " level" if self.low <= 0 <= self.high else ""
-        return f"{self.median:.3g} [{self.low:.3g}, {self.high:.3g}]{level}"
+        return f"{self.median:.3g} [{self.low:.3g}, {self.high:.3g}] {self.remark}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -75,6 +89,12 @@ class Explanation:
     shares: tuple[tuple[str, str, float], ...] = ()  # of each Steer's behaviours: which, and the mean share granted
 
     @property
+    def notes(self) -> list[str]:
+        """What the intervals cover, and the meaning of the remarks on them, one sentence or two each."""
+        remarks = {cost.remark for cost in (*(row.cost for row in self.rows), self.shared)}
+        return [ONE_PROCESS, *(text for remark, text in REMARKS.items() if remark in remarks)]
+
+    @property
     def remaining_parts(self) -> str:
         """Parts of a step that remain without any effect, in words."""
         scene = self.scene
@@ -100,8 +120,9 @@ def explain(
     """Measure the cost of each effect, from a state on (default: the start with seed 0), leaving out one at a time.
 
     All variants are timed in turn, ROUNDS times. A cost is the median over the rounds of the difference within a round,
-    with its 95 % interval: a disturbance that lasts affects both variants. `progress` is called with the number of
-    variants that are ready; each may have to be compiled.
+    with its 95 % interval: a disturbance that lasts affects both variants. The interval does not cover differences
+    between processes, nor the place of compiled code in memory: a cost may be below 0. `progress` is called with the
+    number of variants that are ready; each may have to be compiled.
     """
     state = scene.start(0) if state is None else state
     effects = scene.effects
