@@ -2,10 +2,10 @@
 
 Each run is a process group of its own in an empty folder, with a kernel cache that is warm or empty. It gets SIGINT (a
 tenth SIGTERM) at a random moment: the whole group, as from a terminal, or the command alone; a tenth get it twice. What
-is counted must be 0: tracebacks, other words than the one line, wrong exit codes, processes that are still there 5 s
-later, temporary files and files that cannot be read. Runs in which SIGTERM was neither blocked nor handled when the
-signal was sent, by /proc/PID/status, are counted apart, with how they ended: Python was starting, and had not run the
-first statements of flockenv. POSIX with /proc (Linux).
+is counted must be 0: tracebacks, other words than the one line and the announcements before it, wrong exit codes,
+processes that are still there 5 s later, temporary files and files that cannot be read. Runs in which SIGTERM was
+neither blocked nor handled when the signal was sent, by /proc/PID/status, are counted apart, with how they ended:
+Python was starting, and had not run the first statements of flockenv. POSIX with /proc (Linux).
 """
 
 from __future__ import annotations
@@ -58,6 +58,9 @@ ALLOWED = re.compile(
     r".*\(.* so far.*\)|\s*[\d,]+ steps .*|\s*"
 )
 """Lines of stderr that are not complained of: the one line, warnings, and news of how far a command is."""
+
+REST = re.compile(r"\w+: (interrupted|terminated).*; .*, Ctrl-C again ends it")
+"""An announcement of what a command still does after a signal; the one line follows at its end."""
 
 LEFT = re.compile(r".*(\.part|\.tmp.*)$|\.partial-.*|tmp\w{8}|.*\.pyc\.\d+$")
 
@@ -159,7 +162,8 @@ def _faults_of(stderr: str) -> Iterator[str]:
         yield "traceback"
     elif any(not ALLOWED.fullmatch(line) for line in stderr.splitlines()):
         yield "words"
-    ends = [line for line in stderr.splitlines() if re.match(r"(\w+: )?(interrupted|terminated)", line)]
+    lines = [line for line in stderr.splitlines() if not REST.fullmatch(line)]
+    ends = [line for line in lines if re.match(r"(\w+: )?(interrupted|terminated)", line)]
     if len(ends) != 1:
         yield f"{len(ends)} lines"
 

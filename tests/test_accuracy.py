@@ -495,9 +495,12 @@ def test_ctrl_c_on_the_command_line_keeps_the_finished_problems(
     command = ["accuracy", "--suite", "--problems", "damped,oscillator", "--methods", "rk4", "--repetitions", "0"]
     assert main([*command, "--out", "a.json"]) == 130
     text = capsys.readouterr()
-    assert "Damped oscillator" in text.out and "interrupted" in text.err
+    last = "flockenv: interrupted; results so far are shown\n"
+    assert "Damped oscillator" in text.out and text.err == last
     (report,) = Results.model_validate_json(Path("a.json").read_text()).reports
     assert report.name == "damped"
+    assert main([*command, "--out", "b.png"]) == 130
+    assert capsys.readouterr().err == f"flockenv: interrupted; drawing b.png, Ctrl-C again ends it\n{last}"
 
 
 def test_ctrl_c_before_the_first_run_ends_writes_one_line_and_no_file(

@@ -287,7 +287,9 @@ sys.exit(main.main())
 def test_interrupted_run_writes_its_steps_and_exits_with_130(tmp_path: Path) -> None:
     done = interrupted("simulating", "run", "tiny.yaml", "--duration", "1e6", "--every", "1000", "--out", "t.npz")
     assert done.returncode == 130, done.stderr
-    assert re.fullmatch(r"flockenv: interrupted; results until \S+ s are shown\n", done.stderr)
+    first, last = done.stderr.splitlines()
+    assert re.fullmatch(r"flockenv: interrupted; measuring the state at \S+ s, Ctrl-C again ends it", first)
+    assert re.fullmatch(r"flockenv: interrupted; results until \S+ s are shown", last)
     summary = json.loads(Path("t.json").read_text())
     assert summary["stopped"] == "interrupted"
     assert 0 < summary["steps"] < 1e8
@@ -610,8 +612,11 @@ def test_interrupted_stress_writes_its_findings(
 
     first = flockenv.studies.stress.CASES[0]
     monkeypatch.setattr("flockenv.studies.stress.CASES", (first, Case("X03", "stopped", "none", interrupted)))
+    last = "flockenv: interrupted; results so far are shown, the same command continues\n"
     assert main(["stress", "--methods", "rk4", "--out", "hard.json"]) == 130
-    assert "interrupted; results so far are shown, the same command continues" in capsys.readouterr().err
+    assert capsys.readouterr().err == last
+    assert main(["stress", "--methods", "rk4", "--out", "hard.png"]) == 130
+    assert capsys.readouterr().err == f"flockenv: interrupted; drawing hard.png, Ctrl-C again ends it\n{last}"
     assert [f["case"] for f in json.loads(Path("hard.json").read_text())["findings"]] == ["X01"]
 
 

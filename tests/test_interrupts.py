@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import interrupts
 from flockenv.core import signals
 from flockenv.core.signals import ONE_PRESS
 from flockenv.jobs import Failure, Job
@@ -210,6 +211,30 @@ def test_a_command_under_nohup_ignores_a_closed_terminal(tmp_path: Path) -> None
     wait_for(process, "ready")
     process.send_signal(signal.SIGHUP)
     assert process.communicate(timeout=60)[1] == "" and process.returncode == 0
+
+
+def test_a_signal_during_a_simulation_is_announced_before_it_is_measured(tmp_path: Path) -> None:
+    """SIGTERM is announced by its own word, and the benchmark of interrupts does not count the line as a fault."""
+    (tmp_path / "x.yaml").write_text(SCENE)
+    command = [
+        str(Path(sys.executable).with_name("flockenv")),
+        "measure",
+        "x.yaml",
+        "--time",
+        "1e6",
+        "--every",
+        "1e4",
+    ]
+    process = start(*command, folder=tmp_path)
+    assert process.stderr is not None
+    assert any(line.startswith("simulating") for line in process.stderr)
+    process.send_signal(signal.SIGTERM)
+    out, message = process.communicate(timeout=60)
+    first, last = message.splitlines()
+    assert re.fullmatch(r"flockenv: terminated; measuring the first \S+ s, Ctrl-C again ends it", first)
+    assert last == "flockenv: terminated; results until then are shown"
+    assert process.returncode == 143 and "nearest neighbour" in out
+    assert not list(interrupts._faults_of(message))
 
 
 def test_importing_flockenv_does_not_change_signal_handlers() -> None:

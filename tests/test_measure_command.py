@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,10 @@ from PIL import Image
 import flockenv.studies.measured_run
 import flockenv.studies.trajectory
 from flockenv.cli.main import main
+from flockenv.scene import Scene
 from flockenv.scene.yaml_io import load_scene
-from flockenv.studies.measured_run import UNITS, Scope, survey
-from flockenv.studies.trajectory import record
+from flockenv.studies.measured_run import UNITS, Scope, Survey, survey
+from flockenv.studies.trajectory import Trajectory, record
 
 STREAMS = """\
 space: {kind: torus, size: [10, 4]}
@@ -33,6 +35,8 @@ groups: [{count: 30, radius: 0, spawn: {low: [0, 0], high: [4, 4], speed: [1, 1]
 dt: 0.05
 """
 """Thirty agents that move to the right, in a plane."""
+
+INTERRUPTED = "flockenv: interrupted; {}, Ctrl-C again ends it\nflockenv: interrupted; results until then are shown\n"
 
 LINE = ["--line", "5,0,5,4"]
 
@@ -159,12 +163,40 @@ def test_after_an_interrupt_the_results_until_then_are_shown(
     command = ["measure", "streams.yaml", "--time", "2", "--seeds", "3", "--json", "x.json", "--out", "p", *LINE]
     assert main(command) == 130
     captured = capsys.readouterr()
-    assert "interrupted; results until then are shown" in captured.err
+    assert captured.err == INTERRUPTED.format("showing what was measured")
     assert "density times speed" in captured.out
     assert "nearest neighbour" not in captured.out
     found = numbers()
     assert (found["stopped"], found["seeds"]) == ("interrupted", [0])
     assert (Path("p") / "lanes.png").exists()
+
+
+@pytest.mark.parametrize("seeds", ["1", "3"])
+def test_an_interrupted_simulation_is_announced_before_it_is_measured(
+    seeds: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Measuring takes up to 20 s: nobody should have to guess whether Ctrl-C was noticed."""
+    told = []
+
+    def late(scene: Scene, seed: int, steps: int, every: int, progress: Callable[[int], None]) -> Trajectory:
+        def show(done: int) -> None:
+            if seed == int(seeds) - 1 and done >= 20:
+                raise KeyboardInterrupt
+
+        return record(scene, seed, steps, every, show)
+
+    def measured(*given: Any) -> Survey:
+        told.append(capsys.readouterr().err)
+        return survey(*given)
+
+    monkeypatch.setattr(flockenv.studies.trajectory, "PATIENCE", 80)  # a step of 80 agents
+    monkeypatch.setattr(flockenv.studies.trajectory, "record", late)
+    monkeypatch.setattr(flockenv.studies.measured_run, "survey", measured)
+    assert main(["measure", "streams.yaml", "--time", "2", "--seeds", seeds]) == 130
+    told.append(capsys.readouterr().err)
+    assert told[:-2] == [""] * (int(seeds) - 1)
+    assert told[-2] + told[-1] == INTERRUPTED.format("measuring the first 1 s")
+    assert told[-1].startswith("flockenv: interrupted; results")
 
 
 def test_an_interrupt_before_the_first_picture_leaves_no_folder(monkeypatch: pytest.MonkeyPatch) -> None:

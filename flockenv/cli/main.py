@@ -33,6 +33,7 @@ from flockenv.cli.terminal import (
     EarlyEnd,
     Force,
     Seed,
+    announce_rest,
     describe_error,
     flush_output,
     name_stdout_errors,
@@ -207,6 +208,8 @@ def run(
     usual = max(1, round(RECORDED_EVERY / loaded.dt))
     stride = usual if every is None else whole_steps("--every", every, loaded.dt, 1)
     trajectory = _record(loaded, seed, steps, stride if path is not None else max(1, steps))
+    if trajectory.stopped == "interrupted":
+        announce_rest(f"measuring the state at {trajectory.last.time[0]:.3g} s")
     console = new_console()
     _show_measures(console, trajectory)
     if path is not None:

@@ -17,6 +17,7 @@ from flockenv.cli.terminal import (
     EarlyEnd,
     Force,
     Seed,
+    announce_rest,
     new_console,
     progress_bar,
     relative_path,
@@ -141,14 +142,19 @@ def _survey_seeds(
             title = f"simulating {k + 1}/{seeds}" if seeds > 1 else "simulating"
             with progress_bar(title, steps, "steps") as progress:
                 run = record(scene, seed + k, steps, stride, progress)
+            if run.stopped == "interrupted":
+                announce_rest(f"measuring the first {run.last.time[0]:.3g} s")
             with progress_bar("measuring", 6, "families") as progress:
                 found.append(survey(run, scope, progress))
             first = first or run
+            if found[-1].stopped == "interrupted" and not run.stopped:
+                announce_rest("showing what was measured")
             if found[-1].stopped:
                 break
     except KeyboardInterrupt:
         if first is None:
             raise
+        announce_rest("showing what was measured")
     assert first is not None  # there is at least one seed
     return found, first
 

@@ -15,6 +15,7 @@ from flockenv.cli.terminal import (
     EarlyEnd,
     Force,
     Seed,
+    announce_rest,
     flush_output,
     new_console,
     progress_bar,
@@ -90,11 +91,14 @@ def accuracy(
 
     write = functools.partial(_write_reports, path)
     reports, refused = _measure_problems(todo, chosen, repetitions, finer, aimed, console, write)
+    stopped = len(reports) + refused < len(todo) or (reports and reports[-1].stopped)
     if path is not None and reports:
         if path.suffix.lower() == ".png":
+            if stopped:
+                announce_rest(f"drawing {relative_path(path)}")
             _draw_precision(reports, path)
         console.print(f"{len(reports)} problems in {relative_path(path)}")
-    if len(reports) + refused < len(todo) or (reports and reports[-1].stopped):
+    if stopped:
         raise EarlyEnd(INTERRUPTED_LATER, INTERRUPTED)
     if not reports:
         raise ValueError("accuracy: no problem has a reference; each line gives the reason")
@@ -270,6 +274,8 @@ def run_trials(what: str, count: int, path: Path | None, known: Results | None, 
     except KeyboardInterrupt:
         if found is None:
             raise
+        if path is not None and path.suffix.lower() != ".json":
+            announce_rest(f"drawing {relative_path(path)}")
         return found, True
 
 

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from rich.progress import Progress, Task
 
 __all__ = [
-    "BAD_INPUT", "DIVERGED", "INTERRUPTED", "OK", "EarlyEnd", "Force", "Seed", "describe_error", "duration_text",
-    "flush_output", "handle_interrupt", "job_bar", "name_stdout_errors", "new_console", "print_error", "printable",
-    "progress_bar", "relative_path", "report_errors", "run_program", "show_progress", "show_table",
+    "BAD_INPUT", "DIVERGED", "INTERRUPTED", "OK", "EarlyEnd", "Force", "Seed", "announce_rest", "describe_error",
+    "duration_text", "flush_output", "handle_interrupt", "job_bar", "name_stdout_errors", "new_console", "print_error",
+    "printable", "progress_bar", "relative_path", "report_errors", "run_program", "show_progress", "show_table",
 ]  # fmt: skip
 
 OK, DIVERGED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -48,6 +48,11 @@ def print_error(name: str, text: str) -> None:
     """Write lines to stderr, each prefixed by the name of the command."""
     for line in text.splitlines():
         print(f"{name}: {printable(line)}", file=sys.stderr)
+
+
+def announce_rest(doing: str) -> None:
+    """Write to stderr, at once, that a signal arrived and what the command still does before it ends."""
+    print(printable(signals.signal_line(f"interrupted; {doing}, Ctrl-C again ends it")), file=sys.stderr, flush=True)
 
 
 def describe_error(error: Exception) -> tuple[str, int]:

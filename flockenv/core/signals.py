@@ -35,6 +35,7 @@ __all__ = [
     "remove_at_end",
     "remove_unfinished",
     "set_message",
+    "signal_line",
     "take_message",
 ]
 
@@ -214,8 +215,12 @@ def take_message() -> str:
     if _Received.written:
         return ""
     _Received.written = True
-    number = _Received.signal or signal.SIGINT
-    word, text = SIGNALS[signal.Signals(number).name], _Received.text or SIGNALS["SIGINT"]
+    return signal_line(_Received.text or SIGNALS["SIGINT"])
+
+
+def signal_line(text: str) -> str:
+    """Return a line about the signal. A leading "interrupted" in `text` is replaced by the signal's own word."""
+    word = SIGNALS[signal.Signals(_Received.signal or signal.SIGINT).name]
     rest = text.removeprefix(SIGNALS["SIGINT"])
     return f"{_Received.name}: {text if rest == text else word + rest}"
 
