@@ -64,8 +64,8 @@ class KernelPlan(ObstacleSets):
     """The first agent of each group, and N: values only, code does not depend on them."""
     shapes: tuple[Any, ...] = field(default=(), compare=False)
     """Obstacles that are not in the state: code depends on their forms, and on whether any of them moves."""
-    circles: int = 0
-    """Number of obstacles that come before them: circles of the state."""
+    circles: tuple[Any, ...] = field(default=(), compare=False)
+    """Obstacles that come before them: circles of the state, at the places that they have when it is made."""
     stepped: bool = True
     """True if steps are made; else accelerations are computed, also of agents whose position is not finite."""
     touching: float = field(default=math.inf, compare=False)
@@ -208,10 +208,16 @@ class KernelPlan(ObstacleSets):
         """How many numbers the kernel is passed."""
         return len(self.parameters()) + sum(map(len, self.tables))
 
-    def packed_numbers(self) -> NDArray[Any]:
-        """Return `parameters()` and the tables behind them, in the scene's precision, as the kernel is passed them."""
+    def packed_numbers(self, in_place: bool = False) -> NDArray[Any]:
+        """Return `parameters()` and the tables behind them, in the scene's precision, as the kernel is passed them.
+
+        in_place: True if the circles of all worlds are where the scene has them, so that the grid over them holds.
+        """
         every: list[Any] = [self.parameters(), self.shape_table[0], *self.cells.values(), *self.tables]
-        return np.concatenate(every).astype(self.dtype)
+        numbers = np.concatenate(every).astype(self.dtype)
+        if self.number_plan.circles >= 0 and not in_place:
+            numbers[self.number_plan.circles + 2] = 0
+        return numbers
 
     def numbers_of(self, effect: Effect) -> dict[str, Any]:
         """Return the numbers and vectors that the laws of an effect are passed, by name."""

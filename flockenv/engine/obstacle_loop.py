@@ -4,8 +4,8 @@ The circles may differ from world to world; the other shapes are those that are 
 hollow. They are placed where they are at the time of the stage.
 
 If there are many shapes of a form, each agent looks up those that may lie within reach in a grid (shapes/cells.py), in
-the order in which they are listed. That is the order of a loop over all shapes, and a law ignores shapes out of reach:
-so results are the same bits.
+the order in which they are listed. So does it with circles, if those of the state are where the scene has them. That is
+the order of a loop over all shapes, and a law ignores shapes out of reach: so results are the same bits.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from flockenv.engine.obstacle_folds import update_by_circle, update_by_shape
 from flockenv.engine.obstacle_plan import Fold, Obstacles, Place, Shape
 from flockenv.engine.shape_rows import near_rows
 from flockenv.engine.silhouette import passing_side_of
+from flockenv.geometry.shapes.cells import CIRCLES
 from flockenv.geometry.shapes.edges import near_path
 from flockenv.geometry.shapes.row_header import outside_box, shift_of, velocity_of
 from flockenv.geometry.shapes.table import law_of
@@ -49,7 +50,8 @@ def obstacles_of(plan: Obstacles) -> Callable[..., None]:
         for j, form in enumerate(plan.around.forms)
     )
     edges = (_passing_sides(plan, fold) for fold in plan.folds if fold.ahead)
-    passes = call_in_turn(_starts(plan), _circles(plan), *forms, *edges)
+    circles = _circles_of(plan) if CIRCLES in plan.gridded_forms else _every_circle(plan)
+    passes = call_in_turn(_starts(plan), circles, *forms, *edges)
 
     def fold_obstacles(context: Any, pos: Any, vel: Any, time: Any, block: Any) -> None:
         base, row = block * size, block * wide
@@ -141,7 +143,21 @@ def _furthest(folds: tuple[Fold, ...]) -> Callable[..., float]:
 
 
 @section
-def _circles(plan: Obstacles) -> Callable[..., None]:
+def _circles_of(plan: Obstacles) -> Callable[..., None]:
+    """Make `circles(context, pos, vel, time, place)`: as `_every_circle`, by the grid if it holds for this state."""
+    every, listed = _every_circle(plan), _gridded_circles(plan)
+
+    def circles(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
+        if context.numbers.circles.cells > 0:
+            listed(context, pos, vel, time, place)
+        else:
+            every(context, pos, vel, time, place)
+
+    return circles
+
+
+@section
+def _every_circle(plan: Obstacles) -> Callable[..., None]:
     """Make `circles(context, pos, vel, time, place)`: update all folds of a block by every circle of the state."""
     width, agent, circle = plan.agent.width, _agent_of(plan.agent), vector_of(plan.agent.dimension)
     offset_to, update, world_of = plan.around.offset_to, update_by_circle(plan.folds), _world_of(plan)
@@ -158,6 +174,34 @@ def _circles(plan: Obstacles) -> Callable[..., None]:
                 for lane in range(np.uint64(width)):
                     me = agent(scratch, random_key, pos, vel, time, place, lane)
                     update(numbers, world, me, offset_to(numbers.size, me.pos, centre), rho, m, lanes, lane)
+
+    return circles
+
+
+@section
+def _gridded_circles(plan: Obstacles) -> Callable[..., None]:
+    """Make `circles(context, pos, vel, time, place)`: update each agent's folds by circles of the state, by a grid.
+
+    Only those that may lie within reach, in order.
+    """
+    width, agent, circle = plan.agent.width, _agent_of(plan.agent), vector_of(plan.agent.dimension)
+    offset_to, update, world_of = plan.around.offset_to, update_by_circle(plan.folds), _world_of(plan)
+    near, box = near_rows(offset_to, plan.agent.dimension), _box(plan.folds, plan.only_rays)
+    first, reach = plan.found, np.uint64(plan.reach)
+
+    def circles(context: Any, pos: Any, vel: Any, time: Any, place: Any) -> None:
+        scratch, numbers, b, world = context.scratch, context.numbers, context.b, world_of(context)
+        lanes, random_key, mine = scratch.lanes, context.key[b], numbers.circles
+        if place.row == 0:
+            context.work[b, 3] += context.n * mine.many
+        for lane in range(np.uint64(width)):
+            me = agent(scratch, random_key, pos, vel, time, place, lane)
+            middle, around = box(numbers, me, lanes[reach + lane] * like(me.pos[0], LOOSE))
+            listed = near(context.params, numbers.size, mine.cells, middle, around, lanes, np.int64(first))
+            for k in range(listed if listed >= 0 else mine.many):
+                m = np.int64(lanes[np.uint64(first) + np.uint64(k)]) if listed >= 0 else k
+                to = offset_to(numbers.size, me.pos, circle(context.obstacle_x, b, m))
+                update(numbers, world, me, to, context.obstacle_radius[b, m], m, lanes, lane)
 
     return circles
 

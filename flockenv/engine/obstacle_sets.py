@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from flockenv.engine.parameters import NumberPlan
 from flockenv.engine.shape_rows import FormPlan, Surroundings
 from flockenv.geometry.shapes import pack_shapes
-from flockenv.geometry.shapes.cells import FEWEST_ROWS, cells_of
+from flockenv.geometry.shapes.cells import CIRCLES, cells_of, fewest_rows
 from flockenv.geometry.space import Space
 from flockenv.physics.effects.effect import Effect, Sight
 
@@ -28,7 +28,7 @@ class ObstacleSets:
     space: Space
     effects: tuple[Effect, ...]
     shapes: tuple[Any, ...]
-    circles: int
+    circles: tuple[Any, ...]
 
     if TYPE_CHECKING:
 
@@ -46,7 +46,7 @@ class ObstacleSets:
         if not self.reads_obstacles:
             return np.zeros(0), {}
         period = np.array(self.space.extent(self.dimension)) if self.space.periodic else None
-        return pack_shapes(self.shapes, self.dimension, self.circles, period)
+        return pack_shapes(self.shapes, self.dimension, len(self.circles), period)
 
     @property
     def moving(self) -> bool:
@@ -72,12 +72,12 @@ class ObstacleSets:
 
     @functools.cached_property
     def cells(self) -> dict[str, NDArray[np.float64]]:
-        """Grids over the shapes of each form of finite extent that has many of them: see shapes/cells.py."""
+        """Grids over the circles of the state and the shapes of each finite form, if many: see shapes/cells.py."""
         table, forms = self.shape_table
         period = np.array(self.space.extent(self.dimension)) if self.space.periodic else None
         found = {}
         for form, (begin, count) in forms.items():
-            if count >= FEWEST_ROWS and form in ("chain", "block", "distance_field"):
+            if form in ("chain", "block", "distance_field") and count >= fewest_rows(form, self.dimension):
                 mine = [shape for shape in self.shapes if shape.form == form]
                 lengths = [int(table[begin])]
                 while len(lengths) < count:
@@ -86,6 +86,10 @@ class ObstacleSets:
                 grid = cells_of(mine, rows, period)
                 if max(rows[-1], len(grid)) < MOST_NUMBERS:
                     found[form] = grid
+        if self.reads_obstacles and len(self.circles) >= fewest_rows(CIRCLES, self.dimension):
+            grid = cells_of(self.circles, range(len(self.circles)), period)
+            if len(grid) < MOST_NUMBERS:
+                found[CIRCLES] = grid
         return found
 
     @property
@@ -108,7 +112,8 @@ class ObstacleSets:
         """Constants of the code about obstacles."""
         plans = zip(self.shape_table[1], self.number_plan.forms, strict=True)
         forms = tuple(FormPlan(form, *plan) for form, plan in plans)
-        return Surroundings(self.dimension, self.space.offset_law, self.moving, forms)
+        circles = FormPlan(CIRCLES, self.number_plan.circles, True) if CIRCLES in self.cells else None
+        return Surroundings(self.dimension, self.space.offset_law, self.moving, circles, forms)
 
     @property
     def reads_obstacles(self) -> bool:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 
 from flockenv.engine.lane_access import gather
+from flockenv.geometry.shapes.cells import CIRCLES
 from flockenv.jit.decorators import Law, kernel
 from flockenv.jit.section import concatenation_from, record, section, tuple_from
 from flockenv.maths.vectors import add
@@ -60,6 +61,7 @@ class Numbers(NamedTuple):
     size: tuple[float, ...]  # m, size of the space
     reach: float  # m, the largest radius within which any law looks for neighbours
     forms: tuple[Form, ...]
+    circles: Form  # the circles of the state if they have a grid: `cells` is 0 if they lie elsewhere than in the scene
     views: tuple[View, ...]
     effects: tuple[Any, ...]  # for each effect a record of what its laws are passed, by name
     space: tuple[float, ...]
@@ -79,6 +81,7 @@ class NumberPlan(NamedTuple):
 
     dimension: int
     forms: tuple[tuple[int, bool], ...]  # (place, has a grid)
+    circles: int  # place of what belongs to the circles of the state if they have a grid; -1: they have none
     views: tuple[tuple[int, bool], ...]  # (place, sees only one group)
     effects: tuple[EffectPlan, ...]
     space: tuple[int, int]  # (place, how many)
@@ -128,6 +131,10 @@ class Numbered(Protocol):
         """The rows of all shapes, and where the rows of each form lie."""
 
     @property
+    def circles(self) -> tuple[Any, ...]:
+        """The circles of the scene that are kept in the state."""
+
+    @property
     def cells(self) -> dict[Any, Any]:
         """The grids of forms that have one."""
 
@@ -165,7 +172,8 @@ class Numbered(Protocol):
 def pack_numbers(parts: Numbered) -> tuple[list[float], NumberPlan]:
     """Return every number that a kernel is passed, and where each lies; tables follow behind them.
 
-    What follows (rows of shapes, grids, tables) is addressed by where it begins, a table also by where it ends.
+    What follows (rows of shapes, grids, tables) is addressed by where it begins, a table also by where it ends. Circles
+    of the state have no rows.
     """
     shapes, forms = parts.shape_table
     ends = np.cumsum([len(shapes), *map(len, parts.cells.values())]).tolist()
@@ -181,6 +189,11 @@ def pack_numbers(parts: Numbered) -> tuple[list[float], NumberPlan]:
         if form in grids:
             behind.append((len(values), grids[form]))
             values.append(0.0)
+    circles = -1
+    if CIRCLES in grids:
+        circles = len(values)
+        values += [0.0, float(len(parts.circles)), 0.0]
+        behind.append((circles + 2, grids[CIRCLES]))
     for sight in parts.sights:
         views.append((len(values), sight.group is not None))
         values += [sight.radius**2, view_of(sight.fov, parts.dtype)]
@@ -208,7 +221,7 @@ def pack_numbers(parts: Numbered) -> tuple[list[float], NumberPlan]:
         values += more
     for place, bound in behind:
         values[place] = float(len(values) + bound)
-    return values, NumberPlan(parts.dimension, tuple(planned_forms), tuple(views), tuple(effects), *rest)
+    return values, NumberPlan(parts.dimension, tuple(planned_forms), circles, tuple(views), tuple(effects), *rest)
 
 
 def _look_numbers(parts: Numbered) -> list[float]:
@@ -222,6 +235,7 @@ def numbers_of(plan: NumberPlan) -> Callable[[Any, Any], Numbers]:
     d, size = plan.dimension, tuple(range(plan.dimension))
     forms, views, effects = _all(_form, plan.forms), _all(_view, plan.views), _all(_effect, plan.effects)
     space, method, look = (_places(*some) for some in (plan.space, plan.method, plan.look))
+    circles = _form((plan.circles, True)) if plan.circles >= 0 else _no_form()
 
     def read(params: Any, counters: Any) -> Any:
         begin = np.uint64(0)
@@ -229,6 +243,7 @@ def numbers_of(plan: NumberPlan) -> Callable[[Any, Any], Numbers]:
             gather(params, begin, size),
             params[d],
             forms(params, counters),
+            circles(params, counters),
             views(params, counters),
             effects(params, counters),
             gather(params, begin, space),
@@ -257,6 +272,11 @@ def _form(place: tuple[int, bool]) -> Callable[..., Form]:
         return Form(np.int64(params[at]), np.int64(params[at + 1]), np.int64(0))
 
     return kernel(form)
+
+
+@functools.cache
+def _no_form() -> Callable[..., Form]:
+    return kernel(lambda params, counters: Form(0, 0, 0))
 
 
 @functools.cache

@@ -32,6 +32,7 @@ __all__ = [
     "Surroundings",
     "box_of_path",
     "by_form",
+    "each_circle",
     "each_row",
     "near_rows",
     "number_of",
@@ -57,6 +58,8 @@ class Surroundings(NamedTuple):
     """The law of the space that returns the shortest offset from one place to another."""
     moving: bool
     """True if any shape moves."""
+    circles: FormPlan | None
+    """The circles of the state, if they have a grid."""
     forms: tuple[FormPlan, ...]
 
 
@@ -134,6 +137,38 @@ def each_row(around: Surroundings, form: FormPlan, visit: Law, box: Law, done: L
         return state
 
     return each
+
+
+@section
+def each_circle(around: Surroundings, visit: Law, box: Law, done: Law) -> Callable[..., Any]:
+    """Make `each(params, size, given, state)`: as `each_row`, for the circles of the state.
+
+    `state = visit(params, size, m, given, state)`; given: (obstacle_x, obstacle_radius, b) first.
+    """
+    gridded, present = around.circles is not None, _if_present(visit)
+    place = around.circles.place if around.circles is not None else 0
+    each_listed: Any = _each_listed(around.offset_to, around.dimension, _relative_to_first(present), box, done)
+
+    def each(params: Any, size: Any, given: Any, state: Any) -> Any:
+        if gridded:  # noqa: SIM102  # numba drops the branch by this alone
+            if params[place + 2] > 0:
+                return each_listed(params, size, np.int64(params[place + 2]), 0, given, state)
+        for m in range(given[0][1].shape[1]):
+            state = present(params, size, m, given, state)
+        return state
+
+    return each
+
+
+@section
+def _if_present(visit: Law) -> Callable[..., Any]:
+    """Make `visit` for a circle that may be missing: a radius of 0."""
+
+    def visit_present(params: Any, size: Any, m: Any, given: Any, state: Any) -> Any:
+        _, radius, b = given[0]
+        return visit(params, size, m, given, state) if radius[b, m] > 0 else state
+
+    return visit_present
 
 
 @section

@@ -26,6 +26,7 @@ from flockenv.engine.shape_rows import (
     Surroundings,
     box_of_path,
     by_form,
+    each_circle,
     each_row,
     number_of,
     offset_from_shape,
@@ -90,24 +91,34 @@ def first_hit(around: Surroundings) -> Callable[..., tuple[float, int, int]]:
 
     At most `most`. If several are touched at once, it returns the first as they are listed.
     """
-    offset_to, circle, has_shapes = around.offset_to, vector_of(around.dimension), bool(around.forms)
+    each, has_shapes = each_circle(around, _first_circle(around), _box_of_path, _never), bool(around.forms)
     first_row: Any = _first_row(around) if has_shapes else None
 
     def first_hit(world: Any, x: Any, ray: Any, room: Any, most: Any) -> Any:
         obstacle_x, obstacle_radius, params, size, b, time = world
-        best, form, row = most, -2, -1
-        for m in range(obstacle_radius.shape[1]):
-            rho = obstacle_radius[b, m]
-            if rho > 0:
-                to = offset_to(size, x, circle(obstacle_x, b, m))
-                here = threat(ray, to, room + rho, like(room, np.inf))
-                if here < best:
-                    best, form, row = here, -1, m
+        found = each(params, size, ((obstacle_x, obstacle_radius, b), x, ray, room), (most, -2, -1))
         if has_shapes:
-            return first_row(params, size, (time, x, ray, room), (best, form, row))
-        return best, form, row
+            return first_row(params, size, (time, x, ray, room), found)
+        return found
 
     return routine(first_hit)
+
+
+@section
+def _first_circle(around: Surroundings) -> Callable[..., tuple[float, int, int]]:
+    """Make the function for each circle: keep (distance, form, index) of what is touched first."""
+    offset_to, circle = around.offset_to, vector_of(around.dimension)
+
+    def touches(params: Any, size: Any, m: Any, given: Any, state: Any) -> Any:
+        (obstacle_x, obstacle_radius, b), x, ray, room = given
+        best, form, row = state
+        to = offset_to(size, x, circle(obstacle_x, b, m))
+        here = threat(ray, to, room + obstacle_radius[b, m], like(room, np.inf))
+        if here < best or (here == best and form == -1 and m < row):
+            best, form, row = here, -1, m
+        return best, form, row
+
+    return touches
 
 
 @section

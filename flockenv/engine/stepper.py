@@ -46,10 +46,26 @@ class Stepper:
         return scene
 
     @functools.cached_property
-    def params(self) -> Floats:
-        """Every number that the kernel is passed."""
+    def _params(self) -> Floats:
         numbers: Floats = self.scene.parts.packed_numbers()
         return numbers
+
+    @functools.cached_property
+    def _params_in_place(self) -> tuple[Floats, Floats, Floats]:
+        """The numbers with a grid over the circles, and where these must be: centres (D, 1, M) m, radii (1, M) m."""
+        scene = self.scene
+        centre = np.array([circle.centre for circle in scene.circles], scene.dtype).T[:, None]
+        radius = np.array([[circle.radius for circle in scene.circles]], scene.dtype)
+        return scene.parts.packed_numbers(in_place=True), centre, radius
+
+    def params(self, state: State) -> Floats:
+        """Return every number that the kernel is passed for a state; the grid over its circles only if it holds."""
+        if self.scene.parts.number_plan.circles >= 0:
+            numbers, *expected = self._params_in_place
+            found = state.obstacle_x, state.obstacle_radius
+            if all(a.shape[-1] == b.shape[-1] and (a == b).all() for a, b in zip(found, expected, strict=True)):
+                return numbers
+        return self._params
 
     @property
     def dt(self) -> Any:
@@ -60,7 +76,7 @@ class Stepper:
         """Write the initial inner numbers of the agents in `fresh`, (B, N)."""
         if self.scene.parts.inner and fresh.any():
             scratch = self.workspaces(1, 1)[0].of(0, self._scratch_kind)
-            self._fill_inner(worlds_of(state), self.params, self.dt, fresh, scratch)
+            self._fill_inner(worlds_of(state), self._params, self.dt, fresh, scratch)
 
     def advance(self, state: State, drive: Floats, steps: int) -> tuple[int, int, str]:
         """Step in place; return the first (world, agent) that failed, or (-1, -1), and why if numbers are finite."""
@@ -159,7 +175,7 @@ class Stepper:
         """
         worlds, agents, _ = state.shape
         move, kind = self.move, self._scratch_kind
-        arrays = worlds_of(state), drive, self.params, self.dt, steps
+        arrays = worlds_of(state), drive, self.params(state), self.dt, steps
         threads, team = self._thread_counts(worlds, agents)
 
         def alone() -> tuple[int, int]:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from flockenv.engine.blocks import vector_of
-from flockenv.engine.shape_rows import FormPlan, Surroundings, box_of_path, each_row, offset_from_shape
+from flockenv.engine.shape_rows import FormPlan, Surroundings, box_of_path, each_circle, each_row, offset_from_shape
 from flockenv.geometry.shapes.round import blocks
 from flockenv.geometry.shapes.table import law_of
 from flockenv.jit.decorators import kernel, like
@@ -22,22 +22,30 @@ def is_blocked_of(around: Surroundings) -> Callable[..., bool]:
 
     It returns True if an obstacle intersects the straight line from place x to the offset `to`, m.
     """
-    offset_to, circle, has_shapes = around.offset_to, vector_of(around.dimension), bool(around.forms)
+    each, has_shapes = each_circle(around, _circle_blocks_line(around), _box_of_line, _is_found), bool(around.forms)
     is_hidden: Any = _is_hidden_by_shape(around) if has_shapes else None
 
     def is_blocked(
         obstacle_x: Any, obstacle_radius: Any, params: Any, size: Any, b: Any, time: Any, x: Any, to: Any
     ) -> Any:
-        found = False
-        for m in range(obstacle_radius.shape[1]):
-            rho = obstacle_radius[b, m]
-            if rho > 0:
-                found |= blocks(offset_to(size, x, circle(obstacle_x, b, m)), rho, to)
+        found = each(params, size, ((obstacle_x, obstacle_radius, b), x, to), False)
         if has_shapes:
             return is_hidden(params, size, time, x, to, found)
         return found
 
     return is_blocked
+
+
+@section
+def _circle_blocks_line(around: Surroundings) -> Callable[..., bool]:
+    """Make the function for each circle: return True if it or an earlier one intersects the line."""
+    offset_to, circle = around.offset_to, vector_of(around.dimension)
+
+    def hides(params: Any, size: Any, m: Any, given: Any, found: Any) -> Any:
+        (obstacle_x, obstacle_radius, b), x, to = given
+        return found | blocks(offset_to(size, x, circle(obstacle_x, b, m)), obstacle_radius[b, m], to)
+
+    return hides
 
 
 @section

@@ -334,7 +334,7 @@ class Scene(Record):
             oriented=any(group.keeps_heading for group in self.groups),
             turns=any(group.max_turn_rate is not None for group in self.groups),
             leans=any(group.banking is not None for group in self.groups),
-            starts=self.starts, shapes=self.shapes, circles=len(self.circles),
+            starts=self.starts, shapes=self.shapes, circles=self.circles,
             touching=1.001 * self.contact_distance or 1e-300,
             tables=tuple(self.table_of(effect) for effect in effects if effect.tabled),
         )  # fmt: skip
@@ -506,7 +506,7 @@ class Scene(Record):
             with np.errstate(invalid="ignore"):  # an infinite position has no image, and is no neighbour
                 x = np.ascontiguousarray(self.space.wrap(state.pos).transpose(2, 0, 1), self.dtype)
         self.stepper.accelerate(
-            worlds_of(state)._replace(x=x), self._drive(drive, state), self.stepper.params, time, acc, flow,
+            worlds_of(state)._replace(x=x), self._drive(drive, state), self.stepper.params(state), time, acc, flow,
             self.stepper.workspaces(1, 1)[0].of(0, scratch_record(self.stepper.plain_parts)),
         )  # fmt: skip
         return acc.transpose(1, 2, 0), flow.transpose(1, 2, 0) if self.parts.flows else None
