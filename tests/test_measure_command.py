@@ -175,7 +175,7 @@ def test_after_an_interrupt_the_results_until_then_are_shown(
 def test_an_interrupted_simulation_is_announced_before_it_is_measured(
     seeds: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Measuring takes up to 20 s: nobody should have to guess whether Ctrl-C was noticed."""
+    """Measuring takes up to 20 s, in which the user must know that Ctrl-C was noticed."""
     told = []
 
     def late(scene: Scene, seed: int, steps: int, every: int, progress: Callable[[int], None]) -> Trajectory:
