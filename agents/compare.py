@@ -59,7 +59,7 @@ PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "pettingzoo")
 FILES = ("results.json", "table.md", "comparison.png", "replay.html")
 JOBS = "jobs"
 """Folder of the jobs' records, in the results folder."""
-STOPPED = "interrupted; what was played is stored, and the same command goes on"
+STOPPED = "interrupted; what was played is stored, run the same command to continue"
 ROOM = 2**24
 """Bytes that all files take, approximately."""
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)

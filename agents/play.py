@@ -116,17 +116,22 @@ def play_job(
 
     kind: first word of the job's name. record: index of a world whose episode is recorded.
     """
+    digest = player_digest(player, task, seed)
     about = {
         "task": type(task).__name__, "settings": task.model_dump(mode="json"), "worlds": worlds, "seed": seed,
-        "record": record, "player": player_digest(player, task, seed),
+        "record": record, "player": digest,
     }  # fmt: skip
-    arguments = task, player, worlds, seed, record, trust_pickle
+    arguments = task, player, worlds, seed, record, trust_pickle, digest
     return Job(f"{kind}/{task.name}/{player.name}", _play, arguments, about)
 
 
-def _play(task: Task, player: Player, worlds: int, seed: int, record: int | None, trust_pickle: bool) -> bytes:
-    """Play the worlds; return the episodes as bytes."""
+def _play(
+    task: Task, player: Player, worlds: int, seed: int, record: int | None, trust_pickle: bool, digest: str
+) -> bytes:
+    """Play the worlds; return the episodes as bytes. Raise ValueError if the player has another digest than before."""
     policy = player.policy(task, seed, trust_pickle)
+    if player_digest(player, task, seed) != digest:
+        raise ValueError(f"player {player.spec!r} has changed since the command began, or differs on this machine")
     with blame(player.name, task):
         return records.to_bytes(rollout(task, policy, worlds, worlds_for("evaluation", seed, worlds), record=record))
 
@@ -142,14 +147,17 @@ def episodes_of_bytes(data: bytes) -> Episodes:
 
 
 def player_digest(player: Player, task: Task, seed: int) -> str:
-    """Return a digest of a player: of its parameters and weights, or of its file and the Python files beside it."""
+    """Return a digest of a player: of its parameters and weights, or of its file and the files that belong to it.
+
+    These are the Python files in the folder of a Python file, and the card of a weights file.
+    """
     if player.spec in NAMES:
         policy = player.policy(task, seed)
         weights = (getattr(policy, "card", None) or {}).get("sha256", "")
         return hashlib.sha256(f"{policy!r} {weights}".encode()).hexdigest()
-    path = Path(player.spec)
-    beside = sorted(path.parent.glob("*.py")) if path.suffix.lower() == ".py" else []
-    digest = hashlib.sha256(path.read_bytes())
-    for other in beside:
-        digest.update(other.read_bytes())
+    path, digest = Path(player.spec), hashlib.sha256()
+    beside = path.parent.glob("*.py") if path.suffix.lower() == ".py" else [path.with_suffix(".json")]
+    for file in sorted({path, *beside}):
+        if file.is_file():
+            digest.update(f"{file.name} {file.stat().st_size} ".encode() + file.read_bytes())
     return digest.hexdigest()

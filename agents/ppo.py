@@ -364,7 +364,10 @@ def main(
         experiment = experiment.model_copy(update={"ppo": PpoSettings(**{**experiment.ppo.model_dump(), **changes})})
         name = experiment.build().name
         if seeds is not None:
-            _train_seeds(experiment, seeds, out or Path("results/ppo"), runs, engine_of(engine, processes), fresh)
+            if seed is not None or go_on or tensorboard is not None:
+                raise ValueError("--seeds: not together with --seed, --resume or --tensorboard; it resumes by itself")
+            runner = engine_of(engine, processes, renew=True)
+            _train_seeds(experiment, seeds, out or Path("results/ppo"), runs, runner, fresh)
             return
         target = WEIGHTS / f"{name}.safetensors" if out is None else valid_file(str(out), (".safetensors",), True)
         folder = valid_path(str(runs / name), "--runs")
@@ -386,22 +389,24 @@ def main(
 
 
 def _train_seeds(experiment: Experiment, text: str, out: Path, runs: Path, engine: Engine, fresh: bool) -> None:
-    """Train with several seeds as jobs, and write the policy of each."""
-    from agents.training_job import policy_of_bytes, seeds_of, training_job, with_seed
+    """Train with several seeds as jobs, and write the policy of each that has ended."""
+    from agents.training_job import file_name, policy_of_bytes, seeds_of, training_job, with_seed
 
     folder, checkpoints = valid_path(str(out)), valid_path(str(runs), "--runs")
+    for path in (folder / "policy", checkpoints / "checkpoint"):
+        check_room(path, expected_bytes(experiment))
     jobs = [training_job(with_seed(experiment, seed), checkpoints, not fresh) for seed in seeds_of(text)]
     store = Store(folder / "jobs")
-    with (
-        handle_interrupt("interrupted; what was trained is stored, and the same command goes on"),
-        job_bar() as progress,
-    ):
-        run_jobs(jobs, Work(store, engine, fresh, progress))
-    for job in jobs:
-        tensors, card = store.read(job, policy_of_bytes)
-        path = folder / f"{job.name.removeprefix('ppo/').replace('/', '-')}.safetensors"
-        save_policy(path, tensors, card)
-        console.print(f"{path}: mean return {card['tuning_mean']:.3f} on the tuning worlds", soft_wrap=True)
+    interrupted = "interrupted; checkpoints and finished trainings are stored, run the same command to continue"
+    with handle_interrupt(interrupted), job_bar("training") as progress:
+        try:
+            run_jobs(jobs, Work(store, engine, fresh, progress))
+        finally:
+            for job in filter(store.has, jobs):
+                tensors, card = store.read(job, policy_of_bytes)
+                save_policy(folder / file_name(job), tensors, card)
+                mean = f"mean return {card['tuning_mean']:.3f} on the tuning worlds"
+                console.print(f"{folder / file_name(job)}: {mean}", soft_wrap=True, highlight=False)
 
 
 def _check_outputs(experiment: Experiment, target: Path, folder: Path, tensorboard: str | None) -> None:

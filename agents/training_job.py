@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from agents.run import recipe_of
 from flockenv.core.errors import printable
 from flockenv.jobs import Job, records
 
-__all__ = ["policy_of_bytes", "seeds_of", "training_job", "with_seed"]
+__all__ = ["file_name", "policy_of_bytes", "seeds_of", "training_job", "with_seed"]
 
 MOST = 1000
 """Number of training seeds: each has a block of worlds."""
@@ -23,7 +24,7 @@ def seeds_of(text: str) -> list[int]:
     for part in text.split(","):
         first, dash, last = part.strip().partition("-")
         ends = (first, last if dash else first)
-        if not all(end.isascii() and end.isdigit() and int(end[:9]) < MOST for end in ends):
+        if not all(end.isascii() and end.isdigit() and len(end) < 9 and int(end) < MOST for end in ends):
             allowed = f"each must be a number from 0 to {MOST - 1} or a range of them, such as 0-9"
             raise ValueError(f"--seeds {printable(text)}: {allowed}")
         if int(ends[0]) > int(ends[1]):
@@ -40,11 +41,18 @@ def with_seed(experiment: Experiment, seed: int) -> Experiment:
 def training_job(experiment: Experiment, runs: Path, go_on: bool = True) -> Job:
     """Return the job that trains an experiment; go_on: continue from the checkpoint that a killed process left.
 
-    The record is read by `policy_of_bytes`. The checkpoint is in `runs`, in a folder named after the task and seed.
+    The record is read by `policy_of_bytes`. The checkpoint is in `runs`, in a folder named by the job's key: another
+    recipe or other code begins anew.
     """
-    name = f"{experiment.build().name}/seed-{experiment.ppo.seed}"
-    arguments = experiment.model_dump_json(), str(runs / name.replace("/", "-")), go_on
-    return Job(f"ppo/{name}", _train, arguments, recipe_of(experiment))
+    title = f"{experiment.build().name}/seed-{experiment.ppo.seed}"
+    unplaced = Job(f"ppo/{title}", _train, (), recipe_of(experiment))
+    folder = runs / unplaced.key.removeprefix("ppo/").replace("/", "-")
+    return replace(unplaced, arguments=(experiment.model_dump_json(), str(folder), go_on))
+
+
+def file_name(job: Job) -> str:
+    """Return the name of the policy's file: pursuit-seed-3.safetensors."""
+    return f"{job.name.removeprefix('ppo/').replace('/', '-')}.safetensors"
 
 
 def _train(experiment: str, folder: str, go_on: bool) -> bytes:

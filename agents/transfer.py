@@ -141,13 +141,13 @@ def _measure(plans: Sequence[Plan], work: Work) -> report.Results:
     for plan in plans:
         for player in plan.players:
             plan.policy(player, plan.task)  # players that cannot be loaded are rejected before any plays
-    rounds = round_jobs(plans)
-    run_jobs(list(jobs_by_kernel(plans)), work)
+    jobs, rounds = jobs_by_kernel(plans), round_jobs(plans)
+    run_jobs(list(jobs.values()), work)
     run_jobs(rounds, dataclasses.replace(work, engine=LocalEngine(1, renew=True)))
     about = {
         plan.task.name: transfer_report.task_results(
-            plan.task, plan.settings, read_cells(plan, work.store), clock_of(plan, rounds, work.store),
-            read_again(plan, work.store), RESAMPLES, plan.seed,
+            plan.task, plan.settings, read_cells(plan, jobs, work.store), clock_of(plan, rounds, work.store),
+            read_again(plan, jobs, work.store), RESAMPLES, plan.seed,
         )
         for plan in plans
     }  # fmt: skip

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
@@ -71,32 +71,35 @@ def cell_job(plan: Plan, setting: Setting, player: Player, kind: str = "transfer
     return play_job(kind, task, player, plan.worlds, plan.seed, trust_pickle=plan.trust_pickle)
 
 
-def jobs_by_kernel(plans: Sequence[Plan]) -> Iterator[Job]:
-    """Yield all jobs that play, those that share a kernel one after another; the trained settings are played twice."""
+def jobs_by_kernel(plans: Sequence[Plan]) -> dict[tuple[str, Setting, str, bool], Job]:
+    """Return all jobs that play, by task, setting, player, and whether it is the second time.
+
+    Those that share a kernel follow one another; the trained settings are played twice.
+    """
+    found = {}
     for plan in plans:
+        name = plan.task.name
         for setting in sorted(plan.settings, key=lambda setting: setting.solver):
             for player in plan.players:
-                yield cell_job(plan, setting, player)
-        for player in plan.players:
-            yield _job_again(plan, player)
+                found[name, setting, player.name, False] = cell_job(plan, setting, player)
+        for player in plan.players:  # the scores must be equal to the last bit
+            again = cell_job(plan, plan.trained_setting, player, "transfer-again")
+            found[name, plan.trained_setting, player.name, True] = again
+    return found
 
 
-def _job_again(plan: Plan, player: Player) -> Job:
-    """Return a second job with the trained setting: its scores must be equal to the last bit."""
-    return cell_job(plan, plan.trained_setting, player, "transfer-again")
-
-
-def read_cells(plan: Plan, store: Store) -> dict[tuple[Setting, str], Cell]:
+def read_cells(
+    plan: Plan, jobs: Mapping[tuple[str, Setting, str, bool], Job], store: Store
+) -> dict[tuple[Setting, str], Cell]:
     """Return all cells of a plan."""
-    return {
-        (setting, player.name): _read_cell(store, cell_job(plan, setting, player))
-        for setting in plan.settings for player in plan.players
-    }  # fmt: skip
+    keys = [(setting, player.name) for setting in plan.settings for player in plan.players]
+    return {key: _read_cell(store, jobs[(plan.task.name, *key, False)]) for key in keys}
 
 
-def read_again(plan: Plan, store: Store) -> dict[str, Cell]:
+def read_again(plan: Plan, jobs: Mapping[tuple[str, Setting, str, bool], Job], store: Store) -> dict[str, Cell]:
     """Return, by player, the cells of the trained setting, played a second time."""
-    return {player.name: _read_cell(store, _job_again(plan, player)) for player in plan.players}
+    names = [player.name for player in plan.players]
+    return {name: _read_cell(store, jobs[plan.task.name, plan.trained_setting, name, True]) for name in names}
 
 
 def _read_cell(store: Store, job: Job) -> Cell:

@@ -30,7 +30,7 @@ from flockenv.tasks import Task
 
 __all__ = ["app", "search"]
 
-STOPPED = "interrupted; what was played is stored, and the same command goes on"
+STOPPED = "interrupted; what was played is stored, run the same command to continue"
 ROOM = 2**16
 """Bytes: more than the file takes."""
 
@@ -135,7 +135,7 @@ def main(
         target = TUNED / f"{task.name}.json" if out is None else valid_file(str(out), (".json",), force=True)
         check_room(target, ROOM)
         store, runner = Store(valid_path(str(jobs), "--jobs")), engine_of(engine, processes)
-    with one_line_errors(), job_bar(lines=False) as progress:
+    with one_line_errors(), job_bar("compiling and playing", lines=False) as progress:
         rules, found = search(experiment, Work(store, runner, fresh, progress))
     console.print(f"{task.name}: found {json.dumps(rules)}", markup=False, highlight=False, soft_wrap=True)
     with one_line_errors():

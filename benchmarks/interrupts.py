@@ -53,9 +53,11 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "ppo": ("-m", "agents.ppo", "pursuit.yaml", "--out", "w.safetensors", "--runs", "runs"),
 }
 
+SIGNALLED = re.compile(r"\b(interrupted|terminated)\b")
+
 ALLOWED = re.compile(
-    r"\w+: (interrupted|terminated).*|interrupted; .*|flockenv: warning: .*|\w+: \w+ plays|[\w: ]+: done|"
-    r".*\(.* so far.*\)|\s*[\d,]+ steps .*|\s*"
+    r"\w+: (interrupted|terminated).*|interrupted; .*|flockenv: warning: .*|"
+    r"[\w/: -]+: (done|failed)( \(\d+ of \d+\))?|.*\(.* so far.*\)|\s*[\d,]+ steps .*|\s*"
 )
 """Lines of stderr that are not complained of: the one line, warnings, and news of how far a command is."""
 
@@ -113,7 +115,7 @@ def interrupt(
     if _is_alive(process.pid):
         faults.append("orphan")
         os.killpg(process.pid, signal.SIGKILL)
-    if process.returncode == 0 and not stderr and (done or time.monotonic() - sent < LATE):
+    if process.returncode == 0 and not SIGNALLED.search(stderr) and (done or time.monotonic() - sent < LATE):
         return None
     if process.returncode != 128 + number:
         faults.append(f"exit code {process.returncode}")

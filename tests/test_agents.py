@@ -24,7 +24,7 @@ from agents.imitate import imitate
 from agents.learning_env import ForLearning
 from agents.run import load_checkpoint, recipe_of
 from agents.team_credit import CaringBuffer
-from agents.training_job import seeds_of, with_seed
+from agents.training_job import seeds_of, training_job, with_seed
 from flockenv.envs.sb3 import WorldVecEnv
 from flockenv.envs.world import World
 from flockenv.evaluation import compare, rollout, worlds_for
@@ -207,8 +207,27 @@ def test_trainings_with_several_seeds_are_jobs_with_the_same_policies(
         stored = load_file(tmp_path / f"results/ppo/pursuit-seed-{seed}.safetensors")
         for name, tensor in alone.tensors.items():
             np.testing.assert_array_equal(stored[name], tensor)
-    monkeypatch.setattr(ppo, "build", _fail)
-    assert CliRunner().invoke(ppo.app, command).exit_code == 0, "stored trainings are not repeated"
+    with monkeypatch.context() as patch:
+        patch.setattr(ppo, "build", _fail)
+        assert CliRunner().invoke(ppo.app, command).exit_code == 0, "stored trainings are not repeated"
+    result = CliRunner().invoke(ppo.app, ["tiny.yaml", "--seeds", "3", "--steps", "512", "--processes", "1"])
+    assert result.exit_code == 0, "another recipe has a checkpoint of its own"
+
+
+@pytest.mark.parametrize("other", [("--seed", "1"), ("--resume",), ("--tensorboard", "logs")])
+def test_seeds_are_refused_beside_options_of_one_training(other: tuple[str, ...]) -> None:
+    from agents import ppo
+
+    result = CliRunner().invoke(ppo.app, [str(CONFIGS / "pursuit.yaml"), "--seeds", "0-1", *other])
+    assert result.exit_code == 2 and "--seeds: not together with" in result.stderr
+
+
+def test_the_checkpoint_of_a_training_job_depends_on_recipe_and_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    jobs = [training_job(with_seed(PURSUIT, seed), Path("runs")) for seed in (1, 1, 2)]
+    monkeypatch.setattr("flockenv.jobs.job.code_digest", lambda: "other")
+    jobs.append(training_job(with_seed(PURSUIT, 1), Path("runs")))
+    folders = [job.arguments[1] for job in jobs]
+    assert folders[0] == folders[1] and len(set(folders)) == 3
 
 
 @pytest.mark.parametrize(("text", "seeds"), [("0-3", [0, 1, 2, 3]), ("5, 2,5-6", [5, 2, 6]), ("7", [7])])

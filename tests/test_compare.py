@@ -25,6 +25,8 @@ from agents import compare as comparison
 from agents import play, report
 from flockenv.evaluation import EVALUATION, Episodes
 from flockenv.evaluation.plots import Column, draw_chart, write_chart
+from flockenv.jobs import Failure
+from flockenv.jobs.job import code_digest, execute
 from flockenv.players.policy import save_policy
 from flockenv.tasks import TASKS
 
@@ -168,6 +170,7 @@ def test_stored_episodes_are_not_played_again(monkeypatch: pytest.MonkeyPatch) -
     assert f"{record} is damaged: " in run(*arguments, code=2).stderr
 
 
+@pytest.mark.slow
 def test_failing_player_is_named_and_all_others_are_played() -> None:
     """There are more jobs than processes."""
     Path("odd.py").write_text("def predict(observation):\n    raise RuntimeError('no idea')\n")
@@ -182,11 +185,46 @@ def test_failing_player_is_named_and_all_others_are_played() -> None:
     assert not Path("results/results.json").exists() and not multiprocessing.active_children()
 
 
+def test_a_player_that_changes_during_the_run_is_refused() -> None:
+    Path("mine.py").write_text(STILL)
+    player, task = play.Player.of("mine.py"), TASKS["obstacles"]()
+    job = play.play_job("compare", task, player, 2, 0)
+    Path("mine.py").write_text(STILL.replace("0 *", "0.5 +  0 *"))
+    failure = execute(job.function, job.arguments, code_digest())
+    assert isinstance(failure, Failure) and "player 'mine.py' has changed" in str(failure)
+    assert play.play_job("compare", task, player, 2, 0).key != job.key
+
+
+def test_the_key_of_a_player_s_job_depends_on_the_files_that_belong_to_it() -> None:
+    task, seen = TASKS["obstacles"](), set()
+
+    def key(spec: str) -> str:
+        return play.play_job("compare", task, play.Player.of(spec), 2, 0).key
+
+    Path("mine.py").write_text(STILL)
+    seen.add(key("mine.py"))
+    for name, text in (("helper.py", "A = 1"), ("helper.py", "A = 2"), ("other.py", "A = 2")):
+        Path(name).write_text(text)
+        seen.add(key("mine.py"))
+    assert len(seen) == 4
+    save_policy("own.safetensors", still_tensors(task), {"activation": "tanh", "layout": task.layout.digest})
+    before = key("own.safetensors")
+    Path("own.json").write_text(Path("own.json").read_text().replace("tanh", "relu"))
+    assert key("own.safetensors") != before
+
+
+def still_tensors(task: Any) -> dict[str, Any]:
+    """Return the weights of a policy without hidden layers that never acts."""
+    inputs, outputs = task.layout.size, task.action_layout.size
+    tensors = {"action.weight": np.zeros((outputs, inputs), np.float32), "action.bias": np.zeros(outputs, np.float32)}
+    return {**tensors, "log_std": np.zeros(outputs, np.float32)}
+
+
 @pytest.mark.slow
 def test_process_that_exits_is_reported_and_nothing_hangs() -> None:
     Path("gone.py").write_text("import os\n\ndef predict(observation):\n    print('farewell')\n    os._exit(3)\n")
     line = run("--tasks", "pursuit,obstacles", "--players", "gone.py", "--worlds", "2", *TWO, code=2).stderr
-    assert line.count("was ended from outside 3 times") == 2 and not Path("results/results.json").exists()
+    assert line.count("its process ended 3 times") == 2 and not Path("results/results.json").exists()
 
 
 def _enable_interrupts() -> None:
@@ -351,10 +389,8 @@ def test_order_of_players_does_not_depend_on_the_arguments() -> None:
 
 def test_user_s_weights_play_under_the_name_of_their_file() -> None:
     task = TASKS["obstacles"]()
-    inputs, outputs = task.layout.size, task.action_layout.size
-    tensors = {"action.weight": np.zeros((outputs, inputs), np.float32), "action.bias": np.zeros(outputs, np.float32)}
     card = {"activation": "tanh", "layout": task.layout.digest, "steps": 5, "wall_time_s": 3.0}
-    save_policy("own.safetensors", {**tensors, "log_std": np.zeros(outputs, np.float32)}, card)
+    save_policy("own.safetensors", still_tensors(task), card)
     run("--tasks", "obstacles", "--players", "random", "--players", "own.safetensors", "--worlds", "2", "--smoke")
     players = json.loads(Path("results/results.json").read_text())["tasks"]["obstacles"]["players"]
     assert players["own"]["cost"] == {"wall_time_s": 3.0, "steps": 5}

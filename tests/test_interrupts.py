@@ -357,7 +357,7 @@ def test_workers_ended_by_a_signal_to_the_whole_group_are_no_error(monkeypatch: 
         with pytest.raises(KeyboardInterrupt):
             list(LocalEngine(2).run(jobs, lambda job: None))
     [(_, failure)] = LocalEngine(2).run(jobs, lambda job: None)
-    assert isinstance(failure, Failure) and "was ended from outside 3 times" in str(failure)
+    assert isinstance(failure, Failure) and "its process ended 3 times" in str(failure)
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM], ids=lambda number: number.name)

@@ -93,7 +93,7 @@ def test_the_trained_setting_scores_as_in_the_comparison_bit_for_bit() -> None:
     field = play.players_in_order(["random", "rules", "ppo"])
     report, _ = comparison.compare([task], field, worlds=3, resamples=100)
     plan = Plan(task, (Setting.of_training(task),), tuple(field), 3, 0, 2)
-    for (_, name), cell in transfer_jobs.read_cells(plan, Store(JOBS)).items():
+    for (_, name), cell in transfer_jobs.read_cells(plan, transfer_jobs.jobs_by_kernel([plan]), Store(JOBS)).items():
         assert cell.returns.tolist() == report["tasks"]["pursuit"]["players"][name]["returns"]
     about = results()["tasks"]["pursuit"]
     assert about["again"] == {"random": 0.0, "rules": 0.0, "ppo": 0.0}
@@ -161,6 +161,7 @@ def test_more_rounds_are_added_to_the_kept_ones() -> None:
     assert len(before) == 2 and len(after) == 3 and before.items() <= after.items()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["transfer/pursuit/rules-*", "transfer-clock/round-1-*"])
 def test_a_damaged_kept_file_is_named_in_one_line(name: str) -> None:
     request = (*TINY, *TRAINED, "--players", "rules")

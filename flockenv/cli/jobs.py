@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flockenv.cli.terminal import new_console, show_table
+from flockenv.cli.terminal import duration_text, new_console, show_table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -40,23 +41,44 @@ def jobs(
 
     if state is not None and state not in STATES:
         raise ValueError(f"--state {printable(state)}: unknown{nearest(state, STATES)}; allowed: {', '.join(STATES)}")
-    content = State.read(folder)
-    keys = _keys_by_state(content)
-    console = new_console()
+    commands, console = State.read(folder), new_console()
+    keys = {command: _keys_by_state(content) for command, content in commands.items()}
     if state is not None:
-        for key in keys[state]:
-            console.print(key, markup=False, soft_wrap=True)
+        for of in keys.values():
+            for key in of[state]:
+                console.print(key, markup=False, soft_wrap=True)
         return
-    kinds = list(dict.fromkeys(key.split("/")[0] for key in content["keys"]))
-    rows = [[kind, *(str(sum(key.startswith(f"{kind}/") for key in keys[name])) for name in STATES)] for kind in kinds]
-    age = time.time() - float(content["written"])
-    show_table(console, f"Jobs in {folder}, as of {age:.0f} s ago", rows, ("", *STATES))
-    if content["failed"]:
-        show_table(console, "Failed", list(content["failed"].items()))
+    rows = [
+        [command, *(str(len(of[name])) for name in STATES), _age(commands[command])] for command, of in keys.items()
+    ]
+    show_table(console, f"Jobs in {folder}", rows, ("", *STATES, "as of"))
+    if failed := [item for content in commands.values() for item in content["failed"].items()]:
+        show_table(console, "Failed", failed)
 
 
 def _keys_by_state(content: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Return the keys of all jobs in their order, by state."""
-    ended = {*content["done"], *content["running"], *content["failed"]}
-    found = {name: [key for key in content["keys"] if key in content[name]] for name in ("running", "failed", "done")}
-    return {**found, "waiting": [key for key in content["keys"] if key not in ended]}
+    """Return the keys of all jobs in their order, by state; none runs if the process has ended."""
+    of = {name: set(content[name]) for name in ("running", "failed", "done")}
+    if not _is_alive(content["process"]):
+        of["running"].clear()
+    found = {name: [key for key in content["keys"] if key in keys] for name, keys in of.items()}
+    return {**found, "waiting": [key for key in content["keys"] if not any(key in keys for keys in of.values())]}
+
+
+def _age(content: Mapping[str, Any]) -> str:
+    """Return when the file was written."""
+    text = f"{duration_text(max(0.0, time.time() - float(content['written'])))} ago"
+    return text if _is_alive(content["process"]) else f"{text}, ended"
+
+
+def _is_alive(process: int) -> bool:
+    """Return True if a process of this machine runs, or if that cannot be found out."""
+    if os.name != "posix":
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from flockenv.cli.jobs import EngineName, Processes
 from flockenv.cli.terminal import (
     INTERRUPTED,
     EarlyEnd,
@@ -36,8 +37,19 @@ if TYPE_CHECKING:
 
     Run = Callable[[Results | None, Callable[[int], None], Callable[[Results], None]], Results]
 
-__all__ = ["accuracy", "experiment", "gallery", "read_findings", "run_trials", "stress", "write_numbers"]
+__all__ = [
+    "accuracy",
+    "experiment",
+    "gallery",
+    "processes_for",
+    "read_findings",
+    "run_trials",
+    "stress",
+    "write_numbers",
+]
 
+FEW = 8
+"""Trials for which no processes are started."""
 INTERRUPTED_LATER = "interrupted; results so far are shown"
 """Message about an interrupt after the first problem has been measured."""
 
@@ -258,6 +270,11 @@ def read_findings(path: Path | None, what: str, sources: str) -> Results | None:
     return found
 
 
+def processes_for(count: int) -> int | None:
+    """Return the number of processes for some trials: 1 if they are few; None stands for all cores."""
+    return None if count > FEW else 1
+
+
 def run_trials(what: str, count: int, path: Path | None, known: Results | None, run: Run) -> tuple[Results, bool]:
     """Run unknown trials, and write all results after each; return the results, and True if interrupted."""
     found = known
@@ -317,9 +334,12 @@ def stress(
         ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Start again, ignoring X.json.")] = False,
+    engine: EngineName = "local",
+    processes: Processes = None,
 ) -> None:
     """Run every hard case with every integrator, and show value, bound and verdict of each."""
     from flockenv.core.output_paths import valid_file
+    from flockenv.jobs import engine_of
     from flockenv.physics.integrators import methods_of
     from flockenv.studies.stress import CASES, fingerprint, run, select_cases, trials, usual_methods
 
@@ -328,7 +348,11 @@ def stress(
     under = methods_of(_split_words(methods)) if methods else usual_methods()
     kinds = [method.kind for method in under]
     known = None if force else read_findings(path, "hard cases", fingerprint())
-    found, stopped = run_trials("hard cases", trials(todo, kinds), path, known, lambda *given: run(todo, under, *given))
+    count = trials(todo, kinds)
+    runner = engine_of(engine, processes or processes_for(count))
+    found, stopped = run_trials(
+        "hard cases", count, path, known, lambda known, progress, keep: run(todo, under, known, progress, keep, runner)
+    )
     asked = found.only({case.name for case in todo}, kinds)
     console = new_console()
     show_table(console, "Hard cases", asked.rows(), ("case", "scene", "bound", *asked.unders))

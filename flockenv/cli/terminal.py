@@ -227,8 +227,11 @@ def progress_bar(title: str, total: int, unit: str, first: str = "compiling") ->
 
 
 @contextmanager
-def job_bar(lines: bool = True) -> Iterator[Callable[[int, int, str], None]]:
-    """Show one bar over all jobs on a terminal; otherwise write a line for each job that ends, if `lines`."""
+def job_bar(first: str = "compiling and playing", lines: bool = True) -> Iterator[Callable[[int, int, str], None]]:
+    """Show one bar over all jobs on a terminal; otherwise write a line for each job that ends, if `lines`.
+
+    first: description until the first job ends.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -238,14 +241,14 @@ def job_bar(lines: bool = True) -> Iterator[Callable[[int, int, str], None]]:
         TextColumn("{task.fields[left]}"),
     )  # fmt: skip
     with show_progress(Progress(*columns, console=console, transient=True)) as progress:
-        bar = progress.add_task("compiling and playing", total=None, left="")
+        bar = progress.add_task(first, total=None, left="")
         clock = _Clock()
 
         def update(done: int, most: int, name: str) -> None:
             left = clock.remaining(done, most)
-            progress.update(bar, completed=done, total=most, description=name or "compiling and playing", left=left)
+            progress.update(bar, completed=done, total=most, description=name or first, left=left)
             if lines and name and not console.is_terminal:
-                console.print(f"{name}: done ({done} of {most})", highlight=False)
+                console.print(f"{name} ({done} of {most})", highlight=False)
 
         yield update
 

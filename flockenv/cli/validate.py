@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flockenv.cli.studies import read_findings, run_trials, write_numbers
+from flockenv.cli.jobs import EngineName, Processes
+from flockenv.cli.studies import processes_for, read_findings, run_trials, write_numbers
 from flockenv.cli.terminal import INTERRUPTED, EarlyEnd, Force, new_console, relative_path, show_table
 
 if TYPE_CHECKING:
@@ -37,9 +38,12 @@ def validate(
         typer.Option(metavar="FOLDER", help="Only write the cases' scenes, as YAML, into this folder."),
     ] = None,
     force: Force = False,
+    engine: EngineName = "local",
+    processes: Processes = None,
 ) -> None:
     """Run published models of pedestrians in the test scenes of RiMEA and NIST: value, bound and verdict of each."""
     from flockenv.core.output_paths import valid_file
+    from flockenv.jobs import engine_of
     from flockenv.studies.validation import CASES, fingerprint, run, select_cases, select_presets, trials
 
     path = valid_file(out, [".json", ".md"], True, beside=".json") if out is not None else None
@@ -50,7 +54,11 @@ def validate(
         _write_scenes(scenes, force, todo, under)
         return
     known = None if force else read_findings(path, "crowds", fingerprint())
-    found, stopped = run_trials("crowds", trials(todo, under), path, known, lambda *given: run(todo, under, *given))
+    count = trials(todo, under)
+    runner = engine_of(engine, processes or processes_for(count))
+    found, stopped = run_trials(
+        "crowds", count, path, known, lambda known, progress, keep: run(todo, under, known, progress, keep, runner)
+    )
     asked = found.only({case.name for case in todo}, set(under))
     if as_json:
         print(asked.model_dump_json(indent=1))

@@ -36,6 +36,7 @@ __all__ = [
     "remove_unfinished",
     "set_message",
     "signal_line",
+    "take_handlers_back",
     "take_message",
 ]
 
@@ -174,6 +175,12 @@ def defer_signals() -> Iterator[None]:
         yield
     finally:
         _deferring.discard(section)
+
+
+def take_handlers_back() -> None:
+    """Handle signals again if this process is a command: a library may have set handlers of its own."""
+    if _Received.main:
+        begin(_Received.name)
 
 
 def raise_if_received() -> None:

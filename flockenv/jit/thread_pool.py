@@ -104,7 +104,14 @@ def _work(desk: queue.SimpleQueue[Any]) -> None:
 
 
 _count = 1
-_cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+_cores = cores()
 _pool: _ThreadPool | None = None
 _in_python = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")  # numba itself takes long to import
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Generator, Iterable
 from typing import Protocol
 
@@ -27,16 +26,19 @@ class Engine(Protocol):
         ...
 
 
-def engine_of(name: str, processes: int | None = None) -> Engine:
-    """Return an engine by name; processes: of a local engine (default: one for each core).
+def engine_of(name: str, processes: int | None = None, renew: bool = False) -> Engine:
+    """Return an engine by name.
+
+    processes: of a local engine (default: one for each core). renew: a local engine gives every job a new process.
 
     Raises:
         ValueError: unknown name, or Ray is not installed.
     """
     if name == "local":
+        from flockenv.jit.thread_pool import cores
         from flockenv.jobs.local_engine import LocalEngine
 
-        return LocalEngine(processes or len(os.sched_getaffinity(0)))
+        return LocalEngine(processes or cores(), renew)
     if name == "ray":
         from flockenv.jobs.ray_engine import RayEngine
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import tempfile
 import threading
 from collections import Counter, deque
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from multiprocessing import active_children, get_context, parent_process, resource_tracker
@@ -29,8 +30,8 @@ LOG_END = 300
 class LocalEngine:
     """Runs jobs in a number of processes; 1: in this process, unless renew.
 
-    renew: every job gets a new process. Each process is a pool of its own, so that one that ends takes no other job
-    with it.
+    renew: every job gets a new process. Each process is a pool of its own, so the end of one does not affect the
+    jobs of others.
     """
 
     def __init__(self, processes: int, renew: bool = False) -> None:
@@ -44,7 +45,7 @@ class LocalEngine:
                 yield job, execute(job.function, job.arguments, code_digest())
             return
         _start_tracker()
-        with tempfile.TemporaryDirectory(prefix="flockenv-logs-") as logs:
+        with tempfile.TemporaryDirectory(prefix="flockenv-logs-") as logs, signals.remove_at_end(logs):
             workers: list[_Worker] = []
             try:
                 yield from self._run(deque(jobs), begun, workers, Path(logs))
@@ -76,9 +77,8 @@ class LocalEngine:
                     log = worker.restart()
                     if tries[job.key] < TRIES:
                         waiting.appendleft(job)
-                    else:
-                        yield job, Failure(f"its process was ended from outside {TRIES} times; not enough memory?", log)
-                    continue
+                        continue
+                    record = Failure(f"its process ended {TRIES} times, perhaps for lack of memory", log)
                 if self.renew:
                     worker.restart()
                 yield job, record
@@ -95,17 +95,22 @@ class _Worker:
         return ProcessPoolExecutor(1, get_context("spawn"), _begin_worker, (str(self._log),))
 
     def submit(self, job: Job) -> Future[bytes | Failure]:
-        """Give the process a job; it starts now if it does not run."""
+        """Give the process a job; it starts now if it does not run, or has ended since its last job."""
+        work = functools.partial(_execute_with_log, job.function, job.arguments, code_digest())
         if self._processes:
-            return self._pool.submit(execute, job.function, job.arguments, code_digest())
+            try:
+                return self._pool.submit(work)
+            except BrokenExecutor:
+                self.restart()
         before = active_children()
-        with guard_process_starts():
-            future = self._pool.submit(execute, job.function, job.arguments, code_digest())
-        self._processes = [process for process in active_children() if process not in before]
-        return future
+        try:
+            with guard_process_starts():
+                return self._pool.submit(work)
+        finally:
+            self._processes = [process for process in active_children() if process not in before]
 
     def restart(self) -> str:
-        """Replace a process that has ended; return the end of its output."""
+        """End the process if it runs, and prepare a new one; return the end of its output since its last job began."""
         self.end()
         text = self._log.read_text(errors="replace") if self._log.exists() else ""
         self._log.unlink(missing_ok=True)
@@ -150,6 +155,8 @@ def guard_process_starts() -> Iterator[None]:
 
 def _start_tracker() -> None:
     """Start Python's resource tracker, which removes semaphores that processes leave behind, with warnings off."""
+    if os.name != "posix":
+        return
     before = os.environ.get("PYTHONWARNINGS")
     os.environ["PYTHONWARNINGS"] = "ignore"
     try:
@@ -171,6 +178,12 @@ def _begin_worker(log: str) -> None:
     parent = parent_process()
     if parent is not None:
         threading.Thread(target=_end_with_parent, args=(parent.sentinel,), daemon=True).start()
+
+
+def _execute_with_log(function: Callable[..., bytes], arguments: tuple[Any, ...], code: str) -> bytes | Failure:
+    """Run a job with an empty log, which is this process's standard output."""
+    os.ftruncate(1, 0)
+    return execute(function, arguments, code)
 
 
 def _end_with_parent(sentinel: Any) -> None:

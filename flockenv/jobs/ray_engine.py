@@ -12,6 +12,7 @@ from collections.abc import Callable, Generator, Iterable
 from itertools import islice
 from typing import Any
 
+from flockenv.core import signals
 from flockenv.jobs.engine import TRIES, Begun
 from flockenv.jobs.job import Failure, Job, code_digest, execute
 
@@ -20,31 +21,34 @@ __all__ = ["RayEngine"]
 AHEAD = 2
 """Tasks per core of the cluster that are submitted at a time; the driver holds no more records than that."""
 
+POLL = 0.2
+"""s, after which the driver looks for a signal that has arrived while Ray waits."""
+
 LOG_END = 300
 """Characters of Ray's report on a process that ended."""
 
 
 class RayEngine:
-    """Runs each job as a Ray task with one core; memory: bytes that Ray reserves for each, 0 = none."""
+    """Runs each job as a Ray task with one core."""
 
-    def __init__(self, memory: int = 0) -> None:
-        self._ray, self._memory = _import_ray(), memory
+    def __init__(self) -> None:
+        self._ray = _import_ray()
 
     def run(self, jobs: Iterable[Job], begun: Begun) -> Generator[tuple[Job, bytes | Failure], None, None]:
         """Yield each job with its record or its failure."""
         ray, started = self._ray, self._start()
-        reserved = {"memory": self._memory} if self._memory else {}
-        task = ray.remote(num_cpus=1, max_retries=TRIES - 1, **reserved)(_execute)
+        task = ray.remote(num_cpus=1, max_retries=TRIES - 1)(_execute)
         running: dict[Any, Job] = {}
         waiting, code = iter(jobs), code_digest()
         try:
             while True:
                 for job in islice(waiting, self._room(len(running))):
-                    running[task.remote(job.function, job.arguments, code)] = job
+                    running[task.remote(job.function, job.arguments, code, os.getcwd())] = job
                     begun(job)
                 if not running:
                     return
-                for reference in ray.wait(list(running), num_returns=1)[0]:
+                signals.raise_if_received()
+                for reference in ray.wait(list(running), num_returns=1, timeout=POLL)[0]:
                     yield running.pop(reference), self._result(reference)
         finally:
             for reference in running:
@@ -61,7 +65,10 @@ class RayEngine:
         """Connect to the cluster, or start a local one; return True if this process was not connected before."""
         if self._ray.is_initialized():
             return False
-        self._ray.init(include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
+        address = os.environ.get("RAY_ADDRESS", "local")
+        own = {"include_dashboard": False} if address == "local" else {}
+        self._ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **own)
+        signals.take_handlers_back()  # Ray handles SIGTERM, and would print its own stack
         return True
 
     def _result(self, reference: Any) -> bytes | Failure:
@@ -71,13 +78,17 @@ class RayEngine:
             return self._ray.get(reference)  # type: ignore[no-any-return]
         except errors.RayTaskError as error:
             return Failure(" ".join(str(error.cause or error).split()))
-        except errors.RayError as error:
+        except (errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError) as error:
             return Failure(f"its process or node ended {TRIES} times", " ".join(str(error).split())[-LOG_END:])
+        except errors.RayError as error:
+            return Failure(f"Ray: {type(error).__name__}: {' '.join(str(error).split())[:LOG_END]}")
 
 
-def _execute(function: Callable[..., bytes], arguments: tuple[Any, ...], code: str) -> bytes | Failure:
-    """Run a job in a process of Ray, without the lines that a terminal shows."""
+def _execute(function: Callable[..., bytes], arguments: tuple[Any, ...], code: str, folder: str) -> bytes | Failure:
+    """Run a job in a process of Ray, in the driver's folder if this machine has it, as arguments may name files."""
     os.environ["FLOCKENV_QUIET"] = "1"
+    if os.path.isdir(folder):
+        os.chdir(folder)
     return execute(function, arguments, code)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -23,21 +22,21 @@ class FailedJobsError(ValueError):
 
     def __init__(self, failures: dict[str, Failure], folder: Path) -> None:
         self.failures = failures
+        for failure in failures.values():
+            if failure.trace:
+                self.add_note(failure.trace)  # shown with --debug
         lines = [f"{failure} (job {key})" for key, failure in list(failures.items())[:NAMED]]
-        more = (
-            [f"{len(failures) - NAMED} more, see `flockenv jobs {os.path.relpath(folder)}`"]
-            if len(failures) > NAMED
-            else []
-        )
-        super().__init__("; ".join([*lines, *more]))
+        if len(failures) > NAMED:
+            lines.append(f"{len(failures) - NAMED} more, see `flockenv jobs {_relative(folder)}`")
+        super().__init__("; ".join(lines))
 
 
 @dataclass(frozen=True)
 class Work:
     """Where the records of jobs are stored, what runs the jobs, and how.
 
-    fresh: jobs whose record is stored are also run. progress: called with the number of jobs done, of all jobs, and the
-    name of the last one.
+    fresh: jobs whose record is stored are also run. progress: called with the number of jobs that have ended, the
+    number of all jobs, and the name and the outcome of the last one.
     """
 
     store: Store
@@ -54,20 +53,16 @@ def run_jobs(jobs: Sequence[Job], work: Work) -> None:
     """
     store = work.store
     missing = [job for job in jobs if work.fresh or not store.has(job)]
-    state = State(store.folder, [job.key for job in jobs])
+    state = State(store.folder, _command(jobs), [job.key for job in jobs])
     state.done |= {job.key for job in jobs} - {job.key for job in missing}
     work.progress(len(jobs) - len(missing), len(jobs), "")
     failures: dict[str, Failure] = {}
-
-    def begin(job: Job) -> None:
-        state.running.add(job.key)
-        state.write()
 
     state.write(force=True)
     if not missing:
         return
     try:
-        with closing(work.engine.run(missing, begin)) as results:
+        with closing(work.engine.run(missing, lambda job: state.begin(job.key))) as results:
             for done, (job, record) in enumerate(results, len(jobs) - len(missing) + 1):
                 if isinstance(record, Failure):
                     failures[job.key] = record
@@ -75,9 +70,19 @@ def run_jobs(jobs: Sequence[Job], work: Work) -> None:
                 else:
                     store.write(job, record)
                     state.finish(job.key)
-                work.progress(done, len(jobs), job.name)
+                work.progress(done, len(jobs), f"{job.name}: {'failed' if job.key in failures else 'done'}")
     finally:
-        state.running.clear()
-        state.write(force=True)
+        state.stop()
     if failures:
         raise FailedJobsError(failures, store.folder)
+
+
+def _relative(folder: Path) -> Path:
+    """Return a folder, relative to the current one if it is below it."""
+    here, full = Path.cwd().resolve(), folder.resolve()
+    return full.relative_to(here) if full.is_relative_to(here) else folder
+
+
+def _command(jobs: Sequence[Job]) -> str:
+    """Return the first word of the jobs' names: "transfer" of transfer-clock/round-1."""
+    return jobs[0].name.split("/")[0].split("-")[0] if jobs else "none"

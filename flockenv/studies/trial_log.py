@@ -6,9 +6,11 @@ are run this way. An error that a case raises is its verdict: a scene that is re
 
 from __future__ import annotations
 
+import importlib
 import math
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any, Literal
@@ -17,6 +19,8 @@ from pydantic import Field
 
 from flockenv.core.errors import nearest_few, printable
 from flockenv.core.record import ResultRecord
+from flockenv.jobs import Engine, Failure, Job
+from flockenv.jobs.local_engine import LocalEngine
 from flockenv.model.divergence import SimulationDiverged
 
 __all__ = ["VERDICTS", "Case", "Finding", "Results", "Value", "Verdict", "run", "select_cases", "trials"]
@@ -50,7 +54,10 @@ class Value:
 
 @dataclass(frozen=True)
 class Case:
-    """A test case: its name, what happens in it, its bound, and a function that runs it under a method or model."""
+    """A test case: its name, what happens in it, its bound, and a function that runs it under a method or model.
+
+    Other processes find a case by its name in CASES of the package in which its trial is defined.
+    """
 
     name: str
     title: str
@@ -58,6 +65,9 @@ class Case:
     trial: Callable[[Any], Value]
     only: tuple[str, ...] = ()
     """Names of the methods or models that it is run under (default: all)."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _find_case, (self.trial.__module__.rpartition(".")[0], self.name)
 
     def runs_under(self, name: str) -> bool:
         """Return True if the case is run under this method or model."""
@@ -145,27 +155,55 @@ def run(
     progress: Callable[[int], None] = lambda done: None,
     keep: Callable[[Results], None] = lambda results: None,
     warning_kinds: tuple[type[Warning], ...] = (),
+    engine: Engine | None = None,
 ) -> Results:
     """Run every case under every method or model in `unders`, by name; return these findings with the known ones.
 
     A case with names in `only` is run under no others. `warning_kinds` lead to the verdict "warned".
     Known findings from the same sources are kept and not run again; those from other sources are dropped. `progress`
     is called with the number done, `keep` with all findings after each trial, so an interrupted run loses nothing.
+    engine: runs the trials as jobs (default: one after another in this process).
+
+    Raises:
+        RuntimeError: a trial raises an error that is no verdict, or its process ends in every attempt.
     """
     found = {(f.case, f.under): f for f in known.findings} if known and known.sources == sources else {}
     place = {case.name: k for k, case in enumerate(cases)}
+    order = {name: k for k, name in enumerate(dict.fromkeys([*(under for _, under in found), *unders]))}
 
     def results_so_far() -> Results:
-        ordered = sorted(found.values(), key=lambda f: (place.get(f.case, len(place)), f.case))
-        return Results(findings=tuple(ordered), sources=sources)
+        def position(finding: Finding) -> tuple[int, str, int]:
+            return place.get(finding.case, len(place)), finding.case, order[finding.under]
+
+        return Results(findings=tuple(sorted(found.values(), key=position)), sources=sources)
 
     pairs = [(name, case) for name in unders for case in cases if case.runs_under(name)]
-    for done, (name, case) in enumerate(pairs):
-        progress(done)
-        if (case.name, name) not in found:
-            found[case.name, name] = _try_case(case, name, unders[name], warning_kinds)
+    jobs = [
+        Job(f"{case.name} under {name}", _try_as_job, (case, name, unders[name], warning_kinds), [case.name, name])
+        for name, case in pairs if (case.name, name) not in found
+    ]  # fmt: skip
+    stored = len(pairs) - len(jobs)
+    progress(stored)
+    with closing((engine or LocalEngine(1)).run(jobs, lambda job: None)) as results:
+        for done, (job, record) in enumerate(results, stored + 1):
+            if isinstance(record, Failure):
+                raise RuntimeError(f"{job.name}: {record}")
+            finding = Finding.model_validate_json(record)
+            found[finding.case, finding.under] = finding
             keep(results_so_far())
+            progress(done)
     return results_so_far()
+
+
+def _find_case(package: str, name: str) -> Case:
+    """Return a case of a package by its name."""
+    cases: tuple[Case, ...] = importlib.import_module(package).CASES
+    return next(case for case in cases if case.name == name)
+
+
+def _try_as_job(case: Case, name: str, argument: Any, warning_kinds: tuple[type[Warning], ...]) -> bytes:
+    """Return the finding of one case under one method or model as JSON."""
+    return _try_case(case, name, argument, warning_kinds).model_dump_json().encode()
 
 
 def _try_case(case: Case, name: str, argument: Any, warning_kinds: tuple[type[Warning], ...]) -> Finding:

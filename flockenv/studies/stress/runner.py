@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from flockenv.core.warnings import UnsolvedContactsWarning
+from flockenv.jobs import Engine
 from flockenv.physics.integrators import INTEGRATORS, Integrator
 from flockenv.studies import sources, trial_log
 from flockenv.studies.sources import SIMULATOR
@@ -33,6 +34,7 @@ def run(
     known: Results | None = None,
     progress: Callable[[int], None] = lambda done: None,
     keep: Callable[[Results], None] = lambda results: None,
+    engine: Engine | None = None,
 ) -> Results:
     """Run every case under every method, and return the findings with the known ones; see `trial_log.run`."""
-    return trial_log.run(cases, {m.kind: m for m in methods}, fingerprint(), known, progress, keep, TOLD)
+    return trial_log.run(cases, {m.kind: m for m in methods}, fingerprint(), known, progress, keep, TOLD, engine)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from flockenv.jobs import Engine
 from flockenv.studies import sources, trial_log
 from flockenv.studies.sources import SIMULATOR
 from flockenv.studies.trial_log import Case, Results
@@ -23,7 +24,8 @@ def run(
     known: Results | None = None,
     progress: Callable[[int], None] = lambda done: None,
     keep: Callable[[Results], None] = lambda results: None,
+    engine: Engine | None = None,
 ) -> Results:
     """Run every case with every preset, and return the findings with the known ones; see `trial_log.run`."""
     with ignore_contact_warnings():
-        return trial_log.run(cases, {name: name for name in presets}, fingerprint(), known, progress, keep)
+        return trial_log.run(cases, {name: name for name in presets}, fingerprint(), known, progress, keep, (), engine)
