@@ -19,6 +19,7 @@ from flockenv.physics.constraints import Collisions
 from flockenv.physics.effects import Attraction, Drag, Gravity, Springs, Tether
 from flockenv.physics.population import Drain
 from flockenv.scene import Group, Scene
+from flockenv.scene.yaml_io import load_scene
 
 Array = NDArray[np.float64]
 HERE = (Group(count=3, spawn=Spawn(low=(0, 0), high=(1, 1))),)
@@ -176,3 +177,15 @@ def test_a_scene_far_from_the_origin_moves_the_same_in_double_precision(scene: A
     assert np.abs(near.pos - start.pos).max() > 0.05 * size
     np.testing.assert_allclose(far.pos - (offset, -offset), near.pos, atol=1e-6 * size)
     np.testing.assert_allclose(far.vel, near.vel, atol=1e-6 * np.abs(near.vel).max())
+
+
+def test_the_smallest_agent_of_a_spread_decides() -> None:
+    text = """
+groups: [{count: 5, radius: {low: 1.0e-6, high: 1.0}, spawn: {low: [0, 0], high: [9, 9]}}]
+obstacles: [{kind: wall, vertices: [[-9.0e+8, -1], [9.0e+8, -1]]}]
+effects: [{kind: gravity}]
+dt: 0.01
+"""
+    with pytest.raises(ValueError, match="up to 1000 m from the origin"):
+        load_scene(text)
+    load_scene(text.replace("9.0e+8", "900"))

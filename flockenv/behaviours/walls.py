@@ -160,7 +160,7 @@ class Contain(Moving):
 
     kind: Literal["contain"] = "contain"
     within: AnyShape = Field(
-        description="a circle (or sphere), a block, a polygon; whole bodies stay inside, but for about max_speed dt / 2"
+        description="a circle (or sphere), a block, a polygon; bodies may protrude by about max_speed dt / 2"
     )
     time: float = Field(default=1.0, gt=0, description="s, look-ahead time")
     tabled: ClassVar[bool] = True

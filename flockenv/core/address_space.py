@@ -27,7 +27,7 @@ LOADING = 32 * 2**20
 TORCH = 720 * 2**20
 """Bytes that torch, Stable-Baselines3 and what they import need: 690 MiB."""
 
-IN_USE = "beside those in use"
+IN_USE = "in addition to what is in use"
 """The end of a purpose: the bytes are needed in addition."""
 
 TRAINING = 300 * 2**20 + 72 * 2**20 * (os.cpu_count() or 1)
@@ -47,7 +47,7 @@ def require(command: str) -> None:
 def require_room(purpose: str, needed: int) -> None:
     """Raise MemoryError, in one line, unless `needed` bytes of address space are left.
 
-    purpose: what they are needed for, as the end of the line: "to compile a kernel, beside those in use".
+    purpose: what they are needed for, as the end of the line: "to compile a kernel, in addition to what is in use".
     """
     if os.name != "posix":
         return

@@ -4,8 +4,8 @@ The circles may differ from world to world; the other shapes are those that are 
 hollow. They are placed where they are at the time of the stage.
 
 If there are many shapes of a form, each agent looks up those that may lie within reach in a grid (shapes/cells.py), in
-the order in which they are listed. So does it with circles, if those of the state are where the scene has them. That is
-the order of a loop over all shapes, and a law ignores shapes out of reach: so results are the same bits.
+the order in which they are listed. Circles have a grid too, if those of the state are where the scene has them. Both
+keep the order of a loop over all shapes, and a law ignores shapes out of reach: so results are the same bits.
 """
 
 from __future__ import annotations

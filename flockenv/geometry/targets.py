@@ -229,7 +229,7 @@ def _is_beside(table: Any, at: Any, x: Vec) -> bool:
 def way_out(table: Any, at: Any, side: float, step: Vec) -> Vec:
     """Return the direction, of any length, in which an agent goes on that has reached a target with its last `step`.
 
-    It is that of the step; but straight out of a door, if the step led back to its approach side.
+    It is the direction of the step, or straight out of the door if the step led back to the approach side.
     """
     o, u, v = like(side, 0.0), table[at + 2], table[at + 3]
     back = side * (u * step[1] - v * step[0])

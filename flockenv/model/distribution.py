@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from flockenv.core.record import Record
 
-__all__ = ["Spread", "draw", "largest"]
+__all__ = ["Spread", "draw", "largest", "smallest"]
 
 MOST = 10_000_000
 """Most agents for which numbers are drawn to find the largest: larger groups are rejected elsewhere."""
@@ -68,6 +68,13 @@ def draw(value: float | Spread, count: int, channel: int) -> NDArray[np.float64]
     if not isinstance(value, Spread):
         return np.full(count, float(value))
     return value.at(np.random.default_rng([value.seed, channel]).random(count))
+
+
+def smallest(value: float | Spread, count: int, channel: int) -> float:
+    """Return the lower bound of the numbers: that of the spread or, if it is 0, the smallest number drawn."""
+    if not isinstance(value, Spread):
+        return float(value)
+    return value.least if value.least > 0 else float(draw(value, min(count, MOST), channel).min())
 
 
 def largest(value: float | Spread, count: int, channel: int) -> float:

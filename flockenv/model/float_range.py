@@ -32,12 +32,12 @@ def check_places(scene: SceneView) -> None:
         reason = f"float32 tells places apart up to {FARTHEST:,.0f} m from the origin; use dtype = float64"
         _check_distances(chain(_places(scene), _surfaces(scene)), FARTHEST, reason)
         return
-    radius = min((group.widest for group in scene.groups if group.widest > 0), default=0.0)
+    radius = min((group.narrowest for group in scene.groups if group.narrowest > 0), default=0.0)
     most = FARTHEST_PER_RADIUS * (radius or 1.0)
     whose = f"{FARTHEST_PER_RADIUS:g} times the smallest radius, {radius:g} m" if radius else "for agents of radius 0"
     reason = (
         f"float64 computes accurate distances to shapes up to {most:g} m from the origin ({whose}); use nearer points, "
-        "for an endless wall those of a half_space"
+        "or a half_space for an endless wall"
     )
     _check_distances(_surfaces(scene), most, reason)
 

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from flockenv.core.record import Record
 from flockenv.model.appearance import Appearance
-from flockenv.model.distribution import Spread, draw, largest
+from flockenv.model.distribution import Spread, draw, largest, smallest
 from flockenv.model.networks import AnyNetwork
 from flockenv.model.spawn import Spawn
 
@@ -116,6 +116,11 @@ class Group(Record):
         if self.haste is not None:
             return self.haste * self.desired_speeds
         return np.full(self.size, math.inf if self.max_speed is None else self.max_speed)
+
+    @property
+    def narrowest(self) -> float:
+        """The smallest radius, m."""
+        return smallest(self.radius, self.size, SIZE)
 
     @property
     def widest(self) -> float:

@@ -28,7 +28,7 @@ ONE_PROCESS = "An interval covers the rounds of this process; in another one a c
 REMARKS = {
     "level": "level: the interval contains 0.",
     "not measurable": "not measurable: the step took longer without the effect. Each variant of a step is compiled by "
-    "itself, and where the compiler puts its code changes its time by more than the effect costs.",
+    "itself, and the place of its code in memory changes its time by more than the effect costs.",
 }
 
 
