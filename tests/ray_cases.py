@@ -116,7 +116,7 @@ def a_killed_node_loses_nothing() -> None:
 
         run_jobs(jobs, Work(Store(Path("jobs")), RayEngine(), progress=end_node))
     assert [Store(Path("jobs")).read(job, bytes) for job in jobs] == [bytes([k]) for k in range(12)]
-    assert sorted(written[1:]) == sorted(job.name for job in jobs) and not workers
+    assert sorted(written[1:]) == sorted(f"{job.name}: done" for job in jobs) and not workers
 
 
 def memory_of_the_driver_does_not_grow_with_the_number_of_jobs() -> None:
