@@ -23,7 +23,7 @@ import flockenv
 from agents import report
 from agents.experiment import CONFIGS, Experiment, load_experiment
 from agents.play import Player, episodes_of_bytes, play_job, players_in_order, players_of, usual_players
-from flockenv.cli.jobs import EngineName, Fresh, Processes
+from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes
 from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import nearest, printable
@@ -38,14 +38,12 @@ from flockenv.tasks import TASKS, Task
 
 __all__ = [
     "JOBS",
-    "STOPPED",
     "app",
     "compare",
     "experiment_of",
     "folder_of",
     "in_turn",
     "pick",
-    "processes_for",
     "provenance",
     "split",
     "write_text",
@@ -59,7 +57,6 @@ PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "pettingzoo")
 FILES = ("results.json", "table.md", "comparison.png", "replay.html")
 JOBS = "jobs"
 """Folder of the jobs' records, in the results folder."""
-STOPPED = "interrupted; what was played is stored, run the same command to continue"
 ROOM = 2**24
 """Bytes that all files take, approximately."""
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
@@ -82,6 +79,10 @@ def compare(
     Raises:
         ValueError: a player cannot be loaded (before any episode), or jobs fail while playing; one line.
     """
+    if work is None:
+        with TemporaryDirectory(prefix="flockenv-jobs-") as folder:
+            work = Work(Store(Path(folder)), LocalEngine(1))
+            return compare(tasks, players, worlds, seed, resamples, trust_pickle, work)
     began = perf_counter()
     first = worlds_for("evaluation", seed, worlds)
     fields = players_of(tasks, players)
@@ -93,16 +94,14 @@ def compare(
         (task.name, player.name): play_job("compare", task, player, worlds, seed, RECORDED, trust_pickle)
         for task in tasks for player in fields[task.name]
     }  # fmt: skip
-    with TemporaryDirectory(prefix="flockenv-jobs-") as folder:
-        work = work or Work(Store(Path(folder)), LocalEngine(1))
-        run_jobs(in_turn(jobs), work)
-        episodes = {
-            task.name: {
-                player.name: work.store.read(jobs[task.name, player.name], episodes_of_bytes)
-                for player in fields[task.name]
-            }
-            for task in tasks
+    run_jobs(in_turn(jobs), work)
+    episodes = {
+        task.name: {
+            player.name: work.store.read(jobs[task.name, player.name], episodes_of_bytes)
+            for player in fields[task.name]
         }
+        for task in tasks
+    }
     results: report.Results = {
         "seed": seed,
         "worlds": worlds,
@@ -207,18 +206,13 @@ def main(
         if not 2 <= count <= WORLDS_PER_SEED:
             raise ValueError(f"--worlds {count}: must be from 2 to {WORLDS_PER_SEED}")
         resamples = SMOKE_RESAMPLES if smoke else RESAMPLES
-        runner = engine_of(engine, processes_for(count) if processes is None else processes)
+        runner = engine_of(engine, processes, small=count < WORLDS)
         with job_bar() as progress:
             work = Work(Store(folder / JOBS), runner, fresh, progress)
             results, episodes = compare(chosen, field, count, seed, resamples, trust_pickle, work)
         results["smoke"] = smoke
         write_all_or_none(folder, _file_writers(results, episodes))
     _show(results, folder)
-
-
-def processes_for(worlds: int) -> int | None:
-    """Return the number of processes that play a number of worlds: 1 if they are few; None stands for all cores."""
-    return None if worlds >= WORLDS else 1
 
 
 def folder_of(text: str, files: Sequence[str]) -> Path:

@@ -130,7 +130,7 @@ def _play(
 ) -> bytes:
     """Play the worlds; return the episodes as bytes. Raise ValueError if the player has another digest than before."""
     policy = player.policy(task, seed, trust_pickle)
-    if player_digest(player, task, seed) != digest:
+    if _digest(player, policy) != digest:
         raise ValueError(f"player {player.spec!r} has changed since the command began, or differs on this machine")
     with blame(player.name, task):
         return records.to_bytes(rollout(task, policy, worlds, worlds_for("evaluation", seed, worlds), record=record))
@@ -151,8 +151,12 @@ def player_digest(player: Player, task: Task, seed: int) -> str:
 
     These are the Python files in the folder of a Python file, and the card of a weights file.
     """
+    return _digest(player, player.policy(task, seed) if player.spec in NAMES else None)
+
+
+def _digest(player: Player, policy: Policy | None) -> str:
+    """Return the digest of a player; policy: its policy, which only a known name needs."""
     if player.spec in NAMES:
-        policy = player.policy(task, seed)
         weights = (getattr(policy, "card", None) or {}).get("sha256", "")
         return hashlib.sha256(f"{policy!r} {weights}".encode()).hexdigest()
     path, digest = Path(player.spec), hashlib.sha256()

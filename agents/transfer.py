@@ -19,7 +19,6 @@ import typer
 from agents import report, transfer_report
 from agents.compare import (
     JOBS,
-    STOPPED,
     experiment_of,
     folder_of,
     pick,
@@ -30,7 +29,7 @@ from agents.compare import (
 from agents.play import players_in_order, players_of, usual_players
 from agents.transfer_jobs import Plan, clock_of, jobs_by_kernel, read_again, read_cells, round_jobs
 from agents.transfer_report import Setting
-from flockenv.cli.jobs import EngineName, Fresh, Processes
+from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes
 from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import nearest, printable

@@ -92,15 +92,6 @@ class Cell:
     returns: NDArray[np.float64]
     success: NDArray[np.bool_]
 
-    def to_json(self) -> Results:
-        """Return lists from which of_json reads the same bits."""
-        return {"returns": self.returns.tolist(), "success": self.success.tolist()}
-
-    @classmethod
-    def of_json(cls, content: Results) -> Cell:
-        """Return the cell from the lists of to_json."""
-        return cls(np.array(content["returns"], np.float64), np.array(content["success"], np.bool_))
-
 
 @dataclass
 class Clock:

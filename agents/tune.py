@@ -18,7 +18,7 @@ import typer
 from rich.console import Console
 
 from agents.experiment import Experiment, load_experiment, one_line_errors
-from flockenv.cli.jobs import EngineName, Fresh, Processes
+from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes
 from flockenv.cli.terminal import job_bar, run_program
 from flockenv.core.atomic_files import new_folder, replace_file
 from flockenv.core.output_paths import check_room, valid_file, valid_path
@@ -30,7 +30,6 @@ from flockenv.tasks import Task
 
 __all__ = ["app", "search"]
 
-STOPPED = "interrupted; what was played is stored, run the same command to continue"
 ROOM = 2**16
 """Bytes: more than the file takes."""
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import os
 import resource
-import signal
 import sys
 import tempfile
 import time
@@ -24,6 +23,7 @@ from typer.testing import CliRunner
 from agents import compare
 from flockenv.jobs import FailedJobsError, Job, Store, Work, run_jobs
 from flockenv.jobs.ray_engine import RayEngine
+from tests.small_jobs import end_always, end_twice
 
 CLOCKS = ("microseconds_per_decision", "microseconds_single", "wall_time_s", "verdict", "versions", "machine", "git")
 """Keys of results.json that depend on clocks, or on the packages of the environment."""
@@ -35,20 +35,6 @@ def wait_and_return(folder: str, value: int, seconds: float, size: int = 1) -> b
     with open(Path(folder, f"{value}.txt"), "a") as file:
         file.write("ran\n")
     return bytes([value % 256]) * size
-
-
-def end_twice(folder: str) -> bytes:
-    """End the process in the first two attempts."""
-    attempt = len(list(Path(folder).glob("attempt-*")))
-    Path(folder, f"attempt-{attempt}").touch()
-    if attempt < 2:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return b"survived"
-
-
-def end_always() -> bytes:
-    os.kill(os.getpid(), signal.SIGKILL)
-    return b""
 
 
 @contextmanager

@@ -25,6 +25,7 @@ from flockenv.jobs.job import code_digest, execute
 from flockenv.jobs.local_engine import LocalEngine
 from flockenv.jobs.store import State
 from flockenv.model.appearance import Appearance
+from tests.small_jobs import end_always, end_twice
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -42,21 +43,6 @@ def note_and_return(folder: str, value: int) -> bytes:
 
 def fail(value: int) -> bytes:
     raise ValueError(f"{value} is too much")
-
-
-def end_twice(folder: str) -> bytes:
-    """End the process in the first two attempts."""
-    attempt = len(list(Path(folder).glob("attempt-*")))
-    Path(folder, f"attempt-{attempt}").touch()
-    if attempt < 2:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return b"survived"
-
-
-def end_always() -> bytes:
-    print("the last words", flush=True)
-    os.kill(os.getpid(), signal.SIGKILL)
-    return b""
 
 
 def numbers(count: int) -> list[Job]:

@@ -14,7 +14,10 @@ from flockenv.cli.terminal import duration_text, new_console, show_table
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = ["EngineName", "Fresh", "Processes", "jobs"]
+__all__ = ["STOPPED", "EngineName", "Fresh", "Processes", "jobs"]
+
+STOPPED = "interrupted; what was played is stored, run the same command to continue"
+"""The line about an interrupt of a command that stores the records of jobs."""
 
 EngineName = Annotated[
     str, typer.Option(help="local: processes of this machine; ray: a Ray cluster (RAY_ADDRESS), or a local Ray.")

@@ -38,10 +38,10 @@ if TYPE_CHECKING:
     Run = Callable[[Results | None, Callable[[int], None], Callable[[Results], None]], Results]
 
 __all__ = [
+    "FEW",
     "accuracy",
     "experiment",
     "gallery",
-    "processes_for",
     "read_findings",
     "run_trials",
     "stress",
@@ -270,11 +270,6 @@ def read_findings(path: Path | None, what: str, sources: str) -> Results | None:
     return found
 
 
-def processes_for(count: int) -> int | None:
-    """Return the number of processes for some trials: 1 if they are few; None stands for all cores."""
-    return None if count > FEW else 1
-
-
 def run_trials(what: str, count: int, path: Path | None, known: Results | None, run: Run) -> tuple[Results, bool]:
     """Run unknown trials, and write all results after each; return the results, and True if interrupted."""
     found = known
@@ -349,7 +344,7 @@ def stress(
     kinds = [method.kind for method in under]
     known = None if force else read_findings(path, "hard cases", fingerprint())
     count = trials(todo, kinds)
-    runner = engine_of(engine, processes or processes_for(count))
+    runner = engine_of(engine, processes, small=count <= FEW)
     found, stopped = run_trials(
         "hard cases", count, path, known, lambda known, progress, keep: run(todo, under, known, progress, keep, runner)
     )

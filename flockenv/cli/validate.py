@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flockenv.cli.jobs import EngineName, Processes
-from flockenv.cli.studies import processes_for, read_findings, run_trials, write_numbers
+from flockenv.cli.studies import FEW, read_findings, run_trials, write_numbers
 from flockenv.cli.terminal import INTERRUPTED, EarlyEnd, Force, new_console, relative_path, show_table
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def validate(
         return
     known = None if force else read_findings(path, "crowds", fingerprint())
     count = trials(todo, under)
-    runner = engine_of(engine, processes or processes_for(count))
+    runner = engine_of(engine, processes, small=count <= FEW)
     found, stopped = run_trials(
         "crowds", count, path, known, lambda known, progress, keep: run(todo, under, known, progress, keep, runner)
     )

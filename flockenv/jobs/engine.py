@@ -26,10 +26,11 @@ class Engine(Protocol):
         ...
 
 
-def engine_of(name: str, processes: int | None = None, renew: bool = False) -> Engine:
+def engine_of(name: str, processes: int | None = None, small: bool = False, renew: bool = False) -> Engine:
     """Return an engine by name.
 
-    processes: of a local engine (default: one for each core). renew: a local engine gives every job a new process.
+    processes: of a local engine (default: one for each core; 1 if the work is `small`, as processes take long to
+    start). renew: a local engine gives every job a new process.
 
     Raises:
         ValueError: unknown name, or Ray is not installed.
@@ -38,7 +39,7 @@ def engine_of(name: str, processes: int | None = None, renew: bool = False) -> E
         from flockenv.jit.thread_pool import cores
         from flockenv.jobs.local_engine import LocalEngine
 
-        return LocalEngine(processes or cores(), renew)
+        return LocalEngine(processes or (1 if small else cores()), renew)
     if name == "ray":
         from flockenv.jobs.ray_engine import RayEngine
 

@@ -21,7 +21,7 @@ from flockenv.core import signals
 from flockenv.jobs.engine import TRIES, Begun
 from flockenv.jobs.job import Failure, Job, code_digest, execute
 
-__all__ = ["LocalEngine", "announce_parent", "guard_process_starts"]
+__all__ = ["LocalEngine", "guard_process_starts"]
 
 LOG_END = 300
 """Characters of a process's output that a failure quotes."""
@@ -125,7 +125,7 @@ class _Worker:
 
 
 @contextmanager
-def announce_parent() -> Iterator[None]:
+def _announce_parent() -> Iterator[None]:
     """Set the environment so that processes that are started in a block end when this one ends."""
     before = os.environ.get(signals.PARENT)
     os.environ[signals.PARENT] = str(os.getpid())
@@ -141,7 +141,7 @@ def announce_parent() -> Iterator[None]:
 @contextmanager
 def guard_process_starts() -> Iterator[None]:
     """Let processes that are started in a block end with this one and ignore Ctrl-C, by inherited blocked signals."""
-    with announce_parent():
+    with _announce_parent():
         if os.name != "posix":
             yield
             return
