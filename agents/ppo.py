@@ -277,7 +277,8 @@ def _train_from(
     experiment: Experiment, folder: Path, run: Run | None, tensorboard: str | None, saved: Callable[[Run], None]
 ) -> Run:
     task, p, anew = experiment.build(), experiment.ppo, run is None
-    model = build(task, p, tensorboard)
+    with use_thread_count(p.threads):  # the first weights depend on it
+        model = build(task, p, tensorboard)
     if run is not None:
         resume(folder, model, run, p)
     else:

@@ -247,6 +247,21 @@ def test_other_seeds_are_refused_in_one_line(text: str) -> None:
         seeds_of(text)
 
 
+@pytest.mark.slow
+def test_weights_do_not_depend_on_the_threads_that_torch_had_before(tmp_path: Path) -> None:
+    from agents import ppo
+
+    found, before = [], torch.get_num_threads()
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            found.append(ppo.train(PURSUIT, tmp_path / str(threads)).tensors)
+    finally:
+        torch.set_num_threads(before)
+    for name, tensor in found[0].items():
+        np.testing.assert_array_equal(tensor, found[1][name])
+
+
 def _fail(*_: object, **__: object) -> None:
     raise AssertionError("unexpected training")
 
