@@ -15,6 +15,7 @@ import numpy as np
 
 from flockenv.core.errors import printable
 from flockenv.core.warnings import OtherTaskWarning
+from flockenv.envs.world import bytes_per_world, first_step
 from flockenv.evaluation import Episodes, Recording, rollout, worlds_for
 from flockenv.jobs import Job, records
 from flockenv.model.appearance import Appearance
@@ -31,6 +32,9 @@ __all__ = [
 
 NAME = re.compile(r"\w[\w.+-]{0,39}")
 """A player's name becomes a key, a table cell, a label, a file and a piece of HTML."""
+
+PLAYING = 350 * 2**20
+"""Bytes that a process needs to play, besides its worlds: libraries, and compiling a kernel; 180 to 340 MiB."""
 
 KINDS = (Episodes, Recording, Snapshot, Mark, Appearance)
 """The classes in a record of episodes."""
@@ -122,7 +126,8 @@ def play_job(
         "record": record, "player": digest,
     }  # fmt: skip
     arguments = task, player, worlds, seed, record, trust_pickle, digest
-    return Job(f"{kind}/{task.name}/{player.name}", _play, arguments, about)
+    memory = PLAYING + worlds * bytes_per_world(task)
+    return Job(f"{kind}/{task.name}/{player.name}", _play, arguments, about, memory, (first_step, (task,)))
 
 
 def _play(

@@ -10,9 +10,14 @@ from agents.experiment import Experiment
 from agents.ppo import card_of, train
 from agents.run import recipe_of
 from flockenv.core.errors import printable
+from flockenv.envs.world import bytes_per_world, first_step
 from flockenv.jobs import Job, records
+from flockenv.tasks import Task
 
 __all__ = ["file_name", "policy_of_bytes", "seeds_of", "training_job", "with_seed"]
+
+TRAINING = 700 * 2**20
+"""Bytes that a process needs to train, besides worlds and rollout: torch and other libraries, and compiling."""
 
 MOST = 1000
 """Number of training seeds: each has a block of worlds."""
@@ -44,10 +49,22 @@ def training_job(experiment: Experiment, runs: Path, go_on: bool = True) -> Job:
     The record is read by `policy_of_bytes`. The checkpoint is in `runs`, in a folder named by the job's key: another
     recipe or other code begins anew.
     """
-    title = f"{experiment.build().name}/seed-{experiment.ppo.seed}"
-    unplaced = Job(f"ppo/{title}", _train, (), recipe_of(experiment))
+    title, task = f"{experiment.build().name}/seed-{experiment.ppo.seed}", _learned(experiment)
+    unplaced = Job(f"ppo/{title}", _train, (), recipe_of(experiment), _memory(experiment, task), (first_step, (task,)))
     folder = runs / unplaced.key.removeprefix("ppo/").replace("/", "-")
     return replace(unplaced, arguments=(experiment.model_dump_json(), str(folder), go_on))
+
+
+def _learned(experiment: Experiment) -> Task:
+    """Return the task as it is learnt, in the precision of the training worlds."""
+    return experiment.build().model_copy(update={"dtype": experiment.ppo.dtype})
+
+
+def _memory(experiment: Experiment, task: Task) -> int:
+    """Return the memory of a training, bytes: libraries, worlds, and the rollout twice, as minibatches are drawn."""
+    p = experiment.ppo
+    row = 4 * (task.layout.size + task.action_layout.size + 6)  # float32: also rewards, values and the like
+    return TRAINING + p.worlds * (bytes_per_world(task) + 2 * p.rollout * task.learners * row)
 
 
 def file_name(job: Job) -> str:

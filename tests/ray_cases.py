@@ -23,7 +23,7 @@ from typer.testing import CliRunner
 from agents import compare
 from flockenv.jobs import FailedJobsError, Job, Store, Work, run_jobs
 from flockenv.jobs.ray_engine import RayEngine
-from tests.small_jobs import end_always, end_twice
+from tests.small_jobs import blas_threads, end_always, end_twice
 
 CLOCKS = ("microseconds_per_decision", "microseconds_single", "wall_time_s", "verdict", "versions", "machine", "git")
 """Keys of results.json that depend on clocks, or on the packages of the environment."""
@@ -38,9 +38,9 @@ def wait_and_return(folder: str, value: int, seconds: float, size: int = 1) -> b
 
 
 @contextmanager
-def cluster(nodes: int) -> Iterator[Any]:
-    """Connect to a cluster of nodes with one core each, all on this machine."""
-    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+def cluster(nodes: int, cores: int = 1, **more: Any) -> Iterator[Any]:
+    """Connect to a cluster of nodes with one core each, all on this machine; more: arguments of the head."""
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": cores, "include_dashboard": False, **more})
     workers = [made.add_node(num_cpus=1) for _ in range(nodes - 1)]
     ray.init(address=made.address, log_to_driver=False)
     try:
@@ -105,6 +105,53 @@ def a_killed_node_loses_nothing() -> None:
     assert sorted(written[1:]) == sorted(f"{job.name}: done" for job in jobs) and not workers
 
 
+def note_node(folder: str, kernel: int) -> None:
+    """Note in a file that a kernel has been compiled on this node."""
+    with open(Path(folder, f"kernel-{kernel}.txt"), "a") as file:
+        file.write(f"{ray.get_runtime_context().get_node_id()}\n")
+
+
+def see_kernel(folder: str, kernel: int) -> bytes:
+    """Return the nodes on which a kernel has been compiled so far."""
+    return Path(folder, f"kernel-{kernel}.txt").read_bytes()
+
+
+def each_node_is_warmed_once_before_any_job() -> None:
+    """A kernel that more jobs need than there are nodes is compiled on each; an error there fails no job."""
+    here = os.getcwd()
+    jobs = [
+        Job(f"job/{k}", see_kernel, (here, k % 2), k, warm_up=(note_node, (here, k % 2)))
+        for k in range(6)
+    ]  # fmt: skip
+    jobs += [Job(f"rest/{k}", wait_and_return, (here, k, 0.0), k, warm_up=(note_node, (here, 2))) for k in range(2)]
+    jobs += [Job(f"bad/{k}", wait_and_return, (here, k, 0.0), k, warm_up=(end_always, ())) for k in range(3)]
+    with cluster(2):
+        nodes = sorted(node["NodeID"] for node in ray.nodes())
+        run_jobs(jobs, Work(Store(Path("jobs")), RayEngine()))
+    store = Store(Path("jobs"))
+    assert all(sorted(store.read(job, bytes.decode).split()) == nodes for job in jobs[:6])
+    assert all(store.has(job) for job in jobs) and not Path("kernel-2.txt").exists()
+
+
+def a_worker_uses_one_thread_and_a_job_gets_its_memory() -> None:
+    """Ray bounds the threads of a job with one core; a job that needs more memory than any node has runs alone."""
+    jobs = [Job(f"threads/{k}", blas_threads, (), k, memory=(0, 10**6, 10**15)[k]) for k in range(3)]
+    assert [record for _, record in RayEngine().run(jobs, lambda job: None)] == 3 * [b"1"]
+    Path("memory").mkdir()
+    with cluster(1, cores=3, memory=10**9):
+        large = [Job(f"m/{k}", note_and_wait, (os.getcwd(), k), k, memory=6 * 10**8) for k in range(3)]
+        assert [record for _, record in RayEngine().run(large, lambda job: None)] == 3 * [b"1"]
+
+
+def note_and_wait(folder: str, value: int) -> bytes:
+    """Return how many jobs ran while this one did, at most."""
+    with open(Path(folder, "memory", str(value)), "w"):
+        time.sleep(0.5)
+    most = len(list(Path(folder, "memory").iterdir()))
+    Path(folder, "memory", str(value)).unlink()
+    return str(most).encode()
+
+
 def memory_of_the_driver_does_not_grow_with_the_number_of_jobs() -> None:
     """1,000 records of 100 kB: the peak after all of them is that after the first 200, but for 30 MB."""
     peaks = {}
@@ -121,6 +168,8 @@ CASES = (
     results_are_the_same_on_one_node_and_on_two,
     a_killed_worker_loses_nothing,
     a_killed_node_loses_nothing,
+    each_node_is_warmed_once_before_any_job,
+    a_worker_uses_one_thread_and_a_job_gets_its_memory,
     memory_of_the_driver_does_not_grow_with_the_number_of_jobs,
 )
 

@@ -19,13 +19,15 @@ import pytest
 from typer.testing import CliRunner
 
 from flockenv.cli.main import app
+from flockenv.core.available_memory import available_memory
+from flockenv.jit.thread_pool import cores
 from flockenv.jobs import FailedJobsError, Failure, Job, Store, Work, engine_of, records, run_jobs
 from flockenv.jobs import job as job_module
 from flockenv.jobs.job import code_digest, execute
-from flockenv.jobs.local_engine import LocalEngine
+from flockenv.jobs.local_engine import LocalEngine, count_fitting
 from flockenv.jobs.store import State
 from flockenv.model.appearance import Appearance
-from tests.small_jobs import end_always, end_twice
+from tests.small_jobs import blas_threads, end_always, end_twice
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -208,6 +210,63 @@ def test_jobs_that_run_for_long_are_shown_as_running(tmp_path: Path) -> None:
     assert seen == [[jobs[0].key], [jobs[1].key]]
 
 
+# --- threads and memory
+
+
+@pytest.mark.skipif(sys.platform != "linux" or cores() < 2, reason="finds the library in /proc; needs two cores")
+@pytest.mark.parametrize(("processes", "given", "bound"), [(1, None, cores()), (2, None, cores() // 2), (2, "2", 2)])
+def test_a_worker_uses_its_share_of_the_cores_for_blas(
+    processes: int, given: str | None, bound: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if given is not None:
+        monkeypatch.setenv("OMP_NUM_THREADS", given)
+    jobs = [Job(f"threads/{k}", blas_threads, (), k) for k in range(processes)]
+    found = [record for _, record in LocalEngine(processes, renew=True).run(jobs, lambda job: None)]
+    assert found == processes * [str(bound).encode()]
+    assert os.environ.get("OMP_NUM_THREADS") == given
+
+
+def test_fewer_processes_run_if_jobs_would_not_fit_into_memory(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("flockenv.jobs.local_engine.available_memory", lambda: 5 * 10**9)
+    large = [dataclasses.replace(job, memory=2 * 10**9) for job in numbers(4)]
+    sizes = "processes: a job needs about 2 GB, 5 GB are available\n"
+    for jobs, processes, count, text in (
+        (large, 4, 2, f"2 of 4 {sizes}"), (large, 2, 2, ""), (large, 1, 1, ""), (numbers(4), 4, 4, ""),
+        ([dataclasses.replace(job, memory=10**10) for job in numbers(2)], 2, 1, "1 of 2 processes: "),
+    ):  # fmt: skip
+        assert count_fitting(processes, jobs) == count
+        error = capsys.readouterr().err
+        assert error.startswith(text) and bool(error) == bool(text)
+    jobs = [Job(f"pid/{k}", own_process, (), k, memory=3 * 10**9) for k in range(3)]
+    found = {record for _, record in LocalEngine(2).run(jobs, lambda job: None)}
+    assert len(found) == 1 and capsys.readouterr().err.startswith("1 of 2 processes: ")
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_available_memory_is_the_least_of_the_machine_and_of_the_control_groups(version: int, tmp_path: Path) -> None:
+    assert available_memory(tmp_path) is None
+    (tmp_path / "proc/self").mkdir(parents=True)
+    (tmp_path / "proc/meminfo").write_text("MemTotal:  9000 kB\nMemAvailable:    8000 kB\n")
+    assert available_memory(tmp_path) == 8000 * 1024
+    line, top, names = {
+        1: ("4:memory:/job/step", "sys/fs/cgroup/memory", ("memory.limit_in_bytes", "memory.usage_in_bytes")),
+        2: ("0::/job/step", "sys/fs/cgroup", ("memory.max", "memory.current")),
+    }[version]
+    (tmp_path / "proc/self/cgroup").write_text(f"7:pids:/\n{line}\n")
+    groups = ("", "job", "job/step")
+    for group, limit in zip(groups, ("max", "5000000", "6000000"), strict=True):
+        folder = tmp_path / top / group
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in zip(names, (limit, "3000000"), strict=True):
+            (folder / name).write_text(f"{text}\n")
+        (folder / "memory.stat").write_text("inactive_file 1000\ntotal_inactive_file 1000\n")
+    assert available_memory(tmp_path) == 5_000_000 - 3_000_000 + 1000
+
+
 def own_process() -> bytes:
     return str(os.getpid()).encode()
 
@@ -216,7 +275,7 @@ RUN = """
 import sys, time
 from pathlib import Path
 from flockenv.jobs import Job, Store, Work, run_jobs
-from flockenv.jobs.local_engine import LocalEngine
+from flockenv.jobs.local_engine import LocalEngine, count_fitting
 
 def slow(k):
     time.sleep(0.3)

@@ -21,6 +21,8 @@ CASES = (
     "results_are_the_same_on_one_node_and_on_two",
     "a_killed_worker_loses_nothing",
     "a_killed_node_loses_nothing",
+    "each_node_is_warmed_once_before_any_job",
+    "a_worker_uses_one_thread_and_a_job_gets_its_memory",
     "memory_of_the_driver_does_not_grow_with_the_number_of_jobs",
 )
 

@@ -322,6 +322,7 @@ def warmup(
     ] = None,
 ) -> None:
     """Compile the kernels of tasks and scenes in advance, so that the first step is fast; show how long each took."""
+    from flockenv.envs.world import first_step
     from flockenv.jit.progress import compiled_kernels, unapplied_patches
     from flockenv.scene.yaml_io import load_scene
     from flockenv.tasks import TASKS
@@ -338,7 +339,7 @@ def warmup(
             scene = load_scene(Path(name)).model_copy(update=change)
             jobs.append((name, functools.partial(_first_step_of_scene, scene)))
         else:
-            jobs.append((name, functools.partial(_first_step_of_task, TASKS[name](**change))))
+            jobs.append((name, functools.partial(first_step, TASKS[name](**change))))
     rows = []
     with progress_bar("compiling", len(jobs), "kernels") as progress:
         for done, (name, job) in enumerate(jobs):
@@ -356,16 +357,6 @@ def warmup(
             f"numba {numba.__version__}: compiling takes longer, as flockenv leaves out patches that were tested with "
             f"another version: {', '.join(unapplied_patches())}"
         )
-
-
-def _first_step_of_task(task: Task) -> None:
-    import numpy as np
-
-    from flockenv.envs.world import World
-
-    world = World(task)
-    world.reset(0)
-    world.step(np.zeros((1, task.learners, task.action_layout.size)))
 
 
 def _first_step_of_scene(scene: Scene) -> None:

@@ -32,7 +32,7 @@ from flockenv.tasks import Task
 from flockenv.tasks.play import metrics_of, play_of
 from flockenv.tasks.play_plan import REFUSED, Constants, Decision, Near, Results, Totals, WorldArrays
 
-__all__ = ["Step", "World"]
+__all__ = ["Step", "World", "bytes_per_world", "first_step"]
 
 Rows = NDArray[np.float32]
 
@@ -84,7 +84,7 @@ class World:
         if time_limit is not None and (not _is_integer(time_limit) or time_limit < 1):
             raise ValueError(f"time_limit is {time_limit}, must be an integer >= 1 (decisions), or None")
         scene = task.scene
-        bytes_ = worlds * (scene.bytes_per_world() + task.learners * 8 * task.layout.size)
+        bytes_ = worlds * bytes_per_world(task)
         if bytes_ > MEMORY_LIMIT:
             need = f"{bytes_ / 2**30:.3g} GiB, at most {MEMORY_LIMIT / 2**30:g} allowed"
             raise ValueError(f"worlds is {worlds}: needs about {need}")
@@ -434,6 +434,18 @@ class World:
             periodic=self.task.scene.space.periodic, title=type(self.task).__name__,
             outlines=self.task.scene.view.outlines(low, high, float(s.time[world])),
         )  # fmt: skip
+
+
+def bytes_per_world(task: Task) -> int:
+    """Return the memory of one world of a task with its observations, in bytes, before anything is allocated."""
+    return task.scene.bytes_per_world() + task.learners * 8 * task.layout.size
+
+
+def first_step(task: Task) -> None:
+    """Reset and step one world of a task, which compiles its kernels, or loads them from the cache folder."""
+    world = World(task)
+    world.reset(0)
+    world.step(np.zeros((1, world.learners, world.action_size)))
 
 
 @functools.cache

@@ -32,13 +32,16 @@ class Job:
 
     name: path of readable words, "compare/pursuit/rules". function: of a module, found there by its name; it is called
     with `arguments`, which are pickled, and returns the record as bytes. about: all that the record depends on besides
-    the code, the versions and the processor, as JSON.
+    the code, the versions and the processor, as JSON. memory: bytes that its process needs, approximately; 0: unknown.
+    warm_up: a function and its arguments, which compiles the kernels of the job; equal ones are called once per node.
     """
 
     name: str
     function: Callable[..., bytes]
     arguments: tuple[Any, ...]
     about: Any
+    memory: int = 0
+    warm_up: tuple[Callable[..., object], tuple[Any, ...]] | None = None
 
     @functools.cached_property
     def key(self) -> str:

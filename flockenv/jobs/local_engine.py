@@ -5,10 +5,11 @@ from __future__ import annotations
 import functools
 import os
 import signal
+import sys
 import tempfile
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from multiprocessing import active_children, get_context, parent_process, resource_tracker
@@ -18,20 +19,27 @@ from pathlib import Path
 from typing import Any
 
 from flockenv.core import signals
+from flockenv.core.available_memory import available_memory
+from flockenv.jit.thread_pool import cores
 from flockenv.jobs.engine import TRIES, Begun
 from flockenv.jobs.job import Failure, Job, code_digest, execute
 
-__all__ = ["LocalEngine", "guard_process_starts"]
+__all__ = ["LocalEngine", "count_fitting", "guard_process_starts"]
 
 LOG_END = 300
 """Characters of a process's output that a failure quotes."""
+
+BLAS_THREADS = "OMP_NUM_THREADS"
+"""Environment variable that OpenMP, OpenBLAS, MKL and torch read when they are loaded; the first three have variables
+of their own, which go before it."""
 
 
 class LocalEngine:
     """Runs jobs in a number of processes; 1: in this process, unless renew.
 
     renew: every job gets a new process. Each process is a pool of its own, so the end of one does not affect the
-    jobs of others.
+    jobs of others. There are fewer processes if jobs that run together would not fit into the available memory, and
+    each uses its share of the cores for BLAS and OpenMP, unless OMP_NUM_THREADS is set.
     """
 
     def __init__(self, processes: int, renew: bool = False) -> None:
@@ -39,6 +47,8 @@ class LocalEngine:
 
     def run(self, jobs: Iterable[Job], begun: Begun) -> Generator[tuple[Job, bytes | Failure], None, None]:
         """Yield each job with its record or its failure."""
+        jobs = deque(jobs)
+        processes = count_fitting(min(self.processes, len(jobs)), jobs)
         if self.processes == 1 and not self.renew:
             for job in jobs:
                 begun(job)
@@ -48,17 +58,17 @@ class LocalEngine:
         with tempfile.TemporaryDirectory(prefix="flockenv-logs-") as logs, signals.remove_at_end(logs):
             workers: list[_Worker] = []
             try:
-                yield from self._run(deque(jobs), begun, workers, Path(logs))
+                workers += [_Worker(Path(logs, str(k)), max(1, cores() // processes)) for k in range(processes)]
+                yield from self._run(jobs, begun, workers)
             finally:
                 for worker in workers:
                     worker.end()
 
     def _run(
-        self, waiting: deque[Job], begun: Begun, workers: list[_Worker], logs: Path
+        self, waiting: deque[Job], begun: Begun, workers: Sequence[_Worker]
     ) -> Generator[tuple[Job, bytes | Failure], None, None]:
         """Give each free process the next job, until all are done."""
         tries: Counter[str] = Counter()
-        workers += [_Worker(logs / str(k)) for k in range(min(self.processes, len(waiting)))]
         working: dict[Future[bytes | Failure], tuple[Job, _Worker]] = {}
         idle = list(workers)
         while waiting or working:
@@ -85,10 +95,13 @@ class LocalEngine:
 
 
 class _Worker:
-    """A process for jobs, which starts with its first job."""
+    """A process for jobs, which starts with its first job.
 
-    def __init__(self, log: Path) -> None:
-        self._log, self._processes = log, list[BaseProcess]()
+    threads: of BLAS and OpenMP.
+    """
+
+    def __init__(self, log: Path, threads: int) -> None:
+        self._log, self._threads, self._processes = log, threads, list[BaseProcess]()
         self._pool = self._new_pool()
 
     def _new_pool(self) -> ProcessPoolExecutor:
@@ -104,7 +117,7 @@ class _Worker:
                 self.restart()
         before = active_children()
         try:
-            with guard_process_starts():
+            with guard_process_starts(), _environment({BLAS_THREADS: os.environ.get(BLAS_THREADS, str(self._threads))}):
                 return self._pool.submit(work)
         finally:
             self._processes = [process for process in active_children() if process not in before]
@@ -124,24 +137,37 @@ class _Worker:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
 
+def count_fitting(processes: int, jobs: Iterable[Job]) -> int:
+    """Return the number of processes, at least 1, whose jobs fit into the available memory; write a line if reduced."""
+    need, room = max((job.memory for job in jobs), default=0), available_memory()
+    if not need or room is None or need * processes <= room:
+        return processes
+    fitting = max(1, min(processes, room // need))
+    if fitting < processes and sys.stderr is not None:
+        sizes = f"a job needs about {need / 1e9:.2g} GB, {room / 1e9:.2g} GB are available"
+        print(f"{fitting} of {processes} processes: {sizes}", file=sys.stderr, flush=True)
+    return fitting
+
+
 @contextmanager
-def _announce_parent() -> Iterator[None]:
-    """Set the environment so that processes that are started in a block end when this one ends."""
-    before = os.environ.get(signals.PARENT)
-    os.environ[signals.PARENT] = str(os.getpid())
+def _environment(changes: Mapping[str, str]) -> Iterator[None]:
+    """Set environment variables for the processes that are started in a block."""
+    before = {name: os.environ.get(name) for name in changes}
+    os.environ.update(changes)
     try:
         yield
     finally:
-        if before is None:
-            os.environ.pop(signals.PARENT, None)
-        else:
-            os.environ[signals.PARENT] = before
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
 
 
 @contextmanager
 def guard_process_starts() -> Iterator[None]:
     """Let processes that are started in a block end with this one and ignore Ctrl-C, by inherited blocked signals."""
-    with _announce_parent():
+    with _environment({signals.PARENT: str(os.getpid())}):
         if os.name != "posix":
             yield
             return
@@ -157,14 +183,8 @@ def _start_tracker() -> None:
     """Start Python's resource tracker, which removes semaphores that processes leave behind, with warnings off."""
     if os.name != "posix":
         return
-    before = os.environ.get("PYTHONWARNINGS")
-    os.environ["PYTHONWARNINGS"] = "ignore"
-    try:
+    with _environment({"PYTHONWARNINGS": "ignore"}):
         resource_tracker.ensure_running()
-    finally:
-        del os.environ["PYTHONWARNINGS"]
-        if before is not None:
-            os.environ["PYTHONWARNINGS"] = before
 
 
 def _begin_worker(log: str) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable
 from itertools import islice
 from typing import Any
@@ -39,11 +40,14 @@ class RayEngine:
         ray, started = self._ray, self._start()
         task = ray.remote(num_cpus=1, max_retries=TRIES - 1)(_execute)
         running: dict[Any, Job] = {}
-        waiting, code = iter(jobs), code_digest()
+        jobs, code = list(jobs), code_digest()
+        waiting = iter(jobs)
         try:
+            self._warm_up(jobs)
             while True:
                 for job in islice(waiting, self._room(len(running))):
-                    running[task.remote(job.function, job.arguments, code, os.getcwd())] = job
+                    placed = task.options(memory=self._fitting(job.memory)) if job.memory else task
+                    running[placed.remote(job.function, job.arguments, code, os.getcwd())] = job
                     begun(job)
                 if not running:
                     return
@@ -55,6 +59,36 @@ class RayEngine:
                 ray.cancel(reference, force=True)
             if started:
                 ray.shutdown()
+
+    def _warm_up(self, jobs: Iterable[Job]) -> None:
+        """Compile kernels on every node, each kernel in one task, and wait for the end of all tasks.
+
+        These are the kernels that more jobs need than there are nodes: jobs that run at the same time on a node would
+        wait for one compilation. An error is left to the job that meets it again.
+        """
+        ray, nodes = self._ray, [node for node in self._ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
+        counts = Counter(job.warm_up for job in jobs if job.warm_up is not None)
+        task, placed_on = ray.remote(num_cpus=1, max_retries=0)(_call), self._placed_on
+        running = [
+            task.options(scheduling_strategy=placed_on(node["NodeID"])).remote(*warm_up, os.getcwd())
+            for warm_up, count in counts.items() if count > len(nodes) for node in nodes
+        ]  # fmt: skip
+        try:
+            while running:
+                signals.raise_if_received()
+                running = ray.wait(running, num_returns=len(running), timeout=POLL)[1]
+        finally:
+            for reference in running:
+                ray.cancel(reference, force=True)
+
+    def _placed_on(self, node: str) -> Any:
+        """Return the strategy that places a task on a node."""
+        return self._ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(node, soft=False)
+
+    def _fitting(self, memory: int) -> int:
+        """Return the memory of a job, at most that of the largest node, which then runs this job alone."""
+        sizes = [int(node["Resources"].get("memory", 0)) for node in self._ray.nodes() if node["Alive"]]
+        return min(memory, max(sizes, default=memory))
 
     def _room(self, running: int) -> int:
         """Return how many more tasks may be submitted; the cluster may grow and shrink."""
@@ -85,11 +119,22 @@ class RayEngine:
 
 
 def _execute(function: Callable[..., bytes], arguments: tuple[Any, ...], code: str, folder: str) -> bytes | Failure:
-    """Run a job in a process of Ray, in the driver's folder if this machine has it, as arguments may name files."""
+    """Run a job in a process of Ray."""
+    _begin_task(folder)
+    return execute(function, arguments, code)
+
+
+def _call(function: Callable[..., object], arguments: tuple[Any, ...], folder: str) -> None:
+    """Call a function in a process of Ray."""
+    _begin_task(folder)
+    function(*arguments)
+
+
+def _begin_task(folder: str) -> None:
+    """Go to the driver's folder if this machine has it, as arguments may name files; write nothing about kernels."""
     os.environ["FLOCKENV_QUIET"] = "1"
     if os.path.isdir(folder):
         os.chdir(folder)
-    return execute(function, arguments, code)
 
 
 def _import_ray() -> Any:
@@ -97,6 +142,7 @@ def _import_ray() -> Any:
     try:
         import ray  # type: ignore[import-not-found, unused-ignore]
         import ray.exceptions  # type: ignore[import-not-found, unused-ignore]
+        import ray.util.scheduling_strategies  # type: ignore[import-not-found, unused-ignore]
     except ImportError as error:
         raise ValueError(f"--engine ray: {error}; install the extra: pip install 'flockenv[ray]'") from None
     return ray
