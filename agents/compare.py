@@ -23,7 +23,7 @@ import flockenv
 from agents import report
 from agents.experiment import CONFIGS, Experiment, load_experiment
 from agents.play import Player, episodes_of_bytes, play_job, players_in_order, players_of, usual_players
-from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes
+from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
 from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import nearest, printable
@@ -191,6 +191,7 @@ def main(
     engine: EngineName = "local",
     processes: Processes = None,
     fresh: Fresh = False,
+    shard: ShardText = None,
     smoke: Annotated[bool, typer.Option("--smoke", help=f"A quick look: {SMOKE_WORLDS} worlds.")] = False,
     trust_pickle: Annotated[
         bool, typer.Option("--trust-pickle", help="Also load Stable-Baselines3 zips, which executes the code in them.")
@@ -198,7 +199,7 @@ def main(
     debug: Annotated[bool, typer.Option("--debug", help="Show a traceback if something goes wrong.")] = False,
 ) -> None:
     """Play all tasks with all players in the same worlds, and compare their scores."""
-    with report_errors("compare", STOPPED, debug):
+    with report_errors("compare", STOPPED, debug), end_of_shard():
         folder = folder_of(out, FILES)
         chosen = [experiment_of(name).build() for name in pick("--tasks", split(tasks) or list(TASKS), TASKS)]
         field = players_in_order(split(players) or usual_players(chosen))
@@ -206,9 +207,9 @@ def main(
         if not 2 <= count <= WORLDS_PER_SEED:
             raise ValueError(f"--worlds {count}: must be from 2 to {WORLDS_PER_SEED}")
         resamples = SMOKE_RESAMPLES if smoke else RESAMPLES
-        runner = engine_of(engine, processes, small=count < WORLDS)
+        runner, part = engine_of(engine, processes, small=count < WORLDS), shard_of(shard)
         with job_bar() as progress:
-            work = Work(Store(folder / JOBS), runner, fresh, progress)
+            work = Work(Store(folder / JOBS), runner, fresh, progress, part)
             results, episodes = compare(chosen, field, count, seed, resamples, trust_pickle, work)
         results["smoke"] = smoke
         write_all_or_none(folder, _file_writers(results, episodes))

@@ -1,9 +1,10 @@
 """Learning curves of several settings, side by side: `python -m agents.curves configs/training/obstacles.yaml ...`.
 
-A config may list further settings (`curves: {name: differences}`). Each is trained as by agents.ppo, into
-RUNS/TASK/NAME, one after the other, so that wall times are comparable. A finished training is not repeated, an
-interrupted one continues, and one of another recipe starts again. The picture shows the mean return on the tuning
-worlds over wall time, s, with the tuned rules as a line: so it shows which setting learns fastest on this machine.
+A config may list further settings (`curves: {name: differences}`). Each is trained as by agents.ppo, as a job in a
+process of its own; by default one after the other, so that wall times are comparable. A finished training is not
+repeated, an interrupted one continues, and one of another recipe, other code or another number of trainings at a time
+begins anew. The picture shows the mean return on the tuning worlds over wall time, s, with the tuned rules as a line:
+so it shows which setting learns fastest on this machine.
 """
 
 from __future__ import annotations
@@ -17,10 +18,13 @@ import typer
 from rich.console import Console
 
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors
-from flockenv.cli.terminal import report_errors, run_program
+from agents.run import expected_bytes
+from flockenv.cli.jobs import EngineName, Fresh, ShardText, end_of_shard, shard_of
+from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import replace_file, write_all_or_none
 from flockenv.core.output_paths import check_room, valid_file, valid_path
 from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK
+from flockenv.jobs import Job, Store, Work, engine_of, run_jobs
 from flockenv.players.rules import load_tuned
 
 if TYPE_CHECKING:
@@ -33,6 +37,10 @@ console = Console(stderr=True, soft_wrap=True)
 
 ROOM = 2**20
 """Largest size of a picture, bytes."""
+
+SEEDS = "One seed each; policies play without noise."
+NOTE = f"{SEEDS} One training at a time."
+STOPPED = "interrupted; checkpoints and finished trainings are stored, the same command goes on"
 
 Curve = list[dict[str, float]]
 Numbers = Mapping[str, Any]
@@ -56,37 +64,39 @@ def label(name: str, p: PpoSettings) -> str:
     return f"{name}: {p.epochs} epoch{'s' * (p.epochs > 1)}, minibatch {p.minibatch:,}, rate {p.learning_rate:g}"
 
 
-def learning_curve(experiment: Experiment, name: str, runs: Path) -> Curve:
-    """Return the curve of one setting, from its checkpoint if training is finished; otherwise train it to the end."""
-    from agents import ppo  # with torch
-    from agents.run import OtherRecipe, load_checkpoint
+def curve_jobs(
+    experiments: Mapping[str, Experiment], runs: Path, at_a_time: int | str, go_on: bool
+) -> dict[tuple[str, str], Job]:
+    """Return the trainings by task and setting; at_a_time, go_on: as of `training_job`."""
+    from agents.training_job import training_job  # with torch
 
-    p = experiment.settings()[name]
-    wanted, folder = experiment.model_copy(update={"ppo": p}), runs / experiment.task / name
-    run, how = None, "begins"
-    try:
-        run = load_checkpoint(wanted, folder)
-    except OtherRecipe as other:
-        how = f"begins anew ({other})"
-    if run is None or run.steps < p.steps:
-        how = f"goes on after {run.steps:,} steps" if run is not None else how
-        console.print(f"{experiment.task}, {label(name, p)}: {how}", markup=False, highlight=False)
-        run = ppo.train(wanted, folder, go_on=run is not None)
-    return run.curve
+    return {
+        (task, name): training_job(
+            experiment.model_copy(update={"ppo": p}), runs, go_on, f"curves/{task}/{name.replace(' ', '-')}", at_a_time
+        )
+        for task, experiment in experiments.items() for name, p in experiment.settings().items()
+    }  # fmt: skip
 
 
-def measure_task(experiment: Experiment, runs: Path) -> Numbers:
-    """Return the results of a task, once all of its settings are trained."""
+def task_numbers(experiment: Experiment, curves: Mapping[str, Curve]) -> Numbers:
+    """Return the results of a task from the curves of its settings."""
     rules = load_tuned(experiment.task).found.get("tuning_mean")
     rows = {}
     for name, p in experiment.settings().items():
-        curve = learning_curve(experiment, name, runs)
-        past = next((point["seconds"] for point in curve if rules is not None and point["mean"] > rules), None)
-        rows[name] = {"ppo": p.model_dump(mode="json"), "past_the_rules_s": past, "curve": curve}
+        past = next((point["seconds"] for point in curves[name] if rules is not None and point["mean"] > rules), None)
+        rows[name] = {"ppo": p.model_dump(mode="json"), "past_the_rules_s": past, "curve": curves[name]}
     return {"rules": rules, "settings": rows}
 
 
-def draw(path: Path, tasks: Mapping[str, Numbers], note: str = "One seed each; policies play without noise.") -> None:
+def note_of(at_a_time: int | str) -> str:
+    """Return the note of the picture: how many trainings ran at a time, and whether wall times are comparable."""
+    if at_a_time == 1:
+        return NOTE
+    together = "one per core of a Ray cluster" if at_a_time == "ray" else f"up to {at_a_time}"
+    return f"{SEEDS} Trainings at a time: {together}; wall times are comparable only with one thread and core for each."
+
+
+def draw(path: Path, tasks: Mapping[str, Numbers], note: str = NOTE) -> None:
     """Write the picture: for each task the mean return of the rules, and the curve of each setting."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -133,18 +143,40 @@ def main(
     configs: Annotated[list[Path], typer.Argument(help="experiments, such as configs/training/obstacles.yaml")],
     out: Annotated[str, typer.Option(help="picture; numbers are written beside it")] = "results/learning.png",
     runs: Annotated[Path, typer.Option(help="folder of checkpoints")] = Path("runs/curves"),
+    jobs: Annotated[Path, typer.Option(help="folder for the records of jobs")] = Path("results/jobs"),
+    engine: EngineName = "local",
+    processes: Annotated[
+        int,
+        typer.Option(
+            min=1, max=256, help="trainings at a time; more than 1 slow each other down, unless each has one thread"
+        ),
+    ] = 1,
+    fresh: Fresh = False,
+    shard: ShardText = None,
 ) -> None:
-    """Train several settings of each task, and draw their learning curves side by side."""
+    """Train several settings of each task, one after the other, and draw their learning curves side by side."""
     with one_line_errors():
         picture = valid_file(out, (".png",), force=True, beside=".json")
-        folder = valid_path(str(runs), "--runs")
+        folder, store = valid_path(str(runs), "--runs"), Store(valid_path(str(jobs), "--jobs"))
         experiments = experiments_of(configs)
         check_room(picture, ROOM)
-    stays = f"interrupted; what is trained stays in {runs}, the same command goes on"
-    with report_errors("curves", stays), one_line_errors((FloatingPointError,)):
-        tasks = {task: measure_task(experiment, folder) for task, experiment in experiments.items()}
+        for experiment in experiments.values():
+            check_room(folder / "checkpoint", expected_bytes(experiment))
+        runner, part = engine_of(engine, processes, renew=True), shard_of(shard)
+    from agents.training_job import policy_of_bytes  # with torch
+
+    at_a_time = processes if engine == "local" else engine
+    trainings = curve_jobs(experiments, folder, at_a_time, not fresh)
+    with report_errors("curves", STOPPED), end_of_shard():
+        with job_bar("training") as progress:
+            run_jobs(list(trainings.values()), Work(store, runner, fresh, progress, part))
+        curves = {key: store.read(job, policy_of_bytes)[1]["curve"] for key, job in trainings.items()}
+        tasks = {
+            task: task_numbers(experiment, {name: curve for (of, name), curve in curves.items() if of == task})
+            for task, experiment in experiments.items()
+        }
         write_all_or_none(picture.parent, {
-            picture.name: lambda path: draw(path, tasks),
+            picture.name: lambda path: draw(path, tasks, note_of(at_a_time)),
             picture.with_suffix(".json").name: lambda path: path.write_bytes(json.dumps(tasks).encode()),
         })  # fmt: skip
     for task, numbers in tasks.items():

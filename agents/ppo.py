@@ -38,7 +38,7 @@ from agents.learning_env import ForLearning
 from agents.run import Run, expected_bytes, load_checkpoint, recipe_of, save_checkpoint
 from agents.team_credit import CaringBuffer
 from agents.training_state import capture, restore, surroundings
-from flockenv.cli.jobs import EngineName, Fresh, Processes
+from flockenv.cli.jobs import EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
 from flockenv.cli.terminal import DIVERGED, handle_interrupt, job_bar, run_program, show_progress
 from flockenv.core import signals
 from flockenv.core.address_space import IN_USE, TRAINING, require_room
@@ -46,7 +46,7 @@ from flockenv.core.output_paths import check_room, valid_file, valid_path
 from flockenv.envs.sb3 import WorldVecEnv
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.jit.thread_pool import threads, use_threads
-from flockenv.jobs import Engine, Store, Work, engine_of, run_jobs
+from flockenv.jobs import Store, Work, engine_of, run_jobs
 from flockenv.players import WEIGHTS
 from flockenv.players.policy import MlpPolicy, describe, save_policy
 from flockenv.players.rules import player
@@ -357,6 +357,7 @@ def main(
     engine: EngineName = "local",
     processes: Processes = None,
     fresh: Fresh = False,
+    shard: ShardText = None,
 ) -> None:
     """Train a policy with PPO and export its weights."""
     with one_line_errors():
@@ -367,9 +368,13 @@ def main(
         if seeds is not None:
             if seed is not None or go_on or tensorboard is not None:
                 raise ValueError("--seeds: not together with --seed, --resume or --tensorboard; it resumes by itself")
-            runner = engine_of(engine, processes, renew=True)
-            _train_seeds(experiment, seeds, out or Path("results/ppo"), runs, runner, fresh)
+            folder = valid_path(str(out or "results/ppo"))
+            work = Work(Store(folder / "jobs"), engine_of(engine, processes, renew=True), fresh, shard=shard_of(shard))
+            with end_of_shard():
+                _train_seeds(experiment, seeds, folder, valid_path(str(runs), "--runs"), work)
             return
+        if shard is not None:
+            raise ValueError("--shard: needs --seeds, whose trainings are jobs")
         target = WEIGHTS / f"{name}.safetensors" if out is None else valid_file(str(out), (".safetensors",), True)
         folder = valid_path(str(runs / name), "--runs")
         _check_outputs(experiment, target, folder, tensorboard)
@@ -389,22 +394,21 @@ def main(
     console.print(f"{target}: {best} after {run.steps:,} steps, {run.wall:.0f} s")
 
 
-def _train_seeds(experiment: Experiment, text: str, out: Path, runs: Path, engine: Engine, fresh: bool) -> None:
+def _train_seeds(experiment: Experiment, text: str, folder: Path, runs: Path, work: Work) -> None:
     """Train with several seeds as jobs, and write the policy of each that has ended."""
     from agents.training_job import file_name, policy_of_bytes, seeds_of, training_job, with_seed
 
-    folder, checkpoints = valid_path(str(out)), valid_path(str(runs), "--runs")
-    for path in (folder / "policy", checkpoints / "checkpoint"):
+    for path in (folder / "policy", runs / "checkpoint"):
         check_room(path, expected_bytes(experiment))
-    jobs = [training_job(with_seed(experiment, seed), checkpoints, not fresh) for seed in seeds_of(text)]
-    store = Store(folder / "jobs")
+    jobs = [training_job(with_seed(experiment, seed), runs, not work.fresh) for seed in seeds_of(text)]
     interrupted = "interrupted; checkpoints and finished trainings are stored, run the same command to continue"
     with handle_interrupt(interrupted), job_bar("training") as progress:
         try:
-            run_jobs(jobs, Work(store, engine, fresh, progress))
+            run_jobs(jobs, replace(work, progress=progress))
         finally:
-            for job in filter(store.has, jobs):
-                tensors, card = store.read(job, policy_of_bytes)
+            share = jobs if work.shard is None else work.shard.of(jobs)
+            for job in filter(work.store.has, share):
+                tensors, card = work.store.read(job, policy_of_bytes)
                 save_policy(folder / file_name(job), tensors, card)
                 mean = f"mean return {card['tuning_mean']:.3f} on the tuning worlds"
                 console.print(f"{folder / file_name(job)}: {mean}", soft_wrap=True, highlight=False)

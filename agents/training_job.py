@@ -43,15 +43,21 @@ def with_seed(experiment: Experiment, seed: int) -> Experiment:
     return experiment.model_copy(update={"ppo": experiment.ppo.model_copy(update={"seed": seed})})
 
 
-def training_job(experiment: Experiment, runs: Path, go_on: bool = True) -> Job:
+def training_job(
+    experiment: Experiment, runs: Path, go_on: bool = True, name: str | None = None, at_a_time: int | str | None = None
+) -> Job:
     """Return the job that trains an experiment; go_on: continue from the checkpoint that a killed process left.
 
     The record is read by `policy_of_bytes`. The checkpoint is in `runs`, in a folder named by the job's key: another
-    recipe or other code begins anew.
+    recipe or other code begins anew. name: of the job (default: "ppo/TASK/seed-N"). at_a_time: how many trainings run
+    at the same time, if its wall time is a result: a training among others has another key.
     """
-    title, task = f"{experiment.build().name}/seed-{experiment.ppo.seed}", _learned(experiment)
-    unplaced = Job(f"ppo/{title}", _train, (), recipe_of(experiment), _memory(experiment, task), (first_step, (task,)))
-    folder = runs / unplaced.key.removeprefix("ppo/").replace("/", "-")
+    task, about = _learned(experiment), recipe_of(experiment)
+    unplaced = Job(
+        name or f"ppo/{experiment.build().name}/seed-{experiment.ppo.seed}", _train, (),
+        about if at_a_time is None else [about, at_a_time], _memory(experiment, task), (first_step, (task,)),
+    )  # fmt: skip
+    folder = runs / unplaced.key.partition("/")[2].replace("/", "-")
     return replace(unplaced, arguments=(experiment.model_dump_json(), str(folder), go_on))
 
 

@@ -29,7 +29,7 @@ from agents.compare import (
 from agents.play import players_in_order, players_of, usual_players
 from agents.transfer_jobs import Plan, clock_of, jobs_by_kernel, read_again, read_cells, round_jobs
 from agents.transfer_report import Setting
-from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes
+from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
 from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import nearest, printable
@@ -70,6 +70,7 @@ def main(
     engine: EngineName = "local",
     processes: Processes = None,
     fresh: Fresh = False,
+    shard: ShardText = None,
     out: Annotated[str, typer.Option(help=f"Folder for {', '.join(FILES)}.")] = "results",
     trust_pickle: Annotated[
         bool, typer.Option("--trust-pickle", help="Also load Stable-Baselines3 zips, which executes the code in them.")
@@ -77,7 +78,7 @@ def main(
     debug: Annotated[bool, typer.Option("--debug", help="Show a traceback if something goes wrong.")] = False,
 ) -> None:
     """Play the same worlds with integrators of different accuracy; show the effect on each policy, and the cost."""
-    with report_errors("transfer", STOPPED, debug):
+    with report_errors("transfer", STOPPED, debug), end_of_shard():
         folder = folder_of(out, FILES)
         _check("--worlds", worlds, 2, WORLDS_PER_SEED)
         _check("--rounds", rounds, 1, 1000)
@@ -89,9 +90,9 @@ def main(
             Plan(task, _settings(task, solvers, steps), tuple(fields[task.name]), worlds, seed, rounds, trust_pickle)
             for task in chosen
         ]
-        runner = engine_of(engine, processes)
+        runner, part = engine_of(engine, processes), shard_of(shard)
         with job_bar() as progress:
-            results = _measure(plans, Work(Store(folder / JOBS), runner, fresh, progress))
+            results = _measure(plans, Work(Store(folder / JOBS), runner, fresh, progress, part))
         write_all_or_none(folder, {
             "transfer.json": lambda path: write_text(path, report.json_text(results)),
             "transfer.md": lambda path: write_text(path, transfer_report.markdown(results)),
@@ -141,7 +142,7 @@ def _measure(plans: Sequence[Plan], work: Work) -> report.Results:
         for player in plan.players:
             plan.policy(player, plan.task)  # players that cannot be loaded are rejected before any plays
     jobs, rounds = jobs_by_kernel(plans), round_jobs(plans)
-    run_jobs(list(jobs.values()), work)
+    run_jobs(list(jobs.values()), work)  # a shard ends here: it does not time
     run_jobs(rounds, dataclasses.replace(work, engine=LocalEngine(1, renew=True)))
     about = {
         plan.task.name: transfer_report.task_results(

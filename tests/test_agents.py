@@ -228,6 +228,13 @@ def test_seeds_are_refused_beside_options_of_one_training(other: tuple[str, ...]
     assert result.exit_code == 2 and "--seeds: not together with" in result.stderr
 
 
+def test_a_shard_needs_several_seeds() -> None:
+    from agents import ppo
+
+    result = CliRunner().invoke(ppo.app, [str(CONFIGS / "pursuit.yaml"), "--shard", "0/2"])
+    assert result.exit_code == 2 and result.stderr == "error: --shard: needs --seeds, whose trainings are jobs\n"
+
+
 def test_the_checkpoint_of_a_training_job_depends_on_recipe_and_code(monkeypatch: pytest.MonkeyPatch) -> None:
     jobs = [training_job(with_seed(PURSUIT, seed), Path("runs")) for seed in (1, 1, 2)]
     monkeypatch.setattr("flockenv.jobs.job.code_digest", lambda: "other")
@@ -306,7 +313,7 @@ def test_training_does_not_resume_with_another_recipe(tmp_path: Path, change: di
 # --- learning curves --------------------------------------------------------------------------------------------------
 
 
-def _curves(folder: Path, code: int = 0, **changes: Any) -> str:
+def _curves(folder: Path, *more: str, code: int = 0, **changes: Any) -> str:
     """Compare two settings of Pursuit from a config with some changes; return the command's stderr."""
     from agents import curves
 
@@ -318,22 +325,21 @@ def _curves(folder: Path, code: int = 0, **changes: Any) -> str:
     config = folder / "pursuit.yaml"
     config.write_text(yaml.safe_dump({**settings, **changes}), encoding="utf-8")
     given = [str(config), "--out", str(folder / "new" / "learning.png"), "--runs", str(folder / "runs")]
-    result = CliRunner().invoke(curves.app, given)
+    result = CliRunner().invoke(curves.app, [*given, "--jobs", str(folder / "jobs"), *more])
     assert result.exit_code == code, (result.output, result.exception)
     return result.stderr
 
 
 @pytest.mark.slow
 def test_curves_train_every_setting_once_and_draw_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from agents import ppo
-    from agents.curves import draw
+    from agents.curves import curve_jobs, draw
 
     experiment = Experiment(task="pursuit", ppo={**TINY, "steps": 512}, curves={"two epochs": {"epochs": 2}})
-    interrupt(experiment, tmp_path / "runs" / "pursuit" / AS_CONFIGURED)
+    job = curve_jobs({"pursuit": experiment}, tmp_path / "runs", 1, True)["pursuit", AS_CONFIGURED]
+    interrupt(experiment, Path(job.arguments[1]))
     monkeypatch.setattr("agents.curves.load_tuned", lambda task: Tuned({}, {"tuning_mean": -100.0}))
     message = _curves(tmp_path)
-    assert "pursuit, as configured: 1 epoch, minibatch 64, rate 0.002: goes on after 256 steps\n" in message
-    assert "pursuit, two epochs: 2 epochs, minibatch 64, rate 0.002: begins\n" in message
+    assert "curves/pursuit/as-configured: done (1 of 2)\ncurves/pursuit/two-epochs: done (2 of 2)\n" in message
     picture, file = tmp_path / "new" / "learning.png", tmp_path / "new" / "learning.json"
     numbers = json.loads(file.read_text(encoding="utf-8"))
     rows = numbers["pursuit"]["settings"]
@@ -341,17 +347,30 @@ def test_curves_train_every_setting_once_and_draw_them(tmp_path: Path, monkeypat
     for row in rows.values():
         assert row["curve"][-1]["steps"] >= 512
         assert row["past_the_rules_s"] == row["curve"][0]["seconds"]
+    assert rows[AS_CONFIGURED]["curve"][0]["steps"] == 256 < rows[AS_CONFIGURED]["curve"][-1]["steps"]
     draw(tmp_path / "again.png", numbers)
     assert picture.read_bytes() == (tmp_path / "again.png").read_bytes()
-    with monkeypatch.context() as patch:
-        patch.setattr(ppo, "train", _fail)
-        assert ": begins" not in _curves(tmp_path)
-        assert json.loads(file.read_text(encoding="utf-8")) == numbers
+    assert "done (" not in _curves(tmp_path), "no training is repeated"
+    assert json.loads(file.read_text(encoding="utf-8")) == numbers
     message = _curves(tmp_path, curves={"two epochs": {"epochs": 2, "gamma": 0.9}})
-    assert "two epochs: 2 epochs, minibatch 64, rate 0.002: begins anew (ppo.gamma = 0.9: " in message
-    assert "as configured: 1 epoch, minibatch 64" not in message
+    assert "two-epochs: done" in message and "as-configured: done" not in message
     again = json.loads(file.read_text(encoding="utf-8"))["pursuit"]["settings"]
     assert again[AS_CONFIGURED] == rows[AS_CONFIGURED] and again["two epochs"]["curve"] != rows["two epochs"]["curve"]
+
+
+def test_a_training_among_others_is_another_curve(tmp_path: Path) -> None:
+    """Its wall time is not comparable with that of one which ran alone."""
+    from agents.curves import NOTE, curve_jobs, note_of
+
+    experiment = Experiment(task="pursuit", ppo=TINY, curves={"two epochs": {"epochs": 2}})
+    keys = {
+        job.key
+        for at_a_time in (1, 2, "ray")
+        for job in curve_jobs({"pursuit": experiment}, tmp_path, at_a_time, True).values()
+    }
+    assert len(keys) == 6
+    assert note_of(1) == NOTE and NOTE.endswith("One training at a time.")
+    assert "up to 3; wall times are comparable only" in note_of(3) and "Ray cluster" in note_of("ray")
 
 
 @pytest.mark.parametrize(

@@ -156,6 +156,26 @@ def test_results_of_two_processes_equal_those_of_one() -> None:
             ]
 
 
+def test_shards_store_jobs_and_a_call_without_a_shard_collects_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = ("--tasks", "obstacles", "--players", "random,textbook", "--worlds", "2", "--smoke")
+    for shard in ("0/2", "1/2"):
+        result = run(*arguments, "--shard", shard)
+        assert result.stderr.splitlines()[-1].startswith(f"shard {shard}: 1 jobs are stored in results/jobs; the same")
+        assert not result.stdout and sorted(path.name for path in Path("results").iterdir()) == ["jobs"]
+    run(*arguments, "--out", "once")
+    monkeypatch.setattr(play, "rollout", None)
+    run(*arguments)
+    names = [sorted(path.name for path in Path(out, "jobs").rglob("*.safetensors")) for out in ("results", "once")]
+    assert names[0] == names[1] and len(names[0]) == 2
+    tasks = [json.loads(Path(out, "results.json").read_text())["tasks"]["obstacles"] for out in ("results", "once")]
+    assert tasks[0]["pairs"] == tasks[1]["pairs"]
+    for player, numbers in tasks[0]["players"].items():
+        assert all(tasks[1]["players"][player][key] == numbers[key] for key in WITHOUT_CLOCK)
+    assert refused(*arguments, "--shard", "2/2").startswith(
+        "compare: --shard '2/2': must be I/N with I from 0 to N - 1"
+    )
+
+
 def test_stored_episodes_are_not_played_again(monkeypatch: pytest.MonkeyPatch) -> None:
     arguments = ("--tasks", "obstacles", "--players", "random", "--worlds", "2", "--smoke")
     run(*arguments)

@@ -21,7 +21,18 @@ from typer.testing import CliRunner
 from flockenv.cli.main import app
 from flockenv.core.available_memory import available_memory
 from flockenv.jit.thread_pool import cores
-from flockenv.jobs import FailedJobsError, Failure, Job, Store, Work, engine_of, records, run_jobs
+from flockenv.jobs import (
+    FailedJobsError,
+    Failure,
+    Job,
+    Shard,
+    ShardDone,
+    Store,
+    Work,
+    engine_of,
+    records,
+    run_jobs,
+)
 from flockenv.jobs import job as job_module
 from flockenv.jobs.job import code_digest, execute
 from flockenv.jobs.local_engine import LocalEngine, count_fitting
@@ -274,15 +285,20 @@ def own_process() -> bytes:
 RUN = """
 import sys, time
 from pathlib import Path
-from flockenv.jobs import Job, Store, Work, run_jobs
-from flockenv.jobs.local_engine import LocalEngine, count_fitting
+from flockenv.jobs import Job, Shard, ShardDone, Store, Work, run_jobs
+from flockenv.jobs.local_engine import LocalEngine
 
 def slow(k):
     time.sleep(0.3)
     return str(k).encode()
 
 if __name__ == "__main__":
-    run_jobs([Job(f"slow/{k}", slow, (k,), k) for k in range(8)], Work(Store(Path("jobs")), LocalEngine(2)))
+    jobs = [Job(f"slow/{k}", slow, (k,), k) for k in range(8)]
+    shard = Shard.of_text(sys.argv[1]) if len(sys.argv) > 1 else None
+    try:
+        run_jobs(jobs, Work(Store(Path("jobs")), LocalEngine(1 if shard else 2), shard=shard))
+    except ShardDone as done:
+        print(done, file=sys.stderr)
 """
 
 
@@ -305,6 +321,59 @@ def test_a_run_that_is_ended_goes_on_where_it_was(number: signal.Signals, tmp_pa
     subprocess.run([sys.executable, "run.py"], cwd=tmp_path, env=environment, check=True)
     after = {path: path.stat().st_mtime_ns for path in tmp_path.glob("jobs/slow/*.safetensors")}
     assert len(after) == 8 and before.items() <= after.items()
+
+
+def records_of(folder: Path) -> dict[str, tuple[bytes, int]]:
+    """Return the content of all records, and when they were written."""
+    paths = sorted(folder.rglob("*.safetensors"))
+    return {path.relative_to(folder).as_posix(): (path.read_bytes(), path.stat().st_mtime_ns) for path in paths}
+
+
+@pytest.mark.slow
+def test_shards_at_the_same_time_and_a_run_that_collects_store_the_bytes_of_one_run(tmp_path: Path) -> None:
+    (tmp_path / "run.py").write_text(RUN)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "../run.py"]
+    folders = [tmp_path / name for name in ("shards", "once")]
+    for folder in folders:
+        folder.mkdir()
+    running = [
+        subprocess.Popen([*command, f"{k}/2"], cwd=folders[0], env=environment, stderr=subprocess.PIPE, text=True)
+        for k in range(2)
+    ]
+    for k, process in enumerate(running):
+        line = process.communicate(timeout=60)[1].splitlines()[0]
+        assert line.startswith(f"shard {k}/2: 4 jobs are stored in jobs; the same command without --shard collects")
+    stored, states = records_of(folders[0] / "jobs"), State.read(folders[0] / "jobs")
+    assert [len(states[f"slow-{k}-of-2"]["done"]) for k in range(2)] == [4, 4]
+    for folder in folders:
+        subprocess.run(command, cwd=folder, env=environment, check=True)
+    assert records_of(folders[0] / "jobs") == stored, "collecting runs nothing again"
+    assert len(State.read(folders[0] / "jobs")["slow"]["done"]) == 8
+    once = records_of(folders[1] / "jobs")
+    assert {name: data for name, (data, _) in once.items()} == {name: data for name, (data, _) in stored.items()}
+    assert len(once) == 8
+
+
+def test_shards_have_each_job_once_and_invalid_ones_are_refused(tmp_path: Path) -> None:
+    jobs = numbers(7)
+    shares = [Shard.of_text(f"{k}/3").of(jobs) for k in range(3)]
+    assert sorted(job.name for share in shares for job in share) == [job.name for job in jobs]
+    assert Shard(8, 9).of(jobs) == []
+    with pytest.raises(ShardDone, match="shard 8/9: 0 jobs are stored"):
+        run_jobs(jobs, work(tmp_path, shard=Shard(8, 9)))
+    for text in ("", "3/3", "4/3", "1", "-1/3", "1/0", "a/b", "1/3 ", "1.0/3"):
+        with pytest.raises(ValueError, match=r"^--shard '.*': must be I/N with I from 0 to N - 1, such as 0/4"):
+            Shard.of_text(text)
+
+
+def test_a_process_of_another_machine_counts_as_running(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_jobs(numbers(1), work(tmp_path))
+    file = tmp_path / "jobs" / "state-test.json"
+    for host, ended in ((None, True), ("elsewhere", False)):
+        content = {**json.loads(file.read_text()), "process": 2**22 + 1}  # beyond the largest process id
+        file.write_text(json.dumps({**content, **({"host": host} if host else {})}))
+        assert ("ended" in CliRunner().invoke(app, ["jobs", str(tmp_path / "jobs")]).stdout) == ended
 
 
 def test_an_unknown_engine_is_refused_with_the_nearest_name() -> None:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import platform
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +17,9 @@ from flockenv.cli.terminal import duration_text, new_console, show_table
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = ["STOPPED", "EngineName", "Fresh", "Processes", "jobs"]
+    from flockenv.jobs import Shard
+
+__all__ = ["STOPPED", "EngineName", "Fresh", "Processes", "ShardText", "end_of_shard", "jobs", "shard_of"]
 
 STOPPED = "interrupted; what was played is stored, run the same command to continue"
 """The line about an interrupt of a command that stores the records of jobs."""
@@ -26,8 +31,33 @@ Processes = Annotated[
     int | None, typer.Option(min=1, max=256, help="Processes of the local engine. [one for each core]")
 ]
 Fresh = Annotated[bool, typer.Option("--fresh", help="Run all jobs anew, also those whose record is stored.")]
+ShardText = Annotated[
+    str | None,
+    typer.Option(
+        "--shard", metavar="I/N", help="Run share I (from 0) of N of the jobs only; a later call without it collects."
+    ),
+]
 
 STATES = ("running", "failed", "waiting", "done")
+
+
+def shard_of(text: str | None) -> Shard | None:
+    """Return the shard of the option; raise ValueError if its text is none."""
+    from flockenv.jobs import Shard
+
+    return None if text is None else Shard.of_text(text)
+
+
+@contextmanager
+def end_of_shard() -> Iterator[None]:
+    """End a command whose share of the jobs is done with one line on stderr and exit code 0."""
+    from flockenv.jobs import ShardDone
+
+    try:
+        yield
+    except ShardDone as done:
+        typer.echo(str(done), err=True)
+        raise typer.Exit(0) from None
 
 
 def jobs(
@@ -62,7 +92,7 @@ def jobs(
 def _keys_by_state(content: Mapping[str, Any]) -> dict[str, list[str]]:
     """Return the keys of all jobs in their order, by state; none runs if the process has ended."""
     of = {name: set(content[name]) for name in ("running", "failed", "done")}
-    if not _is_alive(content["process"]):
+    if not _is_alive(content):
         of["running"].clear()
     found = {name: [key for key in content["keys"] if key in keys] for name, keys in of.items()}
     return {**found, "waiting": [key for key in content["keys"] if not any(key in keys for keys in of.values())]}
@@ -71,15 +101,15 @@ def _keys_by_state(content: Mapping[str, Any]) -> dict[str, list[str]]:
 def _age(content: Mapping[str, Any]) -> str:
     """Return when the file was written."""
     text = f"{duration_text(max(0.0, time.time() - float(content['written'])))} ago"
-    return text if _is_alive(content["process"]) else f"{text}, ended"
+    return text if _is_alive(content) else f"{text}, ended"
 
 
-def _is_alive(process: int) -> bool:
-    """Return True if a process of this machine runs, or if that cannot be found out."""
-    if os.name != "posix":
+def _is_alive(content: Mapping[str, Any]) -> bool:
+    """Return True if the process that wrote a file runs, or if that cannot be found out: it is on another machine."""
+    if os.name != "posix" or content["host"] != platform.node():
         return True
     try:
-        os.kill(process, 0)
+        os.kill(content["process"], 0)
     except ProcessLookupError:
         return False
     except OSError:

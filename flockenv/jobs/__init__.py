@@ -2,7 +2,10 @@
 
 from flockenv.jobs.engine import ENGINES, Engine, engine_of
 from flockenv.jobs.job import Failure, Job
-from flockenv.jobs.run import FailedJobsError, Work, run_jobs
+from flockenv.jobs.run import FailedJobsError, Shard, ShardDone, Work, run_jobs
 from flockenv.jobs.store import Store
 
-__all__ = ["ENGINES", "Engine", "FailedJobsError", "Failure", "Job", "Store", "Work", "engine_of", "run_jobs"]
+__all__ = [
+    "ENGINES", "Engine", "FailedJobsError", "Failure", "Job", "Shard", "ShardDone", "Store", "Work", "engine_of",
+    "run_jobs",
+]  # fmt: skip

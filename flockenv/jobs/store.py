@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import platform
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,7 +21,7 @@ T = TypeVar("T")
 EVERY = 1.0
 """s, between two versions of the file that says how far the work is."""
 NAME = "state-{}.json"
-KEYS = {"process", "began", "written", "keys", "done", "running", "failed"}
+KEYS = {"process", "host", "began", "written", "keys", "done", "running", "failed"}
 """Keys of that file."""
 PROCESS_BEGAN = time.time()
 """When this process imported this module: a process id may be used again by a later process."""
@@ -59,7 +60,7 @@ class Store:
 class State:
     """How far the jobs of a command are, by key; written to the results folder while it runs, for `flockenv jobs`.
 
-    command: the first word of the jobs' names; it is part of the file's name.
+    command: the first word of the jobs' names, with the shard if it is one; it is part of the file's name.
     """
 
     folder: Path
@@ -122,8 +123,9 @@ class State:
                 return
             self._written = time.monotonic()
             content = {
-                "process": os.getpid(), "began": self.began, "written": time.time(), "keys": list(self.keys),
-                "done": sorted(self.done), "running": sorted(self.running), "failed": self.failed,
+                "process": os.getpid(), "host": platform.node(), "began": self.began, "written": time.time(),
+                "keys": list(self.keys), "done": sorted(self.done), "running": sorted(self.running),
+                "failed": self.failed,
             }  # fmt: skip
             with new_folder(self.folder), replace_file(self._path) as file:
                 file.write((json.dumps(content, indent=1) + "\n").encode())
