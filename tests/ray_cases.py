@@ -20,9 +20,12 @@ import ray
 from ray.cluster_utils import Cluster
 from typer.testing import CliRunner
 
-from agents import compare
+from agents import compare, tune
 from flockenv.jobs import FailedJobsError, Job, Store, Work, run_jobs
+from flockenv.jobs.local_engine import LocalEngine
 from flockenv.jobs.ray_engine import RayEngine
+from flockenv.physics.integrators import methods_of
+from flockenv.studies.accuracy import measure_errors, select_problems
 from tests.small_jobs import blas_threads, end_always, end_twice
 
 CLOCKS = ("microseconds_per_decision", "microseconds_single", "wall_time_s", "verdict", "versions", "machine", "git")
@@ -152,6 +155,22 @@ def note_and_wait(folder: str, value: int) -> bytes:
     return str(most).encode()
 
 
+def errors_of_methods_and_a_search_are_the_same() -> None:
+    """Of `flockenv accuracy`, and of `agents.tune` with two sets of parameters."""
+    problems, methods = {each.name: each for each in select_problems(["damped", "tracer"])}, methods_of(["rk4"])
+    reports = [
+        {name: report.model_dump(exclude={"machine"}) for name, report in measure_errors(problems, methods, None, of)}
+        for of in (LocalEngine(1), RayEngine())
+    ]
+    assert reports[0] == reports[1] and reports[0]["damped"]["curves"]
+    Path("tiny.yaml").write_text("task: pursuit\nsearch: {candidates: 4, worlds: 4, rounds: 2}\n")
+    for name in ("local", "ray"):
+        command = ["tiny.yaml", "--engine", name, "--jobs", f"jobs-{name}", "--out", f"{name}.json"]
+        result = CliRunner().invoke(tune.app, command)
+        assert result.exit_code == 0, result.output
+    assert Path("local.json").read_bytes() == Path("ray.json").read_bytes()
+
+
 def memory_of_the_driver_does_not_grow_with_the_number_of_jobs() -> None:
     """1,000 records of 100 kB: the peak after all of them is that after the first 200, but for 30 MB."""
     peaks = {}
@@ -170,6 +189,7 @@ CASES = (
     a_killed_node_loses_nothing,
     each_node_is_warmed_once_before_any_job,
     a_worker_uses_one_thread_and_a_job_gets_its_memory,
+    errors_of_methods_and_a_search_are_the_same,
     memory_of_the_driver_does_not_grow_with_the_number_of_jobs,
 )
 

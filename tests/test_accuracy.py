@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+import multiprocessing
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,23 @@ import pytest
 
 from flockenv.behaviours import Separation
 from flockenv.cli.main import main
+from flockenv.jobs.local_engine import LocalEngine
 from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import Effect, Fluctuation, Swing, Tether
 from flockenv.physics.integrators import RK4, Integrator, methods_of
 from flockenv.scene import Group, Scene
-from flockenv.studies.accuracy import SUITE, Problem, Report, Results, chaos, measure, select_problems, usual_methods
+from flockenv.studies.accuracy import (
+    SUITE,
+    Problem,
+    Report,
+    Results,
+    add_times,
+    chaos,
+    measure,
+    measure_errors,
+    select_problems,
+    usual_methods,
+)
 from flockenv.studies.accuracy import problem as problems
 from flockenv.studies.accuracy import reference as references
 from flockenv.studies.accuracy.plots import draw_precision, write_precision
@@ -553,6 +566,66 @@ def test_finished_problems_are_written_before_the_next_one_begins(
     command = ["accuracy", "--suite", "--problems", "damped,oscillator", "--methods", "rk4", "--repetitions", "0"]
     assert main([*command, "--out", "new/a.json"]) == 0
     assert kept == [[], ["damped"]]
+
+
+def without_times(report: Report) -> dict[str, Any]:
+    """Return a report as plain data without its times and the machine."""
+    content = report.model_dump(exclude={"machine", "repetitions"})
+    for curve in content["curves"]:
+        for point in curve["points"]:
+            del point["seconds"]
+    return content
+
+
+def test_times_are_added_to_errors_that_were_measured_before() -> None:
+    problem, methods = replace(one("damped"), steps=(8, 16, 32, 64, 128)), methods_of(["rk4", "heun"])
+    whole = measure(problem, methods, 2)
+    [(name, errors)] = measure_errors({"a": problem}, methods, None, LocalEngine(1))
+    assert name == "a" and isinstance(errors, Report)
+    assert all(point.seconds is None for curve in errors.curves for point in curve.points)
+    timed = add_times(errors, problem, methods, 2)
+    assert all((point.seconds or 0) > 0 for curve in timed.curves for point in curve.points)
+    assert without_times(timed) == without_times(whole) and timed.repetitions == 2
+    stopped = add_times(errors, problem, methods, 2, progress=_Stop(60))
+    assert stopped.stopped == "interrupted" and without_times(stopped)["curves"] == without_times(whole)["curves"]
+
+
+@pytest.mark.slow
+def test_errors_measured_as_jobs_are_the_same_and_times_are_measured_when_no_job_runs(
+    in_a_folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alone: list[bool] = []
+
+    def watched(*arguments: Any) -> Report:
+        alone.append(not multiprocessing.active_children())
+        return add_times(*arguments)
+
+    monkeypatch.setattr("flockenv.studies.accuracy.add_times", watched)
+    (in_a_folder / "float32.yaml").write_text(f"{TINY}\ndtype: float32\n")
+    command = ["accuracy", "tiny.yaml", "float32.yaml", "--methods", "rk4,heun", "--repetitions", "1"]
+    for processes in "12":
+        assert main([*command, "--processes", processes, "--out", f"{processes}.json"]) == 0
+        assert "float32.yaml: dtype = float32: its rounding would hide" in capsys.readouterr().out
+    one_process, two = (Results.model_validate_json(Path(f"{n}.json").read_text()).reports for n in "12")
+    assert list(map(without_times, two)) == list(map(without_times, one_process)) and len(two) == 1
+    assert all((point.seconds or 0) > 0 for curve in two[0].curves for point in curve.points)
+    assert alone == [True]
+
+
+def test_ctrl_c_while_jobs_run_shows_the_errors_that_are_known(
+    in_a_folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def impatient(problems: Any, methods: Any, finer: Any, engine: Any) -> Iterator[tuple[str, Report | ValueError]]:
+        yield "damped", measure(problems["damped"], methods, 0)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("flockenv.studies.accuracy.measure_errors", impatient)
+    command = ["accuracy", "--suite", "--problems", "oscillator,damped", "--methods", "rk4", "--out", "a.json"]
+    assert main([*command, "--processes", "2"]) == 130
+    text = capsys.readouterr()
+    assert "Damped oscillator" in text.out and text.err == "flockenv: interrupted; results so far are shown\n"
+    (report,) = Results.model_validate_json(Path("a.json").read_text()).reports
+    assert report.name == "damped" and report.repetitions == 0
 
 
 def test_times_of_comparison_are_steps_of_every_run() -> None:

@@ -23,6 +23,7 @@ CASES = (
     "a_killed_node_loses_nothing",
     "each_node_is_warmed_once_before_any_job",
     "a_worker_uses_one_thread_and_a_job_gets_its_memory",
+    "errors_of_methods_and_a_search_are_the_same",
     "memory_of_the_driver_does_not_grow_with_the_number_of_jobs",
 )
 

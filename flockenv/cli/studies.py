@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from flockenv.core.record import Record
+    from flockenv.jobs import Engine
     from flockenv.physics.integrators import Integrator
     from flockenv.studies.accuracy import Problem, Report
     from flockenv.studies.trial_log import Results
@@ -89,9 +90,15 @@ def accuracy(
         str | None, typer.Option(metavar="X.json|X.png", help="Write the numbers; a picture has X.json beside it.")
     ] = None,
     force: Force = False,
+    engine: EngineName = "local",
+    processes: Processes = None,
 ) -> None:
-    """Show the cost of accuracy: the final error of each integrator for each step length, and its time."""
+    """Show the cost of accuracy: the final error of each integrator for each step length, and its time.
+
+    Errors of several problems are measured as jobs; times afterwards in this process, one run at a time.
+    """
     from flockenv.core.output_paths import valid_file
+    from flockenv.jobs import engine_of
     from flockenv.physics.integrators import methods_of
     from flockenv.studies.accuracy import usual_methods
 
@@ -102,7 +109,8 @@ def accuracy(
     console = new_console()
 
     write = functools.partial(_write_reports, path)
-    reports, refused = _measure_problems(todo, chosen, repetitions, finer, aimed, console, write)
+    runner = engine_of(engine, processes, small=len(todo) <= FEW)
+    reports, refused = _measure_problems(todo, chosen, repetitions, finer, aimed, console, write, runner)
     stopped = len(reports) + refused < len(todo) or (reports and reports[-1].stopped)
     if path is not None and reports:
         if path.suffix.lower() == ".png":
@@ -142,29 +150,41 @@ def _problem_makers(
 
 def _measure_problems(
     todo: Mapping[str, Callable[[], Problem]], methods: Sequence[Integrator], repetitions: int, finer: int | None,
-    tolerances: Sequence[float], console: Console, keep: Callable[[Sequence[Report]], None],
+    tolerances: Sequence[float], console: Console, keep: Callable[[Sequence[Report]], None], engine: Engine,
 ) -> tuple[list[Report], int]:  # fmt: skip
     """Measure problem after problem, store and show each; return the reports, and the number of problems without one.
 
     keep: called with all reports after each problem; an interrupt during compilation ends the process and loses none.
-    If there are several problems, each one without a reference gives a line; a single one raises its ValueError.
+    engine: measures all errors first if it has several processes. If there are several problems, each one without a
+    reference gives a line; a single one raises its ValueError.
     """
-    from flockenv.studies.accuracy import measure
+    from flockenv.studies.accuracy import add_times, measure
 
     reports: list[Report] = []
+    known: dict[str, Report | ValueError] = {}
     rejected = 0
+    if engine.parallel:
+        todo = {name: functools.cache(problem) for name, problem in todo.items()}
+        if _measure_errors(todo, methods, finer, engine, known):
+            todo, repetitions = {name: problem for name, problem in todo.items() if name in known}, 0
     try:
         for name, problem in todo.items():
             try:
+                if isinstance(found := known.get(name), ValueError):
+                    raise found
                 current = problem()
                 with progress_bar(f"measuring {current.name}", 100, "%") as progress:
-                    reports.append(measure(current, methods, repetitions, finer=finer, progress=progress))
+                    if found is None:
+                        report = measure(current, methods, repetitions, finer=finer, progress=progress)
+                    else:
+                        report = add_times(found, current, methods, repetitions, progress)
             except ValueError as error:
                 if len(todo) < 2:
                     raise
                 rejected += 1
                 console.print(f"{_error_line(name, error)}\n", soft_wrap=True)
                 continue
+            reports.append(report)
             keep(reports)
             _show_accuracy(console, reports[-1], tolerances)
             flush_output()
@@ -176,6 +196,34 @@ def _measure_problems(
             raise
         keep(reports)
     return reports, rejected
+
+
+def _measure_errors(
+    todo: Mapping[str, Callable[[], Problem]], methods: Sequence[Integrator], finer: int | None, engine: Engine,
+    known: dict[str, Report | ValueError],
+) -> bool:  # fmt: skip
+    """Measure the errors of all problems as jobs, and enter the reports, or why there is none, into `known`.
+
+    Returns True if interrupted; KeyboardInterrupt is raised only if there is no report yet.
+    """
+    from flockenv.studies.accuracy import Report, measure_errors
+
+    problems: dict[str, Problem] = {}
+    for name, problem in todo.items():
+        try:
+            problems[name] = problem()
+        except ValueError as error:
+            known[name] = error
+    try:
+        with progress_bar("measuring errors", len(problems), "problems") as advance:
+            for done, (name, found) in enumerate(measure_errors(problems, methods, finer, engine), 1):
+                known[name] = found
+                advance(done)
+    except KeyboardInterrupt:
+        if not any(isinstance(found, Report) for found in known.values()):
+            raise
+        return True
+    return False
 
 
 def _error_line(name: str, error: ValueError) -> str:

@@ -21,6 +21,11 @@ Begun = Callable[[Job], None]
 class Engine(Protocol):
     """Runs jobs in any order."""
 
+    @property
+    def parallel(self) -> bool:
+        """True if several jobs may run at a time, which changes the times that they measure."""
+        ...
+
     def run(self, jobs: Iterable[Job], begun: Begun) -> Generator[tuple[Job, bytes | Failure], None, None]:
         """Yield each job with its record or its failure; closing the generator ends all work."""
         ...

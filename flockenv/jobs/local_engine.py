@@ -45,6 +45,11 @@ class LocalEngine:
     def __init__(self, processes: int, renew: bool = False) -> None:
         self.processes, self.renew = processes, renew
 
+    @property
+    def parallel(self) -> bool:
+        """True if there are several processes."""
+        return self.processes > 1
+
     def run(self, jobs: Iterable[Job], begun: Begun) -> Generator[tuple[Job, bytes | Failure], None, None]:
         """Yield each job with its record or its failure."""
         jobs = deque(jobs)

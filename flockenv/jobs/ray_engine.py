@@ -32,6 +32,8 @@ LOG_END = 300
 class RayEngine:
     """Runs each job as a Ray task with one core."""
 
+    parallel = True
+
     def __init__(self) -> None:
         self._ray = _import_ray()
 

@@ -24,7 +24,7 @@ from flockenv.studies.accuracy.problem import Problem
 from flockenv.studies.accuracy.reference import COARSE, LEAST_FINER, Reference, find_reference
 from flockenv.studies.accuracy.results import Curve, Machine, Point, Report, measured_order
 
-__all__ = ["REPETITIONS", "TOLERANCES", "machine", "measure", "usual_methods"]
+__all__ = ["REPETITIONS", "TOLERANCES", "add_times", "machine", "measure", "usual_methods"]
 
 REPETITIONS = 20
 TOLERANCES = tuple(10.0**-k for k in range(3, 13))
@@ -144,6 +144,44 @@ def measure(
         energy=problem.energies, repetitions=repetitions,
         machine=machine(), curves=tuple(_curves(trials, floor, COARSE * reference.reach)), stopped=stopped,
     )  # fmt: skip
+
+
+def add_times(
+    report: Report,
+    problem: Problem,
+    methods: Sequence[Integrator],
+    repetitions: int = REPETITIONS,
+    progress: Callable[[int], None] = lambda percent: None,
+) -> Report:
+    """Return a report with wall times, measured now, of the runs whose errors another process may have measured.
+
+    report: `measure` with the same problem and methods, and repetitions = 0. Other arguments, and a KeyboardInterrupt:
+    as of `measure`.
+    """
+    trials = [_Trial(problem, *setting) for method in methods for setting in _settings(problem, method)]
+    points = {_key(curve, point): point for curve in report.curves for point in curve.points}
+    for trial in trials:
+        trial.point = points.get((trial.method.kind, trial.steps, trial.tolerance))
+    stopped = ""
+    try:
+        _clock([trial for trial in trials if trial.has_error], repetitions, progress)
+    except KeyboardInterrupt:
+        stopped = "interrupted"
+    timed = {
+        (trial.method.kind, trial.steps, trial.tolerance): trial.timed_point
+        for trial in trials if trial.point is not None
+    }  # fmt: skip
+    curves = [
+        curve.model_copy(update={"points": tuple(timed[_key(curve, point)] for point in curve.points)})
+        for curve in report.curves
+    ]
+    news = {"curves": tuple(curves), "repetitions": repetitions, "machine": machine(), "stopped": stopped}
+    return report.model_copy(update=news)
+
+
+def _key(curve: Curve, point: Point) -> tuple[str, int, float | None]:
+    """Return the method and the setting of a point."""
+    return curve.method, point.steps, point.tolerance
 
 
 def _settings(problem: Problem, method: Integrator) -> list[tuple[Integrator, int, float | None]]:
