@@ -23,12 +23,11 @@ from rich.table import Table
 
 from agents.compare import split
 from agents.experiment import load_experiment, one_line_errors
-from agents.play import blame, players_in_order
+from agents.play import blame, players_in_order, usual_players
 from flockenv.cli.terminal import run_program, show_progress
 from flockenv.envs.world import Step, World
 from flockenv.evaluation import Episodes, Interval, bootstrap, compare, rollout, worlds_for
 from flockenv.model.snapshot import Snapshot
-from flockenv.players import NAMES, other_tasks
 from flockenv.players.policy import Policy
 from flockenv.tasks import Task
 
@@ -199,7 +198,7 @@ def _policy_makers(
     task: Task, names: Sequence[str], seed: int, trust_pickle: bool
 ) -> dict[str, Callable[[Task], Policy]]:
     """Return the factory of each player of a task, by name; bad ones raise before any episode."""
-    specs = names or [name for name in NAMES if name not in ("random", "textbook") and not other_tasks(name, task.name)]
+    specs = names or [name for name in usual_players([task]) if name not in ("random", "textbook")]
     makers = {
         player.name: functools.partial(player.policy, seed=seed, trust_pickle=trust_pickle)
         for player in players_in_order(specs)

@@ -139,9 +139,8 @@ def _costs(task: Task, policies: Mapping[str, Policy]) -> dict[str, report.Resul
     for name, policy in policies.items():
         card = getattr(policy, "card", None) or {}
         costs[name] = {key: card[key] for key in ("wall_time_s", "steps") if key in card}
-    steps = load_tuned(task.name).found.get("agent_steps")
-    if steps and "rules" in policies:
-        costs["rules"] = {"of": "tuning", "steps": round(steps)}
+        if steps := load_tuned(task.name, name).found.get("agent_steps"):
+            costs[name] = {"of": "tuning", "steps": round(steps)}
     return costs
 
 

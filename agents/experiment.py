@@ -1,4 +1,4 @@
-"""An experiment, configs/training/<task>.yaml: how PPO trains on a task, and how its rules are tuned."""
+"""An experiment, configs/training/<task>.yaml: how PPO trains on a task, and how its hand-written players are tuned."""
 
 from __future__ import annotations
 
@@ -68,12 +68,18 @@ class PpoSettings(Record):
 
 
 class SearchSettings(Record):
-    """The budget of the search over the rules' parameters."""
+    """Settings of the search for the parameters of hand-written players, by CMA-ES."""
 
-    candidates: int = Field(default=256, ge=2, description="parameter sets drawn at random in the first round")
-    worlds: int = Field(default=96, ge=2, description="tuning worlds per candidate, doubled each round")
-    rounds: int = Field(default=5, ge=1, description="successive halvings, each with refinements around the best")
-    seed: int = Field(default=0, ge=0, lt=1000, description="seed of the search")
+    steps: int | None = Field(default=None, ge=1, description="agent-steps in all [as many as ppo.steps]")
+    worlds: int = Field(default=96, ge=1, description="tuning worlds per candidate; others in each generation")
+    candidates: int | None = Field(
+        default=None, ge=4, description="parameter sets per generation [4 + 3 ln(number of parameters)]"
+    )
+    sigma: float = Field(default=0.25, gt=0, le=1, description="first standard deviation, as a share of each range")
+    final_worlds: int = Field(
+        default=512, ge=2, description="tuning worlds of the final choice, the same for all search seeds"
+    )
+    seed: int = Field(default=0, ge=0, lt=1000, description="search seed, if --seeds is not given")
 
 
 class Experiment(Record):

@@ -79,8 +79,9 @@ def blame(player: str, task: Task, *clear: type[Exception]) -> Iterator[None]:
 
 
 def usual_players(tasks: Sequence[Task]) -> list[str]:
-    """Return the default players: all named ones that can play one of the tasks."""
-    return [name for name in NAMES if any(not other_tasks(name, task.name) for task in tasks)]
+    """Return the default players: the named ones that can play one of the tasks; of published ones the textbook."""
+    shown = [name for name in NAMES if not name.endswith("_published")]
+    return [name for name in shown if any(not other_tasks(name, task.name) for task in tasks)]
 
 
 def players_of(tasks: Sequence[Task], players: Sequence[Player]) -> dict[str, list[Player]]:

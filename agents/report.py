@@ -29,9 +29,9 @@ Return: the mean reward of a world's learners, summed over its episode; higher i
 worlds, and no player was trained or tuned on one of them. IQM (the mean without the best and the worst quarter of the
 worlds), mean and differences: 95 % percentile bootstrap over worlds; success and "scores higher" (ties count half):
 95 % Wilson. A difference is the mean over worlds, so rare disasters count in it, unlike in the IQM. There is one
-trained policy per task and one search per task tuned its rules: the intervals are of the luck of worlds, not of the
-luck of training or of that search. µs: per decision, all worlds at once / one row alone (medians; in a large comparison
-other cores play other tasks meanwhile)."""
+trained policy per task, and one search for the parameters of a tuned player (the median of several search seeds): the
+intervals are of the luck of worlds, not of the luck of training or of search. µs: per decision, all worlds at once /
+one row alone (medians; in a large comparison other cores play other tasks meanwhile)."""
 
 
 def task_results(

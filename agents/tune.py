@@ -1,146 +1,147 @@
-"""Search for better parameters of the rules: `python -m agents.tune configs/training/pursuit.yaml`.
+"""Search for better parameters of a hand-written player: `python -m agents.tune configs/training/pursuit.yaml`.
 
-A plain search: random parameter sets and the textbook's, played on tuning worlds; the best quarter goes on to twice as
-many worlds, each with a slightly changed copy, for a few rounds. The parameters found, and the agent-steps spent, are
-written to flockenv/players/tuned/TASK.json; the default budget is of the order of that of PPO.
+`--player orca` tunes another one than the rules, `--seeds 0-9` searches with several search seeds. Each search's
+outcome is a file in the folder of `--records`; the search with the median score on the common tuning worlds goes into
+flockenv/players/tuned/TASK.json, with the scores of all. agents/search.py has the algorithm.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 from rich.console import Console
 
 from agents.experiment import Experiment, load_experiment, one_line_errors
+from agents.search import Found, median_of, search
+from agents.training_job import seeds_of
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes
 from flockenv.cli.terminal import job_bar, run_program
 from flockenv.core.atomic_files import new_folder, replace_file
+from flockenv.core.errors import nearest, printable
 from flockenv.core.output_paths import check_room, valid_file, valid_path
-from flockenv.evaluation import rollout, worlds_for
-from flockenv.jobs import Job, Store, Work, engine_of, records, run_jobs
-from flockenv.players.rules import RULES, TUNED, RulesPlayer, as_dict
-from flockenv.players.rules.parameter import ranges_of
+from flockenv.jobs import Store, Work, engine_of
+from flockenv.players import PUBLISHED
+from flockenv.players.rules import PLAYERS, TUNED, read_tuned
 from flockenv.tasks import Task
 
-__all__ = ["app", "search"]
+__all__ = ["app", "found_of", "write"]
 
-ROOM = 2**16
-"""Bytes: more than the file takes."""
+ROOM = 2**18
+"""Bytes: more than a file takes."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-console = Console(stderr=True)
+console = Console(stderr=True, markup=False, highlight=False, soft_wrap=True)
 
 
-def search(experiment: Experiment, work: Work) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the best parameters, and the agent-steps and scores of the search.
+def found_of(ships: Found, found: Sequence[Found]) -> dict[str, Any]:
+    """Return how the parameters that ship were found: cost, scores on the common tuning worlds, and all seeds' scores.
 
-    work: stores and runs the jobs, one for each set of parameters in each round; its progress counts those of all
-    rounds.
+    Keys: agent_steps, tuning_mean, tuning_success, textbook_mean, textbook_success, tuning_worlds, at_bounds, of the
+    search that ships; seed, its search seed; seeds, the number of searches; scores, of each search seed, and their
+    lowest and highest.
     """
-    task, s = experiment.build(), experiment.search
-    rng = np.random.default_rng(s.seed)
-    parameters = RULES[task.name][1]
-    ranges, textbook = ranges_of(parameters), as_dict(parameters())
-    pool = [textbook, *({k: float(rng.uniform(*r)) for k, r in ranges.items()} for _ in range(s.candidates - 1))]
-    worlds, played, steps, best_score = s.worlds, 0, 0, -np.inf
-    total = _count_plays(s.candidates, s.rounds)
-    for round_ in range(s.rounds):
-
-        def progress(done: int, most: int, name: str, before: int = played) -> None:
-            work.progress(before + done, total, name)
-
-        scores = _scores(task, pool, worlds, s.seed, replace(work, progress=progress))
-        played, steps = played + len(pool), steps + sum(spent for _, spent in scores)
-        scored = sorted(zip((score for score, _ in scores), pool, strict=True), key=lambda pair: -pair[0])
-        best_score = scored[0][0]
-        keep = [candidate for _, candidate in scored[: max(2, len(scored) // 4)]]
-        spread = 0.25 / (round_ + 1)
-        pool = [*keep, *(_vary(keep[k % len(keep)], ranges, spread, rng) for k in range(len(keep)))]
-        worlds *= 2
-    found = {"agent_steps": float(steps), "tuning_mean": best_score, "tuning_worlds": float(worlds // 2)}
-    found["textbook_mean"] = _score(task, textbook, worlds // 2, s.seed)[0]
-    return {k: float(np.round(v, 4)) for k, v in scored[0][1].items()}, found
+    kept = (
+        "agent_steps", "tuning_mean", "tuning_success", "textbook_mean", "textbook_success", "tuning_worlds",
+        "at_bounds", "seed",
+    )  # fmt: skip
+    scores = {str(each.seed): each.tuning_mean for each in found}
+    return {
+        **{key: getattr(ships, key) for key in kept},
+        "seeds": len(found),
+        "scores": scores,
+        "lowest": min(scores.values()),
+        "highest": max(scores.values()),
+    }
 
 
-def _scores(
-    task: Task, pool: Sequence[dict[str, float]], worlds: int, seed: int, work: Work
-) -> list[tuple[float, int]]:
-    """Return the mean return of each set of parameters on tuning worlds, and the agent-steps it took."""
-    settings = [type(task).__name__, task.model_dump(mode="json")]
-    jobs = [
-        Job(f"tune/{task.name}/{worlds}-worlds", _play, (task, values, worlds, seed), [settings, values, worlds, seed])
-        for values in pool
-    ]
-    run_jobs(jobs, work)
-    return [work.store.read(job, lambda data: records.from_bytes(data, ())) for job in jobs]
+def write(path: Path, task: str, player: str, parameters: Mapping[str, float], found: Mapping[str, Any]) -> None:
+    """Write a player's parameters into the file of a task, which keeps those of other players."""
+    players = {**read_tuned(path), player: {"parameters": parameters, "found": found}}
+    order = {name: players[name] for name in PLAYERS if name in players}
+    _write_json(path, {"task": task, "players": order})
 
 
-def _play(task: Task, values: dict[str, float], worlds: int, seed: int) -> bytes:
-    """Return the score of a set of parameters as bytes."""
-    return records.to_bytes(_score(task, values, worlds, seed))
-
-
-def _count_plays(candidates: int, rounds: int) -> int:
-    """Return how many parameter sets are played in all rounds."""
-    pool, total = candidates, 0
-    for _ in range(rounds):
-        total += pool
-        pool = 2 * max(2, pool // 4)
-    return total
-
-
-def _vary(base: dict[str, float], ranges: dict[str, tuple[float, float]], spread: float, rng: Any) -> dict[str, float]:
-    """Return a set of parameters near another: each moved by a share of its range."""
-    return {k: float(np.clip(base[k] + spread * (hi - lo) * rng.normal(), lo, hi)) for k, (lo, hi) in ranges.items()}
-
-
-def _score(task: Task, values: dict[str, float], worlds: int, seed: int) -> tuple[float, int]:
-    """Return the mean return on tuning worlds, and the agent-steps it took.
-
-    The mean is used, as in the paired differences of the comparison: a failure in one world out of ten must count.
-    """
-    episodes = rollout(
-        task, RulesPlayer(task, RULES[task.name][1](**values)), worlds, worlds_for("tuning", seed, worlds)
-    )
-    return float(np.mean(episodes.returns)), int(np.sum(episodes.lengths) * task.learners)
-
-
-def write(path: Path, task: str, parameters: dict[str, float], found: dict[str, float]) -> None:
-    """Write the parameters that the search found for a task, completely or not at all."""
-    content = {"task": task, "parameters": parameters, "found": found}
+def _write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a file completely or not at all."""
     with new_folder(path.parent), replace_file(path) as file:
         file.write((json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+
+
+def _check_player(name: str, task: Task) -> None:
+    """Raise ValueError, with the nearest name, unless a task has a hand-written player that is tuned by that name."""
+    allowed = [each for each in PUBLISHED if task.name in PLAYERS[each]]
+    if name not in allowed:
+        raise ValueError(
+            f"--player {printable(name)}: unknown{nearest(name[:200], allowed)}; for {task.name} allowed: "
+            f"{', '.join(allowed)}"
+        )
+
+
+def _show(found: Sequence[Found], target: Path) -> None:
+    """Print a line for each search, which parameters lie on a bound, and which search ships."""
+    for each in found:
+        console.print(
+            f"{each.task}, {each.player}, seed {each.seed}: mean return {each.textbook_mean:.3f} (textbook) -> "
+            f"{each.tuning_mean:.3f}, success {each.textbook_success:.0%} -> {each.tuning_success:.0%}, "
+            f"{each.agent_steps:,} agent-steps, {each.seconds:.0f} s"
+        )
+    ships = median_of(found)
+    if ships.at_bounds:
+        ends = ", ".join(f"{name} = {end:g}" for name, end in ships.at_bounds.items())
+        console.print(f"on a bound of its range: {ends}")
+    console.print(f"{target}: seed {ships.seed}, the median of {len(found)}: {json.dumps(ships.parameters)}")
 
 
 @app.command()
 def main(
     config: Annotated[Path, typer.Argument(help="an experiment, such as configs/training/pursuit.yaml")],
+    player: Annotated[
+        str, typer.Option(help="Hand-written player of the task: rules, orca, heuristics or queueing.")
+    ] = "rules",
+    seeds: Annotated[
+        str | None, typer.Option(help="Search seeds, 0-9 or 0,3; the median search is written. [that of the config]")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="default: flockenv/players/tuned/TASK.json")] = None,
+    results: Annotated[Path, typer.Option("--records", help="Folder for the outcome of each search.")] = Path(
+        "results/tune"
+    ),
     jobs: Annotated[Path, typer.Option(help="Folder for the records of jobs.")] = Path("results/jobs"),
     engine: EngineName = "local",
     processes: Processes = None,
     fresh: Fresh = False,
 ) -> None:
-    """Search the rules' parameters and write what was found."""
+    """Search a hand-written player's parameters and write what was found."""
     with one_line_errors():
         experiment = load_experiment(config)
         task = experiment.build()
+        _check_player(player, task)
+        numbers = [experiment.search.seed] if seeds is None else seeds_of(seeds)
         target = TUNED / f"{task.name}.json" if out is None else valid_file(str(out), (".json",), force=True)
-        check_room(target, ROOM)
+        folder = valid_path(str(results), "--records")
+        read_tuned(target)
+        for path in (target, folder / "record"):
+            check_room(path, ROOM)
         store, runner = Store(valid_path(str(jobs), "--jobs")), engine_of(engine, processes)
     with one_line_errors(), job_bar("compiling and playing", lines=False) as progress:
-        rules, found = search(experiment, Work(store, runner, fresh, progress))
-    console.print(f"{task.name}: found {json.dumps(rules)}", markup=False, highlight=False, soft_wrap=True)
+        found = search(experiment, player, numbers, Work(store, runner, fresh, progress))
+    _show(found, target)
     with one_line_errors():
-        write(target, task.name, rules, found)
-    gained = f"mean return {found['textbook_mean']:.3f} (textbook) -> {found['tuning_mean']:.3f}"
-    console.print(f"{target}: {gained}, {found['agent_steps']:,.0f} agent-steps")
+        _write_all(experiment, found, folder, target)
+
+
+def _write_all(experiment: Experiment, found: Sequence[Found], folder: Path, target: Path) -> None:
+    """Write the outcome of each search, and the median search as the tuned parameters."""
+    settings = experiment.search.model_dump(mode="json")
+    for each in found:
+        path = folder / f"{each.task}-{each.player}-seed-{each.seed}.json"
+        _write_json(path, {**asdict(each), "settings": settings})
+    ships = median_of(found)
+    write(target, ships.task, ships.player, ships.parameters, found_of(ships, found))
 
 
 if __name__ == "__main__":

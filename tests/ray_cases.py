@@ -156,14 +156,15 @@ def note_and_wait(folder: str, value: int) -> bytes:
 
 
 def errors_of_methods_and_a_search_are_the_same() -> None:
-    """Of `flockenv accuracy`, and of `agents.tune` with two sets of parameters."""
+    """Of `flockenv accuracy`, and of a short search of `agents.tune`."""
     problems, methods = {each.name: each for each in select_problems(["damped", "tracer"])}, methods_of(["rk4"])
     reports = [
         {name: report.model_dump(exclude={"machine"}) for name, report in measure_errors(problems, methods, None, of)}
         for of in (LocalEngine(1), RayEngine())
     ]
     assert reports[0] == reports[1] and reports[0]["damped"]["curves"]
-    Path("tiny.yaml").write_text("task: pursuit\nsearch: {candidates: 4, worlds: 4, rounds: 2}\n")
+    settings = "{steps: 600, candidates: 4, worlds: 4, final_worlds: 4}"
+    Path("tiny.yaml").write_text(f"task: pursuit\nppo: {{evaluate_worlds: 4}}\nsearch: {settings}\n")
     for name in ("local", "ray"):
         command = ["tiny.yaml", "--engine", name, "--jobs", f"jobs-{name}", "--out", f"{name}.json"]
         result = CliRunner().invoke(tune.app, command)

@@ -19,7 +19,7 @@ from safetensors.numpy import load_file
 from stable_baselines3.common.buffers import RolloutBuffer
 from typer.testing import CliRunner
 
-from agents import dagger, tune
+from agents import dagger
 from agents import imitate as imitation
 from agents.dagger import collect_answers
 from agents.experiment import AS_CONFIGURED, CONFIGS, Experiment, PpoSettings, load_experiment
@@ -32,12 +32,9 @@ from flockenv.envs.sb3 import WorldVecEnv
 from flockenv.envs.world import World
 from flockenv.evaluation import compare, rollout, worlds_for
 from flockenv.jit.thread_pool import threads
-from flockenv.jobs import Store, Work
-from flockenv.jobs.local_engine import LocalEngine
 from flockenv.players import WEIGHTS
 from flockenv.players.policy import MlpPolicy, RandomPolicy
-from flockenv.players.rules import RULES, Tuned, as_dict, load_tuned, player
-from flockenv.players.rules.parameter import ranges_of
+from flockenv.players.rules import Tuned, as_dict, load_tuned, player
 from flockenv.tasks import TASKS, School, Task
 from tests.training import PURSUIT, TINY, interrupt
 
@@ -103,74 +100,11 @@ def test_a_player_returns_finite_actions_for_an_observation_of_zeros(name: str) 
     assert np.isfinite(action).all()
 
 
-def test_every_parameter_of_the_rules_has_a_range_around_its_textbook_value() -> None:
-    unlimited = {("pursuit", "horizon"), ("path_follow", "grip")}  # in the textbook: wide above the range
-    for name, (_, rules) in RULES.items():
-        for parameter, (low, high) in ranges_of(rules).items():
-            inside = low <= getattr(rules(), parameter) <= high
-            assert inside != ((name, parameter) in unlimited), (name, parameter)
-
-
 def test_tuned_rules_have_every_parameter_and_beat_the_textbook_on_tuning_worlds() -> None:
     for name in TASKS:
         record = load_tuned(name)
         assert record.parameters == as_dict(player(TASKS[name]()).rules)
         assert record.found["tuning_mean"] > record.found["textbook_mean"]
-
-
-def test_the_rules_use_the_parameters_that_the_search_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    search = {"candidates": 4, "worlds": 2, "rounds": 2}
-    config = tmp_path / "pursuit.yaml"
-    config.write_text(yaml.safe_dump({"task": "pursuit", "search": search}), encoding="utf-8")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(tune, "TUNED", tmp_path / "tuned")
-    monkeypatch.setattr("flockenv.players.rules.TUNED", tmp_path / "tuned")
-    assert load_tuned("pursuit") == Tuned(), "no search yet"
-    result = CliRunner().invoke(tune.app, [str(config), "--processes", "2"])
-    assert result.exit_code == 0, result.output
-    reports: list[tuple[int, int]] = []
-    work = Work(
-        Store(tmp_path / "again"), LocalEngine(1), progress=lambda done, most, name: reports.append((done, most))
-    )
-    rules, found = tune.search(load_experiment(config), work)
-    assert reports == [(done, 8) for done in (0, 1, 2, 3, 4, 4, 5, 6, 7, 8)]
-    assert load_tuned("pursuit") == Tuned(rules, found), "the search is reproducible"
-    assert as_dict(player(TASKS["pursuit"]()).rules) == rules
-    assert found["agent_steps"] > 0 and found["tuning_mean"] >= found["textbook_mean"]
-
-
-@pytest.mark.parametrize(
-    ("out", "fault"),
-    [("/proc/none/x.json", "must lie below"), ("file/x.json", "is not a folder"), ("x.yaml", "must end in .json"),
-     ("../x.json", "must not go up")],
-)  # fmt: skip
-def test_a_search_is_refused_if_its_result_cannot_be_written(
-    out: str, fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("file").write_text("mine")
-    Path("pursuit.yaml").write_text("{task: pursuit}", encoding="utf-8")
-    monkeypatch.setattr(tune, "search", lambda *_: pytest.fail("searched before --out was checked"))
-    result = CliRunner().invoke(tune.app, ["pursuit.yaml", "--out", out])
-    assert result.exit_code == 2 and result.output.count("\n") == 1 and fault in result.output
-
-
-def test_a_search_prints_its_result_if_it_cannot_be_written_in_the_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: Any) -> None:
-        raise OSError(28, "No space left on device")
-
-    def search(*_: Any) -> Any:
-        monkeypatch.setattr("os.fsync", full)
-        return {"gain": 1.25}, {"textbook_mean": 1.0, "tuning_mean": 2.0, "agent_steps": 9.0}
-
-    monkeypatch.chdir(tmp_path)
-    Path("pursuit.yaml").write_text("{task: pursuit}", encoding="utf-8")
-    monkeypatch.setattr(tune, "search", search)
-    result = CliRunner().invoke(tune.app, ["pursuit.yaml", "--out", "deep/x.json"])
-    assert result.exit_code == 2 and result.stderr.splitlines()[-1].startswith("error: cannot write ")
-    assert '{"gain": 1.25}' in result.stderr and not Path("deep").exists()
 
 
 @pytest.mark.slow

@@ -524,7 +524,7 @@ def test_cost_of_a_player_comes_from_its_card_or_from_its_tuning(
     monkeypatch.setattr("flockenv.players.rules.TUNED", in_temporary_folder)
     ppo = {"wall_time_s": 2.5, "steps": 3}
     assert comparison._costs(task, policies) == {"rules": {}, "ppo": ppo, "mine": {}}
-    Path("pursuit.json").write_text('{"task": "pursuit", "parameters": {}, "found": {"agent_steps": 1200.0}}')
+    Path("pursuit.json").write_text('{"players": {"rules": {"parameters": {}, "found": {"agent_steps": 1200.0}}}}')
     spent = {"of": "tuning", "steps": 1200}
     assert comparison._costs(task, policies) == {"rules": spent, "ppo": ppo, "mine": {}}
 

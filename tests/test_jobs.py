@@ -58,6 +58,15 @@ def fail(value: int) -> bytes:
     raise ValueError(f"{value} is too much")
 
 
+def process_id(value: int) -> bytes:
+    return str(os.getpid()).encode()
+
+
+def sleep(seconds: float) -> bytes:
+    time.sleep(seconds)
+    return b""
+
+
 def numbers(count: int) -> list[Job]:
     return [Job(f"test/{k}", number, (k,), k) for k in range(count)]
 
@@ -172,6 +181,18 @@ def test_a_job_that_kills_its_process_three_times_fails_with_the_end_of_its_outp
     with pytest.raises(FailedJobsError, match=r"its process ended 3 times.*it wrote: the last words \(job killer"):
         run_jobs(jobs, work(tmp_path, 2))
     assert all(Store(tmp_path / "jobs").has(job) for job in jobs[1:])
+
+
+def test_kept_processes_serve_several_runs_and_end_with_the_block() -> None:
+    engine, jobs = LocalEngine(2), [Job(f"test/{k}", process_id, (k,), k) for k in range(2)]
+    with engine.keep():
+        first, second = ({record for _, record in engine.run(jobs, lambda job: None)} for _ in range(2))
+        assert first == second and len(first) == 2
+        run = engine.run([Job("test/long", sleep, (600.0,), 0), *numbers(1)], lambda job: None)
+        assert next(run)[1] == b"0"
+        run.close()
+        assert {record for _, record in engine.run(numbers(2), lambda job: None)} == {b"0", b"1"}
+    assert not multiprocessing.active_children()
 
 
 def test_every_job_gets_a_process_of_its_own_if_wanted() -> None:

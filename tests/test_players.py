@@ -53,7 +53,7 @@ def test_the_seed_determines_the_random_player() -> None:
 @pytest.mark.parametrize(
     ("name", "task", "message"),
     [
-        ("rule", Pursuit(), "player 'rule': unknown, did you mean `rules`?; allowed: random, textbook, orca, "),
+        ("rule", Pursuit(), "player 'rule': unknown, did you mean `rules`?; allowed: random, textbook, orca_publ"),
         ("reynolds", Pursuit(), "player 'reynolds': is called 'rules'; allowed: "),
         ("x", Pursuit(), "player 'x': unknown; allowed: "),
         ("weights.zip.old", Pursuit(), "ppo, or a .safetensors or .py or .zip file"),

@@ -30,13 +30,16 @@ CASES = (
 
 @pytest.fixture(scope="module")
 def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The interpreter of a new virtual environment with flockenv's requirements and Ray."""
+    """The interpreter of a new virtual environment with flockenv's requirements, Ray and what searches need."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     folder = tmp_path_factory.mktemp("ray") / "venv"
     subprocess.run([sys.executable, "-m", "venv", folder], check=True)
-    ray = project["optional-dependencies"]["ray"]
+    extras = project["optional-dependencies"]
+    searches = [requirement for requirement in extras["train"] if requirement.startswith("cmaes")]
     command = [folder / "bin" / "pip", "install", "-q", "-c", ROOT / "configs" / "constraints-ray.txt"]
-    done = subprocess.run([*command, *project["dependencies"], *ray], capture_output=True, text=True)
+    done = subprocess.run(
+        [*command, *project["dependencies"], *extras["ray"], *searches], capture_output=True, text=True
+    )
     if done.returncode:
         pytest.skip(f"Ray cannot be installed: {done.stderr.strip().splitlines()[-1]}")
     return folder / "bin" / "python"

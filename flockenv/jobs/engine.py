@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable
+from contextlib import AbstractContextManager
 from typing import Protocol
 
 from flockenv.jobs.job import Failure, Job
@@ -28,6 +29,10 @@ class Engine(Protocol):
 
     def run(self, jobs: Iterable[Job], begun: Begun) -> Generator[tuple[Job, bytes | Failure], None, None]:
         """Yield each job with its record or its failure; closing the generator ends all work."""
+        ...
+
+    def keep(self) -> AbstractContextManager[object]:
+        """Keep what a run starts until the end of a block, for later runs in it."""
         ...
 
 

@@ -11,7 +11,7 @@ import threading
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from multiprocessing import active_children, get_context, parent_process, resource_tracker
 from multiprocessing.connection import wait as wait_for
 from multiprocessing.process import BaseProcess
@@ -44,37 +44,65 @@ class LocalEngine:
 
     def __init__(self, processes: int, renew: bool = False) -> None:
         self.processes, self.renew = processes, renew
+        self._kept: tuple[list[_Worker], Path] | None = None
 
     @property
     def parallel(self) -> bool:
         """True if there are several processes."""
         return self.processes > 1
 
-    def run(self, jobs: Iterable[Job], begun: Begun) -> Generator[tuple[Job, bytes | Failure], None, None]:
-        """Yield each job with its record or its failure."""
-        jobs = deque(jobs)
-        processes = count_fitting(min(self.processes, len(jobs)), jobs)
-        if self.processes == 1 and not self.renew:
-            for job in jobs:
-                begun(job)
-                yield job, execute(job.function, job.arguments, code_digest())
+    @property
+    def _in_this_process(self) -> bool:
+        return self.processes == 1 and not self.renew
+
+    def keep(self) -> AbstractContextManager[object]:
+        """Keep the processes of all runs in a block until it ends, so that later runs need not start new ones."""
+        return nullcontext() if self._in_this_process else self._keep()
+
+    @contextmanager
+    def _keep(self) -> Iterator[tuple[list[_Worker], Path]]:
+        if self._kept is not None:
+            yield self._kept
             return
         _start_tracker()
         with tempfile.TemporaryDirectory(prefix="flockenv-logs-") as logs, signals.remove_at_end(logs):
             workers: list[_Worker] = []
+            self._kept = workers, Path(logs)
             try:
-                workers += [_Worker(Path(logs, str(k)), max(1, cores() // processes)) for k in range(processes)]
-                yield from self._run(jobs, begun, workers)
+                yield self._kept
             finally:
+                self._kept = None
                 for worker in workers:
                     worker.end()
 
+    def run(self, jobs: Iterable[Job], begun: Begun) -> Generator[tuple[Job, bytes | Failure], None, None]:
+        """Yield each job with its record or its failure."""
+        jobs = deque(jobs)
+        processes = count_fitting(min(self.processes, len(jobs)), jobs)
+        if self._in_this_process:
+            for job in jobs:
+                begun(job)
+                yield job, execute(job.function, job.arguments, code_digest())
+            return
+        with self._keep() as (workers, logs):
+            more = range(len(workers), processes)
+            workers += [_Worker(logs / str(k), max(1, cores() // processes)) for k in more]
+            working: dict[Future[bytes | Failure], tuple[Job, _Worker]] = {}
+            try:
+                yield from self._run(jobs, begun, workers[:processes], working)
+            finally:
+                for _, worker in working.values():  # the run was closed before these jobs had ended
+                    worker.restart()
+
     def _run(
-        self, waiting: deque[Job], begun: Begun, workers: Sequence[_Worker]
+        self,
+        waiting: deque[Job],
+        begun: Begun,
+        workers: Sequence[_Worker],
+        working: dict[Future[bytes | Failure], tuple[Job, _Worker]],
     ) -> Generator[tuple[Job, bytes | Failure], None, None]:
-        """Give each free process the next job, until all are done."""
+        """Give each free process the next job, until all are done; `working` has those under way."""
         tries: Counter[str] = Counter()
-        working: dict[Future[bytes | Failure], tuple[Job, _Worker]] = {}
         idle = list(workers)
         while waiting or working:
             while waiting and idle:

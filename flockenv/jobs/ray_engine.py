@@ -9,7 +9,8 @@ from __future__ import annotations
 import logging
 import os
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import contextmanager
 from itertools import islice
 from typing import Any
 
@@ -39,7 +40,21 @@ class RayEngine:
 
     def run(self, jobs: Iterable[Job], begun: Begun) -> Generator[tuple[Job, bytes | Failure], None, None]:
         """Yield each job with its record or its failure."""
-        ray, started = self._ray, self._start()
+        with self.keep():
+            yield from self._run(jobs, begun)
+
+    @contextmanager
+    def keep(self) -> Iterator[None]:
+        """Stay connected until the end of a block: to the cluster, or to a local one that is started."""
+        started = self._start()
+        try:
+            yield
+        finally:
+            if started:
+                self._ray.shutdown()
+
+    def _run(self, jobs: Iterable[Job], begun: Begun) -> Generator[tuple[Job, bytes | Failure], None, None]:
+        ray = self._ray
         task = ray.remote(num_cpus=1, max_retries=TRIES - 1)(_execute)
         running: dict[Any, Job] = {}
         jobs, code = list(jobs), code_digest()
@@ -59,8 +74,6 @@ class RayEngine:
         finally:
             for reference in running:
                 ray.cancel(reference, force=True)
-            if started:
-                ray.shutdown()
 
     def _warm_up(self, jobs: Iterable[Job]) -> None:
         """Compile kernels on every node, each kernel in one task, and wait for the end of all tasks.

@@ -7,7 +7,8 @@
 
 * `random`: actions uniform in [-1, 1], the lower baseline of every table;
 * `textbook`: the hand-written player of a task, with published parameters;
-* `orca`, `heuristics`, `queueing`: other hand-written players, of some tasks each;
+* `orca`, `heuristics`, `queueing`: other hand-written players, of some tasks each, with parameters found by a search;
+* `orca_published`, `heuristics_published`, `queueing_published`: the same with published parameters;
 * `rules`: the hand-written player of a task, with parameters found by a search;
 * `ppo`: trained weights.
 """
@@ -26,9 +27,15 @@ if TYPE_CHECKING:
 
 # Neither the laws nor numba are imported here: `flockenv render --help` lists the players in a fifth of a second.
 
-__all__ = ["NAMES", "WEIGHTS", "load_player", "named_player", "other_tasks"]
+__all__ = ["NAMES", "PUBLISHED", "WEIGHTS", "load_player", "named_player", "other_tasks"]
 
-NAMES = ("random", "textbook", "orca", "heuristics", "queueing", "rules", "ppo")
+PUBLISHED = {
+    "orca": "orca_published", "heuristics": "heuristics_published", "queueing": "queueing_published",
+    "rules": "textbook",
+}  # fmt: skip
+"""Hand-written players with tuned parameters, and the name of each with published ones."""
+
+NAMES = ("random", *sorted(PUBLISHED.values(), key="textbook".__ne__), *PUBLISHED, "ppo")
 """Roughly from the weakest to the strongest; tables and pictures keep this order."""
 
 FORMER = {"reynolds": "rules"}

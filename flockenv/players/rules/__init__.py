@@ -1,10 +1,11 @@
 """The hand-written players: a file per task, built from the simulator's own steering laws.
 
-Each receives the learner's observation and nothing else, and its force has the same limits. Three kinds of names:
+Each receives the learner's observation and nothing else, and its force has the same limits. Two kinds of names:
 
-* `textbook`: published parameters, the defaults in the files;
-* `rules`: the same functions with the parameters that a search found (`python -m agents.tune`), in ../tuned/TASK.json;
-* `orca`, `heuristics`, `queueing`: other functions, of some tasks each, with published parameters.
+* `rules`, and of some tasks `orca`, `heuristics`, `queueing`: other functions; all with the parameters that a search
+  found (`python -m agents.tune`), in ../tuned/TASK.json;
+* `textbook`, `orca_published`, `heuristics_published`, `queueing_published`: the same functions with published
+  parameters, the defaults in the files.
 
     from flockenv.players.rules import player
     action, _ = player(task).predict(observation)
@@ -21,6 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flockenv.core.errors import printable_path
+from flockenv.players import PUBLISHED
 from flockenv.players.rules import (
     bottleneck,
     corridor,
@@ -36,7 +39,7 @@ from flockenv.players.rules import (
 )
 from flockenv.tasks import Task
 
-__all__ = ["PLAYERS", "RULES", "TUNED", "RulesPlayer", "Tuned", "as_dict", "load_tuned", "player"]
+__all__ = ["PLAYERS", "RULES", "TUNED", "RulesPlayer", "Tuned", "as_dict", "load_tuned", "player", "read_tuned"]
 
 TUNED = Path(__file__).resolve().parent.parent / "tuned"
 """Folder of parameters found by the search, a file per task."""
@@ -56,8 +59,7 @@ RULES: dict[str, tuple[Callable[..., Any], type]] = {
 }
 """Function of `textbook` and `rules` for each task, and the class of its parameters."""
 
-PLAYERS: dict[str, dict[str, tuple[Callable[..., Any], type]]] = {
-    "textbook": RULES,
+TUNABLE: dict[str, dict[str, tuple[Callable[..., Any], type]]] = {
     "orca": {
         "crossing": (crossing.orca_crossing, crossing.OrcaRules),
         "crowd_nav": (crowd_nav.orca_crowd_nav, crowd_nav.RobotOrcaRules),
@@ -68,6 +70,9 @@ PLAYERS: dict[str, dict[str, tuple[Callable[..., Any], type]]] = {
     "rules": RULES,
 }
 """Function and parameter class of each hand-written player, by its name and the task's."""
+
+PLAYERS = {**{PUBLISHED[name]: of for name, of in TUNABLE.items()}, **TUNABLE}
+"""The same, also by the names of those with published parameters."""
 
 REMEMBERING = (school.school,)
 """Functions with a state per row that is kept between decisions."""
@@ -106,19 +111,32 @@ class RulesPlayer:
 
 @dataclass(frozen=True)
 class Tuned:
-    """The parameters that a search found for a task, and the cost and score of the search."""
+    """The parameters that a search found for a player, and how: see `agents.tune.found_of`."""
 
     parameters: dict[str, float] = field(default_factory=dict)
-    found: dict[str, float] = field(default_factory=dict)  # agent_steps, tuning_mean, tuning_worlds, textbook_mean
+    found: dict[str, Any] = field(default_factory=dict)
 
 
-def load_tuned(name: str) -> Tuned:
-    """Return the parameters that the search found for a task; an empty record if there was no search yet."""
-    path = TUNED / f"{name}.json"
+def load_tuned(task: str, name: str = "rules") -> Tuned:
+    """Return the parameters that a search found for a player of a task; an empty record if there was no search yet."""
+    return Tuned(**read_tuned(TUNED / f"{task}.json").get(name, {}))
+
+
+def read_tuned(path: Path) -> dict[str, dict[str, Any]]:
+    """Return the content of a file of tuned parameters, by player: parameters and found; {} if there is no such file.
+
+    Raises:
+        ValueError: the file holds something else; one line.
+    """
     if not path.is_file():
-        return Tuned()
-    content = json.loads(path.read_text(encoding="utf-8"))
-    return Tuned(content["parameters"], content["found"])
+        return {}
+    try:
+        players: dict[str, dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))["players"]
+        if all(each.keys() == {"parameters", "found"} for each in players.values()):
+            return players
+    except (ValueError, LookupError, TypeError, AttributeError):
+        pass
+    raise ValueError(f"{printable_path(path)}: not a file of tuned parameters, which `python -m agents.tune` writes")
 
 
 def player(task: Task, name: str = "rules") -> RulesPlayer:
@@ -128,7 +146,7 @@ def player(task: Task, name: str = "rules") -> RulesPlayer:
         raise ValueError(
             f"there is no hand-written player {name!r} for {task.name!r}; there is one for: {', '.join(known)}"
         )
-    parameters = load_tuned(task.name).parameters if name == "rules" else {}
+    parameters = load_tuned(task.name, name).parameters if name in PUBLISHED else {}
     return RulesPlayer(task, replace(known[task.name][1](), **parameters), name)
 
 

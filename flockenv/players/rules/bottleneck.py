@@ -60,11 +60,11 @@ def _exit_direction(see: Any, task: Bottleneck) -> NDArray[np.float64]:
 class QueueingRules:
     """Reynolds' queue, with the headway of Tordeux, Chraibi and Seyfried 2016."""
 
-    headway: float = 1.0  # s
-    margin: float = 0.05  # m, clearance
-    gain: float = 8.0  # 1/s: at least 4 / headway
-    apart: float = 40.0  # N m, separation
-    radius: float = 0.8  # m, between centres, within which it acts
+    headway: float = parameter(1.0, 0.2, 2.0)  # s
+    margin: float = parameter(0.05, 0.0, 0.3)  # m, clearance
+    gain: float = parameter(8.0, 2.0, 20.0)  # 1/s: at least 4 / headway
+    apart: float = parameter(40.0, 0.0, 200.0)  # N m, separation
+    radius: float = parameter(0.8, 0.5, 2.0)  # m, between centres, within which it acts
 
 
 def queueing(see: Any, task: Bottleneck, p: QueueingRules) -> NDArray[np.float64]:

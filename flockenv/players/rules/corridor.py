@@ -65,10 +65,10 @@ def _wall_force(see: Any, strength: float, decay: float) -> NDArray[np.float64]:
 class CorridorOrcaRules:
     """ORCA: as published, each agent makes half of the change; a desired velocity that is not free is turned right."""
 
-    horizon: float = 2.0  # s, for which the velocity must be free of collisions
-    margin: float = 0.05  # m, clearance for delays by inertia
-    turn: float = 0.3  # rad, a desired velocity that is not free is turned right by this
-    gain: float = 10.0  # kg/s: reaches the desired velocity within a decision
+    horizon: float = parameter(2.0, 0.5, 6.0)  # s, for which the velocity must be free of collisions
+    margin: float = parameter(0.05, 0.0, 0.5)  # m, clearance for delays by inertia
+    turn: float = parameter(0.3, 0.0, 1.5)  # rad, a desired velocity that is not free is turned right by this
+    gain: float = parameter(10.0, 1.0, 20.0)  # kg/s: reaches the desired velocity within a decision
 
 
 def orca_corridor(see: Any, task: Corridor, p: CorridorOrcaRules) -> NDArray[np.float64]:

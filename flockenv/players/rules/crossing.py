@@ -61,11 +61,11 @@ def crossing(see: Any, task: Crossing, p: CrossingRules) -> NDArray[np.float64]:
 class OrcaRules:
     """ORCA: as published, each agent makes half of the change; without turning right, twelve agents deadlock."""
 
-    horizon: float = 2.0  # s, for which the velocity must be free of collisions
-    margin: float = 0.1  # m, clearance for delays by inertia
-    turn: float = 0.3  # rad, a desired velocity that is not free is turned right by this
-    gain: float = 10.0  # kg/s: reaches the desired velocity within a decision
-    slow_radius: float = 1.0  # m, slow down within this of the goal
+    horizon: float = parameter(2.0, 0.5, 6.0)  # s, for which the velocity must be free of collisions
+    margin: float = parameter(0.1, 0.0, 0.8)  # m, clearance for delays by inertia
+    turn: float = parameter(0.3, 0.0, 1.5)  # rad, a desired velocity that is not free is turned right by this
+    gain: float = parameter(10.0, 1.0, 20.0)  # kg/s: reaches the desired velocity within a decision
+    slow_radius: float = parameter(1.0, 0.1, 2.0)  # m, slow down within this of the goal
 
 
 def orca_crossing(see: Any, task: Crossing, p: OrcaRules) -> NDArray[np.float64]:

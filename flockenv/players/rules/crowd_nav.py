@@ -52,11 +52,11 @@ def crowd_nav(see: Any, task: CrowdNav, p: CrowdNavRules) -> NDArray[np.float64]
 class RobotOrcaRules:
     """ORCA as published, but for the share: a robot that the pedestrians do not see must make the whole change."""
 
-    horizon: float = 2.0  # s, for which the velocity must be free of collisions
-    margin: float = 0.1  # m, clearance for delays by inertia
-    turn: float = 0.0  # rad, a desired velocity that is not free is turned right by this
-    gain: float = 10.0  # kg/s: reaches the desired velocity within a decision
-    share: float = 1.0  # the robot's part of the change if pedestrians do not see it; else it is 0.5
+    horizon: float = parameter(2.0, 0.5, 6.0)  # s, for which the velocity must be free of collisions
+    margin: float = parameter(0.1, 0.0, 0.8)  # m, clearance for delays by inertia
+    turn: float = parameter(0.0, 0.0, 1.5)  # rad, a desired velocity that is not free is turned right by this
+    gain: float = parameter(10.0, 1.0, 20.0)  # kg/s: reaches the desired velocity within a decision
+    share: float = parameter(1.0, 0.5, 1.0)  # the robot's part of the change; 0.5 if pedestrians see it
 
 
 def orca_crowd_nav(see: Any, task: CrowdNav, p: RobotOrcaRules) -> NDArray[np.float64]:
@@ -69,10 +69,10 @@ def orca_crowd_nav(see: Any, task: CrowdNav, p: RobotOrcaRules) -> NDArray[np.fl
 class HeuristicsRules:
     """Parameters of Moussaid et al. 2011 as published, but for the range of sight, which is the observation's."""
 
-    tau: float = 0.5  # s, relaxation time, and the least time to a collision ahead
-    reach: float = 10.0  # d_max, m
-    view: float = 75.0  # degrees to either side of its heading
-    margin: float = 0.0  # m, clearance
+    tau: float = parameter(0.5, 0.1, 1.5)  # s, relaxation time, and the least time to a collision ahead
+    reach: float = parameter(10.0, 1.0, 20.0)  # d_max, m
+    view: float = parameter(75.0, 30.0, 180.0)  # degrees to either side of its heading
+    margin: float = parameter(0.0, 0.0, 0.8)  # m, clearance
 
 
 def heuristics_crowd_nav(see: Any, task: CrowdNav, p: HeuristicsRules) -> NDArray[np.float64]:
