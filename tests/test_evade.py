@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 from flockenv.envs.world import Step, World
+from flockenv.evaluation import rollout
+from flockenv.players.rules import RulesPlayer, player
+from flockenv.players.rules.evade import EscapeRules, EvadeRules, escape
 from flockenv.tasks import Evade
 
 FAR = (27.0, 27.0)
@@ -177,3 +180,60 @@ def test_invalid_fields_are_refused_in_one_line(fields: dict[str, Any], message:
         Evade(**fields)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+# --- the hand-written player ------------------------------------------------------------------------------------------
+
+
+def course(world: World, p: EscapeRules = EscapeRules()) -> Any:  # noqa: B008  # frozen
+    """Return the force of the escape at the present state, N."""
+    rows = world.reset(mask=np.zeros(1, bool))
+    return escape(world.task.layout.unpack(rows[0]), world.task, p)[0]
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7, 2.2, 4.0, 5.5])
+def test_the_escape_flees_from_a_single_pursuer(angle: float) -> None:
+    direction = np.array([np.cos(angle), np.sin(angle)])
+    force = course(scene((14.0, 14.0), (14.0, 14.0) + 3.0 * direction))
+    assert force @ direction < -0.9 * np.linalg.norm(force)
+    assert np.linalg.norm(force) == pytest.approx(5.0 * 3.0)  # gain x speed, from rest
+
+
+def test_the_escape_saves_effort_if_there_is_no_danger() -> None:
+    near, far = (np.linalg.norm(course(scene((4.0, 14.0), (4.0 + d, 14.0)))) for d in (4.0, 20.0))
+    assert far < 0.01 * near
+
+
+def test_the_escape_runs_along_a_wall_and_not_into_it() -> None:
+    force = course(scene((27.4, 10.0), (24.4, 10.0)))
+    assert abs(force[1]) > 3 * abs(force[0])
+
+
+def test_the_escape_prefers_the_course_that_ends_behind_cover() -> None:
+    """Cover beside the straight course away from the pursuer hides the end of a course on its side."""
+    for side in (1.0, -1.0):
+        world = scene((14.0, 14.0), (8.5, 14.0), cover=((13.0, 14.0 + side * 1.9, 0.7),))
+        hidden = course(world, EscapeRules(reach=1.0, exposed=2.0))
+        assert side * hidden[1] > 0.3 * np.linalg.norm(hidden)
+        assert abs(course(world, EscapeRules(reach=1.0, exposed=0.0))[1]) < 1e-9
+
+
+def test_parameters_of_the_escape_may_differ_by_row() -> None:
+    task = Evade()
+    rows = np.random.default_rng(0).uniform(0, 1, (6, task.layout.size)).astype(np.float32)
+    seen, other = task.layout.unpack(rows), EscapeRules(1.0, 1.0, 0.9, 1.5, 1.5, 2.0, 0.3, 8.0)
+    first, second = (escape(seen, task, p) for p in (EscapeRules(), other))
+    mixed = EscapeRules(*(
+        np.where(np.arange(6) < 3, a, b)
+        for a, b in zip(vars(EscapeRules()).values(), vars(other).values(), strict=True)
+    ))  # fmt: skip
+    np.testing.assert_array_equal(escape(seen, task, mixed), np.vstack([first[:3], second[3:]]))
+
+
+def test_the_escape_is_caught_less_often_than_the_textbook() -> None:
+    task = Evade()
+    assert player(task, "textbook").rules == EvadeRules()
+    escaping, hiding = (rollout(task, RulesPlayer(task, rules, name), 64, 7) for rules, name in (
+        (EscapeRules(), "rules"), (EvadeRules(), "textbook")))  # fmt: skip
+    assert escaping.success.mean() > hiding.success.mean() + 0.15
+    assert escaping.returns.mean() > hiding.returns.mean() + 3

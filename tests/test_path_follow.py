@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,14 @@ import pytest
 from flockenv.envs.world import Step, World
 from flockenv.evaluation import rollout
 from flockenv.geometry import polyline
-from flockenv.players.rules import RulesPlayer
-from flockenv.players.rules.path_follow import PathFollowRules
+from flockenv.players.rules import RulesPlayer, player
+from flockenv.players.rules.path_follow import (
+    PathFollowRules,
+    RacingRules,
+    allowed_speeds,
+    race,
+    racing_line,
+)
 from flockenv.render.picture import draw
 from flockenv.tasks import PathFollow
 from flockenv.tasks.path_follow import POINTS
@@ -121,11 +128,11 @@ def test_the_progress_reward_is_the_distance_covered_along_the_track() -> None:
     """The distance is that of flockenv.geometry.polyline, over a whole episode; success needs a full lap."""
     world = world_of()
     track = polyline.pieces(corners(world).tolist(), closed=True)
-    length, player = track[1], RulesPlayer(TASK, CAREFUL)
+    length, careful = track[1], RulesPlayer(TASK, CAREFUL, "textbook")
     s, gone = polyline.project(track, world.state.pos[0, 0])[0], 0.0
     observation = world.reset(3)
     for _ in range(TASK.horizon):
-        step = world.step(player.predict(observation[:, 0])[0][:, None])
+        step = world.step(careful.predict(observation[:, 0])[0][:, None])
         observation = step.observation
         now = polyline.project(track, world.state.pos[0, 0])[0]
         gained = (now - s + length / 2) % length - length / 2
@@ -243,10 +250,97 @@ def test_invalid_parameters_are_refused_in_one_line(change: dict[str, Any], mess
 
 
 def test_a_player_that_brakes_before_bends_stays_on_the_track_unlike_the_textbook() -> None:
-    found = {name: rollout(TASK, RulesPlayer(TASK, rules), 32, 7) for name, rules in (
+    found = {name: rollout(TASK, RulesPlayer(TASK, rules, "textbook"), 32, 7) for name, rules in (
         ("careful", CAREFUL), ("textbook", PathFollowRules()))}  # fmt: skip
     assert found["careful"].success.all()
     assert found["careful"].metrics["off_track"].max() < 0.02
     assert found["careful"].metrics["progress"].min() > 120
     assert found["textbook"].success.mean() < 0.5
     assert found["careful"].returns.mean() > found["textbook"].returns.mean() + 20
+
+
+def view(points: Any, left: float = 0.0, velocity: Any = (0.0, 0.0)) -> Any:
+    """Return one row of an observation: the points ahead (ahead, 2) m, the offset to the left, the velocity."""
+    return SimpleNamespace(points=np.array([points], float), left=np.array([left]), velocity=np.array([velocity]))
+
+
+STRAIGHT = TASK.spacing * np.stack([1.0 + np.arange(TASK.ahead), np.zeros(TASK.ahead)], axis=1)
+CORNER = TASK.spacing * np.array([(1, 0), (2, 0), (3, 0), (4, 0), (4, 1), (4, 2), (4, 3), (4, 4)], float)
+
+
+def test_the_racing_line_of_a_straight_track_is_straight_and_run_at_full_speed() -> None:
+    aside = racing_line(view(STRAIGHT - (0.0, 0.3), 0.3, (5.0, 0.0)), TASK, RacingRules())[0, 1:]
+    np.testing.assert_allclose(aside[:, 1], np.linspace(0.0, aside[-1, 1], len(aside)), atol=0.05)
+    assert np.abs(aside[1:, 1] + 0.3).max() <= 0.9 * TASK.half_width
+    straight = racing_line(view(STRAIGHT), TASK, RacingRules())
+    np.testing.assert_allclose(straight[0, 1:], np.vstack([[0.0, 0.0], STRAIGHT]), atol=1e-9)
+    np.testing.assert_allclose(allowed_speeds(straight, TASK, RacingRules()), TASK.max_speed)
+    np.testing.assert_allclose(race(view(STRAIGHT), TASK, RacingRules()), [[10.0 * TASK.max_speed, 0.0]])
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_the_racing_line_cuts_a_corner_within_the_width(side: float) -> None:
+    corner = CORNER * (1.0, side)
+    line = racing_line(view(corner, velocity=(4.0, 0.0)), TASK, RacingRules(width=0.8))[0]
+    moved, limit = line[2:] - corner, 0.8 * TASK.half_width
+    assert np.linalg.norm(moved, axis=1).max() <= limit + 1e-9
+    inwards = np.array([-1.0, side]) / np.sqrt(2.0)
+    assert moved[3] @ inwards == pytest.approx(limit)  # the corner itself is cut as far as allowed
+    assert side * moved[1, 1] < -0.1 and moved[5, 0] > 0.1  # from the outside to the outside
+    middle = np.vstack([line[:2], corner])
+    bending, straight_bending = (np.square(np.diff(each, n=2, axis=0)[1:]).sum() for each in (line, middle))
+    assert bending < 0.5 * straight_bending
+
+
+def test_no_other_line_within_the_width_bends_less() -> None:
+    """The offsets are compared with those of scipy's bounded least squares."""
+    from scipy.optimize import lsq_linear
+
+    line = racing_line(view(CORNER, velocity=(4.0, 0.0)), TASK, RacingRules(width=0.8))[0, 1:]
+    tangent = np.gradient(np.vstack([[0.0, 0.0], CORNER]), axis=0)[1:]
+    side = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1) / np.linalg.norm(tangent, axis=1)[:, None]
+    second = np.diff(np.eye(TASK.ahead + 1), n=2, axis=0)
+    columns = np.stack([(second[:, k + 1, None] * side[k]).ravel() for k in range(TASK.ahead)], axis=1)
+    limit = 0.8 * TASK.half_width
+    best = lsq_linear(columns, -(second @ np.vstack([[0.0, 0.0], CORNER])).ravel(), (-limit, limit))
+    assert np.square(second @ line).sum() == pytest.approx(2.0 * best.cost, rel=2e-3)
+
+
+def test_speed_in_a_bend_and_before_it_stays_within_the_friction_circle() -> None:
+    radius, turn = 2.0, 0.6 * np.arange(5)
+    bend = radius * np.stack([np.sin(turn), 1.0 - np.cos(turn)], axis=1)
+    line = np.vstack([[(x, 0.0) for x in (-6.0, -4.8, -3.6, -2.4, -1.2)], bend])[None]
+    p = RacingRules(late=1.0)
+    speed = allowed_speeds(line, TASK, p)[0]
+    assert speed.shape == (TASK.ahead,)
+    np.testing.assert_allclose(speed[5:], np.sqrt(TASK.max_force * radius))  # v^2 / r = F / m
+    assert speed[0] == TASK.max_speed
+    assert (np.diff(speed[:6]) <= 0.0).all() and np.diff(speed[:6]).min() < -0.5
+    length = np.linalg.norm(np.diff(line[0], axis=0), axis=1)[1:]
+    braking = -np.diff(speed**2) / (2.0 * length[: len(speed) - 1])
+    across = np.zeros(len(speed) - 1)
+    across[4:] = speed[5:] ** 2 / radius
+    assert np.hypot(braking, across).max() <= TASK.max_force * (1 + 1e-9)
+    assert np.hypot(braking[1:4], across[1:4]).max() == pytest.approx(TASK.max_force)
+    np.testing.assert_allclose(allowed_speeds(line, TASK, RacingRules(grip=0.5))[0, 5:], np.sqrt(8.0))
+
+
+def test_parameters_may_differ_by_row() -> None:
+    rows = np.random.default_rng(0).uniform(-1, 1, (6, TASK.layout.size)).astype(np.float32)
+    seen, other = TASK.layout.unpack(rows), RacingRules(width=0.6, course=0.5, grip=1.2, brake=0.7, late=1, lead=0.2)
+    first, second = (race(seen, TASK, p) for p in (RacingRules(), other))
+    mixed = RacingRules(**{
+        name: np.where(np.arange(6) < 3, a, b)
+        for (name, a), b in zip(vars(RacingRules()).items(), vars(other).values(), strict=True)
+    })  # fmt: skip
+    np.testing.assert_array_equal(race(seen, TASK, mixed), np.vstack([first[:3], second[3:]]))
+
+
+def test_the_racing_line_is_faster_than_braking_on_the_middle_line() -> None:
+    assert player(TASK).rules.__class__ is RacingRules
+    assert player(TASK, "textbook").rules == PathFollowRules()
+    racing, careful = (rollout(TASK, RulesPlayer(TASK, rules, name), 32, 7) for rules, name in (
+        (RacingRules(), "rules"), (CAREFUL, "textbook")))  # fmt: skip
+    assert racing.success.all()
+    assert racing.metrics["off_track"].max() < 0.02
+    assert (racing.returns - careful.returns).min() > 2

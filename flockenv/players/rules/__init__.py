@@ -5,7 +5,7 @@ Each receives the learner's observation and nothing else, and its force has the 
 * `rules`, and of some tasks `orca`, `heuristics`, `queueing`: other functions; all with the parameters that a search
   found (`python -m agents.tune`), in ../tuned/TASK.json;
 * `textbook`, `orca_published`, `heuristics_published`, `queueing_published`: the same functions with published
-  parameters, the defaults in the files.
+  parameters, the defaults in the files; in evade and path_follow, `textbook` is another function than `rules`.
 
     from flockenv.players.rules import player
     action, _ = player(task).predict(observation)
@@ -47,17 +47,24 @@ TUNED = Path(__file__).resolve().parent.parent / "tuned"
 RULES: dict[str, tuple[Callable[..., Any], type]] = {
     "pursuit": (pursuit.pursuit, pursuit.PursuitRules),
     "obstacles": (obstacles.obstacles, obstacles.ObstaclesRules),
-    "evade": (evade.evade, evade.EvadeRules),
+    "evade": (evade.escape, evade.EscapeRules),
     "flock": (flock.flock, flock.FlockRules),
     "crossing": (crossing.crossing, crossing.CrossingRules),
     "herd": (herd.herd, herd.HerdRules),
-    "path_follow": (path_follow.path_follow, path_follow.PathFollowRules),
+    "path_follow": (path_follow.race, path_follow.RacingRules),
     "school": (school.school, school.SchoolRules),
     "crowd_nav": (crowd_nav.crowd_nav, crowd_nav.CrowdNavRules),
     "bottleneck": (bottleneck.bottleneck, bottleneck.BottleneckRules),
     "corridor": (corridor.corridor, corridor.CorridorRules),
 }
-"""Function of `textbook` and `rules` for each task, and the class of its parameters."""
+"""Function of `rules` for each task, and the class of its parameters."""
+
+TEXTBOOK: dict[str, tuple[Callable[..., Any], type]] = {
+    **RULES,
+    "evade": (evade.evade, evade.EvadeRules),
+    "path_follow": (path_follow.path_follow, path_follow.PathFollowRules),
+}
+"""The same of `textbook`: other functions, as published, where `rules` are better ones than those."""
 
 TUNABLE: dict[str, dict[str, tuple[Callable[..., Any], type]]] = {
     "orca": {
@@ -71,7 +78,11 @@ TUNABLE: dict[str, dict[str, tuple[Callable[..., Any], type]]] = {
 }
 """Function and parameter class of each hand-written player, by its name and the task's."""
 
-PLAYERS = {**{PUBLISHED[name]: of for name, of in TUNABLE.items()}, **TUNABLE}
+PLAYERS: dict[str, dict[str, tuple[Callable[..., Any], type]]] = {
+    **{PUBLISHED[name]: of for name, of in TUNABLE.items()},
+    **TUNABLE,
+    "textbook": TEXTBOOK,
+}
 """The same, also by the names of those with published parameters."""
 
 REMEMBERING = (school.school,)

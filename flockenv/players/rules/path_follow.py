@@ -1,4 +1,4 @@
-"""PathFollow: seek the track ahead if the predicted place is off it; brake before a bend."""
+"""PathFollow: follow a racing line at the speed that its bends allow, or keep near the middle line (Reynolds 1999)."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from flockenv.players.rules.parameter import parameter
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import PathFollow
 
-__all__ = ["PathFollowRules", "path_follow"]
+__all__ = ["PathFollowRules", "RacingRules", "allowed_speeds", "path_follow", "race", "racing_line"]
 
 follow_path = rows(steering.follow_path)
+seek = rows(steering.seek)
 
 
 @dataclass(frozen=True)
@@ -58,3 +59,112 @@ def path_follow(see: Any, task: PathFollow, p: PathFollowRules) -> NDArray[np.fl
 
 _FINE = 5
 """Interpolated places per piece between two observed points of the track, among which the nearest is taken."""
+
+
+@dataclass(frozen=True)
+class RacingRules:
+    """Defaults: the whole force limit is used, and the line keeps a tenth of the half width from the track's edges."""
+
+    width: float = parameter(0.9, 0.6, 1.0)  # share of the track's half width that the line may use
+    course: float = parameter(0.0, 0.0, 1.0)  # weight of the bend from the present course into the line
+    grip: float = parameter(1.0, 0.7, 1.4)  # share of max_force that a bend may need
+    brake: float = parameter(1.0, 0.4, 1.4)  # share of max_force that is assumed for braking
+    late: float = parameter(0.5, 0.0, 1.0)  # braking leaves the force for the bend at a piece's start (0) or end (1)
+    lead: float = parameter(0.1, 0.03, 0.4)  # s, look-ahead at the present speed to the point that is sought
+    gain: float = parameter(10.0, 4.0, 20.0)  # kg/s: reaches the desired velocity within a decision
+
+
+def race(see: Any, task: PathFollow, p: RacingRules) -> NDArray[np.float64]:
+    """Seek the racing line just ahead at the speed that its bends allow; vectors are (along the track, left)."""
+    line = racing_line(see, task, p)
+    speeds = allowed_speeds(line, task, p)
+    speed = np.linalg.norm(see.velocity, axis=-1)
+    place = np.minimum(p.lead * np.maximum(speed, 0.25 * task.max_speed) / task.spacing, task.ahead - 1.001)
+    target, desired = _between(line[:, 1:], place), _between(speeds[..., None], place)[:, 0]
+    force: NDArray[np.float64] = np.asarray(p.gain)[..., None] * seek(target, see.velocity, desired)
+    return force
+
+
+def racing_line(see: Any, task: PathFollow, p: RacingRules) -> NDArray[np.float64]:
+    """Return the line of least curvature through the agent and past the points ahead, (R, 2 + ahead, 2) m.
+
+    Its first point lies one spacing behind the agent, against its course; the second is the agent. Each other one is
+    the point of the middle line moved sideways, within the width. The sum of squares of the second differences is least
+    (Heilmeier et al. 2019, Vehicle System Dynamics 58, 1497).
+    """
+    here = np.stack([0.0 * see.left, 0.0 * see.left], axis=-1)[:, None]
+    nearest = np.stack([0.0 * see.left, -see.left], axis=-1)[:, None]
+    tangent = np.gradient(np.concatenate([nearest, see.points], axis=1), axis=1)[:, 1:]
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=-1, keepdims=True), 1e-9)
+    sideways = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
+    speed = np.linalg.norm(see.velocity, axis=-1)[:, None]
+    course = np.where(speed > 0.5, see.velocity / np.maximum(speed, 1e-9), [1.0, 0.0])[:, None]
+    middle = np.concatenate([-task.spacing * course, here, see.points], axis=1)
+    bending = _bending(task.ahead, p.course)
+    matrix = bending[..., 2:] * (sideways @ sideways.transpose(0, 2, 1))
+    pull = np.sum(sideways * (bending @ middle), axis=-1)
+    limit = task.half_width * np.asarray(p.width)[..., None]
+    middle[:, 2:] += _least_within(matrix, pull, limit)[..., None] * sideways
+    return middle
+
+
+def _bending(points: int, course: float) -> NDArray[np.float64]:
+    """Return the matrix whose product with the line is half the derivative of the sum of squares by its points.
+
+    (..., points, points + 2). `course` is the weight of the first second difference, that at the agent.
+    """
+    second = np.diff(np.eye(points + 2), n=2, axis=0)
+    weights = np.concatenate([np.asarray(course)[..., None], np.ones((*np.shape(course), points - 1))], axis=-1)
+    product: NDArray[np.float64] = second[:, 2:].T @ (weights[..., None] * second)
+    return product
+
+
+def _least_within(matrix: NDArray[np.float64], pull: NDArray[np.float64], limit: Any) -> NDArray[np.float64]:
+    """Return the offsets x (R, K) within +-limit for which x M x / 2 + pull x is least.
+
+    Alternating direction method of multipliers (Boyd et al. 2011, Found. Trends Mach. Learn. 3, 1), stopped early.
+    """
+    one = np.eye(pull.shape[1])
+    inverse = np.linalg.inv(matrix + (_PENALTY + _LEVEL) * one)
+    within, excess = np.zeros(pull.shape), np.zeros(pull.shape)
+    for _ in range(_ITERATIONS):
+        offset = (inverse @ (_PENALTY * (within - excess) - pull)[..., None])[..., 0]
+        within = np.clip(offset + excess, -limit, limit)
+        excess += offset - within
+    return within
+
+
+def allowed_speeds(line: NDArray[np.float64], task: PathFollow, p: RacingRules) -> NDArray[np.float64]:
+    """Return the greatest speeds at the agent and at the points ahead of it but the last, (R, ahead) m/s.
+
+    Backwards from the end: braking and cornering forces together stay within a circle (Kapania, Subosits and Gerdes
+    2016, J. Dyn. Sys., Meas., Control 138, 091005).
+    """
+    before, after = line[:, 1:-1] - line[:, :-2], line[:, 2:] - line[:, 1:-1]
+    length = np.linalg.norm(after, axis=-1)
+    sine = np.abs(before[..., 0] * after[..., 1] - before[..., 1] * after[..., 0])
+    sides = np.linalg.norm(before, axis=-1) * length * np.linalg.norm(before + after, axis=-1)
+    needed = 2.0 * sine / np.maximum(sides, 1e-9) / (np.asarray(p.grip)[..., None] * task.max_force)  # s^2/m^2
+    square = np.minimum(task.max_speed**2, 1.0 / np.maximum(needed, 1e-9))
+    for k in range(task.ahead - 2, -1, -1):
+        bend = (1.0 - p.late) * needed[:, k] + p.late * needed[:, k + 1]
+        left = np.sqrt(1.0 - np.minimum(square[:, k + 1] * bend, 1.0) ** 2)
+        slowed = square[:, k + 1] + 2.0 * p.brake * task.max_force * left * length[:, k]
+        square[:, k] = np.minimum(square[:, k], slowed)
+    speeds: NDArray[np.float64] = np.sqrt(square)
+    return speeds
+
+
+def _between(values: NDArray[np.float64], place: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the linear interpolation of values (R, K, D) at places (R,) in units of their index."""
+    row, k = np.arange(len(place)), place.astype(int)
+    share = (place - k)[:, None]
+    between: NDArray[np.float64] = values[row, k] * (1.0 - share) + values[row, k + 1] * share
+    return between
+
+
+_LEVEL = 1e-6
+"""Weight of the squares of the offsets: selects one of the straight lines through the agent on a straight track."""
+
+_ITERATIONS, _PENALTY = 20, 0.5
+"""Of the method of multipliers; more iterations move the line by a few centimetres, and gain nothing."""
