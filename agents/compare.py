@@ -28,6 +28,7 @@ from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import nearest, printable
 from flockenv.core.output_paths import check_room, valid_file, valid_path
+from flockenv.envs.disturbance import Disturbance
 from flockenv.evaluation import WORLDS_PER_SEED, Episodes, task_digest, worlds_for
 from flockenv.jobs import Job, Store, Work, engine_of, run_jobs
 from flockenv.jobs.local_engine import LocalEngine
@@ -70,11 +71,12 @@ def compare(
     resamples: int = RESAMPLES,
     trust_pickle: bool = False,
     work: Work | None = None,
+    disturbance: Disturbance | None = None,
 ) -> tuple[report.Results, dict[str, dict[str, Episodes]]]:
     """Play every task with every player in the same worlds; return the results as plain data, and the episodes.
 
     work: where and how to run the jobs, one for each task and player (default: one after another in this process, and
-    nothing is stored).
+    nothing is stored). disturbance: of the worlds, the same for every player (default: none).
 
     Raises:
         ValueError: a player cannot be loaded (before any episode), or jobs fail while playing; one line.
@@ -82,7 +84,7 @@ def compare(
     if work is None:
         with TemporaryDirectory(prefix="flockenv-jobs-") as folder:
             work = Work(Store(Path(folder)), LocalEngine(1))
-            return compare(tasks, players, worlds, seed, resamples, trust_pickle, work)
+            return compare(tasks, players, worlds, seed, resamples, trust_pickle, work, disturbance)
     began = perf_counter()
     first = worlds_for("evaluation", seed, worlds)
     fields = players_of(tasks, players)
@@ -91,7 +93,7 @@ def compare(
         for task in tasks
     }
     jobs = {
-        (task.name, player.name): play_job("compare", task, player, worlds, seed, RECORDED, trust_pickle)
+        (task.name, player.name): play_job("compare", task, player, worlds, seed, RECORDED, trust_pickle, disturbance)
         for task in tasks for player in fields[task.name]
     }  # fmt: skip
     run_jobs(in_turn(jobs), work)
@@ -106,6 +108,7 @@ def compare(
         "seed": seed,
         "worlds": worlds,
         "world_seeds": {"block": "evaluation", "first": first, "last": first + worlds - 1},
+        "disturbance": (disturbance or Disturbance()).model_dump(),
         "bootstrap": {"resamples": resamples, "seed": seed, "interval": "95 % percentile; proportions: 95 % Wilson"},
         "players": {player.name: player.spec for player in players},
         "tasks": {
@@ -187,6 +190,9 @@ def main(
     worlds: Annotated[int | None, typer.Option(help=f"Worlds per task, the same for every player. [{WORLDS}]")] = None,
     seed: Annotated[int, typer.Option(help="Block of evaluation worlds, 0 to 999.")] = 0,
     out: Annotated[str, typer.Option(help=f"Folder for {', '.join(FILES)}.")] = "results",
+    noise: Annotated[float, typer.Option(help="Standard deviation of noise on what players observe, 0 to 1.")] = 0.0,
+    delay: Annotated[int, typer.Option(help="Decisions by which actions are late, 0 to 20.")] = 0,
+    dropped: Annotated[float, typer.Option(help="Probability that a neighbour is not detected, 0 to 1.")] = 0.0,
     engine: EngineName = "local",
     processes: Processes = None,
     fresh: Fresh = False,
@@ -206,10 +212,11 @@ def main(
         if not 2 <= count <= WORLDS_PER_SEED:
             raise ValueError(f"--worlds {count}: must be from 2 to {WORLDS_PER_SEED}")
         resamples = SMOKE_RESAMPLES if smoke else RESAMPLES
+        disturbance = Disturbance(noise=noise, delay=delay, dropped=dropped)
         runner, part = engine_of(engine, processes, small=count < WORLDS), shard_of(shard)
         with job_bar() as progress:
             work = Work(Store(folder / JOBS), runner, fresh, progress, part)
-            results, episodes = compare(chosen, field, count, seed, resamples, trust_pickle, work)
+            results, episodes = compare(chosen, field, count, seed, resamples, trust_pickle, work, disturbance)
         results["smoke"] = smoke
         write_all_or_none(folder, _file_writers(results, episodes))
     _show(results, folder)
@@ -262,7 +269,7 @@ def _draw(path: Path, results: report.Results, episodes: Mapping[str, Mapping[st
     from flockenv.evaluation.plots import write_chart
 
     columns = [report.chart_column(task, about, episodes[task]) for task, about in results["tasks"].items()]
-    note = f"{results['worlds']} worlds per task, the same for every player; level differences are grey"
+    note = f"{report.conditions(results)}, the same for every player; level differences are grey"
     write_chart(path, columns, "Hand-written steering against learning", note)
 
 

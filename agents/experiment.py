@@ -16,6 +16,7 @@ from pydantic import Field, ValidationError, model_validator
 from flockenv.core.address_space import shortage
 from flockenv.core.errors import key_path, refusals
 from flockenv.core.record import Record
+from flockenv.envs.disturbance import Disturbance
 from flockenv.scene.yaml_io import load
 from flockenv.tasks import TASKS, Task
 
@@ -63,6 +64,11 @@ class PpoSettings(Record):
     threads: int = Field(default=2, ge=1, le=64, description="of torch and of the worlds; 1 if cores are shared")
     dtype: Literal["float32", "float64"] = Field(default="float32", description="precision of the training worlds")
     seed: int = Field(default=0, ge=0, lt=1000, description="seed of the weights and of the training worlds")
+    disturbance: Disturbance = Field(
+        default_factory=Disturbance,
+        exclude_if=lambda disturbance: not disturbance,  # so recipes without one stay equal to those from before
+        description="noise, delay and dropped of the worlds for learning and for the curve, not of imitation",
+    )
     evaluate_every: int = Field(default=1_000_000, ge=1, description="agent-steps between points of the curve")
     evaluate_worlds: int = Field(default=256, ge=1, description="tuning worlds per point of the curve")
 

@@ -9,6 +9,7 @@ resumed under the same versions on the same machine has the same weights as an u
 
 from __future__ import annotations
 
+import functools
 import os
 import platform
 import time
@@ -43,6 +44,7 @@ from flockenv.cli.terminal import DIVERGED, handle_interrupt, job_bar, run_progr
 from flockenv.core import signals
 from flockenv.core.address_space import IN_USE, TRAINING, require_room
 from flockenv.core.output_paths import check_room, valid_file, valid_path
+from flockenv.envs.disturbance import make_world
 from flockenv.envs.sb3 import WorldVecEnv
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.jit.thread_pool import threads, use_threads
@@ -94,7 +96,8 @@ def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
     torch.manual_seed(p.seed)
     learned = task.model_copy(update={"dtype": p.dtype})
     shows = CentralVecEnv if p.central_critic else WorldVecEnv
-    worlds = ForLearning(shows(learned, p.worlds, leaving=not task.ends_together), p.reward_scale, p.stagger, p.hold)
+    envs = shows(learned, p.worlds, leaving=not task.ends_together, disturbance=p.disturbance)
+    worlds = ForLearning(envs, p.reward_scale, p.stagger, p.hold)
     caring: dict[str, Any] = {}
     if p.care:
         caring["rollout_buffer_class"] = CaringBuffer
@@ -133,10 +136,11 @@ def score(task: Task, p: PpoSettings, tensors: dict[str, np.ndarray]) -> tuple[f
     Raises:
         LearningDiverged: an action of the policy, or a reward, is not finite.
     """
-    policy = MlpPolicy(tensors, {"activation": p.activation})
+    policy, first = MlpPolicy(tensors, {"activation": p.activation}), worlds_for("tuning", p.seed, p.evaluate_worlds)
+    make = functools.partial(make_world, disturbance=p.disturbance)
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # a result that is not finite raises an error
-            episodes = rollout(task, policy, p.evaluate_worlds, worlds_for("tuning", p.seed, p.evaluate_worlds))
+            episodes = rollout(task, policy, p.evaluate_worlds, first, make_world=make)
     except ValueError as error:  # the message names the world
         raise LearningDiverged(f"on the tuning worlds: {error}") from error
     return float(np.mean(episodes.returns)), float(np.mean(episodes.success))

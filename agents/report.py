@@ -18,8 +18,8 @@ from flockenv.evaluation import Comparison, Episodes, Interval, compare, summari
 from flockenv.evaluation.plots import Column, Row
 
 __all__ = [
-    "chart_column", "differences", "grid", "interval_fields", "interval_text", "json_text", "markdown", "number_text",
-    "player_tables", "table_of", "task_results", "verdict",
+    "chart_column", "conditions", "differences", "grid", "interval_fields", "interval_text", "json_text", "markdown",
+    "number_text", "player_tables", "table_of", "task_results", "verdict",
 ]  # fmt: skip
 
 Results = dict[str, Any]
@@ -219,10 +219,16 @@ def json_text(results: Results) -> str:
     return re.sub(r"\[\s+([-+.\deE,\s]*?)\s+\]", lambda m: f"[{' '.join(m[1].split())}]", text) + "\n"
 
 
+def conditions(results: Results) -> str:
+    """Return the number of worlds and their disturbance as text: "256 worlds per task, noise 0.05"."""
+    disturbance = [f"{name} {value:g}" for name, value in results.get("disturbance", {}).items() if value]
+    return ", ".join([f"{results['worlds']} worlds per task", *disturbance])
+
+
 def markdown(results: Results) -> str:
     """Return the whole comparison as a Markdown page."""
     seeds = f"{results['world_seeds']['first']} to {results['world_seeds']['last']}"
-    parts = ["# Hand-written steering against learning", f"{results['worlds']} worlds per task, seeds {seeds}."]
+    parts = ["# Hand-written steering against learning", f"{conditions(results)}, seeds {seeds}."]
     for task, about in results["tasks"].items():
         parts += [f"## {task}", about["verdict"], *differences(task, about), grid(*player_cells(about))]
         parts += [grid(*pair_cells(about))] if about["pairs"] else []

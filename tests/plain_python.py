@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flockenv.envs.disturbance import Disturbance, make_world
 from flockenv.envs.world import World
 from flockenv.physics.integrators import INTEGRATORS
 from flockenv.scene import Scene
@@ -31,7 +32,7 @@ STEPS, DECISIONS, MOST_AGENTS = 3, 4, 150
 
 
 def cases() -> Iterator[tuple[str, Any]]:
-    """Yield scenes of each effect, behaviour and method, shipped scenes (constraints, populations), and tasks."""
+    """Yield scenes of each effect, behaviour and method, shipped scenes (constraints, populations), tasks, a world."""
     for row in EFFECTS:
         for dimension in sorted(row.dimensions):
             yield f"{row.name}, {dimension}-D", scene_under(row, dimension)
@@ -46,14 +47,15 @@ def cases() -> Iterator[tuple[str, Any]]:
         if scene.agents <= MOST_AGENTS:
             yield path.name, scene
     yield from ((name, kind()) for name, kind in TASKS.items())
+    yield "disturbance", make_world(TASKS["herd"](), 3, disturbance=Disturbance(noise=0.1, delay=1, dropped=0.3))
 
 
 def ended(case: Any) -> NDArray[np.float64]:
-    """Return a scene's motion after a few steps, or a task's observations and rewards of a few decisions."""
+    """Return a scene's motion after a few steps, or observations and rewards of a few decisions of a task or world."""
     if isinstance(case, Scene):
         state = case.run(case.start(3), STEPS)
         return np.concatenate([state.x.ravel(), state.v.ravel()]).astype(float)
-    world, rng = World(case, 3), np.random.default_rng(0)
+    world, rng = case if isinstance(case, World) else World(case, 3), np.random.default_rng(0)
     world.reset(0)
     steps = [world.step(rng.uniform(-1, 1, (3, world.learners, world.action_size))) for _ in range(DECISIONS)]
     shown = [each.ravel() for step in steps for each in (step.observation, step.reward)]

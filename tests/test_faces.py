@@ -9,9 +9,9 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from flockenv.envs.common import ByAgent, iterate_by_name
+from flockenv.envs.disturbance import Disturbance, make_world
 from flockenv.envs.sb3 import WorldVecEnv
 from flockenv.envs.table import id_of
-from flockenv.envs.world import World
 from flockenv.tasks import Bottleneck, Corridor, Crossing, CrowdNav, Evade, Flock, Herd, Obstacles, Pursuit, School
 
 SEED, LIMIT, STEPS = 21, 15, 40
@@ -43,8 +43,8 @@ def record(observation, reward, terminated, truncated):
 # the first observation, then records, and after each end the first observation of the next episode.
 
 
-def through_world(task, actions):
-    world = World(task, time_limit=LIMIT)
+def through_world(task, actions, disturbance=Disturbance()):  # noqa: B008  # immutable
+    world = make_world(task, time_limit=LIMIT, disturbance=disturbance)
     logs = [[row.tobytes()] for row in world.reset(seeds=SEED)[0]]
     for action in actions:
         step = world.step(action[None])
@@ -86,8 +86,8 @@ def through_vector(env_id, parameters, actions):
     return logs
 
 
-def through_sb3(task, actions):
-    env = WorldVecEnv(task, 3, time_limit=LIMIT)
+def through_sb3(task, actions, disturbance=None):
+    env = WorldVecEnv(task, 3, time_limit=LIMIT, disturbance=disturbance)
     env.seed(SEED - 1)
     mine = slice(task.learners, 2 * task.learners)
     logs = [[row.tobytes()] for row in env.reset()[mine]]
@@ -162,6 +162,28 @@ def test_many_learners_get_the_same_numbers_in_every_face_for_several():
     assert through_vector("flockenv/Flock-v1", parameters, actions) == expected
     assert through_parallel("flockenv/Flock-v1", parameters, actions) == expected
     assert through_turns("flockenv/Flock-v1", parameters, actions) == expected
+
+
+DISTURBED = {"noise": 0.2, "delay": 2, "dropped": 0.3}
+
+
+def test_a_disturbance_has_the_same_numbers_in_every_face():
+    task, parameters, disturbance = Flock(agents=7, learners=5), {"agents": 7, "learners": 5}, Disturbance(**DISTURBED)
+    actions = sequence(task)
+    expected = through_world(task, actions, disturbance)
+    assert expected != through_world(task, actions)
+    assert through_sb3(task, actions, disturbance) == expected
+    for through in (through_vector, through_parallel, through_turns):
+        assert through("flockenv/Flock-v1", {**parameters, **DISTURBED}, actions) == expected
+
+
+def test_a_disturbance_has_the_same_numbers_in_every_face_for_one_learner():
+    task, disturbance = Pursuit(), Disturbance(**DISTURBED)
+    actions = sequence(task)
+    expected = through_world(task, actions, disturbance)
+    assert through_gymnasium("flockenv/Pursuit-v0", DISTURBED, actions) == expected
+    assert through_vector("flockenv/Pursuit-v0", DISTURBED, actions) == expected
+    assert through_sb3(task, actions, disturbance) == expected
 
 
 @pytest.mark.parametrize(

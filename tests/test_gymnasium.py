@@ -71,6 +71,10 @@ def digest(env_id, steps=1000):
 # --- the libraries' own checks -------------------------------------------------------------------------------------
 
 
+def test_check_env_of_gymnasium_passes_under_a_disturbance():
+    check_env(gymnasium.make("flockenv/Pursuit-v0", noise=0.3, delay=2, dropped=0.2).unwrapped, skip_render_check=True)
+
+
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("env_id", SINGLE)
 def test_check_env_of_gymnasium_passes(env_id, mode):

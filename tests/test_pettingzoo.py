@@ -74,6 +74,10 @@ def test_parallel_environments_pass_the_api_test_of_pettingzoo(env_id):
     parallel_api_test(make(env_id), num_cycles=300)
 
 
+def test_a_disturbed_environment_passes_the_api_test_of_pettingzoo():
+    parallel_api_test(make("flockenv/Crossing-v0", agents=5, noise=0.3, delay=2, dropped=0.2), num_cycles=60)
+
+
 @pytest.mark.parametrize("env_id", IDS)
 def test_turn_based_environments_pass_the_api_test_of_pettingzoo(env_id):
     api_test(make(env_id, "aec"), num_cycles=200)

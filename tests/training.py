@@ -22,6 +22,7 @@ SCHOOL = Experiment(
     ppo={
         **TINY, "steps": 2304, "worlds": 4, "hidden": (8, 8), "evaluate_every": 576, "hold": 3,
         "central_critic": True, "care": 1.0, "taught": 3, "critic_first": 600, "stagger": True,
+        "disturbance": {"noise": 0.05, "delay": 2, "dropped": 0.1},
     },
 )  # fmt: skip
 """Experiment with every part of training that has state of its own, which an interrupted run must restore."""

@@ -81,7 +81,7 @@ def __getattr__(name: str) -> Callable[..., AECEnv[str, Any, Any]]:
     env_class: type[parallel.WorldParallelEnv] = getattr(parallel, f"{info.name}ParallelEnv")
 
     def env(max_cycles: int | None = None, render_mode: str | None = None, **parameters: Any) -> AECEnv[str, Any, Any]:
-        """Make the turn-based environment (AEC); the parameters are those of the task."""
+        """Make the turn-based environment (AEC); the parameters are those of the parallel environment."""
         return by_turns(env_class(max_cycles, render_mode, **parameters))
 
     return env

@@ -13,6 +13,7 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from flockenv.core.errors import nearest
+from flockenv.envs.disturbance import Disturbance
 from flockenv.tasks import Task
 
 if TYPE_CHECKING:
@@ -44,15 +45,19 @@ SEEDS = 2**63
 """Seeds are 0 ... 2**63 - 1, so that they fit the int64 arrays of a vector env's infos."""
 
 
-def build(task_type: type[Task], parameters: Mapping[str, Any], limit: str, own: Sequence[str] = ()) -> Task:
-    """Make a task from the keyword arguments of an environment.
+def build(
+    task_type: type[Task], parameters: Mapping[str, Any], limit: str, own: Sequence[str] = ()
+) -> tuple[Task, Disturbance]:
+    """Make a task and its disturbance from the keyword arguments of an environment.
 
-    limit: the environment's name for its time limit. The task's `horizon` is rejected, as two limits could disagree.
-    own: the environment's other arguments, candidates for a misspelt name.
+    An argument with the name of a field of both is the task's. limit: the environment's name for its time limit. The
+    task's `horizon` is rejected, as two limits could disagree. own: the environment's other arguments, candidates for a
+    misspelt name.
 
     Raises TypeError for an unknown name, with Python's own message, which TorchRL and others match.
     """
-    allowed = [*(name for name in task_type.model_fields if name != "horizon"), *own]
+    disturbing = [name for name in Disturbance.model_fields if name not in task_type.model_fields]
+    allowed = [*(name for name in task_type.model_fields if name != "horizon"), *disturbing, *own]
     unknown = next((name for name in parameters if name not in allowed), None)
     if unknown is not None:
         reason = f": the time limit is `{limit}` here" if unknown == "horizon" else nearest(unknown, allowed)
@@ -60,7 +65,8 @@ def build(task_type: type[Task], parameters: Mapping[str, Any], limit: str, own:
             f"{task_type.__name__}() got an unexpected keyword argument {unknown!r}{reason}; "
             f"allowed: {', '.join(allowed)}"
         )
-    return task_type(**parameters)
+    disturbance = Disturbance(**{name: parameters[name] for name in disturbing if name in parameters})
+    return task_type(**{name: value for name, value in parameters.items() if name not in disturbing}), disturbance
 
 
 def check_ends_together(task: Task) -> Task:

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from flockenv.envs.common import reward_keys
+from flockenv.envs.disturbance import Disturbance
 from flockenv.envs.table import EnvInfo
 from flockenv.tasks import Layout, Task
 
@@ -97,10 +98,23 @@ def _arguments(task: Task) -> str:
         for name, field in fields
         if name != "horizon"  # each API has its own name for the time limit
     ]
+    rows += [
+        (f"`{name}`", f"`{field.default!r}`", _disturbs(task, name, field.description or ""))
+        for name, field in Disturbance.model_fields.items()
+        if name not in type(task).model_fields
+    ]
     rows.append(
         ("`render_mode`", "`None`", "`rgb_array` (headless), `human` (window, needs the extra `render`) or None")
     )
     return _table(("argument", "default", "meaning"), rows)
+
+
+def _disturbs(task: Task, name: str, meaning: str) -> str:
+    """Return the meaning of a field of Disturbance, with the entities that this task observes in slots."""
+    if name != "dropped":
+        return meaning
+    kinds = dict.fromkeys(slot.entity for slot in task.layout.slots if slot.entity and slot.size)
+    return f"{meaning}; here: {', '.join(kinds) or 'none, so that it must be 0'}"
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -28,6 +28,7 @@ from flockenv.envs.common import (
     require_episode,
     reward_keys,
 )
+from flockenv.envs.disturbance import make_world
 from flockenv.envs.table import EnvInfo, class_of
 from flockenv.envs.world import Step, World
 from flockenv.tasks import Task
@@ -52,7 +53,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
     Args:
         max_cycles: steps after which the world is truncated (default: the task's horizon).
         render_mode: "rgb_array", "human" or None.
-        parameters: those of the task.
+        parameters: those of the task, and of the disturbance: noise, delay, dropped (see Disturbance).
     """
 
     info: ClassVar[EnvInfo]
@@ -61,7 +62,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
     """Parameters whose default differs from the task's."""
 
     def __init__(self, max_cycles: int | None = None, render_mode: str | None = None, **parameters: Any) -> None:
-        self.task = build(
+        self.task, disturbance = build(
             self.task_type, {**self.fixed, **parameters}, limit="max_cycles", own=("max_cycles", "render_mode")
         )
         self.metadata = {
@@ -72,7 +73,8 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
         }
         self.render_mode = render_mode
         self.possible_agents = list(self.task.agent_names)
-        self.world = World(self.task, time_limit=self.task.horizon if max_cycles is None else max_cycles)
+        limit = self.task.horizon if max_cycles is None else max_cycles
+        self.world = make_world(self.task, time_limit=limit, disturbance=disturbance)
         self._screen = Screen(render_mode, render_fps(self.task))
         self.observation_spaces = {name: observation_space(self.task) for name in self.possible_agents}
         self.action_spaces = {name: action_space(self.task) for name in self.possible_agents}

@@ -34,8 +34,9 @@ from flockenv.envs.common import (
     require_episode,
     reward_keys,
 )
+from flockenv.envs.disturbance import Disturbance, make_world
 from flockenv.envs.table import ENVIRONMENTS
-from flockenv.envs.world import Step, World
+from flockenv.envs.world import Step
 
 if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
@@ -89,6 +90,7 @@ class WorldVecEnv(VecEnv):
             step holds its `terminal_observation` and reward terms; metrics and success of the world are in the infos of
             the rows that end with it. Until the world is reset, `present` is False for the row, its reward is 0 and its
             actions are ignored. The row is not done again at the reset; `present` is True from then on.
+        disturbance: of observations and actions (default: none).
 
     Raises:
         ValueError: the task's learners end one by one, and `leaving` is False.
@@ -98,17 +100,18 @@ class WorldVecEnv(VecEnv):
 
     def __init__(
         self, task: Task, worlds: int = 1, time_limit: int | None = None, render_mode: str | None = None,
-        leaving: bool = False,
+        leaving: bool = False, disturbance: Disturbance | None = None,
     ) -> None:  # fmt: skip
         self.task = task if leaving else check_ends_together(task)
-        self.world = World(task, worlds, time_limit=task.horizon if time_limit is None else time_limit)
+        limit, disturbance = task.horizon if time_limit is None else time_limit, disturbance or Disturbance()
+        self.world = make_world(task, worlds, limit, disturbance)
         self.render_mode = render_mode
         self._screen = Screen(render_mode, render_fps(task), modes=("rgb_array",))
         self._reward_keys = reward_keys(task)
         self._actions: NDArray[Any] | None = None
         self._running = False
         self._present = np.ones((self.world.worlds, task.learners), np.bool_)
-        self.spec = _spec(task, self.world.time_limit)
+        self.spec = _spec(task, self.world.time_limit, disturbance)
         self.np_random = seeding.np_random()[0]
         super().__init__(worlds * task.learners, observation_space(task), action_space(task))
         self.metadata["render_fps"] = render_fps(task)
@@ -237,7 +240,7 @@ class WorldVecEnv(VecEnv):
         return list(self._get_indices(indices))
 
 
-def _spec(task: Task, time_limit: int | None) -> EnvSpec | None:
+def _spec(task: Task, time_limit: int | None, disturbance: Disturbance) -> EnvSpec | None:
     """Return the spec from which `gymnasium.make_vec` makes the same worlds; None for a task without an id."""
     name = type(task).__name__
     if name not in ENVIRONMENTS:
@@ -248,6 +251,7 @@ def _spec(task: Task, time_limit: int | None) -> EnvSpec | None:
         value = getattr(task, name)
         if name != "horizon" and (name == "learners" or value != field.get_default(call_default_factory=True)):
             spec.kwargs[name] = value  # always learners: the default of an id is 1, that of a task is all
+    spec.kwargs.update(disturbance.model_dump(exclude_defaults=True))
     return spec
 
 

@@ -26,23 +26,24 @@ from flockenv.envs.common import (
     require_episode,
     reward_keys,
 )
+from flockenv.envs.disturbance import Disturbance, make_world
 from flockenv.envs.docstring import page
 from flockenv.envs.table import EnvInfo, class_of
-from flockenv.envs.world import Step, World
+from flockenv.envs.world import Step
 from flockenv.tasks import Task
 
 __all__ = ["SingleEnv", "single_learner_task"]
 
 
-def single_learner_task(task_type: type[Task], parameters: dict[str, Any]) -> Task:
-    """Make the task of an environment with one learner; ValueError if the task has several."""
-    task = build(task_type, parameters, limit="max_episode_steps", own=("render_mode",))
+def single_learner_task(task_type: type[Task], parameters: dict[str, Any]) -> tuple[Task, Disturbance]:
+    """Make the task of an environment with one learner, and its disturbance; ValueError if the task has several."""
+    task, disturbance = build(task_type, parameters, limit="max_episode_steps", own=("render_mode",))
     if task.learners != 1:
         raise ValueError(
             f"{task_type.__name__}: {task.learners} learners; a Gymnasium environment has 1: for more use "
             "gymnasium.make_vec(...), pettingzoo.make('parallel', ...) or flockenv.envs.sb3.WorldVecEnv"
         )
-    return task
+    return task, disturbance
 
 
 class SingleEnv(gymnasium.Env[Rows, Rows]):
@@ -65,13 +66,13 @@ class SingleEnv(gymnasium.Env[Rows, Rows]):
             cls.__doc__ = page(cls.info, task)
 
     def __init__(self, render_mode: str | None = None, **parameters: Any) -> None:
-        self.task = single_learner_task(self.task_type, {**self.fixed, **parameters})
+        self.task, disturbance = single_learner_task(self.task_type, {**self.fixed, **parameters})
         self.metadata = {**self.metadata, "render_fps": render_fps(self.task)}
         self._screen = Screen(render_mode, render_fps(self.task))
         self.render_mode = render_mode
         self.observation_space = observation_space(self.task)
         self.action_space = action_space(self.task)
-        self.world = World(self.task)
+        self.world = make_world(self.task, disturbance=disturbance)
         self._reward_keys = reward_keys(self.task)
         self._running = False
 

@@ -32,8 +32,9 @@ from flockenv.envs.common import (
     require_episode,
     reward_keys,
 )
+from flockenv.envs.disturbance import make_world
 from flockenv.envs.table import EnvInfo, class_of
-from flockenv.envs.world import Step, World
+from flockenv.envs.world import Step
 from flockenv.tasks import Task
 
 __all__ = ["WorldsEnv"]
@@ -63,7 +64,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         render_mode: "rgb_array" or None.
         infos: "steps" reports every row after every step, as single environments do; "ends" reports only the
             metrics of episodes that end and the seeds of episodes that begin: faster with many rows.
-        parameters: those of the task.
+        parameters: those of the task, and of the disturbance: noise, delay, dropped (see Disturbance).
     """
 
     info: ClassVar[EnvInfo]
@@ -82,7 +83,8 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         if infos not in INFOS:
             raise ValueError(f"infos: {infos!r} is unknown{nearest(str(infos), INFOS)}; allowed: {', '.join(INFOS)}")
         self.infos: Literal["steps", "ends"] = infos
-        self.task = check_ends_together(build(self.task_type, {**self.fixed, **parameters}, "max_episode_steps", OWN))
+        task, disturbance = build(self.task_type, {**self.fixed, **parameters}, "max_episode_steps", OWN)
+        self.task = check_ends_together(task)
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self._screen = Screen(render_mode, render_fps(self.task), modes=("rgb_array",))
         self.render_mode = render_mode
@@ -91,7 +93,8 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
             "render_fps": render_fps(self.task),
             "autoreset_mode": self.autoreset_mode,
         }
-        self.world = World(self.task, _count_worlds(num_envs, self.task.learners), time_limit=max_episode_steps)
+        worlds = _count_worlds(num_envs, self.task.learners)
+        self.world = make_world(self.task, worlds, max_episode_steps, disturbance)
         self.num_envs = num_envs = self.world.worlds * self.task.learners
         self.single_observation_space = observation_space(self.task)
         self.single_action_space = action_space(self.task)

@@ -190,7 +190,7 @@ class World:
 
     def __deepcopy__(self, memo: dict[int, Any]) -> World:
         """Return an independent world that continues from here."""
-        new = object.__new__(World)
+        new = object.__new__(type(self))
         new.__setstate__({name: copy.deepcopy(value, memo) for name, value in self.__getstate__().items()})
         return new
 

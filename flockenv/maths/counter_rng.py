@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from flockenv.jit.decorators import kernel, python_of
 
-__all__ = ["key_of", "keys_of", "normal", "smooth", "uniform"]
+__all__ = ["key_of", "keys_of", "normal", "quick_normal", "smooth", "uniform"]
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _M1 = np.uint64(0xBF58476D1CE4E5B9)
@@ -46,6 +46,30 @@ def normal(key: np.uint64, step: int, agent: int, channel: int) -> float:
     """Draw from N(0, 1) (Box-Muller; uses channels 2c and 2c + 1 of a separate family)."""
     u = 1.0 - uniform(key, step, agent, 2 * channel + 1_000_003)
     return math.sqrt(-2.0 * math.log(u)) * math.cos(2.0 * math.pi * uniform(key, step, agent, 2 * channel + 1_000_004))
+
+
+@kernel
+def quick_normal(key: np.uint64, step: int, agent: int, channel: int) -> float:
+    """Draw from N(0, 1) by inversion of one uniform number: a third of the time of `normal`, to seven digits.
+
+    Source: Wichura 1988, algorithm AS 241 (PPND7), Applied Statistics 37, 477.
+    """
+    p = uniform(key, step, agent, channel)
+    q = p - 0.5
+    if abs(q) <= 0.425:
+        r = 0.180625 - q * q
+        top = ((59.109374720 * r + 159.29113202) * r + 50.434271938) * r + 3.3871327179
+        return q * top / (((67.187563600 * r + 78.757757664) * r + 17.895169469) * r + 1.0)
+    r = math.sqrt(-math.log(max(min(p, 1.0 - p), 0.5 * _TO_UNIT)))  # uniform numbers are multiples of _TO_UNIT
+    if r <= 5.0:
+        r -= 1.6
+        top = ((0.17023821103 * r + 1.3067284816) * r + 2.7568153900) * r + 1.4234372777
+        size = top / ((0.12021132975 * r + 0.73700164250) * r + 1.0)
+    else:
+        r -= 5.0
+        top = ((0.017337203997 * r + 0.42868294337) * r + 3.0812263860) * r + 6.6579051150
+        size = top / ((0.012258202635 * r + 0.24197894225) * r + 1.0)
+    return size if q > 0.0 else -size
 
 
 @kernel

@@ -18,7 +18,7 @@ from flockenv.maths.vectors import add, norm, scale, unit
 from flockenv.physics.effects import ObstacleContact
 from flockenv.scene import Group, Scene
 from flockenv.steering import arbitration
-from flockenv.tasks.layout import Layout, Slot
+from flockenv.tasks.layout import Layout, Slot, slots_of
 from flockenv.tasks.observations import clip, leaves_gap, ray_directions, shorten_free_paths, velocity_of
 from flockenv.tasks.task import Frame, Task
 
@@ -384,8 +384,10 @@ class Evade(Task):
             Slot("bearing", (n, 2), 1.0, "1", "unit vectors towards them"),
             Slot("closeness", (n,), 1.0, "1", "1 - distance / near; 0 for a distance above near", low=0.0),
             Slot("seen", (n,), 1.0, "1", "1 if that pursuer sees the evader, else 0", low=0.0),
-            Slot("cover", (m, 2), self.size, "m", seen),
-            Slot("cover_radius", (m,), self.greatest_radius, "m", "their radii; 0: empty slot", low=0.0),
+            *slots_of("obstacles",
+                Slot("cover", (m, 2), self.size, "m", seen),
+                Slot("cover_radius", (m,), self.greatest_radius, "m", "their radii; 0: empty slot", low=0.0),
+            ),
             Slot("free_way", (self.rays,), self.way_sight, "m", paths, low=0.0),
         ))  # fmt: skip
 

@@ -23,7 +23,7 @@ from flockenv.model.state import State
 from flockenv.scene import Group, Scene
 from flockenv.steering import arbitration
 from flockenv.tasks.lasting import MEASURES, METRICS, LastingTask, write_aim_measures, write_aim_metrics
-from flockenv.tasks.layout import Layout, Slot
+from flockenv.tasks.layout import Layout, Slot, slots_of
 from flockenv.tasks.observations import local_components, offset, ray_directions, shorten_free_paths
 from flockenv.tasks.task import Frame
 
@@ -526,12 +526,16 @@ class Flock(LastingTask):
         seen = "offsets of the centres of the nearest obstacles, nearest surface first; zeros: empty slot"
         return Layout((
             Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (along the heading, to its left)"),
-            Slot("neighbours", (n, 2), self.sight, "m", "offsets of the nearest neighbours, nearest first"),
-            Slot("neighbour_velocity", (n, 2), 2 * self.max_speed, "m/s", "their velocities minus the agent's own"),
-            Slot("neighbour_present", (n,), 1.0, "1", here, low=0.0),
-            Slot("crowding", (n, 2), 1.0, "1", crowding),
-            Slot("obstacles", (m, 2), self.sight + self.greatest_radius, "m", seen),
-            Slot("obstacle_radius", (m,), self.greatest_radius, "m", "their radii; 0: empty slot", low=0.0),
+            *slots_of("neighbours",
+                Slot("neighbours", (n, 2), self.sight, "m", "offsets of the nearest neighbours, nearest first"),
+                Slot("neighbour_velocity", (n, 2), 2 * self.max_speed, "m/s", "their velocities minus the agent's own"),
+                Slot("neighbour_present", (n,), 1.0, "1", here, low=0.0),
+                Slot("crowding", (n, 2), 1.0, "1", crowding),
+            ),
+            *slots_of("obstacles",
+                Slot("obstacles", (m, 2), self.sight + self.greatest_radius, "m", seen),
+                Slot("obstacle_radius", (m,), self.greatest_radius, "m", "their radii; 0: empty slot", low=0.0),
+            ),
             Slot("free_way", (self.rays,), self.sight, "m", paths, low=0.0),
         ))  # fmt: skip
 

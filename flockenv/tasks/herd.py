@@ -19,7 +19,7 @@ from flockenv.model.snapshot import Mark
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.tasks.layout import Layout, Slot
+from flockenv.tasks.layout import Layout, Slot, slots_of
 from flockenv.tasks.observations import clip, position_of, velocity_of
 from flockenv.tasks.task import Frame, Task
 
@@ -385,11 +385,13 @@ class Herd(Task):
             Slot("farthest", (2,), far, "m", "offset of the sheep that is farthest from the flock's centre"),
             Slot("spread", (), self.spread_scale, "m", "mean distance of the sheep from their centre", low=0.0),
             Slot("stray", (), self.spread_scale, "m", "distance of that sheep from the flock's centre", low=0.0),
-            Slot("sheep", (k, 2), far, "m", "offsets of the nearest sheep, nearest first"),
-            Slot("sheep_velocity", (k, 2), self.sheep_speed, "m/s", "their velocities"),
-            Slot("sheep_present", (k,), 1.0, "1", "1 for each sheep, 0 for an empty slot", low=0.0),
-            Slot("bearing", (2,), 1.0, "1", "unit vector towards the nearest sheep"),
-            Slot("closeness", (), 1.0, "1", near, low=0.0),
+            *slots_of("sheep",
+                Slot("sheep", (k, 2), far, "m", "offsets of the nearest sheep, nearest first"),
+                Slot("sheep_velocity", (k, 2), self.sheep_speed, "m/s", "their velocities"),
+                Slot("sheep_present", (k,), 1.0, "1", "1 for each sheep, 0 for an empty slot", low=0.0),
+                Slot("bearing", (2,), 1.0, "1", "unit vector towards the nearest sheep", nearest=True),
+                Slot("closeness", (), 1.0, "1", near, low=0.0, nearest=True),
+            ),
             Slot("mates", (mates, 2), far, "m", "offsets of the other dogs"),
         ))  # fmt: skip
 

@@ -6,14 +6,14 @@ import functools
 import hashlib
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Layout", "Slot"]
+__all__ = ["Layout", "Slot", "slots_of"]
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,18 @@ class Slot:
     unit: str
     meaning: str
     low: float = -1.0
+    entity: str = ""  # kind of agent or obstacle that each entry of the first axis describes; zeros: there is none
+    nearest: bool = False  # all its numbers describe the first entity of that kind
 
     @property
     def size(self) -> int:
         """Numbers in the slot."""
         return math.prod(self.shape)
+
+
+def slots_of(entity: str, *slots: Slot) -> tuple[Slot, ...]:
+    """Return the slots as those of one kind of entity, such as "obstacles": they describe the same, in one order."""
+    return tuple(replace(slot, entity=entity) for slot in slots)
 
 
 @dataclass(frozen=True)
@@ -59,6 +66,16 @@ class Layout:
     def high(self) -> NDArray[np.float32]:
         """Greatest values of a row, (size,)."""
         return np.ones(self.size, np.float32)
+
+    @functools.cached_property
+    def entities(self) -> NDArray[np.int64]:
+        """Index of the entity that each number of a row describes, (size,); -1: none. Kinds follow one another."""
+        counts: dict[str, int] = {}
+        for slot in self.slots:
+            if slot.entity and not slot.nearest:
+                counts[slot.entity] = max(counts.get(slot.entity, 0), slot.shape[0])
+        first = dict(zip(counts, itertools.accumulate(counts.values(), initial=0), strict=False))
+        return np.concatenate([_entities_of(slot, first.get(slot.entity, -1)) for slot in self.slots])
 
     def unpack(self, rows: ArrayLike) -> SimpleNamespace:
         """Return the quantities of rows (..., size) by name, in SI units: arrays (..., *shape), float64."""
@@ -90,3 +107,10 @@ class Layout:
         """A short digest of this layout without its texts: rows with the same digest have the same meaning."""
         numbers = [(slot.name, slot.shape, slot.scale, slot.unit, slot.low) for slot in self.slots]
         return hashlib.sha256(repr(numbers).encode()).hexdigest()[:16]
+
+
+def _entities_of(slot: Slot, first: int) -> NDArray[np.int64]:
+    """Return the index of the entity that each number of a slot describes; `first`: that of its kind, -1: none."""
+    if first < 0 or slot.nearest:
+        return np.full(slot.size, first)
+    return np.repeat(np.arange(first, first + slot.shape[0]), math.prod(slot.shape[1:]))

@@ -11,7 +11,7 @@ from flockenv.geometry.shapes import ray_hit
 from flockenv.jit.decorators import Vec, kernel, like
 from flockenv.maths.approximations import round_half_even
 from flockenv.maths.vectors import dot
-from flockenv.tasks.layout import Slot
+from flockenv.tasks.layout import Slot, slots_of
 
 __all__ = [
     "clip", "leaves_gap", "local_components", "neighbour_slots", "offset", "position_of", "ray_directions",
@@ -96,7 +96,8 @@ def neighbour_slots(count: int, sight: float, most_relative: float, others: str,
     """
     present = "1 for each neighbour, 0 for an empty slot, whose other numbers are also 0"
     close = "unit vectors towards them, times 1 - gap between the bodies / near; 0 for a gap above near"
-    return (
+    return slots_of(
+        "neighbours",
         Slot("neighbours", (count, 2), sight, "m", f"offsets of the nearest {others}, nearest first"),
         Slot("neighbour_velocity", (count, 2), most_relative, "m/s", "their velocities minus the agent's own"),
         *((Slot("crowding", (count, 2), 1.0, "1", close),) if crowding else ()),

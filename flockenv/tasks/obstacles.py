@@ -17,7 +17,7 @@ from flockenv.maths.counter_rng import uniform
 from flockenv.model.snapshot import Mark
 from flockenv.model.state import State
 from flockenv.scene import Group, Scene
-from flockenv.tasks.layout import Layout, Slot
+from flockenv.tasks.layout import Layout, Slot, slots_of
 from flockenv.tasks.observations import clip, leaves_gap, ray_directions, shorten_free_paths
 from flockenv.tasks.task import Frame, Task
 
@@ -232,14 +232,17 @@ class Obstacles(Task):
         """The observation; axes are the field's, and offsets are relative to the agent."""
         paths = "free path length of the body to the nearest obstacle in each direction, anticlockwise from the x axis"
         seen = "offsets of the centres of the nearest obstacles, nearest surface first; zeros: empty slot"
+        radii = "their radii; 0: empty slot"
         return Layout((
             Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (x, y)"),
             Slot("goal", (2,), self.size, "m", "offset of the goal"),
             Slot("to_low", (2,), self.size, "m", "distance to the walls at x = 0 and y = 0", low=0.0),
             Slot("to_high", (2,), self.size, "m", "distance to the walls at x = size and y = size", low=0.0),
-            Slot("obstacles", (self.slots, 2), self.sight + self.greatest_radius, "m", seen),
-            Slot("obstacle_radius", (self.slots,), self.greatest_radius, "m", "their radii; 0: empty slot", low=0.0),
-            Slot("clearance", (self.slots,), 1.0, "m", "gap between the bodies, at most 1 m; 0: empty slot"),
+            *slots_of("obstacles",
+                Slot("obstacles", (self.slots, 2), self.sight + self.greatest_radius, "m", seen),
+                Slot("obstacle_radius", (self.slots,), self.greatest_radius, "m", radii, low=0.0),
+                Slot("clearance", (self.slots,), 1.0, "m", "gap between the bodies, at most 1 m; 0: empty slot"),
+            ),
             Slot("free_way", (self.rays,), self.sight, "m", paths, low=0.0),
         ))  # fmt: skip
 

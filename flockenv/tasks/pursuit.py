@@ -16,7 +16,7 @@ from flockenv.maths.vectors import scale
 from flockenv.model.spawn import direction
 from flockenv.scene import Group, Scene
 from flockenv.steering import arbitration
-from flockenv.tasks.layout import Layout, Slot
+from flockenv.tasks.layout import Layout, Slot, slots_of
 from flockenv.tasks.task import Frame, Task
 
 __all__ = ["Pursuit"]
@@ -327,14 +327,20 @@ class Pursuit(Task):
             Slot("velocity", (2,), fastest, "m/s", "own velocity (x, y)"),
             Slot("to_low", (2,), self.size, "m", "distance to the walls at x = 0 and y = 0", low=0.0),
             Slot("to_high", (2,), self.size, "m", "distance to the walls at x = size and y = size", low=0.0),
-            Slot("opponents", (opponents, 2), self.size, "m", "offsets of the nearest opponents, nearest first"),
-            Slot("opponent_velocity", (opponents, 2), fastest, "m/s", "their velocities"),
-            Slot("opponent_present", (opponents,), 1.0, "1", there, low=0.0),
-            Slot("mates", (mates, 2), self.size, "m", "offsets of the nearest team mates, nearest first"),
-            Slot("mate_velocity", (mates, 2), fastest, "m/s", "their velocities"),
-            Slot("mate_present", (mates,), 1.0, "1", there, low=0.0),
-            Slot("bearing", (opponents, 2), 1.0, "1", "unit vectors towards the opponents; zeros: empty slot"),
-            Slot("closeness", (opponents,), 1.0, "1", near, low=0.0),
+            *slots_of("opponents",
+                Slot("opponents", (opponents, 2), self.size, "m", "offsets of the nearest opponents, nearest first"),
+                Slot("opponent_velocity", (opponents, 2), fastest, "m/s", "their velocities"),
+                Slot("opponent_present", (opponents,), 1.0, "1", there, low=0.0),
+            ),
+            *slots_of("mates",
+                Slot("mates", (mates, 2), self.size, "m", "offsets of the nearest team mates, nearest first"),
+                Slot("mate_velocity", (mates, 2), fastest, "m/s", "their velocities"),
+                Slot("mate_present", (mates,), 1.0, "1", there, low=0.0),
+            ),
+            *slots_of("opponents",
+                Slot("bearing", (opponents, 2), 1.0, "1", "unit vectors towards the opponents; zeros: empty slot"),
+                Slot("closeness", (opponents,), 1.0, "1", near, low=0.0),
+            ),
         ))  # fmt: skip
 
     @functools.cached_property

@@ -20,7 +20,7 @@ from flockenv.model.state import State
 from flockenv.physics.effects.effect import in_view
 from flockenv.scene import Group, Scene
 from flockenv.steering import arbitration, motivation
-from flockenv.tasks.layout import Layout, Slot
+from flockenv.tasks.layout import Layout, Slot, slots_of
 from flockenv.tasks.observations import clip, position_of, velocity_of
 from flockenv.tasks.task import Frame, Task
 
@@ -520,15 +520,17 @@ class School(Task):
             "mates": ("present", 1.0, "1", "1 for each one, 0 for an empty slot"),
         }
         counts = {"hunters": self.hunters, "food": self.food_seen, "mates": self.fish_seen}
+        near = "1 - distance / near; 0 for a distance above near"
         for name, (what, unit_, of, meaning) in last.items():
             n, one = counts[name], name.removesuffix("s")
-            slots += [
+            slots += slots_of(
+                name,
                 Slot(name, (n, 2), self.sight, "m", f"offsets of the {name} in sight, nearest first"),
                 Slot(f"{one}_bearing", (n, 2), 1.0, "1", "unit vectors towards them"),
                 Slot(f"{one}_velocity", (n, 2), self.hunter_speed, "m/s", "their velocities"),
-                Slot(f"{one}_closeness", (n,), 1.0, "1", "1 - distance / near; 0 for a distance above near", low=0.0),
+                Slot(f"{one}_closeness", (n,), 1.0, "1", near, low=0.0),
                 Slot(f"{one}_{what}", (n,), unit_, of, meaning, low=0.0),
-            ]
+            )
         return Layout(tuple(slots))
 
     @functools.cached_property

@@ -1,0 +1,354 @@
+"""Disturbances: their distribution, what they leave as it is, and the same bits for any batch, thread and process."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import pickle
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from agents import report
+from agents.compare import compare
+from agents.experiment import Experiment, PpoSettings
+from agents.play import Player, play_job
+from agents.run import recipe_of
+from flockenv.envs.disturbance import Disturbance, DisturbedWorld, make_world
+from flockenv.envs.world import World
+from flockenv.evaluation import rollout
+from flockenv.jit.decorators import python_of
+from flockenv.jit.thread_pool import threads, use_threads
+from flockenv.maths import counter_rng
+from flockenv.players import load_player
+from flockenv.tasks import TASKS, Crossing, Herd, Layout, Obstacles, PathFollow, Pursuit, Slot, Task
+
+CROSSING = Crossing(agents=8)
+FULL = Disturbance(noise=0.3, delay=3, dropped=0.3)
+EVERY = pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in ("pursuit", "herd") else pytest.mark.slow) for name in TASKS]
+)
+"""All tasks; those of the default run have kernels that compile fast."""
+SIGHT = Disturbance(noise=0.1, dropped=0.2)
+
+
+def actions_of(task: Task, worlds: int, count: int = 12) -> NDArray[np.float64]:
+    return np.random.default_rng(3).uniform(-1, 1, (count, worlds, task.learners, task.action_layout.size))
+
+
+def play(world: World, actions: NDArray[Any], seed: int) -> list[NDArray[np.float32]]:
+    """Return all observations of an episode from its first on, and of the next episode's start."""
+    rows = [world.reset(seed), *(world.step(action).observation for action in actions)]
+    return [*rows, world.reset()]
+
+
+# --- what is disturbed --------------------------------------------------------------------------------------------
+
+
+def test_without_a_disturbance_the_world_is_a_plain_one() -> None:
+    assert type(make_world(Pursuit())) is World
+    assert type(gymnasium.make("flockenv/Pursuit-v0", noise=0, delay=0).unwrapped.world) is World  # type: ignore[attr-defined]
+    for field in ("noise", "delay", "dropped"):
+        assert isinstance(make_world(Pursuit(), disturbance=Disturbance(**{field: 1})), DisturbedWorld)
+
+
+def test_only_observations_change_without_delay() -> None:
+    plain, disturbed = World(CROSSING, 3), make_world(CROSSING, 3, disturbance=SIGHT)
+    assert not np.array_equal(plain.reset(5), disturbed.reset(5))
+    for action in actions_of(CROSSING, 3):
+        one, two = plain.step(action), disturbed.step(action)
+        assert not np.array_equal(one.observation, two.observation)
+        for a, b in zip(one[1:], two[1:], strict=True):
+            np.testing.assert_array_equal(a, b)
+        np.testing.assert_array_equal(plain.state.pos, disturbed.state.pos)
+        assert plain.metrics(1) == disturbed.metrics(1)
+
+
+def test_noise_is_normal_on_numbers_that_are_not_zero() -> None:
+    task, sigma = Obstacles(), 0.02
+    seen, noisy = (
+        w.reset(0) for w in (World(task, 4000), make_world(task, 4000, disturbance=Disturbance(noise=sigma)))
+    )
+    assert (noisy[seen == 0] == 0).all()
+    inside = (seen > 6 * sigma - 1) & (seen < 1 - 6 * sigma) & (seen != 0)
+    inside &= (seen > 6 * sigma) | (task.layout.low < 0)
+    z = (noisy - seen)[inside].astype(float) / sigma
+    n = z.size
+    assert n > 50_000
+    assert abs(z.mean()) < 4 / n**0.5
+    assert abs(z.var() - 1) < 4 * (2 / n) ** 0.5
+    assert abs((z**4).mean() - 3) < 4 * (96 / n) ** 0.5
+    assert abs(np.mean(abs(z) > 1.959964) - 0.05) < 4 * (0.05 / n) ** 0.5
+
+
+def test_quick_normal_is_the_quantile_function_of_the_uniform_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    quantile = python_of(counter_rng.quick_normal)
+    for p in (2.0**-53, 1e-12, 1e-8, 0.01, 0.0749, 0.0751, 0.3, 0.5, 0.7, 0.9249, 0.9251, 0.99, 1 - 1e-9, 1 - 2.0**-53):
+        monkeypatch.setattr(counter_rng, "uniform", lambda *of, p=p: p)
+        assert quantile(0, 0, 0, 0) == pytest.approx(ndtri(p), rel=3e-7, abs=1e-12)
+    monkeypatch.setattr(counter_rng, "uniform", lambda *of: 0.0)
+    assert quantile(0, 0, 0, 0) == pytest.approx(ndtri(2.0**-54), rel=3e-7)
+
+
+def noise_of(disturbed: World, plain: World, zero: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the noise of a decision on numbers that are well within their bounds, NaN on others."""
+    noisy, seen = (world.step(zero).observation.astype(float) for world in (disturbed, plain))
+    return np.where((abs(seen) < 0.9) & (seen != 0) & (plain.task.layout.low < 0), noisy - seen, np.nan)
+
+
+def test_noise_is_independent_between_numbers_learners_decisions_episodes_and_worlds() -> None:
+    both = make_world(CROSSING, 40, disturbance=Disturbance(noise=0.01)), World(CROSSING, 40)
+    episodes = []
+    for seed in (7, None):
+        for world in both:
+            world.reset(seed)
+        episodes.append([noise_of(*both, np.zeros((40, CROSSING.learners, 2))) for _ in range(3)])
+    noise = np.array(episodes)  # (episode, decision, world, learner, number)
+    for axis in range(5):
+        first, second = (
+            np.take(noise, k + (2 if axis == 4 else 0), axis).ravel() for k in (0, 1)
+        )  # goal, not velocity
+        there = np.isfinite(first * second)
+        assert there.sum() > 200
+        assert abs(np.corrcoef(first[there], second[there])[0, 1]) < 4 / there.sum() ** 0.5
+
+
+@EVERY
+def test_dropped_entities_have_the_numbers_of_an_empty_slot(name: str) -> None:
+    task = TASKS[name]()
+    entities = task.layout.entities
+    seen = World(task, 30).reset(1).reshape(-1, task.layout.size)
+    found = make_world(task, 30, disturbance=Disturbance(dropped=0.4)).reset(1).reshape(seen.shape)
+    np.testing.assert_array_equal(found[:, entities < 0], seen[:, entities < 0])
+    there = dropped = 0
+    if name == "path_follow":
+        assert (entities < 0).all()
+        return
+    for entity in range(entities.max() + 1):
+        its = entities == entity
+        gone, was = (found[:, its] == 0).all(axis=1), (seen[:, its] != 0).any(axis=1)
+        np.testing.assert_array_equal(found[~gone][:, its], seen[~gone][:, its])
+        there, dropped = there + was.sum(), dropped + (gone & was).sum()
+    assert abs(dropped / there - 0.4) < 4 * (0.24 / there) ** 0.5
+
+
+def test_the_slots_of_an_entity_share_its_index() -> None:
+    layout = Layout((
+        Slot("own", (2,), 1.0, "1", ""), Slot("a", (2, 2), 1.0, "m", "", entity="x"),
+        Slot("b", (1,), 1.0, "m", "", entity="y"), Slot("c", (2,), 1.0, "m", "", entity="x"),
+        Slot("d", (2,), 1.0, "m", "", entity="x", nearest=True),
+    ))  # fmt: skip
+    assert layout.entities.tolist() == [-1, -1, 0, 0, 1, 1, 2, 0, 1, 0, 0]
+
+
+def test_the_direction_of_the_nearest_sheep_is_dropped_with_it() -> None:
+    places, rows = Herd().layout.places, make_world(Herd(), 50, disturbance=Disturbance(dropped=0.5)).reset(0)[:, 0]
+    without = rows[:, places["sheep_present"]] == 0
+    assert 0 < without.sum() < 50
+    assert (rows[without][:, places["bearing"] : places["bearing"] + 2] == 0).all()
+    assert (rows[~without][:, places["bearing"] : places["bearing"] + 2] != 0).any(axis=1).all()
+
+
+# --- late actions -----------------------------------------------------------------------------------------------------
+
+
+def test_late_actions_equal_the_same_actions_shifted() -> None:
+    plain, late = World(CROSSING, 2), make_world(CROSSING, 2, disturbance=Disturbance(delay=3))
+    actions = actions_of(CROSSING, 2)
+    np.testing.assert_array_equal(plain.reset(2), late.reset(2))
+    for n, action in enumerate(actions):
+        due = actions[n - 3] if n >= 3 else np.zeros_like(action)
+        np.testing.assert_array_equal(plain.step(due).observation, late.step(action).observation)
+
+
+def test_a_reset_world_forgets_its_pending_actions_and_others_keep_theirs() -> None:
+    worlds, alone = (make_world(Pursuit(), n, disturbance=Disturbance(delay=3)) for n in (2, 1))
+    actions = actions_of(Pursuit(), 2)
+    expected = play(make_world(Pursuit(), 1, disturbance=Disturbance(delay=3)), actions[:, 1:], 3)
+    worlds.reset(2)
+    for action in actions[:5]:
+        rows = worlds.step(action).observation
+    worlds.reset(mask=[True, False], into=rows)
+    alone.reset(2)
+    np.testing.assert_array_equal(rows[0], alone.reset()[0])
+    for n, action in enumerate(actions[5:], start=6):
+        rows = worlds.step(action).observation
+        np.testing.assert_array_equal(rows[0], alone.step(action[:1]).observation[0])
+        np.testing.assert_array_equal(rows[1], expected[n][0])
+
+
+def test_an_invalid_action_is_refused_at_once_and_changes_nothing() -> None:
+    world = make_world(Pursuit(), 2, disturbance=FULL)
+    with pytest.raises(RuntimeError, match="step before the first reset"):
+        world.step(np.zeros((2, 1, 2)))
+    world.reset(0)
+    world.step(np.ones((2, 1, 2)))
+    before = {name: array.copy() for name, array in world.arrays().items()}
+    with pytest.raises(ValueError, match="action 1 of pursuer_0 in world 1 is nan"):
+        world.step(np.array([[[0, 0]], [[0, np.nan]]]))
+    with pytest.raises(ValueError, match="actions have shape"):
+        world.step(np.zeros((1, 1, 2)))
+    for name, array in world.arrays().items():
+        np.testing.assert_array_equal(array, before[name])
+
+
+# --- the same bits ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])  # another kernel
+def test_a_world_of_a_batch_equals_that_world_alone_for_any_number_of_threads(dtype: str) -> None:
+    task, before = Crossing(agents=8, dtype=dtype), threads()
+    actions = actions_of(task, 5)
+    rows = []
+    try:
+        for count in (1, 2):
+            use_threads(count)
+            rows.append(play(make_world(task, 5, disturbance=FULL), actions, 11))
+    finally:
+        use_threads(before)
+    np.testing.assert_array_equal(np.array(rows[0]), np.array(rows[1]))
+    for k in (0, 3):
+        alone = play(make_world(task, 1, disturbance=FULL), actions[:, k : k + 1], 11 + k)
+        np.testing.assert_array_equal(np.array(alone)[:, 0], np.array(rows[0])[:, k])
+
+
+def _continue(world: World, actions: NDArray[Any]) -> NDArray[np.float32]:
+    return np.array([world.step(action).observation for action in actions])
+
+
+def test_copies_and_restored_worlds_continue_with_the_same_bits() -> None:
+    actions, world = actions_of(CROSSING, 2), make_world(CROSSING, 2, disturbance=FULL)
+    play(world, actions[:5], 1)
+    world.step(actions[0])
+    others = [copy.deepcopy(world), pickle.loads(pickle.dumps(world)), make_world(CROSSING, 2, disturbance=FULL)]
+    others[2].reset(9)
+    others[2].restore(world.arrays())
+    expected = _continue(world, actions)
+    for other in others:
+        np.testing.assert_array_equal(_continue(other, actions), expected)
+
+
+@pytest.mark.slow
+def test_another_process_computes_the_same_bits() -> None:
+    actions, world = actions_of(CROSSING, 2), make_world(CROSSING, 2, disturbance=FULL)
+    world.reset(1)
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        other = pool.submit(_continue, world, actions).result()
+    np.testing.assert_array_equal(other, _continue(world, actions))
+
+
+def test_a_masked_reset_disturbs_only_the_worlds_that_it_resets() -> None:
+    world, whole = (make_world(CROSSING, 3, disturbance=FULL) for _ in range(2))
+    action = actions_of(CROSSING, 3)[0]
+    for each in (world, whole):
+        each.reset(4)
+    rows = world.step(action).observation
+    expected = whole.step(action).observation
+    mask = np.array([False, True, False])
+    world.reset(mask=mask, into=rows)
+    np.testing.assert_array_equal(rows[~mask], expected[~mask])
+    np.testing.assert_array_equal(whole.reset(mask=mask), rows)  # a new array holds the others' rows again
+
+
+# --- environments -----------------------------------------------------------------------------------------------------
+
+
+@EVERY
+def test_observations_stay_in_their_space_under_the_greatest_noise(name: str) -> None:
+    task = TASKS[name]()
+    world = make_world(task, 20, disturbance=Disturbance(noise=1.0, delay=20))
+    rows = [world.reset(0), *(world.step(action).observation for action in actions_of(task, 20, 3))]
+    for row in rows:
+        assert ((row >= task.layout.low) & (row <= task.layout.high)).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(TASKS))
+def test_rules_return_finite_actions_under_a_disturbance(name: str) -> None:
+    task = TASKS[name](horizon=60)
+    disturbance = Disturbance(noise=0.2, delay=1, dropped=0.0 if name == "path_follow" else 0.4)
+    make = functools.partial(make_world, disturbance=disturbance)
+    episodes = rollout(task, load_player("rules", task, 0), 8, 0, make_world=make)
+    assert np.isfinite(episodes.returns).all()
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_autoreset_begins_with_no_pending_actions_and_returns_the_last_observation(mode: AutoresetMode) -> None:
+    kwargs: dict[str, Any] = {"noise": 0.2, "delay": 4}
+    envs = gymnasium.make_vec("flockenv/Obstacles-v0", 2, max_episode_steps=6, autoreset_mode=mode, **kwargs)
+    alone = gymnasium.make("flockenv/Obstacles-v0", max_episode_steps=6, **kwargs)
+    envs.reset(seed=3)
+    alone.reset(seed=4)
+    actions = actions_of(Obstacles(), 2, 14)[:, :, 0].astype(np.float32)
+    for action in actions[:6]:
+        rows, _, _, truncated, info = envs.step(action)
+        last = alone.step(action[1])[0]
+    assert truncated.all()
+    if mode is AutoresetMode.SAME_STEP:
+        np.testing.assert_array_equal(info["final_obs"][1], last)
+    else:
+        np.testing.assert_array_equal(rows[1], last)
+    if mode is AutoresetMode.NEXT_STEP:
+        rows = envs.step(np.ones_like(actions[0]))[0]
+    if mode is AutoresetMode.DISABLED:
+        rows = envs.reset(options={"reset_mask": np.ones(2, np.bool_)})[0]
+    np.testing.assert_array_equal(rows[1], alone.reset()[0])
+    for action in actions[6:11]:
+        np.testing.assert_array_equal(envs.step(action)[0][1], alone.step(action[1])[0])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"noise": 2}, "Disturbance: noise = 2: must be a number >= 0 and <= 1"),
+        ({"delay": 1.5}, "Disturbance: delay = 1.5: must be an integer >= 0 and <= 20"),
+        ({"dropped": -0.1}, "Disturbance: dropped = -0.1: must be a number >= 0 and <= 1"),
+        ({"nois": 0.1}, "unexpected keyword argument 'nois', did you mean `noise`?"),
+    ],
+)
+def test_invalid_arguments_are_refused_in_one_line(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises((ValueError, TypeError)) as caught:
+        gymnasium.make("flockenv/Pursuit-v0", **arguments)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_dropping_is_refused_for_a_task_that_observes_no_entities() -> None:
+    with pytest.raises(ValueError, match=r"dropped = 0\.1: must be 0 for path_follow"):
+        make_world(PathFollow(), disturbance=Disturbance(dropped=0.1))
+
+
+# --- comparisons and training -----------------------------------------------------------------------------------------
+
+
+def test_a_disturbance_is_part_of_a_job_s_key_and_none_leaves_it_as_it_was() -> None:
+    player, given = Player.of("random"), (None, Disturbance(), Disturbance(noise=0.1))
+    jobs = [play_job("compare", Pursuit(), player, 2, 0, disturbance=disturbance) for disturbance in given]
+    assert jobs[0].key == jobs[1].key != jobs[2].key
+    assert "disturbance" not in jobs[0].about
+    with pytest.raises(ValueError, match=r"dropped = 0\.1: must be 0 for path_follow"):
+        play_job("compare", PathFollow(), player, 2, 0, disturbance=Disturbance(dropped=0.1))
+
+
+def test_a_comparison_is_played_under_its_disturbance_and_names_it() -> None:
+    tasks, players, disturbance = [Pursuit(horizon=20)], [Player.of("rules")], Disturbance(noise=0.1, delay=2)
+    results, episodes = compare(tasks, players, 4, resamples=10, disturbance=disturbance)
+    plain, undisturbed = compare(tasks, players, 4, resamples=10)
+    assert (episodes["pursuit"]["rules"].returns != undisturbed["pursuit"]["rules"].returns).all()
+    assert results["disturbance"] == {"noise": 0.1, "delay": 2, "dropped": 0.0}
+    assert report.conditions(results) == "4 worlds per task, noise 0.1, delay 2"
+    assert report.conditions(plain) == "4 worlds per task"
+
+
+def test_a_recipe_names_its_disturbance_and_none_leaves_it_as_it_was() -> None:
+    settings = PpoSettings(disturbance={"noise": 0.05})
+    assert "disturbance" not in recipe_of(Experiment(task="pursuit"))["ppo"]
+    recipe = recipe_of(Experiment(task="pursuit", ppo=settings))
+    assert recipe["ppo"]["disturbance"] == {"noise": 0.05, "delay": 0, "dropped": 0.0}
+    assert PpoSettings(**recipe["ppo"]) == settings
