@@ -237,8 +237,8 @@ def test_tuned_players_differ_from_published_ones_where_a_search_was_made() -> N
         for task in PLAYERS[name]:
             tuned = load_tuned(task, name)
             now, before = (as_dict(player(TASKS[task](), each).rules) for each in (name, published))
-            assert now == (tuned.parameters or before), (task, name)
-            assert before == as_dict(PLAYERS[name][task][1]())
+            assert now == (tuned.parameters or as_dict(PLAYERS[name][task][1]())), (task, name)
+            assert before == as_dict(PLAYERS[published][task][1]())
             if tuned.parameters:
                 assert tuned.found["tuning_mean"] >= tuned.found["textbook_mean"]
                 assert tuned.found["tuning_mean"] > tuned.found["textbook_mean"] or now == before
