@@ -14,7 +14,7 @@ import typer
 from pydantic import Field, ValidationError, model_validator
 
 from flockenv.core.address_space import shortage
-from flockenv.core.errors import key_path, refusals
+from flockenv.core.errors import key_path, printable, refusals
 from flockenv.core.record import Record
 from flockenv.envs.disturbance import Disturbance
 from flockenv.scene.yaml_io import load
@@ -22,6 +22,7 @@ from flockenv.tasks import TASKS, Task
 
 __all__ = [
     "AS_CONFIGURED", "CONFIGS", "Experiment", "PpoSettings", "SearchSettings", "load_experiment", "one_line_errors",
+    "seeds_of",
 ]  # fmt: skip
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs" / "training"
@@ -31,6 +32,10 @@ AS_CONFIGURED = "as configured"
 
 _NAME = re.compile(r"\w[\w ,-]{0,39}")
 """A setting's name is a folder of checkpoints and part of a picture's legend."""
+
+
+SEEDS = 1000
+"""Number of training and of search seeds: each has a block of worlds."""
 
 
 class PpoSettings(Record):
@@ -134,6 +139,21 @@ class Experiment(Record):
 def load_experiment(path: str | Path) -> Experiment:
     """Read an experiment from YAML; errors are one line with the key path."""
     return load(Path(path), Experiment)
+
+
+def seeds_of(text: str) -> list[int]:
+    """Return the seeds of "0-9" or "0,3,5-7"; raise ValueError, in one line, for anything else."""
+    found: list[int] = []
+    for part in text.split(","):
+        first, dash, last = part.strip().partition("-")
+        ends = (first, last if dash else first)
+        if not all(end.isascii() and end.isdigit() and len(end) < 9 and int(end) < SEEDS for end in ends):
+            allowed = f"each must be a number from 0 to {SEEDS - 1} or a range of them, such as 0-9"
+            raise ValueError(f"--seeds {printable(text)}: {allowed}")
+        if int(ends[0]) > int(ends[1]):
+            raise ValueError(f"--seeds {printable(text)}: the first number of a range must be at most the last")
+        found += range(int(ends[0]), int(ends[1]) + 1)
+    return list(dict.fromkeys(found))
 
 
 @contextmanager

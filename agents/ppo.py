@@ -34,7 +34,7 @@ from agents.central_critic import CentralPolicy, CentralVecEnv
 from agents.checkpoint import CheckpointError, claim, path_in
 from agents.dagger import teach
 from agents.divergence import LearningDiverged, check_answers, check_model
-from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors
+from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors, seeds_of
 from agents.learning_env import ForLearning
 from agents.run import Run, expected_bytes, load_checkpoint, recipe_of, save_checkpoint
 from agents.team_credit import CaringBuffer
@@ -400,7 +400,7 @@ def main(
 
 def _train_seeds(experiment: Experiment, text: str, folder: Path, runs: Path, work: Work) -> None:
     """Train with several seeds as jobs, and write the policy of each that has ended."""
-    from agents.training_job import file_name, policy_of_bytes, seeds_of, training_job, with_seed
+    from agents.training_job import file_name, policy_of_bytes, training_job, with_seed
 
     for path in (folder / "policy", runs / "checkpoint"):
         check_room(path, expected_bytes(experiment))

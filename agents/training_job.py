@@ -9,33 +9,14 @@ from typing import Any
 from agents.experiment import Experiment
 from agents.ppo import card_of, train
 from agents.run import recipe_of
-from flockenv.core.errors import printable
 from flockenv.envs.world import bytes_per_world, first_step
 from flockenv.jobs import Job, records
 from flockenv.tasks import Task
 
-__all__ = ["file_name", "policy_of_bytes", "seeds_of", "training_job", "with_seed"]
+__all__ = ["file_name", "policy_of_bytes", "training_job", "with_seed"]
 
 TRAINING = 700 * 2**20
 """Bytes that a process needs to train, besides worlds and rollout: torch and other libraries, and compiling."""
-
-MOST = 1000
-"""Number of training seeds: each has a block of worlds."""
-
-
-def seeds_of(text: str) -> list[int]:
-    """Return the seeds of "0-9" or "0,3,5-7"; raise ValueError, in one line, for anything else."""
-    found: list[int] = []
-    for part in text.split(","):
-        first, dash, last = part.strip().partition("-")
-        ends = (first, last if dash else first)
-        if not all(end.isascii() and end.isdigit() and len(end) < 9 and int(end) < MOST for end in ends):
-            allowed = f"each must be a number from 0 to {MOST - 1} or a range of them, such as 0-9"
-            raise ValueError(f"--seeds {printable(text)}: {allowed}")
-        if int(ends[0]) > int(ends[1]):
-            raise ValueError(f"--seeds {printable(text)}: the first number of a range must be at most the last")
-        found += range(int(ends[0]), int(ends[1]) + 1)
-    return list(dict.fromkeys(found))
 
 
 def with_seed(experiment: Experiment, seed: int) -> Experiment:

@@ -16,9 +16,8 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from agents.experiment import Experiment, load_experiment, one_line_errors
+from agents.experiment import Experiment, load_experiment, one_line_errors, seeds_of
 from agents.search import Found, median_of, search
-from agents.training_job import seeds_of
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes
 from flockenv.cli.terminal import job_bar, run_program
 from flockenv.core.atomic_files import new_folder, replace_file

@@ -22,12 +22,12 @@ from typer.testing import CliRunner
 from agents import dagger
 from agents import imitate as imitation
 from agents.dagger import collect_answers
-from agents.experiment import AS_CONFIGURED, CONFIGS, Experiment, PpoSettings, load_experiment
+from agents.experiment import AS_CONFIGURED, CONFIGS, Experiment, PpoSettings, load_experiment, seeds_of
 from agents.imitate import imitate
 from agents.learning_env import ForLearning
 from agents.run import load_checkpoint, recipe_of
 from agents.team_credit import CaringBuffer
-from agents.training_job import seeds_of, training_job, with_seed
+from agents.training_job import training_job, with_seed
 from flockenv.envs.sb3 import WorldVecEnv
 from flockenv.envs.world import World
 from flockenv.evaluation import compare, rollout, worlds_for

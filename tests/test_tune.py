@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +26,8 @@ from flockenv.players.rules import PLAYERS, TUNABLE, Tuned, as_dict, load_tuned,
 from flockenv.players.rules.parameter import ranges_of
 from flockenv.players.rules.pursuit import PursuitRules
 from flockenv.tasks import TASKS
+
+ROOT = Path(__file__).resolve().parent.parent
 
 SMALL = Experiment(
     task="pursuit",
@@ -187,6 +191,12 @@ def test_progress_is_in_thousands_of_agent_steps(tmp_path: Path, monkeypatch: py
     search(SHORT, "rules", [0], replace(work(tmp_path), progress=lambda done, most, name: reports.append((done, most))))
     assert [done for done, _ in reports] == sorted({done for done, _ in reports}) and reports[-1][0] >= 120
     assert {most for _, most in reports} == {120}
+
+
+def test_the_search_needs_no_torch() -> None:
+    code = "import sys, agents.tune; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout == "False\n"
 
 
 # --- several seeds
