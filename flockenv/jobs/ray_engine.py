@@ -61,9 +61,10 @@ class RayEngine:
         waiting = iter(jobs)
         try:
             self._warm_up(jobs)
+            largest = self._largest_memory()
             while True:
                 for job in islice(waiting, self._room(len(running))):
-                    placed = task.options(memory=self._fitting(job.memory)) if job.memory else task
+                    placed = task.options(memory=min(job.memory, largest)) if job.memory else task
                     running[placed.remote(job.function, job.arguments, code, os.getcwd())] = job
                     begun(job)
                 if not running:
@@ -100,10 +101,9 @@ class RayEngine:
         """Return the strategy that places a task on a node."""
         return self._ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(node, soft=False)
 
-    def _fitting(self, memory: int) -> int:
-        """Return the memory of a job, at most that of the largest node, which then runs this job alone."""
-        sizes = [int(node["Resources"].get("memory", 0)) for node in self._ray.nodes() if node["Alive"]]
-        return min(memory, max(sizes, default=memory))
+    def _largest_memory(self) -> int:
+        """Return the memory of the largest node, bytes; a job that needs more gets all of it."""
+        return max(int(node["Resources"].get("memory", 0)) for node in self._ray.nodes() if node["Alive"])
 
     def _room(self, running: int) -> int:
         """Return how many more tasks may be submitted; the cluster may grow and shrink."""
