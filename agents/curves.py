@@ -19,6 +19,7 @@ from rich.console import Console
 
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors
 from agents.run import expected_bytes
+from agents.training_job import policy_of_bytes, training_job
 from flockenv.cli.jobs import EngineName, Fresh, ShardText, end_of_shard, shard_of
 from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import replace_file, write_all_or_none
@@ -68,8 +69,6 @@ def curve_jobs(
     experiments: Mapping[str, Experiment], runs: Path, at_a_time: int | str, go_on: bool
 ) -> dict[tuple[str, str], Job]:
     """Return the trainings by task and setting; at_a_time, go_on: as of `training_job`."""
-    from agents.training_job import training_job  # with torch
-
     return {
         (task, name): training_job(
             experiment.model_copy(update={"ppo": p}), runs, go_on, f"curves/{task}/{name.replace(' ', '-')}", at_a_time
@@ -163,8 +162,6 @@ def main(
         for experiment in experiments.values():
             check_room(folder / "checkpoint", expected_bytes(experiment))
         runner, part = engine_of(engine, processes, renew=True), shard_of(shard)
-    from agents.training_job import policy_of_bytes  # with torch
-
     at_a_time = processes if engine == "local" else engine
     trainings = curve_jobs(experiments, folder, at_a_time, not fresh)
     with report_errors("curves", STOPPED), end_of_shard():

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from agents.experiment import Experiment
-from agents.ppo import card_of, train
 from agents.run import recipe_of
 from flockenv.envs.world import bytes_per_world, first_step
 from flockenv.jobs import Job, records
@@ -61,6 +60,8 @@ def file_name(job: Job) -> str:
 
 def _train(experiment: str, folder: str, go_on: bool) -> bytes:
     """Train to the end of the budget; return the best policy with its card as bytes."""
+    from agents.ppo import card_of, train  # with torch
+
     run = train(Experiment.model_validate_json(experiment), Path(folder), go_on)
     return records.to_bytes({"tensors": dict(run.tensors), "card": card_of(run)})
 

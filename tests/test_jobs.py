@@ -242,6 +242,12 @@ def test_jobs_that_run_for_long_are_shown_as_running(tmp_path: Path) -> None:
     assert seen == [[jobs[0].key], [jobs[1].key]]
 
 
+def test_commands_that_play_as_jobs_need_no_torch() -> None:
+    """The environment with Ray has none, by configs/constraints-ray.txt."""
+    code = "import sys, agents.compare, agents.tune, agents.transfer, agents.curves; sys.exit('torch' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True, timeout=60)
+
+
 # --- threads and memory
 
 
