@@ -178,7 +178,7 @@ def _alone(function: Callable[..., bytes], *arguments: Any) -> dict[str, Any]:
 
 def overhead(rounds: int, milliseconds: float, cores: int) -> dict[str, Any]:
     """Print and return the time of small jobs on Ray and on the local engine."""
-    import ray
+    import ray  # type: ignore[import-not-found, unused-ignore]
 
     from flockenv.jobs.ray_engine import RayEngine
 
