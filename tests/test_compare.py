@@ -160,7 +160,7 @@ def test_shards_store_jobs_and_a_call_without_a_shard_collects_them(monkeypatch:
     arguments = ("--tasks", "obstacles", "--players", "random,textbook", "--worlds", "2", "--smoke")
     for shard in ("0/2", "1/2"):
         result = run(*arguments, "--shard", shard)
-        assert result.stderr.splitlines()[-1].startswith(f"shard {shard}: 1 jobs are stored in results/jobs; the same")
+        assert result.stderr.splitlines()[-1].startswith(f"shard {shard}: 1 of 2 jobs, stored in results/jobs; ")
         assert not result.stdout and sorted(path.name for path in Path("results").iterdir()) == ["jobs"]
     run(*arguments, "--out", "once")
     monkeypatch.setattr(play, "rollout", None)

@@ -370,7 +370,7 @@ def test_shards_at_the_same_time_and_a_run_that_collects_store_the_bytes_of_one_
     ]
     for k, process in enumerate(running):
         line = process.communicate(timeout=60)[1].splitlines()[0]
-        assert line.startswith(f"shard {k}/2: 4 jobs are stored in jobs; the same command without --shard collects")
+        assert line.startswith(f"shard {k}/2: 4 of 8 jobs, stored in jobs; the same command without --shard collects")
     stored, states = records_of(folders[0] / "jobs"), State.read(folders[0] / "jobs")
     assert [len(states[f"slow-{k}-of-2"]["done"]) for k in range(2)] == [4, 4]
     for folder in folders:
@@ -387,7 +387,7 @@ def test_shards_have_each_job_once_and_invalid_ones_are_refused(tmp_path: Path) 
     shares = [Shard.of_text(f"{k}/3").of(jobs) for k in range(3)]
     assert sorted(job.name for share in shares for job in share) == [job.name for job in jobs]
     assert Shard(8, 9).of(jobs) == []
-    with pytest.raises(ShardDone, match="shard 8/9: 0 jobs are stored"):
+    with pytest.raises(ShardDone, match="shard 8/9: 0 of 7 jobs, stored"):
         run_jobs(jobs, work(tmp_path, shard=Shard(8, 9)))
     for text in ("", "3/3", "4/3", "1", "-1/3", "1/0", "a/b", "1/3 ", "1.0/3"):
         with pytest.raises(ValueError, match=r"^--shard '.*': must be I/N with I from 0 to N - 1, such as 0/4"):

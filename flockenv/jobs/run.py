@@ -57,8 +57,8 @@ class Shard:
 class ShardDone(Exception):  # noqa: N818  # not an error: another call collects the records
     """The share of the jobs is done and stored; the text has their number."""
 
-    def __init__(self, shard: Shard, jobs: int, folder: Path) -> None:
-        stored = f"{jobs} jobs are stored in {_relative(folder)}"
+    def __init__(self, shard: Shard, jobs: int, all_jobs: int, folder: Path) -> None:
+        stored = f"{jobs} of {all_jobs} jobs, stored in {_relative(folder)}"
         super().__init__(f"shard {shard.index}/{shard.count}: {stored}; the same command without --shard collects them")
 
 
@@ -89,7 +89,7 @@ def run_jobs(jobs: Sequence[Job], work: Work) -> None:
         return
     share, shard = work.shard.of(jobs), work.shard
     _run_missing(share, work, f"{_command(jobs)}-{shard.index}-of-{shard.count}")
-    raise ShardDone(shard, len(share), work.store.folder)
+    raise ShardDone(shard, len(share), len(jobs), work.store.folder)
 
 
 def _run_missing(jobs: Sequence[Job], work: Work, command: str) -> None:
