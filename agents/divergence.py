@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from stable_baselines3 import PPO
 
 from flockenv.tasks import Task
+
+if TYPE_CHECKING:
+    from stable_baselines3 import PPO
 
 __all__ = ["LearningDiverged", "check_answers", "check_model", "check_step"]
 

@@ -18,7 +18,8 @@ from rich.progress import Progress
 
 from agents.dagger import WORLDS, teach
 from agents.experiment import Experiment, load_experiment, one_line_errors
-from agents.ppo import build, score, tensors_of, use_thread_count
+from agents.ppo import build, tensors_of
+from agents.training import score, use_thread_count
 from flockenv.cli.terminal import DIVERGED, run_program, show_progress
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.players.rules import player

@@ -9,9 +9,6 @@ resumed under the same versions on the same machine has the same weights as an u
 
 from __future__ import annotations
 
-import functools
-import os
-import platform
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -25,7 +22,7 @@ import numpy as np
 import torch
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
@@ -33,28 +30,27 @@ from stable_baselines3.common.logger import Logger
 from agents.central_critic import CentralPolicy, CentralVecEnv
 from agents.checkpoint import CheckpointError, claim, path_in
 from agents.dagger import teach
-from agents.divergence import LearningDiverged, check_answers, check_model
+from agents.divergence import check_answers, check_model
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors, seeds_of
 from agents.learning_env import ForLearning
 from agents.run import Run, expected_bytes, load_checkpoint, recipe_of, save_checkpoint
 from agents.team_credit import CaringBuffer
+from agents.training import add_point, card_of, new_progress, score, use_thread_count
 from agents.training_state import capture, restore, surroundings
 from flockenv.cli.jobs import EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
 from flockenv.cli.terminal import DIVERGED, handle_interrupt, job_bar, run_program, show_progress
 from flockenv.core import signals
 from flockenv.core.address_space import IN_USE, TRAINING, require_room
 from flockenv.core.output_paths import check_room, valid_file, valid_path
-from flockenv.envs.disturbance import make_world
 from flockenv.envs.sb3 import WorldVecEnv
-from flockenv.evaluation import rollout, worlds_for
-from flockenv.jit.thread_pool import threads, use_threads
+from flockenv.evaluation import worlds_for
 from flockenv.jobs import Store, Work, engine_of, run_jobs
 from flockenv.players import WEIGHTS
-from flockenv.players.policy import MlpPolicy, describe, save_policy
+from flockenv.players.policy import save_policy
 from flockenv.players.rules import player
-from flockenv.tasks import TASKS, Task
+from flockenv.tasks import Task
 
-__all__ = ["app", "build", "card_of", "export", "score", "tensors_of", "train", "use_thread_count"]
+__all__ = ["app", "build", "export", "tensors_of", "train"]
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 console = Console(stderr=True)
@@ -72,19 +68,6 @@ def tensors_of(model: PPO) -> dict[str, np.ndarray]:
         for part in ("weight", "bias"):
             out[f"policy.{k}.{part}"] = state[f"mlp_extractor.policy_net.{layer}.{part}"]
     return {name: tensor.copy() for name, tensor in out.items()}
-
-
-@contextmanager
-def use_thread_count(count: int) -> Iterator[None]:
-    """Set the number of threads of torch and of the worlds for a block; restore both afterwards."""
-    before = torch.get_num_threads(), threads()
-    torch.set_num_threads(count)
-    use_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before[0])
-        use_threads(before[1])
 
 
 def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
@@ -128,22 +111,6 @@ def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
         model.set_logger(Logger(folder=None, output_formats=[]))  # its own leaves an empty folder behind
     worlds.seed(worlds_for("training", p.seed, p.worlds))
     return model
-
-
-def score(task: Task, p: PpoSettings, tensors: dict[str, np.ndarray]) -> tuple[float, float]:
-    """Return the mean return and the success rate of a policy, without noise, on the tuning worlds.
-
-    Raises:
-        LearningDiverged: an action of the policy, or a reward, is not finite.
-    """
-    policy, first = MlpPolicy(tensors, {"activation": p.activation}), worlds_for("tuning", p.seed, p.evaluate_worlds)
-    make = functools.partial(make_world, disturbance=p.disturbance)
-    try:
-        with np.errstate(over="ignore", invalid="ignore"):  # a result that is not finite raises an error
-            episodes = rollout(task, policy, p.evaluate_worlds, first, make_world=make)
-    except ValueError as error:  # the message names the world
-        raise LearningDiverged(f"on the tuning worlds: {error}") from error
-    return float(np.mean(episodes.returns)), float(np.mean(episodes.success))
 
 
 class Watch(BaseCallback):
@@ -198,13 +165,8 @@ class Watch(BaseCallback):
         self.run.wall = self.before + time.perf_counter() - self.since
         self.run.steps = self.num_timesteps * self.p.hold
         tensors = tensors_of(self.model)
-        result, success = score(self.task, self.p, tensors)
-        seconds = round(self.run.wall, 1)
-        self.run.curve.append({"steps": self.run.steps, "seconds": seconds, "mean": result, "success": success})
-        if self.run.best is None or result > self.run.best:
-            self.run.best, self.run.tensors = result, tensors
-        self.progress.update(self.bar, score=f"{result:.2f}, success {success:.0%}, best {self.run.best:.2f}")
-        line = f"{self.run.steps:>12,} steps {seconds:7.1f} s  mean {result:8.3f}  success {success:.3f}"
+        text, line = add_point(self.run, tensors, score(self.task, self.p, tensors))
+        self.progress.update(self.bar, score=text)
         self.progress.console.print(line)
         self.due = True
 
@@ -288,11 +250,7 @@ def _train_from(
     else:
         run = Run(recipe_of(experiment), surroundings(model.get_env().get_attr("task", 0)[0]))
         run.wall = _teach_first(model, task, p)
-    columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
-        TextColumn("{task.fields[score]}"),
-    )  # fmt: skip
-    with use_thread_count(p.threads), show_progress(Progress(*columns, console=console)) as progress:
+    with use_thread_count(p.threads), show_progress(new_progress(console)) as progress:
         watch = Watch(task, p, run, folder, progress, saved)
         try:
             with _name_divergence(model):
@@ -318,26 +276,6 @@ def _name_divergence(model: PPO) -> Iterator[None]:
         check_model(model)
         check_answers(model)
         raise
-
-
-def card_of(run: Run) -> dict[str, Any]:
-    """Return the card of the best policy: its recipe, from which it can be reproduced, and how it was trained."""
-    recipe = run.recipe
-    return {
-        **describe(TASKS[recipe["task"]](**recipe["arguments"])),
-        **({"rules": recipe["rules"]} if "rules" in recipe else {}),
-        "activation": recipe["ppo"]["activation"],
-        "algorithm": "PPO (stable-baselines3)",
-        "recipe": {"command": f"python -m agents.ppo configs/training/{recipe['task']}.yaml", "ppo": recipe["ppo"]},
-        "seed": recipe["ppo"]["seed"],
-        "steps": run.steps,
-        "wall_time_s": round(run.wall, 1),
-        "tuning_mean": run.best,
-        "curve": run.curve,
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
-        "versions": run.surroundings,
-        **({"resumed": run.resumed} if run.resumed else {}),
-    }
 
 
 def export(run: Run, path: Path) -> None:

@@ -24,8 +24,8 @@ __all__ = ["OtherRecipe", "Run", "expected_bytes", "load_checkpoint", "recipe_of
 STATE = ("policy", "optimizer", "worlds", "rollout", "random")
 """The parts of a checkpoint that are the model's, see agents.training_state."""
 
-PARTS = (*STATE, "best", "notes", files.TIMES)
-"""All parts of a checkpoint, with the actor of the best policy so far, the notes, and wall times."""
+ALWAYS = ("best", "notes", files.TIMES)
+"""The other parts: the actor of the best policy so far, the notes, and wall times."""
 
 
 class OtherRecipe(CheckpointError):  # noqa: N818  # not an error for a caller that starts anew then
@@ -97,8 +97,8 @@ def save_checkpoint(folder: Path, run: Run) -> None:
     files.write(folder, {**run.state, "best": run.tensors, **words})
 
 
-def load_checkpoint(experiment: Experiment, folder: Path) -> Run | None:
-    """Return the run whose checkpoint lies in a folder, if there is one.
+def load_checkpoint(experiment: Experiment, folder: Path, state: tuple[str, ...] = STATE) -> Run | None:
+    """Return the run whose checkpoint lies in a folder, if there is one; `state` names the parts that are the model's.
 
     Raises:
         OtherRecipe: it is not of this experiment.
@@ -107,10 +107,11 @@ def load_checkpoint(experiment: Experiment, folder: Path) -> Run | None:
     parts = files.read(folder, 16 * expected_bytes(experiment) + 2**26)
     if parts is None:
         return None
-    for part in PARTS:
+    wanted = (*state, *ALWAYS)
+    for part in wanted:
         if part not in parts:
             raise files.Damaged(folder, f"{part}: is missing")
-    if others := sorted(parts.keys() - set(PARTS)):
+    if others := sorted(parts.keys() - set(wanted)):
         raise files.Damaged(folder, f"{others[0]}: is no part of a checkpoint")
     notes, times = files.from_json(Notes, parts, "notes", folder), files.from_json(Times, parts, files.TIMES, folder)
     _compare(notes.recipe, recipe_of(experiment), folder)
@@ -120,7 +121,7 @@ def load_checkpoint(experiment: Experiment, folder: Path) -> Run | None:
     fields = notes.model_dump(mode="json")
     seconds = [{"seconds": value} for value in times.seconds]
     fields["curve"] = [{"steps": p["steps"], **s, **p} for p, s in zip(fields["curve"], seconds, strict=True)]
-    return Run(**fields, wall=times.wall, tensors=best, state={part: parts[part] for part in STATE})
+    return Run(**fields, wall=times.wall, tensors=best, state={part: parts[part] for part in state})
 
 
 def expected_bytes(experiment: Experiment) -> int:

@@ -60,7 +60,8 @@ def file_name(job: Job) -> str:
 
 def _train(experiment: str, folder: str, go_on: bool) -> bytes:
     """Train to the end of the budget; return the best policy with its card as bytes."""
-    from agents.ppo import card_of, train  # with torch
+    from agents.ppo import train  # with torch
+    from agents.training import card_of
 
     run = train(Experiment.model_validate_json(experiment), Path(folder), go_on)
     return records.to_bytes({"tensors": dict(run.tensors), "card": card_of(run)})

@@ -13,22 +13,25 @@ import random
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from stable_baselines3 import PPO
 
+import flockenv
 from agents.checkpoint import JSON, CheckpointParts, Damaged, Tensors, json_part
 from flockenv.envs.world import World
 from flockenv.studies.accuracy.benchmark import machine
 from flockenv.tasks import Task
 from flockenv.tasks.play import name_of
 
+if TYPE_CHECKING:
+    from stable_baselines3 import PPO
+
 __all__ = ["capture", "restore", "surroundings"]
 
-PACKAGES = ("flockenv", "numpy", "numba", "gymnasium", "stable-baselines3", "torch")
+PACKAGES = ("numpy", "numba", "gymnasium", "torch")
 MOMENTS = ("exp_avg", "exp_avg_sq", "step")
 """The state of Adam for each parameter that has had a gradient."""
 
@@ -139,11 +142,12 @@ def _seed_generators(model: PPO, states: Mapping[str, Any]) -> None:
 # --- versions and machine: what results depend on besides the recipe --------------------------------------------------
 
 
-def surroundings(task: Task) -> dict[str, str]:
+def surroundings(task: Task, library: str = "stable-baselines3") -> dict[str, str]:
     """Return the surroundings of training, by name: versions, the machine, and the source of the task's kernel."""
     processor = f"{machine().cpu}, {os.cpu_count()} cores, torch uses {torch.backends.cpu.get_cpu_capability()}"
     return {
-        **{name: version(name) for name in PACKAGES},
+        "flockenv": flockenv.__version__,
+        **{name: version(name) for name in (*PACKAGES, library)},
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.machine()}",
         "processor": processor,

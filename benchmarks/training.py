@@ -89,7 +89,7 @@ class Learning(Contestant):
 
     def _learn_once(self) -> float:
         """Run one rollout and one update; return the number of agent-steps."""
-        from agents.ppo import use_thread_count
+        from agents.training import use_thread_count
 
         before = self.model.num_timesteps
         steps = self.model.n_steps * self.model.n_envs

@@ -122,7 +122,7 @@ def test_the_base_dependencies_do_not_include_torch(metadata: Message) -> None:
         *("numpy", "scipy", "numba", "gymnasium", "pettingzoo", "pydantic", "pyyaml", "typer", "rich"),
         *("matplotlib", "pillow", "safetensors", "shapely", "filelock"),
     }
-    assert set(metadata.get_all("Provides-Extra") or []) == {"train", "test", "render", "docs", "ray"}
+    assert set(metadata.get_all("Provides-Extra") or []) == {"train", "test", "render", "docs", "ray", "rllib"}
     assert "gymnasium<2,>=1.2" in needed
 
 

@@ -6,17 +6,14 @@ the tests are skipped.
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-import tomllib
 from pathlib import Path
 
 import pytest
 
+from tests.ray_venv import new_venv, run_case
+
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).resolve().parent.parent
 CASES = (
     "results_are_the_same_on_one_node_and_on_two",
     "a_killed_worker_loses_nothing",
@@ -31,24 +28,9 @@ CASES = (
 @pytest.fixture(scope="module")
 def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The interpreter of a new virtual environment with flockenv's requirements, Ray and what searches need."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    folder = tmp_path_factory.mktemp("ray") / "venv"
-    subprocess.run([sys.executable, "-m", "venv", folder], check=True)
-    extras = project["optional-dependencies"]
-    searches = [requirement for requirement in extras["train"] if requirement.startswith("cmaes")]
-    command = [folder / "bin" / "pip", "install", "-q", "-c", ROOT / "configs" / "constraints-ray.txt"]
-    done = subprocess.run(
-        [*command, *project["dependencies"], *extras["ray"], *searches], capture_output=True, text=True
-    )
-    if done.returncode:
-        pytest.skip(f"Ray cannot be installed: {done.stderr.strip().splitlines()[-1]}")
-    return folder / "bin" / "python"
+    return new_venv(tmp_path_factory.mktemp("ray") / "venv", "ray", "cmaes")
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_ray(case: str, python: Path) -> None:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0"}
-    done = subprocess.run(
-        [python, "-m", "tests.ray_cases", case], env=environment, capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
+    run_case(python, "tests.ray_cases", case)

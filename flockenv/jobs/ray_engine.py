@@ -18,7 +18,7 @@ from flockenv.core import signals
 from flockenv.jobs.engine import TRIES, Begun
 from flockenv.jobs.job import Failure, Job, code_digest, execute
 
-__all__ = ["RayEngine"]
+__all__ = ["RayEngine", "import_ray", "start_ray"]
 
 AHEAD = 2
 """Tasks per core of the cluster that are submitted at a time; the driver holds no more records than that."""
@@ -36,7 +36,7 @@ class RayEngine:
     parallel = True
 
     def __init__(self) -> None:
-        self._ray = _import_ray()
+        self._ray = import_ray("--engine ray")
 
     def run(self, jobs: Iterable[Job], begun: Begun) -> Generator[tuple[Job, bytes | Failure], None, None]:
         """Yield each job with its record or its failure."""
@@ -46,7 +46,7 @@ class RayEngine:
     @contextmanager
     def keep(self) -> Iterator[None]:
         """Stay connected until the end of a block: to the cluster, or to a local one that is started."""
-        started = self._start()
+        started = start_ray(self._ray)
         try:
             yield
         finally:
@@ -110,16 +110,6 @@ class RayEngine:
         cores = int(self._ray.cluster_resources().get("CPU", 1))
         return max(0, AHEAD * max(1, cores) - running)
 
-    def _start(self) -> bool:
-        """Connect to the cluster, or start a local one; return True if this process was not connected before."""
-        if self._ray.is_initialized():
-            return False
-        address = os.environ.get("RAY_ADDRESS", "local")
-        own = {"include_dashboard": False} if address == "local" else {}
-        self._ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **own)
-        signals.take_handlers_back()  # Ray handles SIGTERM, and would print its own stack
-        return True
-
     def _result(self, reference: Any) -> bytes | Failure:
         """Return the record of a finished task, or its failure."""
         errors = self._ray.exceptions
@@ -152,12 +142,23 @@ def _begin_task(folder: str) -> None:
         os.chdir(folder)
 
 
-def _import_ray() -> Any:
-    """Return the module ray; raise ValueError, in one line, if it is not installed."""
+def start_ray(ray: Any) -> bool:
+    """Connect to the cluster, or start a local one; return True if this process was not connected before."""
+    if ray.is_initialized():
+        return False
+    address = os.environ.get("RAY_ADDRESS", "local")
+    own = {"include_dashboard": False} if address == "local" else {}
+    ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **own)
+    signals.take_handlers_back()  # Ray handles SIGTERM, and would print its own stack
+    return True
+
+
+def import_ray(option: str) -> Any:
+    """Return the module ray; raise ValueError, in one line that begins with the option, if it is not installed."""
     try:
         import ray  # type: ignore[import-not-found, unused-ignore]
         import ray.exceptions  # type: ignore[import-not-found, unused-ignore]
         import ray.util.scheduling_strategies  # type: ignore[import-not-found, unused-ignore]
     except ImportError as error:
-        raise ValueError(f"--engine ray: {error}; install the extra: pip install 'flockenv[ray]'") from None
+        raise ValueError(f"{option}: {error}; install the extra: pip install 'flockenv[ray]'") from None
     return ray

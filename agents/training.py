@@ -1,0 +1,98 @@
+"""Parts of a training that Stable-Baselines3's PPO and RLlib's share: threads, score, progress and card."""
+
+from __future__ import annotations
+
+import functools
+import os
+import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from agents.divergence import LearningDiverged
+from agents.experiment import PpoSettings
+from agents.run import Run
+from flockenv.envs.disturbance import make_world
+from flockenv.evaluation import rollout, worlds_for
+from flockenv.jit.thread_pool import threads, use_threads
+from flockenv.players.policy import MlpPolicy, describe
+from flockenv.tasks import TASKS, Task
+
+__all__ = ["add_point", "card_of", "new_progress", "score", "use_thread_count"]
+
+
+@contextmanager
+def use_thread_count(count: int) -> Iterator[None]:
+    """Set the number of threads of torch and of the worlds for a block; restore both afterwards."""
+    before = torch.get_num_threads(), threads()
+    torch.set_num_threads(count)
+    use_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        use_threads(before[1])
+
+
+def score(task: Task, p: PpoSettings, tensors: dict[str, np.ndarray]) -> tuple[float, float]:
+    """Return the mean return and the success rate of a policy, without noise, on the tuning worlds.
+
+    Raises:
+        LearningDiverged: an action of the policy, or a reward, is not finite.
+    """
+    policy, first = MlpPolicy(tensors, {"activation": p.activation}), worlds_for("tuning", p.seed, p.evaluate_worlds)
+    make = functools.partial(make_world, disturbance=p.disturbance)
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):  # a result that is not finite raises an error
+            episodes = rollout(task, policy, p.evaluate_worlds, first, make_world=make)
+    except ValueError as error:  # the message names the world
+        raise LearningDiverged(f"on the tuning worlds: {error}") from error
+    return float(np.mean(episodes.returns)), float(np.mean(episodes.success))
+
+
+def add_point(run: Run, tensors: dict[str, np.ndarray], scored: tuple[float, float]) -> tuple[str, str]:
+    """Add a point to the learning curve of a run, and keep the policy if it is the best so far.
+
+    scored: mean return and success rate of the policy with these tensors. Returns a text for the progress bar, and a
+    line for the console.
+    """
+    result, success = scored
+    seconds = round(run.wall, 1)
+    run.curve.append({"steps": run.steps, "seconds": seconds, "mean": result, "success": success})
+    if run.best is None or result > run.best:
+        run.best, run.tensors = result, tensors
+    line = f"{run.steps:>12,} steps {seconds:7.1f} s  mean {result:8.3f}  success {success:.3f}"
+    return f"{result:.2f}, success {success:.0%}, best {run.best:.2f}", line
+
+
+def new_progress(console: Console) -> Progress:
+    """Return the display of a training: a bar of agent-steps, times, and the last score."""
+    return Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
+        TextColumn("{task.fields[score]}"), console=console,
+    )  # fmt: skip
+
+
+def card_of(run: Run, library: str = "stable-baselines3", command: str = "agents.ppo") -> dict[str, Any]:
+    """Return the card of a run's policy: its recipe, from which it can be reproduced, and how it was trained."""
+    recipe = run.recipe
+    return {
+        **describe(TASKS[recipe["task"]](**recipe["arguments"])),
+        **({"rules": recipe["rules"]} if "rules" in recipe else {}),
+        "activation": recipe["ppo"]["activation"],
+        "algorithm": f"PPO ({library})",
+        "recipe": {"command": f"python -m {command} configs/training/{recipe['task']}.yaml", "ppo": recipe["ppo"]},
+        "seed": recipe["ppo"]["seed"],
+        "steps": run.steps,
+        "wall_time_s": round(run.wall, 1),
+        "tuning_mean": run.best,
+        "curve": run.curve,
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "versions": run.surroundings,
+        **({"resumed": run.resumed} if run.resumed else {}),
+    }

@@ -1,0 +1,34 @@
+"""RLlib trains policies that play in agents.compare; in a virtual environment with RLlib (configs/constraints-ray.txt).
+
+If RLlib cannot be installed there, the tests are skipped.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.ray_venv import new_venv, run_case
+
+pytestmark = pytest.mark.slow
+
+CASES = (
+    "rows_are_those_of_the_native_environment",
+    "settings_without_an_equal_are_refused_in_one_line",
+    "a_policy_trained_with_a_runner_plays_in_the_comparison",
+    "an_exported_policy_acts_as_in_rllib",
+    "an_interrupted_training_continues",
+    "pursuers_and_evaders_learn_a_policy_each",
+)
+
+
+@pytest.fixture(scope="module")
+def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The interpreter of a new virtual environment with flockenv's requirements and RLlib."""
+    return new_venv(tmp_path_factory.mktemp("rllib") / "venv", "rllib")
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_rllib(case: str, python: Path) -> None:
+    run_case(python, "tests.rllib_cases", case)
