@@ -18,7 +18,7 @@ from flockenv.core.errors import printable
 from flockenv.core.warnings import OtherTaskWarning
 from flockenv.envs.disturbance import Disturbance, make_world
 from flockenv.envs.world import bytes_per_world, first_step
-from flockenv.evaluation import Episodes, Recording, rollout, worlds_for
+from flockenv.evaluation import Episodes, Purpose, Recording, rollout, worlds_for
 from flockenv.jobs import Job, records
 from flockenv.model.appearance import Appearance
 from flockenv.model.snapshot import Mark, Snapshot
@@ -118,7 +118,7 @@ def players_in_order(specs: Sequence[str]) -> list[Player]:
 
 def play_job(
     kind: str, task: Task, player: Player, worlds: int, seed: int, record: int | None = None,
-    trust_pickle: bool = False, disturbance: Disturbance | None = None,
+    trust_pickle: bool = False, disturbance: Disturbance | None = None, purpose: Purpose = "evaluation",
 ) -> Job:  # fmt: skip
     """Return the job that plays the held-out worlds of a seed with a player; its record is read by `episodes_of_bytes`.
 
@@ -130,23 +130,23 @@ def play_job(
     digest = player_digest(player, task, seed)
     about = {
         "task": type(task).__name__, "settings": task.model_dump(mode="json"), "worlds": worlds, "seed": seed,
-        "record": record, "player": digest,
+        "record": record, "player": digest, "purpose": purpose,
         **({"disturbance": disturbance.model_dump(mode="json")} if disturbance else {}),
     }  # fmt: skip
-    arguments = task, player, worlds, seed, record, trust_pickle, digest, disturbance
+    arguments = task, player, worlds, seed, record, trust_pickle, digest, disturbance, purpose
     memory = PLAYING + worlds * bytes_per_world(task)
     return Job(f"{kind}/{task.name}/{player.name}", _play, arguments, about, memory, (first_step, (task,)))
 
 
 def _play(
     task: Task, player: Player, worlds: int, seed: int, record: int | None, trust_pickle: bool, digest: str,
-    disturbance: Disturbance,
+    disturbance: Disturbance, purpose: Purpose,
 ) -> bytes:  # fmt: skip
     """Play the worlds; return the episodes as bytes. Raise ValueError if the player has another digest than before."""
     policy = player.policy(task, seed, trust_pickle)
     if _digest(player, policy) != digest:
         raise ValueError(f"player {player.spec!r} has changed since the command began, or differs on this machine")
-    first, make = worlds_for("evaluation", seed, worlds), functools.partial(make_world, disturbance=disturbance)
+    first, make = worlds_for(purpose, seed, worlds), functools.partial(make_world, disturbance=disturbance)
     with blame(player.name, task):
         return records.to_bytes(rollout(task, policy, worlds, first, record=record, make_world=make))
 

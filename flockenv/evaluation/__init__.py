@@ -10,6 +10,7 @@ from flockenv.evaluation.episodes import (
     Comparison,
     Episodes,
     Interval,
+    Purpose,
     Recording,
     Summary,
     bootstrap,
@@ -21,6 +22,7 @@ from flockenv.evaluation.episodes import (
     task_digest,
     worlds_for,
 )
+from flockenv.evaluation.seeds import lead_interval, mean_interval
 
 __all__ = [
     "EVALUATION",
@@ -30,11 +32,14 @@ __all__ = [
     "Comparison",
     "Episodes",
     "Interval",
+    "Purpose",
     "Recording",
     "Summary",
     "bootstrap",
     "compare",
     "iqm",
+    "lead_interval",
+    "mean_interval",
     "proportion",
     "rollout",
     "summarise",

@@ -25,7 +25,7 @@ from flockenv.core.yaml_paths import STANDARD_INPUT, has_yaml_suffix
 from flockenv.scene import Scene
 from flockenv.scene.presets import Preset, expand_presets
 
-__all__ = ["MAX_BYTES", "ConfigError", "dump", "dump_scene", "load", "load_scene", "schema"]
+__all__ = ["MAX_BYTES", "ConfigError", "dump", "dump_scene", "load", "load_scene", "parse_scalar", "schema"]
 
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 32
@@ -154,7 +154,7 @@ class _Dumper(yaml.SafeDumper):
 
 def _represent_text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
     try:
-        plain = _parse_scalar(text) == text
+        plain = parse_scalar(text) == text
     except ValueError:
         plain = False
     return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=None if plain else "'")
@@ -207,7 +207,7 @@ _NUMBER = re.compile(r"[-+]?(?=\.?[0-9])(?P<whole>[0-9]+(?:_[0-9]+)*)?(?P<point>
 _WORDS: dict[str, bool | None] = {"": None, "~": None, "null": None, "true": True, "false": False}
 
 
-def _parse_scalar(text: str) -> str | int | float | bool | None:
+def parse_scalar(text: str) -> str | int | float | bool | None:
     """Return the value of an unquoted scalar; raise ValueError for an ambiguous one."""
     if text.lower() in _WORDS:
         return _WORDS[text.lower()]
@@ -295,7 +295,7 @@ class _Reader:
         if event.style:  # quoted, or a block of text
             return event.value
         try:
-            return _parse_scalar(event.value)
+            return parse_scalar(event.value)
         except ValueError as error:
             raise self._error(event, f"{key_path(path)}: {error}") from None
 

@@ -1,0 +1,183 @@
+"""A study, configs/studies/NAME.yaml: which settings of each task are varied, and which players play them.
+
+    title: Players away from home
+    worlds: 64
+    players: {random: random, rules: rules, ppo: ppo}
+    everywhere:
+      noise: [0.05]                # of every task: sensors and actions
+    tasks:
+      crossing:
+        agents: [4, 8, 16]         # an argument of the task
+        room:                      # or several at once, under a name of their own
+          - {agents: 48, circle: 12}
+
+Every value changes one thing: all else is as in configs/training/TASK.yaml, which is the setting called home.
+"""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field, model_validator
+
+from agents.experiment import CONFIGS, Experiment, load_experiment
+from agents.play import NAME, Player
+from flockenv.core.errors import key_path, nearest, printable
+from flockenv.core.record import Record
+from flockenv.envs.disturbance import Disturbance
+from flockenv.evaluation import WORLDS_PER_SEED
+from flockenv.players import NAMES, other_tasks
+from flockenv.tasks import TASKS, Task
+
+__all__ = ["HOME", "Contender", "Setting", "Study", "contenders_of", "settings_of"]
+
+HOME = "home"
+"""The setting of a task that its players were made for."""
+
+TASK_PLACE = "{task}"
+"""Stands for the task's name in the files of a player."""
+
+Value = bool | int | float | str | None
+
+
+class Study(Record):
+    """A plan of agents.sweep."""
+
+    title: str = Field(description="title of the page")
+    worlds: int = Field(
+        default=64, ge=2, le=WORLDS_PER_SEED, description="worlds per setting, the same for all players"
+    )
+    seed: int = Field(default=0, ge=0, lt=1000, description="block of the evaluation and tuning worlds")
+    players: dict[str, str] = Field(
+        min_length=1,
+        description="players by name: a known name or a file; with {task} in place of the task's name, and * for the"
+        " files of several training seeds",
+    )
+    everywhere: dict[str, tuple[Value | dict[str, Value], ...]] = Field(
+        default_factory=dict,
+        description="values to play, by name, in every task that has it: noise, delay, dropped, dt",
+    )
+    tasks: dict[str, dict[str, tuple[Value | dict[str, Value], ...]]] = Field(
+        min_length=1, description="values to play in single tasks: arguments of the task, or names of several at once"
+    )
+
+    @model_validator(mode="after")
+    def _names_are_known(self) -> Study:
+        for task in self.tasks:
+            if task not in TASKS:
+                raise ValueError(
+                    f"{key_path(('tasks', task))}: unknown{nearest(task, TASKS)}; allowed: {', '.join(TASKS)}"
+                )
+        for name in self.players:
+            if not NAME.fullmatch(name):
+                raise ValueError(f"{key_path(('players', name))}: a name is up to 40 letters, digits and _ . + -")
+        for missing in {"random", "rules"} - set(self.players.values()):
+            raise ValueError(f"players: needs {missing!r}, as scores are 0 for random and 1 for rules")
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """One setting of a task: what is varied (`axis`), its value as text, and what is played."""
+
+    axis: str
+    value: str
+    task: Task
+    disturbance: Disturbance
+
+    @property
+    def name(self) -> str:
+        """Return "agents=4", or "home"."""
+        return f"{self.axis}={self.value}" if self.value else self.axis
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A player of a study: one, or the same with several training seeds."""
+
+    name: str
+    members: tuple[Player, ...]
+
+
+def settings_of(study: Study, name: str, changes: Mapping[str, Any] | None = None) -> list[Setting]:
+    """Return the settings of a task: home, then one for each value.
+
+    changes: other arguments of the task, or disturbances, that hold in every setting.
+
+    Raises:
+        ValueError: in one line, a value that the task does not accept, or a name that it does not have.
+    """
+    path = CONFIGS / f"{name}.yaml"
+    experiment = load_experiment(path) if path.is_file() else Experiment(task=name)
+    always = {**experiment.arguments, **(changes or {})}
+    found = [_setting(name, HOME, "", always, {})]
+    for axis, values in [*study.tasks[name].items(), *study.everywhere.items()]:
+        for value in values:
+            many = value if isinstance(value, dict) else {axis: value}
+            setting = _setting(name, axis, _text(value), always, many)
+            if axis in study.tasks[name] or _applies(setting):
+                found.append(setting)
+    home = found[0]
+    for setting in found:
+        try:
+            setting.disturbance.check(setting.task)
+        except ValueError as error:
+            raise ValueError(f"tasks.{name}.{setting.axis}: {error}") from None
+    return [home, *(s for s in found[1:] if (s.task, s.disturbance) != (home.task, home.disturbance))]
+
+
+def _applies(setting: Setting) -> bool:
+    """Return False for a disturbance of something that the task does not have."""
+    try:
+        setting.disturbance.check(setting.task)
+    except ValueError:
+        return False
+    return True
+
+
+def _setting(name: str, axis: str, value: str, always: Mapping[str, Any], changes: Mapping[str, Any]) -> Setting:
+    arguments = {**always, **changes}
+    disturbed = {key: arguments.pop(key) for key in Disturbance.model_fields if key in arguments}
+    known = TASKS[name].model_fields
+    for key in arguments:
+        if key not in known:
+            allowed = [*known, *Disturbance.model_fields]
+            raise ValueError(f"{key_path(('tasks', name, key))}: unknown{nearest(key, allowed)}")
+    try:
+        return Setting(axis, value, TASKS[name](**arguments), Disturbance(**disturbed))
+    except ValueError as error:
+        raise ValueError(f"tasks.{name}.{axis}: {error}") from None
+
+
+def _text(value: Value | dict[str, Value]) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_text(each)}" for key, each in value.items())
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def contenders_of(study: Study, task: str) -> list[Contender]:
+    """Return the players of a task; hand-written ones of other tasks are left out.
+
+    Raises:
+        ValueError: in one line, a file that is not there.
+    """
+    return list(_contenders(study.players, task))
+
+
+def _contenders(players: Mapping[str, str], task: str) -> Iterator[Contender]:
+    for name, spec in players.items():
+        if spec in NAMES:
+            if not other_tasks(spec, task):
+                yield Contender(name, (Player(spec, name),))
+            continue
+        pattern = spec.replace(TASK_PLACE, task)
+        paths: Sequence[str] = sorted(glob.glob(pattern)) or [pattern]
+        if not Path(paths[0]).is_file():
+            if TASK_PLACE in spec:
+                continue  # a player of some tasks only
+            raise ValueError(f"players.{name}: {printable(pattern)}: no such file, and no player of that name")
+        yield Contender(name, tuple(Player(path, name) for path in paths))

@@ -1,0 +1,203 @@
+"""Results of a study: returns by setting and player, and who is ahead in each setting.
+
+The results of a task are one file, TASK.json, with the returns of every world; all that pages and pictures show is
+computed from it. Players are of four kinds: hand-written (`rules`), learned (`policy`), learned on top of rules
+(`hybrid`), and those that plan with the simulator (`planner`). A setting is won by a kind if the difference to every
+other kind has an interval above zero; otherwise it is level. If a kind has several players, the best one on the tuning
+worlds of the same setting stands for it, so that no choice is made on the worlds that are reported.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.study import HOME
+from flockenv.core.errors import nearest
+from flockenv.envs.disturbance import Disturbance
+from flockenv.evaluation import Interval, lead_interval, mean_interval, proportion
+from flockenv.players.policy import MlpPolicy, Policy, RandomPolicy
+
+__all__ = [
+    "GROUPS", "KINDS", "LEVEL", "RANDOM", "Score", "SettingResults", "TaskResults", "group_of", "kind_of", "read_file",
+    "read_task", "text_of",
+]  # fmt: skip
+
+KINDS = ("rules", "policy", "hybrid", "planner")
+LEVEL = "level"
+RANDOM = "random"
+
+SOLVER = ("dt", "integrator", "dtype")
+"""Arguments of a task that change how its motion is computed, not the task."""
+
+Floats = NDArray[np.float64]
+
+
+GROUPS = (HOME, "sensors and actions", "solver", "task")
+"""What is varied: nothing, what a player sees and how late it acts, how motion is computed, or the task itself."""
+
+
+def group_of(axis: str) -> str:
+    """Return the group of a setting by what is varied in it."""
+    if axis in Disturbance.model_fields:
+        return "sensors and actions"
+    return axis if axis == HOME else "solver" if axis in SOLVER else "task"
+
+
+def kind_of(policy: Policy) -> str:
+    """Return the kind of a player: that of a Python file is its `kind`, by default rules.
+
+    Raises:
+        ValueError: in one line, a kind that is not one of KINDS.
+    """
+    if isinstance(policy, RandomPolicy):
+        return RANDOM
+    if isinstance(policy, MlpPolicy):
+        return "hybrid" if (policy.card or {}).get("hybrid") else "policy"
+    kind = str(getattr(policy, "kind", "rules"))
+    if kind not in KINDS:
+        raise ValueError(f"player's kind = {kind!r}: unknown{nearest(kind, KINDS)}; allowed: {', '.join(KINDS)}")
+    return kind
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """A player in one setting: returns and successes (seeds, worlds), and its mean return on tuning worlds."""
+
+    kind: str
+    returns: Floats
+    success: NDArray[np.bool_]
+    tuning_mean: float
+
+    @functools.cached_property
+    def mean(self) -> Interval:
+        """The mean return with its interval over seeds and worlds."""
+        return mean_interval(self.returns)
+
+    @functools.cached_property
+    def success_rate(self) -> Interval:
+        """The share of successful worlds; of several seeds, with its interval over seeds and worlds."""
+        if len(self.success) == 1:
+            return proportion(self.success[0].astype(float))
+        return mean_interval(self.success.astype(float))
+
+
+@dataclass(frozen=True, eq=False)
+class SettingResults:
+    """One setting of a task with the scores of its players, and reasons why others cannot play it."""
+
+    axis: str
+    value: str
+    scores: Mapping[str, Score]
+    refused: Mapping[str, str]
+
+    @property
+    def name(self) -> str:
+        """Return "agents=4", or "home"."""
+        return f"{self.axis}={self.value}" if self.value else self.axis
+
+    @functools.cached_property
+    def leaders(self) -> dict[str, str]:
+        """The player that stands for each kind."""
+        found: dict[str, str] = {}
+        for kind in KINDS:
+            names = [name for name, score in self.scores.items() if score.kind == kind]
+            if names:
+                found[kind] = max(names, key=lambda name: self.scores[name].tuning_mean)
+        return found
+
+    @functools.cached_property
+    def leads(self) -> dict[str, Interval]:
+        """The mean return of the best kind minus that of each other kind, by kind, in the same worlds."""
+        ordered = sorted(self.leaders, key=lambda kind: -self.scores[self.leaders[kind]].mean.value)
+        best = self.scores[self.leaders[ordered[0]]]
+        return {kind: lead_interval(best.returns, self.scores[self.leaders[kind]].returns) for kind in ordered[1:]}
+
+    @property
+    def first(self) -> str:
+        """The kind with the highest mean return."""
+        return max(self.leaders, key=lambda kind: self.scores[self.leaders[kind]].mean.value)
+
+    @property
+    def winner(self) -> str:
+        """The kind that is ahead of every other, or "level"."""
+        return self.first if self.leads and all(lead.low > 0 for lead in self.leads.values()) else LEVEL
+
+    @property
+    def lead(self) -> Interval | None:
+        """The smallest lead of the best kind; None if there is one kind only."""
+        return min(self.leads.values(), key=lambda lead: lead.value, default=None)
+
+    def normalised(self, name: str) -> float:
+        """Return the mean return of a player on the scale 0 = random, 1 = tuned rules, in this setting."""
+        low, high = self.scores[RANDOM].mean.value, self.scores["rules"].mean.value
+        return (self.scores[name].mean.value - low) / (high - low)
+
+
+@dataclass(frozen=True, eq=False)
+class TaskResults:
+    """All settings of a task, home first."""
+
+    task: str
+    worlds: int
+    seed: int
+    home: Mapping[str, Any]  # the arguments that are varied, as they are at home
+    settings: tuple[SettingResults, ...]
+
+    @functools.cached_property
+    def groups(self) -> dict[str, list[SettingResults]]:
+        """Settings by what is varied, see GROUPS."""
+        groups: dict[str, list[SettingResults]] = {name: [] for name in GROUPS}
+        for each in self.settings:
+            groups[group_of(each.axis)].append(each)
+        return groups
+
+    @property
+    def axes(self) -> list[str]:
+        """What is varied, in order, without home."""
+        return list(dict.fromkeys(each.axis for each in self.settings[1:]))
+
+
+def read_task(content: Mapping[str, Any]) -> TaskResults:
+    """Return the results of a task from the content of its file."""
+    settings = [
+        SettingResults(
+            each["axis"], each["value"],
+            {name: _score(player) for name, player in each["players"].items() if "refused" not in player},
+            {name: player["refused"] for name, player in each["players"].items() if "refused" in player},
+        )
+        for each in content["settings"]
+    ]  # fmt: skip
+    return TaskResults(content["task"], content["worlds"], content["seed"], content["home"], tuple(settings))
+
+
+def _score(player: Mapping[str, Any]) -> Score:
+    success = np.array([[mark == "1" for mark in row] for row in player["success"]])
+    return Score(player["kind"], np.array(player["returns"], float), success, player["tuning_mean"])
+
+
+def text_of(content: Mapping[str, Any]) -> str:
+    """Return the content of a task's file as JSON with lists of numbers on one line each."""
+    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
+    return re.sub(r"\[\s+([-+.\deE,\s]*?)\s+\]", lambda m: f"[{' '.join(m[1].split())}]", text) + "\n"
+
+
+def read_file(path: Path) -> dict[str, Any] | None:
+    """Return the content of a task's file, or None if there is none; ValueError, in one line, if it is damaged."""
+    try:
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except ValueError as error:
+        raise ValueError(f"{path}: damaged: {error}; delete it, and the same command makes it anew") from None
+    if not isinstance(content, dict) or not content.keys() >= {"task", "worlds", "seed", "home", "settings"}:
+        raise ValueError(f"{path}: not the results of a task; delete it, and the same command makes it anew")
+    return content

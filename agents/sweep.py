@@ -1,0 +1,297 @@
+"""Players away from home: `python -m agents.sweep configs/studies/robustness.yaml` varies what a study names.
+
+All players play the same held-out worlds under each setting. Writes into a folder a file per task with every world's
+return (TASK.json), a map per task (TASK.png) and summary.png, and beside the folder a page. A setting whose results are
+in TASK.json is not played again if its settings, worlds and player are the same; an interrupted run continues.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+
+from agents.compare import JOBS, folder_of, pick, provenance, split, write_text
+from agents.play import Player, episodes_of_bytes, play_job
+from agents.study import Contender, Setting, Study, contenders_of, settings_of
+from agents.study_results import RANDOM, TaskResults, kind_of, read_file, read_task, text_of
+from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
+from flockenv.cli.terminal import job_bar, report_errors, run_program
+from flockenv.core.atomic_files import write_all_or_none
+from flockenv.core.errors import printable
+from flockenv.core.output_paths import valid_file
+from flockenv.jobs import Job, Store, Work, engine_of, run_jobs
+from flockenv.players.files import PlayerError
+from flockenv.scene.yaml_io import load, parse_scalar
+
+__all__ = ["app", "sweep"]
+
+SUMMARY = "summary.png"
+DIGITS = 6
+"""Significant digits of stored returns."""
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+
+Content = dict[str, Any]
+
+
+@dataclass
+class _Entry:
+    """One player in one setting: the jobs that make its results, or its results."""
+
+    setting: Setting
+    contender: Contender
+    kind: str
+    evaluation: Sequence[Job] = ()
+    tuning: Sequence[Job] = ()
+    content: Content = field(default_factory=dict)
+
+    @property
+    def digest(self) -> str:
+        """Return a digest of all that the returns depend on, besides code, versions and processor."""
+        text = json.dumps([job.about for job in self.evaluation], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def sweep(
+    study: Study,
+    tasks: Sequence[str],
+    work: Work,
+    before: Mapping[str, Content | None] = MappingProxyType({}),
+    changes: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
+) -> dict[str, Content]:
+    """Play all settings of tasks with all players; return the content of each task's file.
+
+    before: the contents of an earlier run, of which results are taken over. changes: arguments of tasks that hold in
+    every setting.
+
+    Raises:
+        ValueError: in one line, a bad setting or player, before anything is played.
+    """
+    entries = {
+        task: [
+            entry
+            for setting in settings_of(study, task, changes.get(task))
+            for entry in _entries(study, setting, contenders_of(study, task))
+        ]
+        for task in tasks
+    }
+    for task, of_task in entries.items():
+        known = {} if work.fresh else _known(before.get(task))
+        for entry in of_task:
+            entry.content = entry.content or _stored(known, entry)
+    waiting = [entry for of_task in entries.values() for entry in of_task if not entry.content]
+    run_jobs([job for entry in waiting for job in (*entry.evaluation, *entry.tuning)], work)
+    return {task: _content(study, of_task, work.store) for task, of_task in entries.items()}
+
+
+def _content(study: Study, entries: Sequence[_Entry], store: Store) -> Content:
+    """Return the content of a task's file, once all jobs are done."""
+    settings: dict[str, Content] = {}
+    for entry in entries:
+        about = {"axis": entry.setting.axis, "value": entry.setting.value, "players": {}}
+        setting = settings.setdefault(entry.setting.name, about)
+        setting["players"][entry.contender.name] = entry.content or _played(entry, store, _commit())
+    task = entries[0].setting.task
+    arguments = task.model_dump(mode="json")
+    home = {entry.setting.axis: arguments[entry.setting.axis] for entry in entries if entry.setting.axis in arguments}
+    head = {"task": task.name, "worlds": study.worlds, "seed": study.seed, "home": home}
+    return {**head, "settings": list(settings.values())}
+
+
+def _entries(study: Study, setting: Setting, contenders: Sequence[Contender]) -> list[_Entry]:
+    """Return the entries of a setting; a player that cannot play it has the reason as its content."""
+    found = []
+    for contender in contenders:
+        try:
+            policies = [member.policy(setting.task, study.seed) for member in contender.members]
+        except PlayerError as error:
+            found.append(_Entry(setting, contender, "", content={"refused": str(error)}))
+            continue
+        jobs = [_job(study, setting, member, "evaluation") for member in contender.members]
+        found.append(_Entry(setting, contender, kind_of(policies[0]), jobs))
+    kinds = [entry.kind for entry in found]
+    for entry in found:
+        if entry.kind not in ("", RANDOM) and kinds.count(entry.kind) > 1:
+            entry.tuning = [_job(study, setting, member, "tuning") for member in entry.contender.members]
+    return found
+
+
+def _job(study: Study, setting: Setting, player: Player, purpose: Any) -> Job:
+    kind = "sweep" if purpose == "evaluation" else "sweep-tuning"
+    return play_job(
+        kind, setting.task, player, study.worlds, study.seed, disturbance=setting.disturbance, purpose=purpose
+    )
+
+
+def _known(before: Content | None) -> dict[tuple[str, str], Content]:
+    """Return the stored results by player and digest."""
+    settings = before["settings"] if before else ()
+    return {
+        (name, player["digest"]): player
+        for setting in settings for name, player in setting["players"].items() if "digest" in player
+    }  # fmt: skip
+
+
+def _stored(known: Mapping[tuple[str, str], Content], entry: _Entry) -> Content:
+    content = known.get((entry.contender.name, entry.digest), {})
+    return {} if entry.tuning and content.get("tuning_mean") is None else content
+
+
+def _played(entry: _Entry, store: Store, commit: str | None) -> Content:
+    """Return the results of an entry from the records of its jobs."""
+    episodes = [store.read(job, episodes_of_bytes) for job in entry.evaluation]
+    tuning = [store.read(job, episodes_of_bytes) for job in entry.tuning]
+    return {
+        "kind": entry.kind,
+        "digest": entry.digest,
+        "commit": commit,
+        "microseconds": _rounded(float(np.median([each.microseconds for each in episodes]))),
+        "tuning_mean": _rounded(float(np.mean([each.returns.mean() for each in tuning]))) if tuning else None,
+        "success": ["".join("01"[int(mark)] for mark in each.success) for each in episodes],
+        "returns": [[_rounded(value) for value in each.returns] for each in episodes],
+    }
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{DIGITS}g}")
+
+
+@functools.cache
+def _commit() -> str | None:
+    """Return the commit of this checkout, with "+" if files have changed since."""
+    git = provenance()["git"]
+    return f"{git['commit'][:12]}{'+' * bool(git['changed'])}" if git["commit"] else None
+
+
+# --- the command line -------------------------------------------------------------------------------------------------
+
+
+@app.command()
+def main(
+    study: Annotated[Path, typer.Argument(metavar="STUDY.yaml", help="Such as configs/studies/robustness.yaml.")],
+    tasks: Annotated[list[str] | None, typer.Option(help="Tasks of the study, by comma or repeated. [all]")] = None,
+    changes: Annotated[
+        list[str] | None, typer.Option("--set", help="TASK.ARGUMENT=VALUE, in every setting of that task; repeatable.")
+    ] = None,
+    out: Annotated[
+        str, typer.Option(help="Folder for TASK.json, TASK.png, summary.png; the page is OUT.md.")
+    ] = "results/study",
+    check: Annotated[
+        int, typer.Option(min=0, help="Play this many results of --out again, drawn at random, and compare them.")
+    ] = 0,
+    engine: EngineName = "local",
+    processes: Processes = None,
+    fresh: Fresh = False,
+    shard: ShardText = None,
+    debug: Annotated[bool, typer.Option("--debug", help="Show a traceback if something goes wrong.")] = False,
+) -> None:
+    """Play all settings of a study with all players, and draw who is ahead where."""
+    with report_errors("sweep", STOPPED, debug), end_of_shard():
+        plan = load(study, Study)
+        names = pick("--tasks", split(tasks) or list(plan.tasks), plan.tasks)
+        fixed = _changes(changes or [], plan)
+        folder = folder_of(out, (SUMMARY, *(f"{name}.{end}" for name in names for end in ("json", "png"))))
+        page = valid_file(f"{folder}.md", (".md",), force=True)
+        for name in names:
+            settings_of(plan, name, fixed.get(name)), contenders_of(plan, name)
+        before = {name: read_file(folder / f"{name}.json") for name in plan.tasks}
+        runner, part = engine_of(engine, processes), shard_of(shard)
+        with job_bar() as progress:
+            work = Work(Store(folder / JOBS), runner, fresh or check > 0, progress, part)
+            if check:
+                raise typer.Exit(0 if _check(plan, before, check, work) else 1)
+            contents = sweep(plan, names, work, before, fixed)
+        _write(folder, contents)
+        found = {name: read_task(content) for name, content in {**before, **contents}.items() if content is not None}
+        _publish(page, plan, study, found)
+    for name in names:
+        typer.echo(f"{folder / name}.json, .png: written")
+    typer.echo(f"{page}: written")
+
+
+def _changes(texts: Sequence[str], study: Study) -> dict[str, dict[str, Any]]:
+    """Return the arguments of --set by task; ValueError, in one line, for a text that has none."""
+    found: dict[str, dict[str, Any]] = {}
+    for text in texts:
+        path, sign, value = text.partition("=")
+        task, dot, key = path.strip().partition(".")
+        if not sign or not dot:
+            raise ValueError(f"--set {printable(text)}: must be TASK.ARGUMENT=VALUE, such as crossing.agents=24")
+        pick("--set", [task], study.tasks)
+        found.setdefault(task, {})[key] = parse_scalar(value.strip())
+    return found
+
+
+def _write(folder: Path, contents: Mapping[str, Content]) -> None:
+    """Write the files of the tasks, all or none."""
+    texts = {name: text_of(content) for name, content in contents.items()}
+    write_all_or_none(folder, {
+        f"{name}.json": functools.partial(write_text, text=text) for name, text in texts.items()
+    })  # fmt: skip
+
+
+def _publish(page: Path, study: Study, path: Path, found: Mapping[str, TaskResults]) -> None:
+    """Write the page, and the pictures of all tasks that have results in the folder of the same name."""
+    from agents.study_chart import draw_map, draw_summary
+    from agents.study_report import markdown
+
+    folder = page.with_suffix("").name
+    writers: dict[str, Callable[[Path], None]] = {
+        f"{folder}/{name}.png": functools.partial(draw_map, results=results) for name, results in found.items()
+    }
+    writers[f"{folder}/{SUMMARY}"] = functools.partial(draw_summary, results=list(found.values()), title=study.title)
+    text = markdown(study, path, list(found.values()), folder)
+    writers[page.name] = lambda target: write_text(target, text)
+    write_all_or_none(page.parent, writers)
+
+
+def _check(study: Study, before: Mapping[str, Content | None], count: int, work: Work) -> bool:
+    """Play stored results again, drawn at random; print each, and return True if all returns are the same."""
+    stored = [
+        (task, setting, name, player)
+        for task, content in before.items() if content is not None
+        for setting in content["settings"] for name, player in setting["players"].items() if "returns" in player
+    ]  # fmt: skip
+    if not stored:
+        raise ValueError("--check: there are no results in --out")
+    console, same = Console(highlight=False, soft_wrap=True), True
+    for number in np.random.default_rng().permutation(len(stored))[:count]:
+        task, setting, name, player = stored[number]
+        again = _play_again(study, task, setting, name, work)
+        place = f"{task}, {setting['axis']} {setting['value']}, {name}".replace(" ,", ",")
+        if again is None or again["digest"] != player["digest"]:
+            console.print(f"{place}: cannot be made again: its settings or its player are others now")
+            same = False
+            continue
+        old, new = np.array(player["returns"]), np.array(again["returns"])
+        same &= bool((old == new).all())
+        means = f"mean return {new.mean():.4f}, stored {old.mean():.4f}"
+        console.print(f"{place}: {means}; {(old == new).sum()} of {old.size} worlds equal")
+    return same
+
+
+def _play_again(study: Study, task: str, setting: Content, name: str, work: Work) -> Content | None:
+    """Return the results of one player in one setting, made anew; None if the study does not have it."""
+    for each in settings_of(study, task):
+        if (each.axis, each.value) == (setting["axis"], setting["value"]):
+            chosen = [contender for contender in contenders_of(study, task) if contender.name == name]
+            for entry in _entries(study, each, chosen):
+                if entry.content:
+                    return None
+                run_jobs(entry.evaluation, work)
+                return _played(entry, work.store, _commit())
+    return None
+
+
+if __name__ == "__main__":
+    run_program("sweep", app, STOPPED)

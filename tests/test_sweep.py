@@ -1,0 +1,268 @@
+"""Studies away from home: settings, results, who is ahead, and the command."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from agents.study import HOME, Study, contenders_of, settings_of
+from agents.study_results import LEVEL, Score, SettingResults, kind_of, read_file, read_task, text_of
+from agents.sweep import app, sweep
+from flockenv.evaluation import bootstrap, lead_interval, mean_interval, worlds_for
+from flockenv.jobs import Store, Work
+from flockenv.jobs.local_engine import LocalEngine
+from flockenv.players import load_player
+from flockenv.scene.yaml_io import load
+from flockenv.tasks import TASKS, Pursuit
+
+STUDIES = sorted((Path(__file__).resolve().parent.parent / "configs" / "studies").glob("*.yaml"))
+PLAYERS = {"random": "random", "textbook": "textbook", "rules": "rules", "ppo": "ppo"}
+SMALL = {"players": PLAYERS, "worlds": 3, "everywhere": {"noise": (0.1,)}, "tasks": {"pursuit": {"size": (10,)}}}
+RNG = np.random.default_rng(0)
+
+
+def small(**changes: Any) -> Study:
+    return Study(title="small", **{**SMALL, **changes})
+
+
+def score(kind: str, mean: float, tuning: float = 0.0, seeds: int = 1) -> Score:
+    returns = mean + 0.1 * np.random.default_rng(1).normal(size=(seeds, 40))
+    return Score(kind, returns, returns > 0, tuning)
+
+
+# --- intervals --------------------------------------------------------------------------------------------------------
+
+
+def test_interval_of_one_seed_is_the_bootstrap_over_worlds() -> None:
+    returns = RNG.normal(size=200)
+    two, one = mean_interval(returns[None]), bootstrap(returns, "mean")
+    assert two.value == pytest.approx(one.value)
+    assert two.low == pytest.approx(one.low, abs=0.01)
+    assert two.high == pytest.approx(one.high, abs=0.01)
+
+
+def test_interval_contains_the_luck_of_training() -> None:
+    seeds = RNG.normal(size=10)
+    returns = seeds[:, None] + 0.01 * RNG.normal(size=(10, 300))
+    interval = mean_interval(returns)
+    half = 1.96 * seeds.std() / np.sqrt(10)
+    assert (interval.high - interval.low) / 2 == pytest.approx(half, rel=0.1)
+
+
+def test_lead_is_paired_by_worlds() -> None:
+    worlds = 100 * RNG.normal(size=50)
+    lead = lead_interval(worlds[None] + 1.0, worlds[None])
+    assert (lead.low, lead.value, lead.high) == pytest.approx((1.0, 1.0, 1.0))
+
+
+def test_lead_of_seeds_that_differ_more_than_the_lead_is_level() -> None:
+    worlds = RNG.normal(size=(1, 200))
+    first = worlds + np.array([[1.5], [-1.0], [0.2]])
+    lead = lead_interval(first, worlds)
+    assert lead.low < 0 < lead.value
+    assert lead_interval(first[:1], worlds).low > 0
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "text"),
+    [
+        (np.zeros(5), np.zeros((1, 5)), r"not \(5,\)"),
+        (np.zeros((1, 1)), np.zeros((1, 1)), "two worlds"),
+        (np.full((1, 5), np.nan), np.zeros((1, 5)), "finite"),
+        (np.zeros((1, 5)), np.zeros((1, 6)), "in 5 and in 6 worlds"),
+    ],
+)
+def test_bad_returns_are_refused(first: Any, second: Any, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        lead_interval(first, second)
+
+
+# --- who is ahead -----------------------------------------------------------------------------------------------------
+
+
+def test_level_unless_the_interval_of_every_lead_is_above_zero() -> None:
+    ahead = SettingResults("a", "1", {"rules": score("rules", 1.0), "ppo": score("policy", 2.0)}, {})
+    assert ahead.winner == "policy"
+    assert ahead.lead is not None and ahead.lead.value == pytest.approx(1.0)
+    third = {**ahead.scores, "residual": score("hybrid", 2.0)}
+    assert SettingResults("a", "1", third, {}).winner == LEVEL
+
+
+def test_the_player_of_a_kind_is_chosen_on_tuning_worlds() -> None:
+    scores = {"rules": score("rules", 1.0, 5.0), "orca": score("rules", 3.0, 4.0), "ppo": score("policy", 2.0)}
+    setting = SettingResults("a", "1", scores, {})
+    assert setting.leaders == {"rules": "rules", "policy": "ppo"}
+    assert setting.winner == "policy"
+
+
+def test_score_is_0_for_random_and_1_for_rules() -> None:
+    scores = {"random": score("random", -2.0), "rules": score("rules", 2.0), "ppo": score("policy", 3.0)}
+    setting = SettingResults("a", "1", scores, {})
+    assert [setting.normalised(name) for name in scores] == pytest.approx([0.0, 1.0, 1.25])
+    assert "random" not in setting.leaders
+
+
+def test_kinds_of_players() -> None:
+    kinds = [kind_of(load_player(name, Pursuit())) for name in ("random", "textbook", "rules", "ppo")]
+    assert kinds == ["random", "rules", "rules", "policy"]
+
+
+# --- settings ---------------------------------------------------------------------------------------------------------
+
+
+def test_each_setting_changes_one_thing() -> None:
+    study = small(tasks={"pursuit": {"size": (10, 20.0), "both": ({"size": 30, "pursuer_speed": 4},)}})
+    settings = settings_of(study, "pursuit", {"evader_speed": 2.0})
+    assert [each.name for each in settings] == ["home", "size=10", "both=size 30, pursuer_speed 4", "noise=0.1"]
+    tasks: list[Any] = [each.task for each in settings]
+    assert [task.size for task in tasks] == [20, 10, 30, 20]  # 20.0 is home
+    assert {task.evader_speed for task in tasks} == {2.0}
+    assert settings[-1].disturbance.noise == 0.1
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"tasks": {"pursit": {}}}, "tasks.pursit: unknown, did you mean `pursuit`?"),
+        ({"players": {"rules": "rules"}}, "players: needs 'random'"),
+        ({"players": {**PLAYERS, "a b": "ppo"}}, "a name is up to 40"),
+        ({"worlds": 1}, "worlds = 1"),
+    ],
+)
+def test_bad_studies_are_refused(changes: dict[str, Any], text: str) -> None:
+    with pytest.raises(ValueError, match="Study") as caught:
+        small(**changes)
+    assert text in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ({"sise": (10,)}, "tasks.pursuit.sise: unknown, did you mean `size`?"),
+        ({"size": (-1,)}, "tasks.pursuit.size: Pursuit: size = -1"),
+        ({"noise": (2.0,)}, "tasks.pursuit.noise: Disturbance: noise = 2"),
+    ],
+)
+def test_bad_settings_are_refused(values: dict[str, Any], text: str) -> None:
+    with pytest.raises(ValueError, match="tasks") as caught:
+        settings_of(small(tasks={"pursuit": values}), "pursuit")
+    assert text in str(caught.value)
+
+
+def test_files_of_players() -> None:
+    study = small(players={**PLAYERS, "mine": "nothing/here.py"})
+    with pytest.raises(ValueError, match=r"players\.mine: 'nothing/here\.py': no such file"):
+        contenders_of(study, "pursuit")
+    study = small(players={**PLAYERS, "queueing": "queueing", "seeds": "nothing/{task}-seed-*.safetensors"})
+    assert [each.name for each in contenders_of(study, "pursuit")] == list(PLAYERS)  # the others play other tasks
+
+
+@pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
+def test_shipped_studies_can_be_played(path: Path) -> None:
+    study = load(path, Study)
+    assert set(study.tasks) == set(TASKS)
+    for task in study.tasks:
+        settings = settings_of(study, task)
+        assert settings[0].axis == HOME
+        assert len({each.name for each in settings}) == len(settings)
+        assert {"random", "rules", "ppo"} <= {each.name for each in contenders_of(study, task)}
+
+
+# --- playing ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    return sweep(small(), ["pursuit"], Work(Store(tmp_path_factory.mktemp("jobs")), LocalEngine(1)))["pursuit"]
+
+
+class NoEngine:
+    """An engine that must not get a job."""
+
+    def run(self, jobs: Any, begun: Any) -> Any:
+        raise AssertionError(f"{len(list(jobs))} jobs run")
+
+
+def test_returns_are_those_of_the_held_out_worlds(played: dict[str, Any]) -> None:
+    results = read_task(json.loads(text_of(played)))
+    assert [each.axis for each in results.settings] == ["home", "size", "noise"]
+    assert results.home == {"size": 20}
+    home = results.settings[0].scores["ppo"]
+    from flockenv.evaluation import rollout
+
+    task = Pursuit()
+    episodes = rollout(task, load_player("ppo", task), 3, worlds_for("evaluation", 0, 3))
+    assert home.returns[0] == pytest.approx(episodes.returns, rel=1e-5)
+    assert (home.success[0] == episodes.success).all()
+    assert (results.settings[2].scores["ppo"].returns != home.returns).all()  # noise
+
+
+def test_stored_results_are_not_played_again(played: dict[str, Any], tmp_path: Path) -> None:
+    work = Work(Store(tmp_path), NoEngine())
+    assert sweep(small(), ["pursuit"], work, {"pursuit": played}) == {"pursuit": played}
+    with pytest.raises(
+        AssertionError, match="6 jobs"
+    ):  # the new setting: four players, and two of a kind on tuning worlds
+        sweep(small(tasks={"pursuit": {"size": (10, 11)}}, players=PLAYERS), ["pursuit"], work, {"pursuit": played})
+    with pytest.raises(AssertionError, match="jobs run"):
+        sweep(small(seed=1), ["pursuit"], work, {"pursuit": played})
+    with pytest.raises(AssertionError, match="jobs run"):
+        sweep(small(), ["pursuit"], replace(work, fresh=True), {"pursuit": played})
+
+
+def test_the_command_writes_and_checks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    plan = {**small().model_dump(mode="json"), "players": {"random": "random", "rules": "rules", "ppo": "ppo"}}
+    Path("study.yaml").write_text(json.dumps(plan))
+    run = CliRunner().invoke(app, ["study.yaml", "--out", "out", "--processes", "1"])
+    assert run.exit_code == 0, run.output
+    assert {path.name for path in Path("out").iterdir()} == {"jobs", "pursuit.json", "pursuit.png", "summary.png"}
+    page = Path("out.md").read_text()
+    assert "| size 10 |" in page and "| noise 0.1 |" in page
+    again = CliRunner().invoke(app, ["study.yaml", "--out", "out", "--check", "2", "--processes", "1"])
+    assert again.exit_code == 0, again.output
+    assert again.output.count("3 of 3 worlds equal") == 2
+    content = read_file(Path("out/pursuit.json"))
+    assert content is not None
+    for setting in content["settings"]:
+        for player in setting["players"].values():
+            player["returns"][0][0] += 1
+    Path("out/pursuit.json").write_text(text_of(content))
+    wrong = CliRunner().invoke(app, ["study.yaml", "--out", "out", "--check", "1", "--processes", "1"])
+    assert wrong.exit_code == 1
+    assert "2 of 3 worlds equal" in wrong.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["--tasks", "corsing"], "--tasks 'corsing': unknown"),
+        (["--set", "crossing"], "--set 'crossing': must be TASK.ARGUMENT=VALUE"),
+        (["--set", "crossing.agents=2"], "--set 'crossing': unknown"),
+        (["--set", "pursuit.agents=2"], "tasks.pursuit.agents: unknown"),
+        (["--check", "1"], "--check: there are no results in --out"),
+    ],
+)
+def test_bad_options_are_one_line(
+    arguments: list[str], text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("study.yaml").write_text(json.dumps(small().model_dump(mode="json")))
+    run = CliRunner().invoke(app, ["study.yaml", *arguments])
+    assert run.exit_code == 2
+    assert text in run.output and len(run.output.strip().splitlines()) == 1
+    assert not (tmp_path / "results").exists()
+
+
+def test_damaged_results_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "pursuit.json"
+    for text, reason in (("{", "damaged"), ("{}", "not the results of a task")):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=reason):
+            read_file(path)
