@@ -139,7 +139,7 @@ def rollout(
 
     Args:
         task: the task to play, for at most `task.horizon` control steps.
-        policy: receives only observations.
+        policy: receives only observations, unless it has a method `watch`, which is called with the world.
         worlds: B.
         seed: of the first world; `worlds_for("evaluation", s, B)` avoids the worlds for training and tuning.
         record: index of a world to record snapshots of; None: no recording.
@@ -156,6 +156,8 @@ def rollout(
         _check_integer("record", record, 0, worlds - 1)
     world = make_world(task, worlds, task.horizon)
     observation = world.reset(seed)
+    if hasattr(policy, "watch"):
+        policy.watch(world)
     latency = _latency(policy, observation[0, :1], deterministic)  # first: this compiles what is compiled on first use
     pilot, ledger = _Pilot(policy, deterministic), _Ledger(task, worlds)
     film = _Film(world, record)

@@ -6,8 +6,12 @@ A Python file offers one of these; if it offers several, the first counts:
 * a class `Player`, which is built with the task, or with nothing;
 * a function `predict`.
 
+The file may also say what its player is: `kind = "rules"` (hand-written, the default), "policy", "hybrid" or "planner".
+
 A player is an object with a method `predict`. Every `predict` takes SB3's four arguments (observation, state,
-episode_start, deterministic) and returns (actions, state), or takes the observations alone and returns actions.
+episode_start, deterministic) and returns (actions, state), or takes the observations alone and returns actions. If the
+player has a method `watch`, `flockenv.evaluation.rollout` calls it with its World before the first decision, so that a
+planner can see the state.
 """
 
 from __future__ import annotations
@@ -79,7 +83,7 @@ def _load_python(path: Path, task: Task) -> FilePlayer:
             f"player {printable_path(path)}: {kind} is {_describe_type(offered)}, not a function; {EXPECTED}"
         )
     if kind == "predict":
-        return FilePlayer(path, kind, offered, task.action_layout.size)
+        return FilePlayer(path, kind, offered, task.action_layout.size, _kind_of(module))
     arguments = (task,) if kind == "player" or _accepts(offered, 1) else ()
     if not _accepts(offered, len(arguments)):
         given = _describe_arguments(arguments)
@@ -88,7 +92,16 @@ def _load_python(path: Path, task: Task) -> FilePlayer:
     if isinstance(player, type) or not callable(getattr(player, "predict", None)):
         what = _describe_type(player)
         raise PlayerError(f"player {printable_path(path)}: {kind} made {what} without a predict(); {EXPECTED}")
-    return FilePlayer(path, f"{type(player).__name__}.predict", player.predict, task.action_layout.size)
+    name = f"{type(player).__name__}.predict"
+    found = FilePlayer(path, name, player.predict, task.action_layout.size, _kind_of(module))
+    if callable(getattr(player, "watch", None)):
+        found.watch = player.watch
+    return found
+
+
+def _kind_of(module: Any) -> str:
+    """Return what a player file says that its player is."""
+    return str(getattr(module, "kind", "rules"))
 
 
 def _execute(path: Path) -> Any:
@@ -114,7 +127,11 @@ class FilePlayer:
     error. So do actions of another shape, or that are not finite.
     """
 
-    def __init__(self, path: Path, name: str, function: Callable[..., Any], action_size: int) -> None:
+    def __init__(
+        self, path: Path, name: str, function: Callable[..., Any], action_size: int, kind: str = "rules"
+    ) -> None:
+        self.kind = kind
+        self.watch: Callable[[Any], None] = lambda world: None
         self.path, self._name, self._function, self._takes_all = path, name, function, _accepts(function, 4)
         self._action_size = action_size
         if not self._takes_all and not _accepts(function, 1):

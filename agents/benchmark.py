@@ -1,0 +1,165 @@
+"""One score for a player: `python -m agents.benchmark my_player.py` plays all tasks, at home and in other settings.
+
+The score is 0 for random actions and 1 for tuned rules (agents/scores.py). *Home* is over the tasks as configured,
+*robust* over all settings of a study. Random actions and tuned rules are taken from docs/study/ where they have played
+the same worlds, else they are played as well. Writes an entry, NAME.json, into a folder, and the table of all its
+entries beside it: docs/leaderboard/ and docs/leaderboard.md are made this way.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from agents.compare import JOBS, ROOT, folder_of, provenance, write_text
+from agents.play import NAME
+from agents.report import grid
+from agents.scores import THRESHOLDS, Aggregate, aggregate
+from agents.study import Study
+from agents.study_results import RANDOM, SettingResults, TaskResults, read_file, read_task
+from agents.sweep import sweep
+from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
+from flockenv.cli.terminal import job_bar, report_errors, run_program
+from flockenv.core.atomic_files import write_all_or_none
+from flockenv.core.errors import printable
+from flockenv.core.output_paths import valid_file
+from flockenv.evaluation import Interval
+from flockenv.jobs import Store, Work, engine_of
+from flockenv.players import NAMES
+from flockenv.scene.yaml_io import load
+
+__all__ = ["app", "entry_of", "table"]
+
+STUDY = ROOT / "configs" / "studies" / "robustness.yaml"
+REFERENCES = ROOT / "docs" / "study"
+"""Stored results of random actions and tuned rules."""
+
+LEAST = 0.5
+"""A player below this home score is marked: it does not solve the tasks."""
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+
+
+def entry_of(name: str, spec: str, tasks: Sequence[TaskResults], contents: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entry of a player as plain data: its scores, and what they were computed from."""
+    home = {results.task: results.settings[0] for results in tasks}
+    everywhere = {
+        f"{results.task}/{each.name}": each
+        for results in tasks for each in results.settings
+        if name in each.scores and _has_scale(each)
+    }  # fmt: skip
+    left_out = sum(len(results.settings) for results in tasks) - len(everywhere)
+    digests = {
+        task: [setting["players"][name].get("digest") for setting in content["settings"]]
+        for task, content in contents.items()
+    }
+    players = [setting["players"][name] for content in contents.values() for setting in content["settings"]]
+    known = [player["microseconds"] for player in players if "microseconds" in player]
+    return {
+        "player": name,
+        "spec": spec,
+        "kind": next(iter(home.values())).scores[name].kind,
+        "seeds": len(next(iter(home.values())).scores[name].returns),
+        "home": _plain(aggregate(home, name)),
+        "robust": _plain(aggregate(everywhere, name)),
+        "settings": len(everywhere),
+        "settings_left_out": left_out,
+        "microseconds_per_decision": sorted(known)[len(known) // 2] if known else None,
+        "worlds": digests,
+        **provenance(),
+    }
+
+
+def _has_scale(setting: SettingResults) -> bool:
+    """Return True if rules are better than random, so that a score has a scale."""
+    return setting.scores["rules"].mean.value > setting.scores[RANDOM].mean.value
+
+
+def _plain(found: Aggregate) -> dict[str, Any]:
+    return {
+        "score": _interval(found.score),
+        "profile": dict(zip(map(str, THRESHOLDS), found.profile, strict=True)),
+        "improvement": _interval(found.improvement),
+        "by_task": dict(found.by_task),
+    }
+
+
+def _interval(interval: Interval) -> list[float]:
+    return [round(value, 4) for value in (interval.value, interval.low, interval.high)]
+
+
+def table(entries: Sequence[Mapping[str, Any]]) -> str:
+    """Return the page of all entries, the best home score first, as Markdown."""
+    rows = []
+    for entry in sorted(entries, key=lambda each: -each["home"]["score"][0]):
+        marked = "" if entry["home"]["score"][0] >= LEAST else " (does not solve the tasks)"
+        cost = entry["microseconds_per_decision"]
+        rows.append(
+            [
+                f"`{entry['player']}`{marked}", entry["kind"], str(entry["seeds"]),
+                *(_text(entry[where]["score"]) for where in ("home", "robust")),
+                _text(entry["home"]["improvement"]), "–" if cost is None else f"{cost:.2g}",
+            ]
+        )  # fmt: skip
+    header = ["player", "kind", "seeds", "home", "robust", "higher than rules", "µs per decision"]
+    return "\n\n".join([TITLE, grid(header, rows), NOTES]) + "\n"
+
+
+TITLE = "# Leaderboard"
+NOTES = f"""\
+Score: 0 = random actions, 1 = tuned rules; interquartile mean over tasks (*home*), or over all settings of
+configs/studies/robustness.yaml (*robust*), with the 95 % stratified bootstrap interval over training seeds and worlds.
+*Higher than rules*: probability of a higher return than tuned rules in the same world. A player below {LEAST:g} does
+not solve the tasks. With one seed, the interval does not contain the luck of training. `python -m agents.benchmark
+PLAYER --out docs/leaderboard` adds an entry; its JSON file has the scores of each task, the performance profile, and
+digests of settings, worlds and player."""
+
+
+def _text(values: Sequence[float]) -> str:
+    value, low, high = values
+    return f"{value:.2f} [{low:.2f}, {high:.2f}]"
+
+
+@app.command()
+def main(
+    player: Annotated[str, typer.Argument(help="A known name, a .py, a .safetensors, or files with {task} and *.")],
+    name: Annotated[str | None, typer.Option(help="Name in the table. [the file's name]")] = None,
+    study: Annotated[Path, typer.Option(help="Settings to play.")] = STUDY,
+    out: Annotated[str, typer.Option(help="Folder of entries; the table is OUT.md.")] = "results/leaderboard",
+    engine: EngineName = "local",
+    processes: Processes = None,
+    fresh: Fresh = False,
+    shard: ShardText = None,
+    debug: Annotated[bool, typer.Option("--debug", help="Show a traceback if something goes wrong.")] = False,
+) -> None:
+    """Play all tasks and settings with a player, and write its scores."""
+    with report_errors("benchmark", STOPPED, debug), end_of_shard():
+        called = name or (player if player in NAMES else Path(player.replace("{task}", "").rstrip("*")).stem)
+        if not NAME.fullmatch(called) or (called in (RANDOM, "rules") and called != player):
+            raise ValueError(f"--name {printable(called)}: a name is up to 40 letters, digits and _ . + -")
+        plan = load(study, Study)
+        plan = plan.model_copy(update={"players": {RANDOM: RANDOM, "rules": "rules", called: player}})
+        folder = folder_of(out, (f"{called}.json",))
+        page = valid_file(f"{folder}.md", (".md",), force=True)
+        before = {task: read_file(REFERENCES / f"{task}.json") for task in plan.tasks}
+        with job_bar(lines=False) as progress:
+            work = Work(Store(folder / JOBS), engine_of(engine, processes), fresh, progress, shard_of(shard))
+            contents = sweep(plan, list(plan.tasks), work, before)
+        entry = entry_of(called, player, [read_task(content) for content in contents.values()], contents)
+        others = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*.json"))]
+        entries = [each for each in others if each["player"] != called] + [entry]
+        write_all_or_none(page.parent, {
+            f"{folder.name}/{called}.json": lambda path: write_text(path, json.dumps(entry, indent=1) + "\n"),
+            page.name: lambda path: write_text(path, table(entries)),
+        })  # fmt: skip
+    home, robust = (_text(entry[where]["score"]) for where in ("home", "robust"))
+    typer.echo(f"{called}: home {home}, robust {robust} (0 = random, 1 = tuned rules)")
+    typer.echo(f"{folder / called}.json and {page}: written")
+
+
+if __name__ == "__main__":
+    run_program("benchmark", app, STOPPED)

@@ -1,0 +1,1 @@
+"""Players that do nothing sensible: a benchmark that they pass measures nothing."""

@@ -1,0 +1,159 @@
+"""One score over tasks, and the benchmark of a player."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from agents import benchmark
+from agents.benchmark import app, table
+from agents.planners import mppi
+from agents.scores import aggregate
+from agents.study_results import Score, SettingResults, kind_of
+from flockenv.envs.world import World
+from flockenv.evaluation import rollout, worlds_for
+from flockenv.players import load_player
+from flockenv.tasks import Obstacles, Pursuit
+
+ROOT = Path(__file__).resolve().parent.parent
+TRIVIAL = sorted((ROOT / "agents" / "trivial").glob("[a-z]*.py"))
+
+
+def setting(player: np.ndarray, rules: float = 10.0, random: float = 0.0, worlds: int = 50) -> SettingResults:
+    """Return a setting in which the player has these scores, a row per seed."""
+    noise = np.random.default_rng(0).normal(size=worlds)
+    rows = {"mine": player, "rules": np.array([[rules]]), "random": np.array([[random]])}
+    kinds = {"mine": "policy", "rules": "rules", "random": "random"}
+    scores = {n: Score(kinds[n], row + noise, row + noise > 0, 0.0) for n, row in rows.items()}
+    return SettingResults("home", "", scores, {})
+
+
+def test_rules_have_score_1_and_random_0() -> None:
+    settings = {"a": setting(np.array([[10.0]])), "b": setting(np.array([[0.0]]))}
+    assert aggregate(settings, "rules").score.value == pytest.approx(1.0)
+    assert aggregate(settings, "random").score.value == pytest.approx(0.0)
+    assert aggregate(settings, "mine").by_task == pytest.approx({"a": 1.0, "b": 0.0})
+
+
+def test_the_scale_is_that_of_each_task() -> None:
+    settings = {"a": setting(np.array([[5.0]])), "b": setting(np.array([[-50.0]]), rules=0.0, random=-100.0)}
+    assert aggregate(settings, "mine").by_task == pytest.approx({"a": 0.5, "b": 0.5})
+
+
+def test_the_score_is_the_interquartile_mean_over_tasks_and_seeds() -> None:
+    settings = {"a": setting(np.array([[-900.0], [2.0]])), "b": setting(np.array([[4.0], [900.0]]))}
+    assert aggregate(settings, "mine").score.value == pytest.approx(0.3)
+    assert aggregate(settings, "mine").profile[:3] == pytest.approx((0.75, 0.75, 0.5))
+
+
+def test_the_interval_contains_the_luck_of_seeds() -> None:
+    seeds = np.random.default_rng(1).normal(5.0, 2.0, size=(10, 1))
+    settings = {name: setting(seeds) for name in "abcd"}
+    interval = aggregate(settings, "mine").score
+    assert 0.04 < interval.high - interval.low < 0.3
+    one = aggregate({name: setting(seeds[:1]) for name in "abcd"}, "mine").score
+    assert one.high - one.low < 1e-6  # one seed in paired worlds: no luck can be seen
+
+
+def test_improvement_counts_ties_half() -> None:
+    settings = {"a": setting(np.array([[10.0]])), "b": setting(np.array([[11.0]]))}
+    assert aggregate(settings, "mine").improvement.value == pytest.approx(0.75)
+
+
+def test_a_setting_without_a_scale_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"a: rules \(.*\) are not better than random"):
+        aggregate({"a": setting(np.array([[1.0]]), rules=-1.0)}, "mine")
+
+
+@pytest.fixture
+def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    players = {"random": "random", "rules": "rules"}
+    study = {"title": "small", "worlds": 8, "players": players, "tasks": {"pursuit": {"size": [10]}, "obstacles": {}}}
+    Path("study.yaml").write_text(json.dumps(study))
+    return tmp_path
+
+
+@pytest.mark.parametrize("path", TRIVIAL, ids=lambda path: path.stem)
+def test_trivial_players_fail(path: Path, small: Path) -> None:
+    run = CliRunner().invoke(app, [str(path), "--study", "study.yaml", "--out", "board", "--processes", "1"])
+    assert run.exit_code == 0, run.output
+    entry = json.loads(Path(f"board/{path.stem}.json").read_text())
+    assert entry["kind"] == "rules"
+    assert entry["home"]["score"][0] < benchmark.LEAST
+    assert entry["settings"] + entry["settings_left_out"] == 3
+    assert set(entry["home"]["by_task"]) == {"pursuit", "obstacles"}
+    assert "does not solve the tasks" in Path("board.md").read_text()
+
+
+def test_entries_are_ordered_by_score(small: Path) -> None:
+    for player in ("textbook", "ppo"):
+        run = CliRunner().invoke(app, [player, "--study", "study.yaml", "--out", "board", "--processes", "1"])
+        assert run.exit_code == 0, run.output
+    page = Path("board.md").read_text()
+    assert page.index("`ppo`") < page.index("`textbook`")
+    entries = [json.loads(path.read_text()) for path in Path("board").glob("*.json")]
+    assert table(entries) == page
+    assert {entry["player"]: entry["kind"] for entry in entries} == {"textbook": "rules", "ppo": "policy"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["nobody"], "players.nobody: 'nobody': no such file"),
+        (["ppo", "--name", "a b"], "--name 'a b': a name is"),
+        (["ppo", "--name", "rules"], "--name 'rules'"),
+    ],
+)
+def test_bad_options_are_one_line(arguments: list[str], text: str, small: Path) -> None:
+    run = CliRunner().invoke(app, [*arguments, "--study", "study.yaml"])
+    assert run.exit_code == 2
+    assert text in run.output and len(run.output.strip().splitlines()) == 1
+
+
+def test_a_file_says_its_kind(tmp_path: Path) -> None:
+    path = tmp_path / "mine.py"
+    text = "import numpy as np\ndef predict(observation):\n    return np.zeros((len(observation), 2))\n"
+    path.write_text(text)
+    assert kind_of(load_player(path, Pursuit())) == "rules"
+    path.write_text(f"kind = 'planner'\n{text}")
+    assert kind_of(load_player(path, Pursuit())) == "planner"
+    path.write_text(f"kind = 'plan'\n{text}")
+    with pytest.raises(ValueError, match="player's kind = 'plan': unknown, did you mean `planner`"):
+        kind_of(load_player(path, Pursuit()))
+
+
+# --- a player that plans ----------------------------------------------------------------------------------------------
+
+
+def test_a_planner_sees_the_worlds_that_it_plays_in() -> None:
+    task = Pursuit()
+    planner = load_player(ROOT / "agents" / "planners" / "mppi.py", task)
+    seed = worlds_for("tuning", 1, 4)
+    planned, random = (rollout(task, player, 4, seed) for player in (planner, load_player("random", task)))
+    assert planned.success.all()
+    assert planned.returns.mean() > random.returns.mean() + 15
+    again = rollout(task, load_player(ROOT / "agents" / "planners" / "mppi.py", task), 4, seed)
+    assert (again.returns == planned.returns).all()
+
+
+def test_copies_of_worlds_continue_as_the_worlds_do() -> None:
+    """With the same random numbers and the plan of the rules, a copy has the rewards that the world then gives."""
+    task = Obstacles()
+    world = World(task, 3)
+    rows = world.reset(7).reshape(3, -1)
+    planner: Any = mppi.player(task)
+    planner.watch(world)
+    planner.random = SimpleNamespace(integers=lambda most: 0)
+    plans = np.zeros((3, mppi.SAMPLES, *planner.shape))
+    expected = planner._play(plans, rows)[:, -1]
+    rewards = np.zeros((3, 1))
+    for k in range(mppi.HORIZON):
+        rewards += world.step(plans[:, -1, k].reshape(3, 1, -1)).reward
+    assert rewards == pytest.approx(expected, abs=1e-12)
