@@ -74,8 +74,38 @@ class PpoSettings(Record):
         exclude_if=lambda disturbance: not disturbance,  # so recipes without one stay equal to those from before
         description="noise, delay and dropped of the worlds for learning and for the curve, not of imitation",
     )
+    draw: dict[str, tuple[bool | int | float | str, ...]] = Field(
+        default_factory=dict,
+        exclude_if=lambda draw: not draw,
+        description="values of the task's arguments and of disturbances; all combinations are trained at once",
+    )
+    action: Literal["force", "residual", "gate"] = Field(
+        default="force",
+        exclude_if=lambda action: action == "force",
+        description="what the network decides: the force, an addition to the rules' force, or whose force it is",
+    )
+    base: str = Field(
+        default="rules", exclude_if=lambda base: base == "rules", description="hand-written player under the network"
+    )
+    bound: float = Field(
+        default=0.5,
+        gt=0,
+        le=2,
+        exclude_if=lambda bound: bound == 0.5,
+        description="largest residual, as a share of max_force",
+    )
     evaluate_every: int = Field(default=1_000_000, ge=1, description="agent-steps between points of the curve")
     evaluate_worlds: int = Field(default=256, ge=1, description="tuning worlds per point of the curve")
+
+    @model_validator(mode="after")
+    def _parts_fit(self) -> PpoSettings:
+        """Raise ValueError for settings that exclude each other."""
+        for name, value in (("care", self.care), ("central_critic", self.central_critic), ("taught", self.taught)):
+            if self.draw and value:
+                raise ValueError(f"draw: not together with {name}")
+            if self.action != "force" and value and name != "care":
+                raise ValueError(f"action = {self.action!r}: not together with {name}")
+        return self
 
 
 class SearchSettings(Record):

@@ -31,11 +31,12 @@ from agents.central_critic import CentralPolicy, CentralVecEnv
 from agents.checkpoint import CheckpointError, claim, path_in
 from agents.dagger import teach
 from agents.divergence import check_answers, check_model
+from agents.drawn import check_settings
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors, seeds_of
-from agents.learning_env import ForLearning
 from agents.run import Run, expected_bytes, load_checkpoint, recipe_of, save_checkpoint
 from agents.team_credit import CaringBuffer
 from agents.training import add_point, card_of, new_progress, score, use_thread_count
+from agents.training_env import learning_env
 from agents.training_state import capture, restore, surroundings
 from flockenv.cli.jobs import EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
 from flockenv.cli.terminal import DIVERGED, handle_interrupt, job_bar, run_program, show_progress
@@ -77,10 +78,7 @@ def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
     """
     require_room(f"to train, {IN_USE}", TRAINING)
     torch.manual_seed(p.seed)
-    learned = task.model_copy(update={"dtype": p.dtype})
-    shows = CentralVecEnv if p.central_critic else WorldVecEnv
-    envs = shows(learned, p.worlds, leaving=not task.ends_together, disturbance=p.disturbance)
-    worlds = ForLearning(envs, p.reward_scale, p.stagger, p.hold)
+    worlds = learning_env(task, p, CentralVecEnv if p.central_critic else WorldVecEnv)
     caring: dict[str, Any] = {}
     if p.care:
         caring["rollout_buffer_class"] = CaringBuffer
@@ -292,6 +290,9 @@ def main(
     tensorboard: Annotated[str | None, typer.Option(help="folder of TensorBoard logs")] = None,
     steps: Annotated[int | None, typer.Option(help="total agent-steps, instead of those of the config")] = None,
     seed: Annotated[int | None, typer.Option(help="training seed, instead of that of the config")] = None,
+    action: Annotated[
+        str | None, typer.Option(help="force, residual or gate, instead of the config's ppo.action")
+    ] = None,
     seeds: Annotated[
         str | None,
         typer.Option(help="several training seeds as jobs, 0-9 or 0,3; --out is then a folder [results/ppo]"),
@@ -304,9 +305,10 @@ def main(
     """Train a policy with PPO and export its weights."""
     with one_line_errors():
         experiment = load_experiment(config)
-        changes = {k: v for k, v in (("steps", steps), ("seed", seed)) if v is not None}
+        changes = {k: v for k, v in (("steps", steps), ("seed", seed), ("action", action)) if v is not None}
         experiment = experiment.model_copy(update={"ppo": PpoSettings(**{**experiment.ppo.model_dump(), **changes})})
         name = experiment.build().name
+        check_settings(experiment)
         if seeds is not None:
             if seed is not None or go_on or tensorboard is not None:
                 raise ValueError("--seeds: not together with --seed, --resume or --tensorboard; it resumes by itself")

@@ -60,7 +60,9 @@ Tensors = dict[str, np.ndarray]
 ONE = "default_policy"
 """RLlib's name of the only policy of a single-agent algorithm."""
 
-NO_EQUAL = {"hold": 1, "care": 0.0, "central_critic": False, "taught": 0, "critic_first": 0}
+NO_EQUAL: dict[str, Any] = {
+    "hold": 1, "care": 0.0, "central_critic": False, "taught": 0, "critic_first": 0, "draw": {}, "action": "force",
+}  # fmt: skip
 """Settings of which RLlib's PPO has no equal, with the value that it does have."""
 
 

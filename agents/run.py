@@ -16,6 +16,7 @@ from agents.checkpoint import CheckpointError, CheckpointParts
 from agents.experiment import Experiment
 from flockenv.core.errors import KeyPath, key_path, printable
 from flockenv.core.record import ResultRecord
+from flockenv.players.hybrid import FORCE, Hybrid
 from flockenv.players.policy import MlpPolicy
 from flockenv.players.rules import as_dict, player
 
@@ -37,6 +38,8 @@ def recipe_of(experiment: Experiment) -> dict[str, Any]:
     task, recipe = experiment.build(), experiment.model_dump(mode="json", include={"task", "arguments", "ppo"})
     if experiment.ppo.taught:
         recipe["rules"] = as_dict(player(task).rules)  # the policy that it imitated first
+    if experiment.ppo.action != FORCE:
+        recipe["hybrid"] = Hybrid.of(task, experiment.ppo.action, experiment.ppo.base, experiment.ppo.bound).card
     return {**recipe, "layout": task.layout.digest}
 
 

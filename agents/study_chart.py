@@ -1,4 +1,4 @@
-"""Pictures of a study: a map per task, of who is ahead in which setting and by how much, and all maps in small."""
+"""Pictures of a study: a map per task, of which kind of player is ahead and by how much, and all maps in small."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def draw_map(path: Path, results: TaskResults) -> None:
             lines = "\n".join(text for text in (each.value, _lead(each), _rates(each)) if text)
             axes.text(place + 0.5, at, lines, ha="center", va="center", fontsize=8, color=INK, linespacing=1.35)
     _legend(figure, results)
-    title = f"{results.task}: who is ahead, by what difference in return, and success"
+    title = f"{results.task}: which kind is ahead, by what difference in return, and success"
     figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold", color=INK)
     _save(figure, path)
 

@@ -28,7 +28,7 @@ def markdown(study: Study, path: Path, tasks: Sequence[TaskResults], folder: str
     parts = [
         f"# {study.title}",
         f"{_sentence(tasks)} Made by `python -m agents.sweep {path.as_posix()}`, {study.worlds} worlds per setting.",
-        f"![Who is ahead in which setting]({folder}/summary.png)",
+        f"![Which kind of player is ahead in which setting]({folder}/summary.png)",
         NOTES,
         "## Settings in which a kind of player is ahead",
         grid(*_counts(tasks)),
@@ -91,7 +91,7 @@ def score_text(setting: SettingResults, name: str) -> str:
 
 
 def winner_text(setting: SettingResults) -> str:
-    """Return who is ahead, and by how much."""
+    """Return which kind is ahead, and by how much."""
     lead = setting.lead
     if lead is None:
         return setting.first

@@ -1,4 +1,4 @@
-"""Results of a study: returns by setting and player, and who is ahead in each setting.
+"""Results of a study: returns by setting and player, and which kind is ahead in each setting.
 
 The results of a task are one file, TASK.json, with the returns of every world; all that pages and pictures show is
 computed from it. Players are of four kinds: hand-written (`rules`), learned (`policy`), learned on top of rules
@@ -128,8 +128,8 @@ class SettingResults:
 
     @property
     def winner(self) -> str:
-        """The kind that is ahead of every other, or "level"."""
-        return self.first if self.leads and all(lead.low > 0 for lead in self.leads.values()) else LEVEL
+        """The kind that is ahead of every other, or the only one that can play; else "level"."""
+        return self.first if all(lead.low > 0 for lead in self.leads.values()) else LEVEL
 
     @property
     def lead(self) -> Interval | None:

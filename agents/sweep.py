@@ -30,7 +30,6 @@ from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import printable
 from flockenv.core.output_paths import valid_file
 from flockenv.jobs import Job, Store, Work, engine_of, run_jobs
-from flockenv.players.files import PlayerError
 from flockenv.scene.yaml_io import load, parse_scalar
 
 __all__ = ["app", "sweep"]
@@ -114,7 +113,7 @@ def _entries(study: Study, setting: Setting, contenders: Sequence[Contender]) ->
     for contender in contenders:
         try:
             policies = [member.policy(setting.task, study.seed) for member in contender.members]
-        except PlayerError as error:
+        except ValueError as error:
             found.append(_Entry(setting, contender, "", content={"refused": str(error)}))
             continue
         jobs = [_job(study, setting, member, "evaluation") for member in contender.members]
@@ -195,7 +194,7 @@ def main(
     shard: ShardText = None,
     debug: Annotated[bool, typer.Option("--debug", help="Show a traceback if something goes wrong.")] = False,
 ) -> None:
-    """Play all settings of a study with all players, and draw who is ahead where."""
+    """Play all settings of a study with all players, and draw which kind is ahead where."""
     with report_errors("sweep", STOPPED, debug), end_of_shard():
         plan = load(study, Study)
         names = pick("--tasks", split(tasks) or list(plan.tasks), plan.tasks)

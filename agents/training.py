@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import os
 import platform
 from collections.abc import Iterator
@@ -15,12 +14,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from agents.divergence import LearningDiverged
+from agents.drawn import played_returns
 from agents.experiment import PpoSettings
 from agents.run import Run
-from flockenv.envs.disturbance import make_world
-from flockenv.evaluation import rollout, worlds_for
 from flockenv.jit.thread_pool import threads, use_threads
-from flockenv.players.policy import MlpPolicy, describe
+from flockenv.players.policy import describe
 from flockenv.tasks import TASKS, Task
 
 __all__ = ["add_point", "card_of", "new_progress", "score", "use_thread_count"]
@@ -45,14 +43,12 @@ def score(task: Task, p: PpoSettings, tensors: dict[str, np.ndarray]) -> tuple[f
     Raises:
         LearningDiverged: an action of the policy, or a reward, is not finite.
     """
-    policy, first = MlpPolicy(tensors, {"activation": p.activation}), worlds_for("tuning", p.seed, p.evaluate_worlds)
-    make = functools.partial(make_world, disturbance=p.disturbance)
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # a result that is not finite raises an error
-            episodes = rollout(task, policy, p.evaluate_worlds, first, make_world=make)
+            returns, success = played_returns(task, p, tensors)
     except ValueError as error:  # the message names the world
         raise LearningDiverged(f"on the tuning worlds: {error}") from error
-    return float(np.mean(episodes.returns)), float(np.mean(episodes.success))
+    return float(np.mean(returns)), float(np.mean(success))
 
 
 def add_point(run: Run, tensors: dict[str, np.ndarray], scored: tuple[float, float]) -> tuple[str, str]:
@@ -83,7 +79,7 @@ def card_of(run: Run, library: str = "stable-baselines3", command: str = "agents
     recipe = run.recipe
     return {
         **describe(TASKS[recipe["task"]](**recipe["arguments"])),
-        **({"rules": recipe["rules"]} if "rules" in recipe else {}),
+        **{name: recipe[name] for name in ("rules", "hybrid") if name in recipe},
         "activation": recipe["ppo"]["activation"],
         "algorithm": f"PPO ({library})",
         "recipe": {"command": f"python -m {command} configs/training/{recipe['task']}.yaml", "ppo": recipe["ppo"]},

@@ -49,8 +49,12 @@ def capture(model: PPO) -> CheckpointParts:
             for index, moments in model.policy.optimizer.state_dict()["state"].items()
             for name in MOMENTS
         },
-        "worlds": {name: array.copy() for name, array in _world(model).arrays().items()},
-        "rollout": {"observation": model._last_obs.copy(), "starts": model._last_episode_starts.astype(np.bool_)},
+        "worlds": {name: array.copy() for name, array in _arrays(model).items()},
+        "rollout": {
+            "observation": model._last_obs.copy(),
+            "starts": model._last_episode_starts.astype(np.bool_),
+            **{f"memory.{k}": array.copy() for k, array in enumerate(_memory(model))},
+        },
         "random": {"torch": torch.get_rng_state().numpy().copy(), **json_part(_generators(model))},
     }
 
@@ -67,7 +71,7 @@ def restore(model: PPO, parts: CheckpointParts, steps: int, folder: Path) -> Non
     fresh = capture(model)
     fresh["optimizer"] = _optimizer_like(model, parts.get("optimizer", {}))
     for part, wanted in fresh.items():
-        finite = POSITIONS if part == "worlds" else tuple(wanted)
+        finite = tuple(name for name in wanted if part != "worlds" or name.endswith(POSITIONS))
         if fault := _fault(parts.get(part, {}), wanted, finite):
             raise Damaged(folder, f"{part}: {fault}")
     try:
@@ -77,10 +81,24 @@ def restore(model: PPO, parts: CheckpointParts, steps: int, folder: Path) -> Non
     model.num_timesteps = steps
 
 
-def _world(model: PPO) -> World:
-    assert model.env is not None
-    world: World = model.env.get_attr("world", 0)[0]
-    return world
+def _worlds(model: PPO) -> list[World]:
+    """Return the worlds of a training: one, or one for each drawn setting."""
+    env: Any = model.env
+    return list(env.worlds) if hasattr(env, "worlds") else [env.get_attr("world", 0)[0]]
+
+
+def _memory(model: PPO) -> list[NDArray[Any]]:
+    """Return what the rules of a hybrid remember."""
+    env: Any = model.env
+    return list(env.memory()) if hasattr(env, "go_on") else []
+
+
+def _arrays(model: PPO) -> Tensors:
+    """Return the arrays of all worlds by name; those of second and later ones with a number before."""
+    return {
+        f"{k}.{name}" if k else name: array
+        for k, world in enumerate(_worlds(model)) for name, array in world.arrays().items()
+    }  # fmt: skip
 
 
 def _copy_of(tensor: torch.Tensor) -> NDArray[Any]:
@@ -117,8 +135,14 @@ def _write_into(model: PPO, parts: CheckpointParts) -> None:
     indices = sorted({int(name.split(".")[0]) for name in moments})
     state = {k: {name: torch.from_numpy(moments[f"{k}.{name}"].copy()) for name in MOMENTS} for k in indices}
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
-    _world(model).restore(parts["worlds"])
-    model._last_obs, model._last_episode_starts = parts["rollout"]["observation"], parts["rollout"]["starts"]
+    for k, world in enumerate(_worlds(model)):
+        world.restore({name: parts["worlds"][f"{k}.{name}" if k else name] for name in world.arrays()})
+    rollout = parts["rollout"]
+    model._last_obs, model._last_episode_starts = rollout["observation"], rollout["starts"]
+    env: Any = model.env
+    if hasattr(env, "go_on"):
+        memory = [rollout[f"memory.{k}"] for k in range(len(_memory(model)))]
+        env.go_on(rollout["observation"], rollout["starts"], memory)
     _seed_generators(model, json.loads(parts["random"][JSON].tobytes()))
     torch.set_rng_state(torch.from_numpy(parts["random"]["torch"]))
 

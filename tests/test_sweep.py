@@ -1,4 +1,4 @@
-"""Studies away from home: settings, results, who is ahead, and the command."""
+"""Studies away from home: settings, results, which kind is ahead, and the command."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_bad_returns_are_refused(first: Any, second: Any, text: str) -> None:
         lead_interval(first, second)
 
 
-# --- who is ahead -----------------------------------------------------------------------------------------------------
+# --- which kind is ahead ----------------------------------------------------------------------------------------------
 
 
 def test_level_unless_the_interval_of_every_lead_is_above_zero() -> None:
@@ -180,6 +180,15 @@ def test_shipped_studies_can_be_played(path: Path) -> None:
 @pytest.fixture(scope="module")
 def played(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return sweep(small(), ["pursuit"], Work(Store(tmp_path_factory.mktemp("jobs")), LocalEngine(1)))["pursuit"]
+
+
+def test_a_player_that_cannot_read_a_setting_is_left_out_of_it(tmp_path: Path) -> None:
+    study = small(tasks={"evade": {"pursuers": (1,)}}, everywhere={})
+    results = read_task(sweep(study, ["evade"], Work(Store(tmp_path), LocalEngine(1)))["evade"])
+    assert [each.name for each in results.settings] == ["home", "pursuers=1"]
+    assert "ppo" in results.settings[0].scores and "ppo" not in results.settings[1].scores
+    assert "made for observation 'pursuers'" in results.settings[1].refused["ppo"]
+    assert results.settings[1].winner == results.settings[1].first == "rules"
 
 
 class NoEngine:

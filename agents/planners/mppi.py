@@ -5,7 +5,7 @@ tuned rules, for HORIZON decisions; the new plan is the mean of their actions, w
 for each learner by its own return. Its first action is done, the rest is the plan of the next decision. Source:
 model predictive path integral control, Williams et al. 2017, ICRA, 1714 (information-theoretic MPC).
 
-It is told for what it is: it sees the whole state and knows the task's laws and rewards exactly, it thinks a thousand
+It is no fair opponent: it sees the whole state and knows the task's laws and rewards exactly, it thinks a thousand
 times longer than rules or a policy, and sensor noise does not reach it. What it does not know is chance: random numbers
 of its copies are others than those of the world. So it shows how much more is possible in a task.
 """

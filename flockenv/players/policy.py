@@ -142,7 +142,7 @@ class MlpPolicy:
         path = Path(path)
         try:
             card = _read_card(path.with_suffix(".json"))
-            policy = cls(_read_tensors(path, card), card, seed)
+            policy = cls._of_card(_read_tensors(path, card), card, task, seed)
             _check_sizes(policy)
             policy.differences = () if task is None else _differences(card, task)
         except ValueError as error:
@@ -152,6 +152,17 @@ class MlpPolicy:
             text = "; ".join([*differences, *([f"and {more} more"] if more > 0 else [])])
             warnings.warn(f"policy {printable_path(path)}: {text}", OtherTaskWarning, stacklevel=2)
         return policy
+
+    @classmethod
+    def _of_card(
+        cls, tensors: Mapping[str, NDArray[Any]], card: Mapping[str, Any], task: Task | None, seed: int | None
+    ) -> MlpPolicy:
+        """Return the policy of a card, which may be a hybrid of a network and rules."""
+        if "hybrid" not in card:
+            return cls(tensors, card, seed)
+        from flockenv.players.hybrid import HybridPolicy  # a layer above this file
+
+        return HybridPolicy.of(tensors, card, task, seed)
 
     def predict(
         self,

@@ -1,0 +1,102 @@
+"""Settings of a training: combinations of drawn values, and how the outputs of the network act.
+
+`ppo.draw: {agents: [4, 8, 16, 32], noise: [0, 0.05]}` trains in all eight combinations; each has an equal share of the
+worlds. Domain randomisation: Tobin et al. 2017, arXiv 1703.06907. The rows must have the same slots in every setting.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.experiment import Experiment, PpoSettings
+from flockenv.core.errors import key_path, nearest
+from flockenv.envs.disturbance import Disturbance, make_world
+from flockenv.evaluation import rollout, worlds_for
+from flockenv.players.hybrid import FORCE, Hybrid, HybridPolicy
+from flockenv.players.policy import MlpPolicy
+from flockenv.tasks import Task
+
+__all__ = ["MOST_SETTINGS", "Drawn", "check_settings", "drawn_settings", "hybrid_of", "played_returns"]
+
+MOST_SETTINGS = 64
+"""Combinations of drawn values."""
+
+Drawn = tuple[str, Task, Disturbance]
+"""A setting of a training: its text, the task, and the disturbance."""
+
+
+def drawn_settings(task: Task, disturbance: Disturbance, draw: Mapping[str, Sequence[Any]]) -> list[Drawn]:
+    """Return every combination of drawn values; without any, the setting itself.
+
+    Raises:
+        ValueError: in one line, an unknown name, a value that the task does not accept, observations with other slots,
+            or too many combinations.
+    """
+    known = [*type(task).model_fields, *Disturbance.model_fields]
+    for name, values in draw.items():
+        if name not in known:
+            raise ValueError(f"{key_path(('ppo', 'draw', name))}: unknown{nearest(name, known)}")
+        if not values:
+            raise ValueError(f"ppo.draw.{name}: must have at least one value")
+    combinations = list(itertools.product(*draw.values()))
+    if len(combinations) > MOST_SETTINGS:
+        raise ValueError(f"ppo.draw: {len(combinations)} combinations, at most {MOST_SETTINGS} are allowed")
+    return [_drawn(task, disturbance, dict(zip(draw, values, strict=True))) for values in combinations]
+
+
+def _drawn(task: Task, disturbance: Disturbance, values: Mapping[str, Any]) -> Drawn:
+    text = ", ".join(f"{name} {value}" for name, value in values.items())
+    of_task = {name: value for name, value in values.items() if name not in Disturbance.model_fields}
+    others = {name: value for name, value in values.items() if name in Disturbance.model_fields}
+    try:
+        new = type(task)(**{**task.model_dump(exclude_unset=True, exclude={"scene"}), **of_task}) if of_task else task
+        disturbed = Disturbance(**{**disturbance.model_dump(), **others})
+        disturbed.check(new)
+    except ValueError as error:
+        raise ValueError(f"ppo.draw ({text}): {error}") from None
+    sizes = [(slot.name, slot.shape) for slot in task.layout.slots], [(s.name, s.shape) for s in new.layout.slots]
+    if sizes[0] != sizes[1]:
+        raise ValueError(f"ppo.draw ({text}): observations have other slots than with the task's own arguments")
+    return text, new, disturbed
+
+
+def hybrid_of(task: Task, p: PpoSettings) -> Hybrid | None:
+    """Return how the outputs of the network act, or None if they are the action."""
+    return None if p.action == FORCE else Hybrid.of(task, p.action, p.base, p.bound)
+
+
+def check_settings(experiment: Experiment) -> None:
+    """Raise ValueError, in one line, for settings that cannot be trained."""
+    task, p = experiment.build(), experiment.ppo
+    hybrid_of(task, p)
+    count = len(drawn_settings(task, p.disturbance, p.draw))
+    if count > min(p.worlds, p.evaluate_worlds):
+        raise ValueError(f"ppo.draw: {count} combinations need as many ppo.worlds and ppo.evaluate_worlds at least")
+
+
+def played_returns(
+    task: Task, p: PpoSettings, tensors: Mapping[str, NDArray[Any]]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return returns and successes of a policy, without noise, on the tuning worlds: equal shares of drawn settings."""
+    settings, returns, success = drawn_settings(task, p.disturbance, p.draw), [], []
+    worlds = p.evaluate_worlds // len(settings)
+    for _, drawn, disturbance in settings:
+        make = functools.partial(make_world, disturbance=disturbance)
+        policy, first = _policy(drawn, p, tensors), worlds_for("tuning", p.seed, worlds)
+        episodes = rollout(drawn, policy, worlds, first, make_world=make)
+        returns.append(episodes.returns)
+        success.append(episodes.success)
+    return np.concatenate(returns), np.concatenate(success)
+
+
+def _policy(task: Task, p: PpoSettings, tensors: Mapping[str, NDArray[Any]]) -> MlpPolicy:
+    card: dict[str, Any] = {"activation": p.activation}
+    if (hybrid := hybrid_of(task, p)) is None:
+        return MlpPolicy(tensors, card)
+    return HybridPolicy.of(tensors, {**card, "hybrid": hybrid.card}, task)

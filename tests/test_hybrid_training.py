@@ -1,0 +1,160 @@
+"""Training of hybrids, and in several drawn settings at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agents.drawn import check_settings, drawn_settings, hybrid_of
+from agents.drawn_env import DrawnVecEnv
+from agents.experiment import Experiment, PpoSettings
+from agents.ppo import export, train
+from agents.run import recipe_of
+from agents.training import card_of, score
+from agents.training_env import learning_env
+from flockenv.envs.disturbance import Disturbance
+from flockenv.envs.sb3 import WorldVecEnv
+from flockenv.evaluation import rollout, worlds_for
+from flockenv.players import load_player
+from flockenv.players.hybrid import HybridPolicy
+from flockenv.tasks import Crossing, Pursuit
+from tests.training import TINY, interrupt
+
+SMALL_SCHOOL = {"fish": 3, "patches": 2, "horizon": 20}
+
+
+def experiment(task: str = "pursuit", arguments: dict[str, Any] | None = None, **ppo: Any) -> Experiment:
+    return Experiment(task=task, arguments=arguments or {}, ppo={**TINY, "steps": 1024, "stagger": True, **ppo})
+
+
+# --- drawn settings ---------------------------------------------------------------------------------------------------
+
+
+def test_all_combinations_are_drawn() -> None:
+    found = drawn_settings(Crossing(), Disturbance(delay=1), {"agents": [4, 8], "noise": [0, 0.1]})
+    assert [name for name, _, _ in found] == [
+        "agents 4, noise 0", "agents 4, noise 0.1", "agents 8, noise 0", "agents 8, noise 0.1",
+    ]  # fmt: skip
+    assert [task.learners for _, task, _ in found] == [4, 4, 8, 8]
+    assert [(each.noise, each.delay) for _, _, each in found] == [(0, 1), (0.1, 1)] * 2
+
+
+@pytest.mark.parametrize(
+    ("draw", "text"),
+    [
+        ({"agnts": (4,)}, "ppo.draw.agnts: unknown, did you mean `agents`?"),
+        ({"agents": ()}, "ppo.draw.agents: must have at least one value"),
+        ({"agents": (0,)}, "ppo.draw (agents 0): Crossing: agents = 0"),
+        ({"noise": (2.0,)}, "ppo.draw (noise 2.0): Disturbance: noise = 2"),
+        ({"neighbours": (2,)}, "ppo.draw (neighbours 2): observations have other slots"),
+        ({"agents": tuple(range(2, 70))}, "ppo.draw: 68 combinations, at most 64"),
+        ({"agents": (2, 3, 4, 5, 6)}, "ppo.draw: 5 combinations need as many ppo.worlds"),
+    ],
+)
+def test_bad_draws_are_refused(draw: dict[str, Any], text: str) -> None:
+    with pytest.raises(ValueError, match="draw") as caught:
+        check_settings(experiment("crossing", draw=draw))
+    assert text in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"draw": {"agents": (4,)}, "care": 1.0}, "draw: not together with care"),
+        ({"draw": {"agents": (4,)}, "taught": 1}, "draw: not together with taught"),
+        ({"action": "residual", "central_critic": True}, "action = 'residual': not together with central_critic"),
+        ({"action": "residul"}, "action = 'residul'"),
+        ({"bound": 0.0}, "bound = 0"),
+    ],
+)
+def test_settings_that_exclude_each_other_are_refused(changes: dict[str, Any], text: str) -> None:
+    with pytest.raises(ValueError, match="PpoSettings") as caught:
+        PpoSettings(**changes)
+    assert text in str(caught.value)
+
+
+def test_a_base_that_the_task_does_not_have_is_refused() -> None:
+    with pytest.raises(ValueError, match="no hand-written player 'queueing' for 'pursuit'"):
+        check_settings(experiment(action="residual", base="queueing"))
+
+
+def test_rows_of_drawn_settings_are_those_of_their_own_worlds() -> None:
+    p = PpoSettings(**{**TINY, "worlds": 6, "reward_scale": 1.0, "dtype": "float64", "draw": {"agents": (2, 5)}})
+    env = learning_env(Crossing(), p)
+    assert isinstance(env, DrawnVecEnv) and env.num_envs == 3 * 2 + 3 * 5
+    alone = [WorldVecEnv(Crossing(agents=count), 3) for count in (2, 5)]
+    for each in (env, *alone):
+        each.seed(5)
+    rows = env.reset()
+    assert (rows == np.concatenate([each.reset() for each in alone])).all()
+    actions = np.random.default_rng(0).uniform(-1, 1, (21, 2))
+    for _ in range(3):
+        rows, rewards, dones, infos = env.step(actions)
+        parts = [each.step(part) for each, part in zip(alone, np.split(actions, [6]), strict=True)]
+        assert (rows == np.concatenate([part[0] for part in parts])).all()
+        assert rewards == pytest.approx(np.concatenate([part[1] for part in parts]))
+        assert (dones == np.concatenate([part[2] for part in parts])).all() and len(infos) == 21
+
+
+# --- recipes ----------------------------------------------------------------------------------------------------------
+
+
+def test_recipes_without_the_new_settings_are_as_before() -> None:
+    assert not {"draw", "action", "base", "bound", "hybrid"} & recipe_of(experiment())["ppo"].keys()
+    recipe = recipe_of(experiment(action="residual", bound=0.3))
+    assert recipe["hybrid"]["kind"] == "residual" and recipe["ppo"]["bound"] == 0.3
+
+
+# --- training ---------------------------------------------------------------------------------------------------------
+
+CASES = {
+    "residual": experiment(action="residual"),
+    "gate": experiment(action="gate"),
+    "drawn": experiment("crossing", draw={"agents": (2, 3), "noise": (0.0, 0.1)}, hold=2),
+    "drawn-residual": experiment("crossing", draw={"agents": (2, 3)}, action="residual", base="orca"),
+    "school-residual": experiment("school", SMALL_SCHOOL, action="residual", draw={"noise": (0.0, 0.1)}, worlds=4),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_resumed_training_equals_the_uninterrupted_one(case: str, tmp_path: Path) -> None:
+    whole = train(CASES[case], tmp_path / "whole")
+    interrupt(CASES[case], tmp_path / "parts")
+    resumed = train(CASES[case], tmp_path / "parts", go_on=True)
+    assert resumed.tensors.keys() == whole.tensors.keys()
+    for name, tensor in whole.tensors.items():
+        assert (resumed.tensors[name] == tensor).all(), name
+    assert [point["mean"] for point in resumed.curve] == [point["mean"] for point in whole.curve]
+
+
+@pytest.mark.parametrize("case", ["residual", "gate", "drawn-residual"])
+def test_an_exported_hybrid_plays_as_in_training(case: str, tmp_path: Path) -> None:
+    each = CASES[case]
+    run = train(each, tmp_path)
+    export(run, tmp_path / "mine.safetensors")
+    task = each.build()
+    policy = load_player(tmp_path / "mine.safetensors", task)
+    assert isinstance(policy, HybridPolicy) and policy.hybrid == hybrid_of(task, each.ppo)
+    assert card_of(run)["hybrid"] == policy.hybrid.card
+    home = PpoSettings(**{**each.ppo.model_dump(), "draw": {}})
+    env = learning_env(task, PpoSettings(**{**home.model_dump(), "dtype": "float64", "stagger": False}))
+    env.seed(0)
+    rows = np.asarray(env.reset())
+    outputs = super(HybridPolicy, policy).predict(rows, deterministic=True)[0]
+    expected, _ = policy.predict(rows, None, np.ones(len(rows), np.bool_), True)
+    given: list[np.ndarray] = []
+    monkey: Any = env
+    monkey.venv.step_async = given.append
+    env.step_async(outputs)
+    assert (given[0] == expected).all()
+    assert score(task, home, run.tensors)[0] == pytest.approx(score(task, home, run.tensors)[0])
+
+
+def test_an_untrained_residual_is_near_its_rules(tmp_path: Path) -> None:
+    each = experiment("pursuit", action="residual", steps=16, evaluate_worlds=16)
+    start = train(each, tmp_path).curve[0]["mean"]
+    rules = rollout(Pursuit(), load_player("rules", Pursuit()), 16, worlds_for("tuning", 0, 16)).returns.mean()
+    assert start == pytest.approx(rules, abs=0.5)
