@@ -17,7 +17,9 @@ Every value changes one thing: all else is as in configs/training/TASK.yaml, whi
 from __future__ import annotations
 
 import glob
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,7 @@ from agents.experiment import CONFIGS, Experiment, load_experiment
 from agents.play import NAME, Player
 from flockenv.core.errors import key_path, nearest, printable
 from flockenv.core.record import Record
+from flockenv.core.warnings import UnstableStepWarning
 from flockenv.envs.disturbance import Disturbance
 from flockenv.evaluation import WORLDS_PER_SEED
 from flockenv.players import NAMES, other_tasks
@@ -79,6 +82,15 @@ class Study(Record):
             raise ValueError(f"players: needs {missing!r}, as scores are 0 for random and 1 for rules")
         return self
 
+    @model_validator(mode="after")
+    def _disturbances_are_valid(self) -> Study:
+        """Raise ValueError for a disturbance that no task accepts: `settings_of` leaves out what one does not."""
+        for axis, values in self.everywhere.items():
+            if axis in Disturbance.model_fields:
+                for value in values:
+                    Disturbance(**_changes(axis, value))
+        return self
+
 
 @dataclass(frozen=True, eq=False)
 class Setting:
@@ -109,34 +121,30 @@ def settings_of(study: Study, name: str, changes: Mapping[str, Any] | None = Non
     changes: other arguments of the task, or disturbances, that hold in every setting.
 
     Raises:
-        ValueError: in one line, a value that the task does not accept, or a name that it does not have.
+        ValueError: in one line, a value under `tasks` that the task does not accept, or a name that it does not have.
+            Values under `everywhere` that it does not accept, and unstable time steps, are left out.
     """
     path = CONFIGS / f"{name}.yaml"
     experiment = load_experiment(path) if path.is_file() else Experiment(task=name)
     always = {**experiment.arguments, **(changes or {})}
     found = [_setting(name, HOME, "", always, {})]
-    for axis, values in [*study.tasks[name].items(), *study.everywhere.items()]:
+    for axis, values in study.tasks[name].items():
+        found += [_setting(name, axis, _text(value), always, _changes(axis, value)) for value in values]
+    for axis, values in study.everywhere.items():
         for value in values:
-            many = value if isinstance(value, dict) else {axis: value}
-            setting = _setting(name, axis, _text(value), always, many)
-            if axis in study.tasks[name] or _applies(setting):
-                found.append(setting)
+            with suppress(_DoesNotApply, UnstableStepWarning), warnings.catch_warnings():
+                warnings.simplefilter("error", UnstableStepWarning)
+                found.append(_setting(name, axis, _text(value), always, _changes(axis, value)))
     home = found[0]
-    for setting in found:
-        try:
-            setting.disturbance.check(setting.task)
-        except ValueError as error:
-            raise ValueError(f"tasks.{name}.{setting.axis}: {error}") from None
     return [home, *(s for s in found[1:] if (s.task, s.disturbance) != (home.task, home.disturbance))]
 
 
-def _applies(setting: Setting) -> bool:
-    """Return False for a disturbance of something that the task does not have."""
-    try:
-        setting.disturbance.check(setting.task)
-    except ValueError:
-        return False
-    return True
+class _DoesNotApply(ValueError):  # noqa: N818  # no error where a value is meant for all tasks that accept it
+    """A task does not accept a value."""
+
+
+def _changes(axis: str, value: Value | dict[str, Value]) -> dict[str, Value]:
+    return value if isinstance(value, dict) else {axis: value}
 
 
 def _setting(name: str, axis: str, value: str, always: Mapping[str, Any], changes: Mapping[str, Any]) -> Setting:
@@ -148,9 +156,12 @@ def _setting(name: str, axis: str, value: str, always: Mapping[str, Any], change
             allowed = [*known, *Disturbance.model_fields]
             raise ValueError(f"{key_path(('tasks', name, key))}: unknown{nearest(key, allowed)}")
     try:
-        return Setting(axis, value, TASKS[name](**arguments), Disturbance(**disturbed))
+        setting = Setting(axis, value, TASKS[name](**arguments), Disturbance(**disturbed))
+        setting.disturbance.check(setting.task)
+        setting.task.scene  # noqa: B018  # it is made now, and refuses an unstable time step
     except ValueError as error:
-        raise ValueError(f"tasks.{name}.{axis}: {error}") from None
+        raise _DoesNotApply(f"tasks.{name}.{axis}: {error}") from None
+    return setting
 
 
 def _text(value: Value | dict[str, Value]) -> str:

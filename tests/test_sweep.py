@@ -133,6 +133,7 @@ def test_each_setting_changes_one_thing() -> None:
         ({"players": {"rules": "rules"}}, "players: needs 'random'"),
         ({"players": {**PLAYERS, "a b": "ppo"}}, "a name is up to 40"),
         ({"worlds": 1}, "worlds = 1"),
+        ({"everywhere": {"noise": (2.0,)}}, "Disturbance: noise = 2"),
     ],
 )
 def test_bad_studies_are_refused(changes: dict[str, Any], text: str) -> None:
@@ -153,6 +154,14 @@ def test_bad_settings_are_refused(values: dict[str, Any], text: str) -> None:
     with pytest.raises(ValueError, match="tasks") as caught:
         settings_of(small(tasks={"pursuit": values}), "pursuit")
     assert text in str(caught.value)
+
+
+def test_values_for_all_tasks_are_left_out_where_they_do_not_apply() -> None:
+    study = small(everywhere={"dropped": (0.2,), "dt": (0.1,)}, tasks={"path_follow": {}, "bottleneck": {}})
+    assert [each.name for each in settings_of(study, "path_follow")] == ["home", "dt=0.1"]  # alone
+    assert [each.name for each in settings_of(study, "bottleneck")] == ["home", "dropped=0.2"]  # unstable at 0.1 s
+    with pytest.raises(ValueError, match=r"dropped = 0\.2: must be 0 for path_follow"):
+        settings_of(small(tasks={"path_follow": {"dropped": (0.2,)}}), "path_follow")
 
 
 def test_files_of_players() -> None:

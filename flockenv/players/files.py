@@ -93,10 +93,10 @@ def _load_python(path: Path, task: Task) -> FilePlayer:
         what = _describe_type(player)
         raise PlayerError(f"player {printable_path(path)}: {kind} made {what} without a predict(); {EXPECTED}")
     name = f"{type(player).__name__}.predict"
-    found = FilePlayer(path, name, player.predict, task.action_layout.size, _kind_of(module))
+    file_player = FilePlayer(path, name, player.predict, task.action_layout.size, _kind_of(module))
     if callable(getattr(player, "watch", None)):
-        found.watch = player.watch
-    return found
+        file_player.watch = player.watch
+    return file_player
 
 
 def _kind_of(module: Any) -> str:
