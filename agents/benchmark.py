@@ -1,9 +1,8 @@
 """One score for a player: `python -m agents.benchmark my_player.py` plays all tasks, at home and in other settings.
 
 The score is 0 for random actions and 1 for tuned rules (agents/scores.py). *Home* is over the tasks as configured,
-*robust* over all settings of a study. Random actions and tuned rules are taken from docs/study/ where they have played
-the same worlds, else they are played as well. Writes an entry, NAME.json, into a folder, and the table of all its
-entries beside it: docs/leaderboard/ and docs/leaderboard.md are made this way.
+*robust* over all settings of a study. Random actions and tuned rules play the same worlds. Writes an entry, NAME.json,
+into a folder, and the table of all its entries beside it.
 """
 
 from __future__ import annotations
@@ -19,15 +18,15 @@ from agents.compare import JOBS, ROOT, folder_of, provenance, write_text
 from agents.play import NAME
 from agents.report import grid
 from agents.scores import THRESHOLDS, Aggregate, aggregate
-from agents.study import Study
-from agents.study_results import RANDOM, SettingResults, TaskResults, read_file, read_task
-from agents.sweep import sweep
+from agents.study import Study, contenders_of, settings_of
+from agents.study_results import RANDOM, SettingResults, TaskResults, kind_of, read_task
+from agents.sweep import plan_digest, sweep
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
 from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import printable
 from flockenv.core.output_paths import valid_file
-from flockenv.evaluation import Interval
+from flockenv.evaluation import Interval, lead_interval
 from flockenv.jobs import Store, Work, engine_of
 from flockenv.players import NAMES
 from flockenv.scene.yaml_io import load
@@ -35,17 +34,19 @@ from flockenv.scene.yaml_io import load
 __all__ = ["app", "entry_of", "table"]
 
 STUDY = ROOT / "configs" / "studies" / "robustness.yaml"
-REFERENCES = ROOT / "docs" / "study"
-"""Stored results of random actions and tuned rules."""
-
 LEAST = 0.5
 """A player below this home score is marked: it does not solve the tasks."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 
-def entry_of(name: str, spec: str, tasks: Sequence[TaskResults], contents: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entry of a player as plain data: its scores, and what they were computed from."""
+def entry_of(
+    name: str, spec: str, study: str, tasks: Sequence[TaskResults], contents: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the entry of a player as plain data: its scores, and what they were computed from.
+
+    study: digest of the study, as entries of different studies are not comparable.
+    """
     home = {results.task: results.settings[0] for results in tasks}
     everywhere = {
         f"{results.task}/{each.name}": each
@@ -62,6 +63,7 @@ def entry_of(name: str, spec: str, tasks: Sequence[TaskResults], contents: Mappi
     return {
         "player": name,
         "spec": spec,
+        "study": study,
         "kind": next(iter(home.values())).scores[name].kind,
         "seeds": len(next(iter(home.values())).scores[name].returns),
         "home": _plain(aggregate(home, name)),
@@ -75,8 +77,8 @@ def entry_of(name: str, spec: str, tasks: Sequence[TaskResults], contents: Mappi
 
 
 def _has_scale(setting: SettingResults) -> bool:
-    """Return True if rules are better than random, so that a score has a scale."""
-    return setting.scores["rules"].mean.value > setting.scores[RANDOM].mean.value
+    """Return True if rules are better than random by more than the interval, so that a score has a scale."""
+    return lead_interval(setting.scores["rules"].returns, setting.scores[RANDOM].returns).low > 0
 
 
 def _plain(found: Aggregate) -> dict[str, Any]:
@@ -102,10 +104,11 @@ def table(entries: Sequence[Mapping[str, Any]]) -> str:
             [
                 f"`{entry['player']}`{marked}", entry["kind"], str(entry["seeds"]),
                 *(_text(entry[where]["score"]) for where in ("home", "robust")),
+                f"{entry['settings']} of {entry['settings'] + entry['settings_left_out']}",
                 _text(entry["home"]["improvement"]), "–" if cost is None else f"{cost:.2g}",
             ]
         )  # fmt: skip
-    header = ["player", "kind", "seeds", "home", "robust", "higher than rules", "µs per decision"]
+    header = ["player", "kind", "seeds", "home", "robust", "settings", "higher than rules", "µs per decision"]
     return "\n\n".join([TITLE, grid(header, rows), NOTES]) + "\n"
 
 
@@ -122,6 +125,30 @@ digests of settings, worlds and player."""
 def _text(values: Sequence[float]) -> str:
     value, low, high = values
     return f"{value:.2f} [{low:.2f}, {high:.2f}]"
+
+
+def _check_player(plan: Study, task: str, name: str) -> None:
+    """Raise ValueError, in one line, unless the player can play a task at home."""
+    home = settings_of(plan, task)[0]
+    contender = next((each for each in contenders_of(plan, task) if each.name == name), None)
+    if contender is None:
+        raise ValueError(f"player {name!r} does not play {task}; a score is over all tasks of the study")
+    for member in contender.members:
+        kind_of(member.policy(home.task, plan.seed))
+
+
+def _other_entries(folder: Path, name: str, study: Study) -> list[dict[str, Any]]:
+    """Return the entries of other players of the same study; raise ValueError for a file that is no entry."""
+    found = []
+    for path in sorted(folder.glob("*.json")):
+        try:
+            entry = json.loads(path.read_text(encoding="utf-8"))
+            same = entry["study"] == plan_digest(study)
+        except (ValueError, KeyError, TypeError):
+            raise ValueError(f"{path}: is no entry of agents.benchmark; move it elsewhere") from None
+        if same and entry["player"] != name:
+            found.append(entry)
+    return found
 
 
 @app.command()
@@ -145,16 +172,18 @@ def main(
         plan = plan.model_copy(update={"players": {RANDOM: RANDOM, "rules": "rules", called: player}})
         folder = folder_of(out, (f"{called}.json",))
         page = valid_file(f"{folder}.md", (".md",), force=True)
-        before = {task: read_file(REFERENCES / f"{task}.json") for task in plan.tasks}
+        for task in plan.tasks:
+            _check_player(plan, task, called)
+        others = _other_entries(folder, called, load(study, Study))
         with job_bar(lines=False) as progress:
             work = Work(Store(folder / JOBS), engine_of(engine, processes), fresh, progress, shard_of(shard))
-            contents = sweep(plan, list(plan.tasks), work, before)
-        entry = entry_of(called, player, [read_task(content) for content in contents.values()], contents)
-        others = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(folder.glob("*.json"))]
-        entries = [each for each in others if each["player"] != called] + [entry]
+            contents = sweep(plan, list(plan.tasks), work, choose=False)
+        results = [read_task(content) for content in contents.values()]
+        entry = entry_of(called, player, plan_digest(load(study, Study)), results, contents)
+        text = json.dumps(entry, indent=1, allow_nan=False) + "\n"
         write_all_or_none(page.parent, {
-            f"{folder.name}/{called}.json": lambda path: write_text(path, json.dumps(entry, indent=1) + "\n"),
-            page.name: lambda path: write_text(path, table(entries)),
+            f"{folder.name}/{called}.json": lambda path: write_text(path, text),
+            page.name: lambda path: write_text(path, table([*others, entry])),
         })  # fmt: skip
     home, robust = (_text(entry[where]["score"]) for where in ("home", "robust"))
     typer.echo(f"{called}: home {home}, robust {robust} (0 = random, 1 = tuned rules)")

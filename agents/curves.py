@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
+from agents.drawn import check_settings
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors
 from agents.run import expected_bytes
 from agents.training_job import policy_of_bytes, training_job
@@ -54,6 +55,8 @@ def experiments_of(configs: Sequence[Path]) -> dict[str, Experiment]:
     for path in configs:
         experiment = load_experiment(path)
         task = experiment.build().name
+        for p in experiment.settings().values():
+            check_settings(experiment.model_copy(update={"ppo": p}))
         if task in out:
             raise ValueError(f"{path}: task = {task!r}: another config is of that task; compare settings under curves")
         out[task] = experiment

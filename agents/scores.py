@@ -6,7 +6,7 @@ A player is scored once per task and training seed; random actions and tuned rul
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,15 +43,16 @@ class Aggregate:
 def aggregate(settings: Mapping[str, SettingResults], name: str, seed: int = 0) -> Aggregate:
     """Return the scores of a player over settings, by a name of each (a task, or a task in one of its settings).
 
-    Intervals: stratified bootstrap; in each resample seeds and worlds are drawn anew within every setting, the worlds
-    for the player, random and rules together.
+    Intervals: stratified bootstrap; in each resample seeds and worlds are drawn anew for every task, the same ones for
+    all settings of a task ("crossing/agents=4"), which share policies and worlds. The scale itself, the mean returns of
+    random and rules, is taken as known.
 
     Raises:
         ValueError: rules are not better than random in a setting, so that it has no scale.
     """
-    tables = [_Table.of(key, setting, name) for key, setting in settings.items()]
+    tables = {key: _Table.of(key, setting, name) for key, setting in settings.items()}
     generator = np.random.default_rng(seed)
-    scores = [table.scores() for table in tables]
+    scores = [table.scores() for table in tables.values()]
     drawn = [_draw(tables, generator) for _ in range(RESAMPLES)]
     every = np.concatenate(scores)
     ends = np.quantile([iqm(values) for values, _ in drawn], (0.025, 0.975))
@@ -59,43 +60,50 @@ def aggregate(settings: Mapping[str, SettingResults], name: str, seed: int = 0) 
     return Aggregate(
         Interval(iqm(every), float(ends[0]), float(ends[1])),
         tuple(float((every > threshold).mean()) for threshold in THRESHOLDS),
-        Interval(float(np.mean([table.improvement() for table in tables])), float(better[0]), float(better[1])),
+        Interval(
+            float(np.mean([table.improvement() for table in tables.values()])), float(better[0]), float(better[1])
+        ),
         {key: float(each.mean()) for key, each in zip(settings, scores, strict=True)},
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Table:
-    """Returns in one setting: of the player (seeds, worlds), of random and of rules (worlds,)."""
+    """Returns in one setting: of the player (seeds, worlds), of rules (worlds,); mean returns of random and rules."""
 
     player: Floats
-    random: Floats
     rules: Floats
+    low: float
+    high: float
 
     @staticmethod
     def of(key: str, setting: SettingResults, name: str) -> _Table:
-        low, high = setting.scores[RANDOM].returns.mean(axis=0), setting.scores[RULES].returns.mean(axis=0)
-        if not high.mean() > low.mean():
-            raise ValueError(f"{key}: rules ({high.mean():.4g}) are not better than random ({low.mean():.4g})")
-        return _Table(setting.scores[name].returns, low, high)
+        random, rules = setting.scores[RANDOM].returns.mean(axis=0), setting.scores[RULES].returns.mean(axis=0)
+        if not rules.mean() > random.mean():
+            raise ValueError(f"{key}: rules ({rules.mean():.4g}) are not better than random ({random.mean():.4g})")
+        return _Table(setting.scores[name].returns, rules, float(random.mean()), float(rules.mean()))
 
     def scores(self) -> Floats:
         """Return the score of each seed, (seeds,)."""
-        low, high = self.random.mean(), self.rules.mean()
-        return np.asarray((self.player.mean(axis=1) - low) / (high - low))
+        return np.asarray((self.player.mean(axis=1) - self.low) / (self.high - self.low))
 
     def improvement(self) -> float:
         """Return the share of worlds in which the return is higher than that of rules, ties counted half."""
         return float((np.sign(self.player - self.rules) / 2 + 0.5).mean())
 
-    def resampled(self, generator: np.random.Generator) -> _Table:
-        """Return a table of as many seeds and worlds, drawn with replacement."""
-        seeds = generator.integers(len(self.player), size=len(self.player))
-        worlds = generator.integers(self.player.shape[1], size=self.player.shape[1])
-        return _Table(self.player[seeds][:, worlds], self.random[worlds], self.rules[worlds])
+    def resampled(self, seeds: NDArray[np.int64], worlds: NDArray[np.int64]) -> _Table:
+        """Return the table of these seeds and worlds."""
+        return _Table(self.player[seeds][:, worlds], self.rules[worlds], self.low, self.high)
 
 
-def _draw(tables: Sequence[_Table], generator: np.random.Generator) -> tuple[Floats, float]:
+def _draw(tables: Mapping[str, _Table], generator: np.random.Generator) -> tuple[Floats, float]:
     """Return all scores, and the probability of improvement, of one resample."""
-    drawn = [table.resampled(generator) for table in tables]
-    return np.concatenate([table.scores() for table in drawn]), float(np.mean([t.improvement() for t in drawn]))
+    drawn: dict[tuple[str, tuple[int, ...]], tuple[NDArray[np.int64], NDArray[np.int64]]] = {}
+    found = []
+    for key, table in tables.items():
+        seeds, worlds = table.player.shape
+        of = key.partition("/")[0], table.player.shape
+        if of not in drawn:
+            drawn[of] = generator.integers(seeds, size=seeds), generator.integers(worlds, size=worlds)
+        found.append(table.resampled(*drawn[of]))
+    return np.concatenate([table.scores() for table in found]), float(np.mean([each.improvement() for each in found]))

@@ -209,7 +209,8 @@ class Search:
         finalists = [self.textbook, self.mean, *(self.means[k] for k in best)]
         self.finalists = [values for k, values in enumerate(finalists) if values not in finalists[:k]]
         plays = [(self.mean, self.evaluate_worlds, common_worlds())]
-        plays += [(values, self.settings.final_worlds, common_worlds()) for values in self.finalists]
+        fresh = common_worlds() + self.evaluate_worlds  # not those by which the finalists were chosen
+        plays += [(values, self.settings.final_worlds, fresh) for values in self.finalists]
         return [play_job(self.task, self.player, *play) for play in plays]
 
     def tell_last(self, plays: Sequence[Play]) -> Found:

@@ -60,7 +60,7 @@ class Study(Record):
         description="players by name: a known name or a file; with {task} in place of the task's name, and * for the"
         " files of several training seeds",
     )
-    everywhere: dict[str, tuple[Value | dict[str, Value], ...]] = Field(
+    everywhere: dict[str, tuple[Value, ...]] = Field(
         default_factory=dict,
         description="values to play, by name, in every task that has it: noise, delay, dropped, dt",
     )
@@ -78,17 +78,19 @@ class Study(Record):
         for name in self.players:
             if not NAME.fullmatch(name):
                 raise ValueError(f"{key_path(('players', name))}: a name is up to 40 letters, digits and _ . + -")
-        for missing in {"random", "rules"} - set(self.players.values()):
-            raise ValueError(f"players: needs {missing!r}, as scores are 0 for random and 1 for rules")
         return self
 
     @model_validator(mode="after")
-    def _disturbances_are_valid(self) -> Study:
-        """Raise ValueError for a disturbance that no task accepts: `settings_of` leaves out what one does not."""
+    def _everywhere_applies_somewhere(self) -> Study:
+        """Raise ValueError for a name or a disturbance that no task has; `settings_of` leaves out what one refuses."""
+        known = {name for task in self.tasks if task in TASKS for name in TASKS[task].model_fields}
         for axis, values in self.everywhere.items():
             if axis in Disturbance.model_fields:
                 for value in values:
                     Disturbance(**_changes(axis, value))
+            elif axis not in known:
+                allowed = [*Disturbance.model_fields, *sorted(known)]
+                raise ValueError(f"{key_path(('everywhere', axis))}: unknown{nearest(axis, allowed)}")
         return self
 
 
@@ -132,6 +134,8 @@ def settings_of(study: Study, name: str, changes: Mapping[str, Any] | None = Non
         found += [_setting(name, axis, _text(value), always, _changes(axis, value)) for value in values]
     for axis, values in study.everywhere.items():
         for value in values:
+            if axis not in TASKS[name].model_fields and axis not in Disturbance.model_fields:
+                continue
             with suppress(_DoesNotApply, UnstableStepWarning), warnings.catch_warnings():
                 warnings.simplefilter("error", UnstableStepWarning)
                 found.append(_setting(name, axis, _text(value), always, _changes(axis, value)))

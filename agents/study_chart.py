@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from agents.study import HOME
-from agents.study_results import GROUPS, KINDS, LEVEL, SettingResults, TaskResults
+from agents.study_results import ALONE, GROUPS, KINDS, LEVEL, SettingResults, TaskResults
 from flockenv.core.atomic_files import replace_file
 from flockenv.evaluation.plots import FAINT, INK
 
@@ -17,11 +17,12 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_map", "draw_summary"]
 
-SHADES = {"rules": "#9cc7e8", "policy": "#f2b48c", "hybrid": "#8fd3bd", "planner": "#dcb3cd", LEVEL: "#dde1e6"}
+SHADES = {"rules": "#9cc7e8", "policy": "#f2b48c", "hybrid": "#8fd3bd", "planner": "#dcb3cd", LEVEL: "#dde1e6",
+          ALONE: "#f4f5f7"}  # fmt: skip
 """Light tones of Okabe and Ito's palette, so that text on them can be read."""
 
 MEANING = {"rules": "hand-written rules", "policy": "learned policy", "hybrid": "learned on top of rules",
-           "planner": "planner", LEVEL: "level"}  # fmt: skip
+           "planner": "planner", LEVEL: "level", ALONE: "only one kind can play"}  # fmt: skip
 
 
 def draw_map(path: Path, results: TaskResults) -> None:
@@ -106,7 +107,7 @@ def _legend(figure: Figure, *results: TaskResults) -> None:
     from matplotlib.patches import Patch
 
     winners = {each.winner for task in results for each in task.settings}
-    patches = [Patch(color=SHADES[kind], label=MEANING[kind]) for kind in (*KINDS, LEVEL) if kind in winners]
+    patches = [Patch(color=SHADES[kind], label=MEANING[kind]) for kind in (*KINDS, LEVEL, ALONE) if kind in winners]
     figure.legend(handles=patches, loc="outside lower left", ncols=len(patches), frameon=False, fontsize=9)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from agents.report import grid
 from agents.study import HOME, Study
-from agents.study_results import GROUPS, KINDS, LEVEL, SettingResults, TaskResults
+from agents.study_results import ALONE, GROUPS, KINDS, LEVEL, SettingResults, TaskResults
 from flockenv.evaluation import Interval
 
 __all__ = ["markdown", "score_text", "winner_text"]
@@ -19,8 +19,8 @@ held-out worlds. **Ahead** means that the 95 % interval of the difference of mea
 other kind is above zero; otherwise the setting is *level*. If there are several players of a kind, the best one on the
 tuning worlds of that setting stands for it. Intervals: two-level bootstrap over training seeds and worlds where a
 player has several seeds, else over worlds alone, and then they do not contain the luck of training. Success of a single
-seed: 95 % Wilson. *Score*: 0 = random actions, 1 = tuned rules, in that setting. A dash: the player cannot read the
-observations of that setting."""
+seed: 95 % Wilson. A dash: the player cannot read the observations of that setting; *alone*: only one kind can. A value
+for all tasks is left out where a task does not accept it or its time step is unstable."""
 
 
 def markdown(study: Study, path: Path, tasks: Sequence[TaskResults], folder: str) -> str:
@@ -48,7 +48,7 @@ def _sentence(tasks: Sequence[TaskResults]) -> str:
     texts = []
     for group in GROUPS:
         counts = Counter(each.winner for results in tasks for each in results.groups[group])
-        of = ", ".join(f"{kind} {counts[kind]}" for kind in (*KINDS, LEVEL) if counts[kind])
+        of = ", ".join(f"{kind} {counts[kind]}" for kind in (*KINDS, LEVEL, ALONE) if counts[kind])
         if of:
             texts.append(f"{group}: {of} of {counts.total()}")
     return f"Settings in which a kind of player is ahead, by what is varied: {'; '.join(texts)}."
@@ -94,7 +94,7 @@ def winner_text(setting: SettingResults) -> str:
     """Return which kind is ahead, and by how much."""
     lead = setting.lead
     if lead is None:
-        return setting.first
+        return f"alone: {setting.leaders[setting.first]}"
     name = setting.leaders[setting.first]
     if setting.winner == LEVEL:
         return f"level ({name} {_signed(lead)})"

@@ -27,12 +27,12 @@ from flockenv.evaluation import Interval, lead_interval, mean_interval, proporti
 from flockenv.players.policy import MlpPolicy, Policy, RandomPolicy
 
 __all__ = [
-    "GROUPS", "KINDS", "LEVEL", "RANDOM", "Score", "SettingResults", "TaskResults", "group_of", "kind_of", "read_file",
-    "read_task", "text_of",
+    "ALONE", "GROUPS", "KINDS", "LEVEL", "RANDOM", "Score", "SettingResults", "TaskResults", "group_of", "kind_of",
+    "read_file", "read_task", "text_of",
 ]  # fmt: skip
 
 KINDS = ("rules", "policy", "hybrid", "planner")
-LEVEL = "level"
+LEVEL, ALONE = "level", "alone"
 RANDOM = "random"
 
 SOLVER = ("dt", "integrator", "dtype")
@@ -128,18 +128,15 @@ class SettingResults:
 
     @property
     def winner(self) -> str:
-        """The kind that is ahead of every other, or the only one that can play; else "level"."""
+        """The kind that is ahead of every other; "alone" if no other can play, else "level"."""
+        if not self.leads:
+            return ALONE
         return self.first if all(lead.low > 0 for lead in self.leads.values()) else LEVEL
 
     @property
     def lead(self) -> Interval | None:
         """The smallest lead of the best kind; None if there is one kind only."""
         return min(self.leads.values(), key=lambda lead: lead.value, default=None)
-
-    def normalised(self, name: str) -> float:
-        """Return the mean return of a player on the scale 0 = random, 1 = tuned rules, in this setting."""
-        low, high = self.scores[RANDOM].mean.value, self.scores["rules"].mean.value
-        return (self.scores[name].mean.value - low) / (high - low)
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,6 +195,6 @@ def read_file(path: Path) -> dict[str, Any] | None:
         return None
     except ValueError as error:
         raise ValueError(f"{path}: damaged: {error}; delete it, and the same command makes it anew") from None
-    if not isinstance(content, dict) or not content.keys() >= {"task", "worlds", "seed", "home", "settings"}:
+    if not isinstance(content, dict) or not content.keys() >= {"plan", "task", "worlds", "seed", "home", "settings"}:
         raise ValueError(f"{path}: not the results of a task; delete it, and the same command makes it anew")
     return content

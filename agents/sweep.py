@@ -1,8 +1,8 @@
 """Players away from home: `python -m agents.sweep configs/studies/robustness.yaml` varies what a study names.
 
 All players play the same held-out worlds under each setting. Writes into a folder a file per task with every world's
-return (TASK.json), a map per task (TASK.png) and summary.png, and beside the folder a page. A setting whose results are
-in TASK.json is not played again if its settings, worlds and player are the same; an interrupted run continues.
+return (TASK.json), a map per task (TASK.png) and summary.png, and beside the folder a page. With --tasks, the page also
+shows the other tasks' files of the same study.
 """
 
 from __future__ import annotations
@@ -30,9 +30,10 @@ from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import printable
 from flockenv.core.output_paths import valid_file
 from flockenv.jobs import Job, Store, Work, engine_of, run_jobs
+from flockenv.players.policy import OtherSlotsError
 from flockenv.scene.yaml_io import load, parse_scalar
 
-__all__ = ["app", "sweep"]
+__all__ = ["app", "plan_digest", "sweep"]
 
 SUMMARY = "summary.png"
 DIGITS = 6
@@ -65,13 +66,13 @@ def sweep(
     study: Study,
     tasks: Sequence[str],
     work: Work,
-    before: Mapping[str, Content | None] = MappingProxyType({}),
     changes: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
+    choose: bool = True,
 ) -> dict[str, Content]:
     """Play all settings of tasks with all players; return the content of each task's file.
 
-    before: the contents of an earlier run, of which results are taken over. changes: arguments of tasks that hold in
-    every setting.
+    changes: arguments of tasks that hold in every setting. choose: play tuning worlds as well where a kind has several
+    players, to choose the one that stands for it.
 
     Raises:
         ValueError: in one line, a bad setting or player, before anything is played.
@@ -80,17 +81,20 @@ def sweep(
         task: [
             entry
             for setting in settings_of(study, task, changes.get(task))
-            for entry in _entries(study, setting, contenders_of(study, task))
+            for entry in _entries(study, setting, contenders_of(study, task), choose)
         ]
         for task in tasks
     }
-    for task, of_task in entries.items():
-        known = {} if work.fresh else _known(before.get(task))
-        for entry in of_task:
-            entry.content = entry.content or _stored(known, entry)
     waiting = [entry for of_task in entries.values() for entry in of_task if not entry.content]
     run_jobs([job for entry in waiting for job in (*entry.evaluation, *entry.tuning)], work)
-    return {task: _content(study, of_task, work.store) for task, of_task in entries.items()}
+    digest = plan_digest(study, changes)
+    return {task: {"plan": digest, **_content(study, of_task, work.store)} for task, of_task in entries.items()}
+
+
+def plan_digest(study: Study, changes: Mapping[str, Mapping[str, Any]] = MappingProxyType({})) -> str:
+    """Return a digest of a study and of the changes by --set: only results of one plan are on one page."""
+    text = json.dumps([study.model_dump(mode="json"), {task: dict(each) for task, each in changes.items()}])
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _content(study: Study, entries: Sequence[_Entry], store: Store) -> Content:
@@ -107,20 +111,20 @@ def _content(study: Study, entries: Sequence[_Entry], store: Store) -> Content:
     return {**head, "settings": list(settings.values())}
 
 
-def _entries(study: Study, setting: Setting, contenders: Sequence[Contender]) -> list[_Entry]:
+def _entries(study: Study, setting: Setting, contenders: Sequence[Contender], choose: bool = True) -> list[_Entry]:
     """Return the entries of a setting; a player that cannot play it has the reason as its content."""
     found = []
     for contender in contenders:
         try:
             policies = [member.policy(setting.task, study.seed) for member in contender.members]
-        except ValueError as error:
+        except OtherSlotsError as error:
             found.append(_Entry(setting, contender, "", content={"refused": str(error)}))
             continue
         jobs = [_job(study, setting, member, "evaluation") for member in contender.members]
         found.append(_Entry(setting, contender, kind_of(policies[0]), jobs))
     kinds = [entry.kind for entry in found]
     for entry in found:
-        if entry.kind not in ("", RANDOM) and kinds.count(entry.kind) > 1:
+        if choose and entry.kind not in ("", RANDOM) and kinds.count(entry.kind) > 1:
             entry.tuning = [_job(study, setting, member, "tuning") for member in entry.contender.members]
     return found
 
@@ -130,20 +134,6 @@ def _job(study: Study, setting: Setting, player: Player, purpose: Any) -> Job:
     return play_job(
         kind, setting.task, player, study.worlds, study.seed, disturbance=setting.disturbance, purpose=purpose
     )
-
-
-def _known(before: Content | None) -> dict[tuple[str, str], Content]:
-    """Return the stored results by player and digest."""
-    settings = before["settings"] if before else ()
-    return {
-        (name, player["digest"]): player
-        for setting in settings for name, player in setting["players"].items() if "digest" in player
-    }  # fmt: skip
-
-
-def _stored(known: Mapping[tuple[str, str], Content], entry: _Entry) -> Content:
-    content = known.get((entry.contender.name, entry.digest), {})
-    return {} if entry.tuning and content.get("tuning_mean") is None else content
 
 
 def _played(entry: _Entry, store: Store, commit: str | None) -> Content:
@@ -205,13 +195,18 @@ def main(
             settings_of(plan, name, fixed.get(name)), contenders_of(plan, name)
         before = {name: read_file(folder / f"{name}.json") for name in plan.tasks}
         runner, part = engine_of(engine, processes), shard_of(shard)
+        if check and part is not None:
+            raise ValueError("--check: not together with --shard")
         with job_bar() as progress:
             work = Work(Store(folder / JOBS), runner, fresh or check > 0, progress, part)
             if check:
-                raise typer.Exit(0 if _check(plan, before, check, work) else 1)
-            contents = sweep(plan, names, work, before, fixed)
+                chosen = {name: before[name] for name in names}
+                raise typer.Exit(0 if _check(plan, chosen, fixed, check, work) else 1)
+            contents = sweep(plan, names, work, fixed)
         _write(folder, contents)
-        found = {name: read_task(content) for name, content in {**before, **contents}.items() if content is not None}
+        digest = plan_digest(plan, fixed)
+        others = {name: each for name, each in before.items() if each is not None and each["plan"] == digest}
+        found = {name: read_task(content) for name, content in {**others, **contents}.items()}
         _publish(page, plan, study, found)
     for name in names:
         typer.echo(f"{folder / name}.json, .png: written")
@@ -254,7 +249,9 @@ def _publish(page: Path, study: Study, path: Path, found: Mapping[str, TaskResul
     write_all_or_none(page.parent, writers)
 
 
-def _check(study: Study, before: Mapping[str, Content | None], count: int, work: Work) -> bool:
+def _check(
+    study: Study, before: Mapping[str, Content | None], changes: Mapping[str, Any], count: int, work: Work
+) -> bool:
     """Play stored results again, drawn at random; print each, and return True if all returns are the same."""
     stored = [
         (task, setting, name, player)
@@ -266,7 +263,7 @@ def _check(study: Study, before: Mapping[str, Content | None], count: int, work:
     console, same = Console(highlight=False, soft_wrap=True), True
     for number in np.random.default_rng().permutation(len(stored))[:count]:
         task, setting, name, player = stored[number]
-        again = _play_again(study, task, setting, name, work)
+        again = _play_again(study, task, changes.get(task), setting, name, work)
         place = f"{task}, {setting['axis']} {setting['value']}, {name}".replace(" ,", ",")
         if again is None or again["digest"] != player["digest"]:
             console.print(f"{place}: cannot be made again: its settings or its player are others now")
@@ -279,9 +276,11 @@ def _check(study: Study, before: Mapping[str, Content | None], count: int, work:
     return same
 
 
-def _play_again(study: Study, task: str, setting: Content, name: str, work: Work) -> Content | None:
+def _play_again(
+    study: Study, task: str, changes: Mapping[str, Any] | None, setting: Content, name: str, work: Work
+) -> Content | None:
     """Return the results of one player in one setting, made anew; None if the study does not have it."""
-    for each in settings_of(study, task):
+    for each in settings_of(study, task, changes):
         if (each.axis, each.value) == (setting["axis"], setting["value"]):
             chosen = [contender for contender in contenders_of(study, task) if contender.name == name]
             for entry in _entries(study, each, chosen):

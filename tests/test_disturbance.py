@@ -352,3 +352,20 @@ def test_a_recipe_names_its_disturbance_and_none_leaves_it_as_it_was() -> None:
     recipe = recipe_of(Experiment(task="pursuit", ppo=settings))
     assert recipe["ppo"]["disturbance"] == {"noise": 0.05, "delay": 0, "dropped": 0.0}
     assert PpoSettings(**recipe["ppo"]) == settings
+
+
+def test_noise_does_not_depend_on_what_is_dropped() -> None:
+    """The noise of numbers of detected entities has mean 0, whichever other entities are dropped."""
+    task = Crossing()
+    seeds, both = 400, Disturbance(noise=0.02, dropped=0.3)
+    plain = World(task, seeds).reset(0)
+    seen = make_world(task, seeds, disturbance=both).reset(0)
+    entity, noise, checked = task.layout.entities, (seen - plain) / 0.02, 0
+    free = (np.abs(plain) < 0.9) & (plain != 0) & (seen != 0)
+    for k in range(int(entity.max()) + 1):
+        if entity[k] != k and (entity == k).any():
+            dropped = (seen[..., entity == k] == 0).all(axis=-1)
+            values = noise[..., k][dropped & free[..., k]]
+            assert len(values) == 0 or abs(values.mean()) < 5 / np.sqrt(len(values))
+            checked += len(values)
+    assert checked > 500

@@ -144,3 +144,8 @@ def test_a_card_without_fields_is_refused(tmp_path: Path) -> None:
     path.with_suffix(".json").write_text(json.dumps(card))
     with pytest.raises(ValueError, match="the card's hybrid must hold kind, base, bound and rules"):
         load_player(path, task)
+
+
+def test_an_unknown_base_is_refused() -> None:
+    with pytest.raises(ValueError, match="hand-written player 'rulez': unknown, did you mean `rules`"):
+        Hybrid.of(Pursuit(), "residual", "rulez")

@@ -344,3 +344,11 @@ def test_the_racing_line_is_faster_than_braking_on_the_middle_line() -> None:
     assert racing.success.all()
     assert racing.metrics["off_track"].max() < 0.02
     assert (racing.returns - careful.returns).min() > 2
+
+
+@pytest.mark.parametrize("ahead", [1, 2, 3])
+def test_rules_play_with_few_points_ahead(ahead: int) -> None:
+    task = PathFollow(ahead=ahead)
+    rows = World(task, 4).reset(0).reshape(4, -1)
+    action, _ = player(task).predict(rows)
+    assert np.isfinite(action).all() and (np.linalg.norm(action, axis=1) > 0.1).all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ from agents.benchmark import app, table
 from agents.planners import mppi
 from agents.scores import aggregate
 from agents.study_results import Score, SettingResults, kind_of
+from flockenv.envs.disturbance import Disturbance, make_world
 from flockenv.envs.world import World
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.players import load_player
@@ -57,8 +59,11 @@ def test_the_interval_contains_the_luck_of_seeds() -> None:
     settings = {name: setting(seeds) for name in "abcd"}
     interval = aggregate(settings, "mine").score
     assert 0.04 < interval.high - interval.low < 0.3
+    same = aggregate({f"a/{name}": setting(seeds) for name in "abcdefgh"}, "mine").score
+    alone = aggregate({"a": setting(seeds)}, "mine").score  # eight settings of the same seeds say no more than one
+    assert same.high - same.low == pytest.approx(alone.high - alone.low, rel=0.25)
     one = aggregate({name: setting(seeds[:1]) for name in "abcd"}, "mine").score
-    assert one.high - one.low < 1e-6  # one seed in paired worlds: no luck can be seen
+    assert one.high - one.low < interval.high - interval.low  # of one seed only the luck of worlds is seen
 
 
 def test_improvement_counts_ties_half() -> None:
@@ -107,6 +112,7 @@ def test_entries_are_ordered_by_score(small: Path) -> None:
     ("arguments", "text"),
     [
         (["nobody"], "players.nobody: 'nobody': no such file"),
+        (["orca"], "player 'orca' does not play pursuit"),
         (["ppo", "--name", "a b"], "--name 'a b': a name is"),
         (["ppo", "--name", "rules"], "--name 'rules'"),
     ],
@@ -141,6 +147,13 @@ def test_a_planner_sees_the_worlds_that_it_plays_in() -> None:
     assert planned.returns.mean() > random.returns.mean() + 15
     again = rollout(task, load_player(ROOT / "agents" / "planners" / "mppi.py", task), 4, seed)
     assert (again.returns == planned.returns).all()
+
+
+def test_a_planner_plays_disturbed_worlds() -> None:
+    task = Pursuit()
+    make = functools.partial(make_world, disturbance=Disturbance(noise=0.05, delay=1))
+    planner = load_player(ROOT / "agents" / "planners" / "mppi.py", task)
+    assert rollout(task, planner, 2, worlds_for("tuning", 1, 2), make_world=make).success.all()
 
 
 def test_copies_of_worlds_continue_as_the_worlds_do() -> None:

@@ -5,9 +5,9 @@ tuned rules, for HORIZON decisions; the new plan is the mean of their actions, w
 for each learner by its own return. Its first action is done, the rest is the plan of the next decision. Source:
 model predictive path integral control, Williams et al. 2017, ICRA, 1714 (information-theoretic MPC).
 
-It is no fair opponent: it sees the whole state and knows the task's laws and rewards exactly, it thinks a thousand
-times longer than rules or a policy, and sensor noise does not reach it. What it does not know is chance: random numbers
-of its copies are others than those of the world. So it shows how much more is possible in a task.
+It is no fair opponent: it sees the whole state, knows the task's laws and rewards exactly, takes milliseconds for a
+decision, and its copies have neither noise nor late actions. The only thing that it does not know is chance: the random
+numbers of its copies differ from those of the world. So it shows how much more is possible in a task.
 """
 
 from __future__ import annotations
@@ -103,9 +103,10 @@ class Mppi:
             self.copies = World(self.task, worlds * SAMPLES)
             self.copies.reset(0)
         arrays = {}
-        for name, array in self.world.arrays().items():
+        seen = self.world.arrays()
+        for name in self.copies.arrays():  # a disturbed world has arrays besides: copies are not disturbed
             axis = 1 if name in WORLD_SECOND else 0
-            arrays[name] = np.repeat(array.take(range(worlds), axis), SAMPLES, axis)
+            arrays[name] = np.repeat(seen[name].take(range(worlds), axis), SAMPLES, axis)
         arrays["state.key"] ^= np.uint64(self.random.integers(2**63))
         self.copies.restore(arrays)
         return self.copies

@@ -1,1 +1,1 @@
-"""Players that do nothing sensible: a benchmark that they pass measures nothing."""
+"""Players that ignore what they observe, or only brake: no benchmark may rank them near the rules."""

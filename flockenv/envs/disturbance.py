@@ -88,7 +88,7 @@ def _disturb(
                 x = np.float64(rows[b, i, k])
                 if x == 0.0:
                     continue
-                if entities[k] >= 0 and uniform(key, steps[b], i, entities[k]) < dropped:
+                if entities[k] >= 0 and uniform(key, steps[b], i, rows.shape[2] + entities[k]) < dropped:
                     rows[b, i, k] = 0.0
                 elif noise > 0.0:
                     rows[b, i, k] = min(max(x + noise * quick_normal(key, steps[b], i, k), np.float64(low[k])), 1.0)

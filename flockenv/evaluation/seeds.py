@@ -3,13 +3,19 @@
 A player made once has one row of returns, a player made with S seeds has S rows, all in the same W worlds. Both levels
 are drawn anew in each resample: seeds of each player by themselves, worlds for all players together. So an interval
 contains the luck of training as well as that of worlds. A single seed shows no luck of training: its interval is of the
-worlds alone. Source: Davison and Hinkley 1997, Bootstrap Methods and their Application, section 3.8.
+worlds alone. Source: Owen 2007, The pigeonhole bootstrap, Ann. Appl. Stat. 1, 386.
+
+A bootstrap of few seeds is too narrow, as S drawn seeds vary by (S - 1) / S of the variance, and as their spread is
+itself uncertain. So each seed's distance from the mean of all seeds is stretched by sqrt(S / (S - 1)), and by the ratio
+of Student's quantile with S - 1 degrees of freedom to the normal one.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.stats import norm as normal
+from scipy.stats import t as student
 
 from flockenv.evaluation.episodes import RESAMPLES, Interval
 
@@ -61,8 +67,16 @@ def _world_weights(worlds: int, resamples: int, seed: int) -> tuple[Floats, np.r
 def _resampled_means(rows: Floats, worlds: Floats, generator: np.random.Generator) -> Floats:
     """Return the mean of each resample, (R,)."""
     seeds = len(rows)
+    if seeds > 1:
+        of_seed = rows.mean(axis=1, keepdims=True)
+        rows = rows + (_stretch(seeds) - 1) * (of_seed - of_seed.mean())
     weights = generator.multinomial(seeds, np.full(seeds, 1 / seeds), len(worlds)) / seeds
     return np.asarray(((weights @ rows) * worlds).sum(axis=1))
+
+
+def _stretch(seeds: int) -> float:
+    """Return the factor by which distances between seeds are stretched."""
+    return float(student.ppf(0.975, seeds - 1) / normal.ppf(0.975) * np.sqrt(seeds / (seeds - 1)))
 
 
 def _interval(value: float, drawn: Floats) -> Interval:

@@ -54,7 +54,7 @@ class Hybrid:
         if about["kind"] not in KINDS:
             kind = about["kind"]
             raise ValueError(f"hybrid.kind = {kind!r}: unknown{nearest(str(kind), KINDS)}; allowed: {', '.join(KINDS)}")
-        base = player(task, about["base"])
+        base = player(task, str(about["base"]))
         values, known = about["rules"], as_dict(base.rules)
         if not isinstance(values, Mapping) or values.keys() != known.keys() or not _are_numbers([*values.values()]):
             raise ValueError(f"hybrid.rules must hold a number for each of {', '.join(known)}")

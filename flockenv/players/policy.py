@@ -30,7 +30,7 @@ from flockenv.core.warnings import OtherTaskWarning
 if TYPE_CHECKING:
     from flockenv.tasks import Layout, Task
 
-__all__ = ["ACTIVATIONS", "MlpPolicy", "Policy", "RandomPolicy", "describe", "save_policy"]
+__all__ = ["ACTIVATIONS", "MlpPolicy", "OtherSlotsError", "Policy", "RandomPolicy", "describe", "save_policy"]
 
 Observation = NDArray[Any] | dict[str, NDArray[Any]]
 State = tuple[NDArray[Any], ...]
@@ -48,6 +48,10 @@ cores, waiting threads were measured to cost two hundred times the product itsel
 
 LARGEST_CARD, LARGEST_WEIGHTS = 8 << 20, 256 << 20
 """Bytes: larger files are not read."""
+
+
+class OtherSlotsError(ValueError):
+    """The observations of a task have other slots than those that a policy was trained on."""
 
 
 @runtime_checkable
@@ -146,7 +150,8 @@ class MlpPolicy:
             _check_sizes(policy)
             policy.differences = () if task is None else _differences(card, task)
         except ValueError as error:
-            raise ValueError(f"policy {printable_path(path)}: {error}") from None
+            kind = OtherSlotsError if isinstance(error, OtherSlotsError) else ValueError
+            raise kind(f"policy {printable_path(path)}: {error}") from None
         if policy.differences:
             differences, more = policy.differences[:MOST_SAID], len(policy.differences) - MOST_SAID
             text = "; ".join([*differences, *([f"and {more} more"] if more > 0 else [])])
@@ -305,7 +310,7 @@ def _differences(card: Mapping[str, Any], task: Task) -> tuple[str, ...]:
         for trained, here in zip_longest(_slots_of(card, kind), _slots(layout)):
             if trained is None or here is None or any(trained[key] != here[key] for key in ("name", "shape", "unit")):
                 texts = _describe_slot(trained), _describe_slot(here)
-                raise ValueError(f"made for {kind} {texts[0]}, task {task.name!r} has {texts[1]} there")
+                raise OtherSlotsError(f"made for {kind} {texts[0]}, task {task.name!r} has {texts[1]} there")
             differences += [
                 f"{kind} {here['name']} has {key} {here[key]:g} {here['unit']}, trained with {trained[key]:g}"
                 for key in ("scale", "low")
@@ -329,10 +334,10 @@ def _differences_of_digest(card: Mapping[str, Any], task: Task) -> tuple[str, ..
     sizes = {"observation_size": task.layout.size, "action_size": task.action_layout.size}
     for key, size in sizes.items():
         if card[key] != size:
-            raise ValueError(f"made for {key} = {card[key]}, task {task.name!r} has {size}")
+            raise OtherSlotsError(f"made for {key} = {card[key]}, task {task.name!r} has {size}")
     if card.get("layout") != task.layout.digest:
         digests = f"{card.get('layout')!r}, task {task.name!r} has {task.layout.digest!r}"
-        raise ValueError(f"made for observation layout {digests}, and the card does not list its slots")
+        raise OtherSlotsError(f"made for observation layout {digests}, and the card does not list its slots")
     return ("the card does not list the arguments of its task",)
 
 

@@ -3,7 +3,7 @@
 Each receives the learner's observation and nothing else, and its force has the same limits. Two kinds of names:
 
 * `rules`, and of some tasks `orca`, `heuristics`, `queueing`: other functions; all with the parameters that a search
-  found (`python -m agents.tune`), in ../tuned/TASK.json;
+  found (`python -m agents.tune`; evade's and path_follow's by another random search), in ../tuned/TASK.json;
 * `textbook`, `orca_published`, `heuristics_published`, `queueing_published`: the same functions with published
   parameters, the defaults in the files; in evade and path_follow, `textbook` is another function than `rules`.
 
@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.core.errors import printable_path
+from flockenv.core.errors import nearest, printable, printable_path
 from flockenv.players import PUBLISHED
 from flockenv.players.rules import (
     bottleneck,
@@ -152,6 +152,9 @@ def read_tuned(path: Path) -> dict[str, dict[str, Any]]:
 
 def player(task: Task, name: str = "rules") -> RulesPlayer:
     """Return a hand-written player of a task by name; raise ValueError if the task has none of that name."""
+    if name not in PLAYERS:
+        hint = nearest(name, PLAYERS)
+        raise ValueError(f"hand-written player {printable(name)}: unknown{hint}; allowed: {', '.join(PLAYERS)}")
     known = PLAYERS[name]
     if task.name not in known:
         raise ValueError(

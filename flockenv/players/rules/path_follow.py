@@ -79,7 +79,7 @@ def race(see: Any, task: PathFollow, p: RacingRules) -> NDArray[np.float64]:
     line = racing_line(see, task, p)
     speeds = allowed_speeds(line, task, p)
     speed = np.linalg.norm(see.velocity, axis=-1)
-    place = np.minimum(p.lead * np.maximum(speed, 0.25 * task.max_speed) / task.spacing, task.ahead - 1.001)
+    place = np.minimum(p.lead * np.maximum(speed, 0.25 * task.max_speed) / task.spacing, max(task.ahead - 1.001, 0.999))
     target, desired = _between(line[:, 1:], place), _between(speeds[..., None], place)[:, 0]
     force: NDArray[np.float64] = np.asarray(p.gain)[..., None] * seek(target, see.velocity, desired)
     return force
@@ -156,10 +156,12 @@ def allowed_speeds(line: NDArray[np.float64], task: PathFollow, p: RacingRules) 
 
 
 def _between(values: NDArray[np.float64], place: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the linear interpolation of values (R, K, D) at places (R,) in units of their index."""
+    """Return the linear interpolation of values (R, K, D) at places (R,) of their index, and beyond it the last one."""
+    place = np.clip(place, 0.0, values.shape[1] - 1.0)
     row, k = np.arange(len(place)), place.astype(int)
+    after = np.minimum(k + 1, values.shape[1] - 1)
     share = (place - k)[:, None]
-    between: NDArray[np.float64] = values[row, k] * (1.0 - share) + values[row, k + 1] * share
+    between: NDArray[np.float64] = values[row, k] * (1.0 - share) + values[row, after] * share
     return between
 
 
