@@ -14,8 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import norm as normal
-from scipy.stats import t as student
+from scipy.special import ndtri, stdtrit  # scipy.stats takes a second to import
 
 from flockenv.evaluation.episodes import RESAMPLES, Interval
 
@@ -76,7 +75,7 @@ def _resampled_means(rows: Floats, worlds: Floats, generator: np.random.Generato
 
 def _stretch(seeds: int) -> float:
     """Return the factor by which distances between seeds are stretched."""
-    return float(student.ppf(0.975, seeds - 1) / normal.ppf(0.975) * np.sqrt(seeds / (seeds - 1)))
+    return float(stdtrit(seeds - 1, 0.975) / ndtri(0.975) * np.sqrt(seeds / (seeds - 1)))
 
 
 def _interval(value: float, drawn: Floats) -> Interval:
