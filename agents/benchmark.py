@@ -16,7 +16,7 @@ import typer
 
 from agents.compare import JOBS, ROOT, folder_of, provenance, write_text
 from agents.play import NAME
-from agents.report import grid
+from agents.report import grid, json_text
 from agents.scores import THRESHOLDS, Aggregate, aggregate
 from agents.study import Study, contenders_of, settings_of
 from agents.study_results import RANDOM, SettingResults, TaskResults, kind_of, read_task
@@ -114,8 +114,8 @@ def table(entries: Sequence[Mapping[str, Any]]) -> str:
 
 TITLE = "# Leaderboard"
 NOTES = f"""\
-Score: 0 = random actions, 1 = tuned rules; interquartile mean over tasks (*home*), or over all settings of
-configs/studies/robustness.yaml (*robust*), with the 95 % stratified bootstrap interval over training seeds and worlds.
+Score: 0 = random actions, 1 = tuned rules; interquartile mean over tasks (*home*), or over all settings of the
+study (*robust*), with the 95 % stratified bootstrap interval over training seeds and worlds.
 *Higher than rules*: probability of a higher return than tuned rules in the same world. A player below {LEAST:g} does
 not solve the tasks. With one seed, the interval does not contain the luck of training. `python -m agents.benchmark
 PLAYER --out docs/leaderboard` adds an entry; its JSON file has the scores of each task, the performance profile, and
@@ -180,7 +180,7 @@ def main(
             contents = sweep(plan, list(plan.tasks), work, choose=False)
         results = [read_task(content) for content in contents.values()]
         entry = entry_of(called, player, plan_digest(load(study, Study)), results, contents)
-        text = json.dumps(entry, indent=1, allow_nan=False) + "\n"
+        text = json_text(entry)
         write_all_or_none(page.parent, {
             f"{folder.name}/{called}.json": lambda path: write_text(path, text),
             page.name: lambda path: write_text(path, table([*others, entry])),

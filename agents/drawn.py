@@ -52,10 +52,12 @@ def drawn_settings(task: Task, disturbance: Disturbance, draw: Mapping[str, Sequ
 
 def _drawn(task: Task, disturbance: Disturbance, values: Mapping[str, Any]) -> Drawn:
     text = ", ".join(f"{name} {value}" for name, value in values.items())
+    own = {name: getattr(task, name) for name in type(task).model_fields if name != "scene"}
+    given = {name: value for name, value in own.items() if value != _default(task, name)}
     of_task = {name: value for name, value in values.items() if name not in Disturbance.model_fields}
     others = {name: value for name, value in values.items() if name in Disturbance.model_fields}
     try:
-        new = type(task)(**{**task.model_dump(exclude_unset=True, exclude={"scene"}), **of_task}) if of_task else task
+        new = type(task)(**{**given, **of_task}) if of_task else task
         disturbed = Disturbance(**{**disturbance.model_dump(), **others})
         disturbed.check(new)
     except ValueError as error:
@@ -64,6 +66,11 @@ def _drawn(task: Task, disturbance: Disturbance, values: Mapping[str, Any]) -> D
     if sizes[0] != sizes[1]:
         raise ValueError(f"ppo.draw ({text}): observations have other slots than with the task's own arguments")
     return text, new, disturbed
+
+
+def _default(task: Task, name: str) -> Any:
+    """Return the default of a task's argument, which may follow from others: all agents are learners."""
+    return type(task).model_fields[name].get_default(call_default_factory=True, validated_data=dict(task))
 
 
 def hybrid_of(task: Task, p: PpoSettings) -> Hybrid | None:

@@ -30,7 +30,7 @@ class DrawnVecEnv(VecEnv):
         self.parts, self.names = list(parts.values()), list(parts)
         first = self.parts[0]
         self.task: Task = first.get_attr("task", 0)[0]
-        self._is_hybrid = hasattr(first, "go_on")
+        self._is_hybrid = hasattr(first, "resume")
         rows = [part.num_envs for part in self.parts]
         self._ends = np.cumsum(rows)[:-1]
         self.render_mode = None
@@ -69,13 +69,13 @@ class DrawnVecEnv(VecEnv):
         """Return what rules of hybrids remember in all settings, as arrays."""
         return [array for part in self.parts for array in part.memory()] if self._is_hybrid else []
 
-    def go_on(self, rows: NDArray[np.float32], begins: NDArray[np.bool_], memory: list[NDArray[Any]]) -> None:
+    def resume(self, rows: NDArray[np.float32], begins: NDArray[np.bool_], memory: list[NDArray[Any]]) -> None:
         """Go on from the last observations of a checkpoint, the rows whose episode begins, and `memory`."""
         if self._is_hybrid:
             memories = [[array] for array in memory] or [[] for _ in self.parts]
             shares = zip(self.parts, np.split(rows, self._ends), np.split(begins, self._ends), memories, strict=True)
             for part, *share in shares:
-                part.go_on(*share)
+                part.resume(*share)
 
     def close(self) -> None:
         """Close all environments."""

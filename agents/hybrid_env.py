@@ -37,7 +37,7 @@ class HybridVecEnv(VecEnvWrapper):
         """Return what the rules remember, as arrays: none, or one."""
         return [] if self._state is None else [np.asarray(self._state)]
 
-    def go_on(self, rows: NDArray[np.float32], begins: NDArray[np.bool_], memory: list[NDArray[Any]]) -> None:
+    def resume(self, rows: NDArray[np.float32], begins: NDArray[np.bool_], memory: list[NDArray[Any]]) -> None:
         """Go on from the last observations of a checkpoint, the rows whose episode begins, and `memory`."""
         self._rows, self._begins = rows.copy(), begins.copy()
         self._state = memory[0].copy() if memory else None

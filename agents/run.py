@@ -13,6 +13,7 @@ from pydantic import Field
 
 from agents import checkpoint as files
 from agents.checkpoint import CheckpointError, CheckpointParts
+from agents.drawn import drawn_settings
 from agents.experiment import Experiment
 from flockenv.core.errors import KeyPath, key_path, printable
 from flockenv.core.record import ResultRecord
@@ -130,9 +131,11 @@ def load_checkpoint(experiment: Experiment, folder: Path, state: tuple[str, ...]
 def expected_bytes(experiment: Experiment) -> int:
     """Return the approximate size of an experiment's checkpoint, bytes: worlds, networks and moments of Adam."""
     task, p = experiment.build(), experiment.ppo
+    settings = drawn_settings(task, p.disturbance, p.draw)
+    each = [drawn.scene.bytes_per_world() + 4 * drawn.learners * task.layout.size for _, drawn, _ in settings]
     sizes = (task.layout.size, *p.hidden, task.action_layout.size)
     weights = 24 * sum(a * b for a, b in pairwise(sizes))  # of two networks: weights and two moments of each, float32
-    return p.worlds * (task.scene.bytes_per_world() + 4 * task.learners * task.layout.size) + weights + 2**20
+    return p.worlds * sum(each) // len(each) + weights + 2**20
 
 
 def _compare(kept: dict[str, Any], wanted: dict[str, Any], folder: Path) -> None:

@@ -20,6 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.experiment import Experiment
+from agents.play import PLAYING
+from flockenv.envs.world import bytes_per_world, first_step
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.jobs import Job, Work, records, run_jobs
 from flockenv.players.rules import PLAYERS, RulesPlayer, as_dict
@@ -102,7 +104,8 @@ class Play:
 def play_job(task: Task, name: str, values: Parameters, worlds: int, first: int) -> Job:
     """Return the job that plays the worlds first, first + 1, ... with parameters; its record is read by `_play_of`."""
     about = [type(task).__name__, task.model_dump(mode="json"), values, worlds, first]
-    return Job(f"tune/{task.name}/{name}/{worlds}-worlds", _play, (task, name, values, worlds, first), about)
+    title, memory = f"tune/{task.name}/{name}/{worlds}-worlds", PLAYING + worlds * bytes_per_world(task)
+    return Job(title, _play, (task, name, values, worlds, first), about, memory, (first_step, (task,)))
 
 
 def _play(task: Task, name: str, values: Parameters, worlds: int, first: int) -> bytes:
@@ -242,7 +245,7 @@ class Search:
     def _first_world(self) -> int:
         """Return the first world of this generation: after the common ones, in the block of the search's seed."""
         s = self.settings
-        after = max(s.final_worlds, self.evaluate_worlds) + self.generation * s.worlds
+        after = self.evaluate_worlds + s.final_worlds + self.generation * s.worlds
         return worlds_for("tuning", self.seed, after + s.worlds) + after
 
 

@@ -26,7 +26,7 @@ from typing import Any
 
 from pydantic import Field, model_validator
 
-from agents.experiment import CONFIGS, Experiment, load_experiment
+from agents.compare import experiment_of
 from agents.play import NAME, Player
 from flockenv.core.errors import key_path, nearest, printable
 from flockenv.core.record import Record
@@ -36,7 +36,7 @@ from flockenv.evaluation import WORLDS_PER_SEED
 from flockenv.players import NAMES, other_tasks
 from flockenv.tasks import TASKS, Task
 
-__all__ = ["HOME", "Contender", "Setting", "Study", "contenders_of", "settings_of"]
+__all__ = ["HOME", "Contender", "Setting", "Study", "contenders_of", "setting_name", "settings_of"]
 
 HOME = "home"
 """The setting of a task that its players were made for."""
@@ -105,8 +105,8 @@ class Setting:
 
     @property
     def name(self) -> str:
-        """Return "agents=4", or "home"."""
-        return f"{self.axis}={self.value}" if self.value else self.axis
+        """The text of what is varied, "agents=4", or "home"."""
+        return setting_name(self.axis, self.value)
 
 
 @dataclass(frozen=True)
@@ -115,6 +115,11 @@ class Contender:
 
     name: str
     members: tuple[Player, ...]
+
+
+def setting_name(axis: str, value: str) -> str:
+    """Return "agents=4", or "home", which has no value."""
+    return f"{axis}={value}" if value else axis
 
 
 def settings_of(study: Study, name: str, changes: Mapping[str, Any] | None = None) -> list[Setting]:
@@ -126,9 +131,7 @@ def settings_of(study: Study, name: str, changes: Mapping[str, Any] | None = Non
         ValueError: in one line, a value under `tasks` that the task does not accept, or a name that it does not have.
             Values under `everywhere` that it does not accept, and unstable time steps, are left out.
     """
-    path = CONFIGS / f"{name}.yaml"
-    experiment = load_experiment(path) if path.is_file() else Experiment(task=name)
-    always = {**experiment.arguments, **(changes or {})}
+    always = {**experiment_of(name).arguments, **(changes or {})}
     found = [_setting(name, HOME, "", always, {})]
     for axis, values in study.tasks[name].items():
         found += [_setting(name, axis, _text(value), always, _changes(axis, value)) for value in values]

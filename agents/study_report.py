@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 from agents.report import grid
 from agents.study import HOME, Study
@@ -23,11 +22,11 @@ seed: 95 % Wilson. A dash: the player cannot read the observations of that setti
 for all tasks is left out where a task does not accept it or its time step is unstable."""
 
 
-def markdown(study: Study, path: Path, tasks: Sequence[TaskResults], folder: str) -> str:
-    """Return the page as Markdown; folder: that of the pictures, as links name it."""
+def markdown(study: Study, command: str, tasks: Sequence[TaskResults], folder: str) -> str:
+    """Return the page as Markdown; command: that makes it; folder: that of the pictures, as links name it."""
     parts = [
         f"# {study.title}",
-        f"{_sentence(tasks)} Made by `python -m agents.sweep {path.as_posix()}`, {study.worlds} worlds per setting.",
+        f"{_sentence(tasks)} Made by `{command}`, {study.worlds} worlds per setting.",
         f"![Which kind of player is ahead in which setting]({folder}/summary.png)",
         NOTES,
         "## Settings in which a kind of player is ahead",

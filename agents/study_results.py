@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import functools
 import json
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.study import HOME
+from agents.study import HOME, setting_name
 from flockenv.core.errors import nearest
 from flockenv.envs.disturbance import Disturbance
 from flockenv.evaluation import Interval, lead_interval, mean_interval, proportion
@@ -28,7 +27,7 @@ from flockenv.players.policy import MlpPolicy, Policy, RandomPolicy
 
 __all__ = [
     "ALONE", "GROUPS", "KINDS", "LEVEL", "RANDOM", "Score", "SettingResults", "TaskResults", "group_of", "kind_of",
-    "read_file", "read_task", "text_of",
+    "read_file", "read_task",
 ]  # fmt: skip
 
 KINDS = ("rules", "policy", "hybrid", "planner")
@@ -75,7 +74,7 @@ class Score:
     kind: str
     returns: Floats
     success: NDArray[np.bool_]
-    tuning_mean: float
+    tuning_mean: float | None  # None: no other player of its kind was in the setting
 
     @functools.cached_property
     def mean(self) -> Interval:
@@ -101,8 +100,8 @@ class SettingResults:
 
     @property
     def name(self) -> str:
-        """Return "agents=4", or "home"."""
-        return f"{self.axis}={self.value}" if self.value else self.axis
+        """The text of what is varied, as `Setting.name`."""
+        return setting_name(self.axis, self.value)
 
     @functools.cached_property
     def leaders(self) -> dict[str, str]:
@@ -111,8 +110,14 @@ class SettingResults:
         for kind in KINDS:
             names = [name for name, score in self.scores.items() if score.kind == kind]
             if names:
-                found[kind] = max(names, key=lambda name: self.scores[name].tuning_mean)
+                found[kind] = names[0] if len(names) == 1 else max(names, key=self._tuning_mean)
         return found
+
+    def _tuning_mean(self, name: str) -> float:
+        mean = self.scores[name].tuning_mean
+        if mean is None:
+            raise ValueError(f"{self.name}, {name}: tuning_mean is missing, as other players of its kind have played")
+        return mean
 
     @functools.cached_property
     def leads(self) -> dict[str, Interval]:
@@ -179,12 +184,6 @@ def read_task(content: Mapping[str, Any]) -> TaskResults:
 def _score(player: Mapping[str, Any]) -> Score:
     success = np.array([[mark == "1" for mark in row] for row in player["success"]])
     return Score(player["kind"], np.array(player["returns"], float), success, player["tuning_mean"])
-
-
-def text_of(content: Mapping[str, Any]) -> str:
-    """Return the content of a task's file as JSON with lists of numbers on one line each."""
-    text = json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False)
-    return re.sub(r"\[\s+([-+.\deE,\s]*?)\s+\]", lambda m: f"[{' '.join(m[1].split())}]", text) + "\n"
 
 
 def read_file(path: Path) -> dict[str, Any] | None:

@@ -22,8 +22,9 @@ from rich.console import Console
 
 from agents.compare import JOBS, folder_of, pick, provenance, split, write_text
 from agents.play import Player, episodes_of_bytes, play_job
+from agents.report import json_text
 from agents.study import Contender, Setting, Study, contenders_of, settings_of
-from agents.study_results import RANDOM, TaskResults, kind_of, read_file, read_task, text_of
+from agents.study_results import RANDOM, TaskResults, kind_of, read_file, read_task
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
 from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
@@ -191,8 +192,6 @@ def main(
         fixed = _changes(changes or [], plan)
         folder = folder_of(out, (SUMMARY, *(f"{name}.{end}" for name in names for end in ("json", "png"))))
         page = valid_file(f"{folder}.md", (".md",), force=True)
-        for name in names:
-            settings_of(plan, name, fixed.get(name)), contenders_of(plan, name)
         before = {name: read_file(folder / f"{name}.json") for name in plan.tasks}
         runner, part = engine_of(engine, processes), shard_of(shard)
         if check and part is not None:
@@ -207,7 +206,7 @@ def main(
         digest = plan_digest(plan, fixed)
         others = {name: each for name, each in before.items() if each is not None and each["plan"] == digest}
         found = {name: read_task(content) for name, content in {**others, **contents}.items()}
-        _publish(page, plan, study, found)
+        _publish(page, plan, _command(study, out, changes or []), found)
     for name in names:
         typer.echo(f"{folder / name}.json, .png: written")
     typer.echo(f"{page}: written")
@@ -228,13 +227,19 @@ def _changes(texts: Sequence[str], study: Study) -> dict[str, dict[str, Any]]:
 
 def _write(folder: Path, contents: Mapping[str, Content]) -> None:
     """Write the files of the tasks, all or none."""
-    texts = {name: text_of(content) for name, content in contents.items()}
+    texts = {name: json_text(content) for name, content in contents.items()}
     write_all_or_none(folder, {
         f"{name}.json": functools.partial(write_text, text=text) for name, text in texts.items()
     })  # fmt: skip
 
 
-def _publish(page: Path, study: Study, path: Path, found: Mapping[str, TaskResults]) -> None:
+def _command(study: Path, out: str, changes: Sequence[str]) -> str:
+    """Return the command that makes the page."""
+    options = [f"--out {out}", *(f"--set {text}" for text in changes)]
+    return f"python -m agents.sweep {study.as_posix()} {' '.join(options)}"
+
+
+def _publish(page: Path, study: Study, command: str, found: Mapping[str, TaskResults]) -> None:
     """Write the page, and the pictures of all tasks that have results in the folder of the same name."""
     from agents.study_chart import draw_map, draw_summary
     from agents.study_report import markdown
@@ -244,7 +249,7 @@ def _publish(page: Path, study: Study, path: Path, found: Mapping[str, TaskResul
         f"{folder}/{name}.png": functools.partial(draw_map, results=results) for name, results in found.items()
     }
     writers[f"{folder}/{SUMMARY}"] = functools.partial(draw_summary, results=list(found.values()), title=study.title)
-    text = markdown(study, path, list(found.values()), folder)
+    text = markdown(study, command, list(found.values()), folder)
     writers[page.name] = lambda target: write_text(target, text)
     write_all_or_none(page.parent, writers)
 

@@ -15,14 +15,14 @@ from flockenv.tasks import Task
 __all__ = ["learning_env"]
 
 
-def learning_env(task: Task, p: PpoSettings, shows: type[WorldVecEnv] = WorldVecEnv) -> VecEnv:
+def learning_env(task: Task, p: PpoSettings, env_class: type[WorldVecEnv] = WorldVecEnv) -> VecEnv:
     """Return the worlds of a training; each drawn setting has an equal share of `p.worlds`."""
     settings = drawn_settings(task, p.disturbance, p.draw)
     parts: dict[str, VecEnvWrapper] = {}
     for name, drawn, disturbance in settings:
         learned = drawn.model_copy(update={"dtype": p.dtype})
         share = p.worlds // len(settings)
-        envs = shows(learned, share, leaving=not task.ends_together, disturbance=disturbance)
+        envs = env_class(learned, share, leaving=not task.ends_together, disturbance=disturbance)
         parts[name] = ForLearning(envs, p.reward_scale, p.stagger, p.hold)
         if (hybrid := hybrid_of(drawn, p)) is not None:
             parts[name] = HybridVecEnv(parts[name], hybrid)

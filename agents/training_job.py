@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from agents.drawn import drawn_settings
 from agents.experiment import Experiment
 from agents.run import recipe_of
 from flockenv.envs.world import bytes_per_world, first_step
@@ -50,7 +51,9 @@ def _memory(experiment: Experiment, task: Task) -> int:
     """Return the memory of a training, bytes: libraries, worlds, and the rollout twice, as minibatches are drawn."""
     p = experiment.ppo
     row = 4 * (task.layout.size + task.action_layout.size + 6)  # float32: also rewards, values and the like
-    return TRAINING + p.worlds * (bytes_per_world(task) + 2 * p.rollout * task.learners * row)
+    drawn = [each for _, each, _ in drawn_settings(task, p.disturbance, p.draw)]
+    of_worlds = [bytes_per_world(each) + 2 * p.rollout * each.learners * row for each in drawn]
+    return TRAINING + p.worlds * sum(of_worlds) // len(of_worlds)
 
 
 def file_name(job: Job) -> str:

@@ -90,7 +90,7 @@ def _worlds(model: PPO) -> list[World]:
 def _memory(model: PPO) -> list[NDArray[Any]]:
     """Return what the rules of a hybrid remember."""
     env: Any = model.env
-    return list(env.memory()) if hasattr(env, "go_on") else []
+    return list(env.memory()) if hasattr(env, "resume") else []
 
 
 def _arrays(model: PPO) -> Tensors:
@@ -140,9 +140,9 @@ def _write_into(model: PPO, parts: CheckpointParts) -> None:
     rollout = parts["rollout"]
     model._last_obs, model._last_episode_starts = rollout["observation"], rollout["starts"]
     env: Any = model.env
-    if hasattr(env, "go_on"):
+    if hasattr(env, "resume"):
         memory = [rollout[f"memory.{k}"] for k in range(len(_memory(model)))]
-        env.go_on(rollout["observation"], rollout["starts"], memory)
+        env.resume(rollout["observation"], rollout["starts"], memory)
     _seed_generators(model, json.loads(parts["random"][JSON].tobytes()))
     torch.set_rng_state(torch.from_numpy(parts["random"]["torch"]))
 

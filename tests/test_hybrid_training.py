@@ -12,9 +12,10 @@ from agents.drawn import check_settings, drawn_settings, hybrid_of
 from agents.drawn_env import DrawnVecEnv
 from agents.experiment import Experiment, PpoSettings
 from agents.ppo import export, train
-from agents.run import recipe_of
+from agents.run import expected_bytes, recipe_of
 from agents.training import card_of, score
 from agents.training_env import learning_env
+from agents.training_job import training_job
 from flockenv.envs.disturbance import Disturbance
 from flockenv.envs.sb3 import WorldVecEnv
 from flockenv.evaluation import rollout, worlds_for
@@ -158,3 +159,19 @@ def test_an_untrained_residual_is_near_its_rules(tmp_path: Path) -> None:
     start = train(each, tmp_path).curve[0]["mean"]
     rules = rollout(Pursuit(), load_player("rules", Pursuit()), 16, worlds_for("tuning", 0, 16)).returns.mean()
     assert start == pytest.approx(rules, abs=0.5)
+
+
+def test_memory_is_stated_for_all_drawn_settings(tmp_path: Path) -> None:
+    home = experiment("flock", worlds=64)
+    drawn = experiment("flock", worlds=64, draw={"agents": (24, 384)})
+    assert expected_bytes(drawn) > 1.5 * expected_bytes(home)
+    assert training_job(drawn, tmp_path).memory > training_job(home, tmp_path).memory
+
+
+@pytest.mark.parametrize(("name", "draw"), [("flock", {"agents": (8, 24)}), ("crossing", {"agents": (4, 12)})])
+def test_drawn_settings_keep_the_other_arguments(name: str, draw: dict[str, Any]) -> None:
+    task = experiment(name, {"integrator": {"kind": "velocity_verlet"}, "max_speed": 1.5}).build()
+    for learned in (task, task.model_copy(update={"dtype": "float32"})):
+        for (_, drawn, _), count in zip(drawn_settings(learned, Disturbance(), draw), draw["agents"], strict=True):
+            changed = {key for key in type(task).model_fields if getattr(drawn, key) != getattr(learned, key)}
+            assert changed <= {"agents", "learners", "scene"} and drawn.learners == count

@@ -11,8 +11,9 @@ import pytest
 from scipy.stats import t as student
 from typer.testing import CliRunner
 
+from agents.report import json_text
 from agents.study import HOME, Study, contenders_of, settings_of
-from agents.study_results import ALONE, LEVEL, Score, SettingResults, kind_of, read_file, read_task, text_of
+from agents.study_results import ALONE, LEVEL, Score, SettingResults, kind_of, read_file, read_task
 from agents.sweep import app, sweep
 from flockenv.evaluation import bootstrap, lead_interval, mean_interval, worlds_for
 from flockenv.jobs import Store, Work
@@ -202,7 +203,7 @@ def test_a_player_that_cannot_read_a_setting_is_left_out_of_it(tmp_path: Path) -
 
 
 def test_returns_are_those_of_the_held_out_worlds(played: dict[str, Any]) -> None:
-    results = read_task(json.loads(text_of(played)))
+    results = read_task(json.loads(json_text(played)))
     assert [each.axis for each in results.settings] == ["home", "size", "noise"]
     assert results.home == {"size": 20}
     home = results.settings[0].scores["ppo"]
@@ -252,7 +253,7 @@ def test_the_command_writes_and_checks(tmp_path: Path, monkeypatch: pytest.Monke
     for setting in content["settings"]:
         for player in setting["players"].values():
             player["returns"][0][0] += 1
-    Path("out/pursuit.json").write_text(text_of(content))
+    Path("out/pursuit.json").write_text(json_text(content))
     wrong = CliRunner().invoke(app, ["study.yaml", "--out", "out", "--check", "1", "--processes", "1"])
     assert wrong.exit_code == 1
     assert "2 of 3 worlds equal" in wrong.output

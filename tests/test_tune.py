@@ -132,7 +132,8 @@ def test_candidates_of_a_generation_play_the_same_worlds_which_no_other_generati
             (first,) = {job.arguments[4] for job in jobs}
             worlds.append(set(range(first, first + jobs[0].arguments[3])))
             each.generation += 1
-    worlds.append({job.arguments[4] + k for job in one.ask()[:1] for k in range(3)})  # the common ones
+    last = [job.arguments for job in one.ask_last()[:2]]  # of the curve, and of the final choice
+    worlds += [set(range(first, first + count)) for *_, count, first in last]
     assert sum(len(each) for each in worlds) == len(set().union(*worlds))
 
 
