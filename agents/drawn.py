@@ -2,6 +2,10 @@
 
 `ppo.draw: {agents: [4, 8, 16, 32], noise: [0, 0.05]}` trains in all eight combinations; each has an equal share of the
 worlds. Domain randomisation: Tobin et al. 2017, arXiv 1703.06907. The rows must have the same slots in every setting.
+
+A price of harm (flockenv/tasks/price.py) would let the settings with high prices drown the others, as their rewards
+are larger. So the rewards of a setting are multiplied by 2 / (1 + price) while learning, also where a policy is chosen:
+harm and all else then have weights of a constant sum, as in Abels et al. 2019, arXiv 1809.07803.
 """
 
 from __future__ import annotations
@@ -22,7 +26,7 @@ from flockenv.players.hybrid import FORCE, Hybrid, HybridPolicy
 from flockenv.players.policy import MlpPolicy
 from flockenv.tasks import Task
 
-__all__ = ["MOST_SETTINGS", "Drawn", "check_settings", "drawn_settings", "hybrid_of", "played_returns"]
+__all__ = ["MOST_SETTINGS", "Drawn", "check_settings", "drawn_settings", "hybrid_of", "played_returns", "reward_weight"]
 
 MOST_SETTINGS = 64
 """Combinations of drawn values."""
@@ -78,11 +82,20 @@ def hybrid_of(task: Task, p: PpoSettings) -> Hybrid | None:
     return None if p.action == FORCE else Hybrid.of(task, p.action, p.base, p.bound)
 
 
+def reward_weight(task: Task) -> float:
+    """Return the factor on the rewards of a setting while learning: 1, or less for a high price of harm."""
+    price = getattr(task, "price", None)
+    return 1.0 if price is None else 2.0 / (1.0 + price)
+
+
 def check_settings(experiment: Experiment) -> None:
     """Raise ValueError, in one line, for settings that cannot be trained."""
     task, p = experiment.build(), experiment.ppo
     hybrid_of(task, p)
-    count = len(drawn_settings(task, p.disturbance, p.draw))
+    settings = drawn_settings(task, p.disturbance, p.draw)
+    count, learners = len(settings), {drawn.learners for _, drawn, _ in settings}
+    if p.care and len(learners) > 1:
+        raise ValueError(f"ppo.draw: the number of learners must not vary with care, not {sorted(learners)}")
     if count > min(p.worlds, p.evaluate_worlds):
         raise ValueError(f"ppo.draw: {count} combinations need as many ppo.worlds and ppo.evaluate_worlds at least")
 
@@ -90,14 +103,17 @@ def check_settings(experiment: Experiment) -> None:
 def played_returns(
     task: Task, p: PpoSettings, tensors: Mapping[str, NDArray[Any]]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return returns and successes of a policy, without noise, on the tuning worlds: equal shares of drawn settings."""
+    """Return returns, with the weight of each setting, and successes of a policy on the tuning worlds, without noise.
+
+    Each drawn setting has an equal share of the worlds.
+    """
     settings, returns, success = drawn_settings(task, p.disturbance, p.draw), [], []
     worlds = p.evaluate_worlds // len(settings)
     for _, drawn, disturbance in settings:
         make = functools.partial(make_world, disturbance=disturbance)
         policy, first = _policy(drawn, p, tensors), worlds_for("tuning", p.seed, worlds)
         episodes = rollout(drawn, policy, worlds, first, make_world=make)
-        returns.append(episodes.returns)
+        returns.append(reward_weight(drawn) * episodes.returns)
         success.append(episodes.success)
     return np.concatenate(returns), np.concatenate(success)
 

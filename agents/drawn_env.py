@@ -41,6 +41,11 @@ class DrawnVecEnv(VecEnv):
         """The worlds of all settings."""
         return [part.get_attr("world", 0)[0] for part in self.parts]
 
+    @property
+    def acted(self) -> NDArray[np.bool_]:
+        """(rows,): True for rows whose learner acted in the last step."""
+        return np.concatenate([part.acted for part in self.parts])
+
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed all settings with the same worlds' seeds."""
         return [row for part in self.parts for row in part.seed(seed)]

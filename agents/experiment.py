@@ -101,7 +101,7 @@ class PpoSettings(Record):
     def _parts_fit(self) -> PpoSettings:
         """Raise ValueError for settings that exclude each other."""
         for name, value in (("care", self.care), ("central_critic", self.central_critic), ("taught", self.taught)):
-            if self.draw and value:
+            if self.draw and value and name != "care":
                 raise ValueError(f"draw: not together with {name}")
             if self.action != "force" and value and name != "care":
                 raise ValueError(f"action = {self.action!r}: not together with {name}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from agents.drawn import drawn_settings, hybrid_of
+from agents.drawn import drawn_settings, hybrid_of, reward_weight
 from agents.drawn_env import DrawnVecEnv
 from agents.experiment import PpoSettings
 from agents.hybrid_env import HybridVecEnv
@@ -23,7 +23,7 @@ def learning_env(task: Task, p: PpoSettings, env_class: type[WorldVecEnv] = Worl
         learned = drawn.model_copy(update={"dtype": p.dtype})
         share = p.worlds // len(settings)
         envs = env_class(learned, share, leaving=not task.ends_together, disturbance=disturbance)
-        parts[name] = ForLearning(envs, p.reward_scale, p.stagger, p.hold)
+        parts[name] = ForLearning(envs, p.reward_scale * reward_weight(drawn), p.stagger, p.hold)
         if (hybrid := hybrid_of(drawn, p)) is not None:
             parts[name] = HybridVecEnv(parts[name], hybrid)
     return DrawnVecEnv(parts) if len(parts) > 1 else next(iter(parts.values()))

@@ -64,7 +64,7 @@ def test_bad_draws_are_refused(draw: dict[str, Any], text: str) -> None:
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"draw": {"agents": (4,)}, "care": 1.0}, "draw: not together with care"),
+        ({"draw": {"agents": (4,)}, "central_critic": True}, "draw: not together with central_critic"),
         ({"draw": {"agents": (4,)}, "taught": 1}, "draw: not together with taught"),
         ({"action": "residual", "central_critic": True}, "action = 'residual': not together with central_critic"),
         ({"action": "residul"}, "action = 'residul'"),

@@ -33,6 +33,7 @@ from flockenv.tasks.observations import (
     write_neighbour,
     write_vector,
 )
+from flockenv.tasks.price import price_field, price_numbers, price_slots, write_price
 from flockenv.tasks.task import Frame, Task
 
 __all__ = ["Bottleneck"]
@@ -141,8 +142,8 @@ def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any
             pressure = np.float64(after.memory[0, i])
             terms[i, at.progress] = p.progress_reward * (_exit_distance(p, before, i) - _exit_distance(p, after, i))
             terms[i, at.out] = p.out_reward if after.memory[2, i] > 0.0 else 0.0
-            terms[i, at.pressed] = -p.press_cost * min(pressure / p.limit, 1.0) * p.control_dt
-            terms[i, at.hurt] = -p.hurt_cost * p.control_dt if pressure > p.limit else 0.0
+            terms[i, at.pressed] = -p.press_cost * min(pressure / p.limit, 1.0) * p.control_dt * p.price
+            terms[i, at.hurt] = -p.hurt_cost * p.control_dt * p.price if pressure > p.limit else 0.0
             terms[i, at.time] = -p.time_cost * p.control_dt
 
 
@@ -220,6 +221,7 @@ def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
             distance = max(math.sqrt(to[0] * to[0] + to[1] * to[1]), 1e-9)
             write_neighbour(row, at, s, to, relative, axis, one / p.sight, 0.5 * one / p.max_speed)
             write_crowding(row, at, s, to, axis, distance, distance - 2.0 * _RADIUS, p.near)
+        write_price(p, row)
 
 
 class Bottleneck(Task):
@@ -242,6 +244,8 @@ class Bottleneck(Task):
     metric_names: ClassVar[tuple[str, ...]] = (
         "share_out", "evacuation_time", "specific_flow", "contact_time", "most_pressure", "hurt_time",
     )  # fmt: skip
+    priced: ClassVar[tuple[str, ...]] = ("pressed", "hurt")
+    harm: ClassVar[str] = "hurt"
     measures: ClassVar[tuple[str, ...]] = ("out", "first", "latest", "most", "touched", "hurt")
     memory: ClassVar[int] = 4
     keeps: ClassVar[bool] = True
@@ -271,6 +275,7 @@ class Bottleneck(Task):
     press_cost: float = Field(default=2.0, ge=0, description="per s at the pressure limit; in proportion below it")
     hurt_cost: float = Field(default=50.0, ge=0, description="per s above the pressure limit")
     time_cost: float = Field(default=0.5, ge=0, description="per s in the room")
+    price: float | None = price_field("`pressed` and `hurt`")
 
     @model_validator(mode="after")
     def _check_room(self) -> Bottleneck:
@@ -296,7 +301,7 @@ class Bottleneck(Task):
         """Return the fields, the grid of starting cells, and the parameters of scripted people."""
         columns, rows = self.cells
         cells = {"columns": float(columns), "rows": float(rows)}
-        return super().parameters() | cells | _MODEL.numbers
+        return super().parameters() | price_numbers(self.price) | cells | _MODEL.numbers
 
     @property
     def agents(self) -> int:
@@ -351,6 +356,7 @@ class Bottleneck(Task):
             Slot("to_sides", (2,), self.room, "m", "distance to the walls at y = 0 and y = room", low=0.0),
             Slot("pressure", (), self.limit, "N/m", "sum of the contact forces / circumference of the body", low=0.0),
             *neighbour_slots(self.neighbours, self.sight, 2 * self.max_speed, "people", crowding=True),
+            *price_slots(self.price),
         ))  # fmt: skip
 
     @functools.cached_property

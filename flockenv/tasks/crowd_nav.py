@@ -25,6 +25,7 @@ from flockenv.scene.presets import PRESETS
 from flockenv.steering.arbitration import Blend
 from flockenv.tasks.layout import Layout, Slot
 from flockenv.tasks.observations import local_components, neighbour_slots, write_crowding, write_neighbour, write_vector
+from flockenv.tasks.price import price_field, price_numbers, price_slots, write_price
 from flockenv.tasks.task import Frame, Task
 
 __all__ = ["CrowdNav"]
@@ -113,7 +114,7 @@ def reward(p: Any, at: Any, before: Frame, after: Frame, action: Any, terms: Any
     gap = np.float64(after.memory[4, 0])
     terms[0, at.progress] = p.progress_reward * (_goal_distance(before) - _goal_distance(after))
     terms[0, at.success] = p.success_reward if _arrives(p, after) else 0.0
-    terms[0, at.collision] = -p.collision_cost if gap < 0.0 else 0.0
+    terms[0, at.collision] = -p.collision_cost * p.price if gap < 0.0 else 0.0
     near = p.comfort_distance - gap if gap >= 0.0 else 0.0
     terms[0, at.discomfort] = -p.discomfort_cost * max(near, 0.0) * p.control_dt
     terms[0, at.time] = -p.time_cost * p.control_dt
@@ -171,6 +172,7 @@ def observe(p: Any, at: Any, frame: Frame, rows: Any) -> None:
         gap = distance - frame.radius[0] - frame.radius[j]
         write_neighbour(row, at, s, to, relative, course, one / p.sight, 0.25 * one / p.max_speed)
         write_crowding(row, at, s, to, course, distance, gap, p.near)
+    write_price(p, row)
 
 
 class CrowdNav(Task):
@@ -194,6 +196,8 @@ class CrowdNav(Task):
     metric_names: ClassVar[tuple[str, ...]] = (
         "collided", "timed_out", "time_to_goal", "path_length", "least_gap", "discomfort",
     )  # fmt: skip
+    priced: ClassVar[tuple[str, ...]] = ("collision",)
+    harm: ClassVar[str] = "collision"
     measures: ClassVar[tuple[str, ...]] = ("touch", "there", "walked", "gap", "near")
     memory: ClassVar[int] = 6
     keeps: ClassVar[bool] = True
@@ -224,6 +228,7 @@ class CrowdNav(Task):
     collision_cost: float = Field(default=5.0, ge=0, description="for a collision")
     discomfort_cost: float = Field(default=10.0, ge=0, description="per s and m below the comfort distance")
     time_cost: float = Field(default=0.2, ge=0, description="per s")
+    price: float | None = price_field("`collision`")
 
     @model_validator(mode="after")
     def _check_room(self) -> CrowdNav:
@@ -234,6 +239,10 @@ class CrowdNav(Task):
             least = 0.8 * n / (2 * math.pi * (1 - 2 * self.jitter))
             raise ValueError(f"circle = {self.circle:g} m has no room for {n} agents; at least {least:.3g}")
         return self
+
+    def parameters(self) -> dict[str, float]:
+        """Return the fields, and the price."""
+        return super().parameters() | price_numbers(self.price)
 
     @property
     def learners(self) -> int:
@@ -288,6 +297,7 @@ class CrowdNav(Task):
             Slot("velocity", (2,), self.max_speed, "m/s", "own velocity (along the course, to its left)"),
             Slot("goal", (2,), 3 * self.circle, "m", "offset of the goal"),
             *neighbour_slots(self.neighbours, self.sight, 4 * self.max_speed, "pedestrians", crowding=True),
+            *price_slots(self.price),
         ))  # fmt: skip
 
     @functools.cached_property

@@ -92,6 +92,10 @@ class Task(Record):
     name: ClassVar[str]
     terms: ClassVar[tuple[str, ...]]
     """Names of the reward terms, in order."""
+    priced: ClassVar[tuple[str, ...]] = ()
+    """The reward terms that its `price` multiplies; (): it has no price (tasks/price.py)."""
+    harm: ClassVar[str] = ""
+    """The one of them that is not 0 in a decision in which a learner is harmed."""
     metric_names: ClassVar[tuple[str, ...]]
     """Names of the numbers that `metrics` writes."""
     measures: ClassVar[tuple[str, ...]]
