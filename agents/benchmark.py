@@ -167,7 +167,7 @@ def main(
     with report_errors("benchmark", STOPPED, debug), end_of_shard():
         called = name or (player if player in NAMES else Path(player.replace("{task}", "").rstrip("*")).stem)
         if not NAME.fullmatch(called) or (called in (RANDOM, "rules") and called != player):
-            raise ValueError(f"--name {printable(called)}: a name is up to 40 letters, digits and _ . + -")
+            raise ValueError(f"--name {printable(called)}: a name is up to 40 letters, digits and _ . @ + -")
         plan = load(study, Study)
         plan = plan.model_copy(update={"players": {RANDOM: RANDOM, "rules": "rules", called: player}})
         folder = folder_of(out, (f"{called}.json",))

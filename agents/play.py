@@ -8,7 +8,7 @@ import re
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +22,17 @@ from flockenv.evaluation import Episodes, Purpose, Recording, rollout, worlds_fo
 from flockenv.jobs import Job, records
 from flockenv.model.appearance import Appearance
 from flockenv.model.snapshot import Mark, Snapshot
-from flockenv.players import NAMES, load_player, other_tasks
+from flockenv.players import ALL_SEEDS, NAMES, known_name, load_player, other_tasks, seeds_of_player
 from flockenv.players.files import SUFFIXES, PlayerError
 from flockenv.players.policy import Policy
 from flockenv.tasks import Task
 
 __all__ = [
-    "Player", "blame", "episodes_of_bytes", "play_job", "player_digest", "players_in_order", "players_of",
-    "usual_players",
+    "Player", "blame", "episodes_of_bytes", "members_of", "play_job", "player_digest", "players_in_order",
+    "players_of", "usual_players",
 ]  # fmt: skip
 
-NAME = re.compile(r"\w[\w.+-]{0,39}")
+NAME = re.compile(r"\w[\w.@+-]{0,39}")
 """A player's name becomes a key, a table cell, a label, a file and a piece of HTML."""
 
 PLAYING = 350 * 2**20
@@ -51,10 +51,14 @@ class Player:
 
     @classmethod
     def of(cls, spec: str) -> Player:
-        """Return a player; a file is named by its stem. Raise ValueError for a stem that is not valid in tables."""
-        name = Path(spec).stem if Path(spec).suffix.lower() in SUFFIXES else spec
+        """Return a player; a file is named by its stem, the players of all seeds without "@*".
+
+        Raises:
+            ValueError: a name that is not valid in tables.
+        """
+        name = Path(spec).stem if Path(spec).suffix.lower() in SUFFIXES else spec.removesuffix(ALL_SEEDS)
         if not NAME.fullmatch(name):
-            raise ValueError(f"--players {printable(spec)}: a name is up to 40 letters, digits and _ . + -")
+            raise ValueError(f"--players {printable(spec)}: a name is up to 40 letters, digits and _ . @ + -")
         return cls(spec, name)
 
     def policy(self, task: Task, seed: int, trust_pickle: bool = False) -> Policy:
@@ -112,8 +116,20 @@ def players_in_order(specs: Sequence[str]) -> list[Player]:
     names = [player.name for player in field]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice:
-        raise ValueError(f"--players: two players are called {twice!r}; rename a file")
-    return sorted(field, key=lambda player: NAMES.index(player.spec) if player.spec in NAMES else len(NAMES))
+        raise ValueError(f"--players: two players are called {twice!r}; rename a file, or name the player once")
+    return sorted(field, key=lambda player: _place(known_name(player.spec)))
+
+
+def _place(name: str | None) -> int:
+    return len(NAMES) if name is None else NAMES.index(name)
+
+
+def members_of(player: Player, task: str) -> tuple[Player, ...]:
+    """Return the players of all seeds for which NAME@* stands in a task, the one that ships first; else the player."""
+    if not player.spec.endswith(ALL_SEEDS) or (name := known_name(player.spec)) is None:
+        return (player,)
+    seeds = seeds_of_player(name, task)
+    return tuple(replace(player, spec=f"{name}@{seed}") for seed in seeds) or (replace(player, spec=name),)
 
 
 def play_job(
@@ -166,12 +182,12 @@ def player_digest(player: Player, task: Task, seed: int) -> str:
 
     These are the Python files in the folder of a Python file, and the card of a weights file.
     """
-    return _digest(player, player.policy(task, seed) if player.spec in NAMES else None)
+    return _digest(player, player.policy(task, seed) if known_name(player.spec) else None)
 
 
 def _digest(player: Player, policy: Policy | None) -> str:
     """Return the digest of a player; policy: its policy, which only a known name needs."""
-    if player.spec in NAMES:
+    if known_name(player.spec):
         weights = (getattr(policy, "card", None) or {}).get("sha256", "")
         return hashlib.sha256(f"{policy!r} {weights}".encode()).hexdigest()
     path, digest = Path(player.spec), hashlib.sha256()

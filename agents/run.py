@@ -21,7 +21,9 @@ from flockenv.players.hybrid import FORCE, Hybrid
 from flockenv.players.policy import MlpPolicy
 from flockenv.players.rules import as_dict, player
 
-__all__ = ["OtherRecipe", "Run", "expected_bytes", "load_checkpoint", "recipe_of", "save_checkpoint"]
+__all__ = [
+    "OtherRecipe", "Run", "expected_bytes", "first_difference", "load_checkpoint", "recipe_of", "save_checkpoint",
+]  # fmt: skip
 
 STATE = ("policy", "optimizer", "worlds", "rollout", "random")
 """The parts of a checkpoint that are the model's, see agents.training_state."""
@@ -140,11 +142,19 @@ def expected_bytes(experiment: Experiment) -> int:
 
 def _compare(kept: dict[str, Any], wanted: dict[str, Any], folder: Path) -> None:
     """Raise OtherRecipe, with the first key, if two recipes differ."""
-    of_kept, of_wanted = dict(_values_by_path(kept)), dict(_values_by_path(wanted))
-    for key in {**of_wanted, **of_kept}:
-        if of_kept.get(key) != of_wanted.get(key):
-            has, wants = (printable(of[key]) if key in of else "nothing" for of in (of_kept, of_wanted))
-            raise OtherRecipe(f"{key} = {wants}: the checkpoint in {folder} is of another recipe, with {has}")
+    if found := first_difference(kept, wanted):
+        key, has, wants = found
+        raise OtherRecipe(f"{key} = {wants}: the checkpoint in {folder} is of another recipe, with {has}")
+
+
+def first_difference(first: dict[str, Any], second: dict[str, Any]) -> tuple[str, str, str] | None:
+    """Return the key path of the first value in which two recipes differ, and the values; None if they are equal."""
+    of_first, of_second = dict(_values_by_path(first)), dict(_values_by_path(second))
+    for key in {**of_second, **of_first}:
+        if of_first.get(key) != of_second.get(key):
+            has, wants = (printable(of[key]) if key in of else "nothing" for of in (of_first, of_second))
+            return key, has, wants
+    return None
 
 
 def _fault(notes: Notes, times: Times, best: dict[str, np.ndarray], experiment: Experiment) -> str:

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -288,6 +288,16 @@ def _play_all(lists: Sequence[Sequence[Job]], work: Work) -> list[list[Play]]:
     return [[work.store.read(job, _play_of) for job in jobs] for jobs in lists]
 
 
-def median_of(found: Sequence[Found]) -> Found:
-    """Return the search with the median score on the common tuning worlds; the lower one of two in the middle."""
-    return sorted(found, key=lambda each: each.tuning_mean)[(len(found) - 1) // 2]
+class Scored(Protocol):
+    """A run with a score on tuning worlds."""
+
+    @property
+    def tuning_mean(self) -> float: ...
+
+
+Run = TypeVar("Run", bound=Scored)
+
+
+def median_of(runs: Sequence[Run]) -> Run:
+    """Return the run with the median score on tuning worlds; the lower one of two in the middle."""
+    return sorted(runs, key=lambda each: each.tuning_mean)[(len(runs) - 1) // 2]

@@ -2,7 +2,7 @@
 
     title: Players away from home
     worlds: 64
-    players: {random: random, rules: rules, ppo: ppo}
+    players: {random: random, rules: rules, ppo: "ppo@*"}
     everywhere:
       noise: [0.05]                # of every task: sensors and actions
     tasks:
@@ -27,13 +27,13 @@ from typing import Any
 from pydantic import Field, model_validator
 
 from agents.compare import experiment_of
-from agents.play import NAME, Player
+from agents.play import NAME, Player, members_of
 from flockenv.core.errors import key_path, nearest, printable
 from flockenv.core.record import Record
 from flockenv.core.warnings import UnstableStepWarning
 from flockenv.envs.disturbance import Disturbance
 from flockenv.evaluation import WORLDS_PER_SEED
-from flockenv.players import NAMES, other_tasks
+from flockenv.players import known_name, other_tasks
 from flockenv.tasks import TASKS, Task
 
 __all__ = ["HOME", "Contender", "Setting", "Study", "contenders_of", "setting_name", "settings_of"]
@@ -57,8 +57,8 @@ class Study(Record):
     seed: int = Field(default=0, ge=0, lt=1000, description="block of the evaluation and tuning worlds")
     players: dict[str, str] = Field(
         min_length=1,
-        description="players by name: a known name or a file; with {task} in place of the task's name, and * for the"
-        " files of several training seeds",
+        description="players by name: a known name, with @3 for the run of that seed and @* for those of all seeds; or"
+        " a file, with {task} in place of the task's name and * for the files of several training seeds",
     )
     everywhere: dict[str, tuple[Value, ...]] = Field(
         default_factory=dict,
@@ -77,7 +77,7 @@ class Study(Record):
                 )
         for name in self.players:
             if not NAME.fullmatch(name):
-                raise ValueError(f"{key_path(('players', name))}: a name is up to 40 letters, digits and _ . + -")
+                raise ValueError(f"{key_path(('players', name))}: a name is up to 40 letters, digits and _ . @ + -")
         return self
 
     @model_validator(mode="after")
@@ -111,7 +111,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Contender:
-    """A player of a study: one, or the same with several training seeds."""
+    """A player of a study: one, or the same with several training or search seeds."""
 
     name: str
     members: tuple[Player, ...]
@@ -188,9 +188,9 @@ def contenders_of(study: Study, task: str) -> list[Contender]:
 
 def _contenders(players: Mapping[str, str], task: str) -> Iterator[Contender]:
     for name, spec in players.items():
-        if spec in NAMES:
+        if known_name(spec):
             if not other_tasks(spec, task):
-                yield Contender(name, (Player(spec, name),))
+                yield Contender(name, members_of(Player(spec, name), task))
             continue
         pattern = spec.replace(TASK_PLACE, task)
         paths: Sequence[str] = sorted(glob.glob(pattern)) or [pattern]

@@ -17,6 +17,7 @@ import typer
 from rich.console import Console
 
 from agents.experiment import Experiment, load_experiment, one_line_errors, seeds_of
+from agents.report import json_text
 from agents.search import Found, median_of, search
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes
 from flockenv.cli.terminal import job_bar, run_program
@@ -28,7 +29,10 @@ from flockenv.players import PUBLISHED
 from flockenv.players.rules import PLAYERS, TUNED, read_tuned
 from flockenv.tasks import Task
 
-__all__ = ["app", "found_of", "write"]
+__all__ = ["app", "content_of", "found_of", "write"]
+
+DIGITS = 5
+"""Significant digits of a stored curve."""
 
 ROOM = 2**18
 """Bytes: more than a file takes."""
@@ -38,11 +42,12 @@ console = Console(stderr=True, markup=False, highlight=False, soft_wrap=True)
 
 
 def found_of(ships: Found, found: Sequence[Found]) -> dict[str, Any]:
-    """Return how the parameters that ship were found: cost, scores on the common tuning worlds, and all seeds' scores.
+    """Return how the parameters that ship were found: cost, scores on the common tuning worlds, and all searches.
 
     Keys: agent_steps, tuning_mean, tuning_success, textbook_mean, textbook_success, tuning_worlds, at_bounds, of the
     search that ships; seed, its search seed; seeds, the number of searches; scores, of each search seed, and their
-    lowest and highest.
+    lowest and highest; searches, of each search seed its parameters, success, cost, and curve: agent-steps, seconds,
+    mean return and success of the mean of its distribution.
     """
     kept = (
         "agent_steps", "tuning_mean", "tuning_success", "textbook_mean", "textbook_success", "tuning_worlds",
@@ -55,20 +60,35 @@ def found_of(ships: Found, found: Sequence[Found]) -> dict[str, Any]:
         "scores": scores,
         "lowest": min(scores.values()),
         "highest": max(scores.values()),
+        "searches": {str(each.seed): _search_of(each) for each in found},
     }
+
+
+def _search_of(found: Found) -> dict[str, Any]:
+    """Return what is kept of one search, with few digits except for the parameters."""
+    curve = {key: [_rounded(point[key]) for point in found.curve] for key in ("steps", "seconds", "mean", "success")}
+    about = {"agent_steps": found.agent_steps, "seconds": found.seconds, "curve": curve}
+    return {"parameters": found.parameters, "success": _rounded(found.tuning_success), **about}
+
+
+def _rounded(value: float) -> float:
+    return value if isinstance(value, int) else float(f"{value:.{DIGITS}g}")
 
 
 def write(path: Path, task: str, player: str, parameters: Mapping[str, float], found: Mapping[str, Any]) -> None:
     """Write a player's parameters into the file of a task, which keeps those of other players."""
-    players = {**read_tuned(path), player: {"parameters": parameters, "found": found}}
-    order = {name: players[name] for name in PLAYERS if name in players}
-    _write_json(path, {"task": task, "players": order})
+    _write_json(path, content_of(task, {**read_tuned(path), player: {"parameters": parameters, "found": found}}))
+
+
+def content_of(task: str, players: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of a task's file of tuned parameters, with its players in the order of the tables."""
+    return {"task": task, "players": {name: players[name] for name in PLAYERS if name in players}}
 
 
 def _write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write a file completely or not at all."""
     with new_folder(path.parent), replace_file(path) as file:
-        file.write((json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+        file.write(json_text(content).encode())
 
 
 def _check_player(name: str, task: Task) -> None:

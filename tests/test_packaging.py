@@ -79,6 +79,8 @@ def test_the_wheel_contains_flockenv_alone(wheel: Path) -> None:
     assert tops == {"flockenv", f"flockenv-{PROJECT['version']}.dist-info"}
     sources = {path.relative_to(ROOT).as_posix() for path in (ROOT / "flockenv").rglob("*.py")}
     files = {f"players/weights/{task}.{suffix}" for task in TASKS for suffix in ("json", "safetensors")}
+    seeds = (ROOT / "flockenv" / "players" / "weights" / "seeds").glob("*")
+    files |= {f"players/weights/seeds/{path.name}" for path in seeds}
     files |= {f"players/tuned/{task}.json" for task in TASKS} | {"py.typed", "render/replay.html"}
     assert {name for name in names if name.startswith("flockenv/")} == sources | {f"flockenv/{f}" for f in files}
     assert wheel.stat().st_size < 5_000_000

@@ -230,6 +230,10 @@ def test_tuned_parameters_are_used_and_name_all_searches(tmp_path: Path, monkeyp
     assert sorted(scores.values())[1] == ships["tuning_mean"] == tuned.found["tuning_mean"]
     assert ships["parameters"] == tuned.parameters
     assert (tuned.found["lowest"], tuned.found["highest"]) == (min(scores.values()), max(scores.values()))
+    assert {seed: each["parameters"] for seed, each in tuned.found["searches"].items()} == {
+        str(record["seed"]): record["parameters"] for record in records
+    }
+    assert len(tuned.found["searches"]["1"]["curve"]["mean"]) == len(records[1]["curve"])
     assert tuned.found["seeds"] == 3 and f"seed {ships['seed']}, the median of 3" in result.stderr
 
 

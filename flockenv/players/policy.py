@@ -30,7 +30,9 @@ from flockenv.core.warnings import OtherTaskWarning
 if TYPE_CHECKING:
     from flockenv.tasks import Layout, Task
 
-__all__ = ["ACTIVATIONS", "MlpPolicy", "OtherSlotsError", "Policy", "RandomPolicy", "describe", "save_policy"]
+__all__ = [
+    "ACTIVATIONS", "MlpPolicy", "OtherSlotsError", "Policy", "RandomPolicy", "describe", "read_card", "save_policy",
+]  # fmt: skip
 
 Observation = NDArray[Any] | dict[str, NDArray[Any]]
 State = tuple[NDArray[Any], ...]
@@ -145,7 +147,7 @@ class MlpPolicy:
         """
         path = Path(path)
         try:
-            card = _read_card(path.with_suffix(".json"))
+            card = read_card(path.with_suffix(".json"))
             policy = cls._of_card(_read_tensors(path, card), card, task, seed)
             _check_sizes(policy)
             policy.differences = () if task is None else _differences(card, task)
@@ -237,7 +239,7 @@ def save_policy(path: str | os.PathLike[str], tensors: Mapping[str, NDArray[Any]
     })  # fmt: skip
 
 
-def _read_card(path: Path) -> dict[str, Any]:
+def read_card(path: Path) -> dict[str, Any]:
     """Read a card strictly: no duplicate keys, no NaN, and of the supported version."""
     try:
         text = _read_file(path, LARGEST_CARD)

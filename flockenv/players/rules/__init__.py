@@ -127,6 +127,14 @@ class Tuned:
     parameters: dict[str, float] = field(default_factory=dict)
     found: dict[str, Any] = field(default_factory=dict)
 
+    @property
+    def by_seed(self) -> dict[int, dict[str, float]]:
+        """The parameters that each search seed found, those that ship first; {} if their seed is not known."""
+        if "seed" not in self.found:
+            return {}
+        searches = {int(seed): each["parameters"] for seed, each in self.found.get("searches", {}).items()}
+        return {int(self.found["seed"]): self.parameters, **dict(sorted(searches.items()))}
+
 
 def load_tuned(task: str, name: str = "rules") -> Tuned:
     """Return the parameters that a search found for a player of a task; an empty record if there was no search yet."""
@@ -150,8 +158,11 @@ def read_tuned(path: Path) -> dict[str, dict[str, Any]]:
     raise ValueError(f"{printable_path(path)}: not a file of tuned parameters, which `python -m agents.tune` writes")
 
 
-def player(task: Task, name: str = "rules") -> RulesPlayer:
-    """Return a hand-written player of a task by name; raise ValueError if the task has none of that name."""
+def player(task: Task, name: str = "rules", search_seed: int | None = None) -> RulesPlayer:
+    """Return a hand-written player of a task by name; raise ValueError if the task has none of that name.
+
+    search_seed: one of `Tuned.by_seed`, for the parameters that its search found (default: those that ship).
+    """
     if name not in PLAYERS:
         hint = nearest(name, PLAYERS)
         raise ValueError(f"hand-written player {printable(name)}: unknown{hint}; allowed: {', '.join(PLAYERS)}")
@@ -160,7 +171,8 @@ def player(task: Task, name: str = "rules") -> RulesPlayer:
         raise ValueError(
             f"there is no hand-written player {name!r} for {task.name!r}; there is one for: {', '.join(known)}"
         )
-    parameters = load_tuned(task.name, name).parameters if name in PUBLISHED else {}
+    tuned = load_tuned(task.name, name) if name in PUBLISHED else Tuned()
+    parameters = tuned.parameters if search_seed is None else tuned.by_seed[search_seed]
     return RulesPlayer(task, replace(known[task.name][1](), **parameters), name)
 
 
