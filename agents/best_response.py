@@ -1,159 +1,48 @@
 """Best response: one agent deviates from all others. `python -m agents.best_response configs/training/school.yaml`.
 
 In the comparison all agents of a world play one policy. Here one agent of each world plays one policy, and all others
-another. If a policy scores best among agents without it, and all score worse when all have it, selfish learners leave
-the better policy: a prisoner's dilemma (evolutionary stability: Maynard Smith and Price 1973, Nature 246, 15).
+another (agents/invasion.py). With --out, writes a file and a heat map per task, and a page beside the folder.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
-import numpy as np
 import typer
-from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
-from agents.compare import split
-from agents.experiment import load_experiment, one_line_errors
-from agents.play import blame, players_in_order, usual_players
-from flockenv.cli.terminal import run_program, show_progress
-from flockenv.envs.world import Step, World
-from flockenv.evaluation import Episodes, Interval, bootstrap, compare, rollout, worlds_for
-from flockenv.model.snapshot import Snapshot
-from flockenv.players.policy import Policy
+from agents.compare import JOBS, folder_of, provenance, split, write_text
+from agents.experiment import load_experiment
+from agents.invasion import Payoffs, invade, jobs_of
+from agents.play import Player, players_in_order, players_of, usual_players
+from agents.report import grid, json_text
+from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
+from flockenv.cli.terminal import job_bar, report_errors, run_program
+from flockenv.core.atomic_files import write_all_or_none
+from flockenv.core.output_paths import valid_file
+from flockenv.evaluation import WORLDS_PER_SEED, Interval
+from flockenv.jobs import Store, Work, engine_of, run_jobs
 from flockenv.tasks import Task
 
-__all__ = ["Among", "Payoffs", "app", "invade"]
+__all__ = ["app", "content_of", "markdown", "table_of"]
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 console = Console(stderr=True)
 
 WORLDS = 256
 
-
-class Among:
-    """Worlds in which the caller acts for one agent of each, (B, 1, O); all other agents play `others`.
-
-    In world k that agent is learner k % L, so every learner counts equally if L divides B, otherwise nearly. Its world
-    ends when it is out.
-    """
-
-    def __init__(self, task: Task, worlds: int, time_limit: int, others: Policy) -> None:
-        self._world, self._others = World(task, worlds, time_limit), others
-        seats = np.arange(worlds) % task.learners
-        self._mine = np.arange(task.learners) == seats[:, None]  # (B, L)
-        self._state: Any = None
-        self._begins = True
-
-    def reset(self, seeds: int) -> NDArray[np.float32]:
-        """Begin episodes; return the observations of the one agent per world."""
-        self._seen, self._begins = self._world.reset(seeds), True
-        return self._seen[self._mine][:, None]
-
-    def step(self, actions: NDArray[Any]) -> Step:
-        """Step all agents, the one agent by `actions` (B, 1, A); return its observation and reward."""
-        rows = self._seen[~self._mine]
-        theirs, self._state = self._others.predict(rows, self._state, np.full(len(rows), self._begins), True)
-        if np.shape(theirs) != (len(rows), actions.shape[-1]):
-            raise ValueError(f"others' actions have shape {np.shape(theirs)}, must be {(len(rows), actions.shape[-1])}")
-        joint = np.empty((*self._mine.shape, actions.shape[-1]))
-        joint[self._mine], joint[~self._mine] = actions[:, 0], theirs
-        step, self._begins = self._world.step(joint), False
-        self._seen = step.observation
-        names = ("observation", "reward", "terms", "terminated", "alive")
-        return step._replace(**{name: getattr(step, name)[self._mine][:, None] for name in names})
-
-    def measure(self) -> Mapping[str, NDArray[np.float64]]:
-        """Return the metrics of whole worlds."""
-        return self._world.measure()
-
-    def snapshot(self, world: int = 0) -> Snapshot:
-        """Return one world at this instant, for pictures."""
-        return self._world.snapshot(world)
-
-
-@dataclass(frozen=True)
-class Payoffs:
-    """Episodes of one agent with each policy among others with each policy: `of[one, others]`."""
-
-    task: str
-    players: tuple[str, ...]
-    of: Mapping[tuple[str, str], Episodes]
-
-    def mean(self, one: str, others: str) -> Interval:
-        """Return the mean return of an agent that plays `one` among `others`."""
-        return bootstrap(self.of[one, others].returns, "mean")
-
-    def gain(self, one: str, others: str) -> Interval:
-        """Return the gain of one agent by playing `one` among `others`, over playing `others`, in the same worlds."""
-        return compare(self.of[one, others], self.of[others, others]).difference
-
-    def verdict(self, a: str, b: str) -> str:
-        """Return a line: the gain of one agent that changes its policy, and the gain if all agents change it."""
-        a, b = sorted((a, b), key=lambda name: self.mean(name, name).value)
-        into, back = self.gain(a, b), self.gain(b, a)
-        together = compare(self.of[a, a], self.of[b, b]).difference
-        gains = (
-            f"{a} among {b}: {_signed_text(into)} for one agent; {b} among {a}: {_signed_text(back)}; "
-            f"all {a}: {_signed_text(together)}"
-        )
-        if into.low > 0 and back.high < 0 and together.high < 0:
-            return f"{gains}: a prisoner's dilemma, each agent does better with {a} and all together with {b}"
-        if into.high < 0 and back.low > 0:
-            return f"{gains}: {b} is the better answer to both"
-        if into.high < 0 and back.high < 0:
-            return f"{gains}: either is best among its own kind"
-        if into.low > 0 and back.low > 0:
-            return f"{gains}: either does better among the other kind"
-        if into.low > 0 and back.high < 0:
-            return f"{gains}: {a} is the better answer to both"
-        return f"{gains}: not decided in these worlds"
-
-
-def _signed_text(interval: Interval) -> str:
-    return f"{interval.value:+.2f} [{interval.low:+.2f}, {interval.high:+.2f}]"
-
-
-def invade(
-    task: Task,
-    players: Mapping[str, Callable[[Task], Policy]],
-    worlds: int = WORLDS,
-    seed: int = 0,
-    advance: Callable[[], None] = lambda: None,
-) -> Payoffs:
-    """Play every policy with one agent of each world, among others of every policy, in the same evaluation worlds.
-
-    Args:
-        task: with at least two learners in a world.
-        players: name -> factory of that policy; each rollout has a new one, since a policy may have memory.
-        worlds: number of worlds.
-        seed: of the first, as in the comparison.
-        advance: called after each rollout.
-
-    Raises:
-        ValueError: one line: a world has one learner, or a player fails.
-    """
-    if task.learners < 2:
-        raise ValueError(f"task {task.name!r}: each world has a single learner; this command needs at least two")
-    first, of = worlds_for("evaluation", seed, worlds), {}
-    for others, theirs in players.items():
-        for one, mine in players.items():
-
-            def make(task: Task, worlds: int, limit: int, theirs: Callable[[Task], Policy] = theirs) -> Among:
-                return Among(task, worlds, limit, theirs(task))
-
-            with blame(f"{one} among {others}", task):
-                of[one, others] = rollout(task, mine(task), worlds, first, make_world=make)
-            advance()
-    return Payoffs(task.name, tuple(players), of)
+NOTES = """\
+One agent of each world plays the player of the row, all others that of the column, in the same held-out worlds; each
+learner of a world is that agent equally often. A cell has the mean return of the one agent and, in brackets, what it
+gains over playing as the others do, with its 95 % bootstrap interval over worlds. The picture is coloured by that gain:
+in a column, a blue cell is a player that exploits the column's. There is one policy per task, so the intervals do not
+contain the luck of training."""
 
 
 def table_of(payoffs: Payoffs) -> Table:
@@ -164,6 +53,49 @@ def table_of(payoffs: Payoffs) -> Table:
     return table
 
 
+def content_of(payoffs: Payoffs) -> dict[str, Any]:
+    """Return the payoffs as plain data: means and gains with their intervals, and the verdict on each pair."""
+    pairs = [(one, others) for one in payoffs.players for others in payoffs.players]
+    worlds = next(iter(payoffs.of.values()))
+    return {
+        "task": payoffs.task, "worlds": worlds.worlds, "first_seed": worlds.seed, "players": list(payoffs.players),
+        "mean": {f"{one} among {others}": _numbers(payoffs.mean(one, others)) for one, others in pairs},
+        "gain": {
+            f"{one} among {others}": _numbers(payoffs.gain(one, others)) for one, others in pairs if one != others
+        },
+        "verdicts": [payoffs.verdict(*pair) for pair in combinations(payoffs.players, 2)],
+        **provenance(),
+    }  # fmt: skip
+
+
+def _numbers(interval: Interval) -> list[float]:
+    return [float(f"{value:.6g}") for value in (interval.value, interval.low, interval.high)]
+
+
+def markdown(contents: Sequence[Mapping[str, Any]], command: str, folder: str) -> str:
+    """Return the page: per task the picture, the table, and a verdict per pair; folder: of the pictures."""
+    worlds = ", ".join(dict.fromkeys(str(each["worlds"]) for each in contents))
+    parts = ["# Who gains among whom", f"Made by `{command}`, {worlds} worlds per cell.", NOTES]
+    for each in contents:
+        names = each["players"]
+        rows = [[f"`{one}`", *(_cell(each, one, others) for others in names)] for one in names]
+        parts += [
+            f"## {each['task']}",
+            f"![Gain of one agent in {each['task']}]({folder}/{each['task']}.png)",
+            grid(["one agent", *(f"among `{name}`" for name in names)], rows),
+            "\n".join(f"* {line}" for line in each["verdicts"]),
+        ]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _cell(content: Mapping[str, Any], one: str, others: str) -> str:
+    mean = content["mean"][f"{one} among {others}"][0]
+    if one == others:
+        return f"{mean:.3g}"
+    value, low, high = content["gain"][f"{one} among {others}"]
+    return f"{mean:.3g} ({value:+.3g} [{low:.3g}, {high:.3g}])"
+
+
 @app.command()
 def main(
     configs: Annotated[list[Path], typer.Argument(help="experiments, such as configs/training/school.yaml")],
@@ -171,43 +103,81 @@ def main(
         list[str] | None,
         typer.Option(help="players, by comma or repeated [rules, ppo, and others written for the task]"),
     ] = None,
-    worlds: Annotated[int, typer.Option(min=2, help="number of evaluation worlds")] = WORLDS,
+    worlds: Annotated[int, typer.Option(min=2, max=WORLDS_PER_SEED, help="number of evaluation worlds")] = WORLDS,
     seed: Annotated[int, typer.Option(min=0, max=999, help="block of evaluation worlds")] = 0,
+    out: Annotated[
+        str | None, typer.Option(help="folder for TASK.json and TASK.png; the page is OUT.md [only printed]")
+    ] = None,
+    engine: EngineName = "local",
+    processes: Processes = None,
+    fresh: Fresh = False,
+    shard: ShardText = None,
     trust_pickle: Annotated[
         bool, typer.Option("--trust-pickle", help="also load Stable-Baselines3 zips, which executes the code in them")
     ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="show a traceback if something goes wrong")] = False,
 ) -> None:
     """Measure whether one agent gains by a policy other than that of all others in its world."""
-    with one_line_errors():
+    with report_errors("best_response", STOPPED, debug), end_of_shard(), TemporaryDirectory() as temporary:
         tasks = [load_experiment(config).build() for config in configs]
-        fields = [_policy_makers(task, split(players), seed, trust_pickle) for task in tasks]
-        out = Console(highlight=False)
-        if not out.is_terminal:
-            out = Console(highlight=False, width=200)  # a pipe has no width
-        for task, field in zip(tasks, fields, strict=True):
-            with show_progress(Progress(console=console, transient=True)) as progress:
-                bar = progress.add_task(task.name, total=len(field) ** 2)
-                found = invade(task, field, worlds, seed, lambda: progress.advance(bar))  # noqa: B023  # called at once
-            out.print(f"{task.name}: mean return of one agent that plays the row, among others that play the column")
-            out.print(table_of(found))
-            for pair in combinations(found.players, 2):
-                out.print(found.verdict(*pair), markup=False)
+        fields = _fields(tasks, split(players), seed, trust_pickle)
+        if shard is not None and out is None:
+            raise ValueError("--shard: needs --out, where the records of all shares are stored")
+        names = [f"{task.name}.{end}" for task in tasks for end in ("json", "png")]
+        folder = Path(temporary) if out is None else folder_of(out, names)
+        page = None if out is None else valid_file(f"{folder}.md", (".md",), force=True)
+        runner, part = engine_of(engine, processes, small=worlds < WORLDS), shard_of(shard)
+        with job_bar(lines=out is not None) as progress:
+            work = Work(Store(folder / JOBS), runner, fresh, progress, part)
+            jobs = [jobs_of(task, field, worlds, seed, trust_pickle) for task, field in fields]
+            run_jobs([job for of_task in jobs for job in of_task.values()], work)
+        collect = Work(work.store, runner)
+        found = [invade(task, field, worlds, seed, trust_pickle, collect) for task, field in fields]
+        if page is not None:
+            command = f"python -m agents.best_response {' '.join(map(str, configs))} --out {out}"
+            _write(page, found, command + (f" --players {','.join(split(players))}" if players else ""))
+    _show(found)
+    if page is not None:
+        typer.echo(f"{page}: written")
 
 
-def _policy_makers(
-    task: Task, names: Sequence[str], seed: int, trust_pickle: bool
-) -> dict[str, Callable[[Task], Policy]]:
-    """Return the factory of each player of a task, by name; bad ones raise before any episode."""
-    specs = names or [name for name in usual_players([task]) if name not in ("random", "textbook")]
-    makers = {
-        player.name: functools.partial(player.policy, seed=seed, trust_pickle=trust_pickle)
-        for player in players_in_order(specs)
-    }
-    for name, make in makers.items():
-        for phrase in getattr(make(task), "differences", ()):
-            console.print(f"{task.name}: {name}: {phrase}", markup=False)
-    return makers
+def _fields(
+    tasks: Sequence[Task], names: Sequence[str], seed: int, trust_pickle: bool
+) -> list[tuple[Task, list[Player]]]:
+    """Return each task with its players; bad ones raise before any episode."""
+    specs = names or [name for name in usual_players(tasks) if name not in ("random", "textbook")]
+    of_task = players_of(tasks, players_in_order(specs))
+    for task in tasks:
+        for player in of_task[task.name]:
+            for phrase in getattr(player.policy(task, seed, trust_pickle), "differences", ()):
+                console.print(f"{task.name}: {player.name}: {phrase}", markup=False)
+    return [(task, of_task[task.name]) for task in tasks]
+
+
+def _write(page: Path, found: Sequence[Payoffs], command: str) -> None:
+    """Write the page, and the file and picture of each task in the folder of the same name, all or none."""
+    from agents.payoff_chart import draw_payoffs
+
+    folder, contents = page.with_suffix("").name, [content_of(payoffs) for payoffs in found]
+    writers: dict[str, Callable[[Path], None]] = {}
+    for each in contents:
+        writers[f"{folder}/{each['task']}.json"] = functools.partial(write_text, text=json_text(each))
+        writers[f"{folder}/{each['task']}.png"] = functools.partial(draw_payoffs, content=each)
+    writers[page.name] = functools.partial(write_text, text=markdown(contents, command, folder))
+    write_all_or_none(page.parent, writers)
+
+
+def _show(found: Sequence[Payoffs]) -> None:
+    """Print the table of each task, and a verdict for each pair."""
+    out = Console(highlight=False)
+    if not out.is_terminal:
+        out = Console(highlight=False, width=200)  # a pipe has no width
+    for payoffs in found:
+        out.print(f"{payoffs.task}: mean return of one agent that plays the row, among others that play the column")
+        out.print(table_of(payoffs))
+        for pair in combinations(payoffs.players, 2):
+            out.print(payoffs.verdict(*pair), markup=False)
 
 
 if __name__ == "__main__":
-    run_program("best_response", app)
+    run_program("best_response", app, STOPPED)

@@ -6,7 +6,7 @@ import functools
 import hashlib
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +18,7 @@ from flockenv.core.errors import printable
 from flockenv.core.warnings import OtherTaskWarning
 from flockenv.envs.disturbance import Disturbance, make_world
 from flockenv.envs.world import bytes_per_world, first_step
-from flockenv.evaluation import Episodes, Purpose, Recording, rollout, worlds_for
+from flockenv.evaluation import Episodes, Playable, Purpose, Recording, rollout, worlds_for
 from flockenv.jobs import Job, records
 from flockenv.model.appearance import Appearance
 from flockenv.model.snapshot import Mark, Snapshot
@@ -28,7 +28,7 @@ from flockenv.players.policy import Policy
 from flockenv.tasks import Task
 
 __all__ = [
-    "Player", "blame", "episodes_of_bytes", "members_of", "play_job", "player_digest", "players_in_order",
+    "Player", "Worlds", "blame", "episodes_of_bytes", "members_of", "play_job", "player_digest", "players_in_order",
     "players_of", "usual_players",
 ]  # fmt: skip
 
@@ -66,6 +66,14 @@ class Player:
         with blame(self.name, task, ValueError), warnings.catch_warnings():
             warnings.simplefilter("ignore", OtherTaskWarning)  # the results list the differences
             return load_player(self.spec, task, seed, trust_pickle)
+
+
+@dataclass(frozen=True)
+class Worlds:
+    """The worlds of a job: `make(task, worlds, time limit)`, which is pickled; `about`: all that it depends on."""
+
+    make: Callable[[Task, int, int], Playable]
+    about: Any
 
 
 @contextmanager
@@ -135,6 +143,7 @@ def members_of(player: Player, task: str) -> tuple[Player, ...]:
 def play_job(
     kind: str, task: Task, player: Player, worlds: int, seed: int, record: int | None = None,
     trust_pickle: bool = False, disturbance: Disturbance | None = None, purpose: Purpose = "evaluation",
+    within: Worlds | None = None,
 ) -> Job:  # fmt: skip
     """Return the job that plays the held-out worlds of a seed with a player; its record is read by `episodes_of_bytes`.
 
@@ -148,21 +157,23 @@ def play_job(
         "task": type(task).__name__, "settings": task.model_dump(mode="json"), "worlds": worlds, "seed": seed,
         "record": record, "player": digest, "purpose": purpose,
         **({"disturbance": disturbance.model_dump(mode="json")} if disturbance else {}),
+        **({"within": within.about} if within else {}),
     }  # fmt: skip
-    arguments = task, player, worlds, seed, record, trust_pickle, digest, disturbance, purpose
+    make = within.make if within else functools.partial(make_world, disturbance=disturbance)
+    arguments = task, player, worlds, seed, record, trust_pickle, digest, make, purpose
     memory = PLAYING + worlds * bytes_per_world(task)
     return Job(f"{kind}/{task.name}/{player.name}", _play, arguments, about, memory, (first_step, (task,)))
 
 
 def _play(
     task: Task, player: Player, worlds: int, seed: int, record: int | None, trust_pickle: bool, digest: str,
-    disturbance: Disturbance, purpose: Purpose,
+    make: Callable[[Task, int, int], Playable], purpose: Purpose,
 ) -> bytes:  # fmt: skip
     """Play the worlds; return the episodes as bytes. Raise ValueError if the player has another digest than before."""
     policy = player.policy(task, seed, trust_pickle)
     if _digest(player, policy) != digest:
         raise ValueError(f"player {player.spec!r} has changed since the command began, or differs on this machine")
-    first, make = worlds_for(purpose, seed, worlds), functools.partial(make_world, disturbance=disturbance)
+    first = worlds_for(purpose, seed, worlds)
     with blame(player.name, task):
         return records.to_bytes(rollout(task, policy, worlds, first, record=record, make_world=make))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +10,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from agents import best_response
+from agents import best_response, invasion
+from agents.play import Player
 from flockenv.envs.world import World
 from flockenv.evaluation import Episodes, rollout, worlds_for
-from flockenv.players.policy import RandomPolicy
 from flockenv.tasks import Flock, School
 
 FISH, WORLDS = 3, 7
@@ -55,26 +56,45 @@ def test_one_agent_per_world_deviates_and_is_rewarded_until_it_is_out(theirs: fl
         return push.astype(np.float32)
 
     first = worlds_for("evaluation", 0, WORLDS)
-    made = lambda task, worlds, limit: best_response.Among(task, worlds, limit, Steady(theirs))  # noqa: E731
+    made = lambda task, worlds, limit: invasion.Among(task, worlds, limit, Steady(theirs))  # noqa: E731
     alone = rollout(TASK, Steady(0.2), WORLDS, first, make_world=made)
     np.testing.assert_allclose(alone.returns, returns_of_seats(actions), rtol=0, atol=1e-12)
     assert (alone.lengths < TASK.horizon).any()  # some were out before the time limit
 
 
 def test_payoffs_depend_on_both_players_and_are_reproducible() -> None:
-    field = {"calm": lambda task: Steady(0.0), "wild": lambda task: RandomPolicy(2, 0)}
-    calls: list[int] = []
+    field = [Player.of("rules"), Player.of("random")]
     flock = Flock(agents=7, horizon=10)
-    payoffs = best_response.invade(flock, field, WORLDS, advance=lambda: calls.append(1))  # type: ignore[arg-type]
-    assert len(calls) == 4 and payoffs.players == ("calm", "wild")
-    assert not np.array_equal(payoffs.of["calm", "calm"].returns, payoffs.of["calm", "wild"].returns)
-    assert not np.array_equal(payoffs.of["calm", "calm"].returns, payoffs.of["wild", "calm"].returns)
-    again = best_response.invade(flock, field, WORLDS)  # type: ignore[arg-type]
+    payoffs = invasion.invade(flock, field, WORLDS)
+    assert payoffs.players == ("rules", "random") and len(payoffs.of) == 4
+    assert not np.array_equal(payoffs.of["rules", "rules"].returns, payoffs.of["rules", "random"].returns)
+    assert not np.array_equal(payoffs.of["rules", "rules"].returns, payoffs.of["random", "rules"].returns)
+    again = invasion.invade(flock, field, WORLDS)
     assert all(np.array_equal(payoffs.of[key].returns, again.of[key].returns) for key in payoffs.of)
-    assert [column.header for column in best_response.table_of(payoffs).columns] == ["", "calm", "wild"]
+    assert [column.header for column in best_response.table_of(payoffs).columns] == ["", "rules", "random"]
 
 
-def made_up(aa: float, ab: float, ba: float, bb: float, noise: float = 0.1) -> best_response.Payoffs:
+def test_one_policy_under_two_names_gains_nothing_and_pairs_are_symmetric(tmp_path: Path) -> None:
+    text = "import numpy as np\ndef predict(observation):\n    return 0.3 * observation[:, :2]\n"
+    for name in ("one.py", "other.py"):
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    field = [Player.of(str(tmp_path / name)) for name in ("one.py", "other.py")]
+    payoffs = invasion.invade(Flock(agents=5, horizon=10), field, WORLDS)
+    returns = [episodes.returns for episodes in payoffs.of.values()]
+    assert len(returns) == 4 and all(np.array_equal(each, returns[0]) for each in returns)
+    content = best_response.content_of(payoffs)
+    assert content["gain"] == {"one among other": [0.0, 0.0, 0.0], "other among one": [0.0, 0.0, 0.0]}
+    assert content["verdicts"][0].endswith("not decided in these worlds")
+
+
+def test_a_job_is_another_one_if_the_others_play_another_policy() -> None:
+    jobs = invasion.jobs_of(Flock(agents=5), [Player.of("rules"), Player.of("textbook")], WORLDS)
+    assert len({job.key for job in jobs.values()}) == 4
+    with pytest.raises(ValueError, match="single learner"):
+        invasion.jobs_of(Flock(agents=5, learners=1), [Player.of("rules")], WORLDS)
+
+
+def made_up(aa: float, ab: float, ba: float, bb: float, noise: float = 0.1) -> invasion.Payoffs:
     """Return payoffs of `a` among `a`, of `a` among `b`, and so on, with noise between worlds."""
     values = {("a", "a"): aa, ("a", "b"): ab, ("b", "a"): ba, ("b", "b"): bb}
     luck = np.random.default_rng(0)
@@ -85,7 +105,7 @@ def made_up(aa: float, ab: float, ba: float, bb: float, noise: float = 0.1) -> b
             "toy", "same", 0, 10, returns, returns > 0, np.full(40, 10), {}, {}, microseconds=1.0, latency=1.0
         )
 
-    return best_response.Payoffs("toy", ("a", "b"), {key: episodes(value) for key, value in values.items()})
+    return invasion.Payoffs("toy", ("a", "b"), {key: episodes(value) for key, value in values.items()})
 
 
 @pytest.mark.parametrize(
@@ -100,7 +120,7 @@ def made_up(aa: float, ab: float, ba: float, bb: float, noise: float = 0.1) -> b
         (made_up(1, 1, 1, 1), "not decided in these worlds"),
     ],
 )
-def test_the_verdict_follows_from_the_payoffs(payoffs: best_response.Payoffs, verdict: str) -> None:
+def test_the_verdict_follows_from_the_payoffs(payoffs: invasion.Payoffs, verdict: str) -> None:
     assert payoffs.verdict("a", "b").endswith(verdict)
     assert payoffs.verdict("b", "a") == payoffs.verdict("a", "b")
     assert payoffs.mean("a", "b").low < payoffs.of["a", "b"].returns.mean() < payoffs.mean("a", "b").high
@@ -149,3 +169,21 @@ def test_the_command_prints_a_table_and_a_verdict_for_each_pair() -> None:
     assert result.exit_code == 0, result.output
     assert "school: mean return of one agent that plays the row, among others that play the column" in result.stdout
     assert "rules among textbook: " in result.stdout and "textbook among rules: " in result.stdout
+
+
+def test_the_command_writes_files_a_picture_and_a_page_from_stored_jobs(tmp_path: Path) -> None:
+    command = ["configs/training/flock.yaml", "--players", "textbook,rules", "--worlds", "2", "--processes", "1"]
+    arguments = [*command, "--out", str(tmp_path / "payoffs")]
+    first = CliRunner().invoke(best_response.app, arguments)
+    assert first.exit_code == 0, first.output
+    page = (tmp_path / "payoffs.md").read_text(encoding="utf-8")
+    content = json.loads((tmp_path / "payoffs" / "flock.json").read_text(encoding="utf-8"))
+    assert content["players"] == ["textbook", "rules"] and len(content["mean"]) == 4 and len(content["gain"]) == 2
+    mean, gain = content["mean"]["rules among textbook"][0], content["gain"]["rules among textbook"][0]
+    assert f"{mean:.3g} ({gain:+.3g} [" in page and f"* {content['verdicts'][0]}" in page
+    assert (tmp_path / "payoffs" / "flock.png").read_bytes().startswith(b"\x89PNG")
+    records = {path: path.stat().st_mtime_ns for path in (tmp_path / "payoffs" / "jobs").rglob("*") if path.is_file()}
+    again = CliRunner().invoke(best_response.app, arguments)
+    assert again.exit_code == 0 and (tmp_path / "payoffs.md").read_text(encoding="utf-8") == page
+    now = {path: path.stat().st_mtime_ns for path in (tmp_path / "payoffs" / "jobs").rglob("*") if path.is_file()}
+    assert sum("among" in str(path) and now[path] == records[path] for path in records) >= 4  # nothing is played twice

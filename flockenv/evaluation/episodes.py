@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "EVALUATION", "TRAINING", "TUNING", "WORLDS_PER_SEED",
-    "Comparison", "Episodes", "Interval", "Recording", "Summary",
+    "Comparison", "Episodes", "Interval", "Playable", "Recording", "Summary",
     "bootstrap", "compare", "iqm", "proportion", "rollout", "summarise", "task_digest", "worlds_for",
 ]  # fmt: skip
 
@@ -113,12 +113,19 @@ class Episodes:
 
 
 class Playable(Protocol):
-    """Interface of a world in a rollout, which flockenv.envs.world.World implements."""
+    """Interface of a world in a rollout, which flockenv.envs.world.World implements; it may measure further metrics."""
 
-    def reset(self, seeds: int) -> NDArray[np.float32]: ...
-    def step(self, actions: NDArray[Any]) -> Step: ...
-    def measure(self) -> Mapping[str, Floats]: ...
-    def snapshot(self, world: int = 0) -> Snapshot: ...
+    def reset(self, seeds: int) -> NDArray[np.float32]:
+        """Begin episodes of the worlds seeds, seeds + 1, ...; return observations (B, L, O)."""
+
+    def step(self, actions: NDArray[Any]) -> Step:
+        """Take one decision in each world by actions (B, L, A)."""
+
+    def measure(self) -> Mapping[str, Floats]:
+        """Return metrics of the episodes so far, each (B,), by name."""
+
+    def snapshot(self, world: int = 0) -> Snapshot:
+        """Return one world at this instant."""
 
 
 def rollout(
@@ -259,7 +266,7 @@ class _Ledger:
         if ending.any():
             self.success[ending] = step.success[ending]
             for name, value in measure().items():
-                self.metrics[name][ending] = value[ending]
+                self.metrics.setdefault(name, np.full(len(ending), np.nan))[ending] = value[ending]
         self.running = running & ~ending
         return running
 
