@@ -92,6 +92,10 @@ def check_settings(experiment: Experiment) -> None:
     """Raise ValueError, in one line, for settings that cannot be trained."""
     task, p = experiment.build(), experiment.ppo
     hybrid_of(task, p)
+    if p.start is not None:
+        from agents.warm_start import starting_policy  # with torch
+
+        starting_policy(p.start, task, p.hidden, p.activation)
     settings = drawn_settings(task, p.disturbance, p.draw)
     count, learners = len(settings), {drawn.learners for _, drawn, _ in settings}
     if p.care and len(learners) > 1:

@@ -62,6 +62,11 @@ class PpoSettings(Record):
     taught: int = Field(
         default=0, ge=0, description="gradient steps of imitation of the tuned rules, before PPO begins"
     )
+    start: str | None = Field(
+        default=None,
+        exclude_if=lambda start: start is None,
+        description="trained policy with which learning begins: ppo (the shipped one), or a .safetensors file",
+    )
     critic_first: int = Field(default=0, ge=0, description="agent-steps in which only the critic learns, then")
     stagger: bool = Field(default=False, description="begin worlds at different times of their first episode")
     hidden: tuple[int, ...] = Field(default=(64, 64), min_length=1, description="units per layer")
@@ -105,6 +110,13 @@ class PpoSettings(Record):
                 raise ValueError(f"draw: not together with {name}")
             if self.action != "force" and value and name != "care":
                 raise ValueError(f"action = {self.action!r}: not together with {name}")
+        for name, given in (
+            ("action", self.action != "force"),
+            ("central_critic", self.central_critic),
+            ("taught", self.taught),
+        ):
+            if self.start is not None and given:
+                raise ValueError(f"start: not together with {name}")
         return self
 
 

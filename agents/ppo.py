@@ -38,6 +38,7 @@ from agents.team_credit import CaringBuffer
 from agents.training import add_point, card_of, new_progress, score, use_thread_count
 from agents.training_env import learning_env
 from agents.training_state import capture, restore, surroundings
+from agents.warm_start import starting_policy, use_weights
 from flockenv.cli.jobs import EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
 from flockenv.cli.terminal import DIVERGED, handle_interrupt, job_bar, run_program, show_progress
 from flockenv.core import signals
@@ -248,6 +249,8 @@ def _train_from(
     else:
         run = Run(recipe_of(experiment), surroundings(model.get_env().get_attr("task", 0)[0]))
         run.wall = _teach_first(model, task, p)
+        if p.start is not None:
+            use_weights(model, starting_policy(p.start, task, p.hidden, p.activation))
     with use_thread_count(p.threads), show_progress(new_progress(console)) as progress:
         watch = Watch(task, p, run, folder, progress, saved)
         try:

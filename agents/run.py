@@ -17,12 +17,15 @@ from agents.drawn import drawn_settings
 from agents.experiment import Experiment
 from flockenv.core.errors import KeyPath, key_path, printable
 from flockenv.core.record import ResultRecord
+from flockenv.players import WEIGHTS
 from flockenv.players.hybrid import FORCE, Hybrid
 from flockenv.players.policy import MlpPolicy
 from flockenv.players.rules import as_dict, player
+from flockenv.tasks import Task
 
 __all__ = [
     "OtherRecipe", "Run", "expected_bytes", "first_difference", "load_checkpoint", "recipe_of", "save_checkpoint",
+    "start_path",
 ]  # fmt: skip
 
 STATE = ("policy", "optimizer", "worlds", "rollout", "random")
@@ -41,9 +44,16 @@ def recipe_of(experiment: Experiment) -> dict[str, Any]:
     task, recipe = experiment.build(), experiment.model_dump(mode="json", include={"task", "arguments", "ppo"})
     if experiment.ppo.taught:
         recipe["rules"] = as_dict(player(task).rules)  # the policy that it imitated first
+    if experiment.ppo.start is not None:
+        recipe["start"] = MlpPolicy.load(start_path(experiment.ppo.start, task)).card["sha256"]
     if experiment.ppo.action != FORCE:
         recipe["hybrid"] = Hybrid.of(task, experiment.ppo.action, experiment.ppo.base, experiment.ppo.bound).card
     return {**recipe, "layout": task.layout.digest}
+
+
+def start_path(spec: str, task: Task) -> Path:
+    """Return the file of the policy with which learning begins (`ppo.start`): "ppo" is the shipped one."""
+    return WEIGHTS / f"{task.name}.safetensors" if spec == "ppo" else Path(spec)
 
 
 @dataclass

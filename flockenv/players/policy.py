@@ -131,6 +131,11 @@ class MlpPolicy:
         self.differences: tuple[str, ...] = ()
         """Differences between the task that it plays and the one that it was trained on, a phrase each."""
 
+    @property
+    def layers(self) -> list[Layer]:
+        """Weights (in, out) and biases of all layers, the last one last."""
+        return [*self._hidden, self._head]
+
     def __repr__(self) -> str:
         sizes = [self.observation_size, *(len(bias) for _, bias in self._hidden), self.action_size]
         return f"MlpPolicy({' -> '.join(map(str, sizes))}, {self.card['activation']}, seed={self.seed})"
