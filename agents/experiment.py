@@ -84,10 +84,11 @@ class PpoSettings(Record):
         exclude_if=lambda draw: not draw,
         description="values of the task's arguments and of disturbances; all combinations are trained at once",
     )
-    action: Literal["force", "residual", "gate"] = Field(
+    action: Literal["force", "residual", "weights", "priorities", "gate"] = Field(
         default="force",
         exclude_if=lambda action: action == "force",
-        description="what the network decides: the force, an addition to the rules' force, or whose force it is",
+        description="what the network decides: the force, an addition to the rules' force, the rules' parameters, the "
+        "priorities of their behaviours, or whose force it is",
     )
     base: str = Field(
         default="rules", exclude_if=lambda base: base == "rules", description="hand-written player under the network"

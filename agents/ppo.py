@@ -294,7 +294,8 @@ def main(
     steps: Annotated[int | None, typer.Option(help="total agent-steps, instead of those of the config")] = None,
     seed: Annotated[int | None, typer.Option(help="training seed, instead of that of the config")] = None,
     action: Annotated[
-        str | None, typer.Option(help="force, residual or gate, instead of the config's ppo.action")
+        str | None,
+        typer.Option(help="force, residual, weights, priorities or gate, instead of the config's ppo.action"),
     ] = None,
     seeds: Annotated[
         str | None,

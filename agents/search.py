@@ -25,15 +25,12 @@ from flockenv.envs.world import bytes_per_world, first_step
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.jobs import Job, Work, records, run_jobs
 from flockenv.players.rules import PLAYERS, RulesPlayer, as_dict
-from flockenv.players.rules.parameter import ranges_of
+from flockenv.players.rules.parameter import is_logarithmic, ranges_of
 from flockenv.tasks import Task
 
 __all__ = ["Coordinates", "Found", "Play", "Search", "median_of", "play_job", "search"]
 
 Parameters = dict[str, float]
-
-DECADES = 2.0
-"""A range that spans more than this is searched on a logarithmic scale."""
 
 DIGITS = 5
 """Significant digits of a parameter: what is played is what is written."""
@@ -84,11 +81,6 @@ class Coordinates:
     def _value(share: float, low: float, high: float) -> float:
         value = low * (high / low) ** share if is_logarithmic(low, high) else low + share * (high - low)
         return min(max(float(f"{value:.{DIGITS}g}"), low), high)
-
-
-def is_logarithmic(low: float, high: float) -> bool:
-    """Return True if a range is positive and spans more than DECADES."""
-    return low > 0.0 and high / low > 10.0**DECADES
 
 
 @dataclass(frozen=True)

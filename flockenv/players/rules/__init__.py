@@ -37,6 +37,7 @@ from flockenv.players.rules import (
     pursuit,
     school,
 )
+from flockenv.players.rules.parameter import Order
 from flockenv.tasks import Task
 
 __all__ = ["PLAYERS", "RULES", "TUNED", "RulesPlayer", "Tuned", "as_dict", "load_tuned", "player", "read_tuned"]
@@ -88,6 +89,16 @@ PLAYERS: dict[str, dict[str, tuple[Callable[..., Any], type]]] = {
 REMEMBERING = (school.school,)
 """Functions with a state per row that is kept between decisions."""
 
+ORDERED: dict[Callable[..., Any], tuple[str, ...]] = {
+    obstacles.obstacles: obstacles.BEHAVIOURS,
+    evade.evade: evade.BEHAVIOURS,
+    flock.flock: flock.BEHAVIOURS,
+    crossing.crossing: crossing.BEHAVIOURS,
+    herd.herd: herd.BEHAVIOURS,
+    school.school: school.BEHAVIOURS,
+}
+"""Functions that allocate the force limit to behaviours in an order, which may differ by row; those behaviours."""
+
 
 @dataclass(frozen=True)
 class RulesPlayer:
@@ -102,21 +113,41 @@ class RulesPlayer:
     ) -> tuple[NDArray[np.float32], Any]:
         """Return actions (R, A) float32 for observation rows (R, O), or (A,) for one row (O,)."""
         seen = np.asarray(observation)
-        steer = PLAYERS[self.name][self.task.name][0]
-        see = self.task.layout.unpack(np.atleast_2d(seen))
+        action, state = self.act(np.atleast_2d(seen), state, episode_start)
+        return (action[0] if seen.ndim == 1 else action), state
+
+    def act(
+        self, observation: NDArray[Any], state: Any = None, begins: Any = None, order: Order = None
+    ) -> tuple[NDArray[np.float32], Any]:
+        """Return actions (R, A) for observations (R, O), and the state.
+
+        begins: (R,), True for rows whose episode begins; order: (R, K), indices of the behaviours by priority, for
+        players that have `behaviours`.
+        """
+        steer, see = self.function, self.task.layout.unpack(observation)
+        ordered = {} if order is None else {"order": order}
         if steer in REMEMBERING:
-            begins = False if episode_start is None else np.atleast_1d(episode_start)
-            force, state = steer(see, self.task, self.rules, state, begins)
+            begins = False if begins is None else np.atleast_1d(begins)
+            force, state = steer(see, self.task, self.rules, state, begins, **ordered)
         else:
-            force = steer(see, self.task, self.rules)
+            force = steer(see, self.task, self.rules, **ordered)
         strongest = self.task.action_layout.slots[0].scale
         share = force / strongest
         length = np.maximum(np.linalg.norm(share, axis=-1, keepdims=True), 1.0)
-        action = (share / length).astype(np.float32)
-        return (action[0] if seen.ndim == 1 else action), state
+        return (share / length).astype(np.float32), state
 
-    def with_rules(self, values: Mapping[str, float]) -> RulesPlayer:
-        """Return the same player with other parameters."""
+    @property
+    def function(self) -> Callable[..., Any]:
+        """The function of a file in this folder."""
+        return PLAYERS[self.name][self.task.name][0]
+
+    @property
+    def behaviours(self) -> tuple[str, ...]:
+        """The behaviours whose order of priority may differ by row; () if they have no order."""
+        return ORDERED.get(self.function, ())
+
+    def with_rules(self, values: Mapping[str, Any]) -> RulesPlayer:
+        """Return the same player with other parameters: one number each, or one per row of observations, (R,)."""
         return replace(self, rules=replace(self.rules, **values))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import steering
-from flockenv.players.rules.parameter import parameter
+from flockenv.players.rules.parameter import parameter, per_row
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Bottleneck
 
@@ -34,15 +34,16 @@ class BottleneckRules:
 
 def bottleneck(see: Any, task: Bottleneck, p: BottleneckRules) -> NDArray[np.float64]:
     """Drive to the door, with exponential repulsion from other agents and from walls."""
-    drive = 80.0 * (p.speed * task.max_speed * _exit_direction(see, task) - see.velocity) / p.tau
+    drive = 80.0 * (per_row(p.speed) * task.max_speed * _exit_direction(see, task) - see.velocity) / per_row(p.tau)
     separation = np.array([1.0, 0.0])
-    push = p.strength * repulsion(see.neighbours, separation, 2 * _PERSON, p.decay) * see.neighbour_present[..., None]
+    push = repulsion(see.neighbours, separation, 2 * _PERSON, per_row(p.decay))
+    push = per_row(p.strength, 2) * push * see.neighbour_present[..., None]
     x, y, half = see.door[:, 0], see.door[:, 1], task.width / 2
     points = [
         np.stack([x, np.minimum(y - half, 0.0)], axis=-1), np.stack([x, np.maximum(y + half, 0.0)], axis=-1),
         np.stack([0.0 * x, -see.to_sides[:, 0]], axis=-1), np.stack([0.0 * x, see.to_sides[:, 1]], axis=-1),
     ]  # fmt: skip
-    off = p.walls * repulsion(np.stack(points, axis=1), separation, _PERSON, p.decay)
+    off = per_row(p.walls, 2) * repulsion(np.stack(points, axis=1), separation, _PERSON, per_row(p.decay))
     force: NDArray[np.float64] = drive + push.sum(axis=1) + off.sum(axis=1)
     return force
 
@@ -71,11 +72,13 @@ def queueing(see: Any, task: Bottleneck, p: QueueingRules) -> NDArray[np.float64
     """Go to the door as fast as the gap ahead allows, with a small separation force."""
     direction, present = _exit_direction(see, task), see.neighbour_present > 0
     others = see.velocity[:, None] + see.neighbour_velocity
-    gap = queue_gap(direction[:, None], see.neighbours, others, 2 * _PERSON + p.margin, task.max_speed)
+    gap = queue_gap(direction[:, None], see.neighbours, others, 2 * _PERSON + per_row(p.margin), task.max_speed)
     gap = np.where(present, gap, np.inf).min(axis=1).clip(max=1e3)
-    near = present & (np.linalg.norm(see.neighbours, axis=-1) < p.radius)
-    push = p.apart * np.sum(separate(see.neighbours, np.array([1.0, 0.0])) * near[..., None], axis=1)
-    force: NDArray[np.float64] = 80.0 * p.gain * queue(direction, see.velocity, gap, task.max_speed, p.headway) + push
+    near = present & (np.linalg.norm(see.neighbours, axis=-1) < per_row(p.radius))
+    push = per_row(p.apart) * np.sum(separate(see.neighbours, np.array([1.0, 0.0])) * near[..., None], axis=1)
+    force: NDArray[np.float64] = (
+        80.0 * per_row(p.gain) * queue(direction, see.velocity, gap, task.max_speed, p.headway) + push
+    )
     return force
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flockenv import steering
 from flockenv.players.rules.clearance import keep_clear
-from flockenv.players.rules.parameter import parameter
+from flockenv.players.rules.parameter import parameter, per_row
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Corridor
 
@@ -41,12 +41,12 @@ def corridor(see: Any, task: Corridor, p: CorridorRules) -> NDArray[np.float64]:
     """Drive at the desired speed, away from others and from walls; vectors are (along the desired direction, left)."""
     own = see.velocity[:, None]
     sidesteps = sidestep(
-        see.neighbours, own, own + see.neighbour_velocity, np.array([1.0, 0.0]), p.importance, p.gamma, p.angular,
-        p.forward, p.bias,
+        see.neighbours, own, own + see.neighbour_velocity, np.array([1.0, 0.0]),
+        *map(per_row, (p.importance, p.gamma, p.angular, p.forward, p.bias)),
     )  # fmt: skip
-    push = p.strength * np.sum(sidesteps * see.neighbour_present[..., None], axis=1)
+    push = per_row(p.strength) * np.sum(sidesteps * see.neighbour_present[..., None], axis=1)
     walls = _wall_force(see, p.walls, p.wall_decay)
-    force: NDArray[np.float64] = (_desired_velocity(see) - see.velocity) / p.tau + push + walls
+    force: NDArray[np.float64] = (_desired_velocity(see) - see.velocity) / per_row(p.tau) + push + walls
     return force
 
 
@@ -55,7 +55,7 @@ def _desired_velocity(see: Any) -> NDArray[np.float64]:
     return np.stack([see.desired_speed, 0.0 * see.desired_speed], axis=-1)
 
 
-def _wall_force(see: Any, strength: float, decay: float) -> NDArray[np.float64]:
+def _wall_force(see: Any, strength: Any, decay: Any) -> NDArray[np.float64]:
     """Return the push off both walls, a exp(-d / b), d from the body's centre."""
     push = strength * (np.exp(-see.walls[:, 1] / decay) - np.exp(-see.walls[:, 0] / decay))
     return np.stack([0.0 * push, push], axis=-1)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flockenv import steering
 from flockenv.players.rules.clearance import keep_clear
-from flockenv.players.rules.parameter import parameter
+from flockenv.players.rules.parameter import Order, in_order, parameter, per_row
 from flockenv.steering import arbitration
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Crossing
@@ -39,11 +39,15 @@ class CrossingRules:
     slow_radius: float = parameter(0.8, 0.1, 2.0)  # m, slow down within this of the goal
 
 
-def crossing(see: Any, task: Crossing, p: CrossingRules) -> NDArray[np.float64]:
+BEHAVIOURS = ("avoid", "separate", "arrive")
+"""Of `rules` and `textbook`, in order of priority."""
+
+
+def crossing(see: Any, task: Crossing, p: CrossingRules, order: Order = None) -> NDArray[np.float64]:
     """Avoid collisions (unaligned, Reynolds 1999), then arrive; vectors are (along the course, to its left)."""
     own = see.velocity[:, None]
     others = own + see.neighbour_velocity
-    time = unaligned_threat(see.neighbours, own, others, 2 * _WALKER + p.margin, p.horizon)
+    time = unaligned_threat(see.neighbours, own, others, 2 * _WALKER + per_row(p.margin), per_row(p.horizon))
     time = np.where(see.neighbour_present > 0, time, np.inf)
     row, first = np.arange(len(time)), np.argmin(time, axis=1)
     soonest = time[row, first]
@@ -51,10 +55,11 @@ def crossing(see: Any, task: Crossing, p: CrossingRules) -> NDArray[np.float64]:
     nearness = 1.0 - np.where(danger, soonest, p.horizon) / p.horizon
     strength = p.evade * (1.0 - p.urgency * (1.0 - nearness)) * danger
     away = give_way(see.neighbours[row, first], see.velocity, others[row, first], np.where(danger, soonest, 0.0), 1.0)
-    near = see.neighbour_present * (np.linalg.norm(see.neighbours, axis=-1) < p.radius)
-    push = p.apart * np.sum(separate(see.neighbours, np.array([1.0, 0.0])) * near[..., None], axis=1)
-    course = p.gain * arrive(see.goal, see.velocity, p.speed * task.max_speed, p.slow_radius)
-    return allocate(np.stack([away * strength[:, None], push, course], axis=1), task.max_force)
+    near = see.neighbour_present * (np.linalg.norm(see.neighbours, axis=-1) < per_row(p.radius))
+    push = per_row(p.apart) * np.sum(separate(see.neighbours, np.array([1.0, 0.0])) * near[..., None], axis=1)
+    course = per_row(p.gain) * arrive(see.goal, see.velocity, p.speed * task.max_speed, p.slow_radius)
+    forces = np.stack([away * strength[:, None], push, course], axis=1)
+    return allocate(in_order(forces, order), task.max_force)
 
 
 @dataclass(frozen=True)

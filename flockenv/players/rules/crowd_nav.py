@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flockenv import steering
 from flockenv.players.rules.clearance import keep_clear
-from flockenv.players.rules.parameter import parameter
+from flockenv.players.rules.parameter import parameter, per_row
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import CrowdNav
 
@@ -39,12 +39,12 @@ def crowd_nav(see: Any, task: CrowdNav, p: CrowdNavRules) -> NDArray[np.float64]
     """Drive to the goal, slow down before others and pass them on one side; vectors are (along the course, left)."""
     own = see.velocity[:, None]
     sidesteps = sidestep(
-        see.neighbours, own, own + see.neighbour_velocity, np.array([1.0, 0.0]), p.importance, p.gamma, p.angular,
-        p.forward, p.bias,
+        see.neighbours, own, own + see.neighbour_velocity, np.array([1.0, 0.0]),
+        *map(per_row, (p.importance, p.gamma, p.angular, p.forward, p.bias)),
     )  # fmt: skip
     direction = see.goal / np.maximum(np.linalg.norm(see.goal, axis=-1), 1e-9)[:, None]
-    push = p.strength * np.sum(sidesteps * see.neighbour_present[..., None], axis=1)
-    force: NDArray[np.float64] = (p.speed * task.max_speed * direction - see.velocity) / p.tau + push
+    push = per_row(p.strength) * np.sum(sidesteps * see.neighbour_present[..., None], axis=1)
+    force: NDArray[np.float64] = (per_row(p.speed) * task.max_speed * direction - see.velocity) / per_row(p.tau) + push
     return force
 
 
@@ -78,23 +78,23 @@ class HeuristicsRules:
 def heuristics_crowd_nav(see: Any, task: CrowdNav, p: HeuristicsRules) -> NDArray[np.float64]:
     """Take the most direct free direction, no faster than is safe (Moussaid, Helbing and Theraulaz 2011)."""
     aim = see.goal / np.maximum(np.linalg.norm(see.goal, axis=-1), 1e-9)[:, None]
-    speed = np.linalg.norm(see.velocity, axis=-1)[:, None]
+    speed, reach = np.linalg.norm(see.velocity, axis=-1)[:, None], per_row(p.reach)
     gaze = np.where(speed > 0.05, see.velocity / np.maximum(speed, 1e-9), aim)
-    turn = np.radians(np.linspace(-p.view, p.view, 31))
+    turn = np.radians(np.linspace(np.negative(p.view), p.view, 31, axis=-1))
     cosine, sine = np.cos(turn), np.sin(turn)
     x, y = gaze[:, :1] * cosine - gaze[:, 1:] * sine, gaze[:, :1] * sine + gaze[:, 1:] * cosine
     # the aim comes first, so that it is selected among equally good directions
     directions = np.concatenate([aim[:, None], np.stack([x, y], axis=-1)], axis=1)
     seen, moving = see.neighbour_present[:, :, None] > 0, see.velocity[:, None] + see.neighbour_velocity
-    clearance, one = _ROBOT + _PEDESTRIAN + p.margin, directions[:, None]
+    clearance, one = _ROBOT + _PEDESTRIAN + per_row(p.margin, 2), directions[:, None]
     free = collision_distance(one, see.neighbours[:, :, None], moving[:, :, None], clearance, task.max_speed)
-    free = np.where(seen, free, np.inf).min(axis=1).clip(max=p.reach)
+    free = np.where(seen, free, np.inf).min(axis=1).clip(max=reach)
     now = collision_distance(one, see.neighbours[:, :, None], np.zeros(2), clearance, 1.0)
     now = np.where(seen, now, np.inf).min(axis=1)
-    remaining = p.reach**2 + free**2 - 2.0 * p.reach * free * np.sum(directions * aim[:, None], axis=-1)
+    remaining = reach**2 + free**2 - 2.0 * reach * free * np.sum(directions * aim[:, None], axis=-1)
     row, best = np.arange(len(remaining)), np.argmin(remaining, axis=1)
     safe = np.minimum(task.max_speed, now[row, best] / p.tau)[:, None]
-    force: NDArray[np.float64] = (safe * directions[row, best] - see.velocity) / p.tau
+    force: NDArray[np.float64] = (safe * directions[row, best] - see.velocity) / per_row(p.tau)
     return force
 
 

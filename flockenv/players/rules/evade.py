@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flockenv import steering
 from flockenv.geometry import shapes
-from flockenv.players.rules.parameter import parameter
+from flockenv.players.rules.parameter import Order, in_order, parameter, per_row
 from flockenv.steering import arbitration
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Evade
@@ -46,7 +46,11 @@ class EvadeRules:
     hide: float = parameter(3.0, 0.0, 8.0)  # kg/s, towards the hiding place
 
 
-def evade(see: Any, task: Evade, p: EvadeRules) -> NDArray[np.float64]:
+BEHAVIOURS = ("avoid", "contain", "evade", "hide")
+"""Of `textbook`, in order of priority."""
+
+
+def evade(see: Any, task: Evade, p: EvadeRules, order: Order = None) -> NDArray[np.float64]:
     """Avoid, contain, evade, hide: allocation in that order (Reynolds 1987)."""
     top, row = task.evader_speed, np.arange(len(see.velocity))
     speed = np.linalg.norm(see.velocity, axis=-1)
@@ -54,26 +58,28 @@ def evade(see: Any, task: Evade, p: EvadeRules) -> NDArray[np.float64]:
     there, clearance = see.cover_radius > 0, see.cover_radius + 0.4
     hit = np.where(there, threat(forward[:, None], see.cover, clearance, (speed * p.horizon)[:, None]), np.inf)
     first = np.argmin(hit, axis=1)
-    avoidance = p.avoid * avoid(forward, see.cover[row, first], clearance[row, first], top)
+    avoidance = per_row(p.avoid) * avoid(forward, see.cover[row, first], clearance[row, first], top)
     avoidance *= np.isfinite(hit[row, first])[:, None]
     inside = 5.0 * contain(see.to_low - 0.5, see.to_high - 0.5, see.velocity, top, p.wall)
 
     distance = np.linalg.norm(see.pursuers, axis=-1)
-    time = np.minimum(distance / task.pursuer_speed, p.predict)
+    time = np.minimum(distance / task.pursuer_speed, per_row(p.predict))
     flight = evade_from(see.pursuers, see.velocity[:, None], see.pursuer_velocity, top, time)
-    rank = np.where(np.arange(distance.shape[1]) == 0, 1.0, p.crowd)
-    weight = rank * (distance < p.alarm) / np.maximum(distance, 0.1) ** 2
-    away = p.evade * np.sum(flight * weight[..., None], axis=1) / np.maximum(weight.sum(axis=1), 1e-9)[:, None]
+    rank = np.where(np.arange(distance.shape[1]) == 0, 1.0, per_row(p.crowd))
+    weight = rank * (distance < per_row(p.alarm)) / np.maximum(distance, 0.1) ** 2
+    away = per_row(p.evade) * np.sum(flight * weight[..., None], axis=1)
+    away /= np.maximum(weight.sum(axis=1), 1e-9)[:, None]
     near = (weight.sum(axis=1) > 0)[:, None]
-    away += p.middle * (see.to_high - see.to_low) / 2 * near
+    away += per_row(p.middle) * (see.to_high - see.to_low) / 2 * near
 
-    places = hiding_place(see.cover, see.cover_radius, p.margin, see.pursuers[:, :1])
+    places = hiding_place(see.cover, see.cover_radius, per_row(p.margin), see.pursuers[:, :1])
     theirs = np.linalg.norm(places[:, :, None] - see.pursuers[:, None], axis=-1).min(axis=-1)
-    cost = np.linalg.norm(places, axis=-1) + p.danger * np.maximum(10.0 - theirs, 0.0)
-    cost += p.exposed * _count_watchers(places, see, task.sight)
+    cost = np.linalg.norm(places, axis=-1) + per_row(p.danger) * np.maximum(10.0 - theirs, 0.0)
+    cost += per_row(p.exposed) * _count_watchers(places, see, task.sight)
     nearest = np.argmin(np.where(there, cost, np.inf), axis=1)
-    hidden = p.hide * arrive(places[row, nearest], see.velocity, top, 0.5) * there.any(axis=1)[:, None]
-    return allocate(np.stack([avoidance, inside, away, hidden], axis=1), task.evader_force)
+    hidden = per_row(p.hide) * arrive(places[row, nearest], see.velocity, top, 0.5) * there.any(axis=1)[:, None]
+    forces = np.stack([avoidance, inside, away, hidden], axis=1)
+    return allocate(in_order(forces, order), task.evader_force)
 
 
 @dataclass(frozen=True)
@@ -100,13 +106,13 @@ def escape(see: Any, task: Evade, p: EscapeRules) -> NDArray[np.float64]:
     """
     angle = 2.0 * np.pi * np.arange(task.rays) / task.rays
     courses = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    seconds = np.asarray(p.reach)[..., None] * _SHARES
+    seconds = per_row(p.reach) * _SHARES
     places = _places_along(courses, seconds, see, task, p)
     danger = _danger(places, seconds[..., None, :], see, task, p).max(axis=2)
     speed = np.linalg.norm(see.velocity, axis=-1, keepdims=True)
     back = 0.5 - 0.5 * (see.velocity / np.maximum(speed, 0.3)) @ courses.T
     exposure = _count_watchers(places[:, :, -1], see, task.sight)
-    cost = danger + np.asarray(p.exposed)[..., None] * exposure + np.asarray(p.turn)[..., None] * back
+    cost = danger + per_row(p.exposed) * exposure + per_row(p.turn) * back
     best = courses[np.argmin(cost, axis=1)]
     here = _danger(np.zeros((len(best), 1, 1, 2)), np.zeros(1), see, task, p)[:, 0, 0]
     effort = p.gain * np.minimum(here / np.maximum(p.calm, 1e-9), 1.0)
@@ -121,7 +127,7 @@ def _places_along(
 
     (R, courses, seconds, 2), relative to the evader, m.
     """
-    walls = np.where(courses > 0.0, see.to_high[:, None], see.to_low[:, None]) - np.asarray(p.wall)[..., None, None]
+    walls = np.where(courses > 0.0, see.to_high[:, None], see.to_low[:, None]) - per_row(p.wall, 2)
     to_walls = (np.maximum(walls, 0.0) / np.maximum(np.abs(courses), 1e-9)).min(axis=-1)
     free = np.minimum(see.free_way, to_walls)
     run = np.minimum(task.evader_speed * seconds[..., None, :], free[..., None])
@@ -135,8 +141,8 @@ def _danger(
     """Return the danger of places (R, C, T, 2) at the given times, (T,) or (R, 1, T) s."""
     distance = np.linalg.norm(places[:, :, :, None] - see.pursuers[:, None, None], axis=-1)
     left = distance - task.capture_distance - task.pursuer_speed * seconds[..., None]
-    weight = np.where(see.seen > 0, 1.0, np.asarray(p.unseen)[..., None])[:, None, None]
-    scale = np.asarray(p.margin)[..., None, None, None]
+    weight = np.where(see.seen > 0, 1.0, per_row(p.unseen))[:, None, None]
+    scale = per_row(p.margin, 3)
     danger: NDArray[np.float64] = np.sum(weight * np.exp(-np.maximum(left / scale, -50.0)), axis=-1)
     return danger
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import steering
-from flockenv.players.rules.parameter import parameter
+from flockenv.players.rules.parameter import Order, in_order, parameter, per_row
 from flockenv.steering import arbitration
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Flock
@@ -38,26 +38,32 @@ class FlockRules:
     blend: float = parameter(0.0, 0.0, 1.0)  # 0: allocate in order; 1: sum up
 
 
-def flock(see: Any, task: Flock, p: FlockRules) -> NDArray[np.float64]:
+BEHAVIOURS = ("avoid", "separate", "align", "cohere", "course")
+"""In order of priority."""
+
+
+def flock(see: Any, task: Flock, p: FlockRules, order: Order = None) -> NDArray[np.float64]:
     """Avoid, separate, align, cohere, follow the heading; vectors are (along the heading, to its left)."""
     speed = np.linalg.norm(see.velocity, axis=-1)
     forward = see.velocity / np.maximum(speed, 1e-9)[:, None]
-    clearance = see.obstacle_radius + 0.3 + p.margin
+    clearance = see.obstacle_radius + 0.3 + per_row(p.margin)
     distance = threat(forward[:, None], see.obstacles, clearance, (speed * p.horizon)[:, None])
     distance = np.where(see.obstacle_radius > 0, distance, np.inf)
     first, row = np.argmin(distance, axis=1), np.arange(len(speed))
     around = avoid(forward, see.obstacles[row, first], clearance[row, first], task.max_speed)
-    evasion = p.evade * around * np.isfinite(distance[row, first])[:, None]
+    evasion = per_row(p.evade) * around * np.isfinite(distance[row, first])[:, None]
 
     here = see.neighbour_present
     count = np.maximum(here.sum(axis=1), 1.0)[:, None]
-    near = here * (np.linalg.norm(see.neighbours, axis=-1) < p.radius)
-    push = p.apart * np.sum(separate(see.neighbours, np.array([1.0, 0.0])) * near[..., None], axis=1)
+    near = here * (np.linalg.norm(see.neighbours, axis=-1) < per_row(p.radius))
+    push = per_row(p.apart) * np.sum(separate(see.neighbours, np.array([1.0, 0.0])) * near[..., None], axis=1)
     mean_velocity = see.velocity + np.sum(see.neighbour_velocity * here[..., None], axis=1) / count
-    match = p.match * align(see.velocity, mean_velocity)
-    centre = p.centre * np.sum(see.neighbours * here[..., None], axis=1) / count
-    course = p.course * (np.array([task.cruise, 0.0]) - see.velocity)
-    ordered = allocate(np.stack([evasion, push, match, centre, course], axis=1), task.max_force)
+    match = per_row(p.match) * align(see.velocity, mean_velocity)
+    centre = per_row(p.centre) * np.sum(see.neighbours * here[..., None], axis=1) / count
+    course = per_row(p.course) * (np.array([task.cruise, 0.0]) - see.velocity)
+    forces = np.stack([evasion, push, match, centre, course], axis=1)
+    ordered = allocate(in_order(forces, order), task.max_force)
     summed = evasion + push + match + centre + course
-    force: NDArray[np.float64] = (1.0 - p.blend) * ordered + p.blend * summed
+    blend = per_row(p.blend)
+    force: NDArray[np.float64] = (1.0 - blend) * ordered + blend * summed
     return force

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import steering
-from flockenv.players.rules.parameter import parameter
+from flockenv.players.rules.parameter import Order, in_order, parameter, per_row
 from flockenv.steering import arbitration
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Herd
@@ -38,19 +38,23 @@ class HerdRules:
     apart: float = parameter(4.0, 0.0, 10.0)  # N, away from other dogs, in proportion to nearness within 10 m
 
 
-def herd(see: Any, task: Herd, p: HerdRules) -> NDArray[np.float64]:
+BEHAVIOURS = ("separate", "detour", "arrive")
+"""In order of priority."""
+
+
+def herd(see: Any, task: Herd, p: HerdRules, order: Order = None) -> NDArray[np.float64]:
     """Go behind a sheep that strays, or behind the flock, slower near a sheep; vectors are (along the course, left)."""
     r, n, top = task.apart_distance, task.sheep, task.dog_speed
     together, driving = p.together * r * n ** (2 / 3), p.driving * r * n**0.5
     place = herd_from(see.centre, see.farthest, see.goal, together, p.collecting * r, driving)
     nearest = np.where(see.sheep_present[:, 0] > 0, np.linalg.norm(see.sheep[:, 0], axis=-1), np.inf)
     speed = np.where(nearest < p.near * r, p.slow, 1.0) * top
-    course = p.gain * arrive(place, see.velocity, speed, 0.5)
+    course = per_row(p.gain) * arrive(place, see.velocity, speed, 0.5)
     direction = place / np.maximum(np.linalg.norm(place, axis=-1), 1e-9)[:, None]
     clearance = p.width * see.stray + 2.0 * r
     blocked = np.isfinite(threat(direction, see.centre, clearance, np.linalg.norm(place, axis=-1)))
-    detour = p.around * avoid(direction, see.centre, clearance, top) * blocked[:, None]
+    detour = per_row(p.around) * avoid(direction, see.centre, clearance, top) * blocked[:, None]
     distance = np.linalg.norm(see.mates, axis=-1)[..., None]
     push = -see.mates / np.maximum(distance, 1e-9) * np.maximum(1.0 - distance / 10.0, 0.0)
-    mates = p.apart * np.sum(push, axis=1)
-    return allocate(np.stack([mates, detour, course], axis=1), task.dog_force)
+    mates = per_row(p.apart) * np.sum(push, axis=1)
+    return allocate(in_order(np.stack([mates, detour, course], axis=1), order), task.dog_force)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import steering
-from flockenv.players.rules.parameter import parameter
+from flockenv.players.rules.parameter import Order, in_order, parameter, per_row
 from flockenv.steering import arbitration
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Obstacles
@@ -36,13 +36,17 @@ class ObstaclesRules:
     push: float = parameter(0.0, 0.0, 2.0)  # N m, repulsion from the nearest surfaces, push / gap
 
 
-def obstacles(see: Any, task: Obstacles, p: ObstaclesRules) -> NDArray[np.float64]:
+BEHAVIOURS = ("avoid", "repulsion", "seek")
+"""In order of priority."""
+
+
+def obstacles(see: Any, task: Obstacles, p: ObstaclesRules, order: Order = None) -> NDArray[np.float64]:
     """Avoid the obstacle that the straight path touches first (Reynolds 1999), then seek; allocation as in 1987."""
     speed = np.linalg.norm(see.velocity, axis=-1)
     goal_way = see.goal / np.maximum(np.linalg.norm(see.goal, axis=-1), 1e-9)[:, None]
     forward = np.where(speed[:, None] > 0.05, see.velocity / np.maximum(speed, 1e-9)[:, None], goal_way)
     reach = np.maximum(speed, 0.5) * p.horizon
-    clearance = see.obstacle_radius + 0.3 + p.margin
+    clearance = see.obstacle_radius + 0.3 + per_row(p.margin)
     distance = threat(forward[:, None], see.obstacles, clearance, reach[:, None])
     distance = np.where(see.obstacle_radius > 0, distance, np.inf)
     first = np.argmin(distance, axis=1)
@@ -52,9 +56,9 @@ def obstacles(see: Any, task: Obstacles, p: ObstaclesRules) -> NDArray[np.float6
     nearness = 1.0 - np.where(danger, nearest / np.maximum(reach, 1e-9), 1.0)
     strength = p.evade * (1.0 - p.urgency * (1.0 - nearness)) * danger
     avoidance = avoid(forward, see.obstacles[row, first], clearance[row, first], task.max_speed)
-    evasion = avoidance * strength[:, None] - p.brake * see.velocity * nearness[:, None]
+    evasion = avoidance * strength[:, None] - per_row(p.brake) * see.velocity * nearness[:, None]
     away = -see.obstacles / np.maximum(np.linalg.norm(see.obstacles, axis=-1), 1e-9)[..., None]
     seen = (see.obstacle_radius > 0) & (see.clearance < 1.0)
-    field = p.push * np.sum(away * (seen / np.maximum(see.clearance, 0.05))[..., None], axis=1)
-    course = p.gain * seek(see.goal, see.velocity, p.speed * task.max_speed)
-    return allocate(np.stack([evasion, field, course], axis=1), task.max_force)
+    field = per_row(p.push) * np.sum(away * (seen / np.maximum(see.clearance, 0.05))[..., None], axis=1)
+    course = per_row(p.gain) * seek(see.goal, see.velocity, p.speed * task.max_speed)
+    return allocate(in_order(np.stack([evasion, field, course], axis=1), order), task.max_force)

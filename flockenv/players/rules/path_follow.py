@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import steering
-from flockenv.players.rules.parameter import parameter
+from flockenv.players.rules.parameter import parameter, per_row
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import PathFollow
 
@@ -43,16 +43,17 @@ def path_follow(see: Any, task: PathFollow, p: PathFollowRules) -> NDArray[np.fl
     fine = spine[:, piece] * (1.0 - share)[:, None] + spine[:, piece + 1] * share[:, None]
     far = task.spacing * np.arange(task.ahead)[None]  # a bend is assumed to begin one point earlier
     bend = np.maximum(np.abs(see.curvature), 1e-6)
-    allowed = p.grip * task.max_force / bend + 2.0 * p.early * task.max_force * far
+    allowed = per_row(p.grip) * task.max_force / bend + 2.0 * per_row(p.early) * task.max_force * far
     top = np.minimum(p.speed * task.max_speed, np.sqrt(allowed.min(axis=1)))
     speed = np.linalg.norm(see.velocity, axis=-1)
-    gap = np.linalg.norm(fine - p.time * see.velocity[:, None], axis=-1)
+    gap = np.linalg.norm(fine - per_row(p.time, 2) * see.velocity[:, None], axis=-1)
     then = np.argmin(gap, axis=1)
     gained = then * step - p.keep * top * p.time
     ahead = p.lead * np.maximum(speed, 0.25 * top)
     target = fine[row, np.minimum(np.round(ahead / step), task.ahead * _FINE - 1).astype(int)]
-    following = p.gain * follow_path(gap[row, then] - p.tube * task.half_width, gained, target, see.velocity, top)
-    slower = -p.brake * (np.maximum(speed - top, 0.0) / np.maximum(speed, 1e-9))[:, None] * see.velocity
+    outside = gap[row, then] - p.tube * task.half_width
+    following = per_row(p.gain) * follow_path(outside, gained, target, see.velocity, top)
+    slower = -per_row(p.brake) * (np.maximum(speed - top, 0.0) / np.maximum(speed, 1e-9))[:, None] * see.velocity
     force: NDArray[np.float64] = slower + following
     return force
 
@@ -81,7 +82,7 @@ def race(see: Any, task: PathFollow, p: RacingRules) -> NDArray[np.float64]:
     speed = np.linalg.norm(see.velocity, axis=-1)
     place = np.minimum(p.lead * np.maximum(speed, 0.25 * task.max_speed) / task.spacing, max(task.ahead - 1.001, 0.999))
     target, desired = _between(line[:, 1:], place), _between(speeds[..., None], place)[:, 0]
-    force: NDArray[np.float64] = np.asarray(p.gain)[..., None] * seek(target, see.velocity, desired)
+    force: NDArray[np.float64] = per_row(p.gain) * seek(target, see.velocity, desired)
     return force
 
 
@@ -103,12 +104,12 @@ def racing_line(see: Any, task: PathFollow, p: RacingRules) -> NDArray[np.float6
     bending = _bending(task.ahead, p.course)
     matrix = bending[..., 2:] * (sideways @ sideways.transpose(0, 2, 1))
     pull = np.sum(sideways * (bending @ middle), axis=-1)
-    limit = task.half_width * np.asarray(p.width)[..., None]
+    limit = task.half_width * per_row(p.width)
     middle[:, 2:] += _least_within(matrix, pull, limit)[..., None] * sideways
     return middle
 
 
-def _bending(points: int, course: float) -> NDArray[np.float64]:
+def _bending(points: int, course: Any) -> NDArray[np.float64]:
     """Return the matrix whose product with the line is half the derivative of the sum of squares by its points.
 
     (..., points, points + 2). `course` is the weight of the first second difference, that at the agent.
@@ -144,7 +145,7 @@ def allowed_speeds(line: NDArray[np.float64], task: PathFollow, p: RacingRules) 
     length = np.linalg.norm(after, axis=-1)
     sine = np.abs(before[..., 0] * after[..., 1] - before[..., 1] * after[..., 0])
     sides = np.linalg.norm(before, axis=-1) * length * np.linalg.norm(before + after, axis=-1)
-    needed = 2.0 * sine / np.maximum(sides, 1e-9) / (np.asarray(p.grip)[..., None] * task.max_force)  # s^2/m^2
+    needed = 2.0 * sine / np.maximum(sides, 1e-9) / (per_row(p.grip) * task.max_force)  # s^2/m^2
     square = np.minimum(task.max_speed**2, 1.0 / np.maximum(needed, 1e-9))
     for k in range(task.ahead - 2, -1, -1):
         bend = (1.0 - p.late) * needed[:, k] + p.late * needed[:, k + 1]

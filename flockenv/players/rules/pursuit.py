@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import steering
-from flockenv.players.rules.parameter import parameter
+from flockenv.players.rules.parameter import parameter, per_row
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Pursuit
 
@@ -36,5 +36,7 @@ def pursuit(see: Any, task: Pursuit, p: PursuitRules) -> NDArray[np.float64]:
     top = task.pursuer_speed
     time = np.minimum(p.factor * interception_time(offset, quarry, top), p.horizon)
     ahead = offset + quarry * time[:, None]
-    ahead = np.clip(ahead, p.margin - see.to_low, see.to_high - p.margin)
-    return p.gain * arrive(ahead, see.velocity, top, p.slow_radius)
+    margin = per_row(p.margin)
+    ahead = np.clip(ahead, margin - see.to_low, see.to_high - margin)
+    force: NDArray[np.float64] = per_row(p.gain) * arrive(ahead, see.velocity, top, p.slow_radius)
+    return force

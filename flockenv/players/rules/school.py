@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import steering
-from flockenv.behaviours.reconciliation import reconcile
-from flockenv.players.rules.parameter import parameter
+from flockenv.players.rules.parameter import Order, in_order, parameter, per_row
 from flockenv.steering import arbitration, motivation
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import School
@@ -18,6 +17,7 @@ from flockenv.tasks import School
 __all__ = ["SchoolRules", "school"]
 
 align = rows(steering.align)
+allocate = rows(arbitration.allocate)
 arrive = rows(steering.arrive)
 contain = rows(steering.contain)
 evade_from = rows(steering.evade)
@@ -48,18 +48,21 @@ class SchoolRules:
     turn: float = parameter(0.2, 0.0, 1.0)  # m aside per m ahead, while it wanders
 
 
-_WHEN = arbitration.Intentions(when=("avoid", "avoid", "escape", "school", "eat", "wander"))
+BEHAVIOURS = ("contain", "separate", "flee", "join", "eat", "wander")
+"""In order of priority; the last four are active in one state each."""
+
+_STATES = (motivation.ESCAPE, motivation.SCHOOL, motivation.EAT, motivation.WANDER)
 
 
 def school(
-    see: Any, task: School, p: SchoolRules, before: Any, begins: Any
+    see: Any, task: School, p: SchoolRules, before: Any, begins: Any, order: Order = None
 ) -> tuple[NDArray[np.floating], NDArray[np.float64]]:
     """Select a state from hunger and fear, with hysteresis, and its behaviours; return force and state, (R,)."""
     count, top, ahead = len(see.velocity), task.fish_speed, np.array([1.0, 0.0])
     known = before is not None and np.shape(before) == (count,)
     was = np.where(begins, 0.0, before) if known else np.zeros(count)
-    calm, content = min(p.calm, p.school), min(p.content, p.need)
-    now = intention(was, see.hunger, 0.0, see.fear, max(p.escape, p.school), p.school, p.need, calm, content)
+    calm, content = np.minimum(p.calm, p.school), np.minimum(p.content, p.need)
+    now = intention(was, see.hunger, 0.0, see.fear, np.maximum(p.escape, p.school), p.school, p.need, calm, content)
     hunted = see.hunter_present[:, 0] > 0
     # without a hunter or food in sight: wander
     has_food = np.linalg.norm(see.food_bearing, axis=-1) > 0
@@ -70,20 +73,21 @@ def school(
 
     inside = 5.0 * contain(see.to_low - 0.5, see.to_high - 0.5, see.velocity, top, p.wall)
     near = here * (np.linalg.norm(see.mates, axis=-1) < 0.6)
-    push = p.apart * np.sum(separate(see.mates, ahead) * near[..., None], axis=1)
+    push = per_row(p.apart) * np.sum(separate(see.mates, ahead) * near[..., None], axis=1)
     time = np.minimum(np.linalg.norm(see.hunters[:, 0], axis=-1) / task.hunter_speed, p.predict)
-    flight = p.evade * evade_from(see.hunters[:, 0], see.velocity, see.hunter_velocity[:, 0], top, time)
-    flight += p.middle * (see.to_high - see.to_low) / 2
+    flight = per_row(p.evade) * evade_from(see.hunters[:, 0], see.velocity, see.hunter_velocity[:, 0], top, time)
+    flight += per_row(p.middle) * (see.to_high - see.to_low) / 2
     many = np.maximum(here.sum(axis=1), 1.0)[:, None]
     course = np.sum(see.mate_velocity * here[..., None], axis=1) / many
     centre = np.sum(see.mates * here[..., None], axis=1) / many
-    join = p.match * align(see.velocity, course) + p.centre * centre
-    cost = np.linalg.norm(see.food, axis=-1) - p.rich * see.food_amount / task.capacity
+    join = per_row(p.match) * align(see.velocity, course) + per_row(p.centre) * centre
+    cost = np.linalg.norm(see.food, axis=-1) - per_row(p.rich) * see.food_amount / task.capacity
     best = np.argmin(np.where(has_food, cost, np.inf), axis=1)
-    eat = p.forage * arrive(see.food[np.arange(count), best], see.velocity, top, 1.0)
+    eat = per_row(p.forage) * arrive(see.food[np.arange(count), best], see.velocity, top, 1.0)
     still = np.linalg.norm(see.velocity, axis=-1, keepdims=True) < 1e-6
     heading = np.where(still, ahead, see.velocity)
-    roam = 2.0 * (wander(np.array([0.0, p.turn]), heading, p.pace * top, 1.0) + heading - see.velocity)
-    forces = np.stack([inside, push, flight, join, eat, roam], axis=1)
-    force, _ = reconcile(_WHEN, forces, task.fish_force, inner={"intention": selected})
-    return force, now
+    aside = np.stack([np.zeros_like(p.turn), np.asarray(p.turn)], axis=-1)
+    roam = 2.0 * (wander(aside, heading, p.pace * top, 1.0) + heading - see.velocity)
+    active = np.stack([np.ones(count, np.bool_)] * 2 + [selected == state for state in _STATES], axis=1)
+    forces = np.stack([inside, push, flight, join, eat, roam], axis=1) * active[..., None]
+    return allocate(in_order(forces, order), task.fish_force), now
