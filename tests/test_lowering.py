@@ -311,6 +311,30 @@ def test_a_kernel_may_call_itself() -> None:
         assert compiled_whole(entry)(np.arange(5.0), 4, odd) == 4 + 3 / 2 + 2 / 4 + 1 / 8 + odd / 16
 
 
+@kernel
+def is_between(x: Any, low: float, high: float, inside: bool) -> bool:
+    """Return whether x lies between two numbers, or the opposite."""
+    return bool(((low < x) & (x < high)) == inside)
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_flags_that_a_kernel_returns_select_count_and_branch(inside: bool) -> None:
+    def entry(x: Any, inside: bool) -> tuple[float, int, int, bool]:
+        total, count, branches, last = 0.0, 0, 0, False
+        for k in range(x.shape[0]):
+            last = is_between(x[k], 2.0, 6.0, inside)
+            total += x[k] if last else -0.0
+            count += last
+            if not last:
+                branches += 1
+        return total, count, branches, last
+
+    x = np.arange(10.0)
+    chosen = ((x > 2.0) & (x < 6.0)) == inside
+    expected = (x[chosen].sum(), chosen.sum(), (~chosen).sum(), bool(chosen[-1]))
+    assert compiled_whole(entry)(x, inside) == expected
+
+
 def test_an_unknown_version_of_numba_is_not_patched(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(front_end, "digest", lambda owner, name: "")
     front_end.is_known_source.cache_clear()
