@@ -84,11 +84,11 @@ class PpoSettings(Record):
         exclude_if=lambda draw: not draw,
         description="values of the task's arguments and of disturbances; all combinations are trained at once",
     )
-    action: Literal["force", "residual", "weights", "priorities", "gate"] = Field(
+    action: Literal["force", "residual", "mixture", "weights", "priorities", "gate"] = Field(
         default="force",
         exclude_if=lambda action: action == "force",
-        description="what the network decides: the force, an addition to the rules' force, the rules' parameters, the "
-        "priorities of their behaviours, or whose force it is",
+        description="what the network decides: the force, an addition to the rules' force, a share of it, the rules' "
+        "parameters, the priorities of their behaviours, or whose force it is",
     )
     base: str = Field(
         default="rules", exclude_if=lambda base: base == "rules", description="hand-written player under the network"
@@ -98,7 +98,7 @@ class PpoSettings(Record):
         gt=0,
         le=2,
         exclude_if=lambda bound: bound == 0.5,
-        description="largest residual, as a share of max_force",
+        description="largest residual, as a share of max_force; of a mixture, the share of the network's force",
     )
     evaluate_every: int = Field(default=1_000_000, ge=1, description="agent-steps between points of the curve")
     evaluate_worlds: int = Field(default=256, ge=1, description="tuning worlds per point of the curve")
@@ -112,7 +112,7 @@ class PpoSettings(Record):
             if self.action != "force" and value and name != "care":
                 raise ValueError(f"action = {self.action!r}: not together with {name}")
         for name, given in (
-            ("action", self.action != "force"),
+            ("action", self.action not in ("force", "mixture")),
             ("central_critic", self.central_critic),
             ("taught", self.taught),
         ):

@@ -295,7 +295,7 @@ def main(
     seed: Annotated[int | None, typer.Option(help="training seed, instead of that of the config")] = None,
     action: Annotated[
         str | None,
-        typer.Option(help="force, residual, weights, priorities or gate, instead of the config's ppo.action"),
+        typer.Option(help="force, residual, mixture, weights, priorities or gate, instead of the config's ppo.action"),
     ] = None,
     seeds: Annotated[
         str | None,

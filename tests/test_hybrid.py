@@ -54,6 +54,11 @@ def save(path: Path, task: Task, hybrid: Hybrid, scale: float = 1.0, **changes: 
     return path
 
 
+def share_of_rules(hybrid: Hybrid) -> np.float32:
+    """Return the factor on the rules' force if the outputs are 0, or the gate is closed."""
+    return np.float32(1.0 - hybrid.bound if hybrid.kind == "mixture" else 1.0)
+
+
 def hybrids(name: str) -> list[Hybrid]:
     """Return every hybrid of a task, with one hand-written player for each function."""
     bases = {PLAYERS[base][name][0]: base for base in PLAYERS if name in PLAYERS[base]}.values()
@@ -69,7 +74,8 @@ def test_outputs_of_zero_and_a_closed_gate_play_the_rules(name: str) -> None:
     for hybrid in hybrids(name):
         rules = load_player(hybrid.rules.name, hybrid.rules.task).predict(rows, None, begins)[0]
         outputs = np.full((len(rows), hybrid.outputs), -1.0 if hybrid.kind == "gate" else 0.0, np.float32)
-        assert (hybrid.act(rows, outputs, None, begins)[0] == rules).all(), hybrid.kind
+        expected = rules * share_of_rules(hybrid)
+        assert (hybrid.act(rows, outputs, None, begins)[0] == expected).all(), hybrid.kind
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -151,6 +157,18 @@ def test_a_residual_is_bounded() -> None:
     assert np.abs(action).max() <= 1.0
 
 
+def test_a_mixture_is_the_weighted_mean_of_both_forces() -> None:
+    task = Pursuit()
+    rows, hybrid = rows_of(task, 50), Hybrid.of(task, "mixture", bound=0.25)
+    outputs = RNG.uniform(-1, 1, (len(rows), 2)).astype(np.float32)
+    rules = load_player("rules", task).predict(rows)[0]
+    action, _ = hybrid.act(rows, outputs)
+    np.testing.assert_allclose(action, 0.75 * rules + 0.25 * outputs, atol=1e-6)
+    assert (Hybrid.of(task, "mixture", bound=1.0).act(rows, outputs)[0] == outputs).all()
+    with pytest.raises(ValueError, match=r"bound = 1.5: must be above 0 and at most 1$"):
+        Hybrid.of(task, "mixture", bound=1.5)
+
+
 def test_a_gate_hands_over_by_row() -> None:
     task = Pursuit()
     rows, hybrid = rows_of(task, 50), Hybrid.of(task, "gate")
@@ -173,7 +191,7 @@ def test_rules_that_remember_keep_their_state(kind: str) -> None:
     begins = np.arange(len(rows)) % 2 == 0
     action, state = hybrid.act(rows, outputs, before, begins)
     expected, after = alone.predict(rows, before, begins)
-    assert (action == expected).all() and (state == np.asarray(after)).all()
+    assert (action == expected * share_of_rules(hybrid)).all() and (state == np.asarray(after)).all()
     assert (np.asarray(after) != np.asarray(alone.predict(rows, None)[1])).any()  # that it remembers has an effect
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from agents.drawn import check_settings
 from agents.experiment import Experiment, PpoSettings
-from agents.ppo import build, tensors_of, train
+from agents.ppo import build, export, tensors_of, train
 from agents.run import recipe_of
 from agents.warm_start import starting_policy, use_weights
 from flockenv.players import WEIGHTS, load_player
@@ -59,6 +59,19 @@ def test_a_policy_that_does_not_fit_is_refused_in_one_line(changes: dict[str, An
     with pytest.raises(ValueError, match=r".") as caught:
         check_settings(experiment(**changes))
     assert text in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_mixture_begins_with_the_policy_that_it_mixes(tmp_path: Path) -> None:
+    each = experiment(action="mixture", bound=0.6, base="orca", critic_first=8)
+    run = train(each, tmp_path)
+    export(run, tmp_path / "mine.safetensors")
+    task = each.build()
+    mixed, rules = load_player(tmp_path / "mine.safetensors", task), load_player("orca", task)
+    shipped = load_player("ppo", task.model_copy(update={"price": None, "horizon": 250}))
+    rows = np.random.default_rng(0).uniform(-1, 1, (50, task.layout.size)).astype(np.float32)
+    parts = [rules.predict(rows)[0], shipped.predict(rows[:, :-1], deterministic=True)[0]]
+    expected = 0.4 * parts[0] + 0.6 * parts[1]
+    np.testing.assert_allclose(mixed.predict(rows, deterministic=True)[0], expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("more", [{"action": "residual"}, {"taught": 1}, {"central_critic": True}])

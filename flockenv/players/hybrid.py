@@ -4,6 +4,7 @@ The numbers u that a network puts out become the action of the task in one of th
 
 * `residual`: the rules' force plus `bound` times u (Johannink et al. 2019, ICRA, 6023; Silver et al. 2018,
   arXiv 1812.06298); u = 0 plays the rules;
+* `mixture`: 1 - `bound` times the rules' force plus `bound` times u, so that u may be a policy that plays alone;
 * `weights`: u sets the rules' parameters of this decision within their ranges, a number for each: -1 is the lower end,
   0 the tuned value, 1 the upper end;
 * `priorities`: u sets in which order the rules' behaviours get their share of max_force (Reynolds 1987), a score for
@@ -34,7 +35,7 @@ __all__ = ["FORCE", "KINDS", "Hybrid", "HybridPolicy"]
 FORCE = "force"
 """The kind of a policy that is no hybrid: what its network puts out is the action."""
 
-KINDS = ("residual", "weights", "priorities", "gate")
+KINDS = ("residual", "mixture", "weights", "priorities", "gate")
 
 Floats = NDArray[np.float32]
 
@@ -58,6 +59,7 @@ class Hybrid:
         """
         rules = player(task, base)
         _check_kind("action", kind, rules)
+        _check_bound("bound", kind, bound)
         return cls(kind, rules, bound, _ranges(rules) if kind == "weights" else ())
 
     @classmethod
@@ -71,8 +73,7 @@ class Hybrid:
         if not isinstance(values, Mapping) or values.keys() != known.keys() or not _are_numbers([*values.values()]):
             raise ValueError(f"hybrid.rules must hold a number for each of {', '.join(known)}")
         values = {name: values[name] for name in known}
-        if not _are_numbers([about["bound"]]) or not 0 < about["bound"] <= 2:
-            raise ValueError(f"hybrid.bound = {about['bound']!r}: must be above 0 and at most 2")
+        _check_bound("hybrid.bound", kind, about["bound"])
         if kind == "priorities" and about.get("behaviours") != [*base.behaviours]:
             raise ValueError(f"hybrid.behaviours must be {', '.join(base.behaviours)}, in this order")
         ranges = _ranges_of_card(about.get("ranges"), values) if kind == "weights" else ()
@@ -110,6 +111,8 @@ class Hybrid:
         force, state = self.rules.act(rows, state, begins)
         if self.kind == "residual":
             return np.clip(force + np.float32(self.bound) * outputs, -1.0, 1.0), state
+        if self.kind == "mixture":
+            return np.clip(np.float32(1.0 - self.bound) * force + np.float32(self.bound) * outputs, -1.0, 1.0), state
         return np.where(outputs[:, -1:] < 0, force, outputs[:, :-1]), state
 
     def parameters(self, outputs: Floats) -> dict[str, NDArray[np.float64]]:
@@ -180,6 +183,13 @@ def _check_kind(key: str, kind: str, rules: RulesPlayer) -> None:
             f"{key} = {kind!r}: {rules.name!r} of {rules.task.name!r} has no behaviours in an order; "
             f"tasks whose {rules.name!r} has them: {', '.join(tasks) or 'none'}"
         )
+
+
+def _check_bound(key: str, kind: str, bound: Any) -> None:
+    """Raise ValueError, in one line, for a bound out of its range: a mixture has shares of 1 in all."""
+    most = 1 if kind == "mixture" else 2
+    if not _are_numbers([bound]) or not 0 < bound <= most:
+        raise ValueError(f"{key} = {bound!r}: must be above 0 and at most {most}")
 
 
 def _ranges(rules: RulesPlayer) -> tuple[tuple[float, float], ...]:
