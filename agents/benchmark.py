@@ -28,7 +28,7 @@ from flockenv.core.errors import printable
 from flockenv.core.output_paths import valid_file
 from flockenv.evaluation import Interval, lead_interval
 from flockenv.jobs import Store, Work, engine_of
-from flockenv.players import NAMES
+from flockenv.players import known_name
 from flockenv.scene.yaml_io import load
 
 __all__ = ["app", "entry_of", "table"]
@@ -65,7 +65,7 @@ def entry_of(
         "spec": spec,
         "study": study,
         "kind": next(iter(home.values())).scores[name].kind,
-        "seeds": len(next(iter(home.values())).scores[name].returns),
+        "seeds": min(len(setting.scores[name].returns) for setting in home.values()),
         "home": _plain(aggregate(home, name)),
         "robust": _plain(aggregate(everywhere, name)),
         "settings": len(everywhere),
@@ -151,9 +151,19 @@ def _other_entries(folder: Path, name: str, study: Study) -> list[dict[str, Any]
     return found
 
 
+def _name_of(player: str) -> str:
+    """Return the name of a player in the table: ppo@all of ppo@*; that of a file without its ending."""
+    if known_name(player):
+        return player.replace("*", "all")
+    return Path(player.replace("{task}", "").rstrip("*")).stem
+
+
 @app.command()
 def main(
-    player: Annotated[str, typer.Argument(help="A known name, a .py, a .safetensors, or files with {task} and *.")],
+    player: Annotated[
+        str,
+        typer.Argument(help="A known name, also ppo@3 or ppo@*; a .py, a .safetensors, or files with {task} and *."),
+    ],
     name: Annotated[str | None, typer.Option(help="Name in the table. [the file's name]")] = None,
     study: Annotated[Path, typer.Option(help="Settings to play.")] = STUDY,
     out: Annotated[str, typer.Option(help="Folder of entries; the table is OUT.md.")] = "results/leaderboard",
@@ -165,7 +175,7 @@ def main(
 ) -> None:
     """Play all tasks and settings with a player, and write its scores."""
     with report_errors("benchmark", STOPPED, debug), end_of_shard():
-        called = name or (player if player in NAMES else Path(player.replace("{task}", "").rstrip("*")).stem)
+        called = name or _name_of(player)
         if not NAME.fullmatch(called) or (called in (RANDOM, "rules") and called != player):
             raise ValueError(f"--name {printable(called)}: a name is up to 40 letters, digits and _ . @ + -")
         plan = load(study, Study)

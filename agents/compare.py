@@ -14,7 +14,7 @@ from itertools import zip_longest
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -22,7 +22,7 @@ from rich.console import Console
 import flockenv
 from agents import report
 from agents.experiment import CONFIGS, Experiment, load_experiment
-from agents.play import Player, episodes_of_bytes, play_job, players_in_order, players_of, usual_players
+from agents.play import Player, episodes_of_bytes, members_of, play_job, players_in_order, players_of, usual_players
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
 from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
@@ -32,7 +32,7 @@ from flockenv.envs.disturbance import Disturbance
 from flockenv.evaluation import WORLDS_PER_SEED, Episodes, task_digest, worlds_for
 from flockenv.jobs import Job, Store, Work, engine_of, run_jobs
 from flockenv.jobs.local_engine import LocalEngine
-from flockenv.players import NAMES
+from flockenv.players import ALL_SEEDS, NAMES
 from flockenv.players.policy import Policy
 from flockenv.players.rules import load_tuned
 from flockenv.tasks import TASKS, Task
@@ -51,7 +51,7 @@ __all__ = [
 ]  # fmt: skip
 
 ROOT = Path(__file__).resolve().parent.parent
-WORLDS, SMOKE_WORLDS = 256, 16
+WORLDS, SMOKE_WORLDS = 128, 16  # with ten seeds of each player, twice as many would take over two minutes
 RESAMPLES, SMOKE_RESAMPLES = 10_000, 1_000
 RECORDED = 0  # the world in the replay: the first, not a selected one
 PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "pettingzoo")
@@ -60,6 +60,10 @@ JOBS = "jobs"
 """Folder of the jobs' records, in the results folder."""
 ROOM = 2**24
 """Bytes that all files take, approximately."""
+
+Played = dict[str, dict[str, Episodes]]
+"""The episodes of a task, by player and by the names of its runs, the one that ships first."""
+
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 
@@ -72,11 +76,12 @@ def compare(
     trust_pickle: bool = False,
     work: Work | None = None,
     disturbance: Disturbance | None = None,
-) -> tuple[report.Results, dict[str, dict[str, Episodes]]]:
+) -> tuple[report.Results, dict[str, Played]]:
     """Play every task with every player in the same worlds; return the results as plain data, and the episodes.
 
-    work: where and how to run the jobs, one for each task and player (default: one after another in this process, and
-    nothing is stored). disturbance: of the worlds, the same for every player (default: none).
+    A player NAME@* plays with the runs of all seeds, in the same worlds. work: where and how to run the jobs, one for
+    each run (default: one after another in this process, and nothing is stored). disturbance: of the worlds, the same
+    for every player (default: none).
 
     Raises:
         ValueError: a player cannot be loaded (before any episode), or jobs fail while playing; one line.
@@ -88,28 +93,29 @@ def compare(
     began = perf_counter()
     first = worlds_for("evaluation", seed, worlds)
     fields = players_of(tasks, players)
+    runs = {task.name: {player.name: members_of(player, task.name) for player in fields[task.name]} for task in tasks}
     policies = {
-        task.name: {player.name: player.policy(task, seed, trust_pickle) for player in fields[task.name]}
-        for task in tasks
-    }
-    jobs = {
-        (task.name, player.name): play_job("compare", task, player, worlds, seed, RECORDED, trust_pickle, disturbance)
-        for task in tasks for player in fields[task.name]
-    }  # fmt: skip
-    run_jobs(in_turn(jobs), work)
-    episodes = {
         task.name: {
-            player.name: work.store.read(jobs[task.name, player.name], episodes_of_bytes)
-            for player in fields[task.name]
+            name: [run.policy(task, seed, trust_pickle) for run in each] for name, each in runs[task.name].items()
         }
         for task in tasks
     }
+    jobs: dict[tuple[str, ...], Job] = {
+        (task.name, name, run.spec): play_job(
+            "compare", task, run, worlds, seed, None if number else RECORDED, trust_pickle, disturbance
+        )
+        for task in tasks for name, each in runs[task.name].items() for number, run in enumerate(each)
+    }  # fmt: skip
+    run_jobs(in_turn(jobs), work)
+    episodes: dict[str, Played] = {task.name: {} for task in tasks}
+    for (of_task, name, spec), job in jobs.items():
+        episodes[of_task].setdefault(name, {})[spec] = work.store.read(job, episodes_of_bytes)
     results: report.Results = {
         "seed": seed,
         "worlds": worlds,
         "world_seeds": {"block": "evaluation", "first": first, "last": first + worlds - 1},
         "disturbance": (disturbance or Disturbance()).model_dump(),
-        "bootstrap": {"resamples": resamples, "seed": seed, "interval": "95 % percentile; proportions: 95 % Wilson"},
+        "bootstrap": {"resamples": resamples, "seed": seed, "interval": report.INTERVAL},
         "players": {player.name: player.spec for player in players},
         "tasks": {
             task.name: _task_results(task, episodes[task.name], policies[task.name], resamples, seed) for task in tasks
@@ -120,24 +126,28 @@ def compare(
     return results, episodes
 
 
-def in_turn(jobs: Mapping[tuple[str, str], Job]) -> list[Job]:
-    """Return jobs by task and player so that neighbours are of different tasks: no process waits for a kernel."""
-    tasks = list(dict.fromkeys(task for task, _ in jobs))
-    rows = [[job for (of, _), job in jobs.items() if of == task] for task in tasks]
-    return [job for column in zip_longest(*rows) for job in column if job is not None]
+def in_turn(jobs: Mapping[tuple[str, ...], Job]) -> list[Job]:
+    """Return jobs, whose key begins with the task, so that neighbours are of different tasks: none waits for a kernel.
+
+    The order within a task is kept.
+    """
+    rows: dict[str, list[Job]] = {}
+    for (task, *_), job in jobs.items():
+        rows.setdefault(task, []).append(job)
+    return [job for column in zip_longest(*rows.values()) for job in column if job is not None]
 
 
 def _task_results(
-    task: Task, episodes: Mapping[str, Episodes], policies: Mapping[str, Policy], resamples: int, seed: int
+    task: Task, episodes: Played, policies: Mapping[str, Sequence[Policy]], resamples: int, seed: int
 ) -> report.Results:
     """Return the numbers of one task as plain data."""
-    differences = {name: getattr(policy, "differences", ()) for name, policy in policies.items()}
-    costs = _costs(task, policies)
-    return report.task_results(task_digest(task), episodes, costs, resamples, seed, differences)
+    ships = {name: each[0] for name, each in policies.items()}
+    differences = {name: getattr(policy, "differences", ()) for name, policy in ships.items()}
+    return report.task_results(task_digest(task), episodes, _costs(task, ships), resamples, seed, differences)
 
 
 def _costs(task: Task, policies: Mapping[str, Policy]) -> dict[str, report.Results]:
-    """Return the cost of training or tuning each player, as far as known: purpose, wall time in s, agent-steps."""
+    """Return the cost of training or tuning one run of each player, as far as known: purpose, seconds, agent-steps."""
     costs = {}
     for name, policy in policies.items():
         card = getattr(policy, "card", None) or {}
@@ -185,8 +195,14 @@ def main(
     tasks: Annotated[list[str] | None, typer.Option(help="Tasks, by comma or repeated. [all]")] = None,
     players: Annotated[
         list[str] | None,
-        typer.Option(help=f"Players: {', '.join(NAMES)}, a .py file with a predict, or a .safetensors."),
+        typer.Option(
+            help=f"Players: {', '.join(NAMES)}, also with a seed (ppo@3) or of all seeds (ppo@*); a .py file with a "
+            "predict, or a .safetensors. [the usual ones, of all seeds]"
+        ),
     ] = None,
+    seeds: Annotated[
+        Literal["all", "shipped"], typer.Option(help="What NAME@* plays: all seeds, or the run that ships.")
+    ] = "all",
     worlds: Annotated[int | None, typer.Option(help=f"Worlds per task, the same for every player. [{WORLDS}]")] = None,
     seed: Annotated[int, typer.Option(help="Block of evaluation worlds, 0 to 999.")] = 0,
     out: Annotated[str, typer.Option(help=f"Folder for {', '.join(FILES)}.")] = "results",
@@ -207,7 +223,8 @@ def main(
     with report_errors("compare", STOPPED, debug), end_of_shard():
         folder = folder_of(out, FILES)
         chosen = [experiment_of(name).build() for name in pick("--tasks", split(tasks) or list(TASKS), TASKS)]
-        field = players_in_order(split(players) or usual_players(chosen))
+        specs = split(players) or usual_players(chosen, ALL_SEEDS)
+        field = players_in_order([spec.removesuffix(ALL_SEEDS) if seeds == "shipped" else spec for spec in specs])
         count = worlds if worlds is not None else SMOKE_WORLDS if smoke else WORLDS
         if not 2 <= count <= WORLDS_PER_SEED:
             raise ValueError(f"--worlds {count}: must be from 2 to {WORLDS_PER_SEED}")
@@ -247,14 +264,12 @@ def pick(option: str, names: Sequence[str], allowed: Mapping[str, object]) -> li
     return list(dict.fromkeys(names))
 
 
-def _file_writers(
-    results: report.Results, episodes: Mapping[str, Mapping[str, Episodes]]
-) -> dict[str, Callable[[Path], None]]:
+def _file_writers(results: report.Results, episodes: Mapping[str, Played]) -> dict[str, Callable[[Path], None]]:
     """Return the function that writes each file."""
     writers: tuple[Callable[[Path], None], ...] = (
         lambda path: write_text(path, report.json_text(results)),
         lambda path: write_text(path, report.markdown(results)),
-        lambda path: _draw(path, results, episodes),
+        lambda path: _draw(path, results),
         lambda path: _replay(path, results, episodes),
     )
     return dict(zip(FILES, writers, strict=True))
@@ -265,19 +280,19 @@ def write_text(path: Path, text: str) -> None:
     path.write_text(text, encoding="utf-8", newline="\n")
 
 
-def _draw(path: Path, results: report.Results, episodes: Mapping[str, Mapping[str, Episodes]]) -> None:
+def _draw(path: Path, results: report.Results) -> None:
     from flockenv.evaluation.plots import write_chart
 
-    columns = [report.chart_column(task, about, episodes[task]) for task, about in results["tasks"].items()]
+    columns = [report.chart_column(task, about) for task, about in results["tasks"].items()]
     note = f"{report.conditions(results)}, the same for every player; level differences are grey"
     write_chart(path, columns, "Hand-written steering against learning", note)
 
 
-def _replay(path: Path, results: report.Results, episodes: Mapping[str, Mapping[str, Episodes]]) -> None:
+def _replay(path: Path, results: report.Results, episodes: Mapping[str, Played]) -> None:
     from flockenv.render.replay import Group, Panel, write_replay
 
     groups = [
-        Group(task, [Panel(name, *_replay_parts(played)) for name, played in players.items()])
+        Group(task, [Panel(name, *_replay_parts(next(iter(runs.values())))) for name, runs in players.items()])
         for task, players in episodes.items()
     ]
     first = results["world_seeds"]["first"] + RECORDED
@@ -287,7 +302,7 @@ def _replay(path: Path, results: report.Results, episodes: Mapping[str, Mapping[
 def _replay_parts(played: Episodes) -> tuple[Any, ...]:
     """Return the data of an episode for a replay: instants, return so far, and outcome."""
     recording = played.recording
-    assert recording is not None  # every rollout here is recorded
+    assert recording is not None  # of the run that ships, or of the only one
     outcome = "success" if played.success[recording.world] else "no success"
     return recording.snapshots, recording.returns, f"{outcome} after {recording.snapshots[-1].time:.1f} s"
 

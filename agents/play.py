@@ -22,7 +22,7 @@ from flockenv.evaluation import Episodes, Playable, Purpose, Recording, rollout,
 from flockenv.jobs import Job, records
 from flockenv.model.appearance import Appearance
 from flockenv.model.snapshot import Mark, Snapshot
-from flockenv.players import ALL_SEEDS, NAMES, known_name, load_player, other_tasks, seeds_of_player
+from flockenv.players import ALL_SEEDS, NAMES, SEEDED, known_name, load_player, other_tasks, seeds_of_player
 from flockenv.players.files import SUFFIXES, PlayerError
 from flockenv.players.policy import Policy
 from flockenv.tasks import Task
@@ -92,10 +92,14 @@ def blame(player: str, task: Task, *clear: type[Exception]) -> Iterator[None]:
         raise ValueError(f"player {player!r}, task {task.name!r}: {type(error).__name__}: {error}") from error
 
 
-def usual_players(tasks: Sequence[Task]) -> list[str]:
-    """Return the default players: the named ones that can play one of the tasks; of published ones the textbook."""
+def usual_players(tasks: Sequence[Task], ending: str = "") -> list[str]:
+    """Return the default players: the named ones that can play one of the tasks; of published ones the textbook.
+
+    ending: of the names of players that have seeds; with ALL_SEEDS, they play with all of them.
+    """
     shown = [name for name in NAMES if not name.endswith("_published")]
-    return [name for name in shown if any(not other_tasks(name, task.name) for task in tasks)]
+    usual = [name for name in shown if any(not other_tasks(name, task.name) for task in tasks)]
+    return [f"{name}{ending}" if name in SEEDED else name for name in usual]
 
 
 def players_of(tasks: Sequence[Task], players: Sequence[Player]) -> dict[str, list[Player]]:

@@ -17,7 +17,7 @@ import typer
 
 from agents.compare import ROOT
 from agents.experiment import one_line_errors
-from agents.report import Results, grid
+from agents.report import Results, grid, seeds_text
 from agents.summary_chart import write_summary
 from flockenv.cli.terminal import run_program
 from flockenv.core.atomic_files import write_all_or_none
@@ -48,7 +48,7 @@ def tables(results: Results) -> str:
 
 
 def summary(results: Results) -> str:
-    """Return README's table: scores at two digits, and success rates below 100 %."""
+    """Return README's table: scores at two digits, the seeds of each player, and success rates below 100 %."""
     header = ["task", *(f"`{name}`" for name in SHOWN), "`ppo` - `rules`"]
     rows = [
         [task, *(_short_score(about["players"][name]) for name in SHOWN), _short_lead(about["pairs"]["ppo - rules"])]
@@ -58,8 +58,10 @@ def summary(results: Results) -> str:
 
 
 def _short_score(player: Results) -> str:
-    rate = f"{player['success_rate']:.0%}"
-    return _digits(player["iqm"]) if rate == "100%" else f"{_digits(player['iqm'])}, {rate}"
+    score, rate = _digits(player["mean"]), f"{player['success_rate']:.0%}"
+    if len(player["runs"]) > 1:
+        score += f" ({len(player['runs'])}: {_digits(player['lowest'])}, {_digits(player['highest'])})"
+    return score if rate == "100%" else f"{score}, {rate}"
 
 
 def _short_lead(pair: Results) -> str:
@@ -79,15 +81,16 @@ def _other_rows(results: Results) -> Iterator[list[str]]:
 
 
 def _score(player: Results) -> str:
-    """Return the interquartile mean with its interval, and the success rate where it is not 100 %."""
-    rate = f"{player['success_rate']:.0%}"
-    score = f"{player['iqm']:.2f} [{player['ci_low']:.2f}, {player['ci_high']:.2f}]"
+    """Return the mean with its interval, its seeds if there are several, and the success rate if it is below 100 %."""
+    rate, seeds = f"{player['success_rate']:.0%}", f" ({seeds_text(player)})" if len(player["runs"]) > 1 else ""
+    score = f"{player['mean']:.2f} [{player['mean_low']:.2f}, {player['mean_high']:.2f}]{seeds}"
     return score if rate == "100%" else f"{score}, {rate}"
 
 
 def _lead(pair: Results) -> str:
     difference = f"{pair['difference']:+.2f} [{pair['ci_low']:+.2f}, {pair['ci_high']:+.2f}]"
-    return f"{difference}, higher in {pair['probability_better']:.0%}"
+    level = "" if pair["separated"] else "level: "
+    return f"{level}{difference}, higher in {pair['probability_better']:.0%}"
 
 
 def _read_comparison(folder: Path) -> Results:

@@ -10,6 +10,7 @@ from itertools import combinations
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 from rich import box
 from rich.markup import escape
 from rich.table import Table
@@ -18,25 +19,29 @@ from flockenv.evaluation import Comparison, Episodes, Interval, compare, summari
 from flockenv.evaluation.plots import Column, Row
 
 __all__ = [
-    "chart_column", "conditions", "differences", "grid", "interval_fields", "interval_text", "json_text", "markdown",
-    "number_text", "player_tables", "table_of", "task_results", "verdict",
+    "INTERVAL", "chart_column", "conditions", "differences", "grid", "interval_fields", "interval_text", "json_text",
+    "markdown", "number_text", "player_tables", "rounded", "seeds_text", "table_of", "task_results", "verdict",
 ]  # fmt: skip
 
 Results = dict[str, Any]
 
+SEEDS_HEADER = "seeds: lowest, highest"
+
+INTERVAL = "95 % two-level percentile bootstrap over seeds and worlds; shares of one seed: 95 % Wilson"
+
 NOTES = """\
 Return: the mean reward of a world's learners, summed over its episode; higher is better. Every player met the same
-worlds, and no player was trained or tuned on one of them. IQM (the mean without the best and the worst quarter of the
-worlds), mean and differences: 95 % percentile bootstrap over worlds; success and "scores higher" (ties count half):
-95 % Wilson. A difference is the mean over worlds, so rare disasters count in it, unlike in the IQM. There is one
-trained policy per task, and one search for the parameters of a tuned player (the median of several search seeds): the
-intervals are of the luck of worlds, not of the luck of training or of search. µs: per decision, all worlds at once /
-one row alone (medians; in a large comparison other cores play other tasks meanwhile)."""
+worlds, and no player was trained or tuned on one of them. A player with several training or search seeds has the mean
+over all of them, with the number of seeds and the lowest and the highest mean of a seed. Intervals: 95 %, two-level
+bootstrap over seeds and worlds; of a single seed over worlds alone, and then they do not contain the luck of training
+or of the search. Success and "scores higher" (ties count half) of single seeds: 95 % Wilson. Level: the interval of the
+difference contains 0. µs: per decision, all worlds at once / one row alone (medians; in a large comparison other cores
+play other tasks meanwhile)."""
 
 
 def task_results(
     digest: str,
-    episodes: Mapping[str, Episodes],
+    episodes: Mapping[str, Mapping[str, Episodes]],
     costs: Mapping[str, Results],
     resamples: int,
     seed: int,
@@ -44,42 +49,51 @@ def task_results(
 ) -> Results:
     """Return the results of one task as plain data: players in order, and the difference of each pair, later - earlier.
 
-    differences: by player, the differences between this task and the one that it was trained on.
+    episodes: by player and by the name of its run, the one that ships first. differences: by player, the differences
+    between this task and the one that it was trained on.
     """
+    runs = {name: list(played.values()) for name, played in episodes.items()}
     pairs = {
-        f"{later} - {earlier}": _pair(compare(episodes[later], episodes[earlier], resamples, seed))
-        for earlier, later in reversed(list(combinations(episodes, 2)))
+        f"{later} - {earlier}": _pair(compare(runs[later], runs[earlier], resamples, seed))
+        for earlier, later in reversed(list(combinations(runs, 2)))
     }
     players = {
         name: {**_player(played, costs.get(name, {}), resamples, seed), "differs": list(differences.get(name, ()))}
         for name, played in episodes.items()
     }
-    first = next(iter(episodes.values()))
+    first = next(iter(runs.values()))[0]
     results = {"digest": digest, "horizon": first.horizon, "players": players, "pairs": pairs}
     return {**results, "verdict": verdict(first.task, results)}
 
 
-def _player(played: Episodes, cost: Results, resamples: int, seed: int) -> Results:
-    summary = summarise(played, resamples, seed)
+def _player(played: Mapping[str, Episodes], cost: Results, resamples: int, seed: int) -> Results:
+    runs = list(played.values())
+    summary, means = summarise(runs, resamples, seed), [float(run.returns.mean()) for run in runs]
     return {
-        **interval_fields("iqm", "ci", summary.iqm),
+        "runs": list(played),
         **interval_fields("mean", "mean", summary.mean),
+        "lowest": min(means),
+        "highest": max(means),
         **interval_fields("success_rate", "success", summary.success),
-        "worlds": played.worlds,
-        "episode_length": float(played.lengths.mean()),
+        "worlds": runs[0].worlds,
+        "episode_length": float(np.mean([run.lengths for run in runs])),
         "metrics": {name: {"mean": _number(mean), "worlds": n} for name, (mean, n) in summary.metrics.items()},
-        "terms": {name: float(values.mean()) for name, values in played.terms.items()},
-        "microseconds_per_decision": played.microseconds,
-        "microseconds_single": played.latency,
+        "terms": {name: float(np.mean([run.terms[name] for run in runs])) for name in runs[0].terms},
+        "microseconds_per_decision": float(np.median([run.microseconds for run in runs])),
+        "microseconds_single": float(np.median([run.latency for run in runs])),
         "cost": cost,
-        "returns": [float(x) for x in played.returns],
+        "returns": [[rounded(value) for value in run.returns] for run in runs],
     }
+
+
+def rounded(value: float, digits: int = 6) -> float:
+    """Return a number rounded to some significant digits, as it is stored; an integer stays as it is."""
+    return value if isinstance(value, int) else float(f"{value:.{digits}g}")
 
 
 def _pair(pair: Comparison) -> Results:
     return {
         **interval_fields("difference", "ci", pair.difference),
-        **interval_fields("iqm_difference", "iqm", pair.iqm_difference),
         **interval_fields("probability_better", "better", pair.better),
         "worlds": pair.worlds,
         "separated": pair.separated,
@@ -113,6 +127,9 @@ def verdict(task: str, results: Results) -> str:
     gap = interval_text(pair, "difference", "ci")
     wins = f"{percent_text(pair, 'probability_better', 'better')} of the same {pair['worlds']} worlds"
     rates = f"success {players[first]['success_rate']:.0%} against {players[second]['success_rate']:.0%}"
+    counts = [len(players[name]["runs"]) for name in (first, second)]
+    if max(counts) > 1:
+        rates += f"; seeds: {counts[0]} against {counts[1]}"
     if pair["separated"]:
         claim = f"{first} beats {second} by {gap} per world and scores higher in {wins}; {rates}."
     else:
@@ -168,12 +185,12 @@ def player_cells(results: Results) -> tuple[list[str], list[list[str]]]:
     """Return header and rows: one row per player."""
     players = results["players"]
     metrics = list(next(iter(players.values()))["metrics"])
-    header = ["player", "IQM [95 %]", "mean [95 %]", "success [95 %]", *(m.replace("_", " ") for m in metrics), "µs"]
+    header = ["player", "mean [95 %]", SEEDS_HEADER, "success [95 %]", *(m.replace("_", " ") for m in metrics), "µs"]
     rows = [
         [
             name,
-            interval_text(player, "iqm", "ci"),
             interval_text(player, "mean", "mean"),
+            seeds_text(player),
             percent_text(player, "success_rate", "success"),
             *(number_text(player["metrics"][metric]["mean"]) for metric in metrics),
             f"{micro_text(player['microseconds_per_decision'])} / {micro_text(player['microseconds_single'])}",
@@ -185,12 +202,11 @@ def player_cells(results: Results) -> tuple[list[str], list[list[str]]]:
 
 def pair_cells(results: Results) -> tuple[list[str], list[list[str]]]:
     """Return header and rows: one row per pair."""
-    header = ["same worlds", "difference [95 %]", "IQM of it [95 %]", "higher in [95 %]"]
+    header = ["same worlds", "difference [95 %]", "higher in [95 %]"]
     rows = [
         [
             name,
             interval_text(pair, "difference", "ci") + ("" if pair["separated"] else " (level)"),
-            interval_text(pair, "iqm_difference", "iqm"),
             percent_text(pair, "probability_better", "better"),
         ]
         for name, pair in results["pairs"].items()
@@ -198,22 +214,25 @@ def pair_cells(results: Results) -> tuple[list[str], list[list[str]]]:
     return header, rows
 
 
-def chart_column(task: str, results: Results, episodes: Mapping[str, Episodes]) -> Column:
+def chart_column(task: str, results: Results) -> Column:
     """Return the column of one task in the picture: all players, and the differences between all but random actions."""
 
     def interval(about: Results, name: str, prefix: str) -> Interval:
         return Interval(about[name], about[f"{prefix}_low"], about[f"{prefix}_high"])
 
     rows = [
-        Row(name, interval(player, "iqm", "ci"), interval(player, "success_rate", "success"), episodes[name].returns)
+        Row(
+            name, interval(player, "mean", "mean"), interval(player, "success_rate", "success"),
+            np.mean(player["returns"], axis=0),
+        )
         for name, player in results["players"].items()
-    ]
+    ]  # fmt: skip
     pairs = {name: interval(pair, "difference", "ci") for name, pair in results["pairs"].items()}
     steering = {name: pair for name, pair in pairs.items() if "random" not in name.split(" - ")}
     return Column(task, rows, steering or pairs)
 
 
-def json_text(results: Results) -> str:
+def json_text(results: Mapping[str, Any]) -> str:
     """Return the results as strict JSON, lists of numbers on one line each."""
     text = json.dumps(results, indent=2, allow_nan=False, ensure_ascii=False)
     return re.sub(r"\[\s+([-+.\deE,\s]*?)\s+\]", lambda m: f"[{' '.join(m[1].split())}]", text) + "\n"
@@ -245,9 +264,15 @@ def grid(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def interval_text(about: Results, name: str, prefix: str) -> str:
     """Return 'value [low, high]' with digits down to a twentieth of the interval's width."""
     value, low, high = about[name], about[f"{prefix}_low"], about[f"{prefix}_high"]
-    width = high - low
+    width = 0.0 if math.isclose(low, high) else high - low  # resampled means of equal numbers differ by rounding
     digits = min(6, max(0, math.ceil(1.3 - math.log10(width)))) if width > 0 else 3
     return f"{value:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def seeds_text(player: Results) -> str:
+    """Return the number of a player's seeds, and the lowest and highest mean of a seed: '10: 7.9, 8.2'."""
+    count = len(player["runs"])
+    return f"{count}: {number_text(player['lowest'])}, {number_text(player['highest'])}" if count > 1 else str(count)
 
 
 def percent_text(about: Results, name: str, prefix: str) -> str:

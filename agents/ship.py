@@ -24,7 +24,7 @@ from pydantic import BaseModel, ValidationError
 
 from agents.compare import ROOT, experiment_of
 from agents.experiment import PpoSettings, one_line_errors
-from agents.report import grid, json_text
+from agents.report import grid, json_text, rounded
 from agents.run import first_difference
 from agents.search import Found, median_of
 from agents.tune import content_of, found_of
@@ -45,9 +45,6 @@ BLOCK = re.compile(r"(?<=<!-- python -m agents\.ship -->\n).*?(?=<!-- end -->)",
 
 KEPT_EQUAL = ("algorithm", "rules", "hybrid")
 """Entries of a card that belong to its recipe but are not in a config: the rules as they were when it was trained."""
-
-DIGITS = 6
-"""Significant digits of a learning curve in a card that does not ship."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -161,7 +158,7 @@ def _ship_policies(task: str, trained: Sequence[Trained], files: Files) -> list[
     ships_now = [run for run in _shipped(task, files.root) if run.seed not in new]
     runs = [*trained, *(run for run in ships_now if _difference(run, wanted) is None)]
     left_out = [str(run.seed) for run in ships_now if run not in runs]
-    ships, scores = median_of(runs), {run.seed: _rounded(run.tuning_mean) for run in runs}
+    ships, scores = median_of(runs), {run.seed: rounded(run.tuning_mean) for run in runs}
     about = {"scores": {str(seed): scores[seed] for seed in sorted(scores)}, **_ends(scores)}
     for run in runs:
         name = f"{PLAYERS_FOLDER}/weights/{task if run is ships else f'seeds/{task}-seed-{run.seed}'}"
@@ -242,7 +239,7 @@ def _card(run: Trained, seeds: Content | None) -> Content:
     card = {key: value for key, value in run.card.items() if key != "seeds"}
     card["recipe"] = {**card["recipe"], "command": command}
     if seeds is None:
-        card["curve"] = [{key: _rounded(value) for key, value in point.items()} for point in card["curve"]]
+        card["curve"] = [{key: rounded(value) for key, value in point.items()} for point in card["curve"]]
     return card if seeds is None else {**card, "seeds": seeds}
 
 
@@ -300,10 +297,6 @@ def _line(seed: int, about: Content) -> str:
     scores = about["scores"]
     ends = f"{scores[str(seed)]:.3f}, all from {about['lowest']:.3f} to {about['highest']:.3f}"
     return f"seed {seed}, the median of {len(scores)}: {ends}"
-
-
-def _rounded(value: float) -> float:
-    return value if isinstance(value, int) else float(f"{value:.{DIGITS}g}")
 
 
 def _write(content: bytes, path: Path) -> None:

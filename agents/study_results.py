@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from agents.study import HOME, setting_name
 from flockenv.core.errors import nearest
 from flockenv.envs.disturbance import Disturbance
-from flockenv.evaluation import Interval, lead_interval, mean_interval, proportion
+from flockenv.evaluation import Interval, lead_interval, mean_interval, success_interval
 from flockenv.players.policy import MlpPolicy, Policy, RandomPolicy
 
 __all__ = [
@@ -83,10 +83,8 @@ class Score:
 
     @functools.cached_property
     def success_rate(self) -> Interval:
-        """The share of successful worlds; of several seeds, with its interval over seeds and worlds."""
-        if len(self.success) == 1:
-            return proportion(self.success[0].astype(float))
-        return mean_interval(self.success.astype(float))
+        """The share of successful worlds, with its interval over seeds and worlds."""
+        return success_interval(self.success)
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,16 +29,18 @@ def write_summary(path: str | Path, results: Results) -> None:
 
 
 def draw_summary(results: Results) -> Figure:
-    """Return the chart. A score is (IQM - random's) / (best IQM - random's), its interval scaled in the same way."""
+    """Return the chart. A score is (mean - random's) / (best mean - random's), its interval scaled in the same way."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
     axes: Any = figure.add_subplot()
     for row, about in enumerate(results["tasks"].values()):
         players = about["players"]
-        low, best = players["random"]["iqm"], max(player["iqm"] for player in players.values())
+        low, best = players["random"]["mean"], max(player["mean"] for player in players.values())
         for k, name in enumerate(SHOWN):
-            value, left, right = ((players[name][key] - low) / (best - low) for key in ("iqm", "ci_low", "ci_high"))
+            value, left, right = (
+                (players[name][key] - low) / (best - low) for key in ("mean", "mean_low", "mean_high")
+            )
             y = row + (k - 1) * 0.22
             axes.plot([left, right], [y, y], color=COLOURS[k], linewidth=2.5)
             axes.plot(value, y, "o", color=COLOURS[k], markersize=6, label=SHOWN[name] if row == 0 else None)

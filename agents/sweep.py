@@ -22,7 +22,7 @@ from rich.console import Console
 
 from agents.compare import JOBS, folder_of, pick, provenance, split, write_text
 from agents.play import Player, episodes_of_bytes, play_job
-from agents.report import json_text
+from agents.report import json_text, rounded
 from agents.study import Contender, Setting, Study, contenders_of, settings_of
 from agents.study_results import RANDOM, TaskResults, kind_of, read_file, read_task
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
@@ -37,9 +37,6 @@ from flockenv.scene.yaml_io import load, parse_scalar
 __all__ = ["app", "plan_digest", "sweep"]
 
 SUMMARY = "summary.png"
-DIGITS = 6
-"""Significant digits of stored returns."""
-
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 Content = dict[str, Any]
@@ -119,7 +116,8 @@ def _entries(study: Study, setting: Setting, contenders: Sequence[Contender], ch
         try:
             policies = [member.policy(setting.task, study.seed) for member in contender.members]
         except OtherSlotsError as error:
-            found.append(_Entry(setting, contender, "", content={"refused": str(error)}))
+            reason = str(error).partition(": ")[2]  # without the path of the file, which is this machine's
+            found.append(_Entry(setting, contender, "", content={"refused": reason}))
             continue
         jobs = [_job(study, setting, member, "evaluation") for member in contender.members]
         found.append(_Entry(setting, contender, kind_of(policies[0]), jobs))
@@ -145,15 +143,11 @@ def _played(entry: _Entry, store: Store, commit: str | None) -> Content:
         "kind": entry.kind,
         "digest": entry.digest,
         "commit": commit,
-        "microseconds": _rounded(float(np.median([each.microseconds for each in episodes]))),
-        "tuning_mean": _rounded(float(np.mean([each.returns.mean() for each in tuning]))) if tuning else None,
+        "microseconds": rounded(float(np.median([each.microseconds for each in episodes]))),
+        "tuning_mean": rounded(float(np.mean([each.returns.mean() for each in tuning]))) if tuning else None,
         "success": ["".join("01"[int(mark)] for mark in each.success) for each in episodes],
-        "returns": [[_rounded(value) for value in each.returns] for each in episodes],
+        "returns": [[rounded(value) for value in each.returns] for each in episodes],
     }
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.{DIGITS}g}")
 
 
 @functools.cache

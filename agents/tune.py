@@ -17,7 +17,7 @@ import typer
 from rich.console import Console
 
 from agents.experiment import Experiment, load_experiment, one_line_errors, seeds_of
-from agents.report import json_text
+from agents.report import json_text, rounded
 from agents.search import Found, median_of, search
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes
 from flockenv.cli.terminal import job_bar, run_program
@@ -66,13 +66,11 @@ def found_of(ships: Found, found: Sequence[Found]) -> dict[str, Any]:
 
 def _search_of(found: Found) -> dict[str, Any]:
     """Return what is kept of one search, with few digits except for the parameters."""
-    curve = {key: [_rounded(point[key]) for point in found.curve] for key in ("steps", "seconds", "mean", "success")}
+    curve = {
+        key: [rounded(point[key], DIGITS) for point in found.curve] for key in ("steps", "seconds", "mean", "success")
+    }
     about = {"agent_steps": found.agent_steps, "seconds": found.seconds, "curve": curve}
-    return {"parameters": found.parameters, "success": _rounded(found.tuning_success), **about}
-
-
-def _rounded(value: float) -> float:
-    return value if isinstance(value, int) else float(f"{value:.{DIGITS}g}")
+    return {"parameters": found.parameters, "success": rounded(found.tuning_success, DIGITS), **about}
 
 
 def write(path: Path, task: str, player: str, parameters: Mapping[str, float], found: Mapping[str, Any]) -> None:

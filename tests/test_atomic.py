@@ -229,7 +229,7 @@ def publish_a_comparison(folder: Path, number: int) -> None:
     results = json.loads((ROOT / "docs" / "results.json").read_text(encoding="utf-8"))
     for name in ("results", "root/docs"):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    results["tasks"]["pursuit"]["players"]["rules"]["iqm"] -= number  # another table, and another picture
+    results["tasks"]["pursuit"]["players"]["rules"]["mean"] -= number  # another table, and another picture
     (folder / "results" / "results.json").write_text(json.dumps(results))
     (folder / "results" / "comparison.png").write_bytes(b"%d" % number)
     for page in ("README.md", "docs/results.md"):

@@ -23,11 +23,12 @@ from typer.testing import CliRunner
 
 from agents import compare as comparison
 from agents import play, report
-from flockenv.evaluation import EVALUATION, Episodes
+from flockenv.evaluation import EVALUATION, Episodes, lead_interval
 from flockenv.evaluation.plots import Column, draw_chart, write_chart
 from flockenv.jobs import Failure
 from flockenv.jobs.job import code_digest, execute
 from flockenv.players.policy import save_policy
+from flockenv.players.rules import TUNED
 from flockenv.tasks import TASKS
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -79,7 +80,12 @@ def artificial(returns: Any, task: str = "toy", **change: Any) -> Episodes:
 
 
 def artificial_results(scores: dict[str, Any], costs: dict[str, Any] | None = None) -> report.Results:
-    return report.task_results("d", {name: artificial(x) for name, x in scores.items()}, costs or {}, 300, 0)
+    """Return the results of players with returns (worlds,), or (seeds, worlds)."""
+    runs = {
+        name: {f"{name}@{k}": artificial(row) for k, row in enumerate(np.atleast_2d(rows))}
+        for name, rows in scores.items()
+    }
+    return report.task_results("d", runs, costs or {}, 300, 0)
 
 
 # --- sentences and tables
@@ -90,7 +96,7 @@ def test_results_have_scores_differences_and_intervals() -> None:
     results = artificial_results({"random": luck - 5, "rules": luck, "ppo": luck + 1})
     assert list(results["players"]) == ["random", "rules", "ppo"]
     assert list(results["pairs"]) == ["ppo - rules", "ppo - random", "rules - random"]
-    assert {"iqm", "ci_low", "ci_high", "success_rate", "worlds"} <= results["players"]["ppo"].keys()
+    assert {"mean", "mean_low", "mean_high", "success_rate", "worlds"} <= results["players"]["ppo"].keys()
     pair = results["pairs"]["ppo - rules"]
     assert {"difference", "ci_low", "ci_high"} <= pair.keys()
     assert (pair["difference"], pair["ci_low"], pair["ci_high"]) == pytest.approx((1, 1, 1))
@@ -100,14 +106,14 @@ def test_results_have_scores_differences_and_intervals() -> None:
     assert results["players"]["ppo"]["worlds"] == 40
     assert results["players"]["ppo"]["metrics"]["time_to_goal"] == {"mean": 2.0, "worlds": int((luck + 1 > 0).sum())}
     assert results["players"]["random"]["metrics"]["time_to_goal"] == {"mean": None, "worlds": 0}
-    assert results["players"]["rules"]["returns"] == pytest.approx(list(luck))
+    assert results["players"]["rules"]["returns"] == [pytest.approx(list(luck), rel=1e-5)]
 
 
 def test_results_are_strict_json_with_one_line_per_list() -> None:
     results = artificial_results({"a": [1.0, -2.5e-7, 3.0], "b": [0.0, 1e9, -1.0]})
     text = report.json_text(results)
     assert json.loads(text, parse_constant=pytest.fail) == json.loads(json.dumps(results))
-    assert '"returns": [1.0, -2.5e-07, 3.0]' in text
+    assert " [1.0, -2.5e-07, 3.0]\n" in text
     assert "NaN" not in text
 
 
@@ -138,8 +144,53 @@ def test_verdict_also_reports_a_loss_of_ppo_or_a_tie() -> None:
     assert level.startswith("toy: ppo and rules are level: difference 0.000")
 
 
+def test_a_player_of_several_seeds_has_their_number_and_ends_beside_its_mean() -> None:
+    luck = np.random.default_rng(0).normal(size=40)
+    results = artificial_results({"rules": luck, "ppo": luck + np.array([[0.5], [0.7], [0.9]])})
+    ppo, pair = results["players"]["ppo"], results["pairs"]["ppo - rules"]
+    assert ppo["runs"] == ["ppo@0", "ppo@1", "ppo@2"] and results["players"]["rules"]["runs"] == ["rules@0"]
+    assert (ppo["lowest"], ppo["mean"], ppo["highest"]) == pytest.approx(luck.mean() + np.array([0.5, 0.7, 0.9]))
+    interval = lead_interval(luck + np.array([[0.5], [0.7], [0.9]]), luck[None], 300)
+    assert (pair["difference"], pair["ci_low"], pair["ci_high"]) == (interval.value, interval.low, interval.high)
+    assert pair["ci_high"] - pair["ci_low"] > 0.3, "the luck of training"
+    assert "success" in results["verdict"] and "; seeds: 3 against 1. ppo cost" in results["verdict"]
+    assert report.seeds_text(ppo) == f"3: {ppo['lowest']:.3g}, {ppo['highest']:.3g}"
+
+
+def test_players_are_level_if_the_interval_over_their_seeds_contains_zero() -> None:
+    luck = np.random.default_rng(0).normal(size=40)
+    results = artificial_results({"rules": luck, "ppo": luck + np.array([[0.5], [-0.3], [0.2]])})
+    assert results["pairs"]["ppo - rules"]["separated"] is False
+    assert "ppo and rules are level" in results["verdict"]
+    assert artificial_results({"rules": luck, "ppo": luck + 0.2})["pairs"]["ppo - rules"]["separated"] is True
+
+
+def test_all_seeds_of_a_player_play_the_same_worlds_unless_only_what_ships_is_wanted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tuned = Path("tuned")
+    tuned.mkdir()
+    about = json.loads((TUNED / "pursuit.json").read_text())["players"]["rules"]
+    searches = {str(seed): {**about, "parameters": {**about["parameters"], "gain": 2.0 + seed}} for seed in (1, 3)}
+    found = {**about["found"], "seed": 2, "searches": searches}
+    content = {"players": {"rules": {"parameters": about["parameters"], "found": found}}}
+    (tuned / "pursuit.json").write_text(json.dumps(content))
+    monkeypatch.setattr("flockenv.players.rules.TUNED", tuned)
+
+    def played(*options: str) -> Any:
+        run("--tasks", "pursuit", "--worlds", "3", "--smoke", "--processes", "1", *options)
+        return json.loads(Path("results/results.json").read_text())["tasks"]["pursuit"]["players"]
+
+    players = played("--players", "random,rules@*,rules@3")
+    assert players["rules"]["runs"] == ["rules@2", "rules@1", "rules@3"] and len(players["rules"]["returns"]) == 3
+    assert players["rules@3"]["returns"] == players["rules"]["returns"][2:]
+    assert players["rules"]["returns"][0] != players["rules"]["returns"][1]
+    shipped = played("--players", "random,rules@*", "--seeds", "shipped")
+    assert shipped["rules"]["runs"] == ["rules"] and shipped["rules"]["returns"] == players["rules"]["returns"][:1]
+
+
 TWO = ("--processes", "2")
-WITHOUT_CLOCK = ("worlds", "iqm", "mean", "returns", "metrics", "terms", "episode_length", "success_rate")
+WITHOUT_CLOCK = ("worlds", "runs", "mean", "returns", "metrics", "terms", "episode_length", "success_rate")
 
 
 @pytest.mark.slow
@@ -304,7 +355,7 @@ def test_numbers_are_rounded_by_their_intervals() -> None:
 def test_tables_fit_80_columns_and_escape_markup() -> None:
     luck = np.linspace(-1, 1, 101)
     episodes = {name: artificial(x, metrics={"[b]_m": x}) for name, x in {"[red]": luck, "a|b": luck + 0.5}.items()}
-    results = report.task_results("d", episodes, {}, 100, 0)
+    results = report.task_results("d", {name: {name: each} for name, each in episodes.items()}, {}, 100, 0)
     console = Console(width=80, file=StringIO(), force_terminal=False)
     console.print(*report.player_tables("toy [bold]", results))
     text = console.file.getvalue()  # type: ignore[attr-defined]
@@ -316,7 +367,7 @@ def test_tables_fit_80_columns_and_escape_markup() -> None:
     page = report.markdown({"tasks": {"toy": results}, **about})
     rows = [line for line in page.splitlines() if line.startswith("| ")]
     assert len(rows) == 4 + 3
-    assert {len(re.findall(r"(?<!\\)\|", row)) for row in rows} == {6 + 1, 4 + 1}
+    assert {len(re.findall(r"(?<!\\)\|", row)) for row in rows} == {6 + 1, 3 + 1}
 
 
 # --- the chart
@@ -325,8 +376,7 @@ def test_tables_fit_80_columns_and_escape_markup() -> None:
 def columns() -> list[Column]:
     luck = np.random.default_rng(0).normal(size=50)
     scores = {"random": luck - 5, "rules": luck, "$mine_": luck + 0.5}
-    episodes = {name: artificial(x) for name, x in scores.items()}
-    return [report.chart_column("toy", report.task_results("d", episodes, {}, 200, 0), episodes)]
+    return [report.chart_column("toy", artificial_results(scores))]
 
 
 def test_chart_draws_the_intervals() -> None:
@@ -377,8 +427,8 @@ def test_one_run_writes_all_four_files(in_temporary_folder: Path) -> None:
         assert list(about["players"]) == ["random", "still"]
         assert list(about["pairs"]) == ["still - random"]
         assert about["players"]["still"]["worlds"] == 6
-        assert len(about["players"]["still"]["returns"]) == 6
-        assert about["players"]["still"]["ci_low"] <= about["players"]["still"]["iqm"]
+        assert [len(row) for row in about["players"]["still"]["returns"]] == [6]
+        assert about["players"]["still"]["mean_low"] <= about["players"]["still"]["mean"]
         assert about["verdict"] in " ".join(result.stdout.split())
         assert f"## {name}" in Path("here/results/table.md").read_text()
     assert results["world_seeds"] == {"block": "evaluation", "first": EVALUATION, "last": EVALUATION + 5}
@@ -566,6 +616,7 @@ def test_hand_written_player_plays_only_the_tasks_that_it_supports() -> None:
     crossing, flock = TASKS["crossing"](), TASKS["flock"]()
     assert play.usual_players([crossing]) == ["random", "textbook", "orca", "rules", "ppo"]
     assert play.usual_players([flock]) == ["random", "textbook", "rules", "ppo"]
+    assert play.usual_players([flock], "@*") == ["random", "textbook", "rules@*", "ppo@*"]
     orca, chance = play.Player.of("orca"), play.Player.of("random")
     fields = play.players_of([crossing, flock], [chance, orca])
     assert fields == {"crossing": [chance, orca], "flock": [chance]}

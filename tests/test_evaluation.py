@@ -32,6 +32,7 @@ from flockenv.evaluation import (
 from flockenv.evaluation import (
     episodes as module,
 )
+from flockenv.evaluation.seeds import better_interval
 from flockenv.players.policy import RandomPolicy
 from flockenv.tasks import TASKS
 
@@ -371,7 +372,6 @@ def test_players_are_compared_world_by_world() -> None:
     pair = compare(strong, weak, resamples=500)
     gains = 0.4 * 1.5 * weak.lengths  # the scores of the worlds themselves (10 to 15) cancel
     assert pair.difference.value == pytest.approx(gains.mean())
-    assert pair.iqm_difference.value == pytest.approx(iqm(gains))
     assert pair.difference.low >= gains.min() - 1e-6
     assert pair.difference.high <= gains.max() + 1e-6
     assert pair.better == proportion([1] * 6)
@@ -390,14 +390,36 @@ def test_ties_count_half_and_equal_players_are_not_separated() -> None:
     assert not pair.separated
 
 
-def test_rare_low_scores_count_in_the_mean_difference_but_not_in_the_iqm() -> None:
+def test_rare_low_scores_count_in_the_difference() -> None:
     one = play(worlds=20)
     gain = np.full(20, 1.0)
     gain[:4] = -100
     other = replace(one, returns=one.returns + gain)
-    pair = compare(other, one, resamples=500)
-    assert pair.difference.value == pytest.approx((16 - 400) / 20)
-    assert pair.iqm_difference.value == pytest.approx(1)
+    assert compare(other, one, resamples=500).difference.value == pytest.approx((16 - 400) / 20)
+
+
+def test_every_seed_of_one_player_is_compared_with_every_seed_of_the_other() -> None:
+    base = play(worlds=20)
+    one, two = ([replace(base, returns=base.returns + gain) for gain in gains] for gains in ([1.0, 3.0], [0.0, 2.0]))
+    pair = compare(one, two, resamples=500)
+    assert pair.difference.value == pytest.approx(1.0)
+    assert pair.better.value == pytest.approx(0.75)  # 1 > 0, 1 < 2, 3 > 0, 3 > 2
+    assert 0 <= pair.better.low < 0.75 < pair.better.high <= 1
+    assert not pair.separated, "two seeds say little"
+    summary = summarise(one, resamples=500)
+    assert summary.mean.value == pytest.approx(base.returns.mean() + 2.0)
+    assert summary.metrics["finish"][1] == 2 * summarise(base, resamples=100).metrics["finish"][1]
+
+
+def test_the_share_of_won_worlds_of_many_seeds_has_the_width_of_their_luck() -> None:
+    """Each seed is ahead in all worlds or in none, with probability 0.6: the interval is that of 40 trials."""
+    rng = np.random.default_rng(1)
+    first = np.where(rng.random(40) < 0.6, 1.0, -1.0)[:, None] + np.zeros(50)
+    interval = better_interval(first, np.zeros((1, 50)), 4000)
+    value = (first[:, 0] > 0).mean()
+    assert interval.value == pytest.approx(value)
+    half = stats.t.ppf(0.975, 39) * math.sqrt(value * (1 - value) / 39)
+    assert (interval.high - interval.low) / 2 == pytest.approx(half, rel=0.1)
 
 
 def test_probability_of_improvement_is_that_of_correlated_normals() -> None:

@@ -39,7 +39,7 @@ def test_the_tables_are_those_of_results_json() -> None:
     assert results["tasks"].keys() == TASKS.keys()
     for task in results["tasks"].values():
         for player in task["players"].values():
-            assert f"{player['iqm']:.2f} [{player['ci_low']:.2f}, {player['ci_high']:.2f}]" in RESULTS
+            assert f"{player['mean']:.2f} [{player['mean_low']:.2f}, {player['mean_high']:.2f}]" in RESULTS
 
 
 def test_the_readme_is_short_and_its_tables_are_narrow() -> None:

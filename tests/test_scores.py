@@ -21,6 +21,7 @@ from flockenv.envs.disturbance import Disturbance, make_world
 from flockenv.envs.world import World
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.players import load_player
+from flockenv.players.rules import TUNED
 from flockenv.tasks import Obstacles, Pursuit
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -108,11 +109,29 @@ def test_entries_are_ordered_by_score(small: Path) -> None:
     assert {entry["player"]: entry["kind"] for entry in entries} == {"textbook": "rules", "ppo": "policy"}
 
 
+def test_an_entry_of_all_seeds_has_their_number(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found: dict[str, Any] = {}
+    for task in ("pursuit", "obstacles"):
+        found[task] = json.loads((TUNED / f"{task}.json").read_text())
+        rules = found[task]["players"]["rules"]
+        rules["found"] |= {"seed": 4, "searches": {"1": {"parameters": rules["parameters"]}}}
+    Path("tuned").mkdir()
+    for task, content in found.items():
+        Path(f"tuned/{task}.json").write_text(json.dumps(content))
+    monkeypatch.setattr("flockenv.players.rules.TUNED", Path("tuned"))
+    run = CliRunner().invoke(app, ["rules@*", "--study", "study.yaml", "--out", "board", "--processes", "1"])
+    assert run.exit_code == 0, run.output
+    entry = json.loads(Path("board/rules@all.json").read_text())
+    assert (entry["player"], entry["spec"], entry["seeds"]) == ("rules@all", "rules@*", 2)
+    assert entry["home"]["score"][0] == 1.0, "the same parameters as those that ship, which are the scale"
+
+
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
         (["nobody"], "players.nobody: 'nobody': no such file"),
         (["orca"], "player 'orca' does not play pursuit"),
+        (["ppo@99"], "player 'ppo@99': no such seed; of task 'pursuit' there are "),
         (["ppo", "--name", "a b"], "--name 'a b': a name is"),
         (["ppo", "--name", "rules"], "--name 'rules'"),
     ],

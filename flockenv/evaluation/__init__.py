@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
+from flockenv.evaluation.comparison import Comparison, Summary, compare, summarise
 from flockenv.evaluation.episodes import (
     EVALUATION,
     TRAINING,
     TUNING,
     WORLDS_PER_SEED,
-    Comparison,
     Episodes,
     Interval,
     Playable,
     Purpose,
     Recording,
-    Summary,
     bootstrap,
-    compare,
     iqm,
     proportion,
     rollout,
-    summarise,
     task_digest,
     worlds_for,
 )
-from flockenv.evaluation.seeds import lead_interval, mean_interval
+from flockenv.evaluation.seeds import lead_interval, mean_interval, success_interval
 
 __all__ = [
     "EVALUATION",
@@ -44,6 +41,7 @@ __all__ = [
     "mean_interval",
     "proportion",
     "rollout",
+    "success_interval",
     "summarise",
     "task_digest",
     "worlds_for",

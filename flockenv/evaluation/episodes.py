@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "EVALUATION", "TRAINING", "TUNING", "WORLDS_PER_SEED",
-    "Comparison", "Episodes", "Interval", "Playable", "Recording", "Summary",
-    "bootstrap", "compare", "iqm", "proportion", "rollout", "summarise", "task_digest", "worlds_for",
+    "Episodes", "Interval", "Playable", "Recording",
+    "bootstrap", "iqm", "proportion", "rollout", "task_digest", "worlds_for",
 ]  # fmt: skip
 
 TRAINING, TUNING, EVALUATION = 0, 1_000_000_000, 2_000_000_000
@@ -386,68 +386,6 @@ def proportion(scores: ArrayLike) -> Interval:
     centre = (p + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
     return Interval(p, max(0.0, min(p, centre - half)), min(1.0, max(p, centre + half)))
-
-
-@dataclass(frozen=True)
-class Summary:
-    """Statistics of one player, as shown in a table."""
-
-    iqm: Interval  # bootstrap
-    mean: Interval  # bootstrap
-    success: Interval  # Wilson
-    metrics: Mapping[str, tuple[float, int]]  # mean over the worlds to which it applies, and their number
-
-
-def summarise(episodes: Episodes, resamples: int = RESAMPLES, seed: int = 0) -> Summary:
-    """Return the statistics of one player's episodes."""
-    return Summary(
-        iqm=bootstrap(episodes.returns, "iqm", resamples, seed),
-        mean=bootstrap(episodes.returns, "mean", resamples, seed),
-        success=proportion(episodes.success),
-        metrics={name: _finite_mean(values) for name, values in episodes.metrics.items()},
-    )
-
-
-def _finite_mean(values: Floats) -> tuple[float, int]:
-    finite = values[np.isfinite(values)]
-    return (float(finite.mean()) if len(finite) else math.nan), len(finite)
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """Comparison of two players in the same worlds; differences > 0 and `better` > 1/2: the first is ahead."""
-
-    difference: Interval  # mean of the per-world differences of return, bootstrap
-    iqm_difference: Interval  # interquartile mean of the same differences, bootstrap
-    better: Interval  # probability that the first scores higher in a world, ties counted half, Wilson
-    worlds: int
-
-    @property
-    def separated(self) -> bool:
-        """True if the interval of the difference excludes zero."""
-        return self.difference.low > 0 or self.difference.high < 0
-
-
-def compare(first: Episodes, second: Episodes, resamples: int = RESAMPLES, seed: int = 0) -> Comparison:
-    """Compare two players world by world.
-
-    `difference` is the mean: it equals the difference of the mean returns, and includes the full cost of failures in a
-    few worlds. `iqm_difference`, the interquartile mean, describes typical worlds.
-
-    Raises:
-        ValueError: the episodes are not of the same worlds: task, settings, seed, number or time limit differ.
-    """
-    for name in ("task", "digest", "seed", "worlds", "horizon"):
-        a, b = getattr(first, name), getattr(second, name)
-        if a != b:
-            raise ValueError(f"scores cannot be paired: {name} {a!r} and {b!r}, must be the same worlds")
-    gain = first.returns - second.returns
-    return Comparison(
-        difference=bootstrap(gain, "mean", resamples, seed),
-        iqm_difference=bootstrap(gain, "iqm", resamples, seed),
-        better=proportion((np.sign(gain) + 1) / 2),
-        worlds=first.worlds,
-    )
 
 
 def _check_integer(name: str, value: object, least: int, most: int) -> None:

@@ -118,7 +118,7 @@ def _choose_colours(names: Sequence[str]) -> dict[str, str]:
 def _draw_scores(axes: Axes, column: Column, colours: Mapping[str, str]) -> None:
     """Draw each world as a faint dot, and the interval above them."""
     axes.set_title(column.title, loc="left", fontsize=12.5, fontweight="bold", color=INK, pad=10)
-    axes.set_xlabel("return: interquartile mean, 95 % (dots: worlds)")
+    axes.set_xlabel("return: mean, 95 % (dots: worlds)")
     for y, row in enumerate(column.rows):
         # fixed heights instead of random ones: dots of similar scores do not overlap, and the file is reproducible
         heights = y + 0.30 * (np.argsort(np.argsort(row.scores)) * 0.618034 % 1.0 * 2 - 1)
