@@ -28,6 +28,7 @@ from flockenv.jit.decorators import python_of
 from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.maths import counter_rng
 from flockenv.players import load_player
+from flockenv.players.rules import PLAYERS, player
 from flockenv.tasks import TASKS, Crossing, Herd, Layout, Obstacles, PathFollow, Pursuit, Slot, Task
 
 CROSSING = Crossing(agents=8)
@@ -268,6 +269,55 @@ def test_observations_stay_in_their_space_under_the_greatest_noise(name: str) ->
     rows = [world.reset(0), *(world.step(action).observation for action in actions_of(task, 20, 3))]
     for row in rows:
         assert ((row >= task.layout.low) & (row <= task.layout.high)).all()
+
+
+SEVERAL: dict[str, dict[str, Any]] = {"pursuit": {"evaders": 3}, "school": {"hunters": 3, "fish": 12}}
+"""Arguments with which a task observes several agents of each kind."""
+FLAGS = ("_present", "_radius", "food_bearing")
+"""Ends of the names of slots that are 0 if there is no entity."""
+
+
+@pytest.mark.parametrize("name", [name for name in TASKS if name != "path_follow"])
+def test_rules_act_as_if_an_undetected_entity_were_absent(name: str) -> None:
+    task = TASKS[name](**SEVERAL.get(name, {}))
+    rows, entities, flags = _observed(task), task.layout.entities, _are_flags(task)
+    for base in [base for base in PLAYERS if name in PLAYERS[base]]:
+        rules = player(task, base)
+        for k in range(entities.max() + 1):
+            action, _ = rules.predict(np.where(entities == k, 0.0, rows))
+            for absent in (_without(task, rows, k), np.where(flags & (entities == k), 0.0, rows)):
+                expected, _ = rules.predict(absent)
+                np.testing.assert_allclose(action, expected, atol=1e-5, err_msg=f"{base}, entity {k}")
+
+
+def _observed(task: Task) -> NDArray[np.float64]:
+    """Return observations in which every slot is occupied, (R, O); their numbers are random."""
+    rows = np.random.default_rng(0).uniform(task.layout.low, 1.0, (300, task.layout.size)) ** 3  # many are near
+    present = np.concatenate([np.full(slot.size, slot.name.endswith("_present")) for slot in task.layout.slots])
+    return np.where(present, 1.0, rows)
+
+
+def _are_flags(task: Task) -> NDArray[np.bool_]:
+    """Return True for the numbers of a row, (O,), that are 0 if there is no entity."""
+    return np.concatenate([np.full(slot.size, slot.name.endswith(FLAGS)) for slot in task.layout.slots])
+
+
+def _without(task: Task, rows: NDArray[Any], k: int) -> NDArray[np.float64]:
+    """Return rows without entity k: those after it in the list of its kind move up, and the last slot is empty."""
+    found, entities = np.array(rows, np.float64), task.layout.entities
+    for slot in task.layout.slots:
+        columns = task.layout.places[slot.name] + np.arange(slot.size)
+        here = entities[columns] == k
+        if here.any():
+            left = found[:, columns[~here]]
+            found[:, columns] = np.concatenate([left, np.zeros((len(rows), here.sum()))], axis=1)
+    return found
+
+
+def test_a_pursuer_that_detects_no_quarry_keeps_its_velocity() -> None:
+    rows = make_world(Pursuit(), 20, disturbance=Disturbance(dropped=1.0)).reset(0)[:, 0]
+    rows[:, :2] = 0.5
+    assert (player(Pursuit()).predict(rows)[0] == 0.0).all()
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from flockenv import steering
 from flockenv.players.rules.parameter import Order, in_order, parameter, per_row
+from flockenv.players.rules.slots import nearest
 from flockenv.steering import arbitration
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Herd
@@ -47,8 +48,9 @@ def herd(see: Any, task: Herd, p: HerdRules, order: Order = None) -> NDArray[np.
     r, n, top = task.apart_distance, task.sheep, task.dog_speed
     together, driving = p.together * r * n ** (2 / 3), p.driving * r * n**0.5
     place = herd_from(see.centre, see.farthest, see.goal, together, p.collecting * r, driving)
-    nearest = np.where(see.sheep_present[:, 0] > 0, np.linalg.norm(see.sheep[:, 0], axis=-1), np.inf)
-    speed = np.where(nearest < p.near * r, p.slow, 1.0) * top
+    there, sheep = nearest(see.sheep_present, see.sheep)
+    close = there & (np.linalg.norm(sheep, axis=-1) < p.near * r)
+    speed = np.where(close, p.slow, 1.0) * top
     course = per_row(p.gain) * arrive(place, see.velocity, speed, 0.5)
     direction = place / np.maximum(np.linalg.norm(place, axis=-1), 1e-9)[:, None]
     clearance = p.width * see.stray + 2.0 * r

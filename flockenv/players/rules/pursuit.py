@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from flockenv import steering
 from flockenv.players.rules.parameter import parameter, per_row
+from flockenv.players.rules.slots import nearest
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Pursuit
 
@@ -31,12 +32,12 @@ class PursuitRules:
 
 
 def pursuit(see: Any, task: Pursuit, p: PursuitRules) -> NDArray[np.float64]:
-    """Pursue the nearest opponent (Reynolds 1999) with a bounded exact predictor."""
-    offset, quarry = see.opponents[:, 0], see.opponent_velocity[:, 0]
+    """Pursue the nearest opponent (Reynolds 1999) with a bounded exact predictor; without one, keep the velocity."""
+    there, offset, quarry = nearest(see.opponent_present, see.opponents, see.opponent_velocity)
     top = task.pursuer_speed
     time = np.minimum(p.factor * interception_time(offset, quarry, top), p.horizon)
     ahead = offset + quarry * time[:, None]
     margin = per_row(p.margin)
     ahead = np.clip(ahead, margin - see.to_low, see.to_high - margin)
-    force: NDArray[np.float64] = per_row(p.gain) * arrive(ahead, see.velocity, top, p.slow_radius)
+    force: NDArray[np.float64] = per_row(p.gain) * arrive(ahead, see.velocity, top, p.slow_radius) * there[:, None]
     return force

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from flockenv import steering
 from flockenv.players.rules.parameter import Order, in_order, parameter, per_row
+from flockenv.players.rules.slots import nearest
 from flockenv.steering import arbitration, motivation
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import School
@@ -63,7 +64,7 @@ def school(
     was = np.where(begins, 0.0, before) if known else np.zeros(count)
     calm, content = np.minimum(p.calm, p.school), np.minimum(p.content, p.need)
     now = intention(was, see.hunger, 0.0, see.fear, np.maximum(p.escape, p.school), p.school, p.need, calm, content)
-    hunted = see.hunter_present[:, 0] > 0
+    hunted, hunter, its_velocity = nearest(see.hunter_present, see.hunters, see.hunter_velocity)
     # without a hunter or food in sight: wander
     has_food = np.linalg.norm(see.food_bearing, axis=-1) > 0
     selected = np.where((now == motivation.ESCAPE) & ~hunted, motivation.WANDER, now)
@@ -74,8 +75,8 @@ def school(
     inside = 5.0 * contain(see.to_low - 0.5, see.to_high - 0.5, see.velocity, top, p.wall)
     near = here * (np.linalg.norm(see.mates, axis=-1) < 0.6)
     push = per_row(p.apart) * np.sum(separate(see.mates, ahead) * near[..., None], axis=1)
-    time = np.minimum(np.linalg.norm(see.hunters[:, 0], axis=-1) / task.hunter_speed, p.predict)
-    flight = per_row(p.evade) * evade_from(see.hunters[:, 0], see.velocity, see.hunter_velocity[:, 0], top, time)
+    time = np.minimum(np.linalg.norm(hunter, axis=-1) / task.hunter_speed, p.predict)
+    flight = per_row(p.evade) * evade_from(hunter, see.velocity, its_velocity, top, time)
     flight += per_row(p.middle) * (see.to_high - see.to_low) / 2
     many = np.maximum(here.sum(axis=1), 1.0)[:, None]
     course = np.sum(see.mate_velocity * here[..., None], axis=1) / many
