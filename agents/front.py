@@ -27,7 +27,7 @@ from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, 
 from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.output_paths import valid_file
-from flockenv.evaluation import Episodes, Interval, lead_interval, mean_interval, proportion
+from flockenv.evaluation import Episodes, Interval, lead_interval, mean_interval, success_interval
 from flockenv.jobs import Job, Work, engine_of, run_jobs
 from flockenv.jobs.store import Store
 from flockenv.players.policy import OtherSlotsError
@@ -139,8 +139,8 @@ def _point(
         "player": entry.contender.name, "kind": entry.kind, "price": entry.price, "seeds": len(played),
         "return": _numbers(mean_interval(own)),
         "return_without_harm": _numbers(mean_interval(without)),
-        "success": _numbers(_share(np.array([each.success for each in played]))),
-        "worlds_with_harm": _numbers(_share(harmed > 0)),
+        "success": _numbers(success_interval(np.array([each.success for each in played]))),
+        "worlds_with_harm": _numbers(success_interval(harmed > 0)),
         "harmed": _numbers(mean_interval(harmed)),
         **{name: _numbers(mean_interval(_rows(played, name))) for name in ("frozen", "effort", "time")},
         "metrics": {name: _finite_mean(_rows(played, name)) for name in entry.task.metric_names},
@@ -157,11 +157,6 @@ def _point(
 
 def _rows(played: Sequence[Episodes], name: str) -> Floats:
     return np.array([each.metrics[name] for each in played])
-
-
-def _share(marks: NDArray[np.bool_]) -> Interval:
-    """Return the share of marked worlds (seeds, worlds) with its interval."""
-    return proportion(marks[0].astype(float)) if len(marks) == 1 else mean_interval(marks.astype(float))
 
 
 def _numbers(interval: Interval) -> list[float]:

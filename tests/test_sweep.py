@@ -179,7 +179,7 @@ def test_files_of_players() -> None:
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
 def test_shipped_studies_can_be_played(path: Path) -> None:
     study = load(path, Study)
-    assert set(study.tasks) == set(TASKS)
+    assert set(study.tasks) == set(TASKS) or path.stem == "price"  # of the two tasks that have prices
     for task in study.tasks:
         settings = settings_of(study, task)
         assert settings[0].axis == HOME
