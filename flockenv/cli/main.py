@@ -235,8 +235,8 @@ def render(
         str,
         typer.Option(
             metavar="NAME|FILE,...",
-            help=f"Player of a task: {', '.join(NAMES)}, or a file (.safetensors, .py, .zip); several play the same "
-            "world, side by side.",
+            help=f"Player of a task: {', '.join(NAMES)}, with a seed (ppo@3), or a file (.safetensors, .py, .zip); "
+            "several play the same world, side by side.",
         ),
     ] = "random",
     seed: Seed = 0,
