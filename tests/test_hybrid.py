@@ -139,7 +139,7 @@ def test_scores_reach_every_order_of_behaviours_and_zero_keeps_it() -> None:
 
 def test_the_first_behaviour_gets_the_force_limit_first() -> None:
     task = TASKS["obstacles"]()
-    rows, hybrid = rows_of(task, 100), Hybrid.of(task, "priorities")
+    rows, hybrid = rows_of(task, 100), Hybrid.of(task, "priorities", "textbook")
     seeks = np.array([[-1.0, -1.0, 1.0]], np.float32).repeat(len(rows), axis=0)
     action, _ = hybrid.act(rows, seeks)
     ordinary, _ = hybrid.act(rows, 0 * seeks)
@@ -233,7 +233,7 @@ def test_the_card_keeps_the_parameters_of_the_rules(tmp_path: Path) -> None:
         ({"kind": "weights", "ranges": {**WIDE, "gain": [9, 1]}}, "hybrid.ranges.gain = [9, 1]: must be two numbers"),
         ({"kind": "weights", "ranges": {**WIDE, "gain": [1]}}, "hybrid.ranges.gain = [1]: must be two numbers"),
         ({"kind": "weights", "ranges": WIDE}, "the network puts out 2 numbers, must be 5"),
-        ({"kind": "priorities"}, "tasks whose 'rules' has them: obstacles, flock, crossing, herd, school"),
+        ({"kind": "priorities"}, "tasks whose 'rules' has them: flock, crossing, herd, school"),
     ],
 )
 def test_bad_cards_are_refused(changes: dict[str, Any], text: str, tmp_path: Path) -> None:

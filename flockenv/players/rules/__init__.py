@@ -3,9 +3,9 @@
 Each receives the learner's observation and nothing else, and its force has the same limits. Two kinds of names:
 
 * `rules`, and of some tasks `orca`, `heuristics`, `queueing`: other functions; all with the parameters that a search
-  found (`python -m agents.tune`; evade's and path_follow's by another random search), in ../tuned/TASK.json;
+  found (`python -m agents.tune`), in ../tuned/TASK.json;
 * `textbook`, `orca_published`, `heuristics_published`, `queueing_published`: the same functions with published
-  parameters, the defaults in the files; in evade and path_follow, `textbook` is another function than `rules`.
+  parameters, the defaults in the files; in evade, obstacles and path_follow, `textbook` is another function than `rules`.
 
     from flockenv.players.rules import player
     action, _ = player(task).predict(observation)
@@ -47,7 +47,7 @@ TUNED = Path(__file__).resolve().parent.parent / "tuned"
 
 RULES: dict[str, tuple[Callable[..., Any], type]] = {
     "pursuit": (pursuit.pursuit, pursuit.PursuitRules),
-    "obstacles": (obstacles.obstacles, obstacles.ObstaclesRules),
+    "obstacles": (obstacles.dynamic_window, obstacles.WindowRules),
     "evade": (evade.escape, evade.EscapeRules),
     "flock": (flock.flock, flock.FlockRules),
     "crossing": (crossing.crossing, crossing.CrossingRules),
@@ -62,6 +62,7 @@ RULES: dict[str, tuple[Callable[..., Any], type]] = {
 
 TEXTBOOK: dict[str, tuple[Callable[..., Any], type]] = {
     **RULES,
+    "obstacles": (obstacles.obstacles, obstacles.ObstaclesRules),
     "evade": (evade.evade, evade.EvadeRules),
     "path_follow": (path_follow.path_follow, path_follow.PathFollowRules),
 }

@@ -1,4 +1,4 @@
-"""Obstacles: seek the goal around obstacles."""
+"""Obstacles: try velocities in thought, or avoid the first obstacle and seek the goal (Reynolds 1999)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flockenv.steering import arbitration
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Obstacles
 
-__all__ = ["ObstaclesRules", "obstacles"]
+__all__ = ["ObstaclesRules", "WindowRules", "dynamic_window", "obstacles"]
 
 allocate = rows(arbitration.allocate)
 avoid = rows(steering.avoid)
@@ -62,3 +62,93 @@ def obstacles(see: Any, task: Obstacles, p: ObstaclesRules, order: Order = None)
     field = per_row(p.push) * np.sum(away * (seen / np.maximum(see.clearance, 0.05))[..., None], axis=1)
     course = per_row(p.gain) * seek(see.goal, see.velocity, p.speed * task.max_speed)
     return allocate(in_order(np.stack([evasion, field, course], axis=1), order), task.max_force)
+
+
+@dataclass(frozen=True)
+class WindowRules:
+    """Defaults, set by hand on a few tuning worlds."""
+
+    horizon: float = parameter(0.5, 0.2, 2.0)  # s, for which each velocity is tried
+    margin: float = parameter(0.05, 0.0, 0.4)  # m, a smaller gap counts as a contact
+    near: float = parameter(0.6, 0.0, 5.0)  # s, cost of being at a surface throughout
+    reach: float = parameter(0.25, 0.02, 2.0)  # m, gap over which that cost falls to 1 / e
+    detour: float = parameter(0.3, 0.0, 3.0)  # s per m by which obstacles overlap the straight path to the goal
+
+
+def dynamic_window(see: Any, task: Obstacles, p: WindowRules) -> NDArray[np.float64]:
+    """Accelerate to the velocity that costs least, of 48, each tried for a moment (Fox, Burgard and Thrun 1997).
+
+    The cost is the time to the goal from the end of that path, with a charge for obstacles in between, for closeness on
+    the path, and, above all, for a contact, the earlier the worse.
+    """
+    velocities = _velocities(see.goal, task.max_speed)
+    change = velocities - see.velocity[:, None]
+    path = _path(see.velocity, velocities, change, per_row(p.horizon, 2) * _SHARES, task.max_force)
+    gap = _gap(path, see)
+    contact = gap < per_row(p.margin, 2)
+    first = np.where(contact.any(axis=-1), _SHARES[np.argmax(contact, axis=-1)], np.inf)
+    left = see.goal[:, None, None] - path
+    arrives = (_length(left) < task.goal_radius).any(axis=-1)
+    end = path[:, :, -1]
+    outside = ((end < _BODY - see.to_low[:, None]) | (end > see.to_high[:, None] - _BODY)).any(axis=-1)
+
+    cost = _length(left[:, :, -1]) / task.max_speed + per_row(p.detour) * _overlap(end, left[:, :, -1], see, p)
+    cost += per_row(p.near) * np.exp(-np.maximum(gap, 0.0) / per_row(p.reach, 2)).mean(axis=-1)
+    cost += _CONTACT * np.maximum(1.5 - first, 0.0) + _OUTSIDE * outside - _ARRIVAL * arrives
+    best = change[np.arange(len(change)), np.argmin(cost, axis=1)]
+    force: NDArray[np.float64] = best / task.control_dt  # reached within this decision, if the force limit allows it
+    return force
+
+
+_BODY = 0.3  # m, the agent's radius
+_DIRECTIONS, _SPEEDS = 24, (1.0, 0.5)  # of the velocities; shares of the top speed
+_SHARES = np.linspace(0.2, 1.0, 5)  # of the horizon, at which gaps are measured
+_CONTACT, _OUTSIDE, _ARRIVAL = 20.0, 3.0, 5.0  # s, costs
+
+
+def _length(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the lengths of vectors (..., 2); np.linalg.norm takes several times as long."""
+    length: NDArray[np.float64] = np.sqrt(vectors[..., 0] ** 2 + vectors[..., 1] ** 2)
+    return length
+
+
+def _velocities(goal: NDArray[np.float64], top: float) -> NDArray[np.float64]:
+    """Return the velocities to try, (R, K, 2) m/s: directions around that to the goal, at some speeds each."""
+    angle = np.arctan2(goal[:, 1:], goal[:, :1]) + 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+    directions = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    velocities: NDArray[np.float64] = np.concatenate([speed * top * directions for speed in _SPEEDS], axis=1)
+    return velocities
+
+
+def _path(
+    velocity: NDArray[np.float64], to: NDArray[np.float64], change: NDArray[np.float64], seconds: Any, max_force: float
+) -> NDArray[np.float64]:
+    """Return where a body of 1 kg is that accelerates with the whole force, then keeps a velocity: (R, K, T, 2), m."""
+    size = _length(change)[..., None]
+    until = np.minimum(seconds, size / max_force)[..., None]
+    acceleration = (max_force * change / np.maximum(size, 1e-9))[:, :, None]
+    path: NDArray[np.float64] = velocity[:, None, None] * until + 0.5 * acceleration * until**2
+    path += to[:, :, None] * (np.asarray(seconds)[..., None] - until)
+    return path
+
+
+def _gap(path: NDArray[np.float64], see: Any) -> NDArray[np.float64]:
+    """Return the gap between the body and the nearest obstacle that is seen, (R, K, T), m; inf if there is none."""
+    gap = np.full(path.shape[:-1], np.inf)
+    for centre, radius in zip(see.obstacles.swapaxes(0, 1), see.obstacle_radius.T, strict=True):
+        touching = np.where(radius > 0, radius + _BODY, -np.inf)[:, None, None]
+        np.minimum(gap, _length(path - centre[:, None, None]) - touching, out=gap)
+    return gap
+
+
+def _overlap(begin: NDArray[np.float64], way: NDArray[np.float64], see: Any, p: WindowRules) -> NDArray[np.float64]:
+    """Return by how much obstacles overlap the path of a body along a straight way, (R, K), m: the sum over them."""
+    length = _length(way)
+    x, y = np.moveaxis(way / np.maximum(length, 1e-9)[..., None], -1, 0)
+    total = np.zeros(length.shape)
+    for centre, radius in zip(see.obstacles.swapaxes(0, 1), see.obstacle_radius.T, strict=True):
+        to = centre[:, None] - begin
+        along, beside = to[..., 0] * x + to[..., 1] * y, np.abs(to[..., 0] * y - to[..., 1] * x)
+        depth = np.maximum((radius + _BODY)[:, None] + per_row(p.margin) - beside, 0.0)
+        total += np.where((radius > 0)[:, None] & (along > 0.0) & (along < length), depth, 0.0)
+    return total
