@@ -37,6 +37,8 @@ from flockenv.tasks import TASKS, Task
 __all__ = ["app", "front", "markdown"]
 
 PRICE = "price"
+SAFE = 0.95
+"""Success rate above which the page calls a player safe."""
 
 NOTES = """\
 Return: at a price of 1, which is the task's own reward. *Without harm*: the same without the terms that the price
@@ -176,8 +178,22 @@ def markdown(study: Study, command: str, contents: Sequence[Content], folder: st
     parts = [f"# {study.title}", f"Made by `{command}`, {study.worlds} worlds.", NOTES]
     for content in contents:
         task = content["task"]
-        parts += [f"## {task}", f"![Harm against return in {task}]({folder}/{task}.png)", grid(*_table(content))]
+        picture = f"![Harm against return in {task}]({folder}/{task}.png)"
+        parts += [f"## {task}", _sentence(content), picture, grid(*_table(content))]
     return "\n\n".join(parts) + "\n"
+
+
+def _sentence(content: Content) -> str:
+    """Return which players are safe, and have a return above that of every hand-written player."""
+    points, best = content["players"], content["best_rules"]
+    better = [f"`{name}`" for name, point in points.items() if point.get("against_rules", [0, 0])[1] > 0]
+    safe = [f"`{name}`" for name, point in points.items() if point["success"][0] > SAFE]
+    both = [name for name in better if name in safe]
+    return (
+        f"The hand-written player with the highest return is `{best}`. Ahead of it, with an interval above 0: "
+        f"{', '.join(better) or 'none'}. With a success rate above {SAFE:.0%}: {', '.join(safe) or 'none'}. "
+        f"Both: {', '.join(both) or 'none'}."
+    )
 
 
 def _table(content: Content) -> tuple[list[str], list[list[str]]]:

@@ -128,6 +128,7 @@ def test_a_front_has_a_point_per_player_and_price(tmp_path: Path) -> None:
     assert points["priced 0.5"]["effort"][0] > dear["effort"][0]  # it observes the price
     page = (tmp_path / "fronts.md").read_text(encoding="utf-8")
     assert f"`priced 20` (2 seeds) | {dear['return'][0]:.3g} [" in page
+    assert f"The hand-written player with the highest return is `{content['best_rules']}`. Ahead of it" in page
     assert (tmp_path / "fronts" / "bottleneck.png").read_bytes().startswith(b"\x89PNG")
     again = CliRunner().invoke(front.app, arguments)
     assert again.exit_code == 0 and "done" not in again.stderr  # all records are stored
@@ -149,3 +150,12 @@ def test_a_bad_study_is_refused_in_one_line(tmp_path: Path, changes: dict[str, A
     assert result.exit_code == 2
     assert text in result.stderr and len(result.stderr.strip().splitlines()) == 1
     assert not (tmp_path / "fronts.md").exists()
+
+
+def test_the_page_names_players_that_are_safe_and_ahead() -> None:
+    def point(success: float, low: float) -> dict[str, Any]:
+        return {"success": [success, 0, 1], "against_rules": [low + 1, low, low + 2]}
+
+    points = {"rules": {"success": [0.99, 0, 1]}, "a": point(0.96, 0.1), "b": point(0.9, 0.1), "c": point(0.99, -0.1)}
+    text = front._sentence({"players": points, "best_rules": "rules"})
+    assert text.endswith("above 0: `a`, `b`. With a success rate above 95%: `rules`, `a`, `c`. Both: `a`.")
