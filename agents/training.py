@@ -15,7 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from agents.divergence import LearningDiverged
 from agents.drawn import played_returns
-from agents.experiment import PpoSettings
+from agents.experiment import CONFIGS, PpoSettings, load_experiment
 from agents.run import Run
 from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.players.policy import describe
@@ -74,6 +74,16 @@ def new_progress(console: Console) -> Progress:
     )  # fmt: skip
 
 
+def _config_of(recipe: dict[str, Any]) -> str:
+    """Return the name of the config with a recipe's settings, whatever their seed; else that of the task's config."""
+    for path in sorted(CONFIGS.glob(f"{recipe['task']}_*.yaml")):
+        each = load_experiment(path).model_dump(mode="json", include={"task", "arguments", "ppo"})
+        each["ppo"]["seed"] = recipe["ppo"]["seed"]
+        if all(each[name] == recipe[name] for name in each):
+            return path.name
+    return f"{recipe['task']}.yaml"
+
+
 def card_of(run: Run, library: str = "stable-baselines3", command: str = "agents.ppo") -> dict[str, Any]:
     """Return the card of a run's policy: its recipe, from which it can be reproduced, and how it was trained."""
     recipe = run.recipe
@@ -82,7 +92,7 @@ def card_of(run: Run, library: str = "stable-baselines3", command: str = "agents
         **{name: recipe[name] for name in ("rules", "hybrid") if name in recipe},
         "activation": recipe["ppo"]["activation"],
         "algorithm": f"PPO ({library})",
-        "recipe": {"command": f"python -m {command} configs/training/{recipe['task']}.yaml", "ppo": recipe["ppo"]},
+        "recipe": {"command": f"python -m {command} configs/training/{_config_of(recipe)}", "ppo": recipe["ppo"]},
         "seed": recipe["ppo"]["seed"],
         "steps": run.steps,
         "wall_time_s": round(run.wall, 1),

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from agents.drawn import check_settings
-from agents.experiment import Experiment, PpoSettings
+from agents.experiment import CONFIGS, Experiment, PpoSettings, load_experiment
 from agents.ppo import build, export, tensors_of, train
 from agents.run import recipe_of
+from agents.training import card_of
 from agents.warm_start import starting_policy, use_weights
 from flockenv.players import WEIGHTS, load_player
 from flockenv.players.policy import MlpPolicy
@@ -72,6 +73,14 @@ def test_a_mixture_begins_with_the_policy_that_it_mixes(tmp_path: Path) -> None:
     parts = [rules.predict(rows)[0], shipped.predict(rows[:, :-1], deterministic=True)[0]]
     expected = 0.4 * parts[0] + 0.6 * parts[1]
     np.testing.assert_allclose(mixed.predict(rows, deterministic=True)[0], expected, atol=1e-5)
+
+
+def test_a_card_names_the_config_of_its_recipe(tmp_path: Path) -> None:
+    run = train(experiment(critic_first=8), tmp_path)
+    assert card_of(run)["recipe"]["command"] == "python -m agents.ppo configs/training/crowd_nav.yaml"
+    given = load_experiment(CONFIGS / "crowd_nav_priced.yaml")
+    run.recipe = recipe_of(given.model_copy(update={"ppo": given.ppo.model_copy(update={"seed": 3})}))
+    assert card_of(run)["recipe"]["command"] == "python -m agents.ppo configs/training/crowd_nav_priced.yaml"
 
 
 @pytest.mark.parametrize("more", [{"action": "residual"}, {"taught": 1}, {"central_critic": True}])
