@@ -5,7 +5,8 @@ Each receives the learner's observation and nothing else, and its force has the 
 * `rules`, and of some tasks `orca`, `heuristics`, `queueing`: other functions; all with the parameters that a search
   found (`python -m agents.tune`), in ../tuned/TASK.json;
 * `textbook`, `orca_published`, `heuristics_published`, `queueing_published`: the same functions with published
-  parameters, the defaults in the files; in evade, obstacles and path_follow, `textbook` is another function than `rules`.
+  parameters, the defaults in the files; in evade, obstacles and path_follow, `textbook` is another function than
+  `rules`.
 
     from flockenv.players.rules import player
     action, _ = player(task).predict(observation)
