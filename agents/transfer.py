@@ -26,7 +26,7 @@ from agents.compare import (
     split,
     write_text,
 )
-from agents.play import players_in_order, players_of, usual_players
+from agents.play import players_in_order, players_of
 from agents.transfer_jobs import Plan, clock_of, jobs_by_kernel, read_again, read_cells, round_jobs
 from agents.transfer_report import Setting
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
@@ -42,8 +42,10 @@ from flockenv.tasks import TASKS, Task
 __all__ = ["app"]
 
 WORLDS, ROUNDS, RESAMPLES = 128, 5, 10_000
-METHODS = ("semi_implicit_euler", "explicit_euler", "midpoint", "velocity_verlet", "rk4", "semi_implicit_euler:float32")
-SUBSTEPS = (1, 2, 4, 8)
+PLAYERS = ("random", "rules", "ppo")
+METHODS = ("semi_implicit_euler", "explicit_euler", "velocity_verlet")
+SUBSTEPS = (0.5, 1.0, 4.0)
+"""Physics steps per decision, as multiples of the trained number."""
 MOST_SUBSTEPS = 1000
 FILES = ("transfer.json", "transfer.md", "transfer.png")
 
@@ -56,13 +58,15 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions
 @app.command()
 def main(
     tasks: Annotated[list[str] | None, typer.Argument(metavar="TASK", help="Tasks. [all]")] = None,
-    players: Annotated[list[str] | None, typer.Option(help="Players, as in agents.compare.")] = None,
+    players: Annotated[
+        list[str] | None, typer.Option(help="Players, as in agents.compare. [" + ",".join(PLAYERS) + "]")
+    ] = None,
     methods: Annotated[
         list[str] | None,
         typer.Option(help="Integrators; KIND:float32 in single precision. [" + ",".join(METHODS) + "]"),
     ] = None,
     substeps: Annotated[
-        list[str] | None, typer.Option(help="Physics steps per decision. [" + ",".join(map(str, SUBSTEPS)) + "]")
+        list[str] | None, typer.Option(help="Physics steps per decision. [half, once and 4 times those of training]")
     ] = None,
     worlds: Annotated[int, typer.Option(help="Worlds per task, the same for every player.")] = WORLDS,
     rounds: Annotated[int, typer.Option(help="Rounds in which wall time is measured.")] = ROUNDS,
@@ -84,8 +88,8 @@ def main(
         _check("--rounds", rounds, 1, 1000)
         worlds_for("evaluation", seed, worlds)
         chosen = [experiment_of(name).build() for name in pick("TASK", split(tasks) or list(TASKS), TASKS)]
-        fields = players_of(chosen, players_in_order(split(players) or usual_players(chosen)))
-        solvers, steps = _solvers(split(methods) or list(METHODS)), _substeps(split(substeps), SUBSTEPS)
+        fields = players_of(chosen, players_in_order(split(players) or PLAYERS))
+        solvers, steps = _solvers(split(methods) or list(METHODS)), _substeps(split(substeps))
         plans = [
             Plan(task, _settings(task, solvers, steps), tuple(fields[task.name]), worlds, seed, rounds, trust_pickle)
             for task in chosen
@@ -122,16 +126,21 @@ def _solvers(names: Sequence[str]) -> list[tuple[str, str]]:
     return list(dict.fromkeys(found))
 
 
-def _substeps(texts: Sequence[str], usual: Sequence[int]) -> list[int]:
+def _substeps(texts: Sequence[str]) -> list[int]:
+    """Return numbers of steps per decision, without repeats; raise ValueError for one that is out of range."""
     for text in texts:
         if not (text.isascii() and text.isdigit() and 1 <= int(text[:9]) <= MOST_SUBSTEPS):
             raise ValueError(f"--substeps {printable(text)}: must be an integer from 1 to {MOST_SUBSTEPS}")
-    return sorted({int(text) for text in texts} or usual)
+    return sorted({int(text) for text in texts})
 
 
 def _settings(task: Task, solvers: Sequence[tuple[str, str]], substeps: Sequence[int]) -> tuple[Setting, ...]:
-    """Return the settings to play; the first is that of training, even if it is not selected."""
-    chosen = [Setting(method, dtype, steps) for method, dtype in solvers for steps in substeps]
+    """Return the settings to play; the first is that of training, even if it is not selected.
+
+    substeps: steps per decision (default: SUBSTEPS times those of training).
+    """
+    counts = substeps or sorted({max(1, round(factor * task.substeps)) for factor in SUBSTEPS})
+    chosen = [Setting(method, dtype, steps) for method, dtype in solvers for steps in counts]
     return tuple(dict.fromkeys([Setting.of_training(task), *chosen]))
 
 

@@ -24,8 +24,8 @@ __all__ = ["Plan", "cell_job", "clock_of", "jobs_by_kernel", "read_again", "read
 
 DECISIONS = 30
 """Decisions that are replayed for timing, from the start of the episodes."""
-REFERENCE = 64
-"""RK4 with this number of steps per decision is the reference for positions."""
+REFERENCE, LEAST_FINER = 64, 8
+"""Steps per decision of the reference for positions, RK4, and its least ratio to those of the finest setting."""
 
 Actions = list[NDArray[Any]]
 
@@ -189,7 +189,9 @@ def _position_errors(plan: Plan, actions: Actions) -> dict[str, float]:
     """Return, by setting, the median error of the learners' positions after one second, mm."""
     task = plan.task
     count = max(1, min(len(actions), round(1.0 / task.control_dt)))
-    exact = {"integrator": RK4(), "dtype": "float64", "dt": task.control_dt / REFERENCE}
+    finest = max(setting.substeps for setting in plan.settings)
+    steps = max(REFERENCE, LEAST_FINER * finest)
+    exact = {"integrator": RK4(), "dtype": "float64", "dt": task.control_dt / steps}
     right = _end_positions(task.model_copy(update=exact), plan, actions[:count])
     errors = {}
     for setting in plan.settings:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,18 +12,14 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from agents.report import Results, grid, interval_fields, interval_text, number_text, table_of
+from agents.transfer_verdict import count_text, length_text, settings_of_note, title, verdict
+from flockenv.core.warnings import UnstableStepWarning
 from flockenv.evaluation import bootstrap, task_digest
 from flockenv.physics.integrators import INTEGRATORS
+from flockenv.scene.stability import suggest_dt
 from flockenv.tasks import Task
 
-__all__ = [
-    "Cell", "Clock", "Setting", "cheapest_accurate", "markdown", "most_accurate", "show", "task_results", "verdict",
-]  # fmt: skip
-
-SURVIVES = 0.95
-"""A policy survives if it keeps this share of its lead over random in its worst setting."""
-NOTHING = 1e-6
-"""mm: an error below this is rounding."""
+__all__ = ["Cell", "Clock", "Setting", "markdown", "show", "task_results"]
 
 ASKED = """\
 Policies were trained, and rules tuned, with one integration method and one time step. This page shows whether their
@@ -30,26 +27,33 @@ scores survive a more or less accurate solution of the same worlds, and what acc
 before; only the motion between two decisions is computed differently."""
 
 READING = """\
-In these tasks the only force between two decisions is the constant steering force. So every method of second order
-solves a decision exactly, in one step, up to a speed limit or a wall. Midpoint, velocity Verlet and RK4 therefore agree
-to rounding. Their remaining error comes from the speed limit and falls only with dt, so RK4's additional evaluations
-have no benefit. The two Euler methods are off by half a step. After a decision of n steps under a constant force, a
-body that began at rest has moved (1 + 1/n) times the exact distance under semi-implicit Euler, as if the force had
-acted earlier, and (1 - 1/n) times under explicit Euler, as if later. The scores of players change by this effect.
+Where the steering force is the only force on learners between two decisions, it is constant. Velocity Verlet, as every
+method of second order, then solves a decision exactly, in one step, up to a speed limit or a wall; the error that
+remains falls only with dt. The two Euler methods are off by half a step. After a decision of n steps under a constant
+force, a body that began at rest has moved (1 + 1/n) times the exact distance under semi-implicit Euler, as if the force
+had acted earlier, and (1 - 1/n) times under explicit Euler, as if later. The scores of players change by this effect.
+With contact, a step may also be too long to be stable; such settings are named.
 
 "Trained" is the setting of the comparison, in float64. The shipped policies learned in float32 with the same method and
-step. Their own setting is thus the float32 row of that step, which makes no relevant difference."""
+step, which `--methods semi_implicit_euler:float32` plays."""
 
 NOTES = """\
 Return: the mean reward of a world's learners, summed over its episode. A difference is the mean over the same worlds
 against the same player under the setting that it was made for, with a 95 % percentile bootstrap interval over worlds;
 "(level)": the interval contains 0. Of many intervals without a true difference, one in twenty misses 0 by chance.
-Error: the distance of learners, after one second of the same actions, from their positions under RK4 with 64 steps per
-decision (median over worlds and learners). Evaluations: of the force, per simulated second. Time: physics, observations
-and rewards of one world for one simulated second, in a batch on one thread, without compiling and without the policy.
-It is the median of interleaved rounds (least-most), each the median of its steps in a separate process; "rounds
-overlap" means that these ranges do. The machine was shared with other work. A policy survives if it keeps 95 % of its
-lead over random in its worst setting."""
+Error: the distance of learners, after one second of the same actions, from their positions under RK4 with at least 64
+steps per decision (median over worlds and learners). Evaluations: of the force, per simulated second. Time: physics,
+observations and rewards of one world for one simulated second, in a batch on one thread, without compiling and without
+the policy. It is the median of interleaved rounds (least-most), each the median of its steps in a separate process;
+"rounds overlap" means that these ranges do.
+
+Lead: a player's mean return minus that of random actions, in the trained setting. A loss in another setting is given as
+a share of this lead, so that tasks can be compared; the player keeps the rest. Its interval is that of the loss, with
+the lead as a fixed number. A player survives a setting if it keeps at least 95 %."""
+
+
+KEPT = {"kept": "difference", "kept_low": "ci_low", "kept_high": "ci_high"}
+"""Share of its lead over random that a player keeps, and its interval, and the differences that they are made of."""
 
 
 @dataclass(frozen=True)
@@ -124,13 +128,12 @@ def task_results(
             "dt": dt,
             "evaluations_per_s": method.evaluations / dt,
             "adaptive": method.adaptive,
+            "unstable": is_unstable(setting.applied_to(task)),
             "us_per_s": float(np.median(times)),
             "us_low": min(times),
             "us_high": max(times),
             "error_mm": clock.error_mm[setting.name],
-            "players": {
-                name: _player(cells[setting, name], cells[settings[0], name], resamples, seed) for name in names
-            },
+            "players": {name: _player(cells, setting, settings[0], name, resamples, seed) for name in names},
             "leads": {
                 f"{names[-1]} - {other}": _difference(cells[setting, names[-1]], cells[setting, other], resamples, seed)
                 for other in names[:-1]
@@ -148,115 +151,35 @@ def task_results(
     return {**results, "verdict": verdict(task.name, results)}
 
 
-def _player(cell: Cell, trained: Cell, resamples: int, seed: int) -> Results:
-    return {
+def is_unstable(task: Task) -> bool:
+    """Return True if the step of a task is longer than the largest that is stable at any time in its scene."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnstableStepWarning)
+        return task.dt > suggest_dt(task.scene).dt
+
+
+def _player(
+    cells: Mapping[tuple[Setting, str], Cell], setting: Setting, trained: Setting, name: str, resamples: int, seed: int
+) -> Results:
+    """Return the scores of a player in a setting, and the share of its lead over random that it keeps there."""
+    cell, before = cells[setting, name], cells[trained, name]
+    found = {
         **interval_fields("mean", "mean", bootstrap(cell.returns, "mean", resamples, seed)),
         "success_rate": float(cell.success.mean()),
-        **_difference(cell, trained, resamples, seed),
+        **_difference(cell, before, resamples, seed),
     }
+    if name == "random" or (trained, "random") not in cells:
+        return found
+    lead = float((before.returns - cells[trained, "random"].returns).mean())
+    if lead <= 0:
+        return found  # there is no lead to keep
+    kept = {key: 1.0 + found[of] / lead for key, of in KEPT.items()}
+    return {**found, **kept}
 
 
 def _difference(first: Cell, second: Cell, resamples: int, seed: int) -> Results:
     gain = bootstrap(first.returns - second.returns, "mean", resamples, seed)
     return {**interval_fields("difference", "ci", gain), "separated": gain.low > 0 or gain.high < 0}
-
-
-# --- sentences --------------------------------------------------------------------------------------------------------
-
-
-def most_accurate(results: Results) -> str:
-    """Return the cheapest of the settings whose error is within a tenth of the least, or is rounding."""
-    settings = results["settings"]
-    least = max(NOTHING, 1.1 * min(about["error_mm"] for about in settings.values()))
-    return _cheapest(settings, least)
-
-
-def cheapest_accurate(results: Results) -> str:
-    """Return the cheapest setting that has at most a tenth of the error of the trained one."""
-    settings = results["settings"]
-    least = min(about["error_mm"] for about in settings.values())
-    return _cheapest(settings, max(NOTHING, least, settings[results["trained"]]["error_mm"] / 10))
-
-
-def _cheapest(settings: Results, error_mm: float) -> str:
-    enough = [name for name, about in settings.items() if about["error_mm"] <= error_mm]
-    return min(enough, key=lambda name: settings[name]["us_per_s"])
-
-
-def verdict(task: str, results: Results) -> str:
-    """Return a sentence on the last player: whether it keeps its scores, and what accuracy costs."""
-    settings, trained = results["settings"], results["settings"][results["trained"]]
-    pilot = list(trained["players"])[-1]
-    best, cheap = most_accurate(results), cheapest_accurate(results)
-    fine, saving = settings[best], settings[cheap]
-    claims = [_survival(results, pilot)]
-    text = f"solved to {length_text(fine['error_mm'])} ({title(fine)}; trained: {length_text(trained['error_mm'])})"
-    rates = [about["players"][pilot]["success_rate"] for about in (fine, trained)]
-    change = f"{_change(fine['players'][pilot])}, success {rates[0]:.0%} against {rates[1]:.0%}"
-    claims.append(f"{text} it {change}, and {_standing(fine, pilot)}")
-    claims.append(
-        f"at most a tenth of the trained error ({title(saving)}: {length_text(saving['error_mm'])}) costs "
-        + _times(saving, trained)
-        + (f"; the least error costs {_times(fine, trained)}" if best != cheap else "; no other has less error")
-    )
-    return f"{task}: " + "; ".join(claims) + "."
-
-
-def _survival(results: Results, pilot: str) -> str:
-    """Return, in words, the change of a policy's score in its worst setting, and the share of its lead over random."""
-    settings = results["settings"]
-    name = min(settings, key=lambda s: settings[s]["players"][pilot]["difference"])
-    worst, trained = settings[name]["players"], settings[results["trained"]]["players"]
-    if name == results["trained"]:
-        return f"{pilot} does nowhere worse than where it was made"
-    text = f"in its worst setting ({title(settings[name])}) it {_change(worst[pilot])}"
-    if "random" not in worst or pilot == "random":
-        return f"{pilot}: {text}"
-    kept = (worst[pilot]["mean"] - worst["random"]["mean"]) / (trained[pilot]["mean"] - trained["random"]["mean"])
-    says = "survives every setting" if kept >= SURVIVES else "does not survive every setting"
-    return f"{pilot} {says}: {text} and keeps {100 * kept:.0f} % of its lead over random"
-
-
-def _change(player: Results) -> str:
-    if not player["separated"]:
-        return f"is level with itself, {interval_text(player, 'difference', 'ci')}"
-    verb = "gains" if player["difference"] > 0 else "loses"
-    sign = 1.0 if player["difference"] > 0 else -1.0
-    low, high = sorted((sign * player["ci_low"], sign * player["ci_high"]))
-    size = {"difference": sign * player["difference"], "ci_low": low, "ci_high": high}
-    return f"{verb} {interval_text(size, 'difference', 'ci')}"
-
-
-def _standing(about: Results, pilot: str) -> str:
-    """Return a comparison of the policy with the last of the other players, in words."""
-    if not about["leads"]:
-        return "no other player took part"
-    pair, lead = list(about["leads"].items())[-1]
-    place = "level with" if not lead["separated"] else "ahead of" if lead["difference"] > 0 else "behind"
-    return f"is {place} {pair.removeprefix(f'{pilot} - ')} ({interval_text(lead, 'difference', 'ci')})"
-
-
-def _times(about: Results, trained: Results) -> str:
-    alike = about["us_low"] <= trained["us_high"] and trained["us_low"] <= about["us_high"]
-    ratio = about["us_per_s"] / trained["us_per_s"]
-    return f"{ratio:.2f} times the time" + (" (rounds overlap)" if alike else "")
-
-
-def title(about: Results) -> str:
-    """Return a setting as text: 'rk4, dt 0.0125 s'."""
-    precision = " float32" if about["dtype"] == "float32" else ""
-    return f"{about['method']}{precision}, dt {about['dt']:.4g} s"
-
-
-def length_text(millimetres: float) -> str:
-    """Return a length as text: '74 mm', '0.66 mm' or, below NOTHING, 'rounding'."""
-    return (
-        "rounding"
-        if millimetres < NOTHING
-        else f"{millimetres:.2g} mm"
-        if millimetres < 100
-        else f"{millimetres:.0f} mm"
-    )
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
@@ -276,18 +199,27 @@ def _costs(about: Results) -> list[str]:
 def _scores(results: Results, name: str, players: Sequence[str]) -> list[str]:
     found = results["settings"][name]["players"]
     if name == results["trained"]:
-        return [f"{interval_text(found[p], 'mean', 'mean')} (trained)" for p in players]
+        return [interval_text(found[p], "mean", "mean") for p in players]
     return [
         interval_text(found[p], "difference", "ci") + ("" if found[p]["separated"] else " (level)") for p in players
     ]
 
 
 def cells_of(results: Results, players: Sequence[str]) -> tuple[list[str], list[list[str]]]:
-    """Return header and rows: one row per setting; the trained one first, with its returns, then again."""
+    """Return header and rows of all settings: the trained one first, with its returns, then differences."""
     header = ["method", "dt, s", "evaluations", "µs", "error", *players]
     rows = [[*_costs(about), *_scores(results, name, players)] for name, about in results["settings"].items()]
-    again = [f"{results['again'][p]:.3f}" for p in players]
-    rows.insert(1, ["the same, played again", *rows[0][1:3], "", "", *again])
+    return header, rows
+
+
+def short_cells_of(results: Results) -> tuple[list[str], list[list[str]]]:
+    """Return header and rows of the settings of note, with the reasons for which they are shown."""
+    players = list(results["again"])
+    header = ["setting", "method", "dt, s", "evaluations", "µs", "error", *players]
+    rows = [
+        [", ".join(reasons), *_costs(results["settings"][name]), *_scores(results, name, players)]
+        for name, reasons in settings_of_note(results).items()
+    ]
     return header, rows
 
 
@@ -304,14 +236,30 @@ def show(results: Results) -> None:
 
 
 def markdown(results: Results) -> str:
-    """Return the page in Markdown."""
+    """Return the page in Markdown: counts over all tasks, the picture, and per task a sentence and a short table."""
     seeds = f"{results['world_seeds']['first']} to {results['world_seeds']['last']}"
     held_out = f"{results['worlds']} worlds per task, seeds {seeds}: held out, those of the comparison."
-    about = [ASKED, f"{held_out} `python -m agents.transfer` makes this page."]
-    parts = ["# Policies under other integration methods and steps", *about, "![Differences and times](transfer.png)"]
-    parts += [f"* **{task}**{about['verdict'].removeprefix(task)}" for task, about in results["tasks"].items()]
-    for task, about in results["tasks"].items():
-        parts += [f"## {task}", grid(*cells_of(about, list(about["again"])))]
+    tasks = results["tasks"]
+    parts = ["# Policies under other integration methods and steps", count_text(tasks), ASKED]
+    parts += [f"{held_out} `python -m agents.transfer` makes this page; transfer.json has every setting."]
+    parts += ["![Share of its lead over random that a policy gains or loses in each setting](transfer.png)"]
+    for task, about in tasks.items():
+        parts += [f"## {task}", about["verdict"].removeprefix(f"{task}: "), *_note_on_steps(about)]
+        parts += [grid(*short_cells_of(about))]
     versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
     machine = f"{results['machine']['system']}, {results['machine']['cores']} cores"
-    return "\n\n".join([*parts, "## Conclusions", READING, "---", NOTES, f"Made with {versions} on {machine}.\n"])
+    notes = f"{NOTES} {_repetition(tasks)}"
+    return "\n\n".join([*parts, "## Conclusions", READING, "---", notes, f"Made with {versions} on {machine}.\n"])
+
+
+def _note_on_steps(about: Results) -> list[str]:
+    """Return a line on settings whose steps are too long to be stable at all times, if there are any."""
+    long = ", ".join(title(each) for each in about["settings"].values() if each["unstable"])
+    return [f"Longer than the largest step that is stable in every contact: {long}."] if long else []
+
+
+def _repetition(tasks: Results) -> str:
+    """Return, in words, whether the trained settings, played a second time, had the same returns."""
+    most = max(value for about in tasks.values() for value in about["again"].values())
+    same = "had the same returns to the last bit" if most == 0 else f"differed by up to {most:.3g} in a world"
+    return f"Played a second time, the trained settings {same}."

@@ -12,12 +12,12 @@ import pytest
 from typer.testing import CliRunner
 
 from agents import compare as comparison
-from agents import play, transfer, transfer_chart, transfer_jobs, transfer_report
+from agents import play, transfer, transfer_chart, transfer_jobs, transfer_report, transfer_verdict
 from agents.transfer_jobs import Plan
 from agents.transfer_report import Cell, Clock, Setting
 from flockenv.jobs import Store
 from flockenv.physics.integrators import INTEGRATORS, RK4
-from flockenv.tasks import TASKS, Pursuit
+from flockenv.tasks import TASKS, Bottleneck, Pursuit
 
 FILES = ["transfer.json", "transfer.md", "transfer.png"]
 TINY = ("pursuit", "--worlds", "3", "--rounds", "2", "--processes", "1")
@@ -94,7 +94,7 @@ def test_the_trained_setting_scores_as_in_the_comparison_bit_for_bit() -> None:
     report, _ = comparison.compare([task], field, worlds=3, resamples=100)
     plan = Plan(task, (Setting.of_training(task),), tuple(field), 3, 0, 2)
     for (_, name), cell in transfer_jobs.read_cells(plan, transfer_jobs.jobs_by_kernel([plan]), Store(JOBS)).items():
-        assert cell.returns.tolist() == report["tasks"]["pursuit"]["players"][name]["returns"]
+        assert [cell.returns.tolist()] == report["tasks"]["pursuit"]["players"][name]["returns"]
     about = results()["tasks"]["pursuit"]
     assert about["again"] == {"random": 0.0, "rules": 0.0, "ppo": 0.0}
     [setting] = about["settings"].values()
@@ -230,18 +230,18 @@ def made_up(policy: Any, error_mm: tuple[float, float] = (80.0, 0.5), *rounds: t
 def test_the_verdict_reports_survival_and_the_cost_of_accuracy() -> None:
     noise = 0.01 * np.random.default_rng(1).normal(size=60)
     verdict = made_up(LUCK + 9.8 + noise - noise.mean())["verdict"]
-    assert verdict.startswith(
-        "pursuit: ppo survives every setting: in its worst setting (rk4, dt 0.025 s) it loses 0.2"
-    )
-    assert "keeps 98 % of its lead over random" in verdict
-    assert "solved to 0.5 mm (rk4, dt 0.025 s; trained: 80 mm) it loses 0.2" in verdict
+    assert verdict.startswith("pursuit: ppo survives every setting: it keeps at least 98 % [98, 98] of its lead over ")
+    assert "of its lead over random (rk4, dt 0.025 s); rules at least 100 % [100, 100] (rk4, dt 0.025 s). " in verdict
+    assert "Solved to 0.5 mm (rk4, dt 0.025 s; trained: 80 mm) it loses 0.2" in verdict
     assert "and is ahead of rules (0.8" in verdict
     assert verdict.endswith("(rk4, dt 0.025 s: 0.5 mm) costs 3.00 times the time; no other has less error.")
 
 
 def test_the_verdict_reports_failures_and_uncertainty() -> None:
     lost = made_up(LUCK + 2)
-    assert "ppo does not survive every setting: " in lost["verdict"]
+    assert (
+        "ppo does not survive rk4, dt 0.025 s (keeps 20 % [20, 20] of its lead over random); rules" in lost["verdict"]
+    )
     assert "it loses 8.000 [8.000, 8.000]" in lost["verdict"]
     assert "is behind rules (-7" in lost["verdict"]
     assert "success 0% against 100%" in lost["verdict"]
@@ -249,54 +249,101 @@ def test_the_verdict_reports_failures_and_uncertainty() -> None:
     level = made_up(LUCK + 10 + noise - noise.mean() - 1e-3)["verdict"]
     assert "it is level with itself, -0.0" in level
     better = made_up(LUCK + 10.5, (80.0, 0.5), (1.0, 1.05), (1.02, 1.01), (1.0, 1.2))["verdict"]
-    assert "ppo does nowhere worse than where it was made; " in better
+    assert "ppo survives every setting: it keeps at least 105 % [105, 105]" in better
     assert "it gains 0.500" in better
     assert "costs 1.05 times the time (rounds overlap); no other" in better
 
 
+@pytest.mark.parametrize(("kept", "survives"), [(0.9501, True), (0.9499, False), (1.2, True), (-0.5, False)])
+def test_a_player_survives_a_setting_if_it_keeps_95_percent_of_its_lead_over_random(
+    kept: float, survives: bool
+) -> None:
+    about = made_up(LUCK + 10 * kept)
+    assert about["settings"]["rk4 /4"]["players"]["ppo"]["kept"] == pytest.approx(kept)
+    assert transfer_verdict.lost_settings(about, "ppo") == ([] if survives else ["rk4 /4"])
+    assert ("ppo survives every setting: " in about["verdict"]) is survives
+    assert ("ppo does not survive rk4, dt 0.025 s " in about["verdict"]) is not survives
+
+
+def test_all_settings_that_are_not_survived_are_named_the_worst_first() -> None:
+    about = made_up(LUCK + 9)
+    worse = json.loads(json.dumps(about["settings"]["rk4 /4"]))
+    worse |= {"method": "heun"}
+    worse["players"]["ppo"] |= {"kept": 0.5, "kept_low": 0.4, "kept_high": 0.6}
+    about["settings"]["heun /4"] = worse
+    about["settings"]["rk4 /8"] = json.loads(json.dumps(about["settings"][about["trained"]])) | {"dt": 0.0125}
+    text = transfer_verdict.verdict("pursuit", about)
+    named = "heun, dt 0.025 s (keeps 50 % [40, 60] of its lead over random), rk4, dt 0.025 s (keeps 90 % [90, 90])"
+    assert f"ppo does not survive {named}; it survives the other 1 settings; rules at least" in text
+
+
+def test_the_counts_are_those_of_the_tasks_and_name_the_exceptions() -> None:
+    tasks = {"herd": made_up(LUCK + 9.9), "evade": made_up(LUCK + 9), "school": made_up(LUCK + 9.96)}
+    text = transfer_verdict.count_text(tasks)
+    assert text.startswith("**ppo** survives every setting in 2 of 3 tasks. It does not survive: evade under rk4, dt ")
+    assert "(90 % [90, 90])" in text
+    assert "In settings without more error than the trained one it survives in 2 of 3." in text
+    assert "**rules** survives every setting in 3 of 3 tasks. At most a tenth" in text
+    assert "herd under" not in text and "random" not in text
+    for about in tasks.values():
+        about["settings"]["rk4 /4"]["error_mm"] = 90.0
+    coarser = transfer_verdict.count_text(tasks)
+    assert "In settings without more error than the trained one it survives in 3 of 3." in coarser
+    noise = np.random.default_rng(1).normal(size=60)
+    close = transfer_verdict.count_text({"herd": made_up(LUCK + 9.6 + 2 * (noise - noise.mean()))})
+    assert "in 1 of 1 tasks (in herd an interval reaches below 95%)" in close
+
+
+def test_a_player_without_a_lead_over_random_has_nothing_to_keep() -> None:
+    task, trained, other = Pursuit(), Setting.of_training(Pursuit()), Setting("rk4", "float64", 4)
+    cells = {(setting, name): Cell(LUCK, LUCK > 0) for setting in (trained, other) for name in ("random", "ppo")}
+    clock = Clock([{trained.name: 1.0, other.name: 1.0}], {trained.name: 1.0, other.name: 0.1})
+    again = {name: cells[trained, name] for name in ("random", "ppo")}
+    about = transfer_report.task_results(task, (trained, other), cells, clock, again, 100, 0)
+    assert "kept" not in about["settings"][other.name]["players"]["ppo"]
+    assert "pursuit: ppo has no lead over random that it could keep. " in about["verdict"]
+
+
 def test_the_cheapest_of_the_settings_without_error_is_named() -> None:
     about = made_up(LUCK + 10, error_mm=(1e-9, 1e-12))
-    assert transfer_report.most_accurate(about) == about["trained"]
-    assert "solved to rounding (semi_implicit_euler, dt 0.05 s" in about["verdict"]
+    assert transfer_verdict.most_accurate(about) == about["trained"]
+    assert "Solved to rounding (semi_implicit_euler, dt 0.05 s" in about["verdict"]
 
 
-def test_the_page_has_a_row_per_setting_and_repeats_the_trained_one() -> None:
+def test_the_page_has_a_row_per_setting_of_note_and_says_why_it_is_there() -> None:
     about = {"worlds": 60, "world_seeds": {"first": 1, "last": 60}, "versions": {"python": "3"}}
-    page = transfer_report.markdown({
-        "tasks": {"pursuit": made_up(LUCK + 9.8)}, **about, "machine": {"system": "here", "cores": 2},
-    })  # fmt: skip
+    task = made_up(LUCK + 9.8)
+    task["settings"]["rk4 /4"]["unstable"] = True
+    page = transfer_report.markdown({"tasks": {"pursuit": task}, **about, "machine": {"system": "here", "cores": 2}})
     rows = [line for line in page.splitlines() if line.startswith("| ")]
-    assert len(rows) == 2 + 3
-    assert {len(re.findall(r"(?<!\\)\|", row)) for row in rows} == {8 + 1}
-    assert "(trained)" in rows[2]
-    assert "0.000" in rows[3]
-    assert "-0.200 [-0.200, -0.200]" in rows[4]
-    assert "(level)" in rows[4]
+    assert len(rows) == 2 + 2
+    assert {len(re.findall(r"(?<!\\)\|", row)) for row in rows} == {9 + 1}
+    assert rows[2].startswith("| trained | semi_implicit_euler | 0.05 |")
+    assert rows[3].startswith("| worst for rules, worst for ppo, a tenth of the error, least error | rk4 | 0.025 |")
+    assert "-0.200 [-0.200, -0.200]" in rows[3]
+    assert "(level)" in rows[3]
+    assert page.index(transfer_verdict.count_text({"pursuit": task})) < page.index("Policies were trained")
+    assert "Longer than the largest step that is stable in every contact: rk4, dt 0.025 s." in page
+    assert "Played a second time, the trained settings had the same returns to the last bit." in page
 
 
-def test_the_picture_is_centred_on_the_trained_setting() -> None:
-    figure = transfer_chart.draw_chart({"tasks": {"pursuit": made_up(LUCK + 10.2)}, "players": {"ppo": "ppo"}})
-    heat = figure.axes[0]
-    [shades] = heat.images
-    low, high = shades.get_clim()
-    assert low == -high == pytest.approx(-0.2)
-    assert [text.get_text() for text in heat.texts] == ["trained", "+0.2"]
-    assert [label.get_text() for label in heat.get_xticklabels()] == ["0.05", "0.025"]
-    colours = shades.get_cmap()(shades.norm([-0.2, 0.0, 0.2]))
-    assert np.ptp(colours[1][:3]) < 0.05, "no difference must have no colour"
-    assert colours[0][0] > colours[0][2], "losses must be red"
-    assert colours[2][2] > colours[2][0], "gains must be blue"
-
-
-def test_players_of_a_single_task_have_their_own_colour_in_the_legend() -> None:
-    tasks = {"pursuit": made_up(LUCK + 10.2)}
-    for name in ("orca", "queueing"):
-        tasks[name] = json.loads(json.dumps(tasks["pursuit"]).replace("rules", name))
+def test_the_picture_has_one_colour_scale_for_all_tasks() -> None:
+    tasks = {"pursuit": made_up(LUCK + 10.2), "herd": made_up(LUCK + 5), "evade": made_up(LUCK + 9.8)}
+    tasks["flock"] = json.loads(json.dumps(tasks["evade"]))
+    for about in tasks["flock"]["settings"].values():  # the same share of a lead that is ten times as large
+        for player in about["players"].values():
+            player |= {key: 10 * player[key] for key in ("mean", "difference", "ci_low", "ci_high")}
     figure = transfer_chart.draw_chart({"tasks": tasks})
-    [legend] = figure.legends
-    handles = {t.get_text(): h for t, h in zip(legend.get_texts(), legend.legend_handles, strict=True)}
-    assert {"rules", "orca", "queueing", "ppo"} < handles.keys()
-    assert len({handles[name].get_color() for name in ("rules", "orca", "queueing", "ppo")}) == 4
+    images = {axes.get_title(loc="left"): axes.images[0] for axes in figure.axes if axes.images}
+    assert images.keys() == tasks.keys()
+    assert {image.get_clim() for image in images.values()} == {(-transfer_chart.SCALE, transfer_chart.SCALE)}
+    losses = {name: image.to_rgba(image.get_array())[1, 1] for name, image in images.items()}
+    assert losses["evade"].tolist() == losses["flock"].tolist()
+    assert losses["herd"][0] > losses["herd"][2] and losses["herd"][1] < losses["evade"][1], "large losses are darker"
+    assert losses["pursuit"][2] > losses["pursuit"][0], "gains are blue"
+    texts = [text.get_text() for axes in figure.axes[:4] for text in axes.texts if text.get_text() != "–"]
+    assert texts == ["0", "+2", "0", "-50", "0", "-2", "0", "-2"]
+    assert figure.get_suptitle() == "ppo keeps 95 % of its lead in every setting in 3 of 4 tasks"
 
 
 # --- the command line
@@ -362,6 +409,19 @@ def test_a_method_that_solves_equations_in_python_is_refused(monkeypatch: pytest
     line = run("--methods", "rk4", code=2).stderr
     assert "--methods 'rk4': no method of a task" in line
     assert "midpoint" in line
+
+
+def test_steps_are_half_once_and_four_times_those_of_training() -> None:
+    names = [setting.name for setting in transfer._settings(Pursuit(), [("rk4", "float64")], [])]
+    assert names == ["semi_implicit_euler /2", "rk4 /1", "rk4 /2", "rk4 /8"]
+    names = [setting.name for setting in transfer._settings(Bottleneck(), [("rk4", "float32")], [])]
+    assert names == ["semi_implicit_euler /10", "rk4 float32 /5", "rk4 float32 /10", "rk4 float32 /40"]
+
+
+def test_a_setting_is_unstable_if_its_step_is_longer_than_is_stable_in_a_contact() -> None:
+    long, short = (Setting("rk4", "float64", steps).applied_to(Bottleneck()) for steps in (1, 10))
+    assert (transfer_report.is_unstable(long), transfer_report.is_unstable(short)) == (True, False)
+    assert not transfer_report.is_unstable(Setting("explicit_euler", "float64", 1).applied_to(Pursuit()))
 
 
 def test_the_default_methods_exist() -> None:
