@@ -80,7 +80,7 @@ def heuristics_crowd_nav(see: Any, task: CrowdNav, p: HeuristicsRules) -> NDArra
     aim = see.goal / np.maximum(np.linalg.norm(see.goal, axis=-1), 1e-9)[:, None]
     speed, reach = np.linalg.norm(see.velocity, axis=-1)[:, None], per_row(p.reach)
     gaze = np.where(speed > 0.05, see.velocity / np.maximum(speed, 1e-9), aim)
-    turn = np.radians(np.linspace(np.negative(p.view), p.view, 31, axis=-1))
+    turn = np.radians(np.linspace(-p.view, p.view, 31).T)
     cosine, sine = np.cos(turn), np.sin(turn)
     x, y = gaze[:, :1] * cosine - gaze[:, 1:] * sine, gaze[:, :1] * sine + gaze[:, 1:] * cosine
     # the aim comes first, so that it is selected among equally good directions

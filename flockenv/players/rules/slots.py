@@ -15,5 +15,8 @@ def nearest(present: NDArray[np.float64], *quantities: NDArray[np.float64]) -> t
 
     present: (R, K), 0 for an empty slot; quantities: (R, K, ...). They are 0 in rows without an agent.
     """
-    row, first = np.arange(len(present)), np.argmax(present > 0, axis=1)
-    return (present[row, first] > 0, *(each[row, first] for each in quantities))
+    here = present > 0
+    if here[:, 0].all():  # views are faster
+        return (here[:, 0], *(each[:, 0] for each in quantities))
+    row, first = np.arange(len(here)), np.argmax(here, axis=1)
+    return (here[row, first], *(each[row, first] for each in quantities))
