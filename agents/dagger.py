@@ -49,13 +49,14 @@ def collect_answers(
 
 def teach(
     model: PPO, task: Task, rules: RulesPlayer, updates: int, worlds: int = WORLDS,
-    advance: Callable[[int], None] = lambda n: None,
+    advance: Callable[[int], None] = lambda n: None, rounds: int = ROUNDS, seen: Callable[[int], None] = lambda n: None,
 ) -> tuple[int, float]:  # fmt: skip
-    """Train PPO's actor to imitate the rules (DAgger), by some gradient steps of 2,048 rows in four rounds.
+    """Train PPO's actor to imitate the rules (DAgger), by some gradient steps of 2,048 rows in `rounds` rounds.
 
     The first round uses observations of the rules in training worlds, each later round adds observations of the actor
     in as many more worlds. Returns the number of rows, and the remaining error: the mean square error of the actions
-    over the variance of the rules' actions. advance: called with 1 after every gradient step.
+    over the variance of the rules' actions. advance: called with 1 after every gradient step; seen: with
+    the number of rows after each round's episodes.
 
     Raises:
         FloatingPointError: learning or a world diverged; LearningDiverged names the gradient step and the loss.
@@ -65,13 +66,15 @@ def teach(
         return _finite_answers(model, rows)
 
     rows, answers = collect_answers(task, rules, worlds)
+    seen(len(rows))
     optimiser = torch.optim.Adam(model.policy.parameters(), RATE)
     loss = torch.zeros(())
-    begins = {-(-updates * turn // ROUNDS): turn for turn in range(1, ROUNDS)}
+    begins = {-(-updates * turn // rounds): turn for turn in range(1, rounds)}
     for k in range(updates):
         if k in begins:
             more = collect_answers(task, rules, worlds, answer, first=worlds * begins[k])
             rows, answers = torch.cat([rows, more[0]]), torch.cat([answers, more[1]])
+            seen(len(more[0]))
         for group in optimiser.param_groups:
             group["lr"] = RATE * (1.0 - 0.95 * k / updates)
         batch = torch.randint(len(rows), (MINIBATCH,))

@@ -26,7 +26,10 @@ from flockenv.players.hybrid import FORCE, Hybrid, HybridPolicy
 from flockenv.players.policy import MlpPolicy
 from flockenv.tasks import Task
 
-__all__ = ["MOST_SETTINGS", "Drawn", "check_settings", "drawn_settings", "hybrid_of", "played_returns", "reward_weight"]
+__all__ = [
+    "MOST_SETTINGS", "Drawn", "check_settings", "drawn_settings", "hybrid_of", "played_returns", "reward_weight",
+    "squash_of",
+]  # fmt: skip
 
 MOST_SETTINGS = 64
 """Combinations of drawn values."""
@@ -82,6 +85,11 @@ def hybrid_of(task: Task, p: PpoSettings) -> Hybrid | None:
     return None if p.action == FORCE else Hybrid.of(task, p.action, p.base, p.bound)
 
 
+def squash_of(tensors: Mapping[str, NDArray[Any]]) -> dict[str, str]:
+    """Return the card's entry about the squashing of an actor's output: none, or tanh for one of SAC or TQC."""
+    return {"squash": "tanh"} if "log_std.weight" in tensors else {}
+
+
 def reward_weight(task: Task) -> float:
     """Return the factor on the rewards of a setting while learning: 1, or less for a high price of harm."""
     price = getattr(task, "price", None)
@@ -123,7 +131,7 @@ def played_returns(
 
 
 def _policy(task: Task, p: PpoSettings, tensors: Mapping[str, NDArray[Any]]) -> MlpPolicy:
-    card: dict[str, Any] = {"activation": p.activation}
+    card: dict[str, Any] = {"activation": p.activation, **squash_of(tensors)}
     if (hybrid := hybrid_of(task, p)) is None:
-        return MlpPolicy(tensors, card)
+        return MlpPolicy.of_tensors(tensors, card)
     return HybridPolicy.of(tensors, {**card, "hybrid": hybrid.card}, task)

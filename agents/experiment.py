@@ -13,6 +13,7 @@ from typing import Any, Literal
 import typer
 from pydantic import Field, ValidationError, model_validator
 
+from agents.learner_settings import CloningSettings, OffPolicySettings, RecurrentSettings
 from flockenv.core.address_space import shortage
 from flockenv.core.errors import key_path, printable, refusals
 from flockenv.core.record import Record
@@ -42,11 +43,19 @@ class PpoSettings(Record):
     """Settings of PPO; the defaults suit two cores: many rows per step, large minibatches, few epochs."""
 
     steps: int = Field(default=20_000_000, ge=1, description="agent-steps in all")
+    seconds: float | None = Field(
+        default=None,
+        gt=0,
+        exclude_if=lambda seconds: seconds is None,
+        description="wall time in all, with imitation and evaluation, s; the first budget that is spent ends training",
+    )
     worlds: int = Field(default=2048, ge=1, description="worlds stepped together; rows = worlds x learners")
     rollout: int = Field(default=32, ge=1, description="actions per row and update")
     minibatch: int = Field(default=8192, ge=1, description="rows per gradient step")
     epochs: int = Field(default=4, ge=1, description="passes over a rollout")
-    learning_rate: float = Field(default=2e-3, gt=0, description="at the start; falls linearly to a tenth at the end")
+    learning_rate: float = Field(
+        default=2e-3, gt=0, description="at the start; falls linearly to a tenth as the budget is spent"
+    )
     gamma: float = Field(default=0.99, gt=0, le=1, description="discount per action, whether it is held or not")
     gae_lambda: float = Field(default=0.95, ge=0, le=1, description="lambda of the advantage estimate")
     clip: float = Field(default=0.2, gt=0, description="PPO's clip range")
@@ -137,7 +146,7 @@ class SearchSettings(Record):
 
 
 class Experiment(Record):
-    """One task, and the settings of its training and tuning."""
+    """One task, and the settings of its training and tuning; those of other learners than PPO are for agents.learn."""
 
     task: str = Field(description="name of the task")
     arguments: dict[str, Any] = Field(default_factory=dict, description="keyword arguments of the task")
@@ -145,6 +154,10 @@ class Experiment(Record):
     curves: dict[str, dict[str, Any]] = Field(
         default_factory=dict, description="further settings of PPO for comparison, by name: the fields that differ"
     )
+    sac: OffPolicySettings = Field(default_factory=OffPolicySettings)
+    tqc: OffPolicySettings = Field(default_factory=OffPolicySettings)
+    recurrent_ppo: RecurrentSettings = Field(default_factory=RecurrentSettings)
+    bc: CloningSettings = Field(default_factory=CloningSettings)
     search: SearchSettings = Field(default_factory=SearchSettings)
 
     @model_validator(mode="after")
@@ -152,6 +165,11 @@ class Experiment(Record):
         """Raise ValueError for settings that cannot be trained when they are read, not hours later."""
         self.settings()
         return self
+
+    def with_ppo(self, **changes: Any) -> Experiment:
+        """Return the experiment with other settings under `ppo`, except those that are None, checked as when read."""
+        given = {name: value for name, value in changes.items() if value is not None}
+        return self.model_copy(update={"ppo": PpoSettings(**{**self.ppo.model_dump(), **given})})
 
     def settings(self) -> dict[str, PpoSettings]:
         """Return all settings of PPO by name: the config's own, and those of `curves`."""

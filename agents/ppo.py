@@ -4,7 +4,8 @@ The order of the file: settings -> worlds -> model -> learn -> export. At regula
 tuning worlds in numpy, which gives the learning curve; the best policy is exported, as safetensors with a card that
 holds the recipe. After each point of the curve, and on Ctrl-C, a checkpoint (agents/checkpoint.py) is written, with the
 state at the start of the last rollout; `--resume` continues from it if the recipe is the same. A training that was
-resumed under the same versions on the same machine has the same weights as an uninterrupted one, bit for bit.
+resumed under the same versions on the same machine has the same weights as an uninterrupted one, bit for bit, unless
+`ppo.seconds` is set: then the learning rate and the end depend on the clock.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -35,8 +36,18 @@ from agents.drawn import check_settings
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors, seeds_of
 from agents.run import Run, expected_bytes, load_checkpoint, recipe_of, save_checkpoint
 from agents.team_credit import CaringBuffer
-from agents.training import add_point, card_of, new_progress, score, use_thread_count
+from agents.training import (
+    BudgetSpent,
+    add_point,
+    card_of,
+    is_spent,
+    new_progress,
+    score,
+    share_of_time_left,
+    use_thread_count,
+)
 from agents.training_env import learning_env
+from agents.training_job import file_name, policy_of_bytes, training_job, with_seed
 from agents.training_state import capture, restore, surroundings
 from agents.warm_start import starting_policy, use_weights
 from flockenv.cli.jobs import EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
@@ -46,13 +57,13 @@ from flockenv.core.address_space import IN_USE, TRAINING, require_room
 from flockenv.core.output_paths import check_room, valid_file, valid_path
 from flockenv.envs.sb3 import WorldVecEnv
 from flockenv.evaluation import worlds_for
-from flockenv.jobs import Store, Work, engine_of, run_jobs
+from flockenv.jobs import Job, Store, Work, engine_of, run_jobs
 from flockenv.players import WEIGHTS
 from flockenv.players.policy import save_policy
 from flockenv.players.rules import player
 from flockenv.tasks import Task
 
-__all__ = ["app", "build", "export", "tensors_of", "train"]
+__all__ = ["app", "build", "export", "learning_rate", "run_trainings", "tensors_of", "train"]
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 console = Console(stderr=True)
@@ -70,6 +81,11 @@ def tensors_of(model: PPO) -> dict[str, np.ndarray]:
         for part in ("weight", "bias"):
             out[f"policy.{k}.{part}"] = state[f"mlp_extractor.policy_net.{layer}.{part}"]
     return {name: tensor.copy() for name, tensor in out.items()}
+
+
+def learning_rate(p: PpoSettings) -> Callable[[float], float]:
+    """Return the learning rate as a function of the share of the budget that is left."""
+    return lambda left: p.learning_rate * max(0.1 + 0.9 * left, 0.05)  # the last rollout may go beyond
 
 
 def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
@@ -90,7 +106,7 @@ def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
         n_steps=p.rollout,
         batch_size=p.minibatch,
         n_epochs=p.epochs,
-        learning_rate=lambda left: p.learning_rate * max(0.1 + 0.9 * left, 0.05),  # the last rollout may go beyond
+        learning_rate=learning_rate(p),
         gamma=p.gamma,
         gae_lambda=p.gae_lambda,
         clip_range=p.clip,
@@ -129,15 +145,27 @@ class Watch(BaseCallback):
     def _on_step(self) -> bool:
         return True
 
+    def _on_training_start(self) -> None:
+        """Let the learning rate follow the budget of which less is left, agent-steps or seconds."""
+        rate = learning_rate(self.p)
+        self.model.lr_schedule = lambda left: rate(min(left, share_of_time_left(self.p, self.wall)))
+
+    @property
+    def wall(self) -> float:
+        """Wall time in all, s."""
+        return self.before + time.perf_counter() - self.since
+
     def _on_rollout_start(self) -> None:
         check_model(self.model)
         self._remember()
+        if share_of_time_left(self.p, self.run.wall) <= 0:
+            raise BudgetSpent
         if self.due:
             self.save()
 
     def _remember(self) -> None:
         """Store the state of training at this moment, for the next checkpoint."""
-        self.run.wall = self.before + time.perf_counter() - self.since
+        self.run.wall = self.wall
         self.run.state = capture(self.model)
         self.kept = replace(self.run, curve=list(self.run.curve))
 
@@ -161,7 +189,7 @@ class Watch(BaseCallback):
 
     def add_point(self) -> None:
         """Evaluate the current policy, and keep it if it is the best so far; a checkpoint is then due."""
-        self.run.wall = self.before + time.perf_counter() - self.since
+        self.run.wall = self.wall
         self.run.steps = self.num_timesteps * self.p.hold
         tensors = tensors_of(self.model)
         text, line = add_point(self.run, tensors, score(self.task, self.p, tensors))
@@ -226,7 +254,7 @@ def train(
         run = load_checkpoint(experiment, folder) if go_on else None
         if run is not None:
             saved(replace(run, curve=list(run.curve), resumed=list(run.resumed)))
-        if run is not None and run.steps >= experiment.ppo.steps:
+        if run is not None and is_spent(run, experiment.ppo):
             return run
         if go_on and run is None:
             console.print(
@@ -255,12 +283,13 @@ def _train_from(
         watch = Watch(task, p, run, folder, progress, saved)
         try:
             with _name_divergence(model):
-                model.learn(
-                    -(-(p.steps - run.steps) // p.hold),
-                    callback=watch,
-                    reset_num_timesteps=anew,
-                    log_interval=None if tensorboard is None else 1,
-                )
+                with suppress(BudgetSpent):
+                    model.learn(
+                        -(-(p.steps - run.steps) // p.hold),
+                        callback=watch,
+                        reset_num_timesteps=anew,
+                        log_interval=None if tensorboard is None else 1,
+                    )
                 watch.finish()
         except (KeyboardInterrupt, FloatingPointError):
             watch.save()
@@ -292,6 +321,9 @@ def main(
     go_on: Annotated[bool, typer.Option("--resume", help="continue from the last checkpoint")] = False,
     tensorboard: Annotated[str | None, typer.Option(help="folder of TensorBoard logs")] = None,
     steps: Annotated[int | None, typer.Option(help="total agent-steps, instead of those of the config")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help="wall time in all, s; training ends at the first budget that is spent")
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="training seed, instead of that of the config")] = None,
     action: Annotated[
         str | None,
@@ -309,8 +341,7 @@ def main(
     """Train a policy with PPO and export its weights."""
     with one_line_errors():
         experiment = load_experiment(config)
-        changes = {k: v for k, v in (("steps", steps), ("seed", seed), ("action", action)) if v is not None}
-        experiment = experiment.model_copy(update={"ppo": PpoSettings(**{**experiment.ppo.model_dump(), **changes})})
+        experiment = experiment.with_ppo(steps=steps, seconds=seconds, seed=seed, action=action)
         name = experiment.build().name
         check_settings(experiment)
         if seeds is not None:
@@ -318,8 +349,11 @@ def main(
                 raise ValueError("--seeds: not together with --seed, --resume or --tensorboard; it resumes by itself")
             folder = valid_path(str(out or "results/ppo"))
             work = Work(Store(folder / "jobs"), engine_of(engine, processes, renew=True), fresh, shard=shard_of(shard))
+            checkpoints = valid_path(str(runs), "--runs")
+            check_room(checkpoints / "checkpoint", expected_bytes(experiment))
+            jobs = [training_job(with_seed(experiment, number), checkpoints, not fresh) for number in seeds_of(seeds)]
             with end_of_shard():
-                _train_seeds(experiment, seeds, folder, valid_path(str(runs), "--runs"), work)
+                run_trainings(jobs, folder, work, expected_bytes(experiment))
             return
         if shard is not None:
             raise ValueError("--shard: needs --seeds, whose trainings are jobs")
@@ -342,14 +376,10 @@ def main(
     console.print(f"{target}: {best} after {run.steps:,} steps, {run.wall:.0f} s")
 
 
-def _train_seeds(experiment: Experiment, text: str, folder: Path, runs: Path, work: Work) -> None:
-    """Train with several seeds as jobs, and write the policy of each that has ended."""
-    from agents.training_job import file_name, policy_of_bytes, training_job, with_seed
-
-    for path in (folder / "policy", runs / "checkpoint"):
-        check_room(path, expected_bytes(experiment))
-    jobs = [training_job(with_seed(experiment, seed), runs, not work.fresh) for seed in seeds_of(text)]
-    interrupted = "interrupted; checkpoints and finished trainings are stored, run the same command to continue"
+def run_trainings(jobs: list[Job], folder: Path, work: Work, size: int, stored: str = "checkpoints and ") -> None:
+    """Run trainings as jobs, and write the policy of each that has ended; size: of a policy, bytes, at most."""
+    check_room(folder / "policy", size)
+    interrupted = f"interrupted; {stored}finished trainings are stored, run the same command to continue"
     with handle_interrupt(interrupted), job_bar("training") as progress:
         try:
             run_jobs(jobs, replace(work, progress=progress))

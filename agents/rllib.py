@@ -62,6 +62,7 @@ ONE = "default_policy"
 
 NO_EQUAL: dict[str, Any] = {
     "hold": 1, "care": 0.0, "central_critic": False, "taught": 0, "critic_first": 0, "draw": {}, "action": "force",
+    "seconds": None,
 }  # fmt: skip
 """Settings of which RLlib's PPO has no equal, with the value that it does have."""
 

@@ -69,6 +69,7 @@ class Run:
     best: float | None = None
     tensors: dict[str, np.ndarray] = field(default_factory=dict)
     state: CheckpointParts = field(default_factory=dict)  # of the model, see agents.training_state
+    ended_by: str = ""  # for the card, if it does not follow from the budgets; not in a checkpoint
 
 
 class Point(ResultRecord):

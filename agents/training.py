@@ -1,4 +1,4 @@
-"""Parts of a training that Stable-Baselines3's PPO and RLlib's share: threads, score, progress and card."""
+"""Parts of a training that all learners share: budget in seconds, threads, score, progress and card."""
 
 from __future__ import annotations
 
@@ -14,14 +14,32 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from agents.divergence import LearningDiverged
-from agents.drawn import played_returns
+from agents.drawn import played_returns, squash_of
 from agents.experiment import CONFIGS, PpoSettings, load_experiment
 from agents.run import Run
 from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.players.policy import describe
 from flockenv.tasks import TASKS, Task
 
-__all__ = ["add_point", "card_of", "new_progress", "score", "use_thread_count"]
+__all__ = [
+    "BudgetSpent", "add_point", "card_of", "is_spent", "new_progress", "score", "share_of_time_left",
+    "use_thread_count",
+]  # fmt: skip
+
+
+class BudgetSpent(Exception):  # noqa: N818  # the end of a training
+    """Raised by a callback between two updates if the budget in seconds is spent."""
+
+
+def share_of_time_left(p: PpoSettings, wall: float) -> float:
+    """Return the share of the budget in seconds that is left after `wall` s, at most 1; 1 without such a budget."""
+    return 1.0 if p.seconds is None else min(1.0, 1.0 - wall / p.seconds)
+
+
+def is_spent(run: Run, p: PpoSettings) -> bool:
+    """Return True if a budget is spent, and the last policy has been evaluated."""
+    is_evaluated = bool(run.curve) and run.curve[-1]["steps"] == run.steps
+    return run.steps >= p.steps or (share_of_time_left(p, run.wall) <= 0 and is_evaluated)
 
 
 @contextmanager
@@ -84,6 +102,16 @@ def _config_of(recipe: dict[str, Any]) -> str:
     return f"{recipe['task']}.yaml"
 
 
+def _end_of(run: Run) -> dict[str, str]:
+    """Return the card's entry on what ended a training; none if agent-steps are its only budget."""
+    p = run.recipe["ppo"]
+    if run.ended_by or p.get("seconds") is None:
+        return {"ended_by": run.ended_by} if run.ended_by else {}
+    if run.steps >= p["steps"]:
+        return {"ended_by": "steps"}
+    return {"ended_by": "seconds"} if run.wall >= p["seconds"] else {}
+
+
 def card_of(run: Run, library: str = "stable-baselines3", command: str = "agents.ppo") -> dict[str, Any]:
     """Return the card of a run's policy: its recipe, from which it can be reproduced, and how it was trained."""
     recipe = run.recipe
@@ -91,10 +119,12 @@ def card_of(run: Run, library: str = "stable-baselines3", command: str = "agents
         **describe(TASKS[recipe["task"]](**recipe["arguments"])),
         **{name: recipe[name] for name in ("rules", "hybrid") if name in recipe},
         "activation": recipe["ppo"]["activation"],
+        **squash_of(run.tensors),
         "algorithm": f"PPO ({library})",
         "recipe": {"command": f"python -m {command} configs/training/{_config_of(recipe)}", "ppo": recipe["ppo"]},
         "seed": recipe["ppo"]["seed"],
         "steps": run.steps,
+        **_end_of(run),
         "wall_time_s": round(run.wall, 1),
         "tuning_mean": run.best,
         "curve": run.curve,

@@ -13,7 +13,7 @@ from flockenv.envs.world import bytes_per_world, first_step
 from flockenv.jobs import Job, records
 from flockenv.tasks import Task
 
-__all__ = ["file_name", "policy_of_bytes", "training_job", "with_seed"]
+__all__ = ["file_name", "learned", "memory", "policy_of_bytes", "training_job", "with_seed"]
 
 TRAINING = 700 * 2**20
 """Bytes that a process needs to train, besides worlds and rollout: torch and other libraries, and compiling."""
@@ -33,21 +33,21 @@ def training_job(
     recipe or other code begins anew. name: of the job (default: "ppo/TASK/seed-N"). at_a_time: how many trainings run
     at the same time, if its wall time is a result: a training among others has another key.
     """
-    task, about = _learned(experiment), recipe_of(experiment)
+    task, about = learned(experiment), recipe_of(experiment)
     unplaced = Job(
         name or f"ppo/{experiment.build().name}/seed-{experiment.ppo.seed}", _train, (),
-        about if at_a_time is None else [about, at_a_time], _memory(experiment, task), (first_step, (task,)),
+        about if at_a_time is None else [about, at_a_time], memory(experiment, task), (first_step, (task,)),
     )  # fmt: skip
     folder = runs / unplaced.key.partition("/")[2].replace("/", "-")
     return replace(unplaced, arguments=(experiment.model_dump_json(), str(folder), go_on))
 
 
-def _learned(experiment: Experiment) -> Task:
+def learned(experiment: Experiment) -> Task:
     """Return the task as it is learnt, in the precision of the training worlds."""
     return experiment.build().model_copy(update={"dtype": experiment.ppo.dtype})
 
 
-def _memory(experiment: Experiment, task: Task) -> int:
+def memory(experiment: Experiment, task: Task) -> int:
     """Return the memory of a training, bytes: libraries, worlds, and the rollout twice, as minibatches are drawn."""
     p = experiment.ppo
     row = 4 * (task.layout.size + task.action_layout.size + 6)  # float32: also rewards, values and the like
@@ -58,7 +58,7 @@ def _memory(experiment: Experiment, task: Task) -> int:
 
 def file_name(job: Job) -> str:
     """Return the name of the policy's file: pursuit-seed-3.safetensors."""
-    return f"{job.name.removeprefix('ppo/').replace('/', '-')}.safetensors"
+    return f"{job.name.partition('/')[2].replace('/', '-')}.safetensors"
 
 
 def _train(experiment: str, folder: str, go_on: bool) -> bytes:

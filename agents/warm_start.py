@@ -13,6 +13,7 @@ from stable_baselines3 import PPO
 from agents.run import start_path
 from flockenv.core.errors import printable
 from flockenv.players.policy import MlpPolicy, describe
+from flockenv.players.recurrent import RecurrentPolicy
 from flockenv.tasks import Task
 
 __all__ = ["starting_policy", "use_weights"]
@@ -25,6 +26,8 @@ def starting_policy(spec: str, task: Task, hidden: tuple[int, ...], activation: 
         ValueError: in one line, there is no such policy, it has another network, or it observes something else.
     """
     policy = MlpPolicy.load(start_path(spec, task))
+    if "squash" in policy.card or isinstance(policy, RecurrentPolicy):
+        raise ValueError(f"ppo.start = {printable(spec)}: its actor is squashed or recurrent, must be one of PPO's")
     mine = (tuple(len(bias) for _, bias in policy.layers[:-1]), policy.card["activation"])
     if mine != (hidden, activation):
         raise ValueError(f"ppo.start = {printable(spec)}: its network is {mine}, must be {(hidden, activation)}")

@@ -137,7 +137,7 @@ def an_exported_policy_acts_as_in_rllib() -> None:
         outputs = runner.module.forward_exploration({Columns.OBS: torch.from_numpy(rows)})
     mean, log_std = outputs[Columns.ACTION_DIST_INPUTS].numpy().reshape(500, 2, -1).swapaxes(0, 1)
     assert np.abs(policy.predict(rows, deterministic=True)[0] - np.clip(mean, -1, 1)).max() < 1e-5
-    assert np.abs(policy._deviation - np.exp(log_std)).max() < 1e-6
+    assert np.abs(policy._log_std - log_std).max() < 1e-6
     assert np.abs(run.tensors["log_std"] + 0.7).max() < 0.2 and np.any(run.tensors["log_std"] != -0.7)
 
 

@@ -24,6 +24,7 @@ LAYERS = (
 ONLY_IN = {
     "torch": ("flockenv/envs/sb3.py", "agents", "tests"),
     "stable_baselines3": ("flockenv/envs/sb3.py", "agents", "tests"),
+    "sb3_contrib": ("agents", "tests"),
     "matplotlib": ("flockenv/render", "flockenv/evaluation", "flockenv/studies", "agents", "tests"),
     "pygame": ("flockenv/render", "tests"),
 }

@@ -19,7 +19,7 @@ from flockenv.jit import cpu
 
 __all__ = ["Failure", "Job", "code_digest", "execute"]
 
-PACKAGES = ("numpy", "numba", "llvmlite", "scipy", "gymnasium", "torch", "stable-baselines3")
+PACKAGES = ("numpy", "numba", "llvmlite", "scipy", "gymnasium", "torch", "stable-baselines3", "sb3-contrib")
 """Packages whose version results may depend on; one that is not installed has the version "none"."""
 
 SETTINGS = ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "NUMBA_DISABLE_JIT", "NUMBA_OPT")

@@ -48,6 +48,9 @@ ONE_THREAD = 2**18
 Rows are processed in blocks of that size: so small a product gains nothing from threads, and if other work shares the
 cores, waiting threads were measured to cost two hundred times the product itself."""
 
+LOG_STD = (-20.0, 2.0)
+"""Range of the logarithm of a squashed actor's standard deviation, that of Stable-Baselines3's SAC."""
+
 LARGEST_CARD, LARGEST_WEIGHTS = 8 << 20, 256 << 20
 """Bytes: larger files are not read."""
 
@@ -106,13 +109,18 @@ ACTIVATIONS: Mapping[str, Callable[..., Floats]] = {
 }
 
 
+SQUASHES: Mapping[str, Callable[..., Floats]] = {"tanh": np.tanh}
+
+
 class MlpPolicy:
     """The actor of an MLP policy in plain numpy: float32 throughout, equal to SB3's to 1e-6 and needing no torch.
 
     Args:
         tensors: `policy.0.weight`, `policy.0.bias`, `policy.1.weight`, ... (hidden layers), `action.weight`,
-            `action.bias`, `log_std`; weights are (out, in) as in torch.
-        card: needs `activation`, "tanh" or "relu"; the rest is information.
+            `action.bias`, `log_std`; weights are (out, in) as in torch. A squashed actor has a layer `log_std.weight`,
+            `log_std.bias` instead of `log_std`.
+        card: needs `activation`, "tanh" or "relu"; and `squash`, "tanh", for a squashed actor, whose action is the
+            tanh of its output (Haarnoja et al. 2018, arXiv 1801.01290); the rest is information.
         seed: of the generator that samples when not deterministic; None draws one.
 
     Raises:
@@ -122,11 +130,12 @@ class MlpPolicy:
     def __init__(self, tensors: Mapping[str, NDArray[Any]], card: Mapping[str, Any], seed: int | None = 0) -> None:
         self.card = dict(card)
         self._activation = ACTIVATIONS[_check_known(card.get("activation"), ACTIVATIONS, "activation")]
-        self._hidden, self._head = _layers(tensors)
-        self._deviation = np.exp(tensors["log_std"])
+        self._squash = SQUASHES[_check_known(card["squash"], SQUASHES, "squash")] if "squash" in card else None
+        self._hidden, self._head = _layers(tensors, self._squash is not None)
+        self._log_std = tensors["log_std"] if self._squash is None else None
         self._block = max(1, ONE_THREAD // max(weight.size for weight, _ in [*self._hidden, self._head]))
         self.observation_size = int([*self._hidden, self._head][0][0].shape[0])
-        self.action_size = int(self._head[1].shape[0])
+        self.action_size = len(tensors["action.bias"])
         self.seed, self._generator = _new_generator(seed)
         self.differences: tuple[str, ...] = ()
         """Differences between the task that it plays and the one that it was trained on, a phrase each."""
@@ -171,10 +180,17 @@ class MlpPolicy:
     ) -> MlpPolicy:
         """Return the policy of a card, which may be a hybrid of a network and rules."""
         if "hybrid" not in card:
-            return cls(tensors, card, seed)
+            return cls.of_tensors(tensors, card, seed)
         from flockenv.players.hybrid import HybridPolicy  # a layer above this file
 
         return HybridPolicy.of(tensors, card, task, seed)
+
+    @staticmethod
+    def of_tensors(tensors: Mapping[str, NDArray[Any]], card: Mapping[str, Any], seed: int | None = 0) -> MlpPolicy:
+        """Return the policy of some tensors, with an LSTM if they contain one; the card's hybrid is left out."""
+        from flockenv.players.recurrent import RecurrentPolicy, has_lstm  # a layer above this file
+
+        return (RecurrentPolicy if has_lstm(tensors) else MlpPolicy)(tensors, card, seed)
 
     def predict(
         self,
@@ -183,26 +199,41 @@ class MlpPolicy:
         episode_start: NDArray[Any] | None = None,
         deterministic: bool = False,
     ) -> tuple[Floats, State | None]:
-        """Return the mean action, or a Gaussian sample, clipped to [-1, 1]: (O,) -> (A,), (R, O) -> (R, A)."""
+        """Return the mean action, or a Gaussian sample, clipped to [-1, 1]: (O,) -> (A,), (R, O) -> (R, A).
+
+        If the actor is squashed, that of the mean, or of a sample, before the tanh.
+        """
+        rows = self._rows(observation)
+        action = self._act(rows.reshape(-1, rows.shape[-1]), deterministic)
+        return action.reshape(*rows.shape[:-1], self.action_size), state
+
+    def _rows(self, observation: Observation) -> Floats:
+        """Return observations as float32; raise ValueError for another shape than (O,) or (R, O)."""
         rows = np.asarray(observation, dtype=np.float32)
         if rows.ndim not in (1, 2) or rows.shape[-1] != self.observation_size:
             size = self.observation_size
             raise ValueError(f"observation: shape {rows.shape}, must be ({size},) or (rows, {size})")
-        table = rows.reshape(-1, self.observation_size)
-        blocks = [self._mean(table[k : k + self._block]) for k in range(0, len(table), self._block)]
-        action = np.concatenate(blocks or [table[:, :0]]).reshape(*rows.shape[:-1], self.action_size)
-        if not deterministic:
-            action += self._deviation * self._generator.standard_normal(action.shape, dtype=np.float32)
-        return np.clip(action, -1.0, 1.0, out=action), state
+        return rows
 
-    def _mean(self, rows: Floats) -> Floats:
+    def _act(self, rows: Floats, deterministic: bool) -> Floats:
+        """Return the actions (R, A) of the inputs (R, I) of the first layer."""
+        blocks = [self._output(rows[k : k + self._block]) for k in range(0, len(rows), self._block)]
+        output = np.concatenate(blocks or [np.zeros((0, len(self._head[1])), np.float32)])
+        action, log_std = output[:, : self.action_size], self._log_std
+        if log_std is None:
+            log_std = np.clip(output[:, self.action_size :], *LOG_STD)
+        if not deterministic:
+            action += np.exp(log_std) * self._generator.standard_normal(action.shape, dtype=np.float32)
+        return np.clip(action, -1.0, 1.0, out=action) if self._squash is None else self._squash(action)
+
+    def _output(self, rows: Floats) -> Floats:
         for weight, bias in self._hidden:
             rows = rows @ weight
             rows += bias
             self._activation(rows, out=rows)
-        action: Floats = rows @ self._head[0]
-        action += self._head[1]
-        return action
+        output: Floats = rows @ self._head[0]
+        output += self._head[1]
+        return output
 
 
 def save_policy(path: str | os.PathLike[str], tensors: Mapping[str, NDArray[Any]], card: Mapping[str, Any]) -> None:
@@ -224,7 +255,7 @@ def save_policy(path: str | os.PathLike[str], tensors: Mapping[str, NDArray[Any]
     if path.suffix != ".safetensors":
         raise ValueError(f"policy {printable_path(path)}: the file name must end in .safetensors")
     tensors = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
-    policy = MlpPolicy(tensors, card)
+    policy = MlpPolicy.of_tensors(tensors, card)
     data = save(tensors)
     derived = {
         "version": CARD_VERSION,
@@ -371,11 +402,15 @@ def _describe_slot(slot: Mapping[str, Any] | None) -> str:
     return f"{printable(slot['name'])} of shape {printable(tuple(slot['shape']))} in {printable(slot['unit'])}"
 
 
-def _layers(tensors: Mapping[str, NDArray[Any]]) -> tuple[list[Layer], Layer]:
-    """Check every tensor and return the layers as (in, out) weights and biases: the hidden ones, and the last."""
+def _layers(tensors: Mapping[str, NDArray[Any]], is_squashed: bool) -> tuple[list[Layer], Layer]:
+    """Check every tensor and return the layers as (in, out) weights and biases: the hidden ones, and the last.
+
+    The last layer of a squashed actor puts out means and logarithms of standard deviations side by side.
+    """
     depth = sum(name.startswith("policy.") and name.endswith(".weight") for name in tensors)
     names = [f"policy.{i}" for i in range(depth)] + ["action"]
-    expected = {f"{name}.{part}" for name in names for part in ("weight", "bias")} | {"log_std"}
+    deviations = {"log_std.weight", "log_std.bias"} if is_squashed else {"log_std"}
+    expected = {f"{name}.{part}" for name in names for part in ("weight", "bias")} | deviations
     if expected != tensors.keys():
         name = sorted(expected ^ tensors.keys())[0]
         raise ValueError(f"tensor {name!r} is {'missing' if name in expected else 'not one of an MLP actor'}")
@@ -391,8 +426,14 @@ def _layers(tensors: Mapping[str, NDArray[Any]]) -> tuple[list[Layer], Layer]:
         _check_shape(f"{name}.weight", weight, (weight.shape[0] if weight.ndim else 0, inputs))
         _check_shape(f"{name}.bias", bias, weight.shape[:1])
         layers.append((np.ascontiguousarray(weight.T), bias))
-    _check_shape("log_std", tensors["log_std"], layers[-1][1].shape)
-    return layers[:-1], layers[-1]
+    *hidden, (weight, bias) = layers
+    if not is_squashed:
+        _check_shape("log_std", tensors["log_std"], bias.shape)
+        return hidden, (weight, bias)
+    _check_shape("log_std.weight", tensors["log_std.weight"], weight.shape[::-1])
+    _check_shape("log_std.bias", tensors["log_std.bias"], bias.shape)
+    both = np.concatenate([weight, tensors["log_std.weight"].T], axis=1)
+    return hidden, (np.ascontiguousarray(both), np.concatenate([bias, tensors["log_std.bias"]]))
 
 
 def _check_shape(name: str, tensor: NDArray[Any], shape: tuple[int, ...]) -> None:
