@@ -46,7 +46,8 @@ multiplies. *Harmed*: share of worlds in which a learner was harmed, and how man
 of its time in which a learner stands still (below a tenth of its maximum speed). *Effort*: mean of (force /
 max_force)². *Time*: until a learner leaves or the episode ends. *Against rules*: difference of returns to the
 hand-written player with the highest return in these worlds. Intervals: 95 %; over training seeds and worlds where a
-player has several seeds, else over worlds alone."""
+player has several seeds (their number is beside its name), else over worlds alone: such a player was trained or tuned
+once, and its numbers are those of one run."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -248,7 +249,8 @@ def main(
         with job_bar() as progress:
             work = Work(Store(folder / JOBS), engine_of(engine, processes), fresh, progress, shard_of(shard))
             contents = front(plan, names, work)
-        _write(page, plan, f"python -m agents.front {study.as_posix()} --out {out}", list(contents.values()))
+        some = f" --tasks {','.join(names)}" if names != list(plan.tasks) else ""
+        _write(page, plan, f"python -m agents.front {study.as_posix()} --out {out}{some}", list(contents.values()))
     typer.echo(f"{page}: written")
 
 
