@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from agents.report import Results, grid, interval_fields, interval_text, number_text, table_of
-from agents.transfer_verdict import count_text, length_text, settings_of_note, title, verdict
+from agents.transfer_verdict import LEAST_ROUNDS, count_text, length_text, settings_of_note, title, verdict
 from flockenv.core.warnings import UnstableStepWarning
 from flockenv.evaluation import bootstrap, task_digest
 from flockenv.physics.integrators import INTEGRATORS
@@ -143,6 +143,7 @@ def task_results(
         "digest": task_digest(task),
         "control_dt": task.control_dt,
         "trained": settings[0].name,
+        "rounds": len(clock.rounds),
         "settings": found,
         "again": {
             name: float(np.abs(cell.returns - cells[settings[0], name].returns).max()) for name, cell in again.items()
@@ -248,7 +249,7 @@ def markdown(results: Results) -> str:
         parts += [grid(*short_cells_of(about))]
     versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
     machine = f"{results['machine']['system']}, {results['machine']['cores']} cores"
-    notes = f"{NOTES} {_repetition(tasks)}"
+    notes = f"{NOTES} {_repetition(tasks)} {_rounds(tasks)}"
     return "\n\n".join([*parts, "## Conclusions", READING, "---", notes, f"Made with {versions} on {machine}.\n"])
 
 
@@ -256,6 +257,12 @@ def _note_on_steps(about: Results) -> list[str]:
     """Return a line on settings whose steps are too long to be stable at all times, if there are any."""
     long = ", ".join(title(each) for each in about["settings"].values() if each["unstable"])
     return [f"Longer than the largest step that is stable in every contact: {long}."] if long else []
+
+
+def _rounds(tasks: Results) -> str:
+    """Return the number of rounds of timing as text, and that too few of them are not compared."""
+    fewest = min(about["rounds"] for about in tasks.values())
+    return f"Rounds of timing: {fewest}{'' if fewest >= LEAST_ROUNDS else ', too few to compare times'}."
 
 
 def _repetition(tasks: Results) -> str:

@@ -13,6 +13,8 @@ __all__ = [
 
 SURVIVES = 0.95
 """A player survives a setting if it keeps this share of its lead over random."""
+LEAST_ROUNDS = 3
+"""Rounds of timing below which times are not compared."""
 NOTHING = 1e-6
 """mm: an error below this is rounding."""
 
@@ -81,7 +83,8 @@ def verdict(task: str, results: Results) -> str:
         + _times(saving, trained)
         + (f"; the least error costs {_times(fine, trained)}" if best != cheap else "; no other has less error")
     )
-    return f"{task}: {_survival(results, pilot)}. {text} it {change}, and {_standing(fine, pilot)}. {cost}."
+    claims = f"{task}: {_survival(results, pilot)}. {text} it {change}, and {_standing(fine, pilot)}."
+    return f"{claims} {cost}." if results["rounds"] >= LEAST_ROUNDS else claims
 
 
 def _survival(results: Results, pilot: str) -> str:
@@ -166,6 +169,8 @@ def count_text(tasks: Results) -> str:
     """Return the first paragraph of the page: in how many tasks players survive, where not, and what accuracy costs."""
     players = list(dict.fromkeys(name for about in tasks.values() for name in reversed(about["again"])))
     lines = [line for player in players for line in _player_lines(tasks, player)]
+    if min(about["rounds"] for about in tasks.values()) < LEAST_ROUNDS:
+        return " ".join(lines)
     ratios = [
         about["settings"][cheapest_accurate(about)]["us_per_s"] / about["settings"][about["trained"]]["us_per_s"]
         for about in tasks.values()

@@ -221,7 +221,7 @@ def made_up(policy: Any, error_mm: tuple[float, float] = (80.0, 0.5), *rounds: t
     }
     cells = {key: Cell(returns, returns > 5) for key, returns in scores.items()}
     names = [setting.name for setting in settings]
-    seconds = [dict(zip(names, times, strict=True)) for times in rounds or ((1.0, 3.0),)]
+    seconds = [dict(zip(names, times, strict=True)) for times in rounds or 3 * ((1.0, 3.0),)]
     clock = Clock(seconds, dict(zip(names, error_mm, strict=True)))
     again = {name: cells[settings[0], name] for name in ("random", "rules", "ppo")}
     return transfer_report.task_results(task, settings, cells, clock, again, 500, 0)
@@ -235,6 +235,12 @@ def test_the_verdict_reports_survival_and_the_cost_of_accuracy() -> None:
     assert "Solved to 0.5 mm (rk4, dt 0.025 s; trained: 80 mm) it loses 0.2" in verdict
     assert "and is ahead of rules (0.8" in verdict
     assert verdict.endswith("(rk4, dt 0.025 s: 0.5 mm) costs 3.00 times the time; no other has less error.")
+
+
+def test_times_of_too_few_rounds_are_not_compared() -> None:
+    about = made_up(LUCK + 9.8, (80.0, 0.5), (1.0, 3.0), (1.0, 3.0))
+    assert "times the time" not in about["verdict"] + transfer_verdict.count_text({"herd": about})
+    assert "times the time" in made_up(LUCK + 9.8)["verdict"]
 
 
 def test_the_verdict_reports_failures_and_uncertainty() -> None:
@@ -324,7 +330,9 @@ def test_the_page_has_a_row_per_setting_of_note_and_says_why_it_is_there() -> No
     assert "(level)" in rows[3]
     assert page.index(transfer_verdict.count_text({"pursuit": task})) < page.index("Policies were trained")
     assert "Longer than the largest step that is stable in every contact: rk4, dt 0.025 s." in page
-    assert "Played a second time, the trained settings had the same returns to the last bit." in page
+    assert (
+        "Played a second time, the trained settings had the same returns to the last bit. Rounds of timing: 3." in page
+    )
 
 
 def test_the_picture_has_one_colour_scale_for_all_tasks() -> None:
