@@ -75,7 +75,7 @@ def _numbers(interval: Interval) -> list[float]:
 def markdown(contents: Sequence[Mapping[str, Any]], command: str, folder: str) -> str:
     """Return the page: per task the picture, the table, and a verdict per pair; folder: of the pictures."""
     worlds = ", ".join(dict.fromkeys(str(each["worlds"]) for each in contents))
-    parts = ["# Who gains among whom", f"Made by `{command}`, {worlds} worlds per cell.", NOTES]
+    parts = ["# What one agent gains among others", f"Made by `{command}`, {worlds} worlds per cell.", NOTES]
     for each in contents:
         names = each["players"]
         rows = [[f"`{one}`", *(_cell(each, one, others) for others in names)] for one in names]

@@ -1,4 +1,4 @@
-"""Conduct of players: whom they harm, how often they stand still, how much force they use, and how long they take."""
+"""Conduct of players: which learners they harm, how often they stand still, how much force and time they use."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ METRICS = ("harmed", "frozen", "effort", "time")
 class ConductWorld(World):
     """A World that also measures the conduct of its learners, as long as they are in the world.
 
-    * `harmed`: number of learners to whom the task's term of harm (`Task.harm`) was ever charged;
+    * `harmed`: number of learners that the task's term of harm (`Task.harm`) ever charged;
     * `frozen`: share of their time in which they stand still, slower than SLOW of their maximum speed;
     * `effort`: mean of (force / max_force)^2 over their time, as passed in their actions;
     * `time`: mean time until they leave or the episode ends, s.

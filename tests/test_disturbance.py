@@ -391,7 +391,8 @@ def test_a_comparison_is_played_under_its_disturbance_and_names_it() -> None:
     tasks, players, disturbance = [Pursuit(horizon=20)], [Player.of("rules")], Disturbance(noise=0.1, delay=2)
     results, episodes = compare(tasks, players, 4, resamples=10, disturbance=disturbance)
     plain, undisturbed = compare(tasks, players, 4, resamples=10)
-    assert (episodes["pursuit"]["rules"].returns != undisturbed["pursuit"]["rules"].returns).all()
+    with_noise, without = (each["pursuit"]["rules"] for each in (episodes, undisturbed))
+    assert all((one.returns != without[seed].returns).all() for seed, one in with_noise.items())
     assert results["disturbance"] == {"noise": 0.1, "delay": 2, "dropped": 0.0}
     assert report.conditions(results) == "4 worlds per task, noise 0.1, delay 2"
     assert report.conditions(plain) == "4 worlds per task"

@@ -274,7 +274,7 @@ def test_a_card_with_another_order_of_behaviours_is_refused(tmp_path: Path) -> N
     ("kind", "base", "text"),
     [
         ("residul", "rules", "action = 'residul': unknown, did you mean `residual`?"),
-        ("priorities", "rules", "'rules' of 'evade' has no behaviours in an order; tasks whose 'rules' has them: obst"),
+        ("priorities", "rules", "'rules' of 'evade' has no behaviours in an order; tasks whose 'rules' has them: floc"),
     ],
 )
 def test_kinds_that_rules_do_not_allow_are_refused(kind: str, base: str, text: str) -> None:
