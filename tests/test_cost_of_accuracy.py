@@ -227,7 +227,7 @@ def test_a_scene_is_measured_from_a_later_state_and_both_files_are_written(
     elsewhere: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs = ((("midpoint", "rk4"), (4, 8)), (("velocity_verlet",), (2, 4)))
-    monkeypatch.setattr(cost_of_accuracy, "CASES", (Case("boids.yaml", "A flock", "flock", 1.0, 0.2, runs, 4),))
+    monkeypatch.setattr(cost_of_accuracy, "CASES", (Case("boids.yaml", "A flock", "flock", 1.0, 0.2, runs, 64),))
     Path("mine.json").write_text(json.dumps(transfer()), encoding="utf-8")
     request = ["--transfer", "mine.json", "--repetitions", "1", "--processes", "1"]
     result = CliRunner().invoke(cost_of_accuracy.app, request)

@@ -91,10 +91,11 @@ def test_the_trained_setting_scores_as_in_the_comparison_bit_for_bit() -> None:
     run(*TINY, *TRAINED, "--players", "random,rules,ppo")
     task = TASKS["pursuit"]()
     field = play.players_in_order(["random", "rules", "ppo"])
-    report, _ = comparison.compare([task], field, worlds=3, resamples=100)
+    report, played = comparison.compare([task], field, worlds=3, resamples=100)
     plan = Plan(task, (Setting.of_training(task),), tuple(field), 3, 0, 2)
     for (_, name), cell in transfer_jobs.read_cells(plan, transfer_jobs.jobs_by_kernel([plan]), Store(JOBS)).items():
-        assert [cell.returns.tolist()] == report["tasks"]["pursuit"]["players"][name]["returns"]
+        (episodes,) = played["pursuit"][name].values()
+        assert cell.returns.tolist() == episodes.returns.tolist()
     about = results()["tasks"]["pursuit"]
     assert about["again"] == {"random": 0.0, "rules": 0.0, "ppo": 0.0}
     [setting] = about["settings"].values()
