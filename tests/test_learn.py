@@ -84,9 +84,13 @@ def test_a_learner_uses_what_it_shares_with_ppo_and_nothing_else() -> None:
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_every_config_can_be_trained_or_is_refused_in_one_line(algo: str, path: Path) -> None:
-    experiment = learn.load_experiment(path)
-    if algo == "bc" and experiment.ppo.draw:
-        with pytest.raises(ValueError, match=r"ppo\.draw: not with --algo bc"):
+    experiment, refused = learn.load_experiment(path), ""
+    if algo in ("bc", "recurrent_ppo") and experiment.ppo.action != "force":
+        refused = rf"ppo\.action = '{experiment.ppo.action}': must be force with --algo {algo}"
+    elif algo == "bc" and experiment.ppo.draw:
+        refused = r"ppo\.draw: not with --algo bc"
+    if refused:
+        with pytest.raises(ValueError, match=refused):
             effective(experiment, algo)
         return
     assert effective(experiment, algo, seconds=300).ppo.seconds == 300
