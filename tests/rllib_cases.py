@@ -112,7 +112,7 @@ def a_policy_trained_with_a_runner_plays_in_the_comparison() -> None:
     result = CliRunner().invoke(compare.app, options)
     assert result.exit_code == 0, result.output
     players = read("compared/results.json")["tasks"]["pursuit"]["players"]
-    assert players["p"]["ci_low"] > players["random"]["ci_high"], players
+    assert players["p"]["mean_low"] > players["random"]["mean_high"], players
     before = Path(out).read_bytes()
     assert command(config, "--out", out)[0] == 0
     assert Path(out).read_bytes() == before and read("p.json")["curve"] == card["curve"]
