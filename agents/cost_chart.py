@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from agents.report import Results
 from agents.transfer_verdict import SURVIVES
-from flockenv.core.atomic_files import replace_file
-from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK
+from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,9 +38,7 @@ RIGHT = 0.36
 
 def write_chart(path: str | Path, results: Results) -> None:
     """Write the picture as a PNG file, whole or not at all."""
-    figure = draw_chart(results)
-    with replace_file(path) as file:
-        figure.savefig(file, format="png", dpi=110, metadata={"Software": "flockenv"})
+    save_figure(path, draw_chart(results), 110)
 
 
 def draw_chart(results: Results) -> Figure:

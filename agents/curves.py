@@ -23,9 +23,9 @@ from agents.run import expected_bytes
 from agents.training_job import policy_of_bytes, training_job
 from flockenv.cli.jobs import EngineName, Fresh, ShardText, end_of_shard, shard_of
 from flockenv.cli.terminal import job_bar, report_errors, run_program
-from flockenv.core.atomic_files import replace_file, write_all_or_none
+from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.output_paths import check_room, valid_file, valid_path
-from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK
+from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK, save_figure
 from flockenv.jobs import Job, Store, Work, engine_of, run_jobs
 from flockenv.players.rules import load_tuned
 
@@ -110,8 +110,7 @@ def draw(path: Path, tasks: Mapping[str, Numbers], note: str = NOTE) -> None:
         _curves(axes, task, numbers)
     figure.suptitle("Learning, by the clock", x=0.01, ha="left", fontsize=14, fontweight="bold", color=INK)
     figure.supxlabel(note, x=0.01, ha="left", fontsize=8, color=FAINT)
-    with replace_file(path) as file:
-        figure.savefig(file, format="png", dpi=150, metadata={"Software": "flockenv"})
+    save_figure(path, figure, 150)
 
 
 def _curves(axes: Axes, task: str, numbers: Numbers) -> None:

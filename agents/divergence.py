@@ -12,8 +12,9 @@ from flockenv.tasks import Task
 
 if TYPE_CHECKING:
     from stable_baselines3 import PPO
+    from stable_baselines3.common.base_class import BaseAlgorithm
 
-__all__ = ["LearningDiverged", "check_answers", "check_model", "check_step"]
+__all__ = ["LearningDiverged", "check_answers", "check_model", "check_step", "diverged_weight"]
 
 StepResult = tuple[NDArray[Any], NDArray[Any], NDArray[Any], list[dict[str, Any]]]
 """Result of a VecEnv's step: observations, rewards, dones, infos."""
@@ -71,14 +72,19 @@ def _slot(task: Task, column: int) -> str:
     return f"number {column - at} of what the critic is shown besides"
 
 
+def diverged_weight(model: BaseAlgorithm) -> str | None:
+    """Return the name of the first weight of a model's networks that is not finite; None if all are."""
+    weights = model.policy.named_parameters()
+    return next((name for name, tensor in weights if not torch.isfinite(tensor).all()), None)
+
+
 def check_model(model: PPO) -> None:
     """Raise LearningDiverged if a weight of the network is not finite.
 
     The message names the first array of the last rollout that was not finite; if all were, the weight and the loss.
     """
-    weights = dict(model.policy.named_parameters())
-    bad = [name for name, tensor in weights.items() if not torch.isfinite(tensor).all()]
-    if not bad:
+    bad = diverged_weight(model)
+    if bad is None:
         return
     buffer = model.rollout_buffer
     for name in ("rewards", "values", "log_probs", "advantages", "returns"):
@@ -88,9 +94,7 @@ def check_model(model: PPO) -> None:
     losses = {k.removeprefix("train/"): v for k, v in model.logger.name_to_value.items() if k.startswith("train/")}
     lost = [f"; {name} was {value}" for name, value in losses.items() if not np.isfinite(value)]
     reach = f"the largest return of the last rollout was {np.abs(buffer.returns).max():.3g}"
-    raise LearningDiverged(
-        f"weights of the network, {bad[0]}, are not finite after an update{''.join(lost[:1])}; {reach}"
-    )
+    raise LearningDiverged(f"weights of the network, {bad}, are not finite after an update{''.join(lost[:1])}; {reach}")
 
 
 def check_answers(model: PPO) -> None:

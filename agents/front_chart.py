@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from flockenv.core.atomic_files import replace_file
-from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK
+from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK, save_figure
 
 __all__ = ["draw_front"]
 
@@ -47,5 +46,4 @@ def draw_front(path: Path, content: Mapping[str, Any]) -> None:
     axes.tick_params(colors=FAINT, labelcolor=INK)
     title = f"{content['task']}: harm against return (upper left is better)"
     figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold", color=INK)
-    with replace_file(path) as file:
-        figure.savefig(file, format="png", dpi=130, metadata={"Software": "flockenv"})
+    save_figure(path, figure, 130)

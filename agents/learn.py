@@ -30,7 +30,7 @@ from stable_baselines3.common.logger import Logger
 
 from agents import ppo
 from agents.dagger import teach
-from agents.divergence import LearningDiverged
+from agents.divergence import LearningDiverged, diverged_weight
 from agents.drawn import check_settings
 from agents.experiment import Experiment, load_experiment, one_line_errors, seeds_of
 from agents.learner_job import ALGORITHMS, check_memory, effective, learner_job, learner_recipe
@@ -271,9 +271,8 @@ def _clone(recorder: Recorder, experiment: Experiment) -> None:
 
 def check_weights(model: BaseAlgorithm) -> None:
     """Raise LearningDiverged if a weight of a network is not finite."""
-    for name, tensor in model.policy.named_parameters():
-        if not torch.isfinite(tensor).all():
-            raise LearningDiverged(f"weights of the network, {name}, are not finite after an update")
+    if (name := diverged_weight(model)) is not None:
+        raise LearningDiverged(f"weights of the network, {name}, are not finite after an update")
 
 
 @contextmanager

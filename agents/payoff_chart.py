@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from flockenv.core.atomic_files import replace_file
-from flockenv.evaluation.plots import FAINT, INK
+from flockenv.evaluation.plots import FAINT, INK, save_figure
 
 __all__ = ["draw_payoffs"]
 
@@ -36,8 +35,7 @@ def draw_payoffs(path: Path, content: Mapping[str, Any]) -> None:
     axes.spines[:].set_visible(False)
     title = f"{content['task']}: mean return of one agent, and its gain over playing as the others do"
     figure.suptitle(title, x=0.01, ha="left", fontsize=11, fontweight="bold", color=INK)
-    with replace_file(path) as file:
-        figure.savefig(file, format="png", dpi=130, metadata={"Software": "flockenv"})
+    save_figure(path, figure, 130)
 
 
 def _text(content: Mapping[str, Any], one: str, others: str) -> str:

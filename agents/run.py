@@ -17,7 +17,7 @@ from agents.drawn import drawn_settings
 from agents.experiment import Experiment
 from flockenv.core.errors import KeyPath, key_path, printable
 from flockenv.core.record import ResultRecord
-from flockenv.players import WEIGHTS
+from flockenv.players import weights_file
 from flockenv.players.hybrid import FORCE, Hybrid
 from flockenv.players.policy import MlpPolicy
 from flockenv.players.rules import as_dict, player
@@ -53,7 +53,7 @@ def recipe_of(experiment: Experiment) -> dict[str, Any]:
 
 def start_path(spec: str, task: Task) -> Path:
     """Return the file of the policy with which learning begins (`ppo.start`): "ppo" is the shipped one."""
-    return WEIGHTS / f"{task.name}.safetensors" if spec == "ppo" else Path(spec)
+    return weights_file(task.name) if spec == "ppo" else Path(spec)
 
 
 @dataclass

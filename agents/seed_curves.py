@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from agents.experiment import one_line_errors
 from flockenv.cli.terminal import run_program
-from flockenv.core.atomic_files import replace_file
 from flockenv.core.output_paths import valid_file
-from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK
+from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK, save_figure
 from flockenv.players import PUBLISHED, seeds_of_player, weights_file
 from flockenv.players.policy import read_card
 from flockenv.players.rules import load_tuned
@@ -87,8 +86,7 @@ def draw(path: Path, tasks: Mapping[str, Mapping[str, Sequence[Curve]]]) -> None
         "Mean return on tuning worlds. Line: median over seeds; band: lowest to highest. In brackets: number of seeds."
     )
     figure.supxlabel(note, x=0.01, ha="left", fontsize=9, color=FAINT)
-    with replace_file(path) as file:
-        figure.savefig(file, format="png", dpi=110, metadata={"Software": "flockenv"})
+    save_figure(path, figure, 110)
 
 
 def _draw_task(axes: Axes, task: str, players: Mapping[str, Sequence[Curve]], axis: str) -> None:
@@ -117,7 +115,7 @@ def _limits(players: Mapping[str, Sequence[Curve]]) -> tuple[float, float]:
 
 
 @app.command()
-def main(out: Annotated[str, typer.Option(help="picture")] = "docs/seed_curves.png") -> None:
+def main(out: Annotated[str, typer.Option(help="picture")] = "results/seed_curves.png") -> None:
     """Draw the learning curves of all seeds that are there."""
     with one_line_errors():
         path = valid_file(out, (".png",), force=True)

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 from agents.study import HOME
 from agents.study_results import ALONE, GROUPS, KINDS, LEVEL, SettingResults, TaskResults
-from flockenv.core.atomic_files import replace_file
-from flockenv.evaluation.plots import FAINT, INK
+from flockenv.evaluation.plots import FAINT, INK, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,7 +41,7 @@ def draw_map(path: Path, results: TaskResults) -> None:
     _legend(figure, results)
     title = f"{results.task}: which kind is ahead, by what difference in return, and success"
     figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold", color=INK)
-    _save(figure, path)
+    save_figure(path, figure, 130)
 
 
 def draw_summary(path: Path, results: Sequence[TaskResults], title: str) -> None:
@@ -72,7 +71,7 @@ def draw_summary(path: Path, results: Sequence[TaskResults], title: str) -> None
             )  # fmt: skip
     _legend(figure, *results)
     figure.suptitle(title, x=0.01, ha="left", fontsize=13, fontweight="bold", color=INK)
-    _save(figure, path)
+    save_figure(path, figure, 130)
 
 
 def _text(value: object) -> str:
@@ -126,8 +125,3 @@ def _blank_axes(figure: Figure, wide: float, high: int) -> Axes:
     axes.spines[:].set_visible(False)
     axes.tick_params(colors=FAINT)
     return axes
-
-
-def _save(figure: Figure, path: Path) -> None:
-    with replace_file(path) as file:
-        figure.savefig(file, format="png", dpi=130, metadata={"Software": "flockenv"})

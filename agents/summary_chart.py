@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flockenv.core.atomic_files import replace_file
-from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK
+from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -24,8 +23,7 @@ HEIGHT, WIDTH = 4.2, 9.0
 
 def write_summary(path: str | Path, results: Results) -> None:
     """Write the chart of a comparison as PNG; the file appears whole or not at all."""
-    with replace_file(path) as file:
-        draw_summary(results).savefig(file, format="png", dpi=130)
+    save_figure(path, draw_summary(results), 130)
 
 
 def draw_summary(results: Results) -> Figure:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from flockenv.evaluation import Interval
 
-__all__ = ["COLOURS", "FAINT", "GRID", "INK", "Column", "Row", "draw_chart", "write_chart"]
+__all__ = ["COLOURS", "FAINT", "GRID", "INK", "Column", "Row", "draw_chart", "save_figure", "write_chart"]
 
 INK, FAINT, GRID = "#22272e", "#6b7480", "#e4e7eb"
 COLOURS = ("#D55E00", "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9")
@@ -50,9 +50,13 @@ class Column:
 
 def write_chart(path: str | Path, columns: Sequence[Column], title: str, note: str = "") -> None:
     """Write the plot as a PNG file, atomically and without a display; the same numbers give the same bytes."""
-    figure = draw_chart(columns, title, note)
+    save_figure(path, draw_chart(columns, title, note), 150)
+
+
+def save_figure(path: str | Path, figure: Figure, dpi: int = 100) -> None:
+    """Write a figure as a PNG file, whole or not at all; the same numbers give the same bytes."""
     with replace_file(path) as file:
-        figure.savefig(file, format="png", dpi=150, metadata={"Software": "flockenv"})
+        figure.savefig(file, format="png", dpi=dpi, metadata={"Software": "flockenv"})
 
 
 def draw_chart(columns: Sequence[Column], title: str, note: str = "") -> Figure:

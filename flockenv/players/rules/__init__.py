@@ -3,7 +3,8 @@
 Each receives the learner's observation and nothing else, and its force has the same limits. Two kinds of names:
 
 * `rules`, and of some tasks `orca`, `heuristics`, `queueing`: other functions; all with the parameters that a search
-  found (`python -m agents.tune`), in ../tuned/TASK.json;
+  found (`python -m agents.tune`; evade's and path_follow's by another random search), in
+  ../tuned/TASK.json;
 * `textbook`, `orca_published`, `heuristics_published`, `queueing_published`: the same functions with published
   parameters, the defaults in the files; in evade, obstacles and path_follow, `textbook` is another function than
   `rules`.

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flockenv.core.atomic_files import replace_file
-from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK
+from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,11 +33,7 @@ LABEL = 0.035
 
 def write_precision(path: str | Path, reports: Sequence[Report]) -> None:
     """Write the picture as a PNG file, whole or not at all; the same numbers give the same bytes."""
-    figure = draw_precision(reports)
-    with replace_file(path) as file:
-        figure.savefig(
-            file, format="png", dpi=150 if len(reports) <= COLUMNS else 100, metadata={"Software": "flockenv"}
-        )
+    save_figure(path, draw_precision(reports), 150 if len(reports) <= COLUMNS else 100)
 
 
 def draw_precision(reports: Sequence[Report]) -> Figure:

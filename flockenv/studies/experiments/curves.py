@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flockenv.evaluation.plots import COLOURS, FAINT, INK
-from flockenv.studies.measures.plots import name_axes, new_figure, save
+from flockenv.evaluation.plots import COLOURS, FAINT, INK, save_figure
+from flockenv.studies.measures.plots import name_axes, new_figure
 
 if TYPE_CHECKING:
     from flockenv.studies.experiments import Experiment, Trial
@@ -36,4 +36,4 @@ def write_order(path: str | Path, experiment: Experiment, trials: Mapping[tuple[
     axes.legend(fontsize=8, frameon=False)
     axes.set_ylim(bottom=0)
     name_axes(axes, *experiment.curve)
-    save(figure, path)
+    save_figure(path, figure)

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flockenv.core.atomic_files import replace_file
-from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK
+from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,9 +25,7 @@ WIDE, GAP = 1.9, 0.35
 
 def write_trials(path: str | Path, experiment: Experiment, trials: Mapping[tuple[str, str], Trial]) -> None:
     """Write the picture as a PNG file, whole or not at all; the same trials give the same bytes."""
-    figure = draw_trials(experiment, trials)
-    with replace_file(path) as file:
-        figure.savefig(file, format="png", dpi=120, metadata={"Software": "flockenv"})
+    save_figure(path, draw_trials(experiment, trials), 120)
 
 
 def draw_trials(experiment: Experiment, trials: Mapping[tuple[str, str], Trial]) -> Figure:

@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.core.atomic_files import replace_file
-from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK
+from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK, save_figure
 from flockenv.studies.measures import JUELICH, Tail, survival, weidmann_flow, weidmann_speed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["name_axes", "new_figure", "save", "write_flow_density", "write_gaps", "write_lanes", "write_space_time"]
+__all__ = ["name_axes", "new_figure", "write_flow_density", "write_gaps", "write_lanes", "write_space_time"]
 
 Floats = NDArray[np.float64]
 
@@ -50,7 +49,7 @@ def write_flow_density(path: str | Path, density: Floats, speed: Floats, title: 
         axes.set_ylim(0, 1.15 * max(float(reference.max()), float(data.max(initial=0))))
         name_axes(axes, "density, 1/m²", label)
     figure.axes[0].legend(fontsize=7.5, frameon=False, loc="upper right")
-    save(figure, path)
+    save_figure(path, figure)
 
 
 def write_lanes(
@@ -93,7 +92,7 @@ def write_lanes(
     axes.set_aspect("equal")
     name_axes(axes, "x, m", "y, m")
     axes.grid(False)
-    save(figure, path)
+    save_figure(path, figure)
 
 
 def write_gaps(path: str | Path, gaps: Floats, fit: Tail, p: float, title: str) -> None:
@@ -119,7 +118,7 @@ def write_gaps(path: str | Path, gaps: Floats, fit: Tail, p: float, title: str) 
     axes.set_yscale("log")
     axes.set_ylim(0.5 / len(times), 1.3)
     name_axes(axes, "gap τ between two passages, s", "share of gaps ≥ τ")
-    save(figure, path)
+    save_figure(path, figure)
 
 
 def write_space_time(
@@ -137,7 +136,7 @@ def write_space_time(
         axes.axhline(where, color="white", lw=1.2, ls=(0, (4, 3)))
     name_axes(axes, "time, s", "along the way of walking, m")
     axes.grid(False)
-    save(figure, path)
+    save_figure(path, figure)
 
 
 def new_figure(wide: float, tall: float, title: str) -> Figure:
@@ -151,12 +150,6 @@ def new_figure(wide: float, tall: float, title: str) -> Figure:
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=11, fontweight="bold", color=INK, x=0.02, ha="left", parse_math=False)
     return figure
-
-
-def save(figure: Figure, path: str | Path) -> None:
-    """Write a figure as a PNG file, whole or not at all; the same numbers give the same bytes."""
-    with replace_file(path) as file:
-        figure.savefig(file, format="png", dpi=100, metadata={"Software": "flockenv"})
 
 
 def name_axes(axes: Axes, x: str, y: str) -> None:

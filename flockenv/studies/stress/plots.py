@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockenv.core.atomic_files import replace_file
-from flockenv.evaluation.plots import INK
+from flockenv.evaluation.plots import INK, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -23,9 +22,7 @@ FILL: dict[Verdict, str] = {
 
 def write_verdicts(path: str | Path, results: Results) -> None:
     """Write the picture as a PNG file, whole or not at all; the same findings give the same bytes."""
-    figure = draw_verdicts(results)
-    with replace_file(path) as file:
-        figure.savefig(file, format="png", dpi=120, metadata={"Software": "flockenv"})
+    save_figure(path, draw_verdicts(results), 120)
 
 
 def draw_verdicts(results: Results) -> Figure:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK
+from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK, save_figure
 from flockenv.studies.measures import weidmann_flow, weidmann_speed
-from flockenv.studies.measures.plots import name_axes, new_figure, save
+from flockenv.studies.measures.plots import name_axes, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -88,7 +88,7 @@ def _write_diagrams(path: Path, found: Sequence[Finding]) -> None:
     grid[0, 0].legend(fontsize=6.5, frameon=False, loc="upper right")
     for axes in grid[:, 1:].ravel():
         axes.set_ylabel("")
-    save(figure, path)
+    save_figure(path, figure)
 
 
 def _write_widths(path: Path, found: Sequence[Finding]) -> None:
@@ -119,7 +119,7 @@ def _write_widths(path: Path, found: Sequence[Finding]) -> None:
     name_axes(axes, "width, m", "flow, 1/s")
     axes.set_ylim(bottom=0)
     axes.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    save(figure, path)
+    save_figure(path, figure)
 
 
 def _write_lanes(path: Path, found: Sequence[Finding]) -> None:
@@ -127,7 +127,7 @@ def _write_lanes(path: Path, found: Sequence[Finding]) -> None:
     figure = new_figure(9.6, 1.05 * len(found) + 0.6, "48 + 48 people in a corridor without ends, after a minute")
     for finding, axes in zip(found, figure.subplots(len(found), 1, squeeze=False).ravel(), strict=True):
         _draw_lanes(axes, finding)
-    save(figure, path)
+    save_figure(path, figure)
 
 
 def _draw_lanes(axes: Axes, finding: Finding) -> None:
@@ -166,4 +166,4 @@ def _write_evacuation_times(path: Path, found: Sequence[Finding]) -> None:
     name_axes(axes, "desired speed, m/s", "until all are out, s")
     axes.set_ylim(bottom=0)
     axes.legend(fontsize=7.5, frameon=False)
-    save(figure, path)
+    save_figure(path, figure)
