@@ -109,7 +109,8 @@ def _limits(players: Mapping[str, Sequence[Curve]]) -> tuple[float, float]:
     """Return the lowest and highest value shown, the same over agent-steps and over seconds."""
     bands = [band(curves, "steps") for curves in players.values()]
     longest = max(places[-1] for places, _ in bands)
-    shown = np.concatenate([ends[:, places >= SHOWN_FROM * longest].ravel() for places, ends in bands])
+    late = [ends[:, places >= SHOWN_FROM * longest].ravel() for places, ends in bands]
+    shown = np.concatenate([*late, *(ends[:, -1] for _, ends in bands)])  # also the ends of short curves
     margin = 0.05 * float(np.ptp(shown)) or 0.5
     return float(shown.min()) - margin, float(shown.max()) + margin
 

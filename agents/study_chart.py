@@ -23,13 +23,20 @@ SHADES = {"rules": "#9cc7e8", "policy": "#f2b48c", "hybrid": "#8fd3bd", "planner
 MEANING = {"rules": "hand-written rules", "policy": "learned policy", "hybrid": "learned on top of rules",
            "planner": "planner", LEVEL: "level", ALONE: "only one kind can play"}  # fmt: skip
 
+ABREAST = 2
+"""Success rates in one line of a box."""
+
+LINE = 0.2
+"""Height of a further line, inches."""
+
 
 def draw_map(path: Path, results: TaskResults) -> None:
     """Write the map of a task as PNG: a row for each thing varied, a box for each value."""
     rows = [(HOME, [results.settings[0]])]
     rows += [(axis, [each for each in results.settings if each.axis == axis]) for axis in results.axes]
     wide = max(len(settings) for _, settings in rows)
-    figure = _figure(2.2 + 1.75 * wide, 1.3 + 0.82 * len(rows))
+    kinds = max(len(each.leaders) for each in results.settings)
+    figure = _figure(2.2 + 1.75 * wide, 1.3 + (0.82 + LINE * max(kinds - ABREAST, 0)) * len(rows))
     axes = _blank_axes(figure, wide, len(rows))
     for at, (axis, settings) in enumerate(rows):
         label = axis.replace("_", " ") + (f"\n(home {_text(results.home[axis])})" if axis in results.home else "")
@@ -91,9 +98,9 @@ def _lead(setting: SettingResults) -> str:
 
 
 def _rates(setting: SettingResults) -> str:
-    """Return the success rates of the players that stand for each kind."""
+    """Return the success rates of the players that stand for each kind, in one line if there is room."""
     rates = {name: setting.scores[name].success_rate.value for name in setting.leaders.values()}
-    return " / ".join(f"{name} {rate:.0%}" for name, rate in rates.items())
+    return (" / " if len(rates) <= ABREAST else "\n").join(f"{name} {rate:.0%}" for name, rate in rates.items())
 
 
 def _box(axes: Axes, x: float, y: float, winner: str) -> None:

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from agents.seed_curves import Curve, app, band, curves_of
+from agents.seed_curves import Curve, _limits, app, band, curves_of
 from flockenv import players
 from flockenv.players import WEIGHTS
 from flockenv.players.rules import TUNED
@@ -66,3 +66,10 @@ def test_the_curves_of_all_seeds_are_drawn(tmp_path: Path, monkeypatch: pytest.M
     for colour in ((0xD5, 0x5E, 0x00), (0x00, 0x72, 0xB2)):
         assert (colours == colour).all(axis=1).any(), "a line for each player"
     assert CliRunner().invoke(app, ["--out", "curves.jpg"]).exit_code == 2
+
+
+def test_the_end_of_a_short_curve_is_shown() -> None:
+    long: Curve = {"steps": [0, 10], "seconds": [0, 10], "mean": [0.0, 1.0]}
+    short: Curve = {"steps": [0, 1], "seconds": [0, 1], "mean": [0.0, 5.0]}
+    low, high = _limits({"ppo": [long], "rules": [short]})
+    assert low < 0.2 and high > 5.0
