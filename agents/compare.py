@@ -209,6 +209,12 @@ def main(
     noise: Annotated[float, typer.Option(help="Standard deviation of noise on what players observe, 0 to 1.")] = 0.0,
     delay: Annotated[int, typer.Option(help="Decisions by which actions are late, 0 to 20.")] = 0,
     dropped: Annotated[float, typer.Option(help="Probability that a neighbour is not detected, 0 to 1.")] = 0.0,
+    reach: Annotated[
+        float | None, typer.Option("--range", help="Metres beyond which other agents are not detected. [no limit]")
+    ] = None,
+    seen: Annotated[
+        int | None, typer.Option(help="Agents of a kind that are detected, the nearest. [all in slots]")
+    ] = None,
     engine: EngineName = "local",
     processes: Processes = None,
     fresh: Fresh = False,
@@ -229,7 +235,7 @@ def main(
         if not 2 <= count <= WORLDS_PER_SEED:
             raise ValueError(f"--worlds {count}: must be from 2 to {WORLDS_PER_SEED}")
         resamples = SMOKE_RESAMPLES if smoke else RESAMPLES
-        disturbance = Disturbance(noise=noise, delay=delay, dropped=dropped)
+        disturbance = Disturbance(noise=noise, delay=delay, dropped=dropped, range=reach, seen=seen)
         runner, part = engine_of(engine, processes, small=count < WORLDS), shard_of(shard)
         with job_bar() as progress:
             work = Work(Store(folder / JOBS), runner, fresh, progress, part)

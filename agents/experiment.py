@@ -86,7 +86,7 @@ class PpoSettings(Record):
     disturbance: Disturbance = Field(
         default_factory=Disturbance,
         exclude_if=lambda disturbance: not disturbance,  # so recipes without one stay equal to those from before
-        description="noise, delay and dropped of the worlds for learning and for the curve, not of imitation",
+        description="noise, delay, dropped, range, seen of the worlds for learning and for the curve, not of imitation",
     )
     draw: dict[str, tuple[bool | int | float | str, ...]] = Field(
         default_factory=dict,

@@ -62,7 +62,7 @@ class Study(Record):
     )
     everywhere: dict[str, tuple[Value, ...]] = Field(
         default_factory=dict,
-        description="values to play, by name, in every task that has it: noise, delay, dropped, dt",
+        description="values to play, by name, in every task that has it: noise, delay, dropped, range, seen, dt",
     )
     tasks: dict[str, dict[str, tuple[Value | dict[str, Value], ...]]] = Field(
         min_length=1, description="values to play in single tasks: arguments of the task, or names of several at once"

@@ -7,6 +7,7 @@ import functools
 import pickle
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -15,9 +16,10 @@ import pytest
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from scipy.special import ndtri
+from typer.testing import CliRunner
 
 from agents import report
-from agents.compare import compare
+from agents.compare import app, compare
 from agents.experiment import Experiment, PpoSettings
 from agents.play import Player, play_job
 from agents.run import recipe_of
@@ -32,7 +34,7 @@ from flockenv.players.rules import PLAYERS, player
 from flockenv.tasks import TASKS, Crossing, Herd, Layout, Obstacles, PathFollow, Pursuit, Slot, Task
 
 CROSSING = Crossing(agents=8)
-FULL = Disturbance(noise=0.3, delay=3, dropped=0.3)
+FULL = Disturbance(noise=0.3, delay=3, dropped=0.3, range=5, seen=4)
 EVERY = pytest.mark.parametrize(
     "name", [pytest.param(name, marks=() if name in ("pursuit", "herd") else pytest.mark.slow) for name in TASKS]
 )
@@ -158,6 +160,84 @@ def test_the_direction_of_the_nearest_sheep_is_dropped_with_it() -> None:
     assert (rows[~without][:, places["bearing"] : places["bearing"] + 2] != 0).any(axis=1).all()
 
 
+# --- agents that are out of range, or too many ---------------------------------------------------------------------
+
+
+def offsets_of(task: Task, rows: NDArray[Any], kind: str) -> NDArray[np.float64]:
+    """Return the offsets of the agents of a kind, (R, slots, 2), m."""
+    return np.asarray(getattr(task.layout.unpack(rows.reshape(-1, task.layout.size)), kind))
+
+
+LIMITED = ("bottleneck", "corridor", "crossing", "crowd_nav", "flock", "herd", "school")
+"""Tasks with slots for several agents of a kind; each has the kind of its first list of agents here."""
+KINDS = {"herd": "sheep", "school": "mates"}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in ("crossing", "herd") else pytest.mark.slow) for name in LIMITED]
+)
+def test_agents_out_of_range_and_all_but_the_nearest_have_empty_slots(name: str) -> None:
+    task, kind = TASKS[name](), KINDS.get(name, "neighbours")
+    plain = World(task, 30).reset(3).reshape(-1, task.layout.size)
+    offsets, entities = offsets_of(task, plain, kind), task.layout.entities
+    distance, there = np.hypot(*np.moveaxis(offsets, -1, 0)), (offsets != 0).any(axis=-1)
+    reach = float(np.median(distance[there]))
+    first = entities[task.layout.places[kind]]
+    place = np.arange(offsets.shape[1])
+    many = np.broadcast_to(place >= 2, there.shape)
+    for limit, hidden in (({"range": reach}, distance > reach), ({"seen": 2}, many)):
+        rows = make_world(task, 30, disturbance=Disturbance(**limit)).reset(3).reshape(plain.shape)
+        assert (hidden & there).any() and (~hidden & there).any()
+        for k in place:
+            columns = entities == first + k
+            assert (rows[hidden[:, k]][:, columns] == 0).all()
+            np.testing.assert_array_equal(rows[~hidden[:, k]][:, columns], plain[~hidden[:, k]][:, columns])
+        of_agents = np.isin(entities, np.flatnonzero(task.layout.agent_slots[0] >= 0))
+        np.testing.assert_array_equal(rows[:, ~of_agents], plain[:, ~of_agents])  # food and obstacles too
+
+
+def test_range_is_that_of_the_true_distance_and_hides_no_more_with_noise() -> None:
+    near, both = Disturbance(range=4.6), Disturbance(range=4.6, noise=0.2)
+    plain, noisy = (make_world(CROSSING, 40, disturbance=each).reset(0) for each in (near, both))
+    assert 0 < np.count_nonzero(plain[..., -6:]) < plain[..., -6:].size
+    np.testing.assert_array_equal(plain != 0, noisy != 0)
+
+
+def test_a_sensor_has_the_rules_act_on_fewer_agents() -> None:
+    rows = _observed(CROSSING)
+    far = np.where(np.isin(CROSSING.layout.entities, [2, 3, 4, 5]), 0.0, rows)
+    assert (player(CROSSING).predict(far)[0] != player(CROSSING).predict(rows)[0]).any()
+    fields = Disturbance(seen=2), Disturbance()
+    returns = [
+        rollout(CROSSING, player(CROSSING), 4, 0, make_world=functools.partial(make_world, disturbance=each)).returns
+        for each in fields
+    ]
+    assert (returns[0] != returns[1]).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "limit", "message"),
+    [
+        ("crossing", {"range": 6}, "range = 6: must be < 6 for crossing, which shows other agents up to 6 m away"),
+        ("crossing", {"seen": 6}, "seen = 6: must be < 6 for crossing, which has slots for 6 agents of a kind"),
+        ("school", {"seen": 3}, "seen = 3: must be < 3 for school, which has slots for 3 agents of a kind"),
+        ("pursuit", {"seen": 1}, "seen = 1: must be None for pursuit, which has slots for 1 agent of a kind"),
+        ("evade", {"range": 3}, "range = 3: must be None for evade, which has no slots of other agents to empty"),
+        ("obstacles", {"seen": 2}, "seen = 2: must be None for obstacles, which has no slots of other agents to empty"),
+        ("path_follow", {"range": 1}, "range = 1: must be None for path_follow, which has no slots of other agents"),
+    ],
+)
+def test_a_limit_that_hides_no_agent_is_refused(name: str, limit: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match="must be") as caught:
+        make_world(TASKS[name](), disturbance=Disturbance(**limit))
+    assert str(caught.value).startswith(message) and "\n" not in str(caught.value)
+
+
+def test_records_without_a_limit_are_those_from_before_there_were_any() -> None:
+    assert Disturbance(noise=0.1).model_dump() == {"noise": 0.1, "delay": 0, "dropped": 0.0}
+    assert Disturbance(range=2, seen=1).model_dump(exclude_defaults=True) == {"range": 2, "seen": 1}
+
+
 # --- late actions -----------------------------------------------------------------------------------------------------
 
 
@@ -187,7 +267,7 @@ def test_a_reset_world_forgets_its_pending_actions_and_others_keep_theirs() -> N
 
 
 def test_an_invalid_action_is_refused_at_once_and_changes_nothing() -> None:
-    world = make_world(Pursuit(), 2, disturbance=FULL)
+    world = make_world(Pursuit(), 2, disturbance=Disturbance(noise=0.3, delay=3, dropped=0.3, range=5))
     with pytest.raises(RuntimeError, match="step before the first reset"):
         world.step(np.zeros((2, 1, 2)))
     world.reset(0)
@@ -361,6 +441,8 @@ def test_autoreset_begins_with_no_pending_actions_and_returns_the_last_observati
         ({"noise": 2}, "Disturbance: noise = 2: must be a number >= 0 and <= 1"),
         ({"delay": 1.5}, "Disturbance: delay = 1.5: must be an integer >= 0 and <= 20"),
         ({"dropped": -0.1}, "Disturbance: dropped = -0.1: must be a number >= 0 and <= 1"),
+        ({"range": 0}, "Disturbance: range = 0: must be a number > 0"),
+        ({"seen": 0}, "Disturbance: seen = 0: must be an integer >= 1"),
         ({"nois": 0.1}, "unexpected keyword argument 'nois', did you mean `noise`?"),
     ],
 )
@@ -385,6 +467,14 @@ def test_a_disturbance_is_part_of_a_job_s_key_and_none_leaves_it_as_it_was() -> 
     assert "disturbance" not in jobs[0].about
     with pytest.raises(ValueError, match=r"dropped = 0\.1: must be 0 for path_follow"):
         play_job("compare", PathFollow(), player, 2, 0, disturbance=Disturbance(dropped=0.1))
+
+
+def test_a_comparison_refuses_a_limit_that_hides_no_agent_before_it_plays(tmp_path: Path) -> None:
+    options = ["--tasks", "crossing", "--players", "random", "--worlds", "2", "--out", str(tmp_path / "out")]
+    for limit, text in ((["--range", "6"], "range = 6: must be < 6"), (["--seen", "7"], "seen = 7: must be < 6")):
+        run = CliRunner().invoke(app, [*options, *limit])
+        assert run.exit_code == 2 and text in run.output and len(run.output.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_comparison_is_played_under_its_disturbance_and_names_it() -> None:

@@ -164,17 +164,18 @@ def test_many_learners_get_the_same_numbers_in_every_face_for_several():
     assert through_turns("flockenv/Flock-v1", parameters, actions) == expected
 
 
-DISTURBED = {"noise": 0.2, "delay": 2, "dropped": 0.3}
+DISTURBED = {"noise": 0.2, "delay": 2, "dropped": 0.3, "range": 5.0}
 
 
 def test_a_disturbance_has_the_same_numbers_in_every_face():
-    task, parameters, disturbance = Flock(agents=7, learners=5), {"agents": 7, "learners": 5}, Disturbance(**DISTURBED)
+    parameters, disturbed = {"agents": 7, "learners": 5}, {**DISTURBED, "seen": 3}
+    task, disturbance = Flock(**parameters), Disturbance(**disturbed)
     actions = sequence(task)
     expected = through_world(task, actions, disturbance)
     assert expected != through_world(task, actions)
     assert through_sb3(task, actions, disturbance) == expected
     for through in (through_vector, through_parallel, through_turns):
-        assert through("flockenv/Flock-v1", {**parameters, **DISTURBED}, actions) == expected
+        assert through("flockenv/Flock-v1", {**parameters, **disturbed}, actions) == expected
 
 
 def test_a_disturbance_has_the_same_numbers_in_every_face_for_one_learner():

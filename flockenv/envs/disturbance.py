@@ -1,4 +1,4 @@
-"""Disturbances between World and policy: sensor noise, late actions, entities that are not detected.
+"""Disturbances between World and policy: sensor noise, late actions, entities that are not detected or out of range.
 
 The state, rewards, metrics and pictures are those of the undisturbed world; only what a policy observes, and when its
 actions take effect, differ. Each environment API makes its world here, so that a disturbance has the same numbers
@@ -11,6 +11,7 @@ number of threads, and a disturbance draws none of the numbers of the simulation
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, Final, Literal
 
@@ -52,15 +53,40 @@ class Disturbance(Record):
         description="probability that a learner does not detect an agent or obstacle in a decision: all numbers of its "
         "slot are 0, as of an empty slot",
     )
+    range: float | None = Field(
+        default=None,
+        gt=0,
+        exclude_if=lambda value: value is None,  # so that what was stored before this field stays equal
+        description="m, distance beyond which other agents are not detected; their slots are 0, as empty ones",
+    )
+    seen: int | None = Field(
+        default=None,
+        ge=1,
+        exclude_if=lambda value: value is None,
+        description="number of agents of a kind that are detected, the nearest; the slots of the others are 0",
+    )
 
     def __bool__(self) -> bool:
         """Return True unless it is none."""
         return self != _NONE
 
     def check(self, task: Task) -> None:
-        """Raise ValueError if entities are to be dropped, and the task observes none with a code for absence."""
+        """Raise ValueError, in one line, for a value that needs slots which the task has not, or that hides nothing."""
         if self.dropped > 0 and (task.layout.entities < 0).all():
             raise ValueError(f"dropped = {self.dropped:g}: must be 0 for {task.name}, which has no slots to empty")
+        columns, scales, places = task.layout.agent_slots
+        farthest, most = (float(limit[columns >= 0].max(initial=0)) for limit in (scales, places + 1))
+        _check_limit(task, "range", self.range, farthest, f"shows other agents up to {farthest:g} m away")
+        _check_limit(task, "seen", self.seen, most, f"has slots for {most:g} agent{'s' * (most > 1)} of a kind")
+
+
+def _check_limit(task: Task, name: str, value: float | None, end: float, reason: str) -> None:
+    """Raise ValueError unless a limit is none, or below `end`, as it hides no agent otherwise; end = 0: no slots."""
+    if value is None or value < end:
+        return
+    none = end == 0 or (name == "seen" and end == 1)
+    because = reason if end else "has no slots of other agents to empty"
+    raise ValueError(f"{name} = {value:g}: must be {'None' if none else f'< {end:g}'} for {task.name}, which {because}")
 
 
 _NONE = Disturbance()
@@ -75,15 +101,31 @@ def make_world(task: Task, worlds: int = 1, time_limit: int | None = None, distu
 
 
 @kernel
+def _hide(entities: Any, agents: Any, reach: float, seen: int, row: Any) -> None:
+    """Set the numbers of agents in a row, (O,), to 0 that are beyond `reach` m, or not among the nearest `seen`."""
+    columns, scales, places = agents
+    for e in range(columns.shape[0]):
+        if columns[e] < 0:
+            continue
+        x, y = np.float64(row[columns[e]]) * scales[e], np.float64(row[columns[e] + 1]) * scales[e]
+        if places[e] >= seen or x * x + y * y > reach * reach:
+            for k in range(row.shape[0]):
+                if entities[k] == e:
+                    row[k] = 0.0
+
+
+@kernel
 def _disturb(
-    keys: Any, steps: Any, mask: Any, low: Any, entities: Any, noise: float, dropped: float, rows: Any
-) -> None:
+    keys: Any, steps: Any, mask: Any, low: Any, entities: Any, agents: Any, noise: float, dropped: float, reach: float,
+    seen: int, rows: Any,
+) -> None:  # fmt: skip
     """Disturb the observations of the worlds in the mask in place; rows (B, L, O), the others as in DisturbedWorld."""
     for b in range(rows.shape[0]):
         if not mask[b]:
             continue
         key = mix(keys[b], _FAMILY)
         for i in range(rows.shape[1]):
+            _hide(entities, agents, reach, seen, rows[b, i])
             for k in range(rows.shape[2]):
                 x = np.float64(rows[b, i, k])
                 if x == 0.0:
@@ -114,7 +156,9 @@ class DisturbedWorld(World):
         super()._compile_and_allocate()
         self._rows, layout = np.arange(self.worlds), self.task.layout
         self._entry = self._disturb = entry(_disturb)
-        self._bounds = layout.low, layout.entities, self.disturbance.noise, self.disturbance.dropped
+        d = self.disturbance
+        reach, seen = math.inf if d.range is None else d.range, layout.size if d.seen is None else d.seen
+        self._bounds = layout.low, layout.entities, layout.agent_slots, d.noise, d.dropped, reach, seen
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes that `_compile_and_allocate` cannot make again."""
@@ -148,7 +192,7 @@ class DisturbedWorld(World):
 
     def _disturb_rows(self, rows: Rows, mask: NDArray[np.bool_]) -> None:
         """Disturb the observations of the worlds in the mask, (B,), in place; again, they would be another result."""
-        if self.disturbance.noise or self.disturbance.dropped:
+        if self.disturbance != Disturbance(delay=self.disturbance.delay):
             self._disturb(self.state.key, self.steps, mask, *self._bounds, rows)
             if self._disturb is self._entry:
                 self._disturb = without_dispatch(self._entry)  # argument types do not change after this call

@@ -11,6 +11,7 @@ from flockenv.envs.common import reward_keys
 from flockenv.envs.disturbance import Disturbance
 from flockenv.envs.table import EnvInfo
 from flockenv.tasks import Layout, Task
+from flockenv.tasks.layout import THINGS
 
 __all__ = ["page"]
 
@@ -111,10 +112,12 @@ def _arguments(task: Task) -> str:
 
 def _disturbs(task: Task, name: str, meaning: str) -> str:
     """Return the meaning of a field of Disturbance, with the entities that this task observes in slots."""
-    if name != "dropped":
+    if name not in ("dropped", "range", "seen"):
         return meaning
     kinds = dict.fromkeys(slot.entity for slot in task.layout.slots if slot.entity and slot.size)
-    return f"{meaning}; here: {', '.join(kinds) or 'none, so that it must be 0'}"
+    if name == "dropped":
+        return f"{meaning}; here: {', '.join(kinds) or 'none, so that it must be 0'}"
+    return f"{meaning}; here: {', '.join(k for k in kinds if k not in THINGS) or 'none, so that it must be None'}"
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -53,7 +53,7 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
     Args:
         max_cycles: steps after which the world is truncated (default: the task's horizon).
         render_mode: "rgb_array", "human" or None.
-        parameters: those of the task, and of the disturbance: noise, delay, dropped (see Disturbance).
+        parameters: those of the task, and of the disturbance: noise, delay, dropped, range, seen (see Disturbance).
     """
 
     info: ClassVar[EnvInfo]

@@ -64,7 +64,7 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         render_mode: "rgb_array" or None.
         infos: "steps" reports every row after every step, as single environments do; "ends" reports only the
             metrics of episodes that end and the seeds of episodes that begin: faster with many rows.
-        parameters: those of the task, and of the disturbance: noise, delay, dropped (see Disturbance).
+        parameters: those of the task, and of the disturbance: noise, delay, dropped, range, seen (see Disturbance).
     """
 
     info: ClassVar[EnvInfo]

@@ -13,7 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Layout", "Slot", "slots_of"]
+__all__ = ["THINGS", "Layout", "Slot", "slots_of"]
+
+THINGS = ("food", "obstacles")
+"""Kinds of entities that are not agents."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,22 @@ class Layout:
                 counts[slot.entity] = max(counts.get(slot.entity, 0), slot.shape[0])
         first = dict(zip(counts, itertools.accumulate(counts.values(), initial=0), strict=False))
         return np.concatenate([_entities_of(slot, first.get(slot.entity, -1)) for slot in self.slots])
+
+    @functools.cached_property
+    def agent_slots(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
+        """Of each entity: the column of its offset in a row (-1: no agent), the scale in m, its place in the list.
+
+        All are (entities,); place 0 is the nearest. The offset is the first vector in m of that kind.
+        """
+        count = int(self.entities.max(initial=-1)) + 1
+        columns, scales, places = np.full(count, -1), np.zeros(count), np.zeros(count, np.int64)
+        for slot in self.slots:
+            if slot.size and slot.entity not in ("", *THINGS) and slot.unit == "m" and slot.shape[1:] == (2,):
+                begin, rows = self.places[slot.name], np.arange(slot.shape[0])
+                entity = self.entities[begin] + rows
+                if columns[entity[0]] < 0:
+                    columns[entity], scales[entity], places[entity] = begin + 2 * rows, slot.scale, rows
+        return columns, scales, places
 
     def unpack(self, rows: ArrayLike) -> SimpleNamespace:
         """Return the quantities of rows (..., size) by name, in SI units: arrays (..., *shape), float64."""
