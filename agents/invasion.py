@@ -1,4 +1,4 @@
-"""One agent of each world plays one player, and all others another: the worlds, the jobs, and the payoffs.
+"""One agent of each world, or a share, plays one player, and all others another: worlds, jobs, and payoffs.
 
 If a policy scores best among agents without it, and all score worse when all have it, selfish learners leave the
 better policy: a prisoner's dilemma (evolutionary stability: Maynard Smith and Price 1973, Nature 246, 15).
@@ -17,49 +17,61 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.play import Player, Worlds, episodes_of_bytes, play_job, player_digest
+from flockenv.envs.disturbance import Disturbance, make_world
 from flockenv.envs.world import Step, World
 from flockenv.evaluation import Episodes, Interval, bootstrap, compare
 from flockenv.jobs import Job, Store, Work, run_jobs
 from flockenv.jobs.local_engine import LocalEngine
 from flockenv.model.snapshot import Snapshot
 from flockenv.players.policy import Policy
-from flockenv.tasks import Task
+from flockenv.tasks import Bottleneck, Crossing, School, Task
 
-__all__ = ["Among", "Payoffs", "invade", "jobs_of"]
+__all__ = ["Among", "Payoffs", "invade", "jobs_of", "own_success", "worlds_among"]
 
 
 class Among:
-    """Worlds in which the caller acts for one agent of each, (B, 1, O); all other agents play `others`.
+    """Worlds in which the caller acts for E agents of each, (B, E, O); all other agents play `others`.
 
-    In world k that agent is learner k % L, so every learner counts equally if L divides B, otherwise nearly. Its world
-    ends when it is out.
+    With E = 1, in world k that agent is learner k % L, so every learner counts equally if L divides B, otherwise
+    nearly; more are spread evenly over the learners, from that one on. A world ends when all E are out. Success is that
+    of the E agents, see `own_success`, or that of the world, if the task defines it for all agents together.
     """
 
-    def __init__(self, task: Task, worlds: int, time_limit: int, others: Policy) -> None:
-        self._world, self._others = World(task, worlds, time_limit), others
-        seats = np.arange(worlds) % task.learners
-        self._mine = np.arange(task.learners) == seats[:, None]  # (B, L)
+    def __init__(
+        self, task: Task, worlds: int, time_limit: int, others: Policy, egos: int = 1,
+        disturbance: Disturbance | None = None,
+    ) -> None:  # fmt: skip
+        self._world, self._others = make_world(task, worlds, time_limit, disturbance or Disturbance()), others
+        seats = (np.arange(worlds)[:, None] + np.arange(egos) * task.learners // egos) % task.learners
+        self._mine = (np.arange(task.learners) == seats[:, :, None]).any(axis=1)  # (B, L)
         self._state: Any = None
         self._begins = True
 
     def reset(self, seeds: int) -> NDArray[np.float32]:
-        """Begin episodes; return the observations of the one agent per world."""
+        """Begin episodes; return the observations of the E agents per world."""
         self._seen, self._begins = self._world.reset(seeds), True
-        mine: NDArray[np.float32] = self._seen[self._mine][:, None]
-        return mine
+        return self._of_mine(self._seen)
 
     def step(self, actions: NDArray[Any]) -> Step:
-        """Step all agents, the one agent by `actions` (B, 1, A); return its observation and reward."""
+        """Step all agents, the E agents by `actions` (B, E, A); return their observations and rewards."""
         rows = self._seen[~self._mine]
         theirs, self._state = self._others.predict(rows, self._state, np.full(len(rows), self._begins), True)
         if np.shape(theirs) != (len(rows), actions.shape[-1]):
             raise ValueError(f"others' actions have shape {np.shape(theirs)}, must be {(len(rows), actions.shape[-1])}")
         joint = np.empty((*self._mine.shape, actions.shape[-1]))
-        joint[self._mine], joint[~self._mine] = actions[:, 0], theirs
+        joint[self._mine], joint[~self._mine] = actions.reshape(-1, actions.shape[-1]), theirs
         step, self._begins = self._world.step(joint), False
         self._seen = step.observation
         names = ("observation", "reward", "terms", "terminated", "alive")
-        return step._replace(**{name: getattr(step, name)[self._mine][:, None] for name in names})
+        mine = {name: self._of_mine(getattr(step, name)) for name in names}
+        own = own_success(self._world, step)
+        success = step.success if own is None else np.asarray(self._of_mine(own).all(axis=1))
+        return step._replace(success=success, **mine)
+
+    def _of_mine(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return the values (B, L, ...) of the E agents, (B, E, ...)."""
+        mine: NDArray[Any] = values[self._mine].reshape(len(values), -1, *values.shape[2:])
+        return mine
 
     def measure(self) -> Mapping[str, NDArray[np.float64]]:
         """Return the metrics of whole worlds."""
@@ -68,6 +80,20 @@ class Among:
     def snapshot(self, world: int = 0) -> Snapshot:
         """Return one world at this instant, for pictures."""
         return self._world.snapshot(world)
+
+
+def own_success(world: World, step: Step) -> NDArray[np.bool_] | None:
+    """Return whether each learner, (B, L), does by itself what all must do for success; None if that is of all at once.
+
+    In Crossing it is at its goal; in Bottleneck it is out and was never hurt; in School it lives.
+    """
+    task, n = world.task, world.learners
+    if isinstance(task, Crossing):
+        to_goal = world.memory[:, :2, :n].transpose(0, 2, 1) - world.state.pos[:, :n]
+        return np.asarray(np.linalg.norm(to_goal, axis=2) <= task.goal_radius)
+    if isinstance(task, Bottleneck):
+        return np.asarray((world.memory[:, 2, :n] > 0.0) & (world.memory[:, 1, :n] <= task.limit))
+    return step.alive if isinstance(task, School) else None
 
 
 @dataclass(frozen=True)
@@ -124,23 +150,38 @@ def jobs_of(
         raise ValueError(f"task {task.name!r}: each world has a single learner; this command needs at least two")
     found = {}
     for others in players:
-        digest = player_digest(others, task, seed)
-        make = functools.partial(_among, others=others, seed=seed, trust_pickle=trust_pickle, digest=digest)
+        within = worlds_among(task, others, seed, trust_pickle)
         for one in players:
             found[one.name, others.name] = play_job(
-                f"best_response/among-{others.name}", task, one, worlds, seed, None, trust_pickle,
-                within=Worlds(make, {"others": digest}),
-            )  # fmt: skip
+                f"best_response/among-{others.name}", task, one, worlds, seed, None, trust_pickle, within=within
+            )
     return found
 
 
+def worlds_among(
+    task: Task, others: Player, seed: int, trust_pickle: bool = False, egos: int = 1,
+    disturbance: Disturbance | None = None,
+) -> Worlds:  # fmt: skip
+    """Return the worlds of a job in which `egos` agents of each play the job's player, and all others `others`.
+
+    Raises:
+        ValueError: one line: the others' player cannot be loaded.
+    """
+    digest = player_digest(others, task, seed)
+    make = functools.partial(
+        _among, others=others, seed=seed, trust_pickle=trust_pickle, digest=digest, egos=egos, disturbance=disturbance
+    )
+    return Worlds(make, {"others": digest, **({"egos": egos} if egos > 1 else {})})
+
+
 def _among(
-    task: Task, worlds: int, time_limit: int, others: Player, seed: int, trust_pickle: bool, digest: str
-) -> Among:
+    task: Task, worlds: int, time_limit: int, others: Player, seed: int, trust_pickle: bool, digest: str, egos: int,
+    disturbance: Disturbance | None,
+) -> Among:  # fmt: skip
     """Return worlds whose other agents play `others`, if it has this digest; ValueError if not."""
     if player_digest(others, task, seed) != digest:
         raise ValueError(f"player {others.spec!r} has changed since the command began, or differs on this machine")
-    return Among(task, worlds, time_limit, others.policy(task, seed, trust_pickle))
+    return Among(task, worlds, time_limit, others.policy(task, seed, trust_pickle), egos, disturbance)
 
 
 def invade(

@@ -10,13 +10,18 @@
         agents: [4, 8, 16]         # an argument of the task
         room:                      # or several at once, under a name of their own
           - {agents: 48, circle: 12}
+        walkers: {agents: [4, 8], circle: [6, 9]}   # or all combinations: rows "walkers 4", "walkers 8" of the map
+        partners: [same, rules, {partners: rules, share: 0.5}]   # what all agents but one, or but a share, play
 
-Every value changes one thing: all else is as in configs/training/TASK.yaml, which is the setting called home.
+Every value changes one thing: all else is as in configs/training/TASK.yaml, which is the setting called home. With
+`partners`, one agent of each world plays the player that is evaluated, and all others the player named there, or the
+same one; return and success are those of that one agent (agents/invasion.py).
 """
 
 from __future__ import annotations
 
 import glob
+import itertools
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -36,7 +41,9 @@ from flockenv.evaluation import WORLDS_PER_SEED
 from flockenv.players import known_name, other_tasks
 from flockenv.tasks import TASKS, Task
 
-__all__ = ["HOME", "Contender", "Setting", "Study", "contenders_of", "setting_name", "settings_of"]
+__all__ = [
+    "HOME", "PARTNERS", "Contender", "Partners", "Setting", "Study", "contenders_of", "setting_name", "settings_of",
+]  # fmt: skip
 
 HOME = "home"
 """The setting of a task that its players were made for."""
@@ -44,7 +51,12 @@ HOME = "home"
 TASK_PLACE = "{task}"
 """Stands for the task's name in the files of a player."""
 
+PARTNERS, SHARE, SAME = "partners", "share", "same"
+"""Axis of the player of all other agents; share of the agents that are evaluated; the value for the same player."""
+
 Value = bool | int | float | str | None
+Values = tuple[Value | dict[str, Value], ...] | dict[str, tuple[Value, ...]]
+"""Values of an axis: one after another, or (by name) all combinations."""
 
 
 class Study(Record):
@@ -62,10 +74,13 @@ class Study(Record):
     )
     everywhere: dict[str, tuple[Value, ...]] = Field(
         default_factory=dict,
-        description="values to play, by name, in every task that has it: noise, delay, dropped, range, seen, dt",
+        description="values to play, by name, in every task that has it: noise, delay, dropped, range, seen, dt, "
+        "partners",
     )
-    tasks: dict[str, dict[str, tuple[Value | dict[str, Value], ...]]] = Field(
-        min_length=1, description="values to play in single tasks: arguments of the task, or names of several at once"
+    tasks: dict[str, dict[str, Values]] = Field(
+        min_length=1,
+        description="values to play in single tasks: arguments of the task, or names of several at once; a mapping of "
+        "lists: all combinations",
     )
 
     @model_validator(mode="after")
@@ -88,10 +103,18 @@ class Study(Record):
             if axis in Disturbance.model_fields:
                 for value in values:
                     Disturbance(**_changes(axis, value))
-            elif axis not in known:
-                allowed = [*Disturbance.model_fields, *sorted(known)]
+            elif axis not in known and axis != PARTNERS:
+                allowed = [*Disturbance.model_fields, PARTNERS, *sorted(known)]
                 raise ValueError(f"{key_path(('everywhere', axis))}: unknown{nearest(axis, allowed)}")
         return self
+
+
+@dataclass(frozen=True)
+class Partners:
+    """What the agents that are not evaluated play: a player, None for the same one; number of agents evaluated."""
+
+    player: Player | None
+    egos: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +125,7 @@ class Setting:
     value: str
     task: Task
     disturbance: Disturbance
+    partners: Partners | None = None  # None: all learners are evaluated
 
     @property
     def name(self) -> str:
@@ -132,43 +156,90 @@ def settings_of(study: Study, name: str, changes: Mapping[str, Any] | None = Non
             Values under `everywhere` that it does not accept, and unstable time steps, are left out.
     """
     always = {**experiment_of(name).arguments, **(changes or {})}
-    found = [_setting(name, HOME, "", always, {})]
+    home = _setting(study, name, HOME, "", always, {})
+    found = [home]
     for axis, values in study.tasks[name].items():
-        found += [_setting(name, axis, _text(value), always, _changes(axis, value)) for value in values]
+        settings = [_setting(study, name, row, text, always, each) for row, text, each in _values_of(axis, values)]
+        found += [each for each in settings if isinstance(values, dict) or not _is_same(each, home)]
     for axis, values in study.everywhere.items():
         for value in values:
-            if axis not in TASKS[name].model_fields and axis not in Disturbance.model_fields:
+            if axis not in (*TASKS[name].model_fields, *Disturbance.model_fields, PARTNERS):
                 continue
             with suppress(_DoesNotApply, UnstableStepWarning), warnings.catch_warnings():
                 warnings.simplefilter("error", UnstableStepWarning)
-                found.append(_setting(name, axis, _text(value), always, _changes(axis, value)))
-    home = found[0]
-    return [home, *(s for s in found[1:] if (s.task, s.disturbance) != (home.task, home.disturbance))]
+                setting = _setting(study, name, axis, _text(value), always, _changes(axis, value))
+                found += [] if _is_same(setting, home) else [setting]
+    return found
+
+
+def _is_same(a: Setting, b: Setting) -> bool:
+    return (a.task, a.disturbance, a.partners) == (b.task, b.disturbance, b.partners)
 
 
 class _DoesNotApply(ValueError):  # noqa: N818  # no error where a value is meant for all tasks that accept it
     """A task does not accept a value."""
 
 
+def _values_of(axis: str, values: Values) -> Iterator[tuple[str, str, dict[str, Value]]]:
+    """Yield each value of an axis: the row of the map that it is in, its text, and what it changes."""
+    if not isinstance(values, dict):
+        for value in values:
+            yield axis, _text(value), _changes(axis, value)
+        return
+    first, *others = values
+    for combination in itertools.product(*values.values()):
+        changes = dict(zip(values, combination, strict=True))
+        yield f"{axis} {_text(changes[first])}", _text({key: changes[key] for key in others}), changes
+
+
 def _changes(axis: str, value: Value | dict[str, Value]) -> dict[str, Value]:
     return value if isinstance(value, dict) else {axis: value}
 
 
-def _setting(name: str, axis: str, value: str, always: Mapping[str, Any], changes: Mapping[str, Any]) -> Setting:
+def _setting(
+    study: Study, name: str, axis: str, value: str, always: Mapping[str, Any], changes: Mapping[str, Any]
+) -> Setting:
     arguments = {**always, **changes}
     disturbed = {key: arguments.pop(key) for key in Disturbance.model_fields if key in arguments}
+    others, share = arguments.pop(PARTNERS, None), arguments.pop(SHARE, None)
     known = TASKS[name].model_fields
     for key in arguments:
         if key not in known:
-            allowed = [*known, *Disturbance.model_fields]
+            allowed = [*known, *Disturbance.model_fields, PARTNERS, SHARE]
             raise ValueError(f"{key_path(('tasks', name, key))}: unknown{nearest(key, allowed)}")
     try:
-        setting = Setting(axis, value, TASKS[name](**arguments), Disturbance(**disturbed))
+        task = TASKS[name](**arguments)
+        partners = None if others is None and share is None else _partners(study, task, others, share)
+        setting = Setting(axis, value, task, Disturbance(**disturbed), partners)
         setting.disturbance.check(setting.task)
         setting.task.scene  # noqa: B018  # it is made now, and refuses an unstable time step
     except ValueError as error:
         raise _DoesNotApply(f"tasks.{name}.{axis}: {error}") from None
     return setting
+
+
+def _partners(study: Study, task: Task, others: Any, share: Any) -> Partners:
+    """Return the partners of a setting; raise ValueError, in one line, if the task or the study has none such."""
+    if task.learners < 2:
+        law = "; the law of its scripted people is `crowd`" if task.name == "crowd_nav" else ""
+        raise ValueError(f"{PARTNERS}: must be left out for {task.name}, whose worlds have one learner each{law}")
+    if others is None:
+        raise ValueError(f"share = {share!r}: needs partners, the player of the others")
+    egos = 1
+    if share is not None:
+        if isinstance(share, bool) or not isinstance(share, int | float) or not 0 < share < 1:
+            raise ValueError(f"share = {share!r}: must be a number > 0 and < 1")
+        egos = min(max(round(share * task.learners), 1), task.learners - 1)
+    if others == SAME:
+        return Partners(None, egos)
+    found = dict(_specs(study.players, task.name))
+    if others in found:
+        return Partners(found[others][0], egos)  # of several seeds, the one that ships
+    if isinstance(others, str) and known_name(others) and not other_tasks(others, task.name):
+        return Partners(members_of(Player(others, others), task.name)[0], egos)
+    names = [SAME, *found]
+    allowed = f"{', '.join(names)}, or another known player of {task.name}"
+    raise ValueError(f"{PARTNERS} = {printable(str(others))}: unknown{nearest(str(others), names)}; allowed: {allowed}")
 
 
 def _text(value: Value | dict[str, Value]) -> str:
@@ -183,14 +254,15 @@ def contenders_of(study: Study, task: str) -> list[Contender]:
     Raises:
         ValueError: in one line, a file that is not there.
     """
-    return list(_contenders(study.players, task))
+    return [Contender(name, members) for name, members in _specs(study.players, task)]
 
 
-def _contenders(players: Mapping[str, str], task: str) -> Iterator[Contender]:
+def _specs(players: Mapping[str, str], task: str) -> Iterator[tuple[str, tuple[Player, ...]]]:
+    """Yield each player of a task: its name, and the player of each seed."""
     for name, spec in players.items():
         if known_name(spec):
             if not other_tasks(spec, task):
-                yield Contender(name, members_of(Player(spec, name), task))
+                yield name, members_of(Player(spec, name), task)
             continue
         pattern = spec.replace(TASK_PLACE, task)
         paths: Sequence[str] = sorted(glob.glob(pattern)) or [pattern]
@@ -198,4 +270,4 @@ def _contenders(players: Mapping[str, str], task: str) -> Iterator[Contender]:
             if TASK_PLACE in spec:
                 continue  # a player of some tasks only
             raise ValueError(f"players.{name}: {printable(pattern)}: no such file, and no player of that name")
-        yield Contender(name, tuple(Player(path, name) for path in paths))
+        yield name, tuple(Player(path, name) for path in paths)

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 from agents.report import grid
-from agents.study import HOME, Study
+from agents.study import HOME, PARTNERS, Study
 from agents.study_results import ALONE, GROUPS, KINDS, LEVEL, SettingResults, TaskResults
 from flockenv.evaluation import Interval
 
@@ -22,6 +22,12 @@ worlds alone, and do not contain the luck of training or of the search; its succ
 cannot read the observations of that setting; *alone*: only one kind can. A value for all tasks is left out where a task
 does not accept it or its time step is unstable."""
 
+AMONG = """\
+**Partners**: one agent of each world, or the share named there, plays the player of the column, and all others the
+named player (of several seeds, the one that ships), or the *same* as that one agent. Each learner is that agent equally
+often. Return and success are those of that agent; in tasks whose success is one of all agents together (Flock,
+Corridor) it is that of the world. CrowdNav has no such setting: its people are scripted, and `crowd` is their law."""
+
 
 def markdown(study: Study, command: str, tasks: Sequence[TaskResults], folder: str) -> str:
     """Return the page as Markdown; command: that makes it; folder: that of the pictures, as links name it."""
@@ -30,6 +36,7 @@ def markdown(study: Study, command: str, tasks: Sequence[TaskResults], folder: s
         f"{_sentence(tasks)} Made by `{command}`, {study.worlds} worlds per setting.",
         f"![Which kind of player is ahead in which setting]({folder}/summary.png)",
         NOTES,
+        *([AMONG] if any(results.groups[PARTNERS] for results in tasks) else []),
         "## Settings in which a kind of player is ahead",
         grid(*_counts(tasks)),
     ]

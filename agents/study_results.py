@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.study import HOME, setting_name
+from agents.study import HOME, PARTNERS, setting_name
 from flockenv.core.errors import nearest
 from flockenv.envs.disturbance import Disturbance
 from flockenv.evaluation import Interval, lead_interval, mean_interval, success_interval
@@ -40,15 +40,15 @@ SOLVER = ("dt", "integrator", "dtype")
 Floats = NDArray[np.float64]
 
 
-GROUPS = (HOME, "sensors and actions", "solver", "task")
-"""What is varied: nothing, what a player sees and how late it acts, how motion is computed, or the task itself."""
+GROUPS = (HOME, "sensors and actions", "solver", PARTNERS, "task")
+"""What is varied: nothing, sensors and delays, how motion is computed, what other agents play, or the task itself."""
 
 
 def group_of(axis: str) -> str:
     """Return the group of a setting by what is varied in it."""
     if axis in Disturbance.model_fields:
         return "sensors and actions"
-    return axis if axis == HOME else "solver" if axis in SOLVER else "task"
+    return axis if axis in (HOME, PARTNERS) else "solver" if axis in SOLVER else "task"
 
 
 def kind_of(policy: Policy) -> str:

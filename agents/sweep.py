@@ -21,6 +21,7 @@ import typer
 from rich.console import Console
 
 from agents.compare import JOBS, folder_of, pick, provenance, split, write_text
+from agents.invasion import worlds_among
 from agents.play import Player, episodes_of_bytes, play_job
 from agents.report import json_text, rounded
 from agents.study import Contender, Setting, Study, contenders_of, settings_of
@@ -84,7 +85,8 @@ def sweep(
         for task in tasks
     }
     waiting = [entry for of_task in entries.values() for entry in of_task if not entry.content]
-    run_jobs([job for entry in waiting for job in (*entry.evaluation, *entry.tuning)], work)
+    jobs = {job.key: job for entry in waiting for job in (*entry.evaluation, *entry.tuning)}  # a grid may have home
+    run_jobs(list(jobs.values()), work)
     digest = plan_digest(study, changes)
     return {task: {"plan": digest, **_content(study, of_task, work.store)} for task, of_task in entries.items()}
 
@@ -112,12 +114,16 @@ def _content(study: Study, entries: Sequence[_Entry], store: Store) -> Content:
 def _entries(study: Study, setting: Setting, contenders: Sequence[Contender], choose: bool = True) -> list[_Entry]:
     """Return the entries of a setting; a player that cannot play it has the reason as its content."""
     found = []
+    _check_partners(setting, study.seed)
     for contender in contenders:
         try:
             policies = [member.policy(setting.task, study.seed) for member in contender.members]
         except OtherSlotsError as error:
             reason = str(error).partition(": ")[2]  # without the path of the file, which is this machine's
             found.append(_Entry(setting, contender, "", content={"refused": reason}))
+            continue
+        if setting.partners is not None and hasattr(policies[0], "watch"):
+            found.append(_Entry(setting, contender, "", content={"refused": "acts for all agents of a world at once"}))
             continue
         jobs = [_job(study, setting, member, "evaluation") for member in contender.members]
         found.append(_Entry(setting, contender, kind_of(policies[0]), jobs))
@@ -128,11 +134,28 @@ def _entries(study: Study, setting: Setting, contenders: Sequence[Contender], ch
     return found
 
 
+def _check_partners(setting: Setting, seed: int) -> None:
+    """Raise ValueError, in one line, if the player of the other agents cannot play the setting."""
+    if setting.partners is None or (player := setting.partners.player) is None:
+        return
+    try:
+        policy = player.policy(setting.task, seed)
+    except ValueError as error:
+        raise ValueError(f"{setting.task.name}, {setting.name}: {error}") from None
+    if hasattr(policy, "watch"):
+        raise ValueError(f"{setting.task.name}, {setting.name}: {player.name} acts for all agents of a world at once")
+
+
 def _job(study: Study, setting: Setting, player: Player, purpose: Any) -> Job:
     kind = "sweep" if purpose == "evaluation" else "sweep-tuning"
+    within = None
+    if (partners := setting.partners) is not None:
+        others = partners.player or player
+        within = worlds_among(setting.task, others, study.seed, False, partners.egos, setting.disturbance)
     return play_job(
-        kind, setting.task, player, study.worlds, study.seed, disturbance=setting.disturbance, purpose=purpose
-    )
+        kind, setting.task, player, study.worlds, study.seed, disturbance=setting.disturbance, purpose=purpose,
+        within=within,
+    )  # fmt: skip
 
 
 def _played(entry: _Entry, store: Store, commit: str | None) -> Content:

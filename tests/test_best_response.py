@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,8 @@ from agents import best_response, invasion
 from agents.play import Player
 from flockenv.envs.world import World
 from flockenv.evaluation import Episodes, rollout, worlds_for
-from flockenv.tasks import Flock, School
+from flockenv.players import load_player
+from flockenv.tasks import Bottleneck, Crossing, Flock, School
 
 FISH, WORLDS = 3, 7
 TASK = School(fish=FISH, horizon=60, start_hunger=0.6, metabolism=0.2)  # some starve before the time limit
@@ -60,6 +62,45 @@ def test_one_agent_per_world_deviates_and_is_rewarded_until_it_is_out(theirs: fl
     alone = rollout(TASK, Steady(0.2), WORLDS, first, make_world=made)
     np.testing.assert_allclose(alone.returns, returns_of_seats(actions), rtol=0, atol=1e-12)
     assert (alone.lengths < TASK.horizon).any()  # some were out before the time limit
+
+
+def test_several_agents_per_world_are_spread_evenly_and_rewarded() -> None:
+    task, learners, egos = Crossing(agents=6, horizon=5), 6, 3
+    among = invasion.Among(task, WORLDS, 5, Steady(-0.5), egos)
+    plain = World(task, WORLDS, 5)
+    seats = (np.arange(WORLDS)[:, None] + np.array([0, 2, 4])) % learners
+    mine = (np.arange(learners) == seats[:, :, None]).any(axis=1)
+    rows, seen = among.reset(3), plain.reset(3)
+    np.testing.assert_array_equal(rows, seen[mine].reshape(WORLDS, egos, -1))
+    for t in range(5):
+        actions = np.random.default_rng(t).uniform(-1, 1, (WORLDS, egos, 2)).astype(np.float32)
+        joint = np.zeros((WORLDS, learners, 2))
+        joint[..., 0] = np.float32(-0.5 * np.cos(t))
+        joint[mine] = actions.reshape(-1, 2)
+        step, expected = among.step(actions), plain.step(joint)
+        for name in ("observation", "reward", "terms", "terminated", "alive"):
+            values = getattr(expected, name)[mine]
+            np.testing.assert_array_equal(getattr(step, name), values.reshape(WORLDS, egos, *values.shape[1:]))
+    assert step.truncated.all()
+
+
+def test_success_is_that_of_the_one_agent() -> None:
+    task = Crossing(agents=6, horizon=150)
+    made = lambda task, worlds, limit: invasion.Among(task, worlds, limit, Steady(0.0))  # noqa: E731  # they stay
+    alone = rollout(task, load_player("rules", task), WORLDS, 0, make_world=made)
+    assert alone.success.any()
+    assert not rollout(task, Steady(0.0), WORLDS, 0, make_world=made).success.any()
+
+
+def test_success_of_each_agent() -> None:
+    memory, alive = np.zeros((1, 6, 3)), np.array([[True, False, True]])
+    memory[0, 2], memory[0, 1] = [1.0, 2.0, 0.0], [10.0, 1e6, 10.0]  # the first is out unhurt, the second out and hurt
+    step: Any = SimpleNamespace(alive=alive)
+    expected = ((Bottleneck(people=3), [True, False, False]), (School(fish=3), [True, False, True]), (Flock(), None))
+    for task, marks in expected:
+        world: Any = SimpleNamespace(task=task, learners=3, memory=memory)
+        found = invasion.own_success(world, step)
+        assert marks is None if found is None else found.tolist() == [marks]
 
 
 def test_payoffs_depend_on_both_players_and_are_reproducible() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,10 @@ import pytest
 from scipy.stats import t as student
 from typer.testing import CliRunner
 
+from agents.invasion import Among
+from agents.play import Player
 from agents.report import json_text
-from agents.study import HOME, Study, contenders_of, settings_of
+from agents.study import HOME, Partners, Study, contenders_of, settings_of
 from agents.study_report import markdown
 from agents.study_results import ALONE, LEVEL, Score, SettingResults, kind_of, read_file, read_task
 from agents.sweep import app, sweep
@@ -22,7 +25,7 @@ from flockenv.jobs.local_engine import LocalEngine
 from flockenv.players import load_player
 from flockenv.players.rules import TUNED
 from flockenv.scene.yaml_io import load
-from flockenv.tasks import TASKS, Pursuit
+from flockenv.tasks import TASKS, Crossing, Pursuit
 
 STUDIES = sorted((Path(__file__).resolve().parent.parent / "configs" / "studies").glob("*.yaml"))
 PLAYERS = {"random": "random", "textbook": "textbook", "rules": "rules", "ppo": "ppo"}
@@ -168,6 +171,97 @@ def test_values_for_all_tasks_are_left_out_where_they_do_not_apply() -> None:
         settings_of(small(tasks={"path_follow": {"dropped": (0.2,)}}), "path_follow")
 
 
+def test_a_mapping_of_lists_is_all_combinations_with_home() -> None:
+    study = small(
+        tasks={"pursuit": {"both": {"size": (10, 20), "evader_speed": (2.4, 2)}, "size": (20,)}}, everywhere={}
+    )
+    home, *settings = settings_of(study, "pursuit")
+    rows = [(each.axis, each.value) for each in settings]
+    speeds = ("evader_speed 2.4", "evader_speed 2")
+    assert rows == [(f"both {size}", text) for size in (10, 20) for text in speeds]  # of the axis `size`, 20 is home
+    tasks: list[Any] = [each.task for each in settings]
+    assert [(task.size, task.evader_speed) for task in tasks] == [(10, 2.4), (10, 2), (20, 2.4), (20, 2)]
+    assert tasks[2] == home.task
+
+
+CROWD = {"agents": 4, "horizon": 30}
+
+
+def among(values: Any, **changes: Any) -> Study:
+    players = {"random": "random", "textbook": "textbook", "rules": "rules"}
+    return small(players=players, everywhere={}, tasks={"crossing": {"partners": values}}, **changes)
+
+
+def test_partners_are_named_players_the_same_player_or_left_out() -> None:
+    mixed = {"partners": "rules", "share": 0.5}
+    settings = settings_of(among(("same", "rules", "ppo", mixed)), "crossing", CROWD)
+    assert [each.name for each in settings[1:]] == [
+        "partners=same", "partners=rules", "partners=ppo", "partners=partners rules, share 0.5",
+    ]  # fmt: skip
+    found = [each.partners for each in settings]
+    assert found[0] is None and found[1] == Partners(None, 1) and found[4] == Partners(Player("rules", "rules"), 2)
+    assert found[3] is not None and found[3].player is not None and found[3].player.spec == "ppo"
+    study = small(tasks={"pursuit": {}, "crossing": {}}, everywhere={"partners": ("ppo", "orca", "queueing")})
+    assert [each.name for each in settings_of(study, "crossing")] == ["home", "partners=ppo", "partners=orca"]
+    assert [each.name for each in settings_of(study, "pursuit")] == ["home"]  # one learner
+
+
+@pytest.mark.parametrize(
+    ("task", "values", "text"),
+    [
+        ("crowd_nav", {"partners": ("rules",)}, "one learner each; the law of its scripted people is `crowd`"),
+        ("pursuit", {"partners": ("rules",)}, "must be left out for pursuit, whose worlds have one learner each"),
+        ("crossing", {"partners": ("ruls",)}, "partners = 'ruls': unknown, did you mean `rules`?; allowed: same,"),
+        ("crossing", {"partners": ("queueing",)}, "partners = 'queueing': unknown"),
+        ("crossing", {"mixed": ({"share": 0.5},)}, "tasks.crossing.mixed: share = 0.5: needs partners"),
+        ("crossing", {"mixed": ({"partners": "same", "share": 1},)}, "share = 1: must be a number > 0 and < 1"),
+        ("crossing", {"partner": ("rules",)}, "tasks.crossing.partner: unknown, did you mean `partners`?"),
+    ],
+)  # fmt: skip
+def test_bad_partners_are_refused_in_one_line(task: str, values: dict[str, Any], text: str) -> None:
+    with pytest.raises(ValueError, match="tasks") as caught:
+        settings_of(small(tasks={task: values}, everywhere={}), task)
+    assert text in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_one_agent_is_evaluated_among_partners(tmp_path: Path) -> None:
+    noisy = {"partners": "rules", "noise": 0.2}
+    study = among(("same", "rules", {"partners": "rules", "share": 0.5}, noisy), worlds=4)
+    content = sweep(study, ["crossing"], Work(Store(tmp_path), LocalEngine(1)), {"crossing": CROWD})["crossing"]
+    results = read_task(json.loads(json_text(content)))
+    assert [each.name for each in results.groups["partners"]] == [each.name for each in results.settings[1:]]
+    returns = {each.value: {name: score.returns[0] for name, score in each.scores.items()} for each in results.settings}
+    home, same, rules, half, with_noise = returns.values()
+    np.testing.assert_array_equal(same["rules"], rules["rules"])
+    for one, other in ((same, rules), (home, same), (rules, half), (rules, with_noise)):
+        assert (one["textbook"] != other["textbook"]).all()
+    task = Crossing(**CROWD)
+    made = functools.partial(Among, others=load_player("rules", task, 0))
+    alone = rollout(task, load_player("textbook", task), 4, worlds_for("evaluation", 0, 4), make_world=made)
+    assert rules["textbook"] == pytest.approx(alone.returns, rel=1e-5)
+    page = markdown(study, "command", [results], "folder")
+    assert "| task | home | partners |" in page and "**Partners**: one agent of each world" in page
+
+
+def test_a_player_of_all_agents_is_no_partner_and_is_not_evaluated_among_any(tmp_path: Path) -> None:
+    (tmp_path / "sees.py").write_text(
+        "import numpy as np\n\nclass Sees:\n    def watch(self, world):\n        pass\n\n"
+        "    def predict(self, observation, *rest):\n        return np.zeros((len(observation), 2)), None\n\n"
+        "def player(task):\n    return Sees()\n"
+    )
+    players = {"rules": "rules", "sees": str(tmp_path / "sees.py")}
+    for values, refused in ((("rules",), False), (("sees",), True)):
+        study = small(players=players, everywhere={}, worlds=2, tasks={"crossing": {"partners": values}})
+        work = Work(Store(tmp_path / "jobs"), LocalEngine(1))
+        if refused:
+            with pytest.raises(ValueError, match="crossing, partners=sees: sees acts for all agents"):
+                sweep(study, ["crossing"], work, {"crossing": CROWD})
+            continue
+        results = read_task(sweep(study, ["crossing"], work, {"crossing": CROWD})["crossing"])
+        assert set(results.settings[0].scores) == set(players)
+        assert results.settings[1].refused == {"sees": "acts for all agents of a world at once"}
+
+
 def test_files_of_players() -> None:
     study = small(players={**PLAYERS, "mine": "nothing/here.py"})
     with pytest.raises(ValueError, match=r"players\.mine: 'nothing/here\.py': no such file"):
@@ -179,7 +273,10 @@ def test_files_of_players() -> None:
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
 def test_shipped_studies_can_be_played(path: Path) -> None:
     study = load(path, Study)
-    assert set(study.tasks) == set(TASKS) or path.stem == "price"  # of the two tasks that have prices
+    assert set(study.tasks) == set(TASKS) or path.stem in (
+        "price",
+        "crowd_laws",
+    )  # of tasks that have prices; of one task
     for task in study.tasks:
         settings = settings_of(study, task)
         assert settings[0].axis == HOME
@@ -235,7 +332,7 @@ def test_all_seeds_of_a_name_are_one_player_of_a_study(tmp_path: Path, monkeypat
 
 def test_only_results_of_one_study_are_on_a_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    tasks = {"pursuit": {}, "obstacles": {}}
+    tasks: dict[str, Any] = {"pursuit": {}, "obstacles": {}}
     players = {"random": "random", "rules": "rules"}
     for worlds, task, expected in ((2, "pursuit", 1), (2, "obstacles", 2), (3, "obstacles", 1)):
         study = small(worlds=worlds, tasks=tasks, players=players, everywhere={})
