@@ -1,8 +1,9 @@
 """Search of a hand-written player's parameters by CMA-ES (Hansen 2016, arXiv:1604.00772), from the package `cmaes`.
 
-A search has the agent-steps that PPO has in the same config. It begins at the textbook's parameters. Each generation is
-a list of jobs, one for each candidate; all of its candidates play the same tuning worlds, so that differences between
-them are not the luck of worlds, and the next generation plays other worlds, so that no candidate fits a few of them.
+A search has the agent-steps that PPO has in the same config, in worlds of the same disturbance (`ppo.disturbance`). It
+begins at the textbook's parameters. Each generation is a list of jobs, one for each candidate; all of its candidates
+play the same tuning worlds, so that differences between them are not the luck of worlds, and the next generation plays
+other worlds, so that no candidate fits a few of them.
 
 As in training, the current mean of the distribution plays other tuning worlds at regular intervals, the same ones each
 time: that is the search's curve. In the end a few of these means, the last one and the textbook's parameters play a
@@ -11,6 +12,7 @@ larger set of worlds, the same for all search seeds, and the best of them is the
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
@@ -21,6 +23,7 @@ from numpy.typing import NDArray
 
 from agents.experiment import Experiment
 from agents.play import PLAYING
+from flockenv.envs.disturbance import Disturbance, make_world
 from flockenv.envs.world import bytes_per_world, first_step
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.jobs import Job, Work, records, run_jobs
@@ -93,20 +96,23 @@ class Play:
     seconds: float
 
 
-def play_job(task: Task, name: str, values: Parameters, worlds: int, first: int) -> Job:
+def play_job(task: Task, name: str, values: Parameters, worlds: int, first: int, disturbance: Disturbance) -> Job:
     """Return the job that plays the worlds first, first + 1, ... with parameters; its record is read by `_play_of`."""
     about = [type(task).__name__, task.model_dump(mode="json"), values, worlds, first]
+    about += [disturbance.model_dump(mode="json")] if disturbance else []
     title, memory = f"tune/{task.name}/{name}/{worlds}-worlds", PLAYING + worlds * bytes_per_world(task)
-    return Job(title, _play, (task, name, values, worlds, first), about, memory, (first_step, (task,)))
+    arguments = task, name, values, worlds, first, disturbance
+    return Job(title, _play, arguments, about, memory, (first_step, (task,)))
 
 
-def _play(task: Task, name: str, values: Parameters, worlds: int, first: int) -> bytes:
+def _play(task: Task, name: str, values: Parameters, worlds: int, first: int, disturbance: Disturbance) -> bytes:
     """Play the worlds; return the result as bytes.
 
     The mean return is used, as in the paired differences of the comparison: a failure in one world of ten must count.
     """
-    began = perf_counter()
-    episodes = rollout(task, RulesPlayer(task, PLAYERS[name][task.name][1](**values), name), worlds, first)
+    began, make = perf_counter(), functools.partial(make_world, disturbance=disturbance)
+    policy = RulesPlayer(task, PLAYERS[name][task.name][1](**values), name)
+    episodes = rollout(task, policy, worlds, first, make_world=make)
     mean, success = float(np.mean(episodes.returns)), float(np.mean(episodes.success))
     return records.to_bytes(Play(mean, success, int(episodes.lengths.sum()) * task.learners, perf_counter() - began))
 
@@ -155,7 +161,7 @@ class Search:
     def __post_init__(self) -> None:
         """Begin the distribution at the textbook's parameters."""
         s, p = self.experiment.search, self.experiment.ppo
-        self.task = self.experiment.build()
+        self.task, self.disturbance = self.experiment.build(), p.disturbance
         kind = PLAYERS[self.player][self.task.name][1]
         self.textbook, self.coordinates = as_dict(kind()), Coordinates(ranges_of(kind))
         self.budget, self.settings = s.steps or p.steps, s
@@ -183,7 +189,7 @@ class Search:
         plays = [(self.coordinates.values(point), worlds, first) for point in self._asked]
         if self._point_is_due():
             plays.insert(0, (self.mean if self.curve else self.textbook, self.evaluate_worlds, common_worlds()))
-        return [play_job(self.task, self.player, *play) for play in plays]
+        return [play_job(self.task, self.player, *play, self.disturbance) for play in plays]
 
     def tell(self, plays: Sequence[Play]) -> None:
         """Receive the results of the jobs of `ask`, and update the distribution."""
@@ -206,7 +212,7 @@ class Search:
         plays = [(self.mean, self.evaluate_worlds, common_worlds())]
         fresh = common_worlds() + self.evaluate_worlds  # not those by which the finalists were chosen
         plays += [(values, self.settings.final_worlds, fresh) for values in self.finalists]
-        return [play_job(self.task, self.player, *play) for play in plays]
+        return [play_job(self.task, self.player, *play, self.disturbance) for play in plays]
 
     def tell_last(self, plays: Sequence[Play]) -> Found:
         """Receive the results of the jobs of `ask_last`; return the best of the finalists, the textbook's included."""

@@ -137,6 +137,7 @@ def main(
         experiment = load_experiment(config)
         task = experiment.build()
         _check_player(player, task)
+        experiment.ppo.disturbance.check(task)
         numbers = [experiment.search.seed] if seeds is None else seeds_of(seeds)
         target = TUNED / f"{task.name}.json" if out is None else valid_file(str(out), (".json",), force=True)
         folder = valid_path(str(results), "--records")
@@ -153,12 +154,13 @@ def main(
 
 def _write_all(experiment: Experiment, found: Sequence[Found], folder: Path, target: Path) -> None:
     """Write the outcome of each search, and the median search as the tuned parameters."""
-    settings = experiment.search.model_dump(mode="json")
+    settings, disturbance = experiment.search.model_dump(mode="json"), experiment.ppo.disturbance
+    within = {"disturbance": disturbance.model_dump(mode="json")} if disturbance else {}
     for each in found:
         path = folder / f"{each.task}-{each.player}-seed-{each.seed}.json"
-        _write_json(path, {**asdict(each), "settings": settings})
+        _write_json(path, {**asdict(each), "settings": settings, **within})
     ships = median_of(found)
-    write(target, ships.task, ships.player, ships.parameters, found_of(ships, found))
+    write(target, ships.task, ships.player, ships.parameters, {**found_of(ships, found), **within})
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import subprocess
 import sys
@@ -19,6 +20,8 @@ from agents import search as searching
 from agents import tune
 from agents.experiment import Experiment
 from agents.search import Coordinates, Found, Search, median_of, search
+from flockenv.envs.disturbance import Disturbance, make_world
+from flockenv.evaluation import rollout
 from flockenv.jobs import Store, Work
 from flockenv.jobs.local_engine import LocalEngine
 from flockenv.players import PUBLISHED
@@ -61,7 +64,7 @@ def score_by(monkeypatch: pytest.MonkeyPatch, formula: Callable[[dict[str, float
     """Replace episodes by a formula of the parameters, plus luck of each world; return the list of first worlds."""
     played: list[int] = []
 
-    def rollout(task: Any, policy: Any, worlds: int, seed: int) -> Any:
+    def rollout(task: Any, policy: Any, worlds: int, seed: int, make_world: Any) -> Any:
         played.append(seed)
         luck = np.random.default_rng(seed).normal(size=worlds)
         success = np.zeros(worlds, np.bool_)
@@ -133,7 +136,7 @@ def test_candidates_of_a_generation_play_the_same_worlds_which_no_other_generati
             worlds.append(set(range(first, first + jobs[0].arguments[3])))
             each.generation += 1
     last = [job.arguments for job in one.ask_last()[:2]]  # of the curve, and of the final choice
-    worlds += [set(range(first, first + count)) for *_, count, first in last]
+    worlds += [set(range(first, first + count)) for *_, count, first, _ in last]
     assert sum(len(each) for each in worlds) == len(set().union(*worlds))
 
 
@@ -155,6 +158,17 @@ def test_a_search_has_the_agent_steps_of_ppo_unless_the_config_says_otherwise() 
     assert Search(SMALL, "rules", 0).budget == 100
     own = SMALL.model_copy(update={"search": SMALL.search.model_copy(update={"steps": 77})})
     assert Search(own, "rules", 0).budget == 77
+
+
+def test_candidates_play_in_the_disturbed_worlds_of_the_training() -> None:
+    disturbance = Disturbance(noise=0.5)
+    noisy = SMALL.model_copy(update={"ppo": SMALL.ppo.model_copy(update={"disturbance": disturbance})})
+    job, calm = Search(noisy, "rules", 0).ask()[0], Search(SMALL, "rules", 0).ask()[0]
+    played, undisturbed = (searching._play_of(each.function(*each.arguments)) for each in (job, calm))
+    task, worlds = SMALL.build(), functools.partial(make_world, disturbance=disturbance)
+    expected = rollout(task, player(task, "textbook"), 2, searching.common_worlds(), make_world=worlds)
+    assert played.mean == expected.returns.mean() != undisturbed.mean
+    assert job.key != calm.key
 
 
 @pytest.mark.slow  # its processes load the kernels
@@ -259,7 +273,32 @@ def test_tuned_players_differ_from_published_ones_where_a_search_was_made() -> N
                 assert tuned.found["tuning_mean"] > tuned.found["textbook_mean"] or now == before
 
 
+@pytest.mark.parametrize("settings", [{}, {"disturbance": {"noise": 0.1}}])
+def test_tuned_parameters_name_the_disturbance_of_their_search(
+    settings: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(tune, "search", lambda *_: [found_with(0, 2.0)])
+    Path("pursuit.yaml").write_text(json.dumps({"task": "pursuit", "ppo": settings}), encoding="utf-8")
+    assert CliRunner().invoke(tune.app, ["pursuit.yaml", "--out", "x.json"]).exit_code == 0
+    expected = {"noise": 0.1, "delay": 0, "dropped": 0.0} if settings else None
+    assert read_tuned(Path("x.json"))["rules"]["found"].get("disturbance") == expected
+    record = json.loads(Path("results/tune/pursuit-rules-seed-0.json").read_text())
+    assert record.get("disturbance") == expected
+
+
 # --- refusals
+
+
+def test_a_disturbance_without_slots_is_refused_before_the_search(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("config.yaml").write_text("{task: path_follow, ppo: {disturbance: {dropped: 0.2}}}", encoding="utf-8")
+    result = CliRunner().invoke(tune.app, ["config.yaml"])
+    fault = "dropped = 0.2: must be 0 for path_follow, which has no slots to empty"
+    assert (result.exit_code, result.output) == (2, f"error: {fault}\n")
+    assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"], "nothing is written"
 
 
 @pytest.mark.parametrize(
