@@ -39,6 +39,7 @@ from agents.training import (
     BudgetSpent,
     add_point,
     card_of,
+    command_of,
     new_progress,
     score,
     share_of_time_left,
@@ -302,9 +303,13 @@ def new_run(experiment: Experiment, algo: str) -> Run:
 
 def card(run: Run, algo: str) -> dict[str, Any]:
     """Return the card of a run's best policy."""
-    command = f"python -m agents.learn configs/training/{run.recipe['task']}.yaml --algo {algo}"
-    recipe = {"command": command, "ppo": run.recipe["ppo"], algo: run.recipe[algo]}
-    return {**card_of(run), "algorithm": NAMES[algo], "recipe": recipe}
+
+    def of_config(path: Path) -> dict[str, Any]:
+        return learner_recipe(effective(load_experiment(path), algo), algo)
+
+    command = command_of(run.recipe, "agents.learn", [f"--algo {algo}"], of_config)
+    about = card_of(run, command=command)
+    return {**about, "algorithm": NAMES[algo], "recipe": {**about["recipe"], algo: run.recipe[algo]}}
 
 
 def export(run: Run, algo: str, path: Path) -> str:

@@ -41,7 +41,7 @@ from agents.divergence import LearningDiverged
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors
 from agents.rllib_envs import RowsEnv, Settings, TeamEnv, role
 from agents.run import Run, expected_bytes, load_checkpoint, recipe_of, save_checkpoint
-from agents.training import add_point, card_of, new_progress, score, use_thread_count
+from agents.training import add_point, card_of, command_of, new_progress, score, use_thread_count
 from agents.training_state import surroundings
 from flockenv.cli.terminal import DIVERGED, handle_interrupt, run_program, show_progress
 from flockenv.core import signals
@@ -376,7 +376,7 @@ def main(
             raise typer.Exit(DIVERGED) from None
         for policy, tensors in ({ONE: run.tensors} if run.tensors else last).items():
             path = target.with_stem(f"{target.stem}-{policy}") if len(last) > 1 else target
-            card = {**card_of(run, "RLlib", "agents.rllib"), "runners": runners}
+            card = {**card_of(run, "RLlib", command_of(run.recipe, "agents.rllib")), "runners": runners}
             if check:
                 found = evaluate(experiment, tensors, check)
                 card["rllib_evaluation"] = {"episodes": check, "iqm": found.value, "ci": [found.low, found.high]}

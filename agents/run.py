@@ -24,8 +24,8 @@ from flockenv.players.rules import as_dict, player
 from flockenv.tasks import Task
 
 __all__ = [
-    "OtherRecipe", "Run", "expected_bytes", "first_difference", "load_checkpoint", "recipe_of", "save_checkpoint",
-    "start_path",
+    "OtherRecipe", "Run", "differences", "expected_bytes", "first_difference", "load_checkpoint", "recipe_of",
+    "save_checkpoint", "start_path",
 ]  # fmt: skip
 
 STATE = ("policy", "optimizer", "worlds", "rollout", "random")
@@ -160,12 +160,17 @@ def _compare(kept: dict[str, Any], wanted: dict[str, Any], folder: Path) -> None
 
 def first_difference(first: dict[str, Any], second: dict[str, Any]) -> tuple[str, str, str] | None:
     """Return the key path of the first value in which two recipes differ, and the values; None if they are equal."""
-    of_first, of_second = dict(_values_by_path(first)), dict(_values_by_path(second))
-    for key in {**of_second, **of_first}:
-        if of_first.get(key) != of_second.get(key):
-            has, wants = (printable(of[key]) if key in of else "nothing" for of in (of_first, of_second))
-            return key, has, wants
+    for key, values in differences(first, second).items():
+        has, wants = ("nothing" if value is None else printable(value) for value in values)
+        return key, has, wants
     return None
+
+
+def differences(first: dict[str, Any], second: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Return the values in which two recipes differ, by key path; None for one that is missing."""
+    of_first, of_second = dict(_values_by_path(first)), dict(_values_by_path(second))
+    pairs = {key: (of_first.get(key), of_second.get(key)) for key in {**of_second, **of_first}}
+    return {key: (has, wants) for key, (has, wants) in pairs.items() if has != wants}
 
 
 def _fault(notes: Notes, times: Times, best: dict[str, np.ndarray], experiment: Experiment) -> str:

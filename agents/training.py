@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,15 +17,19 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from agents.divergence import LearningDiverged
 from agents.drawn import played_returns, squash_of
 from agents.experiment import CONFIGS, PpoSettings, load_experiment
-from agents.run import Run
+from agents.run import Run, differences
 from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.players.policy import describe
 from flockenv.tasks import TASKS, Task
 
 __all__ = [
-    "BudgetSpent", "add_point", "card_of", "is_spent", "new_progress", "score", "share_of_time_left",
+    "BudgetSpent", "add_point", "card_of", "command_of", "is_spent", "new_progress", "score", "share_of_time_left",
     "use_thread_count",
 ]  # fmt: skip
+
+
+CHANGED_BY = ("steps", "seconds", "seed", "action")
+"""Settings of a training that an option of its command changes."""
 
 
 class BudgetSpent(Exception):  # noqa: N818  # the end of a training
@@ -92,14 +97,38 @@ def new_progress(console: Console) -> Progress:
     )  # fmt: skip
 
 
-def _config_of(recipe: dict[str, Any]) -> str:
-    """Return the name of the config with a recipe's settings, whatever their seed; else that of the task's config."""
-    for path in sorted(CONFIGS.glob(f"{recipe['task']}_*.yaml")):
-        each = load_experiment(path).model_dump(mode="json", include={"task", "arguments", "ppo"})
-        each["ppo"]["seed"] = recipe["ppo"]["seed"]
-        if all(each[name] == recipe[name] for name in each):
-            return path.name
-    return f"{recipe['task']}.yaml"
+def _recipe_of_config(path: Path) -> dict[str, Any]:
+    """Return the part of a config's recipe that is in its file."""
+    return load_experiment(path).model_dump(mode="json", include={"task", "arguments", "ppo"})
+
+
+def command_of(
+    recipe: dict[str, Any],
+    module: str,
+    options: Sequence[str] = (),
+    of_config: Callable[[Path], dict[str, Any]] = _recipe_of_config,
+) -> str:
+    """Return the command that trains a recipe, with the task's config that has it, and options for what differs.
+
+    Any other config is CONFIG.yaml: the card has its settings. options: further ones of the command. of_config: returns
+    the recipe that the command makes of a config, or raises ValueError if it refuses it.
+    """
+    found: list[tuple[str, list[str]]] = []
+    for path in sorted(CONFIGS.glob(f"{recipe['task']}*.yaml")):
+        with suppress(ValueError):
+            theirs = of_config(path)
+            changes = _options_of(differences(theirs, {key: recipe.get(key, {}) for key in theirs}))
+            found += [] if changes is None else [(f"configs/training/{path.name}", changes)]
+    config, changes = min(found, key=lambda each: len(each[1]), default=("CONFIG.yaml", []))
+    return " ".join([f"python -m {module} {config}", *options, *changes])
+
+
+def _options_of(changed: dict[str, tuple[Any, Any]]) -> list[str] | None:
+    """Return the options for values that differ from those of a config; None if there is none for one of them."""
+    values = {key.rpartition(".")[2]: wants for key, (_, wants) in changed.items()}
+    if any(name not in CHANGED_BY or wants is None for name, wants in values.items()):
+        return None
+    return [f"--{name} {values[name]}" for name in CHANGED_BY if name in values]
 
 
 def _end_of(run: Run) -> dict[str, str]:
@@ -112,8 +141,11 @@ def _end_of(run: Run) -> dict[str, str]:
     return {"ended_by": "seconds"} if run.wall >= p["seconds"] else {}
 
 
-def card_of(run: Run, library: str = "stable-baselines3", command: str = "agents.ppo") -> dict[str, Any]:
-    """Return the card of a run's policy: its recipe, from which it can be reproduced, and how it was trained."""
+def card_of(run: Run, library: str = "stable-baselines3", command: str | None = None) -> dict[str, Any]:
+    """Return the card of a run's policy: its recipe, from which it can be reproduced, and how it was trained.
+
+    command: that trains it (default: that of agents.ppo).
+    """
     recipe = run.recipe
     return {
         **describe(TASKS[recipe["task"]](**recipe["arguments"])),
@@ -121,7 +153,7 @@ def card_of(run: Run, library: str = "stable-baselines3", command: str = "agents
         "activation": recipe["ppo"]["activation"],
         **squash_of(run.tensors),
         "algorithm": f"PPO ({library})",
-        "recipe": {"command": f"python -m {command} configs/training/{_config_of(recipe)}", "ppo": recipe["ppo"]},
+        "recipe": {"command": command or command_of(recipe, "agents.ppo"), "ppo": recipe["ppo"]},
         "seed": recipe["ppo"]["seed"],
         "steps": run.steps,
         **_end_of(run),

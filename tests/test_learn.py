@@ -119,6 +119,25 @@ def test_a_replay_buffer_that_does_not_fit_is_refused_before_training(monkeypatc
     check_memory(effective(Experiment(**SMALL), "sac"), "sac")
 
 
+@pytest.mark.parametrize(
+    ("algo", "config", "changes", "options"),
+    [
+        ("sac", "crossing_drawn", {}, ""),
+        ("sac", "crossing", {}, ""),
+        ("tqc", "crossing_residual", {"steps": 50_000, "seconds": 9.0}, " --steps 50000 --seconds 9.0"),
+        ("recurrent_ppo", "crossing_drawn", {"steps": 50_000}, " --steps 50000"),
+        ("bc", "crowd_nav", {"seed": 3}, " --seed 3"),
+    ],
+)  # fmt: skip
+def test_a_card_names_the_config_and_the_options_of_its_recipe(
+    algo: str, config: str, changes: dict[str, Any], options: str
+) -> None:
+    experiment = effective(learn.load_experiment(CONFIGS / f"{config}.yaml"), algo, **changes)
+    run = Run(learner_recipe(experiment, algo), {}, ended_by="steps")
+    expected = f"python -m agents.learn configs/training/{config}.yaml --algo {algo}{options}"
+    assert learn.card(run, algo)["recipe"]["command"] == expected
+
+
 # --- training ---------------------------------------------------------------------------------------------------------
 
 
@@ -132,7 +151,7 @@ def test_a_learner_trains_and_exports_a_policy_that_plays(algo: str, tmp_path: P
     policy = load_player(path, task)
     assert isinstance(policy, MlpPolicy) and policy.differences == ()
     card = policy.card
-    assert card["recipe"]["command"] == f"python -m agents.learn configs/training/pursuit.yaml --algo {algo}"
+    assert card["recipe"]["command"] == f"python -m agents.learn CONFIG.yaml --algo {algo}"
     assert card["recipe"][algo] == getattr(experiment, algo).model_dump(mode="json")
     assert card["ended_by"] == "steps" and card["steps"] == run.steps == run.curve[-1]["steps"]
     first = worlds_for("tuning", 0, 4)

@@ -11,7 +11,7 @@ import pytest
 from agents.drawn import check_settings
 from agents.experiment import CONFIGS, Experiment, PpoSettings, load_experiment
 from agents.ppo import build, export, tensors_of, train
-from agents.run import recipe_of
+from agents.run import Run, recipe_of
 from agents.training import card_of
 from agents.warm_start import starting_policy, use_weights
 from flockenv.players import WEIGHTS, load_player
@@ -75,12 +75,15 @@ def test_a_mixture_begins_with_the_policy_that_it_mixes(tmp_path: Path) -> None:
     np.testing.assert_allclose(mixed.predict(rows, deterministic=True)[0], expected, atol=1e-5)
 
 
-def test_a_card_names_the_config_of_its_recipe(tmp_path: Path) -> None:
-    run = train(experiment(critic_first=8), tmp_path)
-    assert card_of(run)["recipe"]["command"] == "python -m agents.ppo configs/training/crowd_nav.yaml"
-    given = load_experiment(CONFIGS / "crowd_nav_priced.yaml")
-    run.recipe = recipe_of(given.model_copy(update={"ppo": given.ppo.model_copy(update={"seed": 3})}))
-    assert card_of(run)["recipe"]["command"] == "python -m agents.ppo configs/training/crowd_nav_priced.yaml"
+@pytest.mark.parametrize("config", ["crowd_nav", "crowd_nav_priced", "crowd_nav_drawn", "crossing_residual"])
+def test_a_card_names_the_config_and_the_options_of_its_recipe(config: str) -> None:
+    given = load_experiment(CONFIGS / f"{config}.yaml")
+    for changes, options in (({}, ""), ({"steps": 4000}, " --steps 4000"), ({"seed": 3}, " --seed 3")):
+        run = Run(recipe_of(given.with_ppo(**changes)), {})
+        command = f"python -m agents.ppo configs/training/{config}.yaml{options}"
+        assert card_of(run)["recipe"]["command"] == command
+    run = Run(recipe_of(given.with_ppo(worlds=7)), {})
+    assert card_of(run)["recipe"]["command"] == "python -m agents.ppo CONFIG.yaml", "one that is not ours"
 
 
 @pytest.mark.parametrize("more", [{"action": "residual"}, {"taught": 1}, {"central_critic": True}])
