@@ -23,6 +23,7 @@ from flockenv.evaluation import Episodes, Interval, bootstrap, compare
 from flockenv.jobs import Job, Store, Work, run_jobs
 from flockenv.jobs.local_engine import LocalEngine
 from flockenv.model.snapshot import Snapshot
+from flockenv.players.independent import IndependentPolicy
 from flockenv.players.policy import Policy
 from flockenv.tasks import Bottleneck, Crossing, School, Task
 
@@ -144,10 +145,13 @@ def jobs_of(
     """Return the jobs by the names of the one agent's player and of the others', all in the same evaluation worlds.
 
     Raises:
-        ValueError: one line: a world has one learner, or a player cannot be loaded.
+        ValueError: one line: a world has one learner, or a player cannot be loaded, or has a network for each learner.
     """
     if task.learners < 2:
         raise ValueError(f"task {task.name!r}: each world has a single learner; this command needs at least two")
+    for player in players:
+        if isinstance(player.policy(task, seed, trust_pickle), IndependentPolicy):
+            raise ValueError(f"player {player.name!r}: has a network for each learner, which play together only")
     found = {}
     for others in players:
         within = worlds_among(task, others, seed, trust_pickle)

@@ -2,7 +2,8 @@
 
 The order of the file: settings -> algorithm -> weights -> learn -> evaluate -> export. Settings are
 those of agents.ppo, of which RLlib has an equal. Each learner of each world is a row of the native vector environment;
-with --team each is an agent of PettingZoo's parallel form, and agents of one role (pursuer, evader) share a policy.
+with --team each is an agent of PettingZoo's parallel form, and agents of one role (pursuer, evader) share a network, or
+all of them, or none (--networks).
 
 After each iteration RLlib writes its own state, and beside it our checkpoint (agents/checkpoint.py) that names it. The
 same command continues from there. RLlib does not store the state of environments: episodes begin anew then, so the
@@ -20,7 +21,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import ray
@@ -39,9 +40,9 @@ from rich.console import Console
 from agents.checkpoint import CheckpointError, Damaged, claim, path_in
 from agents.divergence import LearningDiverged
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors
-from agents.rllib_envs import RowsEnv, Settings, TeamEnv, role
+from agents.rllib_envs import NETWORKS, ONE, RowsEnv, Settings, TeamEnv, role
 from agents.run import Run, expected_bytes, load_checkpoint, recipe_of, save_checkpoint
-from agents.training import add_point, card_of, command_of, new_progress, score, use_thread_count
+from agents.training import add_point, card_of, new_progress, score, use_thread_count
 from agents.training_state import surroundings
 from flockenv.cli.terminal import DIVERGED, handle_interrupt, run_program, show_progress
 from flockenv.core import signals
@@ -49,7 +50,9 @@ from flockenv.core.output_paths import check_room, valid_file, valid_path
 from flockenv.envs.table import ENVIRONMENTS
 from flockenv.evaluation import Interval, bootstrap, worlds_for
 from flockenv.jobs.ray_engine import start_ray
+from flockenv.players.independent import stack_networks
 from flockenv.players.policy import save_policy
+from flockenv.tasks import Task
 
 __all__ = ["algorithm_config", "app", "built", "evaluate", "layers", "settings_of", "start", "tensors_of", "train"]
 
@@ -57,8 +60,8 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions
 console = Console(stderr=True)
 Tensors = dict[str, np.ndarray]
 
-ONE = "default_policy"
-"""RLlib's name of the only policy of a single-agent algorithm."""
+Networks = Literal["shared", "role", "agent"]
+"""Which agents of a team share a network, see agents.rllib_envs; None: rows of the native environment share one."""
 
 NO_EQUAL: dict[str, Any] = {
     "hold": 1, "care": 0.0, "central_critic": False, "taught": 0, "critic_first": 0, "draw": {}, "action": "force",
@@ -70,7 +73,7 @@ NO_EQUAL: dict[str, Any] = {
 # --- settings ---------------------------------------------------------------------------------------------------------
 
 
-def settings_of(experiment: Experiment, team: bool, plain: bool, changes: dict[str, Any]) -> Experiment:
+def settings_of(experiment: Experiment, team: Networks | None, plain: bool, changes: dict[str, Any]) -> Experiment:
     """Return an experiment as RLlib can train it.
 
     team: with the arguments of the task's PettingZoo environment, where the experiment has none. plain: without the
@@ -89,9 +92,9 @@ def settings_of(experiment: Experiment, team: bool, plain: bool, changes: dict[s
             raise ValueError(f"ppo.{name} = {getattr(p, name)}: must be {value} with RLlib; --plain trains with that")
     experiment = experiment.model_copy(update={"arguments": arguments, "ppo": p})
     task = experiment.build()
-    if team and task.learners == 1:
+    if team is not None and task.learners == 1:
         raise ValueError(f"--team: {task.name} has one learner; train it without --team")
-    if not team and not task.ends_together:
+    if team is None and not task.ends_together:
         raise ValueError(f"{task.name}: its learners leave one by one; train it with --team")
     return experiment
 
@@ -108,7 +111,9 @@ class Actor(DefaultPPOTorchRLModule):
         torch.nn.init.constant_(self.pi.log_std, self.model_config["first_log_std"])
 
 
-def algorithm_config(experiment: Experiment, team: bool, runners: int, evaluating: bool = False) -> PPOConfig:
+def algorithm_config(
+    experiment: Experiment, team: Networks | None, runners: int, evaluating: bool = False
+) -> PPOConfig:
     """Return RLlib's settings of an experiment.
 
     evaluating: one world of the evaluation worlds instead of the training worlds, and rewards that are not scaled.
@@ -168,9 +173,9 @@ def algorithm_config(experiment: Experiment, team: bool, runners: int, evaluatin
         )
         .debugging(seed=p.seed, log_level="ERROR")
     )
-    if team:
-        policies = sorted({role(agent) for agent in task.agent_names})
-        config.multi_agent(policies=set(policies), policy_mapping_fn=role)
+    if team is not None:
+        policies = sorted({NETWORKS[team](agent) for agent in task.agent_names})
+        config.multi_agent(policies=set(policies), policy_mapping_fn=NETWORKS[team])
         actor = MultiRLModuleSpec(rl_module_specs=dict.fromkeys(policies, actor))
     return config.rl_module(rl_module_spec=actor)
 
@@ -183,7 +188,7 @@ def start() -> bool:
 
 
 @contextmanager
-def built(experiment: Experiment, team: bool, runners: int) -> Iterator[Algorithm]:
+def built(experiment: Experiment, team: Networks | None, runners: int) -> Iterator[Algorithm]:
     """Build the algorithm for a block, with its runners, on the cluster of RAY_ADDRESS or on a local Ray."""
     config = algorithm_config(experiment, team, runners)
     started = start()
@@ -240,11 +245,29 @@ def policies_of(algorithm: Algorithm) -> dict[str, Tensors]:
     return policies
 
 
+def players_of(algorithm: Algorithm, task: Task, team: Networks | None) -> dict[str, Tensors]:
+    """Return the players that an algorithm has learnt, by the ending of their file: ONE, or one of each role.
+
+    Networks of single agents are one player, as they play together only.
+    """
+    policies = policies_of(algorithm)
+    if team == "agent":
+        return {ONE: stack_networks([policies[agent] for agent in task.agent_names])}
+    return policies
+
+
+def has_score(task: Task, team: Networks | None) -> bool:
+    """Return True unless learners of different roles play against each other: the mean of their returns is no score."""
+    return team is None or len({role(agent) for agent in task.agent_names}) == 1
+
+
 # --- learn ------------------------------------------------------------------------------------------------------------
 
 
-def train(experiment: Experiment, folder: Path, team: bool = False, runners: int = 0) -> tuple[Run, dict[str, Tensors]]:
-    """Train to the end of the budget; return the run, and the last weights of each policy.
+def train(
+    experiment: Experiment, folder: Path, team: Networks | None = None, runners: int = 0
+) -> tuple[Run, dict[str, Tensors]]:
+    """Train to the end of the budget; return the run, and the last weights of each player, see `players_of`.
 
     It continues from the folder's checkpoint, if there is one.
 
@@ -266,25 +289,25 @@ def train(experiment: Experiment, folder: Path, team: bool = False, runners: int
             with show_progress(new_progress(console)) as progress:
                 bar = progress.add_task(run.recipe["task"], total=experiment.ppo.steps, completed=run.steps, score="")
                 while run.steps < experiment.ppo.steps:
-                    score_text = _iterate(algorithm, experiment, run, progress.console)
+                    score_text = _iterate(algorithm, experiment, team, run, progress.console)
                     _save(algorithm, folder, run)
                     done = min(run.steps, experiment.ppo.steps)
                     progress.update(bar, completed=done, **({"score": score_text} if score_text else {}))
-            return run, policies_of(algorithm)
+            return run, players_of(algorithm, experiment.build(), team)
 
 
-def _iterate(algorithm: Algorithm, experiment: Experiment, run: Run, out: Console) -> str:
+def _iterate(algorithm: Algorithm, experiment: Experiment, team: Networks | None, run: Run, out: Console) -> str:
     """Sample and learn once; return the score of the policy if a point of the learning curve is due, otherwise ''."""
-    p, began = experiment.ppo, time.perf_counter()
+    p, task, began = experiment.ppo, experiment.build(), time.perf_counter()
     sampled = algorithm.train()["env_runners"]["num_agent_steps_sampled_lifetime"]
     run.steps = int(sum(sampled.values()))
-    policies = policies_of(algorithm)
+    players = players_of(algorithm, task, team)
     run.wall += time.perf_counter() - began
     due = run.steps >= min(len(run.curve) * p.evaluate_every, p.steps)
-    if not due or len(policies) > 1:  # policies that play against each other have no score of their own
+    if not due or not has_score(task, team):
         return ""
-    (tensors,) = policies.values()
-    text, line = add_point(run, tensors, score(experiment.build(), p, tensors))
+    (tensors,) = players.values()
+    text, line = add_point(run, tensors, score(task, p, tensors))
     out.print(line)
     return text
 
@@ -329,7 +352,7 @@ def evaluate(experiment: Experiment, tensors: Tensors, worlds: int) -> Interval:
     task = experiment.build()
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*Overriding environment rllib", UserWarning)  # the trained one's
-        runner = SingleAgentEnvRunner(config=algorithm_config(experiment, False, 0, evaluating=True))
+        runner = SingleAgentEnvRunner(config=algorithm_config(experiment, None, 0, evaluating=True))
     _write_into(runner.module, tensors)
     episodes = runner.sample(num_episodes=worlds * task.learners, explore=False)
     runner.stop()
@@ -341,11 +364,14 @@ def evaluate(experiment: Experiment, tensors: Tensors, worlds: int) -> Interval:
 def main(
     config: Annotated[Path, typer.Argument(help="an experiment, such as configs/training/pursuit.yaml")],
     out: Annotated[
-        Path | None, typer.Option(help="default: results/rllib/TASK.safetensors; --team adds -ROLE to the name")
+        Path | None, typer.Option(help="default: results/rllib/TASK.safetensors; networks of roles add -ROLE")
     ] = None,
     runs: Annotated[Path, typer.Option(help="folder of checkpoints")] = Path("runs/rllib"),
     runners: Annotated[int, typer.Option(min=0, help="remote env runners; 0: sampling in this process")] = 0,
-    team: Annotated[bool, typer.Option("--team", help="learners as PettingZoo agents, a policy for each role")] = False,
+    team: Annotated[bool, typer.Option("--team", help="learners as PettingZoo agents, see --networks")] = False,
+    networks: Annotated[
+        Networks | None, typer.Option(help="of a --team: one that all share, one of each role, or of each agent [role]")
+    ] = None,
     plain: Annotated[bool, typer.Option("--plain", help="without the settings that RLlib's PPO does not have")] = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="start anew instead of from the checkpoint")] = False,
     check: Annotated[int, typer.Option(min=0, help="evaluation episodes that RLlib plays with the policy")] = 0,
@@ -356,10 +382,14 @@ def main(
     """Train policies with RLlib's PPO and export their weights; the same command continues an interrupted training."""
     with one_line_errors():
         changes = {k: v for k, v in (("steps", steps), ("worlds", worlds), ("seed", seed)) if v is not None}
-        experiment = settings_of(load_experiment(config), team, plain, changes)
+        if networks is not None and not team:
+            raise ValueError(f"--networks {networks}: needs --team; without it all learners share one network")
+        sharing: Networks | None = (networks or "role") if team else None
+        experiment = settings_of(load_experiment(config), sharing, plain, changes)
         name = experiment.build().name
         target = valid_file(str(out or f"results/rllib/{name}.safetensors"), (".safetensors",), True)
-        folder = valid_path(str(runs / (f"{name}-team" if team else name)), "--runs")
+        parts = [name, *["team"] * team, *[f"{networks}"] * (networks not in (None, "role"))]
+        folder = valid_path(str(runs / "-".join(parts)), "--runs")
         for path in (target, path_in(folder)):
             check_room(path, expected_bytes(experiment))
         if check == 1 or (check and team):
@@ -370,13 +400,16 @@ def main(
     interrupted = f"interrupted; checkpoints are in {folder}, run the same command to continue"
     with handle_interrupt(interrupted), one_line_errors((ValueError, CheckpointError, OSError)):
         try:
-            run, last = train(experiment, folder, team, runners)
+            run, last = train(experiment, folder, sharing, runners)
         except FloatingPointError as error:
             typer.echo(f"error: {error}; the checkpoint before it is in {folder}", err=True)
             raise typer.Exit(DIVERGED) from None
+        options = [*["--team"] * team, *[f"--networks {networks}"] * bool(networks), *["--plain"] * plain]
+        options += [f"--{name} {value}" for name, value in changes.items()]
+        command = " ".join([f"python -m agents.rllib {config.as_posix()}", *options])
         for policy, tensors in ({ONE: run.tensors} if run.tensors else last).items():
             path = target.with_stem(f"{target.stem}-{policy}") if len(last) > 1 else target
-            card = {**card_of(run, "RLlib", command_of(run.recipe, "agents.rllib")), "runners": runners}
+            card = {**card_of(run, "RLlib", command), "runners": runners}
             if check:
                 found = evaluate(experiment, tensors, check)
                 card["rllib_evaluation"] = {"episodes": check, "iqm": found.value, "ci": [found.low, found.high]}

@@ -12,7 +12,7 @@ from flockenv.envs import parallel, vector
 from flockenv.jit.thread_pool import use_threads
 from flockenv.tasks import TASKS, Task
 
-__all__ = ["EVALUATION_SEEDS", "RowsEnv", "Settings", "TeamEnv", "role"]
+__all__ = ["EVALUATION_SEEDS", "NETWORKS", "ONE", "RowsEnv", "Settings", "TeamEnv", "own", "role", "shared"]
 
 EVALUATION_SEEDS = 1_000_000
 """RLlib adds it to the seed of runners that evaluate."""
@@ -90,6 +90,24 @@ class TeamEnv(ParallelPettingZooEnv):
         return observation, {name: value * self._settings["reward_scale"] for name, value in reward.items()}, *rest
 
 
+ONE = "default_policy"
+"""RLlib's name of the policy of all agents, if there is one."""
+
+
+def shared(agent: str, *_: Any, **__: Any) -> str:
+    """Return the policy of an agent: the one of all agents."""
+    return ONE
+
+
 def role(agent: str, *_: Any, **__: Any) -> str:
     """Return the policy of an agent: that of its role, such as pursuer for pursuer_0."""
     return agent.rsplit("_", 1)[0]
+
+
+def own(agent: str, *_: Any, **__: Any) -> str:
+    """Return the policy of an agent: its own, of the agent's name."""
+    return agent
+
+
+NETWORKS = {"shared": shared, "role": role, "agent": own}
+"""Which agents of a team share a network, by name: the function that returns an agent's policy."""

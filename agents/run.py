@@ -184,7 +184,7 @@ def _fault(notes: Notes, times: Times, best: dict[str, np.ndarray], experiment: 
         return f"notes: best = {notes.best} is not the best of the curve"
     if best or reached:
         try:
-            policy = MlpPolicy(best, {"activation": experiment.ppo.activation})
+            policy = MlpPolicy.of_tensors(best, {"activation": experiment.ppo.activation})
         except (ValueError, KeyError) as error:
             return f"best: {error}"
         if policy.observation_size != experiment.build().layout.size:

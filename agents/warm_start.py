@@ -26,8 +26,9 @@ def starting_policy(spec: str, task: Task, hidden: tuple[int, ...], activation: 
         ValueError: in one line, there is no such policy, it has another network, or it observes something else.
     """
     policy = MlpPolicy.load(start_path(spec, task))
-    if "squash" in policy.card or isinstance(policy, RecurrentPolicy):
-        raise ValueError(f"ppo.start = {printable(spec)}: its actor is squashed or recurrent, must be one of PPO's")
+    if "squash" in policy.card or policy.learners or isinstance(policy, RecurrentPolicy):
+        what = "is squashed, recurrent or of several networks"
+        raise ValueError(f"ppo.start = {printable(spec)}: its actor {what}, must be one of PPO's")
     mine = (tuple(len(bias) for _, bias in policy.layers[:-1]), policy.card["activation"])
     if mine != (hidden, activation):
         raise ValueError(f"ppo.start = {printable(spec)}: its network is {mine}, must be {(hidden, activation)}")

@@ -24,7 +24,7 @@ TIMERS = {"sampling": "env_runner_sampling_timer", "learning": "learner_update_t
 
 def sample(experiment: Experiment, runners: int, seconds: float) -> dict[str, Any]:
     """Return agent-steps per second, and seconds per iteration of sampling and of learning."""
-    with built(experiment, False, runners) as algorithm:
+    with built(experiment, None, runners) as algorithm:
         first = _agent_steps(algorithm.train())
         began, result = time.perf_counter(), {}
         while (took := time.perf_counter() - began) < seconds or not result:
@@ -45,7 +45,7 @@ def main(
     out: Annotated[Path, typer.Option(help="File for all samples.")] = Path("results/benchmarks/rllib.json"),
 ) -> None:
     """Measure how many agent-steps RLlib's PPO learns from per second."""
-    experiment = settings_of(load_experiment(CONFIGS / f"{task}.yaml"), False, True, {})
+    experiment = settings_of(load_experiment(CONFIGS / f"{task}.yaml"), None, True, {})
     start()
     counts = runners or [0, 1, 2]
     samples: dict[int, list[dict[str, Any]]] = {count: [] for count in counts}

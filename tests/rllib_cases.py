@@ -23,11 +23,12 @@ from typer.testing import CliRunner
 
 from agents import compare, rllib
 from agents.experiment import CONFIGS, load_experiment
+from agents.play import players_in_order
 from agents.rllib_envs import RowsEnv
 from agents.run import Run, load_checkpoint
 from flockenv.envs.vector import CrossingVectorEnv
 from flockenv.players.policy import MlpPolicy
-from flockenv.tasks import Crossing, Pursuit
+from flockenv.tasks import Crossing, Herd, Pursuit
 
 SMALL = """
 task: {task}
@@ -91,12 +92,13 @@ def settings_without_an_equal_are_refused_in_one_line() -> None:
         "school: its learners leave one by one; train it with --team": (str(CONFIGS / "school.yaml"), "--plain"),
         "--check 1: at least 2 episodes, and not with --team": (config, "--check", "1"),
         "--runners 3: must divide ppo.worlds = 16": (config, "--runners", "3"),
+        "--networks agent: needs --team; without it all learners share one network": (config, "--networks", "agent"),
     }.items():
         code, output = command(*arguments)
         lines = [line for line in output.splitlines() if "WARNING" not in line]
         assert (code, lines) == (2, [f"error: {text}"]), output
     assert not Path("results").exists() and not list(Path().rglob("rllib-*"))
-    plain = rllib.settings_of(load_experiment(CONFIGS / "bottleneck.yaml"), False, True, {})
+    plain = rllib.settings_of(load_experiment(CONFIGS / "bottleneck.yaml"), None, True, {})
     assert plain.ppo.care == 0 and plain.ppo.gamma == 0.98
 
 
@@ -127,7 +129,7 @@ def an_exported_policy_acts_as_in_rllib() -> None:
     experiment = load_experiment("pursuit.yaml")
     run = load_checkpoint(experiment, Path("runs/rllib/pursuit"), state=())
     assert run is not None
-    runner = SingleAgentEnvRunner(config=rllib.algorithm_config(experiment, False, 0))
+    runner = SingleAgentEnvRunner(config=rllib.algorithm_config(experiment, None, 0))
     rllib._write_into(runner.module, run.tensors)
     for episode in runner.sample(num_timesteps=2000, explore=False):
         seen, acted = episode.get_observations()[:-1], np.clip(episode.get_actions(), -1, 1)
@@ -157,8 +159,8 @@ def an_interrupted_training_continues() -> None:
     assert first is not None and 1000 <= first.steps < 20_000
     steps, iterate = [], rllib._iterate
 
-    def noted(algorithm: Any, experiment: Any, run: Run, out: Any) -> str:
-        text = iterate(algorithm, experiment, run, out)
+    def noted(algorithm: Any, experiment: Any, team: Any, run: Run, out: Any) -> str:
+        text = iterate(algorithm, experiment, team, run, out)
         steps.append(run.steps)
         return text
 
@@ -183,8 +185,8 @@ def pursuers_and_evaders_learn_a_policy_each() -> None:
     task = Pursuit(pursuers=3, evaders=2, sides="both")
     policies = {name: MlpPolicy.load(f"p-{name}.safetensors", task) for name in ("pursuer", "evader")}
     rows = np.random.default_rng(0).uniform(-1, 1, (100, task.layout.size)).astype(np.float32)
-    experiment = rllib.settings_of(load_experiment("pursuit.yaml"), True, False, {"worlds": 2})
-    with rllib.built(experiment, True, 0) as algorithm:
+    experiment = rllib.settings_of(load_experiment("pursuit.yaml"), "role", False, {"worlds": 2})
+    with rllib.built(experiment, "role", 0) as algorithm:
         algorithm.restore_from_path(next(Path("runs/rllib/pursuit-team").resolve().glob("rllib-*")))
         for name, policy in policies.items():
             module = algorithm.get_module(name)
@@ -196,6 +198,33 @@ def pursuers_and_evaders_learn_a_policy_each() -> None:
     assert np.abs(acted[0] - acted[1]).max() > 0.1
 
 
+def agents_of_a_team_learn_a_network_each_which_play_in_the_comparison() -> None:
+    """They are one player: each learner acts as its own module, and their mean return is the learning curve."""
+    options = ["--team", "--networks", "agent", "--worlds", "2", "--steps", "3000", "--out", "p.safetensors"]
+    code, output = command(small("herd"), *options)
+    assert code == 0, output
+    task, card = Herd(dogs=2), read("p.json")
+    assert card["networks"] == 2 and card["tuning_mean"] == max(point["mean"] for point in card["curve"])
+    expected = "python -m agents.rllib herd.yaml --team --networks agent --steps 3000 --worlds 2"
+    assert card["recipe"]["command"] == expected
+    experiment = rllib.settings_of(load_experiment("herd.yaml"), "agent", False, {"worlds": 2, "steps": 3000})
+    run = load_checkpoint(experiment, Path("runs/rllib/herd-team-agent"), state=())
+    assert run is not None and len(run.curve) > 1
+    rows = np.random.default_rng(0).uniform(-1, 1, (100, task.layout.size)).astype(np.float32)
+    with rllib.built(experiment, "agent", 0) as algorithm:
+        algorithm.restore_from_path(next(Path("runs/rllib/herd-team-agent").resolve().glob("rllib-*")))
+        last = rllib.players_of(algorithm, task, "agent")[rllib.ONE]
+        acted = MlpPolicy.of_tensors(last, {"activation": "tanh"}).predict(rows, deterministic=True)[0]
+        for k, name in enumerate(task.agent_names):
+            with torch.no_grad():
+                outputs = algorithm.get_module(name).forward_inference({Columns.OBS: torch.from_numpy(rows[k::2])})
+            mean = np.clip(outputs[Columns.ACTION_DIST_INPUTS].numpy()[:, :2], -1, 1)
+            assert np.abs(acted[k::2] - mean).max() < 1e-5
+    assert np.abs(last["action.weight"][0] - last["action.weight"][1]).max() > 0.01
+    results, _ = compare.compare([task], players_in_order(["random", "p.safetensors"]), worlds=4, resamples=100)
+    assert results["tasks"]["herd"]["players"].keys() == {"random", "p"}
+
+
 CASES = (
     rows_are_those_of_the_native_environment,
     settings_without_an_equal_are_refused_in_one_line,
@@ -203,6 +232,7 @@ CASES = (
     an_exported_policy_acts_as_in_rllib,
     an_interrupted_training_continues,
     pursuers_and_evaders_learn_a_policy_each,
+    agents_of_a_team_learn_a_network_each_which_play_in_the_comparison,
 )
 
 if __name__ == "__main__":

@@ -14,8 +14,14 @@ import numpy as np
 import pytest
 from safetensors.numpy import save
 
+from agents.invasion import jobs_of
+from agents.play import Player
+from agents.warm_start import starting_policy
 from flockenv.core.warnings import OtherTaskWarning
-from flockenv.players.policy import MlpPolicy, Policy, RandomPolicy, describe, save_policy
+from flockenv.evaluation import rollout
+from flockenv.players import load_player
+from flockenv.players.independent import stack_networks
+from flockenv.players.policy import MlpPolicy, OtherSlotsError, Policy, RandomPolicy, describe, save_policy
 from flockenv.tasks import TASKS, Corridor, Crossing, Flock, Pursuit, Task
 
 TASK: Any = SimpleNamespace(
@@ -72,6 +78,55 @@ def test_random_player_is_uniform_reproducible_and_records_its_seed() -> None:
     assert RandomPolicy(3, 0).predict(rows[0])[0].shape == (3,)
     with pytest.raises(ValueError, match="action_size: 0"):
         RandomPolicy(0)
+
+
+# --- networks of single learners
+
+
+def independent(path: Path, task: Task, count: int) -> list[dict[str, np.ndarray]]:
+    """Write a policy of several networks for a task; return the tensors of each."""
+    networks = [tensors((task.layout.size, 7, 6, task.action_layout.size), seed) for seed in range(count)]
+    save_policy(path, stack_networks(networks), {"activation": "tanh", **describe(task)})
+    return networks
+
+
+def test_each_learner_acts_by_its_own_network(tmp_path: Path) -> None:
+    task = Crossing(agents=3)
+    networks = independent(tmp_path / "p.safetensors", task, 3)
+    policy = MlpPolicy.load(tmp_path / "p.safetensors", task)
+    assert policy.card["networks"] == policy.learners == 3 and policy.differences == ()
+    rows = np.random.default_rng(0).uniform(-1, 1, (12, task.layout.size)).astype(np.float32)
+    actions, state = policy.predict(rows, deterministic=True)
+    for k, network in enumerate(networks):
+        alone = MlpPolicy(network, CARD).predict(rows[k::3], deterministic=True)[0]
+        np.testing.assert_array_equal(actions[k::3], alone)
+    assert state is None and np.abs(actions[0::3] - actions[1::3]).max() > 0.1
+    sampled = policy.predict(rows)[0]
+    assert len(np.unique(sampled - actions)) > 12, "the networks' samples are not the same numbers"
+
+
+def test_networks_of_single_learners_play_rows_of_whole_worlds_only(tmp_path: Path) -> None:
+    task = Crossing(agents=3, horizon=10)
+    independent(tmp_path / "p.safetensors", task, 3)
+    policy = load_player(tmp_path / "p.safetensors", task)
+    for rows in (np.zeros((4, task.layout.size)), np.zeros(task.layout.size)):
+        with pytest.raises(ValueError, match=r"must have a row for each of 3 learners, whose networks differ"):
+            policy.predict(rows)
+    assert rollout(task, policy, 2, 0).worlds == 2
+    with pytest.raises(OtherSlotsError, match="has a network for each of 3 learners, task 'crossing' has 4"):
+        load_player(tmp_path / "p.safetensors", Crossing(agents=4))
+    player = Player.of(str(tmp_path / "p.safetensors"))
+    with pytest.raises(ValueError, match="player 'p': has a network for each learner, which play together only"):
+        jobs_of(task, [player], 2)
+    with pytest.raises(ValueError, match="its actor is squashed, recurrent or of several networks"):
+        starting_policy(player.spec, task, (7, 6), "tanh")
+
+
+@pytest.mark.parametrize("name", ["policy.0.weight", "log_std"])
+def test_tensors_of_different_numbers_of_networks_are_refused(name: str) -> None:
+    several = stack_networks([tensors(), tensors(seed=1)])
+    with pytest.raises(ValueError, match=f"tensor '{name}' is of 1 networks, 'action.bias' of 2"):
+        MlpPolicy.of_tensors({**several, name: several[name][:1]}, CARD)
 
 
 # --- the actor in numpy

@@ -20,6 +20,7 @@ CASES = (
     "an_exported_policy_acts_as_in_rllib",
     "an_interrupted_training_continues",
     "pursuers_and_evaders_learn_a_policy_each",
+    "agents_of_a_team_learn_a_network_each_which_play_in_the_comparison",
 )
 
 

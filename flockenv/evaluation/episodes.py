@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flockenv.envs.world import Step, World
+from flockenv.players.independent import IndependentPolicy
 from flockenv.players.policy import Policy
 
 if TYPE_CHECKING:
@@ -297,7 +298,9 @@ class _Film:
 
 
 def _latency(policy: Policy, row: NDArray[np.float32], deterministic: bool) -> float:
-    """Return the median time of a decision for one agent, as on a single robot, in us."""
+    """Return the median time of a decision for one agent, as on a single robot, in us; by its own network if it has."""
+    if isinstance(policy, IndependentPolicy):
+        policy = policy.networks[0]
     times = []
     for _ in range(LATENCY_CALLS):
         start = perf_counter()

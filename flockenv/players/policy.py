@@ -56,7 +56,7 @@ LARGEST_CARD, LARGEST_WEIGHTS = 8 << 20, 256 << 20
 
 
 class OtherSlotsError(ValueError):
-    """The observations of a task have other slots than those that a policy was trained on."""
+    """The observations of a task have other slots than those that a policy was trained on, or it has other learners."""
 
 
 @runtime_checkable
@@ -139,6 +139,8 @@ class MlpPolicy:
         self.seed, self._generator = _new_generator(seed)
         self.differences: tuple[str, ...] = ()
         """Differences between the task that it plays and the one that it was trained on, a phrase each."""
+        self.learners: int | None = None
+        """Number of learners of a world, if each has a network of its own."""
 
     @property
     def layers(self) -> list[Layer]:
@@ -164,6 +166,7 @@ class MlpPolicy:
             card = read_card(path.with_suffix(".json"))
             policy = cls._of_card(_read_tensors(path, card), card, task, seed)
             _check_sizes(policy)
+            _check_learners(policy, task)
             policy.differences = () if task is None else _differences(card, task)
         except ValueError as error:
             kind = OtherSlotsError if isinstance(error, OtherSlotsError) else ValueError
@@ -187,9 +190,15 @@ class MlpPolicy:
 
     @staticmethod
     def of_tensors(tensors: Mapping[str, NDArray[Any]], card: Mapping[str, Any], seed: int | None = 0) -> MlpPolicy:
-        """Return the policy of some tensors, with an LSTM if they contain one; the card's hybrid is left out."""
-        from flockenv.players.recurrent import RecurrentPolicy, has_lstm  # a layer above this file
+        """Return the policy of some tensors: one network, with an LSTM or not, or one for each learner.
 
+        The card's hybrid is left out.
+        """
+        from flockenv.players.independent import IndependentPolicy, has_networks  # layers above this file
+        from flockenv.players.recurrent import RecurrentPolicy, has_lstm
+
+        if has_networks(tensors):
+            return IndependentPolicy(tensors, card, seed)
         return (RecurrentPolicy if has_lstm(tensors) else MlpPolicy)(tensors, card, seed)
 
     def predict(
@@ -262,6 +271,7 @@ def save_policy(path: str | os.PathLike[str], tensors: Mapping[str, NDArray[Any]
         "sha256": hashlib.sha256(data).hexdigest(),
         "observation_size": policy.observation_size,
         "action_size": policy.action_size,
+        **({"networks": policy.learners} if policy.learners else {}),
     }
     for key in derived.keys() & card.keys() - {"sha256"}:
         if card[key] != derived[key]:
@@ -319,6 +329,13 @@ def _check_sizes(policy: MlpPolicy) -> None:
     for key, size in {"observation_size": policy.observation_size, "action_size": policy.action_size}.items():
         if policy.card[key] != size:
             raise ValueError(f"the card says {key} = {policy.card[key]!r}, the weights are for {size}")
+
+
+def _check_learners(policy: MlpPolicy, task: Task | None) -> None:
+    """Raise OtherSlotsError if a policy has a network for each learner, and the task has another number of them."""
+    if task is not None and policy.learners is not None and policy.learners != task.learners:
+        text = f"has a network for each of {policy.learners} learners, task {task.name!r} has {task.learners}"
+        raise OtherSlotsError(text)
 
 
 def describe(task: Task) -> dict[str, Any]:
