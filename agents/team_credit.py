@@ -2,7 +2,7 @@
 
 Each learner has its own reward and a critic of its own return; the advantages are shared. A critic of the team's return
 would have to find the effect of a learner's own hunger in a sum of eight returns, where it is lost in the unexplained
-variance, and such learners starve (docs/players.md). The sum of eight critics is a critic of the sum (value
+variance, and such learners starve (docs/history/players.md). The sum of eight critics is a critic of the sum (value
 decomposition, Sunehag et al. 2018), and finds that effect.
 """
 

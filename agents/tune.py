@@ -27,6 +27,7 @@ from flockenv.core.output_paths import check_room, valid_file, valid_path
 from flockenv.jobs import Store, Work, engine_of
 from flockenv.players import PUBLISHED
 from flockenv.players.rules import PLAYERS, TUNED, read_tuned
+from flockenv.players.rules.parameter import beyond
 from flockenv.tasks import Task
 
 __all__ = ["app", "content_of", "found_of", "write"]
@@ -109,9 +110,15 @@ def _show(found: Sequence[Found], target: Path) -> None:
         )
     ships = median_of(found)
     if ships.at_bounds:
-        ends = ", ".join(f"{name} = {end:g}" for name, end in ships.at_bounds.items())
-        console.print(f"on a bound of its range: {ends}")
+        console.print(f"on a bound of its range: {', '.join(_bound(ships, name) for name in ships.at_bounds)}")
     console.print(f"{target}: seed {ships.seed}, the median of {len(found)}: {json.dumps(ships.parameters)}")
+
+
+def _bound(found: Found, name: str) -> str:
+    """Return a parameter at a bound, and why that bound is natural, if it is."""
+    end = found.at_bounds[name]
+    more = beyond(PLAYERS[found.player][found.task][1], name, end)
+    return f"{name} = {end:g} ({f'natural: {more}' if more else 'a wider range may have a better value'})"
 
 
 @app.command()

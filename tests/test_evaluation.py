@@ -150,6 +150,26 @@ def test_a_policy_is_passed_all_rows_its_own_state_and_episode_starts() -> None:
         assert deterministic is False
 
 
+def test_rows_of_ended_worlds_are_left_out_if_each_row_stands_alone() -> None:
+    class Alone(Constant):
+        each_row_alone = True
+
+        def predict(self, observation: Any, *rest: Any) -> Any:
+            super().predict(observation, *rest)
+            return observation[:, :1] / 20.0, None
+
+    policy, everywhere = Alone(), Alone()
+    everywhere.each_row_alone = False
+    found, whole = (rollout(Toy(), each, 6, 10, make_world=ToyWorld) for each in (policy, everywhere))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(found.returns, whole.returns)
+    np.testing.assert_array_equal(found.lengths, whole.lengths)
+    for k, (rows, _, starts, _) in enumerate(policy.calls[module.LATENCY_CALLS :]):
+        running = [seed for seed in range(10, 16) if k < 2 + seed % 3]
+        np.testing.assert_array_equal(rows[:, 0], np.repeat(running, 2))
+        assert len(starts) == len(rows)
+    assert all(len(call[0]) == 12 for call in everywhere.calls[module.LATENCY_CALLS :])
+
+
 def test_actions_reach_their_learners_in_order() -> None:
     worlds: list[ToyWorld] = []
 

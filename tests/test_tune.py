@@ -154,6 +154,15 @@ def test_a_best_value_on_a_bound_is_reported(tmp_path: Path, monkeypatch: pytest
     assert {"gain": 12.0, "slow_radius": 0.01}.items() <= found.at_bounds.items()
 
 
+def test_a_bound_is_printed_with_what_lies_beyond_it_if_it_is_natural(capsys: pytest.CaptureFixture[str]) -> None:
+    found = replace(found_with(0, 1.0), task="crossing", player="orca", at_bounds={"margin": 0.0, "gain": 20.0})
+    tune._show([found], Path("crossing.json"))
+    assert (
+        "on a bound of its range: margin = 0 (natural: below it, bodies touch), "
+        "gain = 20 (a wider range may have a better value)"
+    ) in capsys.readouterr().err
+
+
 def test_a_search_has_the_agent_steps_of_ppo_unless_the_config_says_otherwise() -> None:
     assert Search(SMALL, "rules", 0).budget == 100
     own = SMALL.model_copy(update={"search": SMALL.search.model_copy(update={"steps": 77})})

@@ -103,7 +103,7 @@ class Episodes:
     lengths: NDArray[np.int64]  # control steps
     terms: Mapping[str, Floats]  # reward term -> its share of the return
     metrics: Mapping[str, Floats]  # NaN if a metric does not apply (such as the time to a capture that did not happen)
-    microseconds: float  # per decision, for all worlds and learners at once, median over steps
+    microseconds: float  # per decision, for at least half of the worlds at once, median over steps
     latency: float  # us for a call with a single row, median
     recording: Recording | None = None
 
@@ -144,6 +144,7 @@ def rollout(
 
     The policy receives (worlds * learners, O) rows at once, with the learners of a world next to each other. Worlds
     that have ended are still stepped and passed to it, so that a policy may keep a state per row, but no longer count.
+    A policy with a true attribute `each_row_alone` does not receive their rows.
 
     Args:
         task: the task to play, for at most `task.horizon` control steps.
@@ -192,7 +193,7 @@ def _play(
 ) -> None:  # fmt: skip
     """Step all worlds with the policy's actions until the last episode has ended; RuntimeError if one does not end."""
     for number in range(1, task.horizon + 1):
-        step = world.step(pilot.act(observation, task.action_layout.size))
+        step = world.step(pilot.act(observation, task.action_layout.size, ledger.running))
         running = ledger.enter(step, world.measure)
         film.take(running, ledger.returns)
         observation = step.observation
@@ -219,21 +220,27 @@ class _Pilot:
 
     def __init__(self, policy: Policy, deterministic: bool) -> None:
         self._policy, self._deterministic = policy, deterministic
+        self._each_row_alone = bool(getattr(policy, "each_row_alone", False))
         self._state: Any = None
         self._times: list[float] = []  # us per row, one entry per call
 
-    def act(self, observation: NDArray[np.float32], action_size: int) -> NDArray[Any]:
-        """Return the actions (B, L, A) for observations (B, L, O)."""
-        rows = observation.reshape(-1, observation.shape[-1])
+    def act(self, observation: NDArray[np.float32], action_size: int, running: NDArray[np.bool_]) -> NDArray[Any]:
+        """Return the actions (B, L, A) for observations (B, L, O); zeros for worlds that are left out."""
+        chosen = running if self._each_row_alone else slice(None)
+        rows = observation[chosen].reshape(-1, observation.shape[-1])
         starts = np.full(len(rows), not self._times)
         start = perf_counter()
         with _exit_as_error():
             action, self._state = self._policy.predict(rows, self._state, starts, self._deterministic)
-        self._times.append(1e6 * (perf_counter() - start) / len(rows))
+        took = perf_counter() - start
+        if 2 * rows.size >= observation.size:  # fewer rows take longer, each
+            self._times.append(1e6 * took / len(rows))
         action = np.asarray(action)
         if action.shape != (len(rows), action_size):
             raise ValueError(f"policy: actions of shape {action.shape}, must be {(len(rows), action_size)}")
-        return action.reshape(*observation.shape[:-1], action_size)
+        actions = np.zeros((*observation.shape[:-1], action_size), action.dtype)
+        actions[chosen] = action.reshape(-1, *actions.shape[1:])
+        return actions
 
     @property
     def microseconds(self) -> float:

@@ -32,7 +32,7 @@ class Slot:
     entity: str = ""  # kind of agent or obstacle that each entry of the first axis describes; zeros: there is none
     nearest: bool = False  # all its numbers describe the first entity of that kind
 
-    @property
+    @functools.cached_property
     def size(self) -> int:
         """Numbers in the slot."""
         return math.prod(self.shape)

@@ -3,8 +3,7 @@
 Each receives the learner's observation and nothing else, and its force has the same limits. Two kinds of names:
 
 * `rules`, and of some tasks `orca`, `heuristics`, `queueing`: other functions; all with the parameters that a search
-  found (`python -m agents.tune`; evade's and path_follow's by another random search), in
-  ../tuned/TASK.json;
+  found, in ../tuned/TASK.json (`python -m agents.tune`);
 * `textbook`, `orca_published`, `heuristics_published`, `queueing_published`: the same functions with published
   parameters, the defaults in the files; in evade, obstacles and path_follow, `textbook` is another function than
   `rules`.
@@ -40,6 +39,7 @@ from flockenv.players.rules import (
     school,
 )
 from flockenv.players.rules.parameter import Order
+from flockenv.players.rules.vectors import length
 from flockenv.tasks import Task
 
 __all__ = ["PLAYERS", "RULES", "TUNED", "RulesPlayer", "Tuned", "as_dict", "load_tuned", "player", "read_tuned"]
@@ -136,13 +136,18 @@ class RulesPlayer:
             force = steer(see, self.task, self.rules, **ordered)
         strongest = self.task.action_layout.slots[0].scale
         share = force / strongest
-        length = np.maximum(np.linalg.norm(share, axis=-1, keepdims=True), 1.0)
-        return (share / length).astype(np.float32), state
+        size = np.maximum(length(share)[..., None], 1.0)
+        return (share / size).astype(np.float32), state
 
     @property
     def function(self) -> Callable[..., Any]:
         """The function of a file in this folder."""
         return PLAYERS[self.name][self.task.name][0]
+
+    @property
+    def each_row_alone(self) -> bool:
+        """True if an action depends on its own row alone; `rollout` leaves out the rows of worlds that have ended."""
+        return self.function not in REMEMBERING
 
     @property
     def behaviours(self) -> tuple[str, ...]:

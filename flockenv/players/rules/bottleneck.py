@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from flockenv import steering
 from flockenv.players.rules.parameter import parameter, per_row
+from flockenv.players.rules.vectors import length
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Bottleneck
 
@@ -26,7 +27,7 @@ class BottleneckRules:
     """Textbook: Helbing, Farkas and Vicsek 2000; the contact forces of bodies and walls are the scene's."""
 
     tau: float = parameter(0.5, 0.1, 1.5)  # s, relaxation time
-    speed: float = parameter(1.0, 0.2, 1.0)  # desired speed as a share of the top speed
+    speed: float = parameter(1.0, 0.2, 1.0, above="it exceeds the limit")  # desired speed as a share of the top speed
     strength: float = parameter(2000.0, 0.0, 4000.0)  # A, N
     decay: float = parameter(0.08, 0.02, 0.5)  # B, m
     walls: float = parameter(2000.0, 0.0, 4000.0)  # A of walls, N
@@ -53,7 +54,7 @@ def _exit_direction(see: Any, task: Bottleneck) -> NDArray[np.float64]:
     half = max(task.width / 2 - 1.2 * _PERSON, 0.0)
     sideways = see.door[:, 1] - np.clip(see.door[:, 1], -half, half)
     offset = np.stack([np.maximum(see.door[:, 0], 0.0) + 0.1, sideways], axis=-1)
-    direction: NDArray[np.float64] = offset / np.linalg.norm(offset, axis=-1)[:, None]
+    direction: NDArray[np.float64] = offset / length(offset)[:, None]
     return direction
 
 
@@ -74,7 +75,7 @@ def queueing(see: Any, task: Bottleneck, p: QueueingRules) -> NDArray[np.float64
     others = see.velocity[:, None] + see.neighbour_velocity
     gap = queue_gap(direction[:, None], see.neighbours, others, 2 * _PERSON + per_row(p.margin), task.max_speed)
     gap = np.where(present, gap, np.inf).min(axis=1).clip(max=1e3)
-    near = present & (np.linalg.norm(see.neighbours, axis=-1) < per_row(p.radius))
+    near = present & (length(see.neighbours) < per_row(p.radius))
     push = per_row(p.apart) * np.sum(separate(see.neighbours, np.array([1.0, 0.0])) * near[..., None], axis=1)
     force: NDArray[np.float64] = (
         80.0 * per_row(p.gain) * queue(direction, see.velocity, gap, task.max_speed, p.headway) + push

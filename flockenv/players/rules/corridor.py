@@ -66,7 +66,7 @@ class CorridorOrcaRules:
     """ORCA: as published, each agent makes half of the change; a desired velocity that is not free is turned right."""
 
     horizon: float = parameter(2.0, 0.5, 6.0)  # s, for which the velocity must be free of collisions
-    margin: float = parameter(0.05, 0.0, 0.5)  # m, clearance for delays by inertia
+    margin: float = parameter(0.05, 0.0, 0.5, below="bodies touch")  # m, clearance for delays by inertia
     turn: float = parameter(0.3, 0.0, 1.5)  # rad, a desired velocity that is not free is turned right by this
     gain: float = parameter(10.0, 1.0, 20.0)  # kg/s: reaches the desired velocity within a decision
 

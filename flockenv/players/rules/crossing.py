@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from flockenv import steering
 from flockenv.players.rules.clearance import keep_clear
 from flockenv.players.rules.parameter import Order, in_order, parameter, per_row
+from flockenv.players.rules.vectors import length
 from flockenv.steering import arbitration
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Crossing
@@ -35,7 +36,7 @@ class CrossingRules:
     radius: float = parameter(1.0, 0.6, 2.0)  # m, neighbours nearer than this push
     apart: float = parameter(0.0, 0.0, 4.0)  # N m, separation
     gain: float = parameter(2.0, 0.5, 6.0)  # kg/s towards the goal
-    speed: float = parameter(1.0, 0.5, 1.0)  # desired speed as a share of the top speed
+    speed: float = parameter(1.0, 0.5, 1.0, above="it exceeds the limit")  # desired speed as a share of the top speed
     slow_radius: float = parameter(0.8, 0.1, 2.0)  # m, slow down within this of the goal
 
 
@@ -55,7 +56,7 @@ def crossing(see: Any, task: Crossing, p: CrossingRules, order: Order = None) ->
     nearness = 1.0 - np.where(danger, soonest, p.horizon) / p.horizon
     strength = p.evade * (1.0 - p.urgency * (1.0 - nearness)) * danger
     away = give_way(see.neighbours[row, first], see.velocity, others[row, first], np.where(danger, soonest, 0.0), 1.0)
-    near = see.neighbour_present * (np.linalg.norm(see.neighbours, axis=-1) < per_row(p.radius))
+    near = see.neighbour_present * (length(see.neighbours) < per_row(p.radius))
     push = per_row(p.apart) * np.sum(separate(see.neighbours, np.array([1.0, 0.0])) * near[..., None], axis=1)
     course = per_row(p.gain) * arrive(see.goal, see.velocity, p.speed * task.max_speed, p.slow_radius)
     forces = np.stack([away * strength[:, None], push, course], axis=1)
@@ -67,7 +68,7 @@ class OrcaRules:
     """ORCA: as published, each agent makes half of the change; without turning right, twelve agents deadlock."""
 
     horizon: float = parameter(2.0, 0.5, 6.0)  # s, for which the velocity must be free of collisions
-    margin: float = parameter(0.1, 0.0, 0.8)  # m, clearance for delays by inertia
+    margin: float = parameter(0.1, 0.0, 0.8, below="bodies touch")  # m, clearance for delays by inertia
     turn: float = parameter(0.3, 0.0, 1.5)  # rad, a desired velocity that is not free is turned right by this
     gain: float = parameter(10.0, 1.0, 20.0)  # kg/s: reaches the desired velocity within a decision
     slow_radius: float = parameter(1.0, 0.1, 2.0)  # m, slow down within this of the goal

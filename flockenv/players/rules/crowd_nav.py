@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from flockenv import steering
 from flockenv.players.rules.clearance import keep_clear
 from flockenv.players.rules.parameter import parameter, per_row
+from flockenv.players.rules.vectors import length
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import CrowdNav
 
@@ -26,7 +27,7 @@ class CrowdNavRules:
     """Textbook: Moussaid et al. 2009, the model of the pedestrians themselves."""
 
     tau: float = parameter(0.54, 0.15, 1.0)  # s, relaxation time
-    speed: float = parameter(1.0, 0.5, 1.0)  # desired speed as a share of the top speed
+    speed: float = parameter(1.0, 0.5, 1.0, above="it exceeds the limit")  # desired speed as a share of the top speed
     strength: float = parameter(4.5, 0.5, 20.0)  # A, m/s^2
     importance: float = parameter(2.0, 0.0, 4.0)  # lambda, s/m, of velocities against positions
     gamma: float = parameter(0.35, 0.05, 1.5)  # s, range of the force per m/s of closing speed
@@ -42,7 +43,7 @@ def crowd_nav(see: Any, task: CrowdNav, p: CrowdNavRules) -> NDArray[np.float64]
         see.neighbours, own, own + see.neighbour_velocity, np.array([1.0, 0.0]),
         *map(per_row, (p.importance, p.gamma, p.angular, p.forward, p.bias)),
     )  # fmt: skip
-    direction = see.goal / np.maximum(np.linalg.norm(see.goal, axis=-1), 1e-9)[:, None]
+    direction = see.goal / np.maximum(length(see.goal), 1e-9)[:, None]
     push = per_row(p.strength) * np.sum(sidesteps * see.neighbour_present[..., None], axis=1)
     force: NDArray[np.float64] = (per_row(p.speed) * task.max_speed * direction - see.velocity) / per_row(p.tau) + push
     return force
@@ -53,7 +54,7 @@ class RobotOrcaRules:
     """ORCA as published, but for the share: a robot that the pedestrians do not see must make the whole change."""
 
     horizon: float = parameter(2.0, 0.5, 6.0)  # s, for which the velocity must be free of collisions
-    margin: float = parameter(0.1, 0.0, 0.8)  # m, clearance for delays by inertia
+    margin: float = parameter(0.1, 0.0, 0.8, below="bodies touch")  # m, clearance for delays by inertia
     turn: float = parameter(0.0, 0.0, 1.5)  # rad, a desired velocity that is not free is turned right by this
     gain: float = parameter(10.0, 1.0, 20.0)  # kg/s: reaches the desired velocity within a decision
     share: float = parameter(1.0, 0.5, 1.0)  # the robot's part of the change; 0.5 if pedestrians see it
@@ -77,24 +78,25 @@ class HeuristicsRules:
 
 def heuristics_crowd_nav(see: Any, task: CrowdNav, p: HeuristicsRules) -> NDArray[np.float64]:
     """Take the most direct free direction, no faster than is safe (Moussaid, Helbing and Theraulaz 2011)."""
-    aim = see.goal / np.maximum(np.linalg.norm(see.goal, axis=-1), 1e-9)[:, None]
-    speed, reach = np.linalg.norm(see.velocity, axis=-1)[:, None], per_row(p.reach)
+    aim = see.goal / np.maximum(length(see.goal), 1e-9)[:, None]
+    speed, reach = length(see.velocity)[:, None], per_row(p.reach)
     gaze = np.where(speed > 0.05, see.velocity / np.maximum(speed, 1e-9), aim)
     turn = np.radians(np.linspace(-p.view, p.view, 31).T)
     cosine, sine = np.cos(turn), np.sin(turn)
     x, y = gaze[:, :1] * cosine - gaze[:, 1:] * sine, gaze[:, :1] * sine + gaze[:, 1:] * cosine
     # the aim comes first, so that it is selected among equally good directions
     directions = np.concatenate([aim[:, None], np.stack([x, y], axis=-1)], axis=1)
-    seen, moving = see.neighbour_present[:, :, None] > 0, see.velocity[:, None] + see.neighbour_velocity
+    seen, moving = see.neighbour_present > 0, see.velocity[:, None] + see.neighbour_velocity
     clearance, one = _ROBOT + _PEDESTRIAN + per_row(p.margin, 2), directions[:, None]
     free = collision_distance(one, see.neighbours[:, :, None], moving[:, :, None], clearance, task.max_speed)
-    free = np.where(seen, free, np.inf).min(axis=1).clip(max=reach)
-    now = collision_distance(one, see.neighbours[:, :, None], np.zeros(2), clearance, 1.0)
-    now = np.where(seen, now, np.inf).min(axis=1)
+    free = np.where(seen[:, :, None], free, np.inf).min(axis=1).clip(max=reach)
     remaining = reach**2 + free**2 - 2.0 * reach * free * np.sum(directions * aim[:, None], axis=-1)
-    row, best = np.arange(len(remaining)), np.argmin(remaining, axis=1)
-    safe = np.minimum(task.max_speed, now[row, best] / p.tau)[:, None]
-    force: NDArray[np.float64] = (safe * directions[row, best] - see.velocity) / per_row(p.tau)
+    best = directions[np.arange(len(remaining)), np.argmin(remaining, axis=1)]
+    clearance = _ROBOT + _PEDESTRIAN + per_row(p.margin)
+    now = collision_distance(best[:, None], see.neighbours, np.zeros(2), clearance, 1.0)
+    now = np.where(seen, now, np.inf).min(axis=1)
+    safe = np.minimum(task.max_speed, now / p.tau)[:, None]
+    force: NDArray[np.float64] = (safe * best - see.velocity) / per_row(p.tau)
     return force
 
 

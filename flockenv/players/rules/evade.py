@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from flockenv import steering
 from flockenv.geometry import shapes
 from flockenv.players.rules.parameter import Order, in_order, parameter, per_row
+from flockenv.players.rules.vectors import hypotenuse, length
 from flockenv.steering import arbitration
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Evade
@@ -53,7 +54,7 @@ BEHAVIOURS = ("avoid", "contain", "evade", "hide")
 def evade(see: Any, task: Evade, p: EvadeRules, order: Order = None) -> NDArray[np.float64]:
     """Avoid, contain, evade, hide: allocation in that order (Reynolds 1987)."""
     top, row = task.evader_speed, np.arange(len(see.velocity))
-    speed = np.linalg.norm(see.velocity, axis=-1)
+    speed = length(see.velocity)
     forward = see.velocity / np.maximum(speed, 1e-9)[:, None]
     there, clearance = see.cover_radius > 0, see.cover_radius + 0.4
     hit = np.where(there, threat(forward[:, None], see.cover, clearance, (speed * p.horizon)[:, None]), np.inf)
@@ -62,7 +63,7 @@ def evade(see: Any, task: Evade, p: EvadeRules, order: Order = None) -> NDArray[
     avoidance *= np.isfinite(hit[row, first])[:, None]
     inside = 5.0 * contain(see.to_low - 0.5, see.to_high - 0.5, see.velocity, top, p.wall)
 
-    distance = np.linalg.norm(see.pursuers, axis=-1)
+    distance = length(see.pursuers)
     time = np.minimum(distance / task.pursuer_speed, per_row(p.predict))
     flight = evade_from(see.pursuers, see.velocity[:, None], see.pursuer_velocity, top, time)
     rank = np.where(np.arange(distance.shape[1]) == 0, 1.0, per_row(p.crowd))
@@ -73,8 +74,8 @@ def evade(see: Any, task: Evade, p: EvadeRules, order: Order = None) -> NDArray[
     away += per_row(p.middle) * (see.to_high - see.to_low) / 2 * near
 
     places = hiding_place(see.cover, see.cover_radius, per_row(p.margin), see.pursuers[:, :1])
-    theirs = np.linalg.norm(places[:, :, None] - see.pursuers[:, None], axis=-1).min(axis=-1)
-    cost = np.linalg.norm(places, axis=-1) + per_row(p.danger) * np.maximum(10.0 - theirs, 0.0)
+    theirs = length(places[:, :, None] - see.pursuers[:, None]).min(axis=-1)
+    cost = length(places) + per_row(p.danger) * np.maximum(10.0 - theirs, 0.0)
     cost += per_row(p.exposed) * _count_watchers(places, see, task.sight)
     nearest = np.argmin(np.where(there, cost, np.inf), axis=1)
     hidden = per_row(p.hide) * arrive(places[row, nearest], see.velocity, top, 0.5) * there.any(axis=1)[:, None]
@@ -107,55 +108,61 @@ def escape(see: Any, task: Evade, p: EscapeRules) -> NDArray[np.float64]:
     angle = 2.0 * np.pi * np.arange(task.rays) / task.rays
     courses = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     seconds = per_row(p.reach) * _SHARES
-    places = _places_along(courses, seconds, see, task, p)
-    danger = _danger(places, seconds[..., None, :], see, task, p).max(axis=2)
-    speed = np.linalg.norm(see.velocity, axis=-1, keepdims=True)
-    back = 0.5 - 0.5 * (see.velocity / np.maximum(speed, 0.3)) @ courses.T
-    exposure = _count_watchers(places[:, :, -1], see, task.sight)
+    run = _runs(courses, seconds, see, task, p)
+    x, y = run * courses[:, :1], run * courses[:, 1:]
+    danger = _danger(x, y, seconds[..., None, :], see, task, p).max(axis=2)
+    heading = see.velocity / np.maximum(length(see.velocity), 0.3)[:, None]
+    back = 0.5 - 0.5 * (heading[:, :1] * courses[:, 0] + heading[:, 1:] * courses[:, 1])
+    exposure = _count_watchers(np.stack([x[..., -1], y[..., -1]], axis=-1), see, task.sight)
     cost = danger + per_row(p.exposed) * exposure + per_row(p.turn) * back
     best = courses[np.argmin(cost, axis=1)]
-    here = _danger(np.zeros((len(best), 1, 1, 2)), np.zeros(1), see, task, p)[:, 0, 0]
+    still = np.zeros((len(best), 1, 1))
+    here = _danger(still, still, np.zeros(1), see, task, p)[:, 0, 0]
     effort = p.gain * np.minimum(here / np.maximum(p.calm, 1e-9), 1.0)
     force: NDArray[np.float64] = effort[:, None] * seek(best, see.velocity, task.evader_speed)
     return force
 
 
-def _places_along(
+def _runs(
     courses: NDArray[np.float64], seconds: NDArray[np.float64], see: Any, task: Evade, p: EscapeRules
 ) -> NDArray[np.float64]:
-    """Return where the evader is on each course at the given times, s; it stops where its free path ends.
+    """Return how far the evader is along each course at the given times, s: (R, courses, seconds), m.
 
-    (R, courses, seconds, 2), relative to the evader, m.
+    It stops where its free path ends.
     """
     walls = np.where(courses > 0.0, see.to_high[:, None], see.to_low[:, None]) - per_row(p.wall, 2)
-    to_walls = (np.maximum(walls, 0.0) / np.maximum(np.abs(courses), 1e-9)).min(axis=-1)
-    free = np.minimum(see.free_way, to_walls)
-    run = np.minimum(task.evader_speed * seconds[..., None, :], free[..., None])
-    places: NDArray[np.float64] = run[..., None] * courses[:, None]
-    return places
+    to_walls = np.maximum(walls, 0.0) / np.maximum(np.abs(courses), 1e-9)
+    free = np.minimum(see.free_way, np.minimum(to_walls[..., 0], to_walls[..., 1]))
+    runs: NDArray[np.float64] = np.minimum(task.evader_speed * seconds[..., None, :], free[..., None])
+    return runs
 
 
 def _danger(
-    places: NDArray[np.float64], seconds: NDArray[np.float64], see: Any, task: Evade, p: EscapeRules
+    x: NDArray[np.float64], y: NDArray[np.float64], seconds: NDArray[np.float64], see: Any, task: Evade, p: EscapeRules
 ) -> NDArray[np.float64]:
-    """Return the danger of places (R, C, T, 2) at the given times, (T,) or (R, 1, T) s."""
-    distance = np.linalg.norm(places[:, :, :, None] - see.pursuers[:, None, None], axis=-1)
-    left = distance - task.capture_distance - task.pursuer_speed * seconds[..., None]
-    weight = np.where(see.seen > 0, 1.0, per_row(p.unseen))[:, None, None]
-    scale = per_row(p.margin, 3)
-    danger: NDArray[np.float64] = np.sum(weight * np.exp(-np.maximum(left / scale, -50.0)), axis=-1)
+    """Return the danger of places (x, y), (R, C, T) m each, at the given times, (T,) or (R, 1, T) s."""
+    weights = np.where(see.seen > 0, 1.0, per_row(p.unseen))[..., None, None]
+    pursuers, scale = see.pursuers[..., None, None], per_row(p.margin, 2)
+    danger = np.zeros(x.shape)
+    for k in range(pursuers.shape[1]):
+        distance = hypotenuse(x - pursuers[:, k, 0], y - pursuers[:, k, 1])
+        left = distance - task.capture_distance - task.pursuer_speed * seconds
+        danger += weights[:, k] * np.exp(-np.maximum(left / scale, -50.0))
     return danger
 
 
-def _count_watchers(places: NDArray[np.float64], see: Any, sight: float) -> NDArray[np.float64]:
+def _count_watchers(places: NDArray[np.float64], see: Any, sight: float) -> NDArray[np.intp]:
     """Return how many pursuers are within sight of each of the places (R, K), with no cover in between."""
     offsets = places[:, :, None] - see.pursuers[:, None]
-    length = np.linalg.norm(offsets, axis=-1)
-    covers = (see.cover[:, None, :] - see.pursuers[:, :, None])[:, None]
-    rays = offsets / np.maximum(length, 1e-9)[..., None]
-    hit = ray_hit(covers, rays[..., None, :], see.cover_radius[:, None, None])
-    hit = np.where(see.cover_radius[:, None, None] > 0, hit, np.inf)
-    count: NDArray[np.float64] = np.sum((hit.min(axis=-1) > length) & (length < sight), axis=-1)
+    distance = length(offsets)
+    near = distance < sight
+    row, _, pursuer = pair = np.nonzero(near)  # a cover is tested only for those within sight
+    covers = see.cover[row] - see.pursuers[row, pursuer][:, None]
+    rays = offsets[pair] / np.maximum(distance[pair], 1e-9)[:, None]
+    hit = ray_hit(covers, rays[:, None], see.cover_radius[row])
+    hit = np.where(see.cover_radius[row] > 0, hit, np.inf)
+    near[pair] = hit.min(axis=-1) > distance[pair]
+    count: NDArray[np.intp] = np.count_nonzero(near, axis=-1)
     return count
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from flockenv import steering
 from flockenv.players.rules.parameter import Order, in_order, parameter, per_row
+from flockenv.players.rules.vectors import length
 from flockenv.steering import arbitration
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Flock
@@ -44,7 +45,7 @@ BEHAVIOURS = ("avoid", "separate", "align", "cohere", "course")
 
 def flock(see: Any, task: Flock, p: FlockRules, order: Order = None) -> NDArray[np.float64]:
     """Avoid, separate, align, cohere, follow the heading; vectors are (along the heading, to its left)."""
-    speed = np.linalg.norm(see.velocity, axis=-1)
+    speed = length(see.velocity)
     forward = see.velocity / np.maximum(speed, 1e-9)[:, None]
     clearance = see.obstacle_radius + 0.3 + per_row(p.margin)
     distance = threat(forward[:, None], see.obstacles, clearance, (speed * p.horizon)[:, None])
@@ -55,7 +56,7 @@ def flock(see: Any, task: Flock, p: FlockRules, order: Order = None) -> NDArray[
 
     here = see.neighbour_present
     count = np.maximum(here.sum(axis=1), 1.0)[:, None]
-    near = here * (np.linalg.norm(see.neighbours, axis=-1) < per_row(p.radius))
+    near = here * (length(see.neighbours) < per_row(p.radius))
     push = per_row(p.apart) * np.sum(separate(see.neighbours, np.array([1.0, 0.0])) * near[..., None], axis=1)
     mean_velocity = see.velocity + np.sum(see.neighbour_velocity * here[..., None], axis=1) / count
     match = per_row(p.match) * align(see.velocity, mean_velocity)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from flockenv import steering
 from flockenv.players.rules.parameter import Order, in_order, parameter, per_row
 from flockenv.players.rules.slots import nearest
+from flockenv.players.rules.vectors import length
 from flockenv.steering import arbitration
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Herd
@@ -49,14 +50,14 @@ def herd(see: Any, task: Herd, p: HerdRules, order: Order = None) -> NDArray[np.
     together, driving = p.together * r * n ** (2 / 3), p.driving * r * n**0.5
     place = herd_from(see.centre, see.farthest, see.goal, together, p.collecting * r, driving)
     there, sheep = nearest(see.sheep_present, see.sheep)
-    close = there & (np.linalg.norm(sheep, axis=-1) < p.near * r)
+    close = there & (length(sheep) < p.near * r)
     speed = np.where(close, p.slow, 1.0) * top
     course = per_row(p.gain) * arrive(place, see.velocity, speed, 0.5)
-    direction = place / np.maximum(np.linalg.norm(place, axis=-1), 1e-9)[:, None]
+    direction = place / np.maximum(length(place), 1e-9)[:, None]
     clearance = p.width * see.stray + 2.0 * r
-    blocked = np.isfinite(threat(direction, see.centre, clearance, np.linalg.norm(place, axis=-1)))
+    blocked = np.isfinite(threat(direction, see.centre, clearance, length(place)))
     detour = per_row(p.around) * avoid(direction, see.centre, clearance, top) * blocked[:, None]
-    distance = np.linalg.norm(see.mates, axis=-1)[..., None]
+    distance = length(see.mates)[..., None]
     push = -see.mates / np.maximum(distance, 1e-9) * np.maximum(1.0 - distance / 10.0, 0.0)
     mates = per_row(p.apart) * np.sum(push, axis=1)
     return allocate(in_order(np.stack([mates, detour, course], axis=1), order), task.dog_force)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Order", "in_order", "is_logarithmic", "parameter", "per_row", "ranges_of"]
+__all__ = ["Order", "beyond", "in_order", "is_logarithmic", "parameter", "per_row", "ranges_of"]
 
 Order = NDArray[np.intp] | None
 """Indices of behaviours by priority, (R, K), or None for the rules' own order."""
@@ -20,9 +20,13 @@ DECADES = 2.0
 """A positive range that spans more than this is divided on a logarithmic scale."""
 
 
-def parameter(default: float, low: float, high: float) -> Any:
-    """Return a field of a parameter class; `python -m agents.tune` searches [low, high]."""
-    return field(default=default, metadata={"range": (low, high)})
+def parameter(default: float, low: float, high: float, *, below: str = "", above: str = "") -> Any:
+    """Return a field of a parameter class; `python -m agents.tune` searches [low, high].
+
+    below, above: what a value below `low`, or above `high`, would mean, if that end is natural; "" if it is a choice,
+    so that a best value at it calls for a wider range.
+    """
+    return field(default=default, metadata={"range": (low, high), "beyond": (below, above)})
 
 
 def ranges_of(parameters: type) -> dict[str, tuple[float, float]]:
@@ -31,6 +35,14 @@ def ranges_of(parameters: type) -> dict[str, tuple[float, float]]:
     if without:
         raise ValueError(f"{parameters.__name__}.{without[0]} has no range: use parameter(default, low, high)")
     return {each.name: each.metadata["range"] for each in fields(parameters)}
+
+
+def beyond(parameters: type, name: str, end: float) -> str:
+    """Return what a value beyond an end of a parameter's range would mean; "" if that end is a choice."""
+    metadata = next(each.metadata for each in fields(parameters) if each.name == name)
+    side = metadata["range"].index(end)
+    text: str = metadata["beyond"][side]
+    return text and f"{('below', 'above')[side]} it, {text}"
 
 
 def is_logarithmic(low: float, high: float) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from flockenv import steering
 from flockenv.players.rules.parameter import parameter, per_row
+from flockenv.players.rules.vectors import length
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import PathFollow
 
@@ -27,7 +29,7 @@ class PathFollowRules:
     lead: float = parameter(0.5, 0.1, 0.8)  # s, look-ahead at the present speed to the point that is sought
     tube: float = parameter(1.0, 0.0, 1.0)  # share of the track's width within which there is no correction
     keep: float = parameter(0.5, 0.3, 0.99)  # share of the desired speed, below which it speeds up
-    speed: float = parameter(1.0, 0.5, 1.0)  # desired speed as a share of the top speed
+    speed: float = parameter(1.0, 0.5, 1.0, above="it exceeds the limit")  # desired speed as a share of the top speed
     grip: float = parameter(100.0, 0.3, 2.5)  # share of max_force that a bend may need; if large, it never slows down
     early: float = parameter(1.0, 0.2, 1.5)  # share of max_force that is assumed for braking before a bend
     brake: float = parameter(0.0, 0.0, 12.0)  # kg/s against speed in excess of that which bends allow
@@ -45,8 +47,8 @@ def path_follow(see: Any, task: PathFollow, p: PathFollowRules) -> NDArray[np.fl
     bend = np.maximum(np.abs(see.curvature), 1e-6)
     allowed = per_row(p.grip) * task.max_force / bend + 2.0 * per_row(p.early) * task.max_force * far
     top = np.minimum(p.speed * task.max_speed, np.sqrt(allowed.min(axis=1)))
-    speed = np.linalg.norm(see.velocity, axis=-1)
-    gap = np.linalg.norm(fine - per_row(p.time, 2) * see.velocity[:, None], axis=-1)
+    speed = length(see.velocity)
+    gap = length(fine - per_row(p.time, 2) * see.velocity[:, None])
     then = np.argmin(gap, axis=1)
     gained = then * step - p.keep * top * p.time
     ahead = p.lead * np.maximum(speed, 0.25 * top)
@@ -67,7 +69,9 @@ class RacingRules:
     """Defaults: the whole force limit is used, and the line keeps a tenth of the half width from the track's edges."""
 
     width: float = parameter(0.9, 0.6, 1.0)  # share of the track's half width that the line may use
-    course: float = parameter(0.0, 0.0, 1.0)  # weight of the bend from the present course into the line
+    course: float = parameter(
+        0.0, 0.0, 1.0, below="bends are sought"
+    )  # weight of the bend from the present course into the line
     grip: float = parameter(1.0, 0.7, 1.4)  # share of max_force that a bend may need
     brake: float = parameter(1.0, 0.4, 1.4)  # share of max_force that is assumed for braking
     late: float = parameter(0.5, 0.0, 1.0)  # braking leaves the force for the bend at a piece's start (0) or end (1)
@@ -79,7 +83,7 @@ def race(see: Any, task: PathFollow, p: RacingRules) -> NDArray[np.float64]:
     """Seek the racing line just ahead at the speed that its bends allow; vectors are (along the track, left)."""
     line = racing_line(see, task, p)
     speeds = allowed_speeds(line, task, p)
-    speed = np.linalg.norm(see.velocity, axis=-1)
+    speed = length(see.velocity)
     place = np.minimum(p.lead * np.maximum(speed, 0.25 * task.max_speed) / task.spacing, max(task.ahead - 1.001, 0.999))
     target, desired = _between(line[:, 1:], place), _between(speeds[..., None], place)[:, 0]
     force: NDArray[np.float64] = per_row(p.gain) * seek(target, see.velocity, desired)
@@ -95,10 +99,11 @@ def racing_line(see: Any, task: PathFollow, p: RacingRules) -> NDArray[np.float6
     """
     here = np.stack([0.0 * see.left, 0.0 * see.left], axis=-1)[:, None]
     nearest = np.stack([0.0 * see.left, -see.left], axis=-1)[:, None]
-    tangent = np.gradient(np.concatenate([nearest, see.points], axis=1), axis=1)[:, 1:]
-    tangent /= np.maximum(np.linalg.norm(tangent, axis=-1, keepdims=True), 1e-9)
+    spine = np.concatenate([nearest, see.points], axis=1)
+    tangent = np.concatenate([(spine[:, 2:] - spine[:, :-2]) / 2.0, spine[:, -1:] - spine[:, -2:-1]], axis=1)
+    tangent /= np.maximum(length(tangent)[..., None], 1e-9)
     sideways = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
-    speed = np.linalg.norm(see.velocity, axis=-1)[:, None]
+    speed = length(see.velocity)[:, None]
     course = np.where(speed > 0.5, see.velocity / np.maximum(speed, 1e-9), [1.0, 0.0])[:, None]
     middle = np.concatenate([-task.spacing * course, here, see.points], axis=1)
     bending = _bending(task.ahead, p.course)
@@ -114,10 +119,17 @@ def _bending(points: int, course: Any) -> NDArray[np.float64]:
 
     (..., points, points + 2). `course` is the weight of the first second difference, that at the agent.
     """
+    return _bending_by_number(points, course) if isinstance(course, float) else _bending_by(points, course)
+
+
+def _bending_by(points: int, course: Any) -> NDArray[np.float64]:
     second = np.diff(np.eye(points + 2), n=2, axis=0)
     weights = np.concatenate([np.asarray(course)[..., None], np.ones((*np.shape(course), points - 1))], axis=-1)
     product: NDArray[np.float64] = second[:, 2:].T @ (weights[..., None] * second)
     return product
+
+
+_bending_by_number = functools.lru_cache(maxsize=64)(_bending_by)  # the same in all decisions of an episode
 
 
 def _least_within(matrix: NDArray[np.float64], pull: NDArray[np.float64], limit: Any) -> NDArray[np.float64]:
@@ -130,7 +142,7 @@ def _least_within(matrix: NDArray[np.float64], pull: NDArray[np.float64], limit:
     within, excess = np.zeros(pull.shape), np.zeros(pull.shape)
     for _ in range(_ITERATIONS):
         offset = (inverse @ (_PENALTY * (within - excess) - pull)[..., None])[..., 0]
-        within = np.clip(offset + excess, -limit, limit)
+        within = np.minimum(np.maximum(offset + excess, -limit), limit)  # np.clip takes longer
         excess += offset - within
     return within
 
@@ -142,15 +154,15 @@ def allowed_speeds(line: NDArray[np.float64], task: PathFollow, p: RacingRules) 
     2016, J. Dyn. Sys., Meas., Control 138, 091005).
     """
     before, after = line[:, 1:-1] - line[:, :-2], line[:, 2:] - line[:, 1:-1]
-    length = np.linalg.norm(after, axis=-1)
+    piece = length(after)
     sine = np.abs(before[..., 0] * after[..., 1] - before[..., 1] * after[..., 0])
-    sides = np.linalg.norm(before, axis=-1) * length * np.linalg.norm(before + after, axis=-1)
+    sides = length(before) * piece * length(before + after)
     needed = 2.0 * sine / np.maximum(sides, 1e-9) / (per_row(p.grip) * task.max_force)  # s^2/m^2
     square = np.minimum(task.max_speed**2, 1.0 / np.maximum(needed, 1e-9))
+    bends = (1.0 - per_row(p.late)) * needed[:, :-1] + per_row(p.late) * needed[:, 1:]
     for k in range(task.ahead - 2, -1, -1):
-        bend = (1.0 - p.late) * needed[:, k] + p.late * needed[:, k + 1]
-        left = np.sqrt(1.0 - np.minimum(square[:, k + 1] * bend, 1.0) ** 2)
-        slowed = square[:, k + 1] + 2.0 * p.brake * task.max_force * left * length[:, k]
+        left = np.sqrt(1.0 - np.minimum(square[:, k + 1] * bends[:, k], 1.0) ** 2)
+        slowed = square[:, k + 1] + 2.0 * p.brake * task.max_force * left * piece[:, k]
         square[:, k] = np.minimum(square[:, k], slowed)
     speeds: NDArray[np.float64] = np.sqrt(square)
     return speeds

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from flockenv import steering
 from flockenv.players.rules.parameter import Order, in_order, parameter, per_row
 from flockenv.players.rules.slots import nearest
+from flockenv.players.rules.vectors import length
 from flockenv.steering import arbitration, motivation
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import School
@@ -66,26 +67,26 @@ def school(
     now = intention(was, see.hunger, 0.0, see.fear, np.maximum(p.escape, p.school), p.school, p.need, calm, content)
     hunted, hunter, its_velocity = nearest(see.hunter_present, see.hunters, see.hunter_velocity)
     # without a hunter or food in sight: wander
-    has_food = np.linalg.norm(see.food_bearing, axis=-1) > 0
+    has_food = length(see.food_bearing) > 0
     selected = np.where((now == motivation.ESCAPE) & ~hunted, motivation.WANDER, now)
     selected = np.where((now == motivation.EAT) & ~has_food.any(axis=1), motivation.WANDER, selected)
     here = see.mate_present
     selected = np.where((now == motivation.SCHOOL) & (here.sum(axis=1) == 0), motivation.WANDER, selected)
 
     inside = 5.0 * contain(see.to_low - 0.5, see.to_high - 0.5, see.velocity, top, p.wall)
-    near = here * (np.linalg.norm(see.mates, axis=-1) < 0.6)
+    near = here * (length(see.mates) < 0.6)
     push = per_row(p.apart) * np.sum(separate(see.mates, ahead) * near[..., None], axis=1)
-    time = np.minimum(np.linalg.norm(hunter, axis=-1) / task.hunter_speed, p.predict)
+    time = np.minimum(length(hunter) / task.hunter_speed, p.predict)
     flight = per_row(p.evade) * evade_from(hunter, see.velocity, its_velocity, top, time)
     flight += per_row(p.middle) * (see.to_high - see.to_low) / 2
     many = np.maximum(here.sum(axis=1), 1.0)[:, None]
     course = np.sum(see.mate_velocity * here[..., None], axis=1) / many
     centre = np.sum(see.mates * here[..., None], axis=1) / many
     join = per_row(p.match) * align(see.velocity, course) + per_row(p.centre) * centre
-    cost = np.linalg.norm(see.food, axis=-1) - per_row(p.rich) * see.food_amount / task.capacity
+    cost = length(see.food) - per_row(p.rich) * see.food_amount / task.capacity
     best = np.argmin(np.where(has_food, cost, np.inf), axis=1)
     eat = per_row(p.forage) * arrive(see.food[np.arange(count), best], see.velocity, top, 1.0)
-    still = np.linalg.norm(see.velocity, axis=-1, keepdims=True) < 1e-6
+    still = length(see.velocity)[..., None] < 1e-6
     heading = np.where(still, ahead, see.velocity)
     aside = np.stack([np.zeros_like(p.turn), np.asarray(p.turn)], axis=-1)
     roam = 2.0 * (wander(aside, heading, p.pace * top, 1.0) + heading - see.velocity)
