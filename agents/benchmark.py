@@ -22,6 +22,7 @@ from agents.study import Study, contenders_of, settings_of
 from agents.study_results import RANDOM, SettingResults, TaskResults, kind_of, read_task
 from agents.sweep import plan_digest, sweep
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
+from flockenv.cli.options import Debug
 from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import printable
@@ -171,7 +172,7 @@ def main(
     processes: Processes = None,
     fresh: Fresh = False,
     shard: ShardText = None,
-    debug: Annotated[bool, typer.Option("--debug", help="Show a traceback if something goes wrong.")] = False,
+    debug: Debug = False,
 ) -> None:
     """Play all tasks and settings with a player, and write its scores."""
     with report_errors("benchmark", STOPPED, debug), end_of_shard():

@@ -23,9 +23,11 @@ from agents.invasion import Payoffs, invade, jobs_of
 from agents.play import Player, players_in_order, players_of, usual_players
 from agents.report import grid, json_text
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
+from flockenv.cli.options import Debug, Delay, Dropped, Noise, Reach, Seen, TrustPickle
 from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.output_paths import valid_file
+from flockenv.envs.disturbance import Disturbance
 from flockenv.evaluation import WORLDS_PER_SEED, Interval
 from flockenv.jobs import Store, Work, engine_of, run_jobs
 from flockenv.tasks import Task
@@ -59,6 +61,7 @@ def content_of(payoffs: Payoffs) -> dict[str, Any]:
     worlds = next(iter(payoffs.of.values()))
     return {
         "task": payoffs.task, "worlds": worlds.worlds, "first_seed": worlds.seed, "players": list(payoffs.players),
+        **({"disturbance": payoffs.disturbance.model_dump()} if payoffs.disturbance else {}),
         "mean": {f"{one} among {others}": _numbers(payoffs.mean(one, others)) for one, others in pairs},
         "gain": {
             f"{one} among {others}": _numbers(payoffs.gain(one, others)) for one, others in pairs if one != others
@@ -105,6 +108,11 @@ def main(
     ] = None,
     worlds: Annotated[int, typer.Option(min=2, max=WORLDS_PER_SEED, help="number of evaluation worlds")] = WORLDS,
     seed: Annotated[int, typer.Option(min=0, max=999, help="block of evaluation worlds")] = 0,
+    noise: Noise = 0.0,
+    delay: Delay = 0,
+    dropped: Dropped = 0.0,
+    reach: Reach = None,
+    seen: Seen = None,
     out: Annotated[
         str | None, typer.Option(help="folder for TASK.json and TASK.png; the page is OUT.md [only printed]")
     ] = None,
@@ -112,14 +120,13 @@ def main(
     processes: Processes = None,
     fresh: Fresh = False,
     shard: ShardText = None,
-    trust_pickle: Annotated[
-        bool, typer.Option("--trust-pickle", help="also load Stable-Baselines3 zips, which executes the code in them")
-    ] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="show a traceback if something goes wrong")] = False,
+    trust_pickle: TrustPickle = False,
+    debug: Debug = False,
 ) -> None:
     """Measure whether one agent gains by a policy other than that of all others in its world."""
     with report_errors("best_response", STOPPED, debug), end_of_shard(), TemporaryDirectory() as temporary:
         tasks = [load_experiment(config).build() for config in configs]
+        disturbance = Disturbance(noise=noise, delay=delay, dropped=dropped, range=reach, seen=seen)
         fields = _fields(tasks, split(players), seed, trust_pickle)
         if shard is not None and out is None:
             raise ValueError("--shard: needs --out, where the records of all shares are stored")
@@ -129,13 +136,15 @@ def main(
         runner, part = engine_of(engine, processes, small=worlds < WORLDS), shard_of(shard)
         with job_bar(lines=out is not None) as progress:
             work = Work(Store(folder / JOBS), runner, fresh, progress, part)
-            jobs = [jobs_of(task, field, worlds, seed, trust_pickle) for task, field in fields]
+            jobs = [jobs_of(task, field, worlds, seed, trust_pickle, disturbance) for task, field in fields]
             run_jobs([job for of_task in jobs for job in of_task.values()], work)
         collect = Work(work.store, runner)
-        found = [invade(task, field, worlds, seed, trust_pickle, collect) for task, field in fields]
+        found = [invade(task, field, worlds, seed, trust_pickle, collect, disturbance) for task, field in fields]
         if page is not None:
             command = f"python -m agents.best_response {' '.join(map(str, configs))} --out {out}"
-            _write(page, found, command + (f" --players {','.join(split(players))}" if players else ""))
+            options = [f"--players {','.join(split(players))}"] if players else []
+            options += [f"--{name} {value}" for name, value in disturbance.model_dump().items() if value]
+            _write(page, found, " ".join([command, *options]))
     _show(found)
     if page is not None:
         typer.echo(f"{page}: written")

@@ -24,6 +24,7 @@ from agents import report
 from agents.experiment import CONFIGS, Experiment, load_experiment
 from agents.play import Player, episodes_of_bytes, members_of, play_job, players_in_order, players_of, usual_players
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
+from flockenv.cli.options import Debug, Delay, Dropped, Noise, Reach, Seen, TrustPickle
 from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import nearest, printable
@@ -206,24 +207,18 @@ def main(
     worlds: Annotated[int | None, typer.Option(help=f"Worlds per task, the same for every player. [{WORLDS}]")] = None,
     seed: Annotated[int, typer.Option(help="Block of evaluation worlds, 0 to 999.")] = 0,
     out: Annotated[str, typer.Option(help=f"Folder for {', '.join(FILES)}.")] = "results",
-    noise: Annotated[float, typer.Option(help="Standard deviation of noise on what players observe, 0 to 1.")] = 0.0,
-    delay: Annotated[int, typer.Option(help="Decisions by which actions are late, 0 to 20.")] = 0,
-    dropped: Annotated[float, typer.Option(help="Probability that a neighbour is not detected, 0 to 1.")] = 0.0,
-    reach: Annotated[
-        float | None, typer.Option("--range", help="Metres beyond which other agents are not detected. [no limit]")
-    ] = None,
-    seen: Annotated[
-        int | None, typer.Option(help="Agents of a kind that are detected, the nearest. [all in slots]")
-    ] = None,
+    noise: Noise = 0.0,
+    delay: Delay = 0,
+    dropped: Dropped = 0.0,
+    reach: Reach = None,
+    seen: Seen = None,
     engine: EngineName = "local",
     processes: Processes = None,
     fresh: Fresh = False,
     shard: ShardText = None,
     smoke: Annotated[bool, typer.Option("--smoke", help=f"A quick look: {SMOKE_WORLDS} worlds.")] = False,
-    trust_pickle: Annotated[
-        bool, typer.Option("--trust-pickle", help="Also load Stable-Baselines3 zips, which executes the code in them.")
-    ] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show a traceback if something goes wrong.")] = False,
+    trust_pickle: TrustPickle = False,
+    debug: Debug = False,
 ) -> None:
     """Play all tasks with all players in the same worlds, and compare their scores."""
     with report_errors("compare", STOPPED, debug), end_of_shard():

@@ -22,6 +22,7 @@ from agents.cost_chart import method_name
 from agents.report import Results, json_text
 from agents.transfer_verdict import SURVIVES, lost_settings
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes
+from flockenv.cli.options import Debug
 from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import printable
@@ -113,7 +114,7 @@ def main(
     processes: Processes = None,
     fresh: Fresh = False,
     out: Annotated[str, typer.Option(help=f"Folder for {', '.join(FILES)}.")] = "results",
-    debug: Annotated[bool, typer.Option("--debug", help="Show a traceback if something goes wrong.")] = False,
+    debug: Debug = False,
 ) -> None:
     """Measure error against wall time in three scenes, and draw it above the returns of some tasks."""
     with report_errors("cost_of_accuracy", STOPPED, debug):

@@ -24,6 +24,7 @@ from agents.report import grid, json_text
 from agents.study import HOME, Contender, Setting, Study, contenders_of, settings_of
 from agents.study_results import RANDOM, kind_of
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
+from flockenv.cli.options import Debug
 from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.output_paths import valid_file
@@ -238,7 +239,7 @@ def main(
     processes: Processes = None,
     fresh: Fresh = False,
     shard: ShardText = None,
-    debug: Annotated[bool, typer.Option("--debug", help="Show a traceback if something goes wrong.")] = False,
+    debug: Debug = False,
 ) -> None:
     """Play players at several prices of harm, and draw harm against return."""
     with report_errors("front", STOPPED, debug), end_of_shard():

@@ -104,6 +104,7 @@ class Payoffs:
     task: str
     players: tuple[str, ...]
     of: Mapping[tuple[str, str], Episodes]
+    disturbance: Disturbance | None = None
 
     def mean(self, one: str, others: str) -> Interval:
         """Return the mean return of an agent that plays `one` among `others`."""
@@ -140,9 +141,12 @@ def _signed_text(interval: Interval) -> str:
 
 
 def jobs_of(
-    task: Task, players: Sequence[Player], worlds: int, seed: int = 0, trust_pickle: bool = False
-) -> dict[tuple[str, str], Job]:
+    task: Task, players: Sequence[Player], worlds: int, seed: int = 0, trust_pickle: bool = False,
+    disturbance: Disturbance | None = None,
+) -> dict[tuple[str, str], Job]:  # fmt: skip
     """Return the jobs by the names of the one agent's player and of the others', all in the same evaluation worlds.
+
+    disturbance: of the worlds, the same for all agents (default: none).
 
     Raises:
         ValueError: one line: a world has one learner, or a player cannot be loaded, or has a network for each learner.
@@ -154,11 +158,12 @@ def jobs_of(
             raise ValueError(f"player {player.name!r}: has a network for each learner, which play together only")
     found = {}
     for others in players:
-        within = worlds_among(task, others, seed, trust_pickle)
+        within = worlds_among(task, others, seed, trust_pickle, disturbance=disturbance)
         for one in players:
             found[one.name, others.name] = play_job(
-                f"best_response/among-{others.name}", task, one, worlds, seed, None, trust_pickle, within=within
-            )
+                f"best_response/among-{others.name}", task, one, worlds, seed, None, trust_pickle, disturbance,
+                within=within,
+            )  # fmt: skip
     return found
 
 
@@ -190,19 +195,22 @@ def _among(
 
 def invade(
     task: Task, players: Sequence[Player], worlds: int, seed: int = 0, trust_pickle: bool = False,
-    work: Work | None = None,
+    work: Work | None = None, disturbance: Disturbance | None = None,
 ) -> Payoffs:  # fmt: skip
     """Play every player with one agent of each world, among others of every player, in the same evaluation worlds.
 
     work: where and how to run the jobs (default: one after another in this process, and nothing is stored).
+    disturbance: of the worlds (default: none).
 
     Raises:
         ValueError: one line: a world has one learner, or a player fails.
     """
     if work is None:
         with TemporaryDirectory(prefix="flockenv-jobs-") as folder:
-            return invade(task, players, worlds, seed, trust_pickle, Work(Store(Path(folder)), LocalEngine(1)))
-    jobs = jobs_of(task, players, worlds, seed, trust_pickle)
+            work = Work(Store(Path(folder)), LocalEngine(1))
+            return invade(task, players, worlds, seed, trust_pickle, work, disturbance)
+    jobs = jobs_of(task, players, worlds, seed, trust_pickle, disturbance)
     run_jobs(list(jobs.values()), work)
     episodes = {pair: work.store.read(job, episodes_of_bytes) for pair, job in jobs.items()}
-    return Payoffs(task.name, tuple(player.name for player in players), episodes)
+    names = tuple(player.name for player in players)
+    return Payoffs(task.name, names, episodes, disturbance)

@@ -34,6 +34,7 @@ from agents.divergence import LearningDiverged, diverged_weight
 from agents.drawn import check_settings
 from agents.experiment import Experiment, load_experiment, one_line_errors, seeds_of
 from agents.learner_job import ALGORITHMS, check_memory, effective, learner_job, learner_recipe
+from agents.options import Config, Seconds, Steps, TrainingSeed
 from agents.run import Run, expected_bytes
 from agents.training import (
     BudgetSpent,
@@ -322,15 +323,13 @@ def export(run: Run, algo: str, path: Path) -> str:
 
 @app.command()
 def main(
-    config: Annotated[Path, typer.Argument(help="an experiment, such as configs/training/pursuit.yaml")],
+    config: Config,
     algo: Annotated[str, typer.Option(help=f"{', '.join(ALGORITHMS)}; agents.ppo trains with PPO")],
     out: Annotated[Path | None, typer.Option(help="default: results/ALGO/TASK.safetensors")] = None,
     go_on: Annotated[bool, typer.Option("--resume", help="refused: these learners do not resume")] = False,
-    steps: Annotated[int | None, typer.Option(help="total agent-steps, instead of those of the config")] = None,
-    seconds: Annotated[
-        float | None, typer.Option(help="wall time in all, s; training ends at the first budget that is spent")
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="training seed, instead of that of the config")] = None,
+    steps: Steps = None,
+    seconds: Seconds = None,
+    seed: TrainingSeed = None,
     seeds: Annotated[
         str | None,
         typer.Option(help="several training seeds as jobs, 0-9 or 0,3; --out is then a folder [results/ALGO]"),

@@ -34,6 +34,7 @@ from agents.dagger import teach
 from agents.divergence import check_answers, check_model
 from agents.drawn import check_settings
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors, seeds_of
+from agents.options import Config, Seconds, Steps, TrainingSeed
 from agents.run import Run, expected_bytes, load_checkpoint, recipe_of, save_checkpoint
 from agents.team_credit import CaringBuffer
 from agents.training import (
@@ -315,16 +316,14 @@ def export(run: Run, path: Path) -> None:
 
 @app.command()
 def main(
-    config: Annotated[Path, typer.Argument(help="an experiment, such as configs/training/pursuit.yaml")],
+    config: Config,
     out: Annotated[Path | None, typer.Option(help="default: flockenv/players/weights/TASK.safetensors")] = None,
     runs: Annotated[Path, typer.Option(help="folder of checkpoints")] = Path("runs"),
     go_on: Annotated[bool, typer.Option("--resume", help="continue from the last checkpoint")] = False,
     tensorboard: Annotated[str | None, typer.Option(help="folder of TensorBoard logs")] = None,
-    steps: Annotated[int | None, typer.Option(help="total agent-steps, instead of those of the config")] = None,
-    seconds: Annotated[
-        float | None, typer.Option(help="wall time in all, s; training ends at the first budget that is spent")
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="training seed, instead of that of the config")] = None,
+    steps: Steps = None,
+    seconds: Seconds = None,
+    seed: TrainingSeed = None,
     action: Annotated[
         str | None,
         typer.Option(help="force, residual, mixture, weights, priorities or gate, instead of the config's ppo.action"),

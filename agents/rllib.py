@@ -40,6 +40,7 @@ from rich.console import Console
 from agents.checkpoint import CheckpointError, Damaged, claim, path_in
 from agents.divergence import LearningDiverged
 from agents.experiment import Experiment, PpoSettings, load_experiment, one_line_errors
+from agents.options import Config, Steps, TrainingSeed
 from agents.rllib_envs import NETWORKS, ONE, RowsEnv, Settings, TeamEnv, role
 from agents.run import Run, expected_bytes, load_checkpoint, recipe_of, save_checkpoint
 from agents.training import add_point, card_of, new_progress, score, use_thread_count
@@ -362,7 +363,7 @@ def evaluate(experiment: Experiment, tensors: Tensors, worlds: int) -> Interval:
 
 @app.command()
 def main(
-    config: Annotated[Path, typer.Argument(help="an experiment, such as configs/training/pursuit.yaml")],
+    config: Config,
     out: Annotated[
         Path | None, typer.Option(help="default: results/rllib/TASK.safetensors; networks of roles add -ROLE")
     ] = None,
@@ -375,9 +376,9 @@ def main(
     plain: Annotated[bool, typer.Option("--plain", help="without the settings that RLlib's PPO does not have")] = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="start anew instead of from the checkpoint")] = False,
     check: Annotated[int, typer.Option(min=0, help="evaluation episodes that RLlib plays with the policy")] = 0,
-    steps: Annotated[int | None, typer.Option(help="total agent-steps, instead of those of the config")] = None,
+    steps: Steps = None,
     worlds: Annotated[int | None, typer.Option(help="worlds, instead of those of the config")] = None,
-    seed: Annotated[int | None, typer.Option(help="training seed, instead of that of the config")] = None,
+    seed: TrainingSeed = None,
 ) -> None:
     """Train policies with RLlib's PPO and export their weights; the same command continues an interrupted training."""
     with one_line_errors():

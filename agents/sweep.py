@@ -27,6 +27,7 @@ from agents.report import json_text, rounded
 from agents.study import Contender, Setting, Study, contenders_of, settings_of
 from agents.study_results import RANDOM, TaskResults, kind_of, read_file, read_task
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
+from flockenv.cli.options import Debug
 from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import printable
@@ -200,7 +201,7 @@ def main(
     processes: Processes = None,
     fresh: Fresh = False,
     shard: ShardText = None,
-    debug: Annotated[bool, typer.Option("--debug", help="Show a traceback if something goes wrong.")] = False,
+    debug: Debug = False,
 ) -> None:
     """Play all settings of a study with all players, and draw which kind is ahead where."""
     with report_errors("sweep", STOPPED, debug), end_of_shard():

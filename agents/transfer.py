@@ -30,9 +30,11 @@ from agents.play import players_in_order, players_of
 from agents.transfer_jobs import Plan, clock_of, jobs_by_kernel, read_again, read_cells, round_jobs
 from agents.transfer_report import Setting
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
+from flockenv.cli.options import Debug, Delay, Dropped, Noise, Reach, Seen, TrustPickle
 from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import nearest, printable
+from flockenv.envs.disturbance import Disturbance
 from flockenv.evaluation import WORLDS_PER_SEED, worlds_for
 from flockenv.jobs import Store, Work, engine_of, run_jobs
 from flockenv.jobs.local_engine import LocalEngine
@@ -71,15 +73,18 @@ def main(
     worlds: Annotated[int, typer.Option(help="Worlds per task, the same for every player.")] = WORLDS,
     rounds: Annotated[int, typer.Option(help="Rounds in which wall time is measured.")] = ROUNDS,
     seed: Annotated[int, typer.Option(help="Block of evaluation worlds, 0 to 999.")] = 0,
+    noise: Noise = 0.0,
+    delay: Delay = 0,
+    dropped: Dropped = 0.0,
+    reach: Reach = None,
+    seen: Seen = None,
     engine: EngineName = "local",
     processes: Processes = None,
     fresh: Fresh = False,
     shard: ShardText = None,
     out: Annotated[str, typer.Option(help=f"Folder for {', '.join(FILES)}.")] = "results",
-    trust_pickle: Annotated[
-        bool, typer.Option("--trust-pickle", help="Also load Stable-Baselines3 zips, which executes the code in them.")
-    ] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show a traceback if something goes wrong.")] = False,
+    trust_pickle: TrustPickle = False,
+    debug: Debug = False,
 ) -> None:
     """Play the same worlds with integrators of different accuracy; show the effect on each policy, and the cost."""
     with report_errors("transfer", STOPPED, debug), end_of_shard():
@@ -90,10 +95,14 @@ def main(
         chosen = [experiment_of(name).build() for name in pick("TASK", split(tasks) or list(TASKS), TASKS)]
         fields = players_of(chosen, players_in_order(split(players) or PLAYERS))
         solvers, steps = _solvers(split(methods) or list(METHODS)), _substeps(split(substeps))
+        disturbance = Disturbance(noise=noise, delay=delay, dropped=dropped, range=reach, seen=seen)
         plans = [
-            Plan(task, _settings(task, solvers, steps), tuple(fields[task.name]), worlds, seed, rounds, trust_pickle)
+            Plan(
+                task, _settings(task, solvers, steps), tuple(fields[task.name]), worlds, seed, rounds, trust_pickle,
+                disturbance,
+            )
             for task in chosen
-        ]
+        ]  # fmt: skip
         runner, part = engine_of(engine, processes), shard_of(shard)
         with job_bar() as progress:
             results = _measure(plans, Work(Store(folder / JOBS), runner, fresh, progress, part))
@@ -165,6 +174,7 @@ def _measure(plans: Sequence[Plan], work: Work) -> report.Results:
         "seed": seed,
         "worlds": worlds,
         "world_seeds": {"block": "evaluation", "first": first, "last": first + worlds - 1},
+        "disturbance": (plans[0].disturbance or Disturbance()).model_dump(),
         "bootstrap": {"resamples": RESAMPLES, "seed": seed, "interval": "95 % percentile"},
         "players": {player.name: player.spec for plan in plans for player in plan.players},
         "tasks": about,

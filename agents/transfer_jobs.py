@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from agents.play import Player, episodes_of_bytes, play_job, player_digest
 from agents.transfer_report import Cell, Clock, Setting
+from flockenv.envs.disturbance import Disturbance, make_world
 from flockenv.envs.world import World
 from flockenv.evaluation import worlds_for
 from flockenv.jobs import Job, Store, records
@@ -41,6 +42,7 @@ class Plan:
     seed: int
     rounds: int
     trust_pickle: bool = False
+    disturbance: Disturbance | None = None
 
     @property
     def first(self) -> int:
@@ -68,7 +70,9 @@ class Plan:
 def cell_job(plan: Plan, setting: Setting, player: Player, kind: str = "transfer") -> Job:
     """Return the job that plays all worlds under one setting with one player."""
     task = setting.applied_to(plan.task)
-    return play_job(kind, task, player, plan.worlds, plan.seed, trust_pickle=plan.trust_pickle)
+    return play_job(
+        kind, task, player, plan.worlds, plan.seed, trust_pickle=plan.trust_pickle, disturbance=plan.disturbance
+    )
 
 
 def jobs_by_kernel(plans: Sequence[Plan]) -> dict[tuple[str, Setting, str, bool], Job]:
@@ -123,6 +127,7 @@ def round_jobs(plans: Sequence[Plan]) -> list[Job]:
             for setting in plan.settings
         ]
         + [player_digest(plan.pilot, plan.task, plan.seed), plan.worlds, plan.seed]
+        + ([plan.disturbance.model_dump(mode="json")] if plan.disturbance else [])
         for plan in plans
     ]
     return [
@@ -164,7 +169,10 @@ def _round_of_bytes(data: bytes) -> Any:
 def _pilot_actions(plan: Plan) -> Actions:
     """Return the actions of the pilot in the first decisions of every world, under the trained setting."""
     task = plan.task
-    world, policy = World(task, plan.worlds), plan.policy(plan.pilot, task)
+    world, policy = (
+        make_world(task, plan.worlds, None, plan.disturbance or Disturbance()),
+        plan.policy(plan.pilot, task),
+    )
     observation, actions, state = world.reset(plan.first), [], None
     for number in range(min(DECISIONS, task.horizon)):
         rows = observation.reshape(-1, observation.shape[-1])

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from agents.report import Results, grid, interval_fields, interval_text, number_text, table_of
+from agents.report import Results, conditions, grid, interval_fields, interval_text, number_text, table_of
 from agents.transfer_verdict import LEAST_ROUNDS, count_text, length_text, settings_of_note, title, verdict
 from flockenv.core.warnings import UnstableStepWarning
 from flockenv.evaluation import bootstrap, task_digest
@@ -239,7 +239,7 @@ def show(results: Results) -> None:
 def markdown(results: Results) -> str:
     """Return the page in Markdown: counts over all tasks, the picture, and per task a sentence and a short table."""
     seeds = f"{results['world_seeds']['first']} to {results['world_seeds']['last']}"
-    held_out = f"{results['worlds']} worlds per task, seeds {seeds}: held out, those of the comparison."
+    held_out = f"{conditions(results)}, seeds {seeds}: held out, those of the comparison."
     tasks = results["tasks"]
     parts = ["# Policies under other integration methods and steps", count_text(tasks), ASKED]
     parts += [f"{held_out} `python -m agents.transfer` makes this page; transfer.json has every setting."]

@@ -17,6 +17,7 @@ import typer
 from rich.console import Console
 
 from agents.experiment import Experiment, load_experiment, one_line_errors, seeds_of
+from agents.options import Config
 from agents.report import json_text, rounded
 from agents.search import Found, median_of, search
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes
@@ -123,7 +124,7 @@ def _bound(found: Found, name: str) -> str:
 
 @app.command()
 def main(
-    config: Annotated[Path, typer.Argument(help="an experiment, such as configs/training/pursuit.yaml")],
+    config: Config,
     player: Annotated[
         str, typer.Option(help="Hand-written player of the task: rules, orca, heuristics or queueing.")
     ] = "rules",

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from agents import best_response, invasion
 from agents.play import Player
+from flockenv.envs.disturbance import Disturbance
 from flockenv.envs.world import World
 from flockenv.evaluation import Episodes, rollout, worlds_for
 from flockenv.players import load_player
@@ -113,6 +114,19 @@ def test_payoffs_depend_on_both_players_and_are_reproducible() -> None:
     again = invasion.invade(flock, field, WORLDS)
     assert all(np.array_equal(payoffs.of[key].returns, again.of[key].returns) for key in payoffs.of)
     assert [column.header for column in best_response.table_of(payoffs).columns] == ["", "rules", "random"]
+
+
+def test_all_agents_play_in_the_same_disturbance() -> None:
+    flock, field, delay = Flock(agents=5, horizon=10), [Player.of("rules")], Disturbance(delay=3)
+    payoffs = invasion.invade(flock, field, WORLDS, disturbance=delay)
+    rules = load_player("rules", flock)
+    made = lambda task, worlds, limit: invasion.Among(task, worlds, limit, rules, 1, delay)  # noqa: E731
+    expected = rollout(flock, rules, WORLDS, worlds_for("evaluation", 0, WORLDS), make_world=made).returns
+    calm = invasion.invade(flock, field, WORLDS)
+    np.testing.assert_array_equal(payoffs.of["rules", "rules"].returns, expected)
+    assert not np.array_equal(calm.of["rules", "rules"].returns, expected)
+    about = best_response.content_of(payoffs)["disturbance"]
+    assert about == delay.model_dump() and "disturbance" not in best_response.content_of(calm)
 
 
 def test_one_policy_under_two_names_gains_nothing_and_pairs_are_symmetric(tmp_path: Path) -> None:

@@ -425,6 +425,23 @@ def test_task_is_rendered_with_a_player_from_a_file() -> None:
         assert png.size[0] == 96
 
 
+def test_a_task_is_rendered_with_a_disturbance(capsys: pytest.CaptureFixture[str]) -> None:
+    for name, options in {"plain": (), "late": ("--delay", "5"), "noisy": ("--noise", "0.3")}.items():
+        assert main(["render", "pursuit", "--player", "rules", "--out", f"{name}.html", *options]) == 0
+    assert len({Path(f"{name}.html").read_text() for name in ("plain", "late", "noisy")}) == 3
+    capsys.readouterr()
+    Path("scene.yaml").write_text("groups: [{count: 1, spawn: {low: [0, 0], high: [1, 1]}}]\n")
+    for what, options, text in (
+        ("path_follow", ("--dropped", "0.1"), "dropped = 0.1: must be 0 for path_follow"),
+        ("pursuit", ("--noise", "2"), "noise = 2.0"),
+        ("scene.yaml", ("--delay", "1"), "--noise, --delay, --dropped, --range, --seen: for tasks only"),
+    ):
+        assert main(["render", what, "--out", "x.html", *options]) == 2
+        error = capsys.readouterr().err
+        assert text in error and error.count("\n") == 1
+    assert not Path("x.html").exists()
+
+
 def test_several_players_are_drawn_side_by_side() -> None:
     command = ["render", "pursuit", "--player", "rules,textbook", "--size", "192", "--seed", "3"]
     for out in ("two.png", "two.gif", "two.html"):

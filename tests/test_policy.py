@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save
 
-from agents.invasion import jobs_of
+from agents.invasion import Among, jobs_of
 from agents.play import Player
 from agents.warm_start import starting_policy
 from flockenv.core.warnings import OtherTaskWarning
@@ -113,6 +113,8 @@ def test_networks_of_single_learners_play_rows_of_whole_worlds_only(tmp_path: Pa
         with pytest.raises(ValueError, match=r"must have a row for each of 3 learners, whose networks differ"):
             policy.predict(rows)
     assert rollout(task, policy, 2, 0).worlds == 2
+    with pytest.raises(ValueError, match="has a network for each of 3 learners, which play together only"):
+        rollout(task, policy, 3, 0, make_world=lambda task, worlds, limit: Among(task, worlds, limit, policy))
     with pytest.raises(OtherSlotsError, match="has a network for each of 3 learners, task 'crossing' has 4"):
         load_player(tmp_path / "p.safetensors", Crossing(agents=4))
     player = Player.of(str(tmp_path / "p.safetensors"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -15,6 +16,7 @@ from agents import compare as comparison
 from agents import play, transfer, transfer_chart, transfer_jobs, transfer_report, transfer_verdict
 from agents.transfer_jobs import Plan
 from agents.transfer_report import Cell, Clock, Setting
+from flockenv.envs.disturbance import Disturbance
 from flockenv.jobs import Store
 from flockenv.physics.integrators import INTEGRATORS, RK4
 from flockenv.tasks import TASKS, Bottleneck, Pursuit
@@ -101,6 +103,29 @@ def test_the_trained_setting_scores_as_in_the_comparison_bit_for_bit() -> None:
     [setting] = about["settings"].values()
     assert [setting["players"]["ppo"][key] for key in ("difference", "ci_low", "ci_high")] == [0, 0, 0]
     assert results()["world_seeds"]["first"] == report["world_seeds"]["first"]
+
+
+def test_a_plan_s_disturbance_is_that_of_its_episodes_and_of_the_pilot() -> None:
+    task, player, delay = Pursuit(horizon=20), play.Player.of("rules"), Disturbance(delay=4)
+    calm = Plan(task, (Setting.of_training(task),), (player,), 3, 0, 1)
+    late = dataclasses.replace(calm, disturbance=delay)
+    job, plain = (transfer_jobs.cell_job(plan, plan.settings[0], player) for plan in (late, calm))
+    compared = play.play_job("compare", task, player, 3, 0, disturbance=delay)
+    played = play.episodes_of_bytes(job.function(*job.arguments))
+    assert (job.about, played.returns.tolist()) == (
+        compared.about, play.episodes_of_bytes(compared.function(*compared.arguments)).returns.tolist()
+    )  # fmt: skip
+    assert job.key != plain.key and transfer_jobs.round_jobs([late])[0].key != transfer_jobs.round_jobs([calm])[0].key
+    actions = [np.array(transfer_jobs._pilot_actions(plan)) for plan in (late, calm)]
+    np.testing.assert_array_equal(actions[0][0], actions[1][0])
+    assert not np.array_equal(*actions)
+
+
+@pytest.mark.slow
+def test_the_page_names_the_disturbance() -> None:
+    run(*TINY, *TRAINED, "--players", "rules", "--delay", "4")
+    assert results()["disturbance"]["delay"] == 4
+    assert "3 worlds per task, delay 4, seeds " in Path("results/transfer.md").read_text()
 
 
 @pytest.mark.slow

@@ -24,6 +24,7 @@ import typer
 import flockenv
 from flockenv.cli.jobs import jobs
 from flockenv.cli.measure import measure
+from flockenv.cli.options import Debug, Delay, Dropped, Noise, Reach, Seen, TrustPickle
 from flockenv.cli.studies import accuracy, experiment, gallery, stress
 from flockenv.cli.targets import complete_target, is_scene_file
 from flockenv.cli.terminal import (
@@ -52,6 +53,7 @@ from flockenv.players import NAMES
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from flockenv.envs.disturbance import Disturbance
     from flockenv.model.snapshot import Snapshot
     from flockenv.model.state import State
     from flockenv.render import Panel
@@ -145,7 +147,7 @@ def _show_version(asked: bool) -> None:
 
 @app.callback()
 def _define_options(
-    debug: Annotated[bool, typer.Option("--debug", help="Show a traceback if something goes wrong.")] = False,
+    debug: Debug = False,
     version: Annotated[
         bool, typer.Option("--version", help="Show the version and exit.", is_eager=True, callback=_show_version)
     ] = False,
@@ -245,24 +247,34 @@ def render(
         typer.Option(metavar="S", help="Simulated seconds of a scene; a task plays to its end.", show_default="10"),
     ] = None,
     size: Annotated[int, typer.Option(min=64, max=4096, help="Width of a picture in pixels.")] = 600,
-    trust_pickle: Annotated[
-        bool, typer.Option("--trust-pickle", help="Also load Stable-Baselines3 zips, which executes the code in them.")
-    ] = False,
+    noise: Noise = 0.0,
+    delay: Delay = 0,
+    dropped: Dropped = 0.0,
+    reach: Reach = None,
+    seen: Seen = None,
+    trust_pickle: TrustPickle = False,
     force: Force = False,
 ) -> None:
     """Draw a scene, or an episode of a task with a player, as GIF, PNG or HTML replay."""
     from flockenv.core.atomic_files import new_folder
     from flockenv.core.output_paths import valid_file
+    from flockenv.envs.disturbance import Disturbance
     from flockenv.tasks import TASKS
 
     path = valid_file(out, PICTURES, force)
+    disturbance = Disturbance(noise=noise, delay=delay, dropped=dropped, range=reach, seen=seen)
     if is_scene_file(what):
+        if disturbance:
+            raise ValueError(
+                "--noise, --delay, --dropped, --range, --seen: for tasks only; in a scene no player observes"
+            )
         panel, fps, left = _film_scene(what, 10.0 if duration is None else duration, seed)
         panels, title = [panel], title_of(what)
     else:
         if duration is not None:
             raise ValueError(f"--duration = {duration:g}: only for scenes; an episode of a task ends by itself")
-        (panels, fps), left = _film_episodes(TASKS[what](), player.split(","), seed, trust_pickle), ""
+        task, players = TASKS[what](), player.split(",")
+        (panels, fps), left = _film_episodes(task, players, seed, trust_pickle, disturbance), ""
         title = what
     with new_folder(path.parent):
         _write_picture(path, panels, title, fps, size)
@@ -426,21 +438,25 @@ def _film_scene(file: str, duration: float, seed: int) -> tuple[Panel, float, st
     return panel, 1.0 / (every * scene.dt), _unsolved_text(trajectory.last)
 
 
-def _film_episodes(task: Task, players: Sequence[str], seed: int, trust_pickle: bool) -> tuple[list[Panel], float]:
+def _film_episodes(
+    task: Task, players: Sequence[str], seed: int, trust_pickle: bool, disturbance: Disturbance
+) -> tuple[list[Panel], float]:
     """Return an episode of the same world per player, as panels, and the frames per second."""
+    from flockenv.envs.disturbance import make_world
     from flockenv.evaluation import rollout
     from flockenv.players import load_player
     from flockenv.render import Panel
 
+    disturbance.check(task)
     policies = [load_player(player, task, seed, trust_pickle) for player in players]
-    panels = []
+    panels, make = [], functools.partial(make_world, disturbance=disturbance)
     with progress_bar("playing", len(players) * task.horizon, "decisions") as progress:
         for k, (player, policy) in enumerate(zip(players, policies, strict=True)):
 
             def show(done: int, most: int, before: int = k * task.horizon) -> None:
                 progress(before + done)
 
-            episode = rollout(task, policy, 1, seed, record=0, progress=show)
+            episode = rollout(task, policy, 1, seed, record=0, progress=show, make_world=make)
             assert episode.recording is not None  # requested with record=0
             outcome, film = "success" if episode.success[0] else "no success", episode.recording
             title = Path(player).stem if len(players) > 1 else film.snapshots[0].title

@@ -58,6 +58,11 @@ class IndependentPolicy(MlpPolicy):
     def __repr__(self) -> str:
         return f"IndependentPolicy({self.learners} networks, {super().__repr__()})"
 
+    def watch(self, world: Any) -> None:
+        """Raise ValueError unless the rows of worlds are those of all their learners."""
+        if getattr(world, "learners", None) != self.learners:
+            raise ValueError(f"policy: has a network for each of {self.learners} learners, which play together only")
+
     def predict(
         self,
         observation: Observation,
@@ -71,7 +76,7 @@ class IndependentPolicy(MlpPolicy):
             ValueError: R is not a multiple of L; `networks[k].predict` takes rows of learner k alone.
         """
         rows = self._rows(observation)
-        if rows.ndim == 1 or len(rows) % self.learners:
+        if rows.ndim == 1 or len(rows) % len(self.networks):
             raise ValueError(
                 f"observation: shape {rows.shape}, must have a row for each of {self.learners} learners, whose "
                 "networks differ; networks[k].predict takes rows of learner k"
