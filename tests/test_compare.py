@@ -403,6 +403,7 @@ def test_chart_is_a_reproducible_png(in_temporary_folder: Path) -> None:
     assert data == Path("b.png").read_bytes()
     assert data[:8] == b"\x89PNG\r\n\x1a\n"
     pixels = np.asarray(Image.open("a.png").convert("L"))
+    assert Image.open("a.png").mode == "P" and Image.open("a.png").info["Software"] == "flockenv"
     assert min(pixels.shape) > 600
     assert (pixels < 128).mean() > 0.002
 
