@@ -7,21 +7,21 @@ Errors are one line on stderr. Exit codes: 0, 1 (a run failed), 2 (bad input), 1
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import json
 import math
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 
 import flockenv
+from flockenv.cli.films import film_episodes, write_picture
 from flockenv.cli.jobs import jobs
 from flockenv.cli.measure import measure
 from flockenv.cli.options import Debug, Delay, Dropped, Noise, Reach, Seen, TrustPickle
@@ -53,21 +53,17 @@ from flockenv.players import NAMES
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from flockenv.envs.disturbance import Disturbance
-    from flockenv.model.snapshot import Snapshot
     from flockenv.model.state import State
     from flockenv.render import Panel
     from flockenv.scene import Scene
     from flockenv.studies.trajectory import Trajectory
-    from flockenv.tasks import Task
 
 # Nothing that simulates, draws or learns is imported at the top, so that `flockenv --help` takes a fifth of a second.
 
 __all__ = ["app", "main"]
 
 PICTURES = (".gif", ".png", ".html")
-FPS, MOST_FPS = 25.0, 50.0  # of a scene's GIF; viewers play faster ones slowly
-TRAIL = 25  # past positions of each agent that a PNG shows
+FPS = 25.0  # of a scene's GIF
 RECORDED_EVERY = 0.1  # s, rounded to whole steps
 
 
@@ -274,10 +270,10 @@ def render(
         if duration is not None:
             raise ValueError(f"--duration = {duration:g}: only for scenes; an episode of a task ends by itself")
         task, players = TASKS[what](), player.split(",")
-        (panels, fps), left = _film_episodes(task, players, seed, trust_pickle, disturbance), ""
+        (panels, fps), left = film_episodes(task, players, seed, trust_pickle, disturbance), ""
         title = what
     with new_folder(path.parent):
-        _write_picture(path, panels, title, fps, size)
+        write_picture(path, panels, title, fps, size)
     end = max(panel.snapshots[-1].time for panel in panels)
     new_console().print(f"{relative_path(path)}: {path.stat().st_size:,} bytes, {end:g} s{left}")
 
@@ -436,71 +432,3 @@ def _film_scene(file: str, duration: float, seed: int) -> tuple[Panel, float, st
     snapshots = list(trajectory.snapshots(title=title_of(file)))
     panel = Panel("", snapshots, None, trajectory.stopped)
     return panel, 1.0 / (every * scene.dt), _unsolved_text(trajectory.last)
-
-
-def _film_episodes(
-    task: Task, players: Sequence[str], seed: int, trust_pickle: bool, disturbance: Disturbance
-) -> tuple[list[Panel], float]:
-    """Return an episode of the same world per player, as panels, and the frames per second."""
-    from flockenv.envs.disturbance import make_world
-    from flockenv.evaluation import rollout
-    from flockenv.players import load_player
-    from flockenv.render import Panel
-
-    disturbance.check(task)
-    policies = [load_player(player, task, seed, trust_pickle) for player in players]
-    panels, make = [], functools.partial(make_world, disturbance=disturbance)
-    with progress_bar("playing", len(players) * task.horizon, "decisions") as progress:
-        for k, (player, policy) in enumerate(zip(players, policies, strict=True)):
-
-            def show(done: int, most: int, before: int = k * task.horizon) -> None:
-                progress(before + done)
-
-            episode = rollout(task, policy, 1, seed, record=0, progress=show, make_world=make)
-            assert episode.recording is not None  # requested with record=0
-            outcome, film = "success" if episode.success[0] else "no success", episode.recording
-            title = Path(player).stem if len(players) > 1 else film.snapshots[0].title
-            shots = [dataclasses.replace(shot, title=title) for shot in film.snapshots]
-            panels.append(Panel(Path(player).stem, shots, film.returns.tolist(), outcome))
-    return panels, 1.0 / task.control_dt
-
-
-def _write_picture(path: Path, panels: Sequence[Panel], title: str, fps: float, size: int) -> None:
-    import numpy as np
-
-    from flockenv.render import Group, write_gif, write_png, write_replay
-
-    films = [panel.snapshots for panel in panels]
-    if path.suffix.lower() == ".html":
-        write_replay(path, [Group(title, list(panels))], title)
-    elif path.suffix.lower() == ".png":
-        write_png(path, np.hstack([_draw_last_frame(film, size // len(films), fps) for film in films]))
-    else:
-        stride = math.ceil(fps / MOST_FPS)
-        frames = _draw_frames([film[::stride] for film in films], size // len(films), fps / stride)
-        write_gif(path, frames, fps / stride)
-
-
-def _draw_last_frame(snapshots: Sequence[Snapshot], size: int, fps: float) -> Any:
-    from flockenv.render import draw
-
-    behind = max(TRAIL, 1 + math.ceil(fps * max((look.trail for look in snapshots[-1].looks), default=0.0)))
-    return draw(snapshots[-1], size=size, trails=snapshots[-behind:-1])
-
-
-def _draw_frames(films: Sequence[Sequence[Snapshot]], size: int, fps: float) -> Iterator[Any]:
-    """Draw the snapshots of several films side by side; a film that has ended shows its last snapshot."""
-    import numpy as np
-
-    from flockenv.render import draw
-
-    behind = math.ceil(fps * max((look.trail for film in films for look in film[0].looks), default=0.0))
-    count = max(map(len, films))
-    with progress_bar("drawing", count, "frames") as progress:
-        for k in range(count):
-            progress(k)
-            pictures = []
-            for film in films:
-                at = min(k, len(film) - 1)
-                pictures.append(draw(film[at], size=size, trails=film[max(0, at - behind) : at], all_trails=False))
-            yield np.hstack(pictures)
