@@ -402,8 +402,9 @@ def test_chart_is_a_reproducible_png(in_temporary_folder: Path) -> None:
     data = Path("a.png").read_bytes()
     assert data == Path("b.png").read_bytes()
     assert data[:8] == b"\x89PNG\r\n\x1a\n"
-    pixels = np.asarray(Image.open("a.png").convert("L"))
-    assert Image.open("a.png").mode == "P" and Image.open("a.png").info["Software"] == "flockenv"
+    with Image.open("a.png") as picture:
+        assert picture.mode == "P" and picture.info["Software"] == "flockenv"
+        pixels = np.asarray(picture.convert("L"))
     assert min(pixels.shape) > 600
     assert (pixels < 128).mean() > 0.002
 
