@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,9 @@ from flockenv.jobs.job import code_digest, execute
 from flockenv.jobs.local_engine import LocalEngine, count_fitting
 from flockenv.jobs.store import State
 from flockenv.model.appearance import Appearance
+from flockenv.physics.integrators import RK4
+from flockenv.studies import accuracy, stress, trial_log
+from flockenv.studies.accuracy.suite import SUITE
 from tests.small_jobs import blas_threads, end_always, end_twice
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -447,3 +450,23 @@ def test_parts_of_one_run_are_shown_together(tmp_path: Path) -> None:
     run_jobs([Job("test-more/1", number, (1,), 1)], work(tmp_path))
     content = json.loads((tmp_path / "jobs" / "state-test.json").read_text())
     assert len(content["keys"]) == 3 and sorted(content["done"]) == sorted(content["keys"])
+
+
+class NotedJobs:
+    """An engine that notes its jobs, and runs none."""
+
+    parallel = False
+
+    def __init__(self) -> None:
+        self.jobs: list[Job] = []
+
+    def run(self, jobs: Iterable[Job], told: Any) -> Iterator[tuple[Job, Any]]:
+        self.jobs += jobs
+        yield from ()
+
+
+def test_jobs_of_trials_and_of_accuracy_state_the_memory_of_libraries_and_kernels() -> None:
+    engine: Any = NotedJobs()
+    trial_log.run(stress.CASES[:2], {"rk4": RK4()}, "sources", engine=engine)
+    assert list(accuracy.measure_errors({"damped": SUITE["damped"]()}, [RK4()], None, engine)) == []
+    assert len(engine.jobs) == 3 and all(2**28 <= job.memory <= 2**30 for job in engine.jobs)

@@ -37,6 +37,9 @@ VERDICTS: dict[Verdict, str] = {
 }
 """Meaning of each verdict."""
 
+MEMORY = 700 * 2**20
+"""Bytes that a process of trials needs: 420 MiB for libraries and to compile contacts, then some MiB for each case."""
+
 MARKS: dict[Verdict, str] = {"pass": "ok", "reported": "", "fails": "FAILS"}
 """Text of a verdict in a table, if it is not its name."""
 
@@ -179,7 +182,10 @@ def run(
 
     pairs = [(name, case) for name in unders for case in cases if case.runs_under(name)]
     jobs = [
-        Job(f"{case.name} under {name}", _try_as_job, (case, name, unders[name], warning_kinds), [case.name, name])
+        Job(
+            f"{case.name} under {name}", _try_as_job, (case, name, unders[name], warning_kinds), [case.name, name],
+            MEMORY,
+        )
         for name, case in pairs if (case.name, name) not in found
     ]  # fmt: skip
     stored = len(pairs) - len(jobs)

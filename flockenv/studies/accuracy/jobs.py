@@ -16,6 +16,9 @@ from flockenv.studies.accuracy.suite import SUITE
 
 __all__ = ["measure_errors"]
 
+MEMORY = 500 * 2**20
+"""Bytes that a process needs: 340 MiB for libraries and to compile a flock's kernel, then some MiB for each method."""
+
 
 def measure_errors(
     problems: Mapping[str, Problem], methods: Sequence[Integrator], finer: int | None, engine: Engine
@@ -33,6 +36,7 @@ def measure_errors(
             _measure,
             (replace(problem, exact=None), bool(problem.exact), tuple(methods), finer),
             name,
+            MEMORY,
         )
         for name, problem in problems.items()
     ]
