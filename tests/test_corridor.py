@@ -13,6 +13,7 @@ from flockenv.evaluation import rollout, worlds_for
 from flockenv.players import WEIGHTS
 from flockenv.players.policy import MlpPolicy, RandomPolicy
 from flockenv.players.rules import player
+from flockenv.players.rules.corridor import CorridorOrcaRules, SampledRules, orca_corridor, sampled_velocity
 from flockenv.tasks import Corridor
 from tests.test_tasks import act, paid, place, random_actions, world_of
 
@@ -131,9 +132,10 @@ def test_rewards_do_not_change_the_motion() -> None:
 
 def test_players_form_lanes_and_a_random_player_does_not() -> None:
     task, first = Corridor(), worlds_for("tuning", 7, 12)
-    players = {
+    players: dict[str, Any] = {
         "random": RandomPolicy(2, 0),
         "force": player(task, name="textbook"),
+        "sampled": player(task, name="rules"),
         "orca": player(task, name="orca"),
         "ppo": MlpPolicy.load(WEIGHTS / "corridor.safetensors", task),
     }
@@ -142,9 +144,73 @@ def test_players_form_lanes_and_a_random_player_does_not() -> None:
     assert abs(order["random"]) < 0.15
     assert order["force"] > 0.25
     assert order["orca"] > 0.9
+    assert order["sampled"] > 0.8
     assert order["ppo"] > 0.5
-    for name in ("force", "orca", "ppo"):
+    for name in ("force", "sampled", "orca", "ppo"):
         assert episodes[name].metrics["speed"].mean() > 0.8
+
+
+def seen(left: float = 2.25, speed: float = 1.0, others: Any = ()) -> Any:
+    """Return what an agent at its desired speed sees: m to the wall on its left, others (x, y, velocity), m and m/s."""
+    task = Corridor()
+    see = task.layout.unpack(np.zeros((1, task.layout.size)))
+    see.walls[0], see.desired_speed[0], see.velocity[0] = (left, task.width - left), speed, (speed, 0.0)
+    for k, (x, y, velocity) in enumerate(others):
+        see.neighbours[0, k], see.neighbour_present[0, k] = (x, y), 1.0
+        see.neighbour_velocity[0, k] = velocity - speed, 0.0
+    return see
+
+
+@pytest.mark.parametrize(("left", "outside"), [(0.5, 1.25), (1.5, 0.25), (1.75, 0.0), (2.5, 0.0)])
+def test_orca_returns_to_the_right_half_at_a_speed_in_proportion(left: float, outside: float) -> None:
+    """A body of 0.25 m is in the right half if its centre is at least that far from the middle."""
+    forces = (orca_corridor(seen(left), Corridor(), CorridorOrcaRules(gain=3.0, lane=lane))[0] for lane in (0.0, 0.4))
+    straight, back = forces
+    np.testing.assert_allclose(back - straight, [0.0, -0.4 * outside * 3.0], atol=1e-12)
+
+
+def sampled(see: Any, **parameters: Any) -> Any:
+    """Return the velocity that is taken, m/s."""
+    return see.velocity[0] + sampled_velocity(see, Corridor(), SampledRules(gain=1.0, **parameters))[0]
+
+
+def test_sampled_velocities_keep_the_desired_speed_in_the_right_half_and_return_to_it() -> None:
+    np.testing.assert_allclose(sampled(seen(2.25, 1.3)), [1.3, 0.0])
+    assert sampled(seen(0.75, 1.3))[1] < 0.0
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_sampled_velocities_overtake_on_the_free_side(side: float) -> None:
+    see = seen(1.5, 1.3, [(1.2, -0.2 * side, 0.4)])
+    assert side * sampled(see, lane=0.0)[1] > 0.0
+    np.testing.assert_allclose(sampled(see, lane=0.0, risk=0.0), [1.3, 0.0])
+
+
+def test_sampled_velocities_slow_down_where_there_is_no_room() -> None:
+    row = [(0.8, y, 0.2) for y in (-1.0, -0.5, 0.0, 0.5, 1.0)]
+    assert sampled(seen(1.5, 1.3, row), lane=0.0)[0] < 1.3
+
+
+@pytest.mark.parametrize("left", [0.3, 2.7])
+def test_sampled_velocities_keep_off_walls(left: float) -> None:
+    towards = 1.0 if left < 1.5 else -1.0
+    assert towards * sampled(seen(left, 1.3, [(0.9, -0.25 * towards, 0.2)]), lane=0.0)[1] <= 0.1
+
+
+def test_parameters_of_sampled_velocities_may_differ_by_row() -> None:
+    one, task = seen(0.9, 1.3, [(1.0, 0.1, 0.2)]), Corridor()
+    two = type(one)(**{name: np.repeat(value, 2, axis=0) for name, value in vars(one).items()})
+    values: dict[str, Any] = {
+        "risk": (0.1, 1.0),
+        "margin": (0.0, 0.3),
+        "share": (0.5, 1.0),
+        "lane": (0.0, 2.0),
+        "gain": (3.0, 9.0),
+    }
+    together = sampled_velocity(two, task, SampledRules(**{name: np.array(values[name]) for name in values}))
+    for k in range(2):
+        alone = sampled_velocity(one, task, SampledRules(**{name: pair[k] for name, pair in values.items()}))
+        np.testing.assert_array_equal(together[k], alone[0])
 
 
 def test_scripted_pedestrians_reach_80_percent_of_their_desired_speed() -> None:

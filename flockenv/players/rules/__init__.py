@@ -5,8 +5,8 @@ Each receives the learner's observation and nothing else, and its force has the 
 * `rules`, and of some tasks `orca`, `heuristics`, `queueing`: other functions; all with the parameters that a search
   found, in ../tuned/TASK.json (`python -m agents.tune`);
 * `textbook`, `orca_published`, `heuristics_published`, `queueing_published`: the same functions with published
-  parameters, the defaults in the files; in evade, obstacles and path_follow, `textbook` is another function than
-  `rules`.
+  parameters, the defaults in the files; in corridor, evade, obstacles and path_follow, `textbook` is another function
+  than `rules`.
 
     from flockenv.players.rules import player
     action, _ = player(task).predict(observation)
@@ -58,7 +58,7 @@ RULES: dict[str, tuple[Callable[..., Any], type]] = {
     "school": (school.school, school.SchoolRules),
     "crowd_nav": (crowd_nav.crowd_nav, crowd_nav.CrowdNavRules),
     "bottleneck": (bottleneck.bottleneck, bottleneck.BottleneckRules),
-    "corridor": (corridor.corridor, corridor.CorridorRules),
+    "corridor": (corridor.sampled_velocity, corridor.SampledRules),
 }
 """Function of `rules` for each task, and the class of its parameters."""
 
@@ -67,6 +67,7 @@ TEXTBOOK: dict[str, tuple[Callable[..., Any], type]] = {
     "obstacles": (obstacles.obstacles, obstacles.ObstaclesRules),
     "evade": (evade.evade, evade.EvadeRules),
     "path_follow": (path_follow.path_follow, path_follow.PathFollowRules),
+    "corridor": (corridor.corridor, corridor.CorridorRules),
 }
 """The same of `textbook`: other functions, as published, where `rules` are better ones than those."""
 

@@ -1,4 +1,4 @@
-"""Corridor: slow down before others, and pass them on one side."""
+"""Corridor: sample velocities, or slow down before others and pass them on one side; or ORCA."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flockenv.players.rules.parameter import parameter, per_row
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Corridor
 
-__all__ = ["CorridorOrcaRules", "CorridorRules", "corridor", "orca_corridor"]
+__all__ = ["CorridorOrcaRules", "CorridorRules", "SampledRules", "corridor", "orca_corridor", "sampled_velocity"]
 
 sidestep = rows(steering.sidestep)
 
@@ -46,13 +46,22 @@ def corridor(see: Any, task: Corridor, p: CorridorRules) -> NDArray[np.float64]:
     )  # fmt: skip
     push = per_row(p.strength) * np.sum(sidesteps * see.neighbour_present[..., None], axis=1)
     walls = _wall_force(see, p.walls, p.wall_decay)
-    force: NDArray[np.float64] = (_desired_velocity(see) - see.velocity) / per_row(p.tau) + push + walls
+    force: NDArray[np.float64] = (_desired_velocity(see, 0.0) - see.velocity) / per_row(p.tau) + push + walls
     return force
 
 
-def _desired_velocity(see: Any) -> NDArray[np.float64]:
-    """Return the desired velocities, m/s."""
-    return np.stack([see.desired_speed, 0.0 * see.desired_speed], axis=-1)
+def _desired_velocity(see: Any, lane: Any) -> NDArray[np.float64]:
+    """Return the desired velocities, m/s: along the corridor and, if the body is not in the right half, into it.
+
+    lane: m/s to the right for each metre that it is outside. All agents keep right, so the directions part.
+    """
+    return np.stack([see.desired_speed, 0.0 - lane * np.maximum(_outside(see), 0.0)], axis=-1)
+
+
+def _outside(see: Any) -> NDArray[np.float64]:
+    """Return how far the body is outside the right half of the corridor, m; negative within it."""
+    outside: NDArray[np.float64] = 0.5 * (see.walls[:, 1] - see.walls[:, 0]) + _PERSON
+    return outside
 
 
 def _wall_force(see: Any, strength: Any, decay: Any) -> NDArray[np.float64]:
@@ -69,8 +78,66 @@ class CorridorOrcaRules:
     margin: float = parameter(0.05, 0.0, 0.5, below="bodies touch")  # m, clearance for delays by inertia
     turn: float = parameter(0.3, 0.0, 1.5)  # rad, a desired velocity that is not free is turned right by this
     gain: float = parameter(10.0, 1.0, 20.0)  # kg/s: reaches the desired velocity within a decision
+    lane: float = parameter(0.0, 0.0, 2.0, below="agents keep left")  # 1/s, back to the right half; not in the paper
 
 
 def orca_corridor(see: Any, task: Corridor, p: CorridorOrcaRules) -> NDArray[np.float64]:
     """Avoid others by ORCA (van den Berg et al. 2011) along the corridor; walls are not among the neighbours."""
-    return keep_clear(see, task, p, _desired_velocity(see), _PERSON, _PERSON, 0.5) + _wall_force(see, 3.0, 0.1)
+    return keep_clear(see, task, p, _desired_velocity(see, p.lane), _PERSON, _PERSON, 0.5) + _wall_force(see, 3.0, 0.1)
+
+
+@dataclass(frozen=True)
+class SampledRules:
+    """Defaults, set by hand on a few tuning worlds."""
+
+    risk: float = parameter(0.2, 0.0, 2.0)  # s, cost of a touch, divided by the time until it
+    horizon: float = parameter(3.0, 0.5, 6.0)  # s, beyond which a touch costs nothing
+    margin: float = parameter(0.12, 0.0, 0.5, below="bodies touch")  # m, clearance
+    share: float = parameter(0.7, 0.4, 1.0)  # the agent's part of a change; the other one makes the rest
+    aside: float = parameter(0.1, 0.0, 1.0)  # s/m, cost of a speed across the corridor
+    lane: float = parameter(1.0, 0.0, 3.0, below="agents keep left")  # 1/m, cost of being outside the right half in 1 s
+    gain: float = parameter(8.0, 1.0, 20.0)  # kg/s, force per m/s of the desired change
+
+
+def sampled_velocity(see: Any, task: Corridor, p: SampledRules) -> NDArray[np.float64]:
+    """Take the velocity that costs least, of 52 (van den Berg, Lin and Manocha 2008, reciprocal velocity obstacles).
+
+    The cost is the deviation from the desired speed, with charges for an early touch, for speed across the corridor,
+    for walls, and for being outside the right half. As in the paper, others are expected to make a part of the change.
+    """
+    own = see.velocity[:, None]
+    along = see.desired_speed[:, None] * _ALONG
+    x, y = (own[..., k] + (v - own[..., k]) / per_row(p.share) for k, v in enumerate((along, _ACROSS)))
+    soon = np.maximum(_time_to_touch(x, y, see, 2 * _PERSON + per_row(p.margin)), _SOONEST)
+    to_wall = np.where(_ACROSS > 0.0, see.walls[:, :1], see.walls[:, 1:]) - _PERSON
+    cost = 1.0 - _ALONG + per_row(p.aside) * np.abs(_ACROSS)
+    cost = cost + per_row(p.risk) * np.maximum(1.0 / soon - 1.0 / per_row(p.horizon), 0.0)
+    cost += np.maximum(1.0 - np.maximum(to_wall, 0.0) / np.maximum(np.abs(_ACROSS) * _WALL_TIME, 1e-9), 0.0)
+    cost += per_row(p.lane) * np.maximum(_outside(see)[:, None] + _ACROSS, 0.0)
+    best = np.argmin(cost, axis=1)
+    desired = np.stack([along[np.arange(len(best)), best], _ACROSS[best]], axis=-1)
+    force: NDArray[np.float64] = per_row(p.gain) * (desired - see.velocity)
+    return force
+
+
+_ACROSS, _ALONG = (
+    each.ravel()
+    for each in np.meshgrid([-1.2, -0.9, -0.6, -0.4, -0.2, -0.1, 0, 0.1, 0.2, 0.4, 0.6, 0.9, 1.2], [1.0, 0.8, 0.5, 0.2])
+)
+"""The velocities: across the corridor, m/s to the left, and along it, as a share of the desired speed."""
+
+_WALL_TIME, _SOONEST = 0.5, 0.05  # s, within which reaching a wall costs; least time to a touch
+
+
+def _time_to_touch(x: NDArray[np.float64], y: NDArray[np.float64], see: Any, clearance: Any) -> NDArray[np.float64]:
+    """Return the time until the agent touches another at velocities (x, y), (R, K) m/s, in a frame at rest; or inf."""
+    soonest = np.full(x.shape, np.inf)
+    for k in np.flatnonzero((see.neighbour_present > 0).any(axis=0)):
+        to, velocity = see.neighbours[:, k], see.velocity + see.neighbour_velocity[:, k]
+        u, v = x - velocity[:, :1], y - velocity[:, 1:]
+        near, closing = np.sum(to * to, axis=-1)[:, None] - clearance * clearance, to[:, :1] * u + to[:, 1:] * v
+        room = closing * closing - (u * u + v * v) * near
+        meets = (closing > 0.0) & (room >= 0.0) & (see.neighbour_present[:, k, None] > 0)
+        time = np.maximum(near, 0.0) / np.maximum(closing + np.sqrt(np.maximum(room, 0.0)), 1e-9)
+        np.minimum(soonest, time, out=soonest, where=meets)
+    return soonest

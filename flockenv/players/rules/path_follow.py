@@ -69,9 +69,7 @@ class RacingRules:
     """Defaults: the whole force limit is used, and the line keeps a tenth of the half width from the track's edges."""
 
     width: float = parameter(0.9, 0.6, 1.0)  # share of the track's half width that the line may use
-    course: float = parameter(
-        0.0, 0.0, 1.0, below="bends are sought"
-    )  # weight of the bend from the present course into the line
+    course: float = parameter(0.0, 0.0, 1.0, below="bends are sought")  # weight of the first bend, at the agent
     grip: float = parameter(1.0, 0.7, 1.4)  # share of max_force that a bend may need
     brake: float = parameter(1.0, 0.4, 1.4)  # share of max_force that is assumed for braking
     late: float = parameter(0.5, 0.0, 1.0)  # braking leaves the force for the bend at a piece's start (0) or end (1)
