@@ -88,14 +88,24 @@ def sweep(
     waiting = [entry for of_task in entries.values() for entry in of_task if not entry.content]
     jobs = {job.key: job for entry in waiting for job in (*entry.evaluation, *entry.tuning)}  # a grid may have home
     run_jobs(list(jobs.values()), work)
-    digest = plan_digest(study, changes)
-    return {task: {"plan": digest, **_content(study, of_task, work.store)} for task, of_task in entries.items()}
+    return {
+        task: {"plan": plan_digest(study, changes, task), **_content(study, of_task, work.store)}
+        for task, of_task in entries.items()
+    }
 
 
-def plan_digest(study: Study, changes: Mapping[str, Mapping[str, Any]] = MappingProxyType({})) -> str:
-    """Return a digest of a study and of the changes by --set: only results of one plan are on one page."""
-    text = json.dumps([study.model_dump(mode="json"), {task: dict(each) for task, each in changes.items()}])
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+def plan_digest(
+    study: Study, changes: Mapping[str, Mapping[str, Any]] = MappingProxyType({}), task: str | None = None
+) -> str:
+    """Return a digest of a study and of the changes by --set, or of what concerns one task of it.
+
+    Only results of one plan are on one page; other settings of another task do not matter to those of this one.
+    """
+    plan, fixed = study.model_dump(mode="json"), {name: dict(each) for name, each in changes.items()}
+    if task is not None:
+        plan["tasks"] = {task: plan["tasks"][task]}
+        fixed = {name: each for name, each in fixed.items() if name == task}
+    return hashlib.sha256(json.dumps([plan, fixed]).encode()).hexdigest()[:16]
 
 
 def _content(study: Study, entries: Sequence[_Entry], store: Store) -> Content:
@@ -221,8 +231,8 @@ def main(
                 raise typer.Exit(0 if _check(plan, chosen, fixed, check, work) else 1)
             contents = sweep(plan, names, work, fixed)
         _write(folder, contents)
-        digest = plan_digest(plan, fixed)
-        others = {name: each for name, each in before.items() if each is not None and each["plan"] == digest}
+        kept = {name: each for name, each in before.items() if each is not None}
+        others = {name: each for name, each in kept.items() if each["plan"] == plan_digest(plan, fixed, name)}
         found = {name: read_task(content) for name, content in {**others, **contents}.items()}
         _publish(page, plan, _command(study, out, changes or []), found)
     for name in names:

@@ -18,7 +18,7 @@ from agents.report import json_text
 from agents.study import HOME, Partners, Study, contenders_of, settings_of
 from agents.study_report import markdown
 from agents.study_results import ALONE, LEVEL, Score, SettingResults, kind_of, read_file, read_task
-from agents.sweep import app, sweep
+from agents.sweep import app, plan_digest, sweep
 from flockenv.evaluation import bootstrap, lead_interval, mean_interval, rollout, worlds_for
 from flockenv.jobs import Store, Work
 from flockenv.jobs.local_engine import LocalEngine
@@ -400,3 +400,14 @@ def test_damaged_results_are_named(tmp_path: Path) -> None:
         path.write_text(text)
         with pytest.raises(ValueError, match=reason):
             read_file(path)
+
+
+def test_settings_of_another_task_do_not_change_the_plan_of_this_one() -> None:
+    study, other = (small(tasks={"pursuit": {"size": (10,)}, "evade": {"cover": (k,)}}) for k in (0, 5))
+    assert plan_digest(study, {}, "pursuit") == plan_digest(other, {}, "pursuit")
+    assert plan_digest(study, {}, "evade") != plan_digest(other, {}, "evade")
+    assert plan_digest(study) != plan_digest(other)
+    fixed = {"evade": {"cover": 5}}
+    assert plan_digest(study, fixed, "pursuit") == plan_digest(study, {}, "pursuit")
+    assert plan_digest(study, fixed, "evade") != plan_digest(study, {}, "evade")
+    assert plan_digest(small(worlds=4, tasks=study.tasks), {}, "pursuit") != plan_digest(study, {}, "pursuit")
