@@ -43,9 +43,10 @@ def test_the_curves_of_all_seeds_are_drawn(tmp_path: Path, monkeypatch: pytest.M
     (tmp_path / "weights" / "seeds").mkdir(parents=True)
     (tmp_path / "tuned").mkdir()
     card = json.loads((WEIGHTS / "pursuit.json").read_text())
-    other = {**card, "seed": 5, "curve": [{**point, "mean": point["mean"] - 1} for point in card["curve"]]}
-    card["seeds"] = {"scores": {str(card["seed"]): 8.0, "5": 7.0}}
-    for name, content in (("pursuit", card), ("seeds/pursuit-seed-5", other)):
+    seed = card["seed"] + 1
+    other = {**card, "seed": seed, "curve": [{**point, "mean": point["mean"] - 1} for point in card["curve"]]}
+    card["seeds"] = {"scores": {str(card["seed"]): 8.0, str(seed): 7.0}}
+    for name, content in (("pursuit", card), (f"seeds/pursuit-seed-{seed}", other)):
         (tmp_path / "weights" / f"{name}.json").write_text(json.dumps(content))
         (tmp_path / "weights" / f"{name}.safetensors").touch()
     tuned: Any = json.loads((TUNED / "pursuit.json").read_text())
