@@ -18,16 +18,16 @@ from numpy.typing import NDArray
 
 from agents.play import Player, Worlds, episodes_of_bytes, play_job, player_digest
 from flockenv.envs.disturbance import Disturbance, make_world
-from flockenv.envs.world import Step, World
+from flockenv.envs.world import Step
 from flockenv.evaluation import Episodes, Interval, bootstrap, compare
 from flockenv.jobs import Job, Store, Work, run_jobs
 from flockenv.jobs.local_engine import LocalEngine
 from flockenv.model.snapshot import Snapshot
 from flockenv.players.independent import IndependentPolicy
 from flockenv.players.policy import Policy
-from flockenv.tasks import Bottleneck, Crossing, School, Task
+from flockenv.tasks import Task
 
-__all__ = ["Among", "Payoffs", "invade", "jobs_of", "own_success", "worlds_among"]
+__all__ = ["Among", "Payoffs", "invade", "jobs_of", "worlds_among"]
 
 
 class Among:
@@ -35,7 +35,7 @@ class Among:
 
     With E = 1, in world k that agent is learner k % L, so every learner counts equally if L divides B, otherwise
     nearly; more are spread evenly over the learners, from that one on. A world ends when all E are out. Success is that
-    of the E agents, see `own_success`, or that of the world, if the task defines it for all agents together.
+    of the E agents, see `Task.own_success`, or that of the world, if the task defines it for all agents together.
     """
 
     def __init__(
@@ -63,9 +63,9 @@ class Among:
         joint[self._mine], joint[~self._mine] = actions.reshape(-1, actions.shape[-1]), theirs
         step, self._begins = self._world.step(joint), False
         self._seen = step.observation
-        names = ("observation", "reward", "terms", "terminated", "alive")
+        task, names = self._world.task, ("observation", "reward", "terms", "terminated", "alive")
         mine = {name: self._of_mine(getattr(step, name)) for name in names}
-        own = own_success(self._world, step)
+        own = task.own_success(self._world.state, self._world.memory, step.alive)
         success = step.success if own is None else np.asarray(self._of_mine(own).all(axis=1))
         return step._replace(success=success, **mine)
 
@@ -81,20 +81,6 @@ class Among:
     def snapshot(self, world: int = 0) -> Snapshot:
         """Return one world at this instant, for pictures."""
         return self._world.snapshot(world)
-
-
-def own_success(world: World, step: Step) -> NDArray[np.bool_] | None:
-    """Return whether each learner, (B, L), does by itself what all must do for success; None if that is of all at once.
-
-    In Crossing it is at its goal; in Bottleneck it is out and was never hurt; in School it lives.
-    """
-    task, n = world.task, world.learners
-    if isinstance(task, Crossing):
-        to_goal = world.memory[:, :2, :n].transpose(0, 2, 1) - world.state.pos[:, :n]
-        return np.asarray(np.linalg.norm(to_goal, axis=2) <= task.goal_radius)
-    if isinstance(task, Bottleneck):
-        return np.asarray((world.memory[:, 2, :n] > 0.0) & (world.memory[:, 1, :n] <= task.limit))
-    return step.alive if isinstance(task, School) else None
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -96,11 +95,10 @@ def test_success_is_that_of_the_one_agent() -> None:
 def test_success_of_each_agent() -> None:
     memory, alive = np.zeros((1, 6, 3)), np.array([[True, False, True]])
     memory[0, 2], memory[0, 1] = [1.0, 2.0, 0.0], [10.0, 1e6, 10.0]  # the first is out unhurt, the second out and hurt
-    step: Any = SimpleNamespace(alive=alive)
+    state = Flock(agents=3).scene.start(seed=0)
     expected = ((Bottleneck(people=3), [True, False, False]), (School(fish=3), [True, False, True]), (Flock(), None))
     for task, marks in expected:
-        world: Any = SimpleNamespace(task=task, learners=3, memory=memory)
-        found = invasion.own_success(world, step)
+        found = task.own_success(state, memory, alive)
         assert marks is None if found is None else found.tolist() == [marks]
 
 

@@ -125,7 +125,8 @@ def _disturb(
             continue
         key = mix(keys[b], _FAMILY)
         for i in range(rows.shape[1]):
-            _hide(entities, agents, reach, seen, rows[b, i])
+            if reach < math.inf or seen < rows.shape[2]:
+                _hide(entities, agents, reach, seen, rows[b, i])
             for k in range(rows.shape[2]):
                 x = np.float64(rows[b, i, k])
                 if x == 0.0:
@@ -157,12 +158,13 @@ class DisturbedWorld(World):
         self._rows, layout = np.arange(self.worlds), self.task.layout
         self._entry = self._disturb = entry(_disturb)
         d = self.disturbance
+        self._changes_rows = d != Disturbance(delay=d.delay)
         reach, seen = math.inf if d.range is None else d.range, layout.size if d.seen is None else d.seen
         self._bounds = layout.low, layout.entities, layout.agent_slots, d.noise, d.dropped, reach, seen
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes that `_compile_and_allocate` cannot make again."""
-        derived = ("_rows", "_entry", "_disturb", "_bounds")
+        derived = ("_rows", "_entry", "_disturb", "_bounds", "_changes_rows")
         return {name: value for name, value in super().__getstate__().items() if name not in derived}
 
     def reset(
@@ -192,7 +194,7 @@ class DisturbedWorld(World):
 
     def _disturb_rows(self, rows: Rows, mask: NDArray[np.bool_]) -> None:
         """Disturb the observations of the worlds in the mask, (B,), in place; again, they would be another result."""
-        if self.disturbance != Disturbance(delay=self.disturbance.delay):
+        if self._changes_rows:
             self._disturb(self.state.key, self.steps, mask, *self._bounds, rows)
             if self._disturb is self._entry:
                 self._disturb = without_dispatch(self._entry)  # argument types do not change after this call

@@ -59,7 +59,7 @@ def write_chart(path: str | Path, columns: Sequence[Column], title: str, note: s
 def save_figure(path: str | Path, figure: Figure, dpi: int = 100) -> None:
     """Write a figure as a PNG file, whole or not at all; the same numbers give the same bytes.
 
-    It has a palette of 256 colours, which a chart seldom needs in full: the file takes a third of the bytes.
+    It has a palette of 256 colours, more than most charts have: such a file is much smaller.
     """
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo

@@ -369,6 +369,11 @@ class Bottleneck(Task):
         """Return a mark at the door."""
         return (Mark("goal", np.array([self.room, self.room / 2]), np.zeros(2), self.width / 2),)
 
+    def own_success(self, state: State, memory: NDArray[Any], alive: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+        """Return whether each learner is out and was never hurt, (B, L)."""
+        n = self.learners
+        return np.asarray((memory[:, 2, :n] > 0.0) & (memory[:, 1, :n] <= self.limit))
+
     def view(self, state: State, world: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Return the room and the floor beyond the door, m."""
         return (0.0, 0.0), (self.room + _BEYOND, self.room)

@@ -285,6 +285,12 @@ class Crossing(Task):
         """Return a mark at each goal."""
         return tuple(Mark("goal", memory[:2, world, i], np.zeros(2), self.goal_radius) for i in range(self.agents))
 
+    def own_success(self, state: State, memory: NDArray[Any], alive: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+        """Return whether each learner is at its goal, (B, L)."""
+        n = self.learners
+        to_goal = memory[:, :2, :n].transpose(0, 2, 1) - state.pos[:, :n]
+        return np.asarray(np.linalg.norm(to_goal, axis=2) <= self.goal_radius)
+
     def view(self, state: State, world: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Return the circle and a margin around it, m."""
         edge = 1.3 * self.circle

@@ -547,6 +547,10 @@ class School(Task):
             for j in range(first, self.agents)
         )
 
+    def own_success(self, state: State, memory: NDArray[Any], alive: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+        """Return whether each learner lives, (B, L)."""
+        return alive
+
     def _drawn_radius(self, amount: float) -> float:
         """Return the radius at which a patch is drawn, m."""
         return self.reach * math.sqrt(min(max(amount / self.capacity, 0.01), 1.0))

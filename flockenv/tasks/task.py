@@ -224,6 +224,13 @@ class Task(Record):
         """Return the role of each agent of a world in pictures, (N,) of snapshot.ROLES; constant over an episode."""
         return self.scene.roles
 
+    def own_success(self, state: State, memory: NDArray[Any], alive: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+        """Return whether each learner, (B, L), does by itself what all must do for success; None if all do it together.
+
+        memory: (B, M, N), as of World.memory; alive: (B, L), after the step.
+        """
+        return None
+
     def view(self, state: State, world: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Return the region that a picture shows, m."""
         d = self.scene.dimension
