@@ -260,7 +260,7 @@ def interrupted(moment: str, *arguments: str) -> subprocess.CompletedProcess[str
     """Run a command in a process that sends itself SIGINT once the progress bar of that name has advanced."""
     code = f"""
 import contextlib, os, signal, sys
-from flockenv.cli import main
+from flockenv.cli import films, main
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a background test run ignores SIGINT, as do its children
 
@@ -271,7 +271,7 @@ def progress(title, total, unit, first=""):
             os.kill(os.getpid(), signal.SIGINT)
     yield show
 
-main.progress_bar = progress
+main.progress_bar = films.progress_bar = progress
 sys.exit(main.main())
 """
     return subprocess.run(
