@@ -135,6 +135,32 @@ def test_the_cause_of_an_error_for_lack_of_memory_is_one_line(error: Exception, 
     assert describe_error(error) == (f"not enough memory: {line}", 2) or line is None
 
 
+CALLS = """
+import resource, sys
+from flockenv.core.address_space import shortage
+
+def deeper():
+    return deeper()
+
+sys.setrecursionlimit(10**7)
+with open("/proc/self/statm") as file:
+    size = int(file.read().split()[0]) * resource.getpagesize()
+hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+resource.setrlimit(resource.RLIMIT_AS, (size + 2**21, hard))
+try:
+    deeper()
+except (MemoryError, SystemError) as raised:
+    error = raised
+print(shortage(error))
+"""
+
+
+def test_a_call_without_memory_for_its_frame_lacks_memory() -> None:
+    """CPython 3.11 raises SystemError there, "error return without exception set"."""
+    done = subprocess.run([sys.executable, "-c", CALLS], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout.endswith(" GB are allowed (ulimit -v)\n"), done.stdout
+
+
 def test_a_library_that_cannot_be_loaded_under_a_limit_lacks_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(address_space, "_limit", lambda: ", 0.70 GB are allowed (ulimit -v)")
     error = ImportError("x.so: failed to map segment from shared object")

@@ -72,6 +72,8 @@ def _failure(error: BaseException) -> str | None:
         return str(error.strerror) if error.filename is None else f"{error.filename}: {error.strerror}"
     if isinstance(error, ImportError) and "failed to map segment" in text and _limit():
         return text
+    if isinstance(error, SystemError) and text == "error return without exception set":
+        return "none is left for a call of a function"  # how CPython 3.11 ends a call that gets no memory
     if isinstance(error, RuntimeError) and "can't start new thread" in text:
         return "no further thread can be started (ulimit -v, ulimit -u)"
     if isinstance(error, RuntimeError) and "DefaultCPUAllocator: " in text:
