@@ -17,7 +17,8 @@ ROOT = Path(__file__).resolve().parent.parent
 
 LAYERS = (
     "core", "jit", "maths", "steering", "geometry", "model", "physics", "behaviours", "engine", "scene", "render",
-    "tasks", "envs", "players", "evaluation", "jobs", "studies", "cli", "agents", "tests",
+    "tasks", "envs", "players", "evaluation", "jobs", "studies", "play", "cli", "agents",
+    "tests",
 )  # fmt: skip
 """The packages from bottom to top: a module imports its own package and those before it in this list."""
 

@@ -81,7 +81,9 @@ def test_the_wheel_contains_flockenv_alone(wheel: Path) -> None:
     files = {f"players/weights/{task}.{suffix}" for task in TASKS for suffix in ("json", "safetensors")}
     seeds = (ROOT / "flockenv" / "players" / "weights" / "seeds").glob("*")
     files |= {f"players/weights/seeds/{path.name}" for path in seeds}
-    files |= {f"players/tuned/{task}.json" for task in TASKS} | {"py.typed", "render/replay.html"}
+    files |= {f"players/tuned/{task}.json" for task in TASKS} | {"py.typed"}
+    for folder in ("render/page", "play/shipped"):
+        files |= {f"{folder}/{path.name}" for path in (ROOT / "flockenv" / folder).iterdir()}
     assert {name for name in names if name.startswith("flockenv/")} == sources | {f"flockenv/{f}" for f in files}
     assert wheel.stat().st_size < 5_000_000
     assert any(name.endswith("licenses/LICENSE") for name in names)
@@ -124,7 +126,8 @@ def test_the_base_dependencies_do_not_include_torch(metadata: Message) -> None:
         *("numpy", "scipy", "numba", "gymnasium", "pettingzoo", "pydantic", "pyyaml", "typer", "rich"),
         *("matplotlib", "pillow", "safetensors", "shapely", "filelock"),
     }
-    assert set(metadata.get_all("Provides-Extra") or []) == {"train", "test", "render", "docs", "ray", "rllib"}
+    extras = {"train", "test", "render", "play", "docs", "ray", "rllib", "browser"}
+    assert set(metadata.get_all("Provides-Extra") or []) == extras
     assert "gymnasium<2,>=1.2" in needed
 
 
@@ -135,7 +138,7 @@ def test_the_wheel_works_without_the_checkout(wheel: Path, tmp_path: Path) -> No
     code = (
         "import flockenv, gymnasium, pettingzoo, importlib.resources as r; from flockenv.cli.main import main;"
         "assert gymnasium.spec('flockenv/Pursuit-v0') and 'flockenv/Flock-v1' in pettingzoo.parallel_registry;"
-        "assert '__DATA__' in (r.files('flockenv.render') / 'replay.html').read_text();"
+        "assert '__DATA__' in (r.files('flockenv.render') / 'page' / 'page.html').read_text();"
         "from flockenv.players import load_player; from flockenv.tasks import Pursuit; import numpy as np;"
         "task = Pursuit(); rows = np.zeros((1, task.layout.size), np.float32);"
         "assert all(load_player(name, task).predict(rows)[0].shape == (1, 2) for name in ('rules', 'textbook', 'ppo'));"

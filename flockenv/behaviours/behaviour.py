@@ -162,7 +162,9 @@ class AboutNearest(Behaviour):
 
     group: int | None = Field(default=None, ge=0, description="group whose nearest agent counts (default: all)")
     radius: float = Field(gt=0, description="m, range of sight")
-    fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
+    fov: float = Field(
+        title="field of view", default=360.0, gt=0, le=360, description="degrees, full angle of the field of view"
+    )
     occluded: bool = Field(default=False, description="True if obstacles hide agents")
     pair_law: ClassVar[Law | None] = nearest_one
 

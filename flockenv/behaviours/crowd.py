@@ -55,7 +55,9 @@ class UnalignedAvoidance(Behaviour):
     kind: Literal["unaligned_avoidance"] = "unaligned_avoidance"
     weight: float = Field(ge=0, description="N, steering force of an evasion")
     radius: float = Field(default=10.0, gt=0, description="m, range within which agents count")
-    fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
+    fov: float = Field(
+        title="field of view", default=360.0, gt=0, le=360, description="degrees, full angle of the field of view"
+    )
     horizon: float = Field(default=3.0, gt=0, description="s, look-ahead time")
     margin: float = Field(default=0.0, ge=0, description="m, clearance beyond both radii")
     group: int | None = Field(default=None, ge=0, description="group that it avoids (default: all)")
@@ -219,7 +221,9 @@ class Forage(Moving):
     kind: Literal["forage"] = "forage"
     food: int = Field(ge=0, strict=True, description="group whose agents are food")
     radius: float = Field(default=3.0, gt=0, description="m, range within which food is seen")
-    fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
+    fov: float = Field(
+        title="field of view", default=360.0, gt=0, le=360, description="degrees, full angle of the field of view"
+    )
     slow_radius: float = Field(default=0.5, gt=0, description="m, distance from food within which it slows down")
     period: float = Field(default=2.0, gt=0, description="s, correlation time of its turns while it wanders")
     strength: float = Field(default=1.0, ge=0, description="m sideways per m ahead while it wanders")

@@ -89,7 +89,9 @@ class _FlockRule(Effect):
 
     weight: float
     radius: float = Field(gt=0, description="m, range within which neighbours count")
-    fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
+    fov: float = Field(
+        title="field of view", default=360.0, gt=0, le=360, description="degrees, full angle of the field of view"
+    )
     nearest: int | None = Field(
         default=None, ge=1, le=32, description="topological: number of nearest neighbours that count (default: all)"
     )
@@ -110,6 +112,7 @@ class Separation(_FlockRule):
     """Keep away from near neighbours: F = w sum of (x - x_j)/|x - x_j|^2."""
 
     kind: Literal["separation"] = "separation"
+    sentence: ClassVar[str] = "Keep away from neighbours within {radius}"
     weight: float = Field(ge=0, description="N m")
     demo: ClassVar[str | None] = """
 groups: [{count: 14, radius: 0.15, spawn: {low: [0, 0], high: [3, 3]}}]
@@ -137,6 +140,7 @@ class Alignment(_FlockRule):
     """Match the mean velocity of the neighbours: F = w (mean v_j - v)."""
 
     kind: Literal["alignment"] = "alignment"
+    sentence: ClassVar[str] = "Match the mean velocity of neighbours within {radius}"
     weight: float = Field(ge=0, description="kg/s")
     demo: ClassVar[str | None] = """
 groups: [{count: 14, radius: 0.15, spawn: {low: [0, 0], high: [6, 6], speed: [0.5, 1.5]}}]
@@ -161,6 +165,7 @@ class Cohesion(_FlockRule):
     """Stay with the neighbours: F = w (mean x_j - x)."""
 
     kind: Literal["cohesion"] = "cohesion"
+    sentence: ClassVar[str] = "Stay with the neighbours within {radius}"
     weight: float = Field(ge=0, description="N/m")
     demo: ClassVar[str | None] = """
 groups: [{count: 14, radius: 0.15, spawn: {low: [0, 0], high: [9, 9], speed: [0.2, 1]}}]

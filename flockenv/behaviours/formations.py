@@ -176,7 +176,9 @@ class Interpose(Moving):
     group: int = Field(ge=0, description="the first group")
     other: int = Field(ge=0, description="the other group, or the same")
     radius: float = Field(gt=0, description="m, range of sight")
-    fov: float = Field(default=360.0, gt=0, le=360, description="degrees, full angle of the field of view")
+    fov: float = Field(
+        title="field of view", default=360.0, gt=0, le=360, description="degrees, full angle of the field of view"
+    )
     share: float = Field(default=0.5, ge=0, le=1, description="share of the path from the first to the other")
     slow_radius: float = Field(gt=0, description="m, distance within which it slows down")
     pair_start: ClassVar[Law | None] = no_agents

@@ -177,6 +177,7 @@ class WalkingGroup(Effect):
     """
 
     kind: Literal["walking_group"] = "walking_group"
+    sentence: ClassVar[str] = "Walk in small parties of {party}"
     group: int | None = Field(
         default=None, ge=0, strict=True, description="group that walks in parties (default: all, counted consecutively)"
     )
@@ -185,7 +186,9 @@ class WalkingGroup(Effect):
     cohesion: float = Field(default=3.0, ge=0, description="beta2, m/s^2, towards the centre")
     repulsion: float = Field(default=1.0, ge=0, description="beta3, m/s^2, from each member that is too near")
     distance: float = Field(default=0.8, gt=0, description="m between centres, below which members repel")
-    fov: float = Field(default=180.0, gt=0, le=360, description="degrees, full angle of view without turning")
+    fov: float = Field(
+        title="field of view", default=180.0, gt=0, le=360, description="degrees, full angle of view without turning"
+    )
     radius: float = Field(default=20.0, gt=0, description="m, range within which members count")
     steering: ClassVar[bool] = True
     always: ClassVar[bool] = False

@@ -192,7 +192,13 @@ class EllipticalRepulsion(Social):
     step: float = Field(ge=0, description="dt, s, duration of the step")
     relative: bool = Field(default=False, description="True: step by relative velocity")
     anisotropy: float = Field(default=1.0, ge=0, le=1, description="lambda, weight of neighbours straight behind")
-    fov: float = Field(default=360.0, gt=0, le=360, description="degrees, 2 phi, full angle of the field of view")
+    fov: float = Field(
+        title="field of view",
+        default=360.0,
+        gt=0,
+        le=360,
+        description="degrees, 2 phi, full angle of the field of view",
+    )
     outside: float = Field(default=1.0, ge=0, le=1, description="c, weight of forces from outside the field of view")
     pair_law: ClassVar[Law | None] = elliptical_pair
     demo: ClassVar[str | None] = HEAD_ON.replace(

@@ -39,6 +39,7 @@ class Steer(Effect):
     """The behaviours of a group in order of priority, and the arbitration that combines them into one force."""
 
     kind: Literal["steer"] = "steer"
+    sentence: ClassVar[str] = "Steer by the following behaviours, the first one first"
     behaviours: tuple[AnyBehaviour, ...] = Field(min_length=1, description="in order of priority, the highest first")
     arbitration: AnyReconciling = Field(default_factory=Allocation, description="how their forces are combined")
     group: int | None = Field(default=None, ge=0, description="group that it steers (default: all)")

@@ -1,6 +1,7 @@
 """The command line of flockenv.
 
-list | run | measure | render | explain | accuracy | stress | experiment | gallery | validate | jobs | warmup | schema
+list | run | play | measure | render | explain | accuracy | stress | experiment | gallery | validate | jobs | warmup
+| schema
 
 Errors are one line on stderr. Exit codes: 0, 1 (a run failed), 2 (bad input), 130 (interrupted).
 """
@@ -25,6 +26,7 @@ from flockenv.cli.films import film_episodes, write_picture
 from flockenv.cli.jobs import jobs
 from flockenv.cli.measure import measure
 from flockenv.cli.options import Debug, Delay, Dropped, Noise, Reach, Seen, TrustPickle
+from flockenv.cli.play import play
 from flockenv.cli.studies import accuracy, experiment, gallery, stress
 from flockenv.cli.targets import complete_target, is_scene_file
 from flockenv.cli.terminal import (
@@ -305,6 +307,7 @@ def explain(scene: SceneFile) -> None:
     show_table(console, "Left out, because nothing in the scene needs it", left_out, [""])
 
 
+app.command()(play)
 app.command()(measure)
 app.command()(accuracy)
 app.command()(stress)
@@ -410,6 +413,7 @@ def _show_measures(console: Console, trajectory: Trajectory) -> None:
     counts = ", ".join(f"{trajectory.last.count_of(name):,} {words}" for words, name in work.items())
     counts += _unsolved_text(trajectory.last)
     console.print(f"{text(trajectory.rate / 1e6)} million agent-steps/s ({trajectory.wall:.3g} s); {counts}")
+    console.print(f"digest of the last state: {trajectory.last.digest}")
 
 
 def _unsolved_text(state: State) -> str:

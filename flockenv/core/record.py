@@ -71,6 +71,11 @@ class Record(BaseModel, metaclass=_OneLine):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
 
+    sentence: ClassVar[str] = ""
+    """Beginning of the sentence about it in the playground: {name} for a field's value, [...] only if not the default.
+
+    Default: the first clause of its docstring, see flockenv/play/sentences.py."""
+
     def __init_subclass__(cls, **options: Any) -> None:
         """Make functions in class variables, such as laws, static methods, so that they are not bound to the record."""
         super().__init_subclass__(**options)

@@ -228,6 +228,7 @@ class Plane(Space):
     """Unbounded flat space, 2-D or 3-D."""
 
     kind: Literal["plane"] = "plane"
+    sentence: ClassVar[str] = "An unbounded space"
     offset_law: ClassVar[Law] = plane_offset
     confine_law: ClassVar[Law] = plane_confine
 
@@ -236,6 +237,7 @@ class Torus(Space):
     """A periodic box [0, size): an agent that leaves on one side enters on the other."""
 
     kind: Literal["torus"] = "torus"
+    sentence: ClassVar[str] = "A torus of {size}, which agents leave on one side and enter on the other"
     size: Size = Field(description="m per axis")
     offset_law: ClassVar[Law] = torus_offset
     confine_law: ClassVar[Law] = torus_confine
@@ -264,6 +266,7 @@ class Box(Space):
     """
 
     kind: Literal["box"] = "box"
+    sentence: ClassVar[str] = "A box of {size}, at whose walls bodies stop or bounce"
     size: Size = Field(description="m per axis")
     restitution: float = Field(
         default=0.0, ge=0, le=1, description="e: 0 = bodies stop at a wall, 1 = no speed is lost"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +20,8 @@ Place = Annotated[tuple[Annotated[float, Field(strict=True)], ...], Field(min_le
 
 class Target(Record):
     """A place to reach: a point `at`, a door between two `ends`, or a box `low` to `high`, enlarged by `radius`."""
+
+    sentence: ClassVar[str] = "[the point {at}][the door between {ends}][the box from {low}][ to {high}]"
 
     at: Place | None = Field(default=None, description="m, a point")
     ends: tuple[Place, Place] | None = Field(default=None, description="m, the two ends of a door")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,8 @@ class Appearance(Record):
     `by` names that quantity, and `over` is its range: from the first to the last colour, opacity and size, which are
     interpolated.
     """
+
+    sentence: ClassVar[str] = "drawn as {form}"
 
     form: Literal["point", "disc", "polygon"] = Field(
         default="point", description="a dot, always visible; a disc of its true size; a polygon that points ahead"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ MOST = 10_000_000
 
 class Spread(Record):
     """A uniform distribution from `low` to `high` or, with `mean` and `sd`, a normal one truncated to [low, high]."""
+
+    sentence: ClassVar[str] = "spread[ around {mean}][ with a deviation of {sd}][ from {low}][ to {high}]"
 
     low: float | None = Field(default=None, description="lower bound (default for a normal one: 0)")
     high: float | None = Field(default=None, description="upper bound (default for a normal one: no limit)")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,8 @@ class Group(Record):
 
     Mass, radius and desired_speed are a number, or a `Spread` of numbers that vary within the group.
     """
+
+    sentence: ClassVar[str] = "[{count} agents][{network}]"
 
     count: int | None = Field(default=None, ge=1, description="number of agents")
     network: AnyNetwork | None = Field(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from typing import Final
@@ -140,14 +140,8 @@ class Snapshot:
     @property
     def shade(self) -> Floats:
         """The position of each agent's value in the range of its look, (N,) from 0 to 1; 0 without a look."""
-        shade = np.zeros(self.agents)
         age = np.full(self.agents, self.time) if self.age is None else self.age
-        with np.errstate(over="ignore", invalid="ignore"):
-            speed = np.linalg.norm(self.vel, axis=1)
-        for k, look in enumerate(self.looks):
-            mine = self.look == k
-            shade[mine] = look.shade(age[mine], speed[mine], None if self.inner is None else self.inner[mine])
-        return shade
+        return shades_of(self.looks, self.look, age, self.vel, self.inner)
 
     def is_same(self, other: Snapshot) -> NDArray[np.bool_]:
         """True for rows that hold the same agent in another snapshot, (N,) bool."""
@@ -166,6 +160,22 @@ class Snapshot:
     def visible(self) -> NDArray[np.bool_]:
         """True for bodies that can be drawn, at finite positions, (N,) bool."""
         return np.asarray(np.isfinite(self.pos).all(axis=1) & np.isfinite(self.vel).all(axis=1))
+
+
+def shades_of(
+    looks: Sequence[Appearance], look: NDArray[np.int32] | None, age: Floats, vel: Floats, inner: Floats | None
+) -> Floats:
+    """Return the position of each agent's value in the range of its look, (N,) from 0 to 1; 0 without a look.
+
+    look (N,): index of the look of each agent; age (N,) s; vel (N, D) m/s; inner (N,): the inner state that is shown.
+    """
+    shade = np.zeros(len(vel))
+    with np.errstate(over="ignore", invalid="ignore"):
+        speed = np.linalg.norm(vel, axis=1)
+    for k, each in enumerate(looks):
+        mine = look == k
+        shade[mine] = each.shade(age[mine], speed[mine], None if inner is None else inner[mine])
+    return shade
 
 
 def _fix(record: Mark | Snapshot, **fields: object) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,7 @@ class Spawn(Record):
     """
 
     kind: Literal["uniform"] = "uniform"
+    sentence: ClassVar[str] = "placed at random[ from {low}][ to {high}]"
     low: tuple[float, ...] | None = Field(default=None, description="m, lower corner")
     high: tuple[float, ...] | None = Field(default=None, description="m, upper corner")
     spacing: Edge | tuple[Edge, ...] | None = Field(

@@ -6,7 +6,8 @@ users see (B, N, D) through transposed views, without a copy.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -18,7 +19,7 @@ from flockenv.jit.memory import zeros
 from flockenv.jit.section import entry
 from flockenv.maths.heading import face
 
-__all__ = ["COUNTED_BY_KERNELS", "WORK", "Body", "Floats", "Obstacles", "State"]
+__all__ = ["COUNTED_BY_KERNELS", "WORK", "Body", "Floats", "Obstacles", "State", "digest_arrays"]
 
 Floats = NDArray[np.floating[Any]]
 
@@ -147,6 +148,14 @@ class State:
         """Return a work counter, summed over the worlds; what: its name in WORK."""
         return int(self.work[:, WORK.index(what)].sum())
 
+    @property
+    def digest(self) -> str:
+        """A digest of all that determines later states: every array but the work counters, and dt.
+
+        Equal states have equal digests, in every process.
+        """
+        return digest_arrays({name: getattr(self, name) for name in _ARRAYS if name != "work"} | {"dt": self.dt})
+
     def copy(self) -> State:
         """Return a state that shares no memory with this one."""
         return replace(self, **{name: getattr(self, name).copy() for name in _ARRAYS})
@@ -211,6 +220,15 @@ class State:
             for name in _ARRAYS
         }
         return replace(self, **arrays)
+
+
+def digest_arrays(arrays: Mapping[str, Any]) -> str:
+    """Return a digest of named arrays or numbers: of their names, types, shapes and bytes, 32 hexadecimal digits."""
+    found = hashlib.sha256()
+    for name, value in sorted(arrays.items()):
+        array = np.ascontiguousarray(value)
+        found.update(f"{name} {array.dtype} {array.shape} ".encode() + array.tobytes())
+    return found.hexdigest()[:32]
 
 
 _PER_COORDINATE = ("x", "v", "obstacle_x", "frame", "inner")

@@ -1,21 +1,16 @@
 """Write a replay: a self-contained HTML file that plays the same world under several players, side by side.
 
-The page is replay.html beside this file; its data is one JSON object. Numbers of each frame are little-endian arrays in
-base64: positions are uint16 over the region shown, extended by half of its size on each side; headings are uint8.
-A frame of 24 agents takes 160 bytes.
+The page is put together in page.py; its data is one JSON object. Numbers of each frame are little-endian arrays in
+base64, as quantise.py defines them. A frame of 24 agents takes 160 bytes.
 """
 
 from __future__ import annotations
 
-import html
-import json
 import math
 import os
-import re
 from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from typing import Any, Final
 
 import numpy as np
@@ -23,18 +18,12 @@ from numpy.typing import NDArray
 
 from flockenv.core.atomic_files import replace_file
 from flockenv.model.appearance import Appearance
-from flockenv.model.snapshot import Floats, Mark, Snapshot
-from flockenv.render.palette import ARROW, BODY_DISC, BOND, DART, DART_REACH, JUMP, PAPER, POINT, ROLE_COLOURS, WAY
+from flockenv.model.snapshot import Mark, Snapshot
+from flockenv.render.page import page
+from flockenv.render.quantise import quantise_headings, quantise_positions
 
-__all__ = ["Group", "Panel", "write_replay"]
+__all__ = ["Group", "Panel", "look_data", "replay_page", "round_digits", "scenery_data", "write_replay"]
 
-#: Headings are 0 to 253, anticlockwise from +x; the other two values: an agent at rest, and one that is not shown.
-_DIRECTIONS: Final = 254
-_RESTING: Final = 254
-_ABSENT: Final = 255
-#: Positions are stored up to this share of the region's extent beyond [low, high]; farther agents are moved there.
-_BEYOND: Final = 0.5
-_LEVELS: Final = 65535
 #: Number of points of an appearance's range at which its colours are stored.
 _LOOKS: Final = 16
 
@@ -102,36 +91,17 @@ def write_replay(path: str | os.PathLike[str], groups: Sequence[Group], title: s
     Its address may end with #task=1&t=4.2&play: the task, the time, s, and play or pause. Raises ValueError if there is
     no group.
     """
+    text = replay_page(groups, title)
+    with replace_file(path) as file:
+        file.write(text)
+
+
+def replay_page(groups: Sequence[Group], title: str) -> bytes:
+    """Return the replay that `write_replay` writes."""
     if not groups:
         raise ValueError("groups: there must be at least one, got none")
-    data = {
-        "title": title,
-        "groups": [{"title": group.title, "panels": [*map(_panel_data, group.panels)]} for group in groups],
-        "roles": ROLE_COLOURS,
-        "paper": PAPER,
-        "dart": DART,
-        "arrow": ARROW,
-        "reach": DART_REACH,
-        "disc": BODY_DISC,
-        "bond": BOND,
-        "point": POINT,
-        "jump": JUMP,
-        "way": WAY,
-        "beyond": _BEYOND,
-        "directions": _DIRECTIONS,
-    }
-    fills = {"TITLE": html.escape(title), "DATA": _to_script_json(data)}
-    page = files("flockenv.render").joinpath("replay.html").read_text(encoding="utf-8")
-    # One pass, so that a title that contains a placeholder is not replaced again.
-    page = re.sub(r"__(TITLE|DATA)__", lambda slot: fills[slot[1]], page)
-    with replace_file(path) as file:
-        file.write(page.encode("utf-8", "replace"))
-
-
-def _to_script_json(data: object) -> str:
-    """Return JSON that is safe within a <script>: <, > and & are escaped."""
-    text = json.dumps(data, separators=(",", ":"), allow_nan=False)
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+    shown = [{"title": group.title, "panels": [*map(_panel_data, group.panels)]} for group in groups]
+    return page("recorded", title, {"groups": shown})
 
 
 def _show_same_agents(one: Snapshot, other: Snapshot) -> bool:
@@ -153,13 +123,13 @@ def _panel_data(panel: Panel) -> dict[str, Any]:
     return {
         "player": panel.player,
         "outcome": panel.outcome,
-        "time": [_round_digits(shot.time, 9) for shot in shots],
-        "reward": None if panel.reward is None else [_round_digits(r, 6) for r in panel.reward],
+        "time": [round_digits(shot.time, 9) for shot in shots],
+        "reward": None if panel.reward is None else [round_digits(r, 6) for r in panel.reward],
         "low": first.low.tolist(),
         "high": first.high.tolist(),
         "periodic": first.periodic,
         "roles": first.roles,
-        "radius": [_round_digits(r, 6) for r in first.radius],
+        "radius": [round_digits(r, 6) for r in first.radius],
         "pos": _to_base64(np.stack([_quantise_positions(shot) for shot in shots])),
         "heading": _to_base64(np.stack([_quantise_headings(shot) for shot in shots])),
         "bonds": first.bonds.tolist(),
@@ -172,7 +142,7 @@ def _look_data(shots: Sequence[Snapshot]) -> dict[str, Any]:
     """Return the appearances, that of each agent, and per frame shades (0 to 255) and new agents; {} without any."""
     first, data = shots[0], dict[str, Any]()
     if first.looks:
-        data["looks"] = [_appearance_data(look) for look in first.looks]
+        data["looks"] = [look_data(look) for look in first.looks]
         data["look"] = np.asarray(first.look).tolist()
         data["shade"] = _to_base64(np.stack([np.rint(255 * shot.shade).astype(np.uint8) for shot in shots]))
     if first.identity is not None:
@@ -182,7 +152,7 @@ def _look_data(shots: Sequence[Snapshot]) -> dict[str, Any]:
     return data
 
 
-def _appearance_data(look: Appearance) -> dict[str, Any]:
+def look_data(look: Appearance) -> dict[str, Any]:
     """Return an appearance with its colours, opacities and sizes at _LOOKS points of its range."""
     places = np.linspace(0.0, 1.0, _LOOKS).tolist()
     colours = ["#{:02x}{:02x}{:02x}".format(*look.colour(s, "#000000")) for s in places] if look.colours else None
@@ -191,12 +161,12 @@ def _appearance_data(look: Appearance) -> dict[str, Any]:
         "vertices": look.vertices,
         "trail": look.trail,
         "colours": colours,
-        "opacity": [_round_digits(look.opacity_at(s), 3) for s in places],
-        "size": None if look.size is None else [_round_digits(look.size_at(s, 0.0), 4) for s in places],
+        "opacity": [round_digits(look.opacity_at(s), 3) for s in places],
+        "size": None if look.size is None else [round_digits(look.size_at(s, 0.0), 4) for s in places],
     }
 
 
-def _round_digits(value: float, digits: int) -> float:
+def round_digits(value: float, digits: int) -> float:
     """Return the number rounded to this many significant digits."""
     return float(f"{value:.{digits}g}")
 
@@ -206,22 +176,13 @@ def _to_base64(array: NDArray[np.uint8] | NDArray[np.uint16]) -> str:
 
 
 def _quantise_positions(shot: Snapshot) -> NDArray[np.uint16]:
-    extent = shot.high - shot.low
-    low = shot.low - _BEYOND * extent
-    high = shot.high + _BEYOND * extent
-    pos: Floats = np.where(shot.visible[:, None], shot.pos, low)
-    level = (np.clip(pos, low, high) - low) / (high - low) * _LEVELS
-    return np.rint(level).astype(np.uint16)
+    """Return the positions of a snapshot, (N, D); bodies that cannot be drawn are in the lowest corner."""
+    visible = np.where(shot.visible, shot.pos.T, -np.inf)
+    return quantise_positions(visible, shot.low, shot.high).T
 
 
 def _quantise_headings(shot: Snapshot) -> NDArray[np.uint8]:
-    """Return the heading of each agent in the x-y plane, (N,) uint8; _RESTING at rest, _ABSENT if it is not shown."""
-    vel = np.where(shot.visible[:, None], shot.aim, 0.0)[:, :2]
-    turn = np.arctan2(vel[:, 1], vel[:, 0]) / (2.0 * np.pi)
-    heading = np.rint(turn * _DIRECTIONS).astype(np.int64) % _DIRECTIONS
-    heading[~vel.any(axis=1)] = _RESTING
-    heading[~(shot.alive & shot.visible)] = _ABSENT
-    return heading.astype(np.uint8)
+    return quantise_headings(np.where(shot.visible, shot.aim.T, 0.0), shot.alive & shot.visible)
 
 
 def _scenery_data(shots: Sequence[Snapshot]) -> list[dict[str, Any]]:
@@ -229,22 +190,36 @@ def _scenery_data(shots: Sequence[Snapshot]) -> list[dict[str, Any]]:
     scenes: list[dict[str, Any]] = []
     converted: dict[Mark, dict[str, Any]] = {}  # each mark is converted once
     for k, shot in enumerate(shots):
-        circles = np.column_stack([shot.obstacle_centre[:, :2], shot.obstacle_radius]).tolist()
-        scene = {
-            "stones": [[_round_digits(x, 6) for x in circle] for circle in circles],
-            "walls": [[[_round_digits(x, 6) for x in corner] for corner in each.tolist()] for each in shot.outlines],
-            "marks": [converted.get(mark) or converted.setdefault(mark, _mark_data(mark)) for mark in shot.marks],
-        }
+        circles = np.column_stack([shot.obstacle_centre[:, :2], shot.obstacle_radius])
+        scene = scenery_data(circles, shot.outlines, shot.marks, converted)
         if not scenes or scene != {name: scenes[-1][name] for name in scene}:
             scenes.append({"from": k, **scene})
     return scenes
+
+
+def scenery_data(
+    circles: NDArray[np.floating[Any]],
+    outlines: Sequence[NDArray[np.floating[Any]]],
+    marks: Sequence[Mark],
+    converted: dict[Mark, dict[str, Any]] | None = None,
+) -> dict[str, Any]:
+    """Return obstacles and marks as JSON: circles (M, 3), centres and radii, m; polygons, each (n, 2) m; marks.
+
+    converted: marks that were converted before, to which others are added.
+    """
+    known = {} if converted is None else converted
+    return {
+        "stones": [[round_digits(x, 6) for x in circle] for circle in circles.tolist()],
+        "walls": [[[round_digits(x, 6) for x in corner] for corner in each.tolist()] for each in outlines],
+        "marks": [known.get(mark) or known.setdefault(mark, _mark_data(mark)) for mark in marks],
+    }
 
 
 def _mark_data(mark: Mark) -> dict[str, Any]:
     norm = float(np.linalg.norm(mark.vector)) or 1.0
     return {
         "kind": mark.kind,
-        "at": [_round_digits(x, 6) for x in mark.at[:2]],
-        "vector": [_round_digits(x, 6) for x in mark.vector[:2] / norm],
-        "radius": _round_digits(mark.radius, 6),
+        "at": [round_digits(x, 6) for x in mark.at[:2]],
+        "vector": [round_digits(x, 6) for x in mark.vector[:2] / norm],
+        "radius": round_digits(mark.radius, 6),
     }

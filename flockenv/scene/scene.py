@@ -12,7 +12,7 @@ import functools
 import itertools
 import math
 import operator
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -110,6 +110,8 @@ def _check_contiguous(out: State) -> None:
 
 class Scene(Record):
     """A simulation: agents, space, effects and integrator. Prints, compares, hashes, pickles, converts to YAML."""
+
+    sentence: ClassVar[str] = "Time passes in steps of {dt}"
 
     dimension: Literal[2, 3] = Field(default=2, description="2 or 3")
     space: AnySpace = Field(default_factory=Plane)

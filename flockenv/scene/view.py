@@ -36,7 +36,7 @@ class View:
 
     def snapshot(self, state: State, world: int = 0, title: str = "") -> Snapshot:
         """Return one world at one instant, for pictures."""
-        low, high = self._region(state, world)
+        low, high = self.region(state, world)
         return Snapshot(
             time=float(state.time[world]), pos=state.pos[world], vel=state.vel[world], alive=state.alive[world],
             heading=state.heading[world] if len(state.frame) else None,
@@ -91,7 +91,7 @@ class View:
             return shift
         return np.asarray(self.scene.space.wrap(np.array(shape.anchor) + shift)) - shape.anchor
 
-    def _region(self, state: State, world: int) -> tuple[Sequence[float], Sequence[float]]:
+    def region(self, state: State, world: int) -> tuple[Sequence[float], Sequence[float]]:
         """Return the region to show: the space, or the bounds of all agents and obstacles."""
         if not isinstance(self.scene.space, Plane):
             return (0.0,) * self.scene.dimension, self.scene.space.extent(self.scene.dimension)

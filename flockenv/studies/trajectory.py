@@ -99,6 +99,7 @@ class Trajectory:
             "instants": len(self.step),
             "stopped": self.stopped,
             "measures": {name: {"start": _json(a), "end": _json(b)} for name, (a, b) in self.measures().items()},
+            "digest": self.last.digest,
             "work": {what: self.last.count_of(what) for what in WORK},
             "wall_s": self.wall,
             "agent_steps_per_s": _json(self.rate),

@@ -32,6 +32,8 @@ class Circle(Closed):
     """A round obstacle: a circle in 2-D, a sphere in 3-D."""
 
     kind: Literal["circle"] = "circle"
+    sentence: ClassVar[str] = "A round obstacle at {centre} of radius {radius}"
+    points: ClassVar[tuple[str, ...]] = ("centre",)
     centre: tuple[float, ...] = Field(min_length=2, max_length=3, description="m")
     radius: float = Field(gt=0, description="m")
 
@@ -75,6 +77,8 @@ class Wall(Shape):
     """
 
     kind: Literal["wall"] = "wall"
+    sentence: ClassVar[str] = "A wall along {vertices}"
+    points: ClassVar[tuple[str, ...]] = ("vertices",)
     vertices: tuple[Point, ...] = Field(min_length=2, max_length=1024, description="m, from end to end")
     radius: float = Field(default=0.0, ge=0, description="m, half its thickness")
 
@@ -123,6 +127,7 @@ class Capsule(Closed):
     """A segment inflated by `radius`: a straight piece of wall with round ends."""
 
     kind: Literal["capsule"] = "capsule"
+    points: ClassVar[tuple[str, ...]] = ("start", "end")
     start: Point = Field(description="m")
     end: Point = Field(description="m")
     radius: float = Field(default=0.0, ge=0, description="m")
@@ -179,6 +184,7 @@ class Polygon(Closed):
     """
 
     kind: Literal["polygon"] = "polygon"
+    points: ClassVar[tuple[str, ...]] = ("vertices",)
     vertices: tuple[Annotated[tuple[float, ...], Field(min_length=2, max_length=2)], ...] = Field(
         min_length=3, max_length=1024, description="m, in either orientation"
     )
@@ -237,6 +243,8 @@ class Block(Closed):
     """A rectangle, or in 3-D a box, of any orientation."""
 
     kind: Literal["block"] = "block"
+    sentence: ClassVar[str] = "A block at {centre} of size {size}"
+    points: ClassVar[tuple[str, ...]] = ("centre",)
     laws: ClassVar[str] = "block"
     centre: Point = Field(description="m")
     size: Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=2, max_length=3)] = Field(
@@ -305,6 +313,7 @@ class HalfSpace(Shape):
     """The half-space behind a line, or in 3-D a plane."""
 
     kind: Literal["half_space"] = "half_space"
+    points: ClassVar[tuple[str, ...]] = ("point",)
     laws: ClassVar[str] = "half_space"
     point: Point = Field(description="m, any point of its surface")
     direction: Point = Field(description="outward normal, of any length")

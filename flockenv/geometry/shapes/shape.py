@@ -46,6 +46,8 @@ class Shape(Record):
     kind: str
     velocity: Point | None = Field(default=None, description="m/s, constant from time 0 on (default: it does not move)")
     sway: Sway | None = Field(default=None, description="oscillation (default: none)")
+    points: ClassVar[tuple[str, ...]] = ()
+    """Names of the fields that are points, or lists of points, of which all move with the shape."""
     laws: ClassVar[str] = "chain"
     """Name of the laws if the shape is solid; see shapes/table.py."""
 
@@ -57,6 +59,21 @@ class Shape(Record):
             if value is not None and len(value) != self.dimension:
                 raise ValueError(f"{name} = {value}: must have {self.dimension} numbers, as the {self.kind} has")
         return self
+
+    def moved_to(self, place: Sequence[float]) -> Self:
+        """Return the shape with its anchor at another place, (D,) m; raise ValueError if it cannot be moved."""
+        if not self.points:
+            raise ValueError(f"kind = {self.kind}: cannot be moved; give its other fields")
+        if len(place) != self.dimension:
+            raise ValueError(f"centre = {tuple(place)}: must have {self.dimension} numbers, as the {self.kind} has")
+        by = np.subtract(place, self.anchor)
+
+        def shifted(value: Any) -> Any:
+            if isinstance(value[0], tuple):
+                return tuple(map(shifted, value))
+            return tuple((np.array(value, float) + by).tolist())
+
+        return self.model_copy(update={name: shifted(getattr(self, name)) for name in self.points})
 
     @property
     def is_hollow(self) -> bool:

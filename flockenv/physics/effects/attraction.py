@@ -35,6 +35,7 @@ class Attraction(Effect):
     """
 
     kind: Literal["attraction"] = "attraction"
+    sentence: ClassVar[str] = "Attract all agents to {centre}"
     centre: Vector = Field(description="m")
     strength: float = Field(description="k, N m^2; negative: repulsion")
     softening: float = Field(default=0.0, ge=0, description="s, m, distance below which it no longer grows as 1 / r^2")

@@ -155,6 +155,7 @@ class ObstacleContact(_Solid):
     """
 
     kind: Literal["obstacle_contact"] = "obstacle_contact"
+    sentence: ClassVar[str] = "Bodies that overlap an obstacle are pushed out"
     obstacle_start: ClassVar[Law | None] = zero_force
     obstacle_law: ClassVar[Law | None] = add_obstacle_force
     obstacle_finish: ClassVar[Law | None] = total_force
@@ -190,6 +191,7 @@ class Contact(_Solid):
     """
 
     kind: Literal["contact"] = "contact"
+    sentence: ClassVar[str] = "Bodies that overlap repel each other"
     radius: float | None = Field(
         default=None,
         gt=0,

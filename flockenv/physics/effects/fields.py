@@ -241,6 +241,7 @@ class Wind(_Timed):
     """
 
     kind: Literal["wind"] = "wind"
+    sentence: ClassVar[str] = "Wind of {velocity}[, in gusts up to {gust} more]"
     velocity: Vector = Field(description="U, m/s")
     gust: Vector | None = Field(default=None, description="G, m/s, added at the peak of a gust (default: no gusts)")
     strengths: ClassVar[tuple[str, ...]] = ("velocity", "gust")

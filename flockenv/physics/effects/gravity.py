@@ -27,6 +27,7 @@ class Gravity(Effect):
     """Uniform gravity, F = m g: without other forces x = x0 + v0 t + g t^2 / 2. Pinned particles stay."""
 
     kind: Literal["gravity"] = "gravity"
+    sentence: ClassVar[str] = "Gravity of {acceleration}"
     acceleration: Vector = Field(default=(0.0, -9.81), description="m/s^2, or N per kg; one number per dimension")
     own_law: ClassVar[Law | None] = gravity
     strengths: ClassVar[tuple[str, ...]] = ("acceleration",)

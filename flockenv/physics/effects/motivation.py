@@ -315,7 +315,9 @@ class Fear(_Urge):
     kind: Literal["fear"] = "fear"
     other: int = Field(ge=0, strict=True, description="the group that is feared")
     radius: float = Field(default=10.0, gt=0, description="m, radius of sight")
-    fov: float = Field(default=300.0, gt=0, le=360, description="degrees, full angle of the field of view")
+    fov: float = Field(
+        title="field of view", default=300.0, gt=0, le=360, description="degrees, full angle of the field of view"
+    )
     occluded: bool = Field(default=False, description="True: obstacles hide agents")
     span: float = Field(default=2.0, ge=0, description="D0, m, distance within which the fear of one agent is 1")
     memory: float = Field(default=3.0, gt=0, description="s, over which fear falls to 1/e")

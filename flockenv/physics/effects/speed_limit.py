@@ -36,6 +36,7 @@ class SpeedLimit(Effect):
     """
 
     kind: Literal["speed_limit"] = "speed_limit"
+    sentence: ClassVar[str] = "Brake agents that approach {speed}"
     speed: float = Field(gt=0, description="V, m/s")
     strength: float = Field(ge=0, description="B, N, braking force at speed V")
     own_law: ClassVar[Law | None] = speed_limit

@@ -8,7 +8,7 @@ order of agents and number of threads.
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -28,6 +28,8 @@ Range = tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]]
 
 class Burst(Record):
     """A number of births at one time."""
+
+    sentence: ClassVar[str] = "{count} births at {time}"
 
     time: float = Field(ge=0, description="s, time since the start")
     count: int = Field(ge=1, le=2**24, description="number of births")

@@ -1,0 +1,93 @@
+"""The fixed parts of a lane as JSON, which a page needs to draw frames: roles, radii, bonds, faces, obstacles."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import zlib
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.geometry.shapes import Circle
+from flockenv.physics.effects import Gravity
+from flockenv.play.lane import Lane
+from flockenv.play.scene_lane import SceneLane
+from flockenv.play.task_lane import TaskLane
+from flockenv.render.replay import look_data, round_digits
+from flockenv.scene import Scene
+
+__all__ = ["describe_lane", "faces_of"]
+
+FACES = 20_000
+"""Most triangles that are sent; larger surfaces are drawn by their bonds."""
+
+
+def describe_lane(lane: Lane, name: str) -> dict[str, Any]:
+    """Return what a page needs of a lane besides its frames; `key` changes if what is drawn without frames does."""
+    shot = lane.snapshot()
+    scene: Scene = lane.record.scene if isinstance(lane, TaskLane) else lane.record
+    fixed = {
+        "periodic": shot.periodic, "roles": _runs(shot.roles), "dimension": shot.dimension,
+        "radius": _runs(round_digits(float(r), 6) for r in shot.radius), "bonds": shot.bonds.ravel().tolist(),
+        "faces": faces_of(scene).ravel().tolist(), "looks": [look_data(look) for look in shot.looks],
+        "look": _runs(np.asarray(shot.look).tolist()) if shot.looks else None, "has_returns": lane.returns is not None,
+    }  # fmt: skip
+    return {
+        **fixed, "name": name, "key": zlib.crc32(json.dumps(fixed).encode()), "low": shot.low.tolist(),
+        "high": shot.high.tolist(), "obstacles": _obstacles(lane, shot.low, shot.high),
+        "up": _up(scene), "players": list(lane.players) if isinstance(lane, TaskLane) else None,
+    }  # fmt: skip
+
+
+def _up(scene: Scene) -> list[float] | None:
+    """Return the direction against gravity; None without gravity."""
+    pull = next((effect.acceleration for effect in scene.effects if isinstance(effect, Gravity)), None)
+    return None if pull is None else [-float(x) for x in pull]
+
+
+def _runs(values: Iterable[Any]) -> list[list[Any]]:
+    """Return a list as [value, count] pairs, one per run of equal values."""
+    return [[value, len(list(run))] for value, run in itertools.groupby(values)]
+
+
+def faces_of(scene: Scene) -> NDArray[np.int32]:
+    """Return the triangles of surfaces, (F, 3) agents: elements of sheets, outer faces of bodies; none if too many."""
+    found, first = [np.zeros((0, 3), np.int32)], 0
+    for group in scene.groups:
+        if group.network is not None:
+            elements = np.asarray(group.network.elements(scene.dimension))
+            if elements.shape[1] == 4:
+                elements = _outer_faces(elements)
+            if elements.shape[1] == 3:
+                found.append((first + elements).astype(np.int32))
+        first += group.size
+    faces = np.concatenate(found)
+    return faces if len(faces) <= FACES else faces[:0]
+
+
+def _outer_faces(tetrahedra: NDArray[Any]) -> NDArray[Any]:
+    """Return the triangles that belong to one tetrahedron only."""
+    corners = np.concatenate([np.delete(tetrahedra, k, axis=1) for k in range(4)])
+    _, where, count = np.unique(np.sort(corners, axis=1), axis=0, return_index=True, return_counts=True)
+    return np.asarray(corners[where[count == 1]])
+
+
+def _obstacles(lane: Lane, low: NDArray[Any], high: NDArray[Any]) -> list[dict[str, Any]]:
+    """Return where the obstacles are that can be moved: index, and a circle (`at`, `radius`) or an outline, m."""
+    if isinstance(lane, TaskLane):
+        state = lane.world.state
+        rows = zip(state.obstacles.centre[0].tolist(), state.obstacle_radius[0].tolist(), strict=True)
+        return [{"index": k, "at": at, "radius": radius} for k, (at, radius) in enumerate(rows) if radius > 0]
+    assert isinstance(lane, SceneLane)
+    found: list[dict[str, Any]] = []
+    for k, shape in enumerate(lane.record.obstacles):
+        if isinstance(shape, Circle):
+            found.append({"index": k, "at": list(shape.centre), "radius": shape.radius})
+        else:
+            shift = shape.shift(lane.time)
+            outlines = shape.outline(low - shift, high - shift)
+            found += [{"index": k, "outline": (each + shift[:2]).tolist()} for each in outlines]
+    return found

@@ -1,0 +1,171 @@
+"""Fields: quantities of agents that colours show, quantities on a grid, measures of a world, costs of effects."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.core.errors import nearest, printable
+from flockenv.play.lane import Drawn, Lane, collected_warnings
+from flockenv.play.scene_lane import SceneLane
+from flockenv.play.task_lane import TaskLane
+from flockenv.studies.cost_breakdown import explain
+from flockenv.studies.measures import polarisation
+
+__all__ = ["CELLS", "Coloured", "Grid", "colour_of", "colours_of", "costs_of", "grid_of", "measures_of"]
+
+CELLS = 48
+"""Cells of a grid along the longer side of the world."""
+
+Floats = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class Coloured:
+    """A quantity of each agent, and the range that colours show."""
+
+    values: Floats  # (N,)
+    low: float
+    high: float
+    unit: str
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """A quantity on a grid over the region that is shown."""
+
+    levels: NDArray[np.uint8]  # (ny, nx) from the lowest row up, 255 for `high`
+    high: float
+    unit: str
+
+
+def _speed(lane: Lane, drawn: Drawn) -> Coloured:
+    speed = np.sqrt((drawn.vel**2).sum(axis=0))
+    return Coloured(speed, 0.0, _largest(speed, drawn), "m/s")
+
+
+def _force(lane: Lane, drawn: Drawn) -> Coloured:
+    """Return the size of each agent's total acceleration, without a task's drive."""
+    assert isinstance(lane, SceneLane)
+    size = np.sqrt((lane.record.acceleration(lane.state.copy())[0] ** 2).sum(axis=1))
+    return Coloured(size, 0.0, _largest(size, drawn), "m/s^2")
+
+
+def _alignment(lane: Lane, drawn: Drawn) -> Coloured:
+    """Return how well each agent's direction agrees with the mean direction, from -1 to 1."""
+    length = np.sqrt((drawn.vel**2).sum(axis=0))
+    unit = np.divide(drawn.vel, length, out=np.zeros_like(drawn.vel), where=length > 0)
+    mean = unit[:, drawn.alive].mean(axis=1, keepdims=True) if drawn.alive.any() else unit[:, :1] * 0
+    norm = float(np.linalg.norm(mean))
+    return Coloured((unit * mean).sum(axis=0) / norm if norm > 0 else length * 0, -1.0, 1.0, "1")
+
+
+def _inner(name: str) -> Callable[[Lane, Drawn], Coloured]:
+    def values(lane: Lane, drawn: Drawn) -> Coloured:
+        assert isinstance(lane, SceneLane)
+        found = lane.record.inner(lane.state, name)[0]
+        shown = found[drawn.alive]
+        low, high = (float(shown.min()), float(shown.max())) if len(shown) else (0.0, 1.0)
+        return Coloured(found, min(low, 0.0), max(high, 1.0), "1")
+
+    return values
+
+
+def _largest(values: Floats, drawn: Drawn) -> float:
+    return max(float(values[drawn.alive].max(initial=0.0)), 1e-9)
+
+
+def colours_of(lane: Lane) -> dict[str, Callable[[Lane, Drawn], Coloured]]:
+    """Return the quantities of a lane's agents that colours can show, by name."""
+    found: dict[str, Callable[[Lane, Drawn], Coloured]] = {"speed": _speed, "alignment": _alignment}
+    if isinstance(lane, SceneLane):
+        found |= {"acceleration": _force, **{name: _inner(name) for name in lane.record.parts.inner}}
+    return found
+
+
+def colour_of(lane: Lane, name: str) -> Coloured:
+    """Return a quantity of each agent; raise ValueError, with the allowed names, if there is none of this name."""
+    known = colours_of(lane)
+    if name not in known:
+        hint = nearest(name, known) or ";"
+        raise ValueError(f"colour = {printable(name)}: unknown{hint} allowed: {', '.join(known)}")
+    return known[name](lane, lane.drawn)
+
+
+def grid_of(lane: Lane, name: str) -> Grid:
+    """Return the density (agents per m^2, seen from above) or the flow (density times mean speed) on a grid.
+
+    Raises ValueError for another name.
+    """
+    if name not in ("density", "flow"):
+        raise ValueError(
+            f"field = {printable(name)}: unknown{nearest(name, ('density', 'flow'))}; allowed: density, flow"
+        )
+    drawn = lane.drawn
+    low, high = np.array(drawn.low[:2]), np.array(drawn.high[:2])
+    cell = float((high - low).max()) / CELLS
+    counts = np.maximum(np.rint((high - low) / cell).astype(int), 1)
+    x, v = drawn.pos[:2, drawn.alive], drawn.vel[:2, drawn.alive]
+    place = np.floor((x - low[:, None]) / (high - low)[:, None] * counts[:, None]).astype(int)
+    inside = ((place >= 0) & (place < counts[:, None])).all(axis=0)
+    index = place[1, inside] * counts[0] + place[0, inside]
+    area, size = float(np.prod((high - low) / counts)), int(np.prod(counts))
+    many = np.bincount(index, minlength=size) / area
+    if name == "flow":
+        along, across = (np.bincount(index, weights=each[inside], minlength=size) / area for each in v)
+        many = np.hypot(along, across)
+    most = max(float(many.max()), 1e-9)
+    levels = np.rint(255 * many / most).astype(np.uint8).reshape(counts[1], counts[0])
+    return Grid(levels, most, "1/m^2" if name == "density" else "1/(m s)")
+
+
+def measures_of(lane: Lane) -> dict[str, dict[str, Any]]:
+    """Return measures of a lane's world now, by name: value (None without a meaning), unit and title.
+
+    Of every world: agents, mean speed, polarisation, kinetic energy, momentum; potential energy of those effects that
+    have one; of a task its return and metrics.
+    """
+    task = lane.record if isinstance(lane, TaskLane) else None
+    scene = lane.record if task is None else task.scene
+    state = lane.world.state if isinstance(lane, TaskLane) else lane.state  # type: ignore[attr-defined]
+    alive = state.alive[0] & np.isfinite(scene.body.mass)
+    mass, vel = np.asarray(scene.body.mass, float)[alive], np.asarray(state.vel[0], float)[alive]
+    found: dict[str, tuple[float, str, str]] = {
+        "agents": (float(state.alive[0].sum()), "1", "living agents"),
+        "speed": (float(np.linalg.norm(vel, axis=1).mean()) if len(vel) else np.nan, "m/s", "mean speed"),
+        "polarisation": (polarisation(vel), "1", "length of the mean heading, 0 to 1"),
+        "kinetic": (float(0.5 * (mass * (vel**2).sum(axis=1)).sum()), "J", "kinetic energy"),
+    }
+    parts = [effect.potential(scene.groups, state, scene.space.displacement) for effect in scene.parts.effects]
+    if stored := [float(part[0]) for part in parts if part is not None]:
+        found["potential"] = (sum(stored), "J", "potential energy")
+        found["energy"] = (sum(stored) + found["kinetic"][0], "J", "energy")
+    momentum = (mass[:, None] * vel).sum(axis=0)
+    found["momentum"] = (float(np.linalg.norm(momentum)), "kg m/s", "size of the total momentum")
+    if isinstance(lane, TaskLane):
+        found["return"] = (lane.returns, "1", "return so far, mean over learners")
+        found |= {name: (value, "", name.replace("_", " ")) for name, value in lane.world.metrics(0).items()}
+    return {
+        name: {"value": value if np.isfinite(value) else None, "unit": unit, "title": title}
+        for name, (value, unit, title) in found.items()
+    }
+
+
+def costs_of(lane: Lane) -> dict[str, Any]:
+    """Return what each effect of a scene costs from the present state on, us per step, as `flockenv explain` measures.
+
+    It takes some seconds, and more the first time; the lane stays as it is. Raises ValueError for a task.
+    """
+    if not isinstance(lane, SceneLane):
+        raise ValueError("costs: only of scenes; the effects of a task are compiled together with its rewards")
+    with collected_warnings():
+        breakdown = explain(lane.record, lane.state.copy())
+    rows = []
+    for k, row in enumerate(breakdown.rows):
+        cost = {"cost": row.cost.median, "low": row.cost.low, "high": row.cost.high}
+        rows.append({"name": row.effect.kind, "path": f"effects[{k}]", **cost})
+    return {"rows": rows, "step": breakdown.step, "rest": breakdown.rest}

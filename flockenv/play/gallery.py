@@ -1,0 +1,173 @@
+"""Gallery: the scenes and tasks that ship with flockenv, with pictures, to be opened in the playground.
+
+Scenes of an installed flockenv are in the folder `shipped` beside this file: copies of configs/scenes, and pictures.
+To update them after a change: python -m flockenv.play.gallery [NAME ...]
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flockenv.core.errors import nearest, printable
+from flockenv.scene import Scene
+from flockenv.scene.yaml_io import load_scene
+from flockenv.tasks import TASKS, Task
+
+if TYPE_CHECKING:
+    from flockenv.model.snapshot import Snapshot
+
+__all__ = ["Entry", "entries", "read_entry", "text_of"]
+
+SHIPPED = files("flockenv.play").joinpath("shipped")
+
+WIDTH = 420
+"""Width of a picture, pixels."""
+
+FIRST_NAMES = ("boids", "crowd_room", "fish", "cloth", "galaxy", "vicsek", "fireworks")
+"""Scenes that come first, each within its family."""
+
+FAMILIES = {
+    "Crowds": {"driving", "line_up", "way", "routes", "journey", "follow_way", "unaligned_avoidance", "heuristics"},
+    "Flocks": {"alignment", "cohesion", "vicsek", "boids"},
+    "Solids and cloth": {"springs", "elastic", "collisions", "rods", "contact"},
+    "Particles and fields": set(),
+}
+"""Families of scenes, each with kinds of which one makes a scene one of that family; the first that fits counts."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A scene or task that can be opened."""
+
+    name: str
+    title: str
+    description: str  # some sentences
+    kind: str  # scene or task
+    family: str
+    picture: bytes | None  # PNG
+
+
+@functools.cache
+def entries() -> tuple[Entry, ...]:
+    """Return all scenes and tasks that ship, by family."""
+    order = [*FIRST_NAMES, *sorted(set(_scene_names()) - set(FIRST_NAMES))]
+    scenes = [_scene_entry(name) for name in order if name in _scene_names()]
+    scenes.sort(key=lambda entry: list(FAMILIES).index(entry.family))
+    return (*scenes, *(_task_entry(name, task) for name, task in TASKS.items()))
+
+
+def read_entry(name: str) -> Scene | Task:
+    """Return a scene or task by its name in the gallery; raise ValueError, with the nearest name, for another one."""
+    if name in TASKS:
+        return TASKS[name]()
+    return load_scene(text_of(name))
+
+
+def text_of(name: str) -> str:
+    """Return the YAML of a scene that ships; raise ValueError, with the nearest name, for another one."""
+    if name not in _scene_names():
+        known = (*_scene_names(), *TASKS)
+        raise ValueError(f"open = {printable(name)}: unknown{nearest(name, known) or ';'} allowed: {', '.join(known)}")
+    return SHIPPED.joinpath(f"{name}.yaml").read_text(encoding="utf-8")
+
+
+@functools.cache
+def _scene_names() -> tuple[str, ...]:
+    names = (item.name for item in SHIPPED.iterdir())
+    return tuple(sorted(name.removesuffix(".yaml") for name in names if name.endswith(".yaml")))
+
+
+def _scene_entry(name: str) -> Entry:
+    text = text_of(name)
+    kinds = set(re.findall(r"kind: (\w+)|preset: \w*", text)) | ({"driving"} if "preset:" in text else set())
+    family = next(family for family, own in FAMILIES.items() if own & kinds or not own)
+    return Entry(name, _title(name), _comment(text), "scene", family, _picture(name))
+
+
+def _task_entry(name: str, task: type[Task]) -> Entry:
+    text = " ".join((task.__doc__ or "").split("\n\n")[0].split())
+    return Entry(name, _title(name), text, "task", "Tasks", _picture(name))
+
+
+def _title(name: str) -> str:
+    title = name.replace("_", " ").capitalize()
+    return title.replace("3d", " 3-D").replace("nav", "navigation")
+
+
+def _comment(text: str) -> str:
+    """Return what a scene's file says about it at its beginning, without commands."""
+    lines = []
+    for line in text.splitlines():
+        if not line.startswith("#"):
+            break
+        if not line.startswith("# yaml-language-server"):
+            lines.append(re.sub(r"\s*flockenv (?:run|render|experiment|explain) .*", "", line.lstrip("#")).strip())
+    return " ".join(line for line in lines if line)
+
+
+def _picture(name: str) -> bytes | None:
+    path = SHIPPED.joinpath(f"{name}.png")
+    return path.read_bytes() if path.is_file() else None
+
+
+# --- making the folder ------------------------------------------------------------------------------------------------
+
+
+def _films(root: Path, name: str) -> Iterator[Snapshot]:
+    """Yield the last moments of a scene or task, the last one at the end."""
+    from flockenv.play.scene_lane import SceneLane
+    from flockenv.play.task_lane import TaskLane
+
+    if name in TASKS:
+        lane: SceneLane | TaskLane = TaskLane(TASKS[name](), "rules", 1)
+        ticks = 60
+    else:
+        text = (root / "configs" / "scenes" / f"{name}.yaml").read_text(encoding="utf-8")
+        lane = SceneLane(load_scene(text), 1)
+        seconds = re.search(r"--duration ([\d.]+)", text)
+        ticks = round(0.4 * float(seconds[1] if seconds else 10.0) / lane.interval)
+    lane.step(max(ticks - 24 * max(1, ticks // 200), 1))
+    for _ in range(24):
+        yield lane.snapshot()
+        lane.step(max(1, ticks // 200))
+    yield lane.snapshot()
+
+
+def _draw(snapshots: Sequence[Snapshot]) -> bytes:
+    """Return the last snapshot as PNG, without caption and margin."""
+    from PIL import Image
+
+    from flockenv.render.picture import draw
+    from flockenv.render.view import view_of
+
+    view = view_of(snapshots[-1], WIDTH, 1)
+    pixels = draw(snapshots[-1], size=WIDTH, scale=3, trails=snapshots[:-1], all_trails=False)
+    inside = pixels[round(view.top) : round(view.bottom), round(view.left) : round(view.right)]
+    out = io.BytesIO()
+    Image.fromarray(inside).quantize(64).save(out, "PNG", optimize=True)
+    return out.getvalue()
+
+
+def _make(names: Sequence[str]) -> None:
+    """Write the folder `shipped`: all scenes of configs/scenes, and the pictures of some scenes and tasks."""
+    root = Path(__file__).resolve().parents[2]
+    folder = Path(str(SHIPPED))
+    folder.mkdir(exist_ok=True)
+    for path in sorted((root / "configs" / "scenes").glob("*.yaml")):
+        (folder / path.name).write_text(path.read_text(encoding="utf-8"), encoding="utf-8")
+    for name in names:
+        (folder / f"{name}.png").write_bytes(_draw(list(_films(root, name))))
+        print(name, flush=True)
+
+
+if __name__ == "__main__":
+    every = sorted(path.stem for path in (Path(__file__).resolve().parents[2] / "configs" / "scenes").glob("*.yaml"))
+    _make(sys.argv[1:] or [*every, *TASKS])

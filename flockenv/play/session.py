@@ -1,0 +1,390 @@
+"""Session: what one server plays, and its answers to the messages of pages, as JSON and bytes; it knows no socket.
+
+It is used by one thread at a time, but for `prepare`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from time import perf_counter
+from typing import Any
+
+from flockenv.play import messages as m
+from flockenv.play.additions import additions_of
+from flockenv.play.controls import controls_of, with_restarts
+from flockenv.play.description import describe_lane
+from flockenv.play.edits import Edit
+from flockenv.play.fields import colours_of
+from flockenv.play.frames import encode_frame
+from flockenv.play.record_paths import with_value
+from flockenv.play.recording import Recording
+from flockenv.play.room import Room
+from flockenv.play.scene_lane import SceneLane
+from flockenv.play.sentences import sentences_of
+from flockenv.play.task_lane import NO_FILES, PlayerFiles, TaskLane, players_of
+from flockenv.scene import Scene
+from flockenv.tasks import Task
+
+__all__ = ["Answer", "Session"]
+
+Answer = Mapping[str, Any] | bytes
+
+
+class Session:
+    """A room, and what opens another one.
+
+    files: players from files that the command line names; no other file is read.
+    """
+
+    def __init__(self, files: PlayerFiles = NO_FILES) -> None:
+        self.files = files
+        self.room: Room | None = None
+        self.name = ""
+        self.opened = 0
+        self._recording: Recording | None = None
+        self._players: tuple[str, ...] = ()
+        self._step_time, self._encode_time = _Mean(), _Mean()
+        self._answers: dict[type[m.Message], Callable[..., list[Answer]]] = {
+            m.Hello: self._hello, m.Open: self._open, m.Load: self._load, m.LinkMessage: self._link,
+            m.Play: self._play, m.Speed: self._speed, m.Step: self._step, m.Seek: self._seek, m.Frame: self._frame,
+            m.LookMessage: self._look, m.Save: self._save, m.Share: self._share, m.Lanes: self._lanes,
+            m.Seed: self._seed, m.RecordMessage: self._record, m.Gallery: self._gallery, m.Measures: self._measures,
+            m.Costs: self._costs,
+        }  # fmt: skip
+
+    # --- what the server does by itself -----------------------------------------------------------------------------
+
+    @property
+    def is_playing(self) -> bool:
+        """True if time passes."""
+        return self.room is not None and self.room.playing
+
+    @property
+    def version(self) -> tuple[int, int]:
+        """Changes when the description does; (0, 0): nothing is open."""
+        return (0, 0) if self.room is None else (self.opened, self.room.version)
+
+    def advance(self) -> None:
+        """Make the steps that are due."""
+        if self.room is None:
+            return
+        began = perf_counter()
+        made = self.room.advance()
+        if made:
+            self._step_time.add((perf_counter() - began) / made)
+            if self._recording is not None:
+                self._recording.take()
+        if self.room.ended:
+            self.room.play(False)
+
+    def pause(self) -> None:
+        """Stop time: no page is open."""
+        if self.room is not None:
+            self.room.play(False)
+
+    def prepare(self, edit: Edit) -> None:
+        """Compile what an edit needs, in a thread beside the one that works."""
+        if self.room is not None:
+            self.room.prepare(edit)
+
+    def edit(self, edit: Edit) -> list[Answer]:
+        """Apply an edit."""
+        change = self._there().edit(edit)
+        lines = [*change.notices]
+        if change.restarts:
+            lines.insert(0, "This value is part of the start: the world begins again.")
+        return [{"type": "notice", "text": " ".join(lines)}] if lines else []
+
+    def answer(self, message: m.Message) -> list[Answer]:
+        """Return the answers to a message; ValueError, in one line, if it cannot be done."""
+        return self._answers[type(message)](message)
+
+    def _there(self) -> Room:
+        if self.room is None:
+            raise ValueError("nothing is open; pick a world first")
+        return self.room
+
+    # --- opening ----------------------------------------------------------------------------------------------------
+
+    def open_scene(self, scene: Scene, name: str, seed: int = 0) -> None:
+        """Open a scene."""
+        self._set_room(Room((SceneLane(scene, seed),)), name)
+
+    def open_task(self, task: Task, players: Sequence[str] = ("rules",), seed: int = 0) -> None:
+        """Open a task in a world for each player, side by side."""
+        lanes = tuple(TaskLane(task, player, seed, files=self.files) for player in players)
+        self._players = players_of(task, self.files)
+        self._set_room(Room(lanes), task.name)
+
+    def _set_room(self, room: Room, name: str, playing: bool = True) -> None:
+        self.room, self.name, self._recording = room, name, None
+        self.opened += 1
+        room.play(playing)
+
+    def _open(self, message: m.Open) -> list[Answer]:
+        from flockenv.play.gallery import read_entry
+
+        record = read_entry(message.what)
+        if isinstance(record, Scene):
+            if message.players is not None:
+                raise ValueError("players: a scene has none")
+            self.open_scene(record, message.what)
+        else:
+            self.open_task(record, message.players or ("rules",))
+        return []
+
+    def _load(self, message: m.Load) -> list[Answer]:
+        from flockenv.scene.yaml_io import load_scene
+
+        scene = load_scene(message.yaml + "\n")  # with a line break it is a text, never the name of a file
+        self.open_scene(scene, self.name or "scene", self.room.lanes[0].seed if self.room is not None else 0)
+        return []
+
+    def _link(self, message: m.LinkMessage) -> list[Answer]:
+        from flockenv.play.link import read_link
+
+        linked = read_link(message.text)
+        room = linked.room(self.files)
+        if isinstance(room.lanes[0], TaskLane):
+            self._players = players_of(room.lanes[0].record, self.files)
+        self._set_room(room, linked.title, playing=False)
+        return [{"type": "camera", "camera": dict(linked.camera)}]
+
+    def _lanes(self, message: m.Lanes) -> list[Answer]:
+        first = self._there().lanes[0]
+        if isinstance(first, TaskLane):
+            if message.players is None:
+                raise ValueError("lanes.players: missing; a task is compared by its players")
+            self.open_task(first.record, message.players, first.seed)
+        else:
+            if message.variants is None:
+                raise ValueError("lanes.variants: missing; a scene is compared by methods and time steps")
+            scenes = [_variant(first.record, each) for each in message.variants]
+            longest = max(scene.dt for scene in scenes)
+            lanes = [SceneLane(scene, first.seed, _whole(longest / scene.dt)) for scene in scenes]
+            self._set_room(Room(lanes), self.name)
+        return []
+
+    def _seed(self, message: m.Seed) -> list[Answer]:
+        room = self._there()
+        for lane in room.lanes:
+            lane.seed = message.seed
+        room.restart()
+        return []
+
+    # --- time -------------------------------------------------------------------------------------------------------
+
+    def _hello(self, message: m.Hello) -> list[Answer]:
+        if message.version != m.VERSION:
+            raise ValueError(f"version = {message.version}: the server speaks {m.VERSION}; reload the page")
+        return [{"type": "welcome", "version": m.VERSION, "open": self.room is not None}]
+
+    def _play(self, message: m.Play) -> list[Answer]:
+        room = self._there()
+        if message.on and room.ended:
+            room.seek(0)
+        room.play(message.on)
+        return []
+
+    def _speed(self, message: m.Speed) -> list[Answer]:
+        self._there().set_speed(message.x)
+        return []
+
+    def _step(self, message: m.Step) -> list[Answer]:
+        self._there().step(message.n)
+        return []
+
+    def _seek(self, message: m.Seek) -> list[Answer]:
+        room = self._there()
+        room.play(False)
+        room.seek(min(message.tick, room.last))
+        return []
+
+    # --- seeing -----------------------------------------------------------------------------------------------------
+
+    def _frame(self, message: m.Frame) -> list[Answer]:
+        began = perf_counter()
+        frame = encode_frame(self._there(), message.want)
+        self._encode_time.add(perf_counter() - began)
+        return [frame]
+
+    def describe(self) -> dict[str, Any]:
+        """Return what a page needs besides frames: lanes, controls, sentences, players."""
+        room = self._there()
+        first = room.lanes[0]
+        record = first.record
+        scene = isinstance(record, Scene)
+        return {
+            "type": "room", "name": self.name, "title": self.name.replace("_", " "),
+            "kind": "scene" if scene else "task",
+            "seed": first.seed, "interval": room.interval, "tick": room.tick, "last": room.last,
+            "playing": room.playing, "speed": room.speed, "version": room.version,
+            "lanes": [describe_lane(lane, name) for lane, name in zip(room.lanes, self._names(), strict=True)],
+            "controls": [_data(control) for control in with_restarts(controls_of(record), first)],
+            "sentences": [_data(sentence) for sentence in sentences_of(record)] if scene else [],
+            "additions": additions_of(record.dimension) if scene else [],
+            "players": list(self._players) if not scene else [], "colours": list(colours_of(first)),
+            "about": _about(record), "action": None if scene else _action(record),
+            "disturbance": first.disturbance.model_dump() if isinstance(first, TaskLane) else None,
+        }  # fmt: skip
+
+    def _names(self) -> list[str]:
+        """Return a name for each lane."""
+        lanes = self._there().lanes
+        if isinstance(lanes[0], TaskLane):
+            return [_player_name(lane) for lane in lanes if isinstance(lane, TaskLane)]
+        if len(lanes) == 1:
+            return [""]
+        return [f"{_method(lane.record)}, dt = {lane.record.dt:g} s" for lane in lanes]
+
+    def _look(self, message: m.LookMessage) -> list[Answer]:
+        from flockenv.play.sight import look
+
+        lanes = self._there().lanes
+        if message.lane >= len(lanes):
+            raise ValueError(f"look.lane = {message.lane}: there are {len(lanes)} lanes, counted from 0")
+        return [{"type": "look", "lane": message.lane, **_data(look(lanes[message.lane], message.agent))}]
+
+    def _measures(self, message: m.Measures) -> list[Answer]:
+        from flockenv.play.fields import measures_of
+
+        room = self._there()
+        lanes = [{name: _data(value) for name, value in measures_of(lane).items()} for lane in room.lanes]
+        for values, apart in zip(lanes, room.apart, strict=True):
+            if apart is not None:
+                values["distance to the first world"] = {"value": apart, "unit": "m"}
+        timing = {"step": 1e3 * self._step_time.value, "encode": 1e3 * self._encode_time.value}
+        return [{"type": "measures", "time": room.lanes[0].time, "lanes": lanes, "timing": timing}]
+
+    def _costs(self, message: m.Costs) -> list[Answer]:
+        from flockenv.play.fields import costs_of
+
+        return [{"type": "costs", **_data(costs_of(self._there().lanes[0]))}]
+
+    def pictures(self) -> Mapping[str, bytes]:
+        """Return the pictures of the gallery by the names of their addresses."""
+        from flockenv.play.gallery import entries
+
+        return {f"{each.name}.png": each.picture for each in entries() if each.picture}
+
+    def _gallery(self, message: m.Gallery) -> list[Answer]:
+        from flockenv.play.gallery import entries
+
+        listed = []
+        for each in entries():
+            picture = f"pictures/{each.name}.png" if each.picture else None
+            listed.append({**_data(dataclasses.replace(each, picture=None)), "picture": picture})
+        return [{"type": "gallery", "entries": listed}]
+
+    # --- keeping ----------------------------------------------------------------------------------------------------
+
+    def _save(self, message: m.Save) -> list[Answer]:
+        from flockenv.scene.yaml_io import dump, dump_scene
+
+        room = self._there()
+        record = room.lanes[0].record
+        text = dump_scene(record, brief=True) if isinstance(record, Scene) else dump(record, brief=True)
+        outside = sum(not _is_in_record(made.edit) for made in room.made)
+        notes = []
+        if outside:
+            notes.append(f"{outside} changes of this run, such as moved agents, are not in the YAML; a link has them.")
+        return [{"type": "yaml", "text": text, "notes": notes}]
+
+    def _share(self, message: m.Share) -> list[Answer]:
+        from flockenv.play.link import write_link
+
+        return [{"type": "link", "text": write_link(self._there(), self.name, message.camera)}]
+
+    def _record(self, message: m.RecordMessage) -> list[Answer]:
+        if message.on:
+            self._recording = Recording(self._there(), self._names())
+            self._recording.take()
+            return [{"type": "record", "on": True, "seconds": 0.0}]
+        if self._recording is None:
+            raise ValueError("record: nothing is being recorded")
+        recording, self._recording = self._recording, None
+        return [
+            {"type": "record", "on": False, "seconds": recording.seconds},
+            {"type": "replay", "html": recording.page(self.name or "flockenv")},
+        ]
+
+
+class _Mean:
+    """A running mean of times, s."""
+
+    def __init__(self) -> None:
+        self.value = 0.0
+
+    def add(self, seconds: float) -> None:
+        self.value += (0.1 if self.value else 1.0) * (seconds - self.value)
+
+
+def _data(value: Any) -> dict[str, Any]:
+    """Return a dataclass, record or mapping as JSON data without numbers that JSON lacks."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        raw = {each.name: getattr(value, each.name) for each in dataclasses.fields(value)}
+    else:
+        raw = dict(value) if isinstance(value, Mapping) else value.model_dump()
+    return {name: _plain(each) for name, each in raw.items()}
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON data; None for NaN and infinity."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, (str, int, bytes)):
+        return value
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {str(name): _plain(each) for name, each in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [_plain(each) for each in value]
+    return _data(value)
+
+
+def _variant(scene: Scene, variant: m.Variant) -> Scene:
+    """Return a scene with another method or time step; ValueError if it has none of that name."""
+    if variant.method is not None:
+        scene = with_value(scene, "integrator", {"kind": variant.method})
+    return scene if variant.dt is None else with_value(scene, "dt", variant.dt)
+
+
+def _whole(ratio: float) -> int:
+    """Return the number of steps that fit into one of another length; ValueError if that is no integer."""
+    steps = round(ratio)
+    if abs(ratio - steps) > 1e-6 * ratio:
+        raise ValueError(
+            f"lanes.variants: time steps must be integer multiples of each other, got a ratio of {ratio:g}"
+        )
+    return steps
+
+
+def _method(scene: Scene) -> str:
+    return str(scene.integrator.kind).replace("_", " ")
+
+
+def _player_name(lane: TaskLane) -> str:
+    """Return the name of the players of a lane: of all learners, or a list of those that differ."""
+    from pathlib import Path
+
+    return " + ".join(Path(name).stem for name in dict.fromkeys(lane.players))
+
+
+def _about(record: Scene | Task) -> str:
+    """Return the first paragraph about a task; "" for a scene, whose sentences say all."""
+    if isinstance(record, Scene):
+        return ""
+    return " ".join((type(record).__doc__ or "").split("\n\n")[0].split()).replace("`", "")
+
+
+def _action(task: Task) -> dict[str, Any]:
+    """Return in which axes the numbers of an action are, and how many there are."""
+    slots = task.action_layout.slots
+    return {"frame": "heading" if "heading" in slots[0].meaning else "world", "size": task.action_layout.size}
+
+
+def _is_in_record(edit: Edit) -> bool:
+    return edit.kind in ("set", "add", "remove", "add_obstacle", "move_obstacle", "remove_obstacle")

@@ -1,0 +1,55 @@
+/* The gallery of all worlds that ship, with pictures; and what to try in the one that is open. */
+
+function openGallery(on) {
+  $("gallery").hidden = !on;
+  if (on) { live.ask({ type: "gallery" }); $("gallery").focus(); } else { live.lastFrame = 0; refresh(); }
+}
+
+function showGallery({ entries }) {
+  const intro = element("div", undefined, "intro"), families = new Map();
+  intro.append(element("h2", "Pick a world"), element("p", "Everything in it can be changed while it runs: its rules, its agents, its obstacles, and the hand that steers. Time can be stopped and turned back."));
+  for (const entry of entries) {
+    const family = entry.family || (entry.kind === "task" ? "Tasks" : "Scenes");
+    if (!families.has(family)) families.set(family, []);
+    families.get(family).push(entry);
+  }
+  const parts = [...families].flatMap(([family, members]) => {
+    const title = element("h3", family), cards = element("div", undefined, "cards");
+    if (members[0].kind === "task") title.append(element("small", "rules, a trained policy and you can play them"));
+    cards.append(...members.map(cardOf));
+    return [title, cards];
+  });
+  $("gallery").replaceChildren(intro, ...parts);
+}
+
+function cardOf(entry) {
+  const card = element("button", undefined, "card");
+  if (entry.picture) {
+    const image = element("img");
+    image.src = entry.picture; image.alt = ""; image.loading = "lazy";
+    card.append(image);
+  } else card.append(element("div", "∴", "blank"));
+  card.append(element("strong", entry.title), element("span", entry.description || ""));
+  card.dataset.name = entry.name;
+  card.onclick = () => { tell(`Opening ${entry.title} …`, false, true); live.send({ type: "open", what: entry.name }); };
+  return card;
+}
+
+const HINTS = [
+  ["Try: drag a blue number in the rules sideways.", room => room.sentences.length],
+  ["Try: click an agent to see the forces on it.", () => true],
+  ["Try: drag an agent, or draw an obstacle (o).", room => room.kind === "scene"],
+  ["Try: press ← to step back in time; it is exact.", () => true],
+  ["Try: under Players, steer yourself, or put rules, ppo and yourself side by side.", room => room.kind === "task"],
+  ["Try: drag the world to turn it, use the wheel to zoom.", room => room.lanes[0].low.length === 3],
+  ["Try: let the agents seek the pointer (f) or flee from it (e).", room => room.kind === "scene"],
+];
+
+/* One hint after another, twelve seconds each, while no tool is in use. */
+function showHint(n = 0) {
+  clearTimeout(showHint.timer);
+  if (tool.name !== "choose") return;
+  const fits = live.room ? HINTS.filter(([, test]) => test(live.room)) : [];
+  if (fits.length) $("hint").textContent = fits[n % fits.length][0];
+  showHint.timer = setTimeout(showHint, 12000, n + 1);
+}

@@ -1,0 +1,86 @@
+/* Saving and sharing: YAML, a link to this moment, PNG, WebM, a replay in one file. */
+
+function download(name, blob) {
+  const link = element("a");
+  link.href = URL.createObjectURL(blob); link.download = name;
+  document.body.append(link); link.click(); link.remove();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+}
+
+function fileName(suffix) { return `${live.room.name.replace(/[^\w-]+/g, "_") || "world"}${suffix}`; }
+
+function openDialog(title, ...parts) {
+  const box = $("dialog"), close = element("button", "Close"), row = element("div", undefined, "row");
+  close.onclick = () => box.close();
+  row.append(close);
+  box.replaceChildren(element("h2", title), ...parts, row);
+  if (!box.open) box.showModal();
+  return row;
+}
+
+function showYaml({ text, notes }) {
+  const area = element("textarea", text);
+  area.spellcheck = false; area.value = text; area.setAttribute("aria-label", "the record as YAML");
+  const about = element("p", notes && notes.length ? notes.join(" ") : `flockenv run FILE --seed ${live.room.seed} gives the same numbers, bit for bit.`, "lead");
+  const row = openDialog("Save", about, area);
+  const act = (name, run) => { const button = element("button", name); button.onclick = run; row.prepend(button); };
+  act("Replay …", () => { $("dialog").close(); live.send({ type: "record", on: !live.recording }); });
+  act("WebM …", () => { $("dialog").close(); film(); });
+  act("PNG", savePicture);
+  act("Load this text", () => { live.send({ type: "load", yaml: area.value }); $("dialog").close(); });
+  act("YAML", () => download(fileName(".yaml"), new Blob([area.value], { type: "text/yaml" })));
+}
+
+/* All worlds of the stage on one canvas, side by side, on paper. */
+function composed() {
+  const out = element("canvas"), first = views[0].canvas;
+  out.width = views.reduce((sum, v) => sum + v.canvas.width, 0); out.height = first.height;
+  return out;
+}
+
+function compose(out) {
+  const pen = out.getContext("2d");
+  let x = 0;
+  pen.fillStyle = paint.paper; pen.fillRect(0, 0, out.width, out.height);
+  for (const { canvas } of views) { pen.drawImage(canvas, x, 0); x += canvas.width; }
+}
+
+function savePicture() {
+  const out = composed();
+  render(); compose(out);
+  out.toBlob(blob => download(fileName(".png"), blob));
+}
+
+let filming = null;
+/* Begins or ends a film of what is on the stage. */
+function film() {
+  if (filming) { filming.stop(); return; }
+  const out = composed(), recorder = new MediaRecorder(out.captureStream(30), { videoBitsPerSecond: 6e6 }), chunks = [];
+  const draw = () => { if (filming) { compose(out); requestAnimationFrame(draw); } };
+  recorder.ondataavailable = event => chunks.push(event.data);
+  recorder.onstop = () => { filming = null; $("save").textContent = "Save"; download(fileName(".webm"), new Blob(chunks, { type: "video/webm" })); };
+  filming = recorder; recorder.start(); draw();
+  $("save").textContent = "Stop filming";
+  tell("Filming. Press “Stop filming” to save the film.");
+}
+
+async function showLink({ text }) {
+  const hash = "#w=" + text;
+  history.replaceState(null, "", location.pathname + location.search + hash);
+  const whole = location.href;
+  try { await navigator.clipboard.writeText(whole); tell("The link to this moment is copied."); } catch { tell("The link to this moment is in the address bar."); }
+}
+
+function saveOrStop() {
+  if (filming) film();
+  else if (live.recording) live.send({ type: "record", on: false });
+  else live.ask({ type: "save" });
+}
+
+function takeReplay({ html }) { download(fileName(".html"), new Blob([html], { type: "text/html" })); }
+
+function showRecording({ on, seconds }) {
+  live.recording = on;
+  $("save").textContent = on ? "Stop recording" : "Save";
+  if (on && !seconds) tell("Recording. Press “Stop recording” to save a replay in one file.");
+}

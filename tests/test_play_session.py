@@ -1,0 +1,182 @@
+"""What a server plays: worlds that are opened, described, compared, saved and recorded, without a socket."""
+
+from __future__ import annotations
+
+import json
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.physics.effects import EFFECTS
+from flockenv.play.additions import additions_of
+from flockenv.play.description import describe_lane, faces_of
+from flockenv.play.frames import decode_frame
+from flockenv.play.messages import read_message
+from flockenv.play.room import Room
+from flockenv.play.scene_lane import SceneLane
+from flockenv.play.session import Session
+from flockenv.scene import Scene
+from flockenv.scene.yaml_io import load_scene
+from flockenv.tasks import TASKS
+from tests.test_play import TINY, edit
+
+
+def opened(text: str = TINY) -> tuple[Session, Room]:
+    session = Session()
+    session.open_scene(load_scene(text), "tiny")
+    assert session.room is not None
+    session.room.play(False)
+    return session, session.room
+
+
+def ask(session: Session, **message: Any) -> Any:
+    answers = session.answer(read_message(json.dumps(message)))
+    return answers[0] if answers else None
+
+
+def test_a_description_is_json_that_counts_every_agent() -> None:
+    session, room = opened()
+    described = json.loads(json.dumps(session.describe(), allow_nan=False))
+    (lane,) = described["lanes"]
+    assert sum(count for _, count in lane["roles"]) == sum(count for _, count in lane["radius"]) == 6
+    assert {"effects[0].rate", "groups[0].count", "dt"} <= {control["path"] for control in described["controls"]}
+    assert any(part["path"] == "effects[0].rate" for each in described["sentences"] for part in each["parts"])
+    assert (described["kind"], described["interval"], described["players"]) == ("scene", room.interval, [])
+
+
+def test_the_key_of_a_lane_changes_with_what_is_drawn_without_frames() -> None:
+    scene = load_scene(TINY)
+    key = describe_lane(SceneLane(scene, 0), "")["key"]
+    assert describe_lane(SceneLane(scene, 7), "other")["key"] == key
+    larger = load_scene(TINY.replace("count: 4,", "count: 4, radius: 0.7,"))
+    assert describe_lane(SceneLane(larger, 0), "")["key"] != key
+
+
+def test_a_frame_decodes_to_the_world() -> None:
+    session, room = opened()
+    header, (blocks,) = decode_frame(ask(session, type="frame"))
+    low, high = (np.array(header["lanes"][0][name]) for name in ("low", "high"))
+    shown = (low - 0.5 * (high - low))[:, None] + blocks["pos"] / 65535 * (2 * (high - low))[:, None]
+    assert np.abs(shown - room.lanes[0].drawn.pos).max() <= 9 / 65535 + 1e-9
+
+
+def test_time_is_stepped_sought_and_recorded() -> None:
+    session, room = opened()
+    ask(session, type="step", n=3)
+    assert room.tick == 3
+    ask(session, type="seek", tick=1)
+    assert (room.tick, room.playing) == (1, False)
+    assert ask(session, type="record", on=True) == {"type": "record", "on": True, "seconds": 0.0}
+    for _ in range(5):
+        ask(session, type="step", n=4)
+        session.advance()  # nothing is due, as time stands still
+        assert session._recording is not None
+        session._recording.take()
+    ended, replay = session.answer(read_message('{"type": "record", "on": false}'))
+    assert ended["seconds"] == pytest.approx(20 * room.interval)  # type: ignore[index]
+    html = replay["html"]  # type: ignore[index]
+    (data,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', html)
+    (panel,) = json.loads(data)["groups"][0]["panels"]
+    assert len(panel["time"]) == 6 and len(panel["roles"]) == 6
+    with pytest.raises(ValueError, match="record: nothing is being recorded"):
+        ask(session, type="record", on=False)
+
+
+def test_a_saved_text_is_the_record_and_tells_what_it_lacks() -> None:
+    session, room = opened()
+    session.edit(edit(kind="set", path="effects[0].rate", value=0.25))
+    session.edit(edit(kind="move_agent", agent=0, pos=[1.0, 1.0]))
+    saved = ask(session, type="save")
+    assert load_scene(saved["text"]) == room.lanes[0].record
+    assert saved["notes"] == ["1 changes of this run, such as moved agents, are not in the YAML; a link has them."]
+
+
+def test_two_time_steps_are_compared_side_by_side() -> None:
+    session, _ = opened()
+    ask(session, type="lanes", variants=[{}, {"dt": 0.005}])
+    room = session.room
+    assert room is not None and [lane.record.dt for lane in room.lanes] == [0.01, 0.005]
+    assert room.lanes[0].interval == room.lanes[1].interval == 0.01
+    names = [lane["name"] for lane in session.describe()["lanes"]]
+    assert names[0] != names[1] and "0.005" in names[1]
+    with pytest.raises(ValueError, match="integer multiples"):
+        ask(session, type="lanes", variants=[{}, {"dt": 0.0073}])
+    with pytest.raises(ValueError, match=r"lanes\.variants: missing"):
+        ask(session, type="lanes", players=["rules"])
+
+
+def test_a_link_is_opened_at_its_moment() -> None:
+    session, room = opened()
+    ask(session, type="step", n=5)
+    text = ask(session, type="share", camera={"zoom": 2.0})["text"]
+    other = Session()
+    assert ask(other, type="link", text=text) == {"type": "camera", "camera": {"zoom": 2.0}}
+    assert other.room is not None and other.room.digests == room.digests and not other.room.playing
+
+
+def test_another_seed_begins_again() -> None:
+    session, room = opened()
+    before = room.digests
+    ask(session, type="seed", seed=9)
+    assert room.tick == 0 and room.lanes[0].seed == 9 and room.digests != before
+    ask(session, type="seed", seed=0)
+    assert room.digests == before
+
+
+@pytest.mark.parametrize(
+    ("message", "line"),
+    [
+        ({"type": "look", "lane": 2, "agent": 0}, "look.lane = 2: there are 1 lanes"),
+        ({"type": "open", "what": "bods"}, "boids"),
+        ({"type": "hello", "version": 0}, "version = 0: the server speaks 1"),
+        ({"type": "load", "yaml": "groups: []"}, "groups"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(message: dict[str, Any], line: str) -> None:
+    session, room = opened()
+    with pytest.raises(ValueError, match=re.escape(line)):
+        ask(session, **message)
+    assert session.room is room
+
+
+def test_nothing_is_played_before_a_world_is_open() -> None:
+    session = Session()
+    assert session.version == (0, 0) and not session.is_playing
+    assert ask(session, type="hello", version=1)["open"] is False
+    with pytest.raises(ValueError, match="nothing is open"):
+        ask(session, type="play", on=True)
+
+
+def test_a_task_is_described_with_its_players() -> None:
+    session = Session()
+    session.open_task(TASKS["pursuit"](), ("rules", "you"))
+    described = session.describe()
+    assert [lane["name"] for lane in described["lanes"]] == ["rules", "you"]
+    assert {"rules", "ppo", "you"} <= set(described["players"]) and described["action"]["size"] == 2
+    assert described["sentences"] == [] and described["about"].endswith(".")
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_additions_are_effects_of_every_kind_that_needs_no_further_choice(dimension: int) -> None:
+    found = additions_of(dimension)
+    assert len(found) > 40 and all(each["value"]["kind"] in EFFECTS and each["description"] for each in found)
+    scene = load_scene(TINY)
+    drag = next(each for each in additions_of(2) if each["title"] == "linear drag" or each["value"]["kind"] == "drag")
+    lane = SceneLane(scene, 0)
+    lane.apply(edit(kind="add", path=drag["path"], value=drag["value"]))
+    assert len(lane.record.effects) == 2
+
+
+def test_faces_are_those_of_sheets_and_the_outer_ones_of_bodies() -> None:
+    sheet = "groups: [{network: {kind: cloth, cells: [3, 2], sides: [3, 2]}}]\neffects: []\nspace: {kind: plane}\n"
+    assert len(faces_of(load_scene(sheet))) == 12
+    body = "dimension: 3\n" + sheet.replace(
+        "cloth, cells: [3, 2], sides: [3, 2]", "jelly, cells: [2, 2, 2], sides: [1, 1, 1]"
+    )
+    scene: Scene = load_scene(body)
+    faces = faces_of(scene)
+    assert len(faces) == 6 * 4 * 2  # two triangles on each square of each side
+    middle = 13  # of 27 particles, the one inside
+    assert middle not in faces
