@@ -160,9 +160,48 @@ def test_a_page_sees_the_world_and_changes_it(server: PlayServer, session: Sessi
         shown = low - 0.5 * (high - low) + blocks["pos"][:, 1] / 65535 * 2 * (high - low)
         assert shown == pytest.approx([2.0, 3.0], abs=1e-3)
         assert lane.drawn.pos[:, 1].tolist() == [2.0, 3.0]
-        page.send(json.dumps({"type": "edit", "edit": {"kind": "set", "path": "groups[0].radius", "value": 0.5}}))
-        ask(page, {"type": "frame"})  # so that the edit is done
+        wider = {"kind": "set", "path": "groups[0].radius", "value": 0.5}
+        assert ask(page, {"type": "edit", "edit": wider}, "room")["lanes"][0]["radius"] == [[0.5, 3]]
         assert ask(other, {"type": "play", "on": False}, "room")["lanes"][0]["radius"] == [[0.5, 3]]
+
+
+def test_frames_go_on_while_an_edit_is_compiled(
+    server: PlayServer, session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Messages are answered in order, unless one before them takes long; then that page is told so."""
+    assert session.room is not None
+    compiled, lane = threading.Event(), session.room.lanes[0]
+    monkeypatch.setattr(session.room, "prepare", lambda edit: edit.kind != "set" or compiled.wait(60))
+    with page_of(server) as page:
+        ask(page, HELLO, "room")
+        for value in (0.4, 0.6, 0.7):
+            wider = {"kind": "set", "path": "groups[0].radius", "value": value}
+            page.send(json.dumps({"type": "edit", "edit": wider}))
+        moved = {"kind": "move_agent", "agent": 1, "pos": [2.0, 3.0]}
+        page.send(json.dumps({"type": "edit", "edit": moved}))
+        assert isinstance(ask(page, {"type": "frame"}), bytes)
+        assert lane.drawn.pos[:, 1].tolist() == [2.0, 3.0] and lane.record.groups[0].radius == 0.3
+        assert ask(page, {"type": "frame"}, "notice")["busy"] is True
+        compiled.set()
+        assert ask(page, {"type": "frame"}, "notice")["text"] == ""
+        wait_for(lambda: lane.record.groups[0].radius == 0.7)
+    assert [made.edit.kind for made in session.room.made].count("set") < 3  # the value between was never set
+
+
+def test_a_world_is_compiled_beside_its_frames(
+    server: PlayServer, session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiled, steps = threading.Event(), list[float]()
+    assert session.room is not None
+    monkeypatch.setattr(session.room, "compile", lambda: compiled.wait(60))
+    monkeypatch.setattr(session.room, "advance", lambda: steps.append(0.0))
+    with page_of(server) as page:
+        ask(page, HELLO, "room")
+        page.send(json.dumps({"type": "play", "on": True}))
+        assert ask(page, {"type": "frame"}, "notice")["busy"] is True
+        assert isinstance(ask(page, {"type": "frame"}), bytes) and not steps
+        compiled.set()
+        wait_for(lambda: len(steps) > 0)
 
 
 def np_of(numbers: list[float]) -> Any:
@@ -225,7 +264,44 @@ def fuzzed(dice: random.Random) -> str | bytes:
     return dice.choice(made)()
 
 
-@pytest.mark.parametrize("count", [40, pytest.param(1000, marks=pytest.mark.slow)])
+def send_fuzz(server: PlayServer, dice: random.Random) -> None:
+    """Send a message that breaks the protocol, mostly after a right one."""
+    with page_of(server) as page:
+        if dice.random() < 0.7:
+            page.send(json.dumps(HELLO))
+        page.send(message := fuzzed(dice))
+        assert close_code(page) == 1008, message[:80]
+
+
+def send_too_early(server: PlayServer, dice: random.Random) -> None:
+    """Send a right message before the first one that is due."""
+    early = [{"type": "step", "n": 5}, {"type": "seed", "seed": 9}, {"type": "edit", "edit": {"kind": "set"}}]
+    with page_of(server) as page:
+        page.send(json.dumps(dice.choice(early)))
+        assert close_code(page) == 1008
+
+
+def send_huge(server: PlayServer, dice: random.Random) -> None:
+    """Send a message, text or binary, above the limit."""
+    size = messages.LARGEST + dice.randint(1, 200_000)
+    with page_of(server) as page:
+        page.send(dice.choice(["x" * size, b"x" * size]))
+        assert close_code(page) == 1009
+
+
+def come_from_elsewhere(server: PlayServer, dice: random.Random) -> None:
+    """Open a socket with a foreign Origin or Host, as a page of another site would."""
+    here = f"127.0.0.1:{server.port}"
+    origin, host = dice.choice([("http://evil.example", ""), ("null", ""), (f"http://{here}", "evil.example")])
+    with pytest.raises(InvalidStatus) as refused:
+        page_of(server, origin, host=host)
+    assert refused.value.response.status_code == 403
+
+
+ATTACKS = [send_fuzz] * 7 + [send_too_early, send_huge, come_from_elsewhere]
+
+
+@pytest.mark.parametrize("count", [30, pytest.param(1000, marks=pytest.mark.slow)])
 def test_hostile_messages_end_their_connection_and_nothing_else(
     server: PlayServer, session: Session, count: int, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -234,30 +310,21 @@ def test_hostile_messages_end_their_connection_and_nothing_else(
     before = (session.room.digests, session.version, session.room.tick)
     for k in range(count):
         caplog.clear()
-        with page_of(server) as page:
-            if dice.random() < 0.7:
-                page.send(json.dumps(HELLO))
-            message = fuzzed(dice)
-            page.send(message)
-            assert close_code(page) == 1008, message[:80]
-        assert len(caplog.records) == 1 and "\n" not in caplog.records[0].getMessage(), (k, message[:80])
+        attack = ATTACKS[k % len(ATTACKS)]
+        attack(server, dice)
+        wait_for(lambda: len(caplog.records) > 0)
+        assert [record.levelname for record in caplog.records] == ["WARNING"], (k, attack.__name__)
+        assert "\n" not in caplog.records[0].getMessage()
     assert (session.room.digests, session.version, session.room.tick) == before
     with page_of(server) as page:
         ask(page, HELLO, "welcome")
         assert isinstance(ask(page, {"type": "frame"}), bytes)
 
 
-def test_a_message_that_is_too_large_ends_its_connection(server: PlayServer, caplog: pytest.LogCaptureFixture) -> None:
-    with page_of(server) as page:
-        page.send("x" * (messages.LARGEST + 1))
-        assert close_code(page) == 1009
-    wait_for(lambda: len(caplog.records) == 1)
-
-
 def test_too_many_messages_end_their_connection(
     server: PlayServer, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("flockenv.play.server.RATE", 1.0)  # a busy machine may be slower than the usual bound
+    monkeypatch.setattr("flockenv.play.visit.RATE", 1.0)  # a busy machine may be slower than the usual bound
     with page_of(server) as page:
         ask(page, HELLO, "room")
         with suppress(ConnectionClosed):

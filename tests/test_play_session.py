@@ -13,7 +13,10 @@ from flockenv.physics.effects import EFFECTS
 from flockenv.play.additions import additions_of
 from flockenv.play.description import describe_lane, faces_of
 from flockenv.play.frames import decode_frame
+from flockenv.play.gallery import entries, read_entry
+from flockenv.play.lane import collected_warnings
 from flockenv.play.messages import read_message
+from flockenv.play.record_paths import with_item
 from flockenv.play.room import Room
 from flockenv.play.scene_lane import SceneLane
 from flockenv.play.session import Session
@@ -158,15 +161,44 @@ def test_a_task_is_described_with_its_players() -> None:
     assert described["sentences"] == [] and described["about"].endswith(".")
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_additions_are_effects_of_every_kind_that_needs_no_further_choice(dimension: int) -> None:
-    found = additions_of(dimension)
+QUICK = ("boids", "crowd_circle", "rope", "sphere")
+"""Scenes that are quickly built with each of their additions."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(each.name, marks=() if each.name in QUICK else pytest.mark.slow)
+        for each in entries()
+        if each.kind == "scene"
+    ],
+)
+def test_every_addition_that_is_offered_is_accepted(name: str) -> None:
+    scene = read_entry(name)
+    assert isinstance(scene, Scene)
+    found = additions_of(scene)
     assert len(found) > 40 and all(each["value"]["kind"] in EFFECTS and each["description"] for each in found)
-    scene = load_scene(TINY)
-    drag = next(each for each in additions_of(2) if each["title"] == "linear drag" or each["value"]["kind"] == "drag")
-    lane = SceneLane(scene, 0)
-    lane.apply(edit(kind="add", path=drag["path"], value=drag["value"]))
-    assert len(lane.record.effects) == 2
+    for each in found:
+        with collected_warnings():
+            added = with_item(scene, each["path"], each["value"])
+        assert len(added.effects) == len(scene.effects) + 1
+
+
+def test_an_addition_becomes_an_effect() -> None:
+    session, room = opened()
+    (drag,) = (each for each in ask(session, type="additions")["additions"] if each["title"] == "drag")
+    session.edit(edit(kind="add", path=drag["path"], value=drag["value"]))
+    assert [effect.kind for effect in room.lanes[0].record.effects] == ["drag", "drag"]
+
+
+@pytest.mark.parametrize(
+    "value", [{"kind": "springs", "stiffness": 1}, {"kind": "drag", "rate": 1e9}, {"kind": "journey"}, {"preset": "x"}]
+)
+def test_an_effect_that_a_scene_cannot_have_is_refused_in_one_line(value: dict[str, Any]) -> None:
+    session, room = opened()
+    with pytest.raises(ValueError, match=r"effects|dt|preset") as refused:
+        ask(session, type="edit", edit={"kind": "add", "path": "effects", "value": value})
+    assert "\n" not in str(refused.value) and len(room.lanes[0].record.effects) == 1
 
 
 def test_faces_are_those_of_sheets_and_the_outer_ones_of_bodies() -> None:

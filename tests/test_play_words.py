@@ -21,6 +21,9 @@ from flockenv.tasks import TASKS
 ROOT = Path(__file__).resolve().parent.parent
 SCENES = sorted((ROOT / "configs" / "scenes").glob("*.yaml"))
 
+QUICK = ("boids", "fireworks", "rope_on_ball", "vortex")
+"""Scenes that are quickly built again for each of their values."""
+
 
 def scene_from(path: Path) -> Scene:
     with warnings.catch_warnings():
@@ -49,7 +52,11 @@ def test_sentences_are_english() -> None:
     assert sentences["effects[0]"].removable and not sentences["space"].removable
 
 
-@pytest.mark.parametrize("path", SCENES[::4], ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, marks=() if path.stem in QUICK else pytest.mark.slow) for path in SCENES],
+    ids=lambda path: path.stem,
+)
 def test_every_value_in_a_sentence_is_a_value_of_the_scene(path: Path) -> None:
     scene = scene_from(path)
     values = [part for sentence in sentences_of(scene) for part in sentence.parts if part.path is not None]

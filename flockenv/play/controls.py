@@ -258,6 +258,8 @@ def _restarts(control: Control, lane: Lane) -> bool | None:
     if isinstance(parent, Effect) and parent.begin_law is None:
         return False  # no initial state depends on it
     key = (type(parent), steps[-1], type(lane.record))
+    if control.value is None:
+        return _known.get(key)
     if key not in _known:
         _known[key] = next(
             (found for value in _nudged(control) if (found := lane.would_restart(control.path, value)) is not None),

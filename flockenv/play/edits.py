@@ -17,8 +17,9 @@ from flockenv.core.errors import key_path, nearest, parse_key_path, printable, r
 from flockenv.core.record import Record, lists_to_tuples
 
 __all__ = [
-    "EDITS", "MOST_AGENTS", "MOST_LANES", "Add", "AddAgents", "AddObstacle", "AnyEdit", "Disturb", "Edit", "Input",
-    "MoveAgent", "MoveObstacle", "Player", "Pointer", "Remove", "RemoveAgents", "RemoveObstacle", "Set", "read_edit",
+    "EDITS", "MOST_AGENTS", "MOST_LANES", "OF_RECORD", "Add", "AddAgents", "AddObstacle", "AnyEdit", "Disturb", "Edit",
+    "Input", "MoveAgent", "MoveObstacle", "Player", "Pointer", "Remove", "RemoveAgents", "RemoveObstacle", "Set",
+    "read_edit",
 ]  # fmt: skip
 
 MOST_LANES = 4
@@ -157,6 +158,9 @@ EDITS: dict[str, type[Edit]] = {
     )
 }  # fmt: skip
 """Every edit by its kind."""
+
+OF_RECORD = ("set", "add", "remove", "add_obstacle", "move_obstacle", "remove_obstacle")
+"""Kinds of edits that change the record of a scene, so that a saved file has them."""
 
 
 def read_edit(data: object) -> Edit:

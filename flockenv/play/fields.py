@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,11 +13,14 @@ from numpy.typing import NDArray
 from flockenv.core.errors import nearest, printable
 from flockenv.play.lane import Drawn, Lane, collected_warnings
 from flockenv.play.scene_lane import SceneLane
+from flockenv.play.sight import prepare_look
 from flockenv.play.task_lane import TaskLane
-from flockenv.studies.cost_breakdown import explain
+from flockenv.studies.cost_breakdown import explain, variants_of
 from flockenv.studies.measures import polarisation
 
-__all__ = ["CELLS", "Coloured", "Grid", "colour_of", "colours_of", "costs_of", "grid_of", "measures_of"]
+__all__ = [
+    "CELLS", "Coloured", "Grid", "colour_of", "colours_of", "costs_of", "grid_of", "measures_of", "prepare_costs",
+]  # fmt: skip
 
 CELLS = 48
 """Cells of a grid along the longer side of the world."""
@@ -155,13 +159,30 @@ def measures_of(lane: Lane) -> dict[str, dict[str, Any]]:
     }
 
 
+def _of_scene(lane: Lane) -> SceneLane:
+    if not isinstance(lane, SceneLane):
+        raise ValueError("costs: only of scenes; the effects of a task are compiled together with its rewards")
+    return lane
+
+
+def prepare_costs(lane: Lane) -> None:
+    """Compile what `costs_of` needs, in any thread; raise ValueError for a task."""
+    lane = _of_scene(lane)
+    with collected_warnings():
+        variants = [lane.record.with_effects(*kept) for kept in variants_of(lane.record)]
+        starts = [scene.start(lane.seed) for scene in variants]
+    for scene, state in zip(variants, starts, strict=True):
+        with suppress(FloatingPointError):
+            scene.step(state)
+    prepare_look(lane)  # shares of behaviours
+
+
 def costs_of(lane: Lane) -> dict[str, Any]:
     """Return what each effect of a scene costs from the present state on, us per step, as `flockenv explain` measures.
 
-    It takes some seconds, and more the first time; the lane stays as it is. Raises ValueError for a task.
+    It takes some seconds, and more without `prepare_costs`; the lane stays as it is. Raises ValueError for a task.
     """
-    if not isinstance(lane, SceneLane):
-        raise ValueError("costs: only of scenes; the effects of a task are compiled together with its rewards")
+    lane = _of_scene(lane)
     with collected_warnings():
         breakdown = explain(lane.record, lane.state.copy())
     rows = []

@@ -96,6 +96,9 @@ class Lane(Protocol):
     def step(self, ticks: int = 1) -> None:
         """Advance by some ticks, fewer if it stops; a stopped lane keeps its last state."""
 
+    def compile(self) -> None:
+        """Compile what steps need, in any thread, before the first one; the state stays as it is."""
+
     def prepare(self, edit: Edit) -> None:
         """Compile what an edit needs, in any thread, so that `apply` is fast; raise ValueError as `apply` does."""
 

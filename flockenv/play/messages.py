@@ -16,9 +16,9 @@ from flockenv.play.edits import MOST_LANES
 from flockenv.play.frames import Want
 
 __all__ = [
-    "LARGEST", "MESSAGES", "VERSION", "Costs", "EditMessage", "Frame", "Gallery", "Hello", "Lanes", "LinkMessage",
-    "Load", "LookMessage", "Measures", "Message", "Open", "Play", "RecordMessage", "Save", "Seed", "Seek", "Share",
-    "Speed", "Step", "Variant", "read_message",
+    "LARGEST", "MESSAGES", "VERSION", "Additions", "Costs", "EditMessage", "Frame", "Gallery", "Hello", "Lanes",
+    "LinkMessage", "Load", "LookMessage", "Measures", "Message", "Open", "Play", "RecordMessage", "Save", "Seed",
+    "Seek", "Share", "Speed", "Step", "Variant", "read_message",
 ]  # fmt: skip
 
 VERSION = 1
@@ -174,6 +174,12 @@ class Measures(Message):
     type: Literal["measures"] = "measures"
 
 
+class Additions(Message):
+    """Ask for the effects that can be added to the scene."""
+
+    type: Literal["additions"] = "additions"
+
+
 class Costs(Message):
     """Ask for the cost of each effect, which takes seconds to measure."""
 
@@ -184,7 +190,7 @@ MESSAGES: dict[str, type[Message]] = {
     each.model_fields["type"].default: each
     for each in (
         Hello, Open, Load, LinkMessage, EditMessage, Play, Speed, Step, Seek, Frame, LookMessage, Save, Share, Lanes,
-        Seed, RecordMessage, Gallery, Measures, Costs,
+        Seed, RecordMessage, Gallery, Measures, Additions, Costs,
     )
 }  # fmt: skip
 """Every message by its type."""
@@ -209,10 +215,13 @@ def read_message(text: str | bytes) -> Message:
         raise ValueError(f"message.type = {printable(kind[:40])}: unknown{nearest(kind[:40], MESSAGES) or ''}")
     model = MESSAGES[kind]
     try:
-        return model.model_validate(lists_to_tuples(data), strict=True)
+        message = model.model_validate(lists_to_tuples(data), strict=True)
     except ValidationError as error:
         wrong = refusals(error, model, data)
         raise ValueError(f"{kind}.{wrong[0]}" if wrong else f"{kind}: {error.errors()[0]['msg']}") from None
+    if isinstance(message, EditMessage) and not isinstance(message.edit.get("kind"), str):
+        raise ValueError("edit.edit.kind: must be text")
+    return message
 
 
 def _refuse_constant(name: str) -> float:

@@ -27,7 +27,7 @@ class Room:
 
     lanes: of equal seeds and equal intervals. budget: bytes for going back. clock: s, increasing.
     Methods that change something raise ValueError, in one line, before anything changes. They are not made for several
-    threads at a time; `prepare` alone may run beside them.
+    threads at a time; `compile` and `prepare` alone may run beside them.
     """
 
     def __init__(self, lanes: Sequence[Lane], budget: int = BUDGET, clock: Callable[[], float] = perf_counter) -> None:
@@ -119,6 +119,11 @@ class Room:
         self._last_time, self._due = self._clock(), 0.0
 
     # --- changes ----------------------------------------------------------------------------------------------------
+
+    def compile(self) -> None:
+        """Compile what steps need, before the first one, in any thread."""
+        for lane in self.lanes:
+            lane.compile()
 
     def prepare(self, edit: Edit) -> None:
         """Compile what an edit needs, in a thread beside those that step; raise ValueError as `edit` does."""

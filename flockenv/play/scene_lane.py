@@ -167,6 +167,13 @@ class SceneLane:
             return self._point(edit)
         raise ValueError(f"{edit.kind}: a scene has no players; open a task for that")
 
+    def compile(self) -> None:
+        """Compile what steps need, in any thread, before the first one; the state stays as it is."""
+        with suppress(FloatingPointError):
+            self.record.step(self.state)
+        for acts in ("goal", "flee"):
+            self.pointer_force(Pointer(acts=acts, at=(0.0,) * self.record.dimension))
+
     def prepare(self, edit: Edit) -> None:
         """Compile what an edit of the record needs, so that `apply` takes no longer than a step; in any thread.
 
@@ -184,35 +191,17 @@ class SceneLane:
 
         The latest results are kept: going back and on applies the same edits to the same records again.
         """
-        key = id(self.record), edit.model_dump_json()
-        if key not in self._results:
-            with collected_warnings() as lines:
-                new = self._edited(edit)
-            fresh = tuple(line for line in lines if line not in self._warned)
-            self._warned.update(lines)
-            results = [*self._results.items(), (key, (self.record, new, fresh))]
-            self._results = dict(results[-max(2, min(MOST_RESULTS, 10**6 // self.record.agents)) :])
-            return new, fresh
-        return self._results[key][1:]
-
-    def _edited(self, edit: Edit) -> Scene:
-        if isinstance(edit, Set):
-            return with_value(self.record, edit.path, edit.value)
-        if isinstance(edit, Add):
-            value: Any = edit.value
-            if edit.path == "effects" and "preset" in value:
-                value = expand_presets({"effects": [value]})[0]["effects"]
-            return with_item(self.record, edit.path, value)
-        if isinstance(edit, Remove):
-            return without_item(self.record, edit.path)
-        if isinstance(edit, AddObstacle):
-            return with_item(self.record, "obstacles", {"kind": "circle", **edit.shape})
-        path = f"obstacles[{edit.index}]"  # type: ignore[attr-defined]  # the two other edits of obstacles have one
-        if isinstance(edit, RemoveObstacle):
-            return without_item(self.record, path)
-        assert isinstance(edit, MoveObstacle)
-        moved = value_at(self.record, path).moved_to(edit.centre)
-        return with_value(self.record, path, moved)
+        record = self.record
+        key = id(record), edit.model_dump_json()
+        if (known := self._results.get(key)) is not None:
+            return known[1:]
+        with collected_warnings() as lines:
+            new = _edited(record, edit)
+        fresh = tuple(line for line in lines if line not in self._warned)
+        self._warned.update(lines)
+        results = [*self._results.items(), (key, (record, new, fresh))]
+        self._results = dict(results[-max(2, min(MOST_RESULTS, 10**6 // record.agents)) :])
+        return new, fresh
 
     def _take(self, new: Scene) -> Change:
         """Go on with a changed scene, or begin it again if the present state is none of its states."""
@@ -340,3 +329,23 @@ class SceneLane:
     def snapshot(self) -> Snapshot:
         """Return the world at this instant."""
         return self.record.snapshot(self.state)
+
+
+def _edited(scene: Scene, edit: Edit) -> Scene:
+    """Return a scene after an edit of its record."""
+    if isinstance(edit, Set):
+        return with_value(scene, edit.path, edit.value)
+    if isinstance(edit, Add):
+        value: Any = edit.value
+        if edit.path == "effects" and "preset" in value:
+            value = expand_presets({"effects": [value]})[0]["effects"]
+        return with_item(scene, edit.path, value)
+    if isinstance(edit, Remove):
+        return without_item(scene, edit.path)
+    if isinstance(edit, AddObstacle):
+        return with_item(scene, "obstacles", {"kind": "circle", **edit.shape})
+    path = f"obstacles[{edit.index}]"  # type: ignore[attr-defined]  # the two other edits of obstacles have one
+    if isinstance(edit, RemoveObstacle):
+        return without_item(scene, path)
+    assert isinstance(edit, MoveObstacle)
+    return with_value(scene, path, value_at(scene, path).moved_to(edit.centre))

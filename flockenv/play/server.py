@@ -1,13 +1,15 @@
 """The server of the playground: one page, pictures, and a socket on which pages ask, change and watch.
 
-All work on the worlds is done in one thread, in order. A frame is sent only as the answer to a question for one: a slow
-page gets fewer frames, and nothing waits for it. A message that breaks the protocol ends its connection, with one line
-in the log; the worlds stay as they are.
+All work on the worlds is done in one thread, in order; what must be compiled or built for it first, in another one, so
+that worlds go on meanwhile. A frame is sent only as the answer to a question for one: a slow page gets fewer frames,
+and nothing waits for it. A message that breaks the protocol ends its connection, with one line in the log; the worlds
+stay as they are.
 """
 
 from __future__ import annotations
 
 import asyncio
+import functools
 import json
 import logging
 import secrets
@@ -18,24 +20,21 @@ from http import HTTPStatus
 from typing import Any, Final
 from urllib.parse import parse_qs, urlsplit
 
-from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.asyncio.server import Server, ServerConnection, broadcast, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from flockenv.core.errors import printable
 from flockenv.play import messages as m
-from flockenv.play.edits import read_edit
 from flockenv.play.session import Answer, Session
+from flockenv.play.visit import HostileError, Visit
 from flockenv.render.page import page, policy
 
 __all__ = ["PORT", "PlayServer"]
 
 PORT: Final = 8712
 """The port if none is given."""
-
-RATE: Final = 240.0
-"""Messages a second that a page may send for long, and twice as many at once."""
 
 REST: Final = 0.003
 """Seconds between two looks at the clock while the worlds run."""
@@ -45,33 +44,16 @@ WILDCARDS: Final = ("0.0.0.0", "::")  # noqa: S104  # named to be told apart
 
 MOST_PAGES: Final = 32
 
-PATIENCE: Final = 1.0
+PATIENCE: Final = 0.5
 """Seconds after which a page is sent a line that an answer takes longer."""
 
-COMPILING: Final = "Computing … the first steps of a world compile its kernels, which takes some seconds, once."
+COMPILING: Final = "Compiling … this takes some seconds, the first time only."
+DONE: Final = {"type": "notice", "text": ""}
 
 _log = logging.getLogger("flockenv.play")
 _quiet = logging.getLogger("flockenv.play.websockets")  # its tracebacks of broken connections are no news
 _quiet.addHandler(logging.NullHandler())
 _quiet.propagate = False
-
-
-class _HostileError(Exception):
-    """A message that no page sends; its text is for the log."""
-
-
-class _Bucket:
-    """Counts messages: RATE a second for long, twice as many at once."""
-
-    def __init__(self, clock: Callable[[], float]) -> None:
-        self._clock, self._left, self._last = clock, 2 * RATE, clock()
-
-    def take(self) -> bool:
-        """Return False if there have been too many."""
-        now = self._clock()
-        self._left = min(2 * RATE, self._left + (now - self._last) * RATE) - 1
-        self._last = now
-        return self._left >= 0
 
 
 class PlayServer:
@@ -85,6 +67,7 @@ class PlayServer:
         self.session, self.host, self.port = session, host, port
         self.token = secrets.token_urlsafe(24) if host else ""
         self._work = ThreadPoolExecutor(1, "flockenv-play")
+        self._beside = ThreadPoolExecutor(1, "flockenv-compile")
         self._pages: set[ServerConnection] = set()
         self._html = page("live", "flockenv", {"version": m.VERSION})
         self._pictures = session.pictures()
@@ -107,7 +90,8 @@ class PlayServer:
             clock.cancel()
             server.close()
             await server.wait_closed()
-            self._work.shutdown(wait=False, cancel_futures=True)
+            for pool in (self._work, self._beside):
+                pool.shutdown(wait=False, cancel_futures=True)
 
     async def _listen(self) -> Server:
         server = await serve(
@@ -122,14 +106,32 @@ class PlayServer:
         """Do some work on the worlds, after what was asked before."""
         return await asyncio.get_running_loop().run_in_executor(self._work, work, *arguments)
 
+    async def _aside(self, work: Callable[..., Any], *arguments: Any) -> Any:
+        """Do some work beside that on the worlds, such as compiling."""
+        return await asyncio.get_running_loop().run_in_executor(self._beside, work, *arguments)
+
     async def _keep_time(self) -> None:
         """Let time pass in the worlds while a page is open."""
         while True:
-            if self._pages and self.session.is_playing:
-                await self._do(self.session.advance)
-                await asyncio.sleep(REST)
-            else:
+            if not self._pages or not self.session.is_playing:
                 await asyncio.sleep(0.02)
+                continue
+            await self._compile()
+            await self._do(self.session.advance)
+            await asyncio.sleep(REST)
+
+    async def _compile(self) -> None:
+        """Compile the steps of the open worlds if that is due; all pages are told if it takes long."""
+        if self.session.is_compiled:
+            return
+        task = asyncio.ensure_future(self._aside(self.session.compile))
+        await asyncio.wait({task}, timeout=PATIENCE)
+        is_late = not task.done()
+        if is_late:
+            broadcast(self._pages, _json({"type": "notice", "text": COMPILING, "busy": True}))
+        await task
+        if is_late:
+            broadcast(self._pages, _json(DONE))
 
     # --- requests ---------------------------------------------------------------------------------------------------
 
@@ -144,7 +146,7 @@ class PlayServer:
         """Return the answer to a request, None to go on with the socket; a foreign Host or Origin gets none of it."""
         refused = self._refusal(request)
         if refused:
-            _log.warning("%s: refused: %s", _address(connection), refused)
+            _log.warning("%s: refused: %s", (connection.remote_address or ("a page",))[0], refused)
             return _response(HTTPStatus.FORBIDDEN, "text/plain; charset=utf-8", b"forbidden\n")
         path = urlsplit(request.path).path
         if path == "/ws":
@@ -179,82 +181,85 @@ class PlayServer:
 
     async def _talk(self, connection: ServerConnection) -> None:
         """Answer the messages of a page until it goes; a message that breaks the protocol ends it."""
+        visit = Visit(connection)
         self._pages.add(connection)
+        long = asyncio.create_task(self._answer_long(visit))
         try:
-            await self._serve_page(connection)
-        except _HostileError as error:
-            _log.warning("%s: closed: %s", _address(connection), error)
+            await self._answer_all(visit)
+        except HostileError as error:
+            _log.warning("%s: closed: %s", visit.address, error)
             await connection.close(1008, str(error).encode()[:100].decode(errors="ignore"))
         except ConnectionClosed as error:
-            if error.sent is not None and error.sent.code not in (1000, 1001, 1005):
-                _log.warning("%s: closed: %s", _address(connection), error.sent.reason or error.sent.code)
+            if error.sent is not None and error.sent.code not in (1000, 1001, 1005, 1011):
+                _log.warning("%s: closed: %s", visit.address, error.sent.reason or error.sent.code)
         except Exception:
-            _log.exception("%s: closed: an error of the server", _address(connection))
-            await connection.close(1011)
+            await self._give_up(visit)
         finally:
+            long.cancel()
             self._pages.discard(connection)
             if not self._pages:
                 await self._do(self.session.pause)
 
-    async def _serve_page(self, connection: ServerConnection) -> None:
-        bucket, seen = _Bucket(asyncio.get_running_loop().time), _Seen()
-        async for text in connection:
-            if not bucket.take():
-                raise _HostileError(f"more than {RATE:g} messages a second")
-            try:
-                message = m.read_message(text)
-            except ValueError as error:
-                raise _HostileError(str(error)) from None
-            if not seen.hello:
-                if not isinstance(message, m.Hello):
-                    raise _HostileError(f"{message.type}: the first message must be hello")
-                seen.hello = True
-            await self._reply(connection, message, seen)
+    async def _give_up(self, visit: Visit) -> None:
+        """End a page because of an error of the server, which is in the log."""
+        _log.exception("%s: closed: an error of the server", visit.address)
+        await visit.connection.close(1011)
 
-    async def _reply(self, connection: ServerConnection, message: m.Message, seen: _Seen) -> None:
+    async def _answer_all(self, visit: Visit) -> None:
+        """Read the messages of a page; answer all but the long ones."""
+        async for text in visit.connection:
+            message = visit.read(text)
+            if self.session.is_long(message):
+                await visit.put(message)
+                continue
+            if not isinstance(message, m.Frame):
+                await visit.calm()
+            await self._reply(visit, message)
+
+    async def _answer_long(self, visit: Visit) -> None:
+        """Answer the long messages of a page one after the other."""
+        try:
+            while True:
+                await self._reply(visit, await visit.take())
+        except ConnectionClosed:
+            pass  # the reader of its messages sees this too
+        except Exception:
+            await self._give_up(visit)
+        finally:
+            visit.end()
+
+    async def _reply(self, visit: Visit, message: m.Message) -> None:
         """Send the answers to a message; a refusal is an answer too."""
         try:
-            answers = await self._with_notice(connection, message)
+            answers = await self._with_notice(visit, message)
         except (ValueError, TypeError, KeyError, IndexError, FloatingPointError, MemoryError) as error:
             answers = ({"type": "error", "text": _line(error), "about": message.type},)
-        if seen.version != self.session.version:
-            seen.version = self.session.version
-            await connection.send(_json(await self._do(self.session.describe)))
+        if visit.version != self.session.version:
+            visit.version = self.session.version
+            await visit.connection.send(_json(await self._do(self.session.describe)))
         for answer in answers:
-            await connection.send(answer if isinstance(answer, bytes) else _json(answer))
+            await visit.connection.send(answer if isinstance(answer, bytes) else _json(answer))
 
-    async def _with_notice(self, connection: ServerConnection, message: m.Message) -> Sequence[Answer]:
-        """Return the answers to a message; if they take long, tell the page."""
+    async def _with_notice(self, visit: Visit, message: m.Message) -> Sequence[Answer]:
+        """Return the answers to a message; if they take long, tell the page, also when they are there."""
         task = asyncio.ensure_future(self._answer(message))
-        if not isinstance(message, m.Frame):
-            await asyncio.wait({task}, timeout=PATIENCE)
-            if not task.done():
-                await connection.send(_json({"type": "notice", "text": COMPILING, "busy": True}))
-        return await task
+        if isinstance(message, m.Frame):
+            return await task
+        await asyncio.wait({task}, timeout=PATIENCE)
+        if task.done():
+            return await task
+        await visit.connection.send(_json({"type": "notice", "text": COMPILING, "busy": True}))
+        return (DONE, *await task)
 
     async def _answer(self, message: m.Message) -> Sequence[Answer]:
-        if not isinstance(message, m.EditMessage):
-            answers: Sequence[Answer] = await self._do(self.session.answer, message)
-            return answers
-        edit = await self._read_edit(message)
-        await asyncio.to_thread(self.session.prepare, edit)
-        done: Sequence[Answer] = await self._do(self.session.edit, edit)
-        return done
-
-    async def _read_edit(self, message: m.EditMessage) -> Any:
-        try:
-            return read_edit(message.edit)
-        except ValueError as error:
-            if not isinstance(message.edit.get("kind"), str):
-                raise _HostileError(str(error)) from None
-            raise
-
-
-class _Seen:
-    """What a page has been sent: whether it said hello, and the version of the room that it knows."""
-
-    def __init__(self) -> None:
-        self.hello, self.version = False, (0, 0)
+        if isinstance(message, (m.Step, m.Seek)):
+            await self._compile()
+        if self.session.is_long(message):
+            work = await self._aside(self.session.prepare, message)
+        else:
+            work = functools.partial(self.session.answer, message)
+        answers: Sequence[Answer] = await self._do(work)
+        return answers
 
 
 def _json(data: object) -> str:
@@ -264,10 +269,6 @@ def _json(data: object) -> str:
 def _line(error: BaseException) -> str:
     text = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
     return " ".join(text.split())[:500] or type(error).__name__
-
-
-def _address(connection: ServerConnection) -> str:
-    return str((connection.remote_address or ("a page",))[0])
 
 
 def _response(status: HTTPStatus, kind: str, body: bytes) -> Response:

@@ -1,6 +1,6 @@
 """Session: what one server plays, and its answers to the messages of pages, as JSON and bytes; it knows no socket.
 
-It is used by one thread at a time, but for `prepare`.
+It is used by one thread at a time, but for `prepare` and `compile`, which may run in one other thread.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from flockenv.play import messages as m
 from flockenv.play.additions import additions_of
 from flockenv.play.controls import controls_of, with_restarts
 from flockenv.play.description import describe_lane
-from flockenv.play.edits import Edit
+from flockenv.play.edits import OF_RECORD, Edit, read_edit
 from flockenv.play.fields import colours_of
 from flockenv.play.frames import encode_frame
+from flockenv.play.lane import Lane
 from flockenv.play.record_paths import with_value
 from flockenv.play.recording import Recording
 from flockenv.play.room import Room
@@ -27,9 +28,11 @@ from flockenv.play.task_lane import NO_FILES, PlayerFiles, TaskLane, players_of
 from flockenv.scene import Scene
 from flockenv.tasks import Task
 
-__all__ = ["Answer", "Session"]
+__all__ = ["Answer", "Rest", "Session"]
 
 Answer = Mapping[str, Any] | bytes
+Rest = Callable[[], list[Answer]]
+"""What is left to do for a message, in the thread that steps the worlds."""
 
 
 class Session:
@@ -43,15 +46,18 @@ class Session:
         self.room: Room | None = None
         self.name = ""
         self.opened = 0
+        self._compiled: Room | None = None
         self._recording: Recording | None = None
         self._players: tuple[str, ...] = ()
         self._step_time, self._encode_time = _Mean(), _Mean()
-        self._answers: dict[type[m.Message], Callable[..., list[Answer]]] = {
-            m.Hello: self._hello, m.Open: self._open, m.Load: self._load, m.LinkMessage: self._link,
-            m.Play: self._play, m.Speed: self._speed, m.Step: self._step, m.Seek: self._seek, m.Frame: self._frame,
-            m.LookMessage: self._look, m.Save: self._save, m.Share: self._share, m.Lanes: self._lanes,
-            m.Seed: self._seed, m.RecordMessage: self._record, m.Gallery: self._gallery, m.Measures: self._measures,
-            m.Costs: self._costs,
+        self._short: dict[type[m.Message], Callable[..., list[Answer]]] = {
+            m.Hello: self._hello, m.Play: self._play, m.Speed: self._speed, m.Step: self._step, m.Seek: self._seek,
+            m.Frame: self._frame, m.Save: self._save, m.Share: self._share, m.Seed: self._seed,
+            m.RecordMessage: self._record, m.Gallery: self._gallery, m.Measures: self._measures,
+        }  # fmt: skip
+        self._long: dict[type[m.Message], Callable[..., Rest]] = {
+            m.Open: self._open, m.Load: self._load, m.LinkMessage: self._link, m.Lanes: self._lanes,
+            m.EditMessage: self._edit, m.LookMessage: self._look, m.Costs: self._costs, m.Additions: self._additions,
         }  # fmt: skip
 
     # --- what the server does by itself -----------------------------------------------------------------------------
@@ -84,10 +90,16 @@ class Session:
         if self.room is not None:
             self.room.play(False)
 
-    def prepare(self, edit: Edit) -> None:
-        """Compile what an edit needs, in a thread beside the one that works."""
-        if self.room is not None:
-            self.room.prepare(edit)
+    @property
+    def is_compiled(self) -> bool:
+        """True if steps take no longer than steps do; before that, `compile` is due."""
+        return self.room is None or self._compiled is self.room
+
+    def compile(self) -> None:
+        """Compile what the steps of the open worlds need."""
+        if (room := self.room) is not None:
+            room.compile()
+            self._compiled = room
 
     def edit(self, edit: Edit) -> list[Answer]:
         """Apply an edit."""
@@ -97,9 +109,24 @@ class Session:
             lines.insert(0, "This value is part of the start: the world begins again.")
         return [{"type": "notice", "text": " ".join(lines)}] if lines else []
 
+    def is_long(self, message: m.Message) -> bool:
+        """Return True if a message may need something compiled or built, which `prepare` does."""
+        if isinstance(message, m.EditMessage):
+            return message.edit["kind"] in (*OF_RECORD, "player")
+        return type(message) in self._long
+
+    def prepare(self, message: m.Message) -> Rest:
+        """Compile and build what a long message needs, and return the rest; ValueError if it cannot be done."""
+        return self._long[type(message)](message)
+
     def answer(self, message: m.Message) -> list[Answer]:
         """Return the answers to a message; ValueError, in one line, if it cannot be done."""
-        return self._answers[type(message)](message)
+        return self.prepare(message)() if type(message) in self._long else self._short[type(message)](message)
+
+    def _edit(self, message: m.EditMessage) -> Rest:
+        edit = read_edit(message.edit)
+        self._there().prepare(edit)
+        return lambda: self.edit(edit)
 
     def _there(self) -> Room:
         if self.room is None:
@@ -114,58 +141,66 @@ class Session:
 
     def open_task(self, task: Task, players: Sequence[str] = ("rules",), seed: int = 0) -> None:
         """Open a task in a world for each player, side by side."""
-        lanes = tuple(TaskLane(task, player, seed, files=self.files) for player in players)
-        self._players = players_of(task, self.files)
-        self._set_room(Room(lanes), task.name)
+        self._set_room(self._room_of(task, players, seed), task.name)
 
-    def _set_room(self, room: Room, name: str, playing: bool = True) -> None:
+    def _room_of(self, task: Task, players: Sequence[str], seed: int) -> Room:
+        return Room(tuple(TaskLane(task, player, seed, files=self.files) for player in players))
+
+    def _set_room(self, room: Room, name: str, playing: bool = True, answers: Sequence[Answer] = ()) -> list[Answer]:
+        """Play another room from now on."""
+        record = room.lanes[0].record
+        self._players = players_of(record, self.files) if isinstance(record, Task) else ()
         self.room, self.name, self._recording = room, name, None
         self.opened += 1
         room.play(playing)
+        return list(answers)
 
-    def _open(self, message: m.Open) -> list[Answer]:
+    def _ready(self, room: Room, name: str, playing: bool = True, answers: Sequence[Answer] = ()) -> Rest:
+        """Compile what a new room needs, and return what opens it."""
+        room.compile()
+
+        def opens() -> list[Answer]:
+            self._compiled = room
+            return self._set_room(room, name, playing, answers)
+
+        return opens
+
+    def _open(self, message: m.Open) -> Rest:
         from flockenv.play.gallery import read_entry
 
         record = read_entry(message.what)
-        if isinstance(record, Scene):
-            if message.players is not None:
-                raise ValueError("players: a scene has none")
-            self.open_scene(record, message.what)
-        else:
-            self.open_task(record, message.players or ("rules",))
-        return []
+        if isinstance(record, Task):
+            return self._ready(self._room_of(record, message.players or ("rules",), 0), record.name)
+        if message.players is not None:
+            raise ValueError("players: a scene has none")
+        return self._ready(Room((SceneLane(record),)), message.what)
 
-    def _load(self, message: m.Load) -> list[Answer]:
+    def _load(self, message: m.Load) -> Rest:
         from flockenv.scene.yaml_io import load_scene
 
         scene = load_scene(message.yaml + "\n")  # with a line break it is a text, never the name of a file
-        self.open_scene(scene, self.name or "scene", self.room.lanes[0].seed if self.room is not None else 0)
-        return []
+        seed = self.room.lanes[0].seed if self.room is not None else 0
+        return self._ready(Room((SceneLane(scene, seed),)), self.name or "scene")
 
-    def _link(self, message: m.LinkMessage) -> list[Answer]:
+    def _link(self, message: m.LinkMessage) -> Rest:
         from flockenv.play.link import read_link
 
         linked = read_link(message.text)
-        room = linked.room(self.files)
-        if isinstance(room.lanes[0], TaskLane):
-            self._players = players_of(room.lanes[0].record, self.files)
-        self._set_room(room, linked.title, playing=False)
-        return [{"type": "camera", "camera": dict(linked.camera)}]
+        camera = {"type": "camera", "camera": dict(linked.camera)}
+        return self._ready(linked.room(self.files), linked.title, False, [camera])
 
-    def _lanes(self, message: m.Lanes) -> list[Answer]:
+    def _lanes(self, message: m.Lanes) -> Rest:
         first = self._there().lanes[0]
         if isinstance(first, TaskLane):
             if message.players is None:
                 raise ValueError("lanes.players: missing; a task is compared by its players")
-            self.open_task(first.record, message.players, first.seed)
-        else:
-            if message.variants is None:
-                raise ValueError("lanes.variants: missing; a scene is compared by methods and time steps")
-            scenes = [_variant(first.record, each) for each in message.variants]
-            longest = max(scene.dt for scene in scenes)
-            lanes = [SceneLane(scene, first.seed, _whole(longest / scene.dt)) for scene in scenes]
-            self._set_room(Room(lanes), self.name)
-        return []
+            return self._ready(self._room_of(first.record, message.players, first.seed), first.record.name)
+        if message.variants is None:
+            raise ValueError("lanes.variants: missing; a scene is compared by methods and time steps")
+        scenes = [_variant(first.record, each) for each in message.variants]
+        longest = max(scene.dt for scene in scenes)
+        lanes = [SceneLane(scene, first.seed, _whole(longest / scene.dt)) for scene in scenes]
+        return self._ready(Room(lanes), self.name)
 
     def _seed(self, message: m.Seed) -> list[Answer]:
         room = self._there()
@@ -224,7 +259,6 @@ class Session:
             "lanes": [describe_lane(lane, name) for lane, name in zip(room.lanes, self._names(), strict=True)],
             "controls": [_data(control) for control in with_restarts(controls_of(record), first)],
             "sentences": [_data(sentence) for sentence in sentences_of(record)] if scene else [],
-            "additions": additions_of(record.dimension) if scene else [],
             "players": list(self._players) if not scene else [], "colours": list(colours_of(first)),
             "about": _about(record), "action": None if scene else _action(record),
             "disturbance": first.disturbance.model_dump() if isinstance(first, TaskLane) else None,
@@ -239,13 +273,17 @@ class Session:
             return [""]
         return [f"{_method(lane.record)}, dt = {lane.record.dt:g} s" for lane in lanes]
 
-    def _look(self, message: m.LookMessage) -> list[Answer]:
-        from flockenv.play.sight import look
+    def _look(self, message: m.LookMessage) -> Rest:
+        from flockenv.play.sight import look, prepare_look
 
-        lanes = self._there().lanes
-        if message.lane >= len(lanes):
-            raise ValueError(f"look.lane = {message.lane}: there are {len(lanes)} lanes, counted from 0")
-        return [{"type": "look", "lane": message.lane, **_data(look(lanes[message.lane], message.agent))}]
+        def lane() -> Lane:
+            lanes = self._there().lanes
+            if message.lane >= len(lanes):
+                raise ValueError(f"look.lane = {message.lane}: there are {len(lanes)} lanes, counted from 0")
+            return lanes[message.lane]
+
+        prepare_look(lane())
+        return lambda: [{"type": "look", "lane": message.lane, **_data(look(lane(), message.agent))}]
 
     def _measures(self, message: m.Measures) -> list[Answer]:
         from flockenv.play.fields import measures_of
@@ -258,10 +296,18 @@ class Session:
         timing = {"step": 1e3 * self._step_time.value, "encode": 1e3 * self._encode_time.value}
         return [{"type": "measures", "time": room.lanes[0].time, "lanes": lanes, "timing": timing}]
 
-    def _costs(self, message: m.Costs) -> list[Answer]:
-        from flockenv.play.fields import costs_of
+    def _costs(self, message: m.Costs) -> Rest:
+        from flockenv.play.fields import costs_of, prepare_costs
 
-        return [{"type": "costs", **_data(costs_of(self._there().lanes[0]))}]
+        prepare_costs(self._there().lanes[0])
+        return lambda: [{"type": "costs", **_data(costs_of(self._there().lanes[0]))}]
+
+    def _additions(self, message: m.Additions) -> Rest:
+        record = self._there().lanes[0].record
+        if not isinstance(record, Scene):
+            raise ValueError("additions: only of scenes; the effects of a task are its own")
+        answer = {"type": "additions", "additions": additions_of(record)}
+        return lambda: [answer]
 
     def pictures(self) -> Mapping[str, bytes]:
         """Return the pictures of the gallery by the names of their addresses."""
@@ -286,7 +332,7 @@ class Session:
         room = self._there()
         record = room.lanes[0].record
         text = dump_scene(record, brief=True) if isinstance(record, Scene) else dump(record, brief=True)
-        outside = sum(not _is_in_record(made.edit) for made in room.made)
+        outside = sum(made.edit.kind not in OF_RECORD for made in room.made)
         notes = []
         if outside:
             notes.append(f"{outside} changes of this run, such as moved agents, are not in the YAML; a link has them.")
@@ -384,7 +430,3 @@ def _action(task: Task) -> dict[str, Any]:
     """Return in which axes the numbers of an action are, and how many there are."""
     slots = task.action_layout.slots
     return {"frame": "heading" if "heading" in slots[0].meaning else "world", "size": task.action_layout.size}
-
-
-def _is_in_record(edit: Edit) -> bool:
-    return edit.kind in ("set", "add", "remove", "add_obstacle", "move_obstacle", "remove_obstacle")

@@ -18,7 +18,7 @@ from flockenv.play.task_lane import TaskLane
 from flockenv.scene import Scene
 from flockenv.studies.arbitration_trace import Grants
 
-__all__ = ["AHEAD", "look", "neighbours_in"]
+__all__ = ["AHEAD", "look", "neighbours_in", "prepare_look"]
 
 AHEAD = 2.0
 """Time of a predicted path, s."""
@@ -35,7 +35,7 @@ def look(lane: Lane, agent: int) -> dict[str, Any]:
     sight, radius and fov; observation: slots with name, unit, meaning, low, value; reward: terms so far; path: points
     of the next AHEAD seconds without further edits. Raises ValueError if there is no such living agent.
 
-    Its first call for a scene compiles kernels, which may take some seconds.
+    Its first call for a scene compiles kernels, which may take some seconds, unless `prepare_look` has done it.
     """
     scene, state = _scene_of(lane), _state_of(lane)
     if not 0 <= agent < scene.agents or not state.alive[0, agent]:
@@ -56,6 +56,23 @@ def look(lane: Lane, agent: int) -> dict[str, Any]:
     }  # fmt: skip
     found: dict[str, Any] = _json(about)
     return found
+
+
+def prepare_look(lane: Lane) -> None:
+    """Compile what `look` needs, in any thread: forces by effect and by behaviour."""
+    _prepare(_scene_of(lane))
+
+
+@functools.lru_cache(maxsize=8)
+def _prepare(scene: Scene) -> None:
+    """Compute the forces of a scene once, at its start: they have one kernel, and those of each `Steer` another."""
+    with collected_warnings():
+        state = scene.start(0)
+    scene.acceleration(state)
+    for single in _alone(scene):
+        single.acceleration(state)
+    if (grants := _grants(scene)) is not None:
+        grants.at(state)
 
 
 def _scene_of(lane: Lane) -> Scene:

@@ -202,13 +202,32 @@ class TaskLane:
 
     # --- edits ------------------------------------------------------------------------------------------------------
 
+    def compile(self) -> None:
+        """Compile what decisions need, in any thread, before the first one; the state stays as it is."""
+        with suppress(FloatingPointError):
+            first_step(self.record)
+        for name in dict.fromkeys(self.players):
+            self._warm_up(name)
+
     def prepare(self, edit: Edit) -> None:
-        """Compile what an edit of the task needs, so that `apply` is fast; in any thread."""
+        """Compile what an edit of the task or of its players needs, so that `apply` is fast; in any thread."""
         if isinstance(edit, Set):
             with collected_warnings():
                 task = with_value(self.record, edit.path, edit.value)
             with suppress(FloatingPointError):
                 first_step(task)
+        elif isinstance(edit, Player):
+            self._warm_up(edit.player)
+
+    def _warm_up(self, name: str) -> None:
+        """Let a player that ships decide once, which compiles its laws."""
+        if known_name(name) is not None:
+            with collected_warnings():
+                player = self.files.load(name, self.record, self.seed)
+            if hasattr(player, "watch"):
+                player.watch(self.world)
+            count = self.record.learners
+            player.predict(self.observation, None, np.ones(count, np.bool_), deterministic=True)
 
     def would_restart(self, path: str, value: object) -> bool | None:
         """Return True if another value at a path begins the episode again; None if the value is not possible."""

@@ -17,7 +17,7 @@ from flockenv.scene import Scene
 from flockenv.scene.stability import Suggestion, suggest_dt
 from flockenv.studies.arbitration_trace import Grants
 
-__all__ = ["Cost", "Explanation", "Row", "explain"]
+__all__ = ["Cost", "Explanation", "Row", "explain", "variants_of"]
 
 ROUNDS = 15
 INSTANTS, BETWEEN = 20, 10  # at which shares are measured, and the steps between two of them
@@ -126,9 +126,8 @@ def explain(
     """
     state = scene.start(0) if state is None else state
     effects = scene.effects
-    variants = [effects, *(effects[:k] + effects[k + 1 :] for k in range(len(effects))), ()]
     timers = []
-    for done, kept in enumerate(variants):
+    for done, kept in enumerate(variants_of(scene)):
         progress(done)
         timers.append(_Timer(scene.with_effects(*kept), state))
     times = np.array([[timer.measure() for timer in timers] for _ in range(ROUNDS)])  # (rounds, variants) us
@@ -140,6 +139,12 @@ def explain(
         scene, rows, float(np.median(full)), float(np.median(bare)), shared, _work_per_step(scene, state),
         _not_computed(scene), suggest_dt(scene), _shares(scene, state),
     )  # fmt: skip
+
+
+def variants_of(scene: Scene) -> list[tuple[Effect, ...]]:
+    """Return the lists of effects that are timed: all, all but one, for each of them, and none."""
+    effects = scene.effects
+    return [effects, *(effects[:k] + effects[k + 1 :] for k in range(len(effects))), ()]
 
 
 class _Timer:

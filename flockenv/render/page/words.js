@@ -10,7 +10,7 @@ function showRules(room) {
   const lead = element("p", "Drag a blue value sideways, or click it to type.", "lead"), part = each => each.path.split("[")[0];
   const lines = (...parts) => parts.flatMap(name => room.sentences.filter(each => part(each) === name)).map(sentenceLine);
   box.replaceChildren(
-    lead, ...lines("groups", "effects", "obstacles", "population"), ...(room.additions.length ? [adder(room.additions)] : []),
+    lead, ...lines("groups", "effects", "obstacles", "population"), adder(),
     heading("Space, time and method"), ...lines("space", "", "integrator", "constraints"),
   );
 }
@@ -34,19 +34,25 @@ function controlOfPart(part) {
   return { path: part.path, title: step.replace(/_/g, " "), unit: part.unit, description: "", kind: isNumeric ? "number" : typeof value === "boolean" ? "switch" : "text", low: null, high: null, choices: [], value, restarts: null };
 }
 
-function adder(additions) {
+/* The button that shows which effects this world, as it is now, can have besides its own. */
+function adder() {
   const box = element("div"), button = element("button", "+ add a rule", "add"), list = element("div", undefined, "choices");
   list.hidden = true;
   button.setAttribute("aria-expanded", "false");
-  button.onclick = () => { list.hidden = !list.hidden; button.setAttribute("aria-expanded", !list.hidden); };
-  list.append(...additions.map(each => {
-    const choice = element("button", each.title);
-    choice.append(element("small", each.description || ""));
-    choice.onclick = () => live.edit({ kind: "add", path: each.path, value: each.value });
-    return choice;
-  }));
+  button.onclick = () => {
+    list.hidden = !list.hidden; button.setAttribute("aria-expanded", !list.hidden);
+    if (!list.hidden) { list.replaceChildren(element("p", "Looking …", "empty")); live.ask({ type: "additions" }); }
+  };
+  live.listeners.additions = [message => list.replaceChildren(...message.additions.map(choiceOf))];
   box.append(button, list);
   return box;
+}
+
+function choiceOf(addition) {
+  const choice = element("button", addition.title);
+  choice.append(element("small", addition.description));
+  choice.onclick = () => live.edit({ kind: "add", path: addition.path, value: addition.value });
+  return choice;
 }
 
 /* The tab "Values": every value of the record, by the part that it belongs to. */
