@@ -164,7 +164,9 @@ def test_the_gallery_has_all_scenes_and_tasks() -> None:
     assert listed.keys() == {*configs, *TASKS}
     for name, text in configs.items():
         assert text_of(name) == text, "python -m flockenv.play.gallery boids"
-        assert len(listed[name].description) > 20 and "flockenv r" not in listed[name].description
+        about = listed[name].description
+        assert len(about) > 20 and about.endswith(".") and about[0].isupper()
+        assert "flockenv " not in about and "yaml-language" not in about
     assert isinstance(read_entry("boids"), Scene) and read_entry("pursuit") == TASKS["pursuit"]()
     for name in ("boid", "../scene", "/etc/passwd", ""):
         with pytest.raises(ValueError, match="unknown"):

@@ -9,8 +9,10 @@ from pathlib import Path
 import pytest
 from pydantic import Field
 
+from flockenv.core.errors import key_path, parse_key_path
 from flockenv.physics.effects import EFFECTS, Effect
-from flockenv.play.controls import controls_of, facts_of, with_restarts
+from flockenv.play.controls import controls_of, facts_of, titles_of, with_restarts
+from flockenv.play.gallery import entries, read_entry
 from flockenv.play.record_paths import value_at, with_value
 from flockenv.play.scene_lane import SceneLane
 from flockenv.play.sentences import read_words, scene_of, sentences_of, words_of
@@ -143,6 +145,57 @@ def test_controls_cover_a_scene_and_can_be_set() -> None:
             assert control.low is not None and control.high is not None and control.low < control.high
             assert control.low <= control.value <= control.high
             with_value(scene, control.path, control.value)
+
+
+PURE = set(
+    "aim anisotropy apart appetite arrival_reward attraction axis calm capacity capture_reward caught_cost cells "
+    "collision_cost content coulomb counts death_cost direction error escape factor fear friction goal_reward haste "
+    "heading hungry inertia jitter lasting level lost_cost meal need opacity opening out_reward poisson price ratio "
+    "ready rest restitution school share spread start start_hunger stretch success_reward touch_cost weight "
+    "winding".split()
+)
+"""Fields whose values are ratios, factors, directions, counts, amounts between 0 and 1, or rewards for an event."""
+
+VARYING = {("appearance", "over"), ("vortex", "strength"), ("vortex", "maximum"), ("source", "strength"),
+           ("source", "maximum"), ("sink", "strength"), ("sink", "maximum"), ("avoid_obstacles", "strength"),
+           ("wander", "strength"), ("forage", "strength")}  # fmt: skip
+"""Fields whose unit depends on another field, and slopes."""
+
+SMALL_WORDS = set("a an the of to from by in on at with within for and or as is are per between into".split())
+
+
+@pytest.mark.parametrize("name", [entry.name for entry in entries()])
+def test_every_value_has_a_noun_as_title_a_description_and_a_unit(name: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        record = read_entry(name)
+    titles = titles_of(record)
+    for title in titles.values():
+        assert title and title.split()[-1].lower() not in SMALL_WORDS, title
+    for control in controls_of(record):
+        *above, field = parse_key_path(control.path)
+        field, above = (field, above) if isinstance(field, str) else (above[-1], above[:-1])
+        owner = key_path(tuple(above))
+        assert owner in titles, control.path
+        assert control.title and control.title.split()[-1].lower() not in SMALL_WORDS, control.path
+        assert control.description not in ("", control.title), control.path
+        if control.kind == "number" and not control.unit and field not in PURE:
+            kind = getattr(value_at(record, owner), "kind", owner.split(".")[-1]) if owner else ""
+            assert (kind, field) in VARYING, (control.path, control.description)
+
+
+def test_titles_name_the_parts_of_a_world() -> None:
+    titles = titles_of(scene_from(ROOT / "configs" / "scenes" / "fish.yaml"))
+    assert titles["space"] == "space: box" and titles["groups[0].spawn"] == "group 1, spawn: uniform"
+    assert titles["effects[7].behaviours[0]"] == "effect 8, behaviour 1: contain"
+
+
+def test_a_scene_without_words_of_its_own_is_described_by_its_rules() -> None:
+    from flockenv.play.gallery import _words
+
+    assert _words("groups: [{count: 3, spawn: {low: [0, 0], high: [9, 9]}}]\neffects: [{kind: drag, rate: 2}]\n") == (
+        "3 agents, spawn (placed at random from (0, 0) m to (9, 9) m). Linear drag, rate 2 kg/s."
+    )
 
 
 def test_controls_of_tasks_have_units() -> None:

@@ -21,14 +21,17 @@ from flockenv.core.errors import KeyPath, key_path, parse_key_path
 from flockenv.physics.effects import Effect
 from flockenv.play.lane import Lane
 
-__all__ = ["Control", "Facts", "controls_of", "default_of", "facts_of", "records_in", "with_restarts"]
+__all__ = ["Control", "Facts", "controls_of", "default_of", "facts_of", "records_in", "titles_of", "with_restarts"]
+
+NOUNS = {"by": "quantity", "of": "inner number", "over": "range", "within": "region", "away": "least distance"}
+"""Titles of fields whose names are no nouns."""
 
 MOST_ITEMS = 64
 """Items of a list that have controls."""
 
 FACTOR = r"(?:1|m|s|kg|N|J|Pa|rad|radians|degrees)(?:\^(?:\d+|\(\d+/\d+\)))?"
 UNIT = rf"{FACTOR}(?:(?:/| ){FACTOR})*(?:/\({FACTOR}(?: {FACTOR})*\))?"
-AFTER = r"(?=$|[,;:]| \(| (?:per|as|between|before|from|behind|of|along|off|in|on|at|nearer|beyond|and|that|to)\b)"
+AFTER = r"(?=$|[,;:]| \(| (?:per|as|between|before|from|behind|of|along|off|in|on|at|nearer|beyond|and|that|to|more)\b)"
 """What may follow a unit at the beginning of a description."""
 
 
@@ -69,7 +72,7 @@ def facts_of(model: type[BaseModel], name: str) -> Facts:
     field = model.model_fields[name]
     unit, about = _unit_and_text(" ".join((field.description or "").split()))
     low, high = _bounds(field)
-    title = field.title or name.replace("_", " ")
+    title = field.title or NOUNS.get(name) or name.replace("_", " ")
     above = any(getattr(part, "gt", None) is not None for part in (*field.metadata, *_metadata(field.annotation)))
     return Facts(title, unit, about, low, high, above, _choices(field.annotation))
 
@@ -84,8 +87,10 @@ def default_of(model: type[BaseModel], name: str) -> Any:
 
 def _unit_and_text(text: str) -> tuple[str, str]:
     """Return the unit with which a description begins, perhaps after a symbol, and the rest of it."""
+    if rate := re.match(r"per (s|m)(?: and (s|m))?\b", text):  # the text goes on: "per s away from the goal"
+        return (f"1/({rate[1]} {rate[2]})" if rate[2] else f"1/{rate[1]}"), text
     first = re.match(rf"({UNIT}){AFTER}[,;:]? ?", text)
-    after_symbol = re.match(rf"[A-Za-z]\w{{0,6}}, ({UNIT}){AFTER}[,;:]? ?", text)
+    after_symbol = re.match(rf"[A-Za-z]\w{{0,6}}'?, ({UNIT}){AFTER}[,;:]? ?", text)
     if after_symbol is not None and not text[after_symbol.end() :].startswith("or "):
         first = after_symbol
     elif after_symbol is not None:
@@ -158,12 +163,34 @@ def controls_of(record: BaseModel) -> list[Control]:
     return list(_walk(record, ()))
 
 
-def _walk(record: BaseModel, above: KeyPath) -> Iterator[Control]:
+def titles_of(record: BaseModel) -> dict[str, str]:
+    """Return the title of each record in a scene or task by its path: "effect 3: drag", "group 1, spawn"."""
+    return dict(_titles(record, (), ""))
+
+
+def _titles(record: BaseModel, above: KeyPath, title: str) -> Iterator[tuple[str, str]]:
+    """Yield the path and the title of a record, and of those in it; title: without its kind."""
+    kind = getattr(record, "kind", None) or getattr(record, "role", None)
+    yield key_path(above), f"{title}: {str(kind).replace('_', ' ')}" if kind and title else title or "world"
+    for name in type(record).model_fields:
+        value, noun = getattr(record, name), facts_of(type(record), name).title
+        before = f"{title}, " if title else ""
+        if isinstance(value, BaseModel):
+            yield from _titles(value, (*above, name), before + noun)
+        elif isinstance(value, tuple) and value and isinstance(value[0], BaseModel):
+            for k, item in enumerate(value[:MOST_ITEMS]):
+                yield from _titles(item, (*above, name, k), f"{before}{noun.removesuffix('s')} {k + 1}")
+
+
+def _walk(record: BaseModel, above: KeyPath, unit: str = "") -> Iterator[Control]:
+    """Yield the controls of a record; unit: of its numbers that name none, such as the bounds of a distribution."""
     model = type(record)
     for name, field in model.model_fields.items():
         if name == "kind":
             continue
-        yield from _of_value(getattr(record, name), model, name, field, (*above, name))
+        for control in _of_value(getattr(record, name), model, name, field, (*above, name)):
+            has_none = not control.unit and control.kind in ("number", "integer")
+            yield replace(control, unit=unit) if unit and has_none else control
 
 
 def _of_value(value: Any, model: type[BaseModel], name: str, field: FieldInfo, path: KeyPath) -> Iterator[Control]:
@@ -172,16 +199,17 @@ def _of_value(value: Any, model: type[BaseModel], name: str, field: FieldInfo, p
     if isinstance(value, BaseModel):
         if len(kinds) > 1 and getattr(value, "kind", None) in kinds:
             yield _control(model, name, field, path, value.kind, "variant", tuple(sorted(kinds)))  # type: ignore[attr-defined]
-        yield from _walk(value, path)
+        yield from _walk(value, path, facts_of(model, name).unit)
     elif isinstance(value, tuple) and value and isinstance(value[0], BaseModel):
         for k, item in enumerate(value[:MOST_ITEMS]):
             yield from _walk(item, (*path, k))
     elif isinstance(value, tuple):
         if len(value) <= 3 and all(isinstance(x, (int, float)) for x in value):
             for k, number in enumerate(value):
-                axis = "xyz"[k] if name not in ("speed", "lifetime", "over", "opacity") else ("least", "most")[k % 2]
                 control = _control(model, name, field, (*path, k), number, "number", ())
-                yield replace(control, title=f"{control.title} {axis}", optional=False, default=None)
+                is_range = name in ("speed", "lifetime", "over", "opacity")
+                title = f"{('least', 'greatest')[k % 2]} {control.title}" if is_range else f"{control.title} {'xyz'[k]}"
+                yield replace(control, title=title, optional=False, default=None)
     else:
         kind = _kind_of_value(value, field)
         if kind is not None:
@@ -216,10 +244,16 @@ def _control(
     default = default if isinstance(default, (int, float, str)) else None
     low, high = _slider(facts, value, default) if kind in ("number", "integer") else (None, None)
     optional = type(None) in _members(field.annotation)
+    about = facts.about or (f"kind of {facts.title}" if kind == "variant" else f"{facts.title} of {_owner(model)}")
     return Control(
-        key_path(path), facts.title, facts.unit, facts.about or facts.title, kind, value, optional, low, high,
+        key_path(path), facts.title, facts.unit, about, kind, value, optional, low, high,
         tuple(choices), default,
     )  # fmt: skip
+
+
+def _owner(model: type[BaseModel]) -> str:
+    """Return what a kind of record describes, in a word or two."""
+    return (_kind_of(model) or {"Group": "each agent"}.get(model.__name__) or model.__name__.lower()).replace("_", " ")
 
 
 def _slider(facts: Facts, value: Any, default: Any) -> tuple[float, float]:

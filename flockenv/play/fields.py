@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from flockenv.core.errors import nearest, printable
 from flockenv.play.lane import Drawn, Lane, collected_warnings
 from flockenv.play.scene_lane import SceneLane
-from flockenv.play.sight import prepare_look
 from flockenv.play.task_lane import TaskLane
 from flockenv.studies.cost_breakdown import explain, variants_of
 from flockenv.studies.measures import polarisation
@@ -174,7 +173,6 @@ def prepare_costs(lane: Lane) -> None:
     for scene, state in zip(variants, starts, strict=True):
         with suppress(FloatingPointError):
             scene.step(state)
-    prepare_look(lane)  # shares of behaviours
 
 
 def costs_of(lane: Lane) -> dict[str, Any]:

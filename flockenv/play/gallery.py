@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import io
+import itertools
 import re
 import sys
 from collections.abc import Iterator, Sequence
@@ -30,6 +31,9 @@ SHIPPED = files("flockenv.play").joinpath("shipped")
 
 WIDTH = 420
 """Width of a picture, pixels."""
+
+MOST_SENTENCES = 3
+"""Sentences about a scene whose file says nothing."""
 
 FIRST_NAMES = ("boids", "crowd_room", "fish", "cloth", "galaxy", "vicsek", "fireworks")
 """Scenes that come first, each within its family."""
@@ -89,7 +93,7 @@ def _scene_entry(name: str) -> Entry:
     text = text_of(name)
     kinds = set(re.findall(r"kind: (\w+)|preset: \w*", text)) | ({"driving"} if "preset:" in text else set())
     family = next(family for family, own in FAMILIES.items() if own & kinds or not own)
-    return Entry(name, _title(name), _comment(text), "scene", family, _picture(name))
+    return Entry(name, _title(name), _comment(text) or _words(text), "scene", family, _picture(name))
 
 
 def _task_entry(name: str, task: type[Task]) -> Entry:
@@ -103,14 +107,20 @@ def _title(name: str) -> str:
 
 
 def _comment(text: str) -> str:
-    """Return what a scene's file says about it at its beginning, without commands."""
-    lines = []
-    for line in text.splitlines():
-        if not line.startswith("#"):
-            break
-        if not line.startswith("# yaml-language-server"):
-            lines.append(re.sub(r"\s*flockenv (?:run|render|experiment|explain) .*", "", line.lstrip("#")).strip())
-    return " ".join(line for line in lines if line)
+    """Return the sentences at the beginning of a scene's file, without those about commands; "" without one."""
+    lines = itertools.takewhile(lambda line: line.startswith("#"), text.splitlines())
+    words = [line.lstrip("# ") for line in lines if "yaml-language-server" not in line]
+    whole = " ".join(re.sub(r"(?:^| {2,})(?:flockenv|python) .*", "", line) for line in words).strip()
+    sentences = re.split(r"(?<=[.!?]) +(?=[A-Z])", whole)
+    return " ".join(each for each in sentences if each.endswith((".", "!", "?")) and "flockenv " not in each)
+
+
+def _words(text: str) -> str:
+    """Return what the rules of a scene say, a few sentences."""
+    from flockenv.play.sentences import sentences_of
+
+    said = [each.text for each in sentences_of(load_scene(text)) if each.path.startswith(("groups", "effects"))]
+    return " ".join(said[:MOST_SENTENCES])
 
 
 def _picture(name: str) -> bytes | None:

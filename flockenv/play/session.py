@@ -13,7 +13,7 @@ from typing import Any
 
 from flockenv.play import messages as m
 from flockenv.play.additions import additions_of
-from flockenv.play.controls import controls_of, with_restarts
+from flockenv.play.controls import controls_of, titles_of, with_restarts
 from flockenv.play.description import describe_lane
 from flockenv.play.edits import OF_RECORD, Edit, read_edit
 from flockenv.play.fields import colours_of
@@ -258,6 +258,7 @@ class Session:
             "playing": room.playing, "speed": room.speed, "version": room.version,
             "lanes": [describe_lane(lane, name) for lane, name in zip(room.lanes, self._names(), strict=True)],
             "controls": [_data(control) for control in with_restarts(controls_of(record), first)],
+            "titles": titles_of(record),
             "sentences": [_data(sentence) for sentence in sentences_of(record)] if scene else [],
             "players": list(self._players) if not scene else [], "colours": list(colours_of(first)),
             "about": _about(record), "action": None if scene else _action(record),
@@ -298,8 +299,10 @@ class Session:
 
     def _costs(self, message: m.Costs) -> Rest:
         from flockenv.play.fields import costs_of, prepare_costs
+        from flockenv.play.sight import prepare_look
 
         prepare_costs(self._there().lanes[0])
+        prepare_look(self._there().lanes[0])  # shares of behaviours are measured too
         return lambda: [{"type": "costs", **_data(costs_of(self._there().lanes[0]))}]
 
     def _additions(self, message: m.Additions) -> Rest:
