@@ -42,70 +42,7 @@ def tiny(**changes: Any) -> SceneLane:
     return SceneLane(load_scene(TINY).model_copy(update=changes), 3)
 
 
-def shipped(name: str) -> Scene:
-    return load_scene(TINY if name == "tiny" else ROOT / "configs" / "scenes" / f"{name}.yaml")
-
-
-def slow(*values: Any) -> Any:
-    return pytest.param(*values, marks=pytest.mark.slow)
-
-
 # --- time -------------------------------------------------------------------------------------------------------------
-
-
-def go_back_and_on(room: Room, edits: list[Edit]) -> None:
-    """Play with edits in between, go back 100 ticks and on again, in several ways."""
-    for each in edits:
-        room.step(17)
-        room.edit(each)
-    room.step(130)
-    end, tick = room.digests, room.tick
-    assert tick == 17 * len(edits) + 130
-    room.step(-100)
-    assert room.tick == tick - 100 and room.digests != end
-    room.step(100)
-    assert room.digests == end
-    room.seek(0)
-    room.seek(tick)
-    assert room.digests == end
-    room.restart()
-    lane = room.lanes[0]
-    assert room.tick == 0 and lane.digest == SceneLane(lane.record, lane.seed).digest
-
-
-@pytest.mark.parametrize(
-    ("name", "path", "value"),
-    [
-        ("tiny", "effects[0].rate", 0.4), slow("boids", "effects[1].weight", 1.5),
-        slow("fish", "effects[7].behaviours[2].weight", 3),
-        slow("obstacles_flow", "obstacles[0].radius", 2), slow("billiards", "effects[0].rate", 0.2),
-        slow("vortex", "effects[0].strength", 1), slow("jelly", "effects[1].alpha", 1),
-    ],
-)  # fmt: skip
-def test_a_scene_goes_back_and_on_exactly(name: str, path: str, value: float) -> None:
-    room = Room([SceneLane(shipped(name), 5)])
-    pos = [float(x) for x in np.mean([room.lanes[0].drawn.low, room.lanes[0].drawn.high], axis=0)]
-    go_back_and_on(room, [edit(kind="set", path=path, value=value), edit(kind="move_agent", agent=3, pos=pos)])
-
-
-@pytest.mark.parametrize("name", ["pursuit", slow("obstacles"), slow("flock"), slow("school")])
-def test_a_task_goes_back_and_on_exactly(name: str) -> None:
-    task = TASKS[name]()
-    room = Room([TaskLane(task, "rules", 7), TaskLane(task, "random", 7)])
-    edits = [
-        edit(kind="move_agent", agent=0, pos=[4, 5]), edit(kind="player", player="you", learners=[0], lane=0),
-        edit(kind="input", action=[1, -0.5]), edit(kind="disturb", noise=0.1, delay=2),
-        edit(kind="player", player="rules"),
-    ]  # fmt: skip
-    for each in edits:
-        room.step(4)
-        room.edit(each)
-    room.step(30)
-    end, tick = room.digests, room.tick
-    room.seek(3)
-    assert room.digests != end
-    room.seek(tick)
-    assert room.digests == end and room.tick == tick == 50
 
 
 def test_an_edit_in_the_past_drops_the_later_ones() -> None:
@@ -195,6 +132,18 @@ def test_a_value_acts_in_the_next_step() -> None:
     expected = other.step(lane.state)
     lane.step()
     assert not change.restarts and lane.tick == 6 and lane.digest == expected.digest
+
+
+def test_only_new_code_is_compiled_before_an_edit(monkeypatch: pytest.MonkeyPatch) -> None:
+    lane, started = tiny(), list[Scene]()
+    lane.step()
+    monkeypatch.setattr(Scene, "start", lambda self, seed: started.append(self))
+    monkeypatch.setattr(Scene, "step", lambda self, state: None)
+    lane.prepare(edit(kind="set", path="effects[0].rate", value=4))
+    lane.prepare(edit(kind="move_agent", agent=0, pos=[1, 1]))
+    assert not started
+    lane.prepare(edit(kind="add", path="effects", value={"kind": "separation", "weight": 1, "radius": 2}))
+    assert [len(scene.effects) for scene in started] == [2] and len(lane.record.effects) == 1
 
 
 @pytest.mark.parametrize(

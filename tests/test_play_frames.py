@@ -151,10 +151,12 @@ def test_neighbours_are_those_in_sight() -> None:
 def test_what_a_learner_observes_has_names_and_units() -> None:
     lane = TaskLane(TASKS["pursuit"](), "rules", 2)
     lane.step(4)
+    before = lane.actions[0].tolist()
     found = look(lane, 0)
     slots = {slot["name"]: slot for slot in found["observation"]}
     assert slots["velocity"]["unit"] == "m/s" and slots["velocity"]["value"] == pytest.approx(found["vel"], abs=1e-5)
     assert sum(term["total"] for term in found["reward"]) == pytest.approx(lane.returns)
+    assert found["action"] == lane.actions[0].tolist() == pytest.approx(before)
     assert found["player"] == "rules" and [force["kind"] for force in found["forces"]] == ["drive", "total"]
 
 

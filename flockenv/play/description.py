@@ -31,7 +31,7 @@ def describe_lane(lane: Lane, name: str) -> dict[str, Any]:
     scene: Scene = lane.record.scene if isinstance(lane, TaskLane) else lane.record
     fixed = {
         "periodic": shot.periodic, "roles": _runs(shot.roles), "dimension": shot.dimension,
-        "radius": _runs(round_digits(float(r), 6) for r in shot.radius), "bonds": shot.bonds.ravel().tolist(),
+        "radius": _number_runs(shot.radius), "bonds": shot.bonds.ravel().tolist(),
         "faces": faces_of(scene).ravel().tolist(), "looks": [look_data(look) for look in shot.looks],
         "look": _runs(np.asarray(shot.look).tolist()) if shot.looks else None, "has_returns": lane.returns is not None,
     }  # fmt: skip
@@ -51,6 +51,13 @@ def _up(scene: Scene) -> list[float] | None:
 def _runs(values: Iterable[Any]) -> list[list[Any]]:
     """Return a list as [value, count] pairs, one per run of equal values."""
     return [[value, len(list(run))] for value, run in itertools.groupby(values)]
+
+
+def _number_runs(values: NDArray[Any]) -> list[list[Any]]:
+    """Return numbers as [value, count] pairs, rounded to six digits."""
+    first = np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1]]))
+    counts = np.diff([*first, len(values)])
+    return [[round_digits(float(values[k]), 6), int(count)] for k, count in zip(first, counts, strict=True)]
 
 
 def faces_of(scene: Scene) -> NDArray[np.int32]:

@@ -23,6 +23,7 @@ from flockenv.envs.disturbance import Disturbance
 from flockenv.play.edits import MOST_LANES, read_edit
 from flockenv.play.history import Made
 from flockenv.play.lane import Lane, collected_warnings
+from flockenv.play.messages import LARGEST_TEXT
 from flockenv.play.room import Room
 from flockenv.play.scene_lane import SceneLane
 from flockenv.play.task_lane import NO_FILES, PlayerFiles, TaskLane
@@ -32,8 +33,8 @@ from flockenv.tasks import TASKS
 
 __all__ = ["LONGEST", "MOST_TICKS", "Link", "read_link", "write_link"]
 
-LONGEST = 200_000
-"""Most characters of a link."""
+LONGEST = LARGEST_TEXT
+"""Most characters of a link: those that a page can send."""
 
 MOST_BYTES = 2_000_000
 """Most bytes of its JSON."""

@@ -16,9 +16,9 @@ from flockenv.play.edits import MOST_LANES
 from flockenv.play.frames import Want
 
 __all__ = [
-    "LARGEST", "MESSAGES", "VERSION", "Additions", "Costs", "EditMessage", "Frame", "Gallery", "Hello", "Lanes",
-    "LinkMessage", "Load", "LookMessage", "Measures", "Message", "Open", "Play", "RecordMessage", "Save", "Seed",
-    "Seek", "Share", "Speed", "Step", "Variant", "read_message",
+    "LARGEST", "LARGEST_TEXT", "MESSAGES", "VERSION", "Additions", "Costs", "EditMessage", "Frame", "Gallery", "Hello",
+    "Lanes", "LinkMessage", "Load", "LookMessage", "Measures", "Message", "Open", "Play", "RecordMessage", "Save",
+    "Seed", "Seek", "Share", "Speed", "Step", "Variant", "read_message",
 ]  # fmt: skip
 
 VERSION = 1
@@ -28,6 +28,8 @@ LARGEST = 65536
 """Most bytes of a message of a page."""
 
 LARGEST_TEXT = 60_000
+"""Most characters of a scene or a link in a message."""
+
 DEEPEST = 24
 """Most levels of lists and objects in a message."""
 

@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 from flockenv.model.state import State
 from flockenv.scene import Scene
 
-__all__ = ["adapted", "begins_otherwise", "rows_after"]
+__all__ = ["adapted", "begins_otherwise", "have_same_code", "rows_after"]
+
+
+def have_same_code(old: Scene, new: Scene) -> bool:
+    """Return True if steps of both run the same compiled code, as they do if only numbers differ."""
+    members, others = ((*scene.constraints, *scene.population) for scene in (old, new))
+    alike = [type(each) for each in members] == [type(each) for each in others]
+    return alike and bool(old.obstacles) == bool(new.obstacles) and old.stepper.move is new.stepper.move
 
 
 def begins_otherwise(old: Scene, new: Scene, seed: int) -> bool:

@@ -31,7 +31,7 @@ from flockenv.play.edits import (
 )
 from flockenv.play.lane import Change, Drawn, Scenery, circles_of, collected_warnings
 from flockenv.play.record_paths import value_at, with_item, with_value, without_item
-from flockenv.play.scene_changes import adapted, begins_otherwise, rows_after
+from flockenv.play.scene_changes import adapted, begins_otherwise, have_same_code, rows_after
 from flockenv.scene import Scene
 from flockenv.scene.presets import expand_presets
 from flockenv.steering.vectorize import rows
@@ -181,6 +181,8 @@ class SceneLane:
         """
         if isinstance(edit, (Set, Add, Remove, AddObstacle, MoveObstacle, RemoveObstacle)):
             new = self._changed(edit)[0]
+            if have_same_code(self.record, new):
+                return
             with collected_warnings():
                 state = new.start(self.seed)
             with suppress(FloatingPointError):

@@ -36,7 +36,6 @@ LONGEST_HEAD = 110
 """Characters of a clause with a colon in it; a longer one ends there."""
 
 FORMULA = re.compile(r", of magnitude W|[:,;] (?:S is|[A-Za-z]\w*'?(?:\^\d)? = |m dv = |dH/dt)")
-PIECES = re.compile(r"\{(\w+)\}|\[|\]")
 NUMBER = re.compile(r"-?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?")
 WORD = re.compile(r"[A-Za-z_#][\w.#/-]*")
 

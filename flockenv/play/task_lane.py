@@ -78,7 +78,8 @@ class TaskKeyframe:
     arrays: Mapping[str, NDArray[Any]]
     states: Mapping[str, Any]
     players: tuple[str, ...]
-    action: NDArray[np.float32]
+    action: NDArray[np.float32]  # of a person
+    actions: NDArray[np.float32]  # of the last decision
     disturbance: Disturbance
     stopped: str
 
@@ -374,8 +375,8 @@ class TaskLane:
         """Return the exact state."""
         arrays = {name: array.copy() for name, array in self.world.arrays().items()}
         return TaskKeyframe(
-            self.record, self.tick, arrays, copy.deepcopy(self.states), self.players, self._action, self.disturbance,
-            self.stopped,
+            self.record, self.tick, arrays, copy.deepcopy(self.states), self.players, self._action, self.actions,
+            self.disturbance, self.stopped,
         )  # fmt: skip
 
     def restore(self, keyframe: TaskKeyframe) -> None:
@@ -387,7 +388,8 @@ class TaskLane:
             self._load(keyframe.players, keyframe.record)
         self.record, self.disturbance, self.players = keyframe.record, keyframe.disturbance, keyframe.players
         self.world.restore(keyframe.arrays)
-        self.states, self._action = copy.deepcopy(dict(keyframe.states)), keyframe.action
+        self.states = copy.deepcopy(dict(keyframe.states))
+        self._action, self.actions = keyframe.action, keyframe.actions
         self.tick, self.stopped = keyframe.tick, keyframe.stopped
         self._observe()
 
