@@ -199,6 +199,7 @@ def test_a_world_is_compiled_beside_its_frames(
         ask(page, HELLO, "room")
         page.send(json.dumps({"type": "play", "on": True}))
         assert ask(page, {"type": "frame"}, "notice")["busy"] is True
+        page.send(json.dumps({"type": "step", "n": 1}))  # it waits too
         assert isinstance(ask(page, {"type": "frame"}), bytes) and not steps
         compiled.set()
         wait_for(lambda: len(steps) > 0)

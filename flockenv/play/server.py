@@ -209,7 +209,8 @@ class PlayServer:
         """Read the messages of a page; answer all but the long ones."""
         async for text in visit.connection:
             message = visit.read(text)
-            if self.session.is_long(message):
+            steps = isinstance(message, (m.Step, m.Seek)) and not self.session.is_compiled
+            if steps or self.session.is_long(message):
                 await visit.put(message)
                 continue
             if not isinstance(message, m.Frame):

@@ -156,8 +156,9 @@ class Session:
         return list(answers)
 
     def _ready(self, room: Room, name: str, playing: bool = True, answers: Sequence[Answer] = ()) -> Rest:
-        """Compile what a new room needs, and return what opens it."""
+        """Compile what a new room needs, try which values begin it again, and return what opens it."""
         room.compile()
+        with_restarts(controls_of(room.lanes[0].record), room.lanes[0])  # so that `describe` takes no time
 
         def opens() -> list[Answer]:
             self._compiled = room
