@@ -23,6 +23,7 @@ from flockenv.physics.integrators import INTEGRATORS, RK4
 from flockenv.scene import Group, Scene
 from flockenv.scene.presets import preset
 from flockenv.scene.yaml_io import MAX_BYTES, ConfigError, dump, dump_scene, load, load_scene, schema
+from flockenv.tasks import TASKS, Task
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENES = sorted(p for p in (ROOT / "configs" / "scenes").glob("*.yaml"))
@@ -167,6 +168,13 @@ def test_brief_scene_omits_defaults_and_survives_a_round_trip(path: Path) -> Non
         assert load_scene(text) == scene
     assert len(text) < len(dump_scene(scene))
     assert "null" not in text
+
+
+@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+def test_brief_task_survives_a_round_trip(task: type[Task]) -> None:
+    """Also where a default depends on another value, such as the number of learners on that of agents."""
+    for record in (task(), task(control_dt=0.2), task(**dict.fromkeys(task.counts[:1], 3))):
+        assert load(dump(record, brief=True) + "\n", task) == record
 
 
 def test_complete_presets_are_written_by_name() -> None:

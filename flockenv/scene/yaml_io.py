@@ -132,7 +132,8 @@ def dump(
 def _drop_defaults(value: Any) -> Any:
     """Return a record's kind and the fields that differ from their defaults, also in the records within it."""
     if isinstance(value, BaseModel):
-        defaults = {name: f.get_default(call_default_factory=True) for name, f in type(value).model_fields.items()}
+        fields, given = type(value).model_fields, dict(value)  # a default may depend on other values
+        defaults = {name: f.get_default(call_default_factory=True, validated_data=given) for name, f in fields.items()}
         values = {name: getattr(value, name) for name in defaults}
         return {name: _drop_defaults(each) for name, each in values.items() if name == "kind" or each != defaults[name]}
     return [_drop_defaults(each) for each in value] if isinstance(value, (list, tuple)) else value
