@@ -38,7 +38,8 @@ class Room:
         self.history = History(self.lanes, budget)
         self.playing, self.speed = False, 1.0
         self.version = 0
-        """Counts changes of records: pages that know another version read titles, controls and sentences anew."""
+        """Counts changes of records, players and obstacles: pages that know another version read the rest anew."""
+        self._known = self._now()
         self._opened = tuple(lane.record for lane in self.lanes)
         self._clock = clock
         self._last_time = clock()
@@ -101,21 +102,23 @@ class Room:
             cost = max((self._clock() - began) / max(steps, 1), 1e-7)
             self._cost = max(cost, 0.7 * self._cost + 0.3 * cost)  # at once if steps take longer, slowly if shorter
             made, self._due = made + steps, self._due - steps
+        self._count_changes()
         return made
 
     def step(self, ticks: int) -> None:
         """Make some ticks at once, or go back some; time stops."""
         self.play(False)
-        if ticks < 0:
-            self.history.go_to(self.tick + ticks)
-            return
         end = self.tick + ticks
+        if ticks < 0:
+            self.history.go_to(end)
         while self.tick < end and not self.ended:
             self.history.advance(end - self.tick)
+        self._count_changes()
 
     def seek(self, tick: int) -> None:
         """Go to a tick between 0 and `last`, exactly."""
         self.history.go_to(tick)
+        self._count_changes()
         self._last_time, self._due = self._clock(), 0.0
 
     # --- changes ----------------------------------------------------------------------------------------------------
@@ -124,6 +127,16 @@ class Room:
         """Compile what steps need, before the first one, in any thread."""
         for lane in self.lanes:
             lane.compile()
+
+    def _now(self) -> tuple[Any, ...]:
+        """Return the records of the lanes and their players."""
+        return tuple((lane.record, getattr(lane, "players", ())) for lane in self.lanes)
+
+    def _count_changes(self) -> None:
+        """Count a version if records or players are others than before: by an edit, or as time went past one."""
+        now = self._now()
+        same = all(a is b and old == new for (a, old), (b, new) in zip(self._known, now, strict=True))
+        self._known, self.version = now, self.version + (not same)
 
     def prepare(self, edit: Edit) -> None:
         """Compile what an edit needs, in a thread beside those that step; raise ValueError as `edit` does."""
@@ -149,7 +162,8 @@ class Room:
             self.restart()
         else:
             self.history.record(edit)
-        self.version += done[0].in_record or restarts
+        self.version += restarts or edit.kind.endswith("obstacle")  # in a task they are no part of its record
+        self._count_changes()
         return Change(restarts, done[0].in_record, notices)
 
     def restart(self) -> None:
