@@ -5,21 +5,24 @@ It needs Chromium and playwright: `apt-get install chromium` and `pip install 'f
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
 pytest.importorskip("websockets", reason="needs the extra `play`: pip install 'flockenv[play]'")
+from flockenv.envs.world import World
+from flockenv.model.state import digest_arrays
 from flockenv.play.room import Room
 from flockenv.play.session import Session
+from flockenv.players import load_player
 from flockenv.render import Group, Panel, write_replay
-from flockenv.scene.yaml_io import load_scene
+from flockenv.scene.yaml_io import load, load_scene
+from flockenv.studies.trajectory import record
 from flockenv.tasks import TASKS
-from tests.playground import PATIENCE, browsing, serving
+from tests.playground import Visit, browsing, serving, wait_for
 from tests.test_render import run
 
 pytestmark = pytest.mark.slow  # starting a browser takes seconds
@@ -33,65 +36,18 @@ def chromium() -> Iterator[Any]:
         yield browser
 
 
-class Visit:
-    """A page in a browser of its own, and what went wrong in it."""
-
-    def __init__(self, chromium: Any, url: str, width: int = 1280) -> None:
-        self.context = chromium.new_context(viewport={"width": width, "height": 800})
-        self.page, self.problems, self.requests = self.context.new_page(), list[str](), list[str]()
-        self.page.set_default_timeout(PATIENCE)
-        self.page.on("pageerror", lambda error: self.problems.append(str(error)))
-        self.page.on("console", lambda line: self.problems.append(line.text) if line.type == "error" else None)
-        self.page.on("request", lambda request: self.requests.append(request.url))
-        self.page.goto(url)
-
-    def value(self, script: str) -> Any:
-        return self.page.evaluate(script)
-
-    def until(self, script: str) -> None:
-        """Wait until an expression is true; the page's policy forbids what playwright waits with."""
-        wait_for(lambda: bool(self.value(f"Boolean({script})")))
-
-    def pixel(self, agent: int, view: int = 0) -> tuple[float, float]:
-        """Return where an agent is in the window, in CSS pixels."""
-        place = f"v = views[{view}], p = placeOf(v.panel.bodies, {agent}), box = v.canvas.getBoundingClientRect()"
-        across = "box.left + v.eye.x(...p) / v.canvas.width * box.width"
-        down = "box.top + v.eye.y(...p) / v.canvas.height * box.height"
-        x, y = self.value(f"(() => {{ const {place}; return [{across}, {down}]; }})()")
-        return x, y
-
-    def drag(self, start: tuple[float, float], by: tuple[float, float]) -> None:
-        mouse = self.page.mouse
-        mouse.move(*start)
-        mouse.down()
-        for k in (1, 2, 3, 4):
-            mouse.move(start[0] + by[0] * k / 4, start[1] + by[1] * k / 4)
-        mouse.up()
-
-    def close(self) -> None:
-        self.context.close()
-
-
 @pytest.fixture
 def visit(chromium: Any) -> Iterator[Callable[..., Visit]]:
     made: list[Visit] = []
 
-    def open_page(url: str, width: int = 1280) -> Visit:
-        made.append(Visit(chromium, url, width))
+    def open_page(url: str, width: int = 1280, **options: Any) -> Visit:
+        made.append(Visit(chromium, url, width, **options))
         return made[-1]
 
     yield open_page
     for each in made:
         each.close()
         assert each.problems == []
-
-
-def wait_for(test: Callable[[], bool]) -> None:
-    """Return when something is true; fail after two minutes."""
-    end = time.monotonic() + PATIENCE / 1000
-    while not test():
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 def room_of(session: Session) -> Room:
@@ -202,6 +158,77 @@ def test_a_person_steers_beside_rules(visit: Callable[..., Visit]) -> None:
         here.until("chosen.look !== null && chosen.look.forces !== undefined")
 
 
+def opened(here: Visit, session: Session) -> Room:
+    """Wait for the open world in a page, and stop time."""
+    room = room_of(session)
+    here.until("live.room !== null && state.group.panels[0].frames.length > 0 && views[0].eye")
+    if room.playing:
+        press_play(here, room, on=False)
+    return room
+
+
+def test_keys_alone_move_an_agent_and_draw_an_obstacle(visit: Callable[..., Visit]) -> None:
+    session = shown_boids()
+    with serving(session) as server:
+        here = visit(server.url)
+        room, keys = opened(here, session), here.page.keyboard
+        keys.press("n")
+        before = room.lanes[0].drawn.pos[:, 0].copy()
+        for key in ("c", "Enter", "ArrowRight", "ArrowRight", "Enter"):
+            keys.press(key)
+        wait_for(lambda: bool(moves_of(room)))
+        wait_for(lambda: room.lanes[0].drawn.pos[0, 0] > before[0] + 1.0)
+        for key in ("o", "Enter", "ArrowDown", "ArrowDown", "Enter", "Escape"):
+            keys.press(key)
+        wait_for(lambda: len(room.lanes[0].record.obstacles) == 1)
+        step_on(here, room, 1)  # the arrows are those of time again
+
+
+def test_two_fingers_zoom_and_leave_the_agents_alone(visit: Callable[..., Visit]) -> None:
+    session = shown_boids()
+    with serving(session) as server:
+        here = visit(server.url, 400, has_touch=True)
+        room = opened(here, session)
+        touch = here.context.new_cdp_session(here.page)
+        x, y = here.pixel(here.value("views[0].panel.bodies.there.indexOf(1)"))
+
+        def send(kind: str, *points: tuple[float, float]) -> None:
+            fingers = [{"x": a, "y": b, "id": k} for k, (a, b) in enumerate(points)]
+            touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": fingers})
+
+        send("touchStart", (x, y))
+        send("touchStart", (x, y), (x + 40, y))
+        send("touchMove", (x - 10, y), (x + 50, y))
+        send("touchMove", (x - 30, y), (x + 70, y))
+        send("touchEnd")
+        here.until("views[0].camera.zoom > 1.5")
+        assert room.made == () and here.value("chosen.agent") is None
+
+
+def test_a_world_waits_for_readers_who_want_less_motion(visit: Callable[..., Visit]) -> None:
+    session = Session()
+    with serving(session) as server:
+        here = visit(server.url, reduced_motion="reduce")
+        here.page.locator(".card[data-name='boids']").click()
+        here.until("live.room !== null && !state.playing")
+        wait_for(lambda: session.room is not None and not session.room.playing)
+
+
+def test_a_recording_is_downloaded_as_a_gif(visit: Callable[..., Visit]) -> None:
+    session = shown_boids()
+    with serving(session) as server:
+        here = visit(server.url)
+        room = opened(here, session)
+        here.page.locator("#save").click()
+        here.page.locator("dialog button", has_text="GIF").click()
+        here.until("live.recording === 'gif'")
+        play_until(here, room, room.tick + 3)
+        with here.page.expect_download() as download:
+            here.page.locator("#save").click()
+        assert download.value.suggested_filename == "boids.gif"
+        assert Path(download.value.path()).read_bytes().startswith(b"GIF89a")
+
+
 def test_only_the_own_server_is_asked(visit: Callable[..., Visit]) -> None:
     session = shown_boids()
     with serving(session) as server:
@@ -221,3 +248,192 @@ def test_a_hostile_title_is_text(visit: Callable[..., Visit]) -> None:
         here.until("live.room !== null")
         assert here.value("document.querySelector('h1').textContent") == name
         assert here.value("document.querySelectorAll('h1 *').length") == 0
+
+
+# --- what a visitor does, in worlds of each kind -------------------------------------------------------------------
+
+
+class Visited(NamedTuple):
+    """A world of the gallery, the value that is changed in it, and the refusal or remark when an obstacle is drawn."""
+
+    name: str
+    path: str
+    obstacle: str = ""
+
+
+IDLE = "no effect of this scene reacts to obstacles"
+SCENES = (
+    Visited("boids", "effects[0].weight", IDLE),
+    Visited("crowd_corridor", "effects[3].strength"),
+    Visited("fireworks", "effects[1].rate", IDLE),
+    Visited("cloth", "effects[2].rate", IDLE),
+    Visited("fish", "effects[4].radius"),
+    Visited("billiards", "constraints[0].restitution"),
+)
+TASK_VISITS = (
+    Visited("pursuit", "evader_speed", "pursuit has no obstacles"),
+    Visited("flock", "sight", "all 6 obstacles are there"),
+    Visited("obstacles", "touch_cost", "all 26 obstacles are there"),
+    Visited("crossing", "goal_radius", "crossing has no obstacles"),
+)
+BACK = 100
+"""Steps that time goes back."""
+
+
+@pytest.mark.parametrize("world", [*SCENES, *TASK_VISITS], ids=lambda world: world.name)
+def test_a_world_keeps_its_bits_through_all_that_a_visitor_does(world: Visited, visit: Callable[..., Visit]) -> None:
+    """Going back and on, a link in another browser and server, and the saved YAML give the same bits as the world."""
+    session, elsewhere = Session(), Session()
+    with serving(session) as server, serving(elsewhere) as second:
+        here = visit(server.url)
+        room = open_from_gallery(here, session, world.name)
+        change_value(here, room, world.path)
+        drag_an_agent(here, room)
+        draw_an_obstacle(here, room, world.obstacle)
+        if world.name in TASKS:
+            switch_players(here, room)
+        play_until(here, room, BACK + 10)
+        tick, digests = room.tick, room.digests
+        go_back_and_on(here, room)
+        assert (room.tick, room.digests) == (tick, digests)
+        here.page.locator("#share").click()
+        here.until("location.hash.startsWith('#w=')")
+        there = visit(second.url + here.value("location.hash"))
+        there.until(f"live.header.tick === {tick}")
+        assert room_of(elsewhere).digests == digests
+        restart_and_run(here, room, world.name)
+
+
+def open_from_gallery(here: Visit, session: Session, name: str) -> Room:
+    """Click a picture of the gallery, and stop time."""
+    here.page.locator(f".card[data-name='{name}']").click()
+    wait_for(lambda: session.name == name)
+    return opened(here, session)
+
+
+def press_play(here: Visit, room: Room, on: bool) -> None:
+    here.until(f"state.playing === {str(not on).lower()}")
+    here.page.locator("#play").click()
+    wait_for(lambda: room.playing == on)
+    here.until("state.playing" if on else f"!state.playing && live.header.tick === {room.tick}")
+
+
+def play_until(here: Visit, room: Room, tick: int) -> None:
+    """Let time pass until a tick; the world stops at it or after it."""
+    press_play(here, room, on=True)
+    wait_for(lambda: room.tick >= tick or room.ended)
+    if not room.ended:
+        press_play(here, room, on=False)
+    assert room.tick >= tick
+
+
+def change_value(here: Visit, room: Room, path: str) -> None:
+    """Drag a value of a sentence, or give one of a task another number under Values."""
+    before = room.lanes[0].record
+    if before.__class__.__name__ == "Scene":
+        value = here.page.locator(f"#rules .value[data-path='{path}']")
+        value.scroll_into_view_if_needed()
+        box = value.bounding_box()
+        here.drag((box["x"] + 5, box["y"] + box["height"] / 2), (40, 0))
+    else:
+        here.page.locator("#tab-values").click()
+        field = here.page.locator(f"#values input[type=number][data-path='{path}']")
+        field.fill(str(0.9 * getattr(before, path)))
+        field.press("Enter")
+    wait_for(lambda: room.lanes[0].record != before)
+    here.page.locator("h1").click()  # the keys belong to the world again
+
+
+def drag_an_agent(here: Visit, room: Room) -> None:
+    """Drag a living agent, and find it where the page says that it was put."""
+    here.until("views[0].panel.bodies && views[0].panel.bodies.there.includes(1)")
+    living = here.value("views[0].panel.bodies.there.indexOf(1)")
+    before = room.lanes[0].drawn.pos.copy()
+    here.drag(here.pixel(living), (36, 24))
+    wait_for(lambda: bool(moves_of(room)))
+    moved: Any = room.lanes[0]
+    space = getattr(moved.record, "scene", moved.record).space
+
+    def is_there() -> bool:
+        edit = moves_of(room)[-1]
+        return bool(np.allclose(moved.drawn.pos[:, edit.agent], space.wrap(edit.pos)))
+
+    wait_for(is_there)
+    assert not np.allclose(moved.drawn.pos, before)
+
+
+def moves_of(room: Room) -> list[Any]:
+    return [made.edit for made in room.made if made.edit.kind == "move_agent"]
+
+
+def draw_an_obstacle(here: Visit, room: Room, words: str) -> None:
+    """Draw a circle with its tool; it is there, or one line says why not."""
+    shown = "document.getElementById('toast').textContent"
+    count = len(getattr(room.lanes[0].record, "obstacles", ()))
+    here.page.keyboard.press("o")
+    box = here.page.locator("canvas.world").bounding_box()
+    here.drag((box["x"] + box["width"] / 2, box["y"] + box["height"] / 4), (26, 0))
+    if words:
+        here.until(f"{shown}.includes('{words}')")
+    if hasattr(room.lanes[0].record, "obstacles"):
+        wait_for(lambda: len(room.lanes[0].record.obstacles) == count + 1)
+    here.page.keyboard.press("v")
+
+
+def switch_players(here: Visit, room: Room) -> None:
+    """Let the policy steer one learner, then a person all; hold a key for a while."""
+    lane: Any = room.lanes[0]
+    here.page.mouse.click(*here.pixel(0))
+    here.page.locator("#agent select[aria-label=player]").select_option("ppo")
+    wait_for(lambda: lane.players[0] == "ppo")
+    play_until(here, room, room.tick + 10)
+    here.page.locator("#tab-rules").click()
+    here.page.locator("#rules select[aria-label=player]").select_option("you")
+    wait_for(lambda: set(lane.players) == {"you"})
+    here.page.locator("h1").click()
+    press_play(here, room, on=True)
+    here.page.keyboard.down("d")
+    wait_for(lambda: float(np.abs(lane.actions).max()) > 0.5)
+    here.page.keyboard.up("d")
+    wait_for(lambda: not lane.actions.any())
+    press_play(here, room, on=False)
+
+
+def go_back_and_on(here: Visit, room: Room) -> None:
+    tick = room.tick
+    for _ in range(BACK):
+        here.page.keyboard.press("ArrowLeft")
+    wait_for(lambda: room.tick == tick - BACK)
+    step_on(here, room, BACK)
+
+
+def restart_and_run(here: Visit, room: Room, name: str, steps: int = 25) -> None:
+    """Begin again, save the record, and run it without the playground: as many steps give the same digest."""
+    if name in TASKS:
+        here.page.locator("#tab-rules").click()
+        here.page.locator("#rules select[aria-label=player]").select_option("rules")
+        here.page.locator("h1").click()
+    here.page.locator("#again").click()
+    wait_for(lambda: room.tick == 0 and not room.made)
+    step_on(here, room, steps)
+    here.page.locator("#save").click()
+    text = here.page.locator("dialog textarea").input_value() + "\n"
+    here.page.keyboard.press("Escape")
+    seed = room.lanes[0].seed
+    if name in TASKS:
+        assert played_by_rules(load(text, TASKS[name]), seed, steps) == room.digests[0]
+    else:
+        assert record(load_scene(text), seed, steps, steps).last.digest == room.digests[0]
+
+
+def played_by_rules(task: Any, seed: int, steps: int) -> str:
+    """Return the digest of a task's world after some decisions of the rules."""
+    world, player = World(task, 1, task.horizon), load_player("rules", task, seed)
+    if hasattr(player, "watch"):
+        player.watch(world)
+    observation, state = world.reset(seed), None
+    for k in range(steps):
+        begins = np.full(task.learners, k == 0)
+        actions, state = player.predict(observation[0], state, begins, deterministic=True)
+        observation = world.step(np.asarray(actions, np.float32)[None]).observation
+    return digest_arrays({name: array for name, array in world.arrays().items() if name != "state.work"})

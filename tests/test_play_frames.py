@@ -105,6 +105,31 @@ def test_density_counts_every_agent_once() -> None:
     assert grid_of(lane, "flow").high > 0
 
 
+def test_a_flow_has_the_direction_of_its_agents() -> None:
+    text = "{space: {kind: torus, size: [12, 12]}, groups: [{count: 60, spawn: {speed: [2, 2], heading: [0, -1]}}], dt: 0.01}"  # noqa: E501
+    room = Room([SceneLane(load_scene(text), 1)])
+    header, (blocks,) = decode_frame(encode_frame(room, Want(field="flow")))
+    ny, nx = header["lanes"][0]["field"]["shape"]
+    along, across = blocks["arrows"].astype(int)
+    assert (ny, nx) == (24, 24) and not along.any() and across.max() == 0 and across.min() == -127
+    whole = -across.sum() / 127 * header["lanes"][0]["field"]["high"] * (12 / 24) ** 2
+    assert whole == pytest.approx(60 * 2, rel=0.05)
+
+
+def test_pressure_is_the_contact_forces_over_the_circumference() -> None:
+    text = """
+        space: {kind: torus, size: [10, 10]}
+        groups: [{count: 3, radius: 0.5, spawn: {low: [0, 0], high: [9, 9]}}]
+        effects: [{kind: contact, stiffness: 100}]
+        dt: 0.001
+    """
+    lane = SceneLane(load_scene(text), 1)
+    assert "pressure" not in colours_of(SceneLane(load_scene(TINY), 1))
+    lane.state.pos[0] = [[0.2, 5.0], [9.4, 5.0], [5.0, 5.0]]  # the first two overlap by 0.2 m across the edge
+    found = colour_of(lane, "pressure")
+    assert found.values == pytest.approx([20 / np.pi, 20 / np.pi, 0.0]) and found.unit == "N/m"
+
+
 def test_measures_of_a_free_fall_keep_the_energy() -> None:
     text = "{groups: [{count: 3, mass: 2, spawn: {low: [0, 0], high: [9, 9]}}], effects: [{kind: tether, centre: [4, 4], stiffness: 3}], integrator: {kind: rk4}, dt: 0.01}"  # noqa: E501
     lane = SceneLane(load_scene(text), 1)

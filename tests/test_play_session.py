@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 import re
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from flockenv.physics.effects import EFFECTS
 from flockenv.play.additions import additions_of
@@ -85,6 +88,54 @@ def test_time_is_stepped_sought_and_recorded() -> None:
     assert len(panel["time"]) == 6 and len(panel["roles"]) == 6
     with pytest.raises(ValueError, match="record: nothing is being recorded"):
         ask(session, type="record", on=False)
+
+
+def test_pages_learn_of_other_agents_also_when_time_goes_past_an_edit() -> None:
+    session, room = opened()
+    ask(session, type="step", n=2)
+    before, agents = session.version, room.lanes[0].record.agents
+    session.edit(edit(kind="move_agent", agent=0, pos=[1.0, 1.0]))
+    assert session.version == before
+    session.edit(edit(kind="add_agents", count=2))
+    added = session.version
+    assert added != before and room.lanes[0].record.agents == agents + 2
+    ask(session, type="step", n=1)
+    assert session.version == added
+    ask(session, type="step", n=-2)
+    gone = session.version
+    assert gone != added and room.lanes[0].record.agents == agents
+    ask(session, type="seek", tick=3)
+    assert session.version != gone and room.lanes[0].record.agents == agents + 2
+
+
+def test_pages_learn_of_other_players() -> None:
+    session = Session()
+    session.open_task(TASKS["pursuit"](), ("rules",))
+    session.pause()
+    before = session.version
+    session.edit(edit(kind="player", player="you"))
+    assert session.version != before and session.describe()["lanes"][0]["players"] == ["you"]
+
+
+def test_a_recording_is_drawn_as_a_gif() -> None:
+    session, _ = opened()
+    ask(session, type="record", on=True)
+    for _ in range(3):
+        ask(session, type="step", n=4)
+        assert session._recording is not None
+        session._recording.take()
+    _, film = session.answer(read_message('{"type": "record", "on": false, "form": "gif"}'))
+    picture = Image.open(io.BytesIO(base64.b64decode(film["data"])))  # type: ignore[index]
+    assert (picture.format, picture.n_frames, picture.width) == ("GIF", 4, 640)  # type: ignore[attr-defined]
+    assert picture.info["duration"] == 40
+
+
+def test_what_a_scene_says_about_itself_is_described() -> None:
+    session = Session()
+    session.answer(read_message('{"type": "open", "what": "boids"}'))
+    assert session.about.startswith("The flock of Reynolds 1987: 300 birds")
+    session.answer(read_message(json.dumps({"type": "load", "yaml": "# Three points.\n" + TINY})))
+    assert session.describe()["about"] == "Three points."
 
 
 def test_a_saved_text_is_the_record_and_tells_what_it_lacks() -> None:

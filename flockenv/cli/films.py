@@ -19,9 +19,6 @@ if TYPE_CHECKING:
 
 __all__ = ["film_episodes", "write_picture"]
 
-MOST_FPS = 50.0
-"""Frames per second of a GIF; viewers play faster ones slowly."""
-
 TRAIL = 25
 """Past positions of each agent that a PNG shows."""
 
@@ -58,6 +55,7 @@ def write_picture(path: Path, panels: Sequence[Panel], title: str, fps: float, s
     import numpy as np
 
     from flockenv.render import Group, write_gif, write_png, write_replay
+    from flockenv.render.gif import MOST_FPS
 
     films = [panel.snapshots for panel in panels]
     if path.suffix.lower() == ".html":
@@ -78,18 +76,10 @@ def _draw_last_frame(snapshots: Sequence[Snapshot], size: int, fps: float) -> An
 
 
 def _draw_frames(films: Sequence[Sequence[Snapshot]], size: int, fps: float) -> Iterator[Any]:
-    """Draw the snapshots of several films side by side; a film that has ended shows its last snapshot."""
-    import numpy as np
+    """Draw the snapshots of several films side by side, and show how far that is."""
+    from flockenv.render.gif import side_by_side
 
-    from flockenv.render import draw
-
-    behind = math.ceil(fps * max((look.trail for film in films for look in film[0].looks), default=0.0))
-    count = max(map(len, films))
-    with progress_bar("drawing", count, "frames") as progress:
-        for k in range(count):
+    with progress_bar("drawing", max(map(len, films)), "frames") as progress:
+        for k, frame in enumerate(side_by_side(films, size, fps)):
+            yield frame
             progress(k)
-            pictures = []
-            for film in films:
-                at = min(k, len(film) - 1)
-                pictures.append(draw(film[at], size=size, trails=film[max(0, at - behind) : at], all_trails=False))
-            yield np.hstack(pictures)

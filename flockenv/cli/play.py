@@ -78,11 +78,13 @@ def _open(session: Session, what: str | None, players: tuple[str, ...], seed: in
         return
     if is_scene_file(what):
         from flockenv.core.yaml_paths import title_of
+        from flockenv.play.gallery import description_of
         from flockenv.scene.yaml_io import load_scene
 
         if players:
             raise ValueError(f"--players: a scene such as {what} has none; tasks have")
-        session.open_scene(load_scene(Path(what)), title_of(what), seed)
+        about = description_of(Path(what).read_text(encoding="utf-8")) if Path(what).is_file() else ""
+        session.open_scene(load_scene(Path(what)), title_of(what), seed, about)
         return
     from flockenv.tasks import TASKS
 

@@ -11,18 +11,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.core.errors import nearest, printable
+from flockenv.geometry.space import Torus
+from flockenv.physics.effects import Contact
 from flockenv.play.lane import Drawn, Lane, collected_warnings
 from flockenv.play.scene_lane import SceneLane
 from flockenv.play.task_lane import TaskLane
+from flockenv.scene import Scene
 from flockenv.studies.cost_breakdown import explain, variants_of
 from flockenv.studies.measures import polarisation
 
 __all__ = [
     "CELLS", "Coloured", "Grid", "colour_of", "colours_of", "costs_of", "grid_of", "measures_of", "prepare_costs",
+    "scene_of",
 ]  # fmt: skip
 
-CELLS = 48
-"""Cells of a grid along the longer side of the world."""
+CELLS = {"density": 48, "flow": 24}
+"""Quantities on a grid, each with the number of cells along the longer side of the world."""
+
+SMOOTH = 0.7
+"""Standard deviation of the average over cells that the flow is, cells."""
 
 Floats = NDArray[np.floating[Any]]
 
@@ -44,6 +51,7 @@ class Grid:
     levels: NDArray[np.uint8]  # (ny, nx) from the lowest row up, 255 for `high`
     high: float
     unit: str
+    arrows: NDArray[np.int8] | None = None  # (2, ny, nx) of a flow: along x and y, 127 for `high`
 
 
 def _speed(lane: Lane, drawn: Drawn) -> Coloured:
@@ -67,6 +75,28 @@ def _alignment(lane: Lane, drawn: Drawn) -> Coloured:
     return Coloured((unit * mean).sum(axis=0) / norm if norm > 0 else length * 0, -1.0, 1.0, "1")
 
 
+def _pressure(lane: Lane, drawn: Drawn) -> Coloured:
+    """Return the elastic contact forces of other bodies on each, added as numbers, over its surface.
+
+    In 2-D, per metre of circumference, it is the pressure of Helbing, Farkas and Vicsek 2000.
+    """
+    from scipy.spatial import cKDTree
+
+    scene = scene_of(lane)
+    living = np.flatnonzero(drawn.alive)
+    pos, radius = np.asarray(drawn.pos[:, living].T, float), np.asarray(scene.body.radius, float)[living]
+    tree = cKDTree(scene.space.wrap(pos), boxsize=scene.space.size if isinstance(scene.space, Torus) else None)
+    first, other = tree.query_pairs(2 * radius.max(initial=0.0), output_type="ndarray").T
+    gap = np.linalg.norm(scene.space.displacement(pos[first], pos[other]), axis=1)
+    stiffness = sum(effect.stiffness for effect in scene.effects if isinstance(effect, Contact))
+    force = stiffness * np.maximum(radius[first] + radius[other] - gap, 0.0)
+    total = sum(np.bincount(each, force, len(living)) for each in (first, other))
+    surface = 2 * np.pi * radius if scene.dimension == 2 else 4 * np.pi * radius**2
+    values = np.zeros(len(drawn.alive))
+    values[living] = total / surface
+    return Coloured(values, 0.0, _largest(values, drawn), "N/m" if scene.dimension == 2 else "N/m^2")
+
+
 def _inner(name: str) -> Callable[[Lane, Drawn], Coloured]:
     def values(lane: Lane, drawn: Drawn) -> Coloured:
         assert isinstance(lane, SceneLane)
@@ -87,6 +117,8 @@ def colours_of(lane: Lane) -> dict[str, Callable[[Lane, Drawn], Coloured]]:
     found: dict[str, Callable[[Lane, Drawn], Coloured]] = {"speed": _speed, "alignment": _alignment}
     if isinstance(lane, SceneLane):
         found |= {"acceleration": _force, **{name: _inner(name) for name in lane.record.parts.inner}}
+        if any(isinstance(effect, Contact) for effect in lane.record.effects) and lane.record.body.radius.all():
+            found["pressure"] = _pressure
     return found
 
 
@@ -100,30 +132,47 @@ def colour_of(lane: Lane, name: str) -> Coloured:
 
 
 def grid_of(lane: Lane, name: str) -> Grid:
-    """Return the density (agents per m^2, seen from above) or the flow (density times mean speed) on a grid.
+    """Return the density (agents per m^2, seen from above) or the flow (density times mean velocity) on a grid.
 
-    Raises ValueError for another name.
+    The flow is averaged over neighbouring cells. Raises ValueError for another name.
     """
-    if name not in ("density", "flow"):
-        raise ValueError(
-            f"field = {printable(name)}: unknown{nearest(name, ('density', 'flow'))}; allowed: density, flow"
-        )
+    if name not in CELLS:
+        raise ValueError(f"field = {printable(name)}: unknown{nearest(name, CELLS) or ';'} allowed: {', '.join(CELLS)}")
     drawn = lane.drawn
     low, high = np.array(drawn.low[:2]), np.array(drawn.high[:2])
-    cell = float((high - low).max()) / CELLS
-    counts = np.maximum(np.rint((high - low) / cell).astype(int), 1)
+    counts = np.maximum(np.rint((high - low) * CELLS[name] / float((high - low).max())).astype(int), 1)
     x, v = drawn.pos[:2, drawn.alive], drawn.vel[:2, drawn.alive]
     place = np.floor((x - low[:, None]) / (high - low)[:, None] * counts[:, None]).astype(int)
     inside = ((place >= 0) & (place < counts[:, None])).all(axis=0)
     index = place[1, inside] * counts[0] + place[0, inside]
-    area, size = float(np.prod((high - low) / counts)), int(np.prod(counts))
-    many = np.bincount(index, minlength=size) / area
-    if name == "flow":
-        along, across = (np.bincount(index, weights=each[inside], minlength=size) / area for each in v)
-        many = np.hypot(along, across)
-    most = max(float(many.max()), 1e-9)
-    levels = np.rint(255 * many / most).astype(np.uint8).reshape(counts[1], counts[0])
-    return Grid(levels, most, "1/m^2" if name == "density" else "1/(m s)")
+
+    def summed(weights: Floats | None = None) -> Floats:
+        found = np.bincount(index, weights, int(np.prod(counts))).reshape(counts[1], counts[0])
+        return np.asarray(found / float(np.prod((high - low) / counts)))
+
+    if name == "density":
+        return Grid(*_levels(summed()), "1/m^2")
+    return _flow(np.stack([summed(each[inside]) for each in v]), scene_of(lane).space.periodic)
+
+
+def _flow(flow: Floats, periodic: bool) -> Grid:
+    """Return a flow, (2, ny, nx) 1/(m s), averaged over neighbouring cells."""
+    from scipy.ndimage import gaussian_filter
+
+    flow = gaussian_filter(flow, (0, SMOOTH, SMOOTH), mode="wrap" if periodic else "constant")
+    levels, high = _levels(np.hypot(*flow))
+    return Grid(levels, high, "1/(m s)", np.rint(127 * flow / high).astype(np.int8))
+
+
+def _levels(values: Floats) -> tuple[NDArray[np.uint8], float]:
+    most = max(float(values.max()), 1e-9)
+    return np.rint(255 * values / most).astype(np.uint8), most
+
+
+def scene_of(lane: Lane) -> Scene:
+    """Return the scene of a lane."""
+    scene: Scene = lane.record.scene if isinstance(lane, TaskLane) else lane.record
+    return scene
 
 
 def measures_of(lane: Lane) -> dict[str, dict[str, Any]]:
@@ -132,8 +181,7 @@ def measures_of(lane: Lane) -> dict[str, dict[str, Any]]:
     Of every world: agents, mean speed, polarisation, kinetic energy, momentum; potential energy of those effects that
     have one; of a task its return and metrics.
     """
-    task = lane.record if isinstance(lane, TaskLane) else None
-    scene = lane.record if task is None else task.scene
+    scene = scene_of(lane)
     state = lane.world.state if isinstance(lane, TaskLane) else lane.state  # type: ignore[attr-defined]
     alive = state.alive[0] & np.isfinite(scene.body.mass)
     mass, vel = np.asarray(scene.body.mass, float)[alive], np.asarray(state.vel[0], float)[alive]

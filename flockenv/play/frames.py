@@ -10,7 +10,8 @@ with spaces; then the blocks of each lane in the order of the header's `blocks`,
 * tilt: i8 (N,), only in 3-D: the angle above the x-y plane, -127 to 127 for -90 to 90 degrees;
 * shade: u8 (N,), the place of the quantity that colours show in its range;
 * identity: u16 (N,), only with births: the number of the agent in this slot, modulo 65536; a new one was just born;
-* field: u8 (ny, nx), a quantity on a grid over [low, high], from the lowest row up, 255 for its maximum.
+* field: u8 (ny, nx), a quantity on a grid over [low, high], from the lowest row up, 255 for its maximum;
+* arrows: i8 (2, ny, nx), of a flow its direction and size on that grid, along x and along y, 127 for the maximum.
 """
 
 from __future__ import annotations
@@ -37,7 +38,15 @@ __all__ = ["MAGIC", "Want", "decode_frame", "encode_frame"]
 MAGIC: Final = 0x0146_4C46
 """The letters FLF and the version of the format, 1."""
 
-_TYPES: Final = {"pos": "<u2", "heading": "u1", "tilt": "i1", "shade": "u1", "identity": "<u2", "field": "u1"}
+_TYPES: Final = {
+    "pos": "<u2",
+    "heading": "u1",
+    "tilt": "i1",
+    "shade": "u1",
+    "identity": "<u2",
+    "field": "u1",
+    "arrows": "i1",
+}
 
 
 class Want(Record):
@@ -95,6 +104,8 @@ def _lane_frame(lane: Lane, want: Want, have: int) -> tuple[dict[str, Any], dict
     if want.field:
         grid = grid_of(lane, want.field)
         arrays["field"] = grid.levels
+        if grid.arrows is not None:
+            arrays["arrows"] = grid.arrows
         about["field"] = {"name": want.field, "unit": grid.unit, "high": grid.high, "shape": grid.levels.shape}
     return about, arrays
 
@@ -121,7 +132,7 @@ def _scenery(lane: Lane, have: int) -> list[Any]:
 
 
 def decode_frame(frame: bytes) -> tuple[Mapping[str, Any], Sequence[Mapping[str, NDArray[Any]]]]:
-    """Return the header and the blocks of each lane by name, flat but for `pos`, (D, N), and `field`, (ny, nx)."""
+    """Return the header and the blocks of each lane by name, with the shapes of this file's docstring."""
     magic, length = np.frombuffer(frame, "<u4", 2)
     if magic != MAGIC:
         raise ValueError("frame: does not begin with its magic number")
@@ -130,8 +141,9 @@ def decode_frame(frame: bytes) -> tuple[Mapping[str, Any], Sequence[Mapping[str,
     for about in head["lanes"]:
         blocks = {}
         for name in about["blocks"]:
-            shape = {"pos": (about["dimension"], about["n"]), "field": about.get("field", {}).get("shape")}.get(name)
-            shape = shape or (about["n"],)
+            grid = about.get("field", {}).get("shape", ())
+            shapes = {"pos": (about["dimension"], about["n"]), "field": grid, "arrows": (2, *grid)}
+            shape = shapes.get(name, (about["n"],))
             kind = np.dtype(_TYPES[name])
             count = int(np.prod(shape))
             blocks[name] = np.frombuffer(frame, kind, count, at).reshape(shape)

@@ -25,7 +25,7 @@ from flockenv.tasks import TASKS, Task
 if TYPE_CHECKING:
     from flockenv.model.snapshot import Snapshot
 
-__all__ = ["Entry", "entries", "read_entry", "text_of"]
+__all__ = ["Entry", "description_of", "entries", "read_entry", "text_of"]
 
 SHIPPED = files("flockenv.play").joinpath("shipped")
 
@@ -46,6 +46,9 @@ FAMILIES = {
 }
 """Families of scenes, each with kinds of which one makes a scene one of that family; the first that fits counts."""
 
+LISTED = ("Flocks", "Tasks", "Crowds", "Solids and cloth", "Particles and fields")
+"""Families in the order in which they are shown."""
+
 
 @dataclass(frozen=True)
 class Entry:
@@ -64,8 +67,8 @@ def entries() -> tuple[Entry, ...]:
     """Return all scenes and tasks that ship, by family."""
     order = [*FIRST_NAMES, *sorted(set(_scene_names()) - set(FIRST_NAMES))]
     scenes = [_scene_entry(name) for name in order if name in _scene_names()]
-    scenes.sort(key=lambda entry: list(FAMILIES).index(entry.family))
-    return (*scenes, *(_task_entry(name, task) for name, task in TASKS.items()))
+    tasks = [_task_entry(name, task) for name, task in TASKS.items()]
+    return tuple(sorted([*scenes, *tasks], key=lambda entry: LISTED.index(entry.family)))
 
 
 def read_entry(name: str) -> Scene | Task:
@@ -93,7 +96,7 @@ def _scene_entry(name: str) -> Entry:
     text = text_of(name)
     kinds = set(re.findall(r"kind: (\w+)|preset: \w*", text)) | ({"driving"} if "preset:" in text else set())
     family = next(family for family, own in FAMILIES.items() if own & kinds or not own)
-    return Entry(name, _title(name), _comment(text) or _words(text), "scene", family, _picture(name))
+    return Entry(name, _title(name), description_of(text), "scene", family, _picture(name))
 
 
 def _task_entry(name: str, task: type[Task]) -> Entry:
@@ -104,6 +107,11 @@ def _task_entry(name: str, task: type[Task]) -> Entry:
 def _title(name: str) -> str:
     title = name.replace("_", " ").capitalize()
     return title.replace("3d", " 3-D").replace("nav", "navigation")
+
+
+def description_of(text: str) -> str:
+    """Return some sentences about a scene: those at the beginning of its file, or else its first rules."""
+    return _comment(text) or _words(text)
 
 
 def _comment(text: str) -> str:

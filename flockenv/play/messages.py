@@ -158,10 +158,11 @@ class Seed(Message):
 
 
 class RecordMessage(Message):
-    """Begin or end the recording of a replay."""
+    """Begin or end a recording; form: what is made of it at its end."""
 
     type: Literal["record"] = "record"
     on: bool
+    form: Literal["replay", "gif"] = "replay"
 
 
 class Gallery(Message):

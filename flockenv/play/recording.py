@@ -1,18 +1,28 @@
-"""Recording of a room as a replay in one file, while it plays."""
+"""Recording of a room while it plays, as a replay in one file or as a GIF."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
+import threading
+from itertools import pairwise
 
 from flockenv.model.snapshot import Snapshot
 from flockenv.play.lane import Lane
 from flockenv.play.room import Room
+from flockenv.render.gif import MOST_FPS, gif_bytes, side_by_side
 from flockenv.render.replay import Group, Panel, replay_page
 
-__all__ = ["FRAMES", "LARGEST", "Recording"]
+__all__ = ["FRAMES", "LARGEST", "PICTURES", "Recording"]
 
 FRAMES = 25.0
 """Frames per second of the world."""
+
+PICTURES = 200
+"""Most frames of a GIF; of a longer recording every second snapshot is drawn, or fewer."""
+
+WIDTH = 640
+"""Width of a GIF, pixels."""
 
 LARGEST = 40_000_000
 """Most numbers of positions in a recording; it ends there."""
@@ -21,11 +31,12 @@ LARGEST = 40_000_000
 class Recording:
     """Snapshots of the lanes of a room, from now on, 25 per second of the world.
 
-    If time goes back, or the agents change, what was recorded before is dropped.
+    If time goes back, or the agents change, what was recorded before is dropped. `take` may run beside `page` and
+    `gif`, which use what has been taken before.
     """
 
     def __init__(self, room: Room, names: list[str]) -> None:
-        self._room, self._names = room, names
+        self._room, self._names, self._lock = room, names, threading.Lock()
         self._begin()
 
     def _begin(self) -> None:
@@ -46,6 +57,10 @@ class Recording:
 
     def take(self) -> None:
         """Take a snapshot of each lane if one is due."""
+        with self._lock:
+            self._take()
+
+    def _take(self) -> None:
         first = self._shots[0]
         time = self._room.lanes[0].time
         if first and (time < first[-1].time - 1e-9 or not _are_alike(first[-1], self._room.lanes[0])):
@@ -63,17 +78,32 @@ class Recording:
             self._returns[k].append(lane.returns or 0.0)
             self._size += shot.pos.size
 
+    def gif(self) -> bytes:
+        """Return the lanes side by side as a GIF, worlds in 3-D from above; ValueError if nothing was recorded."""
+        films = [panel.snapshots for panel in self._panels()]
+        every = math.ceil(max(map(len, films)) / PICTURES)
+        drawn = [film[::every] for film in films]
+        gaps = [after.time - before.time for before, after in pairwise(max(drawn, key=len))]
+        fps = min(len(gaps) / sum(gaps), MOST_FPS) if gaps else FRAMES
+        return gif_bytes(side_by_side(drawn, WIDTH // len(films), fps), fps)
+
     def page(self, title: str) -> str:
         """Return the replay as HTML; ValueError if nothing was recorded."""
-        if not self._shots[0]:
-            raise ValueError("record: nothing was recorded; let time pass first")
-        panels = [
-            Panel(name, shots, returns if lane.returns is not None else None, lane.stopped)
-            for name, shots, returns, lane in zip(
-                self._names, self._shots, self._returns, self._room.lanes, strict=True
-            )
-        ]
-        return replay_page([Group(title, panels)], title).decode()
+        return replay_page([Group(title, self._panels())], title).decode()
+
+    def _panels(self) -> list[Panel]:
+        """Return what was recorded of each lane."""
+        with self._lock:
+            if not self._shots[0]:
+                raise ValueError("record: nothing was recorded; let time pass first")
+            every = zip(self._names, self._shots, self._returns, self._room.lanes, strict=True)
+            return [
+                Panel(
+                    name, [dataclasses.replace(shot, title=name) for shot in shots],
+                    returns if lane.returns is not None else None, lane.stopped,
+                )
+                for name, shots, returns, lane in every
+            ]  # fmt: skip
 
 
 def _are_alike(shot: Snapshot, lane: Lane) -> bool:

@@ -5,6 +5,7 @@ It is used by one thread at a time, but for `prepare` and `compile`, which may r
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -44,7 +45,8 @@ class Session:
     def __init__(self, files: PlayerFiles = NO_FILES) -> None:
         self.files = files
         self.room: Room | None = None
-        self.name = ""
+        self.name, self.about = "", ""
+        """What is open, and some sentences about it."""
         self.opened = 0
         self._compiled: Room | None = None
         self._recording: Recording | None = None
@@ -53,11 +55,12 @@ class Session:
         self._short: dict[type[m.Message], Callable[..., list[Answer]]] = {
             m.Hello: self._hello, m.Play: self._play, m.Speed: self._speed, m.Step: self._step, m.Seek: self._seek,
             m.Frame: self._frame, m.Save: self._save, m.Share: self._share, m.Seed: self._seed,
-            m.RecordMessage: self._record, m.Gallery: self._gallery, m.Measures: self._measures,
+            m.Gallery: self._gallery, m.Measures: self._measures,
         }  # fmt: skip
         self._long: dict[type[m.Message], Callable[..., Rest]] = {
             m.Open: self._open, m.Load: self._load, m.LinkMessage: self._link, m.Lanes: self._lanes,
             m.EditMessage: self._edit, m.LookMessage: self._look, m.Costs: self._costs, m.Additions: self._additions,
+            m.RecordMessage: self._record,
         }  # fmt: skip
 
     # --- what the server does by itself -----------------------------------------------------------------------------
@@ -80,8 +83,8 @@ class Session:
         made = self.room.advance()
         if made:
             self._step_time.add((perf_counter() - began) / made)
-            if self._recording is not None:
-                self._recording.take()
+            if (recording := self._recording) is not None:
+                recording.take()
         if self.room.ended:
             self.room.play(False)
 
@@ -135,73 +138,80 @@ class Session:
 
     # --- opening ----------------------------------------------------------------------------------------------------
 
-    def open_scene(self, scene: Scene, name: str, seed: int = 0) -> None:
-        """Open a scene."""
-        self._set_room(Room((SceneLane(scene, seed),)), name)
+    def open_scene(self, scene: Scene, name: str, seed: int = 0, about: str = "") -> None:
+        """Open a scene; about: some sentences that pages show."""
+        self._set_room(Room((SceneLane(scene, seed),)), name, about)
 
     def open_task(self, task: Task, players: Sequence[str] = ("rules",), seed: int = 0) -> None:
         """Open a task in a world for each player, side by side."""
-        self._set_room(self._room_of(task, players, seed), task.name)
+        self._set_room(self._room_of(task, players, seed), task.name, _about(task))
 
     def _room_of(self, task: Task, players: Sequence[str], seed: int) -> Room:
         return Room(tuple(TaskLane(task, player, seed, files=self.files) for player in players))
 
-    def _set_room(self, room: Room, name: str, playing: bool = True, answers: Sequence[Answer] = ()) -> list[Answer]:
+    def _set_room(
+        self, room: Room, name: str, about: str, playing: bool = True, answers: Sequence[Answer] = ()
+    ) -> list[Answer]:
         """Play another room from now on."""
         record = room.lanes[0].record
         self._players = players_of(record, self.files) if isinstance(record, Task) else ()
-        self.room, self.name, self._recording = room, name, None
+        self.room, self.name, self.about, self._recording = room, name, about, None
         self.opened += 1
         room.play(playing)
         return list(answers)
 
-    def _ready(self, room: Room, name: str, playing: bool = True, answers: Sequence[Answer] = ()) -> Rest:
+    def _ready(self, room: Room, name: str, about: str, playing: bool = True, answers: Sequence[Answer] = ()) -> Rest:
         """Compile what a new room needs, try which values begin it again, and return what opens it."""
         room.compile()
         with_restarts(controls_of(room.lanes[0].record), room.lanes[0])  # so that `describe` takes no time
 
         def opens() -> list[Answer]:
             self._compiled = room
-            return self._set_room(room, name, playing, answers)
+            return self._set_room(room, name, about, playing, answers)
 
         return opens
 
     def _open(self, message: m.Open) -> Rest:
-        from flockenv.play.gallery import read_entry
+        from flockenv.play.gallery import description_of, read_entry, text_of
 
         record = read_entry(message.what)
         if isinstance(record, Task):
-            return self._ready(self._room_of(record, message.players or ("rules",), 0), record.name)
+            room = self._room_of(record, message.players or ("rules",), 0)
+            return self._ready(room, record.name, _about(record))
         if message.players is not None:
             raise ValueError("players: a scene has none")
-        return self._ready(Room((SceneLane(record),)), message.what)
+        return self._ready(Room((SceneLane(record),)), message.what, description_of(text_of(message.what)))
 
     def _load(self, message: m.Load) -> Rest:
+        from flockenv.play.gallery import description_of
         from flockenv.scene.yaml_io import load_scene
 
         scene = load_scene(message.yaml + "\n")  # with a line break it is a text, never the name of a file
         seed = self.room.lanes[0].seed if self.room is not None else 0
-        return self._ready(Room((SceneLane(scene, seed),)), self.name or "scene")
+        return self._ready(Room((SceneLane(scene, seed),)), self.name or "scene", description_of(message.yaml))
 
     def _link(self, message: m.LinkMessage) -> Rest:
         from flockenv.play.link import read_link
 
         linked = read_link(message.text)
-        camera = {"type": "camera", "camera": dict(linked.camera)}
-        return self._ready(linked.room(self.files), linked.title, False, [camera])
+        room, camera = linked.room(self.files), {"type": "camera", "camera": dict(linked.camera)}
+        task = room.lanes[0].record
+        about = _about(task) if isinstance(task, Task) else ""
+        return self._ready(room, linked.title, about, False, [camera])
 
     def _lanes(self, message: m.Lanes) -> Rest:
         first = self._there().lanes[0]
         if isinstance(first, TaskLane):
             if message.players is None:
                 raise ValueError("lanes.players: missing; a task is compared by its players")
-            return self._ready(self._room_of(first.record, message.players, first.seed), first.record.name)
+            room = self._room_of(first.record, message.players, first.seed)
+            return self._ready(room, first.record.name, self.about)
         if message.variants is None:
             raise ValueError("lanes.variants: missing; a scene is compared by methods and time steps")
         scenes = [_variant(first.record, each) for each in message.variants]
         longest = max(scene.dt for scene in scenes)
         lanes = [SceneLane(scene, first.seed, _whole(longest / scene.dt)) for scene in scenes]
-        return self._ready(Room(lanes), self.name)
+        return self._ready(Room(lanes), self.name, self.about)
 
     def _seed(self, message: m.Seed) -> list[Answer]:
         room = self._there()
@@ -262,7 +272,7 @@ class Session:
             "titles": titles_of(record),
             "sentences": [_data(sentence) for sentence in sentences_of(record)] if scene else [],
             "players": list(self._players) if not scene else [], "colours": list(colours_of(first)),
-            "about": _about(record), "action": None if scene else _action(record),
+            "about": self.about, "action": None if scene else _action(record),
             "disturbance": first.disturbance.model_dump() if isinstance(first, TaskLane) else None,
         }  # fmt: skip
 
@@ -347,18 +357,23 @@ class Session:
 
         return [{"type": "link", "text": write_link(self._there(), self.name, message.camera)}]
 
-    def _record(self, message: m.RecordMessage) -> list[Answer]:
+    def _record(self, message: m.RecordMessage) -> Rest:
         if message.on:
-            self._recording = Recording(self._there(), self._names())
-            self._recording.take()
-            return [{"type": "record", "on": True, "seconds": 0.0}]
-        if self._recording is None:
-            raise ValueError("record: nothing is being recorded")
+            return self._begin_recording
         recording, self._recording = self._recording, None
-        return [
-            {"type": "record", "on": False, "seconds": recording.seconds},
-            {"type": "replay", "html": recording.page(self.name or "flockenv")},
-        ]
+        if recording is None:
+            raise ValueError("record: nothing is being recorded")
+        film: dict[str, Any] = {"type": "film", "form": message.form}
+        if message.form == "gif":
+            film["data"] = base64.b64encode(recording.gif()).decode("ascii")
+        else:
+            film["html"] = recording.page(self.name or "flockenv")
+        return lambda: [{"type": "record", "on": False, "seconds": recording.seconds}, film]
+
+    def _begin_recording(self) -> list[Answer]:
+        self._recording = Recording(self._there(), self._names())
+        self._recording.take()
+        return [{"type": "record", "on": True, "seconds": 0.0}]
 
 
 class _Mean:
@@ -423,11 +438,9 @@ def _player_name(lane: TaskLane) -> str:
     return " + ".join(Path(name).stem for name in dict.fromkeys(lane.players))
 
 
-def _about(record: Scene | Task) -> str:
-    """Return the first paragraph about a task; "" for a scene, whose sentences say all."""
-    if isinstance(record, Scene):
-        return ""
-    return " ".join((type(record).__doc__ or "").split("\n\n")[0].split()).replace("`", "")
+def _about(task: Task) -> str:
+    """Return the first paragraph about a task."""
+    return " ".join((type(task).__doc__ or "").split("\n\n")[0].split()).replace("`", "")
 
 
 def _action(task: Task) -> dict[str, Any]:

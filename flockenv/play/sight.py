@@ -12,6 +12,7 @@ from flockenv.behaviours.steer import Steer
 from flockenv.model.state import State
 from flockenv.physics.effects.effect import Effect, Sight
 from flockenv.physics.integrators import ImplicitEuler
+from flockenv.play.fields import scene_of
 from flockenv.play.lane import Lane, collected_warnings
 from flockenv.play.scene_lane import SceneLane
 from flockenv.play.task_lane import TaskLane
@@ -37,7 +38,7 @@ def look(lane: Lane, agent: int) -> dict[str, Any]:
 
     Its first call for a scene compiles kernels, which may take some seconds, unless `prepare_look` has done it.
     """
-    scene, state = _scene_of(lane), _state_of(lane)
+    scene, state = scene_of(lane), _state_of(lane)
     if not 0 <= agent < scene.agents or not state.alive[0, agent]:
         raise ValueError(f"agent = {agent}: there is no such living agent among {scene.agents}")
     path = _path(lane, scene, agent)
@@ -60,7 +61,7 @@ def look(lane: Lane, agent: int) -> dict[str, Any]:
 
 def prepare_look(lane: Lane) -> None:
     """Compile what `look` needs, in any thread: forces by effect and by behaviour."""
-    _prepare(_scene_of(lane))
+    _prepare(scene_of(lane))
 
 
 @functools.lru_cache(maxsize=8)
@@ -73,11 +74,6 @@ def _prepare(scene: Scene) -> None:
         single.acceleration(state)
     if (grants := _grants(scene)) is not None:
         grants.at(state)
-
-
-def _scene_of(lane: Lane) -> Scene:
-    scene: Scene = lane.record.scene if isinstance(lane, TaskLane) else lane.record
-    return scene
 
 
 def _state_of(lane: Lane) -> State:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from io import BytesIO
 from typing import BinaryIO, Final
 
@@ -18,13 +18,16 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from flockenv.core.atomic_files import replace_file
+from flockenv.model.snapshot import Snapshot
+from flockenv.render.picture import draw
 
-__all__ = ["write_gif", "write_png"]
+__all__ = ["gif_bytes", "side_by_side", "write_gif", "write_png"]
 
 Pixels = NDArray[np.uint8]
 
-#: Most frames per second: viewers replace delays shorter than 2/100 s by 10/100 s.
-_MOST_FPS: Final = 50.0
+MOST_FPS: Final = 50.0
+"""Most frames per second: viewers replace delays shorter than 2/100 s by 10/100 s."""
+
 _MOST_SIDE: Final = 65535
 #: Colour index of pixels that are as in the frame before (transparent); colours have the indices below it.
 _UNCHANGED: Final = 255
@@ -39,12 +42,31 @@ def write_gif(path: str | os.PathLike[str], frames: Iterable[Pixels], fps: float
     The file is written completely or not at all, and memory does not grow with the number of frames.
     Raises ValueError or TypeError for an fps out of range, without a frame, or for frames of different shapes.
     """
-    if isinstance(fps, bool) or not isinstance(fps, int | float):
-        raise TypeError(f"fps: must be a number, got {fps!r}")
-    if not (math.isfinite(fps) and 0.0 < fps <= _MOST_FPS):
-        raise ValueError(f"fps: must be above 0 and at most {_MOST_FPS:g} (GIF viewers slow down beyond), got {fps:g}")
+    _check_fps(fps)
     with replace_file(path) as file:
         return _write_frames(file, frames, float(fps))
+
+
+def gif_bytes(frames: Iterable[Pixels], fps: float) -> bytes:
+    """Return the content of the GIF that `write_gif` writes."""
+    _check_fps(fps)
+    buffer = BytesIO()
+    _write_frames(buffer, frames, float(fps))
+    return buffer.getvalue()
+
+
+def side_by_side(films: Sequence[Sequence[Snapshot]], size: int, fps: float) -> Iterator[Pixels]:
+    """Draw the snapshots of several films beside each other; a film that has ended shows its last snapshot.
+
+    size: width of the picture of one film, pixels.
+    """
+    behind = math.ceil(fps * max((look.trail for film in films for look in film[0].looks), default=0.0))
+    for k in range(max(map(len, films))):
+        pictures = []
+        for film in films:
+            at = min(k, len(film) - 1)
+            pictures.append(draw(film[at], size=size, trails=film[max(0, at - behind) : at], all_trails=False))
+        yield np.hstack(pictures)
 
 
 def write_png(path: str | os.PathLike[str], frame: Pixels) -> None:
@@ -71,6 +93,13 @@ def _write_frames(file: BinaryIO, frames: Iterable[Pixels], fps: float) -> int:
         raise ValueError("frames: there must be at least one, got none")
     file.write(b"\x3b")
     return count
+
+
+def _check_fps(fps: object) -> None:
+    if isinstance(fps, bool) or not isinstance(fps, int | float):
+        raise TypeError(f"fps: must be a number, got {fps!r}")
+    if not (math.isfinite(fps) and 0.0 < fps <= MOST_FPS):
+        raise ValueError(f"fps: must be above 0 and at most {MOST_FPS:g} (GIF viewers slow down beyond), got {fps:g}")
 
 
 def _check_frame(frame: object, name: str, like: Image.Image | None = None) -> None:

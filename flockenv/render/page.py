@@ -1,7 +1,8 @@
 """Put the page of worlds together: one self-contained HTML file, of a recorded replay or of the live playground.
 
-Its pieces are in the folder page/ beside this file: page.html, style sheets and scripts. The page loads nothing from
-elsewhere, and its Content-Security-Policy allows only its own script and style, by their SHA-256.
+Its pieces are in the folder page/ beside this file: page.html, style sheets and scripts, each with a comment at its top
+that says what it holds; a tab of the live page has a script of its name. The page loads nothing from elsewhere, and its
+Content-Security-Policy allows only its own script and style, by their SHA-256.
 """
 
 from __future__ import annotations
@@ -27,8 +28,11 @@ _SHARED: Final = ("base", "panels", "lens", "draw", "crowd", "faces", "pointer",
 #: The scripts of a page, in order.
 _SCRIPTS: Final[dict[str, tuple[str, ...]]] = {
     "recorded": (*_SHARED, "recorded"),
-    "live": (*_SHARED, "socket", "overlay", "tools", "values", "words", "agent", "compare", "gallery", "share", "keys"),
-}
+    "live": (
+        *_SHARED, "socket", "overlay", "tools", "steering", "cursor", "controls", "rules", "values", "agent",
+        "measures", "compare", "gallery", "share", "keys", "start",
+    ),
+}  # fmt: skip
 _STYLES: Final[dict[str, tuple[str, ...]]] = {"recorded": ("style",), "live": ("style", "live")}
 #: What a page may load besides its own script and style.
 _SOURCES: Final = {"recorded": "", "live": "; connect-src 'self'; img-src 'self' blob:; media-src blob:"}

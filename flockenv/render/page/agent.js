@@ -1,4 +1,4 @@
-/* The tab "Agent": what one agent does, feels and sees; the tab "Measures"; both ask the server only while they are open. */
+/* The tab "Agent": the forces on one agent, what it observes, and its reward; the server is asked only while it is chosen. */
 
 function choose(lane, agent) {
   chosen.lane = lane; chosen.agent = agent; chosen.look = null;
@@ -76,6 +76,7 @@ function forcesOf(look) {
     const cell = element("td");
     cell.append(name, gauge);
     row.append(cell, element("td", `${number(sizes[n])} N`));
+    row.classList.toggle("idle", sizes[n] < 1e-6 * most);
     return row;
   });
   const table = element("table", undefined, "read");
@@ -91,81 +92,4 @@ function observationOf(look) {
     return many.filter(each => each.length).map((each, n) => [n ? "" : name, each.map(plainNumber).join(", ") + unitOf(slot)]);
   });
   return tableOf("What it observes", rows);
-}
-
-// ---- measures
-
-const curves = new Map();
-
-function takeMeasures(message) {
-  Object.assign(live.timing, message.timing);
-  message.lanes.forEach((values, n) => {
-    for (const [name, value] of Object.entries(values)) {
-      const key = `${n} ${name}`, curve = curves.get(key) || { times: [], values: [] };
-      if (curve.times.length && message.time < curve.times[curve.times.length - 1]) while (curve.times.length && curve.times[curve.times.length - 1] >= message.time) { curve.times.pop(); curve.values.pop(); }
-      if (curve.times[curve.times.length - 1] !== message.time && value.value !== null) { curve.times.push(message.time); curve.values.push(value.value); }
-      if (curve.times.length > 600) { curve.times.shift(); curve.values.shift(); }
-      curves.set(key, curve);
-    }
-  });
-  showMeasures(message);
-}
-
-function showMeasures(message) {
-  const box = $("measures"), names = [...new Set(message.lanes.flatMap(l => Object.keys(l)))];
-  if (box.dataset.names !== names.join()) {
-    box.dataset.names = names.join();
-    box.replaceChildren(...names.map(name => {
-      const first = message.lanes.find(l => l[name])[name], row = element("div", undefined, "measure"), top = element("div", undefined, "top"), value = element("b"), canvas = element("canvas");
-      row.title = first.title || ""; row.dataset.name = name; canvas.height = 36; canvas.width = 320;
-      top.append(element("span", name.replace(/_/g, " ")), value); row.append(top, canvas);
-      return row;
-    }), costBox(), timingBox());
-  }
-  for (const row of box.querySelectorAll(".measure")) {
-    const { name } = row.dataset;
-    row.querySelector("b").textContent = message.lanes.map(l => l[name] && l[name].value !== null ? plainNumber(l[name].value) : "–").join("  |  ") + unitOf(message.lanes[0][name]);
-    drawSparks(row.querySelector("canvas"), message.lanes.map((_, n) => curves.get(`${n} ${name}`)).filter(Boolean));
-  }
-  showTiming();
-}
-
-function plainNumber(x) { return Number.isInteger(x) && Math.abs(x) < 1e6 ? String(x).replace("-", "−") : number(x); }
-
-function unitOf(measure) { return measure && measure.unit && measure.unit !== "1" ? " " + measure.unit : ""; }
-
-/* Curves of one measure, a colour for each world, on shared axes. */
-function drawSparks(canvas, lines) {
-  fit(canvas);
-  const pen = canvas.getContext("2d"), all = lines.flatMap(l => l.values), times = lines.flatMap(l => l.times), w = canvas.width, h = canvas.height, pad = 3;
-  const low = Math.min(...all), high = Math.max(...all), from = Math.min(...times), to = Math.max(...times);
-  pen.clearRect(0, 0, w, h); pen.lineWidth = 1.6; pen.lineJoin = "round";
-  pen.strokeStyle = paint.grid; pen.beginPath(); pen.moveTo(0, h - pad); pen.lineTo(w, h - pad); pen.stroke();
-  lines.forEach((line, n) => {
-    pen.strokeStyle = n ? forceColour(n - 1) : paint.accent; pen.beginPath();
-    line.values.forEach((v, k) => pen.lineTo(pad + (w - 2 * pad) * (line.times[k] - from) / (to - from || 1), h - pad - (h - 2 * pad) * (v - low) / (high - low || 1)));
-    pen.stroke();
-  });
-}
-
-function costBox() {
-  const box = element("div"), button = element("button", "measure what each effect costs"), out = element("div");
-  out.id = "costs";
-  button.onclick = () => { live.ask({ type: "costs" }); out.replaceChildren(element("p", "Measuring; the world waits a moment.", "lead")); };
-  box.append(heading("Time"), button, out);
-  box.style.marginTop = "18px";
-  return box;
-}
-
-function showCosts(message) {
-  const box = $("costs");
-  if (box) box.replaceChildren(plainTable(message.rows.map(row => [row.name.replace(/_/g, " "), `${number(row.cost)} µs/step`])));
-}
-
-function timingBox() { const box = element("div"); box.id = "timing"; return box; }
-
-function showTiming() {
-  const box = $("timing"), t = live.timing;
-  if (!box) return;
-  box.replaceChildren(heading("A picture"), plainTable([["pictures a second", live.rate.shown.toFixed(0)], ["drawing", `${drawn.ms.toFixed(1)} ms`], ["physics", t.step === undefined ? "–" : `${t.step.toFixed(2)} ms/step`], ["encoding", t.encode === undefined ? "–" : `${t.encode.toFixed(2)} ms`], ["answer from the server", t.round === undefined ? "–" : `${t.round.toFixed(1)} ms`]]));
 }

@@ -25,9 +25,10 @@ function clamp(value, low, high) { return Math.min(high, Math.max(low, value)); 
 
 function channels(colour) { return [0, 1, 2].map(n => parseInt(colour.slice(1 + 2 * n, 3 + 2 * n), 16)); }
 
+/* A colour between two, as #rrggbb. */
 function mix(over, under, share) {
   const a = channels(over), b = channels(under);
-  return "rgb(" + a.map((c, n) => Math.round(share * c + (1 - share) * b[n])).join() + ")";
+  return "#" + a.map((c, n) => Math.round(share * c + (1 - share) * b[n]).toString(16).padStart(2, "0")).join("");
 }
 
 /* A number with about four digits, a proper minus, and no exponent where none is needed. */

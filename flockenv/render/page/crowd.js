@@ -91,7 +91,7 @@ function blit(words, w, h, stamp, x, y, colour, opacity) {
   }
 }
 
-function word(colour) { const [r, g, b] = colour[0] === "#" ? channels(colour) : colour.match(/\d+/g).map(Number); return (b << 16) | (g << 8) | r; }
+function word(colour) { const [r, g, b] = channels(colour); return (b << 16) | (g << 8) | r; }
 
 /* How the agents of each look, and those without one, are stamped: form, size as a function of shade, colours, opacities. */
 function stampStyles(panel, eye) {

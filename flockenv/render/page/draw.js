@@ -258,11 +258,17 @@ function drawWorld(view, now) {
     drawLookTrails(pen, eye, panel, now, panel.time[now.k] + now.f * ((panel.time[now.k + 1] || panel.time[now.k]) - panel.time[now.k]));
   }
   drawScenery(pen, eye, panel, now.k);
+  if (!eye.flat) drawBorder(pen, eye, panel);
   const all = bodies(panel, now);
-  if (panel.faces && panel.faces.length) drawFaces(pen, eye, panel, all); else drawBonds(pen, eye, panel, all);
-  if (panel.N > CROWD) drawCrowd(pen, eye, panel, all, now.k); else if (!(panel.faces && panel.faces.length)) drawBodies(pen, eye, panel, all, now.k);
+  if (hasFaces(panel)) drawFaces(pen, eye, panel, all); else drawBonds(pen, eye, panel, all);
+  if (panel.N > CROWD) drawCrowd(pen, eye, panel, all, now.k); else if (!hasFaces(panel)) drawBodies(pen, eye, panel, all, now.k);
   if (view.over) view.over(pen, eye, now, all);
   pen.restore();
+  if (eye.flat) drawBorder(pen, eye, panel);
+}
+
+/* The edge of the ground, dashed if the world goes on across it. */
+function drawBorder(pen, eye, panel) {
   pen.strokeStyle = paint.edge; pen.lineWidth = 1.2 * eye.ratio;
   pen.setLineDash(panel.periodic ? [7 * eye.ratio, 6 * eye.ratio] : []);
   ground(pen, eye, panel); pen.stroke();

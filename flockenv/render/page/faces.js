@@ -1,5 +1,7 @@
 /* Surfaces: the triangles of cloths and bodies, the farthest first, lit from above the reader's left shoulder. */
-const LIGHT = [-0.35, 0.45, 0.82];
+const LIGHT = [-0.35, 0.46, 0.81]; // to the right, upwards, towards the reader; of length 1
+
+function hasFaces(panel) { return Boolean(panel.faces && panel.faces.length); }
 
 /* The normal of a triangle of points in m, of length 1. */
 function normalOf(p, q, r) {
@@ -8,20 +10,28 @@ function normalOf(p, q, r) {
   return n.map(x => x / size);
 }
 
-function drawFaces(pen, eye, panel, all) {
-  const at = i => [all.pos[3 * i], all.pos[3 * i + 1], all.pos[3 * i + 2]];
-  const drawn = panel.faces.filter(face => face.every(i => all.there[i])).map(face => {
-    const corners = face.map(at), middle = [0, 1, 2].map(d => (corners[0][d] + corners[1][d] + corners[2][d]) / 3);
-    const light = panel.D < 3 ? 0.6 : Math.abs(normalOf(...corners).reduce((sum, x, d) => sum + x * LIGHT[d], 0));
-    return { corners, kind: panel.kind[face[0]], depth: eye.depth(...middle), light };
+function dotOf(a, b) { return a.reduce((sum, x, d) => sum + x * b[d], 0); }
+
+/* Triangles with their corners, m, depth, light from 0 to 1, and whether the reader sees their back. */
+function facesInOrder(panel, eye, all) {
+  return panel.faces.filter(face => face.every(i => all.there[i])).map(face => {
+    const corners = face.map(i => placeOf(all, i)), middle = [0, 1, 2].map(d => (corners[0][d] + corners[1][d] + corners[2][d]) / 3);
+    const normal = normalOf(...corners), seen = eye.rows.map(row => dotOf(row, normal)), back = panel.D === 3 && seen[2] < 0;
+    const lit = panel.D < 3 ? 0.6 : clamp(dotOf(seen, LIGHT) * (back ? -1 : 1), 0, 1);
+    return { corners, kind: panel.kind[face[0]], depth: eye.depth(...middle), lit, back };
   }).sort((p, q) => p.depth - q.depth);
+}
+
+/* Front and back in two colours, paler with distance. */
+function drawFaces(pen, eye, panel, all) {
+  const dark = state.dark ? "#0b0f14" : paint.ink;
   pen.lineWidth = 0.7 * eye.ratio; pen.lineJoin = "round";
-  for (const { corners, kind, depth, light } of drawn) {
-    const colour = roleColour[panel.kinds[kind]], lit = light < 0.5 ? mix(colour, state.dark ? paint.paper : paint.ink, 0.5 + light) : mix(state.dark ? paint.ink : paint.paper, colour, 0.9 * (light - 0.5));
-    pen.fillStyle = pen.strokeStyle = lit; pen.globalAlpha = 0.75 + 0.25 * depth;
+  for (const { corners, kind, depth, lit, back } of facesInOrder(panel, eye, all)) {
+    const own = roleColour[panel.kinds[kind]], colour = back ? roleColour.learner : own === roleColour.agent ? paint.accent : own;
+    const shaded = lit < 0.55 ? mix(colour, dark, 0.45 + lit) : mix("#ffffff", colour, 0.7 * (lit - 0.55));
+    pen.fillStyle = pen.strokeStyle = mix(shaded, paint.paper, 0.8 + 0.2 * depth);
     pen.beginPath();
     for (const p of corners) pen.lineTo(eye.x(...p), eye.y(...p));
     pen.closePath(); pen.fill(); pen.stroke();
   }
-  pen.globalAlpha = 1;
 }

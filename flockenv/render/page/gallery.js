@@ -7,7 +7,7 @@ function openGallery(on) {
 
 function showGallery({ entries }) {
   const intro = element("div", undefined, "intro"), families = new Map();
-  intro.append(element("h2", "Pick a world"), element("p", "Everything in it can be changed while it runs: its rules, its agents, its obstacles, and the hand that steers. Time can be stopped and turned back."));
+  intro.append(element("small", "flockenv"), element("h2", "Pick a world"), element("p", "Change anything while it runs: rules, agents, obstacles, players. Stop time, go back, and try again."));
   for (const entry of entries) {
     const family = entry.family || (entry.kind === "task" ? "Tasks" : "Scenes");
     if (!families.has(family)) families.set(family, []);
@@ -15,7 +15,7 @@ function showGallery({ entries }) {
   }
   const parts = [...families].flatMap(([family, members]) => {
     const title = element("h3", family), cards = element("div", undefined, "cards");
-    if (members[0].kind === "task") title.append(element("small", "rules, a trained policy and you can play them"));
+    if (members[0].kind === "task") title.append(element("small", "hand-written rules, a trained policy and you can play them, side by side"));
     cards.append(...members.map(cardOf));
     return [title, cards];
   });
@@ -36,6 +36,7 @@ function cardOf(entry) {
 }
 
 const HINTS = [
+  [STEER, room => room.lanes.some(lane => (lane.players || []).includes("you"))],
   ["Try: drag a blue number in the rules sideways.", room => room.sentences.length],
   ["Try: click an agent to see the forces on it.", () => true],
   ["Try: drag an agent, or draw an obstacle (o).", room => room.kind === "scene"],

@@ -29,7 +29,7 @@ function lens(panel, canvas, camera) {
   const left = a[0] * low[0] + tx, right = a[0] * high[0] + tx, top = b[1] * high[1] + ty, bottom = b[1] * low[1] + ty;
   const copies = (x, r, first, last) => !panel.periodic || !flat ? [x] : [x].concat(x - r < first ? [x + last - first] : [], x + r > last ? [x - last + first] : []);
   return {
-    m, a, b, tx, ty, flat, left, right, top, bottom, w, h, ratio, least: Math.max(data.reach * w, 6.5 * ratio) * clamp(camera.zoom, 1, 3),
+    m, a, b, rows, tx, ty, flat, left, right, top, bottom, w, h, ratio, least: Math.max(data.reach * w, 6.5 * ratio) * clamp(camera.zoom, 1, 3),
     x: (x, y = 0, z = 0) => a[0] * x + a[1] * y + a[2] * z + tx,
     y: (x, y = 0, z = 0) => b[0] * x + b[1] * y + b[2] * z + ty,
     /* 0: the farthest corner from the eye, 1: the nearest; 1 everywhere in 2-D. */
@@ -37,10 +37,10 @@ function lens(panel, canvas, camera) {
     /* The direction on the canvas, in rad anticlockwise, of a heading in the x-y plane. */
     angle: aim => flat ? aim : Math.atan2(-(b[0] * Math.cos(aim) + b[1] * Math.sin(aim)), a[0] * Math.cos(aim) + a[1] * Math.sin(aim)),
     sightings: (x, y, r) => copies(x, r, left, right).flatMap(p => copies(y, r, top, bottom).map(q => [p, q])),
-    /* The point of the x-y plane (2-D, or through the middle of a box) under a pixel, in m. */
-    ground: (px, py) => {
-      const qx = px - tx - a[2] * middle[2], qy = py - ty - b[2] * middle[2], det = a[0] * b[1] - a[1] * b[0];
-      return [(qx * b[1] - qy * a[1]) / det, (a[0] * qy - b[0] * qx) / det];
+    /* The point under a pixel, (D,) m: in 3-D on the plane through another point, or the middle, that faces the reader. */
+    under: (px, py, through = middle) => {
+      const right = px - (a[0] * through[0] + a[1] * through[1] + a[2] * through[2] + tx), down = py - (b[0] * through[0] + b[1] * through[1] + b[2] * through[2] + ty);
+      return through.slice(0, panel.D).map((c, d) => c + (rows[0][d] * right - rows[1][d] * down) / m);
     },
   };
 }

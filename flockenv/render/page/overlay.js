@@ -106,6 +106,19 @@ function drawField(pen, eye, panel, field) {
   pen.restore();
 }
 
+/* A flow on a grid as an arrow for each cell in which there is some. */
+function drawFlow(pen, eye, panel, field) {
+  const [ny, nx] = field.shape, cells = nx * ny, [x0, y0] = field.low, dx = (field.high[0] - x0) / nx, dy = (field.high[1] - y0) / ny, z = panel.D < 3 ? 0 : panel.low[2];
+  for (let k = 0; k < cells; k++) {
+    const flow = [field.arrows[k] / 127, field.arrows[cells + k] / 127], size = Math.hypot(...flow);
+    if (size < 0.05) continue;
+    const [u, v] = vectorOn(eye, flow.map(c => c / size * dx * (0.3 + 0.65 * size))), i = k % nx, at = [x0 + (i + 0.5) * dx, y0 + ((k - i) / nx + 0.5) * dy, z];
+    pen.globalAlpha = 0.3 + 0.6 * size;
+    arrow(pen, eye.x(...at) - u / 2, eye.y(...at) - v / 2, u, v, paint.accent, 1.8 * eye.ratio);
+  }
+  pen.globalAlpha = 1;
+}
+
 /* What a live view draws under and over its agents, and its tools. */
 function prepareView(view, n, camera) {
   const { panel } = view;
@@ -114,26 +127,27 @@ function prepareView(view, n, camera) {
   Object.assign(view.camera, view.home, camera || {});
   view.before = () => {
     if (tool.held && tool.held.you && tool.toward && tool.toward.view === view) steerTo(view, tool.toward.pixel);
-    else if (held.size && isYou(view)) steerByKeys();
+    else if (pressed.size && isYou(view)) steerByKeys();
     panel.tint = panel.colour ? ramp() : null;
-    if (panel.legendOld) { panel.legendOld = false; makeLegend(state.group); if (live.want.colour) addRamp(panel.colour); }
+    showScales(view);
     const { follow } = view.camera, frame = panel.frames[panel.frames.length - 1];
     if (follow !== null && frame && follow < panel.N) centreOn(view, frame.pos.subarray(follow * panel.D, follow * panel.D + panel.D));
   };
-  view.under = (pen, eye) => { if (view.field) drawField(pen, eye, panel, view.field); };
+  view.under = (pen, eye) => { if (view.field) (view.field.arrows ? drawFlow : drawField)(pen, eye, panel, view.field); };
   view.over = (pen, eye, now, all) => {
     drawYou(pen, eye, panel, all);
     if (chosen.lane === n) drawChosen(pen, eye, panel, all);
     if (view.draft) drawDraft(pen, eye, view.draft);
+    if (cursor.view === view) drawCursor(pen, eye);
   };
   view.tool = (kind, event, at) => useTool(view, kind, event, at);
 }
 
-/* In 3-D from the side, with gravity downwards. */
+/* In 3-D from the side and a little from above, with gravity downwards. */
 function homeCamera(panel) {
   if (panel.D < 3) return {};
   const [x, y, z] = panel.lane.up || [0, 0, 1], level = Math.hypot(x, y);
-  return level < 0.05 * Math.abs(z) ? { yaw: -0.55, tilt: 1.12 } : { yaw: Math.atan2(-x, y), tilt: Math.atan2(z, level) };
+  return level < 0.05 * Math.abs(z) ? { yaw: -0.55, tilt: 1.12 } : { yaw: Math.atan2(-x, y), tilt: Math.atan2(z, level) - 0.35 };
 }
 
 function centreOn(view, p) {
@@ -149,18 +163,29 @@ function ramp() {
   ramp.key = key;
   ramp.colours = [...Array(256).keys()].map(s => {
     const at = s / 255 * (stops.length - 1), k = Math.min(Math.floor(at), stops.length - 2);
-    const [r, g, b] = mix(stops[k + 1], stops[k], at - k).match(/\d+/g).map(Number);
-    return "#" + [r, g, b].map(c => c.toString(16).padStart(2, "0")).join("");
+    return mix(stops[k + 1], stops[k], at - k);
   });
   return ramp.colours;
 }
 
-function addRamp(colour) {
-  if (!colour) return;
-  const row = element("span", undefined, "ramp"), bar = element("canvas");
+/* The legend with the scales of what colours and the field show, which change with the world: made anew twice a second. */
+function showScales({ panel, field }) {
+  const shown = panel.colour || field, now = performance.now();
+  if (!panel.legendOld && !(shown && now - (showScales.last || 0) > 500)) return;
+  panel.legendOld = false; showScales.last = now;
+  makeLegend(state.group);
+  if (panel.colour) $("legend").append(scaleOf(panel.colour.name, panel.colour.low, panel.colour.high, panel.colour.unit, ramp()));
+  if (field) $("legend").append(scaleOf(field.name, 0, field.most, field.unit, field.arrows ? null : [paint.paper, mix(paint.accent, paint.paper, 0.6)]));
+}
+
+/* A quantity with its range; colours: from little to much, or null for one that arrows show. */
+function scaleOf(name, low, high, unit, colours) {
+  const row = element("span", undefined, "ramp"), bar = element("canvas"), words = name.replace(/_/g, " ");
+  if (!colours) { row.append(`${words}: the longest arrow is ${shortNumber(high)}${unitOf({ unit })}`); return row; }
   bar.width = 120; bar.height = 8;
-  const pen = bar.getContext("2d");
-  ramp().forEach((c, k) => { pen.fillStyle = c; pen.fillRect(k * 120 / 256, 0, 1, 8); });
-  row.append(`${colour.name}: ${number(colour.low)}`, bar, `${number(colour.high)} ${colour.unit || ""}`);
-  $("legend").append(row);
+  const pen = bar.getContext("2d"), fill = pen.createLinearGradient(0, 0, 120, 0);
+  colours.forEach((c, k) => fill.addColorStop(k / (colours.length - 1), c));
+  pen.fillStyle = fill; pen.fillRect(0, 0, 120, 8);
+  row.append(`${words}: ${shortNumber(low)}`, bar, `${shortNumber(high)}${unitOf({ unit })}`);
+  return row;
 }

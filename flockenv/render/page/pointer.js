@@ -30,7 +30,13 @@ function moveCamera(view, event, now, before) {
   else pan(view, now[0] - before[0], now[1] - before[1]);
 }
 
-/* Listens to a view's canvas. A tool of the live page may take a press for itself: view.tool(kind, event, pixel) -> true. */
+/* A second finger makes a pinch of what the first one began with a tool. */
+function dropTools(take, event, at) {
+  for (const held of pointers.values()) if (held.taken) { held.taken = false; take("cancel", event, at); }
+}
+
+/* Listens to a view's canvas. A tool of the live page may take a press for itself: view.tool(kind, event, pixel) -> true.
+kind: hover, leave, and of a press down, move, up or cancel. */
 function steerCamera(view) {
   const { canvas } = view, take = (kind, event, at) => view.tool ? view.tool(kind, event, at) : false;
   canvas.addEventListener("wheel", event => {
@@ -41,6 +47,7 @@ function steerCamera(view) {
   }, { passive: false });
   canvas.addEventListener("pointerdown", event => {
     const at = pixelOf(canvas, event), taken = pointers.size === 0 && event.button === 0 && take("down", event, at);
+    if (pointers.size) dropTools(take, event, at);
     pointers.set(event.pointerId, { at, taken });
     canvas.setPointerCapture(event.pointerId);
   });
@@ -54,7 +61,7 @@ function steerCamera(view) {
   for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, event => {
     const held = pointers.get(event.pointerId);
     pointers.delete(event.pointerId);
-    if (held && held.taken) take("up", event, pixelOf(canvas, event));
+    if (held && held.taken) take(name === "pointerup" ? "up" : "cancel", event, pixelOf(canvas, event));
   });
   canvas.addEventListener("pointerleave", event => { if (!pointers.has(event.pointerId)) take("leave", event, pixelOf(canvas, event)); });
   canvas.addEventListener("dblclick", () => resetCamera(view));

@@ -1,4 +1,4 @@
-/* Saving and sharing: YAML, a link to this moment, PNG, WebM, a replay in one file. */
+/* Saving and sharing: YAML, a link to this moment, PNG, WebM, GIF, a replay in one file. */
 
 function download(name, blob) {
   const link = element("a");
@@ -24,7 +24,8 @@ function showYaml({ text, notes }) {
   const about = element("p", notes && notes.length ? notes.join(" ") : `flockenv run FILE --seed ${live.room.seed} gives the same numbers, bit for bit.`, "lead");
   const row = openDialog("Save", about, area);
   const act = (name, run) => { const button = element("button", name); button.onclick = run; row.prepend(button); };
-  act("Replay …", () => { $("dialog").close(); live.send({ type: "record", on: !live.recording }); });
+  act("Replay …", () => beginRecording("replay"));
+  act("GIF …", () => beginRecording("gif"));
   act("WebM …", () => { $("dialog").close(); film(); });
   act("PNG", savePicture);
   act("Load this text", () => { live.send({ type: "load", yaml: area.value }); $("dialog").close(); });
@@ -73,14 +74,20 @@ async function showLink({ text }) {
 
 function saveOrStop() {
   if (filming) film();
-  else if (live.recording) live.send({ type: "record", on: false });
+  else if (live.recording) live.send({ type: "record", on: false, form: live.recording });
   else live.ask({ type: "save" });
 }
 
-function takeReplay({ html }) { download(fileName(".html"), new Blob([html], { type: "text/html" })); }
+/* The server records; form: what it makes of that when the recording stops, "replay" or "gif". */
+function beginRecording(form) { $("dialog").close(); live.form = form; live.send({ type: "record", on: true }); }
 
-function showRecording({ on, seconds }) {
-  live.recording = on;
+function takeFilm({ form, html, data: text }) {
+  if (form === "gif") download(fileName(".gif"), new Blob([Uint8Array.from(atob(text), c => c.charCodeAt(0))], { type: "image/gif" }));
+  else download(fileName(".html"), new Blob([html], { type: "text/html" }));
+}
+
+function showRecording({ on }) {
+  live.recording = on ? live.form : null;
   $("save").textContent = on ? "Stop recording" : "Save";
-  if (on && !seconds) tell("Recording. Press “Stop recording” to save a replay in one file.");
+  if (on) tell(`Recording. Press “Stop recording” to save it as ${live.form === "gif" ? "a GIF; worlds in 3-D are drawn from above" : "a replay in one file"}.`);
 }

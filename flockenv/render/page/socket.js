@@ -1,8 +1,8 @@
 /* The live source: a socket to the server, which plays the worlds; the page asks for each frame when it can draw one. */
 const MAGIC = 0x01464c46; // "FLF" and the version 1, little endian: see flockenv/play/frames.py
-const BLOCKS = { pos: Uint16Array, heading: Uint8Array, tilt: Int8Array, shade: Uint8Array, identity: Uint16Array, field: Uint8Array };
+const BLOCKS = { pos: Uint16Array, heading: Uint8Array, tilt: Int8Array, shade: Uint8Array, identity: Uint16Array, field: Uint8Array, arrows: Int8Array };
 const live = {
-  socket: null, room: null, waiting: false, askedAt: 0, lastFrame: 0, header: {}, want: { colour: "", field: "" }, listeners: {}, timing: {}, last: null,
+  socket: null, room: null, waiting: false, askedAt: 0, toldAt: 0, lastFrame: 0, header: {}, want: { colour: "", field: "" }, listeners: {}, timing: {}, last: null,
   asked: new Set(), rate: { since: 0, count: 0, shown: 0 },
 
   connect() {
@@ -62,6 +62,7 @@ const live = {
     }
     showPlaying(room.playing); setSpeed(room.speed);
     document.querySelector("h1").textContent = document.title = room.title;
+    $("about").textContent = $("about").title = room.about;
     $("seed").value = room.seed;
     this.waiting = false; this.lastFrame = 0;
     refresh();
@@ -80,12 +81,12 @@ const live = {
     header.lanes.forEach((lane, n) => {
       const blocks = {};
       for (const name of lane.blocks) {
-        const count = name === "pos" ? lane.n * lane.dimension : name === "field" ? lane.field.shape[0] * lane.field.shape[1] : lane.n;
+        const count = blockSize(lane, name);
         blocks[name] = new BLOCKS[name](buffer, at, count);
         at += (blocks[name].byteLength + 3) & ~3;
       }
       takeLane(panels[n], lane, blocks);
-      if (views[n]) views[n].field = blocks.field ? { ...lane.field, low: lane.low, high: lane.high, values: blocks.field } : null;
+      if (views[n]) views[n].field = blocks.field ? { ...lane.field, most: lane.field.high, low: lane.low, high: lane.high, values: blocks.field, arrows: blocks.arrows } : null;
     });
     this.follow(header);
     refresh();
@@ -101,8 +102,10 @@ const live = {
   follow(header) {
     const group = state.group, end = Math.max(header.last * this.room.interval, this.room.interval);
     if (end !== group.end) { group.end = end; showSpan(group); }
-    if (header.playing !== state.playing) showPlaying(header.playing);
-    if (header.speed !== state.speed) setSpeed(header.speed);
+    if (this.askedAt > this.toldAt) { // a frame that was asked for before has the state before
+      if (header.playing !== state.playing) showPlaying(header.playing);
+      if (header.speed !== state.speed) setSpeed(header.speed);
+    }
     for (const panel of group.panels) if (panel.reward) for (const r of panel.curve.returns) { group.worst = Math.min(group.worst, r); group.best = Math.max(group.best, r); }
     Object.assign(this.timing, header.timing);
   },
@@ -115,11 +118,13 @@ const live = {
   },
   hasEnded: panel => Boolean(panel.ended),
   words: panel => panel.note || "",
-  around: () => innerWidth > 900 ? 170 : 260,
-  play(on) { showPlaying(on); this.last = null; this.send({ type: "play", on }); refresh(); },
+  /* Pixels above and below all panels, and those of each panel's caption. */
+  around: () => innerHeight - document.querySelector(".stage").clientHeight + Math.max($("legend").offsetHeight, 44) + 8,
+  aroundPanel: shown => shown.some(view => view.panel.player) ? 34 : 0,
+  play(on) { showPlaying(on); this.toldAt = performance.now(); this.last = null; this.send({ type: "play", on }); refresh(); },
   seek(t) { this.send({ type: "seek", tick: Math.max(0, Math.round(t / this.room.interval)) }); this.lastFrame = 0; refresh(); },
   step(by) { if (state.playing) this.play(false); this.send({ type: "step", n: by }); this.lastFrame = 0; refresh(); },
-  speedChanged() { this.send({ type: "speed", x: state.speed }); },
+  speedChanged() { this.toldAt = performance.now(); this.send({ type: "speed", x: state.speed }); },
 
   /* Shown time follows the frames one step behind, so that agents move smoothly between two of them. */
   advance(now) {
@@ -137,6 +142,14 @@ const live = {
   },
   key: event => liveKey(event),
 };
+
+/* Number of values in a block of a frame. */
+function blockSize(lane, name) {
+  if (name === "pos") return lane.n * lane.dimension;
+  if (name !== "field" && name !== "arrows") return lane.n;
+  const cells = lane.field.shape[0] * lane.field.shape[1];
+  return name === "field" ? cells : 2 * cells;
+}
 
 /* A list of [value, count] as one value per agent. */
 function unroll(runs) { return runs.flatMap(([value, count]) => new Array(count).fill(value)); }

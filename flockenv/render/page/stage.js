@@ -79,6 +79,7 @@ function makeView(panel) {
   box.append(total, element("small", "return"));
   caption.append(player, outcome); score.append(box, curve); figure.append(caption, canvas, ...(panel.reward ? [score] : []));
   watcher.observe(canvas); watcher.observe(curve);
+  figure.classList.toggle("unnamed", !panel.player);
   const view = { panel, figure, canvas, curve, player, outcome, total, camera: newCamera(panel.D) };
   steerCamera(view);
   return view;
@@ -88,7 +89,7 @@ function aspectOf(panel) { return clamp(panel.shape || panel.extent[0] / panel.e
 
 /* All panels of one size: in as many columns as make them largest with all in sight; where that is too small, as many as fit beside each other. */
 function arrange() {
-  const panels = $("panels"), style = getComputedStyle(panels), n = views.length, gap = 20, around = 62 + (state.group.panels.some(p => p.reward) ? 48 : 0);
+  const panels = $("panels"), style = getComputedStyle(panels), n = views.length, gap = 20, around = source.aroundPanel(views) + (state.group.panels.some(p => p.reward) ? 48 : 0);
   const wide = panels.clientWidth - parseFloat(style.paddingLeft) - parseFloat(style.paddingRight), high = innerHeight - source.around();
   const aspect = clamp(Math.max(...views.map(v => aspectOf(v.panel))), 0.5, 4);
   let best = 0;
@@ -96,7 +97,7 @@ function arrange() {
     const rows = Math.ceil(n / columns);
     best = Math.max(best, Math.min((wide - gap * (columns - 1)) / columns, ((high - gap * (rows - 1)) / rows - around) * aspect));
   }
-  const least = Math.min(wide, 260), columns = Math.max(1, Math.floor((wide + gap) / (least + gap)));
+  const least = Math.min(wide, 240), columns = Math.max(1, Math.floor((wide + gap) / (least + gap)));
   if (best < least) best = (wide - gap * (Math.min(n, columns) - 1)) / Math.min(n, columns);
   panels.style.setProperty("--panel", Math.floor(best) + "px");
 }
@@ -114,7 +115,7 @@ function legendRow([text, colour, kind]) {
 function makeLegend(group) {
   const has = test => group.panels.some(p => p.scenery.some(test)), rows = [];
   for (const role of Object.keys(data.roles)) {
-    const panel = group.panels.find(p => p.kinds.includes(role));
+    const panel = group.panels.find(p => p.kinds.includes(role) && !hasFaces(p));
     if (!panel) continue;
     const look = panel.looks[panel.look[panel.roles.indexOf(role)]];
     rows.push([role, look && look.colours ? look.colours[0] : roleColour[role], look && look.form !== "polygon" ? "disc" : "dart"]);
@@ -133,9 +134,9 @@ function present(group) {
   watcher.disconnect();
   views = group.panels.map(makeView);
   $("panels").replaceChildren(...views.map(v => v.figure));
+  makeLegend(group);
   arrange();
   views.forEach(v => { fit(v.canvas); fit(v.curve); });
-  makeLegend(group);
   refresh();
 }
 

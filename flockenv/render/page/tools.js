@@ -1,4 +1,4 @@
-/* Tools of the stage: choose and drag, add, draw obstacles, erase, lead with the pointer; and steering by a person. */
+/* Tools of the stage: choose and drag, add, draw obstacles, erase, lead with the pointer. */
 const TOOLS = {
   choose: ["v", "choose: click an agent to look inside it, drag it to move it, drag an obstacle", "M4 2l8.5 5-4 1 2.5 4.5-1.6.9-2.5-4.6L4 12z"],
   add: ["a", "add agents: click; with Shift ten at a time", "M8 3v10M3 8h10"],
@@ -57,17 +57,11 @@ function isInside([x, y], outline) {
   return inside;
 }
 
-/* The index of the obstacle at a place in m; null if there is none. obstacles: {index, at, radius, outline}. */
-function obstacleAt(view, at) {
-  const found = (view.panel.lane.obstacles || []).filter(o => o.outline ? isInside(at, o.outline) : Math.hypot(o.at[0] - at[0], o.at[1] - at[1]) <= o.radius);
+/* The obstacle under a pixel; null if there is none. obstacles: {index, at and radius, or outline}. */
+function obstacleAt(view, pixel) {
+  const { eye } = view, at = eye.under(...pixel), isUnder = o => Math.hypot(eye.x(...o.at) - pixel[0], eye.y(...o.at) - pixel[1]) <= o.radius * eye.m;
+  const found = (view.panel.lane.obstacles || []).filter(o => o.outline ? isInside(at, o.outline) : isUnder(o));
   return found.length ? found[found.length - 1] : null;
-}
-
-/* A place in the world for a pixel, (D,) m; in 3-D at the height of the middle, or at that of an agent. */
-function placeAt(view, pixel, agent = null) {
-  const [x, y] = view.eye.ground(...pixel), { panel } = view;
-  if (panel.D < 3) return [x, y];
-  return [x, y, agent === null ? (panel.low[2] + panel.high[2]) / 2 : panel.bodies.pos[3 * agent + 2]];
 }
 
 function often(ms) { const now = performance.now(); if (now - tool.sentAt < ms) return false; tool.sentAt = now; return true; }
@@ -76,15 +70,23 @@ function often(ms) { const now = performance.now(); if (now - tool.sentAt < ms) 
 function useTool(view, kind, event, pixel) {
   if (!view.eye) return false;
   const lane = views.length > 1 ? view.n : null;
+  if (kind === "cancel") { dropHeld(view); return true; }
   if (kind === "down" && isYou(view) && tool.name === "choose" && agentAt(view, pixel) === null && view.panel.D < 3) { tool.held = { you: true }; steerTo(view, pixel); return true; }
   if (tool.held && tool.held.you) { if (kind === "move") steerTo(view, pixel); if (kind === "up") { tool.held = null; steer([0, 0]); } return true; }
   return { choose: useChoose, add: useAdd, obstacle: useObstacle, erase: useErase, goal: usePointer, flee: usePointer }[tool.name](view, kind, event, pixel, lane);
 }
 
+/* Ends what a press began, without its effect. */
+function dropHeld(view) {
+  if (tool.held && tool.held.you) steer([0, 0]);
+  tool.held = view.draft = null;
+  refresh();
+}
+
 function useChoose(view, kind, event, pixel) {
-  if (kind === "hover") { view.canvas.style.cursor = agentAt(view, pixel) !== null || obstacleAt(view, view.eye.ground(...pixel)) ? "pointer" : "default"; return false; }
+  if (kind === "hover") { view.canvas.style.cursor = agentAt(view, pixel) !== null || obstacleAt(view, pixel) ? "pointer" : "default"; return false; }
   if (kind === "down") {
-    const agent = agentAt(view, pixel), obstacle = agent === null ? obstacleAt(view, view.eye.ground(...pixel)) : null;
+    const agent = agentAt(view, pixel), obstacle = agent === null ? obstacleAt(view, pixel) : null;
     if (agent === null && !obstacle) { if (view.panel.D < 3 && view.camera.zoom <= 1) choose(null, null); return false; }
     tool.held = { agent, obstacle, from: pixel, moved: false };
     return true;
@@ -93,24 +95,24 @@ function useChoose(view, kind, event, pixel) {
   if (!held) return false;
   if (Math.hypot(pixel[0] - held.from[0], pixel[1] - held.from[1]) > 5) held.moved = true;
   if (held.moved && (kind === "up" || kind === "move" && often(33))) {
-    const at = placeAt(view, pixel, held.agent), lane = views.length > 1 ? view.n : null;
+    const at = view.eye.under(...pixel, held.agent === null ? held.obstacle.at : placeOf(view.panel.bodies, held.agent)), lane = views.length > 1 ? view.n : null;
     if (held.agent !== null) live.edit({ kind: "move_agent", agent: held.agent, pos: at }, lane);
     else if (kind === "up") live.edit({ kind: "move_obstacle", index: held.obstacle.index, centre: at }, lane);
     live.lastFrame = 0;
   }
-  if (held.obstacle && held.moved) view.draft = kind === "up" ? null : { at: placeAt(view, pixel), radius: held.obstacle.radius || 0.5 };
+  if (held.obstacle && held.moved) view.draft = kind === "up" ? null : { at: view.eye.under(...pixel), radius: held.obstacle.radius || 0.5 };
   if (kind === "up") { if (!held.moved && held.agent !== null) choose(view.n, held.agent); tool.held = null; }
   return true;
 }
 
 function useAdd(view, kind, event, pixel, lane) {
-  if (kind === "down") live.edit({ kind: "add_agents", group: 0, count: event.shiftKey ? 10 : 1, at: placeAt(view, pixel) }, lane);
+  if (kind === "down") live.edit({ kind: "add_agents", group: 0, count: event.shiftKey ? 10 : 1, at: view.eye.under(...pixel) }, lane);
   return kind !== "hover" && kind !== "leave";
 }
 
 function useObstacle(view, kind, event, pixel, lane) {
   if (kind === "hover" || kind === "leave") return false;
-  const at = placeAt(view, pixel);
+  const at = view.eye.under(...pixel);
   if (kind === "down") { view.draft = { at, radius: 0, block: event.shiftKey }; return true; }
   if (!view.draft) return true;
   const from = view.draft.at, reach = at.map((x, d) => x - from[d]);
@@ -134,7 +136,7 @@ function drawDraft(pen, eye, draft) {
 
 function useErase(view, kind, event, pixel, lane) {
   if (kind === "down") {
-    const agent = agentAt(view, pixel), obstacle = obstacleAt(view, view.eye.ground(...pixel));
+    const agent = agentAt(view, pixel), obstacle = obstacleAt(view, pixel);
     if (agent !== null) live.edit({ kind: "remove_agents", agents: [agent] }, lane);
     else if (obstacle) live.edit({ kind: "remove_obstacle", index: obstacle.index }, lane);
     else tell("Nothing here to erase.");
@@ -144,63 +146,6 @@ function useErase(view, kind, event, pixel, lane) {
 
 function usePointer(view, kind, event, pixel, lane) {
   if (kind === "leave") live.edit({ kind: "pointer", acts: tool.name, at: null }, lane);
-  else if (often(40)) live.edit({ kind: "pointer", acts: tool.name, at: placeAt(view, pixel) }, lane);
+  else if (often(40)) live.edit({ kind: "pointer", acts: tool.name, at: view.eye.under(...pixel) }, lane);
   return kind !== "hover" && kind !== "leave";
-}
-
-// ---- steering by a person
-
-const held = new Set();
-let lastAction = "";
-
-function yourAgent(panel) { const n = (panel.lane.players || []).indexOf("you"); return n < 0 ? null : n; }
-
-function isYou(view) { return yourAgent(view.panel) !== null; }
-
-/* Sends a direction in the world's axes, at most of length 1, as an action of the task; only if it changes. */
-function steer([x, y]) {
-  const view = views.find(isYou);
-  if (!view) return;
-  const action = live.room.action || { frame: "world", size: 2 }, agent = yourAgent(view.panel), frame = view.panel.frames[view.panel.frames.length - 1];
-  const size = Math.max(1, Math.hypot(x, y)), aim = frame ? frame.aim[agent] : 0;
-  let [u, v] = [x / size, y / size];
-  if (action.frame === "heading" && !Number.isNaN(aim)) [u, v] = [u * Math.cos(aim) + v * Math.sin(aim), -u * Math.sin(aim) + v * Math.cos(aim)];
-  const numbers = new Array(action.size).fill(0);
-  numbers[0] = Math.round(u * 100) / 100; if (action.size > 1) numbers[1] = Math.round(v * 100) / 100;
-  const text = numbers.join();
-  if (text === lastAction) return;
-  lastAction = text;
-  live.edit({ kind: "input", action: numbers });
-}
-
-function steerTo(view, pixel) {
-  const i = yourAgent(view.panel), p = placeOf(view.panel.bodies, i), dx = pixel[0] - view.eye.x(...p), dy = view.eye.y(...p) - pixel[1], far = Math.hypot(dx, dy);
-  tool.toward = { view, pixel };
-  steer(far < 6 ? [0, 0] : [dx / far, dy / far]);
-}
-
-const STEERING = { w: [0, 1], a: [-1, 0], s: [0, -1], d: [1, 0], ArrowUp: [0, 1], ArrowLeft: [-1, 0], ArrowDown: [0, -1], ArrowRight: [1, 0] };
-
-function steerByKeys() {
-  const sum = [0, 0];
-  for (const key of held) { sum[0] += STEERING[key][0]; sum[1] += STEERING[key][1]; }
-  steer(sum);
-}
-
-/* True if a key press steers; keys do so while a person has an agent and time runs. */
-function steeringKey(event, down) {
-  const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
-  if (!STEERING[key] || event.shiftKey || !views.some(isYou)) return false;
-  if (down && !state.playing) return false;
-  if (down) held.add(key); else held.delete(key);
-  steerByKeys();
-  return true;
-}
-
-/* The first gamepad's left stick, read once per picture. */
-function readGamepad() {
-  const pad = navigator.getGamepads && [...navigator.getGamepads()].find(Boolean);
-  if (!pad || !views.some(isYou)) return;
-  const [x, y] = pad.axes;
-  if (Math.hypot(x, y) > 0.2) { readGamepad.on = true; steer([x, -y]); } else if (readGamepad.on) { readGamepad.on = false; steer([0, 0]); }
 }
