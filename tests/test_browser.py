@@ -401,8 +401,10 @@ def switch_players(here: Visit, room: Room) -> None:
 
 def go_back_and_on(here: Visit, room: Room) -> None:
     tick = room.tick
-    for _ in range(BACK):
-        here.page.keyboard.press("ArrowLeft")
+    here.page.keyboard.press("ArrowLeft")
+    for _ in range(BACK // 10):
+        here.page.keyboard.press("PageUp")
+    here.page.keyboard.press("ArrowRight")
     wait_for(lambda: room.tick == tick - BACK)
     step_on(here, room, BACK)
 

@@ -83,7 +83,8 @@ class Recording:
         films = [panel.snapshots for panel in self._panels()]
         every = math.ceil(max(map(len, films)) / PICTURES)
         drawn = [film[::every] for film in films]
-        gaps = [after.time - before.time for before, after in pairwise(max(drawn, key=len))]
+        longest = max(drawn, key=lambda film: len(film))
+        gaps = [after.time - before.time for before, after in pairwise(longest)]
         fps = min(len(gaps) / sum(gaps), MOST_FPS) if gaps else FRAMES
         return gif_bytes(side_by_side(drawn, WIDTH // len(films), fps), fps)
 

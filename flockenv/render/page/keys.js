@@ -4,7 +4,7 @@ const LIVE_KEYS = {
   g: () => openGallery($("gallery").hidden), s: () => saveOrStop(), l: () => live.ask({ type: "share", camera: cameraNumbers() }), "?": () => showKeys(),
   Escape: () => { if (!$("gallery").hidden && live.room) openGallery(false); else { if (cursor.view) showCursor(false); choose(null, null); takeTool("choose"); } },
   "1": () => openTab("rules"), "2": () => openTab("values"), "3": () => openTab("agent"), "4": () => openTab("measures"), "5": () => openTab("compare"),
-  n: () => nextAgent(1), p: () => nextAgent(-1),
+  n: () => nextAgent(1), p: () => nextAgent(-1), PageUp: () => source.step(-10), PageDown: () => source.step(10),
 };
 
 function liveKey(event) {
@@ -25,7 +25,7 @@ function nextAgent(by) {
 
 function showKeys() {
   const rows = [
-    ["space", "play or pause"], ["← →", "one step back or on"], ["Home, End", "to the start, to the newest moment"], ["↑ ↓", "faster, slower"], ["+ − r", "zoom; the whole world"],
+    ["space", "play or pause"], ["← →", "one step back or on"], ["PgUp PgDn", "ten steps back or on"], ["Home, End", "to the start, to the newest moment"], ["↑ ↓", "faster, slower"], ["+ − r", "zoom; the whole world"],
     ["Shift + arrows", "pan, or turn a world in 3-D"], ...Object.values(TOOLS).map(([key, title]) => [key, title]), ["n, p", "choose the next agent, the one before"],
     ["c", "a pointer for the keyboard: arrows move it, Enter presses and releases the tool"],
     ["1 to 5", "Rules, Values, Agent, Measures, Compare"], ["W A S D, arrows, gamepad", "steer, where you are a player"], ["g", "all worlds"], ["s, l", "save; link to this moment"], ["d", "dark or light"], ["Esc", "put the tool down"],
