@@ -414,6 +414,8 @@ def restart_and_run(here: Visit, room: Room, name: str, steps: int = 25) -> None
     if name in TASKS:
         here.page.locator("#tab-rules").click()
         here.page.locator("#rules select[aria-label=player]").select_option("rules")
+        lane: Any = room.lanes[0]
+        wait_for(lambda: set(lane.players) == {"rules"})
         here.page.locator("h1").click()
     here.page.locator("#again").click()
     wait_for(lambda: room.tick == 0 and not room.made)
