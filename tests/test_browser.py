@@ -17,6 +17,7 @@ from flockenv.envs.world import World
 from flockenv.model.state import digest_arrays
 from flockenv.play.room import Room
 from flockenv.play.session import Session
+from flockenv.play.task_lane import TaskLane
 from flockenv.players import load_player
 from flockenv.render import Group, Panel, write_replay
 from flockenv.scene.yaml_io import load, load_scene
@@ -254,11 +255,16 @@ def test_a_hostile_title_is_text(visit: Callable[..., Visit]) -> None:
 
 
 class Visited(NamedTuple):
-    """A world of the gallery, the value that is changed in it, and the refusal or remark when an obstacle is drawn."""
+    """A world of the gallery, the value that is changed in it, and what is said when an obstacle is drawn.
+
+    obstacles: how many more there are then, 0 if that is refused. share: what a value of a task is multiplied by.
+    """
 
     name: str
     path: str
-    obstacle: str = ""
+    said: str = ""
+    obstacles: int = 1
+    share: float = 0.9
 
 
 IDLE = "no effect of this scene reacts to obstacles"
@@ -271,10 +277,10 @@ SCENES = (
     Visited("billiards", "constraints[0].restitution"),
 )
 TASK_VISITS = (
-    Visited("pursuit", "evader_speed", "pursuit has no obstacles"),
-    Visited("flock", "sight", "all 6 obstacles are there"),
-    Visited("obstacles", "touch_cost", "all 26 obstacles are there"),
-    Visited("crossing", "goal_radius", "crossing has no obstacles"),
+    Visited("pursuit", "evader_speed", "pursuit has no obstacles", 0),
+    Visited("flock", "sight", "all 6 obstacles are there", 0),
+    Visited("obstacles", "max_speed", share=0.02),  # so slow that it touches none, which would end the episode
+    Visited("crossing", "goal_radius", "crossing has no obstacles", 0),
 )
 BACK = 100
 """Steps that time goes back."""
@@ -287,9 +293,9 @@ def test_a_world_keeps_its_bits_through_all_that_a_visitor_does(world: Visited, 
     with serving(session) as server, serving(elsewhere) as second:
         here = visit(server.url)
         room = open_from_gallery(here, session, world.name)
-        change_value(here, room, world.path)
+        change_value(here, room, world)
         drag_an_agent(here, room)
-        draw_an_obstacle(here, room, world.obstacle)
+        draw_an_obstacle(here, room, world)
         if world.name in TASKS:
             switch_players(here, room)
         play_until(here, room, BACK + 10)
@@ -327,18 +333,18 @@ def play_until(here: Visit, room: Room, tick: int) -> None:
     assert room.tick >= tick
 
 
-def change_value(here: Visit, room: Room, path: str) -> None:
+def change_value(here: Visit, room: Room, world: Visited) -> None:
     """Drag a value of a sentence, or give one of a task another number under Values."""
     before = room.lanes[0].record
-    if before.__class__.__name__ == "Scene":
-        value = here.page.locator(f"#rules .value[data-path='{path}']")
+    if world.name not in TASKS:
+        value = here.page.locator(f"#rules .value[data-path='{world.path}']")
         value.scroll_into_view_if_needed()
         box = value.bounding_box()
         here.drag((box["x"] + 5, box["y"] + box["height"] / 2), (40, 0))
     else:
         here.page.locator("#tab-values").click()
-        field = here.page.locator(f"#values input[type=number][data-path='{path}']")
-        field.fill(str(0.9 * getattr(before, path)))
+        field = here.page.locator(f"#values input[type=number][data-path='{world.path}']")
+        field.fill(str(world.share * getattr(before, world.path)))
         field.press("Enter")
     wait_for(lambda: room.lanes[0].record != before)
     here.page.locator("h1").click()  # the keys belong to the world again
@@ -366,18 +372,24 @@ def moves_of(room: Room) -> list[Any]:
     return [made.edit for made in room.made if made.edit.kind == "move_agent"]
 
 
-def draw_an_obstacle(here: Visit, room: Room, words: str) -> None:
+def draw_an_obstacle(here: Visit, room: Room, world: Visited) -> None:
     """Draw a circle with its tool; it is there, or one line says why not."""
     shown = "document.getElementById('toast').textContent"
-    count = len(getattr(room.lanes[0].record, "obstacles", ()))
+    count = obstacles_in(room)
     here.page.keyboard.press("o")
     box = here.page.locator("canvas.world").bounding_box()
     here.drag((box["x"] + box["width"] / 2, box["y"] + box["height"] / 4), (26, 0))
-    if words:
-        here.until(f"{shown}.includes('{words}')")
-    if hasattr(room.lanes[0].record, "obstacles"):
-        wait_for(lambda: len(room.lanes[0].record.obstacles) == count + 1)
+    if world.said:
+        here.until(f"{shown}.includes('{world.said}')")
+    wait_for(lambda: obstacles_in(room) == count + world.obstacles)
     here.page.keyboard.press("v")
+
+
+def obstacles_in(room: Room) -> int:
+    lane: Any = room.lanes[0]
+    if isinstance(lane, TaskLane):
+        return int((lane.world.state.obstacle_radius[0] > 0).sum())
+    return len(lane.record.obstacles)
 
 
 def switch_players(here: Visit, room: Room) -> None:
