@@ -194,6 +194,7 @@ def test_the_gallery_has_all_scenes_and_tasks() -> None:
         about = listed[name].description
         assert len(about) > 20 and about.endswith(".") and about[0].isupper()
         assert "flockenv " not in about and "yaml-language" not in about
+    assert [name for name, entry in listed.items() if not entry.picture] == [], "python -m flockenv.play.gallery NAME"
     assert isinstance(read_entry("boids"), Scene) and read_entry("pursuit") == TASKS["pursuit"]()
     for name in ("boid", "../scene", "/etc/passwd", ""):
         with pytest.raises(ValueError, match="unknown"):

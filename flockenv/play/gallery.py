@@ -159,15 +159,15 @@ def _films(root: Path, name: str) -> Iterator[Snapshot]:
     yield lane.snapshot()
 
 
-def _draw(snapshots: Sequence[Snapshot]) -> bytes:
-    """Return the last snapshot as PNG, without caption and margin."""
+def _draw(snapshots: Sequence[Snapshot], all_trails: bool) -> bytes:
+    """Return the last snapshot as PNG, without caption and margin; all_trails: also of agents without a look."""
     from PIL import Image
 
     from flockenv.render.picture import draw
     from flockenv.render.view import view_of
 
     view = view_of(snapshots[-1], WIDTH, 1)
-    pixels = draw(snapshots[-1], size=WIDTH, scale=3, trails=snapshots[:-1], all_trails=False)
+    pixels = draw(snapshots[-1], size=WIDTH, scale=3, trails=snapshots[:-1], all_trails=all_trails)
     inside = pixels[round(view.top) : round(view.bottom), round(view.left) : round(view.right)]
     out = io.BytesIO()
     Image.fromarray(inside).quantize(64).save(out, "PNG", optimize=True)
@@ -182,7 +182,7 @@ def _make(names: Sequence[str]) -> None:
     for path in sorted((root / "configs" / "scenes").glob("*.yaml")):
         (folder / path.name).write_text(path.read_text(encoding="utf-8"), encoding="utf-8")
     for name in names:
-        (folder / f"{name}.png").write_bytes(_draw(list(_films(root, name))))
+        (folder / f"{name}.png").write_bytes(_draw(list(_films(root, name)), name in TASKS))
         print(name, flush=True)
 
 
