@@ -2,7 +2,8 @@
 
 Draws the curves in the cards of all training seeds, and those of all search seeds of hand-written players, on the same
 axes: mean return on tuning worlds over agent-steps, and over seconds. A line is the median over seeds, a band goes from
-the lowest to the highest. Trains and plays nothing.
+the lowest to the highest. `--learners FOLDER` adds the cards FOLDER/ALGO/TASK-seed-N.json that `agents.learn --seeds`
+writes, and draws their tasks alone. Trains and plays nothing.
 """
 
 from __future__ import annotations
@@ -16,7 +17,9 @@ import typer
 from numpy.typing import NDArray
 
 from agents.experiment import one_line_errors
+from agents.learner_job import ALGORITHMS
 from flockenv.cli.terminal import run_program
+from flockenv.core.errors import printable_path
 from flockenv.core.output_paths import valid_file
 from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK, save_figure
 from flockenv.players import PUBLISHED, seeds_of_player, weights_file
@@ -27,14 +30,17 @@ from flockenv.tasks import TASKS
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["app", "band", "curves_of", "draw"]
+__all__ = ["app", "band", "curves_of", "draw", "with_learners"]
 
 AXES = {"steps": "million agent-steps", "seconds": "seconds"}
 ABREAST = 2
-"""Tasks side by side."""
+"""Most tasks side by side."""
 SHOWN_FROM = 0.2
 """Share of the longest curve before which values may lie below the plot: all learning begins far below its end."""
 COLOUR = dict(zip(("ppo", "rules", "orca", "heuristics", "queueing"), COLOURS, strict=False))
+"""Of PPO and hand-written players."""
+LEARNER_COLOUR = dict(zip(ALGORITHMS, COLOURS[2:], strict=False))
+"""Of other learners, beside which PPO and the rules alone are drawn."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -50,6 +56,29 @@ def curves_of(task: str) -> dict[str, list[Curve]]:
     for name in reversed(PUBLISHED):
         found[name] = [each["curve"] for each in load_tuned(task, name).found.get("searches", {}).values()]
     return {name: curves for name, curves in found.items() if curves}
+
+
+def _all_curves() -> dict[str, dict[str, list[Curve]]]:
+    return {task: curves for task in TASKS if (curves := curves_of(task))}
+
+
+def with_learners(folder: Path) -> dict[str, dict[str, list[Curve]]]:
+    """Return the curves of PPO, of the rules and of other learners, by task and player.
+
+    Raises ValueError, in one line, if the folder has no card of a learner.
+    """
+    found: dict[str, dict[str, list[Curve]]] = {}
+    for name in ALGORITHMS:
+        for path in sorted((folder / name).glob("*-seed-*.json")):
+            card = read_card(path)
+            found.setdefault(card["task"], {}).setdefault(name, []).append(_columns(card))
+    if not found:
+        expected = "FOLDER/ALGO/TASK-seed-N.json, as agents.learn --seeds writes with --out FOLDER/ALGO"
+        raise ValueError(f"--learners {printable_path(folder)}: no card {expected}; ALGO: {', '.join(ALGORITHMS)}")
+    for task, learners in found.items():
+        curves = curves_of(task)
+        found[task] = {**{name: curves[name] for name in ("ppo", "rules") if name in curves}, **learners}
+    return {task: found[task] for task in TASKS if task in found}
 
 
 def _columns(card: Mapping[str, Any]) -> Curve:
@@ -72,10 +101,11 @@ def draw(path: Path, tasks: Mapping[str, Mapping[str, Sequence[Curve]]]) -> None
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    rows = -(-len(tasks) // ABREAST)
-    figure = Figure(figsize=(7.0 * ABREAST, 0.9 + 2.3 * rows), facecolor="white", layout="constrained")
+    abreast = min(ABREAST, len(tasks))
+    rows = -(-len(tasks) // abreast)
+    figure = Figure(figsize=(7.0 * abreast, 0.9 + 2.3 * rows), facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
-    grid = figure.subplots(rows, ABREAST * len(AXES), squeeze=False).ravel()
+    grid = figure.subplots(rows, abreast * len(AXES), squeeze=False).ravel()
     places = [(task, axis) for task in tasks for axis in AXES]
     for axes, (task, axis) in zip(grid, places, strict=False):
         _draw_task(axes, task, tasks[task], axis)
@@ -92,9 +122,9 @@ def draw(path: Path, tasks: Mapping[str, Mapping[str, Sequence[Curve]]]) -> None
 def _draw_task(axes: Axes, task: str, players: Mapping[str, Sequence[Curve]], axis: str) -> None:
     scale, bands = 1e-6 if axis == "steps" else 1.0, {name: band(curves, axis) for name, curves in players.items()}
     for name, (places, (low, middle, high)) in bands.items():
-        label = f"{name} ({len(players[name])})"
-        axes.plot(scale * places, middle, color=COLOUR[name], linewidth=1.6, label=label)
-        axes.fill_between(scale * places, low, high, color=COLOUR[name], alpha=0.25, linewidth=0)
+        label, colour = f"{name} ({len(players[name])})", COLOUR.get(name) or LEARNER_COLOUR[name]
+        axes.plot(scale * places, middle, color=colour, linewidth=1.6, label=label)
+        axes.fill_between(scale * places, low, high, color=colour, alpha=0.25, linewidth=0)
     axes.set_ylim(*_limits(players))
     axes.set_title(task, loc="left", fontsize=10, fontweight="bold", color=INK)
     axes.set_xlabel(AXES[axis], fontsize=8, color=FAINT)
@@ -116,11 +146,16 @@ def _limits(players: Mapping[str, Sequence[Curve]]) -> tuple[float, float]:
 
 
 @app.command()
-def main(out: Annotated[str, typer.Option(help="picture")] = "results/seed_curves.png") -> None:
+def main(
+    out: Annotated[str, typer.Option(help="picture")] = "results/seed_curves.png",
+    learners: Annotated[
+        Path | None, typer.Option(help="Folder with cards of other learners: ALGO/TASK-seed-N.json.")
+    ] = None,
+) -> None:
     """Draw the learning curves of all seeds that are there."""
     with one_line_errors():
         path = valid_file(out, (".png",), force=True)
-        draw(path, {task: curves for task in TASKS if (curves := curves_of(task))})
+        draw(path, _all_curves() if learners is None else with_learners(learners))
     typer.echo(f"{path}: written")
 
 

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from agents.seed_curves import Curve, _limits, app, band, curves_of
+from agents.seed_curves import LEARNER_COLOUR, Curve, _limits, app, band, curves_of, with_learners
 from flockenv import players
 from flockenv.players import WEIGHTS
 from flockenv.players.rules import TUNED
@@ -67,6 +67,31 @@ def test_the_curves_of_all_seeds_are_drawn(tmp_path: Path, monkeypatch: pytest.M
     for colour in ((0xD5, 0x5E, 0x00), (0x00, 0x72, 0xB2)):
         assert (colours == colour).all(axis=1).any(), "a line for each player"
     assert CliRunner().invoke(app, ["--out", "curves.jpg"]).exit_code == 2
+
+
+def test_other_learners_are_drawn_beside_ppo_and_rules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    card = json.loads((WEIGHTS / "pursuit.json").read_text())
+    for name, seed, less in (("sac", 0, 0.2), ("sac", 1, 0.2), ("bc", 0, 0.4)):  # no line hides another
+        path = tmp_path / "cards" / name / f"pursuit-seed-{seed}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        curve = [{**point, "mean": point["mean"] - less} for point in card["curve"]]
+        path.write_text(json.dumps({**card, "seed": seed, "curve": curve}))
+    found = with_learners(Path("cards"))
+    assert list(found) == ["pursuit"], "no other task"
+    assert {name: len(curves) for name, curves in found["pursuit"].items() if name not in ("ppo", "rules")} == {
+        "sac": 2, "bc": 1,
+    }  # fmt: skip
+    assert {"ppo", "rules"} < set(found["pursuit"])
+    run = CliRunner().invoke(app, ["--learners", "cards", "--out", "learners.png"])
+    assert run.exit_code == 0, run.output
+    with Image.open("learners.png") as picture:
+        colours = np.asarray(picture.convert("RGB")).reshape(-1, 3)
+    for colour in LEARNER_COLOUR["sac"], LEARNER_COLOUR["bc"]:
+        wanted = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
+        assert (np.abs(colours.astype(int) - wanted) <= 2).all(axis=1).any(), colour  # the file has a palette
+    none = CliRunner().invoke(app, ["--learners", "nowhere", "--out", "learners.png"])
+    assert none.exit_code == 2 and "--learners 'nowhere': no card FOLDER/ALGO/TASK-seed-N.json" in none.output
 
 
 def test_the_end_of_a_short_curve_is_shown() -> None:
