@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,6 +26,9 @@ MEANING = {"rules": "hand-written rules", "policy": "learned policy", "hybrid": 
 
 ABREAST = 2
 """Success rates in one line of a box."""
+
+MOST_LINES = 3
+"""Lines for a name or a value in a box of the summary."""
 
 LINE = 0.2
 """Height of a further line, inches."""
@@ -56,6 +60,8 @@ def draw_summary(path: Path, results: Sequence[TaskResults], title: str) -> None
     shared = list(
         dict.fromkeys((s.axis, s.value) for group in GROUPS[1:-1] for each in results for s in each.groups[group])
     )
+    axes_shared = list(dict.fromkeys(axis for axis, _ in shared))
+    shared.sort(key=lambda pair: axes_shared.index(pair[0]))  # values of an axis side by side
     own = [each.groups[GROUPS[-1]] for each in results]
     first = 1 + len(shared)
     wide = first + max(map(len, own), default=0) + 0.4
@@ -86,7 +92,9 @@ def _text(value: object) -> str:
 
 
 def _short(text: str, most: int = 17) -> str:
-    return "\n".join(line if len(line) <= most else line[: most - 1] + "…" for line in text.split("\n"))
+    """Return a text of few lines of at most `most` characters; what finds no room is cut."""
+    lines = (textwrap.fill(line, most, max_lines=MOST_LINES, placeholder=" …") for line in text.split("\n"))
+    return "\n".join(lines)
 
 
 def _lead(setting: SettingResults) -> str:
