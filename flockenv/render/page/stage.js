@@ -97,7 +97,7 @@ function arrange() {
     const rows = Math.ceil(n / columns);
     best = Math.max(best, Math.min((wide - gap * (columns - 1)) / columns, ((high - gap * (rows - 1)) / rows - around) * aspect));
   }
-  const least = Math.min(wide, 240), columns = Math.max(1, Math.floor((wide + gap) / (least + gap)));
+  const least = Math.min(wide, 180), columns = Math.max(1, Math.floor((wide + gap) / (least + gap)));
   if (best < least) best = (wide - gap * (Math.min(n, columns) - 1)) / Math.min(n, columns);
   panels.style.setProperty("--panel", Math.floor(best) + "px");
 }
