@@ -68,7 +68,7 @@ def test_a_replay_plays_and_stops(tmp_path: Path, visit: Callable[..., Visit], w
     here.page.keyboard.press("ArrowRight")
     assert here.value("state.time") > still
     here.page.keyboard.press("End")
-    assert here.value("document.querySelector('.outcome').textContent") == "captured at 3.9 s"
+    here.until("document.querySelector('.outcome').textContent === 'captured at 3.9 s'")  # once it is drawn
     colours = "new Set(new Uint32Array(views[0].canvas.getContext('2d').getImageData(0, 0, 200, 200).data.buffer)).size"
     assert here.value(colours) > 3
     assert here.value("document.documentElement.scrollWidth <= innerWidth")
