@@ -168,7 +168,7 @@ def test_a_page_sees_the_world_and_changes_it(server: PlayServer, session: Sessi
 def test_frames_go_on_while_an_edit_is_compiled(
     server: PlayServer, session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Messages are answered in order, unless one before them takes long; then that page is told so."""
+    """Messages are answered in order, unless one before them takes long; then that page gets a line about it."""
     assert session.room is not None
     compiled, lane = threading.Event(), session.room.lanes[0]
     monkeypatch.setattr(session.room, "prepare", lambda edit: edit.kind != "set" or compiled.wait(60))

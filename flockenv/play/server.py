@@ -121,7 +121,7 @@ class PlayServer:
             await asyncio.sleep(REST)
 
     async def _compile(self) -> None:
-        """Compile the steps of the open worlds if that is due; all pages are told if it takes long."""
+        """Compile the steps of the open worlds if that is due; all pages get a line if it takes long."""
         if self.session.is_compiled:
             return
         task = asyncio.ensure_future(self._aside(self.session.compile))
