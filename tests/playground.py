@@ -15,7 +15,7 @@ import pytest
 from flockenv.play.server import PlayServer
 from flockenv.play.session import Session
 
-__all__ = ["Visit", "browsing", "serving", "wait_for"]
+__all__ = ["Visit", "browsing", "digests_of", "serving", "wait_for"]
 
 ARGUMENTS = (
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
@@ -47,6 +47,16 @@ def serving(session: Session, host: str | None = None) -> Iterator[PlayServer]:
         loop.call_soon_threadsafe(task.cancel)
         thread.join(60)
         assert not thread.is_alive()
+
+
+def digests_of(server: PlayServer) -> tuple[str, ...]:
+    """Return the digests of a server's worlds in its own thread: a look moves a world ahead for a moment."""
+
+    def digests() -> tuple[str, ...]:
+        assert server.session.room is not None
+        return server.session.room.digests
+
+    return server._work.submit(digests).result(60)
 
 
 @contextmanager

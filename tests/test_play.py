@@ -19,7 +19,7 @@ from flockenv.play.history import EVERY, History
 from flockenv.play.link import LONGEST, read_link, write_link
 from flockenv.play.room import Room
 from flockenv.play.scene_lane import SceneLane
-from flockenv.play.task_lane import TaskLane, players_of
+from flockenv.play.task_lane import PlayerFiles, TaskLane, players_of
 from flockenv.scene import Scene
 from flockenv.scene.yaml_io import dump_scene, load_scene
 from flockenv.tasks import TASKS
@@ -352,6 +352,43 @@ def bomb() -> str:
     """Return a short link whose JSON is larger than what is read."""
     content = b'{"seed": 1, "lanes": [' + b" " * 10**7 + b"]}"
     return "1." + base64.urlsafe_b64encode(zlib.compress(content, 9)).decode().rstrip("=")
+
+
+SEES = """
+import numpy as np
+class Player:
+    def watch(self, world):
+        self.world = world
+    def predict(self, observation):
+        return np.full((len(observation), 2), self.world.state.pos[0, 0, 0] % 1, np.float32)
+"""
+
+
+def test_a_player_that_sees_the_state_sees_that_of_the_present_world(tmp_path: Path) -> None:
+    """Also when it is switched to, when other sensors make another world, and after going back over both."""
+    path = tmp_path / "sees.py"
+    path.write_text(SEES)
+    room = Room([TaskLane(TASKS["pursuit"](), "rules", 1, files=PlayerFiles((str(path),)))])
+    (lane,) = room.lanes
+    assert isinstance(lane, TaskLane)
+
+    def sees() -> bool:
+        x = float(lane.world.state.pos[0, 0, 0]) % 1
+        room.step(1)
+        return bool(np.allclose(lane.actions, np.float32(x)))
+
+    room.step(3)
+    room.edit(read_edit({"kind": "player", "learners": "all", "player": str(path)}))
+    assert sees()
+    room.edit(read_edit({"kind": "disturb", "noise": 0.1, "delay": 0, "dropped": 0.0}))
+    assert sees()
+    digest = lane.digest
+    room.seek(0)
+    room.seek(4)
+    assert sees() and lane.digest == digest
+    room.seek(2)
+    room.edit(read_edit({"kind": "player", "learners": "all", "player": str(path)}))
+    assert sees()
 
 
 def corrupted(change: Callable[[str], str]) -> str:

@@ -23,6 +23,7 @@ from flockenv.play.record_paths import with_item
 from flockenv.play.room import Room
 from flockenv.play.scene_lane import SceneLane
 from flockenv.play.session import Session
+from flockenv.play.task_lane import TaskLane
 from flockenv.scene import Scene
 from flockenv.scene.yaml_io import load_scene
 from flockenv.tasks import TASKS
@@ -108,6 +109,21 @@ def test_pages_learn_of_other_agents_also_when_time_goes_past_an_edit() -> None:
     assert session.version != gone and room.lanes[0].record.agents == agents + 2
 
 
+def test_the_saved_text_of_a_task_is_loaded_into_that_task_with_its_players() -> None:
+    session = Session()
+    session.open_task(TASKS["pursuit"](size=12), ("rules", "ppo"), seed=3)
+    saved = ask(session, type="save")
+    assert saved["note"] == "The arguments of the task pursuit, whose defaults are left out."
+    ask(session, type="load", yaml=saved["text"].replace("12", "14"))
+    assert session.room is not None
+    assert [lane.record for lane in session.room.lanes] == 2 * [TASKS["pursuit"](size=14)]
+    assert [lane.players[0] for lane in session.room.lanes if isinstance(lane, TaskLane)] == ["rules", "ppo"]
+    assert session.room.lanes[0].seed == 3
+    with pytest.raises(ValueError, match="^text:1: space = .*: unknown key"):
+        ask(session, type="load", yaml=TINY)
+    assert session.room.lanes[0].record == TASKS["pursuit"](size=14)
+
+
 def test_pages_learn_of_other_players() -> None:
     session = Session()
     session.open_task(TASKS["pursuit"](), ("rules",))
@@ -144,7 +160,7 @@ def test_a_saved_text_is_the_record_and_tells_what_it_lacks() -> None:
     session.edit(edit(kind="move_agent", agent=0, pos=[1.0, 1.0]))
     saved = ask(session, type="save")
     assert load_scene(saved["text"]) == room.lanes[0].record
-    assert saved["notes"] == ["1 changes of this run, such as moved agents, are not in the YAML; a link has them."]
+    assert saved["note"] == "1 changes of this run, such as moved agents, are not in the YAML; a link has them."
 
 
 def test_two_time_steps_are_compared_side_by_side() -> None:

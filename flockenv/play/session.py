@@ -184,10 +184,16 @@ class Session:
 
     def _load(self, message: m.Load) -> Rest:
         from flockenv.play.gallery import description_of
-        from flockenv.scene.yaml_io import load_scene
+        from flockenv.scene.yaml_io import load, load_scene
 
-        scene = load_scene(message.yaml + "\n")  # with a line break it is a text, never the name of a file
+        text = message.yaml + "\n"  # with a line break it is a text, never the name of a file
         seed = self.room.lanes[0].seed if self.room is not None else 0
+        lanes = self.room.lanes if self.room is not None else ()
+        if lanes and isinstance(lanes[0], TaskLane):  # the text of a task does not name it
+            task = load(text, type(lanes[0].record))
+            players = [lane.players[0] for lane in lanes if isinstance(lane, TaskLane)]
+            return self._ready(self._room_of(task, players, seed), task.name, _about(task))
+        scene = load_scene(text)
         return self._ready(Room((SceneLane(scene, seed),)), self.name or "scene", description_of(message.yaml))
 
     def _link(self, message: m.LinkMessage) -> Rest:
@@ -347,10 +353,13 @@ class Session:
         record = room.lanes[0].record
         text = dump_scene(record, brief=True) if isinstance(record, Scene) else dump(record, brief=True)
         outside = sum(made.edit.kind not in OF_RECORD for made in room.made)
-        notes = []
         if outside:
-            notes.append(f"{outside} changes of this run, such as moved agents, are not in the YAML; a link has them.")
-        return [{"type": "yaml", "text": text, "notes": notes}]
+            note = f"{outside} changes of this run, such as moved agents, are not in the YAML; a link has them."
+        elif isinstance(record, Scene):
+            note = f"flockenv run FILE --seed {room.lanes[0].seed} gives the same numbers, bit for bit."
+        else:
+            note = f"The arguments of the task {record.name}, whose defaults are left out."
+        return [{"type": "yaml", "text": text, "note": note}]
 
     def _share(self, message: m.Share) -> list[Answer]:
         from flockenv.play.link import write_link

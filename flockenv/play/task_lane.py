@@ -136,6 +136,10 @@ class TaskLane:
         self._action = np.zeros(self.world.action_size, np.float32)
         self.actions = np.zeros((task.learners, self.world.action_size), np.float32)
         """Actions of the last decision, (L, A)."""
+        self._show_world()
+
+    def _show_world(self) -> None:
+        """Let players that see the state, such as planners, see that of the present world."""
         for policy in self._policies.values():
             if hasattr(policy, "watch"):
                 policy.watch(self.world)
@@ -286,6 +290,7 @@ class TaskLane:
         fits = {k: v for k, v in arrays.items() if k in own and own[k].shape == v.shape}
         world.restore({**own, **fits})
         self.world = world
+        self._show_world()
         self._observe()
 
     def _observe(self) -> None:
@@ -305,6 +310,7 @@ class TaskLane:
         self.players = tuple(players)
         for name in changed:
             self.states.pop(name, None)  # its rows are those of other learners
+        self._show_world()
         return Change(in_record=False, notices=notices)
 
     def _steer(self, edit: Input) -> Change:
@@ -391,6 +397,7 @@ class TaskLane:
         self.states = copy.deepcopy(dict(keyframe.states))
         self._action, self.actions = keyframe.action, keyframe.actions
         self.tick, self.stopped = keyframe.tick, keyframe.stopped
+        self._show_world()
         self._observe()
 
     @property

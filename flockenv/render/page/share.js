@@ -18,10 +18,10 @@ function openDialog(title, ...parts) {
   return row;
 }
 
-function showYaml({ text, notes }) {
+function showYaml({ text, note }) {
   const area = element("textarea", text);
   area.spellcheck = false; area.value = text; area.setAttribute("aria-label", "the record as YAML");
-  const about = element("p", notes && notes.length ? notes.join(" ") : `flockenv run FILE --seed ${live.room.seed} gives the same numbers, bit for bit.`, "lead");
+  const about = element("p", note, "lead");
   const row = openDialog("Save", about, area);
   const act = (name, run) => { const button = element("button", name); button.onclick = run; row.prepend(button); };
   act("Replay …", () => beginRecording("replay"));
