@@ -12,12 +12,14 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from flockenv.core.magnitudes import check_array
 from flockenv.core.record import Record
 from flockenv.model.snapshot import Mark, Snapshot
 from flockenv.model.state import State
-from flockenv.play.edits import Edit
+from flockenv.play.edits import Edit, MoveAgent
+from flockenv.scene import Scene
 
-__all__ = ["Change", "Drawn", "Keyframe", "Lane", "Scenery", "circles_of", "collected_warnings"]
+__all__ = ["Change", "Drawn", "Keyframe", "Lane", "Scenery", "circles_of", "collected_warnings", "move_agent"]
 
 Floats = NDArray[np.floating[Any]]
 
@@ -128,6 +130,21 @@ class Lane(Protocol):
 
     def snapshot(self) -> Snapshot:
         """Return the world at this instant, with all that is drawn."""
+
+
+def move_agent(scene: Scene, state: State, edit: MoveAgent) -> None:
+    """Put an agent of a state elsewhere; raise ValueError, in one line, before anything changes if there is none."""
+    if edit.agent >= scene.agents or not state.alive[0, edit.agent]:
+        raise ValueError(f"agent = {edit.agent}: there is no such living agent among {scene.agents}")
+    for name, value in (("pos", edit.pos), ("vel", edit.vel)):
+        if value is not None and len(value) != scene.dimension:
+            raise ValueError(f"{name} = {value}: must have {scene.dimension} numbers")
+        if value is not None:
+            check_array(name, np.array(value, float).reshape(1, 1, -1), scene.dtype)
+    state.pos[0, edit.agent] = scene.space.wrap(edit.pos)
+    if edit.vel is not None:
+        state.vel[0, edit.agent] = edit.vel
+        state.face()
 
 
 def circles_of(state: State) -> Floats:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from flockenv import steering
 from flockenv.core.errors import printable
-from flockenv.core.magnitudes import check_array
 from flockenv.core.record import Record
 from flockenv.model.snapshot import Snapshot, shades_of
 from flockenv.model.state import Floats, State
@@ -29,7 +28,7 @@ from flockenv.play.edits import (
     RemoveObstacle,
     Set,
 )
-from flockenv.play.lane import Change, Drawn, Scenery, circles_of, collected_warnings
+from flockenv.play.lane import Change, Drawn, Scenery, circles_of, collected_warnings, move_agent
 from flockenv.play.record_paths import value_at, with_item, with_value, without_item
 from flockenv.play.scene_changes import adapted, begins_otherwise, have_same_code, rows_after
 from flockenv.scene import Scene
@@ -226,18 +225,7 @@ class SceneLane:
         return ()
 
     def _move(self, edit: MoveAgent) -> Change:
-        scene = self.record
-        if edit.agent >= scene.agents or not self.state.alive[0, edit.agent]:
-            raise ValueError(f"agent = {edit.agent}: there is no such living agent among {scene.agents}")
-        for name, value in (("pos", edit.pos), ("vel", edit.vel)):
-            if value is not None and len(value) != scene.dimension:
-                raise ValueError(f"{name} = {value}: must have {scene.dimension} numbers")
-            if value is not None:
-                check_array(name, np.array(value, float).reshape(1, 1, -1), scene.dtype)
-        self.state.pos[0, edit.agent] = scene.space.wrap(edit.pos)
-        if edit.vel is not None:
-            self.state.vel[0, edit.agent] = edit.vel
-            self.state.face()
+        move_agent(self.record, self.state, edit)
         self.stopped = ""
         return Change(in_record=False)
 

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.core.errors import nearest, printable
-from flockenv.core.magnitudes import check_array
 from flockenv.core.record import Record
 from flockenv.envs.disturbance import Disturbance, make_world
 from flockenv.envs.world import World, first_step
@@ -29,7 +28,7 @@ from flockenv.play.edits import (
     RemoveObstacle,
     Set,
 )
-from flockenv.play.lane import Change, Drawn, Scenery, circles_of, collected_warnings
+from flockenv.play.lane import Change, Drawn, Scenery, circles_of, collected_warnings, move_agent
 from flockenv.play.record_paths import with_value
 from flockenv.players import NAMES, known_name, load_player
 from flockenv.players.policy import RandomPolicy
@@ -328,18 +327,7 @@ class TaskLane:
         return Change(in_record=False)
 
     def _move(self, edit: MoveAgent) -> Change:
-        scene, state = self.record.scene, self.world.state
-        if edit.agent >= scene.agents or not state.alive[0, edit.agent]:
-            raise ValueError(f"agent = {edit.agent}: there is no such living agent among {scene.agents}")
-        for name, value in (("pos", edit.pos), ("vel", edit.vel)):
-            if value is not None and len(value) != scene.dimension:
-                raise ValueError(f"{name} = {value}: must have {scene.dimension} numbers")
-            if value is not None:
-                check_array(name, np.array(value, float).reshape(1, 1, -1), scene.dtype)
-        state.pos[0, edit.agent] = scene.space.wrap(edit.pos)
-        if edit.vel is not None:
-            state.vel[0, edit.agent] = edit.vel
-            state.face()
+        move_agent(self.record.scene, self.world.state, edit)
         self._observe()
         return Change(in_record=False)
 
