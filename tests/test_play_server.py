@@ -9,6 +9,7 @@ import json
 import logging
 import random
 import re
+import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -20,6 +21,7 @@ websockets = pytest.importorskip("websockets", reason="needs the extra `play`: p
 from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
 from websockets.sync.client import ClientConnection, connect  # noqa: E402
 
+from flockenv.cli.main import main  # noqa: E402
 from flockenv.model.group import Group  # noqa: E402
 from flockenv.model.spawn import Spawn  # noqa: E402
 from flockenv.play import messages  # noqa: E402
@@ -372,3 +374,21 @@ def test_messages_are_read() -> None:
 @pytest.fixture(autouse=True)
 def _log_level(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.WARNING, "flockenv.play")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (("--port", "{taken}"), "--port = {taken}: "), (("--host", "no.such.host.invalid", "--port", "0"), "--host = "),
+        (("pursuitt",), "no such task, did you mean `pursuit`"), (("--players", "ppo"), "--players: needs a task"),
+        (("pursuit", "--players", "rulez"), "did you mean `rules`"),
+    ],
+)  # fmt: skip
+def test_the_command_refuses_in_one_line(
+    arguments: tuple[str, ...], line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        taken = other.getsockname()[1]
+        assert main(["play", "--no-browser", *(each.format(taken=taken) for each in arguments)]) == 2
+    shown = capsys.readouterr()
+    assert line.format(taken=taken) in shown.err and shown.err.count("\n") == 1 and not shown.out

@@ -119,7 +119,7 @@ def test_the_saved_text_of_a_task_is_loaded_into_that_task_with_its_players() ->
     assert [lane.record for lane in session.room.lanes] == 2 * [TASKS["pursuit"](size=14)]
     assert [lane.players[0] for lane in session.room.lanes if isinstance(lane, TaskLane)] == ["rules", "ppo"]
     assert session.room.lanes[0].seed == 3
-    with pytest.raises(ValueError, match="^text:1: space = .*: unknown key"):
+    with pytest.raises(ValueError, match=r"^text:1: space = .*: unknown key"):
         ask(session, type="load", yaml=TINY)
     assert session.room.lanes[0].record == TASKS["pursuit"](size=14)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import logging
 import sys
 import webbrowser
@@ -14,6 +15,7 @@ import typer
 from flockenv.cli.options import TrustPickle
 from flockenv.cli.targets import complete_target, is_scene_file
 from flockenv.cli.terminal import Seed
+from flockenv.core.errors import printable
 
 if TYPE_CHECKING:
     from flockenv.play.session import Session
@@ -55,7 +57,10 @@ def play(
     try:
         asyncio.run(_serve(session, host, port, no_browser))
     except OSError as error:
-        raise ValueError(f"--port = {port}: {error.strerror or error}; give another, 0 for any that is free") from None
+        reason = error.strerror or error
+        if host is not None and error.errno not in (errno.EADDRINUSE, errno.EACCES):
+            raise ValueError(f"--host = {printable(host)}: {reason}; must be an address of this machine") from None
+        raise ValueError(f"--port = {port}: {reason}; give another, 0 for any that is free") from None
 
 
 def _session(files: tuple[str, ...], trust_pickle: bool) -> Session:
