@@ -473,8 +473,8 @@ def test_accuracy_of_a_scene_on_the_command_line(in_a_folder: Path, capsys: pyte
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        ("accuracy", "needs either a SCENE.yaml or --suite"),
-        ("accuracy tiny.yaml --suite", "either a SCENE.yaml or --suite"),
+        ("accuracy", "needs either a SCENE or --suite"),
+        ("accuracy tiny.yaml --suite", "either a SCENE or --suite"),
         ("accuracy --suite --seconds 2", "--suite: has its own horizons"),
         ("accuracy --suite --problems keppler", "did you mean `kepler`"),
         ("accuracy tiny.yaml --problems kepler", "--problems: needs --suite"),

@@ -24,6 +24,7 @@ from typer.testing import CliRunner
 import flockenv.studies.stress
 from flockenv.cli import terminal
 from flockenv.cli.main import app, main
+from flockenv.cli.targets import complete_scene, is_scene
 from flockenv.model.networks import Rope
 from flockenv.model.state import State
 from flockenv.physics.effects import EFFECTS
@@ -643,7 +644,7 @@ def test_interrupted_stress_writes_its_findings(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("run", "Missing argument 'SCENE.yaml'"),
+        ("run", "Missing argument 'SCENE'"),
         ("rnu tiny.yaml", "No such command 'rnu'. Did you mean 'run'?"),
         ("run tiny.yaml --sede 1", "No such option: --sede"),
         ("run tinny.yaml", "tinny.yaml: no such file, did you mean `tiny.yaml`?"),
@@ -684,6 +685,8 @@ def test_interrupted_stress_writes_its_findings(
         ("render pursuit --out x.gif --duration 3", "--duration = 3: only for scenes"),
         ("render tiny.yaml --out x.gif --size 1", "Invalid value for '--size'"),
         ("explain nothing.yaml", "nothing.yaml: no such file"),
+        ("run boidz", "boidz: no such file, did you mean `boids`?"),
+        ("render boidz --out x.gif", "'boidz': no such task, did you mean `boids`?"),
         ("render tinny.YAML --out x.png", "tinny.YAML: no such file, did you mean `tiny.yaml`?"),
         ("warmup tinny.YML", "tinny.YML: no such file, did you mean `tiny.yaml`?"),
         ("warmup pursiut", "'pursiut': no such task, did you mean `pursuit`? ("),
@@ -711,6 +714,17 @@ def test_every_command_on_a_scene_reads_standard_input(command: str, monkeypatch
     monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(TINY.encode())))
     assert main(command.split()) == 0
     assert "a.html" not in command or "<title>standard input</title>" in Path("a.html").read_text()
+
+
+def test_a_scene_that_ships_is_read_by_name_and_a_file_of_that_name_comes_first(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert load_scene("boids") == load_scene(ROOT / "configs" / "scenes" / "boids.yaml") == load_scene(Path("boids"))
+    assert is_scene("boids") and not is_scene("pursuit") and complete_scene("cloth_") == ["cloth_on_ball"]
+    assert main(["run", "newtons_cradle", "--duration", "0"]) == 0
+    assert " agents, 0 steps of " in capsys.readouterr().out
+    Path("boids").write_text(TINY)
+    assert load_scene("boids").agents == 4
 
 
 def test_error_in_a_scene_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:

@@ -30,9 +30,9 @@ README_TEST = (
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a wheel built from a copy, so that no build/ or egg-info is left in the repository; needs no network."""
     source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
-    for name in ("flockenv", "agents", "configs", "tests"):
+    for name in ("flockenv", "agents", "configs", "docs", "tests"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
     build = f"from setuptools import build_meta; build_meta.build_wheel({str(target)!r})"
     done = subprocess.run([sys.executable, "-c", build], cwd=source, capture_output=True, text=True, check=False)
@@ -44,7 +44,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 FOLDERS = (".ci", "agents", "benchmarks", "configs", "docs", "flockenv", "tests")
 FILES = (
     "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "MANIFEST.in", "README.md", "pyproject.toml",
-    ".gitignore", ".pre-commit-config.yaml",
+    "setup.py", ".gitignore", ".pre-commit-config.yaml",
 )  # fmt: skip
 """Folders and files of the repository."""
 
@@ -82,8 +82,9 @@ def test_the_wheel_contains_flockenv_alone(wheel: Path) -> None:
     seeds = (ROOT / "flockenv" / "players" / "weights" / "seeds").glob("*")
     files |= {f"players/weights/seeds/{path.name}" for path in seeds}
     files |= {f"players/tuned/{task}.json" for task in TASKS} | {"py.typed"}
-    for folder in ("render/page", "play/shipped"):
+    for folder in ("render/page", "play/pictures"):
         files |= {f"{folder}/{path.name}" for path in (ROOT / "flockenv" / folder).iterdir()}
+    files |= {f"scenes/{path.name}" for path in (ROOT / "configs" / "scenes").glob("*.yaml")}
     assert {name for name in names if name.startswith("flockenv/")} == sources | {f"flockenv/{f}" for f in files}
     assert wheel.stat().st_size < 5_000_000
     assert any(name.endswith("licenses/LICENSE") for name in names)
@@ -131,10 +132,60 @@ def test_the_base_dependencies_do_not_include_torch(metadata: Message) -> None:
     assert "gymnasium<2,>=1.2" in needed
 
 
-def test_the_wheel_works_without_the_checkout(wheel: Path, tmp_path: Path) -> None:
-    """Files that are not Python code are found in it."""
+def test_links_and_pictures_of_the_description_are_absolute(metadata: Message) -> None:
+    """On a registry's page there is no repository beside the README."""
+    text, tree = str(metadata.get_payload(decode=True), "utf-8"), f"{PROJECT['urls']['Repository']}/"
+    assert metadata["Description-Content-Type"] == "text/markdown"
+    pictures, links = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text), re.findall(r"(?<!!)\[[^\]]*\]\(([^)]+)\)", text)
+    version = f"v{PROJECT['version']}"
+    assert len(pictures) > 3 and all(each.startswith(f"{tree}raw/{version}/") for each in pictures)
+    assert len(links) > 20 and all(each.startswith(("https://", "#")) for each in links)
+    assert f"{tree}blob/{version}/docs/play.md" in links and f"{tree}tree/{version}/configs/scenes" in links
+    assert re.sub(rf"\({re.escape(tree)}(raw|blob|tree)/{re.escape(version)}/", "(", text).strip() == (
+        (ROOT / "README.md").read_text(encoding="utf-8").strip()
+    )
+
+
+def test_the_metadata_has_the_addresses_of_the_project(metadata: Message) -> None:
+    urls = dict(line.split(", ") for line in metadata.get_all("Project-URL") or [])
+    assert {"Homepage", "Repository", "Documentation", "Issues", "Changelog"} <= urls.keys()
+    assert f'repository-code: "{urls["Repository"]}"' in (ROOT / "CITATION.cff").read_text()
+
+
+@pytest.fixture(scope="module")
+def site(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the wheel's content, as installed."""
+    folder = tmp_path_factory.mktemp("site")
     with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(tmp_path / "site")
+        archive.extractall(folder)
+    return folder
+
+
+def run_installed(site: Path, code: str, folder: Path) -> str:
+    """Run code in an empty folder with the installed flockenv; return what it prints."""
+    env = {**os.environ, "PYTHONPATH": str(site), "PYTHONSAFEPATH": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, env=env, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_scenes_of_the_wheel_are_read_by_name(site: Path, tmp_path: Path) -> None:
+    code = (
+        "from flockenv.core.bundled import bundled_scenes; from flockenv.scene.yaml_io import load_scene;"
+        "from pathlib import Path; import flockenv;"
+        "home = Path(flockenv.__file__).parent / 'scenes';"
+        "assert all(path.parent == home for path in bundled_scenes().values()), bundled_scenes();"
+        "print(*bundled_scenes()); assert load_scene('boids').agents == 300;"
+        "from flockenv.cli.main import main; assert main(['run', 'particles', '--duration', '0']) == 0"
+    )
+    names = run_installed(site, code, tmp_path).splitlines()[0].split()
+    assert names == sorted(path.stem for path in (ROOT / "configs" / "scenes").glob("*.yaml"))
+
+
+def test_the_wheel_works_without_the_checkout(site: Path, tmp_path: Path) -> None:
+    """Files that are not Python code are found in it."""
     code = (
         "import flockenv, gymnasium, pettingzoo, importlib.resources as r; from flockenv.cli.main import main;"
         "assert gymnasium.spec('flockenv/Pursuit-v0') and 'flockenv/Flock-v1' in pettingzoo.parallel_registry;"
@@ -145,12 +196,7 @@ def test_the_wheel_works_without_the_checkout(wheel: Path, tmp_path: Path) -> No
         "assert load_player('rules', task).rules != load_player('textbook', task).rules;"
         "assert main(['list']) == 0; print(flockenv.__file__)"
     )
-    env = {**os.environ, "PYTHONPATH": str(tmp_path / "site"), "PYTHONSAFEPATH": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env=env, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1].startswith(str(tmp_path / "site"))
+    assert run_installed(site, code, tmp_path).splitlines()[-1].startswith(str(site))
 
 
 def test_the_version_is_the_same_in_all_files(metadata: Message) -> None:
@@ -199,6 +245,7 @@ def test_the_top_level_contains_only_allowed_files_and_folders() -> None:
     tops = {line.split("/")[0] for line in done.stdout.splitlines()}
     allowed = {
         *("pyproject.toml", "README.md", "LICENSE", "CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff", "MANIFEST.in"),
+        "setup.py",
         *("flockenv", "agents", "configs", "tests", "docs", "benchmarks"),
     }
     assert {top for top in tops if not top.startswith(".")} <= allowed

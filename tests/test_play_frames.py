@@ -190,7 +190,7 @@ def test_the_gallery_has_all_scenes_and_tasks() -> None:
     listed = {entry.name: entry for entry in entries()}
     assert listed.keys() == {*configs, *TASKS}
     for name, text in configs.items():
-        assert text_of(name) == text, "python -m flockenv.play.gallery boids"
+        assert text_of(name) == text
         about = listed[name].description
         assert len(about) > 20 and about.endswith(".") and about[0].isupper()
         assert "flockenv " not in about and "yaml-language" not in about

@@ -28,7 +28,7 @@ from flockenv.cli.measure import measure
 from flockenv.cli.options import Debug, Delay, Dropped, Noise, Reach, Seen, TrustPickle
 from flockenv.cli.play import play
 from flockenv.cli.studies import accuracy, experiment, gallery, stress
-from flockenv.cli.targets import complete_target, is_scene_file
+from flockenv.cli.targets import SceneFile, complete_target, is_scene
 from flockenv.cli.terminal import (
     DIVERGED,
     INTERRUPTED,
@@ -77,9 +77,6 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-SceneFile = Annotated[
-    str, typer.Argument(metavar="SCENE.yaml", help="A scene, - for standard input; see `flockenv schema` and configs/.")
-]
 Duration = Annotated[float, typer.Option(metavar="S", help="Simulated time in seconds, a whole multiple of dt.")]
 
 
@@ -155,7 +152,7 @@ def _define_options(
 
 @app.command("list")
 def listing() -> None:
-    """List tasks with their ids, effects, behaviours, integrators, emitters, sinks and spaces, with a sentence each."""
+    """List tasks with their ids, scenes, effects, behaviours, methods, emitters, sinks and spaces, a sentence each."""
     import gymnasium
     import pettingzoo
 
@@ -164,6 +161,7 @@ def listing() -> None:
     from flockenv.physics.effects import EFFECTS
     from flockenv.physics.integrators import INTEGRATORS
     from flockenv.physics.population import POPULATION
+    from flockenv.play.gallery import entries
     from flockenv.steering.arbitration import ARBITRATIONS
     from flockenv.tasks import TASKS
 
@@ -173,6 +171,8 @@ def listing() -> None:
     show_table(console, "Tasks", ((name, _first_sentence(task)) for name, task in TASKS.items()))
     show_table(console, "gymnasium.make, gymnasium.make_vec", ((env_id, "one learner") for env_id in single))
     show_table(console, 'pettingzoo.make("parallel" or "aec", ...)', ((env_id, "many learners") for env_id in many))
+    scenes = ((each.name, _sentence_of(each.description)) for each in entries() if each.kind == "scene")
+    show_table(console, "Scenes", sorted(scenes))
     effects = {kind: effect for kind, effect in EFFECTS.items() if kind not in BEHAVIOURS}
     show_table(console, "Effects", ((kind, _first_sentence(effect)) for kind, effect in sorted(effects.items())))
     show_table(console, "Behaviours", ((kind, _first_sentence(effect)) for kind, effect in sorted(BEHAVIOURS.items())))
@@ -225,8 +225,8 @@ def render(
     what: Annotated[
         str,
         typer.Argument(
-            metavar="SCENE.yaml|TASK",
-            help="A scene file (- for standard input), or a task from `flockenv list`.",
+            metavar="SCENE|TASK",
+            help="A scene or task of `flockenv list`, or a scene file (- for standard input).",
             autocompletion=complete_target,
         ),
     ],
@@ -261,7 +261,7 @@ def render(
 
     path = valid_file(out, PICTURES, force)
     disturbance = Disturbance(noise=noise, delay=delay, dropped=dropped, range=reach, seen=seen)
-    if is_scene_file(what):
+    if is_scene(what):
         if disturbance:
             raise ValueError(
                 "--noise, --delay, --dropped, --range, --seen: for tasks only; in a scene no player observes"
@@ -322,8 +322,8 @@ def warmup(
     what: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="TASK|SCENE.yaml",
-            help="What to compile; - for a scene from standard input.",
+            metavar="TASK|SCENE",
+            help="What to compile: names of `flockenv list`, or scene files; - for a scene from standard input.",
             show_default="every task",
             autocompletion=complete_target,
         ),
@@ -346,7 +346,7 @@ def warmup(
     change = {} if dtype is None else {"dtype": dtype}
     jobs: list[tuple[str, Callable[[], None]]] = []
     for name in names:
-        if is_scene_file(name):
+        if is_scene(name):
             scene = load_scene(Path(name)).model_copy(update=change)
             jobs.append((name, functools.partial(_first_step_of_scene, scene)))
         else:
@@ -384,7 +384,11 @@ def schema() -> None:
 
 def _first_sentence(kind: type) -> str:
     """Return the first sentence of a class's docstring."""
-    text = " ".join((kind.__doc__ or "").split("\n\n")[0].split())
+    return _sentence_of(" ".join((kind.__doc__ or "").split("\n\n")[0].split()))
+
+
+def _sentence_of(text: str) -> str:
+    """Return the first sentence of a text."""
     found = re.match(r".*?\.(?=\s+[A-Z]|$)", text)
     return found[0] if found else text
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from flockenv.cli.targets import SceneFile
 from flockenv.cli.terminal import (
     DIVERGED,
     INTERRUPTED,
@@ -45,7 +46,7 @@ ABOVE_CHANCE = {"lanes": "lanes by chance", "burst length": "burst length by cha
 
 
 def measure(
-    scene: Annotated[str, typer.Argument(metavar="SCENE.yaml", help="A scene; see `flockenv schema` and configs/.")],
+    scene: SceneFile,
     time: Annotated[float, typer.Option(metavar="S", help="Simulated time in seconds, a whole multiple of dt.")] = 30.0,
     skip: Annotated[float, typer.Option(metavar="S", help="Seconds at the beginning that are left out.")] = 0.0,
     line: Annotated[

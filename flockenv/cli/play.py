@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flockenv.cli.options import TrustPickle
-from flockenv.cli.targets import complete_target, is_scene_file
+from flockenv.cli.targets import complete_target, is_scene
 from flockenv.cli.terminal import Seed
+from flockenv.core.bundled import bundled_scenes
 from flockenv.core.errors import printable
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ def play(
     what: Annotated[
         str | None,
         typer.Argument(
-            metavar="SCENE.yaml|TASK", help="A scene file (- for standard input), or a task from `flockenv list`.",
+            metavar="SCENE|TASK", help="A scene or task of `flockenv list`, or a scene file (- for standard input).",
             show_default="a gallery of all", autocompletion=complete_target,
         ),
     ] = None,
@@ -81,14 +82,15 @@ def _open(session: Session, what: str | None, players: tuple[str, ...], seed: in
         if players:
             raise ValueError("--players: needs a task, such as `flockenv play pursuit --players rules,ppo`")
         return
-    if is_scene_file(what):
+    if is_scene(what):
         from flockenv.core.yaml_paths import title_of
         from flockenv.play.gallery import description_of
         from flockenv.scene.yaml_io import load_scene
 
         if players:
             raise ValueError(f"--players: a scene such as {what} has none; tasks have")
-        about = description_of(Path(what).read_text(encoding="utf-8")) if Path(what).is_file() else ""
+        file = Path(what) if Path(what).is_file() else bundled_scenes().get(what)
+        about = description_of(file.read_text(encoding="utf-8")) if file is not None else ""
         session.open_scene(load_scene(Path(what)), title_of(what), seed, about)
         return
     from flockenv.tasks import TASKS

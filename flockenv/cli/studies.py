@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flockenv.cli.jobs import EngineName, Processes
+from flockenv.cli.targets import complete_scene
 from flockenv.cli.terminal import (
     INTERRUPTED,
     EarlyEnd,
@@ -56,7 +57,14 @@ INTERRUPTED_LATER = "interrupted; results so far are shown"
 
 
 def accuracy(
-    scenes: Annotated[list[str] | None, typer.Argument(metavar="SCENE.yaml", help="Scenes; not with --suite.")] = None,
+    scenes: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="SCENE",
+            help="Scenes of `flockenv list`, or files; not with --suite.",
+            autocompletion=complete_scene,
+        ),
+    ] = None,
     suite: Annotated[bool, typer.Option("--suite", help="Measure the built-in problems instead.")] = False,
     problems: Annotated[
         str, typer.Option(metavar="A,B", help="Only these problems of the suite.", show_default="all")
@@ -138,7 +146,7 @@ def _problem_makers(
     from flockenv.studies.accuracy import select_problems
 
     if suite == bool(scenes):
-        raise ValueError("accuracy: needs either a SCENE.yaml or --suite")
+        raise ValueError("accuracy: needs either a SCENE or --suite")
     if suite and (seconds is not None or steps or dts):
         raise ValueError("--suite: has its own horizons and steps; --seconds, --steps and --dts are for scenes")
     if problems and not suite:

@@ -1,7 +1,6 @@
 """Gallery: the scenes and tasks that ship with flockenv, with pictures, to be opened in the playground.
 
-Scenes of an installed flockenv are in the folder `shipped` beside this file: copies of configs/scenes, and pictures.
-To update them after a change: python -m flockenv.play.gallery [NAME ...]
+Pictures are in the folder `pictures` beside this file. To draw them anew: python -m flockenv.play.gallery [NAME ...]
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flockenv.core.bundled import bundled_scenes
 from flockenv.core.errors import nearest, printable
 from flockenv.scene import Scene
 from flockenv.scene.yaml_io import load_scene
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Entry", "description_of", "entries", "read_entry", "text_of"]
 
-SHIPPED = files("flockenv.play").joinpath("shipped")
+PICTURES = files("flockenv.play").joinpath("pictures")
 
 WIDTH = 420
 """Width of a picture, pixels."""
@@ -65,8 +65,8 @@ class Entry:
 @functools.cache
 def entries() -> tuple[Entry, ...]:
     """Return all scenes and tasks that ship, by family."""
-    order = [*FIRST_NAMES, *sorted(set(_scene_names()) - set(FIRST_NAMES))]
-    scenes = [_scene_entry(name) for name in order if name in _scene_names()]
+    order = [*FIRST_NAMES, *sorted(set(bundled_scenes()) - set(FIRST_NAMES))]
+    scenes = [_scene_entry(name) for name in order if name in bundled_scenes()]
     tasks = [_task_entry(name, task) for name, task in TASKS.items()]
     return tuple(sorted([*scenes, *tasks], key=lambda entry: LISTED.index(entry.family)))
 
@@ -80,16 +80,10 @@ def read_entry(name: str) -> Scene | Task:
 
 def text_of(name: str) -> str:
     """Return the YAML of a scene that ships; raise ValueError, with the nearest name, for another one."""
-    if name not in _scene_names():
-        known = (*_scene_names(), *TASKS)
+    if name not in bundled_scenes():
+        known = (*bundled_scenes(), *TASKS)
         raise ValueError(f"open = {printable(name)}: unknown{nearest(name, known) or ';'} allowed: {', '.join(known)}")
-    return SHIPPED.joinpath(f"{name}.yaml").read_text(encoding="utf-8")
-
-
-@functools.cache
-def _scene_names() -> tuple[str, ...]:
-    names = (item.name for item in SHIPPED.iterdir())
-    return tuple(sorted(name.removesuffix(".yaml") for name in names if name.endswith(".yaml")))
+    return bundled_scenes()[name].read_text(encoding="utf-8")
 
 
 def _scene_entry(name: str) -> Entry:
@@ -132,14 +126,14 @@ def _words(text: str) -> str:
 
 
 def _picture(name: str) -> bytes | None:
-    path = SHIPPED.joinpath(f"{name}.png")
+    path = PICTURES.joinpath(f"{name}.png")
     return path.read_bytes() if path.is_file() else None
 
 
-# --- making the folder ------------------------------------------------------------------------------------------------
+# --- drawing pictures -------------------------------------------------------------------------------------------------
 
 
-def _films(root: Path, name: str) -> Iterator[Snapshot]:
+def _films(name: str) -> Iterator[Snapshot]:
     """Yield the last moments of a scene or task, the last one at the end."""
     from flockenv.play.scene_lane import SceneLane
     from flockenv.play.task_lane import TaskLane
@@ -148,7 +142,7 @@ def _films(root: Path, name: str) -> Iterator[Snapshot]:
         lane: SceneLane | TaskLane = TaskLane(TASKS[name](), "rules", 1)
         ticks = 60
     else:
-        text = (root / "configs" / "scenes" / f"{name}.yaml").read_text(encoding="utf-8")
+        text = text_of(name)
         lane = SceneLane(load_scene(text), 1)
         seconds = re.search(r"--duration ([\d.]+)", text)
         ticks = round(0.4 * float(seconds[1] if seconds else 10.0) / lane.interval)
@@ -175,17 +169,11 @@ def _draw(snapshots: Sequence[Snapshot], all_trails: bool) -> bytes:
 
 
 def _make(names: Sequence[str]) -> None:
-    """Write the folder `shipped`: all scenes of configs/scenes, and the pictures of some scenes and tasks."""
-    root = Path(__file__).resolve().parents[2]
-    folder = Path(str(SHIPPED))
-    folder.mkdir(exist_ok=True)
-    for path in sorted((root / "configs" / "scenes").glob("*.yaml")):
-        (folder / path.name).write_text(path.read_text(encoding="utf-8"), encoding="utf-8")
+    """Draw the pictures of some scenes and tasks."""
     for name in names:
-        (folder / f"{name}.png").write_bytes(_draw(list(_films(root, name)), name in TASKS))
+        (Path(str(PICTURES)) / f"{name}.png").write_bytes(_draw(list(_films(name)), name in TASKS))
         print(name, flush=True)
 
 
 if __name__ == "__main__":
-    every = sorted(path.stem for path in (Path(__file__).resolve().parents[2] / "configs" / "scenes").glob("*.yaml"))
-    _make(sys.argv[1:] or [*every, *TASKS])
+    _make(sys.argv[1:] or [*bundled_scenes(), *TASKS])

@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from flockenv.core.bundled import bundled_scenes
 from flockenv.core.errors import KeyPath, key_path, nearest, parse_key_path, printable, refusals
 from flockenv.core.yaml_paths import STANDARD_INPUT, has_yaml_suffix
 from flockenv.scene import Scene
@@ -41,8 +42,11 @@ class ConfigError(ValueError):
 
 
 def load_scene(source: str | Path) -> Scene:
-    """Return the scene of a YAML file or YAML text; see `load`."""
-    return load(source, Scene)
+    """Return the scene of a YAML file or YAML text, see `load`, or of the name of a scene that ships, such as "boids".
+
+    A file of that name in the current folder comes first.
+    """
+    return load(source, Scene, bundled_scenes())
 
 
 def dump_scene(scene: Scene, models: Sequence[str] = (), brief: bool = False) -> str:
@@ -75,13 +79,14 @@ def schema(model: type[BaseModel] = Scene) -> dict[str, Any]:
     return out
 
 
-def load(source: str | Path, model: type[M]) -> M:
+def load(source: str | Path, model: type[M], named: Mapping[str, Path] = MappingProxyType({})) -> M:
     """Return the `model` of a YAML file or text.
 
     A Path names a file or a pipe, `-` standard input; so does a str, unless it contains a line break, a `: ` or a `{`:
-    then it is the text itself. Raise ConfigError, one line per mistake, before anything is built.
+    then it is the text itself. named: files that also have a name. Raise ConfigError, one line per mistake, before
+    anything is built.
     """
-    name, text = _read(source)
+    name, text = _read(source, named)
     reader = _Reader(name, text)
     try:
         data, origins = expand_presets(reader.document())
@@ -164,7 +169,7 @@ def _represent_text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
 _Dumper.add_representer(str, _represent_text)
 
 
-def _read(source: str | Path) -> tuple[str, str]:
+def _read(source: str | Path, named: Mapping[str, Path]) -> tuple[str, str]:
     """Return a name for messages, and the text."""
     if isinstance(source, str) and re.search(r"\n|: |\{|:$", source):
         return "text", source.removeprefix("\ufeff")
@@ -173,8 +178,10 @@ def _read(source: str | Path) -> tuple[str, str]:
     path = Path(source)
     name = repr(str(source))[1:-1]
     try:
+        if str(source) in named and not path.is_file():
+            path = named[str(source)]
         if not (path.is_file() or path.is_fifo()):  # a shell's <(...) is a pipe
-            raise ConfigError(f"{name}: no such file{_nearest_file(path)}")
+            raise ConfigError(f"{name}: no such file{_nearest_file(path, named)}")
         with path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
     except (OSError, ValueError) as error:
@@ -184,11 +191,12 @@ def _read(source: str | Path) -> tuple[str, str]:
     return name, _decode(name, content)
 
 
-def _nearest_file(path: Path) -> str:
+def _nearest_file(path: Path, named: Mapping[str, Path]) -> str:
     if path.exists():
         return " (it is a folder)" if path.is_dir() else " (it is a device)"
     siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-    return nearest(path.name, filter(has_yaml_suffix, siblings))
+    known = () if has_yaml_suffix(path.name) or len(path.parts) > 1 else named
+    return nearest(path.name, [*filter(has_yaml_suffix, siblings), *known])
 
 
 def _decode(name: str, content: bytes) -> str:
