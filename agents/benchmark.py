@@ -15,8 +15,6 @@ from typing import Annotated, Any
 import typer
 
 from agents.compare import JOBS, ROOT, folder_of, provenance, write_text
-from agents.play import NAME
-from agents.report import grid, json_text
 from agents.scores import THRESHOLDS, Aggregate, aggregate
 from agents.study import Study, contenders_of, settings_of
 from agents.study_results import RANDOM, SettingResults, TaskResults, kind_of, read_task
@@ -28,9 +26,11 @@ from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import printable
 from flockenv.core.output_paths import valid_file
 from flockenv.evaluation import Interval, lead_interval
+from flockenv.evaluation.report import grid, json_text
 from flockenv.jobs import Store, Work, engine_of
 from flockenv.players import known_name
 from flockenv.scene.yaml_io import load
+from flockenv.studies.play_jobs import NAME
 
 __all__ = ["app", "entry_of", "table"]
 

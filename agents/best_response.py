@@ -20,8 +20,6 @@ from rich.table import Table
 from agents.compare import JOBS, folder_of, provenance, split, write_text
 from agents.experiment import load_experiment
 from agents.invasion import Payoffs, invade, jobs_of
-from agents.play import Player, players_in_order, players_of, usual_players
-from agents.report import grid, json_text
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
 from flockenv.cli.options import Debug, Delay, Dropped, Noise, Reach, Seen, TrustPickle
 from flockenv.cli.terminal import job_bar, report_errors, run_program
@@ -29,7 +27,9 @@ from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.output_paths import valid_file
 from flockenv.envs.disturbance import Disturbance
 from flockenv.evaluation import WORLDS_PER_SEED, Interval
+from flockenv.evaluation.report import grid, json_text
 from flockenv.jobs import Store, Work, engine_of, run_jobs
+from flockenv.studies.play_jobs import Player, players_in_order, players_of, usual_players
 from flockenv.tasks import Task
 
 __all__ = ["app", "content_of", "markdown", "table_of"]

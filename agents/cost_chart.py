@@ -6,9 +6,9 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.report import Results
 from agents.transfer_verdict import SURVIVES
 from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK, save_figure
+from flockenv.evaluation.report import Results
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -19,13 +19,13 @@ import typer
 
 from agents.compare import JOBS, ROOT, folder_of, provenance, write_text
 from agents.cost_chart import method_name
-from agents.report import Results, json_text
 from agents.transfer_verdict import SURVIVES, lost_settings
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes
 from flockenv.cli.options import Debug
 from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import printable
+from flockenv.evaluation.report import Results, json_text
 from flockenv.jobs import Job, Store, Work, engine_of, records, run_jobs
 from flockenv.physics.integrators import methods_of
 from flockenv.scene import Scene

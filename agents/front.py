@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 
 from agents.compare import JOBS, folder_of, pick, provenance, split, write_text
 from agents.conduct import ConductWorld
-from agents.play import Worlds, episodes_of_bytes, play_job
-from agents.report import grid, json_text
 from agents.study import HOME, Contender, Setting, Study, contenders_of, settings_of
 from agents.study_results import RANDOM, kind_of
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
@@ -29,10 +27,12 @@ from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.output_paths import valid_file
 from flockenv.evaluation import Episodes, Interval, lead_interval, mean_interval, success_interval
+from flockenv.evaluation.report import grid, json_text
 from flockenv.jobs import Job, Work, engine_of, run_jobs
 from flockenv.jobs.store import Store
 from flockenv.players.policy import OtherSlotsError
 from flockenv.scene.yaml_io import load
+from flockenv.studies.play_jobs import Worlds, episodes_of_bytes, play_job
 from flockenv.tasks import TASKS, Task
 
 __all__ = ["app", "front", "markdown"]

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.play import Player, Worlds, episodes_of_bytes, play_job, player_digest
 from flockenv.envs.disturbance import Disturbance, make_world
 from flockenv.envs.world import Step
 from flockenv.evaluation import Episodes, Interval, bootstrap, compare
@@ -25,6 +24,7 @@ from flockenv.jobs.local_engine import LocalEngine
 from flockenv.model.snapshot import Snapshot
 from flockenv.players.independent import IndependentPolicy
 from flockenv.players.policy import Policy
+from flockenv.studies.play_jobs import Player, Worlds, episodes_of_bytes, play_job, player_digest
 from flockenv.tasks import Task
 
 __all__ = ["Among", "Payoffs", "invade", "jobs_of", "worlds_among"]

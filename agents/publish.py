@@ -17,10 +17,10 @@ import typer
 
 from agents.compare import ROOT
 from agents.experiment import one_line_errors
-from agents.report import Results, grid, seeds_text
 from agents.summary_chart import write_summary
 from flockenv.cli.terminal import run_program
 from flockenv.core.atomic_files import write_all_or_none
+from flockenv.evaluation.report import Results, grid, seeds_text
 from flockenv.tasks import TASKS
 
 __all__ = ["BLOCK", "app", "summary", "tables"]

@@ -22,13 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.experiment import Experiment
-from agents.play import PLAYING
 from flockenv.envs.disturbance import Disturbance, make_world
 from flockenv.envs.world import bytes_per_world, first_step
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.jobs import Job, Work, records, run_jobs
 from flockenv.players.rules import PLAYERS, RulesPlayer, as_dict
 from flockenv.players.rules.parameter import is_logarithmic, ranges_of
+from flockenv.studies.play_jobs import PLAYING
 from flockenv.tasks import Task
 
 __all__ = ["Coordinates", "Found", "Play", "Search", "median_of", "play_job", "search"]

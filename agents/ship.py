@@ -24,7 +24,6 @@ from pydantic import BaseModel, ValidationError
 
 from agents.compare import ROOT, experiment_of
 from agents.experiment import PpoSettings, one_line_errors
-from agents.report import grid, json_text, rounded
 from agents.run import first_difference
 from agents.search import Found, median_of
 from agents.tune import content_of, found_of
@@ -32,6 +31,7 @@ from flockenv.cli.terminal import run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import printable_path, refusals
 from flockenv.core.warnings import OtherTaskWarning
+from flockenv.evaluation.report import grid, json_text, rounded
 from flockenv.players.policy import MlpPolicy
 from flockenv.players.rules import PLAYERS, read_tuned
 from flockenv.tasks import TASKS

@@ -32,13 +32,13 @@ from typing import Any
 from pydantic import Field, model_validator
 
 from agents.compare import experiment_of
-from agents.play import NAME, Player, members_of
 from flockenv.core.errors import key_path, nearest, printable
 from flockenv.core.record import Record
 from flockenv.core.warnings import UnstableStepWarning
 from flockenv.envs.disturbance import Disturbance
 from flockenv.evaluation import WORLDS_PER_SEED
 from flockenv.players import known_name, other_tasks
+from flockenv.studies.play_jobs import NAME, Player, members_of
 from flockenv.tasks import TASKS, Task
 
 __all__ = [

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 
-from agents.report import grid
 from agents.study import HOME, PARTNERS, Study
 from agents.study_results import ALONE, GROUPS, KINDS, LEVEL, SettingResults, TaskResults
 from flockenv.evaluation import Interval
+from flockenv.evaluation.report import grid
 
 __all__ = ["markdown", "score_text", "winner_text"]
 

@@ -10,7 +10,7 @@ from flockenv.evaluation.plots import COLOURS, FAINT, GRID, INK, save_figure
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from agents.report import Results
+    from flockenv.evaluation.report import Results
 
 __all__ = ["draw_summary", "write_summary"]
 

@@ -22,8 +22,6 @@ from rich.console import Console
 
 from agents.compare import JOBS, folder_of, pick, provenance, split, write_text
 from agents.invasion import worlds_among
-from agents.play import Player, episodes_of_bytes, play_job
-from agents.report import json_text, rounded
 from agents.study import Contender, Setting, Study, contenders_of, settings_of
 from agents.study_results import RANDOM, TaskResults, kind_of, read_file, read_task
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
@@ -32,9 +30,11 @@ from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import printable
 from flockenv.core.output_paths import valid_file
+from flockenv.evaluation.report import json_text, rounded
 from flockenv.jobs import Job, Store, Work, engine_of, run_jobs
 from flockenv.players.policy import OtherSlotsError
 from flockenv.scene.yaml_io import load, parse_scalar
+from flockenv.studies.play_jobs import Player, episodes_of_bytes, play_job
 
 __all__ = ["app", "plan_digest", "sweep"]
 

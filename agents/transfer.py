@@ -16,7 +16,7 @@ from typing import Annotated
 
 import typer
 
-from agents import report, transfer_report
+from agents import transfer_report
 from agents.compare import (
     JOBS,
     experiment_of,
@@ -26,7 +26,6 @@ from agents.compare import (
     split,
     write_text,
 )
-from agents.play import players_in_order, players_of
 from agents.transfer_jobs import Plan, clock_of, jobs_by_kernel, read_again, read_cells, round_jobs
 from agents.transfer_report import Setting
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
@@ -35,10 +34,11 @@ from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import nearest, printable
 from flockenv.envs.disturbance import Disturbance
-from flockenv.evaluation import WORLDS_PER_SEED, worlds_for
+from flockenv.evaluation import WORLDS_PER_SEED, report, worlds_for
 from flockenv.jobs import Store, Work, engine_of, run_jobs
 from flockenv.jobs.local_engine import LocalEngine
 from flockenv.physics.integrators import INTEGRATORS
+from flockenv.studies.play_jobs import players_in_order, players_of
 from flockenv.tasks import TASKS, Task
 
 __all__ = ["app"]

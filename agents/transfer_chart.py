@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from agents.cost_chart import method_name
-from agents.report import Results
 from agents.transfer_verdict import SURVIVES
 from flockenv.evaluation.plots import FAINT, GRID, INK, save_figure
+from flockenv.evaluation.report import Results
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.play import Player, episodes_of_bytes, play_job, player_digest
 from agents.transfer_report import Cell, Clock, Setting
 from flockenv.envs.disturbance import Disturbance, make_world
 from flockenv.envs.world import World
@@ -19,6 +18,7 @@ from flockenv.evaluation import worlds_for
 from flockenv.jobs import Job, Store, records
 from flockenv.physics.integrators import RK4
 from flockenv.players.policy import Policy
+from flockenv.studies.play_jobs import Player, episodes_of_bytes, play_job, player_digest
 from flockenv.tasks import Task
 
 __all__ = ["Plan", "cell_job", "clock_of", "jobs_by_kernel", "read_again", "read_cells", "round_jobs"]

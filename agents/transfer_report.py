@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from agents.report import Results, conditions, grid, interval_fields, interval_text, number_text, table_of
 from agents.transfer_verdict import LEAST_ROUNDS, count_text, length_text, settings_of_note, title, verdict
 from flockenv.core.warnings import UnstableStepWarning
 from flockenv.evaluation import bootstrap, task_digest
+from flockenv.evaluation.report import Results, conditions, grid, interval_fields, interval_text, number_text, table_of
 from flockenv.physics.integrators import INTEGRATORS
 from flockenv.scene.stability import suggest_dt
 from flockenv.tasks import Task

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from agents.report import Results, interval_text
+from flockenv.evaluation.report import Results, interval_text
 
 __all__ = [
     "NOTHING", "SURVIVES", "cheapest_accurate", "count_text", "kept_text", "length_text", "lost_settings",

@@ -18,13 +18,13 @@ from rich.console import Console
 
 from agents.experiment import Experiment, load_experiment, one_line_errors, seeds_of
 from agents.options import Config
-from agents.report import json_text, rounded
 from agents.search import Found, median_of, search
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes
 from flockenv.cli.terminal import job_bar, run_program
 from flockenv.core.atomic_files import new_folder, replace_file
 from flockenv.core.errors import nearest, printable
 from flockenv.core.output_paths import check_room, valid_file, valid_path
+from flockenv.evaluation.report import json_text, rounded
 from flockenv.jobs import Store, Work, engine_of
 from flockenv.players import PUBLISHED
 from flockenv.players.rules import PLAYERS, TUNED, read_tuned

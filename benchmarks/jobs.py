@@ -64,8 +64,8 @@ def seconds(engine: Engine, milliseconds: float, kind: str) -> float:
 def samples_of_jobs() -> Iterator[Job]:
     """Yield a job of each kind: players of three tasks, a training of one rollout, trials."""
     from agents.experiment import CONFIGS, load_experiment
-    from agents.play import Player, play_job
     from agents.training_job import training_job
+    from flockenv.studies.play_jobs import Player, play_job
 
     for task, player in (("pursuit", "rules"), ("pursuit", "ppo"), ("flock", "rules"), ("school", "ppo")):
         experiment = load_experiment(CONFIGS / f"{task}.yaml")

@@ -23,11 +23,11 @@ from typer.testing import CliRunner
 
 from agents import compare, rllib
 from agents.experiment import CONFIGS, load_experiment
-from agents.play import players_in_order
 from agents.rllib_envs import RowsEnv
 from agents.run import Run, load_checkpoint
 from flockenv.envs.vector import CrossingVectorEnv
 from flockenv.players.policy import MlpPolicy
+from flockenv.studies.play_jobs import players_in_order
 from flockenv.tasks import Crossing, Herd, Pursuit
 
 SMALL = """

@@ -11,11 +11,11 @@ import pytest
 from typer.testing import CliRunner
 
 from agents import best_response, invasion
-from agents.play import Player
 from flockenv.envs.disturbance import Disturbance
 from flockenv.envs.world import World
 from flockenv.evaluation import Episodes, rollout, worlds_for
 from flockenv.players import load_player
+from flockenv.studies.play_jobs import Player
 from flockenv.tasks import Bottleneck, Crossing, Flock, School
 
 FISH, WORLDS = 3, 7

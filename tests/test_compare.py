@@ -22,13 +22,17 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from agents import compare as comparison
-from agents import play, report
-from flockenv.evaluation import EVALUATION, Episodes, lead_interval
+from agents.compare import experiment_of
+from flockenv.cli.main import main
+from flockenv.evaluation import EVALUATION, Episodes, lead_interval, report
 from flockenv.evaluation.plots import Column, draw_chart, write_chart
 from flockenv.jobs import Failure
 from flockenv.jobs.job import code_digest, execute
+from flockenv.players import trained_task
 from flockenv.players.policy import save_policy
 from flockenv.players.rules import TUNED
+from flockenv.studies import comparison as scores
+from flockenv.studies import play_jobs as play
 from flockenv.tasks import TASKS
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -575,10 +579,10 @@ def test_cost_of_a_player_comes_from_its_card_or_from_its_tuning(
     }
     monkeypatch.setattr("flockenv.players.rules.TUNED", in_temporary_folder)
     ppo = {"wall_time_s": 2.5, "steps": 3}
-    assert comparison._costs(task, policies) == {"rules": {}, "ppo": ppo, "mine": {}}
+    assert scores._costs(task, policies) == {"rules": {}, "ppo": ppo, "mine": {}}
     Path("pursuit.json").write_text('{"players": {"rules": {"parameters": {}, "found": {"agent_steps": 1200.0}}}}')
     spent = {"of": "tuning", "steps": 1200}
-    assert comparison._costs(task, policies) == {"rules": spent, "ppo": ppo, "mine": {}}
+    assert scores._costs(task, policies) == {"rules": spent, "ppo": ppo, "mine": {}}
 
 
 def test_task_is_built_from_its_config(in_temporary_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -626,6 +630,46 @@ def test_hand_written_player_plays_only_the_tasks_that_it_supports() -> None:
         comparison.compare([flock], [orca], 2)
     with pytest.raises(ValueError, match="task 'flock': no player for it; these play other tasks only: orca"):
         comparison.compare([crossing, flock], [orca], 2)
+
+
+# --- `flockenv compare`
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_task_as_trained_is_the_one_of_its_config(name: str) -> None:
+    assert trained_task(name) == experiment_of(name).build()
+
+
+def test_the_command_of_the_package_has_the_scores_of_the_workbench(capsys: pytest.CaptureFixture[str]) -> None:
+    options = ("--players", "random,textbook", "--worlds", "2", "--processes", "1")
+    run("--tasks", "obstacles", *options, "--out", "workbench")
+    before = sorted(Path.cwd().iterdir())
+    assert main(["compare", "obstacles", *options]) == 0
+    printed = capsys.readouterr().out
+    assert sorted(Path.cwd().iterdir()) == before
+    assert "obstacles: " in printed and "textbook - random" in printed
+    assert main(["compare", "obstacles", *options, "--out", "package"]) == 0
+    ours, theirs = (json.loads(Path(folder, "results.json").read_text()) for folder in ("package", "workbench"))
+    assert ours["tasks"]["obstacles"]["pairs"] == theirs["tasks"]["obstacles"]["pairs"]
+    assert sorted(path.name for path in Path("package").iterdir()) == sorted([*FILES, "jobs"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("pursiut",), "TASK 'pursiut': unknown, did you mean `pursuit`?; allowed: pursuit, "),
+        (("--players", "rule"), "player 'rule': unknown, did you mean `rules`?"),
+        (("--worlds", "1"), "--worlds 1: must be from 2"),
+        (("--out", "../x"), "--out '../x': must not go up"),
+        (("pursuit", "--seen", "-1"), "seen"),
+    ],
+)
+def test_the_command_of_the_package_refuses_in_one_line(
+    arguments: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["compare", *arguments]) == 2
+    line = capsys.readouterr().err
+    assert message in line and line.count("\n") == 1 and list(Path.cwd().iterdir()) == []
 
 
 def test_policy_in_another_task_than_it_was_trained_on_is_reported(

@@ -18,19 +18,18 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 from typer.testing import CliRunner
 
-from agents import report
 from agents.compare import app, compare
 from agents.experiment import Experiment, PpoSettings
-from agents.play import Player, play_job
 from agents.run import recipe_of
 from flockenv.envs.disturbance import Disturbance, DisturbedWorld, make_world
 from flockenv.envs.world import World
-from flockenv.evaluation import rollout
+from flockenv.evaluation import report, rollout
 from flockenv.jit.decorators import python_of
 from flockenv.jit.thread_pool import threads, use_threads
 from flockenv.maths import counter_rng
 from flockenv.players import load_player
 from flockenv.players.rules import PLAYERS, player
+from flockenv.studies.play_jobs import Player, play_job
 from flockenv.tasks import TASKS, Crossing, Herd, Layout, Obstacles, PathFollow, Pursuit, Slot, Task
 
 CROSSING = Crossing(agents=8)

@@ -12,10 +12,10 @@ from typer.testing import CliRunner
 
 from agents import front
 from agents.conduct import SLOW, ConductWorld
-from agents.play import Player, Worlds, episodes_of_bytes, play_job
 from flockenv.evaluation import rollout, worlds_for
 from flockenv.players.policy import save_policy
 from flockenv.players.rules import player
+from flockenv.studies.play_jobs import Player, Worlds, episodes_of_bytes, play_job
 from flockenv.tasks import Bottleneck, Pursuit
 from tests.test_tasks import place
 

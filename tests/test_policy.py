@@ -15,13 +15,13 @@ import pytest
 from safetensors.numpy import save
 
 from agents.invasion import Among, jobs_of
-from agents.play import Player
 from agents.warm_start import starting_policy
 from flockenv.core.warnings import OtherTaskWarning
 from flockenv.evaluation import rollout
 from flockenv.players import load_player
 from flockenv.players.independent import stack_networks
 from flockenv.players.policy import MlpPolicy, OtherSlotsError, Policy, RandomPolicy, describe, save_policy
+from flockenv.studies.play_jobs import Player
 from flockenv.tasks import TASKS, Corridor, Crossing, Flock, Pursuit, Task
 
 TASK: Any = SimpleNamespace(

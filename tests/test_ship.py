@@ -13,7 +13,6 @@ from safetensors.numpy import load_file
 from typer.testing import CliRunner
 
 from agents.experiment import CONFIGS, load_experiment
-from agents.play import Player, members_of
 from agents.search import Found
 from agents.ship import BLOCK, Files, app, ship, trainings
 from agents.study import Study, contenders_of
@@ -21,6 +20,7 @@ from flockenv import players
 from flockenv.players import NAMES, WEIGHTS, known_name, load_player, other_tasks, seeds_of_player
 from flockenv.players.policy import save_policy
 from flockenv.players.rules import as_dict, load_tuned, player
+from flockenv.studies.play_jobs import Player, members_of
 from flockenv.tasks import TASKS, Flock, Pursuit
 
 ROOT = CONFIGS.parent.parent

@@ -13,18 +13,18 @@ from scipy.stats import t as student
 from typer.testing import CliRunner
 
 from agents.invasion import Among
-from agents.play import Player
-from agents.report import json_text
 from agents.study import HOME, Partners, Study, contenders_of, settings_of
 from agents.study_report import markdown
 from agents.study_results import ALONE, LEVEL, Score, SettingResults, kind_of, read_file, read_task
 from agents.sweep import app, plan_digest, sweep
 from flockenv.evaluation import bootstrap, lead_interval, mean_interval, rollout, worlds_for
+from flockenv.evaluation.report import json_text
 from flockenv.jobs import Store, Work
 from flockenv.jobs.local_engine import LocalEngine
 from flockenv.players import load_player
 from flockenv.players.rules import TUNED
 from flockenv.scene.yaml_io import load
+from flockenv.studies.play_jobs import Player
 from flockenv.tasks import TASKS, Crossing, Pursuit
 
 STUDIES = sorted((Path(__file__).resolve().parent.parent / "configs" / "studies").glob("*.yaml"))

@@ -13,12 +13,13 @@ import pytest
 from typer.testing import CliRunner
 
 from agents import compare as comparison
-from agents import play, transfer, transfer_chart, transfer_jobs, transfer_report, transfer_verdict
+from agents import transfer, transfer_chart, transfer_jobs, transfer_report, transfer_verdict
 from agents.transfer_jobs import Plan
 from agents.transfer_report import Cell, Clock, Setting
 from flockenv.envs.disturbance import Disturbance
 from flockenv.jobs import Store
 from flockenv.physics.integrators import INTEGRATORS, RK4
+from flockenv.studies import play_jobs as play
 from flockenv.tasks import TASKS, Bottleneck, Pursuit
 
 FILES = ["transfer.json", "transfer.md", "transfer.png"]

@@ -1,7 +1,7 @@
 """The command line of flockenv.
 
-list | run | play | measure | render | explain | accuracy | stress | experiment | gallery | validate | jobs | warmup
-| schema
+list | run | play | compare | measure | render | explain | accuracy | stress | experiment | gallery | validate | jobs
+| warmup | schema
 
 Errors are one line on stderr. Exit codes: 0, 1 (a run failed), 2 (bad input), 130 (interrupted).
 """
@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Annotated, get_args
 import typer
 
 import flockenv
+from flockenv.cli.compare import compare
 from flockenv.cli.films import film_episodes, write_picture
 from flockenv.cli.jobs import jobs
 from flockenv.cli.measure import measure
@@ -308,6 +309,7 @@ def explain(scene: SceneFile) -> None:
 
 
 app.command()(play)
+app.command()(compare)
 app.command()(measure)
 app.command()(accuracy)
 app.command()(stress)

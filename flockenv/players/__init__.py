@@ -18,6 +18,7 @@ What was trained or searched with several seeds ships as the median run. `ppo@3`
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ALL_SEEDS", "NAMES", "PUBLISHED", "SEEDED", "WEIGHTS", "known_name", "load_player", "other_tasks",
-    "seeds_of_player", "weights_file",
+    "seeds_of_player", "trained_task", "weights_file",
 ]  # fmt: skip
 
 PUBLISHED = {
@@ -109,6 +110,21 @@ def seeds_of_player(name: str, task: str) -> tuple[int, ...]:
 
         return tuple(load_tuned(task, name).by_seed)
     return ()
+
+
+def trained_task(name: str) -> Task:
+    """Return a task with the arguments with which its policy was trained; without weights, with its defaults.
+
+    Raises:
+        KeyError: no such task.
+        ValueError: the card of the weights is damaged; one line.
+    """
+    from flockenv.players.policy import read_card
+    from flockenv.tasks import TASKS
+
+    card = weights_file(name).with_suffix(".json")
+    arguments = read_card(card).get("arguments", {}) if card.is_file() else {}
+    return TASKS[name].model_validate_json(json.dumps(arguments))
 
 
 def weights_file(task: str, seed: int | None = None) -> Path:

@@ -15,7 +15,8 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from flockenv.evaluation import Comparison, Episodes, Interval, compare, summarise
+from flockenv.evaluation.comparison import Comparison, compare, summarise
+from flockenv.evaluation.episodes import Episodes, Interval
 from flockenv.evaluation.plots import Column, Row
 
 __all__ = [
