@@ -32,6 +32,7 @@ from flockenv.core.atomic_files import write_all_or_none
 from flockenv.core.errors import printable_path, refusals
 from flockenv.core.warnings import OtherTaskWarning
 from flockenv.evaluation.report import grid, json_text, rounded
+from flockenv.players.model_card import model_card
 from flockenv.players.policy import MlpPolicy
 from flockenv.players.rules import PLAYERS, read_tuned
 from flockenv.tasks import TASKS
@@ -165,6 +166,8 @@ def _ship_policies(task: str, trained: Sequence[Trained], files: Files) -> list[
         card = _card(run, about if run is ships else None)
         text = json_text(card) if run is ships else json.dumps(card, separators=(",", ":"), allow_nan=False) + "\n"
         files.new |= {f"{name}.safetensors": run.data, f"{name}.json": text.encode()}
+        if run is ships:
+            files.new[f"{name}.md"] = model_card(card).encode()
     without = f"; of another recipe, left out: {', '.join(left_out)}" if left_out else ""
     return [f"{task}, ppo: {_line(ships.seed, about)}{without}"]
 

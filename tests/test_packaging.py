@@ -78,7 +78,7 @@ def test_the_wheel_contains_flockenv_alone(wheel: Path) -> None:
     tops = {name.split("/")[0] for name in names}
     assert tops == {"flockenv", f"flockenv-{PROJECT['version']}.dist-info"}
     sources = {path.relative_to(ROOT).as_posix() for path in (ROOT / "flockenv").rglob("*.py")}
-    files = {f"players/weights/{task}.{suffix}" for task in TASKS for suffix in ("json", "safetensors")}
+    files = {f"players/weights/{task}.{suffix}" for task in TASKS for suffix in ("json", "md", "safetensors")}
     seeds = (ROOT / "flockenv" / "players" / "weights" / "seeds").glob("*")
     files |= {f"players/weights/seeds/{path.name}" for path in seeds}
     files |= {f"players/tuned/{task}.json" for task in TASKS} | {"py.typed"}

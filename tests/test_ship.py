@@ -85,8 +85,12 @@ def test_the_median_policy_ships_and_the_others_are_kept(tmp_path: Path, target:
     assert line == "pursuit, ppo: seed 1, the median of 4: 8.000, all from 7.000 to 9.000"
     kept = [f"weights/seeds/pursuit-seed-{seed}" for seed in (2, 4, 7)]
     assert files(target) == sorted(
-        f"{name}.{end}" for name in ["weights/pursuit", *kept] for end in ("json", "safetensors")
+        [
+            "weights/pursuit.md",
+            *(f"{name}.{end}" for name in ["weights/pursuit", *kept] for end in ("json", "safetensors")),
+        ]
     )
+    assert "| mean return | 8 (4 seeds, 7 to 9) |" in (players.WEIGHTS / "pursuit.md").read_text()
     card = json.loads((players.WEIGHTS / "pursuit.json").read_text())
     assert card["seed"] == 1 and card["tuning_mean"] == 8.0
     assert card["seeds"] == {"scores": {"1": 8.0, "2": 9.0, "4": 8.5, "7": 7.0}, "lowest": 7.0, "highest": 9.0}
@@ -135,7 +139,7 @@ def test_what_ships_is_left_out_if_its_recipe_is_another(tmp_path: Path, target:
     (line,) = ship([tmp_path / "new"], target)
     assert line.endswith("seed 5, the median of 1: 1.000, all from 1.000 to 1.000; of another recipe, left out: 0, 1")
     assert seeds_of_player("ppo", "pursuit") == (5,)
-    assert files(target) == ["weights/pursuit.json", "weights/pursuit.safetensors"]
+    assert files(target) == ["weights/pursuit.json", "weights/pursuit.md", "weights/pursuit.safetensors"]
 
 
 @pytest.mark.parametrize(

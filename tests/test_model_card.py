@@ -1,0 +1,44 @@
+"""Model cards: the page beside the weights of each task is made of its JSON card, in the form of model hubs."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import yaml
+
+from flockenv.envs.table import ENVIRONMENTS
+from flockenv.players import weights_file
+from flockenv.players.model_card import model_card
+from flockenv.tasks import TASKS
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_page_of_each_task_is_made_of_its_card(task: str) -> None:
+    """If this fails, run `python -m flockenv.players.model_card`."""
+    card = json.loads(weights_file(task).with_suffix(".json").read_text(encoding="utf-8"))
+    page = weights_file(task).with_suffix(".md").read_text(encoding="utf-8")
+    assert page == model_card(card)
+    assert card["sha256"] in page and card["recipe"]["command"] in page
+    assert all(f"| `{name}` | `" in page for name in card["arguments"])
+    assert all(f"| `{slot['name']}` | " in page for slot in card["observation"] if 0 not in slot["shape"])
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_hubs_find_task_library_and_score_at_the_top_of_the_page(task: str) -> None:
+    _, front, _ = weights_file(task).with_suffix(".md").read_text(encoding="utf-8").split("---\n", 2)
+    about, card = yaml.safe_load(front), json.loads(weights_file(task).with_suffix(".json").read_text(encoding="utf-8"))
+    assert (about["license"], about["library_name"], about["pipeline_tag"]) == (
+        "mit", "flockenv", "reinforcement-learning",
+    )  # fmt: skip
+    (model,) = about["model-index"]
+    (result,) = model["results"]
+    assert result["dataset"]["type"] == ENVIRONMENTS[TASKS[task].__name__].id
+    assert result["metrics"][0]["value"] == pytest.approx(card["tuning_mean"], abs=0.005)
+    assert result["task"]["type"] == "reinforcement-learning" and model["name"].startswith("ppo-")
+
+
+def test_a_page_follows_its_card() -> None:
+    card = json.loads(weights_file("pursuit").with_suffix(".json").read_text(encoding="utf-8"))
+    before, after = model_card(card), model_card({**card, "tuning_mean": 1.25, "seed": 77})
+    assert "| mean return | 8.29 (" in before and "| mean return | 1.25 (" in after and "| seed | 77 |" in after
