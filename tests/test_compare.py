@@ -657,7 +657,7 @@ def test_the_command_of_the_package_has_the_scores_of_the_workbench(capsys: pyte
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("pursiut",), "TASK 'pursiut': unknown, did you mean `pursuit`?; allowed: pursuit, "),
+        (("pursiut",), "TASK 'pursiut': unknown, did you mean `pursuit`?; allowed: bottleneck, "),
         (("--players", "rule"), "player 'rule': unknown, did you mean `rules`?"),
         (("--worlds", "1"), "--worlds 1: must be from 2"),
         (("--out", "../x"), "--out '../x': must not go up"),
