@@ -133,6 +133,38 @@ def test_pages_learn_of_other_players() -> None:
     assert session.version != before and session.describe()["lanes"][0]["players"] == ["you"]
 
 
+def test_measures_have_the_time_of_the_world_that_still_runs() -> None:
+    session = Session()
+    session.open_task(TASKS["pursuit"](), ("rules", "random"))
+    session.pause()
+    assert session.room is not None
+    ask(session, type="step", n=100)
+    first, second = session.room.lanes
+    assert first.stopped and not second.stopped and first.time < second.time
+    assert ask(session, type="measures")["time"] == second.time
+
+
+def test_a_restart_keeps_a_seed_that_pages_cannot_write() -> None:
+    session = Session()
+    session.open_scene(load_scene(TINY), "tiny", seed=2**63 - 1)
+    ask(session, type="seed")
+    assert session.room is not None and session.room.lanes[0].seed == 2**63 - 1
+    ask(session, type="seed", seed=3)
+    assert session.room.lanes[0].seed == 3
+
+
+def test_a_recording_that_ends_with_its_world_is_told_to_the_page() -> None:
+    session, _ = opened()
+    ask(session, type="record", on=True)
+    told = session.answer(read_message(json.dumps({"type": "load", "yaml": TINY})))
+    assert told == [{"type": "record", "on": False, "seconds": 0.0, "note": LOST}]
+    assert ask(session, type="save")["type"] == "yaml"
+    assert session.answer(read_message(json.dumps({"type": "load", "yaml": TINY}))) == []
+
+
+LOST = "The recording was not saved: it ended with its world."
+
+
 def test_a_recording_is_drawn_as_a_gif() -> None:
     session, _ = opened()
     ask(session, type="record", on=True)

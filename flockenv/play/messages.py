@@ -151,10 +151,10 @@ class Lanes(Message):
 
 
 class Seed(Message):
-    """Begin again with another seed."""
+    """Begin again, with another seed if one is given."""
 
     type: Literal["seed"] = "seed"
-    seed: int = Field(ge=0, lt=2**53)
+    seed: int | None = Field(default=None, ge=0, lt=2**53)
 
 
 class RecordMessage(Message):

@@ -69,7 +69,7 @@ class PlayServer:
         self._work = ThreadPoolExecutor(1, "flockenv-play")
         self._beside = ThreadPoolExecutor(1, "flockenv-compile")
         self._pages: set[ServerConnection] = set()
-        self._html = page("live", "flockenv", {"version": m.VERSION})
+        self._html = page("live", "flockenv", {"version": m.VERSION, "largest": m.LARGEST, "longest": m.LARGEST_TEXT})
         self._pictures = session.pictures()
 
     @property

@@ -155,10 +155,11 @@ class Session:
         """Play another room from now on."""
         record = room.lanes[0].record
         self._players = players_of(record, self.files) if isinstance(record, Task) else ()
+        lost = [] if self._recording is None else [_LOST]
         self.room, self.name, self.about, self._recording = room, name, about, None
         self.opened += 1
         room.play(playing)
-        return list(answers)
+        return [*lost, *answers]
 
     def _ready(self, room: Room, name: str, about: str, playing: bool = True, answers: Sequence[Answer] = ()) -> Rest:
         """Compile what a new room needs, try which values begin it again, and return what opens it."""
@@ -222,7 +223,7 @@ class Session:
     def _seed(self, message: m.Seed) -> list[Answer]:
         room = self._there()
         for lane in room.lanes:
-            lane.seed = message.seed
+            lane.seed = lane.seed if message.seed is None else message.seed
         room.restart()
         return []
 
@@ -312,7 +313,7 @@ class Session:
             if apart is not None:
                 values["distance to the first world"] = {"value": apart, "unit": "m"}
         timing = {"step": 1e3 * self._step_time.value, "encode": 1e3 * self._encode_time.value}
-        return [{"type": "measures", "time": room.lanes[0].time, "lanes": lanes, "timing": timing}]
+        return [{"type": "measures", "time": max(lane.time for lane in room.lanes), "lanes": lanes, "timing": timing}]
 
     def _costs(self, message: m.Costs) -> Rest:
         from flockenv.play.fields import costs_of, prepare_costs
@@ -383,6 +384,11 @@ class Session:
         self._recording = Recording(self._there(), self._names())
         self._recording.take()
         return [{"type": "record", "on": True, "seconds": 0.0}]
+
+
+_LOST: Answer = {
+    "type": "record", "on": False, "seconds": 0.0, "note": "The recording was not saved: it ended with its world.",
+}  # fmt: skip
 
 
 class _Mean:

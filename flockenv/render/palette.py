@@ -30,7 +30,7 @@ PAPER: Final[dict[str, tuple[str, str]]] = {
     "grid": ("#eef1f5", "#1e2631"),
     "edge": ("#c3cbd6", "#3a4657"),
     "ink": ("#1d2633", "#e6ebf2"),
-    "faint": ("#6b7788", "#8e9bad"),
+    "faint": ("#626e7f", "#8e9bad"),
     "stone": ("#aab3c0", "#4a586b"),
     "rim": ("#8b96a6", "#66768c"),
     "goal": ("#009e73", "#2cc79a"),

@@ -2,7 +2,8 @@
 
 function choose(lane, agent) {
   chosen.lane = lane; chosen.agent = agent; chosen.look = null;
-  if (agent !== null) { openTab("agent"); askLook(); } else showLook();
+  if (agent !== null) { openTab("agent"); askLook(); }
+  showLook();
   refresh();
 }
 
@@ -19,7 +20,7 @@ function heading(text) { return element("h2", text); }
 function showLook() {
   const box = $("agent"), look = chosen.look;
   if (chosen.agent === null) { box.replaceChildren(element("p", "Click an agent to see its forces, what it observes, and where it goes.", "empty")); return; }
-  if (!look) { if (!box.querySelector("h2")) box.replaceChildren(element("p", "Looking …", "empty")); return; }
+  if (!look) { if (!box.querySelector("h2")) box.replaceChildren(element("p", "Computing its forces …", "empty")); return; }
   const parts = [agentHead(look), forcesOf(look)];
   if (look.reward && look.reward.length) parts.push(tableOf("Return so far, by term", look.reward.map(r => [r.name.replace(/_/g, " "), number(r.total)])));
   if (look.observation && look.observation.length) parts.push(observationOf(look));

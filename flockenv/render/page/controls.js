@@ -30,6 +30,18 @@ function rounded(control, x) {
   return control.kind === "integer" ? Math.round(value) : Number(value.toPrecision(3));
 }
 
+/* A field that hides all nodes without the word that is typed; found: is called after each change of the word. */
+function findField(label, nodes, textOf = node => node.textContent, found = () => {}) {
+  const field = element("input", undefined, "find");
+  field.type = "text"; field.placeholder = label; field.setAttribute("aria-label", label);
+  field.oninput = () => {
+    const word = field.value.trim().toLowerCase();
+    for (const node of nodes) node.hidden = !textOf(node).toLowerCase().includes(word);
+    found(word);
+  };
+  return field;
+}
+
 const sending = { path: null, timer: 0, value: null };
 
 /* Sends a value: at once, or every 40 ms while it is dragged; one that restarts only when the pointer is released. */
@@ -52,6 +64,12 @@ function raised(text) { return text.replace(/\^2/g, "²").replace(/\^3/g, "³");
 
 function withUnit(control, unit) { return valueText(control) + (!unit || unit === "1" ? "" : unit === "degrees" ? "°" : ` ${raised(unit)}`); }
 
+/* The name of a value for a reader who does not see what is around it, such as "weight, effect 1: separation". */
+function spokenName(control) {
+  const owner = live.room.titles[control.path.includes(".") ? control.path.slice(0, control.path.lastIndexOf(".")) : ""];
+  return owner ? `${control.title}, ${owner}` : control.title;
+}
+
 /* A value within a line of words. */
 function valueInWords(control, unit) {
   if (control.kind === "choice" || control.kind === "variant") return choiceInWords(control);
@@ -59,8 +77,10 @@ function valueInWords(control, unit) {
   if (control.kind !== "number" && control.kind !== "integer") return buttonValue(control, unit, node => typeValue(node, control, unit));
   const node = element("span", withUnit(control, unit), "value");
   node.tabIndex = 0; node.title = explained(control); node.dataset.path = control.path;
-  node.setAttribute("role", "spinbutton"); node.setAttribute("aria-label", control.title);
-  const show = () => { node.textContent = withUnit(control, unit); node.setAttribute("aria-valuenow", control.value); };
+  node.setAttribute("role", "spinbutton"); node.setAttribute("aria-label", spokenName(control));
+  if (isNumber(control.low)) node.setAttribute("aria-valuemin", control.low);
+  if (isNumber(control.high)) node.setAttribute("aria-valuemax", control.high);
+  const show = () => { node.textContent = withUnit(control, unit); node.setAttribute("aria-valuenow", isNumber(control.value) ? control.value : 0); node.setAttribute("aria-valuetext", node.textContent); };
   show();
   let from = null;
   node.onpointerdown = event => { from = { x: event.clientX, value: isNumber(control.value) ? control.value : 1, moved: false }; node.setPointerCapture(event.pointerId); event.preventDefault(); node.focus(); };
@@ -70,6 +90,7 @@ function valueInWords(control, unit) {
     setValue(control, draggedValue(control, from.value, event.clientX - from.x), true); show();
   };
   node.onpointerup = () => { if (!from) return; const { moved } = from; from = null; node.classList.remove("dragging"); if (moved) { setValue(control, control.value); node.blur(); } else typeValue(node, control, unit); };
+  node.onpointercancel = () => { from = null; node.classList.remove("dragging"); };
   node.onkeydown = event => {
     const by = { ArrowUp: 12, ArrowRight: 12, ArrowDown: -12, ArrowLeft: -12, PageUp: 60, PageDown: -60 }[event.key];
     if (by) { event.preventDefault(); setValue(control, draggedValue(control, isNumber(control.value) ? control.value : 1, by)); show(); }
@@ -93,24 +114,29 @@ function choiceInWords(control) {
 
 function selectOf(control) {
   const node = element("select");
-  node.title = explained(control); node.setAttribute("aria-label", control.title); node.dataset.path = control.path;
+  node.title = explained(control); node.setAttribute("aria-label", spokenName(control)); node.dataset.path = control.path;
   node.append(...control.choices.map(choice => { const option = element("option", String(choice)); option.selected = choice === control.value; return option; }));
   node.onchange = () => setValue(control, control.choices[node.selectedIndex]);
   return node;
 }
 
-/* Reads what was typed: a number, several, or a word; null for nothing. */
+/* Reads what was typed: a number, perhaps with its unit, several numbers, or a word; null for nothing. What cannot be read is undefined, and a line says so. */
 function parsed(control, text) {
-  const clean = text.trim().replace(/−/g, "-");
-  if (clean === "" || clean === "none") return control.optional || control.kind === "text" ? null : undefined;
-  if (control.kind === "number" || control.kind === "integer") { const x = parseFloat(clean); return Number.isFinite(x) ? x : undefined; }
+  const clean = text.trim().replace(/−/g, "-"), refuse = () => { tell(`${control.title} = ${text.trim() || "nothing"}: must be ${control.kind === "integer" ? "an integer" : "a number"}`, true); };
+  if (clean === "" || clean === "none") return control.optional || control.kind === "text" ? null : refuse();
+  if (control.kind === "number" || control.kind === "integer") { const x = Number(withoutUnit(clean, control.unit)); return Number.isFinite(x) ? x : refuse(); }
   try { return JSON.parse(clean); } catch { const many = clean.split(/[\s,×]+/).map(Number); return Array.isArray(control.value) && many.every(Number.isFinite) ? many : clean; }
+}
+
+function withoutUnit(text, unit) {
+  const ends = [unit, raised(unit || ""), unit === "degrees" ? "°" : ""].filter(end => end && end !== "1" && text.endsWith(end));
+  return ends.length ? text.slice(0, -ends[0].length).trim() || "?" : text;
 }
 
 function typeValue(node, control, unit) {
   const input = element("input", undefined, "value typing");
   input.type = "text"; input.value = Array.isArray(control.value) || control.value && typeof control.value === "object" ? JSON.stringify(control.value) : control.value === null ? "" : String(control.value);
-  input.setAttribute("aria-label", control.title);
+  input.setAttribute("aria-label", spokenName(control));
   const close = keep => {
     input.onblur = null;
     const value = keep ? parsed(control, input.value) : undefined;

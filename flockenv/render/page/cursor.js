@@ -10,7 +10,7 @@ function showCursor(on) {
     cursor.at = [canvas.width / 2, canvas.height / 2];
     if (cursor.view.n === chosen.lane && eye && all) { const p = placeOf(all, chosen.agent); cursor.at = [eye.x(...p), eye.y(...p)]; }
     canvas.focus();
-    tell("Arrows move the pointer; Enter presses the tool and releases it; c puts the pointer away.");
+    tell("Arrows move the pointer; Enter presses and releases the tool; c hides the pointer.");
   }
   refresh();
 }

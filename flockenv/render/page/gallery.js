@@ -1,8 +1,13 @@
 /* The gallery of all worlds that ship, with pictures; and what to try in the one that is open. */
 
+/* Shows or hides the gallery; what it covers takes no keyboard meanwhile. */
 function openGallery(on) {
+  if ($("gallery").hidden === !on) return;
   $("gallery").hidden = !on;
-  if (on) { live.ask({ type: "gallery" }); $("gallery").focus(); } else { live.lastFrame = 0; refresh(); }
+  for (const covered of document.querySelectorAll("header, .work > :not(.gallery, dialog, .toast), footer")) covered.inert = on;
+  if (on) { live.ask({ type: "gallery" }); $("gallery").focus(); return; }
+  if (views.length) views[0].canvas.focus({ preventScroll: true });
+  live.lastFrame = 0; refresh();
 }
 
 function showGallery({ entries }) {
@@ -19,7 +24,11 @@ function showGallery({ entries }) {
     cards.append(...members.map(cardOf));
     return [title, cards];
   });
-  $("gallery").replaceChildren(intro, ...parts);
+  const cards = parts.flatMap(part => [...part.querySelectorAll(".card")]);
+  const find = findField("find a world", cards, card => card.textContent, () => {
+    for (const group of parts.filter(part => part.matches(".cards"))) group.hidden = group.previousElementSibling.hidden = !group.querySelector(".card:not([hidden])");
+  });
+  $("gallery").replaceChildren(intro, find, ...parts);
 }
 
 function cardOf(entry) {
@@ -31,16 +40,21 @@ function cardOf(entry) {
   } else card.append(element("div", "∴", "blank"));
   card.append(element("strong", entry.title), element("span", entry.description || ""));
   card.dataset.name = entry.name;
-  card.onclick = () => { tell(`Opening ${entry.title} …`, false, true); live.send({ type: "open", what: entry.name }); };
+  card.title = entry.description || "";
+  card.onclick = () => { live.opening = true; tell(`Opening ${entry.title} …`, false, true); live.send({ type: "open", what: entry.name }); };
   return card;
 }
 
+/* True on a small screen, where the sheet opens by a button. */
+function isNarrow() { return $("open").offsetParent !== null; }
+
 const HINTS = [
   [STEER, room => room.lanes.some(lane => (lane.players || []).includes("you"))],
-  ["Try: drag a blue number in the rules sideways.", room => room.sentences.length],
+  ["Try: drag a blue number in the rules sideways.", room => room.sentences.length && !isNarrow()],
+  ["Try: press Change, then drag a blue number sideways.", room => room.sentences.length && isNarrow()],
   ["Try: click an agent to see the forces on it.", () => true],
   ["Try: drag an agent, or draw an obstacle (o).", room => room.kind === "scene"],
-  ["Try: press ← to step back in time; it is exact.", () => true],
+  ["Try: press ← to step back in time; it is exact.", () => !isNarrow()],
   ["Try: under Players, steer yourself, or put rules, ppo and yourself side by side.", room => room.kind === "task"],
   ["Try: drag the world to turn it, use the wheel to zoom.", room => room.lanes[0].low.length === 3],
   ["Try: let the agents seek the pointer (f) or flee from it (e).", room => room.kind === "scene"],

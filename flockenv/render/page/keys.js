@@ -20,15 +20,15 @@ function liveKey(event) {
 /* Chooses the next agent, so that no pointer is needed. */
 function nextAgent(by) {
   const lane = chosen.lane || 0, { N } = state.group.panels[lane];
-  choose(lane, chosen.agent === null ? 0 : (chosen.agent + by + N) % N);
+  if (N) choose(lane, chosen.agent === null ? 0 : (chosen.agent + by + N) % N);
 }
 
 function showKeys() {
   const rows = [
     ["space", "play or pause"], ["← →", "one step back or on"], ["PgUp PgDn", "ten steps back or on"], ["Home, End", "to the start, to the newest moment"], ["↑ ↓", "faster, slower"], ["+ − r", "zoom; the whole world"],
-    ["Shift + arrows", "pan, or turn a world in 3-D"], ...Object.values(TOOLS).map(([key, title]) => [key, title]), ["n, p", "choose the next agent, the one before"],
+    ["Shift + arrows", "pan, or turn a world in 3-D"], ...Object.values(TOOLS).map(([key, title]) => [key, title]), ["n, p", "select the next agent, the previous one"],
     ["c", "a pointer for the keyboard: arrows move it, Enter presses and releases the tool"],
-    ["1 to 5", "Rules, Values, Agent, Measures, Compare"], ["W A S D, arrows, gamepad", "steer, where you are a player"], ["g", "all worlds"], ["s, l", "save; link to this moment"], ["d", "dark or light"], ["Esc", "put the tool down"],
+    ["1 to 5", "Rules, Values, Agent, Measures, Compare"], ["W A S D, arrows, gamepad", "steer, where you are a player"], ["g", "all worlds"], ["s, l", "save; link to this moment (while you steer: the buttons)"], ["d", "dark or light"], ["Esc", "no agent selected, and the first tool again"],
     ["wheel, pinch", "zoom"], ["drag the ground", "pan, or turn in 3-D (with Shift: pan)"], ["double click", "the whole world"],
   ];
   const list = element("dl");

@@ -40,7 +40,7 @@ function plainNumber(x) { return Number.isInteger(x) && Math.abs(x) < 1e6 ? Stri
 function unitOf(measure) { return measure && measure.unit && measure.unit !== "1" ? " " + raised(measure.unit) : ""; }
 
 /* The colour of a world among several. */
-function laneColour(n) { return n ? forceColour(n - 1) : paint.accent; }
+function laneColour(n) { return [paint.accent, roleColour.pursuer, roleColour["learner 2"], paint.goal][n]; }
 
 function valueOfLane(measure, colour) {
   const out = element("span", measure && measure.value !== null ? plainNumber(measure.value) : "–");
@@ -82,5 +82,5 @@ function timingBox() { const box = element("div"); box.id = "timing"; return box
 function showTiming() {
   const box = $("timing"), t = live.timing;
   if (!box) return;
-  box.replaceChildren(heading("A picture"), plainTable([["pictures a second", live.rate.shown.toFixed(0)], ["drawing", `${drawn.ms.toFixed(1)} ms`], ["physics", t.step === undefined ? "–" : `${t.step.toFixed(2)} ms/step`], ["encoding", t.encode === undefined ? "–" : `${t.encode.toFixed(2)} ms`], ["answer from the server", t.round === undefined ? "–" : `${t.round.toFixed(1)} ms`]]));
+  box.replaceChildren(heading("Frames"), plainTable([["frames per second", live.rate.shown.toFixed(0)], ["drawing", `${drawn.ms.toFixed(1)} ms`], ["physics", t.step === undefined ? "–" : `${t.step.toFixed(2)} ms/step`], ["encoding", t.encode === undefined ? "–" : `${t.encode.toFixed(2)} ms`], ["round trip to the server", t.round === undefined ? "–" : `${t.round.toFixed(1)} ms`]]));
 }

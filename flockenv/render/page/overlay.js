@@ -171,6 +171,7 @@ function ramp() {
 /* The legend with the scales of what colours and the field show, which change with the world: made anew twice a second. */
 function showScales({ panel, field }) {
   const shown = panel.colour || field, now = performance.now();
+  if (panel.scaled !== Boolean(field)) { panel.scaled = Boolean(field); panel.legendOld = true; }
   if (!panel.legendOld && !(shown && now - (showScales.last || 0) > 500)) return;
   panel.legendOld = false; showScales.last = now;
   makeLegend(state.group);

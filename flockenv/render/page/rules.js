@@ -20,8 +20,8 @@ function sentenceLine(sentence) {
   for (const part of sentence.parts) line.append(part.path === null ? raised(part.text) : valueInWords(controlAt(part.path) || controlOfPart(part), part.unit));
   if (sentence.removable) {
     const button = element("button", "×", "remove");
-    button.title = "take this rule out"; button.setAttribute("aria-label", "take this rule out");
-    button.onclick = () => live.edit({ kind: "remove", path: sentence.path });
+    button.title = "remove"; button.setAttribute("aria-label", `remove: ${line.textContent}`);
+    button.onclick = () => { button.disabled = true; live.edit({ kind: "remove", path: sentence.path }); }; // a second click would remove the next one
     line.append(button);
   }
   return line;
@@ -37,13 +37,18 @@ function controlOfPart(part) {
 /* The button that shows which effects this world, as it is now, can have besides its own. */
 function adder() {
   const box = element("div"), button = element("button", "+ add a rule", "add"), list = element("div", undefined, "choices");
+  const offer = message => {
+    const choices = message.additions.map(choiceOf);
+    list.replaceChildren(findField("find a rule", choices), ...choices);
+    box.scrollIntoView({ block: "start" });
+  };
   list.hidden = true;
   button.setAttribute("aria-expanded", "false");
   button.onclick = () => {
     list.hidden = !list.hidden; button.setAttribute("aria-expanded", !list.hidden);
-    if (!list.hidden) { list.replaceChildren(element("p", "Looking …", "empty")); live.ask({ type: "additions" }); }
+    if (!list.hidden) { list.replaceChildren(element("p", "Finding the rules that this world can have …", "empty")); live.ask({ type: "additions" }); }
   };
-  live.listeners.additions = [message => list.replaceChildren(...message.additions.map(choiceOf))];
+  live.listeners.additions = [offer];
   box.append(button, list);
   return box;
 }
@@ -51,6 +56,6 @@ function adder() {
 function choiceOf(addition) {
   const choice = element("button", addition.title);
   choice.append(element("small", addition.description));
-  choice.onclick = () => live.edit({ kind: "add", path: addition.path, value: addition.value });
+  choice.onclick = () => { choice.parentNode.inert = true; live.edit({ kind: "add", path: addition.path, value: addition.value }); };
   return choice;
 }

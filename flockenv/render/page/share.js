@@ -22,13 +22,14 @@ function showYaml({ text, note }) {
   const area = element("textarea", text);
   area.spellcheck = false; area.value = text; area.setAttribute("aria-label", "the record as YAML");
   const about = element("p", note, "lead");
+  about.id = "saved"; about.setAttribute("role", "status");
   const row = openDialog("Save", about, area);
   const act = (name, run) => { const button = element("button", name); button.onclick = run; row.prepend(button); };
   act("Replay …", () => beginRecording("replay"));
   act("GIF …", () => beginRecording("gif"));
   act("WebM …", () => { $("dialog").close(); film(); });
   act("PNG", savePicture);
-  act("Load this text", () => { live.send({ type: "load", yaml: area.value }); $("dialog").close(); });
+  act("Load this text", () => { about.textContent = live.send({ type: "load", yaml: area.value }) || "Loading …"; });
   act("YAML", () => download(fileName(".yaml"), new Blob([area.value], { type: "text/yaml" })));
 }
 
@@ -86,8 +87,9 @@ function takeFilm({ form, html, data: text }) {
   else download(fileName(".html"), new Blob([html], { type: "text/html" }));
 }
 
-function showRecording({ on }) {
+function showRecording({ on, note }) {
+  if (note) tell(note);
   live.recording = on ? live.form : null;
   $("save").textContent = on ? "Stop recording" : "Save";
-  if (on) tell(`Recording. Press “Stop recording” to save it as ${live.form === "gif" ? "a GIF; worlds in 3-D are drawn from above" : "a replay in one file"}.`);
+  if (on) tell(`Recording. Press “Stop recording” to save it as ${live.form === "gif" ? "a GIF; worlds in 3-D are drawn from above" : "a replay in one file"}. It begins anew if time goes back or an agent is added or removed.`);
 }

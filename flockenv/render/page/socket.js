@@ -1,9 +1,11 @@
 /* The live source: a socket to the server, which plays the worlds; the page asks for each frame when it can draw one. */
 const MAGIC = 0x01464c46; // "FLF" and the version 1, little endian: see flockenv/play/frames.py
 const BLOCKS = { pos: Uint16Array, heading: Uint8Array, tilt: Int8Array, shade: Uint8Array, identity: Uint16Array, field: Uint8Array, arrows: Int8Array };
+const QUESTIONS = { yaml: "save", link: "share" }; // the questions of answers with another name
+const RETRY = 1000; // ms until a page without a connection tries again; each time it waits longer
 const live = {
   socket: null, room: null, waiting: false, askedAt: 0, toldAt: 0, lastFrame: 0, header: {}, want: { colour: "", field: "" }, listeners: {}, timing: {}, last: null,
-  asked: new Set(), rate: { since: 0, count: 0, shown: 0 },
+  asked: new Set(), retry: RETRY, greeted: false, opening: false, rate: { since: 0, count: 0, shown: 0 },
 
   connect() {
     const url = new URL("ws", location.href);
@@ -11,15 +13,31 @@ const live = {
     url.search = location.search; url.hash = "";
     this.socket = new WebSocket(url);
     this.socket.binaryType = "arraybuffer";
-    this.socket.onopen = () => { this.send({ type: "hello", version: 1 }); this.begin(); };
+    this.socket.onopen = () => {
+      this.send({ type: "hello", version: data.version });
+      if (this.greeted) tell(""); else this.begin();
+      this.greeted = true; this.retry = RETRY;
+    };
     this.socket.onmessage = event => typeof event.data === "string" ? this.take(JSON.parse(event.data)) : this.frame(event.data);
     this.socket.onclose = event => {
-      this.waiting = true; showPlaying(false);
-      tell(event.reason ? `The server has closed this page: ${event.reason}` : "The server has ended. Start it again with: flockenv play", true, true);
+      this.waiting = true; this.asked.clear(); showPlaying(false);
+      if (event.code === 1001) { tell("The server has ended. Start it again with: flockenv play; then reload this page.", true, true); return; }
+      if (event.reason) { tell(`The server has closed this page: ${event.reason}. Reload it to go on.`, true, true); return; }
+      tell("The page has lost its server and tries again. If the server has ended, start it with: flockenv play", true, true);
+      setTimeout(() => this.connect(), this.retry);
+      this.retry = Math.min(1.5 * this.retry, 10000);
     };
   },
   begin() { const link = location.hash.slice(1); if (link.startsWith("w=")) this.send({ type: "link", text: link.slice(2) }); },
-  send(message) { if (this.socket && this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message)); },
+  /* Sends a message; returns a line if it is too long, else nothing. */
+  send(message) {
+    if (!this.socket || this.socket.readyState !== WebSocket.OPEN) return "";
+    const text = JSON.stringify(message), long = (message.yaml || message.text || "").length, size = new TextEncoder().encode(text).length;
+    if (long <= data.longest && size <= data.largest) { this.socket.send(text); return ""; }
+    const line = `${message.type}: ${long > data.longest ? `${long} characters; at most ${data.longest}` : `${size} bytes; at most ${data.largest}`} can be sent`;
+    this.asked.delete(message.type); tell(line, true);
+    return line;
+  },
 
   /* Sends an edit to one lane (an index) or to all of them (null). */
   edit(edit, lane = null) { this.send({ type: "edit", edit: lane === null ? edit : { ...edit, lane } }); },
@@ -33,7 +51,7 @@ const live = {
   },
   on(type, act) { (this.listeners[type] = this.listeners[type] || []).push(act); },
   take(message) {
-    this.asked.delete(message.type);
+    this.asked.delete(QUESTIONS[message.type] || message.type);
     if (message.type === "error") this.refused(message.about);
     if (message.type !== "notice" && $("toast").dataset.busy) tell("");
     if (message.type === "room") this.takeRoom(message);

@@ -114,7 +114,7 @@ function legendRow([text, colour, kind]) {
 
 function makeLegend(group) {
   const has = test => group.panels.some(p => p.scenery.some(test)), rows = [];
-  for (const role of Object.keys(data.roles)) {
+  for (const role of group.panels.every(p => p.colour) ? [] : Object.keys(data.roles)) { // a scale explains other colours
     const panel = group.panels.find(p => p.kinds.includes(role) && !hasFaces(p));
     if (!panel) continue;
     const look = panel.looks[panel.look[panel.roles.indexOf(role)]];

@@ -59,13 +59,15 @@ function keepAsking() {
 /* What is left of another world is put away; with a wish for less motion the new one begins at rest. */
 function enter(room) {
   showRoom.shown = room.name;
+  live.want = { colour: "", field: "" }; $("field").value = "";
   curves.clear(); choose(null, null); openTab("rules"); tell(""); showHint(0);
   if (matchMedia("(prefers-reduced-motion: reduce)").matches && room.playing) live.play(false);
 }
 
 /* Shows a message about the room beside the worlds: controls, tools, lists. */
 function showRoom(room) {
-  $("gallery").hidden = true;
+  if ($("saved") && $("saved").textContent === "Loading …") $("dialog").close();
+  if (live.opening || showRoom.shown !== room.name) { live.opening = false; openGallery(false); } // another page may change the world that a gallery covers
   if (showRoom.shown !== room.name) enter(room);
   if (chosen.agent !== null && (chosen.lane >= room.lanes.length || chosen.agent >= state.group.panels[chosen.lane].N)) choose(null, null);
   if (live.want.colour && !room.colours.includes(live.want.colour)) live.want.colour = "";
@@ -87,11 +89,19 @@ function keepFocus(act) {
 /* True while a slider is being dragged: its row must not be made anew. */
 function pressedSlider() { return Boolean(document.querySelector("#sheet input[type=range]:active")); }
 
+/* Begins again with the seed that was typed, if it is one. */
+function readSeed() {
+  const field = $("seed"), seed = field.valueAsNumber;
+  if (Number.isSafeInteger(seed) && seed >= 0) { live.send({ type: "seed", seed }); return; }
+  tell(`seed = ${field.value || "nothing"}: must be an integer from 0 to ${Number.MAX_SAFE_INTEGER}`, true);
+  if (live.room) field.value = live.room.seed;
+}
+
 function start() {
   makeTools(); startTabs(); startDrawnList(); showLook();
   $("worlds").onclick = () => openGallery(true);
-  $("again").onclick = () => live.send({ type: "seed", seed: live.room.seed });
-  $("seed").onchange = () => live.send({ type: "seed", seed: Math.max(0, Math.round($("seed").valueAsNumber) || 0) });
+  $("again").onclick = () => live.send({ type: "seed" });
+  $("seed").onchange = readSeed;
   $("save").onclick = saveOrStop;
   $("share").onclick = LIVE_KEYS.l;
   $("help").onclick = showKeys;
@@ -105,10 +115,13 @@ function start() {
   live.on("notice", ({ text, busy }) => { tell(text, false, busy); $("toast").dataset.busy = busy ? "1" : ""; });
   live.on("error", ({ text, about }) => {
     if (about === "look" || about === "frame") return; // the agent, or its world, is there no more
+    if (about === "open") live.opening = false;
+    if (about === "load" && $("saved") && $("dialog").open) { $("saved").textContent = text; return; } // the text stays, to be mended
+    if (about === "record") showRecording({ on: false }); // it ended, as another world was opened
     tell(text, true);
     if (live.room) keepFocus(() => { showRules(live.room); showValues(live.room); });
   });
-  live.on("welcome", ({ open }) => { if (!open) openGallery(true); });
+  live.on("welcome", ({ open }) => { if (!open) { live.room = null; openGallery(true); } });
   live.connect();
 }
 

@@ -1,8 +1,8 @@
 /* Tools of the stage: choose and drag, add, draw obstacles, erase, lead with the pointer. */
 const TOOLS = {
-  choose: ["v", "choose: click an agent to look inside it, drag it to move it, drag an obstacle", "M4 2l8.5 5-4 1 2.5 4.5-1.6.9-2.5-4.6L4 12z"],
+  choose: ["v", "select: click an agent to see its forces; drag an agent or an obstacle to move it", "M4 2l8.5 5-4 1 2.5 4.5-1.6.9-2.5-4.6L4 12z"],
   add: ["a", "add agents: click; with Shift ten at a time", "M8 3v10M3 8h10"],
-  obstacle: ["o", "draw an obstacle: drag from its middle; with Shift a block", "M8 2.5a5.5 5.5 0 1 0 0 11a5.5 5.5 0 0 0 0-11z"],
+  obstacle: ["o", "draw an obstacle: drag from its centre; with Shift a block", "M8 2.5a5.5 5.5 0 1 0 0 11a5.5 5.5 0 0 0 0-11z"],
   erase: ["x", "erase: click an agent or an obstacle", "M4 4l8 8M12 4l-8 8"],
   goal: ["f", "agents seek the pointer", "M8 1.5v3M8 11.5v3M1.5 8h3M11.5 8h3M8 5.5a2.5 2.5 0 1 0 0 5a2.5 2.5 0 0 0 0-5z"],
   flee: ["e", "agents flee from the pointer", "M2 8h4M10 8h4M8 2v4M8 10v4M4 6L2 8l2 2M12 6l2 2-2 2M6 4l2-2 2 2M6 12l2 2 2-2"],

@@ -6,8 +6,6 @@ function showValues(room) {
     if (!parts.has(part)) parts.set(part, []);
     parts.get(part).push(control);
   }
-  const search = element("input");
-  search.type = "text"; search.placeholder = "find a value"; search.style.width = "100%"; search.id = "find"; search.setAttribute("aria-label", "find a value");
   const groups = [...parts].map(([part, controls]) => {
     const group = element("details"), head = element("summary", room.titles[part] || part);
     group.dataset.part = part; group.open = open.has(part) || !part && !open.size;
@@ -15,14 +13,10 @@ function showValues(room) {
     group.append(head, ...controls.map(controlRow));
     return group;
   });
-  search.oninput = () => {
-    const word = search.value.toLowerCase();
-    for (const group of groups) {
-      let any = false;
-      for (const row of group.querySelectorAll(".control")) { const fits = row.textContent.toLowerCase().includes(word) || row.title.toLowerCase().includes(word) || group.textContent.toLowerCase().includes(word) && !word; row.hidden = !fits; any = any || fits; }
-      group.hidden = !any; if (word) group.open = any;
-    }
-  };
+  const search = findField("find a value", groups.flatMap(group => [...group.querySelectorAll(".control")]), row => `${row.textContent} ${row.title}`, word => {
+    for (const group of groups) { group.hidden = !group.querySelector(".control:not([hidden])"); if (word) group.open = !group.hidden; }
+  });
+  search.id = "find";
   $("values").replaceChildren(search, ...groups);
 }
 
@@ -40,7 +34,7 @@ function controlRow(control) {
 
 function checkOf(control) {
   const input = element("input");
-  input.type = "checkbox"; input.checked = control.value; input.setAttribute("aria-label", control.title);
+  input.type = "checkbox"; input.checked = control.value; input.setAttribute("aria-label", spokenName(control));
   input.onchange = () => setValue(control, input.checked);
   return input;
 }
@@ -48,7 +42,7 @@ function checkOf(control) {
 function textOf(control) {
   const input = element("input");
   input.type = "text"; input.value = control.value === null ? "" : typeof control.value === "object" ? JSON.stringify(control.value) : String(control.value); input.placeholder = "none";
-  input.setAttribute("aria-label", control.title);
+  input.setAttribute("aria-label", spokenName(control));
   input.onchange = () => setValue(control, parsed(control, input.value));
   return input;
 }
@@ -57,13 +51,17 @@ function textOf(control) {
 function numberInputs(control, field) {
   const input = element("input"), low = isNumber(control.low) ? control.low : Math.min(0, 3 * (control.value || 0)), high = isNumber(control.high) ? control.high : Math.max(3 * Math.abs(control.value || 0), 1);
   input.type = "number"; input.step = control.kind === "integer" ? "1" : "any"; input.value = control.value === null ? "" : control.value; input.dataset.path = control.path;
-  input.setAttribute("aria-label", control.title);
+  input.setAttribute("aria-label", spokenName(control));
   field.append(input, raised(control.unit || ""));
   const slider = element("input");
   slider.type = "range"; slider.min = low; slider.max = high; slider.step = control.kind === "integer" ? "1" : "any"; slider.value = control.value === null ? low : control.value;
-  slider.setAttribute("aria-label", `${control.title}, slider`);
+  slider.setAttribute("aria-label", `${spokenName(control)}, slider`);
   slider.oninput = () => { const value = rounded(control, slider.valueAsNumber); input.value = value; setValue(control, value, true); };
   slider.onchange = () => setValue(control, rounded(control, slider.valueAsNumber));
-  input.onchange = () => { const value = parsed(control, input.value); if (value !== undefined) { slider.value = value; setValue(control, value); } };
+  input.onchange = () => {
+    const value = parsed(control, input.value);
+    if (value === undefined) { input.value = control.value === null ? "" : control.value; return; }
+    slider.value = value; setValue(control, value);
+  };
   return [slider];
 }

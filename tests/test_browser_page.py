@@ -1,0 +1,231 @@
+"""The live page in a browser: what is refused, what a keyboard and a screen reader reach, and a lost connection."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+pytest.importorskip("websockets", reason="needs the extra `play`: pip install 'flockenv[play]'")
+from flockenv.play.session import Session
+from tests.playground import Visit, serving, wait_for
+from tests.test_browser import chromium, room_of, shown_boids, visit
+
+__all__ = ["chromium", "visit"]
+
+pytestmark = pytest.mark.slow  # starting a browser takes seconds
+
+TOAST = "document.getElementById('toast').textContent"
+
+
+@pytest.fixture(scope="module")
+def boids() -> Session:
+    session = shown_boids()
+    room_of(session).play(False)
+    return session
+
+
+def opened(visit: Callable[..., Visit], url: str, width: int = 1280, **options: Any) -> Visit:
+    here = visit(url, width, **options)
+    here.until("live.room !== null && state.group.panels[0].frames.length > 0")
+    return here
+
+
+@pytest.mark.parametrize(
+    ("path", "text", "refusal"),
+    [
+        ("effects[0].weight", "abc", "weight = abc: must be a number"),
+        ("effects[0].weight", "1,5", "weight = 1,5: must be a number"),
+        ("effects[0].weight", "12 apples", "weight = 12 apples: must be a number"),
+        ("effects[0].weight", "", "weight = nothing: must be a number"),
+        ("groups[0].count", "2.5", "groups[0].count = 2.5: must be an integer"),
+    ],
+)
+def test_what_is_no_number_is_refused_in_one_line(
+    boids: Session, visit: Callable[..., Visit], path: str, text: str, refusal: str
+) -> None:
+    with serving(boids) as server:
+        here = opened(visit, server.url)
+        before = room_of(boids).lanes[0].record
+        here.page.locator(f".value[data-path='{path}']").first.click()
+        here.page.keyboard.press("Control+a")
+        here.page.keyboard.type(text) if text else here.page.keyboard.press("Delete")
+        here.page.keyboard.press("Enter")
+        here.until(f"{TOAST}.includes({refusal!r})")
+        assert room_of(boids).lanes[0].record == before
+
+
+def test_a_number_may_be_typed_with_its_unit(boids: Session, visit: Callable[..., Visit]) -> None:
+    with serving(boids) as server:
+        here = opened(visit, server.url)
+        here.page.locator(".value[data-path='effects[0].radius']").first.click()
+        here.page.keyboard.press("Control+a")
+        here.page.keyboard.type("3.5 m")
+        here.page.keyboard.press("Enter")
+        wait_for(lambda: room_of(boids).lanes[0].record.effects[0].radius == 3.5)
+
+
+def test_a_world_is_saved_and_linked_more_than_once(boids: Session, visit: Callable[..., Visit]) -> None:
+    with serving(boids) as server:
+        here = opened(visit, server.url)
+        for _ in range(2):
+            here.page.keyboard.press("s")
+            here.page.locator("dialog textarea").wait_for()
+            here.page.keyboard.press("Escape")
+            here.value("history.replaceState(null, '', '/')")
+            here.page.locator("#share").click()
+            here.until("location.hash.startsWith('#w=')")
+
+
+@pytest.mark.parametrize("seed", ["-1", "1e30", ""])
+def test_a_seed_that_is_none_is_refused_and_the_page_stays(
+    boids: Session, visit: Callable[..., Visit], seed: str
+) -> None:
+    with serving(boids) as server:
+        here = opened(visit, server.url)
+        here.page.locator("#seed").fill(seed)
+        here.page.locator("#seed").press("Enter")
+        here.until(f"{TOAST}.includes('must be an integer from 0 to 9007199254740991')")
+        assert here.page.locator("#seed").input_value() == "0"
+        here.page.keyboard.press("s")
+        here.page.locator("h1").click()
+        here.page.keyboard.press("s")
+        here.page.locator("dialog textarea").wait_for()  # the server still answers
+
+
+@pytest.mark.parametrize(
+    ("text", "refusal"),
+    [("'# no scene'.repeat(6001)", "load: 60010 characters"), ("'#\\n'.repeat(29000)", "load: 87025 bytes")],
+)
+def test_a_text_that_is_too_long_is_refused_and_the_page_stays(
+    boids: Session, visit: Callable[..., Visit], text: str, refusal: str
+) -> None:
+    with serving(boids) as server:
+        here = opened(visit, server.url)
+        here.page.locator("#save").click()
+        here.page.locator("dialog textarea").wait_for()
+        here.value(f"document.querySelector('dialog textarea').value = {text}")
+        here.page.locator("dialog button", has_text="Load this text").click()
+        here.until(f"document.getElementById('saved').textContent.includes({refusal!r})")
+        here.page.keyboard.press("Escape")
+        here.page.locator("#save").click()
+        here.until("document.querySelector('dialog textarea').value.includes('groups')")
+
+
+def test_a_text_with_an_error_stays_to_be_mended(boids: Session, visit: Callable[..., Visit]) -> None:
+    with serving(boids) as server:
+        here = opened(visit, server.url)
+        here.page.locator("#save").click()
+        area = here.page.locator("dialog textarea")
+        text = area.input_value()
+        area.fill(text.replace("weight:", "wieght:", 1))
+        here.page.locator("dialog button", has_text="Load this text").click()
+        here.until("document.getElementById('saved').textContent.includes('wieght')")
+        line = here.page.locator("#saved").inner_text()
+        assert "did you mean `weight`" in line and "\n" not in line
+        area.fill(text)
+        here.page.locator("dialog button", has_text="Load this text").click()
+        here.until("!document.getElementById('dialog').open")
+
+
+def test_a_second_click_removes_and_adds_nothing_more(boids: Session, visit: Callable[..., Visit]) -> None:
+    with serving(boids) as server:
+        here = opened(visit, server.url)
+        here.value("window.edits = [], live.edit = edit => edits.push(edit.kind), 0")
+        here.page.locator(".sentence:has([data-path='effects[0].weight']) .remove").dblclick(force=True)
+        assert here.value("window.edits") == ["remove"]
+
+
+def test_the_gallery_keeps_the_keyboard_and_finds_worlds(visit: Callable[..., Visit]) -> None:
+    with serving(Session()) as server:
+        here = visit(server.url)
+        here.page.locator(".card").first.wait_for()
+        for _ in range(4):
+            here.page.keyboard.press("Tab")
+            assert here.value("document.activeElement.closest('#gallery') !== null")
+        here.page.locator("#gallery .find").fill("reynolds")
+        assert here.page.locator(".card:visible").evaluate_all("cards => cards.map(c => c.dataset.name)") == ["boids"]
+        assert here.page.locator("#gallery h3:visible").count() == 1
+        here.page.locator(".card:visible").press("Enter")
+        here.until("live.room !== null && document.activeElement === views[0].canvas")
+        assert not here.page.locator("#gallery").is_visible()
+
+
+def test_a_change_by_another_page_leaves_the_gallery_open(boids: Session, visit: Callable[..., Visit]) -> None:
+    with serving(boids) as server:
+        here, other = opened(visit, server.url), opened(visit, server.url)
+        here.page.keyboard.press("g")
+        here.page.locator(".card").first.wait_for()
+        version = here.value("live.room.version")
+        other.value("live.set('effects[1].weight', 0.7)")
+        here.value("live.send({ type: 'save' })")  # its answer comes with the news
+        here.until(f"live.room.version !== {version}")
+        assert here.page.locator("#gallery").is_visible()
+
+
+def test_every_control_has_a_name_of_its_own(boids: Session, visit: Callable[..., Visit]) -> None:
+    """A reader who hears the names alone knows which rule a value or a button belongs to."""
+    with serving(boids) as server:
+        here = opened(visit, server.url)
+        here.page.keyboard.press("2")
+        here.value("document.querySelectorAll('#values details').forEach(group => { group.open = true; })")
+        labels = "(e.labels && e.labels[0] || {}).innerText"
+        named = f"(e.getAttribute('aria-label') || e.innerText || {labels} || '').trim()"
+        controls = "[...document.querySelectorAll('button, input, select, textarea, [tabindex]')]"
+        assert here.value(f"{controls}.filter(e => e.checkVisibility() && !{named}).map(e => e.outerHTML)") == []
+        for section in ("#rules .value, #rules .remove", "#values input"):
+            names = here.value(f"[...document.querySelectorAll('{section}')].map(e => {named})")
+            assert len(names) == len(set(names)), names
+        value = here.page.locator(".value[data-path='effects[1].weight']").first
+        assert value.get_attribute("aria-label") == "weight, effect 2: alignment"
+        assert value.get_attribute("aria-valuetext").endswith(" kg/s")
+
+
+def test_a_page_connects_again(boids: Session, visit: Callable[..., Visit]) -> None:
+    with serving(boids) as server:
+        here = opened(visit, server.url)
+        (connection,) = server._pages
+        connection.loop.call_soon_threadsafe(connection.transport.abort)
+        here.until(f"{TOAST}.includes('tries again')")
+        here.until("live.socket.readyState === WebSocket.OPEN && live.greeted")
+        frames = here.value("live.lastFrame")
+        here.until(f"live.lastFrame > {frames}")
+        here.page.keyboard.press("ArrowRight")
+        tick = room_of(boids).tick
+        wait_for(lambda: room_of(boids).tick >= tick)
+        assert "tries again" not in here.value(TOAST)
+
+
+def test_a_recording_ends_with_its_world(visit: Callable[..., Visit]) -> None:
+    session = shown_boids()
+    with serving(session) as server:
+        here = opened(visit, server.url)
+        here.page.locator("#save").click()
+        here.page.locator("dialog button", has_text="Replay").click()
+        here.until("document.getElementById('save').textContent === 'Stop recording'")
+        here.value("live.send({ type: 'open', what: 'vicsek' })")
+        here.until("live.room.name === 'vicsek'")
+        here.until("document.getElementById('save').textContent === 'Save'")
+
+
+def test_a_phone_shows_all_actions_and_the_whole_title(boids: Session, visit: Callable[..., Visit]) -> None:
+    with serving(boids) as server:
+        here = opened(visit, server.url, 400, has_touch=True)
+        for name in ("worlds", "again", "save", "share", "open", "help"):
+            box = here.page.locator(f"#{name}").bounding_box()
+            assert box["x"] >= 0 and box["x"] + box["width"] <= 400, name
+        assert here.value("document.querySelector('h1').scrollWidth <= document.querySelector('h1').clientWidth")
+        assert here.value("document.documentElement.scrollWidth <= innerWidth")
+
+
+def test_the_legend_shows_what_colours_mean(boids: Session, visit: Callable[..., Visit]) -> None:
+    with serving(boids) as server:
+        here = opened(visit, server.url)
+        legend = "document.getElementById('legend').textContent"
+        here.page.locator("#colour").select_option("speed")
+        here.page.locator("#field").select_option("density")
+        here.until(f"{legend}.includes('speed:') && {legend}.includes('density:') && !{legend}.includes('agent')")
+        here.page.locator("#colour").select_option("")
+        here.page.locator("#field").select_option("")
+        here.until(f"{legend}.includes('agent') && !{legend}.includes('density:')")
