@@ -159,6 +159,7 @@ def test_a_change_by_another_page_leaves_the_gallery_open(boids: Session, visit:
         here.page.locator(".card").first.wait_for()
         version = here.value("live.room.version")
         other.value("live.set('effects[1].weight', 0.7)")
+        wait_for(lambda: room_of(boids).lanes[0].record.effects[1].weight == 0.7)
         here.value("live.send({ type: 'save' })")  # its answer comes with the news
         here.until(f"live.room.version !== {version}")
         assert here.page.locator("#gallery").is_visible()
