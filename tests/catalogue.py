@@ -126,6 +126,7 @@ from flockenv.physics.integrators import (
     ImplicitEuler,
     ImplicitMidpoint,
     Integrator,
+    LinearlyImplicitEuler,
     Midpoint,
     SemiImplicitEuler,
     VelocityVerlet,
@@ -550,6 +551,7 @@ INTEGRATORS = (
     IntegratorRow(DormandPrince(), 271.828183, 3.3065, 0.997),
     IntegratorRow(ExponentialDrag(), 271.68016, 2, 2),  # for drag within the force; none for drag it is passed
     IntegratorRow(ImplicitEuler(), 286.79720, math.inf, math.inf),
+    IntegratorRow(LinearlyImplicitEuler(), 275.31167, 2, 2),  # explicit for forces without a known derivative
     IntegratorRow(ImplicitMidpoint(), 272.055141, math.inf, math.inf),
 )
 

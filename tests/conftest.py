@@ -48,7 +48,15 @@ RARE_EFFECTS = {
 }  # fmt: skip
 """Effects whose symmetries only slow tests try: each compiles a kernel, and has quick tests elsewhere."""
 
-RARE_METHODS = {"averaged_velocity", "midpoint", "heun", "exponential_drag", "adaptive_rk4", "implicit_midpoint"}
+RARE_METHODS = {
+    "averaged_velocity",
+    "midpoint",
+    "heun",
+    "exponential_drag",
+    "adaptive_rk4",
+    "implicit_midpoint",
+    "linearly_implicit_euler",
+}
 """Methods whose kernels only slow tests compile; quick tests run those in Python that are not implicit."""
 
 IN_SPACE_SLOW = {

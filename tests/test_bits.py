@@ -28,8 +28,8 @@ from flockenv.tasks import TASKS
 pytestmark = pytest.mark.filterwarnings("ignore")  # warnings of scenes are not tested here
 ROOT = Path(__file__).resolve().parent.parent
 STORED = Path(__file__).with_name("bits.json")
-STEPS, SLOW_STEPS = 2000, {"configs/scenes/cloth.yaml": 300}
-"""Steps of a scene; the cloth's implicit method takes 20 ms for one."""
+STEPS = 2000
+"""Steps of a scene."""
 WORLDS, DECISIONS = 64, 500
 
 
@@ -48,7 +48,7 @@ def of_scene(name: str) -> str:
     scene = load_scene(ROOT / name)
     state = scene.start(0)
     with contextlib.suppress(SimulationDiverged):
-        for _ in range(SLOW_STEPS.get(name, STEPS) // 50):
+        for _ in range(STEPS // 50):
             state = scene.run(state, 50)
     return digest(state.x, state.v, state.alive, state.tick)
 

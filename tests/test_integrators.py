@@ -90,7 +90,7 @@ def test_the_orders_are_those_of_the_table() -> None:
     promised = {"explicit_euler": (1, 1), "semi_implicit_euler": (1, 1), "averaged_velocity": (1, 1), "rk4": (4, 4)}
     promised |= {"midpoint": (2, 2), "heun": (2, 2), "velocity_verlet": (2, 2), "exponential_drag": (2, 2)}
     promised |= {"adaptive_rk4": (4, 4), "dormand_prince": (5, 5)}
-    promised |= {"implicit_euler": (1, 1), "implicit_midpoint": (2, 2)}
+    promised |= {"implicit_euler": (1, 1), "implicit_midpoint": (2, 2), "linearly_implicit_euler": (1, 1)}
     assert {name: orders[name] for name in promised} == promised
 
 
@@ -186,7 +186,9 @@ def test_a_constant_force_gives_a_parabola(row: IntegratorRow) -> None:
     state, g = at_start(blank(1, 1, 2, 0, 0.25)), -9.81
     for _ in range(8):
         state = row.method(lambda x, v, t: g + 0 * x, state, 0.25)
-    lag = {"explicit_euler": -1, "semi_implicit_euler": 1, "implicit_euler": 1}.get(row.name, 0)
+    lag = {"explicit_euler": -1, "semi_implicit_euler": 1, "implicit_euler": 1, "linearly_implicit_euler": 1}.get(
+        row.name, 0
+    )
     off = lag * 0.25 * g * 2.0 / 2
     np.testing.assert_allclose(state.pos, X0 + 2 * V0 + g * 2 + off, rtol=1e-13)
     np.testing.assert_allclose(state.vel, V0 + g * 2, rtol=1e-13)

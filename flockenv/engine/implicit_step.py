@@ -1,6 +1,7 @@
 """Steps of a scene by an implicit method: which agents depend on which, and how the kernel takes over the solution.
 
-The method itself, and Newton's method, know nothing of scenes (flockenv.physics.integrators.implicit and newton).
+The method itself, and Newton's method, know nothing of scenes (flockenv.physics.integrators.implicit and newton). The
+linear equations of a linearly implicit method are those of the scene's effects (`linear_step`).
 """
 
 from __future__ import annotations
@@ -11,12 +12,18 @@ from typing import Any
 
 import numpy as np
 
+from flockenv.engine.linear_step import LinearSolver, NotSolvedLinearlyError
 from flockenv.model.scene_view import SceneView
 from flockenv.model.state import WORK, Floats, State
 from flockenv.physics.integrators.implicit import Implicit
 from flockenv.physics.integrators.newton import Coupling, Evaluate, NotSolvedError, coupling_between
 
 __all__ = ["coupling_of", "solve_steps"]
+
+Kernel = Callable[[State, int, Floats, Floats], tuple[int, int]]
+
+Advance = Callable[[State], tuple[int, str]]
+"""Advances one world by one step; returns the agent that is not finite or was not solved, or -1, and the reason."""
 
 MOST_NUMBERS = 2**22
 """Coordinates that are evaluated together; the columns of a large matrix are evaluated in portions."""
@@ -47,24 +54,24 @@ def solve_steps(
     state: State,
     drive: Floats,
     steps: int,
-    step: Callable[[State, int, Floats, Floats], tuple[int, int]],
+    step: Kernel,
+    solver: LinearSolver | None = None,
 ) -> tuple[int, int, str]:
     """Advance every world of a state in place; return the first (world, agent) that failed, and why.
 
     A world fails if an agent is not finite or the equations are not solved; it then stays as it was. `step(state,
     world, x, v)` passes positions and velocities (D, N) to the kernel, which applies limits, the space and the time.
+    solver: of a linearly implicit method.
     """
-    method = scene.integrator
-    assert isinstance(method, Implicit)
     broken = (-1, -1, "")
     for b in range(state.shape[0]):
         alone = state.worlds([b])
         push = drive[:, b : b + 1] if drive.shape[1] else drive
-        evaluate = _evaluation(scene, alone, push)
+        advance = _newton_step(scene, alone, push, step) if solver is None else _linear_step(scene, push, step, solver)
         bad, reason = -1, ""
         with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is reported
             for _ in range(steps):
-                bad, reason = _solve_step(scene, method, alone, evaluate, step)
+                bad, reason = advance(alone)
                 if bad >= 0:
                     break
         if bad < 0:
@@ -74,9 +81,31 @@ def solve_steps(
     return broken
 
 
+def _newton_step(scene: SceneView, alone: State, drive: Floats, step: Kernel) -> Advance:
+    """Return the step of a method that Newton's method solves."""
+    method, evaluate = scene.integrator, _evaluation(scene, alone, drive)
+    assert isinstance(method, Implicit)
+    return lambda state: _solve_step(scene, method, state, evaluate, step)
+
+
+def _linear_step(scene: SceneView, drive: Floats, step: Kernel, solver: LinearSolver) -> Advance:
+    """Return the step of a linearly implicit method."""
+    push = drive.transpose(1, 2, 0) if drive.shape[1] else None
+
+    def advance(state: State) -> tuple[int, str]:
+        try:
+            found = solver.step(scene, state, *scene.rates(state, push))
+        except NotSolvedLinearlyError as error:
+            return error.agent, str(error)
+        state.work[0, WORK.index("linear_iterations")] += found.iterations
+        state.work[0, WORK.index("substeps")] += 1
+        return step(state, 0, found.x, found.v)[1], ""
+
+    return advance
+
+
 def _solve_step(
-    scene: SceneView, method: Implicit, alone: State, evaluate: Evaluate,
-    step: Callable[[State, int, Floats, Floats], tuple[int, int]],
+    scene: SceneView, method: Implicit, alone: State, evaluate: Evaluate, step: Kernel
 ) -> tuple[int, str]:  # fmt: skip
     """Advance one world by one step; return the agent that is not finite or was not solved, or -1, and the reason."""
     x, v = alone.x[:, 0].ravel(), alone.v[:, 0].ravel()

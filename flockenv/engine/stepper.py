@@ -16,6 +16,7 @@ from flockenv.engine.context import worlds_of
 from flockenv.engine.entry_points import begin_of, field_of, step_of
 from flockenv.engine.implicit_step import solve_steps
 from flockenv.engine.kernel_plan import KernelPlan
+from flockenv.engine.linear_step import LinearSolver
 from flockenv.engine.scratch import scratch_record
 from flockenv.engine.workspace import Workspace
 from flockenv.jit.thread_pool import LARGEST, AutoTuners, run_parallel, usable_threads
@@ -83,8 +84,18 @@ class Stepper:
         if steps == 0:
             return -1, -1, ""
         if self.scene.integrator.solves:
-            return solve_steps(self.scene, state, drive, steps, self._finish_step)
+            return solve_steps(self.scene, state, drive, steps, self._finish_step, self._linear_solver())
         return *self._step(state, drive, steps), ""
+
+    def _linear_solver(self) -> LinearSolver | None:
+        """Return the linear equations of the scene, with memory of this thread, if its method is linearly implicit."""
+        if not self.scene.integrator.linearises:
+            return None
+        memory = vars(self._threads)
+        if "linear_solver" not in memory:
+            memory["linear_solver"] = LinearSolver(self.scene)
+        found: LinearSolver = memory["linear_solver"]
+        return found
 
     def _finish_step(self, state: State, world: int, x: Floats, v: Floats) -> tuple[int, int]:
         """Let the kernel finish a step with the solved positions and velocities, (D, N): limits, space, time."""
@@ -219,6 +230,11 @@ class Stepper:
     @functools.cached_property
     def _scratch_kind(self) -> Any:
         return scratch_record(self.scene.parts)
+
+    @functools.cached_property
+    def plain_scratch_kind(self) -> Any:
+        """The type of the record of scratch memory that `accelerate` is passed."""
+        return scratch_record(self.plain_parts)
 
     @functools.cached_property
     def accelerate(self) -> Callable[..., None]:

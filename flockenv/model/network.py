@@ -75,14 +75,18 @@ class Network(Record):
             raise ValueError(f"{self.size:,} particles: at most {MOST:,} are allowed")
         self._refuse_mixture()
         self._refuse_shape()
-        for k, pin in enumerate(self.pinned):
-            if isinstance(pin, str) and pin not in self.places:
-                names = f"{', '.join(self.places)}{' or ' if self.places else ''}"
-                hint = nearest(pin, self.places) or ";"
-                raise ValueError(f"pinned[{k}] = {pin!r}: unknown{hint} allowed: {names}numbers 0 to {self.size - 1}")
-            if isinstance(pin, int) and pin >= self.size:
-                raise ValueError(f"pinned[{k}] = {pin}: there is no such particle, they are 0 to {self.size - 1}")
+        self._check_particles("pinned", self.pinned)
         return self
+
+    def _check_particles(self, name: str, given: tuple[int | str, ...]) -> None:
+        """Raise ValueError, with the field's name, on an unknown place or particle."""
+        for k, one in enumerate(given):
+            if isinstance(one, str) and one not in self.places:
+                names = f"{', '.join(self.places)}{' or ' if self.places else ''}"
+                hint = nearest(one, self.places) or ";"
+                raise ValueError(f"{name}[{k}] = {one!r}: unknown{hint} allowed: {names}numbers 0 to {self.size - 1}")
+            if isinstance(one, int) and one >= self.size:
+                raise ValueError(f"{name}[{k}] = {one}: there is no such particle, they are 0 to {self.size - 1}")
 
     def _refuse_mixture(self) -> None:
         first: tuple[str, tuple[float, ...]] | None = None
@@ -152,8 +156,16 @@ class Network(Record):
 
     def pins(self) -> Ints:
         """Return the pinned particles, (P,) ascending."""
-        held = [self._place(pin) if isinstance(pin, str) else np.array([pin]) for pin in self.pinned]
-        return np.unique(np.concatenate([np.zeros(0, np.int32), *held])).astype(np.int32)
+        return self.particles("pinned", self.pinned)
+
+    def particles(self, name: str, given: tuple[int | str, ...]) -> Ints:
+        """Return the particles that names of places and indices stand for, (P,) ascending, each once.
+
+        Raises ValueError, with the name of the field that holds them, on an unknown place or particle.
+        """
+        self._check_particles(name, given)
+        found = [self._place(one) if isinstance(one, str) else np.array([one]) for one in given]
+        return np.unique(np.concatenate([np.zeros(0, np.int32), *found])).astype(np.int32)
 
     def masses(self, total: float, dimension: int) -> Floats:
         """Return the mass of each particle, (n,) kg, `total` in sum, distributed according to `lumping`.

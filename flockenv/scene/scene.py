@@ -27,7 +27,6 @@ from flockenv.engine import (
     flatten_effects,
     pack,
     scratch_bytes,
-    scratch_record,
     worlds_of,
 )
 from flockenv.engine.implicit_step import coupling_of
@@ -509,7 +508,7 @@ class Scene(Record):
                 x = np.ascontiguousarray(self.space.wrap(state.pos).transpose(2, 0, 1), self.dtype)
         self.stepper.accelerate(
             worlds_of(state)._replace(x=x), self._drive(drive, state), self.stepper.params(state), time, acc, flow,
-            self.stepper.workspaces(1, 1)[0].of(0, scratch_record(self.stepper.plain_parts)),
+            self.stepper.workspaces(1, 1)[0].of(0, self.stepper.plain_scratch_kind),
         )  # fmt: skip
         return acc.transpose(1, 2, 0), flow.transpose(1, 2, 0) if self.parts.flows else None
 

@@ -118,7 +118,7 @@ def limit(method: Integrator, zeta: float, drag_zeta: float = 0.0) -> float:
 
     inf: any h w is stable; 0: none is, as there is no damping and the method grows for arbitrarily small h w.
     """
-    if method.solves or method.adaptive:
+    if method.stable_at_any_step:
         return math.inf
     if zeta <= 0 and drag_zeta <= 0 and (growth(method, np.array(NEAR), 0.0) > 1 + ROUNDING).all():
         return 0.0
@@ -128,7 +128,7 @@ def limit(method: Integrator, zeta: float, drag_zeta: float = 0.0) -> float:
 @functools.lru_cache(maxsize=64)
 def drag_limit(method: Integrator) -> float:
     """Return the largest stable h c of x'' = -c x', which is not passed to the method as drag; inf: any is stable."""
-    if method.solves or method.adaptive:
+    if method.stable_at_any_step:
         return math.inf
 
     def speed_factor(z: Floats) -> Floats:
@@ -196,9 +196,11 @@ def _urgency(method: Integrator, square: float, damping: float, drag: float) -> 
 
 
 def _effect_rates(scene: SceneView) -> list[tuple[Effect, _Rates]]:
-    """Return the effects with a known stiffness, and their rates."""
+    """Return the effects with a known stiffness that the method takes explicitly, and their rates."""
     out = []
     for k, effect in enumerate(scene.effects):
+        if scene.integrator.linearises and effect.derivative is not None:
+            continue
         acting = effect if scene.obstacles else effect.without_obstacles()
         try:
             found = acting.rates(scene.groups, scene.dimension) if acting is not None else None

@@ -19,7 +19,7 @@ from flockenv.model.scene_view import SceneView
 from flockenv.model.state import Floats, State
 from flockenv.physics.constraints.constraint import Constraint, Settler
 
-__all__ = ["Rods", "hold_rods"]
+__all__ = ["Rods", "hold_rods", "wrap_position"]
 
 Number = Annotated[int, Field(ge=0, strict=True)]
 Pair = tuple[Number, Number]
@@ -238,7 +238,7 @@ def _copy(x: Any, v: Any, kept: Any, b: int, keep: bool) -> None:
 
 
 @kernel
-def _wrap_position(x: Any, v: Any, b: int, i: int, period: Any) -> bool:
+def wrap_position(x: Any, v: Any, b: int, i: int, period: Any) -> bool:
     """Wrap the position of an agent on a torus; return True if its state is finite."""
     sound = True
     for k in range(x.shape[0]):
@@ -272,7 +272,7 @@ def hold_rods(x0: Any, x: Any, v: Any, alive: Any, rods: Any, first: int, end: i
                     _copy(x, v, rods.kept, b, False)
         for r in range(2 * rods.i.shape[0]):
             i = rods.i[r // 2] if r % 2 == 0 else rods.j[r // 2]
-            if not _wrap_position(x, v, b, i, rods.period) and world < 0:
+            if not wrap_position(x, v, b, i, rods.period) and world < 0:
                 world, agent = b, i
     return world, agent, rod, off
 

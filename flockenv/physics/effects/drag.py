@@ -11,7 +11,7 @@ from pydantic import Field
 
 from flockenv.jit.decorators import Law, Vec, law
 from flockenv.maths.vectors import norm, scale, sub
-from flockenv.physics.effects.effect import Effect, Me, all_masses
+from flockenv.physics.effects.effect import Effect, Me, Stencils, all_masses
 
 __all__ = ["Drag", "QuadraticDrag"]
 
@@ -29,14 +29,29 @@ def quadratic_drag(p: Any, me: Me) -> Vec:
     return scale(relative, -p.rate * norm(relative))
 
 
+@law
+def drag_derivative(local: Any, number: Any, s: int) -> None:
+    """Write dF/dv = -c 1; that of the medium's velocity is left out."""
+    for a in range(local.at.shape[1]):
+        for b in range(local.at.shape[1]):
+            local.by_position[a, b] = 0.0
+            local.by_velocity[a, b] = -number[s, 0] if a == b else 0.0
+
+
 class Drag(Effect):
     """Linear drag, F = -c (v - u) in a medium of velocity u: without other forces v = v0 exp(-c t / m)."""
 
     kind: Literal["drag"] = "drag"
     rate: float = Field(ge=0, description="c, kg/s")
     own_law: ClassVar[Law | None] = drag
+    derivative: ClassVar[Law | None] = drag_derivative
     strengths: ClassVar[tuple[str, ...]] = ("rate",)
     linear_drag: ClassVar[str | None] = "rate"
+
+    def stencils(self, groups: Sequence[Any], dimension: int) -> Stencils:
+        """Return every agent by itself."""
+        count = sum(group.size for group in groups)
+        return Stencils(np.arange(count, dtype=np.int32)[:, None], np.full((count, 1), self.rate))
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return w^2 = 0, as nothing oscillates, and the damping c / m."""

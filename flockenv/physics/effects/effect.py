@@ -71,8 +71,8 @@ from flockenv.maths.vectors import dot
 from flockenv.model.scene_view import SceneView
 
 __all__ = [
-    "EFFECTS", "LAWS", "Bonds", "Effect", "Far", "Me", "Members", "Obstacle", "Other", "Sight", "Vector", "all_masses",
-    "demand_group", "in_view", "network_of", "separation_directions",
+    "EFFECTS", "LAWS", "Bonds", "Effect", "Far", "Me", "Members", "Obstacle", "Other", "Sight", "Stencils", "Vector",
+    "all_masses", "demand_group", "in_view", "network_of", "separation_directions",
 ]  # fmt: skip
 
 Vector = Annotated[tuple[Annotated[float, Field(strict=True)], ...], Field(min_length=2, max_length=3)]
@@ -184,6 +184,13 @@ class Bonds(NamedTuple):
         return cls(np.zeros(0, np.int32), np.zeros((0, partners), np.int32), np.zeros((0, numbers)))
 
 
+class Stencils(NamedTuple):
+    """Sets of agents whose forces depend on each other's motion, each with arguments of the effect's `derivative`."""
+
+    agent: NDArray[np.int32]  # (S, P)
+    number: NDArray[np.float64]  # (S, C)
+
+
 @law
 def in_view(view: float, heading: Vec, offset: Vec, square: float) -> bool:
     """Return True if `offset` is in a cone of half angle a around `heading`, without a root; view = cos a |cos a|.
@@ -275,6 +282,11 @@ class Effect(Record):
     """Name of the parameter c, kg/s, of an own_law that is -c (v - medium): a method may integrate it separately."""
     weighs_mass: ClassVar[bool] = True
     """True if `Far.weight` is a mass, False if it is a number of agents."""
+    derivative: ClassVar[Law | None] = None
+    """(local, number, s): write dF/dx, N/m, and dF/dv, kg/s, of stencil s into the arrays of a `Local`; see `stencils`.
+
+    Both matrices must be symmetric and have no positive eigenvalue: what would violate this is left out.
+    """
     partners: ClassVar[int] = 1
     """Number of partners of a bond, besides the agent it acts on."""
     tabled: ClassVar[bool] = False
@@ -370,6 +382,10 @@ class Effect(Record):
     def bonds(self, groups: Sequence[Any], dimension: int) -> Bonds:
         """Return the bonds in a scene of these groups; raise ValueError, in one line, if the groups do not suit."""
         return Bonds.empty(self.partners, self.numbers(dimension))
+
+    def stencils(self, groups: Sequence[Any], dimension: int) -> Stencils:
+        """Return the sets of agents that the `derivative` couples, for methods that solve linear equations."""
+        raise TypeError(f"{type(self).__name__} has no derivative")
 
     def idle_copy(self) -> Effect:
         """Return a copy with all strengths 0, which has no effect but the same sight and the same compiled code."""

@@ -16,7 +16,7 @@ from pydantic import Field
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import add, axis, dot, norm, scale, select, sub
 from flockenv.model.networks import BEND, SHEAR
-from flockenv.physics.effects.effect import Bonds, Effect, Me, all_masses, network_of
+from flockenv.physics.effects.effect import Bonds, Effect, Me, Stencils, all_masses, network_of
 
 if TYPE_CHECKING:
     from flockenv.model.state import State
@@ -38,6 +38,32 @@ def spring(p: Any, me: Me, others: Any, number: Vec) -> Vec:
     aside = scale(axis(other.offset, 0), like(o, 1.0) if me.who < other.who else like(o, -1.0))
     along = select(apart, scale(other.offset, like(o, 1.0) / length if apart else o), aside)
     return scale(along, number[0] * (length - number[2]) + number[1] * dot(sub(other.vel, me.vel), along))
+
+
+@law
+def spring_derivative(local: Any, number: Any, s: int) -> None:
+    """Write the derivatives of a spring's forces on its two ends.
+
+    dF_i/dx_j = k d d^T + k (1 - L / l) (1 - d d^T) and dF_i/dv_j = c d d^T. The second term is left out if the spring
+    is compressed, where it would be negative (Choi and Ko 2002), and so is the derivative of d in the damping.
+    """
+    d, length = local.at.shape[1], 0.0
+    for k in range(d):
+        length += local.at[1, k] * local.at[1, k]
+    length = np.sqrt(length)
+    apart = length > 0.0
+    per = 1.0 / length if apart else 0.0
+    across = number[s, 0] * max(1.0 - number[s, 2] * per, 0.0) if apart or number[s, 2] == 0.0 else 0.0
+    for a in range(d):
+        along_a = local.at[1, a] * per if apart else (1.0 if a == 0 else 0.0)
+        for b in range(d):
+            outer = along_a * (local.at[1, b] * per if apart else (1.0 if b == 0 else 0.0))
+            slope = (number[s, 0] - across) * outer + (across if a == b else 0.0)
+            damp = number[s, 1] * outer
+            local.by_position[a, b] = local.by_position[d + a, d + b] = -slope
+            local.by_position[a, d + b] = local.by_position[d + a, b] = slope
+            local.by_velocity[a, b] = local.by_velocity[d + a, d + b] = -damp
+            local.by_velocity[a, d + b] = local.by_velocity[d + a, b] = damp
 
 
 @law
@@ -110,6 +136,7 @@ class Springs(Effect):
     ratio: float = Field(default=0.0, ge=0, description="more damping, as a fraction of each spring's critical one")
     rest: float = Field(default=1.0, ge=0, description="rest lengths over those of the network; 0 = rest length 0")
     bond_law: ClassVar[Law | None] = spring
+    derivative: ClassVar[Law | None] = spring_derivative
     strengths: ClassVar[tuple[str, ...]] = ("stiffness", "shear", "bend", "damping", "ratio")
     conserves_momentum: ClassVar[bool] = True
 
@@ -135,6 +162,13 @@ class Springs(Effect):
         number = np.stack([stiffness, damping, self.rest * springs.rest], axis=1)
         agent, partner = np.concatenate([i, j]) + first, np.concatenate([j, i]) + first
         return Bonds(agent.astype(np.int32), partner[:, None].astype(np.int32), np.concatenate([number, number]))
+
+    def stencils(self, groups: Sequence[Any], dimension: int) -> Stencils:
+        """Return the two ends of every spring."""
+        bonds = self.bonds(groups, dimension)
+        half = len(bonds.agent) // 2
+        ends = np.stack([bonds.agent[:half], bonds.partner[:half, 0]], axis=1)
+        return Stencils(ends, bonds.number[:half])
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats] | None:
         """Return bounds by Gershgorin's circles: w^2 <= 2 sum k / m, and damping <= 2 sum c / m."""

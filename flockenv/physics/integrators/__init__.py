@@ -17,6 +17,7 @@ from flockenv.physics.integrators.implicit import Implicit  # noqa: E402
 from flockenv.physics.integrators.implicit_euler import ImplicitEuler  # noqa: E402
 from flockenv.physics.integrators.implicit_midpoint import ImplicitMidpoint  # noqa: E402
 from flockenv.physics.integrators.integrator import INTEGRATORS, Integrator, methods_of  # noqa: E402
+from flockenv.physics.integrators.linearly_implicit_euler import LinearlyImplicitEuler  # noqa: E402
 from flockenv.physics.integrators.midpoint import Midpoint  # noqa: E402
 from flockenv.physics.integrators.rk4 import RK4  # noqa: E402
 from flockenv.physics.integrators.semi_implicit_euler import SemiImplicitEuler  # noqa: E402
@@ -24,6 +25,6 @@ from flockenv.physics.integrators.velocity_verlet import VelocityVerlet  # noqa:
 
 __all__ = [
     "INTEGRATORS", "RK4", "Adaptive", "AdaptiveRK4", "AveragedVelocity", "DormandPrince", "ExplicitEuler",
-    "ExponentialDrag", "Heun", "Implicit", "ImplicitEuler", "ImplicitMidpoint", "Integrator", "Midpoint",
-    "SemiImplicitEuler", "VelocityVerlet", "methods_of",
+    "ExponentialDrag", "Heun", "Implicit", "ImplicitEuler", "ImplicitMidpoint", "Integrator",
+    "LinearlyImplicitEuler", "Midpoint", "SemiImplicitEuler", "VelocityVerlet", "methods_of",
 ]  # fmt: skip

@@ -22,3 +22,4 @@ class Adaptive(Integrator):
         default=100_000, ge=1, description="largest number of substeps within dt; a world that needs more diverges"
     )
     adaptive: ClassVar[bool] = True
+    stable_at_any_step: ClassVar[bool] = True

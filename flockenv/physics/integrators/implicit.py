@@ -24,6 +24,7 @@ class Implicit(Integrator):
     stages: ClassVar[int] = 2
     evaluations: ClassVar[int] = 0  # depends on Newton's method, which counts them
     solves: ClassVar[bool] = True
+    stable_at_any_step: ClassVar[bool] = True
 
     def solve(
         self, evaluate: Evaluate, x: Floats, v: Floats, time: float, dt: float, dimension: int,

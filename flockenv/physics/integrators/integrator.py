@@ -123,7 +123,11 @@ class Integrator(Record):
     splits_drag: ClassVar[bool] = False
     """True if the method integrates linear drag exactly, which the acceleration then excludes; see `damping`."""
     solves: ClassVar[bool] = False
-    """True if the method solves equations (scipy, in Python); `advance` then only copies the solution."""
+    """True if the method solves equations between calls of the kernel; `advance` then only copies the solution."""
+    stable_at_any_step: ClassVar[bool] = False
+    """True if no step is too long for a damped or undamped oscillation, whatever the forces."""
+    linearises: ClassVar[bool] = False
+    """True if the method takes the forces of effects with a `derivative` implicitly: these do not limit its step."""
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:

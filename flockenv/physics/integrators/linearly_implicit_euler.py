@@ -1,0 +1,45 @@
+"""Linearly implicit Euler: the forces of an implicit step, to first order in the change of velocity; one solve."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field
+
+from flockenv.model.state import Floats
+from flockenv.physics.integrators.implicit_euler import advance
+from flockenv.physics.integrators.integrator import Integrator
+
+__all__ = ["LinearlyImplicitEuler", "advance"]
+
+
+class LinearlyImplicitEuler(Integrator):
+    """Linearly implicit Euler, order 1 (Baraff and Witkin 1998): one linear solve per step, x' = x + h (v + dv).
+
+    (M - h dF/dv - h^2 dF/dx) dv = h (F + h dF/dx v), by conjugate gradients with the inverse blocks of the diagonal as
+    preconditioner. The derivatives are those of springs and linear drag; other forces are taken at the beginning of the
+    step, as in semi-implicit Euler, and limit dt as they do there. Particles held in place keep their velocity exactly,
+    those of a `slide` constraint keep to its line or plane within the solve. Momentum is conserved to the tolerance.
+    """
+
+    kind: Literal["linearly_implicit_euler"] = "linearly_implicit_euler"
+    tolerance: float = Field(
+        default=1e-5, ge=1e-14, le=0.1, description="residual of the linear equations, relative to that of dv = 0"
+    )
+    most: int = Field(
+        default=10_000, ge=1, description="largest number of iterations in a step; a world that needs more diverges"
+    )
+    order: ClassVar[int] = 1
+    order_with_drag: ClassVar[int] = 1
+    stages: ClassVar[int] = 2
+    evaluations: ClassVar[int] = 0  # one, which is counted where it is made
+    solves: ClassVar[bool] = True
+    linearises: ClassVar[bool] = True
+
+    def _step(
+        self, law: Any, context: Any, x: Floats, v: Floats, flow: Any, time: float, dt: float, stages: Floats
+    ) -> None:
+        """Advance one world under laws that are Python functions, without known derivatives: explicitly."""
+        law(context, x, v, time, stages[0])
+        v += dt * stages[0]
+        x += dt * (v + flow if len(flow) else v)

@@ -1,0 +1,236 @@
+"""Linearly implicit Euler: its matrix against differences, its solution against a dense one, filters, and its cost."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.core.warnings import UnstableStepWarning
+from flockenv.engine.linear_step import LinearSolver
+from flockenv.model.divergence import SimulationDiverged
+from flockenv.model.networks import Cloth, Rope
+from flockenv.model.state import State
+from flockenv.physics.constraints import Slide
+from flockenv.physics.effects import Drag, Gravity, Springs, Tether
+from flockenv.physics.integrators import ImplicitEuler, LinearlyImplicitEuler, SemiImplicitEuler
+from flockenv.scene import Group, Scene
+from tests.catalogue import Array
+from tests.test_implicit import SHEET, hanging, same, shaken
+
+CLOSELY = LinearlyImplicitEuler(tolerance=1e-13)
+
+
+def sheet_of(method: Any = CLOSELY, **fields: Any) -> Scene:
+    return hanging(method=method, **fields)
+
+
+def dense(scene: Scene, state: State, weights: tuple[float, float, float]) -> tuple[Array, Array]:
+    """Return the weighted sum of the derivatives as a dense matrix, agent after agent, and weighted dF/dx v."""
+    solver, d = LinearSolver(scene), scene.dimension
+    motion = [np.ascontiguousarray(each[:, 0], float) for each in (state.x, state.v)]
+    solver.assemble(*motion, state.alive[0], weights)
+    system, found = solver.system, np.zeros((scene.agents * d, scene.agents * d))
+    for i in range(scene.agents):
+        for k in range(system.start[i], system.start[i + 1]):
+            j = system.column[k]
+            found[i * d : i * d + d, j * d : j * d + d] = system.value[k * d * d : (k + 1) * d * d].reshape(d, d)
+    return found, system.right.copy()
+
+
+def forces(scene: Scene, state: State, pos: Array, vel: Array) -> Array:
+    """Return all forces on free agents, N, those held in place excluded."""
+    mass = np.where(np.isinf(scene.body.mass), 0.0, scene.body.mass)
+    return np.asarray((scene.acceleration(state.with_motion(pos, vel))[0] * mass[:, None]).ravel())
+
+
+def differences(scene: Scene, state: State, of_velocity: bool, step: float = 1e-6) -> Array:
+    """Return dF/dx or dF/dv by central differences, N/m or kg/s."""
+    columns = []
+    for k in range(state.pos[0].size):
+        off = np.zeros(state.pos[0].size)
+        off[k] = step
+        by = off.reshape(state.shape)
+        ends = [
+            forces(scene, state, state.pos + s * by * (not of_velocity), state.vel + s * by * of_velocity)
+            for s in (1, -1)
+        ]
+        columns.append((ends[0] - ends[1]) / (2 * step))
+    return np.stack(columns, axis=1)
+
+
+def free_rows(scene: Scene) -> Array:
+    return np.repeat(np.isfinite(scene.body.mass), scene.dimension)
+
+
+def stretched(scene: Scene, by: float = 1.3) -> State:
+    """Return a state in which all springs are longer than at rest, and ends move."""
+    state = shaken(scene, far=0.005)
+    return state.with_motion(state.pos * by, np.random.default_rng(4).normal(size=state.shape))
+
+
+def test_derivatives_are_those_of_the_forces() -> None:
+    """To 1e-6 of the largest; dF/dx is compared without damping, of which it has no part."""
+    scene = sheet_of(damping=0.0)
+    state, rows = stretched(scene), free_rows(scene)
+    found, along = dense(scene, state, (1.0, 0.0, 1.0))
+    expected = differences(scene, state, of_velocity=False)
+    np.testing.assert_allclose(found[rows], expected[rows], atol=1e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(along[rows], (found @ state.vel.ravel())[rows], atol=1e-9 * np.abs(along).max())
+    damped = sheet_of(damping=3.0, weight=Drag(rate=0.4))
+    found, _ = dense(damped, state, (0.0, 1.0, 0.0))
+    expected = differences(damped, state, of_velocity=True)
+    np.testing.assert_allclose(found[rows], expected[rows], atol=1e-6 * np.abs(expected).max())
+
+
+def test_the_matrix_of_a_compressed_sheet_is_symmetric_and_positive_definite() -> None:
+    """Without the clamp of compressed springs the least eigenvalue would be negative."""
+    scene = sheet_of(stiffness=1e5)
+    state = stretched(scene, by=0.3)
+    exact = differences(scene, state, of_velocity=False)
+    rows = free_rows(scene)
+    assert np.linalg.eigvalsh((exact + exact.T)[np.ix_(rows, rows)]).max() > 1.0
+    found, _ = dense(scene, state, (-1.0, 0.0, 0.0))
+    np.testing.assert_allclose(found, found.T, atol=1e-12 * np.abs(found).max())
+    assert np.linalg.eigvalsh(found).min() > -1e-9 * np.abs(found).max()
+
+
+def test_a_step_is_the_dense_solution_with_filters() -> None:
+    """Two particles are held, one of them moving, and a side slides along (1, 1)."""
+    slide = Slide(particles=("right",), along=((1.0, 1.0),))
+    scene = sheet_of(constraints=(slide,))
+    state, h = stretched(scene), scene.dt
+    state.vel[0, 15] = 0.7, -0.2  # held: a prescribed velocity
+    mass = np.where(np.isfinite(scene.body.mass), scene.body.mass, 1.0)
+    agents = [i for i in slide.agents(scene) if np.isfinite(scene.body.mass[i])]
+    assert len(agents) == 3
+    state.vel[0, agents] = state.vel[0, agents].mean(axis=1, keepdims=True)  # along its line, as the constraint does
+    matrix, along = dense(scene, state, (-h * h, -h, h * h))
+    matrix += np.diag(np.repeat(mass, 2))
+    right = h * forces(scene, state, state.pos, state.vel) + along
+    moves = np.eye(2 * scene.agents)[:, free_rows(scene)]
+    for i in agents:
+        line = np.zeros((2 * scene.agents, 1))
+        line[2 * i : 2 * i + 2] = np.sqrt(0.5)
+        moves = np.concatenate([moves[:, ~moves[2 * i : 2 * i + 2].any(axis=0)], line], axis=1)
+    change = moves @ np.linalg.solve(moves.T @ matrix @ moves, moves.T @ right)
+    end = scene.step(state)
+    np.testing.assert_array_equal(end.vel[0, 15], state.vel[0, 15])
+    np.testing.assert_array_equal(end.pos[0, 15], state.pos[0, 15] + h * state.vel[0, 15])
+    assert np.abs(change).max() > 0.1
+    np.testing.assert_allclose(end.vel.ravel(), state.vel.ravel() + change, atol=1e-9 * np.abs(change).max())
+
+
+def test_results_do_not_depend_on_batches_or_steps_per_call() -> None:
+    scene = sheet_of()
+    start = shaken(scene, worlds=3)
+    whole, again = scene.step(start, steps=3), start
+    for _ in range(3):
+        again = scene.step(again)
+    same(whole, again)
+    for b in range(3):
+        same(whole.worlds([b]), scene.run(start.worlds([b]), 3))
+
+
+def test_it_ends_where_implicit_euler_does_at_a_fraction_of_the_evaluations() -> None:
+    """P10: the sheet comes to rest in the same place; a step evaluates the forces once, without Newton iterations."""
+    ends, counts = [], []
+    for method in (LinearlyImplicitEuler(), ImplicitEuler()):
+        scene = sheet_of(method, damping=2.0, dt=0.05, groups=(Group(network=SHEET, mass=0.05),))
+        end = scene.run(scene.start(0), 150)
+        ends.append(end.pos)
+        counts.append({name: end.count_of(name) / 150 for name in ("evaluations", "newton_iterations")})
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-5)
+    assert counts[0] == {"evaluations": 1.0, "newton_iterations": 0.0}
+    assert counts[1]["evaluations"] > 20
+
+
+@pytest.mark.parametrize("stiffness", [1e3, 1e8])
+def test_a_cloth_gains_no_energy(stiffness: float) -> None:
+    """At 60 steps per second, without damping: at most 1.05 times the work of gravity, however stiff the springs."""
+    sheet = Cloth(cells=(9, 9), sides=(1.0, 1.0), pinned=("top_left", "top_right"))
+    scene = sheet_of(groups=(Group(network=sheet, mass=0.01),), stiffness=stiffness, damping=0.0, dt=1 / 60)
+    state = scene.start(0)
+    springs, mass = scene.effects[0], np.where(np.isfinite(scene.body.mass), 0.01, 0.0)
+    height = (mass * state.pos[0, :, 1]).sum()
+    for _ in range(20):
+        state = scene.step(state)
+        elastic = springs.potential(scene.groups, state, scene.space.displacement)
+        assert elastic is not None
+        total = float(elastic[0]) + 0.5 * float((mass * (state.vel[0] ** 2).sum(axis=1)).sum())
+        assert total <= 1.05 * 9.81 * (height - (mass * state.pos[0, :, 1]).sum()) + 1e-9
+    assert 0 < state.count_of("linear_iterations") <= 20 * 1000
+
+
+def test_springs_do_not_limit_the_step_and_forces_without_a_derivative_do() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sheet_of(stiffness=1e9, dt=0.1)
+    loose = Tether(centre=(0.0, 0.0), stiffness=30.0)
+    with pytest.warns(UnstableStepWarning, match="linearly_implicit_euler with tether"):
+        sheet_of(stiffness=1e9, dt=0.1, weight=loose)
+
+
+def test_equations_that_are_not_solved_are_told() -> None:
+    scene = sheet_of(LinearlyImplicitEuler(most=2), stiffness=1e6)
+    start = shaken(scene)
+    with pytest.raises(SimulationDiverged, match=r"not solved to tolerance = 1e-05 in 2 iterations") as caught:
+        scene.step(start)
+    same(caught.value.state, start)
+
+
+def test_dead_particles_stay_and_pull_at_no_other() -> None:
+    scene = sheet_of(weight=Gravity(acceleration=(0.0, 0.0)))
+    start = scene.start(0)
+    start.alive[0, 6] = False
+    start.pos[0, 6] += 0.3  # its springs would pull
+    end = scene.run(start, 3)
+    np.testing.assert_array_equal(end.pos[0, 6], start.pos[0, 6])
+    other = start.copy()
+    other.pos[0, 6] -= 0.5
+    np.testing.assert_array_equal(np.delete(scene.run(other, 3).pos, 6, 1), np.delete(end.pos, 6, 1))
+
+
+# --- the constraint that both kinds of methods keep -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", [SemiImplicitEuler(), LinearlyImplicitEuler()], ids=lambda method: method.kind)
+def test_a_bead_slides_down_a_line_as_on_an_incline(method: Any) -> None:
+    """Its acceleration is g sin 30 degrees along the line, and it never leaves the line."""
+    rope = Group(network=Rope(links=1, length=1.0), mass=0.1)
+    slide = Slide(particles=(0, 1), along=((3**0.5, -1.0),))
+    effects = (Springs(stiffness=50.0), Gravity(acceleration=(0.0, -9.81)))
+    scene = Scene(groups=(rope,), effects=effects, constraints=(slide,), integrator=method, dt=0.001)
+    start = scene.start(0)
+    end = scene.run(start, 1000)
+    off = (end.pos - start.pos)[0]
+    np.testing.assert_allclose(off @ (0.5, 0.75**0.5), 0, atol=1e-12)
+    way = off.mean(axis=0) @ (0.75**0.5, -0.5)
+    assert way == pytest.approx(0.5 * 9.81 / 2, rel=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("fields", "part"),
+    [
+        ({"particles": ("rigt",)}, r"constraints\[0\].particles\[0\] = 'rigt': unknown.*right"),
+        ({"particles": (20,)}, r"constraints\[0\].particles\[0\] = 20: there is no such particle"),
+        ({"group": 1}, r"constraints\[0\].group = 1: has no network"),
+        ({"group": 2}, r"constraints\[0\].group = 2: there are 2 groups"),
+        ({"along": ((1.0, 0.0, 0.0),)}, r"constraints\[0\].along\[0\] = .* has 3 numbers, but dimension = 2"),
+        ({"along": ((1.0, 0.0), (0.0, 1.0))}, r"constraints\[0\].along: 2 directions in 2 dimensions"),
+        ({"along": ((0.0, 0.0),)}, r"along\[0\] = .*must have a finite length above 0"),
+        ({"along": ((1.0, 0.0), (2.0, 0.0))}, "they are parallel"),
+    ],
+)
+def test_slides_that_do_not_suit_a_scene_are_refused(fields: dict[str, Any], part: str) -> None:
+    with pytest.raises(ValueError, match=part) as caught:
+        sheet_of(constraints=(Slide(**{"particles": ("right",), "along": ((1.0, 0.0),)} | fields),))
+    assert len(str(caught.value).splitlines()) < 5
+
+
+def test_particles_of_two_slides_are_refused() -> None:
+    both = (Slide(particles=("right",), along=((1.0, 0.0),)), Slide(particles=("top",), along=((0.0, 1.0),)))
+    with pytest.raises(ValueError, match=r"constraints\[1\].particles: agent 19 slides along constraints\[0\] already"):
+        sheet_of(constraints=both)
