@@ -287,6 +287,7 @@ class EffectRow:
         fov, nearest = getattr(self.effect, "fov", 360.0), getattr(self.effect, "nearest", None)
         words = ["cone"] * (fov < 360.0) + ([f"nearest_{nearest}"] if nearest else [])
         words += ["medium"] * (getattr(self.effect, "acts", "") == "medium")
+        words += ["corotated"] * (getattr(self.effect, "strain", "") == "corotated")
         return "_".join([self.effect.kind, *words])
 
     def at(self, dimension: int) -> tuple[Effect, ...]:
@@ -514,6 +515,10 @@ EFFECTS = (
         obeys=frozenset({"translation", "rotation"}),  # in the plane an angle has a sign
     ),
     EffectRow(Elastic(young=3, beta=0.1), obeys=frozenset({"translation"})),  # linear: rotations cause strain
+    EffectRow(
+        Elastic(young=3, beta=0.1, strain="corotated"), obeys=frozenset({"translation", "rotation"}),
+        dimensions=(2,),  # in 3-D: test_corotated.py; a mirror image is inside out
+    ),
 )  # fmt: skip
 
 
@@ -609,14 +614,13 @@ EDGE = 6.0
 """m, edge of the square or cube in which agents of `scene_of` begin."""
 
 
-def tied(group: Group, dimension: int) -> Group:
-    """Return the group as a network: a stretched chain through random positions."""
+def tied(group: Group, dimension: int, filled: bool = False) -> Group:
+    """Return the group as a network: a stretched chain through random positions; `filled`: of triangles in 2-D."""
     count = group.size
     vertices = np.random.default_rng(5).uniform(0.2 * EDGE, 0.8 * EDGE, (count, dimension))
-    mesh = Mesh(
-        vertices=tuple(map(tuple, vertices.tolist())), bars=tuple((i, i + 1) for i in range(count - 1)),
-        angles=tuple((i, i + 1, i + 2) for i in range(count - 2)), stretch=1.2,
-    )  # fmt: skip
+    runs = [tuple(tuple(range(i, i + k)) for i in range(count + 1 - k)) for k in (2, 3)]
+    joined: dict[str, Any] = {"triangles": runs[1]} if filled else {"bars": runs[0], "angles": runs[1]}
+    mesh = Mesh(vertices=tuple(map(tuple, vertices.tolist())), stretch=1.2, **joined)
     return Group(network=mesh, mass=group.mass, radius=group.radius)
 
 
@@ -628,7 +632,8 @@ def scene_of(*effects: Effect, dimension: int = 2, space: Space | None = None, *
     groups = (Group(count=14, mass=0.7, radius=0.1, **paced), Group(count=10, mass=2, radius=0.25, **paced))
     groups = fields.pop("groups", groups)
     if any(effect.bond_law for effect in effects):
-        groups = (tied(groups[0], dimension), *groups[1:])
+        filled = any(getattr(effect, "strain", "") == "corotated" for effect in effects)
+        groups = (tied(groups[0], dimension, filled), *groups[1:])
     asked = any("obstacles" in effect.calls_for() for effect in effects)
     centres = ((1.5, 2.0, 2.5)[:dimension], (4.5, 3.5, 3.0)[:dimension]) if asked else ()
     obstacles = tuple({"centre": centre, "radius": 0.6} for centre in centres)

@@ -244,6 +244,7 @@ LINEAR: dict[str, tuple[Network, tuple[Effect, ...], float]] = {
     "hinges": (DAMPED, (AngularSprings(stiffness=2, damping=0.01),), 0.9),
     "bars": (DAMPED, (Elastic(young=1e3, area=0.01, alpha=0.5, beta=1e-3),), 0.9),
     "triangles": (SHEET, (Elastic(young=1e3, thickness=0.1, beta=1e-3),), 0.5),
+    "corotated triangles": (SHEET, (Elastic(young=1e3, strain="corotated", thickness=0.1, beta=1e-3),), 0.3),
     "many": (
         SHEET, (
             Springs(stiffness=300, shear=100, bend=50, damping=0.02), Drag(rate=0.5),

@@ -113,7 +113,9 @@ def bond_plan(parts: KernelPlan, agent: AgentPlan) -> BondPlan:
     """Return the `BondPlan` of a scene."""
     d = parts.dimension
     laws = tuple(
-        BondLaw(k, e.bond_law, e.partners, e.numbers(d)) for k, e in parts.bond_effects if e.bond_law is not None
+        BondLaw(k, e.bond_law, e.partner_count(d), e.numbers(d))
+        for k, e in parts.bond_effects
+        if e.bond_law is not None
     )
     sums, waits = parts.slots["bond0"] * parts.width, not (parts.pairs or parts.far)
     return BondPlan(agent, parts.space.offset_law, laws, sums, waits, bool(parts.far))

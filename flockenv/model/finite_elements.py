@@ -24,6 +24,7 @@ __all__ = [
     "flat",
     "freedoms",
     "frequencies",
+    "gradients",
     "mass",
     "rayleigh",
     "solve_static",
@@ -85,6 +86,14 @@ def flat(points: ArrayLike, elements: ArrayLike) -> NDArray[np.intp]:
     edges = _edges(points, elements)
     span = np.linalg.norm(edges, axis=2).max(axis=1, initial=0.0)
     return np.flatnonzero(contents(points, elements) <= 1e-12 * span ** edges.shape[1])
+
+
+def gradients(points: ArrayLike, elements: ArrayLike) -> Floats:
+    """Return the gradients of each element's shape functions, one per corner, (E, k, D) 1/m; those of a bar along it.
+
+    Raises ValueError if points and elements are not a structure.
+    """
+    return _gradients(*_structure(points, elements))
 
 
 def freedoms(particles: ArrayLike, dimension: int) -> NDArray[np.int64]:

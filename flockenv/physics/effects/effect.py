@@ -379,9 +379,13 @@ class Effect(Record):
         """Return the number of values of a bond."""
         return 0
 
+    def partner_count(self, dimension: int) -> int:
+        """Return the number of partners of a bond in a world of this dimension."""
+        return self.partners
+
     def bonds(self, groups: Sequence[Any], dimension: int) -> Bonds:
         """Return the bonds in a scene of these groups; raise ValueError, in one line, if the groups do not suit."""
-        return Bonds.empty(self.partners, self.numbers(dimension))
+        return Bonds.empty(self.partner_count(dimension), self.numbers(dimension))
 
     def stencils(self, groups: Sequence[Any], dimension: int) -> Stencils:
         """Return the sets of agents that the `derivative` couples, for methods that solve linear equations."""
