@@ -75,6 +75,7 @@ from flockenv.model.networks import Mesh
 from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import EFFECTS as EFFECT_KINDS
 from flockenv.physics.effects import (
+    AltitudeSprings,
     AngularSprings,
     Antipode,
     Attraction,
@@ -519,6 +520,9 @@ EFFECTS = (
         Elastic(young=3, beta=0.1, strain="corotated"), obeys=frozenset({"translation", "rotation"}),
         dimensions=(2,),  # in 3-D: test_corotated.py; a mirror image is inside out
     ),
+    EffectRow(
+        AltitudeSprings(stiffness=3, damping=0.2), obeys=frozenset({"translation", "rotation"}), dimensions=(3,),
+    ),
 )  # fmt: skip
 
 
@@ -614,12 +618,17 @@ EDGE = 6.0
 """m, edge of the square or cube in which agents of `scene_of` begin."""
 
 
+SOLID = {"elastic", "altitude_springs"}
+"""Effects that act on elements; with as many partners as dimensions, these fill space."""
+
+
 def tied(group: Group, dimension: int, filled: bool = False) -> Group:
-    """Return the group as a network: a stretched chain through random positions; `filled`: of triangles in 2-D."""
+    """Return the group as a network: a stretched chain through random positions, or of elements that fill space."""
     count = group.size
     vertices = np.random.default_rng(5).uniform(0.2 * EDGE, 0.8 * EDGE, (count, dimension))
-    runs = [tuple(tuple(range(i, i + k)) for i in range(count + 1 - k)) for k in (2, 3)]
-    joined: dict[str, Any] = {"triangles": runs[1]} if filled else {"bars": runs[0], "angles": runs[1]}
+    runs = [tuple(tuple(range(i, i + k)) for i in range(count + 1 - k)) for k in (2, 3, 4)]
+    solid = {"triangles": runs[1]} if dimension == 2 else {"tetrahedra": runs[2]}
+    joined: dict[str, Any] = solid if filled else {"bars": runs[0], "angles": runs[1]}
     mesh = Mesh(vertices=tuple(map(tuple, vertices.tolist())), stretch=1.2, **joined)
     return Group(network=mesh, mass=group.mass, radius=group.radius)
 
@@ -632,7 +641,7 @@ def scene_of(*effects: Effect, dimension: int = 2, space: Space | None = None, *
     groups = (Group(count=14, mass=0.7, radius=0.1, **paced), Group(count=10, mass=2, radius=0.25, **paced))
     groups = fields.pop("groups", groups)
     if any(effect.bond_law for effect in effects):
-        filled = any(getattr(effect, "strain", "") == "corotated" for effect in effects)
+        filled = any(effect.partner_count(dimension) == dimension for effect in effects if effect.kind in SOLID)
         groups = (tied(groups[0], dimension, filled), *groups[1:])
     asked = any("obstacles" in effect.calls_for() for effect in effects)
     centres = ((1.5, 2.0, 2.5)[:dimension], (4.5, 3.5, 3.0)[:dimension]) if asked else ()

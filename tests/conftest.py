@@ -43,8 +43,8 @@ RARE = {
 """Kernels of catalogue.Variant that only slow tests compile."""
 
 RARE_EFFECTS = {
-    "alignment_cone", "cohesion_cone", "angular_springs", "elastic", "elastic_corotated", "quadratic_drag", "carried",
-    "wind", "obstacle_contact", "gravity",
+    "alignment_cone", "cohesion_cone", "altitude_springs", "angular_springs", "elastic", "elastic_corotated",
+    "quadratic_drag", "carried", "wind", "obstacle_contact", "gravity",
 }  # fmt: skip
 """Effects whose symmetries only slow tests try: each compiles a kernel, and has quick tests elsewhere."""
 

@@ -142,18 +142,18 @@ def test_a_dropped_jelly_comes_to_rest_in_the_shape_of_one_that_is_set_down() ->
     found, least = [], []
     for height in (0.01, 1.0):
         net = Jelly(cells=(3, 3, 3), sides=(0.9, 0.9, 0.9), origin=(0, 0, height))
-        plain = scene(net, each=0.05, g=9.81, dt=2e-3, young=100, alpha=1, beta=0.05)
+        plain = scene(net, each=0.05, g=9.81, dt=4e-3, young=100, alpha=1, beta=0.02)
         floor = HalfSpace(point=(0, 0, 0), direction=(0, 0, 1))
         slides = Collisions(agents=False, restitution=0)
         world = plain.model_copy(update={"obstacles": (floor,), "constraints": (slides,)})
         state = world.start(0)
-        for _ in range(10):
-            state = world.run(state, 250)
+        for steps in (4,) * 50 + (150,) * 7:
+            state = world.run(state, steps)
             least.append(volumes(world, state).min())
         assert np.abs(state.vel).max() < 0.05
         assert (volumes(world, state) > 0).all()
         found.append(volumes(world, state))
-    assert min(least) < 0.2  # almost flat, or inside out
+    assert min(least) < 0  # inside out
     np.testing.assert_allclose(found[1], found[0], atol=0.02)
 
 

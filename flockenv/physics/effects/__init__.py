@@ -7,6 +7,7 @@ from flockenv.jit.startup import import_all
 import_all(__name__, __path__)
 
 from flockenv.physics.effects.aims import Aim, Antipode, Course, Goal  # noqa: E402
+from flockenv.physics.effects.altitude_springs import AltitudeSprings  # noqa: E402
 from flockenv.physics.effects.attraction import Attraction  # noqa: E402
 from flockenv.physics.effects.contact import Contact, ObstacleContact  # noqa: E402
 from flockenv.physics.effects.drag import Drag, QuadraticDrag  # noqa: E402
@@ -28,9 +29,9 @@ from flockenv.physics.effects.wall import WallRepulsion  # noqa: E402
 from flockenv.physics.effects.waypoints import Journey, Stage  # noqa: E402
 
 __all__ = [
-    "EFFECTS", "Aim", "AngularSprings", "Antipode", "Attraction", "Carried", "Contact", "Course", "Door", "Drag",
-    "Effect", "Elastic", "Far", "Fear", "Fluctuation", "Goal", "Gravitation", "Gravity", "Grazing", "Intention",
-    "InverseSquare", "Journey", "Libido", "Me", "Metabolism", "ObstacleContact", "Other", "Predation", "Pressure",
-    "QuadraticDrag", "Routes", "Sight", "Sink", "Source", "SpeedLimit", "Springs", "Stage", "Swing", "Tether",
-    "Uniform", "Vicsek", "Vortex", "WallRepulsion", "Way", "Wind",
+    "EFFECTS", "Aim", "AltitudeSprings", "AngularSprings", "Antipode", "Attraction", "Carried", "Contact", "Course",
+    "Door", "Drag", "Effect", "Elastic", "Far", "Fear", "Fluctuation", "Goal", "Gravitation", "Gravity", "Grazing",
+    "Intention", "InverseSquare", "Journey", "Libido", "Me", "Metabolism", "ObstacleContact", "Other", "Predation",
+    "Pressure", "QuadraticDrag", "Routes", "Sight", "Sink", "Source", "SpeedLimit", "Springs", "Stage", "Swing",
+    "Tether", "Uniform", "Vicsek", "Vortex", "WallRepulsion", "Way", "Wind",
 ]  # fmt: skip
