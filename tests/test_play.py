@@ -45,6 +45,15 @@ def tiny(**changes: Any) -> SceneLane:
 # --- time -------------------------------------------------------------------------------------------------------------
 
 
+class Clock:
+    """A clock that stands still until it is moved."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
 def test_an_edit_in_the_past_drops_the_later_ones() -> None:
     room = Room([tiny()])
     room.step(10)
@@ -72,6 +81,43 @@ def test_memory_of_history_is_bounded_and_time_still_exact() -> None:
         assert lane.digest == seen[tick]
 
 
+def slowed(lane: SceneLane, clock: Clock) -> list[int]:
+    """Let every tick of a lane take 10 ms of a clock; return the list to which the ticks of each call are added."""
+    made, step = list[int](), lane.step
+
+    def slowly(ticks: int = 1) -> None:
+        clock.now += 0.01 * ticks
+        made.append(ticks)
+        step(ticks)
+
+    lane.step = slowly  # type: ignore[method-assign]
+    return made
+
+
+def test_steps_that_take_long_are_not_computed_again_when_time_goes_back() -> None:
+    clock, lane = Clock(), tiny()
+    history, made, seen = History([lane], clock=clock), slowed(lane, clock), list[str]()
+    while history.tick < 4 * EVERY:
+        history.advance(1)
+        seen.append(lane.digest)
+    for tick in (*range(4 * EVERY - 1, 4 * EVERY - 12, -1), 50, 49, 48):
+        made.clear()
+        history.go_to(tick)
+        assert sum(made) <= 3 and lane.digest == seen[tick - 1]
+
+
+def test_keyframes_that_were_dropped_are_made_again_when_time_goes_back() -> None:
+    clock, lane = Clock(), tiny()
+    history, made = History([lane], 8 * lane.keep().nbytes, clock), slowed(lane, clock)
+    while history.tick < 500:
+        history.advance(500 - history.tick)
+    history.go_to(201)
+    for tick in (200, 199, 198, 197):
+        made.clear()
+        history.go_to(tick)
+        assert sum(made) <= 3 and history.nbytes <= 8 * lane.keep().nbytes
+
+
 def test_time_goes_on_behind_a_gap_of_keyframes() -> None:
     room = Room([tiny()], budget=3 * tiny().keep().nbytes)
     room.step(2000)
@@ -83,15 +129,6 @@ def test_time_goes_on_behind_a_gap_of_keyframes() -> None:
     room.seek(1000)
     room.seek(1200)
     assert room.digests == end
-
-
-class Clock:
-    """A clock that stands still until it is moved."""
-
-    now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 def test_a_room_keeps_its_speed_and_drops_what_takes_too_long() -> None:

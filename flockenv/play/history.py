@@ -1,12 +1,15 @@
 """History: the edits of a room by tick, and keyframes from which every tick since the start can be computed again.
 
-Going to a tick is exact: it restores the nearest keyframe at or before it and steps on with the same edits. Keyframes
-are thinned with age, so that their memory is bounded and going back to the recent past is fast.
+Going to a tick is exact: it restores the nearest keyframe at or before it and steps on with the same edits. The more
+time steps take, the fewer there are between two keyframes. Keyframes are thinned with their distance from the present,
+so that their memory is bounded, and going back some steps is fast.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from bisect import bisect_right, insort
+from collections.abc import Callable, Sequence
+from time import perf_counter
 from typing import Any, NamedTuple
 
 from flockenv.play.edits import Edit, Input, Pointer, Set
@@ -18,7 +21,13 @@ BUDGET = 256 * 2**20
 """Most bytes of keyframes; the first and the newest are always kept."""
 
 EVERY = 32
-"""Ticks between two new keyframes."""
+"""Most ticks between two new keyframes."""
+
+REPLAY = 0.03
+"""s, computing time of the ticks between two new keyframes, of which going back a step computes some again."""
+
+SHARE = 0.05
+"""Most of the computing time that keyframes of fewer than EVERY ticks take."""
 
 MOST = 1024
 """Most keyframes."""
@@ -43,11 +52,15 @@ class _Moment(NamedTuple):
 class History:
     """Edits and keyframes of some lanes, which it steps.
 
-    budget: bytes of keyframes. Lanes are stepped by `advance` alone, so that every edit acts at its tick.
+    budget: bytes of keyframes. clock: s, increasing. Lanes are stepped by `advance` alone, so that every edit acts at
+    its tick.
     """
 
-    def __init__(self, lanes: Sequence[Lane], budget: int = BUDGET) -> None:
-        self._lanes, self._budget = tuple(lanes), budget
+    def __init__(
+        self, lanes: Sequence[Lane], budget: int = BUDGET, clock: Callable[[], float] = perf_counter
+    ) -> None:  # fmt: skip
+        self._lanes, self._budget, self._clock = tuple(lanes), budget, clock
+        self._cost, self._copying = 0.0, 0.0  # s per tick and per keyframe, the last ones measured
         self.begin()
 
     def begin(self) -> None:
@@ -55,6 +68,7 @@ class History:
         self.tick, self.last = 0, 0
         self.edits: list[Made] = []
         self._done = 0  # number of edits that have been applied
+        self._spent = 0.0  # s of computing since the latest keyframe at or before the tick
         self._moments = [self._moment()]
 
     def load(self, edits: Sequence[Made], last: int) -> None:
@@ -91,22 +105,37 @@ class History:
         """Step all lanes by up to `ticks`, as far as the next edit or keyframe; return by how many."""
         if self._done < len(self.edits):
             ticks = min(ticks, self.edits[self._done].tick - self.tick)
-        if self._is_newest:
-            ticks = min(ticks, max(self._moments[-1].tick + EVERY - self.tick, 1))
+        before = self._latest(self.tick)
+        ticks = max(min(ticks, before.tick + EVERY - self.tick, self._affordable()), 1)
+        began = self._clock()
         for lane in self._lanes:
             lane.step(ticks)
+        passed = self._clock() - began
+        self._cost, self._spent = passed / ticks, self._spent + passed
         self.tick += ticks
         self.last = max(self.last, self.tick)
         self._apply_due()
-        if self._is_newest and self.tick - self._moments[-1].tick >= EVERY:
-            self._moments.append(self._moment())
+        latest = self._latest(self.tick)
+        if latest is not before:  # time went past it
+            self._spent = 0.0
+        elif self.tick - latest.tick >= EVERY or self._spent >= self._enough:
+            insort(self._moments, self._moment(), key=_tick_of)
+            self._spent = 0.0
             self._thin()
         return ticks
 
+    def _latest(self, tick: int) -> _Moment:
+        """Return the latest keyframe at or before a tick."""
+        return self._moments[bisect_right(self._moments, tick, key=_tick_of) - 1]
+
     @property
-    def _is_newest(self) -> bool:
-        """True if no keyframe lies ahead."""
-        return self._moments[-1].tick <= self.tick
+    def _enough(self) -> float:
+        """Computing time after which a keyframe is due, s."""
+        return max(REPLAY, self._copying / SHARE)
+
+    def _affordable(self) -> int:
+        """Return the number of ticks until that time has passed, if they take as long as the last ones."""
+        return int((self._enough - self._spent) / self._cost) if self._cost > 0 else EVERY
 
     def _apply_due(self) -> None:
         """Apply the recorded edits of this tick again."""
@@ -119,7 +148,7 @@ class History:
     def go_to(self, tick: int) -> None:
         """Go to a tick from 0 to `last`, exactly, with the edits of that tick applied."""
         tick = min(max(tick, 0), self.last)
-        best = max((m for m in self._moments if m.tick <= tick), key=lambda m: m.tick)
+        best = self._latest(tick)
         if not best.tick <= self.tick <= tick:
             self._restore(best)
         while self.tick < tick:
@@ -128,22 +157,28 @@ class History:
     def _restore(self, moment: _Moment) -> None:
         for lane, keyframe in zip(self._lanes, moment.keyframes, strict=True):
             lane.restore(keyframe)
-        self.tick, self._done = moment.tick, moment.edits
+        self.tick, self._done, self._spent = moment.tick, moment.edits, 0.0
         self._apply_due()
 
     def _moment(self) -> _Moment:
+        began = self._clock()
         keyframes = tuple(lane.keep() for lane in self._lanes)
+        self._copying = self._clock() - began
         return _Moment(self.tick, self._done, keyframes, sum(keyframe.nbytes for keyframe in keyframes))
 
     def _thin(self) -> None:
-        """Drop keyframes until the budget holds: always the one whose gap is smallest for its age."""
+        """Drop keyframes until the budget holds: always the one whose gap is smallest for its distance from now."""
         total, now = self.nbytes, self.tick
         while (total > self._budget or len(self._moments) > MOST) and len(self._moments) > 2:
             gaps = [
-                (after.tick - before.tick) / (now - at.tick)
+                (after.tick - before.tick) / max(abs(now - at.tick), 1)
                 for before, at, after in zip(self._moments, self._moments[1:-1], self._moments[2:], strict=False)
             ]
             total -= self._moments.pop(1 + min(range(len(gaps)), key=gaps.__getitem__)).nbytes
+
+
+def _tick_of(moment: _Moment) -> int:
+    return moment.tick
 
 
 def targets(lanes: Sequence[Lane], edit: Edit) -> Sequence[Lane]:

@@ -35,7 +35,7 @@ class Room:
         if not 1 <= len(self.lanes) <= MOST_LANES:
             raise ValueError(f"lanes: there must be 1 to {MOST_LANES}, got {len(self.lanes)}")
         _check_one_clock(self.lanes)
-        self.history = History(self.lanes, budget)
+        self.history = History(self.lanes, budget, clock)
         self.playing, self.speed = False, 1.0
         self.version = 0
         """Counts changes of records, players and obstacles: pages that know another version read the rest anew."""
