@@ -207,6 +207,27 @@ def test_a_world_is_compiled_beside_its_frames(
         wait_for(lambda: len(steps) > 0)
 
 
+def test_frames_and_edits_go_on_while_costs_are_measured(
+    server: PlayServer, session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measured = threading.Event()
+    assert session.room is not None
+    lane = session.room.lanes[0]
+
+    def measure() -> list[Any]:
+        return [{"type": "costs", "rows": [], "in time": measured.wait(10)}]
+
+    monkeypatch.setitem(session._long, messages.Costs, lambda message: lambda: measure)
+    with page_of(server) as page:
+        ask(page, HELLO, "room")
+        page.send(json.dumps({"type": "costs"}))
+        page.send(json.dumps({"type": "edit", "edit": {"kind": "set", "path": "groups[0].radius", "value": 0.4}}))
+        assert isinstance(ask(page, {"type": "frame"}), bytes)
+        wait_for(lambda: lane.record.groups[0].radius == 0.4)
+        measured.set()
+        assert ask(page, {"type": "frame"}, "costs")["in time"] is True
+
+
 def np_of(numbers: list[float]) -> Any:
     import numpy as np
 

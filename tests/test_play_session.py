@@ -119,9 +119,20 @@ def test_the_saved_text_of_a_task_is_loaded_into_that_task_with_its_players() ->
     assert [lane.record for lane in session.room.lanes] == 2 * [TASKS["pursuit"](size=14)]
     assert [lane.players[0] for lane in session.room.lanes if isinstance(lane, TaskLane)] == ["rules", "ppo"]
     assert session.room.lanes[0].seed == 3
-    with pytest.raises(ValueError, match=r"^text:1: space = .*: unknown key"):
-        ask(session, type="load", yaml=TINY)
+    with pytest.raises(ValueError, match=r"^text:1: sise = .*: unknown key, did you mean"):
+        ask(session, type="load", yaml="sise: 3")
     assert session.room.lanes[0].record == TASKS["pursuit"](size=14)
+
+
+def test_the_text_of_a_scene_is_loaded_as_a_scene_while_a_task_is_open() -> None:
+    session = Session()
+    session.open_task(TASKS["pursuit"](), ("rules", "random"), seed=3)
+    ask(session, type="load", yaml=TINY)
+    assert session.room is not None
+    (lane,) = session.room.lanes
+    assert lane.record == load_scene(TINY) and lane.seed == 3 and session.describe()["kind"] == "scene"
+    assert session.name == "scene" and session.describe()["players"] == []
+    assert not any("groups" in task.model_fields for task in TASKS.values())
 
 
 def test_pages_learn_of_other_players() -> None:
@@ -193,6 +204,19 @@ def test_a_saved_text_is_the_record_and_tells_what_it_lacks() -> None:
     saved = ask(session, type="save")
     assert load_scene(saved["text"]) == room.lanes[0].record
     assert saved["note"] == "1 changes of this run, such as moved agents, are not in the YAML; a link has them."
+
+
+@pytest.mark.slow
+def test_costs_are_measured_from_a_copy_of_the_world() -> None:
+    session, room = opened()
+    message = read_message('{"type": "costs"}')
+    later = session.prepare(message)()
+    assert callable(later)
+    ask(session, type="step", n=3)
+    digests = room.digests
+    (answer,) = later()
+    assert isinstance(answer, dict) and [row["path"] for row in answer["rows"]] == ["effects[0]"]
+    assert answer["step"] > 0 and room.tick == 3 and room.digests == digests
 
 
 def test_two_time_steps_are_compared_side_by_side() -> None:

@@ -7,6 +7,9 @@ environment, or of a test run, would all compile the same ones at the same time.
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,10 +18,32 @@ from flockenv.jit.startup import no_garbage_collection
 if TYPE_CHECKING:
     from filelock import FileLock
 
-__all__ = ["PATIENCE", "OneAtATime"]
+__all__ = ["PATIENCE", "NotCachedError", "OneAtATime", "only_cached", "require_cached"]
 
 PATIENCE = 120.0
 """Longest wait, s, for another process, which may have stopped while compiling."""
+
+_only_cached: ContextVar[bool] = ContextVar("only_cached", default=False)
+
+
+class NotCachedError(RuntimeError):
+    """A kernel that is not in the cache was needed in a block of `only_cached`."""
+
+
+@contextmanager
+def only_cached() -> Iterator[None]:
+    """Let no kernel be compiled by this thread in a block: one that is not in the cache raises NotCachedError."""
+    token = _only_cached.set(True)
+    try:
+        yield
+    finally:
+        _only_cached.reset(token)
+
+
+def require_cached(found: object) -> None:
+    """Raise NotCachedError if nothing was found in the cache, in a block of `only_cached`."""
+    if found is None and _only_cached.get():
+        raise NotCachedError("a kernel must be compiled")
 
 
 class OneAtATime:
@@ -42,12 +67,16 @@ class OneAtATime:
         return self._made[os.getpid()]
 
     def load_overload(self, signature: Any, context: Any) -> Any:
-        """Return the entry on the disk, waiting while another process writes it; None if the caller must compile."""
+        """Return the entry on the disk, waiting while another process writes it; None if the caller must compile.
+
+        Raises NotCachedError instead, without waiting, in a block of `only_cached`.
+        """
         if os.getpid() in self._made:
             self.release()  # left by a compilation that failed
         found = self._read(signature, context)
         if found is not None:
             return found
+        require_cached(found)
         try:
             self._lock.acquire()
         except OSError:  # timed out, or locking is impossible here: each process compiles for itself

@@ -27,7 +27,7 @@ from flockenv.jit import cpu
 from flockenv.jit.cache_folder import cache_folder
 from flockenv.jit.checked_store import Store
 from flockenv.jit.decorators import FAST, IN_PYTHON, Vec, kernel, python_of
-from flockenv.jit.lock import OneAtATime
+from flockenv.jit.lock import OneAtATime, require_cached
 from flockenv.jit.machine_code import MachineCode
 from flockenv.jit.pipeline import Whole
 from flockenv.jit.private_folder import ensure_private
@@ -117,6 +117,7 @@ def _entry(make: Callable[..., Callable[..., Any]], plan: tuple[Any, ...]) -> Ca
     import_numba_before_scipy()
     digest, store = digest_of((make, plan, cpu.REGISTER)), Store(cache_folder())
     stand_in = _stand_in(store.read(f"{digest}.plan"))
+    require_cached(stand_in)
     function = stand_in or make(*plan)
     if stand_in is None:
         store.write(f"{digest}.plan", _stand_in_data(function))

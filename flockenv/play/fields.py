@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from flockenv.core.errors import nearest, printable
 from flockenv.geometry.space import Torus
+from flockenv.model.state import State
 from flockenv.physics.effects import Contact
 from flockenv.play.lane import Drawn, Lane, collected_warnings
 from flockenv.play.scene_lane import SceneLane
@@ -223,14 +225,18 @@ def prepare_costs(lane: Lane) -> None:
             scene.step(state)
 
 
-def costs_of(lane: Lane) -> dict[str, Any]:
-    """Return what each effect of a scene costs from the present state on, us per step, as `flockenv explain` measures.
+def costs_of(lane: Lane) -> Callable[[], dict[str, Any]]:
+    """Return a function that measures what each effect of a scene costs, us per step, as `flockenv explain` does.
 
-    It takes some seconds, and more without `prepare_costs`; the lane stays as it is. Raises ValueError for a task.
+    It measures from the present state on, of which it has a copy, and takes some seconds, in any thread; longer without
+    `prepare_costs`. Raises ValueError for a task.
     """
     lane = _of_scene(lane)
-    with collected_warnings():
-        breakdown = explain(lane.record, lane.state.copy())
+    return functools.partial(_costs, lane.record, lane.state.copy())
+
+
+def _costs(scene: Scene, state: State) -> dict[str, Any]:
+    breakdown = explain(scene, state)  # without `collected_warnings`, for which edits would wait meanwhile
     rows = []
     for k, row in enumerate(breakdown.rows):
         cost = {"cost": row.cost.median, "low": row.cost.low, "high": row.cost.high}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -91,6 +91,10 @@ class Lane(Protocol):
     @property
     def returns(self) -> float | None:
         """Return so far, mean over learners; None for a scene."""
+
+    @property
+    def made_of(self) -> Callable[[], Lane]:
+        """What makes such a lane, at its start; it can be pickled."""
 
     def start(self, record: Record | None = None) -> None:
         """Begin again at tick 0, with another record if given."""

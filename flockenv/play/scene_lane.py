@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -87,6 +89,11 @@ class SceneLane:
         self._warned.update(lines)
         self.record, self.tick, self.stopped = scene, 0, ""
         self.pointer: Pointer | None = None
+
+    @property
+    def made_of(self) -> Callable[[], SceneLane]:
+        """What makes such a lane, at its start; it can be pickled."""
+        return functools.partial(SceneLane, self.record, self.seed, self.per_tick)
 
     @property
     def time(self) -> float:

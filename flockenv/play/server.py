@@ -1,9 +1,9 @@
 """The server of the playground: one page, pictures, and a socket on which pages ask, change and watch.
 
-All work on the worlds is done in one thread, in order; what must be compiled or built for it first, in another one, so
-that worlds go on meanwhile. A frame is sent only as the answer to a question for one: a slow page gets fewer frames,
-and nothing waits for it. A message that breaks the protocol ends its connection, with one line in the log; the worlds
-stay as they are.
+All work on the worlds is done in one thread, in order. What must be built for it first is built in another thread, and
+what must be compiled is compiled in a child process, so that worlds and frames go on meanwhile. A frame is sent only as
+the answer to a question for one: a slow page gets fewer frames, and nothing waits for it. A message that breaks the
+protocol ends its connection, with one line in the log; the worlds stay as they are.
 """
 
 from __future__ import annotations
@@ -27,14 +27,12 @@ from websockets.http11 import Request, Response
 
 from flockenv.core.errors import printable
 from flockenv.play import messages as m
+from flockenv.play.compiling import Compiler
 from flockenv.play.session import Answer, Session
 from flockenv.play.visit import HostileError, Visit
 from flockenv.render.page import page, policy
 
-__all__ = ["PORT", "PlayServer"]
-
-PORT: Final = 8712
-"""The port if none is given."""
+__all__ = ["PlayServer"]
 
 REST: Final = 0.003
 """Seconds between two looks at the clock while the worlds run."""
@@ -63,11 +61,13 @@ class PlayServer:
     free.
     """
 
-    def __init__(self, session: Session, host: str | None = None, port: int = PORT) -> None:
+    def __init__(self, session: Session, host: str | None = None, port: int = 0) -> None:
         self.session, self.host, self.port = session, host, port
         self.token = secrets.token_urlsafe(24) if host else ""
         self._work = ThreadPoolExecutor(1, "flockenv-play")
         self._beside = ThreadPoolExecutor(1, "flockenv-compile")
+        self._measuring = ThreadPoolExecutor(1, "flockenv-measure")
+        self._compiler = Compiler()
         self._pages: set[ServerConnection] = set()
         self._html = page("live", "flockenv", {"version": m.VERSION, "largest": m.LARGEST, "longest": m.LARGEST_TEXT})
         self._pictures = session.pictures()
@@ -90,7 +90,8 @@ class PlayServer:
             clock.cancel()
             server.close()
             await server.wait_closed()
-            for pool in (self._work, self._beside):
+            self._compiler.close()
+            for pool in (self._work, self._beside, self._measuring):
                 pool.shutdown(wait=False, cancel_futures=True)
 
     async def _listen(self) -> Server:
@@ -106,9 +107,10 @@ class PlayServer:
         """Do some work on the worlds, after what was asked before."""
         return await asyncio.get_running_loop().run_in_executor(self._work, work, *arguments)
 
-    async def _aside(self, work: Callable[..., Any], *arguments: Any) -> Any:
-        """Do some work beside that on the worlds, such as compiling."""
-        return await asyncio.get_running_loop().run_in_executor(self._beside, work, *arguments)
+    async def _aside(self, work: Callable[[], Any], message: m.Message | None = None) -> Any:
+        """Do the part of a message that may compile, None: of the steps, beside the work on the worlds."""
+        twin = functools.partial(self.session.twin, message)
+        return await asyncio.get_running_loop().run_in_executor(self._beside, self._compiler.do, work, twin)
 
     async def _keep_time(self) -> None:
         """Let time pass in the worlds while a page is open."""
@@ -218,16 +220,30 @@ class PlayServer:
             await self._reply(visit, message)
 
     async def _answer_long(self, visit: Visit) -> None:
-        """Answer the long messages of a page one after the other."""
+        """Answer the long messages of a page one after the other; what effects cost is measured beside the rest."""
+        measuring: asyncio.Task[None] | None = None
         try:
             while True:
-                await self._reply(visit, await visit.take())
+                message = await visit.take()
+                if not isinstance(message, m.Costs):
+                    await self._reply_or_end(visit, message)
+                    continue
+                if measuring is not None:
+                    await measuring
+                measuring = asyncio.create_task(self._reply_or_end(visit, message))
+        finally:
+            if measuring is not None:
+                measuring.cancel()
+            visit.end()
+
+    async def _reply_or_end(self, visit: Visit, message: m.Message) -> None:
+        """Send the answers to a long message; an error of the server ends the page."""
+        try:
+            await self._reply(visit, message)
         except ConnectionClosed:
             pass  # the reader of its messages sees this too
         except Exception:
             await self._give_up(visit)
-        finally:
-            visit.end()
 
     async def _reply(self, visit: Visit, message: m.Message) -> None:
         """Send the answers to a message; a refusal is an answer too."""
@@ -256,11 +272,14 @@ class PlayServer:
         if isinstance(message, (m.Step, m.Seek)):
             await self._compile()
         if self.session.is_long(message):
-            work = await self._aside(self.session.prepare, message)
+            work = await self._aside(functools.partial(self.session.prepare, message), message)
         else:
             work = functools.partial(self.session.answer, message)
-        answers: Sequence[Answer] = await self._do(work)
-        return answers
+        answers = await self._do(work)
+        if callable(answers):
+            answers = await asyncio.get_running_loop().run_in_executor(self._measuring, answers)
+        found: Sequence[Answer] = answers
+        return found
 
 
 def _json(data: object) -> str:

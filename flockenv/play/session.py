@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter
@@ -29,10 +30,12 @@ from flockenv.play.task_lane import NO_FILES, PlayerFiles, TaskLane, players_of
 from flockenv.scene import Scene
 from flockenv.tasks import Task
 
-__all__ = ["Answer", "Rest", "Session"]
+__all__ = ["Answer", "Later", "Rest", "Session"]
 
 Answer = Mapping[str, Any] | bytes
-Rest = Callable[[], list[Answer]]
+Later = Callable[[], list[Answer]]
+"""What takes long and needs the worlds no more, such as measuring; in any thread."""
+Rest = Callable[[], "list[Answer] | Later"]
 """What is left to do for a message, in the thread that steps the worlds."""
 
 
@@ -122,9 +125,20 @@ class Session:
         """Compile and build what a long message needs, and return the rest; ValueError if it cannot be done."""
         return self._long[type(message)](message)
 
+    def twin(self, message: m.Message | None = None) -> Callable[[], object]:
+        """Return what prepares a message, None: compiles, in another process: in a session of the same worlds.
+
+        They are at their start there. What it returns can be pickled, and is called without arguments.
+        """
+        lanes = self.room.lanes if self.room is not None else ()
+        return functools.partial(_prepare_twin, self.files, [lane.made_of for lane in lanes], message)
+
     def answer(self, message: m.Message) -> list[Answer]:
         """Return the answers to a message; ValueError, in one line, if it cannot be done."""
-        return self.prepare(message)() if type(message) in self._long else self._short[type(message)](message)
+        if type(message) in self._short:
+            return self._short[type(message)](message)
+        answers = self.prepare(message)()
+        return answers() if callable(answers) else answers
 
     def _edit(self, message: m.EditMessage) -> Rest:
         edit = read_edit(message.edit)
@@ -185,17 +199,18 @@ class Session:
 
     def _load(self, message: m.Load) -> Rest:
         from flockenv.play.gallery import description_of
-        from flockenv.scene.yaml_io import load, load_scene
+        from flockenv.scene.yaml_io import keys_of, load, load_scene
 
         text = message.yaml + "\n"  # with a line break it is a text, never the name of a file
         seed = self.room.lanes[0].seed if self.room is not None else 0
         lanes = self.room.lanes if self.room is not None else ()
-        if lanes and isinstance(lanes[0], TaskLane):  # the text of a task does not name it
+        is_scene = "groups" in keys_of(text)  # which no task has; the text of a task does not name it
+        if lanes and isinstance(lanes[0], TaskLane) and not is_scene:
             task = load(text, type(lanes[0].record))
             players = [lane.players[0] for lane in lanes if isinstance(lane, TaskLane)]
             return self._ready(self._room_of(task, players, seed), task.name, _about(task))
-        scene = load_scene(text)
-        return self._ready(Room((SceneLane(scene, seed),)), self.name or "scene", description_of(message.yaml))
+        scene, name = load_scene(text), self.name if lanes and isinstance(lanes[0], SceneLane) else "scene"
+        return self._ready(Room((SceneLane(scene, seed),)), name, description_of(message.yaml))
 
     def _link(self, message: m.LinkMessage) -> Rest:
         from flockenv.play.link import read_link
@@ -321,7 +336,12 @@ class Session:
 
         prepare_costs(self._there().lanes[0])
         prepare_look(self._there().lanes[0])  # shares of behaviours are measured too
-        return lambda: [{"type": "costs", **_data(costs_of(self._there().lanes[0]))}]
+
+        def measure() -> Later:
+            costs = costs_of(self._there().lanes[0])
+            return lambda: [{"type": "costs", **_data(costs())}]
+
+        return measure
 
     def _additions(self, message: m.Additions) -> Rest:
         record = self._there().lanes[0].record
@@ -389,6 +409,17 @@ class Session:
 _LOST: Answer = {
     "type": "record", "on": False, "seconds": 0.0, "note": "The recording was not saved: it ended with its world.",
 }  # fmt: skip
+
+
+def _prepare_twin(files: PlayerFiles, lanes: Sequence[Callable[[], Lane]], message: m.Message | None) -> None:
+    """Prepare a message, or compile what steps need, in a new session that plays some lanes."""
+    session = Session(files)
+    if lanes:
+        session.room = Room([make() for make in lanes])
+    if message is None:
+        session.compile()
+    else:
+        session.prepare(message)
 
 
 class _Mean:

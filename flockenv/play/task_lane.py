@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -142,6 +143,11 @@ class TaskLane:
         for policy in self._policies.values():
             if hasattr(policy, "watch"):
                 policy.watch(self.world)
+
+    @property
+    def made_of(self) -> Callable[[], TaskLane]:
+        """What makes such a lane, at its start; it can be pickled."""
+        return functools.partial(TaskLane, self.record, self.players, self.seed, self.disturbance, self.files)
 
     @property
     def time(self) -> float:

@@ -26,7 +26,7 @@ from flockenv.core.yaml_paths import STANDARD_INPUT, has_yaml_suffix
 from flockenv.scene import Scene
 from flockenv.scene.presets import Preset, expand_presets
 
-__all__ = ["MAX_BYTES", "ConfigError", "dump", "dump_scene", "load", "load_scene", "parse_scalar", "schema"]
+__all__ = ["MAX_BYTES", "ConfigError", "dump", "dump_scene", "keys_of", "load", "load_scene", "parse_scalar", "schema"]
 
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 32
@@ -105,6 +105,11 @@ def load(source: str | Path, model: type[M], named: Mapping[str, Path] = Mapping
     lines = [f"{name}:{line}: {text}" for line, text in wrong[:MAX_LINES]]
     more = [f"{name}: and more mistakes"] if len(wrong) > MAX_LINES else []
     raise ConfigError("\n".join(lines + more))
+
+
+def keys_of(source: str | Path) -> tuple[str, ...]:
+    """Return the outermost keys of a YAML file or text; source and errors are those of `load`."""
+    return tuple(_Reader(*_read(source, {})).document())
 
 
 def dump(

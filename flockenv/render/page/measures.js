@@ -66,7 +66,7 @@ function drawSparks(canvas, lines) {
 function costBox() {
   const box = element("div"), button = element("button", "measure what each effect costs"), out = element("div");
   out.id = "costs";
-  button.onclick = () => { live.ask({ type: "costs" }); out.replaceChildren(element("p", "Measuring; the world waits a moment.", "lead")); };
+  button.onclick = () => { live.ask({ type: "costs" }); out.replaceChildren(element("p", "Measuring takes some seconds; the world goes on.", "lead")); };
   box.append(heading("Time"), button, out);
   box.style.marginTop = "18px";
   return box;
