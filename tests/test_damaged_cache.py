@@ -103,12 +103,12 @@ def store(tmp_path: Path) -> Store:
 
 @pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE.keys())
 def test_damaged_data_is_never_returned(
-    damage: Callable[[bytes], bytes], store: Store, capsys: pytest.CaptureFixture[str]
+    damage: Callable[[bytes], bytes], store: Store, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = store.folder / "name"
     path.write_bytes(damage(path.read_bytes()))
     assert store.read("name") is None and store.read("name") is None
-    assert capsys.readouterr().err == f"flockenv: {path}: damaged; rebuilt\n"
+    assert caplog.messages == [f"flockenv: {path}: damaged; rebuilt"]
     store.write("name", b"new")
     assert store.read("name") == b"new"
 
@@ -135,7 +135,7 @@ def test_data_is_read_only_under_its_own_name(store: Store) -> None:
 
 
 def test_full_disk_is_reported_once_and_leaves_no_files(
-    store: Store, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def full(handle: int) -> None:
         raise OSError(28, "No space left on device")
@@ -143,7 +143,7 @@ def test_full_disk_is_reported_once_and_leaves_no_files(
     monkeypatch.setattr(os, "fsync", full)
     for name in ("name", "other"):
         store.write(name, b"new")
-    printed = capsys.readouterr().err
-    assert printed.count("\n") == 1 and "No space left on device" in printed and str(store.folder) in printed
+    (logged,) = caplog.messages
+    assert "No space left on device" in logged and str(store.folder) in logged
     assert [path.name for path in store.folder.iterdir()] == ["name"]
     assert store.read("name") == bytes(range(256)) * 3

@@ -270,21 +270,22 @@ def test_a_worker_uses_its_share_of_the_cores_for_blas(
 
 
 def test_fewer_processes_run_if_jobs_would_not_fit_into_memory(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("flockenv.jobs.local_engine.available_memory", lambda: 5 * 10**9)
     large = [dataclasses.replace(job, memory=2 * 10**9) for job in numbers(4)]
-    sizes = "processes: a job needs about 2 GB, 5 GB are available\n"
+    sizes = "processes: a job needs about 2 GB, 5 GB are available"
     for jobs, processes, count, text in (
         (large, 4, 2, f"2 of 4 {sizes}"), (large, 2, 2, ""), (large, 1, 1, ""), (numbers(4), 4, 4, ""),
         ([dataclasses.replace(job, memory=10**10) for job in numbers(2)], 2, 1, "1 of 2 processes: "),
     ):  # fmt: skip
         assert count_fitting(processes, jobs) == count
-        error = capsys.readouterr().err
-        assert error.startswith(text) and bool(error) == bool(text)
+        assert [each.startswith(text) for each in caplog.messages] == ([True] if text else [])
+        caplog.clear()
     jobs = [Job(f"pid/{k}", own_process, (), k, memory=3 * 10**9) for k in range(3)]
     found = {record for _, record in LocalEngine(2).run(jobs, lambda job: None)}
-    assert len(found) == 1 and capsys.readouterr().err.startswith("1 of 2 processes: ")
+    assert len(found) == 1 and caplog.messages[0].startswith("1 of 2 processes: ")
+    assert {each.name for each in caplog.records} == {"flockenv.jobs"} and not capsys.readouterr().err
 
 
 @pytest.mark.parametrize("version", [1, 2])

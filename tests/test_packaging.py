@@ -15,6 +15,10 @@ from email.message import Message
 from pathlib import Path
 
 import pytest
+import yaml
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+from packaging.version import Version
 
 from flockenv.tasks import TASKS
 
@@ -41,8 +45,9 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built
 
 
-FOLDERS = (".ci", "agents", "benchmarks", "configs", "docs", "flockenv", "tests")
+FOLDERS = (".ci", ".github", "agents", "benchmarks", "configs", "docs", "flockenv", "release", "tests")
 FILES = (
+    "CODE_OF_CONDUCT.md", "SECURITY.md",
     "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "MANIFEST.in", "README.md", "pyproject.toml",
     "setup.py", ".gitignore", ".pre-commit-config.yaml",
 )  # fmt: skip
@@ -239,13 +244,57 @@ def test_every_dependency_is_pinned() -> None:
     assert wanted - pins == {"pillow"}  # not pinned: other packages often pin it
 
 
+def bounds() -> dict[str, SpecifierSet]:
+    """Return the versions that the package and its extras allow, without tools and what only documents need."""
+    extras = PROJECT["optional-dependencies"]
+    lines = [line for name in ("train", "render", "play", "test") for line in extras[name]] + PROJECT["dependencies"]
+    wanted = map(Requirement, lines)
+    return {each.name.lower(): each.specifier for each in wanted if each.name not in TOOLS}
+
+
+TOOLS = ("ruff", "mypy", "types-PyYAML", "setuptools")
+
+
+def test_the_lowest_versions_are_the_lower_bounds() -> None:
+    """.ci/lowest installs them; a bound that is not tried may be wrong."""
+    text = (ROOT / "configs" / "constraints-lowest.txt").read_text()
+    pins = {name.lower().replace("_", "-"): Version(pin) for name, pin in (line.split("==") for line in text.split())}
+    lowest = {
+        name: next(Version(each.version) for each in specifier if each.operator == ">=")
+        for name, specifier in bounds().items()
+    }
+    assert {name: pins.get(name) for name in lowest} == lowest
+    assert "configs/constraints-lowest.txt" in (ROOT / ".ci" / "lowest").read_text()
+
+
+def test_the_conda_recipe_needs_what_the_package_needs() -> None:
+    recipe = yaml.safe_load((ROOT / "release" / "conda" / "recipe.yaml").read_text())
+    listed = {line.split()[0].removesuffix("-base"): line.split()[1] for line in recipe["requirements"]["run"]}
+    assert listed.pop("python") == ">=${{ python_min }}"
+    wanted = {each.name.lower(): each.specifier for each in map(Requirement, PROJECT["dependencies"])}
+    assert {name: SpecifierSet(text) for name, text in listed.items()} == wanted
+    context = recipe["context"]
+    assert (context["version"], f">={context['python_min']}") == (PROJECT["version"], PROJECT["requires-python"])
+
+
+def test_the_workflow_tries_the_pythons_of_the_classifiers_and_both_ends_of_the_versions() -> None:
+    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())
+    marked = [line.rsplit(" ", 1)[1] for line in PROJECT["classifiers"] if re.search(r":: 3\.\d+$", line)]
+    assert workflow["jobs"]["newest"]["strategy"]["matrix"]["python"] == marked
+    assert workflow["jobs"]["wheel"]["strategy"]["matrix"]["python"] == marked
+    ran = [step.get("run", "") for job in workflow["jobs"].values() for step in job["steps"]]
+    assert "bash .ci/lowest" in ran and "bash .ci/run" in ran and any("sphinx -W" in command for command in ran)
+    for path in (ROOT / ".github").rglob("*.yml"):
+        assert yaml.safe_load(path.read_text())
+
+
 def test_the_top_level_contains_only_allowed_files_and_folders() -> None:
     """Tracked files are tested, so without git nothing is tested."""
     done = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False)
     tops = {line.split("/")[0] for line in done.stdout.splitlines()}
     allowed = {
         *("pyproject.toml", "README.md", "LICENSE", "CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff", "MANIFEST.in"),
-        "setup.py",
+        *("setup.py", "CODE_OF_CONDUCT.md", "SECURITY.md", "release"),
         *("flockenv", "agents", "configs", "tests", "docs", "benchmarks"),
     }
     assert {top for top in tops if not top.startswith(".")} <= allowed

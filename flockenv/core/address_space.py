@@ -97,7 +97,7 @@ def _require_or_exit(command: str, needed: int, purpose: str) -> None:
     try:
         require_room(purpose, needed)
     except MemoryError as error:
-        print(f"{command}: not enough memory: {error}", file=sys.stderr)
+        print(f"{command}: not enough memory: {error}", file=sys.stderr)  # noqa: T201  # a command, and it ends here
         raise SystemExit(2) from None
 
 

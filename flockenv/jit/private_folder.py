@@ -8,9 +8,9 @@ the check. Windows has one temporary folder per user and no such modes: nothing 
 
 from __future__ import annotations
 
+import logging
 import os
 import stat
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,6 +20,8 @@ __all__ = ["NotPrivateError", "ensure_private", "first_private", "read_private",
 CHECKED = hasattr(os, "geteuid")
 """True if this system has owners and modes to check."""
 
+_log = logging.getLogger("flockenv.jit")
+
 _said: set[str] = set()
 
 
@@ -28,10 +30,10 @@ class NotPrivateError(PermissionError):
 
 
 def say_once(line: str, about: str = "") -> None:
-    """Write one line to stderr unless this process has already written one with the same `about` or text."""
-    if (about or line) not in _said and sys.stderr is not None:
+    """Log one line as a warning unless this process has already logged one with the same `about` or text."""
+    if (about or line) not in _said:
         _said.add(about or line)
-        print(f"flockenv: {line}", file=sys.stderr, flush=True)
+        _log.warning("flockenv: %s", line)
 
 
 def ensure_private(folder: Path) -> Path:

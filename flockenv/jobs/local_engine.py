@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import functools
+import logging
 import os
 import signal
-import sys
 import tempfile
 import threading
 from collections import Counter, deque
@@ -23,6 +23,8 @@ from flockenv.core.available_memory import available_memory
 from flockenv.jit.thread_pool import cores
 from flockenv.jobs.engine import TRIES, Begun
 from flockenv.jobs.job import Failure, Job, code_digest, execute
+
+_log = logging.getLogger("flockenv.jobs")
 
 __all__ = ["LocalEngine", "count_fitting", "guard_process_starts"]
 
@@ -171,14 +173,14 @@ class _Worker:
 
 
 def count_fitting(processes: int, jobs: Iterable[Job]) -> int:
-    """Return the number of processes, at least 1, whose jobs fit into the available memory; write a line if reduced."""
+    """Return the number of processes, at least 1, whose jobs fit into the available memory; a log line if reduced."""
     need, room = max((job.memory for job in jobs), default=0), available_memory()
     if not need or room is None or need * processes <= room:
         return processes
     fitting = max(1, min(processes, room // need))
-    if fitting < processes and sys.stderr is not None:
+    if fitting < processes:
         sizes = f"a job needs about {need / 1e9:.2g} GB, {room / 1e9:.2g} GB are available"
-        print(f"{fitting} of {processes} processes: {sizes}", file=sys.stderr, flush=True)
+        _log.warning("%d of %d processes: %s", fitting, processes, sizes)
     return fitting
 
 

@@ -172,7 +172,7 @@ def _make(names: Sequence[str]) -> None:
     """Draw the pictures of some scenes and tasks."""
     for name in names:
         (Path(str(PICTURES)) / f"{name}.png").write_bytes(_draw(list(_films(name)), name in TASKS))
-        print(name, flush=True)
+        print(name, flush=True)  # noqa: T201  # a command of developers
 
 
 if __name__ == "__main__":
