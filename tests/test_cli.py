@@ -674,8 +674,11 @@ def test_interrupted_stress_writes_its_findings(
         (f"run tiny.yaml --out {'x' * 300}.npz", "--out '"),
         ("run tiny.yaml --out con.npz", "--out 'con.npz': 'con.npz' is a reserved name"),
         ("render tiny.yaml", "Missing option '--out'"),
-        ("render tiny.yaml --out x.mp4", "--out 'x.mp4': must end in .gif or .png or .html"),
-        ("render tiny.yaml --out x.gfi", "--out 'x.gfi': must end in .gif or .png or .html, did you mean `.gif`?"),
+        ("render tiny.yaml --out x.avi", "--out 'x.avi': must end in .gif or .png or .html or .mp4 or .webp"),
+        (
+            "render tiny.yaml --out x.gfi",
+            "--out 'x.gfi': must end in .gif or .png or .html or .mp4 or .webp, did you mean `.gif`?",
+        ),
         ("render pursiut --out x.gif", "'pursiut': no such task, did you mean `pursuit`? ("),
         ("render pursuit --out x.gif --player nosuch", "player 'nosuch': unknown"),
         ("render pursuit --out x.gif --player rule", "player 'rule': unknown, did you mean `rules`?"),

@@ -51,17 +51,21 @@ def film_episodes(
 
 
 def write_picture(path: Path, panels: Sequence[Panel], title: str, fps: float, size: int) -> None:
-    """Write films side by side: an HTML replay, a PNG of the end, or a GIF; size: width of a picture, pixels."""
+    """Write films side by side: an HTML replay, a PNG of the end, a GIF, MP4 or WebP; size: width, pixels."""
     import numpy as np
 
     from flockenv.render import Group, write_gif, write_png, write_replay
     from flockenv.render.gif import MOST_FPS
+    from flockenv.render.video import write_mp4, write_webp
 
     films = [panel.snapshots for panel in panels]
     if path.suffix.lower() == ".html":
         write_replay(path, [Group(title, list(panels))], title)
     elif path.suffix.lower() == ".png":
         write_png(path, np.hstack([_draw_last_frame(film, size // len(films), fps) for film in films]))
+    elif path.suffix.lower() in (".mp4", ".webp"):
+        write = write_mp4 if path.suffix.lower() == ".mp4" else write_webp
+        write(path, _draw_frames(films, size // len(films), fps), fps)
     else:
         stride = math.ceil(fps / MOST_FPS)
         frames = _draw_frames([film[::stride] for film in films], size // len(films), fps / stride)

@@ -65,7 +65,7 @@ if TYPE_CHECKING:
 
 __all__ = ["app", "main"]
 
-PICTURES = (".gif", ".png", ".html")
+PICTURES = (".gif", ".png", ".html", ".mp4", ".webp")
 FPS = 25.0  # of a scene's GIF
 RECORDED_EVERY = 0.1  # s, rounded to whole steps
 
@@ -231,7 +231,9 @@ def render(
             autocompletion=complete_target,
         ),
     ],
-    out: Annotated[str, typer.Option(metavar="X.gif|X.png|X.html", help="Output file; a PNG shows the end.")],
+    out: Annotated[
+        str, typer.Option(metavar="X.gif|X.png|X.html|X.mp4|X.webp", help="Output file; a PNG shows the end.")
+    ],
     player: Annotated[
         str,
         typer.Option(
@@ -254,13 +256,15 @@ def render(
     trust_pickle: TrustPickle = False,
     force: Force = False,
 ) -> None:
-    """Draw a scene, or an episode of a task with a player, as GIF, PNG or HTML replay."""
+    """Draw a scene, or an episode of a task with a player, as GIF, PNG, HTML replay, MP4 (extra `video`) or WebP."""
     from flockenv.core.atomic_files import new_folder
     from flockenv.core.output_paths import valid_file
     from flockenv.envs.disturbance import Disturbance
+    from flockenv.render.video import require_encoder
     from flockenv.tasks import TASKS
 
     path = valid_file(out, PICTURES, force)
+    require_encoder(path.suffix)
     disturbance = Disturbance(noise=noise, delay=delay, dropped=dropped, range=reach, seen=seen)
     if is_scene(what):
         if disturbance:
