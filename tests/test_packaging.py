@@ -132,7 +132,7 @@ def test_the_base_dependencies_do_not_include_torch(metadata: Message) -> None:
         *("numpy", "scipy", "numba", "gymnasium", "pettingzoo", "pydantic", "pyyaml", "typer", "rich"),
         *("matplotlib", "pillow", "safetensors", "shapely", "filelock"),
     }
-    extras = {"train", "test", "render", "play", "docs", "ray", "rllib", "browser", "video"}
+    extras = {"train", "test", "render", "play", "docs", "ray", "rllib", "browser", "video", "parquet"}
     assert set(metadata.get_all("Provides-Extra") or []) == extras
     assert "gymnasium<2,>=1.2" in needed
 
@@ -269,7 +269,8 @@ def test_the_lowest_versions_are_the_lower_bounds() -> None:
 
 def test_the_conda_recipe_needs_what_the_package_needs() -> None:
     recipe = yaml.safe_load((ROOT / "release" / "conda" / "recipe.yaml").read_text())
-    listed = {line.split()[0].removesuffix("-base"): line.split()[1] for line in recipe["requirements"]["run"]}
+    lines = (line.split(" ", 1) for line in recipe["requirements"]["run"])
+    listed = {name.removesuffix("-base"): versions for name, versions in lines}
     assert listed.pop("python") == ">=${{ python_min }}"
     wanted = {each.name.lower(): each.specifier for each in map(Requirement, PROJECT["dependencies"])}
     assert {name: SpecifierSet(text) for name, text in listed.items()} == wanted

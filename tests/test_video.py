@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,18 @@ groups: [{count: 4, spawn: {speed: [1, 2]}}]
 effects: [{kind: drag, rate: 0.5}]
 dt: 0.01
 """
+
+
+pytestmark = [  # imageio-ffmpeg leaves its pipes to the garbage collector
+    pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+
+@pytest.fixture(autouse=True)
+def _no_pipes_are_left() -> Iterator[None]:
+    yield
+    gc.collect()
 
 
 def film(count: int, height: int = 60, width: int = 90) -> list[NDArray[np.uint8]]:

@@ -190,7 +190,11 @@ def run(
     seed: Seed = 0,
     duration: Duration = 10.0,
     out: Annotated[
-        str | None, typer.Option(metavar="X.npz", help="File for the trajectory; a summary goes to X.json.")
+        str | None,
+        typer.Option(
+            metavar="X.npz|X.csv|X.parquet",
+            help="File for the trajectory, all of it or a table of positions for PedPy; a summary goes to X.json.",
+        ),
     ] = None,
     every: Annotated[
         float | None,
@@ -202,9 +206,12 @@ def run(
     from flockenv.core.output_paths import valid_file
     from flockenv.scene.yaml_io import load_scene
     from flockenv.studies.trajectory import whole_steps
+    from flockenv.studies.trajectory_table import SUFFIXES, require_writer
 
     loaded = load_scene(Path(scene))
-    path = valid_file(out, [".npz"], force, beside=".json") if out is not None else None
+    path = valid_file(out, [".npz", *SUFFIXES], force, beside=".json") if out is not None else None
+    if path is not None:
+        require_writer(path.suffix)
     steps = whole_steps("--duration", duration, loaded.dt)
     usual = max(1, round(RECORDED_EVERY / loaded.dt))
     stride = usual if every is None else whole_steps("--every", every, loaded.dt, 1)

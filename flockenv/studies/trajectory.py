@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import os
@@ -23,6 +24,7 @@ from flockenv.model.state import WORK, Floats, State
 from flockenv.scene import Scene
 from flockenv.scene.yaml_io import dump_scene
 from flockenv.studies.measures import measure
+from flockenv.studies.trajectory_table import frame_rate, write_csv, write_parquet
 
 __all__ = ["MEMORY_LIMIT", "Trajectory", "record", "whole_steps"]
 
@@ -97,6 +99,7 @@ class Trajectory:
             "steps": int(self.step[-1]),
             "time_s": float(self.last.time[0]),
             "instants": len(self.step),
+            "frame_rate": frame_rate(self),
             "stopped": self.stopped,
             "measures": {name: {"start": _json(a), "end": _json(b)} for name, (a, b) in self.measures().items()},
             "digest": self.last.digest,
@@ -108,15 +111,22 @@ class Trajectory:
     def save(self, path: Path) -> Path:
         """Write X.npz and X.json beside it, both or neither; return the path of the latter.
 
+        X.csv and X.parquet are tables of positions, see `trajectory_table`. What X.npz contains:
+
         Arrays: time (T,) s, pos (T, N, D) m, vel (T, N, D) m/s, alive (T, N), radius (N,) m, seed, and `scene`, the
         YAML text that `load_scene` reads; heading (T, N, D) where headings are kept; identity and born (T, N), s, where
         there is a population; shown (T, N), if pictures show inner numbers. None needs pickle. Missing folders are
         created.
         """
+        write = {".csv": write_csv, ".parquet": write_parquet}.get(path.suffix.lower())
         beside = path.with_suffix(".json")
         summary = json.dumps(self.summary(), indent=2, allow_nan=False) + os.linesep
         write_all_or_none(
-            path.parent, {path.name: self._write, beside.name: lambda part: part.write_bytes(summary.encode())}
+            path.parent,
+            {
+                path.name: self._write if write is None else functools.partial(write, self),
+                beside.name: lambda part: part.write_bytes(summary.encode()),
+            },
         )
         return beside
 
