@@ -16,6 +16,7 @@ pytest.importorskip("websockets", reason="needs the extra `play`: pip install 'f
 from flockenv.envs.world import World
 from flockenv.model.state import digest_arrays
 from flockenv.play.room import Room
+from flockenv.play.scene_lane import SceneLane
 from flockenv.play.server import PlayServer
 from flockenv.play.session import Session
 from flockenv.play.task_lane import TaskLane
@@ -205,6 +206,32 @@ def test_two_fingers_zoom_and_leave_the_agents_alone(visit: Callable[..., Visit]
         send("touchEnd")
         here.until("views[0].camera.zoom > 1.5")
         assert room.made == () and here.value("chosen.agent") is None
+
+
+def test_a_finger_scrolls_worlds_that_are_not_all_in_sight(visit: Callable[..., Visit]) -> None:
+    session = shown_boids()
+    room = session.room
+    assert room is not None
+    scene = room.lanes[0].record
+    session._set_room(Room([SceneLane(scene), SceneLane(scene), SceneLane(scene)]), "boids", "", False)
+    with serving(session) as server:
+        here = visit(server.url, 400, has_touch=True)
+        here.until("views.length === 3 && views.every(v => v.panel.frames.length)")
+        touch = here.context.new_cdp_session(here.page)
+        box, camera = here.value("views[0].canvas.getBoundingClientRect()"), here.value("views[0].camera")
+        x, y = box["x"] + 8, box["y"] + box["height"] - 8
+
+        def send(kind: str, *points: tuple[float, float]) -> None:
+            fingers = [{"x": a, "y": b, "id": k} for k, (a, b) in enumerate(points)]
+            touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": fingers})
+
+        send("touchStart", (x, y))
+        for k in range(1, 5):
+            send("touchMove", (x, y - 30 * k))
+        send("touchEnd")
+        here.until("document.querySelector('.stage').scrollTop > 90")
+        assert here.value("document.querySelector('.stage').scrollTop") <= 125
+        assert here.value("views[0].camera") == camera
 
 
 def test_a_world_waits_for_readers_who_want_less_motion(visit: Callable[..., Visit]) -> None:

@@ -19,6 +19,12 @@ function turn(view, dx, dy) {
   view.camera.tilt = clamp(view.camera.tilt - 3 * dy / view.canvas.height, 0, Math.PI);
 }
 
+/* What one finger scrolls: the stage, if it holds several worlds that are not all in sight; null if they are. */
+function scrolledBy(view, event) {
+  const stage = view.canvas.closest(".stage");
+  return event.pointerType === "touch" && pointers.size === 1 && views.length > 1 && stage.scrollHeight > stage.clientHeight + 1 ? stage : null;
+}
+
 /* Moves the camera with one pointer or two; others: pointers by number, with their last pixel. */
 function moveCamera(view, event, now, before) {
   if (pointers.size === 2) {
@@ -48,14 +54,15 @@ function steerCamera(view) {
   canvas.addEventListener("pointerdown", event => {
     const at = pixelOf(canvas, event), taken = pointers.size === 0 && event.button === 0 && take("down", event, at);
     if (pointers.size) dropTools(take, event, at);
-    pointers.set(event.pointerId, { at, taken });
+    pointers.set(event.pointerId, { at, taken, y: event.clientY });
     canvas.setPointerCapture(event.pointerId);
   });
   canvas.addEventListener("pointermove", event => {
     const now = pixelOf(canvas, event), held = pointers.get(event.pointerId);
     if (!held) { take("hover", event, now); return; }
-    if (held.taken) take("move", event, now); else moveCamera(view, event, now, held.at);
-    held.at = now;
+    const stage = held.taken ? null : scrolledBy(view, event);
+    if (held.taken) take("move", event, now); else if (stage) stage.scrollTop += held.y - event.clientY; else moveCamera(view, event, now, held.at);
+    Object.assign(held, { at: pixelOf(canvas, event), y: event.clientY });
     refresh();
   });
   for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, event => {
