@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip("websockets", reason="needs the extra `play`: pip install 'flockenv[play]'")
 from flockenv.play.session import Session
+from flockenv.tasks import TASKS
 from tests.playground import Visit, serving, wait_for
 from tests.test_browser import chromium, room_of, shown_boids, visit
 
@@ -135,6 +136,26 @@ def test_a_second_click_removes_and_adds_nothing_more(boids: Session, visit: Cal
         here.value("window.edits = [], live.edit = edit => edits.push(edit.kind), 0")
         here.page.locator(".sentence:has([data-path='effects[0].weight']) .remove").dblclick(force=True)
         assert here.value("window.edits") == ["remove"]
+
+
+def test_the_keyboard_stays_in_its_tab_when_a_rule_is_removed(boids: Session, visit: Callable[..., Visit]) -> None:
+    with serving(boids) as server:
+        here = opened(visit, server.url)
+        here.page.locator(".sentence:has([data-path='effects[0].weight']) .remove").focus()
+        here.value("keepFocus(() => showRules(live.room))")
+        assert here.value("document.activeElement.className") == "add"
+
+
+def test_measures_name_the_worlds_in_their_colours(visit: Callable[..., Visit]) -> None:
+    session = Session()
+    session.open_task(TASKS["pursuit"](), ("rules", "random"))
+    room_of(session).play(False)
+    with serving(session) as server:
+        here = opened(visit, server.url)
+        here.page.locator("#tab-measures").click()
+        here.until("document.querySelectorAll('.measure').length > 3")
+        assert here.page.locator(".measure b").first.inner_text().split() == ["rules", "random"]
+        assert len(set(here.value("[0, 1, 2, 3].map(laneColour)"))) == 4
 
 
 def test_the_gallery_keeps_the_keyboard_and_finds_worlds(visit: Callable[..., Visit]) -> None:

@@ -16,6 +16,7 @@ from flockenv.play.gallery import entries, read_entry
 from flockenv.play.record_paths import value_at, with_value
 from flockenv.play.scene_lane import SceneLane
 from flockenv.play.sentences import read_words, scene_of, sentences_of, words_of
+from flockenv.render.palette import PAPER, ROLE_COLOURS, rgb
 from flockenv.scene import Scene
 from flockenv.scene.yaml_io import load_scene
 from flockenv.tasks import TASKS
@@ -209,3 +210,18 @@ def test_controls_say_what_begins_the_world_again() -> None:
     controls = {each.path: each for each in with_restarts(controls_of(lane.record), lane)}
     assert controls["groups[0].count"].restarts and controls["groups[0].spawn.speed[0]"].restarts
     assert controls["effects[0].weight"].restarts is False and controls["groups[0].max_speed"].restarts is False
+
+
+def _luminance(colour: str) -> float:
+    """Return the relative luminance of a colour (WCAG 2.2)."""
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in (each / 255 for each in rgb(colour))]
+    return sum(weight * c for weight, c in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
+
+
+@pytest.mark.parametrize("theme", [0, 1])
+@pytest.mark.parametrize("ground", ["page", "paper"])
+def test_words_of_the_page_have_the_contrast_of_wcag_aa(ground: str, theme: int) -> None:
+    behind = _luminance(PAPER[ground][theme])
+    for name, pair in {**{part: PAPER[part] for part in ("ink", "faint")}, "accent": ROLE_COLOURS["evader"]}.items():
+        low, high = sorted((behind, _luminance(pair[theme])))
+        assert (high + 0.05) / (low + 0.05) >= 4.5, name

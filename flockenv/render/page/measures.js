@@ -19,14 +19,14 @@ function showMeasures(message) {
   const box = $("measures"), names = [...new Set(message.lanes.flatMap(l => Object.keys(l)))];
   if (box.dataset.names !== names.join()) {
     box.dataset.names = names.join();
-    box.replaceChildren(...names.map(name => {
+    box.replaceChildren(...namesOfLanes(), ...names.map(name => {
       const first = message.lanes.find(l => l[name])[name], row = element("div", undefined, "measure"), top = element("div", undefined, "top"), value = element("b"), canvas = element("canvas");
       row.title = first.title || ""; row.dataset.name = name; canvas.height = 36; canvas.width = 320;
       top.append(element("span", name.replace(/_/g, " ")), value); row.append(top, canvas);
       return row;
     }), costBox(), timingBox());
   }
-  for (const row of box.querySelectorAll(".measure")) {
+  for (const row of box.querySelectorAll(".measure[data-name]")) {
     const { name } = row.dataset;
     const values = message.lanes.map((lane, n) => valueOfLane(lane[name], message.lanes.length > 1 ? laneColour(n) : ""));
     row.querySelector("b").replaceChildren(...values, unitOf(message.lanes.find(lane => lane[name])[name]));
@@ -42,11 +42,22 @@ function unitOf(measure) { return measure && measure.unit && measure.unit !== "1
 /* The colour of a world among several. */
 function laneColour(n) { return [paint.accent, roleColour.pursuer, roleColour["learner 2"], paint.goal][n]; }
 
-function valueOfLane(measure, colour) {
-  const out = element("span", measure && measure.value !== null ? plainNumber(measure.value) : "–");
-  out.style.color = colour;
+/* The names of several worlds in the order of their values, above their colours. */
+function namesOfLanes() {
+  const { lanes } = live.room, row = element("div", undefined, "measure"), top = element("div", undefined, "top"), names = element("b");
+  if (lanes.length < 2) return [];
+  names.append(...lanes.map((lane, n) => underlined(lane.name, laneColour(n))));
+  top.append(element("span", "world"), names); row.append(top);
+  return [row];
+}
+
+function underlined(text, colour) {
+  const out = element("span", text);
+  if (colour) out.style.borderBottom = `2px solid ${colour}`;
   return out;
 }
+
+function valueOfLane(measure, colour) { return underlined(measure && measure.value !== null ? plainNumber(measure.value) : "–", colour); }
 
 /* Curves of one measure, a colour for each world, on shared axes; a world without the measure has none. */
 function drawSparks(canvas, lines) {

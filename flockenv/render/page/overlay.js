@@ -123,6 +123,7 @@ function drawFlow(pen, eye, panel, field) {
 function prepareView(view, n, camera) {
   const { panel } = view;
   view.n = n;
+  view.canvas.setAttribute("aria-label", `${panel.player || "the world"}; press ? for its keys`);
   view.home = homeCamera(panel);
   Object.assign(view.camera, view.home, camera || {});
   view.before = () => {

@@ -21,7 +21,7 @@ function sentenceLine(sentence) {
   if (sentence.removable) {
     const button = element("button", "×", "remove");
     button.title = "remove"; button.setAttribute("aria-label", `remove: ${line.textContent}`);
-    button.onclick = () => { button.disabled = true; live.edit({ kind: "remove", path: sentence.path }); }; // a second click would remove the next one
+    button.onclick = once(button, () => live.edit({ kind: "remove", path: sentence.path })); // a second click would remove the next one
     line.append(button);
   }
   return line;
@@ -38,7 +38,8 @@ function controlOfPart(part) {
 function adder() {
   const box = element("div"), button = element("button", "+ add a rule", "add"), list = element("div", undefined, "choices");
   const offer = message => {
-    const choices = message.additions.map(choiceOf);
+    const choices = message.additions.map(addition => choiceOf(addition, list));
+    list.removeAttribute("aria-busy");
     list.replaceChildren(findField("find a rule", choices), ...choices);
     box.scrollIntoView({ block: "start" });
   };
@@ -53,9 +54,12 @@ function adder() {
   return box;
 }
 
-function choiceOf(addition) {
+/* An action that is not done again while its answer is awaited: then its node is made anew. */
+function once(node, act) { return () => { if (node.ariaBusy) return; node.ariaBusy = "true"; act(); }; }
+
+function choiceOf(addition, list) {
   const choice = element("button", addition.title);
   choice.append(element("small", addition.description));
-  choice.onclick = () => { choice.parentNode.inert = true; live.edit({ kind: "add", path: addition.path, value: addition.value }); };
+  choice.onclick = once(list, () => live.edit({ kind: "add", path: addition.path, value: addition.value }));
   return choice;
 }

@@ -78,11 +78,12 @@ function showRoom(room) {
   showColours(room); showTools(room);
 }
 
-/* Does something that makes the controls anew; the value that had the keyboard has it afterwards. */
+/* Does something that makes the controls anew; the value that had the keyboard has it afterwards, or else the first button of its tab. */
 function keepFocus(act) {
   const node = document.activeElement, path = node && node.dataset.path, section = node && node.closest("[role=tabpanel]");
   act();
-  const again = path && section && section.querySelector(`[data-path="${CSS.escape(path)}"]`);
+  if (!section || node.isConnected) return;
+  const again = path && section.querySelector(`[data-path="${CSS.escape(path)}"]`) || section.querySelector(".add") || section.querySelector("select, button, input");
   if (again) again.focus({ preventScroll: true });
 }
 
