@@ -179,8 +179,9 @@ def test_a_change_by_another_page_leaves_the_gallery_open(boids: Session, visit:
         here.page.keyboard.press("g")
         here.page.locator(".card").first.wait_for()
         version = here.value("live.room.version")
-        other.value("live.set('effects[1].weight', 0.7)")
-        wait_for(lambda: room_of(boids).lanes[0].record.effects[1].weight == 0.7)
+        agents = room_of(boids).lanes[0].record.agents
+        other.value("live.edit({ kind: 'add_agents', count: 1 })")
+        wait_for(lambda: room_of(boids).lanes[0].record.agents == agents + 1)
         here.value("live.send({ type: 'save' })")  # its answer comes with the news
         here.until(f"live.room.version !== {version}")
         assert here.page.locator("#gallery").is_visible()

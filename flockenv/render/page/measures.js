@@ -28,7 +28,7 @@ function showMeasures(message) {
   }
   for (const row of box.querySelectorAll(".measure[data-name]")) {
     const { name } = row.dataset;
-    const values = message.lanes.map((lane, n) => valueOfLane(lane[name], message.lanes.length > 1 ? laneColour(n) : ""));
+    const values = message.lanes.flatMap((lane, n) => [...(n ? [" "] : []), valueOfLane(lane[name], message.lanes.length > 1 ? laneColour(n) : "")]);
     row.querySelector("b").replaceChildren(...values, unitOf(message.lanes.find(lane => lane[name])[name]));
     drawSparks(row.querySelector("canvas"), message.lanes.map((_, n) => curves.get(`${n} ${name}`)));
   }
@@ -46,7 +46,7 @@ function laneColour(n) { return [paint.accent, roleColour.pursuer, roleColour["l
 function namesOfLanes() {
   const { lanes } = live.room, row = element("div", undefined, "measure"), top = element("div", undefined, "top"), names = element("b");
   if (lanes.length < 2) return [];
-  names.append(...lanes.map((lane, n) => underlined(lane.name, laneColour(n))));
+  names.append(...lanes.flatMap((lane, n) => [underlined(lane.name, laneColour(n)), " "]));
   top.append(element("span", "world"), names); row.append(top);
   return [row];
 }
