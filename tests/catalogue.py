@@ -107,10 +107,12 @@ from flockenv.physics.effects import (
     SpeedLimit,
     Springs,
     Stage,
+    SurfaceTension,
     Swing,
     Tether,
     Uniform,
     Vicsek,
+    Viscosity,
     Vortex,
     WallRepulsion,
     Way,
@@ -411,6 +413,8 @@ EFFECTS = (
     EffectRow(SpeedLimit(speed=1.2, strength=0.8)),
     EffectRow(Fluctuation(strength=0.8), obeys=frozenset({"translation"})),  # random per agent, drawn along the axes
     EffectRow(Pressure(strength=1.5, density=1, radius=1.35)),
+    EffectRow(Viscosity(viscosity=0.4, density=1, radius=2.2)),
+    EffectRow(SurfaceTension(tension=0.8, density=1, radius=2.2)),
     EffectRow(  # random per agent, with the same sign in a mirror image
         Vicsek(speed=1.2, radius=2.5, noise=1, step=0.05), obeys=frozenset({"translation", "rotation"}), dimensions=(2,)
     ),

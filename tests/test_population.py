@@ -506,7 +506,7 @@ def test_a_population_survives_yaml_and_pickle() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["fountain", "fireworks"])
+@pytest.mark.parametrize("name", ["fountain", "fireworks", "fire", "smoke", "waterfall"])
 def test_example_scenes_load_and_refuse_no_births(name: str) -> None:
     loaded = load_scene(Path(__file__).parent.parent / "configs" / "scenes" / f"{name}.yaml")
     assert load_scene(dump_scene(loaded)) == loaded

@@ -134,8 +134,8 @@ def test_folds_of_a_rope_or_cloth_keep_their_distance(name: str, seconds: float,
 
 def test_the_page_of_scenes_has_a_picture_and_a_command_for_each_scene() -> None:
     page = (ROOT / "docs" / "scenes.md").read_text()
-    for name in (*SECONDS, "fountain", "fireworks"):
-        assert re.search(rf"flockenv render configs/scenes/{name}\.yaml .*--out docs/scenes/{name}\.png", page)
+    for name in (*SECONDS, "fountain", "fireworks", "drop", "waterfall", "fire", "smoke"):
+        assert re.search(rf"flockenv render {name} .*--out docs/scenes/{name}\.png", page)
         assert f"scenes/{name}.png" in page
         assert 1000 < (ROOT / "docs" / "scenes" / f"{name}.png").stat().st_size < 150_000
 

@@ -22,7 +22,7 @@ Addition = dict[str, Any]
 PLACES = ("centre", "target", "point")
 """Names of fields that are a place, which is put into the middle of the world."""
 
-OWN_VALUES = {"pressure": {"radius": 1.3}}
+OWN_VALUES = {"pressure": {"radius": 1.3}, "viscosity": {"radius": 2.4}, "surface_tension": {"radius": 2.4}}
 """Values of effects whose numbers must fit each other."""
 
 WEAKER = (1.0, 0.1, 0.01, 1e-3, 1e-4)
