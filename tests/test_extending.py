@@ -2,39 +2,26 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parent.parent
+from tests.page_scripts import ROOT, numbers, python_of, run_python
+
 PAGE = (ROOT / "docs/extending.md").read_text(encoding="utf-8")
-NUMBER = r"-?\d+\.?\d*(?:e-?\d+)?"
 TUTORIALS = ("Your own effect", "Your own behaviour", "Your own integrator", "Your own task", "Your own player")
 
 
 def script_of(section: str) -> str:
     """Return the Python blocks of a section, one after another."""
     (text,) = re.findall(rf"^## {section}\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.MULTILINE)
-    return "\n".join(re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE))
+    return python_of(text)
 
 
 def printed(section: str, folder: Path) -> list[str]:
-    """Run a tutorial as a script in an empty folder, warnings of flockenv as errors; return the lines it prints."""
-    (folder / "tutorial.py").write_text(script_of(section), encoding="utf-8")
-    done = subprocess.run(
-        [sys.executable, "-W", "error::UserWarning", "tutorial.py"], cwd=folder, capture_output=True, text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT)}, check=False, timeout=300,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()
-
-
-def numbers(text: str) -> list[float]:
-    return [float(number) for number in re.findall(NUMBER, text)]
+    """Run a tutorial as a script in an empty folder; return the lines it prints."""
+    return run_python(script_of(section), folder)
 
 
 def test_every_python_block_of_the_page_is_part_of_a_tutorial() -> None:

@@ -1,0 +1,62 @@
+"""The site: links of its pages and of README resolve, and `python -m sphinx -W` builds it."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.page_scripts import ROOT
+
+PAGES = sorted(
+    path
+    for path in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"))
+    if not {"generated", "_build"} & {*path.relative_to(ROOT).parts}
+)
+FENCED = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
+TARGET = re.compile(r"\]\((?![a-z]+:)([^)\s]+)[^)]*\)|<img src=\"(?![a-z]+:)([^\"]+)\"")
+
+
+def text_of(path: Path) -> str:
+    """Return a page without its blocks of code."""
+    return FENCED.sub("", path.read_text(encoding="utf-8"))
+
+
+def anchors_of(path: Path) -> set[str]:
+    """Return the anchors of a page's headings, as code hosts and the site make them."""
+    headings = re.findall(r"^#+ +(.*?) *$", text_of(path), re.MULTILINE)
+    plain = (re.sub(r"\[([^]]*)\]\([^)]*\)|`", r"\1", heading).lower() for heading in headings)
+    return {re.sub(r"[^\w\- ]", "", heading).replace(" ", "-") for heading in plain}
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_link_leads_to_a_file_and_a_heading(path: Path) -> None:
+    for linked, shown in TARGET.findall(text_of(path)):
+        name, _, anchor = (linked or shown).partition("#")
+        target = (path.parent / name).resolve() if name else path
+        assert target.exists(), f"{name}: no such file"
+        assert not anchor or anchor in anchors_of(target), f"{name}: has no heading #{anchor}"
+
+
+def test_pages_with_links_were_found() -> None:
+    assert {"README.md", "docs/index.md", "docs/history/players.md"} <= {str(p.relative_to(ROOT)) for p in PAGES}
+    assert sum(len(TARGET.findall(text_of(path))) for path in PAGES) > 200
+    assert {"seeds", "where-to-go-next"} <= anchors_of(ROOT / "docs/players.md") | anchors_of(ROOT / "README.md")
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_warnings_and_refers_to_no_other_host(tmp_path: Path) -> None:
+    """Without the films of tasks, which the stage `site` of .ci/run draws."""
+    if any(importlib.util.find_spec(name) is None for name in ("sphinx", "myst_parser", "furo")):
+        pytest.skip("needs sphinx, myst-parser and furo: pip install 'flockenv[docs]'")
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-D", "films=0", "-b", "html", "docs"]
+    done = subprocess.run([*command, str(tmp_path)], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "searchindex.js").stat().st_size > 100_000
+    loaded = re.compile(r"<(?:script|link|img|iframe)\b[^>]*?(?:src|href)=\"(?:https?:)?//[^\"]*\"")
+    for path in tmp_path.rglob("*.html"):
+        assert loaded.findall(path.read_text(encoding="utf-8")) == [], path.name
