@@ -290,6 +290,7 @@ class EffectRow:
         fov, nearest = getattr(self.effect, "fov", 360.0), getattr(self.effect, "nearest", None)
         words = ["cone"] * (fov < 360.0) + ([f"nearest_{nearest}"] if nearest else [])
         words += ["medium"] * (getattr(self.effect, "acts", "") == "medium")
+        words += ["yielding"] * bool(getattr(self.effect, "lasts", False))
         words += ["corotated"] * (getattr(self.effect, "strain", "") == "corotated")
         return "_".join([self.effect.kind, *words])
 
@@ -515,6 +516,9 @@ EFFECTS = (
     ),
     # agents of a network; see `tied`
     EffectRow(Springs(stiffness=3, damping=0.2), obeys=frozenset({"translation", "rotation", "mirror"})),
+    EffectRow(
+        Springs(stiffness=3, yield_strain=0.1, break_strain=1), obeys=frozenset({"translation", "rotation", "mirror"})
+    ),
     EffectRow(
         AngularSprings(stiffness=0.05, damping=0.005), beside=(Springs(stiffness=3),),  # a uniform stretch keeps angles
         obeys=frozenset({"translation", "rotation"}),  # in the plane an angle has a sign

@@ -44,7 +44,7 @@ RARE = {
 
 RARE_EFFECTS = {
     "alignment_cone", "cohesion_cone", "altitude_springs", "angular_springs", "elastic", "elastic_corotated",
-    "quadratic_drag", "carried", "wind", "obstacle_contact", "gravity",
+    "springs_yielding", "quadratic_drag", "carried", "wind", "obstacle_contact", "gravity",
 }  # fmt: skip
 """Effects whose symmetries only slow tests try: each compiles a kernel, and has quick tests elsewhere."""
 

@@ -19,11 +19,11 @@ from flockenv.engine.kernel_plan import KernelPlan
 from flockenv.engine.lane_access import gather
 from flockenv.jit.decorators import Law, like
 from flockenv.jit.intrinsics import wait_for_team
-from flockenv.jit.section import section
+from flockenv.jit.section import call_in_turn, section
 from flockenv.maths.vectors import dot, exact_sum, zero
 from flockenv.physics.effects.effect import Bonds, Other
 
-__all__ = ["BondPlan", "Table", "bond_plan", "bonds_of", "pack"]
+__all__ = ["BondPlan", "Table", "bond_plan", "bonds_of", "bring_bonds_of", "keep_bonds_of", "pack"]
 
 
 class Table(NamedTuple):
@@ -34,13 +34,14 @@ class Table(NamedTuple):
     start: NDArray[
         np.int64
     ]  # per effect: the first slot of each block, and one more; then where its places, and numbers, begin
+    kept: NDArray[np.floating]  # (S,) the first values of State.bonds of a world
 
 
 def pack(parts: KernelPlan, agents: int, groups: Sequence[object]) -> Table:
     """Return the table of a scene of `agents` agents; raise ValueError, naming the effect, if its bonds are invalid."""
     w, d = parts.width, parts.dimension
     blocks = -(-agents // w)
-    places, numbers, starts, bases = [], [], [], []
+    places, numbers, starts, bases, kept = [], [], [], [], np.zeros(0)
     first_place = first_number = 0
     for k, effect in parts.bond_effects:
         try:
@@ -50,6 +51,8 @@ def pack(parts: KernelPlan, agents: int, groups: Sequence[object]) -> Table:
                 each < k for each in parts.combined
             )  # the effects listed before the one that combines them
             raise ValueError(f"effects[{listed}].{error}") from None
+        if found.kept is not None:
+            found, kept = _keep_apart(found, kept, parts.itemsize)
         start, place, number = _pack_bonds(found, agents, blocks, w, d)
         starts.append(start)
         bases += [first_place, first_number]
@@ -61,7 +64,24 @@ def pack(parts: KernelPlan, agents: int, groups: Sequence[object]) -> Table:
         np.concatenate(places or empty).astype(np.int32),
         np.concatenate(numbers or empty).astype(parts.dtype),
         np.concatenate([*starts, np.array(bases, np.int64)] if starts else [np.zeros(1, np.int64)]),
+        kept.astype(parts.dtype),
     )
+
+
+def _keep_apart(bonds: Bonds, kept: NDArray[np.float64], itemsize: int) -> tuple[Bonds, NDArray[np.float64]]:
+    """Return bonds whose last number is the place of what they keep, and its first values, behind those before."""
+    assert bonds.kept is not None
+    size = int(bonds.kept.max(initial=-1)) + 1
+    if itemsize == 4 and size > MOST_KEPT:
+        raise ValueError(f"dtype = float32: {size:,} springs that yield or break; at most {MOST_KEPT:,} are allowed")
+    longer = np.zeros(max(size, len(kept)))
+    longer[: len(kept)] = kept
+    longer[bonds.kept] = bonds.number[:, -1]
+    return bonds._replace(number=np.concatenate([bonds.number[:, :-1], bonds.kept[:, None]], axis=1)), longer
+
+
+MOST_KEPT = 2**24
+"""Most bonds that keep a number, in single precision: larger places are no longer exact."""
 
 
 def _pack_bonds(
@@ -96,6 +116,7 @@ class BondLaw(NamedTuple):
     law: Law
     partners: int
     numbers: int
+    keep: Law | None = None  # the law of the number that each bond keeps, the last of `numbers`
 
 
 class BondPlan(NamedTuple):
@@ -107,18 +128,19 @@ class BondPlan(NamedTuple):
     sums: int  # where the sums of a block begin in the scratch of lanes
     waits: bool  # True if no earlier phase has waited until all threads have written their positions
     adds: bool  # True if `far_bond_force` already holds forces of far laws
+    kept: int  # which array of `frame_and_inner` holds the numbers that bonds keep; -1: none
 
 
 def bond_plan(parts: KernelPlan, agent: AgentPlan) -> BondPlan:
     """Return the `BondPlan` of a scene."""
     d = parts.dimension
     laws = tuple(
-        BondLaw(k, e.bond_law, e.partner_count(d), e.numbers(d))
+        BondLaw(k, e.bond_law, e.partner_count(d), e.numbers(d), e.bond_keep_law)
         for k, e in parts.bond_effects
         if e.bond_law is not None
     )
     sums, waits = parts.slots["bond0"] * parts.width, not (parts.pairs or parts.far)
-    return BondPlan(agent, parts.space.offset_law, laws, sums, waits, bool(parts.far))
+    return BondPlan(agent, parts.space.offset_law, laws, sums, waits, bool(parts.far), parts.place_of_bonds)
 
 
 @section
@@ -152,11 +174,11 @@ def _add_bonds(plan: BondPlan, place: int) -> Callable[..., None]:
     The bonds are those of the effect at `place` in the table, and of all effects before it.
     """
     before = _add_bonds(plan, place - 1) if place else None
-    k, law, partners, numbers = plan.laws[place]
+    k, law, partners, numbers, keep_law = plan.laws[place]
     dimension, width = plan.agent.dimension, plan.agent.width
+    numbers_of = _numbers(numbers, width, keep_law is not None)
     vector, agent_at, partners_of = vector_of_lane(dimension, width), agent_of(plan.agent), _partners(plan, partners)
     are_alive = _are_alive(dimension, width, partners)
-    of_bond = tuple(number * width for number in range(numbers))
     keeps, apart, wide = bool(plan.agent.inner), partners * width, numbers * width
     first_place, total = 2 * place, len(plan.laws)
     sum_x, sum_y, sum_z = (np.uint64(plan.sums + axis * width) for axis in range(3))
@@ -164,7 +186,7 @@ def _add_bonds(plan: BondPlan, place: int) -> Callable[..., None]:
     def add(scratch: Any, effects: Any, size: Any, pos: Any, vel: Any, time: Any, key: Any, n: Any, block: Any) -> None:
         if before is not None:
             before(scratch, effects, size, pos, vel, time, key, n, block)
-        lanes, start, numbered = scratch.lanes, scratch.bond_start, scratch.bond_number
+        lanes, start = scratch.lanes, scratch.bond_start
         placed, living, kept = scratch.bond_place, scratch.living, scratch if keeps else ()
         base, row = block * np.uint64(dimension * width), block * np.uint64(width)
         blocks = (n + (width - 1)) // width + 1
@@ -176,7 +198,7 @@ def _add_bonds(plan: BondPlan, place: int) -> Callable[..., None]:
                 x, v = vector(pos, at), vector(vel, at)
                 me = agent_at(scratch, key, time, at, i, i, x, v, zero(x))
                 others = partners_of(kept, placed, pos, vel, scratch.radius, scratch.mass, size, x, places + lane)
-                value = law(effects[k], me, others, gather(numbered, first + lane, of_bond))
+                value = law(effects[k], me, others, numbers_of(scratch, first + lane))
                 whole = are_alive(placed, living, places + lane)  # a bond with a dead partner exerts no force
                 # exact_sum: each form of the loop would fuse the products differently, and bits would depend on the
                 # processor
@@ -186,6 +208,83 @@ def _add_bonds(plan: BondPlan, place: int) -> Callable[..., None]:
                     lanes[sum_z + lane] = exact_sum(lanes[sum_z + lane], value[2] if whole else like(x[0], -0.0))
 
     return add
+
+
+@section
+def _numbers(count: int, width: int, keeps: bool) -> Callable[..., Any]:
+    """Make `numbers(scratch, at)`: the numbers of a bond; the last one, if the bond keeps it, as it is at present."""
+    places, last = tuple(number * width for number in range(count - keeps)), np.uint64((count - 1) * width)
+
+    def numbers(scratch: Any, at: Any) -> Any:
+        if not keeps:
+            return gather(scratch.bond_number, at, places)
+        where = np.uint64(np.int64(scratch.bond_number[at + last]))
+        return gather(scratch.bond_number, at, places) + (scratch.bond_kept[where],)  # noqa: RUF005  # numba adds
+
+    return numbers
+
+
+@section
+def bring_bonds_of(place: int, inwards: bool) -> Callable[..., None]:
+    """Make `bring(worlds, scratch, b)`: copy the numbers that bonds of world b keep into scratch, or back."""
+
+    def bring(worlds: Any, scratch: Any, b: Any) -> None:
+        kept = worlds.frame_and_inner[place]
+        for bond in range(kept.shape[1]):
+            if inwards:
+                scratch.bond_kept[bond] = kept[b, bond]
+            else:
+                kept[b, bond] = scratch.bond_kept[bond]
+
+    return bring
+
+
+@section
+def keep_bonds_of(plan: BondPlan) -> Callable[..., None]:
+    """Make `keep(context, pos, vel, time)`: write the numbers that bonds keep, at the positions after a step."""
+    keep_each = call_in_turn(*(_keep_law(plan, place) for place, law in enumerate(plan.laws) if law.keep is not None))
+
+    def keep(context: Any, pos: Any, vel: Any, time: Any) -> None:
+        scratch = context.scratch
+        wait_for_team(scratch.sync, context.team)  # all agents have moved
+        keep_each(context, pos, vel, time)
+        wait_for_team(scratch.sync, context.team)  # before any force reads what another thread writes
+
+    return keep
+
+
+@section
+def _keep_law(plan: BondPlan, place: int) -> Callable[..., None]:
+    """Make `keep(context, pos, vel, time)` for the effect at `place` in the table."""
+    k, _, partners, numbers, law = plan.laws[place]
+    assert law is not None
+    dimension, width = plan.agent.dimension, plan.agent.width
+    vector, agent_at, partners_of = vector_of_lane(dimension, width), agent_of(plan.agent), _partners(plan, partners)
+    are_alive, numbers_of = _are_alive(dimension, width, partners), _numbers(numbers, width, True)
+    keeps, apart, wide, last = bool(plan.agent.inner), partners * width, numbers * width, (numbers - 1) * width
+    total, first_place = len(plan.laws), 2 * place
+
+    def keep(context: Any, pos: Any, vel: Any, time: Any) -> None:
+        scratch, effects, size = context.scratch, context.numbers.effects, context.numbers.size
+        key, start, placed = context.key[context.b], scratch.bond_start, scratch.bond_place
+        living, kept = scratch.living, scratch if keeps else ()
+        blocks = (context.n + (width - 1)) // width + 1
+        for block in range(np.uint64(context.first), np.uint64(context.end)):
+            base, row = block * np.uint64(dimension * width), block * np.uint64(width)
+            for slot in range(start[place * blocks + np.int64(block)], start[place * blocks + np.int64(block) + 1]):
+                places = np.uint64(start[total * blocks + first_place] + slot * apart)
+                first = np.uint64(start[total * blocks + first_place + 1] + slot * wide)
+                for lane in range(np.uint64(width)):
+                    i, at = row + lane, base + lane
+                    x, v = vector(pos, at), vector(vel, at)
+                    me = agent_at(scratch, key, time, at, i, i, x, v, zero(x))
+                    others = partners_of(kept, placed, pos, vel, scratch.radius, scratch.mass, size, x, places + lane)
+                    now = law(effects[k], me, others, numbers_of(scratch, first + lane))
+                    if me.who < others[0].who and are_alive(placed, living, places + lane):
+                        where = np.uint64(np.int64(scratch.bond_number[first + lane + np.uint64(last)]))
+                        scratch.bond_kept[where] = now
+
+    return keep
 
 
 @section

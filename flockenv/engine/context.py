@@ -14,7 +14,7 @@ class Worlds(NamedTuple):
 
     x: Any  # (D, B, N) m
     v: Any  # (D, B, N) m/s
-    frame_and_inner: Any  # a tuple of arrays: frames and inner states, if there are any
+    frame_and_inner: Any  # a tuple of arrays: frames, inner states and numbers of bonds, if there are any
     alive: Any  # (B, N)
     tick: Any  # (B,) steps since the start
     key: Any  # (B,) key of random numbers

@@ -14,6 +14,7 @@ import numpy as np
 from flockenv.engine.accelerations import ResponsePlan, SensePlan, accelerate_of, response_plan, sense_plan
 from flockenv.engine.agent_records import agent_of
 from flockenv.engine.blocks import out_of_blocks, place_of, vector_of_lane
+from flockenv.engine.bonds import bring_bonds_of
 from flockenv.engine.context import Context
 from flockenv.engine.kernel_plan import KernelPlan
 from flockenv.engine.load_store import bring_in_of, take_drive_of
@@ -142,12 +143,12 @@ def _scene_begin(plan: BeginPlan) -> Callable[..., None]:
 
 def field_of(parts: KernelPlan) -> Callable[..., None]:
     """Return the entry point `field` of parts that are not `stepped`: see `_scene_field`."""
-    made = _scene_field(response_plan(parts), sense_plan(parts), parts.number_plan)
+    made = _scene_field(response_plan(parts), sense_plan(parts), parts.number_plan, parts.place_of_bonds)
     return set_title(made, f"{_title(parts)}, accelerations")
 
 
 @entry_of
-def _scene_field(plan: ResponsePlan, sensed: SensePlan, number_plan: NumberPlan) -> Callable[..., None]:
+def _scene_field(plan: ResponsePlan, sensed: SensePlan, number_plan: NumberPlan, bonds: int) -> Callable[..., None]:
     """Make `scene_field`: write accelerations at given times, and the flow that carries agents if there is one.
 
     Both are of all worlds, (D, B, N); nothing moves.
@@ -155,6 +156,7 @@ def _scene_field(plan: ResponsePlan, sensed: SensePlan, number_plan: NumberPlan)
     agent, d, width = plan.agent, plan.agent.dimension, plan.agent.width
     bring_in, take_drive, out = bring_in_of(agent), take_drive_of(d, width, plan.masked), out_of_blocks(d, width)
     read, accelerate, flows = numbers_of(number_plan), accelerate_of(plan, sensed), bool(plan.flows)
+    bring_bonds = bring_bonds_of(bonds, True) if bonds >= 0 else None
 
     def scene_field(worlds: Any, drive: Any, params: Any, times: Any, acc: Any, flow: Any, scratch: Any) -> None:
         unaliased()
@@ -166,6 +168,8 @@ def _scene_field(plan: ResponsePlan, sensed: SensePlan, number_plan: NumberPlan)
                 scratch.living[i] = worlds.alive[b, i]
             bring_in(worlds, scratch, b, 0, end)
             take_drive(scratch, drive, b, n, 0, end)
+            if bring_bonds is not None:
+                bring_bonds(worlds, scratch, b)
             context = Context(
                 worlds.obstacle_x, worlds.obstacle_radius, worlds.work, params, read(params, scratch.counters),
                 worlds.key, b, n, present, False, 0, end, 0, 1, scratch,

@@ -130,7 +130,7 @@ def _write_back(state: State, b: int, alone: State) -> None:
     """Write a world back to its place in the batch."""
     state.x[:, b], state.v[:, b] = alone.x[:, 0], alone.v[:, 0]
     state.frame[:, b], state.inner[:, b] = alone.frame[:, 0], alone.inner[:, 0]
-    for name in ("tick", "work", "alive", "identity", "born", "dies"):
+    for name in ("tick", "work", "alive", "identity", "born", "dies", "bonds"):
         getattr(state, name)[b] = getattr(alone, name)[0]
 
 
@@ -152,7 +152,7 @@ def _evaluation(scene: SceneView, alone: State, drive: Floats) -> Evaluate:
             alone, x=axes_first(x), v=axes_first(v), alive=copies(alone.alive), tick=copies(alone.tick),
             key=copies(alone.key), obstacle_x=copies(alone.obstacle_x, 1),
             obstacle_radius=copies(alone.obstacle_radius), frame=copies(alone.frame, 1),
-            inner=copies(alone.inner, 1), work=np.zeros((many, len(WORK)), np.int64),
+            inner=copies(alone.inner, 1), bonds=copies(alone.bonds), work=np.zeros((many, len(WORK)), np.int64),
         )  # fmt: skip
         push = copies(drive, 1).transpose(1, 2, 0) if drive.shape[1] else None
         acc, flow = scene.rates(worlds, push, np.full(many, time))

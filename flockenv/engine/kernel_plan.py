@@ -106,6 +106,16 @@ class KernelPlan(ObstacleSets):
         """The effects with a law of bonds, and their indices."""
         return [(k, e) for k, e in enumerate(self.effects) if e.bond_law is not None]
 
+    @property
+    def keeps_bonds(self) -> bool:
+        """True if bonds of some effect keep a number, see State.bonds."""
+        return any(e.bond_keep_law is not None for _, e in self.bond_effects)
+
+    @property
+    def place_of_bonds(self) -> int:
+        """Which array of State.frame_and_inner is State.bonds; -1: none."""
+        return bool(self.frame_rows) + bool(self.inner) if self.keeps_bonds else -1
+
     @functools.cached_property
     def group_effects(self) -> list[tuple[int, Effect]]:
         """The effects with a law about a group as one, and their indices."""

@@ -28,8 +28,8 @@ SMALL_STRIDE = 128
 OWN = ("lanes", "ranges", "spread")
 """Arrays that each thread has for itself: running numbers of a block, ranges of candidates, masks of shared numbers."""
 
-TABLES = ("bond_place", "bond_number", "bond_start")
-"""Tables of bonds, which a scene has made: passed along with scratch, and only read."""
+TABLES = ("bond_place", "bond_number", "bond_start", "bond_kept")
+"""Tables of bonds, which a scene has made: passed along with scratch. All but the last, a copy, are only read."""
 
 Array = tuple[tuple[int, ...], Any]
 """Shape and dtype."""
@@ -62,8 +62,9 @@ def scratch_of(parts: KernelPlan, agents: int, team: int = 1) -> dict[str, Array
     if parts.tree_effects:
         found |= _tree_arrays(parts, agents, team)
     if parts.bond_effects:
-        kinds = np.dtype(np.int32), real, np.dtype(np.int64)
-        found |= {name: ((0,), kind) for name, kind in zip(TABLES, kinds, strict=True)}
+        kinds = np.dtype(np.int32), real, np.dtype(np.int64), real
+        tables = dict(zip(TABLES, kinds, strict=True))
+        found |= {name: ((0,), kind) for name, kind in tables.items() if name != "bond_kept" or parts.keeps_bonds}
     found |= {"tally": ((2 * team,), np.dtype(np.int64)), "sync": ((8,), np.dtype(np.int64))}
     return found | {"lanes": ((len(parts.slots) * width,), real)}
 

@@ -23,6 +23,7 @@ from flockenv.engine.accelerations import (
 )
 from flockenv.engine.agent_records import AgentPlan, agent_of, agent_plan
 from flockenv.engine.blocks import place_of, vector_of_lane
+from flockenv.engine.bonds import BondPlan, bond_plan, bring_bonds_of, keep_bonds_of
 from flockenv.engine.context import Context
 from flockenv.engine.kernel_plan import KernelPlan
 from flockenv.engine.lane_access import gather
@@ -65,6 +66,7 @@ class StepPlan(NamedTuple):
     ahead: tuple[int, ...]  # numbers of a block in `pos`, `vel`, `pair_force` and `ident`, to be prefetched; or empty
     trusts: bool  # True if every agent has a finite position until a step has failed, see KernelPlan.trusts
     spreads: bool  # True if a NaN position reaches every neighbour within one step
+    bonds: BondPlan | None  # of bonds that keep numbers
 
 
 def step_plan(parts: KernelPlan) -> StepPlan:
@@ -78,6 +80,7 @@ def step_plan(parts: KernelPlan) -> StepPlan:
         response_plan(parts),
         move_plan(parts), method, method_plan(parts), parts.inner != () and parts.integrator.solves,
         (d * w, d * w, parts.pair_force_size, w) if parts.sorts else (), parts.trusts, parts.spreads,
+        bond_plan(parts, agent_plan(parts)) if parts.keeps_bonds else None,
     )  # fmt: skip
 
 
@@ -216,6 +219,24 @@ def _by_method(plan: StepPlan) -> Callable[..., None]:
     return advance
 
 
+def _advance(plan: StepPlan) -> Callable[..., None]:
+    """Return `advance(context, pos, vel, time, dt, instant)`: a step of this thread's agents."""
+    return _in_two_loops(plan) if plan.method is None else _by_method(plan)
+
+
+@section
+def _advance_and_keep(plan: StepPlan) -> Callable[..., None]:
+    """Make `advance` for a scene whose bonds keep numbers."""
+    assert plan.bonds is not None
+    advance_agents, keep_bonds = _advance(plan), keep_bonds_of(plan.bonds)
+
+    def advance(context: Any, pos: Any, vel: Any, time: Any, dt: Any, instant: Any) -> None:
+        advance_agents(context, pos, vel, time, dt, instant)
+        keep_bonds(context, pos, vel, time)
+
+    return advance
+
+
 # --- several steps of a world -----------------------------------------------------------------------------------------
 
 
@@ -262,6 +283,7 @@ def _copy_in(plan: StepPlan) -> Callable[..., Context]:
     read, bring_in, take_drive = numbers_of(plan.numbers), bring_in_of(agent), take_drive_of(d, width, ordered)
     bring_inside = bring_inside_of(agent, plan.confines) if plan.confines is not None else None
     move_in = move_in_of(plan.arrange) if plan.arrange is not None else None
+    bring_bonds = bring_bonds_of(plan.bonds.kept, True) if plan.bonds is not None else None
 
     def enter(
         worlds: Any, drive: Any, drive_row: Any, params: Any, count: Any, b: Any, rank: Any, team: Any, scratch: Any
@@ -276,6 +298,9 @@ def _copy_in(plan: StepPlan) -> Callable[..., Context]:
             scratch.living[i] = alive[b, i]
         bring_in(worlds, scratch, b, first, end)
         take_drive(scratch, drive, drive_row, n, first, end)
+        if bring_bonds is not None:  # noqa: SIM102  # numba drops the branch by this alone
+            if rank == 0:  # forces wait for all threads before they read them
+                bring_bonds(worlds, scratch, b)
         numbers, arranged = read(params, scratch.counters), False
         if bring_inside is not None:
             bring_inside(scratch, numbers.size, first, end)
@@ -290,6 +315,21 @@ def _copy_in(plan: StepPlan) -> Callable[..., Context]:
 
 
 @section
+def _copy_out(plan: StepPlan) -> Callable[..., None]:
+    """Make `leave(worlds, scratch, b, first, end, rank)`: copy this thread's agents back, and numbers of bonds."""
+    bring_out = bring_out_of(plan.agent)
+    bring_bonds = bring_bonds_of(plan.bonds.kept, False) if plan.bonds is not None else None
+
+    def leave(worlds: Any, scratch: Any, b: Any, first: Any, end: Any, rank: Any) -> None:
+        bring_out(worlds, scratch, b, first, end)
+        if bring_bonds is not None:  # noqa: SIM102  # numba drops the branch by this alone
+            if rank == 0:
+                bring_bonds(worlds, scratch, b)
+
+    return leave
+
+
+@section
 def step_world_of(plan: StepPlan) -> Callable[..., int]:
     """Make `step_world(worlds, drive, drive_row, params, dt, count, b, rank, team, scratch)`.
 
@@ -299,9 +339,9 @@ def step_world_of(plan: StepPlan) -> Callable[..., int]:
     drive is empty.
     """
     agent, width, bad = plan.agent, plan.agent.width, np.uint64(plan.move.bad)
-    enter, bring_out, counted = _copy_in(plan), bring_out_of(agent), tuple(range(COUNTED_BY_KERNELS))
+    enter, bring_out, counted = _copy_in(plan), _copy_out(plan), tuple(range(COUNTED_BY_KERNELS))
     count_agents = _count(agent, plan.counts) if plan.counts else None
-    advance = _in_two_loops(plan) if plan.method is None else _by_method(plan)
+    advance = _advance(plan) if plan.bonds is None else _advance_and_keep(plan)
     first_bad, failing = (
         _first_bad(plan.move.bad, width),
         _first_failure(plan.move.bad, width) if plan.spreads else None,
@@ -335,7 +375,7 @@ def step_world_of(plan: StepPlan) -> Callable[..., int]:
             failed = np.int64(worst) if worst < well else none_failed
         found = verdict(context, worlds, before, failed, none_failed)
         if found < 0:
-            bring_out(worlds, scratch, b, first, end)
+            bring_out(worlds, scratch, b, first, end, rank)
             if rank == 0:
                 worlds.tick[b] += count
         return found

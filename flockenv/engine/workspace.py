@@ -41,6 +41,8 @@ class Workspace:
         agents, wanted = len(body.mass), scratch_of(parts, len(body.mass), team)
         made = _zeros({name: array for name, array in wanted.items() if name not in (*OWN, *TABLES)})
         arrays = made | {name: getattr(table, name.removeprefix("bond_")) for name in TABLES if name in wanted}
+        if "bond_kept" in arrays:
+            arrays["bond_kept"] = table.kept.copy()
         padded = len(arrays["mass"])
         for name, pad in (("mass", 1), ("radius", 0), ("max_speed", 1), ("max_force", 1)):
             arrays[name][:] = pad

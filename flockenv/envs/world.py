@@ -84,6 +84,8 @@ class World:
         if time_limit is not None and (not _is_integer(time_limit) or time_limit < 1):
             raise ValueError(f"time_limit is {time_limit}, must be an integer >= 1 (decisions), or None")
         scene = task.scene
+        if scene.kept_bonds:
+            raise ValueError(f"task {task.name}: its scene has springs that yield or break, which no task resets")
         bytes_ = worlds * bytes_per_world(task)
         if bytes_ > MEMORY_LIMIT:
             need = f"{bytes_ / 2**30:.3g} GiB, at most {MEMORY_LIMIT / 2**30:g} allowed"

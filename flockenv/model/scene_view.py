@@ -79,6 +79,10 @@ class SceneView(Protocol):
         """Pairs of agents along the edges of networks, (E, 2)."""
 
     @property
+    def edge_springs(self) -> NDArray[Any]:
+        """Where in State.bonds the springs of those edges lie, (E,)."""
+
+    @property
     def living(self) -> tuple[int, ...]:
         """Number of agents of each group that live at the start."""
 

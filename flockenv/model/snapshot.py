@@ -56,6 +56,7 @@ class Snapshot:
     periodic: True if the region is periodic. title: one line. D = 2 or 3; N and M may be 0.
     outlines: polygons (n, 2), m, of obstacles that are not round, as seen from above.
     bonds (E, 2): int, pairs of agents joined by a line, the shortest one; none by default.
+    broken (E,): True for bonds that are broken, which are not drawn; none by default.
     heading (N, D): directions that agents face; default: those of the velocities.
     looks: appearances; look (N,): the index of each agent's own, -1 = none. age (N,): s, of the living; default: the
     time. identity (N,): int, the agent in each row; default: the same agents at all times.
@@ -86,6 +87,7 @@ class Snapshot:
     age: Floats | None = None
     identity: NDArray[np.int64] | None = None
     inner: Floats | None = None
+    broken: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         pos = _array("Snapshot.pos", self.pos, (None, None), finite=False)
@@ -114,6 +116,7 @@ class Snapshot:
             age=None if self.age is None else _array("Snapshot.age", self.age, (agents,)),
             identity=None if self.identity is None else _integers("Snapshot.identity", self.identity, agents),
             inner=None if self.inner is None else _array("Snapshot.inner", self.inner, (agents,)),
+            broken=None if self.broken is None else _switches("Snapshot.broken", self.broken, len(self.bonds)),
         )
         if self.look is not None and not (self.look < len(self.looks)).all():
             raise ValueError(f"Snapshot.look: must be below {len(self.looks)}, the number of looks")
@@ -148,6 +151,11 @@ class Snapshot:
         if self.identity is None or other.identity is None:
             return np.ones(self.agents, np.bool_)
         return np.asarray(self.identity == other.identity)
+
+    @property
+    def whole_bonds(self) -> NDArray[np.int32]:
+        """The bonds that are not broken, (E', 2)."""
+        return self.bonds if self.broken is None else self.bonds[~self.broken]
 
     @property
     def has_bonds(self) -> NDArray[np.bool_]:

@@ -87,6 +87,9 @@ class State:
     identity: NDArray[np.int64]  # (B, N) agent in this slot, or the last one, -1 if none; (B, 0) without a population
     born: NDArray[np.float64]  # (B, N) s, time of birth; (B, 0) without a population
     dies: NDArray[np.float64]  # (B, N) s, when its lifetime ends, inf if never; (B, 0) without a population
+    bonds: (
+        Floats  # (B, S) a number for each spring of networks, see Effect.bond_keep_law; (B, 0) if no effect keeps any
+    )
     dt: float  # s, one physics step: time = tick dt
 
     @property
@@ -101,8 +104,9 @@ class State:
 
     @property
     def frame_and_inner(self) -> tuple[Floats, ...]:
-        """Heading frames and inner states as passed to kernels, without empty ones."""
-        return tuple(array for array in (self.frame, self.inner) if len(array))
+        """Heading frames, inner states and numbers of bonds as passed to kernels, without empty ones."""
+        kept = tuple(array for array in (self.frame, self.inner) if len(array))
+        return (*kept, self.bonds) if self.bonds.shape[1] else kept
 
     @property
     def heading(self) -> Floats:
@@ -154,7 +158,8 @@ class State:
 
         Equal states have equal digests, in every process.
         """
-        return digest_arrays({name: getattr(self, name) for name in _ARRAYS if name != "work"} | {"dt": self.dt})
+        names = [name for name in _ARRAYS if name != "work" and (name != "bonds" or self.bonds.shape[1])]
+        return digest_arrays({name: getattr(self, name) for name in names} | {"dt": self.dt})
 
     def copy(self) -> State:
         """Return a state that shares no memory with this one."""
@@ -234,13 +239,13 @@ def digest_arrays(arrays: Mapping[str, Any]) -> str:
 _PER_COORDINATE = ("x", "v", "obstacle_x", "frame", "inner")
 _ARRAYS = (
     "x", "v", "alive", "tick", "key", "obstacle_x", "obstacle_radius", "work", "frame", "inner", "identity", "born",
-    "dies",
+    "dies", "bonds",
 )  # fmt: skip
 
 
 def blank(
     worlds: int, agents: int, dimension: int, obstacles: int, dt: float, dtype: Any = np.float64, frame_rows: int = 0,
-    population: bool = False, inner_rows: int = 0,
+    population: bool = False, inner_rows: int = 0, bonds: int = 0,
 ) -> State:  # fmt: skip
     """Return a state of zeros with all agents alive, whose identities, if kept, are slot numbers."""
     slots = agents if population else 0
@@ -258,5 +263,6 @@ def blank(
         identity=np.tile(np.arange(slots), (worlds, 1)),
         born=np.zeros((worlds, slots)),
         dies=np.full((worlds, slots), np.inf),
+        bonds=zeros((worlds, bonds), dtype),
         dt=dt,
     )

@@ -3,7 +3,8 @@
 A frame is little-endian: u32 MAGIC; u32 H, the length of the header in bytes, a multiple of 4; the header, JSON padded
 with spaces; then the blocks of each lane in the order of the header's `blocks`, each padded with zeros to a multiple of
 4 bytes. A lane's header has n, dimension, time, low, high (the region of its positions, m), returns, stopped, apart and
-`scenery`: [key] or, if the page does not have that key yet, [key, obstacles and marks]. Blocks:
+`scenery`: [key] or, if the page does not have that key yet, [key, obstacles and marks]; `broken`: the indices of broken
+bonds, if springs break. Blocks:
 
 * pos: u16 (D, N), levels over [low, high] and half of its size on each side, see flockenv/render/quantise.py;
 * heading: u8 (N,), 0 to 253 anticlockwise from +x, 254 at rest, 255 not shown;
@@ -91,6 +92,8 @@ def _lane_frame(lane: Lane, want: Want, have: int) -> tuple[dict[str, Any], dict
         "n": n, "dimension": d, "time": drawn.time, "low": drawn.low, "high": drawn.high, "returns": lane.returns,
         "stopped": lane.stopped, "scenery": _scenery(lane, have),
     }  # fmt: skip
+    if drawn.broken is not None:
+        about["broken"] = np.flatnonzero(drawn.broken).tolist()
     if d == 3:
         arrays["tilt"] = _tilt(drawn)
     coloured = colour_of(lane, want.colour) if want.colour else None

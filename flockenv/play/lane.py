@@ -49,6 +49,7 @@ class Drawn:
     high: tuple[float, ...]
     shade: Floats | None  # (N,) from 0 to 1, set by appearances; None without one
     identity: NDArray[np.int64] | None  # (N,) the agent in each slot; None: the same agents at all times
+    broken: NDArray[np.bool_] | None = None  # (E,) edges of networks that are broken; None if none breaks
 
 
 class Scenery(NamedTuple):

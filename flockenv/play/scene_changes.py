@@ -51,8 +51,9 @@ def _shape(scene: Scene) -> tuple[Any, ...]:
 
 def adapted(old: Scene, new: Scene, state: State, seed: int) -> State:
     """Return a state of one world as one of a changed scene of the same agents: itself if all of it goes on."""
-    same = (old.groups, old.obstacles, old.space, old.parts.inner, old.parts.frame_rows, old.dt)
-    if same == (new.groups, new.obstacles, new.space, new.parts.inner, new.parts.frame_rows, new.dt):
+    kept = state.bonds.shape[1]
+    same = (old.groups, old.obstacles, old.space, old.parts.inner, old.parts.frame_rows, old.dt, kept)
+    if same == (new.groups, new.obstacles, new.space, new.parts.inner, new.parts.frame_rows, new.dt, new.kept_bonds):
         return state
     return rows_after(old, new, state, np.arange(new.agents), seed)
 
@@ -60,8 +61,8 @@ def adapted(old: Scene, new: Scene, state: State, seed: int) -> State:
 def rows_after(old: Scene, new: Scene, state: State, source: NDArray[np.int64], seed: int) -> State:
     """Return a state of a changed scene, whose agent k is agent source[k] of `state`; -1: a new one, as at the start.
 
-    Headings and inner numbers that the old scene does not keep are those at the start. If dt is another one, the time
-    is rounded to a multiple of it.
+    Headings, inner numbers and rest lengths that the old scene does not keep are those at the start. If dt is another
+    one, the time is rounded to a multiple of it.
     """
     out = new.start(seed)
     rows, at = source[source >= 0], source >= 0
@@ -76,6 +77,9 @@ def rows_after(old: Scene, new: Scene, state: State, source: NDArray[np.int64], 
     for k, number in enumerate(new.parts.inner):
         if number in old.parts.inner:
             out.inner[k][:, at] = state.inner[old.parts.inner.index(number)][:, rows]
+    networks = [[g.network for g in scene.groups if g.network is not None] for scene in (old, new)]
+    if out.bonds.shape == state.bonds.shape and networks[0] == networks[1]:
+        out.bonds[...] = state.bonds
     _let_live(new, out, ~at, float(state.time[0]))
     out.tick[:], out.work[:], out.key[:] = np.rint(state.time / new.dt), state.work, state.key
     return out

@@ -304,7 +304,7 @@ class SceneLane:
         return Drawn(
             self.time, state.x[:, 0], state.v[:, 0], state.frame[:d, 0] if kept else state.v[:, 0], state.alive[0],
             tuple(map(float, low)), tuple(map(float, high)), self._shade(),
-            state.identity[0] if scene.population else None,
+            state.identity[0] if scene.population else None, scene.view.broken(state),
         )  # fmt: skip
 
     def _shade(self) -> Floats | None:

@@ -275,7 +275,8 @@ def _dart_corners(spots: Floats, aim: Floats, reach: Floats) -> Floats:
 def _draw_bonds(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot) -> None:
     """Draw a line for each bond between living agents, lowest first; twice if it crosses an edge of a torus."""
     drawn = snapshot.alive & snapshot.visible
-    bonds = snapshot.bonds[drawn[snapshot.bonds].all(axis=1)]
+    bonds = snapshot.whole_bonds
+    bonds = bonds[drawn[bonds].all(axis=1)]
     if not len(bonds):
         return
     offset = snapshot.pos[bonds[:, 1]] - snapshot.pos[bonds[:, 0]]

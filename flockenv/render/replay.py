@@ -133,9 +133,18 @@ def _panel_data(panel: Panel) -> dict[str, Any]:
         "pos": _to_base64(np.stack([_quantise_positions(shot) for shot in shots])),
         "heading": _to_base64(np.stack([_quantise_headings(shot) for shot in shots])),
         "bonds": first.bonds.tolist(),
+        **_broken_data(shots),
         "scenery": _scenery_data(shots),
         **_look_data(shots),
     }
+
+
+def _broken_data(shots: Sequence[Snapshot]) -> dict[str, Any]:
+    """Return for each bond the first frame in which it is broken, -1 for never; {} if none ever is."""
+    if shots[-1].broken is None or not shots[-1].broken.any():
+        return {}
+    broken = np.stack([np.zeros(len(shots[0].bonds), bool) if s.broken is None else s.broken for s in shots])
+    return {"gone": np.where(broken.any(axis=0), broken.argmax(axis=0), -1).tolist()}
 
 
 def _look_data(shots: Sequence[Snapshot]) -> dict[str, Any]:

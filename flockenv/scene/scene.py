@@ -360,6 +360,11 @@ class Scene(Record):
         """The bonds of all effects, as the kernel reads them."""
         return pack(self.parts, self.agents, self.groups)
 
+    @property
+    def kept_bonds(self) -> int:
+        """Number of springs whose present rest lengths are in State.bonds, S: 0 if none yields or breaks."""
+        return len(self.table.kept) if self.parts.keeps_bonds else 0
+
     @functools.cached_property
     def edges(self) -> NDArray[np.int32]:
         """Pairs of agents along the edges of networks, (E, 2), for drawing."""
@@ -370,6 +375,12 @@ class Scene(Record):
                 found.append(first + np.stack([springs.i, springs.j], axis=1)[springs.role == EDGE])
             first += group.size
         return np.concatenate(found)
+
+    @functools.cached_property
+    def edge_springs(self) -> NDArray[np.int64]:
+        """The springs of `edges`, (E,): their numbers among the springs of all networks, as State.bonds counts them."""
+        roles = [g.network.springs(self.dimension).role for g in self.groups if g.network is not None]
+        return np.flatnonzero(np.concatenate([np.zeros(0, np.int8), *roles]) == EDGE)
 
     @functools.cached_property
     def coupling(self) -> Coupling | None:
@@ -404,7 +415,10 @@ class Scene(Record):
         state = states.blank(
             worlds, self.agents, self.dimension, len(self.circles), self.dt, self.dtype, self.parts.frame_rows,
             population=bool(self.population), inner_rows=len(self.parts.inner),
+            bonds=self.kept_bonds,
         )  # fmt: skip
+        if self.kept_bonds:
+            state.bonds[:] = self.table.kept
         state.key[:] = [key_of(seed + k, 0) for k in range(worlds)]
         for m, obstacle in enumerate(self.circles):
             state.obstacles.centre[:, m] = obstacle.centre
@@ -526,6 +540,10 @@ class Scene(Record):
         if len(state.inner) != len(self.parts.inner):
             keeps = ", ".join(self.parts.inner) or "nothing"
             raise ValueError(f"the state has {len(state.inner)} inner numbers, but effects of this scene keep {keeps}")
+        if state.bonds.shape[1] != self.kept_bonds:
+            raise ValueError(
+                f"the state has rest lengths of {state.bonds.shape[1]} springs, but this scene keeps {self.kept_bonds}"
+            )
         if state.identity.shape[1] != (self.agents if self.population else 0):
             has, keeps = ("identities" if k else "no identities" for k in (state.identity.size, self.population))
             raise ValueError(

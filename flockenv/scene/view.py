@@ -49,7 +49,16 @@ class View:
             looks=self.looks, look=self.look if self.looks else None,
             age=state.age[world] if self.scene.population else None,
             identity=state.identity[world] if self.scene.population else None, inner=self.inner_numbers(state, world),
+            broken=self.broken(state, world),
         )  # fmt: skip
+
+    def broken(self, state: State, world: int = 0) -> NDArray[np.bool_] | None:
+        """Return which edges of networks are broken, (E,) bool; None if no effect breaks springs."""
+        kept = state.bonds.shape[1]
+        if not kept:
+            return None
+        springs = self.scene.edge_springs
+        return np.asarray((springs < kept) & np.isinf(state.bonds[world, np.minimum(springs, kept - 1)]))
 
     def inner_numbers(self, state: State, world: int = 0) -> NDArray[np.float64] | None:
         """Return the inner number of every agent that pictures show, (N,), set by its appearance; None without one."""

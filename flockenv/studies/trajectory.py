@@ -55,6 +55,7 @@ class Trajectory:
     identity: NDArray[np.int64] | None = None  # (T, N) the agent in each slot, of scenes with a population
     born: NDArray[np.float64] | None = None  # (T, N) s, times of birth
     shown: NDArray[np.float64] | None = None  # (T, N) inner numbers, of scenes whose pictures show them
+    broken: NDArray[np.bool_] | None = None  # (T, E) edges of networks that are broken, of scenes whose springs break
 
     @property
     def rate(self) -> float:
@@ -88,6 +89,7 @@ class Trajectory:
                 identity=None if self.identity is None else self.identity[k],
                 age=None if self.born is None else time - self.born[k],
                 inner=None if self.shown is None else self.shown[k],
+                broken=None if self.broken is None else self.broken[k],
             )  # fmt: skip
 
     def summary(self) -> dict[str, Any]:
@@ -115,8 +117,8 @@ class Trajectory:
 
         Arrays: time (T,) s, pos (T, N, D) m, vel (T, N, D) m/s, alive (T, N), radius (N,) m, seed, and `scene`, the
         YAML text that `load_scene` reads; heading (T, N, D) where headings are kept; identity and born (T, N), s, where
-        there is a population; shown (T, N), if pictures show inner numbers. None needs pickle. Missing folders are
-        created.
+        there is a population; shown (T, N), if pictures show inner numbers; broken (T, E), if springs yield or break.
+        None needs pickle. Missing folders are created.
         """
         write = {".csv": write_csv, ".parquet": write_parquet}.get(path.suffix.lower())
         beside = path.with_suffix(".json")
@@ -131,7 +133,8 @@ class Trajectory:
         return beside
 
     def _write(self, path: Path) -> None:
-        kept = {"heading": self.heading, "identity": self.identity, "born": self.born, "shown": self.shown}
+        names = ("heading", "identity", "born", "shown", "broken")
+        kept = {name: getattr(self, name) for name in names}
         more: dict[str, Any] = {name: array for name, array in kept.items() if array is not None}
         with path.open("wb") as file:
             np.savez(
@@ -175,6 +178,7 @@ def record(
         scene, seed, step, film.pos[:n], film.vel[:n], film.alive[:n], first, last, wall, stopped,
         None if film.heading is None else film.heading[:n], None if film.identity is None else film.identity[:n],
         None if film.born is None else film.born[:n], None if film.shown is None else film.shown[:n],
+        None if film.broken is None else film.broken[:n],
     )  # fmt: skip
 
 
@@ -196,6 +200,7 @@ class _Film:
     identity: NDArray[np.int64] | None
     born: NDArray[np.float64] | None
     shown: NDArray[np.float64] | None
+    broken: NDArray[np.bool_] | None
     scene: Scene
     step: list[int]
 
@@ -206,7 +211,8 @@ class _Film:
         who, since = (np.empty(shape[:2], np.int64), np.empty(shape[:2])) if scene.population else (None, None)
         faced = heading if scene.parts.oriented else None
         shown = np.empty(shape[:2]) if any(look.by == "inner" for look in scene.view.looks) else None
-        return cls(pos, vel, np.empty(shape[:2], np.bool_), faced, who, since, shown, scene, [])
+        broken = np.zeros((instants, len(scene.edges)), np.bool_) if scene.parts.keeps_bonds else None
+        return cls(pos, vel, np.empty(shape[:2], np.bool_), faced, who, since, shown, broken, scene, [])
 
     def keep(self, state: State) -> None:
         """Add an instant, unless it has been kept already."""
@@ -219,6 +225,8 @@ class _Film:
                 self.identity[k], self.born[k] = state.identity[0], state.born[0]
             if self.shown is not None:
                 self.shown[k] = self.scene.view.inner_numbers(state)
+            if self.broken is not None:
+                self.broken[k] = self.scene.view.broken(state)
             self.step.append(step)
 
 
@@ -228,6 +236,7 @@ def _count_instants(scene: Scene, steps: int, every: int) -> int:
     instants = 1 + -(-steps // every)
     each = scene.agents * ((2 + scene.parts.oriented) * scene.dimension * np.dtype(scene.dtype).itemsize + 1)
     each += (16 * bool(scene.population) + 8 * any(look.by == "inner" for look in scene.view.looks)) * scene.agents
+    each += len(scene.edges) if scene.parts.keeps_bonds else 0
     needed = instants * (each + 40)  # the step is a Python number in a list
     if needed > MEMORY_LIMIT:
         rarer = every * math.ceil(needed / MEMORY_LIMIT) * scene.dt

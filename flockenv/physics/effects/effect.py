@@ -18,6 +18,10 @@ An effect has one or more of these forms, each a law (a compiled function) for o
   `Members`; the effect's `members` method gives the range;
 * `bond_law(p, me, others, numbers) -> force`: of one of the bonds listed by the effect's `bonds`, each between an
   agent and one or more partners (springs, hinges, finite elements);
+* `bond_keep_law(p, me, others, numbers) -> number`: a number that each bond keeps (the rest length of a spring that
+  yields): its value after a step, at the new positions. The last of `numbers`, here and in the bond law, is the present
+  value; `Bonds.kept` says where each bond keeps it in State.bonds. It is written by the row of the bond whose agent has
+  a lower index than its first partner;
 * `kick_law(p, me, seconds, gauss) -> velocity`: added once per step, however often the method evaluates forces, from
   one standard normal number per axis (fluctuations);
 * `aim_law(p, me) -> direction` of travel that is desired: the sum over all effects is `me.aim` in the other laws;
@@ -79,9 +83,9 @@ Vector = Annotated[tuple[Annotated[float, Field(strict=True)], ...], Field(min_l
 """A parameter that is a direction or a point: one number per dimension of the scene."""
 
 LAWS = (
-    "own_law", "group_law", "medium_law", "flow_law", "far_law", "bond_law", "kick_law", "aim_law", "begin_law",
-    "keep_law", "count_law", "pair_start", "pair_law", "apart_law", "finish_law", "obstacle_start", "obstacle_law",
-    "obstacle_finish", "obstacle_ray", "obstacle_from", "obstacle_reach",
+    "own_law", "group_law", "medium_law", "flow_law", "far_law", "bond_law", "bond_keep_law", "kick_law", "aim_law",
+    "begin_law", "keep_law", "count_law", "pair_start", "pair_law", "apart_law", "finish_law", "obstacle_start",
+    "obstacle_law", "obstacle_finish", "obstacle_ray", "obstacle_from", "obstacle_reach",
 )  # fmt: skip
 """Names of the class variables in which an effect may have a law."""
 
@@ -177,6 +181,7 @@ class Bonds(NamedTuple):
     agent: NDArray[np.int32]  # (R,)
     partner: NDArray[np.int32]  # (R, P)
     number: NDArray[np.float64]  # (R, C) arguments of the law: stiffness, rest length, ...
+    kept: NDArray[np.int64] | None = None  # (R,) where in State.bonds a number is kept, whose first value is the last
 
     @classmethod
     def empty(cls, partners: int, numbers: int) -> Bonds:
@@ -247,6 +252,7 @@ class Effect(Record):
     flow_law: ClassVar[Law | None] = None
     far_law: ClassVar[Law | None] = None
     bond_law: ClassVar[Law | None] = None
+    bond_keep_law: ClassVar[Law | None] = None
     kick_law: ClassVar[Law | None] = None
     aim_law: ClassVar[Law | None] = None
     begin_law: ClassVar[Law | None] = None

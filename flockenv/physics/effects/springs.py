@@ -1,11 +1,12 @@
 """Springs of a network: between two particles, along their distance, and about the angles of three.
 
-Rest lengths and angles are those of the network's undeformed shape. The forces of a spring on its two ends, and of a
-hinge on its three particles, sum to zero.
+Rest lengths and angles are those of the network's undeformed shape, until a spring yields. The forces of a spring on
+its two ends, and of a hinge on its three particles, sum to zero.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -19,6 +20,7 @@ from flockenv.model.networks import BEND, SHEAR
 from flockenv.physics.effects.effect import Bonds, Effect, Me, Stencils, all_masses, network_of
 
 if TYPE_CHECKING:
+    from flockenv.model.scene_view import SceneView
     from flockenv.model.state import State
 
 __all__ = ["AngularSprings", "Springs"]
@@ -64,6 +66,30 @@ def spring_derivative(local: Any, number: Any, s: int) -> None:
             local.by_position[a, d + b] = local.by_position[d + a, b] = slope
             local.by_velocity[a, b] = local.by_velocity[d + a, d + b] = -damp
             local.by_velocity[a, d + b] = local.by_velocity[d + a, b] = damp
+
+
+@law
+def lasting_spring(p: Any, me: Me, others: Any, number: Vec) -> Vec:
+    """Return the force of a spring with the last number as rest length; 0 if that is infinite: it is broken."""
+    o, rest = like(number[0], 0.0), number[3]
+    whole = rest < like(rest, np.inf)
+    force = spring(p, me, others, (number[0], number[1], rest if whole else o))
+    return select(whole, force, scale(force, o))
+
+
+@law
+def length_after_yielding(p: Any, me: Me, others: Any, number: Vec) -> float:
+    """Return the rest length after a step at which the spring is l long; inf if it breaks, and stays broken.
+
+    Beyond an elastic strain |l / L - 1| of p.yields the rest length L follows, so that this strain is not exceeded
+    (ideal plasticity). It breaks if l exceeds the first rest length by more than the share p.breaks.
+    """
+    one, never = like(number[0], 1.0), like(number[0], np.inf)
+    length, rest = norm(others[0].offset), number[3]
+    longer, shorter = one + p.yields, one - p.yields
+    follows = length / longer if length > rest * longer else (length / shorter if length < rest * shorter else rest)
+    whole = (rest < never) & ((length - number[2]) <= number[2] * p.breaks)
+    return follows if whole else never
 
 
 @law
@@ -125,7 +151,12 @@ def angular_spring(p: Any, me: Me, others: Any, number: Vec) -> Vec:
 
 
 class Springs(Effect):
-    """Damped springs along the edges of a group's network: F = k (l - L) + c dl/dt towards the other end."""
+    """Damped springs along the edges of a group's network: F = k (l - L) + c dl/dt towards the other end.
+
+    With `yield_strain` a spring that is strained further takes a new rest length for good; with `break_strain` one that
+    is longer breaks, and exerts no force any more. `State.bonds` holds the present rest lengths, inf of broken springs.
+    The work of yielding and the energy of a spring that breaks are dissipated.
+    """
 
     kind: Literal["springs"] = "springs"
     group: int = Field(default=0, ge=0, description="index of the group whose network it acts on")
@@ -135,18 +166,54 @@ class Springs(Effect):
     damping: float = Field(default=0.0, ge=0, description="kg/s, along each spring")
     ratio: float = Field(default=0.0, ge=0, description="more damping, as a fraction of each spring's critical one")
     rest: float = Field(default=1.0, ge=0, description="rest lengths over those of the network; 0 = rest length 0")
-    bond_law: ClassVar[Law | None] = spring
-    derivative: ClassVar[Law | None] = spring_derivative
+    yield_strain: float | None = Field(
+        default=None,
+        gt=0,
+        description="largest elastic strain (l - L) / L in size; beyond it L changes (default: none)",
+    )
+    break_strain: float | None = Field(
+        default=None, gt=0, description="strain over the first rest length at which a spring breaks (default: never)"
+    )
     strengths: ClassVar[tuple[str, ...]] = ("stiffness", "shear", "bend", "damping", "ratio")
     conserves_momentum: ClassVar[bool] = True
 
+    @property
+    def lasts(self) -> bool:
+        """True if springs yield or break, so that their rest lengths are part of the state."""
+        return self.yield_strain is not None or self.break_strain is not None
+
+    @property
+    def bond_law(self) -> Law:  # type: ignore[override]  # depends on what springs keep
+        """The law of a spring, with a constant or a present rest length."""
+        return lasting_spring if self.lasts else spring
+
+    @property
+    def bond_keep_law(self) -> Law | None:  # type: ignore[override]
+        """The law of the present rest length, if springs yield or break."""
+        return length_after_yielding if self.lasts else None
+
+    @property
+    def derivative(self) -> Law | None:  # type: ignore[override]
+        """The law of the derivatives; None if springs yield or break, as their rest lengths change."""
+        return None if self.lasts else spring_derivative
+
     def numbers(self, dimension: int) -> int:
-        """Return 3: stiffness, damping, rest length."""
-        return 3
+        """Return 3: stiffness, damping, rest length; and a fourth, the present one, if springs yield or break."""
+        return 4 if self.lasts else 3
 
     def parameters(self) -> dict[str, float | Vec]:
-        """Return no parameters: every spring has numbers of its own."""
-        return {}
+        """Return the strains at which springs yield and break, if any does: inf for never."""
+        strains = {"yields": self.yield_strain, "breaks": self.break_strain}
+        return {name: math.inf if strain is None else strain for name, strain in strains.items()} if self.lasts else {}
+
+    def check(self, scene: SceneView) -> None:
+        """Raise ValueError also if two effects would keep the rest lengths of one network."""
+        super().check(scene)
+        same = [e for e in scene.effects if isinstance(e, Springs) and e.lasts and e.group == self.group]
+        if self.lasts and len(same) > 1:
+            raise ValueError(
+                f"group = {self.group}: {len(same)} effects let its springs yield or break; at most one may"
+            )
 
     def bonds(self, groups: Sequence[Any], dimension: int) -> Bonds:
         """Return two rows for every spring, one for each end."""
@@ -159,9 +226,15 @@ class Springs(Effect):
         i, j = springs.i, springs.j
         reduced = 1 / (1 / mass[i] + 1 / mass[j] + 1e-300)  # kg; two pinned ends do not oscillate
         damping = self.damping + 2 * self.ratio * np.sqrt(stiffness * np.minimum(reduced, 1e300))
-        number = np.stack([stiffness, damping, self.rest * springs.rest], axis=1)
+        rest = self.rest * springs.rest
+        number = np.stack([stiffness, damping, rest, rest][: self.numbers(dimension)], axis=1)
         agent, partner = np.concatenate([i, j]) + first, np.concatenate([j, i]) + first
-        return Bonds(agent.astype(np.int32), partner[:, None].astype(np.int32), np.concatenate([number, number]))
+        kept = np.tile(np.arange(len(i)) + self.first_kept(groups, dimension), 2) if self.lasts else None
+        return Bonds(agent.astype(np.int32), partner[:, None].astype(np.int32), np.concatenate([number, number]), kept)
+
+    def first_kept(self, groups: Sequence[Any], dimension: int) -> int:
+        """Return where in State.bonds the rest lengths of its group begin: behind those of all networks before."""
+        return springs_before(groups[: self.group], dimension)
 
     def stencils(self, groups: Sequence[Any], dimension: int) -> Stencils:
         """Return the two ends of every spring."""
@@ -177,12 +250,16 @@ class Springs(Effect):
         return 2 * swing / mass, 2 * damp / mass
 
     def potential(self, groups: Sequence[Any], state: State, offset: Any) -> Floats:
-        """Return the sum of k (l - L)^2 / 2 over all springs, (B,) J."""
+        """Return the sum of k (l - L)^2 / 2 over all springs that are not broken, (B,) J."""
         bonds = self.bonds(groups, state.shape[2])
         half = len(bonds.agent) // 2
         i, j, number = bonds.agent[:half], bonds.partner[:half, 0], bonds.number[:half]
         length = np.linalg.norm(offset(state.pos[:, i], state.pos[:, j]), axis=-1)
-        return np.asarray((0.5 * number[:, 0] * (length - number[:, 2]) ** 2).sum(axis=1))
+        rest = number[:, 2]
+        if bonds.kept is not None and state.bonds.shape[1]:
+            rest = state.bonds[:, bonds.kept[:half]]
+            rest = np.where(np.isfinite(rest), rest, length)
+        return np.asarray((0.5 * number[:, 0] * (length - rest) ** 2).sum(axis=1))
 
 
 class AngularSprings(Effect):
@@ -235,6 +312,11 @@ class AngularSprings(Effect):
         off = angle - bonds.number[:third, 2]
         off -= 2 * np.pi * np.floor(off / (2 * np.pi) + 0.5)
         return np.asarray((0.5 * bonds.number[:third, 0] * off**2).sum(axis=1))
+
+
+def springs_before(groups: Sequence[Any], dimension: int) -> int:
+    """Return the number of springs of the networks of some groups."""
+    return sum(len(group.network.springs(dimension).i) for group in groups if group.network is not None)
 
 
 def _angles(a: Floats, b: Floats) -> Floats:

@@ -165,11 +165,16 @@ function drawLookTrails(pen, eye, panel, now, time) {
   pen.globalAlpha = 1;
 }
 
+/* The bonds that are broken in frame k, as a set of their indices; of a live panel those of its last frame. */
+function brokenBonds(panel, k) {
+  return new Set(panel.gone ? panel.gone.flatMap((from, n) => from >= 0 && from <= k ? [n] : []) : panel.broken || []);
+}
+
 /* A line for every bond with both ends there, the lowest first; across an edge of a periodic world from either side. */
-function drawBonds(pen, eye, panel, all) {
+function drawBonds(pen, eye, panel, all, broken) {
   const layers = panel.D < 3 ? 1 : 12, paths = new Map();
-  for (const [a, b] of panel.bonds) {
-    if (!all.there[a] || !all.there[b]) continue;
+  for (const [n, [a, b]] of panel.bonds.entries()) {
+    if (!all.there[a] || !all.there[b] || broken.has(n)) continue;
     const p = Array.from(all.pos.subarray(3 * a, 3 * a + 3)), q = Array.from(all.pos.subarray(3 * b, 3 * b + 3)), r = [...q];
     if (panel.periodic) for (let d = 0; d < panel.D; d++) r[d] -= panel.extent[d] * Math.round((q[d] - p[d]) / panel.extent[d]);
     const layer = Math.min(layers - 1, Math.floor(layers * eye.depth(...p.map((x, d) => (x + r[d]) / 2)))), key = layer * 256 + panel.kind[a];
@@ -259,8 +264,8 @@ function drawWorld(view, now) {
   }
   drawScenery(pen, eye, panel, now.k);
   if (!eye.flat) drawBorder(pen, eye, panel);
-  const all = bodies(panel, now);
-  if (hasFaces(panel)) drawFaces(pen, eye, panel, all); else drawBonds(pen, eye, panel, all);
+  const all = bodies(panel, now), broken = brokenBonds(panel, now.k);
+  if (hasFaces(panel)) drawFaces(pen, eye, panel, all, broken); else drawBonds(pen, eye, panel, all, broken);
   if (panel.N > CROWD) drawCrowd(pen, eye, panel, all, now.k); else if (!hasFaces(panel)) drawBodies(pen, eye, panel, all, now.k);
   if (view.over) view.over(pen, eye, now, all);
   pen.restore();

@@ -12,9 +12,16 @@ function normalOf(p, q, r) {
 
 function dotOf(a, b) { return a.reduce((sum, x, d) => sum + x * b[d], 0); }
 
+/* The faces with no broken edge: of the bonds in a set of indices. */
+function wholeFaces(panel, broken) {
+  if (!broken.size) return panel.faces;
+  const key = (a, b) => Math.min(a, b) * panel.N + Math.max(a, b), torn = new Set([...broken].map(n => key(...panel.bonds[n])));
+  return panel.faces.filter(([a, b, c]) => !torn.has(key(a, b)) && !torn.has(key(b, c)) && !torn.has(key(a, c)));
+}
+
 /* Triangles with their corners, m, depth, light from 0 to 1, and whether the reader sees their back. */
-function facesInOrder(panel, eye, all) {
-  return panel.faces.filter(face => face.every(i => all.there[i])).map(face => {
+function facesInOrder(panel, eye, all, broken) {
+  return wholeFaces(panel, broken).filter(face => face.every(i => all.there[i])).map(face => {
     const corners = face.map(i => placeOf(all, i)), middle = [0, 1, 2].map(d => (corners[0][d] + corners[1][d] + corners[2][d]) / 3);
     const normal = normalOf(...corners), seen = eye.rows.map(row => dotOf(row, normal)), back = panel.D === 3 && seen[2] < 0;
     const lit = panel.D < 3 ? 0.6 : clamp(dotOf(seen, LIGHT) * (back ? -1 : 1), 0, 1);
@@ -23,10 +30,10 @@ function facesInOrder(panel, eye, all) {
 }
 
 /* Front and back in two colours, paler with distance. */
-function drawFaces(pen, eye, panel, all) {
+function drawFaces(pen, eye, panel, all, broken) {
   const dark = state.dark ? "#0b0f14" : paint.ink;
   pen.lineWidth = 0.7 * eye.ratio; pen.lineJoin = "round";
-  for (const { corners, kind, depth, lit, back } of facesInOrder(panel, eye, all)) {
+  for (const { corners, kind, depth, lit, back } of facesInOrder(panel, eye, all, broken)) {
     const own = roleColour[panel.kinds[kind]], colour = back ? roleColour.learner : own === roleColour.agent ? paint.accent : own;
     const shaded = lit < 0.55 ? mix(colour, dark, 0.45 + lit) : mix("#ffffff", colour, 0.7 * (lit - 0.55));
     pen.fillStyle = pen.strokeStyle = mix(shaded, paint.paper, 0.8 + 0.2 * depth);

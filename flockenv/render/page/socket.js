@@ -202,7 +202,7 @@ function takeLane(panel, lane, { pos: level, heading, shade, identity }) {
     for (let i = 0, from = d * N; i < N; i++) pos[i * D + d] = first + level[from + i] * step;
   }
   const fresh = identity && before && before.identity ? identity.map((number, i) => number === before.identity[i] ? 0 : 1) : null;
-  panel.spare = null;
+  panel.spare = null; panel.broken = lane.broken;
   keepFrame(panel, { pos, heading, aim: spare ? spare.aim : new Float64Array(N), shade: shade || null, identity, fresh }, lane);
 }
 

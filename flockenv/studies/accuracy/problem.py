@@ -102,6 +102,7 @@ class Problem:
         found = [constraint.kind for constraint in scene.constraints]
         found += ["births and deaths"] if scene.population else []
         found += ["numbers inside agents"] if parts.inner else []
+        found += ["springs that yield or break"] if parts.keeps_bonds else []
         found += ["headings that turn"] if parts.frame_rows else []
         return ", ".join(found)
 
