@@ -26,10 +26,12 @@ Floats = NDArray[np.floating[Any]]
 WORK = (
     "evaluations", "neighbour_queries", "pairs", "obstacle_tests", "substeps", "rejected_steps", "newton_iterations",
     "linear_iterations", "impacts", "unsolved", "stopped", "births", "deaths", "births_refused",
+    "face_passes", "impact_zones", "largest_zone",
 )  # fmt: skip
 """Counters in State.work: force evaluations, neighbour queries, candidate pairs tested, agent-obstacle tests; of
 adaptive methods, steps accepted and rejected; of implicit methods, iterations; of collisions, impacts, cut or unsolved
-ones, and bodies that stopped within a step; of a population, births, deaths, and births without a free slot."""
+ones, and bodies that stopped within a step; of a population, births, deaths, and births without a free slot; of faces,
+passes over impacts, impact zones, and the number of particles of the largest."""
 
 COUNTED_BY_KERNELS = 8
 """Number of these counters, the first ones, that the kernel of a scene updates."""
@@ -149,8 +151,9 @@ class State:
         return b, n, d
 
     def count_of(self, what: str) -> int:
-        """Return a work counter, summed over the worlds; what: its name in WORK."""
-        return int(self.work[:, WORK.index(what)].sum())
+        """Return a work counter, summed over the worlds (of sizes the largest); what: its name in WORK."""
+        counts = self.work[:, WORK.index(what)]
+        return int(counts.max() if what == "largest_zone" else counts.sum())
 
     @property
     def digest(self) -> str:

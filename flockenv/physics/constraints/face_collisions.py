@@ -1,0 +1,148 @@
+"""Solid faces: cloth and surfaces of solids that nothing passes through, themselves and each other included."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from flockenv.core.warnings import UnsolvedContactsWarning
+from flockenv.geometry.box_tree import DEEPEST
+from flockenv.jit.section import entry
+from flockenv.model.scene_view import SceneView
+from flockenv.model.state import WORK, Floats, State
+from flockenv.physics.constraints.constraint import Constraint, Settler
+from flockenv.physics.constraints.face_contacts import Contacts, Motion, Pairs
+from flockenv.physics.constraints.face_mesh import check_intersections, faces_of, make_mesh, shortest_height
+from flockenv.physics.constraints.face_step import FaceRules, FaceScratch, settle_faces
+from flockenv.physics.constraints.face_zones import SUMS, Zones
+
+__all__ = ["FaceCollisions"]
+
+WHERE = tuple(
+    WORK.index(name) for name in ("face_passes", "impacts", "impact_zones", "largest_zone", "stopped", "unsolved")
+)
+"""Columns of State.work that are counted, in the order of face_step."""
+
+THICKEST = 1 / 3
+"""Largest thickness, in smallest heights of a face: faces next to each other must not touch at rest."""
+
+
+class FaceCollisions(Constraint):
+    """Faces are solid: the triangles of cloth and meshes, and the surfaces of tetrahedra; 3-D.
+
+    No point passes a face, and no edge another, of the same network or of two, along the straight lines from the start
+    to the end of a step. Agents without faces are balls of their radius. Round obstacles, capsules and walls of any
+    size are solid for faces if they stand still; with other obstacles only particles collide (`collisions`, listed
+    before).
+
+    What comes nearer than `thickness` is moved apart gently, and what approaches is stopped by an inelastic impulse
+    with Coulomb friction, in passes over all that touch (Bridson, Fedkiw and Anderson 2002). What `passes` do not
+    resolve moves as a rigid body in this step: an impact zone. A zone that holds a pinned particle or an obstacle
+    stands still. So nothing intersects after any step, and momentum is conserved. Work counters: face_passes, impacts,
+    impact_zones, largest_zone.
+    """
+
+    kind: Literal["face_collisions"] = "face_collisions"
+    thickness: float | None = Field(
+        default=None, gt=0, description="m, distance that is kept (default: a tenth of the smallest height of a face)"
+    )
+    friction: float = Field(default=0.0, ge=0, description="Coulomb's coefficient")
+    obstacles: bool = Field(default=True, description="True if faces collide with obstacles")
+    passes: int = Field(default=20, ge=1, le=10_000, description="most passes in a step; then impact zones")
+
+    def check(self, scene: SceneView) -> None:
+        """Raise ValueError if the scene has no faces, or faces that intersect, or cannot keep them apart."""
+        what = "kind = face_collisions"
+        if scene.dimension != 3:
+            raise ValueError(f"{what}: dimension = {scene.dimension}: there are faces in 3 dimensions only")
+        if sum(isinstance(other, FaceCollisions) for other in scene.constraints) > 1:
+            raise ValueError(f"{what}: there is another; a scene has at most one")
+        if scene.constraints[-1] is not self:
+            raise ValueError(f"{what}: {scene.constraints[-1].kind} after it would move faces; it must be the last")
+        if scene.space.periodic:
+            raise ValueError(f"{what}: faces do not wrap around a {scene.space.kind}; allowed: plane, box")
+        if scene.dtype != "float64":
+            raise ValueError(f"{what}: dtype = {scene.dtype} is too coarse for thin gaps; allowed: float64")
+        if not len(faces_of(scene)):
+            raise ValueError(f"{what}: no group has a network with faces: cloth, or a mesh of triangles or tetrahedra")
+        check_intersections(scene)
+        most = THICKEST * shortest_height(scene)
+        if self.thickness is not None and self.thickness > most:
+            raise ValueError(
+                f"thickness = {self.thickness:g} m: at most {most:.4g} m is allowed, a third of the smallest height of "
+                "a face"
+            )
+
+    def numbers(self, scene: SceneView) -> int:
+        """Return the scratch memory, in numbers per agent."""
+        faces = len(faces_of(scene))
+        return 40 + SUMS + -(-faces * 120 // int(scene.agents))
+
+    def settler(self, scene: SceneView) -> Settler:
+        """Return a function that corrects a step, with scratch memory of its own."""
+        return _FaceSettler(self, scene)
+
+
+class _FaceSettler:
+    """Correction of the steps of one scene, with scratch memory of its own."""
+
+    def __init__(self, record: FaceCollisions, scene: SceneView) -> None:
+        self.record, self.warned = record, False
+        self.mesh = make_mesh(scene, record.obstacles)
+        thickness = record.thickness or 0.1 * shortest_height(scene)
+        self.rules = FaceRules(float(thickness), float(record.friction), record.passes, float(scene.dt))
+        self.circles = len(scene.circles) if record.obstacles else 0
+        v = len(self.mesh.light)
+        self.motion = Motion(*(np.zeros((v, 3)) for _ in range(3)), *(np.zeros(v, np.int64) for _ in range(3)))
+        self.zones = Zones(
+            *(np.zeros(v, np.int64) for _ in range(4)), np.zeros((v, 3)), np.zeros((v, 3)), np.zeros((v, SUMS))
+        )
+        self.where, self.report = np.array(WHERE, np.int64), np.zeros(5, np.int64)
+        self._make_room(4 * len(self.mesh.edges) + 64)
+
+    def _make_room(self, places: int) -> None:
+        """Allocate room for `places` pairs and contacts."""
+        most = max(len(self.mesh.edge_tree.order), len(self.mesh.face_tree.order))
+        pairs = Pairs(
+            np.zeros((places, 4), np.int32), np.zeros(places, np.int32), np.zeros(DEEPEST, np.int64),
+            np.zeros(most, np.int32), np.zeros((2, 3)),
+        )  # fmt: skip
+        contacts = Contacts(
+            np.zeros((places, 4), np.int32), np.zeros((places, 4)), np.zeros((places, 3)), np.zeros(places),
+            np.zeros(places, np.int64),
+        )  # fmt: skip
+        self.scratch = FaceScratch(self.motion, pairs, contacts, self.zones, np.zeros(len(WHERE), np.int64))
+
+    def __call__(self, x0: Floats, v0: Floats, state: State, first: int, end: int) -> tuple[int, int]:
+        """Correct the steps of worlds [first, end); return the first (world, agent) that is not finite, or (-1, -1)."""
+        bad, stopped, unsolved, m = (-1, -1), 0, 0, self.circles
+        while first < end:
+            short = entry(settle_faces)(
+                x0, state.x, state.v, state.alive, np.ascontiguousarray(state.obstacle_x[:, :, :m]),
+                np.ascontiguousarray(state.obstacle_radius[:, :m]), self.mesh, self.scratch, self.rules, state.work,
+                self.where, first, end, self.report,
+            )  # fmt: skip
+            world, agent, needed, *lost = (int(k) for k in self.report)
+            stopped, unsolved = stopped + lost[0], unsolved + lost[1]
+            bad = (world, agent) if bad[0] < 0 else bad
+            if short < 0:
+                break
+            first = short
+            self._make_room(2 * needed)
+        if (stopped or unsolved) and not self.warned:
+            self.warned = True
+            warnings.warn(self._warning_text(stopped, unsolved), UnsolvedContactsWarning, stacklevel=2)
+        return bad
+
+    def _warning_text(self, stopped: int, unsolved: int) -> str:
+        text = f"constraints: face_collisions: in a step, after passes = {self.record.passes}"
+        if stopped:
+            text += f", {stopped} particles in impact zones that touch an obstacle, a pin or themselves stood still"
+        if unsolved:
+            text += (
+                f"{' and' if stopped else ','} {unsolved} pairs of faces and points, or edges, touched from its start"
+            )
+        return text + "; shorter steps or more passes help"

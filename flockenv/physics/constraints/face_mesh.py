@@ -1,0 +1,187 @@
+"""What face_collisions lets collide: the points, edges and faces of a scene, and checks of them at the start."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockenv.geometry.box_tree import BoxTree, build_tree, fit_parents, overlapping_pairs
+from flockenv.geometry.shapes import Capsule, Circle, Shape, Wall
+from flockenv.jit.decorators import python_of
+from flockenv.model.network import element_edges, pairs_of
+from flockenv.model.scene_view import SceneView
+
+__all__ = ["FaceMesh", "check_intersections", "edges_of", "faces_of", "make_mesh", "shortest_height"]
+
+Ints = NDArray[np.int32]
+Floats = NDArray[np.float64]
+
+
+class FaceMesh(NamedTuple):
+    """V vertices: N agents, then M round obstacles of the state, then ends of other obstacles; and what they span."""
+
+    faces: Any  # (F, 3)
+    edges: Any  # (E, 2)
+    points: Any  # (P,) vertices that are tested against faces
+    face_tree: BoxTree
+    edge_tree: BoxTree
+    light: Any  # (V,) 1/kg; 0 for obstacles, and particles that are held in place
+    radius: Any  # (V,) m; 0 for the vertices of faces
+    place: Any  # (V, 3) m, of the ends of obstacles; the others are 0
+
+
+def faces_of(scene: SceneView) -> Ints:
+    """Return the triangles of all networks and the surfaces of tetrahedra, (F, 3), by number of agent."""
+    found = [np.zeros((0, 3), np.int32)]
+    for group, first in zip(scene.groups, scene.starts, strict=False):
+        elements = np.zeros((0, 2), np.int32) if group.network is None else group.network.elements(3)
+        if elements.shape[1] == 4:
+            elements = _surface(elements)
+        if elements.shape[1] == 3:
+            found.append(elements + np.int32(first))
+    return np.concatenate(found)
+
+
+def _surface(elements: Ints) -> Ints:
+    """Return the triangles that belong to one tetrahedron only."""
+    sides = elements[:, [(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)]].reshape(-1, 3)
+    _, first, count = np.unique(np.sort(sides, axis=1), axis=0, return_index=True, return_counts=True)
+    return np.asarray(sides[np.sort(first[count == 1])])
+
+
+def edges_of(faces: Ints) -> Ints:
+    """Return the edges of triangles, each once, (E, 2)."""
+    size = int(faces.max(initial=0)) + 1
+    return pairs_of(element_edges(faces, size), size)
+
+
+def rest_of(scene: SceneView) -> Floats:
+    """Return the initial positions of the particles of networks, (N, 3) m; 0 for other agents."""
+    place = np.zeros((scene.agents, 3))
+    for group, first in zip(scene.groups, scene.starts, strict=False):
+        if group.network is not None:
+            place[first : first + group.size] = group.network.points(3)
+    return place
+
+
+def shortest_height(scene: SceneView) -> float:
+    """Return the smallest height of a face at the start, m."""
+    a, b, c = rest_of(scene)[faces_of(scene)].transpose(1, 0, 2)
+    longest = np.maximum.reduce([np.linalg.norm(p - q, axis=1) for p, q in ((a, b), (b, c), (c, a))])
+    return float((np.linalg.norm(np.cross(b - a, c - a), axis=1) / longest).min())
+
+
+def _segments(shapes: tuple[Shape, ...]) -> tuple[Floats, Ints, Floats]:
+    """Return ends, edges and radii of the ends of capsules and walls that stand still and are not hollow."""
+    ends: list[tuple[float, ...]] = []
+    pairs: list[tuple[int, int]] = []
+    radii: list[float] = []
+    for shape in shapes:
+        if not isinstance(shape, Capsule | Wall) or not _stands(shape):
+            continue
+        line = [shape.start, shape.end] if isinstance(shape, Capsule) else list(shape.vertices)
+        pairs += [(len(ends) + k, len(ends) + k + 1) for k in range(len(line) - 1)]
+        ends += line
+        radii += [shape.radius] * len(line)
+    return np.array(ends).reshape(-1, 3), np.array(pairs, np.int32).reshape(-1, 2), np.array(radii)
+
+
+def _stands(shape: Shape) -> bool:
+    """Return True if an obstacle does not move, and is solid inside."""
+    return shape.velocity is None and shape.sway is None and not getattr(shape, "hollow", False)
+
+
+def outside(shapes: tuple[Shape, ...]) -> list[str]:
+    """Return the kinds of obstacles that only particles collide with, each once."""
+    return sorted({s.kind for s in shapes if not (isinstance(s, Capsule | Wall | Circle) and _stands(s))})
+
+
+def make_mesh(scene: SceneView, obstacles: bool) -> FaceMesh:
+    """Return all that may collide in a scene."""
+    faces, place = faces_of(scene), rest_of(scene)
+    n, m = scene.agents, len(scene.circles) if obstacles else 0
+    ends, more, radii = _segments(tuple(scene.shapes) if obstacles else ())
+    edges = np.concatenate([edges_of(faces), more + np.int32(n + m)])
+    radius = np.concatenate([np.asarray(scene.body.radius, float), np.zeros(m), radii])
+    radius[np.unique(faces)] = 0.0
+    place = np.concatenate([place, np.zeros((m, 3)), ends])
+    light = np.zeros(len(place))
+    light[:n] = np.where(np.isfinite(scene.body.mass), 1 / np.asarray(scene.body.mass, float), 0.0)
+    corners = np.zeros(n, bool)
+    corners[_inner_corners(scene)] = True
+    points = np.concatenate([np.flatnonzero(~corners), np.arange(n, len(place))])
+    trees = build_tree(place[faces].mean(axis=1)), build_tree(place[edges].mean(axis=1))
+    return FaceMesh(faces, edges, points.astype(np.int32), *trees, light, radius, place)
+
+
+def _inner_corners(scene: SceneView) -> NDArray[np.int64]:
+    """Return the particles of networks that have faces, without being a corner of one: inside of tetrahedra."""
+    inner = []
+    used = np.unique(faces_of(scene))
+    for group, first in zip(scene.groups, scene.starts, strict=False):
+        own = np.arange(first, first + group.size)
+        if group.network is not None and np.isin(own, used).any():
+            inner.append(np.setdiff1d(own, used))
+    return np.concatenate([np.zeros(0, np.int64), *inner])
+
+
+def check_intersections(scene: SceneView) -> None:
+    """Raise ValueError if an edge passes through a face at the start, or a particle lies in one."""
+    faces, place = faces_of(scene), rest_of(scene)
+    edges = edges_of(faces)
+    tree = build_tree(place[faces].mean(axis=1))
+    corners = place[faces]
+    at = len(tree.order) - 1 + tree.leaf
+    tree.box[at] = np.concatenate([corners.min(axis=1), corners.max(axis=1)], axis=1)
+    python_of(fit_parents)(tree)
+    ends = place[edges]
+    query, face = overlapping_pairs(tree, np.concatenate([ends.min(axis=1), ends.max(axis=1)], axis=1))
+    own = (edges[query][:, :, None] == faces[face][:, None, :]).any(axis=(1, 2))
+    query, face = query[~own], face[~own]
+    for k in np.flatnonzero(_pierces(ends[query], corners[face])):
+        edge, corner = edges[query[k]].tolist(), faces[face[k]].tolist()
+        raise ValueError(
+            f"kind = face_collisions: at the start the edge between particles {edge[0]} and {edge[1]} passes through "
+            f"the face of {corner[0]}, {corner[1]} and {corner[2]}; meshes must not intersect"
+        )
+
+
+def _pierces(ends: Floats, corners: Floats) -> NDArray[np.bool_]:
+    """Return True for each pair of a segment, (K, 2, 3) m, and a triangle, (K, 3, 3) m, that have a point in common.
+
+    Those in one plane count if an end is in the triangle, or edges cross.
+    """
+    p, q, (a, b, c) = ends[:, 0], ends[:, 1], corners.transpose(1, 0, 2)
+    size = np.abs(corners - p[:, None]).max(axis=(1, 2)) if len(p) else np.zeros(0)
+    little = 1e-12 * size**3
+
+    def volume(*points: Floats) -> Floats:
+        first = points[0]
+        return np.asarray(np.linalg.det(np.stack([x - first for x in points[1:]], axis=1)))
+
+    over, under = volume(a, b, c, p), volume(a, b, c, q)
+    sides = np.stack([volume(p, q, a, b), volume(p, q, b, c), volume(p, q, c, a)])
+    inside = (sides >= -little).all(axis=0) | (sides <= little).all(axis=0)
+    flat = (np.abs(over) <= little) & (np.abs(under) <= little)
+    crossing = ((over >= -little) & (under <= little)) | ((over <= little) & (under >= -little))
+    return np.asarray(np.where(flat, _meet_in_plane(ends, corners), inside & crossing))
+
+
+def _meet_in_plane(ends: Floats, corners: Floats) -> NDArray[np.bool_]:
+    """Return True for each segment and triangle of one plane that have a point in common: along the plane's axes."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    dropped = np.abs(normal).argmax(axis=1)
+    kept = np.array([(1, 2), (0, 2), (0, 1)])[dropped][:, None]
+    s, t = np.take_along_axis(ends, kept, axis=2), np.take_along_axis(corners, kept, axis=2)
+    apart = np.zeros(len(s), bool)
+    for tips in (s, t):  # convex shapes are apart if an edge of one separates them
+        for k in range(tips.shape[1]):
+            edge = tips[:, (k + 1) % tips.shape[1]] - tips[:, k]
+            across = np.stack([-edge[:, 1], edge[:, 0]], axis=1)[:, :, None]
+            x, y = (s @ across)[:, :, 0], (t @ across)[:, :, 0]
+            apart |= (x.max(axis=1) < y.min(axis=1)) | (x.min(axis=1) > y.max(axis=1))
+    along = (s[:, 1] - s[:, 0])[:, :, None]
+    x, y = (s @ along)[:, :, 0], (t @ along)[:, :, 0]
+    return np.asarray(~(apart | (x.max(axis=1) < y.min(axis=1)) | (x.min(axis=1) > y.max(axis=1))))

@@ -1,0 +1,227 @@
+"""Solid faces: nothing passes through cloth, by an exact check of every step; momentum, energy, bits and refusals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.geometry.box_tree import build_tree, overlapping_pairs
+from flockenv.geometry.shapes import Capsule, Circle
+from flockenv.geometry.space import Torus
+from flockenv.model.networks import Cloth, Jelly, Mesh, Rope
+from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
+from flockenv.physics.constraints import Collisions, FaceCollisions, Rods
+from flockenv.physics.constraints.face_mesh import faces_of
+from flockenv.physics.effects import Drag, Gravity, Springs
+from flockenv.scene import Group, Scene
+from tests.exact_crossings import crossings
+
+EFFECTS = (
+    Gravity(acceleration=(0, 0, -9.81)), Springs(stiffness=200.0, shear=50.0, bend=1.0, ratio=0.1), Drag(rate=0.002),
+)  # fmt: skip
+SOLID = FaceCollisions(friction=0.3)
+
+
+def sheet(cells: int, side: float, at: tuple[float, float, float], **more: Any) -> Group:
+    """Return a square sheet, horizontal, of 1 kg/m^2."""
+    cloth = Cloth(cells=(cells, cells), origin=at, sides=(side, side), **more)
+    return Group(network=cloth, mass=side**2 / cloth.size, radius=0.02)
+
+
+def ball(radius: float, place: tuple[float, float, float], mass: float = 0.1) -> Group:
+    return Group(count=1, mass=mass, radius=radius, spawn=Spawn(low=place, high=place))
+
+
+def scene_of(*groups: Group, constraints: Any = (SOLID,), dt: float = 0.004, **more: Any) -> Scene:
+    """Return a scene in gravity; all of them share one kernel per set of obstacles."""
+    return Scene(dimension=3, groups=groups, effects=EFFECTS, constraints=constraints, dt=dt, **more)
+
+
+def run(scene: Scene, seconds: float, check: bool = True) -> State:
+    """Return the state after some time; check each step with the exact predicates."""
+    state, faces = scene.start(0), faces_of(scene)
+    for _ in range(round(seconds / scene.dt)):
+        before = np.array(state.pos[0])
+        state = scene.step(state, out=state)
+        if check:
+            assert crossings(before, np.array(state.pos[0]), faces) == []
+    return state
+
+
+def random_motion(scene: Scene, speed: float, worlds: int = 1) -> State:
+    """Return a state with independent random velocities of all particles."""
+    start = scene.start(0, worlds=worlds)
+    vel = np.random.default_rng(3).normal(0, speed, start.vel.shape)
+    return start.with_motion(start.pos, vel)
+
+
+def energy(state: State, scene: Scene) -> float:
+    """Return the kinetic energy of free particles, J."""
+    mass = np.where(np.isfinite(scene.body.mass), scene.body.mass, 0)
+    return float((0.5 * mass[:, None] * state.vel[0] ** 2).sum())
+
+
+# --- P9: what passed through ----------------------------------------------------------------------------------------
+
+
+WITH_PARTICLES = pytest.param((Collisions(agents=False), SOLID), id="with_collisions", marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("constraints", [(SOLID,), WITH_PARTICLES])
+def test_a_ball_dropped_on_a_pinned_sheet_stays_above_it(constraints: Any) -> None:
+    """Without solid faces it falls through the cell that it hits."""
+    groups = sheet(4, 2.0, (0, 0, 0), pinned=("border",)), ball(0.05, (0.9, 1.13, 0.2))
+    assert run(scene_of(*groups, constraints=constraints[:-1]), 1.0, check=False).pos[0, -1, 2] < -2
+    scene = scene_of(*groups, constraints=constraints)
+    state, lowest = scene.start(0), 1.0
+    for _ in range(250):
+        state = scene.step(state, out=state)
+        place = np.array(state.pos[0])
+        assert crossings(place, place, faces_of(scene), points=np.arange(scene.agents)) == []
+        lowest = min(lowest, float(place[-1, 2]))
+    assert -0.6 < lowest < 0.05
+
+
+def test_of_two_sheets_none_passes_the_other() -> None:
+    """The upper one is shifted by half a cell; without solid faces all its particles fall through."""
+    groups = sheet(8, 1.6, (0, 0, 0), pinned=("border",)), sheet(7, 1.4, (0.1, 0.1, 0.05))
+    without = run(scene_of(*groups, constraints=()), 0.6, check=False)
+    assert without.pos[0, 81:, 2].max() < -0.5
+    state = run(scene_of(*groups), 0.6)
+    assert state.pos[0, 81:, 2].min() > -0.5
+    assert state.count_of("unsolved") == state.count_of("stopped") == 0
+
+
+POLES = (
+    Circle(centre=(0.6, 0.6, -0.1), radius=0.04), Capsule(start=(0.6, -1, -0.1), end=(0.6, 2, -0.1), radius=0.04),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("pole", POLES)
+def test_a_pole_thinner_than_a_cell_holds_a_sheet(pole: Any) -> None:
+    """Not tested against obstacles, faces let the pole through the middle of a cell, and the sheet falls."""
+    group = sheet(5, 1.25, (0, 0, 0))
+    without = run(scene_of(group, constraints=(FaceCollisions(obstacles=False),), obstacles=(pole,)), 0.5, check=False)
+    assert without.pos[0, :, 2].max() < -0.5
+    state = run(scene_of(group, obstacles=(pole,)), 0.5)
+    assert state.pos[0, :, 2].max() > -0.3
+
+
+# --- what holds in every step ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("passes", [1, 20])
+def test_nothing_crosses_and_momentum_is_kept_by_impulses_and_zones(passes: int) -> None:
+    """Two sheets, 2 cm apart, whose particles move at random with 10 m/s: 4 cm a step. Energy only decreases."""
+    groups = sheet(5, 1.0, (0, 0, 0)), sheet(5, 1.0, (0.1, 0.1, 0.02))
+    effects: Any = (Gravity(acceleration=(0, 0, 0.0)), *EFFECTS[1:2], Drag(rate=0.0))
+    scene = scene_of(*groups, constraints=(FaceCollisions(friction=0.3, passes=passes),)).model_copy(
+        update={"effects": effects}
+    )
+    state, mass = random_motion(scene, 10.0), np.asarray(scene.body.mass)
+    total = mass @ state.vel[0]
+    for _ in range(20):
+        before = np.array(state.pos[0])
+        state = scene.step(state, out=state)
+        assert crossings(before, np.array(state.pos[0]), faces_of(scene)) == []
+        assert np.abs(mass @ state.vel[0] - total).max() < 1e-12 * mass.sum() * 10
+    assert state.count_of("impacts") > 0
+    assert (state.count_of("impact_zones") > 0) == (state.count_of("largest_zone") > 1)
+    if passes == 1:
+        assert state.count_of("impact_zones") > 0
+
+
+def test_impulses_never_add_kinetic_energy() -> None:
+    scene = scene_of(sheet(5, 1.0, (0, 0, 0)), sheet(5, 1.0, (0.1, 0.1, 0.02)), constraints=(SOLID,))
+    free = scene.model_copy(update={"constraints": ()})
+    state = random_motion(scene, 5.0)
+    for _ in range(20):
+        loose, state = free.step(state), scene.step(state)
+        assert energy(state, scene) <= energy(loose, scene) * (1 + 1e-12)
+
+
+def test_the_check_finds_what_passes_through() -> None:
+    """The check itself: it sees a crossing if faces are not solid."""
+    scene = scene_of(sheet(2, 1.0, (0, 0, 0)), sheet(2, 1.0, (0.1, 0.13, 0.02)), constraints=())
+    state = random_motion(scene, 10.0)
+    after = scene.step(state)
+    assert crossings(np.array(state.pos[0]), np.array(after.pos[0]), faces_of(scene))
+
+
+def test_a_row_of_a_batch_has_the_bits_of_that_world_alone() -> None:
+    scene = scene_of(sheet(3, 1.0, (0, 0, 0)), sheet(3, 1.0, (0.1, 0.1, 0.02)))
+    start = random_motion(scene, 5.0, worlds=3)
+    batch = scene.step(start, steps=20)
+    assert batch.count_of("impacts") > 0
+    for row in range(3):
+        alone = scene.step(start.worlds([row]), steps=20)
+        assert alone.digest == batch.worlds([row]).digest
+        assert (alone.work == batch.work[row]).all()
+
+
+def test_a_scene_without_contacts_keeps_its_bits() -> None:
+    scene = scene_of(sheet(3, 1.0, (0, 0, 0)))
+    with_faces, without = (
+        scene.step(scene.start(0), steps=10),
+        scene.model_copy(update={"constraints": ()}).step(scene.start(0), steps=10),
+    )
+    assert with_faces.digest == without.digest
+
+
+# --- meshes and refusals --------------------------------------------------------------------------------------------
+
+
+def test_the_surface_of_a_jelly_is_its_faces() -> None:
+    """Two triangles on each square of the sides of the box: 2 (2 + 3 + 2 + 6 + 3 + 6)... of 1 x 2 x 3 cells: 44."""
+    group = Group(network=Jelly(cells=(1, 2, 3), sides=(1, 2, 3)))
+    faces = faces_of(scene_of(group))
+    assert len(faces) == 2 * 2 * (1 * 2 + 2 * 3 + 1 * 3)
+
+
+def test_the_tree_finds_the_boxes_that_overlap() -> None:
+    rng = np.random.default_rng(0)
+    low = rng.uniform(0, 1, (37, 3))
+    boxes = np.concatenate([low, low + 0.2], axis=1)
+    tree = build_tree(low)
+    leaves = len(tree.order)
+    tree.box[leaves - 1 + tree.leaf] = boxes
+    for k in range(leaves - 2, -1, -1):
+        below = tree.box[2 * k + 1 : 2 * k + 3]
+        tree.box[k] = np.concatenate([below[:, :3].min(axis=0), below[:, 3:].max(axis=0)])
+    found = set(zip(*(a.tolist() for a in overlapping_pairs(tree, boxes)), strict=True))
+    meet = (boxes[:, None, :3] <= boxes[None, :, 3:]).all(axis=2)
+    assert found == set(map(tuple, np.argwhere(meet & meet.T).tolist()))
+
+
+CROSSED = Mesh(
+    vertices=((0, 0, 0), (1, 0, 0), (0, 1, 0), (0.2, 0.2, -0.5), (0.2, 0.2, 0.5), (2, 2, 0.5)),
+    triangles=((0, 1, 2), (3, 4, 5)),
+)
+FLAT = Mesh(
+    vertices=((0, 0, 0), (1, 0, 0), (0, 1, 0), (0.1, 0.1, 0), (2, 0.1, 0), (0.1, 2, 0)),
+    triangles=((0, 1, 2), (3, 4, 5)),
+)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"dimension": 2, "groups": (Group(network=Cloth(cells=(2, 2), sides=(1, 1))),)}, "in 3 dimensions only"),
+        ({"groups": (Group(network=Rope(links=3, length=1.0)),)}, "no group has a network with faces"),
+        ({"groups": (ball(0.1, (0, 0, 0)),)}, "no group has a network with faces"),
+        ({"space": Torus(size=(9, 9, 9))}, "do not wrap around a torus"),
+        ({"dtype": "float32"}, "float32"),
+        ({"constraints": (SOLID, FaceCollisions())}, "at most one"),
+        ({"constraints": (SOLID, Rods(group=0))}, "it must be the last"),
+        ({"constraints": (FaceCollisions(thickness=0.2),)}, "at most 0.11.* a third of the smallest height"),
+        ({"groups": (Group(network=CROSSED),)}, "edge between particles 1 and 2 passes through the face of 3, 4 and 5"),
+        ({"groups": (Group(network=FLAT),)}, "meshes must not intersect"),
+    ],
+)  # fmt: skip
+def test_what_makes_no_sense_is_refused(change: dict[str, Any], text: str) -> None:
+    given: dict[str, Any] = {"dimension": 3, "groups": (sheet(2, 1.0, (0, 0, 0)),), "constraints": (SOLID,)}
+    with pytest.raises(ValueError, match=text):
+        Scene(**(given | change))
