@@ -79,6 +79,7 @@ from flockenv.physics.effects import (
     AngularSprings,
     Antipode,
     Attraction,
+    Bending,
     Carried,
     Contact,
     Course,
@@ -96,6 +97,7 @@ from flockenv.physics.effects import (
     InverseSquare,
     Journey,
     Libido,
+    Membrane,
     Metabolism,
     ObstacleContact,
     Predation,
@@ -523,6 +525,13 @@ EFFECTS = (
         AngularSprings(stiffness=0.05, damping=0.005), beside=(Springs(stiffness=3),),  # a uniform stretch keeps angles
         obeys=frozenset({"translation", "rotation"}),  # in the plane an angle has a sign
     ),
+    EffectRow(
+        Membrane(stretch=0.1, shear=0.03, damping=0.01), obeys=frozenset({"translation", "rotation", "mirror"}),
+    ),
+    EffectRow(  # an angle at rest has a sign
+        Bending(stiffness=0.03, damping=0.01), beside=(Springs(stiffness=3),),
+        obeys=frozenset({"translation", "rotation"}), dimensions=(3,),
+    ),
     EffectRow(Elastic(young=3, beta=0.1), obeys=frozenset({"translation"})),  # linear: rotations cause strain
     EffectRow(
         Elastic(young=3, beta=0.1, strain="corotated"), obeys=frozenset({"translation", "rotation"}),
@@ -629,14 +638,17 @@ EDGE = 6.0
 SOLID = {"elastic", "altitude_springs"}
 """Effects that act on elements; with as many partners as dimensions, these fill space."""
 
+FLAT = {"membrane", "bending"}
+"""Effects that act on triangles, in space too."""
 
-def tied(group: Group, dimension: int, filled: bool = False) -> Group:
-    """Return the group as a network: a stretched chain through random positions, or of elements that fill space."""
+
+def tied(group: Group, dimension: int, filled: bool = False, triangles: bool = False) -> Group:
+    """Return the group as a network of random positions, stretched: a chain, elements that fill space, or triangles."""
     count = group.size
     vertices = np.random.default_rng(5).uniform(0.2 * EDGE, 0.8 * EDGE, (count, dimension))
     runs = [tuple(tuple(range(i, i + k)) for i in range(count + 1 - k)) for k in (2, 3, 4)]
-    solid = {"triangles": runs[1]} if dimension == 2 else {"tetrahedra": runs[2]}
-    joined: dict[str, Any] = solid if filled else {"bars": runs[0], "angles": runs[1]}
+    solid = {"triangles": runs[1]} if dimension == 2 or triangles else {"tetrahedra": runs[2]}
+    joined: dict[str, Any] = solid if filled or triangles else {"bars": runs[0], "angles": runs[1]}
     mesh = Mesh(vertices=tuple(map(tuple, vertices.tolist())), stretch=1.2, **joined)
     return Group(network=mesh, mass=group.mass, radius=group.radius)
 
@@ -650,7 +662,7 @@ def scene_of(*effects: Effect, dimension: int = 2, space: Space | None = None, *
     groups = fields.pop("groups", groups)
     if any(effect.bond_law for effect in effects):
         filled = any(effect.partner_count(dimension) == dimension for effect in effects if effect.kind in SOLID)
-        groups = (tied(groups[0], dimension, filled), *groups[1:])
+        groups = (tied(groups[0], dimension, filled, any(effect.kind in FLAT for effect in effects)), *groups[1:])
     asked = any("obstacles" in effect.calls_for() for effect in effects)
     centres = ((1.5, 2.0, 2.5)[:dimension], (4.5, 3.5, 3.0)[:dimension]) if asked else ()
     obstacles = tuple({"centre": centre, "radius": 0.6} for centre in centres)

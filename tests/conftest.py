@@ -43,7 +43,8 @@ RARE = {
 """Kernels of catalogue.Variant that only slow tests compile."""
 
 RARE_EFFECTS = {
-    "alignment_cone", "cohesion_cone", "altitude_springs", "angular_springs", "elastic", "elastic_corotated",
+    "alignment_cone", "cohesion_cone", "altitude_springs", "angular_springs", "membrane", "bending",
+    "elastic", "elastic_corotated",
     "springs_yielding", "quadratic_drag", "carried", "wind", "obstacle_contact", "gravity",
 }  # fmt: skip
 """Effects whose symmetries only slow tests try: each compiles a kernel, and has quick tests elsewhere."""

@@ -20,6 +20,7 @@ from flockenv.physics.effects.fluctuation import Fluctuation  # noqa: E402
 from flockenv.physics.effects.gravitation import Gravitation, InverseSquare  # noqa: E402
 from flockenv.physics.effects.gravity import Gravity  # noqa: E402
 from flockenv.physics.effects.liquid import SurfaceTension, Viscosity  # noqa: E402
+from flockenv.physics.effects.membrane import Bending, Membrane  # noqa: E402
 from flockenv.physics.effects.motivation import Fear, Grazing, Intention, Libido, Metabolism, Predation  # noqa: E402
 from flockenv.physics.effects.pressure import Pressure  # noqa: E402
 from flockenv.physics.effects.speed_limit import SpeedLimit  # noqa: E402
@@ -30,9 +31,10 @@ from flockenv.physics.effects.wall import WallRepulsion  # noqa: E402
 from flockenv.physics.effects.waypoints import Journey, Stage  # noqa: E402
 
 __all__ = [
-    "EFFECTS", "Aim", "AltitudeSprings", "AngularSprings", "Antipode", "Attraction", "Carried", "Contact", "Course",
-    "Door", "Drag", "Effect", "Elastic", "Far", "Fear", "Fluctuation", "Goal", "Gravitation", "Gravity", "Grazing",
-    "Intention", "InverseSquare", "Journey", "Libido", "Me", "Metabolism", "ObstacleContact", "Other", "Predation",
-    "Pressure", "QuadraticDrag", "Routes", "Sight", "Sink", "Source", "SpeedLimit", "Springs", "Stage",
-    "SurfaceTension", "Swing", "Tether", "Uniform", "Vicsek", "Viscosity", "Vortex", "WallRepulsion", "Way", "Wind",
+    "EFFECTS", "Aim", "AltitudeSprings", "AngularSprings", "Antipode", "Attraction", "Bending", "Carried", "Contact",
+    "Course", "Door", "Drag", "Effect", "Elastic", "Far", "Fear", "Fluctuation", "Goal", "Gravitation", "Gravity",
+    "Grazing", "Intention", "InverseSquare", "Journey", "Libido", "Me", "Membrane", "Metabolism", "ObstacleContact",
+    "Other", "Predation", "Pressure", "QuadraticDrag", "Routes", "Sight", "Sink", "Source", "SpeedLimit", "Springs",
+    "Stage", "SurfaceTension", "Swing", "Tether", "Uniform", "Vicsek", "Viscosity", "Vortex", "WallRepulsion", "Way",
+    "Wind",
 ]  # fmt: skip

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from flockenv.model.scene_view import SceneView
     from flockenv.model.state import State
 
-__all__ = ["AngularSprings", "Springs"]
+__all__ = ["AngularSprings", "Springs", "wrap_angle"]
 
 Floats = NDArray[np.float64]
 
@@ -123,7 +123,7 @@ def _angle_and_gradients(a: Vec, b: Vec) -> tuple[float, Vec, Vec]:
 
 
 @law
-def _wrap_angle(angle: float) -> float:
+def wrap_angle(angle: float) -> float:
     """Return the angle wrapped into [-pi, pi)."""
     turn = like(angle, 2 * np.pi)
     return angle - turn * np.floor(angle / turn + like(angle, 0.5))  # type: ignore[no-any-return]
@@ -144,7 +144,7 @@ def angular_spring(p: Any, me: Me, others: Any, number: Vec) -> Vec:
     vb = select(apex, sub(far.vel, me.vel), select(first, passes, moves))
     angle, grows_a, grows_b = _angle_and_gradients(a, b)
     rate = dot(grows_a, va) + dot(grows_b, vb)
-    moment = -number[0] * _wrap_angle(angle - number[2]) - number[1] * rate
+    moment = -number[0] * wrap_angle(angle - number[2]) - number[1] * rate
     on_a, on_b = scale(grows_a, moment), scale(grows_b, moment)
     both = scale(add(on_a, on_b), like(half, -1.0))
     return select(apex, both, select(first, on_a, on_b))

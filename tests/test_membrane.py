@@ -1,0 +1,207 @@
+"""Triangle cloth: forces against energies and closed forms, derivatives against differences, conserved quantities."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockenv.model.networks import Cloth, Mesh, Rope
+from flockenv.model.state import State
+from flockenv.model.triangles import dihedrals
+from flockenv.physics.effects import Bending, Membrane
+from flockenv.physics.integrators import LinearlyImplicitEuler, VelocityVerlet
+from flockenv.scene import Group, Scene
+from tests.catalogue import Array
+from tests.test_linearly_implicit import dense, differences
+
+MASS = 0.03
+
+
+def cloth(
+    stretch: float = 300.0, shear: float = 80.0, bend: float = 0.4, damping: float = 0.0, network: Any = None,
+    cells: tuple[int, int] = (3, 2), **fields: Any,
+) -> Scene:  # fmt: skip
+    """Return a free sheet of triangles of 0.9 m by 0.6 m in the plane z = 0; all share one kernel."""
+    sheet = network or Cloth(cells=cells, sides=(0.9, 0.6))
+    effects = (
+        Membrane(stretch=stretch, shear=shear, damping=damping, warp=(1.0, 0.0, 0.0)),
+        Bending(stiffness=bend, damping=damping),
+    )
+    return Scene(dimension=3, groups=(Group(network=sheet, mass=MASS),), effects=effects, **({"dt": 1e-4} | fields))
+
+
+def turn() -> Array:
+    """Return a rotation by no simple angle."""
+    found, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
+    return np.asarray(found * np.linalg.det(found))
+
+
+def crumpled(scene: Scene, far: float = 0.08) -> State:
+    state, rng = scene.start(0), np.random.default_rng(2)
+    return state.with_motion(state.pos + far * rng.normal(size=state.shape), rng.normal(size=state.shape))
+
+
+def force(scene: Scene, state: State) -> Array:
+    return np.asarray(scene.acceleration(state)[0] * MASS)
+
+
+def energy(scene: Scene, state: State) -> float:
+    found = [effect.potential(scene.groups, state, scene.space.displacement) for effect in scene.effects]
+    return float(sum(each[0] for each in found if each is not None))
+
+
+def affine(scene: Scene, by: tuple[float, float]) -> State:
+    """Return the sheet stretched along its sides and turned, with random velocities."""
+    state = scene.start(0)
+    pos = (state.pos * np.array([*by, 1.0])) @ turn().T
+    return state.with_motion(pos, np.random.default_rng(5).normal(size=state.shape))
+
+
+def test_forces_are_minus_the_gradient_of_the_energy() -> None:
+    scene = cloth()
+    state = crumpled(scene)
+    found, expected = force(scene, state), np.zeros(state.shape[1:])
+    for i in range(scene.agents):
+        for k in range(3):
+            off = np.zeros(state.shape)
+            off[0, i, k] = 1e-6
+            ends = [energy(scene, state.with_motion(state.pos + s * off, state.vel)) for s in (1, -1)]
+            expected[i, k] = -(ends[0] - ends[1]) / 2e-6
+    assert np.abs(expected).max() > 1.0
+    np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
+
+
+def test_derivatives_are_those_of_the_forces() -> None:
+    """Of a stretched flat sheet: there all that the matrix leaves out is 0. dF/dv is compared of a crumpled one too."""
+    scene = cloth()
+    state = affine(scene, (1.2, 1.1))
+    found, _ = dense(scene, state, (1.0, 0.0, 0.0))
+    expected = differences(scene, state, of_velocity=False)
+    np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
+    damped = cloth(damping=0.02)
+    for moving in (state, crumpled(damped)):
+        found, _ = dense(damped, moving, (0.0, 1.0, 0.0))
+        expected = differences(damped, moving, of_velocity=True)
+        np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
+
+
+def test_the_matrix_of_a_crumpled_sheet_has_no_negative_eigenvalue() -> None:
+    scene = cloth(damping=0.02)
+    for far in (0.05, 0.5):
+        found, _ = dense(scene, crumpled(scene, far), (-1.0, 0.0, 0.0))
+        np.testing.assert_allclose(found, found.T, atol=1e-12 * np.abs(found).max())
+        assert np.linalg.eigvalsh(found).min() > -1e-9 * np.abs(found).max()
+
+
+def test_momentum_and_angular_momentum_are_conserved() -> None:
+    scene = cloth(damping=0.02)
+    state = crumpled(scene)
+    found = force(scene, state)
+    size = np.abs(found).max()
+    np.testing.assert_allclose(found.sum(axis=0), 0, atol=1e-12 * size)
+    np.testing.assert_allclose(np.cross(state.pos[0], found).sum(axis=0), 0, atol=1e-12 * size)
+
+
+def test_a_rigid_motion_has_no_force() -> None:
+    scene = cloth(damping=0.02)
+    state = affine(scene, (1.0, 1.0))
+    spin = np.cross(np.array([0.3, -2.0, 1.1]), state.pos)
+    spinning = state.with_motion(state.pos + 3.0, spin + np.array([1.0, 2.0, -0.5]))
+    np.testing.assert_allclose(force(scene, spinning), 0, atol=1e-11)
+
+
+@pytest.mark.parametrize("cells", [(2, 3), (6, 4)])
+def test_a_stretched_sheet_pulls_with_stiffness_times_width_and_strain(cells: tuple[int, int]) -> None:
+    """On any mesh; and a sheared one with s gamma per length of a side."""
+    scene = cloth(cells=cells)
+    network, state = scene.groups[0].network, scene.start(0)
+    assert network is not None
+    right, top = network.particles("pinned", ("right",)), network.particles("pinned", ("top",))
+    pulled = state.with_motion(state.pos * (1.07, 1.0, 1.0), state.vel)
+    np.testing.assert_allclose(force(scene, pulled)[right].sum(axis=0), (-300.0 * 0.07 * 0.6, 0, 0), atol=1e-11)
+    gamma = 1e-4
+    pos = state.pos.copy()
+    pos[0, :, 0] += gamma * pos[0, :, 1]
+    sheared = force(scene, state.with_motion(pos, state.vel))[top].sum(axis=0)
+    assert sheared[0] == pytest.approx(-80.0 * gamma * 0.9, rel=1e-3)
+
+
+@pytest.mark.parametrize("cells", [(8, 2), (16, 3)])
+def test_a_sheet_on_a_cylinder_has_the_energy_of_its_curvature(cells: tuple[int, int]) -> None:
+    """D kappa^2 / 2 per area, of the part between the first and the last row of edges."""
+    scene = cloth(stretch=0.0, shear=0.0, cells=cells)
+    state, curvature = scene.start(0), 0.5
+    step = 0.9 / cells[0]
+    radius = step / (2 * np.sin(curvature * step / 2))
+    angle = curvature * state.pos[0, :, 0]
+    pos = np.stack([radius * np.sin(angle), state.pos[0, :, 1], radius * (1 - np.cos(angle))], axis=-1)
+    found = energy(scene, state.with_motion(pos[None], state.vel))
+    assert found == pytest.approx(0.5 * 0.4 * curvature**2 * (0.9 - step) * 0.6, rel=1e-9)
+
+
+TENT = Mesh(
+    vertices=((0, 0, 0), (1, 0, 0), (1, 1, 0.4), (0, 1, 0.4), (0.5, 0.5, 0.6)),
+    triangles=((0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)),
+)
+
+
+def test_a_mesh_that_is_not_flat_at_rest_stays_as_it_is() -> None:
+    scene = cloth(network=TENT)
+    np.testing.assert_allclose(force(scene, scene.start(0)), 0, atol=1e-12)
+    assert energy(scene, crumpled(scene)) > 0.1
+
+
+def test_an_edge_of_three_triangles_is_refused() -> None:
+    assert dihedrals(np.array([[0, 1, 2], [1, 0, 3]])).tolist() == [[0, 1, 2, 3]]
+    book = Mesh(
+        vertices=((0, 0, 0), (0, 1, 0), (1, 0, 0), (0.2, 0, 1), (-1, 0, 0)),
+        triangles=((0, 1, 2), (0, 1, 3), (1, 0, 4)),
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="the edge of particles 0 and 1 is shared by three triangles"):
+        cloth(network=book)
+
+
+@pytest.mark.parametrize(
+    ("effect", "network", "part"),
+    [
+        (
+            Membrane(stretch=1),
+            Rope(links=3, length=1.0, direction=(1, 0, 0)),
+            r"group = 0: its network has bars; triang",
+        ),
+        (
+            Bending(stiffness=1),
+            Rope(links=3, length=1.0, direction=(1, 0, 0)),
+            r"group = 0: its network has bars; triang",
+        ),
+        (Membrane(stretch=1, warp=(0, 0, 1)), Cloth(cells=(2, 2), sides=(1, 1)), r"warp = .*perpendicular to triangle"),
+        (Membrane(stretch=1, group=1), Cloth(cells=(2, 2), sides=(1, 1)), r"group = 1: there are 1 groups"),
+    ],
+)
+def test_networks_that_do_not_suit_are_refused(effect: Any, network: Any, part: str) -> None:
+    with pytest.raises(ValueError, match=rf"effects\[0\]\.{part}"):
+        Scene(dimension=3, groups=(Group(network=network),), effects=(effect,), dt=1e-4)
+
+
+@pytest.mark.parametrize("dimension", [2])
+def test_a_sheet_in_a_plane_does_not_bend(dimension: int) -> None:
+    with pytest.raises(ValueError, match="needs dimension = 3, it is 2"):
+        Scene(groups=(Group(network=Cloth(cells=(2, 2), sides=(1, 1))),), effects=(Bending(stiffness=1),), dt=1e-4)
+
+
+@pytest.mark.slow
+def test_explicit_and_implicit_steps_agree() -> None:
+    """The difference after 0.2 s halves with the step of the method of order 1."""
+    still = cloth(damping=0.005, bend=0.01, integrator=VelocityVerlet())
+    start = affine(still, (1.1, 1.05))
+    start = start.with_motion(start.pos, 0.1 * start.vel)
+    expected, gaps = still.run(start, 2000).pos, []
+    for n in (400, 800, 1600):
+        scene = cloth(damping=0.005, bend=0.01, integrator=LinearlyImplicitEuler(tolerance=1e-9), dt=0.2 / n)
+        gaps.append(float(np.abs(scene.run(start.with_dt(0.2 / n), n).pos - expected).max()))
+    assert gaps[0] < 0.1
+    for coarse, fine in pairwise(gaps):
+        assert 1.7 < coarse / fine < 2.4
