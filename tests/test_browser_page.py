@@ -238,6 +238,10 @@ def test_a_phone_shows_all_actions_and_the_whole_title(boids: Session, visit: Ca
         for name in ("worlds", "again", "save", "share", "open", "help"):
             box = here.page.locator(f"#{name}").bounding_box()
             assert box["x"] >= 0 and box["x"] + box["width"] <= 400, name
+        rows = {
+            here.page.locator(f"#{name}").bounding_box()["y"] for name in ("worlds", "again", "save", "share", "open")
+        }
+        assert len(rows) == 1
         assert here.value("document.querySelector('h1').scrollWidth <= document.querySelector('h1').clientWidth")
         assert here.value("document.documentElement.scrollWidth <= innerWidth")
 
