@@ -84,7 +84,7 @@ def altitude_spring(p: Any, me: Me, others: Any, number: Vec) -> Vec:
 class AltitudeSprings(Effect):
     """Damped springs across the tetrahedra of a group's network: from corners to faces, and between opposite edges.
 
-    With `springs` along the edges, a body keeps its volume, and a tetrahedron that is turned inside out recovers.
+    With `springs` along the edges, a tetrahedron that is turned inside out recovers.
     """
 
     kind: Literal["altitude_springs"] = "altitude_springs"
