@@ -72,6 +72,11 @@ class Study(Record):
         description="players by name: a known name, with @3 for the run of that seed and @* for those of all seeds; or"
         " a file, with {task} in place of the task's name and * for the files of several training seeds",
     )
+    seeds: int | None = Field(
+        default=None,
+        ge=1,
+        description="most runs of a player of several seeds; the one that ships comes first (all)",
+    )
     everywhere: dict[str, tuple[Value, ...]] = Field(
         default_factory=dict,
         description="values to play, by name, in every task that has it: noise, delay, dropped, range, seen, dt, "
@@ -232,7 +237,7 @@ def _partners(study: Study, task: Task, others: Any, share: Any) -> Partners:
         egos = min(max(round(share * task.learners), 1), task.learners - 1)
     if others == SAME:
         return Partners(None, egos)
-    found = dict(_specs(study.players, task.name))
+    found = dict(_specs(study, task.name))
     if others in found:
         return Partners(found[others][0], egos)  # of several seeds, the one that ships
     if isinstance(others, str) and known_name(others) and not other_tasks(others, task.name):
@@ -254,15 +259,15 @@ def contenders_of(study: Study, task: str) -> list[Contender]:
     Raises:
         ValueError: in one line, a file that is not there.
     """
-    return [Contender(name, members) for name, members in _specs(study.players, task)]
+    return [Contender(name, members) for name, members in _specs(study, task)]
 
 
-def _specs(players: Mapping[str, str], task: str) -> Iterator[tuple[str, tuple[Player, ...]]]:
+def _specs(study: Study, task: str) -> Iterator[tuple[str, tuple[Player, ...]]]:
     """Yield each player of a task: its name, and the player of each seed."""
-    for name, spec in players.items():
+    for name, spec in study.players.items():
         if known_name(spec):
             if not other_tasks(spec, task):
-                yield name, members_of(Player(spec, name), task)
+                yield name, members_of(Player(spec, name), task)[: study.seeds]
             continue
         pattern = spec.replace(TASK_PLACE, task)
         paths: Sequence[str] = sorted(glob.glob(pattern)) or [pattern]
@@ -270,4 +275,4 @@ def _specs(players: Mapping[str, str], task: str) -> Iterator[tuple[str, tuple[P
             if TASK_PLACE in spec:
                 continue  # a player of some tasks only
             raise ValueError(f"players.{name}: {printable(pattern)}: no such file, and no player of that name")
-        yield name, tuple(Player(path, name) for path in paths)
+        yield name, tuple(Player(path, name) for path in paths)[: study.seeds]

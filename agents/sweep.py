@@ -102,6 +102,8 @@ def plan_digest(
     Only results of one plan are on one page; other settings of another task do not matter to those of this one.
     """
     plan, fixed = study.model_dump(mode="json"), {name: dict(each) for name, each in changes.items()}
+    if study.seeds is None:
+        del plan["seeds"]  # plans from before there was this key
     if task is not None:
         plan["tasks"] = {task: plan["tasks"][task]}
         fixed = {name: each for name, each in fixed.items() if name == task}

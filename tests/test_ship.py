@@ -249,6 +249,8 @@ def test_all_seeds_are_the_members_of_one_player(tmp_path: Path, target: Path) -
     study = Study(title="small", players={"ppo": "ppo@*", "orca": "orca@*"}, tasks={"pursuit": {}})
     (contender,) = contenders_of(study, "pursuit")
     assert contender.name == "ppo" and len(contender.members) == 3
+    (few,) = contenders_of(study.model_copy(update={"seeds": 2}), "pursuit")
+    assert few.members == contender.members[:2], "the one that ships, and the next"
 
 
 def test_every_seed_that_is_there_can_be_loaded() -> None:
