@@ -113,7 +113,7 @@ def draw(path: Path, tasks: Mapping[str, Mapping[str, Sequence[Curve]]]) -> None
         axes.set_axis_off()
     figure.suptitle("Learning and search, over seeds", x=0.01, ha="left", fontsize=14, fontweight="bold", color=INK)
     note = (
-        "Mean return on tuning worlds. Line: median over seeds; band: lowest to highest. In brackets: number of seeds."
+        "Mean return on tuning worlds. Line: median over seeds; band: lowest to highest.\nIn brackets: number of seeds."
     )
     figure.supxlabel(note, x=0.01, ha="left", fontsize=9, color=FAINT)
     save_figure(path, figure, 110)
