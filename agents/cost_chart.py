@@ -20,6 +20,7 @@ METHODS = {
     "explicit_euler": ("explicit Euler", COLOURS[2]), "semi_implicit_euler": ("semi-implicit Euler", COLOURS[0]),
     "midpoint": ("midpoint", FAINT), "velocity_verlet": ("velocity Verlet", COLOURS[3]), "rk4": ("RK4", COLOURS[1]),
     "implicit_euler": ("implicit Euler", COLOURS[4]), "implicit_midpoint": ("implicit midpoint", INK),
+    "linearly_implicit_euler": ("linearly implicit Euler", COLOURS[5]),
 }  # fmt: skip
 """Name and colour of each method, the same in every panel."""
 

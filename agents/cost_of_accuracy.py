@@ -44,7 +44,7 @@ TASKS = ("flock", "bottleneck", "path_follow")
 """Tasks whose returns are drawn."""
 
 EXPLICIT = ("explicit_euler", "semi_implicit_euler", "midpoint", "velocity_verlet", "rk4")
-IMPLICIT = ("implicit_euler", "implicit_midpoint")
+IMPLICIT = ("implicit_euler", "implicit_midpoint", "linearly_implicit_euler")
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
