@@ -39,6 +39,9 @@ from flockenv.studies.play_jobs import Player, episodes_of_bytes, play_job
 __all__ = ["app", "plan_digest", "sweep"]
 
 SUMMARY = "summary.png"
+DIGITS = 4
+"""Significant digits of a stored return, far more than its interval resolves; the files have some ten thousand."""
+
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 Content = dict[str, Any]
@@ -182,7 +185,7 @@ def _played(entry: _Entry, store: Store, commit: str | None) -> Content:
         "microseconds": rounded(float(np.median([each.microseconds for each in episodes]))),
         "tuning_mean": rounded(float(np.mean([each.returns.mean() for each in tuning]))) if tuning else None,
         "success": ["".join("01"[int(mark)] for mark in each.success) for each in episodes],
-        "returns": [[rounded(value) for value in each.returns] for each in episodes],
+        "returns": [[rounded(value, DIGITS) for value in each.returns] for each in episodes],
     }
 
 

@@ -131,6 +131,7 @@ WRITING = {
     "measure": (["measure", "tiny.yaml", "--json"], "x.json"),
     "measure pictures": (["measure", "tiny.yaml", "--out"], "x"),
     "accuracy": (["accuracy", "--suite", "--out"], "x.png"),
+    "compare": (["compare", "--out"], "x"),
     "stress": (["stress", "--out"], "x.json"),
     "experiment": (["experiment", "none.yaml", "--out"], "x.png"),
     "gallery": (["gallery", "--out"], "x.md"),

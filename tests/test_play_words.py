@@ -153,14 +153,15 @@ PURE = set(
     "collision_cost content coulomb counts death_cost direction error escape factor fear friction goal_reward haste "
     "heading hungry inertia jitter lasting level lost_cost meal need opacity opening out_reward poisson price ratio "
     "ready rest restitution school share spread start start_hunger stretch success_reward touch_cost weight "
-    "winding".split()
+    "winding yield_strain break_strain".split()
 )
 """Fields whose values are ratios, factors, directions, counts, amounts between 0 and 1, or rewards for an event."""
 
 VARYING = {("appearance", "over"), ("vortex", "strength"), ("vortex", "maximum"), ("source", "strength"),
            ("source", "maximum"), ("sink", "strength"), ("sink", "maximum"), ("avoid_obstacles", "strength"),
-           ("wander", "strength"), ("forage", "strength")}  # fmt: skip
-"""Fields whose unit depends on another field, and slopes."""
+           ("wander", "strength"), ("forage", "strength"), ("pressure", "density"), ("viscosity", "density"),
+           ("surface_tension", "density")}  # fmt: skip
+"""Fields whose unit depends on another field or the dimension, and slopes."""
 
 SMALL_WORDS = set("a an the of to from by in on at with within for and or as is are per between into".split())
 

@@ -72,7 +72,7 @@ class Compiler:
 
 
 def _begin(work: Callable[[], object]) -> None:
-    """Do work as a child process; an error of its own is met again by the server."""
+    """Do work as a child process; the server then runs into the same error itself."""
     signals.begin_worker()
     try:
         work()
