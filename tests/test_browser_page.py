@@ -188,7 +188,7 @@ def test_a_change_by_another_page_leaves_the_gallery_open(boids: Session, visit:
 
 
 def test_every_control_has_a_name_of_its_own(boids: Session, visit: Callable[..., Visit]) -> None:
-    """A reader who hears the names alone knows which rule a value or a button belongs to."""
+    """The names alone tell to which rule a value or a button belongs."""
     with serving(boids) as server:
         here = opened(visit, server.url)
         here.page.keyboard.press("2")
