@@ -201,7 +201,7 @@ def _dot(a: Any, b: Any) -> float:
         two += a[k + np.uint64(1)] * b[k + np.uint64(1)]
         three += a[k + np.uint64(2)] * b[k + np.uint64(2)]
         four += a[k + np.uint64(3)] * b[k + np.uint64(3)]
-    for k in range(np.uint64(4 * whole), np.uint64(a.shape[0])):
+    for k in range(np.uint64(4 * whole), np.uint64(a.shape[0])):  # type: ignore[assignment]
         one += a[k] * b[k]
     return (one + two) + (three + four)
 

@@ -85,14 +85,14 @@ def closest_segments(a: Vec, b: Vec, c: Vec, d: Vec) -> Numbers:
     off = weighted(best, a, b, c, d)
     least = dot(off, off)
     t = _part(vr + uv, vv)
-    best, least = _better((0.0, 1.0, t - 1.0, -t), best, least, a, b, c, d)
+    best, least = _better((0.0, 1.0, t - 1.0, -t), best, least, a, b, c, d)  # type: ignore[assignment]
     s = _part(-ur, uu)
-    best, least = _better((1.0 - s, s, -1.0, 0.0), best, least, a, b, c, d)
+    best, least = _better((1.0 - s, s, -1.0, 0.0), best, least, a, b, c, d)  # type: ignore[assignment]
     s = _part(uv - ur, uu)
-    best, least = _better((1.0 - s, s, 0.0, -1.0), best, least, a, b, c, d)
+    best, least = _better((1.0 - s, s, 0.0, -1.0), best, least, a, b, c, d)  # type: ignore[assignment]
     below = uu * vv - uv * uv
     if below > PARALLEL * uu * vv:
         s, t = (uv * vr - ur * vv) / below, (uu * vr - uv * ur) / below
         if 0.0 < s < 1.0 and 0.0 < t < 1.0:
-            best, least = _better((1.0 - s, s, t - 1.0, -t), best, least, a, b, c, d)
+            best, least = _better((1.0 - s, s, t - 1.0, -t), best, least, a, b, c, d)  # type: ignore[assignment]
     return best

@@ -97,7 +97,7 @@ class _FaceSettler:
         self.circles = len(scene.circles) if record.obstacles else 0
         v = len(self.mesh.light)
         self.motion = Motion(*(np.zeros((v, 3)) for _ in range(3)), *(np.zeros(v, np.int64) for _ in range(3)))
-        self.zones = Zones(
+        self.zones = Zones(  # type: ignore[call-arg]
             *(np.zeros(v, np.int64) for _ in range(4)), np.zeros((v, 3)), np.zeros((v, 3)), np.zeros((v, SUMS))
         )
         self.where, self.report = np.array(WHERE, np.int64), np.zeros(5, np.int64)

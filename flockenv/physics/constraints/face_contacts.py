@@ -161,7 +161,7 @@ def find_pairs(mesh: Any, motion: Any, pairs: Any, reach: float, since: int) -> 
     _refit(mesh.face_tree, mesh.faces, motion, mesh.radius)
     _refit(mesh.edge_tree, mesh.edges, motion, mesh.radius)
     count = _pair_with_faces(mesh, motion, pairs, reach, since)
-    return _pair_edges(mesh, motion, pairs, reach, since, count)  # type: ignore[no-any-return]
+    return _pair_edges(mesh, motion, pairs, reach, since, count)
 
 
 @kernel
@@ -263,7 +263,7 @@ def apply_contact(
     """
     u, yields = (0.0, 0.0, 0.0), 0.0
     for j in range(4):
-        u = add(u, scale(vector_at(u, array, contacts.who[k, j]), contacts.weight[k, j]))
+        u = add(u, scale(vector_at(u, array, contacts.who[k, j]), contacts.weight[k, j]))  # type: ignore[assignment]
     n = vector_at(u, contacts.normal, k)
     along = dot(n, u)
     slip = sub(u, scale(n, along))
@@ -283,4 +283,4 @@ def apply_contact(
             motion.mark[i], motion.touched[i] = clock, 1
             for c in range(3):
                 array[i, c] += by * change[c]
-    return need  # type: ignore[no-any-return]
+    return need

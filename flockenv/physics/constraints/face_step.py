@@ -146,7 +146,7 @@ def _resolve(mesh: Any, scratch: Any, rules: Any) -> int:
     for p in range(rules.passes):
         pairs = find_pairs(mesh, s.motion, s.pairs, reach, since)
         if pairs > room:
-            return pairs  # type: ignore[no-any-return]
+            return pairs
         if p == 0:
             count = _add_near(mesh, s, pairs, rules.thickness)
             if count < 0:
@@ -155,7 +155,7 @@ def _resolve(mesh: Any, scratch: Any, rules: Any) -> int:
                 _sweep(mesh, s, count, rules, False, 0)
                 pairs = find_pairs(mesh, s.motion, s.pairs, reach, 0)
                 if pairs > room:
-                    return pairs  # type: ignore[no-any-return]
+                    return pairs
         found = _impacts(mesh, s, pairs, count, rules, p + 1)
         s.count[PASSES] += 1
         if found < 0:
@@ -178,7 +178,7 @@ def _make_zones(mesh: Any, scratch: Any, rules: Any, since: int) -> int:
     for _ in range(2 * mesh.light.shape[0] + 2):
         pairs = find_pairs(mesh, s.motion, s.pairs, rules.thickness, clock)
         if pairs > room:
-            return pairs  # type: ignore[no-any-return]
+            return pairs
         hits, changed = 0, 0
         for k in range(pairs):
             who = s.pairs.who[k]

@@ -158,9 +158,9 @@ def move_zones(zones: Any, motion: Any, light: Any, ends: bool, clock: int) -> N
             s = zones.sums[r]
             by, off = (s[16], s[17], s[18]), _offset(zones, r, motion, i)
             new = (s[4] / s[0], s[5] / s[0], s[6] / s[0])
-            new = add(new, cross(by, off) if ends else _turned(off, by))
+            new = add(new, cross(by, off) if ends else _turned(off, by))  # type: ignore[assignment]
         elif ends and light[i] <= 0.0:
-            new = vector_at(new, field, i)
+            new = vector_at(new, field, i)  # type: ignore[assignment]
         old = vector_at(new, out, i)
         if norm(sub(new, old)) > 0.0:
             write_vector(out, i, new)

@@ -26,7 +26,7 @@ FEWEST_WITHIN = 12
 def nearness(p: Any, square: float) -> float:
     """Return 1 - r / R, at least 0."""
     o, e = like(square, 0.0), like(square, 1.0)
-    return max(e - np.sqrt(square) / p.radius, o)
+    return max(e - np.sqrt(square) / p.radius, o)  # type: ignore[no-any-return]
 
 
 @law

@@ -257,7 +257,7 @@ class Springs(Effect):
         length = np.linalg.norm(offset(state.pos[:, i], state.pos[:, j]), axis=-1)
         rest = number[:, 2]
         if bonds.kept is not None and state.bonds.shape[1]:
-            rest = state.bonds[:, bonds.kept[:half]]
+            rest = state.bonds[:, bonds.kept[:half]]  # type: ignore[assignment]
             rest = np.where(np.isfinite(rest), rest, length)
         return np.asarray((0.5 * number[:, 0] * (length - rest) ** 2).sum(axis=1))
 
