@@ -102,7 +102,7 @@ def test_the_sdist_contains_all_files_of_the_repository(sdist: Path) -> None:
         path.relative_to(ROOT).as_posix()
         for name in FOLDERS
         for path in (ROOT / name).rglob("*")
-        if path.is_file() and "__pycache__" not in path.parts
+        if path.is_file() and {"__pycache__", "generated", "_build"}.isdisjoint(path.relative_to(ROOT).parts)
     }
     assert {name for name in files - made if ".egg-info/" not in name} == kept | set(FILES)
     if (ROOT / ".git").exists():

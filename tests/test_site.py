@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from docs._ext.links import COPIED
 from tests.page_scripts import ROOT
 
 PAGES = sorted(
@@ -48,15 +49,31 @@ def test_pages_with_links_were_found() -> None:
     assert {"seeds", "where-to-go-next"} <= anchors_of(ROOT / "docs/players.md") | anchors_of(ROOT / "README.md")
 
 
+def test_every_page_is_on_the_site() -> None:
+    """Named in a toctree of docs/index.md; pages of the root that others link to are copied by docs/_ext/links.py."""
+    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^(?:[^<\n]*<)?([\w/]+)>?$", index, re.MULTILINE))
+    pages = {str(path.relative_to(ROOT / "docs").with_suffix("")) for path in PAGES if path.parent != ROOT}
+    assert pages - listed == {"index"}
+    assert {f"generated/{name}" for name in COPIED.values()} <= listed
+    for path in PAGES:
+        linked = {(path.parent / name.partition("#")[0]).resolve() for name, _ in TARGET.findall(text_of(path))}
+        roots = {
+            each.name for each in linked if each.suffix == ".md" and each.parent == ROOT and path.name != "README.md"
+        }
+        assert roots <= {*COPIED}, f"{path.name}: links to a page that the site does not have"
+
+
 @pytest.mark.slow
-def test_the_site_builds_without_warnings_and_refers_to_no_other_host(tmp_path: Path) -> None:
-    """Without the films of tasks, which the stage `site` of .ci/run draws."""
+def test_the_site_builds_without_warnings_and_refers_to_no_other_host() -> None:
+    """In the folder of the stage `site` of .ci/run, so that only what is new is built; without the films of tasks."""
     if any(importlib.util.find_spec(name) is None for name in ("sphinx", "myst_parser", "furo")):
         pytest.skip("needs sphinx, myst-parser and furo: pip install 'flockenv[docs]'")
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-D", "films=0", "-b", "html", "docs"]
-    done = subprocess.run([*command, str(tmp_path)], cwd=ROOT, capture_output=True, text=True, check=False)
+    site = ROOT / "docs" / "_build" / "html"
+    done = subprocess.run([*command, str(site)], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / "searchindex.js").stat().st_size > 100_000
+    assert (site / "searchindex.js").stat().st_size > 100_000
     loaded = re.compile(r"<(?:script|link|img|iframe)\b[^>]*?(?:src|href)=\"(?:https?:)?//[^\"]*\"")
-    for path in tmp_path.rglob("*.html"):
+    for path in site.rglob("*.html"):
         assert loaded.findall(path.read_text(encoding="utf-8")) == [], path.name

@@ -18,7 +18,10 @@ __all__ = ["LINK", "copied_pages", "rewrite_source"]
 LINK = re.compile(r"(?<=\]\()(?![a-z]+:|#)([^)\s#]+)(?=[#)\s])")
 """The path in a Markdown link or picture, if it is no address and no anchor alone."""
 
-COPIED = {"CONTRIBUTING.md": "contributing", "CHANGELOG.md": "changelog"}
+COPIED = {
+    "CONTRIBUTING.md": "contributing", "CODE_OF_CONDUCT.md": "code_of_conduct", "SECURITY.md": "security",
+    "CHANGELOG.md": "changelog",
+}  # fmt: skip
 """Pages of the root that the site shows, and their names in docs/generated/."""
 
 FOLDERS = {"configs/scenes": "scenes", "configs/crowds": "crowd_scenes"}

@@ -52,7 +52,7 @@ def _begin(app: Sphinx) -> None:
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Register the extension; `-D films=0` leaves out the films of tasks, which take a minute or two to draw."""
-    app.add_config_value("films", True, "env")
+    app.add_config_value("films", True, "")
     app.connect("builder-inited", _begin)
     app.connect("source-read", links.rewrite_source)
     app.connect("autodoc-process-docstring", docstrings.process, priority=400)  # before napoleon reads Args:

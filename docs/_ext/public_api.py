@@ -71,7 +71,7 @@ def _parameters(parameters: list[inspect.Parameter]) -> Iterator[str]:
         elif each.kind is each.KEYWORD_ONLY and not starred:
             starred = True
             yield "*"
-        mark = {each.VAR_POSITIONAL: "*", each.VAR_KEYWORD: "**"}.get(each.kind, "")
+        mark = "*" if each.kind is each.VAR_POSITIONAL else "**" if each.kind is each.VAR_KEYWORD else ""
         yield mark + each.name + ("" if each.default is each.empty else f"={_short(each.default)}")
 
 
