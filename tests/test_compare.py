@@ -117,7 +117,7 @@ def test_results_are_strict_json_with_one_line_per_list() -> None:
     results = artificial_results({"a": [1.0, -2.5e-7, 3.0], "b": [0.0, 1e9, -1.0]})
     text = report.json_text(results)
     assert json.loads(text, parse_constant=pytest.fail) == json.loads(json.dumps(results))
-    assert " [1.0, -2.5e-07, 3.0]\n" in text
+    assert " [1.0,-2.5e-07,3.0]\n" in text
     assert "NaN" not in text
 
 

@@ -39,6 +39,11 @@ def test_the_band_of_one_seed_is_its_curve() -> None:
     assert list(places) == CURVES[0]["steps"]
 
 
+def _has(colours: Any, wanted: Any) -> bool:
+    """Return True if a picture has a colour, as nearly as the palette of its file allows."""
+    return bool((np.abs(colours.astype(int) - wanted) <= 16).all(axis=1).any())
+
+
 def test_the_curves_of_all_seeds_are_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "weights" / "seeds").mkdir(parents=True)
     (tmp_path / "tuned").mkdir()
@@ -65,7 +70,7 @@ def test_the_curves_of_all_seeds_are_drawn(tmp_path: Path, monkeypatch: pytest.M
     with Image.open("curves.png") as picture:
         colours = np.asarray(picture.convert("RGB")).reshape(-1, 3)
     for colour in ((0xD5, 0x5E, 0x00), (0x00, 0x72, 0xB2)):
-        assert (colours == colour).all(axis=1).any(), "a line for each player"
+        assert _has(colours, colour), "a line for each player"
     assert CliRunner().invoke(app, ["--out", "curves.jpg"]).exit_code == 2
 
 
@@ -89,7 +94,7 @@ def test_other_learners_are_drawn_beside_ppo_and_rules(tmp_path: Path, monkeypat
         colours = np.asarray(picture.convert("RGB")).reshape(-1, 3)
     for colour in LEARNER_COLOUR["sac"], LEARNER_COLOUR["bc"]:
         wanted = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
-        assert (np.abs(colours.astype(int) - wanted) <= 2).all(axis=1).any(), colour  # the file has a palette
+        assert _has(colours, wanted), colour
     none = CliRunner().invoke(app, ["--learners", "nowhere", "--out", "learners.png"])
     assert none.exit_code == 2 and "--learners 'nowhere': no card FOLDER/ALGO/TASK-seed-N.json" in none.output
 

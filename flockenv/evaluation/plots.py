@@ -24,7 +24,7 @@ __all__ = ["COLOURS", "FAINT", "GRID", "INK", "Column", "Row", "draw_chart", "sa
 INK, FAINT, GRID = "#22272e", "#6b7480", "#e4e7eb"
 COLOURS = ("#D55E00", "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9")
 """Okabe and Ito's palette, distinct for any colour vision."""
-COLOURS_OF_FILE = 256
+COLOURS_OF_FILE = 64
 """Most colours of a PNG file with a palette."""
 ABREAST = 4
 """Most tasks side by side; further ones go below."""
@@ -59,7 +59,7 @@ def write_chart(path: str | Path, columns: Sequence[Column], title: str, note: s
 def save_figure(path: str | Path, figure: Figure, dpi: int = 100) -> None:
     """Write a figure as a PNG file, whole or not at all; the same numbers give the same bytes.
 
-    It has a palette of 256 colours, more than most charts have: such a file is much smaller.
+    It has a palette of 64 colours, chosen by largest coverage, which keeps the colour of every line.
     """
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
@@ -67,7 +67,11 @@ def save_figure(path: str | Path, figure: Figure, dpi: int = 100) -> None:
     drawn, about = io.BytesIO(), PngInfo()
     figure.savefig(drawn, format="png", dpi=dpi)
     about.add_text("Software", "flockenv")
-    picture = Image.open(drawn).convert("RGB").quantize(COLOURS_OF_FILE, dither=Image.Dither.NONE)
+    picture = (
+        Image.open(drawn)
+        .convert("RGB")
+        .quantize(COLOURS_OF_FILE, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    )
     with replace_file(path) as file:
         picture.save(file, "PNG", optimize=True, pnginfo=about, dpi=(dpi, dpi))
 

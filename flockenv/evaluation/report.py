@@ -234,9 +234,9 @@ def chart_column(task: str, results: Results) -> Column:
 
 
 def json_text(results: Mapping[str, Any]) -> str:
-    """Return the results as strict JSON, lists of numbers on one line each."""
-    text = json.dumps(results, indent=2, allow_nan=False, ensure_ascii=False)
-    return re.sub(r"\[\s+([-+.\deE,\s]*?)\s+\]", lambda m: f"[{' '.join(m[1].split())}]", text) + "\n"
+    """Return the results as strict JSON with little white space, lists of numbers on one line each."""
+    text = json.dumps(results, indent=1, allow_nan=False, ensure_ascii=False)
+    return re.sub(r"\[\s+([-+.\deE,\s]*?)\s+\]", lambda m: f"[{''.join(m[1].split())}]", text) + "\n"
 
 
 def conditions(results: Results) -> str:
