@@ -538,7 +538,7 @@ EFFECTS = (
         dimensions=(2,),  # in 3-D: test_corotated.py; a mirror image is inside out
     ),
     EffectRow(
-        AltitudeSprings(stiffness=3, damping=0.2), obeys=frozenset({"translation", "rotation"}), dimensions=(3,),
+        AltitudeSprings(stiffness=0.5, damping=0.02), obeys=frozenset({"translation", "rotation"}), dimensions=(3,),
     ),
 )  # fmt: skip
 
@@ -660,7 +660,7 @@ def scene_of(*effects: Effect, dimension: int = 2, space: Space | None = None, *
     paced = {"desired_speed": 1.2, "spawn": spawn}
     groups = (Group(count=14, mass=0.7, radius=0.1, **paced), Group(count=10, mass=2, radius=0.25, **paced))
     groups = fields.pop("groups", groups)
-    if any(effect.bond_law for effect in effects):
+    if any(effect.bond_law for effect in effects) and groups[0].network is None:
         filled = any(effect.partner_count(dimension) == dimension for effect in effects if effect.kind in SOLID)
         groups = (tied(groups[0], dimension, filled, any(effect.kind in FLAT for effect in effects)), *groups[1:])
     asked = any("obstacles" in effect.calls_for() for effect in effects)

@@ -74,7 +74,7 @@ def _keep_apart(bonds: Bonds, kept: NDArray[np.float64], itemsize: int) -> tuple
     size = int(bonds.kept.max(initial=-1)) + 1
     if itemsize == 4 and size > MOST_KEPT:
         raise ValueError(f"dtype = float32: {size:,} springs that yield or break; at most {MOST_KEPT:,} are allowed")
-    longer = np.zeros(max(size, len(kept)))
+    longer = np.zeros(max(size, len(kept), 1))  # kernels are passed no empty array: one agent alone has no springs
     longer[: len(kept)] = kept
     longer[bonds.kept] = bonds.number[:, -1]
     return bonds._replace(number=np.concatenate([bonds.number[:, :-1], bonds.kept[:, None]], axis=1)), longer

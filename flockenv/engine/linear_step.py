@@ -124,7 +124,7 @@ class LinearSolver:
                 f"the linear equations are not solved to tolerance = {method.tolerance:g} in {iterations:,} iterations",
                 int(np.argmax(np.abs(system.residual))) // d,
             )
-        v += system.change.reshape(-1, d).T
+        v = v + system.change.reshape(-1, d).T  # not in place: a view of the state, where bounces read the old one
         return LinearStep(x + h * (v if flow is None else v + flow[0].T), v, int(iterations))
 
 
