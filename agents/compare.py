@@ -120,7 +120,7 @@ def main(
         with job_bar() as progress:
             work = Work(Store(folder / JOBS), runner, fresh, progress, part)
             results, episodes = compare(chosen, field, count, seed, resamples, trust_pickle, work, disturbance)
-        results |= {**provenance(), "smoke": smoke}
+        results |= provenance()
         write_all_or_none(folder, file_writers(results, episodes))
     show_comparison(results, folder)
 

@@ -21,6 +21,8 @@ from agents.summary_chart import write_summary
 from flockenv.cli.terminal import run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.evaluation.report import Results, grid, seeds_text
+from flockenv.players import NAMES
+from flockenv.studies.comparison import WORLDS
 from flockenv.tasks import TASKS
 
 __all__ = ["BLOCK", "app", "summary", "tables"]
@@ -93,17 +95,24 @@ def _lead(pair: Results) -> str:
     return f"{level}{difference}, higher in {pair['probability_better']:.0%}"
 
 
-def _read_comparison(folder: Path) -> Results:
+def _read_comparison(file: Path) -> Results:
     """Return a comparison; raise ValueError unless it is complete: all tasks, the usual players, all worlds."""
-    file = folder / "results.json"
     if not file.is_file():
         raise ValueError(f"{file}: no such file; `python -m agents.compare` writes it")
-    results: Results = json.loads(file.read_text(encoding="utf-8"))
+    try:
+        results = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{file}: is not JSON: {error}") from None
+    if not isinstance(results, dict):
+        raise ValueError(f"{file}: must be an object, the results of `python -m agents.compare`")
     missing = [task for task in TASKS if task not in results["tasks"]] + [
         n for n in SHOWN if n not in results["players"]
     ]
-    if results["smoke"] or missing:
-        what = "a quick look (--smoke)" if results["smoke"] else f"a part of a comparison, without {missing[0]},"
+    others = [name for name in results["players"] if name not in NAMES]
+    what = f"a comparison with {others[0]}, which does not ship," if others else ""
+    what = f"a part of a comparison, without {missing[0]}," if missing else what
+    what = f"a quick look (--smoke, or less than {WORLDS} worlds)" if results["smoke"] else what
+    if what:
         raise ValueError(f"{file}: {what} must not be published")
     return results
 
@@ -117,9 +126,14 @@ def main(
 ) -> None:
     """Copy a comparison's results and picture into docs/, draw its summary, and write the tables of the pages."""
     with one_line_errors():
-        results = _read_comparison(folder)
+        file = folder / "results.json"
+        try:
+            results = _read_comparison(file)
+            written = {"README.md": summary(results), "docs/results.md": tables(results)}
+        except KeyError as error:
+            raise ValueError(f"{file}: {error} is missing; `python -m agents.compare` writes it") from None
         contents = {f"docs/{name}": (folder / name).read_bytes() for name in ("results.json", "comparison.png")}
-        for name, table in (("README.md", summary(results)), ("docs/results.md", tables(results))):
+        for name, table in written.items():
             contents[name] = _page_with_table(root / name, table).encode()
         writers = {name: functools.partial(_write, content) for name, content in contents.items()}
         writers["docs/summary.png"] = functools.partial(write_summary, results=results)

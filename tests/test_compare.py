@@ -651,6 +651,7 @@ def test_the_command_of_the_package_has_the_scores_of_the_workbench(capsys: pyte
     assert main(["compare", "obstacles", *options, "--out", "package"]) == 0
     ours, theirs = (json.loads(Path(folder, "results.json").read_text()) for folder in ("package", "workbench"))
     assert ours["tasks"]["obstacles"]["pairs"] == theirs["tasks"]["obstacles"]["pairs"]
+    assert ours.keys() == theirs.keys() - {"git"}, "agents.publish reads both"
     assert sorted(path.name for path in Path("package").iterdir()) == sorted([*FILES, "jobs"])
 
 

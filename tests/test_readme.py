@@ -61,7 +61,7 @@ def test_a_full_comparison_is_published_and_a_quick_or_partial_one_is_refused(tm
     (root / "docs" / "results.md").write_text(publish.BLOCK.sub("old\n", RESULTS), encoding="utf-8")
     (folder / "comparison.png").write_bytes(b"a picture")
 
-    def published(results: dict[str, Any] | None) -> Any:
+    def published(results: Any) -> Any:
         if results is not None:
             (folder / "results.json").write_text(json.dumps(results), encoding="utf-8")
         return CliRunner().invoke(publish.app, [str(folder), "--root", str(root)])
@@ -69,8 +69,11 @@ def test_a_full_comparison_is_published_and_a_quick_or_partial_one_is_refused(tm
     without = {**results, "tasks": {name: task for name, task in results["tasks"].items() if name != "herd"}}
     for given, message in (
         (None, "no such file; `python -m agents.compare` writes it"),
-        ({**results, "smoke": True}, "a quick look (--smoke) must not be published"),
+        ({**results, "smoke": True}, "a quick look (--smoke, or less than 128 worlds) must not be published"),
         (without, "a part of a comparison, without herd, must not be published"),
+        ({**results, "players": {**results["players"], "mine": "mine.py"}}, "with mine, which does not ship, must not"),
+        ({name: each for name, each in results.items() if name != "smoke"}, "results.json: 'smoke' is missing"),
+        ([], "results.json: must be an object"),
     ):
         refused = published(given)
         assert refused.exit_code == 2 and message in refused.stderr and refused.stderr.count("\n") == 1

@@ -81,6 +81,7 @@ def compare(
         "world_seeds": {"block": "evaluation", "first": first, "last": first + worlds - 1},
         "disturbance": (disturbance or Disturbance()).model_dump(),
         "bootstrap": {"resamples": resamples, "seed": seed, "interval": report.INTERVAL},
+        "smoke": worlds < WORLDS or resamples < RESAMPLES,
         "players": {player.name: player.spec for player in players},
         "tasks": {
             task.name: _task_results(task, episodes[task.name], policies[task.name], resamples, seed) for task in tasks
