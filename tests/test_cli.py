@@ -426,6 +426,11 @@ def test_task_is_rendered_with_a_player_from_a_file() -> None:
         assert png.size[0] == 96
 
 
+def test_a_shipped_policy_is_rendered_in_the_task_that_it_was_trained_on() -> None:
+    """Bottleneck was trained with together=True; filterwarnings makes the warning about a difference an error."""
+    assert main(["render", "bottleneck", "--player", "ppo", "--size", "64", "--out", "b.png"]) == 0
+
+
 def test_a_task_is_rendered_with_a_disturbance(capsys: pytest.CaptureFixture[str]) -> None:
     for name, options in {"plain": (), "late": ("--delay", "5"), "noisy": ("--noise", "0.3")}.items():
         assert main(["render", "pursuit", "--player", "rules", "--out", f"{name}.html", *options]) == 0

@@ -51,7 +51,7 @@ from flockenv.cli.validate import validate
 from flockenv.core import signals
 from flockenv.core.errors import nearest, printable
 from flockenv.core.yaml_paths import title_of
-from flockenv.players import NAMES
+from flockenv.players import NAMES, trained_task
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -263,12 +263,14 @@ def render(
     trust_pickle: TrustPickle = False,
     force: Force = False,
 ) -> None:
-    """Draw a scene, or an episode of a task with a player, as GIF, PNG, HTML replay, MP4 (extra `video`) or WebP."""
+    """Draw a scene, or an episode of a task with a player, as GIF, PNG, HTML replay, MP4 (extra `video`) or WebP.
+
+    A task has the arguments with which its policy was trained.
+    """
     from flockenv.core.atomic_files import new_folder
     from flockenv.core.output_paths import valid_file
     from flockenv.envs.disturbance import Disturbance
     from flockenv.render.video import require_encoder
-    from flockenv.tasks import TASKS
 
     path = valid_file(out, PICTURES, force)
     require_encoder(path.suffix)
@@ -283,7 +285,7 @@ def render(
     else:
         if duration is not None:
             raise ValueError(f"--duration = {duration:g}: only for scenes; an episode of a task ends by itself")
-        task, players = TASKS[what](), player.split(",")
+        task, players = trained_task(what), player.split(",")
         (panels, fps), left = film_episodes(task, players, seed, trust_pickle, disturbance), ""
         title = what
     with new_folder(path.parent):

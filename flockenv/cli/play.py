@@ -93,9 +93,9 @@ def _open(session: Session, what: str | None, players: tuple[str, ...], seed: in
         about = description_of(file.read_text(encoding="utf-8")) if file is not None else ""
         session.open_scene(load_scene(Path(what)), title_of(what), seed, about)
         return
-    from flockenv.tasks import TASKS
+    from flockenv.players import trained_task
 
-    session.open_task(TASKS[what](), players or ("rules",), seed)
+    session.open_task(trained_task(what), players or ("rules",), seed)
 
 
 async def _serve(session: Session, host: str | None, port: int, no_browser: bool) -> None:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 from flockenv.core.bundled import bundled_scenes
 from flockenv.core.errors import nearest, printable
+from flockenv.players import trained_task
 from flockenv.scene import Scene
 from flockenv.scene.yaml_io import load_scene
 from flockenv.tasks import TASKS, Task
@@ -74,7 +75,7 @@ def entries() -> tuple[Entry, ...]:
 def read_entry(name: str) -> Scene | Task:
     """Return a scene or task by its name in the gallery; raise ValueError, with the nearest name, for another one."""
     if name in TASKS:
-        return TASKS[name]()
+        return trained_task(name)
     return load_scene(text_of(name))
 
 
@@ -139,7 +140,7 @@ def _films(name: str) -> Iterator[Snapshot]:
     from flockenv.play.task_lane import TaskLane
 
     if name in TASKS:
-        lane: SceneLane | TaskLane = TaskLane(TASKS[name](), "rules", 1)
+        lane: SceneLane | TaskLane = TaskLane(trained_task(name), "rules", 1)
         ticks = 60
     else:
         text = text_of(name)
