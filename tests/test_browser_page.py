@@ -220,6 +220,27 @@ def test_a_page_connects_again(boids: Session, visit: Callable[..., Visit]) -> N
         assert "tries again" not in here.value(TOAST)
 
 
+def test_one_frame_is_asked_for_at_a_time(boids: Session, visit: Callable[..., Visit]) -> None:
+    """Also if news of the room arrives while a frame is awaited: else every change would make frames later."""
+    with serving(boids) as server:
+        here = opened(visit, server.url)
+        here.value("""(() => {
+            const send = live.send, take = live.frame;
+            window.open_frames = window.most = window.taken = 0;
+            live.send = function (message) {
+                const line = send.call(this, message);
+                if (message.type === "frame") { most = Math.max(most, ++open_frames); this.takeRoom(this.room); }
+                return line;
+            };
+            live.frame = function (data) {
+                taken++; open_frames = Math.max(0, open_frames - 1);
+                take.call(this, data);
+            };
+        })()""")
+        here.until("taken > 10")
+        assert here.value("most") == 1
+
+
 def test_a_recording_ends_with_its_world(visit: Callable[..., Visit]) -> None:
     session = shown_boids()
     with serving(session) as server:

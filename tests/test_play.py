@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from flockenv.cli.main import main
+from flockenv.engine.workspace import Workspace
 from flockenv.geometry.shapes import SHAPES, Block, Capsule, Circle, DistanceField, HalfSpace, Polygon, Shape, Wall
 from flockenv.play.edits import Edit, read_edit
 from flockenv.play.history import EVERY, History
@@ -116,6 +117,19 @@ def test_keyframes_that_were_dropped_are_made_again_when_time_goes_back() -> Non
         made.clear()
         history.go_to(tick)
         assert sum(made) <= 3 and history.nbytes <= 8 * lane.keep().nbytes
+
+
+def test_steps_after_a_change_of_numbers_allocate_no_scratch(monkeypatch: pytest.MonkeyPatch) -> None:
+    room, allocated = Room([tiny()]), list[int]()
+    room.step(2)
+    allocate = Workspace.allocate
+    monkeypatch.setattr(Workspace, "allocate", lambda *a: (allocated.append(1), allocate(*a))[1])
+    room.edit(edit(kind="set", path="effects[0].rate", value=0.25))
+    room.step(2)
+    assert not allocated
+    room.edit(edit(kind="set", path="groups[0].mass", value=2.0))  # which the scratch holds
+    room.step(2)
+    assert allocated
 
 
 def test_time_goes_on_behind_a_gap_of_keyframes() -> None:

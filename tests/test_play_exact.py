@@ -19,7 +19,7 @@ from flockenv.play.room import Room
 from flockenv.play.session import Session
 from flockenv.play.task_lane import TaskLane
 from flockenv.scene import Scene
-from flockenv.scene.yaml_io import load, load_scene
+from flockenv.scene.yaml_io import dump_scene, load, load_scene
 from flockenv.tasks import TASKS, Task
 from tests.test_play import TINY
 
@@ -108,6 +108,10 @@ def test_a_scene_goes_back_and_on_and_its_file_and_link_give_the_same_bits(
         room.step(STEPS)
         with collected_warnings():
             assert not room.edit(make(lane)).restarts
+            fresh, state = load_scene(dump_scene(lane.record)), lane.state.copy()  # type: ignore[attr-defined]
+        fresh.step(state, out=state, steps=2)
+        room.step(2)
+        assert room.digests == (state.digest,)
     room.step(STEPS)
     assert [made.edit.kind for made in room.made] == ["set", "move_agent"] and not lane.stopped
     check_back_and_on(room)

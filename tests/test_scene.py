@@ -18,7 +18,7 @@ import pytest
 
 import flockenv
 from flockenv.behaviours import Alignment, Cohesion, Separation
-from flockenv.engine import scratch_of
+from flockenv.engine import TABLES, scratch_of
 from flockenv.engine.workspace import Workspace
 from flockenv.geometry.cell_list import FEWEST_AGENTS
 from flockenv.geometry.shapes import Block, Circle
@@ -521,6 +521,26 @@ def test_allocated_memory_agrees_with_bytes_per_world(variant: Variant, count: i
     predicted, fixed = scene.bytes_per_world(), 24 * 1024
     assert predicted <= 1.25 * taken(scene)
     assert taken(scene) <= predicted + fixed
+
+
+CONSTANT = ("mass", "radius", "max_speed", "max_force", "ident", "tie", "number", "spread", "sync", *TABLES)
+"""Scratch that is filled when it is allocated, or by the caller of the threads."""
+
+
+@pytest.mark.parametrize("variant", ALL[: len(VARIANTS)], ids=lambda variant: variant.name)
+@pytest.mark.parametrize("count", [97, 3000])
+def test_steps_read_nothing_that_earlier_steps_left_in_scratch(variant: Variant, count: int) -> None:
+    """So scratch may be used for another scene that fills CONSTANT alike. Lanes beyond the last agent never live."""
+    scene, rng = variant.make(count, 9.0), np.random.default_rng(1)
+    start = scene.start(3)
+    expected = scene.step(start, steps=3)
+    for spaces in vars(scene.stepper._threads)["workspaces"].values():
+        for arrays in (each for space in spaces for each in (space.arrays, *space.own)):
+            for name in set(arrays) - {*CONSTANT, *scene.parts.frame_numbers, "living"}:
+                array = arrays[name]
+                array[...] = rng.normal(size=array.shape) if array.dtype.kind == "f" else 1
+            arrays.get("living", np.zeros(0))[:count] = 0
+    assert scene.step(start, steps=3).digest == expected.digest
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])

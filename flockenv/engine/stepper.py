@@ -17,7 +17,7 @@ from flockenv.engine.entry_points import begin_of, field_of, step_of
 from flockenv.engine.implicit_step import solve_steps
 from flockenv.engine.kernel_plan import KernelPlan
 from flockenv.engine.linear_step import LinearSolver
-from flockenv.engine.scratch import scratch_record
+from flockenv.engine.scratch import TABLES, scratch_of, scratch_record
 from flockenv.engine.workspace import Workspace
 from flockenv.jit.thread_pool import LARGEST, AutoTuners, run_parallel, usable_threads
 from flockenv.model.scene_view import SceneView
@@ -257,6 +257,23 @@ class Stepper:
         while len(found) < count:
             found.append(Workspace.allocate(self.scene.parts, self.scene.body, self.scene.table, team))
         return found
+
+    def share_workspaces(self, other: Stepper) -> None:
+        """Use the scratch memory that this thread has for another scene, if all that steps only read in it is equal.
+
+        That is the case after a change of numbers other than bodies', and saves the allocation, which takes longer than
+        a step of a large world.
+        """
+        mine, theirs = self.scene, other.scene
+        kept: dict[int, list[Workspace]] = vars(other._threads).get("workspaces", {})
+        bodies = mine.body.arrays(), theirs.body.arrays()
+        if self.move is not other.move or not all(map(np.array_equal, *bodies)):
+            return
+        for team in kept:
+            wanted, found = (scratch_of(scene.parts, len(scene.body.mass), team) for scene in (mine, theirs))
+            if wanted != found or any(name in wanted for name in TABLES):
+                return
+        vars(self._threads)["workspaces"] = kept
 
     @property
     def tuners(self) -> AutoTuners:

@@ -220,6 +220,8 @@ class SceneLane:
             return Change(restarts=True)
         with collected_warnings():
             self.state = adapted(self.record, new, self.state, self.seed)
+        if not self.stopped:  # else the scratch holds numbers that are not finite
+            new.stepper.share_workspaces(self.record.stepper)
         self.record, self.stopped = new, ""
         return Change()
 

@@ -14,6 +14,7 @@ const live = {
     this.socket = new WebSocket(url);
     this.socket.binaryType = "arraybuffer";
     this.socket.onopen = () => {
+      this.waiting = false; // nothing that was asked before is answered any more
       this.send({ type: "hello", version: data.version });
       if (this.greeted) tell(""); else this.begin();
       this.greeted = true; this.retry = RETRY;
@@ -82,7 +83,7 @@ const live = {
     document.querySelector("h1").textContent = document.title = room.title;
     $("about").textContent = $("about").title = room.about;
     $("seed").value = room.seed;
-    this.waiting = false; this.lastFrame = 0;
+    this.lastFrame = 0;
     refresh();
   },
 
