@@ -40,7 +40,9 @@ def crossings(before: Array, after: Array, faces: Ints, points: Ints | None = No
         left, right = left[apart], right[apart]
         offsets = _offsets(before, left, right), _offsets(after, left, right)
         unclear = np.flatnonzero(~_apart(np.concatenate(offsets, axis=1)))
-        exact = [[_exact(place[who[k]]) for place in (before, after) for who in (left, right)] for k in unclear]
+        exact = [
+            [_exact(place[vertices[k]]) for place in (before, after) for vertices in (left, right)] for k in unclear
+        ]
         found += [
             (*left[k].tolist(), *right[k].tolist())
             for k, numbers in zip(unclear, exact, strict=True)

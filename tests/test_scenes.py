@@ -14,9 +14,12 @@ from scipy.spatial import cKDTree
 from flockenv.core.warnings import UnsolvedContactsWarning
 from flockenv.geometry.space import Box
 from flockenv.model.state import State
+from flockenv.physics.constraints.face_mesh import faces_of
 from flockenv.scene import Scene
 from flockenv.scene.yaml_io import load_scene
 from tests.catalogue import Array
+from tests.exact_crossings import crossings
+from tests.test_corotated import volumes
 
 ROOT = Path(__file__).parent.parent
 SECONDS = {
@@ -31,6 +34,9 @@ SLOW = (
     "cloth_on_ball",
     "funnel",
 )  # they compile for half a minute or have many bodies
+PICTURES = (
+    "fountain", "fireworks", "drop", "waterfall", "fire", "smoke", "draped_cloth", "torn_paper", "jelly_on_stairs",
+)  # fmt: skip
 UNSOLVED = pytest.mark.filterwarnings("ignore::flockenv.core.warnings.UnsolvedContactsWarning")
 FAST = pytest.mark.parametrize(
     "name",
@@ -134,7 +140,7 @@ def test_folds_of_a_rope_or_cloth_keep_their_distance(name: str, seconds: float,
 
 def test_the_page_of_scenes_has_a_picture_and_a_command_for_each_scene() -> None:
     page = (ROOT / "docs" / "scenes.md").read_text()
-    for name in (*SECONDS, "fountain", "fireworks", "drop", "waterfall", "fire", "smoke"):
+    for name in (*SECONDS, *PICTURES):
         assert re.search(rf"flockenv render {name} .*--out docs/scenes/{name}\.png", page)
         assert f"scenes/{name}.png" in page
         assert 1000 < (ROOT / "docs" / "scenes" / f"{name}.png").stat().st_size < 150_000
@@ -155,3 +161,46 @@ def test_the_funnel_warns_of_unsolved_contacts_with_small_overlaps() -> None:
     (message,) = (str(each.message) for each in caught)
     found = re.search(r"; the deepest overlap is ([\d.e-]+) of a radius$", message)
     assert found and float(found[1]) < 0.03
+
+
+@pytest.mark.slow
+def test_a_sheet_of_paper_tears_around_a_ball_and_stays_bent() -> None:
+    scene = scene_of("torn_paper")
+    end = scene.run(scene.start(0), round(1.2 / scene.dt))
+    network: Any = scene.groups[0].network
+    first, rest = network.springs(3).rest, np.asarray(end.bonds[0])
+    broken, longer = np.isinf(rest), rest > 1.02 * first
+    assert 0.01 < broken.mean() < 0.1
+    assert (longer & ~broken).mean() > 0.01  # they yielded
+    middle = np.linalg.norm(network.points(3) - (2.1, 2.2, 2.0), axis=1) < 0.3
+    assert np.abs(end.pos[0, middle, 2] - 2.0).max() > 0.5  # torn off, or bent out of the sheet
+    assert np.abs(end.pos[0, :41, 2] - 2.0).max() == 0  # the frame holds
+
+
+@pytest.mark.slow
+def test_a_jelly_tumbles_down_the_stairs_and_keeps_its_volume() -> None:
+    scene = scene_of("jelly_on_stairs")
+    state, turned = scene.start(0), 0.0
+    for _ in range(30):
+        state = scene.step(state, steps=100)
+        assert overlap(scene, state) < 0.05
+        side = state.pos[0, 4] - state.pos[0, 0]
+        turned = max(turned, abs(float(np.degrees(np.arctan2(side[1], side[0])))))
+    assert turned > 60
+    assert state.pos[0].mean(axis=0)[0] > 3.5  # beyond the last step
+    assert (volumes(scene, state) > 0).all()
+    assert volumes(scene, state).mean() == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.slow
+def test_no_vertex_passes_a_face_while_two_sheets_drape_over_a_ball() -> None:
+    """Each step is checked by exact predicates."""
+    scene = scene_of("draped_cloth")
+    faces, state, ball = faces_of(scene), scene.start(0), scene.obstacles[0]
+    for _ in range(300):
+        before = np.array(state.pos[0])
+        state = scene.step(state)
+        assert crossings(before, np.array(state.pos[0]), faces) == []
+        assert ball.gap(np.asarray(state.pos[0], float)).min() > 0
+    assert state.pos[0].mean(axis=0)[1] < 1.5  # it fell
+    assert state.count_of("unsolved") == 0

@@ -191,7 +191,7 @@ def test_cases_and_methods_are_found_by_name_and_unknown_names_are_refused() -> 
 
 SOLID = {case.name for case in (*IMPACTS, *HEAPS, *GATHERINGS)}  # tested in tests/test_stress_solids.py
 BOUNDED = tuple(name for name in NAMES if not name.startswith(("N14", "N20")) and name not in SOLID)
-HEAVY = ("N09 crowd", "N10", "N18", "N09 centre")  # a kernel each, of ten seconds
+HEAVY = ("N09 crowd", "N10", "N18", "N09 centre", "N43", "N44")  # kernels that take long to compile
 LIGHT = tuple(name for name in BOUNDED if name not in HEAVY)
 
 

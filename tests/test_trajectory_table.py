@@ -121,7 +121,7 @@ def test_passages_and_flow_are_those_of_pedpy(seen: Any) -> None:
     first = dict(zip(frames["id"], frames["frame"], strict=True))
     ours = dict(zip(found.agent.tolist(), np.ceil(found.time * RATE).astype(int).tolist(), strict=True))
     assert ours.keys() == first.keys()
-    assert all(abs(ours[who] - first[who]) <= 1 for who in ours), "PedPy counts whole frames"
+    assert all(abs(ours[agent] - first[agent]) <= 1 for agent in ours), "PedPy counts whole frames"
     assert passed["cumulative_pedestrians"].iloc[-1] == len(found.time)
     rate = flow(found, 6.0, len(run.pos) / RATE)
     span = (frames["frame"].max() - frames["frame"].min()) / RATE
