@@ -51,7 +51,7 @@ def imitate(
     task, p = experiment.build(), experiment.ppo
     rules = player(task)
     with use_thread_count(p.threads):
-        model = build(task, p, None)
+        model = build(task, p)
         rows, missed = teach(model, task, rules, updates, worlds, advance)
         own = rollout(task, rules, p.evaluate_worlds, worlds_for("tuning", p.seed, p.evaluate_worlds))
         network, _ = score(task, p, tensors_of(model))

@@ -26,7 +26,7 @@ from sb3_contrib import TQC, RecurrentPPO
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from agents import ppo
 from agents.dagger import teach
@@ -48,6 +48,7 @@ from agents.training import (
 )
 from agents.training_env import learning_env
 from agents.training_job import with_seed
+from agents.training_log import log_point, turn_off_log, write_log
 from agents.training_state import surroundings
 from flockenv.cli.jobs import EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
 from flockenv.cli.terminal import DIVERGED, handle_interrupt, run_program, show_progress
@@ -82,7 +83,7 @@ def build(experiment: Experiment, algo: str) -> BaseAlgorithm:
     """Return the model of an experiment that `effective` made, with its worlds."""
     task, p = experiment.build(), experiment.ppo
     if algo == "bc":
-        return ppo.build(task, p.model_copy(update={"worlds": 1, "minibatch": p.rollout}), None)  # for its network
+        return ppo.build(task, p.model_copy(update={"worlds": 1, "minibatch": p.rollout}))  # for its network
     require_room(f"to train, {IN_USE}", TRAINING)
     torch.manual_seed(p.seed)
     worlds = learning_env(task, p)
@@ -92,7 +93,7 @@ def build(experiment: Experiment, algo: str) -> BaseAlgorithm:
         model = _recurrent(experiment, worlds, activation)
     else:
         model = _off_policy(experiment, algo, worlds, activation)
-    model.set_logger(Logger(folder=None, output_formats=[]))  # its own leaves an empty folder behind
+    turn_off_log(model)
     worlds.seed(worlds_for("training", p.seed, p.worlds))
     return model
 
@@ -197,6 +198,8 @@ class Recorder:
         self.run.wall = self.wall
         self.progress.update(self.bar, score=text)
         self.progress.console.print(line)
+        log_point(self.model, self.run.curve[-1])
+        self.model.logger.dump(self.run.steps // self.p.hold)
 
 
 class Watch(BaseCallback):
@@ -228,8 +231,10 @@ class Watch(BaseCallback):
             recorder.add_point()
 
 
-def train(experiment: Experiment, algo: str, run: Run) -> None:
+def train(experiment: Experiment, algo: str, run: Run, folder: Path) -> None:
     """Train to the end of a budget, and store curve and best policy in `run`, which was made by `new_run`.
+
+    folder: of the log.
 
     Raises:
         FloatingPointError: learning or a world diverged; `run` keeps the best policy until then.
@@ -238,7 +243,7 @@ def train(experiment: Experiment, algo: str, run: Run) -> None:
     with use_thread_count(p.threads), show_progress(new_progress(console)) as progress:
         model = build(experiment, algo)
         recorder = Recorder(model, experiment, run, progress, p.steps if algo != "bc" else experiment.bc.updates)
-        with _name_divergence(model):
+        with write_log(model, folder, console), _name_divergence(model):
             ended_by = "steps"
             try:
                 _clone(recorder, experiment) if algo == "bc" else _learn(recorder)
@@ -250,7 +255,8 @@ def train(experiment: Experiment, algo: str, run: Run) -> None:
 
 def _learn(recorder: Recorder) -> None:
     steps = -(-recorder.p.steps // recorder.p.hold)
-    recorder.model.learn(steps, callback=Watch(recorder), log_interval=None)
+    every = recorder.model.n_envs if isinstance(recorder.model, OffPolicyAlgorithm) else 1  # episodes, or rollouts
+    recorder.model.learn(steps, callback=Watch(recorder), log_interval=every)
 
 
 def _clone(recorder: Recorder, experiment: Experiment) -> None:
@@ -326,6 +332,7 @@ def main(
     config: Config,
     algo: Annotated[str, typer.Option(help=f"{', '.join(ALGORITHMS)}; agents.ppo trains with PPO")],
     out: Annotated[Path | None, typer.Option(help="default: results/ALGO/TASK.safetensors")] = None,
+    runs: Annotated[Path, typer.Option(help="folder of logs")] = Path("runs"),
     go_on: Annotated[bool, typer.Option("--resume", help="refused: these learners do not resume")] = False,
     steps: Steps = None,
     seconds: Seconds = None,
@@ -349,11 +356,12 @@ def main(
             raise ValueError("--seeds: not together with --seed")
         if seeds is None and shard is not None:
             raise ValueError("--shard: needs --seeds, whose trainings are jobs")
-        size = expected_bytes(experiment)
+        size, place = expected_bytes(experiment), valid_path(str(runs / algo / experiment.build().name), "--runs")
+        check_room(place / "log", size)
         if seeds is not None:
             folder = valid_path(str(out or f"results/{algo}"))
             work = Work(Store(folder / "jobs"), engine_of(engine, processes, renew=True), fresh, shard=shard_of(shard))
-            jobs = [learner_job(with_seed(experiment, number), algo) for number in seeds_of(seeds)]
+            jobs = [learner_job(with_seed(experiment, number), algo, place) for number in seeds_of(seeds)]
             with end_of_shard():
                 ppo.run_trainings(jobs, folder, work, size, stored="")
             return
@@ -361,15 +369,15 @@ def main(
         target = valid_file(str(out or name), (".safetensors",), True)
         check_room(target, size)
     check_memory(experiment, algo)
-    _train_alone(experiment, algo, target)
+    _train_alone(experiment, algo, target, place)
 
 
-def _train_alone(experiment: Experiment, algo: str, target: Path) -> None:
+def _train_alone(experiment: Experiment, algo: str, target: Path, place: Path) -> None:
     """Train in this process, and write the best policy, also of a training that is interrupted or diverges."""
     run = new_run(experiment, algo)
     with handle_interrupt(), one_line_errors():
         try:
-            train(experiment, algo, run)
+            train(experiment, algo, run, place)
         except KeyboardInterrupt:
             run.ended_by = "interrupt"
             signals.set_message(f"interrupted; {export(run, algo, target)}")

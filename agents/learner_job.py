@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from agents.experiment import Experiment, PpoSettings
@@ -115,19 +116,23 @@ def check_memory(experiment: Experiment, algo: str) -> None:
         raise MemoryError(f"training needs {needed / 1e9:.2g} GB, {part}; {room / 1e9:.2g} GB are available")
 
 
-def learner_job(experiment: Experiment, algo: str) -> Job:
-    """Return the job that trains an experiment which `effective` made; `policy_of_bytes` reads its record."""
+def learner_job(experiment: Experiment, algo: str, folder: Path) -> Job:
+    """Return the job that trains an experiment which `effective` made; `policy_of_bytes` reads its record.
+
+    folder: of logs; the job's is seed-N in it.
+    """
+    name, place = f"seed-{experiment.ppo.seed}", str(folder / f"seed-{experiment.ppo.seed}")
     return Job(
-        f"{algo}/{experiment.build().name}/seed-{experiment.ppo.seed}", _train, (experiment.model_dump_json(), algo),
+        f"{algo}/{experiment.build().name}/{name}", _train, (experiment.model_dump_json(), algo, place),
         learner_recipe(experiment, algo), _needed(experiment, algo), (first_step, (learned(experiment),)),
     )  # fmt: skip
 
 
-def _train(experiment: str, algo: str) -> bytes:
+def _train(experiment: str, algo: str, folder: str) -> bytes:
     """Train to the end of a budget; return the best policy with its card as bytes."""
     from agents import learn  # with torch
 
     given = Experiment.model_validate_json(experiment)
     run = learn.new_run(given, algo)
-    learn.train(given, algo, run)
+    learn.train(given, algo, run, Path(folder))
     return records.to_bytes({"tensors": dict(run.tensors), "card": learn.card(run, algo)})

@@ -15,7 +15,6 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -26,7 +25,6 @@ from rich.console import Console
 from rich.progress import Progress
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
 
 from agents.central_critic import CentralPolicy, CentralVecEnv
 from agents.checkpoint import CheckpointError, claim, path_in
@@ -49,6 +47,7 @@ from agents.training import (
 )
 from agents.training_env import learning_env
 from agents.training_job import file_name, policy_of_bytes, training_job, with_seed
+from agents.training_log import log_point, turn_off_log, write_log
 from agents.training_state import capture, restore, surroundings
 from agents.warm_start import starting_policy, use_weights
 from flockenv.cli.jobs import EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
@@ -89,7 +88,7 @@ def learning_rate(p: PpoSettings) -> Callable[[float], float]:
     return lambda left: p.learning_rate * max(0.1 + 0.9 * left, 0.05)  # the last rollout may go beyond
 
 
-def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
+def build(task: Task, p: PpoSettings) -> PPO:
     """Return the model with its worlds; `use_thread_count` sets how many threads they use.
 
     Raises MemoryError if too little address space is left to train: starting torch's threads would abort the process.
@@ -114,7 +113,6 @@ def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
         ent_coef=p.entropy,
         seed=p.seed,
         device="cpu",
-        tensorboard_log=tensorboard,
         policy_kwargs={
             "net_arch": {"pi": list(p.hidden), "vf": list(p.hidden)},
             "activation_fn": {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh}[p.activation],
@@ -123,8 +121,7 @@ def build(task: Task, p: PpoSettings, tensorboard: str | None) -> PPO:
         },
         **caring,
     )
-    if tensorboard is None:
-        model.set_logger(Logger(folder=None, output_formats=[]))  # its own leaves an empty folder behind
+    turn_off_log(model)
     worlds.seed(worlds_for("training", p.seed, p.worlds))
     return model
 
@@ -196,12 +193,14 @@ class Watch(BaseCallback):
         text, line = add_point(self.run, tensors, score(self.task, self.p, tensors))
         self.progress.update(self.bar, score=text)
         self.progress.console.print(line)
+        log_point(self.model, self.run.curve[-1])
         self.due = True
 
     def finish(self) -> None:
         """Evaluate the last policy, and write the last checkpoint."""
         check_model(self.model)
         self.add_point()
+        self.logger.dump(self.num_timesteps)
         self._remember()
         self.save()
 
@@ -234,16 +233,14 @@ def train(
     experiment: Experiment,
     folder: Path,
     go_on: bool = False,
-    tensorboard: str | None = None,
     saved: Callable[[Run], None] = lambda run: None,
 ) -> Run:
     """Train to the end of the budget, or until Ctrl-C; return the run.
 
     Args:
         experiment: task and settings.
-        folder: of the checkpoint.
+        folder: of the checkpoint and of the log.
         go_on: continue from the folder's checkpoint, if there is one; a finished run is returned as it is.
-        tensorboard: folder of TensorBoard's logs.
         saved: called with the run of the checkpoint from which training continues, and of each that it writes.
 
     Raises:
@@ -264,15 +261,13 @@ def train(
                 highlight=False,
                 soft_wrap=True,
             )
-        return _train_from(experiment, folder, run, tensorboard, saved)
+        return _train_from(experiment, folder, run, saved)
 
 
-def _train_from(
-    experiment: Experiment, folder: Path, run: Run | None, tensorboard: str | None, saved: Callable[[Run], None]
-) -> Run:
+def _train_from(experiment: Experiment, folder: Path, run: Run | None, saved: Callable[[Run], None]) -> Run:
     task, p, anew = experiment.build(), experiment.ppo, run is None
     with use_thread_count(p.threads):  # the first weights depend on it
-        model = build(task, p, tensorboard)
+        model = build(task, p)
     if run is not None:
         resume(folder, model, run, p)
     else:
@@ -283,14 +278,9 @@ def _train_from(
     with use_thread_count(p.threads), show_progress(new_progress(console)) as progress:
         watch = Watch(task, p, run, folder, progress, saved)
         try:
-            with _name_divergence(model):
+            with write_log(model, folder, console), _name_divergence(model):
                 with suppress(BudgetSpent):
-                    model.learn(
-                        -(-(p.steps - run.steps) // p.hold),
-                        callback=watch,
-                        reset_num_timesteps=anew,
-                        log_interval=None if tensorboard is None else 1,
-                    )
+                    model.learn(-(-(p.steps - run.steps) // p.hold), callback=watch, reset_num_timesteps=anew)
                 watch.finish()
         except (KeyboardInterrupt, FloatingPointError):
             watch.save()
@@ -318,9 +308,8 @@ def export(run: Run, path: Path) -> None:
 def main(
     config: Config,
     out: Annotated[Path | None, typer.Option(help="default: flockenv/players/weights/TASK.safetensors")] = None,
-    runs: Annotated[Path, typer.Option(help="folder of checkpoints")] = Path("runs"),
+    runs: Annotated[Path, typer.Option(help="folder of checkpoints and logs")] = Path("runs"),
     go_on: Annotated[bool, typer.Option("--resume", help="continue from the last checkpoint")] = False,
-    tensorboard: Annotated[str | None, typer.Option(help="folder of TensorBoard logs")] = None,
     steps: Steps = None,
     seconds: Seconds = None,
     seed: TrainingSeed = None,
@@ -344,8 +333,8 @@ def main(
         name = experiment.build().name
         check_settings(experiment)
         if seeds is not None:
-            if seed is not None or go_on or tensorboard is not None:
-                raise ValueError("--seeds: not together with --seed, --resume or --tensorboard; it resumes by itself")
+            if seed is not None or go_on:
+                raise ValueError("--seeds: not together with --seed or --resume; it resumes by itself")
             folder = valid_path(str(out or "results/ppo"))
             work = Work(Store(folder / "jobs"), engine_of(engine, processes, renew=True), fresh, shard=shard_of(shard))
             checkpoints = valid_path(str(runs), "--runs")
@@ -358,11 +347,11 @@ def main(
             raise ValueError("--shard: needs --seeds, whose trainings are jobs")
         target = WEIGHTS / f"{name}.safetensors" if out is None else valid_file(str(out), (".safetensors",), True)
         folder = valid_path(str(runs / name), "--runs")
-        _check_outputs(experiment, target, folder, tensorboard)
+        _check_outputs(experiment, target, folder)
     kept: deque[Run] = deque(maxlen=1)  # only the last one: a run holds all arrays of the model
     with handle_interrupt(), one_line_errors((CheckpointError, OSError)):
         try:
-            run = train(experiment, folder, go_on, tensorboard, kept.append)
+            run = train(experiment, folder, go_on, kept.append)
         except KeyboardInterrupt:
             stays = f"checkpoint in {runs / name}, go on with --resume" if kept else "nothing was learnt yet"
             signals.set_message(f"interrupted; {stays}")
@@ -391,16 +380,12 @@ def run_trainings(jobs: list[Job], folder: Path, work: Work, size: int, stored: 
                 console.print(f"{folder / file_name(job)}: {mean}", soft_wrap=True, highlight=False)
 
 
-def _check_outputs(experiment: Experiment, target: Path, folder: Path, tensorboard: str | None) -> None:
+def _check_outputs(experiment: Experiment, target: Path, folder: Path) -> None:
     """Raise ValueError or OSError, in one line, before any training, if an output cannot be written."""
     if target.with_suffix(".json").is_dir():
         raise ValueError(f"--out {str(target)!r}: its card, {target.with_suffix('.json').name!r}, is a folder")
     for path in (target, path_in(folder)):
         check_room(path, expected_bytes(experiment))
-    if tensorboard is not None:
-        valid_path(tensorboard, "--tensorboard")
-        if find_spec("tensorboard") is None:
-            raise ValueError("--tensorboard: the package tensorboard is not installed")
 
 
 def _export_last_good(saved: Sequence[Run], folder: Path, target: Path) -> str:

@@ -146,7 +146,7 @@ def _race(bench: Bench, name: str, seconds: float, most: Machine | None) -> None
     task: Task = experiment.build()
     contestants = []
     for title, p in settings(experiment.ppo, task.learners):
-        model = build(task, p, None)
+        model = build(task, p)
         work = of_learning(model.policy, p.epochs, of_decisions(task, p.worlds))
         floor = most.floor(work, p.threads) if most and p.threads <= MOST_THREADS else None
         contestants.append(Learning(title, lambda: None, 0, floor, _setting_text(p, task), model, p.threads, seconds))

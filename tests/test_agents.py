@@ -142,7 +142,7 @@ def test_trainings_with_several_seeds_are_jobs_with_the_same_policies(
     assert result.exit_code == 0, "another recipe has a checkpoint of its own"
 
 
-@pytest.mark.parametrize("other", [("--seed", "1"), ("--resume",), ("--tensorboard", "logs")])
+@pytest.mark.parametrize("other", [("--seed", "1"), ("--resume",)])
 def test_seeds_are_refused_beside_options_of_one_training(other: tuple[str, ...]) -> None:
     from agents import ppo
 
@@ -469,7 +469,7 @@ def test_the_learning_rate_stays_positive_beyond_the_budget() -> None:
     from agents import ppo
 
     task = HUNGRY
-    model = ppo.build(task, PpoSettings(**TINY, steps=1), None)
+    model = ppo.build(task, PpoSettings(**TINY, steps=1))
     assert model.lr_schedule(1.0) == pytest.approx(2e-3) and model.lr_schedule(0.0) == pytest.approx(2e-4)
     assert model.lr_schedule(-5.0) == pytest.approx(1e-4)
 

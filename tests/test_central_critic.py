@@ -88,7 +88,7 @@ def settings(**changes: Any) -> Experiment:
 def test_actor_ignores_the_critic_s_observation_and_is_exported() -> None:
     experiment = settings()
     task = experiment.build()
-    model = ppo.build(task, experiment.ppo, None)
+    model = ppo.build(task, experiment.ppo)
     model.learn(192)
     rows = torch.as_tensor(model.env.reset())
     size, other = task.layout.size, rows.clone()

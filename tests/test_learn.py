@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any
 
@@ -37,13 +38,14 @@ SMALL: dict[str, Any] = {
 def trained(algo: str, changes: dict[str, Any] | None = None, **options: Any) -> tuple[Experiment, Run]:
     experiment = effective(Experiment(**{**SMALL, **(changes or {})}), algo, **options)
     run = learn.new_run(experiment, algo)
-    learn.train(experiment, algo, run)
+    with TemporaryDirectory() as folder:
+        learn.train(experiment, algo, run, Path(folder))
     return experiment, run
 
 
 def command(folder: Path, *options: str, changes: dict[str, Any] | None = None) -> Any:
     (folder / "small.yaml").write_text(json.dumps({**SMALL, **(changes or {})}), encoding="utf-8")
-    return CliRunner().invoke(learn.app, [str(folder / "small.yaml"), *options])
+    return CliRunner().invoke(learn.app, [str(folder / "small.yaml"), "--runs", str(folder / "runs"), *options])
 
 
 # --- settings ---------------------------------------------------------------------------------------------------------
@@ -270,12 +272,12 @@ def test_a_seed_determines_the_training(algo: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("algo", ALGORITHMS)
-def test_every_learner_passes_random_on_pursuit(algo: str) -> None:
+def test_every_learner_passes_random_on_pursuit(algo: str, tmp_path: Path) -> None:
     budgets = {"sac": {"steps": 60_000}, "tqc": {"steps": 60_000}, "recurrent_ppo": {}, "bc": {"updates": 600}}
     settings = {"worlds": 256, "rollout": 32, "minibatch": 2048, "evaluate_worlds": 32, "threads": 1, "steps": 600_000}
     experiment = effective(Experiment(task="pursuit", ppo=settings, **{algo: budgets[algo]}), algo)  # type: ignore[arg-type]
     run = learn.new_run(experiment, algo)
-    learn.train(experiment, algo, run)
+    learn.train(experiment, algo, run, tmp_path)
     task = experiment.build()
     random = rollout(task, RandomPolicy(task.action_layout.size, 0), 32, worlds_for("tuning", 0, 32)).returns
     assert run.best is not None and run.best > random.mean() + 3 * random.std()

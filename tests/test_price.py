@@ -139,7 +139,7 @@ def test_care_works_with_a_drawn_price_and_not_with_a_drawn_number_of_learners()
 
     each = experiment(draw=DRAW, care=1.0)
     check_settings(each)
-    model = build(each.build(), each.ppo, None)
+    model = build(each.build(), each.ppo)
     assert isinstance(model.rollout_buffer, CaringBuffer) and isinstance(model.env, DrawnVecEnv)
     model.learn(48)
     assert model.rollout_buffer.acted.shape == (4, 12) and model.rollout_buffer.acted.all()

@@ -28,7 +28,7 @@ def experiment(arguments: dict[str, Any] = PRICED, **changes: Any) -> Experiment
 def test_learning_begins_with_the_policy_and_ignores_what_it_does_not_observe() -> None:
     each = experiment()
     task, p = each.build(), each.ppo
-    model = build(task, p, None)
+    model = build(task, p)
     use_weights(model, starting_policy(p.start or "", task, p.hidden, p.activation))
     mine = MlpPolicy(tensors_of(model), {"activation": "relu"})
     shipped = load_player("ppo", task.model_copy(update={"price": None, "horizon": 250}))
