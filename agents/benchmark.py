@@ -38,6 +38,9 @@ STUDY = ROOT / "configs" / "studies" / "robustness.yaml"
 LEAST = 0.5
 """A player below this home score is marked: it does not solve the tasks."""
 
+GOOD = 0.9
+"""Score, one of THRESHOLDS, for the share of settings in the table: interquartile means hide the worst settings."""
+
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 
@@ -106,10 +109,14 @@ def table(entries: Sequence[Mapping[str, Any]]) -> str:
                 f"`{entry['player']}`{marked}", entry["kind"], str(entry["seeds"]),
                 *(_text(entry[where]["score"]) for where in ("home", "robust")),
                 f"{entry['settings']} of {entry['settings'] + entry['settings_left_out']}",
-                _text(entry["home"]["improvement"]), "–" if cost is None else f"{cost:.2g}",
+                f"{entry['robust']['profile'][str(GOOD)]:.0%}", _text(entry["home"]["improvement"]),
+                "–" if cost is None else f"{cost:.2g}",
             ]
         )  # fmt: skip
-    header = ["player", "kind", "seeds", "home", "robust", "settings", "higher than rules", "µs per decision"]
+    header = [
+        "player", "kind", "seeds", "home", "robust", "settings", f"above {GOOD:g}", "higher than rules",
+        "µs per decision",
+    ]  # fmt: skip
     return "\n\n".join([TITLE, grid(header, rows), NOTES]) + "\n"
 
 
@@ -117,6 +124,7 @@ TITLE = "# Leaderboard"
 NOTES = f"""\
 Score: 0 = random actions, 1 = tuned rules; interquartile mean over tasks (*home*), or over all settings of the
 study (*robust*), with the 95 % stratified bootstrap interval over training seeds and worlds.
+An interquartile mean leaves out the worst quarter: *above {GOOD:g}* is the share of settings with such a score.
 *Higher than rules*: probability of a higher return than tuned rules in the same world. A player below {LEAST:g} does
 not solve the tasks. With one seed, the interval does not contain the luck of training. `python -m agents.benchmark
 PLAYER --out docs/leaderboard` adds an entry; its JSON file has the scores of each task, the performance profile, and

@@ -43,8 +43,8 @@ NOTES = """\
 One agent of each world plays the player of the row, all others that of the column, in the same held-out worlds; each
 learner of a world is that agent equally often. A cell has the mean return of the one agent and, in brackets, what it
 gains over playing as the others do, with its 95 % bootstrap interval over worlds. The picture is coloured by that gain:
-a blue cell is a player that does better among the column's than they do themselves. There is one policy per task, so
-the intervals do not contain the luck of training."""
+a blue cell is a player that does better among the column's than they do themselves. A player of several seeds is the
+one that ships, so the intervals do not contain the luck of training or of the search."""
 
 
 def table_of(payoffs: Payoffs) -> Table:

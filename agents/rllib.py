@@ -127,17 +127,7 @@ def algorithm_config(
         raise ValueError(f"--runners {runners}: must divide ppo.worlds = {p.worlds}")
     envs = worlds if team else worlds * task.learners
     batch, per_step = p.rollout * envs * max(runners, 1), task.learners if team else 1
-    environment: Settings = {
-        "task": task.name,
-        "arguments": {**experiment.arguments, "dtype": p.dtype},
-        "disturbance": p.disturbance.model_dump(),
-        "threads": 1 if runners else p.threads,
-        "first": worlds_for("evaluation" if evaluating else "training", p.seed, p.worlds),
-        "seed": p.seed,
-        "worlds": worlds,
-        "stagger": p.stagger and not evaluating,
-        "reward_scale": 1.0 if evaluating else p.reward_scale,
-    }
+    environment = _environment(experiment, runners, worlds, evaluating)
     register_env("flockenv-rows", RowsEnv)
     register_env("flockenv-team", TeamEnv)
     model = DefaultModelConfig(
@@ -158,20 +148,7 @@ def algorithm_config(
             rollout_fragment_length=p.rollout,
             gym_env_vectorize_mode="sync" if team else "vector_entry_point",
         )
-        .training(
-            train_batch_size_per_learner=batch,
-            minibatch_size=min(p.minibatch, batch),
-            num_epochs=p.epochs,
-            lr=[[0, p.learning_rate], [max(p.steps // per_step, 1), p.learning_rate * 0.1]],
-            gamma=p.gamma,
-            lambda_=p.gae_lambda,
-            clip_param=p.clip,
-            entropy_coeff=p.entropy,
-            vf_loss_coeff=0.5,  # these four are what Stable-Baselines3's PPO has
-            vf_clip_param=float("inf"),
-            grad_clip=0.5,
-            use_kl_loss=False,
-        )
+        .training(**_ppo_settings(p, batch, per_step))
         .debugging(seed=p.seed, log_level="ERROR")
     )
     if team is not None:
@@ -179,6 +156,40 @@ def algorithm_config(
         config.multi_agent(policies=set(policies), policy_mapping_fn=NETWORKS[team])
         actor = MultiRLModuleSpec(rl_module_specs=dict.fromkeys(policies, actor))
     return config.rl_module(rl_module_spec=actor)
+
+
+def _environment(experiment: Experiment, runners: int, worlds: int, evaluating: bool) -> Settings:
+    """Return the settings of the environments of one runner, see `agents.rllib_envs`; worlds: that it steps."""
+    p = experiment.ppo
+    return {
+        "task": experiment.build().name,
+        "arguments": {**experiment.arguments, "dtype": p.dtype},
+        "disturbance": p.disturbance.model_dump(),
+        "threads": 1 if runners else p.threads,
+        "first": worlds_for("evaluation" if evaluating else "training", p.seed, p.worlds),
+        "seed": p.seed,
+        "worlds": worlds,
+        "stagger": p.stagger and not evaluating,
+        "reward_scale": 1.0 if evaluating else p.reward_scale,
+    }
+
+
+def _ppo_settings(p: PpoSettings, batch: int, per_step: int) -> dict[str, Any]:
+    """Return the settings of RLlib's PPO; batch: rows per update; per_step: agent-steps that RLlib counts as one."""
+    return {
+        "train_batch_size_per_learner": batch,
+        "minibatch_size": min(p.minibatch, batch),
+        "num_epochs": p.epochs,
+        "lr": [[0, p.learning_rate], [max(p.steps // per_step, 1), p.learning_rate * 0.1]],
+        "gamma": p.gamma,
+        "lambda_": p.gae_lambda,
+        "clip_param": p.clip,
+        "entropy_coeff": p.entropy,
+        "vf_loss_coeff": 0.5,  # these four are what Stable-Baselines3's PPO has
+        "vf_clip_param": float("inf"),
+        "grad_clip": 0.5,
+        "use_kl_loss": False,
+    }
 
 
 def start() -> bool:

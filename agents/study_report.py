@@ -12,15 +12,23 @@ from flockenv.evaluation.report import grid
 
 __all__ = ["markdown", "score_text", "winner_text"]
 
+RULES = KINDS[0]
+
 NOTES = """\
 Every value changes one thing of the setting that players were made for (home). All players of a setting play the same
 held-out worlds. **Ahead** means that the 95 % interval of the difference of mean returns to the best player of every
-other kind is above zero; otherwise the setting is *level*. If there are several players of a kind, the best one on the
-tuning worlds of that setting stands for it. The number of training or search seeds of a player stands beside its name,
-if there are several; intervals are then two-level bootstraps over seeds and worlds. Those of a single seed are over
-worlds alone, and do not contain the luck of training or of the search; its success: 95 % Wilson. A dash: the player
-cannot read the observations of that setting; *alone*: only one kind can. A value for all tasks is left out where a task
-does not accept it or its time step is unstable."""
+other kind is above zero; otherwise the setting is *level*. Two kinds may be level there and ahead of a third, which the
+last column of the tables names. If there are several players of a kind, the best one on the tuning worlds of that
+setting stands for it. The number of training or search seeds of a player stands beside its name, if there are several;
+intervals are then two-level bootstraps over seeds and worlds. Those of a single seed are over worlds alone, and do not
+contain the luck of training or of the search; its success: 95 % Wilson. A dash: the player cannot read the observations
+of that setting; *alone*: only one kind can. A value for all tasks is left out where a task does not accept it or its
+time step is unstable."""
+
+CHECKED = """\
+`{command} --check 2` plays two stored results, drawn at random, again, and compares the return of
+every world to the four digits that are stored. In {folder}/TASK.json, `digest` is that of a result's settings, worlds
+and players. `commit` names the code of that day; with + it had further changes, so that no history has it."""
 
 AMONG = """\
 **Partners**: one agent of each world, or the share named there, plays the player of the column, and all others the
@@ -33,9 +41,10 @@ def markdown(study: Study, command: str, tasks: Sequence[TaskResults], folder: s
     """Return the page as Markdown; command: that makes it; folder: that of the pictures, as links name it."""
     parts = [
         f"# {study.title}",
-        f"{_sentence(tasks)} Made by `{command}`, {study.worlds} worlds per setting.",
+        f"{_sentence(tasks)} {_behind(tasks)}Made by `{command}`, {study.worlds} worlds per setting.",
         f"![Which kind of player is ahead in which setting]({folder}/summary.png)",
         NOTES,
+        CHECKED.format(command=command, folder=folder),
         *([AMONG] if any(results.groups[PARTNERS] for results in tasks) else []),
         "## Settings in which a kind of player is ahead",
         grid(*_counts(tasks)),
@@ -59,6 +68,16 @@ def _sentence(tasks: Sequence[TaskResults]) -> str:
         if of:
             texts.append(f"{group}: {of} of {counts.total()}")
     return f"Settings in which a kind of player is ahead, by what is varied: {'; '.join(texts)}."
+
+
+def _behind(tasks: Sequence[TaskResults]) -> str:
+    """Return where rules are not enough: settings, by what is varied, in which the best kind is ahead of them."""
+    texts = []
+    for group in GROUPS:
+        settings = [each for results in tasks for each in results.groups[group] if RULES in each.leaders]
+        if settings:
+            texts.append(f"{group}: {sum(RULES in each.behind for each in settings)} of {len(settings)}")
+    return f"Settings in which rules are behind the best kind: {'; '.join(texts)}. " if texts else ""
 
 
 def _counts(tasks: Sequence[TaskResults]) -> tuple[list[str], list[list[str]]]:
@@ -104,7 +123,8 @@ def winner_text(setting: SettingResults) -> str:
         return f"alone: {setting.leaders[setting.first]}"
     name = setting.leaders[setting.first]
     if setting.winner == LEVEL:
-        return f"level ({name} {_signed(lead)})"
+        behind = f"; ahead of {' and '.join(setting.behind)}" if setting.behind else ""
+        return f"level ({name} {_signed(lead)}{behind})"
     return f"{setting.winner}: {name} {_signed(lead)}"
 
 

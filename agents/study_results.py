@@ -134,7 +134,12 @@ class SettingResults:
         """The kind that is ahead of every other; "alone" if no other can play, else "level"."""
         if not self.leads:
             return ALONE
-        return self.first if all(lead.low > 0 for lead in self.leads.values()) else LEVEL
+        return self.first if len(self.behind) == len(self.leads) else LEVEL
+
+    @property
+    def behind(self) -> list[str]:
+        """The kinds to which the lead of the best kind has an interval above zero."""
+        return [kind for kind, lead in self.leads.items() if lead.low > 0]
 
     @property
     def lead(self) -> Interval | None:

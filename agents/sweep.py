@@ -71,11 +71,13 @@ def sweep(
     work: Work,
     changes: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
     choose: bool = True,
+    stored: Mapping[str, Content] = MappingProxyType({}),
 ) -> dict[str, Content]:
     """Play all settings of tasks with all players; return the content of each task's file.
 
     changes: arguments of tasks that hold in every setting. choose: play tuning worlds as well where a kind has several
-    players, to choose the one that stands for it.
+    players, to choose the one that stands for it. stored: results by task that are kept, not played, where settings,
+    worlds and players are the same.
 
     Raises:
         ValueError: in one line, a bad setting or player, before anything is played.
@@ -88,6 +90,8 @@ def sweep(
         ]
         for task in tasks
     }
+    for task in stored.keys() & entries.keys():
+        _keep(entries[task], stored[task])
     waiting = [entry for of_task in entries.values() for entry in of_task if not entry.content]
     jobs = {job.key: job for entry in waiting for job in (*entry.evaluation, *entry.tuning)}  # a grid may have home
     run_jobs(list(jobs.values()), work)
@@ -148,6 +152,18 @@ def _entries(study: Study, setting: Setting, contenders: Sequence[Contender], ch
         if choose and entry.kind not in ("", RANDOM) and kinds.count(entry.kind) > 1:
             entry.tuning = [_job(study, setting, member, "tuning") for member in entry.contender.members]
     return found
+
+
+def _keep(entries: Sequence[_Entry], stored: Content) -> None:
+    """Set the contents of entries that are stored already: by the same digest, with tuning worlds if they need them."""
+    players = {
+        (setting["axis"], setting["value"], name): player
+        for setting in stored["settings"] for name, player in setting["players"].items() if "returns" in player
+    }  # fmt: skip
+    for entry in entries:
+        found = players.get((entry.setting.axis, entry.setting.value, entry.contender.name))
+        if not entry.content and found and found["digest"] == entry.digest:
+            entry.content = found if not entry.tuning or found["tuning_mean"] is not None else {}
 
 
 def _check_partners(setting: Setting, seed: int) -> None:
@@ -214,6 +230,9 @@ def main(
     ] = 0,
     engine: EngineName = "local",
     processes: Processes = None,
+    reuse: Annotated[
+        bool, typer.Option("--reuse", help="Keep results of --out whose settings, worlds and players are the same.")
+    ] = False,
     fresh: Fresh = False,
     shard: ShardText = None,
     debug: Debug = False,
@@ -229,14 +248,16 @@ def main(
         runner, part = engine_of(engine, processes), shard_of(shard)
         if check and part is not None:
             raise ValueError("--check: not together with --shard")
+        if reuse and (check or fresh):
+            raise ValueError("--reuse: not together with --check or --fresh, which play anew")
         with job_bar() as progress:
             work = Work(Store(folder / JOBS), runner, fresh or check > 0, progress, part)
             if check:
                 chosen = {name: before[name] for name in names}
                 raise typer.Exit(0 if _check(plan, chosen, fixed, check, work) else 1)
-            contents = sweep(plan, names, work, fixed)
+            kept = {name: each for name, each in before.items() if each is not None}
+            contents = sweep(plan, names, work, fixed, stored=kept if reuse else {})
         _write(folder, contents)
-        kept = {name: each for name, each in before.items() if each is not None}
         others = {name: each for name, each in kept.items() if each["plan"] == plan_digest(plan, fixed, name)}
         found = {name: read_task(content) for name, content in {**others, **contents}.items()}
         _publish(page, plan, _command(study, out, changes or []), found)

@@ -41,6 +41,7 @@ NOTES = """\
 Return: the mean reward of a world's learners, summed over its episode. A difference is the mean over the same worlds
 against the same player under the setting that it was made for, with a 95 % percentile bootstrap interval over worlds;
 "(level)": the interval contains 0. Of many intervals without a true difference, one in twenty misses 0 by chance.
+A player of several seeds is the one that ships: intervals do not contain the luck of training or of the search.
 Error: the distance of learners, after one second of the same actions, from their positions under RK4 with at least 64
 steps per decision (median over worlds and learners). Evaluations: of the force, per simulated second. Time: physics,
 observations and rewards of one world for one simulated second, in a batch on one thread, without compiling and without

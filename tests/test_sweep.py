@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,8 @@ from typer.testing import CliRunner
 
 from agents.invasion import Among
 from agents.study import HOME, Partners, Study, contenders_of, settings_of
-from agents.study_report import markdown
-from agents.study_results import ALONE, LEVEL, Score, SettingResults, kind_of, read_file, read_task
+from agents.study_report import markdown, winner_text
+from agents.study_results import ALONE, LEVEL, Score, SettingResults, TaskResults, kind_of, read_file, read_task
 from agents.sweep import app, plan_digest, sweep
 from flockenv.evaluation import bootstrap, lead_interval, mean_interval, rollout, worlds_for
 from flockenv.evaluation.report import json_text
@@ -106,6 +107,17 @@ def test_level_unless_the_interval_of_every_lead_is_above_zero() -> None:
     assert ahead.lead is not None and ahead.lead.value == pytest.approx(1.0)
     third = {**ahead.scores, "residual": score("hybrid", 2.0)}
     assert SettingResults("a", "1", third, {}).winner == LEVEL
+
+
+def test_two_kinds_may_be_level_and_ahead_of_a_third() -> None:
+    scores = {"rules": score("rules", 1.0), "ppo": score("policy", 5.0), "residual": score("hybrid", 5.0)}
+    setting = SettingResults("agents", "8", scores, {})
+    assert setting.winner == LEVEL and setting.behind == ["rules"]
+    assert winner_text(setting).endswith("; ahead of rules)")
+    home = SettingResults(HOME, "", {"rules": score("rules", 1.0), "ppo": score("policy", 1.0)}, {})
+    assert home.winner == LEVEL and home.behind == [] and "ahead" not in winner_text(home)
+    page = markdown(small(), "command", [TaskResults("crossing", 40, 0, {}, (home, setting))], "out")
+    assert "Settings in which rules are behind the best kind: home: 0 of 1; task: 1 of 1." in page
 
 
 def test_the_player_of_a_kind_is_chosen_on_tuning_worlds() -> None:
@@ -373,6 +385,39 @@ def test_the_command_writes_and_checks(tmp_path: Path, monkeypatch: pytest.Monke
     assert "2 of 3 worlds equal" in wrong.output
 
 
+def test_stored_results_are_kept_by_reuse_unless_their_player_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    one = {**small().model_dump(mode="json"), "players": {"random": "random", "rules": "rules"}, "everywhere": {}}
+    Path("one.yaml").write_text(json.dumps(one))
+    Path("two.yaml").write_text(json.dumps({**one, "tasks": {"pursuit": {"size": [10, 12]}}}))
+    assert CliRunner().invoke(app, ["one.yaml", "--out", "out", "--processes", "1"]).exit_code == 0
+    first = read_file(Path("out/pursuit.json"))
+    assert first is not None
+    marked, stale = (first["settings"][0]["players"][name] for name in ("random", "rules"))
+    marked["returns"][0][0], stale["returns"][0][0], stale["digest"] = 1234.0, 1234.0, "that of other rules"
+    Path("out/pursuit.json").write_text(json_text(first))
+    shutil.rmtree("out/jobs")
+    run = CliRunner().invoke(app, ["two.yaml", "--out", "out", "--reuse", "--processes", "1"])
+    assert run.exit_code == 0, run.output
+    assert len(list(Path("out/jobs").rglob("*.safetensors"))) == 3, "the stale one, and both players in the new setting"
+    second = read_file(Path("out/pursuit.json"))
+    assert second is not None and [each["value"] for each in second["settings"]] == ["", "10", "12"]
+    home = second["settings"][0]["players"]
+    assert home["random"]["returns"][0][0] == 1234.0 and home["rules"]["returns"][0][0] != 1234.0
+    assert second["settings"][1] == first["settings"][1]
+
+
+def test_reuse_plays_tuning_worlds_that_are_missing(tmp_path: Path) -> None:
+    work = Work(Store(tmp_path / "jobs"), LocalEngine(1))
+    study = small(players={"random": "random", "rules": "rules", "textbook": "textbook"}, everywhere={}, worlds=2)
+    without = sweep(study, ["pursuit"], work, choose=False)
+    found = sweep(study, ["pursuit"], work, stored=without)
+    for setting in found["pursuit"]["settings"]:
+        assert [each["tuning_mean"] is None for each in setting["players"].values()] == [True, False, False]
+
+
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
@@ -381,6 +426,7 @@ def test_the_command_writes_and_checks(tmp_path: Path, monkeypatch: pytest.Monke
         (["--set", "crossing.agents=2"], "--set 'crossing': unknown"),
         (["--set", "pursuit.agents=2"], "tasks.pursuit.agents: unknown"),
         (["--check", "1"], "--check: there are no results in --out"),
+        (["--reuse", "--fresh"], "--reuse: not together with --check or --fresh"),
     ],
 )
 def test_bad_options_are_one_line(

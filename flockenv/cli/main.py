@@ -56,6 +56,7 @@ from flockenv.players import NAMES, trained_task
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from flockenv.envs.disturbance import Disturbance
     from flockenv.model.state import State
     from flockenv.render import Panel
     from flockenv.scene import Scene
@@ -283,15 +284,21 @@ def render(
         panel, fps, left = _film_scene(what, 10.0 if duration is None else duration, seed)
         panels, title = [panel], title_of(what)
     else:
-        if duration is not None:
-            raise ValueError(f"--duration = {duration:g}: only for scenes; an episode of a task ends by itself")
-        task, players = trained_task(what), player.split(",")
-        (panels, fps), left = film_episodes(task, players, seed, trust_pickle, disturbance), ""
-        title = what
+        panels, fps = _film_task(what, player, seed, duration, trust_pickle, disturbance)
+        title, left = what, ""
     with new_folder(path.parent):
         write_picture(path, panels, title, fps, size)
     end = max(panel.snapshots[-1].time for panel in panels)
     new_console().print(f"{relative_path(path)}: {path.stat().st_size:,} bytes, {end:g} s{left}")
+
+
+def _film_task(
+    name: str, player: str, seed: int, duration: float | None, trust_pickle: bool, disturbance: Disturbance
+) -> tuple[list[Panel], float]:
+    """Return an episode of each of the players (a,b) in the same world, as panels, and the frames per second."""
+    if duration is not None:
+        raise ValueError(f"--duration = {duration:g}: only for scenes; an episode of a task ends by itself")
+    return film_episodes(trained_task(name), player.split(","), seed, trust_pickle, disturbance)
 
 
 @app.command()

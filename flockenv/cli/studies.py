@@ -50,6 +50,23 @@ __all__ = [
     "write_numbers",
 ]
 
+Scenes = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="SCENE", help="Scenes of `flockenv list`, or files; not with --suite.", autocompletion=complete_scene
+    ),
+]
+Steps = Annotated[
+    str,
+    typer.Option(metavar="N,M", help="Numbers of steps in which a scene is simulated.", show_default="around its dt"),
+]
+Finer = Annotated[
+    int | None,
+    typer.Option(
+        metavar="N", min=4, help="Steps of the reference per step of the finest run.", show_default="up to 64"
+    ),
+]
+
 FEW = 8
 """Trials for which no processes are started."""
 INTERRUPTED_LATER = "interrupted; results so far are shown"
@@ -57,14 +74,7 @@ INTERRUPTED_LATER = "interrupted; results so far are shown"
 
 
 def accuracy(
-    scenes: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="SCENE",
-            help="Scenes of `flockenv list`, or files; not with --suite.",
-            autocompletion=complete_scene,
-        ),
-    ] = None,
+    scenes: Scenes = None,
     suite: Annotated[bool, typer.Option("--suite", help="Measure the built-in problems instead.")] = False,
     problems: Annotated[
         str, typer.Option(metavar="A,B", help="Only these problems of the suite.", show_default="all")
@@ -73,26 +83,13 @@ def accuracy(
         float | None, typer.Option(metavar="S", help="Simulated time of a scene in seconds.", show_default="about 1")
     ] = None,
     methods: Annotated[str, typer.Option(metavar="A,B", help="Integrators.", show_default="all explicit ones")] = "",
-    steps: Annotated[
-        str,
-        typer.Option(
-            metavar="N,M", help="Numbers of steps in which a scene is simulated.", show_default="around its dt"
-        ),
-    ] = "",
+    steps: Steps = "",
     dts: Annotated[str, typer.Option(metavar="S,S", help="The same, as lengths of a step in seconds.")] = "",
     tolerance: Annotated[
         str, typer.Option(metavar="M,M", help="Errors in metres for which the cheapest method is found.")
     ] = "1e-2,1e-4,1e-6",
     repetitions: Annotated[int, typer.Option(min=0, max=1000, help="Runs; the wall time is their median.")] = 20,
-    finer: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            min=4,
-            help="Steps of the reference per step of the finest run.",
-            show_default="up to 64",
-        ),
-    ] = None,
+    finer: Finer = None,
     seed: Seed = 0,
     out: Annotated[
         str | None, typer.Option(metavar="X.json|X.png", help="Write the numbers; a picture has X.json beside it.")

@@ -63,7 +63,7 @@ class QueueingRules:
     """Reynolds' queue, with the headway of Tordeux, Chraibi and Seyfried 2016."""
 
     headway: float = parameter(1.0, 0.2, 2.0)  # s
-    margin: float = parameter(0.05, 0.0, 0.3)  # m, clearance
+    margin: float = parameter(0.05, 0.0, 0.3, below="bodies touch")  # m, clearance
     gain: float = parameter(8.0, 2.0, 20.0)  # 1/s: at least 4 / headway
     apart: float = parameter(40.0, 0.0, 200.0)  # N m, separation
     radius: float = parameter(0.8, 0.5, 2.0)  # m, between centres, within which it acts
