@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from flockenv.model.appearance import Appearance
 from flockenv.model.networks import Cloth
 from flockenv.model.snapshot import ROLES, Mark, Snapshot
 from flockenv.model.spawn import Spawn
@@ -187,6 +188,13 @@ def test_no_body_covers_the_caption() -> None:
     plain = draw(shot(np.empty((0, 2)), title="x"))
     covered = draw(shot([(5.0, 10.3)], title="x", radius=[2.0], roles=("agent",)))
     assert (covered[:38, :100] == plain[:38, :100]).all()
+
+
+def test_the_legend_leaves_out_roles_that_no_agent_is_drawn_in_the_colour_of() -> None:
+    looks = {"looks": (Appearance(colours=("#d55e00",)), Appearance(size=(0.3, 0.3)))}
+    red, bare, mixed = (draw(shot([(3, 3), (7, 7)], **looks, look=look)) for look in ((0, 0), (1, 1), (0, 1)))
+    dots = [int(close_to(image[:38], rgb(ROLE_COLOURS["evader"][0])).sum()) for image in (red, bare, mixed)]
+    assert dots[0] == 0 < dots[1] == dots[2]
 
 
 def test_obstacles_goals_and_headings_are_drawn() -> None:

@@ -64,7 +64,7 @@ def draw(
     view = view_of(snapshot, size, scale)
     circles = np.column_stack([snapshot.obstacle_centre[:, :2], snapshot.obstacle_radius])
     outlines = tuple(polygon.tobytes() for polygon in snapshot.outlines)
-    backdrop = _draw_backdrop(view, snapshot.title, tuple(dict.fromkeys(snapshot.roles)), circles.tobytes(), outlines)
+    backdrop = _draw_backdrop(view, snapshot.title, _roles_in_their_colours(snapshot), circles.tobytes(), outlines)
     canvas = backdrop.copy()
     pen = ImageDraw.Draw(canvas, "RGBA")
     tracks = [mark for mark in snapshot.marks if mark.kind == "way"]
@@ -165,6 +165,15 @@ def _draw_border(pen: ImageDraw.ImageDraw, view: View) -> None:
 
 
 # ---- caption
+
+
+def _roles_in_their_colours(snapshot: Snapshot) -> tuple[str, ...]:
+    """Return the roles that some agent is drawn in the colour of; an appearance with colours needs no legend."""
+    assert snapshot.look is not None
+    coloured = [bool(look.colours) for look in snapshot.looks] + [False]  # the last for index -1: no appearance
+    return tuple(
+        dict.fromkeys(role for role, k in zip(snapshot.roles, snapshot.look.tolist(), strict=True) if not coloured[k])
+    )
 
 
 @lru_cache(maxsize=8)
