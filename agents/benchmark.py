@@ -101,7 +101,7 @@ def _interval(interval: Interval) -> list[float]:
 def table(entries: Sequence[Mapping[str, Any]]) -> str:
     """Return the page of all entries, the best home score first, as Markdown."""
     rows = []
-    for entry in sorted(entries, key=lambda each: -each["home"]["score"][0]):
+    for entry in sorted(entries, key=lambda each: (-each["home"]["score"][0], each["player"])):
         marked = "" if entry["home"]["score"][0] >= LEAST else " (does not solve the tasks)"
         cost = entry["microseconds_per_decision"]
         rows.append(

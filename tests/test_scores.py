@@ -20,7 +20,7 @@ from agents.study_results import Score, SettingResults, kind_of
 from flockenv.envs.disturbance import Disturbance, make_world
 from flockenv.envs.world import World
 from flockenv.evaluation import rollout, worlds_for
-from flockenv.players import load_player
+from flockenv.players import load_player, weights_file
 from flockenv.players.rules import TUNED
 from flockenv.tasks import Obstacles, Pursuit
 
@@ -98,15 +98,26 @@ def test_trivial_players_fail(path: Path, small: Path) -> None:
     assert "does not solve the tasks" in Path("board.md").read_text()
 
 
-def test_entries_are_ordered_by_score(small: Path) -> None:
-    for player in ("textbook", "ppo"):
-        run = CliRunner().invoke(app, [player, "--study", "study.yaml", "--out", "board", "--processes", "1"])
+def test_entries_are_ordered_by_score_and_files_of_a_policy_have_that_of_its_name(small: Path) -> None:
+    files = str(weights_file("pursuit", None).parent / "{task}.safetensors")
+    for player, name in (("textbook", "textbook"), ("ppo", "ppo"), (files, "mine")):
+        arguments = ["--name", name, "--study", "study.yaml", "--out", "board", "--processes", "1"]
+        run = CliRunner().invoke(app, [player, *arguments])
         assert run.exit_code == 0, run.output
     page = Path("board.md").read_text()
     assert page.index("`ppo`") < page.index("`textbook`")
     entries = [json.loads(path.read_text()) for path in Path("board").glob("*.json")]
     assert table(entries) == page
-    assert {entry["player"]: entry["kind"] for entry in entries} == {"textbook": "rules", "ppo": "policy"}
+    kinds = {entry["player"]: entry["kind"] for entry in entries}
+    assert kinds == {"textbook": "rules", "ppo": "policy", "mine": "policy"}
+    scores = {entry["player"]: (entry["home"], entry["robust"]) for entry in entries}
+    assert scores["mine"] == scores["ppo"]
+
+
+def test_a_policy_of_one_task_alone_is_refused(small: Path) -> None:
+    run = CliRunner().invoke(app, [str(weights_file("pursuit", None)), "--study", "study.yaml", "--out", "board"])
+    assert run.exit_code == 2 and len(run.output.strip().splitlines()) == 1
+    assert "obstacles" in run.output and not Path("board").exists()
 
 
 def test_an_entry_of_all_seeds_has_their_number(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
