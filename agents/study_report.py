@@ -17,13 +17,14 @@ RULES = KINDS[0]
 NOTES = """\
 Every value changes one thing of the setting that players were made for (home). All players of a setting play the same
 held-out worlds. **Ahead** means that the 95 % interval of the difference of mean returns to the best player of every
-other kind is above zero; otherwise the setting is *level*. Two kinds may be level there and ahead of a third, which the
-last column of the tables names. If there are several players of a kind, the best one on the tuning worlds of that
-setting stands for it. The number of training or search seeds of a player stands beside its name, if there are several;
-intervals are then two-level bootstraps over seeds and worlds. Those of a single seed are over worlds alone, and do not
-contain the luck of training or of the search; its success: 95 % Wilson. A dash: the player cannot read the observations
-of that setting; *alone*: only one kind can. A value for all tasks is left out where a task does not accept it or its
-time step is unstable."""
+other kind is above zero; otherwise the setting is *level*, which does not mean that they are equal: with few seeds only
+large differences show. Of settings without any difference, one in twenty has a kind ahead by chance. Two kinds may be
+level and ahead of a third, which the last column of the tables names. If there are several players of a kind, the best
+one on the tuning worlds of that setting stands for it. The number of training or search seeds of a player stands beside
+its name, if there are several; intervals are then two-level bootstraps over seeds and worlds. Those of a single seed
+are over worlds alone, and do not contain the luck of training or of the search; its success: 95 % Wilson. A dash: the
+player cannot read the observations of that setting; *alone*: only one kind can. A value for all tasks is left out where
+a task does not accept it or its time step is unstable."""
 
 CHECKED = """\
 `{command} --check 2` plays two stored results, drawn at random, again, and compares the return of

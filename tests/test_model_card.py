@@ -8,8 +8,9 @@ import pytest
 import yaml
 
 from flockenv.envs.table import ENVIRONMENTS
-from flockenv.players import weights_file
+from flockenv.players import PUBLISHED, weights_file
 from flockenv.players.model_card import model_card
+from flockenv.players.rules import PLAYERS, load_tuned
 from flockenv.tasks import TASKS
 
 
@@ -36,6 +37,21 @@ def test_hubs_find_task_library_and_score_at_the_top_of_the_page(task: str) -> N
     assert result["dataset"]["type"] == ENVIRONMENTS[TASKS[task].__name__].id
     assert result["metrics"][0]["value"] == pytest.approx(card["tuning_mean"], abs=0.005)
     assert result["task"]["type"] == "reinforcement-learning" and model["name"].startswith("ppo-")
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_policy_and_the_rules_that_ship_are_median_runs_and_the_card_says_so(task: str) -> None:
+    card = json.loads(weights_file(task).with_suffix(".json").read_text(encoding="utf-8"))
+    runs = [(card["seed"], card["tuning_mean"], card["seeds"]["scores"])]
+    for name in PUBLISHED:
+        if task in PLAYERS[name]:
+            found = load_tuned(task, name).found
+            runs.append((found["seed"], found["tuning_mean"], found["scores"]))
+    for seed, mean, scores in runs:
+        ordered = sorted(scores.values())
+        assert scores[str(seed)] == ordered[(len(ordered) - 1) // 2] == pytest.approx(mean, rel=1e-4)
+    page = weights_file(task).with_suffix(".md").read_text(encoding="utf-8")
+    assert f"(the median of {len(card['seeds']['scores'])} training seeds, " in page
 
 
 def test_a_page_follows_its_card() -> None:

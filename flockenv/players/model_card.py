@@ -82,7 +82,10 @@ def _training(card: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return what was trained how, as rows of a table."""
     versions = ", ".join(f"{name} {version}" for name, version in card.get("versions", {}).items() if name != "kernel")
     seeds = card.get("seeds", {})
-    scores = f"{len(seeds['scores'])} seeds, {seeds['lowest']:.3g} to {seeds['highest']:.3g}" if seeds else "one seed"
+    scores = "one seed"
+    if seeds:
+        ends = f"{seeds['lowest']:.3g} to {seeds['highest']:.3g}"
+        scores = f"the median of {len(seeds['scores'])} training seeds, {ends}"
     return [
         ("algorithm", str(card.get("algorithm", ""))),
         ("command", f"`{card.get('recipe', {}).get('command', '')}`"),
