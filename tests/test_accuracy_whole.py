@@ -201,7 +201,10 @@ def test_steps_of_further_runs_end_at_other_times(many: int) -> None:
     assert len(set(counts)) == len(counts) == (4 if many == 4 else 6)
 
 
-@pytest.mark.parametrize("response", ["earliest", "back_up", "impulses", "project"])
+SLOWLY = [pytest.param(each, marks=pytest.mark.slow) for each in ("back_up", "project")]
+
+
+@pytest.mark.parametrize("response", ["earliest", "impulses", *SLOWLY])
 def test_the_error_of_a_reference_with_impacts_is_not_understated(response: str) -> None:
     """The response `impulses` delays an impact to the end of a step, which often is the same one in half the steps."""
     for height, e in itertools.product((0.8, 1.0, 1.3, 1.68, 1.94), (0.5, 0.69, 0.8)):

@@ -114,6 +114,7 @@ def test_payoffs_depend_on_both_players_and_are_reproducible() -> None:
     assert [column.header for column in best_response.table_of(payoffs).columns] == ["", "rules", "random"]
 
 
+@pytest.mark.slow
 def test_all_agents_play_in_the_same_disturbance() -> None:
     flock, field, delay = Flock(agents=5, horizon=10), [Player.of("rules")], Disturbance(delay=3)
     payoffs = invasion.invade(flock, field, WORLDS, disturbance=delay)

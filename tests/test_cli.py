@@ -595,6 +595,7 @@ def test_stress_prints_values_and_failures(tried: list[str], capsys: pytest.Capt
     assert not list(Path().glob("*.json"))
 
 
+@pytest.mark.slow
 def test_stress_continues_with_the_findings_of_its_file(tried: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["stress", "--methods", "rk4", "--out", "hard.png"]) == 0
     with Image.open("hard.png") as picture:
@@ -713,7 +714,8 @@ def test_user_error_is_one_line_with_exit_code_2_and_writes_nothing(
 
 SCENE_COMMANDS = [
     "run - --duration 0", "measure - --time 0.1", "render - --out a.png --duration 0", "explain -", "warmup -",
-    "render - --out a.html --duration 0", "accuracy - --seconds 0.1 --steps 1,2,4,8",
+    "render - --out a.html --duration 0",
+    pytest.param("accuracy - --seconds 0.1 --steps 1,2,4,8", marks=pytest.mark.slow),  # one kernel for each method
 ]  # fmt: skip
 
 

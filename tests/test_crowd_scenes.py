@@ -190,6 +190,7 @@ def test_unknown_names_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert "--preset = 'helbing_2001': unknown, did you mean" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_validate_writes_a_page_and_continues_with_earlier_findings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -126,6 +126,7 @@ def test_absent_agents_push_no_agent_in_the_same_place() -> None:
     assert (found[5] == 0).all() and (whole[5] != 0).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [700, WORTH_ARRANGING + 3])
 def test_one_call_of_four_steps_equals_four_calls_if_agents_share_a_place(count: int) -> None:
     """A call may sort agents in memory: ties belong to agent numbers, not to places in memory."""

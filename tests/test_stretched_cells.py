@@ -68,6 +68,7 @@ def test_agents_far_away_do_not_add_candidates(how: Any, outline: tuple[float, .
     assert candidates(scene, moved(state, how)) < 2.5 * candidates(scene, state)
 
 
+@pytest.mark.slow
 def test_agents_far_away_do_not_add_candidates_in_3d() -> None:
     scene = flock(dimension=3)
     state = placed(scene, (50, 50, 50))

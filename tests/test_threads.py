@@ -207,6 +207,7 @@ def test_one_call_of_many_steps_equals_many_calls_of_one_step(name: str) -> None
     )  # their order in space has changed
 
 
+@pytest.mark.slow
 def test_a_team_reorders_smaller_worlds_than_one_thread_does() -> None:
     scene = NAMED["torus_single"].make(FEWEST_ARRANGED, 70.0)
     start = scene.start(3)
@@ -317,6 +318,7 @@ def test_worlds_divided_among_threads_keep_their_bits(variant: Variant, count: i
     assert shared == [2, 3, 7, 8 if count >= steppers.FEWEST_TOGETHER else 7]  # a world per job, or a team of 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("used", [1, 3])
 def test_long_calls_equal_short_ones_however_many_agents_leave_their_tiles(used: int) -> None:
     """3 m/s for 2 s, in tiles of 14 m: few agents have left their tile at first, over a quarter at the end."""
