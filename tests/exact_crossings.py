@@ -57,14 +57,18 @@ def _exact(places: Array) -> list[list[Fraction]]:
 
 
 def _near(before: Array, after: Array, one: Ints, other: Ints) -> tuple[Ints, Ints]:
-    """Return the pairs whose bounding balls over the step overlap."""
-    centres, reaches = [], []
+    """Return the pairs whose bounding balls and boxes over the step overlap."""
+    centres, reaches, boxes = [], [], []
     for part in (one, other):
         places = np.concatenate([before[part], after[part]], axis=1)
         centres.append(places.mean(axis=1))
         reaches.append(np.linalg.norm(places - centres[-1][:, None], axis=2).max())
+        boxes.append((places.min(axis=1), places.max(axis=1)))
     pairs = cKDTree(centres[0]).sparse_distance_matrix(cKDTree(centres[1]), 1.001 * sum(reaches), output_type="ndarray")
-    return pairs["i"], pairs["j"]
+    a, b = pairs["i"], pairs["j"]
+    (low, high), (other_low, other_high) = boxes
+    meet = ((low[a] <= other_high[b]) & (other_low[b] <= high[a])).all(axis=1)
+    return a[meet], b[meet]
 
 
 def _offsets(place: Array, left: Ints, right: Ints) -> Array:
