@@ -90,7 +90,8 @@ def test_the_median_policy_ships_and_the_others_are_kept(tmp_path: Path, target:
             *(f"{name}.{end}" for name in ["weights/pursuit", *kept] for end in ("json", "safetensors")),
         ]
     )
-    assert "| mean return | 8 (4 seeds, 7 to 9) |" in (players.WEIGHTS / "pursuit.md").read_text()
+    page = (players.WEIGHTS / "pursuit.md").read_text()
+    assert "| mean return | 8 (the median of 4 training seeds, 7 to 9) |" in page
     card = json.loads((players.WEIGHTS / "pursuit.json").read_text())
     assert card["seed"] == 1 and card["tuning_mean"] == 8.0
     assert card["seeds"] == {"scores": {"1": 8.0, "2": 9.0, "4": 8.5, "7": 7.0}, "lowest": 7.0, "highest": 9.0}
