@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +18,9 @@ from flockenv.engine.workspace import Workspace
 from flockenv.geometry.shapes import SHAPES, Block, Capsule, Circle, DistanceField, HalfSpace, Polygon, Shape, Wall
 from flockenv.play.edits import Edit, read_edit
 from flockenv.play.history import EVERY, History
+from flockenv.play.limits import pairs_of
 from flockenv.play.link import LONGEST, read_link, write_link
+from flockenv.play.record_paths import with_item
 from flockenv.play.room import Room
 from flockenv.play.scene_lane import SceneLane
 from flockenv.play.task_lane import PlayerFiles, TaskLane, players_of
@@ -123,13 +126,87 @@ def test_steps_after_a_change_of_numbers_allocate_no_scratch(monkeypatch: pytest
     room, allocated = Room([tiny()]), list[int]()
     room.step(2)
     allocate = Workspace.allocate
-    monkeypatch.setattr(Workspace, "allocate", lambda *a: (allocated.append(1), allocate(*a))[1])
+
+    def counted(*arguments: Any) -> Workspace:
+        allocated.append(1)
+        return allocate(*arguments)
+
+    monkeypatch.setattr(Workspace, "allocate", counted)
     room.edit(edit(kind="set", path="effects[0].rate", value=0.25))
     room.step(2)
     assert not allocated
     room.edit(edit(kind="set", path="groups[0].mass", value=2.0))  # which the scratch holds
     room.step(2)
     assert allocated
+
+
+DENSE = """\
+space: {kind: torus, size: [9, 9]}
+groups: [{count: 20000, spawn: {speed: [1, 2]}}]
+effects: [{kind: separation, weight: 1, radius: 0.5}]
+"""
+"""A scene of which only a smaller one is stepped here."""
+
+
+@pytest.mark.parametrize(
+    ("text", "path", "value", "refusal"),
+    [
+        (TINY, "groups[0].count", 300_000, "300,002 agents; a page may ask for at most 250,000"),
+        (
+            DENSE,
+            "groups[0].count",
+            200_000,
+            "a step would compare about",
+        ),
+        (DENSE, "effects[0].radius", 4.0, "a step would compare about 4.0e+08 pairs of agents"),
+        (DENSE, "groups[0].count", 10**9, "agents need about"),
+    ],
+)
+def test_what_would_take_long_to_start_or_step_is_refused_before_anything_is_allocated(
+    text: str, path: str, value: float, refusal: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Other pages see the same worlds, and would wait."""
+    lane = SceneLane(load_scene(text), 3)
+    scene, digest = lane.record, lane.digest
+    monkeypatch.setattr(Workspace, "allocate", lambda *a: pytest.fail("scratch is allocated"))
+    change = edit(kind="set", path=path, value=value)
+    for act in (lane.prepare, lane.apply):
+        with pytest.raises(ValueError, match=re.escape(refusal)) as caught:
+            act(change)
+        assert "\n" not in str(caught.value) and (lane.record, lane.digest) == (scene, digest)
+        assert value == 10**9 or str(caught.value).startswith(f"{path} = {value}: ")
+
+
+def test_a_scene_that_is_large_from_the_start_may_be_changed_but_not_grow(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flockenv.play.limits.MOST_AGENTS", 3)
+    monkeypatch.setattr("flockenv.play.limits.MOST_PAIRS", 1.0)
+    lane = SceneLane(load_scene(DENSE.replace("20000", "40")), 3)
+    for path, value in (("effects[0].weight", 2.0), ("effects[0].radius", 0.1), ("groups[0].count", 39)):
+        lane.prepare(edit(kind="set", path=path, value=value))
+    for path, more in (("effects[0].radius", 3.0), ("groups[0].count", 41)):
+        with pytest.raises(ValueError, match="a page may ask for at most"):
+            lane.prepare(edit(kind="set", path=path, value=more))
+    with pytest.raises(ValueError, match=r"^add_agents = 1: 41 agents"):
+        lane.apply(edit(kind="add_agents"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reach", [0.3, 1.0])
+def test_pairs_are_estimated_as_steps_count_them(reach: float) -> None:
+    scene = load_scene(DENSE.replace("20000", "2000").replace("radius: 0.5", f"radius: {reach}"))
+    state = scene.start(3)
+    assert 0.5 < scene.step(state).work[0, 2] / pairs_of(scene, state.pos[0]) < 2
+
+
+def test_a_law_that_reaches_all_agents_compares_all_pairs_unless_it_joins_far_ones() -> None:
+    scene = load_scene(DENSE.replace("torus", "box").replace("20000", "9000"))
+    far = {"kind": "gravitation", "constant": 1.0, "softening": 0.1}
+    pos = scene.start(3).pos[0]
+    near, all_pairs, joined = (
+        pairs_of(each, pos)
+        for each in (scene, *(with_item(scene, "effects", far | {"opening": x}) for x in (0.0, 0.5)))
+    )
+    assert near < joined < all_pairs == 9000**2
 
 
 def test_time_goes_on_behind_a_gap_of_keyframes() -> None:

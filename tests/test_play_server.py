@@ -22,9 +22,10 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
 from websockets.sync.client import ClientConnection, connect  # noqa: E402
 
 from flockenv.cli.main import main  # noqa: E402
+from flockenv.jit.lock import require_cached  # noqa: E402
 from flockenv.model.group import Group  # noqa: E402
 from flockenv.model.spawn import Spawn  # noqa: E402
-from flockenv.play import messages  # noqa: E402
+from flockenv.play import fields, messages  # noqa: E402
 from flockenv.play.frames import decode_frame  # noqa: E402
 from flockenv.play.server import PlayServer  # noqa: E402
 from flockenv.play.session import Session  # noqa: E402
@@ -226,6 +227,39 @@ def test_frames_and_edits_go_on_while_costs_are_measured(
         wait_for(lambda: lane.record.groups[0].radius == 0.4)
         measured.set()
         assert ask(page, {"type": "frame"}, "costs")["in time"] is True
+
+
+def test_frames_go_on_without_colours_whose_kernel_is_compiled(
+    server: PlayServer, session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Other pages do not wait for it, and the colours come when it is there."""
+    compiled = threading.Event()
+    original, prepare = fields.colour_of, session.prepare
+
+    def needs(lane: Any, name: str) -> fields.Coloured:
+        require_cached("a kernel" if compiled.is_set() else None)
+        return original(lane, "speed")
+
+    monkeypatch.setattr("flockenv.play.frames.colour_of", needs)
+    waits = lambda message: compiled.wait(60) if message.type == "frame" else prepare(message)  # noqa: E731
+    monkeypatch.setattr(session, "prepare", waits)
+    want = {"type": "frame", "want": {"colour": "acceleration"}}
+
+    def colours(frame: bytes) -> bool:
+        return "colour" in decode_frame(frame)[0]["lanes"][0]
+
+    with page_of(server) as page, page_of(server) as other:
+        for each in (page, other):
+            ask(each, HELLO, "room")
+        assert not colours(ask(page, want))
+        other.send(json.dumps({"type": "edit", "edit": {"kind": "move_agent", "agent": 1, "pos": [2.0, 3.0]}}))
+        assert isinstance(ask(other, {"type": "frame"}), bytes)
+        assert session.room is not None and session.room.lanes[0].drawn.pos[:, 1].tolist() == [2.0, 3.0]
+        assert ask(page, want, "notice")["busy"] is True
+        assert not colours(ask(page, want))
+        compiled.set()
+        assert ask(page, want, "notice")["text"] == ""
+        wait_for(lambda: colours(ask(page, want)))
 
 
 def np_of(numbers: list[float]) -> Any:

@@ -1,11 +1,13 @@
-"""The fixed parts of a lane as JSON, which a page needs to draw frames: roles, radii, bonds, faces, obstacles."""
+"""JSON for pages: the fixed parts of a lane, which frames do not have, such as roles, radii, bonds and faces."""
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import json
+import math
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,7 @@ from flockenv.play.task_lane import TaskLane
 from flockenv.render.replay import look_data, round_digits
 from flockenv.scene import Scene
 
-__all__ = ["describe_lane", "faces_of"]
+__all__ = ["describe_lane", "faces_of", "json_data"]
 
 FACES = 20_000
 """Most triangles that are sent; larger surfaces are drawn by their bonds."""
@@ -98,3 +100,27 @@ def _obstacles(lane: Lane, low: NDArray[Any], high: NDArray[Any]) -> list[dict[s
             outlines = shape.outline(low - shift, high - shift)
             found += [{"index": k, "outline": (each + shift[:2]).tolist()} for each in outlines]
     return found
+
+
+def json_data(value: Any) -> dict[str, Any]:
+    """Return a dataclass, record or mapping as JSON data without numbers that JSON lacks."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        raw = {each.name: getattr(value, each.name) for each in dataclasses.fields(value)}
+    else:
+        raw = dict(value) if isinstance(value, Mapping) else value.model_dump()
+    return {name: _plain(each) for name, each in raw.items()}
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON data; None for NaN and infinity."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, (str, int, bytes)):
+        return value
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {str(name): _plain(each) for name, each in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [_plain(each) for each in value]
+    return json_data(value)

@@ -23,6 +23,7 @@ from flockenv.envs.disturbance import Disturbance
 from flockenv.play.edits import MOST_LANES, read_edit
 from flockenv.play.history import Made
 from flockenv.play.lane import Lane, collected_warnings
+from flockenv.play.limits import check_size
 from flockenv.play.messages import LARGEST_TEXT
 from flockenv.play.room import Room
 from flockenv.play.scene_lane import SceneLane
@@ -85,7 +86,9 @@ class Link(Record):
 
     def _lane(self, lane: _LaneLink, files: PlayerFiles) -> Lane:
         if self.task is None:
-            return SceneLane(load(lane.config + "\n", Scene), self.seed, lane.per_tick)
+            scene = load(lane.config + "\n", Scene)
+            check_size("link", scene, self.seed)
+            return SceneLane(scene, self.seed, lane.per_tick)
         if self.task not in TASKS:
             raise ValueError(f"link.task = {printable(self.task)}: unknown{nearest(self.task, TASKS)}")
         task = load(lane.config + "\n", TASKS[self.task])

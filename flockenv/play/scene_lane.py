@@ -31,6 +31,7 @@ from flockenv.play.edits import (
     Set,
 )
 from flockenv.play.lane import Change, Drawn, Scenery, circles_of, collected_warnings, move_agent
+from flockenv.play.limits import check_size
 from flockenv.play.record_paths import value_at, with_item, with_value, without_item
 from flockenv.play.scene_changes import adapted, begins_otherwise, have_same_code, rows_after
 from flockenv.scene import Scene
@@ -205,6 +206,7 @@ class SceneLane:
             return known[1:]
         with collected_warnings() as lines:
             new = _edited(record, edit)
+            check_size(_named(edit), new, self.seed, record, self.state.pos[0])
         fresh = tuple(line for line in lines if line not in self._warned)
         self._warned.update(lines)
         results = [*self._results.items(), (key, (record, new, fresh))]
@@ -253,6 +255,7 @@ class SceneLane:
             raise ValueError(f"at = {edit.at}: must have {scene.dimension} numbers")
         with collected_warnings() as lines:
             new = with_value(scene, f"groups[{edit.group}].count", group.size + edit.count)
+            check_size(f"add_agents = {edit.count}", new, self.seed, scene, self.state.pos[0])
         end = scene.starts[edit.group + 1]
         source = np.insert(np.arange(scene.agents), end, np.full(edit.count, -1))
         state = rows_after(scene, new, self.state, source, self.seed)
@@ -328,6 +331,13 @@ class SceneLane:
     def snapshot(self) -> Snapshot:
         """Return the world at this instant."""
         return self.record.snapshot(self.state)
+
+
+def _named(edit: Edit) -> str:
+    """Return what an edit changes, for a message: its key and value if it has them."""
+    if isinstance(edit, Set):
+        return f"{edit.path} = {printable(edit.value)}"
+    return str(getattr(edit, "path", edit.kind))
 
 
 def _edited(scene: Scene, edit: Edit) -> Scene:

@@ -14,7 +14,7 @@ import json
 import logging
 import secrets
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from http import HTTPStatus
 from typing import Any, Final
@@ -26,6 +26,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from flockenv.core.errors import printable
+from flockenv.jit.lock import NotCachedError, only_cached
 from flockenv.play import messages as m
 from flockenv.play.compiling import Compiler
 from flockenv.play.session import Answer, Session
@@ -68,6 +69,7 @@ class PlayServer:
         self._beside = ThreadPoolExecutor(1, "flockenv-compile")
         self._measuring = ThreadPoolExecutor(1, "flockenv-measure")
         self._compiler = Compiler()
+        self._colouring: asyncio.Task[None] | None = None
         self._pages: set[ServerConnection] = set()
         self._html = page("live", "flockenv", {"version": m.VERSION, "largest": m.LARGEST, "longest": m.LARGEST_TEXT})
         self._pictures = session.pictures()
@@ -123,10 +125,13 @@ class PlayServer:
             await asyncio.sleep(REST)
 
     async def _compile(self) -> None:
-        """Compile the steps of the open worlds if that is due; all pages get a line if it takes long."""
-        if self.session.is_compiled:
-            return
-        task = asyncio.ensure_future(self._aside(self.session.compile))
+        """Compile the steps of the open worlds if that is due."""
+        if not self.session.is_compiled:
+            await self._announced(self._aside(self.session.compile))
+
+    async def _announced(self, work: Coroutine[Any, Any, Any]) -> None:
+        """Wait for what compiles; all pages get a line if it takes long."""
+        task = asyncio.ensure_future(work)
         await asyncio.wait({task}, timeout=PATIENCE)
         is_late = not task.done()
         if is_late:
@@ -271,6 +276,8 @@ class PlayServer:
     async def _answer(self, message: m.Message) -> Sequence[Answer]:
         if isinstance(message, (m.Step, m.Seek)):
             await self._compile()
+        if isinstance(message, m.Frame) and message.want.colour:
+            return await self._coloured(message)
         if self.session.is_long(message):
             work = await self._aside(functools.partial(self.session.prepare, message), message)
         else:
@@ -280,6 +287,31 @@ class PlayServer:
             answers = await asyncio.get_running_loop().run_in_executor(self._measuring, answers)
         found: Sequence[Answer] = answers
         return found
+
+    async def _coloured(self, message: m.Frame) -> Sequence[Answer]:
+        """Return a frame with colours; without them while their kernel is being compiled, for which no page waits."""
+        answer = functools.partial(self.session.answer, message)
+        if self._colouring is None or self._colouring.done():
+            try:
+                coloured: Sequence[Answer] = await self._do(_from_cache, answer)
+                return coloured
+            except NotCachedError:
+                self._colouring = asyncio.create_task(self._compile_colours(message))
+        plain = message.model_copy(update={"want": message.want.model_copy(update={"colour": ""})})
+        without: Sequence[Answer] = await self._do(self.session.answer, plain)
+        return without
+
+    async def _compile_colours(self, message: m.Frame) -> None:
+        try:
+            await self._announced(self._aside(functools.partial(self.session.prepare, message), message))
+        except Exception as error:
+            _log.warning("the colours of a frame were not compiled: %s", _line(error))
+
+
+def _from_cache(work: Callable[[], Any]) -> Any:
+    """Do some work that raises NotCachedError where it would compile."""
+    with only_cached():
+        return work()
 
 
 def _json(data: object) -> str:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import base64
 import dataclasses
 import functools
-import math
 from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter
 from typing import Any
@@ -16,11 +15,12 @@ from typing import Any
 from flockenv.play import messages as m
 from flockenv.play.additions import additions_of
 from flockenv.play.controls import controls_of, titles_of, with_restarts
-from flockenv.play.description import describe_lane
+from flockenv.play.description import describe_lane, json_data
 from flockenv.play.edits import OF_RECORD, Edit, read_edit
-from flockenv.play.fields import colours_of
+from flockenv.play.fields import colour_of, colours_of
 from flockenv.play.frames import encode_frame
 from flockenv.play.lane import Lane
+from flockenv.play.limits import check_size
 from flockenv.play.record_paths import with_value
 from flockenv.play.recording import Recording
 from flockenv.play.room import Room
@@ -122,7 +122,12 @@ class Session:
         return type(message) in self._long
 
     def prepare(self, message: m.Message) -> Rest:
-        """Compile and build what a long message needs, and return the rest; ValueError if it cannot be done."""
+        """Compile and build what a message needs, and return the rest; ValueError if it cannot be done.
+
+        Of the short messages only a frame may need something: a kernel for its colours.
+        """
+        if isinstance(message, m.Frame):
+            return self._colours(message)
         return self._long[type(message)](message)
 
     def twin(self, message: m.Message | None = None) -> Callable[[], object]:
@@ -210,6 +215,7 @@ class Session:
             players = [lane.players[0] for lane in lanes if isinstance(lane, TaskLane)]
             return self._ready(self._room_of(task, players, seed), task.name, _about(task))
         scene, name = load_scene(text), self.name if lanes and isinstance(lanes[0], SceneLane) else "scene"
+        check_size("load", scene, seed)
         return self._ready(Room((SceneLane(scene, seed),)), name, description_of(message.yaml))
 
     def _link(self, message: m.LinkMessage) -> Rest:
@@ -278,6 +284,11 @@ class Session:
         self._encode_time.add(perf_counter() - began)
         return [frame]
 
+    def _colours(self, message: m.Frame) -> Rest:
+        for lane in self._there().lanes:
+            colour_of(lane.made_of(), message.want.colour)
+        return lambda: self._frame(message)
+
     def describe(self) -> dict[str, Any]:
         """Return what a page needs besides frames: lanes, controls, sentences, players."""
         room = self._there()
@@ -290,9 +301,9 @@ class Session:
             "seed": first.seed, "interval": room.interval, "tick": room.tick, "last": room.last,
             "playing": room.playing, "speed": room.speed, "version": room.version,
             "lanes": [describe_lane(lane, name) for lane, name in zip(room.lanes, self._names(), strict=True)],
-            "controls": [_data(control) for control in with_restarts(controls_of(record), first)],
+            "controls": [json_data(control) for control in with_restarts(controls_of(record), first)],
             "titles": titles_of(record),
-            "sentences": [_data(sentence) for sentence in sentences_of(record)] if scene else [],
+            "sentences": [json_data(sentence) for sentence in sentences_of(record)] if scene else [],
             "players": list(self._players) if not scene else [], "colours": list(colours_of(first)),
             "about": self.about, "action": None if scene else _action(record),
             "disturbance": first.disturbance.model_dump() if isinstance(first, TaskLane) else None,
@@ -317,13 +328,13 @@ class Session:
             return lanes[message.lane]
 
         prepare_look(lane())
-        return lambda: [{"type": "look", "lane": message.lane, **_data(look(lane(), message.agent))}]
+        return lambda: [{"type": "look", "lane": message.lane, **json_data(look(lane(), message.agent))}]
 
     def _measures(self, message: m.Measures) -> list[Answer]:
         from flockenv.play.fields import measures_of
 
         room = self._there()
-        lanes = [{name: _data(value) for name, value in measures_of(lane).items()} for lane in room.lanes]
+        lanes = [{name: json_data(value) for name, value in measures_of(lane).items()} for lane in room.lanes]
         for values, apart in zip(lanes, room.apart, strict=True):
             if apart is not None:
                 values["distance to the first world"] = {"value": apart, "unit": "m"}
@@ -339,7 +350,7 @@ class Session:
 
         def measure() -> Later:
             costs = costs_of(self._there().lanes[0])
-            return lambda: [{"type": "costs", **_data(costs())}]
+            return lambda: [{"type": "costs", **json_data(costs())}]
 
         return measure
 
@@ -362,7 +373,7 @@ class Session:
         listed = []
         for each in entries():
             picture = f"pictures/{each.name}.png" if each.picture else None
-            listed.append({**_data(dataclasses.replace(each, picture=None)), "picture": picture})
+            listed.append({**json_data(dataclasses.replace(each, picture=None)), "picture": picture})
         return [{"type": "gallery", "entries": listed}]
 
     # --- keeping ----------------------------------------------------------------------------------------------------
@@ -430,30 +441,6 @@ class _Mean:
 
     def add(self, seconds: float) -> None:
         self.value += (0.1 if self.value else 1.0) * (seconds - self.value)
-
-
-def _data(value: Any) -> dict[str, Any]:
-    """Return a dataclass, record or mapping as JSON data without numbers that JSON lacks."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        raw = {each.name: getattr(value, each.name) for each in dataclasses.fields(value)}
-    else:
-        raw = dict(value) if isinstance(value, Mapping) else value.model_dump()
-    return {name: _plain(each) for name, each in raw.items()}
-
-
-def _plain(value: Any) -> Any:
-    """Return a value as JSON data; None for NaN and infinity."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if value is None or isinstance(value, (str, int, bytes)):
-        return value
-    if hasattr(value, "tolist"):
-        return _plain(value.tolist())
-    if isinstance(value, Mapping):
-        return {str(name): _plain(each) for name, each in value.items()}
-    if isinstance(value, (list, tuple, set, frozenset)):
-        return [_plain(each) for each in value]
-    return _data(value)
 
 
 def _variant(scene: Scene, variant: m.Variant) -> Scene:
