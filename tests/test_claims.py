@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents import cost_of_accuracy
+from agents import best_response, cost_of_accuracy, front, transfer_report
 from agents.benchmark import table
 from agents.search import Coordinates
 from agents.seed_curves import curves_of
@@ -267,6 +267,41 @@ def test_the_leaderboard_is_that_of_its_entries_and_trivial_players_fail() -> No
     assert page == table(entries)
     for path in (ROOT / "agents" / "trivial").glob("[a-z]*.py"):
         assert f"`{path.stem}` (does not solve the tasks)" in page
+
+
+def test_the_map_has_eleven_tasks_with_eight_variations_and_more() -> None:
+    assert {task for task, _, _ in winners()} == TASKS.keys() and len(TASKS) == 11
+    assert min(Counter(task for task, axis, _ in winners() if axis != "home").values()) >= 8
+
+
+def test_players_of_the_transfer_are_those_that_ship_in_the_comparison() -> None:
+    """The same worlds, so the same returns; if this fails, one of both was played with other players."""
+    compared = json.loads((DOCS / "results.json").read_text(encoding="utf-8"))["tasks"]
+    for task, about in json.loads((DOCS / "transfer.json").read_text(encoding="utf-8"))["tasks"].items():
+        trained = about["settings"][about["trained"]]["players"]
+        for name in ("random", "rules", "ppo"):
+            ships = np.mean(compared[task]["players"][name]["returns"][0])
+            assert trained[name]["mean"] == pytest.approx(ships, abs=1e-4), (task, name)
+
+
+def test_pages_of_transfer_fronts_and_partners_are_those_of_their_files() -> None:
+    def content(name: str) -> Any:
+        return json.loads((DOCS / f"{name}.json").read_text(encoding="utf-8"))
+
+    study = load(ROOT / "configs" / "studies" / "price.yaml", Study)
+    fronts = [content(f"fronts/{task}") for task in study.tasks]
+    pages = {
+        name: (DOCS / f"{name}.md").read_text(encoding="utf-8") for name in ("transfer", "fronts", "best_response")
+    }
+    assert pages["transfer"] == transfer_report.markdown(content("transfer"))
+    command = "python -m agents.front configs/studies/price.yaml --out docs/fronts"
+    assert pages["fronts"] == front.markdown(study, command, fronts, "fronts")
+    command = pages["best_response"].split("`")[1]
+    tasks = re.findall(r"training/(\w+)\.yaml", command)
+    payoffs = [content(f"best_response/{task}") for task in tasks]
+    assert pages["best_response"] == best_response.markdown(payoffs, command, "best_response")
+    together = [task for task, kind in TASKS.items() if kind().learners > 1]
+    assert sorted(tasks) == sorted(together), "all tasks with several learners have a matrix"
 
 
 @pytest.mark.parametrize("folder", [pytest.param("study", marks=pytest.mark.slow), "crowd_laws", "study_planner"])
