@@ -159,6 +159,7 @@ def test_a_person_steers_beside_rules(visit: Callable[..., Visit]) -> None:
         wait_for(lambda: float(lane.actions[0, 0]) == 0.0 or bool(lane.stopped))
         here.page.keyboard.press("n")
         here.until("chosen.look !== null && chosen.look.forces !== undefined")
+        assert "drive" in here.value("chosen.look.forces.map(force => force.kind)")
 
 
 def opened(here: Visit, session: Session) -> Room:
@@ -241,6 +242,9 @@ def test_a_world_waits_for_readers_who_want_less_motion(visit: Callable[..., Vis
         here.page.locator(".card[data-name='boids']").click()
         here.until("live.room !== null && !state.playing")
         wait_for(lambda: session.room is not None and not session.room.playing)
+        tick, frames = room_of(session).tick, here.value("live.lastFrame")
+        here.until(f"live.lastFrame > {frames} + 300")
+        assert room_of(session).tick == tick
 
 
 def test_a_recording_is_downloaded_as_a_gif(visit: Callable[..., Visit]) -> None:
@@ -321,6 +325,7 @@ def test_a_world_keeps_its_bits_through_all_that_a_visitor_does(world: Visited, 
     with serving(session) as server, serving(elsewhere) as second:
         here = visit(server.url)
         room = open_from_gallery(here, session, world.name)
+        begin_again(here, room)  # how long it has played depends on the machine
         change_value(here, room, world)
         drag_an_agent(here, room)
         draw_an_obstacle(here, room, world)
@@ -345,10 +350,17 @@ def open_from_gallery(here: Visit, session: Session, name: str) -> Room:
     return opened(here, session)
 
 
+def begin_again(here: Visit, room: Room) -> None:
+    here.page.locator("#again").click()
+    wait_for(lambda: room.tick == 0 and not room.made)
+    here.until("live.header.tick === 0")
+
+
 def press_play(here: Visit, room: Room, on: bool) -> None:
     here.until(f"state.playing === {str(not on).lower()}")
     here.page.locator("#play").click()
-    wait_for(lambda: room.playing == on)
+    wait_for(lambda: room.playing == on or room.ended)
+    assert not room.ended, room.lanes[0].stopped
     here.until("state.playing" if on else f"!state.playing && live.header.tick === {room.tick}")
 
 
@@ -459,8 +471,7 @@ def restart_and_run(here: Visit, server: PlayServer, room: Room, name: str, step
         lane: Any = room.lanes[0]
         wait_for(lambda: set(lane.players) == {"rules"})
         here.page.locator("h1").click()
-    here.page.locator("#again").click()
-    wait_for(lambda: room.tick == 0 and not room.made)
+    begin_again(here, room)
     step_on(here, room, steps)
     here.page.locator("#save").click()
     text = here.page.locator("dialog textarea").input_value() + "\n"

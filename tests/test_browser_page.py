@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip("websockets", reason="needs the extra `play`: pip install 'flockenv[play]'")
 from flockenv.play.session import Session
+from flockenv.scene.yaml_io import load_scene
 from flockenv.tasks import TASKS
 from tests.playground import Visit, serving, wait_for
 from tests.test_browser import chromium, room_of, shown_boids, visit
@@ -65,18 +66,25 @@ def test_a_number_may_be_typed_with_its_unit(boids: Session, visit: Callable[...
         here.page.keyboard.type("3.5 m")
         here.page.keyboard.press("Enter")
         wait_for(lambda: room_of(boids).lanes[0].record.effects[0].radius == 3.5)
+        here.until("document.querySelector(\".value[data-path='effects[0].radius']\") !== null")  # it is no field now
+        assert here.page.locator(".value[data-path='effects[0].radius']").first.inner_text().split() == ["3.5", "m"]
 
 
 def test_a_world_is_saved_and_linked_more_than_once(boids: Session, visit: Callable[..., Visit]) -> None:
     with serving(boids) as server:
         here = opened(visit, server.url)
+        links = []
         for _ in range(2):
             here.page.keyboard.press("s")
             here.page.locator("dialog textarea").wait_for()
+            text = here.page.locator("dialog textarea").input_value()
+            assert load_scene(text + "\n") == room_of(boids).lanes[0].record
             here.page.keyboard.press("Escape")
             here.value("history.replaceState(null, '', '/')")
             here.page.locator("#share").click()
             here.until("location.hash.startsWith('#w=')")
+            links.append(here.value("location.hash"))
+        assert links[0] == links[1]
 
 
 @pytest.mark.parametrize("seed", ["-1", "1e30", ""])
@@ -112,6 +120,7 @@ def test_a_text_that_is_too_long_is_refused_and_the_page_stays(
         here.page.keyboard.press("Escape")
         here.page.locator("#save").click()
         here.until("document.querySelector('dialog textarea').value.includes('groups')")
+        assert load_scene(here.page.locator("dialog textarea").input_value() + "\n") == room_of(boids).lanes[0].record
 
 
 def test_a_text_with_an_error_stays_to_be_mended(boids: Session, visit: Callable[..., Visit]) -> None:
@@ -214,9 +223,10 @@ def test_a_page_connects_again(boids: Session, visit: Callable[..., Visit]) -> N
         here.until("live.socket.readyState === WebSocket.OPEN && live.greeted")
         frames = here.value("live.lastFrame")
         here.until(f"live.lastFrame > {frames}")
-        here.page.keyboard.press("ArrowRight")
         tick = room_of(boids).tick
-        wait_for(lambda: room_of(boids).tick >= tick)
+        here.page.keyboard.press("ArrowRight")
+        wait_for(lambda: room_of(boids).tick > tick)
+        assert room_of(boids).tick == tick + 1
         assert "tries again" not in here.value(TOAST)
 
 
@@ -251,6 +261,7 @@ def test_a_recording_ends_with_its_world(visit: Callable[..., Visit]) -> None:
         here.value("live.send({ type: 'open', what: 'vicsek' })")
         here.until("live.room.name === 'vicsek'")
         here.until("document.getElementById('save').textContent === 'Save'")
+        assert session._recording is None and here.value("live.recording") in (None, "")
 
 
 def test_a_phone_shows_all_actions_and_the_whole_title(boids: Session, visit: Callable[..., Visit]) -> None:
