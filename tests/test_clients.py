@@ -6,18 +6,27 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import re
 import sys
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import yaml
+from stable_baselines3 import PPO
 
 from tests.clients import __main__ as runner
 from tests.clients.__main__ import CLIENTS, HERE, ROOT, head
+from tests.clients.zoo_settings import rl_zoo_settings
 
 PAGE = (ROOT / "docs" / "clients.md").read_text(encoding="utf-8")
-BLOCKS = re.findall(r"^## ([^\n]*)\n[^#]*?```python\n(.*?)```", PAGE, re.DOTALL | re.MULTILINE)
+SECTIONS = re.findall(r"^##+ ([^\n]*)\n(.*?)(?=^##|\Z)", PAGE, re.DOTALL | re.MULTILINE)
+BLOCKS = [
+    (title, code)
+    for title, text in SECTIONS
+    for code in re.findall(r"^```python\n(.*?)```", text, re.DOTALL | re.MULTILINE)
+]
 
 
 @pytest.mark.parametrize("client", CLIENTS)
@@ -46,6 +55,18 @@ def test_code_on_the_page_runs_if_its_libraries_are_installed(title: str, code: 
     if lacking:
         pytest.skip(f"not installed: {', '.join(lacking)}")
     exec(program, {})  # noqa: S102  # the test runs the page's code
+
+
+def test_the_page_has_code_for_each_client() -> None:
+    titles = {title.partition(",")[0] for title, _ in BLOCKS}
+    clients = ("Stable-Baselines3", "sbx", "CleanRL", "TorchRL", "skrl", "Tianshou", "AgileRL", "RLlib")
+    assert {*clients, "Weights & Biases"} <= titles
+
+
+def test_the_hyperparameters_for_rl_zoo_are_arguments_of_its_ppo() -> None:
+    (entry,) = yaml.safe_load(rl_zoo_settings()).values()
+    own = {"n_timesteps", "policy", "n_envs", "normalize"}
+    assert own < entry.keys() and entry.keys() - own <= inspect.signature(PPO).parameters.keys()
 
 
 PLAYED = """
@@ -84,8 +105,10 @@ def test_results_before_a_script_fails_are_in_the_table(
 def test_source_for_a_client_is_the_package(tmp_path: Path) -> None:
     copy = runner.source(tmp_path / "source")
     packages = {path.relative_to(ROOT) for path in (ROOT / "flockenv").rglob("*.py")}
-    assert packages == {path.relative_to(copy) for path in copy.rglob("*.py")}
+    assert packages == {path.relative_to(copy) for path in (copy / "flockenv").rglob("*.py")}
     assert (copy / "pyproject.toml").read_bytes() == (ROOT / "pyproject.toml").read_bytes()
+    assert (copy / "setup.py").is_file(), "scenes join the wheel by it"
+    assert len(list((copy / "configs" / "scenes").glob("*.yaml"))) > 30
 
 
 def test_pytest_does_not_collect_the_scripts() -> None:

@@ -34,7 +34,8 @@ def head(client: str) -> dict[str, Any]:
 def source(folder: Path) -> Path:
     """Return a copy of what the package is built from: pip would leave build/ and egg-info in the repository."""
     shutil.copytree(ROOT / "flockenv", folder / "flockenv", ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+    shutil.copytree(ROOT / "configs" / "scenes", folder / "configs" / "scenes")
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, folder)
     return folder
 

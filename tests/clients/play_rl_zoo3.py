@@ -3,7 +3,7 @@
 # [tool.flockenv]
 # constraints = "configs/constraints.txt"
 # ///
-"""RL Baselines3 Zoo: its training script, with our package named and settings of our own."""
+"""RL Baselines3 Zoo: its training script, with our package named and the settings of docs/clients.md."""
 
 import subprocess
 import sys
@@ -11,22 +11,12 @@ import tempfile
 from pathlib import Path
 
 from row import IDS, STEPS, row
-
-SETTINGS = """
-{env_id}:
-  n_timesteps: !!float {steps}
-  policy: MlpPolicy
-  n_envs: 4
-  n_steps: 250
-  batch_size: 100
-  n_epochs: 2
-  normalize: true
-"""
+from zoo_settings import rl_zoo_settings
 
 for env_id in IDS:
     with row("rl_zoo3", "rl_zoo3.train --algo ppo, id", env_id), tempfile.TemporaryDirectory() as folder:
         settings = Path(folder, "ppo.yml")
-        settings.write_text(SETTINGS.format(env_id=env_id, steps=STEPS), encoding="utf-8")
+        settings.write_text(rl_zoo_settings().replace("flockenv/Pursuit-v0", env_id), encoding="utf-8")
         command = [
             sys.executable,
             "-m",
@@ -37,6 +27,8 @@ for env_id in IDS:
             env_id,
             "--gym-packages",
             "flockenv",
+            "-n",
+            str(STEPS),
         ]
         options = ["-conf", settings, "-f", folder, "--eval-freq", "5000", "--eval-episodes", "4", "--verbose", "0"]
         subprocess.run([*command, *options], check=True, cwd=folder, stdout=sys.stderr)
