@@ -274,6 +274,17 @@ def test_a_phone_shows_all_actions_and_the_whole_title(boids: Session, visit: Ca
             here.page.locator(f"#{name}").bounding_box()["y"] for name in ("worlds", "again", "save", "share", "open")
         }
         assert len(rows) == 1
+        assert not here.page.locator("#seed").is_visible()
+        here.page.locator("#open").click()
+        for name in ("seed", "trails"):
+            box = here.page.locator(f"#{name}").bounding_box()
+            assert box["x"] >= 0 and box["x"] + box["width"] <= 400, name
+        here.page.locator("#trails").click()
+        for seed in (5, 0):
+            here.page.locator("#seed").fill(str(seed))
+            here.page.locator("#seed").press("Enter")
+            wait_for(lambda seed=seed: room_of(boids).lanes[0].seed == seed)  # type: ignore[misc]
+        here.page.locator("#open").click()
         assert here.value("document.querySelector('h1').scrollWidth <= document.querySelector('h1').clientWidth")
         assert here.value("document.documentElement.scrollWidth <= innerWidth")
 

@@ -847,6 +847,13 @@ def test_full_disk_is_one_line_with_the_file_and_leaves_no_files(name: str, tmp_
     assert [path.name for path in tmp_path.iterdir()] == ["tiny.yaml"]
 
 
+def test_the_command_line_is_a_module_too() -> None:
+    command = [sys.executable, "-m", "flockenv.cli.main", "play", "boidz"]
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert re.fullmatch("flockenv: .*boidz.*did you mean .boids.*\n", done.stderr)
+
+
 def test_no_arguments_show_the_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 2
     assert "Usage:" in capsys.readouterr().out

@@ -464,3 +464,7 @@ def _film_scene(file: str, duration: float, seed: int) -> tuple[Panel, float, st
     snapshots = list(trajectory.snapshots(title=title_of(file)))
     panel = Panel("", snapshots, None, trajectory.stopped)
     return panel, 1.0 / (every * scene.dt), _unsolved_text(trajectory.last)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -146,6 +146,6 @@ function dress(dark) {
   paint = pick(data.paper); roleColour = pick(data.roles);
   paint.accent = roleColour.evader; paint.chip = dark ? paint.grid : "#e3e8ef";
   for (const [name, colour] of Object.entries(paint)) document.documentElement.style.setProperty("--" + name, colour);
-  document.documentElement.style.colorScheme = dark ? "dark" : "light";
+  document.documentElement.style.colorScheme = document.documentElement.dataset.theme = dark ? "dark" : "light";
   if (state.group) { makeLegend(state.group); refresh(); }
 }

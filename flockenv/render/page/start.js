@@ -98,8 +98,16 @@ function readSeed() {
   if (live.room) field.value = live.room.seed;
 }
 
+/* On a small screen the seed and the switch of trails are in the sheet. */
+function startMore() {
+  const small = matchMedia("(max-width: 900px)"), seed = document.querySelector(".seed"), trails = $("trails").parentElement;
+  const place = () => { if (small.matches) $("more").append(seed, trails); else { $("again").before(seed); $("colour").before(trails); } };
+  small.addEventListener("change", place);
+  place();
+}
+
 function start() {
-  makeTools(); startTabs(); startDrawnList(); showLook();
+  makeTools(); startTabs(); startDrawnList(); startMore(); showLook();
   $("worlds").onclick = () => openGallery(true);
   $("again").onclick = () => live.send({ type: "seed" });
   $("seed").onchange = readSeed;
