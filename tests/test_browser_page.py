@@ -283,7 +283,8 @@ def test_a_phone_shows_all_actions_and_the_whole_title(boids: Session, visit: Ca
         for seed in (5, 0):
             here.page.locator("#seed").fill(str(seed))
             here.page.locator("#seed").press("Enter")
-            wait_for(lambda seed=seed: room_of(boids).lanes[0].seed == seed)  # type: ignore[misc]
+            here.until(f"live.room.seed === {seed}")  # else its news would overwrite what is typed next
+            assert room_of(boids).lanes[0].seed == seed
         here.page.locator("#open").click()
         assert here.value("document.querySelector('h1').scrollWidth <= document.querySelector('h1').clientWidth")
         assert here.value("document.documentElement.scrollWidth <= innerWidth")
