@@ -38,6 +38,8 @@ STUDY = ROOT / "configs" / "studies" / "robustness.yaml"
 LEAST = 0.5
 """A player below this home score is marked: it does not solve the tasks."""
 
+DIGITS = 6
+"""Significant digits of returns: with few, those of players that are nearly alike would be ties."""
 GOOD = 0.9
 """Score, one of THRESHOLDS, for the share of settings in the table: interquartile means hide the worst settings."""
 
@@ -196,7 +198,7 @@ def main(
         others = _other_entries(folder, called, load(study, Study))
         with job_bar(lines=False) as progress:
             work = Work(Store(folder / JOBS), engine_of(engine, processes), fresh, progress, shard_of(shard))
-            contents = sweep(plan, list(plan.tasks), work, choose=False)
+            contents = sweep(plan, list(plan.tasks), work, choose=False, digits=DIGITS)
         results = [read_task(content) for content in contents.values()]
         entry = entry_of(called, player, plan_digest(load(study, Study)), results, contents)
         text = json_text(entry)

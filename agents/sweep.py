@@ -72,12 +72,13 @@ def sweep(
     changes: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
     choose: bool = True,
     stored: Mapping[str, Content] = MappingProxyType({}),
+    digits: int = DIGITS,
 ) -> dict[str, Content]:
     """Play all settings of tasks with all players; return the content of each task's file.
 
     changes: arguments of tasks that hold in every setting. choose: play tuning worlds as well where a kind has several
     players, to choose the one that stands for it. stored: results by task that are kept, not played, where settings,
-    worlds and players are the same.
+    worlds and players are the same. digits: significant ones of a return.
 
     Raises:
         ValueError: in one line, a bad setting or player, before anything is played.
@@ -96,7 +97,7 @@ def sweep(
     jobs = {job.key: job for entry in waiting for job in (*entry.evaluation, *entry.tuning)}  # a grid may have home
     run_jobs(list(jobs.values()), work)
     return {
-        task: {"plan": plan_digest(study, changes, task), **_content(study, of_task, work.store)}
+        task: {"plan": plan_digest(study, changes, task), **_content(study, of_task, work.store, digits)}
         for task, of_task in entries.items()
     }
 
@@ -117,13 +118,13 @@ def plan_digest(
     return hashlib.sha256(json.dumps([plan, fixed]).encode()).hexdigest()[:16]
 
 
-def _content(study: Study, entries: Sequence[_Entry], store: Store) -> Content:
+def _content(study: Study, entries: Sequence[_Entry], store: Store, digits: int) -> Content:
     """Return the content of a task's file, once all jobs are done."""
     settings: dict[str, Content] = {}
     for entry in entries:
         about = {"axis": entry.setting.axis, "value": entry.setting.value, "players": {}}
         setting = settings.setdefault(entry.setting.name, about)
-        setting["players"][entry.contender.name] = entry.content or _played(entry, store, _commit())
+        setting["players"][entry.contender.name] = entry.content or _played(entry, store, _commit(), digits)
     task = entries[0].setting.task
     arguments = task.model_dump(mode="json")
     home = {entry.setting.axis: arguments[entry.setting.axis] for entry in entries if entry.setting.axis in arguments}
@@ -190,7 +191,7 @@ def _job(study: Study, setting: Setting, player: Player, purpose: Any) -> Job:
     )  # fmt: skip
 
 
-def _played(entry: _Entry, store: Store, commit: str | None) -> Content:
+def _played(entry: _Entry, store: Store, commit: str | None, digits: int = DIGITS) -> Content:
     """Return the results of an entry from the records of its jobs."""
     episodes = [store.read(job, episodes_of_bytes) for job in entry.evaluation]
     tuning = [store.read(job, episodes_of_bytes) for job in entry.tuning]
@@ -201,7 +202,7 @@ def _played(entry: _Entry, store: Store, commit: str | None) -> Content:
         "microseconds": rounded(float(np.median([each.microseconds for each in episodes]))),
         "tuning_mean": rounded(float(np.mean([each.returns.mean() for each in tuning]))) if tuning else None,
         "success": ["".join("01"[int(mark)] for mark in each.success) for each in episodes],
-        "returns": [[rounded(value, DIGITS) for value in each.returns] for each in episodes],
+        "returns": [[rounded(value, digits) for value in each.returns] for each in episodes],
     }
 
 

@@ -16,7 +16,7 @@ from agents import benchmark
 from agents.benchmark import app, table
 from agents.planners import mppi
 from agents.scores import aggregate
-from agents.study_results import Score, SettingResults, kind_of
+from agents.study_results import Score, SettingResults, kind_of, read_task
 from flockenv.envs.disturbance import Disturbance, make_world
 from flockenv.envs.world import World
 from flockenv.evaluation import rollout, worlds_for
@@ -65,6 +65,19 @@ def test_the_interval_contains_the_luck_of_seeds() -> None:
     assert same.high - same.low == pytest.approx(alone.high - alone.low, rel=0.25)
     one = aggregate({name: setting(seeds[:1]) for name in "abcd"}, "mine").score
     assert one.high - one.low < interval.high - interval.low  # of one seed only the luck of worlds is seen
+
+
+def test_players_that_differ_in_the_fifth_digit_are_no_ties(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    returns: list[float] = []
+    monkeypatch.setattr(benchmark, "read_task", lambda content: returns.extend(_returns(content)) or read_task(content))
+    run = CliRunner().invoke(app, ["textbook", "--study", "study.yaml", "--out", "board", "--processes", "1"])
+    assert run.exit_code == 0, run.output
+    assert max(len(f"{abs(value):.12g}".replace(".", "").lstrip("0")) for value in returns) == 6
+
+
+def _returns(content: Any) -> list[float]:
+    players = [player for setting in content["settings"] for player in setting["players"].values()]
+    return [value for player in players for row in player["returns"] for value in row]
 
 
 def test_improvement_counts_ties_half() -> None:
