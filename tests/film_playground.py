@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from PIL import Image, ImageDraw
 
 from flockenv.play.gallery import description_of, text_of
@@ -26,6 +27,9 @@ OUT = Path(__file__).resolve().parent.parent / "docs" / "play"
 WIDTH, HEIGHT, SHOWN = 1280, 720, 800
 """Size of the page, and the width of a film, pixels."""
 
+SMALL = 560
+"""Width of a film in which almost everything moves, pixels."""
+
 DURATION = 80
 """Time of a picture, ms."""
 
@@ -38,8 +42,8 @@ POINTER = ((0, 0), (0, 17), (4, 13), (7, 19), (10, 18), (7, 12), (12, 12))
 class Film:
     """Pictures of a page with its pointer."""
 
-    def __init__(self, here: Visit, room: Room) -> None:
-        self.here, self.room, self.pictures = here, room, list[Image.Image]()
+    def __init__(self, here: Visit, room: Room, shown: int) -> None:
+        self.here, self.room, self.pictures, self.shown = here, room, list[Image.Image](), shown
         self.at = (WIDTH * 0.4, HEIGHT * 0.9)
 
     def take(self, count: int = 1) -> None:
@@ -48,7 +52,7 @@ class Film:
         picture = Image.open(io.BytesIO(self.here.page.screenshot())).convert("RGB")
         shape = [(self.at[0] + x, self.at[1] + y) for x, y in POINTER]
         ImageDraw.Draw(picture).polygon(shape, "#1d2633", "#ffffff", 1)
-        self.pictures += [picture.resize((SHOWN, SHOWN * HEIGHT // WIDTH), Image.Resampling.LANCZOS)] * count
+        self.pictures += [picture.resize((self.shown, self.shown * HEIGHT // WIDTH), Image.Resampling.LANCZOS)] * count
 
     def step(self, pictures: int, steps: int = 1) -> None:
         """Let the world make some steps before each picture."""
@@ -120,9 +124,22 @@ def players(film: Film) -> None:
     film.take(10)
 
 
+def space(film: Film) -> None:
+    """A bird in space is clicked, and the world is turned while the forces on it are shown."""
+    pos = film.room.lanes[0].drawn.pos
+    middle = np.abs(pos - pos.mean(axis=1, keepdims=True)).max(axis=0).argmin()
+    film.click(film.here.pixel(int(middle)))
+    film.here.until("chosen.look !== null && chosen.look.forces !== undefined")
+    film.step(3, 2)
+    box = film.here.page.locator("canvas.world").bounding_box()
+    film.drag((box["x"] + 20, box["y"] + 40), (box["x"] + 190, box["y"] + 190), 7)
+    film.step(7, 2)
+
+
 FILMS: dict[str, tuple[str, tuple[str, ...], int, Callable[[Film], None]]] = {
     "rules": ("boids", (), 160, rules),
     "players": ("pursuit", ("rules", "ppo", "you"), 0, players),
+    "space": ("boids3d", (), 200, space),
 }
 """Films by name: what is open, with which players, at which step the film begins, and what happens in it."""
 
@@ -142,7 +159,7 @@ def make(browser: Any, name: str) -> None:
         here = Visit(browser, server.url, WIDTH)
         here.page.set_viewport_size({"width": WIDTH, "height": HEIGHT})
         here.until(f"live.room !== null && live.header.tick === {start} && views.every(v => v.eye)")
-        film = Film(here, session.room)
+        film = Film(here, session.room, SMALL if name == "space" else SHOWN)
         act(film)
         film.save(OUT / f"{name}.webp")
         here.close()

@@ -251,6 +251,20 @@ def test_one_frame_is_asked_for_at_a_time(boids: Session, visit: Callable[..., V
         assert here.value("most") == 1
 
 
+def test_pictures_that_take_long_are_drawn_once_a_frame(boids: Session, visit: Callable[..., Visit]) -> None:
+    """Those between two frames would keep the page from reading the next one."""
+    with serving(boids) as server:
+        here = opened(visit, server.url)
+        here.value("live.request = () => {}, state.playing = true, 0")
+        for took, more in ((0, True), (1e9, False)):
+            before = here.value(f"(drawn.ms = {took}, drawn.count)")
+            if more:
+                here.until(f"drawn.count > {before} + 5")
+            else:
+                here.page.wait_for_timeout(400)
+                assert here.value("drawn.count") <= before + 1
+
+
 def test_a_recording_ends_with_its_world(visit: Callable[..., Visit]) -> None:
     session = shown_boids()
     with serving(session) as server:

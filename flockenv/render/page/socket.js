@@ -2,6 +2,7 @@
 const MAGIC = 0x01464c46; // "FLF" and the version 1, little endian: see flockenv/play/frames.py
 const BLOCKS = { pos: Uint16Array, heading: Uint8Array, tilt: Int8Array, shade: Uint8Array, identity: Uint16Array, field: Uint8Array, arrows: Int8Array };
 const QUESTIONS = { yaml: "save", link: "share" }; // the questions of answers with another name
+const SLOW = 12; // ms; slower pictures are drawn only when a frame has come, because those between would keep the page from reading it
 const RETRY = 1000; // ms until a page without a connection tries again; each time it waits longer
 const live = {
   socket: null, room: null, waiting: false, askedAt: 0, toldAt: 0, lastFrame: 0, header: {}, want: { colour: "", field: "" }, listeners: {}, timing: {}, last: null,
@@ -135,6 +136,7 @@ const live = {
     this.waiting = true; this.askedAt = performance.now();
     this.send({ type: "frame", want: { ...this.want, scenery: state.group.panels.map(p => p.sceneryKey === undefined ? -1 : p.sceneryKey) } });
   },
+  get saves() { return drawn.ms > SLOW; },
   hasEnded: panel => Boolean(panel.ended),
   words: panel => panel.note || "",
   /* Pixels above and below all panels, and those of each panel's caption. */

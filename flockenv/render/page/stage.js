@@ -55,7 +55,7 @@ function schedule() {
     state.queued = false;
     if (!views.length) return;
     if (source.advance(now)) schedule();
-    if (!state.dirty && !state.playing) return;
+    if (!state.dirty && (!state.playing || source.saves)) return;
     state.dirty = false;
     render();
   });
