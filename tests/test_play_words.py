@@ -206,7 +206,13 @@ def test_controls_of_tasks_have_units() -> None:
         assert controls["control_dt"].unit == "s" and controls["horizon"].kind == "integer"
 
 
-def test_controls_say_what_begins_the_world_again() -> None:
+def test_controls_say_what_begins_the_world_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also if a scene was open before in which no other value of a field could be tried: speeds from 0 to 0."""
+    monkeypatch.setattr("flockenv.play.controls._known", {})
+    still = SceneLane(load_scene("groups: [{count: 3, spawn: {low: [0, 0], high: [9, 9]}}]\n"))
+    assert {each.path: each for each in with_restarts(controls_of(still.record), still)}[
+        "groups[0].spawn.speed[0]"
+    ].restarts is None
     lane = SceneLane(scene_from(ROOT / "configs" / "scenes" / "boids.yaml"))
     controls = {each.path: each for each in with_restarts(controls_of(lane.record), lane)}
     assert controls["groups[0].count"].restarts and controls["groups[0].spawn.speed[0]"].restarts

@@ -274,7 +274,7 @@ def _round_up(x: float) -> float:
 
 # --- what begins again ------------------------------------------------------------------------------------------------
 
-_known: dict[tuple[type, str, type], bool | None] = {}
+_known: dict[tuple[type, str, type], bool] = {}
 """Whether values of a field of a record begin a world again; by record, field and what is played."""
 
 
@@ -295,10 +295,10 @@ def _restarts(control: Control, lane: Lane) -> bool | None:
     if control.value is None:
         return _known.get(key)
     if key not in _known:
-        _known[key] = next(
-            (found for value in _nudged(control) if (found := lane.would_restart(control.path, value)) is not None),
-            None,
-        )
+        tried = (lane.would_restart(control.path, value) for value in _nudged(control))
+        if (found := next((each for each in tried if each is not None), None)) is None:
+            return None  # another scene may have room for another value
+        _known[key] = found
     return _known[key]
 
 
@@ -321,6 +321,6 @@ def _nudged(control: Control) -> Iterator[Any]:
     elif control.kind == "integer" and value is not None:
         yield from (value + 1, value - 1)
     elif control.kind == "number" and value is not None:
-        yield from (value * 1.01 + 1e-3 * (value == 0), value * 0.99)
+        yield from (value * 1.01, value * 0.99) if value else (1e-3, -1e-3)
     elif control.kind == "choice":
         yield from (choice for choice in control.choices if choice != value)
