@@ -27,7 +27,7 @@ OUT = Path(__file__).resolve().parent.parent / "docs" / "play"
 WIDTH, HEIGHT, SHOWN = 1280, 720, 800
 """Size of the page, and the width of a film, pixels."""
 
-SMALL = 560
+SMALL = 480
 """Width of a film in which almost everything moves, pixels."""
 
 DURATION = 80
