@@ -1,8 +1,8 @@
 """What steering around many obstacles costs: `python -m benchmarks.obstacles`.
 
-2,000 agents under `avoid_obstacles`, or another behaviour, among 1 to 1,000 obstacles, one per 25 m^2, or in 3-D per
-125 m^3. Every call does ten steps from the same beginning. What a step of an agent costs with many shapes, against what
-it costs with ten.
+2,000 agents under `avoid_obstacles`, another behaviour, or hard collisions, among 1 to 10,000 obstacles, one per
+25 m^2, or in 3-D per 125 m^3. Every call does ten steps from the same beginning. What a step of an agent costs with
+many shapes, against what it costs with ten.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ from benchmarks.scenes import step_from_start
 from flockenv.behaviours import AvoidObstacles, FollowWall, ForceField, Whiskers
 from flockenv.geometry.shapes import Block, Capsule, Circle, Shape
 from flockenv.model.spawn import Spawn
+from flockenv.physics.constraints import Collisions
 from flockenv.physics.effects.effect import Effect
 from flockenv.scene import Group, Scene
 
 __all__ = ["agents_among_obstacles"]
 
 AGENTS, STEPS = 2_000, 10
-COUNTS = (1, 4, 10, 100, 1_000)
+COUNTS = (1, 4, 10, 100, 1_000, 10_000)
 APART = 5.0  # m, between obstacles
 FEWEST = 10  # obstacles that the plane has room for: with fewer, the same agents are in the same plane
 
@@ -42,7 +43,10 @@ BEHAVIOURS: dict[str, Effect] = {
 def agents_among_obstacles(
     count: int, kind: Kind = "block", dtype: str = "float64", dimension: int = 2, behaviour: str = "avoid_obstacles"
 ) -> Scene:
-    """Return agents among a number of obstacles that lie near the points of a square or cubic lattice."""
+    """Return agents among a number of obstacles that lie near the points of a square or cubic lattice.
+
+    behaviour: one of BEHAVIOURS, or collisions: agents that do not steer, and bounce off obstacles.
+    """
     side, rows = APART * max(count, FEWEST) ** (1 / dimension), math.ceil(round(count ** (1 / dimension), 9))
     rng = np.random.default_rng(1)
     obstacles = []
@@ -53,9 +57,11 @@ def agents_among_obstacles(
         count=AGENTS, radius=0.2, max_speed=2, max_force=10,
         spawn=Spawn(low=(0,) * dimension, high=(side,) * dimension, speed=(1.5, 2)),
     )  # fmt: skip
+    effects = (BEHAVIOURS[behaviour],) if behaviour in BEHAVIOURS else ()
+    constraints = () if behaviour in BEHAVIOURS else (Collisions(agents=False),)
     return Scene(
-        dimension=dimension, groups=(agents,), obstacles=tuple(obstacles), effects=(BEHAVIOURS[behaviour],), dt=0.02,
-        dtype=dtype,
+        dimension=dimension, groups=(agents,), obstacles=tuple(obstacles), effects=effects, constraints=constraints,
+        dt=0.02, dtype=dtype,
     )  # fmt: skip
 
 
@@ -74,13 +80,14 @@ def main(
     dtype: Annotated[Literal["float32", "float64"], typer.Option(help="Precision of the scene.")] = "float64",
     dimension: Annotated[int, typer.Option(min=2, max=3, help="2 or 3.")] = 2,
     behaviour: Annotated[
-        Literal["avoid_obstacles", "whiskers", "force_field", "follow_wall"], typer.Option(help="What agents do.")
+        Literal["avoid_obstacles", "whiskers", "force_field", "follow_wall", "collisions"],
+        typer.Option(help="What agents do."),
     ] = "avoid_obstacles",
     quick: Quick = False,
     rounds: Rounds = None,
     out: Out = None,
 ) -> None:
-    """Measure agent-steps per second among 1 to 1,000 obstacles, as ratios to 10 of them."""
+    """Measure agent-steps per second among 1 to 10,000 obstacles, as ratios to 10 of them."""
     with Bench("obstacles", quick, rounds, out) as bench:
         contestants = []
         for count in COUNTS:

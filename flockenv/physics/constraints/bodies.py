@@ -80,6 +80,7 @@ class Meetings(NamedTuple):
     listed: Any  # 1 = among the active
     active: Any  # meetings with a time, and some that no longer have one
     todo: Any  # (2 places,) meetings whose time is to be computed
+    near: Any  # (2, places) pairs found by the grid of obstacles, as numbers, and their order
 
 
 class Things(NamedTuple):
@@ -92,6 +93,9 @@ class Things(NamedTuple):
     drift: Any  # (M, D) m/s, its velocity in this step
     size: Any  # (M,) m, radius of a disc or ball, 0 for other shapes; negative = absent
     restitution: Any  # (M,) of its surface
+    moving: Any  # (K,) the obstacles that move
+    cells: Any  # the grid over all obstacles, see flockenv/geometry/shapes/cells.py
+    listed: Any  # (1,) 1 if the grid holds: there is one, and the round obstacles are where the scene has them
 
 
 class Rules(NamedTuple):

@@ -61,16 +61,17 @@ def _obstacles(
     period: Vec, things: Things, obstacle_x: Any, obstacle_radius: Any, b: int, begun: float, ended: float
 ) -> None:
     """Compute positions and velocities of the obstacles of world b in this step; its own round ones come first."""
-    for m in range(things.row.shape[0]):
-        if m < obstacle_radius.shape[1]:
+    if things.listed[0] == 0:
+        for m in range(obstacle_radius.shape[1]):
             radius = np.float64(obstacle_radius[b, m])
             things.size[m] = radius if radius > 0.0 else -1.0
             write_vector(things.place, m, load_vector(period, obstacle_x, b, m))
-        else:
-            here = shift_of(things.table, things.row[m], begun, period)
-            there = shift_of(things.table, things.row[m], ended, period)
-            write_vector(things.place, m, add(vector_at(period, things.anchor, m), here))
-            write_vector(things.drift, m, scale(sub(there, here), 1.0 / (ended - begun)))
+    for k in range(things.moving.shape[0]):
+        m = things.moving[k]
+        here = shift_of(things.table, things.row[m], begun, period)
+        there = shift_of(things.table, things.row[m], ended, period)
+        write_vector(things.place, m, add(vector_at(period, things.anchor, m), here))
+        write_vector(things.drift, m, scale(sub(there, here), 1.0 / (ended - begun)))
 
 
 @kernel

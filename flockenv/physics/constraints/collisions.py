@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from pydantic import Field
 from flockenv.core.warnings import UnsolvedContactsWarning
 from flockenv.geometry.cell_list import MAX_RANGES
 from flockenv.geometry.shapes import HalfSpace, pack_shapes
+from flockenv.geometry.shapes.cells import FEWEST_ROWS, cells_of
 from flockenv.geometry.space import Box, Torus
 from flockenv.jit.section import entry
 from flockenv.model.scene_view import SceneView
@@ -91,7 +92,7 @@ class Collisions(Constraint):
 
     def numbers(self, scene: SceneView) -> int:
         """Return the memory of bodies, ends and meetings, in numbers per agent."""
-        return int(8 * scene.dimension + 12 + self.capacity * (12 + 4 * scene.dimension))
+        return int(8 * scene.dimension + 12 + self.capacity * (14 + 4 * scene.dimension))
 
     def settler(self, scene: SceneView) -> Settler:
         """Return a function that corrects a step."""
@@ -121,7 +122,7 @@ class _Settler:
             np.zeros(max(n, 64), np.int64), np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n + 1, np.int32),
             np.zeros((1, n), np.int32), np.zeros((1, 6)), np.zeros(8, np.int64), np.zeros((MAX_RANGES, 3), np.int64),
         )  # fmt: skip
-        self.things = self._obstacles()
+        self.things, self.given = self._obstacles(), self._given_circles()
         self.report, self.lost = np.zeros(COUNTED, np.int64), np.zeros(LOST)
         self._make_room(record.capacity * n + 64)
 
@@ -135,7 +136,7 @@ class _Settler:
         self.meetings = Meetings(
             who=zeros(places), other=zeros(places), time=np.zeros(places), hits=zeros(places), closed=zeros(places),
             deep=np.zeros(places), following=zeros(2, places), listed=zeros(places), active=zeros(places),
-            todo=zeros(2 * places),
+            todo=zeros(2 * places), near=zeros(2, places),
         )  # fmt: skip
         self.contacts = Contacts(
             who=zeros(places), other=zeros(places), normal=np.zeros((places, d)), allowed=np.zeros(places),
@@ -165,15 +166,39 @@ class _Settler:
             for _ in range(count):
                 rows.append(at)
                 at += int(table[at])
-        circles = len(scene.circles) if self.record.obstacles else 0
-        m = circles + len(rows)
-        anchor, elastic = np.zeros((m, d)), np.array(restitution, float)
-        for k, at in enumerate(rows, circles):
-            anchor[k], elastic[k] = table[at + 2 : at + 2 + d], restitution[circles + int(table[at + 1])]
+        circles = scene.circles if self.record.obstacles else ()
+        every = [*circles, *(shapes[int(table[at + 1])] for at in rows)]
+        anchor, elastic = np.zeros((len(every), d)), np.array(restitution, float)
+        for k, at in enumerate(rows, len(circles)):
+            anchor[k], elastic[k] = table[at + 2 : at + 2 + d], restitution[len(circles) + int(table[at + 1])]
+        moving = [k for k, shape in enumerate(every) if shape.moves]
         return Things(
-            table=np.append(table, 0.0), row=np.array([POINT] * circles + rows, np.int64), anchor=anchor,
-            place=np.zeros((m, d)), drift=np.zeros((m, d)), size=np.zeros(m), restitution=elastic,
+            table=np.append(table, 0.0), row=np.array([POINT] * len(circles) + rows, np.int64), anchor=anchor,
+            place=anchor.copy(), drift=np.zeros(anchor.shape), size=np.zeros(len(every)), restitution=elastic,
+            moving=np.array(moving, np.int64), cells=self._grid_over(every), listed=np.zeros(1, np.int64),
         )  # fmt: skip
+
+    def _grid_over(self, obstacles: list[Any]) -> Floats:
+        """Return the grid over all obstacles, whose rows are their numbers; empty if there are few."""
+        if len(obstacles) < FEWEST_ROWS:
+            return np.zeros(0)
+        return cells_of(obstacles, range(len(obstacles)), np.array(self.period) if self.period[0] > 0 else None)
+
+    def _given_circles(self) -> tuple[Floats, Floats]:
+        """Return centres (D, 1, M), m, and radii (1, M), m, of the round obstacles of the scene, in its precision."""
+        scene, given = self.scene, self.scene.circles if self.record.obstacles else ()
+        centre = np.array([circle.centre for circle in given], scene.dtype).reshape(-1, scene.dimension)
+        return centre.T[:, None], np.array([[circle.radius for circle in given]], scene.dtype)
+
+    def _choose_grid(self, centre: Floats, radius: Floats) -> None:
+        """Use the grid, if there is one, and if the round obstacles of all worlds are where the scene has them."""
+        things, expected = self.things, self.given
+        same = len(things.cells) > 0 and radius.shape[1] == expected[1].shape[1]
+        same = same and bool((radius == expected[1]).all() and (centre == expected[0]).all())
+        if same and not things.listed[0]:
+            many = radius.shape[1]
+            things.place[:many], things.size[:many] = expected[0][:, 0].T, expected[1][0]
+        things.listed[0] = same
 
     def __call__(self, x0: Floats, v0: Floats, state: State, first: int, end: int) -> tuple[int, int]:
         """Correct the steps of worlds [first, end); return the first (world, agent) that is not finite, or (-1, -1)."""
@@ -183,6 +208,7 @@ class _Settler:
             min(r.again, r.most) if r.response == "back_up" else r.most, 1e-12, r.agents, False,
         )  # fmt: skip
         circles = slice(None) if r.obstacles else slice(0, 0)
+        self._choose_grid(state.obstacle_x[:, :, circles], state.obstacle_radius[:, circles])
         spread = np.inf if r.part_speed is None else r.part_speed * self.scene.dt
         bad, unsolved, lost = (-1, -1), 0, np.zeros(LOST)
         while first < end:

@@ -132,7 +132,7 @@ def gather_contacts(
             contacts.rank[found] = dot(middle, up)
             contacts.order[found] = found
             found += 1
-    _sort(contacts.rank, contacts.order, found)
+    sort_by_rank(contacts.rank, contacts.order, found)
     return found
 
 
@@ -157,7 +157,7 @@ def _obstacle_displacement(period: Vec, things: Things, j: int, seconds: float) 
 
 
 @kernel
-def _sort(rank: Any, order: Any, count: int) -> None:
+def sort_by_rank(rank: Any, order: Any, count: int) -> None:
     """Sort the first `count` entries of `order` by rank: heapsort."""
     end = count
     start = count // 2

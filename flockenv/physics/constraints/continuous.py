@@ -56,8 +56,8 @@ def may_pass(period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: f
     turned: True if impacts have changed the paths of bodies.
     """
     drift = 0.0
-    for m in range(things.row.shape[0]):
-        drift = max(drift, norm(vector_at(period, things.drift, m)) if things.size[m] >= 0.0 else 0.0)
+    for k in range(things.moving.shape[0]):
+        drift = max(drift, norm(vector_at(period, things.drift, things.moving[k])))
     for i in range(bodies.living.shape[0]):
         if bodies.living[i] > 0 and bodies.light[i] > 0.0:
             moved = norm(_path(period, bodies, ends, i, seconds)) if turned else bodies.reach[i]
