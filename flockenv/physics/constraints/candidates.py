@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from flockenv.geometry.shapes.cells import count_of, entry_length, is_near_box, list_of, row_of_entry, span_of
+from flockenv.geometry.shapes.cells import count_of, is_near_box, list_of, row_of_entry, span_of
 from flockenv.geometry.shapes.row_header import bound_of
 from flockenv.geometry.shapes.row_header import vector_at as vector_in
 from flockenv.jit.decorators import Vec, kernel, law
@@ -116,7 +116,7 @@ def _list_by_grid(
     Return their number; if it exceeds the capacity, not all are written.
     """
     n, found, capacity = bodies.living.shape[0], 0, meetings.near.shape[1]
-    length = entry_length(len(period))
+    length = 1 + 2 * len(period)  # see cells.entry_length
     for i in range(n):
         if bodies.living[i] > 0 and bodies.light[i] > 0.0:
             x = vector_at(period, at, i)
