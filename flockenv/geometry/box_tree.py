@@ -96,4 +96,4 @@ def overlapping_pairs(tree: BoxTree, boxes: NDArray[np.float64]) -> tuple[NDArra
         query, node = query[meet], node[meet]
         if not len(node) or node[0] >= leaves - 1:  # all nodes are of one level
             return query, tree.order[node - leaves + 1].astype(np.int64)
-        query, node = np.repeat(query, 2), (2 * node[:, None] + [1, 2]).ravel()  # type: ignore[assignment]
+        query, node = np.repeat(query, 2), np.asarray((2 * node[:, None] + [1, 2]).ravel(), np.int64)

@@ -97,9 +97,10 @@ class _FaceSettler:
         self.circles = len(scene.circles) if record.obstacles else 0
         v = len(self.mesh.light)
         self.motion = Motion(*(np.zeros((v, 3)) for _ in range(3)), *(np.zeros(v, np.int64) for _ in range(3)))
-        self.zones = Zones(  # type: ignore[call-arg]
-            *(np.zeros(v, np.int64) for _ in range(4)), np.zeros((v, 3)), np.zeros((v, 3)), np.zeros((v, SUMS))
-        )
+        self.zones = Zones(
+            parent=np.zeros(v, np.int64), size=np.zeros(v, np.int64), still=np.zeros(v, np.int64),
+            held=np.zeros(v, np.int64), before=np.zeros((v, 3)), speed=np.zeros((v, 3)), sums=np.zeros((v, SUMS)),
+        )  # fmt: skip
         self.where, self.report = np.array(WHERE, np.int64), np.zeros(5, np.int64)
         self._make_room(4 * len(self.mesh.edges) + 64)
 

@@ -280,7 +280,7 @@ class Elastic(Effect):
         tied = self.matrix(network, dimension).tobsr((dimension, dimension))
         sizes = np.linalg.norm(tied.data, ord=2, axis=(1, 2))
         row = np.repeat(np.arange(network.size), np.diff(tied.indptr))
-        return np.bincount(row, sizes, network.size)  # type: ignore[return-value]
+        return np.asarray(np.bincount(row, sizes, network.size), np.float64)
 
     def potential(self, groups: Sequence[Any], state: State, offset: Any) -> Floats:
         """Return u . K u / 2, (B,) J; corotated: the sum of V (G |S - 1|^2 + L tr(S - 1)^2 / 2)."""
