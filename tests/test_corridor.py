@@ -241,3 +241,13 @@ def test_snapshot_has_a_role_for_each_direction() -> None:
     assert 0 < east.sum() < 8
     assert [name.endswith("2") for name in moved.roles] == (~east).tolist()
     assert [name.removesuffix(" 2") for name in moved.roles] == ["learner"] * 6 + ["agent"] * 2
+
+
+def test_rules_act_on_each_row_alone_however_many_are_computed_together() -> None:
+    task = Corridor()
+    rules, seen = player(task, name="rules"), np.random.default_rng(3).uniform(-1, 1, (1100, task.layout.size))
+    together = rules.predict(seen)[0]
+    np.testing.assert_array_equal(
+        together, np.concatenate([rules.predict(seen[k : k + 7])[0] for k in range(0, 1100, 7)])
+    )
+    assert rules.predict(seen[:0])[0].shape == (0, *together.shape[1:])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -105,6 +106,12 @@ def sampled_velocity(see: Any, task: Corridor, p: SampledRules) -> NDArray[np.fl
     The cost is the deviation from the desired speed, with charges for an early touch, for speed across the corridor,
     for walls, and for being outside the right half. As in the paper, others are expected to make a part of the change.
     """
+    parts = [slice(first, first + _TOGETHER) for first in range(0, max(len(see.velocity), 1), _TOGETHER)]
+    return np.concatenate([_sampled(_rows_of(see, part), _rows_of(p, part)) for part in parts])
+
+
+def _sampled(see: SimpleNamespace, p: SimpleNamespace) -> NDArray[np.float64]:
+    """Return the forces of `sampled_velocity` in some rows, (R, 2) N."""
     own = see.velocity[:, None]
     along = see.desired_speed[:, None] * _ALONG
     x, y = (own[..., k] + (v - own[..., k]) / per_row(p.share) for k, v in enumerate((along, _ACROSS)))
@@ -129,23 +136,24 @@ _ACROSS, _ALONG = (
 _WALL_TIME, _SOONEST = 0.5, 0.05  # s, within which reaching a wall costs; least time to a touch
 
 
-_TOGETHER = 256
+_TOGETHER = 512
 """Rows computed together: an array with a number for each of their velocities then fits into a core's cache."""
+
+
+def _rows_of(values: Any, part: slice) -> SimpleNamespace:
+    """Return some rows of what is seen, or of parameters: those of each array; a number is that of all rows."""
+    return SimpleNamespace(**{k: v[part] if isinstance(v, np.ndarray) else v for k, v in vars(values).items()})
 
 
 def _time_to_touch(x: NDArray[np.float64], y: NDArray[np.float64], see: Any, clearance: Any) -> NDArray[np.float64]:
     """Return the time until the agent touches another at velocities (x, y), (R, K) m/s, in a frame at rest; or inf."""
-    soonest = np.full(x.shape, np.inf)
-    least = np.broadcast_to(clearance * clearance, (len(x), 1))
-    for first in range(0, len(x), _TOGETHER):
-        part = slice(first, first + _TOGETHER)
-        present = see.neighbour_present[part] > 0
-        for k in np.flatnonzero(present.any(axis=0)):
-            to, velocity = see.neighbours[part, k], see.velocity[part] + see.neighbour_velocity[part, k]
-            u, v = x[part] - velocity[:, :1], y[part] - velocity[:, 1:]
-            near, closing = np.sum(to * to, axis=-1)[:, None] - least[part], to[:, :1] * u + to[:, 1:] * v
-            room = closing * closing - (u * u + v * v) * near
-            time = np.maximum(near, 0.0) / np.maximum(closing + np.sqrt(np.maximum(room, 0.0)), 1e-9)
-            time[~((closing > 0.0) & (room >= 0.0) & present[:, k, None])] = np.inf
-            np.minimum(soonest[part], time, out=soonest[part])
+    soonest, present = np.full(x.shape, np.inf), see.neighbour_present > 0
+    for k in np.flatnonzero(present.any(axis=0)):
+        to, velocity = see.neighbours[:, k], see.velocity + see.neighbour_velocity[:, k]
+        u, v = x - velocity[:, :1], y - velocity[:, 1:]
+        near, closing = np.sum(to * to, axis=-1)[:, None] - clearance * clearance, to[:, :1] * u + to[:, 1:] * v
+        room = closing * closing - (u * u + v * v) * near
+        time = np.maximum(near, 0.0) / np.maximum(closing + np.sqrt(np.maximum(room, 0.0)), 1e-9)
+        time[~((closing > 0.0) & (room >= 0.0) & present[:, k, None])] = np.inf
+        np.minimum(soonest, time, out=soonest)
     return soonest
