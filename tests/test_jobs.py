@@ -131,6 +131,17 @@ def test_equal_arrays_are_written_once() -> None:
     assert twice < once + 200
 
 
+def test_one_object_in_several_places_is_written_once_and_read_as_one() -> None:
+    inner, other = Sample("in", (1.0,), {}), Sample("other", (2.0,), {})
+    outer = Sample("out", (inner, other, inner), {"again": inner})
+    once, often = (len(records.to_bytes([outer] * count)) for count in (1, 9))
+    assert often < once + 200
+    first, second = records.from_bytes(records.to_bytes([outer, outer]), (Sample,))
+    assert first is second
+    assert first.values[0] is first.values[2] is first.by_name["again"] is not first.values[1]
+    assert [first.values[0].name, first.values[1].name] == ["in", "other"]
+
+
 def test_a_record_of_an_unexpected_class_and_damaged_bytes_are_refused() -> None:
     data = records.to_bytes(Sample("a", (np.arange(9.0),), {}))
     with pytest.raises(ValueError, match=r"^damaged: "):
