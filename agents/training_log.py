@@ -42,7 +42,8 @@ def write_log(model: BaseAlgorithm, folder: Path, console: Console) -> Iterator[
     finally:
         logger.close()
         turn_off_log(model)
-        if (place / "progress.csv").stat().st_size == 0:
+        rows = place / "progress.csv"
+        if rows.exists() and rows.stat().st_size == 0:  # a folder that somebody removed must not cost the policy
             shutil.rmtree(place)
 
 

@@ -241,7 +241,10 @@ def test_frames_go_on_without_colours_whose_kernel_is_compiled(
         return original(lane, "speed")
 
     monkeypatch.setattr("flockenv.play.frames.colour_of", needs)
-    waits = lambda message: compiled.wait(60) if message.type == "frame" else prepare(message)  # noqa: E731
+
+    def waits(message: Any) -> Any:
+        return compiled.wait(60) if message.type == "frame" else prepare(message)
+
     monkeypatch.setattr(session, "prepare", waits)
     want = {"type": "frame", "want": {"colour": "acceleration"}}
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import csv
+import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from agents import learn, ppo, training_log
 from agents.experiment import Experiment
@@ -53,6 +55,13 @@ def test_a_training_that_continues_logs_what_follows_into_the_next_folder(tmp_pa
 
 def test_no_log_stays_of_a_training_that_was_interrupted_before_its_first_row(tmp_path: Path) -> None:
     interrupt(PURSUIT, tmp_path, points=0)
+    assert not (tmp_path / "log_1").exists()
+
+
+def test_a_log_that_is_removed_during_a_training_does_not_end_it(tmp_path: Path) -> None:
+    model = ppo.build(PURSUIT.build(), PURSUIT.ppo)
+    with training_log.write_log(model, tmp_path, Console(quiet=True)):
+        shutil.rmtree(tmp_path / "log_1")
     assert not (tmp_path / "log_1").exists()
 
 

@@ -29,7 +29,7 @@ from flockenv.geometry.shapes.row_header import outside_box, shift_of, velocity_
 from flockenv.geometry.shapes.table import law_of
 from flockenv.jit.decorators import Vec, kernel, law, like
 from flockenv.jit.section import call_in_turn, section, vector
-from flockenv.maths.vectors import add, dot, scale, sub, zero
+from flockenv.maths.vectors import add, dot, equal_coordinates, scale, sub, zero
 
 __all__ = ["obstacles_of"]
 
@@ -325,15 +325,6 @@ def _near_a_ray(folds: tuple[Fold, ...]) -> Callable[..., bool]:
 
 
 @law
-def _equal_coordinates(x: Vec, length: float) -> Vec:
-    """Return the vector of x's dimension whose coordinates are all `length`."""
-    if len(x) == 2:
-        return (length, length)
-    else:
-        return (length, length, length)
-
-
-@law
 def _grow(low: Vec, high: Vec, spot: Vec) -> tuple[Vec, Vec]:
     """Return the corners of a box, grown to hold a point."""
     a, b = (min(low[0], spot[0]), min(low[1], spot[1])), (max(high[0], spot[0]), max(high[1], spot[1]))
@@ -357,8 +348,8 @@ def _box(folds: tuple[Fold, ...], only_rays: bool) -> Callable[..., tuple[Vec, V
             low, high, wide = span(numbers, me, seen)
             wide = wide * like(wide, LOOSE)
             room = scale(sub(high, low), half)
-            return add(x, scale(add(low, high), half)), add(room, _equal_coordinates(x, wide))
-        return x, _equal_coordinates(x, seen)
+            return add(x, scale(add(low, high), half)), add(room, equal_coordinates(x, wide))
+        return x, equal_coordinates(x, seen)
 
     return box
 

@@ -17,6 +17,7 @@ __all__ = [
     "axis",
     "cross",
     "dot",
+    "equal_coordinates",
     "exact_dot",
     "exact_sum",
     "lateral",
@@ -77,6 +78,15 @@ def zero(a: Vec) -> Vec:
         return (o, o)
     else:
         return (o, o, o)
+
+
+@law
+def equal_coordinates(x: Vec, length: float) -> Vec:
+    """Return the vector of x's dimension whose coordinates are all `length`."""
+    if len(x) == 2:
+        return (length, length)
+    else:
+        return (length, length, length)
 
 
 @law

@@ -7,8 +7,8 @@ from typing import Any
 from flockenv.geometry.shapes.cells import count_of, is_near_box, list_of, row_of_entry, span_of
 from flockenv.geometry.shapes.row_header import bound_of
 from flockenv.geometry.shapes.row_header import vector_at as vector_in
-from flockenv.jit.decorators import Vec, kernel, law
-from flockenv.maths.vectors import add, dot, norm, scale, sub
+from flockenv.jit.decorators import Vec, kernel
+from flockenv.maths.vectors import add, dot, equal_coordinates, norm, scale, sub
 from flockenv.physics.constraints.bodies import Bodies, Meetings, Rules, Things, add_to_lists
 from flockenv.physics.constraints.broad_phase import list_near_pairs, nearest_image, vector_at
 from flockenv.physics.constraints.contacts import NEARLY, Ends, sort_by_rank
@@ -120,7 +120,7 @@ def _list_by_grid(
     for i in range(n):
         if bodies.living[i] > 0 and bodies.light[i] > 0.0:
             x = vector_at(period, at, i)
-            room = _in_all_directions(period, bodies.radius[i] + touch + reach[i])
+            room = equal_coordinates(period, bodies.radius[i] + touch + reach[i])
             span = span_of(things.cells, 0, x, room)
             for k in range(count_of(span)):
                 begin, end = list_of(things.cells, 0, x, span, k)
@@ -133,15 +133,6 @@ def _list_by_grid(
                             meetings.near[0, found], meetings.near[1, found] = m * n + i, found
                         found += 1
     return found
-
-
-@law
-def _in_all_directions(period: Vec, length: float) -> Vec:
-    """Return the vector whose coordinates are all `length`."""
-    if len(period) == 2:
-        return (length, length)
-    else:
-        return (length, length, length)
 
 
 @kernel
