@@ -43,7 +43,7 @@ def write_log(model: BaseAlgorithm, folder: Path, console: Console) -> Iterator[
         logger.close()
         turn_off_log(model)
         rows = place / "progress.csv"
-        if rows.exists() and rows.stat().st_size == 0:  # a folder that somebody removed must not cost the policy
+        if rows.exists() and rows.stat().st_size == 0:  # gone if the folder was removed meanwhile
             shutil.rmtree(place)
 
 
