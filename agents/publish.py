@@ -20,7 +20,7 @@ from agents.experiment import one_line_errors
 from agents.summary_chart import write_summary
 from flockenv.cli.terminal import run_program
 from flockenv.core.atomic_files import write_all_or_none
-from flockenv.evaluation.report import Results, grid, seeds_text
+from flockenv.evaluation.report import Results, conditions, grid, seeds_text
 from flockenv.players import NAMES
 from flockenv.studies.comparison import WORLDS
 from flockenv.tasks import TASKS
@@ -112,6 +112,8 @@ def _read_comparison(file: Path) -> Results:
     what = f"a comparison with {others[0]}, which does not ship," if others else ""
     what = f"a part of a comparison, without {missing[0]}," if missing else what
     what = f"a quick look (--smoke, or less than {WORLDS} worlds)" if results["smoke"] else what
+    if results.get("changes") or any(results.get("disturbance", {}).values()):
+        what = f"a comparison of {conditions(results)}"
     if what:
         raise ValueError(f"{file}: {what} must not be published")
     return results

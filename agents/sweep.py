@@ -24,16 +24,16 @@ from agents.compare import JOBS, folder_of, pick, provenance, split, write_text
 from agents.invasion import worlds_among
 from agents.study import Contender, Setting, Study, contenders_of, settings_of
 from agents.study_results import RANDOM, TaskResults, kind_of, read_file, read_task
+from flockenv.cli.compare import changes_of
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
 from flockenv.cli.options import Debug
 from flockenv.cli.terminal import job_bar, report_errors, run_program
 from flockenv.core.atomic_files import write_all_or_none
-from flockenv.core.errors import printable
 from flockenv.core.output_paths import valid_file
 from flockenv.evaluation.report import json_text, rounded
 from flockenv.jobs import Job, Store, Work, engine_of, run_jobs
 from flockenv.players.policy import OtherSlotsError
-from flockenv.scene.yaml_io import load, parse_scalar
+from flockenv.scene.yaml_io import load
 from flockenv.studies.play_jobs import Player, episodes_of_bytes, play_job
 
 __all__ = ["app", "plan_digest", "sweep"]
@@ -242,7 +242,7 @@ def main(
     with report_errors("sweep", STOPPED, debug), end_of_shard():
         plan = load(study, Study)
         names = pick("--tasks", split(tasks) or list(plan.tasks), plan.tasks)
-        fixed = _changes(changes or [], plan)
+        fixed = changes_of(changes or [], plan.tasks)
         folder = folder_of(out, (SUMMARY, *(f"{name}.{end}" for name in names for end in ("json", "png"))))
         page = valid_file(f"{folder}.md", (".md",), force=True)
         before = {name: read_file(folder / f"{name}.json") for name in plan.tasks}
@@ -265,19 +265,6 @@ def main(
     for name in names:
         typer.echo(f"{folder / name}.json, .png: written")
     typer.echo(f"{page}: written")
-
-
-def _changes(texts: Sequence[str], study: Study) -> dict[str, dict[str, Any]]:
-    """Return the arguments of --set by task; ValueError, in one line, for a text that has none."""
-    found: dict[str, dict[str, Any]] = {}
-    for text in texts:
-        path, sign, value = text.partition("=")
-        task, dot, key = path.strip().partition(".")
-        if not sign or not dot:
-            raise ValueError(f"--set {printable(text)}: must be TASK.ARGUMENT=VALUE, such as crossing.agents=24")
-        pick("--set", [task], study.tasks)
-        found.setdefault(task, {})[key] = parse_scalar(value.strip())
-    return found
 
 
 def _write(folder: Path, contents: Mapping[str, Content]) -> None:

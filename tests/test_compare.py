@@ -24,7 +24,7 @@ from typer.testing import CliRunner
 from agents import compare as comparison
 from agents.compare import experiment_of
 from flockenv.cli.main import main
-from flockenv.evaluation import EVALUATION, Episodes, lead_interval, report
+from flockenv.evaluation import EVALUATION, Episodes, lead_interval, report, task_digest
 from flockenv.evaluation.plots import Column, draw_chart, write_chart
 from flockenv.jobs import Failure
 from flockenv.jobs.job import code_digest, execute
@@ -663,6 +663,14 @@ def test_the_command_of_the_package_has_the_scores_of_the_workbench(capsys: pyte
         (("--worlds", "1"), "--worlds 1: must be from 2"),
         (("--out", "../x"), "--out '../x': must not go up"),
         (("pursuit", "--seen", "-1"), "seen"),
+        (("pursuit", "--set", "size=10"), "--set 'size=10': must be TASK.ARGUMENT=VALUE"),
+        (("pursuit", "--set", "flock.agents=10"), "--set 'flock': unknown; allowed: pursuit"),
+        (("pursuit", "--set", "pursuit.sise=10"), "--set: Pursuit: sise = 10: unknown key, did you mean `size`?"),
+        (("pursuit", "--set", "pursuit.size=-1"), "--set: Pursuit: size = -1: must be a number > 6"),
+        (
+            ("pursuit", "--set", "pursuit.dt=1"),
+            "--set: Pursuit: control_dt = 0.1 s is not a whole multiple of dt = 1 s",
+        ),
     ],
 )
 def test_the_command_of_the_package_refuses_in_one_line(
@@ -671,6 +679,15 @@ def test_the_command_of_the_package_refuses_in_one_line(
     assert main(["compare", *arguments]) == 2
     line = capsys.readouterr().err
     assert message in line and line.count("\n") == 1 and list(Path.cwd().iterdir()) == []
+
+
+def test_the_command_of_the_package_plays_a_task_with_other_arguments(capsys: pytest.CaptureFixture[str]) -> None:
+    options = ("--players", "random,rules", "--worlds", "2", "--processes", "1", "--out", "small")
+    assert main(["compare", "obstacles", *options, "--set", "obstacles.count=3", "--set", "obstacles.horizon=5"]) == 0
+    assert "obstacles.count = 3, obstacles.horizon = 5" in Path("small/table.md").read_text()
+    found = json.loads(Path("small/results.json").read_text())
+    task = trained_task("obstacles").model_copy(update={"count": 3, "horizon": 5.0})
+    assert found["tasks"]["obstacles"]["digest"] == task_digest(task)
 
 
 def test_policy_in_another_task_than_it_was_trained_on_is_reported(

@@ -70,6 +70,8 @@ def test_a_full_comparison_is_published_and_a_quick_or_partial_one_is_refused(tm
     for given, message in (
         (None, "no such file; `python -m agents.compare` writes it"),
         ({**results, "smoke": True}, "a quick look (--smoke, or less than 128 worlds) must not be published"),
+        ({**results, "disturbance": {"noise": 0.1}}, "a comparison of 128 worlds per task, noise 0.1 must not be"),
+        ({**results, "changes": {"herd": {"sheep": 3}}}, "128 worlds per task, herd.sheep = 3 must not be published"),
         (without, "a part of a comparison, without herd, must not be published"),
         ({**results, "players": {**results["players"], "mine": "mine.py"}}, "with mine, which does not ship, must not"),
         ({name: each for name, each in results.items() if name != "smoke"}, "results.json: 'smoke' is missing"),

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from docstrings import markdown, table
+from films import hybrid_of
 
 from flockenv.envs.docstring import page as page_of_environment
 from flockenv.envs.table import ENVIRONMENTS, EnvInfo
@@ -57,9 +58,8 @@ def _page(docs: Path, name: str, info: EnvInfo, results: dict[str, Any]) -> str:
 def _film(docs: Path, name: str) -> str:
     if not (docs / "generated" / "films" / f"{name}.gif").exists():
         return ""
-    return (
-        f"![An episode of {name}: the rules on the left, PPO on the right, in the same world](../films/{name}.gif)\n\n"
-    )
+    players = "rules, PPO and a hybrid of both" if hybrid_of(name) else "rules and PPO"
+    return f"![An episode of {name} in the same world, from left to right: {players}](../films/{name}.gif)\n\n"
 
 
 def _kernel_text(task: Task, kernel: str) -> str:

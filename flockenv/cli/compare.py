@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,10 +26,11 @@ if TYPE_CHECKING:
     from flockenv.evaluation import Episodes
     from flockenv.evaluation.report import Results
     from flockenv.studies.comparison import Played
+    from flockenv.tasks import Task
 
 __all__ = [
-    "FILES", "JOBS", "compare", "file_writers", "folder_of", "pick", "show_comparison", "split", "valid_worlds",
-    "versions", "write_text",
+    "FILES", "JOBS", "changes_of", "compare", "file_writers", "folder_of", "pick", "show_comparison", "split",
+    "valid_worlds", "versions", "write_text",
 ]  # fmt: skip
 
 FILES = ("results.json", "table.md", "comparison.png", "replay.html")
@@ -51,6 +52,10 @@ def compare(
             show_default="the usual ones",
         ),
     ] = None,
+    changed: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="TASK.ARGUMENT=VALUE", help="Another argument of a task; repeatable."),
+    ] = None,
     worlds: Annotated[int | None, typer.Option(metavar="N", help="Worlds per task.", show_default="128")] = None,
     seed: Annotated[int, typer.Option(help="Block of evaluation worlds, 0 to 999.")] = 0,
     out: Annotated[
@@ -71,7 +76,8 @@ def compare(
 ) -> None:  # fmt: skip
     """Play tasks with several players in the same worlds, and compare their scores.
 
-    Tasks have the arguments with which their policies were trained. No player was trained or tuned in these worlds.
+    Tasks have the arguments with which their policies were trained, but for those of --set. No player was trained or
+    tuned in these worlds.
     """
     from flockenv.core.atomic_files import write_all_or_none
     from flockenv.envs.disturbance import Disturbance
@@ -82,7 +88,9 @@ def compare(
     from flockenv.tasks import TASKS
 
     folder = folder_of(out, FILES) if out is not None else None
-    chosen = [trained_task(name) for name in pick("TASK", tasks or list(TASKS), TASKS)]
+    names = pick("TASK", tasks or list(TASKS), TASKS)
+    changes = changes_of(changed or [], names)
+    chosen = [_changed(trained_task(name), changes.get(name, {})) for name in names]
     field = players_in_order(split([players] if players is not None else []) or usual_players(chosen))
     count = valid_worlds(comparison.WORLDS if worlds is None else worlds)
     disturbance = Disturbance(noise=noise, delay=delay, dropped=dropped, range=reach, seen=seen)
@@ -95,6 +103,8 @@ def compare(
             chosen, field, count, seed, trust_pickle=trust_pickle, work=work, disturbance=disturbance
         )
     results |= versions()
+    if changes:
+        results["changes"] = changes
     if folder is not None:
         write_all_or_none(folder, file_writers(results, episodes))
     show_comparison(results, folder)
@@ -141,7 +151,34 @@ def split(values: Sequence[str] | None) -> list[str]:
     return [part.strip() for value in values or () for part in value.split(",") if part.strip()]
 
 
-def pick(option: str, names: Sequence[str], allowed: Mapping[str, object]) -> list[str]:
+def changes_of(texts: Sequence[str], tasks: Collection[str]) -> dict[str, dict[str, Any]]:
+    """Return the arguments of --set, TASK.ARGUMENT=VALUE each, by task; ValueError, in one line, for another text."""
+    from flockenv.scene.yaml_io import parse_scalar
+
+    found: dict[str, dict[str, Any]] = {}
+    for text in texts:
+        path, sign, value = text.partition("=")
+        task, dot, key = path.strip().partition(".")
+        if not sign or not dot:
+            raise ValueError(f"--set {printable(text)}: must be TASK.ARGUMENT=VALUE, such as crossing.agents=24")
+        pick("--set", [task], tasks)
+        found.setdefault(task, {})[key] = parse_scalar(value.strip())
+    return found
+
+
+def _changed(task: Task, changes: Mapping[str, Any]) -> Task:
+    """Return a task with other arguments; ValueError, in one line, if it refuses them."""
+    if not changes:
+        return task
+    try:
+        new = type(task)(**{**task.model_dump(mode="json"), **changes})
+        new.scene  # noqa: B018  # it is made now, and refuses an unstable time step
+    except ValueError as error:
+        raise ValueError(f"--set: {error}") from None
+    return new
+
+
+def pick(option: str, names: Sequence[str], allowed: Collection[str]) -> list[str]:
     """Return the names without repeats; ValueError for one that is not allowed."""
     for name in names:
         if name not in allowed:

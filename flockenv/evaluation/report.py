@@ -240,9 +240,12 @@ def json_text(results: Mapping[str, Any]) -> str:
 
 
 def conditions(results: Results) -> str:
-    """Return the number of worlds and their disturbance as text: "256 worlds per task, noise 0.05"."""
+    """Return the number of worlds, changed arguments and disturbance: "256 worlds per task, noise 0.05"."""
+    changes = [
+        f"{task}.{key} = {value}" for task, each in results.get("changes", {}).items() for key, value in each.items()
+    ]
     disturbance = [f"{name} {value:g}" for name, value in results.get("disturbance", {}).items() if value]
-    return ", ".join([f"{results['worlds']} worlds per task", *disturbance])
+    return ", ".join([f"{results['worlds']} worlds per task", *changes, *disturbance])
 
 
 def markdown(results: Results) -> str:
