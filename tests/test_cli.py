@@ -95,6 +95,7 @@ def test_schema_prints_the_json_schema_of_scenes(capsys: pytest.CaptureFixture[s
         "experiment",
         "gallery",
         "validate",
+        "import-mesh",
         "import-plan",
         "schema",
     ],

@@ -28,10 +28,11 @@ ONLY_IN = {
     "sb3_contrib": ("agents", "tests"),
     "matplotlib": ("flockenv/render", "flockenv/evaluation", "flockenv/studies", "agents", "tests"),
     "pygame": ("flockenv/render", "tests"),
+    "meshio": ("flockenv/scene/mesh_file.py", "tests"),
 }
 """Libraries that only the given files and folders may import."""
 
-INSIDE_FUNCTIONS = {"matplotlib", "pygame"}
+INSIDE_FUNCTIONS = {"matplotlib", "meshio", "pygame"}
 """Packages that only functions import, because loading them is slow."""
 
 

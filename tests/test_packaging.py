@@ -132,7 +132,7 @@ def test_the_base_dependencies_do_not_include_torch(metadata: Message) -> None:
         *("numpy", "scipy", "numba", "gymnasium", "pettingzoo", "pydantic", "pyyaml", "typer", "rich"),
         *("matplotlib", "pillow", "safetensors", "shapely", "filelock"),
     }
-    extras = {"train", "test", "render", "play", "docs", "ray", "rllib", "browser", "video", "parquet"}
+    extras = {"train", "test", "render", "play", "docs", "ray", "rllib", "browser", "video", "parquet", "mesh"}
     assert set(metadata.get_all("Provides-Extra") or []) == extras
     assert "gymnasium<2,>=1.2" in needed
 

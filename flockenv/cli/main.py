@@ -24,6 +24,7 @@ import typer
 import flockenv
 from flockenv.cli.compare import compare
 from flockenv.cli.films import film_episodes, write_picture
+from flockenv.cli.import_mesh import import_mesh
 from flockenv.cli.import_plan import import_plan
 from flockenv.cli.jobs import jobs
 from flockenv.cli.measure import measure
@@ -337,6 +338,7 @@ app.command()(stress)
 app.command()(experiment)
 app.command()(gallery)
 app.command()(validate)
+app.command()(import_mesh)
 app.command()(import_plan)
 app.command()(jobs)
 
