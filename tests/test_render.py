@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from flockenv.cli.films import Shutter, write_picture
 from flockenv.model.appearance import Appearance
 from flockenv.model.networks import Cloth
 from flockenv.model.snapshot import ROLES, Mark, Snapshot
@@ -61,6 +62,60 @@ def blob(image: np.ndarray, role: str) -> tuple[float, float]:
 
 def difference(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.abs(one.astype(int) - other).max(axis=2)
+
+
+# ---- metaballs and motion blur
+
+
+RED = Appearance(form="metaball", colours=("#ff0000",))
+
+
+def reds(pos: Any, **look: Any) -> np.ndarray:
+    """Return the red pixels of a picture of agents with a radius of 0.5 m in a field of 10 m."""
+    n = len(pos)
+    return close_to(
+        draw(shot(pos, looks=(RED.model_copy(update=look),), look=np.zeros(n, dtype=int)), 400), (255, 0, 0)
+    )
+
+
+def test_metaballs_melt_if_they_are_near_and_are_discs_of_their_size_if_not() -> None:
+    alone, disc = reds([(5, 5)]).sum(), reds([(5, 5)], form="disc").sum()
+    assert alone == pytest.approx(disc, rel=0.05)
+    assert reds([(2, 5), (8, 5)]).sum() == pytest.approx(2 * disc, rel=0.05)
+    near, apart = [(4.2, 5), (5.8, 5)], reds([(4.2, 5), (5.8, 5)], form="disc")
+    row, column = (int(np.round(np.nonzero(apart)[k].mean())) for k in (0, 1))
+    assert reds(near)[row, column] and not apart[row, column], "the gap of 0.6 m is filled"
+    assert reds(near).sum() > apart.sum()
+
+
+def test_metaballs_melt_across_the_edge_of_a_torus_and_take_mean_colours() -> None:
+    assert reds([(0.2, 5)]).sum() < reds([(5, 5)]).sum()
+    whole = {"looks": (RED,), "look": np.zeros(1, dtype=int), "periodic": True}
+    parts = close_to(draw(shot([(0.2, 5)], **whole), 400), (255, 0, 0))
+    assert parts.sum() == pytest.approx(reds([(5, 5)]).sum(), rel=0.05)
+    both = Appearance(form="metaball", by="speed", over=(0, 1), colours=("#ff0000", "#0000ff"))
+    two = shot([(4.4, 5), (5.6, 5)], vel=[(0, 0), (1, 0)], looks=(both,), look=np.zeros(2, dtype=int))
+    purple = close_to(draw(two, 400), (128, 0, 128), within=30)
+    assert purple.any()
+
+
+def test_a_picture_with_motion_blur_is_the_mean_of_the_last_instants_of_its_frame(tmp_path: Path) -> None:
+    film = [replace(shot([(1.0 + k, 5)]), time=0.1 * k) for k in range(9)]
+    write_picture(tmp_path / "blur.webp", [Panel("", film, None, "")], "", 10.0, 200, Shutter(4, 2))
+    with Image.open(tmp_path / "blur.webp") as file:
+        assert file.n_frames == 3, "the first instant, and two frames of four parts"
+    write_picture(tmp_path / "blur.png", [Panel("", film, None, "")], "", 10.0, 200, Shutter(4, 2))
+    with Image.open(tmp_path / "blur.png") as file:
+        found = np.asarray(file)
+    ends = [draw(film[k], 200, trails=film[:k]).astype(float) for k in (8, 7)]
+    np.testing.assert_allclose(found, np.mean(ends, axis=0), atol=0.51)
+
+
+def test_a_shutter_needs_several_steps_in_a_frame() -> None:
+    assert Shutter.of(0.5, 20) == Shutter(8, 4) and Shutter.of(0, 1) == Shutter(1, 1)
+    assert Shutter.of(0.01, 3) == Shutter(3, 2)
+    with pytest.raises(ValueError, match=r"--shutter 0\.5: each frame of this scene is one time step"):
+        Shutter.of(0.5, 1)
 
 
 # ---- snapshot

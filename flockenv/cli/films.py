@@ -17,10 +17,13 @@ if TYPE_CHECKING:
     from flockenv.render import Panel
     from flockenv.tasks import Task
 
-__all__ = ["film_episodes", "write_picture"]
+__all__ = ["Shutter", "film_episodes", "mean_picture", "write_picture"]
 
 TRAIL = 25
 """Past positions of each agent that a PNG shows."""
+
+MOST_PARTS = 8
+"""Instants in a frame, of which a picture with motion blur is the mean."""
 
 
 def film_episodes(
@@ -50,40 +53,85 @@ def film_episodes(
     return panels, 1.0 / task.control_dt
 
 
-def write_picture(path: Path, panels: Sequence[Panel], title: str, fps: float, size: int) -> None:
-    """Write films side by side: an HTML replay, a PNG of the end, a GIF, MP4 or WebP; size: width, pixels."""
+@dataclasses.dataclass(frozen=True)
+class Shutter:
+    """Motion blur: a picture is the mean of the last `open` of the `parts` instants that a film has for each frame."""
+
+    parts: int = 1
+    open: int = 1
+
+    @classmethod
+    def of(cls, share: float, steps: int) -> Shutter:
+        """Return the shutter that is open for a share of a frame of some time steps; 0: no blur.
+
+        Raises ValueError, in one line, if a frame has one step, so that nothing is known between two frames.
+        """
+        if share == 0:
+            return cls()
+        parts = min(steps, MOST_PARTS)
+        if parts < 2:
+            raise ValueError(f"--shutter {share:g}: each frame of this scene is one time step, so there is no blur")
+        return cls(parts, max(2, round(share * parts)))
+
+
+def write_picture(
+    path: Path, panels: Sequence[Panel], title: str, fps: float, size: int, shutter: Shutter | None = None
+) -> None:
+    """Write films side by side: an HTML replay, a PNG of the end, a GIF, MP4 or WebP; size: width, pixels.
+
+    fps: frames per second; the films have an instant for each part of a frame of the shutter (default: one, no blur).
+    """
     import numpy as np
 
     from flockenv.render import Group, write_gif, write_png, write_replay
     from flockenv.render.gif import MOST_FPS
     from flockenv.render.video import write_mp4, write_webp
 
-    films = [panel.snapshots for panel in panels]
+    films, shutter = [panel.snapshots for panel in panels], shutter or Shutter()
     if path.suffix.lower() == ".html":
         write_replay(path, [Group(title, list(panels))], title)
     elif path.suffix.lower() == ".png":
-        write_png(path, np.hstack([_draw_last_frame(film, size // len(films), fps) for film in films]))
+        rate, width = fps * shutter.parts, size // len(films)
+        ends = [
+            [_draw_frame(film[: len(film) - k], width, rate) for k in range(min(shutter.open, len(film)))]
+            for film in films
+        ]
+        write_png(path, np.hstack([mean_picture(pictures) for pictures in ends]))
     elif path.suffix.lower() in (".mp4", ".webp"):
         write = write_mp4 if path.suffix.lower() == ".mp4" else write_webp
-        write(path, _draw_frames(films, size // len(films), fps), fps)
+        write(path, _draw_frames(films, size // len(films), fps, shutter), fps)
     else:
         stride = math.ceil(fps / MOST_FPS)
-        frames = _draw_frames([film[::stride] for film in films], size // len(films), fps / stride)
+        frames = _draw_frames([film[::stride] for film in films], size // len(films), fps / stride, shutter)
         write_gif(path, frames, fps / stride)
 
 
-def _draw_last_frame(snapshots: Sequence[Snapshot], size: int, fps: float) -> Any:
+def mean_picture(pictures: Sequence[Any]) -> Any:
+    """Return the mean of pictures, (height, width, 3) uint8."""
+    import numpy as np
+
+    return pictures[0] if len(pictures) == 1 else np.rint(np.mean(pictures, axis=0)).astype(np.uint8)
+
+
+def _draw_frame(snapshots: Sequence[Snapshot], size: int, fps: float) -> Any:
+    """Draw the last snapshot, with the paths that lead to it."""
     from flockenv.render import draw
 
     behind = max(TRAIL, 1 + math.ceil(fps * max((look.trail for look in snapshots[-1].looks), default=0.0)))
     return draw(snapshots[-1], size=size, trails=snapshots[-behind:-1])
 
 
-def _draw_frames(films: Sequence[Sequence[Snapshot]], size: int, fps: float) -> Iterator[Any]:
-    """Draw the snapshots of several films side by side, and show how far that is."""
+def _draw_frames(films: Sequence[Sequence[Snapshot]], size: int, fps: float, shutter: Shutter) -> Iterator[Any]:
+    """Draw films side by side, a picture per frame, and show how far that is; the first frame is sharp."""
     from flockenv.render.gif import side_by_side
 
-    with progress_bar("drawing", max(map(len, films)), "frames") as progress:
-        for k, frame in enumerate(side_by_side(films, size, fps)):
-            yield frame
-            progress(k)
+    count = max(map(len, films))
+    shown = [k for k in range(count) if k == 0 or -k % shutter.parts < shutter.open]
+    with progress_bar("drawing", len(shown), "frames") as progress:
+        pictures = []
+        for done, picture in enumerate(side_by_side(films, size, fps * shutter.parts, shown)):
+            pictures.append(picture)
+            if shown[done] % shutter.parts == 0:
+                yield mean_picture(pictures)
+                pictures.clear()
+            progress(done)

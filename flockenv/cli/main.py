@@ -23,7 +23,7 @@ import typer
 
 import flockenv
 from flockenv.cli.compare import compare
-from flockenv.cli.films import film_episodes, write_picture
+from flockenv.cli.films import Shutter, film_episodes, write_picture
 from flockenv.cli.import_mesh import import_mesh
 from flockenv.cli.import_plan import import_plan
 from flockenv.cli.jobs import jobs
@@ -258,6 +258,16 @@ def render(
         typer.Option(metavar="S", help="Simulated seconds of a scene; a task plays to its end.", show_default="10"),
     ] = None,
     size: Annotated[int, typer.Option(min=64, max=4096, help="Width of a picture in pixels.")] = 600,
+    shutter: Annotated[
+        float,
+        typer.Option(
+            min=0,
+            max=1,
+            metavar="SHARE",
+            help="Motion blur of a scene: a picture is the mean over this share of the "
+            "time since the one before, as in a film camera (0.5).",
+        ),
+    ] = 0.0,
     noise: Noise = 0.0,
     delay: Delay = 0,
     dropped: Dropped = 0.0,
@@ -283,13 +293,18 @@ def render(
             raise ValueError(
                 "--noise, --delay, --dropped, --range, --seen: for tasks only; in a scene no player observes"
             )
-        panel, fps, left = _film_scene(what, 10.0 if duration is None else duration, seed)
+        if shutter and path.suffix.lower() == ".html":
+            raise ValueError(f"--shutter {shutter:g}: for pictures and films; an HTML replay has no motion blur")
+        panel, fps, blur, left = _film_scene(what, 10.0 if duration is None else duration, seed, shutter)
         panels, title = [panel], title_of(what)
     else:
+        if shutter:
+            raise ValueError(f"--shutter {shutter:g}: for scenes only; a task shows one instant per decision")
+        blur = Shutter()
         panels, fps = _film_task(what, player, seed, duration, trust_pickle, disturbance)
         title, left = what, ""
     with new_folder(path.parent):
-        write_picture(path, panels, title, fps, size)
+        write_picture(path, panels, title, fps, size, blur)
     end = max(panel.snapshots[-1].time for panel in panels)
     new_console().print(f"{relative_path(path)}: {path.stat().st_size:,} bytes, {end:g} s{left}")
 
@@ -452,20 +467,25 @@ def _unsolved_text(state: State) -> str:
     return f", {count:,} times contacts left unsolved" if count else ""
 
 
-def _film_scene(file: str, duration: float, seed: int) -> tuple[Panel, float, str]:
-    """Return the run of a scene as a panel, its frames per second, and the text about unsolved contacts."""
+def _film_scene(file: str, duration: float, seed: int, share: float) -> tuple[Panel, float, Shutter, str]:
+    """Return the run of a scene as a panel, its frames per second, the shutter, and the text about unsolved contacts.
+
+    share: of the time of a frame in which the shutter is open.
+    """
     from flockenv.render import Panel
     from flockenv.scene.yaml_io import load_scene
     from flockenv.studies.trajectory import whole_steps
 
     scene = load_scene(Path(file))
     every = max(1, round(1.0 / (FPS * scene.dt)))
-    trajectory = _record(scene, seed, whole_steps("--duration", duration, scene.dt), every)
+    blur = Shutter.of(share, every)
+    part = every // blur.parts
+    trajectory = _record(scene, seed, whole_steps("--duration", duration, scene.dt), part)
     if trajectory.stopped == "interrupted":
         raise KeyboardInterrupt
     snapshots = list(trajectory.snapshots(title=title_of(file)))
     panel = Panel("", snapshots, None, trajectory.stopped)
-    return panel, 1.0 / (every * scene.dt), _unsolved_text(trajectory.last)
+    return panel, 1.0 / (part * blur.parts * scene.dt), blur, _unsolved_text(trajectory.last)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ Size = Annotated[float, Field(ge=0)]
 
 
 class Appearance(Record):
-    """Points, discs or polygons whose colour, opacity and size may depend on age, speed or an inner state.
+    """Points, discs, polygons or metaballs whose colour, opacity and size may depend on age, speed or an inner state.
 
     `by` names that quantity, and `over` is its range: from the first to the last colour, opacity and size, which are
     interpolated.
@@ -26,8 +26,10 @@ class Appearance(Record):
 
     sentence: ClassVar[str] = "drawn as {form}"
 
-    form: Literal["point", "disc", "polygon"] = Field(
-        default="point", description="a dot, always visible; a disc of its true size; a polygon that points ahead"
+    form: Literal["point", "disc", "polygon", "metaball"] = Field(
+        default="point",
+        description="a dot, always visible; a disc of its true size; a polygon that points ahead; a disc that melts "
+        "into its neighbours, as drops of a liquid do",
     )
     vertices: tuple[tuple[float, float], ...] = Field(
         default=((1.0, 0.0), (-0.8, 0.6), (-0.8, -0.6)), min_length=3, max_length=64,

@@ -55,13 +55,15 @@ def gif_bytes(frames: Iterable[Pixels], fps: float) -> bytes:
     return buffer.getvalue()
 
 
-def side_by_side(films: Sequence[Sequence[Snapshot]], size: int, fps: float) -> Iterator[Pixels]:
+def side_by_side(
+    films: Sequence[Sequence[Snapshot]], size: int, fps: float, shown: Sequence[int] | None = None
+) -> Iterator[Pixels]:
     """Draw the snapshots of several films beside each other; a film that has ended shows its last snapshot.
 
-    size: width of the picture of one film, pixels.
+    size: width of the picture of one film, pixels. fps: snapshots per second. shown: their indices (default: all).
     """
     behind = math.ceil(fps * max((look.trail for film in films for look in film[0].looks), default=0.0))
-    for k in range(max(map(len, films))):
+    for k in range(max(map(len, films))) if shown is None else shown:
         pictures = []
         for film in films:
             at = min(k, len(film) - 1)

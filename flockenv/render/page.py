@@ -17,14 +17,26 @@ from hashlib import sha256
 from importlib.resources import files
 from typing import Any, Final, Literal
 
-from flockenv.render.palette import ARROW, BODY_DISC, BOND, DART, DART_REACH, JUMP, PAPER, POINT, ROLE_COLOURS, WAY
+from flockenv.render.palette import (
+    ARROW,
+    BODY_DISC,
+    BOND,
+    DART,
+    DART_REACH,
+    JUMP,
+    METABALL,
+    PAPER,
+    POINT,
+    ROLE_COLOURS,
+    WAY,
+)
 from flockenv.render.quantise import BEYOND, DIRECTIONS
 
 __all__ = ["page"]
 
 Kind = Literal["recorded", "live"]
 
-_SHARED: Final = ("base", "panels", "lens", "draw", "crowd", "faces", "pointer", "stage", "clock")
+_SHARED: Final = ("base", "panels", "lens", "draw", "crowd", "metaballs", "faces", "pointer", "stage", "clock")
 #: The scripts of a page, in order.
 _SCRIPTS: Final[dict[str, tuple[str, ...]]] = {
     "recorded": (*_SHARED, "recorded"),
@@ -44,6 +56,7 @@ def page(kind: Kind, title: str, data: Mapping[str, Any]) -> bytes:
     constants = {
         "roles": ROLE_COLOURS, "paper": PAPER, "dart": DART, "arrow": ARROW, "reach": DART_REACH, "disc": BODY_DISC,
         "bond": BOND, "point": POINT, "jump": JUMP, "way": WAY, "beyond": BEYOND, "directions": DIRECTIONS,
+        "metaball": METABALL,
     }  # fmt: skip
     fills = {
         "TITLE": html.escape(title), "KIND": kind, "STYLE": style, "SCRIPT": script, "POLICY": policy(kind),

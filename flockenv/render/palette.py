@@ -52,6 +52,9 @@ BOND: Final = 0.0022
 #: Least radius of agents drawn as points, as a share of the picture's width.
 POINT: Final = 0.0022
 
+#: Reach of a metaball, in units of its size: others within twice that distance are melted with it.
+METABALL: Final = 4.0
+
 #: Corners of the arrow that shows a heading, x along it, in units of its length.
 ARROW: Final = ((0.0, 0.035), (0.7, 0.05), (0.66, 0.16), (1.0, 0.0), (0.66, -0.16), (0.7, -0.05), (0.0, -0.035))
 

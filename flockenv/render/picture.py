@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from flockenv.model.snapshot import Floats, Mark, Snapshot
+from flockenv.render.metaballs import draw_metaballs
 from flockenv.render.palette import (
     ARROW,
     BODY_DISC,
@@ -52,8 +53,8 @@ def draw(
 
     An agent is a dart that points along its velocity (a dot if it is at rest), over a disc of its radius, in the colour
     of its role. Agents with bonds are dots, and bonds are thin lines behind them. 3-D scenes are seen from above: upper
-    agents are larger, and drawn last. An agent with an appearance is drawn as a point, a disc or a polygon, whose
-    colour may show its age or speed.
+    agents are larger, and drawn last. An agent with an appearance is drawn as a point, a disc, a polygon or a metaball,
+    whose colour may show its age or speed.
 
     trails: earlier snapshots of the same world, oldest first. The path of each agent without bonds is drawn behind it;
     of an agent with an appearance, its last `trail` seconds. all_trails: False: only of agents with an appearance.
@@ -80,6 +81,7 @@ def draw(
         if mark.kind != "way":
             _draw_mark(pen, view, mark)
     _draw_bonds(pen, view, snapshot)
+    _draw_liquids(canvas, view, snapshot)
     _draw_agents(pen, view, snapshot)
     _restore_margins(canvas, backdrop, view, view.spill)
     _draw_time(pen, view, snapshot.time)
@@ -304,6 +306,27 @@ def _draw_bonds(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot) -> Non
             pen.line(line.tolist(), fill=fill, width=thick)
 
 
+def _draw_liquids(canvas: Image.Image, view: View, snapshot: Snapshot) -> None:
+    """Draw the agents that are metaballs, one surface for each appearance."""
+    depth, shades, which = _relative_heights(snapshot), snapshot.shade, np.asarray(snapshot.look)
+    magnification = 0.7 + 0.5 * depth if snapshot.dimension == 3 else depth
+    spots = view.to_pixels(snapshot.pos)
+    for k, look in enumerate(snapshot.looks):
+        chosen = np.flatnonzero((which == k) & snapshot.alive & snapshot.visible)
+        if look.form != "metaball" or not len(chosen):
+            continue
+        sizes = [look.size_at(float(shades[i]), float(snapshot.radius[i])) for i in chosen.tolist()]
+        colours = [
+            (
+                *look.colour(float(shades[i]), ROLE_COLOURS[snapshot.roles[i]][0]),
+                255 * look.opacity_at(float(shades[i])),
+            )
+            for i in chosen.tolist()
+        ]
+        reach = np.array(sizes) * view.metre * magnification[chosen]
+        draw_metaballs(canvas, view, spots[chosen], reach, np.array(colours, dtype=float))
+
+
 def _draw_agents(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot) -> None:
     visible = np.flatnonzero(snapshot.visible)
     depth = _relative_heights(snapshot)
@@ -413,8 +436,10 @@ def _draw_look(
     pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot, i: int, position: tuple[float, float], aim: Floats,
     shade: float, magnification: float,
 ) -> None:  # fmt: skip
-    """Draw an agent as its appearance defines it."""
+    """Draw an agent as its appearance defines it; metaballs are drawn already."""
     look = snapshot.looks[int(np.asarray(snapshot.look)[i])]
+    if look.form == "metaball":
+        return
     x, y = position
     reach = look.size_at(shade, float(snapshot.radius[i])) * view.metre * magnification
     fill = (*look.colour(shade, ROLE_COLOURS[snapshot.roles[i]][0]), round(255 * look.opacity_at(shade)))

@@ -129,7 +129,7 @@ function drawCrowd(pen, eye, panel, all, k) {
   const sorted = drawingOrder(panel, eye, all), least = leastReach(panel, eye), paper = word(paint.paper), pos = all.pos, dotNumber = formNumber("dot"), { flat } = eye, perTurn = TURNS / (2 * Math.PI);
   for (let n = 0; n < panel.N; n++) {
     const i = sorted ? sorted.order[n] : n;
-    if (!all.there[i]) continue;
+    if (!all.there[i] || melts(panel, i)) continue;
     const x = a[0] * pos[3 * i] + a[1] * pos[3 * i + 1] + a[2] * pos[3 * i + 2] + tx, y = b[0] * pos[3 * i] + b[1] * pos[3 * i + 1] + b[2] * pos[3 * i + 2] + ty;
     if (!(x > -50 && y > -50 && x < w + 50 && y < h + 50)) continue;
     const style = panel.look[i] < 0 ? styles.plain[panel.kind[i]] : styles.looks[panel.look[i]][panel.kind[i]];

@@ -193,6 +193,7 @@ function drawBonds(pen, eye, panel, all, broken) {
 }
 
 function drawLook(pen, eye, panel, body, k, swell) {
+  if (melts(panel, body.i)) return;
   const look = panel.looks[panel.look[body.i]], { at, colour } = lookColour(panel, look, body.i, k);
   const reach = (look.size ? look.size[at] : panel.radius[body.i]) * eye.m * swell;
   for (const [x, y] of eye.sightings(body.x, body.y, 1.1 * reach)) {
@@ -266,6 +267,7 @@ function drawWorld(view, now) {
   if (!eye.flat) drawBorder(pen, eye, panel);
   const all = bodies(panel, now), broken = brokenBonds(panel, now.k);
   if (hasFaces(panel)) drawFaces(pen, eye, panel, all, broken); else drawBonds(pen, eye, panel, all, broken);
+  drawMetaballs(pen, eye, panel, all, now.k);
   if (panel.N > CROWD) drawCrowd(pen, eye, panel, all, now.k); else if (!hasFaces(panel)) drawBodies(pen, eye, panel, all, now.k);
   if (view.over) view.over(pen, eye, now, all);
   pen.restore();
