@@ -212,10 +212,15 @@ def test_semi_implicit_euler_stays_within_the_bounds_of_crowds(name: str) -> Non
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", LIGHT)
+def test_velocity_verlet_stays_within_the_bounds(name: str) -> None:
+    within(VelocityVerlet(), name)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BOUNDED)
-@pytest.mark.parametrize("method", [VelocityVerlet(), RK4()], ids=lambda method: method.kind)
-def test_velocity_verlet_and_rk4_stay_within_the_bounds(method: Integrator, name: str) -> None:
-    within(method, name)
+def test_rk4_stays_within_the_bounds(name: str) -> None:
+    within(RK4(), name)
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name.startswith("N14")])
