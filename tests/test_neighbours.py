@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any
 
@@ -464,8 +465,14 @@ def assert_few_as_expected(variant: Variant, x: Array, edge: float, hair: float 
 
 
 @ONE_LONG_STEP
-@pytest.mark.parametrize("count", [1, 2, 5, 40, 95, 96, 1500])
-@FEW
+@pytest.mark.parametrize(
+    ("variant", "count"),
+    [
+        *itertools.product(NEAREST, [1, 2, 5, 40, 95, 96, 1500]),
+        pytest.param(NEAREST_MANY, 1500, marks=pytest.mark.slow),  # fewer would compile one more kernel without cells
+    ],
+    ids=lambda value: getattr(value, "name", value),
+)
 def test_the_nearest_few_are_those_of_the_reference(variant: Variant, count: int) -> None:
     """From fewer agents than the nearest few to far more, by brute force and by cell list."""
     edge = max(7.0, (count / 1.5) ** 0.5) if variant.dimension == 2 else max(7.0, (count / 0.3) ** (1 / 3))
