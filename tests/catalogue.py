@@ -519,7 +519,8 @@ EFFECTS = (
     # agents of a network; see `tied`
     EffectRow(Springs(stiffness=3, damping=0.2), obeys=frozenset({"translation", "rotation", "mirror"})),
     EffectRow(
-        Springs(stiffness=3, yield_strain=0.1, break_strain=1), obeys=frozenset({"translation", "rotation", "mirror"})
+        Springs(stiffness=3, curve=((-1, -0.5), (0, 0), (0.05, 0.05), (1, 0.4)), yield_strain=0.1, break_strain=1),
+        obeys=frozenset({"translation", "rotation", "mirror"})
     ),
     EffectRow(
         AngularSprings(stiffness=0.05, damping=0.005), beside=(Springs(stiffness=3),),  # a uniform stretch keeps angles

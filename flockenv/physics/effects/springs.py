@@ -6,17 +6,19 @@ its two ends, and of a hinge on its three particles, sum to zero.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import add, axis, dot, norm, scale, select, sub
 from flockenv.model.networks import BEND, SHEAR
+from flockenv.model.networks import Springs as Joints
 from flockenv.physics.effects.effect import Bonds, Effect, Me, Stencils, all_masses, network_of
 
 if TYPE_CHECKING:
@@ -29,17 +31,72 @@ Floats = NDArray[np.float64]
 
 
 @law
+def _towards(me: Me, other: Any) -> tuple[Vec, float]:
+    """Return the unit vector to the other end and its distance; two ends in one place part along the first axis."""
+    o, length = like(other.offset[0], 0.0), norm(other.offset)
+    apart = length > o
+    aside = scale(axis(other.offset, 0), like(o, 1.0) if me.who < other.who else like(o, -1.0))
+    return select(apart, scale(other.offset, like(o, 1.0) / length if apart else o), aside), length
+
+
+@law
 def spring(p: Any, me: Me, others: Any, number: Vec) -> Vec:
     """Return F = (k (l - L) + c (v_j - v) . d) d, along the unit vector d to the other end (Witkin & Baraff 1997).
 
     Two ends in one place part along the first axis: the one with the higher index in the positive direction.
     """
-    other, o = others[0], like(number[0], 0.0)
-    length = norm(other.offset)
-    apart = length > o
-    aside = scale(axis(other.offset, 0), like(o, 1.0) if me.who < other.who else like(o, -1.0))
-    along = select(apart, scale(other.offset, like(o, 1.0) / length if apart else o), aside)
+    other = others[0]
+    along, length = _towards(me, other)
     return scale(along, number[0] * (length - number[2]) + number[1] * dot(sub(other.vel, me.vel), along))
+
+
+@law
+def _curve_force(number: Vec, extension: float, rest: float) -> float:
+    """Return k L f((l - L) / L) for an extension l - L: the slope at rest, and its change past each kink of the curve.
+
+    number: the slope at rest, damping, rest length, and for each kink its strain and the change of slope, times k.
+    """
+    o, force = like(extension, 0.0), number[0] * extension
+    for place in range(3, len(number) - 1, 2):
+        past = extension - rest * number[place]
+        outwards = past if number[place] >= o else -past
+        force += number[place + 1] * (outwards if outwards > o else o)
+    return force
+
+
+@law
+def curved_spring(p: Any, me: Me, others: Any, number: Vec) -> Vec:
+    """Return the force of a spring with a strain-stress curve; the damping and the direction are those of `spring`."""
+    other = others[0]
+    along, length = _towards(me, other)
+    force = _curve_force(number, length - number[2], number[2])
+    return scale(along, force + number[1] * dot(sub(other.vel, me.vel), along))
+
+
+@law
+def _per_length(local: Any) -> tuple[float, float]:
+    """Return the distance of the two ends of a stencil, and one over it; 0 if it is 0."""
+    length = 0.0
+    for k in range(local.at.shape[1]):
+        length += local.at[1, k] * local.at[1, k]
+    length = np.sqrt(length)
+    return length, 1.0 / length if length > 0.0 else 0.0
+
+
+@law
+def _write_blocks(local: Any, per: float, stiffness: float, across: float, damping: float) -> None:
+    """Write the derivatives of the forces on two ends, from those along d and across it, and the damping along d."""
+    d, apart = local.at.shape[1], per > 0.0
+    for a in range(d):
+        along_a = local.at[1, a] * per if apart else (1.0 if a == 0 else 0.0)
+        for b in range(d):
+            outer = along_a * (local.at[1, b] * per if apart else (1.0 if b == 0 else 0.0))
+            slope = (stiffness - across) * outer + (across if a == b else 0.0)
+            damp = damping * outer
+            local.by_position[a, b] = local.by_position[d + a, d + b] = -slope
+            local.by_position[a, d + b] = local.by_position[d + a, b] = slope
+            local.by_velocity[a, b] = local.by_velocity[d + a, d + b] = -damp
+            local.by_velocity[a, d + b] = local.by_velocity[d + a, b] = damp
 
 
 @law
@@ -49,23 +106,28 @@ def spring_derivative(local: Any, number: Any, s: int) -> None:
     dF_i/dx_j = k d d^T + k (1 - L / l) (1 - d d^T) and dF_i/dv_j = c d d^T. The second term is left out if the spring
     is compressed, where it would be negative (Choi and Ko 2002), and so is the derivative of d in the damping.
     """
-    d, length = local.at.shape[1], 0.0
-    for k in range(d):
-        length += local.at[1, k] * local.at[1, k]
-    length = np.sqrt(length)
-    apart = length > 0.0
-    per = 1.0 / length if apart else 0.0
-    across = number[s, 0] * max(1.0 - number[s, 2] * per, 0.0) if apart or number[s, 2] == 0.0 else 0.0
-    for a in range(d):
-        along_a = local.at[1, a] * per if apart else (1.0 if a == 0 else 0.0)
-        for b in range(d):
-            outer = along_a * (local.at[1, b] * per if apart else (1.0 if b == 0 else 0.0))
-            slope = (number[s, 0] - across) * outer + (across if a == b else 0.0)
-            damp = number[s, 1] * outer
-            local.by_position[a, b] = local.by_position[d + a, d + b] = -slope
-            local.by_position[a, d + b] = local.by_position[d + a, b] = slope
-            local.by_velocity[a, b] = local.by_velocity[d + a, d + b] = -damp
-            local.by_velocity[a, d + b] = local.by_velocity[d + a, b] = damp
+    _, per = _per_length(local)
+    across = number[s, 0] * max(1.0 - number[s, 2] * per, 0.0) if per > 0.0 or number[s, 2] == 0.0 else 0.0
+    _write_blocks(local, per, number[s, 0], across, number[s, 1])
+
+
+@law
+def curved_derivative(local: Any, number: Any, s: int) -> None:
+    """Write the derivatives of a spring with a strain-stress curve: k f' along it, and F / l across it if that is > 0.
+
+    At a kink the slope is the one nearer to rest. Numbers are those of `curved_spring`.
+    """
+    length, per = _per_length(local)
+    extension, rest = length - number[s, 2], number[s, 2]
+    slope, force = number[s, 0], number[s, 0] * extension
+    for place in range(3, number.shape[1] - 1, 2):
+        past = extension - rest * number[s, place]
+        side = 1.0 if number[s, place] >= 0.0 else -1.0
+        if side * past > 0.0:
+            slope += side * number[s, place + 1]
+            force += number[s, place + 1] * side * past
+    across = max(force * per, 0.0) if per > 0.0 else (slope if rest == 0.0 else 0.0)
+    _write_blocks(local, per, slope, across, number[s, 1])
 
 
 @law
@@ -78,6 +140,17 @@ def lasting_spring(p: Any, me: Me, others: Any, number: Vec) -> Vec:
 
 
 @law
+def lasting_curved_spring(p: Any, me: Me, others: Any, number: Vec) -> Vec:
+    """Return the force of a spring with a curve, whose strain is that over the last number; see `lasting_spring`."""
+    o, rest, other = like(number[0], 0.0), number[-1], others[0]
+    whole = rest < like(rest, np.inf)
+    now = rest if whole else o
+    along, length = _towards(me, other)
+    force = _curve_force(number, length - now, now) + number[1] * dot(sub(other.vel, me.vel), along)
+    return scale(along, force if whole else o)
+
+
+@law
 def length_after_yielding(p: Any, me: Me, others: Any, number: Vec) -> float:
     """Return the rest length after a step at which the spring is l long; inf if it breaks, and stays broken.
 
@@ -85,7 +158,7 @@ def length_after_yielding(p: Any, me: Me, others: Any, number: Vec) -> float:
     (ideal plasticity). It breaks if l exceeds the first rest length by more than the share p.breaks.
     """
     one, never = like(number[0], 1.0), like(number[0], np.inf)
-    length, rest = norm(others[0].offset), number[3]
+    length, rest = norm(others[0].offset), number[-1]
     longer, shorter = one + p.yields, one - p.yields
     follows = length / longer if length > rest * longer else (length / shorter if length < rest * shorter else rest)
     whole = (rest < never) & ((length - number[2]) <= number[2] * p.breaks)
@@ -150,8 +223,15 @@ def angular_spring(p: Any, me: Me, others: Any, number: Vec) -> Vec:
     return select(apex, both, select(first, on_a, on_b))
 
 
+Curve = Annotated[tuple[tuple[float, float], ...], Field(min_length=2, max_length=64)]
+"""Points of a strain-stress curve, (strain, force over k L)."""
+
+
 class Springs(Effect):
     """Damped springs along the edges of a group's network: F = k (l - L) + c dl/dt towards the other end.
+
+    With a `curve`, F = k L f((l - L) / L) + c dl/dt: f is linear between its points, and goes on with the first and the
+    last slope. It is stress over Young's modulus, if k = E A / L for a fibre of cross section A.
 
     With `yield_strain` a spring that is strained further takes a new rest length for good; with `break_strain` one that
     is longer breaks, and exerts no force any more. `State.bonds` holds the present rest lengths, inf of broken springs.
@@ -166,6 +246,10 @@ class Springs(Effect):
     damping: float = Field(default=0.0, ge=0, description="kg/s, along each spring")
     ratio: float = Field(default=0.0, ge=0, description="more damping, as a fraction of each spring's critical one")
     rest: float = Field(default=1.0, ge=0, description="rest lengths over those of the network; 0 = rest length 0")
+    curve: Curve | None = Field(
+        default=None,
+        description="points of strain (l - L) / L and force over k L, not falling, 0 at 0 (default: [0, 0], [1, 1])",
+    )
     yield_strain: float | None = Field(
         default=None,
         gt=0,
@@ -177,6 +261,28 @@ class Springs(Effect):
     strengths: ClassVar[tuple[str, ...]] = ("stiffness", "shear", "bend", "damping", "ratio")
     conserves_momentum: ClassVar[bool] = True
 
+    @field_validator("curve")
+    @classmethod
+    def _check_curve(cls, curve: Curve | None) -> Curve | None:
+        """Raise ValueError unless strains increase, forces do not fall, and there is none at rest."""
+        for k, (before, after) in enumerate(itertools.pairwise(curve or ())):
+            if not after[0] > before[0]:
+                raise ValueError(
+                    f"strain {after[0]:g} of point {k + 1} is not larger than {before[0]:g}, the one before"
+                )
+            if after[1] < before[1]:
+                raise ValueError(f"force {after[1]:g} of point {k + 1} is less than {before[1]:g}, the one before")
+        if curve is not None:
+            strain, force = np.array(curve).T
+            slopes = np.diff(force) / np.diff(strain)
+            place = int((strain[1:-1] < 0).sum())  # of the part that holds strain 0, perhaps beyond the points
+            at_rest = force[place] - slopes[place] * strain[place]
+            if abs(at_rest) > 1e-9 * np.abs(force).max():
+                raise ValueError(
+                    f"force at strain 0 is {at_rest:g}; must be 0, as rest lengths are those without force"
+                )
+        return curve
+
     @property
     def lasts(self) -> bool:
         """True if springs yield or break, so that their rest lengths are part of the state."""
@@ -184,7 +290,9 @@ class Springs(Effect):
 
     @property
     def bond_law(self) -> Law:  # type: ignore[override]  # depends on what springs keep
-        """The law of a spring, with a constant or a present rest length."""
+        """The law of a spring, by a curve or without, with a constant or a present rest length."""
+        if self.curve is not None:
+            return lasting_curved_spring if self.lasts else curved_spring
         return lasting_spring if self.lasts else spring
 
     @property
@@ -195,11 +303,27 @@ class Springs(Effect):
     @property
     def derivative(self) -> Law | None:  # type: ignore[override]
         """The law of the derivatives; None if springs yield or break, as their rest lengths change."""
-        return None if self.lasts else spring_derivative
+        return None if self.lasts else (spring_derivative if self.curve is None else curved_derivative)
 
     def numbers(self, dimension: int) -> int:
-        """Return 3: stiffness, damping, rest length; and a fourth, the present one, if springs yield or break."""
-        return 4 if self.lasts else 3
+        """Return 3: stiffness, damping, rest length; 2 for each kink; and 1, the present length, if springs last."""
+        return 3 + self._kinks.size + self.lasts
+
+    @property
+    def _slopes(self) -> Floats:
+        """The slopes of the curve, from the lowest strain on; that of Hooke is 1."""
+        strain, force = np.array(self.curve or ((0.0, 0.0), (1.0, 1.0))).T
+        return np.asarray(np.diff(force) / np.diff(strain))
+
+    @property
+    def _kinks(self) -> Floats:
+        """The strain of each kink of the curve and the change of slope there, (K, 2)."""
+        strain = [point[0] for point in (self.curve or ())[1:-1]]
+        return np.array([strain, np.diff(self._slopes)]).T
+
+    def _slope_at_rest(self, side: Literal["left", "right"]) -> float:
+        """Return the slope of the curve just below strain 0, or just above."""
+        return float(self._slopes[np.searchsorted(self._kinks[:, 0], 0.0, side)])
 
     def parameters(self) -> dict[str, float | Vec]:
         """Return the strains at which springs yield and break, if any does: inf for never."""
@@ -219,18 +343,25 @@ class Springs(Effect):
         """Return two rows for every spring, one for each end."""
         first, network, mass = network_of(groups, self.group, dimension)
         springs = network.springs(dimension)
+        stiffness, i, j = self._stiffness(springs), springs.i, springs.j
+        reduced = 1 / (1 / mass[i] + 1 / mass[j] + 1e-300)  # kg; two pinned ends do not oscillate
+        firm = stiffness * self._slope_at_rest("right")
+        damping = self.damping + 2 * self.ratio * np.sqrt(firm * np.minimum(reduced, 1e300))
+        rest = self.rest * springs.rest
+        kinks = [part for strain, turn in self._kinks for part in (np.full(len(rest), strain), turn * stiffness)]
+        every = [stiffness * self._slope_at_rest("left"), damping, rest, *kinks, rest]
+        number = np.stack(every[: self.numbers(dimension)], axis=1)
+        agent, partner = np.concatenate([i, j]) + first, np.concatenate([j, i]) + first
+        kept = np.tile(np.arange(len(i)) + self.first_kept(groups, dimension), 2) if self.lasts else None
+        return Bonds(agent.astype(np.int32), partner[:, None].astype(np.int32), np.concatenate([number, number]), kept)
+
+    def _stiffness(self, springs: Joints) -> Floats:
+        """Return the stiffness of each spring by its role, N/m."""
         stiffness = np.full(len(springs.i), self.stiffness)
         for role, value in ((SHEAR, self.shear), (BEND, self.bend)):
             if value is not None:
                 stiffness[springs.role == role] = value
-        i, j = springs.i, springs.j
-        reduced = 1 / (1 / mass[i] + 1 / mass[j] + 1e-300)  # kg; two pinned ends do not oscillate
-        damping = self.damping + 2 * self.ratio * np.sqrt(stiffness * np.minimum(reduced, 1e300))
-        rest = self.rest * springs.rest
-        number = np.stack([stiffness, damping, rest, rest][: self.numbers(dimension)], axis=1)
-        agent, partner = np.concatenate([i, j]) + first, np.concatenate([j, i]) + first
-        kept = np.tile(np.arange(len(i)) + self.first_kept(groups, dimension), 2) if self.lasts else None
-        return Bonds(agent.astype(np.int32), partner[:, None].astype(np.int32), np.concatenate([number, number]), kept)
+        return stiffness
 
     def first_kept(self, groups: Sequence[Any], dimension: int) -> int:
         """Return where in State.bonds the rest lengths of its group begin: behind those of all networks before."""
@@ -244,13 +375,15 @@ class Springs(Effect):
         return Stencils(ends, bonds.number[:half])
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats] | None:
-        """Return bounds by Gershgorin's circles: w^2 <= 2 sum k / m, and damping <= 2 sum c / m."""
+        """Return bounds by Gershgorin's circles: w^2 <= 2 sum k / m (k: steepest slope), and damping <= 2 sum c / m."""
         bonds, mass = self.bonds(groups, dimension), all_masses(groups, dimension)
-        swing, damp = (np.bincount(bonds.agent, bonds.number[:, k], len(mass)) for k in (0, 1))
+        _, network, _ = network_of(groups, self.group, dimension)
+        stiffest = np.tile(self._stiffness(network.springs(dimension)) * self._slopes.max(), 2)
+        swing, damp = (np.bincount(bonds.agent, each, len(mass)) for each in (stiffest, bonds.number[:, 1]))
         return 2 * swing / mass, 2 * damp / mass
 
     def potential(self, groups: Sequence[Any], state: State, offset: Any) -> Floats:
-        """Return the sum of k (l - L)^2 / 2 over all springs that are not broken, (B,) J."""
+        """Return the energy of all springs that are not broken, (B,) J: sum of k (l - L)^2 / 2 without a curve."""
         bonds = self.bonds(groups, state.shape[2])
         half = len(bonds.agent) // 2
         i, j, number = bonds.agent[:half], bonds.partner[:half, 0], bonds.number[:half]
@@ -259,7 +392,11 @@ class Springs(Effect):
         if bonds.kept is not None and state.bonds.shape[1]:
             rest = state.bonds[:, bonds.kept[:half]]  # type: ignore[assignment]
             rest = np.where(np.isfinite(rest), rest, length)
-        return np.asarray((0.5 * number[:, 0] * (length - rest) ** 2).sum(axis=1))
+        energy = 0.5 * number[:, 0] * (length - rest) ** 2
+        for k, (strain, _) in enumerate(self._kinks):
+            side = 1.0 if strain >= 0 else -1.0
+            energy += side * 0.5 * number[:, 4 + 2 * k] * np.maximum(side * (length - rest * (1 + strain)), 0.0) ** 2
+        return np.asarray(energy.sum(axis=1))
 
 
 class AngularSprings(Effect):
