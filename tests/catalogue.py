@@ -300,17 +300,19 @@ class EffectRow:
         """Return the effect in `dimension` and those beside it; skip the test if it is not defined there."""
         if dimension not in self.dimensions:
             pytest.skip(f"{self.name}: not in {dimension}-D")
-        effect = self.flat if self.flat is not None and dimension == 2 else self.effect
-        return tuple(in_dimension(effect, dimension) for effect in (effect, *self.beside))
+        return tuple(in_dimension(effect, dimension) for effect in (self._own(dimension), *self.beside))
+
+    def _own(self, dimension: int) -> Effect:
+        return self.flat if self.flat is not None and dimension == 2 else self.effect
 
     def company(self, dimension: int, idle: bool = False) -> tuple[Effect, ...]:
-        """Return the effect among the idle effects of its family; with `idle` it is idle itself."""
+        """Return the effect among the idle effects of its family, and those beside it; with `idle` it is idle too."""
+        effect, *beside = self.at(dimension)
         if not self.family:
-            effect, *beside = self.at(dimension)
             return (effect.idle_copy() if idle else effect, *beside)
-        family = [row for row in EFFECTS if row.family == self.family]
-        here = [(in_dimension(row.effect, dimension), row is self and not idle) for row in family]
-        return tuple(effect if acts else effect.idle_copy() for effect, acts in here)
+        family = [row for row in EFFECTS if row.family == self.family and dimension in row.dimensions]
+        here = [(in_dimension(row._own(dimension), dimension), row is self and not idle) for row in family]
+        return (*(effect if acts else effect.idle_copy() for effect, acts in here), *beside)
 
 
 def vectors(effect: Effect) -> dict[str, tuple[Any, ...]]:
@@ -363,29 +365,32 @@ DRIVING = Driving(tau=0.8)
 
 EFFECTS = (
     EffectRow(DRAG),
-    EffectRow(QuadraticDrag(rate=0.3)),
-    EffectRow(Gravity(acceleration=(0.5, -3, 1))),
-    EffectRow(Uniform(strength=(0.8, -0.5, 0.3), period=2, phase=0.3), signed=("phase",)),
-    EffectRow(Source(strength=2, centre=CENTRE, maximum=3), signed=("phase",)),
-    EffectRow(Sink(strength=2, centre=CENTRE, maximum=3, acts="medium"), beside=(DRAG,), signed=("phase",)),
+    EffectRow(QuadraticDrag(rate=0.3), family="own"),
+    EffectRow(Gravity(acceleration=(0.5, -3, 1)), family="own"),
+    EffectRow(Uniform(strength=(0.8, -0.5, 0.3), period=2, phase=0.3), signed=("phase",), family="own"),
+    EffectRow(Source(strength=2, centre=CENTRE, maximum=3), signed=("phase",), family="own"),
+    EffectRow(
+        Sink(strength=2, centre=CENTRE, maximum=3, acts="medium"), beside=(DRAG,), signed=("phase",), family="medium"
+    ),
     EffectRow(
         Vortex(strength=-2, centre=CENTRE, maximum=3, axis=(0.6, 0, 0.8), acts="medium", period=3), beside=(DRAG,),
         obeys=frozenset({"translation", "rotation", "relabelling"}),  # its mirror image turns in the opposite direction
-        signed=("strength", "phase"),
+        signed=("strength", "phase"), family="medium",
     ),
     EffectRow(
         Vortex(strength=2, centre=CENTRE, maximum=3, axis=(0.6, 0, 0.8)),
-        obeys=frozenset({"translation", "rotation", "relabelling"}), signed=("strength", "phase"),
+        obeys=frozenset({"translation", "rotation", "relabelling"}), signed=("strength", "phase"), family="own",
     ),
-    EffectRow(WIND, beside=(DRAG,), signed=("phase",)),
+    EffectRow(WIND, beside=(DRAG,), signed=("phase",), family="medium"),
     EffectRow(Carried(share=0.9), beside=(WIND, DRAG)),
-    EffectRow(Attraction(strength=2, centre=CENTRE, softening=0.5), signed=("strength",)),
-    EffectRow(Tether(centre=CENTRE, stiffness=0.8, damping=0.1, rest=0.5)),
+    EffectRow(Attraction(strength=2, centre=CENTRE, softening=0.5), signed=("strength",), family="own"),
+    EffectRow(Tether(centre=CENTRE, stiffness=0.8, damping=0.1, rest=0.5), family="own"),
     EffectRow(
-        Swing(centre=CENTRE, strength=0.8, length=0.7), obeys=frozenset({"translation", "mirror", "relabelling"})
+        Swing(centre=CENTRE, strength=0.8, length=0.7), obeys=frozenset({"translation", "mirror", "relabelling"}),
+        family="own",
     ),
-    EffectRow(Goal(target=CENTRE, slow_radius=2), beside=(DRIVING,)),
-    EffectRow(Course(direction=(0.8, -0.5, 0.3), share=0.7), beside=(DRIVING,)),
+    EffectRow(Goal(target=CENTRE, slow_radius=2), beside=(DRIVING,), family="aims"),
+    EffectRow(Course(direction=(0.8, -0.5, 0.3), share=0.7), beside=(DRIVING,), family="aims"),
     EffectRow(  # the target is fixed at the start: an agent that is shifted later still goes there
         Antipode(centre=CENTRE[:2]), beside=(DRIVING,), dimensions=(2,), obeys=frozenset()
     ),
@@ -410,14 +415,16 @@ EFFECTS = (
     EffectRow(Fear(group=0, other=1, radius=2.5), family="urges", obeys=frozenset()),
     EffectRow(Libido(radius=1.0, start=0.4, spread=0.6), family="urges", obeys=frozenset()),
     EffectRow(Intention(), family="urges", obeys=frozenset()),
-    EffectRow(WallRepulsion(point=CENTRE, normal=(1.2, -0.7, 0.9), strength=2, decay=1.5)),
+    EffectRow(WallRepulsion(point=CENTRE, normal=(1.2, -0.7, 0.9), strength=2, decay=1.5), family="own"),
     EffectRow(ObstacleContact(stiffness=30, damping=4, friction=8, coulomb=0.6, most=5)),
     EffectRow(Contact(stiffness=20, ratio=0.3, damping=0.1, friction=6, coulomb=0.5, most=4, radius=0.5)),
-    EffectRow(SpeedLimit(speed=1.2, strength=0.8)),
-    EffectRow(Fluctuation(strength=0.8), obeys=frozenset({"translation"})),  # random per agent, drawn along the axes
-    EffectRow(Pressure(strength=1.5, density=1, radius=1.35)),
-    EffectRow(Viscosity(viscosity=0.4, density=1, radius=2.2)),
-    EffectRow(SurfaceTension(tension=0.8, density=1, radius=2.2)),
+    EffectRow(SpeedLimit(speed=1.2, strength=0.8), family="own"),
+    EffectRow(  # random per agent, drawn along the axes
+        Fluctuation(strength=0.8), obeys=frozenset({"translation"}), family="own"
+    ),
+    EffectRow(Pressure(strength=1.5, density=1, radius=1.35), family="liquid"),
+    EffectRow(Viscosity(viscosity=0.4, density=1, radius=2.2), family="liquid"),
+    EffectRow(SurfaceTension(tension=0.8, density=1, radius=2.2), family="liquid"),
     EffectRow(  # random per agent, with the same sign in a mirror image
         Vicsek(speed=1.2, radius=2.5, noise=1, step=0.05), obeys=frozenset({"translation", "rotation"}), dimensions=(2,)
     ),

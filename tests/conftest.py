@@ -44,10 +44,9 @@ RARE = {
 
 RARE_EFFECTS = {
     "alignment_cone", "cohesion_cone", "altitude_springs", "angular_springs", "membrane", "bending",
-    "elastic", "elastic_corotated",
-    "springs_yielding", "quadratic_drag", "carried", "wind", "obstacle_contact", "gravity",
+    "elastic", "elastic_corotated", "springs_yielding", "carried", "wind", "obstacle_contact",
 }  # fmt: skip
-"""Effects whose symmetries only slow tests try: each compiles a kernel, and has quick tests elsewhere."""
+"""Effects whose symmetries only slow tests try: their kernels are compiled for them, and quick tests are elsewhere."""
 
 RARE_METHODS = {
     "averaged_velocity",

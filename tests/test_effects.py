@@ -454,8 +454,7 @@ def test_pair_law_may_call_a_function_of_another_user_module_that_reads_bodies(t
 @ROWS
 def test_idle_effect_changes_nothing(row: EffectRow, dimension: int) -> None:
     idle = scene_of(*row.company(dimension, idle=True), dimension=dimension)
-    rest = () if row.family else row.at(dimension)[1:]
-    absent = scene_of(*rest, dimension=dimension, groups=idle.groups)
+    absent = scene_of(*row.at(dimension)[1:], dimension=dimension, groups=idle.groups)
     start = idle.start(3)  # clear of obstacles; a start with inner state or bonds fits only its own scene
     own = row.effect.keeps or row.effect.bond_keep_law
     ends = [scene.run(scene.start(3) if own else start, 20) for scene in (idle, absent)]
