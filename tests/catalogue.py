@@ -428,10 +428,10 @@ EFFECTS = (
     EffectRow(  # random per agent, with the same sign in a mirror image
         Vicsek(speed=1.2, radius=2.5, noise=1, step=0.05), obeys=frozenset({"translation", "rotation"}), dimensions=(2,)
     ),
-    EffectRow(Separation(weight=1.3, radius=2.5)),
+    EffectRow(Separation(weight=1.3, radius=2.5), family="flock"),
     EffectRow(Separation(weight=1.3, radius=2.5, fov=200, nearest=3)),
-    EffectRow(Alignment(weight=0.7, radius=3, fov=270)),
-    EffectRow(Cohesion(weight=0.9, radius=2.8, fov=240)),
+    EffectRow(Alignment(weight=0.7, radius=3, fov=270), family="flock"),
+    EffectRow(Cohesion(weight=0.9, radius=2.8, fov=240), family="flock"),
     EffectRow(AvoidObstacles(weight=5, horizon=3, margin=0.1)),
     EffectRow(UnalignedAvoidance(weight=3, radius=4, horizon=2, margin=0.2), family="crowd"),
     EffectRow(Queue(weight=2, target=CENTRE, speed=1.2, margin=0.1), family="crowd"),
@@ -486,22 +486,26 @@ EFFECTS = (
     EffectRow(ForceField(weight=0.5, range=2), family="around"),
     EffectRow(FollowWall(weight=2, speed=1.5, distance=0.7, range=4), family="around"),
     EffectRow(  # its circle is not moved with the scene
-        Contain(weight=2, speed=1.5, within=Circle(centre=(3, 3), radius=2.5)), obeys=frozenset({"relabelling"})
+        Contain(weight=2, speed=1.5, within=Circle(centre=(3, 3), radius=2.5)), obeys=frozenset({"relabelling"}),
+        family="paths",
     ),
     EffectRow(  # its grid lies along the axes
         FollowWay(weight=2, speed=1.5, target=(3.0, 5.5, 2.5), clearance=0.1, spacing=0.3, margin=1),
         obeys=frozenset({"relabelling"}),
     ),
-    EffectRow(FollowPath(weight=2, points=LOOP, closed=True, radius=0.3, speed=1.5), signed=("way",)),
-    EffectRow(StayOnPath(weight=2, points=LOOP[:3], radius=0.4, speed=1.5, time=1)),
+    EffectRow(
+        FollowPath(weight=2, points=LOOP, closed=True, radius=0.3, speed=1.5), signed=("way",), family="paths"
+    ),
+    EffectRow(StayOnPath(weight=2, points=LOOP[:3], radius=0.4, speed=1.5, time=1), family="paths"),
     EffectRow(
         FollowFlow(weight=1.5, centre=CENTRE, spacing=1.5, counts=(4, 3, 2), velocities=FLOWS),
         flat=FollowFlow(weight=1.5, centre=CENTRE[:2], spacing=1.5, counts=(4, 3),
                         velocities=tuple(flow[:2] for flow in FLOWS[:12])),
-        obeys=frozenset({"translation", "relabelling"}),  # its grid lies along the axes
+        obeys=frozenset({"translation", "relabelling"}), family="paths",  # its grid lies along the axes
     ),
-    EffectRow(Gravitation(constant=0.3, softening=0.5)),  # exact for few agents; for many, see test_gravitation.py
-    EffectRow(InverseSquare(strength=-0.4, softening=0.3), signed=("strength",)),
+    # exact for few agents; for many, see test_gravitation.py
+    EffectRow(Gravitation(constant=0.3, softening=0.5), family="far"),
+    EffectRow(InverseSquare(strength=-0.4, softening=0.3), signed=("strength",), family="far"),
     EffectRow(CircularRepulsion(strength=2, decay=0.8, anisotropy=0.3, radius=2.5), family="social"),
     EffectRow(
         EllipticalRepulsion(

@@ -43,8 +43,8 @@ RARE = {
 """Kernels of catalogue.Variant that only slow tests compile."""
 
 RARE_EFFECTS = {
-    "alignment_cone", "cohesion_cone", "altitude_springs", "angular_springs", "membrane", "bending",
-    "elastic", "elastic_corotated", "springs_yielding", "carried", "wind", "obstacle_contact",
+    "altitude_springs", "angular_springs", "membrane", "bending", "elastic", "elastic_corotated", "springs_yielding",
+    "carried", "wind", "obstacle_contact",
 }  # fmt: skip
 """Effects whose symmetries only slow tests try: their kernels are compiled for them, and quick tests are elsewhere."""
 
