@@ -326,6 +326,22 @@ def test_lumped_mass_lowers_and_consistent_mass_raises_the_frequency_of_a_bar() 
     assert consistent[0] == pytest.approx(exact, rel=1e-4)
 
 
+def test_the_bending_frequencies_of_a_beam_converge_to_those_of_euler_and_bernoulli() -> None:
+    """Fixed-free, 20 m by 1 m: w = (b / L)^2 sqrt(E I / (rho A)) with cos b cosh b = -1; errors are of order h^2."""
+    material, beam = Material(young=1000, poisson=0, density=1), np.sqrt(1000 / 12) / 20**2
+    found = []
+    for refined in (2, 4, 8):
+        block = Jelly(cells=(20 * refined, 2 * refined), sides=(20, 1), pinned=("left",))
+        points, elements = block.points(2), block.elements(2)
+        K, M = stiffness(points, elements, material), mass(points, elements, material, lumped=False)
+        found.append(frequencies(K, M, freedoms(block.pins(), 2), count=2))
+    rates = np.log2((found[0] - found[1]) / (found[1] - found[2]))
+    assert (rates > 1.7).all() and (rates < 2.2).all(), rates
+    limit = found[2] - (found[1] - found[2]) / 3
+    exact = beam * np.array([1.875104, 4.694091]) ** 2
+    assert (np.abs(limit / exact - 1) < (0.01, 0.03)).all(), "shear and rotation of the section lower them a little"
+
+
 def test_the_lowest_frequencies_of_a_large_structure_are_exact() -> None:
     """Inverse iteration, used above DENSE freedoms, against closed forms of a fixed and of a free bar."""
     N = DENSE + 200

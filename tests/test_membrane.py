@@ -142,6 +142,38 @@ def test_a_sheet_on_a_cylinder_has_the_energy_of_its_curvature(cells: tuple[int,
     assert found == pytest.approx(0.5 * 0.4 * curvature**2 * (0.9 - step) * 0.6, rel=1e-9)
 
 
+def test_a_hanging_sheet_is_stretched_by_what_hangs_below() -> None:
+    """Strain weight / (k width) in each row of cells, from its top side down, carries the rows of particles below."""
+    rows, weight = 6, 4 * MASS * 9.81
+    scene = cloth(cells=(3, rows))
+    state, height = scene.start(0), 0.6 / rows
+    strain = np.arange(1, rows + 1) * weight / (300.0 * 0.9)  # of rows of cells, from below
+    level = np.concatenate([[0.0], np.cumsum(height * (1 + strain))])
+    row = np.rint(state.pos[0, :, 1] / height).astype(int)
+    pos = state.pos.copy()
+    pos[0, :, 1] = level[row]
+    pull = np.bincount(row, force(scene, state.with_motion(pos, state.vel))[:, 1])
+    np.testing.assert_allclose(pull[:-1], weight, rtol=1e-9)
+    assert level[-1] - 0.6 == pytest.approx(height * weight * rows * (rows + 1) / 2 / (300.0 * 0.9))
+
+
+def test_a_compressed_strip_buckles_at_eulers_strain() -> None:
+    """Of a half wave z = a sin(q x): D q^4 a resists and k strain q^2 a drives, equal at a strain of D q^2 / k."""
+    scene = cloth(cells=(16, 3))
+    state, q = scene.start(0), np.pi / 0.9
+    wave = np.sin(q * state.pos[0, :, 0])
+    expected = 0.4 * q**2 / 300.0
+
+    def growth(strain: float) -> float:
+        pos = state.pos * (1 - strain, 1.0, 1.0)
+        pos[0, :, 2] = 1e-5 * wave
+        return float(force(scene, state.with_motion(pos, state.vel))[:, 2] @ wave)
+
+    below, above = growth(0.9 * expected), growth(1.1 * expected)
+    assert below < 0 < above
+    assert expected * (0.9 + 0.2 * below / (below - above)) == pytest.approx(expected, rel=0.02)
+
+
 TENT = Mesh(
     vertices=((0, 0, 0), (1, 0, 0), (1, 1, 0.4), (0, 1, 0.4), (0.5, 0.5, 0.6)),
     triangles=((0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)),
