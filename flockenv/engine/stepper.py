@@ -22,7 +22,8 @@ from flockenv.engine.workspace import Workspace
 from flockenv.jit.thread_pool import LARGEST, AutoTuners, run_parallel, usable_threads
 from flockenv.model.scene_view import SceneView
 from flockenv.model.state import Floats, State
-from flockenv.physics.constraints import Settler
+from flockenv.physics.constraints import BodyContacts, Settler
+from flockenv.physics.constraints.rigid_bodies import BodySettler
 from flockenv.physics.integrators import SemiImplicitEuler
 from flockenv.physics.population import make_settler as population_settler
 
@@ -178,6 +179,10 @@ class Stepper:
             last = [population_settler(self.scene)] if self.scene.population else []
             kept.append([constraint.settler(self.scene) for constraint in self.scene.constraints] + last)
         return kept
+
+    def body_contacts(self) -> BodyContacts:
+        """Return the contacts of rigid bodies in the last step of one world by this thread."""
+        return next(each.found() for each in self._settlers(1)[0] if isinstance(each, BodySettler))
 
     def _step_by_kernel(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
         """Step in place by the kernel alone, on all threads in use.

@@ -138,6 +138,11 @@ class Network(Record):
         points = self.points(dimension)
         return np.asarray(points if self.stretch == 1 else points[0] + (points - points[0]) / self.stretch)
 
+    def velocities(self, dimension: int) -> Floats:
+        """Return the initial velocities of particles relative to that of the group, (n, D) m/s."""
+        self._check_dimension(dimension)
+        return np.zeros((self.size, dimension))
+
     @abstractmethod
     def springs(self, dimension: int) -> Springs:
         """Return the springs: pairs of particles, rest lengths and roles."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from flockenv.model.blocks import Blocks
 from flockenv.model.finite_elements import flat
 from flockenv.model.network import (
     BEND,
@@ -37,7 +38,9 @@ from flockenv.model.network import (
     springs_of,
 )
 
-__all__ = ["BEND", "EDGE", "MOST", "SHEAR", "AnyNetwork", "Cloth", "Jelly", "Mesh", "Network", "Rope", "Springs"]
+__all__ = [
+    "BEND", "EDGE", "MOST", "SHEAR", "AnyNetwork", "Blocks", "Cloth", "Jelly", "Mesh", "Network", "Rope", "Springs",
+]  # fmt: skip
 
 
 class Rope(Network):
@@ -371,7 +374,7 @@ class Mesh(Network):
         return orient(self.points(dimension), self._element_array())
 
 
-AnyNetwork = Annotated[Rope | Cloth | Jelly | Mesh, Field(discriminator="kind")]
+AnyNetwork = Annotated[Rope | Cloth | Jelly | Mesh | Blocks, Field(discriminator="kind")]
 
 
 # --- lattices -------------------------------------------------------------------------------------------------------

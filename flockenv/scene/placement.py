@@ -95,13 +95,14 @@ def _place_scattered(scene: SceneView, state: State, b: int, first: int, group: 
 
 
 def _place_network(scene: SceneView, state: State, b: int, first: int, group: Group) -> None:
-    """Write the initial positions and common velocity of a network's particles in one world."""
+    """Write the initial positions and velocities of a network's particles in one world."""
     assert group.network is not None
     slots = slice(first, first + group.size)
     state.pos[b, slots] = group.network.points(scene.dimension)
+    state.vel[b, slots] = group.network.velocities(scene.dimension)
     if group.spawn.heading is not None:
         heading = np.asarray(group.spawn.heading, float)
-        state.vel[b, slots] = group.spawn.speed[0] * heading / np.linalg.norm(heading)
+        state.vel[b, slots] += group.spawn.speed[0] * heading / np.linalg.norm(heading)
         state.vel[b, first + group.network.pins()] = 0
 
 

@@ -43,7 +43,7 @@ from flockenv.model.group import Group
 from flockenv.model.networks import EDGE
 from flockenv.model.snapshot import Snapshot
 from flockenv.model.state import Body, Floats, State
-from flockenv.physics.constraints import CONSTRAINTS, Collisions, Constraint
+from flockenv.physics.constraints import CONSTRAINTS, BodyContacts, Collisions, Constraint, RigidBodies
 from flockenv.physics.effects import EFFECTS, Effect
 from flockenv.physics.effects.effect import all_masses
 from flockenv.physics.integrators import INTEGRATORS, Adaptive, ImplicitEuler, Integrator, SemiImplicitEuler
@@ -328,7 +328,10 @@ class Scene(Record):
         sorts = self.agents >= FEWEST_AGENTS
         crowded = self.agents > MOST_DIRECT
         effects = flatten_effects(self.effects)
-        solid_walls = any(isinstance(each, Collisions) and each.obstacles for each in self.constraints)
+        solid_walls = any(
+            isinstance(each, RigidBodies) or (isinstance(each, Collisions) and each.obstacles)
+            for each in self.constraints
+        )
         space = Plane() if solid_walls and isinstance(self.space, Box) else self.space  # its walls are then obstacles
         return KernelPlan(
             self.dimension, space, effects, self.integrator, self.dtype, sorts, crowded=crowded,
@@ -559,6 +562,13 @@ class Scene(Record):
     def run(self, state: State, steps: int) -> State:
         """Return the state after `steps` steps."""
         return self.step(state, steps=steps)
+
+    def contacts(self, state: State, world: int = 0) -> BodyContacts:
+        """Return the contacts of rigid bodies, with their forces, in the step of one world that begins at a state."""
+        if not any(isinstance(each, RigidBodies) for each in self.constraints):
+            raise ValueError("constraints: the scene has no rigid_bodies, which have contacts")
+        self.step(state.worlds([world]))
+        return self.stepper.body_contacts()
 
     def _drive(self, drive: ArrayLike | None, state: State) -> Floats:
         if drive is None:

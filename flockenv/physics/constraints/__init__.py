@@ -10,7 +10,11 @@ import_all(__name__, __path__)
 from flockenv.physics.constraints.collisions import Collisions  # noqa: E402  # after the folder has been walked
 from flockenv.physics.constraints.constraint import CONSTRAINTS, Constraint, Settler  # noqa: E402
 from flockenv.physics.constraints.face_collisions import FaceCollisions  # noqa: E402
+from flockenv.physics.constraints.rigid_bodies import BodyContacts, RigidBodies  # noqa: E402
 from flockenv.physics.constraints.rods import Rods  # noqa: E402
 from flockenv.physics.constraints.slide import Slide  # noqa: E402
 
-__all__ = ["CONSTRAINTS", "Collisions", "Constraint", "FaceCollisions", "Rods", "Settler", "Slide", "UnmetWarning"]
+__all__ = [
+    "CONSTRAINTS", "BodyContacts", "Collisions", "Constraint", "FaceCollisions", "RigidBodies", "Rods", "Settler",
+    "Slide", "UnmetWarning",
+]  # fmt: skip
