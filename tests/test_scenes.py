@@ -36,6 +36,7 @@ SLOW = (
 )  # they compile for half a minute or have many bodies
 PICTURES = (
     "fountain", "fireworks", "drop", "waterfall", "fire", "smoke", "draped_cloth", "torn_paper", "jelly_on_stairs",
+    "dice",
 )  # fmt: skip
 UNSOLVED = pytest.mark.filterwarnings("ignore::flockenv.core.warnings.UnsolvedContactsWarning")
 FAST = pytest.mark.parametrize(
@@ -190,6 +191,19 @@ def test_a_jelly_tumbles_down_the_stairs_and_keeps_its_volume() -> None:
     assert state.pos[0].mean(axis=0)[0] > 3.5  # beyond the last step
     assert (volumes(scene, state) > 0).all()
     assert volumes(scene, state).mean() == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.slow
+def test_thrown_dice_come_to_rest_on_their_faces() -> None:
+    scene = scene_of("dice")
+    up = np.array((0, 0.8, 0.6))
+    state, lowest = scene.start(0), np.inf
+    for _ in range(100):
+        state = scene.step(state, steps=10, out=state)
+        lowest = min(lowest, float((state.pos[0] @ up).min()) - 0.088)
+    assert lowest > -1e-4 and state.count_of("unsolved") == 0
+    assert np.abs(state.vel).max() < 1e-9
+    np.testing.assert_allclose((state.pos[0].reshape(7, 9, 3)[:, 8] @ up) - 0.088, 0.008, atol=1e-6)
 
 
 @pytest.mark.slow

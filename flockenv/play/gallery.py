@@ -45,7 +45,16 @@ FIRST_NAMES = ("boids", "crowd_room", "fish", "cloth", "galaxy", "vicsek", "fire
 FAMILIES = {
     "Crowds": {"driving", "line_up", "way", "routes", "journey", "follow_way", "unaligned_avoidance", "heuristics"},
     "Flocks": {"alignment", "cohesion", "vicsek", "boids"},
-    "Solids and cloth": {"springs", "elastic", "collisions", "face_collisions", "rods", "slide", "contact"},
+    "Solids and cloth": {
+        "springs",
+        "elastic",
+        "collisions",
+        "face_collisions",
+        "rigid_bodies",
+        "rods",
+        "slide",
+        "contact",
+    },
     "Particles and fields": set(),
 }
 """Families of scenes, each with kinds of which one makes a scene one of that family; the first that fits counts."""
