@@ -90,6 +90,12 @@ def test_points_are_merged_within_a_distance_and_elements_that_vanish_are_left_o
     np.testing.assert_array_equal(mesh.vertices, points[first])
 
 
+def test_a_point_whose_only_element_vanishes_is_left_out() -> None:
+    points = np.array([(9, 9, 9), (0, 0, 0), (1, 0, 0), (0, 1, 0), (1e-9, 0, 0)])
+    mesh = mesh_of(points, np.array([(0, 1, 4), (1, 2, 3)]), merge=1e-6)
+    assert mesh.vertices == ((0, 0, 0), (1, 0, 0), (0, 1, 0)) and mesh.triangles == ((0, 1, 2),)
+
+
 @pytest.mark.parametrize(
     ("cells", "force"), [([("tetra", FIVE)], Elastic), ([("triangle", BOX)], Membrane), ([("line", [(0, 1)])], Springs)]
 )
@@ -133,6 +139,9 @@ TENT = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1)]  # three triangl
             "triangles 0 and 1 overlap: both are on the same side of their common edge, of (0, 0) and (1, 0)",
         ),
         (CORNERS, [("tetra", FIVE)], ["--dimension", "2"], "the mesh is not flat, but 1 m thick along z"),
+        (CORNERS, [("tetra", FIVE)], ["--merge", "2"], "merge = 2: corners of every element become one"),
+        (CORNERS, [("tetra", FIVE)], ["--merge", "inf"], "merge = inf: must be finite"),
+        (CORNERS, [("tetra", FIVE)], ["--move", "0", "inf", "0"], "move = (0.0, inf, 0.0): must be finite"),
         (CORNERS, [("tetra", FIVE)], ["--closed"], "closed: only a surface of triangles in 3-D"),
         (CORNERS, [("tetra", FIVE)], ["--elements", "bars"], "the file has no bars; its cells: 5 tetra"),
         (CORNERS, [("vertex", [[0]])], [], "no bars, triangles or tetrahedra; its cells: 1 vertex"),

@@ -88,6 +88,10 @@ def test_metaballs_melt_if_they_are_near_and_are_discs_of_their_size_if_not() ->
     assert reds(near).sum() > apart.sum()
 
 
+def test_a_metaball_without_a_size_is_not_drawn() -> None:
+    assert not reds([(5, 5)], size=(0.0, 0.0)).any()
+
+
 def test_metaballs_melt_across_the_edge_of_a_torus_and_take_mean_colours() -> None:
     assert reds([(0.2, 5)]).sum() < reds([(5, 5)]).sum()
     whole = {"looks": (RED,), "look": np.zeros(1, dtype=int), "periodic": True}

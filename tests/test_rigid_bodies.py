@@ -297,6 +297,20 @@ def test_a_row_of_a_batch_has_the_bits_of_that_world_alone() -> None:
     assert batch.count_of("impacts") > 0
 
 
+@pytest.mark.filterwarnings("ignore")
+def test_a_world_whose_impulses_overflow_is_reported_and_leaves_the_next_one_alone() -> None:
+    scene = scene_of(Blocks(sides=CUBE, centres=((0, 0, 0.5),), turns=((3, 4, 0),)))
+    start = scene.start(0, worlds=2)
+    start.v[2] = ((-1e200,), (-1.0,))
+    ends = []
+    for first in (0, 1):
+        end, settle = start.copy(), scene.constraints[0].settler(scene)
+        end.x[...] += 0.01 * end.v
+        assert settle(start.x, start.v, end, first, 2) == ((0, 0) if first == 0 else (-1, -1))
+        ends.append(end.worlds([1]))
+    assert ends[0].digest == ends[1].digest and ends[1].vel[0, -1, 2] > -0.9
+
+
 def test_a_scene_with_rigid_bodies_has_the_kernel_of_one_without() -> None:
     """Nothing of the constraint is in the kernel of a scene, and a scene without it has no scratch memory of it."""
     scene = free(Blocks(sides=CUBE, centres=((0, 0, 0),)))

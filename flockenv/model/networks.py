@@ -1,4 +1,4 @@
-"""Networks: particles joined to each other (a rope, a cloth, a jelly or a custom mesh), as arrays of their joints.
+"""Networks: particles joined to each other (a rope, a cloth, a jelly, a mesh or blocks), as arrays of their joints.
 
 A network defines the initial positions of its particles, the springs, hinges and finite elements that join them, which
 particles are pinned, and their masses. The forces of springs are effects, defined elsewhere.

@@ -27,7 +27,7 @@ def draw_metaballs(canvas: Image.Image, view: View, spots: Floats, size: Floats,
     sums = np.zeros((canvas.height, canvas.width, 5))  # fields, and colours times fields
     for (x, y), r, paint in zip(spots.tolist(), size.tolist(), colour, strict=True):
         reach = METABALL * r
-        for a, b in view.visible_positions(x, y, reach):
+        for a, b in view.visible_positions(x, y, reach) if reach > 0 else ():
             left, right = max(0, math.floor(a - reach)), min(canvas.width, math.ceil(a + reach) + 1)
             top, bottom = max(0, math.floor(b - reach)), min(canvas.height, math.ceil(b + reach) + 1)
             if left < right and top < bottom:

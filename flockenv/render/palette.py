@@ -52,7 +52,7 @@ BOND: Final = 0.0022
 #: Least radius of agents drawn as points, as a share of the picture's width.
 POINT: Final = 0.0022
 
-#: Reach of a metaball, in units of its size: others within twice that distance are melted with it.
+#: Reach of a metaball, in units of its size: two of one size melt if their centres are within 4.6 sizes.
 METABALL: Final = 4.0
 
 #: Corners of the arrow that shows a heading, x along it, in units of its length.

@@ -83,8 +83,11 @@ def mesh_of(
         closed: True if a surface with a hole is refused.
 
     Raises:
-        ValueError: a mesh that is not sound; see check_mesh.
+        ValueError: a mesh that is not sound; see check_mesh; or a number that is not finite.
     """
+    for name, value in {"scale": scale, "rotate": rotate, "move": move, "merge": merge or 0.0}.items():
+        if not np.isfinite(value).all():
+            raise ValueError(f"{name} = {value}: must be finite")
     points, elements = _merge(_placed(points, scale, rotate, move), elements, merge)
     if dimension == 2:
         thick = np.ptp(points[:, 2])
@@ -197,8 +200,13 @@ def _elements_of(points: Floats, blocks: Sequence[Any], kind: Elements | None) -
         if block.type not in allowed:
             raise ValueError(f"cells of kind {block.type}: allowed: {' and '.join(allowed)}; its cells: {found}")
     rows = np.concatenate([_corners_of(block, points) for block in taken])
-    used, rows = np.unique(rows, return_inverse=True)
-    return points[used], rows.reshape(-1, wanted + 1)
+    return _used(points, rows)
+
+
+def _used(points: Floats, rows: Ints) -> tuple[Floats, Ints]:
+    """Return the points that belong to an element, and the elements with their new numbers."""
+    used, numbers = np.unique(rows, return_inverse=True)
+    return points[used], numbers.reshape(rows.shape)
 
 
 def _corners_of(block: Any, points: Floats) -> Ints:
@@ -233,7 +241,8 @@ def _placed(points: Floats, scale: float, rotate: Sequence[float], move: Sequenc
 def _merge(points: Floats, elements: Ints, distance: float | None) -> tuple[Floats, Ints]:
     """Return points and elements after points up to a distance apart have become the first of them.
 
-    Elements of which corners become one are left out. Raises ValueError if distance is None and points coincide.
+    Elements of which corners become one are left out, and so are points that belong to no other element. Raises
+    ValueError if no element is left, or if distance is None and points coincide.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -252,4 +261,7 @@ def _merge(points: Floats, elements: Ints, distance: float | None) -> tuple[Floa
     order = np.argsort(first)  # the numbers of points in the order of the file
     rows = np.argsort(order)[which][elements]
     ordered = np.sort(rows, axis=1)
-    return points[first[order]], rows[(ordered[:, 1:] != ordered[:, :-1]).all(axis=1)]
+    left = rows[(ordered[:, 1:] != ordered[:, :-1]).all(axis=1)]
+    if not len(left):
+        raise ValueError(f"merge = {distance:g}: corners of every element become one")
+    return _used(points[first[order]], left)

@@ -14,7 +14,7 @@ from flockenv.jit.decorators import Vec, finite, kernel, law, routine
 from flockenv.maths.polar import nearest_rotation
 from flockenv.maths.vectors import add, axis, cross, dot, norm, scale, sub
 
-__all__ = ["Solids", "advance_axes", "load_bodies", "put", "row", "spin_of", "store_body"]
+__all__ = ["Solids", "advance_axes", "first_not_finite", "load_bodies", "put", "row", "spin_of", "store_body"]
 
 NEWTON = 20
 """Most iterations of the midpoint rule; beyond them the rotation is that of the start."""
@@ -118,13 +118,21 @@ def _moment(solids: Any, x: Any, centre: Vec, v: Any, other: Any, b: int, i: int
 
 
 @routine
-def load_bodies(solids: Any, x0: Any, v0: Any, x: Any, v: Any, b: int, dt: float) -> int:
-    """Read the step of all bodies of world b; return the first agent that is not finite, or -1."""
-    flat = x.shape[0] == 2
+def first_not_finite(x: Any, v: Any, b: int) -> int:
+    """Return the first agent of world b whose position or velocity is not finite, or -1."""
     for p in range(x.shape[2]):
         for k in range(x.shape[0]):
             if not finite(x[k, b, p] + v[k, b, p]):
                 return p
+    return -1
+
+
+@routine
+def load_bodies(solids: Any, x0: Any, v0: Any, x: Any, v: Any, b: int, dt: float) -> int:
+    """Read the step of all bodies of world b; return the first agent that is not finite, or -1."""
+    flat, bad = x.shape[0] == 2, first_not_finite(x, v, b)
+    if bad >= 0:
+        return bad
     for i in range(solids.first.shape[0]):
         _read_axes(solids, x0, b, i, flat)
         centre, end = _mean(solids, x0, b, i, flat), _mean(solids, x, b, i, flat)

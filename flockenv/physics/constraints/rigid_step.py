@@ -15,7 +15,16 @@ import numpy as np
 from flockenv.jit.decorators import Vec, kernel, routine
 from flockenv.maths.vectors import add, cross, dot, norm, scale, sub
 from flockenv.physics.constraints.rigid_contacts import Contacts, add_ball, add_pair, add_plane
-from flockenv.physics.constraints.rigid_motion import Solids, advance_axes, load_bodies, put, row, spin_of, store_body
+from flockenv.physics.constraints.rigid_motion import (
+    Solids,
+    advance_axes,
+    first_not_finite,
+    load_bodies,
+    put,
+    row,
+    spin_of,
+    store_body,
+)
 from flockenv.physics.constraints.rigid_solver import apply_impulse, slide_speed, solve_contacts, sum_impulses
 
 __all__ = ["Around", "BodyRules", "settle_bodies"]
@@ -118,8 +127,8 @@ def _hardest(solids: Any, contacts: Any, count: int, dt: float) -> float:
 
 @kernel
 def _restart(solids: Any) -> None:
-    """Set velocities to those without contacts."""
-    for i in range(solids.first.shape[0]):
+    """Set velocities to those without contacts; what stands still too: impulses that overflow make it not finite."""
+    for i in range(solids.light.shape[0]):
         for k in range(2):
             put(solids.speed[k], i, row(solids.free[k], i))
 
@@ -235,6 +244,9 @@ def settle_bodies(
             left = max(left, _solve_velocities(solids, contacts, count, rules, hard, report))
             _balance(solids, contacts, count, rules.dt)
         _move(solids, x, v, b, count, rules.dt)
+        bad = first_not_finite(x, v, b)
+        if bad >= 0 and report[1] < 0:
+            report[1], report[2] = b, bad
         work[b, where[0]] += count
         deep = _deepest(solids, contacts, count)
         if left > UNSOLVED * hard or deep > DEEP:

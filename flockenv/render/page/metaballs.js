@@ -15,6 +15,7 @@ function emptySums(w, h) {
 }
 
 function addField({ sums, w, h }, x, y, reach, colour, opacity) {
+  if (!(reach > 0)) return;
   const left = Math.max(0, Math.floor(x - reach)), right = Math.min(w - 1, Math.ceil(x + reach));
   const top = Math.max(0, Math.floor(y - reach)), bottom = Math.min(h - 1, Math.ceil(y + reach)), [r, g, b] = channels(colour);
   for (let row = top; row <= bottom; row++) {
