@@ -85,7 +85,8 @@ def ship(folders: Sequence[Path], root: Path = ROOT) -> list[str]:
     """Write the runs of folders into a checkout; return a line for each player.
 
     Raises:
-        ValueError: in one line, before anything is written: a file that is no run, or one of another recipe.
+        ValueError: in one line, before anything is written: a file that is no run, one of another recipe, or a second
+            one of a seed.
     """
     policies = [path for folder in folders for path in sorted(folder.glob("*-seed-*.safetensors"))]
     searches = [path for folder in folders for path in sorted(folder.glob("*-seed-*.json"))]
@@ -93,6 +94,11 @@ def ship(folders: Sequence[Path], root: Path = ROOT) -> list[str]:
     if folders and not policies and not searches:
         names = ", ".join(map(printable_path, folders))
         raise ValueError(f"{names}: neither TASK-seed-N.safetensors nor TASK-PLAYER-seed-N.json in it")
+    seen: set[str] = set()
+    for path in (*policies, *searches):
+        if path.name in seen:
+            raise ValueError(f"{printable_path(path)}: another folder has a run of that seed too")
+        seen.add(path.name)
     files, lines = Files(root), []
     by_task = _by(lambda run: str(run.card["task"]), map(_read_policy, policies))
     for task, trained in by_task.items():

@@ -104,14 +104,14 @@ def test_metaballs_melt_across_the_edge_of_a_torus_and_take_mean_colours() -> No
 
 
 def test_a_picture_with_motion_blur_is_the_mean_of_the_last_instants_of_its_frame(tmp_path: Path) -> None:
-    film = [replace(shot([(1.0 + k, 5)]), time=0.1 * k) for k in range(9)]
+    film = [replace(shot([(1.0 + 0.2 * k, 5)]), time=0.025 * k) for k in range(41)]
     write_picture(tmp_path / "blur.webp", [Panel("", film, None, "")], "", 10.0, 200, Shutter(4, 2))
     with Image.open(tmp_path / "blur.webp") as file:
-        assert file.n_frames == 3, "the first instant, and two frames of four parts"
+        assert file.n_frames == 11, "the first instant, and ten frames of four parts"
     write_picture(tmp_path / "blur.png", [Panel("", film, None, "")], "", 10.0, 200, Shutter(4, 2))
     with Image.open(tmp_path / "blur.png") as file:
         found = np.asarray(file)
-    ends = [draw(film[k], 200, trails=film[:k]).astype(float) for k in (8, 7)]
+    ends = [draw(film[k], 200, trails=film[:k]).astype(float) for k in (40, 39)]
     np.testing.assert_allclose(found, np.mean(ends, axis=0), atol=0.51)
 
 

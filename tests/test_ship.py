@@ -166,6 +166,14 @@ def test_a_policy_of_another_recipe_is_refused_in_one_line(
     assert files(target) == []
 
 
+def test_two_runs_of_one_seed_are_refused_in_one_line(tmp_path: Path, target: Path) -> None:
+    trained(tmp_path / "a", 1, 8.0)
+    trained(tmp_path / "b", 1, 9.0)
+    run = CliRunner().invoke(app, [str(tmp_path / "a"), str(tmp_path / "b"), "--root", str(target)])
+    assert run.exit_code == 2 and ": another folder has a run of that seed too" in run.output
+    assert run.output.count("\n") == 1 and files(target) == []
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [("none", "no such folder"), ("empty", "neither TASK-seed-N.safetensors nor"), ("odd", "'mine' is no task")],

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["Shutter", "film_episodes", "mean_picture", "write_picture"]
 
 TRAIL = 25
-"""Past positions of each agent that a PNG shows."""
+"""Past frames of which a PNG shows the positions of each agent."""
 
 MOST_PARTS = 8
 """Instants in a frame, of which a picture with motion blur is the mean."""
@@ -93,7 +93,7 @@ def write_picture(
     elif path.suffix.lower() == ".png":
         rate, width = fps * shutter.parts, size // len(films)
         ends = [
-            [_draw_frame(film[: len(film) - k], width, rate) for k in range(min(shutter.open, len(film)))]
+            [_draw_frame(film[: len(film) - k], width, rate, shutter) for k in range(min(shutter.open, len(film)))]
             for film in films
         ]
         write_png(path, np.hstack([mean_picture(pictures) for pictures in ends]))
@@ -113,11 +113,13 @@ def mean_picture(pictures: Sequence[Any]) -> Any:
     return pictures[0] if len(pictures) == 1 else np.rint(np.mean(pictures, axis=0)).astype(np.uint8)
 
 
-def _draw_frame(snapshots: Sequence[Snapshot], size: int, fps: float) -> Any:
-    """Draw the last snapshot, with the paths that lead to it."""
+def _draw_frame(snapshots: Sequence[Snapshot], size: int, rate: float, shutter: Shutter) -> Any:
+    """Draw the last snapshot, with the paths that lead to it; rate: snapshots per second."""
     from flockenv.render import draw
 
-    behind = max(TRAIL, 1 + math.ceil(fps * max((look.trail for look in snapshots[-1].looks), default=0.0)))
+    behind = max(
+        TRAIL * shutter.parts, 1 + math.ceil(rate * max((look.trail for look in snapshots[-1].looks), default=0.0))
+    )
     return draw(snapshots[-1], size=size, trails=snapshots[-behind:-1])
 
 
