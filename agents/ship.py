@@ -15,7 +15,7 @@ import math
 import re
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,7 +25,7 @@ from pydantic import BaseModel, ValidationError
 from agents.compare import ROOT, experiment_of
 from agents.experiment import PpoSettings, one_line_errors
 from agents.run import first_difference
-from agents.search import Found, median_of
+from agents.search import Coordinates, Found, median_of
 from agents.tune import content_of, found_of
 from flockenv.cli.terminal import run_program
 from flockenv.core.atomic_files import write_all_or_none
@@ -35,6 +35,7 @@ from flockenv.evaluation.report import grid, json_text, rounded
 from flockenv.players.model_card import model_card
 from flockenv.players.policy import MlpPolicy
 from flockenv.players.rules import PLAYERS, read_tuned
+from flockenv.players.rules.parameter import ranges_of
 from flockenv.tasks import TASKS
 
 __all__ = ["BLOCK", "Files", "app", "ship", "trainings"]
@@ -267,13 +268,44 @@ def _ship_searches(task: str, found: Sequence[Found], files: Files) -> list[str]
     """Add the file of a task's tuned parameters; return a line for each player."""
     name = f"{PLAYERS_FOLDER}/tuned/{task}.json"
     players, lines = read_tuned(files.root / name), []
-    for player, runs in _by(lambda run: run.player, found).items():
+    for player, new in _by(lambda run: run.player, found).items():
+        before = _searched(new[0], players.get(player, {}).get("found", {}))
+        others = [run for run in before if run.seed not in {each.seed for each in new}]
+        runs = [*new, *(run for run in others if _is_same_search(run, new[0]))]
+        left_out = [str(run.seed) for run in others if run not in runs]
         ships = median_of(runs)
         about = found_of(ships, sorted(runs, key=lambda run: run.seed))
         players[player] = {"parameters": ships.parameters, "found": about}
-        lines.append(f"{task}, {player}: {_line(ships.seed, about)}")
+        without = f"; of another search, left out: {', '.join(left_out)}" if left_out else ""
+        lines.append(f"{task}, {player}: {_line(ships.seed, about)}{without}")
     files.new[name] = json_text(content_of(task, players)).encode()
     return lines
+
+
+def _searched(like: Found, about: Content) -> list[Found]:
+    """Return the searches that a file of tuned parameters has of a player; what it does not say is that of `like`."""
+    ranges = Coordinates(ranges_of(PLAYERS[like.player][like.task][1]))
+    common = {key: about[key] for key in ("textbook_mean", "textbook_success", "tuning_worlds") if key in about}
+    runs = []
+    for seed, each in about.get("searches", {}).items():
+        points = [dict(zip(each["curve"], values, strict=True)) for values in zip(*each["curve"].values(), strict=True)]
+        known = each["parameters"].keys() == ranges.ranges.keys()
+        runs.append(replace(
+            like, **common, seed=int(seed), parameters=each["parameters"], tuning_mean=about["scores"][seed],
+            tuning_success=each["success"], agent_steps=each["agent_steps"], seconds=each["seconds"], curve=points,
+            at_bounds=ranges.at_bounds(each["parameters"]) if known else {},
+        ))  # fmt: skip
+    return runs
+
+
+def _is_same_search(one: Found, other: Found) -> bool:
+    """Return True if two searches had the same parameters, tuning worlds, rules and, within a generation, budget."""
+    same = ("textbook_mean", "textbook_success", "tuning_worlds")
+    return (
+        one.parameters.keys() == other.parameters.keys()
+        and all(getattr(one, key) == getattr(other, key) for key in same)
+        and abs(one.agent_steps - other.agent_steps) <= 1.5 * other.agent_steps / max(other.generations, 1)
+    )
 
 
 def _read_search(path: Path) -> Found:

@@ -204,6 +204,25 @@ def test_searches_ship_with_the_parameters_and_curve_of_every_seed(tmp_path: Pat
     assert searches["2"]["curve"]["mean"] == [0, 0.33333, 0.66667] and searches["2"]["success"] == 0.75
 
 
+def test_searches_that_ship_take_part_unless_they_are_others(tmp_path: Path, target: Path) -> None:
+    for seed, mean in ((1, 8.0), (2, 9.0), (4, 8.5)):
+        searched(tmp_path / "tune", seed, mean)
+    CliRunner().invoke(app, [str(tmp_path / "tune"), "--root", str(target)])
+    before = load_tuned("pursuit").found
+    searched(tmp_path / "more", 4, 9.5)
+    searched(tmp_path / "more", 5, 9.25)
+    run = CliRunner().invoke(app, [str(tmp_path / "more"), "--root", str(target)])
+    assert "pursuit, rules: seed 2, the median of 4: 9.000, all from 8.000 to 9.500\n" in run.output
+    found = load_tuned("pursuit").found
+    assert found["scores"] == {"1": 8.0, "2": 9.0, "4": 9.5, "5": 9.25}
+    assert {seed: found["searches"][seed] for seed in "12"} == {seed: before["searches"][seed] for seed in "12"}
+    searched(tmp_path / "other", 6, 9.75, textbook_mean=1.5)
+    run = CliRunner().invoke(app, [str(tmp_path / "other"), "--root", str(target)])
+    assert "seed 6, the median of 1: 9.750, all from 9.750 to 9.750; of another search, left out: 1, 2, 4, 5" in (
+        run.output
+    )
+
+
 def test_searches_of_other_settings_are_refused_in_one_line(tmp_path: Path, target: Path) -> None:
     searched(tmp_path / "tune", 1, 8.0)
     other = {**load_experiment(CONFIG).search.model_dump(mode="json"), "sigma": 0.5}
