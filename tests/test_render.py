@@ -116,7 +116,8 @@ def test_a_picture_with_motion_blur_is_the_mean_of_the_last_instants_of_its_fram
 
 
 def test_a_shutter_needs_several_steps_in_a_frame() -> None:
-    assert Shutter.of(0.5, 20) == Shutter(8, 4) and Shutter.of(0, 1) == Shutter(1, 1)
+    assert Shutter.of(0.5, 16) == Shutter(8, 4) and Shutter.of(0, 1) == Shutter(1, 1)
+    assert [Shutter.of(1, steps).parts for steps in (2, 15, 17, 20)] == [2, 5, 8, 5], "whole steps, no other frame rate"
     assert Shutter.of(0.01, 3) == Shutter(3, 2)
     with pytest.raises(ValueError, match=r"--shutter 0\.5: each frame of this scene is one time step"):
         Shutter.of(0.5, 1)

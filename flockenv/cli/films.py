@@ -68,9 +68,9 @@ class Shutter:
         """
         if share == 0:
             return cls()
-        parts = min(steps, MOST_PARTS)
-        if parts < 2:
+        if steps < 2:
             raise ValueError(f"--shutter {share:g}: each frame of this scene is one time step, so there is no blur")
+        parts = min(range(2, min(steps, MOST_PARTS) + 1), key=lambda n: (steps % n, -n))  # the frame keeps its steps
         return cls(parts, max(2, round(share * parts)))
 
 
