@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flockenv import steering
+from flockenv.jit.decorators import Numbers, Vec, unfused
 from flockenv.players.rules.clearance import keep_clear
 from flockenv.players.rules.parameter import parameter, per_row
+from flockenv.steering.arbitration import Forces
 from flockenv.steering.vectorize import rows
 from flockenv.tasks import Corridor
 
-__all__ = ["CorridorOrcaRules", "CorridorRules", "SampledRules", "corridor", "orca_corridor", "sampled_velocity"]
+__all__ = [
+    "CorridorOrcaRules", "CorridorRules", "SampledRules", "best_velocity", "corridor", "orca_corridor",
+    "sampled_velocity",
+]  # fmt: skip
 
 sidestep = rows(steering.sidestep)
 
@@ -106,54 +111,53 @@ def sampled_velocity(see: Any, task: Corridor, p: SampledRules) -> NDArray[np.fl
     The cost is the deviation from the desired speed, with charges for an early touch, for speed across the corridor,
     for walls, and for being outside the right half. As in the paper, others are expected to make a part of the change.
     """
-    parts = [slice(first, first + _TOGETHER) for first in range(0, max(len(see.velocity), 1), _TOGETHER)]
-    return np.concatenate([_sampled(_rows_of(see, part), _rows_of(p, part)) for part in parts])
-
-
-def _sampled(see: SimpleNamespace, p: SimpleNamespace) -> NDArray[np.float64]:
-    """Return the forces of `sampled_velocity` in some rows, (R, 2) N."""
-    own = see.velocity[:, None]
-    along = see.desired_speed[:, None] * _ALONG
-    x, y = (own[..., k] + (v - own[..., k]) / per_row(p.share) for k, v in enumerate((along, _ACROSS)))
-    soon = np.maximum(_time_to_touch(x, y, see, 2 * _PERSON + per_row(p.margin)), _SOONEST)
-    to_wall = np.where(_ACROSS > 0.0, see.walls[:, :1], see.walls[:, 1:]) - _PERSON
-    cost = 1.0 - _ALONG + per_row(p.aside) * np.abs(_ACROSS)
-    cost = cost + per_row(p.risk) * np.maximum(1.0 / soon - 1.0 / per_row(p.horizon), 0.0)
-    cost += np.maximum(1.0 - np.maximum(to_wall, 0.0) / np.maximum(np.abs(_ACROSS) * _WALL_TIME, 1e-9), 0.0)
-    cost += per_row(p.lane) * np.maximum(_outside(see)[:, None] + _ACROSS, 0.0)
-    best = np.argmin(cost, axis=1)
-    desired = np.stack([along[np.arange(len(best)), best], _ACROSS[best]], axis=-1)
+    desired = best_velocity(
+        see.neighbours, see.neighbour_velocity, see.neighbour_present, see.velocity, see.walls, see.desired_speed,
+        _outside(see), 2 * _PERSON + p.margin, p.risk, p.horizon, p.share, p.aside, p.lane,
+    )  # fmt: skip
     force: NDArray[np.float64] = per_row(p.gain) * (desired - see.velocity)
     return force
 
 
-_ACROSS, _ALONG = (
-    each.ravel()
-    for each in np.meshgrid([-1.2, -0.9, -0.6, -0.4, -0.2, -0.1, 0, 0.1, 0.2, 0.4, 0.6, 0.9, 1.2], [1.0, 0.8, 0.5, 0.2])
-)
+_ACROSS = (-1.2, -0.9, -0.6, -0.4, -0.2, -0.1, 0.0, 0.1, 0.2, 0.4, 0.6, 0.9, 1.2)
+_ALONG = (1.0, 0.8, 0.5, 0.2)
 """The velocities: across the corridor, m/s to the left, and along it, as a share of the desired speed."""
 
 _WALL_TIME, _SOONEST = 0.5, 0.05  # s, within which reaching a wall costs; least time to a touch
 
 
-_TOGETHER = 512
-"""Rows computed together: an array with a number for each of their velocities then fits into a core's cache."""
+@unfused
+def _time_to_touch(to: Vec, x: float, y: float, clearance: float) -> float:
+    """Return the time until two bodies touch that approach at (x, y) m/s, the other one at `to`; inf for never."""
+    near, closing = to[0] * to[0] + to[1] * to[1] - clearance * clearance, to[0] * x + to[1] * y
+    room = closing * closing - (x * x + y * y) * near
+    if not (closing > 0.0 and room >= 0.0):
+        return np.inf
+    return max(near, 0.0) / max(closing + math.sqrt(room), 1e-9)
 
 
-def _rows_of(values: Any, part: slice) -> SimpleNamespace:
-    """Return some rows of what is seen, or of parameters: those of each array; a number is that of all rows."""
-    return SimpleNamespace(**{k: v[part] if isinstance(v, np.ndarray) else v for k, v in vars(values).items()})
+@unfused
+def _best_velocity(
+    others: Forces, velocities: Forces, present: Numbers, own: Vec, walls: Numbers, speed: float, outside: float,
+    clearance: float, risk: float, horizon: float, share: float, aside: float, lane: float,
+) -> Vec:  # fmt: skip
+    """Return the velocity that costs least of one agent; parameters are those of SampledRules, the rest is seen."""
+    least, best = np.inf, (0.0, 0.0)
+    for along in _ALONG:
+        for across in _ACROSS:
+            x, y, soonest = own[0] + (speed * along - own[0]) / share, own[1] + (across - own[1]) / share, np.inf
+            for k in range(len(others)):
+                if present[k] > 0.0:
+                    u, v = x - (own[0] + velocities[k][0]), y - (own[1] + velocities[k][1])
+                    soonest = min(soonest, _time_to_touch(others[k], u, v, clearance))
+            to_wall = (walls[0] if across > 0.0 else walls[1]) - _PERSON
+            cost = 1.0 - along + aside * abs(across)
+            cost += risk * max(1.0 / max(soonest, _SOONEST) - 1.0 / horizon, 0.0)
+            cost += max(1.0 - max(to_wall, 0.0) / max(abs(across) * _WALL_TIME, 1e-9), 0.0)
+            cost += lane * max(outside + across, 0.0)
+            if cost < least:
+                least, best = cost, (speed * along, across)
+    return best
 
 
-def _time_to_touch(x: NDArray[np.float64], y: NDArray[np.float64], see: Any, clearance: Any) -> NDArray[np.float64]:
-    """Return the time until the agent touches another at velocities (x, y), (R, K) m/s, in a frame at rest; or inf."""
-    soonest, present = np.full(x.shape, np.inf), see.neighbour_present > 0
-    for k in np.flatnonzero(present.any(axis=0)):
-        to, velocity = see.neighbours[:, k], see.velocity + see.neighbour_velocity[:, k]
-        u, v = x - velocity[:, :1], y - velocity[:, 1:]
-        near, closing = np.sum(to * to, axis=-1)[:, None] - clearance * clearance, to[:, :1] * u + to[:, 1:] * v
-        room = closing * closing - (u * u + v * v) * near
-        time = np.maximum(near, 0.0) / np.maximum(closing + np.sqrt(np.maximum(room, 0.0)), 1e-9)
-        time[~((closing > 0.0) & (room >= 0.0) & present[:, k, None])] = np.inf
-        np.minimum(soonest, time, out=soonest)
-    return soonest
+best_velocity = rows(_best_velocity)
