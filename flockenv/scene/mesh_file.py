@@ -86,7 +86,7 @@ def mesh_of(
         ValueError: a mesh that is not sound; see check_mesh; or a number that is not finite.
     """
     for name, value in {"scale": scale, "rotate": rotate, "move": move, "merge": merge or 0.0}.items():
-        if not np.isfinite(value).all():
+        if not np.isfinite(np.asarray(value)).all():
             raise ValueError(f"{name} = {value}: must be finite")
     points, elements = _merge(_placed(points, scale, rotate, move), elements, merge)
     if dimension == 2:
