@@ -134,7 +134,7 @@ def test_the_base_dependencies_do_not_include_torch(metadata: Message) -> None:
     }
     extras = {"train", "test", "render", "play", "docs", "ray", "rllib", "browser", "video", "parquet", "mesh"}
     assert set(metadata.get_all("Provides-Extra") or []) == extras
-    assert "gymnasium<2,>=1.2" in needed
+    assert "gymnasium<2,>=1.2.2" in needed
 
 
 def test_links_and_pictures_of_the_description_are_absolute(metadata: Message) -> None:
