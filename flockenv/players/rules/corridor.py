@@ -145,16 +145,20 @@ def _best_velocity(
     least, best = np.inf, (0.0, 0.0)
     for along in _ALONG:
         for across in _ACROSS:
+            to_wall = (walls[0] if across > 0.0 else walls[1]) - _PERSON
+            cost = 1.0 - along + aside * abs(across)
+            wall = max(1.0 - max(to_wall, 0.0) / max(abs(across) * _WALL_TIME, 1e-9), 0.0)
+            half = lane * max(outside + across, 0.0)
+            if cost + wall + half >= least:
+                continue  # a touch only adds to it
             x, y, soonest = own[0] + (speed * along - own[0]) / share, own[1] + (across - own[1]) / share, np.inf
             for k in range(len(others)):
                 if present[k] > 0.0:
                     u, v = x - (own[0] + velocities[k][0]), y - (own[1] + velocities[k][1])
                     soonest = min(soonest, _time_to_touch(others[k], u, v, clearance))
-            to_wall = (walls[0] if across > 0.0 else walls[1]) - _PERSON
-            cost = 1.0 - along + aside * abs(across)
             cost += risk * max(1.0 / max(soonest, _SOONEST) - 1.0 / horizon, 0.0)
-            cost += max(1.0 - max(to_wall, 0.0) / max(abs(across) * _WALL_TIME, 1e-9), 0.0)
-            cost += lane * max(outside + across, 0.0)
+            cost += wall
+            cost += half
             if cost < least:
                 least, best = cost, (speed * along, across)
     return best
