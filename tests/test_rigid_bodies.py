@@ -74,6 +74,22 @@ def test_particles_have_mass_centre_and_inertia_of_a_solid_block(sides: tuple[fl
         np.testing.assert_allclose(moments, 6 * np.array(sides) ** 2 / 12)
 
 
+def _numbers_in(value: Any) -> int:
+    """Return how many numbers the arrays of a tuple, nested or not, have."""
+    return value.size if isinstance(value, np.ndarray) else sum(map(_numbers_in, value))
+
+
+@pytest.mark.parametrize("sides", [CUBE, (1.0, 1.0)])
+def test_the_memory_that_is_told_is_that_of_bodies_and_contacts(sides: tuple[float, ...]) -> None:
+    floor = HalfSpace(point=(0.0,) * len(sides), direction=(*(0.0,) * (len(sides) - 1), 1.0))
+    centres = tuple((*(0.0,) * (len(sides) - 1), 0.5 + k) for k in range(10))
+    scene = scene_of(Blocks(sides=sides, centres=centres), obstacles=(floor,))
+    (rigid,) = scene.constraints
+    settler: Any = rigid.settler(scene)
+    allocated = _numbers_in(settler.solids) + _numbers_in(settler.contacts)
+    assert 0.97 * allocated < rigid.numbers(scene) * scene.agents < 1.03 * allocated
+
+
 def test_initial_velocities_are_those_of_the_spin_and_the_group() -> None:
     blocks = Blocks(sides=CUBE, centres=((1, 2, 3), (5, 5, 5)), turns=((0, 0, 45),), spins=((0, 0, 2), (1, 0, 0)))
     group = Group(network=blocks, spawn=Spawn(speed=(3, 3), heading=(0, 1, 0)))

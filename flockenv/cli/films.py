@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from flockenv.render import Panel
     from flockenv.tasks import Task
 
-__all__ = ["Shutter", "film_episodes", "mean_picture", "write_picture"]
+__all__ = ["Shutter", "film_episodes", "write_picture"]
 
 TRAIL = 25
 """Past frames of which a PNG shows the positions of each agent."""
@@ -96,7 +96,7 @@ def write_picture(
             [_draw_frame(film[: len(film) - k], width, rate, shutter) for k in range(min(shutter.open, len(film)))]
             for film in films
         ]
-        write_png(path, np.hstack([mean_picture(pictures) for pictures in ends]))
+        write_png(path, np.hstack([_mean(pictures) for pictures in ends]))
     elif path.suffix.lower() in (".mp4", ".webp"):
         write = write_mp4 if path.suffix.lower() == ".mp4" else write_webp
         write(path, _draw_frames(films, size // len(films), fps, shutter), fps)
@@ -106,7 +106,7 @@ def write_picture(
         write_gif(path, frames, fps / stride)
 
 
-def mean_picture(pictures: Sequence[Any]) -> Any:
+def _mean(pictures: Sequence[Any]) -> Any:
     """Return the mean of pictures, (height, width, 3) uint8."""
     import numpy as np
 
@@ -134,6 +134,6 @@ def _draw_frames(films: Sequence[Sequence[Snapshot]], size: int, fps: float, shu
         for done, picture in enumerate(side_by_side(films, size, fps * shutter.parts, shown)):
             pictures.append(picture)
             if shown[done] % shutter.parts == 0:
-                yield mean_picture(pictures)
+                yield _mean(pictures)
                 pictures.clear()
             progress(done)

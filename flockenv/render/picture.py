@@ -308,29 +308,31 @@ def _draw_bonds(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot) -> Non
 
 def _draw_liquids(canvas: Image.Image, view: View, snapshot: Snapshot) -> None:
     """Draw the agents that are metaballs, one surface for each appearance."""
-    depth, shades, which = _relative_heights(snapshot), snapshot.shade, np.asarray(snapshot.look)
-    magnification = 0.7 + 0.5 * depth if snapshot.dimension == 3 else depth
-    spots = view.to_pixels(snapshot.pos)
+    which = np.asarray(snapshot.look)
     for k, look in enumerate(snapshot.looks):
-        chosen = np.flatnonzero((which == k) & snapshot.alive & snapshot.visible)
-        if look.form != "metaball" or not len(chosen):
+        if look.form != "metaball":
             continue
-        sizes = [look.size_at(float(shades[i]), float(snapshot.radius[i])) for i in chosen.tolist()]
-        colours = [
-            (
-                *look.colour(float(shades[i]), ROLE_COLOURS[snapshot.roles[i]][0]),
-                255 * look.opacity_at(float(shades[i])),
+        chosen = np.flatnonzero((which == k) & snapshot.alive & snapshot.visible)
+        magnification, sizes, colours = _magnification(snapshot), [], []
+        for i, shade in zip(chosen.tolist(), snapshot.shade[chosen].tolist(), strict=True):
+            sizes.append(look.size_at(shade, float(snapshot.radius[i])) * view.metre * magnification[i])
+            colour = look.colour(shade, ROLE_COLOURS[snapshot.roles[i]][0])
+            colours.append((*colour, 255 * look.opacity_at(shade)))
+        if colours:
+            draw_metaballs(
+                canvas, view, view.to_pixels(snapshot.pos[chosen]), np.array(sizes), np.array(colours, float)
             )
-            for i in chosen.tolist()
-        ]
-        reach = np.array(sizes) * view.metre * magnification[chosen]
-        draw_metaballs(canvas, view, spots[chosen], reach, np.array(colours, dtype=float))
+
+
+def _magnification(snapshot: Snapshot) -> Floats:
+    """Return the factor on the size of each agent, (N,): in 3-D upper agents are nearer, and larger."""
+    depth = _relative_heights(snapshot)
+    return 0.7 + 0.5 * depth if snapshot.dimension == 3 else depth
 
 
 def _draw_agents(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot) -> None:
     visible = np.flatnonzero(snapshot.visible)
-    depth = _relative_heights(snapshot)
-    magnification = 0.7 + 0.5 * depth if snapshot.dimension == 3 else depth
+    depth, magnification = _relative_heights(snapshot), _magnification(snapshot)
     body = snapshot.radius * view.metre * magnification
     reach = np.maximum(body, DART_REACH * view.width * magnification)
     has_bonds, least_radius = snapshot.has_bonds, view.width * BOND

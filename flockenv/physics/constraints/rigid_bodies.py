@@ -27,6 +27,9 @@ __all__ = ["BodyContacts", "RigidBodies"]
 WHERE = tuple(WORK.index(name) for name in ("impacts", "unsolved"))
 """Columns of State.work that are counted: contacts of steps, and steps that were not solved."""
 
+PER_CONTACT, PER_SOLID = 73 + 6 * PAST, 60
+"""Numbers of scratch memory for a contact, and for a block or the ground."""
+
 THICK = 10.0
 """Half thickness of blocks in 2-D, in largest edges: no contact is along z."""
 
@@ -89,12 +92,19 @@ class RigidBodies(Constraint):
                 )
 
     def numbers(self, scene: SceneView) -> int:
-        """Return the scratch memory, in numbers per agent."""
-        return 60
+        """Return the memory of contacts and bodies, in numbers per agent."""
+        bodies = sum(len(group.network.centres) for group in scene.groups if isinstance(group.network, Blocks))
+        solids = bodies + sum(isinstance(shape, Block) for shape in scene.obstacles) + 1
+        return -(-(_places(bodies) * PER_CONTACT + solids * PER_SOLID) // int(scene.agents))
 
     def settler(self, scene: SceneView) -> Settler:
         """Return a function that corrects a step, with scratch memory of its own."""
         return BodySettler(self, scene)
+
+
+def _places(bodies: int) -> int:
+    """Return the number of contacts for which there is room at first."""
+    return 16 * bodies + 16
 
 
 def _stands(shape: Shape) -> bool:
@@ -110,7 +120,7 @@ class BodySettler:
         self.solids, self.around = _solids_of(scene), _planes_of(scene, record.restitution)
         self.rules = BodyRules(float(record.restitution), float(record.friction), record.sweeps, float(scene.dt))
         self.where, self.report, self.lost = np.array(WHERE, np.int64), np.zeros(5, np.int64), np.zeros(2)
-        self._make_room(16 * len(self.solids.first) + 16)
+        self._make_room(_places(len(self.solids.first)))
 
     def _make_room(self, places: int) -> None:
         """Allocate room for `places` contacts."""

@@ -142,7 +142,8 @@ def add_ball(
 ) -> int:
     """Add the contact of body i with a ball if it is nearer than `margin`; return the number of contacts."""
     off = sub(middle, row(solids.centre, i))
-    nearest, inside, shallow, out = row(solids.centre, i), True, np.inf, (0.0, 0.0, 0.0)
+    nearest, inside, shallow = row(solids.centre, i), True, np.inf
+    out: Vec = (0.0, 0.0, 0.0)
     for k in range(3):
         along = row(solids.axes[i], k)
         d, h = dot(off, along), solids.half[i, k]
@@ -150,7 +151,7 @@ def add_ball(
         inside = inside and abs(d) < h
         if h - abs(d) < shallow:
             shallow = h - abs(d)
-            out = scale(along, -1.0 if d > 0.0 else 1.0)  # type: ignore[assignment]
+            out = scale(along, -1.0 if d > 0.0 else 1.0)
     apart = sub(nearest, middle)
     far = norm(apart)
     gap = -shallow - radius if inside else far - radius
@@ -258,7 +259,8 @@ def add_pair(
             return count
         if gap > best + 0.01 * FACES_FIRST * small:
             best, face = gap, m
-    edges, normal, found = -1, (0.0, 0.0, 0.0), -np.inf
+    edges, found = -1, -np.inf
+    normal: Vec = (0.0, 0.0, 0.0)
     for m in range(0 if flat else 9):
         n = cross(row(solids.axes[i], m // 3), row(solids.axes[j], m % 3))
         size = norm(n)
@@ -269,7 +271,7 @@ def add_pair(
         if gap > margin:
             return count
         if gap > found:
-            edges, normal, found = m, n, gap  # type: ignore[assignment]
+            edges, normal, found = m, n, gap
     if edges >= 0 and found > best + FACES_FIRST * small:
         return _add_edges(solids, contacts, count, i, j, edges // 3, edges % 3, normal, found, bounce, margin)
     return _add_face(solids, contacts, count, i, j, face < 3, face % 3, bounce, margin, flat)

@@ -79,16 +79,17 @@ def spin_of(solids: Any, i: int, twist: Vec) -> Vec:
 @kernel
 def _read_axes(solids: Any, x: Any, b: int, i: int, flat: bool) -> None:
     """Set the axes of a body to the rotation nearest to the mean directions of its edges."""
-    columns = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     corners = 4 if flat else 8
-    one, two, three = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0 if flat else 0.0)
+    one: Vec = (0.0, 0.0, 0.0)
+    two: Vec = (0.0, 0.0, 0.0)
+    three: Vec = (0.0, 0.0, 1.0 if flat else 0.0)
     for c in range(corners):
         at = scale(_vector(x, b, solids.first[i] + c, flat), 1.0 / corners)
-        one = add(one, scale(at, solids.corner[c, 0] / solids.half[i, 0]))  # type: ignore[assignment]
-        two = add(two, scale(at, solids.corner[c, 1] / solids.half[i, 1]))  # type: ignore[assignment]
+        one = add(one, scale(at, solids.corner[c, 0] / solids.half[i, 0]))
+        two = add(two, scale(at, solids.corner[c, 1] / solids.half[i, 1]))
         if not flat:
-            three = add(three, scale(at, solids.corner[c, 2] / solids.half[i, 2]))  # type: ignore[assignment]
-    columns = nearest_rotation((one, two, three))  # type: ignore[assignment]
+            three = add(three, scale(at, solids.corner[c, 2] / solids.half[i, 2]))
+    columns = nearest_rotation((one, two, three))
     for k in range(3):
         put(solids.axes[i], k, columns[k])
 
