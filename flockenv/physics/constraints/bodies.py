@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flockenv.jit.decorators import Vec, kernel
+from flockenv.jit.decorators import Vec, kernel, routine
 from flockenv.maths.vectors import add, norm, scale, sub
 from flockenv.physics.constraints.broad_phase import balls_overlap, nearest_image, vector_at, write_vector
 from flockenv.physics.constraints.impact import POINT, parabola_of, position_along
@@ -187,7 +187,7 @@ def larger_acceleration(period: Vec, bodies: Bodies, i: int, j: int) -> float:
     return float(max(hard, norm(vector_at(period, bodies.free, j))) if j >= 0 else hard)
 
 
-@kernel
+@routine
 def widen_reach(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, i: int, t: float, count: int
 ) -> int:

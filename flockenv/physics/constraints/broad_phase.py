@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from flockenv.geometry.cell_list import candidates, count_cells, row_of
-from flockenv.jit.decorators import Vec, kernel, law
+from flockenv.jit.decorators import Vec, kernel, law, routine
 from flockenv.maths.approximations import round_half_even
 from flockenv.maths.vectors import dot, sub
 
@@ -105,7 +105,7 @@ def _common_reach(living: Any, radius: Any, reach: Any, n: int, many: Any) -> fl
     return 1.000001 * widest if widest > 0.0 else limit  # cells as small as possible
 
 
-@kernel
+@routine
 def list_near_pairs(
     period: Vec, at: Any, living: Any, radius: Any, reach: Any, n: int, grid: Any, order: Any, cell: Any, start: Any,
     offset: Any, bounds: Any, sync: Any, ranges: Any, first: Any, second: Any,

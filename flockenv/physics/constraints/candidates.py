@@ -7,7 +7,7 @@ from typing import Any
 from flockenv.geometry.shapes.cells import count_of, is_near_box, list_of, row_of_entry, span_of
 from flockenv.geometry.shapes.row_header import bound_of
 from flockenv.geometry.shapes.row_header import vector_at as vector_in
-from flockenv.jit.decorators import Vec, kernel
+from flockenv.jit.decorators import Vec, kernel, routine
 from flockenv.maths.vectors import add, dot, equal_coordinates, norm, scale, sub
 from flockenv.physics.constraints.bodies import Bodies, Meetings, Rules, Things, add_to_lists
 from flockenv.physics.constraints.broad_phase import list_near_pairs, nearest_image, vector_at
@@ -17,7 +17,7 @@ from flockenv.physics.constraints.impact import surface_at
 __all__ = ["list_meetings"]
 
 
-@kernel
+@routine
 def list_meetings(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, reach: Any,
     ahead: bool, nearly: bool, scratch: Any,

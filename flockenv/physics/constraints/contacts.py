@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from flockenv.jit.decorators import Vec, kernel
+from flockenv.jit.decorators import Vec, kernel, routine
 from flockenv.maths.vectors import add, axis, dot, norm, scale, select, sub, unit, zero
 from flockenv.physics.constraints.bodies import RESTS, Bodies, Meetings, Things, larger_acceleration, width
 from flockenv.physics.constraints.broad_phase import nearest_image, vector_at, write_vector
@@ -86,7 +86,7 @@ def _relative_velocity(period: Vec, things: Things, vel: Any, i: int, j: int) ->
     return sub(v, vector_at(period, vel, j)) if j >= 0 else sub(v, vector_at(period, things.drift, -1 - j))
 
 
-@kernel
+@routine
 def gather_contacts(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, contacts: Contacts, seconds: float,
     up: Vec, touch: float, slow: float, restitution: float, in_time: bool, passing: bool, count: int,
@@ -192,7 +192,7 @@ def _inverse_reduced_mass(bodies: Bodies, i: int, j: int) -> float:
     return float(bodies.light[i] + (bodies.light[j] if j >= 0 else 0.0))
 
 
-@kernel
+@routine
 def resolve_impacts(
     period: Vec, bodies: Bodies, things: Things, contacts: Contacts, vel: Any, restitution: float, friction: float,
     sticky: bool, rounds: int, slow: float, count: int,
@@ -269,7 +269,7 @@ def _stop_approach_once(
     return worst, square
 
 
-@kernel
+@routine
 def stop_approach(
     period: Vec, bodies: Bodies, things: Things, contacts: Contacts, vel: Any, friction: float, sticky: bool,
     rounds: int, slow: float, count: int,
@@ -317,7 +317,7 @@ def stop_approach(
     return worst
 
 
-@kernel
+@routine
 def move_apart(
     period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: float, rounds: int, touch: float, most: float,
     contacts: Contacts, count: int,
@@ -349,7 +349,7 @@ def move_apart(
     return worst
 
 
-@kernel
+@routine
 def deepest_overlap(
     period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: float, who: Any, other: Any, count: int
 ) -> float:

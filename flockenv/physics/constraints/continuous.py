@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.jit.decorators import Vec, kernel
+from flockenv.jit.decorators import Vec, kernel, routine
 from flockenv.maths.vectors import norm, scale, sub, zero
 from flockenv.physics.constraints.bodies import (
     DEEP,
@@ -49,7 +49,7 @@ def may_meet_around(period: Vec, path: float) -> bool:
     return bool(4.0 * path > least > 0.0)
 
 
-@kernel
+@routine
 def may_pass(period: Vec, bodies: Bodies, things: Things, ends: Ends, seconds: float, turned: bool) -> bool:
     """Return True if some body moves so far in the step, or an obstacle relative to it, that one may pass the other.
 
@@ -80,7 +80,7 @@ def _path(period: Vec, bodies: Bodies, ends: Ends, i: int, seconds: float) -> Ve
     return displacement_near(period, apart, scale(vector_at(period, ends.vel, i), seconds))
 
 
-@kernel
+@routine
 def stop_on_path(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, rules: Rules, strict: bool, count: int,
     lost: Any,

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.jit.decorators import Vec, kernel
+from flockenv.jit.decorators import Vec, kernel, routine
 from flockenv.maths.vectors import add, dot, scale, sub
 from flockenv.physics.constraints.bodies import (
     ANEW,
@@ -85,7 +85,7 @@ def _use_old_velocity(period: Vec, bodies: Bodies, i: int, before: Any) -> None:
         bodies.excess[i, k] = 0.0
 
 
-@kernel
+@routine
 def process_impacts(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, rules: Rules, count: int, lost: Any
 ) -> tuple[int, int, int]:

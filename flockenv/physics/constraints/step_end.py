@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.jit.decorators import Vec, kernel
+from flockenv.jit.decorators import Vec, kernel, routine
 from flockenv.maths.vectors import add, dot, norm, scale, sub, zero
 from flockenv.physics.constraints.bodies import DEEP, Bodies, Meetings, Rules, Things, widen_reach
 from flockenv.physics.constraints.broad_phase import displacement_near, nearest_image, vector_at, write_vector
@@ -45,7 +45,7 @@ LEFT, SUNK = 5, 6
 deepest overlap, as a part of the smaller radius."""
 
 
-@kernel
+@routine
 def settle_ends(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, contacts: Contacts, ends: Ends, before: Any,
     reach: Any, rules: Rules, in_time: bool, once: bool, passing: bool, rounds: int, fast: float, hard: float, up: Vec,
@@ -100,7 +100,7 @@ def settle_ends(
     return count
 
 
-@kernel
+@routine
 def _hold_back(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, before: Any, reach: Any, rules: Rules,
     once: bool, stuck: bool, spread: float, count: int, scratch: Any, lost: Any,
@@ -170,7 +170,7 @@ def _solve_velocities(
     return float(worst)
 
 
-@kernel
+@routine
 def _separate_bodies(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, contacts: Contacts, ends: Ends, reach: Any,
     rules: Rules, once: bool, anew: bool, rounds: int, up: Vec, spread: float, touching: int, count: int, scratch: Any,
