@@ -776,7 +776,6 @@ VARIANTS = (
     Variant("torus_3", (), "torus", 3),
     Variant("torus_single", (), "torus", 2, "float32"),
     Variant("torus_single_rk4", (), "torus", 2, "float32", RK4()),
-    Variant("plane_single", (), "plane", 2, "float32"),
     Variant("plane_3_single", (), "plane", 3, "float32"),
     Variant("box", (Separation(weight=1.3, radius=1.0),), "box", 2),
     *NEAREST,

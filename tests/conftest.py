@@ -34,7 +34,6 @@ RARE = {
     "torus_3",
     "torus_single",
     "torus_single_rk4",
-    "plane_single",
     "plane_3_single",
     "nearest_plane_3",
     "nearest_torus_single",

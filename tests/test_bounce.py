@@ -23,6 +23,8 @@ pytestmark = pytest.mark.slow
 
 G = 9.81
 METHODS = pytest.mark.parametrize("row", INTEGRATORS, ids=lambda row: row.name)
+ORDERS = [row for row in INTEGRATORS if row.name in ("semi_implicit_euler", "velocity_verlet", "rk4")]
+ONE_OF_EACH_ORDER = pytest.mark.parametrize("row", ORDERS, ids=lambda row: row.name)
 STEPS = pytest.mark.parametrize("dt", [0.001, 0.005, 0.02])
 
 
@@ -79,7 +81,7 @@ def test_a_ball_rises_to_e_squared_of_its_height_and_rests_after_a_known_time(ro
     np.testing.assert_array_equal(np.abs(y[-10:]) + np.abs(v[-10:]), 0)  # P19: no jitter
 
 
-@METHODS
+@ONE_OF_EACH_ORDER
 def test_an_elastic_ball_rises_as_high_after_100_bounces(row: IntegratorRow) -> None:
     """N06: within 1 % of h for all methods, exactly from order 2 on. P22: plain reflection would pump it to 29 m."""
     scene, h = dropped(0.02, integrator=row.method)

@@ -302,17 +302,14 @@ class Visited(NamedTuple):
 IDLE = "no effect of this scene reacts to obstacles"
 SCENES = (
     Visited("boids", "effects[0].weight", IDLE),
-    Visited("crowd_corridor", "effects[3].strength"),
     Visited("fireworks", "effects[1].rate", IDLE),
     Visited("cloth", "effects[2].rate", IDLE),
-    Visited("fish", "effects[4].radius"),
     Visited("billiards", "constraints[0].restitution"),
 )
 TASK_VISITS = (
     Visited("pursuit", "evader_speed", "pursuit has no obstacles", 0),
     Visited("flock", "sight", "all 6 obstacles are there", 0),
     Visited("obstacles", "max_speed", share=0.02),  # so slow that it touches none, which would end the episode
-    Visited("crossing", "goal_radius", "crossing has no obstacles", 0),
 )
 BACK = 100
 """Steps that time goes back."""

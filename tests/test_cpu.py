@@ -27,7 +27,7 @@ from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import Effect, Gravitation
 from flockenv.scene import Scene
 from flockenv.scene.yaml_io import load_scene
-from flockenv.tasks import TASKS, Flock, Task
+from flockenv.tasks import TASKS, Task
 from flockenv.tasks.observations import ray_directions, shorten_free_paths
 from tests.catalogue import everything
 
@@ -69,9 +69,7 @@ def played(task: Task, decisions: int = 12) -> dict[str, Any]:
 CASES: dict[str, Callable[[], dict[str, Any]]] = {
     "few": lambda: stepped(flock(37, "float32", fov=270), 7),
     "many": lambda: stepped(flock(900, "float32", nearest=4), 7),
-    "many, reordered in memory": lambda: stepped(flock(20_003, "float32"), 3),
     "far groups and neighbours": lambda: stepped(heavy(3000, Separation(weight=1, radius=0.5)), 2),
-    "Flock": lambda: played(Flock(agents=24, dtype="float32")),
     **{
         f"all forms, {d}-D, {t}": lambda d=d, t=t: stepped(everything(d, dtype=t), 7)  # type: ignore[misc]
         for d, t in ((2, "float32"), (3, "float64"))
@@ -80,7 +78,7 @@ CASES: dict[str, Callable[[], dict[str, Any]]] = {
         f"{name}.yaml": lambda name=name: stepped(load_scene(CONFIGS / f"{name}.yaml"), 5)  # type: ignore[misc]
         for name in ("cloth",)
     },
-    **{f"task {name}": lambda name=name: played(TASKS[name]()) for name in ("bottleneck", "school")},  # type: ignore[misc]
+    **{f"task {name}": lambda name=name: played(TASKS[name]()) for name in ("bottleneck",)},  # type: ignore[misc]
 }
 
 

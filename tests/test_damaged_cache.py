@@ -64,7 +64,13 @@ DAMAGE: dict[str, Callable[[bytes], bytes]] = {
 }
 
 
-@pytest.mark.parametrize("how", ["emptied", "cut in the middle", "a bit flipped in the middle"])
+@pytest.mark.parametrize(
+    "how",
+    [
+        "a bit flipped in the middle",
+        *(pytest.param(how, marks=pytest.mark.slow) for how in ("emptied", "cut in the middle")),
+    ],
+)
 @pytest.mark.parametrize("kind", ["nbc"])
 def test_damaged_file_causes_one_message_and_one_compilation(
     kind: str, how: str, whole: tuple[Path, str], tmp_path: Path

@@ -123,7 +123,10 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+SLOW = ("drawn-weights", "school-weights", "drawn-residual", "school-residual")
+
+
+@pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.slow if c in SLOW else ()) for c in CASES])
 def test_resumed_training_equals_the_uninterrupted_one(case: str, tmp_path: Path) -> None:
     whole = train(CASES[case], tmp_path / "whole")
     interrupt(CASES[case], tmp_path / "parts")

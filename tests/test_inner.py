@@ -75,8 +75,8 @@ def warm(count: int, size: float) -> Scene:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("count", "size"), [(30, 5.0), pytest.param(2**14, 90.0, marks=pytest.mark.slow)])
-def test_inner_numbers_do_not_depend_on_threads_calls_or_batches(count: int, size: float) -> None:
+def test_inner_numbers_do_not_depend_on_threads_calls_or_batches() -> None:
+    count, size = 2**14, 90.0
     scene = warm(count, size)
     start = scene.start(3, 2)
     warmth = np.array(scene.inner(start, "warmth"))

@@ -74,16 +74,6 @@ def test_the_order_is_the_declared_one(row: IntegratorRow, way: str, tether: Any
     assert measured == pytest.approx(row.method.order_with_drag, abs=0.2)
 
 
-@pytest.mark.slow
-@METHODS
-def test_the_order_without_damping_is_the_declared_one(row: IntegratorRow, tether: Any) -> None:
-    seconds = 0.7 * PERIOD
-    target = X0 * math.cos(W * seconds) + V0 / W * math.sin(W * seconds)
-    speed = -X0 * W * math.sin(W * seconds) + V0 * math.cos(W * seconds)
-    measured = order(oscillator(tether, "compiled", zeta=0), row.fixed, (target, speed), seconds, first_of(row.method))
-    assert measured == pytest.approx(row.method.order, abs=0.2)
-
-
 def test_the_orders_are_those_of_the_table() -> None:
     """The orders are written here again, so that a wrong declaration fails."""
     orders = {row.name: (row.method.order, row.method.order_with_drag) for row in INTEGRATORS}

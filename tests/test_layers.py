@@ -224,8 +224,9 @@ for name in sys.argv[1:]:
 
 
 @pytest.mark.slow
-def test_every_module_can_be_imported_first() -> None:
-    files = [path.relative_to(ROOT).with_suffix("") for path in sorted((ROOT / "flockenv").rglob("*.py"))]
-    names = [".".join(path.parts).removesuffix(".__init__") for path in files if path.name != "__main__"]
+def test_every_package_and_its_last_module_can_be_imported_first() -> None:
+    folders = [path.parent for path in sorted((ROOT / "flockenv").rglob("__init__.py"))]
+    files = [path for folder in folders for path in (folder, max(folder.glob("*.py")))]
+    names = sorted({".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in files})
     run = subprocess.run([sys.executable, "-c", FIRST, *names], cwd=ROOT, text=True, stdout=subprocess.PIPE, check=True)
     assert run.stdout == "", "modules that cannot be imported first"

@@ -271,9 +271,9 @@ def test_a_seed_determines_the_training(algo: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize("algo", [algo for algo in ALGORITHMS if algo != "tqc"])  # SAC with other critics
 def test_every_learner_passes_random_on_pursuit(algo: str, tmp_path: Path) -> None:
-    budgets = {"sac": {"steps": 60_000}, "tqc": {"steps": 60_000}, "recurrent_ppo": {}, "bc": {"updates": 600}}
+    budgets = {"sac": {"steps": 60_000}, "recurrent_ppo": {}, "bc": {"updates": 600}}
     settings = {"worlds": 256, "rollout": 32, "minibatch": 2048, "evaluate_worlds": 32, "threads": 1, "steps": 600_000}
     experiment = effective(Experiment(task="pursuit", ppo=settings, **{algo: budgets[algo]}), algo)  # type: ignore[arg-type]
     run = learn.new_run(experiment, algo)

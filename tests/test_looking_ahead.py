@@ -16,7 +16,7 @@ from flockenv.scene import Group, Scene
 
 
 @pytest.mark.skipif(not KernelPlan(2, Plane(), (), SemiImplicitEuler()).masks, reason="only with AVX-512")
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("agents", [17, 95])  # from 96 on they are sorted by cell
 def test_computing_the_next_distance_early_changes_no_bits(
     agents: int, dtype: str, monkeypatch: pytest.MonkeyPatch

@@ -74,9 +74,7 @@ PROBLEMS: dict[str, tuple[dict[str, float], Callable[[float], tuple[float, float
 
 @WAYS
 @METHODS
-@pytest.mark.parametrize(
-    "problem", ["forced", *(pytest.param(name, marks=pytest.mark.slow) for name in ("pendulum", "projectile"))]
-)
+@pytest.mark.parametrize("problem", ["forced", pytest.param("pendulum", marks=pytest.mark.slow)])
 def test_the_order_is_the_declared_one_on_harder_problems(
     problem: str, row: IntegratorRow, way: str, tether: Any
 ) -> None:

@@ -230,7 +230,10 @@ def test_what_is_planted_in_a_folder_of_ones_own_is_used_but_for_a_linked_lock(
     assert used or done.stdout == compiled[1]
 
 
-@pytest.mark.parametrize("make", [world_writable, a_link, pytest.param(of_a_stranger, marks=as_root)])
+RARELY = [pytest.param(a_link, marks=pytest.mark.slow), pytest.param(of_a_stranger, marks=[as_root, pytest.mark.slow])]
+
+
+@pytest.mark.parametrize("make", [world_writable, *RARELY])
 def test_nothing_planted_in_the_temporary_folder_is_used(
     make: Callable[[Path], None], compiled: tuple[Path, str], tmp_path: Path
 ) -> None:

@@ -15,7 +15,7 @@ from tests.ray_venv import new_venv, run_case
 pytestmark = pytest.mark.slow
 
 CASES = (
-    "results_are_the_same_on_one_node_and_on_two",
+    "results_are_those_of_a_cluster_of_two_nodes",
     "a_killed_worker_loses_nothing",
     "a_killed_node_loses_nothing",
     "each_node_is_warmed_once_before_any_job",

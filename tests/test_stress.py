@@ -211,14 +211,17 @@ def test_semi_implicit_euler_stays_within_the_bounds_of_crowds(name: str) -> Non
     within(SemiImplicitEuler(), name)
 
 
+# Each method compiles each case anew: here two share the cases; `flockenv stress` tries all pairs (docs/stress.json).
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", LIGHT)
+@pytest.mark.parametrize("name", LIGHT[::2])
 def test_velocity_verlet_stays_within_the_bounds(name: str) -> None:
     within(VelocityVerlet(), name)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", BOUNDED)
+@pytest.mark.parametrize("name", sorted(set(BOUNDED) - set(LIGHT[::2])))
 def test_rk4_stays_within_the_bounds(name: str) -> None:
     within(RK4(), name)
 

@@ -74,7 +74,7 @@ def test_a_warning_of_unsolved_contacts_makes_the_verdict_warned() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ONCE)
+@pytest.mark.parametrize("name", ONCE[::3])  # of each case another response
 def test_rk4_has_the_known_verdicts(name: str) -> None:
     as_known(name, RK4())
 

@@ -76,7 +76,7 @@ def test_agents_far_away_do_not_add_candidates_in_3d() -> None:
         assert candidates(scene, moved(state, how)) < 2.5 * candidates(scene, state)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("how", FAR.values(), ids=FAR.keys())
 def test_agents_far_away_do_not_change_the_neighbours_that_are_found(how: Any, dimension: int) -> None:
     """Positions are multiples of 2^-10 m, so that moving a cluster by kilometres changes no distance in it."""

@@ -108,7 +108,6 @@ LARGE = [
     Large("torus_single", 20_000, 140.0),
     Large("torus_single_rk4", 6000, 70.0),
     Large("box", 4500, 45.0),
-    Large("plane_single", 4097, 60.0),
     Large("plane_3_single", 5003, 24.0),
     Large("nearest_plane", 4111, 60.0),
     Large("nearest_plane_3", 4096, 24.0),
@@ -483,7 +482,7 @@ def test_nan_found_by_any_thread_names_the_first_agent(agent: int, count: int) -
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_nan_in_a_batch_is_found_in_its_first_world(count: int) -> None:
-    scene = NAMED["plane_single"].make(33, 20.0)
+    scene = NAMED["plane_3_single"].make(33, 20.0)
     start = scene.start(0, worlds=40)
     for world, agent in ((39, 2), (17, 30), (18, 0)):
         start.pos[world, agent] = np.nan

@@ -22,7 +22,9 @@ from flockenv.tasks import Crossing, Flock, Obstacles, Pursuit
 from flockenv.tasks.play import _play
 from tests.catalogue import TASKS, TaskRow
 
-EVERY = pytest.mark.parametrize("row", TASKS[::-1], ids=lambda row: row.name)
+EVERY = pytest.mark.parametrize(
+    "row", [pytest.param(r, id=r.name, marks=pytest.mark.slow if r.variant else ()) for r in TASKS[::-1]]
+)
 """In reverse order: test_tasks.py, which may run in parallel, compiles the kernels of the first tasks first."""
 
 ARRAYS = ("x", "v", "alive", "tick", "key", "obstacle_x", "obstacle_radius", "work")
