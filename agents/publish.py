@@ -1,4 +1,4 @@
-"""Publish a comparison in README.md and docs/: `python -m agents.compare && python -m agents.publish`.
+"""Publish a comparison in README.md and docs/: `python -m agents.compare --worlds 128 && python -m agents.publish`.
 
 Copies results.json and comparison.png into docs/, draws docs/summary.png, and writes the tables of README.md and of
 docs/results.md, so that all of them are from one run.
@@ -22,10 +22,12 @@ from flockenv.cli.terminal import run_program
 from flockenv.core.atomic_files import write_all_or_none
 from flockenv.evaluation.report import Results, conditions, grid, seeds_text
 from flockenv.players import NAMES
-from flockenv.studies.comparison import WORLDS
 from flockenv.tasks import TASKS
 
-__all__ = ["BLOCK", "app", "summary", "tables"]
+__all__ = ["BLOCK", "WORLDS", "app", "summary", "tables"]
+
+WORLDS = 128
+"""Smallest number of worlds of a comparison that is published: more than README's command plays in two minutes."""
 
 BLOCK = re.compile(r"(?<=<!-- python -m agents\.publish -->\n).*?(?=<!-- end -->)", re.DOTALL)
 """The part of a page between its two marks."""
@@ -109,9 +111,10 @@ def _read_comparison(file: Path) -> Results:
         n for n in SHOWN if n not in results["players"]
     ]
     others = [name for name in results["players"] if name not in NAMES]
+    few = results["smoke"] or results["worlds"] < WORLDS
     what = f"a comparison with {others[0]}, which does not ship," if others else ""
     what = f"a part of a comparison, without {missing[0]}," if missing else what
-    what = f"a quick look (--smoke, or less than {WORLDS} worlds)" if results["smoke"] else what
+    what = f"a quick look (--smoke, or less than {WORLDS} worlds)" if few else what
     if results.get("changes") or any(results.get("disturbance", {}).values()):
         what = f"a comparison of {conditions(results)}"
     if what:

@@ -56,7 +56,7 @@ def compare(
         list[str] | None,
         typer.Option("--set", metavar="TASK.ARGUMENT=VALUE", help="Another argument of a task; repeatable."),
     ] = None,
-    worlds: Annotated[int | None, typer.Option(metavar="N", help="Worlds per task.", show_default="128")] = None,
+    worlds: Annotated[int | None, typer.Option(metavar="N", help="Worlds per task.", show_default="64")] = None,
     seed: Annotated[int, typer.Option(help="Block of evaluation worlds, 0 to 999.")] = 0,
     out: Annotated[
         str | None,

@@ -24,7 +24,7 @@ __all__ = [
     "RECORDED", "RESAMPLES", "SMOKE_RESAMPLES", "SMOKE_WORLDS", "WORLDS", "Played", "compare", "in_turn",
 ]  # fmt: skip
 
-WORLDS, SMOKE_WORLDS = 128, 16  # with ten seeds of each player, twice as many would take over two minutes
+WORLDS, SMOKE_WORLDS = 64, 16  # with ten seeds of most players, twice as many would take over two minutes
 RESAMPLES, SMOKE_RESAMPLES = 10_000, 1_000
 RECORDED = 0  # the world in the replay: the first, not a selected one
 
