@@ -13,8 +13,8 @@ from flockenv.geometry.space import Torus
 from flockenv.model.networks import Cloth, Jelly, Mesh, Rope
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
+from flockenv.model.surface import faces_of
 from flockenv.physics.constraints import Collisions, FaceCollisions, Rods
-from flockenv.physics.constraints.face_mesh import faces_of
 from flockenv.physics.effects import Drag, Gravity, Springs
 from flockenv.scene import Group, Scene
 from tests.exact_crossings import crossings

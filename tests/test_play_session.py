@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from flockenv.model.surface import faces_of
 from flockenv.physics.effects import EFFECTS
 from flockenv.play.additions import additions_of
-from flockenv.play.description import describe_lane, faces_of
+from flockenv.play.description import describe_lane
 from flockenv.play.frames import decode_frame
 from flockenv.play.gallery import entries, read_entry
 from flockenv.play.lane import collected_warnings

@@ -25,6 +25,7 @@ from flockenv.model.snapshot import ROLES, Mark, Snapshot
 from flockenv.model.spawn import Spawn
 from flockenv.render import Group, Panel, Window, draw, write_gif, write_png, write_replay
 from flockenv.render.palette import ROLE_COLOURS, rgb
+from flockenv.render.view import view_of
 from flockenv.scene import Group as SceneGroup
 from flockenv.scene import Scene
 
@@ -131,7 +132,18 @@ def test_snapshot_copies_and_is_read_only() -> None:
     snapshot = shot(vel=vel)
     vel[:] = 7.0
     assert (snapshot.vel == 1.0).all()
-    for name in ("pos", "vel", "alive", "radius", "obstacle_centre", "obstacle_radius", "low", "high", "bonds"):
+    for name in (
+        "pos",
+        "vel",
+        "alive",
+        "radius",
+        "obstacle_centre",
+        "obstacle_radius",
+        "low",
+        "high",
+        "bonds",
+        "faces",
+    ):
         with pytest.raises(ValueError, match="read-only"):
             getattr(snapshot, name)[...] = 0
     with pytest.raises(AttributeError):
@@ -165,6 +177,8 @@ def test_snapshot_survives_pickling() -> None:
         ({"bonds": [(0, -1)]}, r"Snapshot.bonds: must be agents from 0 to 0, got \[-1\]"),
         ({"bonds": [0, 0]}, r"Snapshot.bonds: must have shape \(any, 2\), got shape \(2,\)"),
         ({"bonds": [(0.0, 0.0)]}, "Snapshot.bonds: must be integers, got float64"),
+        ({"faces": [(0, 0, 1)]}, r"Snapshot.faces: must be agents from 0 to 0, got \[1\]"),
+        ({"faces": [(0, 0)]}, r"Snapshot.faces: must have shape \(any, 3\), got shape \(1, 2\)"),
         ({"marks": (Mark("goal", np.ones(3), np.ones(3), 0.0),)}, "Snapshot.marks: must have 2 coordinates, got 3"),
     ],
 )
@@ -310,6 +324,54 @@ def test_a_bond_across_the_seam_takes_the_shortest_path() -> None:
     assert not seen[60:, 100:500].any()
     assert seen[60:, 30:60].any(axis=0).all()
     assert seen[60:, 540:570].any(axis=0).all()
+
+
+# ---- faces
+
+
+def faced(pos: Any, faces: Any, **fields: Any) -> np.ndarray:
+    """Return which pixels of a field of 10 m differ from those without agents, below the caption."""
+    given = {"roles": ("agent",) * len(pos), "radius": np.full(len(pos), 0.01), "faces": faces} | fields
+    empty = draw(shot(np.empty((0, len(pos[0]))), periodic=fields.get("periodic", False)), scale=1)
+    return (difference(draw(shot(pos, **given), scale=1), empty) > 20)[60:]
+
+
+CORNERS = [(2.0, 2.0), (7.0, 2.0), (2.0, 7.0)]
+
+
+def test_a_face_covers_its_area_and_its_corners_are_no_dots() -> None:
+    metre = view_of(shot(), 600, 1).metre
+    for corners in (CORNERS, CORNERS[::-1]):
+        assert faced(corners, [(0, 1, 2)]).sum() == pytest.approx(12.5 * metre**2, rel=0.01)
+    assert not faced(CORNERS, [(0, 1, 2)], alive=[True, True, False]).any()
+
+
+def test_an_edge_that_broke_takes_its_face_away_and_the_inside_of_a_body_is_hidden() -> None:
+    pos, bonds, faces = [*CORNERS, (7.0, 7.0)], [(1, 0), (1, 2), (3, 2)], [(0, 1, 2), (1, 3, 2)]
+    whole = faced(pos, faces, bonds=bonds)
+    torn = faced(pos, faces, bonds=bonds, broken=[True, False, False])
+    assert torn.sum() == pytest.approx(whole.sum() / 2, rel=0.02)
+    inner = [*CORNERS, (3.0, 3.0)]
+    tied = faced(inner, faces[:1], bonds=[(0, 1), (3, 0)], radius=np.full(4, 0.5))
+    np.testing.assert_array_equal(tied, faced(CORNERS, faces[:1]))
+
+
+def test_faces_that_cross_hide_each_other_pixel_by_pixel_and_backs_have_their_own_colour() -> None:
+    one, other = (
+        [(1.0, 1.0, 1.0), (9.0, 1.0, 9.0), (5.0, 9.0, 5.0)],
+        [(1.0, 1.0, 9.0), (9.0, 1.0, 1.0), (5.0, 9.0, 5.0)],
+    )
+    roles = ("pursuer",) * 3 + ("flockmate",) * 3
+    image = draw(shot([*one, *other], roles=roles, radius=np.full(6, 0.01), faces=[(0, 1, 2), (3, 4, 5)]), scale=1)
+    left, right = (image[400, x].astype(int) for x in (200, 400))
+    assert left[2] > left[0] and right[0] > right[2]  # the flockmates' blue is higher on the left
+    flipped = draw(shot(one, roles=roles[3:], radius=np.full(3, 0.01), faces=[(0, 2, 1)]), scale=1)
+    assert flipped[400, 300, 0] > flipped[400, 300, 2]  # orange
+
+
+def test_a_face_across_the_seam_is_drawn_at_both_edges() -> None:
+    seen = faced([(9.0, 4.0), (1.0, 4.0), (9.0, 6.0)], [(0, 1, 2)], periodic=True)
+    assert seen[:, :40].any() and seen[:, -40:].any() and not seen[:, 100:500].any()
 
 
 def test_agents_with_bonds_leave_no_trail() -> None:

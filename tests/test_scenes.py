@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from flockenv.core.warnings import UnsolvedContactsWarning
 from flockenv.geometry.space import Box
 from flockenv.model.state import State
-from flockenv.physics.constraints.face_mesh import faces_of
+from flockenv.model.surface import faces_of
 from flockenv.scene import Scene
 from flockenv.scene.yaml_io import load_scene
 from tests.catalogue import Array

@@ -10,8 +10,8 @@ import pytest
 from flockenv.geometry.shapes import Circle
 from flockenv.model.networks import Mesh
 from flockenv.model.state import State
+from flockenv.model.surface import faces_of
 from flockenv.physics.constraints import FaceCollisions
-from flockenv.physics.constraints.face_mesh import faces_of
 from flockenv.physics.effects import Springs
 from flockenv.physics.integrators import LinearlyImplicitEuler
 from flockenv.scene import Group, Scene

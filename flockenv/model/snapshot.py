@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flockenv.model.appearance import Appearance
+from flockenv.model.surface import whole_faces
 
 __all__ = ["KINDS", "ROLES", "Floats", "Mark", "Snapshot"]
 
@@ -57,6 +58,7 @@ class Snapshot:
     outlines: polygons (n, 2), m, of obstacles that are not round, as seen from above.
     bonds (E, 2): int, pairs of agents joined by a line, the shortest one; none by default.
     broken (E,): True for bonds that are broken, which are not drawn; none by default.
+    faces (F, 3): int, triangles of agents, which are drawn in place of their bonds; none by default.
     heading (N, D): directions that agents face; default: those of the velocities.
     looks: appearances; look (N,): the index of each agent's own, -1 = none. age (N,): s, of the living; default: the
     time. identity (N,): int, the agent in each row; default: the same agents at all times.
@@ -88,6 +90,7 @@ class Snapshot:
     identity: NDArray[np.int64] | None = None
     inner: Floats | None = None
     broken: NDArray[np.bool_] | None = None
+    faces: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 3), np.int32))
 
     def __post_init__(self) -> None:
         pos = _array("Snapshot.pos", self.pos, (None, None), finite=False)
@@ -109,7 +112,7 @@ class Snapshot:
             high=_array("Snapshot.high", self.high, (dimension,)),
             periodic=bool(self.periodic),
             heading=None if self.heading is None else _array("Snapshot.heading", self.heading, (agents, dimension)),
-            bonds=_pairs("Snapshot.bonds", self.bonds, agents),
+            bonds=_agents("Snapshot.bonds", self.bonds, 2, agents),
             outlines=tuple(_array("Snapshot.outlines", polygon, (None, 2)) for polygon in self.outlines),
             looks=tuple(self.looks),
             look=_integers("Snapshot.look", np.full(agents, -1) if self.look is None else self.look, agents),
@@ -117,6 +120,7 @@ class Snapshot:
             identity=None if self.identity is None else _integers("Snapshot.identity", self.identity, agents),
             inner=None if self.inner is None else _array("Snapshot.inner", self.inner, (agents,)),
             broken=None if self.broken is None else _switches("Snapshot.broken", self.broken, len(self.bonds)),
+            faces=_agents("Snapshot.faces", self.faces, 3, agents),
         )
         if self.look is not None and not (self.look < len(self.looks)).all():
             raise ValueError(f"Snapshot.look: must be below {len(self.looks)}, the number of looks")
@@ -156,6 +160,11 @@ class Snapshot:
     def whole_bonds(self) -> NDArray[np.int32]:
         """The bonds that are not broken, (E', 2)."""
         return self.bonds if self.broken is None else self.bonds[~self.broken]
+
+    @property
+    def whole_faces(self) -> NDArray[np.int32]:
+        """The faces with no broken bond, (F', 3)."""
+        return self.faces if self.broken is None else whole_faces(self.faces, self.bonds[self.broken])
 
     @property
     def has_bonds(self) -> NDArray[np.bool_]:
@@ -251,16 +260,17 @@ def _integers(field: str, value: ArrayLike, count: int) -> NDArray[np.int64]:
     return numbers
 
 
-def _pairs(field: str, value: ArrayLike, count: int) -> NDArray[np.int32]:
-    pairs = np.array(value)
-    if pairs.size and pairs.dtype.kind not in "iu":
-        raise TypeError(f"{field}: must be integers, got {pairs.dtype}")
-    _require(pairs.ndim == 2 and pairs.shape[1] == 2, field, "must have shape (any, 2)", f"shape {pairs.shape}")
-    outside = pairs[(pairs < 0) | (pairs >= count)]
+def _agents(field: str, value: ArrayLike, each: int, count: int) -> NDArray[np.int32]:
+    """Return rows of `each` numbers of agents."""
+    rows = np.array(value)
+    if rows.size and rows.dtype.kind not in "iu":
+        raise TypeError(f"{field}: must be integers, got {rows.dtype}")
+    _require(rows.ndim == 2 and rows.shape[1] == each, field, f"must have shape (any, {each})", f"shape {rows.shape}")
+    outside = rows[(rows < 0) | (rows >= count)]
     _require(not len(outside), field, f"must be agents from 0 to {count - 1}", outside[:1])
-    pairs = pairs.astype(np.int32)
-    pairs.flags.writeable = False
-    return pairs
+    rows = rows.astype(np.int32)
+    rows.flags.writeable = False
+    return rows
 
 
 def _names(field: str, value: Iterable[str], count: int) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ from flockenv.play.task_lane import TaskLane
 from flockenv.render.replay import look_data, round_digits
 from flockenv.scene import Scene
 
-__all__ = ["describe_lane", "faces_of", "json_data"]
+__all__ = ["describe_lane", "json_data"]
 
 FACES = 20_000
 """Most triangles that are sent; larger surfaces are drawn by their bonds."""
@@ -34,7 +34,8 @@ def describe_lane(lane: Lane, name: str) -> dict[str, Any]:
     fixed = {
         "periodic": shot.periodic, "roles": _runs(shot.roles), "dimension": shot.dimension,
         "radius": _number_runs(shot.radius), "bonds": shot.bonds.ravel().tolist(),
-        "faces": faces_of(scene).ravel().tolist(), "looks": [look_data(look) for look in shot.looks],
+        "faces": shot.faces.ravel().tolist() if len(shot.faces) <= FACES else [],
+        "looks": [look_data(look) for look in shot.looks],
         "look": _runs(np.asarray(shot.look).tolist()) if shot.looks else None, "has_returns": lane.returns is not None,
     }  # fmt: skip
     return {
@@ -60,28 +61,6 @@ def _number_runs(values: NDArray[Any]) -> list[list[Any]]:
     first = np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1]]))
     counts = np.diff([*first, len(values)])
     return [[round_digits(float(values[k]), 6), int(count)] for k, count in zip(first, counts, strict=True)]
-
-
-def faces_of(scene: Scene) -> NDArray[np.int32]:
-    """Return the triangles of surfaces, (F, 3) agents: elements of sheets, outer faces of bodies; none if too many."""
-    found, first = [np.zeros((0, 3), np.int32)], 0
-    for group in scene.groups:
-        if group.network is not None:
-            elements = np.asarray(group.network.elements(scene.dimension))
-            if elements.shape[1] == 4:
-                elements = _outer_faces(elements)
-            if elements.shape[1] == 3:
-                found.append((first + elements).astype(np.int32))
-        first += group.size
-    faces = np.concatenate(found)
-    return faces if len(faces) <= FACES else faces[:0]
-
-
-def _outer_faces(tetrahedra: NDArray[Any]) -> NDArray[Any]:
-    """Return the triangles that belong to one tetrahedron only."""
-    corners = np.concatenate([np.delete(tetrahedra, k, axis=1) for k in range(4)])
-    _, where, count = np.unique(np.sort(corners, axis=1), axis=0, return_index=True, return_counts=True)
-    return np.asarray(corners[where[count == 1]])
 
 
 def _obstacles(lane: Lane, low: NDArray[Any], high: NDArray[Any]) -> list[dict[str, Any]]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from flockenv.model.snapshot import Floats, Mark, Snapshot
+from flockenv.render.faces import covered, draw_faces, relative_heights
 from flockenv.render.metaballs import draw_metaballs
 from flockenv.render.palette import (
     ARROW,
@@ -52,7 +53,8 @@ def draw(
     """Return the picture of a snapshot, (height, width, 3) uint8, with width = size and height <= size px, both even.
 
     An agent is a dart that points along its velocity (a dot if it is at rest), over a disc of its radius, in the colour
-    of its role. Agents with bonds are dots, and bonds are thin lines behind them. 3-D scenes are seen from above: upper
+    of its role. Agents with bonds are dots, and bonds are thin lines behind them; sheets and bodies are shaded faces
+    instead, whose back has another colour. 3-D scenes are seen from above: upper
     agents are larger, and drawn last. An agent with an appearance is drawn as a point, a disc, a polygon or a metaball,
     whose colour may show its age or speed.
 
@@ -81,6 +83,7 @@ def draw(
         if mark.kind != "way":
             _draw_mark(pen, view, mark)
     _draw_bonds(pen, view, snapshot)
+    draw_faces(canvas, view, snapshot, relative_heights(snapshot))
     _draw_liquids(canvas, view, snapshot)
     _draw_agents(pen, view, snapshot)
     _restore_margins(canvas, backdrop, view, view.spill)
@@ -170,12 +173,11 @@ def _draw_border(pen: ImageDraw.ImageDraw, view: View) -> None:
 
 
 def _roles_in_their_colours(snapshot: Snapshot) -> tuple[str, ...]:
-    """Return the roles that some agent is drawn in the colour of; an appearance with colours needs no legend."""
+    """Return the roles that some agent is drawn in the colour of; an appearance, and a surface, need no legend."""
     assert snapshot.look is not None
     coloured = [bool(look.colours) for look in snapshot.looks] + [False]  # the last for index -1: no appearance
-    return tuple(
-        dict.fromkeys(role for role, k in zip(snapshot.roles, snapshot.look.tolist(), strict=True) if not coloured[k])
-    )
+    each = zip(snapshot.roles, snapshot.look.tolist(), covered(snapshot).tolist(), strict=True)
+    return tuple(dict.fromkeys(role for role, k, hidden in each if not (coloured[k] or hidden)))
 
 
 @lru_cache(maxsize=8)
@@ -264,14 +266,6 @@ def _directions(vel: Floats) -> Floats:
     return np.asarray(unit[:, :2] / np.where(norm > 0.0, norm, 1.0))
 
 
-def _relative_heights(snapshot: Snapshot) -> Floats:
-    """Return the height of each agent, (N,), from 0 (bottom) to 1 (top, nearest to the viewer); 1 in 2-D."""
-    if snapshot.dimension == 2:
-        return np.ones(snapshot.agents)
-    low, high = snapshot.low[2], snapshot.high[2]
-    return np.asarray((np.clip(snapshot.pos[:, 2], low, high) - low) / (high - low))
-
-
 def _dart_corners(spots: Floats, aim: Floats, reach: Floats) -> Floats:
     """Return the corners of every dart, (N, 4, 2) px; one that points up or down is a third as long."""
     length = np.hypot(aim[:, 0], aim[:, 1])
@@ -287,7 +281,7 @@ def _draw_bonds(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot) -> Non
     """Draw a line for each bond between living agents, lowest first; twice if it crosses an edge of a torus."""
     drawn = snapshot.alive & snapshot.visible
     bonds = snapshot.whole_bonds
-    bonds = bonds[drawn[bonds].all(axis=1)]
+    bonds = bonds[drawn[bonds].all(axis=1) & ~covered(snapshot)[bonds].all(axis=1)]
     if not len(bonds):
         return
     offset = snapshot.pos[bonds[:, 1]] - snapshot.pos[bonds[:, 0]]
@@ -298,7 +292,7 @@ def _draw_bonds(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot) -> Non
     lines = np.concatenate([view.to_pixels(ends[0]), view.to_pixels(ends[0] + offset)], axis=1)
     copies = np.concatenate([view.to_pixels(ends[1] - offset), view.to_pixels(ends[1])], axis=1)
     twice = np.abs(copies - lines).max(axis=1) > 1.0
-    depth, thick = _relative_heights(snapshot)[bonds].mean(axis=1), max(1, round(view.width * BOND))
+    depth, thick = relative_heights(snapshot)[bonds].mean(axis=1), max(1, round(view.width * BOND))
     for k in np.argsort(depth, kind="stable").tolist():
         share = 0.6 * (0.45 + 0.55 * float(depth[k]))
         fill = mix(ROLE_COLOURS[snapshot.roles[bonds[k, 0]]][0], _PAPER, share)
@@ -326,16 +320,16 @@ def _draw_liquids(canvas: Image.Image, view: View, snapshot: Snapshot) -> None:
 
 def _magnification(snapshot: Snapshot) -> Floats:
     """Return the factor on the size of each agent, (N,): in 3-D upper agents are nearer, and larger."""
-    depth = _relative_heights(snapshot)
+    depth = relative_heights(snapshot)
     return 0.7 + 0.5 * depth if snapshot.dimension == 3 else depth
 
 
 def _draw_agents(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot) -> None:
     visible = np.flatnonzero(snapshot.visible)
-    depth, magnification = _relative_heights(snapshot), _magnification(snapshot)
+    depth, magnification = relative_heights(snapshot), _magnification(snapshot)
     body = snapshot.radius * view.metre * magnification
     reach = np.maximum(body, DART_REACH * view.width * magnification)
-    has_bonds, least_radius = snapshot.has_bonds, view.width * BOND
+    has_bonds, is_covered, least_radius = snapshot.has_bonds, covered(snapshot), view.width * BOND
     spots = view.to_pixels(snapshot.pos)
     aim = _directions(np.where(snapshot.visible[:, None], snapshot.aim, 0.0))
     darts = _dart_corners(spots, aim, 0.94 * reach)
@@ -346,6 +340,8 @@ def _draw_agents(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot) -> No
         for a, b in view.visible_positions(x, y, 1.1 * float(reach[i])):
             if not snapshot.alive[i]:
                 _draw_cross(pen, a, b, float(reach[i]), role)
+                continue
+            if is_covered[i]:
                 continue
             if not lacks_look[i]:
                 _draw_look(pen, view, snapshot, i, (a, b), aim[i], float(shades[i]), float(magnification[i]))

@@ -15,6 +15,7 @@ from flockenv.model.appearance import Appearance
 from flockenv.model.scene_view import SceneView
 from flockenv.model.snapshot import Mark, Snapshot
 from flockenv.model.state import Floats, State
+from flockenv.model.surface import faces_of
 from flockenv.physics.population import Emitter
 
 __all__ = ["View"]
@@ -49,8 +50,13 @@ class View:
             looks=self.looks, look=self.look if self.looks else None,
             age=state.age[world] if self.scene.population else None,
             identity=state.identity[world] if self.scene.population else None, inner=self.inner_numbers(state, world),
-            broken=self.broken(state, world),
+            broken=self.broken(state, world), faces=self.faces,
         )  # fmt: skip
+
+    @functools.cached_property
+    def faces(self) -> NDArray[np.int32]:
+        """The triangles of the surfaces of networks, (F, 3)."""
+        return faces_of(self.scene)
 
     def broken(self, state: State, world: int = 0) -> NDArray[np.bool_] | None:
         """Return which edges of networks are broken, (E,) bool; None if no effect breaks springs."""

@@ -13,9 +13,10 @@ from flockenv.geometry.box_tree import DEEPEST
 from flockenv.jit.section import entry
 from flockenv.model.scene_view import SceneView
 from flockenv.model.state import WORK, Floats, State
+from flockenv.model.surface import faces_of
 from flockenv.physics.constraints.constraint import Constraint, Settler
 from flockenv.physics.constraints.face_contacts import Contacts, Motion, Pairs
-from flockenv.physics.constraints.face_mesh import check_intersections, faces_of, make_mesh, shortest_height
+from flockenv.physics.constraints.face_mesh import check_intersections, make_mesh, shortest_height
 from flockenv.physics.constraints.face_step import FaceRules, FaceScratch, settle_faces
 from flockenv.physics.constraints.face_zones import SUMS, Zones
 

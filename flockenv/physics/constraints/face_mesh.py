@@ -12,8 +12,9 @@ from flockenv.geometry.shapes import Capsule, Circle, Shape, Wall
 from flockenv.jit.decorators import python_of
 from flockenv.model.network import element_edges, pairs_of
 from flockenv.model.scene_view import SceneView
+from flockenv.model.surface import faces_of
 
-__all__ = ["FaceMesh", "check_intersections", "edges_of", "faces_of", "make_mesh", "shortest_height"]
+__all__ = ["FaceMesh", "check_intersections", "edges_of", "make_mesh", "shortest_height"]
 
 Ints = NDArray[np.int32]
 Floats = NDArray[np.float64]
@@ -30,25 +31,6 @@ class FaceMesh(NamedTuple):
     light: Any  # (V,) 1/kg; 0 for obstacles, and particles that are held in place
     radius: Any  # (V,) m; 0 for the vertices of faces
     place: Any  # (V, 3) m, of the ends of obstacles; the others are 0
-
-
-def faces_of(scene: SceneView) -> Ints:
-    """Return the triangles of all networks and the surfaces of tetrahedra, (F, 3), by number of agent."""
-    found = [np.zeros((0, 3), np.int32)]
-    for group, first in zip(scene.groups, scene.starts, strict=False):
-        elements = np.zeros((0, 2), np.int32) if group.network is None else group.network.elements(3)
-        if elements.shape[1] == 4:
-            elements = _surface(elements)
-        if elements.shape[1] == 3:
-            found.append(elements + np.int32(first))
-    return np.concatenate(found)
-
-
-def _surface(elements: Ints) -> Ints:
-    """Return the triangles that belong to one tetrahedron only."""
-    sides = elements[:, [(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)]].reshape(-1, 3)
-    _, first, count = np.unique(np.sort(sides, axis=1), axis=0, return_index=True, return_counts=True)
-    return np.asarray(sides[np.sort(first[count == 1])])
 
 
 def edges_of(faces: Ints) -> Ints:
