@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Iterator
 from typing import Any
@@ -21,6 +22,9 @@ os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
 hypothesis.settings.register_profile("flockenv", derandomize=True, deadline=None, database=None, max_examples=60)
 hypothesis.settings.load_profile("flockenv")
 
+
+# numba keeps millions of objects alive, and each collection visits them.
+gc.set_threshold(5_000, 20, 20)
 
 # In tests with threads, all threads share all work, however little, because tests do not measure speed.
 thread_pool.AutoTuner.always, thread_pool._cores = True, 64

@@ -59,16 +59,9 @@ def pendulum(t: float) -> tuple[float, float]:
     return x, -2 * k * (1 - k * k) * sn / dn**2 / math.cos(x / 2)
 
 
-def projectile(t: float, drag: float = 0.7, weight: float = -9.81) -> tuple[float, float]:
-    """v' = -drag v + weight."""
-    gone, last = -math.expm1(-drag * t) / drag, weight / drag
-    return X0 + last * t + (V0 - last) * gone, last + (V0 - last) * math.exp(-drag * t)
-
-
 PROBLEMS: dict[str, tuple[dict[str, float], Callable[[float], tuple[float, float]], float]] = {
     "forced": ({"stiffness": 1, "push": 1}, forced, 4.4),
     "pendulum": ({"sine": 1, "pos": math.pi / 3, "vel": 0}, pendulum, 3.1),
-    "projectile": ({"damping": 0.7, "weight": -9.81}, projectile, 1.9),
 }
 
 
@@ -87,10 +80,9 @@ def test_the_order_is_the_declared_one_on_harder_problems(
 def test_the_exact_solutions_solve_their_equations() -> None:
     h = 1e-4
     for given, exact, seconds in PROBLEMS.values():
-        law = {"stiffness": 0.0, "push": 0.0, "sine": 0.0, "damping": 0.0, "weight": 0.0} | given
+        law = {"stiffness": 0.0, "push": 0.0, "sine": 0.0} | given
         (before, _), (x, v), (after, _) = (exact(seconds + k * h) for k in (-1, 0, 1))
         force = -law["stiffness"] * x + law["push"] * math.cos(2 * seconds) - law["sine"] * math.sin(x)
-        force += law["weight"] - law["damping"] * v
         assert (after - before) / (2 * h) == pytest.approx(v, abs=1e-7)
         assert (after - 2 * x + before) / h**2 == pytest.approx(force, abs=1e-6)
         assert exact(0.0) == pytest.approx((law.get("pos", X0), law.get("vel", V0)))
