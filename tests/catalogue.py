@@ -756,11 +756,6 @@ NEAREST = (
         Alignment(weight=0.7, radius=3, fov=270, nearest=1),
         Cohesion(weight=0.9, radius=2, nearest=7),
     ), "torus", 2, "float32"),
-    Variant("nearest_torus_3", (
-        Separation(weight=1.3, radius=2.5, fov=300, nearest=1),
-        Alignment(weight=0.7, radius=3, fov=270, nearest=6),
-        Cohesion(weight=0.9, radius=2),
-    ), "torus", 3, method=ExplicitEuler()),
 )  # fmt: skip
 """Behaviours with the nearest 1, 6, 7 or 32 neighbours, with and without a view cone, in planes and on toruses."""
 

@@ -41,7 +41,6 @@ RARE = {
     "plane_3_single",
     "nearest_plane_3",
     "nearest_torus_single",
-    "nearest_torus_3",
 }
 """Kernels of catalogue.Variant that only slow tests compile."""
 

@@ -70,10 +70,7 @@ CASES: dict[str, Callable[[], dict[str, Any]]] = {
     "few": lambda: stepped(flock(37, "float32", fov=270), 7),
     "many, reordered in memory": lambda: stepped(flock(20_003, "float32", nearest=4), 3),
     "far groups and neighbours": lambda: stepped(heavy(3000, Separation(weight=1, radius=0.5)), 2),
-    **{
-        f"all forms, {d}-D, {t}": lambda d=d, t=t: stepped(everything(d, dtype=t), 7)  # type: ignore[misc]
-        for d, t in ((2, "float32"), (3, "float64"))
-    },
+    "all forms": lambda: stepped(everything(3), 7),
     "cloth.yaml": lambda: stepped(load_scene(CONFIGS / "cloth.yaml"), 5),
     "task bottleneck": lambda: played(TASKS["bottleneck"]()),
 }

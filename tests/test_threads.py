@@ -112,7 +112,6 @@ LARGE = [
     Large("nearest_plane", 4111, 60.0),
     Large("nearest_plane_3", 4096, 24.0),
     Large("nearest_torus_single", 4999, 60.0),
-    Large("nearest_torus_3", 4096, 24.0),
     Large("torus", 4099, 9.0, sorts=False),
     Large("plane_3_single", 4096, 3.0, sorts=False),
     Large("nearest_torus_single", 4096, 9.0, sorts=False),
