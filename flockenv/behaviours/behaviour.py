@@ -95,7 +95,11 @@ class Behaviour(Effect):
         return {**dict.fromkeys(self.unlimited, math.inf), **super().parameters()}
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Return no oscillation, and a damping of weight / m, or twice that if it copies a velocity."""
+        """Return no oscillation, and a damping of weight / m, or twice that if it copies a velocity.
+
+        Left out is that what an agent heads for may move with its velocity, as for follow_path and orca, whose damping
+        can be larger (tests/test_gains.py).
+        """
         damping = gains(self.weight * (2.0 if self.copies else 1.0), groups, dimension)
         return np.zeros(len(damping)), damping
 
