@@ -100,7 +100,7 @@ def _lead(pair: Results) -> str:
 def _read_comparison(file: Path) -> Results:
     """Return a comparison; raise ValueError unless it is complete: all tasks, the usual players, all worlds."""
     if not file.is_file():
-        raise ValueError(f"{file}: no such file; `python -m agents.compare` writes it")
+        raise ValueError(f"{file}: no such file; `python -m agents.compare --worlds {WORLDS}` writes it")
     try:
         results = json.loads(file.read_text(encoding="utf-8"))
     except ValueError as error:
@@ -114,7 +114,7 @@ def _read_comparison(file: Path) -> Results:
     few = results["smoke"] or results["worlds"] < WORLDS
     what = f"a comparison with {others[0]}, which does not ship," if others else ""
     what = f"a part of a comparison, without {missing[0]}," if missing else what
-    what = f"a quick look (--smoke, or less than {WORLDS} worlds)" if few else what
+    what = f"a quick look (--smoke, or without --worlds {WORLDS})" if few else what
     if results.get("changes") or any(results.get("disturbance", {}).values()):
         what = f"a comparison of {conditions(results)}"
     if what:

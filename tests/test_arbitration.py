@@ -299,7 +299,7 @@ def test_steer_survives_a_round_trip_through_yaml(arbitration: Arbitration) -> N
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("arbitration", "dtype", "dimension"),
-    [(a, *(("float64", 3) if k == 0 else ("float32", 2))) for k, a in enumerate(catalogue.ARBITRATIONS)],
+    [(a, *(("float64", 3) if k == 0 else ("float32", 2))) for k, a in enumerate(catalogue.ARBITRATIONS)],  # one in 3-D
     ids=lambda value: getattr(value, "kind", value),
 )
 def test_every_arbitration_steers_a_scene(arbitration: Arbitration, dtype: str, dimension: int) -> None:

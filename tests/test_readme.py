@@ -68,9 +68,9 @@ def test_a_full_comparison_is_published_and_a_quick_or_partial_one_is_refused(tm
 
     without = {**results, "tasks": {name: task for name, task in results["tasks"].items() if name != "herd"}}
     for given, message in (
-        (None, "no such file; `python -m agents.compare` writes it"),
-        ({**results, "worlds": 64}, "a quick look (--smoke, or less than 128 worlds) must not be published"),
-        ({**results, "smoke": True}, "a quick look (--smoke, or less than 128 worlds) must not be published"),
+        (None, "no such file; `python -m agents.compare --worlds 128` writes it"),
+        ({**results, "worlds": 64}, "a quick look (--smoke, or without --worlds 128) must not be published"),
+        ({**results, "smoke": True}, "a quick look (--smoke, or without --worlds 128) must not be published"),
         ({**results, "disturbance": {"noise": 0.1}}, "a comparison of 128 worlds per task, noise 0.1 must not be"),
         ({**results, "changes": {"herd": {"sheep": 3}}}, "128 worlds per task, herd.sheep = 3 must not be published"),
         (without, "a part of a comparison, without herd, must not be published"),

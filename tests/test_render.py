@@ -132,18 +132,7 @@ def test_snapshot_copies_and_is_read_only() -> None:
     snapshot = shot(vel=vel)
     vel[:] = 7.0
     assert (snapshot.vel == 1.0).all()
-    for name in (
-        "pos",
-        "vel",
-        "alive",
-        "radius",
-        "obstacle_centre",
-        "obstacle_radius",
-        "low",
-        "high",
-        "bonds",
-        "faces",
-    ):
+    for name in "pos vel alive radius obstacle_centre obstacle_radius low high bonds faces".split():
         with pytest.raises(ValueError, match="read-only"):
             getattr(snapshot, name)[...] = 0
     with pytest.raises(AttributeError):
@@ -357,10 +346,8 @@ def test_an_edge_that_broke_takes_its_face_away_and_the_inside_of_a_body_is_hidd
 
 
 def test_faces_that_cross_hide_each_other_pixel_by_pixel_and_backs_have_their_own_colour() -> None:
-    one, other = (
-        [(1.0, 1.0, 1.0), (9.0, 1.0, 9.0), (5.0, 9.0, 5.0)],
-        [(1.0, 1.0, 9.0), (9.0, 1.0, 1.0), (5.0, 9.0, 5.0)],
-    )
+    one = [(1.0, 1.0, 1.0), (9.0, 1.0, 9.0), (5.0, 9.0, 5.0)]
+    other = [(1.0, 1.0, 9.0), (9.0, 1.0, 1.0), (5.0, 9.0, 5.0)]
     roles = ("pursuer",) * 3 + ("flockmate",) * 3
     image = draw(shot([*one, *other], roles=roles, radius=np.full(6, 0.01), faces=[(0, 1, 2), (3, 4, 5)]), scale=1)
     left, right = (image[400, x].astype(int) for x in (200, 400))

@@ -12,21 +12,13 @@ from flockenv.model.snapshot import Floats, Snapshot
 from flockenv.render.palette import PAPER, ROLE_COLOURS, rgb
 from flockenv.render.view import View
 
-__all__ = ["covered", "draw_faces", "relative_heights"]
+__all__ = ["covered", "draw_faces"]
 
 LIGHT: Final = np.array([-0.35, 0.46, 0.81])
 """Direction of the light: to the right, upwards, towards the reader; that of page/faces.js."""
 
 EVEN: Final = 0.6
 """Light on all faces in 2-D."""
-
-
-def relative_heights(snapshot: Snapshot) -> Floats:
-    """Return the height of each agent, (N,), from 0 (bottom) to 1 (top, nearest to the viewer); 1 in 2-D."""
-    if snapshot.dimension == 2:
-        return np.ones(snapshot.agents)
-    low, high = snapshot.low[2], snapshot.high[2]
-    return np.asarray((np.clip(snapshot.pos[:, 2], low, high) - low) / (high - low))
 
 
 def covered(snapshot: Snapshot) -> NDArray[np.bool_]:

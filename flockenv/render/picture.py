@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from flockenv.model.snapshot import Floats, Mark, Snapshot
-from flockenv.render.faces import covered, draw_faces, relative_heights
+from flockenv.render.faces import covered, draw_faces
 from flockenv.render.metaballs import draw_metaballs
 from flockenv.render.palette import (
     ARROW,
@@ -54,9 +54,9 @@ def draw(
 
     An agent is a dart that points along its velocity (a dot if it is at rest), over a disc of its radius, in the colour
     of its role. Agents with bonds are dots, and bonds are thin lines behind them; sheets and bodies are shaded faces
-    instead, whose back has another colour. 3-D scenes are seen from above: upper
-    agents are larger, and drawn last. An agent with an appearance is drawn as a point, a disc, a polygon or a metaball,
-    whose colour may show its age or speed.
+    instead, whose back has another colour. 3-D scenes are seen from above: upper agents are larger, and drawn last. An
+    agent with an appearance is drawn as a point, a disc, a polygon or a metaball, whose colour may show its age or
+    speed; a face has the colour of its first corner.
 
     trails: earlier snapshots of the same world, oldest first. The path of each agent without bonds is drawn behind it;
     of an agent with an appearance, its last `trail` seconds. all_trails: False: only of agents with an appearance.
@@ -67,7 +67,9 @@ def draw(
     view = view_of(snapshot, size, scale)
     circles = np.column_stack([snapshot.obstacle_centre[:, :2], snapshot.obstacle_radius])
     outlines = tuple(polygon.tobytes() for polygon in snapshot.outlines)
-    backdrop = _draw_backdrop(view, snapshot.title, _roles_in_their_colours(snapshot), circles.tobytes(), outlines)
+    hidden = covered(snapshot)
+    roles = _roles_in_their_colours(snapshot, hidden)
+    backdrop = _draw_backdrop(view, snapshot.title, roles, circles.tobytes(), outlines)
     canvas = backdrop.copy()
     pen = ImageDraw.Draw(canvas, "RGBA")
     tracks = [mark for mark in snapshot.marks if mark.kind == "way"]
@@ -82,10 +84,10 @@ def draw(
     for mark in snapshot.marks:
         if mark.kind != "way":
             _draw_mark(pen, view, mark)
-    _draw_bonds(pen, view, snapshot)
-    draw_faces(canvas, view, snapshot, relative_heights(snapshot))
+    _draw_bonds(pen, view, snapshot, hidden)
+    draw_faces(canvas, view, snapshot, _relative_heights(snapshot))
     _draw_liquids(canvas, view, snapshot)
-    _draw_agents(pen, view, snapshot)
+    _draw_agents(pen, view, snapshot, hidden)
     _restore_margins(canvas, backdrop, view, view.spill)
     _draw_time(pen, view, snapshot.time)
     return np.array(canvas.reduce(scale) if scale > 1 else canvas)
@@ -172,12 +174,15 @@ def _draw_border(pen: ImageDraw.ImageDraw, view: View) -> None:
 # ---- caption
 
 
-def _roles_in_their_colours(snapshot: Snapshot) -> tuple[str, ...]:
-    """Return the roles that some agent is drawn in the colour of; an appearance, and a surface, need no legend."""
+def _roles_in_their_colours(snapshot: Snapshot, hidden: NDArray[np.bool_]) -> tuple[str, ...]:
+    """Return the roles that some agent is drawn in the colour of; appearances with colours need no legend.
+
+    hidden (N,): agents that are not drawn, but the surface of their network.
+    """
     assert snapshot.look is not None
     coloured = [bool(look.colours) for look in snapshot.looks] + [False]  # the last for index -1: no appearance
-    each = zip(snapshot.roles, snapshot.look.tolist(), covered(snapshot).tolist(), strict=True)
-    return tuple(dict.fromkeys(role for role, k, hidden in each if not (coloured[k] or hidden)))
+    each = zip(snapshot.roles, snapshot.look.tolist(), hidden.tolist(), strict=True)
+    return tuple(dict.fromkeys(role for role, k, unseen in each if not (coloured[k] or unseen)))
 
 
 @lru_cache(maxsize=8)
@@ -266,6 +271,14 @@ def _directions(vel: Floats) -> Floats:
     return np.asarray(unit[:, :2] / np.where(norm > 0.0, norm, 1.0))
 
 
+def _relative_heights(snapshot: Snapshot) -> Floats:
+    """Return the height of each agent, (N,), from 0 (bottom) to 1 (top, nearest to the viewer); 1 in 2-D."""
+    if snapshot.dimension == 2:
+        return np.ones(snapshot.agents)
+    low, high = snapshot.low[2], snapshot.high[2]
+    return np.asarray((np.clip(snapshot.pos[:, 2], low, high) - low) / (high - low))
+
+
 def _dart_corners(spots: Floats, aim: Floats, reach: Floats) -> Floats:
     """Return the corners of every dart, (N, 4, 2) px; one that points up or down is a third as long."""
     length = np.hypot(aim[:, 0], aim[:, 1])
@@ -277,11 +290,14 @@ def _dart_corners(spots: Floats, aim: Floats, reach: Floats) -> Floats:
     return np.asarray(spots[:, None] + reach[:, None, None] * corners * np.array([1.0, -1.0]))
 
 
-def _draw_bonds(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot) -> None:
-    """Draw a line for each bond between living agents, lowest first; twice if it crosses an edge of a torus."""
+def _draw_bonds(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot, hidden: NDArray[np.bool_]) -> None:
+    """Draw a line for each bond between living agents, lowest first; twice if it crosses an edge of a torus.
+
+    hidden (N,): agents whose bonds are not drawn, but the surface of their network.
+    """
     drawn = snapshot.alive & snapshot.visible
     bonds = snapshot.whole_bonds
-    bonds = bonds[drawn[bonds].all(axis=1) & ~covered(snapshot)[bonds].all(axis=1)]
+    bonds = bonds[drawn[bonds].all(axis=1) & ~hidden[bonds].all(axis=1)]
     if not len(bonds):
         return
     offset = snapshot.pos[bonds[:, 1]] - snapshot.pos[bonds[:, 0]]
@@ -292,7 +308,7 @@ def _draw_bonds(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot) -> Non
     lines = np.concatenate([view.to_pixels(ends[0]), view.to_pixels(ends[0] + offset)], axis=1)
     copies = np.concatenate([view.to_pixels(ends[1] - offset), view.to_pixels(ends[1])], axis=1)
     twice = np.abs(copies - lines).max(axis=1) > 1.0
-    depth, thick = relative_heights(snapshot)[bonds].mean(axis=1), max(1, round(view.width * BOND))
+    depth, thick = _relative_heights(snapshot)[bonds].mean(axis=1), max(1, round(view.width * BOND))
     for k in np.argsort(depth, kind="stable").tolist():
         share = 0.6 * (0.45 + 0.55 * float(depth[k]))
         fill = mix(ROLE_COLOURS[snapshot.roles[bonds[k, 0]]][0], _PAPER, share)
@@ -320,16 +336,16 @@ def _draw_liquids(canvas: Image.Image, view: View, snapshot: Snapshot) -> None:
 
 def _magnification(snapshot: Snapshot) -> Floats:
     """Return the factor on the size of each agent, (N,): in 3-D upper agents are nearer, and larger."""
-    depth = relative_heights(snapshot)
+    depth = _relative_heights(snapshot)
     return 0.7 + 0.5 * depth if snapshot.dimension == 3 else depth
 
 
-def _draw_agents(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot) -> None:
-    visible = np.flatnonzero(snapshot.visible)
-    depth, magnification = relative_heights(snapshot), _magnification(snapshot)
+def _draw_agents(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot, hidden: NDArray[np.bool_]) -> None:
+    visible = np.flatnonzero(snapshot.visible & ~(hidden & snapshot.alive))
+    depth, magnification = _relative_heights(snapshot), _magnification(snapshot)
     body = snapshot.radius * view.metre * magnification
     reach = np.maximum(body, DART_REACH * view.width * magnification)
-    has_bonds, is_covered, least_radius = snapshot.has_bonds, covered(snapshot), view.width * BOND
+    has_bonds, least_radius = snapshot.has_bonds, view.width * BOND
     spots = view.to_pixels(snapshot.pos)
     aim = _directions(np.where(snapshot.visible[:, None], snapshot.aim, 0.0))
     darts = _dart_corners(spots, aim, 0.94 * reach)
@@ -340,8 +356,6 @@ def _draw_agents(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot) -> No
         for a, b in view.visible_positions(x, y, 1.1 * float(reach[i])):
             if not snapshot.alive[i]:
                 _draw_cross(pen, a, b, float(reach[i]), role)
-                continue
-            if is_covered[i]:
                 continue
             if not lacks_look[i]:
                 _draw_look(pen, view, snapshot, i, (a, b), aim[i], float(shades[i]), float(magnification[i]))
