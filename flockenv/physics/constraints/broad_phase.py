@@ -105,7 +105,7 @@ def _common_reach(living: Any, radius: Any, reach: Any, n: int, many: Any) -> fl
     return 1.000001 * widest if widest > 0.0 else limit  # cells as small as possible
 
 
-@routine
+@kernel
 def list_near_pairs(
     period: Vec, at: Any, living: Any, radius: Any, reach: Any, n: int, grid: Any, order: Any, cell: Any, start: Any,
     offset: Any, bounds: Any, sync: Any, ranges: Any, first: Any, second: Any,

@@ -192,7 +192,7 @@ def _inverse_reduced_mass(bodies: Bodies, i: int, j: int) -> float:
     return float(bodies.light[i] + (bodies.light[j] if j >= 0 else 0.0))
 
 
-@routine
+@kernel
 def resolve_impacts(
     period: Vec, bodies: Bodies, things: Things, contacts: Contacts, vel: Any, restitution: float, friction: float,
     sticky: bool, rounds: int, slow: float, count: int,
@@ -269,7 +269,7 @@ def _stop_approach_once(
     return worst, square
 
 
-@routine
+@kernel
 def stop_approach(
     period: Vec, bodies: Bodies, things: Things, contacts: Contacts, vel: Any, friction: float, sticky: bool,
     rounds: int, slow: float, count: int,

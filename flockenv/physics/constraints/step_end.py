@@ -45,7 +45,7 @@ LEFT, SUNK = 5, 6
 deepest overlap, as a part of the smaller radius."""
 
 
-@routine
+@kernel
 def settle_ends(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, contacts: Contacts, ends: Ends, before: Any,
     reach: Any, rules: Rules, in_time: bool, once: bool, passing: bool, rounds: int, fast: float, hard: float, up: Vec,
@@ -100,7 +100,7 @@ def settle_ends(
     return count
 
 
-@routine
+@kernel
 def _hold_back(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, ends: Ends, before: Any, reach: Any, rules: Rules,
     once: bool, stuck: bool, spread: float, count: int, scratch: Any, lost: Any,
@@ -170,7 +170,7 @@ def _solve_velocities(
     return float(worst)
 
 
-@routine
+@kernel
 def _separate_bodies(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, contacts: Contacts, ends: Ends, reach: Any,
     rules: Rules, once: bool, anew: bool, rounds: int, up: Vec, spread: float, touching: int, count: int, scratch: Any,
