@@ -82,21 +82,29 @@ def test_damping_stays_below_its_bound_and_reaches_about_half_of_it(kind: str) -
     """Damping is measured by differences of the compiled law along a run of the demo.
 
     The bounds of follow_path and orca leave out that what an agent heads for moves with its velocity: in these runs
-    they are exceeded by 22 and 4.4 %. Cohesion has no damping, heads in a walking group turn less far than they could,
-    and agents that evade have no pursuer near in this scene.
+    they are exceeded by 22 and 4.4 %, and by less than 5 % if the behaviour is alone. Cohesion has no damping, heads in
+    a walking group turn less far than they could, and agents that evade have no pursuer near in this scene.
     """
-    shown, only, shares = load_scene(str(EFFECTS[kind].demo)), alone(kind), []
-    state = shown.start(0)
+    shares = shares_of_the_bound(load_scene(str(EFFECTS[kind].demo)), alone(kind))  # test_gallery.py compiles its step
+    assert max(shares) <= EXCEEDED.get(kind, 1.0001)
+    assert max(shares) > 0.45 or kind in ("cohesion", "evade", "walking_group")
+    if kind in EXCEEDED:
+        assert max(shares_of_the_bound(alone(kind), alone(kind))) <= 1.05
+
+
+def shares_of_the_bound(runs: Scene, only: Scene) -> list[float]:
+    """Return damping over its bound of each agent of a behaviour alone, in four states along a run of 2.8 s."""
+    state, shares = runs.start(0), []
     bounds = [each for effect in only.effects if effect.steering if (each := effect.rates(only.groups, only.dimension))]
     most = sum(damping for _, damping in bounds)
     for _ in range(4):
-        state = shown.run(state, round(0.7 / shown.dt))  # test_gallery.py has compiled its step
+        state = runs.run(state, round(0.7 / runs.dt))
         now = state.with_dt(only.dt)
         for agent in range(only.agents):
             damping = np.linalg.eigvals(derivative(only, now, agent, "v")).real.max()
-            assert damping <= EXCEEDED.get(kind, 1.0001) * most[agent] + 1e-6
-            shares.append(damping / most[agent] if most[agent] > 0 else 0.0)
-    assert max(shares) > 0.45 or kind in ("cohesion", "evade", "walking_group")
+            assert damping <= 1e-6 or most[agent] > 0
+            shares.append(float(damping / most[agent]) if most[agent] > 0 else 0.0)
+    return shares
 
 
 @pytest.mark.parametrize("kind", [kind for kind in BEHAVIOURS if kind not in UNBOUNDED])

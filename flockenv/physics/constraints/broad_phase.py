@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from flockenv.geometry.cell_list import candidates, count_cells, row_of
-from flockenv.jit.decorators import Vec, kernel, law, routine
+from flockenv.jit.decorators import Vec, kernel, law
 from flockenv.maths.approximations import round_half_even
 from flockenv.maths.vectors import dot, sub
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from flockenv.jit.decorators import Vec, kernel, routine
+from flockenv.jit.decorators import Vec, kernel
 from flockenv.maths.vectors import add, dot, norm, scale, sub, zero
 from flockenv.physics.constraints.bodies import DEEP, Bodies, Meetings, Rules, Things, widen_reach
 from flockenv.physics.constraints.broad_phase import displacement_near, nearest_image, vector_at, write_vector
