@@ -315,3 +315,29 @@ def test_the_legend_shows_what_colours_mean(boids: Session, visit: Callable[...,
         here.page.locator("#colour").select_option("")
         here.page.locator("#field").select_option("")
         here.until(f"{legend}.includes('agent') && !{legend}.includes('density:')")
+
+
+STAMPED = """() => {
+  const w = 297, h = 261, words = new Int32Array(w * h), other = new Int32Array(w * h);
+  const colour = 0x804020, plane = emptyPlane(w, h);
+  let dice = 1;
+  const random = () => (dice = dice * 16807 % 2147483647) / 2147483647;
+  for (let n = 0; n < 3000; n++) {
+    const reach = n % 1000 ? 0.5 + 3 * random() : 60;
+    const x = Math.floor((w + 99) * random() - 50), y = Math.floor((h + 99) * random() - 50);
+    const mark = stampOf("dot", formNumber("dot"), reach, reach, -1, n % 2, (n >> 1) % 2);
+    blit(words, w, h, mark, x, y, colour, 1);
+    addCover(plane, mark, x, y);
+  }
+  unfoldPlane(plane, other, w, h, colour);
+  return [words.every((word, n) => word === other[n]), words.filter(word => word !== 0).length, new Set(words).size];
+}"""
+
+
+def test_a_crowd_in_one_colour_is_drawn_as_one_in_several(boids: Session, visit: Callable[..., Visit]) -> None:
+    with serving(boids) as server:
+        here = opened(visit, server.url)
+        equal, filled, levels = here.value(f"({STAMPED})()")
+        assert equal
+        assert filled > 5000
+        assert levels > 50  # not all of them are wholly covered
