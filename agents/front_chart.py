@@ -46,4 +46,4 @@ def draw_front(path: Path, content: Mapping[str, Any]) -> None:
     axes.tick_params(colors=FAINT, labelcolor=INK)
     title = f"{content['task']}: harm against return (upper left is better)"
     figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold", color=INK)
-    save_figure(path, figure, 130)
+    save_figure(path, figure)

@@ -35,7 +35,7 @@ def draw_payoffs(path: Path, content: Mapping[str, Any]) -> None:
     axes.spines[:].set_visible(False)
     title = f"{content['task']}: mean return of one agent, and its gain over playing as the others do"
     figure.suptitle(title, x=0.01, ha="left", fontsize=11, fontweight="bold", color=INK)
-    save_figure(path, figure, 130)
+    save_figure(path, figure)
 
 
 def _text(content: Mapping[str, Any], one: str, others: str) -> str:

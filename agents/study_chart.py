@@ -52,7 +52,7 @@ def draw_map(path: Path, results: TaskResults) -> None:
     _legend(figure, results)
     title = f"{results.task}: which kind is ahead, by what difference in return, and success"
     figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold", color=INK)
-    save_figure(path, figure, 130)
+    save_figure(path, figure)
 
 
 def draw_summary(path: Path, results: Sequence[TaskResults], title: str) -> None:
@@ -84,7 +84,7 @@ def draw_summary(path: Path, results: Sequence[TaskResults], title: str) -> None
             )  # fmt: skip
     _legend(figure, *results)
     figure.suptitle(title, x=0.01, ha="left", fontsize=13, fontweight="bold", color=INK)
-    save_figure(path, figure, 130)
+    save_figure(path, figure)
 
 
 def _text(value: object) -> str:

@@ -121,6 +121,14 @@ def test_results_are_strict_json_with_one_line_per_list() -> None:
     assert "NaN" not in text
 
 
+def test_innermost_objects_are_on_one_line_whatever_their_strings_hold() -> None:
+    inner = {"a": '{ [x] }\n  "y"', "b": {}, "c": None}
+    results = {"one": {"a": "x\n  y", "b": 1.5, "c": {}}, "two": [inner, {"d": []}], "three": {"deep": {"e": [1, 2]}}}
+    text = report.json_text(results)
+    assert json.loads(text) == results
+    assert ' "one": {"a": "x\\n  y", "b": 1.5, "c": {}},\n' in text and '{"d": []}' in text
+
+
 def test_verdict_names_the_winner_the_difference_and_the_costs() -> None:
     luck = np.linspace(-1, 1, 101)
     costs = {"ppo": {"wall_time_s": 252, "steps": 1_000_000}, "rules": {"of": "tuning", "steps": 950}}

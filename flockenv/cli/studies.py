@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -296,9 +297,10 @@ def _write_results(path: Path, numbers: Record, draw: Callable[[Path], None]) ->
 def write_numbers(path: Path, numbers: Record) -> None:
     """Write results as JSON, completely or not at all, with the suffix of `path` replaced by .json."""
     from flockenv.core.atomic_files import new_folder, replace_file
+    from flockenv.evaluation.report import json_text
 
     with new_folder(path.parent), replace_file(path.with_suffix(".json")) as file:
-        file.write((numbers.model_dump_json(indent=1) + "\n").encode())
+        file.write(json_text(json.loads(numbers.model_dump_json())).encode())
 
 
 def read_findings(path: Path | None, what: str, sources: str) -> Results | None:

@@ -53,7 +53,7 @@ class Column:
 
 def write_chart(path: str | Path, columns: Sequence[Column], title: str, note: str = "") -> None:
     """Write the plot as a PNG file, atomically and without a display; the same numbers give the same bytes."""
-    save_figure(path, draw_chart(columns, title, note), 150)
+    save_figure(path, draw_chart(columns, title, note))
 
 
 def save_figure(path: str | Path, figure: Figure, dpi: int = 100) -> None:

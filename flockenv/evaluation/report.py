@@ -234,9 +234,11 @@ def chart_column(task: str, results: Results) -> Column:
 
 
 def json_text(results: Mapping[str, Any]) -> str:
-    """Return the results as strict JSON with little white space, lists of numbers on one line each."""
+    """Return the results as strict JSON with little white space: lists of numbers and innermost objects on one line."""
     text = json.dumps(results, indent=1, allow_nan=False, ensure_ascii=False)
-    return re.sub(r"\[\s+([-+.\deE,\s]*?)\s+\]", lambda m: f"[{''.join(m[1].split())}]", text) + "\n"
+    text = re.sub(r"\[\s+([-+.\deE,\s]*?)\s+\]", lambda m: f"[{''.join(m[1].split())}]", text)
+    inner = r"\{\n\s*((?:[^{}\[\]]|\{\}|\[\])*)\n\s*\}"  # what a string has of such brackets only keeps its lines apart
+    return re.sub(inner, lambda m: "{" + re.sub(r"\n\s*", " ", m[1]) + "}", text) + "\n"
 
 
 def conditions(results: Results) -> str:

@@ -278,7 +278,7 @@ def save_policy(path: str | os.PathLike[str], tensors: Mapping[str, NDArray[Any]
             raise ValueError(
                 f"policy {printable_path(path)}: card: {key} = {card[key]!r}, the weights say {derived[key]!r}"
             )
-    text = json.dumps({**card, **derived}, indent=2, allow_nan=False) + "\n"
+    text = json.dumps({**card, **derived}, indent=1, allow_nan=False) + "\n"
     write_all_or_none(path.parent, {
         path.name: lambda part: part.write_bytes(data),
         path.with_suffix(".json").name: lambda part: part.write_bytes(text.encode()),

@@ -22,7 +22,7 @@ FILL: dict[Verdict, str] = {
 
 def write_verdicts(path: str | Path, results: Results) -> None:
     """Write the picture as a PNG file, whole or not at all; the same findings give the same bytes."""
-    save_figure(path, draw_verdicts(results), 120)
+    save_figure(path, draw_verdicts(results), 90)
 
 
 def draw_verdicts(results: Results) -> Figure:
