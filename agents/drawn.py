@@ -103,7 +103,7 @@ def check_settings(experiment: Experiment) -> None:
     if p.start is not None:
         from agents.warm_start import starting_policy  # with torch
 
-        starting_policy(p.start, task, p.hidden, p.activation)
+        starting_policy(p, task)
     settings = drawn_settings(task, p.disturbance, p.draw)
     count, learners = len(settings), {drawn.learners for _, drawn, _ in settings}
     if p.care and len(learners) > 1:

@@ -74,7 +74,8 @@ class PpoSettings(Record):
     start: str | None = Field(
         default=None,
         exclude_if=lambda start: start is None,
-        description="trained policy with which learning begins: ppo (the shipped one), or a .safetensors file",
+        description="trained policy with which learning begins: ppo (the shipped one), ppo@3 (that of a seed), ppo@* "
+        "(that of this training's seed), or a .safetensors file",
     )
     critic_first: int = Field(default=0, ge=0, description="agent-steps in which only the critic learns, then")
     stagger: bool = Field(default=False, description="begin worlds at different times of their first episode")
@@ -100,7 +101,9 @@ class PpoSettings(Record):
         "parameters, the priorities of their behaviours, or whose force it is",
     )
     base: str = Field(
-        default="rules", exclude_if=lambda base: base == "rules", description="hand-written player under the network"
+        default="rules",
+        exclude_if=lambda base: base == "rules",
+        description="hand-written player under the network; queueing@5: that of a search seed",
     )
     bound: float = Field(
         default=0.5,

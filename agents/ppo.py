@@ -274,7 +274,7 @@ def _train_from(experiment: Experiment, folder: Path, run: Run | None, saved: Ca
         run = Run(recipe_of(experiment), surroundings(model.get_env().get_attr("task", 0)[0]))
         run.wall = _teach_first(model, task, p)
         if p.start is not None:
-            use_weights(model, starting_policy(p.start, task, p.hidden, p.activation))
+            use_weights(model, starting_policy(p, task))
     with use_thread_count(p.threads), show_progress(new_progress(console)) as progress:
         watch = Watch(task, p, run, folder, progress, saved)
         try:

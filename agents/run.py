@@ -17,7 +17,7 @@ from agents.drawn import drawn_settings
 from agents.experiment import Experiment
 from flockenv.core.errors import KeyPath, key_path, printable
 from flockenv.core.record import ResultRecord
-from flockenv.players import weights_file
+from flockenv.players import ALL_SEEDS, known_name, policy_file
 from flockenv.players.hybrid import FORCE, Hybrid
 from flockenv.players.policy import MlpPolicy
 from flockenv.players.rules import as_dict, player
@@ -45,15 +45,17 @@ def recipe_of(experiment: Experiment) -> dict[str, Any]:
     if experiment.ppo.taught:
         recipe["rules"] = as_dict(player(task).rules)  # the policy that it imitated first
     if experiment.ppo.start is not None:
-        recipe["start"] = MlpPolicy.load(start_path(experiment.ppo.start, task)).card["sha256"]
+        recipe["start"] = MlpPolicy.load(start_path(experiment.ppo.start, task, experiment.ppo.seed)).card["sha256"]
     if experiment.ppo.action != FORCE:
         recipe["hybrid"] = Hybrid.of(task, experiment.ppo.action, experiment.ppo.base, experiment.ppo.bound).card
     return {**recipe, "layout": task.layout.digest}
 
 
-def start_path(spec: str, task: Task) -> Path:
-    """Return the file of the policy with which learning begins (`ppo.start`): "ppo" is the shipped one."""
-    return weights_file(task.name) if spec == "ppo" else Path(spec)
+def start_path(spec: str, task: Task, seed: int) -> Path:
+    """Return the file of the policy with which learning begins (`ppo.start`); seed: of the training, for ppo@*."""
+    if known_name(spec) != "ppo":
+        return Path(spec)
+    return policy_file(spec.replace(ALL_SEEDS, f"@{seed}"), task)
 
 
 @dataclass

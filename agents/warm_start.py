@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from stable_baselines3 import PPO
 
+from agents.experiment import PpoSettings
 from agents.run import start_path
 from flockenv.core.errors import printable
 from flockenv.players.policy import MlpPolicy, describe
@@ -19,19 +20,20 @@ from flockenv.tasks import Task
 __all__ = ["starting_policy", "use_weights"]
 
 
-def starting_policy(spec: str, task: Task, hidden: tuple[int, ...], activation: str) -> MlpPolicy:
-    """Return the policy of a file, or of the task's shipped weights ("ppo"), from which a training begins.
+def starting_policy(p: PpoSettings, task: Task) -> MlpPolicy:
+    """Return the policy from which a training begins (`ppo.start`): of a file, or one of the task's own.
 
     Raises:
         ValueError: in one line, there is no such policy, it has another network, or it observes something else.
     """
-    policy = MlpPolicy.load(start_path(spec, task))
+    spec, own = p.start or "", (p.hidden, p.activation)
+    policy = MlpPolicy.load(start_path(spec, task, p.seed))
     if "squash" in policy.card or policy.learners or isinstance(policy, RecurrentPolicy):
         what = "is squashed, recurrent or of several networks"
         raise ValueError(f"ppo.start = {printable(spec)}: its actor {what}, must be one of PPO's")
     mine = (tuple(len(bias) for _, bias in policy.layers[:-1]), policy.card["activation"])
-    if mine != (hidden, activation):
-        raise ValueError(f"ppo.start = {printable(spec)}: its network is {mine}, must be {(hidden, activation)}")
+    if mine != own:
+        raise ValueError(f"ppo.start = {printable(spec)}: its network is {mine}, must be {own}")
     seen, here = policy.card.get("observation"), describe(task)["observation"]
     if not isinstance(seen, list) or seen != here[: len(seen)] or policy.card.get("action") != describe(task)["action"]:
         raise ValueError(f"ppo.start = {printable(spec)}: its observations or actions are not those of the task")

@@ -16,7 +16,7 @@ from flockenv.envs.world import World
 from flockenv.players import load_player
 from flockenv.players.hybrid import KINDS, Hybrid, HybridPolicy
 from flockenv.players.policy import describe, save_policy
-from flockenv.players.rules import PLAYERS, as_dict, player
+from flockenv.players.rules import PLAYERS, as_dict, load_tuned, player
 from flockenv.players.rules.parameter import ranges_of
 from flockenv.steering.motivation import ESCAPE
 from flockenv.tasks import TASKS, Crossing, Pursuit, School, Task
@@ -302,3 +302,15 @@ def test_a_file_plays_without_torch(tmp_path: Path) -> None:
 def test_an_unknown_base_is_refused() -> None:
     with pytest.raises(ValueError, match="hand-written player 'rulez': unknown, did you mean `rules`"):
         Hybrid.of(Pursuit(), "residual", "rulez")
+
+
+def test_a_base_may_be_the_result_of_a_search_seed() -> None:
+    each = Hybrid.of(TASKS["bottleneck"](), "mixture", "queueing@5", 0.4)
+    found = load_tuned("bottleneck", "queueing").by_seed
+    assert as_dict(each.rules.rules) == {**as_dict(player(TASKS["bottleneck"](), "queueing").rules), **found[5]}
+    assert (
+        each.card["base"] == "queueing" and each.card["rules"]["headway"] == found[5]["headway"] != found[1]["headway"]
+    )
+    assert Hybrid.from_card(each.card, TASKS["bottleneck"]()) == each
+    with pytest.raises(ValueError, match=r"^player 'queueing@77': no such seed; of task 'bottleneck' there are queue"):
+        Hybrid.of(TASKS["bottleneck"](), "mixture", "queueing@77")

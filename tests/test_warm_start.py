@@ -11,10 +11,10 @@ import pytest
 from agents.drawn import check_settings
 from agents.experiment import CONFIGS, Experiment, PpoSettings, load_experiment
 from agents.ppo import build, export, tensors_of, train
-from agents.run import Run, recipe_of
+from agents.run import Run, recipe_of, start_path
 from agents.training import card_of
 from agents.warm_start import starting_policy, use_weights
-from flockenv.players import WEIGHTS, load_player
+from flockenv.players import WEIGHTS, load_player, seeds_of_player, weights_file
 from flockenv.players.policy import MlpPolicy
 
 FEW: dict[str, Any] = {"worlds": 2, "rollout": 4, "minibatch": 8, "threads": 1, "evaluate_worlds": 2, "steps": 8}
@@ -29,7 +29,7 @@ def test_learning_begins_with_the_policy_and_ignores_what_it_does_not_observe() 
     each = experiment()
     task, p = each.build(), each.ppo
     model = build(task, p)
-    use_weights(model, starting_policy(p.start or "", task, p.hidden, p.activation))
+    use_weights(model, starting_policy(p, task))
     mine = MlpPolicy(tensors_of(model), {"activation": "relu"})
     shipped = load_player("ppo", task.model_copy(update={"price": None, "horizon": 250}))
     rows = np.random.default_rng(0).uniform(-1, 1, (50, task.layout.size)).astype(np.float32)
@@ -51,6 +51,8 @@ def test_a_training_and_its_recipe_name_the_start(tmp_path: Path) -> None:
     ("changes", "text"),
     [
         ({"start": "no.safetensors"}, "no.safetensors"),
+        ({"start": "ppo@77"}, "player 'ppo@77': no such seed; of task 'crowd_nav' there are ppo@0, ppo@1"),
+        ({"start": "ppo@*", "seed": 78}, "player 'ppo@78': no such seed; of task 'crowd_nav' there are ppo@0, ppo@1"),
         ({"hidden": (32, 64)}, "ppo.start = 'ppo': its network is ((64, 64), 'relu'), must be ((32, 64), 'relu')"),
         ({"arguments": {"neighbours": 5}}, "its observations or actions are not those of the task"),
         ({"start": str(WEIGHTS / "bottleneck.safetensors")}, "its observations or actions are not those of the task"),
@@ -60,6 +62,15 @@ def test_a_policy_that_does_not_fit_is_refused_in_one_line(changes: dict[str, An
     with pytest.raises(ValueError, match=r".") as caught:
         check_settings(experiment(**changes))
     assert text in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_learning_may_begin_with_a_policy_of_another_seed_or_of_its_own() -> None:
+    task, (ships, other, *_) = experiment().build(), seeds_of_player("ppo", "crowd_nav")
+    assert start_path("ppo", task, other) == start_path(f"ppo@{ships}", task, other) == weights_file("crowd_nav")
+    assert start_path(f"ppo@{other}", task, ships) == weights_file("crowd_nav", other)
+    assert start_path("ppo@*", task, other) == weights_file("crowd_nav", other)
+    assert start_path("ppo@*", task, ships) == weights_file("crowd_nav")
+    assert recipe_of(experiment(start="ppo@*", seed=other))["start"] != recipe_of(experiment(seed=other))["start"]
 
 
 def test_a_mixture_begins_with_the_policy_that_it_mixes(tmp_path: Path) -> None:

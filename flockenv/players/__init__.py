@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 # Neither the laws nor numba are imported here: `flockenv render --help` lists the players in a fifth of a second.
 
 __all__ = [
-    "ALL_SEEDS", "NAMES", "PUBLISHED", "SEEDED", "WEIGHTS", "known_name", "load_player", "other_tasks",
+    "ALL_SEEDS", "NAMES", "PUBLISHED", "SEEDED", "WEIGHTS", "known_name", "load_player", "other_tasks", "policy_file",
     "seeds_of_player", "trained_task", "weights_file",
 ]  # fmt: skip
 
@@ -132,6 +132,17 @@ def weights_file(task: str, seed: int | None = None) -> Path:
     return WEIGHTS / (f"{task}.safetensors" if seed is None else f"seeds/{task}-seed-{seed}.safetensors")
 
 
+def policy_file(spec: str, task: Task) -> Path:
+    """Return the path of the weights of `ppo`, or of a training seed, such as ppo@3, whether it ships or not.
+
+    Raises:
+        ValueError: there is no such seed; one line.
+    """
+    seed = _checked_seed(spec, task) if "@" in spec else None
+    ships = seed is None or seed == seeds_of_player("ppo", task.name)[0]
+    return weights_file(task.name, None if ships else seed)
+
+
 def _training_seeds(task: str) -> tuple[int, ...]:
     from flockenv.players.policy import read_card
 
@@ -151,8 +162,9 @@ def _named_player(spec: str, task: Task, seed: int) -> Policy:
     name, _, text = spec.partition("@")
     if name == "random" and not text:
         return RandomPolicy(task.action_layout.size, seed)
-    run = _checked_seed(spec, task) if text and not other_tasks(name, task.name) else None
-    return _load_trained(task, seed, run) if name == "ppo" else player(task, name, run)
+    if name == "ppo":
+        return _load_trained(spec, task, seed)
+    return player(task, name, _checked_seed(spec, task) if text and not other_tasks(name, task.name) else None)
 
 
 def _checked_seed(spec: str, task: Task) -> int:
@@ -169,14 +181,13 @@ def _checked_seed(spec: str, task: Task) -> int:
     return int(text)
 
 
-def _load_trained(task: Task, seed: int, training_seed: int | None) -> Policy:
+def _load_trained(spec: str, task: Task, seed: int) -> Policy:
     from flockenv.players.policy import MlpPolicy
 
     if not weights_file(task.name).is_file():
         command = f"python -m agents.ppo configs/training/{task.name}.yaml"
         raise ValueError(f"player 'ppo' has no weights for task {task.name!r}; this trains them: {command}")
-    ships = training_seed is None or training_seed == seeds_of_player("ppo", task.name)[0]
-    return MlpPolicy.load(weights_file(task.name, None if ships else training_seed), task, seed)
+    return MlpPolicy.load(policy_file(spec, task), task, seed)
 
 
 def other_tasks(name: str, task: str) -> tuple[str, ...]:

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.core.errors import nearest, printable
+from flockenv.players import PUBLISHED, load_player
 from flockenv.players.policy import MlpPolicy, Observation, State
 from flockenv.players.rules import ORDERED, PLAYERS, RulesPlayer, as_dict, player
 from flockenv.players.rules.parameter import is_logarithmic, ranges_of
@@ -52,12 +53,12 @@ class Hybrid:
 
     @classmethod
     def of(cls, task: Task, kind: str, base: str = "rules", bound: float = 0.5) -> Hybrid:
-        """Return the hybrid of a task with its hand-written player `base`.
+        """Return the hybrid of a task with its hand-written player `base`; queueing@5 is that of search seed 5.
 
         Raises:
-            ValueError: in one line, an unknown kind or base, or a base that does not allow this kind.
+            ValueError: in one line, an unknown kind, base or seed, or a base that does not allow this kind.
         """
-        rules = player(task, base)
+        rules = _base(task, base)
         _check_kind("action", kind, rules)
         _check_bound("bound", kind, bound)
         return cls(kind, rules, bound, _ranges(rules) if kind == "weights" else ())
@@ -167,6 +168,15 @@ class HybridPolicy(MlpPolicy):
         rows = np.atleast_2d(np.asarray(observation, np.float32))
         action, state = self.hybrid.act(rows, np.atleast_2d(outputs), state, episode_start)
         return (action[0] if outputs.ndim == 1 else action), state
+
+
+def _base(task: Task, spec: str) -> RulesPlayer:
+    """Return a hand-written player by name, with or without a search seed; raise ValueError if there is none."""
+    if spec.partition("@")[0] not in PUBLISHED:
+        return player(task, spec)
+    found = load_player(spec, task)
+    assert isinstance(found, RulesPlayer)
+    return found
 
 
 def _are_numbers(values: list[Any]) -> bool:
