@@ -54,6 +54,8 @@ TASK_PLACE = "{task}"
 PARTNERS, SHARE, SAME = "partners", "share", "same"
 """Axis of the player of all other agents; share of the agents that are evaluated; the value for the same player."""
 
+INTEGRATOR = "integrator"
+
 Value = bool | int | float | str | None
 Values = tuple[Value | dict[str, Value], ...] | dict[str, tuple[Value, ...]]
 """Values of an axis: one after another, or (by name) all combinations."""
@@ -80,8 +82,9 @@ class Study(Record):
     everywhere: dict[str, tuple[Value, ...]] = Field(
         default_factory=dict,
         description="values to play, by name, in every task that has it: noise, delay, dropped, range, seen, dt, "
-        "partners",
+        "integrator (its kind), partners",
     )
+    left_out: str = Field(default="", description="settings that a reader may miss, and why; on the page")
     tasks: dict[str, dict[str, Values]] = Field(
         min_length=1,
         description="values to play in single tasks: arguments of the task, or names of several at once; a mapping of "
@@ -197,8 +200,11 @@ def _values_of(axis: str, values: Values) -> Iterator[tuple[str, str, dict[str, 
         yield f"{axis} {_text(changes[first])}", _text({key: changes[key] for key in others}), changes
 
 
-def _changes(axis: str, value: Value | dict[str, Value]) -> dict[str, Value]:
-    return value if isinstance(value, dict) else {axis: value}
+def _changes(axis: str, value: Value | dict[str, Value]) -> dict[str, Any]:
+    """Return the arguments that a value changes; an integrator is named by its kind."""
+    if isinstance(value, dict):
+        return value
+    return {axis: {"kind": value} if axis == INTEGRATOR and isinstance(value, str) else value}
 
 
 def _setting(

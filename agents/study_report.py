@@ -46,6 +46,7 @@ def markdown(study: Study, command: str, tasks: Sequence[TaskResults], folder: s
         f"![Which kind of player is ahead in which setting]({folder}/summary.png)",
         NOTES,
         CHECKED.format(command=command, folder=folder),
+        *([f"**Left out**: {study.left_out}"] if study.left_out else []),
         *([AMONG] if any(results.groups[PARTNERS] for results in tasks) else []),
         "## Settings in which a kind of player is ahead",
         grid(*_counts(tasks)),

@@ -110,6 +110,7 @@ def plan_digest(
     Only results of one plan are on one page; other settings of another task do not matter to those of this one.
     """
     plan, fixed = study.model_dump(mode="json"), {name: dict(each) for name, each in changes.items()}
+    del plan["left_out"]  # a text alone
     if study.seeds is None:
         del plan["seeds"]  # plans from before there was this key
     if task is not None:

@@ -22,6 +22,7 @@ from flockenv.evaluation import bootstrap, lead_interval, mean_interval, rollout
 from flockenv.evaluation.report import json_text
 from flockenv.jobs import Store, Work
 from flockenv.jobs.local_engine import LocalEngine
+from flockenv.physics.integrators import RK4
 from flockenv.players import load_player
 from flockenv.players.rules import TUNED
 from flockenv.scene.yaml_io import load
@@ -352,6 +353,22 @@ def test_only_results_of_one_study_are_on_a_page(tmp_path: Path, monkeypatch: py
         run = CliRunner().invoke(app, ["study.yaml", "--tasks", task, "--out", "out", "--processes", "1"])
         assert run.exit_code == 0, run.output
         assert Path("out.md").read_text().count("![Map of") == expected
+
+
+def test_an_integrator_is_named_by_its_kind_and_is_of_the_solver() -> None:
+    study = small(everywhere={"integrator": ("semi_implicit_euler", "rk4")}, tasks={"pursuit": {}})
+    settings = settings_of(study, "pursuit")
+    assert [each.name for each in settings] == ["home", "integrator=rk4"]
+    assert settings[1].task.integrator == RK4()
+    with pytest.raises(ValueError, match=r"^tasks\.pursuit\.integrator: Pursuit: integrator.*'rk5'"):
+        settings_of(small(tasks={"pursuit": {"integrator": ("rk5",)}}), "pursuit")
+
+
+def test_what_a_study_leaves_out_is_on_its_page_and_is_no_other_plan() -> None:
+    study = small(left_out="16 N, as the circle is too small.")
+    assert "\n**Left out**: 16 N, as the circle is too small.\n" in markdown(study, "command", [], "out")
+    assert "**Left out**" not in markdown(small(), "command", [], "out")
+    assert plan_digest(study) == plan_digest(small())
 
 
 def test_a_damaged_player_is_refused_before_anything_is_played(tmp_path: Path) -> None:
