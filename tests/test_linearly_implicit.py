@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from flockenv.core.warnings import UnstableStepWarning
-from flockenv.engine.linear_step import LinearSolver
+from flockenv.engine.linear_step import LinearSolver, LinearStep
 from flockenv.model.divergence import SimulationDiverged
 from flockenv.model.networks import Cloth, Rope
 from flockenv.model.state import State
 from flockenv.physics.constraints import Slide
-from flockenv.physics.effects import Drag, Gravity, Springs, Tether
+from flockenv.physics.effects import Drag, Gravity, Membrane, Springs, Tether
 from flockenv.physics.integrators import ImplicitEuler, LinearlyImplicitEuler, SemiImplicitEuler
 from flockenv.scene import Group, Scene
 from tests.catalogue import Array
@@ -162,6 +162,59 @@ def test_a_cloth_gains_no_energy(stiffness: float) -> None:
         total = float(elastic[0]) + 0.5 * float((mass * (state.vel[0] ** 2).sum(axis=1)).sum())
         assert total <= 1.05 * 9.81 * (height - (mass * state.pos[0, :, 1]).sum()) + 1e-9
     assert 0 < state.count_of("linear_iterations") <= 20 * 1000
+
+
+def hit(scene: Scene, speed: float, worlds: int = 1) -> State:
+    """Return a sheet at rest of which one particle moves."""
+    state, vel = scene.start(0, worlds=worlds), np.zeros((worlds, scene.agents, scene.dimension))
+    vel[:, 10] = speed
+    return state.with_motion(state.pos, vel)
+
+
+@pytest.mark.parametrize(
+    "effect", [Springs(stiffness=40.0), Membrane(stretch=40.0, shear=10.0)], ids=["springs", "membrane"]
+)
+def test_strain_is_that_of_the_shape(effect: Any) -> None:
+    group = Group(network=Cloth(cells=(4, 3), sides=(1.0, 0.8)), mass=0.05)
+    scene = Scene(groups=(group,), effects=(effect,), integrator=CLOSELY, dt=0.02)
+    state = scene.start(0)
+    end = LinearStep(1.3 * np.asarray(state.x[:, 0], float), np.asarray(state.v[:, 0], float), 0)
+    change, agent = LinearSolver(scene)._strain_change(state, end)
+    assert change == pytest.approx(0.3, rel=1e-6) and 0 <= agent < scene.agents
+
+
+def test_a_step_with_a_large_change_of_strain_is_two_of_half_the_time() -> None:
+    free, start = sheet_of(), hit(sheet_of(), 3.0, worlds=2)
+    for strain in np.geomspace(1.0, 1e-3, 40):
+        scene = sheet_of(CLOSELY.model_copy(update={"strain": float(strain)}))
+        end = scene.step(start)
+        if end.count_of("substeps") == 4:
+            break
+    assert (end.count_of("substeps"), end.count_of("rejected_steps")) == (4, 2)  # of two worlds
+    halves = sheet_of(dt=free.dt / 2).step(start.with_dt(free.dt / 2), steps=2)
+    np.testing.assert_array_equal(end.pos, halves.pos)
+    np.testing.assert_array_equal(end.vel, halves.vel)
+    assert (end.pos != free.step(start).pos).any()
+
+
+def test_limited_strains_bring_a_hit_sheet_closer_to_the_exact_motion() -> None:
+    start, errors, solves = hit(sheet_of(), 20.0), [], []
+    exact = sheet_of(dt=sheet_of().dt / 512).step(start.with_dt(sheet_of().dt / 512), steps=512 * 4)
+    for strain in (0.0, 0.05, 0.01):
+        end = sheet_of(CLOSELY.model_copy(update={"strain": strain, "halvings": 12})).step(start, steps=4)
+        errors.append(np.abs(end.pos - exact.pos).max())
+        solves.append(end.count_of("substeps"))
+    assert errors[0] > 1.5 * errors[1] > 6 * errors[2]
+    assert solves[0] == 4 < solves[1] < solves[2] < 4 * 512
+
+
+def test_a_strain_that_changes_too_much_in_the_shortest_step_is_told() -> None:
+    scene = sheet_of(CLOSELY.model_copy(update={"strain": 0.001, "halvings": 1}))
+    start = hit(scene, 50.0)
+    with pytest.raises(
+        SimulationDiverged, match=r"a strain changes by \S+ in \S+ s, a step halved 1 times; strain = 0\.001"
+    ):
+        scene.step(start)
 
 
 def test_springs_do_not_limit_the_step_and_forces_without_a_derivative_do() -> None:

@@ -16,7 +16,7 @@ from flockenv.jit.decorators import Law, kernel
 from flockenv.jit.section import entry_of, section
 from flockenv.maths.approximations import round_half_even
 
-__all__ = ["FIXED", "FREE", "SLIDES", "Local", "System", "assemble_of", "solve_of"]
+__all__ = ["FIXED", "FREE", "SLIDES", "Local", "System", "assemble_of", "solve_of", "strain_change_of"]
 
 FREE, FIXED, SLIDES = 0, 1, 2
 """Kinds of filters of an agent: none; its velocity is prescribed; a projection onto a line or a plane."""
@@ -97,6 +97,31 @@ def assemble_of(derivative: Law, dimension: int, nodes: int) -> Callable[..., No
                             system.right[agent[s, p] * d + a] += along * total
 
     return assemble
+
+
+@entry_of
+def strain_change_of(strain: Law, dimension: int, nodes: int) -> Callable[..., tuple[float, int]]:
+    """Make `strain_change(x, y, v, alive, agent, number, period, local)`: the largest change from positions x to y.
+
+    It returns the change and the first agent of the stencil that has it, or 0 and -1. Arguments as for `assemble_of`.
+    """
+    gather = _gather(dimension, nodes)
+
+    def strain_change(
+        x: Any, y: Any, v: Any, alive: Any, agent: Any, number: Any, period: Any, local: Any
+    ) -> tuple[float, int]:
+        most, where = 0.0, -1
+        for s in range(agent.shape[0]):
+            if gather(x, v, alive, agent, s, period, local):
+                one, two = strain(local, number, s)
+                gather(y, v, alive, agent, s, period, local)
+                then_one, then_two = strain(local, number, s)
+                change = max(abs(then_one - one), abs(then_two - two))
+                if change > most:
+                    most, where = change, agent[s, 0]
+        return most, where
+
+    return strain_change
 
 
 @section

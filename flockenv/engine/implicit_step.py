@@ -94,11 +94,12 @@ def _linear_step(scene: SceneView, drive: Floats, step: Kernel, solver: LinearSo
 
     def advance(state: State) -> tuple[int, str]:
         try:
-            found = solver.step(scene, state, *scene.rates(state, push))
+            found = solver.advance(scene, state, push)
         except NotSolvedLinearlyError as error:
             return error.agent, str(error)
         state.work[0, WORK.index("linear_iterations")] += found.iterations
-        state.work[0, WORK.index("substeps")] += 1
+        state.work[0, WORK.index("substeps")] += found.solves
+        state.work[0, WORK.index("rejected_steps")] += found.rejected
         return step(state, 0, found.x, found.v)[1], ""
 
     return advance

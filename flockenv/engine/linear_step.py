@@ -6,12 +6,22 @@ Source: Baraff and Witkin 1998, Large steps in cloth simulation, equation 16 and
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.engine.conjugate_gradients import FIXED, FREE, SLIDES, Local, System, assemble_of, solve_of
+from flockenv.engine.conjugate_gradients import (
+    FIXED,
+    FREE,
+    SLIDES,
+    Local,
+    System,
+    assemble_of,
+    solve_of,
+    strain_change_of,
+)
 from flockenv.model.scene_view import SceneView
 from flockenv.model.state import Floats, State
 from flockenv.physics.constraints import Slide
@@ -31,17 +41,20 @@ class NotSolvedLinearlyError(ArithmeticError):
 
 
 class LinearStep(NamedTuple):
-    """Positions and velocities one step later, (D, N), and the iterations to compute them."""
+    """Positions and velocities later, (D, N), and the work to compute them."""
 
     x: Doubles
     v: Doubles
     iterations: int
+    solves: int = 1  # that were accepted
+    rejected: int = 0  # solves after which a strain had changed too much
 
 
 class _Part(NamedTuple):
     """The stencils of one effect, and the function that adds their derivatives to the matrix."""
 
     assemble: Callable[..., None]
+    strain_change: Callable[..., tuple[float, int]] | None
     agent: NDArray[np.int32]  # (S, P)
     number: Doubles  # (S, C)
     block: NDArray[np.int32]  # (S, P, P)
@@ -55,22 +68,25 @@ class LinearSolver:
         """Lay out the matrix: a block for every pair of agents that some effect with a derivative couples."""
         n, d = scene.agents, scene.dimension
         found = [
-            (effect.derivative, effect.stencils(scene.groups, d))
+            (effect.derivative, effect.strain_law, effect.stencils(scene.groups, d))
             for effect in scene.effects
             if effect.derivative is not None
         ]
         keys = [np.arange(n, dtype=np.int64) * (n + 1)]  # row n + column, of the diagonal
-        pairs = [each.agent[:, :, None].astype(np.int64) * n + each.agent[:, None, :] for _, each in found]
+        pairs = [each.agent[:, :, None].astype(np.int64) * n + each.agent[:, None, :] for *_, each in found]
         every = np.unique(np.concatenate([*keys, *(each.ravel() for each in pairs)]))
         self.system = _system(every, n, d)
         self.parts = [
             _Part(
-                assemble_of(law, d, each.agent.shape[1]), np.ascontiguousarray(each.agent, np.int32),
-                np.ascontiguousarray(each.number, float), np.searchsorted(every, pair).astype(np.int32),
+                assemble_of(law, d, each.agent.shape[1]),
+                None if strain is None else strain_change_of(strain, d, each.agent.shape[1]),
+                np.ascontiguousarray(each.agent, np.int32),
+                np.ascontiguousarray(each.number, float),
+                np.searchsorted(every, pair).astype(np.int32),
                 _local(each.agent.shape[1], d),
             )
-            for (law, each), pair in zip(found, pairs, strict=True)
-        ]  # fmt: skip
+            for (law, strain, each), pair in zip(found, pairs, strict=True)
+        ]
         self.held = np.isinf(scene.body.mass)
         self.mass = np.where(self.held, 1.0, scene.body.mass.astype(float))
         self.period = np.array(scene.space.extent(d) if scene.space.periodic else (0.0,) * d)
@@ -98,14 +114,55 @@ class LinearSolver:
                 x, v, alive, part.agent, part.number, part.block, self.period, *weights, self.system, part.local
             )
 
+    def advance(self, scene: SceneView, state: State, drive: Any) -> LinearStep:
+        """Return the motion of a single world one step later: of one solve, or of several over shorter times.
+
+        drive: as for `Scene.rates`. Raises NotSolvedLinearlyError if there is no solution, or if a strain changes by
+        more than `method.strain` even in the shortest of them.
+        """
+        return self._advance(scene, state, drive, float(state.time[0]), scene.dt, 0)
+
+    def _advance(self, scene: SceneView, state: State, drive: Any, time: float, h: float, halved: int) -> LinearStep:
+        """Return the motion after h seconds, from a state at a time; halved: how often the step was halved for it."""
+        method = scene.integrator
+        acceleration, flow = scene.rates(state, drive, [time])
+        found = self.step(scene, state, acceleration, flow, h)
+        change, agent = self._strain_change(state, found) if method.strain > 0 else (0.0, -1)
+        if change <= method.strain:
+            return found
+        if halved == method.halvings:
+            raise NotSolvedLinearlyError(
+                f"a strain changes by {change:.3g} in {h:.3g} s, a step halved {halved} times; strain = "
+                f"{method.strain:g} allows no more than that",
+                agent,
+            )
+        first = self._advance(scene, state, drive, time, h / 2, halved + 1)
+        pos, vel = (np.ascontiguousarray(each[:, None], scene.dtype) for each in (first.x, first.v))
+        last = self._advance(scene, replace(state, x=pos, v=vel), drive, time + h / 2, h / 2, halved + 1)
+        return last._replace(
+            iterations=found.iterations + first.iterations + last.iterations, solves=first.solves + last.solves,
+            rejected=1 + first.rejected + last.rejected,
+        )  # fmt: skip
+
+    def _strain_change(self, state: State, found: LinearStep) -> tuple[float, int]:
+        """Return the largest change of a strain over a step, and an agent that it concerns."""
+        x, v = (np.ascontiguousarray(each[:, 0], float) for each in (state.x, state.v))
+        end, alive = np.ascontiguousarray(found.x), state.alive[0]
+        every = [
+            part.strain_change(x, end, v, alive, part.agent, part.number, self.period, part.local)
+            for part in self.parts
+            if part.strain_change is not None
+        ]
+        return max(every, default=(0.0, -1))
+
     def step(
-        self, scene: SceneView, state: State, acceleration: Floats, flow: Floats | None
+        self, scene: SceneView, state: State, acceleration: Floats, flow: Floats | None, h: float
     ) -> LinearStep:  # fmt: skip
-        """Return the motion of a single world one step later; raise NotSolvedLinearlyError without a solution.
+        """Return the motion of a single world h seconds later; raise NotSolvedLinearlyError without a solution.
 
         acceleration, flow: at the beginning, (1, N, D) m/s^2, m/s.
         """
-        method, h, system, d = scene.integrator, scene.dt, self.system, scene.dimension
+        method, system, d = scene.integrator, self.system, scene.dimension
         acc = np.asarray(acceleration[0], float)
         if not np.isfinite(acc).all():
             raise NotSolvedLinearlyError("the acceleration is not finite", int(np.argmin(np.isfinite(acc).all(axis=1))))

@@ -293,6 +293,8 @@ class Effect(Record):
 
     Both matrices must be symmetric and have no positive eigenvalue: what would violate this is left out.
     """
+    strain_law: ClassVar[Law | None] = None
+    """(local, number, s) -> (a, b): lengths in stencil s over those at rest, whose changes in a step may be limited."""
     partners: ClassVar[int] = 1
     """Number of partners of a bond, besides the agent it acts on."""
     tabled: ClassVar[bool] = False

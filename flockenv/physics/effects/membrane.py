@@ -113,6 +113,18 @@ def membrane_derivative(local: Any, number: Any, s: int) -> None:
                     local.by_velocity[p * d + a, q * d + b] = -number[s, 6] * damped
 
 
+@law
+def membrane_strain(local: Any, number: Any, s: int) -> tuple[float, float]:
+    """Return |w_u| and |w_v| of a triangle, which are 1 at rest; numbers are those of `membrane`."""
+    square_u, square_v = 0.0, 0.0
+    for k in range(local.at.shape[1]):
+        wu = number[s, 0] * local.at[1, k] + number[s, 1] * local.at[2, k]
+        wv = number[s, 2] * local.at[1, k] + number[s, 3] * local.at[2, k]
+        square_u += wu * wu
+        square_v += wv * wv
+    return np.sqrt(square_u), np.sqrt(square_v)
+
+
 class Membrane(Effect):
     """Stretch and shear of the triangles of a group's network, in the material coordinates (u, v) of its rest shape.
 
@@ -131,6 +143,7 @@ class Membrane(Effect):
     )
     bond_law: ClassVar[Law | None] = membrane
     derivative: ClassVar[Law | None] = membrane_derivative
+    strain_law: ClassVar[Law | None] = membrane_strain
     partners: ClassVar[int] = 2
     strengths: ClassVar[tuple[str, ...]] = ("stretch", "shear")
     conserves_momentum: ClassVar[bool] = True

@@ -112,6 +112,14 @@ def spring_derivative(local: Any, number: Any, s: int) -> None:
 
 
 @law
+def spring_strain(local: Any, number: Any, s: int) -> tuple[float, float]:
+    """Return the length of a spring over its rest length, twice; 0 without a rest length."""
+    length, _ = _per_length(local)
+    strain = length / number[s, 2] if number[s, 2] > 0.0 else 0.0
+    return strain, strain
+
+
+@law
 def curved_derivative(local: Any, number: Any, s: int) -> None:
     """Write the derivatives of a spring with a strain-stress curve: k f' along it, and F / l across it if that is > 0.
 
@@ -258,6 +266,7 @@ class Springs(Effect):
     break_strain: float | None = Field(
         default=None, gt=0, description="strain over the first rest length at which a spring breaks (default: never)"
     )
+    strain_law: ClassVar[Law | None] = spring_strain
     strengths: ClassVar[tuple[str, ...]] = ("stiffness", "shear", "bend", "damping", "ratio")
     conserves_momentum: ClassVar[bool] = True
 

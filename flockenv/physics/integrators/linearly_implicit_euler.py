@@ -20,6 +20,10 @@ class LinearlyImplicitEuler(Integrator):
     preconditioner. The derivatives are those of springs and linear drag; other forces are taken at the beginning of the
     step, as in semi-implicit Euler, and limit dt as they do there. Particles held in place keep their velocity exactly,
     those of a `slide` constraint keep to its line or plane within the solve. Momentum is conserved to the tolerance.
+
+    With `strain`, a step in which some spring or triangle changes its length by more than that share of its rest length
+    is made again as two halves, and these likewise (section 6 there, but without a step size that lasts): a sheet that
+    is hit hard gets short steps as long as it needs them. Limits, constraints and space act once per step, at its end.
     """
 
     kind: Literal["linearly_implicit_euler"] = "linearly_implicit_euler"
@@ -28,6 +32,20 @@ class LinearlyImplicitEuler(Integrator):
     )
     most: int = Field(
         default=10_000, ge=1, description="largest number of iterations in a step; a world that needs more diverges"
+    )
+    strain: float = Field(
+        default=0.0,
+        ge=0,
+        exclude_if=lambda strain: strain == 0,
+        description="largest change of strain, of a spring or a triangle, in one solve; a step with more is halved; "
+        "0: not limited",
+    )
+    halvings: int = Field(
+        default=8,
+        ge=0,
+        le=20,
+        exclude_if=lambda halvings: halvings == 8,
+        description="how often a step is halved at most; a world that needs more diverges",
     )
     order: ClassVar[int] = 1
     order_with_drag: ClassVar[int] = 1
