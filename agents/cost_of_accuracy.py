@@ -37,6 +37,9 @@ __all__ = ["AIM", "CASES", "Case", "app", "costs_of", "scores_of", "sentence"]
 AIM = 0.01
 """The error for which the cheapest method is marked, as a share of the distance that the farthest agent moves."""
 
+LEVEL = 1.1
+"""Costs up to this ratio to the lowest are level: times on one machine vary by as much."""
+
 REPETITIONS = 7
 """Runs of each setting whose median is the wall time; of implicit methods, whose runs take seconds, one."""
 FILES = ("cost_of_accuracy.json", "cost_of_accuracy.png")
@@ -272,17 +275,22 @@ def scores_of(played: Results, task: str, players: Sequence[str] = ("rules", "pp
 
 
 def sentence(scenes: Results, played: Results) -> str:
-    """Return the message of the picture: the cheapest method of each scene, and in how many tasks policies survive."""
-    by_method: dict[str, list[str]] = {}
-    for about in scenes.values():
-        by_method.setdefault(method_name(about["cheapest"] or "no method"), []).append(about["short"])
-    cheapest = ", ".join(f"{method} ({', '.join(names)})" for method, names in by_method.items())
+    """Return the message of the picture: the cheapest methods of each scene, and in how many tasks policies survive."""
+    cheapest = ", ".join(f"with {_cheapest(about)} ({about['short']})" for about in scenes.values())
     tasks = played["tasks"]
     pilots = " and ".join(dict.fromkeys(list(about["again"])[-1] for about in tasks.values()))
     safe = sum(not lost_settings(about, list(about["again"])[-1]) for about in tasks.values())
     kept = f"keeps {100 * SURVIVES:.0f} % of its lead over random with every method and step"
     who = pilots.replace("ppo", "PPO")
-    return f"An error of {100 * AIM:.0f} % costs least with {cheapest}; {who} {kept} in {safe} of {len(tasks)} tasks."
+    return f"An error of {100 * AIM:.0f} % costs least {cheapest}; {who} {kept} in {safe} of {len(tasks)} tasks."
+
+
+def _cheapest(about: Results) -> str:
+    """Return the names of the methods of a scene whose costs are level with the lowest, which comes first."""
+    costs = {method: found["ms_per_s"] for method, found in about["to_aim"].items() if found}
+    level = [method for method in sorted(costs, key=lambda m: costs[m]) if costs[method] <= LEVEL * min(costs.values())]
+    *others, last = map(method_name, level or ["no method"])
+    return f"{', '.join(others)} or {last}" if others else last
 
 
 def _line(about: Results) -> str:

@@ -163,14 +163,17 @@ def race_parts(bench: Bench, which: World, scene: Scene, server: Server) -> None
 
 WATCH = """seconds => new Promise(done => {
   const take = live.frame, began = performance.now(), pictures = drawn.count, tick = live.header.tick;
-  let frames = 0;
+  let frames = 0, screen = 0, watched = true;
+  const count = () => { if (watched) { screen++; requestAnimationFrame(count); } };
+  requestAnimationFrame(count);
   live.frame = function (data) { frames++; return take.call(this, data); };
   setTimeout(() => {
-    live.frame = take;
+    live.frame = take; watched = false;
     const passed = (performance.now() - began) / 1000;
     live.ask({ type: "measures" });
     setTimeout(() => done({
       frames_per_second: frames / passed, pictures_per_second: (drawn.count - pictures) / passed,
+      screen_per_second: screen / passed,
       ticks_per_second: (live.header.tick - tick) / passed, drawing_ms: drawn.ms, round_trip_ms: live.timing.round,
       step_ms: live.timing.step, encoding_ms: live.timing.encode }), 500);
   }, 1000 * seconds);
@@ -229,7 +232,8 @@ def browse(bench: Bench, which: World, scene: Scene, server: Server, seconds: fl
     bench.extra.setdefault("pages", {})[which.title] = found
     bench.note(
         f"{which.title}, page of 1280 x 800: {found['frames_per_second']:.1f} frames and "
-        f"{found['pictures_per_second']:.1f} pictures a second, {found['ticks_per_second']:.1f} ticks a second; "
+        f"{found['pictures_per_second']:.1f} pictures a second (the browser asks for "
+        f"{found['screen_per_second']:.1f}), {found['ticks_per_second']:.1f} ticks a second; "
         f"drawing {found['drawing_ms']:.1f} ms; a slider acts within {found['slider_frames'][1]:g} frames (median of "
         f"{MOVES})"
     )

@@ -125,15 +125,22 @@ def test_missing_tasks_and_players_are_named() -> None:
 
 
 def test_the_sentence_names_the_cheapest_methods_and_counts_the_tasks() -> None:
-    scenes = {name: {"cheapest": method, "short": name} for name, method in
-              (("flock", "rk4"), ("crowd", "velocity_verlet"), ("cloth", "rk4"))}  # fmt: skip
+    costs = {
+        "flock": {"midpoint": 1.05, "rk4": 1.0, "heun": 1.09, "explicit_euler": 1.2},
+        "crowd": {"velocity_verlet": 2.0, "rk4": 2.3},
+        "cloth": {"rk4": 1.0, "midpoint": None},
+    }
+    scenes: dict[str, Any] = {
+        name: {"short": name, "to_aim": {method: ms and {"ms_per_s": ms} for method, ms in of.items()}}
+        for name, of in costs.items()
+    }
     assert cost_of_accuracy.sentence(scenes, transfer(path_follow=12.0)) == (
-        "An error of 1 % costs least with RK4 (flock, cloth), velocity Verlet (crowd); PPO keeps 95 % of its lead over "
-        "random with every method and step in 3 of 3 tasks."
+        "An error of 1 % costs least with RK4, midpoint or heun (flock), with velocity Verlet (crowd), with RK4 "
+        "(cloth); PPO keeps 95 % of its lead over random with every method and step in 3 of 3 tasks."
     )
     assert "in 2 of 3 tasks" in cost_of_accuracy.sentence(scenes, transfer(path_follow=10.0))
-    scenes["crowd"]["cheapest"] = None
-    assert "no method (crowd)" in cost_of_accuracy.sentence(scenes, transfer())
+    scenes["crowd"]["to_aim"] = {"rk4": None}
+    assert "with no method (crowd)" in cost_of_accuracy.sentence(scenes, transfer())
 
 
 # --- the picture

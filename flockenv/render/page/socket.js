@@ -5,7 +5,7 @@ const QUESTIONS = { yaml: "save", link: "share" }; // the questions of answers w
 const SLOW = 12; // ms; slower pictures are drawn only when a frame has come, because those between would keep the page from reading it
 const RETRY = 1000; // ms until a page without a connection tries again; each time it waits longer
 const live = {
-  socket: null, room: null, waiting: false, askedAt: 0, toldAt: 0, lastFrame: 0, header: {}, want: { colour: "", field: "" }, listeners: {}, timing: {}, last: null,
+  socket: null, room: null, waiting: false, due: false, askedAt: 0, toldAt: 0, lastFrame: 0, header: {}, want: { colour: "", field: "" }, listeners: {}, timing: {}, last: null,
   asked: new Set(), retry: RETRY, greeted: false, opening: false, rate: { since: 0, count: 0, shown: 0 },
 
   connect() {
@@ -110,6 +110,7 @@ const live = {
     });
     this.follow(header);
     refresh();
+    if (this.due) this.request();
   },
   /* Frames a second, over one second. */
   count() {
@@ -130,8 +131,10 @@ const live = {
     Object.assign(this.timing, header.timing);
   },
 
+  /* Asks for a frame, once per picture of the screen; one that is due while another is on its way is asked for when that comes. */
   request() {
     const idle = !state.playing && performance.now() - this.lastFrame < 120;
+    this.due = this.waiting && !this.saves;
     if (this.waiting || !this.room || idle || !$("gallery").hidden) return;
     this.waiting = true; this.askedAt = performance.now();
     this.send({ type: "frame", want: { ...this.want, scenery: state.group.panels.map(p => p.sceneryKey === undefined ? -1 : p.sceneryKey) } });
