@@ -8,7 +8,11 @@ from typing import Any
 import pytest
 
 pytest.importorskip("websockets", reason="needs the extra `play`: pip install 'flockenv[play]'")
+from flockenv.model.networks import Cloth, Rope
+from flockenv.model.spawn import Spawn
+from flockenv.physics.effects import Springs
 from flockenv.play.session import Session
+from flockenv.scene import Group, Scene
 from flockenv.scene.yaml_io import load_scene
 from flockenv.tasks import TASKS
 from tests.playground import Visit, serving, wait_for
@@ -341,3 +345,34 @@ def test_a_crowd_in_one_colour_is_drawn_as_one_in_several(boids: Session, visit:
         assert equal
         assert filled > 5000
         assert levels > 50  # not all of them are wholly covered
+
+
+DRAWN = """() => {
+  const found = { bodies: [], faces: 0 }, [body, triangles] = [drawBody, facesInOrder];
+  drawBody = (pen, eye, panel, one, k) => { found.bodies.push(one.i); body(pen, eye, panel, one, k); };
+  facesInOrder = (...given) => { const all = triangles(...given); found.faces = all.length; return all; };
+  drawWorld(views[0], moment(views[0].panel, state.time));
+  drawBody = body; facesInOrder = triangles;
+  found.legend = document.getElementById("legend").textContent;
+  return found;
+}"""
+
+
+def test_agents_without_faces_are_drawn_beside_a_sheet(visit: Callable[..., Visit]) -> None:
+    sheet = Group(network=Cloth(cells=(2, 2), sides=(1.0, 1.0)), mass=0.1)
+    rope = Group(network=Rope(links=2, length=1.0), mass=0.1)
+    scene = Scene(
+        dimension=3,
+        groups=(sheet, Group(count=3, spawn=Spawn(low=(2, 0, 0), high=(3, 1, 1))), rope),
+        effects=(Springs(stiffness=10.0),),
+        dt=0.01,
+    )
+    session = Session()
+    session.open_scene(scene, "sheet")
+    room_of(session).play(False)
+    with serving(session) as server:
+        here = opened(visit, server.url)
+        found = here.value(f"({DRAWN})()")
+        assert sorted(found["bodies"]) == list(range(9, 15))  # the free agents, and the particles of the rope
+        assert found["faces"] == 8
+        assert "agent" in found["legend"]

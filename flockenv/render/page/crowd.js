@@ -170,12 +170,12 @@ function fade(colour, ground, share) {
 /* The colour that all agents of a crowd have, or -1. */
 function oneColour(panel, styles) { return panel.D > 2 || panel.tint || panel.looks.length || styles.plain.length > 1 ? -1 : styles.plain[0].colours[0]; }
 
-function drawCrowd(pen, eye, panel, all, k) {
+function drawCrowd(pen, eye, panel, all, k, hidden) {
   const { w, h, a, b, tx, ty } = eye, pixels = emptyLayer(w, h), styles = stampStyles(panel, eye), shade = panel.frames[k].shade;
   const sorted = drawingOrder(panel, eye, all), least = leastReach(panel, eye), paper = word(paint.paper), pos = all.pos, one = oneColour(panel, styles), bytes = one < 0 ? null : emptyPlane(w, h), dotNumber = formNumber("dot"), { flat } = eye, perTurn = TURNS / (2 * Math.PI);
   for (let n = 0; n < panel.N; n++) {
     const i = sorted ? sorted.order[n] : n;
-    if (!all.there[i] || melts(panel, i)) continue;
+    if (!all.there[i] || melts(panel, i) || hidden && hidden[i]) continue;
     const x = a[0] * pos[3 * i] + a[1] * pos[3 * i + 1] + a[2] * pos[3 * i + 2] + tx, y = b[0] * pos[3 * i] + b[1] * pos[3 * i + 1] + b[2] * pos[3 * i + 2] + ty;
     if (!(x > -50 && y > -50 && x < w + 50 && y < h + 50)) continue;
     const style = panel.look[i] < 0 ? styles.plain[panel.kind[i]] : styles.looks[panel.look[i]][panel.kind[i]];

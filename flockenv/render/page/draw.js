@@ -170,11 +170,11 @@ function brokenBonds(panel, k) {
   return new Set(panel.gone ? panel.gone.flatMap((from, n) => from >= 0 && from <= k ? [n] : []) : panel.broken || []);
 }
 
-/* A line for every bond with both ends there, the lowest first; across an edge of a periodic world from either side. */
-function drawBonds(pen, eye, panel, all, broken) {
+/* A line for every bond with both ends there, the lowest first; across an edge of a periodic world from either side. None of hidden agents. */
+function drawBonds(pen, eye, panel, all, broken, hidden) {
   const layers = panel.D < 3 ? 1 : 12, paths = new Map();
   for (const [n, [a, b]] of panel.bonds.entries()) {
-    if (!all.there[a] || !all.there[b] || broken.has(n)) continue;
+    if (!all.there[a] || !all.there[b] || broken.has(n) || hidden && hidden[a]) continue;
     const p = Array.from(all.pos.subarray(3 * a, 3 * a + 3)), q = Array.from(all.pos.subarray(3 * b, 3 * b + 3)), r = [...q];
     if (panel.periodic) for (let d = 0; d < panel.D; d++) r[d] -= panel.extent[d] * Math.round((q[d] - p[d]) / panel.extent[d]);
     const layer = Math.min(layers - 1, Math.floor(layers * eye.depth(...p.map((x, d) => (x + r[d]) / 2)))), key = layer * 256 + panel.kind[a];
@@ -241,9 +241,10 @@ function bodyColour(panel, i, k) {
   return shade ? panel.tint[shade[i]] : roleColour[panel.roles[i]];
 }
 
-function drawBodies(pen, eye, panel, all, k) {
+function drawBodies(pen, eye, panel, all, k, hidden) {
   const shown = [];
   for (let i = 0; i < panel.N; i++) {
+    if (hidden && hidden[i]) continue;
     if (!all.there[i] && !NAMED.has(panel.roles[i])) continue;
     const p = [all.pos[3 * i], all.pos[3 * i + 1], all.pos[3 * i + 2]];
     shown.push({ i, x: eye.x(...p), y: eye.y(...p), depth: eye.depth(...p), aim: eye.angle(all.aim[i]), there: all.there[i] });
@@ -265,10 +266,11 @@ function drawWorld(view, now) {
   }
   drawScenery(pen, eye, panel, now.k);
   if (!eye.flat) drawBorder(pen, eye, panel);
-  const all = bodies(panel, now), broken = brokenBonds(panel, now.k);
-  if (hasFaces(panel)) drawFaces(pen, eye, panel, all, broken); else drawBonds(pen, eye, panel, all, broken);
+  const all = bodies(panel, now), broken = brokenBonds(panel, now.k), hidden = coveredAgents(panel);
+  drawBonds(pen, eye, panel, all, broken, hidden);
+  if (hidden) drawFaces(pen, eye, panel, all, broken);
   drawMetaballs(pen, eye, panel, all, now.k);
-  if (panel.N > CROWD) drawCrowd(pen, eye, panel, all, now.k); else if (!hasFaces(panel)) drawBodies(pen, eye, panel, all, now.k);
+  if (panel.N > CROWD) drawCrowd(pen, eye, panel, all, now.k, hidden); else drawBodies(pen, eye, panel, all, now.k, hidden);
   if (view.over) view.over(pen, eye, now, all);
   pen.restore();
   if (eye.flat) drawBorder(pen, eye, panel);

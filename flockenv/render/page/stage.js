@@ -115,7 +115,7 @@ function legendRow([text, colour, kind]) {
 function makeLegend(group) {
   const has = test => group.panels.some(p => p.scenery.some(test)), rows = [];
   for (const role of group.panels.every(p => p.colour) ? [] : Object.keys(data.roles)) { // a scale explains other colours
-    const panel = group.panels.find(p => p.kinds.includes(role) && !hasFaces(p));
+    const panel = group.panels.find(p => { const hidden = coveredAgents(p) || []; return p.roles.some((each, i) => each === role && !hidden[i]); });
     if (!panel) continue;
     const look = panel.looks[panel.look[panel.roles.indexOf(role)]];
     rows.push([role, look && look.colours ? look.colours[0] : roleColour[role], look && look.form !== "polygon" ? "disc" : "dart"]);
