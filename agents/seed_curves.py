@@ -116,7 +116,7 @@ def draw(path: Path, tasks: Mapping[str, Mapping[str, Sequence[Curve]]]) -> None
         "Mean return on tuning worlds. Line: median over seeds; band: lowest to highest.\nIn brackets: number of seeds."
     )
     figure.supxlabel(note, x=0.01, ha="left", fontsize=9, color=FAINT)
-    save_figure(path, figure, 110)
+    save_figure(path, figure)
 
 
 def _draw_task(axes: Axes, task: str, players: Mapping[str, Sequence[Curve]], axis: str) -> None:

@@ -28,8 +28,8 @@ a task does not accept it or its time step is unstable."""
 
 CHECKED = """\
 `{command} --check 2` plays two stored results, drawn at random, again, and compares the return of
-every world to the four digits that are stored. In {folder}/TASK.json, `digest` is that of a result's settings, worlds
-and players. `commit` names the code of that day; with + it had further changes, so that no history has it."""
+every world to the four digits, of which two are decimals at most, that are stored. In {folder}/TASK.json, `digest` is
+that of a result's settings, worlds and players."""
 
 AMONG = """\
 **Partners**: one agent of each world, or the share named there, plays the player of the column, and all others the

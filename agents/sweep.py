@@ -20,7 +20,7 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from agents.compare import JOBS, folder_of, pick, provenance, split, write_text
+from agents.compare import JOBS, folder_of, pick, split, write_text
 from agents.invasion import worlds_among
 from agents.study import Contender, Setting, Study, contenders_of, settings_of
 from agents.study_results import RANDOM, TaskResults, kind_of, read_file, read_task
@@ -40,7 +40,7 @@ __all__ = ["app", "plan_digest", "sweep"]
 
 SUMMARY = "summary.png"
 DIGITS = 4
-"""Significant digits of a stored return, far more than its interval resolves; the files have some ten thousand."""
+"""Significant digits of a stored return, two of them decimals at most: far more than its interval resolves."""
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -78,7 +78,7 @@ def sweep(
 
     changes: arguments of tasks that hold in every setting. choose: play tuning worlds as well where a kind has several
     players, to choose the one that stands for it. stored: results by task that are kept, not played, where settings,
-    worlds and players are the same. digits: significant ones of a return.
+    worlds and players are the same. digits: significant ones of a return; at most two fewer are decimals.
 
     Raises:
         ValueError: in one line, a bad setting or player, before anything is played.
@@ -125,7 +125,7 @@ def _content(study: Study, entries: Sequence[_Entry], store: Store, digits: int)
     for entry in entries:
         about = {"axis": entry.setting.axis, "value": entry.setting.value, "players": {}}
         setting = settings.setdefault(entry.setting.name, about)
-        setting["players"][entry.contender.name] = entry.content or _played(entry, store, _commit(), digits)
+        setting["players"][entry.contender.name] = entry.content or _played(entry, store, digits)
     task = entries[0].setting.task
     arguments = task.model_dump(mode="json")
     home = {entry.setting.axis: arguments[entry.setting.axis] for entry in entries if entry.setting.axis in arguments}
@@ -192,26 +192,18 @@ def _job(study: Study, setting: Setting, player: Player, purpose: Any) -> Job:
     )  # fmt: skip
 
 
-def _played(entry: _Entry, store: Store, commit: str | None, digits: int = DIGITS) -> Content:
+def _played(entry: _Entry, store: Store, digits: int = DIGITS) -> Content:
     """Return the results of an entry from the records of its jobs."""
     episodes = [store.read(job, episodes_of_bytes) for job in entry.evaluation]
     tuning = [store.read(job, episodes_of_bytes) for job in entry.tuning]
     return {
         "kind": entry.kind,
         "digest": entry.digest,
-        "commit": commit,
         "microseconds": rounded(float(np.median([each.microseconds for each in episodes]))),
         "tuning_mean": rounded(float(np.mean([each.returns.mean() for each in tuning]))) if tuning else None,
         "success": ["".join("01"[int(mark)] for mark in each.success) for each in episodes],
-        "returns": [[rounded(value, digits) for value in each.returns] for each in episodes],
+        "returns": [[rounded(round(value, digits - 2), digits) for value in each.returns] for each in episodes],
     }
-
-
-@functools.cache
-def _commit() -> str | None:
-    """Return the commit of this checkout, with "+" if files have changed since."""
-    git = provenance()["git"]
-    return f"{git['commit'][:12]}{'+' * bool(git['changed'])}" if git["commit"] else None
 
 
 # --- the command line -------------------------------------------------------------------------------------------------
@@ -335,7 +327,7 @@ def _play_again(
                 if entry.content:
                     return None
                 run_jobs(entry.evaluation, work)
-                return _played(entry, work.store, _commit())
+                return _played(entry, work.store)
     return None
 
 

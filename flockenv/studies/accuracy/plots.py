@@ -33,7 +33,7 @@ LABEL = 0.035
 
 def write_precision(path: str | Path, reports: Sequence[Report]) -> None:
     """Write the picture as a PNG file, whole or not at all; the same numbers give the same bytes."""
-    save_figure(path, draw_precision(reports), 150 if len(reports) <= COLUMNS else 100)
+    save_figure(path, draw_precision(reports), 150 if len(reports) <= COLUMNS else 75)
 
 
 def draw_precision(reports: Sequence[Report]) -> Figure:
