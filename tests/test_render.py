@@ -521,6 +521,19 @@ def test_a_gif_holds_every_frame_and_the_whole_duration(tmp_path: Path) -> None:
     assert total == 230  # 7/30 s in hundredths
 
 
+@pytest.mark.parametrize("colours", [40, 63, 64, 200, 300])
+def test_a_gif_shows_black_and_new_colours_after_frames_without_them(tmp_path: Path, colours: int) -> None:
+    light = np.random.default_rng(colours).integers(150, 256, (colours, 3)).astype(np.uint8)
+    frames = [light[np.arange(2400).reshape(40, 60) % colours]]
+    frames += [frames[0].copy() for _ in range(2)]
+    frames[1][:9], frames[2][9:20] = 0, (200, 20, 20)
+    assert write_gif(tmp_path / "run.gif", iter(frames), fps=10) == 3
+    with Image.open(tmp_path / "run.gif") as gif:
+        for k, frame in enumerate(frames):
+            gif.seek(k)
+            assert np.abs(np.asarray(gif.convert("RGB")).astype(int) - frame).max() <= 40
+
+
 def test_a_gif_of_a_run_looks_like_the_run(tmp_path: Path) -> None:
     run = [shot([(1.0 + k, 5.0)], [(1.0, 0.0)], time=0.1 * k) for k in range(6)]
     write_gif(tmp_path / "run.gif", (draw(s, size=200) for s in run), fps=10)

@@ -29,9 +29,10 @@ MOST_FPS: Final = 50.0
 """Most frames per second: viewers replace delays shorter than 2/100 s by 10/100 s."""
 
 _MOST_SIDE: Final = 65535
-#: Colour index of pixels that are as in the frame before (transparent); colours have the indices below it.
-_UNCHANGED: Final = 255
-#: Largest error of a colour channel, of 255, with the previous frame's palette; above it, the frame gets a new one.
+#: Numbers of colours of a frame, the first that is enough, and how Pillow chooses them. The next index is that of
+#: pixels that are as in the frame before (transparent): 63 colours take six bits, and a table of a quarter of the size.
+_PALETTES: Final = ((63, Image.Quantize.MAXCOVERAGE), (255, Image.Quantize.MEDIANCUT))
+#: Largest error of a colour channel, of 255, with a smaller palette or that of the frame before.
 _TOLERANCE: Final = 40
 
 
@@ -115,14 +116,31 @@ def _check_frame(frame: object, name: str, like: Image.Image | None = None) -> N
 
 
 def _to_palette(frame: Pixels, previous: Image.Image | None) -> Image.Image:
-    """Return the frame in 255 colours: those of `previous` if they are close enough, so that nothing flickers."""
+    """Return the frame in few colours: those of `previous` if they are close enough, so that nothing flickers."""
     picture = Image.fromarray(frame)
     if previous is not None:
         mapped = picture.quantize(palette=previous, dither=Image.Dither.NONE)
-        error = np.abs(np.asarray(mapped.convert("RGB"), dtype=np.int16) - frame)
-        if error.max() <= _TOLERANCE:
+        kept = np.asarray(mapped).max() < _unchanged(previous)  # not the black with which Pillow fills palettes
+        if kept and _is_close(mapped, frame):
+            mapped.putpalette(previous.getpalette() or [])
             return mapped
-    return picture.quantize(_UNCHANGED, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    for colours, method in _PALETTES:
+        mapped = picture.quantize(colours, method=method, dither=Image.Dither.NONE)
+        if _is_close(mapped, frame):
+            break
+    palette = [*(mapped.getpalette() or []), *[0] * (3 * colours)]
+    mapped.putpalette([*palette[: 3 * colours], 0, 0, 0])  # the last one is that of unchanged pixels
+    return mapped
+
+
+def _is_close(mapped: Image.Image, frame: Pixels) -> bool:
+    error = np.abs(np.asarray(mapped.convert("RGB"), dtype=np.int16) - frame)
+    return bool(error.max() <= _TOLERANCE)
+
+
+def _unchanged(picture: Image.Image) -> int:
+    """Return the colour index of pixels that are as in the frame before: the last one."""
+    return len(picture.getpalette() or []) // 3 - 1
 
 
 def _keep_changes(picture: Image.Image, previous: Image.Image | None) -> Image.Image:
@@ -130,14 +148,9 @@ def _keep_changes(picture: Image.Image, previous: Image.Image | None) -> Image.I
     if previous is None or previous.getpalette() != picture.getpalette():
         return picture
     index = np.asarray(picture)
-    changes = Image.fromarray(np.where(index == np.asarray(previous), np.uint8(_UNCHANGED), index))
-    changes.putpalette(_full_palette(picture))
+    changes = Image.fromarray(np.where(index == np.asarray(previous), np.uint8(_unchanged(picture)), index))
+    changes.putpalette(picture.getpalette() or [])
     return changes
-
-
-def _full_palette(picture: Image.Image) -> list[int]:
-    palette = picture.getpalette() or []
-    return palette + [0] * (3 * (_UNCHANGED + 1) - len(palette))
 
 
 def _file_header(width: int, height: int) -> bytes:
@@ -159,6 +172,6 @@ def _frame_blocks(picture: Image.Image, delay: int) -> bytes:
         while content[start]:
             start += 1 + content[start]
         start += 1
-    control = struct.pack("<BBBBHBB", 0x21, 0xF9, 4, 0x05, delay, _UNCHANGED, 0)
+    control = struct.pack("<BBBBHBB", 0x21, 0xF9, 4, 0x05, delay, _unchanged(picture), 0)
     descriptor = content[start : start + 9] + bytes([0x80 | size])
     return control + descriptor + table + content[start + 10 : -1]
