@@ -110,7 +110,7 @@ def draw(path: Path, tasks: Mapping[str, Numbers], note: str = NOTE) -> None:
         _curves(axes, task, numbers)
     figure.suptitle("Learning, by the clock", x=0.01, ha="left", fontsize=14, fontweight="bold", color=INK)
     figure.supxlabel(note, x=0.01, ha="left", fontsize=8, color=FAINT)
-    save_figure(path, figure, 150)
+    save_figure(path, figure)
 
 
 def _curves(axes: Axes, task: str, numbers: Numbers) -> None:

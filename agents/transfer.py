@@ -107,7 +107,7 @@ def main(
         with job_bar() as progress:
             results = _measure(plans, Work(Store(folder / JOBS), runner, fresh, progress, part))
         write_all_or_none(folder, {
-            "transfer.json": lambda path: write_text(path, report.json_text(results)),
+            "transfer.json": lambda path: write_text(path, report.json_text(report.all_rounded(results))),
             "transfer.md": lambda path: write_text(path, transfer_report.markdown(results)),
             "transfer.png": lambda path: _draw(path, results),
         })  # fmt: skip

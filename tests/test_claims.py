@@ -132,9 +132,13 @@ def test_rules_are_ahead_or_level_if_agents_see_less() -> None:
     assert found["policy"] + found["hybrid"] <= 0.1 * found.total() and found["rules"] > 0
 
 
-def test_rules_are_ahead_more_often_than_policies_if_the_task_changes() -> None:
+def test_if_the_task_changes_rules_are_ahead_in_a_third_what_is_learned_in_an_eighth_and_nearly_half_are_level() -> (
+    None
+):
     found = ahead(*{axis for _, axis, _ in winners() if group_of(axis) == "task"})
-    assert found["rules"] > 2 * found["policy"] and found["level"] > found.total() / 2
+    assert found["rules"] / found.total() == pytest.approx(1 / 3, abs=0.02)
+    assert (found["policy"] + found["hybrid"]) / found.total() == pytest.approx(1 / 8, abs=0.02)
+    assert 0.45 < found["level"] / found.total() < 0.5
 
 
 def test_ppo_of_crossing_does_not_carry_over_and_that_of_flock_does() -> None:
@@ -157,22 +161,29 @@ def larger_circles() -> list[SettingResults]:
 
 
 def test_the_residual_of_crossing_succeeds_everywhere_and_passes_orca_from_16_agents_on() -> None:
-    many = [at("crossing", "agents", count) for count in (16, *MANY)] + larger_circles()
-    assert larger_circles()[-1].value.startswith("agents 192")
+    agents_48, agents_192 = larger_circles()
+    assert agents_192.value.startswith("agents 192")
+    many = [at("crossing", "agents", count) for count in (16, *MANY)] + [agents_48]
     for setting in many + [at("crossing", "agents", count) for count in FEW] + [at("crossing", "home")]:
         assert success(setting, "residual").min() == 1
-    for setting in many:
+    assert 0.92 <= success(agents_192, "residual").mean() < 0.93
+    assert [round(each, 2) for each in sorted(success(agents_192, "residual"))] == [0.67, 0.95, 1, 1, 1]
+    for setting in [*many, agents_192]:
         assert lead(setting, "residual", "orca").low > 0
         assert all(lead(setting, "residual", "orca", seed).low > 0 for seed in range(5))
     assert is_level(lead(at("crossing", "home"), "residual", "ppo"))
 
 
-def test_the_residual_of_crowd_nav_is_level_with_orca_under_every_law_where_ppo_often_fails() -> None:
+def test_the_residual_of_crowd_nav_is_level_with_orca_in_all_settings_but_one_where_ppo_often_fails() -> None:
     settings = results("crowd_nav", "crowd_laws").settings
     assert len(settings) == 1 + 5 * 5
+    leads = [lead(setting, "residual", "orca") for setting in settings]
+    assert (
+        sum(map(is_level, leads)) == len(settings) - 1
+        and min(each.value for each in leads if not is_level(each)) > -0.05
+    )
     for setting in settings:
-        assert is_level(lead(setting, "residual", "orca"))
-        assert success(setting, "residual").mean() >= 0.95
+        assert success(setting, "residual").mean() > 0.97
     assert sum(success(setting, "ppo").mean() < 0.5 for setting in settings) > len(settings) / 2
 
 
@@ -180,7 +191,7 @@ def test_under_noise_ppo_and_policies_trained_with_it_succeed_in_crossing_where_
     setting = at("crossing", "noise", 0.05)
     assert max(success(setting, name).max() for name in ("orca", "residual", "rules")) < 0.2
     assert min(success(setting, name).mean() for name in ("ppo", "drawn_noise")) > 0.9
-    assert max(success(at("crossing", "noise", 0.1), name).max() for name in setting.scores) < 0.5
+    assert max(success(at("crossing", "noise", 0.1), name).mean() for name in setting.scores) < 0.5
 
 
 def test_the_residual_of_obstacles_keeps_what_noise_takes_from_the_rules() -> None:
@@ -194,9 +205,11 @@ def test_the_residual_of_obstacles_keeps_what_noise_takes_from_the_rules() -> No
 def test_training_in_several_settings_mends_those_and_no_others() -> None:
     for count in (*FEW, 16, *MANY):
         assert success(at("crossing", "agents", count), "drawn").min() == 1
-    assert max(success(setting, "drawn").max() for setting in larger_circles()) < 0.5
-    for task in ("crossing", "crowd_nav", "obstacles"):
+    assert [round(float(success(setting, "drawn").mean()), 1) for setting in larger_circles()] == [0.3, 0]
+    for task in ("crowd_nav", "obstacles"):
         assert is_level(lead(at(task, "home"), "drawn", "ppo"))
+    behind = lead(at("crossing", "home"), "drawn", "ppo")
+    assert behind.value > -0.1 and behind.high < 0
 
 
 def test_residual_and_gate_pass_the_rules_of_crossing_and_weights_and_priorities_do_not() -> None:

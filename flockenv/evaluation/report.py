@@ -20,8 +20,9 @@ from flockenv.evaluation.episodes import Episodes, Interval
 from flockenv.evaluation.plots import Column, Row
 
 __all__ = [
-    "INTERVAL", "chart_column", "conditions", "differences", "grid", "interval_fields", "interval_text", "json_text",
-    "markdown", "number_text", "player_tables", "rounded", "seeds_text", "table_of", "task_results", "verdict",
+    "INTERVAL", "all_rounded", "chart_column", "conditions", "differences", "grid", "interval_fields", "interval_text",
+    "json_text", "markdown", "number_text", "player_tables", "rounded", "seeds_text", "table_of", "task_results",
+    "verdict",
 ]  # fmt: skip
 
 Results = dict[str, Any]
@@ -233,12 +234,29 @@ def chart_column(task: str, results: Results) -> Column:
     return Column(task, rows, steering or pairs)
 
 
+SCALAR = r'"[^"\n]*": (?:"(?:[^"\\\n]|\\.)*"|-?[\d.eE+-]+|true|false|null)'
+"""An entry of an object in JSON whose value has no parts."""
+
+
+def all_rounded(value: Any, digits: int = 6) -> Any:
+    """Return data with all floats rounded to some significant digits."""
+    if isinstance(value, Mapping):
+        return {key: all_rounded(each, digits) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [all_rounded(each, digits) for each in value]
+    return rounded(value, digits) if isinstance(value, float) else value
+
+
 def json_text(results: Mapping[str, Any]) -> str:
-    """Return the results as strict JSON with little white space: lists of numbers and innermost objects on one line."""
+    """Return the results as strict JSON with few lines.
+
+    A list of numbers, an innermost object, and entries without parts that follow each other are on one line each.
+    """
     text = json.dumps(results, indent=1, allow_nan=False, ensure_ascii=False)
     text = re.sub(r"\[\s+([-+.\deE,\s]*?)\s+\]", lambda m: f"[{''.join(m[1].split())}]", text)
     inner = r"\{\n\s*((?:[^{}\[\]]|\{\}|\[\])*)\n\s*\}"  # what a string has of such brackets only keeps its lines apart
-    return re.sub(inner, lambda m: "{" + re.sub(r"\n\s*", " ", m[1]) + "}", text) + "\n"
+    text = re.sub(inner, lambda m: "{" + re.sub(r"\n\s*", " ", m[1]) + "}", text)
+    return re.sub(rf"({SCALAR},)\n\s+(?={SCALAR}(?:,|\n))", r"\1 ", text) + "\n"
 
 
 def conditions(results: Results) -> str:
