@@ -1,8 +1,8 @@
 """One score for a player: `python -m agents.benchmark my_player.py` plays all tasks, at home and in other settings.
 
 The score is 0 for random actions and 1 for tuned rules (agents/scores.py). *Home* is over the tasks as configured,
-*robust* over all settings of a study. Random actions and tuned rules play the same worlds. Writes an entry, NAME.json,
-into a folder, and the table of all its entries beside it.
+*robust* over all settings of a study, without those of other integrators. Random actions and tuned rules play the same
+worlds. Writes an entry, NAME.json, into a folder, and the table of all its entries beside it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import typer
 
 from agents.compare import JOBS, ROOT, folder_of, provenance, write_text
 from agents.scores import THRESHOLDS, Aggregate, aggregate
-from agents.study import Study, contenders_of, settings_of
+from agents.study import INTEGRATOR, Study, contenders_of, settings_of
 from agents.study_results import RANDOM, SettingResults, TaskResults, kind_of, read_task
 from agents.sweep import plan_digest, sweep
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
@@ -32,7 +32,7 @@ from flockenv.players import known_name
 from flockenv.scene.yaml_io import load
 from flockenv.studies.play_jobs import NAME
 
-__all__ = ["app", "entry_of", "table"]
+__all__ = ["app", "entry_of", "plan_of", "table"]
 
 STUDY = ROOT / "configs" / "studies" / "robustness.yaml"
 LEAST = 0.5
@@ -138,6 +138,12 @@ def _text(values: Sequence[float]) -> str:
     return f"{value:.2f} [{low:.2f}, {high:.2f}]"
 
 
+def plan_of(path: Path) -> Study:
+    """Return the settings to play: those of a study but for other integrators, which are slow to compile."""
+    plan: Study = load(path, Study)
+    return plan.model_copy(update={"everywhere": {a: each for a, each in plan.everywhere.items() if a != INTEGRATOR}})
+
+
 def _check_player(plan: Study, task: str, name: str) -> None:
     """Raise ValueError, in one line, unless the player can play a task at home."""
     home = settings_of(plan, task)[0]
@@ -189,18 +195,18 @@ def main(
         called = name or _name_of(player)
         if not NAME.fullmatch(called) or (called in (RANDOM, "rules") and called != player):
             raise ValueError(f"--name {printable(called)}: a name is up to 40 letters, digits and _ . @ + -")
-        plan = load(study, Study)
-        plan = plan.model_copy(update={"players": {RANDOM: RANDOM, "rules": "rules", called: player}})
+        settings = plan_of(study)
+        plan = settings.model_copy(update={"players": {RANDOM: RANDOM, "rules": "rules", called: player}})
         folder = folder_of(out, (f"{called}.json",))
         page = valid_file(f"{folder}.md", (".md",), force=True)
         for task in plan.tasks:
             _check_player(plan, task, called)
-        others = _other_entries(folder, called, load(study, Study))
+        others = _other_entries(folder, called, settings)
         with job_bar(lines=False) as progress:
             work = Work(Store(folder / JOBS), engine_of(engine, processes), fresh, progress, shard_of(shard))
             contents = sweep(plan, list(plan.tasks), work, choose=False, digits=DIGITS)
         results = [read_task(content) for content in contents.values()]
-        entry = entry_of(called, player, plan_digest(load(study, Study)), results, contents)
+        entry = entry_of(called, player, plan_digest(settings), results, contents)
         text = json_text(entry)
         write_all_or_none(page.parent, {
             f"{folder.name}/{called}.json": lambda path: write_text(path, text),

@@ -42,7 +42,8 @@ from flockenv.studies.play_jobs import NAME, Player, members_of
 from flockenv.tasks import TASKS, Task
 
 __all__ = [
-    "HOME", "PARTNERS", "Contender", "Partners", "Setting", "Study", "contenders_of", "setting_name", "settings_of",
+    "HOME", "INTEGRATOR", "PARTNERS", "Contender", "Partners", "Setting", "Study", "contenders_of", "setting_name",
+    "settings_of",
 ]  # fmt: skip
 
 HOME = "home"
@@ -55,6 +56,7 @@ PARTNERS, SHARE, SAME = "partners", "share", "same"
 """Axis of the player of all other agents; share of the agents that are evaluated; the value for the same player."""
 
 INTEGRATOR = "integrator"
+"""Axis of the solver whose values are kinds."""
 
 Value = bool | int | float | str | None
 Values = tuple[Value | dict[str, Value], ...] | dict[str, tuple[Value, ...]]

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from agents import best_response, cost_of_accuracy, front, transfer_report
-from agents.benchmark import table
+from agents.benchmark import STUDY, plan_of, table
 from agents.search import Coordinates
 from agents.seed_curves import curves_of
 from agents.study import Study, contenders_of, settings_of
 from agents.study_report import markdown
 from agents.study_results import SettingResults, TaskResults, group_of, read_file, read_task
-from agents.sweep import _entries
+from agents.sweep import _entries, plan_digest
 from flockenv.evaluation import Interval, lead_interval
 from flockenv.players import PUBLISHED
 from flockenv.players.rules import PLAYERS, load_tuned
@@ -278,6 +278,7 @@ def test_the_leaderboard_is_that_of_its_entries_and_trivial_players_fail() -> No
     entries = [json.loads(path.read_text(encoding="utf-8")) for path in (DOCS / "leaderboard").glob("*.json")]
     page = (DOCS / "leaderboard.md").read_text(encoding="utf-8")
     assert page == table(entries)
+    assert {entry["study"] for entry in entries} == {plan_digest(plan_of(STUDY))}  # a new entry joins them
     for path in (ROOT / "agents" / "trivial").glob("[a-z]*.py"):
         assert f"`{path.stem}` (does not solve the tasks)" in page
 
