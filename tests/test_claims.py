@@ -256,6 +256,12 @@ def test_other_learners_are_above_random_and_not_above_ppo() -> None:
     assert Counter(card["algorithm"].split()[0] for card in cards).values() and len(cards) == 8
     for card in cards:
         assert 7 < card["tuning_mean"] < min(max(curve) for curve in ppo)
+    crossing = [curve["mean"] for curve in curves_of("crossing")["ppo"]]
+    others = [json.loads(path.read_text(encoding="utf-8")) for path in (DOCS / "learners").glob("*/crossing-*.json")]
+    rules = load_tuned("crossing", "rules").found["tuning_mean"]
+    assert len(others) == 4
+    for card in others:
+        assert rules - 0.05 < card["tuning_mean"] < np.median([max(curve) for curve in crossing])
 
 
 def test_players_harm_less_than_one_world_of_a_hundred_in_crowd_nav() -> None:
