@@ -125,7 +125,8 @@ def table(entries: Sequence[Mapping[str, Any]]) -> str:
 TITLE = "# Leaderboard"
 NOTES = f"""\
 Score: 0 = random actions, 1 = tuned rules; interquartile mean over tasks (*home*), or over all settings of the
-study (*robust*), with the 95 % stratified bootstrap interval over training seeds and worlds.
+study but those of other integrators (*robust*), with the 95 % stratified bootstrap interval over training seeds and
+worlds.
 An interquartile mean leaves out the worst quarter: *above {GOOD:g}* is the share of settings with such a score.
 *Higher than rules*: probability of a higher return than tuned rules in the same world. A player below {LEAST:g} does
 not solve the tasks. With one seed, the interval does not contain the luck of training. `python -m agents.benchmark

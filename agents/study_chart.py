@@ -47,7 +47,7 @@ def draw_map(path: Path, results: TaskResults) -> None:
         axes.text(-0.08, at, label, ha="right", va="center", fontsize=9, color=INK)
         for place, each in enumerate(settings):
             _box(axes, place, at, each.winner)
-            lines = "\n".join(text for text in (each.value, _lead(each), _rates(each)) if text)
+            lines = "\n".join(text for text in (textwrap.fill(each.value, 26), _lead(each), _rates(each)) if text)
             axes.text(place + 0.5, at, lines, ha="center", va="center", fontsize=8, color=INK, linespacing=1.35)
     _legend(figure, results)
     title = f"{results.task}: which kind is ahead, by what difference in return, and success"

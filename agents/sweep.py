@@ -22,7 +22,7 @@ from rich.console import Console
 
 from agents.compare import JOBS, folder_of, pick, split, write_text
 from agents.invasion import worlds_among
-from agents.study import Contender, Setting, Study, contenders_of, settings_of
+from agents.study import INTEGRATOR, Contender, Setting, Study, contenders_of, settings_of
 from agents.study_results import RANDOM, TaskResults, kind_of, read_file, read_task
 from flockenv.cli.compare import changes_of
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
@@ -128,6 +128,7 @@ def _content(study: Study, entries: Sequence[_Entry], store: Store, digits: int)
         setting["players"][entry.contender.name] = entry.content or _played(entry, store, digits)
     task = entries[0].setting.task
     arguments = task.model_dump(mode="json")
+    arguments[INTEGRATOR] = arguments[INTEGRATOR]["kind"]
     home = {entry.setting.axis: arguments[entry.setting.axis] for entry in entries if entry.setting.axis in arguments}
     head = {"task": task.name, "worlds": study.worlds, "seed": study.seed, "home": home}
     return {**head, "settings": list(settings.values())}
@@ -192,6 +193,14 @@ def _job(study: Study, setting: Setting, player: Player, purpose: Any) -> Job:
     )  # fmt: skip
 
 
+def stored_return(value: float, digits: int = DIGITS) -> float:
+    """Return a return as it is stored: in significant digits, and then in at most two fewer decimals.
+
+    It is rounded twice, as those of files from before that had more decimals are.
+    """
+    return rounded(round(rounded(value, digits), digits - 2), digits)
+
+
 def _played(entry: _Entry, store: Store, digits: int = DIGITS) -> Content:
     """Return the results of an entry from the records of its jobs."""
     episodes = [store.read(job, episodes_of_bytes) for job in entry.evaluation]
@@ -202,7 +211,7 @@ def _played(entry: _Entry, store: Store, digits: int = DIGITS) -> Content:
         "microseconds": rounded(float(np.median([each.microseconds for each in episodes]))),
         "tuning_mean": rounded(float(np.mean([each.returns.mean() for each in tuning]))) if tuning else None,
         "success": ["".join("01"[int(mark)] for mark in each.success) for each in episodes],
-        "returns": [[rounded(round(value, digits - 2), digits) for value in each.returns] for each in episodes],
+        "returns": [[stored_return(value, digits) for value in each.returns] for each in episodes],
     }
 
 

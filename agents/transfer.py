@@ -105,9 +105,10 @@ def main(
         ]  # fmt: skip
         runner, part = engine_of(engine, processes), shard_of(shard)
         with job_bar() as progress:
-            results = _measure(plans, Work(Store(folder / JOBS), runner, fresh, progress, part))
+            measured = _measure(plans, Work(Store(folder / JOBS), runner, fresh, progress, part))
+        results = report.all_rounded(measured)
         write_all_or_none(folder, {
-            "transfer.json": lambda path: write_text(path, report.json_text(report.all_rounded(results))),
+            "transfer.json": lambda path: write_text(path, report.json_text(results)),
             "transfer.md": lambda path: write_text(path, transfer_report.markdown(results)),
             "transfer.png": lambda path: _draw(path, results),
         })  # fmt: skip

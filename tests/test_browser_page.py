@@ -347,6 +347,29 @@ def test_a_crowd_in_one_colour_is_drawn_as_one_in_several(boids: Session, visit:
         assert levels > 50  # not all of them are wholly covered
 
 
+ASKED = """() => new Promise(done => {
+  const send = live.send, sent = [];
+  live.send = function (message) { sent.push(message.type); return send.call(this, message); };
+  live.waiting = false; live.lastFrame = -1e9; drawn.ms = 1;
+  live.request(); live.lastFrame = -1e9; live.request(); // the second while the first is on its way
+  const before = sent.length, take = live.frame;
+  live.frame = function (data) {
+    this.lastFrame = -1e9; state.playing = true;
+    take.call(this, data); live.frame = take; live.send = send; state.playing = false;
+    done([before, sent.filter(each => each === "frame").length, live.due]);
+  };
+})"""
+
+
+def test_a_frame_that_is_due_is_asked_for_when_the_one_before_has_come(
+    boids: Session, visit: Callable[..., Visit]
+) -> None:
+    with serving(boids) as server:
+        here = opened(visit, server.url)
+        here.until("!live.waiting")
+        assert here.value(f"({ASKED})()") == [1, 2, False]
+
+
 DRAWN = """() => {
   const found = { bodies: [], faces: 0 }, [body, triangles] = [drawBody, facesInOrder];
   drawBody = (pen, eye, panel, one, k) => { found.bodies.push(one.i); body(pen, eye, panel, one, k); };

@@ -111,6 +111,7 @@ def test_rules_of_corridor_have_25_and_bottleneck_s_mixture_beats_queueing_safel
     assert at("corridor", "home").scores["rules"].mean.low > 25
     home = at("bottleneck", "home")
     assert success(home, "mixture").min() > 0.95 and lead(home, "mixture", "queueing").low > 0
+    assert all(lead(home, "mixture", "queueing", seed).low > 0 for seed in range(5))
 
 
 def test_decisions_of_ppo_take_less_than_a_microsecond_and_those_of_rules_longer() -> None:

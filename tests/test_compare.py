@@ -122,7 +122,7 @@ def test_results_are_strict_json_with_one_line_per_list() -> None:
 
 
 def test_innermost_objects_are_on_one_line_whatever_their_strings_hold() -> None:
-    inner = {"a": '{ [x] }\n  "y"', "b": {}, "c": None}
+    inner = {"a": '{ [x] }\n  "y"', "b": {}, "c": "[ 1 ] [  ] [ - ]"}
     results = {"one": {"a": "x\n  y", "b": 1.5, "c": {}}, "two": [inner, {"d": []}], "three": {"deep": {"e": [1, 2]}}}
     text = report.json_text(results)
     assert json.loads(text) == results

@@ -18,7 +18,7 @@ from flockenv.physics.effects import Drag, Gravity, Membrane, Springs, Tether
 from flockenv.physics.integrators import ImplicitEuler, LinearlyImplicitEuler, SemiImplicitEuler
 from flockenv.scene import Group, Scene
 from tests.catalogue import Array
-from tests.test_implicit import SHEET, hanging, same, shaken
+from tests.test_implicit import SHEET, WEIGHT, hanging, same, shaken
 
 CLOSELY = LinearlyImplicitEuler(tolerance=1e-13)
 
@@ -212,9 +212,18 @@ def test_a_strain_that_changes_too_much_in_the_shortest_step_is_told() -> None:
     scene = sheet_of(CLOSELY.model_copy(update={"strain": 0.001, "halvings": 1}))
     start = hit(scene, 50.0)
     with pytest.raises(
-        SimulationDiverged, match=r"a strain changes by \S+ in \S+ s, a step halved 1 times; strain = 0\.001"
+        SimulationDiverged, match=r"a strain changes by \S+ in \S+ s, after 1 halvings of dt; strain = 0\.001"
     ):
         scene.step(start)
+
+
+def test_a_limit_on_strains_that_limits_nothing_is_refused() -> None:
+    limited, group = CLOSELY.model_copy(update={"strain": 0.1}), Group(network=SHEET, mass=0.05)
+    for effects in ((WEIGHT,), (Springs(stiffness=40.0, break_strain=0.5),)):
+        with pytest.raises(
+            ValueError, match=r"integrator\.strain = 0\.1: limits nothing in this scene; needs a membrane"
+        ):
+            Scene(groups=(group,), effects=effects, integrator=limited, dt=0.02)
 
 
 def test_springs_do_not_limit_the_step_and_forces_without_a_derivative_do() -> None:

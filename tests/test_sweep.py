@@ -17,9 +17,9 @@ from agents.invasion import Among
 from agents.study import HOME, Partners, Study, contenders_of, settings_of
 from agents.study_report import markdown, winner_text
 from agents.study_results import ALONE, LEVEL, Score, SettingResults, TaskResults, kind_of, read_file, read_task
-from agents.sweep import app, plan_digest, sweep
+from agents.sweep import app, plan_digest, stored_return, sweep
 from flockenv.evaluation import bootstrap, lead_interval, mean_interval, rollout, worlds_for
-from flockenv.evaluation.report import json_text
+from flockenv.evaluation.report import json_text, rounded
 from flockenv.jobs import Store, Work
 from flockenv.jobs.local_engine import LocalEngine
 from flockenv.physics.integrators import RK4
@@ -362,6 +362,14 @@ def test_an_integrator_is_named_by_its_kind_and_is_of_the_solver() -> None:
     assert settings[1].task.integrator == RK4()
     with pytest.raises(ValueError, match=r"^tasks\.pursuit\.integrator: Pursuit: integrator.*'rk5'"):
         settings_of(small(tasks={"pursuit": {"integrator": ("rk5",)}}), "pursuit")
+
+
+def test_stored_returns_are_those_of_files_that_had_more_decimals() -> None:
+    """Of 1.2349999, a file with four digits had 1.235."""
+    values = np.random.default_rng(0).normal(0, 10, 1000)
+    assert [stored_return(value) for value in (1.2349999, -16.3512, 103.44)] == [1.24, -16.35, 103.4]
+    assert [stored_return(rounded(value, 4)) for value in values] == [stored_return(value) for value in values]
+    assert stored_return(1.23456789, 6) == 1.2346
 
 
 def test_what_a_study_leaves_out_is_on_its_page_and_is_no_other_plan() -> None:

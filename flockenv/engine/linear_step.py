@@ -132,7 +132,7 @@ class LinearSolver:
             return found
         if halved == method.halvings:
             raise NotSolvedLinearlyError(
-                f"a strain changes by {change:.3g} in {h:.3g} s, a step halved {halved} times; strain = "
+                f"a strain changes by {change:.3g} in {h:.3g} s, after {halved} halvings of dt; strain = "
                 f"{method.strain:g} allows no more than that",
                 agent,
             )

@@ -253,7 +253,7 @@ def json_text(results: Mapping[str, Any]) -> str:
     A list of numbers, an innermost object, and entries without parts that follow each other are on one line each.
     """
     text = json.dumps(results, indent=1, allow_nan=False, ensure_ascii=False)
-    text = re.sub(r"\[\s+([-+.\deE,\s]*?)\s+\]", lambda m: f"[{''.join(m[1].split())}]", text)
+    text = re.sub(r"\[\n\s*([-+.\deE,\s]*?)\n\s*\]", lambda m: f"[{''.join(m[1].split())}]", text)
     inner = r"\{\n\s*((?:[^{}\[\]]|\{\}|\[\])*)\n\s*\}"  # what a string has of such brackets only keeps its lines apart
     text = re.sub(inner, lambda m: "{" + re.sub(r"\n\s*", " ", m[1]) + "}", text)
     return re.sub(rf"({SCALAR},)\n\s+(?={SCALAR}(?:,|\n))", r"\1 ", text) + "\n"

@@ -29,9 +29,9 @@ WORK = (
     "face_passes", "impact_zones", "largest_zone",
 )  # fmt: skip
 """Counters in State.work: force evaluations, neighbour queries, candidate pairs tested, agent-obstacle tests; of
-adaptive methods, steps accepted and rejected; of implicit methods, iterations; of collisions, impacts, cut or unsolved
-ones, and bodies that stopped within a step; of a population, births, deaths, and births without a free slot; of faces,
-passes over impacts, impact zones, and the number of particles of the largest."""
+adaptive and linearly implicit methods, steps accepted and rejected; of implicit methods, iterations; of collisions,
+impacts, cut or unsolved ones, and bodies that stopped within a step; of a population, births, deaths, and births
+without a free slot; of faces, passes over impacts, impact zones, and the number of particles of the largest."""
 
 COUNTED_BY_KERNELS = 8
 """Number of these counters, the first ones, that the kernel of a scene updates."""

@@ -30,7 +30,7 @@ MOST_FPS: Final = 50.0
 
 _MOST_SIDE: Final = 65535
 #: Numbers of colours of a frame, the first that is enough, and how Pillow chooses them. The next index is that of
-#: pixels that are as in the frame before (transparent): 63 colours take six bits, and a table of a quarter of the size.
+#: pixels that are as in the frame before (transparent): with 63 colours the table has a quarter of the size.
 _PALETTES: Final = ((63, Image.Quantize.MAXCOVERAGE), (255, Image.Quantize.MEDIANCUT))
 #: Largest error of a colour channel, of 255, with a smaller palette or that of the frame before.
 _TOLERANCE: Final = 40

@@ -146,6 +146,7 @@ class Scene(Record):
                 except ValueError as error:
                     raise ValueError(f"{name}[{k}].{error}") from None
         self._check_inner_numbers()
+        self._check_strain()
         self._check_space()
         if self.dtype == "float32":
             self._check_counts()
@@ -179,6 +180,15 @@ class Scene(Record):
                 raise ValueError(
                     f"groups[{k}].appearance.of = {of!r}: no effect of this scene keeps such an inner number"
                 )
+
+    def _check_strain(self) -> None:
+        """Raise ValueError if a limit on strains would have no effect."""
+        strain = getattr(self.integrator, "strain", 0)
+        if strain > 0 and not any(effect.derivative and effect.strain_law for effect in self.effects):
+            raise ValueError(
+                f"integrator.strain = {strain:g}: limits nothing in this scene; needs a membrane, or springs that "
+                "neither yield nor break"
+            )
 
     def _check_space(self) -> None:
         size = getattr(self.space, "size", None)

@@ -115,9 +115,10 @@ function legendRow([text, colour, kind]) {
 function makeLegend(group) {
   const has = test => group.panels.some(p => p.scenery.some(test)), rows = [];
   for (const role of group.panels.every(p => p.colour) ? [] : Object.keys(data.roles)) { // a scale explains other colours
-    const panel = group.panels.find(p => { const hidden = coveredAgents(p) || []; return p.roles.some((each, i) => each === role && !hidden[i]); });
+    const shown = p => { const hidden = coveredAgents(p) || []; return p.roles.findIndex((each, i) => each === role && !hidden[i]); };
+    const panel = group.panels.find(p => shown(p) >= 0);
     if (!panel) continue;
-    const look = panel.looks[panel.look[panel.roles.indexOf(role)]];
+    const look = panel.looks[panel.look[shown(panel)]];
     rows.push([role, look && look.colours ? look.colours[0] : roleColour[role], look && look.form !== "polygon" ? "disc" : "dart"]);
   }
   if (has(s => s.stones.length || s.walls.length)) rows.push(["obstacle", paint.stone, "disc"]);
