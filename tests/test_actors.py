@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from agents import learn
-from agents.experiment import Experiment
+from agents.experiment import Experiment, PpoSettings
 from agents.learner_job import effective
 from agents.warm_start import starting_policy
 from flockenv.evaluation import rollout
@@ -105,7 +105,7 @@ def test_ppo_does_not_start_with_an_actor_that_it_cannot_represent(algo: str, tm
     card = {**describe(TASK), **(SQUASHED if algo == "sac" else RELU)}
     save_policy(tmp_path / "p.safetensors", learn.tensors_of(model), card)
     with pytest.raises(ValueError, match=r"ppo\.start = .*: its actor is squashed, recurrent or .* one of PPO's"):
-        starting_policy(str(tmp_path / "p.safetensors"), TASK, (20, 12), "relu")
+        starting_policy(PpoSettings(start=str(tmp_path / "p.safetensors"), hidden=(20, 12)), TASK)
 
 
 # --- recurrent --------------------------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save
 
+from agents.experiment import PpoSettings
 from agents.invasion import Among, jobs_of
 from agents.warm_start import starting_policy
 from flockenv.core.warnings import OtherTaskWarning
@@ -121,7 +122,7 @@ def test_networks_of_single_learners_play_rows_of_whole_worlds_only(tmp_path: Pa
     with pytest.raises(ValueError, match="player 'p': has a network for each learner, which play together only"):
         jobs_of(task, [player], 2)
     with pytest.raises(ValueError, match="its actor is squashed, recurrent or of several networks"):
-        starting_policy(player.spec, task, (7, 6), "tanh")
+        starting_policy(PpoSettings(start=player.spec, hidden=(7, 6), activation="tanh"), task)
 
 
 @pytest.mark.parametrize("name", ["policy.0.weight", "log_std"])
