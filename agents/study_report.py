@@ -27,9 +27,9 @@ player cannot read the observations of that setting; *alone*: only one kind can.
 a task does not accept it or its time step is unstable."""
 
 CHECKED = """\
-`{command} --check 2` plays two stored results, drawn at random, again,
-and compares the return of every world with the stored one (four digits, at most two decimals). In {folder}/TASK.json,
-`digest` is that of a result's settings, worlds and players."""
+`{command} --check 2` plays two
+stored results, drawn at random, again, and compares the return of every world with the stored one (four digits, at most
+two decimals). In {folder}/TASK.json, `digest` is that of a result's settings, worlds and players."""
 
 AMONG = """\
 **Partners**: one agent of each world, or the share named there, plays the player of the column, and all others the

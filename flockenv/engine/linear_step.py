@@ -51,7 +51,7 @@ class LinearStep(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """The stencils of one effect, and the function that adds their derivatives to the matrix."""
+    """The stencils of one effect, and functions: of their derivatives for the matrix, and of their change of strain."""
 
     assemble: Callable[..., None]
     strain_change: Callable[..., tuple[float, int]] | None
