@@ -231,6 +231,80 @@ def test_single_precision_holds_rod_lengths_to_4e_5() -> None:
     np.testing.assert_allclose(gaps(scene, end), 1.0, rtol=4e-5)
 
 
+# --- forces ---------------------------------------------------------------------------------------------------------
+
+
+def forces_on_agents(scene: Scene, state: State, world: int = 0) -> Array:
+    """Return the sum of the forces of rods on each agent, (N, D) N."""
+    found = scene.rod_forces(state, world)
+    total = np.zeros(state.pos.shape[1:])
+    np.add.at(total, found.first, found.force)
+    np.add.at(total, found.second, -found.force)
+    return total
+
+
+@pytest.mark.parametrize("links", [1, 8])
+def test_each_link_of_a_hanging_chain_carries_the_weight_below(links: int) -> None:
+    chain = Rope(links=links, length=2.0, direction=(0, -1), pinned=("start",))
+    scene = hanging(chain, 0.01, mass=0.3, tolerance=1e-13)
+    start = scene.start(0)
+    found = scene.rod_forces(start)
+    np.testing.assert_array_equal(found.first, np.arange(links))
+    np.testing.assert_array_equal(found.second, np.arange(1, links + 1))
+    weight = 0.3 * G * np.arange(links, 0, -1)
+    np.testing.assert_allclose(found.tension, weight, rtol=1e-6)
+    np.testing.assert_allclose(found.force, np.outer(weight, (0, -1)), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(scene.rod_forces(scene.run(start, 300)).tension, weight, rtol=1e-6)
+
+
+def test_the_tension_of_a_swinging_pendulum_is_its_weight_along_the_rod_and_its_centripetal_force() -> None:
+    """T = m (g cos a + v^2 / l) = m g (3 cos a - 2 cos a0), m g + m v^2 / l at the lowest point; of order 2."""
+    errors = []
+    for dt in (0.02, 0.01, 0.005):
+        scene, state = pendulum(dt, 1.2)
+        worst = 0.0
+        for _ in range(round(1.2 / dt)):  # past the lowest point
+            after, found = scene.step(state), scene.rod_forces(state).tension[0]
+            x, y = (state.pos + after.pos)[0, 1]
+            exact = G * (3 * math.cos(math.atan2(x, -y)) - 2 * math.cos(1.2))
+            worst, state = max(worst, abs(found - exact)), after
+        errors.append(worst)
+    assert errors[-1] < 1e-4 * G
+    assert -np.diff(np.log2(errors)) == pytest.approx([2, 2], abs=0.1)
+
+
+def test_a_strut_has_a_negative_tension_and_a_slack_rope_none() -> None:
+    """A mass stands upright on a rod; with a rope instead of the rod it falls."""
+    upright = Rope(links=1, length=1.0, direction=(0, 1), pinned=("start",))
+    strut = hanging(upright, 0.01)
+    assert strut.rod_forces(strut.start(0)).tension[0] == pytest.approx(-G, rel=1e-6)
+    falling = hanging(upright, 0.01, slack=True)
+    np.testing.assert_array_equal(falling.rod_forces(falling.start(0)).force, 0)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_the_forces_of_rods_change_momentum_even_if_sweeps_do_not_suffice() -> None:
+    scene, hurried = free(), free(most=2)
+    start = ring_state(scene, worlds=3)
+    for each in (scene, hurried):
+        end = each.step(start)
+        for world in range(3):
+            gained = each.body.mass[:, None] * (end.vel - start.vel)[world] / each.dt
+            np.testing.assert_allclose(forces_on_agents(each, start, world), gained, atol=1e-9)
+    np.testing.assert_array_equal(scene.rod_forces(start, 2).force, scene.rod_forces(start.worlds([2])).force)
+
+
+def test_forces_are_those_of_all_constraints_with_rods_one_after_another() -> None:
+    scene = free(pairs=((5, 4), (0, 1)))
+    rope = Rods(pairs=((2, 3),), lengths=(4.0,), slack=True)
+    found = scene.model_copy(update={"constraints": (*scene.constraints, rope)}).rod_forces(ring_state(scene))
+    assert list(zip(found.first.tolist(), found.second.tolist(), strict=True)) == [(0, 1), (4, 5), (2, 3)]
+    assert (found.tension[:2] != 0).all() and found.tension[2] == 0
+    without = scene.model_copy(update={"constraints": ()})
+    with pytest.raises(ValueError, match=r"^constraints: the scene has no rods"):
+        without.rod_forces(ring_state(without))
+
+
 # --- ropes ----------------------------------------------------------------------------------------------------------
 
 

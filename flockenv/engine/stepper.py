@@ -22,8 +22,9 @@ from flockenv.engine.workspace import Workspace
 from flockenv.jit.thread_pool import LARGEST, AutoTuners, run_parallel, usable_threads
 from flockenv.model.scene_view import SceneView
 from flockenv.model.state import Floats, State
-from flockenv.physics.constraints import BodyContacts, Settler
+from flockenv.physics.constraints import BodyContacts, RodForces, Settler
 from flockenv.physics.constraints.rigid_bodies import BodySettler
+from flockenv.physics.constraints.rods import RodSettler
 from flockenv.physics.integrators import SemiImplicitEuler
 from flockenv.physics.population import make_settler as population_settler
 
@@ -183,6 +184,11 @@ class Stepper:
     def body_contacts(self) -> BodyContacts:
         """Return the contacts of rigid bodies in the last step of one world by this thread."""
         return next(each.found() for each in self._settlers(1)[0] if isinstance(each, BodySettler))
+
+    def rod_forces(self) -> RodForces:
+        """Return the forces of all rods in the last step of one world by this thread; constraints one after another."""
+        found = [each.found() for each in self._settlers(1)[0] if isinstance(each, RodSettler)]
+        return RodForces(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
     def _step_by_kernel(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
         """Step in place by the kernel alone, on all threads in use.

@@ -43,7 +43,15 @@ from flockenv.model.group import Group
 from flockenv.model.networks import EDGE
 from flockenv.model.snapshot import Snapshot
 from flockenv.model.state import Body, Floats, State
-from flockenv.physics.constraints import CONSTRAINTS, BodyContacts, Collisions, Constraint, RigidBodies
+from flockenv.physics.constraints import (
+    CONSTRAINTS,
+    BodyContacts,
+    Collisions,
+    Constraint,
+    RigidBodies,
+    RodForces,
+    Rods,
+)
 from flockenv.physics.effects import EFFECTS, Effect
 from flockenv.physics.effects.effect import all_masses
 from flockenv.physics.integrators import INTEGRATORS, Adaptive, ImplicitEuler, Integrator, SemiImplicitEuler
@@ -579,6 +587,13 @@ class Scene(Record):
             raise ValueError("constraints: the scene has no rigid_bodies, which have contacts")
         self.step(state.worlds([world]))
         return self.stepper.body_contacts()
+
+    def rod_forces(self, state: State, world: int = 0) -> RodForces:
+        """Return the forces of rods and ropes in the step of one world that begins at a state."""
+        if not any(isinstance(each, Rods) for each in self.constraints):
+            raise ValueError("constraints: the scene has no rods, which have tensions")
+        self.step(state.worlds([world]))
+        return self.stepper.rod_forces()
 
     def _drive(self, drive: ArrayLike | None, state: State) -> Floats:
         if drive is None:

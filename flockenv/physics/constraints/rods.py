@@ -19,7 +19,7 @@ from flockenv.model.scene_view import SceneView
 from flockenv.model.state import Floats, State
 from flockenv.physics.constraints.constraint import Constraint, Settler
 
-__all__ = ["Rods", "hold_rods", "wrap_position"]
+__all__ = ["RodForces", "Rods", "hold_rods", "wrap_position"]
 
 Number = Annotated[int, Field(ge=0, strict=True)]
 Pair = tuple[Number, Number]
@@ -30,6 +30,15 @@ KNOWN, UNKNOWN = 0.9999, 0.99
 
 POWERS, LEAST = 50, 1e-9
 """Steps of inverse iteration for that factor, and a shift of the matrix, which redundant rods make singular."""
+
+
+class RodForces(NamedTuple):
+    """Forces of R rods and ropes in a step, sorted by agents; 0 where a rope is slack or an end is dead."""
+
+    first: NDArray[np.int32]  # (R,) the agent of the smaller number
+    second: NDArray[np.int32]  # (R,) the other agent
+    force: Floats  # (R, D) N, on `first`: impulse over dt; -force acts on `second`
+    tension: Floats  # (R,) N, sum of the impulses along the rod over dt; > 0: it pulls, < 0: it pushes
 
 
 class RodPairs(NamedTuple):
@@ -61,6 +70,8 @@ class Hold(NamedTuple):
     offset: Any  # (D,) m, from i to j now
     along: Any  # (D,) the direction in which the rod acts, of any length
     kept: Any  # (2, D, N) positions and velocities after the method
+    impulse: Any  # (R, D) kg m/s, on agent i in the step of the last world
+    size: Any  # (R,) kg m/s, sum of the impulses along each rod; > 0: it pulls
 
 
 @kernel
@@ -92,6 +103,15 @@ def _add_along(x: Any, b: int, rods: Any, r: int, by: float) -> None:
     for k in range(x.shape[0]):
         x[k, b, i] += by * rods.weight[i] * rods.along[k]
         x[k, b, j] -= by * rods.weight[j] * rods.along[k]
+
+
+@kernel
+def _add_impulse(v: Any, b: int, rods: Any, r: int, by: float, long: float) -> None:
+    """Change the velocities of both ends by the impulse `by` times the direction, which is `long`, and record it."""
+    _add_along(v, b, rods, r, by)
+    for k in range(v.shape[0]):
+        rods.impulse[r, k] += by * rods.along[k]
+    rods.size[r] += by * long
 
 
 @kernel
@@ -171,7 +191,7 @@ def _correct_length(x: Any, v: Any, b: int, rods: Any, r: int, over: float, carr
     rods.pull[r] += by
     _add_along(x, b, rods, r, by)
     if carry:
-        _add_along(v, b, rods, r, by * rods.per_dt)
+        _add_impulse(v, b, rods, r, by * rods.per_dt, np.sqrt(_dot(rods.along, rods.along)))
     return abs(now - aim) / rods.length[r], abs(now - aim) > like(o, 0.5) * rods.allowed[r]
 
 
@@ -195,7 +215,7 @@ def _correct_velocity(x: Any, v: Any, b: int, rods: Any, r: int, over: float) ->
     if rods.slack:
         by = max(by, -rods.pull[r])
     rods.pull[r] += by
-    _add_along(v, b, rods, r, by)
+    _add_impulse(v, b, rods, r, by, like(o, 1.0))
     return abs(rate) / (rods.length[r] * rods.per_dt), abs(rate) > like(o, 0.5) * allowed * rods.per_dt
 
 
@@ -238,6 +258,13 @@ def _copy(x: Any, v: Any, kept: Any, b: int, keep: bool) -> None:
 
 
 @kernel
+def _clear_impulses(rods: Any) -> None:
+    """Set the impulses of all rods to 0."""
+    rods.impulse[:] = 0
+    rods.size[:] = 0
+
+
+@kernel
 def wrap_position(x: Any, v: Any, b: int, i: int, period: Any) -> bool:
     """Wrap the position of an agent on a torus; return True if its state is finite."""
     sound = True
@@ -263,6 +290,7 @@ def hold_rods(x0: Any, x: Any, v: Any, alive: Any, rods: Any, first: int, end: i
     world, agent, rod, off = -1, -1, -1, like(rods.per_dt, 0.0)
     for b in range(first, end):
         _copy(x, v, rods.kept, b, True)
+        _clear_impulses(rods)
         _write_offsets(x0, x, b, rods)
         for stage in range(3):
             worst, by = _sweep(x, v, alive, b, rods, stage)
@@ -270,6 +298,7 @@ def hold_rods(x0: Any, x: Any, v: Any, alive: Any, rods: Any, first: int, end: i
                 rod, off = worst, by
                 if stage == 0:
                     _copy(x, v, rods.kept, b, False)
+                    _clear_impulses(rods)
         for r in range(2 * rods.i.shape[0]):
             i = rods.i[r // 2] if r % 2 == 0 else rods.j[r // 2]
             if not wrap_position(x, v, b, i, rods.period) and world < 0:
@@ -286,6 +315,7 @@ class Rods(Constraint):
     Agents that are held in place are not moved. Distances that are wrong at the start are corrected in the first step,
     without a change of velocity. A chain of n links takes some 6 n sweeps in a step, and so does a cloth of n x n
     cells. Rods are applied last, after the speed limit and the walls of a box.
+    `Scene.rod_forces` returns their tensions.
     """
 
     kind: Literal["rods"] = "rods"
@@ -355,33 +385,46 @@ class Rods(Constraint):
 
     def settler(self, scene: SceneView) -> Settler:
         """Return a function that corrects a step, with scratch memory of its own, and warns once of wrong lengths."""
-        pairs, real, d = self.rod_pairs(scene), np.dtype(scene.dtype).type, scene.dimension
+        return RodSettler(self, scene)
+
+
+class RodSettler:
+    """Correction of the steps of one scene by one record of rods; its scratch memory holds the impulses of the last."""
+
+    def __init__(self, record: Rods, scene: SceneView) -> None:
+        self.record, self.dt, self.warned = record, float(scene.dt), False
+        pairs, real, d = record.rod_pairs(scene), np.dtype(scene.dtype).type, scene.dimension
         weight = (1 / scene.body.mass).astype(real)  # agents held in place have an infinite mass
         period = np.array(scene.space.extent(d) if scene.space.periodic else (0.0,) * d, real)
         length = pairs.length.astype(real)
-        rods = Hold(
-            weight, pairs.i, pairs.j, length, period, real(1 / scene.dt), self.slack,
-            real(self.tolerance), self.most, real(_spectral_radius(pairs, weight)), np.zeros_like(length),
+        self.rods = Hold(
+            weight, pairs.i, pairs.j, length, period, real(1 / scene.dt), record.slack,
+            real(record.tolerance), record.most, real(_spectral_radius(pairs, weight)), np.zeros_like(length),
             np.zeros((len(length), d), real), np.zeros_like(length), np.zeros_like(length), np.zeros(d, real),
-            np.zeros(d, real), np.zeros((2, d, scene.agents), real),
+            np.zeros(d, real), np.zeros((2, d, scene.agents), real), np.zeros((len(length), d), real),
+            np.zeros_like(length),
         )  # fmt: skip
-        solve, warned = entry(hold_rods), False
 
-        def settle(x0: Floats, v0: Floats, state: State, first: int, end: int) -> tuple[int, int]:
-            nonlocal warned
-            world, agent, rod, off = solve(x0, state.x, state.v, state.alive, rods, first, end)
-            if rod >= 0 and world < 0 and not warned:
-                warned = True
-                warnings.warn(
-                    f"rods: after most = {self.most} sweeps agents {pairs.i[rod]} and {pairs.j[rod]} were {off:.2g} of "
-                    f"their length off (tolerance = {self.tolerance:g}); their speeds are only damped then, so allow "
-                    "more sweeps, or make shorter steps",
-                    UnmetWarning,
-                    stacklevel=2,
-                )
-            return int(world), int(agent)
+    def __call__(self, x0: Floats, v0: Floats, state: State, first: int, end: int) -> tuple[int, int]:
+        """Correct the steps of worlds [first, end); return the first (world, agent) that is not finite, or (-1, -1)."""
+        rods = self.rods
+        world, agent, rod, off = entry(hold_rods)(x0, state.x, state.v, state.alive, rods, first, end)
+        if rod >= 0 and world < 0 and not self.warned:
+            self.warned = True
+            warnings.warn(
+                f"rods: after most = {rods.most} sweeps agents {rods.i[rod]} and {rods.j[rod]} were {off:.2g} of "
+                f"their length off (tolerance = {rods.tolerance:g}); their speeds are only damped then, so allow "
+                "more sweeps, or make shorter steps",
+                UnmetWarning,
+                stacklevel=2,
+            )
+        return int(world), int(agent)
 
-        return settle
+    def found(self) -> RodForces:
+        """Return the forces in the world that was corrected last."""
+        rods = self.rods
+        order = np.lexsort((rods.j, rods.i))
+        return RodForces(rods.i[order], rods.j[order], rods.impulse[order] / self.dt, rods.size[order] / self.dt)
 
 
 def _sort_by_layer(pairs: RodPairs) -> RodPairs:
