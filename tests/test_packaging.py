@@ -132,7 +132,9 @@ def test_the_base_dependencies_do_not_include_torch(metadata: Message) -> None:
         *("numpy", "scipy", "numba", "gymnasium", "pettingzoo", "pydantic", "pyyaml", "typer", "rich"),
         *("matplotlib", "pillow", "safetensors", "shapely", "filelock"),
     }
-    extras = {"train", "test", "render", "play", "docs", "ray", "rllib", "browser", "video", "parquet", "mesh"}
+    extras = {"train", "test", "render", "play", "docs", "ray", "rllib", "browser", "video", "parquet", "mesh"} | {
+        "measures"
+    }
     assert set(metadata.get_all("Provides-Extra") or []) == extras
     assert "gymnasium<2,>=1.2.2" in needed
 
@@ -219,6 +221,15 @@ def test_ci_runs_the_command_of_the_readme() -> None:
     assert README_TEST in (ROOT / "README.md").read_text()
 
 
+def test_ci_installs_the_packages_of_all_extras_but_ray() -> None:
+    """Tests skip without a package, so that one which is never installed is never tested."""
+    extras = PROJECT["optional-dependencies"]
+    packages = {extra: {Requirement(line).name for line in lines} for extra, lines in extras.items()}
+    installed = re.findall(r"-e '\.\[(.*?)\]'", (ROOT / ".ci" / "run").read_text())
+    brought = set().union(*(packages[extra] for each in installed for extra in each.split(",")))
+    assert {extra for extra, names in packages.items() if not names <= brought} == {"ray", "rllib"}
+
+
 def test_installed_versions_are_those_of_the_constraints() -> None:
     """Otherwise tests that pass here may fail in a fresh clone."""
     from importlib.metadata import PackageNotFoundError, version
@@ -238,9 +249,8 @@ def test_every_dependency_is_pinned() -> None:
     pins = {line.split("==")[0].lower() for line in (ROOT / "configs" / "constraints.txt").read_text().split()}
     pins = {name.replace("_", "-") for name in pins}
     extras = PROJECT["optional-dependencies"]
-    wanted = {
-        re.split(r"[<>=]", line)[0].lower() for line in PROJECT["dependencies"] + extras["train"] + extras["test"]
-    }
+    tested = [line for name in ("train", "test", "parquet", "measures") for line in extras[name]]
+    wanted = {re.split(r"[<>=]", line)[0].lower() for line in PROJECT["dependencies"] + tested}
     assert wanted - pins == {"pillow"}  # not pinned: other packages often pin it
 
 

@@ -74,6 +74,7 @@ def test_the_command_writes_a_table_and_its_frame_rate(
     assert "pip install 'flockenv[parquet]'" in capsys.readouterr().err and not Path("b.parquet").exists()
 
 
+@pytest.mark.slow  # .ci/run installs pyarrow after the quick tests
 def test_a_parquet_file_has_the_same_table(tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     run = walkers(5, 3)
