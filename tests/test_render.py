@@ -124,6 +124,15 @@ def test_a_shutter_needs_several_steps_in_a_frame() -> None:
         Shutter.of(0.5, 1)
 
 
+def test_a_picture_in_few_colours_keeps_those_of_its_areas(tmp_path: Path) -> None:
+    whole = draw(shot([(3.0, 5.0), (7.0, 5.0)], [(1.0, 0.0), (0.0, 1.0)], roles=("pursuer", "agent")), 300)
+    write_png(tmp_path / "few.png", whole, 64)
+    with Image.open(tmp_path / "few.png") as file:
+        assert file.mode == "P" and len(file.getcolors() or []) <= 64
+        few = np.asarray(file.convert("RGB"))
+    assert difference(few, whole).max() <= 14 and (difference(few, whole) > 0).mean() < 0.1
+
+
 # ---- snapshot
 
 

@@ -23,6 +23,9 @@ __all__ = ["page", "run_demo", "write_gallery"]
 SIZE = 360
 """Width of a picture, pixels."""
 
+COLOURS = 64
+"""Colours of a picture."""
+
 INSTANTS = 160
 """Approximate number of instants at which a drawn trajectory is sampled."""
 
@@ -78,7 +81,7 @@ def write_gallery(
         for done, (kind, behaviour) in enumerate(behaviours.items()):
             progress(done)
             snapshots = list(run_demo(behaviour).snapshots())
-            write_png(folder / f"{kind}.png", draw(snapshots[-1], SIZE, 3, snapshots))
+            write_png(folder / f"{kind}.png", draw(snapshots[-1], SIZE, 3, snapshots), COLOURS)
     with replace_file(path) as file:
         file.write(page(behaviours, folder.name).encode())
     return len(behaviours)

@@ -72,11 +72,33 @@ def side_by_side(
         yield np.hstack(pictures)
 
 
-def write_png(path: str | os.PathLike[str], frame: Pixels) -> None:
-    """Write one frame, (H, W, 3) uint8, as PNG; the file is written completely or not at all."""
+def write_png(path: str | os.PathLike[str], frame: Pixels, colours: int | None = None) -> None:
+    """Write one frame, (H, W, 3) uint8, as PNG; the file is written completely or not at all.
+
+    colours: reduce the picture to this many, 16 to 256, which makes drawings a third as large (default: all).
+    """
     _check_frame(frame, "frame")
+    picture = Image.fromarray(frame)
+    if colours is not None:
+        picture = _reduced(picture, colours)
     with replace_file(path) as file:
-        Image.fromarray(frame).save(file, "PNG")
+        picture.save(file, "PNG", optimize=True)
+
+
+def _reduced(picture: Image.Image, colours: int) -> Image.Image:
+    """Return a picture in few colours: its 8 most frequent ones, so that areas keep theirs, and some that cover all.
+
+    Pillow would map pixels to a palette by the highest 6 bits of each channel only.
+    """
+    pixels = np.asarray(picture).reshape(-1, 3)
+    found, place, count = np.unique(pixels, axis=0, return_inverse=True, return_counts=True)
+    some = picture.quantize(colours - 8, method=Image.Quantize.MAXCOVERAGE).getpalette() or []
+    palette = np.concatenate([found[np.argsort(-count)[:8]], np.reshape(some, (-1, 3))]).astype(np.int32)
+    distance = ((found[:, None].astype(np.int32) - palette) ** 2).sum(axis=2)
+    index = distance.argmin(axis=1).astype(np.uint8)[place.ravel()]
+    reduced = Image.frombytes("P", picture.size, index.tobytes())
+    reduced.putpalette(palette.astype(np.uint8).tobytes())
+    return reduced
 
 
 def _write_frames(file: BinaryIO, frames: Iterable[Pixels], fps: float) -> int:
