@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from itertools import cycle
+from itertools import count, cycle
 from typing import Any
 
 from turns import DRAWS, Case, run
@@ -233,6 +233,16 @@ def _crowd_case(scene: Any, does: str) -> Case:
     return Case(step, 10 * scene.agents, does + "; ten steps a call", of_scene(scene, state, 10))
 
 
+def declared(size: str, worlds: int = 1) -> Case:
+    """The flocking model of the comparison of ABM frameworks, by the file that is contributed there."""
+    from release.abm.Flocking.flockenv.flocking import LARGE, SMALL, flocking_model, run_model
+
+    scene, seeds, steps = flocking_model(**{"small": SMALL, "large": LARGE}[size]), count(), 100
+    many = f"{worlds} new worlds" if worlds > 1 else "a new world"
+    does = f"own effect, {many} of {scene.agents} and {steps} steps, float64; all birds are updated at once"
+    return Case(lambda: run_model(scene, next(seeds), steps, worlds), worlds * steps * scene.agents, does)
+
+
 CASES = {
     "flock_4": lambda threads: flock_batch(4),
     "flock_3": lambda threads: flock_batch(3),
@@ -248,6 +258,10 @@ CASES = {
     "crowd_1000": lambda threads: social_corridor(1000),
     "crowd_100": lambda threads: social_field(100),
     "crowd_500": lambda threads: social_field(500),
+    "declared_small": lambda threads: declared("small"),
+    "declared_large": lambda threads: declared("large"),
+    "declared_small_100": lambda threads: declared("small", 100),
+    "declared_large_100": lambda threads: declared("large", 100),
 }
 
 if __name__ == "__main__":
