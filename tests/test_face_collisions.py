@@ -7,14 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockenv.core.warnings import UnsolvedContactsWarning
 from flockenv.geometry.box_tree import build_tree, overlapping_pairs
-from flockenv.geometry.shapes import Capsule, Circle
+from flockenv.geometry.shapes import Block, Capsule, Circle, DistanceField, HalfSpace, Sway
 from flockenv.geometry.space import Torus
 from flockenv.model.networks import Cloth, Jelly, Mesh, Rope
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
 from flockenv.model.surface import faces_of
 from flockenv.physics.constraints import Collisions, FaceCollisions, Rods
+from flockenv.physics.constraints.face_obstacles import solids_of
 from flockenv.physics.effects import Drag, Gravity, Springs
 from flockenv.scene import Group, Scene
 from tests.exact_crossings import crossings
@@ -97,6 +99,7 @@ def test_of_two_sheets_none_passes_the_other() -> None:
 
 POLES = (
     Circle(centre=(0.6, 0.6, -0.1), radius=0.04), Capsule(start=(0.6, -1, -0.1), end=(0.6, 2, -0.1), radius=0.04),
+    Block(centre=(0.6, 0.62, -0.1), size=(0.08, 0.08, 0.08), turn=45, axis=(1, 1, 0)),
 )  # fmt: skip
 
 
@@ -108,6 +111,43 @@ def test_a_pole_thinner_than_a_cell_holds_a_sheet(pole: Any) -> None:
     assert without.pos[0, :, 2].max() < -0.5
     state = run(scene_of(group, obstacles=(pole,)), 0.5)
     assert state.pos[0, :, 2].max() > -0.3
+
+
+RISING = (
+    Circle(centre=(0.6, 0.62, -0.3), radius=0.04, velocity=(0, 0, 2)),
+    Capsule(start=(0.6, -1, -0.3), end=(0.6, 2, -0.3), radius=0.04, velocity=(0, 0, 2)),
+    Block(
+        centre=(0.6, 0.62, -0.3), size=(0.08, 0.08, 0.08), turn=45, axis=(1, 1, 0), velocity=(0, 0, 2),
+        sway=Sway(amplitude=(0.02, 0, 0), period=0.1),
+    ),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("pole", RISING, ids=[pole.kind for pole in RISING])
+def test_a_sheet_is_lifted_by_an_obstacle_that_rises(pole: Any) -> None:
+    """Rising at 2 m/s it meets the falling sheet, and is smaller than a cell. Nothing of it passes a face."""
+    scene = scene_of(sheet(5, 1.25, (0, 0, 0)), obstacles=(pole,))
+    state, solids, n = scene.start(0), solids_of(scene.obstacles), scene.agents
+    faces = np.concatenate([faces_of(scene), solids.faces + n])
+    points = np.arange(n + len(solids.place))
+
+    def places(state: State) -> Any:
+        return np.concatenate([state.pos[0], solids.place + pole.shift(float(state.time[0]))])
+
+    for _ in range(150):
+        before = places(state)
+        state = scene.step(state, out=state)
+        assert crossings(before, places(state), faces, points) == []
+    assert state.pos[0, :, 2].max() > pole.anchor[2] + pole.shift(0.6)[2]
+    assert state.count_of("unsolved") == 0
+
+
+def test_a_sheet_between_two_obstacles_that_close_is_reported() -> None:
+    """No motion of the sheet avoids both, so particles cannot be kept out of them."""
+    jaws = [Block(centre=(0.6, 0.6, z), size=(0.5, 0.5, 0.2), velocity=(0, 0, -4 * z)) for z in (-0.25, 0.25)]
+    scene = scene_of(sheet(5, 1.25, (0, 0, 0)), obstacles=tuple(jaws))
+    with pytest.warns(UnsolvedContactsWarning, match="touched from its start"):
+        run(scene, 0.2, check=False)
 
 
 # --- what holds in every step ---------------------------------------------------------------------------------------
@@ -200,6 +240,10 @@ CROSSED = Mesh(
     vertices=((0, 0, 0), (1, 0, 0), (0, 1, 0), (0.2, 0.2, -0.5), (0.2, 0.2, 0.5), (2, 2, 0.5)),
     triangles=((0, 1, 2), (3, 4, 5)),
 )
+FLOOR = HalfSpace(point=(0, 0, -1), direction=(0, 0, 1))
+FIELD = DistanceField(low=(-1, -1, -1), high=(1, 1, 1), spacing=0.5, shapes=(POLES[0],))
+HUGE = Block(centre=(0.5, 0.05, 0), size=(9, 9, 9))
+POLE = Capsule(start=(0.6, 0.7, -1), end=(0.6, 0.7, 1), radius=0.01)
 FLAT = Mesh(
     vertices=((0, 0, 0), (1, 0, 0), (0, 1, 0), (0.1, 0.1, 0), (2, 0.1, 0), (0.1, 2, 0)),
     triangles=((0, 1, 2), (3, 4, 5)),
@@ -219,9 +263,25 @@ FLAT = Mesh(
         ({"constraints": (FaceCollisions(thickness=0.2),)}, "at most 0.11.* a third of the smallest height"),
         ({"groups": (Group(network=CROSSED),)}, "edge between particles 1 and 2 passes through the face of 3, 4 and 5"),
         ({"groups": (Group(network=FLAT),)}, "meshes must not intersect"),
+        ({"obstacles": (FLOOR,)}, r"obstacles\[0\] = half_space: only particles.* by collisions, which must be listed"),
+        ({"obstacles": (FLOOR,), "constraints": (Collisions(obstacles=False), SOLID)}, "by collisions"),
+        ({"obstacles": (Circle(centre=(0, 0, 0), radius=3, hollow=True),)}, r"obstacles\[0\] = hollow circle: only"),
+        ({"obstacles": (POLES[0], FIELD)}, r"obstacles\[1\] = distance_field: faces would go through it; allowed"),
+        ({"obstacles": (POLES[1], HUGE)}, r"particle 0 is inside obstacles\[1\]"),
+        ({"obstacles": (Block(centre=(0.5, 0.05, 0), size=(0.2, 0.2, 9)),)}, r"edge .* passes through obstacles\[0\]"),
+        ({"obstacles": (POLE,)}, r"obstacles\[0\] passes through the face of"),
     ],
 )  # fmt: skip
 def test_what_makes_no_sense_is_refused(change: dict[str, Any], text: str) -> None:
     given: dict[str, Any] = {"dimension": 3, "groups": (sheet(2, 1.0, (0, 0, 0)),), "constraints": (SOLID,)}
     with pytest.raises(ValueError, match=text):
         Scene(**(given | change))
+
+
+@pytest.mark.parametrize("obstacle", [FLOOR, Circle(centre=(0, 0, 0), radius=3, hollow=True)])
+def test_what_leaves_a_convex_region_free_needs_collisions_of_particles(obstacle: Any) -> None:
+    scene_of(sheet(2, 1.0, (0, 0, 0)), constraints=(Collisions(agents=False), SOLID), obstacles=(obstacle,))
+
+
+def test_without_obstacles_any_are_allowed() -> None:
+    scene_of(sheet(2, 1.0, (0, 0, 0)), constraints=(FaceCollisions(obstacles=False),), obstacles=(FLOOR, FIELD, HUGE))

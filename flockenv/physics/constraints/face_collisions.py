@@ -17,6 +17,7 @@ from flockenv.model.surface import faces_of
 from flockenv.physics.constraints.constraint import Constraint, Settler
 from flockenv.physics.constraints.face_contacts import Contacts, Motion, Pairs
 from flockenv.physics.constraints.face_mesh import check_intersections, make_mesh, shortest_height
+from flockenv.physics.constraints.face_obstacles import check_obstacles, solids_of
 from flockenv.physics.constraints.face_step import FaceRules, FaceScratch, settle_faces
 from flockenv.physics.constraints.face_zones import SUMS, Zones
 
@@ -35,15 +36,15 @@ class FaceCollisions(Constraint):
     """Faces are solid: the triangles of cloth and meshes, and the surfaces of tetrahedra; 3-D.
 
     No point passes a face, and no edge another, of the same network or of two, along the straight lines from the start
-    to the end of a step. Agents without faces are balls of their radius. Round obstacles, capsules and walls of any
-    size are solid for faces if they stand still; with other obstacles only particles collide (`collisions`, listed
-    before).
+    to the end of a step. Agents without faces are balls of their radius. Obstacles of any size are solid for faces,
+    also if they move: circles, capsules, walls and blocks. Half-spaces and hollow shapes need `collisions` of
+    particles, listed before; other obstacles are refused.
 
     What comes nearer than `thickness` is moved apart gently, and what approaches is stopped by an inelastic impulse
     with Coulomb friction, in passes over all that touch (Bridson, Fedkiw and Anderson 2002). What `passes` do not
     resolve moves as a rigid body in this step: an impact zone. A zone that holds a pinned particle or an obstacle
-    stands still. So nothing intersects after any step, and momentum is conserved. Work counters: face_passes, impacts,
-    impact_zones, largest_zone.
+    moves as that does. So nothing intersects after any step, and momentum is conserved. If given motions leave no
+    room, a warning says so. Work counters: face_passes, impacts, impact_zones, largest_zone.
     """
 
     kind: Literal["face_collisions"] = "face_collisions"
@@ -69,7 +70,9 @@ class FaceCollisions(Constraint):
             raise ValueError(f"{what}: dtype = {scene.dtype} is too coarse for thin gaps; allowed: float64")
         if not len(faces_of(scene)):
             raise ValueError(f"{what}: no group has a network with faces: cloth, or a mesh of triangles or tetrahedra")
-        check_intersections(scene)
+        if self.obstacles:
+            check_obstacles(scene, scene.constraints[:-1])
+        check_intersections(scene, self.obstacles)
         most = THICKEST * shortest_height(scene)
         if self.thickness is not None and self.thickness > most:
             raise ValueError(
@@ -79,8 +82,9 @@ class FaceCollisions(Constraint):
 
     def numbers(self, scene: SceneView) -> int:
         """Return the scratch memory, in numbers per agent."""
-        faces = len(faces_of(scene))
-        return 40 + SUMS + -(-faces * 120 // int(scene.agents))
+        solids = solids_of(scene.obstacles if self.obstacles else ())
+        more = 120 * (len(faces_of(scene)) + len(solids.faces)) + (40 + SUMS) * len(solids.place)
+        return 40 + SUMS + -(-more // int(scene.agents))
 
     def settler(self, scene: SceneView) -> Settler:
         """Return a function that corrects a step, with scratch memory of its own."""
@@ -124,8 +128,8 @@ class _FaceSettler:
         while first < end:
             short = entry(settle_faces)(
                 x0, state.x, state.v, state.alive, np.ascontiguousarray(state.obstacle_x[:, :, :m]),
-                np.ascontiguousarray(state.obstacle_radius[:, :m]), self.mesh, self.scratch, self.rules, state.work,
-                self.where, first, end, self.report,
+                np.ascontiguousarray(state.obstacle_radius[:, :m]), state.tick, self.mesh, self.scratch, self.rules,
+                state.work, self.where, first, end, self.report,
             )  # fmt: skip
             world, agent, needed, *lost = (int(k) for k in self.report)
             stopped, unsolved = stopped + lost[0], unsolved + lost[1]
@@ -143,6 +147,7 @@ class _FaceSettler:
         text = f"constraints: face_collisions: in a step, after passes = {self.record.passes}"
         if stopped:
             text += f", {stopped} particles in impact zones that touch an obstacle, a pin or themselves stood still"
+            text += " or moved with it"
         if unsolved:
             text += (
                 f"{' and' if stopped else ','} {unsolved} pairs of faces and points, or edges, touched from its start"

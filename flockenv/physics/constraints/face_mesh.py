@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.geometry.box_tree import BoxTree, build_tree, fit_parents, overlapping_pairs
-from flockenv.geometry.shapes import Capsule, Circle, Shape, Wall
 from flockenv.jit.decorators import python_of
 from flockenv.model.network import element_edges, pairs_of
 from flockenv.model.scene_view import SceneView
 from flockenv.model.surface import faces_of
+from flockenv.physics.constraints.face_obstacles import MOTION, Solids, solids_of
 
 __all__ = ["FaceMesh", "check_intersections", "edges_of", "make_mesh", "shortest_height"]
 
@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 
 
 class FaceMesh(NamedTuple):
-    """V vertices: N agents, then M round obstacles of the state, then ends of other obstacles; and what they span."""
+    """V vertices: N agents, then M round obstacles of the state, then those of other obstacles; and what they span."""
 
     faces: Any  # (F, 3)
     edges: Any  # (E, 2)
@@ -30,7 +30,8 @@ class FaceMesh(NamedTuple):
     edge_tree: BoxTree
     light: Any  # (V,) 1/kg; 0 for obstacles, and particles that are held in place
     radius: Any  # (V,) m; 0 for the vertices of faces
-    place: Any  # (V, 3) m, of the ends of obstacles; the others are 0
+    place: Any  # (V, 3) m, of the vertices of obstacles that are not in the state; the others are 0
+    motion: Any  # (V, MOTION) of the same vertices; the others are 0
 
 
 def edges_of(faces: Ints) -> Ints:
@@ -49,53 +50,38 @@ def rest_of(scene: SceneView) -> Floats:
 
 
 def shortest_height(scene: SceneView) -> float:
-    """Return the smallest height of a face at the start, m."""
+    """Return the smallest height of a face of a network at the start, m."""
     a, b, c = rest_of(scene)[faces_of(scene)].transpose(1, 0, 2)
     longest = np.maximum.reduce([np.linalg.norm(p - q, axis=1) for p, q in ((a, b), (b, c), (c, a))])
     return float((np.linalg.norm(np.cross(b - a, c - a), axis=1) / longest).min())
 
 
-def _segments(shapes: tuple[Shape, ...]) -> tuple[Floats, Ints, Floats]:
-    """Return ends, edges and radii of the ends of capsules and walls that stand still and are not hollow."""
-    ends: list[tuple[float, ...]] = []
-    pairs: list[tuple[int, int]] = []
-    radii: list[float] = []
-    for shape in shapes:
-        if not isinstance(shape, Capsule | Wall) or not _stands(shape):
-            continue
-        line = [shape.start, shape.end] if isinstance(shape, Capsule) else list(shape.vertices)
-        pairs += [(len(ends) + k, len(ends) + k + 1) for k in range(len(line) - 1)]
-        ends += line
-        radii += [shape.radius] * len(line)
-    return np.array(ends).reshape(-1, 3), np.array(pairs, np.int32).reshape(-1, 2), np.array(radii)
-
-
-def _stands(shape: Shape) -> bool:
-    """Return True if an obstacle does not move, and is solid inside."""
-    return shape.velocity is None and shape.sway is None and not getattr(shape, "hollow", False)
-
-
-def outside(shapes: tuple[Shape, ...]) -> list[str]:
-    """Return the kinds of obstacles that only particles collide with, each once."""
-    return sorted({s.kind for s in shapes if not (isinstance(s, Capsule | Wall | Circle) and _stands(s))})
-
-
 def make_mesh(scene: SceneView, obstacles: bool) -> FaceMesh:
     """Return all that may collide in a scene."""
-    faces, place = faces_of(scene), rest_of(scene)
+    solids = solids_of(scene.obstacles if obstacles else ())
     n, m = scene.agents, len(scene.circles) if obstacles else 0
-    ends, more, radii = _segments(tuple(scene.shapes) if obstacles else ())
-    edges = np.concatenate([edges_of(faces), more + np.int32(n + m)])
-    radius = np.concatenate([np.asarray(scene.body.radius, float), np.zeros(m), radii])
-    radius[np.unique(faces)] = 0.0
-    place = np.concatenate([place, np.zeros((m, 3)), ends])
+    faces, edges, place = _with_solids(scene, solids, n + m)
+    radius = np.concatenate([np.asarray(scene.body.radius, float), np.zeros(m), solids.radius])
+    radius[np.unique(faces_of(scene))] = 0.0
     light = np.zeros(len(place))
     light[:n] = np.where(np.isfinite(scene.body.mass), 1 / np.asarray(scene.body.mass, float), 0.0)
     corners = np.zeros(n, bool)
     corners[_inner_corners(scene)] = True
     points = np.concatenate([np.flatnonzero(~corners), np.arange(n, len(place))])
     trees = build_tree(place[faces].mean(axis=1)), build_tree(place[edges].mean(axis=1))
-    return FaceMesh(faces, edges, points.astype(np.int32), *trees, light, radius, place)
+    motion = np.concatenate([np.zeros((n + m, MOTION)), solids.motion])
+    return FaceMesh(faces, edges, points.astype(np.int32), *trees, light, radius, place, motion)
+
+
+def _with_solids(scene: SceneView, solids: Solids, first: int) -> tuple[Ints, Ints, Floats]:
+    """Return the faces, the edges and the positions of networks and of solids, whose first vertex is `first`."""
+    faces, place = faces_of(scene), rest_of(scene)
+    between = np.zeros((first - scene.agents, 3))
+    return (
+        np.concatenate([faces, solids.faces + np.int32(first)]),
+        np.concatenate([edges_of(faces), solids.edges + np.int32(first)]),
+        np.concatenate([place, between, solids.place]),
+    )
 
 
 def _inner_corners(scene: SceneView) -> NDArray[np.int64]:
@@ -109,10 +95,10 @@ def _inner_corners(scene: SceneView) -> NDArray[np.int64]:
     return np.concatenate([np.zeros(0, np.int64), *inner])
 
 
-def check_intersections(scene: SceneView) -> None:
-    """Raise ValueError if an edge passes through a face at the start, or a particle lies in one."""
-    faces, place = faces_of(scene), rest_of(scene)
-    edges = edges_of(faces)
+def check_intersections(scene: SceneView, obstacles: bool) -> None:
+    """Raise ValueError if an edge passes through a face at the start, or a particle lies in one or in a block."""
+    solids, n = solids_of(scene.obstacles if obstacles else ()), scene.agents
+    faces, edges, place = _with_solids(scene, solids._replace(place=solids.start), n)
     tree = build_tree(place[faces].mean(axis=1))
     corners = place[faces]
     at = len(tree.order) - 1 + tree.leaf
@@ -121,13 +107,24 @@ def check_intersections(scene: SceneView) -> None:
     ends = place[edges]
     query, face = overlapping_pairs(tree, np.concatenate([ends.min(axis=1), ends.max(axis=1)], axis=1))
     own = (edges[query][:, :, None] == faces[face][:, None, :]).any(axis=(1, 2))
+    own |= (edges[query, 0] >= n) & (faces[face, 0] >= n)
     query, face = query[~own], face[~own]
+
+    def name(what: str, particles: Ints) -> str:
+        if particles[0] >= n:
+            return f"obstacles[{solids.owner[particles[0] - n]}]"
+        *most, last = particles.tolist()
+        return f"the {what} {', '.join(map(str, most))} and {last}"
+
     for k in np.flatnonzero(_pierces(ends[query], corners[face])):
-        edge, corner = edges[query[k]].tolist(), faces[face[k]].tolist()
         raise ValueError(
-            f"kind = face_collisions: at the start the edge between particles {edge[0]} and {edge[1]} passes through "
-            f"the face of {corner[0]}, {corner[1]} and {corner[2]}; meshes must not intersect"
+            f"kind = face_collisions: at the start {name('edge between particles', edges[query[k]])} passes through "
+            f"{name('face of', faces[face[k]])}; meshes must not intersect"
         )
+    for k in np.unique(solids.owner[solids.faces[:, 0]]):
+        inside = scene.obstacles[k].inside(rest_of(scene) - scene.obstacles[k].shift(0.0))
+        for i in np.intersect1d(np.flatnonzero(inside), faces_of(scene)):
+            raise ValueError(f"kind = face_collisions: at the start particle {i} is inside obstacles[{k}]")
 
 
 def _pierces(ends: Floats, corners: Floats) -> NDArray[np.bool_]:

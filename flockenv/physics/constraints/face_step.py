@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from flockenv.jit.decorators import finite, kernel, routine
 from flockenv.physics.constraints.face_contacts import (
     NEAR,
@@ -53,7 +55,9 @@ class FaceScratch(NamedTuple):
 
 
 @kernel
-def _load(x0: Any, x: Any, v: Any, alive: Any, circles: Any, radii: Any, b: int, mesh: Any, motion: Any) -> int:
+def _load(
+    x0: Any, x: Any, v: Any, alive: Any, circles: Any, radii: Any, tick: Any, b: int, mesh: Any, motion: Any, dt: float
+) -> int:
     """Read the step of world b; return the first agent that is not finite, or -1."""
     n, m, bad = x.shape[2], radii.shape[1], -1
     for i in range(motion.live.shape[0]):
@@ -65,14 +69,27 @@ def _load(x0: Any, x: Any, v: Any, alive: Any, circles: Any, radii: Any, b: int,
                 motion.move[i, k], motion.speed[i, k] = x[k, b, i] - x0[k, b, i], v[k, b, i]
                 if alive[b, i] and not finite(x[k, b, i] + v[k, b, i]) and bad < 0:
                     bad = i
+            elif i < n + m:
+                motion.start[i, k] = circles[k, b, i - n]
             else:
-                motion.start[i, k] = circles[k, b, i - n] if i < n + m else mesh.place[i, k]
+                _load_solid(mesh, i, k, (tick[b] - 1) * dt, tick[b] * dt, motion)
         if i < n:
             motion.live[i] = 1 if alive[b, i] else 0
         elif i < n + m:
             mesh.radius[i] = radii[b, i - n]
             motion.live[i] = 1 if radii[b, i - n] > 0.0 else 0
     return bad
+
+
+@kernel
+def _load_solid(mesh: Any, i: int, k: int, begun: float, ended: float, motion: Any) -> None:
+    """Set coordinate k of an obstacle's vertex: where it begins and ends a step, and its velocity at the end."""
+    course = mesh.motion[i]
+    way, rate, phase = course[3 + k], course[6], course[7]
+    here = course[k] * begun + way * np.sin(rate * begun + phase)
+    motion.start[i, k] = mesh.place[i, k] + here
+    motion.move[i, k] = course[k] * ended + way * np.sin(rate * ended + phase) - here
+    motion.speed[i, k] = course[k] + way * rate * np.cos(rate * ended + phase)
 
 
 @kernel
@@ -204,7 +221,7 @@ def _make_zones(mesh: Any, scratch: Any, rules: Any, since: int) -> int:
 
 @kernel
 def settle_faces(
-    x0: Any, x: Any, v: Any, alive: Any, circles: Any, radii: Any, mesh: FaceMesh, scratch: FaceScratch,
+    x0: Any, x: Any, v: Any, alive: Any, circles: Any, radii: Any, tick: Any, mesh: FaceMesh, scratch: FaceScratch,
     rules: FaceRules, work: Any, where: Any, first: int, end: int, report: Any,
 ) -> int:  # fmt: skip
     """Correct the steps of worlds [first, end) in place; return the world for which there was no room, or -1.
@@ -214,7 +231,7 @@ def settle_faces(
     """
     report[0], report[1], report[2], report[3], report[4] = -1, -1, 0, 0, 0
     for b in range(first, end):
-        bad = _load(x0, x, v, alive, circles, radii, b, mesh, scratch.motion)
+        bad = _load(x0, x, v, alive, circles, radii, tick, b, mesh, scratch.motion, rules.dt)
         if bad >= 0:
             if report[0] < 0:
                 report[0], report[1] = b, bad

@@ -1,8 +1,9 @@
 """Rigid impact zones: vertices whose contacts the passes did not resolve move together, as a rigid body.
 
 Rotation and translation map all of a zone alike, and the straight paths to their ends are affine maps, so nothing in a
-zone passes through it. A zone that still touches something grows; one that touches itself, by rounding, or holds
-something that cannot move, stands still for the rest of the step. As zones only grow or stop, this ends.
+zone passes through it. A zone that still touches something grows; one that touches itself, by rounding, stands still
+for the rest of the step. One that holds a pinned particle or an obstacle moves as that does. As zones only grow or
+stop, this ends.
 Sources: Provot 1997, Collision and self-collision handling in cloth model; Bridson, Fedkiw and Anderson 2002.
 """
 
@@ -33,8 +34,8 @@ class Zones(NamedTuple):
 
     parent: Any  # (V,)
     size: Any  # (V,) number of vertices, of roots
-    still: Any  # (V,) 1 if the zone stands still in this step, of roots
-    held: Any  # (V,) 1 if the zone has a vertex that cannot move, of roots
+    still: Any  # (V,) 1 if the zone stands still in this step, or moves as a vertex whose motion is given, of roots
+    held: Any  # (V,) 1 + number of a vertex of the zone whose motion is given, or 0, of roots
     before: Any  # (V, 3) m, moves before zones
     speed: Any  # (V, 3) m/s, speeds before zones
     sums: Any  # (V, SUMS) of roots
@@ -45,7 +46,7 @@ def clear_zones(zones: Any, light: Any, motion: Any) -> None:
     """Make each vertex a zone of its own, and save its motion."""
     for i in range(light.shape[0]):
         zones.parent[i], zones.size[i], zones.still[i] = i, 1, 0
-        zones.held[i] = 0 if light[i] > 0.0 else 1
+        zones.held[i] = 0 if light[i] > 0.0 else 1 + i
         for k in range(3):
             zones.before[i, k], zones.speed[i, k] = motion.move[i, k], motion.speed[i, k]
 
@@ -73,7 +74,7 @@ def join(zones: Any, who: Any) -> bool:
         zones.still[low] = max(zones.still[low], zones.still[high])
         zones.held[low] = max(zones.held[low], zones.held[high])
     if joined:
-        zones.still[first] = max(zones.still[first], zones.held[first])
+        zones.still[first] = 1 if zones.held[first] > 0 else zones.still[first]
         return True
     stops = zones.still[first] == 0
     zones.still[first] = 1
@@ -142,7 +143,8 @@ def _turned(off: Vec, by: Vec) -> Vec:
 def move_zones(zones: Any, motion: Any, light: Any, ends: bool, clock: int) -> None:
     """Set the moves, or with `ends` the speeds, of zones to rigid ones, of the same momentum and angular momentum.
 
-    A zone that stands still does not move, and keeps its speed, unless it holds a vertex that cannot move.
+    A zone that stands still does not move, and keeps its speed. If it holds vertices whose motion is given, those keep
+    it, and the others move as one of them does.
     """
     field, out = (zones.speed, motion.speed) if ends else (zones.before, motion.move)
     _add_up(zones, motion, light, field)
@@ -159,8 +161,8 @@ def move_zones(zones: Any, motion: Any, light: Any, ends: bool, clock: int) -> N
             by, off = (s[16], s[17], s[18]), _offset(zones, r, motion, i)
             new = (s[4] / s[0], s[5] / s[0], s[6] / s[0])
             new = add(new, cross(by, off) if ends else _turned(off, by))  # type: ignore[assignment]
-        elif ends and light[i] <= 0.0:
-            new = vector_at(new, field, i)  # type: ignore[assignment]
+        elif zones.held[r] > 0:
+            new = vector_at(new, field, i if light[i] <= 0.0 else zones.held[r] - 1)  # type: ignore[assignment]
         old = vector_at(new, out, i)
         if norm(sub(new, old)) > 0.0:
             write_vector(out, i, new)
