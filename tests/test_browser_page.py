@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 pytest.importorskip("websockets", reason="needs the extra `play`: pip install 'flockenv[play]'")
+from flockenv.model.appearance import Appearance
 from flockenv.model.networks import Cloth, Rope
 from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import Springs
@@ -375,21 +376,24 @@ def test_a_frame_that_is_due_is_asked_for_when_the_one_before_has_come(
 DRAWN = """() => {
   const found = { bodies: [], faces: 0 }, [body, triangles] = [drawBody, facesInOrder];
   drawBody = (pen, eye, panel, one, k) => { found.bodies.push(one.i); body(pen, eye, panel, one, k); };
-  facesInOrder = (...given) => { const all = triangles(...given); found.faces = all.length; return all; };
+  facesInOrder = (...given) => { const all = triangles(...given); found.faces = all; return all; };
   drawWorld(views[0], moment(views[0].panel, state.time));
   drawBody = body; facesInOrder = triangles;
+  found.colours = [...new Set(found.faces.map(f => faceColour(views[0].panel, f.face, f.back, 0)))];
+  found.faces = found.faces.length;
   found.legend = document.getElementById("legend").textContent;
   return found;
 }"""
 
 
 def test_agents_without_faces_are_drawn_beside_a_sheet(visit: Callable[..., Visit]) -> None:
-    sheet = Group(network=Cloth(cells=(2, 2), sides=(1.0, 1.0)), mass=0.1)
+    look = Appearance(by="strain", colours=("#0000ff", "#00ff00"))  # twice as long as its springs: a strain of 1
+    sheet = Group(network=Cloth(cells=(2, 2), sides=(1.0, 1.0)), mass=0.1, appearance=look)
     rope = Group(network=Rope(links=2, length=1.0), mass=0.1)
     scene = Scene(
         dimension=3,
         groups=(sheet, Group(count=3, spawn=Spawn(low=(2, 0, 0), high=(3, 1, 1))), rope),
-        effects=(Springs(stiffness=10.0),),
+        effects=(Springs(stiffness=10.0, rest=0.5),),
         dt=0.01,
     )
     session = Session()
@@ -399,5 +403,5 @@ def test_agents_without_faces_are_drawn_beside_a_sheet(visit: Callable[..., Visi
         here = opened(visit, server.url)
         found = here.value(f"({DRAWN})()")
         assert sorted(found["bodies"]) == list(range(9, 15))  # the free agents, and the particles of the rope
-        assert found["faces"] == 8
+        assert found["faces"] == 8 and found["colours"] == ["#00ff00"]
         assert "agent" in found["legend"]

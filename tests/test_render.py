@@ -19,15 +19,21 @@ import pytest
 from PIL import Image
 
 from flockenv.cli.films import Shutter, write_picture
+from flockenv.geometry.space import Torus
 from flockenv.model.appearance import Appearance
 from flockenv.model.networks import Cloth
 from flockenv.model.snapshot import ROLES, Mark, Snapshot
 from flockenv.model.spawn import Spawn
+from flockenv.model.state import State
+from flockenv.physics.effects import Springs
+from flockenv.play.fields import colour_of
+from flockenv.play.scene_lane import SceneLane
 from flockenv.render import Group, Panel, Window, draw, write_gif, write_png, write_replay
 from flockenv.render.palette import ROLE_COLOURS, rgb
 from flockenv.render.view import view_of
 from flockenv.scene import Group as SceneGroup
 from flockenv.scene import Scene
+from flockenv.studies.trajectory import record
 
 
 def shot(pos: Any = ((5.0, 5.0),), vel: Any = None, **fields: Any) -> Snapshot:
@@ -368,6 +374,53 @@ def test_faces_that_cross_hide_each_other_pixel_by_pixel_and_backs_have_their_ow
 def test_a_face_across_the_seam_is_drawn_at_both_edges() -> None:
     seen = faced([(9.0, 4.0), (1.0, 4.0), (9.0, 6.0)], [(0, 1, 2)], periodic=True)
     assert seen[:, :40].any() and seen[:, -40:].any() and not seen[:, 100:500].any()
+
+
+STRAINED = Appearance(by="strain", over=(0.0, 0.1), colours=("#0000ff", "#ff0000"))
+
+
+def strained(springs: Springs, by: float = 1.0, **fields: Any) -> tuple[Scene, State]:
+    """Return a sheet of two cells of 1 m by 1 m, pulled along x by a factor."""
+    sheet = SceneGroup(network=Cloth(cells=(2, 1), sides=(2.0, 1.0)), appearance=STRAINED)
+    scene = Scene(dimension=3, groups=(sheet,), effects=(springs,), dt=0.001, **fields)
+    state = scene.start(0)
+    return scene, state.with_motion(state.pos * (by, 1.0, 1.0), state.vel)
+
+
+def test_strain_is_the_mean_over_the_edges_at_an_agent_and_colours_faces() -> None:
+    scene, state = strained(Springs(stiffness=1.0), 1.05)
+    expected = np.array([0.025, 0.1 / 3, 0.025] * 2)
+    np.testing.assert_allclose(scene.view.strain(state), expected, atol=1e-12)
+    np.testing.assert_allclose(scene.snapshot(state).shade, expected / 0.1, atol=1e-9)
+    np.testing.assert_allclose(next(record(scene, 0, 0, 1).snapshots()).shade, 0.0, atol=1e-9)
+    lane = SceneLane(scene)
+    lane.state = state
+    np.testing.assert_allclose(lane.drawn.shade, expected / 0.1, atol=1e-9)
+    np.testing.assert_allclose(colour_of(lane, "strain").values, expected, atol=1e-12)
+    for factor, channel in ((1.0, 2), (1.5, 0)):  # blue at rest, red if strained
+        scene, state = strained(Springs(stiffness=1.0), factor)
+        picture = draw(scene.snapshot(state), 200)
+        assert (picture[..., channel].astype(int) - picture[..., 2 - channel] > 100).sum() > 500
+
+
+def test_strain_is_over_the_present_rest_lengths_and_leaves_broken_edges_out() -> None:
+    scene, state = strained(Springs(stiffness=1.0, break_strain=0.5))
+    assert scene.edges[:2].tolist() == [[0, 1], [0, 3]]
+    first, second = scene.edge_springs[:2]
+    state.bonds[0, first], state.bonds[0, second] = np.inf, 0.8  # broken, and yielded from 1 m
+    np.testing.assert_allclose(scene.view.strain(state), [0.25, 0, 0, 0.25 / 2, 0, 0], atol=1e-12)
+    scene, state = strained(Springs(stiffness=1.0, rest=0.5))
+    np.testing.assert_allclose(scene.view.strain(state), 1.0)
+    scene, state = strained(Springs(stiffness=1.0, rest=0.0))
+    np.testing.assert_array_equal(scene.view.strain(state), 0.0)
+
+
+def test_strain_takes_the_shortest_path_on_a_torus_and_needs_a_network() -> None:
+    scene, state = strained(Springs(stiffness=1.0), space=Torus(size=(9, 9, 9)))
+    state = state.with_motion(scene.space.wrap(state.pos - 0.5), state.vel)
+    np.testing.assert_allclose(scene.view.strain(state), 0.0, atol=1e-12)
+    with pytest.raises(ValueError, match=r"groups\[0\].appearance.by = strain: needs a network"):
+        Scene(groups=(SceneGroup(count=2, appearance=STRAINED),), space=Torus(size=(9, 9)), dt=0.1)
 
 
 def test_agents_with_bonds_leave_no_trail() -> None:

@@ -18,10 +18,10 @@ Size = Annotated[float, Field(ge=0)]
 
 
 class Appearance(Record):
-    """Points, discs, polygons or metaballs whose colour, opacity and size may depend on age, speed or an inner state.
+    """Points, discs, polygons or metaballs whose colour, opacity and size may depend on one quantity.
 
-    `by` names that quantity, and `over` is its range: from the first to the last colour, opacity and size, which are
-    interpolated.
+    `by` names it: age, speed, strain or an inner state. `over` is its range: from the first to the last colour, opacity
+    and size, which are interpolated.
     """
 
     sentence: ClassVar[str] = "drawn as {form}"
@@ -35,12 +35,14 @@ class Appearance(Record):
         default=((1.0, 0.0), (-0.8, 0.6), (-0.8, -0.6)), min_length=3, max_length=64,
         description="corners of a polygon, x ahead, in units of its size",
     )  # fmt: skip
-    by: Literal["age", "speed", "inner"] | None = Field(
-        default=None, description="quantity on which the appearance depends (default: none)"
+    by: Literal["age", "speed", "strain", "inner"] | None = Field(
+        default=None,
+        description="quantity on which the appearance depends; strain: the mean of |l / L - 1| over the edges of the "
+        "agent's network that end at it, L the rest length (default: none)",
     )
     of: str | None = Field(default=None, description="name of the inner state; only if by = inner")
     over: tuple[float, float] = Field(
-        default=(0.0, 1.0), description="s, m/s, or the unit of the inner state: range of that quantity"
+        default=(0.0, 1.0), description="s, m/s, 1, or the unit of the inner state: range of that quantity"
     )
     colours: tuple[Colour, ...] = Field(
         default=(), description="#rrggbb, first to last, evenly spaced (default: the colour of its role)"
@@ -57,20 +59,25 @@ class Appearance(Record):
         changes = len(self.colours) > 1 or self.opacity[0] != self.opacity[1]
         changes |= self.size is not None and self.size[0] != self.size[1]
         if changes and self.by is None:
-            raise ValueError("by: missing; colours, opacity or size depend on age, speed or an inner state")
+            raise ValueError("by: missing; colours, opacity or size depend on age, speed, strain or an inner state")
         if (self.by == "inner") != (self.of is not None):
             raise ValueError(f"of = {self.of}: is needed if by = inner, to name the inner state, and only then")
         return self
 
     def shade(
-        self, age: NDArray[np.float64], speed: NDArray[np.float64], inner: NDArray[np.float64] | None = None
+        self, age: NDArray[np.float64], speed: NDArray[np.float64], shown: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Return the position of each agent's value within `over`, (N,) from 0 to 1; inner: the state named by `of`."""
-        value = {"age": age, "speed": speed, "inner": inner}.get(self.by or "")
+        """Return the position of each agent's value within `over`, (N,) from 0 to 1; shown: strain or inner state."""
+        value = {"age": age, "speed": speed, "strain": shown, "inner": shown}.get(self.by or "")
         if value is None:
             return np.zeros(len(age))
         value = np.nan_to_num(value, posinf=self.over[1])
         return np.asarray(np.clip((value - self.over[0]) / (self.over[1] - self.over[0]), 0.0, 1.0))
+
+    @property
+    def reads_scene(self) -> bool:
+        """True if its quantity is known to the scene only, not to a snapshot's positions and velocities."""
+        return self.by in ("strain", "inner")
 
     def colour(self, shade: float, usual: str) -> tuple[int, int, int]:
         """Return the colour at a shade, red, green and blue from 0 to 255; usual: the colour of the role."""

@@ -62,7 +62,7 @@ class Snapshot:
     heading (N, D): directions that agents face; default: those of the velocities.
     looks: appearances; look (N,): the index of each agent's own, -1 = none. age (N,): s, of the living; default: the
     time. identity (N,): int, the agent in each row; default: the same agents at all times.
-    inner (N,): the inner state of each agent that its look shows; none by default.
+    shown (N,): the strain or inner state of each agent that its look shows; none by default.
     Arrays are private copies and read-only. Positions and velocities may hold NaN or inf: such bodies of a run that
     diverged are not drawn.
     Raises ValueError or TypeError, in one line that names the field, for other values.
@@ -88,7 +88,7 @@ class Snapshot:
     look: NDArray[np.int32] | None = None
     age: Floats | None = None
     identity: NDArray[np.int64] | None = None
-    inner: Floats | None = None
+    shown: Floats | None = None
     broken: NDArray[np.bool_] | None = None
     faces: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 3), np.int32))
 
@@ -118,7 +118,7 @@ class Snapshot:
             look=_integers("Snapshot.look", np.full(agents, -1) if self.look is None else self.look, agents),
             age=None if self.age is None else _array("Snapshot.age", self.age, (agents,)),
             identity=None if self.identity is None else _integers("Snapshot.identity", self.identity, agents),
-            inner=None if self.inner is None else _array("Snapshot.inner", self.inner, (agents,)),
+            shown=None if self.shown is None else _array("Snapshot.shown", self.shown, (agents,)),
             broken=None if self.broken is None else _switches("Snapshot.broken", self.broken, len(self.bonds)),
             faces=_agents("Snapshot.faces", self.faces, 3, agents),
         )
@@ -148,7 +148,7 @@ class Snapshot:
     def shade(self) -> Floats:
         """The position of each agent's value in the range of its look, (N,) from 0 to 1; 0 without a look."""
         age = np.full(self.agents, self.time) if self.age is None else self.age
-        return shades_of(self.looks, self.look, age, self.vel, self.inner)
+        return shades_of(self.looks, self.look, age, self.vel, self.shown)
 
     def is_same(self, other: Snapshot) -> NDArray[np.bool_]:
         """True for rows that hold the same agent in another snapshot, (N,) bool."""
@@ -180,18 +180,18 @@ class Snapshot:
 
 
 def shades_of(
-    looks: Sequence[Appearance], look: NDArray[np.int32] | None, age: Floats, vel: Floats, inner: Floats | None
+    looks: Sequence[Appearance], look: NDArray[np.int32] | None, age: Floats, vel: Floats, shown: Floats | None
 ) -> Floats:
     """Return the position of each agent's value in the range of its look, (N,) from 0 to 1; 0 without a look.
 
-    look (N,): index of the look of each agent; age (N,) s; vel (N, D) m/s; inner (N,): the inner state that is shown.
+    look (N,): index of the look of each agent; age (N,) s; vel (N, D) m/s; shown (N,): strain or inner state.
     """
     shade = np.zeros(len(vel))
     with np.errstate(over="ignore", invalid="ignore"):
         speed = np.linalg.norm(vel, axis=1)
     for k, each in enumerate(looks):
         mine = look == k
-        shade[mine] = each.shade(age[mine], speed[mine], None if inner is None else inner[mine])
+        shade[mine] = each.shade(age[mine], speed[mine], None if shown is None else shown[mine])
     return shade
 
 

@@ -99,6 +99,13 @@ def _pressure(lane: Lane, drawn: Drawn) -> Coloured:
     return Coloured(values, 0.0, _largest(values, drawn), "N/m" if scene.dimension == 2 else "N/m^2")
 
 
+def _strain(lane: Lane, drawn: Drawn) -> Coloured:
+    """Return the mean strain of the edges at each agent, as of appearances."""
+    assert isinstance(lane, SceneLane)
+    strain = lane.record.view.strain(lane.state)
+    return Coloured(strain, 0.0, _largest(strain, drawn), "1")
+
+
 def _inner(name: str) -> Callable[[Lane, Drawn], Coloured]:
     def values(lane: Lane, drawn: Drawn) -> Coloured:
         assert isinstance(lane, SceneLane)
@@ -121,6 +128,8 @@ def colours_of(lane: Lane) -> dict[str, Callable[[Lane, Drawn], Coloured]]:
         found |= {"acceleration": _force, **{name: _inner(name) for name in lane.record.parts.inner}}
         if any(isinstance(effect, Contact) for effect in lane.record.effects) and lane.record.body.radius.all():
             found["pressure"] = _pressure
+        if len(lane.record.edges):
+            found["strain"] = _strain
     return found
 
 

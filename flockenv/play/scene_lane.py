@@ -316,7 +316,7 @@ class SceneLane:
         view, state = self.record.view, self.state
         if not view.looks:
             return None
-        return shades_of(view.looks, view.look, state.age[0], state.vel[0], view.inner_numbers(state))
+        return shades_of(view.looks, view.look, state.age[0], state.vel[0], view.shown_numbers(state))
 
     @property
     def scenery(self) -> Scenery:

@@ -133,6 +133,7 @@ def _panel_data(panel: Panel) -> dict[str, Any]:
         "pos": _to_base64(np.stack([_quantise_positions(shot) for shot in shots])),
         "heading": _to_base64(np.stack([_quantise_headings(shot) for shot in shots])),
         "bonds": first.bonds.tolist(),
+        "faces": first.faces.tolist(),
         **_broken_data(shots),
         "scenery": _scenery_data(shots),
         **_look_data(shots),

@@ -172,7 +172,7 @@ class Scene(Record):
         return self
 
     def _check_inner_numbers(self) -> None:
-        """Raise ValueError for laws that read inner numbers which no effect keeps."""
+        """Raise ValueError for laws and appearances that read inner numbers or strains which the scene lacks."""
         kept_numbers = {name for effect in self.effects for each in (*effect.components, effect) for name in each.keeps}
         for k, effect in enumerate(self.effects):
             for each in (*effect.components, effect):
@@ -183,6 +183,8 @@ class Scene(Record):
                         f"kinds that keep it: {', '.join(keepers) or 'none'}"
                     )
         for k, group in enumerate(self.groups):
+            if group.appearance is not None and group.appearance.by == "strain" and group.network is None:
+                raise ValueError(f"groups[{k}].appearance.by = strain: needs a network, whose edges are strained")
             if group.appearance is not None and group.appearance.of not in {None, *kept_numbers}:
                 of = group.appearance.of
                 raise ValueError(

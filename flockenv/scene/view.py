@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from flockenv.geometry.shapes import Shape
 from flockenv.geometry.space import Plane
 from flockenv.model.appearance import Appearance
+from flockenv.model.networks import EDGE
 from flockenv.model.scene_view import SceneView
 from flockenv.model.snapshot import Mark, Snapshot
 from flockenv.model.state import Floats, State
 from flockenv.model.surface import faces_of
+from flockenv.physics.effects import Springs
 from flockenv.physics.population import Emitter
 
 __all__ = ["View"]
@@ -49,7 +51,7 @@ class View:
             outlines=self.outlines(low, high, float(state.time[world])),
             looks=self.looks, look=self.look if self.looks else None,
             age=state.age[world] if self.scene.population else None,
-            identity=state.identity[world] if self.scene.population else None, inner=self.inner_numbers(state, world),
+            identity=state.identity[world] if self.scene.population else None, shown=self.shown_numbers(state, world),
             broken=self.broken(state, world), faces=self.faces,
         )  # fmt: skip
 
@@ -66,15 +68,44 @@ class View:
         springs = self.scene.edge_springs
         return np.asarray((springs < kept) & np.isinf(state.bonds[world, np.minimum(springs, kept - 1)]))
 
-    def inner_numbers(self, state: State, world: int = 0) -> NDArray[np.float64] | None:
-        """Return the inner number of every agent that pictures show, (N,), set by its appearance; None without one."""
-        if not any(look.by == "inner" for look in self.looks):
+    def strain(self, state: State, world: int = 0) -> NDArray[np.float64]:
+        """Return the mean of |l / L - 1| over the edges of networks at each agent, (N,); 0 without one.
+
+        L: the present rest length; edges that are broken, or have none, do not count.
+        """
+        edges, rest, kept = self.scene.edges, self._rest, state.bonds.shape[1]
+        if kept:
+            springs = self.scene.edge_springs
+            present = state.bonds[world, np.minimum(springs, kept - 1)]
+            rest = np.where((springs < kept) & (present > 0), present, rest)
+        whole = (rest > 0) & np.isfinite(rest)
+        ends, rest = edges[whole].T, rest[whole]
+        offset = self.scene.space.displacement(state.pos[world][ends[0]], state.pos[world][ends[1]])
+        strain = np.abs(np.linalg.norm(offset, axis=1) / rest - 1.0)
+        total, count = (np.bincount(ends.ravel(), w, self.scene.agents) for w in (np.tile(strain, 2), None))
+        return np.asarray(total / np.maximum(count, 1))
+
+    @functools.cached_property
+    def _rest(self) -> NDArray[np.float64]:
+        """The rest lengths of the edges of networks at the start, (E,) m."""
+        found = [np.zeros(0)]
+        for k, group in enumerate(self.scene.groups):
+            if group.network is not None:
+                springs = group.network.springs(self.scene.dimension)
+                own = (e.rest for e in self.scene.effects if isinstance(e, Springs) and e.group == k)
+                found.append(next(own, 1.0) * springs.rest[springs.role == EDGE])
+        return np.concatenate(found)
+
+    def shown_numbers(self, state: State, world: int = 0) -> NDArray[np.float64] | None:
+        """Return the strain or inner number of every agent that its appearance shows, (N,); None without one."""
+        if not any(look.reads_scene for look in self.looks):
             return None
         numbers = np.zeros(self.scene.agents)
+        strain = self.strain(state, world) if any(look.by == "strain" for look in self.looks) else numbers
         for k, group in enumerate(self.scene.groups):
-            if group.appearance is not None and group.appearance.of is not None:
-                slots = slice(self.scene.starts[k], self.scene.starts[k + 1])
-                numbers[slots] = self.scene.inner(state, group.appearance.of)[world, slots]
+            if group.appearance is not None and group.appearance.reads_scene:
+                slots, name = slice(self.scene.starts[k], self.scene.starts[k + 1]), group.appearance.of
+                numbers[slots] = (strain if name is None else self.scene.inner(state, name)[world])[slots]
         return numbers
 
     @property

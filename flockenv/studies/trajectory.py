@@ -54,7 +54,7 @@ class Trajectory:
     heading: Floats | None = None  # (T, N, D) directions that agents face, of scenes that keep headings
     identity: NDArray[np.int64] | None = None  # (T, N) the agent in each slot, of scenes with a population
     born: NDArray[np.float64] | None = None  # (T, N) s, times of birth
-    shown: NDArray[np.float64] | None = None  # (T, N) inner numbers, of scenes whose pictures show them
+    shown: NDArray[np.float64] | None = None  # (T, N) strains or inner numbers, of scenes whose pictures show them
     broken: NDArray[np.bool_] | None = None  # (T, E) edges of networks that are broken, of scenes whose springs break
 
     @property
@@ -88,7 +88,7 @@ class Trajectory:
                 heading=None if self.heading is None else self.heading[k], outlines=walls,
                 identity=None if self.identity is None else self.identity[k],
                 age=None if self.born is None else time - self.born[k],
-                inner=None if self.shown is None else self.shown[k],
+                shown=None if self.shown is None else self.shown[k],
                 broken=None if self.broken is None else self.broken[k],
             )  # fmt: skip
 
@@ -117,8 +117,8 @@ class Trajectory:
 
         Arrays: time (T,) s, pos (T, N, D) m, vel (T, N, D) m/s, alive (T, N), radius (N,) m, seed, and `scene`, the
         YAML text that `load_scene` reads; heading (T, N, D) where headings are kept; identity and born (T, N), s, where
-        there is a population; shown (T, N), if pictures show inner numbers; broken (T, E), if springs yield or break.
-        None needs pickle. Missing folders are created.
+        there is a population; shown (T, N), if pictures show strains or inner numbers; broken (T, E), if springs yield
+        or break. None needs pickle. Missing folders are created.
         """
         write = {".csv": write_csv, ".parquet": write_parquet}.get(path.suffix.lower())
         beside = path.with_suffix(".json")
@@ -210,7 +210,7 @@ class _Film:
         pos, vel, heading = (np.empty(shape, scene.dtype) for _ in range(3))
         who, since = (np.empty(shape[:2], np.int64), np.empty(shape[:2])) if scene.population else (None, None)
         faced = heading if scene.parts.oriented else None
-        shown = np.empty(shape[:2]) if any(look.by == "inner" for look in scene.view.looks) else None
+        shown = np.empty(shape[:2]) if any(look.reads_scene for look in scene.view.looks) else None
         broken = np.zeros((instants, len(scene.edges)), np.bool_) if scene.parts.keeps_bonds else None
         return cls(pos, vel, np.empty(shape[:2], np.bool_), faced, who, since, shown, broken, scene, [])
 
@@ -224,7 +224,7 @@ class _Film:
             if self.identity is not None and self.born is not None:
                 self.identity[k], self.born[k] = state.identity[0], state.born[0]
             if self.shown is not None:
-                self.shown[k] = self.scene.view.inner_numbers(state)
+                self.shown[k] = self.scene.view.shown_numbers(state)
             if self.broken is not None:
                 self.broken[k] = self.scene.view.broken(state)
             self.step.append(step)
@@ -235,7 +235,7 @@ def _count_instants(scene: Scene, steps: int, every: int) -> int:
         raise ValueError(f"steps = {steps} must be at least 0 and every = {every} at least 1")
     instants = 1 + -(-steps // every)
     each = scene.agents * ((2 + scene.parts.oriented) * scene.dimension * np.dtype(scene.dtype).itemsize + 1)
-    each += (16 * bool(scene.population) + 8 * any(look.by == "inner" for look in scene.view.looks)) * scene.agents
+    each += (16 * bool(scene.population) + 8 * any(look.reads_scene for look in scene.view.looks)) * scene.agents
     each += len(scene.edges) if scene.parts.keeps_bonds else 0
     needed = instants * (each + 40)  # the step is a Python number in a list
     if needed > MEMORY_LIMIT:

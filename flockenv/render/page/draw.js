@@ -268,7 +268,7 @@ function drawWorld(view, now) {
   if (!eye.flat) drawBorder(pen, eye, panel);
   const all = bodies(panel, now), broken = brokenBonds(panel, now.k), hidden = coveredAgents(panel);
   drawBonds(pen, eye, panel, all, broken, hidden);
-  if (hidden) drawFaces(pen, eye, panel, all, broken);
+  if (hidden) drawFaces(pen, eye, panel, all, broken, now.k);
   drawMetaballs(pen, eye, panel, all, now.k);
   if (panel.N > CROWD) drawCrowd(pen, eye, panel, all, now.k, hidden); else drawBodies(pen, eye, panel, all, now.k, hidden);
   if (view.over) view.over(pen, eye, now, all);

@@ -37,16 +37,25 @@ function facesInOrder(panel, eye, all, broken) {
     const corners = face.map(i => placeOf(all, i)), middle = [0, 1, 2].map(d => (corners[0][d] + corners[1][d] + corners[2][d]) / 3);
     const normal = normalOf(...corners), seen = eye.rows.map(row => dotOf(row, normal)), back = panel.D === 3 && seen[2] < 0;
     const lit = panel.D < 3 ? 0.6 : clamp(dotOf(seen, LIGHT) * (back ? -1 : 1), 0, 1);
-    return { corners, kind: panel.kind[face[0]], depth: eye.depth(...middle), lit, back };
+    return { corners, face, depth: eye.depth(...middle), lit, back };
   }).sort((p, q) => p.depth - q.depth);
 }
 
-/* Front and back in two colours, paler with distance. */
-function drawFaces(pen, eye, panel, all, broken) {
+/* The colour of a face in frame k: by the quantity that the reader has chosen, or its first corner's look or role. */
+function faceColour(panel, face, back, k) {
+  const shade = panel.frames[k].shade, mean = shade ? Math.round(face.reduce((sum, i) => sum + shade[i], 0) / 3) : 0;
+  if (panel.tint && shade) return panel.tint[mean];
+  const look = panel.looks[panel.look[face[0]]], own = roleColour[panel.roles[face[0]]];
+  if (look && look.colours) return look.colours[Math.round(mean / 255 * (look.colours.length - 1))];
+  return back ? roleColour.learner : own === roleColour.agent ? paint.accent : own;
+}
+
+/* Front and back in two colours without a look, paler with distance. */
+function drawFaces(pen, eye, panel, all, broken, k) {
   const dark = state.dark ? "#0b0f14" : paint.ink;
   pen.lineWidth = 0.7 * eye.ratio; pen.lineJoin = "round";
-  for (const { corners, kind, depth, lit, back } of facesInOrder(panel, eye, all, broken)) {
-    const own = roleColour[panel.kinds[kind]], colour = back ? roleColour.learner : own === roleColour.agent ? paint.accent : own;
+  for (const { corners, face, depth, lit, back } of facesInOrder(panel, eye, all, broken)) {
+    const colour = faceColour(panel, face, back, k);
     const shaded = lit < 0.55 ? mix(colour, dark, 0.45 + lit) : mix("#ffffff", colour, 0.7 * (lit - 0.55));
     pen.fillStyle = pen.strokeStyle = mix(shaded, paint.paper, 0.8 + 0.2 * depth);
     pen.beginPath();
