@@ -128,6 +128,7 @@ def test_all_agents_play_in_the_same_disturbance() -> None:
     assert about == delay.model_dump() and "disturbance" not in best_response.content_of(calm)
 
 
+@pytest.mark.slow
 def test_one_policy_under_two_names_gains_nothing_and_pairs_are_symmetric(tmp_path: Path) -> None:
     text = "import numpy as np\ndef predict(observation):\n    return 0.3 * observation[:, :2]\n"
     for name in ("one.py", "other.py"):

@@ -74,7 +74,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Experiment], Pa
     ("experiment", "points"),
     [
         *(pytest.param(PURSUIT, k, id=f"pursuit-{k}") for k in range(4)),
-        *(pytest.param(SCHOOL, k, id=f"school-{k}") for k in range(4)),
+        *(pytest.param(SCHOOL, k, id=f"school-{k}", marks=pytest.mark.slow) for k in range(4)),
         pytest.param(TWO_THREADS, 1, id="two threads", marks=pytest.mark.slow),
     ],
 )

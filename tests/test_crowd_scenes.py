@@ -89,7 +89,9 @@ def test_crowds_in_configs_move(path: Path) -> None:
 DENSE = sorted(p for p in (ROOT / "configs" / "crowds").glob("rimea_*") if p.stem.split("_")[1] in ("4", "16"))
 
 
-@pytest.mark.parametrize("path", DENSE, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", [pytest.param(path, id=path.stem, marks=() if path == DENSE[0] else slow) for path in DENSE]
+)
 def test_dense_crowds_start_without_deep_overlap_and_stay_in_the_corridor(path: Path) -> None:
     """With uniformly random positions, overlaps of up to 0.65 m caused speeds of 3,000 m/s, or divergence."""
     with ignore_contact_warnings():

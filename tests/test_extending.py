@@ -36,11 +36,13 @@ def test_the_wind_of_the_page_moves_agents_by_its_mean_force(tmp_path: Path) -> 
     assert numbers(" ".join(printed(TUTORIALS[0], tmp_path))) == pytest.approx([0.75, 0] * 2, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_agents_settle_on_the_orbit_that_the_page_computes(tmp_path: Path) -> None:
     """d = R + m V / weight = 5.2 m."""
     assert numbers(" ".join(printed(TUTORIALS[1], tmp_path))) == pytest.approx([5.2] * 8, abs=0.1)
 
 
+@pytest.mark.slow
 def test_the_task_of_the_page_is_solved_in_every_world_and_is_an_environment(tmp_path: Path) -> None:
     rollout, environment, vector = printed(TUTORIALS[3], tmp_path)
     success, longest = numbers(rollout)

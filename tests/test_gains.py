@@ -167,6 +167,7 @@ def test_arrive_oscillates_at_its_target_only_beyond_the_limit() -> None:
     assert np.abs(end.vel).max() > 0.1
 
 
+@pytest.mark.slow
 def test_aligned_velocities_flip_in_every_step_only_beyond_the_limit() -> None:
     """Each of 100 agents sees some others: limits lie between m / w for two agents and 2 m / w for very many."""
     rule = Alignment(weight=10.0, radius=5.0)

@@ -123,7 +123,7 @@ CASES = {
 }
 
 
-SLOW = ("drawn-weights", "school-weights", "drawn-residual", "school-residual")
+SLOW = ("priorities", "drawn-weights", "school-weights", "drawn-residual", "school-residual")
 
 
 @pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.slow if c in SLOW else ()) for c in CASES])

@@ -190,6 +190,7 @@ def test_a_job_whose_process_is_killed_runs_again_and_nothing_else_is_lost(tmp_p
     assert len(list(tmp_path.glob("attempt-*"))) == 3
 
 
+@pytest.mark.slow
 def test_a_job_that_kills_its_process_three_times_fails_with_the_end_of_its_output(tmp_path: Path) -> None:
     jobs = [Job("killer", end_always, (), None), *numbers(3)]
     with pytest.raises(FailedJobsError, match=r"its process ended 3 times.*it wrote: the last words \(job killer"):
@@ -197,6 +198,7 @@ def test_a_job_that_kills_its_process_three_times_fails_with_the_end_of_its_outp
     assert all(Store(tmp_path / "jobs").has(job) for job in jobs[1:])
 
 
+@pytest.mark.slow
 def test_kept_processes_serve_several_runs_and_end_with_the_block() -> None:
     engine, jobs = LocalEngine(2), [Job(f"test/{k}", process_id, (k,), k) for k in range(2)]
     with engine.keep():
@@ -209,12 +211,14 @@ def test_kept_processes_serve_several_runs_and_end_with_the_block() -> None:
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.slow
 def test_every_job_gets_a_process_of_its_own_if_wanted() -> None:
     jobs = [Job(f"pid/{k}", own_process, (), k) for k in range(3)]
     found = {record for _, record in LocalEngine(1, renew=True).run(jobs, lambda job: None)}
     assert len(found) == 3 and str(os.getpid()).encode() not in found
 
 
+@pytest.mark.slow
 def test_a_process_that_ends_between_two_jobs_is_replaced() -> None:
     jobs = [Job(f"pid/{k}", own_process, (), k) for k in range(3)]
     found = []

@@ -107,6 +107,7 @@ def test_a_share_or_time_out_of_range_is_refused(kind: type[LastingTask], field:
         kind(**{field: value})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", LASTING)
 def test_both_precisions_count_from_the_same_decision(kind: type[LastingTask]) -> None:
     counted = []

@@ -108,6 +108,7 @@ def lattice(rows: int) -> tuple[Array, tuple[float, float]]:
     return x, (12 * a, rows * a * math.sqrt(3) / 2)
 
 
+@pytest.mark.slow
 def test_a_shear_flow_decays_at_the_rate_of_the_given_viscosity() -> None:
     """v = U sin(k y) decays as exp(-eta k^2 t / (rho m)); so slow a flow does not disturb the lattice."""
     x, size = lattice(32)

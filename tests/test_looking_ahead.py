@@ -15,6 +15,7 @@ from flockenv.physics.integrators import SemiImplicitEuler
 from flockenv.scene import Group, Scene
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not KernelPlan(2, Plane(), (), SemiImplicitEuler()).masks, reason="only with AVX-512")
 @pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("agents", [17, 95])  # from 96 on they are sorted by cell

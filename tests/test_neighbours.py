@@ -280,6 +280,7 @@ def test_a_query_writes_only_into_its_own_arrays(size: Any, dimension: int, abse
             np.testing.assert_array_equal(tile, np.where(cell < 0, -1, (z * up + y) * along + x))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "size",
     [

@@ -79,7 +79,7 @@ def billiard(masses: Any, x: Any, v: Any, seconds: float) -> tuple[Floats, int]:
 # --- a light body between a heavy one and a wall: a thousand impacts in a few steps -----------------------------------
 
 SQUEEZED = [
-    ((1, 1e6), (1.1, 2.3), (0, -1), 12.0),
+    pytest.param((1, 1e6), (1.1, 2.3), (0, -1), 12.0, marks=pytest.mark.slow),
     ((1, 1e4), (1.1, 2.3), (0, -1), 12.0),
     ((1e4, 1), (1.1, 2.3), (0, -50), 1.0),
     ((1e4, 1), (1.1, 2.3), (1, -3), 3.0),
@@ -166,7 +166,7 @@ def test_energy_lost_at_the_limit_of_impacts_is_reported() -> None:
 
 
 @pytest.mark.parametrize("response", ALL)
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_body_that_moves_many_times_its_width_in_a_step_passes_nothing(response: str, dimension: int) -> None:
     """It moves 3.3 m per step, towards a row of discs at rest and a thin wall behind them."""
     thin = Capsule(start=(9.0, -5.0), end=(9.0, 5.0), radius=0.01)
@@ -257,7 +257,8 @@ def test_a_ball_slides_over_collinear_pieces_of_a_wall(response: str, speed: flo
 @pytest.mark.parametrize(
     ("count", "e", "friction", "dt"),
     [(3, 0.5, 0.3, 0.005), (3, 0.2, 0.3, 0.005), (3, 0.8, 0.3, 0.005), (3, 0.5, 0.0, 0.005), (3, 0.5, 0.3, 0.001),
-     (3, 0.0, 0.3, 0.005), (4, 0.5, 0.3, 0.005), (6, 0.5, 0.3, 0.005), (11, 0.5, 0.3, 0.005)],
+     (3, 0.0, 0.3, 0.005), (4, 0.5, 0.3, 0.005), pytest.param(6, 0.5, 0.3, 0.005, marks=pytest.mark.slow),
+     pytest.param(11, 0.5, 0.3, 0.005, marks=pytest.mark.slow)],
 )  # fmt: skip
 def test_bodies_that_lean_on_each_other_come_to_rest(
     response: str, count: int, e: float, friction: float, dt: float

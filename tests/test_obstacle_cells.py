@@ -96,6 +96,7 @@ def check_equal(found: Any, expected: Any) -> None:
 PLANE, SQUARE, CUBE = Plane(), Torus(size=(SIDE, SIDE)), Torus(size=(SIDE,) * 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "space", "dimension", "dtype", "moving"),
     [
@@ -116,6 +117,7 @@ def test_a_grid_of_obstacles_changes_no_bits(
     assert plain.parts.cells == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "space", "dimension", "dtype", "moving"),
     [

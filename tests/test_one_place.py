@@ -71,7 +71,8 @@ def expected(scene: Scene, state: State) -> Any:
 
 @pytest.mark.parametrize(
     ("count", "dimension", "dtype", "torus"),
-    [(10, 2, "float64", False), (33, 2, "float32", True), (700, 2, "float64", True),
+    [(10, 2, "float64", False), (33, 2, "float32", True),
+     pytest.param(700, 2, "float64", True, marks=pytest.mark.slow),
      pytest.param(700, 3, "float32", True, marks=pytest.mark.slow),
      pytest.param(33, 3, "float64", False, marks=pytest.mark.slow)],
 )  # fmt: skip
@@ -95,6 +96,7 @@ def test_all_agents_in_one_place_part_with_zero_total_force() -> None:
     np.testing.assert_allclose(found.sum(axis=0), 0, atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nearest", [1, 2])
 def test_agents_in_the_same_place_are_among_the_nearest(nearest: int) -> None:
     scene, state = crowd(
@@ -315,6 +317,7 @@ def test_the_first_agent_that_diverges_is_named_in_a_call_of_many_steps() -> Non
         assert scene.stepper.advance(state.copy(), np.zeros((2, 0, 0)), steps)[:2] == (0, 7)
 
 
+@pytest.mark.slow
 def test_neighbours_of_equal_sights_are_counted_once() -> None:
     """Alignment and cohesion share a count if their radii are equal."""
     far = Cohesion(weight=0.2, radius=2.5)

@@ -22,7 +22,9 @@ from tests.test_tasks import random_actions, world_of
 PRICED: tuple[Task, ...] = (Bottleneck(people=12, clear=0.0, room=3.0), CrowdNav(people=15, circle=4.0, jitter=0.05))
 """Crowded, so that random actions do harm."""
 
-by_name = pytest.mark.parametrize("task", PRICED, ids=lambda task: task.name)
+by_name = pytest.mark.parametrize(
+    "task", [pytest.param(PRICED[0], id="bottleneck"), pytest.param(PRICED[1], id="crowd_nav", marks=pytest.mark.slow)]
+)
 
 
 def played(task: Task, decisions: int = 40) -> tuple[Any, Any, Any]:

@@ -214,7 +214,9 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 PLANTS = [plant_plan, plant_code, plant_lock]
 
 
-@pytest.mark.parametrize(("plant", "used"), [(plant_plan, True), (plant_code, True), (plant_lock, False)])
+@pytest.mark.parametrize(
+    ("plant", "used"), [pytest.param(plant_plan, True, marks=pytest.mark.slow), (plant_code, True), (plant_lock, False)]
+)
 def test_what_is_planted_in_a_folder_of_ones_own_is_used_but_for_a_linked_lock(
     plant: Callable[[Path, Path], None], used: bool, compiled: tuple[Path, str], tmp_path: Path
 ) -> None:
@@ -233,6 +235,7 @@ def test_what_is_planted_in_a_folder_of_ones_own_is_used_but_for_a_linked_lock(
 RARELY = [pytest.param(a_link, marks=pytest.mark.slow), pytest.param(of_a_stranger, marks=[as_root, pytest.mark.slow])]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [world_writable, *RARELY])
 def test_nothing_planted_in_the_temporary_folder_is_used(
     make: Callable[[Path], None], compiled: tuple[Path, str], tmp_path: Path

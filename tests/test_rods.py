@@ -93,6 +93,7 @@ def test_a_pendulum_keeps_its_length_its_energy_and_its_period() -> None:
     assert len(np.flatnonzero((x[:-1, 0] > 0) & (x[1:, 0] <= 0))) > 100
 
 
+@pytest.mark.slow
 def test_a_hanging_chain_is_the_catenary_of_its_links() -> None:
     """tan theta_i = (m g / H)(i - (n + 1) / 2), H so that sum l cos theta_i = span."""
     links, long, span = 8, 2.0, 1.3

@@ -85,6 +85,7 @@ def placed(scene: Scene, *places: Any, worlds: int = 1, velocity: Any = 0.0) -> 
 # --- closed forms -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_hunger_grows_with_time_and_effort_up_to_1() -> None:
     scene = tank(mortal=False, force=0.0)
     state = placed(scene, velocity=(1.0, 0.0))  # half of max_speed; no force changes it

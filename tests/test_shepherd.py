@@ -100,6 +100,7 @@ def test_a_diverged_member_is_named_although_it_enters_all_forces() -> None:
         scene.step(state, steps=3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sheep", [20, 300])  # with 300, another effect sorts them by cell
 def test_threads_calls_and_batches_give_the_same_bits(sheep: int) -> None:
     beside = (Cohesion(weight=1, radius=3),)
@@ -148,6 +149,7 @@ def test_the_mean_velocity_of_a_group_excludes_dead_members() -> None:
     np.testing.assert_allclose(scene.acceleration(state)[0, state.alive[0]], np.tile(mean / 1.5, (11, 1)), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_demo_s_shepherd_drives_its_group_to_the_goal() -> None:
     """From more than 8 m away to within 4 m in 35 s; without the shepherd the group stays more than 8 m away."""
     assert Shepherd.demo is not None

@@ -78,7 +78,7 @@ def mirrored(shape: Shape) -> Shape:
     return type(shape)(**{**{n: getattr(shape, n) for n in type(shape).model_fields}, **changed})
 
 
-quick = ("block", "wall", "joined walls")
+quick = ("block", "joined walls")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in quick else pytest.mark.slow) for n in LONG])
@@ -93,6 +93,7 @@ def test_the_path_passes_the_near_edge_on_either_side(name: str) -> None:
         assert trip(LONG[name], y=y)[0] < 14.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n == "block" else pytest.mark.slow) for n in LONG_3])
 def test_in_3d_the_path_passes_the_near_edge(name: str) -> None:
     length, time, _ = trip(LONG_3[name], d=3)
@@ -169,6 +170,7 @@ def test_the_force_in_a_pocket_points_to_its_nearer_end() -> None:
     np.testing.assert_allclose(first_force((upside_down,), (1, 0)), [0, -8], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_without_an_edge_the_force_is_to_the_side_of_the_normal() -> None:
     slope = HalfSpace(point=(4, 0), direction=(-1, 0.1))
     room = Block(centre=(0, 0), size=(8, 8), turn=-5, hollow=True)

@@ -225,6 +225,7 @@ def test_friction_against_a_wall_never_adds_kinetic_energy() -> None:
     assert np.abs(pushed(scene, pos, vel)[:, 0]).max() < 1e-9  # friction is along the wall
 
 
+@pytest.mark.slow
 def test_friction_between_agents_opposes_slip_at_every_contact_angle() -> None:
     """kappa d (dv_ji . t) t on i; in Menge it adds to the slip in half of the cases (peers.md 2.6)."""
     scene = crowd(Contact(stiffness=0, friction=2.4e5, radius=20), count=1)

@@ -148,6 +148,7 @@ def test_methods_that_touch_the_axis_at_0_alone_have_no_stable_step_without_damp
             assert limit(two_stages, zeta) == pytest.approx((8 * zeta) ** (1 / 3), rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", GROWING, ids=lambda method: method.kind)
 def test_the_warning_of_an_undamped_spring_gives_the_growth_of_its_amplitude(method: Integrator) -> None:
     """k = 18, m = 2, w = 3. The e-fold time in the warning is that of the amplitude in a run."""

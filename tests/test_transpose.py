@@ -9,7 +9,7 @@ import pytest
 from flockenv.jit.cpu import LINE
 from flockenv.jit.transpose import out_of_records, put_lines, put_records
 
-LENGTHS = [3, 5, 6, 8, 9, 16, 17, 20]
+LENGTHS = [3, 8, 17, *(pytest.param(n, marks=pytest.mark.slow) for n in (5, 6, 9, 16, 20))]
 WIDTHS = [("float32", 16), ("float32", 8), ("float64", 8), ("float64", 4), ("float64", 16)]
 
 
@@ -57,7 +57,7 @@ def test_records_are_transposed_lanes(dtype: str, width: int, length: int) -> No
     np.testing.assert_array_equal(lanes[:width], before[:width])
 
 
-@pytest.mark.parametrize("count", [1, 3, 8, 11, 16, 19, 33])
+@pytest.mark.parametrize("count", [1, *(pytest.param(n, marks=pytest.mark.slow) for n in (3, 8, 11, 16)), 19, 33])
 @pytest.mark.parametrize(("dtype", "width"), WIDTHS)
 def test_lines_are_transposed_lanes(dtype: str, width: int, count: int) -> None:
     side = LINE // np.dtype(dtype).itemsize

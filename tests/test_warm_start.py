@@ -38,6 +38,7 @@ def test_learning_begins_with_the_policy_and_ignores_what_it_does_not_observe() 
     assert (tensors_of(model)["log_std"] == np.float32(p.log_std)).all()
 
 
+@pytest.mark.slow
 def test_a_training_and_its_recipe_name_the_start(tmp_path: Path) -> None:
     each = experiment(critic_first=8)  # the actor does not learn yet
     run = train(each, tmp_path)

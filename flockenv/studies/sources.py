@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import hashlib
 import sys
 from collections.abc import Iterable
@@ -28,8 +29,14 @@ def fingerprint(folders: Iterable[str], but: Iterable[str] = ()) -> str:
     digest = hashlib.sha256(f"{numba.__version__} {sys.version_info[:2]}".encode())
     for path in sorted(path for folder in folders for path in (PACKAGE / folder).rglob("*.py")):
         if path.name not in but:
-            digest.update(_code(path.read_text(encoding="utf-8")).encode())
+            digest.update(_digest(path, path.stat().st_mtime_ns))
     return digest.hexdigest()[:20]
+
+
+@functools.cache
+def _digest(path: Path, changed: int) -> bytes:
+    """Return a digest of a module's code, of a file that was changed at a time (ns): each is read once per process."""
+    return hashlib.sha256(_code(path.read_text(encoding="utf-8")).encode()).digest()
 
 
 def _code(text: str) -> str:
