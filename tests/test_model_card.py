@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pytest
 import yaml
 
 from flockenv.envs.table import ENVIRONMENTS
-from flockenv.players import PUBLISHED, weights_file
-from flockenv.players.model_card import model_card
+from flockenv.players import PUBLISHED, WEIGHTS, weights_file
+from flockenv.players.model_card import cards_in, folder_card, model_card
 from flockenv.players.rules import PLAYERS, load_tuned
 from flockenv.tasks import TASKS
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -52,6 +55,25 @@ def test_the_policy_and_the_rules_that_ship_are_median_runs_and_the_card_says_so
         assert scores[str(seed)] == ordered[(len(ordered) - 1) // 2] == pytest.approx(mean, rel=1e-4)
     page = weights_file(task).with_suffix(".md").read_text(encoding="utf-8")
     assert f"(the median of {len(card['seeds']['scores'])} training seeds, " in page
+
+
+def test_weights_are_named_on_a_card_of_their_folder() -> None:
+    """If this fails, run `python -m flockenv.players.model_card agents/policies/* agents/priced`."""
+    weights = [path for room in ("flockenv", "agents") for path in (ROOT / room).rglob("*.safetensors")]
+    assert len(weights) > 100
+    for folder in {path.parent for path in weights} - {WEIGHTS}:
+        page = (folder / "README.md").read_text(encoding="utf-8")
+        assert page == folder_card(cards_in(folder), folder.name)
+        assert all(f"\n| {path.name} | " in page for path in weights if path.parent == folder)
+    assert all(path.with_suffix(".md").is_file() for path in weights if path.parent == WEIGHTS)
+
+
+def test_a_card_says_which_algorithm_and_hybrid_it_is() -> None:
+    card = json.loads((ROOT / "agents/policies/residual/crossing-seed-0.json").read_text(encoding="utf-8"))
+    page = model_card({**card, "algorithm": "SAC (stable-baselines3)"})
+    about = yaml.safe_load(page.split("---\n")[1])
+    assert "# SAC, residual on orca for flockenv/Crossing" in page and "# PPO" not in page
+    assert about["tags"][1:3] == ["sac", "residual"] and about["model-index"][0]["name"].startswith("sac-")
 
 
 def test_a_page_follows_its_card() -> None:

@@ -1,27 +1,34 @@
-"""Model cards: a Markdown page beside the weights of each task, in the form of model hubs, made of the JSON card.
+"""Model cards: Markdown beside weights, in the form of model hubs, made of the JSON cards.
 
-To write all of them anew: python -m flockenv.players.model_card
+The weights of each task that ship have a page each; a folder of several, such as other training seeds, has a table.
+To write all of them anew: python -m flockenv.players.model_card agents/policies/* agents/priced
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import yaml
 
 from flockenv.core.atomic_files import replace_file
 from flockenv.envs.table import ENVIRONMENTS
-from flockenv.players import weights_file
+from flockenv.players import WEIGHTS, weights_file
 from flockenv.players.policy import read_card
 from flockenv.tasks import TASKS
 
-__all__ = ["model_card"]
+__all__ = ["cards_in", "folder_card", "model_card"]
 
 
 ABOUT_SCORES = """\
 The mean return is that of the last evaluation during training, in worlds for tuning. The comparison with hand-written
 players in held-out worlds is in docs/results.md of the repository."""
+
+ABOUT_FOLDER = """\
+The JSON beside each file of weights has its observation, action, arguments, learning curve, versions and digest. The
+mean return is that of the last evaluation during training, in worlds for tuning. `python -m` goes before a command."""
 
 LIMITS = """\
 The policy was trained in one simulated task, with these arguments, and with physics of this package alone. With other
@@ -38,7 +45,7 @@ def model_card(card: Mapping[str, Any]) -> str:
     about, env = " ".join((kind.__doc__ or "").split("\n\n")[0].split()), ENVIRONMENTS[kind.__name__].id
     parts = [
         f"---\n{yaml.safe_dump(_front_matter(card, env), sort_keys=False)}---",
-        f"# PPO for {env}", about, _usage(card["task"], env), "## Training", _grid(_training(card)),
+        f"# {_short(card)} for {env}", about, _usage(card["task"], env), "## Training", _grid(_training(card)),
         ABOUT_SCORES,
         "## Observation", f"{card['observation_size']} numbers, in this order.", _slots(card.get("observation", ())),
         "## Action", _slots(card.get("action", ())), "## Arguments of the task",
@@ -60,9 +67,43 @@ def _front_matter(card: Mapping[str, Any], env: str) -> dict[str, Any]:
         "license": "mit",
         "library_name": "flockenv",
         "pipeline_tag": "reinforcement-learning",
-        "tags": ["reinforcement-learning", "ppo", "gymnasium", "steering", env],
-        "model-index": [{"name": f"ppo-{env.removeprefix('flockenv/')}", "results": [result]}],
+        "tags": ["reinforcement-learning", *_tags(card), "gymnasium", "steering", env],
+        "model-index": [{"name": f"{_tags(card)[0]}-{env.removeprefix('flockenv/')}", "results": [result]}],
     }
+
+
+def _short(card: Mapping[str, Any]) -> str:
+    """Return the algorithm without its library, and the kind and base of a hybrid policy."""
+    algorithm, hybrid = str(card["algorithm"]).split(" (")[0], card.get("hybrid")
+    return f"{algorithm}, {hybrid['kind']} on {hybrid['base']}" if hybrid else algorithm
+
+
+def _tags(card: Mapping[str, Any]) -> list[str]:
+    """Return the algorithm, and the kind of a hybrid policy, as hubs name them."""
+    names = [str(card["algorithm"]).split(" (")[0], *([card["hybrid"]["kind"]] if card.get("hybrid") else [])]
+    return [name.lower().replace(" ", "-") for name in names]
+
+
+def folder_card(cards: Mapping[str, Mapping[str, Any]], title: str) -> str:
+    """Return the page of a folder of weights: a table of its files, whose JSON cards these are."""
+    kinds = sorted({tag for card in cards.values() for tag in _tags(card)})
+    tags = ["reinforcement-learning", *kinds, "gymnasium", "steering"]
+    front = {"license": "mit", "library_name": "flockenv", "pipeline_tag": "reinforcement-learning", "tags": tags}
+    rows = [
+        f"| {name} | {card['task']} | {_short(card)} | {card['seed']} | {card['tuning_mean']:.3g} "
+        f"| `{card['recipe']['command'].removeprefix('python -m ')}` |"
+        for name, card in cards.items()
+    ]
+    table = "\n".join(["| file | task | algorithm | seed | mean return | command |", "|" + " --- |" * 6, *rows])
+    parts = [
+        f"---\n{yaml.safe_dump(front, sort_keys=False)}---",
+        f"# {title}",
+        ABOUT_FOLDER,
+        table,
+        "## Limits",
+        LIMITS,
+    ]
+    return "\n\n".join(parts) + "\n"
 
 
 def _usage(task: str, env: str) -> str:
@@ -118,14 +159,23 @@ def _slots(slots: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(["| name | shape | 1 stands for | range |", "| --- | --- | --- | --- |", *rows])
 
 
-def _write_all() -> None:
-    """Write the page of each task that has weights."""
+def cards_in(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return the cards of all weights in a folder by their file, in order of task and seed."""
+    cards = {path.name: read_card(path.with_suffix(".json")) for path in folder.glob("*.safetensors")}
+    return dict(sorted(cards.items(), key=lambda item: (item[1]["task"], item[1]["seed"])))
+
+
+def _write_all(folders: Sequence[Path]) -> None:
+    """Write the page of each task that has weights, of its other seeds, and of some folders."""
     for task in TASKS:
         path = weights_file(task).with_suffix(".json")
         if path.is_file():
             with replace_file(path.with_suffix(".md")) as file:
                 file.write(model_card(read_card(path)).encode())
+    for folder in (WEIGHTS / "seeds", *folders):
+        with replace_file(folder / "README.md") as file:
+            file.write(folder_card(cards_in(folder), folder.name).encode())
 
 
 if __name__ == "__main__":
-    _write_all()
+    _write_all([Path(name) for name in sys.argv[1:]])
