@@ -15,7 +15,18 @@ import pytest
 
 from flockenv.cli.main import main
 from flockenv.engine.workspace import Workspace
-from flockenv.geometry.shapes import SHAPES, Block, Capsule, Circle, DistanceField, HalfSpace, Polygon, Shape, Wall
+from flockenv.geometry.shapes import (
+    SHAPES,
+    Block,
+    Capsule,
+    Circle,
+    DistanceField,
+    HalfSpace,
+    Polygon,
+    Shape,
+    TriangleMesh,
+    Wall,
+)
 from flockenv.play.edits import Edit, read_edit
 from flockenv.play.history import EVERY, History
 from flockenv.play.limits import pairs_of
@@ -349,8 +360,13 @@ def test_a_shape_moves_to_a_place(kind: str) -> None:
         "wall": Wall(vertices=((0, 0), (1, 0), (1, 3))), "polygon": Polygon(vertices=((0, 0), (2, 0), (2, 1))),
         "block": Block(centre=(1, 1), size=(2, 3)), "half_space": HalfSpace(point=(0, 0), direction=(0, 1)),
         "distance_field": DistanceField(low=(0, 0), spacing=1, values=((1, 1), (1, 1))),
+        "mesh": TriangleMesh(
+            vertices=((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)), spacing=0.1,
+            triangles=((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)),
+        ),
     }  # fmt: skip
-    shape, by, place = shapes[kind], np.array([3.0, -1.0]), np.array([0.3, 2.7])
+    shape = shapes[kind]
+    by, place = np.array([3.0, -1.0, 0.5])[: shape.dimension], np.array([0.3, 2.7, 0.4])[: shape.dimension]
     if kind == "distance_field":
         with pytest.raises(ValueError, match="cannot be moved"):
             shape.moved_to((1.0, 1.0))

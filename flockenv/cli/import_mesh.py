@@ -1,7 +1,8 @@
-"""The `import-mesh` command: a mesh of another program as a network in a scene."""
+"""The `import-mesh` command: a mesh of another program as a network, or an obstacle, in a scene."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -42,21 +43,46 @@ def import_mesh(
         int, typer.Option(metavar="2|3", min=2, max=3, help="2: a flat mesh, without its third coordinate.")
     ] = 3,
     closed: Annotated[bool, typer.Option("--closed", help="Refuse a surface with a hole.")] = False,
+    obstacle: Annotated[
+        bool, typer.Option("--obstacle", help="A closed surface of triangles as a solid obstacle, on which balls fall.")
+    ] = False,
+    spacing: Annotated[
+        float | None,
+        typer.Option(
+            metavar="M", min=1e-9, help="Of the obstacle's grid of distances.", show_default="a fortieth of its extent"
+        ),
+    ] = None,
 ) -> None:
     """Print a scene in which a mesh falls on a floor: `flockenv import-mesh bunny.obj > scene.yaml`."""
-    from flockenv.scene.mesh_file import mesh_of, read_mesh, scene_of
-    from flockenv.scene.yaml_io import MAX_BYTES, dump_scene
+    from flockenv.scene.mesh_file import mesh_of, obstacle_of, obstacle_scene_of, read_mesh, scene_of
+    from flockenv.scene.yaml_io import dump_scene
 
-    points, cells = read_mesh(Path(mesh), elements)
+    if obstacle and (dimension == 2 or elements not in (None, "triangles")):
+        raise ValueError("--obstacle: is a surface of triangles in 3-D; leave out --dimension and --elements")
+    if spacing is not None and not obstacle:
+        raise ValueError("--spacing: is of the grid of an obstacle; add --obstacle")
+    points, cells = read_mesh(Path(mesh), "triangles" if obstacle else elements)
     try:
-        network = mesh_of(points, cells, scale, rotate, move, merge, dimension, closed)
-        rows = network.elements(dimension).tolist()
-        if len(str(network.vertices)) + len(str(rows)) > MAX_BYTES:  # known before a scene is made, which takes long
-            raise ValueError(
-                f"{network.size:,} vertices and {len(rows):,} elements are too many for a scene file of {MAX_BYTES:,} "
-                "bytes: simplify it"
-            )
-        text = dump_scene(scene_of(network), brief=True)
+        if obstacle:
+            solid = obstacle_of(points, cells, spacing, scale, rotate, move, merge)
+            _refuse_many(solid.vertices, solid.triangles)
+            scene = obstacle_scene_of(solid)
+        else:
+            network = mesh_of(points, cells, scale, rotate, move, merge, dimension, closed)
+            _refuse_many(network.vertices, network.elements(dimension).tolist())
+            scene = scene_of(network)
+        text = dump_scene(scene, brief=True)
     except ValueError as error:
         raise ValueError(f"{printable(mesh)[1:-1]}: {error}") from None
     print(text, end="")
+
+
+def _refuse_many(vertices: Sequence[object], rows: Sequence[object]) -> None:
+    """Raise ValueError if a scene file has no room for a mesh: known before a scene is made, which takes long."""
+    from flockenv.scene.yaml_io import MAX_BYTES
+
+    if len(str(vertices)) + len(str(rows)) > MAX_BYTES:
+        raise ValueError(
+            f"{len(vertices):,} vertices and {len(rows):,} elements are too many for a scene file of {MAX_BYTES:,} "
+            "bytes: simplify it"
+        )

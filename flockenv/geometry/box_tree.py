@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from flockenv.jit.decorators import kernel
 
-__all__ = ["DEEPEST", "BoxTree", "build_tree", "find_overlaps", "fit_parents", "overlapping_pairs"]
+__all__ = ["DEEPEST", "BoxTree", "build_tree", "find_overlaps", "fit_parents", "overlapping_pairs", "set_boxes"]
 
 DEEPEST = 64
 """Length of the stack of a traversal: more than the levels of any tree."""
@@ -59,6 +59,17 @@ def fit_parents(tree: Any) -> None:
         for c in range(3):
             tree.box[k, c] = min(tree.box[2 * k + 1, c], tree.box[2 * k + 2, c])
             tree.box[k, 3 + c] = max(tree.box[2 * k + 1, 3 + c], tree.box[2 * k + 2, 3 + c])
+
+
+def set_boxes(tree: BoxTree, corners: NDArray[np.float64]) -> None:
+    """Set the boxes of the leaves to those of their elements, (n, k, 3) m, and those of all nodes above; uncompiled."""
+    first = len(tree.order) - 1
+    tree.box[first + tree.leaf] = np.concatenate([corners.min(axis=1), corners.max(axis=1)], axis=1)
+    while first > 0:  # level by level
+        up, one, two = first // 2, tree.box[first : 2 * first : 2], tree.box[first + 1 : 2 * first + 1 : 2]
+        tree.box[up:first, :DIMENSION] = np.minimum(one[:, :DIMENSION], two[:, :DIMENSION])
+        tree.box[up:first, DIMENSION:] = np.maximum(one[:, DIMENSION:], two[:, DIMENSION:])
+        first = up
 
 
 @kernel

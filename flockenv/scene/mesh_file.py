@@ -1,7 +1,7 @@
-"""Meshes of other programs as networks: OBJ, PLY, STL, MSH, VTK and others, read by meshio (extra `mesh`).
+"""Meshes of other programs as networks or obstacles: OBJ, PLY, STL, MSH, VTK and others, by meshio (extra `mesh`).
 
-Tetrahedra become a solid body, triangles a sheet or a surface, lines a network of springs. Coordinates are in m, after
-they are scaled, rotated and moved in this order.
+Tetrahedra become a solid body, triangles a sheet, a surface or an obstacle, lines a network of springs. Coordinates are
+in m, after they are scaled, rotated and moved in this order.
 """
 
 from __future__ import annotations
@@ -18,19 +18,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.core.errors import nearest, printable
-from flockenv.geometry.shapes import HalfSpace
+from flockenv.geometry.mesh_checks import check_mesh
+from flockenv.geometry.shapes import HalfSpace, TriangleMesh
 from flockenv.model.finite_elements import contents
 from flockenv.model.group import Group
-from flockenv.model.mesh_checks import check_mesh
 from flockenv.model.network import element_edges, pairs_of
 from flockenv.model.networks import Mesh
+from flockenv.model.spawn import Spawn
 from flockenv.physics.constraints import Collisions, Constraint, FaceCollisions
 from flockenv.physics.effects import Bending, Effect, Elastic, Gravity, Membrane, Springs
 from flockenv.physics.integrators import LinearlyImplicitEuler, SemiImplicitEuler
 from flockenv.scene.scene import Scene
 from flockenv.scene.stability import suggest_dt
 
-__all__ = ["Elements", "mesh_of", "read_mesh", "scene_of"]
+__all__ = ["Elements", "mesh_of", "obstacle_of", "obstacle_scene_of", "read_mesh", "scene_of"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[Any]
@@ -85,9 +86,6 @@ def mesh_of(
     Raises:
         ValueError: a mesh that is not sound; see check_mesh; or a number that is not finite.
     """
-    for name, value in {"scale": scale, "rotate": rotate, "move": move, "merge": merge or 0.0}.items():
-        if not np.isfinite(np.asarray(value)).all():
-            raise ValueError(f"{name} = {value}: must be finite")
     points, elements = _merge(_placed(points, scale, rotate, move), elements, merge)
     if dimension == 2:
         thick = np.ptp(points[:, 2])
@@ -99,6 +97,48 @@ def mesh_of(
     mesh = Mesh(vertices=tuple(map(tuple, points.tolist())), lumping="geometric", **rows)
     check_mesh(points, elements, closed)
     return mesh
+
+
+def obstacle_of(
+    points: Floats,
+    triangles: Ints,
+    spacing: float | None = None,
+    scale: float = 1.0,
+    rotate: Sequence[float] = (0.0, 0.0, 0.0),
+    move: Sequence[float] = (0.0, 0.0, 0.0),
+    merge: float | None = None,
+) -> TriangleMesh:
+    """Return a closed surface of triangles as an obstacle.
+
+    spacing: of its grid of distances, m (default: a fortieth of its longest extent). The other arguments are those of
+    `mesh_of`. Raises ValueError if triangles do not bound a solid.
+    """
+    points, triangles = _merge(_placed(points, scale, rotate, move), triangles, merge)
+    size = float(np.ptp(points, axis=0).max())
+    try:
+        return TriangleMesh(
+            vertices=tuple(map(tuple, points.tolist())), triangles=tuple(map(tuple, triangles.tolist())),
+            spacing=_brief(size / 40) if spacing is None else spacing,
+        )  # fmt: skip
+    except ValueError as error:
+        raise ValueError(str(error).removeprefix("TriangleMesh: ")) from None
+
+
+def obstacle_scene_of(obstacle: TriangleMesh) -> Scene:
+    """Return a scene in which balls fall on an obstacle that stands on a floor, to be edited."""
+    low, high = np.array(obstacle.vertices).min(axis=0), np.array(obstacle.vertices).max(axis=0)
+    size = float((high - low).max())
+    radius, above = _brief(0.05 * size), (0.0, 0.1 * size, 0.0)
+    spawn = Spawn(
+        low=tuple(((low * (1, 0, 1) + high * (0, 1, 0)) + above).tolist()),
+        high=tuple((high + np.array(above) + (0.0, 0.5 * size, 0.0)).tolist()), spacing=2.1 * radius,
+    )  # fmt: skip
+    floor = HalfSpace(point=(0.0, float(low[1]), 0.0), direction=(0.0, 1.0, 0.0))
+    return Scene(
+        dimension=3, groups=(Group(count=20, radius=radius, spawn=spawn),), obstacles=(obstacle, floor),
+        effects=(Gravity(acceleration=(0.0, -G, 0.0)),), constraints=(Collisions(restitution=0.5, friction=0.3),),
+        dt=float(f"{0.03 * math.sqrt(size / G):.0e}"),
+    )  # fmt: skip
 
 
 def scene_of(mesh: Mesh) -> Scene:
@@ -228,6 +268,9 @@ def _placed(points: Floats, scale: float, rotate: Sequence[float], move: Sequenc
     """Return points in m, (n, 3): scaled, then rotated, then moved; raise ValueError unless they are finite."""
     from scipy.spatial.transform import Rotation
 
+    for name, value in {"scale": scale, "rotate": rotate, "move": move}.items():
+        if not np.isfinite(np.asarray(value)).all():
+            raise ValueError(f"{name} = {value}: must be finite")
     for k in np.flatnonzero(~np.isfinite(points).all(axis=1)):
         raise ValueError(f"vertex {k} = {tuple(points[k].tolist())}: must be finite")
     placed = np.zeros((len(points), 3))
@@ -248,6 +291,8 @@ def _merge(points: Floats, elements: Ints, distance: float | None) -> tuple[Floa
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
 
+    if not np.isfinite(distance or 0.0):
+        raise ValueError(f"merge = {distance}: must be finite")
     near = KDTree(points).query_pairs(distance or 0.0, output_type="ndarray")
     if not len(near):
         return points, elements

@@ -33,7 +33,7 @@ from flockenv.engine.implicit_step import coupling_of
 from flockenv.engine.stepper import Stepper
 from flockenv.geometry.barnes_hut import MOST_DIRECT
 from flockenv.geometry.cell_list import FEWEST_AGENTS
-from flockenv.geometry.shapes import AnyShape, Circle, HalfSpace, Shape
+from flockenv.geometry.shapes import AnyShape, Circle, HalfSpace, Shape, TriangleMesh
 from flockenv.geometry.space import AnySpace, Box, Plane, Torus
 from flockenv.maths.counter_rng import MASK, key_of
 from flockenv.model import state as states
@@ -257,7 +257,16 @@ class Scene(Record):
                 raise ValueError(f"groups[{k}].spawn.low: missing; a plane has no edges, so give low and high")
 
     def _check_shape(self, k: int, shape: Shape) -> None:
-        """Raise ValueError if a shape reaches around a torus: only its nearest image is used."""
+        """Raise ValueError if a shape reaches around a torus, or an agent touches a mesh from beyond its grid.
+
+        On a torus only the nearest image of a shape is used.
+        """
+        widest = max(group.widest for group in self.groups)
+        if isinstance(shape, TriangleMesh) and shape.grid_margin < widest:
+            raise ValueError(
+                f"obstacles[{k}].margin = {shape.grid_margin:g}: is less than the largest radius of agents, "
+                f"{widest:g} m: give at least that, so that they touch the mesh where its grid is"
+            )
         if not isinstance(self.space, Torus) or shape.in_state:
             return
         if isinstance(shape, HalfSpace):

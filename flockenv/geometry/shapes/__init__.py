@@ -1,9 +1,10 @@
-"""Obstacles: circles, capsules, walls, polygons, blocks, half-spaces, distance fields; in 2-D and (but polygons) 3-D.
+"""Obstacles: circles, capsules, walls, polygons, blocks, half-spaces, distance fields and meshes, in 2-D and 3-D.
 
 `round`, `chain`, `block`, `field` have the laws of one agent and one shape, `inverted` those of hollow shapes, `edges`
 those of silhouettes; `row_header` reads bounds and motion, which rows of every form have; `dispatch` calls the law of a
 row's form at run time; `table` packs shapes for kernels, `cells` sorts them into a grid, `joints` finds joined walls;
-`shape` has the base classes, `records` the kinds that scenes list; `outlines` is for pictures.
+`shape` and `grid_shape` have the base classes, `records` and `triangle_mesh` the kinds that scenes list; `outlines` is
+for pictures. Polygons are in 2-D only, meshes in 3-D.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from flockenv.geometry.shapes.records import (
     Polygon,
     Shape,
     Sway,
+    TriangleMesh,
     Wall,
     distance_to_shapes,
 )
@@ -28,6 +30,6 @@ from flockenv.geometry.shapes.table import FORMS, pack_shapes
 
 __all__ = [
     "FORMS", "SHAPES", "AnyShape", "Block", "Bound", "Capsule", "Circle", "DistanceField", "HalfSpace", "Polygon",
-    "Shape", "Sway", "Wall", "blocks", "distance_to_shapes", "gap", "normal", "pack_shapes", "ray_hit", "silhouette",
-    "touched_normal",
+    "Shape", "Sway", "TriangleMesh", "Wall", "blocks", "distance_to_shapes", "gap", "normal", "pack_shapes", "ray_hit",
+    "silhouette", "touched_normal",
 ]  # fmt: skip

@@ -18,13 +18,15 @@ from pydantic import Field, WrapValidator, field_validator, model_validator
 
 from flockenv.core.record import instance_of, lists_to_tuples
 from flockenv.geometry.shapes import outlines
+from flockenv.geometry.shapes.grid_shape import GridShape
 from flockenv.geometry.shapes.shape import Bound, Closed, Point, Shape, Sway
 from flockenv.geometry.shapes.table import Floats
-from flockenv.maths.grid import MOST_POINTS, pack_grid, points_of
+from flockenv.geometry.shapes.triangle_mesh import TriangleMesh
+from flockenv.maths.grid import points_of
 
 __all__ = [
     "SHAPES", "AnyShape", "Block", "Bound", "Capsule", "Circle", "Closed", "DistanceField", "HalfSpace", "Polygon",
-    "Shape", "Sway", "Wall", "distance_to_shapes",
+    "Shape", "Sway", "TriangleMesh", "Wall", "distance_to_shapes",
 ]  # fmt: skip
 
 
@@ -354,11 +356,10 @@ class HalfSpace(Shape):
         return outlines.half_plane(np.array(self.point[:2]), np.array(self.direction[:2]), low, high)
 
 
-class DistanceField(Closed):
+class DistanceField(GridShape):
     """Signed distances on a grid, of other shapes or given as an array (negative inside)."""
 
     kind: Literal["distance_field"] = "distance_field"
-    laws: ClassVar[str] = "distance_field"
     low: Point = Field(description="m, the lowest corner of the grid")
     high: Point | None = Field(default=None, description="m, the highest corner of the grid; only with shapes")
     spacing: float = Field(gt=0, description="m, between grid points")
@@ -389,10 +390,7 @@ class DistanceField(Closed):
             raise ValueError(
                 f"spacing: gives a grid of {counts} points; needs at least 2 along each of {len(self.low)} axes"
             )
-        if math.prod(counts) > MOST_POINTS:
-            raise ValueError(
-                f"spacing = {self.spacing:g}: {math.prod(counts):,} points; at most {MOST_POINTS:,} allowed"
-            )
+        self._check_counts()
         for k, shape in enumerate(self.shapes):
             if shape.dimension != len(self.low):
                 raise ValueError(f"shapes[{k}]: lies in {shape.dimension} dimensions, but low in {len(self.low)}")
@@ -401,6 +399,16 @@ class DistanceField(Closed):
         if not np.isfinite(self.distances).all():
             raise ValueError("values: must be finite")
         return self
+
+    @property
+    def grid_low(self) -> Floats:
+        """The lowest corner of the grid, (D,) m."""
+        return np.array(self.low)
+
+    @property
+    def grid_spacing(self) -> float:
+        """Distance between grid points, m."""
+        return self.spacing
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -423,45 +431,6 @@ class DistanceField(Closed):
     def anchor(self) -> tuple[float, ...]:
         """The lowest corner of the grid."""
         return self.low
-
-    @property
-    def extremes(self) -> Floats:
-        """The lower and the upper corner of the grid."""
-        return np.array([self.low, np.array(self.low) + self.spacing * (np.array(self.counts) - 1)])
-
-    @functools.cached_property
-    def bound(self) -> Bound:
-        """The box of the grid, enlarged by the greatest depth, as the solid may extend beyond the grid."""
-        if self.hollow:
-            return super().bound
-        low, high = self.extremes
-        half = (high - low) / 2 + max(0.0, -float(self.distances.min()))
-        return Bound((low + high) / 2, half, float(np.linalg.norm(half)))
-
-    @functools.cached_property
-    def _grid(self) -> Floats:
-        along: Any = np.gradient(self.distances, self.spacing)
-        slopes = np.stack(along, axis=-1)
-        size = np.linalg.norm(slopes, axis=-1, keepdims=True)
-        numbers = np.concatenate([self.distances[..., None], slopes / np.maximum(size, 1e-12)], axis=-1)
-        return pack_grid(numbers, (0.0,) * len(self.low), self.spacing)
-
-    def row(self, dimension: int) -> Floats:
-        """Return the grid with distances and unit gradients."""
-        return self._grid
-
-    def polygons(self, low: Floats, high: Floats) -> list[Floats]:
-        """Return strips of grid cells inside the shape; in 3-D, inside its projection from above."""
-        return outlines.strips(self._from_above, self.low[:2], self.spacing)
-
-    def outline(self, low: Floats, high: Floats) -> list[Floats]:
-        """Return the shape's polygons; if it is hollow, strips along its surface."""
-        edge = np.abs(self._from_above) - self.spacing / 2
-        return outlines.strips(edge, self.low[:2], self.spacing) if self.hollow else self.polygons(low, high)
-
-    @property
-    def _from_above(self) -> Floats:
-        return self.distances if self.distances.ndim == 2 else np.asarray(self.distances.min(axis=2))
 
 
 def _nested(values: Any) -> tuple[Any, ...]:
@@ -486,7 +455,7 @@ def _inflate(vertices: Sequence[tuple[float, ...]], radius: float) -> Floats:
 
 SHAPES: dict[str, type[Shape]] = {
     str(shape.model_fields["kind"].default): shape
-    for shape in (Circle, Capsule, Wall, Polygon, Block, HalfSpace, DistanceField)
+    for shape in (Circle, Capsule, Wall, Polygon, Block, HalfSpace, DistanceField, TriangleMesh)
 }
 """Shape classes by kind."""
 

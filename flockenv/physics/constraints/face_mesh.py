@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.geometry.box_tree import BoxTree, build_tree, fit_parents, overlapping_pairs
-from flockenv.jit.decorators import python_of
+from flockenv.geometry.box_tree import BoxTree, build_tree
+from flockenv.geometry.mesh_checks import first_piercing
 from flockenv.model.network import element_edges, pairs_of
 from flockenv.model.scene_view import SceneView
 from flockenv.model.surface import faces_of
@@ -99,16 +99,7 @@ def check_intersections(scene: SceneView, obstacles: bool) -> None:
     """Raise ValueError if an edge passes through a face at the start, or a particle lies in one or in a block."""
     solids, n = solids_of(scene.obstacles if obstacles else ()), scene.agents
     faces, edges, place = _with_solids(scene, solids._replace(place=solids.start), n)
-    tree = build_tree(place[faces].mean(axis=1))
-    corners = place[faces]
-    at = len(tree.order) - 1 + tree.leaf
-    tree.box[at] = np.concatenate([corners.min(axis=1), corners.max(axis=1)], axis=1)
-    python_of(fit_parents)(tree)
-    ends = place[edges]
-    query, face = overlapping_pairs(tree, np.concatenate([ends.min(axis=1), ends.max(axis=1)], axis=1))
-    own = (edges[query][:, :, None] == faces[face][:, None, :]).any(axis=(1, 2))
-    own |= (edges[query, 0] >= n) & (faces[face, 0] >= n)
-    query, face = query[~own], face[~own]
+    found = first_piercing(place, edges, faces, n)
 
     def name(what: str, particles: Ints) -> str:
         if particles[0] >= n:
@@ -116,51 +107,12 @@ def check_intersections(scene: SceneView, obstacles: bool) -> None:
         *most, last = particles.tolist()
         return f"the {what} {', '.join(map(str, most))} and {last}"
 
-    for k in np.flatnonzero(_pierces(ends[query], corners[face])):
+    if found is not None:
         raise ValueError(
-            f"kind = face_collisions: at the start {name('edge between particles', edges[query[k]])} passes through "
-            f"{name('face of', faces[face[k]])}; meshes must not intersect"
+            f"kind = face_collisions: at the start {name('edge between particles', edges[found[0]])} passes through "
+            f"{name('face of', faces[found[1]])}; meshes must not intersect"
         )
     for k in np.unique(solids.owner[solids.faces[:, 0]]):
         inside = scene.obstacles[k].inside(rest_of(scene) - scene.obstacles[k].shift(0.0))
         for i in np.intersect1d(np.flatnonzero(inside), faces_of(scene)):
             raise ValueError(f"kind = face_collisions: at the start particle {i} is inside obstacles[{k}]")
-
-
-def _pierces(ends: Floats, corners: Floats) -> NDArray[np.bool_]:
-    """Return True for each pair of a segment, (K, 2, 3) m, and a triangle, (K, 3, 3) m, that have a point in common.
-
-    Those in one plane count if an end is in the triangle, or edges cross.
-    """
-    p, q, (a, b, c) = ends[:, 0], ends[:, 1], corners.transpose(1, 0, 2)
-    size = np.abs(corners - p[:, None]).max(axis=(1, 2)) if len(p) else np.zeros(0)
-    little = 1e-12 * size**3
-
-    def volume(*points: Floats) -> Floats:
-        first = points[0]
-        return np.asarray(np.linalg.det(np.stack([x - first for x in points[1:]], axis=1)))
-
-    over, under = volume(a, b, c, p), volume(a, b, c, q)
-    sides = np.stack([volume(p, q, a, b), volume(p, q, b, c), volume(p, q, c, a)])
-    inside = (sides >= -little).all(axis=0) | (sides <= little).all(axis=0)
-    flat = (np.abs(over) <= little) & (np.abs(under) <= little)
-    crossing = ((over >= -little) & (under <= little)) | ((over <= little) & (under >= -little))
-    return np.asarray(np.where(flat, _meet_in_plane(ends, corners), inside & crossing))
-
-
-def _meet_in_plane(ends: Floats, corners: Floats) -> NDArray[np.bool_]:
-    """Return True for each segment and triangle of one plane that have a point in common: along the plane's axes."""
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    dropped = np.abs(normal).argmax(axis=1)
-    kept = np.array([(1, 2), (0, 2), (0, 1)])[dropped][:, None]
-    s, t = np.take_along_axis(ends, kept, axis=2), np.take_along_axis(corners, kept, axis=2)
-    apart = np.zeros(len(s), bool)
-    for tips in (s, t):  # convex shapes are apart if an edge of one separates them
-        for k in range(tips.shape[1]):
-            edge = tips[:, (k + 1) % tips.shape[1]] - tips[:, k]
-            across = np.stack([-edge[:, 1], edge[:, 0]], axis=1)[:, :, None]
-            x, y = (s @ across)[:, :, 0], (t @ across)[:, :, 0]
-            apart |= (x.max(axis=1) < y.min(axis=1)) | (x.min(axis=1) > y.max(axis=1))
-    along = (s[:, 1] - s[:, 0])[:, :, None]
-    x, y = (s @ along)[:, :, 0], (t @ along)[:, :, 0]
-    return np.asarray(~(apart | (x.max(axis=1) < y.min(axis=1)) | (x.min(axis=1) > y.max(axis=1))))

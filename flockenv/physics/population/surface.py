@@ -26,7 +26,7 @@ FLAT, SIDE, ENDS = 0.0, 1.0, 2.0
 def pieces(shape: Any) -> Floats:
     """Return the pieces of a shape's surface, (n, 14).
 
-    Raise ValueError if the shape is unbounded, hollow, or a grid of distances.
+    Raise ValueError if the shape is unbounded, hollow, or has a grid of distances.
     """
     if shape.form == "block":
         found = _block(shape)
@@ -35,7 +35,7 @@ def pieces(shape: Any) -> Floats:
     elif shape.form == "chain":
         found = _chain(shape)
     else:
-        why = "has no end" if shape.kind == "half_space" else "is a grid of distances"
+        why = "has no end" if shape.kind == "half_space" else "has distances on a grid"
         why = "is hollow" if shape.is_hollow else why
         raise ValueError(
             f"shape.kind = {shape.kind}: {why}, its surface cannot be drawn from; allowed: circle, capsule, wall, "

@@ -1,4 +1,7 @@
-"""Checks of meshes that were made elsewhere: holes, flipped faces, elements that overlap, parts that only touch."""
+"""Checks of meshes that were made elsewhere.
+
+Holes, flipped faces, elements that overlap, parts that only touch or face inwards, edges that pass through faces.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["check_mesh"]
+from flockenv.geometry.box_tree import build_tree, overlapping_pairs, set_boxes
+
+__all__ = ["check_facing", "check_mesh", "first_piercing"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[Any]
@@ -135,3 +140,97 @@ def _refuse_touching(points: Floats, elements: Ints, sides: _Sides, one: Ints, t
             f"parts of the mesh touch in vertex {at}, {_place(points[at])}, without a common "
             f"{_word(sides.corners)[0]}: give each part a vertex there"
         )
+
+
+# --- surfaces that separate inside from outside -------------------------------------------------------------------
+
+
+def check_facing(points: Floats, triangles: Ints) -> None:
+    """Raise ValueError unless the parts of a closed surface (n, 3), (T, 3) separate a solid from what is outside it.
+
+    The winding number is 1 in the solid and 0 elsewhere, so half of that on each part: a part that faces inwards bounds
+    a cavity in another part, and one that faces outwards lies outside all others.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    ends = np.concatenate([triangles[:, :2], triangles[:, 1:]]).T
+    label = connected_components(coo_array((np.ones(ends.shape[1], bool), tuple(ends)), (len(points),) * 2))[1]
+    corners = points[triangles]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    order = np.argsort(-area, kind="stable")
+    for at in np.sort(order[np.unique(label[triangles[order, 0]], return_index=True)[1]]):  # the largest of each part
+        turns = _winding_number(np.delete(corners, at, axis=0), corners[at].mean(axis=0))
+        if abs(turns - 0.5) > 0.25:
+            why = "faces inwards: reverse its triangles" if turns < 0.5 else "lies inside another part: leave it out"
+            raise ValueError(f"the part of triangle {at}, at {_place(corners[at, 0])}, {why}")
+
+
+def _winding_number(corners: Floats, x: Floats) -> float:
+    """Return how often triangles (T, 3, 3) m wind around a point: the sum of solid angles / 4 pi.
+
+    Source: van Oosterom and Strackee 1983.
+    """
+    a, b, c = (corners - x).transpose(1, 0, 2)
+    la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
+    over = (a * np.cross(b, c)).sum(axis=1)
+    under = la * lb * lc + (a * b).sum(axis=1) * lc + (b * c).sum(axis=1) * la + (c * a).sum(axis=1) * lb
+    return float(np.arctan2(over, under).sum() / (2 * np.pi))
+
+
+def first_piercing(
+    points: Floats, edges: Ints, triangles: Ints, count: int | None = None
+) -> tuple[int, int] | None:  # fmt: skip
+    """Return an edge, of (E, 2), and a triangle, of (T, 3), that have a point but no corner in common; None if none.
+
+    count: edges and triangles of which all corners have this number or a higher one are not compared with each other.
+    """
+    corners, ends = points[triangles], points[edges]
+    tree = build_tree(corners.mean(axis=1))
+    set_boxes(tree, corners)
+    edge, triangle = overlapping_pairs(tree, np.concatenate([ends.min(axis=1), ends.max(axis=1)], axis=1))
+    own = (edges[edge][:, :, None] == triangles[triangle][:, None, :]).any(axis=(1, 2))
+    if count is not None:
+        own |= (edges[edge, 0] >= count) & (triangles[triangle, 0] >= count)
+    edge, triangle = edge[~own], triangle[~own]
+    found = np.flatnonzero(_pierces(ends[edge], corners[triangle]))
+    return (int(edge[found[0]]), int(triangle[found[0]])) if len(found) else None
+
+
+def _pierces(ends: Floats, corners: Floats) -> NDArray[np.bool_]:
+    """Return True for each pair of a segment, (K, 2, 3) m, and a triangle, (K, 3, 3) m, that have a point in common.
+
+    Those in one plane count if an end is in the triangle, or edges cross.
+    """
+    p, q, (a, b, c) = ends[:, 0], ends[:, 1], corners.transpose(1, 0, 2)
+    size = np.abs(corners - p[:, None]).max(axis=(1, 2)) if len(p) else np.zeros(0)
+    little = 1e-12 * size**3
+
+    def volume(*points: Floats) -> Floats:
+        first = points[0]
+        return np.asarray(np.linalg.det(np.stack([x - first for x in points[1:]], axis=1)))
+
+    over, under = volume(a, b, c, p), volume(a, b, c, q)
+    sides = np.stack([volume(p, q, a, b), volume(p, q, b, c), volume(p, q, c, a)])
+    inside = (sides >= -little).all(axis=0) | (sides <= little).all(axis=0)
+    flat = (np.abs(over) <= little) & (np.abs(under) <= little)
+    crossing = ((over >= -little) & (under <= little)) | ((over <= little) & (under >= -little))
+    return np.asarray(np.where(flat, _meet_in_plane(ends, corners), inside & crossing))
+
+
+def _meet_in_plane(ends: Floats, corners: Floats) -> NDArray[np.bool_]:
+    """Return True for each segment and triangle of one plane that have a point in common: along the plane's axes."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    dropped = np.abs(normal).argmax(axis=1)
+    kept = np.array([(1, 2), (0, 2), (0, 1)])[dropped][:, None]
+    s, t = np.take_along_axis(ends, kept, axis=2), np.take_along_axis(corners, kept, axis=2)
+    apart = np.zeros(len(s), bool)
+    for tips in (s, t):  # convex shapes are apart if an edge of one separates them
+        for k in range(tips.shape[1]):
+            edge = tips[:, (k + 1) % tips.shape[1]] - tips[:, k]
+            across = np.stack([-edge[:, 1], edge[:, 0]], axis=1)[:, :, None]
+            x, y = (s @ across)[:, :, 0], (t @ across)[:, :, 0]
+            apart |= (x.max(axis=1) < y.min(axis=1)) | (x.min(axis=1) > y.max(axis=1))
+    along = (s[:, 1] - s[:, 0])[:, :, None]
+    x, y = (s @ along)[:, :, 0], (t @ along)[:, :, 0]
+    return np.asarray(~(apart | (x.max(axis=1) < y.min(axis=1)) | (x.min(axis=1) > y.max(axis=1))))
