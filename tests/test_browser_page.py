@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 
 pytest.importorskip("websockets", reason="needs the extra `play`: pip install 'flockenv[play]'")
@@ -13,6 +15,7 @@ from flockenv.model.networks import Cloth, Rope
 from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import Springs
 from flockenv.play.session import Session
+from flockenv.render.camera import rows_of
 from flockenv.scene import Group, Scene
 from flockenv.scene.yaml_io import load_scene
 from flockenv.tasks import TASKS
@@ -405,3 +408,5 @@ def test_agents_without_faces_are_drawn_beside_a_sheet(visit: Callable[..., Visi
         assert sorted(found["bodies"]) == list(range(9, 15))  # the free agents, and the particles of the rope
         assert found["faces"] == 8 and found["colours"] == ["#00ff00"]
         assert "agent" in found["legend"]
+        angles = f"{{yaw: {math.radians(35)}, tilt: {math.radians(50)}}}"
+        assert np.array(here.value(f"turned({angles})")) == pytest.approx(rows_of(35, 50), abs=1e-12)

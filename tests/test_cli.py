@@ -442,11 +442,14 @@ def test_a_task_is_rendered_with_a_disturbance(capsys: pytest.CaptureFixture[str
         ("path_follow", ("--dropped", "0.1"), "dropped = 0.1: must be 0 for path_follow"),
         ("pursuit", ("--noise", "2"), "noise = 2.0"),
         ("scene.yaml", ("--delay", "1"), "--noise, --delay, --dropped, --range, --seen: for tasks only"),
+        ("pursuit", ("--yaw", "30"), "--yaw, --tilt: for scenes only"),
+        ("scene.yaml", ("--tilt", "30"), "--yaw, --tilt: for pictures and films; an HTML replay is turned by the"),
+        ("scene.yaml", ("--tilt", "30", "--out", "x.png"), "yaw = 0, tilt = 30: for worlds in 3-D only"),
     ):
         assert main(["render", what, "--out", "x.html", *options]) == 2
         error = capsys.readouterr().err
         assert text in error and error.count("\n") == 1
-    assert not Path("x.html").exists()
+    assert not Path("x.html").exists() and not Path("x.png").exists()
 
 
 def test_several_players_are_drawn_side_by_side() -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import os
 import pickle
 import re
@@ -28,7 +29,8 @@ from flockenv.model.state import State
 from flockenv.physics.effects import Springs
 from flockenv.play.fields import colour_of
 from flockenv.play.scene_lane import SceneLane
-from flockenv.render import Group, Panel, Window, draw, write_gif, write_png, write_replay
+from flockenv.render import Group, Panel, Window, draw, turned, write_gif, write_png, write_replay
+from flockenv.render.camera import rows_of
 from flockenv.render.palette import ROLE_COLOURS, rgb
 from flockenv.render.view import view_of
 from flockenv.scene import Group as SceneGroup
@@ -421,6 +423,64 @@ def test_strain_takes_the_shortest_path_on_a_torus_and_needs_a_network() -> None
     np.testing.assert_allclose(scene.view.strain(state), 0.0, atol=1e-12)
     with pytest.raises(ValueError, match=r"groups\[0\].appearance.by = strain: needs a network"):
         Scene(groups=(SceneGroup(count=2, appearance=STRAINED),), space=Torus(size=(9, 9)), dt=0.1)
+
+
+# ---- camera
+
+
+def test_the_rotation_is_that_of_the_page() -> None:
+    """Numbers of `turned` in page/lens.js, by Node: tests/test_browser_page.py compares again, in a browser."""
+    points = np.array([(1.0, 2.0, 3.0), (-0.5, 0.0, 4.0)])
+    for camera, expected in (
+        ((30, 60), [(1.8660254037844386, 3.214101615137755, 0.43301270189221963),
+                    (-0.43301270189221935, 3.5891016151377544, 1.7834936490538909)]),
+        ((-100, 140), [(-2.1432636836913463, 1.4400007654431075, -2.7079177568185235),
+                       (0.08682408883346515, 2.948353692113902, -2.747666661696167)]),
+    ):  # fmt: skip
+        np.testing.assert_allclose(points @ rows_of(*camera).T, expected, atol=1e-14)
+
+
+def test_a_turned_snapshot_shows_a_side_and_keeps_distances_and_speeds() -> None:
+    world = shot(
+        [(2.0, 5.0, 9.0), (8.0, 5.0, 1.0)],
+        vel=[(0, 0, 3.0), (1.0, 0, 0)],
+        obstacle_centre=[(2.0, 5.0, 9.0)],
+        obstacle_radius=[1.0],
+        outlines=(np.array([(1.0, 1.0), (2.0, 1.0), (2.0, 9.0)]),),
+        marks=(Mark("goal", np.array((8.0, 5.0, 1.0)), np.zeros(3), 1.0),),
+    )
+    side = turned(world, 0, 90)
+    np.testing.assert_allclose(side.pos, [(-3.0, 4.0, 0.0), (3.0, -4.0, 0.0)], atol=1e-12)
+    np.testing.assert_allclose(side.vel, [(0.0, 3.0, 0.0), (1.0, 0.0, 0.0)], atol=1e-12)
+    np.testing.assert_allclose(side.obstacle_centre[0], side.pos[0])
+    np.testing.assert_allclose(side.marks[0].at, side.pos[1])
+    np.testing.assert_allclose(side.outlines[0][:, 1], -5.0)  # on the ground, which is seen from its edge
+    np.testing.assert_allclose((side.low, side.high), ([-5.0] * 3, [5.0] * 3), atol=1e-12)
+    assert turned(world, 0, 0) is world
+    oblique = turned(world, 35, 50)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(oblique.pos, axis=0)), 10.0)
+    assert (np.abs(oblique.pos) <= oblique.high).all() and draw(oblique, 200).shape[1] == 200
+
+
+def test_bonds_across_the_edge_of_a_torus_are_left_out_of_a_turned_picture() -> None:
+    pos = [(0.5, 5.0, 5.0), (9.5, 5.0, 5.0), (8.0, 5.0, 5.0)]
+    world = shot(pos, bonds=[(0, 1), (1, 2)], periodic=True, faces=[(0, 1, 2)])
+    side = turned(world, 20, 60)
+    assert side.whole_bonds.tolist() == [[1, 2]] and not len(side.whole_faces) and not side.periodic
+
+
+@pytest.mark.parametrize(
+    ("camera", "message"),
+    [
+        ((361, 0), "yaw = 361: must be from -360 to 360 degrees"),
+        ((0, -1), "tilt = -1: must be from 0 to 180 degrees"),
+        ((math.nan, 0), "yaw = nan: must be"),
+        ((10, 0), "yaw = 10, tilt = 0: for worlds in 3-D only; this one is in 2-D"),
+    ],
+)
+def test_bad_cameras_are_refused(camera: tuple[float, float], message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        turned(shot(), *camera)
 
 
 def test_agents_with_bonds_leave_no_trail() -> None:

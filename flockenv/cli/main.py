@@ -268,6 +268,14 @@ def render(
             "time since the one before, as in a film camera (0.5).",
         ),
     ] = 0.0,
+    yaw: Annotated[
+        float,
+        typer.Option(metavar="DEG", help="Turn a 3-D scene about its z axis, -360 to 360 degrees."),
+    ] = 0.0,
+    tilt: Annotated[
+        float,
+        typer.Option(metavar="DEG", help="Lower the view of a 3-D scene: 0 from above, 90 from the side, to 180."),
+    ] = 0.0,
     noise: Noise = 0.0,
     delay: Delay = 0,
     dropped: Dropped = 0.0,
@@ -295,11 +303,15 @@ def render(
             )
         if shutter and path.suffix.lower() == ".html":
             raise ValueError(f"--shutter {shutter:g}: for pictures and films; an HTML replay has no motion blur")
-        panel, fps, blur, left = _film_scene(what, 10.0 if duration is None else duration, seed, shutter)
+        if (yaw or tilt) and path.suffix.lower() == ".html":
+            raise ValueError("--yaw, --tilt: for pictures and films; an HTML replay is turned by the pointer")
+        panel, fps, blur, left = _film_scene(what, 10.0 if duration is None else duration, seed, shutter, (yaw, tilt))
         panels, title = [panel], title_of(what)
     else:
         if shutter:
             raise ValueError(f"--shutter {shutter:g}: for scenes only; a task shows one instant per decision")
+        if yaw or tilt:
+            raise ValueError("--yaw, --tilt: for scenes only; tasks are in 2-D")
         blur = Shutter()
         panels, fps = _film_task(what, player, seed, duration, trust_pickle, disturbance)
         title, left = what, ""
@@ -467,23 +479,27 @@ def _unsolved_text(state: State) -> str:
     return f", {count:,} times contacts left unsolved" if count else ""
 
 
-def _film_scene(file: str, duration: float, seed: int, share: float) -> tuple[Panel, float, Shutter, str]:
+def _film_scene(
+    file: str, duration: float, seed: int, share: float, camera: tuple[float, float]
+) -> tuple[Panel, float, Shutter, str]:
     """Return the run of a scene as a panel, its frames per second, the shutter, and the text about unsolved contacts.
 
-    share: of the time of a frame in which the shutter is open.
+    share: of the time of a frame in which the shutter is open. camera: yaw and tilt, degrees.
     """
-    from flockenv.render import Panel
+    from flockenv.render import Panel, turned
+    from flockenv.render.camera import check_camera
     from flockenv.scene.yaml_io import load_scene
     from flockenv.studies.trajectory import whole_steps
 
     scene = load_scene(Path(file))
+    check_camera(*camera, scene.dimension)
     every = max(1, round(1.0 / (FPS * scene.dt)))
     blur = Shutter.of(share, every)
     part = every // blur.parts
     trajectory = _record(scene, seed, whole_steps("--duration", duration, scene.dt), part)
     if trajectory.stopped == "interrupted":
         raise KeyboardInterrupt
-    snapshots = list(trajectory.snapshots(title=title_of(file)))
+    snapshots = [turned(shot, *camera) for shot in trajectory.snapshots(title=title_of(file))]
     panel = Panel("", snapshots, None, trajectory.stopped)
     return panel, 1.0 / (part * blur.parts * scene.dt), blur, _unsolved_text(trajectory.last)
 

@@ -62,6 +62,7 @@ class Snapshot:
     heading (N, D): directions that agents face; default: those of the velocities.
     looks: appearances; look (N,): the index of each agent's own, -1 = none. age (N,): s, of the living; default: the
     time. identity (N,): int, the agent in each row; default: the same agents at all times.
+    box (4, 3): of a world that was turned, a corner of its region and the three next to it along its axes, m.
     shown (N,): the strain or inner state of each agent that its look shows; none by default.
     Arrays are private copies and read-only. Positions and velocities may hold NaN or inf: such bodies of a run that
     diverged are not drawn.
@@ -91,6 +92,7 @@ class Snapshot:
     shown: Floats | None = None
     broken: NDArray[np.bool_] | None = None
     faces: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 3), np.int32))
+    box: Floats | None = None
 
     def __post_init__(self) -> None:
         pos = _array("Snapshot.pos", self.pos, (None, None), finite=False)
@@ -121,6 +123,7 @@ class Snapshot:
             shown=None if self.shown is None else _array("Snapshot.shown", self.shown, (agents,)),
             broken=None if self.broken is None else _switches("Snapshot.broken", self.broken, len(self.bonds)),
             faces=_agents("Snapshot.faces", self.faces, 3, agents),
+            box=None if self.box is None else _array("Snapshot.box", self.box, (4, 3)),
         )
         if self.look is not None and not (self.look < len(self.looks)).all():
             raise ValueError(f"Snapshot.look: must be below {len(self.looks)}, the number of looks")

@@ -9,18 +9,20 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
+    from flockenv.render.camera import turned
     from flockenv.render.gif import write_gif, write_png
     from flockenv.render.picture import draw
     from flockenv.render.replay import Group, Panel, write_replay
     from flockenv.render.window import Window
 
-__all__ = ["Group", "Panel", "Window", "draw", "write_gif", "write_png", "write_replay"]
+__all__ = ["Group", "Panel", "Window", "draw", "turned", "write_gif", "write_png", "write_replay"]
 
 _MODULES: Final = {
     "Group": "replay",
     "Panel": "replay",
     "Window": "window",
     "draw": "picture",
+    "turned": "camera",
     "write_gif": "gif",
     "write_png": "gif",
     "write_replay": "replay",

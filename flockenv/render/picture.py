@@ -54,9 +54,9 @@ def draw(
 
     An agent is a dart that points along its velocity (a dot if it is at rest), over a disc of its radius, in the colour
     of its role. Agents with bonds are dots, and bonds are thin lines behind them; sheets and bodies are shaded faces
-    instead, whose back has another colour. 3-D scenes are seen from above: upper agents are larger, and drawn last. An
-    agent with an appearance is drawn as a point, a disc, a polygon or a metaball, whose colour may show its age or
-    speed; a face has the colour of its first corner.
+    instead, whose back has another colour. 3-D scenes are seen from above, others by `turned`: near agents are larger,
+    and drawn last. An agent with an appearance is drawn as a point, a disc, a polygon or a metaball, whose colour may
+    show its age or speed; a face has the colour of its first corner.
 
     trails: earlier snapshots of the same world, oldest first. The path of each agent without bonds is drawn behind it;
     of an agent with an appearance, its last `trail` seconds. all_trails: False: only of agents with an appearance.
@@ -69,7 +69,8 @@ def draw(
     outlines = tuple(polygon.tobytes() for polygon in snapshot.outlines)
     hidden = covered(snapshot)
     roles = _roles_in_their_colours(snapshot, hidden)
-    backdrop = _draw_backdrop(view, snapshot.title, roles, circles.tobytes(), outlines)
+    box = b"" if snapshot.box is None else snapshot.box.tobytes()
+    backdrop = _draw_backdrop(view, snapshot.title, roles, circles.tobytes(), outlines, box)
     canvas = backdrop.copy()
     pen = ImageDraw.Draw(canvas, "RGBA")
     tracks = [mark for mark in snapshot.marks if mark.kind == "way"]
@@ -106,28 +107,51 @@ def _check_integer(name: str, value: int, limits: tuple[int, int]) -> None:
 
 @lru_cache(maxsize=4)
 def _draw_backdrop(
-    view: View, title: str, roles: tuple[str, ...], circles: bytes, outlines: tuple[bytes, ...]
+    view: View, title: str, roles: tuple[str, ...], circles: bytes, outlines: tuple[bytes, ...], box: bytes
 ) -> Image.Image:
-    """Draw the parts that do not move; circles and outlines are bytes, so that the result can be cached."""
+    """Draw the parts that do not move; circles, outlines and box are bytes, so that the result can be cached."""
     canvas = Image.new("RGB", (view.width, view.height), rgb(PAPER["page"][0]))
     pen = ImageDraw.Draw(canvas, "RGBA")
     world = (view.left, view.top, view.right, view.bottom)
     pen.rectangle(world, fill=rgb(_PAPER))
-    _draw_grid(pen, view)
+    if box:
+        _draw_box(pen, view, np.frombuffer(box).reshape(4, 3))
+    else:
+        _draw_grid(pen, view)
     for x, y, radius in np.frombuffer(circles).reshape(-1, 3).tolist():
         _draw_circle(pen, view, x, y, radius)
     for outline in outlines:
         _draw_outline(pen, view, np.frombuffer(outline).reshape(-1, 2))
     _restore_margins(canvas, Image.new("RGB", canvas.size, rgb(PAPER["page"][0])), view, spill=0.0)
-    _draw_border(pen, view)
+    if not box:
+        _draw_border(pen, view)
     _draw_caption(pen, view, title, roles)
     return canvas
 
 
-def _draw_grid(pen: ImageDraw.ImageDraw, view: View) -> None:
-    extent = max(view.high[0] - view.low[0], view.high[1] - view.low[1])
+def _draw_box(pen: ImageDraw.ImageDraw, view: View, box: Floats) -> None:
+    """Draw the region of a world that was turned: its ground with a grid, and its other edges; box: of a snapshot."""
+    corner, (x, y, z) = box[0], box[1:] - box[0]
+    wide, deep = float(np.linalg.norm(x)), float(np.linalg.norm(y))
+    step, thick = _grid_step(max(wide, deep)), max(1, round(view.width / 600))
+    lines = [(corner + x * k * step / wide, y) for k in range(1, math.ceil(wide / step))]
+    lines += [(corner + y * k * step / deep, x) for k in range(1, math.ceil(deep / step))]
+    lines += [(corner + side, z) for side in (0 * x, x, y, x + y)]
+    lines += [(corner + z + side, along) for side, along in ((0 * x, x), (y, x), (0 * x, y), (x, y))]
+    for start, along in lines:
+        pen.line(view.to_pixels(np.stack([start, start + along])).ravel().tolist(), PAPER["grid"][0], thick)
+    ground = view.to_pixels(np.stack([corner, corner + x, corner + x + y, corner + y, corner]))
+    pen.line(ground.ravel().tolist(), PAPER["edge"][0], max(1, round(view.width / 500)))
+
+
+def _grid_step(extent: float) -> float:
+    """Return the distance of grid lines, m, in a world of this extent: 5 to 10 of them."""
     power = 10.0 ** math.floor(math.log10(extent / 5.0))
-    step = next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power * 10.0 >= extent)
+    return next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power * 10.0 >= extent)
+
+
+def _draw_grid(pen: ImageDraw.ImageDraw, view: View) -> None:
+    step = _grid_step(max(view.high[0] - view.low[0], view.high[1] - view.low[1]))
     thick = max(1, round(view.width / 600))
     for n in range(math.ceil(view.low[0] / step), math.floor(view.high[0] / step) + 1):
         x = view.left + (n * step - view.low[0]) * view.metre
