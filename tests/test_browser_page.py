@@ -410,3 +410,14 @@ def test_agents_without_faces_are_drawn_beside_a_sheet(visit: Callable[..., Visi
         assert "agent" in found["legend"]
         angles = f"{{yaw: {math.radians(35)}, tilt: {math.radians(50)}}}"
         assert np.array(here.value(f"turned({angles})")) == pytest.approx(rows_of(35, 50), abs=1e-12)
+
+
+SOFT = """() => {
+  const { data, width } = softDisc("#ff0000").getContext("2d").getImageData(0, 0, 64, 64);
+  return [32, 48, 63].map(x => data[4 * (32 * width + x) + 3]);
+}"""
+
+
+def test_a_billboard_fades_from_its_middle_to_its_edge(boids: Session, visit: Callable[..., Visit]) -> None:
+    with serving(boids) as server:
+        assert opened(visit, server.url).value(f"({SOFT})()") == pytest.approx([255, 255 * 0.75**2, 0], abs=12)

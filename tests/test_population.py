@@ -635,10 +635,10 @@ def test_a_trail_does_not_join_two_agents_of_one_slot() -> None:
 
 def test_forms_look_different_and_bad_appearances_are_refused() -> None:
     pictures = []
-    for form in ("point", "disc", "polygon", "metaball"):
+    for form in ("point", "disc", "polygon", "metaball", "billboard"):
         jet = looked_at(form=form, opacity=(1.0, 1.0))
         pictures.append(draw(jet.snapshot(jet.run(jet.start(0), 20)), 300))
-    assert (pictures[1] != pictures[2]).any() and (pictures[1] != pictures[3]).any()
+    assert (pictures[1] != pictures[2]).any() and all((pictures[1] != pictures[k]).any() for k in (3, 4))
     for wrong, message in (
         ({"colours": ("red",)}, "colours"), ({"colours": ("#ff0000", "#00ff00")}, "by: missing"),
         ({"over": (1.0, 1.0)}, "over"), ({"form": "star"}, "form"), ({"opacity": (1.0, 2.0)}, "opacity"),

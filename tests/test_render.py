@@ -97,6 +97,21 @@ def test_metaballs_melt_if_they_are_near_and_are_discs_of_their_size_if_not() ->
     assert reds(near).sum() > apart.sum()
 
 
+def test_a_billboard_is_opaque_in_its_middle_and_fades_to_its_edge_and_the_nearest_covers_others() -> None:
+    soft = Appearance(form="billboard", colours=("#ff0000",), size=(2.0, 2.0))
+    picture = draw(shot([(5, 5)], looks=(soft,), look=[0]), 400)
+    view = view_of(shot(), 400, 1)
+    x, y = view.to_pixels(np.array((5.0, 5.0))).round().astype(int)
+    for share in (0.0, 0.25, 0.5, 0.75):  # green where the paper, which is white, shows
+        green = picture[y, x + round(share * 2.0 * view.metre), 1]
+        assert green == pytest.approx(255 * (1 - (1 - share**2) ** 2), abs=12)
+    assert (picture[y, x + round(2.1 * view.metre)] == 255).all()
+    blue = soft.model_copy(update={"colours": ("#0000ff",)})
+    for heights, channel in (((2.0, 8.0), 2), ((8.0, 2.0), 0)):
+        pair = shot([(5, 5, z) for z in heights], looks=(soft, blue), look=[0, 1])
+        assert draw(pair, 400)[y, x, channel] > 250
+
+
 def test_a_metaball_without_a_size_is_not_drawn() -> None:
     assert not reds([(5, 5)], size=(0.0, 0.0)).any()
 

@@ -18,7 +18,7 @@ Size = Annotated[float, Field(ge=0)]
 
 
 class Appearance(Record):
-    """Points, discs, polygons or metaballs whose colour, opacity and size may depend on one quantity.
+    """Points, discs, polygons, metaballs or billboards whose colour, opacity and size may depend on one quantity.
 
     `by` names it: age, speed, strain or an inner state. `over` is its range: from the first to the last colour, opacity
     and size, which are interpolated.
@@ -26,10 +26,10 @@ class Appearance(Record):
 
     sentence: ClassVar[str] = "drawn as {form}"
 
-    form: Literal["point", "disc", "polygon", "metaball"] = Field(
+    form: Literal["point", "disc", "polygon", "metaball", "billboard"] = Field(
         default="point",
         description="a dot, always visible; a disc of its true size; a polygon that points ahead; a disc that melts "
-        "into its neighbours, as drops of a liquid do",
+        "into its neighbours, as drops of a liquid do; a billboard, a soft disc that faces the viewer, as of smoke",
     )
     vertices: tuple[tuple[float, float], ...] = Field(
         default=((1.0, 0.0), (-0.8, 0.6), (-0.8, -0.6)), min_length=3, max_length=64,

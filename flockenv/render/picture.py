@@ -55,8 +55,8 @@ def draw(
     An agent is a dart that points along its velocity (a dot if it is at rest), over a disc of its radius, in the colour
     of its role. Agents with bonds are dots, and bonds are thin lines behind them; sheets and bodies are shaded faces
     instead, whose back has another colour. 3-D scenes are seen from above, others by `turned`: near agents are larger,
-    and drawn last. An agent with an appearance is drawn as a point, a disc, a polygon or a metaball, whose colour may
-    show its age or speed; a face has the colour of its first corner.
+    and drawn last. An agent with an appearance is drawn as a point, disc, polygon, metaball or billboard, whose colour
+    may show its age or speed; a face has the colour of its first corner.
 
     trails: earlier snapshots of the same world, oldest first. The path of each agent without bonds is drawn behind it;
     of an agent with an appearance, its last `trail` seconds. all_trails: False: only of agents with an appearance.
@@ -88,7 +88,7 @@ def draw(
     _draw_bonds(pen, view, snapshot, hidden)
     draw_faces(canvas, view, snapshot, _relative_heights(snapshot))
     _draw_liquids(canvas, view, snapshot)
-    _draw_agents(pen, view, snapshot, hidden)
+    _draw_agents(canvas, pen, view, snapshot, hidden)
     _restore_margins(canvas, backdrop, view, view.spill)
     _draw_time(pen, view, snapshot.time)
     return np.array(canvas.reduce(scale) if scale > 1 else canvas)
@@ -364,7 +364,10 @@ def _magnification(snapshot: Snapshot) -> Floats:
     return 0.7 + 0.5 * depth if snapshot.dimension == 3 else depth
 
 
-def _draw_agents(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot, hidden: NDArray[np.bool_]) -> None:
+def _draw_agents(
+    canvas: Image.Image, pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot, hidden: NDArray[np.bool_]
+) -> None:
+    """Draw agents, the farthest first, as their appearance or role defines; pen: of the canvas."""
     visible = np.flatnonzero(snapshot.visible & ~(hidden & snapshot.alive))
     depth, magnification = _relative_heights(snapshot), _magnification(snapshot)
     body = snapshot.radius * view.metre * magnification
@@ -382,7 +385,8 @@ def _draw_agents(pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot, hidde
                 _draw_cross(pen, a, b, float(reach[i]), role)
                 continue
             if not lacks_look[i]:
-                _draw_look(pen, view, snapshot, i, (a, b), aim[i], float(shades[i]), float(magnification[i]))
+                share, factor = float(shades[i]), float(magnification[i])
+                _draw_look(canvas, pen, view, snapshot, i, (a, b), aim[i], share, factor)
                 continue
             if has_bonds[i]:
                 shade = mix(ROLE_COLOURS[role][0], _PAPER, 0.45 + 0.55 * float(depth[i]))
@@ -469,8 +473,8 @@ def _draw_look_trails(pen: ImageDraw.ImageDraw, view: View, path: Sequence[Snaps
 
 
 def _draw_look(
-    pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot, i: int, position: tuple[float, float], aim: Floats,
-    shade: float, magnification: float,
+    canvas: Image.Image, pen: ImageDraw.ImageDraw, view: View, snapshot: Snapshot, i: int,
+    position: tuple[float, float], aim: Floats, shade: float, magnification: float,
 ) -> None:  # fmt: skip
     """Draw an agent as its appearance defines it; metaballs are drawn already."""
     look = snapshot.looks[int(np.asarray(snapshot.look)[i])]
@@ -484,8 +488,19 @@ def _draw_look(
         c, s = (aim / length).tolist() if length > 0 else (1.0, 0.0)
         corners = [p for a, b in look.vertices for p in (x + reach * (a * c - b * s), y - reach * (a * s + b * c))]
         pen.polygon(corners, fill=fill)
+    elif look.form == "billboard":
+        mask = _soft_disc(min(max(1, round(reach)), view.width), fill[3])
+        canvas.paste(fill[:3], (round(x) - mask.width // 2, round(y) - mask.height // 2), mask)
     else:
         _draw_disc(pen, x, y, max(reach, view.width * POINT) if look.form == "point" else reach, fill)
+
+
+@lru_cache(maxsize=1024)
+def _soft_disc(radius: int, opacity: int) -> Image.Image:
+    """Return the coverage of a billboard, 0 to 255: opacity (1 - (d / r)^2)^2 at a distance d; radius r in px."""
+    place = np.arange(-radius, radius + 1) / radius
+    inside = np.maximum(1.0 - place**2 - place[:, None] ** 2, 0.0)
+    return Image.fromarray(np.rint(opacity * inside**2).astype(np.uint8))
 
 
 def _restore_margins(canvas: Image.Image, backdrop: Image.Image, view: View, spill: float) -> None:

@@ -170,13 +170,17 @@ function fade(colour, ground, share) {
 /* The colour that all agents of a crowd have, or -1. */
 function oneColour(panel, styles) { return panel.D > 2 || panel.tint || panel.looks.length || styles.plain.length > 1 ? -1 : styles.plain[0].colours[0]; }
 
+/* True if an agent is a billboard: those are images, drawn over the stamps, in order. */
+function floats(panel, i) { return panel.look[i] >= 0 && !panel.tint && panel.looks[panel.look[i]].form === "billboard"; }
+
 function drawCrowd(pen, eye, panel, all, k, hidden) {
   const { w, h, a, b, tx, ty } = eye, pixels = emptyLayer(w, h), styles = stampStyles(panel, eye), shade = panel.frames[k].shade;
-  const sorted = drawingOrder(panel, eye, all), least = leastReach(panel, eye), paper = word(paint.paper), pos = all.pos, one = oneColour(panel, styles), bytes = one < 0 ? null : emptyPlane(w, h), dotNumber = formNumber("dot"), { flat } = eye, perTurn = TURNS / (2 * Math.PI);
+  const sorted = drawingOrder(panel, eye, all), least = leastReach(panel, eye), paper = word(paint.paper), pos = all.pos, one = oneColour(panel, styles), bytes = one < 0 ? null : emptyPlane(w, h), dotNumber = formNumber("dot"), soft = [], { flat } = eye, perTurn = TURNS / (2 * Math.PI);
   for (let n = 0; n < panel.N; n++) {
     const i = sorted ? sorted.order[n] : n;
     if (!all.there[i] || melts(panel, i) || hidden && hidden[i]) continue;
     const x = a[0] * pos[3 * i] + a[1] * pos[3 * i + 1] + a[2] * pos[3 * i + 2] + tx, y = b[0] * pos[3 * i] + b[1] * pos[3 * i + 1] + b[2] * pos[3 * i + 2] + ty;
+    if (floats(panel, i)) { soft.push({ i, x, y, depth: sorted ? sorted.depth[i] : 1 }); continue; }
     if (!(x > -50 && y > -50 && x < w + 50 && y < h + 50)) continue;
     const style = panel.look[i] < 0 ? styles.plain[panel.kind[i]] : styles.looks[panel.look[i]][panel.kind[i]];
     const s = shade ? shade[i] : 0, depth = sorted ? Math.round(16 * sorted.depth[i]) / 16 : 1, swell = sorted ? 0.7 + 0.5 * depth : 1;
@@ -193,4 +197,5 @@ function drawCrowd(pen, eye, panel, all, k, hidden) {
   if (bytes) unfoldPlane(bytes, pixels.words, w, h, one);
   pixels.pen.putImageData(pixels.image, 0, 0);
   pen.drawImage(pixels.canvas, 0, 0);
+  for (const body of soft) drawLook(pen, eye, panel, body, k, sorted ? 0.7 + 0.5 * body.depth : 1);
 }

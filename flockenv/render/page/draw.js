@@ -192,11 +192,29 @@ function drawBonds(pen, eye, panel, all, broken, hidden) {
   pen.globalAlpha = 1;
 }
 
+/* A soft disc in a colour, opaque in its middle: (1 - d^2)^2 at a share d of its radius, as in render/picture.py. */
+const softDiscs = new Map();
+function softDisc(colour) {
+  if (softDiscs.has(colour)) return softDiscs.get(colour);
+  const r = 32, canvas = document.createElement("canvas"), brush = canvas.getContext("2d"), [red, green, blue] = channels(colour);
+  canvas.width = canvas.height = 2 * r;
+  const shade = brush.createRadialGradient(r, r, 0, r, r, r);
+  for (let d = 0; d <= 1; d += 1 / 16) shade.addColorStop(d, `rgba(${red}, ${green}, ${blue}, ${(1 - d * d) ** 2})`);
+  brush.fillStyle = shade; brush.fillRect(0, 0, 2 * r, 2 * r);
+  softDiscs.set(colour, canvas);
+  return canvas;
+}
+
+function drawBillboard(pen, x, y, reach, colour, opacity) {
+  pen.globalAlpha = opacity; pen.drawImage(softDisc(colour), x - reach, y - reach, 2 * reach, 2 * reach); pen.globalAlpha = 1;
+}
+
 function drawLook(pen, eye, panel, body, k, swell) {
   if (melts(panel, body.i)) return;
   const look = panel.looks[panel.look[body.i]], { at, colour } = lookColour(panel, look, body.i, k);
   const reach = (look.size ? look.size[at] : panel.radius[body.i]) * eye.m * swell;
   for (const [x, y] of eye.sightings(body.x, body.y, 1.1 * reach)) {
+    if (look.form === "billboard") { drawBillboard(pen, x, y, reach, colour, look.opacity[at]); continue; }
     if (look.form === "polygon") polygon(pen, look.vertices, x, y, Number.isNaN(body.aim) ? 0 : body.aim, reach);
     else disc(pen, x, y, look.form === "point" ? Math.max(reach, data.point * eye.w) : reach);
     pen.fillStyle = colour; pen.globalAlpha = look.opacity[at]; pen.fill(); pen.globalAlpha = 1;
