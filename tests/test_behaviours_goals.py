@@ -471,6 +471,19 @@ def test_hide_evades_without_a_hiding_place_and_is_zero_without_a_seeker_in_sigh
         np.testing.assert_array_equal(change(scene, state)[1], 0)
 
 
+def test_with_a_range_only_obstacles_whose_surface_is_within_it_hide() -> None:
+    """The rocks' surfaces are 1.24 and 1.95 m from the agent; without one in range it flees as if there were none."""
+
+    def force(rocks: Any, **fields: Any) -> Array:
+        scene = hiding(1, rocks=rocks, **fields)
+        return np.asarray(change(scene, at(scene, ((0, 0), (0, 0)), ((1, 5), (0, 0))))[0])
+
+    np.testing.assert_array_equal(force(ROCKS, range=5.0), force(ROCKS))
+    np.testing.assert_array_equal(force(ROCKS, range=1.5), force(ROCKS[:1], range=1.5))
+    np.testing.assert_array_equal(force(ROCKS, range=1.2), force((), range=1.2))
+    assert np.abs(force(ROCKS, range=1.2) - force(ROCKS, range=1.5)).max() > 1
+
+
 # --- what all behaviours must obey ------------------------------------------------------------------------------------
 
 ABOUT_OTHERS = tuple(row for row in EFFECTS if row.family == "others")

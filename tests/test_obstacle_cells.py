@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockenv.behaviours import AvoidObstacles, FollowWall, ForceField, ObstacleRepulsion, Separation, Whiskers
+from flockenv.behaviours import AvoidObstacles, FollowWall, ForceField, Hide, ObstacleRepulsion, Separation, Whiskers
 from flockenv.engine import obstacle_sets
 from flockenv.geometry.shapes import Block, Capsule, Circle, Shape, Sway
 from flockenv.geometry.space import Box, Plane, Torus
@@ -138,6 +138,22 @@ def test_a_grid_of_circles_changes_no_bits(
     plain = scene_of(space, EFFECTS[name], dtype, circles(dimension, moving))
     check_equal(found, plain.run(begun(plain), 40))
     assert plain.parts.cells == {}
+
+
+@pytest.mark.slow  # two kernels
+def test_hide_with_a_range_finds_circles_by_the_grid_with_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With avoid_obstacles beside it; without a range neither may skip an obstacle."""
+    hide = Hide(weight=8, radius=12, slow_radius=1, range=4)
+    scene = scene_of(PLANE, (hide, AvoidObstacles(weight=4)), "float64", circles(2, False))
+    state = begun(scene)
+    assert uses_grid(scene, state)
+    found = scene.run(state, 40)
+    everywhere = hide.model_copy(update={"range": None})
+    assert not scene_of(PLANE, (everywhere, AvoidObstacles(weight=4)), "float64", circles(2, False)).parts.reaches
+    without_grids(monkeypatch)
+    plain = scene_of(PLANE, scene.effects, "float64", circles(2, False))
+    check_equal(found, plain.run(begun(plain), 40))
+    assert not uses_grid(plain, state)
 
 
 @pytest.mark.parametrize("moved", ["centre", "radius"])

@@ -11,7 +11,7 @@ from flockenv import steering
 from flockenv.behaviours.behaviour import AboutNearest, Moving, mean_nearest, top_speed
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import add, dot, norm, scale, select, zero
-from flockenv.physics.effects.effect import Me, Other
+from flockenv.physics.effects.effect import Me, Obstacle
 
 __all__ = ["Hide"]
 
@@ -40,13 +40,31 @@ def _place_and_threat(acc: Vec) -> tuple[Vec, Vec]:
 
 
 @law
-def nearest_place(p: Any, me: Me, other: Other, acc: Vec) -> Vec:
-    """Keep the nearest hiding place behind an obstacle."""
+def _nearer_place(p: Any, me: Me, other: Obstacle, acc: Vec, near: bool) -> Vec:
+    """Keep the nearest hiding place behind an obstacle; one that is not near has none."""
     goal, threat = _place_and_threat(acc)
     place = steering.hiding_place(other.offset, other.radius, me.radius + p.margin, threat)
     square = dot(place, place)
-    nearer = (square < acc[0]) & (other.radius > like(square, 0.0))  # round obstacles only
+    nearer = (square < acc[0]) & (other.radius > like(square, 0.0)) & near  # round obstacles only
     return (square if nearer else acc[0],) + select(nearer, place, goal) + threat  # noqa: RUF005
+
+
+@law
+def nearest_place(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
+    """Keep the nearest hiding place behind an obstacle."""
+    return _nearer_place(p, me, other, acc, True)
+
+
+@law
+def nearest_place_in_range(p: Any, me: Me, other: Obstacle, acc: Vec) -> Vec:
+    """Keep the nearest hiding place behind an obstacle within range."""
+    return _nearer_place(p, me, other, acc, other.gap <= p.range)
+
+
+@law
+def place_reach(p: Any, me: Me) -> float:
+    """Return the distance within which obstacles are considered, m."""
+    return p.range  # type: ignore[no-any-return]
 
 
 @law
@@ -63,16 +81,19 @@ class Hide(AboutNearest, Moving):
     """Arrive at the nearest place behind a round obstacle, seen from the nearest of a group; evade if there is none.
 
     The place is c + (radius + own radius + margin) unit(c - x_s) (Reynolds 1999; yuka), x_s the seeker's position after
-    min(longest, d / |v_s|). Combine it with avoid_obstacles for obstacles on the path.
+    min(longest, d / |v_s|). Combine it with avoid_obstacles for obstacles on the path. The nearest place may be behind
+    any obstacle, so without a `range` the cost is linear in their number; with one, a grid finds those near.
     """
 
     kind: Literal["hide"] = "hide"
     margin: float = Field(default=0.5, ge=0, description="m, gap between an obstacle and the hidden agent")
     slow_radius: float = Field(gt=0, description="m, distance from the place within which it slows down")
     longest: float = Field(default=0.5, ge=0, description="s, longest prediction of the seeker")
+    range: float | None = Field(
+        default=None, gt=0, description="m, within which obstacles hide (default: any distance)"
+    )
     finish_law: ClassVar[Law | None] = seeker_offset
     obstacle_start: ClassVar[Law | None] = no_place
-    obstacle_law: ClassVar[Law | None] = nearest_place
     obstacle_finish: ClassVar[Law | None] = hide_force
     demo: ClassVar[str | None] = """
 groups:
@@ -87,6 +108,16 @@ effects:
       - {kind: separation, weight: 1, radius: 0.7}
       - {kind: hide, weight: 8, group: 1, radius: 30, slow_radius: 1}
 """
+
+    @property
+    def obstacle_law(self) -> Law | None:  # type: ignore[override]  # depends on the range
+        """The law with a range, or without."""
+        return nearest_place if self.range is None else nearest_place_in_range
+
+    @property
+    def obstacle_reach(self) -> Law | None:  # type: ignore[override]
+        """The range, as a law; None without."""
+        return None if self.range is None else place_reach
 
     def fold_size(self, dimension: int) -> int:
         """Return the size of squared distance, and offsets of the nearest place and of the seeker."""
