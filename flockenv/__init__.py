@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from flockenv.tasks import TASKS, Task
 
 __version__ = "0.1.0"
+"""Version of the package, that of pyproject.toml."""
 
 __all__ = ["TASKS", "Body", "Scene", "Snapshot", "State", "Step", "Task", "World", "__version__", *ENVIRONMENTS]
 

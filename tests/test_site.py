@@ -6,11 +6,13 @@ import importlib.util
 import re
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import pytest
 
 from docs._ext.links import COPIED
+from docs._ext.public_api import lines
 from tests.page_scripts import ROOT
 
 PAGES = sorted(
@@ -64,6 +66,13 @@ def test_every_page_is_on_the_site() -> None:
         assert roots <= {*COPIED}, f"{path.name}: links to a page that the site does not have"
 
 
+def names_in(inventory: Path) -> set[str]:
+    """Return the names that a site documents: four lines, then compressed lines of a name and where it is."""
+    return {
+        line.split()[0] for line in zlib.decompress(inventory.read_bytes().split(b"\n", 4)[4]).decode().splitlines()
+    }
+
+
 @pytest.mark.slow
 def test_the_site_builds_without_warnings_and_refers_to_no_other_host() -> None:
     """In the folder of the stage `site` of .ci/run, so that only what is new is built; without the films of tasks."""
@@ -74,6 +83,7 @@ def test_the_site_builds_without_warnings_and_refers_to_no_other_host() -> None:
     done = subprocess.run([*command, str(site)], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert (site / "searchindex.js").stat().st_size > 100_000
+    assert {line.split("(")[0].split(":")[0] for line in lines()} - names_in(site / "objects.inv") == set()
     loaded = re.compile(r"<(?:script|link|img|iframe)\b[^>]*?(?:src|href)=\"(?:https?:)?//[^\"]*\"")
     for path in site.rglob("*.html"):
         assert loaded.findall(path.read_text(encoding="utf-8")) == [], path.name

@@ -19,7 +19,7 @@ from flockenv.play.controls import Facts, default_of, facts_of, records_in
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
 
-__all__ = ["field_rows", "first_sentence", "markdown", "process", "signature", "skip", "table"]
+__all__ = ["field_rows", "first_paragraph", "first_sentence", "markdown", "process", "signature", "skip", "table"]
 
 CODE = re.compile(r"(``.+?``|:[\w:]+:`[^`]+`|`[^`]+`)", re.DOTALL)
 
@@ -37,6 +37,11 @@ def first_sentence(text: str | None) -> str:
     """Return the first sentence of a docstring as Markdown on one line."""
     paragraph = " ".join(inspect.cleandoc(text or "").split("\n\n")[0].split())
     return markdown(re.split(r"(?<=[a-z)\]`]\.)\s", paragraph)[0])
+
+
+def first_paragraph(text: str) -> str:
+    """Return the first paragraph of a docstring as reStructuredText on one line."""
+    return " ".join(_rst(text.split("\n\n")[0].splitlines())).strip()
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
+import functools
 import importlib
 import inspect
+import itertools
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +14,7 @@ from typing import Any, get_origin
 
 from pydantic import BaseModel
 
-__all__ = ["internal_modules", "lines", "public_modules"]
+__all__ = ["defined_in", "description", "internal_modules", "is_value", "lines", "public_modules", "type_of"]
 
 PAGE = Path(__file__).resolve().parent.parent / "api.md"
 
@@ -40,14 +43,66 @@ def lines() -> Iterator[str]:
             yield f"{module}.{name}{_form(getattr(home, name))}"
 
 
+def is_value(value: Any) -> bool:
+    """True for a constant or a type alias: what is neither a class nor a function."""
+    compiled = hasattr(value, "py_func")
+    return get_origin(value) is not None or not (inspect.isclass(value) or inspect.isroutine(value) or compiled)
+
+
+def type_of(value: Any) -> str:
+    """Return the name of the type of a constant; `type` for a type alias."""
+    return "type" if get_origin(value) is not None else type(value).__name__
+
+
+def defined_in(module: str, name: str) -> str:
+    """Return the module that defines a name of a module, which may import it from there."""
+    if module == "flockenv":  # it imports on first use, from the public module that has the same object
+        value = getattr(importlib.import_module(module), name)
+        homes = (each for each in public_modules() if each != module)
+        found = [each for each in homes if getattr(importlib.import_module(each), name, None) is value]
+        return defined_in(found[0], name) if found else module
+    for node in _statements(_tree(module)):
+        if isinstance(node, ast.ImportFrom) and any((each.asname or each.name) == name for each in node.names):
+            return defined_in(str(node.module), name)
+    return module
+
+
+def description(module: str, name: str) -> str:
+    """Return the docstring of a public name: of a constant or type alias, the text below its assignment; else ''."""
+    value = getattr(importlib.import_module(module), name)
+    if not is_value(value):
+        return inspect.getdoc(value) or ""
+    for node, after in itertools.pairwise(_statements(_tree(defined_in(module, name)))):
+        if name in _targets(node) and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+            return inspect.cleandoc(str(after.value.value))
+    return ""
+
+
+@functools.cache
+def _tree(module: str) -> ast.Module:
+    return ast.parse(inspect.getsource(importlib.import_module(module)))
+
+
+def _statements(block: ast.Module | ast.If) -> Iterator[ast.stmt]:
+    """Yield the statements of a module, also those under `if` and `else`."""
+    for node in (*block.body, *getattr(block, "orelse", ())):
+        yield node
+        if isinstance(node, ast.If):
+            yield from _statements(node)
+
+
+def _targets(node: ast.stmt) -> set[str]:
+    """Return the names that a statement assigns."""
+    targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
+    return {each.id for target in targets for each in ast.walk(target) if isinstance(each, ast.Name)}
+
+
 def _form(value: Any) -> str:
     """Return the fields of a record, the parameters of a function or class, or the type of another value."""
-    if get_origin(value) is not None:
-        return ": type"
+    if is_value(value):
+        return f": {type_of(value)}"
     if inspect.isclass(value) and issubclass(value, BaseModel):
         return f"(*{''.join(_fields(value))})"
-    if not (inspect.isclass(value) or inspect.isroutine(value) or hasattr(value, "py_func")):  # py_func: compiled
-        return f": {type(value).__name__}"
     try:
         parameters = inspect.signature(value).parameters.values()
     except (TypeError, ValueError):  # a class of C

@@ -39,7 +39,11 @@ Each block has 1,000 seeds of a million worlds each and ends where the next begi
 held-out worlds. Seeds that are usual for an environment (0, 1, 42) are in the first block."""
 
 WORLDS_PER_SEED, SEEDS = 1_000_000, 1_000
+"""Worlds of each seed, and seeds of each block."""
+
 Purpose = Literal["training", "tuning", "evaluation"]
+"""What worlds are for; each has its own block of seeds."""
+
 _BLOCKS: Mapping[str, int] = {"training": TRAINING, "tuning": TUNING, "evaluation": EVALUATION}
 
 RESAMPLES = 10_000

@@ -289,3 +289,4 @@ class Box(Space):
 
 
 AnySpace = Annotated[Plane | Torus | Box, Field(discriminator="kind")]
+"""A space of any kind, as a field of a record: read from a file, its `kind` selects the class."""

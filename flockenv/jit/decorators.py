@@ -52,6 +52,7 @@ Numbers = tuple[float, ...]
 # division in a vector register is an estimate and a scalar one is exact, so that results depend on how agents are
 # divided among threads; with `reassoc` and `nsz` a NaN check (x - x == 0) folds to True.
 FAST = frozenset({"contract"})
+"""Flags of fast mathematics that kernels are compiled with."""
 
 # _nrt=False: no reference counts. The caller of the entry point owns the arrays while it runs; counting every view of
 # them with a locked instruction took nine tenths of the time of a world of 32 agents. So nothing compiled here may
@@ -60,6 +61,7 @@ OPTIONS: Any = {
     "forceinline": True, "fastmath": set(FAST), "error_model": "numpy", "nogil": True, "_nrt": False,
     "pipeline_class": Inlined,
 }  # fmt: skip
+"""Options of numba that kernels are compiled with."""
 
 _njit: Any = numba.njit  # numba's stubs do not know `_nrt`
 

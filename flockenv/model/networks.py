@@ -375,6 +375,7 @@ class Mesh(Network):
 
 
 AnyNetwork = Annotated[Rope | Cloth | Jelly | Mesh | Blocks, Field(discriminator="kind")]
+"""A network of any kind, as a field of a record: read from a file, its `kind` selects the class."""
 
 
 # --- lattices -------------------------------------------------------------------------------------------------------

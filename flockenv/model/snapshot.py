@@ -16,11 +16,15 @@ from flockenv.model.surface import whole_faces
 __all__ = ["KINDS", "ROLES", "Floats", "Mark", "Snapshot"]
 
 Floats = NDArray[np.float64]
+"""An array of floats, as pictures use them."""
 
 ROLES: Final = (
     "pursuer", "evader", "learner", "learner 2", "flockmate", "agent", "agent 2", "agent 3", "agent 4"
 )  # fmt: skip
+"""Roles of agents in pictures; each has a colour."""
+
 KINDS: Final = ("goal", "heading", "way")
+"""Kinds of marks, see `Mark`."""
 
 
 @dataclass(frozen=True, eq=False)

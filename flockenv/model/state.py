@@ -22,6 +22,7 @@ from flockenv.maths.heading import face
 __all__ = ["COUNTED_BY_KERNELS", "WORK", "Body", "Floats", "Obstacles", "State", "digest_arrays"]
 
 Floats = NDArray[np.floating[Any]]
+"""An array of floats of the scene's dtype."""
 
 WORK = (
     "evaluations", "neighbour_queries", "pairs", "obstacle_tests", "substeps", "rejected_steps", "newton_iterations",

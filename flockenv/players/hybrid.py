@@ -37,6 +37,7 @@ FORCE = "force"
 """The kind of a policy that is no hybrid: what its network puts out is the action."""
 
 KINDS = ("residual", "mixture", "weights", "priorities", "gate")
+"""Kinds of hybrids, see `Hybrid`."""
 
 Floats = NDArray[np.float32]
 

@@ -107,6 +107,7 @@ ACTIVATIONS: Mapping[str, Callable[..., Floats]] = {
     "tanh": np.tanh,
     "relu": lambda x, out: np.maximum(x, np.float32(0), out=out),
 }
+"""Activation functions of networks by name; each writes into `out`."""
 
 
 SQUASHES: Mapping[str, Callable[..., Floats]] = {"tanh": np.tanh}

@@ -189,6 +189,7 @@ PRESETS: dict[str, Model] = {
         },
     ),
 }  # fmt: skip
+"""Published models of pedestrians by name, each with its source."""
 
 ALIASES = {
     "helbing_1995": "helbing_molnar_1995",

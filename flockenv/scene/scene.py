@@ -82,18 +82,22 @@ else:
         Annotated[functools.reduce(operator.or_, EVERY_EFFECT), Field(discriminator="kind")],
         WrapValidator(instance_of(Effect)),
     ]
+    """An effect of any kind, as a field of a record: read from a file, its `kind` selects the class."""
     AnyIntegrator = Annotated[
         Annotated[functools.reduce(operator.or_, INTEGRATORS.values()), Field(discriminator="kind")],
         WrapValidator(instance_of(Integrator)),
     ]
+    """An integrator of any kind, as a field of a record: read from a file, its `kind` selects the class."""
     AnyConstraint = Annotated[
         Annotated[functools.reduce(operator.or_, CONSTRAINTS.values()), Field(discriminator="kind")],
         WrapValidator(instance_of(Constraint)),
     ]
+    """A constraint of any kind, as a field of a record: read from a file, its `kind` selects the class."""
     AnyMember = Annotated[
         Annotated[functools.reduce(operator.or_, POPULATION.values()), Field(discriminator="kind")],
         WrapValidator(instance_of(Member)),
     ]
+    """An emitter or sink of any kind, as a field of a record: read from a file, its `kind` selects the class."""
 
 
 TURNING = ("max_turn_rate", "banking")

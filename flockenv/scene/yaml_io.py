@@ -29,6 +29,8 @@ from flockenv.scene.presets import Preset, expand_presets
 __all__ = ["MAX_BYTES", "ConfigError", "dump", "dump_scene", "keys_of", "load", "load_scene", "parse_scalar", "schema"]
 
 MAX_BYTES = 1_000_000
+"""Most bytes of a file that is read as a record."""
+
 MAX_DEPTH = 32
 MAX_LINES = 5  # of one error message; the rest is left out
 

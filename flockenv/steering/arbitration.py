@@ -420,3 +420,4 @@ if TYPE_CHECKING:
     AnyArbitration = Arbitration
 else:
     AnyArbitration = Annotated[functools.reduce(operator.or_, ARBITRATIONS.values()), Field(discriminator="kind")]
+    """An arbitration of any kind, as a field of a record: read from a file, its `kind` selects the class."""

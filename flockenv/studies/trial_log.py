@@ -26,6 +26,7 @@ from flockenv.model.divergence import SimulationDiverged
 __all__ = ["VERDICTS", "Case", "Finding", "Results", "Value", "Verdict", "run", "select_cases", "trials"]
 
 Verdict = Literal["pass", "warned", "reported", "refused", "fails", "diverges"]
+"""Verdict on one trial; VERDICTS explains each."""
 
 VERDICTS: dict[Verdict, str] = {
     "pass": "within the bound",

@@ -474,6 +474,7 @@ else:
         Annotated[functools.reduce(operator.or_, SHAPES.values()), Field(discriminator="kind")],
         WrapValidator(_round_by_default),
     ]
+    """A shape of any kind, as a field of a record: read from a file, its `kind` selects the class, default: circle."""
 
 
 def shape_of(data: Any) -> Shape:
