@@ -5,13 +5,18 @@ If a change is intended, `python -m tests.test_public_api` writes the list anew;
 
 from __future__ import annotations
 
+import functools
 import importlib
+import inspect
 import pkgutil
+import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import flockenv
 from docs._ext.public_api import description, internal_modules, lines, public_modules
 
+ROOT = Path(__file__).resolve().parent.parent
 LIST = Path(__file__).with_name("public_api.txt")
 
 
@@ -40,6 +45,53 @@ def test_every_public_name_has_a_description() -> None:
     assert [f"{module}.{name}" for module, name in names if not description(module, name)] == []
     assert description("flockenv.evaluation", "TUNING").startswith("First world seeds")  # assigned beside another name
     assert description("flockenv.scene", "AnyEffect").startswith("An effect")  # under `else`
+
+
+def imported_in(text: str) -> Iterator[tuple[str, str]]:
+    """Yield the module and name of each import from flockenv."""
+    for module, block, line in re.findall(r"from (flockenv[\w.]*) import (?:\(([^)]*)\)|([^\n]*))", text):
+        names = re.sub(r"#.*", "", block or line).split(",")
+        yield from ((module, name.split(" as ")[0].strip()) for name in names if name.strip())
+
+
+def named_in(text: str) -> Iterator[tuple[str, str]]:
+    """Yield the module and name of each import from flockenv in a page, and of each dotted name of flockenv."""
+    yield from imported_in(text)
+    for dotted in re.findall(r"\bflockenv(?:\.[A-Za-z_]\w*)+", text):
+        module = max((each for each in modules() if f"{dotted}.".startswith(f"{each}.")), key=len)
+        if dotted != module:
+            yield module, dotted.removeprefix(f"{module}.").split(".")[0]
+
+
+@functools.cache
+def modules() -> frozenset[str]:
+    return frozenset(["flockenv", *(each.name for each in pkgutil.walk_packages(flockenv.__path__, "flockenv."))])
+
+
+def is_public(module: str, name: str) -> bool:
+    """True for a public name, and for a module that is public."""
+    return f"{module}.{name}" in public_modules() or (
+        module in public_modules() and name in importlib.import_module(module).__all__
+    )
+
+
+def test_pages_name_public_names_only() -> None:
+    pages = [*ROOT.glob("[!C]*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "tutorials").glob("*.md")]
+    found = {(page.name, *each) for page in pages for each in named_in(page.read_text(encoding="utf-8"))}
+    assert sorted(each for each in found if not is_public(*each[1:])) == []
+    assert ("README.md", "flockenv.players", "load_player") in found
+    assert ("numerics.md", "flockenv.scene.stability", "growth") in found
+
+
+def test_functions_outside_all_begin_with_an_underscore_unless_another_module_imports_them() -> None:
+    texts = (path.read_text(encoding="utf-8") for path in (ROOT / "flockenv").rglob("*.py"))
+    imports = {each for text in texts for each in imported_in(text)}
+    bare = []
+    for module in public_modules():
+        home = importlib.import_module(module)
+        defined = re.findall(r"^(?:def|class) ([A-Za-z]\w*)", inspect.getsource(home), re.MULTILINE)
+        bare += [name for name in defined if name not in home.__all__ and (module, name) not in imports]
+    assert bare == []
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from flockenv.behaviours import Separation
-from flockenv.geometry import space as space_module
 from flockenv.geometry.space import Box, Plane, Space, Torus
 from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import Drag
@@ -71,7 +70,7 @@ def test_the_displacement_on_a_torus_is_the_shortest_for_any_distance(times: flo
     expected = ((b - a) % np.array([10.0, 4.0]) + images)[:, None]
     shortest = np.take_along_axis(expected[:, 0], np.abs(expected[:, 0]).argmin(axis=0)[None], axis=0)[0]
     np.testing.assert_allclose(space.displacement(a, b), shortest, atol=1e-9)
-    np.testing.assert_allclose(rows(space_module.torus_offset)(space.size, a, b), shortest, atol=1e-9)
+    np.testing.assert_allclose(rows(Torus.offset_law)(space.size, a, b), shortest, atol=1e-9)
 
 
 @DIMENSIONS
@@ -79,7 +78,7 @@ def test_displacements_by_half_a_box_are_opposite_for_the_two_agents(dimension: 
     """Otherwise two agents that repel each other would be pushed in the same direction."""
     space = SPACES["torus"][dimension]
     half = np.asarray(space.size) / 2  # type: ignore[attr-defined]
-    for offset in (space.displacement, functools.partial(rows(space_module.torus_offset), space.extent(dimension))):
+    for offset in (space.displacement, functools.partial(rows(Torus.offset_law), space.extent(dimension))):
         for times in (-5, -3, -1, 1, 3, 5):
             there, back = (np.asarray(offset(times * a, times * b)) for a, b in ((0 * half, half), (half, 0 * half)))
             np.testing.assert_array_equal(there, -back)

@@ -28,7 +28,7 @@ BOUNCES = 100
 
 
 @law
-def plane_offset(size: Vec, a: Vec, b: Vec) -> Vec:
+def _plane_offset(size: Vec, a: Vec, b: Vec) -> Vec:
     """Return b - a."""
     return sub(b, a)
 
@@ -40,7 +40,7 @@ def _shortest(d: float, length: float) -> float:
 
 
 @law
-def torus_offset(size: Vec, a: Vec, b: Vec) -> Vec:
+def _torus_offset(size: Vec, a: Vec, b: Vec) -> Vec:
     """Return the shortest offset from a to b (minimum image), for points any number of boxes apart.
 
     For two points exactly half a box apart, the offsets a to b and b to a are opposite.
@@ -56,7 +56,7 @@ def torus_offset(size: Vec, a: Vec, b: Vec) -> Vec:
 
 
 @law
-def plane_confine(size: Vec, radius: float, x: Vec, v: Vec) -> tuple[Vec, Vec]:
+def _plane_confine(size: Vec, radius: float, x: Vec, v: Vec) -> tuple[Vec, Vec]:
     """Return x and v unchanged."""
     return x, v
 
@@ -90,7 +90,7 @@ def _stop_at_wall(x: float, v: float, radius: float, length: float) -> tuple[flo
 
 
 @law
-def box_confine(size: Vec, radius: float, x: Vec, v: Vec) -> tuple[Vec, Vec]:
+def _box_confine(size: Vec, radius: float, x: Vec, v: Vec) -> tuple[Vec, Vec]:
     """Return position and velocity of a body inside the walls; at a wall the velocity into it is removed."""
     x0, v0 = _stop_at_wall(x[0], v[0], radius, size[0])
     x1, v1 = _stop_at_wall(x[1], v[1], radius, size[1])
@@ -173,7 +173,7 @@ def _bounce(
 def _bounce_or_stop(
     size: float, radius: float, restitution: float, dt: float, was: float, before: float, x: float, v: float
 ) -> tuple[float, float]:
-    """Return position and velocity along one axis of `box_bounce`."""
+    """Return position and velocity along one axis of `_box_bounce`."""
     if was < radius or was > size - radius:
         return _stop_at_wall(x, v, radius, size)
     else:
@@ -181,7 +181,7 @@ def _bounce_or_stop(
 
 
 @law
-def box_bounce(
+def _box_bounce(
     size: Vec, radius: float, restitution: float, dt: float, was: Vec, before: Vec, x: Vec, v: Vec
 ) -> tuple[Vec, Vec]:
     """Return position and velocity after a step from `was` to x, over which velocity changed from `before` to v.
@@ -229,8 +229,8 @@ class Plane(Space):
 
     kind: Literal["plane"] = "plane"
     sentence: ClassVar[str] = "An unbounded space"
-    offset_law: ClassVar[Law] = plane_offset
-    confine_law: ClassVar[Law] = plane_confine
+    offset_law: ClassVar[Law] = _plane_offset
+    confine_law: ClassVar[Law] = _plane_confine
 
 
 class Torus(Space):
@@ -239,7 +239,7 @@ class Torus(Space):
     kind: Literal["torus"] = "torus"
     sentence: ClassVar[str] = "A torus of {size}, which agents leave on one side and enter on the other"
     size: Size = Field(description="m per axis")
-    offset_law: ClassVar[Law] = torus_offset
+    offset_law: ClassVar[Law] = _torus_offset
     confine_law: ClassVar[Law] = torus_confine
     periodic: ClassVar[bool] = True
 
@@ -271,13 +271,13 @@ class Box(Space):
     restitution: float = Field(
         default=0.0, ge=0, le=1, description="e: 0 = bodies stop at a wall, 1 = no speed is lost"
     )
-    offset_law: ClassVar[Law] = plane_offset
-    confine_law: ClassVar[Law] = box_confine
+    offset_law: ClassVar[Law] = _plane_offset
+    confine_law: ClassVar[Law] = _box_confine
 
     @property
     def bounce_law(self) -> Law | None:  # type: ignore[override]  # not compiled if bodies do not bounce
         """The law of impacts; None if bodies stop at walls."""
-        return box_bounce if self.restitution > 0 else None
+        return _box_bounce if self.restitution > 0 else None
 
     def numbers(self) -> tuple[float, ...]:
         """Return the restitution, if it is not 0."""

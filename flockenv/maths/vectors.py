@@ -6,8 +6,6 @@ written with these functions is as fast as hand-written scalar code.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from flockenv.jit.decorators import Vec, law, like, unfused
@@ -198,12 +196,3 @@ def perpendicular(forward: Vec) -> Vec:
         side = (forward[1], -forward[0], like(forward[0], 0.0))
         upright = dot(side, side) <= like(forward[0], 1e-12)
         return select(upright, axis(forward, 0), unit(side))
-
-
-def is_vector(value: object, dimension: int) -> bool:
-    """Return True if `value` is a sequence of `dimension` finite numbers; for checks in Python, not in laws."""
-    return (
-        isinstance(value, (tuple, list))
-        and len(value) == dimension
-        and all(isinstance(x, (int, float)) and math.isfinite(x) for x in value)
-    )

@@ -37,6 +37,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[Any]
 
 Elements = Literal["bars", "triangles", "tetrahedra"]
+"""Cells of a file that become the elements of a network."""
 
 _CELLS = {"bars": ("line",), "triangles": ("triangle", "quad"), "tetrahedra": ("tetra",)}
 """Names in meshio of the cells that become elements: of one, two and three dimensions."""

@@ -30,7 +30,7 @@ from flockenv.model.distribution import Spread
 from flockenv.physics.effects import Contact, Effect, ObstacleContact
 from flockenv.steering.arbitration import Blend
 
-__all__ = ["ALIASES", "PRESETS", "Model", "Preset", "expand_presets", "preset"]
+__all__ = ["ALIASES", "PRESETS", "Model", "Origins", "Preset", "expand_presets", "preset"]
 
 
 @dataclass(frozen=True)

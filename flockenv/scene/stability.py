@@ -33,6 +33,8 @@ __all__ = [
     "check_dt",
     "check_lookahead",
     "contact_limit",
+    "drag_limit",
+    "growth",
     "limit",
     "suggest_dt",
 ]

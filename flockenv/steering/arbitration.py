@@ -39,13 +39,13 @@ ARBITRATIONS: dict[str, type[Arbitration]] = {}
 """Every arbitration by its kind; a class registers itself when it is defined."""
 
 
-def no_shares(forces: Forces) -> Shares:
+def _no_shares(forces: Forces) -> Shares:
     """Return a zero for each force."""
     return (0.0,) * len(forces)
 
 
-@overload(no_shares, jit_options=OPTIONS)
-def _no_shares(forces):  # type: ignore[no-untyped-def]  # numba compares signatures, annotations included
+@overload(_no_shares, jit_options=OPTIONS)
+def _compiled_no_shares(forces):  # type: ignore[no-untyped-def]  # numba compares signatures, annotations included
     zeros = "".join("o, " for _ in range(len(forces)))
     namespace: dict[str, Any] = {"like": like}
     exec(f"def zeros(forces):\n    o = like(forces[0][0], 0.0)\n    return ({zeros})", namespace)  # noqa: S102  # K is a type's
@@ -63,7 +63,7 @@ def _period_number(time: float, period: float) -> int:
 
 
 @law
-def total_share(forces: Forces, shares: Shares) -> Vec:
+def _total_share(forces: Forces, shares: Shares) -> Vec:
     """Return the sum of the forces times their shares."""
     total = zero(forces[0])
     for k in range(len(forces)):
@@ -79,7 +79,7 @@ def _blend_shares(forces: Forces, budget: float) -> Shares:
     total = zero(forces[0])
     for k in range(len(forces)):
         total = add(total, forces[k])
-    length, shares = norm(total), no_shares(forces)
+    length, shares = norm(total), _no_shares(forces)
     share = budget / length if length > budget else like(length, 1.0)
     for k in range(len(forces)):
         shares = replace_at(shares, k, share)
@@ -89,7 +89,7 @@ def _blend_shares(forces: Forces, budget: float) -> Shares:
 @law
 def _first_share(forces: Forces, threshold: float, budget: float) -> Shares:
     """Return the shares: that of the first force longer than the threshold, cut to the budget; 0 for all others."""
-    shares, open_ = no_shares(forces), True
+    shares, open_ = _no_shares(forces), True
     for k in range(len(forces)):
         length = norm(forces[k])
         takes = open_ and length > threshold
@@ -101,7 +101,7 @@ def _first_share(forces: Forces, threshold: float, budget: float) -> Shares:
 
 @law
 def _allocate_shares(forces: Forces, budget: float) -> Shares:
-    shares, left = no_shares(forces), budget
+    shares, left = _no_shares(forces), budget
     o = like(budget, 0.0)
     for k in range(len(forces)):
         length = norm(forces[k])
@@ -113,7 +113,7 @@ def _allocate_shares(forces: Forces, budget: float) -> Shares:
 
 @law
 def _running_shares(forces: Forces, budget: float) -> Shares:
-    shares, total = no_shares(forces), zero(forces[0])
+    shares, total = _no_shares(forces), zero(forces[0])
     o = like(budget, 0.0)
     for k in range(len(forces)):
         length, left = norm(forces[k]), budget - norm(total)
@@ -136,7 +136,7 @@ def blend(forces: Forces, weights: Vec, budget: float) -> Vec:
 @law
 def prioritise(forces: Forces, threshold: float, budget: float) -> Vec:
     """Return the first force longer than the threshold, shortened to the budget; all others are ignored."""
-    return total_share(forces, _first_share(forces, threshold, budget))
+    return _total_share(forces, _first_share(forces, threshold, budget))
 
 
 @law
@@ -146,7 +146,7 @@ def allocate(forces: Forces, budget: float) -> Vec:
     Prioritised acceleration allocation (Reynolds 1987): lengths add up as scalars, so the sum needs no shortening, and
     the most important force is never shortened by others. (8,0), (-8,0), (0,5) within 10 give (6, 0).
     """
-    return total_share(forces, _allocate_shares(forces, budget))
+    return _total_share(forces, _allocate_shares(forces, budget))
 
 
 @law
@@ -155,7 +155,7 @@ def allocate_running(forces: Forces, budget: float) -> Vec:
 
     Unlike in `allocate`, opposite forces free a part of the budget: (8,0), (-8,0), (0,5) within 10 give (6, 4).
     """
-    return total_share(forces, _running_shares(forces, budget))
+    return _total_share(forces, _running_shares(forces, budget))
 
 
 # --- records, for scenes ----------------------------------------------------------------------------------------------
@@ -184,7 +184,7 @@ class Arbitration(Record):
 
 
 @law
-def blend_forces(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
+def _blend_forces(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
     """Return the sum of all forces; the caller cuts it to max_force."""
     total = zero(forces[0])
     for k in range(len(forces)):
@@ -199,14 +199,14 @@ class Blend(Arbitration):
     """
 
     kind: Literal["blend"] = "blend"
-    law: ClassVar[Law] = blend_forces
+    law: ClassVar[Law] = _blend_forces
 
 
 @law
-def take_first(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
+def _take_first(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
     """Return the first force above the threshold, and the shares."""
     shares = _first_share(forces, p.threshold, me.max_force)
-    return total_share(forces, shares), shares
+    return _total_share(forces, shares), shares
 
 
 class Priority(Arbitration):
@@ -214,14 +214,14 @@ class Priority(Arbitration):
 
     kind: Literal["priority"] = "priority"
     threshold: float = Field(default=1e-3, ge=0, description="N, a force of at most this size counts as zero")
-    law: ClassVar[Law] = take_first
+    law: ClassVar[Law] = _take_first
     exclusive: ClassVar[bool] = True
 
 
 @law
-def take_at_random(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
+def _take_at_random(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
     """Return the first force above the threshold whose behaviour is drawn, and the shares."""
-    shares, open_ = no_shares(forces), True
+    shares, open_ = _no_shares(forces), True
     frame, who = _period_number(me.time, p.period), int(me.who)
     for k in range(len(forces)):
         length = norm(forces[k])
@@ -230,7 +230,7 @@ def take_at_random(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
         cut = me.max_force / length if length > me.max_force else like(length, 1.0)
         shares = replace_at(shares, k, cut if takes else like(length, 0.0))
         open_ = open_ and not takes
-    return total_share(forces, shares), shares
+    return _total_share(forces, shares), shares
 
 
 class Dithering(Arbitration):
@@ -245,7 +245,7 @@ class Dithering(Arbitration):
     )
     period: float = Field(default=0.1, gt=0, description="s, duration of a draw")
     threshold: float = Field(default=1e-3, ge=0, description="N, a force of at most this size counts as zero")
-    law: ClassVar[Law] = take_at_random
+    law: ClassVar[Law] = _take_at_random
     exclusive: ClassVar[bool] = True
 
     def parameters(self, forces: int) -> dict[str, float | Vec]:
@@ -260,43 +260,43 @@ class Dithering(Arbitration):
 
 
 @law
-def allocate_force(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
+def _allocate_force(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
     """Return the sum of forces whose lengths use up max_force in order, and the shares."""
     shares = _allocate_shares(forces, me.max_force)
-    return total_share(forces, shares), shares
+    return _total_share(forces, shares), shares
 
 
 class Allocation(Arbitration):
     """Prioritised acceleration allocation (Reynolds 1987): in order, until their lengths have used up max_force."""
 
     kind: Literal["allocation"] = "allocation"
-    law: ClassVar[Law] = allocate_force
+    law: ClassVar[Law] = _allocate_force
 
 
 @law
-def allocate_running_force(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
+def _allocate_running_force(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
     """Return the sum of forces, each cut to max_force less the length of the sum so far, and the shares."""
     shares = _running_shares(forces, me.max_force)
-    return total_share(forces, shares), shares
+    return _total_share(forces, shares), shares
 
 
 class RunningSum(Arbitration):
     """Forces in order, as in `Allocation`, but the length of the sum so far uses up max_force (Buckland 2004)."""
 
     kind: Literal["running_sum"] = "running_sum"
-    law: ClassVar[Law] = allocate_running_force
+    law: ClassVar[Law] = _allocate_running_force
 
 
 @law
-def take_turns(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
+def _take_turns(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
     """Return the force of the behaviour that acts in this period, and the shares."""
-    shares = no_shares(forces)
+    shares = _no_shares(forces)
     turn = _period_number(me.time, p.period) % len(forces)
     for k in range(len(forces)):
         length = norm(forces[k])
         cut = me.max_force / length if length > me.max_force else like(length, 1.0)
         shares = replace_at(shares, k, cut if k == turn else like(length, 0.0))
-    return total_share(forces, shares), shares
+    return _total_share(forces, shares), shares
 
 
 class RoundRobin(Arbitration):
@@ -304,7 +304,7 @@ class RoundRobin(Arbitration):
 
     kind: Literal["round_robin"] = "round_robin"
     period: float = Field(default=0.05, gt=0, description="s, duration of a turn")
-    law: ClassVar[Law] = take_turns
+    law: ClassVar[Law] = _take_turns
     exclusive: ClassVar[bool] = True
 
 
@@ -338,7 +338,7 @@ def _danger_and_interest(p: Any, forces: Forces, direction: Vec) -> tuple[float,
 
 
 @law
-def choose_direction(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
+def _choose_direction(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
     """Return a force in the most interesting of the least dangerous directions, and the shares."""
     o, e = like(forces[0][0], 0.0), like(forces[0][0], 1.0)
     total = zero(forces[0])
@@ -360,7 +360,7 @@ def choose_direction(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
         better = (danger <= bound) & (interest > best)
         best, chosen = interest if better else best, select(better, direction, chosen)
     force = limit(scale(chosen, best if best > o else o), me.max_force)
-    shares = no_shares(forces)
+    shares = _no_shares(forces)
     for k in range(len(forces)):
         square = dot(forces[k], forces[k])
         share = dot(force, forces[k]) / square if square > o else o
@@ -378,13 +378,13 @@ class ContextSteering(Arbitration):
     kind: Literal["context"] = "context"
     dangers: int = Field(default=1, ge=0, description="number of behaviours, from the first on, that avert a danger")
     directions: int = Field(default=24, ge=4, le=256, description="number of directions")
-    law: ClassVar[Law] = choose_direction
+    law: ClassVar[Law] = _choose_direction
 
 
 @law
-def take_by_intention(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
+def _take_by_intention(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
     """Return the allocated sum of the forces that belong to the intention or always act, and the shares."""
-    shares, left = no_shares(forces), me.max_force
+    shares, left = _no_shares(forces), me.max_force
     o, e = like(left, 0.0), like(left, 1.0)
     for k in range(len(forces)):
         length = norm(forces[k])
@@ -393,7 +393,7 @@ def take_by_intention(p: Any, me: Any, forces: Forces) -> tuple[Vec, Shares]:
         share = e if fits else left / length
         shares = replace_at(shares, k, share if acts else o)
         left = left - (length if fits else left) if acts else left
-    return total_share(forces, shares), shares
+    return _total_share(forces, shares), shares
 
 
 class Intentions(Arbitration):
@@ -406,7 +406,7 @@ class Intentions(Arbitration):
     when: tuple[Literal["avoid", "escape", "eat", "mate", "school", "wander"], ...] = Field(
         min_length=1, description="state in which each behaviour is active; avoid = always"
     )
-    law: ClassVar[Law] = take_by_intention
+    law: ClassVar[Law] = _take_by_intention
     recalls: ClassVar[tuple[str, ...]] = ("intention",)
 
     def parameters(self, forces: int) -> dict[str, float | Vec]:

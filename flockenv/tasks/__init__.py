@@ -13,7 +13,7 @@ from flockenv.tasks.crowd_nav import CrowdNav  # noqa: E402
 from flockenv.tasks.evade import Evade  # noqa: E402
 from flockenv.tasks.flock import Flock  # noqa: E402
 from flockenv.tasks.herd import Herd  # noqa: E402
-from flockenv.tasks.layout import Layout, Slot  # noqa: E402
+from flockenv.tasks.layout import Layout, Slot, slots_of  # noqa: E402
 from flockenv.tasks.obstacles import Obstacles  # noqa: E402
 from flockenv.tasks.path_follow import PathFollow  # noqa: E402
 from flockenv.tasks.pursuit import Pursuit  # noqa: E402
@@ -37,4 +37,5 @@ __all__ = [
     "School",
     "Slot",
     "Task",
+    "slots_of",
 ]

@@ -11,7 +11,7 @@ from flockenv.physics.effects.altitude_springs import AltitudeSprings  # noqa: E
 from flockenv.physics.effects.attraction import Attraction  # noqa: E402
 from flockenv.physics.effects.contact import Contact, ObstacleContact  # noqa: E402
 from flockenv.physics.effects.drag import Drag, QuadraticDrag  # noqa: E402
-from flockenv.physics.effects.effect import EFFECTS, Effect, Far, Me, Other, Sight  # noqa: E402  # after the folder has been walked
+from flockenv.physics.effects.effect import EFFECTS, Effect, Far, Me, Other, Sight, Vector  # noqa: E402  # after the folder has been walked
 from flockenv.physics.effects.elastic import Elastic  # noqa: E402
 from flockenv.physics.effects.exit_choice import Door, Routes  # noqa: E402
 from flockenv.physics.effects.fields import Carried, Sink, Source, Uniform, Vortex, Wind  # noqa: E402
@@ -35,6 +35,6 @@ __all__ = [
     "Course", "Door", "Drag", "Effect", "Elastic", "Far", "Fear", "Fluctuation", "Goal", "Gravitation", "Gravity",
     "Grazing", "Intention", "InverseSquare", "Journey", "Libido", "Me", "Membrane", "Metabolism", "ObstacleContact",
     "Other", "Predation", "Pressure", "QuadraticDrag", "Routes", "Sight", "Sink", "Source", "SpeedLimit", "Springs",
-    "Stage", "SurfaceTension", "Swing", "Tether", "Uniform", "Vicsek", "Viscosity", "Vortex", "WallRepulsion", "Way",
-    "Wind",
+    "Stage", "SurfaceTension", "Swing", "Tether", "Uniform", "Vector", "Vicsek", "Viscosity", "Vortex", "WallRepulsion",
+    "Way", "Wind",
 ]  # fmt: skip
