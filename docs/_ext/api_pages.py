@@ -6,11 +6,16 @@ import importlib
 import inspect
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from docstrings import first_paragraph
 from public_api import defined_in, description, is_value, public_modules, type_of
 
-__all__ = ["pages"]
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
+    from sphinx.environment import BuildEnvironment
+
+__all__ = ["mark_second_names", "pages"]
 
 
 def pages(docs: Path) -> dict[str, str]:
@@ -30,18 +35,31 @@ def _page(module: str) -> str:
 
 
 def _entries(module: str) -> Iterator[str]:
-    """Yield an entry for each public name that autodoc does not show.
+    """Yield an entry for each public name of a module that autodoc does not show."""
+    home = importlib.import_module(module)
+    for name in _second_names(module):
+        value, source = getattr(home, name), defined_in(module, name)
+        role = "data" if is_value(value) else "class" if inspect.isclass(value) else "function"
+        kind = f"   :type: {type_of(value)}\n" if is_value(value) else ""
+        place = f" Defined in ``{source}``." if source != module else ""
+        text = first_paragraph(description(module, name))
+        yield f".. py:{role}:: {name}\n   :module: {module}\n{kind}\n   {text}{place}\n"
+
+
+def _second_names(module: str) -> Iterator[str]:
+    """Yield the public names of a module that autodoc does not show.
 
     These are all names of flockenv itself, and the constants and type aliases that a module imports from another.
     """
     home = importlib.import_module(module)
     for name in home.__all__:
-        value, source = getattr(home, name), defined_in(module, name)
-        if module == "flockenv" or (is_value(value) and source != module):
-            role = "data" if is_value(value) else "class" if inspect.isclass(value) else "function"
-            kind = f"   :type: {type_of(value)}\n" if is_value(value) else ""
-            place = f" Defined in ``{source}``." if source != module else ""
-            yield (
-                f".. py:{role}:: {name}\n   :module: {module}\n{kind}\n"
-                f"   {first_paragraph(description(module, name))}{place}\n"
-            )
+        if module == "flockenv" or (is_value(getattr(home, name)) and defined_in(module, name) != module):
+            yield name
+
+
+def mark_second_names(app: Sphinx, env: BuildEnvironment) -> None:
+    """Mark these names as aliases, so that a type without its module in a signature leads to the first name."""
+    objects = env.get_domain("py").data["objects"]
+    for module in public_modules():
+        for name in _second_names(module):
+            objects[f"{module}.{name}"] = objects[f"{module}.{name}"]._replace(aliased=True)

@@ -1,22 +1,26 @@
-"""Pages of behaviours, effects, methods, constraints and presets: formula, fields, picture, source, scenes."""
+"""Pages of behaviours, effects, methods, constraints and presets: formula, picture, source, limits, fields, scenes."""
 
 from __future__ import annotations
 
 import inspect
+import math
+import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from docstrings import field_rows, first_sentence, markdown, table
-from scene_pages import uses
+from pictures import demos
+from scene_pages import Use, uses
 
 from flockenv.behaviours import BEHAVIOURS
 from flockenv.physics.constraints import CONSTRAINTS
 from flockenv.physics.effects import EFFECTS
 from flockenv.physics.effects.effect import LAWS
-from flockenv.physics.integrators import INTEGRATORS
+from flockenv.physics.integrators import INTEGRATORS, Integrator
 from flockenv.scene.presets import PRESETS, Model
+from flockenv.scene.stability import drag_limit, limit
 
 __all__ = ["pages"]
 
@@ -46,7 +50,7 @@ ABOUT = {
 
 def pages(docs: Path) -> dict[str, str]:
     """Return a page for each kind and preset, and an overview of each registry."""
-    used: dict[str, list[str]] = uses(docs)
+    used = uses(docs)
     made: dict[str, str] = {}
     for folder, (title, kinds) in REGISTRIES.items():
         texts = {kind: first_sentence(each.__doc__) for kind, each in kinds.items()}
@@ -68,15 +72,34 @@ def _overview(title: str, about: str, texts: Mapping[str, str]) -> str:
     )
 
 
-def _kind_page(docs: Path, folder: str, kind: str, model: type[Any], used: list[str]) -> str:
-    parts = [f"# {kind}"]
-    if (docs / folder / f"{kind}.png").exists():
-        parts.append(f"![Trajectories under {kind}](../../{folder}/{kind}.png)")
+def _kind_page(docs: Path, folder: str, kind: str, model: type[Any], used: list[Use]) -> str:
+    parts = [f"# {kind}", *_picture(docs, folder, kind, used)]
     parts += [markdown(model.__doc__), *_laws(model), *_method(model), *_fields(model)]
     parts += _used(used)
-    if demo := getattr(model, "demo", None):
+    if demo := getattr(model, "demo", None) or demos().get(kind, (0, None))[1]:
         parts += ["## Its scene in the picture", f"```yaml\n{demo.strip()}\n```"]
     return "\n\n".join([*parts, _origin(model)]) + "\n"
+
+
+STILLS = ("docs/scenes", "flockenv/play/pictures")
+"""Folders with a picture of each scene and task."""
+
+
+def _picture(docs: Path, folder: str, kind: str, used: list[Use]) -> list[str]:
+    """Return the picture of a kind: its own, one that pictures.py draws, or that of the simplest scene that uses it."""
+    if (docs / folder / f"{kind}.png").exists():
+        return [f"![Trajectories under {kind}](../../{folder}/{kind}.png)"]
+    if folder == "methods":
+        return [f"![Error of {kind} for a harmonic oscillator, and its order](../pictures/{kind}.png)"]
+    if kind in demos():
+        return [f"![Trajectories under {kind}](../pictures/{kind}.png)"]
+    page = docs / "generated" / folder
+    for use in used:
+        for still in (docs.parent / place / f"{use.name}.png" for place in STILLS):
+            if still.exists():
+                picture = f"![The scene {use.name}]({os.path.relpath(still, page)})"
+                return [picture, f"A scene that uses it: {use.link()}."]
+    return []
 
 
 def _laws(model: type[Any]) -> list[str]:
@@ -102,7 +125,23 @@ def _method(model: type[Any]) -> list[str]:
         ("integrates linear drag exactly", "yes" if model.splits_drag else "no"),
         ("solves equations", "yes" if model.solves else "no"),
     ]
-    return ["## Properties", table(("property", ""), rows)]
+    return ["## Properties", table(("property", ""), rows), *_limits(model())]
+
+
+def _limits(method: Integrator) -> list[str]:
+    """Return the section with the longest stable steps of an integration method, as stability.py computes them."""
+    if method.stable_at_any_step:
+        text = "It chooses substeps that are stable." if method.adaptive else "It is stable at any step."
+        return ["## Limits", f"{text} A force that jumps reduces its order, and a long step its accuracy."]
+    free, damped, drag = limit(method, 0.0), limit(method, 0.1), drag_limit(method)
+    undamped = f"stable for h omega < {free:.3g}" if free else "unstable at any step"
+    slows = "at any step" if math.isinf(drag) or method.splits_drag else f"for h c / m < {drag:.3g}"
+    text = (
+        f"An undamped oscillation of angular frequency omega is {undamped}; with 10 % of critical damping it is stable "
+        f"for h omega < {damped:.3g}. Linear drag c is stable {slows}."
+    )
+    more = " This is for forces without a `derivative`; others do not limit the step." if method.linearises else ""
+    return ["## Limits", text + more]
 
 
 def _fields(model: type[Any]) -> list[str]:
@@ -116,8 +155,8 @@ def _cell(text: str) -> str:
     return markdown(text).replace("\n", " ")
 
 
-def _used(used: list[str]) -> list[str]:
-    return ["## Used by", ", ".join(used) + "."] if used else []
+def _used(used: list[Use]) -> list[str]:
+    return ["## Used by", ", ".join(use.link() for use in used) + "."] if used else []
 
 
 def _origin(model: type[Any]) -> str:
@@ -128,18 +167,20 @@ def _origin(model: type[Any]) -> str:
     return f"Class `{model.__name__}` of `{package}`, in `{model.__module__}`: {markdown(family)}"
 
 
-def _preset_page(name: str, model: Model, used: list[str]) -> str:
+def _preset_page(name: str, model: Model, used: list[Use]) -> str:
     symbols = table(
         ("symbol of the paper", "value"), [(f"`{key}`", _cell(value)) for key, value in model.symbols.items()]
     )
     effects = "\n".join(map(repr, (*model.behaviours(False, None), *model.bodies)))
     people = "\n".join(f"{key}: {value!r}" for key, value in model.people.items())
-    parts = [f"# {name}", _cell(model.source) + ".", "## Values", symbols]
+    picture = f"![Two streams of four under {name}](../pictures/{name}.png)"
+    parts = [f"# {name}", picture, _cell(model.source) + ".", "## Values", symbols]
     if model.note:
         parts.append(f"Note: {_cell(model.note)}.")
     parts += [
         "## Effects that it stands for", f"```python\n{effects}\n```",
         "## Pedestrians", f"```python\n{people}\n```",
         "## Use", f"```yaml\neffects:\n  - {{preset: {name}}}\n```", *_used(used),
+        "## Its scene in the picture", f"```yaml\n{demos()[name][1].strip()}\n```",
     ]  # fmt: skip
     return "\n\n".join(parts) + "\n"

@@ -15,6 +15,7 @@ import environment_pages
 import films
 import kind_pages
 import links
+import pictures
 import scene_pages
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ def _begin(app: Sphinx) -> None:
     docs = Path(app.srcdir)
     if app.config.films:
         films.draw_missing(docs / "generated" / "films")
+    pictures.draw_missing(docs / "generated" / "pictures")
     write_pages(docs)
 
 
@@ -54,6 +56,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     """Register the extension; `-D films=0` leaves out the films of tasks, which take a minute or two to draw."""
     app.add_config_value("films", True, "")
     app.connect("builder-inited", _begin)
+    app.connect("env-updated", api_pages.mark_second_names)
     app.connect("source-read", links.rewrite_source)
     app.connect("autodoc-process-docstring", docstrings.process, priority=400)  # before napoleon reads Args:
     app.connect("autodoc-process-signature", docstrings.signature)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -13,7 +13,7 @@ from flockenv.scene.presets import ALIASES
 from flockenv.scene.scene import Scene
 from flockenv.tasks import TASKS
 
-__all__ = ["pages", "uses"]
+__all__ = ["Use", "pages", "uses"]
 
 FOLDERS = {
     "scenes": (
@@ -52,18 +52,34 @@ def _comment(text: str) -> str:
     return re.sub(r"([*_<])", r"\\\1", re.sub(r"\s+flockenv [a-z]+ (configs/|-).*", "", words)) or "A scene."
 
 
-def uses(docs: Path) -> dict[str, list[str]]:
-    """Return links to the scenes and tasks that use an effect, method, constraint or preset, by its name."""
-    found: dict[str, list[str]] = {}
+class Use(NamedTuple):
+    """A scene or task that uses a kind."""
+
+    name: str
+    page: str  # from a page in a folder of docs/generated/
+    kinds: int  # number of kinds that it uses
+
+    def link(self) -> str:
+        """Return a link to its page."""
+        return f"[{self.name}]({self.page})"
+
+
+def uses(docs: Path) -> dict[str, list[Use]]:
+    """Return the scenes and tasks that use an effect, method, constraint or preset, by its name; simple ones first."""
+    found: dict[str, list[Use]] = {}
+
+    def add(name: str, page: str, kinds: dict[str, None]) -> None:
+        for kind in kinds:
+            found.setdefault(kind, []).append(Use(name, page, len(kinds)))
+
     for folder, page in NAMES.items():
         for path in sorted((docs.parent / "configs" / folder).glob("*.yaml")):
             anchor = re.sub(r"[^\w-]", "", path.stem)
-            for kind in dict.fromkeys(_kinds(yaml.safe_load(path.read_text(encoding="utf-8")))):
-                found.setdefault(kind, []).append(f"[{path.stem}](../{page}.md#{anchor})")
+            kinds = dict.fromkeys(_kinds(yaml.safe_load(path.read_text(encoding="utf-8"))))
+            add(path.stem, f"../{page}.md#{anchor}", kinds)
     for name, task in TASKS.items():
-        for kind in dict.fromkeys(_kinds_of_scene(task().scene)):
-            found.setdefault(kind, []).append(f"[{name}](../environments/{name}.md)")
-    return found
+        add(name, f"../environments/{name}.md", dict.fromkeys(_kinds_of_scene(task().scene)))
+    return {kind: sorted(each, key=lambda use: use.kinds) for kind, each in found.items()}
 
 
 def _kinds(block: Any) -> Iterator[str]:

@@ -50,7 +50,10 @@ def give_way_force(p: Any, me: Me, acc: Vec) -> Vec:
 
 
 class UnalignedAvoidance(Behaviour):
-    """Avoid the earliest predicted collision within `horizon` seconds: turn aside, and brake or speed up."""
+    """Avoid the earliest predicted collision within `horizon` seconds: turn aside, and brake or speed up.
+
+    Reynolds 1999.
+    """
 
     kind: Literal["unaligned_avoidance"] = "unaligned_avoidance"
     weight: float = Field(ge=0, description="N, steering force of an evasion")
@@ -139,7 +142,10 @@ def queue_force(p: Any, me: Me, acc: Vec) -> Vec:
 
 
 class Queue(Moving):
-    """Seek a door, and slow down behind slower agents ahead, without pushing."""
+    """Seek a door, and slow down behind slower agents ahead, without pushing.
+
+    Named in Reynolds 1999; the speed v_queue = gap / `headway` is that of Tordeux, Chraibi and Seyfried 2016.
+    """
 
     kind: Literal["queue"] = "queue"
     weight: float = Field(ge=0, description="kg/s, gain; at 4 m / headway or more it does not overshoot")
@@ -270,6 +276,8 @@ class Explore(Moving):
     """Sweep a region for ever along a closed comb of tracks, so that all of it comes into sight once per round.
 
     There is no memory of what was seen: the position determines the direction (steering.explore).
+
+    Named in Reynolds 1999; the comb is ours.
     """
 
     kind: Literal["explore"] = "explore"

@@ -107,6 +107,8 @@ class LineUp(Behaviour):
     F = m (e min(v0, gap / T) - v) / tau, instead of `driving`, with the same aims. If T >= 4 tau a gap closes as
     exp(-t / T) without overshoot (see `queue`). Ahead is within 45 degrees of the aim; agents beside are kept apart by
     separation or contact only. Oncoming agents also block: such scenes need a behaviour that avoids them.
+
+    The speed gap / T is that of Tordeux, Chraibi and Seyfried 2016.
     """
 
     kind: Literal["line_up"] = "line_up"

@@ -109,7 +109,10 @@ class _FlockRule(Effect):
 
 
 class Separation(_FlockRule):
-    """Keep away from near neighbours: F = w sum of (x - x_j)/|x - x_j|^2."""
+    """Keep away from near neighbours: F = w sum of (x - x_j)/|x - x_j|^2.
+
+    Reynolds 1987 and 1999.
+    """
 
     kind: Literal["separation"] = "separation"
     sentence: ClassVar[str] = "Keep away from neighbours within {radius}"
@@ -137,7 +140,10 @@ dt: 0.02
 
 
 class Alignment(_FlockRule):
-    """Match the mean velocity of the neighbours: F = w (mean v_j - v)."""
+    """Match the mean velocity of the neighbours: F = w (mean v_j - v).
+
+    Reynolds 1987 and 1999.
+    """
 
     kind: Literal["alignment"] = "alignment"
     sentence: ClassVar[str] = "Match the mean velocity of neighbours within {radius}"
@@ -162,7 +168,10 @@ dt: 0.02
 
 
 class Cohesion(_FlockRule):
-    """Stay with the neighbours: F = w (mean x_j - x)."""
+    """Stay with the neighbours: F = w (mean x_j - x).
+
+    Reynolds 1987 and 1999.
+    """
 
     kind: Literal["cohesion"] = "cohesion"
     sentence: ClassVar[str] = "Stay with the neighbours within {radius}"

@@ -44,6 +44,8 @@ class FollowWay(Moving):
 
     The floor field u is computed once on a grid, when the scene is built, and interpolated between grid points. Paths
     keep `clearance` from every obstacle. Outside the grid the direction is straight to the point.
+
+    The eikonal equation as a model of pedestrians: Hughes 2002.
     """
 
     kind: Literal["follow_way"] = "follow_way"

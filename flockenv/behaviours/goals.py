@@ -166,7 +166,10 @@ effects:
 
 
 class TargetSpeed(Behaviour):
-    """Reach a speed in the current direction of motion: S = (v_t - |v|) unit(v); zero at rest."""
+    """Reach a speed in the current direction of motion: S = (v_t - |v|) unit(v); zero at rest.
+
+    The law is ours.
+    """
 
     kind: Literal["target_speed"] = "target_speed"
     speed: float = Field(ge=0, description="v_t, m/s")

@@ -145,6 +145,8 @@ class FollowPath(_OnPath):
     In Reynolds' version any progress is enough, so an agent coasts for ever at whatever speed it has; here it must
     progress at `keep` times top speed. Two groups with opposite directions are traffic. At the end of an open path the
     agent seeks the end, or arrives at it within `slow_radius`.
+
+    Reynolds 1999, path following.
     """
 
     kind: Literal["follow_path"] = "follow_path"
@@ -188,7 +190,10 @@ effects:
 
 
 class StayOnPath(_OnPath):
-    """Stay in a path's tube, in either direction: seek the nearest spine if the position after `time` s is outside."""
+    """Stay in a path's tube, in either direction: seek the nearest spine if the position after `time` s is outside.
+
+    Reynolds 1999, path following.
+    """
 
     kind: Literal["stay_on_path"] = "stay_on_path"
     own_law: ClassVar[Law | None] = stay_on_path_force
@@ -203,7 +208,10 @@ effects:
 
 
 class FollowFlow(Behaviour):
-    """Follow a field of velocities on a grid, linear in between: F = w (u - v), 0 outside the grid."""
+    """Follow a field of velocities on a grid, linear in between: F = w (u - v), 0 outside the grid.
+
+    Reynolds 1999, flow field following.
+    """
 
     kind: Literal["follow_flow"] = "follow_flow"
     centre: Vector = Field(description="m, centre of the grid")

@@ -36,7 +36,11 @@ else:
 
 
 class Steer(Effect):
-    """The behaviours of a group in order of priority, and the arbitration that combines them into one force."""
+    """The behaviours of a group in order of priority, and the arbitration that combines them into one force.
+
+    The force is F = arbitration(F_1, ..., F_n) with |F| <= max_force, F_k the steering force of behaviour k (Reynolds
+    1987 and 1999).
+    """
 
     kind: Literal["steer"] = "steer"
     sentence: ClassVar[str] = "Steer by the following behaviours, the first one first"

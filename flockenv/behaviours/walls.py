@@ -72,6 +72,8 @@ class FollowWall(Moving):
 
     It keeps to the side on which it arrives; at rest it starts with the wall on its right. Around a corner it turns as
     sharply as its force allows: with `time` of about 2 m / w it does not cut corners.
+
+    Reynolds 1999, wall following.
     """
 
     kind: Literal["follow_wall"] = "follow_wall"
@@ -156,6 +158,8 @@ class Contain(Moving):
     A steering force is no wall. Agents that turn along the surface cross it by about half the length of a step,
     max_speed dt / 2, and by a little at corners. They cross it further if `weight` or max_force is too small to turn
     within `time`, or if others push. Agents that must never leave need a hollow obstacle and `collisions`.
+
+    The predicted position is p = x + T v, T = `time`.
     """
 
     kind: Literal["contain"] = "contain"

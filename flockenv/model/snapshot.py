@@ -13,10 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from flockenv.model.appearance import Appearance
 from flockenv.model.surface import whole_faces
 
-__all__ = ["KINDS", "ROLES", "Floats", "Mark", "Snapshot"]
+__all__ = ["KINDS", "ROLES", "Mark", "Snapshot"]
 
 Floats = NDArray[np.float64]
-"""An array of floats, as pictures use them."""
 
 ROLES: Final = (
     "pursuer", "evader", "learner", "learner 2", "flockmate", "agent", "agent 2", "agent 3", "agent 4"

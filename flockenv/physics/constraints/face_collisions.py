@@ -45,6 +45,9 @@ class FaceCollisions(Constraint):
     resolve moves as a rigid body in this step: an impact zone. A zone that holds a pinned particle or an obstacle
     moves as that does. So nothing intersects after any step, and momentum is conserved. If given motions leave no
     room, a warning says so. Work counters: face_passes, impacts, impact_zones, largest_zone.
+
+    After the impulses every contact has g >= 0 at the end of the step, g = w1 n . x1 + ... + w4 n . x4 - d: the
+    distance of point and face or of two edges, less the sum d of their radii.
     """
 
     kind: Literal["face_collisions"] = "face_collisions"

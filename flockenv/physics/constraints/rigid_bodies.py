@@ -56,6 +56,10 @@ class RigidBodies(Constraint):
     change. `Scene.contacts` returns their forces. Limits: contacts are found for motions along straight
     lines from the start of a step, so a block should not move further than its half edge in a step; other agents,
     headings and speed limits are not considered. Work counters: impacts (contacts of steps), unsolved.
+
+    m dv/dt = F, dL/dt = T, L = J w: momentum, angular momentum L of a body with inertia J and angular velocity w (Euler
+    1758; rotation: Austin, Krishnaprasad and Wang 1993). Contacts: projected Gauss-Seidel (Catto 2006) with Anderson's
+    extrapolation (Walker and Ni 2011).
     """
 
     kind: Literal["rigid_bodies"] = "rigid_bodies"

@@ -316,6 +316,8 @@ class Rods(Constraint):
     without a change of velocity. A chain of n links takes some 6 n sweeps in a step, and so does a cloth of n x n
     cells. Rods are applied last, after the speed limit and the walls of a box.
     `Scene.rod_forces` returns their tensions.
+
+    |x_i - x_j| = L for a rod, <= L for a rope.
     """
 
     kind: Literal["rods"] = "rods"

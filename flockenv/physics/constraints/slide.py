@@ -56,6 +56,8 @@ class Slide(Constraint):
 
     Each step is projected onto the directions, from where it began, and so is the velocity: a force across them does no
     work. Linearly implicit methods solve their equations with the constraint (Baraff and Witkin 1998, section 5.1).
+
+    x' = x0 + P (x - x0), v' = P v, with the projection P onto the directions and the position x0 before the step.
     """
 
     kind: Literal["slide"] = "slide"

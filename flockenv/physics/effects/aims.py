@@ -57,7 +57,11 @@ def goal_aim(p: Any, me: Me) -> Vec:
 
 
 class Goal(Aim):
-    """Agents of a group head for a point, and slow down within `slow_radius` of it."""
+    """Agents of a group head for a point, and slow down within `slow_radius` of it.
+
+    The direction is e = d / max(|d|, `slow_radius`), with d from the agent to the point: the desired direction of
+    Helbing and Molnar 1995, which here falls to 0 at the point (arrival, Reynolds 1999).
+    """
 
     kind: Literal["goal"] = "goal"
     target: Vector = Field(description="m, the point")
@@ -77,7 +81,11 @@ def course_aim(p: Any, me: Me) -> Vec:
 
 
 class Course(Aim):
-    """Agents of a group always head in one direction: along a corridor, around a torus."""
+    """Agents of a group always head in one direction: along a corridor, around a torus.
+
+    The direction is e = unit(`direction`), times `share`: the desired direction of Helbing and Molnar 1995 for a target
+    far away.
+    """
 
     kind: Literal["course"] = "course"
     direction: Vector = Field(description="direction of travel; its length does not matter")
@@ -124,7 +132,11 @@ def antipode_aim(p: Any, me: Me) -> Vec:
 
 
 class Antipode(Aim):
-    """Agents of a group head across a centre to the point opposite to their initial position: a circle swap."""
+    """Agents of a group head across a centre to the point opposite to their initial position: a circle swap.
+
+    The target is g = 2 c - x0, with the centre c and the initial position x0, and e = d / max(|d|, `slow_radius`) with
+    d = g - x. A circle swap is the usual test of collision avoidance (van den Berg, Guy, Lin and Manocha 2011).
+    """
 
     kind: Literal["antipode"] = "antipode"
     centre: Vector = Field(description="m, the point that all cross")

@@ -85,6 +85,9 @@ class AltitudeSprings(Effect):
     """Damped springs across the tetrahedra of a group's network: from corners to faces, and between opposite edges.
 
     With `springs` along the edges, a tetrahedron that is turned inside out recovers.
+
+    The energy is E = sum of k (h - L)^2 / 2 over the seven heights h of a tetrahedron, L their lengths at rest (Molino,
+    Bridson, Teran and Fedkiw 2003; edges: Selle, Lentine and Fedkiw 2008).
     """
 
     kind: Literal["altitude_springs"] = "altitude_springs"

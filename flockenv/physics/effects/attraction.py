@@ -32,6 +32,8 @@ class Attraction(Effect):
 
     Conserves m v^2 / 2 - k / sqrt(r^2 + s^2), s the softening, and the angular momentum about the centre; with s = 0
     the orbits of one body are Kepler's. On a torus only the nearest image of the centre attracts.
+
+    An inverse-square law (Newton 1687), softened as in Plummer 1911.
     """
 
     kind: Literal["attraction"] = "attraction"

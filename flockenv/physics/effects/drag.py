@@ -39,7 +39,10 @@ def drag_derivative(local: Any, number: Any, s: int) -> None:
 
 
 class Drag(Effect):
-    """Linear drag, F = -c (v - u) in a medium of velocity u: without other forces v = v0 exp(-c t / m)."""
+    """Linear drag, F = -c (v - u) in a medium of velocity u: without other forces v = v0 exp(-c t / m).
+
+    The resistance of a slow body in a viscous fluid (Stokes 1851).
+    """
 
     kind: Literal["drag"] = "drag"
     rate: float = Field(ge=0, description="c, kg/s")
@@ -63,6 +66,8 @@ class QuadraticDrag(Effect):
     """Quadratic drag (of a body with a wake), F = -c |v - u| (v - u) in a medium of velocity u.
 
     Under gravity g the speed of fall is v tanh(g t / v), with v = sqrt(m g / c) in the end.
+
+    Newton 1687, Principia, book II.
     """
 
     kind: Literal["quadratic_drag"] = "quadratic_drag"

@@ -172,6 +172,9 @@ class Elastic(Effect):
     strain = linear holds for small displacements: a large rotation stretches the body. strain = corotated, of triangles
     in 2-D and tetrahedra in 3-D, holds for rotations of any size at small strains; an element that is turned inside out
     recovers. Both are the same at small displacements. Masses are those of the group's particles.
+
+    The force is F = -K (u + beta v) - alpha M v, u the displacements. Elements of constant strain: Turner, Clough,
+    Martin and Topp 1956; corotated: Mueller and Gross 2004; damping: Rayleigh 1877.
     """
 
     kind: Literal["elastic"] = "elastic"

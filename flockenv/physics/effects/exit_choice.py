@@ -163,6 +163,8 @@ class Routes(Around):
     of 1/256 of the longest path. `inner(state, "door")` is the index of the door; for an agent that has passed its
     door, and then goes straight on, it is the number of doors. A door is passed from the side on which the agent
     approached it, also just beside an end that stands free; crossing it backwards does not count.
+
+    The choice by expected time is ours.
     """
 
     kind: Literal["routes"] = "routes"

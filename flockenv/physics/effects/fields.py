@@ -168,7 +168,10 @@ class _Central(_Field):
 
 
 class Uniform(_Field):
-    """A uniform field; as a force it does work F . (x - x0), independent of the mass (for gravity see `Gravity`)."""
+    """A uniform field; as a force it does work F . (x - x0), independent of the mass (for gravity see `Gravity`).
+
+    It is W = `strength`, with a period W cos(2 pi t / period + phase). The field is ours.
+    """
 
     kind: Literal["uniform"] = "uniform"
     strength: Vector = Field(description="N as a force, m/s as a medium, per axis")
@@ -183,6 +186,8 @@ class Source(_Central):
     """A field away from a centre, of magnitude W = Phi / (Phi / Phi_max + r^2).
 
     As a steady force it conserves m v^2 / 2 - Phi / sqrt(a) arctan(r / sqrt(a)), a = Phi / Phi_max.
+
+    The bound near the centre is ours.
     """
 
     kind: Literal["source"] = "source"
@@ -198,6 +203,8 @@ class Sink(_Central):
     """A field towards a centre, of magnitude W = Phi / (Phi / Phi_max + r^2): a reversed source.
 
     As a steady force it conserves m v^2 / 2 + Phi / sqrt(a) arctan(r / sqrt(a)), a = Phi / Phi_max.
+
+    The bound near the centre is ours.
     """
 
     kind: Literal["sink"] = "sink"
@@ -214,6 +221,8 @@ class Vortex(_Central):
 
     As a medium it carries agents in circles, one turn in 2 pi r / W. As a force it conserves no energy: it does work
     2 pi r W in every turn.
+
+    The profile is ours.
     """
 
     kind: Literal["vortex"] = "vortex"
@@ -238,6 +247,8 @@ class Wind(_Timed):
 
     u = U + G (1 - cos(2 pi t / period + phase)) / 2: successive gusts of the "one minus cosine" shape for which
     aircraft are certified (CS-25.341).
+
+    The model is ours.
     """
 
     kind: Literal["wind"] = "wind"
@@ -263,6 +274,8 @@ class Carried(Effect):
 
     Unlike `Drag`, a force that pulls v towards u with time constant m / c, this is the limit without inertia. v stays
     the agent's own velocity, and max_speed bounds the sum.
+
+    The model is ours.
     """
 
     kind: Literal["carried"] = "carried"

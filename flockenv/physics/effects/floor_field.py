@@ -100,6 +100,8 @@ class Way(Around):
     Paths follow the negative gradient of their length u, |grad u| = 1 (eikonal equation). Nearest means by path length,
     not by straight distance. The target of a door is the part at least `clearance` from its jambs. Within a target box
     the desired velocity is 0.
+
+    The eikonal equation as a model of pedestrians: Hughes 2002; its solution: Zhao 2005 and Sethian 1999.
     """
 
     kind: Literal["way"] = "way"

@@ -65,7 +65,10 @@ class _Softened(Effect):
 
 
 class Gravitation(_Softened):
-    """Newton's gravitation, softened: F_i = sum of G m_i m_j d / (d^2 + eps^2)^(3/2), d from i to j."""
+    """Newton's gravitation, softened: F_i = sum of G m_i m_j d / (d^2 + eps^2)^(3/2), d from i to j.
+
+    Newton 1687; softening: Plummer 1911; groups of far bodies: Barnes and Hut 1986.
+    """
 
     kind: Literal["gravitation"] = "gravitation"
     constant: float = Field(ge=0, description="G, N m^2/kg^2; in nature 6.674e-11")
@@ -87,7 +90,10 @@ class Gravitation(_Softened):
 
 
 class InverseSquare(_Softened):
-    """Attraction or repulsion of every pair, independent of mass: F_i = sum of k d / (d^2 + eps^2)^(3/2)."""
+    """Attraction or repulsion of every pair, independent of mass: F_i = sum of k d / (d^2 + eps^2)^(3/2).
+
+    Coulomb 1785; softening: Plummer 1911; groups of far agents: Barnes and Hut 1986.
+    """
 
     kind: Literal["inverse_square"] = "inverse_square"
     strength: float = Field(description="k, N m^2; positive attracts, negative repels")

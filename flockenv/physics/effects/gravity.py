@@ -24,7 +24,10 @@ def gravity(p: Any, me: Me) -> Vec:
 
 
 class Gravity(Effect):
-    """Uniform gravity, F = m g: without other forces x = x0 + v0 t + g t^2 / 2. Pinned particles stay."""
+    """Uniform gravity, F = m g: without other forces x = x0 + v0 t + g t^2 / 2. Pinned particles stay.
+
+    Galileo 1638.
+    """
 
     kind: Literal["gravity"] = "gravity"
     sentence: ClassVar[str] = "Gravity of {acceleration}"

@@ -131,6 +131,9 @@ class Membrane(Effect):
     A condition of stretch is sqrt(A) (|dx/du| - 1), and the same for v; that of shear is sqrt(A) dx/du . dx/dv. A is
     the area of the triangle at rest (Baraff and Witkin weight by A itself, which makes a finer mesh softer). Damping
     acts along the gradients of the conditions, so rigid motions are not damped.
+
+    The energy of a triangle is E = A (k (|dx/du| - 1)^2 + k (|dx/dv| - 1)^2 + s (dx/du . dx/dv)^2) / 2: Baraff and
+    Witkin 1998, sections 4.1 to 4.4.
     """
 
     kind: Literal["membrane"] = "membrane"
@@ -268,7 +271,7 @@ def bending_derivative(local: Any, number: Any, s: int) -> None:
 class Bending(Effect):
     """Bending of the triangles of a group's network, by the angle between the normals of neighbouring triangles.
 
-    The condition is |e| / sqrt(A + A') (angle - rest angle) for the edge e between triangles of areas A and A'. The
+    The condition is C = |e| / sqrt(A + A') (angle - rest angle) for the edge e between triangles of areas A and A'. The
     stiffness is then the flexural rigidity of a sheet bent along the sides of its square cells, and does not depend on
     their size (compare Grinspun et al. 2003, Discrete shells).
     """

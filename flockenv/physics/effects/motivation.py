@@ -243,6 +243,8 @@ class Predation(_Urge):
 
     `caught` counts the hunters that have caught an agent; with a sink `threshold` at 1 a caught agent dies. A prey
     caught by two in one step reduces the hunger of both. The model is ours.
+
+    A hunter that catches n prey in a step has the hunger H = max(H - n `meal`, 0) after it.
     """
 
     kind: Literal["predation"] = "predation"
@@ -370,7 +372,7 @@ def update_urge(p: Any, me: Me, message: Vec, seconds: float) -> Vec:
 
 
 class Libido(_Urge):
-    """An urge s that grows linearly since the last mating; libido is s (1 - H) (Tu and Terzopoulos 1994).
+    """An urge s that grows linearly since the last mating; libido = s (1 - H) (Tu and Terzopoulos 1994).
 
     Two agents mate if they are nearer than `radius` and both have a libido above `ready`; `mated` counts matings. Three
     agents in reach of each other all mate. This replaces the paper's courtship and is ours; no agent is born.
@@ -435,7 +437,7 @@ class Intention(_Urge):
     With fear above `escape` the intention is to escape; above `school`, to school; else to eat or mate for the larger
     of hunger and libido, if above `need`; else to wander (Tu and Terzopoulos 1994). An intention ends only when its
     level has fallen by `calm` or `content` below the threshold, against rapid changes; that is ours. An arbitration
-    `intentions` reads it.
+    `intentions` reads it. The level of eating is the hunger H, that of mating the libido L = s (1 - H).
     """
 
     kind: Literal["intention"] = "intention"

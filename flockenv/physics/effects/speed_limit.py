@@ -33,6 +33,8 @@ class SpeedLimit(Effect):
     1.319 V; it is 14 % of B at 0.8 V and 0.2 % at V / 2. For high speeds it is a linear drag, 16 B / V: this bounds its
     stiffness, so any step of less than m V / (8 B) is stable. `Group.max_speed` is the hard limit: it holds exactly,
     and clips the result of a step, so that with it every method is of order 1.
+
+    The function is ours.
     """
 
     kind: Literal["speed_limit"] = "speed_limit"

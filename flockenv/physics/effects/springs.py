@@ -244,6 +244,8 @@ class Springs(Effect):
     With `yield_strain` a spring that is strained further takes a new rest length for good; with `break_strain` one that
     is longer breaks, and exerts no force any more. `State.bonds` holds the present rest lengths, inf of broken springs.
     The work of yielding and the energy of a spring that breaks are dissipated.
+
+    Springs: Hooke 1678; cloth of springs along, across and beyond cells: Provot 1995.
     """
 
     kind: Literal["springs"] = "springs"
@@ -409,7 +411,11 @@ class Springs(Effect):
 
 
 class AngularSprings(Effect):
-    """Damped springs about the hinges of a group's network: a moment k (angle - rest angle) at each apex."""
+    """Damped springs about the hinges of a group's network: a moment k (angle - rest angle) at each apex.
+
+    The moment is M = -k (a - L) - c da/dt, a the angle and L that at rest: the angle term of molecular mechanics
+    (Brooks et al. 1983), here damped.
+    """
 
     kind: Literal["angular_springs"] = "angular_springs"
     group: int = Field(default=0, ge=0, description="index of the group whose network it acts on")

@@ -50,7 +50,10 @@ class _Centred(Effect):
 
 
 class Tether(_Centred):
-    """A damped spring to a fixed point, F = -k (|d| - L) unit(d) - c v: with L = 0 an oscillator, w^2 = k / m."""
+    """A damped spring to a fixed point, F = -k (|d| - L) unit(d) - c v: with L = 0 an oscillator, w^2 = k / m.
+
+    Hooke 1678.
+    """
 
     kind: Literal["tether"] = "tether"
     stiffness: float = Field(ge=0, description="k, N/m")
@@ -71,7 +74,10 @@ class Tether(_Centred):
 
 
 class Swing(_Centred):
-    """A pendulum along each axis, F = -s sin((x - c) / l): the angle is (x - c) / l, w^2 = s / (m l) for small ones."""
+    """A pendulum along each axis, F = -s sin((x - c) / l): the angle is (x - c) / l, w^2 = s / (m l) for small ones.
+
+    Huygens 1673.
+    """
 
     kind: Literal["swing"] = "swing"
     strength: float = Field(ge=0, description="s, N; of a pendulum in gravity: m g")

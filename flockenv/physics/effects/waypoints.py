@@ -128,6 +128,9 @@ class Journey(Around):
     -1/2 during a wait before the first; the number of stages after the last. A wait ends with the first step that
     begins after its duration, for any dt. After the last stage, with then = "leave", an agent goes straight on, through
     a sink if there is one. In 2-D only.
+
+    The direction to a stage is e = unit(d), with d to the stage, or down the gradient of the path length. The model is
+    ours.
     """
 
     kind: Literal["journey"] = "journey"

@@ -18,7 +18,10 @@ def move(x: float, v: float, a: float, dt: float) -> tuple[float, float]:
 
 
 class AveragedVelocity(OneStage):
-    """Averaged-velocity step, order 1, one evaluation; exact under a constant force, adds energy to oscillations."""
+    """Averaged-velocity step, order 1, one evaluation; exact under a constant force, adds energy to oscillations.
+
+    v' = v + h a(x, v, t), x' = x + h (v + v') / 2: the formulas of uniform acceleration (Galileo 1638), step by step.
+    """
 
     kind: Literal["averaged_velocity"] = "averaged_velocity"
     order: ClassVar[int] = 1

@@ -74,7 +74,11 @@ def advance(provided: Provided) -> Method:
 
 
 class DormandPrince(Adaptive):
-    """Dormand-Prince 5(4) with adaptive substeps within dt, 6 evaluations each and one more; for smooth forces."""
+    """Dormand-Prince 5(4) with adaptive substeps within dt, 6 evaluations each and one more; for smooth forces.
+
+    y' = y + h (b1 k1 + ... + b7 k7) for y = (x, v) and slopes k = (v, a); the error is e = h |sum of (b - c) k|, with
+    the weights c of order 4; the next substep is h (tolerance / e)^(1/5), times 0.9 (Dormand and Prince 1980).
+    """
 
     kind: Literal["dormand_prince"] = "dormand_prince"
     order: ClassVar[int] = 5

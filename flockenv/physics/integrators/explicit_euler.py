@@ -17,7 +17,10 @@ def move(x: float, v: float, a: float, dt: float) -> tuple[float, float]:
 
 
 class ExplicitEuler(OneStage):
-    """Explicit Euler, order 1, one evaluation; unstable for every undamped oscillation at every step size."""
+    """Explicit Euler, order 1, one evaluation; unstable for every undamped oscillation at every step size.
+
+    x' = x + h v, v' = v + h a(x, v, t) (Euler 1768).
+    """
 
     kind: Literal["explicit_euler"] = "explicit_euler"
     order: ClassVar[int] = 1

@@ -74,7 +74,12 @@ def advance(provided: Provided) -> Method:
 
 
 class ExponentialDrag(Integrator):
-    """Linear drag exactly at any dt, other forces to order 2, two evaluations; oscillations lose (h omega)^4 / 12."""
+    """Linear drag exactly at any dt, other forces to order 2, two evaluations; oscillations lose (h omega)^4 / 12.
+
+    With z = -h c / m and the other accelerations a: y = x + h phi1(z) v + h^2 phi2(z) a, w = exp(z) v + h phi1(z) a,
+    then x' = y + h^2 phi3(z) (b - a), v' = w + h phi2(z) (b - a) with b = a(y, w, t + h). ETD2RK of Cox and Matthews
+    2002.
+    """
 
     kind: Literal["exponential_drag"] = "exponential_drag"
     order: ClassVar[int] = 2

@@ -25,7 +25,10 @@ def advance(provided: Provided) -> Method:
 
 
 class ImplicitEuler(Implicit):
-    """Implicit Euler, order 1: v' = v + h a(x', v'), x' = x + h v'; an oscillation loses 1/(1 + h^2 w^2) per step."""
+    """Implicit Euler, order 1: v' = v + h a(x', v'), x' = x + h v'; an oscillation loses 1/(1 + h^2 w^2) per step.
+
+    Curtiss and Hirschfelder 1952.
+    """
 
     kind: Literal["implicit_euler"] = "implicit_euler"
     order: ClassVar[int] = 1

@@ -11,7 +11,11 @@ __all__ = ["ImplicitMidpoint", "advance"]
 
 
 class ImplicitMidpoint(Implicit):
-    """Implicit midpoint, order 2; symplectic, stable at every step, undamped: stiff modes keep oscillating."""
+    """Implicit midpoint, order 2; symplectic, stable at every step, undamped: stiff modes keep oscillating.
+
+    x' = x + h (v + v') / 2, v' = v + h a((x + x') / 2, (v + v') / 2, t + h / 2): the Gauss method of one stage (Butcher
+    1964).
+    """
 
     kind: Literal["implicit_midpoint"] = "implicit_midpoint"
     order: ClassVar[int] = 2

@@ -37,7 +37,10 @@ def advance(provided: Provided) -> Method:
 
 
 class Midpoint(Integrator):
-    """Explicit midpoint, order 2, two evaluations; energy of an oscillation grows by (h omega)^4 / 4 per step."""
+    """Explicit midpoint, order 2, two evaluations; energy of an oscillation grows by (h omega)^4 / 4 per step.
+
+    x' = x + h (v + h a / 2), v' = v + h a(x + h v / 2, v + h a / 2, t + h / 2) with a = a(x, v, t) (Runge 1895).
+    """
 
     kind: Literal["midpoint"] = "midpoint"
     order: ClassVar[int] = 2

@@ -41,7 +41,11 @@ def advance(provided: Provided) -> Method:
 
 
 class RK4(Integrator):
-    """Classical Runge-Kutta, order 4, four evaluations; of order 1 if a limit or a view cone makes forces jump."""
+    """Classical Runge-Kutta, order 4, four evaluations; of order 1 if a limit or a view cone makes forces jump.
+
+    y' = y + h (k1 + 2 k2 + 2 k3 + k4) / 6 for y = (x, v) and slopes k = (v, a): k1 at y, k2 at y + h k1 / 2, k3 at y +
+    h k2 / 2, k4 at y + h k3 (Kutta 1901).
+    """
 
     kind: Literal["rk4"] = "rk4"
     order: ClassVar[int] = 4

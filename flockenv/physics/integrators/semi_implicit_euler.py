@@ -18,7 +18,10 @@ def move(x: float, v: float, a: float, dt: float) -> tuple[float, float]:
 
 
 class SemiImplicitEuler(OneStage):
-    """Semi-implicit Euler, order 1, one evaluation; bounded energy while h omega < 2 (Reynolds' own step, 1999)."""
+    """Semi-implicit Euler, order 1, one evaluation; bounded energy while h omega < 2 (Reynolds' own step, 1999).
+
+    v' = v + h a(x, v, t), x' = x + h v' (de Vogelaere 1956; Hairer, Lubich and Wanner 2006, VI.3).
+    """
 
     kind: Literal["semi_implicit_euler"] = "semi_implicit_euler"
     order: ClassVar[int] = 1

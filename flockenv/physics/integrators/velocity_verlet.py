@@ -40,7 +40,11 @@ def advance(provided: Provided) -> Method:
 
 
 class VelocityVerlet(Integrator):
-    """Velocity Verlet, order 2 with and without drag, two evaluations; bounded energy while h omega < 2."""
+    """Velocity Verlet, order 2 with and without drag, two evaluations; bounded energy while h omega < 2.
+
+    x' = x + h v + h^2 a / 2, v' = v + h (a + a(x', v + h a, t + h)) / 2 with a = a(x, v, t) (Verlet 1967; Swope,
+    Andersen, Berens and Wilson 1982; the predicted velocity is ours).
+    """
 
     kind: Literal["velocity_verlet"] = "velocity_verlet"
     order: ClassVar[int] = 2
