@@ -9,20 +9,28 @@ from __future__ import annotations
 
 import os
 import sys
+import tomllib
 from pathlib import Path
 
 os.environ["NUMBA_DISABLE_JIT"] = "1"  # functions stay functions of Python, whose signatures autodoc reads
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "docs" / "_ext")]
 
+_about = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 project = "flockenv"
+version = release = _about["version"]
 author = "flockenv contributors"
 project_copyright = f"2026, {author}"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "pages"]
 exclude_patterns = ["_ext", "_build", "**/jobs"]
 smartquotes = False  # quotes in prose are often those of code
 html_theme = "furo"
-html_title = "flockenv"
+html_theme_options = {
+    "source_repository": _about["urls"]["Repository"],
+    "source_branch": "main",
+    "source_directory": "docs/",
+}
+html_title = f"flockenv {release}"
 html_copy_source = False
 html_show_sourcelink = False
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from docstrings import markdown, table
 from films import hybrid_of
+from sphinx.util import logging
 
 from flockenv.envs.docstring import page as page_of_environment
 from flockenv.envs.table import ENVIRONMENTS, EnvInfo
@@ -18,12 +19,17 @@ from flockenv.tasks import TASKS, Task
 
 __all__ = ["pages"]
 
+_log = logging.getLogger(__name__)  # with -W a warning fails the build
 
-def pages(docs: Path) -> dict[str, str]:
-    """Return a page for each environment, and their overview."""
+
+def pages(docs: Path, films_are_drawn: bool) -> dict[str, str]:
+    """Return a page for each environment, and their overview; warn of a film that is missing but should be there."""
     results = json.loads((docs / "results.json").read_text(encoding="utf-8"))
     infos = {info.task_type().name: info for info in ENVIRONMENTS.values()}
     made = {f"environments/{name}": _page(docs, name, infos[name], results) for name in TASKS}
+    for name in TASKS:
+        if films_are_drawn and not _path_of_film(docs, name).exists():
+            _log.warning("%s: its film is missing", name)
     return {**made, "environments/index": _overview(infos)}
 
 
@@ -56,10 +62,15 @@ def _page(docs: Path, name: str, info: EnvInfo, results: dict[str, Any]) -> str:
 
 
 def _film(docs: Path, name: str) -> str:
-    if not (docs / "generated" / "films" / f"{name}.gif").exists():
-        return ""
-    players = "rules, PPO and a hybrid of both" if hybrid_of(name) else "rules and PPO"
-    return f"![An episode of {name} in the same world, from left to right: {players}](../films/{name}.gif)\n\n"
+    hybrid = "" if hybrid_of(name) else f"No hybrid of rules and policy was trained in {name}.\n\n"
+    if not _path_of_film(docs, name).exists():
+        return hybrid
+    players = "rules and PPO" if hybrid else "rules, PPO and a hybrid of both"
+    return f"![An episode of {name} in the same world, from left to right: {players}](../films/{name}.gif)\n\n{hybrid}"
+
+
+def _path_of_film(docs: Path, name: str) -> Path:
+    return docs / "generated" / "films" / f"{name}.gif"
 
 
 def _kernel_text(task: Task, kernel: str) -> str:

@@ -7,7 +7,7 @@ that a second build reads only what is new; pages of kinds that are gone are rem
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import api_pages
 import docstrings
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 __all__ = ["setup", "write_pages"]
 
 
-def write_pages(docs: Path) -> None:
+def write_pages(docs: Path, films_are_drawn: bool) -> None:
     """Write all generated pages below docs/generated/ and remove those that no longer belong there."""
     made = docs / "generated"
     pages = {
-        **environment_pages.pages(docs),
+        **environment_pages.pages(docs, films_are_drawn),
         **kind_pages.pages(docs),
         **scene_pages.pages(docs),
         **api_pages.pages(docs),
@@ -49,7 +49,13 @@ def _begin(app: Sphinx) -> None:
     if app.config.films:
         films.draw_missing(docs / "generated" / "films")
     pictures.draw_missing(docs / "generated" / "pictures")
-    write_pages(docs)
+    write_pages(docs, app.config.films)
+
+
+def _leave_out_source(app: Sphinx, pagename: str, template: str, context: dict[str, Any], tree: object) -> None:
+    """Leave out the links of the theme to the source of a generated page, which is not in the repository."""
+    if pagename.startswith("generated/"):
+        context["page_source_suffix"] = ""
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
@@ -57,6 +63,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.add_config_value("films", True, "")
     app.connect("builder-inited", _begin)
     app.connect("env-updated", api_pages.mark_second_names)
+    app.connect("html-page-context", _leave_out_source)
     app.connect("source-read", links.rewrite_source)
     app.connect("autodoc-process-docstring", docstrings.process, priority=400)  # before napoleon reads Args:
     app.connect("autodoc-process-signature", docstrings.signature)
