@@ -1,4 +1,4 @@
-"""Make a virtual environment per client, install the client and flockenv there, and let it play.
+"""Make a virtual environment per client, install the client and flockenv there, let it play, and run docs/clients.md.
 
 `python -m tests.clients sb3 torchrl`, or without names all of them. Ends with the log of docs/clients.md.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -21,6 +22,22 @@ from typing import Any
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 CLIENTS = sorted(path.stem.removeprefix("play_") for path in HERE.glob("play_*.py"))
+
+
+PAGE = (ROOT / "docs" / "clients.md").read_text(encoding="utf-8")
+SECTIONS = {
+    "agilerl": "AgileRL", "cleanrl": "CleanRL", "rllib": "RLlib", "sb3": "Stable-Baselines3, sb3-contrib", "sbx": "sbx",
+    "skrl": "skrl", "tianshou": "Tianshou", "torchrl": "TorchRL", "wandb": "Weights & Biases",
+}  # fmt: skip
+"""Sections of the page with code; rl_zoo3 has a command and settings there, sb3_contrib no more than its ids."""
+
+
+def page_code(client: str) -> list[str]:
+    """Return the programs of the page's section about a client."""
+    if client not in SECTIONS:
+        return []
+    section = re.split(r"^##+ ", PAGE.split(f"# {SECTIONS[client]}\n")[1], maxsplit=1, flags=re.MULTILINE)[0]
+    return re.findall(r"^```python\n(.*?)```", section, re.DOTALL | re.MULTILINE)
 
 
 def head(client: str) -> dict[str, Any]:
@@ -62,6 +79,18 @@ def play(client: str, python: Path, steps: int) -> Iterator[dict[str, Any]]:
         raise RuntimeError(f"{' '.join(command)} ended with {script.returncode}")
 
 
+def run_page(client: str, python: Path) -> int:
+    """Run the programs of the page in an empty folder each; return their number, RuntimeError if one failed."""
+    programs = page_code(client)
+    for program in programs:
+        with tempfile.TemporaryDirectory() as folder:
+            (Path(folder) / "page.py").write_text(program, encoding="utf-8")
+            done = subprocess.run([python, "page.py"], cwd=folder, env={**os.environ, "WANDB_MODE": "offline"})
+        if done.returncode:
+            raise RuntimeError(f"the code of docs/clients.md, {SECTIONS[client]}, ended with {done.returncode}")
+    return len(programs)
+
+
 def table(rows: list[dict[str, Any]]) -> str:
     """Return the log: what each client played, and how many steps of each environment."""
     envs = sorted({row["env"] for row in rows}, reverse=True)
@@ -88,9 +117,11 @@ def main() -> None:
     for client in asked.clients:
         with tempfile.TemporaryDirectory() as folder:
             try:
-                for row in play(client, python or installed(client, Path(folder)), asked.steps):
+                has_it = python or installed(client, Path(folder))
+                for row in play(client, has_it, asked.steps):
                     print("{client}, {what}, {env}: {steps:,} steps in {seconds} s".format(**row), file=sys.stderr)
                     rows.append(row)
+                print(f"{client}: {run_page(client, has_it)} programs of docs/clients.md ran", file=sys.stderr)
             except (OSError, RuntimeError, subprocess.CalledProcessError) as error:
                 failed.append(f"{client}: {error}")
     print(table(rows))
