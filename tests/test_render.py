@@ -22,7 +22,7 @@ from PIL import Image
 from flockenv.cli.films import Shutter, write_picture
 from flockenv.geometry.space import Torus
 from flockenv.model.appearance import Appearance
-from flockenv.model.networks import Cloth
+from flockenv.model.networks import Blocks, Cloth
 from flockenv.model.snapshot import ROLES, Mark, Snapshot
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
@@ -373,7 +373,7 @@ def test_an_edge_that_broke_takes_its_face_away_and_the_inside_of_a_body_is_hidd
     torn = faced(pos, faces, bonds=bonds, broken=[True, False, False])
     assert torn.sum() == pytest.approx(whole.sum() / 2, rel=0.02)
     inner = [*CORNERS, (3.0, 3.0)]
-    tied = faced(inner, faces[:1], bonds=[(0, 1), (3, 0)], radius=np.full(4, 0.5))
+    tied = faced(inner, faces[:1], covered=[True] * 4, radius=np.full(4, 0.5))
     np.testing.assert_array_equal(tied, faced(CORNERS, faces[:1]))
 
 
@@ -391,6 +391,12 @@ def test_faces_that_cross_hide_each_other_pixel_by_pixel_and_backs_have_their_ow
 def test_a_face_across_the_seam_is_drawn_at_both_edges() -> None:
     seen = faced([(9.0, 4.0), (1.0, 4.0), (9.0, 6.0)], [(0, 1, 2)], periodic=True)
     assert seen[:, :40].any() and seen[:, -40:].any() and not seen[:, 100:500].any()
+
+
+def test_corners_and_centres_of_blocks_are_drawn_as_their_surface_and_other_agents_are_not() -> None:
+    block = SceneGroup(network=Blocks(sides=(1.0, 1.0, 1.0), centres=((0.0, 0.0, 0.0),)))
+    scene = Scene(dimension=3, groups=(SceneGroup(count=2, spawn=Spawn(low=(3, 3, 3), high=(4, 4, 4))), block), dt=0.01)
+    assert scene.snapshot(scene.start(0)).covered.tolist() == [False] * 2 + [True] * 9
 
 
 STRAINED = Appearance(by="strain", over=(0.0, 0.1), colours=("#0000ff", "#ff0000"))

@@ -36,7 +36,7 @@ SLOW = (
 )  # they compile for half a minute or have many bodies
 PICTURES = (
     "fountain", "fireworks", "drop", "waterfall", "fire", "smoke", "draped_cloth", "torn_paper", "jelly_on_stairs",
-    "dice",
+    "dice", "flag",
 )  # fmt: skip
 UNSOLVED = pytest.mark.filterwarnings("ignore::flockenv.core.warnings.UnsolvedContactsWarning")
 FAST = pytest.mark.parametrize(

@@ -61,7 +61,8 @@ class Snapshot:
     outlines: polygons (n, 2), m, of obstacles that are not round, as seen from above.
     bonds (E, 2): int, pairs of agents joined by a line, the shortest one; none by default.
     broken (E,): True for bonds that are broken, which are not drawn; none by default.
-    faces (F, 3): int, triangles of agents, which are drawn in place of their bonds; none by default.
+    faces (F, 3): int, triangles of agents, which are drawn in place of their bonds; none by default. covered (N,): True
+    for agents that are drawn as such a surface only; default: the corners of faces.
     heading (N, D): directions that agents face; default: those of the velocities.
     looks: appearances; look (N,): the index of each agent's own, -1 = none. age (N,): s, of the living; default: the
     time. identity (N,): int, the agent in each row; default: the same agents at all times.
@@ -96,6 +97,7 @@ class Snapshot:
     broken: NDArray[np.bool_] | None = None
     faces: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 3), np.int32))
     box: Floats | None = None
+    covered: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         pos = _array("Snapshot.pos", self.pos, (None, None), finite=False)
@@ -126,6 +128,7 @@ class Snapshot:
             shown=None if self.shown is None else _array("Snapshot.shown", self.shown, (agents,)),
             broken=None if self.broken is None else _switches("Snapshot.broken", self.broken, len(self.bonds)),
             faces=_agents("Snapshot.faces", self.faces, 3, agents),
+            covered=_switches("Snapshot.covered", self._corners if self.covered is None else self.covered, agents),
             box=None if self.box is None else _array("Snapshot.box", self.box, (4, 3)),
         )
         if self.look is not None and not (self.look < len(self.looks)).all():
@@ -144,6 +147,12 @@ class Snapshot:
     def dimension(self) -> int:
         """Dimension D, 2 or 3."""
         return int(self.pos.shape[1])
+
+    @property
+    def _corners(self) -> NDArray[np.bool_]:
+        corner = np.zeros(self.agents, np.bool_)
+        corner[_agents("Snapshot.faces", self.faces, 3, self.agents)] = True
+        return corner
 
     @property
     def aim(self) -> Floats:

@@ -35,6 +35,7 @@ def describe_lane(lane: Lane, name: str) -> dict[str, Any]:
         "periodic": shot.periodic, "roles": _runs(shot.roles), "dimension": shot.dimension,
         "radius": _number_runs(shot.radius), "bonds": shot.bonds.ravel().tolist(),
         "faces": shot.faces.ravel().tolist() if len(shot.faces) <= FACES else [],
+        "covered": _runs(np.asarray(shot.covered).astype(int).tolist()),
         "looks": [look_data(look) for look in shot.looks],
         "look": _runs(np.asarray(shot.look).tolist()) if shot.looks else None, "has_returns": lane.returns is not None,
     }  # fmt: skip

@@ -12,26 +12,13 @@ from flockenv.model.snapshot import Floats, Snapshot
 from flockenv.render.palette import PAPER, ROLE_COLOURS, rgb
 from flockenv.render.view import View
 
-__all__ = ["covered", "draw_faces"]
+__all__ = ["draw_faces"]
 
 LIGHT: Final = np.array([-0.35, 0.46, 0.81])
 """Direction of the light: to the right, upwards, towards the reader; that of page/faces.js."""
 
 EVEN: Final = 0.6
 """Light on all faces in 2-D."""
-
-
-def covered(snapshot: Snapshot) -> NDArray[np.bool_]:
-    """Return True for agents whose network has faces, (N,) bool: they are drawn as its surface."""
-    if not len(snapshot.faces):
-        return np.zeros(snapshot.agents, np.bool_)
-    from scipy.sparse import coo_array  # slow to import, and needed only here
-    from scipy.sparse.csgraph import connected_components
-
-    ends = snapshot.bonds.T
-    joined = coo_array((np.ones(len(snapshot.bonds), np.bool_), (ends[0], ends[1])), (snapshot.agents,) * 2)
-    _, network = connected_components(joined, directed=False)
-    return np.asarray(np.isin(network, network[snapshot.faces]))
 
 
 def draw_faces(canvas: Image.Image, view: View, snapshot: Snapshot, height: Floats) -> None:

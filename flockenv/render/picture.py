@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from flockenv.model.snapshot import Floats, Mark, Snapshot
-from flockenv.render.faces import covered, draw_faces
+from flockenv.render.faces import draw_faces
 from flockenv.render.metaballs import draw_metaballs
 from flockenv.render.palette import (
     ARROW,
@@ -67,7 +67,7 @@ def draw(
     view = view_of(snapshot, size, scale)
     circles = np.column_stack([snapshot.obstacle_centre[:, :2], snapshot.obstacle_radius])
     outlines = tuple(polygon.tobytes() for polygon in snapshot.outlines)
-    hidden = covered(snapshot)
+    hidden = np.asarray(snapshot.covered)
     roles = _roles_in_their_colours(snapshot, hidden)
     box = b"" if snapshot.box is None else snapshot.box.tobytes()
     backdrop = _draw_backdrop(view, snapshot.title, roles, circles.tobytes(), outlines, box)

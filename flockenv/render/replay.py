@@ -134,6 +134,7 @@ def _panel_data(panel: Panel) -> dict[str, Any]:
         "heading": _to_base64(np.stack([_quantise_headings(shot) for shot in shots])),
         "bonds": first.bonds.tolist(),
         "faces": first.faces.tolist(),
+        "covered": np.asarray(first.covered).astype(int).tolist() if len(first.faces) else [],
         **_broken_data(shots),
         "scenery": _scenery_data(shots),
         **_look_data(shots),

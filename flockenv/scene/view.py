@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import weakref
 from collections.abc import Sequence
 
@@ -52,13 +53,22 @@ class View:
             looks=self.looks, look=self.look if self.looks else None,
             age=state.age[world] if self.scene.population else None,
             identity=state.identity[world] if self.scene.population else None, shown=self.shown_numbers(state, world),
-            broken=self.broken(state, world), faces=self.faces,
+            broken=self.broken(state, world), faces=self.faces, covered=self.covered,
         )  # fmt: skip
 
     @functools.cached_property
     def faces(self) -> NDArray[np.int32]:
         """The triangles of the surfaces of networks, (F, 3)."""
         return faces_of(self.scene)
+
+    @functools.cached_property
+    def covered(self) -> NDArray[np.bool_]:
+        """True for agents that are drawn as a surface: those of networks with faces, also inside them, (N,) bool."""
+        corner = np.zeros(self.scene.agents, np.bool_)
+        corner[self.faces] = True
+        starts = self.scene.starts
+        parts = [corner[first:end] for first, end in itertools.pairwise(starts)]
+        return np.concatenate([np.full(len(part), part.any()) for part in parts])
 
     def broken(self, state: State, world: int = 0) -> NDArray[np.bool_] | None:
         """Return which edges of networks are broken, (E,) bool; None if no effect breaks springs."""

@@ -4,16 +4,7 @@ const LIGHT = [-0.35, 0.46, 0.81]; // to the right, upwards, towards the reader;
 function hasFaces(panel) { return Boolean(panel.faces && panel.faces.length); }
 
 /* For each agent 1 if its network has faces, as its surface is drawn instead; null if no network has. */
-function coveredAgents(panel) {
-  if (!hasFaces(panel)) return null;
-  if (panel.coveredBy === panel.faces) return panel.covered;
-  const network = Array.from({ length: panel.N }, (_, i) => i);
-  const first = i => { while (network[i] !== i) i = network[i] = network[network[i]]; return i; };
-  for (const [a, b] of panel.bonds) network[first(a)] = first(b);
-  const sheets = new Set(panel.faces.flat().map(first));
-  panel.covered = Uint8Array.from(network, (_, i) => sheets.has(first(i))); panel.coveredBy = panel.faces;
-  return panel.covered;
-}
+function coveredAgents(panel) { return hasFaces(panel) ? panel.covered : null; }
 
 /* The normal of a triangle of points in m, of length 1. */
 function normalOf(p, q, r) {

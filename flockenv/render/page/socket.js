@@ -181,7 +181,7 @@ function unroll(runs) { return runs.flatMap(([value, count]) => new Array(count)
 function livePanel(lane) {
   const panel = complete({
     player: lane.name, low: lane.low, high: lane.high, periodic: lane.periodic, roles: unroll(lane.roles), radius: unroll(lane.radius), bonds: pairsOf(lane.bonds, 2),
-    faces: pairsOf(lane.faces || [], 3), look: lane.look ? unroll(lane.look) : null, looks: lane.looks || [], scenery: [{ from: 0, stones: [], walls: [], marks: [] }],
+    faces: pairsOf(lane.faces || [], 3), covered: unroll(lane.covered || []), look: lane.look ? unroll(lane.look) : null, looks: lane.looks || [], scenery: [{ from: 0, stones: [], walls: [], marks: [] }],
     time: [], frames: [], reward: lane.has_returns ? [] : null, curve: { times: [], returns: [] }, outcome: "", lane, shown: null,
   });
   const long = panel.looks.some(look => look.trail);
