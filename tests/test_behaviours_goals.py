@@ -471,6 +471,7 @@ def test_hide_evades_without_a_hiding_place_and_is_zero_without_a_seeker_in_sigh
         np.testing.assert_array_equal(change(scene, state)[1], 0)
 
 
+@pytest.mark.slow  # two kernels
 def test_with_a_range_only_obstacles_whose_surface_is_within_it_hide() -> None:
     """The rocks' surfaces are 1.24 and 1.95 m from the agent; without one in range it flees as if there were none."""
 
