@@ -659,7 +659,8 @@ def tied(group: Group, dimension: int, filled: bool = False, triangles: bool = F
     count = group.size
     vertices = np.random.default_rng(5).uniform(0.2 * EDGE, 0.8 * EDGE, (count, dimension))
     runs = [tuple(tuple(range(i, i + k)) for i in range(count + 1 - k)) for k in (2, 3, 4)]
-    solid = {"triangles": runs[1]} if dimension == 2 or triangles else {"tetrahedra": runs[2]}
+    strip = tuple((i, i + 1, i + 2) if i % 2 == 0 else (i + 1, i, i + 2) for i in range(count - 2))
+    solid = {"triangles": strip} if dimension == 2 or triangles else {"tetrahedra": runs[2]}
     joined: dict[str, Any] = solid if filled or triangles else {"bars": runs[0], "angles": runs[1]}
     mesh = Mesh(vertices=tuple(map(tuple, vertices.tolist())), stretch=1.2, **joined)
     return Group(network=mesh, mass=group.mass, radius=group.radius)

@@ -11,11 +11,11 @@ from flockenv.core.warnings import UnsolvedContactsWarning
 from flockenv.geometry.box_tree import build_tree, overlapping_pairs
 from flockenv.geometry.shapes import Block, Capsule, Circle, DistanceField, HalfSpace, Sway
 from flockenv.geometry.space import Torus
-from flockenv.model.networks import Cloth, Jelly, Mesh, Rope
+from flockenv.model.networks import Blocks, Cloth, Jelly, Mesh, Rope
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
 from flockenv.model.surface import faces_of
-from flockenv.physics.constraints import Collisions, FaceCollisions, Rods
+from flockenv.physics.constraints import Collisions, FaceCollisions, RigidBodies, Rods
 from flockenv.physics.constraints.face_obstacles import solids_of
 from flockenv.physics.effects import Drag, Gravity, Springs
 from flockenv.scene import Group, Scene
@@ -150,6 +150,24 @@ def test_a_sheet_between_two_obstacles_that_close_is_reported() -> None:
         run(scene, 0.2, check=False)
 
 
+def test_a_torn_face_is_no_longer_solid() -> None:
+    """A ball falls on the middle of a sheet in two worlds of a batch; in the second the springs there are broken."""
+    group = sheet(4, 2.0, (0, 0, 0), pinned=("border",))
+    springs = Springs(stiffness=200.0, break_strain=9.0)
+    scene = Scene(
+        dimension=3, groups=(group, ball(0.05, (0.9, 1.13, 0.2))), effects=(springs,), constraints=(SOLID,), dt=0.004
+    )
+    state = scene.start(0, worlds=2)
+    middle = scene.edge_springs[(scene.edges == 12).any(axis=1)]
+    state.bonds[1, middle] = np.inf
+    assert (scene.view.snapshot(state, 1).whole_faces != 12).all()
+    settle, x0, v0 = SOLID.settler(scene), state.x.copy(), state.v.copy()
+    state.x[2, :, -1], state.v[2, :, -1] = -0.2, -80.0
+    assert settle(x0, v0, state, 0, 2) == (-1, -1)
+    assert state.x[2, 0, -1] > -0.1  # it pushes the sheet down
+    assert state.x[2, 1, -1] == -0.2 and state.v[2, 1, -1] == -80
+
+
 # --- what holds in every step ---------------------------------------------------------------------------------------
 
 
@@ -276,6 +294,13 @@ def test_what_makes_no_sense_is_refused(change: dict[str, Any], text: str) -> No
     given: dict[str, Any] = {"dimension": 3, "groups": (sheet(2, 1.0, (0, 0, 0)),), "constraints": (SOLID,)}
     with pytest.raises(ValueError, match=text):
         Scene(**(given | change))
+
+
+@pytest.mark.parametrize("constraints", [(SOLID, RigidBodies()), (RigidBodies(), SOLID)])
+def test_rigid_bodies_beside_faces_are_refused_in_either_order(constraints: Any) -> None:
+    dice = Group(network=Blocks(sides=(0.1, 0.1, 0.1), centres=((0.5, 0.5, 1),)))
+    with pytest.raises(ValueError, match="the blocks of rigid_bodies do not collide with faces; leave one of the two"):
+        scene_of(sheet(2, 1.0, (0, 0, 0)), dice, constraints=constraints)
 
 
 @pytest.mark.parametrize("obstacle", [FLOOR, Circle(centre=(0, 0, 0), radius=3, hollow=True)])

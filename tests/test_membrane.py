@@ -11,7 +11,8 @@ import pytest
 from flockenv.model.networks import Cloth, Mesh, Rope
 from flockenv.model.state import State
 from flockenv.model.triangles import dihedrals
-from flockenv.physics.effects import Bending, Membrane
+from flockenv.physics.constraints import FaceCollisions
+from flockenv.physics.effects import Bending, Membrane, Springs
 from flockenv.physics.integrators import LinearlyImplicitEuler, VelocityVerlet
 from flockenv.scene import Group, Scene
 from tests.catalogue import Array
@@ -193,7 +194,44 @@ def test_an_edge_of_three_triangles_is_refused() -> None:
         triangles=((0, 1, 2), (0, 1, 3), (1, 0, 4)),
     )  # fmt: skip
     with pytest.raises(ValueError, match="the edge of particles 0 and 1 is shared by three triangles"):
-        cloth(network=book)
+        dihedrals(np.array(book.triangles))
+
+
+STRIP = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0), (2, 1, 0))
+UNSOUND = [
+    (STRIP, ((0, 1, 2), (1, 2, 3)), r"triangles 0 and 1 face opposite directions .*: one of them is flipped"),
+    (STRIP, ((0, 1, 2), (1, 3, 2), (2, 1, 4)), r"the edge of .* belongs to three triangles or more; at most two do"),
+    (STRIP, ((0, 1, 2), (1, 3, 4)), r"parts of the mesh touch in vertex 1, \(1, 0, 0\), without a common edge"),
+    (
+        (*STRIP, (1, 0, 0)),
+        ((0, 1, 2), (5, 3, 2)),
+        r"vertices 1 and 5 are in one place, \(1, 0, 0\) m, so nothing joins",
+    ),
+]
+
+
+@pytest.mark.parametrize(("vertices", "triangles", "text"), UNSOUND)
+@pytest.mark.parametrize(
+    "given",
+    [{"effects": (Membrane(stretch=1),)}, {"effects": (Bending(stiffness=1),)}, {"constraints": (FaceCollisions(),)}],
+)
+def test_a_mesh_that_is_no_surface_is_refused_where_it_is_read_as_one(
+    given: dict[str, Any], vertices: Any, triangles: Any, text: str
+) -> None:
+    """As a net of springs it is allowed."""
+    group = Group(network=Mesh(vertices=vertices, triangles=triangles))
+    Scene(dimension=3, groups=(group,), effects=(Springs(stiffness=1),))
+    with pytest.raises(ValueError, match=rf"(group = 0: in its network|in the network of groups\[0\]) {text}"):
+        Scene(dimension=3, groups=(group,), **given)
+
+
+def test_vertices_in_one_place_may_be_joined_by_a_spring() -> None:
+    """A seam: two triangles, whose common edge is twice in the mesh."""
+    seam = Mesh(
+        vertices=(*STRIP[:4], (1, 0, 0), (0, 1, 0)), triangles=((0, 1, 2), (4, 3, 5)),
+        pairs=((0, 1), (1, 2), (0, 2), (3, 4), (4, 5), (3, 5), (1, 4), (2, 5)),
+    )  # fmt: skip
+    Scene(dimension=3, groups=(Group(network=seam),), effects=(Membrane(stretch=1),))
 
 
 @pytest.mark.parametrize(

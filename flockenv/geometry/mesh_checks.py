@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from flockenv.geometry.box_tree import build_tree, overlapping_pairs, set_boxes
 
-__all__ = ["check_facing", "check_mesh", "first_piercing"]
+__all__ = ["check_facing", "check_mesh", "first_piercing", "refuse_coincident"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[Any]
@@ -52,6 +52,21 @@ def check_mesh(points: Floats, elements: Ints, closed: bool = False) -> None:
     if closed:
         _refuse_holes(points, sides)
     _refuse_touching(points, elements, sides, before, after)
+
+
+def refuse_coincident(points: Floats, joined: Ints | None = None) -> None:
+    """Raise ValueError if two points, (n, D), that are no pair of `joined`, (E, 2), are in one place."""
+    from scipy.spatial import KDTree
+
+    near = KDTree(points).query_pairs(0.0, output_type="ndarray")
+    if joined is not None and len(near):
+        keys = [np.sort(pairs, axis=1).astype(np.int64) @ (len(points), 1) for pairs in (near, joined)]
+        near = near[~np.isin(*keys)]
+    if len(near):
+        one, two = near[np.lexsort(near.T[::-1])[0]].tolist()
+        raise ValueError(
+            f"vertices {one} and {two} are in one place, {_place(points[one])} m, so nothing joins them; merge them"
+        )
 
 
 def _sides_of(elements: Ints) -> _Sides:

@@ -159,6 +159,9 @@ class Network(Record):
         Triangles in 2-D and tetrahedra in 3-D are positively oriented (det of the edges from the first corner > 0).
         """
 
+    def check_elements(self, dimension: int) -> None:
+        """Raise ValueError, in one line, if triangles make up no sound surface in 3-D, or tetrahedra no sound body."""
+
     def pins(self) -> Ints:
         """Return the pinned particles, (P,) ascending."""
         return self.particles("pinned", self.pinned)

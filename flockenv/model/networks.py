@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from flockenv.geometry.mesh_checks import check_mesh, refuse_coincident
 from flockenv.model.blocks import Blocks
 from flockenv.model.finite_elements import flat
 from flockenv.model.network import (
@@ -367,6 +368,16 @@ class Mesh(Network):
         """Return the given angles."""
         self._check_dimension(dimension)
         return np.array(self.angles, np.int32).reshape(-1, 3)
+
+    def check_elements(self, dimension: int) -> None:
+        """Raise ValueError if triangles make up no sound surface in 3-D, or tetrahedra no sound body; see check_mesh.
+
+        Vertices in one place are allowed if a spring joins them. In 2-D triangles may be folded over each other.
+        """
+        if self.tetrahedra or (self.triangles and dimension == 3):
+            points, springs = self.points(dimension), self.springs(dimension)
+            refuse_coincident(points, np.stack([springs.i, springs.j], axis=1))
+            check_mesh(points, self.elements(dimension))
 
     def elements(self, dimension: int) -> Ints:
         """Return the given bars, triangles or tetrahedra."""

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockenv.core.errors import nearest, printable
-from flockenv.geometry.mesh_checks import check_mesh
+from flockenv.geometry.mesh_checks import check_mesh, refuse_coincident
 from flockenv.geometry.shapes import HalfSpace, TriangleMesh
 from flockenv.model.finite_elements import contents
 from flockenv.model.group import Group
@@ -292,15 +292,14 @@ def _merge(points: Floats, elements: Ints, distance: float | None) -> tuple[Floa
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
 
-    if not np.isfinite(distance or 0.0):
+    if distance is None:
+        refuse_coincident(points)
+        return points, elements
+    if not np.isfinite(distance):
         raise ValueError(f"merge = {distance}: must be finite")
-    near = KDTree(points).query_pairs(distance or 0.0, output_type="ndarray")
+    near = KDTree(points).query_pairs(distance, output_type="ndarray")
     if not len(near):
         return points, elements
-    if distance is None:
-        one, two = near[np.lexsort(near.T[::-1])[0]].tolist()
-        place = ", ".join(f"{x:.6g}" for x in points[one])
-        raise ValueError(f"vertices {one} and {two} are in one place, ({place}) m, so nothing joins them; merge them")
     links = coo_array((np.ones(len(near), bool), tuple(near.T)), shape=(len(points), len(points)))
     label = connected_components(links, directed=False)[1]
     _, first, which = np.unique(label, return_index=True, return_inverse=True)

@@ -20,6 +20,7 @@ from flockenv.physics.constraints.face_mesh import check_intersections, make_mes
 from flockenv.physics.constraints.face_obstacles import check_obstacles, solids_of
 from flockenv.physics.constraints.face_step import FaceRules, FaceScratch, settle_faces
 from flockenv.physics.constraints.face_zones import SUMS, Zones
+from flockenv.physics.constraints.rigid_bodies import RigidBodies
 
 __all__ = ["FaceCollisions"]
 
@@ -38,7 +39,7 @@ class FaceCollisions(Constraint):
     No point passes a face, and no edge another, of the same network or of two, along the straight lines from the start
     to the end of a step. Agents without faces are balls of their radius. Obstacles of any size are solid for faces,
     also if they move: circles, capsules, walls and blocks. Half-spaces and hollow shapes need `collisions` of
-    particles, listed before; other obstacles are refused.
+    particles, listed before; other obstacles are refused. A face with a broken spring is no longer solid.
 
     What comes nearer than `thickness` is moved apart gently, and what approaches is stopped by an inelastic impulse
     with Coulomb friction, in passes over all that touch (Bridson, Fedkiw and Anderson 2002). What `passes` do not
@@ -65,6 +66,11 @@ class FaceCollisions(Constraint):
             raise ValueError(f"{what}: dimension = {scene.dimension}: there are faces in 3 dimensions only")
         if sum(isinstance(other, FaceCollisions) for other in scene.constraints) > 1:
             raise ValueError(f"{what}: there is another; a scene has at most one")
+        if any(isinstance(other, RigidBodies) for other in scene.constraints):
+            raise ValueError(
+                f"{what}: the blocks of rigid_bodies do not collide with faces; leave one of the two out, or make a "
+                "block an obstacle, which may move"
+            )
         if scene.constraints[-1] is not self:
             raise ValueError(f"{what}: {scene.constraints[-1].kind} after it would move faces; it must be the last")
         if scene.space.periodic:
@@ -73,6 +79,16 @@ class FaceCollisions(Constraint):
             raise ValueError(f"{what}: dtype = {scene.dtype} is too coarse for thin gaps; allowed: float64")
         if not len(faces_of(scene)):
             raise ValueError(f"{what}: no group has a network with faces: cloth, or a mesh of triangles or tetrahedra")
+        self._check_shapes(scene)
+
+    def _check_shapes(self, scene: SceneView) -> None:
+        """Raise ValueError on meshes that are not sound, on obstacles that are not solid, and on intersections."""
+        for k, group in enumerate(scene.groups):
+            if group.network is not None:
+                try:
+                    group.network.check_elements(3)
+                except ValueError as error:
+                    raise ValueError(f"kind = face_collisions: in the network of groups[{k}] {error}") from None
         if self.obstacles:
             check_obstacles(scene, scene.constraints[:-1])
         check_intersections(scene, self.obstacles)
@@ -131,8 +147,8 @@ class _FaceSettler:
         while first < end:
             short = entry(settle_faces)(
                 x0, state.x, state.v, state.alive, np.ascontiguousarray(state.obstacle_x[:, :, :m]),
-                np.ascontiguousarray(state.obstacle_radius[:, :m]), state.tick, self.mesh, self.scratch, self.rules,
-                state.work, self.where, first, end, self.report,
+                np.ascontiguousarray(state.obstacle_radius[:, :m]), state.tick, state.bonds, self.mesh, self.scratch,
+                self.rules, state.work, self.where, first, end, self.report,
             )  # fmt: skip
             world, agent, needed, *lost = (int(k) for k in self.report)
             stopped, unsolved = stopped + lost[0], unsolved + lost[1]

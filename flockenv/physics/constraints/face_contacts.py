@@ -71,11 +71,13 @@ class Contacts(NamedTuple):
 
 
 @kernel
-def _fit_leaf(tree: Any, k: int, who: Any, motion: Any, radius: Any) -> None:
-    """Set the box of element k to that of the paths of its vertices."""
+def _fit_leaf(tree: Any, k: int, who: Any, whole: Any, motion: Any, radius: Any) -> None:
+    """Set the box of element k to that of the paths of its vertices; an empty one if it is not whole."""
     at = tree.order.shape[0] - 1 + tree.leaf[k]
     for c in range(3):
         tree.box[at, c], tree.box[at, 3 + c] = np.inf, -np.inf
+    if not whole[k]:
+        return
     for j in range(who.shape[1]):
         i = who[k, j]
         if not motion.live[i]:
@@ -108,10 +110,10 @@ def _fresh(motion: Any, light: Any, since: int, a: int, b: int, c: int, d: int) 
 
 
 @kernel
-def _refit(tree: Any, who: Any, motion: Any, radius: Any) -> None:
+def _refit(tree: Any, who: Any, whole: Any, motion: Any, radius: Any) -> None:
     """Fit all boxes to the paths of the elements."""
     for k in range(who.shape[0]):
-        _fit_leaf(tree, k, who, motion, radius)
+        _fit_leaf(tree, k, who, whole, motion, radius)
     fit_parents(tree)
 
 
@@ -158,8 +160,8 @@ def find_pairs(mesh: Any, motion: Any, pairs: Any, reach: float, since: int) -> 
 
     Pairs with a common vertex are left out. More than there is room for are counted only.
     """
-    _refit(mesh.face_tree, mesh.faces, motion, mesh.radius)
-    _refit(mesh.edge_tree, mesh.edges, motion, mesh.radius)
+    _refit(mesh.face_tree, mesh.faces, mesh.whole_faces, motion, mesh.radius)
+    _refit(mesh.edge_tree, mesh.edges, mesh.whole_edges, motion, mesh.radius)
     count = _pair_with_faces(mesh, motion, pairs, reach, since)
     return _pair_edges(mesh, motion, pairs, reach, since, count)
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from flockenv.geometry.box_tree import BoxTree, build_tree
 from flockenv.geometry.mesh_checks import first_piercing
-from flockenv.model.network import element_edges, pairs_of
+from flockenv.model.network import element_edges, keys_of, pairs_of
 from flockenv.model.scene_view import SceneView
 from flockenv.model.surface import faces_of
 from flockenv.physics.constraints.face_obstacles import MOTION, Solids, solids_of
@@ -32,6 +32,10 @@ class FaceMesh(NamedTuple):
     radius: Any  # (V,) m; 0 for the vertices of faces
     place: Any  # (V, 3) m, of the vertices of obstacles that are not in the state; the others are 0
     motion: Any  # (V, MOTION) of the same vertices; the others are 0
+    sides: Any  # (F', 3) the edges of each face of a network; these faces, and their E' edges, come first
+    bond: Any  # (E',) the spring of an edge of a network, as State.bonds counts them; -1 if there is none
+    whole_faces: Any  # (F,) 1, or 0 if an edge is broken
+    whole_edges: Any  # (E,) 1, or 0 if no face of it is whole
 
 
 def edges_of(faces: Ints) -> Ints:
@@ -70,7 +74,21 @@ def make_mesh(scene: SceneView, obstacles: bool) -> FaceMesh:
     points = np.concatenate([np.flatnonzero(~corners), np.arange(n, len(place))])
     trees = build_tree(place[faces].mean(axis=1)), build_tree(place[edges].mean(axis=1))
     motion = np.concatenate([np.zeros((n + m, MOTION)), solids.motion])
-    return FaceMesh(faces, edges, points.astype(np.int32), *trees, light, radius, place, motion)
+    whole = np.ones(len(faces), np.int8), np.ones(len(edges), np.int8)
+    return FaceMesh(faces, edges, points.astype(np.int32), *trees, light, radius, place, motion, *_bonds(scene), *whole)
+
+
+def _bonds(scene: SceneView) -> tuple[Ints, Ints]:
+    """Return the edges of each face, (F', 3), and the spring of each edge, (E',), or -1, of networks."""
+    faces, n = faces_of(scene), scene.agents
+    own = keys_of(edges_of(faces), n)
+    sides = [np.searchsorted(own, keys_of(faces[:, pair], n)) for pair in ([0, 1], [1, 2], [2, 0])]
+    drawn = keys_of(scene.edges, n)
+    order = np.argsort(drawn)
+    at = np.minimum(np.searchsorted(drawn[order], own), max(len(drawn) - 1, 0))
+    found = drawn[order][at] == own if len(drawn) else np.zeros(len(own), bool)
+    springs = scene.edge_springs[order][at] if len(drawn) else np.zeros(len(own))
+    return np.stack(sides, axis=1).astype(np.int32), np.where(found, springs, -1).astype(np.int32)
 
 
 def _with_solids(scene: SceneView, solids: Solids, first: int) -> tuple[Ints, Ints, Floats]:
@@ -113,6 +131,8 @@ def check_intersections(scene: SceneView, obstacles: bool) -> None:
             f"{name('face of', faces[found[1]])}; meshes must not intersect"
         )
     for k in np.unique(solids.owner[solids.faces[:, 0]]):
-        inside = scene.obstacles[k].inside(rest_of(scene) - scene.obstacles[k].shift(0.0))
+        shape = scene.obstacles[k]
+        surely = -getattr(shape, "grid_spacing", 0.0)  # m; distances to a mesh are not exact
+        inside = shape.gap(rest_of(scene) - shape.shift(0.0)) < surely
         for i in np.intersect1d(np.flatnonzero(inside), faces_of(scene)):
             raise ValueError(f"kind = face_collisions: at the start particle {i} is inside obstacles[{k}]")

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.geometry.shapes import Block, Capsule, Circle, HalfSpace, Shape, Wall
+from flockenv.geometry.shapes import Block, Capsule, Circle, HalfSpace, Shape, TriangleMesh, Wall
+from flockenv.model.network import element_edges, pairs_of
 from flockenv.model.scene_view import SceneView
 from flockenv.physics.constraints.collisions import Collisions
 
@@ -64,7 +65,7 @@ def solids_of(obstacles: Sequence[Shape]) -> Solids:
 
 def _solid(shape: Shape) -> bool:
     """Return True if faces collide with a shape."""
-    return isinstance(shape, Circle | Capsule | Wall | Block) and not shape.is_hollow
+    return isinstance(shape, Circle | Capsule | Wall | Block | TriangleMesh) and not shape.is_hollow
 
 
 def _spanned(shape: Shape) -> tuple[Floats, Ints, Ints]:
@@ -75,6 +76,9 @@ def _spanned(shape: Shape) -> tuple[Floats, Ints, Ints]:
         squares = [(c, c | u, c | u | v, c | v) for u, v in ((1, 2), (1, 4), (2, 4)) for c in (0, 7 - u - v)]
         faces = [(a, b, c) for a, *rest in squares for b, c in itertools.pairwise(rest)]
         return shape.extremes, np.array(edges, np.int32), np.array(faces, np.int32)
+    if isinstance(shape, TriangleMesh):
+        rows, size = np.array(shape.triangles, np.int32), len(shape.vertices)
+        return np.array(shape.vertices), pairs_of(element_edges(rows, size), size), rows
     if isinstance(shape, Wall):
         points = np.array(shape.vertices)
     else:
@@ -95,7 +99,7 @@ def check_obstacles(scene: SceneView, before: Sequence[Any]) -> None:
         what = f"kind = face_collisions: obstacles[{k}] = {'hollow ' if shape.is_hollow else ''}{shape.kind}"
         if not isinstance(shape, HalfSpace | Circle | Capsule | Block):
             raise ValueError(
-                f"{what}: faces would go through it; allowed: circles, capsules, walls and blocks, and half-spaces; "
+                f"{what}: faces would go through it; allowed: circles, capsules, walls, blocks, meshes and half-spaces; "
                 "obstacles = False turns collisions of faces with all of them off"
             )
         if not particles:

@@ -93,6 +93,21 @@ def _load_solid(mesh: Any, i: int, k: int, begun: float, ended: float, motion: A
 
 
 @kernel
+def _tear(bonds: Any, b: int, mesh: Any) -> None:
+    """Mark the faces of world b of which no edge is broken, and the edges of these faces."""
+    whole = mesh.whole_edges
+    for e in range(mesh.bond.shape[0]):
+        at = mesh.bond[e]
+        whole[e] = 0 if 0 <= at < bonds.shape[1] and bonds[b, at] == np.inf else 1
+    for f in range(mesh.sides.shape[0]):
+        mesh.whole_faces[f] = whole[mesh.sides[f, 0]] * whole[mesh.sides[f, 1]] * whole[mesh.sides[f, 2]]
+    whole[: mesh.bond.shape[0]] = 0
+    for f in range(mesh.sides.shape[0]):
+        for k in range(3):
+            whole[mesh.sides[f, k]] = max(whole[mesh.sides[f, k]], mesh.whole_faces[f])
+
+
+@kernel
 def _store(x0: Any, x: Any, v: Any, b: int, motion: Any) -> None:
     """Write the agents that were changed."""
     for i in range(x.shape[2]):
@@ -221,8 +236,8 @@ def _make_zones(mesh: Any, scratch: Any, rules: Any, since: int) -> int:
 
 @kernel
 def settle_faces(
-    x0: Any, x: Any, v: Any, alive: Any, circles: Any, radii: Any, tick: Any, mesh: FaceMesh, scratch: FaceScratch,
-    rules: FaceRules, work: Any, where: Any, first: int, end: int, report: Any,
+    x0: Any, x: Any, v: Any, alive: Any, circles: Any, radii: Any, tick: Any, bonds: Any, mesh: FaceMesh,
+    scratch: FaceScratch, rules: FaceRules, work: Any, where: Any, first: int, end: int, report: Any,
 ) -> int:  # fmt: skip
     """Correct the steps of worlds [first, end) in place; return the world for which there was no room, or -1.
 
@@ -236,6 +251,8 @@ def settle_faces(
             if report[0] < 0:
                 report[0], report[1] = b, bad
             continue
+        if bonds.shape[1] > 0:
+            _tear(bonds, b, mesh)
         for k in range(6):
             scratch.count[k] = 0
         needed = _resolve(mesh, scratch, rules)

@@ -72,7 +72,7 @@ class RigidBodies(Constraint):
         what = "kind = rigid_bodies"
         if sum(isinstance(other, RigidBodies) for other in scene.constraints) > 1:
             raise ValueError(f"{what}: there is another; a scene has at most one")
-        if scene.constraints[-1] is not self:
+        if scene.constraints[-1] is not self and scene.constraints[-1].kind != "face_collisions":  # which refuses it
             raise ValueError(f"{what}: {scene.constraints[-1].kind} after it would deform blocks; it must be the last")
         if scene.space.periodic:
             raise ValueError(f"{what}: blocks do not wrap around a {scene.space.kind}; allowed: plane, box")

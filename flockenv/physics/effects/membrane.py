@@ -21,6 +21,7 @@ from flockenv.physics.effects.effect import Bonds, Effect, Me, Stencils, Vector,
 from flockenv.physics.effects.springs import wrap_angle
 
 if TYPE_CHECKING:
+    from flockenv.model.scene_view import SceneView
     from flockenv.model.state import State
 
 __all__ = ["Bending", "Membrane"]
@@ -35,6 +36,16 @@ def _triangles_only(elements: Ints, group: int) -> Ints:
         kind = {2: "bars", 4: "tetrahedra"}[elements.shape[1]]
         raise ValueError(f"group = {group}: its network has {kind}; triangles are needed, as of a cloth or a mesh")
     return elements.reshape(-1, 3)
+
+
+def _check_network(group: int, scene: SceneView) -> None:
+    """Raise ValueError if the network of a group is a mesh that is not sound."""
+    _, network, _ = network_of(scene.groups, group, scene.dimension)
+    _triangles_only(network.elements(scene.dimension), group)
+    try:
+        network.check_elements(scene.dimension)
+    except ValueError as error:
+        raise ValueError(f"group = {group}: in its network {error}") from None
 
 
 # --- stretch and shear ------------------------------------------------------------------------------------------------
@@ -150,6 +161,11 @@ class Membrane(Effect):
     partners: ClassVar[int] = 2
     strengths: ClassVar[tuple[str, ...]] = ("stretch", "shear")
     conserves_momentum: ClassVar[bool] = True
+
+    def check(self, scene: SceneView) -> None:
+        """Raise ValueError also if the group has no network of triangles, or one that is not sound."""
+        super().check(scene)
+        _check_network(self.group, scene)
 
     def numbers(self, dimension: int) -> int:
         """Return 7: gradients of u and of v at the two partners, stretch and shear stiffness times area, damping."""
@@ -285,6 +301,11 @@ class Bending(Effect):
     partners: ClassVar[int] = 3
     strengths: ClassVar[tuple[str, ...]] = ("stiffness",)
     conserves_momentum: ClassVar[bool] = True
+
+    def check(self, scene: SceneView) -> None:
+        """Raise ValueError also if the group has no network of triangles, or one that is not sound."""
+        super().check(scene)
+        _check_network(self.group, scene)
 
     def numbers(self, dimension: int) -> int:
         """Return 4: stiffness, rest angle, damping, and role (0: end of the edge, 1: opposite corner)."""
