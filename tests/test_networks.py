@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 from typing import Any
 
@@ -12,11 +13,14 @@ from pydantic import TypeAdapter
 
 from flockenv.model.finite_elements import contents
 from flockenv.model.networks import BEND, EDGE, SHEAR, AnyNetwork, Cloth, Jelly, Mesh, Network, Rope
+from flockenv.physics.effects import Springs
+from flockenv.scene import Group, Scene
 
 Floats = NDArray[np.float64]
 
 TURNED = ((0.6, 0.8, 0.0), (-0.8, 0.6, 0.0), (0.0, 0.0, 2.0))  # right-handed edges, not along the axes
 SQUARE = ((0, 0), (1, 0), (1, 1), (0, 1))
+BOOK = ((0, 1, 2), (0, 2, 3), (0, 2, 4))
 
 NETWORKS: list[tuple[Network, int]] = [
     (Rope(links=5, length=2), 2),
@@ -304,6 +308,62 @@ def test_springs_of_a_mesh_are_the_edges_of_its_elements_unless_pairs_are_given(
     np.testing.assert_array_equal(mesh.elements(2), [(0, 1, 2), (3, 0, 2)])
 
 
+CUBE = (
+    (0, 3, 1), (0, 2, 3), (4, 5, 7), (4, 7, 6), (0, 1, 5), (0, 5, 4), (2, 7, 3), (2, 6, 7), (0, 4, 6), (0, 6, 2),
+    (1, 3, 7), (1, 7, 5),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("triangles", "count"),
+    [
+        (tuple(map(tuple, Cloth(cells=(3, 2), sides=(3, 2)).elements(3).tolist())), 11),
+        (CUBE, 7),  # the other diagonals of its sides, and one through it
+        (((0, 1, 2), (0, 2, 3), (0, 3, 1)), 0),  # each two opposite corners are joined by a side
+    ],
+)
+def test_bending_springs_of_a_mesh_join_the_opposite_corners_of_edges(triangles: Any, count: int) -> None:
+    size = 1 + max(map(max, triangles))
+    vertices = tuple(map(tuple, np.random.default_rng(0).uniform(-1, 1, (size, 3)).tolist()))
+    plain, mesh = (Mesh(vertices=vertices, triangles=triangles, bend=bend) for bend in (False, True))
+    i, j, rest, role = mesh.springs(3)
+    pairs = list(zip(i.tolist(), j.tolist(), strict=True))
+    assert len(set(pairs)) == len(pairs) and (role == BEND).sum() == count
+    edges = np.stack(plain.springs(3)[:2], axis=1)
+    np.testing.assert_array_equal(np.stack([i, j], axis=1)[role == EDGE], edges)
+    sides: dict[frozenset[int], set[int]] = {}
+    for corners in triangles:
+        for corner in corners:
+            sides.setdefault(frozenset(corners) - {corner}, set()).add(corner)
+    expected = {tuple(sorted(far)) for far in sides.values() if len(far) == 2} - set(map(tuple, edges.tolist()))
+    assert {pair for pair, one in zip(pairs, role, strict=True) if one == BEND} == expected
+    np.testing.assert_allclose(rest, np.linalg.norm(np.subtract(mesh.points(3)[i], mesh.points(3)[j]), axis=1))
+
+
+def test_bending_springs_of_a_mesh_resist_folding_with_the_stiffness_bend() -> None:
+    """Two triangles, folded by a right angle: the opposite corners, sqrt(2) apart at rest, are 1 m apart."""
+    hinge = ((0, 0, 0), (1, 1, 0), (1, 0, 0), (0, 1, 0))
+    scene = Scene(
+        dimension=3, effects=(Springs(stiffness=0, bend=3.0),), dt=1e-3,
+        groups=(Group(network=Mesh(vertices=hinge, triangles=((0, 2, 1), (0, 1, 3)), bend=True)),),
+    )  # fmt: skip
+    state = scene.start(0)
+    pos = state.pos.copy()
+    pos[0, 3] = (0.5, 0.5, 0.5**0.5)
+    found = scene.effects[0].potential(scene.groups, state.with_motion(pos, state.vel), scene.space.displacement)
+    assert found == pytest.approx([0.5 * 3.0 * (math.sqrt(2) - 1) ** 2])
+
+
+def test_rest_lengths_given_with_pairs_do_not_change_those_of_bending() -> None:
+    square = Mesh(
+        vertices=SQUARE, triangles=((0, 1, 2), (0, 2, 3)), pairs=((2, 0), (1, 0)), rest=(3.0, 2.0), bend=True
+    )  # fmt: skip
+    i, j, rest, role = square.springs(2)
+    across = float(np.linalg.norm(np.subtract(SQUARE[1], SQUARE[3])))
+    rows = list(zip(i.tolist(), j.tolist(), rest.tolist(), role.tolist(), strict=True))
+    assert rows == [(0, 1, 2.0, EDGE), (0, 2, 3.0, EDGE), (1, 3, across, BEND)]
+
+
 # --- refusals ---------------------------------------------------------------------------------------------------------
 
 
@@ -361,6 +421,8 @@ def test_springs_of_a_mesh_are_the_edges_of_its_elements_unless_pairs_are_given(
     (lambda: Mesh(vertices=SQUARE, tetrahedra=((0, 1, 2, 3),)), "tetrahedra: vertices have 2 coordinates"),
     (lambda: Mesh(vertices=SQUARE, angles=((0, 1, 2), (0, 2, 1), (2, 1, 0))), "angles[2] = (2, 1, 0): the same as"),
     (lambda: Mesh(vertices=SQUARE, triangles=((0, 1, 2),), lumping="geometric"), "particle 3 is part of no element"),
+    (lambda: Mesh(vertices=SQUARE, bars=((0, 1),), bend=True), "bend = True: needs triangles"),
+    (lambda: Mesh(vertices=(*SQUARE, (3, 1)), triangles=BOOK, bend=True), "bend = True: the edge of particles 0 and 2"),
     (lambda: Mesh(vertices=SQUARE, pinned=("left",)), "pinned[0] = 'left': unknown; allowed: numbers 0 to 3"),
 ])  # fmt: skip
 def test_an_invalid_network_is_refused_in_one_line(call: Any, line: str) -> None:

@@ -38,6 +38,7 @@ from flockenv.model.network import (
     pairs_of,
     springs_of,
 )
+from flockenv.model.triangles import dihedrals
 
 __all__ = [
     "BEND", "EDGE", "MOST", "SHEAR", "AnyNetwork", "Blocks", "Cloth", "Jelly", "Mesh", "Network", "Rope", "Springs",
@@ -291,7 +292,11 @@ class Jelly(_Lattice):
 
 
 class Mesh(Network):
-    """Custom points with elements of one kind; springs are the edges of elements, or the given pairs."""
+    """Custom points with elements of one kind; springs are the edges of elements, or the given pairs.
+
+    With `bend` there are also springs across each edge of two triangles, between their opposite corners, unless these
+    are joined already.
+    """
 
     kind: Literal["mesh"] = "mesh"
     vertices: tuple[Point, ...] = Field(min_length=1, description="m, initial positions of particles")
@@ -309,6 +314,7 @@ class Mesh(Network):
         default=(), description="elements of four corners"
     )
     angles: tuple[tuple[Particle, Particle, Particle], ...] = Field(default=(), description="hinges: end, apex, end")
+    bend: bool = Field(default=False, description="True: also springs across the common edges of triangles")
 
     _ELEMENTS: ClassVar[tuple[str, ...]] = ("bars", "triangles", "tetrahedra")
 
@@ -339,8 +345,19 @@ class Mesh(Network):
             raise ValueError(
                 f"stretch = {self.stretch:g}: rest already gives the lengths of the springs; give one of the two"
             )
+        if self.bend:
+            self._refuse_bend()
         if self.lumping == "geometric":
             self.masses(1.0, len(self.vertices[0]))  # raises ValueError if a particle is part of no element
+
+    def _refuse_bend(self) -> None:
+        """Raise ValueError if there are no triangles, or three at an edge, so that opposite corners are not defined."""
+        if not self.triangles:
+            raise ValueError("bend = True: needs triangles")
+        try:
+            dihedrals(self._element_array())
+        except ValueError as error:
+            raise ValueError(f"bend = True: {error}") from None
 
     def _element_array(self) -> Ints:
         """Return the elements as given; an empty array of bars if there are none."""
@@ -353,16 +370,19 @@ class Mesh(Network):
         return np.array(self.vertices, float)
 
     def springs(self, dimension: int) -> Springs:
-        """Return the given pairs, or the edges of elements, as springs."""
+        """Return the given pairs, or the edges of elements, as springs; with `bend` also those of opposite corners."""
         self._check_dimension(dimension)
         if self.pairs is None:
             pairs = pairs_of(element_edges(self._element_array(), self.size), self.size)
         else:
             pairs = np.array(self.pairs, np.int32).reshape(-1, 2)
-        found = springs_of([(pairs, EDGE)], self.rest_points(dimension))
-        if self.rest is None:
-            return found
-        return found._replace(rest=np.array(self.rest, float)[np.argsort(keys_of(pairs, self.size))])
+        keys = keys_of(pairs, self.size)
+        opposite = dihedrals(self._element_array())[:, 2:] if self.bend else np.zeros((0, 2), np.int32)
+        across = pairs_of(np.setdiff1d(keys_of(opposite, self.size), keys), self.size)
+        found = springs_of([(pairs, EDGE), (across, BEND)], self.rest_points(dimension))
+        if self.rest is not None:
+            found.rest[found.role == EDGE] = np.array(self.rest, float)[np.argsort(keys)]
+        return found
 
     def hinges(self, dimension: int) -> Ints:
         """Return the given angles."""
