@@ -9,7 +9,7 @@ import pytest
 
 from flockenv.core.warnings import UnsolvedContactsWarning
 from flockenv.geometry.box_tree import build_tree, overlapping_pairs
-from flockenv.geometry.shapes import Block, Capsule, Circle, DistanceField, HalfSpace, Sway
+from flockenv.geometry.shapes import Block, Capsule, Circle, DistanceField, HalfSpace, Sway, TriangleMesh
 from flockenv.geometry.space import Torus
 from flockenv.model.networks import Blocks, Cloth, Jelly, Mesh, Rope
 from flockenv.model.spawn import Spawn
@@ -119,6 +119,10 @@ RISING = (
     Block(
         centre=(0.6, 0.62, -0.3), size=(0.08, 0.08, 0.08), turn=45, axis=(1, 1, 0), velocity=(0, 0, 2),
         sway=Sway(amplitude=(0.02, 0, 0), period=0.1),
+    ),
+    TriangleMesh(
+        vertices=((0.6, 0.62, -0.3), (0.62, 0.62, -0.36), (0.58, 0.65, -0.36), (0.58, 0.6, -0.36)), velocity=(0, 0, 2),
+        triangles=((0, 1, 2), (0, 2, 3), (0, 3, 1), (1, 3, 2)), spacing=0.005, margin=0.03,
     ),
 )  # fmt: skip
 

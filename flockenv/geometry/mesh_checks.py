@@ -60,8 +60,8 @@ def refuse_coincident(points: Floats, joined: Ints | None = None) -> None:
 
     near = KDTree(points).query_pairs(0.0, output_type="ndarray")
     if joined is not None and len(near):
-        keys = [np.sort(pairs, axis=1).astype(np.int64) @ (len(points), 1) for pairs in (near, joined)]
-        near = near[~np.isin(*keys)]
+        found, known = (np.sort(pairs, axis=1).astype(np.int64) @ (len(points), 1) for pairs in (near, joined))
+        near = near[~np.isin(found, known)]
     if len(near):
         one, two = near[np.lexsort(near.T[::-1])[0]].tolist()
         raise ValueError(

@@ -38,7 +38,7 @@ class FaceCollisions(Constraint):
 
     No point passes a face, and no edge another, of the same network or of two, along the straight lines from the start
     to the end of a step. Agents without faces are balls of their radius. Obstacles of any size are solid for faces,
-    also if they move: circles, capsules, walls and blocks. Half-spaces and hollow shapes need `collisions` of
+    also if they move: circles, capsules, walls, blocks, meshes. Half-spaces and hollow shapes need `collisions` of
     particles, listed before; other obstacles are refused. A face with a broken spring is no longer solid.
 
     What comes nearer than `thickness` is moved apart gently, and what approaches is stopped by an inelastic impulse

@@ -77,8 +77,9 @@ def _spanned(shape: Shape) -> tuple[Floats, Ints, Ints]:
         faces = [(a, b, c) for a, *rest in squares for b, c in itertools.pairwise(rest)]
         return shape.extremes, np.array(edges, np.int32), np.array(faces, np.int32)
     if isinstance(shape, TriangleMesh):
-        rows, size = np.array(shape.triangles, np.int32), len(shape.vertices)
-        return np.array(shape.vertices), pairs_of(element_edges(rows, size), size), rows
+        used, number = np.unique(shape.triangles, return_inverse=True)
+        rows: Ints = np.asarray(number.reshape(-1, 3), np.int32)
+        return np.array(shape.vertices)[used], pairs_of(element_edges(rows, len(used)), len(used)), rows
     if isinstance(shape, Wall):
         points = np.array(shape.vertices)
     else:
@@ -99,8 +100,8 @@ def check_obstacles(scene: SceneView, before: Sequence[Any]) -> None:
         what = f"kind = face_collisions: obstacles[{k}] = {'hollow ' if shape.is_hollow else ''}{shape.kind}"
         if not isinstance(shape, HalfSpace | Circle | Capsule | Block):
             raise ValueError(
-                f"{what}: faces would go through it; allowed: circles, capsules, walls, blocks, meshes and half-spaces; "
-                "obstacles = False turns collisions of faces with all of them off"
+                f"{what}: faces would go through it; allowed: circles, capsules, walls, blocks, meshes and "
+                "half-spaces; obstacles = False turns collisions of faces with all of them off"
             )
         if not particles:
             raise ValueError(f"{what}: only particles collide with it, by collisions, which must be listed before")
