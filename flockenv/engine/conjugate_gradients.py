@@ -16,7 +16,10 @@ from flockenv.jit.decorators import Law, kernel
 from flockenv.jit.section import entry_of, section
 from flockenv.maths.approximations import round_half_even
 
-__all__ = ["FIXED", "FREE", "SLIDES", "Local", "System", "assemble_of", "solve_of", "strain_change_of"]
+__all__ = [
+    "FIXED", "FREE", "SLIDES", "Local", "System", "assemble_of", "image_of", "size_of", "solve_from_of", "solve_of",
+    "strain_change_of",
+]  # fmt: skip
 
 FREE, FIXED, SLIDES = 0, 1, 2
 """Kinds of filters of an agent: none; its velocity is prescribed; a projection onto a line or a plane."""
@@ -254,20 +257,45 @@ def _begin(dimension: int) -> Callable[..., None]:
 
 
 @entry_of
-def solve_of(dimension: int) -> Callable[..., tuple[int, float]]:
-    """Make `solve(system, tolerance, most)`: write dv by filtered, preconditioned conjugate gradients.
+def size_of(dimension: int) -> Callable[..., float]:
+    """Make `size(system)`: invert the diagonal; return the square of the norm of the residual of dv = 0."""
+    invert, project, apply_blocks, d = _invert(dimension), _project(dimension), _apply_blocks(dimension), dimension
 
-    It returns the number of iterations and the norm of the residual relative to the first one, in the norm r . P r of
-    the preconditioner P, the inverse blocks on the diagonal. The filter and the criterion are those of Baraff and
-    Witkin 1998, section 5.3. An iteration that finds a direction without curvature ends it: the relative norm is NaN.
+    def size(system: Any) -> float:
+        for i in range(system.start.shape[0] - 1):
+            invert(system.value, system.diagonal[i] * (d * d), system.inverse, i * (d * d))
+            for k in range(d):
+                system.residual[i * d + k] = system.right[i * d + k]
+            project(system, system.residual, i)
+            apply_blocks(system.inverse, system.residual, system.direction, i)
+        return _dot(system.residual, system.direction)
+
+    return size
+
+
+@entry_of
+def image_of(dimension: int) -> Callable[..., None]:
+    """Make `image(system)`: write A dv into `image`."""
+    multiply = _multiply(dimension)
+
+    def image(system: Any) -> None:
+        for k in range(system.right.shape[0]):
+            system.direction[k] = system.change[k]
+        multiply(system)
+
+    return image
+
+
+@section
+def _descend(dimension: int) -> Callable[..., tuple[int, float]]:
+    """Make `descend(system, first, now, tolerance, most)`: iterate until the norm is `tolerance` times the first.
+
+    first, now: squares of norms, the first and that of the residual.
     """
-    begin, multiply, project = _begin(dimension), _multiply(dimension), _project(dimension)
-    apply_blocks = _apply_blocks(dimension)
+    multiply, project, apply_blocks = _multiply(dimension), _project(dimension), _apply_blocks(dimension)
 
-    def solve(system: Any, tolerance: float, most: int) -> tuple[int, float]:
-        begin(system)
+    def descend(system: Any, first: float, now: float, tolerance: float, most: int) -> tuple[int, float]:
         count, size = system.start.shape[0] - 1, system.right.shape[0]
-        first = now = _dot(system.residual, system.direction)
         iterations = 0
         while now > tolerance * tolerance * first and iterations < most:
             iterations += 1
@@ -286,5 +314,50 @@ def solve_of(dimension: int) -> Callable[..., tuple[int, float]]:
             for k in range(np.uint64(size)):
                 system.direction[k] = system.scaled[k] + share * system.direction[k]
         return iterations, np.sqrt(now / first) if first != 0 else 0.0
+
+    return descend
+
+
+@entry_of
+def solve_from_of(dimension: int) -> Callable[..., tuple[int, float]]:
+    """Make `solve_from(system, first, tolerance, most)`: as `solve`, from the change that `system` holds.
+
+    The change must agree with what the filter prescribes; components that the filter removes stay as they are. This is
+    the modified method of Baraff and Witkin 1998, with the start of Ascher and Boxerman 2003. `size` must have been
+    called, and `first` is its result; if the residual of the start is larger, the criterion is relative to that.
+    """
+    multiply, project, apply_blocks = _multiply(dimension), _project(dimension), _apply_blocks(dimension)
+    descend = _descend(dimension)
+
+    def solve_from(system: Any, first: float, tolerance: float, most: int) -> tuple[int, float]:
+        for k in range(system.right.shape[0]):
+            system.direction[k] = system.change[k]
+        multiply(system)
+        for k in range(system.right.shape[0]):
+            system.residual[k] = system.right[k] - system.image[k]
+        for i in range(system.start.shape[0] - 1):
+            project(system, system.residual, i)
+            apply_blocks(system.inverse, system.residual, system.direction, i)
+            project(system, system.direction, i)
+        now = _dot(system.residual, system.direction)
+        return descend(system, max(first, now), now, tolerance, most)  # type: ignore[no-any-return]
+
+    return solve_from
+
+
+@entry_of
+def solve_of(dimension: int) -> Callable[..., tuple[int, float]]:
+    """Make `solve(system, tolerance, most)`: write dv by filtered, preconditioned conjugate gradients.
+
+    It returns the number of iterations and the norm of the residual relative to the first one, in the norm r . P r of
+    the preconditioner P, the inverse blocks on the diagonal. The filter and the criterion are those of Baraff and
+    Witkin 1998, section 5.3. An iteration that finds a direction without curvature ends it: the relative norm is NaN.
+    """
+    begin, descend = _begin(dimension), _descend(dimension)
+
+    def solve(system: Any, tolerance: float, most: int) -> tuple[int, float]:
+        begin(system)
+        first = _dot(system.residual, system.direction)
+        return descend(system, first, first, tolerance, most)  # type: ignore[no-any-return]
 
     return solve

@@ -100,6 +100,8 @@ def _linear_step(scene: SceneView, drive: Floats, step: Kernel, solver: LinearSo
         state.work[0, WORK.index("linear_iterations")] += found.iterations
         state.work[0, WORK.index("substeps")] += found.solves
         state.work[0, WORK.index("rejected_steps")] += found.rejected
+        if found.held is not None:  # their impacts are over: constraints see a straight path along the surface
+            state.v[:, 0, found.held] = (found.x - state.x[:, 0])[:, found.held] / scene.dt
         return step(state, 0, found.x, found.v)[1], ""
 
     return advance

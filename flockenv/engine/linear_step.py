@@ -22,9 +22,10 @@ from flockenv.engine.conjugate_gradients import (
     solve_of,
     strain_change_of,
 )
+from flockenv.engine.linear_contacts import ContactSolver
 from flockenv.model.scene_view import SceneView
 from flockenv.model.state import Floats, State
-from flockenv.physics.constraints import Slide
+from flockenv.physics.constraints import Collisions, Slide
 
 __all__ = ["LinearSolver", "NotSolvedLinearlyError"]
 
@@ -48,6 +49,7 @@ class LinearStep(NamedTuple):
     iterations: int
     solves: int = 1  # that were accepted
     rejected: int = 0  # solves after which a strain had changed too much
+    held: NDArray[np.bool_] | None = None  # (N,) agents in contact with an obstacle in some solve
 
 
 class _Part(NamedTuple):
@@ -93,6 +95,7 @@ class LinearSolver:
         self.kinds = np.where(self.held, FIXED, FREE).astype(np.int8)
         self._read_slides(scene)
         self.solve = solve_of(d)
+        self.contacts = self._contacts(scene)
 
     def _read_slides(self, scene: SceneView) -> None:
         """Set the filters of particles that slide."""
@@ -103,6 +106,16 @@ class LinearSolver:
                 agents = agents[~self.held[agents]]
                 self.kinds[agents] = SLIDES
                 projection[agents] = constraint.projection().ravel()
+
+    def _contacts(self, scene: SceneView) -> ContactSolver | None:
+        """Return the contacts with obstacles, if the scene has collisions with some."""
+        rules = next((each for each in scene.constraints if isinstance(each, Collisions)), None)
+        find = None if rules is None else rules.finder(scene)
+        if rules is None or find is None:
+            return None
+        base = self.system.projection.copy().reshape(scene.agents, scene.dimension, scene.dimension)
+        base[self.kinds != SLIDES] = np.eye(scene.dimension)
+        return ContactSolver(scene, find, rules, self.kinds, base.ravel())
 
     def assemble(self, x: Doubles, v: Doubles, alive: NDArray[np.bool_], weights: tuple[float, float, float]) -> None:
         """Add the derivatives, times weights of dF/dx and dF/dv, to the matrix, and weighted dF/dx v to its right side.
@@ -126,7 +139,7 @@ class LinearSolver:
         """Return the motion after h seconds, from a state at a time; halved: how often the step was halved for it."""
         method = scene.integrator
         acceleration, flow = scene.rates(state, drive, [time])
-        found = self.step(scene, state, acceleration, flow, h)
+        found = self.step(scene, state, acceleration, flow, time, h)
         change, agent = self._strain_change(state, found) if method.strain > 0 else (0.0, -1)
         if change <= method.strain:
             return found
@@ -141,7 +154,7 @@ class LinearSolver:
         last = self._advance(scene, replace(state, x=pos, v=vel), drive, time + h / 2, h / 2, halved + 1)
         return last._replace(
             iterations=found.iterations + first.iterations + last.iterations, solves=first.solves + last.solves,
-            rejected=1 + first.rejected + last.rejected,
+            rejected=1 + first.rejected + last.rejected, held=_either(first.held, last.held),
         )  # fmt: skip
 
     def _strain_change(self, state: State, found: LinearStep) -> tuple[float, int]:
@@ -156,9 +169,9 @@ class LinearSolver:
         return max(every, default=(0.0, -1))
 
     def step(
-        self, scene: SceneView, state: State, acceleration: Floats, flow: Floats | None, h: float
-    ) -> LinearStep:  # fmt: skip
-        """Return the motion of a single world h seconds later; raise NotSolvedLinearlyError without a solution.
+        self, scene: SceneView, state: State, acceleration: Floats, flow: Floats | None, time: float, h: float
+    ) -> LinearStep:
+        """Return the motion of a single world h seconds after `time`; raise NotSolvedLinearlyError without a solution.
 
         acceleration, flow: at the beginning, (1, N, D) m/s^2, m/s.
         """
@@ -175,14 +188,25 @@ class LinearSolver:
         system.filter[~alive] = FIXED
         x, v = (np.ascontiguousarray(each[:, 0], float) for each in (state.x, state.v))
         self.assemble(x, v, alive, (-h * h, -h, h * h))
-        iterations, left = self.solve(system, method.tolerance, method.most)
+        carried = np.zeros((d, 0)) if flow is None else np.ascontiguousarray(flow[0].T, float)
+        held = None
+        if self.contacts is not None and self.contacts.look(system, state, x, v, carried, time, h):
+            iterations, left = self.contacts.solve(system, self.mass, method.tolerance, method.most)
+            held = self.contacts.held()
+        else:
+            iterations, left = self.solve(system, method.tolerance, method.most)
         if not left <= method.tolerance:
             raise NotSolvedLinearlyError(
                 f"the linear equations are not solved to tolerance = {method.tolerance:g} in {iterations:,} iterations",
                 int(np.argmax(np.abs(system.residual))) // d,
             )
         v = v + system.change.reshape(-1, d).T  # not in place: a view of the state, where bounces read the old one
-        return LinearStep(x + h * (v if flow is None else v + flow[0].T), v, int(iterations))
+        return LinearStep(x + h * (v if flow is None else v + flow[0].T), v, int(iterations), held=held)
+
+
+def _either(first: NDArray[np.bool_] | None, last: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+    """Return the union of two masks; None stands for an empty one."""
+    return last if first is None else first if last is None else first | last
 
 
 def _system(every: NDArray[np.int64], agents: int, dimension: int) -> System:

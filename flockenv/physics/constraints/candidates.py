@@ -14,7 +14,7 @@ from flockenv.physics.constraints.broad_phase import list_near_pairs, nearest_im
 from flockenv.physics.constraints.contacts import NEARLY, Ends, sort_by_rank
 from flockenv.physics.constraints.impact import surface_at
 
-__all__ = ["list_meetings"]
+__all__ = ["add_obstacle_pairs", "list_meetings"]
 
 
 @routine
@@ -40,9 +40,7 @@ def list_meetings(
             period, where, bodies.living, bodies.radius, reach, n, grid, order, cell, start, offset, bounds, sync,
             ranges, meetings.who, meetings.other,
         )  # fmt: skip
-    count = _add_obstacle_pairs(
-        period, bodies, meetings, things, where, reach, rules.seconds, rules.touch, ahead, count
-    )
+    count = add_obstacle_pairs(period, bodies, meetings, things, where, reach, rules.seconds, rules.touch, ahead, count)
     if count <= meetings.who.shape[0]:
         for c in range(count):
             add_to_lists(bodies, meetings, c)
@@ -61,7 +59,7 @@ def _enlarge_reach(bodies: Bodies) -> None:
 
 
 @kernel
-def _add_obstacle_pairs(
+def add_obstacle_pairs(
     period: Vec, bodies: Bodies, meetings: Meetings, things: Things, at: Any, reach: Any, seconds: float, touch: float,
     ahead: bool, count: int,
 ) -> int:  # fmt: skip

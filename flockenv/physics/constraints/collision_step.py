@@ -18,7 +18,7 @@ from flockenv.physics.constraints.event_driven import process_impacts, start_tou
 from flockenv.physics.constraints.impact import position_along
 from flockenv.physics.constraints.step_end import RAISED, settle_ends
 
-__all__ = ["COUNTED", "LOST", "collide"]
+__all__ = ["COUNTED", "LOST", "collide", "place_obstacles"]
 
 COUNTED = 5
 """Length of the report of a call: world, agent, number of meetings, of impacts, and of unsolved ones."""
@@ -57,7 +57,7 @@ def _load_bodies(
 
 
 @kernel
-def _obstacles(
+def place_obstacles(
     period: Vec, things: Things, obstacle_x: Any, obstacle_radius: Any, b: int, begun: float, ended: float
 ) -> None:
     """Compute positions and velocities of the obstacles of world b in this step; its own round ones come first."""
@@ -100,7 +100,7 @@ def collide(
         if not (far < np.inf and fast < np.inf):
             continue
         began = (tick[b] - 1) * rules.seconds
-        _obstacles(period, things, obstacle_x, obstacle_radius, b, began, tick[b] * rules.seconds)
+        place_obstacles(period, things, obstacle_x, obstacle_radius, b, began, tick[b] * rules.seconds)
         revised = Rules(
             rules.seconds, rules.restitution, rules.friction, rules.sticky, rules.most, rules.again,
             rules.touch + EXACT * far, rules.pairs, not in_time,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -23,11 +24,17 @@ from flockenv.physics.constraints.constraint import Constraint, Settler
 from flockenv.physics.constraints.contacts import Contacts, Ends
 from flockenv.physics.constraints.impact import POINT
 from flockenv.physics.constraints.step_end import LEFT, RAISED, SUNK
+from flockenv.physics.constraints.touching import Touching, find_touching
 from flockenv.physics.effects.effect import separation_directions
 
-__all__ = [
-    "Collisions",
-]
+__all__ = ["Collisions", "Finder"]
+
+Finder = Callable[[State, Floats, Floats, Floats, float, float, Touching], None]
+"""find(state, x, v, flow, begun, seconds, touching): write the contacts of a single world, as `find_touching` does."""
+
+
+TOUCH = 1e-12
+"""m, gap at and below which two bodies touch, but for the rounding of their positions."""
 
 
 class Collisions(Constraint):
@@ -101,6 +108,11 @@ class Collisions(Constraint):
     def settler(self, scene: SceneView) -> Settler:
         """Return a function that corrects a step."""
         return _Settler(self, scene)
+
+    def finder(self, scene: SceneView) -> Finder | None:
+        """Return a function that finds the contacts with obstacles at the beginning of a step; None without any."""
+        settler = _Settler(self, scene)
+        return settler.find if len(settler.things.row) else None
 
 
 class _Settler:
@@ -209,7 +221,7 @@ class _Settler:
         r = self.record
         rules = Rules(
             self.scene.dt, r.restitution, r.friction, r.sticky, r.most,
-            min(r.again, r.most) if r.response == "back_up" else r.most, 1e-12, r.agents, False,
+            min(r.again, r.most) if r.response == "back_up" else r.most, TOUCH, r.agents, False,
         )  # fmt: skip
         circles = slice(None) if r.obstacles else slice(0, 0)
         self._choose_grid(state.obstacle_x[:, :, circles], state.obstacle_radius[:, circles])
@@ -236,6 +248,24 @@ class _Settler:
             self.warned = True
             warnings.warn(self._warning_text(unsolved, lost), UnsolvedContactsWarning, stacklevel=2)
         return bad
+
+    def find(
+        self, state: State, x: Floats, v: Floats, flow: Floats, begun: float, seconds: float, touching: Touching
+    ) -> None:
+        """Write the contacts of a single world in a step of `seconds` from `begun`, s; see `find_touching`."""
+        r, circles = self.record, slice(None) if self.record.obstacles else slice(0, 0)
+        given = state.obstacle_x[:, :, circles], state.obstacle_radius[:, circles]
+        self._choose_grid(*given)
+        rules = Rules(seconds, r.restitution, r.friction, r.sticky, r.most, r.most, TOUCH, r.agents, False)
+        exact = 8 * float(np.finfo(state.x.dtype).eps)
+        while True:
+            needed = entry(find_touching)(
+                self.period, x, v, flow, state.alive[0], *given, self.bodies, self.meetings, self.things, self.ends,
+                self.reach, rules, exact, begun, touching,
+            )  # fmt: skip
+            if needed <= len(self.meetings.who):
+                return
+            self._make_room(2 * int(needed))
 
     def _warning_text(self, unsolved: int, lost: NDArray[np.float64]) -> str:
         """Return the warning about a step; `lost`: see event_driven.process_impacts and step_end.py."""

@@ -23,6 +23,7 @@ __all__ = [
     "Contacts",
     "Ends",
     "deepest_overlap",
+    "gap_and_normal",
     "gather_contacts",
     "move_apart",
     "resolve_impacts",
@@ -59,7 +60,7 @@ class Ends(NamedTuple):
 
 
 @kernel
-def _normal(
+def gap_and_normal(
     period: Vec, bodies: Bodies, things: Things, pos: Any, ends: Ends, seconds: float, i: int, j: int
 ) -> tuple[float, Vec]:
     """Return the gap between a body and another, or an obstacle, m, and the normal towards the body.
@@ -104,10 +105,10 @@ def gather_contacts(
         margin = max(touch, NEARLY * width(bodies, i, j))
         if j >= 0 and not passing and _far_apart(period, bodies, ends, i, j, margin):
             continue
-        gap, n = _normal(period, bodies, things, ends.pos, ends, seconds, i, j)
+        gap, n = gap_and_normal(period, bodies, things, ends.pos, ends, seconds, i, j)
         begun, first, passed = gap, n, False
         if passing:
-            begun, first = _normal(period, bodies, things, bodies.start, ends, 0.0, i, j)
+            begun, first = gap_and_normal(period, bodies, things, bodies.start, ends, 0.0, i, j)
             passed = begun <= margin and (gap < -margin or dot(n, first) < 0.5)
             n = select(passed, first, n)
         if (gap <= margin and not (passing and gap < -margin)) or passed:  # a body from afar stops on its path
@@ -335,7 +336,7 @@ def move_apart(
         for k in range(count):
             c = contacts.order[k if turn % 2 == 0 else count - 1 - k]
             i, j = contacts.who[c], contacts.other[c]
-            gap, n = _normal(period, bodies, things, ends.pos, ends, seconds, i, j)
+            gap, n = gap_and_normal(period, bodies, things, ends.pos, ends, seconds, i, j)
             if gap < 0.0 and _inverse_reduced_mass(bodies, i, j) > 0.0:
                 far = min(-gap, most - contacts.push[c])
                 contacts.push[c] += far
@@ -360,7 +361,7 @@ def deepest_overlap(
     deep = 0.0
     for c in range(count):
         i, j = who[c], other[c]
-        gap, _ = _normal(period, bodies, things, ends.pos, ends, seconds, i, j)
+        gap, _ = gap_and_normal(period, bodies, things, ends.pos, ends, seconds, i, j)
         if gap < 0.0 and _inverse_reduced_mass(bodies, i, j) > 0.0:
             deep = max(deep, -gap / max(width(bodies, i, j), 1e-300))
     return deep

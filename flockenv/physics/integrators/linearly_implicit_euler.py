@@ -25,6 +25,11 @@ class LinearlyImplicitEuler(Integrator):
     than that share of its rest length is made again as two halves, and these likewise (section 6 there, but without a
     step size that lasts): a sheet that is hit hard gets short steps as long as it needs them. Limits, constraints and
     space act once per step, at its end.
+
+    In a scene with `collisions` the contacts with obstacles are part of the equations (section 5 there): a particle
+    that touches one, and does not bounce, keeps to its surface within the solve, and its neighbours move accordingly in
+    the same step. Contacts that would pull are released, and friction is Coulomb's; each change is another solve.
+    Impacts that bounce, and whatever the linear equations miss, are left to `collisions` after the solve.
     """
 
     kind: Literal["linearly_implicit_euler"] = "linearly_implicit_euler"
