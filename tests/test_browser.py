@@ -6,6 +6,7 @@ It needs Chromium and playwright: `apt-get install chromium` and `pip install 'f
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -78,10 +79,12 @@ def test_a_replay_plays_and_stops(tmp_path: Path, visit: Callable[..., Visit], w
 
 
 def test_a_recorded_world_in_three_dimensions_turns(tmp_path: Path, visit: Callable[..., Visit]) -> None:
-    write_replay(tmp_path / "r.html", [Group("one", [Panel("", run(5, dimension=3), None, "")])], "cube")
+    shots = [replace(shot, faces=[(0, 1, 2)]) for shot in run(5, dimension=3)]
+    write_replay(tmp_path / "r.html", [Group("one", [Panel("", shots, None, "")])], "cube")
     here = visit((tmp_path / "r.html").as_uri() + "#t=0.1")
     here.until("drawn.count > 0")
     flat = here.value("views[0].eye.flat")
+    assert here.value("facesInOrder(views[0].panel, views[0].eye, views[0].panel.bodies, new Set()).length") == 1
     box = here.page.locator("canvas.world").bounding_box()
     here.drag((box["x"] + 60, box["y"] + 60), (80, -120))
     here.until("!views[0].eye.flat")

@@ -14,8 +14,6 @@ function arrow(pen, x, y, dx, dy, colour, width) {
   pen.beginPath(); pen.moveTo(x + dx, y + dy); pen.lineTo(bx - 0.55 * head * uy, by + 0.55 * head * ux); pen.lineTo(bx + 0.55 * head * uy, by - 0.55 * head * ux); pen.closePath(); pen.fill();
 }
 
-function placeOf(all, i) { return [all.pos[3 * i], all.pos[3 * i + 1], all.pos[3 * i + 2]]; }
-
 function vectorOn(eye, [x, y, z = 0]) { return [eye.x(x, y, z) - eye.x(0, 0, 0), eye.y(x, y, z) - eye.y(0, 0, 0)]; }
 
 function drawForces(pen, eye, look, x, y) {

@@ -72,6 +72,9 @@ function bodies(panel, { k, f }) {
   return out;
 }
 
+/* The position of an agent among those of `bodies`, m. */
+function placeOf(all, i) { return [all.pos[3 * i], all.pos[3 * i + 1], all.pos[3 * i + 2]]; }
+
 /* The direction between two, along the shorter arc; the second if the first is unknown. */
 function between(first, second, f) {
   if (first !== first) return second;
