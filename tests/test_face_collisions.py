@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -111,6 +112,25 @@ def test_a_pole_thinner_than_a_cell_holds_a_sheet(pole: Any) -> None:
     assert without.pos[0, :, 2].max() < -0.5
     state = run(scene_of(group, obstacles=(pole,)), 0.5)
     assert state.pos[0, :, 2].max() > -0.3
+
+
+@pytest.mark.parametrize("share", [0.97, 1.03, 1.5])
+def test_a_sheet_rests_on_an_incline_up_to_the_angle_of_friction(share: float) -> None:
+    """On a pinned sheet of slope share mu it rests, or slides with g (sin - mu cos)."""
+    angle = math.atan(share * 0.3)
+    slope = Gravity(acceleration=(9.81 * math.sin(angle), 0, -9.81 * math.cos(angle)))
+    groups = sheet(2, 0.4, (0.05, 0.03, 0.011)), sheet(2, 2.0, (-0.5, -0.5, 0), pinned=tuple(range(9)))
+    scene = scene_of(*groups, constraints=(FaceCollisions(friction=0.3, thickness=0.01),))
+    scene = scene.model_copy(update={"effects": (slope, *EFFECTS[1:2], Drag(rate=0.0))})
+    early = scene.step(scene.start(0), steps=50)
+    late = scene.step(early, steps=50)
+    gained = np.subtract(late.vel[0, :9], early.vel[0, :9])
+    assert np.abs(late.pos[0, :9, 2] - 0.01).max() < 1e-6
+    if share < 1:
+        assert np.abs(late.pos[0, :9] - early.pos[0, :9]).max() < 1e-9 and np.abs(late.vel[0, :9]).max() < 1e-9
+    else:
+        drive, friction = 9.81 * math.sin(angle) * 50 * scene.dt, 0.3 * 9.81 * math.cos(angle) * 50 * scene.dt
+        np.testing.assert_allclose(gained, np.tile([drive - friction, 0, 0], (9, 1)), rtol=0, atol=0.02 * friction)
 
 
 RISING = (
