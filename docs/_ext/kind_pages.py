@@ -140,8 +140,11 @@ def _limits(method: Integrator) -> list[str]:
         f"An undamped oscillation of angular frequency omega is {undamped}; with 10 % of critical damping it is stable "
         f"for h omega < {damped:.3g}. Linear drag c is stable {slows}."
     )
-    more = " This is for forces without a `derivative`; others do not limit the step." if method.linearises else ""
-    return ["## Limits", text + more]
+    more = (
+        " This, and the curve, is for forces without a `derivative`; others do not limit the step, which is then "
+        "that of [implicit Euler](implicit_euler.md) for a linear force."
+    )
+    return ["## Limits", text + more * method.linearises]
 
 
 def _fields(model: type[Any]) -> list[str]:
