@@ -50,13 +50,15 @@ def collect_answers(
 def teach(
     model: PPO, task: Task, rules: RulesPlayer, updates: int, worlds: int = WORLDS,
     advance: Callable[[int], None] = lambda n: None, rounds: int = ROUNDS, seen: Callable[[int], None] = lambda n: None,
+    ended: Callable[[int, int, float], None] = lambda steps, rows, missed: None,
 ) -> tuple[int, float]:  # fmt: skip
     """Train PPO's actor to imitate the rules (DAgger), by some gradient steps of 2,048 rows in `rounds` rounds.
 
     The first round uses observations of the rules in training worlds, each later round adds observations of the actor
     in as many more worlds. Returns the number of rows, and the remaining error: the mean square error of the actions
     over the variance of the rules' actions. advance: called with 1 after every gradient step; seen: with
-    the number of rows after each round's episodes.
+    the number of rows after each round's episodes; ended: after each round, with the gradient steps and rows so far and
+    the remaining error.
 
     Raises:
         FloatingPointError: learning or a world diverged; LearningDiverged names the gradient step and the loss.
@@ -84,6 +86,8 @@ def teach(
         optimiser.step()
         _check_weights(model, k + 1, updates, float(loss.detach()))
         advance(1)
+        if k + 1 in begins or k + 1 == updates:
+            ended(k + 1, len(rows), float(loss.detach() / answers.var()))
     return len(rows), float(loss.detach() / answers.var())
 
 

@@ -198,7 +198,7 @@ class Recorder:
         self.run.wall = self.wall
         self.progress.update(self.bar, score=text)
         self.progress.console.print(line)
-        log_point(self.model, self.run.curve[-1])
+        log_point(self.model.logger, self.run.curve[-1])
         self.model.logger.dump(self.run.steps // self.p.hold)
 
 

@@ -193,7 +193,7 @@ class Watch(BaseCallback):
         text, line = add_point(self.run, tensors, score(self.task, self.p, tensors))
         self.progress.update(self.bar, score=text)
         self.progress.console.print(line)
-        log_point(self.model, self.run.curve[-1])
+        log_point(self.model.logger, self.run.curve[-1])
         self.due = True
 
     def finish(self) -> None:

@@ -30,12 +30,14 @@ import typer
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.algorithms.ppo.torch.default_ppo_torch_rl_module import DefaultPPOTorchRLModule
+from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 from ray.tune.registry import register_env
 from rich.console import Console
+from stable_baselines3.common.logger import Logger
 
 from agents.checkpoint import CheckpointError, Damaged, claim, path_in
 from agents.divergence import LearningDiverged
@@ -44,6 +46,7 @@ from agents.options import Config, Steps, TrainingSeed
 from agents.rllib_envs import NETWORKS, ONE, RowsEnv, Settings, TeamEnv, role
 from agents.run import Run, expected_bytes, load_checkpoint, recipe_of, save_checkpoint
 from agents.training import add_point, card_of, new_progress, score, use_thread_count
+from agents.training_log import log_point, open_log
 from agents.training_state import surroundings
 from flockenv.cli.terminal import DIVERGED, handle_interrupt, run_program, show_progress
 from flockenv.core import signals
@@ -69,6 +72,10 @@ NO_EQUAL: dict[str, Any] = {
     "seconds": None,
 }  # fmt: skip
 """Settings of which RLlib's PPO has no equal, with the value that it does have."""
+
+
+LOSSES = ("total_loss", "policy_loss", "vf_loss", "entropy", "mean_kl_loss", "gradients_default_optimizer_global_norm")
+"""What is logged of RLlib's metrics of a network."""
 
 
 # --- settings ---------------------------------------------------------------------------------------------------------
@@ -298,30 +305,47 @@ def train(
             else:
                 _restore(algorithm, folder, run)
             _remove_states(folder, run)
-            with show_progress(new_progress(console)) as progress:
+            with open_log(folder, console) as log, show_progress(new_progress(console)) as progress:
                 bar = progress.add_task(run.recipe["task"], total=experiment.ppo.steps, completed=run.steps, score="")
                 while run.steps < experiment.ppo.steps:
-                    score_text = _iterate(algorithm, experiment, team, run, progress.console)
+                    score_text = _iterate(algorithm, experiment, team, run, log, progress.console)
                     _save(algorithm, folder, run)
                     done = min(run.steps, experiment.ppo.steps)
                     progress.update(bar, completed=done, **({"score": score_text} if score_text else {}))
             return run, players_of(algorithm, experiment.build(), team)
 
 
-def _iterate(algorithm: Algorithm, experiment: Experiment, team: Networks | None, run: Run, out: Console) -> str:
+def _iterate(
+    algorithm: Algorithm, experiment: Experiment, team: Networks | None, run: Run, log: Logger, out: Console
+) -> str:
     """Sample and learn once; return the score of the policy if a point of the learning curve is due, otherwise ''."""
-    p, task, began = experiment.ppo, experiment.build(), time.perf_counter()
-    sampled = algorithm.train()["env_runners"]["num_agent_steps_sampled_lifetime"]
-    run.steps = int(sum(sampled.values()))
+    p, task, began, text = experiment.ppo, experiment.build(), time.perf_counter(), ""
+    result = algorithm.train()
+    run.steps = int(sum(result["env_runners"]["num_agent_steps_sampled_lifetime"].values()))
     players = players_of(algorithm, task, team)
     run.wall += time.perf_counter() - began
     due = run.steps >= min(len(run.curve) * p.evaluate_every, p.steps)
-    if not due or not has_score(task, team):
-        return ""
-    (tensors,) = players.values()
-    text, line = add_point(run, tensors, score(task, p, tensors))
-    out.print(line)
+    if due and has_score(task, team):
+        (tensors,) = players.values()
+        text, line = add_point(run, tensors, score(task, p, tensors))
+        log_point(log, run.curve[-1])
+        out.print(line)
+    _log_iteration(log, run, result)
     return text
+
+
+def _log_iteration(log: Logger, run: Run, result: dict[str, Any]) -> None:
+    """Write a row of the log: steps, time, and what RLlib reports of its episodes and of each network's losses."""
+    numbers = {"time/iterations": result["training_iteration"], "time/agent_steps": run.steps, "time/seconds": run.wall}
+    episodes = result["env_runners"]
+    numbers |= {f"rollout/{name}": episodes.get(name) for name in ("episode_return_mean", "episode_len_mean")}
+    for network, losses in result["learners"].items():
+        part = "" if network == DEFAULT_MODULE_ID else f"{network}/"
+        numbers |= {f"train/{part}{name}": losses.get(name) for name in LOSSES}
+    for name, value in numbers.items():
+        if value is not None:
+            log.record(name, float(value))
+    log.dump(run.steps)
 
 
 def _state(folder: Path, run: Run) -> Path:

@@ -18,7 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.utils import get_latest_run_id
 
-__all__ = ["log_point", "turn_off_log", "write_log"]
+__all__ = ["log_point", "open_log", "turn_off_log", "write_log"]
 
 NAME = "log"
 
@@ -29,26 +29,35 @@ def turn_off_log(model: BaseAlgorithm) -> None:
 
 
 @contextmanager
-def write_log(model: BaseAlgorithm, folder: Path, console: Console) -> Iterator[None]:
-    """Let a model log into the next folder log_N of a folder, for a block; nothing stays of a log without rows."""
+def open_log(folder: Path, console: Console) -> Iterator[Logger]:
+    """Open a logger into the next folder log_N of a folder, for a block; nothing stays of a log without rows."""
     place = folder / f"{NAME}_{get_latest_run_id(str(folder), NAME) + 1}"
     is_there = find_spec("tensorboard") is not None
     note = "" if is_there else " (CSV only: TensorBoard's needs the package tensorboard)"
     console.print(f"log: {place}{note}", markup=False, highlight=False, soft_wrap=True)
     logger = configure(str(place), ["csv", "tensorboard"] if is_there else ["csv"])
-    model.set_logger(logger)
     try:
-        yield
+        yield logger
     finally:
         logger.close()
-        turn_off_log(model)
         rows = place / "progress.csv"
         if rows.exists() and rows.stat().st_size == 0:  # gone if the folder was removed meanwhile
             shutil.rmtree(place)
 
 
-def log_point(model: BaseAlgorithm, point: dict[str, Any]) -> None:
+@contextmanager
+def write_log(model: BaseAlgorithm, folder: Path, console: Console) -> Iterator[None]:
+    """Let a model log into the next folder log_N of a folder, for a block."""
+    with open_log(folder, console) as logger:
+        model.set_logger(logger)
+        try:
+            yield
+        finally:
+            turn_off_log(model)
+
+
+def log_point(logger: Logger, point: dict[str, Any]) -> None:
     """Add a point of the learning curve to the next row of the log."""
-    model.logger.record("time/agent_steps", point["steps"])
-    model.logger.record("tuning/mean_return", point["mean"])
-    model.logger.record("tuning/success_rate", point["success"])
+    logger.record("time/agent_steps", point["steps"])
+    logger.record("tuning/mean_return", point["mean"])
+    logger.record("tuning/success_rate", point["success"])

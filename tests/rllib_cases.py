@@ -5,6 +5,7 @@ Each case is a function, runs in an empty folder, and raises an error if it fail
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import signal
@@ -110,6 +111,14 @@ def a_policy_trained_with_a_runner_plays_in_the_comparison() -> None:
     card = read("p.json")
     assert (card["algorithm"], card["runners"], card["recipe"]["ppo"]["log_std"]) == ("PPO (RLlib)", 1, -0.7)
     assert 30_000 <= card["steps"] < 31_000 and len(card["curve"]) == 16
+    with Path("runs/rllib/pursuit/log_1/progress.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(float(row["time/iterations"])) for row in rows] == list(range(1, len(rows) + 1)), "a row per iteration"
+    assert [float(row["tuning/mean_return"]) for row in rows if row["tuning/mean_return"]] == [
+        float(point["mean"]) for point in card["curve"]
+    ]
+    assert all(float(row["train/policy_loss"]) for row in rows)
+    assert any(row["rollout/episode_return_mean"] for row in rows), "if an episode has ended"
     options = ["--tasks", "pursuit", "--players", f"random,{out}", "--worlds", "16", "--out", "compared"]
     result = CliRunner().invoke(compare.app, options)
     assert result.exit_code == 0, result.output
@@ -159,8 +168,8 @@ def an_interrupted_training_continues() -> None:
     assert first is not None and 1000 <= first.steps < 20_000
     steps, iterate = [], rllib._iterate
 
-    def noted(algorithm: Any, experiment: Any, team: Any, run: Run, out: Any) -> str:
-        text = iterate(algorithm, experiment, team, run, out)
+    def noted(algorithm: Any, experiment: Any, team: Any, run: Run, *others: Any) -> str:
+        text = iterate(algorithm, experiment, team, run, *others)
         steps.append(run.steps)
         return text
 

@@ -376,9 +376,9 @@ def test_invalid_settings_are_refused_in_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_longer_imitation_brings_a_network_closer_to_the_rules() -> None:
+def test_longer_imitation_brings_a_network_closer_to_the_rules(tmp_path: Path) -> None:
     experiment = Experiment(task="pursuit", ppo={**TINY, "evaluate_worlds": 16})
-    little, more = (imitate(experiment, worlds=4, updates=updates) for updates in (1, 300))
+    little, more = (imitate(experiment, tmp_path, worlds=4, updates=updates) for updates in (1, 300))
     assert little.rules == more.rules and more.rows > 4 * little.rows > 0  # the network acted in later rounds
     assert more.missed < 0.5 * little.missed
     assert more.network > little.network
@@ -391,7 +391,7 @@ def test_diverging_imitation_ends_with_one_error_line(
 ) -> None:
     monkeypatch.setattr(dagger, "RATE", rate)
     (tmp_path / "p.yaml").write_text(f"task: pursuit\nppo: {json.dumps(TINY)}\n", encoding="utf-8")
-    given = [str(tmp_path / "p.yaml"), "--worlds", "2", "--updates", str(updates)]
+    given = [str(tmp_path / "p.yaml"), "--worlds", "2", "--updates", str(updates), "--runs", str(tmp_path)]
     result = CliRunner().invoke(imitation.app, given)
     lines = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
     assert result.exit_code == 1 and len(lines) == 1 and "Traceback" not in result.stderr, result.stderr

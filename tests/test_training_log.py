@@ -12,6 +12,7 @@ from rich.console import Console
 
 from agents import learn, ppo, training_log
 from agents.experiment import Experiment
+from agents.imitate import imitate
 from agents.learner_job import ALGORITHMS, effective
 from tests.training import PURSUIT, TINY, interrupt
 
@@ -97,3 +98,14 @@ def test_the_other_learners_log_their_curve_too(algo: str, tmp_path: Path) -> No
     assert curve_of(rows) == points_of(run.curve)
     if algo != "bc":
         assert any(name.startswith("train/") and rows[-1][name] for name in rows[-1])
+
+
+def test_imitation_logs_a_row_per_round_and_its_scores(tmp_path: Path) -> None:
+    found = imitate(PURSUIT, tmp_path, worlds=2, updates=8)
+    *rounds, last = rows_of(tmp_path / "log_1")
+    assert [int(row["time/gradient_steps"]) for row in rounds] == [2, 4, 6, 8]
+    sizes = [int(row["train/rows"]) for row in rounds]
+    assert sizes == sorted(set(sizes)) and sizes[-1] == found.rows
+    assert float(rounds[-1]["train/missed"]) == pytest.approx(found.missed)
+    assert float(last["tuning/mean_return"]) == pytest.approx(found.network)
+    assert float(last["tuning/mean_return_of_rules"]) == pytest.approx(found.rules)
