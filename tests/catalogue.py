@@ -1,6 +1,7 @@
-"""Lists of all laws, effects, integrators, spaces and tasks: a new row inherits all tests of its kind.
+"""Lists of all laws, effects, integrators, constraints, spaces and tasks: a new row inherits all tests of its kind.
 
-A new effect, integrator, behaviour, task or space is one row below; `test_catalogue.py` fails while a row is missing.
+A new effect, integrator, constraint, behaviour, task or space is one row below; `test_catalogue.py` fails while a row
+is missing.
 """
 
 from __future__ import annotations
@@ -68,11 +69,12 @@ from flockenv.behaviours import (
 )
 from flockenv.behaviours.steer import Steer
 from flockenv.envs.table import ENVIRONMENTS
-from flockenv.geometry.shapes import Circle
+from flockenv.geometry.shapes import Circle, HalfSpace, Shape
 from flockenv.geometry.space import Box, Plane, Space, Torus
 from flockenv.geometry.targets import Target
-from flockenv.model.networks import Mesh
+from flockenv.model.networks import Blocks, Cloth, Mesh, Rope
 from flockenv.model.spawn import Spawn
+from flockenv.physics.constraints import Collisions, Constraint, FaceCollisions, RigidBodies, Rods, Slide
 from flockenv.physics.effects import EFFECTS as EFFECT_KINDS
 from flockenv.physics.effects import (
     AltitudeSprings,
@@ -592,6 +594,47 @@ INTEGRATORS = (
     IntegratorRow(LinearlyImplicitEuler(), 275.31167, 2, 2),  # explicit for forces without a known derivative
     IntegratorRow(ImplicitMidpoint(), 272.055141, math.inf, math.inf),
 )
+
+
+@dataclass(frozen=True)
+class ConstraintRow:
+    """A constraint and what it acts on in 3-D, under gravity, from the first steps on; see `constrained`."""
+
+    constraint: Constraint
+    groups: tuple[Group, ...]
+    obstacles: tuple[Shape, ...] = ()
+
+    @property
+    def name(self) -> str:
+        return self.constraint.kind
+
+
+FLOOR = HalfSpace(point=(0, 0, 0), direction=(0, 0, 1))
+SHEET = Cloth(cells=(2, 2), origin=(0, 0, 0.11), sides=(0.5, 0.5))
+CHAIN = Rope(links=4, length=1.0, direction=(1, 0, 0), pinned=("start",))
+HEAP = Group(count=8, radius=0.1, spawn=Spawn(low=(0, 0, 0.1), high=(0.8, 0.8, 0.5), speed=(0, 2)))
+
+CONSTRAINTS = (
+    ConstraintRow(Collisions(restitution=0.5), (HEAP,), (FLOOR,)),
+    ConstraintRow(Rods(group=0), (Group(network=CHAIN, radius=0.01),)),
+    ConstraintRow(Slide(particles=("end",), along=((1, 0, 0),)), (Group(network=CHAIN, radius=0.01),)),
+    ConstraintRow(
+        FaceCollisions(friction=0.3), (Group(network=SHEET, mass=0.01, radius=0.01),),
+        (Circle(centre=(0.3, 0.25, 0), radius=0.1),),
+    ),
+    ConstraintRow(
+        RigidBodies(), (Group(network=Blocks(sides=(0.2, 0.2, 0.2), centres=((0, 0, 0.11), (0.1, 0, 0.33)))),), (FLOOR,)
+    ),
+)  # fmt: skip
+
+
+def constrained(row: ConstraintRow) -> Scene:
+    """Return the scene in which tests simulate a constraint; without it all have one kernel but for obstacles."""
+    return Scene(
+        dimension=3, groups=row.groups, effects=(Gravity(acceleration=(0, 0, -9.81)),), obstacles=row.obstacles,
+        constraints=(row.constraint,), dt=0.01,
+    )  # fmt: skip
+
 
 SPACES = {
     "plane": {2: Plane(), 3: Plane()},

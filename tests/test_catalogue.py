@@ -11,6 +11,7 @@ import pytest
 from flockenv import steering
 from flockenv.behaviours.steer import Steer
 from flockenv.geometry.space import Space
+from flockenv.physics.constraints import CONSTRAINTS
 from flockenv.physics.effects import EFFECTS
 from flockenv.physics.integrators import INTEGRATORS
 from flockenv.steering import arbitration
@@ -68,6 +69,11 @@ def test_every_integrator_has_a_row() -> None:
     assert rows == kinds_in("physics/integrators", "kind") == set(INTEGRATORS)
 
 
+def test_every_constraint_has_a_row() -> None:
+    rows = {row.constraint.kind for row in catalogue.CONSTRAINTS}
+    assert rows == kinds_in("physics/constraints", "kind") == set(CONSTRAINTS)
+
+
 def test_every_task_has_a_row() -> None:
     assert {row.task.name for row in catalogue.TASKS} == kinds_in("tasks", "name") == set(TASKS)
 
@@ -89,7 +95,7 @@ def test_every_space_has_a_row() -> None:
 
 
 def test_names_of_rows_are_unique() -> None:
-    for rows in (catalogue.EFFECTS, catalogue.INTEGRATORS, catalogue.TASKS, catalogue.STEERING):
+    for rows in (catalogue.EFFECTS, catalogue.INTEGRATORS, catalogue.CONSTRAINTS, catalogue.TASKS, catalogue.STEERING):
         names = [row.name for row in rows]
         assert len(set(names)) == len(names)
 
