@@ -32,15 +32,18 @@ class System(NamedTuple):
     column: Any  # (K,) int32
     diagonal: Any  # (N,) int32, block of each row on the diagonal
     value: Any  # (K D D,)
+    filtered: Any  # (K D D,) S A S + 1 - S with the filter S; on and below the diagonal
     right: Any  # (N D,) kg m/s, the right-hand side b
     filter: Any  # (N,) FREE, FIXED or SLIDES
     projection: Any  # (N D D,) of agents that slide
     inverse: Any  # (N D D,) of the blocks on the diagonal
     change: Any  # (N D,) m/s, the solution dv
-    residual: Any  # (N D,)
+    residual: Any  # (N D,) this and the next five: see `_descend`
+    weighted: Any  # (N D,) D times the residual
     direction: Any  # (N D,)
-    image: Any  # (N D,) A times the direction
-    scaled: Any  # (N D,) the residual times the inverse
+    step: Any  # (N D,) the direction of dv
+    image: Any  # (N D,) of the direction
+    carried: Any  # (N D,) L times a part of the image
 
 
 class Local(NamedTuple):
@@ -188,34 +191,167 @@ def _project(dimension: int) -> Callable[..., None]:
 
 
 @section
-def _multiply(dimension: int) -> Callable[..., None]:
-    """Make `multiply(system)`: write A times the direction into `image`."""
+def _add_row(dimension: int) -> Callable[..., tuple[float, float, float]]:
+    """Make `add_row(value, column, vector, first, end)`: the sum of blocks [first, end) of a row times their parts."""
 
-    def multiply(system: Any) -> None:
-        value, column, vector, image = system.value, system.column, system.direction, system.image
+    def add_row(value: Any, column: Any, vector: Any, first: Any, end: Any) -> Any:
+        a, b, c = 0.0, 0.0, 0.0
+        for k in range(np.uint64(first), np.uint64(end)):
+            if dimension == 2:
+                to, at = np.uint64(column[k]) * np.uint64(2), k * np.uint64(4)
+                x, y = vector[to], vector[to + np.uint64(1)]
+                a += value[at] * x + value[at + np.uint64(1)] * y
+                b += value[at + np.uint64(2)] * x + value[at + np.uint64(3)] * y
+            else:
+                to, at = np.uint64(column[k]) * np.uint64(3), k * np.uint64(9)
+                x, y, z = vector[to], vector[to + np.uint64(1)], vector[to + np.uint64(2)]
+                a += value[at] * x + (value[at + np.uint64(1)] * y + value[at + np.uint64(2)] * z)
+                b += value[at + np.uint64(3)] * x + (value[at + np.uint64(4)] * y + value[at + np.uint64(5)] * z)
+                c += value[at + np.uint64(6)] * x + (value[at + np.uint64(7)] * y + value[at + np.uint64(8)] * z)
+        return a, b, c
+
+    return add_row
+
+
+@section
+def _multiply(dimension: int) -> Callable[..., None]:
+    """Make `multiply(system, vector, out)`: out = A vector, without the filter."""
+    add_row, d = _add_row(dimension), dimension
+
+    def multiply(system: Any, vector: Any, out: Any) -> None:
         for i in range(system.start.shape[0] - 1):
-            first, second, third = 0.0, 0.0, 0.0
-            for k in range(np.uint64(system.start[i]), np.uint64(system.start[i + 1])):
-                if dimension == 2:
-                    to, at = np.uint64(column[k]) * np.uint64(2), k * np.uint64(4)
-                    x, y = vector[to], vector[to + np.uint64(1)]
-                    first += value[at] * x + value[at + np.uint64(1)] * y
-                    second += value[at + np.uint64(2)] * x + value[at + np.uint64(3)] * y
-                else:
-                    to, at = np.uint64(column[k]) * np.uint64(3), k * np.uint64(9)
-                    x, y, z = vector[to], vector[to + np.uint64(1)], vector[to + np.uint64(2)]
-                    first += value[at] * x + (value[at + np.uint64(1)] * y + value[at + np.uint64(2)] * z)
-                    second += value[at + np.uint64(3)] * x + (
-                        value[at + np.uint64(4)] * y + value[at + np.uint64(5)] * z
-                    )
-                    third += value[at + np.uint64(6)] * x + (
-                        value[at + np.uint64(7)] * y + value[at + np.uint64(8)] * z
-                    )
-            image[i * dimension], image[i * dimension + 1] = first, second
-            if dimension == 3:
-                image[i * dimension + 2] = third
+            a, b, c = add_row(system.value, system.column, vector, system.start[i], system.start[i + 1])
+            out[i * d], out[i * d + 1] = a, b
+            if d == 3:
+                out[i * d + 2] = c
 
     return multiply
+
+
+@section
+def _project_block(dimension: int) -> Callable[..., None]:
+    """Make `project_block(system, i, j, at)`: write P_i A_ij P_j with the projections P of two agents."""
+    d = dimension
+
+    def part(system: Any, i: Any, a: Any, b: Any) -> float:
+        return system.projection[(i * d + a) * d + b] if system.filter[i] == SLIDES else 1.0 if a == b else 0.0
+
+    part = kernel(part)
+
+    def project_block(system: Any, i: Any, j: Any, at: Any) -> None:
+        for a in range(d):
+            for b in range(d):
+                total = 0.0
+                for r in range(d):
+                    for q in range(d):
+                        total += part(system, i, a, r) * system.value[at + r * d + q] * part(system, j, q, b)
+                system.filtered[at + a * d + b] = total
+
+    return project_block
+
+
+@section
+def _filter_blocks(dimension: int) -> Callable[..., None]:
+    """Make `filter_blocks(system)`: write S A S + 1 - S on and below the diagonal, and the inverse of the diagonal."""
+    invert, project_block, d = _invert(dimension), _project_block(dimension), dimension
+
+    def filter_blocks(system: Any) -> None:
+        value, filtered, kinds = system.value, system.filtered, system.filter
+        for i in range(system.start.shape[0] - 1):
+            for k in range(system.start[i], system.diagonal[i] + 1):
+                j, at = system.column[k], k * (d * d)
+                if kinds[i] == FIXED or kinds[j] == FIXED:
+                    for a in range(d * d):
+                        filtered[at + a] = 0.0
+                elif kinds[i] == SLIDES or kinds[j] == SLIDES:
+                    project_block(system, i, j, at)
+                else:
+                    for a in range(d * d):
+                        filtered[at + a] = value[at + a]
+            own = system.diagonal[i] * (d * d)
+            if kinds[i] != FREE:
+                for a in range(d):
+                    filtered[own + a * d + a] += 1.0
+            if kinds[i] == SLIDES:
+                for a in range(d * d):
+                    filtered[own + a] -= system.projection[i * d * d + a]
+            invert(filtered, own, system.inverse, i * (d * d))
+
+    return filter_blocks
+
+
+@section
+def _apply_inverse(dimension: int) -> Callable[..., None]:
+    """Make `apply_inverse(system, vector, carried, out, i)`: out_i = (vector_i - carried_i) / D_i of agent i."""
+
+    def apply_inverse(system: Any, vector: Any, carried: Any, out: Any, i: Any) -> None:
+        inverse = system.inverse
+        if dimension == 2:
+            to, at = i * 2, i * 4
+            x, y = vector[to] - carried[to], vector[to + 1] - carried[to + 1]
+            out[to], out[to + 1] = inverse[at] * x + inverse[at + 1] * y, inverse[at + 2] * x + inverse[at + 3] * y
+        else:
+            to, at = i * 3, i * 9
+            x, y, z = vector[to] - carried[to], vector[to + 1] - carried[to + 1], vector[to + 2] - carried[to + 2]
+            out[to] = inverse[at] * x + (inverse[at + 1] * y + inverse[at + 2] * z)
+            out[to + 1] = inverse[at + 3] * x + (inverse[at + 4] * y + inverse[at + 5] * z)
+            out[to + 2] = inverse[at + 6] * x + (inverse[at + 7] * y + inverse[at + 8] * z)
+
+    return apply_inverse
+
+
+@section
+def _forward(dimension: int) -> Callable[..., None]:
+    """Make `forward(system, vector, carried)`: solve (D + L) y = vector in place, and write carried = L y.
+
+    D, L: the blocks of the filtered matrix on the diagonal and below it.
+    """
+    add_row, apply_inverse, d = _add_row(dimension), _apply_inverse(dimension), dimension
+
+    def forward(system: Any, vector: Any, carried: Any) -> None:
+        for i in range(system.start.shape[0] - 1):
+            a, b, c = add_row(system.filtered, system.column, vector, system.start[i], system.diagonal[i])
+            carried[i * d], carried[i * d + 1] = a, b
+            if d == 3:
+                carried[i * d + 2] = c
+            apply_inverse(system, vector, carried, vector, i)
+
+    return forward
+
+
+@section
+def _backward(dimension: int) -> Callable[..., None]:
+    """Make `backward(system, vector, out, carried)`: solve (D + L') out = vector, and write carried = L' out.
+
+    It reads the same blocks as `forward`, below the diagonal, which stay in the cache of the processor.
+    """
+    apply_inverse, d = _apply_inverse(dimension), dimension
+
+    def backward(system: Any, vector: Any, out: Any, carried: Any) -> None:
+        value, column, last = system.filtered, system.column, system.start.shape[0] - 2
+        for k in range(carried.shape[0]):
+            carried[k] = 0.0
+        for back in range(last + 1):
+            i = last - back
+            apply_inverse(system, vector, carried, out, i)
+            for k in range(np.uint64(system.start[i]), np.uint64(system.diagonal[i])):
+                if d == 2:
+                    x, y = out[i * 2], out[i * 2 + 1]
+                    to, at = np.uint64(column[k]) * np.uint64(2), k * np.uint64(4)
+                    carried[to] += value[at] * x + value[at + np.uint64(2)] * y
+                    carried[to + np.uint64(1)] += value[at + np.uint64(1)] * x + value[at + np.uint64(3)] * y
+                else:
+                    x, y, z = out[i * 3], out[i * 3 + 1], out[i * 3 + 2]
+                    to, at = np.uint64(column[k]) * np.uint64(3), k * np.uint64(9)
+                    carried[to] += value[at] * x + (value[at + np.uint64(3)] * y + value[at + np.uint64(6)] * z)
+                    carried[to + np.uint64(1)] += value[at + np.uint64(1)] * x + (
+                        value[at + np.uint64(4)] * y + value[at + np.uint64(7)] * z
+                    )
+                    carried[to + np.uint64(2)] += value[at + np.uint64(2)] * x + (
+                        value[at + np.uint64(5)] * y + value[at + np.uint64(8)] * z
+                    )
+
+    return backward
 
 
 @kernel
@@ -235,55 +371,30 @@ def _dot(a: Any, b: Any) -> float:
 
 
 @section
-def _begin(dimension: int) -> Callable[..., None]:
-    """Make `begin(system)`: invert the diagonal, solve agents that depend on no other, and set the first residual."""
-    invert, project, apply_blocks, d = _invert(dimension), _project(dimension), _apply_blocks(dimension), dimension
+def _set_residual(dimension: int) -> Callable[..., float]:
+    """Make `set_residual(system)`: replace `residual` by (D + L)^-1 of its filtered part; return its squared norm.
 
-    def begin(system: Any) -> None:
+    `weighted` becomes D times that. Agents that depend on no other are solved here, and have no residual.
+    """
+    project, apply_blocks, forward, d = _project(dimension), _apply_blocks(dimension), _forward(dimension), dimension
+
+    def set_residual(system: Any) -> float:
+        residual, weighted, size = system.residual, system.weighted, np.uint64(system.right.shape[0])
         for i in range(system.start.shape[0] - 1):
-            invert(system.value, system.diagonal[i] * (d * d), system.inverse, i * (d * d))
-            for k in range(d):
-                system.residual[i * d + k], system.change[i * d + k] = system.right[i * d + k], 0.0
-            project(system, system.residual, i)
-            apply_blocks(system.inverse, system.residual, system.direction, i)
-            project(system, system.direction, i)
-            alone = system.start[i + 1] - system.start[i] == 1
-            for k in range(d):
-                if alone and system.filter[i] != SLIDES:
-                    system.change[i * d + k] = system.direction[i * d + k]
-                    system.residual[i * d + k] = system.direction[i * d + k] = 0.0
+            project(system, residual, i)
+            if system.start[i + 1] - system.start[i] == 1:
+                apply_blocks(system.inverse, residual, system.step, i)
+                for k in range(d):
+                    system.change[i * d + k] += system.step[i * d + k]
+                    residual[i * d + k] = 0.0
+        for k in range(size):
+            weighted[k] = residual[k]
+        forward(system, residual, system.carried)
+        for k in range(size):
+            weighted[k] -= system.carried[k]
+        return _dot(residual, weighted)
 
-    return begin
-
-
-@entry_of
-def size_of(dimension: int) -> Callable[..., float]:
-    """Make `size(system)`: invert the diagonal; return the square of the norm of the residual of dv = 0."""
-    invert, project, apply_blocks, d = _invert(dimension), _project(dimension), _apply_blocks(dimension), dimension
-
-    def size(system: Any) -> float:
-        for i in range(system.start.shape[0] - 1):
-            invert(system.value, system.diagonal[i] * (d * d), system.inverse, i * (d * d))
-            for k in range(d):
-                system.residual[i * d + k] = system.right[i * d + k]
-            project(system, system.residual, i)
-            apply_blocks(system.inverse, system.residual, system.direction, i)
-        return _dot(system.residual, system.direction)
-
-    return size
-
-
-@entry_of
-def image_of(dimension: int) -> Callable[..., None]:
-    """Make `image(system)`: write A dv into `image`."""
-    multiply = _multiply(dimension)
-
-    def image(system: Any) -> None:
-        for k in range(system.right.shape[0]):
-            system.direction[k] = system.change[k]
-        multiply(system)
-
-    return image
+    return set_residual
 
 
 @section
@@ -292,30 +403,57 @@ def _descend(dimension: int) -> Callable[..., tuple[int, float]]:
 
     first, now: squares of norms, the first and that of the residual.
     """
-    multiply, project, apply_blocks = _multiply(dimension), _project(dimension), _apply_blocks(dimension)
+    forward, backward = _forward(dimension), _backward(dimension)
 
     def descend(system: Any, first: float, now: float, tolerance: float, most: int) -> tuple[int, float]:
-        count, size = system.start.shape[0] - 1, system.right.shape[0]
+        residual, weighted, direction, carried = system.residual, system.weighted, system.direction, system.carried
+        change, step, image, size = system.change, system.step, system.image, np.uint64(system.right.shape[0])
+        for k in range(size):
+            direction[k] = weighted[k]
         iterations = 0
         while now > tolerance * tolerance * first and iterations < most:
             iterations += 1
-            multiply(system)
-            for i in range(count):
-                project(system, system.image, i)
-            by = now / _dot(system.direction, system.image)
-            for k in range(np.uint64(size)):
-                system.change[k] += by * system.direction[k]
-                system.residual[k] -= by * system.image[k]
-            for i in range(count):
-                apply_blocks(system.inverse, system.residual, system.scaled, i)
-                project(system, system.scaled, i)
-            before, now = now, _dot(system.residual, system.scaled)
+            backward(system, direction, step, image)
+            forward(system, image, carried)
+            for k in range(size):
+                image[k] += step[k]
+            by = now / _dot(direction, image)
+            for k in range(size):
+                change[k] += by * step[k]
+                residual[k] -= by * image[k]
+                weighted[k] -= by * (direction[k] - carried[k])
+            before, now = now, abs(_dot(residual, weighted))  # below 0 by rounding alone
             share = now / before
-            for k in range(np.uint64(size)):
-                system.direction[k] = system.scaled[k] + share * system.direction[k]
+            for k in range(size):
+                direction[k] = weighted[k] + share * direction[k]
         return iterations, np.sqrt(now / first) if first != 0 else 0.0
 
     return descend
+
+
+@entry_of
+def size_of(dimension: int) -> Callable[..., float]:
+    """Make `size(system)`: return the square of the norm of the residual of dv = 0, with the filter of the system."""
+    filter_blocks, set_residual = _filter_blocks(dimension), _set_residual(dimension)
+
+    def size(system: Any) -> float:
+        filter_blocks(system)
+        for k in range(np.uint64(system.right.shape[0])):
+            system.residual[k], system.change[k] = system.right[k], 0.0
+        return set_residual(system)  # type: ignore[no-any-return]
+
+    return size
+
+
+@entry_of
+def image_of(dimension: int) -> Callable[..., None]:
+    """Make `image(system)`: write A dv into `image`, without the filter."""
+    multiply = _multiply(dimension)
+
+    def image(system: Any) -> None:
+        multiply(system, system.change, system.image)
+
+    return image
 
 
 @entry_of
@@ -323,23 +461,18 @@ def solve_from_of(dimension: int) -> Callable[..., tuple[int, float]]:
     """Make `solve_from(system, first, tolerance, most)`: as `solve`, from the change that `system` holds.
 
     The change must agree with what the filter prescribes; components that the filter removes stay as they are. This is
-    the modified method of Baraff and Witkin 1998, with the start of Ascher and Boxerman 2003. `size` must have been
-    called, and `first` is its result; if the residual of the start is larger, the criterion is relative to that.
+    the modified method of Baraff and Witkin 1998, with the start of Ascher and Boxerman 2003. first: a result of
+    `size`; if the residual of the start is larger, the criterion is relative to that.
     """
-    multiply, project, apply_blocks = _multiply(dimension), _project(dimension), _apply_blocks(dimension)
-    descend = _descend(dimension)
+    filter_blocks, set_residual = _filter_blocks(dimension), _set_residual(dimension)
+    multiply, descend = _multiply(dimension), _descend(dimension)
 
     def solve_from(system: Any, first: float, tolerance: float, most: int) -> tuple[int, float]:
-        for k in range(system.right.shape[0]):
-            system.direction[k] = system.change[k]
-        multiply(system)
-        for k in range(system.right.shape[0]):
+        filter_blocks(system)
+        multiply(system, system.change, system.image)
+        for k in range(np.uint64(system.right.shape[0])):
             system.residual[k] = system.right[k] - system.image[k]
-        for i in range(system.start.shape[0] - 1):
-            project(system, system.residual, i)
-            apply_blocks(system.inverse, system.residual, system.direction, i)
-            project(system, system.direction, i)
-        now = _dot(system.residual, system.direction)
+        now = set_residual(system)
         return descend(system, max(first, now), now, tolerance, most)  # type: ignore[no-any-return]
 
     return solve_from
@@ -349,15 +482,20 @@ def solve_from_of(dimension: int) -> Callable[..., tuple[int, float]]:
 def solve_of(dimension: int) -> Callable[..., tuple[int, float]]:
     """Make `solve(system, tolerance, most)`: write dv by filtered, preconditioned conjugate gradients.
 
-    It returns the number of iterations and the norm of the residual relative to the first one, in the norm r . P r of
-    the preconditioner P, the inverse blocks on the diagonal. The filter and the criterion are those of Baraff and
-    Witkin 1998, section 5.3. An iteration that finds a direction without curvature ends it: the relative norm is NaN.
+    It returns the number of iterations and the norm of the residual relative to that of dv = 0, in the norm r . P r of
+    the preconditioner P. The filter and the criterion are those of Baraff and Witkin 1998, section 5.3. P is symmetric
+    Gauss-Seidel: the inverse of (D + L) D^-1 (D + L'), with the blocks D on the diagonal of A and L below it. In the
+    form of Eisenstat 1981 the equations are those of (D + L') dv, multiplied by (D + L)^-1: an iteration then costs a
+    backward and a forward substitution, as much as a product with A. An iteration that finds a direction without
+    curvature ends it: the relative norm is NaN.
     """
-    begin, descend = _begin(dimension), _descend(dimension)
+    filter_blocks, set_residual, descend = _filter_blocks(dimension), _set_residual(dimension), _descend(dimension)
 
     def solve(system: Any, tolerance: float, most: int) -> tuple[int, float]:
-        begin(system)
-        first = _dot(system.residual, system.direction)
+        filter_blocks(system)
+        for k in range(np.uint64(system.right.shape[0])):
+            system.residual[k], system.change[k] = system.right[k], 0.0
+        first = set_residual(system)
         return descend(system, first, first, tolerance, most)  # type: ignore[no-any-return]
 
     return solve

@@ -215,10 +215,12 @@ def _system(every: NDArray[np.int64], agents: int, dimension: int) -> System:
     start = np.searchsorted(row, np.arange(agents + 1)).astype(np.int32)
     diagonal = np.searchsorted(every, np.arange(agents, dtype=np.int64) * (agents + 1)).astype(np.int32)
     square, size = agents * dimension**2, agents * dimension
-    right, change, residual, direction, image, scaled = (np.zeros(size) for _ in range(6))
+    right, change, residual, weighted, direction, step, image, carried = (np.zeros(size) for _ in range(8))
     return System(
-        start, column.astype(np.int32), diagonal, np.zeros(len(every) * dimension**2), right,
-        np.zeros(agents, np.int8), np.zeros(square), np.zeros(square), change, residual, direction, image, scaled,
+        start, column.astype(np.int32), diagonal, np.zeros(len(every) * dimension**2),
+        np.zeros(len(every) * dimension**2), right,
+        np.zeros(agents, np.int8), np.zeros(square), np.zeros(square), change, residual, weighted, direction, step,
+        image, carried,
     )  # fmt: skip
 
 
