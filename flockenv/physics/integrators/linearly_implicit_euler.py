@@ -16,8 +16,8 @@ __all__ = ["LinearlyImplicitEuler", "advance"]
 class LinearlyImplicitEuler(Integrator):
     """Linearly implicit Euler, order 1 (Baraff and Witkin 1998): one linear solve per step, x' = x + h (v + dv).
 
-    (M - h dF/dv - h^2 dF/dx) dv = h (F + h dF/dx v), by conjugate gradients with the inverse blocks of the diagonal as
-    preconditioner. The derivatives are those of springs and linear drag; other forces are taken at the beginning of the
+    (M - h dF/dv - h^2 dF/dx) dv = h (F + h dF/dx v), by conjugate gradients with symmetric Gauss-Seidel (Eisenstat 1981)
+    as preconditioner. The derivatives are those of springs and linear drag; other forces are taken at the beginning of the
     step, as in semi-implicit Euler, and limit dt as they do there. Particles held in place keep their velocity exactly,
     those of a `slide` constraint keep to its line or plane within the solve. Momentum is conserved to the tolerance.
 
@@ -34,7 +34,7 @@ class LinearlyImplicitEuler(Integrator):
 
     kind: Literal["linearly_implicit_euler"] = "linearly_implicit_euler"
     tolerance: float = Field(
-        default=1e-5, ge=1e-14, le=0.1, description="residual of the linear equations, relative to that of dv = 0"
+        default=1e-3, ge=1e-14, le=0.1, description="residual of the linear equations, relative to that of dv = 0"
     )
     most: int = Field(
         default=10_000, ge=1, description="largest number of iterations in a step; a world that needs more diverges"
