@@ -16,10 +16,11 @@ __all__ = ["LinearlyImplicitEuler", "advance"]
 class LinearlyImplicitEuler(Integrator):
     """Linearly implicit Euler, order 1 (Baraff and Witkin 1998): one linear solve per step, x' = x + h (v + dv).
 
-    (M - h dF/dv - h^2 dF/dx) dv = h (F + h dF/dx v), by conjugate gradients with symmetric Gauss-Seidel (Eisenstat 1981)
-    as preconditioner. The derivatives are those of springs and linear drag; other forces are taken at the beginning of the
-    step, as in semi-implicit Euler, and limit dt as they do there. Particles held in place keep their velocity exactly,
-    those of a `slide` constraint keep to its line or plane within the solve. Momentum is conserved to the tolerance.
+    (M - h dF/dv - h^2 dF/dx) dv = h (F + h dF/dx v), by conjugate gradients with symmetric Gauss-Seidel (Eisenstat
+    1981) as preconditioner. The derivatives are those of springs and linear drag; other forces are taken at the
+    beginning of the step, as in semi-implicit Euler, and limit dt as they do there. Particles held in place keep their
+    velocity exactly, those of a `slide` constraint keep to its line or plane within the solve. Momentum is conserved
+    to the tolerance.
 
     With `strain`, a step in which some triangle, or spring that neither yields nor breaks, changes its length by more
     than that share of its rest length is made again as two halves, and these likewise (section 6 there, but without a
