@@ -59,6 +59,7 @@ class _Part(NamedTuple):
     strain_change: Callable[..., tuple[float, int]] | None
     agent: NDArray[np.int32]  # (S, P)
     number: Doubles  # (S, C)
+    kept: NDArray[np.int64] | None  # (S,) see Stencils
     block: NDArray[np.int32]  # (S, P, P)
     local: Local
 
@@ -83,7 +84,8 @@ class LinearSolver:
                 assemble_of(law, d, each.agent.shape[1]),
                 None if strain is None else strain_change_of(strain, d, each.agent.shape[1]),
                 np.ascontiguousarray(each.agent, np.int32),
-                np.ascontiguousarray(each.number, float),
+                np.array(each.number, float),  # of its own: `kept` numbers are written into it
+                each.kept,
                 np.searchsorted(every, pair).astype(np.int32),
                 _local(each.agent.shape[1], d),
             )
@@ -116,6 +118,12 @@ class LinearSolver:
         base = self.system.projection.copy().reshape(scene.agents, scene.dimension, scene.dimension)
         base[self.kinds != SLIDES] = np.eye(scene.dimension)
         return ContactSolver(scene, find, rules, self.kinds, base.ravel())
+
+    def read_kept(self, state: State) -> None:
+        """Write the present rest lengths of springs that yield or break into the numbers of their stencils."""
+        for part in self.parts:
+            if part.kept is not None:
+                part.number[:, -1] = state.bonds[0, part.kept]
 
     def assemble(self, x: Doubles, v: Doubles, alive: NDArray[np.bool_], weights: tuple[float, float, float]) -> None:
         """Add the derivatives, times weights of dF/dx and dF/dv, to the matrix, and weighted dF/dx v to its right side.
@@ -187,6 +195,7 @@ class LinearSolver:
         np.copyto(system.filter, self.kinds)
         system.filter[~alive] = FIXED
         x, v = (np.ascontiguousarray(each[:, 0], float) for each in (state.x, state.v))
+        self.read_kept(state)
         self.assemble(x, v, alive, (-h * h, -h, h * h))
         carried = np.zeros((d, 0)) if flow is None else np.ascontiguousarray(flow[0].T, float)
         held = None

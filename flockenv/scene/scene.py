@@ -200,8 +200,7 @@ class Scene(Record):
         strain = getattr(self.integrator, "strain", 0)
         if strain > 0 and not any(effect.derivative and effect.strain_law for effect in self.effects):
             raise ValueError(
-                f"integrator.strain = {strain:g}: limits nothing in this scene; needs a membrane, or springs that "
-                "neither yield nor break"
+                f"integrator.strain = {strain:g}: limits nothing in this scene; needs a membrane or springs"
             )
 
     def _check_space(self) -> None:

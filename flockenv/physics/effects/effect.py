@@ -194,6 +194,7 @@ class Stencils(NamedTuple):
 
     agent: NDArray[np.int32]  # (S, P)
     number: NDArray[np.float64]  # (S, C)
+    kept: NDArray[np.int64] | None = None  # (S,) where in State.bonds the present value of the last number is
 
 
 @law

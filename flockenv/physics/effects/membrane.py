@@ -332,7 +332,7 @@ class Bending(Effect):
 
     def bonds(self, groups: Sequence[Any], dimension: int) -> Bonds:
         """Return four rows for every edge: for its ends, and for the opposite corners."""
-        agent, number = self.stencils(groups, dimension)
+        agent, number, _ = self.stencils(groups, dimension)
         orders = [(0, 1, 2, 3), (1, 0, 3, 2), (2, 0, 1, 3), (3, 1, 0, 2)]
         rows = np.concatenate([agent[:, order] for order in orders])
         role = np.repeat([0.0, 0.0, 1.0, 1.0], len(agent))
@@ -340,7 +340,7 @@ class Bending(Effect):
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats] | None:
         """Return bounds for the undeformed shape: row sums of k |g_p| |g_q|, over the masses."""
-        agent, number = self.stencils(groups, dimension)
+        agent, number, _ = self.stencils(groups, dimension)
         first, network, _ = network_of(groups, self.group, dimension)
         points, masses = network.rest_points(dimension), all_masses(groups, dimension)
         a, b, c, d = (points[agent[:, k] - first] for k in range(4))
@@ -358,7 +358,7 @@ class Bending(Effect):
 
     def potential(self, groups: Sequence[Any], state: State, offset: Any) -> Floats:
         """Return the sum of k (angle - rest)^2 / 2 over all edges, (B,) J."""
-        agent, number = self.stencils(groups, state.shape[2])
+        agent, number, _ = self.stencils(groups, state.shape[2])
         base = state.pos[:, agent[:, 0]]
         at = np.stack([offset(base, state.pos[:, agent[:, k]]) for k in range(4)], axis=2)  # (B, E, 4, 3)
         every = np.arange(4 * len(agent)).reshape(-1, 4)

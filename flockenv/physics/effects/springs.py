@@ -101,32 +101,36 @@ def _write_blocks(local: Any, per: float, stiffness: float, across: float, dampi
 
 @law
 def spring_derivative(local: Any, number: Any, s: int) -> None:
-    """Write the derivatives of a spring's forces on its two ends.
+    """Write the derivatives of a spring's forces on its two ends; the last number is the rest length L.
 
     dF_i/dx_j = k d d^T + k (1 - L / l) (1 - d d^T) and dF_i/dv_j = c d d^T. The second term is left out if the spring
-    is compressed, where it would be negative (Choi and Ko 2002), and so is the derivative of d in the damping.
+    is compressed, where it would be negative (Choi and Ko 2002), and so is the derivative of d in the damping. A broken
+    spring, of infinite rest length, has none.
     """
     _, per = _per_length(local)
-    across = number[s, 0] * max(1.0 - number[s, 2] * per, 0.0) if per > 0.0 or number[s, 2] == 0.0 else 0.0
-    _write_blocks(local, per, number[s, 0], across, number[s, 1])
+    rest = number[s, number.shape[1] - 1]
+    whole = 1.0 if rest < np.inf else 0.0
+    across = max(1.0 - rest * per, 0.0) if per > 0.0 or rest == 0.0 else 0.0
+    _write_blocks(local, per, whole * number[s, 0], number[s, 0] * across, whole * number[s, 1])
 
 
 @law
 def spring_strain(local: Any, number: Any, s: int) -> tuple[float, float]:
-    """Return the length of a spring over its rest length, twice; 0 without a rest length."""
+    """Return the length of a spring over its rest length, the last number, twice; 0 without one, or if it is broken."""
     length, _ = _per_length(local)
-    strain = length / number[s, 2] if number[s, 2] > 0.0 else 0.0
+    rest = number[s, number.shape[1] - 1]
+    strain = length / rest if 0.0 < rest < np.inf else 0.0
     return strain, strain
 
 
 @law
-def curved_derivative(local: Any, number: Any, s: int) -> None:
+def _write_curved(local: Any, number: Any, s: int, rest: float) -> None:
     """Write the derivatives of a spring with a strain-stress curve: k f' along it, and F / l across it if that is > 0.
 
     At a kink the slope is the one nearer to rest. Numbers are those of `curved_spring`.
     """
     length, per = _per_length(local)
-    extension, rest = length - number[s, 2], number[s, 2]
+    extension = length - rest
     slope, force = number[s, 0], number[s, 0] * extension
     for place in range(3, number.shape[1] - 1, 2):
         past = extension - rest * number[s, place]
@@ -136,6 +140,30 @@ def curved_derivative(local: Any, number: Any, s: int) -> None:
             force += number[s, place + 1] * side * past
     across = max(force * per, 0.0) if per > 0.0 else (slope if rest == 0.0 else 0.0)
     _write_blocks(local, per, slope, across, number[s, 1])
+
+
+@law
+def curved_derivative(local: Any, number: Any, s: int) -> None:
+    """Write the derivatives of a spring with a strain-stress curve and a constant rest length."""
+    _write_curved(local, number, s, number[s, 2])
+
+
+@law
+def lasting_curved_derivative(local: Any, number: Any, s: int) -> None:
+    """Write the same with the last number as rest length; none of a broken spring, whose rest length is infinite."""
+    rest = number[s, number.shape[1] - 1]
+    if rest < np.inf:
+        _write_curved(local, number, s, rest)
+    else:
+        _write_blocks(local, 0.0, 0.0, 0.0, 0.0)
+
+
+@law
+def curved_spring_strain(local: Any, number: Any, s: int) -> tuple[float, float]:
+    """Return the length of a spring with a curve over its constant rest length, twice; 0 without one."""
+    length, _ = _per_length(local)
+    strain = length / number[s, 2] if number[s, 2] > 0.0 else 0.0
+    return strain, strain
 
 
 @law
@@ -268,7 +296,6 @@ class Springs(Effect):
     break_strain: float | None = Field(
         default=None, gt=0, description="strain over the first rest length at which a spring breaks (default: never)"
     )
-    strain_law: ClassVar[Law | None] = spring_strain
     strengths: ClassVar[tuple[str, ...]] = ("stiffness", "shear", "bend", "damping", "ratio")
     conserves_momentum: ClassVar[bool] = True
 
@@ -313,8 +340,15 @@ class Springs(Effect):
 
     @property
     def derivative(self) -> Law | None:  # type: ignore[override]
-        """The law of the derivatives; None if springs yield or break, as their rest lengths change."""
-        return None if self.lasts else (spring_derivative if self.curve is None else curved_derivative)
+        """The law of the derivatives, by a curve or without, with a constant or a present rest length."""
+        if self.curve is None:
+            return spring_derivative
+        return lasting_curved_derivative if self.lasts else curved_derivative
+
+    @property
+    def strain_law(self) -> Law | None:  # type: ignore[override]
+        """The law of the strain, over the present rest length if springs yield or break."""
+        return spring_strain if self.lasts or self.curve is None else curved_spring_strain
 
     def numbers(self, dimension: int) -> int:
         """Return 3: stiffness, damping, rest length; 2 for each kink; and 1, the present length, if springs last."""
@@ -383,7 +417,7 @@ class Springs(Effect):
         bonds = self.bonds(groups, dimension)
         half = len(bonds.agent) // 2
         ends = np.stack([bonds.agent[:half], bonds.partner[:half, 0]], axis=1)
-        return Stencils(ends, bonds.number[:half])
+        return Stencils(ends, bonds.number[:half], None if bonds.kept is None else bonds.kept[:half])
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats] | None:
         """Return bounds by Gershgorin's circles: w^2 <= 2 sum k / m (k: steepest slope), and damping <= 2 sum c / m."""

@@ -22,8 +22,8 @@ class LinearlyImplicitEuler(Integrator):
     velocity exactly, those of a `slide` constraint keep to its line or plane within the solve. Momentum is conserved
     to the tolerance.
 
-    With `strain`, a step in which some triangle, or spring that neither yields nor breaks, changes its length by more
-    than that share of its rest length is made again as two halves, and these likewise (section 6 there, but without a
+    With `strain`, a step in which some triangle or spring changes its length by more than that share of its rest
+    length is made again as two halves, and these likewise (section 6 there, but without a
     step size that lasts): a sheet that is hit hard gets short steps as long as it needs them. Limits, constraints and
     space act once per step, at its end.
 
