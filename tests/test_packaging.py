@@ -255,9 +255,9 @@ def test_every_dependency_is_pinned() -> None:
 
 
 def bounds() -> dict[str, SpecifierSet]:
-    """Return the versions that the package and its extras allow, without tools and what only documents need."""
-    extras = PROJECT["optional-dependencies"]
-    lines = [line for name in ("train", "render", "play", "test") for line in extras[name]] + PROJECT["dependencies"]
+    """Return the versions that the package and its extras allow, without tools."""
+    extras, names = PROJECT["optional-dependencies"], ("train", "render", "play", "video", "parquet", "docs", "test")
+    lines = [line for name in names for line in extras[name]] + PROJECT["dependencies"]
     wanted = map(Requirement, lines)
     return {each.name.lower(): each.specifier for each in wanted if each.name not in TOOLS}
 
