@@ -29,10 +29,10 @@ __all__ = ["draw", "errors"]
 
 SECONDS, EDGE, AIM = 1.0, 5.0, 0.01
 FRAMES = round(SECONDS / FRAME)
-STIFFNESS = (1e2, 1e4, 1e6, 1e8)  # N/m
-LINEAR = (1, 2, 4, 8, 16, 32, 64)  # steps in a frame
+STIFFNESS = (1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8)  # N/m
+LINEAR = (1, 2, 3, 4, 6, 8, 16, 32, 64)  # steps in a frame
 EXPLICIT = (1, 2, 4)  # steps in a frame, in units of the smallest stable number
-MOST = 100_000  # steps in a second, of the linearly implicit method too
+COLUMNS = 4  # of panels in the picture
 REFINED = 4
 LINES = {"linear": ("linearly implicit Euler", COLOURS[1]), "explicit": ("semi-implicit Euler", COLOURS[0])}
 
@@ -58,6 +58,10 @@ def _contestant(name: str, scene: Scene, steps: int) -> Contestant:
 
 def main(
     cells: Annotated[int, typer.Option(min=1, help="Cells along each side; 12: 169 particles.")] = 12,
+    stiffness: Annotated[list[float] | None, typer.Option(help="N/m; may be repeated. [1e2 to 1e8]")] = None,
+    steps: Annotated[
+        list[int] | None, typer.Option(min=1, help="Linearly implicit steps in a frame; may be repeated. [1 to 64]")
+    ] = None,
     picture: Annotated[str | None, typer.Option(metavar="X.png", help="Where to draw it. [not drawn]")] = None,
     quick: Quick = False,
     rounds: Rounds = None,
@@ -67,22 +71,21 @@ def main(
     path = valid_file(picture, (".png",), force=True) if picture is not None else None
     found: dict[float, list[Numbers]] = {}
     with Bench("cloth_error", quick, rounds, out, unit="s of the world per second", scale=1.0) as bench:
-        for stiffness in STIFFNESS:
-            shortest = substeps(cells, stiffness)
-            runs: list[tuple[str, Integrator, int]] = [("linear", LinearlyImplicitEuler(), n) for n in LINEAR]
+        for k in stiffness or STIFFNESS:
+            shortest = substeps(cells, k)
+            runs: list[tuple[str, Integrator, int]] = [("linear", LinearlyImplicitEuler(), n) for n in steps or LINEAR]
             runs += [("explicit", SemiImplicitEuler(), n * shortest) for n in EXPLICIT]
-            share = errors(cells, stiffness, [(method, steps) for _, method, steps in runs])
+            share = errors(cells, k, [(method, n) for _, method, n in runs])
             contestants = [
-                _contestant(f"{name} {steps}", sheet(cells, stiffness, method, FRAME / steps), steps)
-                for name, method, steps in runs
+                _contestant(f"{name} {n}", sheet(cells, k, method, FRAME / n), n) for name, method, n in runs
             ]
-            results = bench.race(f"k = {stiffness:g} N/m", contestants, baseline="linear 1")
-            found[stiffness] = [
-                _point(name, steps, error, result)
-                for (name, _, steps), error, result in zip(runs, share, results, strict=False)
+            results = bench.race(f"k = {k:g} N/m", contestants, baseline=contestants[0].name)
+            found[k] = [
+                _point(name, n, error, result)
+                for (name, _, n), error, result in zip(runs, share, results, strict=False)
             ]
-            bench.note(f"k = {stiffness:g} N/m: {_cheapest(found[stiffness])}")
-        bench.extra["points"] = {f"{k:g}": points for k, points in found.items()}
+            bench.note(f"k = {k:g} N/m: {_cheapest(found[k])}")
+        bench.extra["points"] = {f"{each:g}": points for each, points in found.items()}
         bench.note(f"{(cells + 1) ** 2:,} particles, {SECONDS:g} s, float64, one thread")
     if path is not None:
         draw(path, found)
@@ -104,17 +107,21 @@ def _cheapest(points: Sequence[Numbers]) -> str:
 
 
 def draw(path: Path, found: dict[float, list[Numbers]]) -> None:
-    """Draw error against time, a panel for each stiffness and a line for each method."""
+    """Draw error against time, a panel for each stiffness and a line for each method; four panels in a row."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(3.0 * len(found), 3.4), facecolor="white", layout="constrained")
+    rows = -(-len(found) // COLUMNS)
+    figure = Figure(figsize=(2.8 * COLUMNS, 2.6 * rows), facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(1, len(found), sharex=True, sharey=True, squeeze=False)[0]
-    for axes, (stiffness, points) in zip(panels, found.items(), strict=True):
+    panels = figure.subplots(rows, COLUMNS, sharex=True, sharey=True, squeeze=False)
+    for axes, (stiffness, points) in zip(panels.flat, found.items(), strict=False):
         _draw_panel(axes, stiffness, points)
-    panels[0].set_ylabel("error after 1 s, share of the edge", color=FAINT)
-    panels[0].legend(frameon=False, fontsize=8, loc="lower left")
+    for axes in panels.flat[len(found) :]:
+        axes.set_axis_off()
+    figure.supylabel("error after 1 s, share of the edge", color=FAINT, fontsize=9)
+    figure.supxlabel("ms of computing per second; beside the ends of a line: steps in a frame", color=FAINT, fontsize=9)
+    figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside upper left", ncols=2, frameon=False)
     save_figure(path, figure, 100)
 
 
@@ -137,7 +144,6 @@ def _draw_panel(axes: Axes, stiffness: float, points: Sequence[Numbers]) -> None
                 color=colour,
             )
     axes.set_title(f"k = {stiffness:g} N/m", color=INK, fontsize=10)
-    axes.set_xlabel("ms of computing per second", color=FAINT)
     axes.grid(color=GRID, linewidth=0.6)
     axes.spines[["top", "right"]].set_visible(False)
 
