@@ -1,4 +1,4 @@
-"""All constraints: as values and YAML, the same bits in a batch, and no code or memory in a scene without them."""
+"""All constraints: as values and YAML, the same bits in a batch, and the same kernel in a plane as without them."""
 
 from __future__ import annotations
 
@@ -22,11 +22,9 @@ def test_a_constraint_is_a_value_that_pickle_and_yaml_keep(row: ConstraintRow) -
 
 
 @every_constraint
-def test_a_scene_without_a_constraint_has_no_code_or_memory_of_it(row: ConstraintRow) -> None:
+def test_a_constraint_does_not_change_the_kernel_in_a_plane(row: ConstraintRow) -> None:
     scene = constrained(row)
-    bare = scene.model_copy(update={"constraints": ()})
-    assert scene.parts == bare.parts  # all that a kernel depends on
-    assert scene.bytes_per_world() - bare.bytes_per_world() >= 8 * scene.agents * row.constraint.numbers(scene)
+    assert scene.parts == scene.model_copy(update={"constraints": ()}).parts  # all that a kernel depends on
 
 
 @pytest.mark.slow

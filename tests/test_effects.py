@@ -224,16 +224,14 @@ def singly(rows: Iterable[EffectRow], changes: tuple[str, ...] = ("",)) -> pytes
     """Parametrize over rows, dimensions and declared symmetries for single precision.
 
     Only rows that share a kernel run in 3-D or without the slow mark. float32 can break by a constant that promotes to
-    float64 or by a threshold; both are the same in 2-D and 3-D. Of most behaviours
-    only the formulas are tried in float32, by test_steering.py.
+    float64 or by a threshold; both are the same in 2-D and 3-D.
     """
     given = [
         pytest.param(row, d, *filter(None, [change]), marks=() if d == 2 and row.effect.kind in AMONG_ALL else SLOW)
         for row in rows
         for d in (2, 3)
         for change in changes
-        if (row.effect.kind in AMONG_ALL or (d == 2 and not row.effect.steering))
-        and (not change or change in row.obeys)
+        if (d == 2 or row.effect.kind in AMONG_ALL) and (not change or change in row.obeys)
     ]
     names = ("row", "dimension", "change") if any(changes) else ("row", "dimension")
     return pytest.mark.parametrize(names, given, ids=lambda value: getattr(value, "name", value))

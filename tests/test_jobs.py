@@ -190,7 +190,6 @@ def test_a_job_whose_process_is_killed_runs_again_and_nothing_else_is_lost(tmp_p
     assert len(list(tmp_path.glob("attempt-*"))) == 3
 
 
-@pytest.mark.slow
 def test_a_job_that_kills_its_process_three_times_fails_with_the_end_of_its_output(tmp_path: Path) -> None:
     jobs = [Job("killer", end_always, (), None), *numbers(3)]
     with pytest.raises(FailedJobsError, match=r"its process ended 3 times.*it wrote: the last words \(job killer"):

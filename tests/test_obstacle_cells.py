@@ -101,8 +101,8 @@ PLANE, SQUARE, CUBE = Plane(), Torus(size=(SIDE, SIDE)), Torus(size=(SIDE,) * 3)
     ("name", "space", "dimension", "dtype", "moving"),
     [
         ("rays", PLANE, 2, "float64", True),
-        pytest.param("all around", SQUARE, 2, "float32", True, marks=pytest.mark.slow),
-        pytest.param("hidden", Box(size=(SIDE, SIDE)), 2, "float64", False, marks=pytest.mark.slow),
+        ("all around", SQUARE, 2, "float32", True),
+        ("hidden", Box(size=(SIDE, SIDE)), 2, "float64", False),
     ],
 )
 def test_a_grid_of_obstacles_changes_no_bits(
@@ -117,7 +117,6 @@ def test_a_grid_of_obstacles_changes_no_bits(
     assert plain.parts.cells == {}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "space", "dimension", "dtype", "moving"),
     [

@@ -21,6 +21,9 @@ __all__ = [
     "strain_change_of",
 ]  # fmt: skip
 
+ROUNDING = 1e-20
+"""Largest negative square of a norm, relative to the first one, that rounding is taken to have caused."""
+
 FREE, FIXED, SLIDES = 0, 1, 2
 """Kinds of filters of an agent: none; its velocity is prescribed; a projection onto a line or a plane."""
 
@@ -422,7 +425,9 @@ def _descend(dimension: int) -> Callable[..., tuple[int, float]]:
                 change[k] += by * step[k]
                 residual[k] -= by * image[k]
                 weighted[k] -= by * (direction[k] - carried[k])
-            before, now = now, abs(_dot(residual, weighted))  # below 0 by rounding alone
+            before, now = now, _dot(residual, weighted)
+            if now < 0.0:  # by rounding, or because a block D is not positive definite
+                now = 0.0 if now > -ROUNDING * first else np.nan
             share = now / before
             for k in range(size):
                 direction[k] = weighted[k] + share * direction[k]

@@ -41,7 +41,7 @@ DEPENDENT = 1e-6
 class Impulses(NamedTuple):
     """The state of the contacts of N bodies during a step."""
 
-    active: Any  # (N, D) 1 or 0
+    active: Any  # (N, D) 1: in the solve; 2: adds nothing to those before it; 0: released, or none
     sticks: Any  # (N,) 1 if the body does not slide
     across: Any  # (N, D, D) the unit part of each active normal across those before it
     rub: Any  # (N, D) N s, friction of bodies that slide; part of the right-hand side
@@ -60,11 +60,11 @@ def begin(system: System, touching: Touching, impulses: Impulses, sticks: bool) 
 
 
 @kernel
-def _is_held(touching: Touching, impulses: Impulses, i: int) -> bool:
-    """Return True if body i has an active contact."""
+def _is_held(touching: Touching, impulses: Impulses, i: int, dormant: bool) -> bool:
+    """Return True if body i has a contact in the solve; dormant: or one that adds nothing to others."""
     held = False
     for k in range(touching.count[i]):
-        held = held or impulses.active[i, k] > 0
+        held = held or impulses.active[i, k] == 1 or (dormant and impulses.active[i, k] == 2)
     return held
 
 
@@ -72,7 +72,8 @@ def _is_held(touching: Touching, impulses: Impulses, i: int) -> bool:
 def _satisfy(system: System, touching: Touching, impulses: Impulses, base: Any, i: int, k: int) -> None:
     """Change the velocity of body i least, so that it satisfies contact k, and take its direction from the filter.
 
-    The normal is projected onto the directions in which the body may move; a contact that adds none is deactivated.
+    The normal is projected onto the directions in which the body may move. A contact that adds none is left out, until
+    another one of the body is released.
     """
     d, work, own, change = impulses.work.shape[0], impulses.work, i * impulses.work.shape[0] ** 2, system.change
     size, along = 0.0, 0.0
@@ -87,8 +88,8 @@ def _satisfy(system: System, touching: Touching, impulses: Impulses, base: Any, 
         impulses.across[i, k, a], touching.normal[i, k, a] = across, work[a]
         size += across * across
         along += work[a] * change[i * d + a]
+    impulses.active[i, k] = 2 if size < DEPENDENT else 1
     if size < DEPENDENT:
-        impulses.active[i, k] = 0
         return
     for a in range(d):
         change[i * d + a] += (touching.rise[i, k] - along) / size * impulses.across[i, k, a]
@@ -112,10 +113,7 @@ def impose(system: System, touching: Touching, impulses: Impulses, kinds: Any, b
         system.filter[i] = kinds[i]
         for k in range(i * d * d, (i + 1) * d * d):
             system.projection[k] = base[k]
-        if not _is_held(touching, impulses, i):
-            continue
-        system.filter[i] = FIXED if impulses.sticks[i] > 0 else SLIDES
-        if impulses.sticks[i] > 0:
+        if impulses.sticks[i] > 0 and _is_held(touching, impulses, i, True):
             for a in range(i * d, (i + 1) * d):
                 system.change[a] = 0.0
                 for b in range(d):
@@ -123,6 +121,8 @@ def impose(system: System, touching: Touching, impulses: Impulses, kinds: Any, b
         for k in range(touching.count[i]):
             if impulses.active[i, k] > 0:
                 _satisfy(system, touching, impulses, base, i, k)
+        if _is_held(touching, impulses, i, False):
+            system.filter[i] = FIXED if impulses.sticks[i] > 0 else SLIDES
 
 
 @kernel
@@ -136,7 +136,7 @@ def _release(touching: Touching, impulses: Impulses, mass: Any, sticky: bool, i:
     d, work, total, released = impulses.work.shape[0], impulses.work, 0.0, False
     for back in range(touching.count[i]):
         k = touching.count[i] - 1 - back
-        if impulses.active[i, k] == 0:
+        if impulses.active[i, k] != 1:
             continue
         push, lean = 0.0, 0.0
         for a in range(d):
@@ -206,7 +206,7 @@ def judge(
     """
     d, work, changed = impulses.work.shape[0], impulses.work, False
     for i in range(touching.count.shape[0]):
-        if not _is_held(touching, impulses, i):
+        if not _is_held(touching, impulses, i, False):
             continue
         for a in range(d):
             work[a] = 0.0
@@ -253,7 +253,7 @@ class ContactSolver:
         entry(begin)(system, self.touching, self.impulses, self.sticky or self.friction > 0)
         while True:
             entry(impose)(system, self.touching, self.impulses, self.kinds, self.base)
-            iterations, left = self.solve_from(system, first, tolerance, most)
+            iterations, left = self.solve_from(system, first, tolerance, most - total)
             total, turn = total + int(iterations), turn + 1
             if not left <= tolerance:
                 return total, left
@@ -265,4 +265,4 @@ class ContactSolver:
 
     def held(self) -> NDArray[np.bool_]:
         """Return which agents were in contact in the last step, (N,)."""
-        return self.impulses.active.any(axis=1)  # type: ignore[no-any-return]
+        return (self.impulses.active == 1).any(axis=1)  # type: ignore[no-any-return]

@@ -102,8 +102,9 @@ class Collisions(Constraint):
         return tuple(what for what, needed in needs if needed)
 
     def numbers(self, scene: SceneView) -> int:
-        """Return the memory of bodies, ends and meetings, in numbers per agent."""
-        return int(8 * scene.dimension + 12 + self.capacity * (14 + 4 * scene.dimension))
+        """Return the memory of bodies, ends and meetings, in numbers per agent; twice if the method solves contacts."""
+        once = int(8 * scene.dimension + 12 + self.capacity * (14 + 4 * scene.dimension))
+        return 2 * once if scene.integrator.linearises else once
 
     def settler(self, scene: SceneView) -> Settler:
         """Return a function that corrects a step."""

@@ -39,13 +39,13 @@ class FaceCollisions(Constraint):
     No point passes a face, and no edge another, of the same network or of two, along the straight lines from the start
     to the end of a step. Agents without faces are balls of their radius. Obstacles of any size are solid for faces,
     also if they move: circles, capsules, walls, blocks, meshes. Half-spaces and hollow shapes need `collisions` of
-    particles, listed before; other obstacles are refused. A face with a broken spring is no longer solid.
+    particles, listed before; other obstacles are refused. A face with a broken edge spring is no longer solid.
 
     What comes nearer than `thickness` is moved apart gently, and what approaches is stopped by an inelastic impulse
     with Coulomb friction, in passes over all that touch (Bridson, Fedkiw and Anderson 2002). What `passes` do not
     resolve moves as a rigid body in this step: an impact zone. A zone that holds a pinned particle or an obstacle
-    moves as that does. So nothing intersects after any step, and momentum is conserved. If given motions leave no
-    room, a warning says so. Work counters: face_passes, impacts, impact_zones, largest_zone.
+    moves as that does. So, if given motions leave room, nothing intersects after a step; otherwise a warning says so.
+    Momentum is conserved. Work counters: face_passes, impacts, impact_zones, largest_zone.
 
     After the impulses every contact has g >= 0 at the end of the step, g = w1 n . x1 + ... + w4 n . x4 - d: the
     distance of point and face or of two edges, less the sum d of their radii.

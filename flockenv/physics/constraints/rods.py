@@ -383,7 +383,7 @@ class Rods(Constraint):
     def numbers(self, scene: SceneView) -> int:
         """Return the memory of `Hold`, and of a copy of positions and velocities, in numbers per agent."""
         d = int(scene.dimension)
-        return 2 * d - (-(6 + d) * len(self.rod_pairs(scene).i) // int(scene.agents))
+        return 2 * d - (-(7 + 2 * d) * len(self.rod_pairs(scene).i) // int(scene.agents))
 
     def settler(self, scene: SceneView) -> Settler:
         """Return a function that corrects a step, with scratch memory of its own, and warns once of wrong lengths."""

@@ -17,19 +17,19 @@ class LinearlyImplicitEuler(Integrator):
     """Linearly implicit Euler, order 1 (Baraff and Witkin 1998): one linear solve per step, x' = x + h (v + dv).
 
     (M - h dF/dv - h^2 dF/dx) dv = h (F + h dF/dx v), by conjugate gradients with symmetric Gauss-Seidel (Eisenstat
-    1981) as preconditioner. The derivatives are those of springs and linear drag; other forces are taken at the
-    beginning of the step, as in semi-implicit Euler, and limit dt as they do there. Particles held in place keep their
-    velocity exactly, those of a `slide` constraint keep to its line or plane within the solve. Momentum is conserved
-    to the tolerance.
+    1981) as preconditioner. The derivatives are those of springs, membranes, bending and linear drag; other forces are
+    taken at the beginning of the step, as in semi-implicit Euler, and limit dt as they do there. Particles held in
+    place keep their velocity exactly, those of a `slide` constraint keep to its line or plane within the solve.
+    Momentum is conserved to the tolerance.
 
     With `strain`, a step in which some triangle or spring changes its length by more than that share of its rest
-    length is made again as two halves, and these likewise (section 6 there, but without a
-    step size that lasts): a sheet that is hit hard gets short steps as long as it needs them. Limits, constraints and
-    space act once per step, at its end.
+    length is made again as two halves, and these likewise (section 6 there, but without a step size that lasts): a
+    sheet that is hit hard gets short steps as long as it needs them. Limits, constraints and space act once per step,
+    at its end.
 
     In a scene with `collisions` the contacts with obstacles are part of the equations (section 5 there): a particle
-    that touches one, and does not bounce, keeps to its surface within the solve, and its neighbours move accordingly in
-    the same step. Contacts that would pull are released, and friction is Coulomb's; each change is another solve.
+    that touches one, and does not bounce, keeps to its surface within the solve, and its neighbours move accordingly
+    in the same step. Contacts that would pull are released, and friction is Coulomb's; each change is another solve.
     Impacts that bounce, and whatever the linear equations miss, are left to `collisions` after the solve.
     """
 
