@@ -20,7 +20,7 @@ import pytest
 from PIL import Image
 
 from flockenv.cli.films import Shutter, write_picture
-from flockenv.geometry.space import Torus
+from flockenv.geometry.space import Box, Torus
 from flockenv.model.appearance import Appearance
 from flockenv.model.networks import Blocks, Cloth
 from flockenv.model.snapshot import ROLES, Mark, Snapshot
@@ -112,6 +112,22 @@ def test_a_billboard_is_opaque_in_its_middle_and_fades_to_its_edge_and_the_neare
         assert draw(pair, 400)[y, x, channel] > 250
 
 
+def test_a_billboard_larger_than_the_picture_has_its_whole_radius() -> None:
+    soft = Appearance(form="billboard", colours=("#ff0000",), size=(30.0, 30.0))
+    view = view_of(shot(), 200, 1)
+    x, y = view.to_pixels(np.array((2.0, 5.0))).round().astype(int)
+    rows, columns = np.mgrid[math.ceil(view.top) : int(view.bottom), math.ceil(view.left) : int(view.right)]
+    part = ((columns - x) ** 2 + (rows - y) ** 2) / (30.0 * view.metre) ** 2
+    inside = np.s_[rows[0, 0] : rows[-1, 0] + 1, columns[0, 0] : columns[0, -1] + 1, 1]
+    small = soft.model_copy(update={"size": (1.0, 1.0)})
+    near, far, empty = (
+        draw(shot([at], looks=(look,), look=[0]), 200, 1)
+        for at, look in (((2.0, 5.0), soft), ((60.0, 60.0), soft), ((60.0, 60.0), small))
+    )
+    np.testing.assert_allclose(near[inside], empty[inside] * (1 - (1 - part) ** 2), atol=2)
+    np.testing.assert_array_equal(far, empty)
+
+
 def test_a_metaball_without_a_size_is_not_drawn() -> None:
     assert not reds([(5, 5)], size=(0.0, 0.0)).any()
 
@@ -154,6 +170,10 @@ def test_a_picture_in_few_colours_keeps_those_of_its_areas(tmp_path: Path) -> No
         assert file.mode == "P" and len(file.getcolors() or []) <= 64
         few = np.asarray(file.convert("RGB"))
     assert difference(few, whole).max() <= 14 and (difference(few, whole) > 0).mean() < 0.1
+    for colours in (15, 257, 64.0):
+        with pytest.raises(ValueError, match=f"^colours: must be an integer from 16 to 256, got {colours}$"):
+            write_png(tmp_path / "new.png", whole, colours)  # type: ignore[arg-type]
+    assert [path.name for path in tmp_path.iterdir()] == ["few.png"]
 
 
 # ---- snapshot
@@ -438,6 +458,18 @@ def test_strain_is_over_the_present_rest_lengths_and_leaves_broken_edges_out() -
     np.testing.assert_array_equal(scene.view.strain(state), 0.0)
 
 
+@pytest.mark.parametrize("at", [np.nan, np.inf, 1e200, 1.5e308])
+def test_a_run_that_diverged_is_drawn_in_the_colours_of_its_strain(at: float) -> None:
+    """Also the neighbours of an agent at a position that is not finite, whose strain has no finite value."""
+    scene, state = strained(Springs(stiffness=1.0), space=Box(size=(9, 9, 9)))
+    state.pos[0, 0, 0] = at
+    shown = scene.view.strain(state)
+    assert np.isfinite(shown).all() and shown[5] == pytest.approx(0.0)
+    snapshot = scene.snapshot(state)
+    assert snapshot.shade[1] == (0.0 if np.isnan(at) else 1.0) and snapshot.shade[5] == pytest.approx(0.0)
+    assert draw(snapshot, 100).shape[1] == 100
+
+
 def test_strain_takes_the_shortest_path_on_a_torus_and_needs_a_network() -> None:
     scene, state = strained(Springs(stiffness=1.0), space=Torus(size=(9, 9, 9)))
     state = state.with_motion(scene.space.wrap(state.pos - 0.5), state.vel)
@@ -481,6 +513,19 @@ def test_a_turned_snapshot_shows_a_side_and_keeps_distances_and_speeds() -> None
     oblique = turned(world, 35, 50)
     np.testing.assert_allclose(np.linalg.norm(np.diff(oblique.pos, axis=0)), 10.0)
     assert (np.abs(oblique.pos) <= oblique.high).all() and draw(oblique, 200).shape[1] == 200
+
+
+@pytest.mark.parametrize("camera", [(0, 90), (35, 90), (20, 60)])
+def test_no_trail_is_drawn_across_a_turned_torus(camera: tuple[float, float]) -> None:
+    """Seen from the side, a jump along y is one towards the viewer, which moves an agent by a pixel or two."""
+    for axis in range(3):
+        path = np.full((3, 3), 5.0)
+        path[:, axis] = (9.6, 0.4, 1.2)
+        path[:, (axis + 1) % 3] = (4.0, 4.4, 4.8)
+        film = [turned(shot([at], periodic=True), *camera) for at in path]
+        for trails in (film[:1], film[:2]):
+            plain, drawn = draw(film[len(trails)], 300), draw(film[len(trails)], 300, trails=trails)
+            assert (difference(plain, drawn) > 0).any() == (len(trails) == 2), "the second step only"
 
 
 def test_bonds_across_the_edge_of_a_torus_are_left_out_of_a_turned_picture() -> None:

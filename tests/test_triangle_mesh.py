@@ -18,6 +18,7 @@ from flockenv.model.group import Group
 from flockenv.model.spawn import Spawn
 from flockenv.physics.constraints import Collisions
 from flockenv.physics.effects import Gravity
+from flockenv.scene.mesh_file import obstacle_of, obstacle_scene_of
 from flockenv.scene.scene import Scene
 from flockenv.scene.yaml_io import dump_scene, load_scene
 from tests.catalogue import Array
@@ -219,6 +220,13 @@ def test_bad_meshes_raise_errors_of_one_line(points: Any, rows: Any, fields: dic
     assert "\n" not in str(caught.value)
 
 
+def test_vertices_without_a_triangle_do_not_enlarge_the_grid_or_the_bounds() -> None:
+    plain, spare = box(), mesh_of([*(CORNERS - 0.5), (9.0, 0.0, 0.0)], BOX, spacing=0.1)
+    assert spare.counts == plain.counts and spare.anchor == plain.anchor
+    np.testing.assert_array_equal(spare.extremes, plain.extremes)
+    np.testing.assert_array_equal(spare.distances, plain.distances)
+
+
 # --- files ----------------------------------------------------------------------------------------------------------
 
 
@@ -243,3 +251,13 @@ def test_the_command_makes_a_scene_of_a_file_or_refuses_it_by_its_name(
         assert main(["import-mesh", *arguments]) == 2
         printed = capsys.readouterr()
         assert line in printed.err and printed.err.count("\n") == 1 and printed.out == ""
+
+
+@pytest.mark.parametrize("sides", [(0.05, 1.0, 0.05), (1.0, 0.05, 0.05), (0.05, 0.05, 1.0), (1.0, 1.0, 1.0)])
+def test_balls_start_clear_above_an_obstacle_of_any_shape_and_some_fall_on_it(sides: tuple[float, ...]) -> None:
+    points = np.concatenate([CORNERS * sides + (7.0, 0.0, -3.0), [(99.0, 0.0, 0.0)]])  # the last has no triangle
+    scene = obstacle_scene_of(obstacle_of(points, BOX, spacing=0.02))
+    pos, radius = scene.start(0).pos[0], scene.groups[0].widest
+    assert len(pos) == 20 and (pos[:, 1] > sides[1] + radius).all()
+    beyond = np.maximum(np.abs(pos - points[:8].mean(axis=0))[:, [0, 2]] - np.array(sides)[[0, 2]] / 2, 0.0)
+    assert (np.linalg.norm(beyond, axis=1) < radius).sum() >= 2

@@ -71,8 +71,8 @@ class Appearance(Record):
         value = {"age": age, "speed": speed, "strain": shown, "inner": shown}.get(self.by or "")
         if value is None:
             return np.zeros(len(age))
-        value = np.nan_to_num(value, posinf=self.over[1])
-        return np.asarray(np.clip((value - self.over[0]) / (self.over[1] - self.over[0]), 0.0, 1.0))
+        value = np.clip(np.nan_to_num(value), *self.over)  # first, so that no difference overflows
+        return np.asarray((value - self.over[0]) / (self.over[1] - self.over[0]))
 
     @property
     def reads_scene(self) -> bool:

@@ -10,7 +10,7 @@ from PIL import Image
 
 from flockenv.model.snapshot import Floats, Snapshot
 from flockenv.render.palette import PAPER, ROLE_COLOURS, rgb
-from flockenv.render.view import View
+from flockenv.render.view import FARTHEST, View
 
 __all__ = ["draw_faces"]
 
@@ -30,9 +30,10 @@ def draw_faces(canvas: Image.Image, view: View, snapshot: Snapshot, height: Floa
     faces = faces[(snapshot.alive & snapshot.visible)[faces].all(axis=1)]
     if not len(faces):
         return
-    corners = snapshot.pos[faces]
+    extent = snapshot.high - snapshot.low
+    reach = FARTHEST * extent  # as of points in pixels, so that no normal of a run that diverged overflows
+    corners = np.clip(snapshot.pos[faces], snapshot.low - reach, snapshot.high + reach)
     if snapshot.periodic:
-        extent = snapshot.high - snapshot.low
         corners = corners - extent * np.rint((corners - corners[:, :1]) / extent)
     spots, colours = view.to_pixels(corners), _colours(snapshot, faces, corners, height[faces].mean(axis=1))
     depth = corners[..., 2] if snapshot.dimension == 3 else np.zeros(faces.shape)

@@ -29,6 +29,8 @@ MOST_FPS: Final = 50.0
 """Most frames per second: viewers replace delays shorter than 2/100 s by 10/100 s."""
 
 _MOST_SIDE: Final = 65535
+#: Least and most colours of a PNG that is reduced.
+_COLOURS: Final = (16, 256)
 #: Numbers of colours of a frame, the first that is enough, and how Pillow chooses them. The next index is that of
 #: pixels that are as in the frame before (transparent): with 63 colours the table has a quarter of the size.
 _PALETTES: Final = ((63, Image.Quantize.MAXCOVERAGE), (255, Image.Quantize.MEDIANCUT))
@@ -76,8 +78,10 @@ def write_png(path: str | os.PathLike[str], frame: Pixels, colours: int | None =
     """Write one frame, (H, W, 3) uint8, as PNG; the file is written completely or not at all.
 
     colours: reduce the picture to this many, 16 to 256, which makes drawings a third as large (default: all).
+    Raises ValueError or TypeError for colours out of range, or for another frame, before anything is written.
     """
     _check_frame(frame, "frame")
+    _check_colours(colours)
     picture = Image.fromarray(frame)
     if colours is not None:
         picture = _reduced(picture, colours)
@@ -125,6 +129,13 @@ def _check_fps(fps: object) -> None:
         raise TypeError(f"fps: must be a number, got {fps!r}")
     if not (math.isfinite(fps) and 0.0 < fps <= MOST_FPS):
         raise ValueError(f"fps: must be above 0 and at most {MOST_FPS:g} (GIF viewers slow down beyond), got {fps:g}")
+
+
+def _check_colours(colours: object) -> None:
+    low, high = _COLOURS
+    if colours is None or (isinstance(colours, int) and low <= colours <= high):
+        return
+    raise ValueError(f"colours: must be an integer from {low} to {high}, got {colours!r}")
 
 
 def _check_frame(frame: object, name: str, like: Image.Image | None = None) -> None:

@@ -42,6 +42,9 @@ Pixels = NDArray[np.uint8]
 _PAPER, _INK, _FAINT, _GOAL = (PAPER[part][0] for part in ("paper", "ink", "faint", "goal"))
 _SIZES: Final = (64, 4096)
 _SCALES: Final = (1, 4)
+#: Largest radius, px, of billboards whose coverage is cached, and rows of larger ones that are computed at a time.
+_LARGEST_KEPT: Final = 64
+_ROWS: Final = 64
 #: Roles whose dead agents are drawn as crosses; those of other roles are empty slots, which are not drawn.
 _CROSSED: Final = ("pursuer", "evader", "learner")
 
@@ -56,7 +59,7 @@ def draw(
     of its role. Agents with bonds are dots, and bonds are thin lines behind them; sheets and bodies are shaded faces
     instead, whose back has another colour. 3-D scenes are seen from above, others by `turned`: near agents are larger,
     and drawn last. An agent with an appearance is drawn as a point, disc, polygon, metaball or billboard, whose colour
-    may show its age or speed; a face has the colour of its first corner.
+    may show its age, speed, strain or an inner state; a face has the colour of its first corner.
 
     trails: earlier snapshots of the same world, oldest first. The path of each agent without bonds is drawn behind it;
     of an agent with an appearance, its last `trail` seconds. all_trails: False: only of agents with an appearance.
@@ -446,7 +449,14 @@ def _lacks_look(snapshot: Snapshot) -> NDArray[np.bool_]:
 
 def _is_continuous(view: View, spots: Floats, path: Sequence[Snapshot]) -> NDArray[np.bool_]:
     """Return True for slots with the same agent in two successive snapshots, and no jump between, (T - 1, N) bool."""
-    small = np.abs(np.diff(spots, axis=0)) < JUMP * np.array([view.right - view.left, view.bottom - view.top])
+    box = path[-1].box
+    if box is None:
+        small = np.abs(np.diff(spots, axis=0)) < JUMP * np.array([view.right - view.left, view.bottom - view.top])
+    else:  # of a world that was turned: a jump along any of its three axes, also towards the viewer
+        axes = box[1:] - box[0]
+        with np.errstate(over="ignore", invalid="ignore"):  # of bodies that diverged, which are not drawn
+            step = np.diff(np.stack([each.pos for each in path]), axis=0) @ axes.T
+        small = np.abs(step) < JUMP * (axes**2).sum(axis=1)
     same = np.stack([before.is_same(after) for before, after in itertools.pairwise(path)])
     return np.asarray(small.all(axis=2) & same)
 
@@ -489,17 +499,36 @@ def _draw_look(
         corners = [p for a, b in look.vertices for p in (x + reach * (a * c - b * s), y - reach * (a * s + b * c))]
         pen.polygon(corners, fill=fill)
     elif look.form == "billboard":
-        mask = _soft_disc(min(max(1, round(reach)), view.width), fill[3])
-        canvas.paste(fill[:3], (round(x) - mask.width // 2, round(y) - mask.height // 2), mask)
+        _draw_billboard(canvas, round(x), round(y), max(1, round(reach)), fill)
     else:
         _draw_disc(pen, x, y, max(reach, view.width * POINT) if look.form == "point" else reach, fill)
 
 
+def _draw_billboard(canvas: Image.Image, x: int, y: int, radius: int, fill: tuple[int, int, int, int]) -> None:
+    """Draw a soft disc around a pixel; of a large one only the part in the picture, some rows at a time."""
+    if radius <= _LARGEST_KEPT:
+        canvas.paste(fill[:3], (x - radius, y - radius), _soft_disc(radius, fill[3]))
+        return
+    left, right = max(x - radius, 0), min(x + radius + 1, canvas.width)
+    first, last = max(y - radius, 0), min(y + radius + 1, canvas.height)
+    if left >= right:
+        return
+    for top in range(first, last, _ROWS):
+        rows = np.arange(top, min(top + _ROWS, last))
+        mask = _coverage((np.arange(left, right) - x) / radius, (rows - y) / radius, fill[3])
+        canvas.paste(fill[:3], (left, top), mask)
+
+
 @lru_cache(maxsize=1024)
 def _soft_disc(radius: int, opacity: int) -> Image.Image:
-    """Return the coverage of a billboard, 0 to 255: opacity (1 - (d / r)^2)^2 at a distance d; radius r in px."""
+    """Return the coverage of a billboard; radius in px."""
     place = np.arange(-radius, radius + 1) / radius
-    inside = np.maximum(1.0 - place**2 - place[:, None] ** 2, 0.0)
+    return _coverage(place, place, opacity)
+
+
+def _coverage(x: Floats, y: Floats, opacity: int) -> Image.Image:
+    """Return the coverage of a billboard, 0 to 255: opacity (1 - d^2)^2 at a distance d; x, y and d in radii."""
+    inside = np.maximum(1.0 - x**2 - y[:, None] ** 2, 0.0)
     return Image.fromarray(np.rint(opacity * inside**2).astype(np.uint8))
 
 

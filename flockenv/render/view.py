@@ -10,13 +10,13 @@ import numpy as np
 
 from flockenv.model.snapshot import Floats, Snapshot
 
-__all__ = ["View", "view_of"]
+__all__ = ["FARTHEST", "View", "view_of"]
 
 _MARGIN: Final = 0.03
 _BAND: Final = 0.068
 #: Distance, in extents of the world, to which farther agents are moved: they are outside the picture, and no number
 #: overflows.
-_FARTHEST: Final = 5.0
+FARTHEST: Final = 5.0
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class View:
     def to_pixels(self, points: Floats) -> Floats:
         """Return the pixel coordinates, (..., 2), of points, (..., D) m; z is ignored."""
         low, high = np.array(self.low), np.array(self.high)
-        reach = _FARTHEST * (high - low)
+        reach = FARTHEST * (high - low)
         near = np.clip(points[..., :2], low - reach, high + reach)
         offset = (near - low) * self.metre
         return np.stack([self.left + offset[..., 0], self.bottom - offset[..., 1]], axis=-1)

@@ -126,13 +126,19 @@ def obstacle_of(
 
 
 def obstacle_scene_of(obstacle: TriangleMesh) -> Scene:
-    """Return a scene in which balls fall on an obstacle that stands on a floor, to be edited."""
-    low, high = np.array(obstacle.vertices).min(axis=0), np.array(obstacle.vertices).max(axis=0)
+    """Return a scene in which balls fall on an obstacle that stands on a floor, to be edited.
+
+    The balls start above its middle, in 3 x 3 columns, which have room for them however slim it is.
+    """
+    corners = np.array(obstacle.vertices)[np.array(obstacle.triangles)]  # not of vertices without a triangle
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     size = float((high - low).max())
-    radius, above = _brief(0.05 * size), (0.0, 0.1 * size, 0.0)
+    radius = _brief(0.05 * size)
+    spacing = 2.1 * radius
+    middle = ((low + high) / 2 * (1, 0, 1)) + (high + 0.1 * size) * (0, 1, 0)
     spawn = Spawn(
-        low=tuple(((low * (1, 0, 1) + high * (0, 1, 0)) + above).tolist()),
-        high=tuple((high + np.array(above) + (0.0, 0.5 * size, 0.0)).tolist()), spacing=2.1 * radius,
+        low=tuple((middle - spacing * np.array((1.6, 0.0, 1.6))).tolist()),
+        high=tuple((middle + spacing * np.array((1.6, 3.2, 1.6))).tolist()), spacing=spacing,
     )  # fmt: skip
     floor = HalfSpace(point=(0.0, float(low[1]), 0.0), direction=(0.0, 1.0, 0.0))
     return Scene(

@@ -81,7 +81,8 @@ class View:
     def strain(self, state: State, world: int = 0) -> NDArray[np.float64]:
         """Return the mean of |l / L - 1| over the edges of networks at each agent, (N,); 0 without one.
 
-        L: the present rest length; edges that are broken, or have none, do not count.
+        L: the present rest length; edges that are broken, or have none, do not count. Finite for any state: it is the
+        largest number where agents are infinitely far apart, and 0 where positions are NaN.
         """
         edges, rest, kept = self.scene.edges, self._rest, state.bonds.shape[1]
         if kept:
@@ -90,10 +91,11 @@ class View:
             rest = np.where((springs < kept) & (present > 0), present, rest)
         whole = (rest > 0) & np.isfinite(rest)
         ends, rest = edges[whole].T, rest[whole]
-        offset = self.scene.space.displacement(state.pos[world][ends[0]], state.pos[world][ends[1]])
-        strain = np.abs(np.linalg.norm(offset, axis=1) / rest - 1.0)
-        total, count = (np.bincount(ends.ravel(), w, self.scene.agents) for w in (np.tile(strain, 2), None))
-        return np.asarray(total / np.maximum(count, 1))
+        with np.errstate(over="ignore", invalid="ignore"):  # of runs that diverged
+            offset = self.scene.space.displacement(state.pos[world][ends[0]], state.pos[world][ends[1]])
+            strain = np.abs(np.linalg.norm(offset, axis=1) / rest - 1.0)
+            total, count = (np.bincount(ends.ravel(), w, self.scene.agents) for w in (np.tile(strain, 2), None))
+            return np.nan_to_num(total / np.maximum(count, 1))
 
     @functools.cached_property
     def _rest(self) -> NDArray[np.float64]:

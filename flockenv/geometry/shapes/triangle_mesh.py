@@ -77,9 +77,9 @@ class TriangleMesh(GridShape):
 
     @functools.cached_property
     def _box(self) -> Floats:
-        """The lowest and the highest corner of the mesh, (2, 3) m."""
-        points = np.array(self.vertices)
-        return np.array([points.min(axis=0), points.max(axis=0)])
+        """The lowest and the highest corner of the triangles, (2, 3) m."""
+        corners = np.array(self.vertices)[self._rows]
+        return np.array([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))])
 
     @property
     def grid_spacing(self) -> float:
