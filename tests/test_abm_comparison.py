@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from release.abm.Flocking.flockenv.flocking import LARGE, SMALL, flocking_model, run_model
-from tests.catalogue import Array
+from tests.catalogue import Array, users_module
+
+ROOT = Path(__file__).parent.parent
 
 COHERE, SEPARATE, MATCH, SEPARATION = 0.03, 0.015, 0.05, 1.0
 
@@ -27,14 +30,16 @@ def declared(pos: Array, vel: Array, extent: float, visual_distance: float) -> t
 
 
 @pytest.mark.slow
-def test_a_step_is_that_of_the_declaration_for_all_birds_at_once() -> None:
-    scene = flocking_model(**SMALL)
-    state = scene.start(seed=3)
-    for _ in range(3):
-        pos, vel = declared(state.pos[0], state.vel[0], SMALL["extent"], SMALL["visual_distance"])
-        state = scene.step(state)
-        np.testing.assert_allclose(state.vel[0], vel, atol=1e-12)
-        np.testing.assert_allclose(state.pos[0], pos, atol=1e-10)
-    birds = np.array([*SMALL.values(), *LARGE.values()])
-    np.testing.assert_array_equal(birds, [200, 100, 5, 400, 150, 15])
-    assert run_model(scene, 0, worlds=2).tick.tolist() == [100, 100]
+def test_a_step_is_that_of_the_declaration_for_all_birds_at_once(tmp_path: Path) -> None:
+    text = (ROOT / "release" / "abm" / "Flocking" / "flockenv" / "flocking.py").read_text(encoding="utf-8")
+    with users_module(tmp_path, text, "declared_flocking") as model:
+        scene = model.flocking_model(**model.SMALL)
+        state = scene.start(seed=3)
+        for _ in range(3):
+            pos, vel = declared(state.pos[0], state.vel[0], model.SMALL["extent"], model.SMALL["visual_distance"])
+            state = scene.step(state)
+            np.testing.assert_allclose(state.vel[0], vel, atol=1e-12)
+            np.testing.assert_allclose(state.pos[0], pos, atol=1e-10)
+        birds = np.array([*model.SMALL.values(), *model.LARGE.values()])
+        np.testing.assert_array_equal(birds, [200, 100, 5, 400, 150, 15])
+        assert model.run_model(scene, 0, worlds=2).tick.tolist() == [100, 100]
