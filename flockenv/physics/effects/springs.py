@@ -115,21 +115,16 @@ def spring_derivative(local: Any, number: Any, s: int) -> None:
 
 
 @law
-def spring_strain(local: Any, number: Any, s: int) -> tuple[float, float]:
-    """Return the length of a spring over its rest length, the last number, twice; 0 without one, or if it is broken."""
-    length, _ = _per_length(local)
-    rest = number[s, number.shape[1] - 1]
-    strain = length / rest if 0.0 < rest < np.inf else 0.0
-    return strain, strain
-
-
-@law
-def _write_curved(local: Any, number: Any, s: int, rest: float) -> None:
+def curved_derivative(local: Any, number: Any, s: int) -> None:
     """Write the derivatives of a spring with a strain-stress curve: k f' along it, and F / l across it if that is > 0.
 
-    At a kink the slope is the one nearer to rest. Numbers are those of `curved_spring`.
+    At a kink the slope is the one nearer to rest. The last number is the rest length; a broken spring has none.
     """
     length, per = _per_length(local)
+    rest = number[s, number.shape[1] - 1]
+    if rest == np.inf:
+        _write_blocks(local, 0.0, 0.0, 0.0, 0.0)
+        return
     extension = length - rest
     slope, force = number[s, 0], number[s, 0] * extension
     for place in range(3, number.shape[1] - 1, 2):
@@ -143,26 +138,11 @@ def _write_curved(local: Any, number: Any, s: int, rest: float) -> None:
 
 
 @law
-def curved_derivative(local: Any, number: Any, s: int) -> None:
-    """Write the derivatives of a spring with a strain-stress curve and a constant rest length."""
-    _write_curved(local, number, s, number[s, 2])
-
-
-@law
-def lasting_curved_derivative(local: Any, number: Any, s: int) -> None:
-    """Write the same with the last number as rest length; none of a broken spring, whose rest length is infinite."""
-    rest = number[s, number.shape[1] - 1]
-    if rest < np.inf:
-        _write_curved(local, number, s, rest)
-    else:
-        _write_blocks(local, 0.0, 0.0, 0.0, 0.0)
-
-
-@law
-def curved_spring_strain(local: Any, number: Any, s: int) -> tuple[float, float]:
-    """Return the length of a spring with a curve over its constant rest length, twice; 0 without one."""
+def spring_strain(local: Any, number: Any, s: int) -> tuple[float, float]:
+    """Return the length of a spring over its rest length, the last number, twice; 0 without one, or if it is broken."""
     length, _ = _per_length(local)
-    strain = length / number[s, 2] if number[s, 2] > 0.0 else 0.0
+    rest = number[s, number.shape[1] - 1]
+    strain = length / rest if 0.0 < rest < np.inf else 0.0
     return strain, strain
 
 
@@ -296,6 +276,7 @@ class Springs(Effect):
     break_strain: float | None = Field(
         default=None, gt=0, description="strain over the first rest length at which a spring breaks (default: never)"
     )
+    strain_law: ClassVar[Law | None] = spring_strain
     strengths: ClassVar[tuple[str, ...]] = ("stiffness", "shear", "bend", "damping", "ratio")
     conserves_momentum: ClassVar[bool] = True
 
@@ -340,15 +321,8 @@ class Springs(Effect):
 
     @property
     def derivative(self) -> Law | None:  # type: ignore[override]
-        """The law of the derivatives, by a curve or without, with a constant or a present rest length."""
-        if self.curve is None:
-            return spring_derivative
-        return lasting_curved_derivative if self.lasts else curved_derivative
-
-    @property
-    def strain_law(self) -> Law | None:  # type: ignore[override]
-        """The law of the strain, over the present rest length if springs yield or break."""
-        return spring_strain if self.lasts or self.curve is None else curved_spring_strain
+        """The law of the derivatives, by a curve or without."""
+        return spring_derivative if self.curve is None else curved_derivative
 
     def numbers(self, dimension: int) -> int:
         """Return 3: stiffness, damping, rest length; 2 for each kink; and 1, the present length, if springs last."""
@@ -413,11 +387,14 @@ class Springs(Effect):
         return springs_before(groups[: self.group], dimension)
 
     def stencils(self, groups: Sequence[Any], dimension: int) -> Stencils:
-        """Return the two ends of every spring."""
+        """Return the two ends of every spring; the last number is the present rest length, and so it is if constant."""
         bonds = self.bonds(groups, dimension)
         half = len(bonds.agent) // 2
         ends = np.stack([bonds.agent[:half], bonds.partner[:half, 0]], axis=1)
-        return Stencils(ends, bonds.number[:half], None if bonds.kept is None else bonds.kept[:half])
+        number = bonds.number[:half]
+        if bonds.kept is None:
+            return Stencils(ends, np.concatenate([number, number[:, 2:3]], axis=1))
+        return Stencils(ends, number, bonds.kept[:half])
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[Floats, Floats] | None:
         """Return bounds by Gershgorin's circles: w^2 <= 2 sum k / m (k: steepest slope), and damping <= 2 sum c / m."""
