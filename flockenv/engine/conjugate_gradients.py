@@ -1,136 +1,24 @@
-"""Kernels of a linearly implicit step: the matrix in block compressed sparse rows, and conjugate gradients.
+"""Solution of the linear equations of a step by filtered, preconditioned conjugate gradients.
 
-The matrix A = M - h dF/dv - h^2 dF/dx has a block of D x D numbers for each pair of agents that depend on each other,
-row after row. A filter S projects the velocity change of each agent onto the directions in which it may move. One
-thread solves one world, in float64, and sums in one order: results do not depend on threads or batches.
+A filter S projects the velocity change of each agent onto the directions in which it may move. One thread solves one
+world, in float64, and sums in one order: results do not depend on threads or batches.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from flockenv.jit.decorators import Law, kernel
+from flockenv.engine.linear_equations import FIXED, FREE, SLIDES
+from flockenv.jit.decorators import kernel
 from flockenv.jit.section import entry_of, section
-from flockenv.maths.approximations import round_half_even
 
-__all__ = [
-    "FIXED", "FREE", "SLIDES", "Local", "System", "assemble_of", "image_of", "size_of", "solve_from_of", "solve_of",
-    "strain_change_of",
-]  # fmt: skip
+__all__ = ["image_of", "size_of", "solve_from_of", "solve_of"]
 
 ROUNDING = 1e-20
 """Largest negative square of a norm, relative to the first one, that rounding is taken to have caused."""
-
-FREE, FIXED, SLIDES = 0, 1, 2
-"""Kinds of filters of an agent: none; its velocity is prescribed; a projection onto a line or a plane."""
-
-
-class System(NamedTuple):
-    """The linear equations A dv = b of N agents with K blocks, and scratch memory."""
-
-    start: Any  # (N + 1,) int32, first block of each row
-    column: Any  # (K,) int32
-    diagonal: Any  # (N,) int32, block of each row on the diagonal
-    value: Any  # (K D D,)
-    filtered: Any  # (K D D,) S A S + 1 - S with the filter S; on and below the diagonal
-    right: Any  # (N D,) kg m/s, the right-hand side b
-    filter: Any  # (N,) FREE, FIXED or SLIDES
-    projection: Any  # (N D D,) of agents that slide
-    inverse: Any  # (N D D,) of the blocks on the diagonal
-    change: Any  # (N D,) m/s, the solution dv
-    residual: Any  # (N D,) this and the next five: see `_descend`
-    weighted: Any  # (N D,) D times the residual
-    direction: Any  # (N D,)
-    step: Any  # (N D,) the direction of dv
-    image: Any  # (N D,) of the direction
-    carried: Any  # (N D,) L times a part of the image
-
-
-class Local(NamedTuple):
-    """Scratch memory of one stencil of P agents."""
-
-    at: Any  # (P, D) m, from the first agent
-    vel: Any  # (P, D) m/s
-    by_position: Any  # (P D, P D) N/m, dF/dx
-    by_velocity: Any  # (P D, P D) kg/s, dF/dv
-
-
-@section
-def _gather(dimension: int, nodes: int) -> Callable[..., bool]:
-    """Make `gather(x, v, alive, agent, s, period, local)`: copy a stencil's motion; return True if all are alive."""
-    d = dimension
-
-    def gather(x: Any, v: Any, alive: Any, agent: Any, s: Any, period: Any, local: Any) -> Any:
-        living = True
-        for p in range(nodes):
-            living = living and alive[agent[s, p]]
-            for k in range(d):
-                off = x[k, agent[s, p]] - x[k, agent[s, 0]]
-                if period[k] > 0:
-                    off -= period[k] * round_half_even(off / period[k])
-                local.at[p, k], local.vel[p, k] = off, v[k, agent[s, p]]
-        return living
-
-    return gather
-
-
-@entry_of
-def assemble_of(derivative: Law, dimension: int, nodes: int) -> Callable[..., None]:
-    """Make `assemble(...)`: add wx dF/dx + wv dF/dv of the stencils of an effect to A, and w dF/dx v to b.
-
-    Arguments: x, v (D, N); alive (N,); agent (S, P), number (S, C) and block (S, P, P) of the stencils; period (D,) m,
-    0 = not periodic; the three weights; system; local.
-    """
-    gather, d = _gather(dimension, nodes), dimension
-
-    def assemble(
-        x: Any, v: Any, alive: Any, agent: Any, number: Any, block: Any, period: Any, by_x: float, by_v: float,
-        along: float, system: Any, local: Any,
-    ) -> None:  # fmt: skip
-        for s in range(agent.shape[0]):
-            if gather(x, v, alive, agent, s, period, local):
-                derivative(local, number, s)
-                for p in range(nodes):
-                    for q in range(nodes):
-                        base = block[s, p, q] * (d * d)
-                        for a in range(d):
-                            total = 0.0
-                            for c in range(d):
-                                slope = local.by_position[p * d + a, q * d + c]
-                                damp = local.by_velocity[p * d + a, q * d + c]
-                                system.value[base + a * d + c] += by_x * slope + by_v * damp
-                                total += slope * local.vel[q, c]
-                            system.right[agent[s, p] * d + a] += along * total
-
-    return assemble
-
-
-@entry_of
-def strain_change_of(strain: Law, dimension: int, nodes: int) -> Callable[..., tuple[float, int]]:
-    """Make `strain_change(x, y, v, alive, agent, number, period, local)`: the largest change from positions x to y.
-
-    It returns the change and the first agent of the stencil that has it, or 0 and -1. Arguments as for `assemble_of`.
-    """
-    gather = _gather(dimension, nodes)
-
-    def strain_change(
-        x: Any, y: Any, v: Any, alive: Any, agent: Any, number: Any, period: Any, local: Any
-    ) -> tuple[float, int]:
-        most, where = 0.0, -1
-        for s in range(agent.shape[0]):
-            if gather(x, v, alive, agent, s, period, local):
-                one, two = strain(local, number, s)
-                gather(y, v, alive, agent, s, period, local)
-                then_one, then_two = strain(local, number, s)
-                change = max(abs(then_one - one), abs(then_two - two))
-                if change > most:
-                    most, where = change, agent[s, 0]
-        return most, where
-
-    return strain_change
 
 
 @section
@@ -171,9 +59,9 @@ def _apply_blocks(dimension: int) -> Callable[..., None]:
         else:
             to, at = i * 3, i * 9
             x, y, z = vector[to], vector[to + 1], vector[to + 2]
-            out[to] = block[at] * x + block[at + 1] * y + block[at + 2] * z
-            out[to + 1] = block[at + 3] * x + block[at + 4] * y + block[at + 5] * z
-            out[to + 2] = block[at + 6] * x + block[at + 7] * y + block[at + 8] * z
+            out[to] = block[at] * x + (block[at + 1] * y + block[at + 2] * z)
+            out[to + 1] = block[at + 3] * x + (block[at + 4] * y + block[at + 5] * z)
+            out[to + 2] = block[at + 6] * x + (block[at + 7] * y + block[at + 8] * z)
 
     return apply_blocks
 
@@ -286,19 +174,12 @@ def _filter_blocks(dimension: int) -> Callable[..., None]:
 @section
 def _apply_inverse(dimension: int) -> Callable[..., None]:
     """Make `apply_inverse(system, vector, carried, out, i)`: out_i = (vector_i - carried_i) / D_i of agent i."""
+    apply_blocks = _apply_blocks(dimension)
 
     def apply_inverse(system: Any, vector: Any, carried: Any, out: Any, i: Any) -> None:
-        inverse = system.inverse
-        if dimension == 2:
-            to, at = i * 2, i * 4
-            x, y = vector[to] - carried[to], vector[to + 1] - carried[to + 1]
-            out[to], out[to + 1] = inverse[at] * x + inverse[at + 1] * y, inverse[at + 2] * x + inverse[at + 3] * y
-        else:
-            to, at = i * 3, i * 9
-            x, y, z = vector[to] - carried[to], vector[to + 1] - carried[to + 1], vector[to + 2] - carried[to + 2]
-            out[to] = inverse[at] * x + (inverse[at + 1] * y + inverse[at + 2] * z)
-            out[to + 1] = inverse[at + 3] * x + (inverse[at + 4] * y + inverse[at + 5] * z)
-            out[to + 2] = inverse[at + 6] * x + (inverse[at + 7] * y + inverse[at + 8] * z)
+        for k in range(i * dimension, (i + 1) * dimension):
+            out[k] = vector[k] - carried[k]
+        apply_blocks(system.inverse, out, out, i)
 
     return apply_inverse
 
@@ -436,16 +317,27 @@ def _descend(dimension: int) -> Callable[..., tuple[int, float]]:
     return descend
 
 
-@entry_of
-def size_of(dimension: int) -> Callable[..., float]:
-    """Make `size(system)`: return the square of the norm of the residual of dv = 0, with the filter of the system."""
+@section
+def _begin(dimension: int) -> Callable[..., float]:
+    """Make `begin(system)`: filter the matrix and set dv = 0; return the squared norm of the residual."""
     filter_blocks, set_residual = _filter_blocks(dimension), _set_residual(dimension)
 
-    def size(system: Any) -> float:
+    def begin(system: Any) -> float:
         filter_blocks(system)
         for k in range(np.uint64(system.right.shape[0])):
             system.residual[k], system.change[k] = system.right[k], 0.0
         return set_residual(system)  # type: ignore[no-any-return]
+
+    return begin
+
+
+@entry_of
+def size_of(dimension: int) -> Callable[..., float]:
+    """Make `size(system)`: return the square of the norm of the residual of dv = 0, with the filter of the system."""
+    begin = _begin(dimension)
+
+    def size(system: Any) -> float:
+        return begin(system)  # type: ignore[no-any-return]
 
     return size
 
@@ -494,13 +386,10 @@ def solve_of(dimension: int) -> Callable[..., tuple[int, float]]:
     backward and a forward substitution, as much as a product with A. An iteration that finds a direction without
     curvature ends it: the relative norm is NaN.
     """
-    filter_blocks, set_residual, descend = _filter_blocks(dimension), _set_residual(dimension), _descend(dimension)
+    begin, descend = _begin(dimension), _descend(dimension)
 
     def solve(system: Any, tolerance: float, most: int) -> tuple[int, float]:
-        filter_blocks(system)
-        for k in range(np.uint64(system.right.shape[0])):
-            system.residual[k], system.change[k] = system.right[k], 0.0
-        first = set_residual(system)
+        first = begin(system)
         return descend(system, first, first, tolerance, most)  # type: ignore[no-any-return]
 
     return solve

@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.engine.conjugate_gradients import FIXED, SLIDES, System, image_of, size_of, solve_from_of
+from flockenv.engine.conjugate_gradients import image_of, size_of, solve_from_of
+from flockenv.engine.linear_equations import FIXED, SLIDES, System
 from flockenv.jit.decorators import kernel
 from flockenv.jit.section import entry
 from flockenv.model.scene_view import SceneView

@@ -12,17 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.engine.conjugate_gradients import (
-    FIXED,
-    FREE,
-    SLIDES,
-    Local,
-    System,
-    assemble_of,
-    solve_of,
-    strain_change_of,
-)
+from flockenv.engine.conjugate_gradients import solve_of
 from flockenv.engine.linear_contacts import ContactSolver
+from flockenv.engine.linear_equations import FIXED, FREE, SLIDES, Local, System, assemble_of, strain_change_of
 from flockenv.model.scene_view import SceneView
 from flockenv.model.state import Floats, State
 from flockenv.physics.constraints import Collisions, Slide
