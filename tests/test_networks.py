@@ -12,8 +12,18 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from flockenv.model.finite_elements import contents
-from flockenv.model.networks import BEND, EDGE, SHEAR, AnyNetwork, Cloth, Jelly, Mesh, Network, Rope
-from flockenv.physics.effects import Springs
+from flockenv.model.networks import BEND, EDGE, SHEAR, AnyNetwork, Blocks, Cloth, Jelly, Mesh, Move, Network, Rope
+from flockenv.model.spawn import Spawn
+from flockenv.physics.effects import Drag, Springs
+from flockenv.physics.integrators import (
+    RK4,
+    DormandPrince,
+    ExponentialDrag,
+    ImplicitEuler,
+    Integrator,
+    LinearlyImplicitEuler,
+    SemiImplicitEuler,
+)
 from flockenv.scene import Group, Scene
 
 Floats = NDArray[np.float64]
@@ -27,6 +37,7 @@ NETWORKS: list[tuple[Network, int]] = [
     (Rope(links=5, length=2, bend=True, stretch=1.5), 3),
     (Rope(links=1, start=(1, 2), end=(4, 6)), 2),
     (Rope(links=6, start=(0, 0, 1), end=(1, 0, 1), length=2), 3),
+    (Rope(links=3, length=1, pinned=("start",), moves=(Move(particles=("end", 2), velocity=(1, 2)),)), 2),
     (Cloth(cells=(4, 3), sides=(2, 1)), 2),
     (Cloth(cells=(4, 3), sides=(2, 1), stretch=0.5, diagonals="parallel"), 3),
     (Cloth(cells=(1, 1), origin=(1, 2, 3), edges=TURNED[1:]), 3),
@@ -40,6 +51,13 @@ NETWORKS: list[tuple[Network, int]] = [
     (Mesh(vertices=((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)), tetrahedra=((0, 2, 1, 3),), stretch=2), 3),
     (Mesh(vertices=SQUARE), 2),
 ]
+
+
+def move(particle: int | str, *more: float) -> Move:
+    """Return a move of one particle at 1 m/s."""
+    return Move(particles=(particle,), velocity=(1.0, 0.0, *more))
+
+
 EVERY = pytest.mark.parametrize(("network", "dimension"), NETWORKS, ids=lambda value: getattr(value, "kind", value))
 
 
@@ -290,6 +308,41 @@ def test_pins_are_given_by_place_or_number(network: Network, pinned: tuple[Any, 
     assert pins.tolist() == held
 
 
+def test_particles_that_move_are_held_at_their_velocity() -> None:
+    """Whatever heading and speed the group begins with."""
+    moves = (Move(particles=("right",), velocity=(0.5, 0.25)), Move(particles=(6, 7), velocity=(0, 1)))
+    sheet = Cloth(cells=(2, 2), sides=(1, 1), pinned=("top_left", "bottom_left"), moves=moves[:1])
+    assert sheet.pins().tolist() == [0, 2, 5, 6, 8]
+    assert sheet.dimension == 2
+    group = Group(network=sheet, spawn=Spawn(heading=(1, 0), speed=(3, 3)))
+    vel = Scene(groups=(group,)).start(0).vel[0]
+    np.testing.assert_array_equal(vel[[0, 6]], 0)
+    np.testing.assert_array_equal(vel[[2, 5, 8]], [(0.5, 0.25)] * 3)
+    np.testing.assert_array_equal(vel[[1, 3, 4, 7]], [(3.0, 0.0)] * 4)
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        SemiImplicitEuler(),
+        LinearlyImplicitEuler(),
+        *(
+            pytest.param(m, marks=pytest.mark.slow)
+            for m in (RK4(), ImplicitEuler(), DormandPrince(), ExponentialDrag())
+        ),
+    ],
+    ids=lambda method: method.kind,
+)
+def test_a_moving_end_pulls_a_rope_and_keeps_its_velocity(method: Integrator) -> None:
+    """The forces at the end of a rope at rest: one is pinned, one moves, and the spring between has their distance."""
+    rope = Rope(links=2, length=2.0, pinned=("start",), moves=(Move(particles=("end",), velocity=(0.1, 0.02)),))
+    effects = (Springs(stiffness=50.0, damping=2.0), Drag(rate=0.1))
+    scene = Scene(groups=(Group(network=rope, mass=0.1),), effects=effects, integrator=method, dt=0.01)
+    end = scene.run(scene.start(0), 500).pos[0]
+    np.testing.assert_allclose(end[[0, 2]], [(0, 0), (2.5, 0.1)], atol=1e-12)
+    np.testing.assert_allclose(end[1], (1.25, 0.05), atol=2e-3)
+
+
 # --- meshes -----------------------------------------------------------------------------------------------------------
 
 
@@ -389,6 +442,13 @@ def test_rest_lengths_given_with_pairs_do_not_change_those_of_bending() -> None:
     (lambda: Rope(links=2, length=1).springs(4), "dimension = 4: must be 2 or 3"),
     (lambda: Rope(links=2, length=1).masses(0, 2), "total = 0"),
     (lambda: Rope(links=2, length=1).masses(float("nan"), 2), "total = nan"),
+    (lambda: Rope(links=2, length=1, moves=(move("ned"),)), "moves[0].particles[0] = 'ned': unknown, did you mean"),
+    (lambda: Rope(links=2, length=1, moves=(move("end"), move(2))), "moves[1].particles: particle 2 is held by"),
+    (lambda: Rope(links=2, length=1, moves=(move(0),), pinned=("start",)), "particle 0 is held by pinned, too"),
+    (lambda: Rope(links=2, length=1, moves=(move(0), move(1, 0.0))), "moves[1].velocity = (1.0, 0.0, 0.0) has 3"),
+    (lambda: Rope(links=2, end=(1, 0, 0), moves=(move(0),)), "moves[0].velocity = (1.0, 0.0) has 2 coordinates, end"),
+    (lambda: Group(network=Rope(links=2, length=1, moves=(move(0),)), max_speed=0.5), "1 m/s is more than the limit"),
+    (lambda: Blocks(sides=(1, 1), centres=((0, 0),), moves=(move(0),)), "moves: blocks move as a whole"),
     (lambda: Cloth(cells=(0, 1), sides=(1, 1)), "cells[0] = 0"),
     (lambda: Cloth(cells=(2, 2)), "sides or edges: give one of them"),
     (lambda: Cloth(cells=(2, 2), sides=(1, 0)), "sides[1] = 0"),

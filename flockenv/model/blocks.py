@@ -72,6 +72,8 @@ class Blocks(Network):
                     raise ValueError(f"{name}[{k}] = {one}: must have {2 * d - 3} numbers in {d} dimensions")
         if self.pinned:
             raise ValueError(f"pinned = {self.pinned}: blocks move as a whole; one that does not is an obstacle")
+        if self.moves:
+            raise ValueError("moves: blocks move as a whole; a solid that moves at a constant velocity is an obstacle")
         if self.stretch != 1 or self.lumping != "equal":
             name = "lumping" if self.stretch == 1 else "stretch"
             raise ValueError(f"{name} = {getattr(self, name)}: must be left out, since blocks are rigid and solid")

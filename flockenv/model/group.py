@@ -90,7 +90,20 @@ class Group(Record):
             raise ValueError(f"alive = {self.alive}: must be left out, since all particles of a network are alive")
         if self.alive is not None and self.alive > self.size:
             raise ValueError(f"alive = {self.alive}: at most its count, {self.size}, is allowed")
+        self._refuse_fast_moves()
         return self
+
+    def _refuse_fast_moves(self) -> None:
+        """Raise ValueError if particles of the network are held at a speed above the limit."""
+        if self.network is None or not self.network.moves:
+            return
+        limit = float(self.max_speeds.min())
+        for k, move in enumerate(self.network.moves):
+            speed = math.hypot(*move.velocity)
+            if speed > limit:
+                raise ValueError(
+                    f"network.moves[{k}].velocity = {move.velocity}: {speed:g} m/s is more than the limit, {limit:g}"
+                )
 
     @property
     def keeps_heading(self) -> bool:

@@ -16,7 +16,7 @@ from flockenv.core.record import Record
 from flockenv.model.finite_elements import contents
 
 __all__ = [
-    "BEND", "EDGE", "MOST", "SHEAR", "Network", "Springs", "check_rows", "element_edges", "keys_of", "orient",
+    "BEND", "EDGE", "MOST", "SHEAR", "Move", "Network", "Springs", "check_rows", "element_edges", "keys_of", "orient",
     "pairs_of", "springs_of",
 ]  # fmt: skip
 
@@ -53,6 +53,13 @@ class Springs(NamedTuple):
     role: NDArray[np.int8]  # (E,) EDGE, SHEAR or BEND
 
 
+class Move(Record):
+    """A constant velocity, on which some particles of a network are held: no force changes it."""
+
+    particles: tuple[Particle | Name, ...] = Field(min_length=1, description="names of places, or indices")
+    velocity: Point = Field(description="m/s")
+
+
 class Network(Record):
     """Particles joined to each other; each kind of network defines their positions and joints.
 
@@ -63,6 +70,7 @@ class Network(Record):
     pinned: tuple[Particle | Name, ...] = Field(
         default=(), description="particles held in place: names of places, or indices"
     )
+    moves: tuple[Move, ...] = Field(default=(), description="particles held at a constant velocity, from the start")
     stretch: float = Field(default=1.0, ge=1e-6, le=1e6, description="ratio of initial lengths to rest lengths")
     lumping: Literal["equal", "geometric"] = Field(
         default="equal", description="mass of each particle: equal, or by length, area or volume around it"
@@ -76,7 +84,23 @@ class Network(Record):
         self._refuse_mixture()
         self._refuse_shape()
         self._check_particles("pinned", self.pinned)
+        self._check_moves()
         return self
+
+    def _check_moves(self) -> None:
+        """Raise ValueError if a particle has two velocities, or one beside its pin."""
+        held = dict.fromkeys(self.particles("pinned", self.pinned).tolist(), "pinned")
+        for k, (name, _, who) in enumerate(self._moved()):
+            for one in who.tolist():
+                if one in held:
+                    raise ValueError(f"{name}: particle {one} is held by {held[one]}, too; it can have one velocity")
+                held[one] = f"moves[{k}]"
+
+    def _moved(self) -> Iterator[tuple[str, Move, Ints]]:
+        """Yield the moves, each with the name of its field and its particles."""
+        for k, move in enumerate(self.moves):
+            name = f"moves[{k}].particles"
+            yield name, move, self.particles(name, move.particles)
 
     def _check_particles(self, name: str, given: tuple[int | str, ...]) -> None:
         """Raise ValueError, with the field's name, on an unknown place or particle."""
@@ -90,7 +114,8 @@ class Network(Record):
 
     def _refuse_mixture(self) -> None:
         first: tuple[str, tuple[float, ...]] | None = None
-        for name, point in self._given_points():
+        velocities = ((f"moves[{k}].velocity", move.velocity) for k, move in enumerate(self.moves))
+        for name, point in itertools.chain(self._given_points(), velocities):
             first = first or (name, point)
             if len(point) != len(first[1]):
                 raise ValueError(
@@ -117,8 +142,9 @@ class Network(Record):
 
     @property
     def dimension(self) -> int | None:
-        """Dimension of the given points, 2 or 3; None if both are possible."""
-        return next((len(point) for _, point in self._given_points()), None)
+        """Dimension of the given points or velocities, 2 or 3; None if both are possible."""
+        given = itertools.chain((point for _, point in self._given_points()), (move.velocity for move in self.moves))
+        return next((len(vector) for vector in given), None)
 
     @property
     def places(self) -> tuple[str, ...]:
@@ -139,9 +165,12 @@ class Network(Record):
         return np.asarray(points if self.stretch == 1 else points[0] + (points - points[0]) / self.stretch)
 
     def velocities(self, dimension: int) -> Floats:
-        """Return the initial velocities of particles relative to that of the group, (n, D) m/s."""
+        """Return the initial velocities of particles, (n, D) m/s: relative to that of the group, unless held."""
         self._check_dimension(dimension)
-        return np.zeros((self.size, dimension))
+        out = np.zeros((self.size, dimension))
+        for _, move, who in self._moved():
+            out[who] = move.velocity
+        return out
 
     @abstractmethod
     def springs(self, dimension: int) -> Springs:
@@ -163,8 +192,9 @@ class Network(Record):
         """Raise ValueError, in one line, if triangles make up no sound surface in 3-D, or tetrahedra no sound body."""
 
     def pins(self) -> Ints:
-        """Return the pinned particles, (P,) ascending."""
-        return self.particles("pinned", self.pinned)
+        """Return the particles that no force moves: pinned ones, and those of `moves`; (P,) ascending."""
+        held = [self.particles("pinned", self.pinned), *(who for _, _, who in self._moved())]
+        return np.unique(np.concatenate(held)).astype(np.int32)
 
     def particles(self, name: str, given: tuple[int | str, ...]) -> Ints:
         """Return the particles that names of places and indices stand for, (P,) ascending, each once.

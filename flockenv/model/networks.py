@@ -27,6 +27,7 @@ from flockenv.model.network import (
     Floats,
     Ints,
     Length,
+    Move,
     Network,
     Particle,
     Point,
@@ -41,7 +42,8 @@ from flockenv.model.network import (
 from flockenv.model.triangles import dihedrals
 
 __all__ = [
-    "BEND", "EDGE", "MOST", "SHEAR", "AnyNetwork", "Blocks", "Cloth", "Jelly", "Mesh", "Network", "Rope", "Springs",
+    "BEND", "EDGE", "MOST", "SHEAR", "AnyNetwork", "Blocks", "Cloth", "Jelly", "Mesh", "Move", "Network", "Rope",
+    "Springs",
 ]  # fmt: skip
 
 

@@ -99,11 +99,12 @@ def _place_network(scene: SceneView, state: State, b: int, first: int, group: Gr
     assert group.network is not None
     slots = slice(first, first + group.size)
     state.pos[b, slots] = group.network.points(scene.dimension)
-    state.vel[b, slots] = group.network.velocities(scene.dimension)
+    velocities, held = group.network.velocities(scene.dimension), group.network.pins()
+    state.vel[b, slots] = velocities
     if group.spawn.heading is not None:
         heading = np.asarray(group.spawn.heading, float)
         state.vel[b, slots] += group.spawn.speed[0] * heading / np.linalg.norm(heading)
-        state.vel[b, first + group.network.pins()] = 0
+        state.vel[b, first + held] = velocities[held]
 
 
 def _clear_empty_slots(scene: SceneView, state: State) -> None:
