@@ -107,6 +107,24 @@ def test_orders_are_the_declared_ones_on_every_smooth_problem(name: str) -> None
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["bar", "sheet", "jelly", "drop"])
+def test_orders_are_the_declared_ones_for_bonds_finite_elements_and_liquids(name: str) -> None:
+    report = measure(one(name), methods_of(["semi_implicit_euler", "rk4"]), repetitions=0)
+    for curve in report.curves:
+        assert curve.order == pytest.approx(curve.declared, abs=0.25), curve.method
+
+
+@pytest.mark.slow
+def test_rigid_bodies_turn_to_order_2_under_every_method() -> None:
+    """Their constraint turns them after each step, whatever the method."""
+    report = measure(one("block"), methods_of(["semi_implicit_euler", "rk4"]), repetitions=0)
+    for curve in report.curves:
+        assert curve.order == pytest.approx(2, abs=0.1), curve.method
+    errors = [[point.error for point in curve.points] for curve in report.curves]
+    np.testing.assert_allclose(errors[0], errors[1], rtol=1e-3)
+
+
+@pytest.mark.slow
 def test_a_speed_limit_reduces_every_method_to_order_1() -> None:
     """The scene limits the speed after each step, outside the method.
 

@@ -1,5 +1,7 @@
 """The suite of benchmark problems: some with closed forms, and flocks, with smooth and non-smooth forces.
 
+Those of solids and liquids are in `solids`.
+
 Durations are not integer multiples of periods, at which semi-implicit Euler would seem to have order 2.
 """
 
@@ -32,6 +34,7 @@ from flockenv.physics.effects import (
 from flockenv.scene import Group, Scene
 from flockenv.studies.accuracy.paths import Floats
 from flockenv.studies.accuracy.problem import Exact, Problem
+from flockenv.studies.accuracy.solids import bar, block, drop, jelly, sheet
 
 __all__ = ["SUITE", "select_problems"]
 
@@ -263,6 +266,11 @@ SUITE: dict[str, Callable[[], Problem]] = {
     "tracer": tracer,
     "bounces": bounces,
     "rod": rod,
+    "bar": bar,
+    "sheet": sheet,
+    "jelly": jelly,
+    "block": block,
+    "drop": drop,
     "boids": boids,
     "boids_cone": boids_cone,
     "boids_limit": boids_limit,

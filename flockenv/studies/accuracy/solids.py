@@ -1,0 +1,101 @@
+"""Benchmark problems of solids and liquids: a bar, a sheet of triangles, an elastic cube, a free block, a drop."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from flockenv.model.blocks import Blocks
+from flockenv.model.networks import Cloth, Jelly, Rope
+from flockenv.model.spawn import Spawn
+from flockenv.physics.constraints import RigidBodies
+from flockenv.physics.effects import (
+    Bending,
+    Effect,
+    Elastic,
+    Gravity,
+    Membrane,
+    Pressure,
+    Springs,
+    SurfaceTension,
+    Viscosity,
+)
+from flockenv.scene import Group, Scene
+from flockenv.studies.accuracy.paths import Floats
+from flockenv.studies.accuracy.problem import Problem
+
+__all__ = ["bar", "block", "drop", "jelly", "sheet"]
+
+STEPS = tuple(2**k for k in range(6, 15))
+
+
+def _free(group: Group, *effects: Effect, **more: Any) -> Scene:
+    """Return a scene in 3-D of one group without obstacles."""
+    return Scene(dimension=3, groups=(group,), effects=effects, dt=1e-3, **more)
+
+
+def bar() -> Problem:
+    """Return a bar of 8 springs, 100 N/m, and masses of 0.1 kg in its first longitudinal mode, for 1.3 periods.
+
+    x_i = i L + a sin(i q) cos(w t), q = pi / (2 N + 1), w = 2 sqrt(k / m) sin(q / 2): a chain with one free end.
+    """
+    many, long, stiffness, mass, far = 8, 0.25, 100.0, 0.1, 0.1
+    index = np.arange(many + 1)
+    shape = far * np.sin(index * math.pi / (2 * many + 1))
+    w = 2 * math.sqrt(stiffness / mass) * math.sin(math.pi / (4 * many + 2))
+
+    def exact(t: float) -> tuple[Floats, Floats]:
+        still = np.zeros(many + 1)
+        x, v = long * index + shape * math.cos(w * t), -w * shape * math.sin(w * t)
+        return np.stack([x, still], axis=1), np.stack([v, still], axis=1)
+
+    rope = Rope(links=many, length=many * long, pinned=("start",))
+    scene = Scene(groups=(Group(network=rope, mass=mass),), effects=(Springs(stiffness=stiffness),))
+    return Problem.of(
+        scene, 1.3 * 2 * math.pi / w, STEPS, name="bar", title="Bar of 8 springs, 1.3 periods",
+        motion=exact(0.0), exact=exact,
+    )  # fmt: skip
+
+
+def sheet() -> Problem:
+    """Return a sheet of 18 triangles that swings down from one edge: stretch, shear, bending and damping."""
+    cloth = Cloth(cells=(3, 3), edges=((0.6, 0, 0), (0, 0.6, 0)), pinned=("top",))
+    scene = _free(
+        Group(network=cloth, mass=0.03), Membrane(stretch=40.0, shear=10.0, damping=0.001), Bending(stiffness=0.02),
+        Gravity(acceleration=(0.0, 0.0, -9.81)),
+    )  # fmt: skip
+    return Problem.of(scene, 0.7, STEPS, name="sheet", title="Sheet of 18 triangles that swings down")
+
+
+def jelly() -> Problem:
+    """Return a cube of 5 corotated tetrahedra that turns once a second, stretched by a fifth at the start."""
+    scene = _free(
+        Group(network=Jelly(cells=(1, 1, 1), sides=(1, 1, 1)), mass=0.1), Elastic(young=50.0, strain="corotated")
+    )
+    pos = (scene.start(0).pos[0] - 0.5) * (1.2, 1.0, 1.0)
+    vel = 2 * math.pi * np.stack([-pos[:, 1], pos[:, 0], 0 * pos[:, 0]], axis=1)
+    return Problem.of(scene, 0.7, STEPS, name="jelly", title="Jelly that spins, 0.7 turns", motion=(pos, vel))
+
+
+def block() -> Problem:
+    """Return a free rigid block that turns over: it is spun about its intermediate axis."""
+    blocks = Blocks(sides=(1, 2, 3), centres=((0, 0, 0),), spins=((0.05, 4, 0.02),))
+    scene = _free(Group(network=blocks, radius=0.05), constraints=(RigidBodies(),))
+    return Problem.of(scene, 3.0, STEPS, name="block", title="Free block that turns over")
+
+
+def drop() -> Problem:
+    """Return a drop of 24 agents, oblong at the start: pressure, viscosity and surface tension."""
+    near = np.stack(np.mgrid[:6, :4], axis=2).reshape(-1, 2).astype(float)
+    pos = near + 0.1 * np.sin(np.arange(48)).reshape(24, 2)
+    group = Group(count=24, spawn=Spawn(low=(0, 0), high=(1, 1)))
+    effects = (
+        Pressure(strength=0.75, density=1.0, radius=1.35),
+        Viscosity(viscosity=0.2, density=1.0, radius=2.4),
+        SurfaceTension(tension=3.0, density=1.0, radius=2.4),
+    )
+    scene = Scene(groups=(group,), effects=effects)
+    title = "Drop of 24 agents that becomes round"
+    return Problem.of(scene, 2.0, STEPS, name="drop", title=title, motion=(pos, 0 * pos))
