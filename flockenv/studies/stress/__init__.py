@@ -3,10 +3,10 @@
 from flockenv.studies.stress import CASES, run
 results = run(CASES, methods)
 
-Cases are functions from a method to a `Value`; see `bodies`, `bonded`, `dice`, `crowds`, `contacts`; for bodies that
-collide there is a case per response, see `impacts`, `heaps`, `gatherings`. An error that a case raises is also a
-verdict: a scene refused because its step must blow up, a simulation that diverges with a message. No case ends in NaN
-without one.
+Cases are functions from a method to a `Value`; see `bodies`, `bonded`, `sheets`, `dice`, `crowds`, `contacts`; for
+bodies that collide there is a case per response, see `impacts`, `heaps`, `gatherings`. An error that a case raises is
+also a verdict: a scene refused because its step must blow up, a simulation that diverges with a message. No case ends
+in NaN without one.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from flockenv.studies.stress.gatherings import GATHERINGS
 from flockenv.studies.stress.heaps import HEAPS
 from flockenv.studies.stress.impacts import IMPACTS
 from flockenv.studies.stress.runner import fingerprint, run, usual_methods
+from flockenv.studies.stress.sheets import SHEETS
 from flockenv.studies.trial_log import VERDICTS, Case, Finding, Results, Value, select_cases, trials
 
 __all__ = [
@@ -36,5 +37,5 @@ __all__ = [
     "usual_methods",
 ]  # fmt: skip
 
-CASES: tuple[Case, ...] = (*BODIES, *BONDED, *DICE, *CROWDS, *CONTACTS, *IMPACTS, *HEAPS, *GATHERINGS)
+CASES: tuple[Case, ...] = (*BODIES, *BONDED, *SHEETS, *DICE, *CROWDS, *CONTACTS, *IMPACTS, *HEAPS, *GATHERINGS)
 """Every hard case, by kind of scene."""
