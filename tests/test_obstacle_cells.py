@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,10 @@ import pytest
 from flockenv.behaviours import AvoidObstacles, FollowWall, ForceField, Hide, ObstacleRepulsion, Separation, Whiskers
 from flockenv.engine import obstacle_sets
 from flockenv.geometry.shapes import Block, Capsule, Circle, Shape, Sway
+from flockenv.geometry.shapes.cells import cells_of, count_of, list_of, span_of
 from flockenv.geometry.space import Box, Plane, Torus
+from flockenv.jit.decorators import kernel
+from flockenv.jit.section import entry
 from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import ObstacleContact
 from flockenv.physics.effects.effect import Effect
@@ -193,3 +197,32 @@ def test_a_few_obstacles_have_no_grid(form: str, dimension: int, fewest: int) ->
         return scene_of(PLANE, EFFECTS["rays"], "float64", (one,) * count).parts.gridded_forms
 
     assert (forms(fewest - 1), forms(fewest)) == ((), (form,))
+
+
+@kernel
+def listed(table: Any, places: Any, reach: float) -> int:
+    """Return the number of entries that a search within `reach` reads, for all places together, (N, 2) m."""
+    found = 0
+    for i in range(places.shape[0]):
+        x, room = (places[i, 0], places[i, 1]), (reach, reach)
+        span = span_of(table, 0, x, room)
+        for k in range(count_of(span)):
+            begin, end = list_of(table, 0, x, span, k)
+            found += (end - begin) // 5
+    return found
+
+
+@pytest.mark.parametrize("form", ["circle", "block"])
+def test_a_search_reads_as_many_obstacles_among_ten_thousand_as_among_a_hundred(form: str) -> None:
+    """One per square metre, whatever their number: the cost of avoiding or hitting them is that of those nearby."""
+    rng, read = np.random.default_rng(1), {}
+    for count in (100, 1_000, 10_000):
+        side = math.sqrt(count)
+        shapes: list[Shape] = [
+            Circle(centre=at, radius=0.2) if form == "circle" else Block(centre=at, size=(0.3, 0.3))
+            for at in map(tuple, rng.uniform(0, side, (count, 2)).tolist())
+        ]
+        places = rng.uniform(2, side - 2, (1_000, 2))
+        read[count] = entry(listed)(cells_of(shapes, range(count)), places, 1.0) / 1_000
+    assert 4 < read[100] < 20  # of them 4 to 7 in reach
+    assert read[1_000] < 1.5 * read[100] and read[10_000] < 1.5 * read[100]
