@@ -185,10 +185,17 @@ class Stepper:
         """Return the contacts of rigid bodies in the last step of one world by this thread."""
         return next(each.found() for each in self._settlers(1)[0] if isinstance(each, BodySettler))
 
-    def rod_forces(self) -> RodForces:
-        """Return the forces of all rods in the last step of one world by this thread; constraints one after another."""
-        found = [each.found() for each in self._settlers(1)[0] if isinstance(each, RodSettler)]
-        return RodForces(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+    def rod_forces(self, step: Callable[[], object]) -> RodForces:
+        """Return the forces of all rods in a step of one world, which `step` makes; constraints one after another."""
+        settlers = [each for each in self._settlers(1)[0] if isinstance(each, RodSettler)]
+        for each in settlers:
+            each.rods.records[0] = True
+        try:
+            step()
+        finally:
+            for each in settlers:
+                each.rods.records[0] = False
+        return RodForces(*(np.concatenate(parts) for parts in zip(*(each.found() for each in settlers), strict=True)))
 
     def _step_by_kernel(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
         """Step in place by the kernel alone, on all threads in use.

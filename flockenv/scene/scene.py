@@ -606,8 +606,7 @@ class Scene(Record):
         """Return the forces of rods and ropes in the step of one world that begins at a state."""
         if not any(isinstance(each, Rods) for each in self.constraints):
             raise ValueError("constraints: the scene has no rods, which have tensions")
-        self.step(state.worlds([world]))
-        return self.stepper.rod_forces()
+        return self.stepper.rod_forces(lambda: self.step(state.worlds([world])))
 
     def _drive(self, drive: ArrayLike | None, state: State) -> Floats:
         if drive is None:

@@ -70,7 +70,8 @@ class Hold(NamedTuple):
     offset: Any  # (D,) m, from i to j now
     along: Any  # (D,) the direction in which the rod acts, of any length
     kept: Any  # (2, D, N) positions and velocities after the method
-    impulse: Any  # (R, D) kg m/s, on agent i in the step of the last world
+    records: Any  # (1,) True while impulses are recorded
+    impulse: Any  # (R, D) kg m/s, on agent i in the step of the last world, if recorded
     size: Any  # (R,) kg m/s, sum of the impulses along each rod; > 0: it pulls
 
 
@@ -106,12 +107,13 @@ def _add_along(x: Any, b: int, rods: Any, r: int, by: float) -> None:
 
 
 @kernel
-def _add_impulse(v: Any, b: int, rods: Any, r: int, by: float, long: float) -> None:
-    """Change the velocities of both ends by the impulse `by` times the direction, which is `long`, and record it."""
+def _add_impulse(v: Any, b: int, rods: Any, r: int, by: float) -> None:
+    """Change the velocities of both ends by the impulse `by` times the direction, and record it if that is wanted."""
     _add_along(v, b, rods, r, by)
-    for k in range(v.shape[0]):
-        rods.impulse[r, k] += by * rods.along[k]
-    rods.size[r] += by * long
+    if rods.records[0]:
+        for k in range(v.shape[0]):
+            rods.impulse[r, k] += by * rods.along[k]
+        rods.size[r] += by * np.sqrt(_dot(rods.along, rods.along))
 
 
 @kernel
@@ -191,7 +193,7 @@ def _correct_length(x: Any, v: Any, b: int, rods: Any, r: int, over: float, carr
     rods.pull[r] += by
     _add_along(x, b, rods, r, by)
     if carry:
-        _add_impulse(v, b, rods, r, by * rods.per_dt, np.sqrt(_dot(rods.along, rods.along)))
+        _add_impulse(v, b, rods, r, by * rods.per_dt)
     return abs(now - aim) / rods.length[r], abs(now - aim) > like(o, 0.5) * rods.allowed[r]
 
 
@@ -215,7 +217,7 @@ def _correct_velocity(x: Any, v: Any, b: int, rods: Any, r: int, over: float) ->
     if rods.slack:
         by = max(by, -rods.pull[r])
     rods.pull[r] += by
-    _add_impulse(v, b, rods, r, by, like(o, 1.0))
+    _add_impulse(v, b, rods, r, by)
     return abs(rate) / (rods.length[r] * rods.per_dt), abs(rate) > like(o, 0.5) * allowed * rods.per_dt
 
 
@@ -403,8 +405,8 @@ class RodSettler:
             weight, pairs.i, pairs.j, length, period, real(1 / scene.dt), record.slack,
             real(record.tolerance), record.most, real(_spectral_radius(pairs, weight)), np.zeros_like(length),
             np.zeros((len(length), d), real), np.zeros_like(length), np.zeros_like(length), np.zeros(d, real),
-            np.zeros(d, real), np.zeros((2, d, scene.agents), real), np.zeros((len(length), d), real),
-            np.zeros_like(length),
+            np.zeros(d, real), np.zeros((2, d, scene.agents), real), np.zeros(1, np.bool_),
+            np.zeros((len(length), d), real), np.zeros_like(length),
         )  # fmt: skip
 
     def __call__(self, x0: Floats, v0: Floats, state: State, first: int, end: int) -> tuple[int, int]:
@@ -423,7 +425,7 @@ class RodSettler:
         return int(world), int(agent)
 
     def found(self) -> RodForces:
-        """Return the forces in the world that was corrected last."""
+        """Return the forces in the world that was corrected last while rods.records was True."""
         rods = self.rods
         order = np.lexsort((rods.j, rods.i))
         return RodForces(rods.i[order], rods.j[order], rods.impulse[order] / self.dt, rods.size[order] / self.dt)
