@@ -418,8 +418,10 @@ EFFECTS = (
     EffectRow(Libido(radius=1.0, start=0.4, spread=0.6), family="urges", obeys=frozenset()),
     EffectRow(Intention(), family="urges", obeys=frozenset()),
     EffectRow(WallRepulsion(point=CENTRE, normal=(1.2, -0.7, 0.9), strength=2, decay=1.5), family="own"),
-    EffectRow(ObstacleContact(stiffness=30, damping=4, friction=8, coulomb=0.6, most=5)),
-    EffectRow(Contact(stiffness=20, ratio=0.3, damping=0.1, friction=6, coulomb=0.5, most=4, radius=0.5)),
+    EffectRow(ObstacleContact(stiffness=30, damping=4, friction=8, coulomb=0.6, most=5), family="around"),
+    EffectRow(
+        Contact(stiffness=20, ratio=0.3, damping=0.1, friction=6, coulomb=0.5, most=4, radius=0.5), family="others"
+    ),
     EffectRow(SpeedLimit(speed=1.2, strength=0.8), family="own"),
     EffectRow(  # random per agent, drawn along the axes
         Fluctuation(strength=0.8), obeys=frozenset({"translation"}), family="own"
@@ -481,9 +483,9 @@ EFFECTS = (
         FollowLeader(weight=2, speed=1.5, group=0, radius=2.5, distance=0.5, headway=0.3, slow_radius=1),
         family="others",
     ),
-    EffectRow(Shepherd(weight=2, speed=1.5, group=0, goal=CENTRE, spacing=0.4, slow_radius=2)),
+    EffectRow(Shepherd(weight=2, speed=1.5, group=0, goal=CENTRE, spacing=0.4, slow_radius=2), family="others"),
     EffectRow(Interpose(weight=2, speed=1.5, group=0, other=0, radius=2.5, slow_radius=1), family="others"),
-    EffectRow(Hide(weight=2, speed=1.5, group=0, radius=2.5, slow_radius=1)),
+    EffectRow(Hide(weight=2, speed=1.5, group=0, radius=2.5, slow_radius=1), family="around"),
     EffectRow(Whiskers(weight=5, horizon=3), obeys=UPRIGHT, family="around"),  # some whiskers are horizontal
     EffectRow(ForceField(weight=0.5, range=2), family="around"),
     EffectRow(FollowWall(weight=2, speed=1.5, distance=0.7, range=4), family="around"),
@@ -814,7 +816,18 @@ VARIANTS = (
     Variant("torus", (), "torus", 2),
     Variant("torus_3", (), "torus", 3),
     Variant("torus_single", (), "torus", 2, "float32"),
-    Variant("torus_single_rk4", (), "torus", 2, "float32", RK4()),
+    Variant(
+        "torus_single_rk4",
+        (
+            Separation(weight=1.3, radius=2.5),
+            Alignment(weight=0.7, radius=3, fov=270),
+            Drag(rate=0.4),
+        ),
+        "torus",
+        2,
+        "float32",
+        RK4(),
+    ),
     Variant("plane_3_single", (), "plane", 3, "float32"),
     Variant("box", (Separation(weight=1.3, radius=1.0),), "box", 2),
     *NEAREST,

@@ -106,7 +106,7 @@ def test_order_1_is_distinguished_from_rounding_on_the_bouncing_ball() -> None:
 @pytest.mark.parametrize("name", ["bounces", "rod"])
 def test_closed_forms_agree_with_the_scenes_own_steps(name: str) -> None:
     known = select_problems([name])[0]
-    exact, own = find_reference(known), reference_by_own_steps(known, 16)
+    exact, own = find_reference(known), reference_by_own_steps(known, 8)
     assert exact.kind == "closed form"
     assert exact.error == 0
     off = np.abs(known.distances(exact.path, own.path)).max()
@@ -206,6 +206,7 @@ def test_steps_of_further_runs_end_at_other_times(many: int) -> None:
 SLOWLY = [pytest.param(each, marks=pytest.mark.slow) for each in ("impulses", "back_up", "project")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("response", ["earliest", *SLOWLY])
 def test_the_error_of_a_reference_with_impacts_is_not_understated(response: str) -> None:
     """The response `impulses` delays an impact to the end of a step, which often is the same one in half the steps."""

@@ -76,23 +76,32 @@ CASES: dict[str, Callable[[], dict[str, Any]]] = {
 }
 
 
-def write(case: str, path: str) -> None:
-    """Run a case and save its results; called in a process of its own."""
-    np.savez(path, **CASES[case](), register=cpu.REGISTER)
+def write(folder: str) -> None:
+    """Run all cases and save their results; called in a process of its own."""
+    for case, play in CASES.items():
+        np.savez(Path(folder) / f"{case}.npz", **play(), register=cpu.REGISTER)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", CASES)
-def test_results_are_equal_in_registers_of_64_and_32_bytes(case: str, tmp_path: Path) -> None:
-    found = []
-    for size in ("64", "32"):
-        program = f"from tests.test_cpu import write; write({case!r}, {str(tmp_path / size)!r})"
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Return the results of a process for registers of 64 bytes, and of another for those of 32 bytes."""
+    found = tmp_path_factory.mktemp("wide"), tmp_path_factory.mktemp("narrow")
+    for folder, size in zip(found, ("64", "32"), strict=True):
+        program = f"from tests.test_cpu import write; write({str(folder)!r})"
         environment = {**os.environ, "FLOCKENV_REGISTER": size}
         done = subprocess.run(
             [sys.executable, "-W", "ignore", "-c", program], env=environment, cwd=ROOT, capture_output=True, text=True
         )
         assert done.returncode == 0, done.stderr
-        with np.load(tmp_path / f"{size}.npz") as arrays:
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_results_are_equal_in_registers_of_64_and_32_bytes(case: str, folders: tuple[Path, Path]) -> None:
+    found = []
+    for folder in folders:
+        with np.load(folder / f"{case}.npz") as arrays:
             found.append(dict(arrays))
     assert [one.pop("register") for one in found] == [64, 32]
     wide, narrow = found

@@ -373,7 +373,7 @@ def step_world_of(plan: StepPlan) -> Callable[..., int]:
         if failing is None:
             worst = first_bad(lanes, well)
             failed = np.int64(worst) if worst < well else none_failed
-        found = verdict(context, worlds, before, failed, none_failed)
+        found = verdict(worlds, scratch, b, n, (rank, team), before, failed, none_failed)
         if found < 0:
             bring_out(worlds, scratch, b, first, end, rank)
             if rank == 0:
@@ -385,13 +385,16 @@ def step_world_of(plan: StepPlan) -> Callable[..., int]:
 
 @section
 def _verdict(trusts: bool, dimension: int) -> Callable[..., int]:
-    """Make `verdict(context, worlds, before, failed, none_failed)`: which agent of a world is not finite, or -1.
+    """Make `verdict(worlds, scratch, b, n, place, before, failed, none_failed)`: an agent that is not finite, or -1.
 
-    It combines the results of all threads of the team. On failure the counters of the world are reset to `before`.
+    It combines the results of all threads of the team; place = (rank, team). On failure the counters of the world are
+    reset to `before`. It takes no context, whose type is that of one scene, so it is compiled once for all of them.
     """
 
-    def verdict(context: Any, worlds: Any, before: Any, failed: Any, none_failed: Any) -> Any:
-        scratch, b, n, rank, team = context.scratch, context.b, context.n, context.rank, context.team
+    def verdict(
+        worlds: Any, scratch: Any, b: Any, n: Any, place: Any, before: Any, failed: Any, none_failed: Any
+    ) -> Any:
+        rank, team = place
         # the first half may still be read by threads that count
         scratch.tally[team + rank] = failed
         wait_for_team(scratch.sync, team)
