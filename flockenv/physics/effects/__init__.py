@@ -8,6 +8,7 @@ import_all(__name__, __path__)
 
 from flockenv.physics.effects.aims import Aim, Antipode, Course, Goal  # noqa: E402
 from flockenv.physics.effects.altitude_springs import AltitudeSprings  # noqa: E402
+from flockenv.physics.effects.angular_springs import AngularSprings  # noqa: E402
 from flockenv.physics.effects.attraction import Attraction  # noqa: E402
 from flockenv.physics.effects.contact import Contact, ObstacleContact  # noqa: E402
 from flockenv.physics.effects.drag import Drag, QuadraticDrag  # noqa: E402
@@ -24,7 +25,7 @@ from flockenv.physics.effects.membrane import Bending, Membrane  # noqa: E402
 from flockenv.physics.effects.motivation import Fear, Grazing, Intention, Libido, Metabolism, Predation  # noqa: E402
 from flockenv.physics.effects.pressure import Pressure  # noqa: E402
 from flockenv.physics.effects.speed_limit import SpeedLimit  # noqa: E402
-from flockenv.physics.effects.springs import AngularSprings, Springs  # noqa: E402
+from flockenv.physics.effects.springs import Springs  # noqa: E402
 from flockenv.physics.effects.tether import Swing, Tether  # noqa: E402
 from flockenv.physics.effects.vicsek import Vicsek  # noqa: E402
 from flockenv.physics.effects.wall import WallRepulsion  # noqa: E402

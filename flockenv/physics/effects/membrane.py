@@ -17,8 +17,8 @@ from pydantic import Field
 from flockenv.jit.decorators import Law, Vec, law, like
 from flockenv.maths.vectors import add, cross, dot, norm, scale, select, sub, zero
 from flockenv.model.triangles import dihedral_angles, dihedrals, material_gradients
+from flockenv.physics.effects.angular_springs import wrap_angle
 from flockenv.physics.effects.effect import Bonds, Effect, Me, Stencils, Vector, all_masses, network_of
-from flockenv.physics.effects.springs import wrap_angle
 
 if TYPE_CHECKING:
     from flockenv.model.scene_view import SceneView
