@@ -185,6 +185,7 @@ def test_two_agents_on_a_collision_course_do_not_collide(case: str, radii: tuple
     assert gaps[1] > 0
 
 
+@pytest.mark.slow
 def test_a_small_agent_gives_way_to_a_large_one() -> None:
     """It would miss the other's centre by 0.8 m: more than twice its own radius, less than the sum of both."""
     for weight, clear in ((0.0, False), (4.0, True)):

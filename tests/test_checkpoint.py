@@ -613,6 +613,7 @@ def test_non_finite_reward_in_a_tuning_world_is_named(
     assert "and the best policy so far" in result.stderr and (copied / "p.safetensors").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("experiment", [PURSUIT, SCHOOL], ids=["pursuit", "school"])
 def test_divergence_of_learning_is_reported(tmp_path: Path, experiment: Experiment) -> None:
     settings = experiment.ppo.model_copy(update={"learning_rate": 1e30, "taught": 0, "critic_first": 0})

@@ -831,6 +831,7 @@ def test_system_error_prints_nothing_to_standard_output(
     assert capsys.readouterr() == ("", f"flockenv: {where}{error.strerror}\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["t.npz", "t.gif", "t.png", "t.html"])
 def test_full_disk_is_one_line_with_the_file_and_leaves_no_files(name: str, tmp_path: Path) -> None:
     """A limit on file size replaces the full disk."""
@@ -880,6 +881,7 @@ def test_closed_pipe_is_no_error() -> None:
     assert (done.stdout, done.stderr) == ("Tasks\n", "")
 
 
+@pytest.mark.slow
 def test_run_works_without_home_display_or_locale() -> None:
     bare = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "LANG": "C", "LC_ALL": "C", "TZ": "Mars/Phobos"}
     done = subprocess.run(

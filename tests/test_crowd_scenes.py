@@ -89,6 +89,7 @@ def test_crowds_in_configs_move(path: Path) -> None:
 DENSE = sorted(p for p in (ROOT / "configs" / "crowds").glob("rimea_*") if p.stem.split("_")[1] in ("4", "16"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "path", [pytest.param(path, id=path.stem, marks=() if path == DENSE[0] else slow) for path in DENSE]
 )

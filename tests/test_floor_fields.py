@@ -148,6 +148,7 @@ def test_one_reachable_door_is_enough_but_every_stage_of_a_journey_is_needed() -
         cut_off(Journey(stages=stages)).start(0, 10)
 
 
+@pytest.mark.slow
 def test_an_agent_without_a_path_to_a_later_stage_walks_to_the_stage_before_it() -> None:
     scene = cut_off(Journey(stages=(Stage(at=(2, 3), radius=0.3), Stage(at=(9, 3), radius=0.3))), count=2, dt=0.01)
     with pytest.warns(NoWayWarning, match="they stand still once they head for a place without a way"):
@@ -369,6 +370,7 @@ FREE = ((11.0, 5.0), (11.0, 6.0))
 PASSING = [Routes(doors=(Door(ends=FREE),)), Journey(stages=(Stage(ends=FREE),), then="leave")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", PASSING, ids=lambda effect: effect.kind)
 def test_a_free_door_is_passed_away_from_the_side_of_approach(effect: Any) -> None:
     """Several agents pass x = 11 just beside an end of the door; once they turned back and walked away for good."""
@@ -381,6 +383,7 @@ def test_a_free_door_is_passed_away_from_the_side_of_approach(effect: Any) -> No
     assert (end.pos[0, 5:, 0] < 10).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", PASSING, ids=lambda effect: effect.kind)
 @pytest.mark.parametrize(
     ("places", "passed"),

@@ -126,6 +126,7 @@ CASES = {
 SLOW = ("priorities", "drawn-weights", "school-weights", "drawn-residual", "school-residual")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.slow if c in SLOW else ()) for c in CASES])
 def test_resumed_training_equals_the_uninterrupted_one(case: str, tmp_path: Path) -> None:
     whole = train(CASES[case], tmp_path / "whole")

@@ -298,6 +298,7 @@ def test_each_thread_of_a_shared_world_writes_only_its_own_part(row: IntegratorR
         np.testing.assert_array_equal(whole, once)
 
 
+@pytest.mark.slow
 def test_linear_drags_of_several_effects_are_summed() -> None:
     """v = v0 exp(-(c + c') dt / m) exactly, in both dimensions."""
     for dimension in (2, 3):

@@ -213,6 +213,7 @@ def test_a_command_under_nohup_ignores_a_closed_terminal(tmp_path: Path) -> None
     assert process.communicate(timeout=60)[1] == "" and process.returncode == 0
 
 
+@pytest.mark.slow
 def test_a_signal_during_a_simulation_is_announced_before_it_is_measured(tmp_path: Path) -> None:
     """SIGTERM is announced by its own word, and the benchmark of interrupts does not count the line as a fault."""
     (tmp_path / "x.yaml").write_text(SCENE)

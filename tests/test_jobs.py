@@ -190,6 +190,7 @@ def test_a_job_whose_process_is_killed_runs_again_and_nothing_else_is_lost(tmp_p
     assert len(list(tmp_path.glob("attempt-*"))) == 3
 
 
+@pytest.mark.slow
 def test_a_job_that_kills_its_process_three_times_fails_with_the_end_of_its_output(tmp_path: Path) -> None:
     jobs = [Job("killer", end_always, (), None), *numbers(3)]
     with pytest.raises(FailedJobsError, match=r"its process ended 3 times.*it wrote: the last words \(job killer"):
@@ -240,6 +241,7 @@ def lack_memory() -> bytes:
     raise MemoryError("at least 9 TB are needed")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("processes", [1, 2])
 def test_lack_of_memory_ends_the_run(processes: int, tmp_path: Path) -> None:
     with pytest.raises(MemoryError, match="at least 9 TB"):

@@ -82,6 +82,7 @@ def sparse(n: int, rng: np.random.Generator) -> Any:
 CROWDS = (crowd, lattice, ring, heap, edge, sparse)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["float32", "float64"])
 @pytest.mark.parametrize("make", CROWDS)
 @pytest.mark.parametrize(

@@ -171,6 +171,7 @@ def test_after_an_interrupt_the_results_until_then_are_shown(
     assert (Path("p") / "lanes.png").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", ["1", "3"])
 def test_an_interrupted_simulation_is_announced_before_it_is_measured(
     seeds: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

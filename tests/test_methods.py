@@ -432,6 +432,7 @@ def test_steps_across_a_jump_of_the_force_are_few(kind: type[Integrator], tolera
     assert energy == pytest.approx(0.3 * jump, abs=200 * crossings * tolerance)
 
 
+@pytest.mark.slow
 @ADAPTIVE
 @pytest.mark.parametrize("jump", [1.0, 10.0])
 def test_the_agent_with_the_largest_error_sets_the_substeps(kind: type[Integrator], jump: float, tether: Any) -> None:

@@ -184,6 +184,7 @@ def test_rules_of_different_radii_share_the_widest_query() -> None:
     assert alone.count_of("pairs") == after.count_of("pairs")  # a smaller radius adds nothing to the query
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [50, pytest.param(700, marks=pytest.mark.slow)])
 def test_effects_of_weight_zero_change_no_bits_and_no_counters(count: int) -> None:
     space = Torus(size=(14.0, 11.0))
@@ -465,6 +466,7 @@ def assert_few_as_expected(variant: Variant, x: Array, edge: float, hair: float 
     return after
 
 
+@pytest.mark.slow
 @ONE_LONG_STEP
 @pytest.mark.parametrize(
     ("variant", "count"),

@@ -299,6 +299,7 @@ def passes(before: Floats, after: Floats, room: float) -> bool:
     return bool(((nearest < room / 2) & ((a * b).sum(-1) < 0)).any())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("response", ALL)
 @pytest.mark.parametrize("dimension", [2, 3])

@@ -69,6 +69,7 @@ def expected(scene: Scene, state: State) -> Any:
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "dimension", "dtype", "torus"),
     [(10, 2, "float64", False), (33, 2, "float32", True),
@@ -142,6 +143,7 @@ def test_one_call_of_four_steps_equals_four_calls_if_agents_share_a_place(count:
     np.testing.assert_array_equal(one.v, state.v)
 
 
+@pytest.mark.slow
 def test_records_beyond_the_last_agent_change_no_result() -> None:
     """The unused lanes of the last block hold such records; their values must not be used as indices."""
     scene, state = crowd(700, 2, "float64", True, drawn=SIZE)

@@ -346,6 +346,7 @@ def test_the_racing_line_is_faster_than_braking_on_the_middle_line() -> None:
     assert (racing.returns - careful.returns).min() > 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ahead", [1, 3])
 def test_rules_play_with_few_points_ahead(ahead: int) -> None:
     task = PathFollow(ahead=ahead)

@@ -214,6 +214,7 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 PLANTS = [plant_plan, plant_code, plant_lock]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("plant", "used"), [pytest.param(plant_plan, True, marks=pytest.mark.slow), (plant_code, True), (plant_lock, False)]
 )

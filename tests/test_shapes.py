@@ -146,6 +146,7 @@ def test_lines_to_the_ends_of_the_silhouette_just_touch_the_shape(name: str, cle
         assert abs(float(shape.gap(end)) - clearance) < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["concave", "turned_box"])
 def test_a_distance_field_agrees_with_its_shape_to_the_spacing(name: str) -> None:
     shape = SHAPES[name]

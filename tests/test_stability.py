@@ -167,6 +167,7 @@ def test_the_warning_of_an_undamped_spring_gives_the_growth_of_its_amplitude(met
     assert math.log(amplitude) == pytest.approx(steps * scene.dt / seconds, rel=0.2)
 
 
+@pytest.mark.slow
 def test_explain_reports_that_no_step_is_stable() -> None:
     tether = Tether(centre=O2, stiffness=18.0)
     with warnings.catch_warnings():

@@ -60,6 +60,7 @@ FAR: dict[str, Any] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("outline", [(200, 200), (2000, 20), (20, 2000)], ids=["square", "long", "high"])
 @pytest.mark.parametrize("how", FAR.values(), ids=FAR.keys())
 def test_agents_far_away_do_not_add_candidates(how: Any, outline: tuple[float, ...]) -> None:

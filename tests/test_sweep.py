@@ -305,6 +305,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return sweep(small(), ["pursuit"], Work(Store(tmp_path_factory.mktemp("jobs")), LocalEngine(1)))["pursuit"]
 
 
+@pytest.mark.slow
 def test_a_player_that_cannot_read_a_setting_is_left_out_of_it(tmp_path: Path) -> None:
     study = small(tasks={"evade": {"pursuers": (1,)}}, everywhere={})
     results = read_task(sweep(study, ["evade"], Work(Store(tmp_path), LocalEngine(1)))["evade"])

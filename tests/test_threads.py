@@ -729,6 +729,7 @@ def test_the_environment_sets_the_number_of_threads() -> None:
     assert refused.stderr.splitlines()[-1].startswith("ValueError: FLOCKENV_THREADS is 'many'")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="torch has another OpenMP there")
 @pytest.mark.parametrize(
     ("given", "spins"), [({}, "10000"), ({"GOMP_SPINCOUNT": "77"}, "77"), ({"OMP_WAIT_POLICY": "passive"}, "0")]
