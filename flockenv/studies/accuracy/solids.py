@@ -97,5 +97,5 @@ def drop() -> Problem:
         SurfaceTension(tension=3.0, density=1.0, radius=2.4),
     )
     scene = Scene(groups=(group,), effects=effects)
-    title = "Drop of 24 agents that becomes round"
+    title = "Drop of 24 agents, oblong at the start"
     return Problem.of(scene, 2.0, STEPS, name="drop", title=title, motion=(pos, 0 * pos))
