@@ -69,6 +69,7 @@ RANGE = [700, 740, 780, 820, 860, 900, 940, 980, 1020]
 FAST = {700, 860, 1020}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mb", [pytest.param(mb, marks=[] if mb in FAST else pytest.mark.slow) for mb in RANGE])
 def test_a_command_that_cannot_compile_its_kernels_names_memory(mb: int, tmp_path: Path) -> None:
     """Below some of these limits LLVM aborted, with and without a C++ exception; at others no thread started."""

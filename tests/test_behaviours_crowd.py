@@ -196,6 +196,7 @@ def test_a_small_agent_gives_way_to_a_large_one() -> None:
         np.testing.assert_array_equal(pos[-1, 1], (100, 100.8))
 
 
+@pytest.mark.slow
 def test_the_agent_that_passes_behind_slows_down_and_the_first_does_not() -> None:
     pos, vel = (np.array(a, float) for a in MEETINGS["crossing"])
     scene = crowd((bodies(1), bodies(1)), ((172.0, 100.0), (100.0, 172.0)), give_way=4.0)

@@ -48,6 +48,7 @@ def scene(damping: float = 0.0, at: float = 3.4, speed: float = SPEED) -> Scene:
     )
 
 
+@pytest.mark.slow
 def test_elastic_contact_converts_kinetic_energy_to_depth_and_back() -> None:
     elastic = scene()
     deepest = elastic.run(elastic.start(0), round(1000 * (0.2 + math.pi / 2 / OMEGA)))

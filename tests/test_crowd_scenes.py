@@ -47,6 +47,7 @@ def found(name: str, preset: str = NERVOUS) -> Finding:
 # --- motion -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param("rimea 1", marks=slow), "nist 2.1", "juelich 2", "rimea 7"])
 def test_single_pedestrian_passes_the_guidelines(name: str) -> None:
     finding = found(name)

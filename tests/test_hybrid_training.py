@@ -138,6 +138,7 @@ def test_resumed_training_equals_the_uninterrupted_one(case: str, tmp_path: Path
     assert [point["mean"] for point in resumed.curve] == [point["mean"] for point in whole.curve]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["residual", "gate", "drawn-weights", "priorities", "drawn-residual"])
 def test_an_exported_hybrid_plays_as_in_training(case: str, tmp_path: Path) -> None:
     each = CASES[case]

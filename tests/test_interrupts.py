@@ -129,6 +129,7 @@ with signals.handle_signals('toy'):
 """The code that the main thread executes when a signal arrives, or soon after."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("body", PLACES.values(), ids=PLACES)
 def test_an_interrupt_ends_a_command_in_any_code(body: str, tmp_path: Path) -> None:
     process = toy(body, tmp_path)

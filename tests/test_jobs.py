@@ -182,6 +182,7 @@ def test_the_rest_is_done_if_jobs_fail(tmp_path: Path) -> None:
     assert all(Store(tmp_path / "jobs").has(job) for job in jobs[:3])
 
 
+@pytest.mark.slow
 def test_a_job_whose_process_is_killed_runs_again_and_nothing_else_is_lost(tmp_path: Path) -> None:
     jobs = [Job("killed", end_twice, (str(tmp_path),), None), *numbers(6)]
     run_jobs(jobs, work(tmp_path, 2))

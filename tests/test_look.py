@@ -14,6 +14,8 @@ from flockenv.jit.decorators import kernel
 from flockenv.jit.simd_rows import float_as_key, key_as_float, key_of, order_keys, same_key, tag_of
 from flockenv.tasks import Bottleneck, Flock
 
+pytestmark = pytest.mark.slow
+
 SIGHT, MIDDLE = 6.1, 20.0  # the last bits of the square of SIGHT are not zeros
 
 

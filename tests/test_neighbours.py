@@ -485,6 +485,7 @@ def test_the_nearest_few_are_those_of_the_reference(variant: Variant, count: int
         assert after.count_of("pairs") < 0.8 * count**2
 
 
+@pytest.mark.slow
 @ONE_LONG_STEP
 @FEW
 @pytest.mark.parametrize("share", [0.4, 1.0])

@@ -193,6 +193,7 @@ def test_ties_are_sorted_with_the_agents_if_the_law_of_agents_elsewhere_reads_th
         assert {"t0", "t1"} <= set(scene.parts.sorted_fields)
 
 
+@pytest.mark.slow
 def test_an_agent_outside_of_the_box_counts_as_its_image_inside() -> None:
     """This matters for `acceleration` only: a step first moves all agents into the box."""
     scene, state = crowd(700, 2, "float64", True, drawn=SIZE)

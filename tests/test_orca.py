@@ -287,6 +287,7 @@ def test_a_lone_agent_has_the_desired_velocity_and_arrives() -> None:
     np.testing.assert_allclose(scene.run(start, 150).pos[0, 0], [6, 2], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_agents_in_one_place_part() -> None:
     scene = walkers(2, target=(0.0, 0.0))
     start = scene.start(0)

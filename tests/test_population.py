@@ -370,6 +370,7 @@ def test_drain_leaving_and_ageing_remove_agents_by_place_and_age() -> None:
     assert [int(old.run(old.start(0), k).alive.sum()) for k in (4, 5)] == [9, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("space", "dtype"),
     [

@@ -26,6 +26,8 @@ from flockenv.studies.arbitration_trace import arbitration_shares
 from flockenv.tasks import School
 from flockenv.tasks.school import CAUGHT, EATEN, FATE, FEAR, FOOD, HUNGER, INTENT
 
+pytestmark = pytest.mark.slow
+
 FISH, HUNTERS, PATCHES = 6, 2, 3
 AWAY = 1e3  # m, more than any radius of an effect
 

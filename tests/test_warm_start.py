@@ -74,6 +74,7 @@ def test_learning_may_begin_with_a_policy_of_another_seed_or_of_its_own() -> Non
     assert recipe_of(experiment(start="ppo@*", seed=other))["start"] != recipe_of(experiment(seed=other))["start"]
 
 
+@pytest.mark.slow
 def test_a_mixture_begins_with_the_policy_that_it_mixes(tmp_path: Path) -> None:
     each = experiment(action="mixture", bound=0.6, base="orca", critic_first=8)
     run = train(each, tmp_path)
