@@ -420,7 +420,7 @@ EFFECTS = (
     EffectRow(WallRepulsion(point=CENTRE, normal=(1.2, -0.7, 0.9), strength=2, decay=1.5), family="own"),
     EffectRow(ObstacleContact(stiffness=30, damping=4, friction=8, coulomb=0.6, most=5), family="around"),
     EffectRow(
-        Contact(stiffness=20, ratio=0.3, damping=0.1, friction=6, coulomb=0.5, most=4, radius=0.5), family="others"
+        Contact(stiffness=20, ratio=0.3, damping=0.1, friction=6, coulomb=0.5, most=4, radius=0.5), family="pushes"
     ),
     EffectRow(SpeedLimit(speed=1.2, strength=0.8), family="own"),
     EffectRow(  # random per agent, drawn along the axes
@@ -483,7 +483,7 @@ EFFECTS = (
         FollowLeader(weight=2, speed=1.5, group=0, radius=2.5, distance=0.5, headway=0.3, slow_radius=1),
         family="others",
     ),
-    EffectRow(Shepherd(weight=2, speed=1.5, group=0, goal=CENTRE, spacing=0.4, slow_radius=2), family="others"),
+    EffectRow(Shepherd(weight=2, speed=1.5, group=0, goal=CENTRE, spacing=0.4, slow_radius=2), family="pushes"),
     EffectRow(Interpose(weight=2, speed=1.5, group=0, other=0, radius=2.5, slow_radius=1), family="others"),
     EffectRow(Hide(weight=2, speed=1.5, group=0, radius=2.5, slow_radius=1), family="around"),
     EffectRow(Whiskers(weight=5, horizon=3), obeys=UPRIGHT, family="around"),  # some whiskers are horizontal
