@@ -88,7 +88,7 @@ def block() -> Problem:
 
 def drop() -> Problem:
     """Return a drop of 24 agents, oblong at the start: pressure, viscosity and surface tension."""
-    near = np.stack(np.mgrid[:6, :4], axis=2).reshape(-1, 2).astype(float)
+    near = np.moveaxis(np.mgrid[:6, :4], 0, -1).reshape(-1, 2).astype(float)
     pos = near + 0.1 * np.sin(np.arange(48)).reshape(24, 2)
     group = Group(count=24, spawn=Spawn(low=(0, 0), high=(1, 1)))
     effects = (

@@ -33,7 +33,7 @@ def bullets(method: Integrator) -> Value:
     )  # fmt: skip
     start = scene.start(0)
     pos, vel = np.array(start.pos[0]), np.zeros_like(start.pos[0])
-    aims = np.stack(np.mgrid[:4, :4], axis=2).reshape(-1, 2)
+    aims = np.moveaxis(np.mgrid[:4, :4], 0, -1).reshape(-1, 2)
     pos[-16:, :2], pos[-16:, 2], vel[-16:, 2] = 0.17 + 0.21 * aims, 0.5 + 0.07 * np.arange(16), -100.0
     end = scene.run(start_with(scene, pos, vel), 100)
     lowest = float(end.pos[0, :-16, 2].min())
@@ -56,9 +56,9 @@ def triangles(stretch: float, steps: int = 20) -> Callable[[Integrator], Value]:
         free = np.where(np.isfinite(scene.body.mass), scene.body.mass, 0.0)
         for _ in range(steps):
             state = scene.step(state)
-            stored = [each.potential(scene.groups, state, scene.space.displacement) for each in forces]
-            energy = sum(float(each[0]) for each in stored if each is not None)
-            energy += float(0.5 * free @ (state.vel[0] ** 2).sum(axis=1))
+            energy = float(0.5 * free @ (state.vel[0] ** 2).sum(axis=1))
+            for each in forces:
+                energy += float(each.potential(scene.groups, state, scene.space.displacement)[0])
             most = max(most, energy / float(-G * free @ state.pos[0, :, 2]))
         return Value(most, most <= 1.05, f"energy at most {most:.3g} of the work of gravity")
 
@@ -90,7 +90,7 @@ def drop(method: Integrator) -> Value:
     )
     group = Group(count=40, spawn=Spawn(low=(0, 0), high=(1, 1)))
     scene = Scene(groups=(group,), effects=effects, integrator=method, dt=0.02)
-    near = np.stack(np.mgrid[:10, :4], axis=2).reshape(-1, 2)
+    near = np.moveaxis(np.mgrid[:10, :4], 0, -1).reshape(-1, 2)
     start = start_with(scene, near + 0.1 * np.random.default_rng(1).normal(size=(40, 2)), [[0.3, -0.2]] * 40)
     end = scene.run(start, 200)
     off = float(np.abs((end.vel - start.vel).sum(axis=1)).max() / np.abs(end.vel).sum())
