@@ -99,9 +99,9 @@ def test_orders_and_evaluations_are_the_declared_ones_for_smooth_forces() -> Non
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["forced", "kepler", "projectile", "quadratic_fall", "tracer", "boids"])
 def test_orders_are_the_declared_ones_on_every_smooth_problem(name: str) -> None:
-    """Two methods: tests/test_methods.py measures every one on problems like these."""
-    report = measure(one(name), methods_of(["semi_implicit_euler", "rk4"]), repetitions=0)
-    assert {curve.declared for curve in report.curves} == {1, 4}
+    """One method of each order: tests/test_methods.py measures every method on problems like these."""
+    report = measure(one(name), METHODS, repetitions=0)
+    assert {curve.declared for curve in report.curves} == {1, 2, 4}
     for curve in report.curves:
         assert curve.order == pytest.approx(curve.declared, abs=0.25), curve.method
 
@@ -140,7 +140,7 @@ def test_a_speed_limit_reduces_every_method_to_order_1() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["boids_cone", "boids_limit"])
 def test_view_cones_and_speed_limits_reduce_flocks_to_order_1(name: str) -> None:
-    report = measure(one(name), methods_of(["velocity_verlet", "rk4"]), repetitions=0)
+    report = measure(one(name), METHODS, repetitions=0)
     assert report.reference == "own steps"
     for curve in report.curves:
         assert curve.order == pytest.approx(1, abs=0.3), curve.method

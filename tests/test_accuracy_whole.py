@@ -106,7 +106,7 @@ def test_order_1_is_distinguished_from_rounding_on_the_bouncing_ball() -> None:
 @pytest.mark.parametrize("name", ["bounces", "rod"])
 def test_closed_forms_agree_with_the_scenes_own_steps(name: str) -> None:
     known = select_problems([name])[0]
-    exact, own = find_reference(known), reference_by_own_steps(known, 8)
+    exact, own = find_reference(known), reference_by_own_steps(known, 16)
     assert exact.kind == "closed form"
     assert exact.error == 0
     off = np.abs(known.distances(exact.path, own.path)).max()

@@ -77,11 +77,12 @@ def walls(offset: float = 0.0) -> tuple[Wall, ...]:
 # --- closed forms -----------------------------------------------------------------------------------------------------
 
 
-SLOW_METHODS = (pytest.param(kind(), marks=pytest.mark.slow) for kind in (VelocityVerlet, RK4))
-
-
 @pytest.mark.parametrize("response", IN_TIME)
-@pytest.mark.parametrize("method", [SemiImplicitEuler(), *SLOW_METHODS], ids=lambda m: m.kind)
+@pytest.mark.parametrize(
+    "method",
+    [SemiImplicitEuler(), *(pytest.param(kind(), marks=pytest.mark.slow) for kind in (VelocityVerlet, RK4))],
+    ids=lambda m: m.kind,
+)
 def test_elastic_ball_keeps_its_height_over_a_hundred_bounces(response: str, method: Integrator) -> None:
     of = scene([1], response, g=G, dt=0.02, obstacles=FLOOR, method=method)
     state = begun(of, [(0, 1 + R)], [(1, 0)])

@@ -233,7 +233,7 @@ def test_bad_results_of_a_transfer_are_refused_before_anything_is_measured(
 def test_a_scene_is_measured_from_a_later_state_and_both_files_are_written(
     elsewhere: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    runs = ((("rk4",), (4, 8)), (("velocity_verlet",), (2, 4)))
+    runs = ((("midpoint", "rk4"), (4, 8)), (("velocity_verlet",), (2, 4)))
     monkeypatch.setattr(cost_of_accuracy, "CASES", (Case("boids.yaml", "A flock", "flock", 1.0, 0.2, runs, 64),))
     Path("mine.json").write_text(json.dumps(transfer()), encoding="utf-8")
     request = ["--transfer", "mine.json", "--repetitions", "1", "--processes", "1"]
@@ -241,7 +241,7 @@ def test_a_scene_is_measured_from_a_later_state_and_both_files_are_written(
     assert result.exit_code == 0, (result.output, result.exception)
     found = json.loads(Path("results/cost_of_accuracy.json").read_text(encoding="utf-8"))
     about = found["scenes"]["boids"]
-    assert list(about["methods"]) == ["rk4", "velocity_verlet"]
+    assert list(about["methods"]) == ["midpoint", "rk4", "velocity_verlet"]
     assert all(point["ms_per_s"] > 0 for points in about["methods"].values() for point in points)
     assert found["sentence"] in " ".join(result.stdout.split())
     assert Path("results/cost_of_accuracy.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"

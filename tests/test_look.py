@@ -84,7 +84,6 @@ def sparse(n: int, rng: np.random.Generator) -> Any:
 CROWDS = (crowd, lattice, ring, heap, edge, sparse)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["float32", "float64"])
 @pytest.mark.parametrize("make", CROWDS)
 @pytest.mark.parametrize(
@@ -129,7 +128,6 @@ def test_the_lists_are_the_same_across_the_edge_of_a_periodic_box() -> None:
     assert (across[0][1:] >= across[0][:-1]).all()
 
 
-@pytest.mark.slow
 def test_absent_agents_are_in_no_list() -> None:
     """In a kernel that uses keys as long as all agents are present."""
     world = World(Bottleneck(dtype="float32"))

@@ -87,7 +87,6 @@ def placed(scene: Scene, *places: Any, worlds: int = 1, velocity: Any = 0.0) -> 
 # --- closed forms -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_hunger_grows_with_time_and_effort_up_to_1() -> None:
     scene = tank(mortal=False, force=0.0)
     state = placed(scene, velocity=(1.0, 0.0))  # half of max_speed; no force changes it
@@ -101,7 +100,6 @@ def test_hunger_grows_with_time_and_effort_up_to_1() -> None:
     np.testing.assert_array_equal(scene.inner(state, "hunger")[0, FISH + HUNTERS :], 0)
 
 
-@pytest.mark.slow
 def test_food_grows_by_the_logistic_equation_of_verhulst() -> None:
     scene = tank(force=0.0)
     state = scene.run(placed(scene), 200)
