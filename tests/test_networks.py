@@ -15,15 +15,7 @@ from flockenv.model.finite_elements import contents
 from flockenv.model.networks import BEND, EDGE, SHEAR, AnyNetwork, Blocks, Cloth, Jelly, Mesh, Move, Network, Rope
 from flockenv.model.spawn import Spawn
 from flockenv.physics.effects import Drag, Springs
-from flockenv.physics.integrators import (
-    RK4,
-    DormandPrince,
-    ExponentialDrag,
-    ImplicitEuler,
-    Integrator,
-    LinearlyImplicitEuler,
-    SemiImplicitEuler,
-)
+from flockenv.physics.integrators import INTEGRATORS, Integrator, SemiImplicitEuler
 from flockenv.scene import Group, Scene
 
 Floats = NDArray[np.float64]
@@ -324,11 +316,8 @@ def test_particles_that_move_are_held_at_their_velocity() -> None:
 @pytest.mark.parametrize(
     "method",
     [
-        SemiImplicitEuler(),
-        *(
-            pytest.param(kind(), marks=pytest.mark.slow)
-            for kind in (LinearlyImplicitEuler, RK4, ImplicitEuler, DormandPrince, ExponentialDrag)
-        ),
+        pytest.param(kind(), marks=() if kind is SemiImplicitEuler else pytest.mark.slow)
+        for kind in INTEGRATORS.values()
     ],
     ids=lambda method: method.kind,
 )

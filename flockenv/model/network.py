@@ -89,6 +89,8 @@ class Network(Record):
 
     def _check_moves(self) -> None:
         """Raise ValueError if a particle has two velocities, or one beside its pin."""
+        if not self.moves:  # the particles of a place are found only if they are needed
+            return
         held = dict.fromkeys(self.particles("pinned", self.pinned).tolist(), "pinned")
         for k, (name, _, who) in enumerate(self._moved()):
             for one in who.tolist():
