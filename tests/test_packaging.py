@@ -304,6 +304,14 @@ def test_the_workflow_tries_the_pythons_of_the_classifiers_and_both_ends_of_the_
         assert yaml.safe_load(path.read_text())
 
 
+def test_no_file_is_large_and_neither_are_all_together() -> None:
+    """At most 2 MB each and 20 MB in all; without git nothing is tested."""
+    done = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False)
+    sizes = {name: (ROOT / name).stat().st_size for name in done.stdout.split("\0") if (ROOT / name).is_file()}
+    assert {name: size for name, size in sizes.items() if size > 2_000_000} == {}
+    assert sum(sizes.values()) <= 20_000_000
+
+
 def test_the_top_level_contains_only_allowed_files_and_folders() -> None:
     """Tracked files are tested, so without git nothing is tested."""
     done = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False)

@@ -432,7 +432,7 @@ def schema() -> None:
     """Print the JSON Schema of a scene, for completion and checking of YAML in editors."""
     from flockenv.scene.yaml_io import schema as json_schema
 
-    print(json.dumps(json_schema(), indent=0, allow_nan=False))  # a line each, for diffs; indents are a fifth
+    print(json.dumps(json_schema(), indent=0, allow_nan=False))  # a line for each value; indents were a fifth of it
 
 
 def _first_sentence(kind: type) -> str:
