@@ -3,7 +3,7 @@
 from flockenv.studies.stress import CASES, run
 results = run(CASES, methods)
 
-Cases are functions from a method to a `Value`; see `bodies`, `bonded`, `sheets`, `dice`, `crowds`, `contacts`; for
+Cases are functions from a method to a `Value`; see `bodies`, `bonded`, `dice`, `sheets`, `crowds`, `contacts`; for
 bodies that collide there is a case per response, see `impacts`, `heaps`, `gatherings`. An error that a case raises is
 also a verdict: a scene refused because its step must blow up, a simulation that diverges with a message. No case ends
 in NaN without one.
@@ -37,5 +37,5 @@ __all__ = [
     "usual_methods",
 ]  # fmt: skip
 
-CASES: tuple[Case, ...] = (*BODIES, *BONDED, *SHEETS, *DICE, *CROWDS, *CONTACTS, *IMPACTS, *HEAPS, *GATHERINGS)
+CASES: tuple[Case, ...] = (*BODIES, *BONDED, *DICE, *SHEETS, *CROWDS, *CONTACTS, *IMPACTS, *HEAPS, *GATHERINGS)
 """Every hard case, by kind of scene."""

@@ -12,6 +12,7 @@ from flockenv.model.state import State
 from flockenv.physics.effects import Elastic, Gravity, Springs
 from flockenv.physics.integrators import Integrator
 from flockenv.scene import Group, Scene
+from flockenv.studies.stress.setup import energy_of_a_fall
 from flockenv.studies.trial_log import Case, Value
 
 __all__ = ["BONDED"]
@@ -35,10 +36,7 @@ def cloth(stiffness: float, steps: int = 20) -> Callable[[Integrator], Value]:
     def trial(method: Integrator) -> Value:
         sheet = Cloth(cells=(19, 19), edges=((1, 0, 0), (0, 1, 0)), pinned=("top",))
         scene = hanging_scene(method, sheet, stiffness, FRAME, each=1 / 400, damping=0.0)
-        state, most = scene.start(0), 0.0
-        for _ in range(steps):
-            state = scene.step(state)
-            most = max(most, _energy(scene, state) / max(_work_of_gravity(scene, state), 1e-12))
+        state, most = energy_of_a_fall(scene, steps)
         newton, linear = state.count_of("newton_iterations"), state.count_of("linear_iterations")
         note = f"energy at most {most:.3g} of the work of gravity"
         if newton:
@@ -48,21 +46,6 @@ def cloth(stiffness: float, steps: int = 20) -> Callable[[Integrator], Value]:
         return Value(most, most <= 1.05, note)
 
     return trial
-
-
-def _energy(scene: Scene, state: State) -> float:
-    """Return kinetic and elastic energy, J."""
-    springs = scene.effects[0]
-    elastic = springs.potential(scene.groups, state, scene.space.displacement)
-    assert elastic is not None
-    mass = np.where(np.isfinite(scene.body.mass), scene.body.mass, 0.0)
-    return float(elastic[0] + 0.5 * (mass * (state.vel[0] ** 2).sum(axis=1)).sum())
-
-
-def _work_of_gravity(scene: Scene, state: State) -> float:
-    """Return the work of gravity since all particles were at height 0, J."""
-    mass = np.where(np.isfinite(scene.body.mass), scene.body.mass, 0.0)
-    return float(-G * (mass * state.pos[0, :, 2]).sum())
 
 
 def chain(method: Integrator) -> Value:

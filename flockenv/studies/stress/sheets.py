@@ -13,7 +13,7 @@ from flockenv.physics.constraints import Collisions, FaceCollisions
 from flockenv.physics.effects import Bending, Gravity, Membrane, Pressure, Springs, SurfaceTension, Viscosity
 from flockenv.physics.integrators import Integrator, LinearlyImplicitEuler
 from flockenv.scene import Group, Scene
-from flockenv.studies.stress.setup import start_with
+from flockenv.studies.stress.setup import energy_of_a_fall, start_with
 from flockenv.studies.trial_log import Case, Value
 
 __all__ = ["SHEETS"]
@@ -52,14 +52,7 @@ def triangles(stretch: float, steps: int = 20) -> Callable[[Integrator], Value]:
             dimension=3, groups=(Group(network=cloth, mass=1 / 121),), integrator=method, dt=FRAME,
             effects=(*forces, Gravity(acceleration=(0.0, 0.0, -G))),
         )  # fmt: skip
-        state, most = scene.start(0), 0.0
-        free = np.where(np.isfinite(scene.body.mass), scene.body.mass, 0.0)
-        for _ in range(steps):
-            state = scene.step(state)
-            energy = float(0.5 * free @ (state.vel[0] ** 2).sum(axis=1))
-            for each in forces:
-                energy += float(each.potential(scene.groups, state, scene.space.displacement)[0])
-            most = max(most, energy / float(-G * free @ state.pos[0, :, 2]))
+        _, most = energy_of_a_fall(scene, steps)
         return Value(most, most <= 1.05, f"energy at most {most:.3g} of the work of gravity")
 
     return trial
