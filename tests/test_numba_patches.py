@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 from llvmlite.binding import get_host_cpu_features
 from numba import config
+from numba.core import event
+from numba.core.compiler import run_frontend
 
 from flockenv.jit.decorators import kernel, law
 from flockenv.jit.intrinsics import unaliased
@@ -142,6 +144,53 @@ def machine_code(pipeline: Any) -> str:
 def test_the_machine_code_equals_that_of_numba_without_patches() -> None:
     assert machine_code(Whole) == machine_code(None)
     assert machine_code(Whole).count("\n") > 50
+
+
+def test_variables_of_instructions_are_listed_in_the_order_of_numba() -> None:
+    code = run_frontend(sample)
+    lines = [line for block in code.blocks.values() for line in block.body]
+    assert len(lines) > 50
+    theirs = [[each.name for each in line.list_vars()] for line in lines]
+    with front_end.apply_patches():
+        assert [[each.name for each in line.list_vars()] for line in lines] == theirs
+
+
+class Heard(event.Listener):
+    """Listener that keeps the kinds of all events."""
+
+    def __init__(self) -> None:
+        self.kinds: list[tuple[str, bool]] = []
+
+    def on_start(self, event: Any) -> None:
+        """Keep the kind."""
+        self.kinds.append((event.kind, True))
+
+    def on_end(self, event: Any) -> None:
+        """Keep the kind."""
+        self.kinds.append((event.kind, False))
+
+
+@pytest.mark.parametrize("kind", ["numba:run_pass", "numba:llvm_lock"])
+def test_a_listener_hears_every_event_and_begins_and_ends_are_paired(kind: str) -> None:
+    heard = Heard()
+    event.register(kind, heard)  # type: ignore[no-untyped-call]
+    try:
+        machine_code(Whole)
+    finally:
+        event.unregister(kind, heard)  # type: ignore[no-untyped-call]
+    assert len(heard.kinds) > 50
+    assert heard.kinds.count((kind, True)) == heard.kinds.count((kind, False))
+
+
+def test_without_a_listener_no_event_of_the_lock_of_llvm_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[str] = []
+    monkeypatch.setattr(event, "broadcast", lambda each: made.append(each.kind))
+    machine_code(Whole)
+    assert made.count("numba:llvm_lock") < 50  # of what precedes our own compilation
+    with_numba_alone = len(made)
+    made.clear()
+    machine_code(None)
+    assert made.count("numba:llvm_lock") > 10 * with_numba_alone
 
 
 def doubled(x: Any) -> None:

@@ -20,6 +20,7 @@ from numba.core import (
     compiler_lock,
     dispatcher,
     event,
+    ir,
     postproc,
     targetconfig,
     transforms,
@@ -111,9 +112,39 @@ def _memory(function: Any) -> dict[Any, Any]:
 
 
 def _call(context: Any, args: Any, kws: Any) -> tuple[Any, ...]:
-    """Return the cache key of a resolution beside the function: argument types, and the flags of the caller."""
+    """Return the cache key of a resolution beside the function: argument types, and the flags of the caller.
+
+    Types are compared by identity: numba keeps one object for equal types, and hashing a record of arrays takes long.
+    """
+    named = tuple((name, id(kind)) for name, kind in kws.items()) if kws else ()
+    return id(context), tuple(map(id, args)), named, _flags_number()
+
+
+def _objects(context: Any, args: Any, kws: Any) -> tuple[Any, ...]:
+    """Return the objects that a key of `_call` stands for."""
+    return context, *args, *(kws.values() if kws else ())
+
+
+_known_flags: list[dict[str, Any]] = []
+
+
+def _flags_number() -> int:
+    """Return a number for the flags of the caller, the same for equal flags; numba's hash is the same for all flags."""
     flags = targetconfig.ConfigStack.top_or_none()  # type: ignore[no-untyped-call]
-    return context, tuple(args), tuple(kws.items()) if kws else (), flags
+    options = {} if flags is None else flags._values
+    for number, known in enumerate(_known_flags):
+        if known == options:
+            return number
+    _known_flags.append(dict(options))
+    return len(_known_flags) - 1
+
+
+class _Resolved(NamedTuple):
+    """A cached resolution."""
+
+    signature: Any
+    implementation: Any  # key of the compiled form among those of an operator
+    alive: tuple[Any, ...]  # the objects of which the cache key holds the identities
 
 
 def _cached_signature(function: Any, call: tuple[Any, ...]) -> Any:
@@ -122,9 +153,9 @@ def _cached_signature(function: Any, call: tuple[Any, ...]) -> Any:
     if known is None:
         return None
     if isinstance(function, functions.Dispatcher):
-        return known if known.args in function.dispatcher.overloads else None
-    signature, function._impl_keys[signature.args] = known
-    return signature
+        return known.signature if known.signature.args in function.dispatcher.overloads else None
+    function._impl_keys[known.signature.args] = known.implementation
+    return known.signature
 
 
 def _cache_calls(resolve: Any) -> Any:
@@ -136,7 +167,9 @@ def _cache_calls(resolve: Any) -> Any:
         if signature is None:
             signature = resolve(self, context, args, kws)
             if signature is not None and signature.args in self._impl_keys:
-                _memory(self)[call] = signature, self._impl_keys[signature.args]
+                _memory(self)[call] = _Resolved(
+                    signature, self._impl_keys[signature.args], _objects(context, args, kws)
+                )
         return signature
 
     return get_call_type
@@ -155,7 +188,7 @@ def _cache_laws(resolve: Any) -> Any:
         if signature is None:
             signature = resolve(self, context, args, kws)
             if signature is not None:
-                _memory(self)[call] = signature
+                _memory(self)[call] = _Resolved(signature, None, _objects(context, args, kws))
         return signature
 
     return get_call_type
@@ -172,6 +205,45 @@ def _without_literals(args: Any) -> tuple[Any, ...]:
 def _no_timers(_: Any) -> Any:
     """Measure no times of locks: numba informs two timers for each enclosing function, with every nested call."""
     return lambda kind, callback: nullcontext()
+
+
+def _for_listeners(inform: Any) -> Any:
+    """Make events for others than numba's timers, see `_no_timers`: numba makes two for every call of LLVM."""
+
+    def event_of(kind: str, *args: Any, **kwargs: Any) -> None:
+        if any(type(each) is not event.TimingListener for each in event._registered[kind]):
+            inform(kind, *args, **kwargs)
+
+    return event_of
+
+
+def _list_variables(_: Any) -> Any:
+    """List the variables of an instruction in one walk: numba makes a list for every field and every list in it."""
+
+    def _rec_list_vars(self: Any, val: Any) -> list[Any]:
+        found: list[Any] = []
+        _add_variables(val.values() if isinstance(val, dict) else (val,), found)
+        return found
+
+    return _rec_list_vars
+
+
+_PLAIN = frozenset((str, int, float, bool, type(None), ir.Loc))
+"""Types of fields of instructions that hold no variables."""
+
+
+def _add_variables(fields: Any, found: list[Any]) -> None:
+    for each in fields:
+        if isinstance(each, ir.Var):
+            found.append(each)
+        elif type(each) in _PLAIN:
+            continue
+        elif isinstance(each, ir.Inst):
+            found += each.list_vars()  # type: ignore[no-untyped-call]
+        elif isinstance(each, (list, tuple)):
+            _add_variables(each, found)
+        elif isinstance(each, dict):
+            _add_variables(each.values(), found)
 
 
 def _lifetimes_on_demand(slowly: Any) -> Any:
@@ -198,12 +270,24 @@ PATCHES = (
     Patch(functions.BaseFunction, "get_call_type", _cache_calls, (
         Known(functions.BaseFunction, "get_call_type", "6559c167bfc0"),
         Known(functions.BaseFunction, "get_impl_key", "ebed5750a018"),
+        Known(targetconfig.TargetConfig, "__init__", "7167e496c1f7"),
     )),
     Patch(functions.Dispatcher, "get_call_type", _cache_laws, (
         Known(functions.Dispatcher, "get_call_type", "ae1ef289d128"),
         Known(dispatcher._DispatcherBase, "get_call_template", "f15b62d0e9c0"),
+        Known(targetconfig.TargetConfig, "__init__", "7167e496c1f7"),
     )),
     Patch(event, "install_timer", _no_timers, (Known(event, "install_timer", "754d2f8aad8c"),)),
+    Patch(event, "start_event", _for_listeners, (
+        Known(event, "start_event", "ee296d6ff362"), Known(event, "broadcast", "0c3ca6589b31"),
+    )),
+    Patch(event, "end_event", _for_listeners, (
+        Known(event, "end_event", "1f3727213c76"), Known(event, "broadcast", "0c3ca6589b31"),
+    )),
+    Patch(ir.Inst, "_rec_list_vars", _list_variables, (
+        Known(ir.Inst, "_rec_list_vars", "054700e9100b"), Known(ir.Stmt, "list_vars", "da90b4d7fc05"),
+        Known(ir.Expr, "list_vars", "a32a9eae072e"),
+    )),
     Patch(postproc.PostProcessor, "run", _lifetimes_on_demand, (Known(postproc.PostProcessor, "run", "e1a8e77d6f17"),)),
 )  # fmt: skip
 """All patches of functions."""
