@@ -84,6 +84,15 @@ def test_each_patch_has_its_own_title_and_other_names_are_refused(
         front_end._replacements()
 
 
+def test_the_page_leaves_out_patches_that_exist(monkeypatch: pytest.MonkeyPatch, cleared_caches: None) -> None:
+    given = re.findall(rf"{front_end.LEFT_OUT}=([\w.,]+)", (ROOT / "docs" / "engine.md").read_text(encoding="utf-8"))
+    assert len(given) == 2
+    for value in given:
+        monkeypatch.setenv(front_end.LEFT_OUT, value)
+        front_end._replacements.cache_clear()
+        front_end._replacements()
+
+
 @pytest.mark.parametrize("left_out", ["all", "one"])
 def test_an_environment_variable_leaves_patches_out(
     left_out: str, monkeypatch: pytest.MonkeyPatch, cleared_caches: None
