@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import hypothesis
@@ -13,6 +14,7 @@ import pytest
 from flockenv.cli import terminal
 from flockenv.jit import thread_pool
 from tests.catalogue import TETHER, users_module
+from tests.ray_venv import new_venv
 
 # Before pygame is imported: windows open without a display.
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
@@ -91,3 +93,9 @@ def tether(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """Yield the class of the effect in catalogue.TETHER."""
     with users_module(tmp_path_factory.mktemp("laws"), TETHER, "tethers") as module:
         yield module.Tether
+
+
+@pytest.fixture(scope="session")  # of test_ray.py and test_rllib.py: it takes a minute to install
+def ray_python(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The interpreter of a new virtual environment with Ray."""
+    return new_venv(tmp_path_factory.mktemp("ray") / "venv")

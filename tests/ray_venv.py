@@ -5,31 +5,51 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import sysconfig
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-__all__ = ["new_venv", "run_case"]
+__all__ = ["add_rllib", "new_venv", "run_case"]
 
 ROOT = Path(__file__).resolve().parent.parent
+SITE = "import sysconfig; print(sysconfig.get_path('purelib'))"
 
 
-def new_venv(folder: Path, extra: str, *others: str) -> Path:
-    """Return the interpreter of a new virtual environment with flockenv's requirements and those of an extra.
+def new_venv(folder: Path) -> Path:
+    """Return the interpreter of a new virtual environment with flockenv's requirements, Ray and what searches need.
 
-    others: packages of the extra `train` that are needed too. If a package cannot be installed, the test is skipped.
+    Packages of the environment of the tests serve where their versions are the wanted ones, as with pip's system
+    packages: to install torch again takes longer than a test. If a package cannot be installed, the test is skipped.
     """
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     subprocess.run([sys.executable, "-m", "venv", folder], check=True)
-    extras = project["optional-dependencies"]
-    more = [requirement for requirement in extras["train"] if requirement.startswith(others)]
-    packages = [*project["dependencies"], *extras[extra], *more]
-    command = [folder / "bin" / "pip", "install", "-q", "-c", ROOT / "configs" / "constraints-ray.txt", *packages]
+    python = folder / "bin" / "python"
+    own = subprocess.run([python, "-c", SITE], check=True, capture_output=True, text=True).stdout.strip()
+    (Path(own) / "of_the_tests.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    project = _project()
+    cmaes = [each for each in project["optional-dependencies"]["train"] if each.startswith("cmaes")]
+    _install(python, "ray", [*project["dependencies"], *cmaes])
+    return python
+
+
+def add_rllib(python: Path) -> None:
+    """Install RLlib beside Ray; if a package cannot be installed, the test is skipped."""
+    _install(python, "rllib", [])
+
+
+def _project() -> dict[str, Any]:
+    project: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    return project
+
+
+def _install(python: Path, extra: str, packages: list[str]) -> None:
+    limits, wanted = ROOT / "configs" / "constraints-ray.txt", _project()["optional-dependencies"][extra]
+    command = [python, "-m", "pip", "install", "-q", "-c", limits, *packages, *wanted]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         pytest.skip(f"the extra {extra!r} cannot be installed: {done.stderr.strip().splitlines()[-1]}")
-    return folder / "bin" / "python"
 
 
 def run_case(python: Path, module: str, case: str) -> None:

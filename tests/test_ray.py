@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.ray_venv import new_venv, run_case
+from tests.ray_venv import run_case
 
 pytestmark = pytest.mark.slow
 
@@ -25,12 +25,6 @@ CASES = (
 )
 
 
-@pytest.fixture(scope="module")
-def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The interpreter of a new virtual environment with flockenv's requirements, Ray and what searches need."""
-    return new_venv(tmp_path_factory.mktemp("ray") / "venv", "ray", "cmaes")
-
-
 @pytest.mark.parametrize("case", CASES)
-def test_ray(case: str, python: Path) -> None:
-    run_case(python, "tests.ray_cases", case)
+def test_ray(case: str, ray_python: Path) -> None:
+    run_case(ray_python, "tests.ray_cases", case)

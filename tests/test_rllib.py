@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.ray_venv import new_venv, run_case
+from tests.ray_venv import add_rllib, run_case
 
 pytestmark = pytest.mark.slow
 
@@ -25,9 +25,10 @@ CASES = (
 
 
 @pytest.fixture(scope="module")
-def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The interpreter of a new virtual environment with flockenv's requirements and RLlib."""
-    return new_venv(tmp_path_factory.mktemp("rllib") / "venv", "rllib")
+def python(ray_python: Path) -> Path:
+    """The interpreter of a virtual environment with flockenv's requirements and RLlib."""
+    add_rllib(ray_python)
+    return ray_python
 
 
 @pytest.mark.parametrize("case", CASES)
