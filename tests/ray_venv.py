@@ -1,4 +1,4 @@
-"""Virtual environments with Ray, whose packages are those of configs/constraints-ray.txt."""
+"""A virtual environment with Ray or RLlib, whose versions are those of configs/constraints-ray.txt."""
 
 from __future__ import annotations
 
@@ -16,18 +16,17 @@ __all__ = ["add_rllib", "new_venv", "run_case"]
 
 ROOT = Path(__file__).resolve().parent.parent
 SITE = "import sysconfig; print(sysconfig.get_path('purelib'))"
+TORCH = ("torch", "torchgen", "functorch")
+"""What torch installs, beside its metadata."""
 
 
 def new_venv(folder: Path) -> Path:
     """Return the interpreter of a new virtual environment with flockenv's requirements, Ray and what searches need.
 
-    Packages of the environment of the tests serve where their versions are the wanted ones, as with pip's system
-    packages: to install torch again takes longer than a test. If a package cannot be installed, the test is skipped.
+    If a package cannot be installed, the test is skipped.
     """
     subprocess.run([sys.executable, "-m", "venv", folder], check=True)
     python = folder / "bin" / "python"
-    own = subprocess.run([python, "-c", SITE], check=True, capture_output=True, text=True).stdout.strip()
-    (Path(own) / "of_the_tests.pth").write_text(sysconfig.get_path("purelib") + "\n")
     project = _project()
     cmaes = [each for each in project["optional-dependencies"]["train"] if each.startswith("cmaes")]
     _install(python, "ray", [*project["dependencies"], *cmaes])
@@ -35,7 +34,18 @@ def new_venv(folder: Path) -> Path:
 
 
 def add_rllib(python: Path) -> None:
-    """Install RLlib beside Ray; if a package cannot be installed, the test is skipped."""
+    """Install RLlib beside Ray; if a package cannot be installed, the test is skipped.
+
+    torch is that of the tests' own environment, if it has the wanted version: to install it again takes longer than
+    most of the tests.
+    """
+    here, there = Path(sysconfig.get_path("purelib")), python.parent.parent / "torch"
+    there.mkdir()
+    for path in here.glob("*torch*"):
+        if path.name.split("-")[0] in TORCH:
+            (there / path.name).symlink_to(path)
+    own = subprocess.run([python, "-c", SITE], check=True, capture_output=True, text=True).stdout.strip()
+    (Path(own) / "torch_of_the_tests.pth").write_text(f"{there}\n")
     _install(python, "rllib", [])
 
 

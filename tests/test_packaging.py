@@ -29,6 +29,9 @@ README_TEST = (
     "&& .venv/bin/python -m pytest -q"
 )
 
+MADE = ("__pycache__", "generated", "_build")
+"""Folders that are made, perhaps at this moment: the site may be built beside these tests."""
+
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -37,7 +40,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
     for name in ("flockenv", "agents", "configs", "docs", "tests"):
-        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns(*MADE))
     build = f"from setuptools import build_meta; build_meta.build_wheel({str(target)!r})"
     done = subprocess.run([sys.executable, "-c", build], cwd=source, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -61,7 +64,7 @@ def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in FILES:
         shutil.copy(ROOT / name, source)
     for name in FOLDERS:
-        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns(*MADE))
     build = f"from setuptools import build_meta; build_meta.build_sdist({str(target)!r})"
     done = subprocess.run([sys.executable, "-c", build], cwd=source, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -102,9 +105,10 @@ def test_the_sdist_contains_all_files_of_the_repository(sdist: Path) -> None:
         path.relative_to(ROOT).as_posix()
         for name in FOLDERS
         for path in (ROOT / name).rglob("*")
-        if path.is_file() and {"__pycache__", "generated", "_build"}.isdisjoint(path.relative_to(ROOT).parts)
+        if path.is_file() and {*MADE}.isdisjoint(path.relative_to(ROOT).parts)
     }
     assert {name for name in files - made if ".egg-info/" not in name} == kept | set(FILES)
+    assert {"prune docs/generated", "prune docs/_build"} <= set((ROOT / "MANIFEST.in").read_text().splitlines())
     if (ROOT / ".git").exists():
         tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
         assert set(tracked.split("\n")) - {""} <= kept | set(FILES)

@@ -114,7 +114,7 @@ def _optimise_cheaply(library: Any) -> None:
 def _finalise_without_code(library: Any) -> None:
     """Finalise a library like numba, but do not add it to the execution engine, which generates machine code.
 
-    numba's checks of its names are made for the entry point, into which all of them are linked.
+    numba's two checks of names are made once, for the entry point, into which every part is linked.
     """
     library._finalized = True
 

@@ -208,7 +208,10 @@ def _no_timers(_: Any) -> Any:
 
 
 def _for_listeners(inform: Any) -> Any:
-    """Make events for others than numba's timers, see `_no_timers`: numba makes two for every call of LLVM."""
+    """Make an event only if some listener is no timer, see `_no_timers`: numba makes two for every call of LLVM.
+
+    So a TimingListener of a user measures nothing while our kernels compile.
+    """
 
     def event_of(kind: str, *args: Any, **kwargs: Any) -> None:
         if any(type(each) is not event.TimingListener for each in event._registered[kind]):
