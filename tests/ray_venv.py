@@ -65,5 +65,5 @@ def _install(python: Path, extra: str, packages: list[str]) -> None:
 def run_case(python: Path, module: str, case: str) -> None:
     """Run a case, a function of a module of tests/, with another interpreter; raise AssertionError if it fails."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0"}
-    done = subprocess.run([python, "-m", module, case], env=environment, capture_output=True, text=True, timeout=300)
+    done = subprocess.run([python, "-m", module, case], env=environment, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr[-3000:]
