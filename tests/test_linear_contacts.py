@@ -17,6 +17,7 @@ from flockenv.physics.constraints import Collisions, Slide
 from flockenv.physics.effects import Drag, Gravity, Springs
 from flockenv.physics.integrators import LinearlyImplicitEuler
 from flockenv.scene import Group, Scene
+from flockenv.studies.stress.impacts import G, drop_balls
 from tests.catalogue import Array
 from tests.test_implicit import LOOSE, hanging, same
 from tests.test_linearly_implicit import CLOSELY, dense, forces
@@ -231,3 +232,16 @@ def test_a_cloth_on_a_ball_comes_to_rest_outside_it(restitution: float) -> None:
     assert np.abs(state.vel).max() < 1e-3
     found = state.count_of("impacts")
     assert scene.run(state, 60).count_of("impacts") == found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("dt", "early"), [(0.02, 0.025), (0.01, 0.017), (0.005, 0.007)])
+def test_the_last_bounces_are_cut_short_by_a_few_steps(dt: float, early: float) -> None:
+    """The numbers of N05 in docs/stress.md: e = .8, rest is due after 9 sqrt(2 h / g); 16 balls."""
+    _, v, heights = drop_balls(LinearlyImplicitEuler(), "earliest", dt, 0.8, round(5.0 / dt))
+    moving = np.abs(v) > 1e-9
+    assert not moving[-1].any()
+    rest = dt * (len(v) - moving[::-1].argmax(axis=0) + 1)
+    late = rest / (9 * np.sqrt(2 * heights / G)) - 1
+    assert -early <= late.min() < -0.8 * early
+    assert late.max() <= 0.003

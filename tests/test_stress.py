@@ -247,7 +247,7 @@ def test_a_stiff_cloth_is_refused_before_anything_runs(method: Integrator, name:
         # one iteration leaves a link that turns in the step too long; `strain` halves such steps
         ("N14 5", 0.0, "fails"), ("N14 8", 0.0, "fails"), ("N14 5", 1e-3, "pass"), ("N14 6", 1e-4, "pass"),
         ("N14 8", 1e-4, "fails"),
-        ("N05 earliest", 0.0, "fails"),  # the last bounces are left out: see docs/stress.md
+        ("N05 earliest", 0.0, "fails"),  # the last bounces are cut short: see docs/stress.md
     ],
 )  # fmt: skip
 def test_linearly_implicit_euler_has_its_known_verdicts(name: str, strain: float, verdict: str) -> None:
