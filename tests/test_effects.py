@@ -24,12 +24,13 @@ from flockenv.model.networks import Mesh
 from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
 from flockenv.physics import effects as effects_module
-from flockenv.physics.effects import Door, Drag, Stage
+from flockenv.physics.effects import Door, Drag, Springs, Stage
 from flockenv.physics.integrators import RK4
 from flockenv.scene import Group, Scene
 from flockenv.steering.arbitration import ARBITRATIONS
 from tests.catalogue import (
     AMONG_ALL,
+    DRAG,
     EDGE,
     EFFECTS,
     FIRST,
@@ -44,6 +45,7 @@ from tests.catalogue import (
     turned,
     users_module,
 )
+from tests.kernels import functions_of, modules_of
 
 BASES = tuple({type(row.effect).__mro__[1]: row for row in reversed(EFFECTS)}.values())
 """One row for each base class, for properties that an effect inherits from it."""
@@ -179,12 +181,13 @@ def test_world_of_a_batch_equals_the_same_world_alone(row: EffectRow, dimension:
 @DIMENSIONS
 @ROWS
 def test_momentum_is_conserved_exactly_by_effects_that_declare_it(row: EffectRow, dimension: int) -> None:
+    """To 1e-12 of the sum of magnitudes of what the agents gained."""
     scene = scene_under(row, dimension)
     start = scene.start(3, worlds=8)  # in some of them agents are in the way of others
     end = scene.run(start, 50)
-    mass = scene.body.mass[None, :, None]
-    gained = np.abs(((end.vel - start.vel) * mass).sum(axis=1)).max()
-    assert (gained < 1e-10) == row.effect.conserves_momentum
+    gained = (end.vel - start.vel) * scene.body.mass[None, :, None]
+    total, magnitudes = np.abs(gained.sum(axis=1)).max(), np.abs(gained).sum(axis=1).max()
+    assert (total <= 1e-12 * magnitudes) == row.effect.conserves_momentum
 
 
 @DIMENSIONS
@@ -340,6 +343,24 @@ def test_pairs_in_one_place_separate_in_opposite_directions_unique_to_each_pair(
     lines = np.abs(directions @ directions.T)[~np.eye(30, dtype=bool)]
     assert lines.max() < 1 - 1e-6
     assert np.linalg.norm(directions.mean(axis=0)) < 0.5
+
+
+SOLIDS = [row for row in EFFECTS if row.family == "liquid" or (row.effect.bond_law and row.effect.kind != "springs")]
+
+
+@pytest.mark.parametrize("row", SOLIDS, ids=lambda row: row.name)
+def test_a_scene_without_a_law_of_solids_or_liquids_has_no_line_byte_or_query_of_it(row: EffectRow) -> None:
+    """It has springs on the same network, whose lasting kinds tests/test_yielding_springs.py compares."""
+    scene = scene_under(row, row.dimensions[0])
+    plain = scene.with_effects(DRAG, *(Springs(stiffness=3),) * bool(row.effect.bond_law))
+    laws = (row.effect.bond_law, row.effect.pair_law, row.effect.finish_law)
+    own = {law.py_func.__name__ for law in laws if law}
+    assert own <= functions_of(scene) and not own & functions_of(plain)
+    module = type(row.effect).__module__
+    assert module in modules_of(scene) and module not in modules_of(plain)
+    assert scene.parts.sweeps == (row.family == "liquid") and not plain.parts.sweeps
+    start = plain.start(0)
+    assert start.bonds.size == start.inner.size == 0
 
 
 WELL = """

@@ -214,6 +214,9 @@ def test_nothing_crosses_and_momentum_is_kept_by_impulses_and_zones(passes: int)
     assert (state.count_of("impact_zones") > 0) == (state.count_of("largest_zone") > 1)
     if passes == 1:
         assert state.count_of("impact_zones") > 0
+        assert state.count_of("face_passes") == 20
+    else:
+        assert 20 < state.count_of("face_passes") <= 20 * passes
 
 
 def test_impulses_never_add_kinetic_energy() -> None:
@@ -251,6 +254,7 @@ def test_a_scene_without_contacts_keeps_its_bits() -> None:
         scene.model_copy(update={"constraints": ()}).step(scene.start(0), steps=10),
     )
     assert with_faces.digest == without.digest
+    assert with_faces.count_of("face_passes") == 10 and with_faces.count_of("impacts") == 0  # one look per step
 
 
 # --- meshes and refusals --------------------------------------------------------------------------------------------

@@ -10,13 +10,13 @@ import pytest
 
 from flockenv.model.networks import Cloth, Mesh, Rope
 from flockenv.model.state import State
-from flockenv.model.triangles import dihedrals
-from flockenv.physics.constraints import FaceCollisions
+from flockenv.model.triangles import dihedral_angles, dihedrals
+from flockenv.physics.constraints import FaceCollisions, Slide
 from flockenv.physics.effects import Bending, Membrane, Springs
 from flockenv.physics.integrators import LinearlyImplicitEuler, VelocityVerlet
 from flockenv.scene import Group, Scene
 from tests.catalogue import Array
-from tests.test_linearly_implicit import dense, differences
+from tests.test_linearly_implicit import CLOSELY, dense, differences, filtered_change
 
 MASS = 0.03
 
@@ -87,6 +87,67 @@ def test_derivatives_are_those_of_the_forces() -> None:
         found, _ = dense(damped, moving, (0.0, 1.0, 0.0))
         expected = differences(damped, moving, of_velocity=True)
         np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
+
+
+def kept_derivative(scene: Scene, state: State) -> Array:
+    """Return what the matrix keeps of dF/dx, from the conditions: -k (C' C'^T + C C''), the last of stretched ones."""
+    membrane, bending = scene.effects
+    assert isinstance(membrane, Membrane) and isinstance(bending, Bending)
+    corners, gradient, area = membrane.triangles(scene.groups, 3)
+    agent, number, _ = bending.stencils(scene.groups, 3)
+    size, step = state.pos[0].size, 1e-6
+
+    def conditions(x: Any) -> tuple[Any, Any]:
+        w = np.einsum("btkd,tku->btud", x.reshape(-1, size // 3, 3)[:, corners], gradient)
+        return np.sqrt((w * w).sum(axis=-1)) - 1, (w[:, :, 0] * w[:, :, 1]).sum(axis=-1)
+
+    def slopes(x: Array) -> tuple[Array, Array]:  # by complex steps, exact to rounding
+        return tuple(each.imag / 1e-20 for each in conditions(x + 1e-20j * np.eye(size)))
+
+    def pull(x: Array) -> Array:
+        length, (slope, _) = conditions(x)[0][0], slopes(x)
+        return np.einsum("t,tu,itu->i", membrane.stretch * area, np.where(stretched, length, 0.0), slope)
+
+    x, off = state.pos[0].ravel(), step * np.eye(size)
+    stretched = conditions(x)[0][0] > 0
+    assert 0.2 < stretched.mean() < 0.8
+    found = np.stack([(pull(x + by) - pull(x - by)) / (2 * step) for by in off], axis=1)
+    slope, shear = slopes(x)
+    found += np.einsum("t,tu,itu,jtu->ij", membrane.stretch * area, ~stretched, slope, slope)
+    found += np.einsum("t,it,jt->ij", membrane.shear * area, shear, shear)
+    angles = [dihedral_angles(at.reshape(-1, 3), agent)[0] for by in off for at in (x + by, x - by)]
+    angle = (np.array(angles[::2]) - angles[1::2]) / (2 * step)
+    return -found - np.einsum("e,ie,je->ij", number[:, 0], angle, angle)
+
+
+def test_derivatives_of_a_sheared_and_bent_sheet_are_those_that_are_kept() -> None:
+    """Left out are second derivatives of shear, of angles, and of stretch that is negative, and those of damping."""
+    scene = cloth(damping=0.02)
+    state = crumpled(scene)
+    state.pos[0, :, 0] += 0.4 * state.pos[0, :, 1]
+    found, _ = dense(scene, state, (1.0, 0.0, 0.0))
+    expected = kept_derivative(scene, state)
+    np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
+    assert np.abs(found - differences(scene, state, of_velocity=False)).max() > 0.1 * np.abs(found).max()
+
+
+@pytest.mark.slow
+def test_a_step_is_the_dense_solution_with_filters_in_space() -> None:
+    """A particle is held, a side slides in a plane, others on a line."""
+    plane = Slide(particles=("right",), along=((1.0, 0.0, 1.0), (0.0, 1.0, 1.0)))
+    line = Slide(particles=(4, 5), along=((1.0, 2.0, -2.0),))
+    sheet = Cloth(cells=(3, 2), sides=(0.9, 0.6), pinned=("top_left",))
+    scene = cloth(damping=0.02, network=sheet, constraints=(plane, line), dt=0.05, integrator=CLOSELY)
+    along: dict[int, Array] = {}
+    state = crumpled(scene)
+    for slide in (plane, line):
+        basis = np.linalg.qr(np.array(slide.along).T)[0].T
+        along |= dict.fromkeys(slide.agents(scene).tolist(), basis)
+    for i, basis in along.items():
+        state.vel[0, i] = state.vel[0, i] @ basis.T @ basis
+    change = filtered_change(scene, state, along)
+    assert np.linalg.norm(change, axis=1).min() == 0 < 1 < np.abs(change[[3, 4, 5, 7, 11]]).max()
+    np.testing.assert_allclose(scene.step(state).vel[0] - state.vel[0], change, atol=1e-9 * np.abs(change).max())
 
 
 def test_the_matrix_of_a_crumpled_sheet_has_no_negative_eigenvalue() -> None:
@@ -275,3 +336,64 @@ def test_explicit_and_implicit_steps_agree() -> None:
     assert gaps[0] < 0.1
     for coarse, fine in pairwise(gaps):
         assert 1.7 < coarse / fine < 2.4
+
+
+# --- strips under load, at rest and swinging: slow tests that share the kernels of the one above ----------------------
+
+LENGTH, RIGID = 0.9, LinearlyImplicitEuler(tolerance=1e-9)
+
+
+def strip(cells: int, width: float, pinned: tuple[Any, ...], **fields: Any) -> tuple[Scene, State, Array, float]:
+    """Return a strip of one row of cells, its start, its x, m, and its rigidity under load, N m: see `Bending`."""
+    sheet = Cloth(cells=(cells, 1), sides=(LENGTH, width), pinned=pinned)
+    scene, r = cloth(network=sheet, **fields), width * cells / LENGTH
+    state, bend = scene.start(0), float(scene.effects[1].stiffness)
+    return scene, state, np.asarray(state.pos[0, :, 0]), bend * (r + 1 / r) ** 2 / (r * r + (r + 1 / r) ** 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("width", "share"), [(LENGTH / 32, 0.8), (LENGTH / 128, 1.0)], ids=["square", "long"])
+def test_a_clamped_strip_bends_as_a_beam_of_its_rigidity(width: float, share: float) -> None:
+    """q L^4 / (8 D) from the middle of the clamped cells on; D is the stiffness if cells are long, 4/5 if square."""
+    held = (0, 1, 33, 34)
+    scene, state, x, rigidity = strip(32, width, held, integrator=RIGID, dt=20.0)
+    assert rigidity == pytest.approx(share * 0.4, rel=0.005)
+    long, load = LENGTH * (1 - 0.5 / 32), np.zeros(state.shape)
+    load[0, :, 2] = -0.01 * (LENGTH / 32) * width / 2 * np.where(x > LENGTH - 1e-9, 0.5, 1.0)
+    for _ in range(40):
+        state = scene.step(state, load)
+    assert np.abs(state.vel).max() < 1e-10
+    dropped = -state.pos[0, x > LENGTH - 1e-9, 2].mean()
+    assert dropped < 0.01 * LENGTH
+    assert dropped == pytest.approx(0.01 * long**4 / (8 * rigidity), rel=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("bend", "short"), [(0.02, 0.01), (0.2, 0.02)])
+def test_a_strip_compressed_past_eulers_load_rests_in_the_wave_of_the_elastica(bend: float, short: float) -> None:
+    """Amplitude (2 L / pi) sqrt(shortening - strain), with Euler's strain D q^2 / k, to first order; below it, none."""
+    for strain, buckles in ((short, True), (0.7 * 0.8 * bend * (np.pi / LENGTH) ** 2 / 300.0, False)):
+        scene, state, x, rigidity = strip(16, LENGTH / 16, ("left", "right"), bend=bend, integrator=RIGID, dt=4.0)
+        pos = state.pos * (1 - strain, 1.0, 1.0)
+        pos[0, :, 2] = 1e-3 * np.sin(np.pi * x / LENGTH)
+        end = scene.run(state.with_motion(pos, state.vel), 200)
+        assert np.abs(end.vel).max() < 1e-8
+        room = strain - rigidity * (np.pi / LENGTH) ** 2 / 300.0
+        expected = 2 * LENGTH / np.pi * np.sqrt(room) if buckles else 0.0
+        assert end.pos[0, :, 2].max() == pytest.approx(expected, rel=0.01, abs=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("waves", [1, 2])
+@pytest.mark.parametrize("width", [LENGTH / 32, LENGTH / 128], ids=["square", "long"])
+def test_a_strip_swings_at_the_frequencies_of_a_beam(width: float, waves: int) -> None:
+    """With pinned ends (n pi / L)^2 sqrt(D / mass per area); after a quarter of the time it is flat."""
+    scene, state, x, rigidity = strip(32, width, ("left", "right"), integrator=VelocityVerlet(), dt=1e-3, bend=0.01)
+    q = waves * np.pi / LENGTH
+    wave, omega = np.sin(q * x), q**2 * np.sqrt(rigidity / (2 * MASS / (width * LENGTH / 32)))
+    pos = state.pos.copy()
+    pos[0, :, 2] = 1e-4 * wave
+    end = scene.run(state.with_motion(pos, state.vel), round(np.pi / 2 / omega / scene.dt))
+    phase = float(end.pos[0, :, 2] @ wave / (1e-4 * wave @ wave))
+    assert abs(phase) < 0.01 * np.pi / 2
+    assert float(end.vel[0, :, 2] @ wave / (1e-4 * wave @ wave)) == pytest.approx(-omega, rel=0.01)

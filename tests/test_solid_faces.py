@@ -12,7 +12,7 @@ from flockenv.model.networks import Jelly, Mesh
 from flockenv.model.state import State
 from flockenv.model.surface import faces_of
 from flockenv.physics.constraints import FaceCollisions
-from flockenv.physics.effects import Springs
+from flockenv.physics.effects import Bending, Membrane, Springs
 from flockenv.physics.integrators import LinearlyImplicitEuler
 from flockenv.scene import Group, Scene
 from tests.catalogue import Array
@@ -23,11 +23,12 @@ pytestmark = pytest.mark.slow
 
 
 def total_energy(scene: Scene, state: State) -> float:
-    """Return the energy of motion and height of free particles, and of springs, J."""
-    springs = [effect for effect in scene.effects if isinstance(effect, Springs)]
+    """Return the energy of motion and height of free particles, and of springs and triangles, J."""
     stored = 0.0
-    for spring in springs:
-        found = spring.potential(scene.groups, state, scene.space.displacement)
+    for effect in scene.effects:
+        if not isinstance(effect, Springs | Membrane | Bending):
+            continue
+        found = effect.potential(scene.groups, state, scene.space.displacement)
         assert found is not None
         stored += float(found[0])
     free = np.isfinite(scene.body.mass)
@@ -72,6 +73,17 @@ def test_two_sheets_drape_on_a_ball_and_are_pulled_off_without_a_crossing() -> N
     state = pull(scene, state, 60, force)
     moved = state.pos[0] - draped
     assert moved[lower, 0].mean() > 0.2 and moved[upper, 0].mean() < -0.2
+
+
+def test_a_sheet_of_triangles_drapes_on_a_ball_without_a_crossing() -> None:
+    effects = (EFFECTS[0], Membrane(stretch=2e3, shear=500.0, damping=0.02), Bending(stiffness=0.01, damping=0.02))
+    scene = Scene(
+        dimension=3, groups=(sheet(8, 1.0, (-0.5, -0.5, 0.45)),), effects=effects, integrator=LinearlyImplicitEuler(),
+        constraints=(FaceCollisions(friction=0.4, thickness=0.01),), obstacles=(Circle(centre=(0, 0, 0), radius=0.4),),
+        dt=0.005,
+    )  # fmt: skip
+    place = pull(scene, scene.start(0), 200, np.zeros((scene.agents, 3))).pos[0]
+    assert np.linalg.norm(place, axis=1).min() > 0.4 and place[:, 2].min() < 0 and place[:, 2].max() > 0.4
 
 
 def knotted_strip() -> Group:

@@ -288,8 +288,10 @@ class Bending(Effect):
     """Bending of the triangles of a group's network, by the angle between the normals of neighbouring triangles.
 
     The condition is C = |e| / sqrt(A + A') (angle - rest angle) for the edge e between triangles of areas A and A'. The
-    stiffness is then the flexural rigidity of a sheet bent along the sides of its square cells, and does not depend on
-    their size (compare Grinspun et al. 2003, Discrete shells).
+    stiffness is then the flexural rigidity of a sheet that has the shape of a cylinder, bent along the sides of its
+    cells, and does not depend on their size (compare Grinspun et al. 2003, Discrete shells). Under load a sheet also
+    folds along the diagonals of its cells: a strip of cells r times as wide as long has s / (s + r^2) of that rigidity,
+    s = (r + 1 / r)^2. This is 4/5 of it if cells are square, and more if they are longer.
     """
 
     kind: Literal["bending"] = "bending"

@@ -20,7 +20,8 @@ class LinearlyImplicitEuler(Integrator):
     1981) as preconditioner. The derivatives are those of springs, membranes, bending and linear drag; other forces are
     taken at the beginning of the step, as in semi-implicit Euler, and limit dt as they do there. Particles held in
     place keep their velocity exactly, those of a `slide` constraint keep to its line or plane within the solve.
-    Momentum is conserved to the tolerance.
+    The equations conserve momentum; what a solve leaves in its residual changes it. The tolerance is relative to the
+    forces between particles, so stiff sheets that are far from rest need a smaller one to keep their momentum.
 
     With `strain`, a step in which some triangle or spring changes its length by more than that share of its rest
     length is made again as two halves, and these likewise (section 6 there, but without a step size that lasts): a
