@@ -214,9 +214,7 @@ def test_nothing_crosses_and_momentum_is_kept_by_impulses_and_zones(passes: int)
     assert (state.count_of("impact_zones") > 0) == (state.count_of("largest_zone") > 1)
     if passes == 1:
         assert state.count_of("impact_zones") > 0
-        assert state.count_of("face_passes") == 20
-    else:
-        assert 20 < state.count_of("face_passes") <= 20 * passes
+    assert state.count_of("face_passes") > 20  # with passes = 1 those over zones
 
 
 def test_impulses_never_add_kinetic_energy() -> None:

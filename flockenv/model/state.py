@@ -32,7 +32,8 @@ WORK = (
 """Counters in State.work: force evaluations, neighbour queries, candidate pairs tested, agent-obstacle tests; of
 adaptive and linearly implicit methods, steps accepted and rejected; of implicit methods, iterations; of collisions,
 impacts, cut or unsolved ones, and bodies that stopped within a step; of a population, births, deaths, and births
-without a free slot; of faces, passes over impacts, impact zones, and the number of particles of the largest."""
+without a free slot; of faces, passes over impacts and over zones, impact zones, and the number of particles of the
+largest."""
 
 COUNTED_BY_KERNELS = 8
 """Number of these counters, the first ones, that the kernel of a scene updates."""

@@ -211,6 +211,7 @@ def _make_zones(mesh: Any, scratch: Any, rules: Any, since: int) -> int:
         pairs = find_pairs(mesh, s.motion, s.pairs, rules.thickness, clock)
         if pairs > room:
             return pairs
+        s.count[PASSES] += 1
         hits, changed = 0, 0
         for k in range(pairs):
             who = s.pairs.who[k]
