@@ -10,6 +10,7 @@ import pytest
 
 from flockenv.core.warnings import UnsolvedContactsWarning
 from flockenv.geometry.box_tree import build_tree, overlapping_pairs
+from flockenv.geometry.mesh_checks import first_piercing
 from flockenv.geometry.shapes import Block, Capsule, Circle, DistanceField, HalfSpace, Sway, TriangleMesh
 from flockenv.geometry.space import Torus
 from flockenv.model.networks import Blocks, Cloth, Jelly, Mesh, Rope
@@ -320,6 +321,23 @@ def test_what_makes_no_sense_is_refused(change: dict[str, Any], text: str) -> No
     given: dict[str, Any] = {"dimension": 3, "groups": (sheet(2, 1.0, (0, 0, 0)),), "constraints": (SOLID,)}
     with pytest.raises(ValueError, match=text):
         Scene(**(given | change))
+
+
+def test_an_edge_beside_a_triangle_in_one_plane_but_for_rounding_does_not_pierce_it() -> None:
+    """From a sheet that falls: 5 cm apart, and 4e-13 m off the plane. Moved over to the triangle, it pierces it."""
+    points = np.array(
+        [
+            (0.14999999999999997, 0.09509295750257127, 0.7102394375214358),
+            (0.14999999999999988, 0.10329827812728622, 0.7786171093940516),
+            (0.07411217318258559, 0.08701783469578381, 0.642946747465564),
+            (0.15000000000000013, 0.08699362160722789, 0.6427449717274907),
+            (0.0744675198494101, 0.09509409695942635, 0.7102489329952321),
+        ]
+    )
+    edges, triangles = np.array([(0, 1)]), np.array([(2, 3, 4)])
+    assert first_piercing(points, edges, triangles) is None
+    points[:2] = points[2:].mean(axis=0) + np.array([(0, 0.01, 0), (0, -0.01, 0)])
+    assert first_piercing(points, edges, triangles) == (0, 0)
 
 
 @pytest.mark.parametrize("constraints", [(SOLID, RigidBodies()), (RigidBodies(), SOLID)])

@@ -215,7 +215,8 @@ def first_piercing(
 def _pierces(ends: Floats, corners: Floats) -> NDArray[np.bool_]:
     """Return True for each pair of a segment, (K, 2, 3) m, and a triangle, (K, 3, 3) m, that have a point in common.
 
-    Those in one plane count if an end is in the triangle, or edges cross.
+    Those in one plane count if an end is in the triangle, or edges cross. So must the shadows of all others on a plane:
+    for points that are in one plane but for rounding, volumes alone decide nothing.
     """
     p, q, (a, b, c) = ends[:, 0], ends[:, 1], corners.transpose(1, 0, 2)
     size = np.abs(corners - p[:, None]).max(axis=(1, 2)) if len(p) else np.zeros(0)
@@ -230,11 +231,11 @@ def _pierces(ends: Floats, corners: Floats) -> NDArray[np.bool_]:
     inside = (sides >= -little).all(axis=0) | (sides <= little).all(axis=0)
     flat = (np.abs(over) <= little) & (np.abs(under) <= little)
     crossing = ((over >= -little) & (under <= little)) | ((over <= little) & (under >= -little))
-    return np.asarray(np.where(flat, _meet_in_plane(ends, corners), inside & crossing))
+    return np.asarray((flat | (inside & crossing)) & _meet_from_above(ends, corners))
 
 
-def _meet_in_plane(ends: Floats, corners: Floats) -> NDArray[np.bool_]:
-    """Return True for each segment and triangle of one plane that have a point in common: along the plane's axes."""
+def _meet_from_above(ends: Floats, corners: Floats) -> NDArray[np.bool_]:
+    """Return True for each segment and triangle that have a point in common, seen along the axis next to its normal."""
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     dropped = np.abs(normal).argmax(axis=1)
     kept = np.array([(1, 2), (0, 2), (0, 1)])[dropped][:, None]
