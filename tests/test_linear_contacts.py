@@ -35,9 +35,9 @@ def standing(shape: Any = FLOOR, pinned: tuple[str, ...] = (), **fields: Any) ->
     rules = {name: fields.pop(name) for name in ("restitution", "friction") if name in fields}
     groups = Group(network=sheet, mass=0.05, radius=RADIUS), LOOSE.model_copy(update={"radius": RADIUS})
     return hanging(
-        method=CLOSELY, groups=groups, obstacles=(shape,),
+        groups=groups, obstacles=(shape,),
         **{
-            "constraints": (Collisions(agents=False, **({"restitution": 0.0} | rules)),),
+            "method": CLOSELY, "constraints": (Collisions(agents=False, **({"restitution": 0.0} | rules)),),
             "stiffness": 2e4, "damping": 20.0, "dt": 1 / 60, **fields,
         },
     )  # fmt: skip
@@ -130,8 +130,9 @@ def test_a_contact_along_which_a_body_cannot_move_does_not_hold_it() -> None:
     assert (scene.step(start).vel[0, :ROW, 0] > 0.04).all()
 
 
-def test_a_sheet_at_rest_presses_with_its_weight_and_has_no_impacts() -> None:
-    scene = standing(friction=0.5)
+@pytest.mark.parametrize("linearisations", [1, 3])
+def test_a_sheet_at_rest_presses_with_its_weight_and_has_no_impacts(linearisations: int) -> None:
+    scene = standing(friction=0.5, method=CLOSELY.model_copy(update={"linearisations": linearisations}))
     state = scene.run(scene.start(0), 150)
     end = scene.run(state, 10)
     own = slice(0, 3 * ROW)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from typing import Any
 
@@ -170,8 +171,22 @@ def test_a_free_sheet_gains_the_momentum_that_the_solve_leaves_in_its_residual(
     assert least <= worst <= most
 
 
+@pytest.mark.parametrize("by", [1.0, 1.3], ids=["shaken", "stretched"])
+def test_further_linearisations_end_at_implicit_euler(by: float) -> None:
+    """They are Newton's iterations: each error is at most a tenth of the last. Drag and a moving end are part of it."""
+    laws: dict[str, Any] = {"damping": 0.0, "weight": Drag(rate=0.4)}
+    state, errors = stretched(sheet_of(**laws), by), []
+    state.vel[0, 15] = 0.7, -0.2  # held
+    exact = sheet_of(ImplicitEuler(), **laws).step(state)
+    for linearisations in range(1, 7):
+        method = CLOSELY.model_copy(update={"linearisations": linearisations})
+        errors.append(float(np.abs(sheet_of(method, **laws).step(state).vel - exact.vel).max()))
+    assert errors[0] > 0.02 and errors[-1] < 1e-11
+    assert all(next_one < 0.1 * error for error, next_one in itertools.pairwise(errors))
+
+
 def test_results_do_not_depend_on_batches_or_steps_per_call() -> None:
-    scene = sheet_of()
+    scene = sheet_of(CLOSELY.model_copy(update={"linearisations": 2}))
     start = shaken(scene, worlds=3)
     whole, again = scene.step(start, steps=3), start
     for _ in range(3):

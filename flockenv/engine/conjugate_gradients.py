@@ -359,7 +359,7 @@ def solve_from_of(dimension: int) -> Callable[..., tuple[int, float]]:
 
     The change must agree with what the filter prescribes; components that the filter removes stay as they are. This is
     the modified method of Baraff and Witkin 1998, with the start of Ascher and Boxerman 2003. first: a result of
-    `size`; if the residual of the start is larger, the criterion is relative to that.
+    `size` or `solve`; if the residual of the start is larger, the criterion is relative to that.
     """
     filter_blocks, set_residual = _filter_blocks(dimension), _set_residual(dimension)
     multiply, descend = _multiply(dimension), _descend(dimension)
@@ -376,20 +376,21 @@ def solve_from_of(dimension: int) -> Callable[..., tuple[int, float]]:
 
 
 @entry_of
-def solve_of(dimension: int) -> Callable[..., tuple[int, float]]:
+def solve_of(dimension: int) -> Callable[..., tuple[int, float, float]]:
     """Make `solve(system, tolerance, most)`: write dv by filtered, preconditioned conjugate gradients.
 
-    It returns the number of iterations and the norm of the residual relative to that of dv = 0, in the norm r . P r of
-    the preconditioner P. The filter and the criterion are those of Baraff and Witkin 1998, section 5.3. P is symmetric
-    Gauss-Seidel: the inverse of (D + L) D^-1 (D + L'), with the blocks D on the diagonal of A and L below it. In the
-    form of Eisenstat 1981 the equations are those of (D + L') dv, multiplied by (D + L)^-1: an iteration then costs a
-    backward and a forward substitution, as much as a product with A. An iteration that finds a direction without
-    curvature ends it: the relative norm is NaN.
+    It returns the number of iterations, the norm of the residual relative to that of dv = 0, in the norm r . P r of the
+    preconditioner P, and the square of the latter. The filter and the criterion are those of Baraff and Witkin 1998,
+    section 5.3. P is symmetric Gauss-Seidel: the inverse of (D + L) D^-1 (D + L'), with the blocks D on the diagonal of
+    A and L below it. In the form of Eisenstat 1981 the equations are those of (D + L') dv, multiplied by (D + L)^-1: an
+    iteration then costs a backward and a forward substitution, as much as a product with A. An iteration that finds a
+    direction without curvature ends it: the relative norm is NaN.
     """
     begin, descend = _begin(dimension), _descend(dimension)
 
-    def solve(system: Any, tolerance: float, most: int) -> tuple[int, float]:
+    def solve(system: Any, tolerance: float, most: int) -> tuple[int, float, float]:
         first = begin(system)
-        return descend(system, first, first, tolerance, most)  # type: ignore[no-any-return]
+        iterations, left = descend(system, first, first, tolerance, most)
+        return iterations, left, first
 
     return solve

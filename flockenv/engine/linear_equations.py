@@ -9,7 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from flockenv.jit.decorators import Law
+from flockenv.jit.intrinsics import unaliased
 from flockenv.jit.section import entry_of, section
 from flockenv.maths.approximations import round_half_even
 
@@ -55,14 +58,15 @@ def _gather(dimension: int, nodes: int) -> Callable[..., bool]:
     d = dimension
 
     def gather(x: Any, v: Any, alive: Any, agent: Any, s: Any, period: Any, local: Any) -> Any:
-        living = True
+        living, first = True, np.uint64(agent[s, 0])
         for p in range(nodes):
-            living = living and alive[agent[s, p]]
+            i = np.uint64(agent[s, p])
+            living = living and alive[i]
             for k in range(d):
-                off = x[k, agent[s, p]] - x[k, agent[s, 0]]
+                off = x[k, i] - x[k, first]
                 if period[k] > 0:
                     off -= period[k] * round_half_even(off / period[k])
-                local.at[p, k], local.vel[p, k] = off, v[k, agent[s, p]]
+                local.at[p, k], local.vel[p, k] = off, v[k, i]
         return living
 
     return gather
@@ -81,20 +85,25 @@ def assemble_of(derivative: Law, dimension: int, nodes: int) -> Callable[..., No
         x: Any, v: Any, alive: Any, agent: Any, number: Any, block: Any, period: Any, by_x: float, by_v: float,
         along: float, system: Any, local: Any,
     ) -> None:  # fmt: skip
+        unaliased()
         for s in range(agent.shape[0]):
             if gather(x, v, alive, agent, s, period, local):
                 derivative(local, number, s)
                 for p in range(nodes):
-                    for q in range(nodes):
-                        base = block[s, p, q] * (d * d)
-                        for a in range(d):
-                            total = 0.0
+                    row = np.uint64(agent[s, p]) * np.uint64(d)
+                    for a in range(d):
+                        total = 0.0
+                        for q in range(nodes):
                             for c in range(d):
-                                slope = local.by_position[p * d + a, q * d + c]
-                                damp = local.by_velocity[p * d + a, q * d + c]
-                                system.value[base + a * d + c] += by_x * slope + by_v * damp
-                                total += slope * local.vel[q, c]
-                            system.right[agent[s, p] * d + a] += along * total
+                                total += local.by_position[p * d + a, q * d + c] * local.vel[q, c]
+                        system.right[row + np.uint64(a)] += along * total
+                    for q in range(nodes):
+                        base = np.uint64(block[s, p, q]) * np.uint64(d * d)
+                        for a in range(d):
+                            for c in range(d):
+                                slope = by_x * local.by_position[p * d + a, q * d + c]
+                                damp = by_v * local.by_velocity[p * d + a, q * d + c]
+                                system.value[base + np.uint64(a * d + c)] += slope + damp
 
     return assemble
 

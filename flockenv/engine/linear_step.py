@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.engine.conjugate_gradients import solve_of
+from flockenv.engine.conjugate_gradients import image_of, solve_from_of, solve_of
 from flockenv.engine.linear_contacts import ContactSolver
 from flockenv.engine.linear_equations import FIXED, FREE, SLIDES, Local, System, assemble_of, strain_change_of
 from flockenv.model.scene_view import SceneView
@@ -85,10 +85,12 @@ class LinearSolver:
         ]
         self.held = np.isinf(scene.body.mass)
         self.mass = np.where(self.held, 1.0, scene.body.mass.astype(float))
+        self.masses = np.repeat(self.mass, d)  # of each component
+        self.own = (self.system.diagonal[:, None] * d**2 + np.arange(d) * (d + 1)).ravel()  # where `value` has them
         self.period = np.array(scene.space.extent(d) if scene.space.periodic else (0.0,) * d)
         self.kinds = np.where(self.held, FIXED, FREE).astype(np.int8)
         self._read_slides(scene)
-        self.solve = solve_of(d)
+        self.solve, self.solve_from, self.image, self.first = solve_of(d), solve_from_of(d), image_of(d), 0.0
         self.contacts = self._contacts(scene)
 
     def _read_slides(self, scene: SceneView) -> None:
@@ -138,8 +140,7 @@ class LinearSolver:
     def _advance(self, scene: SceneView, state: State, drive: Any, time: float, h: float, halved: int) -> LinearStep:
         """Return the motion after h seconds, from a state at a time; halved: how often the step was halved for it."""
         method = scene.integrator
-        acceleration, flow = scene.rates(state, drive, [time])
-        found = self.step(scene, state, acceleration, flow, time, h)
+        found = self.step(scene, state, drive, time, h)
         change, agent = self._strain_change(state, found) if method.strain > 0 else (0.0, -1)
         if change <= method.strain:
             return found
@@ -168,41 +169,80 @@ class LinearSolver:
         ]
         return max(every, default=(0.0, -1))
 
-    def step(
-        self, scene: SceneView, state: State, acceleration: Floats, flow: Floats | None, time: float, h: float
-    ) -> LinearStep:
+    def step(self, scene: SceneView, state: State, drive: Any, time: float, h: float) -> LinearStep:
         """Return the motion of a single world h seconds after `time`; raise NotSolvedLinearlyError without a solution.
 
-        acceleration, flow: at the beginning, (1, N, D) m/s^2, m/s.
+        The first linearisation is about the beginning of the step, each further one about the end that the last one has
+        found: they are Newton's iterations for the equation of implicit Euler.
         """
-        method, system, d = scene.integrator, self.system, scene.dimension
+        x, v = (np.ascontiguousarray(each[:, 0], float) for each in (state.x, state.v))
+        self.read_kept(state)
+        flow = self._set_equations(scene, state, drive, time, h, h * h)
+        carried = np.zeros((scene.dimension, 0)) if flow is None else np.ascontiguousarray(flow[0].T, float)
+        begins = x, v, carried, time, h
+        iterations, held = self._solve(scene, state, begins)
+        for _ in range(scene.integrator.linearisations - 1):
+            pos, vel = (np.ascontiguousarray(each[:, None], scene.dtype) for each in self._end(*begins))
+            self._set_equations(scene, replace(state, x=pos, v=vel), drive, time + h, h, 0.0)
+            self._count_from_start()
+            more, held = self._solve(scene, state, begins, iterations)
+            iterations += more
+        return LinearStep(*self._end(*begins), iterations, held=held)
+
+    def _set_equations(
+        self, scene: SceneView, state: State, drive: Any, time: float, h: float, along: float
+    ) -> Floats | None:
+        """Write A = M - h dF/dv - h^2 dF/dx and b = h F + `along` dF/dx v at a state, and the filters.
+
+        Returns the velocity by which a medium carries agents, if there is one.
+        """
+        system, alive = self.system, state.alive[0]
+        acceleration, flow = scene.rates(state, drive, [time])
         acc = np.asarray(acceleration[0], float)
         if not np.isfinite(acc).all():
             raise NotSolvedLinearlyError("the acceleration is not finite", int(np.argmin(np.isfinite(acc).all(axis=1))))
-        alive = state.alive[0]
-        np.multiply(acc, h * self.mass[:, None], out=system.right.reshape(-1, d))
+        np.multiply(acc.ravel(), h * self.masses, out=system.right)
         system.value[:] = 0.0
-        blocks = system.value.reshape(-1, d, d)
-        blocks[system.diagonal, np.arange(d)[:, None], np.arange(d)[:, None]] = self.mass
+        system.value[self.own] = self.masses
         np.copyto(system.filter, self.kinds)
         system.filter[~alive] = FIXED
         x, v = (np.ascontiguousarray(each[:, 0], float) for each in (state.x, state.v))
-        self.read_kept(state)
-        self.assemble(x, v, alive, (-h * h, -h, h * h))
-        carried = np.zeros((d, 0)) if flow is None else np.ascontiguousarray(flow[0].T, float)
-        held = None
-        if self.contacts is not None and self.contacts.look(system, state, x, v, carried, time, h):
-            iterations, left = self.contacts.solve(system, self.mass, method.tolerance, method.most)
+        self.assemble(x, v, alive, (-h * h, -h, along))
+        return flow  # type: ignore[no-any-return]
+
+    def _count_from_start(self) -> None:
+        """Add (A - M) dv to b, with the change dv so far: its solution is then the whole change, not the next one."""
+        system = self.system
+        self.image(system)
+        system.right[:] += system.image - self.masses * system.change
+
+    def _solve(
+        self, scene: SceneView, state: State, begins: tuple[Doubles, Doubles, Doubles, float, float], done: int = 0
+    ) -> tuple[int, NDArray[np.bool_] | None]:
+        """Solve the equations; return the number of iterations, and which agents are in contact, if the scene has any.
+
+        done: iterations of earlier linearisations of the step; with some, the solve begins with their change.
+        """
+        method, system, held = scene.integrator, self.system, None
+        if self.contacts is not None and self.contacts.look(system, state, *begins):
+            iterations, left = self.contacts.solve(system, self.mass, method.tolerance, method.most - done)
             held = self.contacts.held()
+        elif done:
+            iterations, left = self.solve_from(system, self.first, method.tolerance, method.most - done)
         else:
-            iterations, left = self.solve(system, method.tolerance, method.most)
+            iterations, left, self.first = self.solve(system, method.tolerance, method.most)
         if not left <= method.tolerance:
             raise NotSolvedLinearlyError(
-                f"the linear equations are not solved to tolerance = {method.tolerance:g} in {iterations:,} iterations",
-                int(np.argmax(np.abs(system.residual))) // d,
+                f"the linear equations are not solved to tolerance = {method.tolerance:g} in "
+                f"{done + iterations:,} iterations",
+                int(np.argmax(np.abs(system.residual))) // scene.dimension,
             )
-        v = v + system.change.reshape(-1, d).T  # not in place: a view of the state, where bounces read the old one
-        return LinearStep(x + h * (v if flow is None else v + flow[0].T), v, int(iterations), held=held)
+        return int(iterations), held
+
+    def _end(self, x: Doubles, v: Doubles, flow: Doubles, time: float, h: float) -> tuple[Doubles, Doubles]:
+        """Return positions and velocities after the change that was found, (D, N)."""
+        v = v + self.system.change.reshape(-1, len(v)).T  # not in place: a view of the state, which bounces read
+        return x + h * (v + flow if flow.size else v), v
 
 
 def _either(first: NDArray[np.bool_] | None, last: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:

@@ -101,12 +101,11 @@ class Stepper:
 
     def _finish_step(self, state: State, world: int, x: Floats, v: Floats) -> tuple[int, int]:
         """Let the kernel finish a step with the solved positions and velocities, (D, N): limits, space, time."""
-        width, (_, n) = self.scene.parts.width, x.shape
+        width, (d, n) = self.scene.parts.width, x.shape
         stages = self.workspaces(1, 1)[0].arrays["stages"]
-        for row, solved in zip(stages, (x, v), strict=True):
-            padded = np.zeros((self.scene.dimension, -(-n // width) * width), self.scene.dtype)
-            padded[:, :n] = solved
-            row[:] = padded.reshape(self.scene.dimension, -1, width).transpose(1, 0, 2).ravel()
+        padded = np.zeros((2, d, -(-n // width) * width), self.scene.dtype)
+        padded[0, :, :n], padded[1, :, :n] = x, v
+        stages[:] = padded.reshape(2, d, -1, width).transpose(0, 2, 1, 3).reshape(stages.shape)
         return self._step(state, np.zeros((self.scene.dimension, 0, 0), self.scene.dtype), 1)
 
     def _step(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:

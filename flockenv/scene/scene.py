@@ -551,7 +551,7 @@ class Scene(Record):
         all_times = np.asarray(state.time if times is None else times, float)
         if all_times.shape not in ((), (b,)) or not np.isfinite(all_times).all():
             raise ValueError(f"times is {times!r}, must be a finite number for each of {b} worlds, or one for all")
-        time, x = np.ascontiguousarray(np.broadcast_to(all_times, b), self.dtype), state.x
+        time, x = np.full(b, all_times, self.dtype), state.x
         if self.parts.confines:  # as at the start of a step; a given state may be outside the box
             with np.errstate(invalid="ignore"):  # an infinite position has no image, and is no neighbour
                 x = np.ascontiguousarray(self.space.wrap(state.pos).transpose(2, 0, 1), self.dtype)
