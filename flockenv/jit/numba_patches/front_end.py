@@ -125,17 +125,17 @@ def _objects(context: Any, args: Any, kws: Any) -> tuple[Any, ...]:
     return context, *args, *(kws.values() if kws else ())
 
 
-_known_flags: list[dict[str, Any]] = []
+_known_flags: list[dict[str, Any] | None] = []
 
 
 def _flags_number() -> int:
     """Return a number for the flags of the caller, the same for equal flags; numba's hash is the same for all flags."""
     flags = targetconfig.ConfigStack.top_or_none()  # type: ignore[no-untyped-call]
-    options = {} if flags is None else flags._values
+    options = None if flags is None else flags._values
     for number, known in enumerate(_known_flags):
         if known == options:
             return number
-    _known_flags.append(dict(options))
+    _known_flags.append(None if options is None else dict(options))
     return len(_known_flags) - 1
 
 
@@ -202,19 +202,24 @@ def _without_literals(args: Any) -> tuple[Any, ...]:
 # --- cheaper: the same result, computed faster ------------------------------------------------------------------------
 
 
+LOCKS = ("numba:compiler_lock", "numba:llvm_lock")
+"""Kinds of events of which numba measures times."""
+
+
 def _no_timers(_: Any) -> Any:
     """Measure no times of locks: numba informs two timers for each enclosing function, with every nested call."""
     return lambda kind, callback: nullcontext()
 
 
 def _for_listeners(inform: Any) -> Any:
-    """Make an event only if some listener is no timer, see `_no_timers`: numba makes two for every call of LLVM.
+    """Make an event only if somebody listens; of a lock, only if it is no timer, see `_no_timers`.
 
-    So a TimingListener of a user measures nothing while our kernels compile.
+    numba makes two events of a lock for every call of LLVM. So a TimingListener of a user measures nothing of locks
+    while our kernels compile.
     """
 
     def event_of(kind: str, *args: Any, **kwargs: Any) -> None:
-        if any(type(each) is not event.TimingListener for each in event._registered[kind]):
+        if any(kind not in LOCKS or type(each) is not event.TimingListener for each in event._registered[kind]):
             inform(kind, *args, **kwargs)
 
     return event_of
