@@ -191,8 +191,8 @@ def threshold(method: Integrator) -> Value:
 # --- N04: an orbit ---------------------------------------------------------------------------------------------------
 
 ORBIT = {
-    "velocity_verlet": 4e-4, "rk4": 3e-7, "semi_implicit_euler": 2e-2, "midpoint": 3e-3, "dormand_prince": 1e-4,
-    "adaptive_rk4": 1e-3,
+    "velocity_verlet": 4e-4, "rk4": 3e-7, "semi_implicit_euler": 2e-2, "linearly_implicit_euler": 2e-2,
+    "midpoint": 3e-3, "dormand_prince": 1e-4, "adaptive_rk4": 1e-3,
 }  # fmt: skip
 """Bounds of |dE/E| over 100 periods at 1,000 steps each; 1e-2 for other methods."""
 

@@ -6,9 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
+from flockenv.geometry.mesh_checks import first_piercing
 from flockenv.geometry.shapes import HalfSpace
 from flockenv.model.networks import Cloth, Rope
 from flockenv.model.spawn import Spawn
+from flockenv.model.surface import faces_of
 from flockenv.physics.constraints import Collisions, FaceCollisions
 from flockenv.physics.effects import Bending, Gravity, Membrane, Pressure, Springs, SurfaceTension, Viscosity
 from flockenv.physics.integrators import Integrator, LinearlyImplicitEuler
@@ -74,6 +76,42 @@ def torn(method: Integrator) -> Value:
     return Value(off, broken and off <= 0.02, f"{left:.4g} J remain of 4 J; {'broken' if broken else 'whole'}")
 
 
+def stretched_for_good(method: Integrator) -> Value:
+    """Check the rest length, m, of a spring of 1 m that starts at 1.4 m and yields at a strain of 0.1, after 2 s.
+
+    It is 1.4 / 1.1 once it has yielded; the elastic swing that remains does not change it.
+    """
+    rope = Rope(links=1, length=1.0, stretch=1.4)
+    scene = Scene(
+        groups=(Group(network=rope, mass=1.0),), effects=(Springs(stiffness=100.0, yield_strain=0.1),),
+        integrator=method, dt=5e-4,
+    )  # fmt: skip
+    end = scene.run(scene.start(0), 4000)
+    rest, long = float(end.bonds[0, 0]), float(np.linalg.norm(end.pos[0, 1] - end.pos[0, 0]))
+    off = abs(rest / (1.4 / 1.1) - 1)
+    return Value(off, off <= 0.01, f"{rest:.5g} m at rest, {long:.4g} m long then")
+
+
+def folded(method: Integrator) -> Value:
+    """Count the looks, of 40 in 1 s, at which a sheet pierces itself that falls on its edge and folds."""
+    cloth = Cloth(cells=(4, 14), edges=((0.3, 0, 0), (0, 0.12, 1)), origin=(0, 0, 0.03))
+    scene = Scene(
+        dimension=3, groups=(Group(network=cloth, mass=0.005, radius=0.005),), integrator=method, dt=0.0025,
+        effects=(
+            Springs(stiffness=100.0, shear=30.0, bend=0.02, damping=0.02), Gravity(acceleration=(0.0, 0.0, -G)),
+        ),
+        obstacles=(HalfSpace(point=(0, 0, 0), direction=(0, 0, 1)),),
+        constraints=(Collisions(agents=False), FaceCollisions(thickness=0.01, friction=0.3)),
+    )  # fmt: skip
+    state, faces, pierced = scene.start(0), faces_of(scene), 0
+    edges = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=-1).reshape(-1, 2), axis=0)
+    for _ in range(40):
+        state = scene.run(state, 10)
+        pierced += first_piercing(state.pos[0], edges, faces) is not None
+    note = f"{state.count_of('impacts')} impacts, {state.count_of('unsolved') + state.count_of('stopped')} unsolved"
+    return Value(pierced, pierced == 0, note)
+
+
 def drop(method: Integrator) -> Value:
     """Check that a drop keeps its momentum for 4 s: 40 agents in an oblong, shaken, that drift."""
     effects = (
@@ -121,4 +159,6 @@ SHEETS = (
     Case("N49", "sheet on an incline", "sticks; slides within 2 %", incline, (LinearlyImplicitEuler().kind,)),
     Case("N50", "spring torn apart", "2 J remain +- 2 %", torn),
     Case("N51", "drop of liquid, 4 s", "momentum within 1e-12", drop),
+    Case("N53", "spring that yields, 2 s", "1.4 m / 1.1 at rest +- 1 %", stretched_for_good),
+    Case("N54", "sheet that folds on a floor, 1 s", "does not pierce itself", folded),
 )
