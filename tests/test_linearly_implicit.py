@@ -11,7 +11,6 @@ import pytest
 from scipy.linalg import block_diag
 
 from flockenv.core.warnings import UnstableStepWarning
-from flockenv.engine.conjugate_gradients import image_of
 from flockenv.engine.linear_step import LinearSolver, LinearStep
 from flockenv.model.divergence import SimulationDiverged
 from flockenv.model.networks import Cloth, Rope
@@ -149,26 +148,25 @@ def test_a_step_is_the_dense_solution_with_filters() -> None:
     np.testing.assert_allclose(end.vel[0], state.vel[0] + change, atol=1e-9 * np.abs(change).max())
 
 
-@pytest.mark.parametrize(
-    ("tolerance", "stiffness", "least", "most"),
-    [(1e-3, 400.0, 0.0, 1e-2), (1e-13, 400.0, 0.0, 1e-11), (1e-3, 1e6, 0.1, 0.5), (1e-10, 1e6, 0.0, 1e-7)],
-)
-def test_a_free_sheet_gains_the_momentum_that_the_solve_leaves_in_its_residual(
-    tolerance: float, stiffness: float, least: float, most: float
-) -> None:
-    """In shares of the sum of magnitudes of what its particles gain in a step; of 20 steps the worst is compared."""
-    group = Group(network=SHEET.model_copy(update={"pinned": ()}), mass=0.05)
-    method, still = LinearlyImplicitEuler(tolerance=tolerance), Gravity(acceleration=(0.0, 0.0))
-    scene = sheet_of(method, stiffness=stiffness, weight=still, groups=(group,))
-    state, system, worst = shaken(scene), scene.stepper._linear_solver().system, 0.0
-    for _ in range(20):
-        before, state = state, scene.step(state)
-        gained = 0.05 * (state.vel - before.vel)[0]
-        image_of(2)(system)
-        left = (system.right - system.image).reshape(-1, 2).sum(axis=0)
-        np.testing.assert_allclose(gained.sum(axis=0), -left, rtol=0, atol=1e-12 * np.abs(system.right).sum())
-        worst = max(worst, np.abs(gained.sum(axis=0)).max() / np.abs(gained).sum(axis=0).max())
-    assert least <= worst <= most
+@pytest.mark.parametrize("linearisations", [1, 2])
+@pytest.mark.parametrize("stiffness", [400.0, 1e6])
+def test_free_sheets_keep_their_momentum_however_large_the_tolerance(stiffness: float, linearisations: int) -> None:
+    """To 1e-12 of the impulses of a step; under drag they lose what it takes. A pinned one beside them does not."""
+    free, pinned = SHEET.model_copy(update={"pinned": ()}), Group(network=SHEET, mass=0.05)
+    groups = Group(network=free, mass=0.05), pinned, Group(network=free, mass=0.2)
+    sheets = slice(0, free.size), slice(2 * free.size, 3 * free.size)
+    method = LinearlyImplicitEuler(tolerance=0.1, linearisations=linearisations)
+    for rate in (0.0, 0.4):
+        scene = sheet_of(method, stiffness=stiffness, weight=Drag(rate=rate), groups=groups)
+        state, mass = shaken(scene), np.asarray(scene.body.mass)[:, None]
+        system = scene.stepper._linear_solver().system
+        for _ in range(20):
+            before, state = state, scene.step(state)
+            for own in sheets:
+                gained = mass[own] * (state.vel - before.vel)[0, own]
+                lost = rate * scene.dt * state.vel[0, own]
+                np.testing.assert_allclose((gained + lost).sum(axis=0), 0, atol=1e-12 * np.abs(system.right).sum())
+        assert np.abs(state.vel).max() > 0.1
 
 
 @pytest.mark.parametrize("by", [1.0, 1.3], ids=["shaken", "stretched"])

@@ -15,7 +15,7 @@ from flockenv.engine.linear_equations import FIXED, FREE, SLIDES
 from flockenv.jit.decorators import kernel
 from flockenv.jit.section import entry_of, section
 
-__all__ = ["image_of", "size_of", "solve_from_of", "solve_of"]
+__all__ = ["image_of", "keep_momentum_of", "size_of", "solve_from_of", "solve_of"]
 
 ROUNDING = 1e-20
 """Largest negative square of a norm, relative to the first one, that rounding is taken to have caused."""
@@ -351,6 +351,49 @@ def image_of(dimension: int) -> Callable[..., None]:
         multiply(system, system.change, system.image)
 
     return image
+
+
+@section
+def _sum_parts(dimension: int) -> Callable[..., None]:
+    """Make `sum_parts(system, part, matrix, pull)`: add up the blocks and the residual of the agents of each part."""
+    d = dimension
+
+    def sum_parts(system: Any, part: Any, matrix: Any, pull: Any) -> None:
+        matrix[:], pull[:] = 0.0, 0.0
+        for i in range(part.shape[0]):
+            if part[i] >= 0:
+                for a in range(d):
+                    pull[part[i] * d + a] += system.right[i * d + a] - system.image[i * d + a]
+                for k in range(system.start[i], system.start[i + 1]):
+                    for a in range(d * d):
+                        matrix[part[i] * d * d + a] += system.value[k * d * d + a]
+
+    return sum_parts
+
+
+@entry_of
+def keep_momentum_of(dimension: int) -> Callable[..., None]:
+    """Make `keep_momentum(system, part, matrix, inverse, pull)`: change dv by a velocity of each part as a whole.
+
+    Afterwards the residuals of a part add up to 0: it gains the momentum that outer forces give it, however large the
+    tolerance. part: (N,) number of the part that an agent belongs to, -1 if none; no filter acts on a part.
+    matrix, inverse (P D D,), pull (P D,): scratch memory, for the sums of its blocks, their inverse, and the residual.
+    """
+    multiply, sum_parts, invert, d = _multiply(dimension), _sum_parts(dimension), _invert(dimension), dimension
+
+    def keep_momentum(system: Any, part: Any, matrix: Any, inverse: Any, pull: Any) -> None:
+        multiply(system, system.change, system.image)
+        sum_parts(system, part, matrix, pull)
+        for own in range(0, matrix.shape[0], d * d):
+            if matrix[own] != 0.0:  # of a part that is not free in this step
+                invert(matrix, own, inverse, own)
+        for i in range(part.shape[0]):
+            if part[i] >= 0:
+                for a in range(d):
+                    for b in range(d):
+                        system.change[i * d + a] += inverse[(part[i] * d + a) * d + b] * pull[part[i] * d + b]
+
+    return keep_momentum
 
 
 @entry_of

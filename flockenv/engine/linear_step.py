@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flockenv.engine.conjugate_gradients import image_of, solve_from_of, solve_of
+from flockenv.engine.conjugate_gradients import image_of, keep_momentum_of, solve_from_of, solve_of
 from flockenv.engine.linear_contacts import ContactSolver
 from flockenv.engine.linear_equations import FIXED, FREE, SLIDES, Local, System, assemble_of, strain_change_of
 from flockenv.model.scene_view import SceneView
@@ -92,6 +92,9 @@ class LinearSolver:
         self._read_slides(scene)
         self.solve, self.solve_from, self.image, self.first = solve_of(d), solve_from_of(d), image_of(d), 0.0
         self.contacts = self._contacts(scene)
+        self.keep_momentum, self.part = keep_momentum_of(d), _loose_parts(self.system, self.kinds)
+        parts = int(self.part.max(initial=-1)) + 1
+        self.scratch = np.zeros(parts * d * d), np.zeros(parts * d * d), np.zeros(parts * d)
 
     def _read_slides(self, scene: SceneView) -> None:
         """Set the filters of particles that slide."""
@@ -237,7 +240,16 @@ class LinearSolver:
                 f"{done + iterations:,} iterations",
                 int(np.argmax(np.abs(system.residual))) // scene.dimension,
             )
+        self._keep_momentum(state.alive[0] if held is None else state.alive[0] & ~held)
         return int(iterations), held
+
+    def _keep_momentum(self, free: NDArray[np.bool_]) -> None:
+        """Let parts keep their momentum of which all agents are `free`, (N,): they live, and nothing holds them."""
+        part = self.part
+        if not free.all():
+            part = np.where(np.isin(part, part[~free]), -1, part)
+        if part.max(initial=-1) >= 0:
+            self.keep_momentum(self.system, part, *self.scratch)
 
     def _end(self, x: Doubles, v: Doubles, flow: Doubles, time: float, h: float) -> tuple[Doubles, Doubles]:
         """Return positions and velocities after the change that was found, (D, N)."""
@@ -263,6 +275,20 @@ def _system(every: NDArray[np.int64], agents: int, dimension: int) -> System:
         np.zeros(agents, np.int8), np.zeros(square), np.zeros(square), change, residual, weighted, direction, step,
         image, carried,
     )  # fmt: skip
+
+
+def _loose_parts(system: System, kinds: NDArray[np.int8]) -> NDArray[np.int64]:
+    """Return the number of the part that each agent belongs to, (N,), -1 if it is alone or the part has a filter.
+
+    Parts are joined by the blocks of the matrix.
+    """
+    from scipy import sparse  # slow to import, and used only by linearly implicit methods
+
+    joined = sparse.csr_matrix((np.ones(len(system.column)), system.column, system.start))
+    _, part = sparse.csgraph.connected_components(joined, directed=False)
+    held = np.bincount(part, kinds != FREE) > 0
+    loose = ~held & (np.bincount(part) > 1)
+    return np.where(loose[part], np.cumsum(loose)[part] - 1, -1)
 
 
 def _local(nodes: int, dimension: int) -> Local:

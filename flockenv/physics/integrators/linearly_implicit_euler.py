@@ -20,8 +20,8 @@ class LinearlyImplicitEuler(Integrator):
     1981) as preconditioner. The derivatives are those of springs, membranes, bending and linear drag; other forces are
     taken at the beginning of the step, as in semi-implicit Euler, and limit dt as they do there. Particles held in
     place keep their velocity exactly, those of a `slide` constraint keep to its line or plane within the solve.
-    The equations conserve momentum; what a solve leaves in its residual changes it. The tolerance is relative to the
-    forces between particles, so stiff sheets that are far from rest need a smaller one to keep their momentum.
+    After the solve, parts that nothing holds are moved as a whole, so that they keep their momentum to rounding. They
+    lose angular momentum: the method damps rotation, and what the solve leaves in its residual adds to that.
 
     With `linearisations: 2` or more the forces are linearised again about the end that the last solve has found, which
     are Newton's iterations for implicit Euler (the first begins at the old positions); other forces are then read
