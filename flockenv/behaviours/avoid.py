@@ -121,6 +121,10 @@ class AvoidObstacles(Effect):
     side of its normal. In 3-D the edges on five sides are compared: the side of the normal, and both directions along
     and across the obstacle's own axis. A sphere has no axis: its sides lie away from the obstacle that blocks the side
     of the normal, and across that. An obstacle that moves is treated as if it stood still at its current place.
+
+    Limits: it looks straight ahead, over a distance proportional to the speed: at rest it sees only what it overlaps,
+    it does not brake, and it knows no path out of a dead end. Only the first obstacle in the path counts. The force is
+    w or 0, so it switches on and off beside an edge.
     """
 
     kind: Literal["avoid_obstacles"] = "avoid_obstacles"
@@ -216,6 +220,9 @@ class Whiskers(Effect):
 
     Three whiskers in 2-D, five in 3-D, of length `horizon` times the speed. In Buckland 2005, "wall avoidance",
     whiskers have a fixed length and the body no size; here a whisker is swept by the whole body.
+
+    Limits: at rest whiskers have no length. What is narrower than the gap between the ends of two whiskers is missed
+    until it is nearer, and one obstacle at a time is avoided.
     """
 
     kind: Literal["whiskers"] = "whiskers"
@@ -275,6 +282,9 @@ class ForceField(Effect):
 
     The drawbacks named by Reynolds (1988): head-on it only brakes; it is too strong near and too weak far away; and it
     pushes agents that fly past.
+
+    Limits: the force jumps by w / range^p at the range, and distances below `nearest` count as `nearest`, so it is at
+    most w / nearest^p per obstacle: a fast agent passes through a thin wall. Nothing damps it.
     """
 
     kind: Literal["force_field"] = "force_field"

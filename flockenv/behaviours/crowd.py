@@ -53,6 +53,9 @@ class UnalignedAvoidance(Behaviour):
     """Avoid the earliest predicted collision within `horizon` seconds: turn aside, and brake or speed up.
 
     Reynolds 1999.
+
+    Limits: both are assumed to keep their velocities, and only the earliest collision is avoided. Agents that do not
+    approach each other have none, also if they overlap. It sees no obstacles, and its force is w or 0.
     """
 
     kind: Literal["unaligned_avoidance"] = "unaligned_avoidance"
@@ -145,6 +148,9 @@ class Queue(Moving):
     """Seek a door, and slow down behind slower agents ahead, without pushing.
 
     Named in Reynolds 1999; the speed v_queue = gap / `headway` is that of Tordeux, Chraibi and Seyfried 2016.
+
+    Limits: the path is straight, without obstacles. Every slower agent ahead blocks, oncoming ones also, so that two
+    streams stop each other; and nothing keeps apart agents that stand side by side.
     """
 
     kind: Literal["queue"] = "queue"
@@ -222,7 +228,11 @@ def forage_force(p: Any, me: Me, acc: Vec) -> Vec:
 
 
 class Forage(Moving):
-    """Arrive at the nearest food in sight, and wander while there is none (named in Reynolds 1999)."""
+    """Arrive at the nearest food in sight, and wander while there is none (named in Reynolds 1999).
+
+    Limits: food is not eaten by it: an agent stays at the nearest food until an effect such as `grazing` or a sink
+    takes that away. It has no memory of food that is out of sight.
+    """
 
     kind: Literal["forage"] = "forage"
     food: int = Field(ge=0, strict=True, description="group whose agents are food")
@@ -278,6 +288,9 @@ class Explore(Moving):
     There is no memory of what was seen: the position determines the direction (steering.explore).
 
     Named in Reynolds 1999; the comb is ours.
+
+    Limits: it sees no obstacles. In 3-D the comb lies in the plane of the first two axes, and every agent keeps its
+    height. Agents overshoot at turns if `track` is less than V^2 m / max_force.
     """
 
     kind: Literal["explore"] = "explore"

@@ -29,6 +29,9 @@ class Driving(Behaviour):
 
     v0 is the group's `desired_speed`, e the direction from goals, courses and journeys of the scene; an agent without
     an aim stops.
+
+    Limits: it knows neither walls nor other agents: an agent that cannot go on pushes with m v0 / tau for as long as it
+    is held up.
     """
 
     kind: Literal["driving"] = "driving"
@@ -105,10 +108,12 @@ class LineUp(Behaviour):
     """Driving without pushing: walk towards the aim, no faster than the gap to the agent ahead allows.
 
     F = m (e min(v0, gap / T) - v) / tau, instead of `driving`, with the same aims. If T >= 4 tau a gap closes as
-    exp(-t / T) without overshoot (see `queue`). Ahead is within 45 degrees of the aim; agents beside are kept apart by
-    separation or contact only. Oncoming agents also block: such scenes need a behaviour that avoids them.
+    exp(-t / T) without overshoot (see `queue`). Ahead is within 45 degrees of the aim.
 
     The speed gap / T is that of Tordeux, Chraibi and Seyfried 2016.
+
+    Limits: oncoming agents also block, so two streams that meet stop; such scenes need a behaviour that avoids them.
+    Agents beside each other are kept apart by separation or contact only.
     """
 
     kind: Literal["line_up"] = "line_up"

@@ -112,11 +112,15 @@ class Separation(_FlockRule):
     """Keep away from near neighbours: F = w sum of (x - x_j)/|x - x_j|^2.
 
     Reynolds 1987 and 1999.
+
+    Limits: the force of a neighbour is w / r without an upper bound as r goes to 0, and falls from w / radius to 0 at
+    the radius. r is a distance of centres: the radii of bodies do not count. It is a sum, so it grows with the number
+    of neighbours.
     """
 
     kind: Literal["separation"] = "separation"
     sentence: ClassVar[str] = "Keep away from neighbours within {radius}"
-    weight: float = Field(ge=0, description="N m")
+    weight: float = Field(ge=0, description="N m, force of a neighbour times its distance")
     demo: ClassVar[str | None] = """
 groups: [{count: 14, radius: 0.15, spawn: {low: [0, 0], high: [3, 3]}}]
 effects:
@@ -143,11 +147,14 @@ class Alignment(_FlockRule):
     """Match the mean velocity of the neighbours: F = w (mean v_j - v).
 
     Reynolds 1987 and 1999.
+
+    Limits: no speed is preferred: velocities of different directions cancel in the mean, and the flock slows down. The
+    distance of a neighbour does not matter, so the force jumps if one crosses the radius.
     """
 
     kind: Literal["alignment"] = "alignment"
     sentence: ClassVar[str] = "Match the mean velocity of neighbours within {radius}"
-    weight: float = Field(ge=0, description="kg/s")
+    weight: float = Field(ge=0, description="kg/s, force per difference of velocities")
     demo: ClassVar[str | None] = """
 groups: [{count: 14, radius: 0.15, spawn: {low: [0, 0], high: [6, 6], speed: [0.5, 1.5]}}]
 effects: [{kind: alignment, weight: 0.7, radius: 5, fov: 300}]
@@ -171,11 +178,14 @@ class Cohesion(_FlockRule):
     """Stay with the neighbours: F = w (mean x_j - x).
 
     Reynolds 1987 and 1999.
+
+    Limits: the force is a spring of rest length 0 without damping: alone, agents swing through each other's centre, and
+    nothing keeps them apart. It grows with the distance up to w times the radius, and jumps if a neighbour crosses it.
     """
 
     kind: Literal["cohesion"] = "cohesion"
     sentence: ClassVar[str] = "Stay with the neighbours within {radius}"
-    weight: float = Field(ge=0, description="N/m")
+    weight: float = Field(ge=0, description="N/m, force per distance from the centre of the neighbours")
     demo: ClassVar[str | None] = """
 groups: [{count: 14, radius: 0.15, spawn: {low: [0, 0], high: [9, 9], speed: [0.2, 1]}}]
 effects:

@@ -46,6 +46,10 @@ class FollowWay(Moving):
     keep `clearance` from every obstacle. Outside the grid the direction is straight to the point.
 
     The eikonal equation as a model of pedestrians: Hughes 2002.
+
+    Limits: the paths are found once, for obstacles that stand still, and without other agents: a crowd does not spread
+    over two doors. Gaps narrower than 2 `clearance` are closed, and wider ones also if no point of the grid lies in
+    them.
     """
 
     kind: Literal["follow_way"] = "follow_way"

@@ -109,6 +109,9 @@ class Formation(AboutNearest, Moving):
 
     The formation variant of offset pursuit (Reynolds 1999). Arriving at the predicted station, as in yuka, would lag
     behind: at the station itself its desired velocity is zero. A leader at rest faces along the x axis.
+
+    Limits: all agents under one record share one station. Stations turn at once with the leader's velocity, so the
+    outer ones cannot follow a sharp turn, and they jump if a leader at rest starts in another direction than x.
     """
 
     kind: Literal["formation"] = "formation"
@@ -142,6 +145,9 @@ class FollowLeader(AboutNearest, Moving):
     """Stay behind the nearest of a group, and out of its path: agents in the box in front of it move out sideways.
 
     The target is D = distance + headway x leader's speed behind it (Reynolds 1999). Separation keeps followers apart.
+
+    Limits: all followers have the same target and need `separation`. Around a leader at rest there is no box, and the
+    target lies behind it along the x axis.
     """
 
     kind: Literal["follow_leader"] = "follow_leader"
@@ -170,6 +176,9 @@ class Interpose(Moving):
     """Arrive between the nearest of one group and the nearest of another, at the predicted time of arrival.
 
     If both are the same group, between its two nearest (Reynolds 1999; T = d / V). Zero unless both are visible.
+
+    Limits: both are assumed to go straight on. The force is 0 unless an agent of each group is in sight, and obstacles
+    between them are not seen.
     """
 
     kind: Literal["interpose"] = "interpose"

@@ -70,7 +70,11 @@ class _ToTarget(Moving):
 
 
 class Seek(_ToTarget):
-    """Head for a place at full speed: S = V unit(T - x) - v (Reynolds 1999's figure; its pseudo-code flees)."""
+    """Head for a place at full speed: S = V unit(T - x) - v (Reynolds 1999's figure; its pseudo-code flees).
+
+    Limits: it does not brake. The desired velocity keeps the length V up to the target and reverses there, so agents
+    swing about it (`arrive` stops). It sees no obstacles and no other agents.
+    """
 
     kind: Literal["seek"] = "seek"
     own_law: ClassVar[Law | None] = seek_force
@@ -83,7 +87,11 @@ effects:
 
 
 class Flee(_ToTarget):
-    """Head away from a place at full speed, if it is within a panic radius: S = V unit(x - T) - v (Reynolds 1999)."""
+    """Head away from a place at full speed, if it is within a panic radius: S = V unit(x - T) - v (Reynolds 1999).
+
+    Limits: without a `radius` it acts at any distance, so agents never come to rest; with one the force ends there, and
+    nothing stops them beyond. Exactly at the place an agent keeps its direction, and at rest there it stays.
+    """
 
     kind: Literal["flee"] = "flee"
     radius: float | None = Field(default=None, gt=0, description="m, beyond it the force is 0 (default: unlimited)")
@@ -101,6 +109,9 @@ class Arrive(_ToTarget):
     """Seek a place and stand still there: S = V min(1, d / d_slow) unit(T - x) - v (Reynolds 1999).
 
     It does not overshoot if d_slow >= V^2 m / max_force (else a LookaheadWarning) and weight >= 4 m V / d_slow.
+
+    Limits: the speed is a function of the distance alone. A constant force f, such as wind, moves the place of rest by
+    f d_slow / (weight V). Agents with one target end in one place, and obstacles are not seen.
     """
 
     kind: Literal["arrive"] = "arrive"
@@ -120,6 +131,9 @@ class Dock(_ToTarget):
 
     It stops at the place, its last heading along that direction: the distance from the axis falls as the square of the
     remaining distance.
+
+    Limits: the path is computed without max_force: an agent whose turning radius m V^2 / max_force is larger than the
+    gate may miss the axis. One that starts beyond the place flies round it. Obstacles are not seen.
     """
 
     kind: Literal["dock"] = "dock"
@@ -139,6 +153,7 @@ effects:
 
     @model_validator(mode="after")
     def _check_direction(self) -> Self:
+        """Raise ValueError if the direction has no length."""
         _demand_direction("direction", self.direction)
         return self
 
@@ -147,6 +162,9 @@ class Face(Behaviour):
     """Turn the velocity toward a heading at unchanged speed: S is perpendicular to the velocity.
 
     tan(a/2) of the angle a between the two falls as exp(-weight t / m). The construction is ours.
+
+    Limits: S is proportional to the speed, so an agent at rest does not turn. If the heading is straight behind, it
+    turns right.
     """
 
     kind: Literal["face"] = "face"
@@ -161,6 +179,7 @@ effects:
 
     @model_validator(mode="after")
     def _check_direction(self) -> Self:
+        """Raise ValueError if the heading has no length."""
         _demand_direction("heading", self.heading)
         return self
 
@@ -169,10 +188,12 @@ class TargetSpeed(Behaviour):
     """Reach a speed in the current direction of motion: S = (v_t - |v|) unit(v); zero at rest.
 
     The law is ours.
+
+    Limits: an agent at rest stays at rest, and the direction is left to other forces.
     """
 
     kind: Literal["target_speed"] = "target_speed"
-    speed: float = Field(ge=0, description="v_t, m/s")
+    speed: float = Field(ge=0, description="v_t, m/s, to be reached")
     own_law: ClassVar[Law | None] = target_speed_force
     demo: ClassVar[str | None] = """
 groups:

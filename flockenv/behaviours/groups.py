@@ -47,11 +47,14 @@ class Interest(Effect):
 
     It is -grad W of a potential that grows with the distance and fades with time, as required by Helbing and Molnar
     1995 (equation 7). They give neither form nor numbers: both are ours.
+
+    Limits: the pull jumps from A exp(-radius / B) to 0 at the radius, and reverses at the place, about which agents
+    swing: nothing damps it. It begins and fades for all agents at the same time.
     """
 
     kind: Literal["interest"] = "interest"
     target: Vector = Field(description="m, place of attraction")
-    strength: float = Field(default=0.0, ge=0, description="A, N")
+    strength: float = Field(default=0.0, ge=0, description="A, N, pull at the place itself, the same for all masses")
     acceleration: float = Field(default=0.0, ge=0, description="A, m/s^2: the force is that times its own mass")
     decay: float = Field(gt=0, description="B, m, over which the pull falls to 1/e")
     fades: float | None = Field(default=None, gt=0, description="T, s, in which interest falls to 1/e (default: never)")
@@ -96,6 +99,9 @@ class Friends(Social):
     """Attraction to the agents of a group, that fades: F = A exp(-(t - t0) / T) sum exp(-d / B) n.
 
     The attraction of Helbing and Molnar 1995 (equation 7) to friends; form and numbers are ours, see `interest`.
+
+    Limits: every agent of the group is a friend, and the sum has no upper bound in their number. The pull of each
+    reverses where the two are in one place, and nothing keeps them apart.
     """
 
     kind: Literal["friends"] = "friends"
@@ -174,6 +180,10 @@ class WalkingGroup(Effect):
     must turn its head to see the centre of the others. U points to the centre of the party, if that is further than
     (N - 1) / 2 m (N members), and W away from each member nearer than `distance`. Combine it with a repulsion from all
     agents.
+
+    Limits: parties are runs of consecutive indices, so a newborn agent belongs to that of its index. Members beyond the
+    radius are lost to it. At standstill the gaze has no direction and brakes nothing, and each pull or push begins with
+    a jump.
     """
 
     kind: Literal["walking_group"] = "walking_group"

@@ -188,6 +188,9 @@ class Heuristics(Effect):
 
     31 directions are tested, and that of the aim (me.aim): the paper's alpha is continuous, ours is within 2.5 degrees
     at 75. It replaces `driving`: use one or the other. In 2-D only, among walls that stand still.
+
+    Limits: every step chooses anew, without memory, so the direction may jump from step to step, and a method of higher
+    order gains little. All neighbours are assumed to keep their velocities.
     """
 
     kind: Literal["heuristics"] = "heuristics"

@@ -83,6 +83,9 @@ class Hide(AboutNearest, Moving):
     The place is c + (radius + own radius + margin) unit(c - x_s) (Reynolds 1999; yuka), x_s the seeker's position after
     min(longest, d / |v_s|). Combine it with avoid_obstacles for obstacles on the path. The nearest place may be behind
     any obstacle, so without a `range` the cost is linear in their number; with one, a grid finds those near.
+
+    Limits: only circles and spheres that stand still and are solid hide. It is no test of sight: whether the seeker
+    looks, or sees the place from elsewhere, does not count, and of several seekers only the nearest does.
     """
 
     kind: Literal["hide"] = "hide"

@@ -48,12 +48,18 @@ class ObstacleRepulsion(Push):
     """Keep off every wall: F = A exp((r_i - d) / B) n, d from the body's centre; r_i its radius, or 0.
 
     Helbing and Molnar 1995: -grad U0 exp(-d / R), so A = U0 / R in m/s^2, B = R, `bodies: false`. Helbing, Farkas and
-    Vicsek 2000: A in N, with bodies. Summed over sides: every straight side of walls, polygons and rooms acts by the
-    foot of the perpendicular on it; a corner acts once, if it is the nearest point of all sides that meet there. So
-    the force does not depend on how a wall is divided, also where walls that stand still are joined. If two obstacles
-    coincide (a wall given twice, rooms with a common side), both act. Round and thick shapes and grids act by their
-    nearest point. With `occluded`, no side acts through another obstacle. If a body is inside a solid obstacle, the
-    force points out through the nearest point, and grows with depth.
+    Vicsek 2000: A in N, with bodies.
+
+    Summed over sides: every straight side of walls, polygons and rooms acts by the foot of the perpendicular on it; a
+    corner acts once, if it is the nearest point of all sides that meet there. So the force does not depend on how a
+    wall is divided, also where walls that stand still are joined. If two obstacles coincide (a wall given twice, rooms
+    with a common side), both act. Round and thick shapes and grids act by their nearest point. With `occluded`, no side
+    acts through another obstacle. If a body is inside a solid obstacle, the force points out through the nearest point,
+    and grows with depth.
+
+    Limits: a thin wall is a hill of height A B exp(r_i / B) (r_i = 0 without `bodies`): an agent that comes head-on
+    with more than that as kinetic energy, or is driven by more than A exp(r_i / B), passes through it. It has no
+    damping.
     """
 
     kind: Literal["obstacle_repulsion"] = "obstacle_repulsion"

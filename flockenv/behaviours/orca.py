@@ -92,6 +92,10 @@ class Orca(Moving):
 
     Optimal reciprocal collision avoidance (van den Berg et al. 2011) among the six nearest agents and obstacles.
     It selects a velocity: without inertia (weight = m / dt, no max_force) agents that all use it never touch.
+
+    Limits: of agents and obstacles in range the six nearest count, a seventh is not seen. Half of every evasion is left
+    to the other agent, also if that does not give way. Where no velocity is free, the one with the least violation is
+    taken, and bodies may touch.
     """
 
     kind: Literal["orca"] = "orca"

@@ -147,6 +147,9 @@ class FollowPath(_OnPath):
     agent seeks the end, or arrives at it within `slow_radius`.
 
     Reynolds 1999, path following.
+
+    Limits: it has no memory: where pieces of the path cross or come near each other, the nearest one counts, and an
+    agent may change over. Inside the tube nothing keeps agents apart.
     """
 
     kind: Literal["follow_path"] = "follow_path"
@@ -193,6 +196,9 @@ class StayOnPath(_OnPath):
     """Stay in a path's tube, in either direction: seek the nearest spine if the position after `time` s is outside.
 
     Reynolds 1999, path following.
+
+    Limits: inside the tube the force is 0: an agent at rest stays at rest. Where pieces of the path cross, the nearest
+    one counts.
     """
 
     kind: Literal["stay_on_path"] = "stay_on_path"
@@ -211,6 +217,9 @@ class FollowFlow(Behaviour):
     """Follow a field of velocities on a grid, linear in between: F = w (u - v), 0 outside the grid.
 
     Reynolds 1999, flow field following.
+
+    Limits: the field does not change in time, and outside the grid no force brings an agent back. Obstacles have to be
+    part of the field.
     """
 
     kind: Literal["follow_flow"] = "follow_flow"

@@ -110,6 +110,9 @@ class Pursue(Predicting):
 
     T is factor d / V (distance), OpenSteer's k d / |v| with k by position and heading of the quarry (opensteer), or the
     earliest interception time if the quarry goes straight on (exact).
+
+    Limits: it aims to pass through the quarry and does not brake; a quarry that turns is not where it was predicted. It
+    follows the nearest one in sight, which may change from step to step, and knows no obstacles.
     """
 
     kind: Literal["pursue"] = "pursue"
@@ -129,6 +132,9 @@ class Evade(Predicting):
 
     T is factor d / V (distance), d / |v_p| (opensteer), or the time at which the pursuer at its speed can intercept it
     (exact).
+
+    Limits: it flees from the nearest pursuer alone, perhaps towards a second one, and knows no walls. Without one in
+    sight the force is 0, and the agent goes on.
     """
 
     kind: Literal["evade"] = "evade"
@@ -147,7 +153,11 @@ effects:
 
 
 class OffsetPursue(Predicting):
-    """Pass the nearest of a group at a distance: seek a point beside its predicted position (Reynolds 1999)."""
+    """Pass the nearest of a group at a distance: seek a point beside its predicted position (Reynolds 1999).
+
+    Limits: the side is chosen anew in every step, and a quarry dead ahead is passed on the right. After it has passed,
+    it turns back to pass again.
+    """
 
     kind: Literal["offset_pursue"] = "offset_pursue"
     distance: float = Field(ge=0, description="m, distance at which it passes")
@@ -171,6 +181,9 @@ class Shadow(Predicting):
 
     Pursuit fades linearly from distance + band to distance, within which it only matches, so that it does not chatter.
     Described in Reynolds 1999, where the two alternate; to do that with hysteresis would need a memory.
+
+    Limits: within the distance it only matches the velocity: it does not move away from a quarry that comes nearer.
+    Another agent that becomes the nearest is followed from then on.
     """
 
     kind: Literal["shadow"] = "shadow"
@@ -194,7 +207,11 @@ effects:
 
 
 class MatchVelocity(AboutNearest):
-    """Match the velocity of the nearest of a group: S = v_j - v (Reynolds 1987)."""
+    """Match the velocity of the nearest of a group: S = v_j - v (Reynolds 1987).
+
+    Limits: only the velocity is matched: the distance is left as it is, and of several neighbours only the nearest
+    counts.
+    """
 
     kind: Literal["match_velocity"] = "match_velocity"
     finish_law: ClassVar[Law | None] = match_velocity_force

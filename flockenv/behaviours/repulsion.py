@@ -16,7 +16,7 @@ __all__ = ["Push"]
 class Push(Effect):
     """A force of strength A: in newtons, or in m/s^2 times the agent's mass; or the sum of both."""
 
-    strength: float = Field(default=0.0, ge=0, description="A, N")
+    strength: float = Field(default=0.0, ge=0, description="A, N, factor of the force, the same for all masses")
     acceleration: float = Field(default=0.0, ge=0, description="A, m/s^2: the force is that times its own mass")
     most: float | None = Field(
         default=None, gt=0, description="N, largest force from one neighbour or wall, before weighting"

@@ -34,6 +34,9 @@ class Shepherd(Moving):
     behind that member, seen from the centre; else r_a sqrt(N) behind the centre, seen from the goal (Strombom et al.
     2014). In the paper a shepherd also slows down near a sheep and moves with noise; that is left to other behaviours
     (`separation` keeps a shepherd off). Without living members the force is zero.
+
+    Limits: it knows where all members are, at any distance and behind walls. Several shepherds of one group go to the
+    same place. It does not walk around the group, so it may pass through it.
     """
 
     kind: Literal["shepherd"] = "shepherd"

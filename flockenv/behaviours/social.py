@@ -134,6 +134,10 @@ class CircularRepulsion(Social):
     Helbing, Farkas and Vicsek 2000 (A in N, with bodies, lambda = 1); the circular specification of Johansson, Helbing
     and Shukla 2007 (A in m/s^2, distances between centres, w = lambda + (1 - lambda)(1 + cos phi) / 2, phi the angle
     from its aim, or else its heading, to the other). The forces of a pair are not opposite: w differs.
+
+    Limits: at the radius the force jumps to 0. It is at most A exp(r_ij / B) and has no damping: bodies that are
+    pressed together harder pass through each other, unless a `contact` acts as well. If they overlap, the stable step
+    is shorter than that of bodies in touch.
     """
 
     kind: Literal["circular_repulsion"] = "circular_repulsion"
@@ -185,6 +189,9 @@ class EllipticalRepulsion(Social):
     `outside` out of it; elliptical I of Johansson, Helbing and Shukla 2007), or y = (v_j - v_i) dt (`relative`:
     elliptical II), with their w(phi) = lambda + (1 - lambda)(1 + cos phi) / 2. The step uses the actual velocity, not
     the desired one.
+
+    Limits: at the end of the neighbour's step the force grows as 1 over the root of the distance, up to 500 times A,
+    and on the step it has no direction. Bodies have no size in it, and it has no damping.
     """
 
     kind: Literal["elliptical_repulsion"] = "elliptical_repulsion"
@@ -233,9 +240,13 @@ def sidestep_pair(p: Any, me: Me, other: Other) -> Vec:
 class Sidestep(Social):
     """Slow down before others and pass them on one side, as fitted to experiments (Moussaid et al. 2009, eq. 4 to 7).
 
-    D = lambda (v_i - v_j) + e_ij, t = unit(D), B = gamma |D|, theta the angle from t to e_ij in (-pi, pi], with B eps
-    added: -A exp(-d / B - (n' B theta)^2) along t, and A exp(-d / B - (n B theta)^2) to the side away from the
-    neighbour. If that is dead ahead, eps > 0 keeps right. In 3-D the agent turns in the plane of t and e_ij (ours).
+    F = -A exp(-d / B - (n' B theta)^2) t + A exp(-d / B - (n B theta)^2) s, s to the side away from the neighbour, with
+    D = lambda (v_i - v_j) + e_ij, t = unit(D), B = gamma |D|, and theta the angle from t to e_ij in (-pi, pi], to which
+    B eps is added. If the neighbour is dead ahead, eps > 0 keeps right. In 3-D the agent turns in the plane of t and
+    e_ij (ours).
+
+    Limits: it was fitted to single pairs in a corridor, and sums over all others. d is a distance of centres: without a
+    contact force bodies overlap in a crowd. It sees no walls.
     """
 
     kind: Literal["sidestep"] = "sidestep"

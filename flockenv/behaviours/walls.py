@@ -74,6 +74,9 @@ class FollowWall(Moving):
     sharply as its force allows: with `time` of about 2 m / w it does not cut corners.
 
     Reynolds 1999, wall following.
+
+    Limits: the nearest surface counts, so in a passage narrower than two distances an agent may change over to the
+    other wall. Without a wall in range the force is 0.
     """
 
     kind: Literal["follow_wall"] = "follow_wall"
@@ -155,11 +158,11 @@ class Contain(Moving):
     The inward normal's part across the heading steers; head-on there is none, so the agent brakes and keeps right. From
     outside, an agent heads straight back in. Reynolds 1999, containment.
 
-    A steering force is no wall. Agents that turn along the surface cross it by about half the length of a step,
+    The predicted position is p = x + T v, T = `time`.
+
+    Limits: a steering force is no wall. Agents that turn along the surface cross it by about half the length of a step,
     max_speed dt / 2, and by a little at corners. They cross it further if `weight` or max_force is too small to turn
     within `time`, or if others push. Agents that must never leave need a hollow obstacle and `collisions`.
-
-    The predicted position is p = x + T v, T = `time`.
     """
 
     kind: Literal["contain"] = "contain"
@@ -181,6 +184,7 @@ effects:
 
     @model_validator(mode="after")
     def _check_shape(self) -> Self:
+        """Raise ValueError if the shape is no circle, block or polygon, moves, or is hollow."""
         if self.within.kind not in ("circle", "block", "polygon"):
             raise ValueError(f"within.kind = {self.within.kind}: must be one of circle, block, polygon")
         if self.within.moves or self.within.form.startswith("hollow"):

@@ -49,6 +49,9 @@ class Wander(Moving):
 
     n is coherent noise (Perlin 1985) of each agent, in [-1, 1] per axis across its heading, as a function of time: the
     same walk for every dt. Reynolds 1999 displaces the point a little in each step; here it also moves continuously.
+
+    Limits: the walk has no bounds and no memory, and sees nothing: agents spread for ever. Any other force turns the
+    heading from which the walk goes on.
     """
 
     kind: Literal["wander"] = "wander"

@@ -64,6 +64,10 @@ class Collisions(Constraint):
     An impact changes the velocity relative to the surface to u' = u - (1 + e) (u . n) n, less the friction. Impacts in
     the order of time: Alder and Wainwright 1959; impulses: Guendelman, Bridson and Fedkiw 2003, in passes accelerated
     as in Silcowitz, Niebe and Erleben 2010.
+
+    Limits: bodies are discs or balls that do not spin. It acts after the method, so forces do not see the impacts
+    within a step. Heaps need many `passes`, and rows of bodies in touch many impacts, beyond which a warning gives what
+    was left.
     """
 
     kind: Literal["collisions"] = "collisions"

@@ -49,6 +49,9 @@ class FaceCollisions(Constraint):
 
     After the impulses every contact has g >= 0 at the end of the step, g = w1 n . x1 + ... + w4 n . x4 - d: the
     distance of point and face or of two edges, less the sum d of their radii.
+
+    Limits: contacts are inelastic: nothing bounces. Paths are straight within a step, so a fast rotation has errors.
+    Impact zones are rigid, and freeze fast crumpling for a step; shorter steps or more passes help.
     """
 
     kind: Literal["face_collisions"] = "face_collisions"
@@ -60,7 +63,11 @@ class FaceCollisions(Constraint):
     passes: int = Field(default=20, ge=1, le=10_000, description="most passes in a step; then impact zones")
 
     def check(self, scene: SceneView) -> None:
-        """Raise ValueError if the scene has no faces, or faces that intersect, or cannot keep them apart."""
+        """Raise ValueError in 2-D, on a torus, in float32, without faces, and beside `rigid_bodies`.
+
+        Also before another constraint, for faces that intersect at the start, and for a thickness above a third of a
+        face's smallest height.
+        """
         what = "kind = face_collisions"
         if scene.dimension != 3:
             raise ValueError(f"{what}: dimension = {scene.dimension}: there are faces in 3 dimensions only")

@@ -53,13 +53,15 @@ class RigidBodies(Constraint):
     Restitution is the normal speed after an impact over that before; friction is Coulomb's cone.
 
     All contacts of a step are solved together by sweeps over them, extrapolated from sweep to sweep, until they hardly
-    change. `Scene.contacts` returns their forces. Limits: contacts are found for motions along straight
-    lines from the start of a step, so a block should not move further than its half edge in a step; other agents,
-    headings and speed limits are not considered. Work counters: impacts (contacts of steps), unsolved.
+    change. `Scene.contacts` returns their forces. Work counters: impacts (contacts of steps), unsolved.
 
     m dv/dt = F, dL/dt = T, L = J w: momentum, angular momentum L of a body with inertia J and angular velocity w (Euler
     1758; rotation: Austin, Krishnaprasad and Wang 1993). Contacts: projected Gauss-Seidel (Catto 2006) with Anderson's
     extrapolation (Walker and Ni 2011).
+
+    Limits: contacts are found for motions along straight lines from the start of a step, so a block should not move
+    further than its half edge in a step. Other agents, headings and speed limits are not considered, and no block
+    breaks or deforms.
     """
 
     kind: Literal["rigid_bodies"] = "rigid_bodies"
@@ -68,7 +70,11 @@ class RigidBodies(Constraint):
     sweeps: int = Field(default=300, ge=1, le=1_000_000, description="most sweeps over all contacts; then a warning")
 
     def check(self, scene: SceneView) -> None:
-        """Raise ValueError if the scene has no blocks, or something that does not suit them."""
+        """Raise ValueError on a torus, in float32, without blocks, with a population, and before another constraint.
+
+        Also in a box with agents that are no blocks, and for obstacles other than circles, blocks and half-spaces that
+        stand still.
+        """
         what = "kind = rigid_bodies"
         if sum(isinstance(other, RigidBodies) for other in scene.constraints) > 1:
             raise ValueError(f"{what}: there is another; a scene has at most one")

@@ -320,6 +320,9 @@ class Rods(Constraint):
     `Scene.rod_forces` returns their tensions.
 
     |x_i - x_j| = L for a rod, <= L for a rope.
+
+    Limits: it is an iteration: a chain or a cloth of n needs a number of sweeps that grows with n, and above `most`
+    lengths are off, with a warning. Rods do not resist bending, have no mass and no body, and cannot break.
     """
 
     kind: Literal["rods"] = "rods"

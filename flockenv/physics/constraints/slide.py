@@ -58,6 +58,9 @@ class Slide(Constraint):
     work. Linearly implicit methods solve their equations with the constraint (Baraff and Witkin 1998, section 5.1).
 
     x' = x0 + P (x - x0), v' = P v, with the projection P onto the directions and the position x0 before the step.
+
+    Limits: the directions do not turn, and there is no friction and no end of the rail. A later constraint, such as
+    `collisions`, may move a particle off it.
     """
 
     kind: Literal["slide"] = "slide"
@@ -99,7 +102,7 @@ class Slide(Constraint):
         return np.asarray(scene.starts[self.group] + network.particles("particles", self.particles), np.int64)
 
     def check(self, scene: SceneView) -> None:
-        """Raise ValueError on an unknown particle, one of an earlier constraint, or directions of another dimension."""
+        """Raise ValueError for an unknown particle, one of a constraint before, or directions of another dimension."""
         if len(self.along[0]) != scene.dimension:
             raise ValueError(
                 f"along[0] = {self.along[0]}: has {len(self.along[0])} numbers, but dimension = {scene.dimension}"

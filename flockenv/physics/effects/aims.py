@@ -61,6 +61,9 @@ class Goal(Aim):
 
     The direction is e = d / max(|d|, `slow_radius`), with d from the agent to the point: the desired direction of
     Helbing and Molnar 1995, which here falls to 0 at the point (arrival, Reynolds 1999).
+
+    Limits: the aim is a straight line, through obstacles. All agents of the group head for the same point, and
+    crowd around it if their bodies do not overlap.
     """
 
     kind: Literal["goal"] = "goal"
@@ -85,6 +88,8 @@ class Course(Aim):
 
     The direction is e = unit(`direction`), times `share`: the desired direction of Helbing and Molnar 1995 for a target
     far away.
+
+    Limits: it never ends, and knows no obstacles.
     """
 
     kind: Literal["course"] = "course"
@@ -136,6 +141,9 @@ class Antipode(Aim):
 
     The target is g = 2 c - x0, with the centre c and the initial position x0, and e = d / max(|d|, `slow_radius`) with
     d = g - x. A circle swap is the usual test of collision avoidance (van den Berg, Guy, Lin and Manocha 2011).
+
+    Limits: the target is fixed at the start, or at the birth of an agent, and the aim is a straight line through
+    obstacles.
     """
 
     kind: Literal["antipode"] = "antipode"

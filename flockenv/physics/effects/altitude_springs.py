@@ -84,10 +84,13 @@ def altitude_spring(p: Any, me: Me, others: Any, number: Vec) -> Vec:
 class AltitudeSprings(Effect):
     """Damped springs across the tetrahedra of a group's network: from corners to faces, and between opposite edges.
 
-    With `springs` along the edges, a tetrahedron that is turned inside out recovers.
+    With `springs` along the edges, a tetrahedron that is turned inside out recovers. In 3-D only.
 
     The energy is E = sum of k (h - L)^2 / 2 over the seven heights h of a tetrahedron, L their lengths at rest (Molino,
     Bridson, Teran and Fedkiw 2003; edges: Selle, Lentine and Fedkiw 2008).
+
+    Limits: they do not act along edges, so they need `springs` beside them. Rates are those of the undeformed shape:
+    flattened elements are stiffer.
     """
 
     kind: Literal["altitude_springs"] = "altitude_springs"

@@ -87,12 +87,16 @@ class AngularSprings(Effect):
 
     The moment is M = -k (a - L) - c da/dt, a the angle and L that at rest: the angle term of molecular mechanics
     (Brooks et al. 1983), here damped.
+
+    Limits: in 3-D the angle has no sign: a hinge that is bent through straight is not brought back, and one that is
+    exactly straight, but bent at rest, has no direction to return in. Nothing resists torsion. Rates are those of the
+    undeformed shape.
     """
 
     kind: Literal["angular_springs"] = "angular_springs"
     group: int = Field(default=0, ge=0, description="index of the group whose network it acts on")
-    stiffness: float = Field(ge=0, description="N m/rad")
-    damping: float = Field(default=0.0, ge=0, description="N m s/rad")
+    stiffness: float = Field(ge=0, description="N m/rad, moment per change of the angle")
+    damping: float = Field(default=0.0, ge=0, description="N m s/rad, moment per rate of the angle")
     bond_law: ClassVar[Law | None] = angular_spring
     partners: ClassVar[int] = 2
     strengths: ClassVar[tuple[str, ...]] = ("stiffness", "damping")

@@ -34,11 +34,14 @@ class Attraction(Effect):
     the orbits of one body are Kepler's. On a torus only the nearest image of the centre attracts.
 
     An inverse-square law (Newton 1687), softened as in Plummer 1911.
+
+    Limits: without a softening the force has no bound near the centre, and an agent that passes it within one step is
+    thrown out with energy it did not have. The centre takes up any momentum.
     """
 
     kind: Literal["attraction"] = "attraction"
     sentence: ClassVar[str] = "Attract all agents to {centre}"
-    centre: Vector = Field(description="m")
+    centre: Vector = Field(description="m, the point")
     strength: float = Field(description="k, N m^2; negative: repulsion")
     softening: float = Field(default=0.0, ge=0, description="s, m, distance below which it no longer grows as 1 / r^2")
     own_law: ClassVar[Law | None] = attraction

@@ -109,8 +109,8 @@ def restitution(ratio: float, adhesive: bool = False) -> float:
 class _Solid(Effect):
     """Base class with the fields that both kinds of contact have."""
 
-    stiffness: float = Field(ge=0, description="k, N/m")
-    damping: float = Field(default=0.0, ge=0, description="c, kg/s")
+    stiffness: float = Field(ge=0, description="k, N/m, force per overlap")
+    damping: float = Field(default=0.0, ge=0, description="c, kg/s, force per speed of approach")
     ratio: float = Field(
         default=0.0, ge=0, description="additional damping, as a fraction of critical damping for the masses"
     )
@@ -152,6 +152,10 @@ class ObstacleContact(_Solid):
     adhesive. Their friction, -kappa d (v . t) t, opposes the slip; it is stable in steps of less than 2 m / (kappa d).
     A body of mass m with speed v relative to the obstacle penetrates by at most v sqrt(m / k). For `most` see
     `Contact`.
+
+    Limits: an obstacle is a spring: a body whose centre passes a thin wall within a step, or is pressed in by more than
+    k times its radius, leaves on the other side. Friction is proportional to the slip, so nothing holds a body at rest
+    on a slope.
     """
 
     kind: Literal["obstacle_contact"] = "obstacle_contact"
@@ -188,6 +192,9 @@ class Contact(_Solid):
     `most` = U limits the speed at which bodies that overlap at the start separate: the spring force is at most U sqrt(k
     m), times 1 - u / U during separation, so no pair separates faster than U (damping as in Hunt and Crossley 1975).
     Impacts at up to U penetrate no deeper than where the limit begins; those at v << U lose v / (3 U) of their speed.
+
+    Limits: bodies are springs: two that meet faster than the sum of their radii times the root of k / m pass through
+    each other. Friction is proportional to the slip, without a static part: a heap creeps.
     """
 
     kind: Literal["contact"] = "contact"

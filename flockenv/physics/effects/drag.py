@@ -42,10 +42,13 @@ class Drag(Effect):
     """Linear drag, F = -c (v - u) in a medium of velocity u: without other forces v = v0 exp(-c t / m).
 
     The resistance of a slow body in a viscous fluid (Stokes 1851).
+
+    Limits: it is the resistance at low Reynolds numbers; a fast body leaves a wake, and has that of `quadratic_drag`. c
+    is the same for all agents, whatever their radius.
     """
 
     kind: Literal["drag"] = "drag"
-    rate: float = Field(ge=0, description="c, kg/s")
+    rate: float = Field(ge=0, description="c, kg/s, force per speed relative to the medium")
     own_law: ClassVar[Law | None] = drag
     derivative: ClassVar[Law | None] = drag_derivative
     strengths: ClassVar[tuple[str, ...]] = ("rate",)
@@ -68,6 +71,9 @@ class QuadraticDrag(Effect):
     Under gravity g the speed of fall is v tanh(g t / v), with v = sqrt(m g / c) in the end.
 
     Newton 1687, Principia, book II.
+
+    Limits: an Euler method reverses the velocity relative to the medium if h c |v| / m > 1, and diverges if it is above
+    2: the limit depends on the speed, so it is not tested.
     """
 
     kind: Literal["quadratic_drag"] = "quadratic_drag"

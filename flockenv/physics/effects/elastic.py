@@ -175,6 +175,9 @@ class Elastic(Effect):
 
     The force is F = -K (u + beta v) - alpha M v, u the displacements. Elements of constant strain: Turner, Clough,
     Martin and Topp 1956; corotated: Mueller and Gross 2004; damping: Rayleigh 1877.
+
+    Limits: strain = linear is wrong for rotations (a rotation by a stretches by 1 - cos a), both are for small strains,
+    and nothing yields or breaks. Nodes are the only bodies: surfaces need `face_collisions`.
     """
 
     kind: Literal["elastic"] = "elastic"
@@ -186,8 +189,10 @@ class Elastic(Effect):
     )
     area: float = Field(default=1.0, gt=0, description="m^2, cross section of bars")
     thickness: float = Field(default=1.0, gt=0, description="m, thickness of triangles")
-    alpha: float = Field(default=0.0, ge=0, description="alpha, 1/s, of the damping D = alpha M + beta K")
-    beta: float = Field(default=0.0, ge=0, description="beta, s")
+    alpha: float = Field(
+        default=0.0, ge=0, description="alpha, 1/s, part of the damping D = alpha M + beta K proportional to mass"
+    )
+    beta: float = Field(default=0.0, ge=0, description="beta, s, part of D proportional to stiffness")
     own_law: ClassVar[Law | None] = rayleigh_mass
     strengths: ClassVar[tuple[str, ...]] = ("young", "alpha", "beta")
 

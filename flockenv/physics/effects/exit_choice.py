@@ -165,6 +165,9 @@ class Routes(Around):
     approached it, also just beside an end that stands free; crossing it backwards does not count.
 
     The choice by expected time is ours.
+
+    Limits: every agent knows the queue at every door, also behind walls, and agents outside the group are not counted.
+    J w is an assumed capacity: a blocked door is still expected to let agents pass.
     """
 
     kind: Literal["routes"] = "routes"

@@ -113,6 +113,7 @@ class _Timed(Effect):
 
     @model_validator(mode="after")
     def _check_phase(self) -> Self:
+        """Raise ValueError if a phase is given without a period."""
         if self.period is None and self.phase != 0.0:
             raise ValueError(f"phase = {self.phase:g}: needs a period")
         return self
@@ -156,7 +157,7 @@ class _Field(_Timed):
 class _Central(_Field):
     """Base class of fields whose magnitude falls with the distance from a centre (on a torus, its nearest image)."""
 
-    centre: Vector = Field(description="m")
+    centre: Vector = Field(description="m, the centre")
     maximum: float = Field(gt=0, description="Phi_max, N as a force, m/s as a medium: limit near the centre")
     places: ClassVar[tuple[str, ...]] = ("centre",)
 
@@ -171,6 +172,9 @@ class Uniform(_Field):
     """A uniform field; as a force it does work F . (x - x0), independent of the mass (for gravity see `Gravity`).
 
     It is W = `strength`, with a period W cos(2 pi t / period + phase). The field is ours.
+
+    Limits: it is the same everywhere and acts on every agent alike: walls do not shield from it, and as a force it
+    accelerates light agents more.
     """
 
     kind: Literal["uniform"] = "uniform"
@@ -188,6 +192,9 @@ class Source(_Central):
     As a steady force it conserves m v^2 / 2 - Phi / sqrt(a) arctan(r / sqrt(a)), a = Phi / Phi_max.
 
     The bound near the centre is ours.
+
+    Limits: it falls as 1 / r^2 in the plane also, so as a medium it is the flow of an incompressible fluid only in
+    space. It acts through obstacles.
     """
 
     kind: Literal["source"] = "source"
@@ -205,6 +212,9 @@ class Sink(_Central):
     As a steady force it conserves m v^2 / 2 + Phi / sqrt(a) arctan(r / sqrt(a)), a = Phi / Phi_max.
 
     The bound near the centre is ours.
+
+    Limits: it falls as 1 / r^2 in the plane also, so as a medium it is the flow of an incompressible fluid only in
+    space. It acts through obstacles, and its direction reverses at the centre, about which agents swing.
     """
 
     kind: Literal["sink"] = "sink"
@@ -223,6 +233,9 @@ class Vortex(_Central):
     2 pi r W in every turn.
 
     The profile is ours.
+
+    Limits: a force around a centre has no potential: without drag agents gain energy in every turn and spiral outwards.
+    The profile is not that of a free vortex, which falls as 1 / r.
     """
 
     kind: Literal["vortex"] = "vortex"
@@ -232,6 +245,7 @@ class Vortex(_Central):
 
     @model_validator(mode="after")
     def _check_axis(self) -> Self:
+        """Raise ValueError if an axis is given in 2-D, or has no length."""
         if self.axis is not None and (len(self.axis) != 3 or not any(self.axis)):
             raise ValueError(f"axis = {self.axis}: must be three numbers, not all 0, or None for the z axis")
         return self
@@ -249,16 +263,19 @@ class Wind(_Timed):
     aircraft are certified (CS-25.341).
 
     The model is ours.
+
+    Limits: it is the same everywhere at one time: obstacles cast no lee, and agents do not slow it down.
     """
 
     kind: Literal["wind"] = "wind"
     sentence: ClassVar[str] = "Wind of {velocity}[, in gusts up to {gust} more]"
-    velocity: Vector = Field(description="U, m/s")
+    velocity: Vector = Field(description="U, m/s, of the medium between gusts")
     gust: Vector | None = Field(default=None, description="G, m/s, added at the peak of a gust (default: no gusts)")
     strengths: ClassVar[tuple[str, ...]] = ("velocity", "gust")
 
     @model_validator(mode="after")
     def _check_gusts(self) -> Self:
+        """Raise ValueError if only one of gust and period is given."""
         if (self.gust is None) != (self.period is None):
             raise ValueError("gust and period go together: give both or neither")
         return self
@@ -276,6 +293,9 @@ class Carried(Effect):
     the agent's own velocity, and max_speed bounds the sum.
 
     The model is ours.
+
+    Limits: agents do not act back on the medium, and obstacles do not divert it: it carries agents into walls, which
+    need `collisions`.
     """
 
     kind: Literal["carried"] = "carried"

@@ -102,6 +102,10 @@ class Way(Around):
     the desired velocity is 0.
 
     The eikonal equation as a model of pedestrians: Hughes 2002; its solution: Zhao 2005 and Sethian 1999.
+
+    Limits: the paths are found once, for obstacles that stand still, and without other agents: a crowd does not spread
+    over two doors of different distance (`routes` does). Gaps narrower than 2 `clearance` are closed, and an agent
+    without a path stands still.
     """
 
     kind: Literal["way"] = "way"

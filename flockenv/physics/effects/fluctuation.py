@@ -28,9 +28,12 @@ class Fluctuation(Effect):
     run (Langevin 1908), which is k T / m at s^2 = 2 c k T; at the end of a step, just after the kick, var v is larger
     by a fraction c dt / m. A kick is a function of (seed, world, step, agent, index of the effect in the scene), drawn
     once per step however often a method evaluates forces.
+
+    Limits: the noise is white: a single path depends on dt, and only the statistics do not. Alone it heats agents
+    without bound. It has no correlation in space: near agents get independent kicks.
     """
 
     kind: Literal["fluctuation"] = "fluctuation"
-    strength: float = Field(ge=0, description="s, N s^(1/2)")
+    strength: float = Field(ge=0, description="s, N s^(1/2), momentum of the kicks per root of time")
     kick_law: ClassVar[Law | None] = fluctuation
     strengths: ClassVar[tuple[str, ...]] = ("strength",)

@@ -68,6 +68,9 @@ class Gravitation(_Softened):
     """Newton's gravitation, softened: F_i = sum of G m_i m_j d / (d^2 + eps^2)^(3/2), d from i to j.
 
     Newton 1687; softening: Plummer 1911; groups of far bodies: Barnes and Hut 1986.
+
+    Limits: with a softening of 0 close passages have no bound, and dt is not adapted to them: energy is lost or gained.
+    Combined groups make forces of a pair not exactly opposite.
     """
 
     kind: Literal["gravitation"] = "gravitation"
@@ -93,6 +96,9 @@ class InverseSquare(_Softened):
     """Attraction or repulsion of every pair, independent of mass: F_i = sum of k d / (d^2 + eps^2)^(3/2).
 
     Coulomb 1785; softening: Plummer 1911; groups of far agents: Barnes and Hut 1986.
+
+    Limits: with a softening of 0 close passages have no bound, and dt is not adapted to them: energy is lost or gained.
+    Combined groups make forces of a pair not exactly opposite.
     """
 
     kind: Literal["inverse_square"] = "inverse_square"

@@ -27,6 +27,8 @@ class Gravity(Effect):
     """Uniform gravity, F = m g: without other forces x = x0 + v0 t + g t^2 / 2. Pinned particles stay.
 
     Galileo 1638.
+
+    Limits: it does not depend on the height, and acts on every agent of finite mass, whatever its group.
     """
 
     kind: Literal["gravity"] = "gravity"

@@ -105,6 +105,9 @@ class Viscosity(_Liquid):
     motion and in rotation as a body. g follows from the viscosity: eta = pi g rho^2 R^4 / 480 in the plane,
     2 pi g rho^2 R^5 / 1575 in space, for neighbours that are evenly distributed. A shear flow of wave number k decays
     as exp(-eta k^2 t / (rho m)). Motion of the agents across a flow adds to the viscosity, as in a gas.
+
+    Limits: it acts along the line between two agents only, so the closed form holds for many evenly distributed
+    neighbours: near a surface or in a thin film the viscosity is lower.
     """
 
     kind: Literal["viscosity"] = "viscosity"
@@ -138,6 +141,9 @@ class SurfaceTension(_Liquid):
     integral (1937) for the surface the given tension: in the plane sigma = K rho^2 R^4 / 3 times the integral of
     q^3 (1 - q)^2 (q - z), in space pi K rho^2 R^5 / 8 times that of q^4. Momentum and angular momentum are conserved. A
     `Pressure` beside it keeps the density; agents in perfect order are a soft solid, which a `Fluctuation` melts.
+
+    Limits: the closed form holds inside a liquid of the given density with a surface that is wide compared with R:
+    small drops and thin films have another tension. It has no contact angle with walls.
     """
 
     kind: Literal["surface_tension"] = "surface_tension"

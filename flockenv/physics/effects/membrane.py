@@ -145,6 +145,9 @@ class Membrane(Effect):
 
     The energy of a triangle is E = A (k (|dx/du| - 1)^2 + k (|dx/dv| - 1)^2 + s (dx/du . dx/dv)^2) / 2: Baraff and
     Witkin 1998, sections 4.1 to 4.4.
+
+    Limits: a triangle is a plane of constant strain, without resistance to bending and without a side: it may turn
+    inside out, and fold through itself unless `face_collisions` acts. Rates are those of the undeformed shape.
     """
 
     kind: Literal["membrane"] = "membrane"
@@ -289,9 +292,12 @@ class Bending(Effect):
 
     The condition is C = |e| / sqrt(A + A') (angle - rest angle) for the edge e between triangles of areas A and A'. The
     stiffness is then the flexural rigidity of a sheet that has the shape of a cylinder, bent along the sides of its
-    cells, and does not depend on their size (compare Grinspun et al. 2003, Discrete shells). Under load a sheet also
-    folds along the diagonals of its cells: a strip of cells r times as wide as long has s / (s + r^2) of that rigidity,
-    s = (r + 1 / r)^2. This is 4/5 of it if cells are square, and more if they are longer.
+    cells, and does not depend on their size (compare Grinspun et al. 2003, Discrete shells). In 3-D only.
+
+    Limits: under load a sheet also folds along the diagonals of its cells: a strip of cells r times as wide as long has
+    s / (s + r^2) of that rigidity, s = (r + 1 / r)^2. This is 4/5 of it if cells are square, and more if they are
+    longer. It acts on angles between triangles alone, so a border bends freely, and a triangle that shrinks to a line
+    has none. Rates are those of the undeformed shape.
     """
 
     kind: Literal["bending"] = "bending"

@@ -91,6 +91,9 @@ class Metabolism(_Urge):
     """Hunger, 0 (full) to 1 (starved), that grows with time and effort: dH/dt = rate + effort (v / max_speed)^2.
 
     The first term is Tu and Terzopoulos' (1994), the second ours.
+
+    Limits: hunger has an effect only through what reads it: an arbitration, a sink or a law. It grows by speed relative
+    to max_speed, and for agents without one by time alone.
     """
 
     kind: Literal["metabolism"] = "metabolism"
@@ -166,13 +169,16 @@ class Grazing(_Urge):
     A patch holds an amount a with da/dt = growth a (1 - a / capacity) minus rate a H for each agent that eats there, H
     its hunger. Hunger falls by the amount eaten divided by `appetite`. The model is ours: in Tu and Terzopoulos (1994)
     food is particles. Amounts are in units of food: `food` of a patch, `eaten` by an agent since the start.
+
+    Limits: patches are agents: they do not spread, and a patch that is eaten to 0 does not grow again. Eaters need no
+    line of sight, and eat whatever they do.
     """
 
     kind: Literal["grazing"] = "grazing"
     other: int = Field(ge=0, strict=True, description="the group whose agents are patches of food")
     radius: float = Field(gt=0, description="m, agents nearer than this to a patch's centre eat of it")
     rate: float = Field(default=0.5, ge=0, description="1/s, fraction of a patch eaten by a starved agent")
-    growth: float = Field(default=0.2, ge=0, description="r, 1/s")
+    growth: float = Field(default=0.2, ge=0, description="r, 1/s, growth of a small amount of food")
     capacity: float = Field(default=3.0, gt=0, description="K, units of food in a full patch")
     start: float = Field(default=1.0, gt=0, le=1, description="initial amount, as a fraction of capacity")
     appetite: float = Field(default=1.0, gt=0, description="units of food from starved to full")
@@ -245,6 +251,9 @@ class Predation(_Urge):
     caught by two in one step reduces the hunger of both. The model is ours.
 
     A hunter that catches n prey in a step has the hunger H = max(H - n `meal`, 0) after it.
+
+    Limits: there is no chase and no failure: prey in reach of a hungry hunter is caught, through walls also, and stays
+    alive unless a sink removes it.
     """
 
     kind: Literal["predation"] = "predation"
@@ -312,6 +321,9 @@ class Fear(_Urge):
     """Fear of others in sight, F = min(sum of min(span / distance, 1), 1), which decays over `memory` seconds.
 
     Sight, sum and 1 / distance are from Tu and Terzopoulos (1994; a view of 300 degrees); the decay is ours.
+
+    Limits: it is a sum over those in sight, cut at 1: two near predators are feared as much as one. What is out of
+    sight is forgotten over `memory`.
     """
 
     kind: Literal["fear"] = "fear"
@@ -376,11 +388,13 @@ class Libido(_Urge):
 
     Two agents mate if they are nearer than `radius` and both have a libido above `ready`; `mated` counts matings. Three
     agents in reach of each other all mate. This replaces the paper's courtship and is ours; no agent is born.
+
+    Limits: there are no sexes, no courtship and no births. Agents mate through walls.
     """
 
     kind: Literal["libido"] = "libido"
     radius: float = Field(gt=0, description="m, distance at which agents mate")
-    rate: float = Field(default=0.025, ge=0, description="1/s")
+    rate: float = Field(default=0.025, ge=0, description="1/s, growth of the urge")
     ready: float = Field(default=0.4, ge=0, le=1, description="libido above which an agent is willing to mate")
     start: float = Field(default=0.0, ge=0, description="mean initial urge")
     spread: float = Field(default=0.0, ge=0, description="width of the uniform distribution of initial values")
@@ -438,6 +452,9 @@ class Intention(_Urge):
     of hunger and libido, if above `need`; else to wander (Tu and Terzopoulos 1994). An intention ends only when its
     level has fallen by `calm` or `content` below the threshold, against rapid changes; that is ours. An arbitration
     `intentions` reads it. The level of eating is the hunger H, that of mating the libido L = s (1 - H).
+
+    Limits: it only names what an agent would do: an arbitration `intentions` in a `steer` has to act on it. The order
+    of its tests is fixed.
     """
 
     kind: Literal["intention"] = "intention"

@@ -47,6 +47,9 @@ class Pressure(Effect):
     is not the pressure of smoothed particles, which is a function of both partners' densities, and needs a second pass
     over all pairs (Monaghan 1992). A mere sum over pairs has no preferred density in a mean field (its pressure grows
     with rho^2 for any force); here the distance a and the order of agents set the density, to a few percent.
+
+    Limits: the density holds to a few per cent, for a crowd that fills its space. The force is 64 K at distance 0, so
+    two agents that are pressed harder pass through each other, and without `drag` agents do not come to rest.
     """
 
     kind: Literal["pressure"] = "pressure"

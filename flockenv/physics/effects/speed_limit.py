@@ -35,11 +35,14 @@ class SpeedLimit(Effect):
     and clips the result of a step, so that with it every method is of order 1.
 
     The function is ours.
+
+    Limits: it is soft: with a stronger drive than B agents are faster than V, and below V they are braked too. The
+    velocity is that in space, not relative to a medium.
     """
 
     kind: Literal["speed_limit"] = "speed_limit"
     sentence: ClassVar[str] = "Brake agents that approach {speed}"
-    speed: float = Field(gt=0, description="V, m/s")
+    speed: float = Field(gt=0, description="V, m/s, at which the braking force is B")
     strength: float = Field(ge=0, description="B, N, braking force at speed V")
     own_law: ClassVar[Law | None] = speed_limit
     strengths: ClassVar[tuple[str, ...]] = ("strength",)

@@ -195,6 +195,9 @@ class Springs(Effect):
     The work of yielding and the energy of a spring that breaks are dissipated.
 
     Springs: Hooke 1678; cloth of springs along, across and beyond cells: Provot 1995.
+
+    Limits: they act along edges alone: nothing resists folding, and a triangle or cell of springs that is inside out is
+    at rest there (`altitude_springs`, `angular_springs`, `elastic`). Two ends may pass through each other.
     """
 
     kind: Literal["springs"] = "springs"

@@ -45,7 +45,7 @@ def swing(p: Any, me: Me) -> Vec:
 class _Centred(Effect):
     """Base class of forces about a fixed point; on a torus, about its nearest image."""
 
-    centre: Vector = Field(description="m")
+    centre: Vector = Field(description="m, the fixed point")
     places: ClassVar[tuple[str, ...]] = ("centre",)
 
 
@@ -53,11 +53,14 @@ class Tether(_Centred):
     """A damped spring to a fixed point, F = -k (|d| - L) unit(d) - c v: with L = 0 an oscillator, w^2 = k / m.
 
     Hooke 1678.
+
+    Limits: with a rest length the direction jumps at the centre, where agents have no direction. The damping is
+    relative to space, not to a medium.
     """
 
     kind: Literal["tether"] = "tether"
-    stiffness: float = Field(ge=0, description="k, N/m")
-    damping: float = Field(default=0.0, ge=0, description="c, kg/s")
+    stiffness: float = Field(ge=0, description="k, N/m, force per stretch")
+    damping: float = Field(default=0.0, ge=0, description="c, kg/s, force per speed")
     rest: float = Field(default=0.0, ge=0, description="L, m, rest length")
     own_law: ClassVar[Law | None] = tether
     strengths: ClassVar[tuple[str, ...]] = ("stiffness", "damping")
@@ -77,11 +80,15 @@ class Swing(_Centred):
     """A pendulum along each axis, F = -s sin((x - c) / l): the angle is (x - c) / l, w^2 = s / (m l) for small ones.
 
     Huygens 1673.
+
+    Limits: it is the force of a pendulum on a coordinate, along each axis by itself: the agent moves on a straight
+    line, not on an arc, and in all directions it is no spherical pendulum. Beyond x = l pi it pulls to the next
+    minimum.
     """
 
     kind: Literal["swing"] = "swing"
     strength: float = Field(ge=0, description="s, N; of a pendulum in gravity: m g")
-    length: float = Field(default=1.0, gt=0, description="l, m")
+    length: float = Field(default=1.0, gt=0, description="l, m, length of the pendulum")
     own_law: ClassVar[Law | None] = swing
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
 

@@ -50,6 +50,9 @@ class Vicsek(Effect):
     0, the agent keeps its direction. In 2-D only.
 
     Source: Vicsek, Czirok, Ben-Jacob, Cohen, Shochet 1995, Phys. Rev. Lett. 75, 1226, eqs. 1 and 2.
+
+    Limits: it is a map, so masses cancel, and v0 is kept only if no other force acts. Neighbours are those within r in
+    all directions, at any density, and bodies have no size.
     """
 
     kind: Literal["vicsek"] = "vicsek"
@@ -76,7 +79,7 @@ class Vicsek(Effect):
         return (*super().calls_for(), "random numbers")
 
     def check(self, scene: SceneView) -> None:
-        """Raise ValueError in 3-D, and for other methods or another dt."""
+        """Raise ValueError in 3-D, for methods but explicit_euler and semi_implicit_euler, and if dt is not `step`."""
         if scene.dimension != 2:
             raise ValueError(f"kind = vicsek: dimension = {scene.dimension}, must be 2")
         if scene.integrator.kind not in METHODS:

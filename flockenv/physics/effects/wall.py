@@ -37,6 +37,9 @@ class WallRepulsion(Effect):
     desired speed v0 and relaxation time tau rests at d = B ln(A tau / (m v0)), which it approaches without oscillation
     if v0 tau / B <= 1/4. Helbing and Molnar 1995 (A = U0 / R, B = R); Helbing, Farkas and Vicsek 2000 without contact
     (their A times exp(radius / B)); Kretz, arXiv 1507.02566.
+
+    Limits: the wall has no end, and bodies have no size. Behind it the force grows as exp(|d| / B) without bound, and
+    dt is not tested for it: an agent that a long step takes far behind is thrown back at any speed.
     """
 
     kind: Literal["wall_repulsion"] = "wall_repulsion"
@@ -50,6 +53,7 @@ class WallRepulsion(Effect):
 
     @model_validator(mode="after")
     def _check_normal(self) -> Self:
+        """Raise ValueError if the normal has no length."""
         if not SHORTEST <= math.hypot(*self.normal) <= LONGEST:
             raise ValueError(
                 f"normal = {self.normal}: must be a direction, not all 0, of length {SHORTEST:g} to {LONGEST:g}"

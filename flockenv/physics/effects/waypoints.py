@@ -131,6 +131,9 @@ class Journey(Around):
 
     The direction to a stage is e = unit(d), with d to the stage, or down the gradient of the path length. The model is
     ours.
+
+    Limits: the order of stages is fixed, and the paths are found once, without other agents: a crowd does not avoid a
+    full stage. Waits are drawn when the scene is built, and are the same in all worlds.
     """
 
     kind: Literal["journey"] = "journey"

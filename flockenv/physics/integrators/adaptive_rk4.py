@@ -71,6 +71,9 @@ class AdaptiveRK4(Adaptive):
 
     The error of a substep h is e = |y(h) - y(h/2, h/2)|, of one step and of two half steps of RK4 (Kutta 1901); the
     next substep is h (tolerance / e)^(1/5), times 0.9 (Hairer, Norsett and Wanner 1993, II.4).
+
+    Limits: substeps follow the worst agent of a world, so one fast agent makes all slow, and threads do not share a
+    world. Noise, constraints and limits still act once per dt.
     """
 
     kind: Literal["adaptive_rk4"] = "adaptive_rk4"

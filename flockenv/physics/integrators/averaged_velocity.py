@@ -21,6 +21,8 @@ class AveragedVelocity(OneStage):
     """Averaged-velocity step, order 1, one evaluation; exact under a constant force, adds energy to oscillations.
 
     v' = v + h a(x, v, t), x' = x + h (v + v') / 2: the formulas of uniform acceleration (Galileo 1638), step by step.
+
+    Limits: it is exact under a constant force only.
     """
 
     kind: Literal["averaged_velocity"] = "averaged_velocity"

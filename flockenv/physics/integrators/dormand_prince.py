@@ -78,6 +78,9 @@ class DormandPrince(Adaptive):
 
     y' = y + h (b1 k1 + ... + b7 k7) for y = (x, v) and slopes k = (v, a); the error is e = h |sum of (b - c) k|, with
     the weights c of order 4; the next substep is h (tolerance / e)^(1/5), times 0.9 (Dormand and Prince 1980).
+
+    Limits: substeps follow the worst agent of a world, so one fast agent makes all slow, and threads do not share a
+    world. Noise, constraints and limits still act once per dt.
     """
 
     kind: Literal["dormand_prince"] = "dormand_prince"

@@ -20,6 +20,9 @@ class ExplicitEuler(OneStage):
     """Explicit Euler, order 1, one evaluation; unstable for every undamped oscillation at every step size.
 
     x' = x + h v, v' = v + h a(x, v, t) (Euler 1768).
+
+    Limits: every undamped oscillation grows by the root of 1 + (h omega)^2 per step: for orbits and springs take
+    another method.
     """
 
     kind: Literal["explicit_euler"] = "explicit_euler"

@@ -79,6 +79,9 @@ class ExponentialDrag(Integrator):
     With z = -h c / m and the other accelerations a: y = x + h phi1(z) v + h^2 phi2(z) a, w = exp(z) v + h phi1(z) a,
     then x' = y + h^2 phi3(z) (b - a), v' = w + h phi2(z) (b - a) with b = a(y, w, t + h). ETD2RK of Cox and Matthews
     2002.
+
+    Limits: only the linear drag of a `drag` effect is exact: damping within other forces, of springs or behaviours, is
+    explicit.
     """
 
     kind: Literal["exponential_drag"] = "exponential_drag"

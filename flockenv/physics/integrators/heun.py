@@ -38,6 +38,8 @@ class Heun(Integrator):
     """Heun, order 2, two evaluations; energy of an oscillation grows by (h omega)^4 / 4 per step.
 
     x' = x + h (v + w) / 2, v' = v + h (a + a(x + h v, w, t + h)) / 2 with w = v + h a and a = a(x, v, t) (Heun 1900).
+
+    Limits: for oscillations without damping over many periods take velocity_verlet or rk4.
     """
 
     kind: Literal["heun"] = "heun"

@@ -28,6 +28,9 @@ class ImplicitEuler(Implicit):
     """Implicit Euler, order 1: v' = v + h a(x', v'), x' = x + h v'; an oscillation loses 1/(1 + h^2 w^2) per step.
 
     Curtiss and Hirschfelder 1952.
+
+    Limits: Newton's method has to solve each step: where forces jump it may fail, and then the step is halved, at most
+    three times, before the world counts as diverged. It damps all fast motion, also that which should last.
     """
 
     kind: Literal["implicit_euler"] = "implicit_euler"

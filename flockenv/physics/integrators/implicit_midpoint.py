@@ -15,6 +15,10 @@ class ImplicitMidpoint(Implicit):
 
     x' = x + h (v + v') / 2, v' = v + h a((x + x') / 2, (v + v') / 2, t + h / 2): the Gauss method of one stage (Butcher
     1964).
+
+    Limits: Newton's method has to solve each step: where forces jump it may fail, and then the step is halved, at most
+    three times, before the world counts as diverged. Stiff modes that are not resolved keep their energy and swing for
+    ever.
     """
 
     kind: Literal["implicit_midpoint"] = "implicit_midpoint"

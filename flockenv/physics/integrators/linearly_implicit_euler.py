@@ -37,6 +37,9 @@ class LinearlyImplicitEuler(Integrator):
     that touches one, and does not bounce, keeps to its surface within the solve, and its neighbours move accordingly
     in the same step. Contacts that would pull are released, and friction is Coulomb's; each change is another solve.
     Impacts that bounce, and whatever the linear equations miss, are left to `collisions` after the solve.
+
+    Limits: forces without a `derivative` are explicit. It damps fast motion, as implicit Euler does, and threads do not
+    share a world.
     """
 
     kind: Literal["linearly_implicit_euler"] = "linearly_implicit_euler"

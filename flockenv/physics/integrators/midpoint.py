@@ -40,6 +40,8 @@ class Midpoint(Integrator):
     """Explicit midpoint, order 2, two evaluations; energy of an oscillation grows by (h omega)^4 / 4 per step.
 
     x' = x + h (v + h a / 2), v' = v + h a(x + h v / 2, v + h a / 2, t + h / 2) with a = a(x, v, t) (Runge 1895).
+
+    Limits: for oscillations without damping over many periods take velocity_verlet or rk4.
     """
 
     kind: Literal["midpoint"] = "midpoint"

@@ -45,6 +45,8 @@ class RK4(Integrator):
 
     y' = y + h (k1 + 2 k2 + 2 k3 + k4) / 6 for y = (x, v) and slopes k = (v, a): k1 at y, k2 at y + h k1 / 2, k3 at y +
     h k2 / 2, k4 at y + h k3 (Kutta 1901).
+
+    Limits: it is not symplectic: an oscillation loses (h omega)^6 / 72 of its energy per step.
     """
 
     kind: Literal["rk4"] = "rk4"

@@ -21,6 +21,9 @@ class SemiImplicitEuler(OneStage):
     """Semi-implicit Euler, order 1, one evaluation; bounded energy while h omega < 2 (Reynolds' own step, 1999).
 
     v' = v + h a(x, v, t), x' = x + h v' (de Vogelaere 1956; Hairer, Lubich and Wanner 2006, VI.3).
+
+    Limits: with drag or other forces of the velocity it is no longer symplectic, and energy is that of a near system:
+    it swings about the true one by an amount proportional to h.
     """
 
     kind: Literal["semi_implicit_euler"] = "semi_implicit_euler"

@@ -44,6 +44,8 @@ class VelocityVerlet(Integrator):
 
     x' = x + h v + h^2 a / 2, v' = v + h (a + a(x', v + h a, t + h)) / 2 with a = a(x, v, t) (Verlet 1967; Swope,
     Andersen, Berens and Wilson 1982; the predicted velocity is ours).
+
+    Limits: it is symplectic for forces of position alone.
     """
 
     kind: Literal["velocity_verlet"] = "velocity_verlet"
