@@ -19,7 +19,10 @@ from flockenv.play.controls import Facts, default_of, facts_of, records_in
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
 
-__all__ = ["field_rows", "first_paragraph", "first_sentence", "markdown", "process", "signature", "skip", "table"]
+__all__ = [
+    "field_rows", "first_paragraph", "first_sentence", "markdown", "process", "signature", "skip", "table",
+    "without_limits",
+]  # fmt: skip
 
 CODE = re.compile(r"(``.+?``|:[\w:]+:`[^`]+`|`[^`]+`)", re.DOTALL)
 
@@ -31,6 +34,13 @@ def markdown(text: str | None) -> str:
     text = _outside_code(text, lambda part: re.sub(r"(?<!^)([*_])|^(\*)(?! )", r"\\\1\2", part, flags=re.MULTILINE))
     text = _outside_code(text, lambda part: part.replace("<", "&lt;"))
     return re.sub(r"^([+=#>])", r"\\\1", text, flags=re.MULTILINE)
+
+
+def without_limits(text: str | None) -> tuple[str, str]:
+    """Return a docstring without its paragraph "Limits: ...", and the text of that paragraph; "" if it has none."""
+    paragraphs = inspect.cleandoc(text or "").split("\n\n")
+    own = [each for each in paragraphs if each.startswith("Limits: ")]
+    return "\n\n".join(each for each in paragraphs if each not in own), "".join(own).removeprefix("Limits: ")
 
 
 def first_sentence(text: str | None) -> str:

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import inspect
-import math
 import os
+import re
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from docstrings import field_rows, first_sentence, markdown, table
+from docstrings import field_rows, first_sentence, markdown, table, without_limits
+from limits import limits, limits_of_preset, link
 from pictures import demos
 from scene_pages import Use, uses
 
 from flockenv.behaviours import BEHAVIOURS
 from flockenv.physics.constraints import CONSTRAINTS
-from flockenv.physics.effects import EFFECTS
+from flockenv.physics.effects import EFFECTS, Effect
 from flockenv.physics.effects.effect import LAWS
-from flockenv.physics.integrators import INTEGRATORS, Integrator
+from flockenv.physics.integrators import INTEGRATORS
 from flockenv.scene.presets import PRESETS, Model
-from flockenv.scene.stability import drag_limit, limit
 
 __all__ = ["pages"]
 
@@ -59,8 +59,8 @@ def pages(docs: Path) -> dict[str, str]:
             made[f"{folder}/{kind}"] = _kind_page(docs, folder, kind, model, used.get(kind, []))
     sources = {name: model.source for name, model in PRESETS.items()}
     made["presets/index"] = _overview("Presets", ABOUT["presets"], sources)
-    for name, model in PRESETS.items():
-        made[f"presets/{name}"] = _preset_page(name, model, used.get(name, []))
+    for name, preset in PRESETS.items():
+        made[f"presets/{name}"] = _preset_page(name, preset, used.get(name, []))
     return made
 
 
@@ -74,7 +74,8 @@ def _overview(title: str, about: str, texts: Mapping[str, str]) -> str:
 
 def _kind_page(docs: Path, folder: str, kind: str, model: type[Any], used: list[Use]) -> str:
     parts = [f"# {kind}", *_picture(docs, folder, kind, used)]
-    parts += [markdown(model.__doc__), *_laws(model), *_method(model), *_fields(model)]
+    parts += [markdown(without_limits(model.__doc__)[0]), *_laws(model), *_method(model), *limits(model)]
+    parts += _fields(model)
     parts += _used(used)
     if demo := getattr(model, "demo", None) or demos().get(kind, (0, None))[1]:
         parts += ["## Its scene in the picture", f"```yaml\n{demo.strip()}\n```"]
@@ -120,31 +121,15 @@ def _method(model: type[Any]) -> list[str]:
     rows = [
         ("order, forces of position", str(model.order)),
         ("order, forces of velocity also", str(model.order_with_drag)),
-        ("evaluations of the force per step" + (", at least" if model.adaptive else ""), str(model.evaluations)),
+        (
+            "evaluations of the force per step" + (", at least" if model.adaptive else ""),
+            str(model.evaluations or "as many as its equations take"),
+        ),
         ("chooses its own substeps", "yes" if model.adaptive else "no"),
         ("integrates linear drag exactly", "yes" if model.splits_drag else "no"),
         ("solves equations", "yes" if model.solves else "no"),
     ]
-    return ["## Properties", table(("property", ""), rows), *_limits(model())]
-
-
-def _limits(method: Integrator) -> list[str]:
-    """Return the section with the longest stable steps of an integration method, as stability.py computes them."""
-    if method.stable_at_any_step:
-        text = "It chooses substeps that are stable." if method.adaptive else "It is stable at any step."
-        return ["## Limits", f"{text} A force that jumps reduces its order, and a long step its accuracy."]
-    free, damped, drag = limit(method, 0.0), limit(method, 0.1), drag_limit(method)
-    undamped = f"stable for h omega < {free:.3g}" if free else "unstable at any step"
-    slows = "at any step" if math.isinf(drag) or method.splits_drag else f"for h c / m < {drag:.3g}"
-    text = (
-        f"An undamped oscillation of angular frequency omega is {undamped}; with 10 % of critical damping it is stable "
-        f"for h omega < {damped:.3g}. Linear drag c is stable {slows}."
-    )
-    more = (
-        " This, and the curve, is for forces without a `derivative`; others do not limit the step, which is then "
-        "that of [implicit Euler](implicit_euler.md) for a linear force."
-    )
-    return ["## Limits", text + more * method.linearises]
+    return ["## Properties", table(("property", ""), rows)]
 
 
 def _fields(model: type[Any]) -> list[str]:
@@ -174,16 +159,27 @@ def _preset_page(name: str, model: Model, used: list[Use]) -> str:
     symbols = table(
         ("symbol of the paper", "value"), [(f"`{key}`", _cell(value)) for key, value in model.symbols.items()]
     )
-    effects = "\n".join(map(repr, (*model.behaviours(False, None), *model.bodies)))
+    effects = (*model.behaviours(False, None), *model.bodies)
+    calls = "\n".join(map(repr, effects))
     people = "\n".join(f"{key}: {value!r}" for key, value in model.people.items())
     picture = f"![Two streams of four under {name}](../pictures/{name}.png)"
-    parts = [f"# {name}", picture, _cell(model.source) + ".", "## Values", symbols]
+    parts = [f"# {name}", picture, _cell(model.source) + ".", "## Formulas"]
+    parts.append(table(("force", "formula"), [(link(each.kind), _cell(_formula(each))) for each in effects]))
+    parts += ["## Values", symbols]
     if model.note:
         parts.append(f"Note: {_cell(model.note)}.")
+    parts += limits_of_preset(model)
     parts += [
-        "## Effects that it stands for", f"```python\n{effects}\n```",
+        "## Effects that it stands for", f"```python\n{calls}\n```",
         "## Pedestrians", f"```python\n{people}\n```",
         "## Use", f"```yaml\neffects:\n  - {{preset: {name}}}\n```", *_used(used),
         "## Its scene in the picture", f"```yaml\n{demos()[name][1].strip()}\n```",
     ]  # fmt: skip
     return "\n\n".join(parts) + "\n"
+
+
+def _formula(effect: Effect) -> str:
+    """Return the paragraph of an effect's docstring with its formula, and the next one, which explains its letters."""
+    paragraphs = without_limits(type(effect).__doc__)[0].split("\n\n")
+    first = next(k for k, text in enumerate(paragraphs) if re.search(r"\bF = ", text))
+    return " ".join(paragraphs[first : first + 2])
