@@ -18,7 +18,6 @@ from stable_baselines3 import PPO
 
 from tests.clients import __main__ as runner
 from tests.clients.__main__ import CLIENTS, HERE, PAGE, ROOT, head, page_code
-from tests.clients.zoo_settings import rl_zoo_settings
 
 SECTIONS = re.findall(r"^##+ ([^\n]*)\n(.*?)(?=^##|\Z)", PAGE, re.DOTALL | re.MULTILINE)
 BLOCKS = [
@@ -64,9 +63,12 @@ def test_the_code_of_the_page_is_run_by_the_scripts_of_its_clients() -> None:
 
 
 def test_the_hyperparameters_for_rl_zoo_are_arguments_of_its_ppo() -> None:
-    (entry,) = yaml.safe_load(rl_zoo_settings()).values()
+    assert "../configs/clients/ppo.yml\n:language: yaml" in PAGE
+    entries = yaml.safe_load((ROOT / "configs" / "clients" / "ppo.yml").read_text(encoding="utf-8"))
+    assert entries.keys() == {f"flockenv/{name}" for name in re.findall(r"\w+-v\d", PAGE.split("| lines |")[1][:99])}
     own = {"n_timesteps", "policy", "n_envs", "normalize"}
-    assert own < entry.keys() and entry.keys() - own <= inspect.signature(PPO).parameters.keys()
+    for entry in entries.values():
+        assert own < entry.keys() and entry.keys() - own <= inspect.signature(PPO).parameters.keys()
 
 
 PLAYED = """

@@ -18,7 +18,7 @@ ROWS, GAMMA = 8, 0.99
 
 def made(env_id):
     """Return the stack of make_env, over all rows at once."""
-    envs = gymnasium.make_vec(env_id, num_envs=ROWS)
+    envs = gymnasium.make_vec(env_id, num_envs=ROWS, max_episode_steps=100)  # some end within 1,000 steps
     envs = wrappers.FlattenObservation(envs)
     envs = wrappers.RecordEpisodeStatistics(envs)
     envs = wrappers.ClipAction(envs)

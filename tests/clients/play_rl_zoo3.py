@@ -3,7 +3,7 @@
 # [tool.flockenv]
 # constraints = "configs/constraints.txt"
 # ///
-"""RL Baselines3 Zoo: its training script, with our package named and the settings of docs/clients.md."""
+"""RL Baselines3 Zoo: its training script, with our package named and the hyperparameters of configs/clients/ppo.yml."""
 
 import subprocess
 import sys
@@ -11,12 +11,11 @@ import tempfile
 from pathlib import Path
 
 from row import IDS, STEPS, row
-from zoo_settings import rl_zoo_settings
+
+SETTINGS = Path(__file__).resolve().parents[2] / "configs" / "clients" / "ppo.yml"
 
 for env_id in IDS:
     with row("rl_zoo3", "rl_zoo3.train --algo ppo, id", env_id), tempfile.TemporaryDirectory() as folder:
-        settings = Path(folder, "ppo.yml")
-        settings.write_text(rl_zoo_settings().replace("flockenv/Pursuit-v0", env_id), encoding="utf-8")
         command = [
             sys.executable,
             "-m",
@@ -30,5 +29,5 @@ for env_id in IDS:
             "-n",
             str(STEPS),
         ]
-        options = ["-conf", settings, "-f", folder, "--eval-freq", "5000", "--eval-episodes", "4", "--verbose", "0"]
+        options = ["-conf", SETTINGS, "-f", folder, "--eval-freq", "5000", "--eval-episodes", "4", "--verbose", "0"]
         subprocess.run([*command, *options], check=True, cwd=folder, stdout=sys.stderr)
