@@ -8,6 +8,7 @@ by its pages.
 from __future__ import annotations
 
 import os
+import re
 import sys
 import tomllib
 from pathlib import Path
@@ -33,6 +34,9 @@ html_theme_options = {
 html_title = f"flockenv {release}"
 html_copy_source = False
 html_show_sourcelink = False
+
+# the addresses of the project itself are assumed: nothing is published yet
+linkcheck_ignore = [re.escape(_about["urls"][name].rstrip("/")) for name in ("Repository", "Documentation")]
 
 myst_heading_anchors = 4  # links to headings, as code hosts have them: players.md#seeds
 myst_enable_extensions = ["html_image"]  # <img width=...> in pages
