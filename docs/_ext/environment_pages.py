@@ -62,9 +62,10 @@ def _page(docs: Path, name: str, info: EnvInfo, results: dict[str, Any]) -> str:
 
 
 def _film(docs: Path, name: str) -> str:
+    """Return the film above a page; if it was not drawn, or has no hybrid of rules and policy, say so."""
     hybrid = "" if hybrid_of(name) else f"No hybrid of rules and policy was trained in {name}.\n\n"
     if not _path_of_film(docs, name).exists():
-        return hybrid
+        return f"{hybrid}This site was built without films (`-D films=0`).\n\n"
     players = "rules and PPO" if hybrid else "rules, PPO and a hybrid of both"
     return f"![An episode of {name} in the same world, from left to right: {players}](../films/{name}.gif)\n\n{hybrid}"
 
@@ -80,15 +81,20 @@ def _kernel_text(task: Task, kernel: str) -> str:
 
 
 def _reward_table(task: Task) -> str:
-    """Return the table of reward terms with the parameters that weigh them, and what the kernel says about all."""
+    """Return the table of reward terms and their factors, and what the kernel says about all terms after a `;`."""
     fields = type(task).model_fields
+    weights = [key for key in fields if key.endswith(("_reward", "_cost"))]
     rows = []
     for term in task.terms:
-        weights = [key for key in fields if key.endswith(("_reward", "_cost"))]
         own = [key for key in weights if _stem(key).startswith(_stem(term)[:5])]
-        meaning = "; ".join(f"`{key}` = {getattr(task, key):g}, {fields[key].description}" for key in own)
-        rows.append((f"`{term}`", meaning or "see the arguments"))
-    return f"{_kernel_text(task, 'reward')}\n\n{table(('term', 'factor'), rows)}"
+        factors = "; ".join(f"`{key}` = {getattr(task, key):g}" for key in own)
+        rows.append((f"`{term}`", factors, "; ".join(fields[key].description or "" for key in own)))
+    text = (
+        "The table has a row for each term: the argument that is its factor, with its default, and what the factor is "
+        "paid for; a factor whose name ends in `_cost` is subtracted."
+    )
+    note = _kernel_text(task, "reward").partition("; ")[2]
+    return f"{text}{f' Note: {note}' if note else ''}\n\n{table(('term', 'factor', 'paid'), rows)}"
 
 
 def _stem(name: str) -> str:
