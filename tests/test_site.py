@@ -73,17 +73,42 @@ def names_in(inventory: Path) -> set[str]:
     }
 
 
-@pytest.mark.slow
-def test_the_site_builds_without_warnings_and_refers_to_no_other_host() -> None:
-    """In the folder of the stage `site` of .ci/run, so that only what is new is built; without the films of tasks."""
+@pytest.fixture(scope="module")
+def site() -> Path:
+    """The site, built into the folder of the stage `site` of .ci/run: only what is new, without the films of tasks."""
     if any(importlib.util.find_spec(name) is None for name in ("sphinx", "myst_parser", "furo")):
         pytest.skip("needs sphinx, myst-parser and furo: pip install 'flockenv[docs]'")
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-D", "films=0", "-b", "html", "docs"]
-    site = ROOT / "docs" / "_build" / "html"
-    done = subprocess.run([*command, str(site)], cwd=ROOT, capture_output=True, text=True, check=False)
+    built = ROOT / "docs" / "_build" / "html"
+    done = subprocess.run([*command, str(built)], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert (site / "searchindex.js").stat().st_size > 100_000
+    return built
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_warnings_and_refers_to_no_other_host(site: Path) -> None:
     assert {line.split("(")[0].split(":")[0] for line in lines()} - names_in(site / "objects.inv") == set()
     loaded = re.compile(r"<(?:script|link|img|iframe)\b[^>]*?(?:src|href)=\"(?:https?:)?//[^\"]*\"")
     for path in site.rglob("*.html"):
         assert loaded.findall(path.read_text(encoding="utf-8")) == [], path.name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("word", "hit"), [("separation", "generated/behaviours/separation"), ("load_player", "flockenv.players")]
+)
+def test_the_search_page_finds_a_word_without_a_network(site: Path, word: str, hit: str) -> None:
+    """As files of a disk, in a browser that is offline."""
+    pytest.importorskip("websockets", reason="needs the extra `play`: pip install 'flockenv[play]'")
+    from tests.playground import Visit, browsing, wait_for
+
+    with browsing() as chromium:
+        here = Visit(chromium, f"{(site / 'search.html').as_uri()}?q={word}", offline=True)
+        links = here.page.locator("#search-results li a")
+        wait_for(lambda: links.count() > 0)
+        found = [link.get_attribute("href") or "" for link in links.all()]
+        assert any(hit in each for each in found), found
+        links.first.click()
+        assert here.page.url.startswith(site.as_uri())
+        assert [url for url in here.requests if not url.startswith("file:")] == []
+        here.close()
