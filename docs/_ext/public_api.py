@@ -14,7 +14,16 @@ from typing import Any, get_origin
 
 from pydantic import BaseModel
 
-__all__ = ["defined_in", "description", "internal_modules", "is_value", "lines", "public_modules", "type_of"]
+__all__ = [
+    "defined_in",
+    "description",
+    "internal_modules",
+    "is_value",
+    "lines",
+    "names_of",
+    "public_modules",
+    "type_of",
+]
 
 PAGE = Path(__file__).resolve().parent.parent / "api.md"
 
@@ -76,6 +85,13 @@ def description(module: str, name: str) -> str:
         if name in _targets(node) and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
             return inspect.cleandoc(str(after.value.value))
     return ""
+
+
+def names_of(module: str) -> set[str]:
+    """Return the names that a module defines or assigns, also under `if`; not those that it imports."""
+    nodes = [*_statements(_tree(module))]
+    defined = {each.name for each in nodes if isinstance(each, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef)}
+    return defined.union(*map(_targets, nodes))
 
 
 @functools.cache
