@@ -25,9 +25,20 @@ SAVED = re.compile(r"`([\w.]+\.yaml)`[^`]*\Z")
 
 PROGRAMS = {
     "python": '#!/bin/sh\nexec "{python}" "$@"\n',
-    "flockenv": "#!{python}\nimport sys\nfrom flockenv.cli.main import main\nsys.exit(main(sys.argv[1:]))\n",
+    "flockenv": """#!{python}
+import subprocess, sys
+from urllib.request import urlopen
+from flockenv.cli.main import main
+if sys.argv[1] != "play" or "--no-browser" in sys.argv:
+    sys.exit(main(sys.argv[1:]))
+with subprocess.Popen([*sys.argv, "--no-browser", "--port", "0"], stdout=subprocess.PIPE, text=True) as server:
+    print(line := server.stdout.readline(), end="")
+    urlopen(line.split()[0]).read()
+    server.terminate()
+""",
 }
-"""What a page calls by name, as it is in an environment with flockenv."""
+"""What a page calls by name, as it is in an environment with flockenv. A playground is read in place of a browser, and
+then ended, as it would otherwise go on."""
 
 
 def blocks_of(text: str) -> list[tuple[str, str]]:
@@ -64,8 +75,10 @@ def run_python(script: str, folder: Path, *, more: str = "") -> list[str]:
 def run_page(text: str, folder: Path) -> tuple[list[str], list[str]]:
     """Run a tutorial: save its YAML files, run its commands, then its Python blocks as one script.
 
-    Return the lines that the commands print, and those that the script prints.
+    In this checkout the folder has its `configs`. Return the lines that the commands print, and those of the script.
     """
+    if not INSTALLED:
+        (folder / "configs").symlink_to(ROOT / "configs")
     programs = folder / "programs"
     programs.mkdir()
     for name, program in PROGRAMS.items():

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from pathlib import Path
 
 import pytest
 
-from tests.page_scripts import ROOT, blocks_of, numbers, run_page
+from tests.page_scripts import ROOT, numbers, run_page
 
 pytestmark = pytest.mark.slow
 DOCS = ROOT / "docs"
@@ -22,11 +23,17 @@ def test_every_tutorial_is_tested_here() -> None:
     source = Path(__file__).read_text(encoding="utf-8")
     for path in DOCS.glob("tutorials/*.md"):
         assert f'played("tutorials/{path.stem}"' in source
-        assert blocks_of(path.read_text(encoding="utf-8"))
+    for path in (*DOCS.glob("tutorials/*.md"), DOCS / "quickstart.md"):
+        blocks = re.findall(r"^```([^\n]*)\n(.*?)^```", path.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+        assert blocks
+        others = [text for language, text in blocks if language not in {"python", "yaml", "sh"}]
+        assert [text for text in others if not text.startswith("pip install ")] == []
 
 
 def test_the_player_of_the_quickstart_succeeds(tmp_path: Path) -> None:
-    _, (line,) = played("quickstart", tmp_path)
+    printed, (line,) = played("quickstart", tmp_path)
+    assert any(line.startswith("http://127.0.0.1:") for line in printed)  # of `flockenv play`
+    assert (tmp_path / "p.gif").stat().st_size > 1000
     assert numbers(line)[0] > 5
     assert line.endswith("success True")
 
@@ -42,7 +49,9 @@ def test_birds_of_the_page_agree_on_a_direction_only_with_alignment(tmp_path: Pa
 def test_the_trained_policy_of_the_page_plays_and_is_compared(tmp_path: Path) -> None:
     if importlib.util.find_spec("stable_baselines3") is None:
         pytest.skip("needs stable-baselines3: pip install 'flockenv[train]'")
-    _, lines = played("tutorials/training", tmp_path)
+    printed, lines = played("tutorials/training", tmp_path)
+    assert (tmp_path / "mine.safetensors").is_file()
+    assert any("mine" in line for line in printed) and any("rules" in line for line in printed)
     scores = {line.split(":")[0]: numbers(line)[0] for line in lines[:3]}
     assert scores["rules"] > 5
     assert scores["rules"] > scores["mine"] > scores["random"]
