@@ -24,7 +24,7 @@ from tests.playground import Visit, browsing, serving, wait_for
 
 OUT = Path(__file__).resolve().parent.parent / "docs" / "play"
 
-WIDTH, HEIGHT, SHOWN = 1280, 720, 800
+WIDTH, HEIGHT, SHOWN = 1280, 720, 640
 """Size of the page, and the width of a film, pixels."""
 
 SMALL = 480

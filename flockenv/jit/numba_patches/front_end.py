@@ -212,7 +212,7 @@ def _no_timers(_: Any) -> Any:
 
 
 def _for_listeners(inform: Any) -> Any:
-    """Make an event only if somebody listens; of a lock, only if it is no timer, see `_no_timers`.
+    """Make an event only if there is a listener; of a lock, only if it is no timer, see `_no_timers`.
 
     numba makes two events of a lock for every call of LLVM. So a TimingListener of a user measures nothing of locks
     while our kernels compile.
