@@ -55,7 +55,7 @@ def main(
     out: Out = None,
 ) -> None:
     """Measure frames per second for springs of 1e2 to 1e8 N/m, as ratios to the linearly implicit method."""
-    with Bench("cloth", quick, rounds, out) as bench:
+    with Bench("cloth", quick, rounds, out, unit="frames per second", scale=1.0) as bench:
         for stiffness in (1e2, 1e4, 1e6, 1e8):
             explicit, contestants = substeps(cells, stiffness), []
             methods: dict[str, tuple[Integrator, int]] = {"linear": (LinearlyImplicitEuler(), 1)}

@@ -353,9 +353,19 @@ def report(
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     with replace_file(path) as file:
-        file.write(json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False).encode() + b"\n")
+        text = json.dumps(_rounded(content), indent=1, ensure_ascii=False, allow_nan=False)
+        file.write(text.encode() + b"\n")
     console.print(f"{'interrupted; what was measured is' if interrupted else 'written'} in {path}", highlight=False)
     return path
+
+
+def _rounded(content: Any) -> Any:
+    """Return data with six significant digits of each float: more than a measurement has."""
+    if isinstance(content, float):
+        return float(f"{content:.6g}")
+    if isinstance(content, dict):
+        return {key: _rounded(each) for key, each in content.items()}
+    return [_rounded(each) for each in content] if isinstance(content, (list, tuple)) else content
 
 
 def _place(name: str, out: str | None) -> Path:
