@@ -89,7 +89,9 @@ class Finding(ResultRecord):
     verdict: Verdict
     note: str = ""
     seconds: float = Field(ge=0, description="s, wall time, compiling included")
-    series: dict[str, tuple[float | None, ...]] = Field(default_factory=dict, description="data for pictures")
+    series: dict[str, tuple[float | None, ...]] = Field(
+        default_factory=dict, exclude_if=lambda series: not series, description="data for pictures"
+    )
 
     def cell(self, digits: int = 2) -> str:
         """Return value and verdict, short."""
@@ -232,7 +234,7 @@ def _try_case(case: Case, name: str, argument: Any, warning_kinds: tuple[type[Wa
     return Finding(
         case=case.name, title=case.title, under=name, bound=case.bound, value=_finite_or_none(value.number),
         verdict="warned" if warning and verdict == "pass" else verdict,
-        note="; ".join(text for text in (note, warning) if text), seconds=perf_counter() - began,
+        note="; ".join(text for text in (note, warning) if text), seconds=round(perf_counter() - began, 3),
         series=_round_series(value.series),
     )  # fmt: skip
 
