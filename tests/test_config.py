@@ -289,7 +289,7 @@ def test_other_yaml_readers_read_equal_numbers() -> None:
         ("count: 5", "mass: 1", "text:4: groups[0]: count: give either a count or a network"),
         ("count: 5", "count: 5\n    mass: 0", "text:5: groups[0].mass = 0: must be a number > 0 (kg)"),
         ("count: 5", "count: 5\n    radius: -1", "text:5: groups[0].radius = -1: must be a number >= 0 (m)"),
-        ("rate: 0.3", "rate: -1", "text:6: effects[0].rate = -1: must be a number >= 0 (c, kg/s)"),
+        ("rate: 0.3", "rate: -1", "text:6: effects[0].rate = -1: must be a number >= 0 (c, kg/s"),
         ("12.5]", "0]", "text:2: space.size[1] = 0: must be a number > 0"),
         ("12.5]", "1, 2, 3]", "text:2: space.size: must be a list of 2 to 3, each a number > 0, not of 4 (m per axis)"),
         ("dimension: 2", "dimension: 4", "text:1: dimension = 4: unknown; allowed: 2, 3"),
