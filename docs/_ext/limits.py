@@ -91,7 +91,7 @@ def _needs(model: type[Effect]) -> Iterator[str]:
     for name in model.recalls:
         yield f"Another effect must keep `{name}`: {_listed(k for k, e in EFFECTS.items() if name in e.keeps)}."
     if model.keeps:
-        yield f"It keeps numbers of every agent, {_code(model.keeps)}, that change at the end of a step."
+        yield f"It stores {_code(model.keeps)} for every agent, updated at the end of each step."
 
 
 def _on_torus(model: type[Effect]) -> Iterator[str]:
@@ -157,13 +157,13 @@ def _stable_step(model: type[Effect]) -> str:
     if text.startswith("None"):
         return f"It names no stiffness{text.removeprefix('None')}: no stable step is computed from it."
     facts = [f"The stable step follows from {markdown(text)}{' (w: angular frequency)' * ('w^2' in text)}."]
-    facts.append("A `dt` above it warns" + (", and far above it is refused." if model.always is True else "."))
+    facts.append("A larger `dt` gives a warning" + (", a far larger one is refused." if model.always is True else "."))
     if model.derivative:
         facts.append("It does not limit the step of [linearly_implicit_euler](../methods/linearly_implicit_euler.md).")
     if model.linear_drag:
         facts.append("[exponential_drag](../methods/exponential_drag.md) integrates it exactly.")
     if model.contact:
-        facts.append("A contact that bounces must last 30 steps, or a warning gives its duration.")
+        facts.append("A contact that bounces and lasts fewer than 30 steps gives a warning.")
     return " ".join(facts)
 
 
@@ -197,8 +197,8 @@ def _steps_of(method: Integrator) -> str:
         f"for h omega < {damped:.3g}. Linear drag c is stable {slows}."
     )
     more = (
-        " This, and the curve, is for forces without a `derivative`; others do not limit the step, which is then "
-        "that of [implicit Euler](implicit_euler.md) for a linear force."
+        " Both limits and the curve are for forces without a `derivative`. Forces with one do not limit `dt`; linear "
+        "ones are integrated as by [implicit Euler](implicit_euler.md)."
     )
     return text + more * method.linearises
 
@@ -238,6 +238,6 @@ def _wall(wall: ObstacleRepulsion, people: Group) -> str:
     push = wall.strength / mass + wall.acceleration
     speed = math.sqrt(2 * push * wall.decay * math.exp(radius * wall.bodies / wall.decay))
     return (
-        f"Head-on, a thin wall stops a mean pedestrian without drive below {speed:.2g} m/s, and one that walks on only "
-        "at lower speeds; a faster one passes through."
+        f"A thin wall stops a mean pedestrian without drive, head-on, below {speed:.2g} m/s. With a drive the limit is "
+        "lower. A faster one passes through."
     )

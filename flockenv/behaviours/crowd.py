@@ -54,8 +54,8 @@ class UnalignedAvoidance(Behaviour):
 
     Reynolds 1999.
 
-    Limits: both are assumed to keep their velocities, and only the earliest collision is avoided. Agents that do not
-    approach each other have none, also if they overlap. It sees no obstacles, and its force is w or 0.
+    Limits: all agents are assumed to keep their velocities, and only the earliest collision is avoided. Agents that do
+    not approach are not avoided, even if they overlap. It sees no obstacles, and its force is w or 0.
     """
 
     kind: Literal["unaligned_avoidance"] = "unaligned_avoidance"
@@ -231,7 +231,7 @@ class Forage(Moving):
     """Arrive at the nearest food in sight, and wander while there is none (named in Reynolds 1999).
 
     Limits: food is not eaten by it: an agent stays at the nearest food until an effect such as `grazing` or a sink
-    takes that away. It has no memory of food that is out of sight.
+    of the population takes that away. It has no memory of food that is out of sight.
     """
 
     kind: Literal["forage"] = "forage"

@@ -179,7 +179,7 @@ class Cohesion(_FlockRule):
 
     Reynolds 1987 and 1999.
 
-    Limits: the force is a spring of rest length 0 without damping: alone, agents swing through each other's centre, and
+    Limits: the force is a spring of rest length 0 without damping: alone, agents swing through their common centre, and
     nothing keeps them apart. It grows with the distance up to w times the radius, and jumps if a neighbour crosses it.
     """
 

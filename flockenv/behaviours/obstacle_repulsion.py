@@ -57,9 +57,9 @@ class ObstacleRepulsion(Push):
     acts through another obstacle. If a body is inside a solid obstacle, the force points out through the nearest point,
     and grows with depth.
 
-    Limits: a thin wall is a hill of height A B exp(r_i / B) (r_i = 0 without `bodies`): an agent that comes head-on
-    with more than that as kinetic energy, or is driven by more than A exp(r_i / B), passes through it. It has no
-    damping.
+    Limits: without `most` a thin wall is a hill of height A B exp(r_i / B) (r_i = 0 without `bodies`): an agent that
+    comes head-on with more than that as kinetic energy, or is driven by more than A exp(r_i / B), passes through it. It
+    has no damping.
     """
 
     kind: Literal["obstacle_repulsion"] = "obstacle_repulsion"

@@ -41,8 +41,8 @@ class Steer(Effect):
     The force is F = arbitration(F_1, ..., F_n) with |F| <= max_force, F_k the steering force of behaviour k (Reynolds
     1987 and 1999).
 
-    Limits: priorities count only under a `max_force`: without one, `allocation`, `running_sum` and `blend` let all
-    behaviours act in full. A second `steer` of the same group adds its force, and both together are cut to max_force.
+    Limits: without a `max_force`, `allocation`, `running_sum` and `blend` add up all forces in full. A second `steer`
+    of the same group adds its force, and both together are cut to max_force.
     """
 
     kind: Literal["steer"] = "steer"

@@ -66,8 +66,8 @@ class Collisions(Constraint):
     as in Silcowitz, Niebe and Erleben 2010.
 
     Limits: bodies are discs or balls that do not spin. It acts after the method, so forces do not see the impacts
-    within a step. Heaps need many `passes`, and rows of bodies in touch many impacts, beyond which a warning gives what
-    was left.
+    within a step. Heaps need many `passes`, and rows of bodies in touch many impacts; if there are more than allowed, a
+    warning counts the contacts that are left.
     """
 
     kind: Literal["collisions"] = "collisions"

@@ -321,8 +321,8 @@ class Rods(Constraint):
 
     |x_i - x_j| = L for a rod, <= L for a rope.
 
-    Limits: it is an iteration: a chain or a cloth of n needs a number of sweeps that grows with n, and above `most`
-    lengths are off, with a warning. Rods do not resist bending, have no mass and no body, and cannot break.
+    Limits: it is an iteration: a chain or a cloth of n needs a number of sweeps that grows with n, and after `most`
+    of them lengths may be off, with a warning. Rods do not resist bending, have no mass and no body, and cannot break.
     """
 
     kind: Literal["rods"] = "rods"

@@ -153,9 +153,9 @@ class ObstacleContact(_Solid):
     A body of mass m with speed v relative to the obstacle penetrates by at most v sqrt(m / k). For `most` see
     `Contact`.
 
-    Limits: an obstacle is a spring: a body whose centre passes a thin wall within a step, or is pressed in by more than
-    k times its radius, leaves on the other side. Friction is proportional to the slip, so nothing holds a body at rest
-    on a slope.
+    Limits: an obstacle is a spring: a body whose centre passes a thin wall within a step, or is pressed in by a force
+    above k times its radius, leaves on the other side. Friction is proportional to the slip, so nothing holds a body at
+    rest on a slope.
     """
 
     kind: Literal["obstacle_contact"] = "obstacle_contact"

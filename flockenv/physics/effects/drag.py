@@ -72,8 +72,8 @@ class QuadraticDrag(Effect):
 
     Newton 1687, Principia, book II.
 
-    Limits: an Euler method reverses the velocity relative to the medium if h c |v| / m > 1, and diverges if it is above
-    2: the limit depends on the speed, so it is not tested.
+    Limits: an explicit Euler step reverses the velocity relative to the medium if h c |v| / m > 1, and diverges if it
+    is above 2: the limit depends on the speed, so it is not tested.
     """
 
     kind: Literal["quadratic_drag"] = "quadratic_drag"

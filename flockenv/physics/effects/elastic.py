@@ -176,8 +176,8 @@ class Elastic(Effect):
     The force is F = -K (u + beta v) - alpha M v, u the displacements. Elements of constant strain: Turner, Clough,
     Martin and Topp 1956; corotated: Mueller and Gross 2004; damping: Rayleigh 1877.
 
-    Limits: strain = linear is wrong for rotations (a rotation by a stretches by 1 - cos a), both are for small strains,
-    and nothing yields or breaks. Nodes are the only bodies: surfaces need `face_collisions`.
+    Limits: strain = linear is wrong for rotations (one by an angle phi counts as a compression by 1 - cos phi), both
+    are for small strains, and nothing yields or breaks. Nodes are the only bodies: surfaces need `face_collisions`.
     """
 
     kind: Literal["elastic"] = "elastic"

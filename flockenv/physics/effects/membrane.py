@@ -294,10 +294,10 @@ class Bending(Effect):
     stiffness is then the flexural rigidity of a sheet that has the shape of a cylinder, bent along the sides of its
     cells, and does not depend on their size (compare Grinspun et al. 2003, Discrete shells). In 3-D only.
 
-    Limits: under load a sheet also folds along the diagonals of its cells: a strip of cells r times as wide as long has
-    s / (s + r^2) of that rigidity, s = (r + 1 / r)^2. This is 4/5 of it if cells are square, and more if they are
-    longer. It acts on angles between triangles alone, so a border bends freely, and a triangle that shrinks to a line
-    has none. Rates are those of the undeformed shape.
+    Limits: under load a sheet also folds along the diagonals of its cells: a strip of cells that are r times as wide as
+    long has s / (s + r^2) of that rigidity along its length, s = (r + 1 / r)^2. This is 4/5 of it if cells are square,
+    and more if they are longer. It acts on angles between triangles alone, so a border bends freely, and a triangle
+    that shrinks to a line has none. Rates are those of the undeformed shape.
     """
 
     kind: Literal["bending"] = "bending"

@@ -171,7 +171,7 @@ class Grazing(_Urge):
     food is particles. Amounts are in units of food: `food` of a patch, `eaten` by an agent since the start.
 
     Limits: patches are agents: they do not spread, and a patch that is eaten to 0 does not grow again. Eaters need no
-    line of sight, and eat whatever they do.
+    line of sight, and eat regardless of what else they do.
     """
 
     kind: Literal["grazing"] = "grazing"

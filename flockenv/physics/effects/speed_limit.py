@@ -36,7 +36,7 @@ class SpeedLimit(Effect):
 
     The function is ours.
 
-    Limits: it is soft: with a stronger drive than B agents are faster than V, and below V they are braked too. The
+    Limits: it is soft: with a stronger drive than B agents are faster than V, and below V they are braked as well. The
     velocity is that in space, not relative to a medium.
     """
 

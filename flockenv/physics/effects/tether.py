@@ -54,7 +54,7 @@ class Tether(_Centred):
 
     Hooke 1678.
 
-    Limits: with a rest length the direction jumps at the centre, where agents have no direction. The damping is
+    Limits: with a rest length the direction jumps at the centre, where the force is 0. The damping is
     relative to space, not to a medium.
     """
 
@@ -82,7 +82,7 @@ class Swing(_Centred):
     Huygens 1673.
 
     Limits: it is the force of a pendulum on a coordinate, along each axis by itself: the agent moves on a straight
-    line, not on an arc, and in all directions it is no spherical pendulum. Beyond x = l pi it pulls to the next
+    line, not on an arc, and in all directions it is no spherical pendulum. Beyond |x - c| = pi l it pulls to the next
     minimum.
     """
 

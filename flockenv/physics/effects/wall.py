@@ -39,7 +39,8 @@ class WallRepulsion(Effect):
     (their A times exp(radius / B)); Kretz, arXiv 1507.02566.
 
     Limits: the wall has no end, and bodies have no size. Behind it the force grows as exp(|d| / B) without bound, and
-    dt is not tested for it: an agent that a long step takes far behind is thrown back at any speed.
+    dt is not tested for it: an agent that a long step takes far behind is thrown back without an upper bound on its
+    speed.
     """
 
     kind: Literal["wall_repulsion"] = "wall_repulsion"

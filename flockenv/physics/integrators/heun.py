@@ -39,7 +39,7 @@ class Heun(Integrator):
 
     x' = x + h (v + w) / 2, v' = v + h (a + a(x + h v, w, t + h)) / 2 with w = v + h a and a = a(x, v, t) (Heun 1900).
 
-    Limits: for oscillations without damping over many periods take velocity_verlet or rk4.
+    Limits: an oscillation without damping gains energy; over many periods take velocity_verlet or rk4.
     """
 
     kind: Literal["heun"] = "heun"

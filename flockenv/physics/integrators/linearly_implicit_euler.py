@@ -23,10 +23,10 @@ class LinearlyImplicitEuler(Integrator):
     After the solve, parts that nothing holds are moved as a whole, so that they keep their momentum to rounding. They
     lose angular momentum: the method damps rotation, and what the solve leaves in its residual adds to that.
 
-    With `linearisations: 2` or more the forces are linearised again about the end that the last solve has found, which
-    are Newton's iterations for implicit Euler (the first begins at the old positions); other forces are then read
-    there, too. A link that turns by an angle in a step is too long after one solve, and much less so after two: a
-    stiff sheet without damping stores less energy, and long steps are more accurate (docs/numerics.md).
+    With `linearisations: 2` or more the forces are linearised again about the end that the last solve has found: these
+    are Newton's iterations for implicit Euler. Other forces are also evaluated again, at that end. A link that turns by
+    an angle in a step is too long after one solve, and much less so after two: a stiff sheet without damping stores
+    less energy, and at some stiffnesses long steps are more accurate (docs/numerics.md).
 
     With `strain`, a step in which some triangle or spring changes its length by more than that share of its rest
     length is made again as two halves, and these likewise (section 6 there, but without a step size that lasts): a
@@ -38,8 +38,8 @@ class LinearlyImplicitEuler(Integrator):
     in the same step. Contacts that would pull are released, and friction is Coulomb's; each change is another solve.
     Impacts that bounce, and whatever the linear equations miss, are left to `collisions` after the solve.
 
-    Limits: forces without a `derivative` are explicit. It damps fast motion, as implicit Euler does, and threads do not
-    share a world.
+    Limits: forces without a `derivative` are no part of the equations. It damps fast motion, as implicit Euler does,
+    and threads do not share a world.
     """
 
     kind: Literal["linearly_implicit_euler"] = "linearly_implicit_euler"

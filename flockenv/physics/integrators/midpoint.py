@@ -41,7 +41,7 @@ class Midpoint(Integrator):
 
     x' = x + h (v + h a / 2), v' = v + h a(x + h v / 2, v + h a / 2, t + h / 2) with a = a(x, v, t) (Runge 1895).
 
-    Limits: for oscillations without damping over many periods take velocity_verlet or rk4.
+    Limits: an oscillation without damping gains energy; over many periods take velocity_verlet or rk4.
     """
 
     kind: Literal["midpoint"] = "midpoint"
