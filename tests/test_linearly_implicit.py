@@ -14,12 +14,13 @@ from flockenv.core.warnings import UnstableStepWarning
 from flockenv.engine.linear_step import LinearSolver, LinearStep
 from flockenv.model.divergence import SimulationDiverged
 from flockenv.model.networks import Cloth, Rope
+from flockenv.model.spawn import Spawn
 from flockenv.model.state import State
 from flockenv.physics.constraints import Slide
 from flockenv.physics.effects import Drag, Gravity, Membrane, Springs, Tether
 from flockenv.physics.integrators import ImplicitEuler, LinearlyImplicitEuler, SemiImplicitEuler
 from flockenv.scene import Group, Scene
-from flockenv.scene.stability import suggest_dt
+from flockenv.scene.stability import limit, suggest_dt
 from tests.catalogue import Array
 from tests.test_implicit import SHEET, WEIGHT, hanging, same, shaken
 
@@ -151,7 +152,7 @@ def test_a_step_is_the_dense_solution_with_filters() -> None:
 @pytest.mark.parametrize("linearisations", [1, 2])
 @pytest.mark.parametrize("stiffness", [400.0, 1e6])
 def test_free_sheets_keep_their_momentum_however_large_the_tolerance(stiffness: float, linearisations: int) -> None:
-    """To 1e-12 of the impulses of a step; under drag they lose what it takes. A pinned one beside them does not."""
+    """To 1e-12 of the impulses of a step; under drag they lose what it takes. There is a pinned one beside them."""
     free, pinned = SHEET.model_copy(update={"pinned": ()}), Group(network=SHEET, mass=0.05)
     groups = Group(network=free, mass=0.05), pinned, Group(network=free, mass=0.2)
     sheets = slice(0, free.size), slice(2 * free.size, 3 * free.size)
@@ -308,6 +309,22 @@ def test_springs_do_not_limit_the_step_and_forces_without_a_derivative_do() -> N
     loose = Tether(centre=(0.0, 0.0), stiffness=30.0)
     with pytest.warns(UnstableStepWarning, match="linearly_implicit_euler with tether"):
         sheet_of(stiffness=1e9, dt=0.1, weight=loose)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("linearisations", "most"), [(1, 2.0), (2, 1.0), (3, 1.0)])
+def test_other_forces_limit_dt_as_the_scene_says(linearisations: int, most: float) -> None:
+    """Up to h omega = 2 for one linearisation, 1 for more: just below a swing stays small, just above it grows."""
+    method = LinearlyImplicitEuler(linearisations=linearisations)
+    assert limit(method, 0.0) == pytest.approx(most, rel=1e-5)
+    swing = Scene(
+        groups=(Group(count=1, spawn=Spawn(low=(1, 0), high=(1, 0))),), integrator=method, dt=0.01,
+        effects=(Tether(centre=(0.0, 0.0), stiffness=(0.98 * most / 0.01) ** 2),),
+    )  # fmt: skip
+    assert np.abs(swing.run(swing.start(0), 2000).pos).max() < 10
+    with pytest.warns(UnstableStepWarning, match="with tether"):
+        fast = swing.with_effects(Tether(centre=(0.0, 0.0), stiffness=(1.02 * most / 0.01) ** 2))
+    assert np.abs(fast.run(fast.start(0), 200).pos).max() > 30
 
 
 def test_equations_that_are_not_solved_are_told() -> None:

@@ -39,9 +39,9 @@ class LinearStep(NamedTuple):
     x: Doubles
     v: Doubles
     iterations: int
-    solves: int = 1  # that were accepted
-    rejected: int = 0  # solves after which a strain had changed too much
-    held: NDArray[np.bool_] | None = None  # (N,) agents in contact with an obstacle in some solve
+    solves: int = 1  # steps that were accepted, whole ones or halves
+    rejected: int = 0  # those in which a strain changed too much
+    held: NDArray[np.bool_] | None = None  # (N,) agents in contact with an obstacle, by the last linearisation
 
 
 class _Part(NamedTuple):

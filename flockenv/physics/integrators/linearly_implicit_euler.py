@@ -14,19 +14,21 @@ __all__ = ["LinearlyImplicitEuler", "advance"]
 
 
 class LinearlyImplicitEuler(Integrator):
-    """Linearly implicit Euler, order 1 (Baraff and Witkin 1998): one linear solve per step, x' = x + h (v + dv).
+    """Linearly implicit Euler, order 1 (Baraff and Witkin 1998): linear solves for a step, x' = x + h (v + dv).
 
     (M - h dF/dv - h^2 dF/dx) dv = h (F + h dF/dx v), by conjugate gradients with symmetric Gauss-Seidel (Eisenstat
     1981) as preconditioner. The derivatives are those of springs, membranes, bending and linear drag; other forces are
     taken at the beginning of the step, as in semi-implicit Euler, and limit dt as they do there. Particles held in
-    place keep their velocity exactly, those of a `slide` constraint keep to its line or plane within the solve.
-    After the solve, parts that nothing holds are moved as a whole, so that they keep their momentum to rounding. They
-    lose angular momentum: the method damps rotation, and what the solve leaves in its residual adds to that.
+    place keep their velocity exactly, those of a `slide` constraint keep to its line or plane within the solve. After
+    the solve, parts that nothing holds are moved as a whole, so that they keep their momentum to rounding; the pieces
+    of a torn sheet count as one part. They lose angular momentum: the method damps rotation, and what the solve leaves
+    in its residual adds to that.
 
     With `linearisations: 2` or more the forces are linearised again about the end that the last solve has found: these
-    are Newton's iterations for implicit Euler. Other forces are also evaluated again, at that end. A link that turns by
-    an angle in a step is too long after one solve, and much less so after two: a stiff sheet without damping stores
-    less energy, and at some stiffnesses long steps are more accurate (docs/numerics.md).
+    are Newton's iterations for implicit Euler. Other forces are also evaluated again, at that end, which is stable up
+    to about half the dt. A link that turns by an angle in a step is too long after one solve, and much less so after
+    two: a stiff sheet without damping stores less energy, and at some stiffnesses long steps are more accurate
+    (docs/numerics.md).
 
     With `strain`, a step in which some triangle or spring changes its length by more than that share of its rest
     length is made again as two halves, and these likewise (section 6 there, but without a step size that lasts): a
@@ -82,5 +84,8 @@ class LinearlyImplicitEuler(Integrator):
     ) -> None:
         """Advance one world under laws that are Python functions, without known derivatives: explicitly."""
         law(context, x, v, time, stages[0])
+        for _ in range(self.linearisations - 1):
+            later = v + dt * stages[0]
+            law(context, x + dt * (later + flow if len(flow) else later), later, time + dt, stages[0])
         v += dt * stages[0]
         x += dt * (v + flow if len(flow) else v)
