@@ -32,9 +32,11 @@ from flockenv.cli.main import main
 if sys.argv[1] != "play" or "--no-browser" in sys.argv:
     sys.exit(main(sys.argv[1:]))
 with subprocess.Popen([*sys.argv, "--no-browser", "--port", "0"], stdout=subprocess.PIPE, text=True) as server:
-    print(line := server.stdout.readline(), end="")
-    urlopen(line.split()[0]).read()
-    server.terminate()
+    try:
+        print(line := server.stdout.readline(), end="")
+        urlopen(line.split()[0], timeout=60).read()
+    finally:
+        server.terminate()
 """,
 }
 """What a page calls by name, as it is in an environment with flockenv. A playground is read in place of a browser, and

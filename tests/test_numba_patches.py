@@ -203,6 +203,16 @@ def test_a_listener_hears_the_events_of_numba_alone(
     assert len(ours) > 50 and ours.count((kind, True)) == ours.count((kind, False))
 
 
+def test_a_timer_of_a_user_measures_events_of_other_kinds_than_locks() -> None:
+    timer = event.TimingListener()  # type: ignore[no-untyped-call]
+    event.register("numba:run_pass", timer)  # type: ignore[no-untyped-call]
+    try:
+        machine_code(Whole)
+    finally:
+        event.unregister("numba:run_pass", timer)  # type: ignore[no-untyped-call]
+    assert timer.done and timer.duration > 0.0
+
+
 def test_without_a_listener_few_events_of_the_lock_of_llvm_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[str] = []
 
