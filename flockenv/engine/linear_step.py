@@ -190,6 +190,7 @@ class LinearSolver:
             self._count_from_start()
             more, held = self._solve(scene, state, begins, iterations)
             iterations += more
+        self._keep_momentum(state.alive[0] if held is None else state.alive[0] & ~held)
         return LinearStep(*self._end(*begins), iterations, held=held)
 
     def _set_equations(
@@ -240,7 +241,6 @@ class LinearSolver:
                 f"{done + iterations:,} iterations",
                 int(np.argmax(np.abs(system.residual))) // scene.dimension,
             )
-        self._keep_momentum(state.alive[0] if held is None else state.alive[0] & ~held)
         return int(iterations), held
 
     def _keep_momentum(self, free: NDArray[np.bool_]) -> None:

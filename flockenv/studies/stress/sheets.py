@@ -12,6 +12,7 @@ from flockenv.model.networks import Cloth, Rope
 from flockenv.model.spawn import Spawn
 from flockenv.model.surface import faces_of
 from flockenv.physics.constraints import Collisions, FaceCollisions
+from flockenv.physics.constraints.face_mesh import edges_of
 from flockenv.physics.effects import Bending, Gravity, Membrane, Pressure, Springs, SurfaceTension, Viscosity
 from flockenv.physics.integrators import Integrator, LinearlyImplicitEuler
 from flockenv.scene import Group, Scene
@@ -104,10 +105,9 @@ def folded(method: Integrator) -> Value:
         constraints=(Collisions(agents=False), FaceCollisions(thickness=0.01, friction=0.3)),
     )  # fmt: skip
     state, faces, pierced = scene.start(0), faces_of(scene), 0
-    edges = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=-1).reshape(-1, 2), axis=0)
     for _ in range(40):
         state = scene.run(state, 10)
-        pierced += first_piercing(state.pos[0], edges, faces) is not None
+        pierced += first_piercing(state.pos[0], edges_of(faces), faces) is not None
     note = f"{state.count_of('impacts')} impacts, {state.count_of('unsolved') + state.count_of('stopped')} unsolved"
     return Value(pierced, pierced == 0, note)
 
