@@ -27,7 +27,7 @@ from flockenv.players.policy import MlpPolicy, Policy, RandomPolicy
 
 __all__ = [
     "ALONE", "GROUPS", "KINDS", "LEVEL", "RANDOM", "Score", "SettingResults", "TaskResults", "group_of", "kind_of",
-    "read_file", "read_task",
+    "marks_of", "read_file", "read_task", "stored_marks",
 ]  # fmt: skip
 
 KINDS = ("rules", "policy", "hybrid", "planner")
@@ -185,8 +185,21 @@ def read_task(content: Mapping[str, Any]) -> TaskResults:
 
 
 def _score(player: Mapping[str, Any]) -> Score:
-    success = np.array([[mark == "1" for mark in row] for row in player["success"]])
-    return Score(player["kind"], np.array(player["returns"], float), success, player["tuning_mean"])
+    returns = np.array(player["returns"], float)
+    success = np.array([marks_of(row, len(each)) for row, each in zip(player["success"], returns, strict=True)])
+    return Score(player["kind"], returns, success, player["tuning_mean"])
+
+
+def stored_marks(marks: NDArray[np.bool_]) -> str:
+    """Return one bit per world, the first world in the highest bit of the first byte, in hexadecimal digits."""
+    return np.packbits(marks).tobytes().hex()
+
+
+def marks_of(stored: str, worlds: int) -> NDArray[np.bool_]:
+    """Return the marks (worlds,) that `stored_marks` has written; ValueError if they are of other worlds."""
+    if len(stored) != 2 * (-(-worlds // 8)):
+        raise ValueError(f"success = {stored!r}: must be hexadecimal digits, two for each 8 of {worlds} worlds")
+    return np.unpackbits(np.frombuffer(bytes.fromhex(stored), np.uint8), count=worlds).astype(np.bool_)
 
 
 def read_file(path: Path) -> dict[str, Any] | None:

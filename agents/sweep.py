@@ -23,7 +23,7 @@ from rich.console import Console
 from agents.compare import JOBS, folder_of, pick, split, write_text
 from agents.invasion import worlds_among
 from agents.study import INTEGRATOR, Contender, Setting, Study, contenders_of, settings_of
-from agents.study_results import RANDOM, TaskResults, kind_of, read_file, read_task
+from agents.study_results import RANDOM, TaskResults, kind_of, read_file, read_task, stored_marks
 from flockenv.cli.compare import changes_of
 from flockenv.cli.jobs import STOPPED, EngineName, Fresh, Processes, ShardText, end_of_shard, shard_of
 from flockenv.cli.options import Debug
@@ -210,7 +210,7 @@ def _played(entry: _Entry, store: Store, digits: int = DIGITS) -> Content:
         "digest": entry.digest,
         "microseconds": rounded(float(np.median([each.microseconds for each in episodes]))),
         "tuning_mean": rounded(float(np.mean([each.returns.mean() for each in tuning]))) if tuning else None,
-        "success": ["".join("01"[int(mark)] for mark in each.success) for each in episodes],
+        "success": [stored_marks(each.success) for each in episodes],
         "returns": [[stored_return(value, digits) for value in each.returns] for each in episodes],
     }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 import shutil
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,18 @@ from typer.testing import CliRunner
 from agents.invasion import Among
 from agents.study import HOME, Partners, Study, contenders_of, settings_of
 from agents.study_report import markdown, winner_text
-from agents.study_results import ALONE, LEVEL, Score, SettingResults, TaskResults, kind_of, read_file, read_task
+from agents.study_results import (
+    ALONE,
+    LEVEL,
+    Score,
+    SettingResults,
+    TaskResults,
+    kind_of,
+    marks_of,
+    read_file,
+    read_task,
+    stored_marks,
+)
 from agents.sweep import app, plan_digest, stored_return, sweep
 from flockenv.evaluation import bootstrap, lead_interval, mean_interval, rollout, worlds_for
 from flockenv.evaluation.report import json_text, rounded
@@ -464,6 +476,16 @@ def test_bad_options_are_one_line(
     assert run.exit_code == 2
     assert text in run.output and len(run.output.strip().splitlines()) == 1
     assert not (tmp_path / "results").exists()
+
+
+@pytest.mark.parametrize("worlds", (1, 7, 8, 9, 64))
+def test_successes_are_stored_as_bits(worlds: int) -> None:
+    marks = np.random.default_rng(worlds).random(worlds) < 0.5
+    stored = stored_marks(marks)
+    assert len(stored) == 2 * math.ceil(worlds / 8) and (marks_of(stored, worlds) == marks).all()
+    assert stored_marks(np.array([True, False, False, True])) == "90"
+    with pytest.raises(ValueError, match=f"success = .*{worlds + 8} worlds"):
+        marks_of(stored, worlds + 8)
 
 
 def test_damaged_results_are_named(tmp_path: Path) -> None:
