@@ -478,7 +478,7 @@ def test_bad_options_are_one_line(
     assert not (tmp_path / "results").exists()
 
 
-@pytest.mark.parametrize("worlds", (1, 7, 8, 9, 64))
+@pytest.mark.parametrize("worlds", [1, 7, 8, 9, 64])
 def test_successes_are_stored_as_bits(worlds: int) -> None:
     marks = np.random.default_rng(worlds).random(worlds) < 0.5
     stored = stored_marks(marks)
