@@ -11,7 +11,7 @@ import pytest
 from flockenv.core.warnings import UnsolvedContactsWarning
 from flockenv.geometry.box_tree import build_tree, overlapping_pairs
 from flockenv.geometry.mesh_checks import first_piercing
-from flockenv.geometry.shapes import Block, Capsule, Circle, DistanceField, HalfSpace, Sway, TriangleMesh
+from flockenv.geometry.shapes import Block, Capsule, Circle, DistanceField, HalfSpace, Sway, TriangleMesh, Wall
 from flockenv.geometry.space import Torus
 from flockenv.model.networks import Blocks, Cloth, Jelly, Mesh, Rope
 from flockenv.model.spawn import Spawn
@@ -288,6 +288,10 @@ CROSSED = Mesh(
 FLOOR = HalfSpace(point=(0, 0, -1), direction=(0, 0, 1))
 FIELD = DistanceField(low=(-1, -1, -1), high=(1, 1, 1), spacing=0.5, shapes=(POLES[0],))
 HUGE = Block(centre=(0.5, 0.05, 0), size=(9, 9, 9))
+SMALL = Circle(centre=(0.1, 0.2, 0.015), radius=0.02)
+"""It is between the particles of a face, and above it, but for 5 mm."""
+BESIDE = Circle(centre=(0.5, 0.5, 0.21), radius=0.2)
+LEVEL = Capsule(start=(0.2, 0.7, 0.04), end=(0.3, 0.7, 0.04), radius=0.05)
 POLE = Capsule(start=(0.6, 0.7, -1), end=(0.6, 0.7, 1), radius=0.01)
 FLAT = Mesh(
     vertices=((0, 0, 0), (1, 0, 0), (0, 1, 0), (0.1, 0.1, 0), (2, 0.1, 0), (0.1, 2, 0)),
@@ -315,6 +319,11 @@ FLAT = Mesh(
         ({"obstacles": (POLES[1], HUGE)}, r"particle 0 is inside obstacles\[1\]"),
         ({"obstacles": (Block(centre=(0.5, 0.05, 0), size=(0.2, 0.2, 9)),)}, r"edge .* passes through obstacles\[0\]"),
         ({"obstacles": (POLE,)}, r"obstacles\[0\] passes through the face of"),
+        ({"obstacles": (Circle(centre=(0.5, 0.5, -0.1), radius=0.3),)}, r"0.2 m inside obstacles\[0\] = circle; faces"),
+        ({"obstacles": (BESIDE, SMALL)}, r"face of 0, . and . is 0.005 m inside obstacles\[1\] = circle"),
+        ({"obstacles": (SMALL.model_copy(update={"velocity": (0, 0, 1)}),)}, r"0.005 m inside obstacles\[0\] = circle"),
+        ({"obstacles": (LEVEL,)}, r"0.01 m inside obstacles\[0\] = capsule"),
+        ({"obstacles": (Wall(vertices=((-1, 0.6, 0.1), (2, 0.6, 0.1)), radius=0.15),)}, r"0.05 m inside .* = wall"),
     ],
 )  # fmt: skip
 def test_what_makes_no_sense_is_refused(change: dict[str, Any], text: str) -> None:

@@ -12,12 +12,15 @@ from flockenv.geometry.mesh_checks import first_piercing
 from flockenv.model.network import element_edges, keys_of, pairs_of
 from flockenv.model.scene_view import SceneView
 from flockenv.model.surface import faces_of
-from flockenv.physics.constraints.face_obstacles import MOTION, Solids, solids_of
+from flockenv.physics.constraints.face_obstacles import MOTION, Solids, depths_in, solids_of
 
 __all__ = ["FaceMesh", "check_intersections", "edges_of", "make_mesh", "shortest_height"]
 
 Ints = NDArray[np.int32]
 Floats = NDArray[np.float64]
+
+SHALLOW = 1e-9
+"""m. A face may begin this deep in an obstacle, by rounding."""
 
 
 class FaceMesh(NamedTuple):
@@ -114,7 +117,7 @@ def _inner_corners(scene: SceneView) -> NDArray[np.int64]:
 
 
 def check_intersections(scene: SceneView, obstacles: bool) -> None:
-    """Raise ValueError if an edge passes through a face at the start, or a particle lies in one or in a block."""
+    """Raise ValueError if an edge passes through a face at the start, or a particle or a face lies in an obstacle."""
     solids, n = solids_of(scene.obstacles if obstacles else ()), scene.agents
     faces, edges, place = _with_solids(scene, solids._replace(place=solids.start), n)
     found = first_piercing(place, edges, faces, n)
@@ -136,3 +139,19 @@ def check_intersections(scene: SceneView, obstacles: bool) -> None:
         inside = shape.gap(rest_of(scene) - shape.shift(0.0)) < surely
         for i in np.intersect1d(np.flatnonzero(inside), faces_of(scene)):
             raise ValueError(f"kind = face_collisions: at the start particle {i} is inside obstacles[{k}]")
+    if obstacles:
+        _refuse_faces_in_round_obstacles(scene)
+
+
+def _refuse_faces_in_round_obstacles(scene: SceneView) -> None:
+    """Raise ValueError if a face is nearer to the core of a circle, capsule or wall than the radius, at the start."""
+    faces = faces_of(scene)
+    for k, shape in enumerate(scene.obstacles):
+        depths = depths_in(shape, rest_of(scene), faces)
+        if depths.max(initial=0.0) > SHALLOW:
+            deepest = int(depths.argmax())
+            a, b, c = faces[deepest].tolist()
+            raise ValueError(
+                f"kind = face_collisions: at the start the face of {a}, {b} and {c} is {depths[deepest]:.4g} m inside "
+                f"obstacles[{k}] = {shape.kind}; faces must begin outside of obstacles"
+            )

@@ -9,12 +9,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from flockenv.geometry.closest_points import closest_point_face, closest_segments, weighted
 from flockenv.geometry.shapes import Block, Capsule, Circle, HalfSpace, Shape, TriangleMesh, Wall
+from flockenv.jit.decorators import Vec, kernel
+from flockenv.jit.section import entry
+from flockenv.maths.vectors import dot
 from flockenv.model.network import element_edges, pairs_of
 from flockenv.model.scene_view import SceneView
 from flockenv.physics.constraints.collisions import Collisions
 
-__all__ = ["MOTION", "Solids", "check_obstacles", "solids_of"]
+__all__ = ["MOTION", "Solids", "check_obstacles", "depths_in", "solids_of"]
 
 Ints = NDArray[np.int32]
 Floats = NDArray[np.float64]
@@ -86,6 +90,46 @@ def _spanned(shape: Shape) -> tuple[Floats, Ints, Ints]:
         points = np.array([shape.start, shape.end] if isinstance(shape, Capsule) else [shape.anchor])
     along = np.arange(len(points), dtype=np.int32)
     return points, np.stack([along[:-1], along[1:]], axis=1), none
+
+
+def depths_in(shape: Shape, points: Floats, faces: Ints) -> Floats:
+    """Return how deep each face, (F, 3) of points (n, 3) m, is inside a circle, capsule or wall at time 0, (F,) m.
+
+    0 outside, and in other shapes.
+    """
+    if not isinstance(shape, Circle | Capsule | Wall) or shape.is_hollow:
+        return np.zeros(len(faces))
+    core, pairs, _ = _spanned(shape)
+    distances = np.empty(len(faces))
+    entry(_write_distances)(points[faces] - shape.shift(0.0), core, core[pairs], distances)
+    return np.asarray(np.maximum(shape.radius - distances, 0.0))
+
+
+@kernel
+def _point(rows: Any, r: int, k: int) -> Vec:
+    """Return rows[r, k] as a vector."""
+    return (rows[r, k, 0], rows[r, k, 1], rows[r, k, 2])
+
+
+@kernel
+def _write_distances(corners: Any, core: Any, parts: Any, out: Any) -> None:
+    """Write the distance of each face, (F, 3, 3), to the nearest of points (K, 3) and segments (S, 2, 3), m.
+
+    Of a face and a segment that do not meet, two edges are nearest, or an end of the segment.
+    """
+    for f in range(out.shape[0]):
+        a, b, c = _point(corners, f, 0), _point(corners, f, 1), _point(corners, f, 2)
+        least = np.inf
+        for k in range(core.shape[0]):
+            p = (core[k, 0], core[k, 1], core[k, 2])
+            apart = weighted(closest_point_face(p, a, b, c), p, a, b, c)
+            least = min(least, dot(apart, apart))
+        for s in range(parts.shape[0]):
+            q, r = _point(parts, s, 0), _point(parts, s, 1)
+            for one, two in ((a, b), (b, c), (c, a)):
+                off = weighted(closest_segments(q, r, one, two), q, r, one, two)
+                least = min(least, dot(off, off))
+        out[f] = np.sqrt(least)
 
 
 def check_obstacles(scene: SceneView, before: Sequence[Any]) -> None:
