@@ -7,15 +7,19 @@ from __future__ import annotations
 
 import functools
 import importlib
+import inspect
 import pkgutil
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
+
+from pydantic import BaseModel
 
 import flockenv
 from docs._ext.public_api import (
     description,
+    field_comments,
     internal_modules,
     is_value,
     lines,
@@ -53,6 +57,87 @@ def test_every_public_name_has_a_description() -> None:
     assert [f"{module}.{name}" for module, name in names if not description(module, name)] == []
     assert description("flockenv.evaluation", "TUNING").startswith("First world seeds")  # assigned beside another name
     assert description("flockenv.scene", "AnyEffect").startswith("An effect")  # under `else`
+
+
+def own_parameters(function: Callable[..., Any]) -> list[str]:
+    """Return the names of the parameters; none of a class of C, which has no signature."""
+    try:
+        names = inspect.signature(function).parameters
+    except (TypeError, ValueError):
+        return []
+    return [name for name in names if name not in ("self", "cls") and not name.startswith("_")]
+
+
+def plain(value: Any) -> Any:
+    """Return a function as it is written in Python: without a decorator of classes or of numba."""
+    value = getattr(value, "__func__", value)
+    return getattr(value, "py_func", value)
+
+
+def bases(home: type) -> list[type]:
+    """Return a class of flockenv and its base classes of flockenv."""
+    return [each for each in home.__mro__ if each.__module__.startswith("flockenv")]
+
+
+def text_of_method(home: type, name: str) -> str:
+    """Return the docstrings of a method in a class and its bases.
+
+    If a base only declares it, the text below that declaration and the docstring of its module belong to it: the forms
+    of laws are described there.
+    """
+    texts = []
+    for each in bases(home):
+        if name in vars(each):
+            texts.append(inspect.getdoc(plain(vars(each)[name])))
+        if name in vars(each).get("__annotations__", {}):
+            texts += [inspect.getdoc(inspect.getmodule(each)), below_declaration(each, name)]
+    return "\n".join(filter(None, texts))
+
+
+def below_declaration(home: type, name: str) -> str:
+    """Return the string below `name: type` in a class; "" if there is none."""
+    found = re.search(rf'^    {name}: [^\n]*\n    """(.*?)"""', inspect.getsource(home), re.DOTALL | re.MULTILINE)
+    return found[1] if found else ""
+
+
+def text_of_class(home: type) -> str:
+    """Return the docstrings of a class and its constructor, also of its bases, and its fields with a text."""
+    texts = [text for each in bases(home) for text in (each.__doc__, vars(each).get("__init__", each).__doc__)]
+    fields = [name for each in bases(home) for name in vars(each).get("__annotations__", {})]
+    described = [name for name in fields if any(below_declaration(each, name) for each in bases(home))]
+    return " ".join([*filter(None, texts), *field_comments(home), *described])
+
+
+def described_parameters() -> Iterator[tuple[str, list[str], str]]:
+    """Yield the name, the parameters and the text of each public function, method and constructor.
+
+    Without constructors of records, whose fields have descriptions, and of protocols.
+    """
+    for module in public_modules():
+        for name in importlib.import_module(module).__all__:
+            value = getattr(importlib.import_module(module), name)
+            if is_value(value):
+                continue
+            if not inspect.isclass(value):
+                yield f"{module}.{name}", own_parameters(plain(value)), inspect.getdoc(plain(value)) or ""
+                continue
+            if not issubclass(value, BaseModel) and not getattr(value, "_is_protocol", False):
+                yield f"{module}.{name}", own_parameters(value), text_of_class(value)
+            for method, function in vars(value).items():
+                if not method.startswith("_") and inspect.isfunction(plain(function)):
+                    yield f"{module}.{name}.{method}", own_parameters(plain(function)), text_of_method(value, method)
+
+
+def test_every_parameter_is_named_in_a_description() -> None:
+    """In the docstring of the function, method or class, of the same method of a base, or in the text of a field."""
+    found = [*described_parameters()]
+    missing = {
+        name: left for name, all_, text in found if (left := [n for n in all_ if not re.search(rf"\b{n}\b", text)])
+    }
+    assert missing == {}
+    assert {"flockenv.steering.seek", "flockenv.scene.Scene.start", "flockenv.evaluation.Interval"} <= {
+        name for name, all_, _ in found if all_
+    }
 
 
 def imported_in(text: str) -> Iterator[tuple[str, str]]:

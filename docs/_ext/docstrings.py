@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
+from public_api import field_comments
 from pydantic import BaseModel
 
 from flockenv.play.controls import Facts, default_of, facts_of, records_in
@@ -91,10 +92,12 @@ def _default(model: type[BaseModel], name: str) -> str:
 
 
 def process(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
-    """Turn a docstring into reStructuredText, and append the fields of a record."""
+    """Turn a docstring into reStructuredText, and append the fields of a record, or those of a class with comments."""
     lines[:] = _rst(lines)
-    if isinstance(thing, type) and issubclass(thing, BaseModel) and len(thing.model_fields) > 0:
-        lines += ["", *_rst_fields(thing)]
+    if isinstance(thing, type) and issubclass(thing, BaseModel):
+        lines += ["", *_rst_table(("field", "unit", "values", "default", "meaning"), field_rows(thing))]
+    elif isinstance(thing, type):
+        lines += ["", *_rst_table(("field", "meaning"), field_comments(thing).items())]
 
 
 def skip(app: Sphinx, what: str, name: str, thing: Any, skipped: bool, options: Any) -> bool | None:
@@ -108,13 +111,13 @@ def signature(app: Sphinx, what: str, name: str, thing: Any, *rest: Any) -> tupl
     return ("(...)", "") if isinstance(thing, type) and issubclass(thing, BaseModel) else None
 
 
-def _rst_fields(model: type[BaseModel]) -> Iterator[str]:
-    """Yield the fields of a record as a table of reStructuredText."""
-    rows = list(field_rows(model))
+def _rst_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
+    """Yield a table of reStructuredText; nothing without rows."""
+    rows = list(rows)
     if not rows:
         return
     yield from (".. list-table::", "   :header-rows: 1", "   :class: fields", "")
-    for row in (("field", "unit", "values", "default", "meaning"), *rows):
+    for row in (head, *rows):
         for k, cell in enumerate(row):
             yield f"   {'* -' if k == 0 else '  -'} {_outside_code(cell, _escape_rst) or '..'}"
     yield ""

@@ -6,8 +6,11 @@ import ast
 import functools
 import importlib
 import inspect
+import io
 import itertools
 import re
+import textwrap
+import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_origin
@@ -17,6 +20,7 @@ from pydantic import BaseModel
 __all__ = [
     "defined_in",
     "description",
+    "field_comments",
     "internal_modules",
     "is_value",
     "lines",
@@ -85,6 +89,19 @@ def description(module: str, name: str) -> str:
         if name in _targets(node) and isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
             return inspect.cleandoc(str(after.value.value))
     return ""
+
+
+def field_comments(thing: type) -> dict[str, str]:
+    """Return the comments of a class's fields, by name: text and unit, those of the base classes first."""
+    found: dict[str, str] = {}
+    for each in reversed([base for base in thing.__mro__ if base.__module__.startswith("flockenv")]):
+        text = textwrap.dedent(inspect.getsource(each))
+        tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+        comments = {token.start[0]: token.string.lstrip("# ") for token in tokens if token.type == tokenize.COMMENT}
+        for node in getattr(ast.parse(text).body[0], "body", ()):
+            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.end_lineno in comments:
+                found[node.target.id] = comments[node.end_lineno]
+    return found
 
 
 def names_of(module: str) -> set[str]:

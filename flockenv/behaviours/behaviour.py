@@ -32,6 +32,8 @@ __all__ = [
 def top_speed(p: Any, me: Me) -> float:
     """Return the top speed of a behaviour, m/s.
 
+    p: the parameters of the behaviour, whose `speed`, m/s, is a limit; me: the agent.
+
     1 for agents without any limit: they are not steered (see Moving), but their force must be finite.
     """
     top = p.speed if p.speed < me.max_speed else me.max_speed
@@ -40,13 +42,19 @@ def top_speed(p: Any, me: Me) -> float:
 
 @law
 def nearest_one(p: Any, me: Me, other: Other) -> Vec:
-    """Return offset, velocity and the count 1, to be summed over the nearest neighbour, or several equally near."""
+    """Return offset, velocity and the count 1, to be summed over the nearest neighbour, or several equally near.
+
+    p: parameters, not used; me: the agent; other: the neighbour.
+    """
     return other.offset + other.vel + (like(other.square, 1.0),)
 
 
 @law
 def mean_nearest(sums: Vec) -> tuple[Vec, Vec, bool]:
-    """Return the mean offset and velocity of the nearest neighbour, and True if there is one."""
+    """Return the mean offset and velocity of the nearest neighbour, and True if there is one.
+
+    sums: those of `nearest_one`: offset, m, velocity, m/s, and the number of the nearest.
+    """
     o, e = like(sums[0], 0.0), like(sums[0], 1.0)
     count = sums[len(sums) - 1]
     share = e / count if count > o else o
@@ -58,7 +66,10 @@ def mean_nearest(sums: Vec) -> tuple[Vec, Vec, bool]:
 
 
 def steered_groups(effect: Effect, scene: SceneView) -> list[int]:
-    """Return the indices of the groups that a behaviour of a scene steers."""
+    """Return the indices of the groups that a behaviour of a scene steers.
+
+    effect: the behaviour; scene: the scene that has it, itself or inside others.
+    """
     found: set[int] = set()
     for each in scene.effects:
         if each == effect or effect in each.components:
@@ -69,7 +80,10 @@ def steered_groups(effect: Effect, scene: SceneView) -> list[int]:
 
 
 def gains(weight: float, groups: Sequence[Any], dimension: int) -> NDArray[np.float64]:
-    """Return weight / mass of every agent, (N,); 0 for agents held in place, or with a max_force of 0."""
+    """Return weight / mass of every agent, (N,); 0 for agents held in place, or with a max_force of 0.
+
+    weight: the behaviour weight, kg/s; groups: of the scene; dimension: 2 or 3.
+    """
     free = np.repeat([group.max_force != 0 for group in groups], [group.size for group in groups])
     return np.where(free, weight / all_masses(groups, dimension), 0.0)
 

@@ -26,7 +26,7 @@ def seeker_offset(p: Any, me: Me, sums: Vec) -> Vec:
 
 @law
 def no_place(p: Any, me: Me, threat: Vec) -> Vec:
-    """Return the initial value: no hiding place, infinitely far; and the offset of the seeker."""
+    """Return the initial value: no hiding place, infinitely far; and the offset of the seeker, `threat`, m."""
     return (like(me.radius, np.inf),) + zero(threat) + threat  # noqa: RUF005  # numba joins tuples, does not unpack them
 
 

@@ -19,7 +19,7 @@ __all__ = ["Shepherd"]
 
 @law
 def shepherd_force(p: Any, me: Me, flock: Members) -> Vec:
-    """Return F = w S: arrive behind the stray member, or else behind the whole group; 0 without members."""
+    """Return F = w S: arrive behind the stray member, or else behind the whole `flock`; 0 without members."""
     n, o = flock.size, like(flock.size, 0.0)
     together, driving = p.spacing * np.cbrt(n * n), p.spacing * np.sqrt(n)
     place = steering.herding_offset(flock.centre, flock.farthest, sub(p.goal, me.pos), together, p.spacing, driving)

@@ -32,6 +32,8 @@ def instance_of(*kinds: type) -> Callable[[Any, Any], Any]:
 def lists_to_tuples(value: Any) -> Any:
     """Return the content of a file with lists replaced by tuples at every depth; mappings become dicts.
 
+    value: of any type; what is neither a list nor a mapping is returned as it is.
+
     Pydantic's strict mode accepts a list as a tuple only from JSON, and a validator receives Python values.
     """
     if isinstance(value, Mapping):
@@ -111,7 +113,10 @@ class Record(BaseModel, metaclass=_OneLine):
         )
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """Return a copy with the fields in `update` changed, validated as a new record, without cached values."""
+        """Return a copy with the fields in `update` changed, validated as a new record, without cached values.
+
+        update: new values by field; deep: True to copy the values of other fields as well.
+        """
         fields = {name: getattr(self, name) for name in type(self).model_fields}
         return type(self)(**{**fields, **(update or {})})
 

@@ -68,6 +68,8 @@ class _CheckedAEC(BaseWrapper):  # type: ignore[misc]  # pettingzoo ships no typ
 def by_turns(env: parallel.WorldParallelEnv) -> AECEnv[str, Any, Any]:
     """Return the AEC form, with order enforced (no step before reset, one per turn) and actions checked.
 
+    env: the parallel form of the environment.
+
     Actions out of [-1, 1] are clipped by the world, as in all other APIs, and not by a wrapper that warns.
     """
     return OrderEnforcingWrapper(_CheckedAEC(parallel_to_aec_wrapper(env)))

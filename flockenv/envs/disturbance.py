@@ -95,6 +95,8 @@ _NONE = Disturbance()
 def make_world(task: Task, worlds: int = 1, time_limit: int | None = None, disturbance: Disturbance = _NONE) -> World:
     """Return B worlds of a task; with no disturbance it is a plain `World`, without any cost.
 
+    worlds: B >= 1; time_limit: decisions until truncation (default: that of the task).
+
     Raises ValueError for bad numbers, and for a disturbance that the task has no slots for.
     """
     return DisturbedWorld(task, worlds, time_limit, disturbance) if disturbance else World(task, worlds, time_limit)
@@ -146,7 +148,11 @@ class DisturbedWorld(World):
     def __init__(
         self, task: Task, worlds: int = 1, time_limit: int | None = None, disturbance: Disturbance = _NONE
     ) -> None:
-        """Make B = `worlds` >= 1 worlds; the other arguments are those of `make_world`."""
+        """Make B = `worlds` >= 1 worlds of a task.
+
+        task: has slots that the disturbance can miss; time_limit: decisions until truncation (default: that of the
+        task); disturbance: as of `make_world`.
+        """
         disturbance.check(task)
         self.disturbance: Final = disturbance
         super().__init__(task, worlds, time_limit)

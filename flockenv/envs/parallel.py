@@ -115,6 +115,8 @@ class WorldParallelEnv(ParallelEnv[str, Rows, Rows]):  # type: ignore[misc]  # p
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Named, dict[str, Named]]:
         """Begin an episode; return observations, (O,) float32 each, and infos, which are empty, by agent.
 
+        seed: of the world (default: the next episode of the present one); options: None.
+
         The seed is `world.seeds[0]`. It is not in the infos, because TorchRL takes their keys as all keys of infos.
         """
         seed = check_seed(seed)

@@ -21,6 +21,8 @@ def register_all() -> None:
 def register(info: EnvInfo) -> None:
     """Add a row to the table, and register its environments with Gymnasium and PettingZoo.
 
+    info: the row of `table.ENVIRONMENTS`: the task, its environments, its horizon and its version.
+
     An existing registration of the same id stays. Raises ValueError if the table has another row of that name.
     """
     if ENVIRONMENTS.setdefault(info.name, info) != info:

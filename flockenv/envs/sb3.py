@@ -209,16 +209,25 @@ class WorldVecEnv(VecEnv):
         return [self._screen.show(self.world.snapshot(), "rgb_array")]
 
     def render(self, mode: str | None = None) -> NDArray[np.uint8] | None:
-        """Return the picture of world 0, (H, W, 3) uint8, or show it ("human") in flockenv's window, without OpenCV."""
+        """Return the picture of world 0, (H, W, 3) uint8, or show it ("human") in flockenv's window, without OpenCV.
+
+        mode: `human` or `rgb_array` (default: that of the constructor).
+        """
         require_episode(self._running, "render")
         return self._screen.show(self.world.snapshot(), mode)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute of this object (`task`, `world`, ...) for each of the rows."""
+        """Return an attribute of this object (`task`, `world`, ...) for each of the rows.
+
+        attr_name: its name; indices: of the rows (default: all).
+        """
         return [getattr(self, attr_name)] * len(self._row_indices(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of this object; ValueError for a subset of rows, since all rows share one simulator."""
+        """Set an attribute of this object; ValueError for a subset of rows, since all rows share one simulator.
+
+        attr_name: its name; value: the new one; indices: of the rows (default: all).
+        """
         if len(self._row_indices(indices)) != self.num_envs:
             raise ValueError(f"set_attr({attr_name!r}): the rows share one simulator; leave out indices")
         setattr(self, attr_name, value)
@@ -226,14 +235,20 @@ class WorldVecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of this object once, and return its result for each of the rows."""
+        """Call a method of this object once, and return its result for each of the rows.
+
+        method_name: its name; method_args, method_kwargs: its arguments; indices: of the rows (default: all).
+        """
         rows = self._row_indices(indices)
         return [getattr(self, method_name)(*method_args, **method_kwargs)] * len(rows)
 
     def env_is_wrapped(
         self, wrapper_class: type[Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """Return False for each of the rows: they contain no gymnasium environment that could be wrapped."""
+        """Return False for each of the rows: they contain no gymnasium environment that could be wrapped.
+
+        wrapper_class: any; indices: of the rows (default: all).
+        """
         return [False] * len(self._row_indices(indices))
 
     def _row_indices(self, indices: VecEnvIndices) -> list[int]:
@@ -280,6 +295,8 @@ def load_sb3_zip(
     path: str | os.PathLike[str], trust_pickle: bool = False, algorithm: type[BaseAlgorithm] = PPO
 ) -> BaseAlgorithm:
     """Load a model that Stable-Baselines3 saved; this RUNS CODE from the file (cloudpickle, SB3 #2281).
+
+    path: of the zip file; algorithm: the class that saved it (default: PPO).
 
     Policies of flockenv are safetensors, which run no code: flockenv.players.policy.MlpPolicy.load.
 

@@ -36,7 +36,10 @@ __all__ = ["SingleEnv", "single_learner_task"]
 
 
 def single_learner_task(task_type: type[Task], parameters: dict[str, Any]) -> tuple[Task, Disturbance]:
-    """Make the task of an environment with one learner, and its disturbance; ValueError if the task has several."""
+    """Make the task of an environment with one learner, and its disturbance; ValueError if the task has several.
+
+    task_type: the class of the task; parameters: its arguments and those of `Disturbance`, by name.
+    """
     task, disturbance = build(task_type, parameters, limit="max_episode_steps", own=("render_mode",))
     if task.learners != 1:
         raise ValueError(
@@ -66,6 +69,10 @@ class SingleEnv(gymnasium.Env[Rows, Rows]):
             cls.__doc__ = page(cls.info, task)
 
     def __init__(self, render_mode: str | None = None, **parameters: Any) -> None:
+        """Make the environment.
+
+        render_mode: `human`, `rgb_array` or None, without pictures; parameters: those of the task and of `Disturbance`.
+        """
         self.task, disturbance = single_learner_task(self.task_type, {**self.fixed, **parameters})
         self.metadata = {**self.metadata, "render_fps": render_fps(self.task)}
         self._screen = Screen(render_mode, render_fps(self.task))
@@ -79,7 +86,10 @@ class SingleEnv(gymnasium.Env[Rows, Rows]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begin an episode; return (O,) float32 and info with the seed. Raises ValueError for any option."""
+        """Begin an episode; return (O,) float32 and info with the seed. Raises ValueError for any option.
+
+        seed: of the world (default: the next episode of the present one); options: None.
+        """
         seed = check_seed(seed)
         check_options(options)
         super().reset(seed=seed)

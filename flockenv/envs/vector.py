@@ -277,7 +277,10 @@ class WorldsEnv(VectorEnv[Rows, Rows, Rows]):
         return tuple(frame for frame in frames if frame is not None)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """End the episodes; the next step then needs a reset."""
+        """End the episodes; the next step then needs a reset.
+
+        kwargs: of gymnasium; not used.
+        """
         self._running = False
 
 

@@ -24,13 +24,16 @@ Runs = Episodes | Sequence[Episodes]
 class Summary:
     """Statistics of one player, as shown in a table; intervals are over seeds and worlds, see `seeds`."""
 
-    mean: Interval
-    success: Interval
+    mean: Interval  # of the returns
+    success: Interval  # success rate, 0 to 1
     metrics: Mapping[str, tuple[float, int]]  # mean over the episodes to which it applies, and their number
 
 
 def summarise(runs: Runs, resamples: int = RESAMPLES, seed: int = 0) -> Summary:
-    """Return the statistics of one player's episodes."""
+    """Return the statistics of one player's episodes.
+
+    runs: its episodes, by `rollout`; resamples: number of bootstrap samples; seed: of their random numbers.
+    """
     rows = _runs(runs)
     metrics = {name: np.concatenate([run.metrics[name] for run in rows]) for name in rows[0].metrics}
     return Summary(
@@ -56,6 +59,9 @@ class Comparison:
 
 def compare(first: Runs, second: Runs, resamples: int = RESAMPLES, seed: int = 0) -> Comparison:
     """Compare two players world by world.
+
+    first, second: their episodes, by `rollout`; the difference is first less second. resamples: number of bootstrap
+    samples; seed: of their random numbers.
 
     Raises:
         ValueError: the episodes are not of the same worlds: task, settings, seed, number or time limit differ.

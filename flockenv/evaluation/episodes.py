@@ -77,9 +77,9 @@ def worlds_for(purpose: Purpose, seed: int = 0, worlds: int = 1) -> int:
 class Interval:
     """An estimate and the ends of its 95 % confidence interval."""
 
-    value: float
-    low: float
-    high: float
+    value: float  # the estimate
+    low: float  # lower end
+    high: float  # upper end
 
     def __str__(self) -> str:
         return f"{self.value:.3g} [{self.low:.3g}, {self.high:.3g}]"
@@ -90,7 +90,7 @@ class Recording:
     """Recording of one world: a snapshot at the start and after each control step, and the return until then."""
 
     world: int
-    snapshots: tuple[Snapshot, ...]
+    snapshots: tuple[Snapshot, ...]  # one per instant
     returns: Floats  # (instants,)
 
 
@@ -98,18 +98,18 @@ class Recording:
 class Episodes:
     """Results of one policy in B worlds, one episode in each; arrays are (B,)."""
 
-    task: str
-    digest: str
+    task: str  # its name
+    digest: str  # of the task's arguments, see `task_digest`
     seed: int  # world k is the world of seed + k
     horizon: int  # control steps
-    returns: Floats
-    success: NDArray[np.bool_]
+    returns: Floats  # sums of rewards
+    success: NDArray[np.bool_]  # True for worlds in which the task was done
     lengths: NDArray[np.int64]  # control steps
     terms: Mapping[str, Floats]  # reward term -> its share of the return
     metrics: Mapping[str, Floats]  # NaN if a metric does not apply (such as the time to a capture that did not happen)
     microseconds: float  # per decision, for at least half of the worlds at once, median over steps
     latency: float  # us for a call with a single row, median
-    recording: Recording | None = None
+    recording: Recording | None = None  # of one world, if it was asked for
 
     @property
     def worlds(self) -> int:
@@ -352,6 +352,9 @@ def bootstrap(
     values: ArrayLike, statistic: Literal["iqm", "mean"] = "iqm", resamples: int = RESAMPLES, seed: int = 0
 ) -> Interval:
     """Return a statistic of one number per world with its 95 % percentile bootstrap interval.
+
+    values: (W,), of W worlds; statistic: iqm, the interquartile mean, or mean; resamples: number of bootstrap samples;
+    seed: of their random numbers.
 
     Percentile and not BCa: the latter is undefined if all worlds have the same score. tests/test_evaluation.py measures
     the coverage of the interval on a skewed distribution.

@@ -28,6 +28,8 @@ Floats = NDArray[np.float64]
 def mean_interval(returns: ArrayLike, resamples: int = RESAMPLES, seed: int = 0) -> Interval:
     """Return the mean of returns (S, W), of S seeds in W worlds, with its 95 % two-level bootstrap interval.
 
+    resamples: number of bootstrap samples; seed: of their random numbers.
+
     Raises:
         ValueError: not two axes, fewer than two worlds, or a value that is not finite.
     """
@@ -39,6 +41,8 @@ def mean_interval(returns: ArrayLike, resamples: int = RESAMPLES, seed: int = 0)
 def success_interval(marks: ArrayLike, resamples: int = RESAMPLES, seed: int = 0) -> Interval:
     """Return the success rate of marks (S, W), True for a success, with its 95 % interval.
 
+    resamples: number of bootstrap samples; seed: of their random numbers.
+
     Of one seed it is Wilson's (see `proportion`), of several the two-level bootstrap, cut off at 0 and 1.
     """
     rows = np.asarray(marks, np.float64)
@@ -47,6 +51,8 @@ def success_interval(marks: ArrayLike, resamples: int = RESAMPLES, seed: int = 0
 
 def lead_interval(first: ArrayLike, second: ArrayLike, resamples: int = RESAMPLES, seed: int = 0) -> Interval:
     """Return the mean return of `first` minus that of `second` in the same worlds, with its interval.
+
+    resamples: number of bootstrap samples; seed: of their random numbers.
 
     first, second: returns (S1, W) and (S2, W). With one seed each, it is the bootstrap of the paired differences.
 

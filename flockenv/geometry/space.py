@@ -202,12 +202,17 @@ class Space(Record):
 
     kind: str
     offset_law: ClassVar[Law]
+    """(size, a, b) -> the offset from a to b, m, with the `size` that `extent` returns."""
     confine_law: ClassVar[Law]
+    """(size, radius, x, v) -> position, m, and velocity, m/s, of a body of this radius, m, back inside the space."""
     bounce_law: ClassVar[Law | None] = None
     periodic: ClassVar[bool] = False
 
     def extent(self, dimension: int) -> tuple[float, ...]:
-        """Return the size passed to the laws, m per axis; 1 for a space without size."""
+        """Return the size passed to the laws, m per axis; 1 for a space without size.
+
+        dimension: 2 or 3.
+        """
         size: tuple[float, ...] | None = getattr(self, "size", None)
         return size if size is not None else (1.0,) * dimension
 
@@ -220,7 +225,10 @@ class Space(Record):
         return np.asarray(np.asarray(b, float) - np.asarray(a, float))
 
     def wrap(self, x: ArrayLike) -> Floats:
-        """Return positions (..., D) m moved back into the space, of arrays outside kernels."""
+        """Return positions (..., D) m moved back into the space, of arrays outside kernels.
+
+        x: (..., D) m.
+        """
         return np.asarray(x, np.float64)
 
 

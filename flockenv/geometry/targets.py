@@ -105,7 +105,10 @@ class Target(Record):
         return np.asarray(to * np.maximum(far - self.radius, 0) / np.where(far > 0, far, 1))
 
     def count(self, spacing: float) -> int:
-        """Return the number of samples along the core, a point or a door: these come first in `samples`."""
+        """Return the number of samples along the core, a point or a door: these come first in `samples`.
+
+        spacing: m, at most, between samples.
+        """
         return 1 + int(np.ceil(4 * self.length / spacing - 1e-9))
 
     def samples(self, spacing: float) -> Floats:
@@ -122,7 +125,10 @@ class Target(Record):
 
 
 def row_size(dimension: int) -> int:
-    """Return the length of a target's row."""
+    """Return the length of a target's row.
+
+    dimension: 2 or 3.
+    """
     return 3 * dimension + 1
 
 
@@ -149,7 +155,10 @@ def _share(to_along: float, square: float) -> float:
 
 @law
 def to_target(table: Any, at: Any, x: Vec) -> Vec:
-    """Return the offset from x to the nearest point of the target whose row begins at `at`; 0 inside."""
+    """Return the offset from x to the nearest point of the target whose row begins at `at`; 0 inside.
+
+    table: the numbers of the targets, rows of `Target.row`; x: m.
+    """
     if len(x) == 2:
         a, b, u, v = table[at] - x[0], table[at + 1] - x[1], table[at + 2], table[at + 3]
         s = _share(a * u + b * v, u * u + v * v)
@@ -166,7 +175,10 @@ def to_target(table: Any, at: Any, x: Vec) -> Vec:
 
 @law
 def to_any(table: Any, at: Any, count: Any, x: Vec) -> Vec:
-    """Return the offset from x to the nearest of `count` targets whose rows begin at `at`."""
+    """Return the offset from x to the nearest of `count` targets whose rows begin at `at`.
+
+    table: the numbers of the targets, rows of `Target.row`; x: m.
+    """
     best = to_target(table, at, x)
     size = 3 * len(x) + 1
     for k in range(1, count):
@@ -177,7 +189,10 @@ def to_any(table: Any, at: Any, count: Any, x: Vec) -> Vec:
 
 @law
 def side_of_door(table: Any, at: Any, x: Vec) -> float:
-    """Return a number, m^2, whose sign says on which side of the line through a door x lies; 0 for other targets."""
+    """Return a number, m^2, whose sign says on which side of the line through a door x lies; 0 for other targets.
+
+    table: the numbers of the targets, rows of `Target.row`; at: where the row begins; x: m.
+    """
     side: float = table[at + 2] * (x[1] - table[at + 1]) - table[at + 3] * (x[0] - table[at])
     return side
 
@@ -185,6 +200,8 @@ def side_of_door(table: Any, at: Any, x: Vec) -> float:
 @law
 def approach_side(table: Any, at: Any, side: float, x: Vec) -> float:
     """Return the side (see `side_of_door`) from which an agent at x approaches a door: 2-D.
+
+    table: the numbers of the targets, rows of `Target.row`; at: where the row of the door begins; x: m.
 
     It is the side on which the agent was when it was last farther away than the door is long, so that it remains the
     same for an agent that passes beside the end of a door. side: the value so far, 0 if there is none.
@@ -197,6 +214,9 @@ def approach_side(table: Any, at: Any, side: float, x: Vec) -> float:
 @law
 def is_reached(table: Any, at: Any, side: float, was: Vec, now: Vec) -> bool:
     """Return True if a move from `was` to `now` ends in the target whose row begins at `at`, or behind a door; 2-D.
+
+    table: the numbers of the targets, rows of `Target.row`; side: the `approach_side` so far, 0 if there is none; was,
+    now: m.
 
     A door is reached by crossing it from its `approach_side`, or beside its end to a place behind it, no farther from
     it than it is long; not by crossing it backwards.
@@ -230,6 +250,9 @@ def _is_beside(table: Any, at: Any, x: Vec) -> bool:
 @law
 def way_out(table: Any, at: Any, side: float, step: Vec) -> Vec:
     """Return the direction, of any length, in which an agent goes on that has reached a target with its last `step`.
+
+    table: the numbers of the targets, rows of `Target.row`; at: where the row begins; side: the `approach_side` of the
+    door, 0 if there is none; step: m.
 
     It is the direction of the step, or straight out of the door if the step led back to the approach side.
     """

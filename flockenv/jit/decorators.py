@@ -81,18 +81,26 @@ def _compile_part(function: F, **options: Any) -> F:
 def law(function: F) -> F:
     """Mark a scalar law: branch-free if possible, inlined into the loop that calls it, never called from Python.
 
+    function: of one agent, with tuples of D floats as vectors.
+
     For numba it is the same as `kernel`; the two names distinguish physics from engine.
     """
     return _compile_part(function)
 
 
 def unfused(function: F) -> F:
-    """Mark a law that must give the same bits in every loop it is inlined into: no multiply is fused with an add."""
+    """Mark a law that must give the same bits in every loop it is inlined into: no multiply is fused with an add.
+
+    function: as of `law`.
+    """
     return _compile_part(function, fastmath=False)
 
 
 def kernel(function: F) -> F:
-    """Mark a part of a kernel that reads and writes arrays or combines laws; it is inlined into its callers."""
+    """Mark a part of a kernel that reads and writes arrays or combines laws; it is inlined into its callers.
+
+    function: in the part of Python that numba compiles.
+    """
     return _compile_part(function)
 
 
@@ -102,7 +110,10 @@ def routine(function: F) -> F:
 
 
 def shared(function: F) -> F:
-    """Mark a law that Python code also calls, uncompiled: for example a method's `advance`."""
+    """Mark a law that Python code also calls, uncompiled: for example a method's `advance`.
+
+    function: as of `law`.
+    """
     mark: Any = register_jitable
     return cast(F, mark(**OPTIONS)(function))
 

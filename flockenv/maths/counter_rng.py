@@ -36,14 +36,22 @@ def mix(a: np.uint64, b: np.uint64) -> np.uint64:
 
 @kernel
 def uniform(key: np.uint64, step: int, agent: int, channel: int) -> float:
-    """Draw from U[0, 1): the same four arguments always give the same number."""
+    """Draw from U[0, 1): the same four arguments always give the same number.
+
+    key: of the world, by `key_of`; step: number of the step or draw; agent: its index; channel: an integer >= 0, a
+    different one for each use.
+    """
     h = mix(mix(mix(key, np.uint64(step)), np.uint64(agent)), np.uint64(channel))
     return float(h >> _11) * _TO_UNIT
 
 
 @kernel
 def normal(key: np.uint64, step: int, agent: int, channel: int) -> float:
-    """Draw from N(0, 1) (Box-Muller; uses channels 2c and 2c + 1 of a separate family)."""
+    """Draw from N(0, 1) (Box-Muller; uses channels 2c and 2c + 1 of a separate family).
+
+    key: of the world, by `key_of`; step: number of the step or draw; agent: its index; channel: an integer >= 0, a
+    different one for each use.
+    """
     u = 1.0 - uniform(key, step, agent, 2 * channel + 1_000_003)
     return math.sqrt(-2.0 * math.log(u)) * math.cos(2.0 * math.pi * uniform(key, step, agent, 2 * channel + 1_000_004))
 
@@ -51,6 +59,9 @@ def normal(key: np.uint64, step: int, agent: int, channel: int) -> float:
 @kernel
 def quick_normal(key: np.uint64, step: int, agent: int, channel: int) -> float:
     """Draw from N(0, 1) by inversion of one uniform number: a third of the time of `normal`, to seven digits.
+
+    key: of the world, by `key_of`; step: number of the step or draw; agent: its index; channel: an integer >= 0, a
+    different one for each use.
 
     Source: Wichura 1988, algorithm AS 241 (PPND7), Applied Statistics 37, 477.
     """
@@ -76,6 +87,9 @@ def quick_normal(key: np.uint64, step: int, agent: int, channel: int) -> float:
 def smooth(key: np.uint64, time: float, agent: int, channel: int) -> float:
     """Draw a number in [-1, 1] that changes smoothly with time, whose unit is the correlation time.
 
+    key: of the world, by `key_of`; time: in units of the correlation time; agent: its index; channel: an integer >= 0,
+    a different one for each use.
+
     Coherent noise, after Perlin (1985): independent draws at integer times, interpolated between them by the weight
     6 s^5 - 15 s^4 + 10 s^3. As it is a function of time, the signal is the same for every dt.
     """
@@ -87,12 +101,18 @@ def smooth(key: np.uint64, time: float, agent: int, channel: int) -> float:
 
 
 def key_of(seed: int, episode: int) -> np.uint64:
-    """Return the key of a world, by the same mixing as in the kernels, in plain Python."""
+    """Return the key of a world, by the same mixing as in the kernels, in plain Python.
+
+    seed: of the world, an integer, of which the lowest 64 bits count; episode: its number, from 0.
+    """
     return np.uint64(_mix(_mix(int(_START), seed & MASK), episode & MASK))
 
 
 def keys_of(seeds: NDArray[np.uint64], episodes: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Return the keys of many worlds at once."""
+    """Return the keys of many worlds at once.
+
+    seeds, episodes: (B,) uint64, as of `key_of`.
+    """
     plain = python_of(mix)  # on arrays, whose integers wrap as in a kernel
     return np.asarray(plain(plain(_START, seeds), episodes))
 

@@ -67,7 +67,10 @@ class Appearance(Record):
     def shade(
         self, age: NDArray[np.float64], speed: NDArray[np.float64], shown: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Return the position of each agent's value within `over`, (N,) from 0 to 1; shown: strain or inner state."""
+        """Return the position of each agent's value within `over`, (N,) from 0 to 1; shown: strain or inner state.
+
+        age: (N,) s; speed: (N,) m/s.
+        """
         value = {"age": age, "speed": speed, "strain": shown, "inner": shown}.get(self.by or "")
         if value is None:
             return np.zeros(len(age))

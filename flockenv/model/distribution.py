@@ -67,21 +67,31 @@ class Spread(Record):
 
 
 def draw(value: float | Spread, count: int, channel: int) -> NDArray[np.float64]:
-    """Return `count` numbers, whose ranks depend on channel and seed alone (so that heavy agents are wide)."""
+    """Return `count` numbers, whose ranks depend on channel and seed alone (so that heavy agents are wide).
+
+    value: a number, which all of them are, or a spread; channel: an integer >= 0, a different one for each property of
+    a group.
+    """
     if not isinstance(value, Spread):
         return np.full(count, float(value))
     return value.at(np.random.default_rng([value.seed, channel]).random(count))
 
 
 def smallest(value: float | Spread, count: int, channel: int) -> float:
-    """Return the lower bound of the numbers: that of the spread or, if it is 0, the smallest number drawn."""
+    """Return the lower bound of the numbers: that of the spread or, if it is 0, the smallest number drawn.
+
+    value: a number or a spread; count: how many are drawn; channel: as of `draw`.
+    """
     if not isinstance(value, Spread):
         return float(value)
     return value.least if value.least > 0 else float(draw(value, min(count, MOST), channel).min())
 
 
 def largest(value: float | Spread, count: int, channel: int) -> float:
-    """Return the upper bound of the numbers: that of the spread or, if infinite, the largest number drawn."""
+    """Return the upper bound of the numbers: that of the spread or, if infinite, the largest number drawn.
+
+    value: a number or a spread; count: how many are drawn; channel: as of `draw`.
+    """
     if not isinstance(value, Spread):
         return float(value)
     return value.most if math.isfinite(value.most) else float(draw(value, min(count, MOST), channel).max())

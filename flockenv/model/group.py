@@ -153,7 +153,10 @@ class Group(Record):
         return self.max_speed if self.haste is None else float(self.max_speeds.max())
 
     def masses(self, dimension: int) -> NDArray[np.float64]:
-        """Return the mass of each agent, (size,) kg; infinite for pinned particles of a network."""
+        """Return the mass of each agent, (size,) kg; infinite for pinned particles of a network.
+
+        dimension: 2 or 3.
+        """
         if self.network is None:
             return draw(self.mass, self.size, SIZE)
         assert not isinstance(self.mass, Spread)

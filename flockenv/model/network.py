@@ -159,15 +159,24 @@ class Network(Record):
 
     @abstractmethod
     def points(self, dimension: int) -> Floats:
-        """Return the initial positions of particles, (n, D) m."""
+        """Return the initial positions of particles, (n, D) m.
+
+        dimension: 2 or 3.
+        """
 
     def rest_points(self, dimension: int) -> Floats:
-        """Return the unstrained positions of particles, (n, D) m; the first is at its initial position."""
+        """Return the unstrained positions of particles, (n, D) m; the first is at its initial position.
+
+        dimension: 2 or 3.
+        """
         points = self.points(dimension)
         return np.asarray(points if self.stretch == 1 else points[0] + (points - points[0]) / self.stretch)
 
     def velocities(self, dimension: int) -> Floats:
-        """Return the initial velocities of particles, (n, D) m/s: relative to that of the group, unless held."""
+        """Return the initial velocities of particles, (n, D) m/s: relative to that of the group, unless held.
+
+        dimension: 2 or 3.
+        """
         self._check_dimension(dimension)
         out = np.zeros((self.size, dimension))
         for _, move, who in self._moved():
@@ -176,10 +185,16 @@ class Network(Record):
 
     @abstractmethod
     def springs(self, dimension: int) -> Springs:
-        """Return the springs: pairs of particles, rest lengths and roles."""
+        """Return the springs: pairs of particles, rest lengths and roles.
+
+        dimension: 2 or 3.
+        """
 
     def hinges(self, dimension: int) -> Ints:
-        """Return the angles that resist bending, (H, 3): end, apex, end."""
+        """Return the angles that resist bending, (H, 3): end, apex, end.
+
+        dimension: 2 or 3.
+        """
         self._check_dimension(dimension)
         return np.zeros((0, 3), np.int32)
 
@@ -187,11 +202,16 @@ class Network(Record):
     def elements(self, dimension: int) -> Ints:
         """Return finite elements, (E, k): bars (k = 2), triangles (k = 3) or tetrahedra (k = 4).
 
+        dimension: 2 or 3.
+
         Triangles in 2-D and tetrahedra in 3-D are positively oriented (det of the edges from the first corner > 0).
         """
 
     def check_elements(self, dimension: int) -> None:
-        """Raise ValueError, in one line, if triangles make up no sound surface in 3-D, or tetrahedra no sound body."""
+        """Raise ValueError, in one line, if triangles make up no sound surface in 3-D, or tetrahedra no sound body.
+
+        dimension: 2 or 3.
+        """
 
     def pins(self) -> Ints:
         """Return the particles that no force moves: pinned ones, and those of `moves`; (P,) ascending."""
@@ -201,6 +221,8 @@ class Network(Record):
     def particles(self, name: str, given: tuple[int | str, ...]) -> Ints:
         """Return the particles that names of places and indices stand for, (P,) ascending, each once.
 
+        name: of the field, for messages; given: names of places, such as `left`, and indices.
+
         Raises ValueError, with the name of the field that holds them, on an unknown place or particle.
         """
         self._check_particles(name, given)
@@ -209,6 +231,8 @@ class Network(Record):
 
     def masses(self, total: float, dimension: int) -> Floats:
         """Return the mass of each particle, (n,) kg, `total` in sum, distributed according to `lumping`.
+
+        dimension: 2 or 3.
 
         Geometric: each element, or spring if there are no elements, divides its length, area or volume equally among
         its corners. Raises ValueError if a particle has no mass.

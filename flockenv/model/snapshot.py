@@ -166,7 +166,10 @@ class Snapshot:
         return shades_of(self.looks, self.look, age, self.vel, self.shown)
 
     def is_same(self, other: Snapshot) -> NDArray[np.bool_]:
-        """True for rows that hold the same agent in another snapshot, (N,) bool."""
+        """True for rows that hold the same agent in another snapshot, (N,) bool.
+
+        other: of the same world.
+        """
         if self.identity is None or other.identity is None:
             return np.ones(self.agents, np.bool_)
         return np.asarray(self.identity == other.identity)

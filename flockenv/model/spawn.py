@@ -76,6 +76,9 @@ def cells(
 ) -> NDArray[np.float64]:  # fmt: skip
     """Return the middles of the first grid cells in [low, high) that are clear of shapes, (count, D) m.
 
+    spawn: its spacing, m, and `wider` define the grid; low, high: corners of the region, (D,) m; count: number of
+    cells; period: (D,) m, size of a periodic box, zeros for none.
+
     Raises ValueError, beginning with the field's name, if bodies of this radius, m, are wider than a cell, or if there
     are too few free cells.
     """
@@ -124,7 +127,10 @@ def _edges_text(spacing: tuple[float, ...]) -> str:
 
 @kernel
 def direction(key: Any, step: int, agent: int, channel: int, out: Any) -> None:
-    """Write a uniformly distributed unit vector (2-D or 3-D) into `out` (D,)."""
+    """Write a uniformly distributed unit vector (2-D or 3-D) into `out` (D,).
+
+    key: of the world; step, agent, channel: as of `counter_rng.uniform`; in 3-D it also draws from channel + 1.
+    """
     turn = 2.0 * math.pi * uniform(key, step, agent, channel)
     if out.shape[0] == 2:
         out[0], out[1] = math.cos(turn), math.sin(turn)
@@ -155,6 +161,9 @@ def scatter(
     heading: Any, centre: Any, obstacle_radius: Any, period: Any, unit: Any, tried: Any,
 ) -> None:  # fmt: skip
     """Place agents [first, end) of one world uniformly in [low, high), clear of obstacles if 64 tries suffice.
+
+    key: of the world. radius (N,) m; slow, fast: m/s, speeds are uniform between them; centre (D, M) m and
+    obstacle_radius (M,) m: the obstacles, radius 0 for none.
 
     pos, vel (D, N); low, high, heading, period, unit (D,); heading: zeros for a random one; period: size of a periodic
     box, zeros for none; unit: scratch. tried (N,): on entry the number of tries already made, on return the index of

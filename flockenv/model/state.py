@@ -63,7 +63,10 @@ class Body:
     banking: Floats  # (N,) s, time constant of banking; inf: no banking; (0,) if no agent banks
 
     def astype(self, dtype: Any) -> Body:
-        """Return the same bodies in another precision."""
+        """Return the same bodies in another precision.
+
+        dtype: `float32` or `float64`.
+        """
         return Body(*(np.ascontiguousarray(a, dtype) for a in self.arrays()))
 
     def arrays(self) -> tuple[Floats, ...]:
@@ -91,9 +94,7 @@ class State:
     identity: NDArray[np.int64]  # (B, N) agent in this slot, or the last one, -1 if none; (B, 0) without a population
     born: NDArray[np.float64]  # (B, N) s, time of birth; (B, 0) without a population
     dies: NDArray[np.float64]  # (B, N) s, when its lifetime ends, inf if never; (B, 0) without a population
-    bonds: (
-        Floats  # (B, S) a number for each spring of networks, see Effect.bond_keep_law; (B, 0) if no effect keeps any
-    )
+    bonds: Floats  # (B, S) a number per spring of networks, see Effect.bond_keep_law; (B, 0) if none is kept
     dt: float  # s, one physics step: time = tick dt
 
     @property
@@ -171,7 +172,10 @@ class State:
         return replace(self, **{name: getattr(self, name).copy() for name in _ARRAYS})
 
     def copy_from(self, other: State) -> None:
-        """Overwrite the arrays of this state with another's; raise ValueError if shape or precision differ."""
+        """Overwrite the arrays of this state with another's; raise ValueError if shape or precision differ.
+
+        other: of the same shape and precision.
+        """
         for name in _ARRAYS:
             mine, theirs = getattr(self, name), getattr(other, name)
             if (mine.shape, mine.dtype) != (theirs.shape, theirs.dtype):
@@ -183,13 +187,18 @@ class State:
             getattr(self, name)[...] = getattr(other, name)
 
     def put(self, rows: NDArray[np.bool_], other: State) -> None:
-        """Overwrite the worlds selected by `rows`, (B,), with those of another state of the same shape."""
+        """Overwrite the worlds selected by `rows`, (B,), with those of another state of the same shape.
+
+        other: B worlds, as this one.
+        """
         for name in _ARRAYS:
             at = (slice(None), rows) if name in _PER_COORDINATE else rows
             getattr(self, name)[at] = getattr(other, name)[at]
 
     def with_motion(self, pos: ArrayLike, vel: ArrayLike) -> State:
         """Return a copy with other positions and velocities, each (B, N, D).
+
+        pos: m; vel: m/s.
 
         If headings are kept, moving agents face along their new velocity. Raises ValueError on other shapes, NaN, and
         numbers too large to be squared (flockenv.core.magnitudes).
@@ -210,7 +219,10 @@ class State:
             entry(face)(self.v, self.frame, b, False)
 
     def with_dt(self, dt: float) -> State:
-        """Return a copy with another step length, s; raise ValueError unless each world's time is a multiple of it."""
+        """Return a copy with another step length, s; raise ValueError unless each world's time is a multiple of it.
+
+        dt: > 0.
+        """
         if not (dt > 0 and np.isfinite(dt)):
             raise ValueError(f"dt is {dt}, must be a positive number of seconds")
         ticks = self.time / dt
@@ -221,7 +233,10 @@ class State:
         return replace(self.copy(), tick=whole.astype(np.int64), dt=float(dt))
 
     def worlds(self, rows: Sequence[int] | slice) -> State:
-        """Return a copy of some of the worlds."""
+        """Return a copy of some of the worlds.
+
+        rows: their indices.
+        """
         rows = rows if isinstance(rows, slice) else list(rows)
         arrays: dict[str, Any] = {
             name: np.ascontiguousarray(

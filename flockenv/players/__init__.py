@@ -89,7 +89,10 @@ def load_player(spec: str | os.PathLike[str], task: Task, seed: int = 0, trust_p
 
 
 def known_name(spec: str) -> str | None:
-    """Return which of NAMES a player is, with or without a seed: "ppo" of "ppo", "ppo@3" and "ppo@*"; None if none."""
+    """Return which of NAMES a player is, with or without a seed: "ppo" of "ppo", "ppo@3" and "ppo@*"; None if none.
+
+    spec: a player as in `load_player`.
+    """
     name, at, seed = spec.partition("@")
     with_seed = seed.isascii() and seed.isdigit() and len(seed) < 9
     return name if name in NAMES and (not at or with_seed or at + seed == ALL_SEEDS) else None
@@ -115,6 +118,8 @@ def seeds_of_player(name: str, task: str) -> tuple[int, ...]:
 def trained_task(name: str) -> Task:
     """Return a task with the arguments with which its policy was trained; without weights, with its defaults.
 
+    name: of the task, such as `pursuit`.
+
     Raises:
         KeyError: no such task.
         ValueError: the card of the weights is damaged; one line.
@@ -128,12 +133,17 @@ def trained_task(name: str) -> Task:
 
 
 def weights_file(task: str, seed: int | None = None) -> Path:
-    """Return the path of the weights that ship, or of those of a training seed that is not the one that ships."""
+    """Return the path of the weights that ship, or of those of a training seed that is not the one that ships.
+
+    task: its name; seed: the training seed (default: what ships).
+    """
     return WEIGHTS / (f"{task}.safetensors" if seed is None else f"seeds/{task}-seed-{seed}.safetensors")
 
 
 def policy_file(spec: str, task: Task) -> Path:
     """Return the path of the weights of `ppo`, or of a training seed, such as ppo@3, whether it ships or not.
+
+    spec: `ppo`, `ppo@3`; task: the task that it plays.
 
     Raises:
         ValueError: there is no such seed; one line.
@@ -191,7 +201,10 @@ def _load_trained(spec: str, task: Task, seed: int) -> Policy:
 
 
 def other_tasks(name: str, task: str) -> tuple[str, ...]:
-    """Return the tasks that a player is written for if `task` is not among them; () if it plays `task`."""
+    """Return the tasks that a player is written for if `task` is not among them; () if it plays `task`.
+
+    name: of the player, with or without a seed.
+    """
     from flockenv.players.rules import PLAYERS
 
     known = PLAYERS.get(known_name(name) or name, {task: None})

@@ -46,15 +46,17 @@ Floats = NDArray[np.float32]
 class Hybrid:
     """How the numbers of a network become actions of a task."""
 
-    kind: str
-    rules: RulesPlayer
-    bound: float = 0.5
+    kind: str  # what the network puts out
+    rules: RulesPlayer  # the hand-written player
+    bound: float = 0.5  # of the network's part, see the module
     ranges: tuple[tuple[float, float], ...] = ()
     """Of `weights`: the ends between which each parameter of the rules is set."""
 
     @classmethod
     def of(cls, task: Task, kind: str, base: str = "rules", bound: float = 0.5) -> Hybrid:
         """Return the hybrid of a task with its hand-written player `base`; queueing@5 is that of search seed 5.
+
+        kind: one of KINDS, see the module; bound: of the network's part, see there.
 
         Raises:
             ValueError: in one line, an unknown kind, base or seed, or a base that does not allow this kind.
@@ -66,7 +68,10 @@ class Hybrid:
 
     @classmethod
     def from_card(cls, about: Any, task: Task) -> Hybrid:
-        """Return the hybrid that a card describes; raise ValueError, in one line, if it cannot be used."""
+        """Return the hybrid that a card describes; raise ValueError, in one line, if it cannot be used.
+
+        about: the entry `hybrid` of the card; task: that it plays.
+        """
         if not isinstance(about, Mapping) or not about.keys() >= {"kind", "base", "bound", "rules"}:
             raise ValueError("the card's hybrid must hold kind, base, bound and rules")
         base = player(task, str(about["base"]))
@@ -148,7 +153,11 @@ class HybridPolicy(MlpPolicy):
     def of(
         cls, tensors: Mapping[str, NDArray[Any]], card: Mapping[str, Any], task: Task | None, seed: int | None = 0
     ) -> HybridPolicy:
-        """Return the policy of a task; raise ValueError, in one line, if card, weights and task do not fit."""
+        """Return the policy of a task; raise ValueError, in one line, if card, weights and task do not fit.
+
+        tensors: of the network, by name; card: see `read_card`; seed: of the generator that samples when not
+        deterministic; None draws one.
+        """
         if task is None:
             raise ValueError("a hybrid of a network and rules needs the task that it plays")
         policy = cls(tensors, card, seed)
@@ -164,7 +173,11 @@ class HybridPolicy(MlpPolicy):
         episode_start: NDArray[Any] | None = None,
         deterministic: bool = False,
     ) -> tuple[Floats, Any]:
-        """Return actions (R, A) for observations (R, O), or (A,) for one row (O,), and the state of the rules."""
+        """Return actions (R, A) for observations (R, O), or (A,) for one row (O,), and the state of the rules.
+
+        observation: (R, O) or (O,) float32; state: what the last call returned, None at the start; episode_start: (R,),
+        True for rows whose episode begins; deterministic: True for the mean action, if there is one.
+        """
         outputs, _ = super().predict(observation, None, episode_start, deterministic)
         rows = np.atleast_2d(np.asarray(observation, np.float32))
         action, state = self.hybrid.act(rows, np.atleast_2d(outputs), state, episode_start)

@@ -59,7 +59,10 @@ class IndependentPolicy(MlpPolicy):
         return f"IndependentPolicy({self.learners} networks, {super().__repr__()})"
 
     def watch(self, world: Any) -> None:
-        """Raise ValueError unless the rows of worlds are those of all their learners."""
+        """Raise ValueError unless the rows of worlds are those of all their learners.
+
+        world: whose task and worlds are compared.
+        """
         if getattr(world, "learners", None) != self.learners:
             raise ValueError(f"policy: has a network for each of {self.learners} learners, which play together only")
 
@@ -71,6 +74,9 @@ class IndependentPolicy(MlpPolicy):
         deterministic: bool = False,
     ) -> tuple[Floats, State | None]:
         """Return actions (R, A) of observations (R, O), where row r is of learner r % L.
+
+        observation: (R, O) or (O,) float32; state: what the last call returned, None at the start; episode_start: (R,),
+        True for rows whose episode begins; deterministic: True for the mean action, if there is one.
 
         Raises:
             ValueError: R is not a multiple of L; `networks[k].predict` takes rows of learner k alone.

@@ -70,7 +70,11 @@ class Policy(Protocol):
         episode_start: NDArray[Any] | None = None,
         deterministic: bool = False,
     ) -> tuple[NDArray[Any], State | None]:
-        """Return actions for observations, (R, O) float32 -> (R, A) float32 (or one row, (O,) -> (A,)), and a state."""
+        """Return actions for observations, (R, O) float32 -> (R, A) float32 (or one row, (O,) -> (A,)), and a state.
+
+        observation: (R, O) or (O,) float32; state: what the last call returned, None at the start; episode_start:
+        (R,), True for rows whose episode begins; deterministic: True for the mean action, if there is one.
+        """
         ...
 
 
@@ -98,7 +102,10 @@ class RandomPolicy:
         episode_start: NDArray[Any] | None = None,
         deterministic: bool = False,
     ) -> tuple[Floats, State | None]:
-        """Return a new draw per row; `deterministic` is ignored, as the mean action would be zero."""
+        """Return a new draw per row; `deterministic` is ignored, as the mean action would be zero.
+
+        observation: (R, O) or (O,) float32; state: is returned as None; episode_start: not used.
+        """
         shape = (*np.asarray(observation).shape[:-1], self.action_size)
         return self._generator.uniform(-1.0, 1.0, shape).astype(np.float32), state
 
@@ -156,6 +163,9 @@ class MlpPolicy:
     def load(cls, path: str | os.PathLike[str], task: Task | None = None, seed: int | None = 0) -> MlpPolicy:
         """Read `X.safetensors` and the card beside it; with a task, check that its observations match the card.
 
+        path: of either file; task: that it is to play; seed: of the generator that samples when not deterministic; None
+        draws one.
+
         Warns with OtherTaskWarning, in one line, if the task has other arguments or scales than the card's;
         `differences` lists them all.
 
@@ -193,6 +203,8 @@ class MlpPolicy:
     def of_tensors(tensors: Mapping[str, NDArray[Any]], card: Mapping[str, Any], seed: int | None = 0) -> MlpPolicy:
         """Return the policy of some tensors: one network, with an LSTM or not, or one for each learner.
 
+        seed: of the generator that samples when not deterministic; None draws one.
+
         The card's hybrid is left out.
         """
         from flockenv.players.independent import IndependentPolicy, has_networks  # layers above this file
@@ -210,6 +222,9 @@ class MlpPolicy:
         deterministic: bool = False,
     ) -> tuple[Floats, State | None]:
         """Return the mean action, or a Gaussian sample, clipped to [-1, 1]: (O,) -> (A,), (R, O) -> (R, A).
+
+        observation: (R, O) or (O,) float32; state: what the last call returned, None at the start; episode_start: (R,),
+        True for rows whose episode begins; deterministic: True for the mean action, if there is one.
 
         If the actor is squashed, that of the mean, or of a sample, before the tanh.
         """
@@ -287,7 +302,10 @@ def save_policy(path: str | os.PathLike[str], tensors: Mapping[str, NDArray[Any]
 
 
 def read_card(path: Path) -> dict[str, Any]:
-    """Read a card strictly: no duplicate keys, no NaN, and of the supported version."""
+    """Read a card strictly: no duplicate keys, no NaN, and of the supported version.
+
+    path: of the JSON file beside the weights.
+    """
     try:
         text = _read_file(path, LARGEST_CARD)
         card = json.loads(text, object_pairs_hook=_check_unique, parse_constant=_reject_constant)

@@ -35,6 +35,8 @@ def rows_of(yaw: float, tilt: float) -> Floats:
 def turned(snapshot: Snapshot, yaw: float, tilt: float) -> Snapshot:
     """Return a snapshot in axes that point to the right, upwards and towards the viewer; the region's middle is 0.
 
+    yaw: degrees about the vertical; tilt: degrees from above.
+
     Obstacles that are not round lie on the ground of the region. Nothing is drawn twice at the edges of a torus, and
     bonds across them are left out.
     Raises ValueError, in one line, for angles out of range, see `check_camera`, and in 2-D unless both are 0.

@@ -41,6 +41,8 @@ _TOLERANCE: Final = 40
 def write_gif(path: str | os.PathLike[str], frames: Iterable[Pixels], fps: float) -> int:
     """Write frames, (H, W, 3) uint8, as a GIF that repeats endlessly; return the number of frames.
 
+    path: of the file; a file of that name is replaced.
+
     fps: 0 < fps <= 50; delays are in hundredths of a second, rounded so that the total duration is right.
     The file is written completely or not at all, and memory does not grow with the number of frames.
     Raises ValueError or TypeError for an fps out of range, without a frame, or for frames of different shapes.
@@ -76,6 +78,8 @@ def side_by_side(
 
 def write_png(path: str | os.PathLike[str], frame: Pixels, colours: int | None = None) -> None:
     """Write one frame, (H, W, 3) uint8, as PNG; the file is written completely or not at all.
+
+    path: of the file; a file of that name is replaced.
 
     colours: reduce the picture to this many, 16 to 256, which makes drawings a third as large (default: all).
     Raises ValueError or TypeError for colours out of range, or for another frame, before anything is written.

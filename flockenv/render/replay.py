@@ -87,6 +87,8 @@ class Group:
 def write_replay(path: str | os.PathLike[str], groups: Sequence[Group], title: str) -> None:
     """Write the replay of one or several tasks as one self-contained HTML file, completely or not at all.
 
+    path: of the file; groups: the recorded episodes of each task; title: of the page.
+
     The page loads nothing, and its Content-Security-Policy forbids it; names are shown as text, never as HTML.
     Its address may end with #task=1&t=4.2&play: the task, the time, s, and play or pause. Raises ValueError if there is
     no group.

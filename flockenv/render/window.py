@@ -16,7 +16,7 @@ class Window:
     """A window that shows frames at a steady rate. After it is closed, by close() or by the user, show() does nothing.
 
     A process has one window, which all objects of this class share. Raises ImportError without pygame-ce, and
-    RuntimeError without a display, in one line with the remedy.
+    RuntimeError without a display, in one line with the remedy. title: of the window.
     """
 
     def __init__(self, title: str = "flockenv") -> None:

@@ -35,6 +35,8 @@ MOST_VERTICES = 1024
 def read_plan(path: Path, scale: float = 1.0) -> BaseGeometry:
     """Return the geometry of a GeoJSON or WKT file, in m: coordinates times `scale`.
 
+    path: of the file, UTF-8, at most MAX_BYTES long.
+
     Raises ValueError, in one line, if the file cannot be read or is neither.
     """
     name = printable(str(path))[1:-1]

@@ -49,6 +49,8 @@ G = 9.81
 def read_mesh(path: Path, elements: Elements | None = None) -> tuple[Floats, Ints]:
     """Return the points of a mesh file, (n, 2) or (n, 3), and its elements, (E, k), by meshio.
 
+    path: its ending names the format, one of those that meshio reads.
+
     elements: those that are taken (default: those of the most dimensions in the file, so tetrahedra and not their
     faces). Quadrilaterals are cut in two triangles along the shorter diagonal. Points that belong to no element are
     left out.
@@ -110,6 +112,9 @@ def obstacle_of(
     merge: float | None = None,
 ) -> TriangleMesh:
     """Return a closed surface of triangles as an obstacle.
+
+    points: (n, 3), in any unit; scale: m per unit; rotate: degrees, about the x axis, then y, then z; move: m; merge:
+    m, distance up to which points become one (default: points in one place are refused), all as of `mesh_of`.
 
     spacing: of its grid of distances, m (default: a fortieth of its longest extent). The other arguments are those of
     `mesh_of`. Raises ValueError if triangles do not bound a solid.

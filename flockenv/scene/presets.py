@@ -37,10 +37,10 @@ __all__ = ["ALIASES", "PRESETS", "Model", "Origins", "Preset", "expand_presets",
 class Model:
     """A published model: its behaviours, contact forces, pedestrians, and sources."""
 
-    source: str
+    source: str  # the paper
     behaviours: Callable[[bool, int | None], tuple[Effect, ...]] = field(repr=False)
     """(True if walls occlude, group for models of walking groups) -> behaviours."""
-    bodies: tuple[Effect, ...] = ()
+    bodies: tuple[Effect, ...] = ()  # contact forces of bodies
     people: Mapping[str, Any] = field(default_factory=dict)
     """Fields of a `Group`, as the paper has them."""
     symbols: Mapping[str, str] = field(default_factory=dict)
@@ -251,7 +251,10 @@ class Origins(dict[KeyPath, list[int]]):
         return path
 
     def text(self, text: str) -> str:
-        """Return a message with its leading key path replaced by that in the file."""
+        """Return a message with its leading key path replaced by that in the file.
+
+        text: begins with a key path, such as `effects[2].radius`.
+        """
         path = parse_key_path(text)
         for k in range(len(path), 0, -1):
             before, after = key_path(path[:k]), key_path(self.path(path[:k]))

@@ -440,7 +440,10 @@ class Scene(Record):
     # --- running ----------------------------------------------------------------------------------------------------
 
     def start(self, seed: int, worlds: int = 1) -> State:
-        """Return the initial state: world k is drawn from seed + k, independent of the batch."""
+        """Return the initial state: world k is drawn from seed + k, independent of the batch.
+
+        worlds: B >= 1.
+        """
         _check_integer("seed", seed, 0, MASK)
         _check_integer("worlds", worlds, 1)
         if self.bytes_per_world() * worlds > MEMORY_LIMIT:
@@ -466,7 +469,10 @@ class Scene(Record):
         return state
 
     def inner(self, state: State, name: str) -> Floats:
-        """Return an inner number of every agent by name, as a view, (B, N); see `Effect.keeps`."""
+        """Return an inner number of every agent by name, as a view, (B, N); see `Effect.keeps`.
+
+        state: of this scene.
+        """
         if name not in self.parts.inner:
             raise ValueError(
                 f"{name!r}: no effect of this scene keeps such an inner number; "
@@ -533,6 +539,8 @@ class Scene(Record):
     def acceleration(self, state: State, drive: ArrayLike | None = None) -> Floats:
         """Return the acceleration of every agent in this state, (B, N, D) m/s^2, without moving it.
 
+        drive: (B, N, D) N, in addition to the effects (default: none).
+
         Drag is included, for any integrator; drives are bounded as in a step, speeds are not.
         """
         return self.rates(state, drive)[0]
@@ -541,6 +549,8 @@ class Scene(Record):
         self, state: State, drive: ArrayLike | None = None, times: ArrayLike | None = None
     ) -> tuple[Floats, Floats | None]:
         """Return the acceleration, (B, N, D) m/s^2, and the velocity by which a medium carries agents, m/s, or None.
+
+        drive: (B, N, D) N, in addition to the effects (default: none).
 
         times: of each world, (B,) s; None: those of the state.
         """
@@ -623,7 +633,10 @@ class Scene(Record):
     # --- looking at it ----------------------------------------------------------------------------------------------
 
     def snapshot(self, state: State, world: int = 0, title: str = "") -> Snapshot:
-        """Return one world at one instant, for pictures."""
+        """Return one world at one instant, for pictures.
+
+        state: of this scene; world: its index; title: text above the picture.
+        """
         return self.view.snapshot(state, world, title)
 
     def with_effects(self, *effects: Effect) -> Scene:

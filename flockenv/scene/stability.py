@@ -90,6 +90,8 @@ class Suggestion(NamedTuple):
 def amplification(method: Integrator, y: Floats, zeta: float, drag_zeta: float = 0.0) -> Floats:
     """Return the amplification matrices of (x, v) in one step of h = 1 s, (K, 2, 2), for oscillators of h w = y, (K,).
 
+    method: a method of integration.
+
     zeta, drag_zeta: damping as fractions of critical damping; `drag_zeta` belongs to drag, which some methods integrate
     separately.
     """
@@ -103,7 +105,11 @@ def amplification(method: Integrator, y: Floats, zeta: float, drag_zeta: float =
 
 
 def growth(method: Integrator, y: Floats, zeta: float, drag_zeta: float = 0.0) -> Floats:
-    """Return the largest factor of the amplitude in one step, (K,): the spectral radius."""
+    """Return the largest factor of the amplitude in one step, (K,): the spectral radius.
+
+    method: a method of integration; y: (K,) values of h w; zeta, drag_zeta: damping as fractions of critical damping
+    (see `amplification`).
+    """
     with np.errstate(all="ignore"):
         matrices = amplification(method, y, zeta, drag_zeta)
         matrices[~np.isfinite(matrices)] = 1e300
@@ -117,6 +123,8 @@ def growth(method: Integrator, y: Floats, zeta: float, drag_zeta: float = 0.0) -
 @functools.lru_cache(maxsize=1024)
 def limit(method: Integrator, zeta: float, drag_zeta: float = 0.0) -> float:
     """Return the largest stable h w, for damping as fractions of critical damping (see amplification).
+
+    method: a method of integration; zeta: damping of bonds and contacts; drag_zeta: of drag.
 
     inf: any h w is stable; 0: none is, as there is no damping and the method grows for arbitrarily small h w.
     """
@@ -242,6 +250,8 @@ def _stable_step(method: Integrator, square: float, damping: float, drag: float)
 def check_dt(scene: SceneView) -> None:
     """Warn if dt exceeds the largest stable step, naming limit and effect; raise ValueError if it must blow up.
 
+    scene: its effects and its method are read.
+
     Effects that act at times, or with bounded forces, do not make it blow up: see `Effect.always`.
     """
     suggestion = suggest_dt(scene)
@@ -289,6 +299,8 @@ def _blows_up(scene: SceneView, suggestion: Suggestion) -> bool:
 def contact_limit(method: Integrator) -> float:
     """Return the largest h w at which half an undamped oscillation is resolved.
 
+    method: a method of integration. w: the frequency of the contact, rad/s.
+
     Resolved means in at least STEPS steps, and with the same amplitude within OFF: explicit Euler multiplies it by
     (1 + y^2)^(pi / 2y), implicit Euler divides it, and both need 105 steps.
     """
@@ -306,7 +318,10 @@ def contact_limit(method: Integrator) -> float:
 
 
 def check_contact(scene: SceneView) -> None:
-    """Warn if contacts of bouncing bodies last too few steps, naming the limit and the consequence."""
+    """Warn if contacts of bouncing bodies last too few steps, naming the limit and the consequence.
+
+    scene: its effects and its method are read.
+    """
     for k, effect in enumerate(scene.effects):
         acting = effect if scene.obstacles else effect.without_obstacles()
         found = acting.rates(scene.groups, scene.dimension) if acting is not None and effect.contact else None
@@ -341,7 +356,10 @@ def _describe_consequence(scene: SceneView, frequency: float, agent: int) -> str
 
 
 def check_lookahead(scene: SceneView) -> None:
-    """Warn if a lookahead is shorter than the stopping distance V^2 m/(2 F) plus the radius."""
+    """Warn if a lookahead is shorter than the stopping distance V^2 m/(2 F) plus the radius.
+
+    scene: its behaviours are read.
+    """
     for k, effect in enumerate(scene.effects):
         behaviours = [(f"effects[{k}].behaviours[{j}]", each) for j, each in enumerate(effect.components)]
         group_index = getattr(effect, "group", None) if behaviours else None

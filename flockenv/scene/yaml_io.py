@@ -46,6 +46,8 @@ class ConfigError(ValueError):
 def load_scene(source: str | Path) -> Scene:
     """Return the scene of a YAML file or YAML text, see `load`, or of the name of a scene that ships, such as "boids".
 
+    source: as of `load`; a name without a folder also finds a scene that ships.
+
     A file of that name in the current folder comes first.
     """
     return load(source, Scene, bundled_scenes())
@@ -84,9 +86,9 @@ def schema(model: type[BaseModel] = Scene) -> dict[str, Any]:
 def load(source: str | Path, model: type[M], named: Mapping[str, Path] = MappingProxyType({})) -> M:
     """Return the `model` of a YAML file or text.
 
-    A Path names a file or a pipe, `-` standard input; so does a str, unless it contains a line break, a `: ` or a `{`:
-    then it is the text itself. named: files that also have a name. Raise ConfigError, one line per mistake, before
-    anything is built.
+    source: a Path names a file or a pipe, `-` standard input; so does a str, unless it contains a line break, a `: `
+    or a `{`: then it is the text itself. named: files that also have a name. Raise ConfigError, one line per mistake,
+    before anything is built.
     """
     name, text = _read(source, named)
     reader = _Reader(name, text)
@@ -224,7 +226,10 @@ _WORDS: dict[str, bool | None] = {"": None, "~": None, "null": None, "true": Tru
 
 
 def parse_scalar(text: str) -> str | int | float | bool | None:
-    """Return the value of an unquoted scalar; raise ValueError for an ambiguous one."""
+    """Return the value of an unquoted scalar; raise ValueError for an ambiguous one.
+
+    text: without the blanks around it.
+    """
     if text.lower() in _WORDS:
         return _WORDS[text.lower()]
     if re.fullmatch(r"[-+]?\.(inf|nan)", text, re.IGNORECASE):

@@ -126,7 +126,10 @@ def _running_shares(forces: Forces, budget: float) -> Shares:
 
 @law
 def blend(forces: Forces, weights: Vec, budget: float) -> Vec:
-    """Return the weighted sum, shortened to the budget (Reynolds 1999). Opposite forces cancel: +8 and -8 give 0."""
+    """Return the weighted sum, shortened to the budget (Reynolds 1999). Opposite forces cancel: +8 and -8 give 0.
+
+    forces: in one unit; weights: a number for each, without a unit; budget: the longest result.
+    """
     total = zero(forces[0])
     for k in range(len(forces)):
         total = add(total, scale(forces[k], weights[k]))
@@ -135,7 +138,10 @@ def blend(forces: Forces, weights: Vec, budget: float) -> Vec:
 
 @law
 def prioritise(forces: Forces, threshold: float, budget: float) -> Vec:
-    """Return the first force longer than the threshold, shortened to the budget; all others are ignored."""
+    """Return the first force longer than the threshold, shortened to the budget; all others are ignored.
+
+    forces: in order of priority, in one unit, as are threshold and budget, the longest result.
+    """
     return _total_share(forces, _first_share(forces, threshold, budget))
 
 

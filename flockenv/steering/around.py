@@ -33,6 +33,9 @@ def threat(forward: Vec, offset: Vec, clearance: float, lookahead: float) -> flo
 def avoid(forward: Vec, offset: Vec, clearance: float, max_speed: float) -> Vec:
     """Steer around a circle or sphere ahead (see `threat`): S = V sideways, away from its centre (Reynolds 1999).
 
+    forward: the unit vector of the heading; offset: to the centre, m; clearance: the sum of both radii, m; max_speed:
+    V, m/s.
+
     An obstacle dead ahead is passed on the right; an agent inside is steered straight out. The agent never brakes.
     """
     o = like(max_speed, 0.0)
@@ -54,6 +57,8 @@ def _clamp(x: float, low: float, high: float) -> float:
 @law
 def contain(to_low: Vec, to_high: Vec, velocity: Vec, max_speed: float, time: float) -> Vec:
     """Stay in a box: if the position after `time` [s] is outside, seek the nearest one inside, else return zero.
+
+    velocity: of the agent, m/s; max_speed: V, m/s.
 
     `to_low` and `to_high` are the distances to the lower and the upper wall per axis, m; negative beyond it
     (Reynolds 1999, containment).

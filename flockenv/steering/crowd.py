@@ -15,6 +15,8 @@ __all__ = ["explore", "give_way", "queue", "queue_gap", "unaligned_threat"]
 def unaligned_threat(offset: Vec, velocity: Vec, other_velocity: Vec, clearance: float, horizon: float) -> float:
     """Return the time of closest approach to a neighbour, s; inf if it is past, too late, or not near enough.
 
+    offset: to the neighbour, dx, m; velocity: of the agent, m/s; other_velocity: of the neighbour, m/s; horizon: s.
+
     t* = -dx . dv / |dv|^2, kept if 0 <= t* <= horizon and |dx + dv t*| < clearance, the sum of both radii and a margin
     (Reynolds 1999, unaligned collision avoidance; not twice the own radius). Both keep their velocities.
     """
@@ -31,6 +33,9 @@ def unaligned_threat(offset: Vec, velocity: Vec, other_velocity: Vec, clearance:
 def give_way(offset: Vec, velocity: Vec, other_velocity: Vec, time: float, max_speed: float) -> Vec:
     """Steer away from the predicted offset p of a neighbour at the closest approach: S = -V unit(p), m/s.
 
+    offset: to the neighbour, m; velocity: of the agent, m/s; other_velocity: its velocity, m/s; time: until the closest
+    approach, s; max_speed: V, m/s.
+
     p is perpendicular to the relative motion. So an agent that meets another head-on steers aside, one that crosses
     behind also brakes, and one that crosses in front also speeds up; the changes of the two are opposite. If p = 0,
     both keep right of the relative motion: of two that cross, the one on the other's right goes first.
@@ -46,6 +51,9 @@ def give_way(offset: Vec, velocity: Vec, other_velocity: Vec, time: float, max_s
 def queue_gap(direction: Vec, offset: Vec, other_velocity: Vec, clearance: float, max_speed: float) -> float:
     """Return the gap along a unit vector to a neighbour slower than the desired speed, m; inf if there is none.
 
+    direction: the unit vector; offset: to the neighbour, m; other_velocity: its velocity, m/s; clearance: the sum of
+    both radii, m; max_speed: the desired speed, m/s.
+
     A neighbour behind, beside the path, or as fast as the desired speed does not count (Reynolds 1999: near, ahead and
     slower).
     """
@@ -59,6 +67,8 @@ def queue_gap(direction: Vec, offset: Vec, other_velocity: Vec, clearance: float
 def queue(direction: Vec, velocity: Vec, gap: float, max_speed: float, headway: float) -> Vec:
     """Move in a `direction` as fast as the gap allows: S = direction min(V, gap / T) - v, m/s; T = headway [s].
 
+    velocity: of the agent, m/s; gap: to the agent ahead, m, or inf; max_speed: V, m/s.
+
     The brake of Reynolds 1999 in the form of Tordeux, Chraibi, Seyfried 2016 (doi 10.1007/978-3-319-33482-0_29): a gap
     closes as exp(-t / T), and 1 / (T + l / V) agents of length l pass per second. With a gain of k = 4 m / T or more no
     agent overshoots.
@@ -70,6 +80,8 @@ def queue(direction: Vec, velocity: Vec, gap: float, max_speed: float, headway: 
 @law
 def explore(to_low: Vec, to_high: Vec, velocity: Vec, max_speed: float, track: float) -> Vec:
     """Cover a rectangle endlessly along a closed comb of tracks, at most `track` [m] apart: S, m/s.
+
+    velocity: of the agent, m/s; max_speed: V, m/s.
 
     The loop leads to and fro along an even number of rows from the lower wall to the upper, and back down beside the
     left wall; in 3-D each agent keeps its height. Direction is a function of position alone, so a displaced agent

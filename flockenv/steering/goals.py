@@ -23,13 +23,19 @@ __all__ = [
 
 @law
 def seek(offset: Vec, velocity: Vec, max_speed: float) -> Vec:
-    """Head for a point at full speed: S = V unit(offset) - v, m/s (Reynolds 1999)."""
+    """Head for a point at full speed: S = V unit(offset) - v, m/s (Reynolds 1999).
+
+    offset: to the point, m; velocity: of the agent, m/s; max_speed: V, m/s.
+    """
     return sub(scale(unit(offset), max_speed), velocity)
 
 
 @law
 def flee(offset: Vec, velocity: Vec, max_speed: float) -> Vec:
-    """Head away from a point at full speed; exactly at it, keep the present direction (Reynolds 1999)."""
+    """Head away from a point at full speed; exactly at it, keep the present direction (Reynolds 1999).
+
+    offset: to the point, m; velocity: of the agent, m/s; max_speed: V, m/s.
+    """
     away = scale(unit(offset), -max_speed)
     onward = scale(unit(velocity), max_speed)
     return sub(select(dot(offset, offset) > like(max_speed, 0.0), away, onward), velocity)
@@ -38,6 +44,8 @@ def flee(offset: Vec, velocity: Vec, max_speed: float) -> Vec:
 @law
 def arrive(offset: Vec, velocity: Vec, max_speed: float, slow_radius: float) -> Vec:
     """Seek, slowing down linearly within slow_radius [m] to a stop at the point (Reynolds 1999).
+
+    offset: to the point, m; velocity: of the agent, m/s; max_speed: V, m/s.
 
     This is feasible if slow_radius >= V^2 m / F_max: the ramp requires that deceleration at its edge.
     """
@@ -60,6 +68,8 @@ def wander_turn(target: Vec, noise: Vec, rate: float, dt: float) -> Vec:
 def to_world_axes(own: Vec, velocity: Vec) -> Vec:
     """Return in world axes a vector given in those of an agent at this velocity: (forward, left[, up]).
 
+    own: a vector in any unit; velocity: of the agent, m/s.
+
     Left is level unless the agent flies straight up; at standstill forward is the x axis.
     """
     moving = unit(velocity)
@@ -76,6 +86,8 @@ def to_world_axes(own: Vec, velocity: Vec) -> Vec:
 def wander(target: Vec, velocity: Vec, max_speed: float, ahead: float) -> Vec:
     """Seek the target on a unit sphere whose centre is `ahead` (in its radii) of the agent (Reynolds 1999).
 
+    velocity: of the agent, m/s; max_speed: V, m/s.
+
     `target` is in the agent's own frame: (forward, left) or (forward, left, up). At standstill, forward is the x axis.
     """
     goal = add(to_world_axes(target, velocity), to_world_axes(scale(axis(target, 0), ahead), velocity))
@@ -84,13 +96,19 @@ def wander(target: Vec, velocity: Vec, max_speed: float, ahead: float) -> Vec:
 
 @law
 def match_velocity(velocity: Vec, target_velocity: Vec) -> Vec:
-    """Take on a velocity: S = v_t - v, m/s (Reynolds 1987)."""
+    """Take on a velocity: S = v_t - v, m/s (Reynolds 1987).
+
+    velocity: of the agent, m/s; target_velocity: m/s.
+    """
     return sub(target_velocity, velocity)
 
 
 @law
 def target_speed(velocity: Vec, speed: float) -> Vec:
-    """Take on a speed in the present direction: S = (v_t - |v|) unit(v), m/s; 0 at standstill."""
+    """Take on a speed in the present direction: S = (v_t - |v|) unit(v), m/s; 0 at standstill.
+
+    velocity: of the agent, m/s; speed: v_t, m/s.
+    """
     return scale(unit(velocity), speed - norm(velocity))
 
 
@@ -114,6 +132,9 @@ def dock(
     offset: Vec, velocity: Vec, direction: Vec, max_speed: float, gate: float, width: float, slow_radius: float
 ) -> Vec:
     """Arrive at a point while flying in a `direction`: through a gate `gate` [m] before it, then along its axis.
+
+    offset: to the point, m; velocity: of the agent, m/s; direction: a unit vector; max_speed: V, m/s; slow_radius: m,
+    as of `arrive`.
 
     In a cone about the axis, with its tip at the point and radius `width` [m] at the gate, the agent aims at the axis
     half-way to the point: its distance from the axis falls as the square of the distance to go, its angle linearly.

@@ -19,6 +19,9 @@ def sheep_direction(
 ) -> Vec:  # fmt: skip
     """Return the direction of a sheep, unit(h unit(v) + c unit(C) + rho_a unit(R_a) + rho_s unit(R_s) + e noise).
 
+    velocity: v, m/s; centre: C, m; crowd: R_a; away: R_s; noise: a vector; inertia: h; attraction: c; apart: rho_a;
+    fear: rho_s; error: e.
+
     C leads to the centre of the sheep around it, R_a and R_s are sums of unit vectors away from sheep that are too near
     and from dogs (Strombom et al. 2014, H'; there h = 0.5, c = 1.05, rho_a = 2, rho_s = 1, e = 0.3). 0 if all terms are
     0.

@@ -49,13 +49,18 @@ ONE_PLACE = 1e-30
 
 @law
 def distance_time(offset: Vec, max_speed: float, factor: float) -> float:
-    """Predict by distance: T = factor |offset| / V, s. The simplest predictor of Reynolds 1999."""
+    """Predict by distance: T = factor |offset| / V, s. The simplest predictor of Reynolds 1999.
+
+    offset: to the other, m; max_speed: V, m/s; factor: a number >= 0.
+    """
     return factor * norm(offset) / max_speed
 
 
 @law
 def interception_time(offset: Vec, quarry_velocity: Vec, max_speed: float) -> float:
     """Predict exactly: the first time at which a pursuer at full speed V can meet the quarry, s.
+
+    offset: to the quarry, m; quarry_velocity: m/s; max_speed: V, m/s.
 
     Smallest t > 0 of (w.w - V^2) t^2 + 2 p.w t + p.p = 0 with p = offset, w = quarry velocity, computed without
     cancellation; |p|/V if no interception exists.
@@ -91,6 +96,8 @@ def cosine_sector(x: float) -> float:
 def opensteer_time(offset: Vec, velocity: Vec, quarry_velocity: Vec, longest: float) -> float:
     """Predict as OpenSteer does: T = k |offset| / |v|, s, at most `longest` [s].
 
+    offset: to the quarry, m; velocity: of the agent, m/s; quarry_velocity: m/s.
+
     k for a quarry ahead: 4 on a parallel course, 1.8 across, 0.85 opposite; beside: 1, 0.8, 4; behind: 0.5, 2, 2.
     """
     forward = unit(velocity)
@@ -106,13 +113,19 @@ def opensteer_time(offset: Vec, velocity: Vec, quarry_velocity: Vec, longest: fl
 
 @law
 def pursue(offset: Vec, velocity: Vec, quarry_velocity: Vec, max_speed: float, time: float) -> Vec:
-    """Seek where the quarry will be after `time` [s], which a predictor returns (Reynolds 1999)."""
+    """Seek where the quarry will be after `time` [s], which a predictor returns (Reynolds 1999).
+
+    offset: to the quarry, m; velocity: of the agent, m/s; quarry_velocity: m/s; max_speed: V, m/s.
+    """
     return seek(add(offset, scale(quarry_velocity, time)), velocity, max_speed)
 
 
 @law
 def evade(offset: Vec, velocity: Vec, pursuer_velocity: Vec, max_speed: float, time: float) -> Vec:
-    """Flee from where the pursuer will be after `time` [s] (Reynolds 1999)."""
+    """Flee from where the pursuer will be after `time` [s] (Reynolds 1999).
+
+    offset: to the pursuer, m; velocity: of the agent, m/s; pursuer_velocity: m/s; max_speed: V, m/s.
+    """
     return flee(add(offset, scale(pursuer_velocity, time)), velocity, max_speed)
 
 
@@ -125,6 +138,8 @@ def push_off(offset: Vec, square: float) -> Vec:
 @law
 def separate(offset: Vec, tie: Vec) -> Vec:
     """Return the push of a neighbour: away from it, weighted 1/distance, 1/m (Reynolds 1999). Sum over neighbours.
+
+    offset: to the other, m.
 
     `tie` is the direction if the two coincide, a unit vector that is opposite for the other one.
     """
@@ -139,13 +154,19 @@ def separate_at(offset: Vec, square: float, tie: Vec) -> Vec:
 
 @law
 def align(velocity: Vec, mean_velocity: Vec) -> Vec:
-    """Take on the neighbours' mean velocity: S = mean(v_j) - v, m/s (Reynolds 1999: the average, not the sum)."""
+    """Take on the neighbours' mean velocity: S = mean(v_j) - v, m/s (Reynolds 1999: the average, not the sum).
+
+    velocity: of the agent, m/s; mean_velocity: of the neighbours, m/s.
+    """
     return sub(mean_velocity, velocity)
 
 
 @law
 def cohere(mean_offset: Vec, velocity: Vec, max_speed: float) -> Vec:
-    """Seek the neighbours' centre, at `mean_offset` [m] (Reynolds 1999); return zero if the offset is zero."""
+    """Seek the neighbours' centre, at `mean_offset` [m] (Reynolds 1999); return zero if the offset is zero.
+
+    velocity: of the agent, m/s; max_speed: V, m/s.
+    """
     found = dot(mean_offset, mean_offset) > like(max_speed, 0.0)
     return select(found, seek(mean_offset, velocity, max_speed), zero(velocity))
 
@@ -153,6 +174,8 @@ def cohere(mean_offset: Vec, velocity: Vec, max_speed: float) -> Vec:
 @law
 def passing_point(offset: Vec, velocity: Vec, distance: float) -> Vec:
     """Return the offset of the point beside a neighbour, `distance` [m] from it towards this agent's path, to pass it.
+
+    offset: to the other, m; velocity: of the agent, m/s.
 
     Seen from the neighbour it is perpendicular to the path; a neighbour dead ahead is passed on the right.
     """
@@ -169,6 +192,8 @@ def offset_pursue(
 ) -> Vec:
     """Pass the quarry at a distance [m]: seek a point beside its predicted position, on this side (Reynolds 1999).
 
+    offset: to the quarry, m; velocity: of the agent, m/s; quarry_velocity: m/s; max_speed: V, m/s; time: s.
+
     The distance is exact if `time` is predicted for the passing point, not for the quarry.
     """
     there = add(offset, scale(quarry_velocity, time))
@@ -180,6 +205,9 @@ def keep_station(
     offset: Vec, velocity: Vec, leader_velocity: Vec, place: Vec, max_speed: float, slow_radius: float
 ) -> Vec:
     """Arrive at a place in a leader's frame, (forward, left[, up]) in m, and keep it: a formation.
+
+    offset: to the leader, m; velocity: of the agent, m/s; leader_velocity: m/s; max_speed: V, m/s; slow_radius: m, from
+    which on the agent slows down.
 
     v_d = v_L + V min(1, d / slow_radius) towards the place, at most V. An agent that arrives at the predicted place,
     as in offset pursuit (Reynolds 1999), has v_d = 0 there and lags behind a moving leader.
@@ -201,6 +229,9 @@ def follow_leader(
     slow_radius: float,
 ) -> Vec:
     """Keep station `behind` a leader [m]; an agent in the box in front of the leader moves out sideways.
+
+    offset: to the leader, m; velocity: of the agent, m/s; leader_velocity: m/s; max_speed: V, m/s; slow_radius: m, as
+    of `arrive`.
 
     The box is `ahead` long and `aside` to each side [m]; on its axis agents move to the leader's right
     (Reynolds 1999). Separation keeps neighbours apart.
@@ -230,6 +261,9 @@ def interpose(
 ) -> Vec:
     """Arrive between two others: at the predicted point a fraction `share` from a to b (Reynolds 1999).
 
+    offset_a, offset_b: to the two others, m; velocity_a, velocity_b: theirs, m/s; velocity: of the agent, m/s; share: 0
+    to 1; max_speed: V, m/s; slow_radius: m, as of `arrive`.
+
     Both are extrapolated over the time to get between them at full speed.
     """
     now = add(offset_a, scale(sub(offset_b, offset_a), share))
@@ -243,6 +277,9 @@ def shadow(
     offset: Vec, velocity: Vec, quarry_velocity: Vec, max_speed: float, distance: float, band: float, time: float
 ) -> Vec:
     """Pursue beyond `distance` + `band` [m], match speed and heading within `distance`, and mix both in between.
+
+    offset: to the quarry, m; velocity: of the agent, m/s; quarry_velocity: m/s; max_speed: V, m/s; time: s, which a
+    predictor returns.
 
     The shares change linearly over the band. Reynolds 1999 switches, which would need hysteresis and so a memory.
     """

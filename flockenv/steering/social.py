@@ -39,6 +39,8 @@ NO_SIDE = 1e-14
 def gaze_direction(aim: Vec, heading: Vec) -> Vec:
     """Return the direction in which an agent looks: its aim, else its velocity; 0 if it has neither.
 
+    aim: the desired direction, or 0; heading: the unit vector of the velocity, or 0.
+
     The length is arbitrary: laws use the direction alone.
     """
     return select(dot(aim, aim) > like(aim[0], 0.0), aim, heading)
@@ -47,6 +49,8 @@ def gaze_direction(aim: Vec, heading: Vec) -> Vec:
 @law
 def view_weight(direction: Vec, offset: Vec, least: float) -> float:
     """Return lambda + (1 - lambda)(1 + cos phi) / 2: 1 straight ahead, lambda behind.
+
+    least: lambda, 0 to 1.
 
     phi lies between `direction` and `offset`, which leads to the other (Johansson, Helbing and Shukla 2007: cos phi is
     -n . e with n from the other to me). Without a direction, or if both are in one place, it is 1.
@@ -61,6 +65,8 @@ def view_weight(direction: Vec, offset: Vec, least: float) -> float:
 @law
 def cone_weight(direction: Vec, force: Vec, cosine: float, outside: float) -> float:
     """Return 1 if the source of a repulsive `force` is within the field of view, else `outside`; 1 without a direction.
+
+    direction: e, a unit vector, or 0; cosine: cos phi; outside: c, 0 to 1.
 
     w = 1 if e . (-f) >= |f| cos phi, else c; 2 phi is the full angle (Helbing and Molnar 1995, equation 8).
     """
@@ -85,6 +91,8 @@ def unit_away(offset: Vec, tie: Vec) -> tuple[Vec, float]:
 def repulsion(offset: Vec, tie: Vec, size: float, decay: float) -> Vec:
     """Return exp((size - d) / B) away from the other; `size` is the sum of both radii, or 0 (of distances alone).
 
+    offset: to the other, m; tie: the direction for two in one place; decay: B, m.
+
     Helbing, Farkas and Vicsek 2000; the circular specification of Johansson, Helbing and Shukla 2007.
     """
     away, distance = unit_away(offset, tie)
@@ -94,6 +102,8 @@ def repulsion(offset: Vec, tie: Vec, size: float, decay: float) -> Vec:
 @law
 def elliptical_repulsion(offset: Vec, step: Vec, tie: Vec, decay: float) -> Vec:
     """Return -B grad exp(-b / B), away from the other and from the end of its `step` y; times A: an acceleration.
+
+    offset: to the other, m; tie: a unit vector; decay: B, m.
 
     b = sqrt((|d| + |d - y|)^2 - |y|^2) / 2 is the smaller half axis of the ellipse through this agent i with foci at
     the other agent j and at the end of its step, d from j to i. y is the step of j, v_j dt (Helbing and Molnar 1995;
@@ -133,6 +143,9 @@ def sidestep(
     importance: float, gamma: float, angular: float, forward: float, bias: float,
 ) -> Vec:  # fmt: skip
     """Slow down before a neighbour and turn to one side of it; times A: an acceleration.
+
+    offset: to the neighbour j, m; velocity: v_i, m/s; other_velocity: v_j, m/s; tie: the direction e for two in one
+    place.
 
     D = lambda (v_i - v_j) + e, with e from i to j, t = unit(D), B = gamma |D|; theta is the angle from t to e in
     (-pi, pi], positive if j is to the left of t; -exp(-d / B - (n' B theta)^2) along t, and away from the side of j,
@@ -181,6 +194,8 @@ def _side_and_angle(towards: Vec, t: Vec) -> tuple[Vec, float]:
 def attraction(offset: Vec, decay: float) -> Vec:
     """Return exp(-d / B) towards a place; times A it is the pull of a potential that grows to A B far away.
 
+    offset: to the place, m; d is its length; decay: B, m.
+
     Helbing and Molnar 1995 have such a potential, W(d, t), without a formula; this one is ours.
     """
     return scale(unit(offset), exp(-norm(offset) / decay))
@@ -189,6 +204,8 @@ def attraction(offset: Vec, decay: float) -> Vec:
 @law
 def gaze_turn(heading: Vec, offset: Vec, half: float) -> float:
     """Return the angle by which the head must turn to see what is at `offset`, rad: the part beyond `half` the view.
+
+    heading: the unit vector of the direction in which the agent looks, or 0; half: half the field of view, rad.
 
     Moussaid et al. 2010, alpha of the gaze; 0 at standstill.
     """
@@ -205,6 +222,9 @@ def gaze_turn(heading: Vec, offset: Vec, half: float) -> float:
 @law
 def collision_distance(direction: Vec, offset: Vec, other_velocity: Vec, clearance: float, speed: float) -> float:
     """Return the free distance along a unit vector at `speed` until contact with a moving neighbour, m; or inf.
+
+    direction: the unit vector e; offset: to the neighbour, m; other_velocity: its velocity, m/s; clearance: the sum of
+    both radii, m; speed: v, m/s.
 
     The smallest t >= 0 with |x_j + v_j t - v t e| = clearance, times v; e the direction (f(alpha) of Moussaid, Helbing
     and Theraulaz 2011); 0 for two that overlap and approach.

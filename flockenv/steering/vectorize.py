@@ -84,7 +84,10 @@ def _rank(python: Any, name: str, annotation: Any) -> int:
 
 @entry_of
 def loop_of(law: Law, tails: tuple[tuple[int, ...], ...], dimension: int) -> Callable[..., None]:
-    """Return the loop of a law over rows of arrays (R, *tail), into (R, dimension), or (R,) if that is 0."""
+    """Return the loop of a law over rows of arrays (R, *tail), into (R, dimension), or (R,) if that is 0.
+
+    law: a law of one agent; tails: the shape of a row of each of its arguments, () for numbers.
+    """
     arguments = _arguments(tails)
 
     def over(arrays: Any, out: Any) -> None:

@@ -36,8 +36,8 @@ class Cost(NamedTuple):
     """A difference of measured times, us per step: the median over rounds and its 95 % interval."""
 
     median: float
-    low: float
-    high: float
+    low: float  # lower end
+    high: float  # upper end
 
     @classmethod
     def of(cls, differences: NDArray[np.float64]) -> Cost:
@@ -78,8 +78,8 @@ class Row:
 class Explanation:
     """Cost of one step of one world, by effect."""
 
-    scene: Scene
-    rows: tuple[Row, ...]
+    scene: Scene  # whose step it is
+    rows: tuple[Row, ...]  # an effect each
     step: float  # us, a whole step
     rest: float  # us, a step without any effect: integrator, limits, confinement, constraints, population
     shared: Cost  # not saved by removing any single effect: the neighbour query and the pass that several share
@@ -119,6 +119,8 @@ def explain(
 ) -> Explanation:
     """Measure the cost of each effect, from a state on (default: the start with seed 0), leaving out one at a time.
 
+    scene: whose effects are measured.
+
     All variants are timed in turn, ROUNDS times. A cost is the median over the rounds of the difference within a round,
     with its 95 % interval: a disturbance that lasts affects both variants. The interval does not cover differences
     between processes, nor the place of compiled code in memory: a cost may be below 0. `progress` is called with the
@@ -142,7 +144,10 @@ def explain(
 
 
 def variants_of(scene: Scene) -> list[tuple[Effect, ...]]:
-    """Return the lists of effects that are timed: all, all but one, for each of them, and none."""
+    """Return the lists of effects that are timed: all, all but one, for each of them, and none.
+
+    scene: whose effects are left out in turn.
+    """
     effects = scene.effects
     return [effects, *(effects[:k] + effects[k + 1 :] for k in range(len(effects))), ()]
 

@@ -109,6 +109,9 @@ def survey(
 ) -> Survey:  # fmt: skip
     """Return the measures of a run that apply to its scene.
 
+    trajectory: the run, by `record`; scope: the line, the areas and the time that count; `progress` is called with the
+    number of parts done, of six.
+
     A KeyboardInterrupt ends it early: the measures so far are returned, with `stopped` = "interrupted".
     """
     run = _Run.of(trajectory, scope)
@@ -350,6 +353,9 @@ def _bodies(run: _Run) -> Part:
 
 
 def mean_measures(found: Sequence[Survey]) -> dict[str, m.Mean]:
-    """Return the mean of every measure over runs, with its 95 % interval."""
+    """Return the mean of every measure over runs, with its 95 % interval.
+
+    found: a survey of each run.
+    """
     names = [name for name in UNITS if any(name in each.values for each in found)]
     return {name: m.mean_of_runs([each.values.get(name, np.nan) for each in found]) for name in names}

@@ -41,8 +41,8 @@ FORMAT = 1
 class Trajectory:
     """T instants of one world, the first at the start and the last where the run ended."""
 
-    scene: Scene
-    seed: int
+    scene: Scene  # that was run
+    seed: int  # of the run
     step: NDArray[np.int64]  # (T,) physics steps since the start; time = step dt
     pos: Floats  # (T, N, D) m
     vel: Floats  # (T, N, D) m/s
@@ -75,7 +75,10 @@ class Trajectory:
         return {name: (start[name], end[name]) for name in start}
 
     def snapshots(self, title: str = "") -> Iterator[Snapshot]:
-        """Return every instant, ready to be drawn, all in one frame: the space, or the box of all positions."""
+        """Return every instant, ready to be drawn, all in one frame: the space, or the box of all positions.
+
+        title: text above each picture.
+        """
         times = (self.step * self.scene.dt).tolist()
         low, high = _region(self.scene, self.pos, self.alive, times)
         start = replace(
@@ -148,6 +151,8 @@ def record(
     scene: Scene, seed: int, steps: int, every: int, progress: Callable[[int], None] = lambda done: None
 ) -> Trajectory:
     """Run a scene for `steps` physics steps and keep an instant every `every` steps, and the last one.
+
+    seed: of the start and of all random numbers of the run.
 
     progress is called with the steps done, first with 0 once the scene is compiled. A KeyboardInterrupt, or a position
     that is no longer finite, ends the run early: the instants until then are returned, and `stopped` has the reason.
@@ -248,7 +253,10 @@ def _count_instants(scene: Scene, steps: int, every: int) -> int:
 
 
 def whole_steps(name: str, seconds: float, dt: float, least: int = 0) -> int:
-    """Return the number of steps of dt in a time; raise ValueError, with the nearest times, if it is not an integer."""
+    """Return the number of steps of dt in a time; raise ValueError, with the nearest times, if it is not an integer.
+
+    name: of the time in the message; seconds: the time, s; dt: s; least: the smallest number that is allowed.
+    """
     if not (math.isfinite(seconds) and seconds >= 0):
         raise ValueError(f"{name} = {seconds:g}: must be a finite number of seconds >= {least * dt:g}")
     if seconds / dt > 2**53:

@@ -49,9 +49,9 @@ MARKS: dict[Verdict, str] = {"pass": "ok", "reported": "", "fails": "FAILS"}
 class Value:
     """Result of a case, and whether it is within its bound; `holds` is None without a bound: it is only reported."""
 
-    number: float
+    number: float  # what the case measures, in the unit of its bound
     holds: bool | None
-    note: str = ""
+    note: str = ""  # remark beside the number
     series: Mapping[str, Sequence[float]] = field(default_factory=dict)
     """Data for pictures."""
 
@@ -64,7 +64,7 @@ class Case:
     """
 
     name: str
-    title: str
+    title: str  # what happens in it
     bound: str
     trial: Callable[[Any], Value]
     only: tuple[str, ...] = ()
@@ -74,7 +74,10 @@ class Case:
         return _find_case, (self.trial.__module__.rpartition(".")[0], self.name)
 
     def runs_under(self, name: str) -> bool:
-        """Return True if the case is run under this method or model."""
+        """Return True if the case is run under this method or model.
+
+        name: of the method or model.
+        """
         return not self.only or name in self.only
 
 
@@ -94,7 +97,10 @@ class Finding(ResultRecord):
     )
 
     def cell(self, digits: int = 2) -> str:
-        """Return value and verdict, short."""
+        """Return value and verdict, short.
+
+        digits: significant ones of the value.
+        """
         number = "" if self.value is None else f"{self.value:.{digits}g} "
         return f"{number}{MARKS.get(self.verdict, self.verdict)}".strip() or "-"
 
@@ -116,16 +122,25 @@ class Results(ResultRecord):
         return list(dict.fromkeys(f.case for f in self.findings))
 
     def only(self, cases: Collection[str], unders: Collection[str]) -> Results:
-        """Return the findings of some cases under some methods or models."""
+        """Return the findings of some cases under some methods or models.
+
+        cases, unders: their names.
+        """
         found = tuple(f for f in self.findings if f.case in cases and f.under in unders)
         return self.model_copy(update={"findings": found})
 
     def at(self, case: str, under: str) -> Finding | None:
-        """Return one finding; None if that case was not run."""
+        """Return one finding; None if that case was not run.
+
+        case, under: their names.
+        """
         return next((f for f in self.findings if (f.case, f.under) == (case, under)), None)
 
     def rows(self, digits: int = 2) -> list[list[str]]:
-        """Return the table: a row for each case, a column for each method or model."""
+        """Return the table: a row for each case, a column for each method or model.
+
+        digits: significant ones of each value.
+        """
         out = []
         for case in self.cases:
             found = [self.at(case, under) for under in self.unders]
@@ -149,7 +164,10 @@ def select_cases(cases: Sequence[Case], names: Sequence[str]) -> tuple[Case, ...
 
 
 def trials(cases: Sequence[Case], unders: Collection[str]) -> int:
-    """Return the number of trials of these cases under these methods or models."""
+    """Return the number of trials of these cases under these methods or models.
+
+    unders: the names of the methods or models.
+    """
     return sum(case.runs_under(name) for case in cases for name in unders)
 
 
@@ -164,6 +182,8 @@ def run(
     engine: Engine | None = None,
 ) -> Results:
     """Run every case under every method or model in `unders`, by name; return these findings with the known ones.
+
+    cases: each with its name and its trial; sources: digest of the code on which findings depend.
 
     A case with names in `only` is run under no others. `warning_kinds` lead to the verdict "warned".
     Known findings from the same sources are kept and not run again; those from other sources are dropped. `progress`

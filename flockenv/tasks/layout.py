@@ -23,12 +23,12 @@ THINGS = ("food", "obstacles")
 class Slot:
     """Consecutive numbers of a row, in this shape, each the quantity divided by `scale`."""
 
-    name: str
+    name: str  # of the quantity
     shape: tuple[int, ...]  # (2,) a vector, (6, 2) six vectors, () a number
     scale: float  # row value = quantity / scale, clipped to [low, 1]
-    unit: str
-    meaning: str
-    low: float = -1.0
+    unit: str  # of the quantity, such as m/s
+    meaning: str  # of the quantity, for pages
+    low: float = -1.0  # lower bound of a row value: -1 or 0
     entity: str = ""  # kind of agent or obstacle that each entry of the first axis describes; zeros: there is none
     nearest: bool = False  # all its numbers describe the first entity of that kind
 

@@ -122,7 +122,10 @@ class Task(Record):
             TASKS[cls.name] = cls
 
     def model_post_init(self, context: Any) -> None:
-        """Raise ValueError if control_dt is no integer multiple of dt, or the integrator solves equations in Python."""
+        """Raise ValueError if control_dt is no integer multiple of dt, or the integrator solves equations in Python.
+
+        context: of pydantic; not used.
+        """
         if self.integrator.solves:
             allowed = ", ".join(kind for kind, method in INTEGRATORS.items() if not method.solves)
             solves = "solves equations in Python, while a task plays in one kernel"
@@ -217,21 +220,32 @@ class Task(Record):
         return {n: float(v) for n, v in numbers.items() if isinstance(v, (int, float))}
 
     def marks(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[Mark, ...]:
-        """Return the marks of a picture, such as goals."""
+        """Return the marks of a picture, such as goals.
+
+        state: of all worlds; memory: (B, M, N), as of World.memory; world: index of the world shown.
+        """
         return ()
 
     def roles(self, state: State, memory: NDArray[np.float64], world: int) -> tuple[str, ...]:
-        """Return the role of each agent of a world in pictures, (N,) of snapshot.ROLES; constant over an episode."""
+        """Return the role of each agent of a world in pictures, (N,) of snapshot.ROLES; constant over an episode.
+
+        state: of all worlds; memory: (B, M, N), as of World.memory; world: index of the world.
+        """
         return self.scene.roles
 
     def own_success(self, state: State, memory: NDArray[Any], alive: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
         """Return whether each learner, (B, L), does by itself what all must do for success; None if all do it together.
+
+        state: after the step.
 
         memory: (B, M, N), as of World.memory; alive: (B, L), after the step.
         """
         return None
 
     def view(self, state: State, world: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Return the region that a picture shows, m."""
+        """Return the region that a picture shows, m.
+
+        state: of all worlds; world: index of the world shown.
+        """
         d = self.scene.dimension
         return (0.0,) * d, self.scene.space.extent(d)

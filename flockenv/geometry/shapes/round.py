@@ -15,13 +15,19 @@ __all__ = ["blocks", "gap", "normal", "ray_hit", "silhouette", "touched_normal"]
 
 @law
 def gap(offset: Vec, radius: float) -> float:
-    """Return the distance to the surface of a circle or sphere, m; negative inside."""
+    """Return the distance to the surface of a circle or sphere, m; negative inside.
+
+    offset: from the agent to the centre, m; radius: m.
+    """
     return norm(offset) - radius
 
 
 @law
 def normal(offset: Vec) -> Vec:
-    """Return the outward unit normal at the nearest point of the surface; the x axis if at the centre."""
+    """Return the outward unit normal at the nearest point of the surface; the x axis if at the centre.
+
+    offset: from the agent to the centre, m.
+    """
     outside = dot(offset, offset) > like(offset[0], 0.0)
     return select(outside, scale(unit(offset), like(offset[0], -1.0)), axis(offset, 0))
 
@@ -29,6 +35,8 @@ def normal(offset: Vec) -> Vec:
 @law
 def ray_hit(offset: Vec, direction: Vec, radius: float) -> float:
     """Return the distance along a unit `direction` to the surface, m: 0 from inside, inf if missed.
+
+    offset: from the agent to the centre, m; radius: m.
 
     It is computed as c / (b + sqrt(b^2 - c)), without cancellation for grazing rays.
     """
@@ -43,7 +51,10 @@ def ray_hit(offset: Vec, direction: Vec, radius: float) -> float:
 
 @law
 def touched_normal(offset: Vec, direction: Vec, hit: float) -> Vec:
-    """Return the outward unit normal where a ray hits after `hit` m; if it misses, at the nearest point."""
+    """Return the outward unit normal where a ray hits after `hit` m; if it misses, at the nearest point.
+
+    offset: from the agent to the centre, m; direction: of the ray, a unit vector.
+    """
     o = like(hit, 0.0)
     there = (hit > o) & (hit < like(hit, np.inf))
     return normal(sub(offset, scale(direction, hit if there else o)))
@@ -51,7 +62,10 @@ def touched_normal(offset: Vec, direction: Vec, hit: float) -> Vec:
 
 @law
 def blocks(offset: Vec, radius: float, to: Vec) -> bool:
-    """Return True if a circle or sphere intersects the straight line to `to`, an offset in m."""
+    """Return True if a circle or sphere intersects the straight line to `to`, an offset in m.
+
+    offset: from the agent to the centre, m; radius: m.
+    """
     o, e = like(radius, 0.0), like(radius, 1.0)
     length = dot(to, to)
     along = dot(offset, to)
@@ -64,6 +78,8 @@ def blocks(offset: Vec, radius: float, to: Vec) -> bool:
 @law
 def silhouette(offset: Vec, radius: float, toward: Vec) -> Vec:
     """Return the point of the silhouette, as seen from the agent, on the side `toward`; an offset in m.
+
+    offset: from the agent to the centre, m; radius: m.
 
     The silhouette of a circle or sphere at distance d is where lines from the agent touch it: at sqrt(d^2 - r^2) from
     the agent. `toward` is any vector not parallel to the offset; from inside, the nearest surface point is returned.

@@ -158,14 +158,23 @@ class Shape(Record):
 
     @abstractmethod
     def row(self, dimension: int) -> Sequence[float] | Floats:
-        """Return the numbers of the form, which follow the row header."""
+        """Return the numbers of the form, which follow the row header.
+
+        dimension: 2 or 3.
+        """
 
     @abstractmethod
     def polygons(self, low: Floats, high: Floats) -> list[Floats]:
-        """Return the polygons, each (n, 2) m, of the solid in a region, as seen from above."""
+        """Return the polygons, each (n, 2) m, of the solid in a region, as seen from above.
+
+        low, high: (2,) m, corners of the region.
+        """
 
     def outline(self, low: Floats, high: Floats) -> list[Floats]:
-        """Return the polygons, each (n, 2) m, of the shape in a region from above; only its edge if it is hollow."""
+        """Return the polygons, each (n, 2) m, of the shape in a region from above; only its edge if it is hollow.
+
+        low, high: (2,) m, corners of the region.
+        """
         whole = self.polygons(low, high)
         return [outlines.band(each, 0.004 * float((high - low).max())) for each in whole] if self.is_hollow else whole
 
@@ -174,20 +183,31 @@ class Shape(Record):
         return nearest(self, points)[0]
 
     def normal(self, points: ArrayLike) -> Floats:
-        """Return the unit normal out of the solid at the nearest point of the surface, (..., D)."""
+        """Return the unit normal out of the solid at the nearest point of the surface, (..., D).
+
+        points: (..., D) m.
+        """
         return nearest(self, points)[1]
 
     def nearest(self, points: ArrayLike) -> Floats:
-        """Return the nearest point of the surface, (..., D) m."""
+        """Return the nearest point of the surface, (..., D) m.
+
+        points: (..., D) m.
+        """
         gap, normal = nearest(self, points)
         return np.asarray(points, float) - gap[..., None] * normal
 
     def inside(self, points: ArrayLike) -> np.ndarray[Any, np.dtype[np.bool_]]:
-        """Return True for each point inside the shape, (...) bool."""
+        """Return True for each point inside the shape, (...) bool.
+
+        points: (..., D) m.
+        """
         return np.asarray(self.gap(points) < 0)
 
     def hit(self, points: ArrayLike, directions: ArrayLike, clearance: ArrayLike = 0.0) -> Floats:
         """Return the distance along unit directions at which a body of radius `clearance` touches, (...) m, or inf.
+
+        points: (..., D) m, where the rays begin; directions: (..., D) unit vectors; clearance: m.
 
         It is exact at every angle, as the ray is cast at the shape inflated by the body's radius.
         """

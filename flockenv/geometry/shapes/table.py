@@ -45,6 +45,8 @@ def pack_shapes(
 ) -> tuple[Floats, dict[str, tuple[int, int]]]:
     """Return the table of some shapes, numbered from `first`, and (first index, number of rows) of each form.
 
+    dimension: 2 or 3.
+
     period: the edges of a torus, m, across which walls may be joined.
     """
     rows: list[Floats] = []

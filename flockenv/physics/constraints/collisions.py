@@ -115,7 +115,10 @@ class Collisions(Constraint):
         return _Settler(self, scene)
 
     def finder(self, scene: SceneView) -> Finder | None:
-        """Return a function that finds the contacts with obstacles at the beginning of a step; None without any."""
+        """Return a function that finds the contacts with obstacles at the beginning of a step; None without any.
+
+        scene: that has this constraint.
+        """
         settler = _Settler(self, scene)
         return settler.find if len(settler.things.row) else None
 

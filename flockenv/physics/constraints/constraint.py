@@ -48,9 +48,15 @@ class Constraint(Record):
         return ()
 
     def numbers(self, scene: SceneView) -> int:
-        """Return the scratch memory, in numbers per agent."""
+        """Return the scratch memory, in numbers per agent.
+
+        scene: that has this constraint.
+        """
         return 0
 
     @abstractmethod
     def settler(self, scene: SceneView) -> Settler:
-        """Return a function that corrects a step, with scratch memory of its own."""
+        """Return a function that corrects a step, with scratch memory of its own.
+
+        scene: that has this constraint.
+        """

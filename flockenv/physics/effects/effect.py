@@ -116,7 +116,7 @@ class Me(NamedTuple):
 class Other(NamedTuple):
     """A neighbour of the agent."""
 
-    who: float
+    who: float  # its index; of an obstacle, see `Obstacle`
     offset: Vec  # m, other minus me, by the nearest image
     square: float  # m^2, |offset|^2
     vel: Vec  # m/s
@@ -373,19 +373,31 @@ class Effect(Record):
         return {}
 
     def sums(self, dimension: int) -> int:
-        """Return how many running numbers the pair law has: sums, or whatever it keeps from neighbour to neighbour."""
+        """Return how many running numbers the pair law has: sums, or whatever it keeps from neighbour to neighbour.
+
+        dimension: 2 or 3.
+        """
         return 0
 
     def fold_size(self, dimension: int) -> int:
-        """Return the number of values that the fold over obstacles carries."""
+        """Return the number of values that the fold over obstacles carries.
+
+        dimension: 2 or 3.
+        """
         return 0
 
     def rays(self, dimension: int) -> int:
-        """Return the number of rays of the obstacle_ray."""
+        """Return the number of rays of the obstacle_ray.
+
+        dimension: 2 or 3.
+        """
         return 1
 
     def numbers(self, dimension: int) -> int:
-        """Return the number of values of a bond."""
+        """Return the number of values of a bond.
+
+        dimension: 2 or 3.
+        """
         return 0
 
     def partner_count(self, dimension: int) -> int:
@@ -393,11 +405,17 @@ class Effect(Record):
         return self.partners
 
     def bonds(self, groups: Sequence[Any], dimension: int) -> Bonds:
-        """Return the bonds in a scene of these groups; raise ValueError, in one line, if the groups do not suit."""
+        """Return the bonds in a scene of these groups; raise ValueError, in one line, if the groups do not suit.
+
+        dimension: 2 or 3.
+        """
         return Bonds.empty(self.partner_count(dimension), self.numbers(dimension))
 
     def stencils(self, groups: Sequence[Any], dimension: int) -> Stencils:
-        """Return the sets of agents that the `derivative` couples, for methods that solve linear equations."""
+        """Return the sets of agents that the `derivative` couples, for methods that solve linear equations.
+
+        groups: of the scene, in its order; dimension: 2 or 3.
+        """
         raise TypeError(f"{type(self).__name__} has no derivative")
 
     def idle_copy(self) -> Effect:
@@ -419,18 +437,26 @@ class Effect(Record):
         raise TypeError(f"{type(self).__name__} has no table")
 
     def path_to_draw(self, scene: SceneView) -> tuple[tuple[Vec, ...], float] | None:
-        """Return a followed path for pictures: points along it, m, and half its width, m; None without a path."""
+        """Return a followed path for pictures: points along it, m, and half its width, m; None without a path.
+
+        scene: that has the effect.
+        """
         return None
 
     def rates(self, groups: Sequence[Any], dimension: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Return upper bounds, in any state, of w^2, 1/s^2, and of damping, 1/s, for every agent, (N,).
+
+        groups: of the scene, in its order; dimension: 2 or 3.
 
         Return None if there is no bound, or no stiffness.
         """
         return None
 
     def potential(self, groups: Sequence[Any], state: Any, offset: Any) -> NDArray[np.float64] | None:
-        """Return the potential energy of each world, (B,) J, or None without one; `offset(a, b)`: that of the space."""
+        """Return the potential energy of each world, (B,) J, or None without one; `offset(a, b)`: that of the space.
+
+        groups: of the scene, in its order; state: of B worlds; a, b: (..., D) m.
+        """
         return None
 
     def lookahead(self, speed: float) -> float | None:
@@ -453,7 +479,10 @@ class Effect(Record):
             demand_group("group", self.sight.group, scene.groups)
 
     def check_start(self, scene: SceneView, state: Any) -> None:
-        """Warn of problems that depend on the initial state, such as the positions of agents."""
+        """Warn of problems that depend on the initial state, such as the positions of agents.
+
+        scene: that has the effect; state: its initial state.
+        """
 
     def parameters(self) -> dict[str, float | Vec]:
         """Return the numbers and vectors passed to the laws, by name: all fields except None and strings."""

@@ -224,7 +224,10 @@ class Elastic(Effect):
         return Material(young=self.young or 1.0, poisson=self.poisson, area=self.area, thickness=self.thickness)
 
     def matrix(self, network: Any, dimension: int) -> Any:
-        """Return K of a network, sparse, (D n, D n) N/m, particle after particle."""
+        """Return K of a network, sparse, (D n, D n) N/m, particle after particle.
+
+        network: n particles; dimension: D, 2 or 3.
+        """
         found = stiffness(network.rest_points(dimension), network.elements(dimension), self._material)
         return found if self.young else 0 * found
 

@@ -128,6 +128,7 @@ class _Field(_Timed):
     """Base class of fields that are a force or a velocity of the medium, as `acts` selects."""
 
     formula: ClassVar[Law]
+    """(p, me) -> the vector at the position of the agent `me`, with the parameters `p` of the field."""
     acts: Literal["force", "medium"] = Field(
         default="force", description="as a force, N, or as a velocity of the medium, m/s"
     )

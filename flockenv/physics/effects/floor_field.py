@@ -70,7 +70,10 @@ class Around(Aim):
         scene.table_of(self)
 
     def grids(self, scene: SceneView) -> list[NDArray[np.float64]]:
-        """Return the floor fields, one for each target or set of alternatives."""
+        """Return the floor fields, one for each target or set of alternatives.
+
+        scene: that has the effect.
+        """
         raise TypeError(f"{type(self).__name__} has no floor fields")
 
     def check_start(self, scene: SceneView, state: Any) -> None:
@@ -127,7 +130,10 @@ class Way(Around):
         return self.field_block(scene, *self.goals)
 
     def lengths(self, scene: SceneView, points: ArrayLike) -> NDArray[np.float64]:
-        """Return path lengths from points (..., D), (...) m; inf without a path; outside the grid those of its edge."""
+        """Return path lengths from points (..., D), (...) m; inf without a path; outside the grid those of its edge.
+
+        scene: whose shapes block the paths.
+        """
         return path_lengths(self.grids(scene)[0], points)
 
     def grids(self, scene: SceneView) -> list[NDArray[np.float64]]:

@@ -77,7 +77,10 @@ class _Liquid(Effect):
         return dimension
 
     def pair_strength(self, dimension: int) -> float:
-        """Return the factor of the pair force with which the closed form has the given value."""
+        """Return the factor of the pair force with which the closed form has the given value.
+
+        dimension: 2 or 3.
+        """
         raise NotImplementedError
 
     def check(self, scene: SceneView) -> None:
@@ -153,12 +156,18 @@ class SurfaceTension(_Liquid):
     strengths: ClassVar[tuple[str, ...]] = ("tension",)
 
     def hole(self, dimension: int) -> float:
-        """Return d / R, where a disc or ball of radius d has room for one agent."""
+        """Return d / R, where a disc or ball of radius d has room for one agent.
+
+        dimension: 2 or 3.
+        """
         ball = math.pi if dimension == 2 else 4 / 3 * math.pi
         return float((ball * self.density) ** (-1 / dimension)) / self.radius
 
     def rest(self, dimension: int) -> float:
-        """Return z, the distance without force as a fraction of R."""
+        """Return z, the distance without force as a fraction of R.
+
+        dimension: 2 or 3.
+        """
         low = self.hole(dimension)
         return _moment(dimension + 1, low) / _moment(dimension, low)
 

@@ -179,7 +179,10 @@ class Membrane(Effect):
         return {}
 
     def triangles(self, groups: Sequence[Any], dimension: int) -> tuple[Ints, Floats, Floats]:
-        """Return the corners of triangles, (T, 3) agents, gradients of u and v there, (T, 3, 2) 1/m, and areas, m^2."""
+        """Return the corners of triangles, (T, 3) agents, gradients of u and v there, (T, 3, 2) 1/m, and areas, m^2.
+
+        groups: of the scene, in its order; dimension: 2 or 3.
+        """
         first, network, _ = network_of(groups, self.group, dimension)
         corners, points = network.elements(dimension), network.rest_points(dimension)
         corners = _triangles_only(corners, self.group)

@@ -71,7 +71,10 @@ class Pressure(Effect):
         return dimension
 
     def distance(self, dimension: int) -> float:
-        """Return a, the distance of nearest neighbours at this density, m."""
+        """Return a, the distance of nearest neighbours at this density, m.
+
+        dimension: 2 or 3.
+        """
         if dimension == 2:
             return math.sqrt(2 / (math.sqrt(3) * self.density))
         return math.cbrt(PACKED * 6 / (math.pi * self.density))

@@ -327,7 +327,10 @@ class Springs(Effect):
         return stiffness
 
     def first_kept(self, groups: Sequence[Any], dimension: int) -> int:
-        """Return where in State.bonds the rest lengths of its group begin: behind those of all networks before."""
+        """Return where in State.bonds the rest lengths of its group begin: behind those of all networks before.
+
+        groups: of the scene, in its order; dimension: 2 or 3.
+        """
         return springs_before(groups[: self.group], dimension)
 
     def stencils(self, groups: Sequence[Any], dimension: int) -> Stencils:

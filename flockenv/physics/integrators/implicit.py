@@ -32,6 +32,10 @@ class Implicit(Integrator):
     ) -> Stage:  # fmt: skip
         """Return positions and velocities one step later, (D N,); raise newton.NotSolvedError without a solution.
 
+        evaluate: (x, v, time) -> accelerations, m/s^2, and velocities by which a medium carries agents, m/s, or None;
+        x: (D N,) m; v: (D N,) m/s; time: s; dt: s; dimension: D, 2 or 3; coupling: which agents depend on each other
+        (default: all on all).
+
         A step whose equations Newton's method does not solve is halved, repeatedly if needed: if forces jump, a
         solution may exist for one step length and not for another.
         """

@@ -97,7 +97,10 @@ SUBSTEPS = WORK.index("substeps")
 
 
 def methods_of(names: Sequence[str]) -> tuple[Integrator, ...]:
-    """Return methods by their kinds, each once; raise ValueError, with the nearest name, for an unknown one."""
+    """Return methods by their kinds, each once; raise ValueError, with the nearest name, for an unknown one.
+
+    names: kinds, such as `verlet`.
+    """
     for name in names:
         if name not in INTEGRATORS:
             raise ValueError(

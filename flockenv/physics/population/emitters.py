@@ -113,7 +113,10 @@ class Emitter(Member):
                 raise ValueError(f"place.radius = {self.place.radius:g}: at most {most:g} m is allowed on this torus")
 
     def rows(self, first: int, end: int, dimension: int) -> list[list[float]]:
-        """Return a row of numbers for the rate and for each burst, as births.py reads them; slots are [first, end)."""
+        """Return a row of numbers for the rate and for each burst, as births.py reads them; slots are [first, end).
+
+        dimension: 2 or 3.
+        """
         spread = 0.0 if self.direction is not None or isinstance(self.place, Surface) else 180.0
         spread = math.radians(spread if self.spread is None else self.spread)
         aim = three_numbers(self.direction or (1.0,) + (0.0,) * (dimension - 1))

@@ -183,13 +183,19 @@ def _parts(scene: SceneView) -> list[Part]:
 
 
 def create_initial(scene: SceneView, state: State) -> None:
-    """Create the agents that are born at time 0, in place."""
+    """Create the agents that are born at time 0, in place.
+
+    scene: its population is created; state: its slots of agents that are not born yet are filled.
+    """
     if any(isinstance(member, Emitter) for member in scene.population):
         _make_births(scene, _Scratch.of(scene.agents, _counts_agents(scene)))(state.x, state, 0, state.shape[0])
 
 
 def make_settler(scene: SceneView) -> Callable[[Floats, Floats, State, int, int], tuple[int, int]]:
-    """Return a function that updates the population at the end of a step, with scratch memory of its own."""
+    """Return a function that updates the population at the end of a step, with scratch memory of its own.
+
+    scene: its population is updated.
+    """
     parts = _parts(scene)
 
     def settle(x0: Floats, v0: Floats, state: State, first: int, end: int) -> tuple[int, int]:

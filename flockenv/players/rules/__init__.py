@@ -108,14 +108,18 @@ ORDERED: dict[Callable[..., Any], tuple[str, ...]] = {
 class RulesPlayer:
     """A hand-written player: SB3's `predict` around a function of a file in this folder."""
 
-    task: Task
-    rules: Any
-    name: str = "rules"
+    task: Task  # that it plays
+    rules: Any  # a dataclass of its parameters
+    name: str = "rules"  # of the player, see NAMES
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[NDArray[np.float32], Any]:
-        """Return actions (R, A) float32 for observation rows (R, O), or (A,) for one row (O,)."""
+        """Return actions (R, A) float32 for observation rows (R, O), or (A,) for one row (O,).
+
+        state: what the last call returned, None at the start; episode_start: (R,), True for rows whose episode begins;
+        deterministic: not used.
+        """
         seen = np.asarray(observation)
         action, state = self.act(np.atleast_2d(seen), state, episode_start)
         return (action[0] if seen.ndim == 1 else action), state
@@ -124,6 +128,8 @@ class RulesPlayer:
         self, observation: NDArray[Any], state: Any = None, begins: Any = None, order: Order = None
     ) -> tuple[NDArray[np.float32], Any]:
         """Return actions (R, A) for observations (R, O), and the state.
+
+        observation: (R, O) float; state: what the last call returned.
 
         begins: (R,), True for rows whose episode begins; order: (R, K), indices of the behaviours by priority, for
         players that have `behaviours`.
@@ -156,7 +162,10 @@ class RulesPlayer:
         return ORDERED.get(self.function, ())
 
     def with_rules(self, values: Mapping[str, Any]) -> RulesPlayer:
-        """Return the same player with other parameters: one number each, or one per row of observations, (R,)."""
+        """Return the same player with other parameters: one number each, or one per row of observations, (R,).
+
+        values: by the name of the parameter.
+        """
         return replace(self, rules=replace(self.rules, **values))
 
 
@@ -177,12 +186,17 @@ class Tuned:
 
 
 def load_tuned(task: str, name: str = "rules") -> Tuned:
-    """Return the parameters that a search found for a player of a task; an empty record if there was no search yet."""
+    """Return the parameters that a search found for a player of a task; an empty record if there was no search yet.
+
+    task: its name; name: of the player, with a seed or without.
+    """
     return Tuned(**read_tuned(TUNED / f"{task}.json").get(name, {}))
 
 
 def read_tuned(path: Path) -> dict[str, dict[str, Any]]:
     """Return the content of a file of tuned parameters, by player: parameters and found; {} if there is no such file.
+
+    path: of the JSON file.
 
     Raises:
         ValueError: the file holds something else; one line.
@@ -217,5 +231,8 @@ def player(task: Task, name: str = "rules", search_seed: int | None = None) -> R
 
 
 def as_dict(rules: Any) -> dict[str, float]:
-    """Return parameters by name."""
+    """Return parameters by name.
+
+    rules: a dataclass of parameters.
+    """
     return {name: float(value) for name, value in asdict(rules).items()}

@@ -23,6 +23,8 @@ DECADES = 2.0
 def parameter(default: float, low: float, high: float, *, below: str = "", above: str = "") -> Any:
     """Return a field of a parameter class; `python -m agents.tune` searches [low, high].
 
+    default: the published or initial value, in the parameter's unit.
+
     below, above: what a value below `low`, or above `high`, would mean, if that end is natural; "" if it is a choice,
     so that a best value at it calls for a wider range.
     """
@@ -30,7 +32,10 @@ def parameter(default: float, low: float, high: float, *, below: str = "", above
 
 
 def ranges_of(parameters: type) -> dict[str, tuple[float, float]]:
-    """Return the range of each parameter; raise ValueError for one that has none."""
+    """Return the range of each parameter; raise ValueError for one that has none.
+
+    parameters: the dataclass.
+    """
     without = [each.name for each in fields(parameters) if "range" not in each.metadata]
     if without:
         raise ValueError(f"{parameters.__name__}.{without[0]} has no range: use parameter(default, low, high)")
@@ -38,7 +43,10 @@ def ranges_of(parameters: type) -> dict[str, tuple[float, float]]:
 
 
 def beyond(parameters: type, name: str, end: float) -> str:
-    """Return what a value beyond an end of a parameter's range would mean; "" if that end is a choice."""
+    """Return what a value beyond an end of a parameter's range would mean; "" if that end is a choice.
+
+    parameters: the dataclass; name: of the parameter; end: the lower or the upper end of its range.
+    """
     metadata = next(each.metadata for each in fields(parameters) if each.name == name)
     side = metadata["range"].index(end)
     text: str = metadata["beyond"][side]
@@ -46,12 +54,18 @@ def beyond(parameters: type, name: str, end: float) -> str:
 
 
 def is_logarithmic(low: float, high: float) -> bool:
-    """Return True if a range is positive and spans more than DECADES."""
+    """Return True if a range is positive and spans more than DECADES.
+
+    low, high: the ends, in the parameter's unit.
+    """
     return low > 0.0 and high / low > 10.0**DECADES
 
 
 def per_row(value: Any, axes: int = 1) -> Any:
-    """Return a parameter as it multiplies arrays (R, ...): a number as it is, (R,) with further axes of length 1."""
+    """Return a parameter as it multiplies arrays (R, ...): a number as it is, (R,) with further axes of length 1.
+
+    value: a number or an array (R,); axes: number of further axes.
+    """
     return value if isinstance(value, float) else np.asarray(value, np.float64)[(..., *(None,) * axes)]
 
 

@@ -113,6 +113,8 @@ def measure(
 ) -> Report:
     """Return the error at the end and the cost of each method in each number of steps.
 
+    problem: the scene, its start, its horizon and the numbers of steps.
+
     methods: instances (default: those of `usual_methods`). repetitions: number of wall times per point, taken in turns
     after compiling; 0 = none. finer: ratio of steps for a reference by own steps (see `reference_by_own_steps`).
     progress is called with percents. A KeyboardInterrupt ends it early: the report has what was done, with `stopped` =
@@ -154,6 +156,8 @@ def add_times(
     progress: Callable[[int], None] = lambda percent: None,
 ) -> Report:
     """Return a report with wall times, measured now, of the runs whose errors another process may have measured.
+
+    `progress` is called with percents.
 
     report: `measure` with the same problem and methods, and repetitions = 0. Other arguments, and a KeyboardInterrupt:
     as of `measure`.

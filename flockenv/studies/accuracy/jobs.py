@@ -25,6 +25,8 @@ def measure_errors(
 ) -> Iterator[tuple[str, Report | ValueError]]:
     """Yield the report of each problem without times, see `add_times`, by name; ValueError if it has no reference.
 
+    problems: by name; methods: instances; engine: runs the measurements as jobs.
+
     finer: as of `measure`. A closed form must be that of the problem's name in the suite: processes find it there.
 
     Raises:

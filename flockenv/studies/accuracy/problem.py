@@ -41,13 +41,13 @@ BY_DT = (UnstableStepWarning, CoarseContactWarning, UnsolvedContactsWarning, Unm
 class Problem:
     """A scene, its start, its duration, and the numbers of steps in which methods run it."""
 
-    name: str
-    title: str
+    name: str  # unique in the suite
+    title: str  # for pictures
     scene: Scene
     start: State  # one world, at time 0
-    seconds: float
+    seconds: float  # duration, s
     steps: tuple[int, ...]  # ascending; time step = seconds / steps
-    exact: Exact | None = None
+    exact: Exact | None = None  # the exact path, if it is known
 
     @classmethod
     def of(
@@ -62,6 +62,9 @@ class Problem:
         exact: Exact | None = None,
     ) -> Problem:
         """Return the problem of a scene from its start with a seed, or from positions and velocities, (N, D) each.
+
+        seconds: duration, s; steps: numbers of steps, ascending; name: of the problem; title: for pictures; motion:
+        positions, m, and velocities, m/s, at the start; exact: the exact path, if it is known.
 
         Raises ValueError if no method can be measured on it: invalid seconds or steps, float32 (rounding hides the
         errors of methods), random draws in every step (runs with different steps have no path in common), and laws
@@ -145,7 +148,10 @@ class Problem:
         return times
 
     def path(self, method: Integrator, steps: int, start: State | None = None) -> Path:
-        """Run, and return the path of all agents at the instants; raise FloatingPointError if it diverges."""
+        """Run, and return the path of all agents at the instants; raise FloatingPointError if it diverges.
+
+        method: a method; steps: their number; start: (default: that of the problem).
+        """
         try:
             scene, state = self.prepare(method, steps)
         except ValueError as error:  # the steps are unstable
@@ -167,11 +173,17 @@ class Problem:
         )  # fmt: skip
 
     def distances(self, path: Path, other: Path) -> Floats:
-        """Return the distance of every agent between two paths, (K, N) m; see `paths.distances`."""
+        """Return the distance of every agent between two paths, (K, N) m; see `paths.distances`.
+
+        path, other: at the same instants.
+        """
         return distances(path, other, self.scene.space.displacement)
 
     def energy(self, pos: Floats, vel: Floats) -> Floats:
-        """Return kinetic energy plus the potential energies that effects have, at instants (K, N, D), (K,) J."""
+        """Return kinetic energy plus the potential energies that effects have, at instants (K, N, D), (K,) J.
+
+        pos: (K, N, D) m; vel: (K, N, D) m/s.
+        """
         instants, agents, dimension = pos.shape  # a world for every instant
         state = blank(instants, agents, dimension, 0, self.start.dt).with_motion(pos, vel)
         total = self.kinetic(vel)
@@ -184,7 +196,10 @@ class Problem:
         return effect.potential(self.scene.groups, state, self.scene.space.displacement)
 
     def momentum(self, vel: Floats) -> Floats:
-        """Return the total momentum, (..., D) kg m/s."""
+        """Return the total momentum, (..., D) kg m/s.
+
+        vel: (..., N, D) m/s.
+        """
         return np.asarray((self._moving_mass[:, None] * vel).sum(axis=-2))
 
     @property
@@ -194,11 +209,17 @@ class Problem:
         return [effect for effect in known if self._potential(effect, self.start) is not None]
 
     def impulse(self, vel: Floats) -> Floats:
-        """Return the sum of the magnitudes of all momenta, (...) kg m/s."""
+        """Return the sum of the magnitudes of all momenta, (...) kg m/s.
+
+        vel: (..., N, D) m/s.
+        """
         return np.asarray((self._moving_mass * np.linalg.norm(vel, axis=-1)).sum(axis=-1))
 
     def kinetic(self, vel: Floats) -> Floats:
-        """Return the kinetic energy, (...) J."""
+        """Return the kinetic energy, (...) J.
+
+        vel: (..., N, D) m/s.
+        """
         return np.asarray(0.5 * (self._moving_mass * (vel**2).sum(axis=-1)).sum(axis=-1))
 
     @property

@@ -67,7 +67,10 @@ class Point(ResultRecord):
     """Contacts that collisions left unsolved, see State.work."""
 
     def cost(self, by: Cost) -> float | None:
-        """Return the cost of this point, in seconds or evaluations."""
+        """Return the cost of this point, in seconds or evaluations.
+
+        by: `seconds` or `evaluations`.
+        """
         return self.seconds if by == "seconds" else float(self.evaluations)
 
 
@@ -168,7 +171,10 @@ class Report(ResultRecord):
         return self.growth > SENSITIVE
 
     def trusts(self, point: Point) -> bool:
-        """Return True if the error is clearly above that of the reference itself."""
+        """Return True if the error is clearly above that of the reference itself.
+
+        point: one of this report.
+        """
         return point.error is not None and point.error > self.floor
 
     def curve(self, method: str) -> Curve:
@@ -181,6 +187,9 @@ class Report(ResultRecord):
 
     def cheapest(self, tolerance: float, by: Cost = "evaluations", interpolate: bool = True) -> Choice | None:
         """Return the cheapest choice with an error of at most `tolerance`, m; None if no method reaches it.
+
+        by: what is to be least, `seconds` or `evaluations`; interpolate: True if numbers of steps between the measured
+        ones count.
 
         Raises ValueError for a tolerance below the floor of this report.
         """

@@ -43,7 +43,10 @@ class _Named(BaseModel):
 
 
 def load_plan(source: str | Path) -> Plan:
-    """Return the plan that a YAML file or text describes; see `yaml_io.load`."""
+    """Return the plan that a YAML file or text describes; see `yaml_io.load`.
+
+    source: as of `yaml_io.load`.
+    """
     measure = load(source, _Named).measure
     if measure not in PLANS:
         raise ConfigError(

@@ -22,7 +22,7 @@ class Trial(NamedTuple):
     """Result of one case under one variant."""
 
     numbers: Mapping[str, float]  # by the names of the experiment's columns; NaN = no value
-    scene: Scene
+    scene: Scene  # that was run
     path: Floats  # (T, N, D) m, of the first world, for pictures
 
 
@@ -30,8 +30,8 @@ class Trial(NamedTuple):
 class Experiment:
     """Cases, variants and the numbers measured on them."""
 
-    name: str
-    title: str
+    name: str  # of the experiment
+    title: str  # for pictures and pages
     cases: Mapping[str, str]  # description of each
     variants: tuple[str, ...]
     columns: Mapping[str, str]  # meaning of each number, with its unit
@@ -79,7 +79,10 @@ def depth(scene: Scene, state: State) -> Floats:
 def run(
     experiment: Experiment, progress: Callable[[int], None] = lambda done: None
 ) -> tuple[Results, dict[tuple[str, str], Trial]]:
-    """Run every case under every variant; return the numbers, and the trials for pictures."""
+    """Run every case under every variant; return the numbers, and the trials for pictures.
+
+    experiment: its cases, variants and trial; `progress` is called with the number of trials done.
+    """
     trials: dict[tuple[str, str], Trial] = {}
     for case in experiment.cases:
         for variant in experiment.variants:

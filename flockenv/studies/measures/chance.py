@@ -20,7 +20,7 @@ class Mean(NamedTuple):
     runs: int
     mean: float
     low: float  # NaN for fewer than two runs
-    high: float
+    high: float  # upper end of the interval
 
 
 class Above(NamedTuple):
@@ -29,7 +29,7 @@ class Above(NamedTuple):
     runs: int
     excess: float  # mean of value - null
     low: float  # its 95 % interval
-    high: float
+    high: float  # its upper end
 
     @property
     def holds(self) -> bool:
@@ -38,7 +38,10 @@ class Above(NamedTuple):
 
 
 def mean_of_runs(values: ArrayLike, seed: int = 0) -> Mean:
-    """Return the mean of one number per run, (R,), with its 95 % bootstrap interval; only finite values count."""
+    """Return the mean of one number per run, (R,), with its 95 % bootstrap interval; only finite values count.
+
+    values: (R,); seed: of the bootstrap.
+    """
     given = np.asarray(values, np.float64)
     x = given[np.isfinite(given)]
     if len(x) < 2:
@@ -52,6 +55,8 @@ def mean_of_runs(values: ArrayLike, seed: int = 0) -> Mean:
 
 def above_null(values: ArrayLike, nulls: ArrayLike, seed: int = 0) -> Above:
     """Return the excess of an order, one number per run (R,), over its value by chance in the same run, (R,).
+
+    values, nulls: (R,), the order and its value by chance; seed: of the bootstrap.
 
     For lanes `Lanes.order` against `Lanes.null`, for a door `Bursts.length` against `Bursts.null_length`: values are
     paired, so differences between runs (number of agents, positions) cancel. Runs without a null (NaN) are left out.

@@ -75,6 +75,8 @@ def tail(gaps: ArrayLike, start: float | None = None) -> Tail:
 def goodness(gaps: ArrayLike, fit: Tail, samples: int = 200, seed: int = 0) -> float:
     """Return the share of samples of the fit that are at least as far from their own fits as the gaps (n,) from `fit`.
 
+    fit: the fit of `tail` to the gaps; seed: of the samples.
+
     Below .1 a power law is rejected (Clauset, Shalizi, Newman 2009, 4.1): each sample has as many gaps as given; its
     tail is drawn from the fit, the rest from the gaps before `fit.start`. NaN without a tail.
     """

@@ -49,6 +49,8 @@ def speed_in_area(
 ) -> Floats:
     """Return the mean speed of agents in a polygon at each instant, (T,) m/s; NaN if it is empty.
 
+    area: (n, 2) m, the corners of the polygon; alive: (T, N), default: all.
+
     pos, vel (T, N, 2) m, m/s; along: a direction (2,); if given, the component of velocity along it replaces |v|.
     Raises ValueError if the polygon is invalid or the direction has length 0.
     """
@@ -84,10 +86,10 @@ def voronoi(
 class Ground(NamedTuple):
     """The walkable area and the measured area, checked once for many instants."""
 
-    walk: Floats
+    walk: Floats  # (n, 2) m, corners of the walkable polygon
     free: BaseGeometry  # the walkable polygon less the obstacles
     target: BaseGeometry  # the part of that which is measured
-    period: tuple[float, float]
+    period: tuple[float, float]  # m, size of a torus; 0: none
     area: float  # m^2, of the measured area
 
     @classmethod
@@ -95,7 +97,11 @@ class Ground(NamedTuple):
         cls, walkable: ArrayLike, area: ArrayLike | None = None, holes: Sequence[ArrayLike] = (),
         period: tuple[float, float] = (0.0, 0.0),
     ) -> Ground:  # fmt: skip
-        """Return the ground of these polygons; see `voronoi` for the arguments and errors."""
+        """Return the ground of these polygons; see `voronoi` for the arguments and errors.
+
+        walkable: (n, 2) m, the corners of the walkable area; area: those of the measured one (default: all of it);
+        holes: those of obstacles; period: m, size of a torus, 0 for none.
+        """
         walk = valid_polygon("walkable", walkable)
         polygon = None if area is None else valid_polygon("area", area, is_convex=True)
         solid = [valid_polygon(f"holes[{k}]", hole) for k, hole in enumerate(holes)]
@@ -106,7 +112,10 @@ class Ground(NamedTuple):
         return cls(walk, free, target, period, float(target.area))
 
     def room(self, pos: ArrayLike) -> Room:
-        """Return the cells of agents at positions (N, 2), m."""
+        """Return the cells of agents at positions (N, 2), m.
+
+        pos: (N, 2) m.
+        """
         points = _flat(pos)
         here = np.flatnonzero(contains(self.walk, points)) if len(points) else np.zeros(0, np.int64)
         cell, inside = np.full(len(points), np.nan), np.zeros(len(points))
@@ -136,13 +145,18 @@ def _shared_areas(cells: Sequence[Corners], ground: BaseGeometry, period: tuple[
 
 
 def voronoi_density(room: Room) -> float:
-    """Return agents per m^2: the mean over the area of 1 / (the area of the cell that contains the point)."""
+    """Return agents per m^2: the mean over the area of 1 / (the area of the cell that contains the point).
+
+    room: the cells at one instant, by `Ground.room`.
+    """
     some = room.inside > 0
     return float((room.inside[some] / room.cell[some]).sum() / room.area)
 
 
 def voronoi_speed(room: Room, speed: ArrayLike) -> float:
     """Return the mean over the area of the speed, m/s, of the agent whose cell contains the point; NaN without cells.
+
+    room: the cells at one instant, by `Ground.room`.
 
     speed: (N,) m/s, or any other number per agent.
     """

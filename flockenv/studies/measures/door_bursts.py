@@ -17,7 +17,7 @@ class Bursts(NamedTuple):
     """Runs of equal direction, and the same by chance with as many crossings in each direction."""
 
     crossings: int
-    bursts: int
+    bursts: int  # number of runs of equal direction
     length: float  # mean, crossings per burst
     null_bursts: float  # expected by chance
     null_length: float  # crossings / null_bursts

@@ -32,7 +32,10 @@ def leaving_times(time: ArrayLike, inside: ArrayLike) -> Floats:
 
 
 def last_crossing(found: Crossings, agents: int) -> Floats:
-    """Return the time of each agent's last crossing of a line, (N,) s, if that is forward; else NaN."""
+    """Return the time of each agent's last crossing of a line, (N,) s, if that is forward; else NaN.
+
+    found: the crossings, by `crossings`; agents: their number N.
+    """
     out = np.full(agents, np.nan)
     out[found.agent] = np.where(found.sign > 0, found.time, np.nan)  # in the order of time: the last one remains
     return out

@@ -72,7 +72,10 @@ def weidmann_speed(density: ArrayLike) -> Floats:
 
 
 def weidmann_flow(density: ArrayLike) -> Floats:
-    """Return the specific flow rho v of Weidmann's curve, 1/(m s): 1.225 at most, at 1.75 per m^2."""
+    """Return the specific flow rho v of Weidmann's curve, 1/(m s): 1.225 at most, at 1.75 per m^2.
+
+    density: 1/m^2, of any shape.
+    """
     return np.asarray(np.asarray(density, np.float64) * weidmann_speed(density))
 
 
@@ -85,7 +88,10 @@ def required_length(speed: ArrayLike) -> Floats:
 
 
 def single_file_speed(density: ArrayLike) -> Floats:
-    """Return v = (1/rho - .36) / 1.06, m/s, at densities per m of path; at least 0. See `required_length`."""
+    """Return v = (1/rho - .36) / 1.06, m/s, at densities per m of path; at least 0. See `required_length`.
+
+    density: 1/m, of any shape.
+    """
     with np.errstate(divide="ignore"):
         return np.asarray(np.maximum((1.0 / np.asarray(density, np.float64) - AT_REST) / PER_SPEED, 0.0))
 
@@ -106,6 +112,8 @@ def single_file_density(place: ArrayLike, length: float) -> Floats:
 
 def diagram(density: ArrayLike, speed: ArrayLike, edges: ArrayLike | None = None) -> list[Bin]:
     """Return speeds (S,), m/s, over densities (S,), 1/m^2, in bins between edges.
+
+    density: (S,) 1/m^2; speed: (S,) m/s; edges: of the bins, 1/m^2, ascending.
 
     Default edges: those of `JUELICH`, and one more bin below. Samples that are not finite (an empty area) are left out.
     Raises ValueError if the lengths differ.
@@ -128,6 +136,8 @@ def diagram(density: ArrayLike, speed: ArrayLike, edges: ArrayLike | None = None
 def weidmann_deviation(density: ArrayLike, speed: ArrayLike, low: float = 0.5, high: float = 3.0) -> Deviation:
     """Return the deviation of speeds (S,) from Weidmann's at densities (S,) in [low, high), 1/m^2; NaN without samples.
 
+    density: (S,) 1/m^2; speed: (S,) m/s.
+
     `worst` is over the means of bins .5 per m^2 wide; the last may be narrower. A model is close enough if it stays
     below .25 m/s: real corridors are .15 m/s below the curve (JuPedSim's validation of ug-180).
     Raises ValueError unless 0 <= low < high.
@@ -145,7 +155,10 @@ def weidmann_deviation(density: ArrayLike, speed: ArrayLike, low: float = 0.5, h
 
 
 def juelich_share(density: ArrayLike, speed: ArrayLike) -> float:
-    """Return the share of sampled bins of `JUELICH` whose mean lies within one deviation; NaN without samples."""
+    """Return the share of sampled bins of `JUELICH` whose mean lies within one deviation; NaN without samples.
+
+    density: (S,) 1/m^2; speed: (S,) m/s.
+    """
     found = diagram(density, speed)[1:]
     inside = [
         abs(b.speed - mean) <= spread for b, (_, _, mean, spread) in zip(found, JUELICH, strict=True) if b.samples

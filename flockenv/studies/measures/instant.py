@@ -28,6 +28,8 @@ def measure(
 ) -> dict[str, float]:
     """Return the measures of one world by name; NaN if one has no meaning (spacing of a single agent).
 
+    scene: that of the state; state: at the instant; world: index of the world.
+
     progress: called with the number of agents whose nearest neighbour has been found.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # a run that is about to diverge may also be measured

@@ -47,6 +47,8 @@ def rows_of(across: ArrayLike, low: float, high: float, width: float) -> NDArray
 def lane_order(across: ArrayLike, direction: ArrayLike, low: float, high: float, width: float = ROW) -> float:
     """Return Phi, the mean over occupied rows of ((n+ - n-) / (n+ + n-))^2; NaN without agents.
 
+    low, high: m, edges of the region across; width: of a row, m.
+
     across (N,) m, perpendicular to the walking direction; direction (N,), > 0 or < 0: that of each agent. 1 = no row
     holds agents of both directions; by chance it is not 0 but about 1/n in rows of n. Source: Feliciani & Nishinari
     2016, Phys. Rev. E 94, 032304, rows .2 m wide; after Rex & Loewen 2007, Phys. Rev. E 75, 051402.
@@ -57,6 +59,9 @@ def lane_order(across: ArrayLike, direction: ArrayLike, low: float, high: float,
 
 def band_index(across: ArrayLike, direction: ArrayLike, low: float, high: float, width: float = BAND) -> float:
     """Return Y, the mean over occupied bands of |n+ - n-| / (n+ + n-); NaN without agents.
+
+    across (N,) m, perpendicular to the walking direction; direction (N,), > 0 or < 0; low, high: m, edges of the region
+    across; width: of a band, m.
 
     Like `lane_order`, but without the square and with bands .3 m wide. Source: Yamori 1998, Psychol. Rev. 105, 530.
     """
@@ -86,6 +91,8 @@ def lanes(
     seed: int = 0,
 ) -> Lanes:
     """Return the order of lanes over a run, and over `deals` permutations of its directions.
+
+    low, high: m, edges of the region across; width: of a row, m; seed: of the permutations.
 
     across (T, N) m; direction (N,): that of each agent over the whole run, > 0 or < 0; agents with 0 are not
     counted; present (T, N): True for agents in the measured region (default: all). This is a permutation test:

@@ -28,6 +28,8 @@ FARTHEST = 1e150
 def polarisation(vel: Floats) -> float:
     """Return |mean of v_i / |v_i|| over velocities (N, D): 1 if all have the same heading; NaN if no agent moves.
 
+    vel: (N, D) m/s.
+
     Source: Vicsek et al. 1995, Phys. Rev. Lett. 75, 1226.
     """
     speed = np.linalg.norm(vel, axis=1)
@@ -39,6 +41,8 @@ def polarisation(vel: Floats) -> float:
 
 def milling(pos: Floats, vel: Floats, space: Space) -> float:
     """Return |mean of unit(x_i - centre) x unit(v_i)|, positions and velocities (N, D): 1 if all circle in one sense.
+
+    pos: (N, D) m; vel: (N, D) m/s. space: the plane, box or torus in which distances are measured.
 
     NaN if no agent moves away from the centre. Source: Couzin et al. 2002, J. theor. Biol. 218, 1, there called group
     angular momentum.
@@ -54,7 +58,10 @@ def milling(pos: Floats, vel: Floats, space: Space) -> float:
 
 
 def group_momentum(vel: Floats, mass: ArrayLike) -> float:
-    """Return |sum of m_i v_i|, kg m/s, of velocities (N, D), m/s, and masses (N,), kg; infinite masses are left out."""
+    """Return |sum of m_i v_i|, kg m/s, of velocities (N, D), m/s, and masses (N,), kg; infinite masses are left out.
+
+    vel: (N, D) m/s; mass: (N,) kg.
+    """
     weight = np.asarray(mass, np.float64)
     free = np.isfinite(weight)
     return float(np.linalg.norm((vel[free] * weight[free, None]).sum(axis=0)))
@@ -73,7 +80,10 @@ def centre(pos: Floats, space: Space) -> Floats:
 
 
 def cohesion_radius(pos: Floats, space: Space) -> float:
-    """Return the mean distance of positions (N, D) from their centre, m; NaN without agents."""
+    """Return the mean distance of positions (N, D) from their centre, m; NaN without agents.
+
+    pos: (N, D) m. space: the plane, box or torus in which distances are measured.
+    """
     if not len(pos):
         return np.nan
     return float(np.linalg.norm(space.displacement(centre(pos, space), pos), axis=1).mean())
@@ -82,6 +92,7 @@ def cohesion_radius(pos: Floats, space: Space) -> float:
 def components(pos: Floats, reach: float, space: Space) -> int:
     """Return the number of connected components of positions (N, D), m, if points within `reach`, m, are linked.
 
+    pos: (N, D) m. space: the plane, box or torus in which distances are measured.
     Raises ValueError if the reach is not positive or, on a torus, more than half of its shortest side.
     """
     longest = min(space.size) / 2 if isinstance(space, Torus) else np.inf
@@ -98,6 +109,8 @@ def nearest_distances(
     pos: Floats, space: Space, progress: Callable[[int], None] = lambda done: None
 ) -> tuple[Floats, NDArray[np.intp]]:
     """Return for each of (N, D) points, m, the distance to its nearest neighbour, m, and which point that is.
+
+    pos: (N, D) m. space: the plane, box or torus in which distances are measured.
 
     A single point, or one beyond FARTHEST along an axis, has itself as nearest neighbour, at distance inf.
     progress: called with the number of points done.

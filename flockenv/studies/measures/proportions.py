@@ -62,6 +62,8 @@ def touching_pairs(pos: Floats, radius: Floats, space: Space, margin: float = 0.
 def overlap_proportion(pos: ArrayLike, radius: ArrayLike, space: Space, alive: ArrayLike | None = None) -> Proportion:
     """Return how much bodies overlap: the mean of A_ij / min(A_i, A_j) over all pairs that overlap.
 
+    space: the plane, box or torus in which distances are measured.
+
     pos (T, N, 2) m; radius (N,) m; alive (T, N). `mean` is 0 if no two agents ever overlap, 1 if one always lies in the
     other; `share` is the share of agent-instants in a pair that overlaps.
     Source: Chraibi, Seyfried, Schadschneider 2010, Phys. Rev. E 82, 046111 (arXiv 1008.4297), there of ellipses.
@@ -102,6 +104,8 @@ def collision_rate(
     time: ArrayLike, pos: ArrayLike, radius: ArrayLike, space: Space, alive: ArrayLike | None = None
 ) -> float:
     """Return the rate at which agents begin to touch, 1/s per agent: 2 (pairs that newly touch) / (N T).
+
+    space: the plane, box or torus in which distances are measured.
 
     time (T,) s; pos (T, N, D) m; radius (N,) m; alive (T, N). Pairs that touch at the first instant are not counted;
     contacts that begin and end between two instants are missed. NaN for fewer than two instants, or no agents.

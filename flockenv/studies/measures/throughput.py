@@ -28,7 +28,7 @@ class Flow(NamedTuple):
     """Flow through a line over some time; `forward` is to its right."""
 
     forward: int
-    backward: int
+    backward: int  # crossings to the left
     rate: float  # 1/s, (forward - backward) / the whole time
     specific: float  # 1/(m s), rate / width
     passing: float  # 1/s, (n - 1) / (t_n - t_1) of forward crossings; NaN for fewer than two
@@ -108,6 +108,8 @@ def _check_line(line: ArrayLike) -> Floats:
 def flow(found: Crossings, width: float, seconds: float) -> Flow:
     """Return the flow through a line of some width, m, over a time, s.
 
+    found: the crossings, by `crossings`; width: m; seconds: s.
+
     rate = N / seconds and specific = rate / width, with N = forward less backward; `passing` is what experiments at
     bottlenecks call J (Seyfried et al. 2009, Transp. Sci. 43, 395): it leaves out the time before the first crossing
     and after the last. Raises ValueError if width or time is not positive.
@@ -123,12 +125,17 @@ def flow(found: Crossings, width: float, seconds: float) -> Flow:
 
 
 def cumulative(found: Crossings) -> tuple[Floats, NDArray[np.int64]]:
-    """Return N(t): times (C,), s, and forward less backward crossings just after each, (C,)."""
+    """Return N(t): times (C,), s, and forward less backward crossings just after each, (C,).
+
+    found: the crossings, by `crossings`.
+    """
     return found.time, np.cumsum(found.sign)
 
 
 def time_gaps(found: Crossings, sign: int = 1) -> Floats:
     """Return the times between successive crossings of one sign, s, in their order: C - 1 for C such crossings.
+
+    found: the crossings, by `crossings`; sign: 1 for forward crossings, -1 for backward ones.
 
     Source: Kretz, Gruenebohm, Schreckenberg 2006, J. Stat. Mech. P10014 (arXiv physics/0610077).
     """

@@ -36,5 +36,9 @@ def run(
     keep: Callable[[Results], None] = lambda results: None,
     engine: Engine | None = None,
 ) -> Results:
-    """Run every case under every method, and return the findings with the known ones; see `trial_log.run`."""
+    """Run every case under every method, and return the findings with the known ones; see `trial_log.run`.
+
+    cases: such as those of `stress.CASES`; methods: instances; known: findings that are not computed again; progress,
+    keep and engine: as of `trial_log.run`.
+    """
     return trial_log.run(cases, {m.kind: m for m in methods}, fingerprint(), known, progress, keep, TOLD, engine)

@@ -26,6 +26,10 @@ def run(
     keep: Callable[[Results], None] = lambda results: None,
     engine: Engine | None = None,
 ) -> Results:
-    """Run every case with every preset, and return the findings with the known ones; see `trial_log.run`."""
+    """Run every case with every preset, and return the findings with the known ones; see `trial_log.run`.
+
+    cases: such as those of `validation.CASES`; presets: names of `PRESETS`; known: findings that are not computed
+    again; progress, keep and engine: as of `trial_log.run`.
+    """
     with ignore_contact_warnings():
         return trial_log.run(cases, {name: name for name in presets}, fingerprint(), known, progress, keep, (), engine)
