@@ -167,7 +167,8 @@ PRESETS: dict[str, Model] = {
             "A": "4.5 +- .3 m/s^2", "gamma": ".35 +- .01 s", "n": "2.0 +- .1", "n'": "3.0 +- .7",
             "lambda": "2.0 +- .2 s/m", "tau": ".54 +- .05 s", "v0": "1.29 +- .19 m/s", "a": "3 m/s^2", "b": ".1 m",
         },
-        note="A, tau, v0, the wall's a and b, and the bias eps = .005 are quoted from memory, not checked in the paper",
+        note="A, tau, v0, and the wall's a and b are those of programs after the paper, see docs/social_forces.md; the "
+        "bias eps = .005 is quoted from memory; none is checked in the paper",
     ),
     "moussaid_2010_groups": Model(
         "Moussaid et al., PLoS ONE 5:e10047, 2010",
