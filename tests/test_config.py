@@ -340,13 +340,17 @@ def test_up_to_five_errors_are_listed_one_per_line() -> None:
         ("- 1\n- 2\n", "text: a list or a word, not a block of `key: value`"),
         ("word\nword", "text: a list or a word, not a block of `key: value`"),
         ("a: " + "[" * 50 + "]" * 50, "text:1: nested more than 32 deep"),
-        ("a: " + "[" * 100_000, "text:1: nested more than 32 deep"),
+        ("a: " + "[" * 900, "text:1: nested more than 32 deep"),
+        (  # PyYAML 6.0.4 has a limit of 1,000 of its own
+            "a: " + "[" * 100_000,
+            ("text:1: nested more than 32 deep", "text:1: not YAML: exceeded maximum nesting depth"),
+        ),
         ("a: " + "9" * 5000, "text:1: a: '9999"),
         ("a: \ud800", "text:1: not YAML text: surrogates not allowed"),
         ("a: \0", "text:1: not YAML text: "),
     ],
 )
-def test_text_without_keys_and_values_is_refused(text: str, expected: str) -> None:
+def test_text_without_keys_and_values_is_refused(text: str, expected: str | tuple[str, ...]) -> None:
     message = refusal(text)
     assert message.startswith(expected)
     assert "\n" not in message and len(message) < 300

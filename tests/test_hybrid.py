@@ -207,7 +207,8 @@ def test_a_file_plays_as_its_hybrid(kind: str, tmp_path: Path) -> None:
     action, _ = policy.predict(rows, deterministic=True)
     assert (action == hybrid.act(rows, outputs)[0]).all()
     one, _ = policy.predict(rows[0], deterministic=True)
-    assert one.shape == (2,) and one == pytest.approx(action[0], abs=1e-6)
+    # float32: how BLAS rounds a row alone depends on the processor, and the rules amplify it (1.1e-6 on an EPYC)
+    assert one.shape == (2,) and one == pytest.approx(action[0], abs=1e-5)
 
 
 def test_the_card_keeps_the_parameters_of_the_rules(tmp_path: Path) -> None:
