@@ -107,7 +107,7 @@ def test_orders_are_the_declared_ones_on_every_smooth_problem(name: str) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["bar", "sheet", "jelly", "drop"])
+@pytest.mark.parametrize("name", ["bar", "sheet", "jelly", "altitudes", "drop"])
 def test_orders_are_the_declared_ones_for_bonds_finite_elements_and_liquids(name: str) -> None:
     report = measure(one(name), methods_of(["rk4"]), repetitions=0)
     assert report.curve("rk4").order == pytest.approx(4, abs=0.25)

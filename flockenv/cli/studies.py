@@ -68,6 +68,13 @@ Finer = Annotated[
     ),
 ]
 
+Methods = Annotated[
+    str,
+    typer.Option(
+        metavar="A,B", help="Integrators, also with a field: KIND:FIELD=NUMBER.", show_default="all explicit ones"
+    ),
+]
+
 FEW = 8
 """Trials for which no processes are started."""
 INTERRUPTED_LATER = "interrupted; results so far are shown"
@@ -83,7 +90,7 @@ def accuracy(
     seconds: Annotated[
         float | None, typer.Option(metavar="S", help="Simulated time of a scene in seconds.", show_default="about 1")
     ] = None,
-    methods: Annotated[str, typer.Option(metavar="A,B", help="Integrators.", show_default="all explicit ones")] = "",
+    methods: Methods = "",
     steps: Steps = "",
     dts: Annotated[str, typer.Option(metavar="S,S", help="The same, as lengths of a step in seconds.")] = "",
     tolerance: Annotated[
@@ -105,13 +112,12 @@ def accuracy(
     """
     from flockenv.core.output_paths import valid_file
     from flockenv.jobs import engine_of
-    from flockenv.physics.integrators import methods_of
-    from flockenv.studies.accuracy import usual_methods
+    from flockenv.studies.accuracy import methods_named, usual_methods
 
     todo = _problem_makers(scenes or (), suite, problems, seconds, steps, dts, seed)
     aimed = _parse_numbers("--tolerance", tolerance)
     path = valid_file(out, [".json", ".png"], force, beside=".json") if out is not None else None
-    chosen = methods_of(_split_words(methods)) if methods else usual_methods()
+    chosen = methods_named(_split_words(methods)) if methods else usual_methods()
     console = new_console()
 
     write = functools.partial(_write_reports, path)

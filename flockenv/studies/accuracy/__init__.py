@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from flockenv.studies.accuracy.benchmark import add_times, measure, usual_methods
 from flockenv.studies.accuracy.jobs import measure_errors
+from flockenv.studies.accuracy.methods import methods_named
 from flockenv.studies.accuracy.problem import Problem
 from flockenv.studies.accuracy.results import Choice, Curve, Machine, Point, Report, Results
 from flockenv.studies.accuracy.suite import SUITE, select_problems
 
 __all__ = [
     "SUITE", "Choice", "Curve", "Machine", "Point", "Problem", "Report", "Results", "add_times", "measure",
-    "measure_errors", "select_problems", "usual_methods",
+    "measure_errors", "methods_named", "select_problems", "usual_methods",
 ]  # fmt: skip

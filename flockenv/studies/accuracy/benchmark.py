@@ -12,6 +12,7 @@ from functools import cached_property
 from pathlib import Path as File
 from statistics import median
 from time import perf_counter
+from typing import Literal
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from flockenv.model.state import State
 from flockenv.physics.integrators import INTEGRATORS, Integrator
 from flockenv.scene import Scene
 from flockenv.studies.accuracy.chaos import find_sensitivity
+from flockenv.studies.accuracy.methods import method_name
 from flockenv.studies.accuracy.paths import Path, count_unmatched, largest_distance, largest_value
 from flockenv.studies.accuracy.problem import Problem
 from flockenv.studies.accuracy.reference import COARSE, LEAST_FINER, Reference, find_reference
@@ -32,6 +34,9 @@ TOLERANCES = tuple(10.0**-k for k in range(3, 13))
 
 DEAREST = 4
 """Evaluations per step of the most expensive method with fixed steps."""
+
+MOST_SOLVED = 100_000
+"""Evaluations of a method that solves equations beyond which finer steps are not measured: they take minutes."""
 
 TRUSTED = 4.0
 """Errors below this multiple of the reference's own error are not trusted."""
@@ -51,6 +56,11 @@ class _Trial:
     times: list[float] = field(default_factory=list)
     point: Point | None = None
 
+    @property
+    def name(self) -> str:
+        """The name of the method, see `method_name`."""
+        return method_name(self.method)
+
     def compare(self, reference: Reference) -> None:
         """Run from instant to instant, and measure the distance from the reference."""
         try:
@@ -69,14 +79,17 @@ class _Trial:
         }
         self.point = self._point(
             path.count_of("evaluations"), {k: v for k, v in errors.items() if np.isfinite(v)},
-            count_unmatched(path, reference.path), path.count_of("unsolved"),
+            count_unmatched(path, reference.path), path.count_of("unsolved"), path.count_of("linear_iterations"),
         )  # fmt: skip
 
-    def _point(self, evaluations: int, errors: dict[str, float], unmatched: int = 0, unsolved: int = 0) -> Point:
+    def _point(
+        self, evaluations: int, errors: dict[str, float], unmatched: int = 0, unsolved: int = 0, iterations: int = 0
+    ) -> Point:
         names = ("error", "rms", "along", "energy", "momentum")
         return Point(
             steps=self.steps, dt=self.problem.seconds / self.steps, tolerance=self.tolerance, evaluations=evaluations,
-            seconds=None, unmatched=unmatched, unsolved=unsolved, **{name: errors.get(name) for name in names},
+            seconds=None, unmatched=unmatched, unsolved=unsolved, iterations=iterations,
+            **{name: errors.get(name) for name in names},
         )  # fmt: skip
 
     def clock(self) -> None:
@@ -165,14 +178,14 @@ def add_times(
     trials = [_Trial(problem, *setting) for method in methods for setting in _settings(problem, method)]
     points = {_key(curve, point): point for curve in report.curves for point in curve.points}
     for trial in trials:
-        trial.point = points.get((trial.method.kind, trial.steps, trial.tolerance))
+        trial.point = points.get((trial.name, trial.steps, trial.tolerance))
     stopped = ""
     try:
         _clock([trial for trial in trials if trial.has_error], repetitions, progress)
     except KeyboardInterrupt:
         stopped = "interrupted"
     timed = {
-        (trial.method.kind, trial.steps, trial.tolerance): trial.timed_point
+        (trial.name, trial.steps, trial.tolerance): trial.timed_point
         for trial in trials if trial.point is not None
     }  # fmt: skip
     curves = [
@@ -199,13 +212,15 @@ def _settings(problem: Problem, method: Integrator) -> list[tuple[Integrator, in
 
 
 def _is_too_costly(before: _Trial, trial: _Trial) -> bool:
-    """Return True if this method took more evaluations at the previous, larger tolerance than any with fixed steps.
+    """Return True if this method took too many evaluations in its previous, coarser setting.
 
-    If forces jump repeatedly, an adaptive method may need as many steps as 1 / tolerance.
+    Adaptive methods: more than any method with fixed steps; if forces jump repeatedly, they may need as many steps as
+    1 / tolerance. Methods that solve equations by differences of forces: more than MOST_SOLVED.
     """
-    if trial.tolerance is None or before.method.kind != trial.method.kind:
+    if before.name != trial.name or not (trial.method.solves or trial.tolerance is not None):
         return False
-    return before.point is None or before.point.evaluations > DEAREST * trial.problem.steps[-1]
+    most = MOST_SOLVED if trial.method.solves else DEAREST * trial.problem.steps[-1]
+    return before.point is None or before.point.evaluations > most
 
 
 def _clock(trials: Sequence[_Trial], repetitions: int, progress: Callable[[int], None]) -> None:
@@ -223,17 +238,17 @@ def _clock(trials: Sequence[_Trial], repetitions: int, progress: Callable[[int],
 
 
 def _curves(trials: Sequence[_Trial], least: float, most: float) -> list[Curve]:
-    kinds = dict.fromkeys(trial.method.kind for trial in trials)
     curves = []
-    for kind in kinds:
-        trials_of_kind = [trial for trial in trials if trial.method.kind == kind and trial.point is not None]
-        if not trials_of_kind:
+    for name in dict.fromkeys(trial.name for trial in trials):
+        its = [trial for trial in trials if trial.name == name and trial.point is not None]
+        if not its:
             continue
-        points = tuple(trial.timed_point for trial in trials_of_kind)
-        chosen = trials_of_kind[0].tolerance is not None
-        order, used = (None, 0) if chosen else measured_order(points, least, most)
-        declared = min(trials_of_kind[0].method.order, trials_of_kind[0].method.order_with_drag)
-        curves.append(Curve(method=kind, declared=declared, points=points, order=order, used=used))
+        points = tuple(trial.timed_point for trial in its)
+        chosen = its[0].tolerance is not None
+        by: Literal["evaluations", "steps"] = "steps" if its[0].method.solves else "evaluations"
+        order, used = (None, 0) if chosen else measured_order(points, least, most, by)
+        declared = min(its[0].method.order, its[0].method.order_with_drag)
+        curves.append(Curve(method=name, declared=declared, points=points, order=order, used=used))
     return curves
 
 

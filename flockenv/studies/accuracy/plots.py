@@ -182,7 +182,14 @@ def _draw_legend(figure: Figure, styles: dict[str, dict[str, Any]], reports: Seq
 
     orders = {curve.method: _order_text(curve, reports[0]) for curve in reports[0].curves} if len(reports) == 1 else {}
     handles = [
-        Line2D([], [], markersize=6, linewidth=2, label=name.replace("_", " ") + orders.get(name, ""), **style)
+        Line2D(
+            [],
+            [],
+            markersize=6,
+            linewidth=2,
+            label=name.replace("_", " ").replace(":", ", ") + orders.get(name, ""),
+            **style,
+        )
         for name, style in styles.items()
     ]
     figure.legend(

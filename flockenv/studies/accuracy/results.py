@@ -65,6 +65,8 @@ class Point(ResultRecord):
     """Agents that live in only one of this run and the reference, at the instant with most of them."""
     unsolved: int = 0
     """Contacts that collisions left unsolved, see State.work."""
+    iterations: int = 0
+    """Of a method that solves equations: linear iterations and factorisations, see State.work."""
 
     def cost(self, by: Cost) -> float | None:
         """Return the cost of this point, in seconds or evaluations.
@@ -92,6 +94,7 @@ class Curve(ResultRecord):
     """The points of a method, from the cheapest to the most expensive."""
 
     method: str
+    """Its kind, with fields that are not the default, see `method_name`."""
     declared: int
     """The order of the method if forces are smooth."""
     points: tuple[Point, ...]
@@ -209,17 +212,20 @@ class Results(ResultRecord):
     reports: tuple[Report, ...]
 
 
-def measured_order(points: Iterable[Point], least: float, most: float) -> tuple[float | None, int]:
+def measured_order(
+    points: Iterable[Point], least: float, most: float, by: Literal["evaluations", "steps"] = "evaluations"
+) -> tuple[float | None, int]:
     """Return the slope of the logarithm of the error over that of the evaluations, and the number of points used.
 
-    Uses the finest HALVINGS + 1 points whose errors lie between `least` (rounding) and `most` (no approximation), m;
-    the order is None for fewer than FEWEST. The error is the largest over all instants, as at one it may pass zero.
+    by: "steps" for methods that solve equations, which take fewer evaluations per step in shorter ones. Uses the
+    finest HALVINGS + 1 points whose errors lie between `least` (rounding) and `most` (no approximation), m; the order
+    is None for fewer than FEWEST. The error is the largest over all instants, as at one it may pass zero.
     """
     usable = [p for p in points if p.along is not None and least < p.along < most]
     kept = usable[-HALVINGS - 1 :]
     if len(kept) < FEWEST:
         return None, len(kept)
-    work, error = (np.log([getattr(p, name) for p in kept]) for name in ("evaluations", "along"))
+    work, error = (np.log([getattr(p, name) for p in kept]) for name in (by, "along"))
     return float(-np.polyfit(work, error, 1)[0]), len(kept)
 
 

@@ -1,8 +1,9 @@
-"""Benchmark problems of solids and liquids: a bar, a sheet of triangles, an elastic cube, a free block, a drop."""
+"""Benchmark problems of solids and liquids: springs, a sheet of triangles, elastic cubes, a free block, a drop."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from flockenv.model.networks import Cloth, Jelly, Rope
 from flockenv.model.spawn import Spawn
 from flockenv.physics.constraints import RigidBodies
 from flockenv.physics.effects import (
+    AltitudeSprings,
     Bending,
     Effect,
     Elastic,
@@ -26,9 +28,11 @@ from flockenv.scene import Group, Scene
 from flockenv.studies.accuracy.paths import Floats
 from flockenv.studies.accuracy.problem import Problem
 
-__all__ = ["bar", "block", "drop", "jelly", "sheet"]
+__all__ = ["altitudes", "bar", "block", "breaking", "drop", "jelly", "sheet", "yielding"]
 
 STEPS = tuple(2**k for k in range(6, 15))
+REST, RATE = 1.0, 10.0
+"""Springs that yield or break: rest length, m, and sqrt(k / m), 1/s."""
 
 
 def _free(group: Group, *effects: Effect, **more: Any) -> Scene:
@@ -69,14 +73,81 @@ def sheet() -> Problem:
     return Problem.of(scene, 0.7, STEPS, name="sheet", title="Sheet of 18 triangles that swings down")
 
 
-def jelly() -> Problem:
-    """Return a cube of 5 corotated tetrahedra that turns once a second, stretched by a fifth at the start."""
-    scene = _free(
-        Group(network=Jelly(cells=(1, 1, 1), sides=(1, 1, 1)), mass=0.1), Elastic(young=50.0, strain="corotated")
-    )
+def _spinning_cube(name: str, title: str, *effects: Effect) -> Problem:
+    """Return a cube of 5 tetrahedra that turns once a second, stretched by a fifth at the start."""
+    scene = _free(Group(network=Jelly(cells=(1, 1, 1), sides=(1, 1, 1)), mass=0.1), *effects)
     pos = (scene.start(0).pos[0] - 0.5) * (1.2, 1.0, 1.0)
     vel = 2 * math.pi * np.stack([-pos[:, 1], pos[:, 0], 0 * pos[:, 0]], axis=1)
-    return Problem.of(scene, 0.7, STEPS, name="jelly", title="Jelly that spins, 0.7 turns", motion=(pos, vel))
+    return Problem.of(scene, 0.7, STEPS, name=name, title=title, motion=(pos, vel))
+
+
+def jelly() -> Problem:
+    """Return a spinning cube of corotated elements."""
+    return _spinning_cube("jelly", "Jelly that spins, 0.7 turns", Elastic(young=50.0, strain="corotated"))
+
+
+def altitudes() -> Problem:
+    """Return a spinning cube of springs: along edges, from corners to faces, and between opposite edges."""
+    effects = Springs(stiffness=3.0), AltitudeSprings(stiffness=3.0, across=1.0, damping=0.01)
+    return _spinning_cube("altitudes", "Cube of altitude springs that spins", *effects)
+
+
+def _pull(limit: float) -> tuple[Callable[[float], tuple[float, float]], float]:
+    """Return the length and its rate of a spring that is pulled while elastic, m and m/s, and the time at `limit`."""
+    pressed, speed = -0.05, 3.0
+    far, phase = math.hypot(pressed, speed / RATE), math.atan2(pressed, speed / RATE)
+
+    def elastic(t: float) -> tuple[float, float]:
+        return REST + far * math.sin(RATE * t + phase), far * RATE * math.cos(RATE * t + phase)
+
+    return elastic, (math.asin((limit - REST) / far) - phase) / RATE
+
+
+def _on_a_spring(name: str, title: str, springs: Springs, motion: Callable[[float], tuple[float, float]]) -> Problem:
+    """Return the problem of 1 kg on one spring; motion: t -> length of the spring, m, and its rate, m/s."""
+
+    def exact(t: float) -> tuple[Floats, Floats]:
+        x, v = motion(t)
+        return np.array([[0.0, 0.0], [x, 0.0]]), np.array([[0.0, 0.0], [v, 0.0]])
+
+    rope = Rope(links=1, start=(0.0, 0.0), end=(REST, 0.0), pinned=("start",))
+    scene = Scene(groups=(Group(network=rope),), effects=(springs,))
+    return Problem.of(scene, 0.55, STEPS, name=name, title=title, motion=exact(0.0), exact=exact)
+
+
+def yielding() -> Problem:
+    """Return a mass of 1 kg on a spring of 100 N/m and 1 m that yields at a tenth; pulled from 0.95 m at 3 m/s.
+
+    Up to the length 1.1 m it is elastic, with w^2 = k / m. Then the strain is constant, so the force is proportional to
+    the length: k l y / (1 + y), an oscillation about length 0. From its greatest length on it is elastic again.
+    """
+    y, length = 0.1, 1.1 * REST
+    elastic, yields = _pull(length)
+    u, out = RATE * math.sqrt(y / (1 + y)), elastic(yields)[1]
+    longest, turns = math.hypot(length, out / u), yields + math.atan2(out / u, length) / u
+    spare = longest * y / (1 + y)
+
+    def motion(t: float) -> tuple[float, float]:
+        if t < yields:
+            return elastic(t)
+        if t < turns:
+            return longest * math.cos(u * (turns - t)), longest * u * math.sin(u * (turns - t))
+        angle = RATE * (t - turns)
+        return longest - spare * (1 - math.cos(angle)), -spare * RATE * math.sin(angle)
+
+    springs = Springs(stiffness=RATE**2, yield_strain=y)
+    return _on_a_spring("yielding", "Spring that yields", springs, motion)
+
+
+def breaking() -> Problem:
+    """Return the mass of `yielding` on a spring that breaks at 1.1 m: from there on its velocity is constant."""
+    elastic, breaks = _pull(1.1 * REST)
+
+    def motion(t: float) -> tuple[float, float]:
+        x, v = elastic(min(t, breaks))
+        return x + v * max(t - breaks, 0.0), v
+
+    return _on_a_spring("breaking", "Spring that breaks", Springs(stiffness=RATE**2, break_strain=0.1), motion)
 
 
 def block() -> Problem:

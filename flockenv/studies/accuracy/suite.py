@@ -1,6 +1,6 @@
 """The suite of benchmark problems: some with closed forms, and flocks, with smooth and non-smooth forces.
 
-Those of solids and liquids are in `solids`.
+Those of solids and liquids are in `solids`, those of contacts with faces in `faces`.
 
 Durations are not integer multiples of periods, at which semi-implicit Euler would seem to have order 2.
 """
@@ -32,9 +32,10 @@ from flockenv.physics.effects import (
     Vortex,
 )
 from flockenv.scene import Group, Scene
+from flockenv.studies.accuracy.faces import slope, trampoline
 from flockenv.studies.accuracy.paths import Floats
 from flockenv.studies.accuracy.problem import Exact, Problem
-from flockenv.studies.accuracy.solids import bar, block, drop, jelly, sheet
+from flockenv.studies.accuracy.solids import altitudes, bar, block, breaking, drop, jelly, sheet, yielding
 
 __all__ = ["SUITE", "select_problems"]
 
@@ -269,8 +270,13 @@ SUITE: dict[str, Callable[[], Problem]] = {
     "bar": bar,
     "sheet": sheet,
     "jelly": jelly,
+    "altitudes": altitudes,
+    "yielding": yielding,
+    "breaking": breaking,
     "block": block,
     "drop": drop,
+    "slope": slope,
+    "trampoline": trampoline,
     "boids": boids,
     "boids_cone": boids_cone,
     "boids_limit": boids_limit,

@@ -29,7 +29,18 @@ def headlines(report: Report) -> list[str]:
         lines.append(f"agents are compared by identity; up to {most:,} live in a run or in the reference alone")
     if most := max((point.unsolved for point in points), default=0):
         lines.append(f"collisions: up to {most:,} contacts unsolved in a run")
+    if solves := _solves(report):
+        lines.append(f"linear iterations in a step, which are no evaluations: {solves}")
     return lines + ([f"{report.stopped}: what was done until then is shown"] if report.stopped else [])
+
+
+def _solves(report: Report) -> str:
+    """Return the range of linear iterations in a step of each method that solves equations."""
+    found = []
+    for curve in report.curves:
+        each = [point.iterations / point.steps for point in curve.points if point.iterations]
+        found += [f"{curve.method} {min(each):.1f} to {max(each):.1f}"] if each else []
+    return ", ".join(found)
 
 
 def _reference_error_text(report: Report) -> str:
