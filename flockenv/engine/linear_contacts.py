@@ -264,6 +264,16 @@ class ContactSolver:
             ):
                 return total, left
 
+    def pushes(self, system: System) -> Doubles:
+        """Return the impulses of the contacts that were found by the last solve, (N, D) kg m/s: A dv less b.
+
+        Of a particle that slides, only the part along its line or plane.
+        """
+        n, d = self.impulses.rub.shape
+        left = (system.image - system.right).reshape(n, d) + self.impulses.rub
+        along = np.einsum("iab,ib->ia", self.base.reshape(n, d, d), left)
+        return np.where(self.held()[:, None], along, 0.0)
+
     def held(self) -> NDArray[np.bool_]:
         """Return which agents were in contact in the last step, (N,)."""
         return (self.impulses.active == 1).any(axis=1)  # type: ignore[no-any-return]

@@ -42,6 +42,7 @@ class LinearStep(NamedTuple):
     solves: int = 1  # steps that were accepted, whole ones or halves
     rejected: int = 0  # those in which a strain changed too much
     held: NDArray[np.bool_] | None = None  # (N,) agents in contact with an obstacle, by the last linearisation
+    push: Doubles | float = 0.0  # (N, D) kg m/s, impulses of these contacts, if they are recorded
 
 
 class _Part(NamedTuple):
@@ -90,6 +91,8 @@ class LinearSolver:
         self.period = np.array(scene.space.extent(d) if scene.space.periodic else (0.0,) * d)
         self.kinds = np.where(self.held, FIXED, FREE).astype(np.int8)
         self._read_slides(scene)
+        self.records = False  # True while impulses of contacts with obstacles are recorded
+        self.push: Doubles | float = 0.0  # (N, D) kg m/s, these impulses in the last step
         self.solve, self.solve_from, self.image, self.first = solve_of(d), solve_from_of(d), image_of(d), 0.0
         self.contacts = self._contacts(scene)
         self.keep_momentum, self.part = keep_momentum_of(d), _loose_parts(self.system, self.kinds)
@@ -138,7 +141,9 @@ class LinearSolver:
         drive: as for `Scene.rates`. Raises NotSolvedLinearlyError if there is no solution, or if a strain changes by
         more than `method.strain` even in the shortest of them.
         """
-        return self._advance(scene, state, drive, float(state.time[0]), scene.dt, 0)
+        found = self._advance(scene, state, drive, float(state.time[0]), scene.dt, 0)
+        self.push = found.push
+        return found
 
     def _advance(self, scene: SceneView, state: State, drive: Any, time: float, h: float, halved: int) -> LinearStep:
         """Return the motion after h seconds, from a state at a time; halved: how often the step was halved for it."""
@@ -159,6 +164,7 @@ class LinearSolver:
         return last._replace(
             iterations=found.iterations + first.iterations + last.iterations, solves=first.solves + last.solves,
             rejected=1 + first.rejected + last.rejected, held=_either(first.held, last.held),
+            push=first.push + last.push,
         )  # fmt: skip
 
     def _strain_change(self, state: State, found: LinearStep) -> tuple[float, int]:
@@ -190,8 +196,10 @@ class LinearSolver:
             self._count_from_start()
             more, held = self._solve(scene, state, begins, iterations)
             iterations += more
+        recorded = self.contacts if self.records and held is not None else None
+        push = 0.0 if recorded is None else recorded.pushes(self.system)
         self._keep_momentum(state.alive[0] if held is None else state.alive[0] & ~held)
-        return LinearStep(*self._end(*begins), iterations, held=held)
+        return LinearStep(*self._end(*begins), iterations, held=held, push=push)
 
     def _set_equations(
         self, scene: SceneView, state: State, drive: Any, time: float, h: float, along: float

@@ -22,7 +22,16 @@ from flockenv.engine.workspace import Workspace
 from flockenv.jit.thread_pool import LARGEST, AutoTuners, run_parallel, usable_threads
 from flockenv.model.scene_view import SceneView
 from flockenv.model.state import Floats, State
-from flockenv.physics.constraints import BodyContacts, RodForces, Settler
+from flockenv.physics.constraints import (
+    BodyContacts,
+    CollisionForces,
+    Collisions,
+    Constraint,
+    FaceCollisions,
+    RodForces,
+    Settler,
+)
+from flockenv.physics.constraints.constraint_forces import WatchedSettler
 from flockenv.physics.constraints.rigid_bodies import BodySettler
 from flockenv.physics.constraints.rods import RodSettler
 from flockenv.physics.integrators import SemiImplicitEuler
@@ -195,6 +204,39 @@ class Stepper:
             for each in settlers:
                 each.rods.records[0] = False
         return RodForces(*(np.concatenate(parts) for parts in zip(*(each.found() for each in settlers), strict=True)))
+
+    def collision_forces(self, step: Callable[[], object]) -> CollisionForces:
+        """Return the forces of collisions in a step of one world, which `step` makes."""
+        settlers, solver = self._settlers(1)[0], self._linear_solver()
+        unwatched, watched = settlers[:], dict[type[Constraint], WatchedSettler]()
+        for k, constraint in enumerate(self.scene.constraints):
+            if isinstance(constraint, Collisions | FaceCollisions):
+                settlers[k] = watched[type(constraint)] = WatchedSettler(settlers[k])
+        if solver is not None:
+            solver.records = True
+        try:
+            step()
+        finally:
+            settlers[:] = unwatched
+            if solver is not None:
+                solver.records = False
+        return self._forces_of(watched, 0.0 if solver is None else solver.push)
+
+    def _forces_of(self, watched: dict[type[Constraint], WatchedSettler], push: Floats | float) -> CollisionForces:
+        """Return forces by the changes of velocity in a step; push: (N, D) kg m/s, impulses before, of `collisions`."""
+        mass, dt = self.scene.body.mass, self.scene.dt
+        own, impulses = np.where(np.isinf(mass), 0, mass)[:, None], []
+        for kind in (Collisions, FaceCollisions):
+            change = watched[kind].change[:, 0].T if kind in watched else np.zeros((len(mass), self.scene.dimension))
+            impulses.append(own * change)
+        return CollisionForces((impulses[0] + push) / dt, impulses[1] / dt)
+
+    def plain_scratch(self, masses: Floats | None = None) -> Any:
+        """Return scratch for `accelerate`; masses: (N,) kg instead of the scene's, for this call alone."""
+        if masses is None:
+            return self.workspaces(1, 1)[0].of(0, self.plain_scratch_kind)
+        body = dataclasses.replace(self.scene.body, mass=masses)
+        return Workspace.allocate(self.scene.parts, body, self.scene.table).of(0, self.plain_scratch_kind)
 
     def _step_by_kernel(self, state: State, drive: Floats, steps: int) -> tuple[int, int]:
         """Step in place by the kernel alone, on all threads in use.

@@ -157,9 +157,17 @@ class Group(Record):
 
         dimension: 2 or 3.
         """
+        out = self.own_masses(dimension)
+        if self.network is not None:
+            out[self.network.pins()] = np.inf
+        return out
+
+    def own_masses(self, dimension: int) -> NDArray[np.float64]:
+        """Return the mass of each agent, (size,) kg, as if no particle of a network was pinned.
+
+        dimension: 2 or 3.
+        """
         if self.network is None:
             return draw(self.mass, self.size, SIZE)
         assert not isinstance(self.mass, Spread)
-        out = self.network.masses(self.mass * self.size, dimension)
-        out[self.network.pins()] = np.inf
-        return out
+        return self.network.masses(self.mass * self.size, dimension)

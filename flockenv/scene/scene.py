@@ -46,8 +46,11 @@ from flockenv.model.state import Body, Floats, State
 from flockenv.physics.constraints import (
     CONSTRAINTS,
     BodyContacts,
+    CollisionForces,
     Collisions,
     Constraint,
+    FaceCollisions,
+    PinForces,
     RigidBodies,
     RodForces,
     Rods,
@@ -554,6 +557,12 @@ class Scene(Record):
 
         times: of each world, (B,) s; None: those of the state.
         """
+        return self._rates(state, drive, times)
+
+    def _rates(
+        self, state: State, drive: ArrayLike | None, times: ArrayLike | None, masses: Floats | None = None
+    ) -> tuple[Floats, Floats | None]:
+        """Return what `rates` does, if agents had other masses, (N,) kg."""
         self._check(state, 0)
         b, n, d = state.shape
         acc = np.empty((d, b, n), self.dtype)
@@ -567,7 +576,7 @@ class Scene(Record):
                 x = np.ascontiguousarray(self.space.wrap(state.pos).transpose(2, 0, 1), self.dtype)
         self.stepper.accelerate(
             worlds_of(state)._replace(x=x), self._drive(drive, state), self.stepper.params(state), time, acc, flow,
-            self.stepper.workspaces(1, 1)[0].of(0, self.stepper.plain_scratch_kind),
+            self.stepper.plain_scratch(masses),
         )  # fmt: skip
         return acc.transpose(1, 2, 0), flow.transpose(1, 2, 0) if self.parts.flows else None
 
@@ -617,6 +626,30 @@ class Scene(Record):
         if not any(isinstance(each, Rods) for each in self.constraints):
             raise ValueError("constraints: the scene has no rods, which have tensions")
         return self.stepper.rod_forces(lambda: self.step(state.worlds([world])))
+
+    def collision_forces(self, state: State, world: int = 0) -> CollisionForces:
+        """Return the forces of collisions on agents in the step of one world that begins at a state."""
+        if not any(isinstance(each, Collisions | FaceCollisions) for each in self.constraints):
+            raise ValueError("constraints: the scene has neither collisions nor face_collisions")
+        return self.stepper.collision_forces(lambda: self.step(state.worlds([world])))
+
+    def pin_forces(self, state: State, world: int = 0) -> PinForces:
+        """Return the forces that hold pinned particles of networks, and those of `moves`, in one world at a state.
+
+        They balance the effects at the state, weight included, and the rods in the step that begins at it. Effects see
+        a particle's own mass, which changes the damping of `contact` with it. Collisions are not included.
+        """
+        pins = np.flatnonzero(np.isinf(self.body.mass))
+        if not len(pins):
+            raise ValueError("groups: no network has pinned particles or moves")
+        mass = np.concatenate([group.own_masses(self.dimension) for group in self.groups]).astype(self.dtype)
+        acc, _ = self._rates(state.worlds([world]), None, None, mass)
+        force = -mass[:, None] * acc[0]
+        if any(isinstance(each, Rods) for each in self.constraints):
+            rods = self.rod_forces(state, world)
+            np.subtract.at(force, rods.first, rods.force)
+            np.add.at(force, rods.second, rods.force)
+        return PinForces(pins, force[pins])
 
     def _drive(self, drive: ArrayLike | None, state: State) -> Floats:
         if drive is None:

@@ -60,6 +60,7 @@ class Collisions(Constraint):
     All responses end with passes over near bodies, so that none overlap. Restitution e is the normal speed after an
     impact over that before; friction is Coulomb's. A ball dropped from h bounces to e^2 h, and is at rest after
     sqrt(2 h / g) (1 + e) / (1 - e); a body sticks on an incline up to tan(angle) = friction. Bodies do not spin.
+    `Scene.collision_forces` returns the force on each agent.
 
     An impact changes the velocity relative to the surface to u' = u - (1 + e) (u . n) n, less the friction. Impacts in
     the order of time: Alder and Wainwright 1959; impulses: Guendelman, Bridson and Fedkiw 2003, in passes accelerated

@@ -45,7 +45,8 @@ class FaceCollisions(Constraint):
     with Coulomb friction, in passes over all that touch (Bridson, Fedkiw and Anderson 2002). What `passes` do not
     resolve moves as a rigid body in this step: an impact zone. A zone that holds a pinned particle or an obstacle
     moves as that does. So, if given motions leave room, nothing intersects after a step; otherwise a warning says so.
-    Momentum is conserved. Work counters: face_passes, impacts, impact_zones, largest_zone.
+    Momentum is conserved. Work counters: face_passes, impacts, impact_zones, largest_zone. `Scene.collision_forces`
+    returns the force on each agent.
 
     After the impulses every contact has g >= 0 at the end of the step, g = w1 n . x1 + ... + w4 n . x4 - d: the
     distance of point and face or of two edges, less the sum d of their radii.
