@@ -13,8 +13,10 @@ from scipy.spatial import cKDTree
 
 from flockenv.core.warnings import UnsolvedContactsWarning
 from flockenv.geometry.space import Box
+from flockenv.model.networks import EDGE
 from flockenv.model.state import State
 from flockenv.model.surface import faces_of
+from flockenv.physics.integrators import SemiImplicitEuler
 from flockenv.scene import Scene
 from flockenv.scene.yaml_io import load_scene
 from tests.catalogue import Array
@@ -36,7 +38,7 @@ SLOW = (
 )  # they compile for half a minute or have many bodies
 PICTURES = (
     "fountain", "fireworks", "drop", "waterfall", "fire", "smoke", "draped_cloth", "torn_paper", "jelly_on_stairs",
-    "dice", "flag",
+    "dice", "flag", "curtain",
 )  # fmt: skip
 UNSOLVED = pytest.mark.filterwarnings("ignore::flockenv.core.warnings.UnsolvedContactsWarning")
 FAST = pytest.mark.parametrize(
@@ -176,6 +178,23 @@ def test_a_sheet_of_paper_tears_around_a_ball_and_stays_bent() -> None:
     middle = np.linalg.norm(network.points(3) - (2.1, 2.2, 2.0), axis=1) < 0.3
     assert np.abs(end.pos[0, middle, 2] - 2.0).max() > 0.5  # torn off, or bent out of the sheet
     assert np.abs(end.pos[0, :41, 2] - 2.0).max() == 0  # the frame holds
+
+
+@pytest.mark.slow
+def test_a_stiff_curtain_is_drawn_with_small_strains_at_60_steps_a_second() -> None:
+    scene = scene_of("curtain")
+    network: Any = scene.groups[0].network
+    springs, state, top = network.springs(3), scene.start(0), slice(540, 567)
+    i, j, rest = (each[springs.role == EDGE] for each in springs[:3])
+    for _ in range(20):
+        state = scene.step(state, steps=30)
+        strain = np.linalg.norm(state.pos[0, i] - state.pos[0, j], axis=1) / rest - 1
+        assert strain.min() > -0.002 and 0.004 < strain.max() < 0.01
+        assert np.abs(state.vel).max() < 2
+    np.testing.assert_allclose(state.pos[0, [540, 553, 566], 0], [0, 1.5 - 0.045 * 10, 3 - 0.09 * 10], atol=1e-9)
+    assert (state.pos[0, top] @ (0, 0.8, 0.6)).min() < 2.4 - 0.2  # it sags between the hooks
+    with pytest.raises(ValueError, match=r"at most 3\.3\d*e-05 s is stable"):
+        scene.model_copy(update={"integrator": SemiImplicitEuler()})
 
 
 @pytest.mark.slow

@@ -47,6 +47,7 @@ FAMILIES = {
     "Flocks": {"alignment", "cohesion", "vicsek", "boids"},
     "Solids and cloth": {
         "springs",
+        "membrane",
         "elastic",
         "collisions",
         "face_collisions",
