@@ -12,8 +12,8 @@ from flockenv.envs.table import ENVIRONMENTS
 from flockenv.tasks import TASKS
 from tests.page_scripts import ROOT
 
-FILMED = {"pursuit": "rules and PPO", "crossing": "rules, PPO and a hybrid of both"}
-"""Tasks whose films were drawn, and the players in them: no hybrid of rules and policy was trained in Pursuit."""
+FILMED = dict.fromkeys(("pursuit", "crossing"), "rules, PPO and a hybrid of both")
+"""Tasks whose films were drawn, and the players in them."""
 
 
 @pytest.fixture(scope="module")
@@ -75,4 +75,22 @@ def test_a_page_has_a_film_or_says_why_not(pages: dict[str, str], name: str) -> 
     players = re.findall(rf"from left to right: (.*)\]\(\.\./films/{name}\.gif\)", top)
     assert players == ([FILMED[name]] if name in FILMED else [])
     assert ("was built without films" in top) == (name not in FILMED)
-    assert "No hybrid of rules and policy" in top or name != "pursuit"
+    assert "No hybrid of rules and policy" not in top, "every task has one"
+
+
+@pytest.mark.parametrize("filmed", [True, False])
+def test_a_page_names_a_missing_hybrid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, filmed: bool) -> None:
+    """As of a new task."""
+    monkeypatch.syspath_prepend(str(ROOT / "docs" / "_ext"))
+    import environment_pages
+    import films
+
+    film = tmp_path / "generated" / "films" / "mine.gif"
+    film.parent.mkdir(parents=True)
+    if filmed:
+        film.touch()
+    assert films.hybrid_of("mine") is None
+    assert all(films.hybrid_of(task) is not None for task in TASKS)
+    top = environment_pages._film(tmp_path, "mine")
+    assert "No hybrid of rules and policy was trained in mine" in top
+    assert ("left to right: rules and PPO]" in top) == filmed

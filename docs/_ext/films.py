@@ -13,7 +13,7 @@ from flockenv.tasks import TASKS
 __all__ = ["draw_missing", "hybrid_of"]
 
 ROOT = Path(__file__).resolve().parent.parent.parent
-HYBRIDS = ("residual", "mixture")
+HYBRIDS = ("residual", "mixture", "residual_home")
 """Folders of agents/policies with hybrids of rules and policy; the first that has one of a task is shown."""
 
 COMMAND = "import sys; from flockenv.cli.main import main; sys.exit(main(sys.argv[1:]))"
