@@ -90,7 +90,7 @@ class Film:
     def save(self, path: Path) -> None:
         path.parent.mkdir(exist_ok=True)
         first, *others = self.pictures
-        first.save(path, append_images=others, duration=DURATION, loop=0, quality=QUALITY, method=4)
+        first.save(path, append_images=others, duration=DURATION, loop=0, quality=QUALITY, method=6, minimize_size=True)
         print(f"{path}: {len(self.pictures)} pictures, {path.stat().st_size:,} bytes", flush=True)
 
 
@@ -100,14 +100,14 @@ def rules(film: Film) -> None:
     value = film.middle(".value[data-path='effects[1].weight']")
     film.drag(value, (value[0] - 90, value[1]))
     film.here.page.locator("h1").click()
-    film.step(11, 5)
+    film.step(7, 8)
     value = film.middle(".value[data-path='effects[1].weight']")
     film.drag(value, (value[0] + 60, value[1]))
     film.here.page.locator("h1").click()
-    film.step(11, 5)
+    film.step(7, 8)
     film.click(film.here.pixel(7))
     film.here.until("chosen.look !== null && chosen.look.forces !== undefined")
-    film.step(8, 1)
+    film.step(6, 1)
 
 
 def players(film: Film) -> None:

@@ -32,7 +32,7 @@ ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
 README = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
 PLAYERS_PAGE = " ".join((DOCS / "players.md").read_text(encoding="utf-8").split())
-PAGES = {"study": "robustness", "crowd_laws": "crowd_laws", "study_planner": "planner"}
+PAGES = {"study": "robustness", "crowd_laws": "crowd_laws", "study_planner": "planner", "study_hybrids": "hybrids"}
 FEW, MANY = (3, 4, 8), (24, 32)
 """Numbers of agents of Crossing, far from the 12 at home."""
 
@@ -147,6 +147,16 @@ def test_ppo_of_crossing_does_not_carry_over_and_that_of_flock_does() -> None:
     for count in (*FEW, *MANY):
         assert success(at("crossing", "agents", count), "ppo").max() == 0
     assert winners()["flock", "same_density", "agents 1024, size 261"] == "policy"
+
+
+def test_hybrids_at_home_are_level_with_the_better_of_rules_and_ppo() -> None:
+    folder, name = "study_hybrids", "residual_home"
+    found = winners(folder)
+    assert len(found) == 7 and set(found.values()) == {"level"}
+    better = {task for task, *_ in found if lead(at(task, "home", folder=folder), name, "ppo").low > 0}
+    assert better == {"corridor", "flock"}
+    herd = at("herd", "home", folder=folder)
+    assert success(herd, name).min() == 1.0 and success(herd, "ppo").min() == 0.0
 
 
 def test_no_planner_is_ahead() -> None:
@@ -325,7 +335,7 @@ def test_pages_of_transfer_fronts_and_partners_are_those_of_their_files() -> Non
     assert sorted(tasks) == sorted(together), "all tasks with several learners have a matrix"
 
 
-@pytest.mark.parametrize("folder", [pytest.param("study", marks=pytest.mark.slow), "crowd_laws", "study_planner"])
+@pytest.mark.parametrize("folder", [pytest.param("study", marks=pytest.mark.slow), "crowd_laws", "study_planner", "study_hybrids"])
 def test_stored_results_are_those_of_today_s_settings_and_players(folder: str) -> None:
     """If this fails, run `python -m agents.sweep configs/studies/NAME.yaml --out docs/FOLDER --reuse`."""
     study = load(ROOT / "configs" / "studies" / f"{PAGES[folder]}.yaml", Study)
