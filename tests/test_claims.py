@@ -335,7 +335,7 @@ def test_pages_of_transfer_fronts_and_partners_are_those_of_their_files() -> Non
     assert sorted(tasks) == sorted(together), "all tasks with several learners have a matrix"
 
 
-@pytest.mark.parametrize("folder", [pytest.param("study", marks=pytest.mark.slow), "crowd_laws", "study_planner", "study_hybrids"])
+@pytest.mark.parametrize("folder", [pytest.param("study", marks=pytest.mark.slow), *list(PAGES)[1:]])
 def test_stored_results_are_those_of_today_s_settings_and_players(folder: str) -> None:
     """If this fails, run `python -m agents.sweep configs/studies/NAME.yaml --out docs/FOLDER --reuse`."""
     study = load(ROOT / "configs" / "studies" / f"{PAGES[folder]}.yaml", Study)
