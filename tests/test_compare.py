@@ -445,6 +445,7 @@ def test_one_run_writes_all_four_files(in_temporary_folder: Path) -> None:
         assert about["players"]["still"]["mean_low"] <= about["players"]["still"]["mean"]
         assert about["verdict"] in " ".join(result.stdout.split())
         assert f"## {name}" in Path("here/results/table.md").read_text()
+    assert result.stdout.count("µs: per decision, all worlds at once / one row alone") == 1
     assert results["world_seeds"] == {"block": "evaluation", "first": EVALUATION, "last": EVALUATION + 5}
     assert results["players"] == {"random": "random", "still": "still.py"}
     assert results["smoke"] is True

@@ -243,6 +243,7 @@ def show_comparison(results: Results, folder: Path | None) -> None:
         console = Console(highlight=False, width=160)  # a pipe has no width; with 80 every cell would wrap
     for task, about in results["tasks"].items():
         console.print(*report.player_tables(task, about))
+    console.print(f"{report.MICROSECONDS}\n", highlight=False)
     for task, about in results["tasks"].items():
         console.print(about["verdict"], markup=False)
         for line in report.differences(task, about):

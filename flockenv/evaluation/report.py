@@ -20,24 +20,26 @@ from flockenv.evaluation.episodes import Episodes, Interval
 from flockenv.evaluation.plots import Column, Row
 
 __all__ = [
-    "INTERVAL", "all_rounded", "chart_column", "conditions", "differences", "grid", "interval_fields", "interval_text",
-    "json_text", "markdown", "number_text", "player_tables", "rounded", "seeds_text", "table_of", "task_results",
-    "verdict",
+    "INTERVAL", "MICROSECONDS", "all_rounded", "chart_column", "conditions", "differences", "grid", "interval_fields",
+    "interval_text", "json_text", "markdown", "number_text", "player_tables", "rounded", "seeds_text", "table_of",
+    "task_results", "verdict",
 ]  # fmt: skip
 
 Results = dict[str, Any]
+
+MICROSECONDS = "µs: per decision, all worlds at once / one row alone"
 
 SEEDS_HEADER = "seeds: lowest, highest"
 
 INTERVAL = "95 % two-level percentile bootstrap over seeds and worlds; shares of one seed: 95 % Wilson"
 
-NOTES = """\
+NOTES = f"""\
 Return: the mean reward of a world's learners, summed over its episode; higher is better. Every player met the same
 worlds, and no player was trained or tuned on one of them. A player with several training or search seeds has the mean
 over all of them, with the number of seeds and the lowest and the highest mean of a seed. Intervals: 95 %, two-level
 bootstrap over seeds and worlds; of a single seed over worlds alone, and then they do not contain the luck of training
 or of the search. Success and "scores higher" (ties count half) of single seeds: 95 % Wilson. Level: the interval of the
-difference contains 0. µs: per decision, all worlds at once / one row alone (medians; in a large comparison other cores
+difference contains 0. {MICROSECONDS} (medians; in a large comparison other cores
 play other tasks meanwhile)."""
 
 
